@@ -1,0 +1,1 @@
+"""Fit neural materials to multi-resolution BTF data."""

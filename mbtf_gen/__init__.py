@@ -1,0 +1,1 @@
+"""Generate multi-resolution BTF data sets from displaced materials."""

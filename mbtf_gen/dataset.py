@@ -1,0 +1,126 @@
+"""A folder of shards as one data set: manifest, splits, sidecars, arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .atomic import read_json
+from .errors import InputError
+from .levels import Lattice
+from .schema import FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, Layout
+from .shard_files import Arrays, read_shard
+
+
+@dataclass(frozen=True)
+class Shard:
+    """One finished shard: its files and what its sidecar says."""
+
+    path: Path
+    sidecar: dict[str, Any]
+
+    @property
+    def rows(self) -> int:
+        """Queries in the shuffled layout, buffers in the image layout."""
+        return int(self.sidecar["rows"])
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A data set made by ``mbtf-gen``.
+
+    Attributes
+    ----------
+    folder : where it lies
+    manifest : content of ``manifest.json``
+    """
+
+    folder: Path
+    manifest: dict[str, Any]
+
+    @classmethod
+    def open(cls, folder: str | Path) -> Dataset:
+        """Open a folder of shards.
+
+        Raises
+        ------
+        InputError : no manifest, another format, or another schema version
+        """
+        folder = Path(folder)
+        if not folder.is_dir():
+            raise InputError("no such folder", where=folder)
+        path = folder / MANIFEST_NAME
+        if not path.exists():
+            raise InputError(
+                f"no {MANIFEST_NAME} in it", where=folder, cure="make shards with: mbtf-gen heightfield.exr -o FOLDER"
+            )
+        manifest = read_json(path)
+        if manifest.get("format") != FORMAT_NAME:
+            raise InputError(f"is not a manifest of {FORMAT_NAME}", where=path)
+        if manifest.get("schema") != SCHEMA_VERSION:
+            raise InputError(
+                f"shards of schema {manifest.get('schema')}; this version reads schema {SCHEMA_VERSION}",
+                where=path,
+                cure="generate them again with this version of mbtf-gen",
+            )
+        return cls(folder, manifest)
+
+    @property
+    def layout(self) -> Layout:
+        """``shuffled`` or ``image``."""
+        layout: Layout = self.manifest["layout"]
+        return layout
+
+    @property
+    def lattice(self) -> Lattice:
+        """Texel grids of the tile."""
+        return Lattice(int(self.manifest["levels"]["finest"]), float(self.manifest["tile"]["aspect"]))
+
+    @property
+    def splits(self) -> list[str]:
+        """Names of the splits, ``train`` and ``test`` as a rule."""
+        return list(self.manifest["splits"])
+
+    def shards(self, split: str) -> list[Shard]:
+        """Shards of a split in order.
+
+        Raises
+        ------
+        InputError : no such split, or a shard that the manifest lists is missing
+        """
+        if split not in self.manifest["splits"]:
+            raise InputError(f"has no split '{split}' (it has: {', '.join(self.splits)})", where=self.folder)
+        out = []
+        for entry in self.manifest["splits"][split]["shards"]:
+            path = self.folder / entry["file"]
+            sidecar = path.with_suffix(".json")
+            if not path.exists() or not sidecar.exists():
+                raise InputError(
+                    f"shard {entry['file']} is missing or unfinished",
+                    where=self.folder,
+                    cure="run the mbtf-gen command that made the folder again: it resumes",
+                )
+            out.append(Shard(path, read_json(sidecar)))
+        return out
+
+    def iterate(self, split: str, names: Iterable[str] | None = None) -> Iterator[Arrays]:
+        """Arrays of each shard of a split in turn, memory-mapped where the format allows."""
+        wanted = None if names is None else list(names)
+        for shard in self.shards(split):
+            yield read_shard(shard.path, wanted)
+
+    def load(self, split: str, names: Iterable[str] | None = None) -> Arrays:
+        """All queries of a split in memory, leading axis the query (or buffer)."""
+        parts = list(self.iterate(split, names))
+        if not parts:
+            raise InputError(f"split '{split}' has no shards", where=self.folder)
+        return {name: _concatenate([p[name] for p in parts]) for name in parts[0]}
+
+
+def _concatenate(parts: list[NDArray[np.float32]]) -> NDArray[np.float32]:
+    return np.concatenate(parts, axis=0)

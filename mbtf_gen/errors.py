@@ -1,0 +1,62 @@
+"""Errors a user can meet, each with its exit code.
+
+Every failure that a user can cause or cure is raised as an :class:`MbtfError`; the command lines print it
+as one or two lines (what, where, what to do) and exit with its code. Anything else is a defect of ours.
+"""
+
+from __future__ import annotations
+
+EXIT_OK = 0
+EXIT_USAGE = 2
+EXIT_BAD_INPUT = 3
+EXIT_PARTIAL = 4
+EXIT_INTERRUPTED = 130
+
+
+class MbtfError(Exception):
+    """Base of all errors that reach a user as a message.
+
+    Parameters
+    ----------
+    what : what is wrong, in one line
+    where : file, key or line the fault lies in; printed before `what`
+    cure : what to do about it; printed after `what`
+    """
+
+    exit_code = 1
+
+    def __init__(self, what: str, *, where: object = None, cure: str = "") -> None:
+        self.what = what
+        self.where = None if where is None else str(where)
+        self.cure = cure
+        super().__init__(self.message)
+
+    @property
+    def message(self) -> str:
+        """`where: what. cure`, one line."""
+        text = f"{self.where}: {self.what}" if self.where else self.what
+        return f"{text}\n  {self.cure}" if self.cure else text
+
+
+class UsageError(MbtfError):
+    """The command line makes no sense (exit code 2)."""
+
+    exit_code = EXIT_USAGE
+
+
+class InputError(MbtfError):
+    """A file or a configuration value cannot be used (exit code 3)."""
+
+    exit_code = EXIT_BAD_INPUT
+
+
+class EngineError(MbtfError):
+    """The machine cannot run the renderer or the trainer (exit code 3)."""
+
+    exit_code = EXIT_BAD_INPUT
+
+
+class PartialError(MbtfError):
+    """Work is unfinished but what was done is kept; the same command resumes (exit code 4)."""
+
+    exit_code = EXIT_PARTIAL

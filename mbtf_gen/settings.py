@@ -1,0 +1,213 @@
+"""Typed configuration: YAML file, then ``--set a.b=c``, then flags, checked by pydantic.
+
+Used by all three programs. A key that the model does not know is refused with its file and line and the
+nearest valid key; a value that does not fit is refused with its key and what was expected.
+"""
+
+from __future__ import annotations
+
+import difflib
+import io
+import types
+import typing
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, TypeVar, Union
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from .errors import InputError, MbtfError, UsageError
+
+
+class Settings(BaseModel):
+    """Base of every configuration section: unknown keys are errors, values are fixed once read."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
+
+
+S = TypeVar("S", bound=BaseModel)
+
+
+def _yaml() -> Any:
+    from ruamel.yaml import YAML
+
+    return YAML(typ="rt")
+
+
+def read_yaml(path: Path) -> Any:
+    """Mapping stored in a YAML file, with line numbers kept.
+
+    Raises
+    ------
+    InputError : the file is missing, unreadable, not YAML, or not a mapping
+    """
+    from ruamel.yaml.error import MarkedYAMLError, YAMLError
+
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise InputError("no such file", where=path) from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot be read as text ({error})", where=path) from None
+    try:
+        data = _yaml().load(text)
+    except MarkedYAMLError as error:
+        mark = error.problem_mark
+        line = f":{mark.line + 1}" if mark is not None else ""
+        raise InputError(f"not valid YAML ({error.problem})", where=f"{path}{line}") from None
+    except YAMLError as error:
+        raise InputError(f"not valid YAML ({str(error).splitlines()[0]})", where=path) from None
+    if data is None:
+        return {}
+    if not isinstance(data, Mapping):
+        raise InputError("must hold a mapping of keys to values", where=path)
+    return data
+
+
+def dump_yaml(data: Mapping[str, Any]) -> str:
+    """YAML text of plain data (dicts, lists, strings, numbers), keys in the given order."""
+    from ruamel.yaml import YAML
+
+    yaml = YAML(typ="safe", pure=True)
+    yaml.default_flow_style = False
+    yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
+    stream = io.StringIO()
+    yaml.dump(dict(data), stream)
+    return stream.getvalue()
+
+
+def _model_in(annotation: Any) -> list[type[BaseModel]]:
+    """The models that a field's annotation may hold: through Optional, unions, lists and dicts."""
+    origin = typing.get_origin(annotation)
+    if origin is Annotated:
+        return _model_in(typing.get_args(annotation)[0])
+    if origin in (Union, types.UnionType, list, tuple, dict):
+        return [m for a in typing.get_args(annotation) for m in _model_in(a)]
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return []
+
+
+def _known_keys(model: type[BaseModel], location: Sequence[str | int]) -> list[str]:
+    """Valid keys of the section that `location` lies in (the last part is the offending key)."""
+    models = [model]
+    for part in location[:-1]:
+        if isinstance(part, int):
+            continue
+        deeper = [m for mm in models if part in mm.model_fields for m in _model_in(mm.model_fields[part].annotation)]
+        models = deeper or models
+    return sorted({key for m in models for key in m.model_fields})
+
+
+def _line_of(data: Any, location: Sequence[str | int]) -> int | None:
+    """Line (from 1) of a key in data that :func:`read_yaml` returned; None where it is not in the file."""
+    line = None
+    for part in location:
+        try:
+            if isinstance(part, str) and part not in data:
+                continue  # pydantic inserts tags of unions into its locations
+            position = data.lc.key(part) if isinstance(part, str) else data.lc.item(part)
+            line = position[0] + 1
+            data = data[part]
+        except (AttributeError, KeyError, IndexError, TypeError):
+            break
+    return line
+
+
+def _explain(error: ValidationError, model: type[BaseModel], data: Any, source: str) -> tuple[str, str, str]:
+    """(where, what, cure) of the first fault that pydantic found."""
+    fault = error.errors()[0]
+    location = [p for p in fault["loc"]]
+    dotted = ".".join(str(p) for p in location) or "(top level)"
+    line = _line_of(data, location)
+    where = f"{source}:{line}" if line is not None else source
+    if fault["type"] == "extra_forbidden":
+        known = _known_keys(model, location)
+        near = difflib.get_close_matches(str(location[-1]), known, n=1, cutoff=0.5)
+        what = f"unknown key '{dotted}'"
+        cure = f"did you mean '{near[0]}'?" if near else f"valid keys: {', '.join(known)}"
+        return where, what, cure
+    if fault["type"] == "missing":
+        return where, f"key '{dotted}' is missing", "add it"
+    given = fault.get("input")
+    message = fault["msg"].removeprefix("Value error, ").removeprefix("Assertion failed, ")
+    shown = "" if isinstance(given, Mapping | BaseModel) else f" (given {given!r})"
+    return where, f"'{dotted}': {message}{shown}", ""
+
+
+def build(
+    model: type[S], data: Mapping[str, Any], *, source: str, error: type[MbtfError] = InputError
+) -> S:
+    """Check `data` against `model`.
+
+    Parameters
+    ----------
+    source : where the data come from, for messages: a file, "command line"
+    error : class of the error to raise
+
+    Raises
+    ------
+    error : with the key, its line where `data` came from :func:`read_yaml`, and the nearest valid key
+    """
+    try:
+        return model.model_validate(data)
+    except ValidationError as fault:
+        where, what, cure = _explain(fault, model, data, source)
+        raise error(what, where=where, cure=cure) from None
+
+
+def _parse_value(text: str) -> Any:
+    """A ``--set`` value, read as YAML reads a scalar."""
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    try:
+        return YAML(typ="safe", pure=True).load(text)
+    except YAMLError:
+        return text
+
+
+def merge(base: Any, path: Sequence[str], value: Any) -> None:
+    """Set ``base[path[0]][path[1]]… = value`` in nested mappings, making sections as needed."""
+    for part in path[:-1]:
+        if not isinstance(base.get(part), Mapping):
+            base[part] = {}
+        base = base[part]
+    base[path[-1]] = value
+
+
+def resolve(
+    model: type[S],
+    *,
+    file: Path | None = None,
+    assignments: Sequence[str] = (),
+    flags: Mapping[str, Any] | None = None,
+) -> S:
+    """Resolved configuration: defaults, then the file, then ``a.b=c`` assignments, then flags.
+
+    Parameters
+    ----------
+    flags : dotted key → value; None values are flags that were not given
+
+    Raises
+    ------
+    InputError : the file is at fault
+    UsageError : an assignment or a flag is at fault
+    """
+    data: Any = read_yaml(file) if file is not None else {}
+    if file is not None and not assignments and not any(v is not None for v in (flags or {}).values()):
+        return build(model, data, source=str(file))
+    if file is not None:
+        probe = {k: v for k, v in (flags or {}).items() if v is not None}
+        missing = [k for k, f in model.model_fields.items() if f.is_required() and k not in data]
+        if not any(k in probe or any(a.startswith(f"{k}=") for a in assignments) for k in missing):
+            build(model, data, source=str(file))
+    for assignment in assignments:
+        key, sign, text = assignment.partition("=")
+        if not sign or not key:
+            raise UsageError(f"'{assignment}' is not of the form key=value", where="--set")
+        merge(data, key.strip().split("."), _parse_value(text))
+    for key, value in (flags or {}).items():
+        if value is not None:
+            merge(data, key.split("."), value)
+    return build(model, data, source="command line", error=UsageError)

@@ -1,0 +1,197 @@
+"""One shard on disk: npz (uncompressed, memory-mappable) or EXR (named float32 channels).
+
+A shard is a mapping of array name to array; all arrays share their leading axes: ``(n,)`` queries in the
+``shuffled`` layout, ``(items, rows, columns)`` in the ``image`` layout. See ``docs/format.md``.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.lib import format as npy_format
+from numpy.typing import NDArray
+
+from .atomic import write_file, write_through
+from .errors import InputError
+from .schema import ARRAY, ARRAYS, ArrayFormat
+
+Arrays = dict[str, NDArray[np.float32]]
+
+# Offsets of members are multiples of this, so that mapped arrays are aligned for any use.
+_ALIGNMENT = 64
+# Width of the EXR images that shuffled queries are folded into.
+_FOLD_WIDTH = 1024
+
+
+def check_arrays(arrays: Mapping[str, NDArray[np.float32]], where: object) -> tuple[int, ...]:
+    """Leading axes shared by all arrays of a shard.
+
+    Raises
+    ------
+    InputError : a required array is missing, unknown, or of the wrong shape
+    """
+    missing = [a.name for a in ARRAYS if not a.optional and a.name not in arrays]
+    if missing:
+        raise InputError(f"shard lacks the array(s) {', '.join(missing)}", where=where)
+    lead: tuple[int, ...] | None = None
+    for name, array in arrays.items():
+        if name not in ARRAY:
+            raise InputError(f"shard holds an unknown array '{name}'", where=where)
+        trailing = ARRAY[name].trailing
+        shape = array.shape[: array.ndim - len(trailing)]
+        if array.shape[len(shape) :] != trailing or lead not in (None, shape):
+            raise InputError(f"array '{name}' has the shape {array.shape}", where=where)
+        lead = shape
+    assert lead is not None
+    return lead
+
+
+def write_npz(path: Path, arrays: Mapping[str, NDArray[np.float32]]) -> None:
+    """Write a shard as npz, atomically; the bytes depend on the arrays alone."""
+    check_arrays(arrays, path)
+
+    def write(stream: BinaryIO) -> None:
+        with zipfile.ZipFile(stream, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
+            for spec in ARRAYS:
+                if spec.name not in arrays:
+                    continue
+                array = np.ascontiguousarray(arrays[spec.name], spec.dtype)
+                info = zipfile.ZipInfo(f"{spec.name}.npy")
+                # Local header: 30 bytes, name, 20 bytes of zip64 sizes; an extra field of ours fills up.
+                fixed = stream.tell() + 30 + len(info.filename) + 20
+                padding = -(fixed + 4) % _ALIGNMENT
+                info.extra = b"\x4d\x54" + padding.to_bytes(2, "little") + bytes(padding)
+                with archive.open(info, "w", force_zip64=True) as member:
+                    npy_format.write_array(member, array, version=(1, 0), allow_pickle=False)
+
+    write_file(path, write)
+
+
+def read_npz(path: Path, names: Iterable[str] | None = None, *, mapped: bool = True) -> Arrays:
+    """Arrays of an npz shard, memory-mapped read-only by default.
+
+    Parameters
+    ----------
+    names : arrays wanted; all by default
+
+    Raises
+    ------
+    InputError : missing file, not a shard, truncated, or compressed by another writer
+    """
+    out: Arrays = {}
+    try:
+        with zipfile.ZipFile(path) as archive, path.open("rb") as stream:
+            members = {i.filename.removesuffix(".npy"): i for i in archive.infolist()}
+            wanted = list(members) if names is None else [n for n in names]
+            for name in wanted:
+                if name not in members:
+                    raise InputError(f"shard lacks the array '{name}'", where=path)
+                info = members[name]
+                if info.compress_type != zipfile.ZIP_STORED:
+                    raise InputError("shard is compressed; shards are stored uncompressed", where=path)
+                stream.seek(info.header_offset + 26)
+                lengths = stream.read(4)
+                skip = int.from_bytes(lengths[:2], "little") + int.from_bytes(lengths[2:], "little")
+                stream.seek(info.header_offset + 30 + skip)
+                version = npy_format.read_magic(stream)
+                reader = {(1, 0): npy_format.read_array_header_1_0, (2, 0): npy_format.read_array_header_2_0}
+                shape, fortran, dtype = reader[version](stream)
+                if fortran or dtype != np.dtype("<f4"):
+                    raise InputError(f"array '{name}' is not C-ordered float32", where=path)
+                if mapped and 0 not in shape:
+                    array = np.memmap(path, dtype, mode="r", offset=stream.tell(), shape=shape)
+                else:
+                    array = np.fromfile(stream, dtype, int(np.prod(shape))).reshape(shape)
+                out[name] = array
+    except FileNotFoundError:
+        raise InputError("no such shard", where=path) from None
+    except (zipfile.BadZipFile, OSError, ValueError, KeyError, EOFError) as error:
+        raise InputError(f"shard cannot be read ({error})", where=path) from None
+    return out
+
+
+def _fold(array: NDArray[np.float32], lead: tuple[int, ...]) -> NDArray[np.float32]:
+    """Bring leading axes to (rows, columns) of one image: queries row by row, buffers stacked downwards."""
+    trailing = array.shape[len(lead) :]
+    if len(lead) == 1:
+        rows = -(-lead[0] // _FOLD_WIDTH)
+        folded = np.zeros((rows * _FOLD_WIDTH, *trailing), np.float32)
+        folded[: lead[0]] = array
+        return folded.reshape(rows, _FOLD_WIDTH, *trailing)
+    return array.reshape(lead[0] * lead[1], lead[2], *trailing)
+
+
+def write_exr(path: Path, arrays: Mapping[str, NDArray[np.float32]]) -> None:
+    """Write a shard as one EXR image with a named float32 channel per component, atomically.
+
+    The header's string ``mbtf.lead`` holds the leading axes ("n" or "items,rows,columns").
+    """
+    import OpenEXR
+
+    lead = check_arrays(arrays, path)
+    channels: dict[str, Any] = {}
+    for spec in ARRAYS:
+        if spec.name not in arrays:
+            continue
+        image = _fold(np.asarray(arrays[spec.name], np.float32), lead)
+        for index, channel in enumerate(spec.channels):
+            channels[channel] = np.ascontiguousarray(image[..., index] if spec.trailing else image)
+    header = {
+        "compression": OpenEXR.NO_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+        "mbtf.lead": ",".join(str(n) for n in lead),
+    }
+    write_through(path, lambda temporary: OpenEXR.File(header, channels).write(str(temporary)))
+
+
+def read_exr(path: Path, names: Iterable[str] | None = None) -> Arrays:
+    """Arrays of an EXR shard.
+
+    Raises
+    ------
+    InputError : missing file, not an EXR file, or not a shard
+    """
+    import OpenEXR
+
+    if not path.exists():
+        raise InputError("no such shard", where=path)
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            header = file.header()
+            if "mbtf.lead" not in header:
+                raise InputError("EXR image is not a shard (no 'mbtf.lead' in its header)", where=path)
+            lead = tuple(int(n) for n in header["mbtf.lead"].split(","))
+            stored = {name: channel.pixels for name, channel in file.channels().items()}
+    except (RuntimeError, ValueError, OSError) as error:
+        raise InputError(f"shard cannot be read ({error})", where=path) from None
+    count = int(np.prod(lead))
+    out: Arrays = {}
+    for spec in ARRAYS:
+        if names is not None and spec.name not in names:
+            continue
+        if any(c not in stored for c in spec.channels):
+            if spec.optional or (names is not None and spec.name not in names):
+                continue
+            raise InputError(f"shard lacks the array '{spec.name}'", where=path)
+        flat = np.stack([stored[c].reshape(-1)[:count] for c in spec.channels], axis=-1)
+        out[spec.name] = np.ascontiguousarray(flat.reshape(*lead, *spec.trailing), np.float32)
+    return out
+
+
+def shard_suffix(array_format: ArrayFormat) -> str:
+    """File name suffix of a shard of the given format."""
+    return f".{array_format}"
+
+
+def write_shard(path: Path, arrays: Mapping[str, NDArray[np.float32]]) -> None:
+    """Write a shard in the format that its suffix names."""
+    (write_exr if path.suffix == ".exr" else write_npz)(path, arrays)
+
+
+def read_shard(path: Path, names: Iterable[str] | None = None, *, mapped: bool = True) -> Arrays:
+    """Read a shard of either format; npz shards are memory-mapped by default."""
+    return read_exr(path, names) if path.suffix == ".exr" else read_npz(path, names, mapped=mapped)

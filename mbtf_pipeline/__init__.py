@@ -1,0 +1,1 @@
+"""Chain generation, fitting, comparison and reports."""
