@@ -231,7 +231,7 @@ CONSOLE = Console()
 
 
 def new_app(name: str, description: str) -> App:
-    """A cyclopts application that :func:`run` takes, with ``--help`` and ``--version``; `name` is the program's."""
+    """A cyclopts application for :func:`run`, with ``--help`` and ``--version``; `name` is the program's."""
 
     def version() -> str:
         from importlib.metadata import version as installed
@@ -361,7 +361,7 @@ def run(app: App, argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return _fail("interrupted", EXIT_INTERRUPTED, debug)
     except BrokenPipeError:
-        # The reader of our output has gone (`| head`); Python would complain once more when it flushes at exit.
+        # The reader of our output has gone (`| head`); Python would complain again when it flushes at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _EXIT_BROKEN_PIPE
     except OSError as error:
