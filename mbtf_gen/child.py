@@ -1,0 +1,116 @@
+"""Run a function in a child process that may abort or hang, and say in one line how it ended.
+
+Compilers and drivers fail by ending the process; what could do so is tried in a child first.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+# Marks the child's answers among whatever libraries print.
+_MARK = "@mbtf-answer "
+
+_CODE = f"""
+import json, sys
+sys.path[:] = json.loads(sys.argv[1])
+from importlib import import_module
+def say(answer):
+    sys.stdout.write("\\n" + {_MARK!r} + json.dumps(answer) + "\\n")
+    sys.stdout.flush()
+try:
+    for answer in getattr(import_module(sys.argv[2]), sys.argv[3])(*sys.argv[4:]):
+        say(answer)
+    say(dict(finished=True))
+except Exception as error:
+    say(dict(fault=" ".join(str(error).split()) or type(error).__name__))
+"""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a child ended.
+
+    Attributes
+    ----------
+    answers : what the function yielded, merged in order
+    fault : why it did not finish, in one line; empty when it did
+    seconds : wall time, start of the interpreter included
+    """
+
+    answers: dict[str, Any]
+    fault: str
+    seconds: float
+
+
+def _last_line(text: str) -> str:
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    return lines[-1][:200] if lines else ""
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"
+
+
+def run_child(
+    module: str, function: str, *arguments: str, timeout: float, environment: Mapping[str, str] | None = None
+) -> Outcome:
+    """Call ``module.function(*arguments)`` in a fresh interpreter.
+
+    Parameters
+    ----------
+    function : a generator of dicts that JSON can hold; an exception ends it, its text is the fault
+    timeout : seconds after which the child is killed
+    environment : variables set for the child on top of this process's own
+    """
+    path = json.dumps([entry or os.getcwd() for entry in sys.path])
+    start = time.monotonic()
+    process = subprocess.Popen(
+        [sys.executable, "-c", _CODE, path, module, function, *arguments],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        errors="replace",
+        env={**os.environ, **(environment or {})},
+    )
+    with process:
+        late = False
+        try:
+            output, noise = process.communicate(timeout=timeout)
+        except subprocess.TimeoutExpired:
+            late = True
+            process.kill()
+            output, noise = process.communicate()
+        except BaseException:
+            process.kill()
+            raise
+    answers: dict[str, Any] = {}
+    for answer in _answers(output):
+        answers.update(answer)
+    finished = answers.pop("finished", False)
+    fault = answers.pop("fault", "")
+    if late:
+        fault = f"no answer within {timeout:.0f} s"
+    elif not finished and not fault:
+        code = process.returncode
+        ending = f"ended by {_signal_name(-code)}" if code < 0 else f"ended with exit code {code}"
+        detail = _last_line(noise)
+        fault = f"the process was {ending}" + (f" ({detail})" if detail else "")
+    return Outcome(answers, fault, time.monotonic() - start)
+
+
+def _answers(output: str) -> Iterator[dict[str, Any]]:
+    for line in output.splitlines():
+        if line.startswith(_MARK):
+            yield json.loads(line.removeprefix(_MARK))
