@@ -18,6 +18,8 @@ _POINTS = 5
 _MAX_DEPTH = 8
 # Quadrature is refined until its error in the expected count is this share of the count's standard deviation.
 _SHARE = 0.02
+# Probability that is rounding and not mass.
+_ROUNDING = 1e-9
 
 
 class Domain(Protocol):
@@ -117,7 +119,7 @@ class ChiSquare:
 
     Attributes
     ----------
-    statistic, dof, p_value : p is 0 where a sample lies where its density is zero
+    statistic, dof, p_value : p is 0 if a sample lies where the density is zero, or the density exceeds mass 1
     mass : integral of the density over the domain
     observed, expected : counts per cell (rows, columns), before pooling
     outside : (observed, expected) count outside the domain
@@ -180,14 +182,16 @@ def chi_square_test(
     observed, _, _ = np.histogram2d(q[:, 0], q[:, 1], bins=(s, t))
     corners = np.stack(np.meshgrid(s[:-1], t[:-1], indexing="ij"), axis=-1).reshape(-1, 2)
     size = np.array([(s1 - s0) / bins[0], (t1 - t0) / bins[1]])
-    integrals = _integrate(pdf, where, corners, size, n).reshape(bins)
+    integrals, uncertainty = _integrate(pdf, where, corners, size, n)
     mass = float(integrals.sum())
-    outside = (float(n - observed.sum()), max(0.0, n * (1.0 - mass)))
-    o = np.append(observed.ravel(), outside[0])
-    e = np.append(n * integrals.ravel(), outside[1])
-    # A rest outside that is smaller than the quadrature resolves is no expectation.
-    if outside[1] < _SHARE * np.sqrt(n) and outside[0] == 0:
-        o, e = o[:-1], e[:-1]
+    left = 1.0 - mass
+    resolved = left > uncertainty + _ROUNDING
+    # A rest outside that the quadrature cannot tell from none expects no sample, but forbids none either.
+    rest = left if resolved else uncertainty if uncertainty > _ROUNDING else 0.0
+    outside = (float(n - observed.sum()), n * rest)
+    o, e = observed.ravel(), n * integrals
+    if resolved or outside[0] > 0:
+        o, e = np.append(o, outside[0]), np.append(e, outside[1])
     impossible = int(o[e <= 0.0].sum())
     pooled_o, pooled_e, merged = _pool(o[e > 0.0], e[e > 0.0], minimum)
     if len(pooled_e) < 2:
@@ -196,9 +200,14 @@ def chi_square_test(
     dof = len(pooled_e) - 1
     note = f"{n} samples, {len(pooled_e)} cells ({merged} pooled), density integrates to {mass:.6g}"
     if impossible:
-        statistic, note = float("inf"), f"{note}; {impossible} samples where the density is zero"
+        note = f"{note}; {impossible} samples where the density is zero"
+    if mass > 1.0 + uncertainty + _ROUNDING:
+        note, impossible = f"{note}, which is no density", impossible + 1
+    if impossible:
+        statistic = float("inf")
     p_value = 0.0 if impossible else float(chdtrc(dof, statistic))
-    return ChiSquare(statistic, dof, p_value, mass, observed, n * integrals, outside, note)
+    expected = n * integrals.reshape(bins)
+    return ChiSquare(statistic, dof, p_value, mass, observed, expected, outside, note)
 
 
 def _pool(observed: Floats, expected: Floats, minimum: float) -> tuple[Floats, Floats, int]:
@@ -224,8 +233,8 @@ def _pool(observed: Floats, expected: Floats, minimum: float) -> tuple[Floats, F
 
 def _integrate(
     pdf: Callable[[Floats], ArrayLike], domain: Domain, corners: Floats, size: Floats, n: int
-) -> Floats:
-    """Integral of the density over cells of one size, (m,), by adaptive quartering."""
+) -> tuple[Floats, float]:
+    """Integral of the density over each cell (m,) by adaptive quartering, and the error of their sum."""
     abscissae, weights = np.polynomial.legendre.leggauss(_POINTS)
     grid = np.stack(np.meshgrid((abscissae + 1) / 2, (abscissae + 1) / 2, indexing="ij"), axis=-1).reshape(
         -1, 2
@@ -240,7 +249,7 @@ def _integrate(
         return density @ weight * extent[0] * extent[1]
 
     quarters = np.array([[0, 0], [0, 1], [1, 0], [1, 1]], np.float64)
-    total = np.zeros(len(corners))
+    total, uncertainty = np.zeros(len(corners)), 0.0
     owner, at, coarse = np.arange(len(corners)), corners, integral(corners, size)
     tolerance = _SHARE * np.sqrt(np.maximum(coarse * n, 1.0)) / n
     extent = size
@@ -253,8 +262,9 @@ def _integrate(
         if depth == _MAX_DEPTH - 1:
             rough[:] = False
         np.add.at(total, owner[~rough], fine[~rough])
+        uncertainty += float(np.abs(fine - coarse)[~rough].sum())
         keep = np.repeat(rough, 4)
         owner, at, coarse = np.repeat(owner, 4)[keep], children[keep], parts[keep]
         if not len(at):
             break
-    return total
+    return total, uncertainty

@@ -153,6 +153,8 @@ def _centred_products(a: NDArray[np.float64], b: NDArray[np.float64]) -> tuple[N
     n = len(a)
     channels = a.shape[-1] if a.ndim > 1 else 1
     x, y = a.reshape(n, -1, channels), b.reshape(n, -1, channels)
+    # Constant data must come out as exactly zero, without the rounding of their mean.
+    x, y = x - x[0, 0], y - y[0, 0]
     x, y = x - x.mean(axis=(0, 1)), y - y.mean(axis=(0, 1))
     between = float((x.mean(axis=1) * y.mean(axis=1)).sum(axis=0).mean())
     return per_unit(x * y), between / (n * (n - 1)) if n > 1 else 0.0
