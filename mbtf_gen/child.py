@@ -30,7 +30,8 @@ try:
         say(answer)
     say(dict(finished=True))
 except Exception as error:
-    say(dict(fault=" ".join(str(error).split()) or type(error).__name__))
+    text = " ".join(str(getattr(error, "what", error)).split())
+    say(dict(fault=text or type(error).__name__))
 """
 
 
@@ -69,7 +70,7 @@ def run_child(
 
     Parameters
     ----------
-    function : a generator of dicts that JSON can hold; an exception ends it, its text is the fault
+    function : a generator of dicts that JSON can hold; an exception ends it and its message is the fault
     timeout : seconds after which the child is killed
     environment : variables set for the child on top of this process's own
     """
