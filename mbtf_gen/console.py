@@ -38,6 +38,7 @@ import json as json_module
 import logging
 import math
 import os
+import re
 import sys
 import time
 import traceback
@@ -309,7 +310,7 @@ def _command_first(app: App, tokens: list[str]) -> list[str]:
     if word in commands:
         return [word, *tokens[:index], *tokens[index + 1 :]]
     near = difflib.get_close_matches(word, commands, n=1, cutoff=0.75)
-    if near and not os.path.exists(word):
+    if near and not re.search(r"[./\\]", word) and not os.path.exists(word):
         raise UsageError("no such file or command", where=word, cure=f"did you mean: {app.name[0]} {near[0]}")
     return tokens
 

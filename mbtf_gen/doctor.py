@@ -272,8 +272,8 @@ def _drawing() -> Check:
         "Drawing",
         _probe("_use_drawing"),
         lambda a: f"pyvista {a['pyvista']} drew a sphere off screen",
-        "only 3D pictures need it; install OpenGL (software rendering will do), on Debian: apt install libgl1 "
-        "libegl1 libosmesa6",
+        "only 3D pictures need it; install OpenGL (software will do), on Debian: "
+        "apt install libgl1 libegl1 libosmesa6",
         required=False,
     )
 
@@ -296,7 +296,7 @@ def _kernel_cache() -> Check:
     return _result(
         "Kernel cache",
         _probe("_use_kernel_cache", folder),
-        lambda a: f"{folder}, {a['files']} files, {a['bytes'] / 2**20:.1f} MiB",
+        lambda a: f"{folder}, {a['files']} files, {a['bytes'] / 2**10:.0f} KiB",
         f"without it every run compiles its kernels again: make {folder} writable or set {CACHE_VARIABLE}",
         required=False,
     )

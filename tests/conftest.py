@@ -1,0 +1,40 @@
+"""Shared by all tests: reproducible hypothesis runs, and a way to run Python in a fresh process."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+
+import pytest
+from hypothesis import settings
+
+# The same examples in every run, and no limit on the time of one: neither machine nor luck decides a test.
+settings.register_profile("project", derandomize=True, deadline=None)
+settings.load_profile("project")
+
+RunPython = Callable[..., "subprocess.CompletedProcess[str]"]
+
+
+@pytest.fixture
+def run_python() -> RunPython:
+    """``run_python("-m", "mbtf_gen", …, KEY="value")`` in a fresh interpreter; None removes a variable."""
+
+    def run(*arguments: str, **variables: str | None) -> subprocess.CompletedProcess[str]:
+        environment = dict(os.environ)
+        for name, value in variables.items():
+            environment.pop(name, None)
+            if value is not None:
+                environment[name] = value
+        return subprocess.run(
+            [sys.executable, *arguments],
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            env=environment,
+            timeout=300,
+            check=False,
+        )
+
+    return run
