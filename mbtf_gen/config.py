@@ -1,0 +1,164 @@
+"""Configuration of the generator: every option, typed, with its unit and its default.
+
+The hash of a configuration covers what changes the data (the contents of input files, not their names) and leaves out
+what does not (launch size, progress).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, Field
+
+from .errors import UsageError
+from .schema import SCHEMA_VERSION, ArrayFormat, Layout
+from .settings import Settings
+
+CONFIG_VERSION = 1
+
+_COUNT = re.compile(r"^\s*(\d+(?:\.\d+)?(?:[eE][+]?\d+)?)\s*(/\s*texel)?\s*$")
+
+
+def parse_count(text: str | int | float) -> tuple[float, bool]:
+    """Read ``N`` or ``N/texel``: (N, whether it is per texel).
+
+    Raises
+    ------
+    ValueError : neither of the two, or not positive
+    """
+    match = _COUNT.match(str(text))
+    if match is None:
+        raise ValueError("must be N or N/texel, such as 100000 or 400/texel")
+    number = float(match[1])
+    if not 0 < number < 1e13:
+        raise ValueError("must be positive and below 1e13")
+    if match[2] is None and number != int(number):
+        raise ValueError("must be a whole number, or N/texel")
+    return number, match[2] is not None
+
+
+def count_queries(text: str | int | float, texels: int) -> int:
+    """Number of queries that ``N`` or ``N/texel`` stands for; at least 1."""
+    number, per_texel = parse_count(text)
+    return max(1, round(number * texels) if per_texel else int(number))
+
+
+def _count(text: Any) -> str:
+    parse_count(text)
+    return str(text)
+
+
+def _even(spp: int) -> int:
+    if spp % 2:
+        raise ValueError("must be even: the paths of a query are split into two independent halves")
+    return spp
+
+
+Count = Annotated[str, AfterValidator(_count)]
+Paths = Annotated[int, Field(ge=2, le=1 << 20), AfterValidator(_even)]
+
+
+class GeometrySection(Settings):
+    """The displaced tile."""
+
+    height: float | None = Field(
+        None, ge=-100, le=100, description="factor on the stored heights; default: the material's own"
+    )
+    mesh: int | None = Field(
+        None, ge=1, le=8192, description="mesh cells across the tile; default: the map's width, at most 512"
+    )
+
+
+class MixtureSection(Settings):
+    """Mixture over the fractional level l, weights that are normalised to sum 1."""
+
+    log_uniform: float = Field(0.6, ge=0, description="l uniform in [0, k]")
+    finest: float = Field(0.4, ge=0, description="l uniform in [k-1, k]")
+
+
+class QueriesSection(Settings):
+    """Which queries are drawn and how many paths each gets."""
+
+    train: Count = Field("100/texel", description="N or N/texel (texels of the finest level)")
+    test: Count = Field("8192", description="N or N/texel")
+    spp: Paths = Field(8, description="paths per training query, both halves together")
+    test_spp: Paths = Field(256, description="paths per test query, both halves together")
+    levels: int | None = Field(None, ge=0, le=14, description="finest level k; default: from the map's width")
+    mixture: MixtureSection = MixtureSection()
+    min_cos: float = Field(0.1, gt=0, lt=1, description="smallest cosine of both directions to the normal")
+    layout: Layout = "shuffled"
+
+
+class LightSection(Settings):
+    """The smoothed directional light."""
+
+    width: float = Field(1.0, ge=0, le=45, description="RMS angle per axis in degrees; 0 is a delta light")
+
+
+class TransportSection(Settings):
+    """How light paths are followed."""
+
+    max_depth: int = Field(0, ge=0, le=1000, description="surface interactions per path; 0: no limit")
+    roulette_depth: int = Field(3, ge=1, le=1000, description="interactions before Russian roulette begins")
+    max_crossings: int = Field(4096, ge=1, description="tile borders that one ray may cross")
+
+
+class OutputSection(Settings):
+    """How the data are stored."""
+
+    format: ArrayFormat = "npz"
+    shard_queries: int = Field(1 << 18, ge=1, le=1 << 24, description="queries per shard")
+
+
+class GeneratorConfig(Settings):
+    """Everything ``mbtf-gen`` needs to make a data set."""
+
+    version: Literal[1] = CONFIG_VERSION
+    material: str = Field(description="height map, folder of maps, or material.yaml")
+    geometry: GeometrySection = GeometrySection()
+    queries: QueriesSection = QueriesSection()
+    light: LightSection = LightSection()
+    transport: TransportSection = TransportSection()
+    output: OutputSection = OutputSection()
+    seed: int = Field(0, ge=0, lt=1 << 63, description="root seed")
+
+    def data_fields(self, inputs: dict[str, str]) -> dict[str, Any]:
+        """What the data depend on: the options, and the digests of the input files in place of their names."""
+        fields = self.model_dump(exclude={"material"})
+        return {"schema": SCHEMA_VERSION, "inputs": dict(sorted(inputs.items())), **fields}
+
+    def hash(self, inputs: dict[str, str]) -> str:
+        """SHA-256 over :meth:`data_fields`, hexadecimal; `inputs` maps roles to digests of files."""
+        text = json.dumps(self.data_fields(inputs), sort_keys=True, separators=(",", ":"))
+        return hashlib.sha256(text.encode()).hexdigest()
+
+
+def differences(old: dict[str, Any], new: dict[str, Any], prefix: str = "") -> list[str]:
+    """Fields in which two nested mappings differ, as ``key: old -> new``."""
+    out: list[str] = []
+    for key in sorted({*old, *new}):
+        a, b = old.get(key), new.get(key)
+        if isinstance(a, dict) and isinstance(b, dict):
+            out += differences(a, b, f"{prefix}{key}.")
+        elif a != b:
+            out.append(f"{prefix}{key}: {a} -> {b}")
+    return out
+
+
+def check_queries_flag(text: str | None, flag: str = "--queries") -> str | None:
+    """A ``--queries`` value, checked before anything is loaded.
+
+    Raises
+    ------
+    UsageError : not of the form N or N/texel
+    """
+    if text is None:
+        return None
+    try:
+        parse_count(text)
+    except ValueError as error:
+        raise UsageError(f"'{text}' {error}", where=flag) from None
+    return text

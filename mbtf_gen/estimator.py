@@ -1,0 +1,194 @@
+"""Monte Carlo estimates of M at queries: two independent halves per query.
+
+Paths of one launch are traced in the order of the place where they meet the reference plane (a 16-bit Morton key), which
+doubles the speed of incoherent queries. The random numbers of a path depend on its number in the shard alone, so values do
+not depend on how queries are grouped into launches.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import PartialError
+from .light import LightKernel
+from .queries import Queries
+from .scene import CLEARANCE, Tile, register_plugins
+from .seeds import Purpose, path_generator, stream_number
+from .tracing import LaneLight, Transport, trace
+
+# Paths per launch: enough to fill any machine, few enough to stay small in memory.
+LAUNCH_PATHS = 1 << 20
+# Passes in which a path that came out non-finite is traced again before the run is stopped.
+MAX_RESAMPLES = 4
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """Estimates of a batch of queries.
+
+    Attributes
+    ----------
+    value_a, value_b : (n, 3) float32, independent halves of spp/2 paths each
+    paths : paths traced; lost : rays that slipped through the surface; capped : rays cut at the cap on crossings
+    nonfinite : samples that came out non-finite and were drawn again
+    """
+
+    value_a: NDArray[np.float32]
+    value_b: NDArray[np.float32]
+    paths: int
+    lost: int
+    capped: int
+    nonfinite: int
+
+
+@dataclass(frozen=True)
+class Stream:
+    """Which random numbers to use: split and number of the shard under a root seed."""
+
+    root: int
+    split: str
+    shard: int
+
+
+def _spread_bits(x: Any) -> Any:
+    x = (x | (x << 4)) & 0x0F0F
+    x = (x | (x << 2)) & 0x3333
+    return (x | (x << 1)) & 0x5555
+
+
+class Estimator:
+    """Traces queries against one tile.
+
+    Parameters
+    ----------
+    tile : the displaced tile
+    light : smoothed directional light, or None for constant radiance 1 from above (furnace)
+    transport : how paths are followed
+    launch : paths per launch
+    """
+
+    def __init__(
+        self, tile: Tile, light: LightKernel | None, transport: Transport, launch: int = LAUNCH_PATHS
+    ) -> None:
+        register_plugins()
+        self.tile = tile
+        self.light = light
+        self.transport = transport
+        self.launch = launch
+        self._sensor = mi.load_dict(
+            {"type": "mbtf_queries", "unit": tile.unit, "aspect": tile.aspect, "start": CLEARANCE}
+        )
+        self._kappa = dr.opaque(mi.Float, 0.0 if light is None or light.is_delta else light.kappa)
+
+    def estimate(self, queries: Queries, spp: int, stream: Stream) -> Estimates:
+        """Both halves of each query (one leading axis), `spp` paths together.
+
+        Raises
+        ------
+        PartialError : samples stay non-finite after several draws; says where
+        """
+        n = len(queries.sigma)
+        per_launch = max(1, self.launch // spp)
+        parts = [
+            self._batch(queries, slice(start, min(start + per_launch, n)), spp, stream)
+            for start in range(0, n, per_launch)
+        ]
+        return Estimates(
+            np.concatenate([p.value_a for p in parts]),
+            np.concatenate([p.value_b for p in parts]),
+            n * spp,
+            sum(p.lost for p in parts),
+            sum(p.capped for p in parts),
+            sum(p.nonfinite for p in parts),
+        )
+
+    def _batch(self, queries: Queries, rows: slice, spp: int, stream: Stream) -> Estimates:
+        part = Queries(queries.u[rows], queries.sigma[rows], queries.omega_i[rows], queries.omega_o[rows])
+        self._sensor.set_queries(part)
+        count = len(part.sigma)
+        omega_i = mi.Vector3f(part.omega_i.T.copy())
+        if self.light is None:
+            inverse = mi.Float(0.0)
+        else:
+            inverse = mi.Float((1.0 / self.light.irradiance(part.omega_i)).astype(np.float32))
+        lanes = dr.arange(mi.UInt32, count * spp)
+        radiance, lost, capped = self._trace(lanes, rows.start, spp, stream, omega_i, inverse, 0)
+        bad = self._nonfinite(radiance)
+        nonfinite = 0
+        for attempt in range(1, MAX_RESAMPLES + 1):
+            if not len(bad):
+                break
+            nonfinite += len(bad)
+            again, more_lost, more_capped = self._trace(
+                mi.UInt32(bad), rows.start, spp, stream, omega_i, inverse, attempt
+            )
+            dr.scatter(radiance, again, mi.UInt32(bad))
+            dr.eval(radiance)
+            lost, capped = lost + more_lost, capped + more_capped
+            bad = bad[self._nonfinite(again)]
+        if len(bad):
+            raise PartialError(
+                f"{len(bad)} samples stay NaN or infinite after {MAX_RESAMPLES} draws, first at "
+                f"query {rows.start + int(bad[0]) // spp}",
+                where=f"{stream.split} shard {stream.shard}",
+                cure="check the material's values",
+            )
+        half = spp // 2
+        mean = dr.block_reduce(dr.ReduceOp.Add, radiance, half, mode="evaluated") * (1.0 / half)
+        values = np.array(mean, np.float32).T.reshape(count, 2, 3)
+        return Estimates(
+            np.ascontiguousarray(values[:, 0]), np.ascontiguousarray(values[:, 1]), count * spp, lost, capped, nonfinite
+        )
+
+    def _nonfinite(self, radiance: Any) -> NDArray[np.uint32]:
+        finite = dr.isfinite(radiance.x) & dr.isfinite(radiance.y) & dr.isfinite(radiance.z)
+        if dr.all(finite)[0]:
+            return np.zeros(0, np.uint32)
+        return np.nonzero(~np.array(finite))[0].astype(np.uint32)
+
+    def _trace(
+        self, lanes: Any, first: int, spp: int, stream: Stream, omega_i: Any, inverse: Any, attempt: int
+    ) -> tuple[Any, int, int]:
+        """Radiance of the given lanes (query · spp + path), in their order; counts of lost and capped rays."""
+        half = spp // 2
+
+        def generator(lane: Any, purpose: Purpose) -> Any:
+            # The path's number within its half of the shard; both halves use the same numbers in other streams.
+            query = mi.UInt64(lane // spp) + dr.opaque(mi.UInt64, first)
+            path = query * half + mi.UInt64(lane % half)
+            a, b = (stream_number(stream.split, stream.shard, purpose, attempt, h) for h in (0, 1))
+            number = dr.select((lane // half) % 2 == 0, dr.opaque(mi.UInt64, a), dr.opaque(mi.UInt64, b))
+            return path_generator(stream.root, number, path)
+
+        rng = generator(lanes, Purpose.FOOTPRINT)
+        xi = mi.Point2f(rng.next_float32(), rng.next_float32())
+        point = self._sensor.footprint(lanes // spp, xi)
+        key = _spread_bits(mi.UInt32(point.x * 256.0)) | (_spread_bits(mi.UInt32(point.y * 256.0)) << 1)
+        dr.eval(point, key)
+        order = mi.UInt32(np.argsort(np.array(key).astype(np.uint16), kind="stable").astype(np.uint32))
+
+        lane = dr.gather(mi.UInt32, lanes, order)
+        query = lane // spp
+        ray = self._sensor.ray(query, dr.gather(mi.Point2f, point, order))
+        if self.light is None:
+            light = LaneLight("constant")
+        else:
+            light = LaneLight(
+                "delta" if self.light.is_delta else "lobe",
+                dr.gather(mi.Vector3f, omega_i, query),
+                dr.gather(mi.Float, inverse, query),
+                self._kappa,
+            )
+        traced, lost, capped = trace(
+            self.tile.scene, self.tile.period, ray, light, self.transport, generator(lane, Purpose.PATH), mi.Bool(True)
+        )
+        radiance = dr.zeros(mi.Color3f, dr.width(lanes))
+        dr.scatter(radiance, traced, order)
+        dr.eval(radiance, lost, capped)
+        return radiance, int(dr.count(lost)[0]), int(dr.sum(capped)[0])
