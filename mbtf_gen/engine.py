@@ -178,6 +178,7 @@ def _mitsuba_error(fault: str) -> EngineError:
 
 def _proof(variant: str) -> Iterator[dict[str, Any]]:
     """Child process of :func:`prove`."""
+    use_shipped_llvm()
     library = chosen_llvm()
     if variant == CPU_VARIANT and library is not None:
         try:
