@@ -250,13 +250,13 @@ def leave():  # type: ignore[no-untyped-def]
         ("abort", [], {"step": 1}, "the process was ended by SIGABRT (LLVM ERROR: Cannot select)"),
         ("fail", [], {"step": 1}, "is broken"),
         ("leave", [], {"step": 1}, "the process was ended with exit code 7"),
-        ("hang", [], {"step": 1}, "no answer within 3 s"),
+        ("hang", [], {"step": 1}, "no answer within 1 s"),
     ],
 )
 def test_how_a_child_ended_is_said(
     function: str, arguments: list[str], answers: dict[str, object], fault: str
 ) -> None:
-    outcome = run_child(__name__, function, *arguments, timeout=3 if function == "hang" else 60)
+    outcome = run_child(__name__, function, *arguments, timeout=1 if function == "hang" else 60)
     assert (outcome.answers, outcome.fault) == (answers, fault)
 
 

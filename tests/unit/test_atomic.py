@@ -1,0 +1,164 @@
+"""Files are absent or complete, whatever happens while they are written."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import BinaryIO
+
+import pytest
+
+from mbtf_gen import atomic
+from mbtf_gen.errors import InputError, PartialError
+
+
+def no_leftovers(folder: Path) -> bool:
+    return not any(p.name.endswith(".tmp") for p in folder.iterdir())
+
+
+def test_a_file_is_written_and_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "a.bin"
+    for content in (b"old" * 1000, b"new"):
+        atomic.write_file(path, lambda stream, content=content: stream.write(content) and None)
+        assert path.read_bytes() == content
+    assert no_leftovers(tmp_path)
+
+
+def test_a_failing_writer_leaves_the_old_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.bin"
+    path.write_bytes(b"old")
+
+    def write(stream: BinaryIO) -> None:
+        stream.write(b"half of the ne")
+        raise RuntimeError("crash")
+
+    with pytest.raises(RuntimeError, match="crash"):
+        atomic.write_file(path, write)
+    assert path.read_bytes() == b"old"
+    assert no_leftovers(tmp_path)
+
+
+def test_a_crash_before_the_rename_leaves_the_old_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.bin"
+    path.write_bytes(b"old")
+
+    def crash(source: object, target: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(atomic.os, "replace", crash)
+    with pytest.raises(KeyboardInterrupt):
+        atomic.write_text(path, "new")
+    assert path.read_bytes() == b"old"
+    assert no_leftovers(tmp_path)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
+@pytest.mark.parametrize("moment", ["write", "fsync", "replace"])
+def test_a_kill_leaves_the_old_file(moment: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.bin"
+    path.write_bytes(b"old")
+    code = f"""
+import os, signal
+from pathlib import Path
+from mbtf_gen import atomic
+def die(*arguments):
+    os.kill(os.getpid(), signal.SIGKILL)
+if {moment!r} != "write":
+    setattr(os, {moment!r}, die)
+def write(stream):
+    stream.write(b"x" * 100000)
+    if {moment!r} == "write":
+        stream.flush()
+        die()
+atomic.write_file(Path({str(path)!r}), write)
+"""
+    done = subprocess.run([sys.executable, "-c", code], check=False)
+    assert done.returncode == -signal.SIGKILL
+    assert path.read_bytes() == b"old"
+
+
+@pytest.mark.parametrize("through_name", [False, True])
+def test_a_full_disk_is_partial_and_keeps_the_old_file(tmp_path: Path, through_name: bool) -> None:
+    path = tmp_path / "a.bin"
+    path.write_bytes(b"old")
+
+    def full(target: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with pytest.raises(PartialError, match="No space left on device") as caught:
+        (atomic.write_through if through_name else atomic.write_file)(path, full)
+    assert caught.value.exit_code == 4
+    assert caught.value.where == str(path)
+    assert "run the same command again" in caught.value.cure
+    assert path.read_bytes() == b"old"
+    assert no_leftovers(tmp_path)
+
+
+def test_a_disk_that_fills_at_fsync_is_partial(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(handle: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(atomic.os, "fsync", full)
+    with pytest.raises(PartialError, match="No space left"):
+        atomic.write_text(tmp_path / "a.txt", "text")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_missing_folder_is_partial(tmp_path: Path) -> None:
+    with pytest.raises(PartialError, match="No such file or directory"):
+        atomic.write_text(tmp_path / "none" / "a.txt", "text")
+
+
+def test_the_data_are_synced_before_the_rename(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    events: list[str] = []
+    fsync, replace = os.fsync, os.replace
+    monkeypatch.setattr(atomic.os, "fsync", lambda handle: events.append("fsync") or fsync(handle))
+    monkeypatch.setattr(atomic.os, "replace", lambda *a: events.append("replace") or replace(*a))
+    atomic.write_file(tmp_path / "a", lambda stream: None)
+    assert events == ["fsync", "replace", "fsync"]
+    events.clear()
+    atomic.write_through(tmp_path / "b", lambda temporary: temporary.touch())
+    assert events == ["fsync", "replace", "fsync"]
+
+
+def test_json_goes_there_and_back(tmp_path: Path) -> None:
+    data = {"name": "α", "rows": [1, 2.5, None], "nested": {"flag": True}}
+    atomic.write_json(tmp_path / "a.json", data)
+    assert atomic.read_json(tmp_path / "a.json") == data
+
+
+def test_json_refuses_what_is_no_number(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        atomic.write_json(tmp_path / "a.json", {"loss": float("nan")})
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("content", "what"),
+    [
+        (None, "no such file"),
+        (b"{", "not readable as JSON"),
+        (b"\xff", "not readable"),
+        (b"[1]", "a JSON object"),
+    ],
+)
+def test_bad_json_is_bad_input(tmp_path: Path, content: bytes | None, what: str) -> None:
+    path = tmp_path / "a.json"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InputError, match=what) as caught:
+        atomic.read_json(path)
+    assert caught.value.where == str(path)
+
+
+def test_digests_are_sha256(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(b"mbtf" * 99999)
+    assert atomic.digest(path) == hashlib.sha256(b"mbtf" * 99999).hexdigest()

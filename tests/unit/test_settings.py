@@ -1,0 +1,184 @@
+"""Configuration: file, then assignments, then flags; faults are named with key, line and cure."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import pytest
+from pydantic import Field
+
+from mbtf_gen.errors import InputError, UsageError
+from mbtf_gen.settings import Settings, build, dump_yaml, read_yaml, resolve
+
+
+class Light(Settings):
+    width_deg: float = Field(1.0, ge=0, le=30)
+    kind: Literal["lobe", "delta"] = "lobe"
+
+
+class Stage(Settings):
+    name: str
+    spp: int = Field(16, gt=0)
+
+
+class Whole(Settings):
+    height: float = 1.0
+    light: Light = Light()
+    levels: int | None = None
+    stages: tuple[Stage, ...] = ()
+
+
+class Needy(Settings):
+    source: str
+    spp: int = 1
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Any:
+    def write(text: str) -> Path:
+        path = tmp_path / "config.yaml"
+        path.write_text(text)
+        return path
+
+    return write
+
+
+def test_defaults_stand_alone() -> None:
+    assert resolve(Whole) == Whole()
+
+
+def test_an_empty_file_is_all_defaults(write: Any) -> None:
+    assert resolve(Whole, file=write("# nothing yet\n")) == Whole()
+
+
+def test_flags_win_over_assignments_over_the_file(write: Any) -> None:
+    path = write("height: 0.1\nlevels: 3\nlight:\n  width_deg: 2\n")
+    assert resolve(Whole, file=path).height == 0.1
+    whole = resolve(
+        Whole,
+        file=path,
+        assignments=["height=0.2", "levels=4", "light.width_deg=5"],
+        flags={"height": 0.3, "levels": None},
+    )
+    assert (whole.height, whole.levels, whole.light.width_deg) == (0.3, 4, 5.0)
+
+
+def test_later_assignments_win_and_reach_sections_not_in_the_file() -> None:
+    whole = resolve(Whole, assignments=["light.width_deg=5", "light.width_deg=6", "light.kind=delta"])
+    assert whole.light == Light(width_deg=6, kind="delta")
+
+
+def test_assignments_are_read_as_yaml() -> None:
+    whole = resolve(Whole, assignments=["stages=[{name: a, spp: 4}]", "levels=null", "height=1e-6"])
+    assert whole.stages == (Stage(name="a", spp=4),)
+    assert whole.levels is None
+    assert whole.height == 1e-6
+
+
+@pytest.mark.parametrize(
+    ("text", "where", "what", "cure"),
+    [
+        ("hight: 1\n", 1, "unknown key 'hight'", "did you mean 'height'?"),
+        (
+            "height: 1\nlight:\n  widht_deg: 2\n",
+            3,
+            "unknown key 'light.widht_deg'",
+            "did you mean 'width_deg'?",
+        ),
+        ("height: 1\nxyzzy: 1\n", 2, "unknown key 'xyzzy'", "valid keys: height, levels, light, stages"),
+        ("stages:\n- name: a\n- name: b\n  ssp: 2\n", 4, "unknown key 'stages.1.ssp'", "did you mean 'spp'?"),
+        ("\n\nheight: tall\n", 3, "'height': Input should be a valid number", ""),
+        ("light:\n  width_deg: 31\n", 2, "'light.width_deg': Input should be less than or equal to 30", ""),
+        ("light:\n  kind: lamp\n", 2, "'light.kind': Input should be 'lobe' or 'delta'", ""),
+        ("stages:\n- spp: 2\n", 2, "key 'stages.0.name' is missing", "add it"),
+    ],
+)
+def test_faults_name_line_and_cure(write: Any, text: str, where: int, what: str, cure: str) -> None:
+    path = write(text)
+    with pytest.raises(InputError) as caught:
+        resolve(Whole, file=path)
+    assert caught.value.where == f"{path}:{where}"
+    assert caught.value.what.startswith(what)
+    assert caught.value.cure == cure
+
+
+@pytest.mark.parametrize(
+    ("assignment", "what"),
+    [
+        ("hight=2", "unknown key 'hight'"),
+        ("height=tall", "'height': Input should be a valid number"),
+        ("light.width_deg=31", "'light.width_deg': Input should be less than or equal to 30"),
+        ("height", "'height' is not of the form key=value"),
+        ("=3", "'=3' is not of the form key=value"),
+    ],
+)
+def test_bad_assignments_are_usage_errors(assignment: str, what: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        resolve(Whole, assignments=[assignment])
+    assert caught.value.what.startswith(what)
+    assert caught.value.exit_code == 2
+
+
+def test_a_file_at_fault_is_blamed_before_the_flags(write: Any) -> None:
+    path = write("source: a\nssp: 2\n")
+    with pytest.raises(InputError) as caught:
+        resolve(Needy, file=path, flags={"spp": 3})
+    assert caught.value.where == f"{path}:2"
+
+
+def test_required_keys_may_come_from_flags(write: Any) -> None:
+    assert resolve(Needy, file=write("spp: 2\n"), flags={"source": "map.exr"}) == Needy(
+        source="map.exr", spp=2
+    )
+    with pytest.raises(UsageError, match="'source' is missing"):
+        resolve(Needy)
+
+
+@pytest.mark.parametrize(
+    ("text", "what", "line"),
+    [
+        ("a: [1\nb: 2\n", "not valid YAML", 2),
+        ("a: 1\na: 2\n", "not valid YAML", 2),
+        ("- 1\n- 2\n", "must hold a mapping", None),
+        ("just text\n", "must hold a mapping", None),
+    ],
+)
+def test_files_that_are_no_mapping_are_refused(write: Any, text: str, what: str, line: int | None) -> None:
+    path = write(text)
+    with pytest.raises(InputError, match=what) as caught:
+        read_yaml(path)
+    assert caught.value.where == (str(path) if line is None else f"{path}:{line}")
+
+
+def test_missing_and_unreadable_files_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such file"):
+        read_yaml(tmp_path / "none.yaml")
+    with pytest.raises(InputError, match="cannot be read as text"):
+        read_yaml(tmp_path)
+    (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00a: 1")
+    with pytest.raises(InputError, match="cannot be read as text"):
+        read_yaml(tmp_path / "binary.yaml")
+
+
+def test_settings_do_not_change_once_read() -> None:
+    whole = Whole()
+    with pytest.raises(ValueError, match="frozen"):
+        whole.height = 2.0  # type: ignore[misc]
+
+
+def test_what_is_dumped_reads_back(tmp_path: Path) -> None:
+    whole = Whole(height=1e-6, light=Light(kind="delta"), stages=(Stage(name="ä: #"),))
+    path = tmp_path / "resolved.yaml"
+    path.write_text(dump_yaml(whole.model_dump(mode="json")), encoding="utf-8")
+    assert resolve(Whole, file=path) == whole
+    assert path.read_text(encoding="utf-8").startswith("height:")
+
+
+def test_unions_of_sections_know_their_keys() -> None:
+    class Either(Settings):
+        part: Annotated[Light | Stage | None, Field()] = None
+
+    with pytest.raises(InputError) as caught:
+        build(Either, {"part": {"widht_deg": 2.0}}, source="x")
+    assert caught.value.cure == "did you mean 'width_deg'?"
