@@ -1,0 +1,305 @@
+"""Images as arrays: EXR, PNG, JPG, TIFF and npy, decoded to numbers without loss.
+
+Integer images become ``code / largest code``; float images keep their numbers. No colour space is applied
+here: which map is sRGB and which is data is the material's business.
+"""
+
+from __future__ import annotations
+
+import warnings as python_warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .errors import InputError
+from .exr import read_channels
+from .png16 import header as png_header
+from .png16 import read_png16
+
+# A header may claim any size; beyond this nothing is allocated (11 585² pixels).
+MAX_PIXELS = 2**27
+
+# Grey images stored as colour JPG come back with channels that differ by rounding.
+_GREY_CODES = 2.0 / 255.0
+
+# Rec.709 luminance of linear RGB.
+LUMINANCE = (0.2126, 0.7152, 0.0722)
+
+_KINDS = {
+    ".exr": "EXR",
+    ".png": "PNG",
+    ".jpg": "JPEG",
+    ".jpeg": "JPEG",
+    ".tif": "TIFF",
+    ".tiff": "TIFF",
+    ".npy": "NPY",
+}
+_MAGIC = {
+    b"\x76\x2f\x31\x01": "EXR",
+    b"\x89PNG": "PNG",
+    b"\xff\xd8\xff": "JPEG",
+    b"II*\x00": "TIFF",
+    b"MM\x00*": "TIFF",
+    b"\x93NUMPY": "NPY",
+}
+SUFFIXES = tuple(_KINDS)
+
+
+@dataclass(frozen=True)
+class Image:
+    """A decoded image.
+
+    Attributes
+    ----------
+    pixels : (H, W, C), row 0 the top, C = 1 grey, 2 grey and alpha, 3 RGB, 4 RGBA; float64 for one channel,
+        float32 for several; all finite
+    bits : 8 or 16 where the file holds integers (then pixels are code / largest code), None for floats
+    path : the file
+    """
+
+    pixels: NDArray[np.floating[Any]]
+    bits: int | None
+    path: Path
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, columns)."""
+        return self.pixels.shape[0], self.pixels.shape[1]
+
+
+def is_image(path: Path) -> bool:
+    """Does the file name end like an image that can be read?"""
+    return path.suffix.lower() in _KINDS
+
+
+def read_image(path: str | Path) -> Image:
+    """Decode an image file.
+
+    Raises
+    ------
+    InputError : missing, empty, damaged, cut short, of another kind than its name says, of a kind that is not
+        supported, more than ``MAX_PIXELS`` pixels, or with pixels that are NaN or infinite (with their number
+        and the first one's column and row)
+    """
+    path = Path(path)
+    kind = _kind(path)
+    if kind == "EXR":
+        image = _from_exr(path)
+    elif kind == "NPY":
+        image = _from_npy(path)
+    else:
+        image = _from_pillow(path, kind)
+    bad = ~np.isfinite(image.pixels).all(axis=-1)
+    if bad.any():
+        raise InputError(f"{count_and_first(bad)} NaN or infinite", where=path)
+    return image
+
+
+def count_and_first(bad: NDArray[np.bool_]) -> str:
+    """``3 pixels, the first at column 5, row 2, are`` for a mask (H, W) that is set somewhere."""
+    number = int(bad.sum())
+    row, column = (int(i) for i in np.argwhere(bad)[0])
+    if number == 1:
+        return f"1 pixel, at column {column}, row {row}, is"
+    return f"{number} pixels, the first at column {column}, row {row}, are"
+
+
+def _kind(path: Path) -> str:
+    """What the file is by its first bytes, which must agree with its name."""
+    named = _KINDS.get(path.suffix.lower())
+    if path.is_dir():
+        raise InputError("is a folder, not an image", where=path)
+    try:
+        with path.open("rb") as stream:
+            start = stream.read(8)
+    except FileNotFoundError:
+        raise InputError("no such file", where=path) from None
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
+    if named is None:
+        raise InputError(
+            f"'{path.suffix}' is not an image format that is read",
+            where=path,
+            cure=f"use one of {', '.join(SUFFIXES)}",
+        )
+    if not start:
+        raise InputError("is empty", where=path)
+    found = next((kind for magic, kind in _MAGIC.items() if start.startswith(magic)), None)
+    if found is None:
+        raise InputError(f"is no {named} image", where=path)
+    if found != named:
+        suffix = next(s for s, kind in _KINDS.items() if kind == found)
+        raise InputError(f"holds {found} data", where=path, cure=f"rename it to {path.stem}{suffix}")
+    return found
+
+
+def _check_size(rows: int, columns: int, path: Path) -> None:
+    if rows * columns > MAX_PIXELS:
+        raise InputError(f"claims {columns} x {rows} pixels; at most {MAX_PIXELS:,} are read", where=path)
+    if rows * columns == 0:
+        raise InputError("holds no pixels", where=path)
+
+
+def _from_codes(codes: NDArray[Any], bits: int, path: Path) -> Image:
+    stacked = codes if codes.ndim == 3 else codes[..., None]
+    dtype = np.float64 if stacked.shape[2] == 1 else np.float32
+    return Image(np.divide(stacked, 2**bits - 1, dtype=dtype), bits, path)
+
+
+def _from_floats(numbers: NDArray[Any], path: Path) -> Image:
+    stacked = numbers if numbers.ndim == 3 else numbers[..., None]
+    dtype = np.float64 if stacked.shape[2] == 1 else np.float32
+    with np.errstate(
+        over="ignore", invalid="ignore"
+    ):  # too large for float32 becomes infinite and is reported as that
+        return Image(stacked.astype(dtype), None, path)
+
+
+def _from_exr(path: Path) -> Image:
+    channels = read_channels(path, MAX_PIXELS)
+    names = _exr_order(list(channels), path)
+    return _from_floats(np.stack([channels[n] for n in names], axis=-1), path)
+
+
+def _exr_order(names: list[str], path: Path) -> list[str]:
+    """Channels that make up the image, in order: the only one, or RGB(A) or Y(A) of the only such layer."""
+    if len(names) == 1:
+        return names
+    found = []
+    for layer in sorted({n.rpartition(".")[0] for n in names}):
+        prefix = f"{layer}." if layer else ""
+        base = next((b for b in ("RGB", "Y") if all(prefix + c in names for c in b)), None)
+        if base is not None:
+            found.append([prefix + c for c in base] + ([f"{prefix}A"] if f"{prefix}A" in names else []))
+    unnamed = [f for f in found if "." not in f[0]]
+    if len(found) != 1 and len(unnamed) != 1:
+        raise InputError(
+            f"which of its channels are meant is unclear: {', '.join(sorted(names))}",
+            where=path,
+            cure="keep one channel, or the channels R, G, B",
+        )
+    return (unnamed or found)[0]
+
+
+def _from_npy(path: Path) -> Image:
+    try:
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+    except Exception as error:  # a damaged header may make the parser raise anything
+        raise InputError(f"cannot be read as an npy array ({_first_line(error)})", where=path) from None
+    if array.ndim not in (2, 3) or (array.ndim == 3 and not 1 <= array.shape[2] <= 4):
+        raise InputError(
+            f"holds an array of shape {array.shape}; (H, W) or (H, W, 1..4) is wanted", where=path
+        )
+    _check_size(array.shape[0], array.shape[1], path)
+    if array.dtype.kind == "f":
+        return _from_floats(array, path)
+    if array.dtype in (np.uint8, np.uint16):
+        return _from_codes(array, 8 * array.dtype.itemsize, path)
+    raise InputError(f"holds {array.dtype} numbers; uint8, uint16 or floats are wanted", where=path)
+
+
+def _from_pillow(path: Path, kind: str) -> Image:
+    from PIL import Image as Pillow
+
+    head = None
+    if kind == "PNG":
+        with path.open("rb") as stream:
+            head = png_header(stream.read(33))
+    if head is not None:
+        _check_size(head[1], head[0], path)
+        if head[2] == 16 and head[3] > 1:
+            return _from_codes(read_png16(path), 16, path)
+    try:
+        with python_warnings.catch_warnings():
+            python_warnings.simplefilter("ignore")
+            with Pillow.open(path, formats=[kind]) as picture:
+                _check_size(picture.height, picture.width, path)
+                _refuse_deep_tiff(picture, path)
+                picture.load()
+                return _from_picture(picture, path)
+    except Pillow.DecompressionBombError:
+        raise InputError(f"claims more than {MAX_PIXELS:,} pixels", where=path) from None
+    except InputError:
+        raise
+    except Exception as error:  # a damaged file may make the decoder raise anything
+        raise InputError(f"cannot be read as a {kind} image ({_first_line(error)})", where=path) from None
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error) or type(error).__name__).splitlines()[0]
+
+
+def _refuse_deep_tiff(picture: Any, path: Path) -> None:
+    """The library reads colour TIFF of 16 bits as 8: better refused than cut."""
+    bits = getattr(picture, "tag_v2", {}).get(258, (8,))
+    bits = bits if isinstance(bits, tuple) else (bits,)
+    if len(bits) > 1 and max(bits) > 8:
+        raise InputError(
+            f"colour TIFF of {max(bits)} bits is not read", where=path, cure="save it as PNG or EXR"
+        )
+
+
+def _from_picture(picture: Any, path: Path) -> Image:
+    mode = picture.mode
+    if mode in ("P", "PA"):
+        transparent = mode == "PA" or "transparency" in picture.info
+        picture = picture.convert("RGBA" if transparent else "RGB")
+    elif mode == "1":
+        picture = picture.convert("L")
+    elif mode == "YCbCr":
+        picture = picture.convert("RGB")
+    if picture.mode in ("L", "LA", "RGB", "RGBA"):
+        return _from_codes(np.asarray(picture), 8, path)
+    if picture.mode.startswith("I;16"):
+        return _from_codes(np.asarray(picture).astype(np.uint16), 16, path)
+    if picture.mode == "F":
+        return _from_floats(np.asarray(picture), path)
+    if picture.mode == "I" and picture.format == "PNG":
+        return _from_codes(np.asarray(picture), 16, path)
+    raise InputError(f"holds pixels of the kind '{mode}'", where=path, cure="save it as grey or RGB")
+
+
+def grey(image: Image) -> tuple[NDArray[np.float64], list[str]]:
+    """One number per pixel, (H, W), and warnings about what was dropped.
+
+    A grey image is taken as it is. RGB whose channels agree (within two codes of 8 bits, which is JPG's
+    rounding) is grey too; other colours are reduced to their Rec.709 luminance with a warning. Alpha is
+    dropped, with a warning where it is not 1 everywhere.
+    """
+    pixels, found = image.pixels, []
+    if pixels.shape[2] in (2, 4) and np.any(pixels[..., -1] != 1.0):
+        found.append(f"{image.path}: its alpha channel is not used")
+    rgb = pixels[..., : 3 if pixels.shape[2] > 2 else 1]
+    spread = float(np.max(rgb.max(axis=-1) - rgb.min(axis=-1)))
+    if spread == 0.0:
+        numbers = rgb[..., 0].astype(np.float64)
+        if image.bits is not None:  # back from single precision to the exact fraction
+            largest = 2**image.bits - 1
+            numbers = np.rint(numbers * largest) / largest
+        return numbers, found
+    tolerance = _GREY_CODES if image.bits == 8 else 1e-4 * float(np.abs(rgb).max())
+    if spread > tolerance:
+        found.append(f"{image.path}: is coloured where one number per pixel is wanted; its luminance is used")
+    return rgb.astype(np.float64) @ np.asarray(LUMINANCE), found
+
+
+def srgb_to_linear(encoded: ArrayLike) -> NDArray[np.floating[Any]]:
+    """Linear light of sRGB-encoded numbers in [0, 1], any shape (IEC 61966-2-1)."""
+    c = _floating(encoded)
+    bent = ((np.maximum(c, 0.0) + c.dtype.type(0.055)) / c.dtype.type(1.055)) ** c.dtype.type(2.4)
+    return np.where(c <= 0.04045, c / c.dtype.type(12.92), bent)
+
+
+def linear_to_srgb(linear: ArrayLike) -> NDArray[np.floating[Any]]:
+    """sRGB encoding of linear light in [0, 1], any shape (IEC 61966-2-1); not clamped."""
+    c = _floating(linear)
+    root = np.maximum(c, 0.0) ** c.dtype.type(1.0 / 2.4)
+    return np.where(c <= 0.0031308, c * c.dtype.type(12.92), c.dtype.type(1.055) * root - c.dtype.type(0.055))
+
+
+def _floating(numbers: ArrayLike) -> NDArray[np.floating[Any]]:
+    c = np.asarray(numbers)
+    return c if c.dtype.kind == "f" else c.astype(np.float64)
