@@ -37,7 +37,7 @@ def _replacing(path: Path) -> Iterator[Path]:
         raise PartialError(
             f"cannot be written ({error.strerror or error})",
             where=path,
-            cure="what was finished before is kept; free space or fix the folder and run the same command again",
+            cure="what was finished is kept; free space or mend the folder, then run the same command again",
         ) from None
     finally:
         with contextlib.suppress(OSError):
@@ -65,15 +65,19 @@ def write_through(path: Path, write: Callable[[Path], None]) -> None:
             os.fsync(stream.fileno())
 
 
+def _put(stream: BinaryIO, text: str) -> None:
+    stream.write(text.encode())
+
+
 def write_json(path: Path, data: Mapping[str, Any]) -> None:
     """Write plain data as indented JSON, atomically. NaN and infinities are refused."""
     text = json.dumps(data, indent=2, allow_nan=False) + "\n"
-    write_file(path, lambda stream: stream.write(text.encode()) and None)
+    write_file(path, lambda stream: _put(stream, text))
 
 
 def write_text(path: Path, text: str) -> None:
     """Write text as UTF-8, atomically."""
-    write_file(path, lambda stream: stream.write(text.encode()) and None)
+    write_file(path, lambda stream: _put(stream, text))
 
 
 def read_json(path: Path) -> dict[str, Any]:

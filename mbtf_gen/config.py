@@ -1,7 +1,7 @@
 """Configuration of the generator: every option, typed, with its unit and its default.
 
-The hash of a configuration covers what changes the data (the contents of input files, not their names) and leaves out
-what does not (launch size, progress).
+The hash of a configuration covers what changes the data (the contents of input files, not their names) and
+leaves out what does not (launch size, progress).
 """
 
 from __future__ import annotations
@@ -16,8 +16,6 @@ from pydantic import AfterValidator, Field
 from .errors import UsageError
 from .schema import SCHEMA_VERSION, ArrayFormat, Layout
 from .settings import Settings
-
-CONFIG_VERSION = 1
 
 _COUNT = re.compile(r"^\s*(\d+(?:\.\d+)?(?:[eE][+]?\d+)?)\s*(/\s*texel)?\s*$")
 
@@ -116,7 +114,7 @@ class OutputSection(Settings):
 class GeneratorConfig(Settings):
     """Everything ``mbtf-gen`` needs to make a data set."""
 
-    version: Literal[1] = CONFIG_VERSION
+    version: Literal[1] = 1
     material: str = Field(description="height map, folder of maps, or material.yaml")
     geometry: GeometrySection = GeometrySection()
     queries: QueriesSection = QueriesSection()
@@ -126,7 +124,8 @@ class GeneratorConfig(Settings):
     seed: int = Field(0, ge=0, lt=1 << 63, description="root seed")
 
     def data_fields(self, inputs: dict[str, str]) -> dict[str, Any]:
-        """What the data depend on: the options, and the digests of the input files in place of their names."""
+        """What the data depend on: the options, and the digests of the input files in place of their
+        names."""
         fields = self.model_dump(exclude={"material"})
         return {"schema": SCHEMA_VERSION, "inputs": dict(sorted(inputs.items())), **fields}
 

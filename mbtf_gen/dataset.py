@@ -57,7 +57,7 @@ class Dataset:
         path = folder / MANIFEST_NAME
         if not path.exists():
             raise InputError(
-                f"no {MANIFEST_NAME} in it", where=folder, cure="make shards with: mbtf-gen heightfield.exr -o FOLDER"
+                f"no {MANIFEST_NAME} in it", where=folder, cure="make one: mbtf-gen heightfield.exr -o FOLDER"
             )
         manifest = read_json(path)
         if manifest.get("format") != FORMAT_NAME:

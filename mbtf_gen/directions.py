@@ -21,7 +21,8 @@ def from_projected_disk(xy: ArrayLike) -> NDArray[np.float64]:
 
 
 def from_angles(elevation_deg: ArrayLike, azimuth_deg: ArrayLike) -> NDArray[np.float64]:
-    """Unit vectors (..., 3) from the elevation above the plane and the azimuth from +u towards +v, in degrees."""
+    """Unit vectors (..., 3) from the elevation above the plane and the azimuth from +u towards +v, in
+    degrees."""
     e, a = np.broadcast_arrays(np.radians(elevation_deg), np.radians(azimuth_deg))
     return np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], axis=-1)
 

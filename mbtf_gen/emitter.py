@@ -1,8 +1,8 @@
 """The smoothed directional light as a Mitsuba emitter, for stock integrators.
 
-It takes either one direction (parameter ``direction``, towards the light) or the ``omega_i`` of a batch of queries, which
-it finds by the query number that :class:`~mbtf_gen.sensor.QuerySensor` writes into the rays' time. The formulas are those of
-:class:`~mbtf_gen.tracing.LaneLight`, which the generator's own loop uses.
+It takes either one direction (parameter ``direction``, towards the light) or the ``omega_i`` of a batch of
+queries, which it finds by the query number that :class:`~mbtf_gen.sensor.QuerySensor` writes into the rays'
+time. The formulas are those of :class:`~mbtf_gen.tracing.LaneLight`, which the generator's own loop uses.
 """
 
 from __future__ import annotations
@@ -18,10 +18,12 @@ from .light import LightKernel
 from .tracing import LaneLight
 
 
-class SmoothedDirectional(mi.Emitter):  # type: ignore[misc]
-    """``mbtf_directional``: von Mises–Fisher lobe cut at the horizon z = 0, unit irradiance on the plane z = 0.
+class SmoothedDirectional(mi.Emitter):
+    """``mbtf_directional``: von Mises–Fisher lobe cut at the horizon z = 0, unit irradiance on the plane z =
+    0.
 
-    Plugin parameters: ``width`` (RMS angle per axis in degrees, 0 for a delta light), ``direction`` (towards the light).
+    Plugin parameters: ``width`` (RMS angle per axis in degrees, 0 for a delta light), ``direction`` (towards
+    the light).
     """
 
     def __init__(self, props: Any) -> None:

@@ -1,14 +1,14 @@
 """Monte Carlo estimates of M at queries: two independent halves per query.
 
-Paths of one launch are traced in the order of the place where they meet the reference plane (a 16-bit Morton key), which
-doubles the speed of incoherent queries. The random numbers of a path depend on its number in the shard alone, so values do
-not depend on how queries are grouped into launches.
+Paths of one launch are traced in the order of the place where they meet the reference plane (a 16-bit Morton
+key), which doubles the speed of incoherent queries. The random numbers of a path depend on its number in the
+shard alone, so values do not depend on how queries are grouped into launches.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -35,7 +35,8 @@ class Estimates:
     Attributes
     ----------
     value_a, value_b : (n, 3) float32, independent halves of spp/2 paths each
-    paths : paths traced; lost : rays that slipped through the surface; capped : rays cut at the cap on crossings
+    paths : paths traced; lost : rays that slipped through the surface; capped : rays cut at the cap on
+        crossings
     nonfinite : samples that came out non-finite and were drawn again
     """
 
@@ -54,6 +55,19 @@ class Stream:
     root: int
     split: str
     shard: int
+
+
+class RaySource(Protocol):
+    """What rays of queries start from: the query sensor, or a camera's pixels."""
+
+    def set_queries(self, queries: Queries, first: int = 0) -> None:
+        """Take a batch of queries; `first` is the number of its first query."""
+
+    def footprint(self, query: Any, xi: Any) -> Any:
+        """uv of a point of the footprint of queries of the batch, not wrapped."""
+
+    def ray(self, query: Any, point: Any) -> Any:
+        """Ray through such a point, in scene units."""
 
 
 def _spread_bits(x: Any) -> Any:
@@ -86,8 +100,14 @@ class Estimator:
         )
         self._kappa = dr.opaque(mi.Float, 0.0 if light is None or light.is_delta else light.kappa)
 
-    def estimate(self, queries: Queries, spp: int, stream: Stream) -> Estimates:
+    def estimate(
+        self, queries: Queries, spp: int, stream: Stream, source: RaySource | None = None
+    ) -> Estimates:
         """Both halves of each query (one leading axis), `spp` paths together.
+
+        Parameters
+        ----------
+        source : where rays come from; the query sensor by default
 
         Raises
         ------
@@ -96,7 +116,9 @@ class Estimator:
         n = len(queries.sigma)
         per_launch = max(1, self.launch // spp)
         parts = [
-            self._batch(queries, slice(start, min(start + per_launch, n)), spp, stream)
+            self._batch(
+                queries, slice(start, min(start + per_launch, n)), spp, stream, source or self._sensor
+            )
             for start in range(0, n, per_launch)
         ]
         return Estimates(
@@ -108,9 +130,9 @@ class Estimator:
             sum(p.nonfinite for p in parts),
         )
 
-    def _batch(self, queries: Queries, rows: slice, spp: int, stream: Stream) -> Estimates:
+    def _batch(self, queries: Queries, rows: slice, spp: int, stream: Stream, source: RaySource) -> Estimates:
         part = Queries(queries.u[rows], queries.sigma[rows], queries.omega_i[rows], queries.omega_o[rows])
-        self._sensor.set_queries(part)
+        source.set_queries(part, rows.start)
         count = len(part.sigma)
         omega_i = mi.Vector3f(part.omega_i.T.copy())
         if self.light is None:
@@ -118,16 +140,18 @@ class Estimator:
         else:
             inverse = mi.Float((1.0 / self.light.irradiance(part.omega_i)).astype(np.float32))
         lanes = dr.arange(mi.UInt32, count * spp)
-        radiance, lost, capped = self._trace(lanes, rows.start, spp, stream, omega_i, inverse, 0)
+
+        def trace_lanes(which: Any, attempt: int) -> tuple[Any, int, int]:
+            return self._trace(source, which, rows.start, spp, stream, omega_i, inverse, attempt)
+
+        radiance, lost, capped = trace_lanes(lanes, 0)
         bad = self._nonfinite(radiance)
         nonfinite = 0
         for attempt in range(1, MAX_RESAMPLES + 1):
             if not len(bad):
                 break
             nonfinite += len(bad)
-            again, more_lost, more_capped = self._trace(
-                mi.UInt32(bad), rows.start, spp, stream, omega_i, inverse, attempt
-            )
+            again, more_lost, more_capped = trace_lanes(mi.UInt32(bad), attempt)
             dr.scatter(radiance, again, mi.UInt32(bad))
             dr.eval(radiance)
             lost, capped = lost + more_lost, capped + more_capped
@@ -143,7 +167,12 @@ class Estimator:
         mean = dr.block_reduce(dr.ReduceOp.Add, radiance, half, mode="evaluated") * (1.0 / half)
         values = np.array(mean, np.float32).T.reshape(count, 2, 3)
         return Estimates(
-            np.ascontiguousarray(values[:, 0]), np.ascontiguousarray(values[:, 1]), count * spp, lost, capped, nonfinite
+            np.ascontiguousarray(values[:, 0]),
+            np.ascontiguousarray(values[:, 1]),
+            count * spp,
+            lost,
+            capped,
+            nonfinite,
         )
 
     def _nonfinite(self, radiance: Any) -> NDArray[np.uint32]:
@@ -153,13 +182,23 @@ class Estimator:
         return np.nonzero(~np.array(finite))[0].astype(np.uint32)
 
     def _trace(
-        self, lanes: Any, first: int, spp: int, stream: Stream, omega_i: Any, inverse: Any, attempt: int
+        self,
+        source: RaySource,
+        lanes: Any,
+        first: int,
+        spp: int,
+        stream: Stream,
+        omega_i: Any,
+        inverse: Any,
+        attempt: int,
     ) -> tuple[Any, int, int]:
-        """Radiance of the given lanes (query · spp + path), in their order; counts of lost and capped rays."""
+        """Radiance of the given lanes (query · spp + path), in their order; counts of lost and capped
+        rays."""
         half = spp // 2
 
         def generator(lane: Any, purpose: Purpose) -> Any:
-            # The path's number within its half of the shard; both halves use the same numbers in other streams.
+            # The path's number within its half of the shard; both halves use the same numbers in other
+            # streams.
             query = mi.UInt64(lane // spp) + dr.opaque(mi.UInt64, first)
             path = query * half + mi.UInt64(lane % half)
             a, b = (stream_number(stream.split, stream.shard, purpose, attempt, h) for h in (0, 1))
@@ -168,14 +207,15 @@ class Estimator:
 
         rng = generator(lanes, Purpose.FOOTPRINT)
         xi = mi.Point2f(rng.next_float32(), rng.next_float32())
-        point = self._sensor.footprint(lanes // spp, xi)
-        key = _spread_bits(mi.UInt32(point.x * 256.0)) | (_spread_bits(mi.UInt32(point.y * 256.0)) << 1)
+        point = source.footprint(lanes // spp, xi)
+        cell = mi.Vector2u((point - dr.floor(point)) * 256.0)
+        key = _spread_bits(cell.x) | (_spread_bits(cell.y) << 1)
         dr.eval(point, key)
         order = mi.UInt32(np.argsort(np.array(key).astype(np.uint16), kind="stable").astype(np.uint32))
 
         lane = dr.gather(mi.UInt32, lanes, order)
         query = lane // spp
-        ray = self._sensor.ray(query, dr.gather(mi.Point2f, point, order))
+        ray = source.ray(query, dr.gather(mi.Point2f, point, order))
         if self.light is None:
             light = LaneLight("constant")
         else:
@@ -186,7 +226,13 @@ class Estimator:
                 self._kappa,
             )
         traced, lost, capped = trace(
-            self.tile.scene, self.tile.period, ray, light, self.transport, generator(lane, Purpose.PATH), mi.Bool(True)
+            self.tile.scene,
+            self.tile.period,
+            ray,
+            light,
+            self.transport,
+            generator(lane, Purpose.PATH),
+            mi.Bool(True),
         )
         radiance = dr.zeros(mi.Color3f, dr.width(lanes))
         dr.scatter(radiance, traced, order)

@@ -1,7 +1,7 @@
 """Elementary functions from +, -, ×, ÷ and √ alone, all of which IEEE 754 rounds exactly.
 
-NumPy's sin, cos and exp differ in the last place between processors; queries must not. Relative error below 1e-14,
-far below the float32 in which queries are stored.
+NumPy's sin, cos and exp differ in the last place between processors; queries must not. Relative error below
+1e-14, far below the float32 in which queries are stored.
 """
 
 from __future__ import annotations
@@ -13,7 +13,17 @@ F64 = NDArray[np.float64]
 
 # Taylor coefficients of sin and cos about 0 in x², to be used on |x| ≤ π/4.
 _SIN = (1.0, -1 / 6, 1 / 120, -1 / 5040, 1 / 362880, -1 / 39916800, 1 / 6227020800, -1 / 1307674368000)
-_COS = (1.0, -1 / 2, 1 / 24, -1 / 720, 1 / 40320, -1 / 3628800, 1 / 479001600, -1 / 87178291200, 1 / 20922789888000)
+_COS = (
+    1.0,
+    -1 / 2,
+    1 / 24,
+    -1 / 720,
+    1 / 40320,
+    -1 / 3628800,
+    1 / 479001600,
+    -1 / 87178291200,
+    1 / 20922789888000,
+)
 # Taylor coefficients of exp about 0, to be used on |x| ≤ ln(2)/2.
 _EXP = tuple(1.0 / float(f) for f in np.cumprod([1.0, *range(1, 16)]))
 _LN2 = 0.6931471805599453

@@ -45,8 +45,8 @@ class HeightGrid:
 
 
 def grid_vertices(grid: HeightGrid, apron: tuple[int, int] = (0, 0)) -> NDArray[np.float64]:
-    """Vertices (rows, columns, 3) as (x, y, z) in tile widths, x = u, y = a·v, from the period's first vertex to
-    the first vertex of the next period, plus `apron` = (rows, columns) cells on each side."""
+    """Vertices (rows, columns, 3) as (x, y, z) in tile widths, x = u, y = a·v, from the period's first
+    vertex to the first vertex of the next period, plus `apron` = (rows, columns) cells on each side."""
     rows, columns = grid.z.shape
     j = np.arange(-apron[0], rows + 1 + apron[0])
     i = np.arange(-apron[1], columns + 1 + apron[1])
@@ -67,7 +67,8 @@ def grid_faces(rows: int, columns: int) -> NDArray[np.uint32]:
 
 
 def tile_mesh(grid: HeightGrid) -> Any:
-    """One period of the tile as a :class:`trimesh.Trimesh` with texture coordinates; lengths in tile widths."""
+    """One period of the tile as a :class:`trimesh.Trimesh` with texture coordinates; lengths in tile
+    widths."""
     import trimesh
 
     vertices = grid_vertices(grid)

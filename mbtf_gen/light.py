@@ -4,11 +4,11 @@ r"""The light kernel: a von Mises–Fisher lobe around ω_i, cut at the horizon,
     L(ω) = p(ω) [ω_z > 0] / E(ω_i),    E(ω_i) = ∫ p(ω) max(ω_z, 0) dω
 
 so that the irradiance on the reference plane is 1 at every elevation. The width of the lobe is its RMS angle
-per axis in degrees, ``δ² = E[θ²]/2`` with θ the angle to the axis; κ ≈ 1/δ² for narrow lobes. Width 0 is a delta
-light, ``E = ω_i,z``.
+per axis in degrees, ``δ² = E[θ²]/2`` with θ the angle to the axis; κ ≈ 1/δ² for narrow lobes. Width 0 is a
+delta light, ``E = ω_i,z``.
 
-``1 - ω·ω_i`` is always computed as ``|ω - ω_i|²/2``: in single precision the cosine of a 0.05° lobe has only a
-few hundred distinct values left.
+``1 - ω·ω_i`` is always computed as ``|ω - ω_i|²/2``: in single precision the cosine of a 0.05° lobe has only
+a few hundred distinct values left.
 """
 
 from __future__ import annotations
@@ -53,7 +53,10 @@ def concentration(width_deg: float) -> float:
 
     start = 1.0 / np.radians(width_deg) ** 2
     log_kappa = brentq(
-        lambda x: rms_angle_deg(float(np.exp(x))) - width_deg, np.log(start) - 1.0, np.log(start) + 1.0, xtol=1e-13
+        lambda x: rms_angle_deg(float(np.exp(x))) - width_deg,
+        np.log(start) - 1.0,
+        np.log(start) + 1.0,
+        xtol=1e-13,
     )
     return float(np.exp(log_kappa))
 
@@ -78,10 +81,16 @@ def lobe_irradiance(kappa: float, elevation: ArrayLike) -> NDArray[np.float64]:
         half = 0.5 * (high - low)
         # Squaring the abscissa towards the kink removes the root singularity that the mean has there.
         s = 0.5 * (x + 1.0)
-        t = low[..., None] + 2.0 * half[..., None] * s**2 if low is kink else high[..., None] - 2.0 * half[..., None] * s**2
+        t = (
+            low[..., None] + 2.0 * half[..., None] * s**2
+            if low is kink
+            else high[..., None] - 2.0 * half[..., None] * s**2
+        )
         jacobian = 4.0 * half[..., None] * s * 0.5
         density = _density(kappa, 2.0 * np.sin(0.5 * t) ** 2) * 2.0 * np.pi * np.sin(t)
-        inner = _mean_positive_part(np.cos(t) * np.sin(alpha[..., None]), np.sin(t) * np.cos(alpha[..., None]))
+        inner = _mean_positive_part(
+            np.cos(t) * np.sin(alpha[..., None]), np.sin(t) * np.cos(alpha[..., None])
+        )
         total += np.sum(w * jacobian * density * inner, axis=-1)
     return total.reshape(np.shape(elevation))
 
@@ -134,7 +143,8 @@ class LightKernel:
         return np.asarray(self._table(np.arctan2(w[..., 2], np.hypot(w[..., 0], w[..., 1]))))
 
     def density(self, omega: ArrayLike, omega_i: ArrayLike) -> NDArray[np.float64]:
-        """Lobe p(ω) in 1/sr for directions (..., 3), not cut at the horizon. Not defined for a delta light."""
+        """Lobe p(ω) in 1/sr for directions (..., 3), not cut at the horizon. Not defined for a delta
+        light."""
         difference = np.asarray(omega, np.float64) - np.asarray(omega_i, np.float64)
         return _density(self.kappa, 0.5 * np.sum(difference**2, axis=-1))
 

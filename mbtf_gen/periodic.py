@@ -1,8 +1,8 @@
 """Rays on an infinitely repeated tile: a ray that leaves the tile re-enters it on the other side.
 
-Coordinates are scene units, centred on the tile. A ray's origin is wrapped into the period; it is traced as far as
-the apron reaches; when it hit nothing there it goes on from that point, wrapped again. Successive pieces overlap by a
-small length, so that rounding cannot let a ray slip through between them.
+Coordinates are scene units, centred on the tile. A ray's origin is wrapped into the period; it is traced as
+far as the apron reaches; when it hit nothing there it goes on from that point, wrapped again. Successive
+pieces overlap by a small length, so that rounding cannot let a ray slip through between them.
 """
 
 from __future__ import annotations
@@ -45,7 +45,8 @@ def wrap(period: Period, p: Any) -> Any:
 
 
 def _side(position: Any, direction: Any, low: float, high: float) -> Any:
-    """Distance along a ray to the side of a slab that the ray moves towards; infinite when it moves along it."""
+    """Distance along a ray to the side of a slab that the ray moves towards; infinite when it moves along
+    it."""
     target = dr.select(direction > 0, high, low)
     return dr.select(direction == 0, dr.inf, (target - position) / direction)
 
@@ -53,22 +54,26 @@ def _side(position: Any, direction: Any, low: float, high: float) -> Any:
 def leave(period: Period, si: Any, d: Any) -> Any:
     """Ray that leaves a surface point in direction d.
 
-    The tile is centred on the origin, so hit points are exact to a few units in the last place and a far smaller
-    offset than the renderer's own is enough: it would lift rays by 5e-5 tile widths, through thin ridges and out of creases.
+    The tile is centred on the origin, so hit points are exact to a few units in the last place and a far
+    smaller offset than the renderer's own is enough: it would lift rays by 5e-5 tile widths, through thin
+    ridges and out of creases.
     """
     side = dr.select(dr.dot(si.n, d) < 0, -period.offset, period.offset)
     return mi.Ray3f(dr.fma(si.n, side, si.p), d)
 
 
 def piece_length(period: Period, o: Any, d: Any) -> tuple[Any, Any]:
-    """(distance to the end of the traced box sideways, distance to the top or bottom) of a ray with a wrapped origin."""
+    """(distance to the end of the traced box sideways, distance to the top or bottom) of a ray with a
+    wrapped origin."""
     tx = _side(o.x, d.x, period.low[0] - period.reach[0], period.low[0] + period.size[0] + period.reach[0])
     ty = _side(o.y, d.y, period.low[1] - period.reach[1], period.low[1] + period.size[1] + period.reach[1])
     return dr.minimum(tx, ty), dr.maximum(0.0, _side(o.z, d.z, period.bottom, period.top))
 
 
 @dr.syntax
-def closest_hit(scene: Any, period: Period, ray: Any, active: Any, max_crossings: int) -> tuple[Any, Any, Any]:
+def closest_hit(
+    scene: Any, period: Period, ray: Any, active: Any, max_crossings: int
+) -> tuple[Any, Any, Any]:
     """First hit along a ray over the repeated tile.
 
     Returns

@@ -1,8 +1,9 @@
 """Random 7D queries: position, footprint, light and view.
 
-Positions are stratified: pass after pass over the finest level's texels in a new random order, one query at a random point
-of each. Levels are stratified within a shard over the cumulative mixture. Directions are uniform on the projected disk,
-``r ≤ √(1 - cos²_min)``. All arithmetic is exactly rounded (see ``exact.py``), so queries are the same bits on every machine.
+Positions are stratified: pass after pass over the finest level's texels in a new random order, one query at
+a random point of each. Levels are stratified within a shard over the cumulative mixture. Directions are
+uniform on the projected disk, ``r ≤ √(1 - cos²_min)``. All arithmetic is exactly rounded (see ``exact.py``),
+so queries are the same bits on every machine.
 """
 
 from __future__ import annotations

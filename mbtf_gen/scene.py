@@ -1,7 +1,7 @@
 """The displaced tile as a Mitsuba scene: one mesh of one period plus an apron, centred on the origin.
 
-Scene units: the longer side of the tile is 32 units, where single precision resolves 2e-6 and hit points are exact enough
-for a ray offset of 1e-6 tile widths.
+Scene units: the longer side of the tile is 32 units, where single precision resolves 2e-6 and hit points are
+exact enough for a ray offset of 1e-6 tile widths.
 """
 
 from __future__ import annotations

@@ -30,8 +30,12 @@ class ArraySpec:
     unit: str
     meaning: str
     channels: tuple[str, ...]
-    dtype: np.dtype = np.dtype("<f4")
     optional: bool = False
+
+    @property
+    def dtype(self) -> np.dtype[np.float32]:
+        """Little-endian float32, all of them."""
+        return np.dtype("<f4")
 
 
 def _array(name: str, channels: str, unit: str, meaning: str, optional: bool = False) -> ArraySpec:
@@ -41,7 +45,9 @@ def _array(name: str, channels: str, unit: str, meaning: str, optional: bool = F
 
 
 ARRAYS: tuple[ArraySpec, ...] = (
-    _array("u", "x y", "uv", "query position on the reference plane, uv in [0,1)^2, v = 0 at the images' bottom"),
+    _array(
+        "u", "x y", "uv", "query position on the reference plane, uv in [0,1)^2, v = 0 at the images' bottom"
+    ),
     _array("sigma", "", "tile widths", "standard deviation of the isotropic Gaussian footprint"),
     _array("omega_i", "x y z", "unit vector", "direction from the surface towards the light, z > 0"),
     _array("omega_o", "x y z", "unit vector", "direction from the surface towards the viewer, z > 0"),
@@ -53,21 +59,21 @@ ARRAYS: tuple[ArraySpec, ...] = (
 ARRAY: dict[str, ArraySpec] = {a.name: a for a in ARRAYS}
 
 CONVENTIONS: dict[str, str] = {
-    "tile": "the material's period; uv in [0,1)^2; position on the reference plane x = (u, a*v), z its normal; "
-    "a = H/W is the aspect; lengths (sigma, heights) are in tile widths, isotropic in x",
+    "tile": "the material's period; uv in [0,1)^2; position on the reference plane x = (u, a*v), "
+    "z its normal; a = H/W is the aspect; lengths (sigma, heights) are in tile widths, isotropic in x",
     "image_rows": "row 0 of every map is the side v -> 1; texel centres at ((i+1/2)/W, 1-(j+1/2)/H)",
     "heights": "z = height * (h - max h): the highest point touches the reference plane z = 0",
     "directions": "omega_i from the surface towards the light, omega_o from the surface towards the viewer, "
     "unit vectors in the tile's frame, z > 0",
-    "light": "von Mises-Fisher lobe p around omega_i, cut at the horizon and normalised so that the irradiance "
-    "on the reference plane is exactly 1; its width is the RMS angle per axis in degrees, 0 a delta light",
-    "value": "M(u, sigma, omega_i, omega_o) in 1/sr: radiance leaving towards omega_o under that light, averaged over "
-    "a Gaussian footprint on the reference plane, wrapped on the torus; no cosine, no clamp, no log; "
+    "light": "von Mises-Fisher lobe p around omega_i, cut at the horizon and normalised so that the "
+    "irradiance on the reference plane is exactly 1; its width is the RMS angle per axis in degrees, 0 a delta light",
+    "value": "M(u, sigma, omega_i, omega_o) in 1/sr: radiance leaving towards omega_o under that light, "
+    "averaged over a Gaussian footprint on the reference plane, wrapped on the torus; no cosine, no clamp, no log; "
     "a Lambert plane gives albedo/pi",
     "sigma": "standard deviation of the footprint in tile widths; level l = -log2(2 sigma)",
     "levels": "level s has 2^s x max(1, round(a 2^s)) texels and sigma_s = 2^-s / 2; data lie in l in [0, k]",
-    "halves": "value_a and value_b are independent estimates from spp/2 paths each; the value is their mean and "
-    "(a-b)^2/4 an unbiased estimate of the variance of that mean",
+    "halves": "value_a and value_b are independent estimates from spp/2 paths each; the value is their mean "
+    "and (a-b)^2/4 an unbiased estimate of the variance of that mean",
     "colour": "linear, Rec.709 primaries, RGB order",
     "holes": "a ray that passes through a hole sees black; value is premultiplied",
 }

@@ -1,8 +1,9 @@
 """Random streams, an injective function of (root seed, split, shard, purpose, pass, half).
 
-Queries are drawn with NumPy's Philox, a counter-based generator whose key holds all of these numbers unhashed. Paths are
-drawn inside kernels with PCG32 (O'Neill 2014), one stream per path: the stream's number holds the same fields, its start
-the root seed and the path's number, so that no value depends on how paths are grouped into launches.
+Queries are drawn with NumPy's Philox, a counter-based generator whose key holds all of these numbers
+unhashed. Paths are drawn inside kernels with PCG32 (O'Neill 2014), one stream per path: the stream's number
+holds the same fields, its start the root seed and the path's number, so that no value depends on how paths
+are grouped into launches.
 """
 
 from __future__ import annotations
@@ -12,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from .schema import SPLITS
-
 MAX_SHARDS = 1 << 28
+# Data splits and reference pictures draw from streams of their own.
+_SPLIT_NUMBER: dict[str, int] = {"train": 0, "test": 1, "reference": 2}
 
 
 class Purpose(IntEnum):
@@ -33,7 +34,7 @@ def stream_number(split: str, shard: int, purpose: Purpose, pass_index: int = 0,
         raise ValueError(f"shard number must lie in 0..{MAX_SHARDS - 1}, not {shard}")
     if not 0 <= pass_index < 1 << 12 or half not in (0, 1):
         raise ValueError(f"pass {pass_index}, half {half} out of range")
-    number = SPLITS.index(split)  # type: ignore[arg-type]
+    number = _SPLIT_NUMBER[split]
     for value, bits in ((half, 1), (int(purpose), 4), (pass_index, 12), (shard, 28)):
         number = (number << bits) | value
     return number

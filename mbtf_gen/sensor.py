@@ -1,9 +1,10 @@
 """The query sensor: a Mitsuba sensor whose "pixels" are 7D queries.
 
-Every sample is one ray through a point of the query's Gaussian footprint on the reference plane, against its view
-direction. The generator's own loop asks it for rays by query number; stock ``mi.render`` drives it through
-``sample_ray``: the n-th pixel of its film (in row order) is the n-th query, with the sampler's count of rays each.
-The ray's time carries the query's number, so that the light of a query can follow its rays through stock integrators.
+Every sample is one ray through a point of the query's Gaussian footprint on the reference plane, against its
+view direction. The generator's own loop asks it for rays by query number; stock ``mi.render`` drives it
+through ``sample_ray``: the n-th pixel of its film (in row order) is the n-th query, with the sampler's count
+of rays each. The ray's time carries the query's number, so that the light of a query can follow its rays
+through stock integrators.
 """
 
 from __future__ import annotations
@@ -19,11 +20,23 @@ from .queries import Queries
 MAX_STOCK_QUERIES = 1 << 24
 
 
-class QuerySensor(mi.Sensor):  # type: ignore[misc]
+def ray_through(point: Any, omega_o: Any, unit: float, aspect: float, start: float) -> Any:
+    """Ray against ω_o that passes the reference plane exactly at uv `point`, wrapped into the tile.
+
+    Parameters
+    ----------
+    unit : scene units per tile width; aspect : H/W; start : height in scene units at which the ray begins
+    """
+    wrapped = point - dr.floor(point)
+    plane = mi.Point3f((wrapped.x - 0.5) * unit, (wrapped.y - 0.5) * (unit * aspect), 0.0)
+    return mi.Ray3f(dr.fma(omega_o, start / omega_o.z, plane), -omega_o)
+
+
+class QuerySensor(mi.Sensor):
     """``mbtf_queries``: rays of a batch of queries.
 
-    Plugin parameters: ``unit`` (scene units per tile width), ``aspect`` (H/W of the tile), ``start`` (height above the
-    reference plane, in scene units, at which rays begin), a film and a sampler.
+    Plugin parameters: ``unit`` (scene units per tile width), ``aspect`` (H/W of the tile), ``start`` (height
+    above the reference plane, in scene units, at which rays begin), a film and a sampler.
     """
 
     def __init__(self, props: Any) -> None:
@@ -35,28 +48,24 @@ class QuerySensor(mi.Sensor):  # type: ignore[misc]
         self.sigma = mi.Float(0.0)
         self.omega_o = mi.Vector3f(0, 0, 1)
 
-    def set_queries(self, queries: Queries) -> None:
-        """Take a batch of queries (one leading axis)."""
+    def set_queries(self, queries: Queries, first: int = 0) -> None:
+        """Take a batch of queries (one leading axis); `first` is the number of its first query, unused
+        here."""
         self.u = mi.Point2f(queries.u.T.copy())
         self.sigma = mi.Float(queries.sigma)
         self.omega_o = mi.Vector3f(queries.omega_o.T.copy())
 
     def footprint(self, query: Any, xi: Any) -> Any:
-        """uv, in [0,1)², of a point of the footprint of the given queries; `xi` in [0,1)²."""
+        """uv of a point of the footprint of the given queries, not wrapped; `xi` in [0,1)²."""
         u = dr.gather(mi.Point2f, self.u, query)
         spread = dr.gather(mi.Float, self.sigma, query)
         offset = mi.warp.square_to_std_normal(xi) * spread
-        point = u + mi.Vector2f(offset.x, offset.y / self.aspect)
-        return mi.Point2f(point - dr.floor(point))
+        return mi.Point2f(u + mi.Vector2f(offset.x, offset.y / self.aspect))
 
     def ray(self, query: Any, point: Any) -> Any:
-        """Ray through uv `point` of the reference plane against the view direction of the given queries.
-
-        It starts above the plane, back along the view direction, so that it passes the plane exactly at the point.
-        """
+        """Ray through uv `point` of the reference plane against the view direction of the given queries."""
         omega_o = dr.gather(mi.Vector3f, self.omega_o, query)
-        plane = mi.Point3f((point.x - 0.5) * self.unit, (point.y - 0.5) * (self.unit * self.aspect), 0.0)
-        return mi.Ray3f(dr.fma(omega_o, self.start / omega_o.z, plane), -omega_o)
+        return ray_through(point, omega_o, self.unit, self.aspect, self.start)
 
     def sample_ray(
         self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True

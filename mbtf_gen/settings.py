@@ -94,7 +94,8 @@ def _known_keys(model: type[BaseModel], location: Sequence[str | int]) -> list[s
     for part in location[:-1]:
         if isinstance(part, int):
             continue
-        deeper = [m for mm in models if part in mm.model_fields for m in _model_in(mm.model_fields[part].annotation)]
+        fields = [m.model_fields[part] for m in models if part in m.model_fields]
+        deeper = [m for f in fields for m in _model_in(f.annotation)]
         models = deeper or models
     return sorted({key for m in models for key in m.model_fields})
 
@@ -117,7 +118,7 @@ def _line_of(data: Any, location: Sequence[str | int]) -> int | None:
 def _explain(error: ValidationError, model: type[BaseModel], data: Any, source: str) -> tuple[str, str, str]:
     """(where, what, cure) of the first fault that pydantic found."""
     fault = error.errors()[0]
-    location = [p for p in fault["loc"]]
+    location = list(fault["loc"])
     dotted = ".".join(str(p) for p in location) or "(top level)"
     line = _line_of(data, location)
     where = f"{source}:{line}" if line is not None else source
@@ -135,9 +136,7 @@ def _explain(error: ValidationError, model: type[BaseModel], data: Any, source: 
     return where, f"'{dotted}': {message}{shown}", ""
 
 
-def build(
-    model: type[S], data: Mapping[str, Any], *, source: str, error: type[MbtfError] = InputError
-) -> S:
+def build(model: type[S], data: Mapping[str, Any], *, source: str, error: type[MbtfError] = InputError) -> S:
     """Check `data` against `model`.
 
     Parameters

@@ -86,7 +86,7 @@ def read_npz(path: Path, names: Iterable[str] | None = None, *, mapped: bool = T
     try:
         with zipfile.ZipFile(path) as archive, path.open("rb") as stream:
             members = {i.filename.removesuffix(".npy"): i for i in archive.infolist()}
-            wanted = list(members) if names is None else [n for n in names]
+            wanted = list(members) if names is None else list(names)
             for name in wanted:
                 if name not in members:
                     raise InputError(f"shard lacks the array '{name}'", where=path)
@@ -102,6 +102,7 @@ def read_npz(path: Path, names: Iterable[str] | None = None, *, mapped: bool = T
                 shape, fortran, dtype = reader[version](stream)
                 if fortran or dtype != np.dtype("<f4"):
                     raise InputError(f"array '{name}' is not C-ordered float32", where=path)
+                array: NDArray[np.float32]
                 if mapped and 0 not in shape:
                     array = np.memmap(path, dtype, mode="r", offset=stream.tell(), shape=shape)
                 else:

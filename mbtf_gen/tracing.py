@@ -1,8 +1,9 @@
 """The path tracer: radiance leaving the displaced tile along given rays, one light per ray.
 
-Next-event estimation on the light and BSDF sampling, combined by the balance heuristic (Veach 1997); Russian roulette
-ends paths without bias. Light directions are drawn from the lobe and, where they fall below the horizon, reflected up at it:
-their density ``q(ω) = p(ω) + p(ω mirrored)`` is exact, positive where ``L`` is, and no sample is lost below the horizon.
+Next-event estimation on the light and BSDF sampling, combined by the balance heuristic (Veach 1997); Russian
+roulette ends paths without bias. Light directions are drawn from the lobe and, where they fall below the
+horizon, reflected up at it: their density ``q(ω) = p(ω) + p(ω mirrored)`` is exact, positive where ``L`` is,
+and no sample is lost below the horizon.
 """
 
 from __future__ import annotations
@@ -105,7 +106,8 @@ def trace(
     capped = mi.UInt32(0)
     lost = mi.Bool(False)
     active = mi.Bool(active)
-    # Density with which the last bounce chose its direction; infinite makes the balance heuristic give it all.
+    # Density with which the last bounce chose its direction; infinite makes the balance heuristic give it
+    # all.
     bounce_pdf = mi.Float(dr.inf)
     context = mi.BSDFContext()
     while dr.hint(active, exclude=[scene, period, light, transport, context]):
@@ -114,7 +116,9 @@ def trace(
         escaped = active & ~si.is_valid() & ~cap
         lost |= escaped & (ray.d.z <= 0)
         sky = light.radiance(ray.d)
-        share = dr.select(dr.isinf(bounce_pdf), 1.0, bounce_pdf / (bounce_pdf + light.sampling_density(ray.d)))
+        share = dr.select(
+            dr.isinf(bounce_pdf), 1.0, bounce_pdf / (bounce_pdf + light.sampling_density(ray.d))
+        )
         radiance[escaped & (depth > 0) & (ray.d.z > 0)] += throughput * sky * share
 
         active &= si.is_valid()
@@ -136,7 +140,9 @@ def trace(
                 context, si, wo, rng.next_float32(), _next_2d(rng), active
             )
             connect = active & (dr.max(value) > 0)
-            blocked, _, cap = occluded(scene, period, leave(period, si, omega), connect, transport.max_crossings)
+            blocked, _, cap = occluded(
+                scene, period, leave(period, si, omega), connect, transport.max_crossings
+            )
             capped[cap] += 1
             if dr.hint(light.kind == "delta", mode="scalar"):
                 share = mi.Float(1.0)

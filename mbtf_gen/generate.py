@@ -1,0 +1,355 @@
+"""Makes a data set: material and configuration in, folder of shards out. Resumes where it stopped."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .atomic import digest, read_json, write_json, write_text
+from .config import GeneratorConfig, count_queries, differences
+from .effects import simulated_effects
+from .errors import InputError, PartialError, UsageError
+from .levels import Lattice
+from .locks import shard_lock
+from .manifest import ShardEntry, build_manifest, software_versions
+from .material import Material, load_material
+from .queries import Mixture, QueryPlan
+from .schema import CONFIG_NAME, FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, SPLITS, Split
+from .settings import dump_yaml
+from .shard_files import shard_suffix, write_shard
+from .verify import is_finished, sidecar_of
+
+log = logging.getLogger(__name__)
+
+ProgressCallback = Callable[[float, str], None]
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What a run made.
+
+    Attributes
+    ----------
+    seconds : of this run; paths, queries : traced in this run
+    relative_error : pooled relative standard error of the stored training values, √(mean variance) / mean
+        value
+    mean_value : mean training value per channel, 1/sr
+    lost, capped, nonfinite : rays lost or capped, samples drawn again, over all shards
+    """
+
+    folder: str
+    complete: bool
+    queries: int
+    paths: int
+    seconds: float
+    paths_per_second: float
+    relative_error: float
+    mean_value: list[float]
+    lost: int
+    capped: int
+    nonfinite: int
+    effects: list[str]
+
+
+@dataclass(frozen=True)
+class Job:
+    """A configuration with its material loaded: everything that decides the data."""
+
+    config: GeneratorConfig
+    material: Material
+    lattice: Lattice
+    config_hash: str
+
+    @classmethod
+    def prepare(cls, config: GeneratorConfig) -> Job:
+        """Load the material and resolve what depends on it.
+
+        Raises
+        ------
+        InputError : the material cannot be used
+        """
+        material = load_material(Path(config.material))
+        for warning in material.warnings:
+            log.warning(warning)
+        rows, columns = material.height.shape
+        lattice = Lattice.for_map(rows, columns, config.queries.levels)
+        return cls(config, material, lattice, config.hash(material.digests))
+
+    def plan(self) -> QueryPlan:
+        """How queries are drawn."""
+        queries = self.config.queries
+        try:
+            mixture = Mixture(queries.mixture.log_uniform, queries.mixture.finest)
+        except ValueError as error:
+            raise UsageError(str(error), where="queries.mixture") from None
+        return QueryPlan(
+            self.lattice, mixture, queries.min_cos, queries.layout, self.config.seed, self._shard_rows()
+        )
+
+    def _shard_rows(self) -> int:
+        per_shard = self.config.output.shard_queries
+        if self.config.queries.layout == "image":
+            return max(1, per_shard // self.lattice.texels())
+        return per_shard
+
+    def spp(self, split: Split) -> int:
+        """Paths per query of a split, both halves together."""
+        return self.config.queries.spp if split == "train" else self.config.queries.test_spp
+
+    def shards(self, split: Split) -> list[ShardEntry]:
+        """Shards of a split and their rows."""
+        wanted = self.config.queries.train if split == "train" else self.config.queries.test
+        rows = count_queries(wanted, self.lattice.texels())
+        if self.config.queries.layout == "image":
+            rows = max(1, math.ceil(rows / self.lattice.texels()))
+        size = self._shard_rows()
+        suffix = shard_suffix(self.config.output.format)
+        return [
+            ShardEntry(split, index, f"{split}-{index:05d}{suffix}", min(size, rows - index * size))
+            for index in range(math.ceil(rows / size))
+        ]
+
+
+def build_estimator(config: GeneratorConfig, material: Material) -> Any:
+    """Estimator of a material under a configuration; loads Mitsuba."""
+    from .engine import load_mitsuba
+
+    load_mitsuba()
+    from .bsdf import bsdf_of
+    from .estimator import Estimator
+    from .light import LightKernel
+    from .scene import build_tile
+    from .tracing import Transport
+
+    try:
+        light = LightKernel(config.light.width)
+    except ValueError as error:
+        raise UsageError(str(error), where="light.width") from None
+    tile = build_tile(material.grid(config.geometry.height, config.geometry.mesh), bsdf_of(material))
+    transport = Transport(
+        config.transport.max_depth, config.transport.roulette_depth, config.transport.max_crossings
+    )
+    return Estimator(tile, light, transport)
+
+
+def _open_folder(job: Job, folder: Path, manifest: dict[str, Any], overwrite: bool) -> None:
+    """Claim the output folder: new, empty, resumed, or replaced.
+
+    Raises
+    ------
+    InputError : it holds something else
+    """
+    if folder.exists() and not folder.is_dir():
+        raise InputError("is a file, not a folder", where=folder)
+    existing = folder / MANIFEST_NAME
+    if overwrite and existing.exists():
+        for path in folder.iterdir():
+            if path.name in (MANIFEST_NAME, CONFIG_NAME) or path.name.startswith(("train-", "test-", ".")):
+                path.unlink()
+    if folder.exists() and any(folder.iterdir()):
+        if not existing.exists():
+            raise InputError(
+                "is not empty and holds no data set", where=folder, cure="choose another folder with -o"
+            )
+        old = read_json(existing)
+        if old.get("config_hash") != job.config_hash:
+            before = {**old.get("config", {}), "inputs": old.get("inputs", {}), "schema": old.get("schema")}
+            after = {**manifest["config"], "inputs": manifest["inputs"], "schema": SCHEMA_VERSION}
+            changes = "; ".join(differences(before, after)[:8]) or "inputs differ"
+            raise InputError(
+                f"holds a data set of another configuration: {changes}",
+                where=folder,
+                cure="choose another folder with -o, or replace it with --overwrite",
+            )
+        return
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot be made ({error.strerror})", where=folder) from None
+    write_text(folder / CONFIG_NAME, dump_yaml(manifest["config"]))
+    write_json(folder / MANIFEST_NAME, manifest)
+
+
+def _sidecar(job: Job, entry: ShardEntry, path: Path, estimates: Any, seconds: float) -> dict[str, Any]:
+    a = estimates.value_a.astype(np.float64)
+    b = estimates.value_b.astype(np.float64)
+    return {
+        "format": FORMAT_NAME,
+        "schema": SCHEMA_VERSION,
+        "config_hash": job.config_hash,
+        "file": path.name,
+        "split": entry.split,
+        "index": entry.index,
+        "rows": entry.rows,
+        "bytes": path.stat().st_size,
+        "sha256": digest(path),
+        "seed": {"root": job.config.seed, "split": entry.split, "shard": entry.index},
+        "spp": job.spp(entry.split),
+        "queries": len(a),
+        "paths": estimates.paths,
+        "seconds": round(seconds, 4),
+        "quarantined": {
+            "nonfinite_samples": estimates.nonfinite,
+            "lost_rays": estimates.lost,
+            "capped_rays": estimates.capped,
+        },
+        "statistics": {
+            "mean_value": (0.5 * (a + b)).mean(axis=0).tolist(),
+            "mean_variance": (0.25 * (a - b) ** 2).mean(axis=0).tolist(),
+        },
+    }
+
+
+def _make_shard(job: Job, plan: QueryPlan, estimator: Any, entry: ShardEntry, path: Path) -> dict[str, Any]:
+    from .estimator import Stream
+
+    start = time.perf_counter()
+    queries = plan.draw(entry.split, entry.index, entry.rows)
+    flat = queries.flat()
+    spp = job.spp(entry.split)
+    estimates = estimator.estimate(flat, spp, Stream(job.config.seed, entry.split, entry.index))
+    lead = queries.lead
+    write_shard(
+        path,
+        {
+            "u": queries.u,
+            "sigma": queries.sigma,
+            "omega_i": queries.omega_i,
+            "omega_o": queries.omega_o,
+            "value_a": estimates.value_a.reshape(*lead, 3),
+            "value_b": estimates.value_b.reshape(*lead, 3),
+            "spp": np.full(lead, spp, np.float32),
+        },
+    )
+    record = _sidecar(job, entry, path, estimates, time.perf_counter() - start)
+    write_json(sidecar_of(path), record)
+    return record
+
+
+def generate(
+    config: GeneratorConfig,
+    folder: str | Path,
+    *,
+    overwrite: bool = False,
+    slice_index: int = 1,
+    slice_count: int = 1,
+    progress: ProgressCallback | None = None,
+    job: Job | None = None,
+) -> Summary:
+    """Make (or finish) a data set.
+
+    Parameters
+    ----------
+    folder : output; an unfinished data set of the same configuration there is resumed
+    overwrite : replace a data set of another configuration
+    slice_index, slice_count : make only shards i with ``i % slice_count == slice_index - 1``
+    progress : called with (queries done so far, note)
+    job : the configuration with its material loaded, where the caller has it already
+
+    Raises
+    ------
+    InputError : material or folder cannot be used
+    PartialError : shards are left to others, or the disk is full; the same command resumes
+    """
+    folder = Path(folder)
+    start = time.perf_counter()
+    job = job or Job.prepare(config)
+    plan = job.plan()
+    entries = [e for split in SPLITS for e in job.shards(split)]
+    effects = simulated_effects(job.material, config)
+    manifest = build_manifest(job, entries, effects)
+    _open_folder(job, folder, manifest, overwrite)
+    mine = [e for k, e in enumerate(entries) if k % slice_count == slice_index - 1]
+    per_row = job.lattice.texels() if config.queries.layout == "image" else 1
+    done, paths, busy = 0, 0, []
+    estimator: Any = None
+    for entry in mine:
+        path = folder / entry.file
+        if not is_finished(path, entry.rows, job.config_hash):
+            with shard_lock(path) as held:
+                if not held:
+                    busy.append(entry.file)
+                elif not is_finished(path, entry.rows, job.config_hash):
+                    if estimator is None:
+                        estimator = build_estimator(config, job.material)
+                    paths += _make_shard(job, plan, estimator, entry, path)["paths"]
+        done += entry.rows * per_row
+        if progress is not None:
+            progress(done, f"{paths / max(time.perf_counter() - start, 1e-9) / 1e6:.2f} M paths/s")
+    if busy:
+        raise PartialError(
+            f"{len(busy)} shard(s) are being written by another process, first {busy[0]}",
+            where=folder,
+            cure="wait for it, then run the same command again",
+        )
+    return finish(folder, paths=paths, seconds=time.perf_counter() - start)
+
+
+def finish(folder: str | Path, *, paths: int = 0, seconds: float = 0.0) -> Summary:
+    """Complete the manifest when every shard is there, and summarise (``mbtf-gen merge``).
+
+    Raises
+    ------
+    InputError : no data set there
+    """
+    folder = Path(folder)
+    manifest = read_json(folder / MANIFEST_NAME)
+    records: dict[str, list[dict[str, Any]]] = {}
+    complete = True
+    for split, content in manifest["splits"].items():
+        for entry in content["shards"]:
+            if is_finished(folder / entry["file"], entry["rows"], manifest["config_hash"]):
+                records.setdefault(split, []).append(read_json(sidecar_of(folder / entry["file"])))
+            else:
+                complete = False
+    flat = [r for rs in records.values() for r in rs]
+    train = records.get("train", [])
+    weights = np.array([r["queries"] for r in train], np.float64)
+    if len(train):
+        mean = np.average([r["statistics"]["mean_value"] for r in train], axis=0, weights=weights)
+        variance = np.average([r["statistics"]["mean_variance"] for r in train], axis=0, weights=weights)
+        relative = float(np.sqrt(variance.mean()) / mean.mean()) if mean.mean() > 0 else 0.0
+    else:
+        mean, relative = np.zeros(3), 0.0
+    counts = {
+        k: sum(r["quarantined"][k] for r in flat) for k in ("nonfinite_samples", "lost_rays", "capped_rays")
+    }
+    summary = Summary(
+        folder=str(folder),
+        complete=complete,
+        queries=sum(r["queries"] for r in flat),
+        paths=paths,
+        seconds=round(seconds, 3),
+        paths_per_second=round(paths / seconds, 1) if seconds > 0 else 0.0,
+        relative_error=relative,
+        mean_value=[float(m) for m in mean],
+        lost=counts["lost_rays"],
+        capped=counts["capped_rays"],
+        nonfinite=counts["nonfinite_samples"],
+        effects=[e["effect"] for e in manifest["effects"] if e["on"]],
+    )
+    if complete and not manifest["complete"]:
+        manifest["complete"] = True
+        manifest["software"] = software_versions()
+        manifest["summary"] = {
+            "queries": summary.queries,
+            "paths": sum(r["paths"] for r in flat),
+            "shard_seconds": round(sum(r["seconds"] for r in flat), 3),
+            "relative_error": summary.relative_error,
+            "mean_value": summary.mean_value,
+            **counts,
+        }
+        write_json(folder / MANIFEST_NAME, manifest)
+    return summary
+
+
+def summary_dict(summary: Summary) -> dict[str, Any]:
+    """Summary as plain data for ``--json``."""
+    return asdict(summary)

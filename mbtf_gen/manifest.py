@@ -1,0 +1,85 @@
+"""The manifest of a data set: what it holds, how it was made, what the numbers mean."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from .levels import sigma_of_level
+from .schema import ARRAYS, CONVENTIONS, FORMAT_NAME, SCHEMA_VERSION, SPLITS, Split
+
+if TYPE_CHECKING:
+    from .generate import Job
+
+
+@dataclass(frozen=True)
+class ShardEntry:
+    """A shard to make: split, number within the split, file name, rows (queries or buffers)."""
+
+    split: Split
+    index: int
+    file: str
+    rows: int
+
+
+def software_versions() -> dict[str, str]:
+    """Versions of what the numbers depend on."""
+    import platform
+    from importlib.metadata import PackageNotFoundError, version
+
+    out = {"python": platform.python_version(), "machine": platform.machine()}
+    for name in ("mbtf", "mitsuba", "drjit", "numpy", "trimesh"):
+        try:
+            out[name] = version(name)
+        except PackageNotFoundError:
+            out[name] = "not installed"
+    return out
+
+
+def build_manifest(job: Job, entries: list[ShardEntry], effects: list[dict[str, Any]]) -> dict[str, Any]:
+    """Manifest of a data set that is about to be made (``complete`` is false)."""
+    config, material, lattice = job.config, job.material, job.lattice
+    grid = material.grid(config.geometry.height, config.geometry.mesh)
+    plan = job.plan()
+    rows, columns = lattice.shape()
+    lead = ["n"] if plan.layout == "shuffled" else ["items", "rows", "columns"]
+    return {
+        "format": FORMAT_NAME,
+        "schema": SCHEMA_VERSION,
+        "complete": False,
+        "config_hash": job.config_hash,
+        "config": config.model_dump(mode="json"),
+        "inputs": dict(sorted(material.digests.items())),
+        "conventions": CONVENTIONS,
+        "tile": {
+            "aspect": lattice.aspect,
+            "maps_shape": list(material.height.shape),
+            "mesh_shape": list(grid.z.shape),
+            "relief": grid.relief,
+        },
+        "levels": {
+            "finest": lattice.finest,
+            "shape": [rows, columns],
+            "sigma_finest": float(sigma_of_level(lattice.finest)),
+            "mixture": {"log_uniform": plan.mixture.log_uniform, "finest": plan.mixture.finest},
+        },
+        "layout": plan.layout,
+        "array_format": config.output.format,
+        "arrays": {
+            a.name: {"shape": [*lead, *a.trailing], "unit": a.unit, "meaning": a.meaning}
+            for a in ARRAYS
+            if not a.optional
+        },
+        "effects": effects,
+        "splits": {
+            split: {
+                "queries": sum(e.rows for e in entries if e.split == split)
+                * (lattice.texels() if plan.layout == "image" else 1),
+                "spp": job.spp(split),
+                "shards": [{"file": e.file, "rows": e.rows} for e in entries if e.split == split],
+            }
+            for split in SPLITS
+        },
+        "software": software_versions(),
+        "summary": None,
+    }

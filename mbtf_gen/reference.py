@@ -1,0 +1,150 @@
+"""Reference pictures: path-traced from the real micro-geometry, with both halves kept.
+
+A picture is stored as an EXR image with the channels of the shard schema (``u.x``, ``omega_o.z``,
+``value_a.R``, …), so that a fitted material can be evaluated at exactly its queries, and as a PNG for the
+eye.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .camera import PIXEL_SIGMA, Camera, PixelKind
+from .queries import Queries
+from .shard_files import write_exr
+
+if TYPE_CHECKING:
+    from .estimator import Estimator
+
+
+@dataclass(frozen=True)
+class ReferenceImage:
+    """A rendered picture.
+
+    Attributes
+    ----------
+    kind : ``query`` or ``pixel``
+    queries : one per pixel, leading axes (rows, columns)
+    value_a, value_b : (rows, columns, 3) independent halves, 1/sr
+    spp : paths per pixel, both halves together
+    """
+
+    kind: PixelKind
+    camera: Camera
+    queries: Queries
+    value_a: NDArray[np.float32]
+    value_b: NDArray[np.float32]
+    spp: int
+
+    @property
+    def value(self) -> NDArray[np.float32]:
+        """Mean of the halves, (rows, columns, 3)."""
+        return 0.5 * (self.value_a + self.value_b)
+
+    def write(self, path: Path, exposure: float | None = None) -> None:
+        """Write ``path.exr`` (all channels) and ``path.png`` (sRGB)."""
+        lead = (1, *self.queries.lead)
+        arrays = {
+            "u": self.queries.u.reshape(*lead, 2),
+            "sigma": self.queries.sigma.reshape(lead),
+            "omega_i": self.queries.omega_i.reshape(*lead, 3),
+            "omega_o": self.queries.omega_o.reshape(*lead, 3),
+            "value_a": self.value_a.reshape(*lead, 3),
+            "value_b": self.value_b.reshape(*lead, 3),
+            "spp": np.full(lead, self.spp, np.float32),
+        }
+        write_exr(path.with_suffix(".exr"), arrays)
+        from PIL import Image
+
+        Image.fromarray(to_display(self.value, exposure)).save(path.with_suffix(".png"))
+
+
+def auto_exposure(value: NDArray[np.float32]) -> float:
+    """Factor that brings the 95th percentile of the mean channel to 0.8; 1 for a black picture."""
+    bright = float(np.percentile(np.asarray(value).mean(axis=-1), 95))
+    return 0.8 / bright if bright > 0 else 1.0
+
+
+def to_display(value: NDArray[np.float32], exposure: float | None = None) -> NDArray[np.uint8]:
+    """8-bit sRGB of linear values (..., 3) times an exposure factor (by default :func:`auto_exposure`)."""
+    linear = np.clip(
+        np.asarray(value, np.float64) * (auto_exposure(value) if exposure is None else exposure), 0, 1
+    )
+    coded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    return np.round(255.0 * coded).astype(np.uint8)
+
+
+def _camera_rays(camera: Camera, estimator: Estimator) -> Any:
+    """Ray source whose n-th query is the camera's n-th pixel under its Gaussian filter."""
+    import drjit as dr
+    import mitsuba as mi
+
+    from .scene import CLEARANCE
+    from .sensor import ray_through
+
+    tile = estimator.tile
+    forward, right, up = camera.frame()
+    position = mi.Point3f([float(c) for c in camera.position])
+
+    class CameraRays:
+        def set_queries(self, queries: Queries, first: int = 0) -> None:
+            self.first = dr.opaque(mi.UInt32, first)
+
+        def footprint(self, query: Any, xi: Any) -> Any:
+            pixel = query + self.first
+            jitter = mi.warp.square_to_std_normal(xi) * PIXEL_SIGMA
+            x = (
+                mi.Float(pixel % camera.columns) + (0.5 - camera.columns / 2) + jitter.x
+            ) * camera.pixel_pitch
+            y = ((camera.rows / 2 - 0.5) - mi.Float(pixel // camera.columns) + jitter.y) * camera.pixel_pitch
+            d = mi.Vector3f(forward) + mi.Vector3f(right) * x + mi.Vector3f(up) * y
+            # A jitter of many pixels could reach the horizon; such rays have no weight worth speaking of.
+            t = position.z / dr.maximum(-d.z, 1e-4)
+            return mi.Point2f(position.x + t * d.x, (position.y + t * d.y) / tile.aspect)
+
+        def ray(self, query: Any, point: Any) -> Any:
+            towards = mi.Vector3f(position.x - point.x, position.y - point.y * tile.aspect, position.z)
+            return ray_through(point, dr.normalize(towards), tile.unit, tile.aspect, CLEARANCE)
+
+    return CameraRays()
+
+
+def render_reference(
+    estimator: Estimator,
+    camera: Camera,
+    omega_i: NDArray[np.float64],
+    *,
+    kind: PixelKind = "query",
+    spp: int = 256,
+    seed: int = 0,
+    index: int = 0,
+) -> ReferenceImage:
+    """Render one picture.
+
+    Parameters
+    ----------
+    estimator : of the tile, its light kernel and transport
+    omega_i : (3,) direction towards the light
+    kind : what a pixel means
+    spp : paths per pixel, both halves together
+    seed, index : random numbers: root seed and number of the picture
+
+    Raises
+    ------
+    UsageError : the picture shows the horizon
+    """
+    from .estimator import Stream
+
+    queries = camera.queries(omega_i, estimator.tile.aspect)
+    source = _camera_rays(camera, estimator) if kind == "pixel" else None
+    stream = Stream(seed, "reference", 2 * index + (kind == "pixel"))
+    estimates = estimator.estimate(queries.flat(), spp, stream, source)
+    shape = (*queries.lead, 3)
+    return ReferenceImage(
+        kind, camera, queries, estimates.value_a.reshape(shape), estimates.value_b.reshape(shape), spp
+    )
