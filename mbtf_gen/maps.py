@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 
 Enlargement = Literal["linear", "cubic"]
 
-# Scales, in texels, on which the steps of quantised heights are smoothed, coarse to fine, and how often.
-_SMOOTHING = (32.0, 16.0, 8.0, 4.0, 2.0, 1.0)
-_SWEEPS = 8
+# Scales, in texels, that the steps of quantised heights are smoothed on, fine to coarse.
+_SCALES = tuple(0.5 * 2.0 ** (i / 2.0) for i in range(13))
+# Smoothing is believed where it moves heights by what rounding does (in its standard deviation): fully below
+# the first number, not at all beyond the second.
+_BELIEVED = (0.9, 1.05)
 
 
 def resample(
@@ -78,9 +80,11 @@ def dequantise(height: NDArray[np.float64], step: float) -> NDArray[np.float64]:
     """Smooth heights (H, W) that were rounded to multiples of `step`, within what the rounding allows.
 
     Rounding to codes turns a gentle slope into terraces, whose risers a renderer sees as cliffs. Any surface
-    within half a step of the stored one is equally true to the file; this picks a smooth one by alternating
-    periodic Gaussian smoothing, from coarse to fine scales, with clipping to that band. Details that exceed
-    half a step therefore stay, and no height moves by more than half a step.
+    within half a step of the stored one is equally true to the file. This one takes, texel by texel, the
+    coarsest smoothing that still looks like rounding: rounding moves heights by ``step/√12`` (root mean
+    square), so where a smoothed map departs by more, locally, it has begun to eat detail and is not used. The
+    smoothing is a periodic Gaussian g applied as ``2g - g²``, which keeps curvature. Finally heights are
+    clipped to half a step about the stored ones, so none ever moves by more.
 
     Parameters
     ----------
@@ -88,14 +92,16 @@ def dequantise(height: NDArray[np.float64], step: float) -> NDArray[np.float64]:
     """
     if not step > 0:
         raise ValueError(f"step must be positive, not {step}")
-    low, high = height - 0.5 * step, height + 0.5 * step
+    low, high = (limit**2 for limit in _BELIEVED)
+    spectrum = np.fft.rfft2(height)
     out = height.copy()
-    for scale in _SMOOTHING:
+    for scale in _SCALES:
         transfer = _gaussian(height.shape, scale)
-        for _ in range(_SWEEPS):
-            smooth = np.fft.irfft2(np.fft.rfft2(out) * transfer, height.shape)
-            out = np.clip(smooth, low, high)
-    return out
+        smooth = np.fft.irfft2(spectrum * transfer * (2.0 - transfer), height.shape)
+        moved = np.fft.rfft2((smooth - height) ** 2) * _gaussian(height.shape, 2.0 * scale)
+        local = np.fft.irfft2(moved, height.shape) * (12.0 / step**2)
+        out += np.clip((high - local) / (high - low), 0.0, 1.0) * (smooth - out)
+    return np.clip(out, height - 0.5 * step, height + 0.5 * step)
 
 
 def _gaussian(shape: tuple[int, ...], scale: float) -> NDArray[np.float64]:
