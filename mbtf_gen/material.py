@@ -1,0 +1,240 @@
+"""A material: heights and what covers them, from a height map, a folder of maps, or a ``material.yaml``."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .atomic import digest
+from .errors import InputError
+from .heightfield import HeightGrid
+from .images import SUFFIXES, grey, is_image
+from .map_names import find_maps, normal_convention
+from .maps import dequantise, resample
+from .material_file import MaterialFile, plain, read_material_file
+from .material_maps import DEFAULT_COLOUR, Colour, MapLoader, Share
+
+# Heights of integer images are shares of an unknown range: this many tile widths. Floats are tile widths.
+INTEGER_SCALE = 0.05
+FLOAT_SCALE = 1.0
+# What stands in for the maps that are not given.
+DEFAULT_ROUGHNESS = 0.5
+DEFAULT_METALLIC = 0.0
+DEFAULT_SPECULAR = 0.5
+# Mesh cells across the tile, at most, unless asked for.
+DEFAULT_MESH = 512
+# Beyond so many tile widths a default factor is probably not what was meant.
+_STEEP = 4.0
+_YAML = ("material.yaml", "material.yml")
+
+
+@dataclass(frozen=True)
+class Material:
+    """Everything that a tile is made of. All maps have row 0 at ``v → 1``; resolutions may differ.
+
+    Attributes
+    ----------
+    height : (H, W) stored numbers: code / largest code of integer images, the number itself of float images;
+        8-bit heights are smoothed within half a code
+    height_scale : factor from stored numbers to tile widths unless the configuration says another
+    height_bits : 8, 16, or None for floats
+    basecolor : (h, w, 3) or (3,), linear Rec.709 in [0, 1]
+    roughness, metallic, specular : (h, w) or one number in [0, 1]; all three None for Lambert
+    normal : (h, w, 3) unit vectors, x along u and y along v (OpenGL); None without a map
+    opacity : (h, w) or one number in [0, 1]; None where nothing is transparent
+    bsdf : Mitsuba dictionary that stands in place of the maps, or None
+    files : role → file
+    digests : role → SHA-256 of the file's content; ``settings`` covers everything else that changes the data
+    warnings, notes : what the user should see; what the user may want to know
+    """
+
+    height: NDArray[np.float64]
+    height_scale: float
+    height_bits: int | None
+    basecolor: Colour
+    roughness: Share = None
+    metallic: Share = None
+    specular: Share = None
+    normal: NDArray[np.float32] | None = None
+    opacity: Share = None
+    bsdf: dict[str, Any] | None = None
+    files: dict[str, Path] = field(default_factory=dict)
+    digests: dict[str, str] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def aspect(self) -> float:
+        """Height of the tile over its width, H/W of the maps."""
+        return self.height.shape[0] / self.height.shape[1]
+
+    @property
+    def is_lambert(self) -> bool:
+        """Is the surface Lambert because no roughness, metallic or specular is given?"""
+        return (
+            self.bsdf is None and self.roughness is None and self.metallic is None and self.specular is None
+        )
+
+    def grid(self, height: float | None = None, mesh: int | None = None) -> HeightGrid:
+        """Heights in tile widths on the mesh's grid.
+
+        Parameters
+        ----------
+        height : factor on the stored numbers; the material's own by default
+        mesh : cells across the tile; the map's width, at most 512, by default. Coarser grids average the map
+            (box), finer ones interpolate it (cubic).
+        """
+        columns = min(self.height.shape[1], DEFAULT_MESH) if mesh is None else mesh
+        rows = max(1, round(self.aspect * columns))
+        heights = resample(self.height, rows, columns, "cubic")
+        return HeightGrid.from_map(
+            heights.astype(np.float64), self.height_scale if height is None else height, self.aspect
+        )
+
+
+def load_material(path: str | Path) -> Material:
+    """Load a material.
+
+    Parameters
+    ----------
+    path : a height map; a folder of maps with customary names, or with a ``material.yaml`` in it; or a YAML
+        file of that kind. A bare height map stands alone, whatever lies beside it.
+
+    Raises
+    ------
+    InputError : something is missing, unreadable, ambiguous, out of its range, or maps of different aspect
+    """
+    path = Path(path)
+    notes: list[str] = []
+    if path.is_dir():
+        described = next((path / name for name in _YAML if (path / name).is_file()), None)
+        if described is not None:
+            return _assemble(read_material_file(described), path, notes)
+        found = find_maps(path)
+        spec = MaterialFile.model_validate({role: str(file.name) for role, file in found.maps.items()})
+        return _assemble(spec, path, found.notes)
+    if not path.exists():
+        raise InputError("no such file or folder", where=path)
+    if path.suffix.lower() in (".yaml", ".yml"):
+        return _assemble(read_material_file(path), path.parent, notes)
+    if not is_image(path):
+        raise InputError(
+            f"'{path.suffix}' is no height map",
+            where=path,
+            cure=f"give a folder, a .yaml file, or {', '.join(SUFFIXES)}",
+        )
+    return _assemble(MaterialFile.model_validate({"height": path.name}), path.parent, list(_siblings(path)))
+
+
+def _siblings(path: Path) -> Iterator[str]:
+    """The hint that a bare height map's folder holds more maps."""
+    try:
+        others = {role: file for role, file in find_maps(path.parent).maps.items() if file != path}
+    except InputError:
+        return
+    if others and "height" not in others:
+        names = ", ".join(file.name for file in others.values())
+        yield f"only the heights of {path.name} are used; for {names} too, give the folder {path.parent}"
+
+
+def _assemble(spec: MaterialFile, folder: Path, notes: list[str]) -> Material:
+    load = MapLoader(folder, notes)
+    height, bits, scale = _heights(spec, load)
+    roughness, metallic, specular = (
+        load.share(role, getattr(spec, role)) for role in ("roughness", "metallic", "specular")
+    )
+    if spec.bsdf is not None:
+        load.notes.append(f"surface: the BSDF '{spec.bsdf['type']}' of the material file")
+    elif roughness is None and metallic is None and specular is None:
+        load.notes.append("surface: Lambert, because no roughness, metallic or specular is given")
+    else:
+        constants = {
+            "roughness": DEFAULT_ROUGHNESS,
+            "metallic": DEFAULT_METALLIC,
+            "specular": DEFAULT_SPECULAR,
+        }
+        given = {"roughness": roughness, "metallic": metallic, "specular": specular}
+        filled = [f"{name} {constants[name]}" for name, value in given.items() if value is None]
+        roughness, metallic, specular = (constants[n] if v is None else v for n, v in given.items())
+        load.notes.append(f"surface: principled{', constants ' + ', '.join(filled) if filled else ''}")
+    basecolor = load.colour(spec.basecolor) if spec.bsdf is None else np.full(3, DEFAULT_COLOUR)
+    normal = None
+    if spec.normal is not None:
+        convention = spec.normal.convention or normal_convention(spec.normal.file) or "gl"
+        normal = load.normals(spec.normal.file, convention)
+        load.notes.append("normal map: read, but not simulated yet")
+    opacity = load.share("opacity", spec.opacity)
+    if opacity is not None:
+        load.warnings.append("opacity: read, but holes are not simulated yet")
+    bsdf = None
+    if spec.bsdf is not None:
+        bsdf, load.settings["bsdf"] = _bsdf(plain(spec.bsdf), load)
+    text = json.dumps(load.settings, sort_keys=True)
+    digests = {**load.digests(), "settings": hashlib.sha256(text.encode()).hexdigest()}
+    return Material(
+        height=height,
+        height_scale=scale,
+        height_bits=bits,
+        basecolor=basecolor,
+        roughness=roughness,
+        metallic=metallic,
+        specular=specular,
+        normal=normal,
+        opacity=opacity,
+        bsdf=bsdf,
+        files=load.files,
+        digests=digests,
+        warnings=tuple(load.warnings),
+        notes=tuple(load.notes),
+    )
+
+
+def _heights(spec: MaterialFile, load: MapLoader) -> tuple[NDArray[np.float64], int | None, float]:
+    """Stored heights, their bits, and the factor to tile widths."""
+    image = load.image("height", spec.height.file)
+    height, warnings = grey(image)
+    load.warnings += warnings
+    scale = spec.height.scale
+    if scale is None:
+        scale = FLOAT_SCALE if image.bits is None else INTEGER_SCALE
+    if image.bits == 8 and spec.height.dequantise:
+        levels = len(np.unique(np.rint(height * 255.0)))
+        load.warnings.append(f"{image.path}: heights of 8 bits, {levels} levels; smoothed within half a code")
+        height = dequantise(height, 1.0 / 255.0)
+    load.settings["height"] = [scale, image.bits == 8 and spec.height.dequantise]
+    relief = abs(scale) * float(np.ptp(height))
+    kind = "floats" if image.bits is None else f"{image.bits}-bit integers"
+    load.notes.append(
+        f"heights: {image.path.name}, {image.shape[1]} x {image.shape[0]} {kind}, "
+        f"relief {relief:.4g} tile widths at its factor {scale:g}"
+    )
+    if relief > _STEEP and spec.height.scale is None:
+        load.warnings.append(
+            f"{image.path}: the relief is {relief:.4g} tile widths; is another --height meant?"
+        )
+    return height, image.bits, scale
+
+
+def _bsdf(tree: dict[str, Any], load: MapLoader) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The BSDF with its file names made absolute, and the same with digests in place of file names."""
+    out: dict[str, Any] = {}
+    nameless: dict[str, Any] = {}
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            out[key], nameless[key] = _bsdf(value, load)
+        elif key == "filename" and isinstance(value, str):
+            path = (load.folder / value).resolve()
+            if not path.is_file():
+                raise InputError("no such file (named in the bsdf)", where=path)
+            load.files[f"bsdf.{sum(r.startswith('bsdf.') for r in load.files)}"] = path
+            out[key], nameless[key] = str(path), digest(path)
+        else:
+            out[key] = nameless[key] = value
+    return out, nameless

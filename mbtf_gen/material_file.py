@@ -1,0 +1,140 @@
+"""``material.yaml``: which maps and constants make up a material."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field, model_validator
+
+from .settings import Settings, build, read_yaml
+
+Share = Annotated[float, Field(ge=0, le=1)]
+FileName = Annotated[str, Field(min_length=1)]
+
+
+def _grey(value: Any) -> Any:
+    return (value, value, value) if isinstance(value, int | float) and not isinstance(value, bool) else value
+
+
+def _short(data: Any) -> Any:
+    """``roughness: 0.4`` and ``roughness: rough.png`` stand for their long forms."""
+    if isinstance(data, str):
+        return {"file": data}
+    if isinstance(data, int | float | Sequence) and not isinstance(data, bool):
+        return {"value": data}
+    return data
+
+
+class HeightEntry(Settings):
+    """The height map."""
+
+    file: FileName
+    scale: float | None = Field(
+        None,
+        ge=-100,
+        le=100,
+        description="factor on the stored heights; default 1 for floats, 0.05 for integers",
+    )
+    dequantise: bool = Field(True, description="smooth 8-bit heights within half a code")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _long(cls, data: Any) -> Any:
+        return _short(data)
+
+
+class _FileOrValue(Settings):
+    file: FileName | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _long(cls, data: Any) -> Any:
+        return _short(data)
+
+    @model_validator(mode="after")
+    def _one(self) -> _FileOrValue:
+        if (self.file is None) == (getattr(self, "value", None) is None):
+            raise ValueError("needs either 'file' or 'value'")
+        return self
+
+
+class ColourEntry(_FileOrValue):
+    """A colour map or one colour."""
+
+    value: Annotated[tuple[Share, Share, Share], BeforeValidator(_grey)] | None = None
+    colourspace: Literal["srgb", "linear"] | None = Field(
+        None, description="default: srgb for integer images, linear for float images and values"
+    )
+
+
+class ShareEntry(_FileOrValue):
+    """A map of numbers in [0, 1] or one number."""
+
+    value: Share | None = None
+
+
+class NormalEntry(Settings):
+    """A tangent-space normal map."""
+
+    file: FileName
+    convention: Literal["gl", "dx"] | None = Field(
+        None, description="green up (gl) or down; default: from the name"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _long(cls, data: Any) -> Any:
+        return _short(data)
+
+
+class MaterialFile(Settings):
+    """Content of a ``material.yaml``; file names are relative to its folder."""
+
+    height: HeightEntry
+    basecolor: ColourEntry | None = None
+    roughness: ShareEntry | None = None
+    metallic: ShareEntry | None = None
+    specular: ShareEntry | None = None
+    normal: NormalEntry | None = None
+    opacity: ShareEntry | None = None
+    bsdf: dict[str, Any] | None = Field(
+        None, description="Mitsuba BSDF in place of the maps, passed on as it is"
+    )
+
+    @model_validator(mode="after")
+    def _bsdf_alone(self) -> MaterialFile:
+        given = [
+            n for n in ("basecolor", "roughness", "metallic", "specular") if getattr(self, n) is not None
+        ]
+        if self.bsdf is not None and given:
+            raise ValueError(f"'bsdf' stands in place of {', '.join(given)}; give one or the other")
+        if self.bsdf is not None and not isinstance(self.bsdf.get("type"), str):
+            raise ValueError("'bsdf' needs a 'type', such as diffuse")
+        return self
+
+
+def read_material_file(path: Path) -> MaterialFile:
+    """Read a ``material.yaml``.
+
+    Raises
+    ------
+    InputError : missing, not YAML, an unknown key (with its line and the nearest valid one), a value out of
+        its range
+    """
+    return build(MaterialFile, read_yaml(path), source=str(path))
+
+
+def plain(data: Any) -> Any:
+    """The same nested data in Python's own types, without what a YAML reader attaches."""
+    if isinstance(data, Mapping):
+        return {str(key): plain(value) for key, value in data.items()}
+    if isinstance(data, str):
+        return str(data)
+    if isinstance(data, Sequence):
+        return [plain(value) for value in data]
+    for kind in (bool, int, float):
+        if isinstance(data, kind):
+            return kind(data)
+    return data
