@@ -22,7 +22,10 @@ from mbtf_gen.images import (
     srgb_to_linear,
 )
 
-RNG = np.random.default_rng(7)
+
+def rng() -> np.random.Generator:
+    """The same numbers wherever they are drawn."""
+    return np.random.default_rng(7)
 
 
 def png(path: Path, codes: NDArray[Any], colour: int, bits: int, filters: list[int] | None = None) -> Path:
@@ -70,7 +73,7 @@ def exr(path: Path, channels: dict[str, NDArray[Any]], **header: Any) -> Path:
 @pytest.mark.parametrize("bits", [8, 16])
 def test_png_keeps_every_code(tmp_path: Path, colour: int, channels: int, bits: int) -> None:
     largest = 2**bits - 1
-    codes = RNG.integers(0, largest + 1, (11, 7, channels))
+    codes = rng().integers(0, largest + 1, (11, 7, channels))
     codes[0, 0], codes[0, 1] = 0, largest
     codes[5:] = codes[5:6] // 2 + np.arange(6)[:, None, None]  # so that filters predict something
     image = read_image(png(tmp_path / "x.png", codes, colour, bits, [0, 1, 2, 3, 4]))
@@ -85,7 +88,7 @@ def test_png_keeps_every_code(tmp_path: Path, colour: int, channels: int, bits: 
 def test_palette_png(tmp_path: Path) -> None:
     from PIL import Image as Pillow
 
-    codes = RNG.integers(0, 4, (5, 6)).astype(np.uint8)
+    codes = rng().integers(0, 4, (5, 6)).astype(np.uint8)
     palette = np.array([[0, 0, 0], [255, 10, 20], [30, 40, 50], [255, 255, 255]], np.uint8)
     picture = Pillow.fromarray(codes)
     picture.putpalette(palette.tobytes())
@@ -100,7 +103,7 @@ def test_palette_png(tmp_path: Path) -> None:
 def test_one_bit_png(tmp_path: Path) -> None:
     from PIL import Image as Pillow
 
-    holes = RNG.random((5, 9)) < 0.5
+    holes = rng().random((5, 9)) < 0.5
     Pillow.fromarray(holes).save(tmp_path / "x.png")
     assert np.array_equal(read_image(tmp_path / "x.png").pixels[..., 0], holes.astype(float))
 
@@ -111,10 +114,10 @@ def test_jpg_and_tiff(tmp_path: Path) -> None:
     codes = np.full((16, 24), 77, np.uint8)
     Pillow.fromarray(codes).save(tmp_path / "x.JPG", "JPEG", quality=95)
     assert read_image(tmp_path / "x.JPG").pixels[..., 0] == pytest.approx(77 / 255, abs=1.5 / 255)
-    deep = RNG.integers(0, 65536, (5, 6)).astype(np.uint16)
+    deep = rng().integers(0, 65536, (5, 6)).astype(np.uint16)
     Pillow.fromarray(deep).save(tmp_path / "x.tif")
     assert np.array_equal(read_image(tmp_path / "x.tif").pixels[..., 0], deep / 65535)
-    numbers = RNG.normal(size=(5, 6)).astype(np.float32)
+    numbers = rng().normal(size=(5, 6)).astype(np.float32)
     Pillow.fromarray(numbers).save(tmp_path / "f.tiff")
     image = read_image(tmp_path / "f.tiff")
     assert image.bits is None
@@ -123,7 +126,7 @@ def test_jpg_and_tiff(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32])
 def test_exr(tmp_path: Path, dtype: type) -> None:
-    numbers = (100 * RNG.normal(size=(5, 6, 4))).astype(dtype)
+    numbers = (100 * rng().normal(size=(5, 6, 4))).astype(dtype)
     r, g, b, a = (np.ascontiguousarray(numbers[..., i]) for i in range(4))
     one = read_image(exr(tmp_path / "y.exr", {"displacement.height": r}))
     assert one.bits is None
@@ -139,13 +142,13 @@ def test_exr(tmp_path: Path, dtype: type) -> None:
 
 
 def test_npy(tmp_path: Path) -> None:
-    numbers = RNG.normal(size=(5, 6))
+    numbers = rng().normal(size=(5, 6))
     np.save(tmp_path / "d.npy", numbers)
     assert np.array_equal(read_image(tmp_path / "d.npy").pixels[..., 0], numbers)
     np.save(tmp_path / "t.npy", np.asfortranarray(numbers.astype(">f4")))
     assert np.array_equal(read_image(tmp_path / "t.npy").pixels[..., 0], numbers.astype(np.float32))
     for dtype, bits in ((np.uint8, 8), (np.uint16, 16)):
-        codes = RNG.integers(0, 2**bits, (5, 6, 3)).astype(dtype)
+        codes = rng().integers(0, 2**bits, (5, 6, 3)).astype(dtype)
         np.save(tmp_path / "i.npy", codes)
         image = read_image(tmp_path / "i.npy")
         assert image.bits == bits
@@ -186,13 +189,13 @@ def good_files(folder: Path) -> list[Path]:
     """One good file of every kind, of noise, so that cutting it anywhere loses pixels."""
     from PIL import Image as Pillow
 
-    codes = RNG.integers(0, 256, (64, 64, 3)).astype(np.uint8)
+    codes = rng().integers(0, 256, (64, 64, 3)).astype(np.uint8)
     Pillow.fromarray(codes).save(folder / "a.png")
     Pillow.fromarray(codes).save(folder / "a.jpg")
     Pillow.fromarray(codes).save(folder / "a.tif")
-    png(folder / "deep.png", RNG.integers(0, 65536, (64, 64, 3)), 2, 16, [4])
+    png(folder / "deep.png", rng().integers(0, 65536, (64, 64, 3)), 2, 16, [4])
     np.save(folder / "a.npy", codes)
-    exr(folder / "a.exr", {"Y": RNG.random((64, 64)).astype(np.float32)})
+    exr(folder / "a.exr", {"Y": rng().random((64, 64)).astype(np.float32)})
     return sorted(folder.iterdir())
 
 
@@ -336,7 +339,7 @@ def test_kinds_that_would_lose_something_are_refused(tmp_path: Path) -> None:
 
 class TestGrey:
     def test_exact_for_equal_channels(self) -> None:
-        codes = RNG.integers(0, 256, (4, 5, 1))
+        codes = rng().integers(0, 256, (4, 5, 1))
         image = Image((np.repeat(codes, 3, axis=2) / 255).astype(np.float32), 8, Path("x.png"))
         numbers, warnings = grey(image)
         assert np.array_equal(numbers, codes[..., 0] / 255)
