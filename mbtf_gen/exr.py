@@ -39,8 +39,8 @@ def _window(header: dict[str, Any], name: str) -> tuple[int, int, int, int]:
     return int(low[0]), int(low[1]), int(high[0]), int(high[1])
 
 
-def read_channels(path: Path, max_pixels: int) -> dict[str, NDArray[Any]]:
-    """Channels (H, W) of the first part of an EXR file by name, float16 or float32 as stored.
+def read_file(path: Path, max_pixels: int) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """Header of the first part of an EXR file, and its channels (H, W) by name, float16 or float32.
 
     Raises
     ------
@@ -79,4 +79,9 @@ def read_channels(path: Path, max_pixels: int) -> dict[str, NDArray[Any]]:
             raise InputError(
                 f"channel '{name}' holds whole numbers", where=path, cure="save it as half or float"
             )
-    return channels
+    return head, channels
+
+
+def read_channels(path: Path, max_pixels: int) -> dict[str, NDArray[Any]]:
+    """The channels of :func:`read_file` alone."""
+    return read_file(path, max_pixels)[1]

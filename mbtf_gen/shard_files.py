@@ -25,6 +25,8 @@ Arrays = dict[str, NDArray[np.float32]]
 _ALIGNMENT = 64
 # Width of the EXR images that shuffled queries are folded into.
 _FOLD_WIDTH = 1024
+# An EXR header that claims more is damaged.
+_MAX_PIXELS = 2**31
 
 
 def check_arrays(arrays: Mapping[str, NDArray[np.float32]], where: object) -> tuple[int, ...]:
@@ -110,8 +112,10 @@ def read_npz(path: Path, names: Iterable[str] | None = None, *, mapped: bool = T
                 out[name] = array
     except FileNotFoundError:
         raise InputError("no such shard", where=path) from None
-    except (zipfile.BadZipFile, OSError, ValueError, KeyError, EOFError) as error:
-        raise InputError(f"shard cannot be read ({error})", where=path) from None
+    except InputError:
+        raise
+    except Exception as error:  # a damaged archive or header may make its parser raise anything
+        raise InputError(f"shard cannot be read ({str(error).partition(chr(10))[0]})", where=path) from None
     return out
 
 
@@ -156,30 +160,28 @@ def read_exr(path: Path, names: Iterable[str] | None = None) -> Arrays:
     ------
     InputError : missing file, not an EXR file, or not a shard
     """
-    import OpenEXR
+    from .exr import read_file
 
     if not path.exists():
         raise InputError("no such shard", where=path)
-    try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            header = file.header()
-            if "mbtf.lead" not in header:
-                raise InputError("EXR image is not a shard (no 'mbtf.lead' in its header)", where=path)
-            lead = tuple(int(n) for n in header["mbtf.lead"].split(","))
-            stored = {name: channel.pixels for name, channel in file.channels().items()}
-    except (RuntimeError, ValueError, OSError) as error:
-        raise InputError(f"shard cannot be read ({error})", where=path) from None
-    count = int(np.prod(lead))
+    header, stored = read_file(path, _MAX_PIXELS)
+    if "mbtf.lead" not in header:
+        raise InputError("EXR image is not a shard (no 'mbtf.lead' in its header)", where=path)
     out: Arrays = {}
-    for spec in ARRAYS:
-        if names is not None and spec.name not in names:
-            continue
-        if any(c not in stored for c in spec.channels):
-            if spec.optional or (names is not None and spec.name not in names):
+    try:
+        lead = tuple(int(n) for n in header["mbtf.lead"].split(","))
+        for spec in ARRAYS:
+            if spec.name not in (names if names is not None else [spec.name]):
                 continue
-            raise InputError(f"shard lacks the array '{spec.name}'", where=path)
-        flat = np.stack([stored[c].reshape(-1)[:count] for c in spec.channels], axis=-1)
-        out[spec.name] = np.ascontiguousarray(flat.reshape(*lead, *spec.trailing), np.float32)
+            if any(c not in stored for c in spec.channels):
+                if spec.optional and names is None:
+                    continue
+                raise InputError(f"shard lacks the array '{spec.name}'", where=path)
+            count = int(np.prod(lead))
+            flat = np.stack([stored[c].reshape(-1)[:count] for c in spec.channels], axis=-1)
+            out[spec.name] = np.ascontiguousarray(flat.reshape(*lead, *spec.trailing), np.float32)
+    except (ValueError, AttributeError):
+        raise InputError("shard cannot be read (its 'mbtf.lead' does not fit its size)", where=path) from None
     return out
 
 
