@@ -100,7 +100,7 @@ def _known_keys(model: type[BaseModel], location: Sequence[str | int]) -> list[s
     return sorted({key for m in models for key in m.model_fields})
 
 
-def _line_of(data: Any, location: Sequence[str | int]) -> int | None:
+def line_of(data: Any, location: Sequence[str | int]) -> int | None:
     """Line (from 1) of a key in data that :func:`read_yaml` returned; None where it is not in the file."""
     line = None
     for part in location:
@@ -120,7 +120,7 @@ def _explain(error: ValidationError, model: type[BaseModel], data: Any, source: 
     fault = error.errors()[0]
     location = list(fault["loc"])
     dotted = ".".join(str(p) for p in location) or "(top level)"
-    line = _line_of(data, location)
+    line = line_of(data, location)
     where = f"{source}:{line}" if line is not None else source
     if fault["type"] == "extra_forbidden":
         known = _known_keys(model, location)
