@@ -1,0 +1,91 @@
+"""The own materials: the script makes exactly the stored files, and they are what a tile must be."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenEXR
+import pytest
+from conftest import RunPython
+from numpy.typing import NDArray
+from PIL import Image
+
+ASSETS = Path(__file__).resolve().parents[2] / "assets"
+MATERIALS = ("turtle_shell", "straight_wool")
+MAPS = ("height.exr", "basecolor.png", "roughness.png")
+
+
+def pixels(path: Path) -> NDArray[Any]:
+    if path.suffix == ".exr":
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            (channel,) = file.channels().values()
+            return np.array(channel.pixels)
+    with Image.open(path) as image:
+        return np.asarray(image)
+
+
+@pytest.fixture(scope="module", params=MATERIALS)
+def material(request: pytest.FixtureRequest) -> dict[str, NDArray[Any]]:
+    return {name: pixels(ASSETS / request.param / name) for name in MAPS}
+
+
+# NumPy picks its loops by the processor; without them it computes as on the oldest one.
+@pytest.mark.parametrize("features", ["", "AVX512F AVX512_SKX AVX512_ICL AVX2 FMA3 X86_V4 X86_V3"])
+def test_the_script_makes_the_stored_files(features: str, tmp_path: Path, run_python: RunPython) -> None:
+    done = run_python(
+        "-W", "ignore", str(ASSETS / "make_assets.py"), str(tmp_path), NPY_DISABLE_CPU_FEATURES=features
+    )
+    assert done.returncode == 0, done.stderr
+    made = {p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*") if p.is_file()}
+    assert made == {f"{material}/{name}" for material in MATERIALS for name in MAPS}
+    for name in sorted(made):
+        new, stored = pixels(tmp_path / name), pixels(ASSETS / name)
+        assert new.dtype == stored.dtype
+        assert np.array_equal(new, stored), name
+
+
+def test_maps_have_the_stated_form(material: dict[str, NDArray[Any]]) -> None:
+    height, colour, roughness = (material[name] for name in MAPS)
+    assert (height.shape, height.dtype) == ((256, 256), np.float32)
+    assert (colour.shape, colour.dtype) == ((256, 256, 3), np.uint8)
+    assert (roughness.shape, roughness.dtype) == ((256, 256), np.uint8)
+    # Heights in tile widths, the highest point at 0, on a grid that float32 holds exactly.
+    assert height.max() == 0
+    assert 0.05 < -height.min() < 0.12
+    assert np.array_equal(height * 2**14, np.round(height * 2**14))
+    # No mirror, no perfect white: a specular lobe comes on top of the base colour.
+    assert roughness.min() > 0.2 * 255
+    assert colour.max() < 0.95 * 255
+
+
+def test_folders_are_small() -> None:
+    for name in MATERIALS:
+        assert sum(p.stat().st_size for p in (ASSETS / name).iterdir()) < 1_500_000
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_tiles_have_no_seam(material: dict[str, NDArray[Any]], axis: int) -> None:
+    for name, image in material.items():
+        values = np.moveaxis(np.asarray(image, np.float64), axis, 0)
+        steps = np.abs(values - np.roll(values, 1, axis=0)).reshape(len(values), -1).mean(1)
+        # Step 0 leads from the last line to the first; the largest step inside the tile sets the measure.
+        assert steps[0] <= 1.05 * steps[1:].max(), name
+
+
+def test_orientation_can_be_recognised(material: dict[str, NDArray[Any]]) -> None:
+    """No flip or quarter turn, shifted anyhow, looks like the tile itself in both height and colour."""
+    images = [np.asarray(material["height.exr"], np.float64), material["basecolor.png"].mean(2)]
+    images = [(image - image.mean()) / image.std() for image in images]
+    spectra = [np.fft.rfft2(image) for image in images]
+    for turn in range(4):
+        for flip in (False, True):
+            if turn == 0 and not flip:
+                continue
+            correlation = np.inf
+            for image, spectrum in zip(images, spectra, strict=True):
+                other = np.rot90(image[:, ::-1] if flip else image, turn)
+                over_shifts = np.fft.irfft2(spectrum * np.fft.rfft2(other).conj(), image.shape) / image.size
+                correlation = min(correlation, float(over_shifts.max()))
+            assert correlation < 0.8, (turn, flip)
