@@ -136,7 +136,7 @@ class _LineProgress(Progress):
             self._print()
 
     def _close(self) -> None:
-        if self._shown != self.done:
+        if self.done and self._shown != self.done:
             self._print()
 
     def _print(self) -> None:

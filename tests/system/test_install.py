@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 from importlib.metadata import entry_points, version
+from pathlib import Path
 
+import pytest
 from conftest import RunPython
 
 from mbtf_gen import doctor
@@ -40,6 +42,32 @@ def test_the_three_programs_are_installed() -> None:
     }
 
 
-def test_pinned_versions_are_installed(run_python: RunPython) -> None:
+def test_pinned_versions_are_installed() -> None:
     assert version("mitsuba") == "3.9.1"
     assert version("torch").split("+")[0] == "2.13.0"
+
+
+@pytest.mark.parametrize("content", [b"no library\n", b"\x7fELF" + bytes(4096), None])
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["mbtf_gen", "{asset}", "--queries", "10", "--test-queries", "10", "-o", "{out}"],
+        ["mbtf_gen", "reference", "{asset}", "--size", "8", "-o", "{out}"],
+    ],
+    ids=["generate", "reference"],
+)
+def test_a_broken_llvm_ends_every_rendering_command_in_one_clear_error(
+    arguments: list[str], content: bytes | None, tmp_path: Path, run_python: RunPython
+) -> None:
+    library = tmp_path / "libLLVM.so"
+    if content is not None:
+        library.write_bytes(content)
+    asset = Path(__file__).parents[2] / "assets" / "turtle_shell"
+    filled = [a.format(asset=asset, out=tmp_path / "out") for a in arguments]
+    done = run_python("-m", *filled, "--quiet", DRJIT_LIBLLVM_PATH=str(library))
+    assert done.returncode == 3
+    lines = done.stderr.splitlines()
+    assert len(lines) == 2
+    assert lines[0].startswith(f"error: DRJIT_LIBLLVM_PATH={library}: ")
+    assert "unset it" in lines[1]
+    assert done.stdout == ""

@@ -232,6 +232,12 @@ def test_progress_survives_errors_and_unknown_totals(capsys: pytest.CaptureFixtu
     assert capsys.readouterr().err.startswith("reading: 7 rows, ")
 
 
+def test_progress_that_never_began_is_silent(capsys: pytest.CaptureFixture[str]) -> None:
+    with CONSOLE.progress(4, "rendering", "shards"):
+        pass
+    assert capsys.readouterr().err == ""
+
+
 def test_quiet_shows_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     console = Console(quiet=True)
     console.note("started")
