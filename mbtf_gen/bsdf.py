@@ -1,7 +1,7 @@
 """Material maps → Mitsuba BSDF.
 
 Lambert (``diffuse``) where nothing but base colour is given, else ``principled``. Maps are bilinear,
-periodic, and linear; row 0 of an image is the side ``v → 1``, as Mitsuba's bitmap textures have it.
+periodic, and linear; row 0 of an image is the side ``v → 1`` (the mesh's texture coordinates see to it).
 """
 
 from __future__ import annotations

@@ -17,6 +17,10 @@ from numpy.typing import ArrayLike
 from .light import LightKernel
 from .tracing import LaneLight
 
+# Scene units that stock integrators search for occluders. Mitsuba tells an emitter written in Python nothing
+# of the scene's size, so it is a constant: thousands of tiles, and still exact to 1e-7 in direction.
+SHADOW_DISTANCE = 1.0e5
+
 
 class SmoothedDirectional(mi.Emitter):
     """``mbtf_directional``: von Mises–Fisher lobe cut at the horizon z = 0, unit irradiance on the plane z =
@@ -34,8 +38,6 @@ class SmoothedDirectional(mi.Emitter):
         self.kappa = dr.opaque(mi.Float, 0.0 if self.kernel.is_delta else self.kernel.kappa)
         direction = props.get("direction", mi.ScalarVector3f(0, 0, 1))
         self.set_directions(np.asarray(direction, np.float32).reshape(1, 3))
-        self.radius = mi.Float(1.0)
-        self.centre = mi.Point3f(0.0)
 
     def set_directions(self, omega_i: ArrayLike) -> None:
         """Take the light directions (n, 3) of a batch of queries; one row serves all rays."""
@@ -43,12 +45,6 @@ class SmoothedDirectional(mi.Emitter):
         self.omega_i = mi.Vector3f(w.T.copy())
         self.inverse = mi.Float((1.0 / self.kernel.irradiance(w)).astype(np.float32))
         dr.eval(self.omega_i, self.inverse)
-
-    def set_scene(self, scene: Any) -> None:
-        """Learn the size of the scene, which sampled directions point beyond."""
-        sphere = scene.bbox().bounding_sphere()
-        self.radius = mi.Float(max(1e-3, float(sphere.radius) * 4.0))
-        self.centre = mi.Point3f(sphere.center)
 
     def _light(self, time: Any) -> LaneLight:
         index = dr.minimum(mi.UInt32(time), dr.width(self.inverse) - 1)
@@ -75,7 +71,7 @@ class SmoothedDirectional(mi.Emitter):
             pdf = light.sampling_density(omega)
             weight = light.radiance(omega) / pdf
         ds.d = omega
-        ds.dist = 2.0 * self.radius
+        ds.dist = mi.Float(SHADOW_DISTANCE)
         ds.p = dr.fma(omega, ds.dist, it.p)
         ds.n = -omega
         ds.time = it.time

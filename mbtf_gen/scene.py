@@ -72,7 +72,9 @@ def mesh_of_grid(grid: HeightGrid, unit: float, apron: tuple[int, int], bsdf: An
     centre = np.array([0.5, 0.5 * grid.aspect, 0.0])
     params = mi.traverse(mesh)
     params["vertex_positions"] = ((flat - centre) * unit).astype(np.float32).ravel()
-    params["vertex_texcoords"] = (flat[:, :2] / (1.0, grid.aspect)).astype(np.float32).ravel()
+    # Mitsuba's bitmaps have row 0 at v = 0, ours at v → 1: its texture coordinates are (u, 1-v).
+    texcoords = np.column_stack([flat[:, 0], 1.0 - flat[:, 1] / grid.aspect])
+    params["vertex_texcoords"] = texcoords.astype(np.float32).ravel()
     params["faces"] = faces.ravel()
     params.update()
     return mesh

@@ -66,10 +66,11 @@ CONVENTIONS: dict[str, str] = {
     "directions": "omega_i from the surface towards the light, omega_o from the surface towards the viewer, "
     "unit vectors in the tile's frame, z > 0",
     "light": "von Mises-Fisher lobe p around omega_i, cut at the horizon and normalised so that the "
-    "irradiance on the reference plane is exactly 1; its width is the RMS angle per axis in degrees, 0 a delta light",
+    "irradiance on the reference plane is exactly 1; its width is the RMS angle per axis in degrees, "
+    "0 a delta light",
     "value": "M(u, sigma, omega_i, omega_o) in 1/sr: radiance leaving towards omega_o under that light, "
-    "averaged over a Gaussian footprint on the reference plane, wrapped on the torus; no cosine, no clamp, no log; "
-    "a Lambert plane gives albedo/pi",
+    "averaged over a Gaussian footprint on the reference plane, wrapped on the torus; "
+    "no cosine, no clamp, no log; a Lambert plane gives albedo/pi",
     "sigma": "standard deviation of the footprint in tile widths; level l = -log2(2 sigma)",
     "levels": "level s has 2^s x max(1, round(a 2^s)) texels and sigma_s = 2^-s / 2; data lie in l in [0, k]",
     "halves": "value_a and value_b are independent estimates from spp/2 paths each; the value is their mean "

@@ -1,0 +1,83 @@
+"""Small scenes that several physics tests share, and shorthands to estimate M on them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mbtf_gen.engine import load_mitsuba
+
+mi = load_mitsuba()
+
+from mbtf_gen.estimator import Estimates, Estimator, Stream  # noqa: E402
+from mbtf_gen.heightfield import HeightGrid  # noqa: E402
+from mbtf_gen.light import LightKernel  # noqa: E402
+from mbtf_gen.queries import Queries  # noqa: E402
+from mbtf_gen.scene import build_tile, register_plugins  # noqa: E402
+from mbtf_gen.tracing import Transport  # noqa: E402
+
+register_plugins()
+
+DIRECT = Transport(max_depth=1)
+
+
+def lambert(albedo: float | tuple[float, float, float]) -> dict[str, Any]:
+    """Mitsuba dictionary of a Lambert reflector."""
+    value = [albedo] * 3 if isinstance(albedo, float) else list(albedo)
+    return {"type": "diffuse", "reflectance": {"type": "rgb", "value": value}}
+
+
+def flat(aspect: float = 1.0) -> HeightGrid:
+    """A plane."""
+    return HeightGrid(np.zeros((4, 4)), aspect)
+
+
+def rocks(resolution: int = 64, relief: float = 0.15, seed: int = 3) -> HeightGrid:
+    """A rough, periodic, asymmetric relief with steep flanks."""
+    rng = np.random.default_rng(seed)
+    frequency = np.fft.fftfreq(resolution, 1.0 / resolution)
+    radius = np.hypot(frequency[:, None], frequency[None, :])
+    spectrum = np.exp(2j * np.pi * rng.random((resolution, resolution))) * np.exp(-((radius / 6.0) ** 2))
+    h = np.fft.ifft2(spectrum).real
+    h = (h - h.min()) / (h.max() - h.min())
+    # Terraces: flat tops, steep flanks, a tilt that breaks every symmetry.
+    h = 0.7 * np.floor(5.0 * h) / 5.0 + 0.3 * h
+    return HeightGrid.from_map(h, relief / (h.max() - h.min()))
+
+
+def queries(u: ArrayLike, sigma: ArrayLike, omega_i: ArrayLike, omega_o: ArrayLike, n: int) -> Queries:
+    """n queries; arguments broadcast over them."""
+
+    def rows(x: ArrayLike, trailing: tuple[int, ...]) -> NDArray[np.float32]:
+        return np.broadcast_to(np.asarray(x, np.float32), (n, *trailing)).copy()
+
+    return Queries(rows(u, (2,)), rows(sigma, ()), rows(omega_i, (3,)), rows(omega_o, (3,)))
+
+
+def tile_mean_queries(omega_i: ArrayLike, omega_o: ArrayLike, n: int, seed: int = 0) -> Queries:
+    """n queries with footprints of four tile widths: each of them, and so their mean, is the tile mean."""
+    return queries(np.random.default_rng(seed).random((n, 2)), 4.0, omega_i, omega_o, n)
+
+
+def estimate(
+    grid: HeightGrid,
+    bsdf: Any,
+    light: LightKernel | None,
+    q: Queries,
+    spp: int,
+    *,
+    transport: Transport | None = None,
+    seed: int = 1,
+) -> Estimates:
+    """Both halves of M at the queries."""
+    estimator = Estimator(build_tile(grid, bsdf), light, transport or Transport())
+    return estimator.estimate(q, spp, Stream(seed, "test", 0))
+
+
+def direction(elevation: float, azimuth: float) -> NDArray[np.float64]:
+    """Unit vector from angles in degrees."""
+    from mbtf_gen.directions import from_angles
+
+    return from_angles(elevation, azimuth)
