@@ -93,20 +93,25 @@ def dequantise(height: NDArray[np.float64], step: float) -> NDArray[np.float64]:
     if not step > 0:
         raise ValueError(f"step must be positive, not {step}")
     low, high = (limit**2 for limit in _BELIEVED)
-    spectrum = np.fft.rfft2(height)
-    out = height.copy()
+    # In units of the step and relative to a stored height: constants stay exact, single precision suffices.
+    stored = ((height - height[0, 0]) / step).astype(np.float32)
+    spectrum = np.fft.rfft2(stored)
+    out = stored.copy()
     for scale in _SCALES:
         transfer = _gaussian(height.shape, scale)
-        smooth = np.fft.irfft2(spectrum * transfer * (2.0 - transfer), height.shape)
-        moved = np.fft.rfft2((smooth - height) ** 2) * _gaussian(height.shape, 2.0 * scale)
-        local = np.fft.irfft2(moved, height.shape) * (12.0 / step**2)
-        out += np.clip((high - local) / (high - low), 0.0, 1.0) * (smooth - out)
-    return np.clip(out, height - 0.5 * step, height + 0.5 * step)
+        smooth = np.fft.irfft2(spectrum * (transfer * (2.0 - transfer)), height.shape)
+        moved = np.fft.rfft2((smooth - stored) ** 2) * _gaussian(height.shape, 2.0 * scale)
+        belief = np.clip((high - 12.0 * np.fft.irfft2(moved, height.shape)) / (high - low), 0.0, 1.0)
+        if not belief.any():
+            break  # coarser smoothing departs further still
+        out += belief * (smooth - out)
+    moved_by = np.clip(out - stored, -0.5, 0.5).astype(np.float64)
+    return height + step * moved_by
 
 
-def _gaussian(shape: tuple[int, ...], scale: float) -> NDArray[np.float64]:
+def _gaussian(shape: tuple[int, ...], scale: float) -> NDArray[np.float32]:
     """Transfer function of a periodic Gaussian of standard deviation `scale` texels, for ``rfft2``."""
     rows, columns = np.fft.fftfreq(shape[0]), np.fft.rfftfreq(shape[1])
     spread = -2.0 * (np.pi * scale) ** 2
-    transfer: NDArray[np.float64] = np.exp(spread * rows**2)[:, None] * np.exp(spread * columns**2)
-    return transfer
+    transfer = np.exp(spread * rows**2)[:, None] * np.exp(spread * columns**2)
+    return transfer.astype(np.float32)
