@@ -23,6 +23,7 @@ STAMP_FORMAT = "mbtf-stage"
 # Part of every key: raise it when a stage makes something else from the same inputs.
 STAGE_SCHEMA = 1
 STAMPS = "stages"
+FORCED = "forced"
 
 
 def hash_of(data: Any) -> str:
@@ -94,6 +95,11 @@ class Decision:
     def runs(self) -> bool:
         """Whether the stage must run."""
         return bool(self.reason)
+
+    @property
+    def forced(self) -> bool:
+        """Whether it runs because it was asked to, so that nothing of its last run may be kept."""
+        return self.reason == FORCED
 
 
 def stamp_path(folder: Path, stage: str) -> Path:
@@ -199,7 +205,7 @@ def run_stages(
     for stage in stages:
         upstream = {name: done[name].stamp.outputs_hash for name in stage.needs}
         fresh = [name for name, outcome in done.items() if outcome.ran]
-        decision = Decision("forced") if force else decide(folder, stage, upstream, fresh)
+        decision = Decision(FORCED) if force else decide(folder, stage, upstream, fresh)
         if tell is not None:
             tell(stage.name, decision, None)
         stamp = read_stamp(folder, stage.name)
@@ -209,6 +215,24 @@ def run_stages(
         if tell is not None:
             tell(stage.name, decision, stamp)
     return done
+
+
+def run_again(folder: Path, stage: Stage) -> Stamp:
+    """Run one stage whatever its state; the stages it needs have finished.
+
+    Raises
+    ------
+    InputError : one of them has not
+    """
+    upstream: dict[str, str] = {}
+    for name in stage.needs:
+        stamp = read_stamp(folder, name)
+        if stamp is None:
+            raise InputError(
+                f"stage '{name}' is not finished", where=folder, cure="run the recipe again: it resumes"
+            )
+        upstream[name] = stamp.outputs_hash
+    return _run(folder, stage, upstream, Decision(FORCED))
 
 
 def _run(folder: Path, stage: Stage, upstream: Mapping[str, str], decision: Decision) -> Stamp:
