@@ -21,10 +21,10 @@ _PUBLIC = {
     "LightKernel": "light",
     "MbtfError": "errors",
     "Queries": "queries",
-    "generate": "generate",
+    "generate": "generation",
     "load_material": "material",
     "render_reference": "reference",
-    "verify": "verify",
+    "verify": "verification",
 }
 
 __all__ = [

@@ -15,11 +15,6 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from .material import Material
 
-# What the maps that are not given stand at, once one of roughness, metallic, specular is.
-DEFAULT_ROUGHNESS = 0.5
-DEFAULT_METALLIC = 0.0
-DEFAULT_SPECULAR = 0.5
-
 
 def _texture(value: Any) -> dict[str, Any]:
     """Bilinear periodic bitmap of an (H, W) or (H, W, 3) array of linear numbers."""
@@ -42,9 +37,7 @@ def _colour(value: Any) -> dict[str, Any]:
     return {"type": "rgb", "value": [float(c) for c in np.broadcast_to(array, 3)]}
 
 
-def _scalar(value: Any, default: float) -> Any:
-    if value is None:
-        return default
+def _scalar(value: Any) -> Any:
     array = np.asarray(value, np.float64)
     return _texture(array) if array.ndim >= 2 else float(array)
 
@@ -58,7 +51,7 @@ def bsdf_of(material: Material) -> dict[str, Any]:
     return {
         "type": "principled",
         "base_color": _colour(material.basecolor),
-        "roughness": _scalar(material.roughness, DEFAULT_ROUGHNESS),
-        "metallic": _scalar(material.metallic, DEFAULT_METALLIC),
-        "specular": _scalar(material.specular, DEFAULT_SPECULAR),
+        "roughness": _scalar(material.roughness),
+        "metallic": _scalar(material.metallic),
+        "specular": _scalar(material.specular),
     }

@@ -128,7 +128,7 @@ def generate(
     }
     resolved = _resolve(material, config, assignments or [], flags)
     part = _slice(shards)
-    from .generate import Job, generate, summary_dict
+    from .generation import Job, generate, summary_dict
 
     folder = output or Path("shards")
     job = Job.prepare(resolved)
@@ -181,7 +181,7 @@ def merge(folder: Path, /, *, console: Console = CONSOLE) -> int:
     """
     from .dataset import Dataset
     from .errors import EXIT_PARTIAL
-    from .generate import finish, summary_dict
+    from .generation import finish, summary_dict
 
     Dataset.open(folder)
     summary = finish(folder)
@@ -199,7 +199,7 @@ def verify(folder: Path, /, *, console: Console = CONSOLE) -> int:
         Folder of shards.
     """
     from .dataset import Dataset
-    from .verify import verify
+    from .verification import verify
 
     faults = verify(folder)
     dataset = Dataset.open(folder)
@@ -301,7 +301,7 @@ def reference(
     resolved = _resolve(material, config, assignments or [], flags)
     from .camera import Camera, PixelKind
     from .directions import from_angles
-    from .generate import Job, build_estimator
+    from .generation import Job, build_estimator
     from .reference import auto_exposure, render_reference
     from .stats import pooled_relative_error
 
@@ -328,7 +328,7 @@ def reference(
                 noise = pooled_relative_error(image.value_a.reshape(-1, 3), image.value_b.reshape(-1, 3))
                 pictures.append(
                     {
-                        "file": path.with_suffix(".exr"),
+                        "file": path.with_name(f"{path.name}.exr"),
                         "kind": one,
                         "span": camera.span,
                         "relative_noise": noise.value,

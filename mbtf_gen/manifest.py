@@ -9,7 +9,7 @@ from .levels import sigma_of_level
 from .schema import ARRAYS, CONVENTIONS, FORMAT_NAME, SCHEMA_VERSION, SPLITS, Split
 
 if TYPE_CHECKING:
-    from .generate import Job
+    from .generation import Job
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,7 @@ def build_manifest(job: Job, entries: list[ShardEntry], effects: list[dict[str, 
             "aspect": lattice.aspect,
             "maps_shape": list(material.height.shape),
             "mesh_shape": list(grid.z.shape),
+            "height": material.height_scale if config.geometry.height is None else config.geometry.height,
             "relief": grid.relief,
         },
         "levels": {

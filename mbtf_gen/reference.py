@@ -47,7 +47,7 @@ class ReferenceImage:
         return 0.5 * (self.value_a + self.value_b)
 
     def write(self, path: Path, exposure: float | None = None) -> None:
-        """Write ``path.exr`` (all channels) and ``path.png`` (sRGB)."""
+        """Write ``path`` + ``.exr`` (all channels) and + ``.png`` (sRGB)."""
         lead = (1, *self.queries.lead)
         arrays = {
             "u": self.queries.u.reshape(*lead, 2),
@@ -58,10 +58,10 @@ class ReferenceImage:
             "value_b": self.value_b.reshape(*lead, 3),
             "spp": np.full(lead, self.spp, np.float32),
         }
-        write_exr(path.with_suffix(".exr"), arrays)
+        write_exr(path.with_name(f"{path.name}.exr"), arrays)
         from PIL import Image
 
-        Image.fromarray(to_display(self.value, exposure)).save(path.with_suffix(".png"))
+        Image.fromarray(to_display(self.value, exposure)).save(path.with_name(f"{path.name}.png"))
 
 
 def auto_exposure(value: NDArray[np.float32]) -> float:

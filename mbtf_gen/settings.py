@@ -116,8 +116,9 @@ def line_of(data: Any, location: Sequence[str | int]) -> int | None:
 
 
 def _explain(error: ValidationError, model: type[BaseModel], data: Any, source: str) -> tuple[str, str, str]:
-    """(where, what, cure) of the first fault that pydantic found."""
-    fault = error.errors()[0]
+    """(where, what, cure) of one fault: an unknown key before others, since it may explain a missing one."""
+    faults = error.errors()
+    fault = next((f for f in faults if f["type"] == "extra_forbidden"), faults[0])
     location = list(fault["loc"])
     dotted = ".".join(str(p) for p in location) or "(top level)"
     line = line_of(data, location)

@@ -13,12 +13,12 @@ from mbtf_gen.atomic import write_json
 from mbtf_gen.config import GeneratorConfig
 from mbtf_gen.dataset import Dataset
 from mbtf_gen.effects import simulated_effects
-from mbtf_gen.generate import Job, _open_folder, _sidecar, finish
+from mbtf_gen.generation import Job, _open_folder, _sidecar, finish
 from mbtf_gen.manifest import build_manifest
 from mbtf_gen.queries import Queries
 from mbtf_gen.schema import SPLITS
 from mbtf_gen.shard_files import write_shard
-from mbtf_gen.verify import sidecar_of
+from mbtf_gen.verification import sidecar_of
 
 F32 = NDArray[np.float32]
 NOISE = 0.05

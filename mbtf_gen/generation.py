@@ -24,7 +24,7 @@ from .queries import Mixture, QueryPlan
 from .schema import CONFIG_NAME, FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, SPLITS, Split
 from .settings import dump_yaml
 from .shard_files import shard_suffix, write_shard
-from .verify import is_finished, sidecar_of
+from .verification import is_finished, sidecar_of
 
 log = logging.getLogger(__name__)
 
@@ -76,8 +76,12 @@ class Job:
         InputError : the material cannot be used
         """
         material = load_material(Path(config.material))
+        for note in material.notes:
+            log.info(note)
         for warning in material.warnings:
             log.warning(warning)
+        grid = material.grid(config.geometry.height, config.geometry.mesh)
+        log.info("mesh: %d x %d cells, relief %.4g tile widths", *grid.z.shape[::-1], grid.relief)
         rows, columns = material.height.shape
         lattice = Lattice.for_map(rows, columns, config.queries.levels)
         return cls(config, material, lattice, config.hash(material.digests))
