@@ -82,7 +82,7 @@ class QueriesSection(Settings):
 
     train: Count = Field("100/texel", description="N or N/texel (texels of the finest level)")
     test: Count = Field("8192", description="N or N/texel")
-    spp: Paths = Field(8, description="paths per training query, both halves together")
+    spp: Paths = Field(4, description="paths per training query, both halves together")
     test_spp: Paths = Field(256, description="paths per test query, both halves together")
     levels: int | None = Field(None, ge=0, le=14, description="finest level k; default: from the map's width")
     mixture: MixtureSection = MixtureSection()

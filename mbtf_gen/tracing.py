@@ -16,8 +16,11 @@ import mitsuba as mi
 
 from .periodic import Period, closest_hit, leave, occluded
 
-# Never roulette below this survival chance when the throughput is one: a closed white furnace must end.
-MAX_SURVIVAL = 0.95
+# Roulette leaves paths of throughput one alone, for dividing by a survival chance below it makes their
+# weights grow without bound in white cracks; only after this many interactions they end with a chance of one
+# in twenty each.
+PATIENCE = 64
+LATE_SURVIVAL = 0.95
 
 
 @dataclass(frozen=True)
@@ -158,7 +161,8 @@ def trace(
         depth[active] += 1
         strongest = dr.max(throughput)
         active &= strongest > 0
-        survival = dr.select(depth >= transport.roulette_depth, dr.minimum(strongest, MAX_SURVIVAL), 1.0)
+        longest = dr.select(depth < PATIENCE, 1.0, LATE_SURVIVAL)
+        survival = dr.select(depth >= transport.roulette_depth, dr.minimum(strongest, longest), 1.0)
         active &= rng.next_float32() < survival
         throughput *= dr.rcp(survival)
     return radiance, lost, capped
