@@ -63,8 +63,23 @@ def load_mitsuba(variant: str = CPU_VARIANT) -> Any:
             mitsuba.set_variant(variant)
     except ImportError as error:
         raise _mitsuba_error(" ".join(str(error).split())) from None
+    if variant == CPU_VARIANT:
+        _refuse_early_import()
     _working.add(variant)
     return mitsuba
+
+
+def _refuse_early_import() -> None:
+    """Dr.Jit binds to an LLVM when it is first imported: an old one, where that came before this package's
+    import."""
+    import drjit
+
+    major = int(drjit.detail.llvm_version()[0])
+    if major < OLDEST_LLVM:
+        raise EngineError(
+            f"Dr.Jit was imported before mbtf_gen and has bound to LLVM {major}, which is too old",
+            cure="import mbtf_gen before mitsuba and drjit",
+        )
 
 
 def prove(variant: str) -> Outcome:

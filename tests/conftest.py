@@ -10,6 +10,9 @@ from collections.abc import Callable
 import pytest
 from hypothesis import settings
 
+# Before any test imports drjit: says where the LLVM of the installation lies.
+import mbtf_gen  # noqa: F401
+
 # The same examples in every run, and no limit on the time of one: neither machine nor luck decides a test.
 settings.register_profile("project", derandomize=True, deadline=None)
 settings.load_profile("project")
