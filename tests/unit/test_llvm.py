@@ -243,6 +243,21 @@ def leave():  # type: ignore[no-untyped-def]
     raise SystemExit(7)
 
 
+def prove_whatever_the_version():  # type: ignore[no-untyped-def]
+    engine.OLDEST_LLVM = 0
+    engine.version_of = lambda library: (15, 0, 0)
+    yield from engine._proof(engine.CPU_VARIANT)
+
+
+def test_the_proof_catches_the_abort_of_llvm_15(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Without the version check, the test kernels end the child in the way they would end a render."""
+    monkeypatch.setenv(llvm.VARIABLE, old_llvm(15))
+    environment = {llvm.CACHE_VARIABLE: str(tmp_path)}
+    outcome = run_child(__name__, "prove_whatever_the_version", timeout=60, environment=environment)
+    assert "ended by SIGABRT" in outcome.fault
+    assert "device" not in outcome.answers
+
+
 @pytest.mark.parametrize(
     ("function", "arguments", "answers", "fault"),
     [
