@@ -16,7 +16,8 @@ import mitsuba as mi
 
 @dataclass(frozen=True)
 class Period:
-    """The box a ray is traced in, all in scene units.
+    """The box a ray is traced in, all in scene units; ``mi.Float`` of width 1, kept out of the kernels' code
+    so that tiles of other sizes use the same compiled kernels.
 
     Attributes
     ----------
@@ -28,13 +29,13 @@ class Period:
     offset : distance from the surface at which a ray that leaves it starts
     """
 
-    low: tuple[float, float]
-    size: tuple[float, float]
-    reach: tuple[float, float]
-    bottom: float
-    top: float
-    overlap: float
-    offset: float
+    low: tuple[Any, Any]
+    size: tuple[Any, Any]
+    reach: tuple[Any, Any]
+    bottom: Any
+    top: Any
+    overlap: Any
+    offset: Any
 
 
 def wrap(period: Period, p: Any) -> Any:
@@ -44,7 +45,7 @@ def wrap(period: Period, p: Any) -> Any:
     return mi.Point3f(dr.fma(-kx, period.size[0], p.x), dr.fma(-ky, period.size[1], p.y), p.z)
 
 
-def _side(position: Any, direction: Any, low: float, high: float) -> Any:
+def _side(position: Any, direction: Any, low: Any, high: Any) -> Any:
     """Distance along a ray to the side of a slab that the ray moves towards; infinite when it moves along
     it."""
     target = dr.select(direction > 0, high, low)

@@ -88,8 +88,16 @@ def _camera_rays(camera: Camera, estimator: Estimator) -> Any:
     from .sensor import ray_through
 
     tile = estimator.tile
-    forward, right, up = camera.frame()
-    position = mi.Point3f([float(c) for c in camera.position])
+
+    def numbers(*values: float) -> list[Any]:
+        """Opaque, so that every camera uses the same compiled kernel."""
+        return [dr.opaque(mi.Float, float(v)) for v in values]
+
+    forward, right, up = (mi.Vector3f(*numbers(*axis)) for axis in camera.frame())
+    position = mi.Point3f(*numbers(*camera.position))
+    unit, aspect, start, pitch = numbers(tile.unit, tile.aspect, CLEARANCE, camera.pixel_pitch)
+    centre_x, centre_y = numbers(camera.columns / 2 - 0.5, camera.rows / 2 - 0.5)
+    columns = dr.opaque(mi.UInt32, camera.columns)
 
     class CameraRays:
         def set_queries(self, queries: Queries, first: int = 0) -> None:
@@ -98,18 +106,17 @@ def _camera_rays(camera: Camera, estimator: Estimator) -> Any:
         def footprint(self, query: Any, xi: Any) -> Any:
             pixel = query + self.first
             jitter = mi.warp.square_to_std_normal(xi) * PIXEL_SIGMA
-            x = (
-                mi.Float(pixel % camera.columns) + (0.5 - camera.columns / 2) + jitter.x
-            ) * camera.pixel_pitch
-            y = ((camera.rows / 2 - 0.5) - mi.Float(pixel // camera.columns) + jitter.y) * camera.pixel_pitch
-            d = mi.Vector3f(forward) + mi.Vector3f(right) * x + mi.Vector3f(up) * y
+            row = pixel // columns
+            x = (mi.Float(pixel - row * columns) - centre_x + jitter.x) * pitch
+            y = (centre_y - mi.Float(row) + jitter.y) * pitch
+            d = forward + right * x + up * y
             # A jitter of many pixels could reach the horizon; such rays have no weight worth speaking of.
             t = position.z / dr.maximum(-d.z, 1e-4)
-            return mi.Point2f(position.x + t * d.x, (position.y + t * d.y) / tile.aspect)
+            return mi.Point2f(position.x + t * d.x, (position.y + t * d.y) / aspect)
 
         def ray(self, query: Any, point: Any) -> Any:
-            towards = mi.Vector3f(position.x - point.x, position.y - point.y * tile.aspect, position.z)
-            return ray_through(point, dr.normalize(towards), tile.unit, tile.aspect, CLEARANCE)
+            towards = mi.Vector3f(position.x - point.x, position.y - point.y * aspect, position.z)
+            return ray_through(point, dr.normalize(towards), unit, aspect, start)
 
     return CameraRays()
 

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -91,13 +92,17 @@ def build_tile(grid: HeightGrid, bsdf: Mapping[str, Any] | Any, apron_share: flo
     scene = mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, "tile": mesh})
     cell = (unit / columns, unit * grid.aspect / rows)
     extent = max(0.5 * LONG_SIDE * (1.0 + 2.0 * apron_share), grid.relief * unit)
+
+    def number(x: float) -> Any:
+        return dr.opaque(mi.Float, x)
+
     period = Period(
-        low=(0.5 * cell[0] - 0.5 * unit, -0.5 * cell[1] - 0.5 * unit * grid.aspect),
-        size=(unit, unit * grid.aspect),
-        reach=((cells[1] - 0.5) * cell[0], (cells[0] - 0.5) * cell[1]),
-        bottom=-grid.relief * unit - CLEARANCE,
-        top=CLEARANCE,
-        overlap=0.25 * min(cell),
-        offset=RELATIVE_OFFSET * extent,
+        low=(number(0.5 * cell[0] - 0.5 * unit), number(-0.5 * cell[1] - 0.5 * unit * grid.aspect)),
+        size=(number(unit), number(unit * grid.aspect)),
+        reach=(number((cells[1] - 0.5) * cell[0]), number((cells[0] - 0.5) * cell[1])),
+        bottom=number(-grid.relief * unit - CLEARANCE),
+        top=number(CLEARANCE),
+        overlap=number(0.25 * min(cell)),
+        offset=number(RELATIVE_OFFSET * extent),
     )
     return Tile(grid, unit, mesh, scene, period)

@@ -20,7 +20,7 @@ from .queries import Queries
 MAX_STOCK_QUERIES = 1 << 24
 
 
-def ray_through(point: Any, omega_o: Any, unit: float, aspect: float, start: float) -> Any:
+def ray_through(point: Any, omega_o: Any, unit: Any, aspect: Any, start: Any) -> Any:
     """Ray against ω_o that passes the reference plane exactly at uv `point`, wrapped into the tile.
 
     Parameters
@@ -41,9 +41,10 @@ class QuerySensor(mi.Sensor):
 
     def __init__(self, props: Any) -> None:
         super().__init__(props)
-        self.unit = float(props.get("unit", 32.0))
-        self.aspect = float(props.get("aspect", 1.0))
-        self.start = float(props.get("start", 0.01))
+        # Opaque: other tiles use the same compiled kernels.
+        self.unit = dr.opaque(mi.Float, float(props.get("unit", 32.0)))
+        self.aspect = dr.opaque(mi.Float, float(props.get("aspect", 1.0)))
+        self.start = dr.opaque(mi.Float, float(props.get("start", 0.01)))
         self.u = mi.Point2f(0.0)
         self.sigma = mi.Float(0.0)
         self.omega_o = mi.Vector3f(0, 0, 1)
