@@ -79,31 +79,31 @@ def generate(
     output
         Folder of shards. Default: shards/
     queries
-        Training queries: N, or N/texel of the finest level.
+        Training queries: N, or N/texel of the finest level. Default: 100/texel
     test_queries
-        Test queries: N or N/texel.
+        Test queries: N or N/texel. Default: 8192
     spp
-        Paths per training query, both halves together (even).
+        Paths per training query, both halves together (even). Default: 4
     test_spp
-        Paths per test query, both halves together (even).
+        Paths per test query, both halves together (even). Default: 256
     height
-        Factor on the stored heights, in tile widths.
+        Factor on the stored heights, in tile widths. Default: the material's own
     mesh
-        Mesh cells across the tile.
+        Mesh cells across the tile. Default: the map's width, at most 512
     levels
-        Finest level k: 2^k texels across.
+        Finest level k: 2^k texels across. Default: from the map's width
     light_width
-        RMS angle of the light per axis in degrees; 0 is a delta light.
+        RMS angle of the light per axis in degrees; 0 is a delta light. Default: 1
     min_cos
-        Smallest cosine of light and view directions to the normal.
+        Smallest cosine of light and view directions to the normal. Default: 0.1
     max_depth
-        Surface interactions per path; 0: no limit (Russian roulette).
+        Surface interactions per path; 0: no limit (Russian roulette). Default: 0
     layout
         shuffled queries, or one image buffer per (light, view, footprint).
     format
         npz or exr shards.
     seed
-        Root seed.
+        Root seed. Default: 0
     shards
         Slice i/n: make only every n-th shard; finish with mbtf-gen merge.
     config
