@@ -135,18 +135,6 @@ class GeneratorConfig(Settings):
         return hashlib.sha256(text.encode()).hexdigest()
 
 
-def differences(old: dict[str, Any], new: dict[str, Any], prefix: str = "") -> list[str]:
-    """Fields in which two nested mappings differ, as ``key: old -> new``."""
-    out: list[str] = []
-    for key in sorted({*old, *new}):
-        a, b = old.get(key), new.get(key)
-        if isinstance(a, dict) and isinstance(b, dict):
-            out += differences(a, b, f"{prefix}{key}.")
-        elif a != b:
-            out.append(f"{prefix}{key}: {a} -> {b}")
-    return out
-
-
 def check_queries_flag(text: str | None, flag: str = "--queries") -> str | None:
     """A ``--queries`` value, checked before anything is loaded.
 

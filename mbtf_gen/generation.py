@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from .atomic import digest, read_json, write_json, write_text
-from .config import GeneratorConfig, count_queries, differences
+from .config import GeneratorConfig, count_queries
 from .effects import simulated_effects
 from .errors import InputError, PartialError, UsageError
 from .levels import Lattice
@@ -22,7 +22,7 @@ from .manifest import ShardEntry, build_manifest, software_versions
 from .material import Material, load_material
 from .queries import Mixture, QueryPlan
 from .schema import CONFIG_NAME, FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, SPLITS, Split
-from .settings import dump_yaml
+from .settings import differences, dump_yaml
 from .shard_files import shard_suffix, write_shard
 from .verification import is_finished, sidecar_of
 

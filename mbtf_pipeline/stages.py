@@ -138,7 +138,7 @@ def _key(stage: Stage, depends: Mapping[str, Any]) -> str:
 
 
 def _what_changed(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
-    from mbtf_gen.config import differences
+    from mbtf_gen.settings import differences
 
     if changes := differences(old.get("config", {}), new["config"]):
         more = f" and {len(changes) - 3} more" if len(changes) > 3 else ""
