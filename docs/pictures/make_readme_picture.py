@@ -1,0 +1,42 @@
+"""Makes docs/pictures/readme.png from a finished quickstart run: reference left of each seam, fitted
+material right of it.
+
+Run after ``make demo``, from the repository's root: ``.venv/bin/python
+docs/pictures/make_readme_picture.py``.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+RUN = Path("out/quickstart/compare/pictures")
+SCENES = ("v1-l1-z1", "v2-l1-z1", "v2-l2-z1", "v2-l1-z2")
+GAP = 6
+
+
+def split(scene: str) -> NDArray[np.uint8]:
+    """One picture: the reference on the left, the fit on the right, a white seam between them."""
+    reference, fit = (
+        np.asarray(Image.open(RUN / f"{scene}-{name}.png").convert("RGB"))
+        for name in ("reference-query", "fit-neumip")
+    )
+    middle = reference.shape[1] // 2
+    out = np.concatenate([reference[:, :middle], fit[:, middle:]], axis=1)
+    out[:, middle - 1 : middle + 1] = 255
+    return out
+
+
+def main() -> None:
+    """Write the picture."""
+    panels = [split(scene) for scene in SCENES]
+    gap = np.full((panels[0].shape[0], GAP, 3), 255, np.uint8)
+    row = [part for panel in panels for part in (panel, gap)][:-1]
+    Image.fromarray(np.concatenate(row, axis=1)).save(Path(__file__).with_name("readme.png"), optimize=True)
+
+
+if __name__ == "__main__":
+    main()
