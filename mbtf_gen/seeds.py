@@ -1,9 +1,9 @@
 """Random streams, an injective function of (root seed, split, shard, purpose, pass, half).
 
 Queries are drawn with NumPy's Philox, a counter-based generator whose key holds all of these numbers
-unhashed. Paths are drawn inside kernels with PCG32 (O'Neill 2014), one stream per path: the stream's number
-holds the same fields, its start the root seed and the path's number, so that no value depends on how paths
-are grouped into launches.
+unhashed. Paths are drawn inside kernels with PCG32 (O'Neill 2014), one generator per path: its sequence
+number holds the fields other than the root seed, its start all of them and the path's number, hashed, so that
+no value depends on how paths are grouped into launches.
 """
 
 from __future__ import annotations
@@ -48,6 +48,15 @@ def numpy_generator(
     return np.random.Generator(np.random.Philox(key=key))
 
 
+def _mix(x: Any) -> Any:
+    """The finaliser of MurmurHash3 (Appleby), a bijection of ``mi.UInt64``."""
+    import mitsuba as mi
+
+    x = (x ^ (x >> 33)) * mi.UInt64(0xFF51AFD7ED558CCD)
+    x = (x ^ (x >> 33)) * mi.UInt64(0xC4CEB9FE1A85EC53)
+    return x ^ (x >> 33)
+
+
 def path_generator(root: int, stream: Any, lane: Any) -> Any:
     """PCG32 inside a kernel, one per lane.
 
@@ -59,11 +68,8 @@ def path_generator(root: int, stream: Any, lane: Any) -> Any:
     import drjit as dr
     import mitsuba as mi
 
-    # The finaliser of MurmurHash3 is a bijection: distinct paths start at distinct, unrelated states.
-    state = (lane + dr.opaque(mi.UInt64, root)) * mi.UInt64(0x9E3779B97F4A7C15)
-    state ^= state >> 33
-    state *= mi.UInt64(0xFF51AFD7ED558CCD)
-    state ^= state >> 33
-    state *= mi.UInt64(0xC4CEB9FE1A85EC53)
-    state ^= state >> 33
-    return mi.PCG32(initstate=state, initseq=stream)
+    # PCG32 sequences of different numbers that start from one state stay a constant apart, the same for every
+    # start, and are anything but independent. So every field goes into the start, each hashed before the next
+    # is added: neighbouring root seeds then share nothing either.
+    key = _mix(_mix(stream + mi.UInt64(1)) + dr.opaque(mi.UInt64, root))
+    return mi.PCG32(initstate=_mix(key + lane * mi.UInt64(0x9E3779B97F4A7C15)), initseq=stream)
