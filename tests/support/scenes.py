@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import ArrayLike, NDArray
 
 from mbtf_gen.engine import load_mitsuba
@@ -45,6 +47,25 @@ def rocks(resolution: int = 64, relief: float = 0.15, seed: int = 3) -> HeightGr
     # Terraces: flat tops, steep flanks, a tilt that breaks every symmetry.
     h = 0.7 * np.floor(5.0 * h) / 5.0 + 0.3 * h
     return HeightGrid.from_map(h, relief / (h.max() - h.min()))
+
+
+def real_heights(name: str, resolution: int = 96) -> HeightGrid:
+    """Height grid of a real material: ``turtle_shell`` of the assets, or a set in ``../shared/data`` beside
+    the project.
+
+    The test is skipped, by name, where the set is not there.
+    """
+    from mbtf_gen.material import load_material
+
+    root = Path(__file__).parents[2]
+    folder = root / "assets" / name
+    height = None
+    if not folder.exists():
+        folder = root.parent / "shared" / "data" / "materials" / name
+        height = 0.15
+        if not folder.exists():
+            pytest.skip(f"{name} is not beside the project")
+    return load_material(folder).grid(height, resolution)
 
 
 def queries(u: ArrayLike, sigma: ArrayLike, omega_i: ArrayLike, omega_o: ArrayLike, n: int) -> Queries:
