@@ -11,9 +11,10 @@ import json
 import re
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field
 
 from .errors import UsageError
+from .light import MAX_WIDTH_DEG, MIN_WIDTH_DEG
 from .schema import SCHEMA_VERSION, ArrayFormat, Layout
 from .settings import Settings
 
@@ -45,8 +46,10 @@ def count_queries(text: str | int | float, texels: int) -> int:
 
 
 def _count(text: Any) -> str:
-    parse_count(text)
-    return str(text)
+    """One spelling per count, so that ``400 / texel`` and ``400/texel`` are one configuration."""
+    number, per_texel = parse_count(text)
+    digits = str(int(number)) if number == int(number) else repr(number)
+    return f"{digits}/texel" if per_texel else digits
 
 
 def _even(spp: int) -> int:
@@ -55,7 +58,13 @@ def _even(spp: int) -> int:
     return spp
 
 
-Count = Annotated[str, AfterValidator(_count)]
+def _light_width(width: float) -> float:
+    if 0 < width < MIN_WIDTH_DEG:
+        raise ValueError(f"must be 0 (a delta light) or at least {MIN_WIDTH_DEG} degrees")
+    return width
+
+
+Count = Annotated[str, BeforeValidator(_count)]
 Paths = Annotated[int, Field(ge=2, le=1 << 20), AfterValidator(_even)]
 
 
@@ -93,7 +102,9 @@ class QueriesSection(Settings):
 class LightSection(Settings):
     """The smoothed directional light."""
 
-    width: float = Field(1.0, ge=0, le=45, description="RMS angle per axis in degrees; 0 is a delta light")
+    width: Annotated[float, AfterValidator(_light_width)] = Field(
+        1.0, ge=0, le=MAX_WIDTH_DEG, description="RMS angle per axis in degrees; 0 is a delta light"
+    )
 
 
 class TransportSection(Settings):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -29,6 +30,15 @@ from .verification import is_finished, sidecar_of
 log = logging.getLogger(__name__)
 
 ProgressCallback = Callable[[float, str], None]
+
+# A folder and a manifest of more are of no use to anyone.
+MAX_SHARD_FILES = 1_000_000
+
+# What a run writes into its folder, and what a killed one leaves there.
+_OWN = re.compile(
+    rf"{re.escape(MANIFEST_NAME)}|{re.escape(CONFIG_NAME)}|(?:{'|'.join(SPLITS)})-\d+\.(?:npz|exr|json)"
+)
+_LEFTOVER = re.compile(rf"\.(?:{_OWN.pattern})\.\d+\.tmp|\.(?:{'|'.join(SPLITS)})-\d+\.lock")
 
 
 @dataclass(frozen=True)
@@ -108,12 +118,23 @@ class Job:
         return self.config.queries.spp if split == "train" else self.config.queries.test_spp
 
     def shards(self, split: Split) -> list[ShardEntry]:
-        """Shards of a split and their rows."""
+        """Shards of a split and their rows.
+
+        Raises
+        ------
+        UsageError : more than ``MAX_SHARD_FILES``
+        """
         wanted = self.config.queries.train if split == "train" else self.config.queries.test
         rows = count_queries(wanted, self.lattice.texels())
         if self.config.queries.layout == "image":
             rows = max(1, math.ceil(rows / self.lattice.texels()))
         size = self._shard_rows()
+        if rows > size * MAX_SHARD_FILES:
+            raise UsageError(
+                f"{wanted} {split} queries are more than {MAX_SHARD_FILES} shards of {size}",
+                where="queries",
+                cure="ask for fewer, or raise output.shard_queries",
+            )
         suffix = shard_suffix(self.config.output.format)
         return [
             ShardEntry(split, index, f"{split}-{index:05d}{suffix}", min(size, rows - index * size))
@@ -132,15 +153,11 @@ def build_estimator(config: GeneratorConfig, material: Material) -> Any:
     from .scene import build_tile
     from .tracing import Transport
 
-    try:
-        light = LightKernel(config.light.width)
-    except ValueError as error:
-        raise UsageError(str(error), where="light.width") from None
     tile = build_tile(material.grid(config.geometry.height, config.geometry.mesh), bsdf_of(material))
     transport = Transport(
         config.transport.max_depth, config.transport.roulette_depth, config.transport.max_crossings
     )
-    return Estimator(tile, light, transport)
+    return Estimator(tile, LightKernel(config.light.width), transport)
 
 
 def _open_folder(job: Job, folder: Path, manifest: dict[str, Any], overwrite: bool) -> None:
@@ -153,17 +170,15 @@ def _open_folder(job: Job, folder: Path, manifest: dict[str, Any], overwrite: bo
     if folder.exists() and not folder.is_dir():
         raise InputError("is a file, not a folder", where=folder)
     existing = folder / MANIFEST_NAME
-    if overwrite and existing.exists():
-        for path in folder.iterdir():
-            if path.name in (MANIFEST_NAME, CONFIG_NAME) or path.name.startswith(("train-", "test-", ".")):
-                path.unlink()
-    if folder.exists() and any(folder.iterdir()):
-        if not existing.exists():
-            raise InputError(
-                "is not empty and holds no data set", where=folder, cure="choose another folder with -o"
-            )
+    if existing.exists():
         old = read_json(existing)
-        if old.get("config_hash") != job.config_hash:
+        if old.get("format") != FORMAT_NAME:
+            raise InputError(
+                f"is not a manifest of {FORMAT_NAME}", where=existing, cure="choose another folder with -o"
+            )
+        if overwrite:
+            _clear(folder)
+        elif old.get("config_hash") != job.config_hash:
             before = {**old.get("config", {}), "inputs": old.get("inputs", {}), "schema": old.get("schema")}
             after = {**manifest["config"], "inputs": manifest["inputs"], "schema": SCHEMA_VERSION}
             changes = "; ".join(differences(before, after)[:8]) or "inputs differ"
@@ -172,13 +187,27 @@ def _open_folder(job: Job, folder: Path, manifest: dict[str, Any], overwrite: bo
                 where=folder,
                 cure="choose another folder with -o, or replace it with --overwrite",
             )
-        return
+    elif folder.exists() and not all(_LEFTOVER.fullmatch(p.name) for p in folder.iterdir()):
+        raise InputError(
+            "is not empty and holds no data set", where=folder, cure="choose another folder with -o"
+        )
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"cannot be made ({error.strerror})", where=folder) from None
-    write_text(folder / CONFIG_NAME, dump_yaml(manifest["config"]))
-    write_json(folder / MANIFEST_NAME, manifest)
+    # The manifest first: it makes the folder ours, whatever instant the run is killed at.
+    if not existing.exists():
+        write_json(existing, manifest)
+    if not (folder / CONFIG_NAME).exists():
+        write_text(folder / CONFIG_NAME, dump_yaml(manifest["config"]))
+
+
+def _clear(folder: Path) -> None:
+    """Remove a data set and nothing else; the manifest last, so that the rest never stands without it."""
+    names = (p.name for p in folder.iterdir())
+    for name in sorted(names, key=lambda name: name == MANIFEST_NAME):
+        if _OWN.fullmatch(name) or _LEFTOVER.fullmatch(name):
+            (folder / name).unlink(missing_ok=True)
 
 
 def _sidecar(job: Job, entry: ShardEntry, path: Path, estimates: Any, seconds: float) -> dict[str, Any]:
@@ -281,6 +310,8 @@ def generate(
                 if not held:
                     busy.append(entry.file)
                 elif not is_finished(path, entry.rows, job.config_hash):
+                    for stale in folder.glob(f".{path.stem}.*.tmp"):
+                        stale.unlink(missing_ok=True)
                     if estimator is None:
                         estimator = build_estimator(config, job.material)
                     paths += _make_shard(job, plan, estimator, entry, path)["paths"]

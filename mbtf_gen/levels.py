@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+MAX_LEVEL = 14
+
 
 def sigma_of_level(level: ArrayLike) -> NDArray[np.float64]:
     """Standard deviation, in tile widths, of the footprint of a (fractional) level. Any shape."""
@@ -38,15 +40,16 @@ class Lattice:
     aspect: float = 1.0
 
     def __post_init__(self) -> None:
-        if not 0 <= self.finest <= 14:
-            raise ValueError(f"finest level must lie in 0..14, not {self.finest}")
+        if not 0 <= self.finest <= MAX_LEVEL:
+            raise ValueError(f"finest level must lie in 0..{MAX_LEVEL}, not {self.finest}")
         if not self.aspect > 0:
             raise ValueError(f"aspect must be positive, not {self.aspect}")
 
     @classmethod
     def for_map(cls, rows: int, columns: int, finest: int | None = None) -> Lattice:
-        """Lattice of a map of `rows` × `columns` pixels; by default ``k = floor(log2(columns))``."""
-        k = int(columns).bit_length() - 1 if finest is None else finest
+        """Lattice of a map of `rows` × `columns` pixels; by default ``k = floor(log2(columns))``, at most
+        14."""
+        k = min(int(columns).bit_length() - 1, MAX_LEVEL) if finest is None else finest
         return cls(k, rows / columns)
 
     def shape(self, level: int | None = None) -> tuple[int, int]:

@@ -16,6 +16,8 @@ from pathlib import Path
 
 # Seconds after which an untouched lock of another machine counts as abandoned.
 STALE_SECONDS = 1800.0
+# Locks of this process. Process numbers come again, after a restart of a container in particular.
+_held: set[Path] = set()
 
 
 def _owner_is_gone(lock: Path) -> bool:
@@ -30,7 +32,7 @@ def _owner_is_gone(lock: Path) -> bool:
         return age > 5.0
     if host == socket.gethostname():
         if process == os.getpid():
-            return False
+            return lock.resolve() not in _held
         try:
             os.kill(process, 0)
         except ProcessLookupError:
@@ -51,10 +53,12 @@ def shard_lock(path: Path) -> Iterator[bool]:
     except FileExistsError:
         yield False
         return
+    _held.add(lock.resolve())
     try:
         with os.fdopen(handle, "w") as stream:
             owner = {"host": socket.gethostname(), "process": os.getpid(), "since": time.time()}
             json.dump(owner, stream)
         yield True
     finally:
+        _held.discard(lock.resolve())
         lock.unlink(missing_ok=True)

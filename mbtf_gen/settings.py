@@ -27,6 +27,8 @@ class Settings(BaseModel):
 
 S = TypeVar("S", bound=BaseModel)
 
+_COMMAND_LINE = "command line"
+
 
 def _yaml() -> Any:
     from ruamel.yaml import YAML
@@ -121,7 +123,8 @@ def _explain(error: ValidationError, model: type[BaseModel], data: Any, source: 
     fault = next((f for f in faults if f["type"] == "extra_forbidden"), faults[0])
     location = list(fault["loc"])
     dotted = ".".join(str(p) for p in location) or "(top level)"
-    line = line_of(data, location)
+    # Data that the command line has changed may still carry the file's line numbers.
+    line = None if source == _COMMAND_LINE else line_of(data, location)
     where = f"{source}:{line}" if line is not None else source
     if fault["type"] == "extra_forbidden":
         known = _known_keys(model, location)
@@ -195,22 +198,24 @@ def resolve(
     UsageError : an assignment or a flag is at fault
     """
     data: Any = read_yaml(file) if file is not None else {}
-    if file is not None and not assignments and not any(v is not None for v in (flags or {}).values()):
-        return build(model, data, source=str(file))
-    if file is not None:
-        probe = {k: v for k, v in (flags or {}).items() if v is not None}
-        missing = [k for k, f in model.model_fields.items() if f.is_required() and k not in data]
-        if not any(k in probe or any(a.startswith(f"{k}=") for a in assignments) for k in missing):
-            build(model, data, source=str(file))
+    given: list[tuple[str, Any]] = []
     for assignment in assignments:
         key, sign, text = assignment.partition("=")
         if not sign or not key:
             raise UsageError(f"'{assignment}' is not of the form key=value", where="--set")
-        merge(data, key.strip().split("."), _parse_value(text))
-    for key, value in (flags or {}).items():
-        if value is not None:
-            merge(data, key.split("."), value)
-    return build(model, data, source="command line", error=UsageError)
+        given.append((key.strip(), _parse_value(text)))
+    given += [(key, value) for key, value in (flags or {}).items() if value is not None]
+    if file is not None:
+        # The file's own faults are the file's, also where the command line supplies a key that it lacks.
+        for key, value in given:
+            if key in model.model_fields and model.model_fields[key].is_required() and key not in data:
+                data[key] = value
+        resolved = build(model, data, source=str(file))
+        if not given:
+            return resolved
+    for key, value in given:
+        merge(data, key.split("."), value)
+    return build(model, data, source=_COMMAND_LINE, error=UsageError)
 
 
 def differences(old: Mapping[str, Any], new: Mapping[str, Any], prefix: str = "") -> list[str]:
