@@ -24,6 +24,7 @@ STAMP_FORMAT = "mbtf-stage"
 STAGE_SCHEMA = 1
 STAMPS = "stages"
 FORCED = "forced"
+NOT_RUN = "has not run"
 
 
 def hash_of(data: Any) -> str:
@@ -161,7 +162,7 @@ def decide(folder: Path, stage: Stage, upstream: Mapping[str, str], fresh: Seque
     """
     stamp = read_stamp(folder, stage.name)
     if stamp is None:
-        return Decision("has not run")
+        return Decision(NOT_RUN)
     depends = _depends(stage, upstream)
     if stamp.key != _key(stage, depends):
         return Decision(_what_changed(stamp.depends, depends))

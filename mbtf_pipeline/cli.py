@@ -1,0 +1,150 @@
+"""Command line of ``mbtf-pipeline``."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from cyclopts import Parameter
+
+from mbtf_gen.console import CONSOLE, Console, clock, new_app
+from mbtf_gen.errors import InputError, MbtfError
+
+if TYPE_CHECKING:
+    from .run import RunResult
+
+app = new_app("mbtf-pipeline", "Run recipes: generate, fit, compare, report.")
+
+Set = Annotated[list[str], Parameter(name="--set", help="Set any option of the recipe, a.b=c. Repeatable.")]
+Output = Annotated[Path | None, Parameter(name=["--output", "-o"])]
+_FOLDER = Path("pipelines")
+
+
+@app.command
+def run(
+    recipe: Path,
+    /,
+    *,
+    output: Output = None,
+    force: Annotated[bool, Parameter(negative="")] = False,
+    assignments: Set | None = None,
+    console: Console = CONSOLE,
+) -> None:
+    """Run a recipe: mbtf-pipeline run pipelines/quickstart.yaml
+
+    A stage whose inputs have not changed is skipped; the same command again resumes an interrupted run.
+
+    Parameters
+    ----------
+    recipe
+        YAML file.
+    output
+        Folder of the run. Default: out/NAME
+    force
+        Run every stage, also those that are up to date.
+    """
+    from .recipe import load_recipe
+    from .run import run_recipe
+
+    loaded = load_recipe(recipe, assignments or [])
+    command = ["mbtf-pipeline", "run", str(recipe)]
+    command += ["-o", str(output)] if output is not None else []
+    command += [part for a in assignments or [] for part in ("--set", a)]
+    result = run_recipe(loaded, output, force=force, command=shlex.join(command), console=console)
+    console.report(_summary(result), _describe(result))
+
+
+def _summary(result: RunResult) -> dict[str, Any]:
+    return {
+        "folder": result.folder,
+        "report": result.report,
+        "seconds": round(sum(o.stamp.seconds for o in result.outcomes.values() if o.ran), 3),
+        "stages": {
+            name: {"ran": o.ran, "reason": o.reason or "up to date", "seconds": o.stamp.seconds}
+            for name, o in result.outcomes.items()
+        },
+        "test": {
+            fit: {
+                "unexplained_variance": r["splits"]["test"]["unexplained"],
+                "mse": r["splits"]["test"]["mse"],
+            }
+            for fit, r in result.comparison["test"].items()
+        },
+    }
+
+
+def _describe(result: RunResult) -> str:
+    from .report_pictures import estimate
+
+    ran = [f"{n} {clock(o.stamp.seconds)}" for n, o in result.outcomes.items() if o.ran]
+    lines = [f"{result.report}: {', '.join(ran) or 'everything up to date'}"]
+    for fit, record in result.comparison["test"].items():
+        lines.append(f"  {fit}: unexplained variance {estimate(record['splits']['test']['unexplained'])}")
+    return "\n".join(lines)
+
+
+@app.command(name="list")
+def list_recipes(
+    folder: Path = _FOLDER,
+    /,
+    *,
+    verbose: Annotated[bool, Parameter(alias="-v", negative="")] = False,
+    console: Console = CONSOLE,
+) -> None:
+    """List the recipes of a folder.
+
+    Parameters
+    ----------
+    folder
+        Where to look.
+    verbose
+        Also say which stages of each would run (reads what they made).
+    """
+    if not folder.is_dir():
+        raise InputError("no such folder", where=folder)
+    found = [_entry(path, verbose) for path in sorted(folder.glob("*.y*ml"))]
+    lines = []
+    for entry in found:
+        lines.append(f"{entry['file']}: {entry['error'] or entry['description'] or entry['name']}")
+        lines += [f"    {stage}: {state}" for stage, state in entry["stages"].items()]
+    console.report({"recipes": found}, "\n".join(lines) or f"{folder}: no recipes")
+
+
+def _entry(path: Path, verbose: bool) -> dict[str, Any]:
+    from .recipe import load_recipe
+
+    entry: dict[str, Any] = {
+        "file": str(path),
+        "name": None,
+        "description": None,
+        "error": None,
+        "stages": {},
+    }
+    try:
+        recipe = load_recipe(path)
+        entry |= {"name": recipe.name, "description": recipe.description, "folder": str(recipe.folder)}
+        if verbose:
+            from .run import survey
+
+            decisions = survey(recipe, recipe.folder)
+            entry["stages"] = {name: d.reason or "up to date" for name, d in decisions.items()}
+    except MbtfError as error:
+        entry["error"] = error.message.splitlines()[0]
+    return entry
+
+
+@app.command
+def report(folder: Path, /, *, console: Console = CONSOLE) -> None:
+    """Write the report of a finished run again.
+
+    Parameters
+    ----------
+    folder
+        Folder of the run.
+    """
+    from .run import rerender
+
+    path = rerender(folder)
+    size = path.stat().st_size
+    console.report({"report": path, "bytes": size}, f"{path}: {size / 1e6:.1f} MB")

@@ -1,0 +1,188 @@
+"""The compare stage: references and fits at the same pixels, and the errors of both pictures and data."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mbtf_gen.atomic import write_json
+from mbtf_gen.config import GeneratorConfig
+from mbtf_gen.directions import from_angles
+
+from .metrics import DEFINITIONS, Score, halves_score, score, white_point
+from .offsets import write_offsets
+from .pictures import PICTURES, Scene, fit_name, reference_name, scenes, write_picture, write_preview
+from .recipe import CompareSection
+
+if TYPE_CHECKING:
+    from mbtf_fit import Material
+    from mbtf_gen.camera import PixelKind
+    from mbtf_gen.estimator import Estimator
+    from mbtf_gen.reference import ReferenceImage
+
+COMPARISON_NAME = "comparison.json"
+COMPARISON_FORMAT = "mbtf-comparison"
+COMPARISON_SCHEMA = 1
+
+Progress = Callable[[str], None]
+
+
+def steps(compare: CompareSection, fits: int) -> int:
+    """How often :func:`compare` reports progress."""
+    pictures = sum(1 for _ in scenes(compare))
+    return pictures * (len(compare.kinds) + fits)
+
+
+def compare(
+    section: CompareSection,
+    generate: GeneratorConfig,
+    shards: Path,
+    fits: Mapping[str, Path],
+    out: Path,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Render, evaluate, measure; write everything into `out`.
+
+    Parameters
+    ----------
+    generate : the material, its geometry, light and transport
+    shards : data set whose test split the fits are measured on
+    fits : name → folder of the fitted material
+    out : folder; ``comparison.json`` is written last
+    progress : called with what was just done
+
+    Returns
+    -------
+    the content of ``comparison.json``
+    """
+    from mbtf_fit import Material
+    from mbtf_gen.dataset import Dataset
+    from mbtf_gen.generation import build_estimator
+    from mbtf_gen.material import load_material
+
+    (out / PICTURES).mkdir(parents=True, exist_ok=True)
+    materials = {name: Material.load(folder) for name, folder in fits.items()}
+    start = time.perf_counter()
+    estimator = build_estimator(generate, load_material(generate.material))
+    rendered = _render(section, estimator, progress)
+    seconds = {"references": time.perf_counter() - start}
+    # The white point is that of what is compared with; without a query reference, of what there is.
+    white = white_point([next(iter(images.values())).value for _, images in rendered])
+    start = time.perf_counter()
+    pictures = [_picture(scene, images, materials, white, out, progress) for scene, images in rendered]
+    seconds["fits"] = time.perf_counter() - start
+    data = Dataset.open(shards)
+    offsets = write_offsets(estimator, materials, section.offset_views, data.lattice, out)
+    record = {
+        "format": COMPARISON_FORMAT,
+        "schema": COMPARISON_SCHEMA,
+        "fits": list(fits),
+        "kinds": list(section.kinds),
+        "size": section.size,
+        "spp": section.spp,
+        "white": white,
+        "finest": data.lattice.finest,
+        "test_spp": data.manifest["splits"]["test"]["spp"],
+        "definitions": DEFINITIONS,
+        "pictures": pictures,
+        "test": {name: _on_data(material) for name, material in materials.items()},
+        "offsets": offsets,
+        "seconds": {k: round(v, 3) for k, v in seconds.items()},
+    }
+    write_json(out / COMPARISON_NAME, record)
+    return record
+
+
+# Splits in the report's words.
+_SPLITS = {
+    "test": "test",
+    "held_out_queries": "held-out queries",
+    "held_out_directions": "held-out directions",
+}
+
+
+def _on_data(material: Material) -> dict[str, Any]:
+    """Errors on the splits, as the fit measured them when it was done, and the material's size."""
+    errors, weights = material.description["training"]["errors"], material.description["weights"]
+    return {
+        "splits": {_SPLITS[name]: found for name, found in errors.items()},
+        "network_weights": weights["network_weights"],
+        "texels": weights["texels"],
+    }
+
+
+def _render(
+    section: CompareSection, estimator: Estimator, progress: Progress
+) -> list[tuple[Scene, dict[PixelKind, ReferenceImage]]]:
+    """All references by scene and kind, the query kind first."""
+    from mbtf_gen.reference import render_reference
+
+    kinds = sorted(section.kinds, key=lambda kind: kind != "query")
+    out = []
+    for scene in scenes(section):
+        images: dict[PixelKind, ReferenceImage] = {}
+        for kind in kinds:
+            images[kind] = render_reference(
+                estimator,
+                scene.camera(section.size),
+                from_angles(scene.light.elevation, scene.light.azimuth),
+                kind=kind,
+                spp=section.spp,
+                seed=section.seed,
+                index=scene.index,
+            )
+            progress(f"reference {scene.name}")
+        out.append((scene, images))
+    return out
+
+
+def _picture(
+    scene: Scene,
+    images: Mapping[PixelKind, ReferenceImage],
+    materials: Mapping[str, Material],
+    white: float,
+    out: Path,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Write one scene's pictures and measure them."""
+    from mbtf_gen.levels import level_of_sigma
+    from mbtf_gen.stats import pooled_relative_error
+
+    record: dict[str, Any] = scene.describe()
+    record["references"] = {}
+    for kind, image in images.items():
+        file = scene.file(reference_name(image.kind))
+        image.write(out / file, 1.0 / white)
+        noise = pooled_relative_error(image.value_a.reshape(-1, 3), image.value_b.reshape(-1, 3))
+        record["references"][kind] = {"file": file, "noise": noise.as_dict()}
+    if len(images) == 2:
+        query, pixel = images["query"], images["pixel"]
+        between = halves_score((query.value_a, query.value_b), pixel.value_a, pixel.value_b)
+        record["between_references"] = between.as_dict()
+    queries = next(iter(images.values())).queries
+    level = level_of_sigma(queries.sigma)
+    record["levels"] = [round(float(level.min()), 3), round(float(level.max()), 3)]
+    record["fits"] = {}
+    for name, material in materials.items():
+        start = time.perf_counter()
+        flat = queries.flat()
+        value = np.asarray(material.evaluate(flat.u, flat.sigma, flat.omega_i, flat.omega_o), np.float32)
+        seconds = time.perf_counter() - start
+        value = value.reshape(*queries.lead, 3)
+        file = scene.file(fit_name(name))
+        write_picture(out / file, value)
+        write_preview(out / file, value, white)
+        errors: dict[str, Score] = {
+            kind: score(value, image.value_a, image.value_b) for kind, image in images.items()
+        }
+        record["fits"][name] = {
+            "file": file,
+            "seconds": round(seconds, 4),
+            "errors": {kind: s.as_dict(white) for kind, s in errors.items()},
+        }
+        progress(f"{name} {scene.name}")
+    return record

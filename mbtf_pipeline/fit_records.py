@@ -1,0 +1,75 @@
+"""What a fit says about its own training."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+
+@dataclass(frozen=True)
+class History:
+    """Training over time.
+
+    Attributes
+    ----------
+    steps, batch : number of steps and queries per step
+    seconds : of training; device : it ran on; threads : of the processor
+    records : one per look at the held-out queries, as ``mbtf_fit.read_history`` gives them
+    """
+
+    steps: int
+    batch: int
+    seconds: float
+    device: str
+    threads: int
+    records: list[dict[str, Any]]
+
+    @property
+    def samples(self) -> int:
+        """Queries trained on, repetitions counted."""
+        return self.steps * self.batch
+
+    @property
+    def samples_per_second(self) -> float:
+        """While training."""
+        return self.samples / max(self.seconds, 1e-9)
+
+    @property
+    def loss(self) -> list[tuple[float, float]]:
+        """(seconds, training loss in units of the values' variance, noise included)."""
+        return [(r["seconds"], r["loss"]) for r in self.records if _finite(r["loss"])]
+
+    @property
+    def held_out(self) -> list[tuple[float, float, float]]:
+        """(seconds, unexplained variance of held-out queries, its standard error)."""
+        return [
+            (r["seconds"], r["held_out"], r["held_out_error"])
+            for r in self.records
+            if _finite(r["held_out"]) and _finite(r["held_out_error"])
+        ]
+
+
+def _finite(x: float | None) -> bool:
+    return x is not None and math.isfinite(x)
+
+
+def read_training(folder: Path) -> History:
+    """History of the fit in a folder.
+
+    Raises
+    ------
+    InputError : no material there
+    """
+    from mbtf_fit import Material, read_history
+
+    training = Material.load(folder).description["training"]
+    return History(
+        training["steps"],
+        training["batch"],
+        training["seconds"],
+        training["device"],
+        training["threads"],
+        read_history(folder),
+    )

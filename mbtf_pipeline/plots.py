@@ -1,0 +1,209 @@
+"""Plots of the report as SVG text that takes the page's colour and font."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+# Okabe and Ito (2008), without black and yellow: told apart under every common colour-vision deficiency.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
+MARKERS = ("o", "s", "^", "D", "v", "P")
+# Stands for the page's own text colour until the SVG is inlined.
+_INK = "#010203"
+_WIDTH = 5.6
+_HEIGHT = 3.3
+
+
+def colour(index: int) -> str:
+    """Colour of the fit with the given number."""
+    return COLOURS[index % len(COLOURS)]
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A named line: x and y (n,), and optionally the standard error of y (n,)."""
+
+    name: str
+    x: Sequence[float]
+    y: Sequence[float]
+    error: Sequence[float] | None = None
+
+
+# In place of the user's own matplotlib settings.
+_STYLE: dict[str, Any] = {
+    "svg.fonttype": "none",
+    "font.family": "sans-serif",
+    "font.size": 10,
+    "text.color": _INK,
+    "axes.edgecolor": _INK,
+    "axes.labelcolor": _INK,
+    "xtick.color": _INK,
+    "ytick.color": _INK,
+    "axes.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+}
+
+
+@contextlib.contextmanager
+def _style(label: str) -> Iterator[None]:
+    """Matplotlib's settings while a plot is drawn; with the label as salt its ids do not vary."""
+    import matplotlib
+
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update({**_STYLE, "svg.hashsalt": label})
+        yield
+
+
+def _figure(width: float = _WIDTH, height: float = _HEIGHT) -> Any:
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasSVG(figure)
+    figure.patch.set_alpha(0.0)
+    return figure
+
+
+def _svg(figure: Any, label: str) -> str:
+    """The figure as an ``<svg>`` element whose ids are its own on the page."""
+    stream = io.StringIO()
+    nothing = dict.fromkeys(("Date", "Creator", "Type", "Format"))
+    figure.savefig(stream, format="svg", transparent=True, metadata=nothing)
+    text = stream.getvalue()
+    text = text[text.index("<svg") :]
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    prefix = re.sub(r"[^A-Za-z0-9]+", "-", label)
+    text = re.sub(r'\bid="([^"]+)"', rf'id="{prefix}-\1"', text)
+    text = re.sub(r'href="#([^"]+)"', rf'href="#{prefix}-\1"', text)
+    text = re.sub(r"url\(#([^)]+)\)", rf"url(#{prefix}-\1)", text)
+    text = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", text, count=1)
+    text = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1)
+    text = re.sub(r"font: ([\d.]+px) [^;\"]*", r"font-size: \1", text)
+    return text.replace("<svg ", f'<svg role="img" aria-label="{label}" ', 1).replace(_INK, "currentColor")
+
+
+def _axes(figure: Any, x: str, y: str, *, logx: bool = False, logy: bool = False) -> Any:
+    axes = figure.add_subplot()
+    axes.patch.set_alpha(0.0)
+    axes.set_xlabel(x)
+    axes.set_ylabel(y)
+    if logx:
+        axes.set_xscale("log")
+    if logy:
+        axes.set_yscale("log")
+    axes.grid(True, which="major", color=_INK, alpha=0.12, linewidth=0.6)
+    return axes
+
+
+def curves(
+    lines: Sequence[Curve], x: str, y: str, label: str, *, logx: bool = False, logy: bool = True
+) -> str:
+    """Lines with bands of one standard error; axes named with units."""
+    with _style(label):
+        return _svg(_curves(lines, x, y, logx, logy), label)
+
+
+def _curves(lines: Sequence[Curve], x: str, y: str, logx: bool, logy: bool) -> Any:
+    figure = _figure()
+    axes = _axes(figure, x, y, logx=logx, logy=logy)
+    for index, line in enumerate(lines):
+        xs, ys = np.asarray(line.x, float), np.asarray(line.y, float)
+        axes.plot(xs, ys, color=colour(index), linewidth=1.7, label=line.name)
+        if line.error is not None:
+            e = np.asarray(line.error, float)
+            low = np.maximum(ys - e, 1e-12) if logy else ys - e
+            axes.fill_between(xs, low, ys + e, color=colour(index), alpha=0.18, linewidth=0)
+    if logy:
+        _plain_ticks(axes.yaxis)
+    if logx:
+        _plain_ticks(axes.xaxis)
+    axes.legend(frameon=False)
+    return figure
+
+
+def points(
+    groups: Sequence[str],
+    series: Mapping[str, Sequence[tuple[float, float] | None]],
+    x: str,
+    y: str,
+    label: str,
+) -> str:
+    """Values with error bars for named groups along x, one series per fit; None leaves a point out."""
+    with _style(label):
+        return _svg(_points(groups, series, x, y), label)
+
+
+def _points(
+    groups: Sequence[str], series: Mapping[str, Sequence[tuple[float, float] | None]], x: str, y: str
+) -> Any:
+    figure = _figure()
+    axes = _axes(figure, x, y, logy=True)
+    spread = 0.16
+    for index, (name, values) in enumerate(series.items()):
+        shift = (index - (len(series) - 1) / 2) * spread
+        shown = [(g + shift, *v) for g, v in enumerate(values) if v is not None and v[0] > 0]
+        if not shown:
+            continue
+        xs, ys, es = np.asarray(shown, float).T
+        es = np.minimum(es, 0.95 * ys)
+        axes.errorbar(
+            xs,
+            ys,
+            yerr=es,
+            fmt=MARKERS[index % len(MARKERS)],
+            color=colour(index),
+            markersize=5,
+            capsize=2.5,
+            linewidth=1.2,
+            label=name,
+        )
+        axes.plot(xs, ys, color=colour(index), linewidth=0.8, alpha=0.45)
+    axes.set_xticks(range(len(groups)), groups)
+    axes.set_xlim(-0.6, len(groups) - 0.4)
+    _plain_ticks(axes.yaxis)
+    axes.legend(frameon=False)
+    return figure
+
+
+def _plain_ticks(axis: Any) -> None:
+    """Ticks of a logarithmic axis at 1, 2 and 5 of each decade (fewer or more where it is long or short)."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    low, high = axis.get_view_interval()
+    decades = float(np.log10(high / low)) if 0 < low < high else 9.0
+    subs: tuple[float, ...] = (1.0, 2.0, 5.0) if decades < 2.2 else (1.0,)
+    if decades < 0.35:
+        subs = tuple(np.arange(1.0, 10.0, 0.5))
+    axis.set_major_locator(LogLocator(base=10, subs=subs))
+    axis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def bars(parts: Sequence[tuple[str, float]], x: str, label: str) -> str:
+    """Horizontal bars, the first on top, each with its value written beside it."""
+    with _style(label):
+        return _svg(_bars(parts, x), label)
+
+
+def _bars(parts: Sequence[tuple[str, float]], x: str) -> Any:
+    figure = _figure(_WIDTH, 0.42 * len(parts) + 0.75)
+    axes = _axes(figure, x, "")
+    names = [name for name, _ in parts]
+    values = [value for _, value in parts]
+    axes.barh(range(len(parts)), values, color=COLOURS[0], height=0.62)
+    axes.set_yticks(range(len(parts)), names)
+    axes.invert_yaxis()
+    axes.grid(False, axis="y")
+    axes.set_axisbelow(True)
+    axes.set_xlim(0, 1.18 * max([*values, 1e-9]))
+    for row, value in enumerate(values):
+        axes.annotate(f"{value:.3g}", (value, row), (5, 0), textcoords="offset points", va="center")
+    return figure

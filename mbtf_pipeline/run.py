@@ -1,0 +1,243 @@
+"""Runs a recipe: its stages, in the folder of the run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mbtf_fit.config import FitConfig
+from mbtf_gen.atomic import read_json
+from mbtf_gen.console import Console, clock
+from mbtf_gen.errors import InputError
+
+from .recipe import Recipe, read_resolved
+from .run_folder import COMPARE, FITS, REPORT, SHARDS, claim, clear, describe, locked
+from .stages import NOT_RUN, Decision, Outcome, Stage, Stamp, decide, read_stamp, run_again, run_stages
+
+GENERATE_STAGE, COMPARE_STAGE, REPORT_STAGE = "generate", "compare", "report"
+Inputs = Mapping[str, str]
+
+
+def fit_stage(name: str) -> str:
+    """Name of the stage that makes one fit."""
+    return f"fit {name}"
+
+
+def stage_names(recipe: Recipe) -> list[str]:
+    """Stages of a recipe in the order in which they run."""
+    return [GENERATE_STAGE, *(fit_stage(name) for name in recipe.fit), COMPARE_STAGE, REPORT_STAGE]
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What a run made.
+
+    Attributes
+    ----------
+    folder : of the run; report : the HTML file
+    outcomes : by stage, in order
+    comparison : content of the comparison's record
+    """
+
+    folder: Path
+    report: Path
+    outcomes: dict[str, Outcome]
+    comparison: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class _Run:
+    """The stages of one recipe in one folder."""
+
+    recipe: Recipe
+    folder: Path
+    console: Console
+
+    def stages(self, inputs: Inputs) -> list[Stage]:
+        """All stages; `inputs` are the digests of the material's files by role."""
+        recipe = self.recipe
+        generate = recipe.generate.model_dump(mode="json", exclude={"material"})
+        fits = [fit_stage(name) for name in recipe.fit]
+        out = [Stage(GENERATE_STAGE, (), generate, inputs, self._files(SHARDS), self._generate)]
+        for name, config in recipe.fit.items():
+            options = config.fields()
+            run = self._fit(name)
+            files = self._files(f"{FITS}/{name}")
+            out.append(Stage(fit_stage(name), (GENERATE_STAGE,), options, {}, files, run))
+        compared = recipe.compare.model_dump(mode="json")
+        needs = (GENERATE_STAGE, *fits)
+        out.append(Stage(COMPARE_STAGE, needs, compared, {}, self._files(COMPARE), self._compare))
+        shown = {
+            "name": recipe.name,
+            "description": recipe.description,
+            **recipe.report.model_dump(mode="json"),
+        }
+        needs = (*needs, COMPARE_STAGE)
+        out.append(Stage(REPORT_STAGE, needs, shown, {}, lambda: [self.folder / REPORT], self._report))
+        return out
+
+    def _files(self, sub: str) -> Callable[[], list[Path]]:
+        """Lists the files below a sub-folder, hidden ones left out."""
+        top = self.folder / sub
+        return lambda: [
+            p
+            for p in sorted(top.rglob("*"))
+            if p.is_file() and not any(part.startswith(".") for part in p.relative_to(top).parts)
+        ]
+
+    def _generate(self, decision: Decision) -> dict[str, Any]:
+        from mbtf_gen.generation import Job, generate, summary_dict
+        from mbtf_gen.schema import MANIFEST_NAME
+        from mbtf_gen.verification import sidecar_of
+
+        job = Job.prepare(self.recipe.generate)
+        shards = self.folder / SHARDS
+        manifest = shards / MANIFEST_NAME
+        for path in decision.damaged:
+            path.unlink(missing_ok=True)
+            sidecar_of(path).unlink(missing_ok=True)
+        if (
+            decision.forced
+            or not manifest.exists()
+            or read_json(manifest).get("config_hash") != job.config_hash
+        ):
+            clear(shards)
+        per_row = job.lattice.texels() if self.recipe.generate.queries.layout == "image" else 1
+        total = per_row * sum(e.rows for split in ("train", "test") for e in job.shards(split))
+        with self.console.progress(total, "generate", "queries") as bar:
+            summary = generate(
+                self.recipe.generate, shards, progress=lambda done, note: bar.update(done, note), job=job
+            )
+        return summary_dict(summary)
+
+    def _fit(self, name: str) -> Callable[[Decision], dict[str, Any]]:
+        def run(decision: Decision) -> dict[str, Any]:
+            from mbtf_fit import fit
+
+            config, shards, out = self.recipe.fit[name], self.folder / SHARDS, self.folder / FITS / name
+            if decision.reason != NOT_RUN or not _unfinished(out, config, shards):
+                clear(out)
+            budget, unit = (
+                (config.training.time, "s")
+                if config.training.steps is None
+                else (config.training.steps, "steps")
+            )
+            with self.console.progress(budget, fit_stage(name), unit) as bar:
+                result = fit(
+                    config, shards, out, progress=lambda share, note: bar.update(share * budget, note)
+                )
+            return {"seconds": result.seconds, "resumed": result.resumed}
+
+        return run
+
+    def _compare(self, decision: Decision) -> dict[str, Any]:
+        from .compare import compare, steps
+
+        out = self.folder / COMPARE
+        clear(out)
+        fits = {name: self.folder / FITS / name for name in self.recipe.fit}
+        with self.console.progress(steps(self.recipe.compare, len(fits)), "compare", "pictures") as bar:
+            record = compare(
+                self.recipe.compare,
+                self.recipe.generate,
+                self.folder / SHARDS,
+                fits,
+                out,
+                lambda note: bar.advance(1, note),
+            )
+        return {"seconds": record["seconds"]}
+
+    def _report(self, decision: Decision) -> dict[str, Any]:
+        from .report import write_report
+
+        size = write_report(self.folder, self.recipe, stage_names(self.recipe)[:-1])
+        return {"bytes": size}
+
+
+def _unfinished(out: Path, config: FitConfig, shards: Path) -> bool:
+    """Whether a folder holds the beginning of this very fit, from a run that was interrupted."""
+    from mbtf_gen.schema import MANIFEST_NAME
+
+    try:
+        begun, manifest = read_json(out / "fit.json"), read_json(shards / MANIFEST_NAME)
+    except InputError:
+        return False
+    same_data = begun.get("data", {}).get("hash") == manifest.get("config_hash")
+    return same_data and begun.get("config") == config.fields()
+
+
+def _material_inputs(recipe: Recipe) -> dict[str, str]:
+    from mbtf_gen.material import load_material
+
+    return dict(load_material(recipe.generate.material).digests)
+
+
+def run_recipe(
+    recipe: Recipe,
+    folder: Path | None = None,
+    *,
+    force: bool = False,
+    command: str = "",
+    console: Console | None = None,
+) -> RunResult:
+    """Run a recipe; stages whose inputs have not changed are skipped.
+
+    Parameters
+    ----------
+    recipe : from :func:`~mbtf_pipeline.recipe.load_recipe`
+    folder : of the run; by default the recipe's own
+    force : run every stage
+    command : what the report names as the way to make it again
+    console : where progress goes; nowhere by default
+
+    Raises
+    ------
+    InputError : the material, a data set or the folder cannot be used
+    PartialError : something else works in the folder, or the disk is full; the same command resumes
+    """
+    folder = recipe.folder if folder is None else folder
+    console = console or Console(quiet=True)
+    inputs = _material_inputs(recipe)
+    claim(folder)
+
+    def tell(stage: str, decision: Decision, stamp: Stamp | None) -> None:
+        if stamp is None:
+            state = f"runs: {decision.reason}" if decision.runs else "up to date"
+            console.note(f"{stage}: {state}")
+        elif decision.runs:
+            console.note(f"{stage}: done in {clock(stamp.seconds)}")
+
+    with locked(folder):
+        describe(folder, recipe, command)
+        run = _Run(recipe, folder, console)
+        outcomes = run_stages(folder, run.stages(inputs), force=force, tell=tell)
+    from .compare import COMPARISON_NAME
+
+    return RunResult(folder, folder / REPORT, outcomes, read_json(folder / COMPARE / COMPARISON_NAME))
+
+
+def survey(recipe: Recipe, folder: Path) -> dict[str, Decision]:
+    """What :func:`run_recipe` would do with each stage, without doing it."""
+    run = _Run(recipe, folder, Console(quiet=True))
+    out: dict[str, Decision] = {}
+    for stage in run.stages(_material_inputs(recipe)):
+        stamps = {name: read_stamp(folder, name) for name in stage.needs}
+        upstream = {name: stamp.outputs_hash if stamp is not None else "" for name, stamp in stamps.items()}
+        fresh = [name for name, decision in out.items() if decision.runs]
+        out[stage.name] = decide(folder, stage, upstream, fresh)
+    return out
+
+
+def rerender(folder: Path) -> Path:
+    """Write the report of a finished run again; returns its path.
+
+    Raises
+    ------
+    InputError : no run, or one without a finished comparison
+    """
+    run = _Run(read_resolved(folder), folder, Console(quiet=True))
+    with locked(folder):
+        run_again(folder, run.stages({})[-1])
+    return folder / REPORT

@@ -1,0 +1,110 @@
+"""The folder of a run.
+
+out/NAME/run.json        which command made it
+         recipe.yaml     the resolved recipe, runnable again
+         shards/         the data set, as ``mbtf-gen`` makes it
+         fits/FIT/       each fitted material, as ``mbtf-fit`` makes it
+         compare/        pictures, offsets, errors
+         report.html     the report
+         stages/         a stamp per finished stage
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+from mbtf_gen.atomic import read_json, write_json
+from mbtf_gen.errors import InputError, PartialError
+
+from .recipe import Recipe, write_recipe
+
+RUN_NAME = "run.json"
+RUN_FORMAT = "mbtf-run"
+RUN_SCHEMA = 1
+SHARDS, FITS, COMPARE, REPORT = "shards", "fits", "compare", "report.html"
+
+
+def clear(folder: Path) -> None:
+    """Remove what an earlier run left in one of our own sub-folders."""
+    if folder.exists():
+        shutil.rmtree(folder)
+
+
+def claim(folder: Path) -> None:
+    """Make a run's folder, or take an empty one or one that holds a run.
+
+    Raises
+    ------
+    InputError : it holds something else
+    """
+    if folder.exists() and not folder.is_dir():
+        raise InputError("is a file, not a folder", where=folder)
+    seen = folder.exists() and any(not path.name.startswith(".") for path in folder.iterdir())
+    if seen and not is_run(folder):
+        raise InputError("is not empty and holds no run", where=folder, cure="choose another folder with -o")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot be made ({error.strerror})", where=folder) from None
+
+
+def describe(folder: Path, recipe: Recipe, command: str) -> None:
+    """Write what is run, and the command that does it, into the run's folder."""
+    write_json(
+        folder / RUN_NAME,
+        {
+            "format": RUN_FORMAT,
+            "schema": RUN_SCHEMA,
+            "name": recipe.name,
+            "command": command,
+            "machine": machine(),
+        },
+    )
+    write_recipe(recipe, folder)
+
+
+def machine() -> dict[str, str]:
+    """Versions of what results depend on, and what they ran on."""
+    import os
+    import platform
+    from importlib.metadata import PackageNotFoundError, version
+
+    out = {"python": platform.python_version()}
+    for name in ("mbtf", "mitsuba", "drjit", "torch", "numpy", "scipy", "trimesh"):
+        try:
+            out[name] = version(name)
+        except PackageNotFoundError:
+            out[name] = "not installed"
+    out["system"] = f"{platform.system()} {platform.machine()}, {os.cpu_count()} processors"
+    return out
+
+
+def is_run(folder: Path) -> bool:
+    """Whether a folder holds a run of a recipe."""
+    try:
+        return read_json(folder / RUN_NAME).get("format") == RUN_FORMAT
+    except InputError:
+        return False
+
+
+@contextlib.contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Hold a run's folder against other runs.
+
+    Raises
+    ------
+    PartialError : another process holds it
+    """
+    from mbtf_gen.locks import shard_lock
+
+    with shard_lock(folder / RUN_NAME) as held:
+        if not held:
+            raise PartialError(
+                "another run is at work here",
+                where=folder,
+                cure="wait for it, or choose another folder with -o",
+            )
+        yield

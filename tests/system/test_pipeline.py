@@ -1,0 +1,205 @@
+"""The whole chain on a small recipe: what it makes, what it makes again, and a report that stands alone."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mbtf_gen.console import run
+from mbtf_pipeline.pictures import read_picture
+
+ROOT = Path(__file__).resolve().parents[2]
+RECIPE = ROOT / "pipelines" / "ci.yaml"
+STAGES = ["generate", "fit neumip", "compare", "report"]
+
+
+class Loads(HTMLParser):
+    """Collects everything a page would load, and its pictures."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.external: list[str] = []
+        self.pictures: list[str] = []
+        self.style = ""
+        self._open: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self._open.append(tag)
+        for name, value in attrs:
+            if name == "style":
+                self._css(value or "")
+            if name in ("src", "href", "xlink:href", "srcset", "data", "poster", "action", "background"):
+                if tag == "img" and name == "src":
+                    self.pictures.append(value or "")
+                if not (value or "").startswith(("data:", "#")):
+                    self.external.append(f"{tag} {name}={value}")
+
+    def handle_data(self, data: str) -> None:
+        if self._open and self._open[-1] == "style":
+            self._css(data)
+        elif self._open and self._open[-1] == "script":
+            self.external += re.findall(r"(?:fetch|import|XMLHttpRequest|WebSocket|https?:)[^\n]*", data)
+
+    def _css(self, text: str) -> None:
+        self.external += re.findall(r"@import[^;]*", text)
+        found = re.findall(r"url\(\s*['\"]?([^)'\"]*)", text)
+        self.external += [url for url in found if not url.startswith(("data:", "#"))]
+
+
+def loads(html: str) -> Loads:
+    parser = Loads()
+    parser.feed(html)
+    return parser
+
+
+@pytest.mark.parametrize(
+    "planted",
+    [
+        '<img src="compare/v1.png">',
+        '<link rel="stylesheet" href="https://example.org/a.css">',
+        "<style>@import 'a.css';</style>",
+        "<style>body { background: url(paper.png) }</style>",
+        '<p style="background: url(http://example.org/x)">',
+        "<script>fetch('numbers.json')</script>",
+        '<svg><image xlink:href="plot.png"/></svg>',
+    ],
+)
+def test_the_check_finds_planted_loads(planted: str) -> None:
+    assert loads(f"<html>{planted}</html>").external
+    assert not loads('<a href="#x"></a><svg xmlns="http://www.w3.org/2000/svg"></svg>').external
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("pipeline") / "ci"
+
+
+@pytest.fixture(scope="module")
+def first(folder: Path) -> dict[str, Any]:
+    """What the first run prints, as a user starts it."""
+    command = [sys.executable, "-m", "mbtf_pipeline", "run", str(RECIPE), "-o", str(folder), "--json", "-q"]
+    done = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, timeout=300, stdin=subprocess.DEVNULL, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    out: dict[str, Any] = json.loads(done.stdout)
+    return out
+
+
+@pytest.fixture
+def again(first: dict[str, Any], folder: Path, capsys: pytest.CaptureFixture[str]) -> Any:
+    """Runs the recipe again in the same folder; returns which stages ran, by reason."""
+    from mbtf_pipeline.cli import app
+
+    def execute(*options: str) -> dict[str, str]:
+        capsys.readouterr()
+        assert run(app, ["run", str(RECIPE), "-o", str(folder), "--json", "-q", *options]) == 0
+        stages = json.loads(capsys.readouterr().out)["stages"]
+        assert list(stages) == STAGES
+        return {name: s["reason"] for name, s in stages.items() if s["ran"]}
+
+    return execute
+
+
+def test_every_stage_runs_and_the_material_is_learned(first: dict[str, Any], folder: Path) -> None:
+    assert {name: s["ran"] for name, s in first["stages"].items()} == dict.fromkeys(STAGES, True)
+    assert Path(first["report"]) == folder / "report.html"
+    share = first["test"]["neumip"]["unexplained_variance"]
+    # The best constant leaves 1; the bar is far above what the fit reaches and far below that.
+    assert share["value"] + 3 * share["error"] < 0.8
+
+
+def test_pictures_and_numbers_belong_together(first: dict[str, Any], folder: Path) -> None:
+    record = json.loads((folder / "compare" / "comparison.json").read_text())
+    assert [p["name"] for p in record["pictures"]] == ["v1-l1-z1", "v2-l1-z1"]
+    for picture in record["pictures"]:
+        reference = read_picture(folder / "compare" / picture["references"]["query"]["file"])
+        made = picture["fits"]["neumip"]
+        fit = read_picture(folder / "compare" / made["file"])
+        assert reference.shape == fit.shape == (48, 48, 3)
+        assert np.isfinite(reference).all()
+        mse = made["errors"]["query"]["mse"]
+        # The plain error holds the reference's noise as well.
+        plain = float(np.mean((fit.astype(np.float64) - reference) ** 2))
+        assert mse["value"] - 4 * mse["error"] < plain
+        assert made["errors"]["query"]["psnr"]["value"] == pytest.approx(
+            10 * np.log10(record["white"] ** 2 / mse["value"])
+        )
+    splits = record["test"]["neumip"]["splits"]
+    assert set(splits) == {"test", "held-out queries", "held-out directions"}
+    assert sum(g["mse"]["n"] for g in splits["test"]["levels"].values()) == splits["test"]["n"] == 4096
+
+
+def test_the_report_stands_alone(first: dict[str, Any], folder: Path) -> None:
+    html = (folder / "report.html").read_text(encoding="utf-8")
+    page = loads(html)
+    assert page.external == []
+    assert len(html) < 10e6
+    # Two scenes of two references, a fit and a difference; halves of both; offsets traced and learned; the
+    # enlarged view's own element has no picture of its own.
+    embedded = [p for p in page.pictures if p]
+    assert len(embedded) == 2 * 4 + 2 + 2
+    for uri in embedded:
+        head, _, data = uri.partition(",")
+        assert head in ("data:image/png;base64", "data:image/jpeg;base64")
+        assert len(base64.b64decode(data, validate=True)) > 100
+    for text in (
+        "unexplained variance",
+        "1/sr is white",
+        "seconds of training",
+        "mbtf-pipeline run",
+        "mitsuba",
+    ):
+        assert text in html
+    assert html.count("<svg") >= 6
+    ids = re.findall(r'\bid="([^"]+)"', html)
+    assert len(ids) == len(set(ids))
+
+
+def test_nothing_runs_twice(again: Any) -> None:
+    assert again() == {}
+
+
+def test_other_pictures_leave_data_and_fit_alone(again: Any) -> None:
+    ran = again("--set", "compare.spp=16")
+    assert list(ran) == ["compare", "report"]
+    assert "spp: 32 -> 16" in ran["compare"]
+    assert again("--set", "compare.spp=16") == {}
+    assert list(again()) == ["compare", "report"]
+
+
+def test_another_title_makes_only_the_report(again: Any, folder: Path) -> None:
+    assert list(again("--set", "report.title=A <b> & c")) == ["report"]
+    assert "<h1>A &lt;b&gt; &amp; c</h1>" in (folder / "report.html").read_text()
+    assert list(again()) == ["report"]
+
+
+def test_a_flipped_byte_is_found_and_mended(again: Any, folder: Path) -> None:
+    shard = folder / "shards" / "test-00000.npz"
+    whole = shard.read_bytes()
+    middle = len(whole) // 2
+    shard.write_bytes(whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :])
+    ran = again()
+    assert list(ran) == STAGES
+    assert ran["generate"] == "shards/test-00000.npz has changed"
+    assert shard.read_bytes() == whole
+
+
+def test_the_report_can_be_written_again(
+    again: Any, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from mbtf_pipeline.cli import app
+
+    (folder / "report.html").unlink()
+    assert run(app, ["report", str(folder)]) == 0
+    assert (folder / "report.html").exists()
+    assert again() == {}
