@@ -1,0 +1,306 @@
+"""Making a data set without rendering: shards, slices, claiming a folder, resuming, giving way to others."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.datasets import formula
+
+from mbtf_gen import generation
+from mbtf_gen.config import GeneratorConfig
+from mbtf_gen.dataset import Dataset
+from mbtf_gen.engine import load_mitsuba
+from mbtf_gen.errors import InputError, PartialError, UsageError
+from mbtf_gen.generation import Job, finish, generate
+from mbtf_gen.locks import shard_lock
+from mbtf_gen.verification import sidecar_of, verify
+
+load_mitsuba()
+
+from mbtf_gen.estimator import Estimates  # noqa: E402
+
+SMALL = {
+    "queries": {"train": "100", "test": "30", "spp": 2, "test_spp": 4},
+    "output": {"shard_queries": 40},
+}
+FILES = ["train-00000.npz", "train-00001.npz", "train-00002.npz", "test-00000.npz"]
+
+
+class Formula:
+    """Stands in for the estimator: values from a formula, and a count of the shards it was asked for."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[str, int]] = []
+        self.fail_at: int | None = None
+
+    def estimate(self, queries: Any, spp: int, stream: Any) -> Any:
+        if self.fail_at == len(self.asked):
+            raise KeyboardInterrupt
+        self.asked.append((stream.split, stream.shard))
+        value = formula(queries).astype(np.float32)
+        return Estimates(value, value, len(value) * spp, lost=1, capped=2, nonfinite=3)
+
+
+@pytest.fixture
+def engine(monkeypatch: pytest.MonkeyPatch) -> Formula:
+    fake = Formula()
+    monkeypatch.setattr(generation, "build_estimator", lambda config, material: fake)
+    return fake
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> GeneratorConfig:
+    np.save(tmp_path / "height.npy", np.random.default_rng(0).random((4, 8)))
+    return GeneratorConfig.model_validate({"material": str(tmp_path / "height.npy"), **SMALL})
+
+
+def changed(config: GeneratorConfig, **sections: dict[str, Any]) -> GeneratorConfig:
+    data = config.model_dump()
+    for name, section in sections.items():
+        data[name] = {**data[name], **section} if isinstance(section, dict) else section
+    return GeneratorConfig.model_validate(data)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {p.name: p.read_bytes() for p in folder.iterdir() if p.suffix == ".npz"}
+
+
+def test_shards_cover_the_wanted_rows(config: GeneratorConfig) -> None:
+    entries = Job.prepare(config).shards("train") + Job.prepare(config).shards("test")
+    assert [(e.file, e.rows) for e in entries] == list(zip(FILES, (40, 40, 20, 30), strict=True))
+    # Image layout: whole buffers, 32 texels each; 100 queries are four of them, one per shard.
+    image = Job.prepare(changed(config, queries={"layout": "image"}))
+    assert [(e.file, e.rows) for e in image.shards("train")] == [(f"train-{i:05d}.npz", 1) for i in range(4)]
+    per_texel = Job.prepare(changed(config, queries={"train": "3/texel"}))
+    assert sum(e.rows for e in per_texel.shards("train")) == 96
+
+
+def test_more_shards_than_a_folder_can_hold_are_refused(config: GeneratorConfig) -> None:
+    with pytest.raises(UsageError, match=r"shards of 40"):
+        Job.prepare(changed(config, queries={"train": "1e12/texel"})).shards("train")
+
+
+def test_a_run_is_complete_and_counts(config: GeneratorConfig, engine: Formula, tmp_path: Path) -> None:
+    seen: list[float] = []
+    summary = generate(config, tmp_path / "out", progress=lambda done, note: seen.append(done))
+    assert seen == [40, 80, 100, 130]
+    assert (summary.complete, summary.queries, summary.paths) == (True, 130, 100 * 2 + 30 * 4)
+    assert (summary.lost, summary.capped, summary.nonfinite) == (4, 8, 12)
+    assert summary.relative_error == 0.0
+    data = Dataset.open(tmp_path / "out").load("train")
+    np.testing.assert_allclose(summary.mean_value, data["value_a"].astype(np.float64).mean(axis=0), rtol=1e-6)
+    assert set(data["spp"]) == {2.0}
+    assert verify(tmp_path / "out") == []
+    assert not list((tmp_path / "out").glob(".*"))
+
+
+def test_the_same_command_resumes_without_rendering(
+    config: GeneratorConfig, engine: Formula, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = generate(config, tmp_path / "out")
+    before = {p.name: (p.stat().st_mtime_ns, p.read_bytes()) for p in (tmp_path / "out").iterdir()}
+
+    def never(*_: Any) -> Any:
+        raise AssertionError("the estimator was built although nothing is missing")
+
+    monkeypatch.setattr(generation, "build_estimator", never)
+    second = generate(config, tmp_path / "out")
+    assert (second.paths, second.complete, second.mean_value) == (0, True, first.mean_value)
+    assert before == {p.name: (p.stat().st_mtime_ns, p.read_bytes()) for p in (tmp_path / "out").iterdir()}
+
+
+@pytest.mark.parametrize("done", range(4))
+def test_an_interrupted_run_goes_on_where_it_stopped(
+    config: GeneratorConfig, engine: Formula, tmp_path: Path, done: int
+) -> None:
+    generate(config, tmp_path / "whole")
+    engine.asked.clear()
+    engine.fail_at = done
+    with pytest.raises(KeyboardInterrupt):
+        generate(config, tmp_path / "out")
+    assert len(contents(tmp_path / "out")) == done
+    assert json.loads((tmp_path / "out/manifest.json").read_text())["complete"] is False
+    engine.fail_at = None
+    assert generate(config, tmp_path / "out").complete
+    assert engine.asked == [("train", 0), ("train", 1), ("train", 2), ("test", 0)]
+    assert contents(tmp_path / "out") == contents(tmp_path / "whole")
+
+
+def test_what_a_kill_leaves_is_cleared_away(config: GeneratorConfig, engine: Formula, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    # Killed while the manifest was written: the folder holds a temporary file alone.
+    out.mkdir()
+    (out / ".manifest.json.123.tmp").write_text("{")
+    generate(config, out)
+    # Killed between manifest and configuration, within a shard, and between a shard and its sidecar.
+    (out / "config.yaml").unlink()
+    (out / FILES[0]).unlink()
+    (out / f".{FILES[0]}.99999999.tmp").write_bytes(b"half")
+    sidecar_of(out / FILES[0]).unlink()
+    sidecar_of(out / FILES[1]).unlink()
+    (out / ".train-00001.json.99999999.tmp").write_text("{")
+    assert generate(config, out).complete
+    assert verify(out) == []
+    assert (out / "config.yaml").exists()
+    assert [p.name for p in out.glob(".train*")] == []
+
+
+def test_damage_that_changes_the_size_is_made_anew(
+    config: GeneratorConfig, engine: Formula, tmp_path: Path
+) -> None:
+    generate(config, tmp_path / "out")
+    path = tmp_path / "out" / FILES[2]
+    intact = path.read_bytes()
+    path.write_bytes(intact[:-7])
+    engine.asked.clear()
+    generate(config, tmp_path / "out")
+    assert engine.asked == [("train", 2)]
+    assert path.read_bytes() == intact
+
+
+def test_another_configuration_is_refused_field_by_field_and_nothing_is_touched(
+    config: GeneratorConfig, engine: Formula, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    generate(config, out)
+    before = {p.name: p.read_bytes() for p in out.iterdir()}
+    other = changed(config, queries={"spp": 8, "min_cos": 0.2}, light={"width": 3.0})
+    with pytest.raises(InputError) as caught:
+        generate(other, out)
+    for part in ("light.width: 1.0 -> 3.0", "queries.min_cos: 0.1 -> 0.2", "queries.spp: 2 -> 8"):
+        assert part in caught.value.what
+    assert "--overwrite" in caught.value.cure
+    np.save(tmp_path / "height.npy", np.zeros((4, 8)))
+    with pytest.raises(InputError, match=r"inputs\.height"):
+        generate(config, out)
+    assert before == {p.name: p.read_bytes() for p in out.iterdir()}
+
+
+def test_overwrite_replaces_the_data_set_and_nothing_else(
+    config: GeneratorConfig, engine: Formula, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    generate(config, out)
+    mine = {"notes.txt": "kept", ".hidden": "kept", "train-notes.json": "kept", "render.png": "kept"}
+    for name, text in mine.items():
+        (out / name).write_text(text)
+    (out / ".git").mkdir()
+    (out / ".train-00009.lock").write_text("{}")
+    smaller = changed(config, queries={"train": "40"})
+    assert generate(smaller, out, overwrite=True).complete
+    assert {name: (out / name).read_text() for name in mine} == mine
+    assert sorted(contents(out)) == ["test-00000.npz", "train-00000.npz"]
+    assert not (out / ".train-00009.lock").exists()
+    assert "train: '40'" in (out / "config.yaml").read_text()
+    assert Dataset.open(out).manifest["complete"]
+
+
+def test_a_kill_while_overwriting_leaves_a_data_set_that_can_be_overwritten(
+    config: GeneratorConfig, engine: Formula, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    generate(config, out)
+    count = len(list(out.iterdir()))
+    unlink, removed = Path.unlink, 0
+
+    def interrupted(path: Path, missing_ok: bool = False) -> None:
+        nonlocal removed
+        if removed == stop:
+            raise KeyboardInterrupt
+        removed += 1
+        unlink(path, missing_ok=missing_ok)
+
+    for stop in range(count):
+        shutil.copytree(out, tmp_path / str(stop))
+        removed = 0
+        with monkeypatch.context() as patch:
+            patch.setattr(Path, "unlink", interrupted)
+            with pytest.raises(KeyboardInterrupt):
+                generate(changed(config, light={"width": 3.0}), tmp_path / str(stop), overwrite=True)
+        left = {p.name for p in (tmp_path / str(stop)).iterdir()}
+        assert len(left) == count - stop
+        assert "manifest.json" in left
+        assert generate(changed(config, light={"width": 3.0}), tmp_path / str(stop), overwrite=True).complete
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+@pytest.mark.parametrize(
+    "files",
+    [
+        {"notes.txt": "mine"},
+        {"config.yaml": "mine"},
+        {".env": "mine"},
+        {"manifest.json": '{"name": "a web page"}', ".env": "mine", "train-1.png": "mine"},
+        {"manifest.json": "{"},
+        {"train-00000.npz": "an orphan"},
+    ],
+    ids=["notes", "config", "hidden", "foreign manifest", "broken manifest", "orphan"],
+)
+def test_folders_of_others_are_refused_untouched(
+    files: dict[str, str], overwrite: bool, config: GeneratorConfig, engine: Formula, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    for name, text in files.items():
+        (out / name).write_text(text)
+    with pytest.raises(InputError):
+        generate(config, out, overwrite=overwrite)
+    assert {p.name: p.read_text() for p in out.iterdir()} == files
+
+
+def test_a_file_in_place_of_the_folder_is_refused(
+    config: GeneratorConfig, engine: Formula, tmp_path: Path
+) -> None:
+    for out in (tmp_path / "height.npy", tmp_path / "height.npy" / "below"):
+        with pytest.raises(InputError):
+            generate(config, out)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5])
+def test_slices_share_the_work_without_gap_or_overlap(
+    count: int, config: GeneratorConfig, engine: Formula, tmp_path: Path
+) -> None:
+    generate(config, tmp_path / "whole")
+    engine.asked.clear()
+    for index in range(1, count + 1):
+        summary = generate(config, tmp_path / "out", slice_index=index, slice_count=count)
+        assert summary.complete == (len(contents(tmp_path / "out")) == len(FILES))
+    assert sorted(engine.asked) == [("test", 0), ("train", 0), ("train", 1), ("train", 2)]
+    assert contents(tmp_path / "out") == contents(tmp_path / "whole")
+    assert finish(tmp_path / "out").complete
+
+
+def test_a_shard_that_another_process_writes_is_left_to_it(
+    config: GeneratorConfig, engine: Formula, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    engine.fail_at = 0
+    with pytest.raises(KeyboardInterrupt):
+        generate(config, out)
+    engine.fail_at = None
+    with shard_lock(out / FILES[1]) as held:
+        assert held
+        with pytest.raises(PartialError, match=FILES[1]):
+            generate(config, out)
+        assert sorted(contents(out)) == sorted(set(FILES) - {FILES[1]})
+    assert generate(config, out).complete
+
+
+def test_the_sidecar_says_what_the_shard_holds(
+    config: GeneratorConfig, engine: Formula, tmp_path: Path
+) -> None:
+    generate(config, tmp_path / "out")
+    record = json.loads((tmp_path / "out/train-00002.json").read_text())
+    assert (record["rows"], record["queries"], record["paths"], record["spp"]) == (20, 20, 40, 2)
+    assert record["seed"] == {"root": 0, "split": "train", "shard": 2}
+    assert record["quarantined"] == {"nonfinite_samples": 3, "lost_rays": 1, "capped_rays": 2}
+    manifest = json.loads((tmp_path / "out/manifest.json").read_text())
+    assert manifest["summary"]["nonfinite_samples"] == 12
+    assert manifest["summary"]["paths"] == 320
+    assert manifest["levels"]["mixture"] == {"log_uniform": 0.6, "finest": 0.4}
+    assert manifest["splits"]["train"]["queries"] == 100
