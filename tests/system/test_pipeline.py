@@ -115,7 +115,7 @@ def test_every_stage_runs_and_the_material_is_learned(first: dict[str, Any], fol
     assert Path(first["report"]) == folder / "report.html"
     share = first["test"]["neumip"]["unexplained_variance"]
     # The best constant leaves 1; the bar is far above what the fit reaches and far below that.
-    assert share["value"] + 3 * share["error"] < 0.8
+    assert share["value"] + 3 * share["error"] < 0.5
 
 
 def test_pictures_and_numbers_belong_together(first: dict[str, Any], folder: Path) -> None:
