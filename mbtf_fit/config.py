@@ -74,9 +74,10 @@ class TrainingSection(Settings):
     time: Duration = Field(120.0, description="budget: 90s, 2min, 1h")
     steps: int | None = Field(None, ge=1, description="train this many steps, however long they take")
     batch: int = Field(1 << 15, ge=1, le=1 << 24, description="queries per step")
-    rate: float = Field(1e-2, gt=0, lt=1, description="largest learning rate (Adam)")
-    final_rate: float = Field(0.01, gt=0, le=1, description="share of the rate that is left at the end")
-    warmup: int = Field(100, ge=0, description="steps over which the rate rises")
+    rate: float = Field(3e-2, gt=0, lt=1, description="largest learning rate of the networks (Adam)")
+    texture_rate: float = Field(1e-2, gt=0, lt=1, description="largest learning rate of the textures")
+    final_rate: float = Field(0.01, gt=0, le=1, description="share of the rates that is left at the end")
+    warmup: int = Field(100, ge=0, description="steps over which the rates rise")
     blur: BlurSection = BlurSection()
 
 

@@ -1,0 +1,18 @@
+"""Entry point of ``mbtf-fit``."""
+
+from __future__ import annotations
+
+import sys
+
+
+def main() -> int:
+    """Run the command line; returns the exit code."""
+    from mbtf_gen.console import run
+
+    from .cli import app
+
+    return run(app)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,231 @@
+"""Command line of ``mbtf-fit``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+from mbtf_gen.console import CONSOLE, Console, clock, new_app
+from mbtf_gen.errors import InputError, UsageError
+
+app = new_app("mbtf-fit", "Fit neural materials to multi-resolution BTF (MBTF) data.")
+
+Set = Annotated[
+    list[str], Parameter(name="--set", help="Set any option of the configuration, a.b=c. Repeatable.")
+]
+Output = Annotated[Path, Parameter(name=["--output", "-o"])]
+_SPLITS = {
+    "test": "test",
+    "held_out_queries": "held-out queries",
+    "held_out_directions": "held-out directions",
+}
+
+
+@app.default
+def fit(
+    shards: Path | None = None,
+    /,
+    *,
+    output: Output = Path("material"),
+    model: Literal["neumip", "neumip-baseline"] | None = None,
+    time: str | None = None,
+    steps: int | None = None,
+    batch: int | None = None,
+    rate: float | None = None,
+    seed: int | None = None,
+    device: Literal["auto", "cpu", "cuda"] | None = None,
+    config: Path | None = None,
+    assignments: Set | None = None,
+    overwrite: Annotated[bool, Parameter(negative="")] = False,
+    console: Console = CONSOLE,
+) -> None:
+    """Fit a material to a data set: mbtf-fit shards/ -o material/
+
+    The same command again resumes an unfinished fit.
+
+    Parameters
+    ----------
+    shards
+        Folder made by mbtf-gen.
+    output
+        Folder of the material.
+    model
+        Model to fit. Default: neumip
+    time
+        Training time: 90s, 2min, 1h. Default: 2min
+    steps
+        Train this many steps instead, however long they take.
+    batch
+        Queries per step.
+    rate
+        Largest learning rate of the networks.
+    seed
+        Seed of the first parameters and of the order of batches.
+    device
+        Where to train; auto takes CUDA where there is one. Default: auto
+    config
+        YAML file with the options.
+    overwrite
+        Replace a fit of another configuration.
+    """
+    if shards is None:
+        raise UsageError("no shards given", cure="mbtf-fit shards/ -o material/")
+    if time is not None and steps is not None:
+        raise UsageError("--time and --steps exclude each other", cure="give one of them")
+    from mbtf_gen.settings import resolve
+
+    from .config import FitConfig, format_duration
+
+    flags = {
+        "model": model,
+        "training.time": time,
+        "training.steps": steps,
+        "training.batch": batch,
+        "training.rate": rate,
+        "seed": seed,
+        "device": device,
+    }
+    resolved = resolve(FitConfig, file=config, assignments=assignments or [], flags=flags)
+    training = resolved.training
+    budget = format_duration(training.time) if training.steps is None else f"{training.steps} steps"
+    from .fitting import fit
+
+    console.note(
+        f"{shards} -> {output}: {resolved.model}, training for {budget} (change it with --time or --steps)"
+    )
+    with console.progress(total=100, label="fitting", unit="%") as bar:
+        result = fit(
+            resolved,
+            shards,
+            output,
+            overwrite=overwrite,
+            progress=lambda share, note: bar.update(100 * share, note),
+        )
+    data = result.as_dict()
+    console.report(data, _describe_fit(data))
+
+
+def _describe_errors(errors: dict[str, Any]) -> list[str]:
+    lines = []
+    for name, split in errors.items():
+        share = _number(split["unexplained"])
+        lines.append(f"{_SPLITS[name]}: unexplained variance {share} ({split['n']} queries)")
+    test = errors.get("test") or next(iter(errors.values()), None)
+    if test is not None:
+        levels = "  ".join(f"{level}: {_number(e['unexplained'])}" for level, e in test["levels"].items())
+        bands = "  ".join(f"{band}: {_number(e['unexplained'])}" for band, e in test["elevations"].items())
+        lines += [f"  by level of detail  {levels}", f"  by lowest cosine  {bands}"]
+    return lines
+
+
+def _number(estimate: dict[str, Any]) -> str:
+    if estimate["value"] is None:
+        return "undefined (no variance in the data)"
+    error = "?" if estimate["error"] is None else f"{estimate['error']:.3f}"
+    return f"{estimate['value']:.3f} ± {error}"
+
+
+def _describe_fit(data: dict[str, Any]) -> str:
+    training = data["training"]
+    rate = training["steps"] * training["batch"] / max(training["seconds"], 1e-9)
+    lines = [
+        f"{data['material']}: {data['model']}, {training['steps']} steps of {training['batch']} queries in "
+        f"{clock(training['seconds'])} on {training['device']} ({rate / 1e6:.2f} M queries/s)",
+        *_describe_errors(data["errors"]),
+    ]
+    return "\n".join(lines)
+
+
+@app.command
+def evaluate(material: Path, shards: Path, /, *, console: Console = CONSOLE) -> None:
+    """Errors of a material on a data set, free of the data's noise.
+
+    On the test split, and on the queries and directions that were held out of training: overall, by level of
+    detail, and by elevation.
+
+    Parameters
+    ----------
+    material
+        Folder made by mbtf-fit.
+    shards
+        Folder made by mbtf-gen.
+    """
+    from .evaluation import evaluate
+    from .material import Material
+
+    loaded = Material.load(material)
+    errors = {name: e.as_dict() for name, e in evaluate(loaded, shards).items()}
+    console.report(
+        {"material": material, "shards": shards, "errors": errors},
+        "\n".join([f"{material}: {loaded.config.model} on {shards}", *_describe_errors(errors)]),
+    )
+
+
+@app.command
+def info(path: Path, /, *, console: Console = CONSOLE) -> None:
+    """What a material or a data set holds.
+
+    Parameters
+    ----------
+    path
+        Folder made by mbtf-fit or by mbtf-gen.
+    """
+    if not path.is_dir():
+        raise InputError("no such folder", where=path)
+    from mbtf_gen.schema import MANIFEST_NAME
+
+    data, text = _shards_info(path) if (path / MANIFEST_NAME).exists() else _material_info(path)
+    console.report(data, text)
+
+
+def _shards_info(path: Path) -> tuple[dict[str, Any], str]:
+    from mbtf_gen.dataset import Dataset
+
+    data = Dataset.open(path)
+    lattice = data.lattice
+    rows, columns = lattice.shape()
+    splits = {
+        s: {"shards": len(data.shards(s)), "rows": sum(x.rows for x in data.shards(s))} for s in data.splits
+    }
+    kind = "queries" if data.layout == "shuffled" else "buffers"
+    lines = [
+        f"{path}: shards, {data.layout} layout",
+        f"levels 0 to {lattice.finest}, finest {columns} x {rows} texels, aspect {lattice.aspect:g}",
+        *(f"{s}: {n['rows']} {kind} in {n['shards']} shards" for s, n in splits.items()),
+    ]
+    return {
+        "shards": path,
+        "layout": data.layout,
+        "levels": {"finest": lattice.finest, "shape": [rows, columns]},
+        "aspect": lattice.aspect,
+        "splits": splits,
+    }, "\n".join(lines)
+
+
+def _material_info(path: Path) -> tuple[dict[str, Any], str]:
+    from .material import WEIGHTS_NAME, Material
+
+    material = Material.load(path)
+    description = material.description
+    weights, training = description["weights"], description["training"]
+    size = (path / WEIGHTS_NAME).stat().st_size
+    deviation = material.deviation()
+    rows, columns = material.lattice.shape()
+    lines = [
+        f"{path}: {description['model']}",
+        f"levels 0 to {material.lattice.finest}, finest {columns} x {rows} texels, "
+        f"aspect {material.lattice.aspect:g}",
+        f"{weights['network_weights']} network weights, {weights['texels']} numbers in textures, "
+        f"{size / 1e6:.2f} MB",
+        f"trained {training['steps']} steps of {training['batch']} in {clock(training['seconds'])}",
+        *_describe_errors(training["errors"]),
+        f"conformance: {description['conformance']['count']} queries, largest deviation {deviation:.2g}",
+    ]
+    return {
+        "material": path,
+        "bytes": size,
+        "conformance_deviation": deviation,
+        **{k: description[k] for k in ("model", "levels", "tile", "weights", "config", "data", "training")},
+    }, "\n".join(lines)

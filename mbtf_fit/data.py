@@ -1,0 +1,218 @@
+"""Shards in memory: training queries, and what is kept out of training to judge it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mbtf_gen.dataset import Dataset, Shard
+from mbtf_gen.errors import InputError
+from mbtf_gen.schema import Layout, Split
+from mbtf_gen.shard_files import Arrays, read_shard
+
+from .config import HeldOutSection
+
+_NEEDED = ("u", "sigma", "omega_i", "omega_o", "value_a", "value_b")
+
+
+@dataclass(frozen=True)
+class Queries:
+    """Queries with both estimates of their value, float32 NumPy arrays.
+
+    Attributes
+    ----------
+    u : (n, 2) uv; sigma : (n,) tile widths; omega_i, omega_o : (n, 3); value_a, value_b : (n, 3) in 1/sr
+    """
+
+    u: NDArray[np.float32]
+    sigma: NDArray[np.float32]
+    omega_i: NDArray[np.float32]
+    omega_o: NDArray[np.float32]
+    value_a: NDArray[np.float32]
+    value_b: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.sigma)
+
+    @classmethod
+    def join(cls, parts: Iterable[Queries]) -> Queries:
+        """All parts, one after the other."""
+        found = list(parts)
+        return cls(**{f.name: np.concatenate([getattr(p, f.name) for p in found]) for f in fields(cls)})
+
+    def take(self, rows: Any) -> Queries:
+        """Some of the queries: a slice, an index array or a mask."""
+        return Queries(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+
+
+@dataclass(frozen=True)
+class TrainingQueries:
+    """Queries as training reads them: contiguous tensors on the device, value the mean of both halves."""
+
+    u: Tensor
+    sigma: Tensor
+    omega_i: Tensor
+    omega_o: Tensor
+    value: Tensor
+
+    def __len__(self) -> int:
+        return len(self.sigma)
+
+    def slice(self, start: int, stop: int) -> TrainingQueries:
+        """Consecutive queries, without copying."""
+        return TrainingQueries(*(getattr(self, f.name)[start:stop] for f in fields(self)))
+
+    def to(self, device: torch.device) -> TrainingQueries:
+        """The same queries on another device."""
+        return TrainingQueries(*(getattr(self, f.name).to(device) for f in fields(self)))
+
+
+@dataclass(frozen=True)
+class Partition:
+    """The train split, divided by :func:`load_training`.
+
+    Attributes
+    ----------
+    training : what is trained on, in the order of the shards
+    held_out_queries : a random share of the queries outside the held-out region
+    held_out_directions : queries with light or view in the held-out region; at most `MAX_HELD_OUT`
+    """
+
+    training: TrainingQueries
+    held_out_queries: Queries
+    held_out_directions: Queries
+
+
+# Held-out queries that are kept for evaluation; the rest of them is dropped, never trained on.
+MAX_HELD_OUT = 1 << 16
+
+
+def open_data(folder: str | Path, layout: Layout, model: str) -> Dataset:
+    """Open a folder of shards for a model that needs a layout.
+
+    Raises
+    ------
+    InputError : no data set, or of another layout
+    """
+    data = Dataset.open(folder)
+    if data.layout != layout:
+        raise InputError(
+            f"shards are in the {data.layout} layout, but {model} learns from the {layout} one",
+            where=folder,
+            cure=f"generate them with: mbtf-gen ... --layout {layout}",
+        )
+    return data
+
+
+def data_hash(data: Dataset) -> str:
+    """What identifies a data set: the hash that its generator gave it."""
+    return str(data.manifest.get("config_hash", ""))
+
+
+def _read(shard: Shard) -> Queries:
+    """One shard, every number checked.
+
+    Raises
+    ------
+    InputError : NaN or infinity, or another number of rows than its sidecar says
+    """
+    arrays: Arrays = read_shard(shard.path, _NEEDED)
+    rows = len(arrays["sigma"])
+    if rows != shard.rows:
+        raise InputError(
+            f"shard holds {rows} rows, its sidecar says {shard.rows}",
+            where=shard.path,
+            cure="look for damage with: mbtf-gen verify",
+        )
+    for name, array in arrays.items():
+        # A sum is finite exactly when no addend is NaN or infinite, short of overflow; look closer only then.
+        with np.errstate(all="ignore"):
+            suspicious = not np.isfinite(np.sum(array, dtype=np.float64))
+        if suspicious and not np.isfinite(array).all():
+            bad = np.argwhere(~np.isfinite(array))
+            raise InputError(
+                f"{len(bad)} numbers of '{name}' are NaN or infinite, the first in row {bad[0][0]}",
+                where=shard.path,
+                cure="look for damage with: mbtf-gen verify",
+            )
+    return Queries(**arrays)
+
+
+def in_region(held_out: HeldOutSection, omega: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Which directions (n, 3) lie in the held-out region, a disk on the projected hemisphere: (n,)."""
+    if held_out.radius == 0:
+        return np.zeros(len(omega), bool)
+    centre = np.asarray(held_out.direction, np.float32)
+    return ((omega[:, :2] - centre) ** 2).sum(1) < np.float32(held_out.radius) ** 2
+
+
+def _marks(held_out: HeldOutSection, queries: Queries, seed: int, shard: int) -> NDArray[np.int8]:
+    """What becomes of each query of a shard: 0 trained on, 1 held-out query, 2 held-out direction."""
+    random = np.random.Generator(np.random.Philox(key=[seed, shard])).random(len(queries))
+    marks = np.where(random < held_out.queries, np.int8(1), np.int8(0))
+    region = in_region(held_out, queries.omega_i) | in_region(held_out, queries.omega_o)
+    return np.where(region, np.int8(2), marks)
+
+
+def load_training(data: Dataset, held_out: HeldOutSection, seed: int) -> Partition:
+    """Read the train split and divide it; the division depends on the data and `seed` alone.
+
+    Raises
+    ------
+    InputError : no queries to train on, NaN or infinity in a shard, damaged shards
+    """
+    shards = data.shards("train")
+    total = sum(shard.rows for shard in shards)
+    if total == 0:
+        raise InputError(
+            "its train split holds no queries", where=data.folder, cure="generate some: --queries"
+        )
+    columns = {"u": (2,), "sigma": (), "omega_i": (3,), "omega_o": (3,), "value": (3,)}
+    store = {name: np.empty((total, *shape), np.float32) for name, shape in columns.items()}
+    kept_out: tuple[list[Queries], list[Queries]] = ([], [])
+    filled = 0
+    for index, shard in enumerate(shards):
+        queries = _read(shard)
+        marks = _marks(held_out, queries, seed, index)
+        for group, mark in zip(kept_out, (1, 2), strict=True):
+            wanted = MAX_HELD_OUT - sum(map(len, group))
+            group.append(queries.take(np.flatnonzero(marks == mark)[:wanted]))
+        rows = np.flatnonzero(marks == 0)
+        part = slice(filled, filled + len(rows))
+        for name in ("u", "sigma", "omega_i", "omega_o"):
+            np.take(getattr(queries, name), rows, axis=0, out=store[name][part], mode="clip")
+        half = np.float32(0.5)
+        np.add(half * queries.value_a[rows], half * queries.value_b[rows], out=store["value"][part])
+        filled += len(rows)
+    if filled == 0:
+        raise InputError(
+            f"all {total} queries of its train split are held out",
+            where=data.folder,
+            cure="lower held_out.queries and held_out.radius",
+        )
+    training = TrainingQueries(**{name: torch.from_numpy(array[:filled]) for name, array in store.items()})
+    return Partition(training, *(Queries.join(group) for group in kept_out))
+
+
+def load_split(data: Dataset, split: Split, limit: int | None = None) -> Queries:
+    """Queries of a split, or its first `limit`.
+
+    Raises
+    ------
+    InputError : no such split, no queries in it, NaN or infinity, damaged shards
+    """
+    parts: list[Queries] = []
+    for shard in data.shards(split):
+        left = None if limit is None else limit - sum(map(len, parts))
+        if left is None or left > 0:
+            parts.append(_read(shard).take(slice(left)))
+    if not parts or not sum(map(len, parts)):
+        raise InputError(f"its {split} split holds no queries", where=data.folder)
+    return Queries.join(parts)

@@ -1,0 +1,149 @@
+"""Errors of predictions on a data set, free of the data's noise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbtf_gen.dataset import Dataset
+from mbtf_gen.directions import ELEVATION_BANDS
+from mbtf_gen.errors import InputError
+from mbtf_gen.levels import Lattice
+from mbtf_gen.stats import (
+    Estimate,
+    by_group,
+    elevation_groups,
+    level_groups,
+    noise_free_mse,
+    signal_variance,
+    unexplained_variance,
+)
+
+from .data import Partition, Queries, load_split, load_training, open_data
+
+if TYPE_CHECKING:
+    from .material import Material
+
+Predict = Callable[[Queries], NDArray[np.float32]]
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors on a set of queries.
+
+    Attributes
+    ----------
+    n : queries
+    mse : mean squared error E[(p-a)(p-b)], without the noise of the data, in 1/sr²
+    variance : of the data's values, without their noise, in 1/sr²
+    unexplained : the former over the latter: 0 is perfect, 1 no better than the mean value
+    """
+
+    n: int
+    mse: Estimate
+    variance: Estimate
+    unexplained: Estimate
+
+    @classmethod
+    def of(cls, prediction: NDArray[np.float32], a: NDArray[np.float32], b: NDArray[np.float32]) -> Errors:
+        """Errors of predictions (n, 3) against both halves (n, 3)."""
+        return cls(
+            len(prediction),
+            noise_free_mse(prediction, a, b),
+            signal_variance(a, b),
+            unexplained_variance(prediction, a, b),
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data for JSON."""
+        return {
+            "n": self.n,
+            "mse": self.mse.as_dict(),
+            "variance": self.variance.as_dict(),
+            "unexplained": self.unexplained.as_dict(),
+        }
+
+
+@dataclass(frozen=True)
+class SplitErrors:
+    """Errors on one split: overall, by level of detail, by elevation.
+
+    Attributes
+    ----------
+    levels : nearest level → errors
+    elevations : (lower, upper) edge of the cosine, of light or view, whichever is lower → errors
+    """
+
+    overall: Errors
+    levels: dict[int, Errors]
+    elevations: dict[tuple[float, float], Errors]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data for JSON."""
+        return {
+            **self.overall.as_dict(),
+            "levels": {str(level): errors.as_dict() for level, errors in self.levels.items()},
+            "elevations": {f"{low:g}-{high:g}": e.as_dict() for (low, high), e in self.elevations.items()},
+        }
+
+
+def _grouped(labels: NDArray[np.int64], *arrays: NDArray[np.float32]) -> dict[int, Errors]:
+    mse = by_group(noise_free_mse, labels, *arrays)
+    unexplained = by_group(unexplained_variance, labels, *arrays)
+    variance = by_group(signal_variance, labels, *arrays[1:])
+    return {k: Errors(mse[k].n, mse[k], variance[k], unexplained[k]) for k in mse}
+
+
+def split_errors(predict: Predict, queries: Queries, lattice: Lattice) -> SplitErrors | None:
+    """Errors of a prediction on queries; None where there are none."""
+    if len(queries) == 0:
+        return None
+    arrays = (predict(queries), queries.value_a, queries.value_b)
+    levels = _grouped(level_groups(queries.sigma, lattice.finest), *arrays)
+    bands = _grouped(elevation_groups(queries.omega_i, queries.omega_o), *arrays)
+    edges = ELEVATION_BANDS
+    return SplitErrors(
+        Errors.of(*arrays), levels, {(edges[k], edges[k + 1]): errors for k, errors in bands.items()}
+    )
+
+
+def judge(predict: Predict, data: Dataset, partition: Partition) -> dict[str, SplitErrors]:
+    """Errors of a prediction on ``test``, ``held_out_queries`` and ``held_out_directions``; a set without
+    queries is left out.
+
+    Raises
+    ------
+    InputError : a test shard is missing or damaged
+    """
+    parts: dict[str, Queries] = {}
+    if "test" in data.splits and data.shards("test"):
+        parts["test"] = load_split(data, "test")
+    parts["held_out_queries"] = partition.held_out_queries
+    parts["held_out_directions"] = partition.held_out_directions
+    found = {name: split_errors(predict, queries, data.lattice) for name, queries in parts.items()}
+    return {name: errors for name, errors in found.items() if errors is not None}
+
+
+def evaluate(material: Material, shards: str | Path) -> dict[str, SplitErrors]:
+    """Errors of a fitted material on the splits of a data set: ``test``, and what was held out of ``train``.
+
+    The held-out queries are those that the material's own configuration keeps out; on another data set than
+    the material was made from they are just queries.
+
+    Raises
+    ------
+    InputError : shards missing, damaged, or of another layout or aspect
+    """
+    data = open_data(shards, material.model.layout, material.model.name)
+    if data.lattice.aspect != material.lattice.aspect:
+        raise InputError(
+            f"its tile has the aspect {data.lattice.aspect:g}, the material's {material.lattice.aspect:g}",
+            where=data.folder,
+        )
+    partition = load_training(data, material.config.held_out, material.config.seed)
+    return judge(material.predict, data, partition)

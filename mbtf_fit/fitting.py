@@ -1,0 +1,272 @@
+"""From shards to a material: one fit from start (or from where it stopped) to end."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from mbtf_gen.atomic import read_json, write_json, write_text
+from mbtf_gen.dataset import Dataset
+from mbtf_gen.errors import EngineError, InputError
+from mbtf_gen.settings import differences, dump_yaml
+from mbtf_gen.stats import unexplained_variance
+
+from .config import FitConfig
+from .data import Partition, Queries, data_hash, load_training, open_data
+from .evaluation import judge
+from .material import DESCRIPTION_NAME, WEIGHTS_NAME, Material, export
+from .memory import keep_freed_memory
+from .models import MODELS, build_model
+from .storage import read_tensors, write_tensors
+from .training import Trainer
+
+FIT_NAME = "fit.json"
+CONFIG_NAME = "config.yaml"
+METRICS_NAME = "metrics.jsonl"
+CHECKPOINT_NAME = "checkpoint.safetensors"
+_OWN_FILES = (FIT_NAME, CONFIG_NAME, METRICS_NAME, CHECKPOINT_NAME, DESCRIPTION_NAME, WEIGHTS_NAME)
+_FORMAT = "mbtf-fit"
+_SCHEMA = 1
+# Seconds of training between two looks at held-out queries, and between two checkpoints.
+_REPORT_SECONDS = 2.0
+_CHECKPOINT_SECONDS = 15.0
+# Held-out queries that are looked at while training.
+_GLANCE = 1 << 14
+
+# Called with the share of the budget that is spent and a note on how it goes.
+ProgressCallback = Callable[[float, str], None]
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """What :func:`fit` gives.
+
+    Attributes
+    ----------
+    material : the fitted material, as its folder holds it
+    folder : of the material
+    history : one record per look at the held-out queries: step, seconds, loss, held_out, …
+    seconds : of training, over all runs; total_seconds : of this run, loading and evaluation included
+    errors : split → errors; splits ``test``, ``held_out_queries``, ``held_out_directions``
+    resumed : whether an earlier run was taken up
+    """
+
+    material: Material
+    folder: Path
+    history: list[dict[str, Any]]
+    seconds: float
+    total_seconds: float
+    errors: dict[str, dict[str, Any]]
+    resumed: bool
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data for JSON, without the history."""
+        return {
+            "material": str(self.folder),
+            "model": self.material.config.model,
+            "seconds": self.seconds,
+            "total_seconds": self.total_seconds,
+            "resumed": self.resumed,
+            "training": self.material.description["training"],
+            "errors": self.errors,
+        }
+
+
+def choose_device(name: str) -> torch.device:
+    """The device to train on; ``auto`` is CUDA where there is one.
+
+    Raises
+    ------
+    EngineError : CUDA asked for where there is none
+    """
+    available = torch.cuda.is_available()
+    if name == "cuda" and not available:
+        raise EngineError(
+            "no CUDA device is available", where="--device cuda", cure="use --device cpu or auto"
+        )
+    return torch.device("cuda" if available and name != "cpu" else "cpu")
+
+
+def fit(
+    config: FitConfig,
+    shards: str | Path,
+    out: str | Path,
+    *,
+    overwrite: bool = False,
+    progress: ProgressCallback | None = None,
+) -> FitResult:
+    """Fit a model to a data set and export it as a material.
+
+    Parameters
+    ----------
+    shards : folder made by ``mbtf-gen``
+    out : folder of the material; an unfinished fit of the same configuration and data there is resumed, a
+        finished one is left as it is
+    overwrite : replace a fit of another configuration
+
+    Raises
+    ------
+    InputError : shards or folder cannot be used; training diverged
+    EngineError : the device is not there
+    PartialError : the disk is full; the same command resumes
+    """
+    begin = time.perf_counter()
+    device = choose_device(config.device)
+    out = Path(out)
+    data = open_data(shards, MODELS[config.model].layout, config.model)
+    identity = _identity(config, data)
+    _claim(out, identity, config, overwrite)
+    if (out / DESCRIPTION_NAME).exists():
+        return _finished(out, time.perf_counter() - begin)
+    keep_freed_memory()
+    partition = load_training(data, config.held_out, config.seed)
+    trainer = _trainer(config, data, partition, device)
+    resumed = _resume(trainer, out)
+    _train(trainer, partition.held_out_queries, out, progress or (lambda share, note: None))
+    training = {
+        "steps": trainer.progress.step,
+        "batch": trainer.batch,
+        "queries": len(partition.training),
+        "seconds": round(trainer.progress.seconds, 3),
+        "loss": trainer.progress.loss,
+        "device": str(device),
+        "threads": torch.get_num_threads(),
+        "torch": torch.__version__,
+    }
+    errors = judge(trainer.predict, data, partition)
+    training["errors"] = {name: e.as_dict() for name, e in errors.items()}
+    export(trainer.model, config, out, data=identity["data"], training=training)
+    (out / CHECKPOINT_NAME).unlink(missing_ok=True)
+    return _finished(out, time.perf_counter() - begin, resumed=resumed)
+
+
+def _identity(config: FitConfig, data: Dataset) -> dict[str, Any]:
+    files = {split: [e["file"] for e in data.manifest["splits"][split]["shards"]] for split in data.splits}
+    described = {"hash": data_hash(data), "levels": data.lattice.finest, "aspect": data.lattice.aspect}
+    return {
+        "format": _FORMAT,
+        "schema": _SCHEMA,
+        "config_hash": config.hash(json.dumps({**described, "files": files}, sort_keys=True)),
+        "config": config.fields(),
+        "data": {**described, "shards": {split: len(names) for split, names in files.items()}},
+    }
+
+
+def _claim(out: Path, identity: dict[str, Any], config: FitConfig, overwrite: bool) -> None:
+    """Make the folder this fit's own, or check that it already is.
+
+    Raises
+    ------
+    InputError : it holds something else
+    """
+    if out.exists() and not out.is_dir():
+        raise InputError("is a file, not a folder", where=out)
+    existing = out / FIT_NAME
+    if out.is_dir() and any(out.iterdir()):
+        if not existing.exists():
+            raise InputError("is not empty and holds no fit", where=out, cure="choose another folder with -o")
+        old = read_json(existing)
+        if old.get("config_hash") == identity["config_hash"] and not overwrite:
+            return
+        if not overwrite:
+            keys = ("schema", "config", "data")
+            before, after = ({k: record.get(k) for k in keys} for record in (old, identity))
+            changes = "; ".join(differences(before, after)[:8]) or "other shards"
+            raise InputError(
+                f"holds a fit of another configuration: {changes}",
+                where=out,
+                cure="choose another folder with -o, or replace it with --overwrite",
+            )
+        # The description goes first: without it nothing else passes for a finished material.
+        for name in (DESCRIPTION_NAME, *_OWN_FILES):
+            (out / name).unlink(missing_ok=True)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot be made ({error.strerror})", where=out) from None
+    write_text(out / CONFIG_NAME, dump_yaml(config.model_dump(mode="json")))
+    write_json(out / FIT_NAME, identity)
+
+
+def _trainer(config: FitConfig, data: Dataset, partition: Partition, device: torch.device) -> Trainer:
+    model = build_model(config.model, data.lattice, **config.network.model_dump())
+    unit = float(partition.training.value.mean())
+    model.initialise(torch.Generator().manual_seed(config.seed), unit if unit > 0 else 1.0)
+    return Trainer(config, model.to(device), partition.training.to(device))
+
+
+def _resume(trainer: Trainer, out: Path) -> bool:
+    """Take up the checkpoint where there is one."""
+    path = out / CHECKPOINT_NAME
+    if not path.exists():
+        (out / METRICS_NAME).unlink(missing_ok=True)
+        return False
+    trainer.restore(*read_tensors(path))
+    kept = [line for line in read_history(out) if line["step"] <= trainer.progress.step]
+    write_text(out / METRICS_NAME, "".join(json.dumps(line) + "\n" for line in kept))
+    return True
+
+
+def _train(trainer: Trainer, held_out: Queries, out: Path, progress: ProgressCallback) -> None:
+    glance = held_out.take(slice(_GLANCE))
+    saved = time.perf_counter()
+    done = trainer.share >= 1.0
+    while not done:
+        done = trainer.train(_REPORT_SECONDS)
+        record = _record(trainer, glance)
+        with (out / METRICS_NAME).open("a", encoding="utf-8") as stream:
+            stream.write(json.dumps(record) + "\n")
+        progress(trainer.share, _note(record))
+        if time.perf_counter() - saved > _CHECKPOINT_SECONDS or done:
+            write_tensors(out / CHECKPOINT_NAME, *trainer.state())
+            saved = time.perf_counter()
+
+
+def _record(trainer: Trainer, glance: Queries) -> dict[str, Any]:
+    state = trainer.progress
+    record: dict[str, Any] = {
+        "step": state.step,
+        "seconds": round(state.seconds, 3),
+        "share": round(trainer.share, 5),
+        "loss": state.loss,
+        "held_out": None,
+        "held_out_error": None,
+        "queries_per_second": round(state.step * trainer.batch / max(state.seconds, 1e-9)),
+    }
+    if len(glance):
+        found = unexplained_variance(trainer.predict(glance), glance.value_a, glance.value_b).as_dict()
+        record |= {"held_out": found["value"], "held_out_error": found["error"]}
+    return record
+
+
+def _note(record: dict[str, Any]) -> str:
+    note = f"loss {record['loss']:.3f}"
+    if record["held_out"] is not None:
+        note += f", held out {record['held_out']:.3f} ± {record['held_out_error']:.3f}"
+    return f"{note}, {record['queries_per_second'] / 1e6:.2f} M queries/s"
+
+
+def read_history(folder: str | Path) -> list[dict[str, Any]]:
+    """The records of ``metrics.jsonl``; a line cut off by a crash is left out."""
+    path = Path(folder) / METRICS_NAME
+    out = []
+    for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else []:
+        try:
+            out.append(json.loads(line))
+        except json.JSONDecodeError:
+            break
+    return out
+
+
+def _finished(out: Path, total: float, *, resumed: bool = True) -> FitResult:
+    material = Material.load(out)
+    training = material.description["training"]
+    return FitResult(
+        material, out, read_history(out), training["seconds"], round(total, 3), training["errors"], resumed
+    )

@@ -1,0 +1,208 @@
+"""The training loop: batches, loss, schedules, and a state that can be saved and taken up again."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mbtf_gen.errors import InputError
+
+from .blur import annealed_sigma
+from .config import FitConfig, TrainingSection
+from .data import Queries, TrainingQueries
+from .inference import predict
+from .models import NeuralMaterial
+from .parallel import Workers
+
+# Decay of Adam's running means of the gradient and of its square.
+BETAS = (0.9, 0.99)
+
+
+def rate_factor(training: TrainingSection, step: int, share: float) -> float:
+    """What the rates are multiplied by when `share` of the budget is spent: a linear rise, then half a cosine
+    down."""
+    rise = min(1.0, (step + 1) / (training.warmup + 1))
+    fall = training.final_rate + (1 - training.final_rate) * 0.5 * (1 + math.cos(math.pi * min(share, 1.0)))
+    return rise * fall
+
+
+def mean_squared_error(prediction: Tensor, value: Tensor) -> Tensor:
+    """Mean squared error of linear values.
+
+    Its minimum is the expectation of noisy values. The published code compares logarithms and adds an
+    absolute error: with a few paths per query both pull dark, towards the median.
+    """
+    return torch.nn.functional.mse_loss(prediction, value)
+
+
+@dataclass
+class Progress:
+    """How far training is.
+
+    Attributes
+    ----------
+    step : steps done
+    seconds : time spent in steps, over all runs
+    loss : mean training loss of the last steps, in units of the values' variance
+    """
+
+    step: int = 0
+    seconds: float = 0.0
+    loss: float = math.nan
+
+
+class Trainer:
+    """Trains one model on one set of queries.
+
+    Parameters
+    ----------
+    model : initialised, on the device
+    queries : on the device
+
+    Attributes
+    ----------
+    progress : how far it is
+    """
+
+    def __init__(self, config: FitConfig, model: NeuralMaterial, queries: TrainingQueries) -> None:
+        self.config = config
+        self.model = model
+        self.queries = queries
+        self.progress = Progress()
+        self.batch = min(config.training.batch, len(queries))
+        texels, weights = model.parameter_groups()
+        self.optimiser = torch.optim.Adam([{"params": texels}, {"params": weights}], betas=BETAS, fused=True)
+        variance = float(queries.value.var(0, correction=0).mean()) if len(queries) > 1 else 0.0
+        power = float(queries.value.square().mean())
+        # Of constant data the variance is rounding error: measure by the values themselves.
+        self.unit = variance if variance > 1e-6 * power else power or 1.0
+
+    @property
+    def share(self) -> float:
+        """Share of the budget that is spent, in [0, 1]."""
+        training = self.config.training
+        if training.steps is not None:
+            return min(1.0, self.progress.step / training.steps)
+        return min(1.0, self.progress.seconds / training.time)
+
+    def _batches(self) -> Iterator[TrainingQueries]:
+        """Endless batches from the current step on: every epoch all slices in a new order.
+
+        The layout promises queries in random order, so that consecutive ones are a batch. Each epoch's slices
+        start at another row.
+        """
+        count = len(self.queries) // self.batch
+        while True:
+            epoch, done = divmod(self.progress.step, count)
+            random = np.random.Generator(np.random.Philox(key=[self.config.seed, epoch]))
+            start = int(random.integers(len(self.queries) - count * self.batch + 1))
+            for i in random.permutation(count)[done:]:
+                yield self.queries.slice(start + i * self.batch, start + (i + 1) * self.batch)
+
+    def train(self, seconds: float) -> bool:
+        """Train for about so long, or until the budget is spent; returns whether it is.
+
+        Raises
+        ------
+        InputError : the loss is no longer finite
+        """
+        until = time.perf_counter() + seconds
+        losses: list[Tensor] = []
+        batches = self._batches()
+        with Workers(self.queries.u.device) as workers:
+            while self.share < 1.0:
+                start = time.perf_counter()
+                if start >= until and losses:
+                    break
+                losses.append(self._guarded_step(next(batches), workers))
+                self.progress.step += 1
+                self.progress.seconds += time.perf_counter() - start
+        if losses:
+            self.progress.loss = float(torch.stack(losses).mean())
+            if not math.isfinite(self.progress.loss):
+                raise self._divergence()
+        return self.share >= 1.0
+
+    def _divergence(self) -> InputError:
+        return InputError(
+            f"training diverged: the loss is no longer finite near step {self.progress.step}",
+            cure=f"lower the rate: --rate {self.config.training.rate / 3:.1g} --overwrite",
+        )
+
+    def _guarded_step(self, batch: TrainingQueries, workers: Workers) -> Tensor:
+        try:
+            return self._step(batch, workers)
+        except (RuntimeError, IndexError):
+            # A lookup at NaN has no texel and fails before the loss could show it.
+            if all(bool(p.isfinite().all()) for p in self.model.parameters()):
+                raise
+            raise self._divergence() from None
+
+    def _tables(self) -> list[Tensor]:
+        """The textures through the blur of this moment."""
+        blur = self.config.training.blur
+        sigma = annealed_sigma(self.share / blur.share, blur.start, blur.end)
+        return [
+            t.blurred(max(sigma, blur.offset) if t.moves_lookups else sigma) for t in self.model.textures()
+        ]
+
+    def _loss(self, batch: TrainingQueries) -> Tensor:
+        prediction = self.model(batch.u, batch.sigma, batch.omega_i, batch.omega_o)
+        return mean_squared_error(prediction, batch.value) / self.unit
+
+    def _step(self, batch: TrainingQueries, workers: Workers) -> Tensor:
+        training = self.config.training
+        factor = rate_factor(training, self.progress.step, self.share)
+        for group, rate in zip(
+            self.optimiser.param_groups, (training.texture_rate, training.rate), strict=True
+        ):
+            group["lr"] = rate * factor
+        texels, weights = self.model.parameter_groups()
+        # Queries read detached tables; what they give goes back through the blur once, for all of them.
+        tables = self._tables()
+        leaves = [t.detach().requires_grad_() for t in tables]
+        for texture, leaf in zip(self.model.textures(), leaves, strict=True):
+            texture.read(leaf)
+        loss, gradients = workers.gradients(self._loss, batch, [*leaves, *weights])
+        by_table, by_weight = gradients[: len(leaves)], gradients[len(leaves) :]
+        for p, g in zip(texels, torch.autograd.grad(tables, texels, by_table), strict=True):
+            p.grad = g
+        for p, g in zip(weights, by_weight, strict=True):
+            p.grad = g
+        self.optimiser.step()
+        return loss
+
+    def predict(self, queries: Queries) -> NDArray[np.float32]:
+        """Values (n, 3) of the model as it is now, read through the current blur."""
+        with torch.no_grad():
+            for texture, table in zip(self.model.textures(), self._tables(), strict=True):
+                texture.read(table)
+        return predict(self.model, queries.u, queries.sigma, queries.omega_i, queries.omega_o)
+
+    def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """(tensors, plain data) that :meth:`restore` takes up again."""
+        tensors = {f"model.{name}": p.detach() for name, p in self.model.named_parameters()}
+        for name, p in self.model.named_parameters():
+            for key, value in self.optimiser.state.get(p, {}).items():
+                tensors[f"adam.{key}.{name}"] = value
+        return tensors, {f.name: getattr(self.progress, f.name) for f in fields(Progress)}
+
+    def restore(self, tensors: dict[str, Tensor], data: dict[str, Any]) -> None:
+        """Take up a state of the same configuration and data: training goes on as if never interrupted."""
+        with torch.no_grad():
+            for name, p in self.model.named_parameters():
+                p.copy_(tensors[f"model.{name}"])
+                self.optimiser.state[p] = {
+                    key: tensors[f"adam.{key}.{name}"].to(p.device)
+                    for key in ("step", "exp_avg", "exp_avg_sq")
+                    if f"adam.{key}.{name}" in tensors
+                }
+        self.progress = Progress(**data)

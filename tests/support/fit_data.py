@@ -1,0 +1,99 @@
+"""Small data sets of known functions, written as shards."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbtf_gen.directions import from_projected_disk
+from mbtf_gen.levels import Lattice, sigma_of_level
+from mbtf_gen.schema import FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION
+from mbtf_gen.shard_files import write_shard
+
+F32 = NDArray[np.float32]
+# (u, sigma, omega_i, omega_o) → (n, 3)
+Function = Callable[[F32, F32, F32, F32], NDArray[np.float64]]
+
+
+def random_directions(random: np.random.Generator, n: int) -> F32:
+    """Unit vectors (n, 3), uniform on the projected disk up to cos 0.1."""
+    radius, angle = np.sqrt(0.99 * random.random(n)), 2 * np.pi * random.random(n)
+    xy = np.stack([radius * np.cos(angle), radius * np.sin(angle)], -1)
+    return from_projected_disk(xy).astype(np.float32)
+
+
+def random_queries(random: np.random.Generator, n: int, lattice: Lattice) -> dict[str, F32]:
+    """Queries of all levels and directions."""
+    return {
+        "u": random.random((n, 2)).astype(np.float32),
+        "sigma": sigma_of_level(lattice.finest * random.random(n)).astype(np.float32),
+        "omega_i": random_directions(random, n),
+        "omega_o": random_directions(random, n),
+    }
+
+
+def constant(value: float) -> Function:
+    """The same grey everywhere."""
+    return lambda u, sigma, omega_i, omega_o: np.full((len(u), 3), value)
+
+
+def parallax(u: F32, sigma: F32, omega_i: F32, omega_o: F32) -> NDArray[np.float64]:
+    """A wave at depth 0.05 under the reference plane, darkened by the light's cosine: positive everywhere."""
+    at = u - 0.05 * omega_o[:, :2] / omega_o[:, 2:]
+    fade = np.exp(-2 * (2 * np.pi * sigma) ** 2)
+    wave = np.cos(2 * np.pi * at[:, 0]) * np.sin(4 * np.pi * at[:, 1]) * fade
+    value = 0.1 * (1 + 0.8 * wave) * (0.2 + 0.8 * omega_i[:, 2])
+    return value[:, None] * np.array([1.0, 0.8, 0.6])
+
+
+def write_data(
+    folder: Path,
+    function: Function,
+    *,
+    train: int = 20_000,
+    test: int = 2_000,
+    shards: int = 2,
+    finest: int = 3,
+    aspect: float = 1.0,
+    noise: float = 0.0,
+    suffix: str = ".npz",
+    layout: str = "shuffled",
+    schema: int = SCHEMA_VERSION,
+    seed: int = 0,
+) -> Path:
+    """Write a data set of a known function with independent noise in both halves; returns its folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    lattice = Lattice(finest, aspect)
+    random = np.random.default_rng(seed)
+    splits: dict[str, dict[str, object]] = {}
+    for split, total, count in (("train", train, shards), ("test", test, 1)):
+        entries = []
+        for index in range(count):
+            n = total * (index + 1) // count - total * index // count
+            queries = random_queries(random, n, lattice)
+            value = function(*queries.values())
+            halves = {
+                f"value_{half}": (value + noise * random.standard_normal(value.shape)).astype(np.float32)
+                for half in "ab"
+            }
+            arrays = {**queries, **halves, "spp": np.full(n, 2, np.float32)}
+            name = f"{split}-{index:05d}{suffix}"
+            write_shard(folder / name, arrays)
+            (folder / name).with_suffix(".json").write_text(json.dumps({"rows": n}))
+            entries.append({"file": name, "rows": n})
+        splits[split] = {"queries": total, "shards": entries}
+    manifest = {
+        "format": FORMAT_NAME,
+        "schema": schema,
+        "config_hash": f"{function.__name__}-{seed}-{noise}",
+        "layout": layout,
+        "levels": {"finest": finest},
+        "tile": {"aspect": aspect},
+        "splits": splits,
+    }
+    (folder / MANIFEST_NAME).write_text(json.dumps(manifest))
+    return folder

@@ -1,0 +1,139 @@
+"""Training: batches, schedules, gradients of several threads, resuming."""
+
+from __future__ import annotations
+
+from itertools import islice
+from typing import Any
+
+import pytest
+import torch
+from support.fit_data import parallax, random_queries
+
+import mbtf_fit.parallel
+from mbtf_fit.config import FitConfig
+from mbtf_fit.data import TrainingQueries
+from mbtf_fit.models import build_model
+from mbtf_fit.parallel import Workers
+from mbtf_fit.storage import read_tensors, write_tensors
+from mbtf_fit.training import Trainer, rate_factor
+from mbtf_gen.errors import InputError
+from mbtf_gen.levels import Lattice
+
+LATTICE = Lattice(3)
+
+
+def queries(n: int = 5000) -> TrainingQueries:
+    import numpy as np
+
+    arrays = random_queries(np.random.default_rng(0), n, LATTICE)
+    value = parallax(*arrays.values()).astype(np.float32)
+    return TrainingQueries(*(torch.from_numpy(a) for a in (*arrays.values(), value)))
+
+
+def trainer(data: TrainingQueries, model: str = "neumip", **training: Any) -> Trainer:
+    options = {"steps": 40, "batch": 1000, "warmup": 5, **training}
+    config = FitConfig.model_validate({"model": model, "training": options})
+    network = build_model(model, LATTICE)
+    network.initialise(torch.Generator().manual_seed(0), 0.1)
+    return Trainer(config, network, data)
+
+
+def finish(t: Trainer) -> Trainer:
+    while not t.train(10.0):
+        pass
+    return t
+
+
+@pytest.mark.parametrize("model", ["neumip", "neumip-baseline"])
+def test_training_lowers_the_loss(model: str) -> None:
+    data = queries()
+    t = trainer(data, model, steps=150)
+    with torch.no_grad():
+        first = t._loss(data).item()
+    finish(t)
+    assert t.progress.step == 150
+    assert t.progress.loss < 0.3 * first
+
+
+def test_every_epoch_takes_each_query_at_most_once() -> None:
+    data = queries(1050)
+    t = trainer(data, batch=100)
+    seen = []
+    for k, batch in enumerate(islice(t._batches(), 20)):
+        assert len(batch) == 100
+        seen.append(batch.sigma)
+        t.progress.step = k + 1
+    for epoch in (torch.cat(seen[:10]), torch.cat(seen[10:])):
+        assert len(epoch.unique()) == 1000
+    assert not torch.equal(torch.cat(seen[:10]), torch.cat(seen[10:]))
+
+
+def test_fewer_queries_than_a_batch_make_one_batch() -> None:
+    assert finish(trainer(queries(30), steps=3)).progress.step == 3
+
+
+def test_a_resumed_training_ends_with_the_same_numbers(tmp_path: Any) -> None:
+    data = queries()
+    whole = finish(trainer(data))
+    half = trainer(data)
+    while half.progress.step < 13:
+        half.train(0.0)
+    path = tmp_path / "checkpoint.safetensors"
+    write_tensors(path, *half.state())
+    resumed = trainer(data)
+    resumed.restore(*read_tensors(path))
+    assert resumed.progress == half.progress
+    finish(resumed)
+    for mine, other in zip(resumed.model.parameters(), whole.model.parameters(), strict=True):
+        assert torch.equal(mine, other)
+    with torch.no_grad():
+        assert resumed._loss(data) == whole._loss(data)
+
+
+def test_threads_share_a_batch_without_changing_its_gradient(monkeypatch: pytest.MonkeyPatch) -> None:
+    data = queries(999)
+    t = trainer(data)
+    monkeypatch.setattr(mbtf_fit.parallel, "MAX_THREADS", 3)
+    inputs = list(t.model.parameters())
+    found = []
+    for threads in (1, 3):
+        with Workers(torch.device("cpu"), threads) as workers:
+            assert workers.count == threads
+            found.append(workers.gradients(t._loss, data, inputs))
+    torch.testing.assert_close(found[0][0], found[1][0])
+    for one, three in zip(found[0][1], found[1][1], strict=True):
+        torch.testing.assert_close(one, three, rtol=1e-4, atol=1e-6)
+
+
+def test_workers_leave_torchs_settings_as_they_were() -> None:
+    before = torch.get_num_threads(), torch.get_float32_matmul_precision()
+    with Workers(torch.device("cpu"), 2):
+        pass
+    assert (torch.get_num_threads(), torch.get_float32_matmul_precision()) == before
+
+
+def test_rates_rise_and_fall() -> None:
+    training = FitConfig().training.model_copy(update={"warmup": 10, "final_rate": 0.05})
+    assert rate_factor(training, 0, 0.0) == pytest.approx(1 / 11)
+    assert rate_factor(training, 10, 0.0) == 1.0
+    assert rate_factor(training, 1000, 0.5) == pytest.approx(0.525)
+    assert rate_factor(training, 1000, 1.0) == pytest.approx(0.05)
+
+
+def test_a_budget_of_time_ends_training_and_its_annealing() -> None:
+    t = finish(trainer(queries(), steps=None, time=0.3))
+    assert t.share == 1.0
+    assert t.progress.seconds >= 0.3
+    pyramid, offset = t.model.textures()
+    tables = t._tables()
+    assert tables[0] is pyramid.texels
+    torch.testing.assert_close(tables[1], offset.blurred(2.0))
+
+
+@pytest.mark.parametrize("poison", ["pyramid.texels", "offset_texture.texels", "offset_network.biases.3"])
+def test_divergence_is_one_clear_error(poison: str) -> None:
+    t = trainer(queries())
+    with torch.no_grad():
+        t.model.get_parameter(poison).fill_(torch.nan)
+    with pytest.raises(InputError, match=r"diverged.*\n.*--rate 0\.01 "):
+        finish(t)
