@@ -55,6 +55,7 @@ format: $(INSTALLED)
 
 test: lint
 	$(BIN)/python -m pytest -q -m "not slow"
+	$(BIN)/mbtf-pipeline run pipelines/ci.yaml --force --quiet
 
 test-slow: $(INSTALLED)
 	$(BIN)/python -m pytest -q -m slow
