@@ -113,6 +113,8 @@ class Estimator:
         ------
         PartialError : samples stay non-finite after several draws; says where
         """
+        if spp < 2 or spp % 2:
+            raise ValueError(f"spp must be even, for two equal halves, not {spp}")
         n = len(queries.sigma)
         per_launch = max(1, self.launch // spp)
         parts = [

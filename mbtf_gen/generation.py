@@ -188,6 +188,9 @@ def _open_folder(job: Job, folder: Path, manifest: dict[str, Any], overwrite: bo
                 cure="choose another folder with -o, or replace it with --overwrite",
             )
     elif folder.exists() and not all(_LEFTOVER.fullmatch(p.name) for p in folder.iterdir()):
+        if existing.exists():
+            # Another writer of the same data set made it between the two looks.
+            return _open_folder(job, folder, manifest, overwrite)
         raise InputError(
             "is not empty and holds no data set", where=folder, cure="choose another folder with -o"
         )

@@ -1,7 +1,7 @@
 """Locks per shard: a file beside the shard that names its writer, so that several writers share one folder.
 
-A lock is taken over when its writer is gone (same machine, no such process) or when it has not been touched
-for a while.
+A lock is taken over when its writer is gone: on the same machine when there is no such process, on another
+when the lock is older than any shard takes.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-# Seconds after which an untouched lock of another machine counts as abandoned.
+# Seconds after which the lock of another machine counts as abandoned; a shard takes seconds to minutes.
 STALE_SECONDS = 1800.0
 # Locks of this process. Process numbers come again, after a restart of a container in particular.
 _held: set[Path] = set()
@@ -39,6 +39,7 @@ def _owner_is_gone(lock: Path) -> bool:
             return True
         except PermissionError:
             pass
+        return False
     return age > STALE_SECONDS
 
 

@@ -18,9 +18,9 @@ from .periodic import Period, closest_hit, leave, occluded
 
 # Roulette leaves paths of throughput one alone, for dividing by a survival chance below it makes their
 # weights grow without bound in white cracks; only after this many interactions they end with a chance of one
-# in twenty each.
+# in two hundred each.
 PATIENCE = 64
-LATE_SURVIVAL = 0.95
+LATE_SURVIVAL = 0.995
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ def trace(
 
     Returns
     -------
-    (radiance; rays whose first hit missed everything; rays cut off at the cap on crossings)
+    (radiance; rays that went down and met nothing; rays cut off at the cap on crossings)
     """
     ray = mi.Ray3f(ray)
     radiance = mi.Spectrum(0.0)
@@ -142,7 +142,8 @@ def trace(
             value, pdf, bs, weight = bsdf.eval_pdf_sample(
                 context, si, wo, rng.next_float32(), _next_2d(rng), active
             )
-            connect = active & (dr.max(value) > 0)
+            # Written so that NaN counts as light: it must reach the value, where it is found and drawn again.
+            connect = active & ~(dr.max(value) <= 0)
             blocked, _, cap = occluded(
                 scene, period, leave(period, si, omega), connect, transport.max_crossings
             )
@@ -160,6 +161,8 @@ def trace(
         ray = leave(period, si, si.to_world(bs.wo))
         depth[active] += 1
         strongest = dr.max(throughput)
+        # A path of NaN throughput would end here as if it were black.
+        radiance[active & dr.isnan(strongest)] = mi.Spectrum(dr.nan)
         active &= strongest > 0
         longest = dr.select(depth < PATIENCE, 1.0, LATE_SURVIVAL)
         survival = dr.select(depth >= transport.roulette_depth, dr.minimum(strongest, longest), 1.0)

@@ -59,17 +59,18 @@ def test_values_do_not_depend_on_the_size_of_launches() -> None:
 
 
 class Faulty(mi.BSDF):  # type: ignore[misc]
-    """A Lambert reflector of albedo 1/2 with infinite values on a twentieth of the tile."""
+    """A Lambert reflector of albedo 1/2 with NaN or infinite values on a twentieth of the tile."""
 
-    def __init__(self, props: Any) -> None:
+    def __init__(self, props: Any, bad: float) -> None:
         mi.BSDF.__init__(self, props)
+        self.bad = bad
         self.inner = mi.load_dict(lambert(0.5))
         self.m_flags = self.inner.flags()
         self.m_components = [self.inner.flags()]
 
     def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
         x = 1000.0 * si.uv.x
-        return dr.select(x - dr.floor(x) < 0.05, mi.Color3f(dr.inf), self.inner.eval(ctx, si, wo, active))
+        return dr.select(x - dr.floor(x) < 0.05, mi.Color3f(self.bad), self.inner.eval(ctx, si, wo, active))
 
     def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
         return self.inner.pdf(ctx, si, wo, active)
@@ -78,9 +79,10 @@ class Faulty(mi.BSDF):  # type: ignore[misc]
         return self.inner.sample(ctx, si, s1, s2, active)
 
 
-def test_nonfinite_samples_are_drawn_again_and_counted() -> None:
+@pytest.mark.parametrize("bad", [np.inf, np.nan])
+def test_nonfinite_samples_are_drawn_again_and_counted(bad: float) -> None:
     n, spp = 500, 8
-    tile = build_tile(flat(), Faulty(mi.Properties()))
+    tile = build_tile(flat(), Faulty(mi.Properties(), bad))
     e = Estimator(tile, LightKernel(0.0), Transport(max_depth=1))
     values = e.estimate(same_query(n), spp, Stream(0, "train", 0))
     # One in twenty, and of those one in twenty again; none is left in the values.

@@ -131,6 +131,15 @@ def test_finite_footprint(light: tuple[float, float], view: tuple[float, float],
     # precision.
     dither = np.random.default_rng(8).normal(scale=2e-5, size=(2, n, 1))
     a, b = e.value_a[:, :1] + dither[0], e.value_b[:, :1] + dither[1]
+    # A third that expects a handful of lit paths in all has no normal mean: leave it out.
+    for third in range(3):
+        lit = exact[thirds == third].sum() / (ALBEDO / np.pi) * 64
+        if lit < 100:
+            thirds[thirds == third] = -1
+    if np.all(thirds < 0):
+        # Light and view from opposite sides, both low: no facet has both.
+        assert e.value_a.mean() < 1e-3
+        return
     result = aggregate_test(a, b, exact, exact, thirds, minimum=500)
     assert result.p_value > 1e-3, str(result)
 
