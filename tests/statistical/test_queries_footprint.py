@@ -1,0 +1,68 @@
+"""The query sensor's points, with the random numbers that it is used with: a Gaussian wrapped on the torus."""
+
+from __future__ import annotations
+
+import drjit as dr
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from support.scenes import mi, queries
+
+from mbtf_gen.seeds import Purpose, path_generator, stream_number
+from mbtf_gen.stats import Rectangle, chi_square_test, mean_estimate, z_test
+
+N = 1 << 18
+CENTRE = np.array([0.9, 0.05])
+
+
+def points(sigma: float, aspect: float) -> NDArray[np.float64]:
+    """uv (N, 2) of sampled footprint points, not wrapped."""
+    sensor = mi.load_dict({"type": "mbtf_queries", "aspect": aspect})
+    sensor.set_queries(queries(CENTRE, sigma, [0, 0, 1], [0, 0, 1], 1))
+    number = mi.UInt64(stream_number("test", 2, Purpose.FOOTPRINT))
+    generator = path_generator(4, number, dr.arange(mi.UInt64, N))
+    xi = mi.Point2f(generator.next_float32(), generator.next_float32())
+    return np.array(sensor.footprint(dr.zeros(mi.UInt32, N), xi), np.float64).T
+
+
+@pytest.mark.parametrize("aspect", [1.0, 0.5])
+@pytest.mark.parametrize("sigma", [1e-3, 0.1, 3.0])
+def test_points_have_the_mean_and_covariance_of_the_footprint(sigma: float, aspect: float) -> None:
+    # Lengths in tile widths: on a tile half as high as wide, σ spans twice as much of v.
+    x = (points(sigma, aspect) - CENTRE) * (1.0, aspect) / sigma
+    # Single precision places the centre to 1e-8.
+    allowed = 1e-7 / sigma
+    for axis in (0, 1):
+        assert (
+            z_test(mean_estimate(x[:, axis] - np.clip(x[:, axis].mean(), -allowed, allowed))).p_value > 1e-3
+        )
+        assert z_test(mean_estimate(x[:, axis] ** 2), 1.0).p_value > 1e-3
+        assert z_test(mean_estimate(x[:, axis] ** 4), 3.0).p_value > 1e-3
+    assert z_test(mean_estimate(x[:, 0] * x[:, 1])).p_value > 1e-3
+
+
+def wrapped(offset: NDArray[np.float64], sigma: float) -> NDArray[np.float64]:
+    """Density on the circle of length 1 of a Gaussian around 0, summed over its images."""
+    images = offset[:, None] + np.arange(-30, 31)
+    return np.exp(-0.5 * (images / sigma) ** 2).sum(axis=1) / (sigma * np.sqrt(2 * np.pi))
+
+
+@pytest.mark.parametrize("aspect", [1.0, 0.5])
+@pytest.mark.parametrize("sigma", [0.1, 0.3, 0.5])
+def test_on_the_torus_they_follow_the_wrapped_gaussian(sigma: float, aspect: float) -> None:
+    p = points(sigma, aspect)
+    result = chi_square_test(
+        p - np.floor(p),
+        lambda q: wrapped(q[:, 0] - CENTRE[0], sigma) * wrapped(q[:, 1] - CENTRE[1], sigma / aspect),
+        Rectangle(),
+        (24, 24),
+    )
+    assert result.p_value > 1e-3, str(result)
+
+
+@pytest.mark.parametrize("aspect", [1.0, 0.5])
+@pytest.mark.parametrize("sigma", [2.0, 50.0])
+def test_footprints_far_wider_than_the_tile_are_uniform_on_it(sigma: float, aspect: float) -> None:
+    p = points(sigma, aspect)
+    result = chi_square_test(p - np.floor(p), lambda q: np.ones(len(q)), Rectangle(), (24, 24))
+    assert result.p_value > 1e-3, str(result)
