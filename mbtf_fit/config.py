@@ -15,6 +15,7 @@ _DURATION = re.compile(r"^\s*(\d+(?:\.\d+)?)\s*(s|sec|min|m|h)?\s*$")
 _SECONDS = {"s": 1.0, "sec": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0, None: 1.0}
 
 ModelName = Literal["neumip-baseline", "neumip"]
+LossName = Literal["relative", "squared"]
 
 
 def parse_duration(text: str | float) -> float:
@@ -74,6 +75,7 @@ class TrainingSection(Settings):
     time: Duration = Field(120.0, description="budget: 90s, 2min, 1h")
     steps: int | None = Field(None, ge=1, description="train this many steps, however long they take")
     batch: int = Field(1 << 15, ge=1, le=1 << 24, description="queries per step")
+    loss: LossName = Field("relative", description="relative (highlights do not drown the rest) or squared")
     rate: float = Field(3e-2, gt=0, lt=1, description="largest learning rate of the networks (Adam)")
     texture_rate: float = Field(1e-2, gt=0, lt=1, description="largest learning rate of the textures")
     final_rate: float = Field(0.01, gt=0, le=1, description="share of the rates that is left at the end")

@@ -19,6 +19,7 @@ from .blur import annealed_sigma
 from .config import FitConfig, TrainingSection
 from .data import Queries, TrainingQueries
 from .inference import predict
+from .losses import Loss, relative_error, squared_error
 from .models import NeuralMaterial
 from .parallel import Workers
 
@@ -34,15 +35,6 @@ def rate_factor(training: TrainingSection, step: int, share: float) -> float:
     return rise * fall
 
 
-def mean_squared_error(prediction: Tensor, value: Tensor) -> Tensor:
-    """Mean squared error of linear values.
-
-    Its minimum is the expectation of noisy values. The published code compares logarithms and adds an
-    absolute error: with a few paths per query both pull dark, towards the median.
-    """
-    return torch.nn.functional.mse_loss(prediction, value)
-
-
 @dataclass
 class Progress:
     """How far training is.
@@ -51,7 +43,7 @@ class Progress:
     ----------
     step : steps done
     seconds : time spent in steps, over all runs
-    loss : mean training loss of the last steps, in units of the values' variance
+    loss : mean training loss of the last steps
     """
 
     step: int = 0
@@ -80,10 +72,16 @@ class Trainer:
         self.batch = min(config.training.batch, len(queries))
         texels, weights = model.parameter_groups()
         self.optimiser = torch.optim.Adam([{"params": texels}, {"params": weights}], betas=BETAS, fused=True)
-        variance = float(queries.value.var(0, correction=0).mean()) if len(queries) > 1 else 0.0
-        power = float(queries.value.square().mean())
+        self.loss = self._choose_loss()
+
+    def _choose_loss(self) -> Loss:
+        value = self.queries.value
+        if self.config.training.loss == "relative":
+            return relative_error(float(value.mean()) or 1.0)
+        variance = float(value.var(0, correction=0).mean()) if len(value) > 1 else 0.0
+        power = float(value.square().mean())
         # Of constant data the variance is rounding error: measure by the values themselves.
-        self.unit = variance if variance > 1e-6 * power else power or 1.0
+        return squared_error(variance if variance > 1e-6 * power else power or 1.0)
 
     @property
     def share(self) -> float:
@@ -156,7 +154,7 @@ class Trainer:
 
     def _loss(self, batch: TrainingQueries) -> Tensor:
         prediction = self.model(batch.u, batch.sigma, batch.omega_i, batch.omega_o)
-        return mean_squared_error(prediction, batch.value) / self.unit
+        return self.loss(prediction, batch.value)
 
     def _step(self, batch: TrainingQueries, workers: Workers) -> Tensor:
         training = self.config.training
