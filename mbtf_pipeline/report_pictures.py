@@ -36,7 +36,7 @@ def percent(e: Estimate, digits: int = 2) -> str:
 def decibel(record: Mapping[str, Any]) -> str:
     """PSNR in words; null stands for an error below the reference's noise."""
     e = estimate(record)
-    return f"PSNR {e.value:.1f} ± {e.error:.1f} dB" if math.isfinite(e.value) else "error below the noise"
+    return f"PSNR {e} dB" if math.isfinite(e.value) else "error below the noise"
 
 
 @dataclass

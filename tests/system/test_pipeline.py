@@ -183,6 +183,14 @@ def test_another_title_makes_only_the_report(again: Any, folder: Path) -> None:
     assert list(again()) == ["report"]
 
 
+def test_a_fit_that_was_done_but_not_stamped_is_not_trained_again(again: Any, folder: Path) -> None:
+    weights = folder / "fits" / "neumip" / "weights.safetensors"
+    before = weights.stat().st_mtime_ns
+    (folder / "stages" / "fit-neumip.json").unlink()
+    assert list(again()) == ["fit neumip", "compare", "report"]
+    assert weights.stat().st_mtime_ns == before
+
+
 def test_a_flipped_byte_is_found_and_mended(again: Any, folder: Path) -> None:
     shard = folder / "shards" / "test-00000.npz"
     whole = shard.read_bytes()

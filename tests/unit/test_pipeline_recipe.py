@@ -10,6 +10,7 @@ import pytest
 
 from mbtf_gen.console import run
 from mbtf_gen.errors import InputError, UsageError
+from mbtf_gen.locks import shard_lock
 from mbtf_pipeline.recipe import load_recipe, read_resolved, write_recipe
 
 HEAD = """\
@@ -157,6 +158,19 @@ def test_exit_codes(
     err = capsys.readouterr().err
     assert what in err
     assert len(err.splitlines()) <= 2
+
+
+def test_a_folder_at_work_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = written(tmp_path, SINGLE)
+    folder = tmp_path / "out"
+    folder.mkdir()
+    from mbtf_pipeline.cli import app
+
+    with shard_lock(folder / "run.json") as held:
+        assert held
+        assert run(app, ["run", str(path), "-o", str(folder), "-q"]) == 4
+    assert "another run is at work" in capsys.readouterr().err
+    assert list(folder.iterdir()) == []
 
 
 def test_a_wrong_assignment_is_an_error_of_usage(tmp_path: Path) -> None:
