@@ -175,8 +175,10 @@ def _claim(out: Path, identity: dict[str, Any], config: FitConfig, overwrite: bo
         if old.get("config_hash") == identity["config_hash"] and not overwrite:
             return
         if not overwrite:
-            keys = ("schema", "config", "data")
-            before, after = ({k: record.get(k) for k in keys} for record in (old, identity))
+            before, after = (
+                {**record.get("config", {}), **{k: record.get(k) for k in ("schema", "data")}}
+                for record in (old, identity)
+            )
             changes = "; ".join(differences(before, after)[:8]) or "other shards"
             raise InputError(
                 f"holds a fit of another configuration: {changes}",
