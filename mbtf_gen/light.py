@@ -14,7 +14,7 @@ a few hundred distinct values left.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
@@ -26,10 +26,14 @@ MAX_WIDTH_DEG = 45.0
 MIN_WIDTH_DEG = 0.01
 
 
+# Worked out once: nodes of high order take a tenth of a second.
+_gauss = cache(np.polynomial.legendre.leggauss)
+
+
 def _theta_nodes(kappa: float, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Gauss–Legendre nodes and weights over the polar angle, up to where the lobe holds e^-40 of its peak."""
     end = float(np.arccos(max(-1.0, 1.0 - 40.0 / kappa)))
-    x, w = np.polynomial.legendre.leggauss(count)
+    x, w = _gauss(count)
     return 0.5 * end * (x + 1.0), 0.5 * end * w
 
 
@@ -73,7 +77,7 @@ def lobe_irradiance(kappa: float, elevation: ArrayLike) -> NDArray[np.float64]:
     """E = ∫ p(ω) max(ω_z, 0) dω by quadrature, for elevations of ω_i in radians (any shape)."""
     alpha = np.atleast_1d(np.asarray(elevation, np.float64))
     end = float(np.arccos(max(-1.0, 1.0 - 40.0 / kappa)))
-    x, w = np.polynomial.legendre.leggauss(128)
+    x, w = _gauss(128)
     total = np.zeros_like(alpha)
     # The inner mean has a kink where the cone of half-angle θ touches the horizon, at θ = elevation.
     kink = np.clip(alpha, 0.0, end)
