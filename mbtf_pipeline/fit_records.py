@@ -38,7 +38,7 @@ class History:
 
     @property
     def loss(self) -> list[tuple[float, float]]:
-        """(seconds, training loss in units of the values' variance, noise included)."""
+        """(seconds, training loss, noise included)."""
         return [(r["seconds"], r["loss"]) for r in self.records if _finite(r["loss"])]
 
     @property

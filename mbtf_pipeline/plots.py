@@ -168,10 +168,10 @@ def _points(
         axes.plot(xs, ys, color=colour(index), linewidth=0.8, alpha=0.45)
     axes.set_xticks(range(len(groups)), groups)
     axes.set_xlim(-0.6, len(groups) - 0.4)
-    values = [v[0] for row in series.values() for v in row if v is not None and v[0] > 0]
-    if values:
+    heights = [v[0] for row in series.values() for v in row if v is not None and v[0] > 0]
+    if heights:
         # A bar that reaches down to zero has no end on a logarithmic axis: the values set its range.
-        axes.set_ylim(min(values) / 2.0, max(values) * 2.0)
+        axes.set_ylim(min(heights) / 2.0, max(heights) * 2.0)
     _plain_ticks(axes.yaxis)
     axes.legend(frameon=False)
     return figure

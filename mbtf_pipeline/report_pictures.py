@@ -166,7 +166,8 @@ def show_pictures(
                     value(made["file"]), value(picture["references"][main_kind]["file"]), scale * white
                 ),
             )
-            cells.append(_cell([name], f"{fit} − reference", [], f"{fit} minus reference: {where}"))
+            line = _root(estimate(errors["mse"]), white)
+            cells.append(_cell([name], f"{fit} − reference", [line], f"{fit} minus reference: {where}"))
         rows.append({"index": len(rows), "cells": cells})
     heroes = _heroes(pictures, fits, main_kind, value, white, gallery)
     columns = len(kinds) + 2 * len(fits)
@@ -176,8 +177,16 @@ def show_pictures(
 def _between(difference: Estimate, white: float) -> str:
     """How far the two kinds of reference are apart."""
     if difference.value <= 2.0 * difference.error:
-        return "as the other within noise"
-    return f"{math.sqrt(difference.value) / white:.1%} of white (RMS) from the other"
+        return "differs by less than noise"
+    return f"differs by {math.sqrt(difference.value) / white:.1%} of white"
+
+
+def _root(mse: Estimate, white: float) -> str:
+    """Root mean square error, the reference's noise taken out."""
+    if mse.value <= 0:
+        return "error below the noise"
+    root = math.sqrt(mse.value) / white
+    return f"RMS {Estimate(100 * root, 100 * root * mse.relative_error / 2, mse.n)} % of white"
 
 
 def _levels(levels: list[float], finest: int) -> str:

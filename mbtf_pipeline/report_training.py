@@ -15,9 +15,7 @@ def training_context(histories: Mapping[str, History]) -> dict[str, Any]:
     held = [Curve(name, *_columns(h.held_out)) for name, h in histories.items() if h.held_out]
     plots = []
     if loss:
-        svg = curves(
-            loss, "seconds of training", "loss ÷ variance of the noisy values", "training loss over seconds"
-        )
+        svg = curves(loss, "seconds of training", "training loss", "training loss over seconds")
         plots.append({"title": "Training loss, noise included", "svg": svg})
     if held:
         svg = curves(held, "seconds of training", "unexplained variance", "held-out error over seconds")

@@ -126,7 +126,10 @@ class _Run:
             )
             with self.console.progress(budget, fit_stage(name), unit) as bar:
                 result = fit(
-                    config, shards, out, progress=lambda share, note: bar.update(round(share * budget, 1), note)
+                    config,
+                    shards,
+                    out,
+                    progress=lambda share, note: bar.update(round(share * budget, 1), note),
                 )
             return {"seconds": result.seconds, "resumed": result.resumed}
 
