@@ -36,8 +36,8 @@ def test_lambert_is_albedo_over_pi(width: float, light: float, view: float) -> N
             # passes.
             mean = mean_of_halves(a, b)
             assert mean.relative_error < 2e-2
-            # Of a lobe of 0.05° two parts in 10⁵ come from BSDF samples that hit its outskirts, once in several
-            # runs of this size: an error bar without such a hit does not know of them.
+            # Of a lobe of 0.05° two parts in 10⁵ come from BSDF samples that hit its outskirts, once in a run
+            # or two of this size: an error bar without such a hit does not know of them.
             off = abs(mean.value * np.pi / albedo - 1)
             assert off < 1e-4 or z_test(mean, albedo / np.pi).p_value > 1e-4
     assert e.lost == 0
