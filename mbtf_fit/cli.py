@@ -87,7 +87,9 @@ def fit(
         "seed": seed,
         "device": device,
     }
-    resolved = resolve(FitConfig, file=config, assignments=assignments or [], flags=flags)
+    # Time asked for on the command line takes the place of steps in a file.
+    assigned = [*(assignments or []), *(["training.steps=null"] if time is not None else [])]
+    resolved = resolve(FitConfig, file=config, assignments=assigned, flags=flags)
     training = resolved.training
     budget = format_duration(training.time) if training.steps is None else f"{training.steps} steps"
     from .fitting import fit
@@ -101,7 +103,7 @@ def fit(
             shards,
             output,
             overwrite=overwrite,
-            progress=lambda share, note: bar.update(100 * share, note),
+            progress=lambda share, note: bar.update(round(100 * share, 1), note),
         )
     data = result.as_dict()
     console.report(data, _describe_fit(data))

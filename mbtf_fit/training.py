@@ -24,7 +24,7 @@ from .models import NeuralMaterial
 from .parallel import Workers
 
 # Decay of Adam's running means of the gradient and of its square.
-BETAS = (0.9, 0.99)
+BETAS = (0.8, 0.95)
 
 
 def rate_factor(training: TrainingSection, step: int, share: float) -> float:
