@@ -191,7 +191,7 @@ class Console:
     Attributes
     ----------
     json : print one JSON object on standard output instead of text
-    quiet : no progress and no notes
+    quiet : no progress and no notes; warnings and errors stay
     """
 
     json: Annotated[bool, Parameter(negative="", help="Print one JSON object on standard output.")] = False
@@ -261,12 +261,13 @@ class _LogHandler(logging.Handler):
         print(f"{prefix}{record.getMessage()}", file=sys.stderr, flush=True)
 
 
-def _route_logs(debug: bool) -> None:
+def _route_logs(tokens: Sequence[str], debug: bool) -> None:
+    level = logging.WARNING if {"-q", "--quiet"} & set(tokens) else logging.INFO
     for package in _PACKAGES:
         logger = logging.getLogger(package)
         logger.handlers = [_LogHandler()]
         logger.propagate = False
-        logger.setLevel(logging.DEBUG if debug else logging.INFO)
+        logger.setLevel(logging.DEBUG if debug else level)
 
 
 def _take_debug(tokens: Sequence[str]) -> tuple[bool, list[str]]:
@@ -345,7 +346,7 @@ def run(app: App, argv: Sequence[str] | None = None) -> int:
     of ours. Errors are one or two lines on standard error; ``--debug`` anywhere adds the traceback.
     """
     debug, tokens = _take_debug(sys.argv[1:] if argv is None else list(argv))
-    _route_logs(debug)
+    _route_logs(tokens, debug)
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             # A terminal without our signs (Greek letters, ±) shows question marks instead of failing.

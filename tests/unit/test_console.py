@@ -186,11 +186,14 @@ def test_warnings_of_the_packages_reach_standard_error(capsys: pytest.CaptureFix
     app = new_app("prog", "A program.")
 
     @app.default
-    def warn() -> None:
+    def warn(console: Console = CONSOLE) -> None:
+        logging.getLogger("mbtf_gen.anything").info("mesh: 64 cells")
         logging.getLogger("mbtf_gen.anything").warning("8-bit heights were smoothed")
         logging.getLogger("mbtf_gen.anything").debug("detail")
 
     assert run(app, []) == 0
+    assert capsys.readouterr().err == "mesh: 64 cells\nwarning: 8-bit heights were smoothed\n"
+    assert run(app, ["--quiet"]) == 0
     assert capsys.readouterr().err == "warning: 8-bit heights were smoothed\n"
 
 
