@@ -10,6 +10,7 @@ from .plots import points
 from .report_pictures import decibel, estimate, percent
 
 UNEXPLAINED = "unexplained variance"
+_TERMS = {"mse": "MSE", "psnr": "PSNR", "relative_mse": "relative MSE", "error_bar": "error bar"}
 
 
 def _first_split(comparison: Mapping[str, Any]) -> dict[str, Any]:
@@ -28,7 +29,7 @@ def error_context(comparison: Mapping[str, Any]) -> dict[str, Any]:
             _groups_table(comparison, "elevations", "By the smaller cosine of light and view", "cos θ"),
             _pictures_table(comparison),
         ],
-        "definitions": [(k.replace("_", " "), v) for k, v in comparison["definitions"].items()],
+        "definitions": [(_TERMS[k], v) for k, v in comparison["definitions"].items()],
     }
 
 
@@ -121,16 +122,16 @@ def _groups_table(comparison: Mapping[str, Any], key: str, title: str, head: str
 
 
 def _pictures_table(comparison: Mapping[str, Any]) -> dict[str, Any]:
-    kinds, fits = comparison["kinds"], comparison["fits"]
+    """One row per picture and fit, errors against each kind of reference."""
+    kinds = comparison["kinds"]
     rows = []
     for picture in comparison["pictures"]:
-        view, light = picture["view"], picture["light"]
-        row = [
-            f"{view['elevation']:g}°, {view['azimuth']:g}°",
-            f"{light['elevation']:g}°, {light['azimuth']:g}°",
-            f"{picture['zoom']:g}",
-        ]
-        for fit in fits:
+        view, light = (
+            f"{picture[d]['elevation']:g}°, {picture[d]['azimuth']:g}°".replace("-", "−")
+            for d in ("view", "light")
+        )
+        for fit in comparison["fits"]:
+            row = [view, light, f"{picture['zoom']:g}", fit]
             for kind in kinds:
                 errors = picture["fits"][fit]["errors"][kind]
                 row += [
@@ -138,13 +139,8 @@ def _pictures_table(comparison: Mapping[str, Any]) -> dict[str, Any]:
                     decibel(errors["psnr"]).removeprefix("PSNR "),
                     str(estimate(errors["relative_mse"])),
                 ]
-        rows.append(row)
-    against = (lambda kind: f" against {kind}") if len(kinds) > 1 else (lambda kind: "")
-    heads = [
-        f"{fit}: {what}{against(kind)}"
-        for fit in fits
-        for kind in kinds
-        for what in ("MSE [10⁻³/sr²]", "PSNR", "relative MSE")
-    ]
+            rows.append(row)
+    measures = ("MSE [10⁻³/sr²]", "PSNR", "relative MSE")
+    heads = [f"{m}, {kind} reference" for kind in kinds for m in measures]
     title = f"Pictures (PSNR's peak: {comparison['white']:.3g} 1/sr)"
-    return {"title": title, "head": ["view", "light", "tiles across", *heads], "rows": rows}
+    return {"title": title, "head": ["view", "light", "tiles across", "fit", *heads], "rows": rows}
