@@ -124,7 +124,7 @@ def _describe_errors(errors: dict[str, Any]) -> list[str]:
 
 def _number(estimate: dict[str, Any]) -> str:
     if estimate["value"] is None:
-        return "undefined (no variance in the data)"
+        return "undefined (too few or too noisy queries to tell the variance)"
     error = "?" if estimate["error"] is None else f"{estimate['error']:.3f}"
     return f"{estimate['value']:.3f} ± {error}"
 

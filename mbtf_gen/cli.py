@@ -162,7 +162,7 @@ def _describe(summary: Any) -> str:
         f"{n} {what}"
         for n, what in (
             (summary.nonfinite, "non-finite samples (drawn again)"),
-            (summary.lost, "rays lost between triangles"),
+            (summary.lost, "rays slipped below the surface at a crease (they bring no light)"),
             (summary.capped, "rays cut at the cap on tile crossings"),
         )
         if n
