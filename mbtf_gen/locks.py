@@ -1,12 +1,15 @@
 """Locks per shard: a file beside the shard that names its writer, so that several writers share one folder.
 
-A lock is taken over when its writer is gone: on the same machine when there is no such process, on another
-when the lock is older than any shard takes.
+The lock itself is the kernel's advisory lock on that file: it ends with its process, however that ends, and
+nobody has to guess whether a writer still lives. Machines that share a folder without sharing such locks go
+by what the file says: its writer's machine and its age.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
+import fcntl
 import json
 import os
 import socket
@@ -16,50 +19,57 @@ from pathlib import Path
 
 # Seconds after which the lock of another machine counts as abandoned; a shard takes seconds to minutes.
 STALE_SECONDS = 1800.0
-# Locks of this process. Process numbers come again, after a restart of a container in particular.
-_held: set[Path] = set()
+# What a file system without advisory locks answers.
+_NO_LOCKS = (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK)
 
 
-def _owner_is_gone(lock: Path) -> bool:
-    try:
-        age = time.time() - lock.stat().st_mtime
-        owner = json.loads(lock.read_text())
-        host, process = str(owner["host"]), int(owner["process"])
-    except FileNotFoundError:
-        return True
-    except (OSError, ValueError, KeyError, TypeError):
-        # Half-written by a process that died; a live writer needs milliseconds.
-        return age > 5.0
-    if host == socket.gethostname():
-        if process == os.getpid():
-            return lock.resolve() not in _held
+def _lock_file(lock: Path) -> int | None:
+    """Descriptor of the locked file; None where another process holds it."""
+    while True:
+        handle = os.open(lock, os.O_CREAT | os.O_RDWR, 0o666)
         try:
-            os.kill(process, 0)
-        except ProcessLookupError:
-            return True
-        except PermissionError:
-            pass
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(handle)
+            return None
+        except OSError as error:
+            if error.errno not in _NO_LOCKS:
+                os.close(handle)
+                raise
+        # Its former holder removes the file before letting go: what is locked may be gone from the folder.
+        with contextlib.suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(handle), os.stat(lock)):
+                return handle
+        os.close(handle)
+
+
+def _held_elsewhere(handle: int) -> bool:
+    """Whether another machine wrote the file's content, not long ago."""
+    try:
+        host = str(json.loads(os.pread(handle, 4096, 0))["host"])
+    except (ValueError, KeyError, TypeError):
         return False
-    return age > STALE_SECONDS
+    return host != socket.gethostname() and time.time() - os.fstat(handle).st_mtime < STALE_SECONDS
 
 
 @contextlib.contextmanager
 def shard_lock(path: Path) -> Iterator[bool]:
     """Hold the lock of the shard `path`; yields False when another writer holds it."""
     lock = path.with_name(f".{path.stem}.lock")
-    if lock.exists() and _owner_is_gone(lock):
-        lock.unlink(missing_ok=True)
-    try:
-        handle = os.open(lock, os.O_CREAT | os.O_EXCL | os.O_WRONLY)
-    except FileExistsError:
+    handle = _lock_file(lock)
+    if handle is None:
         yield False
         return
-    _held.add(lock.resolve())
     try:
-        with os.fdopen(handle, "w") as stream:
-            owner = {"host": socket.gethostname(), "process": os.getpid(), "since": time.time()}
-            json.dump(owner, stream)
-        yield True
+        if _held_elsewhere(handle):
+            yield False
+            return
+        owner = {"host": socket.gethostname(), "process": os.getpid(), "since": time.time()}
+        os.ftruncate(handle, 0)
+        os.pwrite(handle, json.dumps(owner).encode(), 0)
+        try:
+            yield True
+        finally:
+            lock.unlink(missing_ok=True)
     finally:
-        _held.discard(lock.resolve())
-        lock.unlink(missing_ok=True)
+        os.close(handle)

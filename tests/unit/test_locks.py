@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import socket
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -59,29 +61,90 @@ def test_an_error_inside_releases_the_lock(shard: Path) -> None:
         assert held
 
 
-def test_the_lock_of_a_dead_process_is_taken_over(shard: Path) -> None:
-    child = subprocess.Popen([sys.executable, "-c", ""])
-    child.wait()
-    plant(shard, owner(socket.gethostname(), child.pid))
-    with shard_lock(shard) as held:
-        assert held
-        assert json.loads(lock_of(shard).read_text())["process"] == os.getpid()
+def hold(shard: Path) -> subprocess.Popen[bytes]:
+    """Another process that holds the lock until its standard input ends."""
+    code = f"""
+import sys
+from pathlib import Path
+from mbtf_gen.locks import shard_lock
+with shard_lock(Path({str(shard)!r})) as held:
+    print(held, flush=True)
+    sys.stdin.read()
+"""
+    child = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    assert child.stdout is not None
+    assert child.stdout.readline() == b"True\n"
+    return child
 
 
 def test_the_lock_of_a_living_process_is_respected_however_old(shard: Path) -> None:
-    child = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+    child = hold(shard)
     try:
-        text = owner(socket.gethostname(), child.pid)
-        lock = plant(shard, text, age=STALE_SECONDS + 60)
+        assert json.loads(lock_of(shard).read_text())["process"] == child.pid
+        os.utime(lock_of(shard), (0, 0))
         with shard_lock(shard) as held:
             assert not held
-        assert lock.read_text() == text
     finally:
-        child.communicate(b"\n")
+        child.communicate()
+    assert not lock_of(shard).exists()
 
 
-def test_a_lock_with_our_own_number_from_an_earlier_life_is_taken_over(shard: Path) -> None:
-    plant(shard, owner(socket.gethostname(), os.getpid()))
+def test_the_lock_of_a_killed_process_is_taken_over_at_once(shard: Path) -> None:
+    child = hold(shard)
+    child.kill()
+    child.communicate()
+    assert lock_of(shard).exists()
+    with shard_lock(shard) as held:
+        assert held
+        assert json.loads(lock_of(shard).read_text())["process"] == os.getpid()
+    assert not lock_of(shard).exists()
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"host": "x"}'[:9], '{"process": 3}'])
+def test_what_a_kill_left_half_written_is_taken_over_at_once(text: str, shard: Path) -> None:
+    plant(shard, text)
+    with shard_lock(shard) as held:
+        assert held
+
+
+def test_of_many_that_take_over_at_once_one_gets_it(shard: Path) -> None:
+    plant(shard, owner(socket.gethostname(), 1))
+    inside, most, gate = 0, 0, threading.Barrier(8)
+    count = threading.Lock()
+
+    def contend() -> None:
+        nonlocal inside, most
+        gate.wait()
+        for _ in range(200):
+            with shard_lock(shard) as held:
+                if held:
+                    with count:
+                        inside += 1
+                        most = max(most, inside)
+                    time.sleep(0)
+                    with count:
+                        inside -= 1
+
+    threads = [threading.Thread(target=contend) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert most == 1
+    assert not lock_of(shard).exists()
+
+
+def test_without_advisory_locks_the_file_still_keeps_other_machines_out(
+    shard: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def unsupported(handle: int, operation: int) -> None:
+        raise OSError(errno.ENOSYS, "not implemented")
+
+    monkeypatch.setattr("fcntl.flock", unsupported)
+    plant(shard, owner(f"{socket.gethostname()}-other", 1))
+    with shard_lock(shard) as held:
+        assert not held
+    plant(shard, "")
     with shard_lock(shard) as held:
         assert held
 
@@ -92,15 +155,5 @@ def test_locks_of_other_machines_count_by_age(shard: Path) -> None:
     with shard_lock(shard) as held:
         assert not held
     plant(shard, text, age=STALE_SECONDS + 60)
-    with shard_lock(shard) as held:
-        assert held
-
-
-@pytest.mark.parametrize("text", ["", "{", "[]", '{"host": "x"}', '{"host": "x", "process": "y"}'])
-def test_half_written_locks_are_respected_for_seconds_only(text: str, shard: Path) -> None:
-    plant(shard, text, age=0)
-    with shard_lock(shard) as held:
-        assert not held
-    plant(shard, text, age=30)
     with shard_lock(shard) as held:
         assert held
