@@ -1,0 +1,1 @@
+"""Commands of ``mbtf-gen``, one file each; every one imports what it needs only when it runs."""

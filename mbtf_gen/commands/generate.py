@@ -1,0 +1,146 @@
+"""``mbtf-gen MATERIAL``: generate a data set."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+from ..console import CONSOLE, Console, clock
+from ..errors import UsageError
+from .common import Output, Set, resolve_config
+
+
+def _slice(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"(\d+)/(\d+)", text.strip())
+    if match is None or not 1 <= int(match[1]) <= int(match[2]):
+        raise UsageError(f"'{text}' must be i/n with 1 <= i <= n, such as 3/8", where="--shards")
+    return int(match[1]), int(match[2])
+
+
+def generate(
+    material: str | None = None,
+    /,
+    *,
+    output: Output = None,
+    queries: str | None = None,
+    test_queries: str | None = None,
+    spp: int | None = None,
+    test_spp: int | None = None,
+    height: float | None = None,
+    mesh: int | None = None,
+    levels: int | None = None,
+    light_width: float | None = None,
+    min_cos: float | None = None,
+    max_depth: int | None = None,
+    layout: Literal["shuffled", "image"] | None = None,
+    format: Literal["npz", "exr"] | None = None,
+    seed: int | None = None,
+    shards: str = "1/1",
+    config: Path | None = None,
+    assignments: Set | None = None,
+    overwrite: Annotated[bool, Parameter(negative="")] = False,
+    console: Console = CONSOLE,
+) -> None:
+    """Generate a data set: mbtf-gen heightfield.exr --queries 400/texel -o shards/
+
+    The same command again resumes an unfinished data set.
+
+    Parameters
+    ----------
+    material
+        Height map, folder of maps, or material.yaml.
+    output
+        Folder of shards. Default: shards/
+    queries
+        Training queries: N, or N/texel of the finest level. Default: 100/texel
+    test_queries
+        Test queries: N or N/texel. Default: 8192
+    spp
+        Paths per training query, both halves together (even). Default: 4
+    test_spp
+        Paths per test query, both halves together (even). Default: 256
+    height
+        Factor on the stored heights, in tile widths. Default: the material's own
+    mesh
+        Mesh cells across the tile. Default: the map's width, at most 512
+    levels
+        Finest level k: 2^k texels across. Default: from the map's width
+    light_width
+        RMS angle of the light per axis in degrees; 0 is a delta light. Default: 1
+    min_cos
+        Smallest cosine of light and view directions to the normal. Default: 0.1
+    max_depth
+        Surface interactions per path; 0: no limit (Russian roulette). Default: 0
+    layout
+        shuffled queries, or one image buffer per (light, view, footprint).
+    format
+        npz or exr shards.
+    seed
+        Root seed. Default: 0
+    shards
+        Slice i/n: make only every n-th shard; finish with mbtf-gen merge.
+    config
+        YAML file with the options.
+    overwrite
+        Replace a data set of another configuration.
+    """
+    flags = {
+        "queries.train": queries,
+        "queries.test": test_queries,
+        "queries.spp": spp,
+        "queries.test_spp": test_spp,
+        "queries.levels": levels,
+        "queries.min_cos": min_cos,
+        "queries.layout": layout,
+        "geometry.height": height,
+        "geometry.mesh": mesh,
+        "light.width": light_width,
+        "transport.max_depth": max_depth,
+        "output.format": format,
+        "seed": seed,
+    }
+    resolved = resolve_config(material, config, assignments or [], flags)
+    part = _slice(shards)
+    from ..generation import Job, generate, summary_dict
+
+    folder = output or Path("shards")
+    job = Job.prepare(resolved)
+    per_row = job.lattice.texels() if resolved.queries.layout == "image" else 1
+    total = sum(e.rows * per_row for split in ("train", "test") for e in job.shards(split))
+    console.note(f"{resolved.material} -> {folder}: {total} queries, level {job.lattice.finest}")
+    with console.progress(total=total, label="generating", unit="queries") as bar:
+        summary = generate(
+            resolved,
+            folder,
+            overwrite=overwrite,
+            slice_index=part[0],
+            slice_count=part[1],
+            progress=lambda done, note: bar.update(done, note),
+            job=job,
+        )
+    console.report(summary_dict(summary), describe(summary))
+
+
+def describe(summary: Any) -> str:
+    state = "complete" if summary.complete else "unfinished: run the other slices, then mbtf-gen merge"
+    lines = [
+        f"{summary.folder}: {summary.queries} queries, {state}",
+        f"  this run: {summary.paths} paths in {clock(summary.seconds)} "
+        f"({summary.paths_per_second / 1e6:.2f} M paths/s)",
+        f"  mean value {sum(summary.mean_value) / 3:.4g} 1/sr, "
+        f"pooled noise of a training query {summary.relative_error:.1%} of the mean",
+        f"  simulated: {', '.join(summary.effects) or 'nothing beyond a flat Lambert plane'}",
+    ]
+    odd = [
+        f"{n} {what}"
+        for n, what in (
+            (summary.nonfinite, "non-finite samples (drawn again)"),
+            (summary.lost, "rays slipped below the surface at a crease (they bring no light)"),
+            (summary.capped, "rays cut at the cap on tile crossings"),
+        )
+        if n
+    ]
+    return "\n".join([*lines, f"  noted: {', '.join(odd)}"] if odd else lines)
