@@ -14,7 +14,7 @@ import torch
 from mbtf_gen.atomic import read_json, write_json, write_text
 from mbtf_gen.dataset import Dataset
 from mbtf_gen.errors import EngineError, InputError
-from mbtf_gen.settings import differences, dump_yaml
+from mbtf_gen.settings import differences, dump_yaml, in_short
 from mbtf_gen.stats import unexplained_variance
 
 from .config import FitConfig
@@ -179,7 +179,7 @@ def _claim(out: Path, identity: dict[str, Any], config: FitConfig, overwrite: bo
                 {**record.get("config", {}), **{k: record.get(k) for k in ("schema", "data")}}
                 for record in (old, identity)
             )
-            changes = "; ".join(differences(before, after)[:8]) or "other shards"
+            changes = in_short(differences(before, after)) or "other shards"
             raise InputError(
                 f"holds a fit of another configuration: {changes}",
                 where=out,

@@ -23,7 +23,7 @@ from .manifest import ShardEntry, build_manifest, software_versions
 from .material import Material, load_material
 from .queries import Mixture, QueryPlan
 from .schema import CONFIG_NAME, FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, SPLITS, Split
-from .settings import differences, dump_yaml
+from .settings import differences, dump_yaml, in_short
 from .shard_files import shard_suffix, write_shard
 from .verification import is_finished, sidecar_of
 
@@ -181,7 +181,7 @@ def _open_folder(job: Job, folder: Path, manifest: dict[str, Any], overwrite: bo
         elif old.get("config_hash") != job.config_hash:
             before = {**old.get("config", {}), "inputs": old.get("inputs", {}), "schema": old.get("schema")}
             after = {**manifest["config"], "inputs": manifest["inputs"], "schema": SCHEMA_VERSION}
-            changes = "; ".join(differences(before, after)[:8]) or "inputs differ"
+            changes = in_short(differences(before, after)) or "inputs differ"
             raise InputError(
                 f"holds a data set of another configuration: {changes}",
                 where=folder,

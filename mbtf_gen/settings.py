@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import difflib
 import io
-import types
-import typing
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, Union
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from .errors import InputError, MbtfError, UsageError
+from .wording import explain, models_in
 
 
 class Settings(BaseModel):
@@ -78,18 +78,6 @@ def dump_yaml(data: Mapping[str, Any]) -> str:
     return stream.getvalue()
 
 
-def _model_in(annotation: Any) -> list[type[BaseModel]]:
-    """The models that a field's annotation may hold: through Optional, unions, lists and dicts."""
-    origin = typing.get_origin(annotation)
-    if origin is Annotated:
-        return _model_in(typing.get_args(annotation)[0])
-    if origin in (Union, types.UnionType, list, tuple, dict):
-        return [m for a in typing.get_args(annotation) for m in _model_in(a)]
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return [annotation]
-    return []
-
-
 def _known_keys(model: type[BaseModel], location: Sequence[str | int]) -> list[str]:
     """Valid keys of the section that `location` lies in (the last part is the offending key)."""
     models = [model]
@@ -97,7 +85,7 @@ def _known_keys(model: type[BaseModel], location: Sequence[str | int]) -> list[s
         if isinstance(part, int):
             continue
         fields = [m.model_fields[part] for m in models if part in m.model_fields]
-        deeper = [m for f in fields for m in _model_in(f.annotation)]
+        deeper = [m for f in fields for m in models_in(f.annotation)]
         models = deeper or models
     return sorted({key for m in models for key in m.model_fields})
 
@@ -117,7 +105,9 @@ def line_of(data: Any, location: Sequence[str | int]) -> int | None:
     return line
 
 
-def _explain(error: ValidationError, model: type[BaseModel], data: Any, source: str) -> tuple[str, str, str]:
+def _explain(
+    error: ValidationError, model: type[BaseModel], data: Any, source: str, spelled: Mapping[str, str]
+) -> tuple[str, str, str]:
     """(where, what, cure) of one fault: an unknown key before others, since it may explain a missing one."""
     faults = error.errors()
     fault = next((f for f in faults if f["type"] == "extra_forbidden"), faults[0])
@@ -125,7 +115,7 @@ def _explain(error: ValidationError, model: type[BaseModel], data: Any, source: 
     dotted = ".".join(str(p) for p in location) or "(top level)"
     # Data that the command line has changed may still carry the file's line numbers.
     line = None if source == _COMMAND_LINE else line_of(data, location)
-    where = f"{source}:{line}" if line is not None else source
+    where = spelled.get(dotted, f"{source}:{line}" if line is not None else source)
     if fault["type"] == "extra_forbidden":
         known = _known_keys(model, location)
         near = difflib.get_close_matches(str(location[-1]), known, n=1, cutoff=0.5)
@@ -135,18 +125,25 @@ def _explain(error: ValidationError, model: type[BaseModel], data: Any, source: 
     if fault["type"] == "missing":
         return where, f"key '{dotted}' is missing", "add it"
     given = fault.get("input")
-    message = fault["msg"].removeprefix("Value error, ").removeprefix("Assertion failed, ")
     shown = "" if isinstance(given, Mapping | BaseModel) else f" (given {given!r})"
-    return where, f"'{dotted}': {message}{shown}", ""
+    return where, f"'{dotted}': {explain(fault, model)}{shown}", ""
 
 
-def build(model: type[S], data: Mapping[str, Any], *, source: str, error: type[MbtfError] = InputError) -> S:
+def build(
+    model: type[S],
+    data: Mapping[str, Any],
+    *,
+    source: str,
+    error: type[MbtfError] = InputError,
+    spelled: Mapping[str, str] | None = None,
+) -> S:
     """Check `data` against `model`.
 
     Parameters
     ----------
     source : where the data come from, for messages: a file, "command line"
     error : class of the error to raise
+    spelled : dotted key → the flag that gave it, named in place of `source`
 
     Raises
     ------
@@ -155,7 +152,7 @@ def build(model: type[S], data: Mapping[str, Any], *, source: str, error: type[M
     try:
         return model.model_validate(data)
     except ValidationError as fault:
-        where, what, cure = _explain(fault, model, data, source)
+        where, what, cure = _explain(fault, model, data, source, spelled or {})
         raise error(what, where=where, cure=cure) from None
 
 
@@ -185,12 +182,14 @@ def resolve(
     file: Path | None = None,
     assignments: Sequence[str] = (),
     flags: Mapping[str, Any] | None = None,
+    spelled: Mapping[str, str] | None = None,
 ) -> S:
     """Resolved configuration: defaults, then the file, then ``a.b=c`` assignments, then flags.
 
     Parameters
     ----------
     flags : dotted key → value; None values are flags that were not given
+    spelled : dotted key → its flag, for messages
 
     Raises
     ------
@@ -215,16 +214,38 @@ def resolve(
             return resolved
     for key, value in given:
         merge(data, key.split("."), value)
-    return build(model, data, source=_COMMAND_LINE, error=UsageError)
+    names = {key: flag for key, flag in (spelled or {}).items() if (flags or {}).get(key) is not None}
+    return build(model, data, source=_COMMAND_LINE, error=UsageError, spelled=names)
 
 
 def differences(old: Mapping[str, Any], new: Mapping[str, Any], prefix: str = "") -> list[str]:
-    """Fields in which two nested mappings differ, as ``key: old -> new``."""
-    out: list[str] = []
+    """Fields in which two nested mappings differ, as ``key: old -> new``; settings before digests of files.
+
+    Digests are shortened to their first eight digits.
+    """
+    changed = list(_changed(old, new, prefix))
+    changed.sort(key=lambda change: any(_is_digest(value) for value in change[1:]))
+    return [f"{key}: {_brief(before)} -> {_brief(after)}" for key, before, after in changed]
+
+
+def in_short(changes: Sequence[str], most: int = 6) -> str:
+    """The first of :func:`differences` on one line, with a count of the others."""
+    more = len(changes) - most
+    return "; ".join([*changes[:most], *([f"and {more} more"] if more > 0 else [])])
+
+
+def _changed(old: Mapping[str, Any], new: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any, Any]]:
     for key in sorted({*old, *new}):
         a, b = old.get(key), new.get(key)
         if isinstance(a, Mapping) and isinstance(b, Mapping):
-            out += differences(a, b, f"{prefix}{key}.")
+            yield from _changed(a, b, f"{prefix}{key}.")
         elif a != b:
-            out.append(f"{prefix}{key}: {a} -> {b}")
-    return out
+            yield f"{prefix}{key}", a, b
+
+
+def _is_digest(value: Any) -> bool:
+    return isinstance(value, str) and re.fullmatch(r"[0-9a-f]{64}", value) is not None
+
+
+def _brief(value: Any) -> str:
+    return f"{value[:8]}…" if _is_digest(value) else str(value)

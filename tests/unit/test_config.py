@@ -64,16 +64,16 @@ def test_nonsense_counts_are_usage_errors(text: str) -> None:
     ("key", "value", "says"),
     [
         ("queries.spp", 3, "even"),
-        ("queries.test_spp", 0, "greater than or equal to 2"),
-        ("queries.min_cos", 0, "greater than 0"),
-        ("queries.levels", 15, "less than or equal to 14"),
+        ("queries.test_spp", 0, "at least 2 and at most 1048576"),
+        ("queries.min_cos", 0, "above 0 and below 1"),
+        ("queries.levels", 15, "at least 0 and at most 14"),
         ("queries.layout", "rows", "'shuffled' or 'image'"),
         ("light.width", 46, "45"),
         ("light.width", 1e-3, "delta light"),
-        ("light.width", float("nan"), "or equal to"),
-        ("seed", 1 << 63, "less than"),
-        ("seed", -1, "greater than or equal to 0"),
-        ("geometry.height", float("inf"), "less than or equal"),
+        ("light.width", float("nan"), "at most 45"),
+        ("seed", 1 << 63, "below"),
+        ("seed", -1, "at least 0"),
+        ("geometry.height", float("inf"), "at most 100"),
     ],
 )
 def test_values_out_of_range_are_refused_with_key_and_reason(key: str, value: Any, says: str) -> None:
