@@ -13,7 +13,6 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from .errors import UsageError
 from .light import MAX_WIDTH_DEG, MIN_WIDTH_DEG
 from .schema import SCHEMA_VERSION, ArrayFormat, Layout
 from .settings import Settings
@@ -144,19 +143,3 @@ class GeneratorConfig(Settings):
         """SHA-256 over :meth:`data_fields`, hexadecimal; `inputs` maps roles to digests of files."""
         text = json.dumps(self.data_fields(inputs), sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()
-
-
-def check_queries_flag(text: str | None, flag: str = "--queries") -> str | None:
-    """A ``--queries`` value, checked before anything is loaded.
-
-    Raises
-    ------
-    UsageError : not of the form N or N/texel
-    """
-    if text is None:
-        return None
-    try:
-        parse_count(text)
-    except ValueError as error:
-        raise UsageError(f"'{text}' {error}", where=flag) from None
-    return text

@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 import io
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -29,6 +29,11 @@ S = TypeVar("S", bound=BaseModel)
 
 _COMMAND_LINE = "command line"
 
+# A configuration that is longer, deeper or (through YAML's aliases) larger than this is no configuration.
+_MAX_CHARACTERS = 1 << 18
+_MAX_DEPTH = 100
+_MAX_VALUES = 100_000
+
 
 def _yaml() -> Any:
     from ruamel.yaml import YAML
@@ -46,11 +51,17 @@ def read_yaml(path: Path) -> Any:
     from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
         raise InputError("no such file", where=path) from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot be read as text ({error})", where=path) from None
+    except UnicodeDecodeError as error:
+        raise InputError(f"is not UTF-8 text (byte {error.start})", where=path) from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot be read ({getattr(error, 'strerror', error)})", where=path) from None
+    if len(text) > _MAX_CHARACTERS:
+        raise InputError(f"is too long: more than {_MAX_CHARACTERS:,} characters", where=path)
+    if _bracket_depth(text) > _MAX_DEPTH:
+        raise InputError(_too_deep(), where=path)
     try:
         data = _yaml().load(text)
     except MarkedYAMLError as error:
@@ -59,11 +70,67 @@ def read_yaml(path: Path) -> Any:
         raise InputError(f"not valid YAML ({error.problem})", where=f"{path}{line}") from None
     except YAMLError as error:
         raise InputError(f"not valid YAML ({str(error).splitlines()[0]})", where=path) from None
+    except RecursionError:
+        raise InputError(_too_deep(), where=path) from None
+    except Exception as error:  # the reader turns scalars into numbers and dates, and may raise anything
+        raise InputError(f"not valid YAML ({_first_line(error)})", where=path) from None
     if data is None:
         return {}
     if not isinstance(data, Mapping):
         raise InputError("must hold a mapping of keys to values", where=path)
+    _check_tree(data, path)
     return data
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error) or type(error).__name__).splitlines()[0][:200]
+
+
+def _too_deep() -> str:
+    return f"is nested more than {_MAX_DEPTH} levels deep"
+
+
+def _bracket_depth(text: str) -> int:
+    """How deep brackets are nested: the reader's time grows with the square of it."""
+    depth = deepest = 0
+    for bracket in re.finditer(r"[\[\]{}]", text):
+        depth += 1 if bracket[0] in "[{" else -1
+        deepest = max(deepest, depth)
+    return deepest
+
+
+def _check_tree(data: Any, where: object) -> None:
+    """Refuse what a few lines of YAML can hold but no configuration does.
+
+    Raises
+    ------
+    InputError : nested too deeply, repeated through aliases (or holding itself), keys that are no text, or
+        tags of some program's own
+    """
+    waiting: list[tuple[Any, int]] = [(data, 1)]
+    seen = 0
+    while waiting:
+        value, depth = waiting.pop()
+        seen += 1
+        if depth > _MAX_DEPTH or seen > _MAX_VALUES:
+            what = _too_deep() if depth > _MAX_DEPTH else f"holds more than {_MAX_VALUES:,} values"
+            raise InputError(what, where=where, cure="aliases (*name) count as what they stand for")
+        tag = getattr(getattr(value, "tag", None), "value", None)
+        if tag is not None and not str(tag).startswith("tag:yaml.org"):
+            raise InputError(f"holds the tag '{tag}'", where=where, cure="plain values are wanted")
+        if isinstance(value, Mapping):
+            for key, inner in value.items():
+                if not isinstance(key, str):
+                    raise InputError(f"key {_shown(key)} is not text", where=where, cure="put it in quotes")
+                waiting.append((inner, depth + 1))
+        elif isinstance(value, Sequence | Set) and not isinstance(value, str | bytes):
+            waiting += ((inner, depth + 1) for inner in value)
+
+
+def _shown(value: Any) -> str:
+    """A value as it was given, shortened to a part of a line."""
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def dump_yaml(data: Mapping[str, Any]) -> str:
@@ -115,7 +182,8 @@ def _explain(
     dotted = ".".join(str(p) for p in location) or "(top level)"
     # Data that the command line has changed may still carry the file's line numbers.
     line = None if source == _COMMAND_LINE else line_of(data, location)
-    where = spelled.get(dotted, f"{source}:{line}" if line is not None else source)
+    flag = next((f for key, f in spelled.items() if f"{dotted}.".startswith(f"{key}.")), None)
+    where = flag or (f"{source}:{line}" if line is not None else source)
     if fault["type"] == "extra_forbidden":
         known = _known_keys(model, location)
         near = difflib.get_close_matches(str(location[-1]), known, n=1, cutoff=0.5)
@@ -125,7 +193,7 @@ def _explain(
     if fault["type"] == "missing":
         return where, f"key '{dotted}' is missing", "add it"
     given = fault.get("input")
-    shown = "" if isinstance(given, Mapping | BaseModel) else f" (given {given!r})"
+    shown = "" if isinstance(given, Mapping | BaseModel) else f" (given {_shown(given)})"
     return where, f"'{dotted}': {explain(fault, model)}{shown}", ""
 
 
@@ -156,15 +224,29 @@ def build(
         raise error(what, where=where, cure=cure) from None
 
 
+def check_document(model: type[BaseModel], data: Mapping[str, Any], path: Path, cure: str) -> None:
+    """Refuse a JSON document of ours whose content is not what `model` says: somebody else changed it.
+
+    Raises
+    ------
+    InputError : with the first key that is missing or holds something else
+    """
+    try:
+        build(model, data, source=str(path))
+    except InputError as error:
+        raise InputError(f"is damaged ({error.what})", where=path, cure=cure) from None
+
+
 def _parse_value(text: str) -> Any:
     """A ``--set`` value, read as YAML reads a scalar."""
     from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
 
     try:
-        return YAML(typ="safe", pure=True).load(text)
-    except YAMLError:
+        value = YAML(typ="safe", pure=True).load(text)
+    except Exception:  # what is no YAML stands for itself; the reader may raise anything
         return text
+    _check_tree(value, "--set")
+    return value
 
 
 def merge(base: Any, path: Sequence[str], value: Any) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mbtf_gen.config import GeneratorConfig, check_queries_flag, count_queries, parse_count
+from mbtf_gen.config import GeneratorConfig, count_queries, parse_count
 from mbtf_gen.errors import InputError, UsageError
 from mbtf_gen.light import MIN_WIDTH_DEG, LightKernel
 from mbtf_gen.material import load_material
@@ -55,7 +55,11 @@ def test_nonsense_counts_are_usage_errors(text: str) -> None:
     with pytest.raises(ValueError, match=r"must be|whole"):
         parse_count(text)
     with pytest.raises(UsageError) as caught:
-        check_queries_flag(text)
+        resolve(
+            GeneratorConfig,
+            flags={"material": "m", "queries.train": text},
+            spelled={"queries.train": "--queries"},
+        )
     assert caught.value.where == "--queries"
     assert f"'{text}'" in caught.value.what
 
