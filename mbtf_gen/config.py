@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from .light import MAX_WIDTH_DEG, MIN_WIDTH_DEG
-from .schema import SCHEMA_VERSION, ArrayFormat, Layout
+from .schema import SCHEMA_VERSION, ArrayFormat, Layout, Tiling
 from .settings import Settings
 
 _COUNT = re.compile(r"^\s*(\d+(?:\.\d+)?(?:[eE][+]?\d+)?)\s*(/\s*texel)?\s*$")
@@ -75,6 +75,9 @@ class GeometrySection(Settings):
     )
     mesh: int | None = Field(
         None, ge=1, le=8192, description="mesh cells across the tile; default: the map's width, at most 512"
+    )
+    tile: Tiling = Field(
+        "none", description="cure for maps that do not tile: mirrored copies, or edges cross-faded"
     )
 
 

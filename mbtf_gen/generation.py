@@ -87,7 +87,7 @@ class Job:
         ------
         InputError : the material cannot be used
         """
-        material = load_material(Path(config.material))
+        material = load_material(Path(config.material), config.geometry.tile)
         for note in material.notes:
             log.info(note)
         for warning in material.warnings:

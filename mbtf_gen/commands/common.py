@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 from cyclopts import Parameter
 
 from ..errors import UsageError
+from ..schema import Tiling
 
 if TYPE_CHECKING:
     from ..config import GeneratorConfig
@@ -30,11 +31,13 @@ def general(
     light_width: float | None,
     max_depth: int | None,
     seed: int | None,
+    tile: Tiling | None = None,
 ) -> Flags:
     """The flags that several commands have: flag → (dotted key it sets, its value or None)."""
     return {
         "--height": ("geometry.height", height),
         "--mesh": ("geometry.mesh", mesh),
+        "--tile": ("geometry.tile", tile),
         "--light-width": ("light.width", light_width),
         "--max-depth": ("transport.max_depth", max_depth),
         "--seed": ("seed", seed),

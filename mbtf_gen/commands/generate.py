@@ -10,6 +10,7 @@ from cyclopts import Parameter
 
 from ..console import CONSOLE, Console, clock
 from ..errors import UsageError
+from ..schema import Tiling
 from .common import Output, Set, general, resolve_config
 
 _SPLIT_WORDS = {"train": "training"}
@@ -33,6 +34,7 @@ def generate(
     test_spp: int | None = None,
     height: float | None = None,
     mesh: int | None = None,
+    tile: Tiling | None = None,
     levels: int | None = None,
     light_width: float | None = None,
     min_cos: float | None = None,
@@ -68,6 +70,8 @@ def generate(
         Factor on the stored heights, in tile widths. Default: the material's own
     mesh
         Mesh cells across the tile. Default: the map's width, at most 512
+    tile
+        Cure for maps that do not tile: 2 x 2 mirrored copies, or edges cross-faded. Default: none
     levels
         Finest level k: 2^k texels across. Default: from the map's width
     light_width
@@ -100,7 +104,9 @@ def generate(
         "--min-cos": ("queries.min_cos", min_cos),
         "--layout": ("queries.layout", layout),
         "--format": ("output.format", format),
-        **general(height=height, mesh=mesh, light_width=light_width, max_depth=max_depth, seed=seed),
+        **general(
+            height=height, mesh=mesh, tile=tile, light_width=light_width, max_depth=max_depth, seed=seed
+        ),
     }
     resolved = resolve_config(GeneratorConfig, material, config, assignments or [], flags)
     part = _slice(shards)

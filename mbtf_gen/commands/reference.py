@@ -9,6 +9,7 @@ from cyclopts import Parameter
 
 from ..console import CONSOLE, Console
 from ..errors import UsageError
+from ..schema import Tiling
 from .common import Output, Set, angles, general, resolve_config
 
 
@@ -36,6 +37,7 @@ def reference(
     kind: Literal["query", "pixel", "both"] | None = None,
     height: float | None = None,
     mesh: int | None = None,
+    tile: Tiling | None = None,
     light_width: float | None = None,
     max_depth: int | None = None,
     seed: int | None = None,
@@ -70,6 +72,8 @@ def reference(
         Factor on the stored heights, in tile widths. Default: the material's own
     mesh
         Mesh cells across the tile. Default: the map's width, at most 512
+    tile
+        Cure for maps that do not tile: 2 x 2 mirrored copies, or edges cross-faded. Default: none
     light_width
         RMS angle of the light per axis in degrees; 0 is a delta light. Default: 1
     max_depth
@@ -88,7 +92,9 @@ def reference(
         "--size": ("reference.size", size),
         "--spp": ("reference.spp", spp),
         "--kind": ("reference.kind", kind),
-        **general(height=height, mesh=mesh, light_width=light_width, max_depth=max_depth, seed=seed),
+        **general(
+            height=height, mesh=mesh, tile=tile, light_width=light_width, max_depth=max_depth, seed=seed
+        ),
     }
     from ..picture_config import ReferenceConfig, without_queries
 

@@ -166,6 +166,7 @@ def test_hash_covers_every_option_but_the_materials_name(tmp_path: Path) -> None
         {"seed": 1},
         {"geometry": {"height": 0.5}},
         {"geometry": {"mesh": 8}},
+        {"geometry": {"tile": "mirror"}},
         {"light": {"width": 2}},
         {"transport": {"max_depth": 3}},
         {"transport": {"roulette_depth": 5}},
