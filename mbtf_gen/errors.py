@@ -60,3 +60,11 @@ class PartialError(MbtfError):
     """Work is unfinished but what was done is kept; the same command resumes (exit code 4)."""
 
     exit_code = EXIT_PARTIAL
+
+
+def reason(error: BaseException, longest: int = 160) -> str:
+    """What another library said went wrong, fit to stand in brackets within a message: one line, printable,
+    at most `longest` characters."""
+    text = " ".join((str(error) or type(error).__name__).split())
+    text = "".join(c if c.isprintable() else "?" for c in text)
+    return text if len(text) <= longest else f"{text[: longest - 3]}..."

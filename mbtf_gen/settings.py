@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from .errors import InputError, MbtfError, UsageError
+from .errors import InputError, MbtfError, UsageError, reason
 from .wording import explain, models_in
 
 
@@ -69,21 +69,17 @@ def read_yaml(path: Path) -> Any:
         line = f":{mark.line + 1}" if mark is not None else ""
         raise InputError(f"not valid YAML ({error.problem})", where=f"{path}{line}") from None
     except YAMLError as error:
-        raise InputError(f"not valid YAML ({str(error).splitlines()[0]})", where=path) from None
+        raise InputError(f"not valid YAML ({reason(error)})", where=path) from None
     except RecursionError:
         raise InputError(_too_deep(), where=path) from None
     except Exception as error:  # the reader turns scalars into numbers and dates, and may raise anything
-        raise InputError(f"not valid YAML ({_first_line(error)})", where=path) from None
+        raise InputError(f"not valid YAML ({reason(error)})", where=path) from None
     if data is None:
         return {}
     if not isinstance(data, Mapping):
         raise InputError("must hold a mapping of keys to values", where=path)
     _check_tree(data, path)
     return data
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error) or type(error).__name__).splitlines()[0][:200]
 
 
 def _too_deep() -> str:
