@@ -228,3 +228,13 @@ def test_a_window_needs_a_display(monkeypatch: pytest.MonkeyPatch) -> None:
         check_display()
     monkeypatch.setenv("WAYLAND_DISPLAY", "wayland-0")
     check_display()
+
+
+def test_the_document_states_options_and_defaults() -> None:
+    from mbtf_gen.picture_config import Direction, PreviewSection
+
+    text = (Path(__file__).parents[2] / "docs/preview.md").read_text()
+    for key, value in PreviewSection():
+        shown = f"{value.elevation:g},{value.azimuth:g}" if isinstance(value, Direction) else str(value)
+        assert f"| `--{key}` | `preview.{key}` | {shown} |" in text
+    assert str(MOST_CELLS) in text
