@@ -10,6 +10,7 @@ from cyclopts import Parameter
 
 from ..console import CONSOLE, Console
 from ..errors import InputError, PartialError, UsageError
+from ..schema import Tiling
 from .common import Flags, Output, Set, angles, general, resolve_config
 
 if TYPE_CHECKING:
@@ -24,11 +25,12 @@ def preview(
     output: Output = None,
     view: str | None = None,
     light: str | None = None,
-    tiles: int | None = None,
+    block: int | None = None,
     size: int | None = None,
     spp: int | None = None,
     height: float | None = None,
     mesh: int | None = None,
+    tile: Tiling | None = None,
     levels: int | None = None,
     light_width: float | None = None,
     min_cos: float | None = None,
@@ -52,8 +54,8 @@ def preview(
         ELEVATION,AZIMUTH of the camera in degrees. Default: 40,-90
     light
         ELEVATION,AZIMUTH of the light in degrees. Default: 35,150
-    tiles
-        Tiles along each side of the block that is shown, 1 to 4. Default: 2
+    block
+        Tiles along each side of the block that is drawn, 1 to 4. Default: 2
     size
         Pixels across. Default: 640
     spp
@@ -62,6 +64,8 @@ def preview(
         Factor on the stored heights, in tile widths. Default: the material's own
     mesh
         Mesh cells across the tile. Default: the map's width, at most 512
+    tile
+        Cure for maps that do not tile: 2 x 2 mirrored copies, or edges cross-faded. Default: none
     levels
         Finest level k of the queries. Default: from the map's width
     light_width
@@ -82,12 +86,14 @@ def preview(
     look = {
         "--view": ("preview.view", angles(view, "--view")),
         "--light": ("preview.light", angles(light, "--light")),
-        "--tiles": ("preview.tiles", tiles),
+        "--block": ("preview.block", block),
         "--size": ("preview.size", size),
         "--spp": ("preview.spp", spp),
     }
     rest = {
-        **general(height=height, mesh=mesh, light_width=light_width, max_depth=max_depth, seed=seed),
+        **general(
+            height=height, mesh=mesh, tile=tile, light_width=light_width, max_depth=max_depth, seed=seed
+        ),
         "--levels": ("queries.levels", levels),
         "--min-cos": ("queries.min_cos", min_cos),
     }
@@ -162,7 +168,7 @@ class _Preview:
         self.camera = block_camera(
             wanted.view.elevation,
             wanted.view.azimuth,
-            tiles=wanted.tiles,
+            tiles=wanted.block,
             aspect=grid.aspect,
             relief=grid.relief,
             columns=wanted.size,
@@ -242,7 +248,7 @@ class _Preview:
 
         assert self.job is not None
         geometry = self.config.geometry
-        return block_of(self.job.material, self.config.preview.tiles, geometry.height, geometry.mesh)
+        return block_of(self.job.material, self.config.preview.block, geometry.height, geometry.mesh)
 
     def _mesh(self, file: Path) -> dict[str, Any]:
         from ..preview.mesh import draw
@@ -251,7 +257,7 @@ class _Preview:
         fault = draw(block, self.camera, self.omega_i, file)
         if fault:
             return {"fault": fault}
-        tiles, (rows, columns) = self.config.preview.tiles, block.cells
+        tiles, (rows, columns) = self.config.preview.block, block.cells
         return {
             "shows": f"the displaced mesh ({columns} x {rows} cells per tile) of {tiles} x {tiles} tiles "
             f"with its base colour, {self.seen}"
