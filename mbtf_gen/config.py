@@ -15,7 +15,7 @@ from pydantic import AfterValidator, BeforeValidator, Field
 
 from .light import MAX_WIDTH_DEG, MIN_WIDTH_DEG
 from .schema import SCHEMA_VERSION, ArrayFormat, Layout, Tiling
-from .settings import Settings
+from .settings import FileName, Settings
 
 _COUNT = re.compile(r"^\s*(\d+(?:\.\d+)?(?:[eE][+]?\d+)?)\s*(/\s*texel)?\s*$")
 
@@ -128,7 +128,7 @@ class GeneratorConfig(Settings):
     """Everything ``mbtf-gen`` needs to make a data set."""
 
     version: Literal[1] = 1
-    material: str = Field(description="height map, folder of maps, or material.yaml")
+    material: FileName = Field(description="height map, folder of maps, or material.yaml")
     geometry: GeometrySection = GeometrySection()
     queries: QueriesSection = QueriesSection()
     light: LightSection = LightSection()

@@ -9,10 +9,9 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, model_validator
 
 from .image_tags import ColourSpace
-from .settings import Settings, build, read_yaml
+from .settings import FileName, Settings, build, read_yaml
 
 Share = Annotated[float, Field(ge=0, le=1)]
-FileName = Annotated[str, Field(min_length=1)]
 Channel = Annotated[str, Field(min_length=1)]
 _CHANNEL = "channel or layer of an EXR file; R, G, B, A or Y of others; default: all that belongs together"
 
