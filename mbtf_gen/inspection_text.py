@@ -10,6 +10,8 @@ from .material_checks import CONVENTION_NAMES
 
 WIDTH = 100
 LINES = 45
+# Room for the material's name in the heading.
+_NAME = 48
 
 # What each map does to the simulation.
 USES = {
@@ -26,6 +28,7 @@ _KINDS = {1: "grey", 2: "grey+alpha", 3: "RGB", 4: "RGBA"}
 
 def inspection_text(found: dict[str, Any], name: str) -> str:
     """Text for people; the longest lists are cut to keep it on one screen."""
+    name = name if len(name) <= _NAME else f"…{name[1 - _NAME :]}"
     head = [f"{name}: tile 1 x {found['aspect']:g}, surface {found['surface']}, tile={found['tile']}", ""]
     body = [*_maps(found), "", *_geometry(found), *_colour(found), *_normal(found)]
     room = LINES - len(head) - len(body) - 2

@@ -62,8 +62,8 @@ class _FileOrValue(Settings):
     def _one(self) -> _FileOrValue:
         if (self.file is None) == (getattr(self, "value", None) is None):
             raise ValueError("needs either 'file' or 'value'")
-        if self.file is None and (self.channel is not None or getattr(self, "invert", False)):
-            raise ValueError("'channel' and 'invert' go with 'file'")
+        if self.file is None and self.channel is not None:
+            raise ValueError("'channel' goes with 'file'")
         return self
 
 
@@ -84,6 +84,12 @@ class ShareEntry(_FileOrValue):
     value: Share | None = Field(None, description="one number")
     colourspace: ColourSpace = Field("linear", description="srgb decodes the stored numbers of a map first")
     invert: bool = Field(False, description="take 1 - x of a map, such as gloss for roughness")
+
+    @model_validator(mode="after")
+    def _of_a_map(self) -> ShareEntry:
+        if self.file is None and (self.invert or self.colourspace != "linear"):
+            raise ValueError("'invert' and 'colourspace' go with 'file'")
+        return self
 
 
 class NormalEntry(Settings):
