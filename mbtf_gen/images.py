@@ -52,6 +52,8 @@ _MAGIC = {
     b"\xff\xd8\xff": "JPEG",
     b"II*\x00": "TIFF",
     b"MM\x00*": "TIFF",
+    b"II+\x00": "TIFF",
+    b"MM\x00+": "TIFF",
     b"\x93NUMPY": "NPY",
 }
 SUFFIXES = tuple(_KINDS)
@@ -212,12 +214,21 @@ def _exact(numbers: NDArray[np.floating[Any]], bits: int | None) -> NDArray[np.f
     return np.rint(numbers.astype(np.float64) * largest) / largest
 
 
+def _npy_fault(error: Exception) -> str:
+    """What the array reader means: its own words quote the header's bytes or speak of its way of reading."""
+    known = {
+        "header": "its header is damaged",
+        "Python objects": "it holds Python objects",
+        "mmap length": "it is cut short",
+    }
+    return next((said for word, said in known.items() if word in str(error)), reason(error))
+
+
 def _from_npy(path: Path) -> Image:
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     except Exception as error:  # a damaged header may make the parser raise anything, its bytes included
-        text = "its header is damaged" if "header" in str(error) else reason(error)
-        raise InputError(f"cannot be read as an npy array ({text})", where=path) from None
+        raise InputError(f"cannot be read as an npy array ({_npy_fault(error)})", where=path) from None
     if array.ndim not in (2, 3) or (array.ndim == 3 and not 1 <= array.shape[2] <= 4):
         raise InputError(
             f"holds an array of shape {array.shape}; (H, W) or (H, W, 1..4) is wanted", where=path

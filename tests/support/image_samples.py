@@ -77,6 +77,7 @@ def tiffs() -> dict[str, bytes]:
         for compression in ("raw", "tiff_lzw", "tiff_adobe_deflate", "packbits"):
             out[f"{kind}-{compression}.tif"] = _saved(picture, "TIFF", compression=compression)
     out["RGB-jpeg.tif"] = _saved(pictures()["RGB"], "TIFF", compression="jpeg")
+    out["RGB-big.tif"] = _saved(pictures()["RGB"], "TIFF", big_tiff=True)
     out["1-group4.tif"] = _saved(pictures()["1"], "TIFF", compression="group4")
     return out
 

@@ -53,3 +53,14 @@ def test_a_damaged_image(
     if kind == "png" and data.draw(st.booleans()):
         content = with_checksums(content)
     read(folder, name, content)
+
+
+@pytest.mark.parametrize("kind", ["png", "jpg", "tif", "exr"])
+def test_decoders_say_nothing(
+    kind: str, samples: dict[str, dict[str, bytes]], folder: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    for name, content in samples[kind].items():
+        for share in (0.3, 0.6, 0.9):
+            at = int(share * len(content))
+            read(folder, name, content[:at] + bytes([content[at] ^ 0x55]) + content[at + 1 :])
+    assert capfd.readouterr() == ("", "")
