@@ -67,13 +67,11 @@ def strands(across: Field, along: Field, count: int, waves: int, seed: int) -> t
         line = (number + 0.5) / count
         # A fibre comes up and dives under; each does so at its own places.
         level = noise(line, along, (count, 2 * waves), key + 1)
-        thick = 0.75 + 0.25 * uniform(key + 2, number)
-        profile = 1.0 - ((2.0 * (x - np.floor(x)) - 1.0) / thick) ** 2
-        z = np.where(profile > 0.0, 0.55 * np.sqrt(np.maximum(profile, 0.0)) + 0.9 * level, -1.0)
+        z = 0.9 * level + 0.75 * (1.0 - (2.0 * (x - np.floor(x)) - 1.0) ** 2)
         upper = z > relief
         relief = np.where(upper, z, relief)
-        tone = np.where(upper, uniform(key + 3, number), tone)
-    return np.asarray(np.clip(relief + 0.3, 0.0, 1.2)), tone
+        tone = np.where(upper, uniform(key + 2, number), tone)
+    return np.asarray(np.clip(relief + 0.05, 0.0, 1.2)), tone
 
 
 def stray_fibres(u: Field, v: Field, count: int, seed: int) -> Field:

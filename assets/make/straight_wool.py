@@ -12,7 +12,7 @@ from .tile import Material
 WIDTHS = np.array([1.05, 0.92, 1.12, 0.90, 1.20, 0.85, 1.00, 0.95, 1.10])
 RED, WINE, OCHRE, CREAM = (0.68, 0.20, 0.16), (0.55, 0.15, 0.16), (0.82, 0.50, 0.20), (0.86, 0.79, 0.65)
 COLOURS = np.array([RED, WINE, OCHRE, RED, CREAM, WINE, RED, RED, OCHRE])
-FIBRES = 30  # around a yarn
+FIBRES = 22  # around a yarn
 
 
 def yarns(u: Field, v: Field) -> Surface:
@@ -39,7 +39,8 @@ def straight_wool() -> Material:
     yarn = np.maximum(surface.tube, 0)
 
     # One turn of the fibres per tile; how steeply they lean sways along the yarn.
-    sway = 0.10 * noise((yarn + 0.5) / len(WIDTHS), v, (len(WIDTHS), 4), 39)
+    line = (yarn + 0.5) / len(WIDTHS)
+    sway = 0.10 * noise(line, v, (len(WIDTHS), 4), 39)
     around = surface.angle / (2.0 * np.pi) - v + sway + uniform(40, yarn)
     relief, tone = strands(around, v, FIBRES, 10, 41)
     upright = np.where(bed, 0.6, np.cos(surface.angle))
@@ -47,7 +48,8 @@ def straight_wool() -> Material:
     lint = layered(u, v, 56, 2, 46)
     height = surface.z + 0.0075 * relief * np.sqrt(upright) + 0.0020 * lint + 0.0030 * stray
 
-    colour = COLOURS[yarn]
+    # The dye took unevenly along the yarn.
+    colour = COLOURS[yarn] * (1.0 + 0.50 * noise(line, v, (len(WIDTHS), 3), 47))[..., None]
     colour = mix(colour, 0.45 * colour + (0.44, 0.39, 0.32), 0.55 * smooth(0.62, 0.95, tone))
     colour = mix(colour, 0.72 * colour, smooth(0.35, 0.05, tone))
     colour = colour * (0.82 + 0.20 * relief + 0.10 * lint)[..., None]

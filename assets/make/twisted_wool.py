@@ -12,7 +12,7 @@ from .tile import Material
 SHARES = np.array([1.00, 1.20, 0.85, 1.10])
 TURNS = (2, 2, 3, 2)
 PLIES = 3
-FIBRES = 34  # around a ply
+FIBRES = 28  # around a ply
 
 CREAM = (0.83, 0.77, 0.65)
 # The third ply of each cord; the other two are natural.
