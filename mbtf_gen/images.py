@@ -324,17 +324,19 @@ def grey(image: Image) -> tuple[NDArray[np.float64], list[str]]:
     rounding) is grey too; other colours are reduced to their Rec.709 luminance with a warning. Alpha is
     dropped, with a warning where it is not 1 everywhere.
     """
-    pixels, found = image.pixels, []
+    pixels, warnings = image.pixels, []
     if pixels.shape[2] in (2, 4) and np.any(pixels[..., -1] != 1.0):
-        found.append(f"{image.path}: its alpha channel is not used")
+        warnings.append(f"{image.path}: its alpha channel is not used")
     rgb = pixels[..., : 3 if pixels.shape[2] > 2 else 1]
     spread = float(np.max(rgb.max(axis=-1) - rgb.min(axis=-1)))
     if spread == 0.0:
-        return _exact(rgb[..., 0], image.bits), found
+        return _exact(rgb[..., 0], image.bits), warnings
     tolerance = _GREY_CODES if image.bits == 8 else 1e-4 * float(np.abs(rgb).max())
     if spread > tolerance:
-        found.append(f"{image.path}: is coloured where one number per pixel is wanted; its luminance is used")
-    return rgb.astype(np.float64) @ np.asarray(LUMINANCE), found
+        warnings.append(
+            f"{image.path}: is coloured where one number per pixel is wanted; its luminance is used"
+        )
+    return rgb.astype(np.float64) @ np.asarray(LUMINANCE), warnings
 
 
 def srgb_to_linear(encoded: ArrayLike) -> NDArray[np.floating[Any]]:
