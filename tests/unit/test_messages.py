@@ -32,6 +32,24 @@ def test_every_group_of_messages_is_explained() -> None:
         assert after or not text.strip(), f"'{heading}' does not say what to do"
 
 
+# Functions whose message is what another one said: of this project (collected there), of the validator,
+# Mitsuba or the system (shown as it is), or a text chosen by the caller.
+RELAYS = {
+    "mbtf_gen/console.py": {"_usage_message", "run"},
+    "mbtf_gen/engine.py": {"_llvm_error", "check_llvm", "load_mitsuba"},
+    "mbtf_gen/generation.py": {"plan", "prepare"},
+    "mbtf_gen/material.py": {"_assemble", "_heights"},
+    "mbtf_gen/material_checks.py": {"orientation_warning", "seam_warning"},
+    "mbtf_gen/settings.py": {"_explain", "build"},
+    "mbtf_gen/verification.py": {"shard_fault", "verify"},
+    "mbtf_gen/wording.py": {"explain"},
+}
+
+
+def test_messages_that_cannot_be_read_off_the_source_are_known() -> None:
+    assert relays() == {f"{file}:{function}" for file, found in RELAYS.items() for function in found}
+
+
 SOURCE = """
 def name(x):
     return f"is {x}" if x else "is nothing"
