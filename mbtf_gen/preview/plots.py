@@ -15,6 +15,7 @@ from .sample import QuerySample
 _SCATTER = 4000
 # Queries per bin of a histogram in two dimensions, about; and bins per side, at least and at most.
 _PER_BIN, _FEWEST, _MOST = 60, 8, 96
+# Bins per level where there are at least _PER_BIN queries for each, else whole levels.
 _BINS_PER_LEVEL = 8
 _INK, _STATED = "#3b6ea5", "#c2571a"
 
@@ -22,7 +23,8 @@ _INK, _STATED = "#3b6ea5", "#c2571a"
 def level_histogram(
     sample: QuerySample,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """(edges, density found, density stated) of the fractional level, in bins of an eighth of a level.
+    """(edges, density found, density stated) of the fractional level, in bins of an eighth of a level, or of
+    whole levels where there are few queries.
 
     With k = 0 there is one bin around 0, whose stated density is 1.
     """
@@ -30,7 +32,9 @@ def level_histogram(
         edges = np.array([-0.5, 0.5])
         stated = np.ones(1)
     else:
-        edges = np.linspace(0.0, sample.finest, _BINS_PER_LEVEL * sample.finest + 1)
+        enough = len(sample.level) >= _PER_BIN * _BINS_PER_LEVEL * sample.finest
+        bins = sample.finest * (_BINS_PER_LEVEL if enough else 1)
+        edges = np.linspace(0.0, sample.finest, bins + 1)
         stated = sample.mixture.density(0.5 * (edges[1:] + edges[:-1]), sample.finest)
     # Footprints are stored in single precision: those of the finest level may round beyond k.
     inside = np.clip(sample.level, edges[0], edges[-1])
@@ -43,7 +47,7 @@ def query_figure(sample: QuerySample, title: str) -> Any:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11.0, 10.0), layout="constrained")
-    figure.suptitle(title)
+    figure.suptitle(title, wrap=True)
     position, level, light, view = figure.subplots(2, 2).ravel()
     _positions(position, sample)
     _levels(level, sample)
@@ -60,6 +64,10 @@ def write_plots(path: Path, sample: QuerySample, title: str) -> None:
 
 def _bins(count: int) -> int:
     return int(np.clip(np.sqrt(count / _PER_BIN), _FEWEST, _MOST))
+
+
+def _points(axes: Any, x: Any, y: Any) -> None:
+    axes.scatter(x, y, s=4 if len(x) > 500 else 16, color=_INK, linewidths=0)
 
 
 def _relative(axes: Any, x: Any, y: Any, edges: Any, share: NDArray[np.float64], region: str) -> None:
@@ -87,7 +95,7 @@ def _positions(axes: Any, sample: QuerySample) -> None:
     u, v = sample.u.T
     axes.set(title="positions", xlabel="u", ylabel="v", xlim=(0, 1), ylim=(0, 1), aspect=sample.aspect)
     if len(u) < _SCATTER:
-        axes.scatter(u, v, s=4, color=_INK, linewidths=0)
+        _points(axes, u, v)
         return
     columns = _bins(round(len(u) * max(1.0, 1.0 / sample.aspect)))
     rows = max(1, round(sample.aspect * columns))
@@ -109,7 +117,7 @@ def _directions(axes: Any, omega: NDArray[np.float32], min_cos: float, title: st
     radius = float(np.sqrt(1.0 - min_cos**2))
     axes.set(title=title, xlabel="x", ylabel="y", xlim=(-1.05, 1.05), ylim=(-1.05, 1.05), aspect="equal")
     if len(x) < _SCATTER:
-        axes.scatter(x, y, s=4, color=_INK, linewidths=0)
+        _points(axes, x, y)
     else:
         edges = np.linspace(-1.0, 1.0, _bins(len(x)) + 1)
         _relative(axes, x, y, (edges, edges), _disk_share(edges, radius), "the disk")

@@ -74,6 +74,8 @@ def batch(work: Path) -> dict[str, Done]:
         "replaced": f"preview flat.npy -o flat --block 1 --overwrite {FAST} --json",
         "others": f"preview maps -o others {FAST} --overwrite",
         "data": "preview data -o data-pictures --size 64 --spp 2 --json",
+        "buffers": "preview flat.npy -o buffers --size 64 --spp 2 --set queries.layout=image "
+        "--set queries.train=200",
         "lonely": "preview lonely -o lonely-pictures --json",
         "settled": "preview data -o nowhere --min-cos 0.2",
         "settled too": "preview data -o nowhere --set queries.min_cos=0.2",
@@ -161,6 +163,7 @@ def test_each_picture_has_a_line_that_says_what_it_shows(batch: dict[str, Done])
     assert "32 x 16 cells per tile) of 2 x 2 tiles" in lines[0]
     assert "4 paths per pixel" in lines[1]
     assert "3000 of 3000 training queries to be drawn for maps" in lines[2]
+    assert "256 of 256 training queries to be drawn for flat.npy, in 4 buffers of one" in batch["buffers"].out
 
 
 @pytest.mark.usefixtures("drawing")

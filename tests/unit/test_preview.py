@@ -133,6 +133,11 @@ def test_the_histogram_of_levels_follows_the_mixture() -> None:
     np.testing.assert_allclose(found, stated, atol=2 / (20_000 * 0.125))
     other = replace(sample_of(20_000), mixture=Mixture(1.0, 0.0))
     assert np.abs(level_histogram(other)[1] - level_histogram(other)[2]).max() > 0.1
+    # Few queries fill whole levels only.
+    edges, found, stated = level_histogram(sample_of(300))
+    assert edges.tolist() == [0, 1, 2, 3]
+    np.testing.assert_allclose(stated, [0.2, 0.2, 0.6])
+    np.testing.assert_allclose(found, stated, atol=2 / 300)
     edges, found, stated = level_histogram(sample_of(50, levels=0))
     assert (found.tolist(), stated.tolist()) == ([1.0], [1.0])
 
