@@ -78,8 +78,11 @@ def repeats(height: NDArray[np.floating[Any]], axis: int) -> int:
     dip = np.nonzero(correlation < _DIP)[0]
     if not len(dip):
         return 1
-    inner = correlation[1:-1]
-    peak = (inner >= _PEAK) & (inner >= correlation[:-2]) & (inner >= correlation[2:])
+    # It is even about half the size, where a map that repeats twice has its peak.
+    beyond = correlation[-1] if height.shape[axis] % 2 else correlation[max(-2, -len(correlation))]
+    inner = correlation[1:]
+    after = np.append(correlation[2:], beyond)
+    peak = (inner >= _PEAK) & (inner >= correlation[:-1]) & (inner >= after)
     lags = np.nonzero(peak)[0] + 1
     lags = lags[(lags > dip[0]) & (lags >= _SHORTEST)]
     return max(1, round(height.shape[axis] / lags[0])) if len(lags) else 1

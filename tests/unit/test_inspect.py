@@ -35,11 +35,24 @@ class TestRelief:
         median, high, steepest = slope_angles(HeightGrid.from_map(roof, 1.0, 0.25))
         assert (median, high, steepest) == pytest.approx((45.0, 45.0, 45.0))
 
+    def test_percentiles(self) -> None:
+        """A gentle flank over seven eighths of the tile, a steep one over the last."""
+        gentle = np.arange(57) / 56 * 0.1
+        steep = 0.1 - np.arange(1, 8) / 8 * 0.1
+        saw = np.tile(np.concatenate([gentle, steep]), (4, 1))
+        median, high, steepest = slope_angles(HeightGrid.from_map(saw, 1.0, 1 / 16))
+        expected = np.degrees(np.arctan([0.1 * 64 / 56, 0.1 * 8, 0.1 * 8]))
+        assert (median, high, steepest) == pytest.approx(tuple(expected))
+
     def test_repeats(self) -> None:
         cell = fractal(16, 16)
         assert [repeats(np.tile(cell, (3, 5)), axis) for axis in (1, 0)] == [5, 3]
         assert [repeats(fractal(64, 64), axis) for axis in (1, 0)] == [1, 1]
         assert repeats(np.zeros((8, 8)), 0) == 1
+        # A ripple on a swell repeats as often as the swell.
+        x = np.arange(96) / 96 * 2 * np.pi
+        assert repeats(np.tile(np.cos(x) + 0.5 * np.cos(16 * x), (4, 1)), 1) == 1
+        assert repeats(np.tile(np.cos(2 * x), (4, 1)), 1) == 2
 
     def test_detail(self) -> None:
         noise = np.random.default_rng(0).normal(size=(128, 128))
