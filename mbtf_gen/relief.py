@@ -35,7 +35,11 @@ def slope_angles(grid: HeightGrid) -> tuple[float, float, float]:
 
 def rms_slope(grid: HeightGrid) -> float:
     """Root mean square of the triangles' slopes."""
-    return float(np.sqrt(np.mean(triangle_slopes(grid) ** 2)))
+    rows, columns = grid.z.shape
+    # Every edge along an axis belongs to one triangle of either kind.
+    along_u = np.mean((np.roll(grid.z, -1, 1) - grid.z) ** 2) * columns**2
+    along_v = np.mean((np.roll(grid.z, -1, 0) - grid.z) ** 2) * (rows / grid.aspect) ** 2
+    return float(np.sqrt(along_u + along_v))
 
 
 def autocorrelation(height: NDArray[np.floating[Any]], axis: int) -> NDArray[np.float64]:

@@ -15,7 +15,7 @@ from mbtf_gen.heightfield import HeightGrid
 from mbtf_gen.inspection import inspect_material
 from mbtf_gen.inspection_text import LINES, WIDTH, inspection_text
 from mbtf_gen.material import load_material
-from mbtf_gen.relief import autocorrelation, detail_size, repeats, slope_angles, triangle_slopes
+from mbtf_gen.relief import autocorrelation, detail_size, repeats, rms_slope, slope_angles, triangle_slopes
 
 
 class TestRelief:
@@ -28,6 +28,7 @@ class TestRelief:
         normals = tile_mesh(grid).face_normals
         expected = np.hypot(normals[:, 0], normals[:, 1]) / normals[:, 2]
         assert np.sort(triangle_slopes(grid)) == pytest.approx(np.sort(expected))
+        assert rms_slope(grid) == pytest.approx(np.sqrt(np.mean(expected**2)))
 
     def test_a_roof(self) -> None:
         """Both flanks of a ridge along v rise by as much as they are wide."""
