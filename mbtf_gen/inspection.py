@@ -21,6 +21,8 @@ _CONSTANT = 0.05
 _FINE = 4.0
 # A mesh that keeps less of the map's slopes is remarked on.
 _KEPT = 0.9
+# Texels beyond which so few different floats are no accident of a small map.
+_MANY = 4096
 # Levels below which 8-bit heights are remarked on.
 _FEW_LEVELS = 128
 
@@ -58,6 +60,7 @@ def inspect_material(
         },
         "heights": {
             "codes": None if material.codes is None else asdict(material.codes),
+            "distinct": len(np.unique(material.height)),
             "low": float(material.height.min()),
             "high": float(material.height.max()),
             "rms_step": float(np.sqrt(np.mean((np.roll(material.height, -1, 1) - material.height) ** 2))),
@@ -157,6 +160,11 @@ def _oddities(found: dict[str, Any]) -> list[str]:
     codes = heights["codes"]
     if codes is not None and height["bits"] == 8 and codes["levels"] < _FEW_LEVELS:
         out.append(f"heights use {codes['levels']} levels only, codes {codes['low']} to {codes['high']}")
+    if height["bits"] is None and 1 < heights["distinct"] <= 256 and rows * columns > _MANY:
+        out.append(
+            f"heights are floats of {heights['distinct']} different values: if they were integers once, "
+            "their terraces are still there"
+        )
     if Path(height["file"]).suffix.lower() in (".jpg", ".jpeg"):
         out.append("heights come from a JPG: its compression is part of the relief")
     if geometry["relief"] > 0 and heights["detail_texels"] < _FINE:

@@ -116,6 +116,21 @@ class TestNumbers:
             assert part in texts
         assert "no base colour" not in texts
 
+    def test_floats_that_were_integers(self, tmp_path: Path) -> None:
+        for name, height in (("a", fractal(96, 96)), ("b", np.rint(fractal(96, 96) * 200) / 200)):
+            np.save(tmp_path / f"{name}.npy", 0.1 * height)
+            oddities = inspect_material(load_material(tmp_path / f"{name}.npy"))["oddities"]
+            assert any("different values" in o for o in oddities) == (name == "b")
+
+    @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (5, 1), (2, 3)])
+    def test_tiny_maps(self, tmp_path: Path, shape: tuple[int, int]) -> None:
+        save_heights(tmp_path / "height.png", np.random.default_rng(0).random(shape), 8)
+        save_normals(tmp_path / "normal.png", np.full((*shape, 3), (0.0, 0.0, 1.0)))
+        found = inspect_material(load_material(tmp_path))
+        assert found["maps"]["height"]["columns"] == shape[1]
+        assert found["normal"] is not None
+        assert len(inspection_text(found, "tiny").splitlines()) <= LINES
+
     def test_a_flat_plain_map_is_nothing_special(self, tmp_path: Path) -> None:
         np.save(tmp_path / "h.npy", np.zeros((4, 4)))
         found = inspect_material(load_material(tmp_path / "h.npy"))
