@@ -112,6 +112,11 @@ class TestMaterial:
         assert material.warnings == ()
         assert np.array_equal(np.rint(material.height * 65535), np.rint(fractal(128, 128) * 65535))
 
+    def test_one_level_is_no_terrace(self, tmp_path: Path) -> None:
+        material = load_material(save_heights(tmp_path / "h.png", np.full((8, 8), 0.5), 8))
+        assert material.warnings == ()
+        assert np.ptp(material.height) == 0.0
+
     def test_smoothing_can_be_declined(self, tmp_path: Path) -> None:
         save_heights(tmp_path / "h.png", fractal(64, 64), 8)
         path = tmp_path / "material.yaml"

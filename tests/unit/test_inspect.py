@@ -134,6 +134,7 @@ class TestNumbers:
     def test_a_flat_plain_map_is_nothing_special(self, tmp_path: Path) -> None:
         np.save(tmp_path / "h.npy", np.zeros((4, 4)))
         found = inspect_material(load_material(tmp_path / "h.npy"))
+        assert "relief 0 tile widths" in inspection_text(found, "flat")
         assert found["geometry"]["slope_max_deg"] == 0.0
         assert found["geometry"]["slope_kept"] == 1.0
         assert found["oddities"] == ["no base colour map: linear RGB 0.5, 0.5, 0.5 everywhere"]
