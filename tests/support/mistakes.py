@@ -54,6 +54,8 @@ LINES: dict[str, list[str]] = {
         "mbtf-gen reference heights.npy --spans 1,zwei",
         "mbtf-gen reference heights.npy --spans 1,1.0",
         "mbtf-gen reference heights.npy --size 0",
+        "mbtf-gen reference heights.npy -o textures",
+        "mbtf-gen reference heights.npy -o pictures",
         "mbtf-gen inspect nowhere",
         "mbtf-fit",
         "mbtf-fit nowhere",
@@ -85,7 +87,7 @@ LINES: dict[str, list[str]] = {
             *("empty", "twice", "unnamed", "aspects", "beyond", "greynormal", "unknown.yaml", "broken.yaml"),
             *("tab.yaml", "twice.yaml", "lost.yaml", "list.yaml", "latin.yaml", "number.yaml", "range.yaml"),
             *("nothing.yaml", "both.yaml", "bsdf.yaml", "bsdftype.yaml", "bsdffile.yaml", "bomb.yaml"),
-            *("tag.yaml", "deep.yaml", "key.yaml", "channel.yaml", "escape.yaml"),
+            *("longnormal", "tag.yaml", "deep.yaml", "key.yaml", "channel.yaml", "escape.yaml"),
         )
     ],
     "configurations": [
@@ -160,14 +162,18 @@ def _images(folder: Path, heights: np.ndarray) -> None:
 
 
 def _folders(folder: Path, heights: np.ndarray) -> None:
-    for name in ("empty", "textures", "twice", "unnamed", "aspects", "beyond", "greynormal"):
+    for name in ("empty", "textures", "twice", "unnamed", "aspects", "beyond", "greynormal", "longnormal"):
         (folder / name).mkdir()
-    for name in ("textures", "twice", "aspects", "beyond", "greynormal"):
+    for name in ("textures", "twice", "aspects", "beyond", "greynormal", "longnormal"):
         np.save(folder / name / "height.npy", heights)
     np.save(folder / "twice/displacement.npy", heights)
     np.save(folder / "unnamed/picture.npy", heights)
     np.save(folder / "aspects/basecolor.npy", np.zeros((8, 8, 3)))
     np.save(folder / "greynormal/normal.npy", heights)
+    np.save(folder / "longnormal/normal.npy", np.full((4, 8, 3), [0.5, 0.5, 255.0]))
+    (folder / "pictures").mkdir()
+    record = {"format": "mbtf-pictures", "kind": "reference", "hash": "", "depends": {}, "files": "all"}
+    (folder / "pictures/pictures.json").write_text(json.dumps(record))
     spoilt = np.full((4, 8), 0.5)
     spoilt[1, 3] = 1.5
     np.save(folder / "beyond/roughness.npy", spoilt)
