@@ -13,13 +13,17 @@ EXIT_PARTIAL = 4
 EXIT_INTERRUPTED = 130
 
 
+_BLANKS = str.maketrans("\n\r\t", "   ")
+
+
 def printable(text: str) -> str:
-    """`text` with control characters and others that cannot be shown written as escapes.
+    """`text` with line breaks and tabs as blanks, and what else cannot be shown written as escapes.
 
     Names and values come from files of anyone's making; a terminal would obey the codes in them.
     """
     if text.isprintable():
         return text
+    text = text.translate(_BLANKS)
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
