@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from .surface import Surface, SurfaceParts
 
 if TYPE_CHECKING:
+    from .effects import EffectsPlan
     from .material import Material
 
 # Parameters of ``mbtf_surface``: textures or numbers.
@@ -33,7 +34,7 @@ class SurfaceBSDF(mi.BSDF):
 
     def __init__(self, props: Any) -> None:
         super().__init__(props)
-        textures = {name: props.get_texture(name) for name in NAMES if props.has_property(name)}
+        textures = {name: props.get_texture(name) for name in NAMES if name in props}
         if "base_color" not in textures:
             textures["base_color"] = props.get_texture("base_color", 0.5)
         for name, number in (("roughness", 0.5), ("coat_roughness", 0.1)):
@@ -150,14 +151,37 @@ def _scalar(value: Any) -> Any:
     return _texture(array) if array.ndim >= 2 else float(array)
 
 
-def bsdf_of(material: Material) -> dict[str, Any]:
-    """Mitsuba dictionary of a material's BSDF, with every term that the material has."""
+def bsdf_of(
+    material: Material, plan: EffectsPlan | None = None, slopes: NDArray[np.float64] | None = None
+) -> dict[str, Any]:
+    """Mitsuba dictionary of a material's BSDF.
+
+    Parameters
+    ----------
+    plan : leaves out what it does not simulate; without one everything but opacity is in
+    slopes : (h, w, 2) slopes added to the mesh's
+    """
     if material.bsdf is not None:
         return dict(material.bsdf)
+
+    def on(name: str) -> bool:
+        return plan is None or plan.on(name)
+
     out = {"type": "mbtf_surface", "base_color": _colour(material.basecolor)}
-    if not material.is_lambert:
+    metallic = (
+        material.metallic is not None and bool(np.any(np.asarray(material.metallic) > 0)) and on("metallic")
+    )
+    if material.roughness is not None:
         out["roughness"] = _scalar(material.roughness)
+    if material.specular is not None and on("specular"):
         out["specular"] = _scalar(material.specular)
-        if np.any(np.asarray(material.metallic) > 0):
-            out["metallic"] = _scalar(material.metallic)
+    if metallic:
+        out["metallic"] = _scalar(material.metallic)
+    if material.coat is not None and on("coat"):
+        out["coat"] = _scalar(material.coat)
+        out["coat_roughness"] = _scalar(material.coat_roughness)
+    if slopes is not None:
+        out["slopes"] = _texture(np.concatenate([slopes, np.zeros_like(slopes[..., :1])], axis=-1))
+    if plan is not None and plan.on("opacity"):
+        out["opacity"] = _scalar(material.opacity)
     return out

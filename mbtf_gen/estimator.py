@@ -7,7 +7,6 @@ shard alone, so values do not depend on how queries are grouped into launches.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import drjit as dr
@@ -16,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import PartialError
+from .estimates import Estimates, Stream
 from .light import LightKernel
 from .queries import Queries
 from .scene import CLEARANCE, Tile
@@ -26,37 +26,6 @@ from .tracing import LaneLight, Transport, trace
 LAUNCH_PATHS = 1 << 20
 # Passes in which a path that came out non-finite is traced again before the run is stopped.
 MAX_RESAMPLES = 4
-
-
-@dataclass(frozen=True)
-class Estimates:
-    """Estimates of a batch of queries.
-
-    Attributes
-    ----------
-    value_a, value_b : (n, 3) float32, independent halves of spp/2 paths each
-    transmittance : (n,) float32, share of the view rays that went through holes; None where there are none
-    paths : paths traced; lost : rays that slipped through the surface; capped : rays cut at the cap on
-        crossings
-    nonfinite : samples that came out non-finite and were drawn again
-    """
-
-    value_a: NDArray[np.float32]
-    value_b: NDArray[np.float32]
-    transmittance: NDArray[np.float32] | None
-    paths: int
-    lost: int
-    capped: int
-    nonfinite: int
-
-
-@dataclass(frozen=True)
-class Stream:
-    """Which random numbers to use: split and number of the shard under a root seed."""
-
-    root: int
-    split: str
-    shard: int
 
 
 class RaySource(Protocol):
@@ -99,17 +68,22 @@ class Estimator:
         self._sensor = mi.load_dict(
             {"type": "mbtf_queries", "unit": tile.unit, "aspect": tile.aspect, "start": CLEARANCE}
         )
-        self._limit = dr.opaque(mi.UInt32, transport.limit)
         self._kappa = dr.opaque(mi.Float, 0.0 if light is None or light.is_delta else light.kappa)
 
     def estimate(
-        self, queries: Queries, spp: int, stream: Stream, source: RaySource | None = None
+        self,
+        queries: Queries,
+        spp: int,
+        stream: Stream,
+        source: RaySource | None = None,
+        limit: int | None = None,
     ) -> Estimates:
         """Both halves of each query (one leading axis), `spp` paths together.
 
         Parameters
         ----------
         source : where rays come from; the query sensor by default
+        limit : another limit on surface interactions, for the same kernel
 
         Raises
         ------
@@ -117,6 +91,7 @@ class Estimator:
         """
         if spp < 2 or spp % 2:
             raise ValueError(f"spp must be even, for two equal halves, not {spp}")
+        self._limit = dr.opaque(mi.UInt32, self.transport.limit if limit is None else limit)
         n = len(queries.sigma)
         per_launch = max(1, self.launch // spp)
         parts = [

@@ -7,24 +7,31 @@ import math
 import re
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .atomic import digest, read_json, write_json, write_text
 from .config import GeneratorConfig, count_queries
-from .effects import simulated_effects
+from .effects import EffectsPlan
 from .errors import InputError, PartialError, UsageError
+from .estimates import Stream
+from .heightfield import HeightGrid
 from .levels import Lattice
 from .locks import shard_lock
 from .manifest import ShardEntry, build_manifest, software_versions
 from .material import Material, load_material
+from .planning import plan_effects, simulated
 from .queries import Mixture, QueryPlan
 from .schema import CONFIG_NAME, FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, SPLITS, Split
 from .settings import differences, dump_yaml
 from .shard_files import shard_suffix, write_shard
+from .simulation import estimator_of
+from .slopes import residual_slopes
 from .verification import is_finished, sidecar_of
 
 log = logging.getLogger(__name__)
@@ -76,6 +83,7 @@ class Job:
     material: Material
     lattice: Lattice
     config_hash: str
+    _tiles: dict[Any, Any] = field(default_factory=dict, repr=False, compare=False)
 
     @classmethod
     def prepare(cls, config: GeneratorConfig) -> Job:
@@ -85,13 +93,17 @@ class Job:
         ------
         InputError : the material cannot be used
         """
-        material = load_material(Path(config.material))
-        for note in material.notes:
+        job = cls.of(config, load_material(Path(config.material)))
+        for note in job.material.notes:
             log.info(note)
-        for warning in material.warnings:
+        for warning in job.material.warnings:
             log.warning(warning)
-        grid = material.grid(config.geometry.height, config.geometry.mesh)
-        log.info("mesh: %d x %d cells, relief %.4g tile widths", *grid.z.shape[::-1], grid.relief)
+        log.info("mesh: %d x %d cells, relief %.4g tile widths", *job.grid.z.shape[::-1], job.grid.relief)
+        return job
+
+    @classmethod
+    def of(cls, config: GeneratorConfig, material: Material) -> Job:
+        """The job of a material that is loaded."""
         rows, columns = material.height.shape
         lattice = Lattice.for_map(rows, columns, config.queries.levels)
         return cls(config, material, lattice, config.hash(material.digests))
@@ -112,6 +124,24 @@ class Job:
         if self.config.queries.layout == "image":
             return max(1, per_shard // self.lattice.texels())
         return per_shard
+
+    @cached_property
+    def grid(self) -> HeightGrid:
+        """Heights of the mesh."""
+        return self.material.grid(self.config.geometry.height, self.config.geometry.mesh)
+
+    @cached_property
+    def residual(self) -> tuple[NDArray[np.float64], float] | None:
+        """Slopes that the normal map adds to the mesh's, and the share of the mesh's that it repeats; None
+        without a map or where it is switched off."""
+        material, mode = self.material, self.config.effects.normal
+        if material.normal is None or material.bsdf is not None or mode == "off":
+            return None
+        return residual_slopes(material.normal, self.grid, mode)
+
+    def estimator(self, plan: EffectsPlan) -> Any:
+        """Estimator of M under an effects plan; loads Mitsuba unless M has a closed form."""
+        return estimator_of(self, plan, self._tiles)
 
     def spp(self, split: Split) -> int:
         """Paths per query of a split, both halves together."""
@@ -143,21 +173,21 @@ class Job:
 
 
 def build_estimator(config: GeneratorConfig, material: Material) -> Any:
-    """Estimator of a material under a configuration; loads Mitsuba."""
-    from .engine import load_mitsuba
+    """Estimator that simulates everything a material calls for, as reference pictures want it; loads
+    Mitsuba."""
+    job = Job.of(config, material)
+    return job.estimator(simulated(job))
 
-    load_mitsuba()
-    from .bsdf import bsdf_of
-    from .estimator import Estimator
-    from .light import LightKernel
-    from .scene import build_tile
-    from .tracing import Transport
 
-    tile = build_tile(material.grid(config.geometry.height, config.geometry.mesh), bsdf_of(material))
-    transport = Transport(
-        config.transport.max_depth, config.transport.roulette_depth, config.transport.max_crossings
-    )
-    return Estimator(tile, LightKernel(config.light.width), transport)
+def _agreed_effects(job: Job, folder: Path, entries: list[ShardEntry], overwrite: bool) -> EffectsPlan:
+    """Claim the folder and say which effects are simulated: as its manifest says where it has one, so that
+    all shards of a data set show the same, whichever machine makes them."""
+    existing = folder / MANIFEST_NAME
+    if existing.exists() and not overwrite:
+        _open_folder(job, folder, build_manifest(job, entries, None), overwrite)
+    else:
+        _open_folder(job, folder, build_manifest(job, entries, plan_effects(job)), overwrite)
+    return EffectsPlan.from_manifest(read_json(existing)["effects"])
 
 
 def _open_folder(job: Job, folder: Path, manifest: dict[str, Any], overwrite: bool) -> None:
@@ -244,14 +274,12 @@ def _sidecar(job: Job, entry: ShardEntry, path: Path, estimates: Any, seconds: f
 
 
 def _make_shard(job: Job, plan: QueryPlan, estimator: Any, entry: ShardEntry, path: Path) -> dict[str, Any]:
-    from .estimator import Stream
-
     start = time.perf_counter()
     queries = plan.draw(entry.split, entry.index, entry.rows)
     flat = queries.flat()
     spp = job.spp(entry.split)
     estimates = estimator.estimate(flat, spp, Stream(job.config.seed, entry.split, entry.index))
-    lead = queries.lead
+    lead, through = queries.lead, estimates.transmittance
     write_shard(
         path,
         {
@@ -262,6 +290,7 @@ def _make_shard(job: Job, plan: QueryPlan, estimator: Any, entry: ShardEntry, pa
             "value_a": estimates.value_a.reshape(*lead, 3),
             "value_b": estimates.value_b.reshape(*lead, 3),
             "spp": np.full(lead, spp, np.float32),
+            **({} if through is None else {"transmittance": through.reshape(lead)}),
         },
     )
     record = _sidecar(job, entry, path, estimates, time.perf_counter() - start)
@@ -299,9 +328,7 @@ def generate(
     job = job or Job.prepare(config)
     plan = job.plan()
     entries = [e for split in SPLITS for e in job.shards(split)]
-    effects = simulated_effects(job.material, config)
-    manifest = build_manifest(job, entries, effects)
-    _open_folder(job, folder, manifest, overwrite)
+    effects = _agreed_effects(job, folder, entries, overwrite)
     mine = [e for k, e in enumerate(entries) if k % slice_count == slice_index - 1]
     per_row = job.lattice.texels() if config.queries.layout == "image" else 1
     done, paths, busy = 0, 0, []
@@ -316,7 +343,7 @@ def generate(
                     for stale in folder.glob(f".{path.stem}.*.tmp"):
                         stale.unlink(missing_ok=True)
                     if estimator is None:
-                        estimator = build_estimator(config, job.material)
+                        estimator = job.estimator(effects)
                     paths += _make_shard(job, plan, estimator, entry, path)["paths"]
         done += entry.rows * per_row
         if progress is not None:
@@ -371,7 +398,7 @@ def finish(folder: str | Path, *, paths: int = 0, seconds: float = 0.0) -> Summa
         lost=counts["lost_rays"],
         capped=counts["capped_rays"],
         nonfinite=counts["nonfinite_samples"],
-        effects=[e["effect"] for e in manifest["effects"] if e["on"]],
+        effects=[e["effect"] for e in manifest["effects"]["effects"] if e["on"]],
     )
     if complete and not manifest["complete"]:
         manifest["complete"] = True

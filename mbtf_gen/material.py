@@ -47,6 +47,7 @@ class Material:
     height_bits : 8, 16, or None for floats
     basecolor : (h, w, 3) or (3,), linear Rec.709 in [0, 1]
     roughness, metallic, specular : (h, w) or one number in [0, 1]; all three None for Lambert
+    coat, coat_roughness : clear coat's share and roughness, (h, w) or one number in [0, 1]; None without one
     normal : (h, w, 3) unit vectors, x along u and y along v (OpenGL); None without a map
     opacity : (h, w) or one number in [0, 1]; None where nothing is transparent
     bsdf : Mitsuba dictionary that stands in place of the maps, or None
@@ -62,6 +63,8 @@ class Material:
     roughness: Share = None
     metallic: Share = None
     specular: Share = None
+    coat: Share = None
+    coat_roughness: Share = None
     normal: NDArray[np.float32] | None = None
     opacity: Share = None
     bsdf: dict[str, Any] | None = None

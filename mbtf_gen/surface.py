@@ -31,6 +31,9 @@ from .microfacet import (
     EnergyTables,
     distribution,
     grazing_reflectance,
+    is_mirror,
+    lost_light,
+    lost_light_pdf,
     schlick,
     smith,
     visible_normal,
@@ -39,6 +42,8 @@ from .microfacet import (
 COAT_REFLECTANCE = 0.04
 # A shading normal that would face away from the viewer is bent until its cosine is this.
 SMALLEST_COSINE = 0.01
+# Least and greatest chance, without a coat, with which sampling chooses the lobe.
+LOBE_CHANCES = (0.1, 0.98)
 
 
 @cache
@@ -49,8 +54,8 @@ def energy_tables(variant: str) -> EnergyTables:
 
 @dataclass(frozen=True)
 class Lobe:
-    """A GGX lobe at lanes' hits: α, roughness √α, reflectances F0 and F90, and the facets' (A, B) towards
-    the viewer."""
+    """A GGX lobe at lanes' hits: α, roughness √α, reflectances F0 and F90, and the facets' energies
+    (L, B) towards the viewer."""
 
     roughness: Any
     normal: Any
@@ -66,7 +71,7 @@ class Lobe:
     @property
     def mirror(self) -> Any:
         """Lanes whose lobe is a mirror."""
-        return dr.square(self.roughness) <= MIRROR_ALPHA
+        return is_mirror(self.roughness)
 
     def fresnel(self, cosine: Any) -> Any:
         """Reflectance of a facet seen under a cosine."""
@@ -74,8 +79,8 @@ class Lobe:
         return self.normal * (1.0 - s) + self.grazing * s
 
     def share(self, pair: tuple[Any, Any]) -> Any:
-        """Reflectance of the lobe from the facets' (A, B)."""
-        return self.normal * (pair[0] - pair[1]) + self.grazing * pair[1]
+        """Reflectance of the lobe from the facets' (L, B)."""
+        return self.normal * (1.0 - pair[0] - pair[1]) + self.grazing * pair[1]
 
     def value_pdf(self, wi: Any, wo: Any) -> tuple[Any, Any]:
         """(f·μo, density of sampling wo); 0 for mirrors."""
@@ -151,7 +156,8 @@ class SurfacePoint:
             normal = _tilted(si, maps["slopes"], towards_viewer)
         self.frame = mi.Frame3f(normal)
         self.wi = self.frame.to_local(towards_viewer)
-        self.visible &= self.wi.z > 0
+        # Written so that NaN counts as seen: it must reach the value, where it is found and drawn again.
+        self.visible &= ~(self.wi.z <= 0)
         self.wi.z = dr.maximum(self.wi.z, 1e-6)
         self.base = maps["base_color"].eval(si) if parts.diffuse or parts.metallic else mi.Color3f(0.0)
         self.metallic = maps["metallic"].eval_1(si) if parts.metallic else mi.Float(0.0)
@@ -173,15 +179,14 @@ class SurfacePoint:
         self.lobe = Lobe(roughness, normal, grazing, tables, pair)
         # What the dielectric's lobe leaves to the diffuse term, by direction and on average.
         self.dielectric, self.edge = dielectric, edge
-        self.left = 1.0 - (dielectric * (pair[0] - pair[1]) + edge * pair[1])
-        self.left_mean = 1.0 - (dielectric * (mean[0] - mean[1]) + edge * mean[1])
+        self.left = 1.0 - (dielectric * (1.0 - pair[0] - pair[1]) + edge * pair[1])
+        self.left_mean = 1.0 - (dielectric * (1.0 - mean[0] - mean[1]) + edge * mean[1])
         if self.parts.metallic:
-            lost = 1.0 - mean[0]
             f = self.base + (grazing_reflectance(self.base) - self.base) * (1.0 / 21.0)
-            several = dr.square(f) * mean[0] / (1.0 - f * lost)
-            # Nothing is lost by smooth facets, and nothing may be divided by it.
-            self.several = several * m / dr.maximum(lost, 1e-6)
-            self.lost = dr.maximum(1.0 - pair[0], 0.0)
+            # Share of what one scattering loses that several give back; as a value, by direction.
+            self.returned = m * dr.square(f) * (1.0 - mean[0]) / (1.0 - f * mean[0])
+            self.several = self.returned / mean[0]
+            self.lost = pair[0]
 
     def _coat(self, maps: dict[str, Any], si: Any) -> None:
         roughness = dr.clip(maps["coat_roughness"].eval_1(si), 0.0, 1.0)
@@ -197,29 +202,32 @@ class SurfacePoint:
         if not (self.parts.specular or self.parts.metallic):
             return diffuse
         assert self.tables is not None
-        a, b = self.tables.at(cosine, self.lobe.roughness)
-        left = 1.0 - (self.dielectric * (a - b) + self.edge * b)
+        lost, b = self.tables.at(cosine, self.lobe.roughness)
+        left = 1.0 - (self.dielectric * (1.0 - lost - b) + self.edge * b)
         value = diffuse * (self.left * left / self.left_mean) if self.parts.diffuse else mi.Color3f(0.0)
         if self.parts.metallic:
-            value += self.several * (self.lost * dr.maximum(1.0 - a, 0.0))
+            value += self.several * (self.lost * lost)
         return value
 
-    def _chances(self) -> tuple[Any, Any]:
-        """Chances with which sampling chooses (the coat, the lobe); the rest is cosine-distributed."""
-        coat, lobe = mi.Float(0.0), mi.Float(0.0)
+    def _chances(self) -> tuple[Any, Any, Any]:
+        """Chances with which sampling chooses (the coat, the lobe, what metal scatters several times); the
+        rest is cosine-distributed."""
+        coat, lobe, several = mi.Float(0.0), mi.Float(0.0), mi.Float(0.0)
         if self.parts.specular or self.parts.metallic:
-            # Energies towards the viewer. A lobe that holds nearly all still leaves broad light a tenth.
+            # Energies towards the viewer.
             strong = dr.mean(self.lobe.share(self.lobe.towards_viewer))
             broad = dr.mean(self.base * (1.0 - self.metallic)) * self.left
+            again = dr.mean(self.returned) * self.lost if self.parts.metallic else mi.Float(0.0)
+            lobe = dr.clip(strong / dr.maximum(strong + broad + again, 1e-6), *LOBE_CHANCES)
             if self.parts.metallic:
-                broad += dr.mean(self.several) * self.lost
-            lobe = dr.clip(strong / dr.maximum(strong + broad, 1e-6), 0.1, 0.9)
+                several = (1.0 - lobe) * again / dr.maximum(broad + again, 1e-12)
         if self.parts.coat:
             share = self.coat_weight * dr.mean(self.coat.share(self.coat.towards_viewer))
             coat = dr.clip(share / dr.maximum(share + (1.0 - share) * dr.mean(self.base), 1e-6), 0.05, 0.9)
             coat = dr.select(self.coat_weight > 0, coat, 0.0)
             lobe *= 1.0 - coat
-        return coat, lobe
+            several *= 1.0 - coat
+        return coat, lobe, several
 
     def _below_coat(self, cosine: Any) -> Any:
         """What the coat lets through of both directions."""
@@ -231,9 +239,11 @@ class SurfacePoint:
 
     def _local(self, wo: Any) -> tuple[Any, Any]:
         """(f·μo, density) for local wo with z > 0, without mirrors."""
-        chance_coat, chance = self._chances()
+        chance_coat, chance, chance_several = self._chances()
         value = self._broad(wo.z) * (dr.inv_pi * wo.z)
-        pdf = (1.0 - chance_coat - chance) * dr.inv_pi * wo.z
+        pdf = (1.0 - chance_coat - chance - chance_several) * (dr.inv_pi * wo.z)
+        if self.parts.metallic:
+            pdf += chance_several * lost_light_pdf(wo.z, self.lobe.alpha)
         if self.parts.specular or self.parts.metallic:
             lobe, lobe_pdf = self.lobe.value_pdf(self.wi, wo)
             value += lobe
@@ -246,7 +256,7 @@ class SurfacePoint:
 
     def _leaves(self, wo: Any, omega: Any) -> Any:
         """Lanes whose direction leaves above the shading plane and above the face."""
-        return self.visible & (wo.z > 0) & (dr.dot(self.face, omega) > 0)
+        return self.visible & ~(wo.z <= 0) & ~(dr.dot(self.face, omega) <= 0)
 
     def eval_pdf(self, omega: Any) -> tuple[Any, Any]:
         """(f·cos, density with which :meth:`sample` chooses it) of a direction, mirrors left out."""
@@ -258,10 +268,13 @@ class SurfacePoint:
 
     def sample(self, xi_lobe: Any, xi: Any) -> tuple[Any, Any, Any]:
         """(direction, weight f·cos/density, density; infinite for a mirrored direction)."""
-        chance_coat, chance = self._chances()
+        chance_coat, chance, chance_several = self._chances()
         wo = mi.warp.square_to_cosine_hemisphere(xi)
         mirrored = mi.Bool(False)
         single = mi.Color3f(0.0)
+        if self.parts.metallic:
+            chosen = xi_lobe < chance + chance_several
+            wo = dr.select(chosen, lost_light(self.lobe.alpha, xi), wo)
         if self.parts.specular or self.parts.metallic:
             chosen = xi_lobe < chance
             wo_lobe, weight = self.lobe.sample(self.wi, xi)
