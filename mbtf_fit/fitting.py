@@ -14,7 +14,7 @@ import torch
 from mbtf_gen.atomic import read_json, write_json, write_text
 from mbtf_gen.dataset import Dataset
 from mbtf_gen.errors import EngineError, InputError
-from mbtf_gen.settings import differences, dump_yaml
+from mbtf_gen.settings import differences, dump_yaml, in_short
 from mbtf_gen.stats import unexplained_variance
 
 from .config import FitConfig
@@ -179,7 +179,7 @@ def _claim(out: Path, identity: dict[str, Any], config: FitConfig, overwrite: bo
                 {**record.get("config", {}), **{k: record.get(k) for k in ("schema", "data")}}
                 for record in (old, identity)
             )
-            changes = "; ".join(differences(before, after)[:8]) or "other shards"
+            changes = in_short(differences(before, after)) or "other shards"
             raise InputError(
                 f"holds a fit of another configuration: {changes}",
                 where=out,
@@ -204,13 +204,25 @@ def _trainer(config: FitConfig, data: Dataset, partition: Partition, device: tor
 
 
 def _resume(trainer: Trainer, out: Path) -> bool:
-    """Take up the checkpoint where there is one."""
+    """Take up the checkpoint where there is one.
+
+    Raises
+    ------
+    InputError : it is damaged, or of another model
+    """
     path = out / CHECKPOINT_NAME
     if not path.exists():
         (out / METRICS_NAME).unlink(missing_ok=True)
         return False
-    trainer.restore(*read_tensors(path))
-    kept = [line for line in read_history(out) if line["step"] <= trainer.progress.step]
+    try:
+        trainer.restore(*read_tensors(path))
+    except (InputError, KeyError, TypeError, ValueError, RuntimeError):
+        raise InputError(
+            "is no checkpoint of this fit: damaged, or put there by something else",
+            where=path,
+            cure="remove it: the same command then starts from the beginning",
+        ) from None
+    kept = [line for line in read_history(out) if line.get("step", 0) <= trainer.progress.step]
     write_text(out / METRICS_NAME, "".join(json.dumps(line) + "\n" for line in kept))
     return True
 
@@ -255,14 +267,17 @@ def _note(record: dict[str, Any]) -> str:
 
 
 def read_history(folder: str | Path) -> list[dict[str, Any]]:
-    """The records of ``metrics.jsonl``; a line cut off by a crash is left out."""
+    """The records of ``metrics.jsonl``; what follows a damaged line is left out."""
     path = Path(folder) / METRICS_NAME
     out = []
-    for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else []:
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []:
         try:
-            out.append(json.loads(line))
-        except json.JSONDecodeError:
+            record = json.loads(line)
+        except (ValueError, RecursionError):
             break
+        if not isinstance(record, dict):
+            break
+        out.append(record)
     return out
 
 

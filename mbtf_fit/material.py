@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
+from pydantic import BaseModel, Field
 
 from mbtf_gen.atomic import digest, read_json, write_json
 from mbtf_gen.directions import from_projected_disk
 from mbtf_gen.errors import InputError
-from mbtf_gen.levels import Lattice, sigma_of_level
+from mbtf_gen.levels import MAX_LEVEL, Lattice, sigma_of_level
 from mbtf_gen.schema import CONVENTIONS
-from mbtf_gen.settings import build
+from mbtf_gen.settings import build, check_document
 
 from .config import FitConfig
 from .data import Queries
@@ -30,6 +31,46 @@ WEIGHTS_NAME = "weights.safetensors"
 # Queries with expected values that every exported material carries.
 CONFORMANCE_COUNT = 256
 _CONFORMANCE = ("u", "sigma", "omega_i", "omega_o", "rgb")
+
+
+class _Weights(BaseModel):
+    sha256: str
+    network_weights: int
+    texels: int
+
+
+class _Levels(BaseModel):
+    finest: Annotated[int, Field(strict=True, ge=0, le=MAX_LEVEL)]
+
+
+class _Tile(BaseModel):
+    aspect: Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)]
+
+
+class _Conformance(BaseModel):
+    count: int
+
+
+class _Training(BaseModel):
+    steps: int
+    batch: int
+    seconds: float
+    device: str
+    threads: int
+    errors: dict[str, Any]
+
+
+class _Description(BaseModel):
+    """What readers of ``material.json`` rely on; it holds more."""
+
+    model: str
+    config: dict[str, Any]
+    weights: _Weights
+    levels: _Levels
+    tile: _Tile
+    conformance: _Conformance
+    training: _Training
+    data: dict[str, Any]
 
 
 def conformance_queries(lattice: Lattice) -> dict[str, NDArray[np.float32]]:
@@ -102,14 +143,29 @@ class Material:
                 where=path,
                 cure="fit it again with this version of mbtf-fit",
             )
+        check_document(_Description, description, path, "fit it again, or fetch it again from where it came")
         weights = folder / WEIGHTS_NAME
-        if not weights.exists() or digest(weights) != description["weights"]["sha256"]:
+        if not weights.is_file() or digest(weights) != description["weights"]["sha256"]:
             raise InputError("is missing or not the file that material.json describes", where=weights)
         config = build(FitConfig, description["config"], source=str(path))
         lattice = Lattice(description["levels"]["finest"], description["tile"]["aspect"])
+        # Before memory is taken for a model that the weights cannot fill.
+        if 4 * lattice.texels() * config.network.channels > weights.stat().st_size:
+            raise InputError("is too small for the levels that material.json describes", where=weights)
         model = build_model(config.model, lattice, **config.network.model_dump())
         tensors, _ = read_tensors(weights, device)
-        conformance = {name: tensors.pop(f"conformance.{name}").cpu().numpy() for name in _CONFORMANCE}
+        missing = [name for name in _CONFORMANCE if f"conformance.{name}" not in tensors]
+        if missing:
+            raise InputError(f"lacks the tensor 'conformance.{missing[0]}'", where=weights)
+        conformance = {
+            name: tensors.pop(f"conformance.{name}").float().cpu().numpy() for name in _CONFORMANCE
+        }
+        wanted = {"u": (2,), "sigma": (), "omega_i": (3,), "omega_o": (3,), "rgb": (3,)}
+        for name, array in conformance.items():
+            if array.shape != (description["conformance"]["count"], *wanted[name]):
+                raise InputError(
+                    f"its tensor 'conformance.{name}' has the shape {array.shape}", where=weights
+                )
         model.to(device).requires_grad_(False)
         model.load_weights(tensors)
         return cls(model, config, description, conformance)

@@ -48,5 +48,6 @@ def read_tensors(path: Path, device: torch.device | str = "cpu") -> tuple[dict[s
             return {name: file.get_tensor(name) for name in file.keys()}, data  # noqa: SIM118
     except FileNotFoundError:
         raise InputError("no such file", where=path) from None
-    except (SafetensorError, OSError, ValueError) as error:
-        raise InputError(f"cannot be read ({error})", where=path) from None
+    except (SafetensorError, OSError, ValueError, RecursionError) as error:
+        text = " ".join(str(error).split())[:200]
+        raise InputError(f"cannot be read as tensors ({text})", where=path) from None

@@ -194,7 +194,12 @@ class Trainer:
         return tensors, {f.name: getattr(self.progress, f.name) for f in fields(Progress)}
 
     def restore(self, tensors: dict[str, Tensor], data: dict[str, Any]) -> None:
-        """Take up a state of the same configuration and data: training goes on as if never interrupted."""
+        """Take up a state of the same configuration and data: training goes on as if never interrupted.
+
+        Raises
+        ------
+        KeyError, TypeError, ValueError, RuntimeError : the state is of another model, or damaged
+        """
         with torch.no_grad():
             for name, p in self.model.named_parameters():
                 p.copy_(tensors[f"model.{name}"])
@@ -203,4 +208,4 @@ class Trainer:
                     for key in ("step", "exp_avg", "exp_avg_sq")
                     if f"adam.{key}.{name}" in tensors
                 }
-        self.progress = Progress(**data)
+        self.progress = Progress(int(data["step"]), float(data["seconds"]), float(data["loss"]))

@@ -88,14 +88,20 @@ def read_json(path: Path) -> dict[str, Any]:
     InputError : missing, unreadable, or not a JSON object
     """
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
     except FileNotFoundError:
         raise InputError("no such file", where=path) from None
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
+    except (ValueError, RecursionError) as error:
         raise InputError(f"not readable as JSON ({error})", where=path) from None
     if not isinstance(data, dict):
         raise InputError("must hold a JSON object", where=path)
     return data
+
+
+def _refuse_constant(name: str) -> None:
+    raise ValueError(f"{name} is no number of JSON")
 
 
 def digest(path: Path) -> str:

@@ -16,7 +16,7 @@ from pydantic import AfterValidator, BeforeValidator, Field
 from .effects import Wish
 from .errors import UsageError
 from .light import MAX_WIDTH_DEG, MIN_WIDTH_DEG
-from .schema import SCHEMA_VERSION, ArrayFormat, Layout
+from .schema import SCHEMA_VERSION, ArrayFormat, Layout, Tiling
 from .settings import Settings
 from .slopes import NormalMode
 
@@ -78,6 +78,9 @@ class GeometrySection(Settings):
     )
     mesh: int | None = Field(
         None, ge=1, le=8192, description="mesh cells across the tile; default: the map's width, at most 512"
+    )
+    tile: Tiling = Field(
+        "none", description="cure for maps that do not tile: mirrored copies, or edges cross-faded"
     )
 
 
@@ -170,19 +173,3 @@ class GeneratorConfig(Settings):
         """SHA-256 over :meth:`data_fields`, hexadecimal; `inputs` maps roles to digests of files."""
         text = json.dumps(self.data_fields(inputs), sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()
-
-
-def check_queries_flag(text: str | None, flag: str = "--queries") -> str | None:
-    """A ``--queries`` value, checked before anything is loaded.
-
-    Raises
-    ------
-    UsageError : not of the form N or N/texel
-    """
-    if text is None:
-        return None
-    try:
-        parse_count(text)
-    except ValueError as error:
-        raise UsageError(f"'{text}' {error}", where=flag) from None
-    return text

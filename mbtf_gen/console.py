@@ -277,6 +277,17 @@ def _take_debug(tokens: Sequence[str]) -> tuple[bool, list[str]]:
     return len(kept) < end, [*kept, *tokens[end:]]
 
 
+def _join_negative_pairs(tokens: Sequence[str]) -> list[str]:
+    """``--view -10,0`` as ``--view=-10,0``: a list of numbers that begins with a minus sign is no flag."""
+    out: list[str] = []
+    for token in tokens:
+        if re.fullmatch(r"-[\d.][^,\s]*,\S+", token) and out and re.fullmatch(r"--[\w-]+", out[-1]):
+            out[-1] += f"={token}"
+        else:
+            out.append(token)
+    return out
+
+
 def _commands(app: App) -> list[str]:
     return [name for name in app if not name.startswith("-")]
 
@@ -352,7 +363,7 @@ def run(app: App, argv: Sequence[str] | None = None) -> int:
             # A terminal without our signs (Greek letters, ±) shows question marks instead of failing.
             stream.reconfigure(errors="replace")
     try:
-        tokens = _command_first(app, tokens)
+        tokens = _command_first(app, _join_negative_pairs(tokens))
         result = app(tokens)
         sys.stdout.flush()
         return result if type(result) is int else EXIT_OK

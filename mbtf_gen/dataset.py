@@ -5,16 +5,57 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, Field
 
 from .atomic import read_json
 from .errors import InputError
-from .levels import Lattice
-from .schema import FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, Layout
+from .levels import MAX_LEVEL, Lattice
+from .schema import ARRAYS, FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, Layout
+from .settings import check_document
 from .shard_files import Arrays, read_shard
+
+_Count = Annotated[int, Field(strict=True, ge=0, lt=1 << 40)]
+_FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*\.(npz|exr)$", max_length=100)]
+_MAKE_AGAIN = "generate the data set again, or fetch it again from where it came"
+# Bytes of a query in a shard.
+_QUERY_BYTES = sum(max(1, sum(a.trailing)) * a.dtype.itemsize for a in ARRAYS if not a.optional)
+
+
+class _Entry(BaseModel):
+    file: _FileName
+    rows: _Count
+
+
+class _Split(BaseModel):
+    shards: list[_Entry]
+
+
+class _Levels(BaseModel):
+    finest: Annotated[int, Field(strict=True, ge=0, le=MAX_LEVEL)]
+
+
+class _Tile(BaseModel):
+    aspect: float = Field(gt=0, le=1e6, allow_inf_nan=False)
+
+
+class _Manifest(BaseModel):
+    """What readers of a manifest rely on; it holds more."""
+
+    config_hash: str
+    layout: Layout
+    levels: _Levels
+    tile: _Tile
+    splits: dict[str, _Split]
+
+
+class _Sidecar(BaseModel):
+    """What readers of a shard's sidecar rely on; it holds more."""
+
+    rows: _Count
 
 
 @dataclass(frozen=True)
@@ -49,7 +90,8 @@ class Dataset:
 
         Raises
         ------
-        InputError : no manifest, another format, or another schema version
+        InputError : no manifest, another format, another schema version, or keys that are missing or hold
+            something else
         """
         folder = Path(folder)
         if not folder.is_dir():
@@ -68,6 +110,7 @@ class Dataset:
                 where=path,
                 cure="generate them again with this version of mbtf-gen",
             )
+        check_document(_Manifest, manifest, path, _MAKE_AGAIN)
         return cls(folder, manifest)
 
     @property
@@ -91,7 +134,7 @@ class Dataset:
 
         Raises
         ------
-        InputError : no such split, or a shard that the manifest lists is missing
+        InputError : no such split, a shard that the manifest lists is missing, or a damaged sidecar
         """
         if split not in self.manifest["splits"]:
             raise InputError(f"has no split '{split}' (it has: {', '.join(self.splits)})", where=self.folder)
@@ -105,7 +148,15 @@ class Dataset:
                     where=self.folder,
                     cure="run the mbtf-gen command that made the folder again: it resumes",
                 )
-            out.append(Shard(path, read_json(sidecar)))
+            record = read_json(sidecar)
+            check_document(_Sidecar, record, sidecar, _MAKE_AGAIN)
+            if record["rows"] * _QUERY_BYTES > path.stat().st_size:
+                raise InputError(
+                    f"is too short for the {record['rows']} rows that its sidecar says",
+                    where=path,
+                    cure="look for damage with: mbtf-gen verify",
+                )
+            out.append(Shard(path, record))
         return out
 
     def iterate(self, split: str, names: Iterable[str] | None = None) -> Iterator[Arrays]:

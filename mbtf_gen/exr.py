@@ -47,14 +47,67 @@ def read_file(path: Path, max_pixels: int) -> tuple[dict[str, Any], dict[str, ND
     InputError : broken, more than `max_pixels`, cropped (data window unlike the display window), deep,
         subsampled, or channels of whole numbers
     """
+    head, channels = _read(path, max_pixels)[0]
+    for name, channel in channels.items():
+        if channel.dtype.kind != "f":
+            raise InputError(
+                f"channel '{name}' holds whole numbers", where=path, cure="save it as half or float"
+            )
+    return head, channels
+
+
+def read_channels(path: Path, max_pixels: int) -> dict[str, NDArray[Any]]:
+    """Channels (H, W) by name of all parts, float16, float32 or uint32.
+
+    With several parts, the channels of a part carry its name in front, as layers do.
+
+    Raises
+    ------
+    InputError : as :func:`read_file`, or two channels of one name
+    """
+    parts = _read(path, max_pixels)
+    if len(parts) == 1:
+        return parts[0][1]
+    out: dict[str, NDArray[Any]] = {}
+    for number, (head, channels) in enumerate(parts):
+        part = str(head.get("name", f"part{number}"))
+        for name, pixels in channels.items():
+            full = name if name.startswith(f"{part}.") else f"{part}.{name}"
+            if full in out:
+                raise InputError(f"two channels are named '{full}'", where=path)
+            out[full] = pixels
+    return out
+
+
+def _read(path: Path, max_pixels: int) -> list[tuple[dict[str, Any], dict[str, NDArray[Any]]]]:
+    """(header, channels) of every part; all sizes are checked before any pixel is read."""
     import OpenEXR
 
     broken = InputError("cannot be read as an EXR image: it is damaged or cut short", where=path)
     try:
         with _silenced():
-            head = OpenEXR.File(str(path), separate_channels=True, header_only=True).header()
+            file = OpenEXR.File(str(path), separate_channels=True, header_only=True)
+            heads = [part.header for part in file.parts]
     except Exception:  # a damaged file may make the library raise anything
         raise broken from None
+    sizes = [_checked_size(head, path, max_pixels) for head in heads]
+    try:
+        with _silenced(), OpenEXR.File(str(path), separate_channels=True) as file:
+            parts = [{n: np.array(c.pixels) for n, c in part.channels.items()} for part in file.parts]
+    except Exception:
+        raise broken from None
+    if not heads or len(parts) != len(heads):
+        raise broken
+    for size, channels in zip(sizes, parts, strict=True):
+        if not channels or any(c.shape != size for c in channels.values()):
+            raise broken
+    return list(zip(heads, parts, strict=True))
+
+
+def _checked_size(head: dict[str, Any], path: Path, max_pixels: int) -> tuple[int, int]:
+    """(rows, columns) of a part, unless it is of a kind that is refused."""
+    import OpenEXR
+
     if head["type"] not in (OpenEXR.scanlineimage, OpenEXR.tiledimage):
         raise InputError("deep EXR images are not supported", where=path, cure="flatten the image")
     window = _window(head, "dataWindow")
@@ -67,21 +120,4 @@ def read_file(path: Path, max_pixels: int) -> tuple[dict[str, Any], dict[str, ND
         )
     if any(c.xSampling != 1 or c.ySampling != 1 for c in head["channels"]):
         raise InputError("subsampled EXR channels are not supported", where=path, cure="save it as plain RGB")
-    try:
-        with _silenced(), OpenEXR.File(str(path), separate_channels=True) as file:
-            channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
-    except Exception:
-        raise broken from None
-    if not channels or any(c.shape != (rows, columns) for c in channels.values()):
-        raise broken
-    for name, channel in channels.items():
-        if channel.dtype.kind != "f":
-            raise InputError(
-                f"channel '{name}' holds whole numbers", where=path, cure="save it as half or float"
-            )
-    return head, channels
-
-
-def read_channels(path: Path, max_pixels: int) -> dict[str, NDArray[Any]]:
-    """The channels of :func:`read_file` alone."""
-    return read_file(path, max_pixels)[1]
+    return rows, columns

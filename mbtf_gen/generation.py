@@ -28,7 +28,7 @@ from .material import Material, load_material
 from .planning import plan_effects, simulated
 from .queries import Mixture, QueryPlan
 from .schema import CONFIG_NAME, FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, SPLITS, Split
-from .settings import differences, dump_yaml
+from .settings import differences, dump_yaml, in_short
 from .shard_files import shard_suffix, write_shard
 from .simulation import estimator_of
 from .slopes import residual_slopes
@@ -54,7 +54,8 @@ class Summary:
 
     Attributes
     ----------
-    seconds : of this run; paths, queries : traced in this run
+    queries : finished, of all splits; splits : the same by split
+    paths, seconds : traced in this run, and its duration
     relative_error : pooled relative standard error of the stored training values, √(mean variance) / mean
         value
     mean_value : mean training value per channel, 1/sr
@@ -64,6 +65,7 @@ class Summary:
     folder: str
     complete: bool
     queries: int
+    splits: dict[str, int]
     paths: int
     seconds: float
     paths_per_second: float
@@ -93,7 +95,7 @@ class Job:
         ------
         InputError : the material cannot be used
         """
-        job = cls.of(config, load_material(Path(config.material)))
+        job = cls.of(config, load_material(Path(config.material), config.geometry.tile))
         for note in job.material.notes:
             log.info(note)
         for warning in job.material.warnings:
@@ -146,6 +148,22 @@ class Job:
     def spp(self, split: Split) -> int:
         """Paths per query of a split, both halves together."""
         return self.config.queries.spp if split == "train" else self.config.queries.test_spp
+
+    def paths(self, entry: ShardEntry) -> int:
+        """Paths that a shard takes."""
+        return self._queries(entry) * self.spp(entry.split)
+
+    def queries(self, split: Split) -> int:
+        """Queries of a split, whole buffers counted in the image layout."""
+        return sum(self._queries(entry) for entry in self.shards(split))
+
+    def _queries(self, entry: ShardEntry) -> int:
+        return entry.rows * (self.lattice.texels() if self.config.queries.layout == "image" else 1)
+
+    def slice(self, index: int, count: int) -> list[ShardEntry]:
+        """Shards of slice number `index` (from 1) of `count`: every `count`-th of all splits' shards."""
+        entries = [e for split in SPLITS for e in self.shards(split)]
+        return [e for k, e in enumerate(entries) if k % count == index - 1]
 
     def shards(self, split: Split) -> list[ShardEntry]:
         """Shards of a split and their rows.
@@ -211,7 +229,7 @@ def _open_folder(job: Job, folder: Path, manifest: dict[str, Any], overwrite: bo
         elif old.get("config_hash") != job.config_hash:
             before = {**old.get("config", {}), "inputs": old.get("inputs", {}), "schema": old.get("schema")}
             after = {**manifest["config"], "inputs": manifest["inputs"], "schema": SCHEMA_VERSION}
-            changes = "; ".join(differences(before, after)[:8]) or "inputs differ"
+            changes = in_short(differences(before, after)) or "inputs differ"
             raise InputError(
                 f"holds a data set of another configuration: {changes}",
                 where=folder,
@@ -298,6 +316,15 @@ def _make_shard(job: Job, plan: QueryPlan, estimator: Any, entry: ShardEntry, pa
     return record
 
 
+def paths_left(job: Job, folder: str | Path, slice_index: int = 1, slice_count: int = 1) -> int:
+    """Paths that :func:`generate` has still to trace: those of the slice's shards that are not finished."""
+    return sum(
+        job.paths(entry)
+        for entry in job.slice(slice_index, slice_count)
+        if not is_finished(Path(folder) / entry.file, entry.rows, job.config_hash)
+    )
+
+
 def generate(
     config: GeneratorConfig,
     folder: str | Path,
@@ -315,7 +342,7 @@ def generate(
     folder : output; an unfinished data set of the same configuration there is resumed
     overwrite : replace a data set of another configuration
     slice_index, slice_count : make only shards i with ``i % slice_count == slice_index - 1``
-    progress : called with (queries done so far, note)
+    progress : called with (paths traced so far in this run, note), see :func:`paths_left`
     job : the configuration with its material loaded, where the caller has it already
 
     Raises
@@ -329,11 +356,9 @@ def generate(
     plan = job.plan()
     entries = [e for split in SPLITS for e in job.shards(split)]
     effects = _agreed_effects(job, folder, entries, overwrite)
-    mine = [e for k, e in enumerate(entries) if k % slice_count == slice_index - 1]
-    per_row = job.lattice.texels() if config.queries.layout == "image" else 1
-    done, paths, busy = 0, 0, []
+    paths, busy = 0, []
     estimator: Any = None
-    for entry in mine:
+    for entry in job.slice(slice_index, slice_count):
         path = folder / entry.file
         if not is_finished(path, entry.rows, job.config_hash):
             with shard_lock(path) as held:
@@ -345,9 +370,8 @@ def generate(
                     if estimator is None:
                         estimator = job.estimator(effects)
                     paths += _make_shard(job, plan, estimator, entry, path)["paths"]
-        done += entry.rows * per_row
         if progress is not None:
-            progress(done, f"{paths / max(time.perf_counter() - start, 1e-9) / 1e6:.2f} M paths/s")
+            progress(paths, f"{paths / max(time.perf_counter() - start, 1e-9) / 1e6:.2f} M paths/s")
     if busy:
         raise PartialError(
             f"{len(busy)} shard(s) are being written by another process, first {busy[0]}",
@@ -390,6 +414,7 @@ def finish(folder: str | Path, *, paths: int = 0, seconds: float = 0.0) -> Summa
         folder=str(folder),
         complete=complete,
         queries=sum(r["queries"] for r in flat),
+        splits={split: sum(r["queries"] for r in records.get(split, [])) for split in manifest["splits"]},
         paths=paths,
         seconds=round(seconds, 3),
         paths_per_second=round(paths / seconds, 1) if seconds > 0 else 0.0,

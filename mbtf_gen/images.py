@@ -7,7 +7,8 @@ here: which map is sRGB and which is data is the material's business.
 from __future__ import annotations
 
 import warnings as python_warnings
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from .errors import InputError
 from .exr import read_channels
+from .exr_layers import choose_channels
+from .image_tags import NO_TAGS, Tags, tags_of
+from .near import near_miss
 from .png16 import header as png_header
 from .png16 import read_png16
+from .tiff import read_tiff
 
 # A header may claim any size; beyond this nothing is allocated (11 585² pixels).
 MAX_PIXELS = 2**27
@@ -58,11 +63,15 @@ class Image:
         float32 for several; all finite
     bits : 8 or 16 where the file holds integers (then pixels are code / largest code), None for floats
     path : the file
+    tags : what the file says about its colours and orientation; nothing of it is applied here
+    channels : names of the channels that were chosen, where there was a choice
     """
 
     pixels: NDArray[np.floating[Any]]
     bits: int | None
     path: Path
+    tags: Tags = NO_TAGS
+    channels: tuple[str, ...] = ()
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -75,23 +84,31 @@ def is_image(path: Path) -> bool:
     return path.suffix.lower() in _KINDS
 
 
-def read_image(path: str | Path) -> Image:
+def read_image(
+    path: str | Path, channel: str | None = None, prefer: Callable[[str], bool] | None = None
+) -> Image:
     """Decode an image file.
+
+    Parameters
+    ----------
+    channel : what to take of it: a channel or a layer of an EXR file, R, G, B, A or Y of the others; by
+        default all that belongs together
+    prefer : of several layers of an EXR file, the one whose name this accepts (see
+        :func:`~mbtf_gen.exr_layers.choose_channels`)
 
     Raises
     ------
     InputError : missing, empty, damaged, cut short, of another kind than its name says, of a kind that is not
-        supported, more than ``MAX_PIXELS`` pixels, or with pixels that are NaN or infinite (with their number
-        and the first one's column and row)
+        supported, more than ``MAX_PIXELS`` pixels, without the channel, or with pixels that are NaN or
+        infinite (with their number and the first one's column and row)
     """
     path = Path(path)
     kind = _kind(path)
     if kind == "EXR":
-        image = _from_exr(path)
-    elif kind == "NPY":
-        image = _from_npy(path)
+        image = _from_exr(path, channel, prefer)
     else:
-        image = _from_pillow(path, kind)
+        image = _from_npy(path) if kind == "NPY" else _from_pillow(path, kind)
+        image = image if channel is None else _pick(image, channel)
     bad = ~np.isfinite(image.pixels).all(axis=-1)
     if bad.any():
         raise InputError(f"{count_and_first(bad)} NaN or infinite", where=path)
@@ -116,7 +133,7 @@ def _kind(path: Path) -> str:
         with path.open("rb") as stream:
             start = stream.read(8)
     except FileNotFoundError:
-        raise InputError("no such file", where=path) from None
+        raise InputError("no such file", where=path, cure=near_miss(path, is_image)) from None
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", where=path) from None
     if named is None:
@@ -158,30 +175,34 @@ def _from_floats(numbers: NDArray[Any], path: Path) -> Image:
         return Image(stacked.astype(dtype), None, path)
 
 
-def _from_exr(path: Path) -> Image:
+def _from_exr(path: Path, channel: str | None, prefer: Callable[[str], bool] | None) -> Image:
     channels = read_channels(path, MAX_PIXELS)
-    names = _exr_order(list(channels), path)
-    return _from_floats(np.stack([channels[n] for n in names], axis=-1), path)
+    names = choose_channels(list(channels), path, channel, prefer)
+    for name in names:
+        if channels[name].dtype.kind != "f":
+            raise InputError(
+                f"channel '{name}' holds whole numbers", where=path, cure="save it as half or float"
+            )
+    image = _from_floats(np.stack([channels[n] for n in names], axis=-1), path)
+    return replace(image, channels=tuple(names) if len(channels) > len(names) else ())
 
 
-def _exr_order(names: list[str], path: Path) -> list[str]:
-    """Channels that make up the image, in order: the only one, or RGB(A) or Y(A) of the only such layer."""
-    if len(names) == 1:
-        return names
-    found = []
-    for layer in sorted({n.rpartition(".")[0] for n in names}):
-        prefix = f"{layer}." if layer else ""
-        base = next((b for b in ("RGB", "Y") if all(prefix + c in names for c in b)), None)
-        if base is not None:
-            found.append([prefix + c for c in base] + ([f"{prefix}A"] if f"{prefix}A" in names else []))
-    unnamed = [f for f in found if "." not in f[0]]
-    if len(found) != 1 and len(unnamed) != 1:
-        raise InputError(
-            f"which of its channels are meant is unclear: {', '.join(sorted(names))}",
-            where=path,
-            cure="keep one channel, or the channels R, G, B",
-        )
-    return (unnamed or found)[0]
+def _pick(image: Image, channel: str) -> Image:
+    """One channel of an image by its letter."""
+    names = {1: "Y", 2: "YA", 3: "RGB", 4: "RGBA"}[image.pixels.shape[2]]
+    if channel.upper() not in tuple(names):
+        raise InputError(f"has no channel '{channel}'", where=image.path, cure=f"it holds {', '.join(names)}")
+    index = names.index(channel.upper())
+    numbers = _exact(image.pixels[..., index], image.bits)
+    return replace(image, pixels=numbers[..., None], channels=(names[index],))
+
+
+def _exact(numbers: NDArray[np.floating[Any]], bits: int | None) -> NDArray[np.float64]:
+    """Back from single precision to the exact fraction that a code stands for."""
+    if bits is None:
+        return numbers.astype(np.float64)
+    largest = 2**bits - 1
+    return np.rint(numbers.astype(np.float64) * largest) / largest
 
 
 def _from_npy(path: Path) -> Image:
@@ -211,7 +232,13 @@ def _from_pillow(path: Path, kind: str) -> Image:
     if head is not None:
         _check_size(head[1], head[0], path)
         if head[2] == 16 and head[3] > 1:
-            return _from_codes(read_png16(path), 16, path)
+            return replace(_from_codes(read_png16(path), 16, path), tags=_tags(path, kind))
+    if kind == "TIFF":
+        array = read_tiff(path, _check_size)
+        if array is not None:
+            floats = array.dtype.kind == "f"
+            image = _from_floats(array, path) if floats else _from_codes(array, 8 * array.itemsize, path)
+            return replace(image, tags=_tags(path, kind))
     try:
         with python_warnings.catch_warnings():
             python_warnings.simplefilter("ignore")
@@ -219,13 +246,26 @@ def _from_pillow(path: Path, kind: str) -> Image:
                 _check_size(picture.height, picture.width, path)
                 _refuse_deep_tiff(picture, path)
                 picture.load()
-                return _from_picture(picture, path)
+                return replace(_from_picture(picture, path), tags=tags_of(picture.info, picture.getexif()))
     except Pillow.DecompressionBombError:
         raise InputError(f"claims more than {MAX_PIXELS:,} pixels", where=path) from None
     except InputError:
         raise
     except Exception as error:  # a damaged file may make the decoder raise anything
         raise InputError(f"cannot be read as a {kind} image ({_first_line(error)})", where=path) from None
+
+
+def _tags(path: Path, kind: str) -> Tags:
+    """Tags of a file whose pixels another reader has decoded; none where they cannot be read."""
+    from PIL import Image as Pillow
+
+    try:
+        with python_warnings.catch_warnings():
+            python_warnings.simplefilter("ignore")
+            with Pillow.open(path, formats=[kind]) as picture:
+                return tags_of(picture.info, picture.getexif())
+    except Exception:  # what the library does not know may make it raise anything
+        return NO_TAGS
 
 
 def _first_line(error: BaseException) -> str:
@@ -275,11 +315,7 @@ def grey(image: Image) -> tuple[NDArray[np.float64], list[str]]:
     rgb = pixels[..., : 3 if pixels.shape[2] > 2 else 1]
     spread = float(np.max(rgb.max(axis=-1) - rgb.min(axis=-1)))
     if spread == 0.0:
-        numbers = rgb[..., 0].astype(np.float64)
-        if image.bits is not None:  # back from single precision to the exact fraction
-            largest = 2**image.bits - 1
-            numbers = np.rint(numbers * largest) / largest
-        return numbers, found
+        return _exact(rgb[..., 0], image.bits), found
     tolerance = _GREY_CODES if image.bits == 8 else 1e-4 * float(np.abs(rgb).max())
     if spread > tolerance:
         found.append(f"{image.path}: is coloured where one number per pixel is wanted; its luminance is used")

@@ -14,12 +14,26 @@ from numpy.typing import NDArray
 
 from .atomic import digest
 from .errors import InputError
+from .height_codes import Codes, code_use
 from .heightfield import HeightGrid
-from .images import SUFFIXES, grey, is_image
-from .map_names import find_maps, normal_convention
+from .images import SUFFIXES, grey, is_image, srgb_to_linear
+from .map_names import Convention, find_maps, normal_convention
 from .maps import dequantise, resample
-from .material_file import MaterialFile, plain, read_material_file
-from .material_maps import DEFAULT_COLOUR, Colour, MapLoader, Share
+from .material_checks import (
+    choose_convention,
+    coarse_step,
+    holes,
+    level_remark,
+    normal_note,
+    orientation_warning,
+    refuse_colour,
+    seam_warning,
+)
+from .material_file import MaterialFile, NormalEntry, plain, read_material_file
+from .material_maps import DEFAULT_COLOUR, Colour, MapFacts, MapLoader, Share
+from .near import near_miss
+from .normal_fit import NormalFit, fit_normals
+from .tiling import Seam, Tiling, retile, seams
 
 # Heights of integer images are shares of an unknown range: this many tile widths. Floats are tile widths.
 INTEGER_SCALE = 0.05
@@ -42,7 +56,8 @@ class Material:
     Attributes
     ----------
     height : (H, W) stored numbers: code / largest code of integer images, the number itself of float images;
-        8-bit heights are smoothed within half a code
+        heights of few levels are smoothed within half a level; halved in a mirrored tile, whose width is two
+        images
     height_scale : factor from stored numbers to tile widths unless the configuration says another
     height_bits : 8, 16, or None for floats
     basecolor : (h, w, 3) or (3,), linear Rec.709 in [0, 1]
@@ -54,6 +69,12 @@ class Material:
     files : role → file
     digests : role → SHA-256 of the file's content; ``settings`` covers everything else that changes the data
     warnings, notes : what the user should see; what the user may want to know
+    facts : role → what the map's file holds
+    codes : use that integer heights make of their codes; None for floats
+    seams : seams of the heights as they are in the file
+    normal_fit : how the normal map relates to the heights; None without a map, or where neither has slopes
+    normal_convention : how the normal map was read; None without a map
+    tile : what was done to make the maps tile
     """
 
     height: NDArray[np.float64]
@@ -72,6 +93,12 @@ class Material:
     digests: dict[str, str] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    facts: dict[str, MapFacts] = field(default_factory=dict)
+    codes: Codes | None = None
+    seams: tuple[Seam, ...] = ()
+    normal_fit: NormalFit | None = None
+    normal_convention: Convention | None = None
+    tile: Tiling = "none"
 
     @property
     def aspect(self) -> float:
@@ -102,38 +129,46 @@ class Material:
         )
 
 
-def load_material(path: str | Path) -> Material:
+def load_material(path: str | Path, tile: Tiling = "none") -> Material:
     """Load a material.
 
     Parameters
     ----------
     path : a height map; a folder of maps with customary names, or with a ``material.yaml`` in it; or a YAML
         file of that kind. A bare height map stands alone, whatever lies beside it.
+    tile : what to do so that the maps tile: nothing; ``mirror``, two by two mirrored copies, a tile of twice
+        the width; ``blend``, a cross-fade over an eighth of the tile at each edge
 
     Raises
     ------
     InputError : something is missing, unreadable, ambiguous, out of its range, or maps of different aspect
     """
-    path = Path(path)
+    spec, folder, notes = _described(Path(path))
+    material = _assemble(spec, folder, notes, tile)
+    return material if tile == "none" else retile(material, tile)
+
+
+def _described(path: Path) -> tuple[MaterialFile, Path, list[str]]:
+    """Maps and constants of a material, the folder that file names are relative to, and notes."""
     notes: list[str] = []
     if path.is_dir():
         described = next((path / name for name in _YAML if (path / name).is_file()), None)
         if described is not None:
-            return _assemble(read_material_file(described), path, notes)
+            return read_material_file(described), path, notes
         found = find_maps(path)
         spec = MaterialFile.model_validate({role: str(file.name) for role, file in found.maps.items()})
-        return _assemble(spec, path, found.notes)
+        return spec, path, found.notes
     if not path.exists():
-        raise InputError("no such file or folder", where=path)
+        raise InputError("no such file or folder", where=path, cure=near_miss(path))
     if path.suffix.lower() in (".yaml", ".yml"):
-        return _assemble(read_material_file(path), path.parent, notes)
+        return read_material_file(path), path.parent, notes
     if not is_image(path):
         raise InputError(
             f"'{path.suffix}' is no height map",
             where=path,
             cure=f"give a folder, a .yaml file, or {', '.join(SUFFIXES)}",
         )
-    return _assemble(MaterialFile.model_validate({"height": path.name}), path.parent, list(_siblings(path)))
+    return MaterialFile.model_validate({"height": path.name}), path.parent, list(_siblings(path))
 
 
 def _siblings(path: Path) -> Iterator[str]:
@@ -147,9 +182,14 @@ def _siblings(path: Path) -> Iterator[str]:
         yield f"only the heights of {path.name} are used; for {names} too, give the folder {path.parent}"
 
 
-def _assemble(spec: MaterialFile, folder: Path, notes: list[str]) -> Material:
+def _assemble(spec: MaterialFile, folder: Path, notes: list[str], tile: Tiling) -> Material:
     load = MapLoader(folder, notes)
-    height, bits, scale = _heights(spec, load)
+    height, codes, scale = _heights(spec, load)
+    rounding = 0.0 if codes is None else codes.rounding / (2 ** (load.facts["height"].bits or 8) - 1)
+    edges = seams(height, rounding)
+    warning = seam_warning(load.files["height"], edges, scale)
+    if warning is not None and tile == "none":
+        load.warnings.append(warning)
     roughness, metallic, specular = (
         load.share(role, getattr(spec, role)) for role in ("roughness", "metallic", "specular")
     )
@@ -168,23 +208,26 @@ def _assemble(spec: MaterialFile, folder: Path, notes: list[str]) -> Material:
         roughness, metallic, specular = (constants[n] if v is None else v for n, v in given.items())
         load.notes.append(f"surface: principled{', constants ' + ', '.join(filled) if filled else ''}")
     basecolor = load.colour(spec.basecolor) if spec.bsdf is None else np.full(3, DEFAULT_COLOUR)
-    normal = None
+    normal, convention, fit = None, None, None
     if spec.normal is not None:
-        convention = spec.normal.convention or normal_convention(spec.normal.file) or "gl"
-        normal = load.normals(spec.normal.file, convention)
+        normal, convention, fit = _normals(spec.normal, load, height, scale)
         load.notes.append("normal map: read, but not simulated yet")
     opacity = load.share("opacity", spec.opacity)
     if opacity is not None:
-        load.warnings.append("opacity: read, but holes are not simulated yet")
+        load.warnings.append(
+            f"opacity: read, but holes are not simulated yet ({holes(opacity):.0%} of the tile)"
+        )
     bsdf = None
     if spec.bsdf is not None:
         bsdf, load.settings["bsdf"] = _bsdf(plain(spec.bsdf), load)
+    if tile != "none":
+        load.settings["tile"] = tile
     text = json.dumps(load.settings, sort_keys=True)
     digests = {**load.digests(), "settings": hashlib.sha256(text.encode()).hexdigest()}
     return Material(
         height=height,
         height_scale=scale,
-        height_bits=bits,
+        height_bits=load.facts["height"].bits,
         basecolor=basecolor,
         roughness=roughness,
         metallic=metallic,
@@ -196,33 +239,62 @@ def _assemble(spec: MaterialFile, folder: Path, notes: list[str]) -> Material:
         digests=digests,
         warnings=tuple(load.warnings),
         notes=tuple(load.notes),
+        facts=load.facts,
+        codes=codes,
+        seams=edges,
+        normal_fit=fit,
+        normal_convention=convention,
     )
 
 
-def _heights(spec: MaterialFile, load: MapLoader) -> tuple[NDArray[np.float64], int | None, float]:
-    """Stored heights, their bits, and the factor to tile widths."""
-    image = load.image("height", spec.height.file)
+def _normals(
+    entry: NormalEntry, load: MapLoader, height: NDArray[np.float64], scale: float
+) -> tuple[NDArray[np.float32], Convention, NormalFit | None]:
+    """Unit vectors (h, w, 3), the convention they were read by, and how they fit the heights."""
+    vectors = load.normals(entry)
+    path = load.files["normal"]
+    fit = fit_normals(height, vectors)
+    convention, how, warning = choose_convention(fit, normal_convention(path.name), entry.convention, path)
+    found = (warning, None if fit is None else orientation_warning(fit, path, load.files["height"]))
+    load.warnings += [text for text in found if text is not None]
+    load.notes.append(normal_note(path, fit, convention, how, scale))
+    return load.turned_green(vectors, convention), convention, fit
+
+
+def _heights(spec: MaterialFile, load: MapLoader) -> tuple[NDArray[np.float64], Codes | None, float]:
+    """Stored heights, the use they make of their codes, and the factor to tile widths."""
+    entry = spec.height
+    image = load.image("height", entry, entry.colourspace)
+    refuse_colour(image)
     height, warnings = grey(image)
     load.warnings += warnings
-    scale = spec.height.scale
+    scale = entry.scale
     if scale is None:
         scale = FLOAT_SCALE if image.bits is None else INTEGER_SCALE
-    if image.bits == 8 and spec.height.dequantise:
-        levels = len(np.unique(np.rint(height * 255.0)))
-        load.warnings.append(f"{image.path}: heights of 8 bits, {levels} levels; smoothed within half a code")
-        height = dequantise(height, 1.0 / 255.0)
-    load.settings["height"] = [scale, image.bits == 8 and spec.height.dequantise]
+    codes, step = None, None
+    if image.bits is not None:
+        largest = 2**image.bits - 1
+        codes = code_use(np.rint(height * largest))
+        step = coarse_step(codes, image.bits)
+        if step is not None:
+            load.warnings.append(level_remark(image.path, codes, image.bits, step, entry.dequantise))
+            if entry.dequantise:
+                height = dequantise(height, step / largest)
+    load.settings["height"] = [scale, step if entry.dequantise else None]
+    if entry.colourspace == "srgb":
+        height = np.asarray(srgb_to_linear(height), np.float64)
+        load.settings["height.encoding"] = entry.colourspace
     relief = abs(scale) * float(np.ptp(height))
     kind = "floats" if image.bits is None else f"{image.bits}-bit integers"
     load.notes.append(
         f"heights: {image.path.name}, {image.shape[1]} x {image.shape[0]} {kind}, "
         f"relief {relief:.4g} tile widths at its factor {scale:g}"
     )
-    if relief > _STEEP and spec.height.scale is None:
+    if relief > _STEEP and entry.scale is None:
         load.warnings.append(
             f"{image.path}: the relief is {relief:.4g} tile widths; is another --height meant?"
         )
-    return height, image.bits, scale
+    return height, codes, scale
 
 
 def _bsdf(tree: dict[str, Any], load: MapLoader) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -235,7 +307,7 @@ def _bsdf(tree: dict[str, Any], load: MapLoader) -> tuple[dict[str, Any], dict[s
         elif key == "filename" and isinstance(value, str):
             path = (load.folder / value).resolve()
             if not path.is_file():
-                raise InputError("no such file (named in the bsdf)", where=path)
+                raise InputError("no such file (named in the bsdf)", where=path, cure=near_miss(path))
             load.files[f"bsdf.{sum(r.startswith('bsdf.') for r in load.files)}"] = path
             out[key], nameless[key] = str(path), digest(path)
         else:

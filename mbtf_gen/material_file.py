@@ -8,10 +8,13 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
+from .image_tags import ColourSpace
 from .settings import Settings, build, read_yaml
 
 Share = Annotated[float, Field(ge=0, le=1)]
 FileName = Annotated[str, Field(min_length=1)]
+Channel = Annotated[str, Field(min_length=1)]
+_CHANNEL = "channel or layer of an EXR file; R, G, B, A or Y of others; default: all that belongs together"
 
 
 def _grey(value: Any) -> Any:
@@ -30,14 +33,16 @@ def _short(data: Any) -> Any:
 class HeightEntry(Settings):
     """The height map."""
 
-    file: FileName
+    file: FileName = Field(description="the height map")
+    channel: Channel | None = Field(None, description=_CHANNEL)
     scale: float | None = Field(
         None,
         ge=-100,
         le=100,
-        description="factor on the stored heights; default 1 for floats, 0.05 for integers",
+        description="factor on the stored heights, tile widths; default 1 for floats, 0.05 for integers",
     )
-    dequantise: bool = Field(True, description="smooth 8-bit heights within half a code")
+    dequantise: bool = Field(True, description="smooth heights of few levels within half a level")
+    colourspace: ColourSpace = Field("linear", description="srgb decodes the stored numbers first")
 
     @model_validator(mode="before")
     @classmethod
@@ -46,7 +51,8 @@ class HeightEntry(Settings):
 
 
 class _FileOrValue(Settings):
-    file: FileName | None = None
+    file: FileName | None = Field(None, description="the map; either this or value")
+    channel: Channel | None = Field(None, description=_CHANNEL)
 
     @model_validator(mode="before")
     @classmethod
@@ -57,14 +63,18 @@ class _FileOrValue(Settings):
     def _one(self) -> _FileOrValue:
         if (self.file is None) == (getattr(self, "value", None) is None):
             raise ValueError("needs either 'file' or 'value'")
+        if self.file is None and (self.channel is not None or getattr(self, "invert", False)):
+            raise ValueError("'channel' and 'invert' go with 'file'")
         return self
 
 
 class ColourEntry(_FileOrValue):
     """A colour map or one colour."""
 
-    value: Annotated[tuple[Share, Share, Share], BeforeValidator(_grey)] | None = None
-    colourspace: Literal["srgb", "linear"] | None = Field(
+    value: Annotated[tuple[Share, Share, Share], BeforeValidator(_grey)] | None = Field(
+        None, description="one colour, three numbers or one"
+    )
+    colourspace: ColourSpace | None = Field(
         None, description="default: srgb for integer images, linear for float images and values"
     )
 
@@ -72,15 +82,18 @@ class ColourEntry(_FileOrValue):
 class ShareEntry(_FileOrValue):
     """A map of numbers in [0, 1] or one number."""
 
-    value: Share | None = None
+    value: Share | None = Field(None, description="one number")
+    colourspace: ColourSpace = Field("linear", description="srgb decodes the stored numbers of a map first")
+    invert: bool = Field(False, description="take 1 - x of a map, such as gloss for roughness")
 
 
 class NormalEntry(Settings):
     """A tangent-space normal map."""
 
-    file: FileName
+    file: FileName = Field(description="the normal map")
+    channel: Channel | None = Field(None, description="layer of an EXR file")
     convention: Literal["gl", "dx"] | None = Field(
-        None, description="green up (gl) or down; default: from the name"
+        None, description="green up (gl) or down (dx); default: as the heights' slopes show, else by the name"
     )
 
     @model_validator(mode="before")
@@ -92,13 +105,13 @@ class NormalEntry(Settings):
 class MaterialFile(Settings):
     """Content of a ``material.yaml``; file names are relative to its folder."""
 
-    height: HeightEntry
-    basecolor: ColourEntry | None = None
-    roughness: ShareEntry | None = None
-    metallic: ShareEntry | None = None
-    specular: ShareEntry | None = None
-    normal: NormalEntry | None = None
-    opacity: ShareEntry | None = None
+    height: HeightEntry = Field(description="heights; the only key that must be there")
+    basecolor: ColourEntry | None = Field(None, description="colour; default: linear grey 0.5")
+    roughness: ShareEntry | None = Field(None, description="0 mirror to 1; default 0.5 once one is given")
+    metallic: ShareEntry | None = Field(None, description="0 dielectric to 1 metal; default 0")
+    specular: ShareEntry | None = Field(None, description="strength of the dielectric lobe; default 0.5")
+    normal: NormalEntry | None = Field(None, description="tangent-space normal map")
+    opacity: ShareEntry | None = Field(None, description="1 opaque to 0 hole; default: opaque")
     bsdf: dict[str, Any] | None = Field(
         None, description="Mitsuba BSDF in place of the maps, passed on as it is"
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,10 @@ from numpy.typing import NDArray
 
 from .atomic import digest
 from .errors import InputError
+from .image_tags import ColourSpace
 from .images import Image, count_and_first, grey, read_image, srgb_to_linear
-from .material_file import ColourEntry, ShareEntry
+from .map_names import Convention, role_of
+from .material_file import ColourEntry, HeightEntry, NormalEntry, ShareEntry
 
 Colour = NDArray[np.floating[Any]]
 Share = NDArray[np.float64] | float | None
@@ -19,6 +22,36 @@ Share = NDArray[np.float64] | float | None
 # Linear grey where no base colour is given.
 DEFAULT_COLOUR = 0.5
 _ROUNDING = 1e-6
+# Float normals this far below 0 are signed, not (n+1)/2.
+_SIGNED = -0.05
+# A smaller share of normals that point into the surface is not worth a word.
+_STRAY = 1e-4
+_FileEntry = HeightEntry | ColourEntry | ShareEntry | NormalEntry
+
+
+@dataclass(frozen=True)
+class MapFacts:
+    """What a map's file holds.
+
+    Attributes
+    ----------
+    rows, columns : size of the image
+    bits : 8 or 16 for integers, None for floats
+    channels : number of channels taken
+    names : their names, where there was a choice
+    low, high : smallest and largest stored number of these channels, alpha left out
+    colourspace : what the numbers were read as
+    """
+
+    file: Path
+    rows: int
+    columns: int
+    bits: int | None
+    channels: int
+    names: tuple[str, ...]
+    low: float
+    high: float
+    colourspace: ColourSpace = "linear"
 
 
 class MapLoader:
@@ -26,7 +59,7 @@ class MapLoader:
 
     Attributes
     ----------
-    files : role → file, of everything read
+    files, facts : role → file, and what it holds, of everything read
     settings : role → options and constants that change the data, for the digest
     warnings, notes : remarks for the user
     """
@@ -34,27 +67,57 @@ class MapLoader:
     def __init__(self, folder: Path, notes: list[str]) -> None:
         self.folder = folder
         self.files: dict[str, Path] = {}
-        self.shapes: dict[str, tuple[int, int]] = {}
+        self.facts: dict[str, MapFacts] = {}
         self.warnings: list[str] = []
         self.notes = notes
         self.settings: dict[str, Any] = {}
 
-    def image(self, role: str, name: str) -> Image:
+    def image(self, role: str, entry: _FileEntry, space: ColourSpace = "linear") -> Image:
         """Read the file of a role; its aspect must be that of the heights, unless it is a single pixel."""
-        path = self.folder / name
-        image = read_image(path)
+        path = self.folder / str(entry.file)
+        image = read_image(path, entry.channel, lambda label: role_of(label) == role)
+        rows, columns = image.shape
+        used = image.pixels[..., :-1] if image.pixels.shape[2] in (2, 4) else image.pixels
         self.files[role] = path
-        self.shapes[role] = image.shape
+        self.facts[role] = MapFacts(
+            path,
+            rows,
+            columns,
+            image.bits,
+            image.pixels.shape[2],
+            image.channels,
+            float(used.min()),
+            float(used.max()),
+            space,
+        )
+        if entry.channel is not None:
+            self.settings[f"{role}.channel"] = entry.channel
+        elif image.channels:
+            self.notes.append(f"{role}: channels {', '.join(image.channels)} of {path.name}")
+        if image.tags.orientation != 1:
+            self.warnings.append(
+                f"{path}: its EXIF orientation ({image.tags.orientation}) is ignored, as for every map; "
+                "save it upright if it looks turned"
+            )
         if role != "height" and image.shape != (1, 1):
-            (h, w), (rows, columns) = self.shapes["height"], image.shape
-            # Half a pixel of rounding in either size is no difference of aspect.
-            if abs(h * columns - rows * w) > 0.5 * max(w, columns):
-                raise InputError(
-                    f"is {columns} x {rows} pixels, the height map {self.files['height'].name} {w} x {h}: "
-                    "maps of one tile need one aspect",
-                    where=path,
-                )
+            self._check_aspect(path, rows, columns)
         return image
+
+    def _check_aspect(self, path: Path, rows: int, columns: int) -> None:
+        height = self.facts["height"]
+        h, w = height.rows, height.columns
+
+        def differ(a: int, b: int) -> bool:
+            # Half a pixel of rounding in either size is no difference of aspect.
+            return abs(h * b - a * w) > 0.5 * max(w, b)
+
+        if differ(rows, columns):
+            raise InputError(
+                f"is {columns} x {rows} pixels, the height map {height.file.name} {w} x {h}: "
+                "maps of one tile need one aspect",
+                where=path,
+                cure="" if differ(columns, rows) else "one of the two seems to be turned by 90 degrees",
+            )
 
     def share(self, role: str, entry: ShareEntry | None) -> Share:
         """(h, w) numbers in [0, 1], one number, or None."""
@@ -63,9 +126,15 @@ class MapLoader:
         if entry.file is None:
             self.settings[role] = entry.value
             return entry.value
-        numbers, warnings = grey(self.image(role, entry.file))
+        numbers, warnings = grey(self.image(role, entry, entry.colourspace))
         self.warnings += warnings
         numbers = self._within(role, numbers, (numbers < -_ROUNDING) | (numbers > 1 + _ROUNDING))
+        if entry.colourspace == "srgb":
+            numbers = np.asarray(srgb_to_linear(numbers), np.float64)
+        if entry.invert:
+            numbers = 1.0 - numbers
+        if entry.colourspace == "srgb" or entry.invert:
+            self.settings[f"{role}.encoding"] = [entry.colourspace, entry.invert]
         return float(numbers[0, 0]) if numbers.shape == (1, 1) else numbers
 
     def colour(self, entry: ColourEntry | None) -> Colour:
@@ -78,33 +147,54 @@ class MapLoader:
             value = np.asarray(srgb_to_linear(value) if entry.colourspace == "srgb" else value)
             self.settings["basecolor"] = value.tolist()
             return value
-        image = self.image("basecolor", entry.file)
+        image = self.image("basecolor", entry)
         pixels = image.pixels
         if pixels.shape[2] in (2, 4) and np.any(pixels[..., -1] != 1.0):
             self.warnings.append(f"{image.path}: the alpha channel of the base colour is not used")
         rgb = pixels[..., :3] if pixels.shape[2] > 2 else np.repeat(pixels[..., :1], 3, axis=2)
         rgb = self._within("basecolor", rgb, np.any((rgb < -_ROUNDING) | (rgb > 1 + _ROUNDING), axis=-1))
-        space = entry.colourspace or ("linear" if image.bits is None else "srgb")
-        self.notes.append(f"base colour: {image.path.name} read as {'sRGB' if space == 'srgb' else 'linear'}")
+        space = self._colour_space(image, entry)
+        self.facts["basecolor"] = replace(self.facts["basecolor"], colourspace=space)
         self.settings["basecolor"] = space
         linear = (srgb_to_linear(rgb) if space == "srgb" else rgb).astype(np.float32)
         return linear[0, 0] if image.shape == (1, 1) else linear
 
-    def normals(self, name: str, convention: str) -> NDArray[np.float32]:
-        """(h, w, 3) unit vectors n with y along v, from pixels (n+1)/2."""
-        image = self.image("normal", name)
+    def _colour_space(self, image: Image, entry: ColourEntry) -> ColourSpace:
+        """What is asked for, else linear if the file says so, else sRGB for integers, linear for floats."""
+        space: ColourSpace = "linear" if image.bits is None else "srgb"
+        why = "the default for " + ("floats" if image.bits is None else "integers")
+        if entry.colourspace is not None:
+            space, why = entry.colourspace, "as asked for"
+        elif image.tags.space == "linear":
+            space, why = "linear", "its gAMA chunk says so"
+        elif image.tags.foreign is not None:
+            self.warnings.append(
+                f"{image.path}: its {image.tags.foreign} is not applied, it is read as "
+                f"{'sRGB' if space == 'srgb' else 'linear'}; convert it to sRGB"
+            )
+        shown = "sRGB" if space == "srgb" else "linear"
+        self.notes.append(f"base colour: {image.path.name} read as {shown} ({why})")
+        return space
+
+    def normals(self, entry: NormalEntry) -> NDArray[np.float32]:
+        """(h, w, 3) unit vectors read as OpenGL, y along v: 2·pixel - 1, or signed floats as they are."""
+        image = self.image("normal", entry)
         if image.pixels.shape[2] < 3:
             raise InputError("is grey; a normal map has three channels", where=image.path)
-        vectors = 2.0 * image.pixels[..., :3].astype(np.float32) - 1.0
-        if convention == "dx":
-            vectors[..., 1] *= -1.0
+        stored = image.pixels[..., :3].astype(np.float32)
+        signed = image.bits is None and float(stored[..., :2].min()) < _SIGNED
+        vectors = stored if signed else 2.0 * stored - 1.0
         length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-        below = int((vectors[..., 2] <= 0).sum())
-        if below:
-            self.warnings.append(f"{image.path}: {below} normals point into the surface")
+        below = float(np.mean(vectors[..., 2] <= 0))
+        if below > _STRAY:
+            self.warnings.append(f"{image.path}: {below:.2%} of its normals point into the surface")
         up = np.array([0.0, 0.0, 1.0], np.float32)
-        self.settings["normal"] = convention
         return np.where(length > 1e-6, vectors / np.maximum(length, 1e-6), up).astype(np.float32)
+
+    def turned_green(self, vectors: NDArray[np.float32], convention: Convention) -> NDArray[np.float32]:
+        """The vectors that :meth:`normals` read, by the map's convention."""
+        self.settings["normal"] = convention
+        return vectors * np.array([1.0, 1.0 if convention == "gl" else -1.0, 1.0], np.float32)
 
     def _within(self, role: str, numbers: Any, bad: Any) -> Any:
         if bad.any():

@@ -111,8 +111,8 @@ class EnergyTables:
     F = F0 (1 - s) + F90 s is ``F0 (1 - L - B) + F90 B``.
 
     All of L happens at μ ~ α, and it falls to 1e-8 away from there; the tables hold the smooth quotients
-    ``L (α² + μ²)/α²`` and ``B/(1-L) - s(μ)``, bilinear in ``√(log(1 + μ/α)/log(1 + 1/α))`` and in √roughness, so
-    that both are exact where they are small. A mirror loses nothing.
+    ``L (α² + μ²)/α²`` and ``B/(1-L) - s(μ)``, bilinear in ``√(log(1 + μ/α)/log(1 + 1/α))`` and in √roughness.
+    So both are exact where they are small. A mirror loses nothing.
     """
 
     def __init__(self) -> None:

@@ -1,6 +1,6 @@
 """Sixteen-bit colour PNG without loss (the common image library keeps only the upper eight bits).
 
-Follows the PNG specification (third edition, W3C 2025): chunks, filters of method 0, no interlace.
+Follows the PNG specification (third edition, W3C 2025): chunks, filters of method 0, Adam7 interlace.
 """
 
 from __future__ import annotations
@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from .errors import InputError
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
+# First row and column, and their steps, of the passes of Adam7.
+_PASSES = ((0, 0, 8, 8), (0, 4, 8, 8), (4, 0, 8, 4), (0, 2, 4, 4), (2, 0, 4, 2), (0, 1, 2, 2), (1, 0, 2, 1))
 _CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 
 
@@ -47,31 +49,36 @@ def read_png16(path: Path) -> NDArray[np.uint16]:
 
     Raises
     ------
-    InputError : damaged, cut short, or interlaced
+    InputError : damaged or cut short
     """
     data = path.read_bytes()
     head = header(data)
     if head is None or head[2] != 16 or not head[3]:
         raise InputError("is not a 16-bit PNG image", where=path)
     columns, rows, _, channels, interlace = head
-    if interlace:
-        raise InputError(
-            "interlaced 16-bit PNG is not supported", where=path, cure="save it without interlace"
-        )
-    stride = columns * channels * 2
+    passes = _PASSES if interlace else ((0, 0, 1, 1),)
+    sizes = [(-(-(rows - y) // dy), -(-(columns - x) // dx)) for y, x, dy, dx in passes]
+    size = 2 * channels
+    length = sum(h * (w * size + 1) for h, w in sizes if h > 0 and w > 0)
     try:
         stream = zlib.decompressobj()
         packed = b"".join(content for kind, content in _chunks(data) if kind == b"IDAT")
-        raw = stream.decompress(packed, rows * (stride + 1))
+        raw = stream.decompress(packed, length)
     except (ValueError, zlib.error) as error:
         raise InputError(f"cannot be read as a PNG image ({error})", where=path) from None
-    if len(raw) != rows * (stride + 1):
+    if len(raw) != length:
         raise InputError("cannot be read as a PNG image (file ends early)", where=path)
-    lines = np.frombuffer(raw, np.uint8).reshape(rows, stride + 1)
-    if lines[:, 0].max(initial=0) > 4:
-        raise InputError("cannot be read as a PNG image (unknown filter)", where=path)
-    pixels = _unfilter(lines[:, 0], lines[:, 1:].reshape(rows, columns, channels * 2))
-    return pixels.reshape(rows, columns, channels, 2).view(">u2")[..., 0].astype(np.uint16)
+    out, at = np.empty((rows, columns, channels), np.uint16), 0
+    for (y, x, dy, dx), (h, w) in zip(passes, sizes, strict=True):
+        if h <= 0 or w <= 0:
+            continue
+        lines = np.frombuffer(raw, np.uint8, h * (w * size + 1), at).reshape(h, w * size + 1)
+        at += lines.size
+        if lines[:, 0].max() > 4:
+            raise InputError("cannot be read as a PNG image (unknown filter)", where=path)
+        pixels = _unfilter(lines[:, 0], lines[:, 1:].reshape(h, w, size))
+        out[y::dy, x::dx] = pixels.reshape(h, w, channels, 2).view(">u2")[..., 0]
+    return out
 
 
 def _unfilter(kinds: NDArray[np.uint8], filtered: NDArray[np.uint8]) -> NDArray[np.uint8]:

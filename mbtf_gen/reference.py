@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .atomic import write_file
 from .camera import PIXEL_SIGMA, Camera, PixelKind
 from .queries import Queries
 from .shard_files import write_exr
@@ -46,8 +47,8 @@ class ReferenceImage:
         """Mean of the halves, (rows, columns, 3)."""
         return 0.5 * (self.value_a + self.value_b)
 
-    def write(self, path: Path, exposure: float | None = None) -> None:
-        """Write ``path`` + ``.exr`` (all channels) and + ``.png`` (sRGB)."""
+    def write(self, path: Path, exposure: float | None = None) -> tuple[Path, Path]:
+        """Write ``path`` + ``.exr`` (all channels) and + ``.png`` (sRGB), each atomically; returns both."""
         lead = (1, *self.queries.lead)
         arrays = {
             "u": self.queries.u.reshape(*lead, 2),
@@ -58,10 +59,17 @@ class ReferenceImage:
             "value_b": self.value_b.reshape(*lead, 3),
             "spp": np.full(lead, self.spp, np.float32),
         }
-        write_exr(path.with_name(f"{path.name}.exr"), arrays)
-        from PIL import Image
+        exr, png = (path.with_name(f"{path.name}{suffix}") for suffix in (".exr", ".png"))
+        write_exr(exr, arrays)
+        write_png(png, to_display(self.value, exposure))
+        return exr, png
 
-        Image.fromarray(to_display(self.value, exposure)).save(path.with_name(f"{path.name}.png"))
+
+def write_png(path: Path, pixels: NDArray[np.uint8]) -> None:
+    """Write an 8-bit picture (rows, columns, 3), atomically."""
+    from PIL import Image
+
+    write_file(path, lambda stream: Image.fromarray(pixels).save(stream, format="PNG"))
 
 
 def auto_exposure(value: NDArray[np.float32]) -> float:

@@ -17,6 +17,8 @@ CONFIG_NAME = "config.yaml"
 
 Layout = Literal["shuffled", "image"]
 ArrayFormat = Literal["npz", "exr"]
+# What is done to maps that do not tile.
+Tiling = Literal["none", "mirror", "blend"]
 Split = Literal["train", "test"]
 SPLITS: tuple[Split, ...] = ("train", "test")
 

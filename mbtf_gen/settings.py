@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import difflib
 import io
-import types
-import typing
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence, Set
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, Union
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from .errors import InputError, MbtfError, UsageError
+from .wording import explain, models_in
 
 
 class Settings(BaseModel):
@@ -28,6 +28,11 @@ class Settings(BaseModel):
 S = TypeVar("S", bound=BaseModel)
 
 _COMMAND_LINE = "command line"
+
+# A configuration that is longer, deeper or (through YAML's aliases) larger than this is no configuration.
+_MAX_CHARACTERS = 1 << 18
+_MAX_DEPTH = 100
+_MAX_VALUES = 100_000
 
 
 def _yaml() -> Any:
@@ -46,11 +51,17 @@ def read_yaml(path: Path) -> Any:
     from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
         raise InputError("no such file", where=path) from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot be read as text ({error})", where=path) from None
+    except UnicodeDecodeError as error:
+        raise InputError(f"is not UTF-8 text (byte {error.start})", where=path) from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot be read ({getattr(error, 'strerror', error)})", where=path) from None
+    if len(text) > _MAX_CHARACTERS:
+        raise InputError(f"is too long: more than {_MAX_CHARACTERS:,} characters", where=path)
+    if _bracket_depth(text) > _MAX_DEPTH:
+        raise InputError(_too_deep(), where=path)
     try:
         data = _yaml().load(text)
     except MarkedYAMLError as error:
@@ -59,11 +70,67 @@ def read_yaml(path: Path) -> Any:
         raise InputError(f"not valid YAML ({error.problem})", where=f"{path}{line}") from None
     except YAMLError as error:
         raise InputError(f"not valid YAML ({str(error).splitlines()[0]})", where=path) from None
+    except RecursionError:
+        raise InputError(_too_deep(), where=path) from None
+    except Exception as error:  # the reader turns scalars into numbers and dates, and may raise anything
+        raise InputError(f"not valid YAML ({_first_line(error)})", where=path) from None
     if data is None:
         return {}
     if not isinstance(data, Mapping):
         raise InputError("must hold a mapping of keys to values", where=path)
+    _check_tree(data, path)
     return data
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error) or type(error).__name__).splitlines()[0][:200]
+
+
+def _too_deep() -> str:
+    return f"is nested more than {_MAX_DEPTH} levels deep"
+
+
+def _bracket_depth(text: str) -> int:
+    """How deep brackets are nested: the reader's time grows with the square of it."""
+    depth = deepest = 0
+    for bracket in re.finditer(r"[\[\]{}]", text):
+        depth += 1 if bracket[0] in "[{" else -1
+        deepest = max(deepest, depth)
+    return deepest
+
+
+def _check_tree(data: Any, where: object) -> None:
+    """Refuse what a few lines of YAML can hold but no configuration does.
+
+    Raises
+    ------
+    InputError : nested too deeply, repeated through aliases (or holding itself), keys that are no text, or
+        tags of some program's own
+    """
+    waiting: list[tuple[Any, int]] = [(data, 1)]
+    seen = 0
+    while waiting:
+        value, depth = waiting.pop()
+        seen += 1
+        if depth > _MAX_DEPTH or seen > _MAX_VALUES:
+            what = _too_deep() if depth > _MAX_DEPTH else f"holds more than {_MAX_VALUES:,} values"
+            raise InputError(what, where=where, cure="aliases (*name) count as what they stand for")
+        tag = getattr(getattr(value, "tag", None), "value", None)
+        if tag is not None and not str(tag).startswith("tag:yaml.org"):
+            raise InputError(f"holds the tag '{tag}'", where=where, cure="plain values are wanted")
+        if isinstance(value, Mapping):
+            for key, inner in value.items():
+                if not isinstance(key, str):
+                    raise InputError(f"key {_shown(key)} is not text", where=where, cure="put it in quotes")
+                waiting.append((inner, depth + 1))
+        elif isinstance(value, Sequence | Set) and not isinstance(value, str | bytes):
+            waiting += ((inner, depth + 1) for inner in value)
+
+
+def _shown(value: Any) -> str:
+    """A value as it was given, shortened to a part of a line."""
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def dump_yaml(data: Mapping[str, Any]) -> str:
@@ -78,18 +145,6 @@ def dump_yaml(data: Mapping[str, Any]) -> str:
     return stream.getvalue()
 
 
-def _model_in(annotation: Any) -> list[type[BaseModel]]:
-    """The models that a field's annotation may hold: through Optional, unions, lists and dicts."""
-    origin = typing.get_origin(annotation)
-    if origin is Annotated:
-        return _model_in(typing.get_args(annotation)[0])
-    if origin in (Union, types.UnionType, list, tuple, dict):
-        return [m for a in typing.get_args(annotation) for m in _model_in(a)]
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return [annotation]
-    return []
-
-
 def _known_keys(model: type[BaseModel], location: Sequence[str | int]) -> list[str]:
     """Valid keys of the section that `location` lies in (the last part is the offending key)."""
     models = [model]
@@ -97,7 +152,7 @@ def _known_keys(model: type[BaseModel], location: Sequence[str | int]) -> list[s
         if isinstance(part, int):
             continue
         fields = [m.model_fields[part] for m in models if part in m.model_fields]
-        deeper = [m for f in fields for m in _model_in(f.annotation)]
+        deeper = [m for f in fields for m in models_in(f.annotation)]
         models = deeper or models
     return sorted({key for m in models for key in m.model_fields})
 
@@ -117,7 +172,9 @@ def line_of(data: Any, location: Sequence[str | int]) -> int | None:
     return line
 
 
-def _explain(error: ValidationError, model: type[BaseModel], data: Any, source: str) -> tuple[str, str, str]:
+def _explain(
+    error: ValidationError, model: type[BaseModel], data: Any, source: str, spelled: Mapping[str, str]
+) -> tuple[str, str, str]:
     """(where, what, cure) of one fault: an unknown key before others, since it may explain a missing one."""
     faults = error.errors()
     fault = next((f for f in faults if f["type"] == "extra_forbidden"), faults[0])
@@ -125,7 +182,8 @@ def _explain(error: ValidationError, model: type[BaseModel], data: Any, source: 
     dotted = ".".join(str(p) for p in location) or "(top level)"
     # Data that the command line has changed may still carry the file's line numbers.
     line = None if source == _COMMAND_LINE else line_of(data, location)
-    where = f"{source}:{line}" if line is not None else source
+    flag = next((f for key, f in spelled.items() if f"{dotted}.".startswith(f"{key}.")), None)
+    where = flag or (f"{source}:{line}" if line is not None else source)
     if fault["type"] == "extra_forbidden":
         known = _known_keys(model, location)
         near = difflib.get_close_matches(str(location[-1]), known, n=1, cutoff=0.5)
@@ -135,18 +193,25 @@ def _explain(error: ValidationError, model: type[BaseModel], data: Any, source: 
     if fault["type"] == "missing":
         return where, f"key '{dotted}' is missing", "add it"
     given = fault.get("input")
-    message = fault["msg"].removeprefix("Value error, ").removeprefix("Assertion failed, ")
-    shown = "" if isinstance(given, Mapping | BaseModel) else f" (given {given!r})"
-    return where, f"'{dotted}': {message}{shown}", ""
+    shown = "" if isinstance(given, Mapping | BaseModel) else f" (given {_shown(given)})"
+    return where, f"'{dotted}': {explain(fault, model)}{shown}", ""
 
 
-def build(model: type[S], data: Mapping[str, Any], *, source: str, error: type[MbtfError] = InputError) -> S:
+def build(
+    model: type[S],
+    data: Mapping[str, Any],
+    *,
+    source: str,
+    error: type[MbtfError] = InputError,
+    spelled: Mapping[str, str] | None = None,
+) -> S:
     """Check `data` against `model`.
 
     Parameters
     ----------
     source : where the data come from, for messages: a file, "command line"
     error : class of the error to raise
+    spelled : dotted key → the flag that gave it, named in place of `source`
 
     Raises
     ------
@@ -155,19 +220,33 @@ def build(model: type[S], data: Mapping[str, Any], *, source: str, error: type[M
     try:
         return model.model_validate(data)
     except ValidationError as fault:
-        where, what, cure = _explain(fault, model, data, source)
+        where, what, cure = _explain(fault, model, data, source, spelled or {})
         raise error(what, where=where, cure=cure) from None
+
+
+def check_document(model: type[BaseModel], data: Mapping[str, Any], path: Path, cure: str) -> None:
+    """Refuse a JSON document of ours whose content is not what `model` says: somebody else changed it.
+
+    Raises
+    ------
+    InputError : with the first key that is missing or holds something else
+    """
+    try:
+        build(model, data, source=str(path))
+    except InputError as error:
+        raise InputError(f"is damaged ({error.what})", where=path, cure=cure) from None
 
 
 def _parse_value(text: str) -> Any:
     """A ``--set`` value, read as YAML reads a scalar."""
     from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
 
     try:
-        return YAML(typ="safe", pure=True).load(text)
-    except YAMLError:
+        value = YAML(typ="safe", pure=True).load(text)
+    except Exception:  # what is no YAML stands for itself; the reader may raise anything
         return text
+    _check_tree(value, "--set")
+    return value
 
 
 def merge(base: Any, path: Sequence[str], value: Any) -> None:
@@ -185,12 +264,14 @@ def resolve(
     file: Path | None = None,
     assignments: Sequence[str] = (),
     flags: Mapping[str, Any] | None = None,
+    spelled: Mapping[str, str] | None = None,
 ) -> S:
     """Resolved configuration: defaults, then the file, then ``a.b=c`` assignments, then flags.
 
     Parameters
     ----------
     flags : dotted key → value; None values are flags that were not given
+    spelled : dotted key → its flag, for messages
 
     Raises
     ------
@@ -215,16 +296,38 @@ def resolve(
             return resolved
     for key, value in given:
         merge(data, key.split("."), value)
-    return build(model, data, source=_COMMAND_LINE, error=UsageError)
+    names = {key: flag for key, flag in (spelled or {}).items() if (flags or {}).get(key) is not None}
+    return build(model, data, source=_COMMAND_LINE, error=UsageError, spelled=names)
 
 
 def differences(old: Mapping[str, Any], new: Mapping[str, Any], prefix: str = "") -> list[str]:
-    """Fields in which two nested mappings differ, as ``key: old -> new``."""
-    out: list[str] = []
+    """Fields in which two nested mappings differ, as ``key: old -> new``; settings before digests of files.
+
+    Digests are shortened to their first eight digits.
+    """
+    changed = list(_changed(old, new, prefix))
+    changed.sort(key=lambda change: any(_is_digest(value) for value in change[1:]))
+    return [f"{key}: {_brief(before)} -> {_brief(after)}" for key, before, after in changed]
+
+
+def in_short(changes: Sequence[str], most: int = 6) -> str:
+    """The first of :func:`differences` on one line, with a count of the others."""
+    more = len(changes) - most
+    return "; ".join([*changes[:most], *([f"and {more} more"] if more > 0 else [])])
+
+
+def _changed(old: Mapping[str, Any], new: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any, Any]]:
     for key in sorted({*old, *new}):
         a, b = old.get(key), new.get(key)
         if isinstance(a, Mapping) and isinstance(b, Mapping):
-            out += differences(a, b, f"{prefix}{key}.")
+            yield from _changed(a, b, f"{prefix}{key}.")
         elif a != b:
-            out.append(f"{prefix}{key}: {a} -> {b}")
-    return out
+            yield f"{prefix}{key}", a, b
+
+
+def _is_digest(value: Any) -> bool:
+    return isinstance(value, str) and re.fullmatch(r"[0-9a-f]{64}", value) is not None
+
+
+def _brief(value: Any) -> str:
+    return f"{value[:8]}…" if _is_digest(value) else str(value)

@@ -6,6 +6,7 @@ A shard is a mapping of array name to array; all arrays share their leading axes
 
 from __future__ import annotations
 
+import math
 import zipfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -39,16 +40,28 @@ def check_arrays(arrays: Mapping[str, NDArray[np.float32]], where: object) -> tu
     missing = [a.name for a in ARRAYS if not a.optional and a.name not in arrays]
     if missing:
         raise InputError(f"shard lacks the array(s) {', '.join(missing)}", where=where)
+    return _common_lead(arrays, where)
+
+
+def _common_lead(arrays: Mapping[str, NDArray[np.float32]], where: object) -> tuple[int, ...]:
+    """Leading axes shared by arrays of a shard, not necessarily all of them.
+
+    Raises
+    ------
+    InputError : an array is unknown or of the wrong shape
+    """
     lead: tuple[int, ...] | None = None
     for name, array in arrays.items():
         if name not in ARRAY:
             raise InputError(f"shard holds an unknown array '{name}'", where=where)
         trailing = ARRAY[name].trailing
         shape = array.shape[: array.ndim - len(trailing)]
-        if array.shape[len(shape) :] != trailing or lead not in (None, shape):
+        fits = array.shape[len(shape) :] == trailing and len(shape) in (1, 3)
+        if not fits or lead not in (None, shape):
             raise InputError(f"array '{name}' has the shape {array.shape}", where=where)
         lead = shape
-    assert lead is not None
+    if lead is None:
+        raise InputError("shard holds no arrays", where=where)
     return lead
 
 
@@ -89,6 +102,7 @@ def read_npz(path: Path, names: Iterable[str] | None = None, *, mapped: bool = T
         with zipfile.ZipFile(path) as archive, path.open("rb") as stream:
             members = {i.filename.removesuffix(".npy"): i for i in archive.infolist()}
             wanted = list(members) if names is None else list(names)
+            size = path.stat().st_size
             for name in wanted:
                 if name not in members:
                     raise InputError(f"shard lacks the array '{name}'", where=path)
@@ -99,16 +113,19 @@ def read_npz(path: Path, names: Iterable[str] | None = None, *, mapped: bool = T
                 lengths = stream.read(4)
                 skip = int.from_bytes(lengths[:2], "little") + int.from_bytes(lengths[2:], "little")
                 stream.seek(info.header_offset + 30 + skip)
-                version = npy_format.read_magic(stream)
-                reader = {(1, 0): npy_format.read_array_header_1_0, (2, 0): npy_format.read_array_header_2_0}
-                shape, fortran, dtype = reader[version](stream)
+                start = stream.tell()
+                shape, fortran, dtype = _npy_header(stream)
                 if fortran or dtype != np.dtype("<f4"):
                     raise InputError(f"array '{name}' is not C-ordered float32", where=path)
+                count = math.prod(shape)
+                end = stream.tell() + count * dtype.itemsize
+                if count < 0 or end - start != info.file_size or end > size:
+                    raise InputError(f"array '{name}' is not as long as its header says", where=path)
                 array: NDArray[np.float32]
                 if mapped and 0 not in shape:
                     array = np.memmap(path, dtype, mode="r", offset=stream.tell(), shape=shape)
                 else:
-                    array = np.fromfile(stream, dtype, int(np.prod(shape))).reshape(shape)
+                    array = np.fromfile(stream, dtype, count).reshape(shape)
                 out[name] = array
     except FileNotFoundError:
         raise InputError("no such shard", where=path) from None
@@ -117,6 +134,15 @@ def read_npz(path: Path, names: Iterable[str] | None = None, *, mapped: bool = T
     except Exception as error:  # a damaged archive or header may make its parser raise anything
         raise InputError(f"shard cannot be read ({str(error).partition(chr(10))[0]})", where=path) from None
     return out
+
+
+def _npy_header(stream: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    version = npy_format.read_magic(stream)
+    if version == (1, 0):
+        return npy_format.read_array_header_1_0(stream)
+    if version == (2, 0):
+        return npy_format.read_array_header_2_0(stream)
+    raise ValueError(f"npy format {version[0]}.{version[1]}")
 
 
 def _fold(array: NDArray[np.float32], lead: tuple[int, ...]) -> NDArray[np.float32]:
@@ -164,7 +190,8 @@ def read_exr(path: Path, names: Iterable[str] | None = None) -> Arrays:
 
     if not path.exists():
         raise InputError("no such shard", where=path)
-    header, stored = read_file(path, _MAX_PIXELS)
+    # Shards are stored uncompressed: one that claims more pixels than it has bytes is damaged.
+    header, stored = read_file(path, min(_MAX_PIXELS, path.stat().st_size))
     if "mbtf.lead" not in header:
         raise InputError("EXR image is not a shard (no 'mbtf.lead' in its header)", where=path)
     out: Arrays = {}
@@ -177,7 +204,7 @@ def read_exr(path: Path, names: Iterable[str] | None = None) -> Arrays:
                 if spec.optional and names is None:
                     continue
                 raise InputError(f"shard lacks the array '{spec.name}'", where=path)
-            count = int(np.prod(lead))
+            count = math.prod(lead)
             flat = np.stack([stored[c].reshape(-1)[:count] for c in spec.channels], axis=-1)
             out[spec.name] = np.ascontiguousarray(flat.reshape(*lead, *spec.trailing), np.float32)
     except (ValueError, AttributeError):
@@ -196,5 +223,13 @@ def write_shard(path: Path, arrays: Mapping[str, NDArray[np.float32]]) -> None:
 
 
 def read_shard(path: Path, names: Iterable[str] | None = None, *, mapped: bool = True) -> Arrays:
-    """Read a shard of either format; npz shards are memory-mapped by default."""
-    return read_exr(path, names) if path.suffix == ".exr" else read_npz(path, names, mapped=mapped)
+    """Read a shard of either format; npz shards are memory-mapped by default.
+
+    Raises
+    ------
+    InputError : missing, damaged, or arrays of shapes that do not fit together
+    """
+    arrays = read_exr(path, names) if path.suffix == ".exr" else read_npz(path, names, mapped=mapped)
+    if arrays:
+        _common_lead(arrays, path)
+    return arrays

@@ -11,16 +11,27 @@ import numpy as np
 from .atomic import digest, read_json
 from .dataset import Dataset
 from .errors import InputError, MbtfError
-from .schema import FORMAT_NAME
+from .schema import FORMAT_NAME, MANIFEST_NAME
 from .shard_files import check_arrays, read_shard
+
+# What is said of a shard that is not there yet; an interrupted run leaves many of them.
+_ABSENT = ("is missing", "is unfinished (no sidecar)")
+_MAKE = "run the same mbtf-gen command again: it makes what is missing"
+_REMAKE = "remove it and run the same mbtf-gen command again"
 
 
 @dataclass(frozen=True)
 class Fault:
-    """One thing that is wrong: the file and what it is."""
+    """One thing that is wrong: the file, what it is, and what to do about it."""
 
     file: str
     what: str
+    cure: str
+
+    @property
+    def absent(self) -> bool:
+        """Whether the file is only not there yet."""
+        return self.what in _ABSENT
 
 
 def sidecar_of(shard: Path) -> Path:
@@ -38,9 +49,9 @@ def shard_fault(path: Path, rows: int, config_hash: str, *, digests: bool = True
     """
     sidecar = sidecar_of(path)
     if not path.exists():
-        return "is missing"
+        return _ABSENT[0]
     if not sidecar.exists():
-        return "is unfinished (no sidecar)"
+        return _ABSENT[1]
     try:
         record: dict[str, Any] = read_json(sidecar)
         if record.get("format") != FORMAT_NAME or record.get("config_hash") != config_hash:
@@ -82,19 +93,23 @@ def verify(folder: Path) -> list[Fault]:
         for entry in dataset.manifest["splits"][split]["shards"]:
             path = folder / entry["file"]
             if path.name in listed:
-                faults.append(Fault(path.name, "is listed twice"))
+                faults.append(Fault(path.name, "is listed twice", "generate the data set again"))
             listed.update({path.name, sidecar_of(path).name})
-            fault = shard_fault(path, entry["rows"], dataset.manifest["config_hash"])
+            wanted = entry["rows"], dataset.manifest["config_hash"]
+            fault = shard_fault(path, *wanted)
             if fault is None:
                 twin = digests.setdefault(read_json(sidecar_of(path))["sha256"], path.name)
                 fault = f"has the same content as {twin}" if twin != path.name else None
             if fault is not None:
-                faults.append(Fault(path.name, fault))
+                # What passes for finished is not made again by itself.
+                cure = _REMAKE if is_finished(path, *wanted) else _MAKE
+                faults.append(Fault(path.name, fault, cure))
     for path in sorted(folder.iterdir()):
         if path.suffix in (".npz", ".exr") and path.name not in listed:
-            faults.append(Fault(path.name, "is not listed in the manifest"))
+            faults.append(Fault(path.name, "is not listed in the manifest", "remove it"))
     if not faults and not dataset.manifest.get("complete"):
-        faults.append(Fault("manifest.json", "is not complete; run the same mbtf-gen command again"))
+        cure = "run the same mbtf-gen command again, or mbtf-gen merge"
+        faults.append(Fault(MANIFEST_NAME, "is not complete", cure))
     return faults
 
 

@@ -20,27 +20,27 @@ PICTURES = "pictures"
 
 @dataclass(frozen=True)
 class Scene:
-    """One view under one light at one zoom.
+    """One view under one light at one span.
 
     Attributes
     ----------
     index : number of the scene in the comparison
-    name : ``v1-l2-z3``: numbers of view, light and zoom, from 1
-    zoom : width of the field of view at the target, in tile widths
+    name : ``v1-l2-s3``: numbers of view, light and span, from 1
+    span : width of the field of view at the target, in tile widths
     """
 
     index: int
     name: str
     view: View
     light: Direction
-    zoom: float
+    span: float
 
     def camera(self, size: int) -> Camera:
         """The scene's camera, `size` pixels along each side."""
         return Camera(
             self.view.elevation,
             self.view.azimuth,
-            self.zoom,
+            self.span,
             rows=size,
             columns=size,
             field_of_view=FIELD_OF_VIEW,
@@ -52,7 +52,7 @@ class Scene:
             "name": self.name,
             "view": self.view.model_dump(),
             "light": self.light.model_dump(),
-            "zoom": self.zoom,
+            "span": self.span,
         }
 
     def file(self, what: str) -> str:
@@ -61,12 +61,12 @@ class Scene:
 
 
 def scenes(compare: CompareSection) -> Iterator[Scene]:
-    """All scenes of a comparison: views outermost, zooms innermost."""
+    """All scenes of a comparison: views outermost, spans innermost."""
     index = 0
     for v, view in enumerate(compare.views, 1):
         for n, light in enumerate(compare.lights, 1):
-            for z, zoom in enumerate(compare.zooms, 1):
-                yield Scene(index, f"v{v}-l{n}-z{z}", view, light, zoom)
+            for s, span in enumerate(compare.spans, 1):
+                yield Scene(index, f"v{v}-l{n}-s{s}", view, light, span)
                 index += 1
 
 

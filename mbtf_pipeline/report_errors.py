@@ -131,7 +131,7 @@ def _pictures_table(comparison: Mapping[str, Any]) -> dict[str, Any]:
             for d in ("view", "light")
         )
         for fit in comparison["fits"]:
-            row = [view, light, f"{picture['zoom']:g}", fit]
+            row = [view, light, f"{picture['span']:g}", fit]
             for kind in kinds:
                 errors = picture["fits"][fit]["errors"][kind]
                 row += [

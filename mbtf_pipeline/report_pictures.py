@@ -142,7 +142,7 @@ def show_pictures(
                 }
             )
         rows = groups[-1]["rows"]
-        where = f"view {_direction(key[0])}, light {_direction(key[1])}, {_width(picture['zoom'])}"
+        where = f"view {_direction(key[0])}, light {_direction(key[1])}, {_width(picture['span'])}"
         cells = []
         for kind in sorted(kinds, key=lambda k: k == "query"):
             reference = picture["references"][kind]
@@ -150,7 +150,7 @@ def show_pictures(
             lines = [f"noise {estimate(reference['noise']).value:.1%} per pixel"]
             if kind == main_kind:
                 lines.insert(
-                    0, f"{_width(picture['zoom'])}, {_levels(picture['levels'], comparison['finest'])}"
+                    0, f"{_width(picture['span'])}, {_levels(picture['levels'], comparison['finest'])}"
                 )
             elif "between_references" in picture:
                 lines.insert(0, _between(estimate(picture["between_references"]), white))
@@ -196,8 +196,8 @@ def _levels(levels: list[float], finest: int) -> str:
     return text if levels[1] <= finest + 0.1 else f"{text} (finest of the data {finest})"
 
 
-def _width(zoom: float) -> str:
-    return f"{zoom:g} tile{'' if zoom == 1 else 's'} across"
+def _width(span: float) -> str:
+    return f"{span:g} tile{'' if span == 1 else 's'} across"
 
 
 def _cell(images: list[str], label: str, lines: list[str], alt: str) -> dict[str, Any]:
@@ -225,8 +225,8 @@ def _heroes(
     white: float,
     gallery: Gallery,
 ) -> list[dict[str, Any]]:
-    """Up to three pictures, of different views and lights where there are such, at the first zoom."""
-    first = [p for p in pictures if p["zoom"] == pictures[0]["zoom"]]
+    """Up to three pictures, of different views and lights where there are such, at the first span."""
+    first = [p for p in pictures if p["span"] == pictures[0]["span"]]
     picked: list[dict[str, Any]] = []
     views: list[Any] = []
     lights: list[Any] = []

@@ -88,7 +88,7 @@ class _Run:
         ]
 
     def _generate(self, decision: Decision) -> dict[str, Any]:
-        from mbtf_gen.generation import Job, generate, summary_dict
+        from mbtf_gen.generation import Job, generate, paths_left, summary_dict
         from mbtf_gen.schema import MANIFEST_NAME
         from mbtf_gen.verification import sidecar_of
 
@@ -104,9 +104,7 @@ class _Run:
             or read_json(manifest).get("config_hash") != job.config_hash
         ):
             clear(shards)
-        per_row = job.lattice.texels() if self.recipe.generate.queries.layout == "image" else 1
-        total = per_row * sum(e.rows for split in ("train", "test") for e in job.shards(split))
-        with self.console.progress(total, "generate", "queries") as bar:
+        with self.console.progress(paths_left(job, shards), "generate", "paths") as bar:
             summary = generate(
                 self.recipe.generate, shards, progress=lambda done, note: bar.update(done, note), job=job
             )

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 RUN = Path("out/quickstart/compare/pictures")
-SCENES = ("v1-l1-z1", "v2-l1-z1", "v2-l2-z1", "v2-l1-z2")
+SCENES = ("v1-l1-s1", "v2-l1-s1", "v2-l2-s1", "v2-l1-s2")
 GAP = 6
 
 

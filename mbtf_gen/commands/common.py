@@ -2,31 +2,76 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from cyclopts import Parameter
 
 from ..errors import UsageError
+from ..schema import Tiling
+
+if TYPE_CHECKING:
+    from ..config import GeneratorConfig
+
+    C = TypeVar("C", bound=GeneratorConfig)
 
 Set = Annotated[
     list[str], Parameter(name="--set", help="Set any option of the configuration, a.b=c. Repeatable.")
 ]
 Output = Annotated[Path | None, Parameter(name=["--output", "-o"])]
 
+Flags = Mapping[str, tuple[str, Any]]
+
+
+def general(
+    *,
+    height: float | None,
+    mesh: int | None,
+    light_width: float | None,
+    max_depth: int | None,
+    seed: int | None,
+    tile: Tiling | None = None,
+) -> Flags:
+    """The flags that several commands have: flag → (dotted key it sets, its value or None)."""
+    return {
+        "--height": ("geometry.height", height),
+        "--mesh": ("geometry.mesh", mesh),
+        "--tile": ("geometry.tile", tile),
+        "--light-width": ("light.width", light_width),
+        "--max-depth": ("transport.max_depth", max_depth),
+        "--seed": ("seed", seed),
+    }
+
 
 def resolve_config(
-    material: str | None, config: Path | None, assignments: list[str], flags: dict[str, Any]
-) -> Any:
-    from ..config import GeneratorConfig, check_queries_flag
+    model: type[C],
+    material: str | None,
+    config: Path | None,
+    assignments: Sequence[str],
+    flags: Flags,
+) -> C:
+    """Configuration of a command.
+
+    Parameters
+    ----------
+    flags : flag → (dotted key it sets, value or None where it was not given)
+
+    Raises
+    ------
+    UsageError : no material, or a flag or an assignment is at fault
+    InputError : the file is at fault
+    """
     from ..settings import resolve
 
-    check_queries_flag(flags.get("queries.train"), "--queries")
-    check_queries_flag(flags.get("queries.test"), "--test-queries")
     if material is None and config is None:
         raise UsageError("no material given", cure="mbtf-gen heightfield.exr --queries 400/texel -o shards/")
     resolved = resolve(
-        GeneratorConfig, file=config, assignments=assignments, flags={"material": material, **flags}
+        model,
+        file=config,
+        assignments=assignments,
+        flags={"material": material, **dict(flags.values())},
+        spelled={key: flag for flag, (key, _) in flags.items()},
     )
     if material is None and config is not None and not Path(resolved.material).is_absolute():
         # A path in a file is relative to that file, so that the file works from anywhere.
@@ -34,14 +79,21 @@ def resolve_config(
     return resolved
 
 
-def angles(text: str, flag: str) -> tuple[float, float]:
-    parts = text.split(",")
+def angles(text: str | None, flag: str) -> dict[str, float] | None:
+    """Elevation and azimuth in degrees of an ``ELEVATION,AZIMUTH``.
+
+    Raises
+    ------
+    UsageError : not of that form, or not above the plane
+    """
+    if text is None:
+        return None
     try:
-        elevation, azimuth = (float(p) for p in parts)
+        elevation, azimuth = (float(part) for part in text.split(","))
     except ValueError:
         raise UsageError(
             f"'{text}' must be ELEVATION,AZIMUTH in degrees, such as 60,-90", where=flag
         ) from None
     if not 0 < elevation <= 90:
         raise UsageError(f"elevation {elevation:g} must lie above 0 and at most at 90 degrees", where=flag)
-    return elevation, azimuth
+    return {"elevation": elevation, "azimuth": azimuth}

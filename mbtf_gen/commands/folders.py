@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 
 from ..console import CONSOLE, Console
@@ -23,7 +24,7 @@ def merge(folder: Path, /, *, console: Console = CONSOLE) -> int:
 
     Dataset.open(folder)
     summary = finish(folder)
-    console.report(summary_dict(summary), describe(summary))
+    console.report(summary_dict(summary), describe(summary, ran=False))
     return EXIT_OK if summary.complete else EXIT_PARTIAL
 
 
@@ -41,9 +42,10 @@ def verify(folder: Path, /, *, console: Console = CONSOLE) -> int:
     faults = verify(folder)
     dataset = Dataset.open(folder)
     count = sum(len(s["shards"]) for s in dataset.manifest["splits"].values())
-    text = (
-        "\n".join(f"{folder / f.file}: {f.what}" for f in faults) or f"{folder}: {count} shards, all intact"
-    )
-    data = {"folder": folder, "shards": count, "faults": [{"file": f.file, "what": f.what} for f in faults]}
-    console.report(data, text)
+    lines = [f"{folder / f.file}: {f.what}; {f.cure}" for f in faults if not f.absent]
+    if absent := [f for f in faults if f.absent]:
+        missing = f"{len(absent)} of {count} shards are missing, first {absent[0].file}"
+        lines.insert(0, f"{folder}: {missing}; {absent[0].cure}")
+    data = {"folder": folder, "shards": count, "faults": [asdict(f) for f in faults]}
+    console.report(data, "\n".join(lines) or f"{folder}: {count} shards, all intact")
     return EXIT_BAD_INPUT if faults else EXIT_OK

@@ -10,7 +10,10 @@ from cyclopts import Parameter
 
 from ..console import CONSOLE, Console, clock
 from ..errors import UsageError
-from .common import Output, Set, resolve_config
+from ..schema import Tiling
+from .common import Output, Set, general, resolve_config
+
+_SPLIT_WORDS = {"train": "training"}
 
 
 def _slice(text: str) -> tuple[int, int]:
@@ -31,6 +34,7 @@ def generate(
     test_spp: int | None = None,
     height: float | None = None,
     mesh: int | None = None,
+    tile: Tiling | None = None,
     levels: int | None = None,
     light_width: float | None = None,
     min_cos: float | None = None,
@@ -57,7 +61,7 @@ def generate(
     queries
         Training queries: N, or N/texel of the finest level. Default: 100/texel
     test_queries
-        Test queries: N or N/texel. Default: 8192
+        Test queries, made besides the training queries: N or N/texel. Default: 8192
     spp
         Paths per training query, both halves together (even). Default: 4
     test_spp
@@ -66,6 +70,8 @@ def generate(
         Factor on the stored heights, in tile widths. Default: the material's own
     mesh
         Mesh cells across the tile. Default: the map's width, at most 512
+    tile
+        Cure for maps that do not tile: 2 x 2 mirrored copies, or edges cross-faded. Default: none
     levels
         Finest level k: 2^k texels across. Default: from the map's width
     light_width
@@ -87,31 +93,33 @@ def generate(
     overwrite
         Replace a data set of another configuration.
     """
+    from ..config import GeneratorConfig
+
     flags = {
-        "queries.train": queries,
-        "queries.test": test_queries,
-        "queries.spp": spp,
-        "queries.test_spp": test_spp,
-        "queries.levels": levels,
-        "queries.min_cos": min_cos,
-        "queries.layout": layout,
-        "geometry.height": height,
-        "geometry.mesh": mesh,
-        "light.width": light_width,
-        "transport.max_depth": max_depth,
-        "output.format": format,
-        "seed": seed,
+        "--queries": ("queries.train", queries),
+        "--test-queries": ("queries.test", test_queries),
+        "--spp": ("queries.spp", spp),
+        "--test-spp": ("queries.test_spp", test_spp),
+        "--levels": ("queries.levels", levels),
+        "--min-cos": ("queries.min_cos", min_cos),
+        "--layout": ("queries.layout", layout),
+        "--format": ("output.format", format),
+        **general(
+            height=height, mesh=mesh, tile=tile, light_width=light_width, max_depth=max_depth, seed=seed
+        ),
     }
-    resolved = resolve_config(material, config, assignments or [], flags)
+    resolved = resolve_config(GeneratorConfig, material, config, assignments or [], flags)
     part = _slice(shards)
-    from ..generation import Job, generate, summary_dict
+    from ..generation import Job, generate, paths_left, summary_dict
 
     folder = output or Path("shards")
     job = Job.prepare(resolved)
-    per_row = job.lattice.texels() if resolved.queries.layout == "image" else 1
-    total = sum(e.rows * per_row for split in ("train", "test") for e in job.shards(split))
-    console.note(f"{resolved.material} -> {folder}: {total} queries, level {job.lattice.finest}")
-    with console.progress(total=total, label="generating", unit="queries") as bar:
+    console.note(
+        f"{resolved.material} -> {folder}: {job.queries('train')} training + {job.queries('test')} test "
+        f"queries, finest level {job.lattice.finest}"
+    )
+    total = paths_left(job, folder, *part)
+    with console.progress(total=total, label="generating", unit="paths") as bar:
         summary = generate(
             resolved,
             folder,
@@ -124,12 +132,17 @@ def generate(
     console.report(summary_dict(summary), describe(summary))
 
 
-def describe(summary: Any) -> str:
+def describe(summary: Any, *, ran: bool = True) -> str:
+    """What a folder of shards holds and, where it `ran`, what the run added."""
     state = "complete" if summary.complete else "unfinished: run the other slices, then mbtf-gen merge"
+    counts = " + ".join(f"{n} {_SPLIT_WORDS.get(split, split)}" for split, n in summary.splits.items())
+    work = "nothing left to do"
+    if summary.paths:
+        speed = f"{summary.paths_per_second / 1e6:.2f} M paths/s"
+        work = f"{summary.paths} paths in {clock(summary.seconds)} ({speed})"
     lines = [
-        f"{summary.folder}: {summary.queries} queries, {state}",
-        f"  this run: {summary.paths} paths in {clock(summary.seconds)} "
-        f"({summary.paths_per_second / 1e6:.2f} M paths/s)",
+        f"{summary.folder}: {counts} queries, {state}",
+        *([f"  this run: {work}"] if ran else []),
         f"  mean value {sum(summary.mean_value) / 3:.4g} 1/sr, "
         f"pooled noise of a training query {summary.relative_error:.1%} of the mean",
         f"  simulated: {', '.join(summary.effects) or 'nothing beyond a flat Lambert plane'}",

@@ -3,11 +3,25 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+from cyclopts import Parameter
 
 from ..console import CONSOLE, Console
 from ..errors import UsageError
-from .common import Output, Set, angles, resolve_config
+from ..schema import Tiling
+from .common import Output, Set, angles, general, resolve_config
+
+
+def _widths(text: str | None) -> list[float] | None:
+    if text is None:
+        return None
+    try:
+        return [float(width) for width in text.split(",")]
+    except ValueError:
+        raise UsageError(
+            f"'{text}' must be numbers separated by commas, such as 1,2,4", where="--spans"
+        ) from None
 
 
 def reference(
@@ -15,22 +29,26 @@ def reference(
     /,
     *,
     output: Output = None,
-    view: str = "60,-90",
-    light: str = "45,45",
-    zooms: str = "1,2,4",
-    size: int = 256,
-    spp: int = 256,
-    kind: Literal["query", "pixel", "both"] = "both",
+    view: str | None = None,
+    light: str | None = None,
+    spans: str | None = None,
+    size: int | None = None,
+    spp: int | None = None,
+    kind: Literal["query", "pixel", "both"] | None = None,
     height: float | None = None,
     mesh: int | None = None,
+    tile: Tiling | None = None,
     light_width: float | None = None,
     max_depth: int | None = None,
     seed: int | None = None,
     config: Path | None = None,
     assignments: Set | None = None,
+    overwrite: Annotated[bool, Parameter(negative="")] = False,
     console: Console = CONSOLE,
 ) -> None:
     """Render reference pictures of the micro-geometry on the plane: EXR with both halves, and PNG.
+
+    The same command again makes the pictures that are missing.
 
     Parameters
     ----------
@@ -39,85 +57,106 @@ def reference(
     output
         Folder of pictures. Default: reference/
     view
-        ELEVATION,AZIMUTH of the camera in degrees.
+        ELEVATION,AZIMUTH of the camera in degrees. Default: 60,-90
     light
-        ELEVATION,AZIMUTH of the light in degrees.
-    zooms
-        Widths of the field of view in tile widths, comma-separated.
+        ELEVATION,AZIMUTH of the light in degrees. Default: 45,45
+    spans
+        Widths of the field of view in tile widths, comma-separated. Default: 1,2,4
     size
-        Pixels along each side.
+        Pixels along each side. Default: 256
     spp
-        Paths per pixel, both halves together (even).
+        Paths per pixel, both halves together (even). Default: 256
     kind
-        query: M at each pixel's footprint; pixel: the truly filtered image.
+        query: M at each pixel's footprint; pixel: the truly filtered image. Default: both
     height
-        Factor on the stored heights, in tile widths.
+        Factor on the stored heights, in tile widths. Default: the material's own
     mesh
-        Mesh cells across the tile.
+        Mesh cells across the tile. Default: the map's width, at most 512
+    tile
+        Cure for maps that do not tile: 2 x 2 mirrored copies, or edges cross-faded. Default: none
     light_width
-        RMS angle of the light per axis in degrees; 0 is a delta light.
+        RMS angle of the light per axis in degrees; 0 is a delta light. Default: 1
     max_depth
-        Surface interactions per path; 0: no limit.
+        Surface interactions per path; 0: no limit. Default: 0
     seed
-        Root seed.
+        Root seed. Default: 0
     config
         YAML file with the options.
+    overwrite
+        Replace pictures of another configuration.
     """
-    elevation, azimuth = angles(view, "--view")
-    towards = angles(light, "--light")
-    try:
-        spans = [float(z) for z in zooms.split(",")]
-    except ValueError:
-        raise UsageError(f"'{zooms}' must be numbers separated by commas", where="--zooms") from None
-    if not spans or min(spans) <= 0:
-        raise UsageError("field widths must be positive", where="--zooms")
-    if spp < 2 or spp % 2:
-        raise UsageError(f"{spp} must be even and at least 2", where="--spp")
-    if not 1 <= size <= 16384:
-        raise UsageError(f"{size} must lie in 1..16384", where="--size")
     flags = {
-        "geometry.height": height,
-        "geometry.mesh": mesh,
-        "light.width": light_width,
-        "transport.max_depth": max_depth,
-        "seed": seed,
+        "--view": ("reference.view", angles(view, "--view")),
+        "--light": ("reference.light", angles(light, "--light")),
+        "--spans": ("reference.spans", _widths(spans)),
+        "--size": ("reference.size", size),
+        "--spp": ("reference.spp", spp),
+        "--kind": ("reference.kind", kind),
+        **general(
+            height=height, mesh=mesh, tile=tile, light_width=light_width, max_depth=max_depth, seed=seed
+        ),
     }
-    resolved = resolve_config(material, config, assignments or [], flags)
+    from ..picture_config import ReferenceConfig, without_queries
+
+    resolved = resolve_config(ReferenceConfig, material, config, assignments or [], flags)
     from ..camera import Camera, PixelKind
     from ..directions import from_angles
     from ..generation import Job, build_estimator
+    from ..picture_folder import PictureFolder
     from ..reference import auto_exposure, render_reference
     from ..stats import pooled_relative_error
 
-    folder = output or Path("reference")
+    wanted = resolved.reference
     job = Job.prepare(resolved)
-    cameras = [Camera(elevation, azimuth, span, rows=size, columns=size) for span in spans]
-    omega_i = from_angles(*towards)
+    cameras = [
+        Camera(wanted.view.elevation, wanted.view.azimuth, span, rows=wanted.size, columns=wanted.size)
+        for span in wanted.spans
+    ]
+    omega_i = from_angles(wanted.light.elevation, wanted.light.azimuth)
     for camera in cameras:
-        camera.queries(omega_i)
-    folder.mkdir(parents=True, exist_ok=True)
-    kinds: tuple[PixelKind, ...] = ("query", "pixel") if kind == "both" else (kind,)
-    estimator = build_estimator(resolved, job.material)
+        camera.queries(omega_i)  # refuses a view of the horizon before anything is written
+    kinds: tuple[PixelKind, ...] = ("query", "pixel") if wanted.kind == "both" else (wanted.kind,)
+    names = {(camera, one): f"{one}-span{camera.span:g}" for camera in cameras for one in kinds}
+    folder = PictureFolder.claim(
+        output or Path("reference"),
+        "reference",
+        files=[f"{name}.{suffix}" for name in names.values() for suffix in ("exr", "png")],
+        config=without_queries(resolved),
+        inputs=job.material.digests,
+        overwrite=overwrite,
+    )
+    estimator: Any = None
     pictures: list[dict[str, Any]] = []
     exposure: float | None = None
     with console.progress(total=len(cameras) * len(kinds), label="rendering", unit="pictures") as bar:
         for index, camera in enumerate(cameras):
             for one in kinds:
-                image = render_reference(
-                    estimator, camera, omega_i, kind=one, spp=spp, seed=resolved.seed, index=index
-                )
-                exposure = auto_exposure(image.value) if exposure is None else exposure
-                path = folder / f"{one}-span{camera.span:g}"
-                image.write(path, exposure)
-                noise = pooled_relative_error(image.value_a.reshape(-1, 3), image.value_b.reshape(-1, 3))
+                name = names[camera, one]
+                facts = folder.finished(name)
+                kept = facts is not None
+                if facts is None:
+                    estimator = estimator or build_estimator(resolved, job.material)
+                    image = render_reference(
+                        estimator, camera, omega_i, kind=one, spp=wanted.spp, seed=resolved.seed, index=index
+                    )
+                    exposure = exposure or auto_exposure(image.value)
+                    noise = pooled_relative_error(image.value_a.reshape(-1, 3), image.value_b.reshape(-1, 3))
+                    facts = {"relative_noise": noise.value, "exposure": exposure}
+                    folder.keep(name, image.write(folder.path / name, exposure), facts)
+                # One exposure for all: that of the first picture.
+                exposure = facts["exposure"]
                 pictures.append(
                     {
-                        "file": path.with_name(f"{path.name}.exr"),
+                        "file": folder.path / f"{name}.exr",
                         "kind": one,
                         "span": camera.span,
-                        "relative_noise": noise.value,
+                        "relative_noise": facts["relative_noise"],
+                        "kept": kept,
                     }
                 )
                 bar.advance(1)
-    text = "\n".join(f"{p['file']}: noise {p['relative_noise']:.2%} of the mean value" for p in pictures)
+    text = "\n".join(
+        f"{p['file']}: noise {p['relative_noise']:.2%} of the mean value{' (was there)' if p['kept'] else ''}"
+        for p in pictures
+    )
     console.report({"pictures": pictures, "exposure": exposure}, text)

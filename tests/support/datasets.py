@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from mbtf_gen.atomic import write_json
 from mbtf_gen.config import GeneratorConfig
 from mbtf_gen.dataset import Dataset
-from mbtf_gen.planning import simulated
 from mbtf_gen.generation import Job, _open_folder, _sidecar, finish
 from mbtf_gen.manifest import build_manifest
+from mbtf_gen.planning import simulated
 from mbtf_gen.queries import Queries
 from mbtf_gen.schema import SPLITS
 from mbtf_gen.shard_files import write_shard

@@ -54,6 +54,8 @@ CASES: dict[str, tuple[str, int, list[str]]] = {
     "merge an empty folder": ("merge empty", INPUT, ["empty", "manifest.json"]),
     "verify nothing": ("verify nowhere", INPUT, ["nowhere", "no such folder"]),
     "output that is a file": ("heights.npy -o notes.txt", INPUT, ["notes.txt", "not a folder"]),
+    "pictures among files of others": ("reference heights.npy -o aspects", INPUT, ["aspects", "no pictures"]),
+    "pictures in a file": ("reference heights.npy -o notes.txt", INPUT, ["notes.txt", "not a folder"]),
     "output of others": ("heights.npy -o aspects", INPUT, ["aspects", "holds no data set"]),
     "output below a file": ("heights.npy -o notes.txt/below", INPUT, ["notes.txt"]),
     "words as a count": ("heights.npy --queries many", USAGE, ["--queries", "'many'", "400/texel"]),
@@ -64,9 +66,13 @@ CASES: dict[str, tuple[str, int, list[str]]] = {
     "nonsense as test queries": ("heights.npy --test-queries x", USAGE, ["--test-queries", "'x'"]),
     "odd paths": ("heights.npy --spp 5", USAGE, ["queries.spp", "even", "5"]),
     "odd test paths": ("heights.npy --test-spp 7", USAGE, ["queries.test_spp", "even"]),
-    "odd paths of a reference": ("reference heights.npy --spp 3", USAGE, ["--spp", "even"]),
+    "odd paths of a reference": ("reference heights.npy --spp 3", USAGE, ["--spp", "reference.spp", "even"]),
     "words as paths": ("heights.npy --spp few", USAGE, ["--spp", "few"]),
-    "level too fine": ("heights.npy --levels 15", USAGE, ["queries.levels", "14"]),
+    "level too fine": (
+        "heights.npy --levels 99",
+        USAGE,
+        ["--levels: 'queries.levels': must be at least 0 and at most 14 (given 99)"],
+    ),
     "light too wide": ("heights.npy --light-width 60", USAGE, ["light.width", "45"]),
     "light too narrow": ("heights.npy --light-width 0.001", USAGE, ["light.width", "delta"]),
     "horizontal directions": ("heights.npy --min-cos 0", USAGE, ["queries.min_cos"]),
@@ -80,16 +86,27 @@ CASES: dict[str, tuple[str, int, list[str]]] = {
     "no such slice": ("heights.npy --shards 4/3", USAGE, ["--shards", "4/3"]),
     "slice zero": ("heights.npy --shards 0/3", USAGE, ["--shards", "0/3"]),
     "unknown layout": ("heights.npy --layout rows", USAGE, ["--layout"]),
-    "unknown flag": ("heights.npy --qeries 5", USAGE, ["qeries", "--help"]),
+    "unknown flag": ("heights.npy --qeries 5", USAGE, ["qeries", "Did you mean --queries", "--help"]),
     "misspelt command": ("verfy empty", USAGE, ["verfy", "mbtf-gen verify"]),
     "no material": ("--queries 5", USAGE, ["no material"]),
     "two materials": ("heights.npy nan.npy", USAGE, ["nan.npy"]),
     "horizon": ("reference heights.npy --view 5,0", USAGE, ["horizon", "elevation"]),
-    "view from below": ("reference heights.npy --view=-10,0", USAGE, ["--view", "-10"]),
+    "view from below": (
+        "reference heights.npy --view -10,0",
+        USAGE,
+        ["--view: elevation -10 must lie above 0 and at most at 90 degrees"],
+    ),
+    "view from below, with a sign of equality": (
+        "reference heights.npy --view=-10,0",
+        USAGE,
+        ["--view", "-10"],
+    ),
+    "flag in place of a view": ("reference heights.npy --view --spp 4", USAGE, ["--view"]),
     "half a view": ("reference heights.npy --view 60", USAGE, ["--view", "'60'"]),
     "light in words": ("reference heights.npy --light high", USAGE, ["--light", "'high'"]),
-    "no zoom": ("reference heights.npy --zooms 1,zwei", USAGE, ["--zooms", "zwei"]),
-    "zoom of nothing": ("reference heights.npy --zooms 0", USAGE, ["--zooms", "positive"]),
+    "no width": ("reference heights.npy --spans 1,zwei", USAGE, ["--spans", "zwei"]),
+    "no width at all": ("reference heights.npy --spans 0", USAGE, ["--spans", "above 0"]),
+    "one width twice": ("reference heights.npy --spans 1,1.0", USAGE, ["--spans", "twice"]),
     "picture of nothing": ("reference heights.npy --size 0", USAGE, ["--size"]),
 }
 
@@ -221,7 +238,7 @@ def test_verify_names_every_fault(suffix: str, tmp_path: Path) -> None:
         "intact": ("", "intact"),
         "flipped": (shard("flipped").name, "SHA-256"),
         "cut": (shard("cut").name, "bytes"),
-        "missing": (shard("missing").name, "is missing"),
+        "missing": (shard("missing").name, "1 of 4 shards are missing, first"),
         "doubled": (shard("doubled", 3).name, "not listed"),
         "foreign": ("render.exr", "not listed"),
     }
@@ -233,4 +250,31 @@ def test_verify_names_every_fault(suffix: str, tmp_path: Path) -> None:
         assert says in text.out
         faults = json.loads(data.out)["faults"]
         assert [f["file"] for f in faults] == ([file] if file else [])
+        assert len(text.out.splitlines()) == 1
+        if faults:
+            assert text.out.rstrip().endswith(f"; {faults[0]['cure']}")
     assert set(read_shard(shard("intact"))) >= {"u", "value_a", "value_b"}
+
+
+def test_verify_counts_what_an_interrupted_run_has_not_made(tmp_path: Path) -> None:
+    write_dataset(
+        tmp_path / "set",
+        queries={"train": "400", "test": "20"},
+        output={"shard_queries": 40, "format": "npz"},
+    )
+    for number in (3, 4, 7):
+        (tmp_path / f"set/train-{number:05d}.npz").unlink()
+    (tmp_path / "set/train-00008.json").unlink()
+    path = tmp_path / "set/train-00001.npz"
+    path.write_bytes(path.read_bytes()[:-1] + b"?")
+    text, data = run_all([["verify", "set"], ["verify", "set", "--json"]], tmp_path)
+    assert (text.code, data.code) == (INPUT, INPUT)
+    assert text.out.splitlines() == [
+        "set: 4 of 11 shards are missing, first train-00003.npz; "
+        "run the same mbtf-gen command again: it makes what is missing",
+        "set/train-00001.npz: has changed since it was written (SHA-256 differs); "
+        "remove it and run the same mbtf-gen command again",
+    ]
+    assert [f["file"] for f in json.loads(data.out)["faults"]] == [
+        f"train-{number:05d}.npz" for number in (1, 3, 4, 7, 8)
+    ]

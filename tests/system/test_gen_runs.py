@@ -7,6 +7,7 @@ import shutil
 import signal
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -143,6 +144,7 @@ def batch(work: Path, whole: Path) -> dict[str, Done]:
     image = f"{few} --layout image --set output.shard_queries=256"
     lines = {
         "again": f"{' '.join(COMMAND)} -o again --json",
+        "again in words": f"{' '.join(COMMAND)} -o again",
         "unmerged": "merge unmerged",
         "verify": "verify again --json",
         "changed seed": f"{' '.join(COMMAND)} -o replaced --seed 3",
@@ -155,15 +157,21 @@ def batch(work: Path, whole: Path) -> dict[str, Done]:
         "plain exr": f"maps {few} --format exr -o plain-exr",
         "images": f"maps {image} -o images",
         "image exr": f"maps {image} --format exr -o image-exr",
-        "reference": "reference maps -o pictures --json --view 50,20 --light 60,80 --zooms 0.5,2 "
+        "reference": "reference maps -o pictures --json --view 50,20 --light 60,80 --spans 0.5,2 "
         "--size 24 --spp 4",
-        "one reference": "reference maps/height.npy -o one --zooms 1 --size 8 --spp 2 --kind query",
+        "pictures again": "reference maps -o pictures --json --view 50,20 --light 60,80 --spans 0.5,2 "
+        "--size 24 --spp 4",
+        "pictures changed": "reference maps -o pictures --view 50,20 --light 60,80 --spans 0.5,2 --size 24",
+        "from its own file": "reference maps -o pictures --json --config pictures/config.yaml",
+        "one reference": "reference maps/height.npy -o one --spans 1 --size 8 --spp 2 --kind query",
+        "one replaced": "reference maps/height.npy -o one --spans 2 --size 8 --spp 2 --kind pixel "
+        "--overwrite",
     }
     done = run_all([line.split() for line in lines.values()], work)
     return dict(zip(lines, done, strict=True))
 
 
-def summary(done: Done) -> dict[str, object]:
+def summary(done: Done) -> dict[str, Any]:
     assert done.code == 0, done.err
     parsed = json.loads(done.out)
     assert isinstance(parsed, dict)
@@ -235,7 +243,9 @@ def test_reference_writes_pictures_for_people_and_programs(batch: dict[str, Done
     report = summary(batch["reference"])
     stems = {f"{kind}-span{span}" for kind in ("query", "pixel") for span in ("0.5", "2")}
     assert {p.name for p in (work / "pictures").iterdir()} == {
-        f"{s}.{x}" for s in stems for x in ("exr", "png")
+        "config.yaml",
+        "pictures.json",
+        *(f"{s}.{x}" for s in stems for x in ("exr", "png")),
     }
     pictures = report["pictures"]
     assert isinstance(pictures, list)
@@ -252,5 +262,41 @@ def test_reference_writes_pictures_for_people_and_programs(batch: dict[str, Done
         # The picture shows the values: brighter where they are brighter.
         assert np.corrcoef(shown.mean(axis=-1).ravel(), value.mean(axis=-1).ravel())[0, 1] > 0.8
     assert batch["one reference"].code == 0
-    assert {p.name for p in (work / "one").iterdir()} == {"query-span1.exr", "query-span1.png"}
     assert "noise" in batch["one reference"].out
+
+
+def test_pictures_that_are_there_are_kept_and_others_refused(batch: dict[str, Done], work: Path) -> None:
+    first = summary(batch["reference"])
+    assert [p["kept"] for p in first["pictures"]] == [False] * 4
+    for name in ("pictures again", "from its own file"):
+        again = summary(batch[name])
+        assert [p["kept"] for p in again["pictures"]] == [True] * 4, name
+        assert again["exposure"] == first["exposure"]
+        assert [p["relative_noise"] for p in again["pictures"]] == [
+            p["relative_noise"] for p in first["pictures"]
+        ]
+    refused = batch["pictures changed"]
+    assert refused.code == 3
+    assert "pictures: holds pictures of another configuration: reference.spp: 4 -> 256" in refused.err
+    assert "size: 24" in (work / "pictures/config.yaml").read_text()
+
+
+def test_overwriting_pictures_leaves_none_of_before(batch: dict[str, Done], work: Path) -> None:
+    assert batch["one replaced"].code == 0, batch["one replaced"].err
+    assert {p.name for p in (work / "one").iterdir()} == {
+        "config.yaml",
+        "pictures.json",
+        "pixel-span2.exr",
+        "pixel-span2.png",
+    }
+
+
+def test_the_report_counts_training_and_test_queries(batch: dict[str, Done], work: Path) -> None:
+    again = batch["again in words"]
+    assert "2048 training + 200 test queries, finest level 4" in again.err
+    assert again.out.splitlines()[:2] == [
+        "again: 2048 training + 200 test queries, complete",
+        "  this run: nothing left to do",
+    ]
+    # Merging traces nothing by its nature, and says nothing of it.
+    assert "this run" not in batch["unmerged"].out

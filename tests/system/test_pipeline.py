@@ -120,7 +120,7 @@ def test_every_stage_runs_and_the_material_is_learned(first: dict[str, Any], fol
 
 def test_pictures_and_numbers_belong_together(first: dict[str, Any], folder: Path) -> None:
     record = json.loads((folder / "compare" / "comparison.json").read_text())
-    assert [p["name"] for p in record["pictures"]] == ["v1-l1-z1", "v2-l1-z1"]
+    assert [p["name"] for p in record["pictures"]] == ["v1-l1-s1", "v2-l1-s1"]
     for picture in record["pictures"]:
         reference = read_picture(folder / "compare" / picture["references"]["query"]["file"])
         made = picture["fits"]["neumip"]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mbtf_gen.config import GeneratorConfig, check_queries_flag, count_queries, parse_count
+from mbtf_gen.config import GeneratorConfig, count_queries, parse_count
 from mbtf_gen.errors import InputError, UsageError
 from mbtf_gen.light import MIN_WIDTH_DEG, LightKernel
 from mbtf_gen.material import load_material
@@ -55,7 +55,11 @@ def test_nonsense_counts_are_usage_errors(text: str) -> None:
     with pytest.raises(ValueError, match=r"must be|whole"):
         parse_count(text)
     with pytest.raises(UsageError) as caught:
-        check_queries_flag(text)
+        resolve(
+            GeneratorConfig,
+            flags={"material": "m", "queries.train": text},
+            spelled={"queries.train": "--queries"},
+        )
     assert caught.value.where == "--queries"
     assert f"'{text}'" in caught.value.what
 
@@ -64,16 +68,16 @@ def test_nonsense_counts_are_usage_errors(text: str) -> None:
     ("key", "value", "says"),
     [
         ("queries.spp", 3, "even"),
-        ("queries.test_spp", 0, "greater than or equal to 2"),
-        ("queries.min_cos", 0, "greater than 0"),
-        ("queries.levels", 15, "less than or equal to 14"),
+        ("queries.test_spp", 0, "at least 2 and at most 1048576"),
+        ("queries.min_cos", 0, "above 0 and below 1"),
+        ("queries.levels", 15, "at least 0 and at most 14"),
         ("queries.layout", "rows", "'shuffled' or 'image'"),
         ("light.width", 46, "45"),
         ("light.width", 1e-3, "delta light"),
-        ("light.width", float("nan"), "or equal to"),
-        ("seed", 1 << 63, "less than"),
-        ("seed", -1, "greater than or equal to 0"),
-        ("geometry.height", float("inf"), "less than or equal"),
+        ("light.width", float("nan"), "at most 45"),
+        ("seed", 1 << 63, "below"),
+        ("seed", -1, "at least 0"),
+        ("geometry.height", float("inf"), "at most 100"),
     ],
 )
 def test_values_out_of_range_are_refused_with_key_and_reason(key: str, value: Any, says: str) -> None:
@@ -162,6 +166,7 @@ def test_hash_covers_every_option_but_the_materials_name(tmp_path: Path) -> None
         {"seed": 1},
         {"geometry": {"height": 0.5}},
         {"geometry": {"mesh": 8}},
+        {"geometry": {"tile": "mirror"}},
         {"light": {"width": 2}},
         {"transport": {"max_depth": 3}},
         {"transport": {"roulette_depth": 5}},

@@ -56,6 +56,8 @@ def failing(error: BaseException) -> App:
         ("map.exr", "make map.exr 4 (1, 1) False"),
         ("map.exr --queries 400/texel", "make map.exr 400/texel (1, 1) False"),
         ("--queries 400/texel map.exr", "make map.exr 400/texel (1, 1) False"),
+        ("map.exr --queries -10,0", "make map.exr -10,0 (1, 1) False"),
+        ("--queries -.5,-1e3 map.exr", "make map.exr -.5,-1e3 (1, 1) False"),
         ("--queries=9 --size 2 3 map.exr --json", "make map.exr 9 (2, 3) True"),
         ("--json --size 2 3 --queries 9 map.exr", "make map.exr 9 (2, 3) True"),
         ("plan map.exr --depth 2", "plan map.exr 2 False False"),

@@ -16,7 +16,7 @@ from mbtf_gen.config import GeneratorConfig
 from mbtf_gen.dataset import Dataset
 from mbtf_gen.engine import load_mitsuba
 from mbtf_gen.errors import InputError, PartialError, UsageError
-from mbtf_gen.generation import Job, finish, generate
+from mbtf_gen.generation import Job, finish, generate, paths_left
 from mbtf_gen.locks import shard_lock
 from mbtf_gen.verification import sidecar_of, verify
 
@@ -89,8 +89,10 @@ def test_more_shards_than_a_folder_can_hold_are_refused(config: GeneratorConfig)
 def test_a_run_is_complete_and_counts(config: GeneratorConfig, engine: Formula, tmp_path: Path) -> None:
     seen: list[float] = []
     summary = generate(config, tmp_path / "out", progress=lambda done, note: seen.append(done))
-    assert seen == [40, 80, 100, 130]
+    # Progress counts paths: a test query takes twice as many as a training query.
+    assert seen == [80, 160, 200, 320]
     assert (summary.complete, summary.queries, summary.paths) == (True, 130, 100 * 2 + 30 * 4)
+    assert summary.splits == {"train": 100, "test": 30}
     assert (summary.lost, summary.capped, summary.nonfinite) == (4, 8, 12)
     assert summary.relative_error == 0.0
     data = Dataset.open(tmp_path / "out").load("train")
@@ -260,6 +262,29 @@ def test_a_file_in_place_of_the_folder_is_refused(
     for out in (tmp_path / "height.npy", tmp_path / "height.npy" / "below"):
         with pytest.raises(InputError):
             generate(config, out)
+
+
+def test_paths_left_are_those_that_the_run_will_trace(
+    config: GeneratorConfig, engine: Formula, tmp_path: Path
+) -> None:
+    job, out = Job.prepare(config), tmp_path / "out"
+    # Shards of 40, 40, 20 training queries at 2 paths and 30 test queries at 4.
+    assert paths_left(job, out) == 80 + 80 + 40 + 120
+    assert [paths_left(job, out, i, 2) for i in (1, 2)] == [80 + 40, 80 + 120]
+    engine.fail_at = 1
+    with pytest.raises(KeyboardInterrupt):
+        generate(config, out)
+    engine.fail_at = None
+    left = paths_left(job, out)
+    assert left == 240
+    seen: list[float] = []
+    assert generate(config, out, progress=lambda done, note: seen.append(done)).paths == left
+    # Shards that were there count for nothing, so that the time left is not underrated.
+    assert seen == [0, 80, 120, 240]
+    assert paths_left(job, out) == 0
+    image = Job.prepare(changed(config, queries={"layout": "image"}))
+    assert image.queries("train") == 4 * 32
+    assert paths_left(image, out) == 4 * 32 * 2 + 32 * 4
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 5])

@@ -6,11 +6,10 @@ import struct
 import zlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+from support.image_files import exr, png, rng
 
 from mbtf_gen.errors import InputError
 from mbtf_gen.images import (
@@ -23,60 +22,15 @@ from mbtf_gen.images import (
 )
 
 
-def rng() -> np.random.Generator:
-    """The same numbers wherever they are drawn."""
-    return np.random.default_rng(7)
-
-
-def png(path: Path, codes: NDArray[Any], colour: int, bits: int, filters: list[int] | None = None) -> Path:
-    """Write a PNG from its specification: codes (H, W, C), a filter per line (cycled)."""
-
-    def chunk(kind: bytes, content: bytes) -> bytes:
-        return (
-            struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
-        )
-
-    rows, columns, channels = codes.shape
-    size = channels * bits // 8
-    raw = codes.astype(">u2" if bits == 16 else "u1").tobytes()
-    lines = np.frombuffer(raw, np.uint8).reshape(rows, columns * size).astype(int)
-    out = b""
-    for y in range(rows):
-        kind = (filters or [0])[y % len(filters or [0])]
-        line = lines[y]
-        up = lines[y - 1] if y else np.zeros_like(line)
-        left = np.concatenate([np.zeros(size, int), line[:-size]])
-        corner = np.concatenate([np.zeros(size, int), up[:-size]])
-        estimate = left + up - corner
-        distances = np.abs(np.stack([estimate - left, estimate - up, estimate - corner]))
-        paeth = np.choose(np.argmin(distances, axis=0), [left, up, corner])
-        predicted = [np.zeros_like(line), left, up, (left + up) // 2, paeth][kind]
-        out += bytes([kind]) + ((line - predicted) % 256).astype(np.uint8).tobytes()
-    path.write_bytes(
-        b"\x89PNG\r\n\x1a\n"
-        + chunk(b"IHDR", struct.pack(">IIBBBBB", columns, rows, bits, colour, 0, 0, 0))
-        + chunk(b"IDAT", zlib.compress(out))
-        + chunk(b"IEND", b"")
-    )
-    return path
-
-
-def exr(path: Path, channels: dict[str, NDArray[Any]], **header: Any) -> Path:
-    import OpenEXR
-
-    head = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **header}
-    OpenEXR.File(head, channels).write(str(path))
-    return path
-
-
 @pytest.mark.parametrize(("colour", "channels"), [(0, 1), (4, 2), (2, 3), (6, 4)])
 @pytest.mark.parametrize("bits", [8, 16])
-def test_png_keeps_every_code(tmp_path: Path, colour: int, channels: int, bits: int) -> None:
+@pytest.mark.parametrize("interlace", [False, True])
+def test_png_keeps_every_code(tmp_path: Path, colour: int, channels: int, bits: int, interlace: bool) -> None:
     largest = 2**bits - 1
     codes = rng().integers(0, largest + 1, (11, 7, channels))
     codes[0, 0], codes[0, 1] = 0, largest
     codes[5:] = codes[5:6] // 2 + np.arange(6)[:, None, None]  # so that filters predict something
-    image = read_image(png(tmp_path / "x.png", codes, colour, bits, [0, 1, 2, 3, 4]))
+    image = read_image(png(tmp_path / "x.png", codes, colour, bits, [0, 1, 2, 3, 4], interlace=interlace))
     assert image.bits == bits
     assert image.pixels.shape == (11, 7, channels)
     assert np.array_equal(np.rint(image.pixels.astype(np.float64) * largest), codes)

@@ -327,10 +327,10 @@ class TestYaml:
             ("roughness: 0.5\n", "key 'height' is missing"),
             (
                 "height: rock_height.npy\nroughness: 1.5\n",
-                r"material\.yaml:2: .*roughness.*less than or equal to 1",
+                r"material\.yaml:2: .*roughness.*at most 1",
             ),
             ("height: rock_height.npy\nbasecolor: [0.1, 0.2]\n", r"material\.yaml:2: .*basecolor"),
-            ("height: rock_height.npy\nbasecolor: [0.1, 0.2, 1.2]\n", r"less than or equal to 1"),
+            ("height: rock_height.npy\nbasecolor: [0.1, 0.2, 1.2]\n", r"at most 1"),
             ("height: rock_height.npy\nmetallic: {}\n", "either 'file' or 'value'"),
             ("height: rock_height.npy\nmetallic: {file: a.png, value: 1}\n", "either 'file' or 'value'"),
             ("height: rock_height.npy\nroughness: gone.png\n", r"gone\.png: no such file"),

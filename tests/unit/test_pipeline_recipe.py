@@ -94,11 +94,11 @@ def test_a_fit_without_a_model_has_the_model_of_its_name(tmp_path: Path) -> None
         (HEAD + "fit:\n  other:\n", 6, "'neumip-baseline' or 'neumip'"),
         (HEAD + "fit: {}\n", 5, "names no fit"),
         (SINGLE.replace("small", "a/b"), 1, "'name'"),
-        (SINGLE + "compare:\n  views:\n  - {elevation: 3}\n", 8, "greater than or equal"),
+        (SINGLE + "compare:\n  views:\n  - {elevation: 3}\n", 8, "at least"),
         (SINGLE + "compare: {spp: 3}\n", 6, "must be even"),
-        (SINGLE + "compare: {zooms: [2, 2.0]}\n", 6, "same entry twice"),
-        (SINGLE + "compare: {kinds: []}\n", 6, "at least 1 item"),
-        (SINGLE + "report: {stops: [0, x]}\n", 6, "valid number"),
+        (SINGLE + "compare: {spans: [2, 2.0]}\n", 6, "same entry twice"),
+        (SINGLE + "compare: {kinds: []}\n", 6, "at least 1"),
+        (SINGLE + "report: {stops: [0, x]}\n", 6, "must be a number"),
     ],
 )
 def test_faults_are_named_with_their_line(tmp_path: Path, text: str, line: int, what: str) -> None:

@@ -1,0 +1,127 @@
+"""What the maps of a material say about each other, put into words: heights, tiling, normals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import InputError
+from .height_codes import Codes
+from .images import Image
+from .normal_fit import Convention, NormalFit
+from .tiling import Seam, broken
+
+CONVENTION_NAMES: dict[Convention, str] = {"gl": "OpenGL", "dx": "DirectX"}
+# Mean spread of the channels, relative to the largest number, beyond which an image is a colour picture.
+_COLOURED = 0.02
+# Levels, and codes between them, that 8-bit heights in a 16-bit file have.
+_FEW_LEVELS, _FAR_APART = 1024, 16.0
+
+
+def refuse_colour(image: Image) -> None:
+    """A colour picture is no height map.
+
+    Raises
+    ------
+    InputError : the channels differ by more than 2 % on average
+    """
+    if image.pixels.shape[2] < 3:
+        return
+    rgb = image.pixels[..., :3].astype(np.float64)
+    largest = float(np.abs(rgb).max())
+    if largest == 0 or float(np.mean(np.ptp(rgb, axis=-1))) <= _COLOURED * largest:
+        return
+    red, green, blue = rgb.mean(axis=(0, 1))
+    normals = abs(red - 0.5) < 0.1 and abs(green - 0.5) < 0.1 and blue > 0.7
+    raise InputError(
+        f"is coloured{' like a normal map' if normals else ''}; a height map is grey",
+        where=image.path,
+        cure="if one of its channels holds the heights, name it in a material.yaml: "
+        f"height: {{file: {image.path.name}, channel: R}}",
+    )
+
+
+def coarse_step(codes: Codes, bits: int) -> float | None:
+    """Step, in codes, that heights were rounded to, where it is coarse enough to show as terraces."""
+    if bits == 8:
+        return codes.rounding
+    hidden = codes.levels <= _FEW_LEVELS and codes.spacing >= _FAR_APART
+    return codes.rounding if hidden else None
+
+
+def level_remark(path: Path, codes: Codes, bits: int, step: float, smoothed: bool) -> str:
+    """The remark that heights come in few levels."""
+    apart = f" {codes.spacing:.4g} codes apart" if codes.spacing > 1 else ""
+    cure = f"smoothed within {'half a code' if step == 1 else f'{step / 2:.3g} codes'}"
+    return f"{path}: heights of {bits} bits, {codes.levels} levels{apart}; " + (
+        cure if smoothed else "their steps stay, as asked for"
+    )
+
+
+def seam_warning(path: Path, seams: Sequence[Seam], factor: float) -> str | None:
+    """The warning that heights do not tile; `factor` takes stored heights to tile widths."""
+    bad = [s for s in seams if broken(s)]
+    if not bad:
+        return None
+    worst = max(bad, key=lambda s: s.ratio)
+    return (
+        f"{path}: does not tile along {' and '.join(s.axis for s in bad)}: the seam is a step of "
+        f"{abs(factor) * worst.step:.2g} tile widths, {worst.ratio:.3g} times the interior's 99th "
+        "percentile; --tile mirror or --tile blend closes it"
+    )
+
+
+def orientation_warning(fit: NormalFit, normal: Path, height: Path) -> str | None:
+    """The warning that a normal map and the heights do not belong together as they are."""
+    if not fit.misfit:
+        return None
+    found = f"correlation of their slopes {fit.best:.2f} so, {fit.as_is:.2f} as it is"
+    if not fit.turn:
+        return (
+            f"{normal}: fits the heights only upside down ({found}); "
+            "if dark is high, give a negative --height"
+        )
+    which, other = (height, normal) if fit.image == "height" else (normal, height)
+    return f"{which}: fits {other.name} only when {fit.turn} ({found}); turn it, or one of the two is wrong"
+
+
+def choose_convention(
+    fit: NormalFit | None, named: Convention | None, asked: Convention | None, path: Path
+) -> tuple[Convention, str, str | None]:
+    """(convention to read by, how it is known, warning or None): what is asked for comes before what the data
+    show, that before the name, and OpenGL is assumed at last."""
+    shown = None if fit is None else fit.convention
+    chosen: Convention = asked or shown or named or "gl"
+    if shown is None or fit is None:
+        how = "as asked for" if asked else "as named" if named else "assumed: the heights do not tell"
+        return chosen, how, None
+    claim = asked or named
+    if claim is None or claim == shown:
+        return chosen, "as the heights' slopes show", None
+    said = "convention in the material file" if asked else "name"
+    warning = (
+        f"{path}: the {said} says {CONVENTION_NAMES[claim]}, the heights' slopes say "
+        f"{CONVENTION_NAMES[shown]} (correlation {fit.as_is:.2f} against {min(fit.gl, fit.dx):.2f}); "
+        f"read as {CONVENTION_NAMES[chosen]}"
+    )
+    return chosen, "as asked for" if asked else "as the heights' slopes show", warning
+
+
+def normal_note(path: Path, fit: NormalFit | None, convention: Convention, how: str, factor: float) -> str:
+    """What a normal map is read as, how it fits, and the height that it suggests."""
+    text = f"normal map: {path.name}, {CONVENTION_NAMES[convention]}, {how}"
+    if fit is None:
+        return text
+    sign = 1.0 if convention == "gl" else -1.0
+    text += f"; correlation with them u {fit.correlation_u:+.2f}, v {sign * fit.correlation_v:+.2f}"
+    if fit.fits:
+        text += f"; it suggests --height {fit.scale:.3g} (the material's own is {factor:.3g})"
+    return text
+
+
+def holes(opacity: NDArray[np.float64] | float | None) -> float:
+    """Share of the tile that is more transparent than opaque."""
+    return 0.0 if opacity is None else float(np.mean(np.asarray(opacity) < 0.5))

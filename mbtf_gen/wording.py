@@ -1,0 +1,86 @@
+"""What is wrong with a value of a configuration, in the programs' words instead of the validator's."""
+
+from __future__ import annotations
+
+import types
+import typing
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Union
+
+from pydantic import BaseModel
+
+_BOUNDS = (("ge", "at least"), ("gt", "above"), ("le", "at most"), ("lt", "below"))
+# Beginnings of pydantic's names of faults → what was expected.
+_KINDS = {
+    "int": "must be a whole number",
+    "float": "must be a number",
+    "finite": "must be a finite number",
+    "bool": "must be true or false",
+    "string": "must be text",
+    "list": "must be a list",
+    "tuple": "must be a list",
+    "dict": "must hold keys and values",
+    "model": "must hold keys and values",
+}
+
+
+def models_in(annotation: Any) -> list[type[BaseModel]]:
+    """The models that a field's annotation may hold: through Optional, unions, lists and dicts."""
+    return [part for part in _parts(annotation) if isinstance(part, type) and issubclass(part, BaseModel)]
+
+
+def _parts(annotation: Any) -> list[Any]:
+    """An annotation without its Optional, unions, lists and dicts; `Annotated` parts stay whole."""
+    origin = typing.get_origin(annotation)
+    if origin is Annotated:
+        inner, *notes = typing.get_args(annotation)
+        deeper = _parts(inner)
+        return [*deeper, *notes]
+    if origin in (Union, types.UnionType, list, tuple, dict):
+        return [p for a in typing.get_args(annotation) for p in _parts(a)]
+    return [annotation]
+
+
+def _limits(model: type[BaseModel], location: Sequence[str | int]) -> dict[str, float]:
+    """Bounds that the field at `location` states: ``ge``, ``gt``, ``le``, ``lt`` → number."""
+    models, notes = [model], []
+    for part in location:
+        fields = [m.model_fields[part] for m in models if isinstance(part, str) and part in m.model_fields]
+        if fields:
+            notes = [n for f in fields for n in (*f.metadata, *_parts(f.annotation))]
+            models = [m for f in fields for m in models_in(f.annotation)] or models
+    found = {}
+    for note in notes:
+        # A field's own bounds are objects with one attribute each, those of a list's items are a FieldInfo.
+        for one in (note, *getattr(note, "metadata", ())):
+            for name, _ in _BOUNDS:
+                value = getattr(one, name, None)
+                if isinstance(value, int | float):
+                    found[name] = value
+    return found
+
+
+def explain(fault: Mapping[str, Any], model: type[BaseModel]) -> str:
+    """One of pydantic's faults as what the value must be.
+
+    Parameters
+    ----------
+    fault : entry of ``ValidationError.errors()``
+    model : what was validated
+    """
+    kind, context = str(fault["type"]), fault.get("ctx", {})
+    if kind in ("greater_than", "greater_than_equal", "less_than", "less_than_equal"):
+        limits = {**_limits(model, fault["loc"]), **context}
+        said = [f"{word} {limits[name]:.10g}" for name, word in _BOUNDS if name in limits]
+        return "must be " + " and ".join(said)
+    if kind == "literal_error":
+        return f"must be {context['expected']}"
+    if kind == "too_short":
+        return f"must hold at least {context['min_length']}"
+    if kind == "string_too_short":
+        return "must not be empty"
+    expected = (
+        _KINDS.get(kind.split("_")[0]) if kind.endswith(("_type", "_parsing", "_number", "_float")) else None
+    )
+    message: str = fault["msg"]
+    return expected or message.removeprefix("Value error, ").removeprefix("Assertion failed, ")
