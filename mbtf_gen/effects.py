@@ -45,6 +45,7 @@ class Effect:
     reason : in words
     cost : of leaving it out, relative to the mean value; None where it was not worked out
     known : how the cost is known
+    error : standard error of a measured cost
     present : the material has what the effect needs; otherwise it cannot be switched on
     """
 
@@ -54,6 +55,7 @@ class Effect:
     cost: float | None = None
     known: Known = "asked"
     present: bool = True
+    error: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,7 @@ class EffectsPlan:
     Attributes
     ----------
     max_depth : cap on surface interactions per path; 0 for none
+    roulette_depth : interactions before Russian roulette begins
     mode : what was asked for
     tolerance : allowed cost of all effects left out together
     closed_form : M is known without tracing anything
@@ -70,6 +73,7 @@ class EffectsPlan:
 
     effects: tuple[Effect, ...]
     max_depth: int = 0
+    roulette_depth: int = 3
     mode: str = "auto"
     tolerance: float = 0.0
     closed_form: bool = False
@@ -94,6 +98,7 @@ class EffectsPlan:
             "tolerance": self.tolerance,
             "cost": self.cost,
             "max_depth": self.max_depth,
+            "roulette_depth": self.roulette_depth,
             "closed_form": self.closed_form,
             "effects": effects,
         }
@@ -102,7 +107,8 @@ class EffectsPlan:
     def from_manifest(cls, data: dict[str, Any]) -> EffectsPlan:
         """Inverse of :meth:`to_manifest`."""
         effects = tuple(Effect(**{k: v for k, v in e.items() if k != "effect"}) for e in data["effects"])
-        return cls(effects, data["max_depth"], data["mode"], data["tolerance"], data["closed_form"])
+        names = ("max_depth", "roulette_depth", "mode", "tolerance", "closed_form")
+        return cls(effects, **{name: data[name] for name in names})
 
 
 @dataclass(frozen=True)

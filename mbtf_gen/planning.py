@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from .effects import EFFECTS, OF_RELIEF, Effect, EffectsPlan, Wish
 from .errors import UsageError
-from .pilot import Pilot
-from .relief import ReliefCosts, largest_slope, relief_costs
+from .pilot import Pilot, pilot_queries
+from .relief import POINTS, ReliefCosts, largest_slope, relief_costs
 
 if TYPE_CHECKING:
     from .generation import Job
@@ -25,6 +25,9 @@ LONGEST_REACH = 0.45
 # Light found by next-event estimation alone keeps its variance when the narrowest lobe of the surface, about
 # 2α wide, is so many times wider than the light's.
 WIDER = 4.0
+# Where nothing reflects more, what comes after the first interaction is so little of the value that roulette
+# from there on saves more time than it costs in variance.
+DARK = 0.25
 # Deepest cap on surface interactions that is tried.
 DEEPEST_CAP = 4
 
@@ -69,6 +72,8 @@ def plan_effects(job: Job) -> EffectsPlan:
     plan = _of_relief(look, wish, decided, costs, left)
     if wish.base != "all" and _known_exactly(look, plan):
         plan = replace(plan, closed_form=True)
+    if wish.base != "all" and look.lambert and look.albedo.max() <= DARK:
+        plan = replace(plan, roulette_depth=1)
     return replace(plan, mode=job.config.effects.mode, tolerance=tolerance)
 
 
@@ -80,22 +85,20 @@ def simulated(job: Job) -> EffectsPlan:
     effects = [*_surface(look), _normal(look, None), _opacity(look), _fibres()]
     effects += [Effect(name, not flat, "flat" if flat else "a relief") for name in OF_RELIEF]
     effects.append(Effect("mis", True, "reference"))
-    plan = _assemble({e.name: wish.decide(e) for e in effects}, job.config.transport.max_depth)
+    plan = _assemble(job, {e.name: wish.decide(e) for e in effects}, job.config.transport.max_depth)
     return replace(plan, mode=job.config.effects.mode)
 
 
 def _look(job: Job) -> _Look:
     material = job.material
-    queries = job.plan().draw("pilot", 0, 4096 if job.config.queries.layout == "shuffled" else 64)
-    flat = queries.flat()
-    some = slice(0, len(flat.sigma), max(1, len(flat.sigma) // 4096))
+    queries = pilot_queries(job, POINTS)
     base = np.asarray(material.basecolor, np.float64)
     own = material.bsdf is not None
     albedo = np.atleast_2d(np.ones(1)) if own else base.mean(axis=-1).reshape(base.shape[:-1] or (1, 1))
     return _Look(
         job,
-        flat.omega_i[some].astype(np.float64),
-        flat.omega_o[some].astype(np.float64),
+        queries.omega_i.astype(np.float64),
+        queries.omega_o.astype(np.float64),
         albedo,
         material.is_lambert,
         own,
@@ -202,7 +205,7 @@ def _of_relief(
         for name in OF_RELIEF:
             decided[name] = wish.decide(Effect(name, False, reason, 0.0, "exact"))
         decided["mis"] = wish.decide(_mis(look))
-        return _assemble(_consistent(decided, wish), cap)
+        return _assemble(job, _consistent(decided, wish), cap)
     shadowing = _shadowing(look, costs)
     masking = Effect(
         "masking",
@@ -219,7 +222,7 @@ def _of_relief(
             decided[name] = wish.decide(Effect(name, False, "no displaced tile", 0.0, "pilot"))
         decided["masking"] = wish.decide(masking)
         decided["mis"] = wish.decide(_mis(look))
-        return _assemble(_consistent(decided, wish), cap)
+        return _assemble(job, _consistent(decided, wish), cap)
     decided["masking"] = wish.decide(masking)
     # The estimate shades Lambert: for lobes only the bound counts.
     sure = look.lambert or shadowing.known == "bound"
@@ -232,7 +235,7 @@ def _of_relief(
     decided["interreflection"] = Effect("interreflection", True, "not looked at")
     decided["interreflection"], cap = _interreflection(look, wish, decided, left)
     decided["neighbours"] = wish.decide(_neighbours(look, decided))
-    return _assemble(_consistent(decided, wish), cap)
+    return _assemble(job, _consistent(decided, wish), cap)
 
 
 def _shadowing(look: _Look, costs: ReliefCosts | None) -> Effect:
@@ -287,8 +290,8 @@ def _interreflection(look: _Look, wish: Wish, decided: dict[str, Effect], left: 
     if "interreflection" in wish.forced or wish.base != "auto" or not decided["masking"].on:
         effect = wish.decide(replace(effect, reason="a relief"))
         return effect, asked
-    pilot = Pilot(look.job, _assemble(_consistent(dict(decided), wish), asked))
-    cost, upper = pilot.cost(1)
+    pilot = Pilot(look.job, _assemble(look.job, _consistent(dict(decided), wish), asked))
+    cost, upper = pilot.cost_of_limit(1)
     reason = f"{cost:.2g} of the mean value comes from it"
     if upper <= left:
         return Effect("interreflection", False, reason, upper, "pilot"), 1
@@ -300,7 +303,7 @@ def _interreflection(look: _Look, wish: Wish, decided: dict[str, Effect], left: 
     for cap in range(2, DEEPEST_CAP + 1):
         if cost * brightest ** (cap - 1) > 2.0 * left:
             continue
-        _, upper = pilot.cost(cap)
+        _, upper = pilot.cost_of_limit(cap)
         if upper <= left:
             reason += f"; at most {cap} interactions, the rest is below {upper:.1g}"
             return replace(found, reason=reason), cap
@@ -345,8 +348,16 @@ def _consistent(decided: dict[str, Effect], wish: Wish) -> dict[str, Effect]:
     return decided
 
 
-def _assemble(decided: dict[str, Effect], cap: int) -> EffectsPlan:
-    return EffectsPlan(tuple(decided[name] for name in EFFECTS), cap)
+def without(plan: EffectsPlan, name: str) -> EffectsPlan:
+    """The plan without an effect and without what needs it."""
+    wish = Wish("auto", {name: False})
+    decided = _consistent({e.name: wish.decide(e) for e in plan.effects}, wish)
+    return replace(plan, effects=tuple(decided.values()))
+
+
+def _assemble(job: Job, decided: dict[str, Effect], cap: int) -> EffectsPlan:
+    effects = tuple(decided[name] for name in EFFECTS)
+    return EffectsPlan(effects, cap, job.config.transport.roulette_depth)
 
 
 def _known_exactly(look: _Look, plan: EffectsPlan) -> bool:

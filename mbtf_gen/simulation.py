@@ -67,7 +67,7 @@ def estimator_of(job: Job, plan: EffectsPlan, tiles: dict[Any, Any]) -> Any:
     config = job.config
     transport = Transport(
         plan.max_depth,
-        config.transport.roulette_depth,
+        plan.roulette_depth,
         config.transport.max_crossings,
         displacement=plan.on("masking"),
         shadowing=plan.on("shadowing"),
