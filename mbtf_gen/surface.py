@@ -219,6 +219,7 @@ class SurfacePoint:
             broad = dr.mean(self.base * (1.0 - self.metallic)) * self.left
             again = dr.mean(self.returned) * self.lost if self.parts.metallic else mi.Float(0.0)
             lobe = dr.clip(strong / dr.maximum(strong + broad + again, 1e-6), *LOBE_CHANCES)
+            lobe = dr.select(broad + again > 0, lobe, 1.0)
             if self.parts.metallic:
                 several = (1.0 - lobe) * again / dr.maximum(broad + again, 1e-12)
         if self.parts.coat:
@@ -299,6 +300,9 @@ class SurfacePoint:
             pdf = dr.select(mirrored, dr.inf, pdf)
         else:
             weight, pdf = self._broad(wo.z), dr.inv_pi * wo.z
+            if self.parts.slopes:
+                # A direction of NaN would meet nothing and bring no light.
+                weight = dr.select(dr.isnan(self.wi.z), dr.nan, weight)
         return omega, dr.select(good, weight, 0.0), dr.select(good, pdf, 0.0)
 
 

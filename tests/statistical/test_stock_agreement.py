@@ -72,7 +72,13 @@ def block(grid: HeightGrid, bsdf: dict[str, Any], folder: Path, tiles: int = 5) 
 
 
 def stock_halves(
-    entries: dict[str, Any], emitter: dict[str, Any], q: Queries, aspect: float, max_depth: int
+    entries: dict[str, Any],
+    emitter: dict[str, Any],
+    q: Queries,
+    aspect: float,
+    max_depth: int,
+    integrator: str = "path",
+    more: dict[str, Any] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Two independent renders of the queries by ``mi.render``: (n, 3) each, SPP/2 rays per query."""
     n = len(q.sigma)
@@ -82,7 +88,12 @@ def stock_halves(
         {
             "type": "scene",
             "embree_use_robust_intersections": True,
-            "integrator": {"type": "path", "max_depth": max_depth, "rr_depth": 1000, "hide_emitters": True},
+            "integrator": {
+                "type": integrator,
+                "max_depth": max_depth,
+                "rr_depth": 1000,
+                "hide_emitters": True,
+            },
             "sensor": {
                 "type": "mbtf_queries",
                 "unit": LONG_SIDE / max(1.0, aspect),
@@ -99,6 +110,7 @@ def stock_halves(
                 },
             },
             "light": emitter,
+            **({} if more is None else {"more": more}),
             **entries,
         }
     )
