@@ -2,9 +2,10 @@
 
     python benchmarks/effects.py [MATERIAL ...] [--queries N] [--spp N] [--rounds N]
 
-For made surfaces (flat Lambert, black, dark, mid-grey) and for every material given — by default the project's
-assets — it prints the time of both, their ratio, what auto leaves out with the cost that the plan states, and
-the cost measured: the RMS change of M, free of noise, relative to the mean value. The last line is a JSON object.
+For made surfaces (flat Lambert, black, dark, mid-grey) and for every material given (by default the
+project's assets) it prints the time of both, their ratio, what auto leaves out with the cost that the plan
+states, and the cost measured: the RMS change of M, free of noise, relative to its mean. The last line is
+a JSON object.
 """
 
 from __future__ import annotations
@@ -98,7 +99,8 @@ def compare(name: str, material: Material, queries: int, spp: int, rounds: int) 
     cap = f", at most {plan.max_depth} interactions" if plan.max_depth else ""
     print(
         f"{name:<20} {row['seconds_auto']:8.2f} s {row['seconds_all']:8.2f} s  x{1 / row['ratio']:<7.3g}"
-        f" cost {plan.cost:.1e}, measured {change:.1e} (<= {cautious:.1e}), mean {row['mean_shift']:+.1e} (z {z:+.1f});"
+        f" cost {plan.cost:.1e}, measured {change:.1e} (<= {cautious:.1e}),"
+        f" mean {row['mean_shift']:+.1e} (z {z:+.1f});"
         f" off: {', '.join(row['off']) or 'nothing'}{cap}",
         flush=True,
     )

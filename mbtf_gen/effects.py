@@ -65,6 +65,7 @@ class EffectsPlan:
     Attributes
     ----------
     max_depth : cap on surface interactions per path; 0 for none
+    cap_cost : cost of that cap where the plan chose it
     roulette_depth : interactions before Russian roulette begins
     mode : what was asked for
     tolerance : allowed cost of all effects left out together
@@ -73,6 +74,7 @@ class EffectsPlan:
 
     effects: tuple[Effect, ...]
     max_depth: int = 0
+    cap_cost: float = 0.0
     roulette_depth: int = 3
     mode: str = "auto"
     tolerance: float = 0.0
@@ -88,7 +90,7 @@ class EffectsPlan:
     @property
     def cost(self) -> float:
         """Cost of everything left out together, at most; relative to the mean value."""
-        return sum(e.cost or 0.0 for e in self.effects if not e.on)
+        return self.cap_cost + sum(e.cost or 0.0 for e in self.effects if not e.on)
 
     def to_manifest(self) -> dict[str, Any]:
         """Plain data for the manifest."""
@@ -98,6 +100,7 @@ class EffectsPlan:
             "tolerance": self.tolerance,
             "cost": self.cost,
             "max_depth": self.max_depth,
+            "cap_cost": self.cap_cost,
             "roulette_depth": self.roulette_depth,
             "closed_form": self.closed_form,
             "effects": effects,
@@ -107,7 +110,7 @@ class EffectsPlan:
     def from_manifest(cls, data: dict[str, Any]) -> EffectsPlan:
         """Inverse of :meth:`to_manifest`."""
         effects = tuple(Effect(**{k: v for k, v in e.items() if k != "effect"}) for e in data["effects"])
-        names = ("max_depth", "roulette_depth", "mode", "tolerance", "closed_form")
+        names = ("max_depth", "cap_cost", "roulette_depth", "mode", "tolerance", "closed_form")
         return cls(effects, **{name: data[name] for name in names})
 
 

@@ -233,9 +233,9 @@ def _of_relief(
     decided["mis"] = wish.decide(_mis(look))
     decided["neighbours"] = Effect("neighbours", True, "rays re-enter the tile")
     decided["interreflection"] = Effect("interreflection", True, "not looked at")
-    decided["interreflection"], cap = _interreflection(look, wish, decided, left)
+    decided["interreflection"], cap, cost = _interreflection(look, wish, decided, left)
     decided["neighbours"] = wish.decide(_neighbours(look, decided))
-    return _assemble(job, _consistent(decided, wish), cap)
+    return _assemble(job, _consistent(decided, wish), cap, cost)
 
 
 def _shadowing(look: _Look, costs: ReliefCosts | None) -> Effect:
@@ -281,23 +281,26 @@ def _bounce_bound(look: _Look) -> float:
     return float(look.albedo.max() * share * brightest)
 
 
-def _interreflection(look: _Look, wish: Wish, decided: dict[str, Effect], left: float) -> tuple[Effect, int]:
-    """Interreflection and its cap, by a pilot with and without it on the same random numbers."""
+def _interreflection(
+    look: _Look, wish: Wish, decided: dict[str, Effect], left: float
+) -> tuple[Effect, int, float]:
+    """Interreflection, its cap and the cap's cost, by a pilot with and without them on the same random
+    numbers."""
     asked = look.job.config.transport.max_depth
     effect = decided["interreflection"]
     if asked == 1:
-        return wish.decide(Effect("interreflection", False, "max_depth 1", None)), 1
+        return wish.decide(Effect("interreflection", False, "max_depth 1", None)), 1, 0.0
     if "interreflection" in wish.forced or wish.base != "auto" or not decided["masking"].on:
         effect = wish.decide(replace(effect, reason="a relief"))
-        return effect, asked
+        return effect, asked, 0.0
     pilot = Pilot(look.job, _assemble(look.job, _consistent(dict(decided), wish), asked))
     cost, upper = pilot.cost_of_limit(1)
     reason = f"{cost:.2g} of the mean value comes from it"
     if upper <= left:
-        return Effect("interreflection", False, reason, upper, "pilot"), 1
+        return Effect("interreflection", False, reason, upper, "pilot"), 1, 0.0
     found = Effect("interreflection", True, reason, cost, "pilot")
     if asked:
-        return found, asked
+        return found, asked, 0.0
     # Every further interaction keeps no more than the brightest reflectance of the light.
     brightest = float(look.albedo.max())
     for cap in range(2, DEEPEST_CAP + 1):
@@ -306,8 +309,8 @@ def _interreflection(look: _Look, wish: Wish, decided: dict[str, Effect], left: 
         _, upper = pilot.cost_of_limit(cap)
         if upper <= left:
             reason += f"; at most {cap} interactions, the rest is below {upper:.1g}"
-            return replace(found, reason=reason), cap
-    return replace(found, reason=reason + "; no depth limit, Russian roulette"), 0
+            return replace(found, reason=reason), cap, upper
+    return replace(found, reason=reason + "; no depth limit, Russian roulette"), 0, 0.0
 
 
 def _neighbours(look: _Look, decided: dict[str, Effect]) -> Effect:
@@ -355,9 +358,9 @@ def without(plan: EffectsPlan, name: str) -> EffectsPlan:
     return replace(plan, effects=tuple(decided.values()))
 
 
-def _assemble(job: Job, decided: dict[str, Effect], cap: int) -> EffectsPlan:
+def _assemble(job: Job, decided: dict[str, Effect], cap: int, cost: float = 0.0) -> EffectsPlan:
     effects = tuple(decided[name] for name in EFFECTS)
-    return EffectsPlan(effects, cap, job.config.transport.roulette_depth)
+    return EffectsPlan(effects, cap, cost, job.config.transport.roulette_depth)
 
 
 def _known_exactly(look: _Look, plan: EffectsPlan) -> bool:
