@@ -2,16 +2,20 @@
 
     python benchmarks/surface.py [--runs 5] [--queries 32768] [--spp 16]
 
-**Energy**: what a white surface under white light returns, by roughness and cosine of the view, from 2^16
+**Energy**: what a white surface under white light returns, by roughness and cosine of the view, from 2^18
 samples of the BSDF's own sampler.
 **Cost**: processor seconds per million paths of the estimator, on a relief of 256² cells with bitmaps of
 colour, roughness and metallic, light of 1°, at most 6 interactions; the least of the runs, which alternate.
 Processor time, not elapsed time, so that other work on the machine matters little.
+
+Tables go to standard error; the last line is one JSON object with the figures.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import sys
 import time
 from typing import Any
 
@@ -25,7 +29,12 @@ COSINES = (1.0, 0.5, 0.2, 0.05)
 WHITE = {"type": "rgb", "value": 1.0}
 
 
-def albedo(mi: Any, bsdf: dict[str, Any], cosine: float, count: int = 1 << 16) -> float:
+def say(line: str) -> None:
+    """One line to standard error."""
+    print(line, file=sys.stderr, flush=True)
+
+
+def albedo(mi: Any, bsdf: dict[str, Any], cosine: float, count: int = 1 << 18) -> float:
     """∫ f μo dωo of a BSDF for a view of the given cosine."""
     import drjit as dr
 
@@ -39,15 +48,19 @@ def albedo(mi: Any, bsdf: dict[str, Any], cosine: float, count: int = 1 << 16) -
     return float(np.mean(np.array(weight.x, np.float64)))
 
 
-def print_energy(mi: Any) -> None:
-    """One table each for a dielectric over a white base, and for white metal."""
+def energies(mi: Any) -> dict[str, dict[str, list[float]]]:
+    """Returned shares of a dielectric over a white base, and of white metal."""
+    out: dict[str, dict[str, list[float]]] = {}
     for metallic, name in ((0.0, "dielectric over white"), (1.0, "white metal")):
-        print(f"{name}: returned share at view cosines {COSINES}")
+        say(f"{name}: returned share at view cosines {COSINES}")
+        out[name] = {}
         for kind in ("principled", "mbtf_surface"):
             for roughness in ROUGHNESSES:
                 bsdf = {"type": kind, "base_color": WHITE, "roughness": roughness, "specular": 0.5}
                 row = [albedo(mi, {**bsdf, "metallic": metallic}, c) for c in COSINES]
-                print(f"  {kind:14} roughness {roughness:<5}", "  ".join(f"{x:.3f}" for x in row))
+                out[name][f"{kind} {roughness}"] = [round(x, 4) for x in row]
+                say(f"  {kind:14} roughness {roughness:<5}  " + "  ".join(f"{x:.3f}" for x in row))
+    return out
 
 
 def relief(resolution: int = 256) -> NDArray[np.float64]:
@@ -88,8 +101,8 @@ def surfaces(mi: Any) -> dict[str, dict[str, Any]]:
     }
 
 
-def print_cost(mi: Any, runs: int, count: int, spp: int) -> None:
-    """Processor time per path, and its ratio to ``principled``'s."""
+def costs(mi: Any, runs: int, count: int, spp: int) -> dict[str, float]:
+    """Processor seconds per million paths."""
     from mbtf_gen.estimator import Estimator, Stream
     from mbtf_gen.heightfield import HeightGrid
     from mbtf_gen.light import LightKernel
@@ -121,10 +134,10 @@ def print_cost(mi: Any, runs: int, count: int, spp: int) -> None:
                 seconds[name].append(time.process_time() - start)
     million = count * spp / 1e6
     least = {name: min(s) / million for name, s in seconds.items()}
-    for name, s in least.items():
-        print(
-            f"{name:26} {s:5.2f} processor s per million paths, {s / least['principled']:.2f} of principled"
-        )
+    for name, value in least.items():
+        ratio = value / least["principled"]
+        say(f"{name:26} {value:5.2f} processor s per million paths, {ratio:.2f} of principled")
+    return {name: round(value, 3) for name, value in least.items()}
 
 
 def main() -> None:
@@ -139,8 +152,8 @@ def main() -> None:
     from mbtf_gen.scene import register_plugins
 
     register_plugins()
-    print_energy(mi)
-    print_cost(mi, options.runs, options.queries, options.spp)
+    figures = {"energy": energies(mi), "cost": costs(mi, options.runs, options.queries, options.spp)}
+    print(json.dumps(figures))
 
 
 if __name__ == "__main__":

@@ -150,7 +150,8 @@ def in_region(held_out: HeldOutSection, omega: NDArray[np.float32]) -> NDArray[n
     if held_out.radius == 0:
         return np.zeros(len(omega), bool)
     centre = np.asarray(held_out.direction, np.float32)
-    return ((omega[:, :2] - centre) ** 2).sum(1) < np.float32(held_out.radius) ** 2
+    with np.errstate(over="ignore"):  # of damaged shards
+        return ((omega[:, :2] - centre) ** 2).sum(1) < np.float32(held_out.radius) ** 2
 
 
 def _marks(held_out: HeldOutSection, queries: Queries, seed: int, shard: int) -> NDArray[np.int8]:

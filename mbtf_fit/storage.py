@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from mbtf_gen.atomic import write_file
-from mbtf_gen.errors import InputError
+from mbtf_gen.errors import InputError, reason
 
 _KEY = "mbtf"
 
@@ -49,5 +49,4 @@ def read_tensors(path: Path, device: torch.device | str = "cpu") -> tuple[dict[s
     except FileNotFoundError:
         raise InputError("no such file", where=path) from None
     except (SafetensorError, OSError, ValueError, RecursionError) as error:
-        text = " ".join(str(error).split())[:200]
-        raise InputError(f"cannot be read as tensors ({text})", where=path) from None
+        raise InputError(f"cannot be read as tensors ({reason(error)})", where=path) from None

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from .errors import InputError, PartialError
+from .errors import InputError, PartialError, reason
 
 
 def sync_folder(folder: Path) -> None:
@@ -94,7 +94,7 @@ def read_json(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", where=path) from None
     except (ValueError, RecursionError) as error:
-        raise InputError(f"not readable as JSON ({error})", where=path) from None
+        raise InputError(f"not readable as JSON ({reason(error)})", where=path) from None
     if not isinstance(data, dict):
         raise InputError("must hold a JSON object", where=path)
     return data

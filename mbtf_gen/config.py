@@ -17,7 +17,7 @@ from .effects import Wish
 from .errors import UsageError
 from .light import MAX_WIDTH_DEG, MIN_WIDTH_DEG
 from .schema import SCHEMA_VERSION, ArrayFormat, Layout, Tiling
-from .settings import Settings
+from .settings import FileName, Settings
 from .slopes import NormalMode
 
 _COUNT = re.compile(r"^\s*(\d+(?:\.\d+)?(?:[eE][+]?\d+)?)\s*(/\s*texel)?\s*$")
@@ -154,7 +154,7 @@ class GeneratorConfig(Settings):
     """Everything ``mbtf-gen`` needs to make a data set."""
 
     version: Literal[1] = 1
-    material: str = Field(description="height map, folder of maps, or material.yaml")
+    material: FileName = Field(description="height map, folder of maps, or material.yaml")
     geometry: GeometrySection = GeometrySection()
     queries: QueriesSection = QueriesSection()
     light: LightSection = LightSection()

@@ -48,7 +48,7 @@ from typing import Annotated, Any
 
 from cyclopts import App, CycloptsError, Parameter, UnusedCliTokensError
 
-from .errors import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, MbtfError, UsageError
+from .errors import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, MbtfError, UsageError, printable
 
 EXIT_INTERNAL = 1
 _EXIT_BROKEN_PIPE = 141
@@ -258,7 +258,7 @@ class _LogHandler(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         prefix = f"{record.levelname.lower()}: " if record.levelno > logging.INFO else ""
-        print(f"{prefix}{record.getMessage()}", file=sys.stderr, flush=True)
+        print(prefix + printable(record.getMessage()), file=sys.stderr, flush=True)
 
 
 def _route_logs(tokens: Sequence[str], debug: bool) -> None:

@@ -13,6 +13,16 @@ EXIT_PARTIAL = 4
 EXIT_INTERRUPTED = 130
 
 
+def printable(text: str) -> str:
+    """`text` with control characters and others that cannot be shown written as escapes.
+
+    Names and values come from files of anyone's making; a terminal would obey the codes in them.
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
 class MbtfError(Exception):
     """Base of all errors that reach a user as a message.
 
@@ -26,9 +36,9 @@ class MbtfError(Exception):
     exit_code = 1
 
     def __init__(self, what: str, *, where: object = None, cure: str = "") -> None:
-        self.what = what
-        self.where = None if where is None else str(where)
-        self.cure = cure
+        self.what = printable(what)
+        self.where = None if where is None else printable(str(where))
+        self.cure = printable(cure)
         super().__init__(self.message)
 
     @property
@@ -60,3 +70,10 @@ class PartialError(MbtfError):
     """Work is unfinished but what was done is kept; the same command resumes (exit code 4)."""
 
     exit_code = EXIT_PARTIAL
+
+
+def reason(fault: BaseException | str | None, longest: int = 160) -> str:
+    """What another library said went wrong, fit to stand in brackets within a message: one line, at most
+    `longest` characters."""
+    text = printable(" ".join((str(fault) or type(fault).__name__).split()))
+    return text if len(text) <= longest else f"{text[: longest - 3]}..."

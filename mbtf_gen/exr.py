@@ -14,9 +14,14 @@ from numpy.typing import NDArray
 
 from .errors import InputError
 
+# Of all channels of all parts together, so many full images are read.
+_MOST_CHANNELS = 4
+# Tiles may be larger than the image, up to this.
+_TILE_PIXELS = 1 << 20
+
 
 @contextlib.contextmanager
-def _silenced() -> Iterator[None]:
+def silenced() -> Iterator[None]:
     """Keep a native library's remarks on a broken file out of standard output and standard error."""
     sys.stdout.flush()
     sys.stderr.flush()
@@ -25,7 +30,11 @@ def _silenced() -> Iterator[None]:
     try:
         os.dup2(sink, 1)
         os.dup2(sink, 2)
-        with open(os.devnull, "w") as nothing, contextlib.redirect_stdout(nothing):
+        with (
+            open(os.devnull, "w") as nothing,
+            contextlib.redirect_stdout(nothing),
+            contextlib.redirect_stderr(nothing),
+        ):
             yield
     finally:
         os.dup2(saved[0], 1)
@@ -85,14 +94,19 @@ def _read(path: Path, max_pixels: int) -> list[tuple[dict[str, Any], dict[str, N
 
     broken = InputError("cannot be read as an EXR image: it is damaged or cut short", where=path)
     try:
-        with _silenced():
+        with silenced():
             file = OpenEXR.File(str(path), separate_channels=True, header_only=True)
             heads = [part.header for part in file.parts]
     except Exception:  # a damaged file may make the library raise anything
         raise broken from None
     sizes = [_checked_size(head, path, max_pixels) for head in heads]
+    numbers = sum(h * w * len(head["channels"]) for (h, w), head in zip(sizes, heads, strict=True))
+    if numbers > _MOST_CHANNELS * max_pixels:
+        raise InputError(
+            f"claims {numbers:,} numbers; at most {_MOST_CHANNELS * max_pixels:,} are read", where=path
+        )
     try:
-        with _silenced(), OpenEXR.File(str(path), separate_channels=True) as file:
+        with silenced(), OpenEXR.File(str(path), separate_channels=True) as file:
             parts = [{n: np.array(c.pixels) for n, c in part.channels.items()} for part in file.parts]
     except Exception:
         raise broken from None
@@ -118,6 +132,10 @@ def _checked_size(head: dict[str, Any], path: Path, max_pixels: int) -> tuple[in
         raise InputError(
             "data window and display window differ: a cropped tile", where=path, cure="crop the image"
         )
+    tiles = head["tiles"] if head["type"] == OpenEXR.tiledimage else None
+    if tiles is not None and tiles.xSize * tiles.ySize > max(rows * columns, _TILE_PIXELS):
+        # The library takes memory for whole tiles, whatever the size of the image.
+        raise InputError(f"claims tiles of {tiles.xSize} x {tiles.ySize} pixels", where=path)
     if any(c.xSampling != 1 or c.ySampling != 1 for c in head["channels"]):
         raise InputError("subsampled EXR channels are not supported", where=path, cure="save it as plain RGB")
     return rows, columns

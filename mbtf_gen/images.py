@@ -6,6 +6,7 @@ here: which map is sRGB and which is data is the material's business.
 
 from __future__ import annotations
 
+import contextlib
 import warnings as python_warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -15,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .errors import InputError
-from .exr import read_channels
+from .errors import InputError, reason
+from .exr import read_channels, silenced
 from .exr_layers import choose_channels
 from .image_tags import NO_TAGS, Tags, tags_of
 from .near import near_miss
@@ -26,6 +27,9 @@ from .tiff import read_tiff
 
 # A header may claim any size; beyond this nothing is allocated (11 585² pixels).
 MAX_PIXELS = 2**27
+
+# No compression of these formats does better (that of PNG reaches 1032 : 1, with 8 pixels in a byte).
+_PIXELS_PER_BYTE = 1 << 14
 
 # Grey images stored as colour JPG come back with channels that differ by rounding.
 _GREY_CODES = 2.0 / 255.0
@@ -48,6 +52,8 @@ _MAGIC = {
     b"\xff\xd8\xff": "JPEG",
     b"II*\x00": "TIFF",
     b"MM\x00*": "TIFF",
+    b"II+\x00": "TIFF",
+    b"MM\x00+": "TIFF",
     b"\x93NUMPY": "NPY",
 }
 SUFFIXES = tuple(_KINDS)
@@ -156,8 +162,11 @@ def _kind(path: Path) -> str:
 def _check_size(rows: int, columns: int, path: Path) -> None:
     if rows * columns > MAX_PIXELS:
         raise InputError(f"claims {columns} x {rows} pixels; at most {MAX_PIXELS:,} are read", where=path)
-    if rows * columns == 0:
+    if rows * columns <= 0:
         raise InputError("holds no pixels", where=path)
+    size = path.stat().st_size
+    if rows * columns > _PIXELS_PER_BYTE * size:
+        raise InputError(f"is cut short: {size} bytes cannot hold {columns} x {rows} pixels", where=path)
 
 
 def _from_codes(codes: NDArray[Any], bits: int, path: Path) -> Image:
@@ -205,11 +214,21 @@ def _exact(numbers: NDArray[np.floating[Any]], bits: int | None) -> NDArray[np.f
     return np.rint(numbers.astype(np.float64) * largest) / largest
 
 
+def _npy_fault(error: Exception) -> str:
+    """What the array reader means: its own words quote the header's bytes or speak of its way of reading."""
+    known = {
+        "header": "its header is damaged",
+        "Python objects": "it holds Python objects",
+        "mmap length": "it is cut short",
+    }
+    return next((said for word, said in known.items() if word in str(error)), reason(error))
+
+
 def _from_npy(path: Path) -> Image:
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except Exception as error:  # a damaged header may make the parser raise anything
-        raise InputError(f"cannot be read as an npy array ({_first_line(error)})", where=path) from None
+    except Exception as error:  # a damaged header may make the parser raise anything, its bytes included
+        raise InputError(f"cannot be read as an npy array ({_npy_fault(error)})", where=path) from None
     if array.ndim not in (2, 3) or (array.ndim == 3 and not 1 <= array.shape[2] <= 4):
         raise InputError(
             f"holds an array of shape {array.shape}; (H, W) or (H, W, 1..4) is wanted", where=path
@@ -240,7 +259,7 @@ def _from_pillow(path: Path, kind: str) -> Image:
             image = _from_floats(array, path) if floats else _from_codes(array, 8 * array.itemsize, path)
             return replace(image, tags=_tags(path, kind))
     try:
-        with python_warnings.catch_warnings():
+        with python_warnings.catch_warnings(), silenced() if kind == "TIFF" else contextlib.nullcontext():
             python_warnings.simplefilter("ignore")
             with Pillow.open(path, formats=[kind]) as picture:
                 _check_size(picture.height, picture.width, path)
@@ -252,7 +271,7 @@ def _from_pillow(path: Path, kind: str) -> Image:
     except InputError:
         raise
     except Exception as error:  # a damaged file may make the decoder raise anything
-        raise InputError(f"cannot be read as a {kind} image ({_first_line(error)})", where=path) from None
+        raise InputError(f"cannot be read as a {kind} image ({reason(error)})", where=path) from None
 
 
 def _tags(path: Path, kind: str) -> Tags:
@@ -260,16 +279,12 @@ def _tags(path: Path, kind: str) -> Tags:
     from PIL import Image as Pillow
 
     try:
-        with python_warnings.catch_warnings():
+        with python_warnings.catch_warnings(), silenced():
             python_warnings.simplefilter("ignore")
             with Pillow.open(path, formats=[kind]) as picture:
                 return tags_of(picture.info, picture.getexif())
     except Exception:  # what the library does not know may make it raise anything
         return NO_TAGS
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error) or type(error).__name__).splitlines()[0]
 
 
 def _refuse_deep_tiff(picture: Any, path: Path) -> None:
@@ -309,17 +324,19 @@ def grey(image: Image) -> tuple[NDArray[np.float64], list[str]]:
     rounding) is grey too; other colours are reduced to their Rec.709 luminance with a warning. Alpha is
     dropped, with a warning where it is not 1 everywhere.
     """
-    pixels, found = image.pixels, []
+    pixels, warnings = image.pixels, []
     if pixels.shape[2] in (2, 4) and np.any(pixels[..., -1] != 1.0):
-        found.append(f"{image.path}: its alpha channel is not used")
+        warnings.append(f"{image.path}: its alpha channel is not used")
     rgb = pixels[..., : 3 if pixels.shape[2] > 2 else 1]
     spread = float(np.max(rgb.max(axis=-1) - rgb.min(axis=-1)))
     if spread == 0.0:
-        return _exact(rgb[..., 0], image.bits), found
+        return _exact(rgb[..., 0], image.bits), warnings
     tolerance = _GREY_CODES if image.bits == 8 else 1e-4 * float(np.abs(rgb).max())
     if spread > tolerance:
-        found.append(f"{image.path}: is coloured where one number per pixel is wanted; its luminance is used")
-    return rgb.astype(np.float64) @ np.asarray(LUMINANCE), found
+        warnings.append(
+            f"{image.path}: is coloured where one number per pixel is wanted; its luminance is used"
+        )
+    return rgb.astype(np.float64) @ np.asarray(LUMINANCE), warnings
 
 
 def srgb_to_linear(encoded: ArrayLike) -> NDArray[np.floating[Any]]:

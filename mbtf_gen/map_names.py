@@ -13,7 +13,8 @@ from .images import SUFFIXES, is_image
 Role = Literal["height", "basecolor", "roughness", "metallic", "normal", "opacity"]
 Convention = Literal["gl", "dx"]
 
-_WORDS: dict[Role, tuple[str, ...]] = {
+# Words of file names that mean a map.
+WORDS: dict[Role, tuple[str, ...]] = {
     "height": ("height", "heightmap", "displacement", "disp", "bump"),
     "basecolor": ("basecolor", "basecolour", "albedo", "color", "colour", "col", "diffuse", "diff"),
     "roughness": ("roughness", "rough", "rgh"),
@@ -21,12 +22,15 @@ _WORDS: dict[Role, tuple[str, ...]] = {
     "normal": ("normal", "normals", "nor", "nrm", "normalgl", "normaldx"),
     "opacity": ("opacity", "alpha", "mask"),
 }
-_ROLES: dict[str, Role] = {word: role for role, words in _WORDS.items() for word in words}
-# Maps that are known but of no use here, and why.
-_UNUSED: dict[str, str] = {
+_ROLES: dict[str, Role] = {word: role for role, words in WORDS.items() for word in words}
+# Words of maps that are known but not used by themselves, and why.
+UNUSED: dict[str, str] = {
     **dict.fromkeys(("ao", "occlusion"), "ambient occlusion comes out of the simulation"),
-    **dict.fromkeys(("arm", "orm", "rma"), "packed maps are not unpacked; save its channels as files"),
-    **dict.fromkeys(("specular", "spec", "gloss", "glossiness"), "name it in a material.yaml to use it"),
+    **dict.fromkeys(
+        ("arm", "orm", "rma"), "name its channels in a material.yaml, as in roughness: {file: …, channel: G}"
+    ),
+    **dict.fromkeys(("specular", "spec"), "name it in a material.yaml to use it"),
+    **dict.fromkeys(("gloss", "glossiness"), "in a material.yaml it is roughness: {file: …, invert: true}"),
     **dict.fromkeys(("emissive", "emission", "preview", "thumb"), "it has no use here"),
 }
 _PIECE = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
@@ -56,7 +60,7 @@ def role_of(name: str) -> Role | None:
 
 
 def _last_word(name: str) -> str | None:
-    return next((t for t in reversed(tokens(name)) if t in _ROLES or t in _UNUSED), None)
+    return next((t for t in reversed(tokens(name)) if t in _ROLES or t in UNUSED), None)
 
 
 def normal_convention(name: str) -> Convention | None:
@@ -93,7 +97,7 @@ def find_maps(folder: Path) -> FoundMaps:
         if role is not None:
             candidates.setdefault(role, []).append(path)
         elif word is not None:
-            notes.append(f"{path.name} is not used: {_UNUSED[word]}")
+            notes.append(f"{path.name} is not used: {UNUSED[word]}")
         else:
             unnamed.append(path.name)
     if unnamed:
@@ -117,6 +121,6 @@ def find_maps(folder: Path) -> FoundMaps:
         raise InputError(
             f"no height map among {', '.join(p.name for p in files[:6])}",
             where=folder,
-            cure=f"its name must hold one of: {', '.join(_WORDS['height'])}",
+            cure=f"its name must hold one of: {', '.join(WORDS['height'])}",
         )
     return FoundMaps(maps, notes)

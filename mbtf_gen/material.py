@@ -305,11 +305,20 @@ def _bsdf(tree: dict[str, Any], load: MapLoader) -> tuple[dict[str, Any], dict[s
         if isinstance(value, dict):
             out[key], nameless[key] = _bsdf(value, load)
         elif key == "filename" and isinstance(value, str):
-            path = (load.folder / value).resolve()
-            if not path.is_file():
+            try:
+                path = (load.folder / value).resolve()
+                found = path.is_file()
+            except (OSError, ValueError):
+                raise InputError("the bsdf names a file that cannot be", where=load.folder) from None
+            if not found:
                 raise InputError("no such file (named in the bsdf)", where=path, cure=near_miss(path))
             load.files[f"bsdf.{sum(r.startswith('bsdf.') for r in load.files)}"] = path
             out[key], nameless[key] = str(path), digest(path)
-        else:
+        elif value is None or isinstance(value, str | bool | int | float | list):
             out[key] = nameless[key] = value
+        else:
+            kind = type(value).__name__
+            raise InputError(
+                f"the bsdf's '{key}' is a {kind}; text and numbers are wanted", where=load.folder
+            )
     return out, nameless

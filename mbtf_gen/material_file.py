@@ -9,10 +9,9 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, model_validator
 
 from .image_tags import ColourSpace
-from .settings import Settings, build, read_yaml
+from .settings import FileName, Settings, build, read_yaml
 
 Share = Annotated[float, Field(ge=0, le=1)]
-FileName = Annotated[str, Field(min_length=1)]
 Channel = Annotated[str, Field(min_length=1)]
 _CHANNEL = "channel or layer of an EXR file; R, G, B, A or Y of others; default: all that belongs together"
 
@@ -63,8 +62,8 @@ class _FileOrValue(Settings):
     def _one(self) -> _FileOrValue:
         if (self.file is None) == (getattr(self, "value", None) is None):
             raise ValueError("needs either 'file' or 'value'")
-        if self.file is None and (self.channel is not None or getattr(self, "invert", False)):
-            raise ValueError("'channel' and 'invert' go with 'file'")
+        if self.file is None and self.channel is not None:
+            raise ValueError("'channel' goes with 'file'")
         return self
 
 
@@ -85,6 +84,12 @@ class ShareEntry(_FileOrValue):
     value: Share | None = Field(None, description="one number")
     colourspace: ColourSpace = Field("linear", description="srgb decodes the stored numbers of a map first")
     invert: bool = Field(False, description="take 1 - x of a map, such as gloss for roughness")
+
+    @model_validator(mode="after")
+    def _of_a_map(self) -> ShareEntry:
+        if self.file is None and (self.invert or self.colourspace != "linear"):
+            raise ValueError("'invert' and 'colourspace' go with 'file'")
+        return self
 
 
 class NormalEntry(Settings):

@@ -41,6 +41,7 @@ _CLEAR, _AHEAD = (0.3, 8.0), (0.1, 4.0)
 # Correlations so close are one.
 _TIE = 1e-6
 _FLATTEST = 0.1
+_SMALLEST = 4
 
 
 @dataclass(frozen=True)
@@ -92,18 +93,19 @@ class _Guess:
 
 
 def slopes_of_heights(height: Array) -> Array:
-    """Slopes (2, H, W) along u and y = a·v of periodic heights (H, W), by central differences, in stored
-    heights per tile width."""
-    columns = height.shape[1]
-    along_u = np.roll(height, -1, 1) - np.roll(height, 1, 1)
-    along_v = np.roll(height, 1, 0) - np.roll(height, -1, 0)
-    return np.stack([along_u, along_v]) * (0.5 * columns)
+    """Slopes (2, H-2, W-2) of heights (H, W) along u and y = a·v, by central differences, in stored heights
+    per tile width. The outermost texels are left out: heights need not tile."""
+    along_u = height[1:-1, 2:] - height[1:-1, :-2]
+    along_v = height[:-2, 1:-1] - height[2:, 1:-1]
+    return np.stack([along_u, along_v]) * (0.5 * height.shape[1])
 
 
 def slopes_of_normals(normal: Array) -> Array:
-    """Slopes (2, H, W) along u and y that normals (H, W, 3) claim, their mean removed."""
-    up = np.maximum(normal[..., 2], _FLATTEST)
-    slopes = np.stack([-normal[..., 0] / up, -normal[..., 1] / up]).astype(np.float64)
+    """Slopes (2, H-2, W-2) along u and y that normals (H, W, 3) claim, their mean removed, without the
+    outermost texels."""
+    inner = normal[1:-1, 1:-1]
+    up = np.maximum(inner[..., 2], _FLATTEST)
+    slopes = np.stack([-inner[..., 0] / up, -inner[..., 1] / up]).astype(np.float64)
     return slopes - slopes.mean(axis=(1, 2), keepdims=True)
 
 
@@ -114,8 +116,10 @@ def fit_normals(height: Array, normal: Array) -> NormalFit | None:
     too small to tell.
     """
     fitted = _common(height, normal, _FITTED)
+    if min(fitted[0].shape) < _SMALLEST:
+        return None
     s, t = slopes_of_heights(fitted[0]), slopes_of_normals(fitted[1])
-    if min(s.shape[1:]) < 4 or not _energy(s) > 0 or not _energy(t) > 1e-9 * t.size:
+    if not _energy(s) > 0 or not _energy(t) > 1e-9 * t.size:
         return None
     along = [_correlation(s[i : i + 1], t[i : i + 1]) for i in (0, 1)]
     h, n = _common(height, normal, _COMPARED)

@@ -46,7 +46,7 @@ class PreviewSection(Settings):
 
     view: Direction = Field(Direction(elevation=40, azimuth=-90), description="where the camera stands")
     light: Direction = Field(Direction(elevation=35, azimuth=150), description="where the light comes from")
-    tiles: Annotated[int, Field(ge=1, le=4)] = Field(2, description="tiles shown along each side")
+    block: Annotated[int, Field(ge=1, le=4)] = Field(2, description="tiles along each side of what is drawn")
     size: Annotated[int, Field(ge=64, le=8192)] = Field(640, description="pixels across")
     spp: Paths = Field(16, description="paths per pixel of the path-traced picture")
 

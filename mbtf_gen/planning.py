@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from .effects import EFFECTS, OF_RELIEF, Effect, EffectsPlan, Wish
 from .errors import UsageError
 from .pilot import Pilot, pilot_queries
-from .relief import POINTS, ReliefCosts, largest_slope, relief_costs
+from .relief_costs import POINTS, ReliefCosts, largest_slope, relief_costs
 
 if TYPE_CHECKING:
     from .generation import Job

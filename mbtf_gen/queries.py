@@ -72,6 +72,15 @@ class Mixture:
         rest = (xi - self.log_uniform) / self.finest if self.finest > 0 else xi
         return np.where(first, share * finest, low + rest * (finest - low))
 
+    def density(self, level: NDArray[np.float64], finest: int) -> NDArray[np.float64]:
+        """Density per level at fractional levels (any shape) for k = `finest` ≥ 1; 0 outside [0, k]."""
+        low = max(finest - 1, 0)
+        inside = (level >= 0) & (level <= finest)
+        near = inside & (level >= low)
+        return np.where(inside, self.log_uniform / finest, 0.0) + np.where(
+            near, self.finest / (finest - low), 0.0
+        )
+
 
 @dataclass(frozen=True)
 class QueryPlan:

@@ -1,151 +1,85 @@
-"""What a relief does to light, estimated on its height grid alone, before anything is rendered.
-
-Rays are marched over the periodic heights, and a Lambert surface is shaded with and without an effect. The
-change at single points (σ → 0) is never smaller, in the root mean square, than that of footprint averages
-(Jensen), so it bounds the cost for any mixture of levels.
-"""
+"""Measures of a relief: slopes of its mesh, how fine its detail is, whether it repeats within the tile."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .heightfield import HeightGrid
-from .slopes import height_slopes
 
-F64 = NDArray[np.float64]
-
-# Rays per estimate, and cells across beyond which a grid is thinned for marching.
-POINTS = 4096
-MARCH_CELLS = 256
-# Steps after which a marched ray is taken to be free.
-MAX_STEPS = 4096
+# A self-repetition shows as a peak of the autocorrelation at least so high, after a dip at least so low.
+_PEAK, _DIP = 0.8, 0.5
+_SHORTEST = 4
 
 
-@dataclass(frozen=True)
-class ReliefCosts:
-    """Costs of leaving effects of the relief out, relative to the mean value, for a Lambert surface.
-
-    Attributes
-    ----------
-    masking : the plane with the mesh's slopes in place of the displaced tile, shadows left out too
-    shadowing : the displaced tile without shadows
-    normal : shading without the given residual slopes
-    """
-
-    masking: float
-    shadowing: float
-    normal: float
-
-
-def largest_slope(grid: HeightGrid) -> float:
-    """Largest slope of any triangle of the mesh (tangent of its angle to the plane)."""
+def triangle_slopes(grid: HeightGrid) -> NDArray[np.float64]:
+    """Slopes |∇z| of all triangles of the periodic mesh (2·H·W,); all cover the same part of the plane."""
     rows, columns = grid.z.shape
-    dx = np.abs(np.roll(grid.z, -1, 1) - grid.z) * columns
-    dy = np.abs(np.roll(grid.z, -1, 0) - grid.z) * (rows / grid.aspect)
-    # A triangle has one edge of each kind; both of its neighbours' count.
-    across = np.maximum(dx, np.roll(dx, -1, 0))
-    along = np.maximum(dy, np.roll(dy, -1, 1))
-    return float(np.hypot(across, along).max())
+    z = grid.z
+    right, low = np.roll(z, -1, 1), np.roll(z, -1, 0)
+    low_right = np.roll(low, -1, 1)
+    per_x, per_y = float(columns), rows / grid.aspect
+    first = np.hypot((low_right - low) * per_x, (z - low) * per_y)
+    second = np.hypot((right - z) * per_x, (right - low_right) * per_y)
+    return np.concatenate([first.ravel(), second.ravel()])
 
 
-class _Field:
-    """Bilinear periodic samples of a grid."""
-
-    def __init__(self, values: F64, aspect: float) -> None:
-        self.values, self.aspect = values, aspect
-
-    def __call__(self, x: F64, y: F64) -> F64:
-        rows, columns = self.values.shape[:2]
-        i = x * columns - 0.5
-        j = (1.0 - y / self.aspect) * rows - 0.5
-        i0, j0 = np.floor(i).astype(np.int64), np.floor(j).astype(np.int64)
-        s, t = i - i0, j - j0
-        if self.values.ndim == 3:
-            s, t = s[:, None], t[:, None]
-        i0, i1, j0, j1 = i0 % columns, (i0 + 1) % columns, j0 % rows, (j0 + 1) % rows
-        v = self.values
-        top = v[j0, i0] * (1 - s) + v[j0, i1] * s
-        low = v[j1, i0] * (1 - s) + v[j1, i1] * s
-        out: F64 = top * (1 - t) + low * t
-        return out
+def slope_angles(grid: HeightGrid) -> tuple[float, float, float]:
+    """Median, 99th percentile and maximum of the triangles' slopes, degrees."""
+    slopes = triangle_slopes(grid)
+    median, high = np.percentile(slopes, (50, 99))
+    return tuple(float(np.degrees(np.arctan(s))) for s in (median, high, slopes.max()))  # type: ignore[return-value]
 
 
-def _march(
-    field: _Field, origin: F64, direction: F64, step: float, relief: float
-) -> tuple[F64, NDArray[np.bool_]]:
-    """First points (n, 3) where rays dip below the heights, and which rays do before they leave the
-    relief."""
-    horizontal = np.hypot(direction[:, 0], direction[:, 1])
-    # A step moves at most one cell sideways and a fiftieth of the relief up or down.
-    pace = 1.0 / np.maximum(horizontal / step, np.abs(direction[:, 2]) / (0.02 * relief))
-    point = origin.copy()
-    hit = np.zeros(len(origin), bool)
-    going = np.arange(len(origin))
-    for _ in range(MAX_STEPS):
-        if not len(going):
-            break
-        point[going] += direction[going] * pace[going, None]
-        p = point[going]
-        below = p[:, 2] < field(p[:, 0], p[:, 1])
-        hit[going[below]] = True
-        going = going[~below & (p[:, 2] <= 0.0) & (p[:, 2] >= -1.01 * relief)]
-    return point, hit
+def rms_slope(grid: HeightGrid) -> float:
+    """Root mean square of the triangles' slopes."""
+    return float(np.sqrt(np.mean(triangle_slopes(grid) ** 2)))
 
 
-def _lambert(slope: F64, omega_i: F64) -> F64:
-    """Reflected share of unit irradiance on the reference plane, for a facet of given slopes."""
-    up = 1.0 / np.sqrt(1.0 + np.sum(slope**2, axis=-1))
-    cosine = up * (omega_i[:, 2] - np.sum(slope * omega_i[:, :2], axis=-1))
-    return np.maximum(cosine, 0.0) / omega_i[:, 2]
+def autocorrelation(height: NDArray[np.floating[Any]], axis: int) -> NDArray[np.float64]:
+    """Periodic autocorrelation of heights (H, W) at lags 0 … half the size along an axis; 1 at lag 0.
 
-
-def relief_costs(
-    grid: HeightGrid,
-    omega_i: F64,
-    omega_o: F64,
-    albedo: F64,
-    residual: F64 | None = None,
-) -> ReliefCosts:
-    """Estimate costs from pairs of directions.
-
-    Parameters
-    ----------
-    grid : heights, relief > 0
-    omega_i, omega_o : (n, 3) directions as the run draws them
-    albedo : (h, w) reflectance, any resolution
-    residual : (h, w, 2) slopes that a normal map adds
+    All zeros beyond lag 0 for constant heights.
     """
-    thin = max(1, -(-max(grid.z.shape) // MARCH_CELLS))
-    z = grid.z[::thin, ::thin]
-    heights = _Field(z, grid.aspect)
-    slopes = _Field(height_slopes(grid), grid.aspect)
-    colour = _Field(albedo, grid.aspect)
-    step = 1.0 / z.shape[1]
-    n = len(omega_i)
-    rng = np.random.default_rng(0)
-    foot = np.column_stack([rng.random(n), rng.random(n) * grid.aspect, np.zeros(n)])
+    size = height.shape[axis]
+    lines = np.moveaxis(np.asarray(height, np.float64), axis, -1)
+    power = np.abs(np.fft.rfft(lines - lines.mean(), axis=-1)) ** 2
+    covariance = np.fft.irfft(power.mean(axis=0), size)[: size // 2 + 1]
+    if covariance[0] <= 0:
+        out = np.zeros(size // 2 + 1)
+        out[0] = 1.0
+        return out
+    return covariance / covariance[0]
 
-    met, _ = _march(heights, foot, -omega_o, step, grid.relief)
-    start = met.copy()
-    start[:, 2] = heights(met[:, 0], met[:, 1]) + 0.02 * grid.relief
-    _, shadowed = _march(heights, start, omega_i, step, grid.relief)
 
-    there = slopes(met[:, 0], met[:, 1])
-    shade = colour(met[:, 0], met[:, 1]) * _lambert(there, omega_i)
-    value = np.where(shadowed, 0.0, shade)
-    here = colour(foot[:, 0], foot[:, 1]) * _lambert(slopes(foot[:, 0], foot[:, 1]), omega_i)
-    mean = max(float(value.mean()), 1e-12)
+def detail_size(height: NDArray[np.floating[Any]]) -> float:
+    """Texels within which heights lose half of their correlation, in the quicker direction (interpolated)."""
+    return min(_half_width(autocorrelation(height, axis)) for axis in (0, 1))
 
-    def cost(change: F64) -> float:
-        return float(np.sqrt(np.mean(change**2))) / mean
 
-    normal = 0.0
-    if residual is not None:
-        tilted = there + _Field(residual, grid.aspect)(met[:, 0], met[:, 1])
-        normal = cost(
-            np.where(shadowed, 0.0, colour(met[:, 0], met[:, 1]) * _lambert(tilted, omega_i) - shade)
-        )
-    return ReliefCosts(cost(here - value), cost(shade - value), normal)
+def _half_width(correlation: NDArray[np.float64]) -> float:
+    below = np.nonzero(correlation < 0.5)[0]
+    if not len(below):
+        return float(len(correlation))
+    after = int(below[0])
+    before = after - 1
+    drop = correlation[before] - correlation[after]
+    return before + float((correlation[before] - 0.5) / drop)
+
+
+def repeats(height: NDArray[np.floating[Any]], axis: int) -> int:
+    """How often heights (H, W) repeat themselves along an axis within the tile; 1 where they do not.
+
+    The first lag at which the autocorrelation peaks at 0.8 or more after falling below 0.5.
+    """
+    correlation = autocorrelation(height, axis)
+    dip = np.nonzero(correlation < _DIP)[0]
+    if not len(dip):
+        return 1
+    inner = correlation[1:-1]
+    peak = (inner >= _PEAK) & (inner >= correlation[:-2]) & (inner >= correlation[2:])
+    lags = np.nonzero(peak)[0] + 1
+    lags = lags[(lags > dip[0]) & (lags >= _SHORTEST)]
+    return max(1, round(height.shape[axis] / lags[0])) if len(lags) else 1

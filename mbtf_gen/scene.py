@@ -6,6 +6,7 @@ exact enough for a ray offset of 1e-6 tile widths.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -16,6 +17,7 @@ import numpy as np
 
 from .bsdf import SurfaceBSDF, surface_of
 from .emitter import SmoothedDirectional
+from .errors import InputError, reason
 from .heightfield import HeightGrid, grid_faces, grid_vertices
 from .periodic import Period
 from .sensor import QuerySensor
@@ -93,13 +95,26 @@ def mesh_of_grid(grid: HeightGrid, unit: float, apron: tuple[int, int], bsdf: An
     return mesh
 
 
+def _load_bsdf(bsdf: Mapping[str, Any]) -> Any:
+    try:
+        return mi.load_dict(dict(bsdf))
+    except Exception as error:  # whatever the plugins raise about their parameters
+        text = re.sub(r"\[\w+\.cpp:\d+\]\s*", "", reason(error, 250))
+        raise InputError(f"Mitsuba does not take the BSDF '{bsdf.get('type')}' ({text})") from None
+
+
 def build_tile(grid: HeightGrid, bsdf: Mapping[str, Any] | Any, apron_share: float = APRON_SHARE) -> Tile:
-    """Tile of a height grid and a BSDF (a Mitsuba dictionary or object)."""
+    """Tile of a height grid and a BSDF (a Mitsuba dictionary or object).
+
+    Raises
+    ------
+    InputError : Mitsuba does not take the BSDF
+    """
     register_plugins()
     rows, columns = grid.z.shape
     unit = LONG_SIDE / max(1.0, grid.aspect)
     cells = (max(2, round(apron_share * rows)), max(2, round(apron_share * columns)))
-    loaded = mi.load_dict(dict(bsdf)) if isinstance(bsdf, Mapping) else bsdf
+    loaded = _load_bsdf(bsdf) if isinstance(bsdf, Mapping) else bsdf
     mesh = mesh_of_grid(grid, unit, cells, loaded)
     # Robust intersections: otherwise one ray in 10⁵ slips between two triangles.
     scene = mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, "tile": mesh})

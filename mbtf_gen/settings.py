@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import difflib
 import io
+import os
 import re
 from collections.abc import Iterator, Mapping, Sequence, Set
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
-from .errors import InputError, MbtfError, UsageError
+from .errors import InputError, MbtfError, UsageError, reason
 from .wording import explain, models_in
 
 
@@ -27,12 +28,28 @@ class Settings(BaseModel):
 
 S = TypeVar("S", bound=BaseModel)
 
+
+def _file_name(name: str) -> str:
+    try:
+        usable = "\0" not in name and all(len(os.fsencode(part)) <= 255 for part in name.split("/"))
+    except UnicodeError:
+        usable = False
+    if not usable or len(name) > 4000:
+        raise ValueError("is no name that a file can have")
+    return name
+
+
+# The name of a file, or a path to it.
+FileName = Annotated[str, Field(min_length=1), AfterValidator(_file_name)]
+
 _COMMAND_LINE = "command line"
 
 # A configuration that is longer, deeper or (through YAML's aliases) larger than this is no configuration.
 _MAX_CHARACTERS = 1 << 18
 _MAX_DEPTH = 100
 _MAX_VALUES = 100_000
+# Tags that stand for plain values.
+_TAGS = ("map", "seq", "str", "int", "float", "bool", "null", "timestamp", "binary", "set", "omap")
 
 
 def _yaml() -> Any:
@@ -67,23 +84,19 @@ def read_yaml(path: Path) -> Any:
     except MarkedYAMLError as error:
         mark = error.problem_mark
         line = f":{mark.line + 1}" if mark is not None else ""
-        raise InputError(f"not valid YAML ({error.problem})", where=f"{path}{line}") from None
+        raise InputError(f"not valid YAML ({reason(error.problem)})", where=f"{path}{line}") from None
     except YAMLError as error:
-        raise InputError(f"not valid YAML ({str(error).splitlines()[0]})", where=path) from None
+        raise InputError(f"not valid YAML ({reason(error)})", where=path) from None
     except RecursionError:
         raise InputError(_too_deep(), where=path) from None
     except Exception as error:  # the reader turns scalars into numbers and dates, and may raise anything
-        raise InputError(f"not valid YAML ({_first_line(error)})", where=path) from None
+        raise InputError(f"not valid YAML ({reason(error)})", where=path) from None
     if data is None:
         return {}
     if not isinstance(data, Mapping):
         raise InputError("must hold a mapping of keys to values", where=path)
     _check_tree(data, path)
     return data
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error) or type(error).__name__).splitlines()[0][:200]
 
 
 def _too_deep() -> str:
@@ -116,7 +129,7 @@ def _check_tree(data: Any, where: object) -> None:
             what = _too_deep() if depth > _MAX_DEPTH else f"holds more than {_MAX_VALUES:,} values"
             raise InputError(what, where=where, cure="aliases (*name) count as what they stand for")
         tag = getattr(getattr(value, "tag", None), "value", None)
-        if tag is not None and not str(tag).startswith("tag:yaml.org"):
+        if tag is not None and str(tag).removeprefix("tag:yaml.org,2002:") not in _TAGS:
             raise InputError(f"holds the tag '{tag}'", where=where, cure="plain values are wanted")
         if isinstance(value, Mapping):
             for key, inner in value.items():
@@ -283,7 +296,7 @@ def resolve(
     for assignment in assignments:
         key, sign, text = assignment.partition("=")
         if not sign or not key:
-            raise UsageError(f"'{assignment}' is not of the form key=value", where="--set")
+            raise UsageError(f"{_shown(assignment)} is not of the form key=value", where="--set")
         given.append((key.strip(), _parse_value(text)))
     given += [(key, value) for key, value in (flags or {}).items() if value is not None]
     if file is not None:

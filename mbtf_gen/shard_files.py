@@ -17,7 +17,7 @@ from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 
 from .atomic import write_file, write_through
-from .errors import InputError
+from .errors import InputError, reason
 from .schema import ARRAY, ARRAYS, ArrayFormat
 
 Arrays = dict[str, NDArray[np.float32]]
@@ -132,17 +132,17 @@ def read_npz(path: Path, names: Iterable[str] | None = None, *, mapped: bool = T
     except InputError:
         raise
     except Exception as error:  # a damaged archive or header may make its parser raise anything
-        raise InputError(f"shard cannot be read ({str(error).partition(chr(10))[0]})", where=path) from None
+        raise InputError(f"shard cannot be read ({reason(error)})", where=path) from None
     return out
 
 
 def _npy_header(stream: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    version = npy_format.read_magic(stream)
-    if version == (1, 0):
-        return npy_format.read_array_header_1_0(stream)
-    if version == (2, 0):
-        return npy_format.read_array_header_2_0(stream)
-    raise ValueError(f"npy format {version[0]}.{version[1]}")
+    try:
+        version = npy_format.read_magic(stream)
+        readers = {(1, 0): npy_format.read_array_header_1_0, (2, 0): npy_format.read_array_header_2_0}
+        return readers[version](stream)
+    except Exception:  # a damaged header may make its parser raise anything, the header's bytes included
+        raise ValueError("the header of an array is damaged") from None
 
 
 def _fold(array: NDArray[np.float32], lead: tuple[int, ...]) -> NDArray[np.float32]:

@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import InputError
+from .errors import InputError, reason
 
 _GREY, _RGB = 1, 2
 
@@ -59,8 +59,7 @@ def read_tiff(path: Path, check_size: Callable[[int, int, Path], None]) -> NDArr
     except InputError:
         raise
     except Exception as error:  # a damaged file may make the decoder raise anything
-        text = (str(error) or type(error).__name__).splitlines()[0]
-        raise InputError(f"cannot be read as a TIFF image ({text})", where=path) from None
+        raise InputError(f"cannot be read as a TIFF image ({reason(error)})", where=path) from None
     if page.planarconfig == 2 and channels > 1:
         array = np.moveaxis(array.reshape(channels, rows, columns), 0, -1)
     if array.size != rows * columns * channels:

@@ -77,6 +77,8 @@ def explain(fault: Mapping[str, Any], model: type[BaseModel]) -> str:
         return f"must be {context['expected']}"
     if kind == "too_short":
         return f"must hold at least {context['min_length']}"
+    if kind == "string_pattern_mismatch":
+        return f"must match {context['pattern']}"
     if kind == "string_too_short":
         return "must not be empty"
     expected = (

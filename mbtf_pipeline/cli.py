@@ -75,7 +75,7 @@ def _summary(result: RunResult) -> dict[str, Any]:
 
 
 def _describe(result: RunResult) -> str:
-    from .report_pictures import estimate
+    from .wording import estimate
 
     ran = [f"{n} {clock(o.stamp.seconds)}" for n, o in result.outcomes.items() if o.ran]
     lines = [f"{result.report}: {', '.join(ran) or 'everything up to date'}"]
@@ -130,8 +130,14 @@ def _entry(path: Path, verbose: bool) -> dict[str, Any]:
             decisions = survey(recipe, recipe.folder)
             entry["stages"] = {name: d.reason or "up to date" for name, d in decisions.items()}
     except MbtfError as error:
-        entry["error"] = error.message.splitlines()[0]
+        entry["error"] = _without(path, error.message.splitlines()[0])
     return entry
+
+
+def _without(path: Path, message: str) -> str:
+    """A message about a recipe without the recipe's path, which stands before it already."""
+    rest = message.removeprefix(f"{path}:")
+    return message if rest == message else f"line {rest}" if rest[:1].isdigit() else rest.strip()
 
 
 @app.command

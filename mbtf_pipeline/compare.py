@@ -8,14 +8,25 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mbtf_gen.atomic import write_json
 from mbtf_gen.config import GeneratorConfig
 from mbtf_gen.directions import from_angles
 
+from .flip import flip
 from .metrics import DEFINITIONS, Score, halves_score, score, white_point
 from .offsets import write_offsets
-from .pictures import PICTURES, Scene, fit_name, reference_name, scenes, write_picture, write_preview
+from .pictures import (
+    PICTURES,
+    Scene,
+    fit_name,
+    reference_name,
+    scenes,
+    write_map,
+    write_picture,
+    write_preview,
+)
 from .recipe import CompareSection
 
 if TYPE_CHECKING:
@@ -26,8 +37,10 @@ if TYPE_CHECKING:
 
 COMPARISON_NAME = "comparison.json"
 COMPARISON_FORMAT = "mbtf-comparison"
-COMPARISON_SCHEMA = 1
+# Raised when the record or what lies beside it changes; part of what the stage depends on.
+COMPARISON_SCHEMA = 2
 
+F32 = NDArray[np.float32]
 Progress = Callable[[str], None]
 
 
@@ -150,7 +163,7 @@ def _picture(
 ) -> dict[str, Any]:
     """Write one scene's pictures and measure them."""
     from mbtf_gen.levels import level_of_sigma
-    from mbtf_gen.stats import pooled_relative_error
+    from mbtf_gen.stats import mse_difference, pooled_relative_error
 
     record: dict[str, Any] = scene.describe()
     record["references"] = {}
@@ -163,10 +176,13 @@ def _picture(
         query, pixel = images["query"], images["pixel"]
         between = halves_score((query.value_a, query.value_b), pixel.value_a, pixel.value_b)
         record["between_references"] = between.as_dict()
-    queries = next(iter(images.values())).queries
+    main_kind, main = next(iter(images.items()))
+    record["references"][main_kind]["flip"] = flip(main.value_a, main.value_b, white).as_dict()
+    queries = main.queries
     level = level_of_sigma(queries.sigma)
     record["levels"] = [round(float(level.min()), 3), round(float(level.max()), 3)]
     record["fits"] = {}
+    values: list[F32] = []
     for name, material in materials.items():
         start = time.perf_counter()
         flat = queries.flat()
@@ -179,10 +195,18 @@ def _picture(
         errors: dict[str, Score] = {
             kind: score(value, image.value_a, image.value_b) for kind, image in images.items()
         }
+        visible = flip(value, main.value, white)
+        write_map(out / file, visible.hdr_map)
         record["fits"][name] = {
             "file": file,
             "seconds": round(seconds, 4),
             "errors": {kind: s.as_dict(white) for kind, s in errors.items()},
+            "flip": visible.as_dict(),
         }
+        if values:
+            halves = [x.reshape(-1, 3) for x in (main.value_a, main.value_b)]
+            apart = mse_difference(value.reshape(-1, 3), values[0].reshape(-1, 3), *halves)
+            record["fits"][name]["mse_less_first"] = apart.as_dict()
+        values.append(value)
         progress(f"{name} {scene.name}")
     return record

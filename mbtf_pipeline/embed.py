@@ -1,54 +1,33 @@
-"""Pictures as ``data:`` URIs, within a budget of bytes, and difference pictures with a stated scale."""
+"""Pictures as ``data:`` URIs and packed linear data, within a budget of bytes."""
 
 from __future__ import annotations
 
 import base64
 import io
-import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .linear_data import Coding, pack
+from .maps import Palette, indices, palette
+
 U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
-
-# Colours of a signed difference from -1 to 1, sRGB: blue is too dark, orange too bright, near black is
-# right. Blue and orange stay apart under every common colour-vision deficiency; lightness alone gives size.
-_STOPS = (-1.0, -0.5, 0.0, 0.5, 1.0)
-_COLOURS = ((199, 233, 255), (34, 136, 209), (13, 15, 20), (214, 98, 16), (255, 232, 189))
+Field = NDArray[np.floating]
+Linear = Callable[[], F32]
 
 
-def signed_colours(x: NDArray[np.floating]) -> U8:
-    """sRGB (..., 3) of numbers (...) in [-1, 1]; numbers beyond are shown as the ends."""
-    t = np.clip(np.nan_to_num(np.asarray(x, np.float64)), -1.0, 1.0)
-    channels = [np.interp(t, _STOPS, [c[i] for c in _COLOURS]) for i in range(3)]
-    return np.round(np.stack(channels, axis=-1)).astype(np.uint8)
-
-
-def difference_picture(fit: F32, reference: F32, scale: float) -> U8:
-    """Mean over channels of fit minus reference (rows, columns, 3), as colours; ±`scale` are the ends."""
-    return signed_colours((fit.astype(np.float64) - reference).mean(axis=-1) / scale)
-
-
-def round_scale(x: float) -> float:
-    """The next of 1, 2, 5 times a power of ten that is not below x; 1 where x is not positive."""
-    if not x > 0 or not math.isfinite(x):
-        return 1.0
-    power = 10.0 ** math.floor(math.log10(x))
-    return next(m * power for m in (1.0, 2.0, 5.0, 10.0) if m * power >= x * (1 - 1e-9))
-
-
-def difference_scale(pairs: Sequence[tuple[F32, F32]], white: float) -> float:
-    """Scale for difference pictures of (fit, reference) pairs, as a rounded share of `white`.
-
-    The 99th percentile of the absolute difference over all of them, so that the scale is one for all.
-    """
-    if not pairs:
-        return 1.0
-    sizes = np.concatenate([np.abs((f.astype(np.float64) - r).mean(axis=-1)).ravel() for f, r in pairs])
-    return round_scale(float(np.percentile(sizes, 99)) / white)
+def shrink(values: Field, factor: int) -> Field:
+    """Average `factor` × `factor` pixels of (rows, columns, ...); rows and columns left over are cut off."""
+    if factor == 1:
+        return values
+    factor = min(factor, *values.shape[:2])
+    rows, columns = (n // factor for n in values.shape[:2])
+    cut = values[: rows * factor, : columns * factor]
+    out: Field = cut.reshape(rows, factor, columns, factor, *values.shape[2:]).mean(axis=(1, 3))
+    return out
 
 
 @dataclass(frozen=True)
@@ -57,36 +36,33 @@ class Encoding:
 
     Attributes
     ----------
-    quality : of JPEG without subsampling; None for lossless PNG
+    bits : of a channel's logarithmic code
+    quality : of JPEG for the fixed pictures, without subsampling
     shrink : this many pixels along each side become one
     """
 
-    quality: int | None
+    bits: int
+    quality: int
     shrink: int = 1
 
-    @property
-    def name(self) -> str:
+    def describe(self, coding: Coding) -> str:
         """In words."""
-        kind = "PNG, lossless" if self.quality is None else f"JPEG, quality {self.quality}"
-        return kind if self.shrink == 1 else f"{kind}, every {self.shrink} × {self.shrink} pixels averaged"
-
-    def encode(self, pixels: U8) -> tuple[str, bytes]:
-        """(media type, bytes)."""
-        from PIL import Image
-
-        image = Image.fromarray(pixels)
-        if self.shrink > 1:
-            image = image.reduce(self.shrink)
-        stream = io.BytesIO()
-        if self.quality is None:
-            image.save(stream, "PNG", optimize=True)
-            return "image/png", stream.getvalue()
-        image.save(stream, "JPEG", quality=self.quality, subsampling=0, optimize=True)
-        return "image/jpeg", stream.getvalue()
+        data = f"{self.bits} bits per channel on a logarithmic scale, within {coding.relative_error:.1%}"
+        size = (
+            ""
+            if self.shrink == 1
+            else f"; to keep the file small, {self.shrink} × {self.shrink} pixels averaged"
+        )
+        return f"{data}{size}"
 
 
 # From the best to the smallest.
-ENCODINGS = (Encoding(None), Encoding(95), Encoding(88), Encoding(75), *(Encoding(75, s) for s in (2, 4, 8)))
+ENCODINGS = (
+    Encoding(10, 88),
+    Encoding(9, 85),
+    Encoding(8, 80),
+    *(Encoding(8, 75, s) for s in (2, 4, 8, 16)),
+)
 
 
 def data_uri(media: str, content: bytes) -> str:
@@ -94,23 +70,90 @@ def data_uri(media: str, content: bytes) -> str:
     return f"data:{media};base64,{base64.b64encode(content).decode()}"
 
 
-def embed(pictures: Mapping[str, Callable[[], U8]], budget: float) -> tuple[dict[str, str], Encoding]:
-    """``data:`` URIs of all pictures with the best encoding that fits.
+def photograph(display: U8, quality: int) -> str:
+    """``data:`` URI of an 8-bit sRGB picture as JPEG."""
+    from PIL import Image
+
+    stream = io.BytesIO()
+    Image.fromarray(display).save(stream, "JPEG", quality=quality, subsampling=0, optimize=True)
+    return data_uri("image/jpeg", stream.getvalue())
+
+
+def chart(field: Field, name: Palette) -> str:
+    """``data:`` URI of a map (rows, columns) in a palette's colours as PNG."""
+    from PIL import Image
+
+    image = Image.fromarray(indices(field, name))
+    image.putpalette([channel for colour in palette(name) for channel in colour])
+    stream = io.BytesIO()
+    image.save(stream, "PNG", optimize=True)
+    return data_uri("image/png", stream.getvalue())
+
+
+@dataclass
+class Gallery:
+    """What the page shows, by name; read when it is encoded.
+
+    Attributes
+    ----------
+    white : linear value shown as white, 1/sr
+    linear : pictures (rows, columns, 3) in 1/sr
+    charts : maps (rows, columns) with their palettes, sizes from 0 to 1 or signed from -1 to 1
+    """
+
+    white: float
+    linear: dict[str, Linear] = field(default_factory=dict)
+    charts: dict[str, tuple[Palette, Callable[[], Field]]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Embedded:
+    """Everything encoded.
+
+    Attributes
+    ----------
+    images : name → ``data:`` URI, of linear pictures at 0 EV
+    packed : name of a linear picture → {rows, columns, data}
+    """
+
+    encoding: Encoding
+    coding: Coding
+    images: dict[str, str]
+    packed: dict[str, Mapping[str, int | str]]
+
+    @property
+    def size(self) -> int:
+        """Bytes of all that is embedded."""
+        return sum(map(len, self.images.values())) + sum(len(str(p["data"])) for p in self.packed.values())
+
+
+def embed(gallery: Gallery, budget: float) -> Embedded:
+    """Encode a gallery with the best encoding that fits.
 
     Parameters
     ----------
-    pictures : name → function that makes its pixels (rows, columns, 3)
-    budget : bytes that all URIs may take together; with the smallest encoding they may take more
+    budget : bytes that all may take together; with the smallest encoding they may take more
     """
     for encoding in ENCODINGS:
-        out: dict[str, str] = {}
-        total = 0
-        last = encoding is ENCODINGS[-1]
-        for name, pixels in pictures.items():
-            out[name] = data_uri(*encoding.encode(pixels()))
-            total += len(out[name])
-            if total > budget and not last:
-                break
-        if total <= budget or last:
-            return out, encoding
-    raise AssertionError("the last encoding is always taken")
+        out = encode(gallery, encoding)
+        if out.size <= budget:
+            break
+    return out
+
+
+def encode(gallery: Gallery, encoding: Encoding) -> Embedded:
+    """Encode a gallery in one way."""
+    from mbtf_gen.reference import to_display
+
+    pictures = {name: read() for name, read in gallery.linear.items()}
+    coding = Coding.spanning(pictures.values(), gallery.white, encoding.bits)
+    images: dict[str, str] = {}
+    packed: dict[str, Mapping[str, int | str]] = {}
+    for name, picture in pictures.items():
+        small = shrink(picture, encoding.shrink).astype(np.float32)
+        images[name] = photograph(to_display(small, 1.0 / gallery.white), encoding.quality)
+        data = base64.b64encode(pack(coding.encode(small))).decode()
+        packed[name] = {"rows": small.shape[0], "columns": small.shape[1], "data": data}
+    for name, (colours, read) in gallery.charts.items():
+        images[name] = chart(shrink(read(), encoding.shrink), colours)
+    return Embedded(encoding, coding, images, packed)

@@ -16,16 +16,21 @@ from numpy.typing import ArrayLike
 
 from mbtf_gen.stats import Estimate, mean_estimate, noise_free_mse
 
+from .flip import DEFINITION as FLIP_DEFINITION
+
 # Floor of the relative error's denominator, as a share of the picture's mean value.
 RELATIVE_FLOOR = 0.1
 
 DEFINITIONS: dict[str, str] = {
     "mse": "mean of (p-a)(p-b) over pixels and channels, 1/sr²; p the picture, a and b the reference's "
     "independent halves: the reference's noise drops out, so a value may come out slightly negative",
-    "psnr": "10 log10(peak²/MSE) in dB, with the noise-free MSE; the peak is the value shown as white",
+    "psnr": "10 log10(peak²/MSE) in dB, with the noise-free MSE; its peak is the value shown as white "
+    "at 0 EV",
     "relative_mse": "mean of (p-a)(p-b) / (t² + (0.1 m)²), t = (a+b)/2 per pixel and channel, m the "
     "picture's mean value",
-    "error_bar": "one standard error, from the scatter over the picture's pixels",
+    "flip": FLIP_DEFINITION,
+    "error_bar": "one standard error, from the scatter over the picture's pixels or the data's queries; a "
+    "value within two of its own is printed as below its error bar, with the bar",
 }
 
 

@@ -107,6 +107,55 @@ def write_preview(path: Path, value: F32, white: float) -> None:
     write_file(with_ending(path, ".png"), lambda stream: image.save(stream, "PNG", optimize=True))
 
 
+# What a fit's map of HDR-FLIP is called, beside its picture.
+_FLIP = "-flip.png"
+
+
+def write_map(path: Path, flip: F32) -> None:
+    """Write a map (rows, columns) from 0 to 1 as ``path`` + ``-flip.png``, 8-bit grey, atomically."""
+    from PIL import Image
+
+    from mbtf_gen.atomic import write_file
+
+    image = Image.fromarray(np.round(255.0 * np.clip(flip, 0.0, 1.0)).astype(np.uint8))
+    write_file(with_ending(path, _FLIP), lambda stream: image.save(stream, "PNG", optimize=True))
+
+
+def read_map(path: Path) -> F32:
+    """The map (rows, columns) from 0 to 1 that :func:`write_map` wrote.
+
+    Raises
+    ------
+    InputError : missing or damaged
+    """
+    from PIL import Image
+
+    from mbtf_gen.errors import InputError
+
+    file = with_ending(path, _FLIP)
+    try:
+        with Image.open(file) as image:
+            return (np.asarray(image.convert("L"), np.float32) / 255.0).astype(np.float32)
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"cannot be read ({error})", where=file, cure="run the recipe again: it is made anew"
+        ) from None
+
+
+def read_halves(path: Path) -> tuple[F32, F32]:
+    """Both halves of a reference, linear RGB (rows, columns, 3).
+
+    Raises
+    ------
+    InputError : missing or damaged
+    """
+    from mbtf_gen.exr import read_channels
+
+    channels = read_channels(with_ending(path, ".exr"), 1 << 26)
+    a, b = (np.stack([channels[f"value_{h}.{c}"] for c in "RGB"], axis=-1) for h in "ab")
+    return a.astype(np.float32), b.astype(np.float32)
+
+
 def read_picture(path: Path) -> F32:
     """Linear RGB (rows, columns, 3) of a picture: of a reference the mean of its halves.
 

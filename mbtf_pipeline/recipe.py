@@ -80,9 +80,6 @@ class ReportSection(Settings):
     exposure: float | None = Field(
         None, gt=0, description="factor from 1/sr to display white; default: from the reference pictures"
     )
-    stops: Annotated[
-        list[Annotated[float, Field(ge=-10, le=10)]], Field(min_length=1), AfterValidator(_distinct)
-    ] = Field([0.0], description="every picture is shown at the exposure times 2^stop")
     max_megabytes: float = Field(9.5, ge=1, le=100, description="largest size of the file")
 
 
@@ -163,10 +160,27 @@ def load_recipe(path: Path, assignments: Sequence[str] = ()) -> Recipe:
         raise InputError(
             f"material '{written}' does not exist",
             where="--set generate.material" if assigned else f"{path}:{line}" if line else path,
-            cure=f"looked for {os.path.abspath(material)}",
+            cure=_cure(path, material, assigned),
         )
     generate = recipe.generate.model_copy(update={"material": os.path.normpath(material)})
     return recipe.model_copy(update={"generate": generate})
+
+
+# Materials that are published and not part of the project, by the name of their folder.
+_PUBLISHED = {"rock_cliff": "ambientCG Rock023 (CC0, https://ambientcg.com/view?id=Rock023)"}
+
+
+def _cure(path: Path, material: Path, assigned: bool) -> str:
+    """What to do about a material that is not there."""
+    looked = f"looked for {os.path.abspath(material)}"
+    source = _PUBLISHED.get(material.name)
+    if source is None:
+        return looked if assigned else f"{looked}; edit 'generate.material' in {path}"
+    named = "" if assigned else f" or edit 'generate.material' in {path}"
+    return (
+        f"{looked}; its maps are {source}: put them there{named}, or name their folder with "
+        "--set generate.material=FOLDER"
+    )
 
 
 def _find(path: Path) -> Path:

@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 from mbtf_gen.atomic import read_json, write_text
+from mbtf_gen.errors import InputError
 
-from .compare import COMPARISON_NAME
-from .embed import embed, signed_colours
+from .compare import COMPARISON_NAME, COMPARISON_SCHEMA
+from .embed import ENCODINGS, Embedded, Gallery, embed, encode
 from .fit_records import read_training
+from .linear_data import EXPOSURE_STOPS
+from .maps import palette
 from .recipe import RECIPE_NAME, Recipe
 from .report_errors import error_context
-from .report_pictures import Gallery, show_offsets, show_pictures
+from .report_offsets import show_offsets
+from .report_pictures import Shown, show_pictures
 from .report_time import provenance, time_context
 from .report_training import training_context
 from .run_folder import COMPARE, FITS, REPORT, RUN_NAME, SHARDS
+
+# Raised when the page changes; part of what the report's stage depends on.
+LAYOUT = 2
 
 _TABLE = """
 <table><thead><tr>{% for h in t.head %}<th>{{ h }}</th>{% endfor %}</tr></thead><tbody>
@@ -36,14 +44,6 @@ def _environment() -> Any:
     return environment
 
 
-def _gradient() -> str:
-    """CSS of the difference scale, the same colours as in the pictures."""
-    import numpy as np
-
-    colours = signed_colours(np.linspace(-1.0, 1.0, 9))
-    return f"linear-gradient(90deg, {', '.join(f'rgb({r} {g} {b})' for r, g, b in colours)})"
-
-
 def write_report(folder: Path, recipe: Recipe, stages: Sequence[str]) -> int:
     """Write ``report.html`` of the finished run in `folder`; returns its size in bytes.
 
@@ -52,11 +52,17 @@ def write_report(folder: Path, recipe: Recipe, stages: Sequence[str]) -> int:
     InputError : a file of the run is missing or damaged
     """
     comparison = read_json(folder / COMPARE / COMPARISON_NAME)
+    if comparison.get("schema") != COMPARISON_SCHEMA:
+        raise InputError(
+            "was written by another version",
+            where=folder / COMPARE / COMPARISON_NAME,
+            cure="run the recipe again: the pictures are compared anew, data and fits are kept",
+        )
     manifest = read_json(folder / SHARDS / "manifest.json")
     run = read_json(folder / RUN_NAME)
     white = comparison["white"] if recipe.report.exposure is None else 1.0 / recipe.report.exposure
-    gallery = Gallery()
-    shown = show_pictures(folder / COMPARE, comparison, white, list(recipe.report.stops), gallery)
+    gallery = Gallery(white)
+    shown = show_pictures(folder / COMPARE, comparison, gallery)
     offsets = show_offsets(folder / COMPARE, comparison["offsets"], gallery)
     fit_folders = {name: folder / FITS / name for name in comparison["fits"]}
     histories = {name: read_training(path) for name, path in fit_folders.items()}
@@ -65,13 +71,8 @@ def write_report(folder: Path, recipe: Recipe, stages: Sequence[str]) -> int:
         "comparison": comparison,
         "description": recipe.description,
         "groups": shown.groups,
-        "heroes": shown.heroes,
-        "columns": shown.columns,
-        "gradient": _gradient(),
-        "scale_low": f"−{shown.scale:.0%}" if shown.scale >= 0.01 else f"−{shown.scale:.1%}",
-        "scale_high": f"+{shown.scale:.0%}" if shown.scale >= 0.01 else f"+{shown.scale:.1%}",
-        "scale_text": "of white, fit minus reference, mean of the channels",
-        "stops": [_stop(s) for s in recipe.report.stops],
+        "scenes": shown.scenes,
+        "bars": {bar.key: bar for bar in shown.bars},
         "offsets": offsets,
         "offset_columns": len(offsets[0]["cells"]) if offsets else 1,
         "effects": manifest["effects"]["effects"],
@@ -82,17 +83,48 @@ def write_report(folder: Path, recipe: Recipe, stages: Sequence[str]) -> int:
         **training_context(histories),
         **time_context(folder, stages, manifest, comparison, histories),
     }
-    plots = [p["svg"] for key in ("error_plots", "training_plots", "time_plots") for p in context[key]]
-    budget = recipe.report.max_megabytes * 1e6 - sum(map(len, plots)) - 200_000
-    images, encoding = embed(gallery.makers, budget)
-    context["images"] = images
-    context["white"] = white
-    context["encoding"] = encoding.name
-    template = (files("mbtf_pipeline") / "templates" / "report.html").read_text(encoding="utf-8")
-    html = _environment().from_string(template).render(context)
+    budget = recipe.report.max_megabytes * 1e6
+    # What is not pictures is measured with the smallest ones, and the rest is theirs.
+    smallest = encode(gallery, ENCODINGS[-1])
+    rest = len(_render(context, comparison, shown, smallest, white).encode()) - smallest.size
+    html = _render(context, comparison, shown, embed(gallery, budget - rest), white)
     write_text(folder / REPORT, html)
     return len(html.encode())
 
 
-def _stop(stop: float) -> str:
-    return "±0 EV" if stop == 0 else f"{stop:+g} EV".replace("-", "−")
+def _render(
+    context: Mapping[str, Any],
+    comparison: Mapping[str, Any],
+    shown: Shown,
+    embedded: Embedded,
+    white: float,
+) -> str:
+    """The page."""
+    pictures = {
+        "images": embedded.images,
+        "white": white,
+        "encoding": embedded.encoding.describe(embedded.coding),
+        "stops": EXPOSURE_STOPS,
+        "viewer": _viewer(comparison, shown, embedded, white),
+        "style": _template("report.css"),
+        "script": _template("report.js"),
+    }
+    html: str = _environment().from_string(_template("report.html")).render(context, **pictures)
+    return html
+
+
+def _template(name: str) -> str:
+    return (files("mbtf_pipeline") / "templates" / name).read_text(encoding="utf-8")
+
+
+def _viewer(comparison: Mapping[str, Any], shown: Shown, embedded: Embedded, white: float) -> str:
+    """What the page's script reads, as JSON that may stand within a ``<script>`` element."""
+    data = {
+        "white": white,
+        "coding": embedded.coding.describe(),
+        "fits": comparison["fits"],
+        "scenes": shown.scenes,
+        "pictures": embedded.packed,
+        "difference": {"scale": shown.difference * white, "colours": palette("signed")},
+    }
+    return json.dumps(data, ensure_ascii=False, separators=(",", ":")).replace("<", "\\u003c")

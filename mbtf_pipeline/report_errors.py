@@ -7,10 +7,17 @@ from collections.abc import Mapping
 from typing import Any
 
 from .plots import points
-from .report_pictures import decibel, estimate, percent
+from .report_pictures import flip_texts
+from .wording import decibel, error_text, estimate, percent, short_direction
 
 UNEXPLAINED = "unexplained variance"
-_TERMS = {"mse": "MSE", "psnr": "PSNR", "relative_mse": "relative MSE", "error_bar": "error bar"}
+_TERMS = {
+    "mse": "MSE",
+    "psnr": "PSNR",
+    "relative_mse": "relative MSE",
+    "flip": "FLIP",
+    "error_bar": "error bar",
+}
 
 
 def _first_split(comparison: Mapping[str, Any]) -> dict[str, Any]:
@@ -40,14 +47,17 @@ def _facts(comparison: Mapping[str, Any]) -> list[dict[str, str]]:
         value = f"{100 * e.value:.1f} %" if math.isfinite(e.value) else "–"
         out.append({"value": value, "what": f"of the test values' variance unexplained by {fit}"})
     fit = comparison["fits"][0]
-    main = "query" if "query" in comparison["kinds"] else comparison["kinds"][0]
-    decibels = [p["fits"][fit]["errors"][main]["psnr"]["value"] for p in comparison["pictures"]]
+    decibels = [
+        p["fits"][fit]["errors"][main_kind(comparison)]["psnr"]["value"] for p in comparison["pictures"]
+    ]
     finite = sorted(d for d in decibels if d is not None)
     if finite:
         middle = finite[len(finite) // 2]
         out.append(
             {"value": f"{middle:.1f} dB", "what": f"median PSNR of {fit} over {len(decibels)} pictures"}
         )
+    visible = sorted(p["fits"][fit]["flip"]["hdr"] for p in comparison["pictures"])
+    out.append({"value": f"{visible[len(visible) // 2]:.3f}", "what": f"median HDR-FLIP of {fit}, 0 is none"})
     record = comparison["test"][fit]
     size = 4 * (record["network_weights"] + record["texels"]) / 1024
     out.append({"value": f"{size:,.0f} KiB", "what": f"{fit}: textures and network as float32"})
@@ -69,8 +79,8 @@ def _table(comparison: Mapping[str, Any]) -> dict[str, Any]:
             percent(estimate(record["splits"][s]["unexplained"])) if s in record["splits"] else "–"
             for s in splits
         ]
-        mse = estimate(record["splits"]["test"]["mse"]).scaled(1e3)
-        rows.append([fit, *cells, str(mse), f"{record['network_weights']:,}", f"{record['texels']:,}"])
+        mse = error_text(estimate(record["splits"]["test"]["mse"]), 1e3)
+        rows.append([fit, *cells, mse, f"{record['network_weights']:,}", f"{record['texels']:,}"])
     return {"head": head, "rows": rows}
 
 
@@ -114,7 +124,7 @@ def _groups_table(comparison: Mapping[str, Any], key: str, title: str, head: str
             cells += (
                 ["–", "–"]
                 if group is None
-                else [percent(estimate(group["unexplained"])), str(estimate(group["mse"]).scaled(1e3))]
+                else [percent(estimate(group["unexplained"])), error_text(estimate(group["mse"]), 1e3)]
             )
         rows.append([name.replace("-", "–"), f"{first['mse']['n']:,}", *cells])
     heads = [h for fit in splits for h in (f"{fit}: unexplained", f"{fit}: MSE [10⁻³/sr²]")]
@@ -124,23 +134,30 @@ def _groups_table(comparison: Mapping[str, Any], key: str, title: str, head: str
 def _pictures_table(comparison: Mapping[str, Any]) -> dict[str, Any]:
     """One row per picture and fit, errors against each kind of reference."""
     kinds = comparison["kinds"]
+    main = main_kind(comparison)
     rows = []
     for picture in comparison["pictures"]:
-        view, light = (
-            f"{picture[d]['elevation']:g}°, {picture[d]['azimuth']:g}°".replace("-", "−")
-            for d in ("view", "light")
-        )
         for fit in comparison["fits"]:
-            row = [view, light, f"{picture['span']:g}", fit]
+            row = [short_direction(picture[d]) for d in ("view", "light")]
+            row += [f"{picture['span']:g}", fit]
+            made = picture["fits"][fit]
             for kind in kinds:
-                errors = picture["fits"][fit]["errors"][kind]
+                errors = made["errors"][kind]
                 row += [
-                    str(estimate(errors["mse"]).scaled(1e3)),
-                    decibel(errors["psnr"]).removeprefix("PSNR "),
-                    str(estimate(errors["relative_mse"])),
+                    error_text(estimate(errors["mse"]), 1e3),
+                    decibel(errors["psnr"], errors["mse"]),
+                    error_text(estimate(errors["relative_mse"])),
                 ]
+            row += [flip_texts(picture, main, [made], key)[0] for key in ("ldr", "hdr")]
             rows.append(row)
     measures = ("MSE [10⁻³/sr²]", "PSNR", "relative MSE")
     heads = [f"{m}, {kind} reference" for kind in kinds for m in measures]
-    title = f"Pictures (PSNR's peak: {comparison['white']:.3g} 1/sr)"
+    heads += ["LDR-FLIP", "HDR-FLIP"]
+    title = f"Pictures (PSNR’s peak and FLIP’s 0 EV: {comparison['white']:.3g} 1/sr is white)"
     return {"title": title, "head": ["view", "light", "tiles across", "fit", *heads], "rows": rows}
+
+
+def main_kind(comparison: Mapping[str, Any]) -> str:
+    """The kind of reference that FLIP and the maps are against."""
+    kinds = comparison["kinds"]
+    return "query" if "query" in kinds else str(kinds[0])

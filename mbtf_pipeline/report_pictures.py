@@ -1,63 +1,23 @@
-"""The report's pictures: rows of references, fits and differences; half-and-half pictures; offsets."""
+"""The report's pictures: the viewer's scenes, and the sheet of references, fits and error maps."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mbtf_gen.reference import to_display
-from mbtf_gen.stats import Estimate
+from .embed import F32, Field, Gallery
+from .maps import Palette, common_scale, gradient, local_error, ticks
+from .pictures import read_halves, read_map, read_picture
+from .wording import decibel, direction, error_text, estimate, levels, short_direction, width
 
-from .embed import F32, U8, difference_picture, difference_scale, round_scale, signed_colours
-from .offsets import read_offset, towards_view
-from .pictures import read_picture
-from .recipe import View
-
-Maker = Callable[[], U8]
-_HEROES = 3
-
-
-def estimate(record: Mapping[str, Any]) -> Estimate:
-    """An estimate read back from JSON, where numbers that are not finite are null."""
-    value, error = record["value"], record["error"]
-    return Estimate(math.nan if value is None else value, math.inf if error is None else error, record["n"])
-
-
-def percent(e: Estimate, digits: int = 2) -> str:
-    """``12.3 ± 0.4 %``."""
-    return f"{e.scaled(100.0)} %" if math.isfinite(e.value) else "not defined"
-
-
-def decibel(record: Mapping[str, Any]) -> str:
-    """PSNR in words; null stands for an error below the reference's noise."""
-    e = estimate(record)
-    return f"PSNR {e} dB" if math.isfinite(e.value) else "error below the noise"
-
-
-@dataclass
-class Gallery:
-    """Pictures by name, made when they are encoded.
-
-    Attributes
-    ----------
-    makers : name → function that makes the pixels
-    """
-
-    makers: dict[str, Maker] = field(default_factory=dict)
-
-    def add(self, name: str, maker: Maker) -> str:
-        """Register a picture; returns its name."""
-        self.makers[name] = maker
-        return name
-
-
-def _direction(d: Mapping[str, float]) -> str:
-    return f"elevation {d['elevation']:g}°, azimuth {d['azimuth']:g}°".replace("-", "−")
+# Sides that a picture's name and caption tell apart.
+_KIND = {"query": "Reference", "pixel": "Reference, filtered pixel"}
 
 
 def diagram(view: Mapping[str, float], light: Mapping[str, float]) -> str:
@@ -69,9 +29,8 @@ def diagram(view: Mapping[str, float], light: Mapping[str, float]) -> str:
         return r * math.cos(a), -r * math.sin(a)
 
     (vx, vy), (lx, ly) = place(view), place(light)
-    text = f"view {_direction(view)}; light {_direction(light)}"
     return (
-        f'<svg viewBox="-24 -24 48 48" role="img" aria-label="{text}"><title>{text}</title>'
+        '<svg viewBox="-24 -24 48 48" aria-hidden="true">'
         '<g fill="none" stroke="currentColor" opacity=".35"><circle r="20"/><circle r="10"/>'
         '<path d="M-20 0H20M0-20V20" stroke-width=".6"/></g>'
         f'<rect x="{vx - 3.4:.2f}" y="{vy - 3.4:.2f}" width="6.8" height="6.8" rx="1" fill="var(--accent)"/>'
@@ -80,212 +39,254 @@ def diagram(view: Mapping[str, float], light: Mapping[str, float]) -> str:
 
 
 @dataclass(frozen=True)
+class Bar:
+    """A labelled colour bar.
+
+    Attributes
+    ----------
+    key : which map it belongs to; title : what is shown
+    gradient : CSS; ticks : numbers from end to end; unit : of the numbers
+    note : how the quantity is made
+    """
+
+    key: str
+    title: str
+    gradient: str
+    ticks: list[str]
+    unit: str
+    note: str
+
+    @classmethod
+    def of(cls, key: str, palette: Palette, title: str, numbers: list[str], unit: str, note: str) -> Bar:
+        """The bar of a palette."""
+        return cls(key, title, gradient(palette), numbers, unit, note)
+
+
+@dataclass(frozen=True)
 class Shown:
     """The comparison's pictures as the page needs them.
 
     Attributes
     ----------
-    groups : per view and light: title, diagram, rows of cells
-    heroes : reference and first fit in one picture
-    columns : cells per row
-    scale : end of the difference scale, as a share of white
+    groups : per view and light: title, diagram, blocks of figures, one block per span
+    scenes : what the viewer can show, plain data
+    bars : of the maps: local error, HDR-FLIP, signed difference
+    difference : end of the signed scale, as a share of white
     """
 
     groups: list[dict[str, Any]]
-    heroes: list[dict[str, Any]]
-    columns: int
-    scale: float
+    scenes: list[dict[str, Any]]
+    bars: list[Bar]
+    difference: float
 
 
-def show_pictures(
-    folder: Path, comparison: Mapping[str, Any], white: float, stops: list[float], gallery: Gallery
-) -> Shown:
+def show_pictures(folder: Path, comparison: Mapping[str, Any], gallery: Gallery) -> Shown:
     """Lay out all pictures of a comparison.
 
     Parameters
     ----------
     folder : of the comparison
-    white : linear value at display white, 1/sr, at stop 0
+    gallery : takes the pictures; errors are shown as shares of its white
     """
-    values: dict[str, F32] = {}
-
-    def value(file: str) -> F32:
-        if file not in values:
-            values[file] = read_picture(folder / file)
-        return values[file]
-
-    def displayed(file: str) -> list[str]:
-        def maker(stop: float) -> Maker:
-            return lambda: to_display(value(file), 2.0**stop / white)
-
-        return [gallery.add(f"{file}@{stop:g}", maker(stop)) for stop in stops]
-
-    pictures, fits, kinds = comparison["pictures"], comparison["fits"], comparison["kinds"]
-    main_kind = "query" if "query" in kinds else kinds[0]
-    pairs = [
-        (value(p["fits"][fit]["file"]), value(p["references"][main_kind]["file"]))
+    pictures, fits = comparison["pictures"], comparison["fits"]
+    kinds = sorted(comparison["kinds"], key=lambda kind: kind != "query")
+    white = gallery.white
+    errors = {
+        p["fits"][fit]["file"]: _errors(folder, p["fits"][fit]["file"], p["references"][kinds[0]]["file"])
         for p in pictures
         for fit in fits
+    }
+    scales = [
+        common_scale([e[i] / unit for e in errors.values()]) for i, unit in enumerate((white, 1.0, white))
     ]
-    scale = difference_scale(pairs, white)
+    scales[1] = min(scales[1], 1.0)
+    sheet = _Sheet(folder, comparison, kinds, gallery)
+    for file, (local, visible, _) in errors.items():
+        sheet.chart(file, "local", "size", local / (scales[0] * white))
+        sheet.chart(file, "flip", "flip", visible / scales[1])
     groups: list[dict[str, Any]] = []
-    for picture in pictures:
+    scenes = []
+    for number, picture in enumerate(pictures):
         key = (picture["view"], picture["light"])
         if not groups or groups[-1]["key"] != key:
             groups.append(
                 {
                     "key": key,
-                    "index": len(groups),
-                    "title": f"View {_direction(key[0])}  ·  light {_direction(key[1])}",
+                    "title": f"View {direction(key[0])}  ·  light {direction(key[1])}",
                     "diagram": diagram(*key),
-                    "rows": [],
+                    "short": [f"view {short_direction(key[0])}", f"light {short_direction(key[1])}"],
+                    "blocks": [],
                 }
             )
-        rows = groups[-1]["rows"]
-        where = f"view {_direction(key[0])}, light {_direction(key[1])}, {_width(picture['span'])}"
-        cells = []
-        for kind in sorted(kinds, key=lambda k: k == "query"):
-            reference = picture["references"][kind]
-            label = "Reference" if kind == "query" else "Reference, filtered pixel"
-            lines = [f"noise {estimate(reference['noise']).value:.1%} per pixel"]
-            if kind == main_kind:
-                lines.insert(
-                    0, f"{_width(picture['span'])}, {_levels(picture['levels'], comparison['finest'])}"
-                )
-            elif "between_references" in picture:
-                lines.insert(0, _between(estimate(picture["between_references"]), white))
-            cells.append(_cell(displayed(reference["file"]), label, lines, f"{label}: {where}"))
-        for fit in fits:
-            made = picture["fits"][fit]
-            errors = made["errors"][main_kind]
-            lines = [decibel(errors["psnr"]), f"relative MSE {estimate(errors['relative_mse'])}"]
-            cells.append(_cell(displayed(made["file"]), fit, lines, f"{fit}: {where}"))
-            name = gallery.add(
-                f"{made['file']}-difference",
-                _difference(
-                    value(made["file"]), value(picture["references"][main_kind]["file"]), scale * white
-                ),
+        groups[-1]["blocks"].append(sheet.block(number, picture))
+        scenes.append({"group": len(groups) - 1, **sheet.scene(picture)})
+    return Shown(groups, scenes, _bars(scales), scales[2])
+
+
+def _errors(folder: Path, fit: str, reference: str) -> tuple[Field, Field, Field]:
+    """(local error in 1/sr, HDR-FLIP, mean over channels of the signed difference in 1/sr)."""
+    a, b = read_halves(folder / reference)
+    value = read_picture(folder / fit)
+    signed = (value.astype(np.float64) - 0.5 * (a.astype(np.float64) + b)).mean(axis=-1)
+    return local_error(value, a, b), read_map(folder / fit), signed
+
+
+def _bars(scales: list[float]) -> list[Bar]:
+    local, visible, signed = scales
+    return [
+        Bar.of(
+            "local",
+            "size",
+            "Local RMS error",
+            ticks(0, local, 100),
+            "% of white",
+            "without the reference’s noise: root of (p−a)(p−b) averaged over the channels and a Gaussian "
+            "window of 2 pixels; 0 where that average is negative: there the error lies below the noise",
+        ),
+        Bar.of(
+            "flip",
+            "flip",
+            "HDR-FLIP",
+            ticks(0, visible),
+            "of 1, the largest",
+            "how visible the difference is at −2, 0 and +2 EV, the worst of the three; the reference’s noise "
+            "counts",
+        ),
+        Bar.of(
+            "signed",
+            "signed",
+            "Fit − reference",
+            ticks(-signed, signed, 100),
+            "% of white",
+            "mean of the channels; blue is too dark, orange too bright; the reference’s noise shows",
+        ),
+    ]
+
+
+class _Sheet:
+    """Figures of the sheet and scenes of the viewer, with their pictures put into the gallery."""
+
+    def __init__(
+        self, folder: Path, comparison: Mapping[str, Any], kinds: list[str], gallery: Gallery
+    ) -> None:
+        self._folder = folder
+        self._comparison = comparison
+        self._kinds = kinds
+        self._gallery = gallery
+
+    def chart(self, file: str, key: str, palette: Palette, values: Field) -> None:
+        self._gallery.charts[f"{file}-{key}"] = (palette, lambda: values)
+
+    def _linear(self, file: str) -> str:
+        self._gallery.linear[file] = _reader(self._folder / file)
+        return file
+
+    def block(self, number: int, picture: Mapping[str, Any]) -> dict[str, Any]:
+        """Figures of one scene: rows of four, references in the first column."""
+        angles = f"view {direction(picture['view'])}, light {direction(picture['light'])}"
+        where = f"{angles}, {width(picture['span'])}"
+        cells: list[list[dict[str, Any] | None]] = []
+        references = [self._reference(picture, kind, where) for kind in self._kinds]
+        for index in range(max(len(references), len(self._comparison["fits"]))):
+            row: list[dict[str, Any] | None] = [references[index] if index < len(references) else None]
+            if index < len(self._comparison["fits"]):
+                row += self._fit(picture, self._comparison["fits"][index], where)
+            cells.append(row)
+        level = levels(picture["levels"], self._comparison["finest"])
+        return {"title": f"{width(picture['span'])}, {level}", "rows": cells, "scene": number}
+
+    def _reference(self, picture: Mapping[str, Any], kind: str, where: str) -> dict[str, Any]:
+        reference = picture["references"][kind]
+        label = _KIND[kind]
+        lines = [f"noise {100 * estimate(reference['noise']).value:.1f} % per pixel"]
+        if kind != self._kinds[0] and "between_references" in picture:
+            lines.append(
+                f"MSE to the other {error_text(estimate(picture['between_references']), 1e3)} · 10⁻³/sr²"
             )
-            line = _root(estimate(errors["mse"]), white)
-            cells.append(_cell([name], f"{fit} − reference", [line], f"{fit} minus reference: {where}"))
-        rows.append({"index": len(rows), "cells": cells})
-    heroes = _heroes(pictures, fits, main_kind, value, white, gallery)
-    columns = len(kinds) + 2 * len(fits)
-    return Shown(groups, heroes, columns, scale)
+        return {
+            "image": self._linear(reference["file"]),
+            "linear": True,
+            "label": label,
+            "lines": lines,
+            "alt": f"{label}: {where}",
+        }
 
-
-def _between(difference: Estimate, white: float) -> str:
-    """How far the two kinds of reference are apart."""
-    if difference.value <= 2.0 * difference.error:
-        return "differs by less than noise"
-    return f"differs by {math.sqrt(difference.value) / white:.1%} of white"
-
-
-def _root(mse: Estimate, white: float) -> str:
-    """Root mean square error, the reference's noise taken out."""
-    if mse.value <= 0:
-        return "error below the noise"
-    root = math.sqrt(mse.value) / white
-    return f"RMS {Estimate(100 * root, 100 * root * mse.relative_error / 2, mse.n)} % of white"
-
-
-def _levels(levels: list[float], finest: int) -> str:
-    """Levels that a picture asks for, and whether the data have them."""
-    low, high = (f"{level:.1f}" for level in levels)
-    text = f"level {low}" if low == high else f"level {low}–{high}"
-    return text if levels[1] <= finest + 0.1 else f"{text} (finest of the data {finest})"
-
-
-def _width(span: float) -> str:
-    return f"{span:g} tile{'' if span == 1 else 's'} across"
-
-
-def _cell(images: list[str], label: str, lines: list[str], alt: str) -> dict[str, Any]:
-    return {"images": images, "label": label, "lines": lines, "alt": alt}
-
-
-def _difference(fit: F32, reference: F32, scale: float) -> Maker:
-    return lambda: difference_picture(fit, reference, scale)
-
-
-def halves(left: F32, right: F32, white: float) -> U8:
-    """Left half of one picture, right half of another, a thin line between."""
-    middle = left.shape[1] // 2
-    joined = np.concatenate([left[:, :middle], right[:, middle:]], axis=1)
-    out = to_display(joined, 1.0 / white)
-    out[:, middle - 1 : middle + 1] = 255
-    return out
-
-
-def _heroes(
-    pictures: list[dict[str, Any]],
-    fits: list[str],
-    kind: str,
-    value: Callable[[str], F32],
-    white: float,
-    gallery: Gallery,
-) -> list[dict[str, Any]]:
-    """Up to three pictures, of different views and lights where there are such, at the first span."""
-    first = [p for p in pictures if p["span"] == pictures[0]["span"]]
-    picked: list[dict[str, Any]] = []
-    views: list[Any] = []
-    lights: list[Any] = []
-    for picture in first:
-        if picture["view"] not in views and (picture["light"] not in lights or len(lights) == _HEROES):
-            picked.append(picture)
-            views.append(picture["view"])
-            lights.append(picture["light"])
-    picked += [p for p in first if p not in picked]
-    out = []
-    for picture in picked[:_HEROES]:
-        left, right = value(picture["references"][kind]["file"]), value(picture["fits"][fits[0]]["file"])
-
-        def maker(left: F32 = left, right: F32 = right) -> U8:
-            return halves(left, right, white)
-
-        name = gallery.add(f"{picture['name']}-halves", maker)
-        caption = f"View {_direction(picture['view'])}; light {_direction(picture['light'])}"
-        out.append({"image": name, "caption": caption})
-    return out
-
-
-def show_offsets(folder: Path, records: list[dict[str, Any]], gallery: Gallery) -> list[dict[str, Any]]:
-    """Rows of offset pictures: traced, then each fit that learns one; each row with its own scale."""
-    if not records:
-        return []
-    rows: list[tuple[str | None, str]] = [(None, "Traced from the heights")]
-    rows += [(name, f"Learned by {name}") for name in records[0]["fits"]]
-    out = []
-    for index, (what, title) in enumerate(rows):
-        fields = []
-        for record in records:
-            file = record["traced"] if what is None else record["fits"][what]["file"]
-            fields.append(towards_view(read_offset(folder / file), View(**record["view"])))
-        medians = [float(np.median(f)) for f in fields]
-        fields = [f - m for f, m in zip(fields, medians, strict=True)]
-        scale = round_scale(float(np.percentile(np.abs(np.stack(fields)), 99)))
-        cells: list[dict[str, Any]] = []
-        for record, shown, median in zip(records, fields, medians, strict=True):
-
-            def maker(shown: F32 = shown, scale: float = scale) -> U8:
-                return signed_colours(shown / scale)
-
-            name = gallery.add(f"offset-{index}-{len(cells)}", maker)
-            lines = [
-                f"view {_direction(record['view'])}",
-                f"median {median:.2g} tile widths".replace("-", "−"),
-            ]
-            if what is not None and record["fits"][what]["correlation"] is not None:
-                lines.append(f"correlation with the traced one {record['fits'][what]['correlation']:.2f}")
-            alt = f"{title}, view {_direction(record['view'])}"
-            cells.append({"image": name, "label": title, "lines": lines, "alt": alt})
-        out.append(
+    def _fit(self, picture: Mapping[str, Any], fit: str, where: str) -> list[dict[str, Any] | None]:
+        made = picture["fits"][fit]
+        errors = made["errors"][self._kinds[0]]
+        file = made["file"]
+        return [
             {
-                "index": index,
-                "cells": cells,
-                "low": f"−{scale:g}",
-                "high": f"+{scale:g} tile widths",
-                "scale_text": "towards the viewer's azimuth, less each picture's median",
-            }
-        )
-    return out
+                "image": self._linear(file),
+                "linear": True,
+                "label": fit,
+                "lines": [f"PSNR {decibel(errors['psnr'], errors['mse'])}"],
+                "alt": f"{fit}: {where}",
+            },
+            {
+                "image": f"{file}-local",
+                "linear": False,
+                "label": "Local RMS error",
+                "lines": [f"MSE {error_text(estimate(errors['mse']), 1e3)} · 10⁻³/sr²"],
+                "alt": f"local RMS error of {fit}: {where}",
+            },
+            {
+                "image": f"{file}-flip",
+                "linear": False,
+                "label": "HDR-FLIP",
+                "lines": [f"mean {made['flip']['hdr']:.3f}"],
+                "alt": f"HDR-FLIP of {fit}: {where}",
+            },
+        ]
+
+    def scene(self, picture: Mapping[str, Any]) -> dict[str, Any]:
+        """What the viewer shows of a scene."""
+        level = levels(picture["levels"], self._comparison["finest"])
+        return {
+            "where": f"View {direction(picture['view'])}; light {direction(picture['light'])}; "
+            f"{width(picture['span'])}, {level}",
+            "span": width(picture["span"]),
+            "references": [
+                {
+                    "label": _KIND[kind],
+                    "picture": picture["references"][kind]["file"],
+                    "rows": self._numbers(picture, kind),
+                }
+                for kind in self._kinds
+            ],
+            "fits": [picture["fits"][fit]["file"] for fit in self._comparison["fits"]],
+        }
+
+    def _numbers(self, picture: Mapping[str, Any], kind: str) -> list[list[str]]:
+        """Rows of the viewer's table: what, then one cell per fit."""
+        made = [picture["fits"][fit] for fit in self._comparison["fits"]]
+        errors = [m["errors"][kind] for m in made]
+        rows = [
+            ["MSE [10⁻³/sr²]", *(error_text(estimate(e["mse"]), 1e3) for e in errors)],
+            ["relative MSE", *(error_text(estimate(e["relative_mse"])) for e in errors)],
+            ["PSNR", *(decibel(e["psnr"], e["mse"]) for e in errors)],
+        ]
+        if kind == self._kinds[0]:
+            rows += [[f"{key.upper()}-FLIP", *flip_texts(picture, kind, made, key)] for key in ("ldr", "hdr")]
+            if len(made) > 1:
+                cells = (error_text(estimate(m["mse_less_first"]), 1e3) for m in made[1:])
+                rows.append([f"MSE less {self._comparison['fits'][0]}’s [10⁻³/sr²]", "–", *cells])
+        return rows
+
+
+def flip_texts(picture: Mapping[str, Any], kind: str, made: list[Mapping[str, Any]], key: str) -> list[str]:
+    """FLIP of each fit; where it is no more than what noise alone gives, that is said."""
+    noise = picture["references"][kind]["flip"][key]
+    return [
+        f"{m['flip'][key]:.3f}"
+        + (f", not above noise alone ({noise:.3f})" if m["flip"][key] <= noise else "")
+        for m in made
+    ]
+
+
+def _reader(path: Path) -> Callable[[], F32]:
+    @lru_cache(maxsize=1)
+    def read() -> F32:
+        return read_picture(path)
+
+    return read

@@ -10,9 +10,9 @@ import numpy as np
 
 from .fit_records import History
 from .plots import Curve, bars, curves
-from .report_pictures import estimate
 from .run_folder import FITS
 from .stages import Stamp, read_stamp
+from .wording import estimate
 
 # Shares of a fit's time at which its error is listed.
 _SHARES = (0.1, 0.25, 0.5, 1.0)

@@ -12,7 +12,9 @@ from mbtf_gen.atomic import read_json
 from mbtf_gen.console import Console, clock
 from mbtf_gen.errors import InputError
 
+from .compare import COMPARISON_NAME, COMPARISON_SCHEMA
 from .recipe import Recipe, read_resolved
+from .report import LAYOUT
 from .run_folder import COMPARE, FITS, REPORT, SHARDS, claim, clear, describe, locked
 from .stages import NOT_RUN, Decision, Outcome, Stage, Stamp, decide, read_stamp, run_again, run_stages
 
@@ -66,12 +68,13 @@ class _Run:
             run = self._fit(name)
             files = self._files(f"{FITS}/{name}")
             out.append(Stage(fit_stage(name), (GENERATE_STAGE,), options, {}, files, run))
-        compared = recipe.compare.model_dump(mode="json")
+        compared = {"record": COMPARISON_SCHEMA, **recipe.compare.model_dump(mode="json")}
         needs = (GENERATE_STAGE, *fits)
         out.append(Stage(COMPARE_STAGE, needs, compared, {}, self._files(COMPARE), self._compare))
         shown = {
             "name": recipe.name,
             "description": recipe.description,
+            "layout": LAYOUT,
             **recipe.report.model_dump(mode="json"),
         }
         needs = (*needs, COMPARE_STAGE)
@@ -214,8 +217,6 @@ def run_recipe(
         describe(folder, recipe, command)
         run = _Run(recipe, folder, console)
         outcomes = run_stages(folder, run.stages(inputs), force=force, tell=tell)
-    from .compare import COMPARISON_NAME
-
     return RunResult(folder, folder / REPORT, outcomes, read_json(folder / COMPARE / COMPARISON_NAME))
 
 

@@ -73,7 +73,7 @@ def machine() -> dict[str, str]:
     from importlib.metadata import PackageNotFoundError, version
 
     out = {"python": platform.python_version()}
-    for name in ("mbtf", "mitsuba", "drjit", "torch", "numpy", "scipy", "trimesh"):
+    for name in ("mbtf", "mitsuba", "drjit", "torch", "numpy", "scipy", "trimesh", "flip-evaluator"):
         try:
             out[name] = version(name)
         except PackageNotFoundError:

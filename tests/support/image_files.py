@@ -87,5 +87,5 @@ def exr(path: Path, channels: dict[str, NDArray[Any]], **header: Any) -> Path:
     import OpenEXR
 
     head = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **header}
-    OpenEXR.File(head, channels).write(str(path))
+    OpenEXR.File(head, dict(channels)).write(str(path))
     return path

@@ -41,6 +41,7 @@ def test_help_answers_without_heavy_modules(program: str, run_python: RunPython)
         ("mbtf-gen", "doctor"),
         ("mbtf-gen", "verify"),
         ("mbtf-gen", "reference"),
+        ("mbtf-gen", "preview"),
         ("mbtf-fit", "evaluate"),
         ("mbtf-fit", "info"),
         ("mbtf-pipeline", "run"),

@@ -98,7 +98,7 @@ def test_a_fit_without_a_model_has_the_model_of_its_name(tmp_path: Path) -> None
         (SINGLE + "compare: {spp: 3}\n", 6, "must be even"),
         (SINGLE + "compare: {spans: [2, 2.0]}\n", 6, "same entry twice"),
         (SINGLE + "compare: {kinds: []}\n", 6, "at least 1"),
-        (SINGLE + "report: {stops: [0, x]}\n", 6, "must be a number"),
+        (SINGLE + "report: {exposure: x}\n", 6, "must be a number"),
     ],
 )
 def test_faults_are_named_with_their_line(tmp_path: Path, text: str, line: int, what: str) -> None:
@@ -122,9 +122,23 @@ def test_a_missing_material_is_one_clear_line(tmp_path: Path, capsys: pytest.Cap
     out, err = capsys.readouterr()
     first, second = err.splitlines()
     assert first == f"error: {path}:3: material '../nowhere/height.exr' does not exist"
-    assert second.strip() == f"looked for {os.path.abspath(tmp_path / '../nowhere/height.exr')}"
+    looked = os.path.abspath(tmp_path / "../nowhere/height.exr")
+    assert second.strip() == f"looked for {looked}; edit 'generate.material' in {path}"
     assert out == ""
     assert not (tmp_path / "out").exists()
+
+
+def test_published_maps_that_are_missing_are_named_with_their_source(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = written(tmp_path, SINGLE.replace("maps/height.npy", "../data/rock_cliff"))
+    with pytest.raises(InputError) as caught:
+        load_recipe(path)
+    for text in ("ambientCG Rock023", "CC0", "'generate.material'", "--set generate.material=FOLDER"):
+        assert text in caught.value.cure
+    with pytest.raises(InputError) as caught:
+        load_recipe(path, ["generate.material=elsewhere/rock_cliff"])
+    assert "edit" not in caught.value.cure
 
 
 @pytest.mark.parametrize(
@@ -206,8 +220,8 @@ def test_listing_names_recipes_and_faults(
 
     assert run(app, ["list", "."]) == 0
     broken, small = capsys.readouterr().out.splitlines()
-    assert broken.startswith("broken.yaml: ")
-    assert "broken.yaml:2: unknown key 'fti'" in broken
+    # The path stands once.
+    assert broken.startswith("broken.yaml: line 2: unknown key 'fti'")
     assert small == "recipe-under-test.yaml: four by four"
     assert run(app, ["list", ".", "-v"]) == 0
     lines = capsys.readouterr().out.splitlines()

@@ -1,0 +1,1 @@
+"""The materials of this folder, one module each, and what they share."""

@@ -1,0 +1,66 @@
+"""Makes docs/pictures/contact_sheet.png: every material of assets/ as a close view and from afar.
+
+Each picture is made by one run of ``mbtf-gen reference``, which is printed; only the labels are added here.
+From the repository's root, in a minute or two: ``.venv/bin/python docs/pictures/make_contact_sheet.py``.
+"""
+
+from __future__ import annotations
+
+import shlex
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from PIL import Image, ImageDraw, ImageFont
+
+MATERIALS = ("twisted_wool", "straight_wool", "turtle_shell", "cliff_rock", "insulation_foam")
+# What is said of a row, and the options that make its pictures.
+ROWS = (
+    ("one tile wide, view at 55°, light at 40°", "--view 55,-90 --light 40,140 --spans 1"),
+    ("two tiles wide, view at 40°, grazing light at 15°", "--view 40,-90 --light 15,150 --spans 2"),
+)
+SIZE, SPP = 248, 256
+GAP, TITLE, CAPTION = 6, 26, 22
+INK, PAPER = (30, 30, 30), (255, 255, 255)
+
+
+def render(material: str, options: str) -> Image.Image:
+    """One picture, (SIZE, SIZE) pixels.
+
+    Raises
+    ------
+    subprocess.CalledProcessError : the program failed; it has said why
+    """
+    words = ["reference", f"assets/{material}", *shlex.split(options)]
+    words += ["--size", str(SIZE), "--spp", str(SPP), "--kind", "pixel"]
+    print("mbtf-gen", *words, flush=True)
+    with tempfile.TemporaryDirectory() as folder:
+        output = Path(folder) / "pictures"
+        root = Path(__file__).parents[2]
+        command = [sys.executable, "-m", "mbtf_gen", *words, "-o", str(output), "--quiet"]
+        subprocess.run(command, check=True, cwd=root, stdout=subprocess.DEVNULL)
+        (picture,) = output.glob("*.png")
+        with Image.open(picture) as image:
+            return image.convert("RGB")
+
+
+def main() -> None:
+    """Write the sheet."""
+    pitch = SIZE + GAP
+    width = len(MATERIALS) * pitch - GAP
+    sheet = Image.new("RGB", (width, TITLE + len(ROWS) * (CAPTION + pitch) - GAP), PAPER)
+    draw = ImageDraw.Draw(sheet)
+    for column, material in enumerate(MATERIALS):
+        title = material.replace("_", " ")
+        draw.text((column * pitch + 2, 2), title, INK, ImageFont.load_default(18))
+        for row, (caption, options) in enumerate(ROWS):
+            top = TITLE + row * (CAPTION + pitch)
+            if column == 0:
+                draw.text((2, top + 2), caption, INK, ImageFont.load_default(14))
+            sheet.paste(render(material, options), (column * pitch, top + CAPTION))
+    sheet.save(Path(__file__).with_name("contact_sheet.png"), optimize=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,208 @@
+"""What a material is, in numbers: for ``mbtf-gen inspect``."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .images import LUMINANCE, linear_to_srgb
+from .material import Material
+from .relief import detail_size, repeats, rms_slope, slope_angles
+from .tiling import broken
+
+# Luminance of what exists: charcoal to fresh snow. Beyond, a colour map is probably not albedo.
+ALBEDO_RANGE = (0.02, 0.95)
+# A colour map that varies by less (RMS of the sRGB-encoded channels) is almost one colour.
+_CONSTANT = 0.05
+# Detail finer than so many texels.
+_FINE = 4.0
+# A mesh that keeps less of the map's slopes is remarked on.
+_KEPT = 0.9
+# Levels below which 8-bit heights are remarked on.
+_FEW_LEVELS = 128
+
+
+def inspect_material(
+    material: Material, height: float | None = None, mesh: int | None = None
+) -> dict[str, Any]:
+    """Everything that is known of a material, as plain data; ``oddities`` are what is out of the ordinary.
+
+    Parameters
+    ----------
+    height, mesh : as :meth:`mbtf_gen.material.Material.grid` takes them
+    """
+    grid = material.grid(height, mesh)
+    factor = material.height_scale if height is None else height
+    full = material.grid(height, material.height.shape[1])
+    median, high, steepest = slope_angles(grid)
+    whole = rms_slope(full)
+    found: dict[str, Any] = {
+        "aspect": material.aspect,
+        "tile": material.tile,
+        "maps": {role: _map(material, role) for role in material.facts},
+        "constants": _constants(material),
+        "surface": _surface(material),
+        "geometry": {
+            "height": factor,
+            "material_height": material.height_scale,
+            "map": list(material.height.shape),
+            "mesh": list(grid.z.shape),
+            "relief": grid.relief,
+            "slope_median_deg": median,
+            "slope_p99_deg": high,
+            "slope_max_deg": steepest,
+            "slope_kept": rms_slope(grid) / whole if whole > 0 else 1.0,
+        },
+        "heights": {
+            "codes": None if material.codes is None else asdict(material.codes),
+            "low": float(material.height.min()),
+            "high": float(material.height.max()),
+            "rms_step": float(np.sqrt(np.mean((np.roll(material.height, -1, 1) - material.height) ** 2))),
+            "detail_texels": detail_size(material.height),
+            "repeats": [repeats(material.height, axis) for axis in (1, 0)],
+        },
+        "tiling": [{**asdict(s), "ratio": s.ratio, "tiles": not broken(s)} for s in material.seams],
+        "albedo": _albedo(material),
+        "normal": _normal(material, factor),
+        "opacity": _opacity(material),
+        "warnings": list(material.warnings),
+        "notes": list(material.notes),
+    }
+    return {**found, "oddities": [*_oddities(found), *_surface_oddities(found)]}
+
+
+def _map(material: Material, role: str) -> dict[str, Any]:
+    facts = material.facts[role]
+    return {**asdict(facts), "file": str(facts.file), "names": list(facts.names)}
+
+
+def _constants(material: Material) -> dict[str, Any]:
+    """What is one number or colour for the whole tile."""
+    values = {
+        "basecolor": material.basecolor if material.bsdf is None else None,
+        "roughness": material.roughness,
+        "metallic": material.metallic,
+        "specular": material.specular,
+        "opacity": material.opacity,
+    }
+    return {n: np.asarray(v).tolist() for n, v in values.items() if v is not None and np.ndim(v) < 2}
+
+
+def _surface(material: Material) -> str:
+    if material.bsdf is not None:
+        return str(material.bsdf["type"])
+    return "diffuse" if material.is_lambert else "principled"
+
+
+def _albedo(material: Material) -> dict[str, Any] | None:
+    if material.bsdf is not None:
+        return None
+    colour = np.asarray(material.basecolor, np.float64)
+    luminance = colour @ np.asarray(LUMINANCE)
+    mean = colour.reshape(-1, 3).mean(axis=0)
+    encoded = np.asarray(linear_to_srgb(colour), np.float64)
+    spread = float(np.sqrt(np.mean((encoded - encoded.reshape(-1, 3).mean(axis=0)) ** 2)))
+    low, high = ALBEDO_RANGE
+    return {
+        "min": float(luminance.min()),
+        "median": float(np.median(luminance)),
+        "max": float(luminance.max()),
+        "mean_rgb": mean.tolist(),
+        "spread_srgb": spread,
+        "share_above": float(np.mean(luminance > high)),
+        "share_below": float(np.mean(luminance < low)),
+        "plausible": [low, high],
+        "given": "basecolor" in material.facts,
+    }
+
+
+def _normal(material: Material, factor: float) -> dict[str, Any] | None:
+    if material.normal is None:
+        return None
+    out: dict[str, Any] = {"convention": material.normal_convention}
+    tilt = np.degrees(np.arccos(np.clip(material.normal[..., 2], -1.0, 1.0)))
+    out["tilt_median_deg"], out["tilt_p99_deg"] = (float(p) for p in np.percentile(tilt, (50, 99)))
+    fit = material.normal_fit
+    if fit is not None:
+        sign = 1.0 if material.normal_convention == "gl" else -1.0
+        shown = asdict(fit)
+        out |= {**shown, "convention": material.normal_convention, "shown_convention": shown["convention"]}
+        out["correlation_v"] = sign * fit.correlation_v
+        out["suggested_height"] = fit.scale if fit.fits else None
+        out["height_in_use"] = factor
+    return out
+
+
+def _opacity(material: Material) -> dict[str, Any] | None:
+    if material.opacity is None:
+        return None
+    opacity = np.asarray(material.opacity)
+    return {
+        "holes": float(np.mean(opacity < 0.5)),
+        "partly": float(np.mean((opacity > 0.02) & (opacity < 0.98))),
+    }
+
+
+def _oddities(found: dict[str, Any]) -> list[str]:
+    out = []
+    height, heights, geometry = found["maps"]["height"], found["heights"], found["geometry"]
+    rows, columns = height["rows"], height["columns"]
+    if rows != columns:
+        out.append(f"the tile is not square: {columns} x {rows} texels, 1 wide and {found['aspect']:g} high")
+    if height["channels"] > 1:
+        out.append(f"{Path(height['file']).name}: grey stored in {height['channels']} channels")
+    codes = heights["codes"]
+    if codes is not None and height["bits"] == 8 and codes["levels"] < _FEW_LEVELS:
+        out.append(f"heights use {codes['levels']} levels only, codes {codes['low']} to {codes['high']}")
+    if Path(height["file"]).suffix.lower() in (".jpg", ".jpeg"):
+        out.append("heights come from a JPG: its compression is part of the relief")
+    if geometry["relief"] > 0 and heights["detail_texels"] < _FINE:
+        out.append(
+            f"fine detail: heights lose half their correlation within {heights['detail_texels']:.1f} texels, "
+            f"RMS step {heights['rms_step']:.2g} of the range per texel"
+        )
+    if max(heights["repeats"]) > 1:
+        u, v = heights["repeats"]
+        out.append(f"the relief repeats {u} x {v} times (u x v) within the tile")
+    if geometry["slope_kept"] < _KEPT:
+        out.append(
+            f"the mesh keeps {geometry['slope_kept']:.0%} of the map's RMS slope; "
+            f"--mesh {geometry['map'][1]} keeps all"
+        )
+    return out
+
+
+def _surface_oddities(found: dict[str, Any]) -> list[str]:
+    out = []
+    albedo, normal, opacity = found["albedo"], found["normal"], found["opacity"]
+    if albedo is not None:
+        if not albedo["given"] and "basecolor" in found["constants"]:
+            shown = ", ".join(f"{c:.3g}" for c in albedo["mean_rgb"])
+            out.append(f"no base colour map: linear RGB {shown} everywhere")
+        elif albedo["given"] and albedo["spread_srgb"] < _CONSTANT:
+            codes = 255.0 * albedo["spread_srgb"]
+            out.append(f"the base colour is almost constant: {codes:.1f} of 255 codes RMS")
+        if albedo["share_above"] > 0:
+            out.append(
+                f"{albedo['share_above']:.2%} of the albedo lies above {ALBEDO_RANGE[1]}: brighter than snow"
+            )
+        if albedo["share_below"] > 0.5:
+            out.append(
+                f"{albedo['share_below']:.0%} of the albedo lies below {ALBEDO_RANGE[0]}: blacker than coal"
+            )
+    if "metallic" in found["maps"] and found["maps"]["metallic"]["low"] < found["maps"]["metallic"]["high"]:
+        low, high = (found["maps"]["metallic"][k] for k in ("low", "high"))
+        out.append(f"metallic varies from {low:.2g} to {high:.2g}: metal and dielectric mixed")
+    if opacity is not None and opacity["holes"] > 0:
+        out.append(f"real holes: {opacity['holes']:.1%} of the tile is see-through")
+    suggested = None if normal is None else normal.get("suggested_height")
+    if suggested:
+        ratio = found["geometry"]["height"] / suggested
+        if not 0.8 < ratio < 1.25:
+            out.append(
+                f"the height in use is {ratio:.3g} times the {suggested:.3g} that the normal map suggests"
+            )
+    return out

@@ -1,0 +1,68 @@
+"""Measured numbers in the report's words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from mbtf_gen.stats import Estimate
+
+# A value within so many standard errors of zero is not told from zero.
+BAR = 2.0
+
+
+def estimate(record: Mapping[str, Any]) -> Estimate:
+    """An estimate read back from JSON, where numbers that are not finite are null."""
+    value, error = record["value"], record["error"]
+    return Estimate(math.nan if value is None else value, math.inf if error is None else error, record["n"])
+
+
+def below_bar(e: Estimate) -> bool:
+    """Whether a value cannot be told from zero."""
+    return math.isfinite(e.value) and abs(e.value) <= BAR * e.error
+
+
+def error_text(e: Estimate, factor: float = 1.0, unit: str = "") -> str:
+    """``0.123 ± 0.004``, or that it lies below its error bar, with both numbers."""
+    if not math.isfinite(e.value):
+        return "not defined"
+    text = f"{e.scaled(factor)}{unit}".replace("-", "−")
+    return f"below its error bar ({text})" if below_bar(e) else text
+
+
+def percent(e: Estimate) -> str:
+    """:func:`error_text` in percent."""
+    return error_text(e, 100.0, " %")
+
+
+def decibel(psnr: Mapping[str, Any], mse: Mapping[str, Any]) -> str:
+    """PSNR in dB; none where the error it stands for lies below its error bar."""
+    e, error = estimate(psnr), estimate(mse)
+    if not math.isfinite(e.value):
+        return "error below its error bar"
+    if below_bar(error):
+        return f"error below its error bar ({e} dB)"
+    return f"{e} dB"
+
+
+def direction(d: Mapping[str, float]) -> str:
+    """``elevation 45°, azimuth −90°``."""
+    return f"elevation {d['elevation']:g}°, azimuth {d['azimuth']:g}°".replace("-", "−")
+
+
+def short_direction(d: Mapping[str, float]) -> str:
+    """``45° / −90°``: elevation and azimuth."""
+    return f"{d['elevation']:g}° / {d['azimuth']:g}°".replace("-", "−")
+
+
+def width(span: float) -> str:
+    """Width of the field of view."""
+    return f"{span:g} tile{'' if span == 1 else 's'} across"
+
+
+def levels(found: list[float], finest: int) -> str:
+    """Levels that a picture asks for, and whether the data have them."""
+    low, high = (f"{level:.1f}" for level in found)
+    text = f"level {low}" if low == high else f"level {low}–{high}"
+    return text if found[1] <= finest + 0.1 else f"{text} (finest of the data {finest})"

@@ -1,0 +1,48 @@
+"""Periodic reliefs without any symmetry, and the normal maps that belong to them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+def fractal(rows: int, columns: int, exponent: float = 2.0, seed: int = 5) -> Floats:
+    """Heights in [0, 1], amplitude 1/frequency^exponent, periodic, no symmetry."""
+    spectrum = np.fft.rfft2(np.random.default_rng(seed).normal(size=(rows, columns)))
+    v = np.fft.fftfreq(rows)[:, None] * rows * (columns / rows)
+    frequency = np.hypot(v, np.fft.rfftfreq(columns) * columns)
+    spectrum *= np.where(frequency > 0, 1.0, 0.0) / np.maximum(frequency, 1.0) ** exponent
+    h = np.fft.irfft2(spectrum, (rows, columns))
+    return (h - h.min()) / np.ptp(h)
+
+
+def normals_of(height: Floats, factor: float) -> Floats:
+    """OpenGL normals (H, W, 3) of heights (H, W) times `factor` tile widths, row 0 at v → 1."""
+    columns = height.shape[1]
+    du = factor * 0.5 * columns * (np.roll(height, -1, 1) - np.roll(height, 1, 1))
+    dv = factor * 0.5 * columns * (np.roll(height, 1, 0) - np.roll(height, -1, 0))
+    n = np.stack([-du, -dv, np.ones_like(du)], axis=-1)
+    return n / np.linalg.norm(n, axis=-1, keepdims=True)
+
+
+def save_normals(path: Path, normals: NDArray[Any], *, dx: bool = False) -> Path:
+    """Write a normal map as 8-bit PNG."""
+    from PIL import Image as Pillow
+
+    flipped = normals * np.array([1.0, -1.0 if dx else 1.0, 1.0])
+    Pillow.fromarray(np.rint((flipped + 1) * 127.5).astype(np.uint8)).save(path)
+    return path
+
+
+def save_heights(path: Path, height: Floats, bits: int = 16) -> Path:
+    """Write heights in [0, 1] as grey PNG of 8 or 16 bits."""
+    from PIL import Image as Pillow
+
+    codes = np.rint(height * (2**bits - 1))
+    Pillow.fromarray(codes.astype(np.uint8 if bits == 8 else np.uint16)).save(path)
+    return path

@@ -1,0 +1,46 @@
+"""What cannot be told from zero is printed as such, with its error bar."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from mbtf_gen.stats import Estimate
+from mbtf_pipeline.report_pictures import flip_texts
+from mbtf_pipeline.wording import decibel, error_text, levels, percent
+
+
+@pytest.mark.parametrize("value", [0.03, -0.03, 0.0])
+def test_a_value_below_its_bar_is_called_that(value: float) -> None:
+    text = error_text(Estimate(value, 0.02, 100))
+    assert text.startswith("below its error bar (")
+    assert "± 0.02" in text
+
+
+def test_a_value_above_its_bar_is_just_printed() -> None:
+    assert error_text(Estimate(0.123, 0.004, 100), 100.0, " %") == "12.3 ± 0.4 %"
+    assert error_text(Estimate(-0.123, 0.004, 100)) == "−0.123 ± 0.004"
+    assert percent(Estimate(math.nan, math.inf, 1)) == "not defined"
+
+
+def test_no_decibels_for_an_error_that_may_be_none() -> None:
+    mse = {"value": 1e-4, "error": 1e-6, "n": 9}
+    psnr = {"value": 40.0, "error": 0.2, "n": 9}
+    assert decibel(psnr, mse) == "40.0 ± 0.2 dB"
+    assert decibel(psnr, {**mse, "error": 1e-4}).startswith("error below its error bar")
+    assert (
+        decibel({"value": None, "error": None, "n": 9}, {**mse, "value": -1e-4})
+        == "error below its error bar"
+    )
+
+
+def test_flip_that_noise_explains() -> None:
+    picture = {"references": {"query": {"flip": {"hdr": 0.1}}}}
+    made = [{"flip": {"hdr": 0.09}}, {"flip": {"hdr": 0.2}}]
+    assert flip_texts(picture, "query", made, "hdr") == ["0.090, not above noise alone (0.100)", "0.200"]
+
+
+def test_levels_finer_than_the_data_are_named() -> None:
+    assert levels([3.0, 3.0], 7) == "level 3.0"
+    assert levels([6.0, 8.5], 7) == "level 6.0–8.5 (finest of the data 7)"
