@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 from support.scenes import DIRECT, direction, estimate, flat, mi, queries
-from support.surfaces import towards
+from support.surfaces import point, towards, vectors
 
 from mbtf_gen.errors import PartialError
 from mbtf_gen.heightfield import HeightGrid
 from mbtf_gen.light import LightKernel
+from mbtf_gen.surface import SurfaceParts
 
 Array = NDArray[np.float64]
 GOLD = np.array([0.9, 0.6, 0.3])
@@ -235,6 +236,18 @@ def test_slopes_add_to_those_of_the_mesh(axis: int) -> None:
         assert seen[factor][0] == pytest.approx(expected[0], rel=1e-3)
         assert seen[factor][-1] == pytest.approx(expected[1], rel=1e-3)
         assert len(seen[factor]) <= 4
+
+
+def test_what_lies_behind_the_face_or_the_shading_plane_is_black() -> None:
+    """A normal tilted towards +x by 45°: light below the face, or on the far side of the normal, is none."""
+    parts = SurfaceParts(specular=True, slopes=True)
+    lights = np.array([[0.9, 0, -0.2], [-0.9, 0, 0.2], [0.9, 0, 0.2], [0, 0, 1]])
+    lights /= np.linalg.norm(lights, axis=1, keepdims=True)
+    tilt = np.array([[-1.0], [0.0], [0.0]])
+    for view, lit in ((towards(0.8), [False, False, True, True]), (-towards(0.8), [False] * 4)):
+        value, pdf = point(parts, np.tile(view, (4, 1)), slopes=tilt).eval_pdf(vectors(lights))
+        assert list(np.array(value.x) > 0) == lit
+        assert list(np.array(pdf) > 0) == lit
 
 
 @pytest.mark.parametrize("view", [(90, 0), (30, 0), (30, 180), (3, 0), (3, 180)])
