@@ -154,13 +154,20 @@ def evaluate(material: Path, shards: Path, /, *, console: Console = CONSOLE) -> 
     shards
         Folder made by mbtf-gen.
     """
-    from .evaluation import evaluate
+    from .evaluation import evaluate, foreign_inputs
     from .material import Material
 
     loaded = Material.load(material)
+    foreign = foreign_inputs(loaded, shards)
+    if foreign:
+        console.note(
+            f"warning: {shards} was made from another material than {material} was trained on "
+            f"({', '.join(foreign)} differ{'s' if len(foreign) == 1 else ''}); these errors say how far the "
+            "two are apart, not how good the fit is"
+        )
     errors = {name: e.as_dict() for name, e in evaluate(loaded, shards).items()}
     console.report(
-        {"material": material, "shards": shards, "errors": errors},
+        {"material": material, "shards": shards, "foreign_inputs": foreign, "errors": errors},
         "\n".join([f"{material}: {loaded.config.model} on {shards}", *_describe_errors(errors)]),
     )
 

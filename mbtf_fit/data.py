@@ -138,7 +138,7 @@ def _read(shard: Shard) -> Queries:
         if suspicious and not np.isfinite(array).all():
             bad = np.argwhere(~np.isfinite(array))
             raise InputError(
-                f"{len(bad)} numbers of '{name}' are NaN or infinite, the first in row {bad[0][0]}",
+                f"'{name}' holds NaN or infinite numbers: {len(bad)}, the first in row {bad[0][0]}",
                 where=shard.path,
                 cure="look for damage with: mbtf-gen verify",
             )

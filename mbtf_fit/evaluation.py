@@ -129,6 +129,20 @@ def judge(predict: Predict, data: Dataset, partition: Partition) -> dict[str, Sp
     return {name: errors for name, errors in found.items() if errors is not None}
 
 
+def foreign_inputs(material: Material, shards: str | Path) -> list[str]:
+    """Roles of the inputs (height, basecolor, …) that differ between a data set and the one that the material
+    was trained on; empty where either does not say what it was made from.
+
+    Raises
+    ------
+    InputError : shards missing or damaged
+    """
+    trained, given = material.description["data"].get("inputs"), Dataset.open(shards).manifest.get("inputs")
+    if not trained or not given:
+        return []
+    return [role for role in sorted({*trained, *given}) if trained.get(role) != given.get(role)]
+
+
 def evaluate(material: Material, shards: str | Path) -> dict[str, SplitErrors]:
     """Errors of a fitted material on the splits of a data set: ``test``, and what was held out of ``train``.
 

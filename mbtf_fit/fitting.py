@@ -149,12 +149,13 @@ def fit(
 def _identity(config: FitConfig, data: Dataset) -> dict[str, Any]:
     files = {split: [e["file"] for e in data.manifest["splits"][split]["shards"]] for split in data.splits}
     described = {"hash": data_hash(data), "levels": data.lattice.finest, "aspect": data.lattice.aspect}
+    lengths = {split: len(names) for split, names in files.items()}
     return {
         "format": _FORMAT,
         "schema": _SCHEMA,
         "config_hash": config.hash(json.dumps({**described, "files": files}, sort_keys=True)),
         "config": config.fields(),
-        "data": {**described, "shards": {split: len(names) for split, names in files.items()}},
+        "data": {**described, "shards": lengths, "inputs": data.manifest.get("inputs", {})},
     }
 
 

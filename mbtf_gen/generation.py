@@ -10,13 +10,15 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, Field
 
 from .atomic import digest, read_json, write_json, write_text
 from .config import GeneratorConfig, count_queries
+from .dataset import Dataset
 from .effects import EffectsPlan
 from .errors import InputError, PartialError, UsageError
 from .estimates import Stream
@@ -28,7 +30,7 @@ from .material import Material, load_material
 from .planning import plan_effects, simulated
 from .queries import Mixture, QueryPlan
 from .schema import CONFIG_NAME, FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, SPLITS, Split
-from .settings import differences, dump_yaml, in_short
+from .settings import check_document, differences, dump_yaml, in_short
 from .shard_files import shard_suffix, write_shard
 from .simulation import estimator_of
 from .slopes import residual_slopes
@@ -227,7 +229,9 @@ def _open_folder(job: Job, folder: Path, manifest: dict[str, Any], overwrite: bo
         if overwrite:
             _clear(folder)
         elif old.get("config_hash") != job.config_hash:
-            before = {**old.get("config", {}), "inputs": old.get("inputs", {}), "schema": old.get("schema")}
+            config = old.get("config")
+            before = {**(config if isinstance(config, dict) else {}), "inputs": old.get("inputs", {})}
+            before["schema"] = old.get("schema")
             after = {**manifest["config"], "inputs": manifest["inputs"], "schema": SCHEMA_VERSION}
             changes = in_short(differences(before, after)) or "inputs differ"
             raise InputError(
@@ -381,21 +385,65 @@ def generate(
     return finish(folder, paths=paths, seconds=time.perf_counter() - start)
 
 
+_Number = Annotated[float, Field(allow_inf_nan=False)]
+_Colour = tuple[_Number, _Number, _Number]
+
+
+class _Effect(BaseModel):
+    effect: str
+    on: bool
+
+
+class _Plan(BaseModel):
+    """What :func:`finish` relies on of a manifest, beside what every reader does."""
+
+    complete: bool
+    effects: list[_Effect]
+
+
+class _Statistics(BaseModel):
+    mean_value: _Colour
+    mean_variance: _Colour
+
+
+class _Quarantined(BaseModel):
+    nonfinite_samples: int
+    lost_rays: int
+    capped_rays: int
+
+
+class _Made(BaseModel):
+    """What :func:`finish` relies on of a shard's sidecar."""
+
+    queries: Annotated[int, Field(ge=1)]
+    paths: int
+    seconds: _Number
+    statistics: _Statistics
+    quarantined: _Quarantined
+
+
+_MEND = "look for damage with: mbtf-gen verify"
+
+
 def finish(folder: str | Path, *, paths: int = 0, seconds: float = 0.0) -> Summary:
     """Complete the manifest when every shard is there, and summarise (``mbtf-gen merge``).
 
     Raises
     ------
-    InputError : no data set there
+    InputError : no data set there, or damaged documents
     """
     folder = Path(folder)
-    manifest = read_json(folder / MANIFEST_NAME)
+    manifest = Dataset.open(folder).manifest
+    check_document(_Plan, manifest, folder / MANIFEST_NAME, _MEND)
     records: dict[str, list[dict[str, Any]]] = {}
     complete = True
     for split, content in manifest["splits"].items():
         for entry in content["shards"]:
             if is_finished(folder / entry["file"], entry["rows"], manifest["config_hash"]):
-                records.setdefault(split, []).append(read_json(sidecar_of(folder / entry["file"])))
+                sidecar = sidecar_of(folder / entry["file"])
+                record = read_json(sidecar)
+                check_document(_Made, record, sidecar, _MEND)
+                records.setdefault(split, []).append(record)
             else:
                 complete = False
     flat = [r for rs in records.values() for r in rs]

@@ -21,6 +21,8 @@ _CONSTANT = 0.05
 _FINE = 4.0
 # A mesh that keeps less of the map's slopes is remarked on.
 _KEPT = 0.9
+# Texels beyond which so few different floats are no accident of a small map.
+_MANY = 4096
 # Levels below which 8-bit heights are remarked on.
 _FEW_LEVELS = 128
 
@@ -50,7 +52,7 @@ def inspect_material(
             "material_height": material.height_scale,
             "map": list(material.height.shape),
             "mesh": list(grid.z.shape),
-            "relief": grid.relief,
+            "relief": abs(grid.relief),
             "slope_median_deg": median,
             "slope_p99_deg": high,
             "slope_max_deg": steepest,
@@ -58,9 +60,10 @@ def inspect_material(
         },
         "heights": {
             "codes": None if material.codes is None else asdict(material.codes),
+            "distinct": len(np.unique(material.height)),
             "low": float(material.height.min()),
             "high": float(material.height.max()),
-            "rms_step": float(np.sqrt(np.mean((np.roll(material.height, -1, 1) - material.height) ** 2))),
+            "rms_step": _rms_step(material),
             "detail_texels": detail_size(material.height),
             "repeats": [repeats(material.height, axis) for axis in (1, 0)],
         },
@@ -72,6 +75,13 @@ def inspect_material(
         "notes": list(material.notes),
     }
     return {**found, "oddities": [*_oddities(found), *_surface_oddities(found)]}
+
+
+def _rms_step(material: Material) -> float:
+    """Root mean square difference of neighbouring columns, relative to the range of the heights."""
+    steps = np.roll(material.height, -1, 1) - material.height
+    extent = float(np.ptp(material.height))
+    return float(np.sqrt(np.mean(steps**2))) / extent if extent > 0 else 0.0
 
 
 def _map(material: Material, role: str) -> dict[str, Any]:
@@ -155,14 +165,19 @@ def _oddities(found: dict[str, Any]) -> list[str]:
     if height["channels"] > 1:
         out.append(f"{Path(height['file']).name}: grey stored in {height['channels']} channels")
     codes = heights["codes"]
-    if codes is not None and height["bits"] == 8 and codes["levels"] < _FEW_LEVELS:
+    if codes is not None and height["bits"] == 8 and 1 < codes["levels"] < _FEW_LEVELS:
         out.append(f"heights use {codes['levels']} levels only, codes {codes['low']} to {codes['high']}")
+    if height["bits"] is None and 1 < heights["distinct"] <= 256 and rows * columns > _MANY:
+        out.append(
+            f"heights are floats of {heights['distinct']} different values: if they were integers once, "
+            "their terraces are still there"
+        )
     if Path(height["file"]).suffix.lower() in (".jpg", ".jpeg"):
         out.append("heights come from a JPG: its compression is part of the relief")
     if geometry["relief"] > 0 and heights["detail_texels"] < _FINE:
         out.append(
             f"fine detail: heights lose half their correlation within {heights['detail_texels']:.1f} texels, "
-            f"RMS step {heights['rms_step']:.2g} of the range per texel"
+            f"RMS step {heights['rms_step']:.0%} of the range per texel"
         )
     if max(heights["repeats"]) > 1:
         u, v = heights["repeats"]

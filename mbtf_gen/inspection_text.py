@@ -6,7 +6,7 @@ import textwrap
 from pathlib import Path
 from typing import Any
 
-from .material_checks import CONVENTION_NAMES
+from .material_checks import CONVENTION_NAMES, signed
 
 WIDTH = 100
 LINES = 45
@@ -131,8 +131,8 @@ def _normal(found: dict[str, Any]) -> list[str]:
     if "best" not in n:
         return [f"{out[0]}; nothing to compare with the heights"]
     out.append(
-        f"           correlation with the heights' slopes: u {n['correlation_u'] or 0:+.2f}, "
-        f"v {n['correlation_v'] or 0:+.2f}; OpenGL {n['gl']:.2f}, DirectX {n['dx']:.2f}"
+        f"           correlation with the heights' slopes: u {signed(n['correlation_u'])}, "
+        f"v {signed(n['correlation_v'])}; OpenGL {n['gl']:.2f}, DirectX {n['dx']:.2f}"
     )
     if n["misfit"]:
         how = f"the {n['image']} map {n['turn']}" if n["turn"] else "heights upside down"

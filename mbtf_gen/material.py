@@ -276,7 +276,7 @@ def _heights(spec: MaterialFile, load: MapLoader) -> tuple[NDArray[np.float64], 
         largest = 2**image.bits - 1
         codes = code_use(np.rint(height * largest))
         step = coarse_step(codes, image.bits)
-        if step is not None:
+        if step is not None and codes.levels > 1:
             load.warnings.append(level_remark(image.path, codes, image.bits, step, entry.dequantise))
             if entry.dequantise:
                 height = dequantise(height, step / largest)

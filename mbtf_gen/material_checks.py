@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -110,13 +111,19 @@ def choose_convention(
     return chosen, "as asked for" if asked else "as the heights' slopes show", warning
 
 
+def signed(correlation: float) -> str:
+    """A correlation as text; NaN, where one of the two has no slopes, as such."""
+    return "undefined" if math.isnan(correlation) else f"{correlation:+.2f}"
+
+
 def normal_note(path: Path, fit: NormalFit | None, convention: Convention, how: str, factor: float) -> str:
     """What a normal map is read as, how it fits, and the height that it suggests."""
     text = f"normal map: {path.name}, {CONVENTION_NAMES[convention]}, {how}"
     if fit is None:
         return text
     sign = 1.0 if convention == "gl" else -1.0
-    text += f"; correlation with them u {fit.correlation_u:+.2f}, v {sign * fit.correlation_v:+.2f}"
+    u, v = signed(fit.correlation_u), signed(sign * fit.correlation_v)
+    text += f"; correlation with them u {u}, v {v}"
     if fit.fits:
         text += f"; it suggests --height {fit.scale:.3g} (the material's own is {factor:.3g})"
     return text

@@ -24,6 +24,9 @@ DEFAULT_COLOUR = 0.5
 _ROUNDING = 1e-6
 # Float normals this far below 0 are signed, not (n+1)/2.
 _SIGNED = -0.05
+# Components beyond this are no normal's, whatever its encoding and its rounding.
+_LONGEST = 1.5
+_NORMALS = "its pixels are (n+1)/2, or the components of n themselves in a float image"
 # A smaller share of normals that point into the surface is not worth a word.
 _STRAY = 1e-4
 _FileEntry = HeightEntry | ColourEntry | ShareEntry | NormalEntry
@@ -184,6 +187,9 @@ class MapLoader:
         stored = image.pixels[..., :3].astype(np.float32)
         signed = image.bits is None and float(stored[..., :2].min()) < _SIGNED
         vectors = stored if signed else 2.0 * stored - 1.0
+        long = np.any(np.abs(vectors) > _LONGEST, axis=-1)
+        if long.any():
+            raise InputError(f"{count_and_first(long)} no normal", where=image.path, cure=_NORMALS)
         length = np.linalg.norm(vectors, axis=-1, keepdims=True)
         below = float(np.mean(vectors[..., 2] <= 0))
         if below > _STRAY:

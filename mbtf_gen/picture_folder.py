@@ -15,10 +15,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from pydantic import BaseModel
+
 from .atomic import read_json, write_json, write_text
 from .errors import InputError
 from .schema import CONFIG_NAME
-from .settings import differences, dump_yaml, in_short
+from .settings import check_document, differences, dump_yaml, in_short
 
 RECORD_NAME = "pictures.json"
 FORMAT_NAME = "mbtf-pictures"
@@ -35,6 +37,20 @@ def _is_leftover(name: str, files: Iterable[str]) -> bool:
 def hash_of(depends: Mapping[str, Any]) -> str:
     """SHA-256 over plain data, hexadecimal."""
     return hashlib.sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()
+
+
+class _Picture(BaseModel):
+    files: dict[str, int]
+    facts: dict[str, Any]
+
+
+class _Record(BaseModel):
+    """Content of ``pictures.json``."""
+
+    hash: str
+    depends: dict[str, Any]
+    files: list[str]
+    pictures: dict[str, _Picture]
 
 
 @dataclass
@@ -87,6 +103,7 @@ class PictureFolder:
                     where=path,
                     cure="choose another folder with -o",
                 )
+            check_document(_Record, old, existing, "choose another folder with -o")
             if not overwrite and old.get("hash") == hash_of(depends):
                 folder = cls(path, old)
                 folder._sweep()

@@ -35,7 +35,11 @@ def slope_angles(grid: HeightGrid) -> tuple[float, float, float]:
 
 def rms_slope(grid: HeightGrid) -> float:
     """Root mean square of the triangles' slopes."""
-    return float(np.sqrt(np.mean(triangle_slopes(grid) ** 2)))
+    rows, columns = grid.z.shape
+    # Every edge along an axis belongs to one triangle of either kind.
+    along_u = np.mean((np.roll(grid.z, -1, 1) - grid.z) ** 2) * columns**2
+    along_v = np.mean((np.roll(grid.z, -1, 0) - grid.z) ** 2) * (rows / grid.aspect) ** 2
+    return float(np.sqrt(along_u + along_v))
 
 
 def autocorrelation(height: NDArray[np.floating[Any]], axis: int) -> NDArray[np.float64]:
@@ -78,8 +82,11 @@ def repeats(height: NDArray[np.floating[Any]], axis: int) -> int:
     dip = np.nonzero(correlation < _DIP)[0]
     if not len(dip):
         return 1
-    inner = correlation[1:-1]
-    peak = (inner >= _PEAK) & (inner >= correlation[:-2]) & (inner >= correlation[2:])
+    # It is even about half the size, where a map that repeats twice has its peak.
+    beyond = correlation[-1] if height.shape[axis] % 2 else correlation[max(-2, -len(correlation))]
+    inner = correlation[1:]
+    after = np.append(correlation[2:], beyond)
+    peak = (inner >= _PEAK) & (inner >= correlation[:-1]) & (inner >= after)
     lags = np.nonzero(peak)[0] + 1
     lags = lags[(lags > dip[0]) & (lags >= _SHORTEST)]
     return max(1, round(height.shape[axis] / lags[0])) if len(lags) else 1

@@ -11,6 +11,7 @@ import io
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence, Set
+from datetime import date
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -142,7 +143,7 @@ def _check_tree(data: Any, where: object) -> None:
 
 def _shown(value: Any) -> str:
     """A value as it was given, shortened to a part of a line."""
-    text = repr(value)
+    text = str(value) if isinstance(value, date) else repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
@@ -207,7 +208,8 @@ def _explain(
         return where, f"key '{dotted}' is missing", "add it"
     given = fault.get("input")
     shown = "" if isinstance(given, Mapping | BaseModel) else f" (given {_shown(given)})"
-    return where, f"'{dotted}': {explain(fault, model)}{shown}", ""
+    named = f"'{dotted}': " if location else ""
+    return where, f"{named}{explain(fault, model)}{shown}", ""
 
 
 def build(

@@ -49,11 +49,7 @@ def read_tiff(path: Path, check_size: Callable[[int, int, Path], None]) -> NDArr
                     _check_segments(page, path)
                 array = page.asarray(maxworkers=1)
             elif page.dtype.kind in "ui" and page.dtype.itemsize > 1:
-                raise InputError(
-                    f"holds {page.dtype.name} numbers",
-                    where=path,
-                    cure="save it as 8 or 16 bits or as floats",
-                )
+                _refuse(page.dtype.name, path)
             else:
                 return None
     except InputError:

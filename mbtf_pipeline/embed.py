@@ -39,29 +39,30 @@ class Encoding:
     bits : of a channel's logarithmic code
     quality : of JPEG for the fixed pictures, without subsampling
     shrink : this many pixels along each side become one
+    still : the same, for the fixed pictures only, on top of it
+    shades : colours of a map
     """
 
     bits: int
     quality: int
     shrink: int = 1
+    still: int = 1
+    shades: int = 256
 
     def describe(self, coding: Coding) -> str:
         """In words."""
         data = f"{self.bits} bits per channel on a logarithmic scale, within {coding.relative_error:.1%}"
-        size = (
-            ""
-            if self.shrink == 1
-            else f"; to keep the file small, {self.shrink} × {self.shrink} pixels averaged"
-        )
-        return f"{data}{size}"
+        less = [f"{self.shrink} × {self.shrink} pixels averaged"] if self.shrink > 1 else []
+        less += [f"maps in {self.shades} shades"] if self.shades < 256 else []
+        return f"{data}; to keep the file small: {', '.join(less)}" if less else data
 
 
 # From the best to the smallest.
 ENCODINGS = (
     Encoding(10, 88),
-    Encoding(9, 85),
-    Encoding(8, 80),
-    *(Encoding(8, 75, s) for s in (2, 4, 8, 16)),
+    Encoding(9, 82),
+    Encoding(9, 80, still=2, shades=64),
+    *(Encoding(8, 75, shrink, still=2, shades=32) for shrink in (1, 2, 4, 8, 16)),
 )
 
 
@@ -79,11 +80,12 @@ def photograph(display: U8, quality: int) -> str:
     return data_uri("image/jpeg", stream.getvalue())
 
 
-def chart(field: Field, name: Palette) -> str:
-    """``data:`` URI of a map (rows, columns) in a palette's colours as PNG."""
+def chart(field: Field, name: Palette, shades: int) -> str:
+    """``data:`` URI of a map (rows, columns) as PNG, in so many of a palette's 256 colours."""
     from PIL import Image
 
-    image = Image.fromarray(indices(field, name))
+    steps = np.round(indices(field, name) * ((shades - 1) / 255.0))
+    image = Image.fromarray(np.round(steps * (255.0 / (shades - 1))).astype(np.uint8))
     image.putpalette([channel for colour in palette(name) for channel in colour])
     stream = io.BytesIO()
     image.save(stream, "PNG", optimize=True)
@@ -151,9 +153,10 @@ def encode(gallery: Gallery, encoding: Encoding) -> Embedded:
     packed: dict[str, Mapping[str, int | str]] = {}
     for name, picture in pictures.items():
         small = shrink(picture, encoding.shrink).astype(np.float32)
-        images[name] = photograph(to_display(small, 1.0 / gallery.white), encoding.quality)
+        still = to_display(shrink(small, encoding.still).astype(np.float32), 1.0 / gallery.white)
+        images[name] = photograph(still, encoding.quality)
         data = base64.b64encode(pack(coding.encode(small))).decode()
         packed[name] = {"rows": small.shape[0], "columns": small.shape[1], "data": data}
     for name, (colours, read) in gallery.charts.items():
-        images[name] = chart(shrink(read(), encoding.shrink), colours)
+        images[name] = chart(shrink(read(), encoding.shrink), colours, encoding.shades)
     return Embedded(encoding, coding, images, packed)

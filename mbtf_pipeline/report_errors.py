@@ -31,11 +31,13 @@ def error_context(comparison: Mapping[str, Any]) -> dict[str, Any]:
         "test": next(iter(_first_split(comparison).values())),
         "error_table": _table(comparison),
         "error_plots": _plots(comparison),
-        "detail_tables": [
-            _groups_table(comparison, "levels", "By level of detail", "level"),
-            _groups_table(comparison, "elevations", "By the smaller cosine of light and view", "cos θ"),
-            _pictures_table(comparison),
+        "group_tables": [
+            _groups_table(comparison, "levels", "By level of detail, test split", "level"),
+            _groups_table(
+                comparison, "elevations", "By the smaller cosine of light and view, test split", "cos θ"
+            ),
         ],
+        "picture_table": _pictures_table(comparison),
         "definitions": [(_TERMS[k], v) for k, v in comparison["definitions"].items()],
     }
 

@@ -47,6 +47,7 @@ def query_figure(sample: QuerySample, title: str) -> Any:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11.0, 10.0), layout="constrained")
+    figure.get_layout_engine().set(w_pad=0.15)
     figure.suptitle(title, wrap=True)
     position, level, light, view = figure.subplots(2, 2).ravel()
     _positions(position, sample)

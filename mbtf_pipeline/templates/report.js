@@ -245,6 +245,9 @@
   });
   dialog.addEventListener('click', () => dialog.close());
 
+  // Paper has no closed boxes.
+  addEventListener('beforeprint', () => document.querySelectorAll('details').forEach(e => { e.open = true; }));
+
   const start = async () => {
     $('viewer').hidden = false;
     spans();

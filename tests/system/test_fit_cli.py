@@ -64,6 +64,24 @@ def test_json_is_one_object(shards: Path, material: Path, tmp_path: Path, run_py
         json.loads(done.stdout)
 
 
+def test_another_material_s_data_are_warned_of(tmp_path: Path, run_python: RunPython) -> None:
+    made = {}
+    for name, digest in (("own", "1"), ("other", "2")):
+        made[name] = write_data(tmp_path / name, parallax, train=2000, test=500)
+        path = made[name] / "manifest.json"
+        inputs = {"height": digest, "settings": "same"}
+        path.write_text(json.dumps({**json.loads(path.read_text()), "inputs": inputs}))
+    fitted = tmp_path / "fitted"
+    done = run_python("-m", "mbtf_fit", str(made["own"]), "-o", str(fitted), *QUICK)
+    assert done.returncode == 0, done.stderr
+    for name, foreign in (("own", []), ("other", ["height"])):
+        done = run_python("-m", "mbtf_fit", "evaluate", str(fitted), str(made[name]), "--json")
+        assert done.returncode == 0, done.stderr
+        assert json.loads(done.stdout)["foreign_inputs"] == foreign
+        assert ("made from another material" in done.stderr) == bool(foreign)
+        assert ("(height differs)" in done.stderr) == bool(foreign)
+
+
 def test_evaluate_and_info_speak_to_people(shards: Path, material: Path, run_python: RunPython) -> None:
     done = run_python("-m", "mbtf_fit", "evaluate", str(material), str(shards))
     assert "held-out directions: unexplained variance" in done.stdout

@@ -40,6 +40,7 @@ def test_help_answers_without_heavy_modules(program: str, run_python: RunPython)
     [
         ("mbtf-gen", "doctor"),
         ("mbtf-gen", "verify"),
+        ("mbtf-gen", "inspect"),
         ("mbtf-gen", "reference"),
         ("mbtf-gen", "preview"),
         ("mbtf-fit", "evaluate"),

@@ -87,7 +87,7 @@ def test_a_shard_with_nan_or_infinity_is_refused_by_name(tmp_path: Path, bad: fl
     arrays = read_shard(path, mapped=False)
     arrays[name][7] = bad
     write_shard(path, arrays)
-    with pytest.raises(InputError, match=rf"train-00001\.npz: \d numbers? of '{name}'.* row 7"):
+    with pytest.raises(InputError, match=rf"train-00001\.npz: '{name}' holds NaN or infinite .* row 7"):
         partition(folder)
 
 

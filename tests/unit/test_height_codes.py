@@ -52,6 +52,12 @@ def test_rare_codes_are_no_stretch() -> None:
     assert use.spacing == 1.0
 
 
+def test_irregular_levels_are_no_stretch() -> None:
+    rng = np.random.default_rng(2)
+    used = rng.choice(256, 80, replace=False)
+    assert code_use(rng.choice(used, (64, 64))).spacing == 1.0
+
+
 @pytest.mark.parametrize("values", [[0, 255], [0, 100, 200], list(range(0, 150, 10))])
 def test_terraces_that_are_meant_stay(values: list[int]) -> None:
     codes = np.random.default_rng(1).choice(values, (64, 64))
@@ -105,6 +111,11 @@ class TestMaterial:
         material = load_material(path)
         assert material.warnings == ()
         assert np.array_equal(np.rint(material.height * 65535), np.rint(fractal(128, 128) * 65535))
+
+    def test_one_level_is_no_terrace(self, tmp_path: Path) -> None:
+        material = load_material(save_heights(tmp_path / "h.png", np.full((8, 8), 0.5), 8))
+        assert material.warnings == ()
+        assert np.ptp(material.height) == 0.0
 
     def test_smoothing_can_be_declined(self, tmp_path: Path) -> None:
         save_heights(tmp_path / "h.png", fractal(64, 64), 8)

@@ -15,7 +15,7 @@ from mbtf_gen.heightfield import HeightGrid
 from mbtf_gen.inspection import inspect_material
 from mbtf_gen.inspection_text import LINES, WIDTH, inspection_text
 from mbtf_gen.material import load_material
-from mbtf_gen.relief import autocorrelation, detail_size, repeats, slope_angles, triangle_slopes
+from mbtf_gen.relief import autocorrelation, detail_size, repeats, rms_slope, slope_angles, triangle_slopes
 
 
 class TestRelief:
@@ -28,6 +28,7 @@ class TestRelief:
         normals = tile_mesh(grid).face_normals
         expected = np.hypot(normals[:, 0], normals[:, 1]) / normals[:, 2]
         assert np.sort(triangle_slopes(grid)) == pytest.approx(np.sort(expected))
+        assert rms_slope(grid) == pytest.approx(np.sqrt(np.mean(expected**2)))
 
     def test_a_roof(self) -> None:
         """Both flanks of a ridge along v rise by as much as they are wide."""
@@ -35,11 +36,24 @@ class TestRelief:
         median, high, steepest = slope_angles(HeightGrid.from_map(roof, 1.0, 0.25))
         assert (median, high, steepest) == pytest.approx((45.0, 45.0, 45.0))
 
+    def test_percentiles(self) -> None:
+        """A gentle flank over seven eighths of the tile, a steep one over the last."""
+        gentle = np.arange(57) / 56 * 0.1
+        steep = 0.1 - np.arange(1, 8) / 8 * 0.1
+        saw = np.tile(np.concatenate([gentle, steep]), (4, 1))
+        median, high, steepest = slope_angles(HeightGrid.from_map(saw, 1.0, 1 / 16))
+        expected = np.degrees(np.arctan([0.1 * 64 / 56, 0.1 * 8, 0.1 * 8]))
+        assert (median, high, steepest) == pytest.approx(tuple(expected))
+
     def test_repeats(self) -> None:
         cell = fractal(16, 16)
         assert [repeats(np.tile(cell, (3, 5)), axis) for axis in (1, 0)] == [5, 3]
         assert [repeats(fractal(64, 64), axis) for axis in (1, 0)] == [1, 1]
         assert repeats(np.zeros((8, 8)), 0) == 1
+        # A ripple on a swell repeats as often as the swell.
+        x = np.arange(96) / 96 * 2 * np.pi
+        assert repeats(np.tile(np.cos(x) + 0.5 * np.cos(16 * x), (4, 1)), 1) == 1
+        assert repeats(np.tile(np.cos(2 * x), (4, 1)), 1) == 2
 
     def test_detail(self) -> None:
         noise = np.random.default_rng(0).normal(size=(128, 128))
@@ -102,9 +116,25 @@ class TestNumbers:
             assert part in texts
         assert "no base colour" not in texts
 
+    def test_floats_that_were_integers(self, tmp_path: Path) -> None:
+        for name, height in (("a", fractal(96, 96)), ("b", np.rint(fractal(96, 96) * 200) / 200)):
+            np.save(tmp_path / f"{name}.npy", 0.1 * height)
+            oddities = inspect_material(load_material(tmp_path / f"{name}.npy"))["oddities"]
+            assert any("different values" in o for o in oddities) == (name == "b")
+
+    @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (5, 1), (2, 3)])
+    def test_tiny_maps(self, tmp_path: Path, shape: tuple[int, int]) -> None:
+        save_heights(tmp_path / "height.png", np.random.default_rng(0).random(shape), 8)
+        save_normals(tmp_path / "normal.png", np.full((*shape, 3), (0.0, 0.0, 1.0)))
+        found = inspect_material(load_material(tmp_path))
+        assert found["maps"]["height"]["columns"] == shape[1]
+        assert found["normal"] is not None
+        assert len(inspection_text(found, "tiny").splitlines()) <= LINES
+
     def test_a_flat_plain_map_is_nothing_special(self, tmp_path: Path) -> None:
         np.save(tmp_path / "h.npy", np.zeros((4, 4)))
         found = inspect_material(load_material(tmp_path / "h.npy"))
+        assert "relief 0 tile widths" in inspection_text(found, "flat")
         assert found["geometry"]["slope_max_deg"] == 0.0
         assert found["geometry"]["slope_kept"] == 1.0
         assert found["oddities"] == ["no base colour map: linear RGB 0.5, 0.5, 0.5 everywhere"]

@@ -77,6 +77,17 @@ def test_numbers_are_those_of_the_code() -> None:
         assert text in DOCUMENT, text
 
 
+def test_the_content_of_inspect_is_documented(tmp_path: Path) -> None:
+    import numpy as np
+
+    from mbtf_gen.inspection import inspect_material
+
+    np.save(tmp_path / "h.npy", np.zeros((4, 4)))
+    rows = DOCUMENT.split("| key | content |", 1)[1].split("\n\n", 1)[0].splitlines()
+    keys = {word.strip(" `") for row in rows[2:] for word in row.split("|")[1].split(",")}
+    assert keys == {"material", *inspect_material(load_material(tmp_path / "h.npy"))}
+
+
 def test_the_example_is_valid(tmp_path: Path) -> None:
     """The document's material file, with maps of those names beside it."""
     import numpy as np

@@ -48,7 +48,7 @@ def test_what_was_given_up_is_said(gallery: Gallery) -> None:
     assert "averaged" not in best.encoding.describe(best.coding)
     assert small.encoding.shrink > 1
     s = small.encoding.shrink
-    assert f"to keep the file small, {s} × {s} pixels averaged" in small.encoding.describe(small.coding)
+    assert f"to keep the file small: {s} × {s} pixels averaged" in small.encoding.describe(small.coding)
     assert small.packed["a"]["columns"] == 128 // s
 
 

@@ -182,6 +182,7 @@ def test_jobs_use_it(tmp_path: Path) -> None:
 
     path = save_heights(tmp_path / "h.png", cut(fractal(64, 64)))
     config = {"material": str(path), "geometry": {"tile": "mirror"}}
+    assert GeneratorConfig.model_validate({"material": "m"}).geometry.tile == "none"
     job = Job.prepare(GeneratorConfig.model_validate(config))
     assert job.material.height.shape == (96, 96)
     assert job.material.tile == "mirror"
