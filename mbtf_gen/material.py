@@ -42,6 +42,7 @@ FLOAT_SCALE = 1.0
 DEFAULT_ROUGHNESS = 0.5
 DEFAULT_METALLIC = 0.0
 DEFAULT_SPECULAR = 0.5
+DEFAULT_COAT_ROUGHNESS = 0.1
 # Mesh cells across the tile, at most, unless asked for.
 DEFAULT_MESH = 512
 # Beyond so many tile widths a default factor is probably not what was meant.
@@ -206,17 +207,17 @@ def _assemble(spec: MaterialFile, folder: Path, notes: list[str], tile: Tiling) 
         given = {"roughness": roughness, "metallic": metallic, "specular": specular}
         filled = [f"{name} {constants[name]}" for name, value in given.items() if value is None]
         roughness, metallic, specular = (constants[n] if v is None else v for n, v in given.items())
-        load.notes.append(f"surface: principled{', constants ' + ', '.join(filled) if filled else ''}")
+        load.notes.append(f"surface: glossy{', constants ' + ', '.join(filled) if filled else ''}")
     basecolor = load.colour(spec.basecolor) if spec.bsdf is None else np.full(3, DEFAULT_COLOUR)
     normal, convention, fit = None, None, None
     if spec.normal is not None:
         normal, convention, fit = _normals(spec.normal, load, height, scale)
-        load.notes.append("normal map: read, but not simulated yet")
     opacity = load.share("opacity", spec.opacity)
     if opacity is not None:
-        load.warnings.append(
-            f"opacity: read, but holes are not simulated yet ({holes(opacity):.0%} of the tile)"
-        )
+        load.notes.append(f"opacity: {holes(opacity):.0%} of the tile are holes")
+    coat, coat_roughness = (load.share(n, getattr(spec, n)) for n in ("clearcoat", "clearcoat_roughness"))
+    if coat is not None and coat_roughness is None:
+        coat_roughness = DEFAULT_COAT_ROUGHNESS
     bsdf = None
     if spec.bsdf is not None:
         bsdf, load.settings["bsdf"] = _bsdf(plain(spec.bsdf), load)
@@ -232,6 +233,8 @@ def _assemble(spec: MaterialFile, folder: Path, notes: list[str], tile: Tiling) 
         roughness=roughness,
         metallic=metallic,
         specular=specular,
+        coat=coat,
+        coat_roughness=coat_roughness,
         normal=normal,
         opacity=opacity,
         bsdf=bsdf,
