@@ -4,36 +4,34 @@ from __future__ import annotations
 
 import logging
 import math
-import re
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, Field
 
-from .atomic import digest, read_json, write_json, write_text
+from .atomic import digest, write_json
 from .config import GeneratorConfig, count_queries
-from .dataset import Dataset
 from .effects import EffectsPlan
-from .errors import InputError, PartialError, UsageError
+from .errors import PartialError, UsageError
 from .estimates import Stream
 from .heightfield import HeightGrid
 from .levels import Lattice
 from .locks import shard_lock
-from .manifest import ShardEntry, build_manifest, software_versions
+from .manifest import ShardEntry, build_manifest
 from .material import Material, load_material
+from .output_folder import open_folder
 from .planning import plan_effects, simulated
 from .queries import Mixture, QueryPlan
-from .schema import CONFIG_NAME, FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, SPLITS, Split
-from .settings import check_document, differences, dump_yaml, in_short
+from .schema import FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, SPLITS, Split
 from .shard_files import shard_suffix, write_shard
 from .simulation import estimator_of
 from .slopes import residual_slopes
+from .summary import Summary, finish, planned_effects
 from .verification import is_finished, sidecar_of
 
 log = logging.getLogger(__name__)
@@ -42,41 +40,6 @@ ProgressCallback = Callable[[float, str], None]
 
 # A folder and a manifest of more are of no use to anyone.
 MAX_SHARD_FILES = 1_000_000
-
-# What a run writes into its folder, and what a killed one leaves there.
-_OWN = re.compile(
-    rf"{re.escape(MANIFEST_NAME)}|{re.escape(CONFIG_NAME)}|(?:{'|'.join(SPLITS)})-\d+\.(?:npz|exr|json)"
-)
-_LEFTOVER = re.compile(rf"\.(?:{_OWN.pattern})\.\d+\.tmp|\.(?:{'|'.join(SPLITS)})-\d+\.lock")
-
-
-@dataclass(frozen=True)
-class Summary:
-    """What a run made.
-
-    Attributes
-    ----------
-    queries : finished, of all splits; splits : the same by split
-    paths, seconds : traced in this run, and its duration
-    relative_error : pooled relative standard error of the stored training values, √(mean variance) / mean
-        value
-    mean_value : mean training value per channel, 1/sr
-    lost, capped, nonfinite : rays lost or capped, samples drawn again, over all shards
-    """
-
-    folder: str
-    complete: bool
-    queries: int
-    splits: dict[str, int]
-    paths: int
-    seconds: float
-    paths_per_second: float
-    relative_error: float
-    mean_value: list[float]
-    lost: int
-    capped: int
-    nonfinite: int
-    effects: list[str]
 
 
 @dataclass(frozen=True)
@@ -204,65 +167,10 @@ def _agreed_effects(job: Job, folder: Path, entries: list[ShardEntry], overwrite
     all shards of a data set show the same, whichever machine makes them."""
     existing = folder / MANIFEST_NAME
     if existing.exists() and not overwrite:
-        _open_folder(job, folder, build_manifest(job, entries, None), overwrite)
+        open_folder(job, folder, build_manifest(job, entries, None), overwrite)
     else:
-        _open_folder(job, folder, build_manifest(job, entries, plan_effects(job)), overwrite)
-    return EffectsPlan.from_manifest(read_json(existing)["effects"])
-
-
-def _open_folder(job: Job, folder: Path, manifest: dict[str, Any], overwrite: bool) -> None:
-    """Claim the output folder: new, empty, resumed, or replaced.
-
-    Raises
-    ------
-    InputError : it holds something else
-    """
-    if folder.exists() and not folder.is_dir():
-        raise InputError("is a file, not a folder", where=folder)
-    existing = folder / MANIFEST_NAME
-    if existing.exists():
-        old = read_json(existing)
-        if old.get("format") != FORMAT_NAME:
-            raise InputError(
-                f"is not a manifest of {FORMAT_NAME}", where=existing, cure="choose another folder with -o"
-            )
-        if overwrite:
-            _clear(folder)
-        elif old.get("config_hash") != job.config_hash:
-            config = old.get("config")
-            before = {**(config if isinstance(config, dict) else {}), "inputs": old.get("inputs", {})}
-            before["schema"] = old.get("schema")
-            after = {**manifest["config"], "inputs": manifest["inputs"], "schema": SCHEMA_VERSION}
-            changes = in_short(differences(before, after)) or "inputs differ"
-            raise InputError(
-                f"holds a data set of another configuration: {changes}",
-                where=folder,
-                cure="choose another folder with -o, or replace it with --overwrite",
-            )
-    elif folder.exists() and not all(_LEFTOVER.fullmatch(p.name) for p in folder.iterdir()):
-        if existing.exists():
-            # Another writer of the same data set made it between the two looks.
-            return _open_folder(job, folder, manifest, overwrite)
-        raise InputError(
-            "is not empty and holds no data set", where=folder, cure="choose another folder with -o"
-        )
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot be made ({error.strerror})", where=folder) from None
-    # The manifest first: it makes the folder ours, whatever instant the run is killed at.
-    if not existing.exists():
-        write_json(existing, manifest)
-    if not (folder / CONFIG_NAME).exists():
-        write_text(folder / CONFIG_NAME, dump_yaml(manifest["config"]))
-
-
-def _clear(folder: Path) -> None:
-    """Remove a data set and nothing else; the manifest last, so that the rest never stands without it."""
-    names = (p.name for p in folder.iterdir())
-    for name in sorted(names, key=lambda name: name == MANIFEST_NAME):
-        if _OWN.fullmatch(name) or _LEFTOVER.fullmatch(name):
-            (folder / name).unlink(missing_ok=True)
+        open_folder(job, folder, build_manifest(job, entries, plan_effects(job)), overwrite)
+    return planned_effects(folder)
 
 
 def _sidecar(job: Job, entry: ShardEntry, path: Path, estimates: Any, seconds: float) -> dict[str, Any]:
@@ -383,111 +291,3 @@ def generate(
             cure="wait for it, then run the same command again",
         )
     return finish(folder, paths=paths, seconds=time.perf_counter() - start)
-
-
-_Number = Annotated[float, Field(allow_inf_nan=False)]
-_Colour = tuple[_Number, _Number, _Number]
-
-
-class _Effect(BaseModel):
-    effect: str
-    on: bool
-
-
-class _Plan(BaseModel):
-    """What :func:`finish` relies on of a manifest, beside what every reader does."""
-
-    complete: bool
-    effects: list[_Effect]
-
-
-class _Statistics(BaseModel):
-    mean_value: _Colour
-    mean_variance: _Colour
-
-
-class _Quarantined(BaseModel):
-    nonfinite_samples: int
-    lost_rays: int
-    capped_rays: int
-
-
-class _Made(BaseModel):
-    """What :func:`finish` relies on of a shard's sidecar."""
-
-    queries: Annotated[int, Field(ge=1)]
-    paths: int
-    seconds: _Number
-    statistics: _Statistics
-    quarantined: _Quarantined
-
-
-_MEND = "look for damage with: mbtf-gen verify"
-
-
-def finish(folder: str | Path, *, paths: int = 0, seconds: float = 0.0) -> Summary:
-    """Complete the manifest when every shard is there, and summarise (``mbtf-gen merge``).
-
-    Raises
-    ------
-    InputError : no data set there, or damaged documents
-    """
-    folder = Path(folder)
-    manifest = Dataset.open(folder).manifest
-    check_document(_Plan, manifest, folder / MANIFEST_NAME, _MEND)
-    records: dict[str, list[dict[str, Any]]] = {}
-    complete = True
-    for split, content in manifest["splits"].items():
-        for entry in content["shards"]:
-            if is_finished(folder / entry["file"], entry["rows"], manifest["config_hash"]):
-                sidecar = sidecar_of(folder / entry["file"])
-                record = read_json(sidecar)
-                check_document(_Made, record, sidecar, _MEND)
-                records.setdefault(split, []).append(record)
-            else:
-                complete = False
-    flat = [r for rs in records.values() for r in rs]
-    train = records.get("train", [])
-    weights = np.array([r["queries"] for r in train], np.float64)
-    if len(train):
-        mean = np.average([r["statistics"]["mean_value"] for r in train], axis=0, weights=weights)
-        variance = np.average([r["statistics"]["mean_variance"] for r in train], axis=0, weights=weights)
-        relative = float(np.sqrt(variance.mean()) / mean.mean()) if mean.mean() > 0 else 0.0
-    else:
-        mean, relative = np.zeros(3), 0.0
-    counts = {
-        k: sum(r["quarantined"][k] for r in flat) for k in ("nonfinite_samples", "lost_rays", "capped_rays")
-    }
-    summary = Summary(
-        folder=str(folder),
-        complete=complete,
-        queries=sum(r["queries"] for r in flat),
-        splits={split: sum(r["queries"] for r in records.get(split, [])) for split in manifest["splits"]},
-        paths=paths,
-        seconds=round(seconds, 3),
-        paths_per_second=round(paths / seconds, 1) if seconds > 0 else 0.0,
-        relative_error=relative,
-        mean_value=[float(m) for m in mean],
-        lost=counts["lost_rays"],
-        capped=counts["capped_rays"],
-        nonfinite=counts["nonfinite_samples"],
-        effects=[e["effect"] for e in manifest["effects"]["effects"] if e["on"]],
-    )
-    if complete and not manifest["complete"]:
-        manifest["complete"] = True
-        manifest["software"] = software_versions()
-        manifest["summary"] = {
-            "queries": summary.queries,
-            "paths": sum(r["paths"] for r in flat),
-            "shard_seconds": round(sum(r["seconds"] for r in flat), 3),
-            "relative_error": summary.relative_error,
-            "mean_value": summary.mean_value,
-            **counts,
-        }
-        write_json(folder / MANIFEST_NAME, manifest)
-    return summary
-
-
-def summary_dict(summary: Summary) -> dict[str, Any]:
-    """Summary as plain data for ``--json``."""
-    return asdict(summary)

@@ -114,7 +114,8 @@ def generate(
     }
     resolved = resolve_config(GeneratorConfig, material, config, assignments or [], flags)
     part = _slice(shards)
-    from ..generation import Job, generate, paths_left, summary_dict
+    from ..generation import Job, generate, paths_left
+    from ..summary import summary_dict
 
     folder = output or Path("shards")
     job = Job.prepare(resolved)

@@ -16,8 +16,9 @@ from mbtf_gen.config import GeneratorConfig
 from mbtf_gen.dataset import Dataset
 from mbtf_gen.engine import load_mitsuba
 from mbtf_gen.errors import InputError, PartialError, UsageError
-from mbtf_gen.generation import Job, finish, generate, paths_left
+from mbtf_gen.generation import Job, generate, paths_left
 from mbtf_gen.locks import shard_lock
+from mbtf_gen.summary import finish
 from mbtf_gen.verification import sidecar_of, verify
 
 load_mitsuba()
