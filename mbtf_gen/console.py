@@ -48,7 +48,16 @@ from typing import Annotated, Any
 
 from cyclopts import App, CycloptsError, Parameter, UnusedCliTokensError
 
-from .errors import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, MbtfError, UsageError, printable
+from .errors import (
+    EXIT_BAD_INPUT,
+    EXIT_INTERRUPTED,
+    EXIT_OK,
+    EXIT_USAGE,
+    MbtfError,
+    UsageError,
+    printable,
+    reason,
+)
 
 EXIT_INTERNAL = 1
 _EXIT_BROKEN_PIPE = 141
@@ -330,9 +339,9 @@ def _command_first(app: App, tokens: list[str]) -> list[str]:
 def _usage_message(app: App, fault: CycloptsError, tokens: Sequence[str]) -> str:
     """What cyclopts found wrong with the command line, with where to read on."""
     if isinstance(fault, UnusedCliTokensError) and fault.unused_tokens:
-        text = f"unexpected argument '{fault.unused_tokens[0]}'"
+        text = f"unexpected argument '{reason(fault.unused_tokens[0])}'"
     else:
-        text = " ".join(str(fault).split())
+        text = reason(fault, 300)
     command = f" {tokens[0]}" if tokens and tokens[0] in _commands(app) else ""
     return f"{text}\n  see {app.name[0]}{command} --help"
 
@@ -380,12 +389,12 @@ def run(app: App, argv: Sequence[str] | None = None) -> int:
     except OSError as error:
         if error.filename is None:
             return _internal(error, debug)
-        return _fail(f"{error.filename}: {error.strerror}", EXIT_BAD_INPUT, debug)
+        return _fail(f"{reason(str(error.filename))}: {error.strerror}", EXIT_BAD_INPUT, debug)
     except Exception as error:
         return _internal(error, debug)
 
 
 def _internal(error: Exception, debug: bool) -> int:
-    text = " ".join(str(error).split()) or "no message"
+    text = reason(error, 1000)
     hint = "" if debug else " (run again with --debug for the traceback)"
     return _fail(f"internal error: {type(error).__name__}: {text}{hint}", EXIT_INTERNAL, debug)

@@ -242,6 +242,7 @@ def _from_npy(path: Path) -> Image:
 
 
 def _from_pillow(path: Path, kind: str) -> Image:
+    import PIL
     from PIL import Image as Pillow
 
     head = None
@@ -270,6 +271,8 @@ def _from_pillow(path: Path, kind: str) -> Image:
         raise InputError(f"claims more than {MAX_PIXELS:,} pixels", where=path) from None
     except InputError:
         raise
+    except PIL.UnidentifiedImageError:
+        raise InputError(f"cannot be read as a {kind} image (its header is damaged)", where=path) from None
     except Exception as error:  # a damaged file may make the decoder raise anything
         raise InputError(f"cannot be read as a {kind} image ({reason(error)})", where=path) from None
 

@@ -82,7 +82,9 @@ def explain(fault: Mapping[str, Any], model: type[BaseModel]) -> str:
     if kind == "string_too_short":
         return "must not be empty"
     expected = (
-        _KINDS.get(kind.split("_")[0]) if kind.endswith(("_type", "_parsing", "_number", "_float")) else None
+        _KINDS.get(kind.split("_")[0])
+        if kind.endswith(("_type", "_parsing", "_number", "_float", "_unicode"))
+        else None
     )
     message: str = fault["msg"]
     return expected or message.removeprefix("Value error, ").removeprefix("Assertion failed, ")

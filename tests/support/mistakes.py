@@ -268,7 +268,7 @@ _THEIRS = re.compile(
 
 def answer(line: str, folder: Path) -> str:
     """A command line, how it ended, and what it printed, without what differs from run to run."""
-    done = call(line)
+    done = call(line.split())
     # Of standard error the complaints: notes on what was read are not about the mistake.
     lines = done.err.splitlines(keepends=True)
     first = next((i for i, text in enumerate(lines) if text.startswith("error: ")), len(lines))
@@ -278,13 +278,13 @@ def answer(line: str, folder: Path) -> str:
     return f"$ {line}\nexit {done.code}\n{text}"
 
 
-def call(line: str) -> Done:
+def call(words: list[str]) -> Done:
     """Run a command line of one of the programs in this process, in the current folder."""
     import mbtf_fit.cli
     import mbtf_gen.cli
     import mbtf_pipeline.cli
 
-    program, *tokens = line.split()
+    program, *tokens = words
     modules = {"mbtf-gen": mbtf_gen.cli, "mbtf-fit": mbtf_fit.cli, "mbtf-pipeline": mbtf_pipeline.cli}
     loggers = [logging.getLogger(name) for name in ("mbtf_gen", "mbtf_fit", "mbtf_pipeline")]
     before = [(logger, logger.handlers, logger.propagate, logger.level) for logger in loggers]

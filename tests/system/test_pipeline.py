@@ -182,6 +182,18 @@ def test_other_pictures_leave_data_and_fit_alone(again: Any) -> None:
     assert list(again()) == ["compare", "report"]
 
 
+def test_a_report_that_would_be_too_large_gives_up_precision_and_says_so(again: Any, folder: Path) -> None:
+    larger = ("--set", "compare.size=256", "--set", "compare.spp=4", "--set", "compare.spans=[2, 4]")
+    assert list(again(*larger)) == ["compare", "report"]
+    report = folder / "report.html"
+    assert report.stat().st_size > 1.2e6
+    assert "to keep the file small" not in report.read_text()
+    assert list(again(*larger, "--set", "report.max_megabytes=1")) == ["report"]
+    assert report.stat().st_size <= 1e6
+    assert "to keep the file small" in report.read_text()
+    assert list(again()) == ["compare", "report"]
+
+
 def test_another_title_makes_only_the_report(again: Any, folder: Path) -> None:
     assert list(again("--set", "report.title=A <b> & c")) == ["report"]
     assert "<h1>A &lt;b&gt; &amp; c</h1>" in (folder / "report.html").read_text()

@@ -87,7 +87,9 @@ def _start(profile: Path) -> Any:
         options.add_argument(flag)
     options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
     try:
-        return selenium.Chrome(options=options, service=Service(executable_path=driver))
+        started = selenium.Chrome(options=options, service=Service(executable_path=driver))
+        started.get("about:blank")
+        return started
     except (WebDriverException, HTTPError, OSError) as error:
         first = (str(error).strip() or type(error).__name__).splitlines()[0]
         pytest.skip(f"the browser does not start here ({first}): the report was not opened in it")
@@ -330,7 +332,8 @@ def test_nothing_is_asked_for_outside(page: Page, stage: Any) -> None:
 
 def test_everything_has_a_name(page: Page, stage: Any) -> None:
     code = """
-        const named = e => e.getAttribute('aria-label') || e.alt || e.textContent.trim()
+        const named = e => e.getAttribute('aria-label') || e.alt
+            || (!e.hasAttribute('role') && e.textContent.trim())
             || [...(e.labels || [])].map(l => l.textContent.trim()).join('')
             || e.querySelector('[alt],[aria-label]');
         return [...document.querySelectorAll('img, button, input, [role=img], [role=slider]')]

@@ -18,8 +18,9 @@ from PIL import Image
 from support.image_samples import png
 
 SIDE = 60_000
-# MiB that all of them together may take: a library loads tables, but no picture.
-ALLOWED = 200
+# MiB that reading all of them may take: of memory (a library loads tables, but no picture), and of addresses
+# (threads reserve some without using them; a claim of 60000 x 60000 asks for 3400 at least).
+ALLOWED, ADDRESSES = 100, 1000
 
 # Reads each file; then says what came of it and by how much the peak of memory rose, in MiB. The limit on
 # addresses makes sure that memory taken and never touched counts as well.
@@ -138,6 +139,7 @@ def write_claims(folder: Path, beside: Path) -> dict[str, str]:
         ),
         "inside.exr": (_exr(beside, dataWindow=struct.pack("<4i", 9, 9, 0, 0)), ""),
         "tiles.exr": (_exr(beside, tiles=struct.pack("<2IB", 30_000, 30_000, 0)), "tiles of 30000 x 30000"),
+        "strips.exr": (_exr(beside, tiles=struct.pack("<2IB", 8, 10_616_840, 0)), "tiles of 8 x 10616840"),
         "mipmaps.exr": (_exr(beside, tiles=struct.pack("<2IB", 2**31 - 1, 1, 1)), ""),
         "shard.exr": (_exr(beside, dataWindow=huge, displayWindow=huge), "claims 60000 x 60000 pixels"),
         "shard.npz": (_bomb(), "shard is compressed"),
@@ -171,7 +173,7 @@ def test_claims_take_no_memory(tmp_path: Path) -> None:
     Image.new("L", (8, 8)).save(tmp_path / "small.tif")
     assert max(path.stat().st_size for path in folder.iterdir()) < 200_000
     child = subprocess.run(
-        [sys.executable, "-c", _CODE, str(folder), str(ALLOWED), str(tmp_path / "small.tif")],
+        [sys.executable, "-c", _CODE, str(folder), str(ADDRESSES), str(tmp_path / "small.tif")],
         capture_output=True,
         text=True,
         timeout=300,
@@ -186,4 +188,4 @@ def test_claims_take_no_memory(tmp_path: Path) -> None:
         assert says in said[name], (name, said[name])
         # Refused by what it claims, not because memory ran out.
         assert "memory" not in said[name].lower(), (name, said[name])
-    assert rise < ALLOWED // 2, said
+    assert rise < ALLOWED, said

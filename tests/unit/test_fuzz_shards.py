@@ -176,6 +176,18 @@ def test_a_manifest_cannot_name_files_elsewhere(whole: Path) -> None:
         path.write_text(before)
 
 
+@pytest.mark.parametrize("rows", ['"ten"', "null", "-1", "1.5", "true", "[10]", "{}", "1e3"])
+def test_a_sidecar_says_a_number_of_rows(rows: str, whole: Path) -> None:
+    path = whole / "train-00001.json"
+    before = path.read_text()
+    try:
+        path.write_text(before.replace('"rows": 10', f'"rows": {rows}'))
+        with pytest.raises(InputError, match="is damaged"):
+            Dataset.open(whole).shards("train")
+    finally:
+        path.write_text(before)
+
+
 def test_a_sidecar_cannot_claim_rows_without_bytes(whole: Path) -> None:
     path = whole / "train-00001.json"
     before = path.read_text()

@@ -226,3 +226,24 @@ def test_aliases_within_reason_are_taken(tmp_path: Path) -> None:
 def test_a_hostile_assignment_is_refused() -> None:
     with pytest.raises(InputError, match="holds more than 100,000 values"):
         resolve(GeneratorConfig, assignments=[f"seed={{{BOMB.strip().replace(chr(10), ', ')}}}"])
+
+
+@pytest.mark.parametrize("text", ["a: " + "[" * 100_000, "a: " + "{a: " * 50_000])
+def test_brackets_are_counted_before_they_are_read(
+    text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The reader's time grows with the square of their depth.
+    monkeypatch.setattr("mbtf_gen.settings._yaml", lambda: pytest.fail("the text was read"))
+    path = tmp_path / "a.yaml"
+    path.write_text(text)
+    with pytest.raises(InputError, match="levels deep"):
+        read_yaml(path)
+
+
+@pytest.mark.parametrize("name", ["a\\0b", "x" * 300, "folder/" + "y" * 300, "z/" * 3000])
+@pytest.mark.parametrize("line", ["height: {}", "height: heights.npy\nroughness: {}"])
+def test_names_that_no_file_can_have(name: str, line: str, tmp_path: Path) -> None:
+    path = tmp_path / "material.yaml"
+    path.write_text(line.format(f'"{name}"'))
+    with pytest.raises(InputError, match="is no name that a file can have"):
+        load_material(path)
