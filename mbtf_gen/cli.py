@@ -6,11 +6,12 @@ from .commands.doctor import doctor
 from .commands.folders import merge, verify
 from .commands.generate import generate
 from .commands.inspect import inspect
+from .commands.plan import plan
 from .commands.preview import preview
 from .commands.reference import reference
 from .console import new_app
 
 app = new_app("mbtf-gen", "Generate multi-resolution BTF (MBTF) data sets from displaced materials.")
 app.default(generate)
-for command in (inspect, preview, merge, verify, reference, doctor):
+for command in (inspect, plan, preview, merge, verify, reference, doctor):
     app.command(command)

@@ -13,9 +13,12 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
+from .effects import Wish
+from .errors import UsageError
 from .light import MAX_WIDTH_DEG, MIN_WIDTH_DEG
 from .schema import SCHEMA_VERSION, ArrayFormat, Layout, Tiling
 from .settings import FileName, Settings
+from .slopes import NormalMode
 
 _COUNT = re.compile(r"^\s*(\d+(?:\.\d+)?(?:[eE][+]?\d+)?)\s*(/\s*texel)?\s*$")
 
@@ -117,6 +120,29 @@ class TransportSection(Settings):
     max_crossings: int = Field(4096, ge=1, description="tile borders that one ray may cross")
 
 
+def _effects(text: str) -> str:
+    try:
+        Wish.parse(text)
+    except UsageError as error:
+        raise ValueError(str(error)) from None
+    return text
+
+
+class EffectsSection(Settings):
+    """Which effects of light are simulated."""
+
+    mode: Annotated[str, AfterValidator(_effects)] = Field(
+        "auto", description="auto, all or none, then +x or -x for single effects, comma-separated"
+    )
+    tolerance: float = Field(
+        0.005, ge=0, lt=1, description="cost of all effects left out together, relative to the mean value"
+    )
+    normal: NormalMode = Field(
+        "residual",
+        description="slopes of a normal map: those the mesh lacks, all in place of its own, or none",
+    )
+
+
 class OutputSection(Settings):
     """How the data are stored."""
 
@@ -133,6 +159,7 @@ class GeneratorConfig(Settings):
     queries: QueriesSection = QueriesSection()
     light: LightSection = LightSection()
     transport: TransportSection = TransportSection()
+    effects: EffectsSection = EffectsSection()
     output: OutputSection = OutputSection()
     seed: int = Field(0, ge=0, lt=1 << 63, description="root seed")
 

@@ -1,39 +1,162 @@
-"""Which effects of light a run simulates, and why: stored in the manifest, printed at the end."""
+"""The effects plan: which effects of light a run simulates, why, and what leaving the others out costs.
+
+The cost of leaving an effect out is the root mean square, over the run's queries, of the change that it makes
+to M, relative to the mean of M. Costs of several effects add up to no less than that of leaving out all of
+them (Minkowski), so a tolerance can be shared out.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal
 
-from .config import GeneratorConfig
+from .errors import UsageError
 
-if TYPE_CHECKING:
-    from .material import Material
+# Effects by name, in the order in which light meets them, and what they are called.
+EFFECTS: dict[str, str] = {
+    "masking": "parallax and masking",
+    "shadowing": "shadowing",
+    "interreflection": "interreflection",
+    "neighbours": "periodic neighbours",
+    "specular": "specular lobe",
+    "metallic": "metallic",
+    "coat": "clear coat",
+    "normal": "normal map",
+    "opacity": "opacity",
+    "fibres": "fibre scattering",
+    "mis": "BSDF sampling of light",
+}
+# Those that only a displaced tile has.
+OF_RELIEF = ("masking", "shadowing", "interreflection", "neighbours")
+
+# How a cost is known: it follows exactly; it is bounded from above by theory; it was measured by a pilot; or
+# the effect was asked for, or asked away, and nobody looked.
+Known = Literal["exact", "bound", "pilot", "asked"]
 
 
-def simulated_effects(material: Material, config: GeneratorConfig) -> list[dict[str, Any]]:
-    """Effects as ``{effect, on, reason}``, in the order in which light meets them."""
-    grid = material.grid(config.geometry.height, config.geometry.mesh)
-    flat = grid.relief == 0.0
-    relief = f"relief of {grid.relief:.4g} tile widths"
-    depth = config.transport.max_depth
-    bounces = "no depth limit, Russian roulette" if depth == 0 else f"at most {depth} surface interactions"
-    lambert = material.is_lambert
-    out = [
-        ("parallax and masking", not flat, "flat" if flat else relief),
-        ("shadowing", not flat, "flat" if flat else relief),
-        (
-            "interreflection",
-            not flat and depth != 1,
-            "flat" if flat else ("depth limit 1" if depth == 1 else bounces),
-        ),
-        ("periodic neighbours", not flat, "flat" if flat else "rays re-enter the tile"),
-        ("specular lobe", not lambert, "Lambert: no roughness, metallic or specular" if lambert else "given"),
-        (
-            "smoothed light",
-            config.light.width > 0,
-            f"RMS width {config.light.width:g} degrees per axis" if config.light.width > 0 else "delta light",
-        ),
-        ("normal map", False, "not simulated yet" if material.normal is not None else "no map"),
-        ("opacity", False, "not simulated yet" if material.opacity is not None else "no map"),
-    ]
-    return [{"effect": name, "on": bool(on), "reason": reason} for name, on, reason in out]
+@dataclass(frozen=True)
+class Effect:
+    """A decision.
+
+    Attributes
+    ----------
+    name : key of :data:`EFFECTS`
+    on : simulated or not
+    reason : in words
+    cost : of leaving it out, relative to the mean value; None where it was not worked out
+    known : how the cost is known
+    error : standard error of a measured cost
+    present : the material has what the effect needs; otherwise it cannot be switched on
+    """
+
+    name: str
+    on: bool
+    reason: str
+    cost: float | None = None
+    known: Known = "asked"
+    present: bool = True
+    error: float = 0.0
+
+
+@dataclass(frozen=True)
+class EffectsPlan:
+    """Decisions on every effect of :data:`EFFECTS`, in that order.
+
+    Attributes
+    ----------
+    max_depth : cap on surface interactions per path; 0 for none
+    cap_cost : cost of that cap where the plan chose it
+    roulette_depth : interactions before Russian roulette begins
+    mode : what was asked for
+    tolerance : allowed cost of all effects left out together
+    closed_form : M is known without tracing anything
+    """
+
+    effects: tuple[Effect, ...]
+    max_depth: int = 0
+    cap_cost: float = 0.0
+    roulette_depth: int = 3
+    mode: str = "auto"
+    tolerance: float = 0.0
+    closed_form: bool = False
+
+    def __getitem__(self, name: str) -> Effect:
+        return next(e for e in self.effects if e.name == name)
+
+    def on(self, name: str) -> bool:
+        """Is an effect simulated?"""
+        return self[name].on
+
+    @property
+    def cost(self) -> float:
+        """Cost of everything left out together, at most; relative to the mean value."""
+        return self.cap_cost + sum(e.cost or 0.0 for e in self.effects if not e.on)
+
+    def to_manifest(self) -> dict[str, Any]:
+        """Plain data for the manifest."""
+        effects = [{"effect": EFFECTS[e.name], **asdict(e)} for e in self.effects]
+        return {
+            "mode": self.mode,
+            "tolerance": self.tolerance,
+            "cost": self.cost,
+            "max_depth": self.max_depth,
+            "cap_cost": self.cap_cost,
+            "roulette_depth": self.roulette_depth,
+            "closed_form": self.closed_form,
+            "effects": effects,
+        }
+
+    @classmethod
+    def from_manifest(cls, data: dict[str, Any]) -> EffectsPlan:
+        """Inverse of :meth:`to_manifest`."""
+        effects = tuple(Effect(**{k: v for k, v in e.items() if k != "effect"}) for e in data["effects"])
+        names = ("max_depth", "cap_cost", "roulette_depth", "mode", "tolerance", "closed_form")
+        return cls(effects, **{name: data[name] for name in names})
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What was asked for: ``auto``, ``all`` or ``none``, and effects forced on or off."""
+
+    base: Literal["auto", "all", "none"]
+    forced: dict[str, bool]
+
+    @classmethod
+    def parse(cls, text: str) -> Wish:
+        """Read ``auto``, ``all``, ``none``, ``+x``, ``-x``, or a comma-separated list of them.
+
+        Raises
+        ------
+        UsageError : an unknown word
+        """
+        base: Any = "auto"
+        forced: dict[str, bool] = {}
+        for position, word in enumerate(w.strip() for w in text.split(",")):
+            if position == 0 and word in ("auto", "all", "none"):
+                base = word
+            elif word[:1] in ("+", "-") and word[1:] in EFFECTS:
+                forced[word[1:]] = word[0] == "+"
+            else:
+                raise UsageError(
+                    f"'{word}' is no effect",
+                    where="--effects",
+                    cure=f"auto, all or none, then +x or -x with x of {', '.join(EFFECTS)}",
+                )
+        return cls(base, forced)
+
+    def decide(self, effect: Effect) -> Effect:
+        """The effect as it was asked for, where it was.
+
+        Raises
+        ------
+        UsageError : asked for by name, but the material does not have it
+        """
+        name = effect.name
+        if not effect.present:
+            if self.forced.get(name):
+                raise UsageError(f"the material has none: {effect.reason}", where=f"--effects +{name}")
+            return effect
+        on = self.forced.get(name, effect.on if self.base == "auto" else self.base == "all")
+        if on == effect.on:
+            return effect
+        return replace(effect, on=on, reason=f"asked {'for' if on else 'away'}; {effect.reason}")

@@ -7,7 +7,6 @@ shard alone, so values do not depend on how queries are grouped into launches.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import drjit as dr
@@ -16,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import PartialError
+from .estimates import Estimates, Stream
 from .light import LightKernel
 from .queries import Queries
-from .scene import CLEARANCE, Tile, register_plugins
+from .scene import CLEARANCE, Tile
 from .seeds import Purpose, path_generator, stream_number
 from .tracing import LaneLight, Transport, trace
 
@@ -26,35 +26,6 @@ from .tracing import LaneLight, Transport, trace
 LAUNCH_PATHS = 1 << 20
 # Passes in which a path that came out non-finite is traced again before the run is stopped.
 MAX_RESAMPLES = 4
-
-
-@dataclass(frozen=True)
-class Estimates:
-    """Estimates of a batch of queries.
-
-    Attributes
-    ----------
-    value_a, value_b : (n, 3) float32, independent halves of spp/2 paths each
-    paths : paths traced; lost : rays that slipped through the surface; capped : rays cut at the cap on
-        crossings
-    nonfinite : samples that came out non-finite and were drawn again
-    """
-
-    value_a: NDArray[np.float32]
-    value_b: NDArray[np.float32]
-    paths: int
-    lost: int
-    capped: int
-    nonfinite: int
-
-
-@dataclass(frozen=True)
-class Stream:
-    """Which random numbers to use: split and number of the shard under a root seed."""
-
-    root: int
-    split: str
-    shard: int
 
 
 class RaySource(Protocol):
@@ -90,7 +61,6 @@ class Estimator:
     def __init__(
         self, tile: Tile, light: LightKernel | None, transport: Transport, launch: int = LAUNCH_PATHS
     ) -> None:
-        register_plugins()
         self.tile = tile
         self.light = light
         self.transport = transport
@@ -101,13 +71,19 @@ class Estimator:
         self._kappa = dr.opaque(mi.Float, 0.0 if light is None or light.is_delta else light.kappa)
 
     def estimate(
-        self, queries: Queries, spp: int, stream: Stream, source: RaySource | None = None
+        self,
+        queries: Queries,
+        spp: int,
+        stream: Stream,
+        source: RaySource | None = None,
+        limit: int | None = None,
     ) -> Estimates:
         """Both halves of each query (one leading axis), `spp` paths together.
 
         Parameters
         ----------
         source : where rays come from; the query sensor by default
+        limit : another limit on surface interactions, for the same kernel
 
         Raises
         ------
@@ -115,6 +91,7 @@ class Estimator:
         """
         if spp < 2 or spp % 2:
             raise ValueError(f"spp must be even, for two equal halves, not {spp}")
+        self._limit = dr.opaque(mi.UInt32, self.transport.limit if limit is None else limit)
         n = len(queries.sigma)
         per_launch = max(1, self.launch // spp)
         parts = [
@@ -126,6 +103,9 @@ class Estimator:
         return Estimates(
             np.concatenate([p.value_a for p in parts]),
             np.concatenate([p.value_b for p in parts]),
+            np.concatenate([p.transmittance for p in parts])
+            if self.tile.world.surface.parts.opacity
+            else None,
             n * spp,
             sum(p.lost for p in parts),
             sum(p.capped for p in parts),
@@ -143,19 +123,20 @@ class Estimator:
             inverse = mi.Float((1.0 / self.light.irradiance(part.omega_i)).astype(np.float32))
         lanes = dr.arange(mi.UInt32, count * spp)
 
-        def trace_lanes(which: Any, attempt: int) -> tuple[Any, int, int]:
+        def trace_lanes(which: Any, attempt: int) -> tuple[Any, Any, int, int]:
             return self._trace(source, which, rows.start, spp, stream, omega_i, inverse, attempt)
 
-        radiance, lost, capped = trace_lanes(lanes, 0)
+        radiance, passed, lost, capped = trace_lanes(lanes, 0)
         bad = self._nonfinite(radiance)
         nonfinite = 0
         for attempt in range(1, MAX_RESAMPLES + 1):
             if not len(bad):
                 break
             nonfinite += len(bad)
-            again, more_lost, more_capped = trace_lanes(mi.UInt32(bad), attempt)
+            again, through, more_lost, more_capped = trace_lanes(mi.UInt32(bad), attempt)
             dr.scatter(radiance, again, mi.UInt32(bad))
-            dr.eval(radiance)
+            dr.scatter(passed, through, mi.UInt32(bad))
+            dr.eval(radiance, passed)
             lost, capped = lost + more_lost, capped + more_capped
             bad = bad[self._nonfinite(again)]
         if len(bad):
@@ -171,11 +152,16 @@ class Estimator:
         return Estimates(
             np.ascontiguousarray(values[:, 0]),
             np.ascontiguousarray(values[:, 1]),
+            self._shares(passed, spp) if self.tile.world.surface.parts.opacity else None,
             count * spp,
             lost,
             capped,
             nonfinite,
         )
+
+    def _shares(self, passed: Any, spp: int) -> NDArray[np.float32]:
+        total = dr.block_reduce(dr.ReduceOp.Add, passed, spp, mode="evaluated")
+        return np.array(total * (1.0 / spp), np.float32)
 
     def _nonfinite(self, radiance: Any) -> NDArray[np.uint32]:
         finite = dr.isfinite(radiance.x) & dr.isfinite(radiance.y) & dr.isfinite(radiance.z)
@@ -193,9 +179,9 @@ class Estimator:
         omega_i: Any,
         inverse: Any,
         attempt: int,
-    ) -> tuple[Any, int, int]:
-        """Radiance of the given lanes (query · spp + path), in their order; counts of lost and capped
-        rays."""
+    ) -> tuple[Any, Any, int, int]:
+        """Radiance of the given lanes (query · spp + path) and whether they passed through the tile, in their
+        order; counts of lost and capped rays."""
         half = spp // 2
 
         def generator(lane: Any, purpose: Purpose) -> Any:
@@ -227,16 +213,18 @@ class Estimator:
                 dr.gather(mi.Float, inverse, query),
                 self._kappa,
             )
-        traced, lost, capped = trace(
-            self.tile.scene,
-            self.tile.period,
+        path = trace(
+            self.tile.world,
             ray,
             light,
             self.transport,
+            self._limit,
             generator(lane, Purpose.PATH),
             mi.Bool(True),
         )
         radiance = dr.zeros(mi.Color3f, dr.width(lanes))
-        dr.scatter(radiance, traced, order)
-        dr.eval(radiance, lost, capped)
-        return radiance, int(dr.count(lost)[0]), int(dr.sum(capped)[0])
+        passed = dr.zeros(mi.Float, dr.width(lanes))
+        dr.scatter(radiance, path.radiance, order)
+        dr.scatter(passed, dr.select(path.passed, 1.0, 0.0), order)
+        dr.eval(radiance, passed, path.lost, path.capped)
+        return radiance, passed, int(dr.count(path.lost)[0]), int(dr.sum(path.capped)[0])

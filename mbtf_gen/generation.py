@@ -4,29 +4,34 @@ from __future__ import annotations
 
 import logging
 import math
-import re
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, Field
+from numpy.typing import NDArray
 
-from .atomic import digest, read_json, write_json, write_text
+from .atomic import digest, write_json
 from .config import GeneratorConfig, count_queries
-from .dataset import Dataset
-from .effects import simulated_effects
-from .errors import InputError, PartialError, UsageError
+from .effects import EffectsPlan
+from .errors import PartialError, UsageError
+from .estimates import Stream
+from .heightfield import HeightGrid
 from .levels import Lattice
 from .locks import shard_lock
-from .manifest import ShardEntry, build_manifest, software_versions
+from .manifest import ShardEntry, build_manifest
 from .material import Material, load_material
+from .output_folder import open_folder
+from .planning import plan_effects, simulated
 from .queries import Mixture, QueryPlan
-from .schema import CONFIG_NAME, FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, SPLITS, Split
-from .settings import check_document, differences, dump_yaml, in_short
+from .schema import FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, SPLITS, Split
 from .shard_files import shard_suffix, write_shard
+from .simulation import estimator_of
+from .slopes import residual_slopes
+from .summary import Summary, finish, planned_effects
 from .verification import is_finished, sidecar_of
 
 log = logging.getLogger(__name__)
@@ -35,41 +40,6 @@ ProgressCallback = Callable[[float, str], None]
 
 # A folder and a manifest of more are of no use to anyone.
 MAX_SHARD_FILES = 1_000_000
-
-# What a run writes into its folder, and what a killed one leaves there.
-_OWN = re.compile(
-    rf"{re.escape(MANIFEST_NAME)}|{re.escape(CONFIG_NAME)}|(?:{'|'.join(SPLITS)})-\d+\.(?:npz|exr|json)"
-)
-_LEFTOVER = re.compile(rf"\.(?:{_OWN.pattern})\.\d+\.tmp|\.(?:{'|'.join(SPLITS)})-\d+\.lock")
-
-
-@dataclass(frozen=True)
-class Summary:
-    """What a run made.
-
-    Attributes
-    ----------
-    queries : finished, of all splits; splits : the same by split
-    paths, seconds : traced in this run, and its duration
-    relative_error : pooled relative standard error of the stored training values, √(mean variance) / mean
-        value
-    mean_value : mean training value per channel, 1/sr
-    lost, capped, nonfinite : rays lost or capped, samples drawn again, over all shards
-    """
-
-    folder: str
-    complete: bool
-    queries: int
-    splits: dict[str, int]
-    paths: int
-    seconds: float
-    paths_per_second: float
-    relative_error: float
-    mean_value: list[float]
-    lost: int
-    capped: int
-    nonfinite: int
-    effects: list[str]
 
 
 @dataclass(frozen=True)
@@ -80,6 +50,7 @@ class Job:
     material: Material
     lattice: Lattice
     config_hash: str
+    _tiles: dict[Any, Any] = field(default_factory=dict, repr=False, compare=False)
 
     @classmethod
     def prepare(cls, config: GeneratorConfig) -> Job:
@@ -89,13 +60,17 @@ class Job:
         ------
         InputError : the material cannot be used
         """
-        material = load_material(Path(config.material), config.geometry.tile)
-        for note in material.notes:
+        job = cls.of(config, load_material(Path(config.material), config.geometry.tile))
+        for note in job.material.notes:
             log.info(note)
-        for warning in material.warnings:
+        for warning in job.material.warnings:
             log.warning(warning)
-        grid = material.grid(config.geometry.height, config.geometry.mesh)
-        log.info("mesh: %d x %d cells, relief %.4g tile widths", *grid.z.shape[::-1], grid.relief)
+        log.info("mesh: %d x %d cells, relief %.4g tile widths", *job.grid.z.shape[::-1], job.grid.relief)
+        return job
+
+    @classmethod
+    def of(cls, config: GeneratorConfig, material: Material) -> Job:
+        """The job of a material that is loaded."""
         rows, columns = material.height.shape
         lattice = Lattice.for_map(rows, columns, config.queries.levels)
         return cls(config, material, lattice, config.hash(material.digests))
@@ -116,6 +91,24 @@ class Job:
         if self.config.queries.layout == "image":
             return max(1, per_shard // self.lattice.texels())
         return per_shard
+
+    @cached_property
+    def grid(self) -> HeightGrid:
+        """Heights of the mesh."""
+        return self.material.grid(self.config.geometry.height, self.config.geometry.mesh)
+
+    @cached_property
+    def residual(self) -> tuple[NDArray[np.float64], float] | None:
+        """Slopes that the normal map adds to the mesh's, and the share of the mesh's that it repeats; None
+        without a map or where it is switched off."""
+        material, mode = self.material, self.config.effects.normal
+        if material.normal is None or material.bsdf is not None or mode == "off":
+            return None
+        return residual_slopes(material.normal, self.grid, mode)
+
+    def estimator(self, plan: EffectsPlan) -> Any:
+        """Estimator of M under an effects plan; loads Mitsuba unless M has a closed form."""
+        return estimator_of(self, plan, self._tiles)
 
     def spp(self, split: Split) -> int:
         """Paths per query of a split, both halves together."""
@@ -163,76 +156,21 @@ class Job:
 
 
 def build_estimator(config: GeneratorConfig, material: Material) -> Any:
-    """Estimator of a material under a configuration; loads Mitsuba."""
-    from .engine import load_mitsuba
-
-    load_mitsuba()
-    from .bsdf import bsdf_of
-    from .estimator import Estimator
-    from .light import LightKernel
-    from .scene import build_tile
-    from .tracing import Transport
-
-    tile = build_tile(material.grid(config.geometry.height, config.geometry.mesh), bsdf_of(material))
-    transport = Transport(
-        config.transport.max_depth, config.transport.roulette_depth, config.transport.max_crossings
-    )
-    return Estimator(tile, LightKernel(config.light.width), transport)
+    """Estimator that simulates everything a material calls for, as reference pictures want it; loads
+    Mitsuba."""
+    job = Job.of(config, material)
+    return job.estimator(simulated(job))
 
 
-def _open_folder(job: Job, folder: Path, manifest: dict[str, Any], overwrite: bool) -> None:
-    """Claim the output folder: new, empty, resumed, or replaced.
-
-    Raises
-    ------
-    InputError : it holds something else
-    """
-    if folder.exists() and not folder.is_dir():
-        raise InputError("is a file, not a folder", where=folder)
+def _agreed_effects(job: Job, folder: Path, entries: list[ShardEntry], overwrite: bool) -> EffectsPlan:
+    """Claim the folder and say which effects are simulated: as its manifest says where it has one, so that
+    all shards of a data set show the same, whichever machine makes them."""
     existing = folder / MANIFEST_NAME
-    if existing.exists():
-        old = read_json(existing)
-        if old.get("format") != FORMAT_NAME:
-            raise InputError(
-                f"is not a manifest of {FORMAT_NAME}", where=existing, cure="choose another folder with -o"
-            )
-        if overwrite:
-            _clear(folder)
-        elif old.get("config_hash") != job.config_hash:
-            config = old.get("config")
-            before = {**(config if isinstance(config, dict) else {}), "inputs": old.get("inputs", {})}
-            before["schema"] = old.get("schema")
-            after = {**manifest["config"], "inputs": manifest["inputs"], "schema": SCHEMA_VERSION}
-            changes = in_short(differences(before, after)) or "inputs differ"
-            raise InputError(
-                f"holds a data set of another configuration: {changes}",
-                where=folder,
-                cure="choose another folder with -o, or replace it with --overwrite",
-            )
-    elif folder.exists() and not all(_LEFTOVER.fullmatch(p.name) for p in folder.iterdir()):
-        if existing.exists():
-            # Another writer of the same data set made it between the two looks.
-            return _open_folder(job, folder, manifest, overwrite)
-        raise InputError(
-            "is not empty and holds no data set", where=folder, cure="choose another folder with -o"
-        )
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot be made ({error.strerror})", where=folder) from None
-    # The manifest first: it makes the folder ours, whatever instant the run is killed at.
-    if not existing.exists():
-        write_json(existing, manifest)
-    if not (folder / CONFIG_NAME).exists():
-        write_text(folder / CONFIG_NAME, dump_yaml(manifest["config"]))
-
-
-def _clear(folder: Path) -> None:
-    """Remove a data set and nothing else; the manifest last, so that the rest never stands without it."""
-    names = (p.name for p in folder.iterdir())
-    for name in sorted(names, key=lambda name: name == MANIFEST_NAME):
-        if _OWN.fullmatch(name) or _LEFTOVER.fullmatch(name):
-            (folder / name).unlink(missing_ok=True)
+    if existing.exists() and not overwrite:
+        open_folder(job, folder, build_manifest(job, entries, None), overwrite)
+    else:
+        open_folder(job, folder, build_manifest(job, entries, plan_effects(job)), overwrite)
+    return planned_effects(folder)
 
 
 def _sidecar(job: Job, entry: ShardEntry, path: Path, estimates: Any, seconds: float) -> dict[str, Any]:
@@ -266,14 +204,12 @@ def _sidecar(job: Job, entry: ShardEntry, path: Path, estimates: Any, seconds: f
 
 
 def _make_shard(job: Job, plan: QueryPlan, estimator: Any, entry: ShardEntry, path: Path) -> dict[str, Any]:
-    from .estimator import Stream
-
     start = time.perf_counter()
     queries = plan.draw(entry.split, entry.index, entry.rows)
     flat = queries.flat()
     spp = job.spp(entry.split)
     estimates = estimator.estimate(flat, spp, Stream(job.config.seed, entry.split, entry.index))
-    lead = queries.lead
+    lead, through = queries.lead, estimates.transmittance
     write_shard(
         path,
         {
@@ -284,6 +220,7 @@ def _make_shard(job: Job, plan: QueryPlan, estimator: Any, entry: ShardEntry, pa
             "value_a": estimates.value_a.reshape(*lead, 3),
             "value_b": estimates.value_b.reshape(*lead, 3),
             "spp": np.full(lead, spp, np.float32),
+            **({} if through is None else {"transmittance": through.reshape(lead)}),
         },
     )
     record = _sidecar(job, entry, path, estimates, time.perf_counter() - start)
@@ -330,9 +267,7 @@ def generate(
     job = job or Job.prepare(config)
     plan = job.plan()
     entries = [e for split in SPLITS for e in job.shards(split)]
-    effects = simulated_effects(job.material, config)
-    manifest = build_manifest(job, entries, effects)
-    _open_folder(job, folder, manifest, overwrite)
+    effects = _agreed_effects(job, folder, entries, overwrite)
     paths, busy = 0, []
     estimator: Any = None
     for entry in job.slice(slice_index, slice_count):
@@ -345,7 +280,7 @@ def generate(
                     for stale in folder.glob(f".{path.stem}.*.tmp"):
                         stale.unlink(missing_ok=True)
                     if estimator is None:
-                        estimator = build_estimator(config, job.material)
+                        estimator = job.estimator(effects)
                     paths += _make_shard(job, plan, estimator, entry, path)["paths"]
         if progress is not None:
             progress(paths, f"{paths / max(time.perf_counter() - start, 1e-9) / 1e6:.2f} M paths/s")
@@ -356,111 +291,3 @@ def generate(
             cure="wait for it, then run the same command again",
         )
     return finish(folder, paths=paths, seconds=time.perf_counter() - start)
-
-
-_Number = Annotated[float, Field(allow_inf_nan=False)]
-_Colour = tuple[_Number, _Number, _Number]
-
-
-class _Effect(BaseModel):
-    effect: str
-    on: bool
-
-
-class _Plan(BaseModel):
-    """What :func:`finish` relies on of a manifest, beside what every reader does."""
-
-    complete: bool
-    effects: list[_Effect]
-
-
-class _Statistics(BaseModel):
-    mean_value: _Colour
-    mean_variance: _Colour
-
-
-class _Quarantined(BaseModel):
-    nonfinite_samples: int
-    lost_rays: int
-    capped_rays: int
-
-
-class _Made(BaseModel):
-    """What :func:`finish` relies on of a shard's sidecar."""
-
-    queries: Annotated[int, Field(ge=1)]
-    paths: int
-    seconds: _Number
-    statistics: _Statistics
-    quarantined: _Quarantined
-
-
-_MEND = "look for damage with: mbtf-gen verify"
-
-
-def finish(folder: str | Path, *, paths: int = 0, seconds: float = 0.0) -> Summary:
-    """Complete the manifest when every shard is there, and summarise (``mbtf-gen merge``).
-
-    Raises
-    ------
-    InputError : no data set there, or damaged documents
-    """
-    folder = Path(folder)
-    manifest = Dataset.open(folder).manifest
-    check_document(_Plan, manifest, folder / MANIFEST_NAME, _MEND)
-    records: dict[str, list[dict[str, Any]]] = {}
-    complete = True
-    for split, content in manifest["splits"].items():
-        for entry in content["shards"]:
-            if is_finished(folder / entry["file"], entry["rows"], manifest["config_hash"]):
-                sidecar = sidecar_of(folder / entry["file"])
-                record = read_json(sidecar)
-                check_document(_Made, record, sidecar, _MEND)
-                records.setdefault(split, []).append(record)
-            else:
-                complete = False
-    flat = [r for rs in records.values() for r in rs]
-    train = records.get("train", [])
-    weights = np.array([r["queries"] for r in train], np.float64)
-    if len(train):
-        mean = np.average([r["statistics"]["mean_value"] for r in train], axis=0, weights=weights)
-        variance = np.average([r["statistics"]["mean_variance"] for r in train], axis=0, weights=weights)
-        relative = float(np.sqrt(variance.mean()) / mean.mean()) if mean.mean() > 0 else 0.0
-    else:
-        mean, relative = np.zeros(3), 0.0
-    counts = {
-        k: sum(r["quarantined"][k] for r in flat) for k in ("nonfinite_samples", "lost_rays", "capped_rays")
-    }
-    summary = Summary(
-        folder=str(folder),
-        complete=complete,
-        queries=sum(r["queries"] for r in flat),
-        splits={split: sum(r["queries"] for r in records.get(split, [])) for split in manifest["splits"]},
-        paths=paths,
-        seconds=round(seconds, 3),
-        paths_per_second=round(paths / seconds, 1) if seconds > 0 else 0.0,
-        relative_error=relative,
-        mean_value=[float(m) for m in mean],
-        lost=counts["lost_rays"],
-        capped=counts["capped_rays"],
-        nonfinite=counts["nonfinite_samples"],
-        effects=[e["effect"] for e in manifest["effects"] if e["on"]],
-    )
-    if complete and not manifest["complete"]:
-        manifest["complete"] = True
-        manifest["software"] = software_versions()
-        manifest["summary"] = {
-            "queries": summary.queries,
-            "paths": sum(r["paths"] for r in flat),
-            "shard_seconds": round(sum(r["seconds"] for r in flat), 3),
-            "relative_error": summary.relative_error,
-            "mean_value": summary.mean_value,
-            **counts,
-        }
-        write_json(folder / MANIFEST_NAME, manifest)
-    return summary
-
-
-def summary_dict(summary: Summary) -> dict[str, Any]:
-    """Summary as plain data for ``--json``."""
-    return asdict(summary)

@@ -96,6 +96,8 @@ def _constants(material: Material) -> dict[str, Any]:
         "roughness": material.roughness,
         "metallic": material.metallic,
         "specular": material.specular,
+        "clearcoat": material.coat,
+        "clearcoat_roughness": material.coat_roughness,
         "opacity": material.opacity,
     }
     return {n: np.asarray(v).tolist() for n, v in values.items() if v is not None and np.ndim(v) < 2}
@@ -104,7 +106,7 @@ def _constants(material: Material) -> dict[str, Any]:
 def _surface(material: Material) -> str:
     if material.bsdf is not None:
         return str(material.bsdf["type"])
-    return "diffuse" if material.is_lambert else "principled"
+    return "diffuse" if material.is_lambert else "glossy"
 
 
 def _albedo(material: Material) -> dict[str, Any] | None:

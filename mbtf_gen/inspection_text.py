@@ -20,8 +20,8 @@ USES = {
     "roughness": "width of the specular lobe",
     "metallic": "share that reflects as metal",
     "specular": "strength of the dielectric lobe",
-    "normal": "finer slopes; not simulated yet",
-    "opacity": "holes; not simulated yet",
+    "normal": "slopes that the mesh lacks",
+    "opacity": "holes",
 }
 _KINDS = {1: "grey", 2: "grey+alpha", 3: "RGB", 4: "RGBA"}
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from .effects import EffectsPlan
 from .levels import sigma_of_level
 from .schema import ARRAYS, CONVENTIONS, FORMAT_NAME, SCHEMA_VERSION, SPLITS, Split
 
@@ -36,10 +37,11 @@ def software_versions() -> dict[str, str]:
     return out
 
 
-def build_manifest(job: Job, entries: list[ShardEntry], effects: list[dict[str, Any]]) -> dict[str, Any]:
-    """Manifest of a data set that is about to be made (``complete`` is false)."""
+def build_manifest(job: Job, entries: list[ShardEntry], effects: EffectsPlan | None) -> dict[str, Any]:
+    """Manifest of a data set that is about to be made (``complete`` is false); without effects where they
+    are not known yet."""
     config, material, lattice = job.config, job.material, job.lattice
-    grid = material.grid(config.geometry.height, config.geometry.mesh)
+    grid = job.grid
     plan = job.plan()
     rows, columns = lattice.shape()
     lead = ["n"] if plan.layout == "shuffled" else ["items", "rows", "columns"]
@@ -69,9 +71,9 @@ def build_manifest(job: Job, entries: list[ShardEntry], effects: list[dict[str, 
         "arrays": {
             a.name: {"shape": [*lead, *a.trailing], "unit": a.unit, "meaning": a.meaning}
             for a in ARRAYS
-            if not a.optional
+            if not a.optional or (a.name == "transmittance" and effects is not None and effects.on("opacity"))
         },
-        "effects": effects,
+        "effects": None if effects is None else effects.to_manifest(),
         "splits": {
             split: {
                 "queries": sum(e.rows for e in entries if e.split == split)

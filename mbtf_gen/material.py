@@ -42,6 +42,7 @@ FLOAT_SCALE = 1.0
 DEFAULT_ROUGHNESS = 0.5
 DEFAULT_METALLIC = 0.0
 DEFAULT_SPECULAR = 0.5
+DEFAULT_COAT_ROUGHNESS = 0.1
 # Mesh cells across the tile, at most, unless asked for.
 DEFAULT_MESH = 512
 # Beyond so many tile widths a default factor is probably not what was meant.
@@ -62,6 +63,7 @@ class Material:
     height_bits : 8, 16, or None for floats
     basecolor : (h, w, 3) or (3,), linear Rec.709 in [0, 1]
     roughness, metallic, specular : (h, w) or one number in [0, 1]; all three None for Lambert
+    coat, coat_roughness : clear coat's share and roughness, (h, w) or one number in [0, 1]; None without one
     normal : (h, w, 3) unit vectors, x along u and y along v (OpenGL); None without a map
     opacity : (h, w) or one number in [0, 1]; None where nothing is transparent
     bsdf : Mitsuba dictionary that stands in place of the maps, or None
@@ -83,6 +85,8 @@ class Material:
     roughness: Share = None
     metallic: Share = None
     specular: Share = None
+    coat: Share = None
+    coat_roughness: Share = None
     normal: NDArray[np.float32] | None = None
     opacity: Share = None
     bsdf: dict[str, Any] | None = None
@@ -203,17 +207,17 @@ def _assemble(spec: MaterialFile, folder: Path, notes: list[str], tile: Tiling) 
         given = {"roughness": roughness, "metallic": metallic, "specular": specular}
         filled = [f"{name} {constants[name]}" for name, value in given.items() if value is None]
         roughness, metallic, specular = (constants[n] if v is None else v for n, v in given.items())
-        load.notes.append(f"surface: principled{', constants ' + ', '.join(filled) if filled else ''}")
+        load.notes.append(f"surface: glossy{', constants ' + ', '.join(filled) if filled else ''}")
     basecolor = load.colour(spec.basecolor) if spec.bsdf is None else np.full(3, DEFAULT_COLOUR)
     normal, convention, fit = None, None, None
     if spec.normal is not None:
         normal, convention, fit = _normals(spec.normal, load, height, scale)
-        load.notes.append("normal map: read, but not simulated yet")
     opacity = load.share("opacity", spec.opacity)
     if opacity is not None:
-        load.warnings.append(
-            f"opacity: read, but holes are not simulated yet ({holes(opacity):.0%} of the tile)"
-        )
+        load.notes.append(f"opacity: {holes(opacity):.0%} of the tile are holes")
+    coat, coat_roughness = (load.share(n, getattr(spec, n)) for n in ("clearcoat", "clearcoat_roughness"))
+    if coat is not None and coat_roughness is None:
+        coat_roughness = DEFAULT_COAT_ROUGHNESS
     bsdf = None
     if spec.bsdf is not None:
         bsdf, load.settings["bsdf"] = _bsdf(plain(spec.bsdf), load)
@@ -229,6 +233,8 @@ def _assemble(spec: MaterialFile, folder: Path, notes: list[str], tile: Tiling) 
         roughness=roughness,
         metallic=metallic,
         specular=specular,
+        coat=coat,
+        coat_roughness=coat_roughness,
         normal=normal,
         opacity=opacity,
         bsdf=bsdf,

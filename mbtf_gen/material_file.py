@@ -107,6 +107,10 @@ class NormalEntry(Settings):
         return _short(data)
 
 
+# What a BSDF of the user's own stands in place of.
+_REFLECTANCE = ("basecolor", "roughness", "metallic", "specular", "clearcoat", "clearcoat_roughness")
+
+
 class MaterialFile(Settings):
     """Content of a ``material.yaml``; file names are relative to its folder."""
 
@@ -115,6 +119,8 @@ class MaterialFile(Settings):
     roughness: ShareEntry | None = Field(None, description="0 mirror to 1; default 0.5 once one is given")
     metallic: ShareEntry | None = Field(None, description="0 dielectric to 1 metal; default 0")
     specular: ShareEntry | None = Field(None, description="strength of the dielectric lobe; default 0.5")
+    clearcoat: ShareEntry | None = Field(None, description="share of a clear coat over it all; default 0")
+    clearcoat_roughness: ShareEntry | None = Field(None, description="of the coat; default 0.1")
     normal: NormalEntry | None = Field(None, description="tangent-space normal map")
     opacity: ShareEntry | None = Field(None, description="1 opaque to 0 hole; default: opaque")
     bsdf: dict[str, Any] | None = Field(
@@ -123,11 +129,11 @@ class MaterialFile(Settings):
 
     @model_validator(mode="after")
     def _bsdf_alone(self) -> MaterialFile:
-        given = [
-            n for n in ("basecolor", "roughness", "metallic", "specular") if getattr(self, n) is not None
-        ]
+        given = [n for n in _REFLECTANCE if getattr(self, n) is not None]
         if self.bsdf is not None and given:
             raise ValueError(f"'bsdf' stands in place of {', '.join(given)}; give one or the other")
+        if self.clearcoat_roughness is not None and self.clearcoat is None:
+            raise ValueError("'clearcoat_roughness' goes with 'clearcoat'")
         if self.bsdf is not None and not isinstance(self.bsdf.get("type"), str):
             raise ValueError("'bsdf' needs a 'type', such as diffuse")
         return self

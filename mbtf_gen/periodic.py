@@ -71,54 +71,100 @@ def piece_length(period: Period, o: Any, d: Any) -> tuple[Any, Any]:
     return dr.minimum(tx, ty), dr.maximum(0.0, _side(o.z, d.z, period.bottom, period.top))
 
 
+def straight(period: Period, ray: Any) -> Any:
+    """The ray with its origin in the period, for rays that cannot leave the apron sideways."""
+    ray = mi.Ray3f(ray)
+    ray.o = wrap(period, ray.o)
+    return ray
+
+
 @dr.syntax
 def closest_hit(
-    scene: Any, period: Period, ray: Any, active: Any, max_crossings: int
-) -> tuple[Any, Any, Any]:
+    scene: Any,
+    period: Period,
+    ray: Any,
+    active: Any,
+    max_crossings: int,
+    flags: int = int(mi.RayFlags.All),
+    holes: Any = None,
+    rng: Any = None,
+) -> tuple[Any, Any, Any, Any]:
     """First hit along a ray over the repeated tile.
+
+    Parameters
+    ----------
+    flags : which parts of the surface interaction are wanted
+    holes : ``holes.opacity(si)``, the chance that a hit stops the ray; None where nothing lets rays through
+    rng : random numbers that decide it
 
     Returns
     -------
-    (surface interaction, in wrapped coordinates; crossings spent; lanes that hit the cap)
+    (surface interaction, in wrapped coordinates; crossings spent; lanes that hit the cap; the generator)
     """
-    ray = mi.Ray3f(ray)
-    ray.o = wrap(period, ray.o)
+    ray = straight(period, ray)
     hit = dr.zeros(mi.PreliminaryIntersection3f, dr.width(ray))
     crossings = mi.UInt32(0)
     searching = mi.Bool(active)
-    while dr.hint(searching, exclude=[scene, period]):
+    while dr.hint(searching, exclude=[scene, period, holes]):
         side, rise = piece_length(period, ray.o, ray.d)
         ray.maxt = dr.minimum(side, rise)
         found = scene.ray_intersect_preliminary(ray, False, searching)
-        hit[searching & found.is_valid()] = found
-        searching &= ~found.is_valid() & (side < rise) & (crossings < max_crossings)
+        stop = searching & found.is_valid()
+        onward = wrap(period, ray(dr.maximum(side - period.overlap, 0.0)))
+        ends = side >= rise
+        if dr.hint(holes is not None, mode="scalar"):
+            si = found.compute_surface_interaction(ray, mi.RayFlags.UV, stop)
+            passes = stop & (rng.next_float32() >= holes.opacity(si))
+            onward = dr.select(passes, leave(period, si, ray.d).o, onward)
+            ends &= ~passes
+            stop &= ~passes
+        hit[stop] = found
+        searching &= ~stop & ~ends & (crossings < max_crossings)
         crossings[searching] += 1
-        ray.o[searching] = wrap(period, ray(dr.maximum(side - period.overlap, 0.0)))
+        ray.o[searching] = onward
     capped = active & ~hit.is_valid() & (crossings >= max_crossings)
-    si = hit.compute_surface_interaction(ray, mi.RayFlags.All, active & hit.is_valid())
-    return si, crossings, capped
+    si = hit.compute_surface_interaction(ray, flags, active & hit.is_valid())
+    return si, crossings, capped, rng
 
 
 @dr.syntax
-def occluded(scene: Any, period: Period, ray: Any, active: Any, max_crossings: int) -> tuple[Any, Any, Any]:
-    """Whether a ray meets anything over the repeated tile.
+def occluded(
+    scene: Any,
+    period: Period,
+    ray: Any,
+    active: Any,
+    max_crossings: int,
+    holes: Any = None,
+    rng: Any = None,
+) -> tuple[Any, Any, Any, Any]:
+    """Whether a ray meets anything over the repeated tile; parameters as of :func:`closest_hit`.
 
     Returns
     -------
-    (occluded; crossings spent; lanes that hit the cap, which count as occluded)
+    (occluded; crossings spent; lanes that hit the cap, which count as occluded; the generator)
     """
-    ray = mi.Ray3f(ray)
-    ray.o = wrap(period, ray.o)
+    ray = straight(period, ray)
     blocked = mi.Bool(False)
     crossings = mi.UInt32(0)
     searching = mi.Bool(active)
-    while dr.hint(searching, exclude=[scene, period]):
+    while dr.hint(searching, exclude=[scene, period, holes]):
         side, rise = piece_length(period, ray.o, ray.d)
         ray.maxt = dr.minimum(side, rise)
-        found = scene.ray_test(ray, False, searching)
-        blocked |= searching & found
-        searching &= ~found & (side < rise) & (crossings < max_crossings)
+        onward = wrap(period, ray(dr.maximum(side - period.overlap, 0.0)))
+        ends = side >= rise
+        if dr.hint(holes is None, mode="scalar"):
+            stop = searching & scene.ray_test(ray, False, searching)
+        else:
+            found = scene.ray_intersect_preliminary(ray, False, searching)
+            stop = searching & found.is_valid()
+            si = found.compute_surface_interaction(ray, mi.RayFlags.UV, stop)
+            passes = stop & (rng.next_float32() >= holes.opacity(si))
+            onward = dr.select(passes, leave(period, si, ray.d).o, onward)
+            ends &= ~passes
+            stop &= ~passes
+        blocked |= stop
+        searching &= ~stop & ~ends & (crossings < max_crossings)
         crossings[searching] += 1
-        ray.o[searching] = wrap(period, ray(dr.maximum(side - period.overlap, 0.0)))
+        ray.o[searching] = onward
     capped = active & ~blocked & (crossings >= max_crossings)
-    return blocked | capped, crossings, capped
+    return blocked | capped, crossings, capped, rng

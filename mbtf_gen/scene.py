@@ -15,11 +15,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .bsdf import SurfaceBSDF, surface_of
 from .emitter import SmoothedDirectional
 from .errors import InputError, reason
 from .heightfield import HeightGrid, grid_faces, grid_vertices
 from .periodic import Period
 from .sensor import QuerySensor
+from .tracing import World
 
 LONG_SIDE = 32.0
 # Apron beyond the period, as a share of it: measured fastest between 0 and 1/2 on a 512² grid.
@@ -31,8 +33,10 @@ RELATIVE_OFFSET = 2.0e-6
 
 
 def register_plugins() -> None:
-    """Make ``mbtf_queries`` and ``mbtf_directional`` known to Mitsuba's loaders under the current variant."""
+    """Make the project's plugins known to Mitsuba's loaders under the current variant: ``mbtf_queries``
+    (sensor), ``mbtf_directional`` (emitter), ``mbtf_surface`` (BSDF)."""
     mi.register_sensor("mbtf_queries", lambda props: QuerySensor(props))
+    mi.register_bsdf("mbtf_surface", lambda props: SurfaceBSDF(props))
     mi.register_emitter("mbtf_directional", lambda props: SmoothedDirectional(props))
 
 
@@ -45,15 +49,23 @@ class Tile:
     grid : its heights in tile widths
     unit : scene units per tile width
     mesh : Mitsuba mesh of a period and its apron
-    scene : Mitsuba scene that holds the mesh alone
-    period : how rays repeat
+    world : what rays meet
     """
 
     grid: HeightGrid
     unit: float
     mesh: Any
-    scene: Any
-    period: Period
+    world: World
+
+    @property
+    def scene(self) -> Any:
+        """Mitsuba scene that holds the mesh alone."""
+        return self.world.scene
+
+    @property
+    def period(self) -> Period:
+        """How rays repeat."""
+        return self.world.period
 
     @property
     def aspect(self) -> float:
@@ -98,6 +110,7 @@ def build_tile(grid: HeightGrid, bsdf: Mapping[str, Any] | Any, apron_share: flo
     ------
     InputError : Mitsuba does not take the BSDF
     """
+    register_plugins()
     rows, columns = grid.z.shape
     unit = LONG_SIDE / max(1.0, grid.aspect)
     cells = (max(2, round(apron_share * rows)), max(2, round(apron_share * columns)))
@@ -120,4 +133,5 @@ def build_tile(grid: HeightGrid, bsdf: Mapping[str, Any] | Any, apron_share: flo
         overlap=number(0.25 * min(cell)),
         offset=number(RELATIVE_OFFSET * extent),
     )
-    return Tile(grid, unit, mesh, scene, period)
+    world = World(scene, period, surface_of(loaded), period.size)
+    return Tile(grid, unit, mesh, world)

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 MAX_SHARDS = 1 << 28
-# Data splits and reference pictures draw from streams of their own.
-_SPLIT_NUMBER: dict[str, int] = {"train": 0, "test": 1, "reference": 2}
+# Data splits, reference pictures and pilots draw from streams of their own.
+_SPLIT_NUMBER: dict[str, int] = {"train": 0, "test": 1, "reference": 2, "pilot": 3}
 
 
 class Purpose(IntEnum):
@@ -25,7 +25,6 @@ class Purpose(IntEnum):
     QUERIES = 1
     FOOTPRINT = 2
     PATH = 3
-    PILOT = 4
 
 
 def stream_number(split: str, shard: int, purpose: Purpose, pass_index: int = 0, half: int = 0) -> int:

@@ -1,9 +1,20 @@
 """The path tracer: radiance leaving the displaced tile along given rays, one light per ray.
 
-Next-event estimation on the light and BSDF sampling, combined by the balance heuristic (Veach 1997); Russian
-roulette ends paths without bias. Light directions are drawn from the lobe and, where they fall below the
-horizon, reflected up at it: their density ``q(ω) = p(ω) + p(ω mirrored)`` is exact, positive where ``L`` is,
-and no sample is lost below the horizon.
+The value of a path is the sum of the effects that are simulated, each in one function:
+
+- :func:`_visible`: parallax and masking, periodic neighbours, holes — or the reference plane without them;
+- :func:`_direct`: direct light, next-event estimation, with shadowing where it is simulated;
+- :func:`_sky`: what BSDF sampling finds of the light, combined with the former by the balance heuristic
+(Veach
+  1997);
+- interreflection: the loop around them, with Russian roulette, which ends paths without bias.
+
+How a point reflects (specular lobe, metal, coat, normal map) is the surface's business,
+:mod:`mbtf_gen.surface`. An effect that is switched off is not in the kernel.
+
+Light directions are drawn from the lobe and, where they fall below the horizon, reflected up at it: their
+density ``q(ω) = p(ω) + p(ω mirrored)`` is exact, positive where ``L`` is, and no sample is lost below the
+horizon.
 """
 
 from __future__ import annotations
@@ -14,29 +25,58 @@ from typing import Any, Literal
 import drjit as dr
 import mitsuba as mi
 
-from .periodic import Period, closest_hit, leave, occluded
+from .periodic import Period, closest_hit, leave, occluded, straight
 
 # Roulette leaves paths of throughput one alone, for dividing by a survival chance below it makes their
 # weights grow without bound in white cracks; only after this many interactions they end with a chance of one
 # in two hundred each.
 PATIENCE = 64
 LATE_SURVIVAL = 0.995
+NO_LIMIT = 0xFFFFFFFF
 
 
 @dataclass(frozen=True)
 class Transport:
-    """How paths are followed.
+    """How paths are followed, and which effects of geometry and light they show.
 
     Attributes
     ----------
     max_depth : largest number of surface interactions of a path; 0 means no limit
     roulette_depth : interactions before Russian roulette begins
     max_crossings : tile borders that one ray may cross
+    displacement : rays meet the displaced tile; otherwise the reference plane, where nothing shadows
+    shadowing : light rays are tested for occluders
+    interreflection : paths go on after their first interaction
+    neighbours : rays that leave the apron re-enter the tile; otherwise no ray may reach its end
+    bsdf_sampling : light is also found by sampling the surface
     """
 
     max_depth: int = 0
     roulette_depth: int = 3
     max_crossings: int = 4096
+    displacement: bool = True
+    shadowing: bool = True
+    interreflection: bool = True
+    neighbours: bool = True
+    bsdf_sampling: bool = True
+
+    def __post_init__(self) -> None:
+        if not self.displacement and (self.shadowing or self.interreflection or self.neighbours):
+            raise ValueError("a plane has no shadows, no interreflection and no neighbours")
+        if self.interreflection and not self.neighbours:
+            raise ValueError("interreflected rays may leave sideways and need the neighbours")
+        if self.displacement and self.bsdf_sampling and not self.neighbours:
+            raise ValueError("rays sampled from the surface may leave sideways and need the neighbours")
+
+    @property
+    def limit(self) -> int:
+        """Largest number of surface interactions of a path."""
+        if not self.interreflection:
+            return 1
+        return self.max_depth or NO_LIMIT
+
+
+PLANE = Transport(displacement=False, shadowing=False, interreflection=False, neighbours=False)
 
 
 @dataclass(frozen=True)
@@ -88,84 +128,215 @@ class LaneLight:
         return mi.Vector3f(omega.x, omega.y, dr.abs(omega.z))
 
 
+@dataclass(frozen=True)
+class World:
+    """What rays meet: the scene of the tile, how it repeats, how it reflects, and how the plane is laid out.
+
+    Attributes
+    ----------
+    scene, period : see :class:`~mbtf_gen.scene.Tile`
+    surface : reflects; see :mod:`mbtf_gen.surface`
+    size : (x, y) lengths of the tile in scene units, opaque
+    """
+
+    scene: Any
+    period: Period
+    surface: Any
+    size: tuple[Any, Any]
+
+
+@dataclass
+class Path:
+    """State of lanes' paths.
+
+    Attributes
+    ----------
+    ray : next ray to follow
+    radiance : found so far
+    throughput : weight of what is still to be found
+    pdf : density with which the last bounce chose its direction; infinite for mirrors and for the first ray
+    depth : surface interactions so far
+    rng : random numbers
+    capped : rays cut off at the cap on crossings
+    lost : rays that went down and met nothing
+    passed : the first ray went through the tile
+    active : lanes that go on
+    """
+
+    ray: Any
+    radiance: Any
+    throughput: Any
+    pdf: Any
+    depth: Any
+    rng: Any
+    capped: Any
+    lost: Any
+    passed: Any
+    active: Any
+
+
 def _next_2d(rng: Any) -> Any:
     return mi.Point2f(rng.next_float32(), rng.next_float32())
 
 
+def _on_plane(world: World, ray: Any, active: Any) -> Any:
+    """Hits of rays on the reference plane."""
+    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray))
+    t = -ray.o.z / ray.d.z
+    si.t = dr.select(active & (ray.d.z < 0), t, dr.inf)
+    si.p = ray(t)
+    si.n = mi.Normal3f(0, 0, 1)
+    si.sh_frame = mi.Frame3f(mi.Normal3f(0, 0, 1))
+    si.dp_du = mi.Vector3f(1, 0, 0)
+    si.dp_dv = mi.Vector3f(0, -1, 0)
+    si.wi = si.to_local(-ray.d)
+    # Mitsuba's bitmaps have row 0 at v = 0, ours at v → 1.
+    si.uv = mi.Point2f(si.p.x / world.size[0] + 0.5, 0.5 - si.p.y / world.size[1])
+    return si
+
+
+def _visible(world: World, path: Path, transport: Transport) -> tuple[Any, Any, Any]:
+    """Parallax and masking, periodic neighbours, holes: (what a path's ray meets, lanes that hit the cap,
+    lanes that passed through the tile)."""
+    parts = world.surface.parts
+    holes = world.surface if parts.opacity else None
+    flags = int(world.surface.ray_flags)
+    if not transport.displacement:
+        si = _on_plane(world, path.ray, path.active)
+        if holes is not None:
+            si.t = dr.select(path.rng.next_float32() < holes.opacity(si), si.t, dr.inf)
+        capped = mi.Bool(False)
+    elif transport.neighbours or holes is not None:
+        si, _, capped, path.rng = closest_hit(
+            world.scene,
+            world.period,
+            path.ray,
+            path.active,
+            transport.max_crossings,
+            flags,
+            holes,
+            path.rng,
+        )
+    else:
+        ray = straight(world.period, path.ray)
+        si = world.scene.ray_intersect(ray, flags, False, path.active)
+        capped = mi.Bool(False)
+    downward = path.active & ~si.is_valid() & ~capped & (path.ray.d.z <= 0)
+    return si, capped, downward
+
+
+def _direct(world: World, path: Path, si: Any, point: Any, light: LaneLight, transport: Transport) -> Any:
+    """Direct light that a surface point sends along a path, by next-event estimation; with shadowing."""
+    if light.kind == "constant":
+        return mi.Spectrum(0.0)
+    if light.kind == "delta":
+        omega, incoming = light.omega_i, light.inverse_irradiance
+    else:
+        omega = light.sample(_next_2d(path.rng))
+        incoming = light.radiance(omega)
+    value, pdf = point.eval_pdf(omega)
+    if light.kind == "lobe":
+        density = light.sampling_density(omega)
+        incoming = incoming / (density + pdf if transport.bsdf_sampling else density)
+    # Written so that NaN counts as light: it must reach the value, where it is found and drawn again.
+    lit = path.active & ~(dr.max(value) <= 0)
+    if transport.shadowing:
+        blocked = _shadowed(world, path, leave(world.period, si, omega), lit, transport)
+        lit &= ~blocked
+    return dr.select(lit, value * incoming, 0.0)
+
+
+def _shadowed(world: World, path: Path, ray: Any, lit: Any, transport: Transport) -> Any:
+    """Lanes whose light is blocked."""
+    holes = world.surface if world.surface.parts.opacity else None
+    if not transport.neighbours and holes is None:
+        return world.scene.ray_test(straight(world.period, ray), False, lit)
+    blocked, _, capped, path.rng = occluded(
+        world.scene, world.period, ray, lit, transport.max_crossings, holes, path.rng
+    )
+    path.capped[capped] += 1
+    return blocked
+
+
+def _sky(path: Path, light: LaneLight, escaped: Any, transport: Transport) -> Any:
+    """Light that BSDF sampling found: what arrives along rays that left the tile upwards."""
+    if light.kind == "delta" or not (transport.bsdf_sampling or light.kind == "constant"):
+        return mi.Spectrum(0.0)
+    d = path.ray.d
+    share = dr.select(dr.isinf(path.pdf), 1.0, path.pdf / (path.pdf + light.sampling_density(d)))
+    found = escaped & (path.depth > 0) & (d.z > 0)
+    return dr.select(found, path.throughput * (light.radiance(d) * share), 0.0)
+
+
+def _interaction(
+    world: World, path: Path, light: LaneLight, transport: Transport, limit: Any, last: bool
+) -> Path:
+    """One surface interaction of every path; `last`: no path goes on after it."""
+    si, capped, downward = _visible(world, path, transport)
+    path.capped[capped] += 1
+    if world.surface.parts.opacity:
+        path.passed |= downward & (path.depth == 0)
+    else:
+        path.lost |= downward
+    path.radiance += _sky(path, light, path.active & ~si.is_valid() & ~capped, transport)
+    path.active &= si.is_valid() & (path.depth < limit)
+
+    point = world.surface.at(si, -path.ray.d)
+    path.radiance += path.throughput * _direct(world, path, si, point, light, transport)
+    path.depth[path.active] += 1
+    if last:
+        return path
+    if not transport.bsdf_sampling and light.kind != "constant":
+        path.active &= path.depth < limit
+    omega, weight, path.pdf = point.sample(path.rng.next_float32(), _next_2d(path.rng))
+    path.ray = leave(world.period, si, omega)
+    path.throughput *= weight
+    _roulette(path, transport)
+    return path
+
+
+def _roulette(path: Path, transport: Transport) -> None:
+    strongest = dr.max(path.throughput)
+    # A path of NaN throughput would end here as if it were black.
+    path.radiance[path.active & dr.isnan(strongest)] = mi.Spectrum(dr.nan)
+    path.active &= strongest > 0
+    longest = dr.select(path.depth < PATIENCE, 1.0, LATE_SURVIVAL)
+    survival = dr.select(path.depth >= transport.roulette_depth, dr.minimum(strongest, longest), 1.0)
+    path.active &= path.rng.next_float32() < survival
+    path.throughput *= dr.rcp(survival)
+
+
 @dr.syntax
 def trace(
-    scene: Any, period: Period, ray: Any, light: LaneLight, transport: Transport, rng: Any, active: Any
-) -> tuple[Any, Any, Any]:
-    """Radiance towards the rays' origins.
+    world: World, ray: Any, light: LaneLight, transport: Transport, limit: Any, rng: Any, active: Any
+) -> Path:
+    """Follow paths to their ends.
+
+    Parameters
+    ----------
+    limit : largest number of surface interactions of a path, opaque so that it is not part of the kernel
 
     Returns
     -------
-    (radiance; rays that went down and met nothing; rays cut off at the cap on crossings)
+    The paths' last state: ``radiance`` towards the rays' origins, ``passed``, and what was ``lost`` or
+    ``capped``
     """
-    ray = mi.Ray3f(ray)
-    radiance = mi.Spectrum(0.0)
-    throughput = mi.Spectrum(1.0)
-    depth = mi.UInt32(0)
-    capped = mi.UInt32(0)
-    lost = mi.Bool(False)
-    active = mi.Bool(active)
-    # Density with which the last bounce chose its direction; infinite makes the balance heuristic give it
-    # all.
-    bounce_pdf = mi.Float(dr.inf)
-    context = mi.BSDFContext()
-    while dr.hint(active, exclude=[scene, period, light, transport, context]):
-        si, _, cap = closest_hit(scene, period, ray, active, transport.max_crossings)
-        capped[cap] += 1
-        escaped = active & ~si.is_valid() & ~cap
-        lost |= escaped & (ray.d.z <= 0)
-        sky = light.radiance(ray.d)
-        share = dr.select(
-            dr.isinf(bounce_pdf), 1.0, bounce_pdf / (bounce_pdf + light.sampling_density(ray.d))
-        )
-        radiance[escaped & (depth > 0) & (ray.d.z > 0)] += throughput * sky * share
-
-        active &= si.is_valid()
-        if dr.hint(transport.max_depth > 0, mode="scalar"):
-            active &= depth < transport.max_depth
-
-        bsdf = si.bsdf()
-        if dr.hint(light.kind == "lobe", mode="scalar"):
-            omega = light.sample(_next_2d(rng))
-            light_pdf = light.sampling_density(omega)
-            incoming = light.radiance(omega)
-        elif dr.hint(light.kind == "delta", mode="scalar"):
-            omega = light.omega_i
-            light_pdf = mi.Float(1.0)
-            incoming = light.inverse_irradiance
-        if dr.hint(light.kind != "constant", mode="scalar"):
-            wo = si.to_local(omega)
-            value, pdf, bs, weight = bsdf.eval_pdf_sample(
-                context, si, wo, rng.next_float32(), _next_2d(rng), active
-            )
-            # Written so that NaN counts as light: it must reach the value, where it is found and drawn again.
-            connect = active & ~(dr.max(value) <= 0)
-            blocked, _, cap = occluded(
-                scene, period, leave(period, si, omega), connect, transport.max_crossings
-            )
-            capped[cap] += 1
-            if dr.hint(light.kind == "delta", mode="scalar"):
-                share = mi.Float(1.0)
-            else:
-                share = 1.0 / (light_pdf + pdf)
-            radiance[connect & ~blocked] += throughput * value * (incoming * share)
-        else:
-            bs, weight = bsdf.sample(context, si, rng.next_float32(), _next_2d(rng), active)
-
-        throughput *= weight
-        bounce_pdf = dr.select(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta), dr.inf, bs.pdf)
-        ray = leave(period, si, si.to_world(bs.wo))
-        depth[active] += 1
-        strongest = dr.max(throughput)
-        # A path of NaN throughput would end here as if it were black.
-        radiance[active & dr.isnan(strongest)] = mi.Spectrum(dr.nan)
-        active &= strongest > 0
-        longest = dr.select(depth < PATIENCE, 1.0, LATE_SURVIVAL)
-        survival = dr.select(depth >= transport.roulette_depth, dr.minimum(strongest, longest), 1.0)
-        active &= rng.next_float32() < survival
-        throughput *= dr.rcp(survival)
-    return radiance, lost, capped
+    path = Path(
+        mi.Ray3f(ray),
+        mi.Spectrum(0.0),
+        mi.Spectrum(1.0),
+        mi.Float(dr.inf),
+        mi.UInt32(0),
+        rng,
+        mi.UInt32(0),
+        mi.Bool(False),
+        mi.Bool(False),
+        mi.Bool(active),
+    )
+    once = not (transport.interreflection or transport.bsdf_sampling or light.kind == "constant")
+    if dr.hint(once, mode="scalar"):
+        path = _interaction(world, path, light, transport, limit, True)
+    else:
+        while dr.hint(path.active, exclude=[world, light, transport, limit]):
+            path = _interaction(world, path, light, transport, limit, False)
+    return path

@@ -75,7 +75,7 @@ def write_report(folder: Path, recipe: Recipe, stages: Sequence[str]) -> int:
         "bars": {bar.key: bar for bar in shown.bars},
         "offsets": offsets,
         "offset_columns": len(offsets[0]["cells"]) if offsets else 1,
-        "effects": manifest["effects"],
+        "effects": manifest["effects"]["effects"],
         "command": run["command"],
         "recipe_yaml": (folder / RECIPE_NAME).read_text(encoding="utf-8"),
         "provenance": provenance(folder, manifest, fit_folders, run["machine"]),

@@ -91,8 +91,9 @@ class _Run:
         ]
 
     def _generate(self, decision: Decision) -> dict[str, Any]:
-        from mbtf_gen.generation import Job, generate, paths_left, summary_dict
+        from mbtf_gen.generation import Job, generate, paths_left
         from mbtf_gen.schema import MANIFEST_NAME
+        from mbtf_gen.summary import summary_dict
         from mbtf_gen.verification import sidecar_of
 
         job = Job.prepare(self.recipe.generate)

@@ -20,7 +20,7 @@ def merge(folder: Path, /, *, console: Console = CONSOLE) -> int:
     """
     from ..dataset import Dataset
     from ..errors import EXIT_PARTIAL
-    from ..generation import finish, summary_dict
+    from ..summary import finish, summary_dict
 
     Dataset.open(folder)
     summary = finish(folder)

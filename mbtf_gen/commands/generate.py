@@ -39,6 +39,7 @@ def generate(
     light_width: float | None = None,
     min_cos: float | None = None,
     max_depth: int | None = None,
+    effects: str | None = None,
     layout: Literal["shuffled", "image"] | None = None,
     format: Literal["npz", "exr"] | None = None,
     seed: int | None = None,
@@ -80,6 +81,8 @@ def generate(
         Smallest cosine of light and view directions to the normal. Default: 0.1
     max_depth
         Surface interactions per path; 0: no limit (Russian roulette). Default: 0
+    effects
+        auto, all, none, then +x or -x: effects of light to simulate. Default: auto
     layout
         shuffled queries, or one image buffer per (light, view, footprint).
     format
@@ -102,6 +105,7 @@ def generate(
         "--test-spp": ("queries.test_spp", test_spp),
         "--levels": ("queries.levels", levels),
         "--min-cos": ("queries.min_cos", min_cos),
+        "--effects": ("effects.mode", effects),
         "--layout": ("queries.layout", layout),
         "--format": ("output.format", format),
         **general(
@@ -110,7 +114,8 @@ def generate(
     }
     resolved = resolve_config(GeneratorConfig, material, config, assignments or [], flags)
     part = _slice(shards)
-    from ..generation import Job, generate, paths_left, summary_dict
+    from ..generation import Job, generate, paths_left
+    from ..summary import summary_dict
 
     folder = output or Path("shards")
     job = Job.prepare(resolved)

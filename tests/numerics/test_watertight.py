@@ -23,7 +23,7 @@ def misses(grid: HeightGrid, uv: NDArray[np.float64], direction: NDArray[np.floa
     total = 0
     for part in range(0, len(uv), 1 << 20):
         o, d = (np.ascontiguousarray(x[part : part + (1 << 20)].T, np.float32) for x in (origin, direction))
-        si, _, capped = closest_hit(
+        si, _, capped, _ = closest_hit(
             tile.scene, tile.period, mi.Ray3f(mi.Point3f(o), mi.Vector3f(d)), mi.Bool(True), 4096
         )
         total += int(np.sum(~np.array(si.is_valid()))) + int(np.sum(np.array(capped)))

@@ -23,6 +23,7 @@ from support.scenes import (
     tile_mean_queries,
 )
 
+from mbtf_gen.bsdf import surface_of
 from mbtf_gen.estimator import Estimator, Stream
 from mbtf_gen.periodic import closest_hit, occluded
 from mbtf_gen.stats import mean_of_halves
@@ -51,7 +52,9 @@ def void(normal: tuple[float, float, float], bsdf: dict[str, Any]) -> Any:
         @ mi.ScalarTransform4f().scale(8.0),
         "bsdf": bsdf,
     }
-    return replace(tile, scene=mi.load_dict({"type": "scene", "facet": facet}))
+    scene = mi.load_dict({"type": "scene", "facet": facet})
+    surface = surface_of(scene.shapes()[0].bsdf())
+    return replace(tile, world=replace(tile.world, scene=scene, surface=surface))
 
 
 def test_rays_lost_below_the_horizon_bring_no_light_and_are_counted() -> None:
@@ -86,11 +89,11 @@ def test_endless_rays_end_at_the_cap(cap: int) -> None:
     tile = build_tile(TROUGH, lambert(0.5))
     z = -0.9 * tile.unit
     ray = mi.Ray3f(mi.Point3f([0.0, 0.5], 0.0, z), mi.Vector3f(0.0, [1.0, -1.0], 0.0))
-    si, crossings, capped = closest_hit(tile.scene, tile.period, ray, mi.Bool(True), cap)
+    si, crossings, capped, _ = closest_hit(tile.scene, tile.period, ray, mi.Bool(True), cap)
     assert not np.any(np.array(si.is_valid()))
     assert np.all(np.array(capped))
     assert list(np.array(crossings)) == [cap, cap]
-    blocked, crossings, capped = occluded(tile.scene, tile.period, ray, mi.Bool(True), cap)
+    blocked, crossings, capped, _ = occluded(tile.scene, tile.period, ray, mi.Bool(True), cap)
     assert np.all(np.array(blocked))
     assert np.all(np.array(capped))
     assert list(np.array(crossings)) == [cap, cap]
@@ -99,7 +102,7 @@ def test_endless_rays_end_at_the_cap(cap: int) -> None:
 def test_rays_that_leave_upwards_are_neither_capped_nor_occluded() -> None:
     tile = build_tile(TROUGH, lambert(0.5))
     ray = mi.Ray3f(mi.Point3f(0.0, 0.0, -0.1 * tile.unit), mi.Vector3f(0.0, [1.0, -0.6], [0.1, 0.8]))
-    blocked, crossings, capped = occluded(tile.scene, tile.period, ray, mi.Bool(True), 4096)
+    blocked, crossings, capped, _ = occluded(tile.scene, tile.period, ray, mi.Bool(True), 4096)
     assert not np.any(np.array(blocked | capped))
     # 0.1 tile widths up at a slope of 0.1 is one tile width along; the steep ray crosses none.
     assert list(np.array(crossings)) == [1, 0]

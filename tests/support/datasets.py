@@ -12,12 +12,14 @@ from numpy.typing import NDArray
 from mbtf_gen.atomic import write_json
 from mbtf_gen.config import GeneratorConfig
 from mbtf_gen.dataset import Dataset
-from mbtf_gen.effects import simulated_effects
-from mbtf_gen.generation import Job, _open_folder, _sidecar, finish
+from mbtf_gen.generation import Job, _sidecar
 from mbtf_gen.manifest import build_manifest
+from mbtf_gen.output_folder import open_folder
+from mbtf_gen.planning import simulated
 from mbtf_gen.queries import Queries
 from mbtf_gen.schema import SPLITS
 from mbtf_gen.shard_files import write_shard
+from mbtf_gen.summary import finish
 from mbtf_gen.verification import sidecar_of
 
 F32 = NDArray[np.float32]
@@ -45,7 +47,7 @@ def write_dataset(folder: Path, *, rows: int = 4, columns: int = 8, **options: A
     config = GeneratorConfig.model_validate({"material": str(heights), **options})
     job = Job.prepare(config)
     entries = [entry for split in SPLITS for entry in job.shards(split)]
-    _open_folder(job, folder, build_manifest(job, entries, simulated_effects(job.material, config)), False)
+    open_folder(job, folder, build_manifest(job, entries, simulated(job)), False)
     for number, entry in enumerate(entries):
         queries = job.plan().draw(entry.split, entry.index, entry.rows)
         truth, rng = formula(queries), np.random.default_rng(number)

@@ -80,7 +80,8 @@ def test_every_key_of_manifest_and_sidecar_is_explained(tmp_path: Path) -> None:
     manifest, sidecar = data.manifest, data.shards("train")[0].sidecar
     split = manifest["splits"]["train"]
     in_manifest = [manifest, manifest["tile"], manifest["levels"], manifest["levels"]["mixture"], split]
-    in_manifest += [split["shards"][0], manifest["effects"][0], next(iter(manifest["arrays"].values()))]
+    in_manifest += [manifest["effects"], manifest["effects"]["effects"][0]]
+    in_manifest += [split["shards"][0], next(iter(manifest["arrays"].values()))]
     in_sidecar = [sidecar, sidecar["seed"], sidecar["quarantined"], sidecar["statistics"]]
     counts = set(sidecar["quarantined"])
     for title, objects in (

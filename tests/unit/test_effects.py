@@ -1,4 +1,4 @@
-"""Which effects a run says that it simulates."""
+"""Effects plan: what is asked for, what depends on what, and what a manifest keeps of it."""
 
 from __future__ import annotations
 
@@ -9,60 +9,115 @@ import numpy as np
 import pytest
 
 from mbtf_gen.config import GeneratorConfig
-from mbtf_gen.effects import simulated_effects
+from mbtf_gen.effects import EFFECTS, OF_RELIEF, Effect, EffectsPlan, Wish
+from mbtf_gen.errors import UsageError
+from mbtf_gen.generation import Job
 from mbtf_gen.material import Material
+from mbtf_gen.planning import plan_effects, simulated
 
 HEIGHTS = np.array([[0.0, 0.1], [0.05, 0.02]])
 LAMBERT = Material(height=HEIGHTS, height_scale=1.0, height_bits=None, basecolor=np.full(3, 0.5))
-GEOMETRIC = {"parallax and masking", "shadowing", "interreflection", "periodic neighbours"}
+FLAT = replace(LAMBERT, height_scale=0.0)
+NORMAL = np.broadcast_to(np.float32([0.6, 0.0, 0.8]), (4, 4, 3))
 
 
-def effects(material: Material, **options: Any) -> set[str]:
-    config = GeneratorConfig.model_validate({"material": "m", **options})
-    return {e["effect"] for e in simulated_effects(material, config) if e["on"]}
+def job_of(material: Material, mode: str = "auto", **options: Any) -> Job:
+    sections = {"effects": {"mode": mode}, **options}
+    return Job.of(GeneratorConfig.model_validate({"material": "m", **sections}), material)
 
 
-def test_a_relief_of_lambert_has_geometric_effects_and_the_smoothed_light() -> None:
-    assert effects(LAMBERT) == {*GEOMETRIC, "smoothed light"}
+def on(plan: EffectsPlan) -> set[str]:
+    return {e.name for e in plan.effects if e.on}
+
+
+def test_a_plane_of_one_colour_is_known_without_tracing() -> None:
+    for material in (FLAT, replace(LAMBERT, height=np.full((2, 2), 0.4))):
+        plan = plan_effects(job_of(material))
+        assert on(plan) == set()
+        assert plan.closed_form
+        assert plan.cost == 0.0
+        assert all(e.known == "exact" for e in plan.effects)
 
 
 @pytest.mark.parametrize(
-    ("material", "options"),
+    "change",
     [
-        (LAMBERT, {"geometry": {"height": 0.0}}),
-        (replace(LAMBERT, height=np.full((2, 2), 0.4)), {}),
-        (replace(LAMBERT, height_scale=0.0), {}),
+        {"basecolor": np.full((2, 2, 3), 0.5) * [[[1.0], [0.5]]]},
+        {"roughness": 0.5, "specular": 0.5, "metallic": 0.0},
+        {"normal": NORMAL},
+        {"opacity": np.array([[1.0, 0.0], [1.0, 1.0]])},
     ],
-    ids=["no factor", "constant map", "material's factor"],
+    ids=["pattern", "gloss", "normal map", "holes"],
 )
-def test_a_plane_has_none_of_the_geometric_ones(material: Material, options: dict[str, Any]) -> None:
-    assert effects(material, **options) == {"smoothed light"}
+def test_a_plane_with_more_on_it_is_not(change: dict[str, Any]) -> None:
+    plan = plan_effects(job_of(replace(FLAT, **change)))
+    assert not plan.closed_form
+    assert not on(plan) & set(OF_RELIEF)
 
 
-def test_options_switch_effects_off() -> None:
-    assert effects(LAMBERT, transport={"max_depth": 1}) == {*GEOMETRIC, "smoothed light"} - {
-        "interreflection"
-    }
-    assert effects(LAMBERT, transport={"max_depth": 2}) >= GEOMETRIC
-    assert effects(LAMBERT, light={"width": 0}) == GEOMETRIC
+def test_black_is_known_whatever_the_relief() -> None:
+    black = replace(LAMBERT, basecolor=np.zeros(3))
+    assert plan_effects(job_of(black)).closed_form
+    # A black dielectric still has highlights, and black cloth still has holes.
+    shiny = replace(black, roughness=0.5, specular=0.5, metallic=0.0)
+    assert not simulated(job_of(shiny)).closed_form
+    holes = replace(black, opacity=np.array([[1.0, 0.0], [1.0, 1.0]]))
+    assert not plan_effects(job_of(holes, mode="-interreflection")).closed_form
 
 
-def test_a_surface_with_roughness_has_a_specular_lobe() -> None:
-    shiny = replace(LAMBERT, roughness=0.4, metallic=0.0, specular=0.5)
-    assert "specular lobe" in effects(shiny)
+def test_all_and_none_force_everything_that_the_material_has() -> None:
+    everything = plan_effects(job_of(FLAT, "all"))
+    assert on(everything) == {*OF_RELIEF, "mis"}
+    assert not everything.closed_form
+    nothing = plan_effects(job_of(replace(LAMBERT, roughness=0.5, specular=0.5, metallic=0.5), "none"))
+    assert on(nothing) == set()
 
 
-def test_maps_that_are_not_simulated_say_so() -> None:
-    material = replace(LAMBERT, normal=np.zeros((2, 2, 3), np.float32), opacity=0.5)
-    config = GeneratorConfig(material="m")
-    said = {e["effect"]: e for e in simulated_effects(material, config)}
-    for name in ("normal map", "opacity"):
-        assert not said[name]["on"]
-        assert said[name]["reason"] == "not simulated yet"
-        assert {e["effect"]: e for e in simulated_effects(LAMBERT, config)}[name]["reason"] == "no map"
+def test_effects_can_be_asked_for_and_away() -> None:
+    plan = plan_effects(job_of(LAMBERT, "-interreflection,+mis"))
+    assert not plan.on("interreflection")
+    assert plan.on("mis")
+    assert plan["interreflection"].reason.startswith("asked away")
+    assert plan_effects(job_of(FLAT, "all,-shadowing")).on("shadowing") is False
 
 
-def test_every_effect_has_a_reason() -> None:
-    for e in simulated_effects(LAMBERT, GeneratorConfig(material="m")):
-        assert e["reason"]
-        assert isinstance(e["on"], bool)
+def test_what_needs_an_effect_goes_with_it() -> None:
+    assert on(plan_effects(job_of(LAMBERT, "-masking"))) == set()
+    with pytest.raises(UsageError, match="'shadowing' needs 'parallax and masking'"):
+        plan_effects(job_of(LAMBERT, "-masking,+shadowing"))
+    assert not plan_effects(job_of(LAMBERT, "all,-neighbours")).on("interreflection")
+
+
+@pytest.mark.parametrize("name", ["specular", "metallic", "coat", "normal", "opacity", "fibres"])
+def test_what_a_material_lacks_cannot_be_asked_for(name: str) -> None:
+    with pytest.raises(UsageError, match="the material has none"):
+        plan_effects(job_of(LAMBERT, f"+{name}"))
+    assert not plan_effects(job_of(LAMBERT, "all")).on(name)
+
+
+@pytest.mark.parametrize("text", ["", "every", "+", "-depth", "none,shadowing", "+shadowing,auto"])
+def test_unknown_words_are_refused(text: str) -> None:
+    with pytest.raises(UsageError, match="is no effect"):
+        Wish.parse(text)
+
+
+def test_a_manifest_keeps_the_plan() -> None:
+    plan = simulated(job_of(LAMBERT, "-mis"))
+    assert [e.name for e in plan.effects] == list(EFFECTS)
+    assert EffectsPlan.from_manifest(plan.to_manifest()) == plan
+
+
+def test_costs_add_up_over_what_is_left_out() -> None:
+    effects = (
+        Effect("masking", True, "", 0.5),
+        Effect("shadowing", False, "", 0.001),
+        Effect("mis", False, "", 0.002),
+    )
+    assert EffectsPlan(effects).cost == pytest.approx(0.003)
+
+
+def test_a_depth_limit_is_kept() -> None:
+    plan = plan_effects(job_of(LAMBERT, transport={"max_depth": 1}))
+    assert not plan.on("interreflection")
+    plan = plan_effects(job_of(LAMBERT, transport={"max_depth": 3}))
+    assert (plan.on("interreflection"), plan.max_depth) == (True, 3)

@@ -17,9 +17,9 @@ from mbtf_fit.config import HeldOutSection
 from mbtf_fit.data import load_split, load_training, open_data
 from mbtf_gen.dataset import Dataset
 from mbtf_gen.errors import InputError
-from mbtf_gen.generation import finish
 from mbtf_gen.schema import MANIFEST_NAME
 from mbtf_gen.shard_files import read_shard, write_exr, write_npz
+from mbtf_gen.summary import finish
 from mbtf_gen.verification import verify
 
 ARRAYS = {

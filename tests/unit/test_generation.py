@@ -16,8 +16,9 @@ from mbtf_gen.config import GeneratorConfig
 from mbtf_gen.dataset import Dataset
 from mbtf_gen.engine import load_mitsuba
 from mbtf_gen.errors import InputError, PartialError, UsageError
-from mbtf_gen.generation import Job, finish, generate, paths_left
+from mbtf_gen.generation import Job, generate, paths_left
 from mbtf_gen.locks import shard_lock
+from mbtf_gen.summary import finish
 from mbtf_gen.verification import sidecar_of, verify
 
 load_mitsuba()
@@ -43,13 +44,14 @@ class Formula:
             raise KeyboardInterrupt
         self.asked.append((stream.split, stream.shard))
         value = formula(queries).astype(np.float32)
-        return Estimates(value, value, len(value) * spp, lost=1, capped=2, nonfinite=3)
+        return Estimates(value, value, None, len(value) * spp, lost=1, capped=2, nonfinite=3)
 
 
 @pytest.fixture
 def engine(monkeypatch: pytest.MonkeyPatch) -> Formula:
     fake = Formula()
-    monkeypatch.setattr(generation, "build_estimator", lambda config, material: fake)
+    monkeypatch.setattr(generation, "plan_effects", generation.simulated)
+    monkeypatch.setattr(generation, "estimator_of", lambda job, plan, tiles: fake)
     return fake
 
 
@@ -110,7 +112,7 @@ def test_the_same_command_resumes_without_rendering(
     def never(*_: Any) -> Any:
         raise AssertionError("the estimator was built although nothing is missing")
 
-    monkeypatch.setattr(generation, "build_estimator", never)
+    monkeypatch.setattr(generation, "estimator_of", never)
     second = generate(config, tmp_path / "out")
     assert (second.paths, second.complete, second.mean_value) == (0, True, first.mean_value)
     assert before == {p.name: (p.stat().st_mtime_ns, p.read_bytes()) for p in (tmp_path / "out").iterdir()}

@@ -88,7 +88,7 @@ class TestNumbers:
     def test_by_hand(self, folder: Path) -> None:
         found = inspect_material(load_material(folder), height=0.2, mesh=48)
         assert found["aspect"] == 0.5
-        assert found["surface"] == "principled"
+        assert found["surface"] == "glossy"
         assert found["geometry"]["mesh"] == [24, 48]
         assert found["geometry"]["height"] == 0.2
         assert found["geometry"]["relief"] <= 0.2
@@ -150,7 +150,7 @@ class TestText:
 
     def test_one_screen(self, folder: Path) -> None:
         lines = self.lines(inspect_material(load_material(folder)))
-        assert lines[0] == "rock: tile 1 x 0.5, surface principled, tile=none"
+        assert lines[0] == "rock: tile 1 x 0.5, surface glossy, tile=none"
         text = "\n".join(lines)
         for part in (
             "displaces the mesh",

@@ -180,7 +180,7 @@ class TestFolder:
         assert material.specular == 0.5
         assert any("constants specular 0.5" in note for note in material.notes)
         assert any("rock_ao.png is not used" in note for note in material.notes)
-        assert any("holes are not simulated" in warning for warning in material.warnings)
+        assert any(note.startswith("opacity: ") for note in material.notes)
 
     def test_colours_become_linear(self, folder: Path) -> None:
         from PIL import Image as Pillow

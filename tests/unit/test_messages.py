@@ -35,6 +35,7 @@ def test_every_group_of_messages_is_explained() -> None:
 # Functions whose message is what another one said: of this project (collected there), of the validator,
 # Mitsuba or the system (shown as it is), or a text chosen by the caller.
 RELAYS = {
+    "mbtf_gen/config.py": {"_effects"},
     "mbtf_gen/console.py": {"_usage_message", "run"},
     "mbtf_gen/engine.py": {"_llvm_error", "check_llvm", "load_mitsuba"},
     "mbtf_gen/generation.py": {"plan", "prepare"},

@@ -1,0 +1,120 @@
+"""``mbtf-gen plan``: which effects a run would simulate, why, and what leaving the others out costs."""
+
+from __future__ import annotations
+
+import textwrap
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..console import CONSOLE, Console
+from .common import Set, general, resolve_config
+
+if TYPE_CHECKING:
+    from ..effects import Effect, EffectsPlan
+
+# Columns of the table before the reason, and its width.
+_NAME, _COST, _WIDTH = 24, 18, 100
+
+
+def plan(
+    material: str | None = None,
+    /,
+    *,
+    effects: str | None = None,
+    tolerance: float | None = None,
+    height: float | None = None,
+    mesh: int | None = None,
+    light_width: float | None = None,
+    min_cos: float | None = None,
+    max_depth: int | None = None,
+    seed: int | None = None,
+    measure: bool = True,
+    config: Path | None = None,
+    assignments: Set | None = None,
+    console: Console = CONSOLE,
+) -> None:
+    """Say which effects of light a run would simulate, why, and what leaving each one out costs.
+
+    A cost is the root mean square change of M over the run's queries, relative to its mean value.
+
+    Parameters
+    ----------
+    material
+        Height map, folder of maps, or material.yaml.
+    effects
+        auto, all, none, then +x or -x: effects of light to simulate. Default: auto
+    tolerance
+        Cost of all effects left out together. Default: 0.005
+    height
+        Factor on the stored heights, in tile widths. Default: the material's own
+    mesh
+        Mesh cells across the tile. Default: the map's width, at most 512
+    light_width
+        RMS angle of the light per axis in degrees; 0 is a delta light. Default: 1
+    min_cos
+        Smallest cosine of light and view directions to the normal. Default: 0.1
+    max_depth
+        Surface interactions per path; 0: no limit (Russian roulette). Default: 0
+    seed
+        Root seed. Default: 0
+    measure
+        Measure the cost of every effect that is on, by a small run without it.
+    config
+        YAML file with the options.
+    """
+    from ..config import GeneratorConfig
+
+    flags = {
+        "--effects": ("effects.mode", effects),
+        "--tolerance": ("effects.tolerance", tolerance),
+        "--min-cos": ("queries.min_cos", min_cos),
+        **general(height=height, mesh=mesh, light_width=light_width, max_depth=max_depth, seed=seed),
+    }
+    resolved = resolve_config(GeneratorConfig, material, config, assignments or [], flags)
+    from ..generation import Job
+    from ..pilot import measured
+    from ..planning import plan_effects
+
+    job = Job.prepare(resolved)
+    found = plan_effects(job)
+    if measure:
+        found = measured(job, found)
+    console.report(found.to_manifest(), table(found))
+
+
+def table(plan: EffectsPlan) -> str:
+    """The plan as a table, a line or two per effect."""
+    lines = [f"{'effect':<{_NAME}}{'':5}{'cost if left out':<{_COST}}why"]
+    for effect in plan.effects:
+        lines += _row(effect)
+    left = plan.cost
+    share = "nothing" if left == 0 else f"at most {left:.2g} of the mean value"
+    lines.append(f"left out together: {share} (tolerance {plan.tolerance:g})")
+    if plan.closed_form:
+        lines.append("M is known in closed form: nothing is traced")
+    elif plan.max_depth:
+        lines.append(f"paths end after {plan.max_depth} surface interactions")
+    return "\n".join(lines)
+
+
+def _row(effect: Effect) -> list[str]:
+    from ..effects import EFFECTS
+
+    before = _NAME + 5 + _COST
+    reason = textwrap.wrap(effect.reason, _WIDTH - before) or [""]
+    first = f"{EFFECTS[effect.name]:<{_NAME}}{'on' if effect.on else 'off':<5}{cost_text(effect):<{_COST}}"
+    return [first + reason[0], *(" " * before + more for more in reason[1:])]
+
+
+def cost_text(effect: Any) -> str:
+    """The cost of leaving an effect out, and how it is known."""
+    if effect.cost is None:
+        return "-"
+    if effect.known == "exact":
+        return "0 exactly" if effect.cost == 0 else f"{effect.cost:.2g} exactly"
+    if effect.known == "bound":
+        return f"< {effect.cost:.2g}"
+    if effect.error:
+        low = effect.cost < 2.0 * effect.error
+        return f"< {effect.cost + 2 * effect.error:.2g}" if low else f"{effect.cost:.2g} ± {effect.error:.1g}"
+    return f"~ {effect.cost:.2g}"

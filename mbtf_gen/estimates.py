@@ -1,0 +1,39 @@
+"""What an estimator returns, and which random numbers it uses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """Estimates of a batch of queries.
+
+    Attributes
+    ----------
+    value_a, value_b : (n, 3) float32, independent halves of spp/2 paths each
+    transmittance : (n,) float32, share of the view rays that went through holes; None where there are none
+    paths : paths traced; lost : rays that slipped through the surface; capped : rays cut at the cap on
+        crossings
+    nonfinite : samples that came out non-finite and were drawn again
+    """
+
+    value_a: NDArray[np.float32]
+    value_b: NDArray[np.float32]
+    transmittance: NDArray[np.float32] | None
+    paths: int
+    lost: int
+    capped: int
+    nonfinite: int
+
+
+@dataclass(frozen=True)
+class Stream:
+    """Which random numbers to use: split and number of the shard under a root seed."""
+
+    root: int
+    split: str
+    shard: int

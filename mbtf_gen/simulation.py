@@ -1,0 +1,90 @@
+"""From an effects plan to what evaluates it: surface, tile, transport — or the closed form."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .effects import EffectsPlan
+from .estimates import Estimates, Stream
+from .maps import resample
+from .slopes import height_slopes
+
+if TYPE_CHECKING:
+    from .generation import Job
+    from .queries import Queries
+
+
+class MeanEstimator(Protocol):
+    """Estimates M at queries."""
+
+    def estimate(self, queries: Queries, spp: int, stream: Stream) -> Estimates:
+        """Both halves of each query."""
+
+
+class ClosedForm:
+    """M of a plane of one Lambert colour, ``albedo/π`` at every query: nothing to trace, and no noise.
+
+    Parameters
+    ----------
+    albedo : (3,) linear
+    """
+
+    def __init__(self, albedo: NDArray[np.float64]) -> None:
+        self.value = (np.asarray(albedo, np.float64) / np.pi).astype(np.float32)
+
+    def estimate(self, queries: Queries, spp: int, stream: Stream) -> Estimates:
+        """Both halves of each query (one leading axis), equal."""
+        value = np.broadcast_to(self.value, (len(queries.sigma), 3))
+        return Estimates(value.copy(), value.copy(), None, 0, 0, 0, 0)
+
+
+def estimator_of(job: Job, plan: EffectsPlan, tiles: dict[Any, Any]) -> Any:
+    """Estimator of a job's material under a plan; `tiles` keeps meshes that several plans share."""
+    if plan.closed_form:
+        base = np.asarray(job.material.basecolor, np.float64).reshape(-1, 3)[0]
+        return ClosedForm(base)
+    from .engine import load_mitsuba
+
+    load_mitsuba()
+    from .bsdf import bsdf_of
+    from .estimator import Estimator
+    from .light import LightKernel
+    from .scene import APRON_SHARE, build_tile
+    from .tracing import Transport
+
+    parts = tuple(plan.on(n) for n in ("masking", "specular", "metallic", "coat", "normal", "opacity"))
+    apron = APRON_SHARE
+    if plan.on("masking") and not plan.on("neighbours"):
+        from .planning import reach_of
+
+        apron = min(0.5, reach_of(job) / min(1.0, job.grid.aspect) + 0.02)
+    key = (*parts, apron)
+    if key not in tiles:
+        tiles[key] = build_tile(job.grid, bsdf_of(job.material, plan, _slopes(job, plan)), apron)
+    config = job.config
+    transport = Transport(
+        plan.max_depth,
+        plan.roulette_depth,
+        config.transport.max_crossings,
+        displacement=plan.on("masking"),
+        shadowing=plan.on("shadowing"),
+        interreflection=plan.on("interreflection"),
+        neighbours=plan.on("neighbours"),
+        bsdf_sampling=plan.on("mis"),
+    )
+    return Estimator(tiles[key], LightKernel(config.light.width), transport)
+
+
+def _slopes(job: Job, plan: EffectsPlan) -> NDArray[np.float64] | None:
+    """Slopes (h, w, 2) that shading adds to the geometry's: the residual of the normal map, and the relief's
+    own where it is not displaced."""
+    residual = job.residual[0] if job.residual is not None and plan.on("normal") else None
+    if plan.on("masking") or job.grid.relief == 0.0:
+        return residual
+    relief = height_slopes(job.grid)
+    if residual is None:
+        return relief
+    return residual + np.asarray(resample(relief, *residual.shape[:2]), np.float64)
