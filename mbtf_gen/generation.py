@@ -25,7 +25,7 @@ from .locks import shard_lock
 from .manifest import ShardEntry, build_manifest
 from .material import Material, load_material
 from .output_folder import open_folder
-from .planning import plan_effects, simulated
+from .planning import SMALL_RUN, plan_effects, simulated
 from .queries import Mixture, QueryPlan
 from .schema import FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, SPLITS, Split
 from .shard_files import shard_suffix, write_shard
@@ -169,7 +169,8 @@ def _agreed_effects(job: Job, folder: Path, entries: list[ShardEntry], overwrite
     if existing.exists() and not overwrite:
         open_folder(job, folder, build_manifest(job, entries, None), overwrite)
     else:
-        open_folder(job, folder, build_manifest(job, entries, plan_effects(job)), overwrite)
+        large = sum(job.paths(entry) for entry in entries) >= SMALL_RUN
+        open_folder(job, folder, build_manifest(job, entries, plan_effects(job, pilots=large)), overwrite)
     return planned_effects(folder)
 
 

@@ -28,6 +28,8 @@ WIDER = 4.0
 # Where nothing reflects more, what comes after the first interaction is so little of the value that roulette
 # from there on saves more time than it costs in variance.
 DARK = 0.25
+# Runs of fewer paths are done before a pilot has paid for itself.
+SMALL_RUN = 2_000_000
 # Deepest cap on surface interactions that is tried.
 DEEPEST_CAP = 4
 
@@ -42,6 +44,7 @@ class _Look:
     albedo: NDArray[np.float64]
     lambert: bool
     own_bsdf: bool
+    pilots: bool
 
     @property
     def lowest_light(self) -> float:
@@ -55,15 +58,19 @@ class _Look:
         return LOBE_TAIL_SHARE if self.job.config.light.width > 0 else 0.0
 
 
-def plan_effects(job: Job) -> EffectsPlan:
+def plan_effects(job: Job, *, pilots: bool = True) -> EffectsPlan:
     """Effects plan of a run.
+
+    Parameters
+    ----------
+    pilots : measure where theory gives no bound; otherwise such effects stay on
 
     Raises
     ------
     UsageError : an effect was asked for that the material does not have, or that needs one asked away
     """
     wish = Wish.parse(job.config.effects.mode)
-    look = _look(job)
+    look = _look(job, pilots)
     tolerance = job.config.effects.tolerance
     costs = _relief(look)
     of_surface = [*_surface(look), _normal(look, costs), _opacity(look), _fibres()]
@@ -80,7 +87,7 @@ def plan_effects(job: Job) -> EffectsPlan:
 def simulated(job: Job) -> EffectsPlan:
     """Everything that the material calls for, without looking at costs: the plan of reference pictures."""
     wish = Wish.parse(job.config.effects.mode)
-    look = _look(job)
+    look = _look(job, False)
     flat = job.grid.relief == 0.0
     effects = [*_surface(look), _normal(look, None), _opacity(look), _fibres()]
     effects += [Effect(name, not flat, "flat" if flat else "a relief") for name in OF_RELIEF]
@@ -89,7 +96,7 @@ def simulated(job: Job) -> EffectsPlan:
     return replace(plan, mode=job.config.effects.mode)
 
 
-def _look(job: Job) -> _Look:
+def _look(job: Job, pilots: bool) -> _Look:
     material = job.material
     queries = pilot_queries(job, POINTS)
     base = np.asarray(material.basecolor, np.float64)
@@ -102,13 +109,14 @@ def _look(job: Job) -> _Look:
         albedo,
         material.is_lambert,
         own,
+        pilots,
     )
 
 
 def _relief(look: _Look) -> ReliefCosts | None:
     """Costs of the relief's effects for a Lambert surface; None on a plane."""
     job = look.job
-    if job.grid.relief == 0.0 or not look.albedo.any():
+    if job.grid.relief == 0.0 or not look.albedo.any() or not look.pilots:
         return None
     residual = job.residual[0] if job.residual is not None else None
     return relief_costs(job.grid, look.omega_i, look.omega_o, look.albedo, residual)
@@ -293,6 +301,8 @@ def _interreflection(
     if "interreflection" in wish.forced or wish.base != "auto" or not decided["masking"].on:
         effect = wish.decide(replace(effect, reason="a relief"))
         return effect, asked, 0.0
+    if not look.pilots:
+        return replace(effect, reason="a relief; the run is too small for a pilot"), asked, 0.0
     pilot = Pilot(look.job, _assemble(look.job, _consistent(dict(decided), wish), asked))
     cost, upper = pilot.cost_of_limit(1)
     reason = f"{cost:.2g} of the mean value comes from it"

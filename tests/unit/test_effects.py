@@ -121,3 +121,11 @@ def test_a_depth_limit_is_kept() -> None:
     assert not plan.on("interreflection")
     plan = plan_effects(job_of(LAMBERT, transport={"max_depth": 3}))
     assert (plan.on("interreflection"), plan.max_depth) == (True, 3)
+
+
+def test_a_small_run_is_not_looked_at_twice() -> None:
+    """What no theory decides stays on, without a cost."""
+    plan = plan_effects(job_of(replace(LAMBERT, basecolor=np.full(3, 0.05))), pilots=False)
+    assert on(plan) == set(OF_RELIEF)
+    assert (plan["interreflection"].cost, plan["masking"].cost, plan.max_depth) == (None, None, 0)
+    assert plan_effects(job_of(FLAT), pilots=False).closed_form

@@ -50,7 +50,7 @@ class Formula:
 @pytest.fixture
 def engine(monkeypatch: pytest.MonkeyPatch) -> Formula:
     fake = Formula()
-    monkeypatch.setattr(generation, "plan_effects", generation.simulated)
+    monkeypatch.setattr(generation, "plan_effects", lambda job, pilots: generation.simulated(job))
     monkeypatch.setattr(generation, "estimator_of", lambda job, plan, tiles: fake)
     return fake
 
