@@ -7,6 +7,23 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+# Non-finite samples whose place is kept.
+MOST_LOCATED = 8
+
+
+@dataclass(frozen=True)
+class BadSample:
+    """Where a sample came out non-finite.
+
+    Attributes
+    ----------
+    query : its number in the batch, or in the shard
+    effect : what brought it there: ``direct light``, or ``interreflection``
+    """
+
+    query: int
+    effect: str
+
 
 @dataclass(frozen=True)
 class Estimates:
@@ -19,6 +36,7 @@ class Estimates:
     paths : paths traced; lost : rays that slipped through the surface; capped : rays cut at the cap on
         crossings
     nonfinite : samples that came out non-finite and were drawn again
+    bad_samples : the first of them, at most ``MOST_LOCATED``
     """
 
     value_a: NDArray[np.float32]
@@ -28,6 +46,7 @@ class Estimates:
     lost: int
     capped: int
     nonfinite: int
+    bad_samples: tuple[BadSample, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import PartialError
-from .estimates import Estimates, Stream
+from .estimates import MOST_LOCATED, BadSample, Estimates, Stream
 from .light import LightKernel
 from .queries import Queries
 from .scene import CLEARANCE, Tile
@@ -110,6 +110,7 @@ class Estimator:
             sum(p.lost for p in parts),
             sum(p.capped for p in parts),
             sum(p.nonfinite for p in parts),
+            tuple(b for p in parts for b in p.bad_samples)[:MOST_LOCATED],
         )
 
     def _batch(self, queries: Queries, rows: slice, spp: int, stream: Stream, source: RaySource) -> Estimates:
@@ -129,6 +130,7 @@ class Estimator:
         radiance, passed, lost, capped = trace_lanes(lanes, 0)
         bad = self._nonfinite(radiance)
         nonfinite = 0
+        located = self._located(source, bad[:MOST_LOCATED], rows.start, spp, stream, omega_i, inverse)
         for attempt in range(1, MAX_RESAMPLES + 1):
             if not len(bad):
                 break
@@ -142,7 +144,7 @@ class Estimator:
         if len(bad):
             raise PartialError(
                 f"{len(bad)} samples stay NaN or infinite after {MAX_RESAMPLES} draws, first at "
-                f"query {rows.start + int(bad[0]) // spp}",
+                f"query {rows.start + int(bad[0]) // spp} ({located[0].effect})",
                 where=f"{stream.split} shard {stream.shard}",
                 cure="check the material's values",
             )
@@ -157,6 +159,30 @@ class Estimator:
             lost,
             capped,
             nonfinite,
+            located,
+        )
+
+    def _located(
+        self,
+        source: RaySource,
+        bad: NDArray[np.uint32],
+        first: int,
+        spp: int,
+        stream: Stream,
+        omega_i: Any,
+        inverse: Any,
+    ) -> tuple[BadSample, ...]:
+        """Queries of bad lanes, and the effect at fault: their paths cut after one interaction show whether
+        direct light is."""
+        if not len(bad):
+            return ()
+        full, self._limit = self._limit, dr.opaque(mi.UInt32, 1)
+        short = self._trace(source, mi.UInt32(bad), first, spp, stream, omega_i, inverse, 0)[0]
+        self._limit = full
+        direct = np.isin(np.arange(len(bad)), self._nonfinite(short))
+        return tuple(
+            BadSample(first + int(lane) // spp, "direct light" if at_once else "interreflection")
+            for lane, at_once in zip(bad, direct, strict=True)
         )
 
     def _shares(self, passed: Any, spp: int) -> NDArray[np.float32]:

@@ -6,7 +6,7 @@ import logging
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,7 @@ from .schema import FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, SPLITS, Split
 from .shard_files import shard_suffix, write_shard
 from .simulation import estimator_of
 from .slopes import residual_slopes
-from .summary import Summary, finish, planned_effects
+from .summary import Summary, finish, planned_effects, refuse_nonfinite
 from .verification import is_finished, sidecar_of
 
 log = logging.getLogger(__name__)
@@ -196,6 +196,7 @@ def _sidecar(job: Job, entry: ShardEntry, path: Path, estimates: Any, seconds: f
             "nonfinite_samples": estimates.nonfinite,
             "lost_rays": estimates.lost,
             "capped_rays": estimates.capped,
+            "nonfinite_at": [asdict(bad) for bad in estimates.bad_samples],
         },
         "statistics": {
             "mean_value": (0.5 * (a + b)).mean(axis=0).tolist(),
@@ -261,7 +262,8 @@ def generate(
     Raises
     ------
     InputError : material or folder cannot be used
-    PartialError : shards are left to others, or the disk is full; the same command resumes
+    PartialError : shards are left to others, or the disk is full; the same command resumes. Too many
+        non-finite samples; says where
     """
     folder = Path(folder)
     start = time.perf_counter()
@@ -269,7 +271,7 @@ def generate(
     plan = job.plan()
     entries = [e for split in SPLITS for e in job.shards(split)]
     effects = _agreed_effects(job, folder, entries, overwrite)
-    paths, busy = 0, []
+    paths, busy, made = 0, [], []
     estimator: Any = None
     for entry in job.slice(slice_index, slice_count):
         path = folder / entry.file
@@ -282,7 +284,11 @@ def generate(
                         stale.unlink(missing_ok=True)
                     if estimator is None:
                         estimator = job.estimator(effects)
-                    paths += _make_shard(job, plan, estimator, entry, path)["paths"]
+                    record = _make_shard(job, plan, estimator, entry, path)
+                    paths += record["paths"]
+                    made.append(record)
+                    # More than the whole data set may have: the rest cannot mend that.
+                    refuse_nonfinite(made, sum(job.paths(e) for e in entries), folder)
         if progress is not None:
             progress(paths, f"{paths / max(time.perf_counter() - start, 1e-9) / 1e6:.2f} M paths/s")
     if busy:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -12,6 +13,7 @@ from pydantic import BaseModel, Field
 from .atomic import read_json, write_json
 from .dataset import Dataset
 from .effects import EFFECTS, EffectsPlan
+from .errors import PartialError
 from .manifest import software_versions
 from .schema import MANIFEST_NAME
 from .settings import check_document
@@ -84,8 +86,14 @@ class _Statistics(BaseModel):
     mean_variance: _Colour
 
 
+class _BadSample(BaseModel):
+    query: int
+    effect: str
+
+
 class _Quarantined(BaseModel):
     nonfinite_samples: int
+    nonfinite_at: list[_BadSample]
     lost_rays: int
     capped_rays: int
 
@@ -99,6 +107,11 @@ class _Made(BaseModel):
     statistics: _Statistics
     quarantined: _Quarantined
 
+
+# A run fails beyond this share of non-finite samples, but not for so few that chance may bring them: at one
+# expected, more than four come once in three hundred runs.
+NONFINITE_SHARE = 1e-6
+NONFINITE_FEW = 4
 
 _MEND = "look for damage with: mbtf-gen verify"
 
@@ -115,12 +128,37 @@ def planned_effects(folder: Path) -> EffectsPlan:
     return EffectsPlan.from_manifest(manifest["effects"])
 
 
+def refuse_nonfinite(records: Sequence[Mapping[str, Any]], paths: int, folder: Path) -> None:
+    """Refuse shards with more non-finite samples than a data set may have.
+
+    Parameters
+    ----------
+    records : sidecars of shards
+    paths : of the whole data set
+
+    Raises
+    ------
+    PartialError : more than ``NONFINITE_FEW`` and more than ``NONFINITE_SHARE`` of the paths; says where
+    """
+    count = sum(r["quarantined"]["nonfinite_samples"] for r in records)
+    if count <= max(NONFINITE_FEW, NONFINITE_SHARE * paths):
+        return
+    where = [(r["file"], bad) for r in records for bad in r["quarantined"]["nonfinite_at"]]
+    first = "; ".join(f"{file} query {bad['query']}, {bad['effect']}" for file, bad in where[:3])
+    raise PartialError(
+        f"{count} of {paths} samples were NaN or infinite, more than 1 in 10⁶: {first}",
+        where=folder,
+        cure="check the material's values, then run again with --overwrite",
+    )
+
+
 def finish(folder: str | Path, *, paths: int = 0, seconds: float = 0.0) -> Summary:
     """Complete the manifest when every shard is there, and summarise (``mbtf-gen merge``).
 
     Raises
     ------
     InputError : no data set there, or damaged documents
+    PartialError : too many non-finite samples
     """
     folder = Path(folder)
     manifest = Dataset.open(folder).manifest
@@ -137,6 +175,8 @@ def finish(folder: str | Path, *, paths: int = 0, seconds: float = 0.0) -> Summa
             else:
                 complete = False
     flat = [r for rs in records.values() for r in rs]
+    if complete:
+        refuse_nonfinite(flat, sum(r["paths"] for r in flat), folder)
     train = records.get("train", [])
     weights = np.array([r["queries"] for r in train], np.float64)
     if len(train):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from support.scenes import (
     Estimator,
+    HeightGrid,
     LightKernel,
     Stream,
     Transport,
@@ -21,6 +22,8 @@ from support.scenes import (
     queries,
     rocks,
 )
+
+from mbtf_gen.estimates import MOST_LOCATED
 
 
 def estimator(launch: int = 1 << 20, **options: Any) -> Estimator:
@@ -59,17 +62,18 @@ def test_values_do_not_depend_on_the_size_of_launches() -> None:
 
 
 class Faulty(mi.BSDF):  # type: ignore[misc]
-    """A Lambert reflector of albedo 1/2 with NaN or infinite values on a twentieth of the tile."""
+    """A Lambert reflector of albedo 1/2 with NaN or infinite values on a twentieth of the tile, in
+    `stripes`."""
 
-    def __init__(self, props: Any, bad: float) -> None:
+    def __init__(self, props: Any, bad: float, stripes: float = 1000.0) -> None:
         mi.BSDF.__init__(self, props)
-        self.bad = bad
+        self.bad, self.stripes = bad, stripes
         self.inner = mi.load_dict(lambert(0.5))
         self.m_flags = self.inner.flags()
         self.m_components = [self.inner.flags()]
 
     def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-        x = 1000.0 * si.uv.x
+        x = self.stripes * si.uv.x
         return dr.select(x - dr.floor(x) < 0.05, mi.Color3f(self.bad), self.inner.eval(ctx, si, wo, active))
 
     def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
@@ -88,3 +92,19 @@ def test_nonfinite_samples_are_drawn_again_and_counted(bad: float) -> None:
     # One in twenty, and of those one in twenty again; none is left in the values.
     assert values.nonfinite == pytest.approx(n * spp / 19, rel=0.3)
     np.testing.assert_allclose([values.value_a, values.value_b], 0.5 / np.pi, rtol=1e-5)
+
+
+def test_nonfinite_samples_are_located() -> None:
+    """A groove whose facet towards u = 0 has a bad stripe: queries on it fail at once, those on the other
+    facet by what the stripe reflects to them."""
+    groove = HeightGrid(np.tile([0.0, -0.4], (2, 1)), 1.0)
+    e = Estimator(build_tile(groove, Faulty(mi.Properties(), np.nan, 1.0)), LightKernel(0.0), Transport())
+    n = 500
+    u = np.array([[0.5, 0.5]] * n + [[0.08, 0.5]] * n)
+    for effect, first in (("interreflection", 0), ("direct light", n)):
+        q = queries(np.roll(u, -first, axis=0), 0.02, direction(80, 90), direction(90, 0), 2 * n)
+        values = e.estimate(q, 8, Stream(0, "train", 0))
+        assert values.nonfinite > MOST_LOCATED == len(values.bad_samples)
+        # Some paths come back to the stripe from the other facet.
+        assert sum(bad.effect == effect for bad in values.bad_samples) > MOST_LOCATED // 2
+        assert all(0 <= bad.query < n for bad in values.bad_samples)

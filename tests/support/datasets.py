@@ -72,6 +72,7 @@ def write_dataset(folder: Path, *, rows: int = 4, columns: int = 8, **options: A
             nonfinite=0,
             lost=0,
             capped=0,
+            bad_samples=(),
         )
         write_json(sidecar_of(path), _sidecar(job, entry, path, made, 0.1))
     finish(folder)

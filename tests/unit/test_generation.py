@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
 from pathlib import Path
@@ -18,12 +19,12 @@ from mbtf_gen.engine import load_mitsuba
 from mbtf_gen.errors import InputError, PartialError, UsageError
 from mbtf_gen.generation import Job, generate, paths_left
 from mbtf_gen.locks import shard_lock
-from mbtf_gen.summary import finish
+from mbtf_gen.summary import finish, refuse_nonfinite
 from mbtf_gen.verification import sidecar_of, verify
 
 load_mitsuba()
 
-from mbtf_gen.estimator import Estimates  # noqa: E402
+from mbtf_gen.estimates import BadSample, Estimates  # noqa: E402
 
 SMALL = {
     "queries": {"train": "100", "test": "30", "spp": 2, "test_spp": 4},
@@ -38,13 +39,14 @@ class Formula:
     def __init__(self) -> None:
         self.asked: list[tuple[str, int]] = []
         self.fail_at: int | None = None
+        self.bad = (BadSample(7, "direct light"),)
 
     def estimate(self, queries: Any, spp: int, stream: Any) -> Any:
         if self.fail_at == len(self.asked):
             raise KeyboardInterrupt
         self.asked.append((stream.split, stream.shard))
         value = formula(queries).astype(np.float32)
-        return Estimates(value, value, None, len(value) * spp, lost=1, capped=2, nonfinite=3)
+        return Estimates(value, value, None, len(value) * spp, 1, 2, len(self.bad), self.bad)
 
 
 @pytest.fixture
@@ -94,13 +96,38 @@ def test_a_run_is_complete_and_counts(config: GeneratorConfig, engine: Formula, 
     assert seen == [80, 160, 200, 320]
     assert (summary.complete, summary.queries, summary.paths) == (True, 130, 100 * 2 + 30 * 4)
     assert summary.splits == {"train": 100, "test": 30}
-    assert (summary.lost, summary.capped, summary.nonfinite) == (4, 8, 12)
+    assert (summary.lost, summary.capped, summary.nonfinite) == (4, 8, 4)
     assert summary.relative_error == 0.0
     data = Dataset.open(tmp_path / "out").load("train")
     np.testing.assert_allclose(summary.mean_value, data["value_a"].astype(np.float64).mean(axis=0), rtol=1e-6)
     assert set(data["spp"]) == {2.0}
     assert verify(tmp_path / "out") == []
     assert not list((tmp_path / "out").glob(".*"))
+
+
+def test_too_many_nonfinite_samples_fail_the_run_and_name_their_place(
+    config: GeneratorConfig, engine: Formula, tmp_path: Path
+) -> None:
+    """Two a shard: four are let pass in any run, the sixth is not; nor do they pass on a second try."""
+    engine.bad = (BadSample(7, "direct light"), BadSample(9, "interreflection"))
+    place = "train-00000.npz query 7, direct light; train-00000.npz query 9, interreflection"
+    with pytest.raises(PartialError, match=f"6 of 320 samples were NaN or infinite.*{place}"):
+        generate(config, tmp_path / "out")
+    assert len(contents(tmp_path / "out")) == 3
+    with pytest.raises(PartialError, match=f"8 of 320 samples.*{place}"):
+        generate(config, tmp_path / "out")
+    with pytest.raises(PartialError, match="8 of 320"):
+        finish(tmp_path / "out")
+    assert not json.loads((tmp_path / "out/manifest.json").read_text())["complete"]
+
+
+@pytest.mark.parametrize(
+    ("count", "paths", "refused"), [(4, 1, False), (5, 4_999_999, True), (5, 5_000_000, False)]
+)
+def test_one_sample_in_a_million_may_be_nonfinite(count: int, paths: int, refused: bool) -> None:
+    quarantined = {"nonfinite_samples": count, "nonfinite_at": []}
+    with pytest.raises(PartialError) if refused else contextlib.nullcontext():
+        refuse_nonfinite([{"file": "train-00000.npz", "quarantined": quarantined}], paths, Path("out"))
 
 
 def test_the_same_command_resumes_without_rendering(
@@ -325,9 +352,14 @@ def test_the_sidecar_says_what_the_shard_holds(
     record = json.loads((tmp_path / "out/train-00002.json").read_text())
     assert (record["rows"], record["queries"], record["paths"], record["spp"]) == (20, 20, 40, 2)
     assert record["seed"] == {"root": 0, "split": "train", "shard": 2}
-    assert record["quarantined"] == {"nonfinite_samples": 3, "lost_rays": 1, "capped_rays": 2}
+    assert record["quarantined"] == {
+        "nonfinite_samples": 1,
+        "lost_rays": 1,
+        "capped_rays": 2,
+        "nonfinite_at": [{"query": 7, "effect": "direct light"}],
+    }
     manifest = json.loads((tmp_path / "out/manifest.json").read_text())
-    assert manifest["summary"]["nonfinite_samples"] == 12
+    assert manifest["summary"]["nonfinite_samples"] == 4
     assert manifest["summary"]["paths"] == 320
     assert manifest["levels"]["mixture"] == {"log_uniform": 0.6, "finest": 0.4}
     assert manifest["splits"]["train"]["queries"] == 100
