@@ -74,9 +74,10 @@ def fit(
         raise UsageError("no shards given", cure="mbtf-fit shards/ -o material/")
     if time is not None and steps is not None:
         raise UsageError("--time and --steps exclude each other", cure="give one of them")
+    from mbtf_gen.durations import format_duration
     from mbtf_gen.settings import resolve
 
-    from .config import FitConfig, format_duration
+    from .config import FitConfig
 
     flags = {
         "model": model,

@@ -4,43 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, PlainSerializer
 
+from mbtf_gen.durations import format_duration, parse_duration
 from mbtf_gen.settings import Settings
-
-_DURATION = re.compile(r"^\s*(\d+(?:\.\d+)?)\s*(s|sec|min|m|h)?\s*$")
-_SECONDS = {"s": 1.0, "sec": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0, None: 1.0}
 
 ModelName = Literal["neumip-baseline", "neumip"]
 LossName = Literal["relative", "squared"]
-
-
-def parse_duration(text: str | float) -> float:
-    """Seconds of ``"90s"``, ``"2min"``, ``"1.5h"``, or of a plain number of seconds.
-
-    Raises
-    ------
-    ValueError : none of these, or not positive
-    """
-    match = _DURATION.match(str(text))
-    if match is None:
-        raise ValueError("must be a duration such as 90s, 2min or 1h")
-    seconds = float(match[1]) * _SECONDS[match[2]]
-    if not 0 < seconds <= 1e7:
-        raise ValueError("must be a positive duration of at most 1e7 seconds")
-    return seconds
-
-
-def format_duration(seconds: float) -> str:
-    """``90s``, ``2min``, ``1h``: the largest unit that needs no fraction."""
-    for unit, size in (("h", 3600.0), ("min", 60.0)):
-        if seconds >= size and seconds % size == 0:
-            return f"{seconds / size:g}{unit}"
-    return f"{seconds:g}s"
-
 
 Duration = Annotated[
     float, BeforeValidator(parse_duration), PlainSerializer(format_duration, when_used="json")

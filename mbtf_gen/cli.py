@@ -9,9 +9,10 @@ from .commands.inspect import inspect
 from .commands.plan import plan
 from .commands.preview import preview
 from .commands.reference import reference
+from .commands.selftest import selftest
 from .console import new_app
 
 app = new_app("mbtf-gen", "Generate multi-resolution BTF (MBTF) data sets from displaced materials.")
 app.default(generate)
-for command in (inspect, plan, preview, merge, verify, reference, doctor):
+for command in (inspect, plan, preview, merge, verify, reference, selftest, doctor):
     app.command(command)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from mbtf_fit.config import FitConfig, format_duration, parse_duration
+from mbtf_fit.config import FitConfig
+from mbtf_gen.durations import format_duration, parse_duration
 from mbtf_gen.errors import UsageError
 from mbtf_gen.settings import resolve
 

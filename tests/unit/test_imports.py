@@ -26,6 +26,7 @@ VOCABULARY = {
     "mbtf_gen.console",
     "mbtf_gen.dataset",
     "mbtf_gen.directions",
+    "mbtf_gen.durations",
     "mbtf_gen.errors",
     "mbtf_gen.levels",
     "mbtf_gen.schema",

@@ -1,0 +1,48 @@
+"""``mbtf-gen selftest``: physics with known answers on this machine."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ..console import CONSOLE, Console
+from ..errors import InputError, UsageError
+
+
+def selftest(*, report: Path | None = None, time: str = "2min", console: Console = CONSOLE) -> int:
+    """Check physics with known answers on this machine, and say how far off the worst case is.
+
+    Exit code 0 when every check passed, 3 otherwise.
+
+    Parameters
+    ----------
+    report
+        Write every case to this file, .md or .html.
+    time
+        About how long to measure: 90s, 2min, 1h. Each check runs at least once; longer means smaller
+        statistical errors.
+    """
+    from ..durations import parse_duration
+
+    try:
+        seconds = parse_duration(time)
+    except ValueError as error:
+        raise UsageError(str(error), where="--time") from None
+    if report is not None and report.suffix not in (".md", ".html"):
+        raise UsageError(f"'{report.name}' must end in .md or .html", where="--report")
+    from ..engine import load_mitsuba
+    from ..selftest import exit_code, run_checks
+    from ..selftest_checks import all_checks
+    from ..selftest_report import as_html, as_json, as_markdown, as_text
+
+    load_mitsuba()
+    with console.progress(total=seconds, label="checking", unit="s") as bar:
+        findings = run_checks(all_checks(), seconds, lambda done, name: bar.update(min(done, seconds), name))
+    if report is not None:
+        from ..atomic import write_text
+
+        try:
+            write_text(report, (as_html if report.suffix == ".html" else as_markdown)(findings))
+        except OSError as error:
+            raise InputError(f"cannot be written ({error.strerror})", where=report) from None
+    console.report(as_json(findings), as_text(findings))
+    return exit_code(findings)
