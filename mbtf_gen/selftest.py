@@ -92,7 +92,7 @@ class Finding:
             return "failed"
         if not self.cases:
             return "absent"
-        good = all(math.isfinite(c.off) and abs(c.off) <= self._limit(c) for c in self.cases.values())
+        good = all(math.isfinite(c.error) and abs(c.off) <= self._limit(c) for c in self.cases.values())
         return "ok" if good else "failed"
 
     def add(self, cases: Mapping[str, Case]) -> None:

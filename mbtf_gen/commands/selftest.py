@@ -36,7 +36,9 @@ def selftest(*, report: Path | None = None, time: str = "2min", console: Console
 
     load_mitsuba()
     with console.progress(total=seconds, label="checking", unit="s") as bar:
-        findings = run_checks(all_checks(), seconds, lambda done, name: bar.update(min(done, seconds), name))
+        findings = run_checks(
+            all_checks(), seconds, lambda done, name: bar.update(round(min(done, seconds)), name)
+        )
     if report is not None:
         from ..atomic import write_text
 

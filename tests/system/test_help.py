@@ -39,6 +39,7 @@ def test_help_answers_without_heavy_modules(program: str, run_python: RunPython)
     ("program", "command"),
     [
         ("mbtf-gen", "doctor"),
+        ("mbtf-gen", "selftest"),
         ("mbtf-gen", "verify"),
         ("mbtf-gen", "inspect"),
         ("mbtf-gen", "reference"),

@@ -35,12 +35,14 @@ def test_every_group_of_messages_is_explained() -> None:
 # Functions whose message is what another one said: of this project (collected there), of the validator,
 # Mitsuba or the system (shown as it is), or a text chosen by the caller.
 RELAYS = {
+    "mbtf_gen/commands/selftest.py": {"selftest"},
     "mbtf_gen/config.py": {"_effects"},
     "mbtf_gen/console.py": {"_usage_message", "run"},
     "mbtf_gen/engine.py": {"_llvm_error", "check_llvm", "load_mitsuba"},
     "mbtf_gen/generation.py": {"plan", "prepare"},
     "mbtf_gen/material.py": {"_assemble", "_heights"},
     "mbtf_gen/material_checks.py": {"orientation_warning", "seam_warning"},
+    "mbtf_gen/selftest_checks.py": {"_cuda"},
     "mbtf_gen/settings.py": {"_explain", "build"},
     "mbtf_gen/verification.py": {"shard_fault", "verify"},
     "mbtf_gen/wording.py": {"explain"},
