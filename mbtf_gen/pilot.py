@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .effects import Effect, EffectsPlan
+from .effects import EFFECTS, Effect, EffectsPlan
 from .estimates import Estimates, Stream
 from .queries import Queries
+from .relief_costs import CAUTION
 
 if TYPE_CHECKING:
     from .generation import Job
@@ -19,8 +20,6 @@ PILOT_QUERIES, PILOT_SPP = 8192, 4
 # Interactions before roulette: late ones that few paths reach with great weights would hardly be seen by both
 # halves of any query.
 PILOT_ROULETTE = 12
-# Standard errors of the mean square that are added before a cost is compared with a tolerance.
-CAUTION = 2.0
 
 
 def pilot_queries(job: Job, count: int = PILOT_QUERIES) -> Queries:
@@ -89,7 +88,12 @@ def measured(job: Job, plan: EffectsPlan, spp: int = PILOT_SPP) -> EffectsPlan:
     def look(effect: Effect) -> Effect:
         if not effect.on:
             return effect
-        cost, upper = pilot.cost_of(without(plan, effect.name))
-        return replace(effect, cost=cost, error=(upper - cost) / CAUTION, known="pilot")
+        cut = without(plan, effect.name)
+        gone = [
+            EFFECTS[e.name] for e in plan.effects if e.on and not cut.on(e.name) and e.name != effect.name
+        ]
+        reason = f"{effect.reason}; its cost is that of {' and '.join(gone)} too" if gone else effect.reason
+        cost, upper = pilot.cost_of(cut)
+        return replace(effect, reason=reason, cost=cost, error=(upper - cost) / CAUTION, known="pilot")
 
     return replace(plan, effects=tuple(look(e) for e in plan.effects))
