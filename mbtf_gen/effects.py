@@ -46,7 +46,7 @@ class Effect:
     cost : of leaving it out, relative to the mean value; None where it was not worked out
     known : how the cost is known
     error : standard error of a measured cost
-    present : the material has what the effect needs; otherwise it cannot be switched on
+    present : the material has what the effect needs, and it is ours to switch; otherwise it stays as it is
     """
 
     name: str
@@ -153,7 +153,7 @@ class Wish:
         """
         name = effect.name
         if not effect.present:
-            if self.forced.get(name):
+            if self.forced.get(name) and not effect.on:
                 raise UsageError(f"the material has none: {effect.reason}", where=f"--effects +{name}")
             return effect
         on = self.forced.get(name, effect.on if self.base == "auto" else self.base == "all")

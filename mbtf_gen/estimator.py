@@ -77,13 +77,15 @@ class Estimator:
         stream: Stream,
         source: RaySource | None = None,
         limit: int | None = None,
+        roulette: int | None = None,
     ) -> Estimates:
         """Both halves of each query (one leading axis), `spp` paths together.
 
         Parameters
         ----------
         source : where rays come from; the query sensor by default
-        limit : another limit on surface interactions, for the same kernel
+        limit, roulette : other numbers of surface interactions at which paths end, and at which roulette
+            begins, for the same kernel
 
         Raises
         ------
@@ -92,6 +94,7 @@ class Estimator:
         if spp < 2 or spp % 2:
             raise ValueError(f"spp must be even, for two equal halves, not {spp}")
         self._limit = dr.opaque(mi.UInt32, self.transport.limit if limit is None else limit)
+        self._roulette = dr.opaque(mi.UInt32, self.transport.roulette_depth if roulette is None else roulette)
         n = len(queries.sigma)
         per_launch = max(1, self.launch // spp)
         parts = [
@@ -245,6 +248,7 @@ class Estimator:
             light,
             self.transport,
             self._limit,
+            self._roulette,
             generator(lane, Purpose.PATH),
             mi.Bool(True),
         )

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from .effects import EFFECTS, OF_RELIEF, Effect, EffectsPlan, Wish
 from .errors import UsageError
+from .light import LightKernel
+from .maps import resample
 from .pilot import Pilot, pilot_queries
 from .relief_costs import POINTS, ReliefCosts, largest_slope, relief_costs
 
@@ -92,7 +94,8 @@ def simulated(job: Job) -> EffectsPlan:
     effects = [*_surface(look), _normal(look, None), _opacity(look), _fibres()]
     effects += [Effect(name, not flat, "flat" if flat else "a relief") for name in OF_RELIEF]
     effects.append(Effect("mis", True, "reference"))
-    plan = _assemble(job, {e.name: wish.decide(e) for e in effects}, job.config.transport.max_depth)
+    decided = _consistent({e.name: wish.decide(e) for e in effects}, wish)
+    plan = _assemble(job, decided, job.config.transport.max_depth)
     return replace(plan, mode=job.config.effects.mode)
 
 
@@ -101,13 +104,13 @@ def _look(job: Job, pilots: bool) -> _Look:
     queries = pilot_queries(job, POINTS)
     base = np.asarray(material.basecolor, np.float64)
     own = material.bsdf is not None
-    albedo = np.atleast_2d(np.ones(1)) if own else base.mean(axis=-1).reshape(base.shape[:-1] or (1, 1))
+    albedo = np.ones((1, 1, 3)) if own else base.reshape(*(base.shape[:-1] or (1, 1)), 3)
     return _Look(
         job,
         queries.omega_i.astype(np.float64),
         queries.omega_o.astype(np.float64),
         albedo,
-        material.is_lambert,
+        material.is_lambert and material.coat is None,
         own,
         pilots,
     )
@@ -119,7 +122,8 @@ def _relief(look: _Look) -> ReliefCosts | None:
     if job.grid.relief == 0.0 or not look.albedo.any() or not look.pilots:
         return None
     residual = job.residual[0] if job.residual is not None else None
-    return relief_costs(job.grid, look.omega_i, look.omega_o, look.albedo, residual)
+    kernel = LightKernel(job.config.light.width)
+    return relief_costs(job.grid, look.omega_i, look.omega_o, kernel, look.albedo, residual)
 
 
 def _affordable(effects: list[Effect], tolerance: float) -> list[Effect]:
@@ -139,7 +143,7 @@ def _surface(look: _Look) -> list[Effect]:
     material = look.job.material
     if look.own_bsdf:
         reason = f"the material's own BSDF '{(material.bsdf or {})['type']}', not analysed"
-        on = Effect("specular", True, reason)
+        on = Effect("specular", True, reason, present=False)
         return [on, *(Effect(n, False, reason, 0.0, "exact", False) for n in ("metallic", "coat"))]
     metal = 0.0 if material.metallic is None else float(np.max(material.metallic))
     specular = 0.0 if material.specular is None else float(np.max(material.specular))
@@ -193,7 +197,15 @@ def _opacity(look: _Look) -> Effect:
     through = 1.0 - np.asarray(opacity, np.float64)
     if not through.any():
         return Effect("opacity", False, "opaque everywhere", 0.0, "exact", False)
-    cost = float(np.sqrt(np.mean(through**2)) / max(1.0 - through.mean(), 1e-12))
+    rows, columns = (
+        max(a, b) for a, b in zip(np.shape(opacity) or (1, 1), look.albedo.shape[:2], strict=True)
+    )
+    through = np.asarray(resample(np.atleast_2d(through), rows, columns), np.float64)[..., None]
+    colour = np.asarray(resample(look.albedo, rows, columns), np.float64)
+    mean = float(np.mean((1.0 - through) * colour))
+    # Twice the share of the light that holes take: neighbouring facets may be lit that much more strongly.
+    lost = 2.0 * float(np.sqrt(np.mean((through * colour) ** 2)))
+    cost = lost / mean if mean > 0 and look.lambert else None
     return Effect("opacity", True, f"{through.mean():.1%} of the area lets light through", cost, "pilot")
 
 
@@ -242,7 +254,8 @@ def _of_relief(
     decided["neighbours"] = Effect("neighbours", True, "rays re-enter the tile")
     decided["interreflection"] = Effect("interreflection", True, "not looked at")
     decided["interreflection"], cap, cost = _interreflection(look, wish, decided, left)
-    decided["neighbours"] = wish.decide(_neighbours(look, decided))
+    left -= cost + sum(decided[n].cost or 0.0 for n in ("interreflection",) if not decided[n].on)
+    decided["neighbours"] = wish.decide(_neighbours(look, decided, left))
     return _assemble(job, _consistent(decided, wish), cap, cost)
 
 
@@ -251,9 +264,11 @@ def _shadowing(look: _Look, costs: ReliefCosts | None) -> Effect:
     angle = np.degrees(np.arctan(steepest))
     lowest = look.lowest_light
     if lowest > 0 and steepest <= np.tan(lowest):
-        reason = f"no slope exceeds {angle:.2g} degrees, the light stays above {np.degrees(lowest):.2g}"
+        reason = (
+            f"no slope exceeds {angle:.2g} degrees, the light stays above {np.degrees(lowest):.2g} degrees"
+        )
         return Effect("shadowing", True, reason, look.below_lowest, "bound")
-    reason = f"slopes up to {angle:.0f} degrees, light down to {np.degrees(max(lowest, 0.0)):.2g}"
+    reason = f"slopes up to {angle:.0f} degrees, light down to {np.degrees(max(lowest, 0.0)):.2g} degrees"
     return Effect("shadowing", True, reason, costs.shadowing if costs else None, "pilot")
 
 
@@ -265,12 +280,12 @@ def _mis(look: _Look) -> Effect:
         return Effect("mis", False, "a delta light cannot be hit", 0.0, "exact")
     if look.own_bsdf:
         return Effect("mis", True, "the material's own BSDF, not analysed")
-    if look.lambert and job.material.coat is None:
+    if look.lambert:
         if job.config.light.width <= 20.0:
             reason = f"Lambert under a light of {job.config.light.width:g} degrees: no bias, no more variance"
             return Effect("mis", False, reason, 0.0, "exact")
         return Effect("mis", True, "a wide light")
-    smoothest = 1.0 if look.lambert else float(np.min(np.asarray(job.material.roughness)))
+    smoothest = 1.0 if job.material.is_lambert else float(np.min(np.asarray(job.material.roughness)))
     if job.material.coat is not None:
         smoothest = min(smoothest, float(np.min(np.asarray(job.material.coat_roughness))))
     lobe = 2.0 * smoothest**2
@@ -305,7 +320,7 @@ def _interreflection(
         return replace(effect, reason="a relief; the run is too small for a pilot"), asked, 0.0
     pilot = Pilot(look.job, _assemble(look.job, _consistent(dict(decided), wish), asked))
     cost, upper = pilot.cost_of_limit(1)
-    reason = f"{cost:.2g} of the mean value comes from it"
+    reason = "light from facet to facet"
     if upper <= left:
         return Effect("interreflection", False, reason, upper, "pilot"), 1, 0.0
     found = Effect("interreflection", True, reason, cost, "pilot")
@@ -318,18 +333,18 @@ def _interreflection(
             continue
         _, upper = pilot.cost_of_limit(cap)
         if upper <= left:
-            reason += f"; at most {cap} interactions, the rest is below {upper:.1g}"
+            reason += f"; at most {cap} interactions, cutting the rest costs below {upper:.1g}"
             return replace(found, reason=reason), cap, upper
     return replace(found, reason=reason + "; no depth limit, Russian roulette"), 0, 0.0
 
 
-def _neighbours(look: _Look, decided: dict[str, Effect]) -> Effect:
+def _neighbours(look: _Look, decided: dict[str, Effect], left: float) -> Effect:
     job = look.job
     if decided["interreflection"].on or decided["mis"].on:
         return Effect("neighbours", True, "scattered rays go anywhere")
     reach = reach_of(job)
     limit = LONGEST_REACH * min(1.0, job.grid.aspect)
-    if reach <= limit:
+    if reach <= limit and look.below_lowest <= left:
         reason = f"rays move sideways by at most {reach:.2g} tile widths"
         return Effect("neighbours", False, reason, look.below_lowest, "bound")
     reason = f"rays cross up to {reach:.3g} tile widths" if np.isfinite(reach) else "light from the horizon"

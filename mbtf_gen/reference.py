@@ -33,6 +33,7 @@ class ReferenceImage:
     queries : one per pixel, leading axes (rows, columns)
     value_a, value_b : (rows, columns, 3) independent halves, 1/sr
     spp : paths per pixel, both halves together
+    transmittance : (rows, columns) share seen through holes; None where there are none
     """
 
     kind: PixelKind
@@ -41,6 +42,7 @@ class ReferenceImage:
     value_a: NDArray[np.float32]
     value_b: NDArray[np.float32]
     spp: int
+    transmittance: NDArray[np.float32] | None = None
 
     @property
     def value(self) -> NDArray[np.float32]:
@@ -59,6 +61,8 @@ class ReferenceImage:
             "value_b": self.value_b.reshape(*lead, 3),
             "spp": np.full(lead, self.spp, np.float32),
         }
+        if self.transmittance is not None:
+            arrays["transmittance"] = self.transmittance.reshape(lead)
         exr, png = (path.with_name(f"{path.name}{suffix}") for suffix in (".exr", ".png"))
         write_exr(exr, arrays)
         write_png(png, to_display(self.value, exposure))
@@ -159,7 +163,13 @@ def render_reference(
     source = _camera_rays(camera, estimator) if kind == "pixel" else None
     stream = Stream(seed, "reference", 2 * index + (kind == "pixel"))
     estimates = estimator.estimate(queries.flat(), spp, stream, source)
-    shape = (*queries.lead, 3)
+    shape, through = (*queries.lead, 3), estimates.transmittance
     return ReferenceImage(
-        kind, camera, queries, estimates.value_a.reshape(shape), estimates.value_b.reshape(shape), spp
+        kind,
+        camera,
+        queries,
+        estimates.value_a.reshape(shape),
+        estimates.value_b.reshape(shape),
+        spp,
+        None if through is None else through.reshape(queries.lead),
     )

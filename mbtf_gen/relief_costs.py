@@ -13,21 +13,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .heightfield import HeightGrid
+from .light import LightKernel
 from .relief import triangle_slopes
 from .slopes import height_slopes
 
 F64 = NDArray[np.float64]
 
-# Rays per estimate, and cells across beyond which a grid is thinned for marching.
+# Rays per estimate.
 POINTS = 4096
-MARCH_CELLS = 256
+# Standard errors of the mean square that are added to an estimate.
+CAUTION = 2.0
 # Steps after which a marched ray is taken to be free.
 MAX_STEPS = 4096
 
 
 @dataclass(frozen=True)
 class ReliefCosts:
-    """Costs of leaving effects of the relief out, relative to the mean value, for a Lambert surface.
+    """Costs of leaving effects of the relief out, relative to the mean value, for a Lambert surface, with
+    :data:`CAUTION`.
 
     Attributes
     ----------
@@ -90,17 +93,36 @@ def _march(
     return point, hit
 
 
-def _lambert(slope: F64, omega_i: F64) -> F64:
-    """Reflected share of unit irradiance on the reference plane, for a facet of given slopes."""
+def _lambert(slope: F64, light: F64, irradiance: F64) -> F64:
+    """Reflected share of unit irradiance on the reference plane, for facets (n, 2) of given slopes."""
     up = 1.0 / np.sqrt(1.0 + np.sum(slope**2, axis=-1))
-    cosine = up * (omega_i[:, 2] - np.sum(slope * omega_i[:, :2], axis=-1))
-    return np.maximum(cosine, 0.0) / omega_i[:, 2]
+    cosine = up * (light[:, 2] - np.sum(slope * light[:, :2], axis=-1))
+    lit = np.where(light[:, 2] > 0, np.maximum(cosine, 0.0) / irradiance, 0.0)
+    return np.asarray(lit[:, None])
+
+
+def _from_lobe(kernel: LightKernel, omega_i: F64, rng: np.random.Generator) -> F64:
+    """Directions (n, 3) drawn from light lobes around omega_i, below the horizon too."""
+    if kernel.is_delta:
+        return omega_i
+    xi, turn = rng.random(len(omega_i)), 2.0 * np.pi * rng.random(len(omega_i))
+    versine = -np.log1p(xi * np.expm1(-2.0 * kernel.kappa)) / kernel.kappa
+    sine = np.sqrt(np.maximum(versine * (2.0 - versine), 0.0))
+    helper = np.where(np.abs(omega_i[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    first = np.cross(omega_i, helper)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    second = np.cross(omega_i, first)
+    out: F64 = (1.0 - versine)[:, None] * omega_i + sine[:, None] * (
+        np.cos(turn)[:, None] * first + np.sin(turn)[:, None] * second
+    )
+    return out
 
 
 def relief_costs(
     grid: HeightGrid,
     omega_i: F64,
     omega_o: F64,
+    kernel: LightKernel,
     albedo: F64,
     residual: F64 | None = None,
 ) -> ReliefCosts:
@@ -110,15 +132,14 @@ def relief_costs(
     ----------
     grid : heights, relief > 0
     omega_i, omega_o : (n, 3) directions as the run draws them
-    albedo : (h, w) reflectance, any resolution
+    kernel : light around omega_i
+    albedo : (h, w, channels) reflectance, any resolution
     residual : (h, w, 2) slopes that a normal map adds
     """
-    thin = max(1, -(-max(grid.z.shape) // MARCH_CELLS))
-    z = grid.z[::thin, ::thin]
-    heights = _Field(z, grid.aspect)
+    heights = _Field(grid.z, grid.aspect)
     slopes = _Field(height_slopes(grid), grid.aspect)
     colour = _Field(albedo, grid.aspect)
-    step = 1.0 / z.shape[1]
+    step = 1.0 / grid.z.shape[1]
     n = len(omega_i)
     rng = np.random.default_rng(0)
     foot = np.column_stack([rng.random(n), rng.random(n) * grid.aspect, np.zeros(n)])
@@ -126,21 +147,27 @@ def relief_costs(
     met, _ = _march(heights, foot, -omega_o, step, grid.relief)
     start = met.copy()
     start[:, 2] = heights(met[:, 0], met[:, 1]) + 0.02 * grid.relief
-    _, shadowed = _march(heights, start, omega_i, step, grid.relief)
+    light, irradiance = _from_lobe(kernel, omega_i, rng), kernel.irradiance(omega_i)
+    up = np.column_stack([light[:, :2], np.maximum(light[:, 2], 1e-6)])
+    _, blocked = _march(heights, start, up, step, grid.relief)
+    shadowed = blocked[:, None]
 
     there = slopes(met[:, 0], met[:, 1])
-    shade = colour(met[:, 0], met[:, 1]) * _lambert(there, omega_i)
+    shade = colour(met[:, 0], met[:, 1]) * _lambert(there, light, irradiance)
     value = np.where(shadowed, 0.0, shade)
-    here = colour(foot[:, 0], foot[:, 1]) * _lambert(slopes(foot[:, 0], foot[:, 1]), omega_i)
+    here = colour(foot[:, 0], foot[:, 1]) * _lambert(slopes(foot[:, 0], foot[:, 1]), light, irradiance)
     mean = max(float(value.mean()), 1e-12)
 
     def cost(change: F64) -> float:
-        return float(np.sqrt(np.mean(change**2))) / mean
+        square = np.mean(change**2, axis=1)
+        return float(np.sqrt(square.mean() + CAUTION * square.std() / np.sqrt(n))) / mean
 
     normal = 0.0
     if residual is not None:
         tilted = there + _Field(residual, grid.aspect)(met[:, 0], met[:, 1])
         normal = cost(
-            np.where(shadowed, 0.0, colour(met[:, 0], met[:, 1]) * _lambert(tilted, omega_i) - shade)
+            np.where(
+                shadowed, 0.0, colour(met[:, 0], met[:, 1]) * _lambert(tilted, light, irradiance) - shade
+            )
         )
     return ReliefCosts(cost(here - value), cost(shade - value), normal)

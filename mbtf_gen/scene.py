@@ -6,6 +6,7 @@ exact enough for a ray offset of 1e-6 tile widths.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -113,7 +114,7 @@ def build_tile(grid: HeightGrid, bsdf: Mapping[str, Any] | Any, apron_share: flo
     register_plugins()
     rows, columns = grid.z.shape
     unit = LONG_SIDE / max(1.0, grid.aspect)
-    cells = (max(2, round(apron_share * rows)), max(2, round(apron_share * columns)))
+    cells = (max(2, math.ceil(apron_share * rows)), max(2, math.ceil(apron_share * columns)))
     loaded = _load_bsdf(bsdf) if isinstance(bsdf, Mapping) else bsdf
     mesh = mesh_of_grid(grid, unit, cells, loaded)
     # Robust intersections: otherwise one ray in 10⁵ slips between two triangles.

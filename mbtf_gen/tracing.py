@@ -269,7 +269,7 @@ def _sky(path: Path, light: LaneLight, escaped: Any, transport: Transport) -> An
 
 
 def _interaction(
-    world: World, path: Path, light: LaneLight, transport: Transport, limit: Any, last: bool
+    world: World, path: Path, light: LaneLight, transport: Transport, limit: Any, roulette: Any, last: bool
 ) -> Path:
     """One surface interaction of every path; `last`: no path goes on after it."""
     si, capped, downward = _visible(world, path, transport)
@@ -291,30 +291,39 @@ def _interaction(
     omega, weight, path.pdf = point.sample(path.rng.next_float32(), _next_2d(path.rng))
     path.ray = leave(world.period, si, omega)
     path.throughput *= weight
-    _roulette(path, transport)
+    _roulette(path, roulette)
     return path
 
 
-def _roulette(path: Path, transport: Transport) -> None:
+def _roulette(path: Path, begin: Any) -> None:
     strongest = dr.max(path.throughput)
     # A path of NaN throughput would end here as if it were black.
     path.radiance[path.active & dr.isnan(strongest)] = mi.Spectrum(dr.nan)
     path.active &= strongest > 0
     longest = dr.select(path.depth < PATIENCE, 1.0, LATE_SURVIVAL)
-    survival = dr.select(path.depth >= transport.roulette_depth, dr.minimum(strongest, longest), 1.0)
+    survival = dr.select(path.depth >= begin, dr.minimum(strongest, longest), 1.0)
     path.active &= path.rng.next_float32() < survival
     path.throughput *= dr.rcp(survival)
 
 
 @dr.syntax
 def trace(
-    world: World, ray: Any, light: LaneLight, transport: Transport, limit: Any, rng: Any, active: Any
+    world: World,
+    ray: Any,
+    light: LaneLight,
+    transport: Transport,
+    limit: Any,
+    roulette: Any,
+    rng: Any,
+    active: Any,
 ) -> Path:
     """Follow paths to their ends.
 
     Parameters
     ----------
-    limit : largest number of surface interactions of a path, opaque so that it is not part of the kernel
+    limit, roulette : largest number of surface interactions of a path, and those before roulette begins;
+        opaque,
+        so that they are not part of the kernel
 
     Returns
     -------
@@ -335,8 +344,8 @@ def trace(
     )
     once = not (transport.interreflection or transport.bsdf_sampling or light.kind == "constant")
     if dr.hint(once, mode="scalar"):
-        path = _interaction(world, path, light, transport, limit, True)
+        path = _interaction(world, path, light, transport, limit, roulette, True)
     else:
-        while dr.hint(path.active, exclude=[world, light, transport, limit]):
-            path = _interaction(world, path, light, transport, limit, False)
+        while dr.hint(path.active, exclude=[world, light, transport, limit, roulette]):
+            path = _interaction(world, path, light, transport, limit, roulette, False)
     return path

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..console import CONSOLE, Console
+from ..schema import Tiling
 from .common import Set, general, resolve_config
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ def plan(
     tolerance: float | None = None,
     height: float | None = None,
     mesh: int | None = None,
+    tile: Tiling | None = None,
     light_width: float | None = None,
     min_cos: float | None = None,
     max_depth: int | None = None,
@@ -49,6 +51,8 @@ def plan(
         Factor on the stored heights, in tile widths. Default: the material's own
     mesh
         Mesh cells across the tile. Default: the map's width, at most 512
+    tile
+        Cure for maps that do not tile: 2 x 2 mirrored copies, or edges cross-faded. Default: none
     light_width
         RMS angle of the light per axis in degrees; 0 is a delta light. Default: 1
     min_cos
@@ -68,7 +72,9 @@ def plan(
         "--effects": ("effects.mode", effects),
         "--tolerance": ("effects.tolerance", tolerance),
         "--min-cos": ("queries.min_cos", min_cos),
-        **general(height=height, mesh=mesh, light_width=light_width, max_depth=max_depth, seed=seed),
+        **general(
+            height=height, mesh=mesh, tile=tile, light_width=light_width, max_depth=max_depth, seed=seed
+        ),
     }
     resolved = resolve_config(GeneratorConfig, material, config, assignments or [], flags)
     from ..generation import Job

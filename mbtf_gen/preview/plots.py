@@ -108,7 +108,8 @@ def _levels(axes: Any, sample: QuerySample) -> None:
     edges, found, stated = level_histogram(sample)
     axes.stairs(found, edges, fill=True, color=_INK, alpha=0.6, label="queries")
     axes.stairs(stated, edges, color=_STATED, linewidth=2.0, label="stated mixture")
-    axes.set(title="levels", xlabel="l = -log2(2σ): 0 is the tile, k the finest texel", ylabel="density")
+    finest = f"k = {sample.finest} the finest texel"
+    axes.set(title="levels", xlabel=f"level l = -log2(2σ): 0 is the tile, {finest}", ylabel="density")
     axes.set_ylim(0.0, 1.35 * float(max(found.max(), stated.max())))
     axes.legend(loc="upper left", frameon=False)
 

@@ -133,3 +133,20 @@ def test_what_passes_is_what_a_stock_ray_sees_behind(tmp_path: Path) -> None:
     error = np.sqrt(2 * np.mean(a[:, 0] * (1 - a[:, 0])) / SPP / len(a))
     assert abs(seen.value) < 4 * error + 1e-3
     assert np.corrcoef(0.5 * (a + b)[:, 0], ours.transmittance)[0, 1] > 0.8
+
+
+def test_pictures_keep_what_passes(tmp_path: Path) -> None:
+    """A picture straight from above shows the holes where the map has them, and stores them."""
+    from mbtf_gen.camera import Camera
+    from mbtf_gen.exr import read_channels
+    from mbtf_gen.reference import render_reference
+
+    camera = Camera(90.0, -90.0, span=1.0, rows=16, columns=16)
+    estimator = Estimator(sheet(flat(), half_open()), LightKernel(2.0), PLANE)
+    image = render_reference(estimator, camera, direction(50, 20), kind="pixel", spp=8)
+    assert image.transmittance is not None
+    expected = np.zeros((16, 16))
+    expected[:, 8:] = 1.0
+    np.testing.assert_allclose(image.transmittance[:, [2, 4, 11, 13]], expected[:, [2, 4, 11, 13]])
+    exr, _ = image.write(tmp_path / "picture")
+    np.testing.assert_array_equal(read_channels(exr, 10_000)["transmittance"], image.transmittance)

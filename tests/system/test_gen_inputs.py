@@ -21,20 +21,23 @@ def test_a_set_of_unequal_maps_that_do_not_tile(tmp_path: Path) -> None:
     png(folder / "Brick_07_Color.png", rng().integers(40, 200, (18, 36, 3)), 2, 8)
     png(folder / "Brick_07_Roughness.png", rng().integers(9000, 60000, (54, 108, 1)), 0, 16, interlace=True)
     options = ["--queries", 200, "--test-queries", 50, "--test-spp", 4, "--levels", 3]
-    looked, plain, mirrored = run_all(
+    looked, plain, mirrored, planned = run_all(
         [
             ["inspect", folder, "--json", "--quiet"],
             [folder, "-o", "plain", *options],
             [folder, "-o", "mirrored", "--tile", "mirror", *options],
+            ["plan", folder, "--tile", "mirror", "--no-measure", "--set", "queries.train=200"],
         ],
         tmp_path,
     )
-    assert [d.code for d in (looked, plain, mirrored)] == [0, 0, 0], [looked.err, plain.err, mirrored.err]
+    done = (looked, plain, mirrored, planned)
+    assert [d.code for d in done] == [0, 0, 0, 0], [d.err for d in done]
     found = json.loads(looked.out)
     assert found["normal"]["convention"] == "dx"
     assert [t["tiles"] for t in found["tiling"]] == [False, False]
     assert "does not tile along u and v" in plain.err
     assert "does not tile" not in mirrored.err
+    assert "does not tile" not in planned.err
     for name, shape in (("plain", [36, 72]), ("mirrored", [72, 144])):
         manifest = json.loads((tmp_path / name / "manifest.json").read_text())
         assert manifest["complete"]

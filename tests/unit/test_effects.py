@@ -129,3 +129,40 @@ def test_a_small_run_is_not_looked_at_twice() -> None:
     assert on(plan) == set(OF_RELIEF)
     assert (plan["interreflection"].cost, plan["masking"].cost, plan.max_depth) == (None, None, 0)
     assert plan_effects(job_of(FLAT), pilots=False).closed_form
+
+
+COAT: dict[str, Any] = {"coat": 1.0, "coat_roughness": 0.1}
+
+
+def test_black_under_a_coat_is_not_black() -> None:
+    black = replace(LAMBERT, basecolor=np.zeros(3), **COAT)
+    plan = plan_effects(job_of(black), pilots=False)
+    assert not plan.closed_form
+    assert on(plan) >= {*OF_RELIEF, "coat"}
+
+
+def test_the_smoothest_place_decides_how_light_is_found() -> None:
+    """A light of one degree against lobes of 2α; Lambert needs no second way."""
+    dull = {"roughness": 0.6, "specular": 0.5, "metallic": 0.0}
+    patch = np.full((8, 8), 0.6)
+    patch[3, 3] = 0.02
+    assert not plan_effects(job_of(replace(FLAT, **dull))).on("mis")
+    assert plan_effects(job_of(replace(FLAT, **{**dull, "roughness": patch}))).on("mis")
+    assert plan_effects(job_of(replace(FLAT, **dull, coat=1.0, coat_roughness=0.05))).on("mis")
+    assert not plan_effects(job_of(FLAT, "+masking")).on("mis")
+
+
+def test_the_configured_roulette_and_cap_reach_the_plan() -> None:
+    plan = plan_effects(job_of(LAMBERT, transport={"roulette_depth": 7, "max_depth": 5}), pilots=False)
+    assert (plan.roulette_depth, plan.max_depth) == (7, 5)
+    pictures = simulated(job_of(LAMBERT, "all,-shadowing"))
+    assert not pictures.on("shadowing")
+    assert pictures.max_depth == 0
+
+
+def test_a_bsdf_of_the_users_own_is_taken_as_it_is() -> None:
+    own = replace(LAMBERT, bsdf={"type": "diffuse"})
+    assert simulated(job_of(own, "none")).on("specular")
+    assert simulated(job_of(own, "+specular")).on("specular")
+    with pytest.raises(UsageError, match="the material has none"):
+        simulated(job_of(own, "+metallic"))

@@ -183,6 +183,7 @@ def test_plots_show_the_queries(count: int, tmp_path: Path) -> None:
     position, level, light, view, *bars = query_figure(sample, "title").axes
     assert len(bars) == (3 if count == 9000 else 0)
     assert position.get_aspect() == 0.5
+    assert f"k = {sample.finest} " in level.get_xlabel()
     for axes, points in ((position, sample.u), (light, sample.omega_i[:, :2]), (view, sample.omega_o[:, :2])):
         collection = axes.collections[0]
         if count < 4000:
