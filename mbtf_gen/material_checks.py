@@ -136,9 +136,10 @@ def suggestion_warning(path: Path, fit: NormalFit | None, factor: float) -> str 
     """The warning that a default factor is far from the one that a normal map was made with."""
     if not misses(fit, factor) or fit is None:
         return None
+    ratio = factor / fit.scale
     return (
         f"{path}: its slopes suggest another height than the default of {factor:.3g}, "
-        f"which is {factor / fit.scale:.2g} times as much; --height {fit.scale:.3g} takes it"
+        f"which is {ratio:{'.0f' if ratio >= 10 else '.2g'}} times as much; --height {fit.scale:.3g} takes it"
     )
 
 

@@ -47,6 +47,8 @@ LINES: dict[str, list[str]] = {
         "mbtf-gen heights.npy -o notes.txt",
         "mbtf-gen heights.npy -o notes.txt/below",
         "mbtf-gen heights.npy -o textures",
+        "mbtf-gen steep.npy -o textures",
+        "mbtf-gen steep.npy --height 0.1 -o textures",
         "mbtf-gen heights.npy -o set --queries 10",
         "mbtf-gen reference heights.npy --view 5,0",
         "mbtf-gen reference heights.npy --view 60",
@@ -120,6 +122,7 @@ def write_files(folder: Path) -> None:
     """Every file and folder that the lines name."""
     heights = 0.2 * np.random.default_rng(0).random((4, 8))
     np.save(folder / "heights.npy", heights)
+    np.save(folder / "steep.npy", 5.0 * heights)
     (folder / "notes.txt").write_text("no image")
     _images(folder, heights)
     _folders(folder, heights)

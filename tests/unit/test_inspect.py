@@ -220,6 +220,10 @@ class TestText:
         assert said() == (True, False)
         assert any("(the default is 0.05)" in note for note in load_material(folder).notes)
         assert said(0.05) == (False, True)
+        save_heights(folder / "height.png", fractal(48, 96) / 50)
+        (warning,) = (w for w in load_material(folder).warnings_at() if "suggest" in w)
+        assert "which is 0.1 times as much" in warning
+        save_heights(folder / "height.png", fractal(48, 96))
         (folder / "material.yaml").write_text("height: {file: height.png, scale: 0.05}\nnormal: normal.png\n")
         assert said() == (False, True)
         assert any("(the material file's is 0.05)" in note for note in load_material(folder).notes)
