@@ -63,7 +63,7 @@ class Job:
         job = cls.of(config, load_material(Path(config.material), config.geometry.tile))
         for note in job.material.notes:
             log.info(note)
-        for warning in job.material.warnings:
+        for warning in job.material.warnings_at(config.geometry.height):
             log.warning(warning)
         log.info("mesh: %d x %d cells, relief %.4g tile widths", *job.grid.z.shape[::-1], job.grid.relief)
         return job

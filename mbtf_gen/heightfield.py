@@ -41,7 +41,7 @@ class HeightGrid:
     @property
     def relief(self) -> float:
         """Largest height difference in tile widths."""
-        return float(-self.z.min())
+        return float(self.z.max() - self.z.min())
 
 
 def grid_vertices(grid: HeightGrid, apron: tuple[int, int] = (0, 0)) -> NDArray[np.float64]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from .images import LUMINANCE, linear_to_srgb
 from .material import Material
+from .material_checks import misses
 from .relief import detail_size, repeats, rms_slope, slope_angles
 from .tiling import broken
 
@@ -50,6 +51,7 @@ def inspect_material(
         "geometry": {
             "height": factor,
             "material_height": material.height_scale,
+            "height_from": _height_from(material, height),
             "map": list(material.height.shape),
             "mesh": list(grid.z.shape),
             "relief": abs(grid.relief),
@@ -71,10 +73,19 @@ def inspect_material(
         "albedo": _albedo(material),
         "normal": _normal(material, factor),
         "opacity": _opacity(material),
-        "warnings": list(material.warnings),
+        "unused": material.unused,
+        "warnings": list(material.warnings_at(height)),
         "notes": list(material.notes),
     }
-    return {**found, "oddities": [*_oddities(found), *_surface_oddities(found)]}
+    warned = found["geometry"]["height_from"] == "default" and misses(material.normal_fit, factor)
+    suggested = [] if warned else _suggestion_oddity(found)
+    return {**found, "oddities": [*_oddities(found), *_surface_oddities(found), *suggested]}
+
+
+def _height_from(material: Material, height: float | None) -> str:
+    if height is not None:
+        return "asked"
+    return "material" if material.height_given else "default"
 
 
 def _rms_step(material: Material) -> float:
@@ -194,7 +205,7 @@ def _oddities(found: dict[str, Any]) -> list[str]:
 
 def _surface_oddities(found: dict[str, Any]) -> list[str]:
     out = []
-    albedo, normal, opacity = found["albedo"], found["normal"], found["opacity"]
+    albedo, opacity = found["albedo"], found["opacity"]
     if albedo is not None:
         if not albedo["given"] and "basecolor" in found["constants"]:
             shown = ", ".join(f"{c:.3g}" for c in albedo["mean_rgb"])
@@ -215,11 +226,14 @@ def _surface_oddities(found: dict[str, Any]) -> list[str]:
         out.append(f"metallic varies from {low:.2g} to {high:.2g}: metal and dielectric mixed")
     if opacity is not None and opacity["holes"] > 0:
         out.append(f"real holes: {opacity['holes']:.1%} of the tile is see-through")
-    suggested = None if normal is None else normal.get("suggested_height")
-    if suggested:
-        ratio = found["geometry"]["height"] / suggested
-        if not 0.8 < ratio < 1.25:
-            out.append(
-                f"the height in use is {ratio:.3g} times the {suggested:.3g} that the normal map suggests"
-            )
     return out
+
+
+def _suggestion_oddity(found: dict[str, Any]) -> list[str]:
+    suggested = None if found["normal"] is None else found["normal"].get("suggested_height")
+    if not suggested:
+        return []
+    ratio = found["geometry"]["height"] / suggested
+    if 0.8 < ratio < 1.25:
+        return []
+    return [f"the height in use is {ratio:.3g} times the {suggested:.3g} that the normal map suggests"]

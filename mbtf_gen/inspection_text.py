@@ -20,17 +20,25 @@ USES = {
     "roughness": "width of the specular lobe",
     "metallic": "share that reflects as metal",
     "specular": "strength of the dielectric lobe",
+    "clearcoat": "share under a clear coat",
+    "clearcoat_roughness": "width of the coat's lobe",
     "normal": "slopes that the mesh lacks",
     "opacity": "holes",
 }
+# Where the factor on the heights comes from.
+_SOURCES = {"asked": "as asked for", "material": "the material file's", "default": "the default"}
+# Lines, at most, on images that are not used.
+_UNUSED_LINES = 8
 _KINDS = {1: "grey", 2: "grey+alpha", 3: "RGB", 4: "RGBA"}
 
 
 def inspection_text(found: dict[str, Any], name: str) -> str:
     """Text for people; the longest lists are cut to keep it on one screen."""
     name = name if len(name) <= _NAME else f"…{name[1 - _NAME :]}"
-    head = [f"{name}: tile 1 x {found['aspect']:g}, surface {found['surface']}, tile={found['tile']}", ""]
-    body = [*_maps(found), "", *_geometry(found), *_colour(found), *_normal(found)]
+    coat = " under a clear coat" if {"clearcoat"} & {*found["maps"], *found["constants"]} else ""
+    surface = f"{found['surface']}{coat}"
+    head = [f"{name}: tile 1 x {found['aspect']:g}, surface {surface}, tile={found['tile']}", ""]
+    body = [*_maps(found), *_unused(found), "", *_geometry(found), *_colour(found), *_normal(found)]
     room = LINES - len(head) - len(body) - 2
     oddities = _list("odd", found["oddities"])
     warnings = _list("warnings", [_short(w) for w in found["warnings"]])
@@ -58,7 +66,11 @@ def _cut(text: str, width: int) -> str:
 
 
 def _maps(found: dict[str, Any]) -> list[str]:
-    out = [f"{'map':<10} {'file':<28} {'size':<11} {'kind':<14} what it does"]
+    roles = [role for role in (*found["maps"], *found["constants"]) if not role.startswith("bsdf")]
+    first = max(10, *map(len, roles))
+    # The names of files give way to long names of roles.
+    second = 38 - first
+    out = [f"{'map':<{first}} {'file':<{second}} {'size':<11} {'kind':<14} what it does"]
     for role, facts in found["maps"].items():
         if role.startswith("bsdf"):
             continue
@@ -69,18 +81,31 @@ def _maps(found: dict[str, Any]) -> list[str]:
         use = USES[role] + (", sRGB decoded" if facts["colourspace"] == "srgb" else "")
         use += ", linear" if role == "basecolor" and facts["colourspace"] == "linear" else ""
         size = f"{facts['columns']}x{facts['rows']}"
-        out.append(f"{role:<10} {_cut(name, 28):<28} {size:<11} {kind:<14} {_cut(use, 33)}".rstrip())
+        name = _cut(name, second)
+        out.append(f"{role:<{first}} {name:<{second}} {size:<11} {kind:<14} {_cut(use, 33)}".rstrip())
     for role, value in found["constants"].items():
         if role in found["maps"]:
             continue
         shown = f"{value:g}" if isinstance(value, int | float) else ", ".join(f"{c:.3g}" for c in value)
-        out.append(f"{role:<10} {'constant ' + shown:<55} {USES[role]}")
+        out.append(f"{role:<{first}} {'constant ' + shown:<{second + 27}} {USES[role]}")
     return out
+
+
+def _unused(found: dict[str, Any]) -> list[str]:
+    """Images of the folder that are not used, those of one reason together."""
+    reasons: dict[str, list[str]] = {}
+    for name, why in found["unused"].items():
+        reasons.setdefault(why, []).append(name)
+    out = []
+    for why, names in reasons.items():
+        text = f"{', '.join(names)}: {why}"
+        out += textwrap.wrap(text, WIDTH, initial_indent="not used   ", subsequent_indent=" " * 11)
+    return out if len(out) <= _UNUSED_LINES else [*out[: _UNUSED_LINES - 1], f"{'':<11}… more with --json"]
 
 
 def _geometry(found: dict[str, Any]) -> list[str]:
     g, h = found["geometry"], found["heights"]
-    source = "as asked for" if g["height"] != g["material_height"] else "the material's own"
+    source = _SOURCES[g["height_from"]]
     u, v = h["repeats"]
     low, high = found["maps"]["height"]["low"], found["maps"]["height"]["high"]
     out = [

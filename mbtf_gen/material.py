@@ -17,17 +17,20 @@ from .errors import InputError
 from .height_codes import Codes, code_use
 from .heightfield import HeightGrid
 from .images import SUFFIXES, grey, is_image, srgb_to_linear
-from .map_names import Convention, find_maps, normal_convention
+from .map_names import Convention, FoundMaps, find_maps, normal_convention, unpack
 from .maps import dequantise, resample
 from .material_checks import (
     choose_convention,
     coarse_step,
+    flat_warning,
     holes,
     level_remark,
     normal_note,
     orientation_warning,
     refuse_colour,
+    relief_warning,
     seam_warning,
+    suggestion_warning,
 )
 from .material_file import MaterialFile, NormalEntry, plain, read_material_file
 from .material_maps import DEFAULT_COLOUR, Colour, MapFacts, MapLoader, Share
@@ -45,8 +48,6 @@ DEFAULT_SPECULAR = 0.5
 DEFAULT_COAT_ROUGHNESS = 0.1
 # Mesh cells across the tile, at most, unless asked for.
 DEFAULT_MESH = 512
-# Beyond so many tile widths a default factor is probably not what was meant.
-_STEEP = 4.0
 _YAML = ("material.yaml", "material.yml")
 
 
@@ -60,6 +61,7 @@ class Material:
         heights of few levels are smoothed within half a level; halved in a mirrored tile, whose width is two
         images
     height_scale : factor from stored numbers to tile widths unless the configuration says another
+    height_given : does the material file state that factor? It is a default otherwise
     height_bits : 8, 16, or None for floats
     basecolor : (h, w, 3) or (3,), linear Rec.709 in [0, 1]
     roughness, metallic, specular : (h, w) or one number in [0, 1]; all three None for Lambert
@@ -69,7 +71,8 @@ class Material:
     bsdf : Mitsuba dictionary that stands in place of the maps, or None
     files : role → file
     digests : role → SHA-256 of the file's content; ``settings`` covers everything else that changes the data
-    warnings, notes : what the user should see; what the user may want to know
+    warnings, notes : what the user should see, whatever height is asked for; what the user may want to know
+    unused : name of an image of the folder that is not used → why
     facts : role → what the map's file holds
     codes : use that integer heights make of their codes; None for floats
     seams : seams of the heights as they are in the file
@@ -90,10 +93,12 @@ class Material:
     normal: NDArray[np.float32] | None = None
     opacity: Share = None
     bsdf: dict[str, Any] | None = None
+    height_given: bool = False
     files: dict[str, Path] = field(default_factory=dict)
     digests: dict[str, str] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    unused: dict[str, str] = field(default_factory=dict)
     facts: dict[str, MapFacts] = field(default_factory=dict)
     codes: Codes | None = None
     seams: tuple[Seam, ...] = ()
@@ -112,6 +117,18 @@ class Material:
         return (
             self.bsdf is None and self.roughness is None and self.metallic is None and self.specular is None
         )
+
+    def warnings_at(self, height: float | None = None) -> tuple[str, ...]:
+        """All warnings where `height` is the factor asked for: a default one is questioned."""
+        flat = flat_warning(self.files["height"], self.height)
+        if flat is not None or height is not None or self.height_given:
+            return (*self.warnings, *([flat] if flat else []))
+        text = None
+        if "normal" in self.files:
+            text = suggestion_warning(self.files["normal"], self.normal_fit, self.height_scale)
+        relief = abs(self.height_scale) * float(np.ptp(self.height))
+        text = text or relief_warning(self.files["height"], relief)
+        return (*self.warnings, *([text] if text else []))
 
     def grid(self, height: float | None = None, mesh: int | None = None) -> HeightGrid:
         """Heights in tile widths on the mesh's grid.
@@ -144,32 +161,32 @@ def load_material(path: str | Path, tile: Tiling = "none") -> Material:
     ------
     InputError : something is missing, unreadable, ambiguous, out of its range, or maps of different aspect
     """
-    spec, folder, notes = _described(Path(path))
-    material = _assemble(spec, folder, notes, tile)
+    spec, folder, found = _described(Path(path))
+    material = _assemble(spec, folder, found, tile)
     return material if tile == "none" else retile(material, tile)
 
 
-def _described(path: Path) -> tuple[MaterialFile, Path, list[str]]:
-    """Maps and constants of a material, the folder that file names are relative to, and notes."""
-    notes: list[str] = []
+def _described(path: Path) -> tuple[MaterialFile, Path, FoundMaps]:
+    """Maps and constants of a material, the folder that file names are relative to, and what lies there."""
     if path.is_dir():
         described = next((path / name for name in _YAML if (path / name).is_file()), None)
         if described is not None:
-            return read_material_file(described), path, notes
+            return read_material_file(described), path, FoundMaps()
         found = find_maps(path)
         spec = MaterialFile.model_validate({role: str(file.name) for role, file in found.maps.items()})
-        return spec, path, found.notes
+        return spec, path, found
     if not path.exists():
         raise InputError("no such file or folder", where=path, cure=near_miss(path))
     if path.suffix.lower() in (".yaml", ".yml"):
-        return read_material_file(path), path.parent, notes
+        return read_material_file(path), path.parent, FoundMaps()
     if not is_image(path):
         raise InputError(
             f"'{path.suffix}' is no height map",
             where=path,
-            cure=f"give a folder, a .yaml file, or {', '.join(SUFFIXES)}",
+            cure=unpack(path) or f"give a folder, a .yaml file, or {', '.join(SUFFIXES)}",
         )
-    return MaterialFile.model_validate({"height": path.name}), path.parent, list(_siblings(path))
+    spec = MaterialFile.model_validate({"height": path.name})
+    return spec, path.parent, FoundMaps(notes=list(_siblings(path)))
 
 
 def _siblings(path: Path) -> Iterator[str]:
@@ -183,8 +200,9 @@ def _siblings(path: Path) -> Iterator[str]:
         yield f"only the heights of {path.name} are used; for {names} too, give the folder {path.parent}"
 
 
-def _assemble(spec: MaterialFile, folder: Path, notes: list[str], tile: Tiling) -> Material:
-    load = MapLoader(folder, notes)
+def _assemble(spec: MaterialFile, folder: Path, found: FoundMaps, tile: Tiling) -> Material:
+    load = MapLoader(folder, found.notes)
+    load.warnings += found.warnings
     height, codes, scale = _heights(spec, load)
     rounding = 0.0 if codes is None else codes.rounding / (2 ** (load.facts["height"].bits or 8) - 1)
     edges = seams(height, rounding)
@@ -197,7 +215,8 @@ def _assemble(spec: MaterialFile, folder: Path, notes: list[str], tile: Tiling) 
     if spec.bsdf is not None:
         load.notes.append(f"surface: the BSDF '{spec.bsdf['type']}' of the material file")
     elif roughness is None and metallic is None and specular is None:
-        load.notes.append("surface: Lambert, because no roughness, metallic or specular is given")
+        under = " under a clear coat" if spec.clearcoat is not None else ""
+        load.notes.append(f"surface: Lambert{under}, because no roughness, metallic or specular is given")
     else:
         constants = {
             "roughness": DEFAULT_ROUGHNESS,
@@ -211,7 +230,7 @@ def _assemble(spec: MaterialFile, folder: Path, notes: list[str], tile: Tiling) 
     basecolor = load.colour(spec.basecolor) if spec.bsdf is None else np.full(3, DEFAULT_COLOUR)
     normal, convention, fit = None, None, None
     if spec.normal is not None:
-        normal, convention, fit = _normals(spec.normal, load, height, scale)
+        normal, convention, fit = _normals(spec, spec.normal, load, height, scale)
     opacity = load.share("opacity", spec.opacity)
     if opacity is not None:
         load.notes.append(f"opacity: {holes(opacity):.0%} of the tile are holes")
@@ -238,10 +257,12 @@ def _assemble(spec: MaterialFile, folder: Path, notes: list[str], tile: Tiling) 
         normal=normal,
         opacity=opacity,
         bsdf=bsdf,
+        height_given=spec.height.scale is not None,
         files=load.files,
         digests=digests,
         warnings=tuple(load.warnings),
         notes=tuple(load.notes),
+        unused=found.unused,
         facts=load.facts,
         codes=codes,
         seams=edges,
@@ -251,7 +272,7 @@ def _assemble(spec: MaterialFile, folder: Path, notes: list[str], tile: Tiling) 
 
 
 def _normals(
-    entry: NormalEntry, load: MapLoader, height: NDArray[np.float64], scale: float
+    spec: MaterialFile, entry: NormalEntry, load: MapLoader, height: NDArray[np.float64], scale: float
 ) -> tuple[NDArray[np.float32], Convention, NormalFit | None]:
     """Unit vectors (h, w, 3), the convention they were read by, and how they fit the heights."""
     vectors = load.normals(entry)
@@ -260,7 +281,7 @@ def _normals(
     convention, how, warning = choose_convention(fit, normal_convention(path.name), entry.convention, path)
     found = (warning, None if fit is None else orientation_warning(fit, path, load.files["height"]))
     load.warnings += [text for text in found if text is not None]
-    load.notes.append(normal_note(path, fit, convention, how, scale))
+    load.notes.append(normal_note(path, fit, convention, how, scale, spec.height.scale is None))
     return load.turned_green(vectors, convention), convention, fit
 
 
@@ -293,10 +314,6 @@ def _heights(spec: MaterialFile, load: MapLoader) -> tuple[NDArray[np.float64], 
         f"heights: {image.path.name}, {image.shape[1]} x {image.shape[0]} {kind}, "
         f"relief {relief:.4g} tile widths at its factor {scale:g}"
     )
-    if relief > _STEEP and entry.scale is None:
-        load.warnings.append(
-            f"{image.path}: the relief is {relief:.4g} tile widths; is another --height meant?"
-        )
     return height, codes, scale
 
 

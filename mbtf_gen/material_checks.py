@@ -20,6 +20,10 @@ CONVENTION_NAMES: dict[Convention, str] = {"gl": "OpenGL", "dx": "DirectX"}
 _COLOURED = 0.02
 # Levels, and codes between them, that 8-bit heights in a 16-bit file have.
 _FEW_LEVELS, _FAR_APART = 1024, 16.0
+# Beyond so many tile widths of relief a default factor is probably not what was meant.
+_STEEP = 0.5
+# So many times more or less than the normal map suggests is far off.
+_FAR_OFF = 3.0
 
 
 def refuse_colour(image: Image) -> None:
@@ -116,7 +120,39 @@ def signed(correlation: float) -> str:
     return "undefined" if math.isnan(correlation) else f"{correlation:+.2f}"
 
 
-def normal_note(path: Path, fit: NormalFit | None, convention: Convention, how: str, factor: float) -> str:
+def flat_warning(path: Path, heights: NDArray[np.float64]) -> str | None:
+    """The warning that there is no relief."""
+    return f"{path}: its heights are constant: the tile is flat" if np.ptp(heights) == 0 else None
+
+
+def relief_warning(path: Path, relief: float) -> str | None:
+    """The warning that a default factor makes too much, in tile widths, of the heights."""
+    if relief <= _STEEP:
+        return None
+    return f"{path}: the relief is {relief:.4g} tile widths; is another --height meant?"
+
+
+def suggestion_warning(path: Path, fit: NormalFit | None, factor: float) -> str | None:
+    """The warning that a default factor is far from the one that a normal map was made with."""
+    if not misses(fit, factor) or fit is None:
+        return None
+    ratio = factor / fit.scale
+    return (
+        f"{path}: its slopes suggest another height than the default of {factor:.3g}, "
+        f"which is {ratio:{'.0f' if ratio >= 10 else '.2g'}} times as much; --height {fit.scale:.3g} takes it"
+    )
+
+
+def misses(fit: NormalFit | None, factor: float) -> bool:
+    """Is a factor more than three times, or less than a third of, what a normal map clearly suggests?"""
+    if fit is None or not fit.fits or fit.scale == 0:
+        return False
+    return not 1 / _FAR_OFF <= factor / fit.scale <= _FAR_OFF
+
+
+def normal_note(
+    path: Path, fit: NormalFit | None, convention: Convention, how: str, factor: float, default: bool
+) -> str:
     """What a normal map is read as, how it fits, and the height that it suggests."""
     text = f"normal map: {path.name}, {CONVENTION_NAMES[convention]}, {how}"
     if fit is None:
@@ -125,7 +161,8 @@ def normal_note(path: Path, fit: NormalFit | None, convention: Convention, how: 
     u, v = signed(fit.correlation_u), signed(sign * fit.correlation_v)
     text += f"; correlation with them u {u}, v {v}"
     if fit.fits:
-        text += f"; it suggests --height {fit.scale:.3g} (the material's own is {factor:.3g})"
+        own = "the default" if default else "the material file's"
+        text += f"; it suggests --height {fit.scale:.3g} ({own} is {factor:.3g})"
     return text
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import statistics
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,10 +40,13 @@ if TYPE_CHECKING:
 COMPARISON_NAME = "comparison.json"
 COMPARISON_FORMAT = "mbtf-comparison"
 # Raised when the record or what lies beside it changes; part of what the stage depends on.
-COMPARISON_SCHEMA = 2
+COMPARISON_SCHEMA = 3
 
 F32 = NDArray[np.float32]
 Progress = Callable[[str], None]
+T = TypeVar("T")
+# Timings of one picture's evaluation, whose median is recorded.
+_TIMINGS = 3
 
 
 def steps(compare: CompareSection, fits: int) -> int:
@@ -153,6 +158,17 @@ def _render(
     return out
 
 
+def timed(work: Callable[[], T]) -> tuple[T, float]:
+    """What `work` returns, and the median of several timings in seconds, after one that is not counted."""
+    result = work()
+    seconds = []
+    for _ in range(_TIMINGS):
+        start = time.perf_counter()
+        work()
+        seconds.append(time.perf_counter() - start)
+    return result, statistics.median(seconds)
+
+
 def _picture(
     scene: Scene,
     images: Mapping[PixelKind, ReferenceImage],
@@ -184,11 +200,10 @@ def _picture(
     record["fits"] = {}
     values: list[F32] = []
     for name, material in materials.items():
-        start = time.perf_counter()
         flat = queries.flat()
-        value = np.asarray(material.evaluate(flat.u, flat.sigma, flat.omega_i, flat.omega_o), np.float32)
-        seconds = time.perf_counter() - start
-        value = value.reshape(*queries.lead, 3)
+        evaluate = partial(material.evaluate, flat.u, flat.sigma, flat.omega_i, flat.omega_o)
+        flat_value, seconds = timed(evaluate)
+        value = np.asarray(flat_value, np.float32).reshape(*queries.lead, 3)
         file = scene.file(fit_name(name))
         write_picture(out / file, value)
         write_preview(out / file, value, white)

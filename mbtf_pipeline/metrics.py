@@ -30,7 +30,7 @@ DEFINITIONS: dict[str, str] = {
     "picture's mean value",
     "flip": FLIP_DEFINITION,
     "error_bar": "one standard error, from the scatter over the picture's pixels or the data's queries; a "
-    "value within two of its own is printed as below its error bar, with the bar",
+    "value within two of its own is printed as below two error bars, with the bar",
 }
 
 

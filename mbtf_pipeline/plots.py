@@ -16,6 +16,12 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 MARKERS = ("o", "s", "^", "D", "v", "P")
 # Stands for the page's own text colour until the SVG is inlined.
 _INK = "#010203"
+# A logarithmic axis ends at most this factor below its smallest value and above its largest.
+_REACH = 2.0
+BARS_NOTE = (
+    "Bars and bands are one standard error. What lies below half the smallest positive value of a plot or "
+    "above twice the largest is cut off there: a logarithmic axis has no zero."
+)
 _WIDTH = 5.6
 _HEIGHT = 3.3
 
@@ -114,19 +120,31 @@ def curves(
 def _curves(lines: Sequence[Curve], x: str, y: str, logx: bool, logy: bool) -> Any:
     figure = _figure()
     axes = _axes(figure, x, y, logx=logx, logy=logy)
+    low, high = _ends([v for line in lines for v in line.y]) if logy else (-np.inf, np.inf)
+    shown: list[float] = []
     for index, line in enumerate(lines):
-        xs, ys = np.asarray(line.x, float), np.asarray(line.y, float)
+        xs, values = np.asarray(line.x, float), np.asarray(line.y, float)
+        ys = np.clip(values, low, high)
         axes.plot(xs, ys, color=colour(index), linewidth=1.7, label=line.name)
+        shown += [ys.min(), ys.max()]
         if line.error is not None:
             e = np.asarray(line.error, float)
-            low = np.maximum(ys - e, 1e-12) if logy else ys - e
-            axes.fill_between(xs, low, ys + e, color=colour(index), alpha=0.18, linewidth=0)
+            below, above = (np.clip(values + side, low, high) for side in (-e, e))
+            axes.fill_between(xs, below, above, color=colour(index), alpha=0.18, linewidth=0)
+            shown += [below.min(), above.max()]
     if logy:
+        axes.set_ylim(max(low, min(shown) / 1.05), min(high, max(shown) * 1.05))
         _plain_ticks(axes.yaxis)
     if logx:
         _plain_ticks(axes.xaxis)
     axes.legend(frameon=False)
     return figure
+
+
+def _ends(values: Sequence[float]) -> tuple[float, float]:
+    """How far a logarithmic axis may reach for these values, of which those above zero count."""
+    positive = [v for v in values if v > 0]
+    return (min(positive) / _REACH, max(positive) * _REACH) if positive else (0.1, 1.0)
 
 
 def points(
@@ -168,10 +186,8 @@ def _points(
         axes.plot(xs, ys, color=colour(index), linewidth=0.8, alpha=0.45)
     axes.set_xticks(range(len(groups)), groups)
     axes.set_xlim(-0.6, len(groups) - 0.4)
-    heights = [v[0] for row in series.values() for v in row if v is not None and v[0] > 0]
-    if heights:
-        # A bar that reaches down to zero has no end on a logarithmic axis: the values set its range.
-        axes.set_ylim(min(heights) / 2.0, max(heights) * 2.0)
+    # A bar that reaches down to zero has no end on a logarithmic axis: the values set its range.
+    axes.set_ylim(*_ends([v[0] for row in series.values() for v in row if v is not None]))
     _plain_ticks(axes.yaxis)
     axes.legend(frameon=False)
     return figure

@@ -16,6 +16,7 @@ from .embed import ENCODINGS, Embedded, Gallery, embed, encode
 from .fit_records import read_training
 from .linear_data import EXPOSURE_STOPS
 from .maps import palette
+from .plots import BARS_NOTE
 from .recipe import RECIPE_NAME, Recipe
 from .report_errors import error_context
 from .report_offsets import show_offsets
@@ -23,13 +24,15 @@ from .report_pictures import Shown, show_pictures
 from .report_time import provenance, time_context
 from .report_training import training_context
 from .run_folder import COMPARE, FITS, REPORT, RUN_NAME, SHARDS
+from .wording import BELOW
 
 # Raised when the page changes; part of what the report's stage depends on.
-LAYOUT = 2
+LAYOUT = 3
 
 _TABLE = """
 <table><thead><tr>{% for h in t.head %}<th>{{ h }}</th>{% endfor %}</tr></thead><tbody>
-{% for row in t.rows %}<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>
+{% for row in t.rows %}<tr>
+{%- for cell in row %}<td{{ ' class=long' if cell is in_words }}>{{ cell }}</td>{% endfor %}</tr>
 {% endfor %}</tbody></table>
 """
 
@@ -39,6 +42,7 @@ def _environment() -> Any:
     from markupsafe import Markup
 
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
+    environment.tests["in_words"] = lambda cell: BELOW in cell
     table = environment.from_string(_TABLE)
     environment.globals["table"] = lambda t: Markup(table.render(t=t))
     return environment
@@ -73,13 +77,15 @@ def write_report(folder: Path, recipe: Recipe, stages: Sequence[str]) -> int:
         "groups": shown.groups,
         "scenes": shown.scenes,
         "bars": {bar.key: bar for bar in shown.bars},
+        "bars_note": BARS_NOTE,
+        "train_spp": manifest["splits"]["train"]["spp"],
         "offsets": offsets,
         "offset_columns": len(offsets[0]["cells"]) if offsets else 1,
         "effects": manifest["effects"]["effects"],
         "command": run["command"],
         "recipe_yaml": (folder / RECIPE_NAME).read_text(encoding="utf-8"),
         "provenance": provenance(folder, manifest, fit_folders, run["machine"]),
-        **error_context(comparison),
+        **error_context(comparison, float(manifest["config"]["queries"]["min_cos"])),
         **training_context(histories),
         **time_context(folder, stages, manifest, comparison, histories),
     }

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from .plots import points
 from .report_pictures import flip_texts
-from .wording import decibel, error_text, estimate, percent, short_direction
+from .wording import data_errors, decibel, error_text, estimate, short_direction
 
 UNEXPLAINED = "unexplained variance"
 _TERMS = {
@@ -24,19 +24,19 @@ def _first_split(comparison: Mapping[str, Any]) -> dict[str, Any]:
     return {fit: record["splits"]["test"] for fit, record in comparison["test"].items()}
 
 
-def error_context(comparison: Mapping[str, Any]) -> dict[str, Any]:
-    """What the template shows about errors."""
+def error_context(comparison: Mapping[str, Any], min_cos: float) -> dict[str, Any]:
+    """What the template shows about errors.
+
+    Parameters
+    ----------
+    min_cos : smallest cosine of light and view in the data
+    """
     return {
         "facts": _facts(comparison),
         "test": next(iter(_first_split(comparison).values())),
         "error_table": _table(comparison),
-        "error_plots": _plots(comparison),
-        "group_tables": [
-            _groups_table(comparison, "levels", "By level of detail, test split", "level"),
-            _groups_table(
-                comparison, "elevations", "By the smaller cosine of light and view, test split", "cos θ"
-            ),
-        ],
+        "error_plots": _plots(comparison, min_cos),
+        "group_tables": [_groups_table(comparison, grouping, min_cos) for grouping in _GROUPINGS],
         "picture_table": _pictures_table(comparison),
         "definitions": [(_TERMS[k], v) for k, v in comparison["definitions"].items()],
     }
@@ -45,8 +45,7 @@ def error_context(comparison: Mapping[str, Any]) -> dict[str, Any]:
 def _facts(comparison: Mapping[str, Any]) -> list[dict[str, str]]:
     out = []
     for fit, split in _first_split(comparison).items():
-        e = estimate(split["unexplained"])
-        value = f"{100 * e.value:.1f} %" if math.isfinite(e.value) else "–"
+        value, _ = data_errors(split)
         out.append({"value": value, "what": f"of the test values' variance unexplained by {fit}"})
     fit = comparison["fits"][0]
     decibels = [
@@ -77,30 +76,48 @@ def _table(comparison: Mapping[str, Any]) -> dict[str, Any]:
     ]
     rows = []
     for fit, record in comparison["test"].items():
-        cells = [
-            percent(estimate(record["splits"][s]["unexplained"])) if s in record["splits"] else "–"
-            for s in splits
-        ]
-        mse = error_text(estimate(record["splits"]["test"]["mse"]), 1e3)
+        cells = [data_errors(record["splits"][s])[0] if s in record["splits"] else "–" for s in splits]
+        mse = data_errors(record["splits"]["test"])[1]
         rows.append([fit, *cells, mse, f"{record['network_weights']:,}", f"{record['texels']:,}"])
     return {"head": head, "rows": rows}
 
 
-def _plots(comparison: Mapping[str, Any]) -> list[dict[str, str]]:
+@dataclass(frozen=True)
+class _Grouping:
+    """A way to group queries: its key in the record, titles, and the name of a group."""
+
+    key: str
+    title: str
+    axis: str
+    head: str
+
+
+_GROUPINGS = (
+    _Grouping("levels", "By level of detail (0 is the whole tile)", "level of the footprint", "level"),
+    _Grouping("elevations", "By lowest cosine of light and view", "lower cosine of light and view", "cos θ"),
+)
+
+
+def group_label(name: str, min_cos: float) -> str:
+    """``4`` of a level, ``0.3–0.4`` of a band of cosines, which begins no lower than the data do."""
+    low, _, high = name.partition("-")
+    if not high:
+        return name
+    return f"{min_cos:g}–{high}" if float(low) < min_cos < float(high) else f"{low}–{high}"
+
+
+def _plots(comparison: Mapping[str, Any], min_cos: float) -> list[dict[str, str]]:
     out = []
     splits = _first_split(comparison)
-    for key, title, axis in (
-        ("levels", "By level of detail (0 is the whole tile)", "level of the footprint"),
-        ("elevations", "By grazing angle", "smaller cosine of light and view"),
-    ):
-        names = _group_names(splits, key)
+    for grouping in _GROUPINGS:
+        names = _group_names(splits, grouping.key)
         series = {
-            fit: [_value(split[key].get(n, {}).get("unexplained")) for n in names]
+            fit: [_value(split[grouping.key].get(n, {}).get("unexplained")) for n in names]
             for fit, split in splits.items()
         }
-        labels = [name.replace("-", "–") for name in names]
-        svg = points(labels, series, axis, UNEXPLAINED, f"{UNEXPLAINED} {title}")
-        out.append({"title": title, "svg": svg})
+        labels = [group_label(name, min_cos) for name in names]
+        svg = points(labels, series, grouping.axis, UNEXPLAINED, f"{UNEXPLAINED} {grouping.title}")
+        out.append({"title": grouping.title, "svg": svg})
     return out
 
 
@@ -114,23 +131,24 @@ def _value(record: Mapping[str, Any] | None) -> tuple[float, float] | None:
     return float(record["value"]), float(record["error"])
 
 
-def _groups_table(comparison: Mapping[str, Any], key: str, title: str, head: str) -> dict[str, Any]:
+def _groups_table(comparison: Mapping[str, Any], grouping: _Grouping, min_cos: float) -> dict[str, Any]:
+    key = grouping.key
     splits = _first_split(comparison)
     names = _group_names(splits, key)
     rows = []
     for name in names:
         first = next(s for s in splits.values() if name in s[key])[key][name]
-        cells = []
+        cells: list[str] = []
         for split in splits.values():
             group = split[key].get(name)
-            cells += (
-                ["–", "–"]
-                if group is None
-                else [percent(estimate(group["unexplained"])), error_text(estimate(group["mse"]), 1e3)]
-            )
-        rows.append([name.replace("-", "–"), f"{first['mse']['n']:,}", *cells])
+            cells += ("–", "–") if group is None else data_errors(group)
+        rows.append([group_label(name, min_cos), f"{first['mse']['n']:,}", *cells])
     heads = [h for fit in splits for h in (f"{fit}: unexplained", f"{fit}: MSE [10⁻³/sr²]")]
-    return {"title": title, "head": [head, "queries", *heads], "rows": rows}
+    return {
+        "title": f"{grouping.title}, test split",
+        "head": [grouping.head, "queries", *heads],
+        "rows": rows,
+    }
 
 
 def _pictures_table(comparison: Mapping[str, Any]) -> dict[str, Any]:

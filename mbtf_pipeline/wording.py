@@ -10,6 +10,7 @@ from mbtf_gen.stats import Estimate
 
 # A value within so many standard errors of zero is not told from zero.
 BAR = 2.0
+BELOW = "below two error bars"
 
 
 def estimate(record: Mapping[str, Any]) -> Estimate:
@@ -23,26 +24,41 @@ def below_bar(e: Estimate) -> bool:
     return math.isfinite(e.value) and abs(e.value) <= BAR * e.error
 
 
-def error_text(e: Estimate, factor: float = 1.0, unit: str = "") -> str:
-    """``0.123 ± 0.004``, or that it lies below its error bar, with both numbers."""
+def error_text(e: Estimate, factor: float = 1.0, unit: str = "", *, told: bool = True) -> str:
+    """``0.123 ± 0.004``, or that it lies below two error bars, with both numbers.
+
+    Parameters
+    ----------
+    told : False where something else already says that the value is not told from zero
+    """
     if not math.isfinite(e.value):
         return "not defined"
     text = f"{e.scaled(factor)}{unit}".replace("-", "−")
-    return f"below its error bar ({text})" if below_bar(e) else text
+    return text if told and not below_bar(e) else f"{BELOW} ({text})"
 
 
-def percent(e: Estimate) -> str:
+def percent(e: Estimate, *, told: bool = True) -> str:
     """:func:`error_text` in percent."""
-    return error_text(e, 100.0, " %")
+    return error_text(e, 100.0, " %", told=told)
+
+
+def data_errors(record: Mapping[str, Any]) -> tuple[str, str]:
+    """(unexplained variance in percent, MSE in 10⁻³/sr²) of the same queries.
+
+    One is the other over a variance with an error bar of its own. So both are told from zero, or neither is.
+    """
+    unexplained, mse = estimate(record["unexplained"]), estimate(record["mse"])
+    told = not below_bar(unexplained) and not below_bar(mse)
+    return percent(unexplained, told=told), error_text(mse, 1e3, told=told)
 
 
 def decibel(psnr: Mapping[str, Any], mse: Mapping[str, Any]) -> str:
-    """PSNR in dB; none where the error it stands for lies below its error bar."""
+    """PSNR in dB; none where the error it stands for lies below two error bars."""
     e, error = estimate(psnr), estimate(mse)
     if not math.isfinite(e.value):
-        return "error below its error bar"
+        return f"error {BELOW}"
     if below_bar(error):
-        return f"error below its error bar ({e} dB)"
+        return f"error {BELOW} ({e} dB)"
     return f"{e} dB"
 
 

@@ -47,6 +47,8 @@ LINES: dict[str, list[str]] = {
         "mbtf-gen heights.npy -o notes.txt",
         "mbtf-gen heights.npy -o notes.txt/below",
         "mbtf-gen heights.npy -o textures",
+        "mbtf-gen steep.npy -o textures",
+        "mbtf-gen steep.npy --height 0.1 -o textures",
         "mbtf-gen heights.npy -o set --queries 10",
         "mbtf-gen reference heights.npy --view 5,0",
         "mbtf-gen reference heights.npy --view 60",
@@ -88,6 +90,7 @@ LINES: dict[str, list[str]] = {
             *("tab.yaml", "twice.yaml", "lost.yaml", "list.yaml", "latin.yaml", "number.yaml", "range.yaml"),
             *("nothing.yaml", "both.yaml", "bsdf.yaml", "bsdftype.yaml", "bsdffile.yaml", "bomb.yaml"),
             *("longnormal", "tag.yaml", "deep.yaml", "key.yaml", "channel.yaml", "escape.yaml"),
+            *("zipped", "zipped/rock.zip", "below"),
         )
     ],
     "configurations": [
@@ -117,8 +120,9 @@ LINES: dict[str, list[str]] = {
 
 def write_files(folder: Path) -> None:
     """Every file and folder that the lines name."""
-    heights = np.random.default_rng(0).random((4, 8))
+    heights = 0.2 * np.random.default_rng(0).random((4, 8))
     np.save(folder / "heights.npy", heights)
+    np.save(folder / "steep.npy", 5.0 * heights)
     (folder / "notes.txt").write_text("no image")
     _images(folder, heights)
     _folders(folder, heights)
@@ -171,6 +175,10 @@ def _folders(folder: Path, heights: np.ndarray) -> None:
     np.save(folder / "aspects/basecolor.npy", np.zeros((8, 8, 3)))
     np.save(folder / "greynormal/normal.npy", heights)
     np.save(folder / "longnormal/normal.npy", np.full((4, 8, 3), [0.5, 0.5, 255.0]))
+    (folder / "zipped").mkdir()
+    (folder / "zipped/rock.zip").write_bytes(b"PK")
+    (folder / "below/textures").mkdir(parents=True)
+    np.save(folder / "below/textures/height.npy", heights)
     (folder / "pictures").mkdir()
     record = {"format": "mbtf-pictures", "kind": "reference", "hash": "", "depends": {}, "files": "all"}
     (folder / "pictures/pictures.json").write_text(json.dumps(record))

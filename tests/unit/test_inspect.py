@@ -13,8 +13,9 @@ from mbtf_gen.cli import app
 from mbtf_gen.console import run
 from mbtf_gen.heightfield import HeightGrid
 from mbtf_gen.inspection import inspect_material
-from mbtf_gen.inspection_text import LINES, WIDTH, inspection_text
+from mbtf_gen.inspection_text import LINES, USES, WIDTH, inspection_text
 from mbtf_gen.material import load_material
+from mbtf_gen.material_file import MaterialFile
 from mbtf_gen.relief import autocorrelation, detail_size, repeats, rms_slope, slope_angles, triangle_slopes
 
 
@@ -139,6 +140,7 @@ class TestNumbers:
         assert found["geometry"]["slope_kept"] == 1.0
         assert found["oddities"] == ["no base colour map: linear RGB 0.5, 0.5, 0.5 everywhere"]
         assert found["tiling"] == []
+        assert any("heights are constant" in w for w in found["warnings"])
 
 
 class TestText:
@@ -167,6 +169,67 @@ class TestText:
         text = "\n".join(self.lines(inspect_material(load_material(folder))))
         assert "DOES NOT FIT; fits with the height map mirrored left to right" in text
         assert "along u DOES NOT TILE" in text
+
+    def test_every_entry_of_a_material_file(self, folder: Path) -> None:
+        """Each as a map and as a constant, but the heights, normals and BSDF, which are no numbers."""
+        assert set(USES) == set(MaterialFile.model_fields) - {"bsdf"}
+        shares = sorted(set(USES) - {"height", "normal"})
+        for value in ("0.5", "metallic.npy"):
+            text = "height: height.png\n" + "".join(f"{name}: {value}\n" for name in shares)
+            (folder / "material.yaml").write_text(text)
+            text = "\n".join(self.lines(inspect_material(load_material(folder))))
+            for name in shares:
+                assert USES[name] in text
+        assert "surface glossy under a clear coat" in text
+
+    def test_a_coat_alone_lies_on_lambert(self, folder: Path) -> None:
+        (folder / "material.yaml").write_text("height: height.png\nclearcoat: 1\n")
+        material = load_material(folder)
+        assert any(n.startswith("surface: Lambert under a clear coat, because") for n in material.notes)
+        lines = self.lines(inspect_material(material))
+        assert "surface diffuse under a clear coat" in lines[0]
+        assert any(line.startswith("clearcoat_roughness constant 0.1") for line in lines)
+
+    def test_maps_that_are_not_used_are_shown(self, folder: Path) -> None:
+        for name in ("orm.png", "gloss.png", "ao.png", "view.png"):
+            save_heights(folder / name, fractal(48, 96))
+        lines = self.lines(inspect_material(load_material(folder)))
+        text = "\n".join(line for line in lines if line.startswith("not used"))
+        for name in (
+            "orm.png: name its channels",
+            "gloss.png: in a",
+            "ao.png: ambient",
+            "view.png: its name",
+        ):
+            assert name in text
+        assert any("orm.png: is not used, and its map is missing" in line for line in lines)
+        found = inspect_material(load_material(folder))
+        found["unused"] = {f"{i} {'long ' * 20}.png": f"reason {i}" for i in range(30)}
+        assert any("… more with --json" in line for line in self.lines(found))
+
+    def test_a_default_height_far_from_the_suggested_one(self, folder: Path) -> None:
+        save_normals(folder / "normal.png", normals_of(fractal(48, 96), 0.01))
+
+        def said(height: float | None = None) -> tuple[bool, bool]:
+            found = inspect_material(load_material(folder), height)
+            warned = any(
+                "default of 0.05, which is 5 times as much; --height 0.0099" in w for w in found["warnings"]
+            )
+            return warned, any("that the normal map suggests" in o for o in found["oddities"])
+
+        assert said() == (True, False)
+        assert any("(the default is 0.05)" in note for note in load_material(folder).notes)
+        assert said(0.05) == (False, True)
+        save_heights(folder / "height.png", fractal(48, 96) / 50)
+        (warning,) = (w for w in load_material(folder).warnings_at() if "suggest" in w)
+        assert "which is 0.1 times as much" in warning
+        save_heights(folder / "height.png", fractal(48, 96))
+        (folder / "material.yaml").write_text("height: {file: height.png, scale: 0.05}\nnormal: normal.png\n")
+        assert said() == (False, True)
+        assert any("(the material file's is 0.05)" in note for note in load_material(folder).notes)
+        (folder / "material.yaml").unlink()
+        save_normals(folder / "normal.png", normals_of(fractal(48, 96), 0.02))
+        assert not any("suggest another" in w for w in load_material(folder).warnings_at())
 
     def test_long_lists_and_names_are_cut(self, folder: Path) -> None:
         found = inspect_material(load_material(folder))

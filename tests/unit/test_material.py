@@ -146,9 +146,21 @@ class TestBareFile:
         assert material.grid().relief == 0.0
         assert material.aspect == shape[0] / shape[1]
 
-    def test_a_relief_of_many_tiles_is_questioned(self, tmp_path: Path) -> None:
-        material = load_material(npy(tmp_path / "h.npy", np.array([[0.0, 300.0]])))
-        assert "300 tile widths" in material.warnings[0]
+    def test_a_great_relief_at_the_default_factor_is_questioned(self, tmp_path: Path) -> None:
+        material = load_material(npy(tmp_path / "h.npy", np.array([[0.0, 0.6]])))
+        (warning,) = material.warnings_at()
+        assert "the relief is 0.6 tile widths; is another --height meant?" in warning
+        assert material.warnings_at(1.0) == ()
+        assert load_material(npy(tmp_path / "h.npy", np.array([[0.0, 0.5]]))).warnings_at() == ()
+        yaml = tmp_path / "m.yaml"
+        yaml.write_text("height: {file: h.npy, scale: 2}\n")
+        assert load_material(yaml).warnings_at() == ()
+
+    def test_constant_heights_are_told(self, tmp_path: Path) -> None:
+        material = load_material(npy(tmp_path / "h.npy", np.full((4, 4), 0.25)))
+        for height in (None, 0.1):
+            assert any("heights are constant: the tile is flat" in w for w in material.warnings_at(height))
+        assert str(material.grid().relief) == "0.0"
 
 
 class TestGrid:

@@ -40,8 +40,11 @@ RELAYS = {
     "mbtf_gen/console.py": {"_usage_message", "run"},
     "mbtf_gen/engine.py": {"_llvm_error", "check_llvm", "load_mitsuba"},
     "mbtf_gen/generation.py": {"plan", "prepare"},
+    "mbtf_gen/map_names.py": {"_lost_warning", "find_maps"},
     "mbtf_gen/material.py": {"_assemble", "_heights"},
-    "mbtf_gen/material_checks.py": {"orientation_warning", "seam_warning"},
+    "mbtf_gen/material_checks.py": {
+        *("flat_warning", "orientation_warning", "relief_warning", "seam_warning", "suggestion_warning"),
+    },
     "mbtf_gen/selftest_checks.py": {"_cuda"},
     "mbtf_gen/settings.py": {"_explain", "build"},
     "mbtf_gen/verification.py": {"shard_fault", "verify"},

@@ -74,3 +74,9 @@ def test_every_series_has_its_colour() -> None:
 def test_a_bar_larger_than_its_value_does_not_stretch_the_axis() -> None:
     wide = points(["0"], {"a": [(0.2, 0.19999)], "b": [(0.3, 0.01)]}, "x", "y", "wide")
     assert "0.001" not in texts(wide)
+
+
+def test_a_band_that_reaches_zero_is_cut_off_where_the_values_end() -> None:
+    lines = [Curve("a", [10.0, 20.0, 30.0], [0.3, 0.2, -0.01], [0.31, 5.0, 0.1])]
+    numbers = {float(t) for t in texts(curves(lines, "x", "y", "band")) if re.fullmatch(r"[\d.e-]+", t)}
+    assert {n for n in numbers if n < 10} == {0.1, 0.2, 0.5}

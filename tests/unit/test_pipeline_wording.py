@@ -8,13 +8,13 @@ import pytest
 
 from mbtf_gen.stats import Estimate
 from mbtf_pipeline.report_pictures import flip_texts
-from mbtf_pipeline.wording import decibel, error_text, levels, percent
+from mbtf_pipeline.wording import data_errors, decibel, error_text, levels, percent
 
 
 @pytest.mark.parametrize("value", [0.03, -0.03, 0.0])
 def test_a_value_below_its_bar_is_called_that(value: float) -> None:
     text = error_text(Estimate(value, 0.02, 100))
-    assert text.startswith("below its error bar (")
+    assert text.startswith("below two error bars (")
     assert "± 0.02" in text
 
 
@@ -24,14 +24,22 @@ def test_a_value_above_its_bar_is_just_printed() -> None:
     assert percent(Estimate(math.nan, math.inf, 1)) == "not defined"
 
 
+def test_both_errors_of_the_same_queries_are_told_from_zero_or_neither() -> None:
+    close, clear = {"value": 0.1, "error": 0.051, "n": 9}, {"value": 1e-4, "error": 4.9e-5, "n": 9}
+    for unexplained, mse in ((close, clear), (clear, close), (close, close)):
+        texts = data_errors({"unexplained": unexplained, "mse": mse})
+        assert all(text.startswith("below two error bars (") for text in texts)
+    assert data_errors({"unexplained": clear, "mse": clear}) == ("0.010 ± 0.005 %", "0.10 ± 0.05")
+
+
 def test_no_decibels_for_an_error_that_may_be_none() -> None:
     mse = {"value": 1e-4, "error": 1e-6, "n": 9}
     psnr = {"value": 40.0, "error": 0.2, "n": 9}
     assert decibel(psnr, mse) == "40.0 ± 0.2 dB"
-    assert decibel(psnr, {**mse, "error": 1e-4}).startswith("error below its error bar")
+    assert decibel(psnr, {**mse, "error": 1e-4}).startswith("error below two error bars")
     assert (
         decibel({"value": None, "error": None, "n": 9}, {**mse, "value": -1e-4})
-        == "error below its error bar"
+        == "error below two error bars"
     )
 
 
