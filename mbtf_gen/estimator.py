@@ -65,6 +65,8 @@ class Estimator:
         self.light = light
         self.transport = transport
         self.launch = launch
+        # Whether rays may pass through, so that what passed is counted.
+        self.holes = bool(tile.world.surface.parts.opacity)
         self._sensor = mi.load_dict(
             {"type": "mbtf_queries", "unit": tile.unit, "aspect": tile.aspect, "start": CLEARANCE}
         )
@@ -106,9 +108,7 @@ class Estimator:
         return Estimates(
             np.concatenate([p.value_a for p in parts]),
             np.concatenate([p.value_b for p in parts]),
-            np.concatenate([p.transmittance for p in parts])
-            if self.tile.world.surface.parts.opacity
-            else None,
+            np.concatenate([p.transmittance for p in parts]) if self.holes else None,
             n * spp,
             sum(p.lost for p in parts),
             sum(p.capped for p in parts),
@@ -140,8 +140,10 @@ class Estimator:
             nonfinite += len(bad)
             again, through, more_lost, more_capped = trace_lanes(mi.UInt32(bad), attempt)
             dr.scatter(radiance, again, mi.UInt32(bad))
-            dr.scatter(passed, through, mi.UInt32(bad))
-            dr.eval(radiance, passed)
+            dr.eval(radiance)
+            if self.holes:
+                dr.scatter(passed, through, mi.UInt32(bad))
+                dr.eval(passed)
             lost, capped = lost + more_lost, capped + more_capped
             bad = bad[self._nonfinite(again)]
         if len(bad):
@@ -157,7 +159,7 @@ class Estimator:
         return Estimates(
             np.ascontiguousarray(values[:, 0]),
             np.ascontiguousarray(values[:, 1]),
-            self._shares(passed, spp) if self.tile.world.surface.parts.opacity else None,
+            self._shares(passed, spp) if self.holes else None,
             count * spp,
             lost,
             capped,
@@ -209,8 +211,8 @@ class Estimator:
         inverse: Any,
         attempt: int,
     ) -> tuple[Any, Any, int, int]:
-        """Radiance of the given lanes (query · spp + path) and whether they passed through the tile, in their
-        order; counts of lost and capped rays."""
+        """Radiance of the given lanes (query · spp + path) and, where there are holes, whether they passed
+        through the tile, in their order; counts of lost and capped rays."""
         half = spp // 2
 
         def generator(lane: Any, purpose: Purpose) -> Any:
@@ -253,8 +255,10 @@ class Estimator:
             mi.Bool(True),
         )
         radiance = dr.zeros(mi.Color3f, dr.width(lanes))
-        passed = dr.zeros(mi.Float, dr.width(lanes))
         dr.scatter(radiance, path.radiance, order)
-        dr.scatter(passed, dr.select(path.passed, 1.0, 0.0), order)
+        passed = None
+        if self.holes:
+            passed = dr.zeros(mi.Float, dr.width(lanes))
+            dr.scatter(passed, dr.select(path.passed, 1.0, 0.0), order)
         dr.eval(radiance, passed, path.lost, path.capped)
         return radiance, passed, int(dr.count(path.lost)[0]), int(dr.sum(path.capped)[0])

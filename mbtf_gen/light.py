@@ -152,6 +152,20 @@ class LightKernel:
         difference = np.asarray(omega, np.float64) - np.asarray(omega_i, np.float64)
         return _density(self.kappa, 0.5 * np.sum(difference**2, axis=-1))
 
+    def sample(self, omega_i: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
+        """Directions (n, 3) drawn from the lobe around each of omega_i (n, 3), not cut at the horizon."""
+        if self.is_delta:
+            return omega_i
+        xi, turn = rng.random(len(omega_i)), 2.0 * np.pi * rng.random(len(omega_i))
+        versine = -np.log1p(xi * np.expm1(-2.0 * self.kappa)) / self.kappa
+        sine = np.sqrt(np.maximum(versine * (2.0 - versine), 0.0))
+        across = np.where(np.abs(omega_i[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+        first = np.cross(omega_i, across)
+        first /= np.linalg.norm(first, axis=1, keepdims=True)
+        second = np.cross(omega_i, first)
+        aside = np.cos(turn)[:, None] * first + np.sin(turn)[:, None] * second
+        return np.asarray((1.0 - versine)[:, None] * omega_i + sine[:, None] * aside)
+
     def radiance(self, omega: ArrayLike, omega_i: ArrayLike) -> NDArray[np.float64]:
         """Arriving radiance L(ω) in 1/sr per unit irradiance: the lobe, cut and normalised."""
         above = np.asarray(omega)[..., 2] > 0

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .maps import resample
+from .slopes import normal_slopes
 
 Convention = Literal["gl", "dx"]
 Array = NDArray[np.floating[Any]]
@@ -103,9 +104,7 @@ def slopes_of_heights(height: Array) -> Array:
 def slopes_of_normals(normal: Array) -> Array:
     """Slopes (2, H-2, W-2) along u and y that normals (H, W, 3) claim, their mean removed, without the
     outermost texels."""
-    inner = normal[1:-1, 1:-1]
-    up = np.maximum(inner[..., 2], _FLATTEST)
-    slopes = np.stack([-inner[..., 0] / up, -inner[..., 1] / up]).astype(np.float64)
+    slopes = np.moveaxis(normal_slopes(normal[1:-1, 1:-1], _FLATTEST), -1, 0)
     return slopes - slopes.mean(axis=(1, 2), keepdims=True)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -41,12 +42,15 @@ class _Look:
     """What the decisions are made from."""
 
     job: Job
-    omega_i: NDArray[np.float64]
-    omega_o: NDArray[np.float64]
     albedo: NDArray[np.float64]
     lambert: bool
     own_bsdf: bool
     pilots: bool
+
+    @cached_property
+    def steepest(self) -> float:
+        """Largest slope of the mesh."""
+        return largest_slope(self.job.grid)
 
     @property
     def lowest_light(self) -> float:
@@ -101,14 +105,11 @@ def simulated(job: Job) -> EffectsPlan:
 
 def _look(job: Job, pilots: bool) -> _Look:
     material = job.material
-    queries = pilot_queries(job, POINTS)
     base = np.asarray(material.basecolor, np.float64)
     own = material.bsdf is not None
     albedo = np.ones((1, 1, 3)) if own else base.reshape(*(base.shape[:-1] or (1, 1)), 3)
     return _Look(
         job,
-        queries.omega_i.astype(np.float64),
-        queries.omega_o.astype(np.float64),
         albedo,
         material.is_lambert and material.coat is None,
         own,
@@ -123,7 +124,9 @@ def _relief(look: _Look) -> ReliefCosts | None:
         return None
     residual = job.residual[0] if job.residual is not None else None
     kernel = LightKernel(job.config.light.width)
-    return relief_costs(job.grid, look.omega_i, look.omega_o, kernel, look.albedo, residual)
+    queries = pilot_queries(job, POINTS)
+    omega_i, omega_o = queries.omega_i.astype(np.float64), queries.omega_o.astype(np.float64)
+    return relief_costs(job.grid, omega_i, omega_o, kernel, look.albedo, residual)
 
 
 def _affordable(effects: list[Effect], tolerance: float) -> list[Effect]:
@@ -172,12 +175,10 @@ def _surface(look: _Look) -> list[Effect]:
 def _normal(look: _Look, costs: ReliefCosts | None) -> Effect:
     job = look.job
     if job.residual is None:
-        reasons = {
-            job.material.normal is None: "no map",
-            job.config.effects.normal == "off": "off in the configuration",
-            look.own_bsdf: "the material has a BSDF of its own",
-        }
-        return Effect("normal", False, reasons[True], 0.0, "exact", False)
+        reason = "no map" if job.material.normal is None else "off in the configuration"
+        if look.own_bsdf:
+            reason = "the material has a BSDF of its own"
+        return Effect("normal", False, reason, 0.0, "exact", False)
     slopes, share = job.residual
     rms = float(np.sqrt(np.mean(np.sum(slopes**2, axis=-1))))
     reason = f"residual slopes of {np.degrees(np.arctan(rms)):.2g} degrees (RMS)"
@@ -219,12 +220,12 @@ def _of_relief(
     """Effects of the relief and the sampling of light, given the surface's."""
     job = look.job
     cap = job.config.transport.max_depth
+    decided["mis"] = wish.decide(_mis(look))
     black = not look.albedo.any() and look.lambert and not (decided["coat"].on or decided["opacity"].on)
     if job.grid.relief == 0.0 or black:
         reason = "flat" if job.grid.relief == 0.0 else "black: nothing is reflected"
         for name in OF_RELIEF:
             decided[name] = wish.decide(Effect(name, False, reason, 0.0, "exact"))
-        decided["mis"] = wish.decide(_mis(look))
         return _assemble(job, _consistent(decided, wish), cap)
     shadowing = _shadowing(look, costs)
     masking = Effect(
@@ -241,7 +242,6 @@ def _of_relief(
         for name in OF_RELIEF[1:]:
             decided[name] = wish.decide(Effect(name, False, "no displaced tile", 0.0, "pilot"))
         decided["masking"] = wish.decide(masking)
-        decided["mis"] = wish.decide(_mis(look))
         return _assemble(job, _consistent(decided, wish), cap)
     decided["masking"] = wish.decide(masking)
     # The estimate shades Lambert: for lobes only the bound counts.
@@ -250,20 +250,19 @@ def _of_relief(
         left -= shadowing.cost
         shadowing = replace(shadowing, on=False)
     decided["shadowing"] = wish.decide(shadowing)
-    decided["mis"] = wish.decide(_mis(look))
     decided["neighbours"] = Effect("neighbours", True, "rays re-enter the tile")
     decided["interreflection"] = Effect("interreflection", True, "not looked at")
     decided["interreflection"], cap, cost = _interreflection(look, wish, decided, left)
-    left -= cost + sum(decided[n].cost or 0.0 for n in ("interreflection",) if not decided[n].on)
+    bounces_left_out = 0.0 if decided["interreflection"].on else decided["interreflection"].cost or 0.0
+    left -= cost + bounces_left_out
     decided["neighbours"] = wish.decide(_neighbours(look, decided, left))
     return _assemble(job, _consistent(decided, wish), cap, cost)
 
 
 def _shadowing(look: _Look, costs: ReliefCosts | None) -> Effect:
-    steepest = largest_slope(look.job.grid)
-    angle = np.degrees(np.arctan(steepest))
+    angle = np.degrees(np.arctan(look.steepest))
     lowest = look.lowest_light
-    if lowest > 0 and steepest <= np.tan(lowest):
+    if lowest > 0 and look.steepest <= np.tan(lowest):
         reason = (
             f"no slope exceeds {angle:.2g} degrees, the light stays above {np.degrees(lowest):.2g} degrees"
         )
@@ -299,7 +298,7 @@ def _bounce_bound(look: _Look) -> float:
     """Interreflection over direct light on a gentle relief: facets of slope s see others only within
     2·atan(s) of their planes, a share sin² of their cosine-weighted view, and these are lit at most by
     1/cos."""
-    share = np.sin(min(2.0 * np.arctan(largest_slope(look.job.grid)), 0.5 * np.pi)) ** 2
+    share = np.sin(min(2.0 * np.arctan(look.steepest), 0.5 * np.pi)) ** 2
     brightest = 1.0 / look.job.config.queries.min_cos
     return float(look.albedo.max() * share * brightest)
 

@@ -101,23 +101,6 @@ def _lambert(slope: F64, light: F64, irradiance: F64) -> F64:
     return np.asarray(lit[:, None])
 
 
-def _from_lobe(kernel: LightKernel, omega_i: F64, rng: np.random.Generator) -> F64:
-    """Directions (n, 3) drawn from light lobes around omega_i, below the horizon too."""
-    if kernel.is_delta:
-        return omega_i
-    xi, turn = rng.random(len(omega_i)), 2.0 * np.pi * rng.random(len(omega_i))
-    versine = -np.log1p(xi * np.expm1(-2.0 * kernel.kappa)) / kernel.kappa
-    sine = np.sqrt(np.maximum(versine * (2.0 - versine), 0.0))
-    helper = np.where(np.abs(omega_i[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
-    first = np.cross(omega_i, helper)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    second = np.cross(omega_i, first)
-    out: F64 = (1.0 - versine)[:, None] * omega_i + sine[:, None] * (
-        np.cos(turn)[:, None] * first + np.sin(turn)[:, None] * second
-    )
-    return out
-
-
 def relief_costs(
     grid: HeightGrid,
     omega_i: F64,
@@ -147,7 +130,7 @@ def relief_costs(
     met, _ = _march(heights, foot, -omega_o, step, grid.relief)
     start = met.copy()
     start[:, 2] = heights(met[:, 0], met[:, 1]) + 0.02 * grid.relief
-    light, irradiance = _from_lobe(kernel, omega_i, rng), kernel.irradiance(omega_i)
+    light, irradiance = kernel.sample(omega_i, rng), kernel.irradiance(omega_i)
     up = np.column_stack([light[:, :2], np.maximum(light[:, 2], 1e-6)])
     _, blocked = _march(heights, start, up, step, grid.relief)
     shadowed = blocked[:, None]

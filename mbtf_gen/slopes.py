@@ -5,7 +5,7 @@ Slopes are rises per length along x = u and y = a·v, both in tile widths; row 0
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,10 +27,11 @@ def height_slopes(grid: HeightGrid) -> NDArray[np.float64]:
     return np.stack([along_x, along_y], axis=-1)
 
 
-def normal_slopes(normal: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Slopes (h, w, 2) that unit normals (h, w, 3) with y along v stand for."""
+def normal_slopes(normal: NDArray[np.floating[Any]], smallest_z: float = _SMALLEST_Z) -> NDArray[np.float64]:
+    """Slopes (h, w, 2) that unit normals (h, w, 3) with y along v stand for, z taken to be at least
+    `smallest_z`."""
     n = normal.astype(np.float64)
-    return -n[..., :2] / np.maximum(n[..., 2:], _SMALLEST_Z)
+    return -n[..., :2] / np.maximum(n[..., 2:], smallest_z)
 
 
 def carried_share(normal: NDArray[np.float64], heights: NDArray[np.float64]) -> float:
