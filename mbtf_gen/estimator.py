@@ -229,7 +229,7 @@ class Estimator:
                 )
                 for shift in (0, 32)
             ]
-            return sequence(*words, lane // spp + dr.opaque(mi.UInt32, first), lane % half)
+            return sequence(words[0], words[1], lane // spp + dr.opaque(mi.UInt32, first), lane % half)
 
         xi = generator(lanes, Purpose.FOOTPRINT).next_2d()
         point = source.footprint(lanes // spp, xi)

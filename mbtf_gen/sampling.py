@@ -47,11 +47,11 @@ def _scramble(x: Any, seed: Any) -> Any:
 
 def _second_coordinate(i: Any) -> Any:
     """Sobol's second coordinate of point i, bit-reversed: i times Pascal's triangle modulo 2."""
-    i = i ^ (i << 16)
-    i = i ^ ((i & 0x00FF00FF) << 8)
-    i = i ^ ((i & 0x0F0F0F0F) << 4)
-    i = i ^ ((i & 0x33333333) << 2)
-    return i ^ ((i & 0x55555555) << 1)
+    i = i ^ (i >> 16)
+    i = i ^ ((i & 0xFF00FF00) >> 8)
+    i = i ^ ((i & 0xF0F0F0F0) >> 4)
+    i = i ^ ((i & 0xCCCCCCCC) >> 2)
+    return i ^ ((i & 0xAAAAAAAA) >> 1)
 
 
 def _unit(x: Any) -> Any:
