@@ -170,7 +170,7 @@ def make_shards(
             reached.add(done)
         if progress is not None:
             rate = made.paths / max(time.perf_counter() - start, 1e-9)
-            error = f", error {reached.relative_error():.2%}" if reached.train else ""
+            error = f", noise {reached.relative_error():.2%}" if reached.train else ""
             progress(made.paths, f"{rate / 1e6:.2f} M paths/s{error}")
 
     def store(shard: Rendered, path: Path) -> None:
