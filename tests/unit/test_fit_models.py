@@ -122,7 +122,9 @@ def test_gradients_agree_with_finite_differences(variant: str) -> None:
         out: torch.Tensor = torch.func.functional_call(model, dict(zip(names, tensors, strict=True)), at)
         return out
 
-    assert torch.autograd.gradcheck(value, parameters, eps=1e-7, atol=1e-5, rtol=1e-3, fast_mode=True, check_undefined_grad=False)
+    assert torch.autograd.gradcheck(
+        value, parameters, eps=1e-7, atol=1e-5, rtol=1e-3, fast_mode=True, check_undefined_grad=False
+    )
 
 
 def test_the_offset_follows_the_papers_formula() -> None:
