@@ -56,7 +56,6 @@ RELAYS = {
         "_manifest_faults",
         "_record_of",
         "examine",
-        "shard_faults",
     },
     "mbtf_gen/wording.py": {"explain"},
 }
