@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import re
 import shutil
@@ -11,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from conftest import RunPython
 from support.datasets import edit
 from support.file_operations import FileOperations, Operation
 from support.small_runs import command, contents, die, ending, generate, in_child, noisy_plane
@@ -171,3 +173,21 @@ def test_a_kill_at_any_file_operation_loses_nothing(name: str, thorough: bool, s
         assert generate(line) == 0, operation
         assert contents(small.out) == small.expected, operation
     assert killed > 3
+
+
+@pytest.mark.parametrize(
+    "amounts",
+    [
+        "--kills 6 --flips 200 --repairs 5 --rendered 0",
+        pytest.param("--kills 150 --flips 3000 --repairs 60 --rendered 6", marks=pytest.mark.slow),
+    ],
+)
+def test_random_kills_lose_nothing_and_random_damage_is_found(amounts: str, run_python: RunPython) -> None:
+    script = Path(__file__).parents[2] / "benchmarks/crash_safety.py"
+    done = run_python(str(script), *amounts.split())
+    assert done.returncode == 0, done.stdout + done.stderr
+    figures = json.loads(done.stdout.splitlines()[-1])
+    assert figures["lost or not found"] == 0
+    assert figures["killed"]["kills"] >= 6
+    assert figures["killed"]["data sets"] > 0
+    assert figures["damaged"]["cuts"] > 0
