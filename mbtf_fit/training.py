@@ -19,8 +19,9 @@ from .blur import annealed_sigma
 from .config import FitConfig, TrainingSection
 from .data import Queries, TrainingQueries
 from .inference import predict
-from .losses import Loss, relative_error, squared_error
+from .losses import Objective
 from .models import NeuralMaterial
+from .noise import NoiseModel
 from .parallel import Workers
 
 # Decay of Adam's running means of the gradient and of its square.
@@ -58,13 +59,16 @@ class Trainer:
     ----------
     model : initialised, on the device
     queries : on the device
+    noise : model of their noise; :meth:`NoiseModel.silent` where there is none
 
     Attributes
     ----------
     progress : how far it is
     """
 
-    def __init__(self, config: FitConfig, model: NeuralMaterial, queries: TrainingQueries) -> None:
+    def __init__(
+        self, config: FitConfig, model: NeuralMaterial, queries: TrainingQueries, noise: NoiseModel
+    ) -> None:
         self.config = config
         self.model = model
         self.queries = queries
@@ -72,16 +76,7 @@ class Trainer:
         self.batch = min(config.training.batch, len(queries))
         texels, weights = model.parameter_groups()
         self.optimiser = torch.optim.Adam([{"params": texels}, {"params": weights}], betas=BETAS, fused=True)
-        self.loss = self._choose_loss()
-
-    def _choose_loss(self) -> Loss:
-        value = self.queries.value
-        if self.config.training.loss == "relative":
-            return relative_error(float(value.mean()) or 1.0)
-        variance = float(value.var(0, correction=0).mean()) if len(value) > 1 else 0.0
-        power = float(value.square().mean())
-        # Of constant data the variance is rounding error: measure by the values themselves.
-        return squared_error(variance if variance > 1e-6 * power else power or 1.0)
+        self.loss = Objective(config.training, noise)
 
     @property
     def share(self) -> float:
@@ -154,7 +149,7 @@ class Trainer:
 
     def _loss(self, batch: TrainingQueries) -> Tensor:
         prediction = self.model(batch.u, batch.sigma, batch.omega_i, batch.omega_o)
-        return self.loss(prediction, batch.value)
+        return self.loss(prediction, batch)
 
     def _step(self, batch: TrainingQueries, workers: Workers) -> Tensor:
         training = self.config.training
