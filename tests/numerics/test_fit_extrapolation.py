@@ -14,7 +14,7 @@ from support.surfaces import towards
 from mbtf_fit.config import FitConfig
 from mbtf_fit.material import Material, export
 from mbtf_fit.models import Neumip, build_model
-from mbtf_fit.models.neumip import GRAZING
+from mbtf_fit.models.textured import GRAZING
 from mbtf_gen.levels import Lattice
 
 LATTICE = Lattice(3)
