@@ -226,7 +226,10 @@ def _scatter(clouds: Sequence[Cloud], x: str, y: str, front: Sequence[tuple[floa
     if front:
         fx, fy = np.asarray(front, float).T
         axes.step(fx, fy, where="post", color=_INK, linewidth=1.3, linestyle=(0, (4, 2)), label="front")
-    axes.margins(x=0.12, y=0.12)
+    axes.margins(y=0.12)
+    # Room for the last point's name.
+    left, right = axes.get_xlim()
+    axes.set_xlim(left, right * (right / left) ** 0.25)
     for axis in (axes.xaxis, axes.yaxis):
         _plain_ticks(axis)
     axes.legend(frameon=False, fontsize=8.5)

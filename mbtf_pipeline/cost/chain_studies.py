@@ -11,7 +11,9 @@ GENERATOR, DATA, FIT, WHOLE = 0.2, 0.2, 0.2, 0.33
 # The shortest whole chain, seconds, and the share of it that generates.
 SHORTEST = 60.0
 SPLITS = (0.25, 0.5, 0.75)
-PATHS = (2, 4, 8, 16, 64)
+PATHS = (2, 4, 16, 64)
+# Path budgets at which they are compared, of the largest.
+PATH_SHARES = (0.4, 1.6)
 MODELS = ("neumip", "neumip-baseline")
 WIDTHS = (16, 40)
 _FEWEST_QUERIES = 20_000
@@ -41,14 +43,14 @@ def chains(budget: float, spp: int, price: Price) -> Iterator[Chain]:
     price : seconds that a query takes to generate, by its number of paths
     """
     yield from _whole(WHOLE * budget, spp, price)
-    # Each point of this study generates for a third of its time and trains for the rest.
-    each = DATA * budget / len(PATHS)
+    # On average a point of this study generates for a third of its time and trains for the rest.
+    each = DATA * budget / (len(PATHS) * len(PATH_SHARES))
     paths = spp * _queries(each / 3, spp, price)
     for n in PATHS:
-        queries = max(_FEWEST_QUERIES, paths // n)
-        yield Chain(
-            "data", f"{paths / 1e6:.3g} M paths", f"{n} paths/query", queries, n, _fit("neumip", 2 * each / 3)
-        )
+        for share in PATH_SHARES:
+            queries = max(_FEWEST_QUERIES, int(share * paths) // n)
+            name = f"{queries * n / 1e6:.3g} M paths"
+            yield Chain("data", f"{n} paths/query", name, queries, n, _fit("neumip", 2 * each / 3))
     yield from _fits(FIT * budget, spp, price)
 
 

@@ -56,9 +56,10 @@ class Chain:
         """What the point depends on besides the study's basis."""
         return {"queries": self.queries, "spp": self.spp, "fit": self.fit}
 
-    def seconds(self, price: Callable[[int], float]) -> float:
-        """What it will take, where a query of so many paths takes ``price(paths)`` seconds to generate."""
-        return self.queries * price(self.spp) + parse_duration(self.fit["training"]["time"])
+    def seconds(self, price: Callable[[int], float], *, data: bool = True) -> float:
+        """What it will take, where a query of so many paths takes ``price(paths)`` seconds to generate;
+        `data`: the data are still to be made."""
+        return data * self.queries * price(self.spp) + parse_duration(self.fit["training"]["time"])
 
 
 @dataclass(frozen=True)
@@ -120,6 +121,10 @@ class Workshop:
             self.progress(f"{queries / 1e6:.2f} M queries of {spp} paths")
             self._made[key] = self._generate(str(queries), spp, _FEWEST, 2, "data")
         return self._made[key]
+
+    def has(self, chain: Chain) -> bool:
+        """Whether the data of a chain are there."""
+        return f"{chain.queries}-{chain.spp}" in self._made
 
     def forget(self, queries: int, spp: int) -> None:
         """Remove training data that no other chain needs."""

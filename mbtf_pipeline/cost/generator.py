@@ -25,17 +25,21 @@ from mbtf_gen.planning import plan_effects
 from mbtf_gen.queries import Queries
 from mbtf_gen.stats import Estimate, mean_estimate
 
-# Queries at which a bias is measured, and paths that the reference and the setting get at each.
-BIAS_QUERIES = 4096
-BIAS_SPP = 512
-# Paths of one timed piece, and the half-width of a 95 % interval at which timing stops.
+# Queries of one piece of the reference, and paths that it and the setting get at each.
+BIAS_QUERIES = 16384
+BIAS_SPP = 64
+_MOST_BIAS_PIECES = 16
+# Paths of one timed piece.
 _PIECE_PATHS = 1 << 19
-_HALF_WIDTH = 0.1
 _FEWEST_PIECES = 4
-# Shards that stand for the study's streams of random numbers: no data set has so many.
-_REFERENCE_SHARD = 900_001
-_FRESH_SHARD = 900_002
-_FIRST_PIECE = 900_003
+# Half-width of a 95 % interval, relative, at which measuring stops; and the bias below which none is looked
+# for.
+_HALF_WIDTH = 0.1
+_NEGLIGIBLE = 0.005
+# Shards, of this many queries, that stand for the study's streams of random numbers.
+_SHARD = 1 << 14
+_FIRST_REFERENCE = 5_001
+_FIRST_PIECE = 10_001
 
 
 @dataclass(frozen=True)
@@ -45,13 +49,23 @@ class Measured:
     Attributes
     ----------
     seconds : per million queries
-    bias, noise, error : root mean squares relative to the reference's mean value
+    bias, noise, error : root mean squares relative to the reference's mean value; no bias where setting and
+        reference trace the same
     """
 
     seconds: Estimate
-    bias: Estimate
+    bias: Estimate | None
     noise: Estimate
     error: Estimate
+
+
+@dataclass(frozen=True)
+class _Reference:
+    """Queries and both halves (n, 3) of the reference's values there."""
+
+    queries: Queries
+    a: NDArray[np.float64]
+    b: NDArray[np.float64]
 
 
 @dataclass
@@ -67,13 +81,17 @@ class Bench:
     config: GeneratorConfig
     material: Material
     seed: int
-    _references: dict[str, Any] = field(default_factory=dict, repr=False)
+    _references: dict[str, _Reference] = field(default_factory=dict, repr=False)
 
     def job(self, changes: dict[str, Any]) -> Job:
         """The job of the configuration with options changed, by dotted name."""
         data = self.config.model_dump(mode="json")
         levels = Job.of(self.config, self.material).lattice.finest
-        fixed = {"queries.levels": levels, "queries.layout": "shuffled"}
+        fixed = {
+            "queries.levels": levels,
+            "queries.layout": "shuffled",
+            "output.shard_queries": _SHARD,
+        }
         for name, value in {**fixed, **changes}.items():
             section, _, key = name.rpartition(".")
             (data[section] if section else data)[key] = value
@@ -83,44 +101,54 @@ class Bench:
         """Queries as a test split has them, one leading axis."""
         return job.plan().draw("test", shard, count)
 
-    def reference(
-        self, changes: dict[str, Any]
-    ) -> tuple[Queries, NDArray[np.float64], NDArray[np.float64], float]:
-        """(queries, both halves, mean value) of the converged reference with these options."""
-        key = repr(sorted(changes.items()))
+    def reference(self, changes: dict[str, Any], piece: int) -> _Reference:
+        """One piece of the converged reference with these options."""
+        key = f"{sorted(changes.items())!r} {piece}"
         if key not in self._references:
             job = self.job({"effects.mode": "all", "transport.max_depth": 0, **changes})
-            queries = self.queries(job, _REFERENCE_SHARD, BIAS_QUERIES)
-            found = job.estimator(plan_effects(job)).estimate(
-                queries, BIAS_SPP, Stream(self.seed, "test", _REFERENCE_SHARD)
-            )
+            queries = self.queries(job, _FIRST_REFERENCE + piece, BIAS_QUERIES)
+            found = job.estimator(plan_effects(job)).estimate(queries, BIAS_SPP, self._stream(piece))
             a, b = found.value_a.astype(np.float64), found.value_b.astype(np.float64)
-            self._references[key] = (queries, a, b, float((a + b).mean() / 2))
-        out: tuple[Queries, NDArray[np.float64], NDArray[np.float64], float] = self._references[key]
-        return out
+            self._references[key] = _Reference(queries, a, b)
+        return self._references[key]
 
-    def measure(
-        self, changes: dict[str, Any], against: dict[str, Any], seconds: float, *, fresh: bool = False
-    ) -> Measured:
+    def _stream(self, piece: int) -> Stream:
+        return Stream(self.seed, "test", _FIRST_REFERENCE + piece)
+
+    def measure(self, changes: dict[str, Any], against: dict[str, Any] | None, seconds: float) -> Measured:
         """Price and error of a setting.
 
         Parameters
         ----------
-        changes : options of the setting; against : options of the reference
-        seconds : spent on timing at most; less where the error bars are small before
-        fresh : random numbers and number of paths of the setting's own; where setting and reference trace the
-            same, with the same numbers their difference would be zero by construction
+        changes : options of the setting; against : options of the reference, or None where the setting only
+            takes another number of paths, which leaves no bias
+        seconds : spent on each of timing and bias at most; less where the error bars are small before
         """
-        queries, r, s, mean = self.reference(against)
         job = self.job(changes)
         estimator = job.estimator(plan_effects(job))
-        spp = job.config.queries.spp
-        shard, paths = (_FRESH_SHARD, spp) if fresh else (_REFERENCE_SHARD, BIAS_SPP)
-        found = estimator.estimate(queries, paths, Stream(self.seed, "test", shard))
-        a, b = found.value_a.astype(np.float64), found.value_b.astype(np.float64)
-        bias = mean_estimate((a - r) * (b - s) / mean**2)
-        noise, price = self._noise(job, estimator, spp, seconds, mean)
+        first = self.reference(against or {}, 0)
+        mean = float((first.a + first.b).mean() / 2)
+        noise, price = self._noise(job, estimator, job.config.queries.spp, seconds, mean)
+        if against is None:
+            return Measured(price, None, _root(noise), _root(noise))
+        bias = self._bias(estimator, against, seconds, mean)
         return Measured(price, _root(bias), _root(noise), _root(_total(bias, noise)))
+
+    def _bias(self, estimator: Any, against: dict[str, Any], seconds: float, mean: float) -> Estimate:
+        """Squared bias relative to the mean value squared."""
+        began = time.perf_counter()
+        squares: list[NDArray[np.float64]] = []
+        while True:
+            piece = len(squares)
+            reference = self.reference(against, piece)
+            found = estimator.estimate(reference.queries, BIAS_SPP, self._stream(piece))
+            a, b = found.value_a.astype(np.float64), found.value_b.astype(np.float64)
+            squares.append(((a - reference.a) * (b - reference.b)).mean(axis=1) / mean**2)
+            square = mean_estimate(np.concatenate(squares))
+            sure = 1.96 * square.error <= max(2 * _HALF_WIDTH * square.value, _NEGLIGIBLE**2)
+            late = time.perf_counter() - began > seconds or len(squares) == _MOST_BIAS_PIECES
+            if sure or late:
+                return square
 
     def _noise(
         self, job: Job, estimator: Any, spp: int, seconds: float, mean: float

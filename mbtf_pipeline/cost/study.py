@@ -187,7 +187,7 @@ def _measure_chains(
     try:
         for number, task in enumerate(tasks):
             point = store.get(task.study, task.key)
-            if point is None and left() > task.seconds(price):
+            if point is None and left() > task.seconds(price, data=not work.has(task)):
                 point = work.measure(task)
                 store.put(task.key, point)
             _keep(study, point, f"{task.study}: {task.series}, {task.name}")
