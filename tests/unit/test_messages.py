@@ -49,6 +49,7 @@ RELAYS = {
     "mbtf_gen/settings.py": {"_explain", "build"},
     "mbtf_gen/verification.py": {"shard_fault", "verify"},
     "mbtf_gen/wording.py": {"explain"},
+    "mbtf_pipeline/cli.py": {"cost"},
 }
 
 
