@@ -115,8 +115,8 @@ class TrainingBuffers:
         )
 
     def batches(self, size: int, seed: int, step: int, margin: int) -> Iterator[Crops]:
-        """Endless batches of at most about `size` queries from a step on, crops of buffers at random: no buffer
-        comes twice before all have come once."""
+        """Endless batches of at most about `size` queries from a step on: crops of buffers, each buffer once
+        before any comes twice."""
         count, rows, columns = self.u.shape[:3]
         side = min(CROP, rows, columns, max(1, round(size**0.5)))
         items = max(1, size // side**2)
