@@ -38,6 +38,7 @@ from .config import Correction, LossKind, TrainingSection
 from .noise import NoiseModel
 
 if TYPE_CHECKING:
+    from .buffers import Crops
     from .data import TrainingQueries
 
 # Absolute terms are parabolas below this, in units of f.
@@ -199,7 +200,7 @@ class Objective:
         straight = all(term.kind in _STRAIGHT for term in training.losses)
         self._needs_variance = training.correction != "none" and not straight
 
-    def __call__(self, prediction: Tensor, queries: TrainingQueries) -> Tensor:
+    def __call__(self, prediction: Tensor, queries: TrainingQueries | Crops) -> Tensor:
         """Weighted sum of the terms' means for predictions (n, 3), or (items, rows, columns, 3)."""
         still, value = prediction.detach(), queries.value
         if self._robust is not None:
