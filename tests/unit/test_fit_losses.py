@@ -33,8 +33,8 @@ def queries(value: Tensor) -> TrainingQueries:
 
 def minimum(loss: Objective, value: Tensor) -> float:
     """Prediction at which the mean gradient over values (n, 1) vanishes, by bisection."""
-    low, high = 0.01, 5.0
-    for _ in range(40):
+    low, high = 0.2, 2.0
+    for _ in range(24):
         middle = (low + high) / 2
         p = torch.full_like(value, middle, requires_grad=True)
         (gradient,) = torch.autograd.grad(loss(p, queries(value)), p)
@@ -46,7 +46,7 @@ def skewed(relative: float) -> Tensor:
     """Values of mean 1 with gamma noise of a relative deviation, as paths make it: never negative, skewed."""
     random = np.random.default_rng(1)
     shape = 1 / relative**2
-    value = random.gamma(shape, 1 / shape, (100_000, 1))
+    value = random.gamma(shape, 1 / shape, (20_000, 1))
     return torch.from_numpy(value / value.mean())
 
 
