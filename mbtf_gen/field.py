@@ -250,12 +250,12 @@ def _step(field: HeightField, walk: Walk, slant: Slant, max_crossings: Any) -> W
     # Modulo the period.
     walk.column = dr.select(i < 0, field.columns - 1, dr.select(i >= field.columns, 0, i))
     walk.row = dr.select(j < 0, field.rows - 1, dr.select(j >= field.rows, 0, j))
-    crossed = (walk.column != i) | (walk.row != j)
-    walk.capped = crossed & (walk.crossings >= max_crossings)
-    walk.crossings += dr.select(crossed & ~walk.capped, mi.UInt32(1), 0)
     gone = slant.rising & (walk.z >= field.top)
     if field.two_sided:
         gone = (gone & (slant.side > 0)) | (~slant.rising & (walk.z <= field.bottom) & (slant.side < 0))
+    crossed = ((walk.column != i) | (walk.row != j)) & ~gone
+    walk.capped = crossed & (walk.crossings >= max_crossings)
+    walk.crossings += dr.select(crossed & ~walk.capped, mi.UInt32(1), 0)
     walk.searching = ~walk.hit & ~gone & ~walk.capped
     return walk
 
@@ -312,7 +312,7 @@ def _search(
             walk.crossings = crossings
             walk = _follow(field, walk, slant, max_crossings)
             si = _surface(field, walk, slant, ray.d)
-            searching = walk.hit & (rng.next_float32() >= holes.opacity(si))
+            searching = walk.hit & (rng.chance() >= holes.opacity(si))
             walk.hit &= ~searching
             ray.o = dr.select(searching, field.leave(si, ray.d).o, ray.o)
             below ^= searching

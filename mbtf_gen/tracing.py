@@ -185,7 +185,7 @@ def _visible(world: World, path: Path, transport: Transport) -> tuple[Any, Any, 
     if not transport.displacement:
         si = _on_plane(world, path.ray, path.active)
         if holes is not None:
-            si.t = dr.select(path.rng.next_float32() < holes.opacity(si), si.t, dr.inf)
+            si.t = dr.select(path.rng.chance() < holes.opacity(si), si.t, dr.inf)
         capped = mi.Bool(False)
     else:
         si, _, capped, path.rng = closest_hit(
