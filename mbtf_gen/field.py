@@ -306,12 +306,11 @@ def _search(
         walk = _follow(field, walk, slant, max_crossings)
     else:
         ray, below, searching = mi.Ray3f(ray), mi.Bool(below), mi.Bool(active)
-        while dr.hint(searching, exclude=[field, holes]):
-            crossings = walk.crossings
-            walk, slant = _start(field, ray, searching, below)
-            walk.crossings = crossings
-            walk = _follow(field, walk, slant, max_crossings)
-            si = _surface(field, walk, slant, ray.d)
+        while dr.hint(searching, exclude=[field, holes, slant]):
+            piece, way = _start(field, ray, searching, below)
+            piece.crossings = walk.crossings
+            walk = _follow(field, piece, way, max_crossings)
+            si = _surface(field, walk, way, ray.d)
             searching = walk.hit & (rng.chance() >= holes.opacity(si))
             walk.hit &= ~searching
             ray.o = dr.select(searching, field.leave(si, ray.d).o, ray.o)

@@ -30,5 +30,3 @@ def mesh_of_grid(grid: HeightGrid, unit: float, apron: tuple[int, int], bsdf: An
     params["faces"] = faces.ravel()
     params.update()
     return mesh
-
-

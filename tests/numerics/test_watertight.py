@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 from support.scenes import build_tile, lambert, mi, rocks
 
-from mbtf_gen.heightfield import HeightGrid
 from mbtf_gen.field import closest_hit
+from mbtf_gen.heightfield import HeightGrid
 from mbtf_gen.scene import CLEARANCE
 
 RAYS = 10_000_000

@@ -23,9 +23,9 @@ from support.scenes import (
 )
 
 from mbtf_gen.camera import Camera
+from mbtf_gen.field import closest_hit
 from mbtf_gen.heightfield import tile_mesh
 from mbtf_gen.levels import Lattice, texel_centres
-from mbtf_gen.field import closest_hit
 from mbtf_gen.queries import Mixture, QueryPlan
 
 ROWS, COLUMNS = 4, 8

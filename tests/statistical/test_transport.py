@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+
 import numpy as np
 import pytest
 from support.scenes import (
     DIRECT,
     HeightGrid,
     LightKernel,
-    Transport,
     build_tile,
     direction,
     estimate,
