@@ -58,6 +58,7 @@ RELAYS = {
         "examine",
     },
     "mbtf_gen/wording.py": {"explain"},
+    "mbtf_pipeline/cli.py": {"cost"},
 }
 
 
