@@ -22,10 +22,13 @@ from mbtf_gen.levels import Lattice, level_of_sigma
 from mbtf_gen.shard_files import read_shard
 
 from .config import HeldOutSection
-from .data import MAX_HELD_OUT, SAMPLE, Partition, Queries, in_region, read_checked
+from .data import SAMPLE, Partition, Queries, in_region, read_checked
 
 # Places along each side of a crop that are compared with values.
 CROP = 32
+# Held-out queries of each kind: those of a buffer have everything in common but their place, so more say
+# little.
+HELD_OUT = 1 << 14
 # Number of the random stream that decides what is held out; those of batches count up from 0.
 _MARKS = 1 << 62
 
@@ -210,5 +213,5 @@ def load_buffers(data: Dataset, held_out: HeldOutSection, seed: int) -> Partitio
         torch.from_numpy(value),
         strides(data.lattice, sigma),
     )
-    kept_out = [_some(Queries.join(group), MAX_HELD_OUT, random) for group in out]
+    kept_out = [_some(Queries.join(group), HELD_OUT, random) for group in out]
     return Partition(training, kept_out[0], kept_out[1], Queries.join(sample))
