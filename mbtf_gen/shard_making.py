@@ -23,7 +23,7 @@ from .schema import FORMAT_NAME, SCHEMA_VERSION
 from .shard_files import write_shard
 from .shard_writer import ShardWriter
 from .tally import Tally, refuse_nonfinite
-from .verification import finished_record, shard_fault, sidecar_of
+from .verification import finished_record, sidecar_of
 
 if TYPE_CHECKING:
     from .generation import Job
@@ -66,7 +66,9 @@ class Claims:
     ) -> None:
         self.busy: list[Path] = []
         self._job, self._folder, self._entries = job, folder, entries
-        self._condemned, self._skipped = condemned, skipped
+        self._skipped = skipped
+        # What is condemned is another one once somebody has made it again.
+        self._stamps = {file: _stamp(folder / file) for file in condemned}
         self._held: set[Lock] = set()
 
     def __enter__(self) -> Claims:
@@ -82,17 +84,14 @@ class Claims:
         self._held.discard(lock)
 
     def _finished(self, entry: ShardEntry, path: Path) -> dict[str, Any] | None:
-        record = finished_record(path, entry.rows, self._job.config_hash)
-        if record is None or entry.file not in self._condemned:
-            return record
-        return record if shard_fault(path, entry.rows, self._job.config_hash) is None else None
+        if entry.file in self._stamps and self._stamps[entry.file] == _stamp(path):
+            return None
+        return finished_record(path, entry.rows, self._job.config_hash)
 
     def __iter__(self) -> Iterator[Claim]:
         for entry in self._entries:
             path = self._folder / entry.file
-            record = None
-            if entry.file not in self._condemned:
-                record = self._finished(entry, path)
+            record = self._finished(entry, path)
             if record is None:
                 lock = take_lock(path)
                 if lock is None:
@@ -107,6 +106,15 @@ class Claims:
                     self._held.discard(lock)
                     lock.release()
             self._skipped(record)
+
+
+def _stamp(path: Path) -> tuple[int, int] | None:
+    """What tells a sidecar from one that was written later; None without one."""
+    try:
+        found = sidecar_of(path).stat()
+    except OSError:
+        return None
+    return found.st_ino, found.st_mtime_ns
 
 
 @dataclass(frozen=True)
