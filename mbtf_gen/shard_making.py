@@ -18,6 +18,7 @@ from .effects import EffectsPlan
 from .estimates import Estimates, Stream
 from .locks import Lock, lock_owner, take_lock
 from .manifest import ShardEntry, effects_digest
+from .output_folder import sweep
 from .queries import Queries
 from .schema import FORMAT_NAME, SCHEMA_VERSION
 from .shard_files import write_shard
@@ -135,7 +136,7 @@ class Made:
     ----------
     paths : traced; shards : their files; busy : files left to other processes
     seconds : in all
-    writing : seconds that writing and digesting took beside the rendering
+    writing : processor seconds that writing and digesting took beside the rendering
     waiting : seconds that rendering waited for it
     """
 
@@ -184,6 +185,8 @@ def make_shards(
     def store(shard: Rendered, path: Path) -> None:
         records.append(store_shard(job, shard, path, effects))
 
+    # What killed runs left takes room that may be wanting.
+    sweep(folder)
     plan = job.plan()
     estimator: Any = None
     with ExitStack() as stack:
@@ -230,8 +233,6 @@ def _one_ahead(
 
 def store_shard(job: Job, shard: Rendered, path: Path, effects: EffectsPlan) -> dict[str, Any]:
     """Write a shard and its sidecar; returns the sidecar."""
-    for stale in path.parent.glob(f".{path.stem}.*.tmp"):
-        remove_file(stale)
     # A sidecar of before would vouch for the new file if this run were killed between the two.
     remove_file(sidecar_of(path))
     queries, estimates = shard.queries, shard.estimates
