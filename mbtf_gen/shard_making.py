@@ -269,8 +269,8 @@ def quarantined(estimates: Estimates) -> dict[str, Any]:
 def sidecar(job: Job, shard: Rendered, file: str, stored: Stored, effects: EffectsPlan) -> dict[str, Any]:
     """Content of a shard's sidecar."""
     entry, estimates = shard.entry, shard.estimates
-    a = estimates.value_a.astype(np.float64)
-    b = estimates.value_b.astype(np.float64)
+    a, b = estimates.value_a, estimates.value_b
+    difference = (a - b).astype(np.float64)
     return {
         "format": FORMAT_NAME,
         "schema": SCHEMA_VERSION,
@@ -289,8 +289,8 @@ def sidecar(job: Job, shard: Rendered, file: str, stored: Stored, effects: Effec
         "seconds": round(shard.seconds, 4),
         "quarantined": quarantined(estimates),
         "statistics": {
-            "mean_value": (0.5 * (a + b)).mean(axis=0).tolist(),
-            "mean_variance": (0.25 * (a - b) ** 2).mean(axis=0).tolist(),
+            "mean_value": (0.5 * sum(half.mean(axis=0, dtype=np.float64) for half in (a, b))).tolist(),
+            "mean_variance": (0.25 * np.square(difference).mean(axis=0)).tolist(),
         },
     }
 
