@@ -21,7 +21,10 @@ from .data import Queries, TrainingQueries
 from .inference import predict
 from .losses import Loss, relative_error, squared_error
 from .models import NeuralMaterial
-from .parallel import Workers
+from .native import kernel
+from .native.model import unsupported_reason
+from .native.stepper import NativeStepper
+from .parallel import MAX_KERNEL_THREADS, Workers
 
 # Decay of Adam's running means of the gradient and of its square.
 BETAS = (0.8, 0.95)
@@ -73,6 +76,17 @@ class Trainer:
         texels, weights = model.parameter_groups()
         self.optimiser = torch.optim.Adam([{"params": texels}, {"params": weights}], betas=BETAS, fused=True)
         self.loss = self._choose_loss()
+        found = kernel()
+        self._stepper = (
+            NativeStepper(found, model, self.optimiser)
+            if found is not None and unsupported_reason(model) is None
+            else None
+        )
+
+    @property
+    def path(self) -> str:
+        """What computes the steps: ``kernel`` and its instruction set, or ``pytorch``."""
+        return "pytorch" if self._stepper is None else f"kernel {self._stepper.kernel.name}"
 
     def _choose_loss(self) -> Loss:
         value = self.queries.value
@@ -115,7 +129,8 @@ class Trainer:
         until = time.perf_counter() + seconds
         losses: list[Tensor] = []
         batches = self._batches()
-        with Workers(self.queries.u.device) as workers:
+        limit = None if self._stepper is None else MAX_KERNEL_THREADS
+        with Workers(self.queries.u.device, limit=limit) as workers:
             while self.share < 1.0:
                 start = time.perf_counter()
                 if start >= until and losses:
@@ -144,17 +159,23 @@ class Trainer:
                 raise
             raise self._divergence() from None
 
-    def _tables(self) -> list[Tensor]:
-        """The textures through the blur of this moment."""
+    def _sigmas(self) -> list[float]:
+        """Blur of each texture at this moment, in texels of the finest level."""
         blur = self.config.training.blur
         sigma = annealed_sigma(self.share / blur.share, blur.start, blur.end)
-        return [
-            t.blurred(max(sigma, blur.offset) if t.moves_lookups else sigma) for t in self.model.textures()
-        ]
+        return [max(sigma, blur.offset) if t.moves_lookups else sigma for t in self.model.textures()]
+
+    def _tables(self) -> list[Tensor]:
+        """The textures through the blur of this moment."""
+        return [t.blurred(sigma) for t, sigma in zip(self.model.textures(), self._sigmas(), strict=True)]
+
+    def _objective(self, prediction: Tensor, batch: TrainingQueries) -> Tensor:
+        """Mean loss of predictions (n, 3) of a batch."""
+        return self.loss(prediction, batch.value)
 
     def _loss(self, batch: TrainingQueries) -> Tensor:
         prediction = self.model(batch.u, batch.sigma, batch.omega_i, batch.omega_o)
-        return self.loss(prediction, batch.value)
+        return self._objective(prediction, batch)
 
     def _step(self, batch: TrainingQueries, workers: Workers) -> Tensor:
         training = self.config.training
@@ -163,6 +184,8 @@ class Trainer:
             self.optimiser.param_groups, (training.texture_rate, training.rate), strict=True
         ):
             group["lr"] = rate * factor
+        if self._stepper is not None:
+            return self._stepper.step(self._objective, batch, self._sigmas(), workers)
         texels, weights = self.model.parameter_groups()
         # Queries read detached tables; what they give goes back through the blur once, for all of them.
         tables = self._tables()
