@@ -20,7 +20,8 @@ from mbtf_gen.stats import unexplained_variance
 from .config import FitConfig
 from .data import Partition, Queries, data_hash, load_training, open_data
 from .evaluation import judge
-from .material import DESCRIPTION_NAME, WEIGHTS_NAME, Material, export
+from .material import Material, export
+from .material_format import DESCRIPTION_NAME, WEIGHTS_NAME
 from .memory import keep_freed_memory
 from .models import MODELS, build_model
 from .storage import read_tensors, write_tensors
@@ -229,7 +230,8 @@ def _resume(trainer: Trainer, out: Path) -> bool:
 
 
 def _train(trainer: Trainer, held_out: Queries, out: Path, progress: ProgressCallback) -> None:
-    glance = held_out.take(slice(_GLANCE))
+    # Looking costs time, of a model of neighbourhoods more than of the others.
+    glance = held_out.take(slice(max(_GLANCE // trainer.model.positions, _GLANCE // 16)))
     saved = time.perf_counter()
     done = trainer.share >= 1.0
     while not done:

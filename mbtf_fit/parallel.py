@@ -11,11 +11,12 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from types import TracebackType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
+from .buffers import Crops
 from .data import TrainingQueries
 
 # Python itself is busy for a part of each step, and one thread at a time: more than these do not pay.
@@ -25,7 +26,8 @@ MAX_KERNEL_THREADS = 32
 
 T = TypeVar("T")
 
-Loss = Callable[[TrainingQueries], Tensor]
+Batch = TrainingQueries | Crops
+Loss = Callable[[Any], Tensor]
 
 
 class Workers:
@@ -65,9 +67,7 @@ class Workers:
         parts = range(self.count)
         return list(map(work, parts) if self._pool is None else self._pool.map(work, parts))
 
-    def gradients(
-        self, loss: Loss, batch: TrainingQueries, inputs: Sequence[Tensor]
-    ) -> tuple[Tensor, list[Tensor]]:
+    def gradients(self, loss: Loss, batch: Batch, inputs: Sequence[Tensor]) -> tuple[Tensor, list[Tensor]]:
         """Mean loss of a batch, and its gradients by `inputs`.
 
         Parameters
@@ -76,9 +76,9 @@ class Workers:
         """
         n = len(batch)
         edges = [n * k // self.count for k in range(self.count + 1)]
-        parts = [batch.slice(a, b) for a, b in pairwise(edges) if b > a]
+        parts: list[Batch] = [batch.slice(a, b) for a, b in pairwise(edges) if b > a]
 
-        def work(part: TrainingQueries) -> tuple[Tensor, tuple[Tensor, ...]]:
+        def work(part: Batch) -> tuple[Tensor, tuple[Tensor, ...]]:
             value = loss(part) * (len(part) / n)
             return value.detach(), torch.autograd.grad(value, inputs)
 

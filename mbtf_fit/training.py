@@ -16,6 +16,7 @@ from torch import Tensor
 from mbtf_gen.errors import InputError
 
 from .blur import annealed_sigma
+from .buffers import Crops, TrainingBuffers
 from .config import FitConfig, TrainingSection
 from .data import Queries, TrainingQueries
 from .inference import predict
@@ -24,7 +25,7 @@ from .models import NeuralMaterial
 from .native import kernel
 from .native.model import unsupported_reason
 from .native.stepper import NativeStepper
-from .parallel import MAX_KERNEL_THREADS, Workers
+from .parallel import MAX_KERNEL_THREADS, Batch, Workers
 
 # Decay of Adam's running means of the gradient and of its square.
 BETAS = (0.8, 0.95)
@@ -67,7 +68,9 @@ class Trainer:
     progress : how far it is
     """
 
-    def __init__(self, config: FitConfig, model: NeuralMaterial, queries: TrainingQueries) -> None:
+    def __init__(
+        self, config: FitConfig, model: NeuralMaterial, queries: TrainingQueries | TrainingBuffers
+    ) -> None:
         self.config = config
         self.model = model
         self.queries = queries
@@ -105,19 +108,9 @@ class Trainer:
             return min(1.0, self.progress.step / training.steps)
         return min(1.0, self.progress.seconds / training.time)
 
-    def _batches(self) -> Iterator[TrainingQueries]:
-        """Endless batches from the current step on: every epoch all slices in a new order.
-
-        The layout promises queries in random order, so that consecutive ones are a batch. Each epoch's slices
-        start at another row.
-        """
-        count = len(self.queries) // self.batch
-        while True:
-            epoch, done = divmod(self.progress.step, count)
-            random = np.random.Generator(np.random.Philox(key=[self.config.seed, epoch]))
-            start = int(random.integers(len(self.queries) - count * self.batch + 1))
-            for i in random.permutation(count)[done:]:
-                yield self.queries.slice(start + i * self.batch, start + (i + 1) * self.batch)
+    def _batches(self) -> Iterator[Batch]:
+        """Endless batches from the current step on."""
+        return self.queries.batches(self.batch, self.config.seed, self.progress.step, self.model.margin)
 
     def train(self, seconds: float) -> bool:
         """Train for about so long, or until the budget is spent; returns whether it is.
@@ -150,7 +143,7 @@ class Trainer:
             cure=f"lower the rate: --rate {self.config.training.rate / 3:.1g} --overwrite",
         )
 
-    def _guarded_step(self, batch: TrainingQueries, workers: Workers) -> Tensor:
+    def _guarded_step(self, batch: Batch, workers: Workers) -> Tensor:
         try:
             return self._step(batch, workers)
         except (RuntimeError, IndexError):
@@ -169,22 +162,23 @@ class Trainer:
         """The textures through the blur of this moment."""
         return [t.blurred(sigma) for t, sigma in zip(self.model.textures(), self._sigmas(), strict=True)]
 
-    def _objective(self, prediction: Tensor, batch: TrainingQueries) -> Tensor:
+    def _objective(self, prediction: Tensor, batch: Batch) -> Tensor:
         """Mean loss of predictions (n, 3) of a batch."""
         return self.loss(prediction, batch.value)
 
-    def _loss(self, batch: TrainingQueries) -> Tensor:
-        prediction = self.model(batch.u, batch.sigma, batch.omega_i, batch.omega_o)
+    def _loss(self, batch: Batch) -> Tensor:
+        evaluate = self.model.crops if isinstance(batch, Crops) else self.model
+        prediction = evaluate(batch.u, batch.sigma, batch.omega_i, batch.omega_o)
         return self._objective(prediction, batch)
 
-    def _step(self, batch: TrainingQueries, workers: Workers) -> Tensor:
+    def _step(self, batch: Batch, workers: Workers) -> Tensor:
         training = self.config.training
         factor = rate_factor(training, self.progress.step, self.share)
         for group, rate in zip(
             self.optimiser.param_groups, (training.texture_rate, training.rate), strict=True
         ):
             group["lr"] = rate * factor
-        if self._stepper is not None:
+        if self._stepper is not None and not isinstance(batch, Crops):
             return self._stepper.step(self._objective, batch, self._sigmas(), workers)
         texels, weights = self.model.parameter_groups()
         # Queries read detached tables; what they give goes back through the blur once, for all of them.

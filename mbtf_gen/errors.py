@@ -47,7 +47,7 @@ class MbtfError(Exception):
 
     @property
     def message(self) -> str:
-        """`where: what. cure`, one line."""
+        """Where and what on one line, the cure on a second."""
         text = f"{self.where}: {self.what}" if self.where else self.what
         return f"{text}\n  {self.cure}" if self.cure else text
 
@@ -74,6 +74,12 @@ class PartialError(MbtfError):
     """Work is unfinished but what was done is kept; the same command resumes (exit code 4)."""
 
     exit_code = EXIT_PARTIAL
+
+
+class Interrupted(MbtfError):
+    """The user or the system ended the run (exit code 130); what was done is kept."""
+
+    exit_code = EXIT_INTERRUPTED
 
 
 def reason(fault: BaseException | str | None, longest: int = 160) -> str:

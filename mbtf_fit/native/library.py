@@ -203,3 +203,8 @@ def kernel() -> Kernel | None:
 def missing_reason() -> str:
     """Why :func:`kernel` is None, in some words; empty where it is not."""
     return _load()[1]
+
+
+def reload() -> None:
+    """Look again, after a change of the environment."""
+    _load.cache_clear()

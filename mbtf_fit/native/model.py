@@ -10,7 +10,8 @@ from torch import Tensor
 
 from ..models import NeuralMaterial
 from ..models.mlp import Mlp
-from ..models.neumip import GRAZING, OFFSET_SCALE, Neumip, NeumipBaseline
+from ..models.neumip import Neumip, NeumipBaseline
+from ..models.textured import GRAZING, OFFSET_SCALE
 from ..models.textures import FeatureTextures
 from .library import (
     MAX_CHANNELS,
@@ -24,29 +25,48 @@ from .library import (
     Textures,
 )
 
+# Options of the architecture that the kernel knows, and their values; any size within its limits will do.
+_KNOWN: dict[str, tuple[Any, ...]] = {
+    "decoder": ("mlp",),
+    "activation": ("relu",),
+    "outputs": (3,),
+    "output": ("exp-1",),
+    "offset": ("depth", "none"),
+    "blending": ("blend",),
+    "encoding": ({"position": 0, "direction": 0, "pi": True, "raw": False, "lifted": False},),
+}
+_SIZES = {"channels", "width", "layers"}
+
 
 def unsupported_reason(model: NeuralMaterial) -> str | None:
     """Why the kernel cannot evaluate a model, in some words; None where it can."""
     if type(model) not in (Neumip, NeumipBaseline):
-        return f"no kernel for the model {model.name}"
+        return f"it does not know the model {model.name}"
+    options = model.network.model_dump()
+    for name, known in _KNOWN.items():
+        if options.pop(name) not in known:
+            return f"it does not know network.{name}={getattr(model.network, name)}"
+    if options.keys() - _SIZES:
+        return f"it does not know network.{min(options.keys() - _SIZES)}"
     tensors = [*model.parameters(), *(t.table for t in model.textures())]
     if any(t.device.type != "cpu" or t.dtype != torch.float32 for t in tensors):
-        return "the kernel runs on CPUs, in float32"
+        return "it runs on CPUs, in float32"
     for network in networks(model):
         if len(network.weights) > MAX_LAYERS or max(max(w.shape) for w in network.weights) > MAX_WIDTH:
-            return f"networks wider than {MAX_WIDTH} or deeper than {MAX_LAYERS} layers"
+            return f"its networks have at most {MAX_LAYERS} layers of {MAX_WIDTH} features"
     for texture in model.textures():
         if texture.texels.shape[1] > MAX_CHANNELS or len(texture.packing.shapes) > MAX_LEVELS:
-            return f"more than {MAX_CHANNELS} channels or {MAX_LEVELS} levels"
+            return f"its textures have at most {MAX_LEVELS} levels of {MAX_CHANNELS} channels"
         if texture.packing.texels >= 1 << 31:
-            return "too many texels"
+            return "its textures have less than 2^31 texels"
     return None
 
 
 def networks(model: NeuralMaterial) -> list[Mlp]:
     """The networks that the kernel evaluates: the decoder, then the offset's where there is one."""
-    assert isinstance(model, NeumipBaseline)
-    return [model.decoder, *([model.offset_network] if isinstance(model, Neumip) else [])]
+    assert isinstance(model, Neumip)
+    assert isinstance(model.decoder, Mlp)
+    return [model.decoder, *([] if model.network.offset == "none" else [model.offset_network])]
 
 
 def parameters_of(network: Mlp) -> list[Tensor]:
@@ -107,7 +127,7 @@ class NativeModel:
     def refresh(self) -> None:
         """Take over the weights, and the tables that lookups read."""
         library, variant = self.kernel.library, self.kernel.variant
-        assert isinstance(self.model, NeumipBaseline)
+        assert isinstance(self.model, Neumip)
         self.description.unit = float(self.model.unit)
         self._kept: list[Tensor] = []
         for network, target, packed in zip(networks(self.model), self._targets(), self._packed, strict=False):
