@@ -82,6 +82,18 @@ class GradientSums(ctypes.Structure):
     )
 
 
+class QuadraticLoss(ctypes.Structure):
+    """``mbtf_loss``"""
+
+    _fields_ = (
+        ("relative", _F32),
+        ("squared", _F32),
+        ("scale", _F32),
+        ("bound", _F32 * 3),
+        ("bounded", _I32),
+    )
+
+
 class AdamStep(ctypes.Structure):
     """``mbtf_adam_step``"""
 
@@ -106,6 +118,10 @@ _PROTOTYPES: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "mbtf_pack": (None, (_I32, _POINTER, _POINTER, _POINTER)),
     "mbtf_forward": (None, (_I32, _POINTER, _POINTER, _I32, _I32, _POINTER, _POINTER)),
     "mbtf_backward": (None, (_I32, _POINTER, _POINTER, _POINTER, _POINTER, _POINTER, _POINTER)),
+    "mbtf_learn": (
+        ctypes.c_double,
+        (_I32, _POINTER, _POINTER, _POINTER, _POINTER, _F32, _POINTER, _POINTER, _POINTER, _POINTER),
+    ),
     "mbtf_collect_weights": (None, (_POINTER, _POINTER, _I64, _POINTER)),
     "mbtf_collect": (None, (_I32, _POINTER, _I64, _I64, _I64, _I64, _POINTER)),
     "mbtf_adam": (None, (_I32, _POINTER, _I64, _POINTER, _POINTER, _POINTER, _POINTER)),

@@ -161,6 +161,14 @@ EXPORT void mbtf_backward(int32_t variant, const mbtf_model *m, const mbtf_queri
     VARIANTS[variant]->backward(m, q, state, by_value, scratch, to);
 }
 
+/* Forward, loss and backward at once: the sum of the loss over queries and colours. `share` is what one of them
+ * counts in the mean. `state` has room for one block, `out` for 6 BLOCK floats. */
+EXPORT double mbtf_learn(int32_t variant, const mbtf_model *m, const mbtf_queries *q, const float *targets,
+                         const mbtf_loss *loss, float share, float *state, float *scratch, float *out,
+                         const mbtf_gradients *to) {
+    return VARIANTS[variant]->learn(m, q, targets, loss, share, state, scratch, out, to);
+}
+
 /* Partial sums of all threads into gradients (weight 0, bias 0, ...), in a fixed order; clears them. */
 EXPORT void mbtf_collect_weights(const mbtf_network *net, float *const *sums, int64_t threads,
                                  float *const *gradients) {

@@ -53,6 +53,15 @@ typedef struct {
     float *pyramid, *offset_texture, *decoder, *offset;
 } mbtf_gradients;
 
+/* Loss of a prediction p on a value t that the kernel takes by itself, the mean over queries and colours of
+ *     (relative / (p² + scale²) + squared / scale²) · d²,   d = p - t,
+ * p held still in the weight and in the bound on d:
+ *     |d| <= √(bound[0] + bound[1] |p| + bound[2] p²)   where `bounded`. */
+typedef struct {
+    float relative, squared, scale, bound[3];
+    int32_t bounded;
+} mbtf_loss;
+
 /* Optimiser of one tensor: Adam (Kingma and Ba 2015) with the corrections of its means worked in. */
 typedef struct {
     float rate, beta1, beta2, epsilon, root_correction2;
