@@ -4,9 +4,10 @@
 
 ``neumip`` with a pyramid of 256² and batches of 2^16. Three ways to do the same arithmetic:
 
-**plain**: as one writes it down (class ``Plain`` below): one tensor per level, blurred by FFT while the blur is
-annealed; each level read by the queries that blend it, four texels at a time; ``torch.nn.Linear``, autograd,
-``torch.optim.Adam``. Texels are read by indexing or by ``grid_sample``, whichever is faster here. All cores.
+**plain**: as one writes it down (class ``Plain`` below): one tensor per level, blurred by FFT while the blur
+is annealed; each level read by the queries that blend it, four texels at a time; ``torch.nn.Linear``,
+autograd, ``torch.optim.Adam``. Texels are read by indexing or by ``grid_sample``, whichever is
+faster. All cores.
 **pytorch**: the fitter's own path where the compiled kernel is missing.
 **kernel**: the compiled kernel, where it is there.
 
@@ -14,8 +15,8 @@ A round takes one step of each way at ten moments of the annealing, spread evenl
 round's mean is that of a whole training; the ways take turns, so that whatever slows the machine slows all.
 Figures are those of the median round. Before that the three are checked to evaluate the same model alike.
 
-The last line is one JSON object: figures, and the bars they are held to. Exit code 1 where a bar is missed; on
-other than two cores, or without the kernel, they are only reported.
+The last line is one JSON object: figures, and the bars they are held to. Exit code 1 where a bar is missed;
+on other than two cores, or without the kernel, they are only reported.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -42,6 +44,7 @@ from mbtf_fit.memory import keep_freed_memory
 from mbtf_fit.models import build_model
 from mbtf_fit.models.neumip import Neumip
 from mbtf_fit.native import library
+from mbtf_fit.noise import NoiseModel
 from mbtf_fit.parallel import MAX_KERNEL_THREADS, Workers
 from mbtf_fit.training import BETAS, Trainer
 from mbtf_gen.directions import from_projected_disk
@@ -93,7 +96,7 @@ def network(inputs: int, outputs: int) -> nn.Sequential:
     """The paper's networks: four layers, 25 features."""
     sizes = [inputs, 25, 25, 25, outputs]
     layers: list[nn.Module] = []
-    for a, b in zip(sizes, sizes[1:], strict=False):
+    for a, b in pairwise(sizes):
         layers += [nn.Linear(a, b), nn.ReLU()]
     return nn.Sequential(*layers[:-1])
 
@@ -214,7 +217,8 @@ class Ours:
 
     def __init__(self, model: Neumip, config: FitConfig, queries: TrainingQueries, kernel: bool) -> None:
         use_kernel(kernel)
-        self.trainer = Trainer(config, model, queries)
+        unit = float(queries.value.mean())
+        self.trainer = Trainer(config, model, queries, NoiseModel.silent(unit, model.lattice))
         self.path = self.trainer.path
         self.limit = MAX_KERNEL_THREADS if kernel else None
 
@@ -321,7 +325,8 @@ def main() -> int:
     print(f"{lattice.shape()[1]}² pyramid, batch {n}, {torch.get_num_threads()} threads, {kernel.path}")
     for kind, found in rates.items():
         line = "  ".join(
-            f"{way} {rate / 1e6:.2f} M samples/s ({rate / found['plain']:.1f}x)" for way, rate in found.items()
+            f"{way} {rate / 1e6:.2f} M samples/s ({rate / found['plain']:.1f}x)"
+            for way, rate in found.items()
         )
         print(f"{kind:10s} {line}")
     judged = torch.get_num_threads() == BAR_CORES and "kernel" in ours

@@ -98,6 +98,10 @@ def fit(
     console.note(
         f"{shards} -> {output}: {resolved.model}, training for {budget} (change it with --time or --steps)"
     )
+    from .native import missing_reason
+
+    if missing_reason():
+        console.note(f"note: training runs in PyTorch, not in the compiled kernel ({missing_reason()})")
     with console.progress(total=100, label="fitting", unit="%") as bar:
         result = fit(
             resolved,
@@ -135,7 +139,8 @@ def _describe_fit(data: dict[str, Any]) -> str:
     rate = training["steps"] * training["batch"] / max(training["seconds"], 1e-9)
     lines = [
         f"{data['material']}: {data['model']}, {training['steps']} steps of {training['batch']} queries in "
-        f"{clock(training['seconds'])} on {training['device']} ({rate / 1e6:.2f} M queries/s)",
+        f"{clock(training['seconds'])} on {training['device']} by {training.get('path', 'pytorch')} "
+        f"({rate / 1e6:.2f} M queries/s)",
         *_describe_errors(data["errors"]),
     ]
     return "\n".join(lines)
@@ -170,6 +175,76 @@ def evaluate(material: Path, shards: Path, /, *, console: Console = CONSOLE) -> 
     console.report(
         {"material": material, "shards": shards, "foreign_inputs": foreign, "errors": errors},
         "\n".join([f"{material}: {loaded.config.model} on {shards}", *_describe_errors(errors)]),
+    )
+
+
+@app.command(name="export")
+def export_material(
+    material: Path,
+    /,
+    *,
+    to: Annotated[
+        list[Literal["exr", "json", "material"]] | None, Parameter(name="--to", negative="")
+    ] = None,
+    output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
+    half: Annotated[bool, Parameter(negative="")] = False,
+    console: Console = CONSOLE,
+) -> None:
+    """Write a material in forms that other programs read: mbtf-fit export material/ --to exr
+
+    exr: the latent textures, a part per level and a channel per feature. json: the networks as a list of
+    layers, with formulas, conventions and queries with expected values. material: another material folder.
+
+    Parameters
+    ----------
+    material
+        Folder made by mbtf-fit.
+    to
+        exr, json or material. Repeatable. Default: exr and json
+    output
+        Folder to write to. Default: the material's own
+    half
+        Round all weights and texels to 16 bits, and print the error of that.
+    """
+    from .exports import LAYERS_NAME, TEXTURES_NAME, to_half, write_layers, write_textures
+    from .material import Material, export
+    from .material_format import DESCRIPTION_NAME, WEIGHTS_NAME
+    from .storage import make_folder
+
+    wanted = list(dict.fromkeys(to or ["exr", "json"]))
+    folder = material if output is None else output
+    loaded = Material.load(material)
+    if "material" in wanted and folder.is_dir() and any(folder.iterdir()):
+        raise InputError(
+            "holds something already", where=folder, cure="name a new folder with -o for --to material"
+        )
+    written, error = loaded, None
+    if half:
+        written, error = to_half(loaded)
+    make_folder(folder)
+    files = []
+    if "exr" in wanted:
+        write_textures(written, folder / TEXTURES_NAME, half=half)
+        files.append(TEXTURES_NAME)
+    if "json" in wanted:
+        write_layers(written, folder / LAYERS_NAME, half=half)
+        files.append(LAYERS_NAME)
+    if "material" in wanted:
+        description = loaded.description
+        export(
+            written.model,
+            written.config,
+            folder,
+            data=description["data"],
+            training=description["training"],
+            half=half,
+        )
+        files += [WEIGHTS_NAME, DESCRIPTION_NAME]
+    sizes = {name: (folder / name).stat().st_size for name in files}
+    lines = [f"{folder / name}: {size / 1e6:.3f} MB" for name, size in sizes.items()]
+    console.report(
+        {"folder": folder, "files": sizes, "half": None if error is None else error.as_dict()},
+        "\n".join([*lines, *([] if error is None else [str(error)])]),
     )
 
 
@@ -217,6 +292,7 @@ def _shards_info(path: Path) -> tuple[dict[str, Any], str]:
 def _material_info(path: Path) -> tuple[dict[str, Any], str]:
     from .material import Material
     from .material_format import WEIGHTS_NAME
+    from .native import describe
 
     material = Material.load(path)
     description = material.description
@@ -231,6 +307,7 @@ def _material_info(path: Path) -> tuple[dict[str, Any], str]:
         f"{weights['network_weights']} network weights, {weights['texels']} numbers in textures, "
         f"{size / 1e6:.2f} MB",
         f"trained {training['steps']} steps of {training['batch']} in {clock(training['seconds'])}",
+        f"this machine's CPU evaluates by: {describe()}",
         *_describe_errors(training["errors"]),
         f"conformance: {description['conformance']['count']} queries, largest deviation {deviation:.2g}",
     ]

@@ -20,11 +20,12 @@ from .buffers import Crops, TrainingBuffers
 from .config import FitConfig, TrainingSection
 from .data import Queries, TrainingQueries
 from .inference import predict
-from .losses import Loss, relative_error, squared_error
+from .losses import Objective
 from .models import NeuralMaterial
 from .native import kernel
 from .native.model import unsupported_reason
 from .native.stepper import NativeStepper
+from .noise import NoiseModel
 from .parallel import MAX_KERNEL_THREADS, Batch, Workers
 
 # Decay of Adam's running means of the gradient and of its square.
@@ -62,6 +63,7 @@ class Trainer:
     ----------
     model : initialised, on the device
     queries : on the device
+    noise : model of their noise; :meth:`NoiseModel.silent` where there is none
 
     Attributes
     ----------
@@ -69,7 +71,11 @@ class Trainer:
     """
 
     def __init__(
-        self, config: FitConfig, model: NeuralMaterial, queries: TrainingQueries | TrainingBuffers
+        self,
+        config: FitConfig,
+        model: NeuralMaterial,
+        queries: TrainingQueries | TrainingBuffers,
+        noise: NoiseModel,
     ) -> None:
         self.config = config
         self.model = model
@@ -78,7 +84,7 @@ class Trainer:
         self.batch = min(config.training.batch, len(queries))
         texels, weights = model.parameter_groups()
         self.optimiser = torch.optim.Adam([{"params": texels}, {"params": weights}], betas=BETAS, fused=True)
-        self.loss = self._choose_loss()
+        self.loss = Objective(config.training, noise)
         found = kernel()
         self._stepper = (
             NativeStepper(found, model, self.optimiser)
@@ -90,15 +96,6 @@ class Trainer:
     def path(self) -> str:
         """What computes the steps: ``kernel`` and its instruction set, or ``pytorch``."""
         return "pytorch" if self._stepper is None else f"kernel {self._stepper.kernel.name}"
-
-    def _choose_loss(self) -> Loss:
-        value = self.queries.value
-        if self.config.training.loss == "relative":
-            return relative_error(float(value.mean()) or 1.0)
-        variance = float(value.var(0, correction=0).mean()) if len(value) > 1 else 0.0
-        power = float(value.square().mean())
-        # Of constant data the variance is rounding error: measure by the values themselves.
-        return squared_error(variance if variance > 1e-6 * power else power or 1.0)
 
     @property
     def share(self) -> float:
@@ -162,14 +159,10 @@ class Trainer:
         """The textures through the blur of this moment."""
         return [t.blurred(sigma) for t, sigma in zip(self.model.textures(), self._sigmas(), strict=True)]
 
-    def _objective(self, prediction: Tensor, batch: Batch) -> Tensor:
-        """Mean loss of predictions (n, 3) of a batch."""
-        return self.loss(prediction, batch.value)
-
     def _loss(self, batch: Batch) -> Tensor:
         evaluate = self.model.crops if isinstance(batch, Crops) else self.model
         prediction = evaluate(batch.u, batch.sigma, batch.omega_i, batch.omega_o)
-        return self._objective(prediction, batch)
+        return self.loss(prediction, batch)
 
     def _step(self, batch: Batch, workers: Workers) -> Tensor:
         training = self.config.training
@@ -179,7 +172,7 @@ class Trainer:
         ):
             group["lr"] = rate * factor
         if self._stepper is not None and not isinstance(batch, Crops):
-            return self._stepper.step(self._objective, batch, self._sigmas(), workers)
+            return self._stepper.step(self.loss, batch, self._sigmas(), workers)
         texels, weights = self.model.parameter_groups()
         # Queries read detached tables; what they give goes back through the blur once, for all of them.
         tables = self._tables()

@@ -6,6 +6,6 @@ missing, everything runs in PyTorch; the tests hold the two equal.
 
 from __future__ import annotations
 
-from .library import Kernel, kernel, missing_reason
+from .library import Kernel, describe, kernel, missing_reason
 
-__all__ = ["Kernel", "kernel", "missing_reason"]
+__all__ = ["Kernel", "describe", "kernel", "missing_reason"]

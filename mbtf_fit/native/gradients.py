@@ -1,28 +1,26 @@
-"""Gradients of a batch by the kernel: every thread works through its share of the queries, piece by piece.
+"""Gradients of a batch by the kernel: every thread works through its share of the queries.
 
-A piece goes forward, through the loss in PyTorch, and backward while its activations are still in the cache.
-Each thread adds to sums of its own; they are added up in a fixed order, so that the result depends on the
-number of threads and on nothing else about them.
+The quadratic losses are the kernel's own: it goes forward and backward block by block. With any other loss a
+share is cut into pieces: each goes forward, through the loss in PyTorch, and backward while its activations
+are still in the cache. Each thread adds to sums of its own; they are added up in a fixed order, so that the
+result depends on the number of threads and on nothing else about them.
 """
 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
 from ..data import TrainingQueries
+from ..losses import Objective, Quadratic
 from ..parallel import Workers
-from .library import GradientSums, QueryPointers
+from .library import GradientSums, QuadraticLoss, QueryPointers
 from .model import NativeModel, aligned, networks, parameters_of, pointers
 
 # Bytes of activations that a piece may have: about what a core has of the last cache.
 _PIECE_BYTES = 6 << 20
-
-# Loss of predictions (n, 3) on queries: the mean over them.
-Objective = Callable[[Tensor, TrainingQueries], Tensor]
 
 
 def query_pointers(batch: TrainingQueries, start: int, stop: int) -> QueryPointers:
@@ -42,7 +40,7 @@ class _Sums:
         self.networks = [aligned(lanes * network.count) for network in networks(native.model)]
         self.state = native.state(piece)
         self.scratch = aligned(int(native.kernel.library.mbtf_scratch_floats()))
-        self.out = torch.empty(piece, 3)
+        self.out = torch.empty(max(piece, 2 * native.kernel.block), 3)
         addresses = [t.data_ptr() for t in self.textures], [t.data_ptr() for t in self.networks]
         texture, network = ([*a, 0][:2] for a in addresses)
         self.pointers = GradientSums(*texture, *network)
@@ -78,7 +76,11 @@ class NativeGradients:
         edges = [n * k // count for k in range(count + 1)]
         self.native.refresh()
 
+        quadratic = objective.quadratic()
+
         def share(k: int) -> Tensor:
+            if quadratic is not None:
+                return self._learn(self._sums[k], quadratic, batch, edges[k], edges[k + 1])
             total = torch.zeros(())
             for start in range(edges[k], edges[k + 1], self.piece):
                 stop = min(start + self.piece, edges[k + 1])
@@ -94,6 +96,27 @@ class NativeGradients:
         for loss in losses[1:]:
             total = total + loss
         return total
+
+    def _learn(self, sums: _Sums, loss: Quadratic, batch: TrainingQueries, start: int, stop: int) -> Tensor:
+        native = self.native
+        bounded = loss.bound is not None
+        bound = (ctypes.c_float * 3)(*(loss.bound or (0.0, 0.0, 0.0)))
+        form = QuadraticLoss(loss.relative, loss.squared, loss.scale, bound, bounded)
+        queries = query_pointers(batch, start, stop)
+        share = 1.0 / (3 * len(batch))
+        total = native.kernel.library.mbtf_learn(
+            native.kernel.variant,
+            ctypes.byref(native.description),
+            ctypes.byref(queries),
+            batch.value.data_ptr() + 12 * start,
+            ctypes.byref(form),
+            share,
+            sums.state.data_ptr(),
+            sums.scratch.data_ptr(),
+            sums.out.data_ptr(),
+            ctypes.byref(sums.pointers),
+        )
+        return torch.tensor(share * total)
 
     def _piece(
         self, sums: _Sums, objective: Objective, batch: TrainingQueries, start: int, stop: int
@@ -134,6 +157,3 @@ class NativeGradients:
             kernel.library.mbtf_collect(
                 kernel.variant, sums, len(self._sums), channels, *edges, gradient.data_ptr()
             )
-
-
-__all__ = ["NativeGradients", "Objective", "query_pointers"]

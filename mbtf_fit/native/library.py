@@ -221,6 +221,12 @@ def missing_reason() -> str:
     return _load()[1]
 
 
+def describe() -> str:
+    """What computes on this machine's CPU, in some words."""
+    found, reason = _load()
+    return f"compiled kernel ({found.name})" if found is not None else f"PyTorch; compiled kernel: {reason}"
+
+
 def reload() -> None:
     """Look again, after a change of the environment."""
     _load.cache_clear()

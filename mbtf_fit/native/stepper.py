@@ -8,11 +8,12 @@ import torch
 from torch import Tensor
 
 from ..data import TrainingQueries
+from ..losses import Objective
 from ..models import NeuralMaterial
 from ..parallel import Workers
 from .adam import adam
 from .blur import Blur
-from .gradients import NativeGradients, Objective
+from .gradients import NativeGradients
 from .library import Kernel
 from .model import NativeModel, networks, parameters_of
 
