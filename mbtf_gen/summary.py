@@ -30,6 +30,7 @@ class Summary:
     paths, seconds : traced in this run, and its duration
     writing_seconds : what writing and digesting took beside the rendering
     waiting_seconds : how long rendering waited for it
+    shard_seconds : of all finished shards, over all runs
     relative_error : pooled relative standard error of the stored training values, √(mean variance) / mean
         value
     mean_value : mean training value per channel, 1/sr
@@ -45,6 +46,7 @@ class Summary:
     paths_per_second: float
     writing_seconds: float
     waiting_seconds: float
+    shard_seconds: float
     relative_error: float
     mean_value: list[float]
     lost: int
@@ -175,6 +177,7 @@ def finish(
         paths_per_second=round(paths / seconds, 1) if seconds > 0 else 0.0,
         writing_seconds=round(writing, 3),
         waiting_seconds=round(waiting, 3),
+        shard_seconds=round(tally.seconds, 3),
         relative_error=tally.relative_error(),
         mean_value=tally.mean_value(),
         lost=tally.counts["lost_rays"],
@@ -184,12 +187,13 @@ def finish(
     )
     if complete and not manifest["complete"]:
         complete_manifest(folder, tally)
+    if complete:
+        sweep(folder)
     return summary
 
 
 def complete_manifest(folder: Path, tally: Tally) -> None:
-    """Say in the manifest that every shard is there, and what they hold together; clear away what killed runs
-    left.
+    """Say in the manifest that every shard is there, and what they hold together.
 
     Raises
     ------
@@ -209,7 +213,6 @@ def complete_manifest(folder: Path, tally: Tally) -> None:
                 **{name: tally.counts[name] for name in COUNTS},
             }
             write_sealed(folder / MANIFEST_NAME, manifest)
-    sweep(folder)
 
 
 def summary_dict(summary: Summary) -> dict[str, Any]:
