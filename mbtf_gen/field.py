@@ -284,8 +284,7 @@ def _surface(field: HeightField, walk: Walk, slant: Slant, d: Any) -> Any:
         dr.fma(t, slant.z, walk.z),
     )
     n = dr.normalize(mi.Normal3f(-(node.y + fold) / field.cell[0], -(node.z + fold) / field.cell[1], 1.0))
-    u, v = (x + 0.5) / mi.Float(field.columns), (y + 0.5) / mi.Float(field.rows)
-    return interaction(p, n, mi.Point2f(u, 1.0 - v), d, field.size, walk.hit)
+    return interaction(p, n, d, field.size, walk.hit)
 
 
 @dr.syntax

@@ -19,7 +19,7 @@ horizon.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, Literal
 
 import drjit as dr
@@ -139,15 +139,14 @@ class World:
 
 @dataclass
 class Path:
-    """State of lanes' paths.
+    """State of lanes' paths between two surface interactions: at a place that their last ray met.
 
     Attributes
     ----------
-    ray : next ray to follow
-    below : it starts below the surface
+    p, n : the place, in scene units, and the surface's normal there
+    d : direction of the ray that met it
     radiance : found so far
     throughput : weight of what is still to be found
-    pdf : density with which the last bounce chose its direction; infinite for mirrors and for the first ray
     depth : surface interactions so far
     rng : random numbers, :class:`~mbtf_gen.sampling.Points`
     capped : rays cut off at the cap on crossings
@@ -156,11 +155,11 @@ class Path:
     active : lanes that go on
     """
 
-    ray: Any
-    below: Any
+    p: Any
+    n: Any
+    d: Any
     radiance: Any
     throughput: Any
-    pdf: Any
     depth: Any
     rng: Any
     capped: Any
@@ -169,30 +168,40 @@ class Path:
     active: Any
 
 
+@dataclass(frozen=True)
+class Bounce:
+    """Rays on their way to the next place.
+
+    Attributes
+    ----------
+    ray : the ray
+    below : it starts below the surface
+    pdf : density with which its direction was chosen; infinite for mirrors and for the first ray
+    """
+
+    ray: Any
+    below: Any
+    pdf: Any
+
+
 def _on_plane(world: World, ray: Any, active: Any) -> Any:
     """Hits of rays on the reference plane."""
-    t = -ray.o.z / ray.d.z
-    p, size = ray(t), world.field.size
-    uv = mi.Point2f(p.x / size[0] + 0.5, 0.5 - p.y / size[1])
-    return interaction(p, mi.Normal3f(0, 0, 1), uv, ray.d, size, active & (ray.d.z < 0))
+    p = ray(-ray.o.z / ray.d.z)
+    return interaction(p, mi.Normal3f(0, 0, 1), ray.d, world.field.size, active & (ray.d.z < 0))
 
 
-def _visible(world: World, path: Path, transport: Transport) -> tuple[Any, Any, Any]:
-    """Parallax and masking, periodic neighbours, holes: (what a path's ray meets, lanes that hit the cap,
-    lanes that passed through the tile)."""
-    parts = world.surface.parts
-    holes = world.surface if parts.opacity else None
-    if not transport.displacement:
-        si = _on_plane(world, path.ray, path.active)
-        if holes is not None:
-            si.t = dr.select(path.rng.chance() < holes.opacity(si), si.t, dr.inf)
-        capped = mi.Bool(False)
-    else:
+def _visible(world: World, path: Path, way: Bounce, transport: Transport) -> tuple[Any, Any]:
+    """Parallax and masking, periodic neighbours, holes: (what rays meet, lanes that hit the cap)."""
+    holes = world.surface if world.surface.parts.opacity else None
+    if transport.displacement:
         si, _, capped, path.rng = closest_hit(
-            world.field, path.ray, path.active, transport.max_crossings, path.below, holes, path.rng
+            world.field, way.ray, path.active, transport.max_crossings, way.below, holes, path.rng
         )
-    downward = path.active & ~si.is_valid() & ~capped & (path.ray.d.z <= 0)
-    return si, capped, downward
+        return si, capped
+    si = _on_plane(world, way.ray, path.active)
+    if holes is not None:
+        si.t = dr.select(path.rng.chance() < holes.opacity(si), si.t, dr.inf)
+    return si, mi.Bool(False)
 
 
 def _direct(world: World, path: Path, si: Any, point: Any, light: LaneLight, transport: Transport) -> Any:
@@ -231,42 +240,47 @@ def _shadowed(world: World, path: Path, si: Any, omega: Any, lit: Any, transport
     return blocked
 
 
-def _sky(path: Path, light: LaneLight, escaped: Any, transport: Transport) -> Any:
+def _sky(path: Path, way: Bounce, light: LaneLight, escaped: Any, transport: Transport) -> Any:
     """Light that BSDF sampling found: what arrives along rays that left the tile upwards."""
     if light.kind == "delta" or not (transport.bsdf_sampling or light.kind == "constant"):
         return mi.Spectrum(0.0)
-    d = path.ray.d
-    share = dr.select(dr.isinf(path.pdf), 1.0, path.pdf / (path.pdf + light.sampling_density(d)))
+    d = way.ray.d
+    share = dr.select(dr.isinf(way.pdf), 1.0, way.pdf / (way.pdf + light.sampling_density(d)))
     found = escaped & (path.depth > 0) & (d.z > 0)
     return dr.select(found, path.throughput * (light.radiance(d) * share), 0.0)
 
 
-def _interaction(
-    world: World, path: Path, light: LaneLight, transport: Transport, limit: Any, roulette: Any, last: bool
-) -> Path:
-    """One surface interaction of every path; `last`: no path goes on after it."""
-    si, capped, downward = _visible(world, path, transport)
+def _follow(
+    world: World, path: Path, way: Bounce, light: LaneLight, transport: Transport, limit: Any
+) -> None:
+    """Take paths along their rays to the next place, or to the sky."""
+    si, capped = _visible(world, path, way, transport)
     path.capped[capped] += 1
+    escaped = path.active & ~si.is_valid() & ~capped
+    downward = escaped & (way.ray.d.z <= 0)
     if world.surface.parts.opacity:
         path.passed |= downward & (path.depth == 0)
     else:
         path.lost |= downward
-    path.radiance += _sky(path, light, path.active & ~si.is_valid() & ~capped, transport)
+    path.radiance += _sky(path, way, light, escaped, transport)
     path.active &= si.is_valid() & (path.depth < limit)
+    path.p, path.n, path.d = mi.Point3f(si.p), mi.Normal3f(si.n), mi.Vector3f(way.ray.d)
 
-    point = world.surface.at(si, -path.ray.d)
+
+def _interact(
+    world: World, path: Path, light: LaneLight, transport: Transport, limit: Any, roulette: Any
+) -> Bounce:
+    """One surface interaction of every path: its direct light, and where the path goes on."""
+    si = interaction(path.p, path.n, path.d, world.field.size, path.active)
+    point = world.surface.at(si, -path.d)
     path.radiance += path.throughput * _direct(world, path, si, point, light, transport)
     path.depth[path.active] += 1
-    if last:
-        return path
     if not transport.bsdf_sampling and light.kind != "constant":
         path.active &= path.depth < limit
-    omega, weight, path.pdf = point.sample(path.rng.next_1d(), path.rng.next_2d())
-    path.ray = world.field.leave(si, omega)
-    path.below = dr.dot(si.n, omega) < 0
+    omega, weight, pdf = point.sample(path.rng.next_1d(), path.rng.next_2d())
     path.throughput *= weight
     _roulette(path, roulette)
-    return path
+    return Bounce(world.field.leave(si, omega), dr.dot(si.n, omega) < 0, pdf)
 
 
 def _roulette(path: Path, begin: Any) -> None:
@@ -280,7 +294,6 @@ def _roulette(path: Path, begin: Any) -> None:
     path.throughput *= dr.rcp(survival)
 
 
-@dr.syntax
 def trace(
     world: World,
     ray: Any,
@@ -293,11 +306,14 @@ def trace(
 ) -> Path:
     """Follow paths to their ends.
 
+    All lanes take the first interaction side by side, in one kernel without a loop over paths; those that
+    meet the surface again are gathered and go on in a second one. Otherwise most lanes would idle beside a
+    few long paths.
+
     Parameters
     ----------
     limit, roulette : largest number of surface interactions of a path, and those before roulette begins;
-        opaque,
-        so that they are not part of the kernel
+        opaque, so that they are not part of the kernel
 
     Returns
     -------
@@ -305,11 +321,11 @@ def trace(
     ``capped``
     """
     path = Path(
-        mi.Ray3f(ray),
-        mi.Bool(False),
+        mi.Point3f(0.0),
+        mi.Normal3f(0.0, 0.0, 1.0),
+        mi.Vector3f(0.0, 0.0, -1.0),
         mi.Spectrum(0.0),
         mi.Spectrum(1.0),
-        mi.Float(dr.inf),
         mi.UInt32(0),
         rng,
         mi.UInt32(0),
@@ -317,10 +333,42 @@ def trace(
         mi.Bool(False),
         mi.Bool(active),
     )
-    once = not (transport.interreflection or transport.bsdf_sampling or light.kind == "constant")
-    if dr.hint(once, mode="scalar"):
-        path = _interaction(world, path, light, transport, limit, roulette, True)
-    else:
-        while dr.hint(path.active, exclude=[world, light, transport, limit, roulette]):
-            path = _interaction(world, path, light, transport, limit, roulette, False)
+    _follow(world, path, Bounce(ray, mi.Bool(False), mi.Float(dr.inf)), light, transport, limit)
+    way = _interact(world, path, light, transport, limit, roulette)
+    if not (transport.interreflection or transport.bsdf_sampling or light.kind == "constant"):
+        return path
+    _follow(world, path, way, light, transport, limit)
+    if not transport.interreflection:
+        return path
+    dr.eval(path)
+    going = dr.compress(path.active)
+    if len(going):
+        rest = _loop(world, _picked(path, going), _picked(light, going), transport, limit, roulette)
+        dr.scatter(path.radiance, rest.radiance, going)
+        dr.scatter(path.capped, rest.capped, going)
+        dr.scatter(path.lost, rest.lost, going)
+    return path
+
+
+def _picked(state: Any, lanes: Any) -> Any:
+    """Some lanes of a dataclass of arrays; what is no array stays as it is."""
+
+    def pick(value: Any) -> Any:
+        if is_dataclass(value):
+            return _picked(value, lanes)
+        if not dr.is_array_v(value) or dr.width(value) == 1:
+            return value
+        return dr.gather(type(value), value, lanes)
+
+    return replace(state, **{f.name: pick(getattr(state, f.name)) for f in fields(state)})
+
+
+@dr.syntax
+def _loop(
+    world: World, path: Path, light: LaneLight, transport: Transport, limit: Any, roulette: Any
+) -> Path:
+    """Follow paths that stand on the surface to their ends."""
+    while dr.hint(path.active, exclude=[world, light, transport, limit, roulette]):
+        way = _interact(world, path, light, transport, limit, roulette)
+        _follow(world, path, way, light, transport, limit)
     return path
