@@ -25,7 +25,7 @@ from typing import Any, Literal
 import drjit as dr
 import mitsuba as mi
 
-from .field import HeightField, closest_hit, occluded
+from .field import HeightField, closest_hit, hit_and_shadow, occluded
 from .hits import interaction
 
 # Roulette leaves paths of throughput one alone, for dividing by a survival chance below it makes their
@@ -169,7 +169,7 @@ class Path:
 
 
 @dataclass(frozen=True)
-class Bounce:
+class Onward:
     """Rays on their way to the next place.
 
     Attributes
@@ -184,30 +184,77 @@ class Bounce:
     pdf: Any
 
 
+@dataclass(frozen=True)
+class Shadow:
+    """Rays towards the light, which bring its light unless something is in their way.
+
+    Attributes
+    ----------
+    ray, below : as of :class:`Onward`
+    active : lanes that have such a ray
+    radiance : what it brings
+    """
+
+    ray: Any
+    below: Any
+    active: Any
+    radiance: Any
+
+
 def _on_plane(world: World, ray: Any, active: Any) -> Any:
     """Hits of rays on the reference plane."""
     p = ray(-ray.o.z / ray.d.z)
     return interaction(p, mi.Normal3f(0, 0, 1), ray.d, world.field.size, active & (ray.d.z < 0))
 
 
-def _visible(world: World, path: Path, way: Bounce, transport: Transport) -> tuple[Any, Any]:
-    """Parallax and masking, periodic neighbours, holes: (what rays meet, lanes that hit the cap)."""
+def _visible(
+    world: World, path: Path, onward: Onward, shadow: Shadow | None, transport: Transport
+) -> tuple[Any, Any]:
+    """Parallax and masking, shadowing, periodic neighbours, holes: (what paths' rays meet, lanes that hit the
+    cap). Light of shadow rays that meet nothing is added to the paths."""
     holes = world.surface if world.surface.parts.opacity else None
-    if transport.displacement:
+    field, most = world.field, transport.max_crossings
+    if shadow is None:
+        if not transport.displacement:
+            si = _on_plane(world, onward.ray, path.active)
+            if holes is not None:
+                si.t = dr.select(path.rng.chance() < holes.opacity(si), si.t, dr.inf)
+            return si, mi.Bool(False)
         si, _, capped, path.rng = closest_hit(
-            world.field, way.ray, path.active, transport.max_crossings, way.below, holes, path.rng
+            field, onward.ray, path.active, most, onward.below, holes, path.rng
         )
         return si, capped
-    si = _on_plane(world, way.ray, path.active)
-    if holes is not None:
-        si.t = dr.select(path.rng.chance() < holes.opacity(si), si.t, dr.inf)
-    return si, mi.Bool(False)
+    if holes is None:
+        si, capped, blocked, shadow_capped = hit_and_shadow(
+            field, onward.ray, path.active, shadow.ray, shadow.active, most, onward.below, shadow.below
+        )
+        _light_up(path, shadow, blocked, shadow_capped)
+        return si, capped
+    _shadowed(world, path, shadow, transport)
+    return _visible(world, path, onward, None, transport)
 
 
-def _direct(world: World, path: Path, si: Any, point: Any, light: LaneLight, transport: Transport) -> Any:
-    """Direct light that a surface point sends along a path, by next-event estimation; with shadowing."""
+def _shadowed(world: World, path: Path, shadow: Shadow, transport: Transport) -> None:
+    """Shadowing alone, for paths that end."""
+    holes = world.surface if world.surface.parts.opacity else None
+    blocked, _, capped, path.rng = occluded(
+        world.field, shadow.ray, shadow.active, transport.max_crossings, shadow.below, holes, path.rng
+    )
+    _light_up(path, shadow, blocked, capped)
+
+
+def _light_up(path: Path, shadow: Shadow, blocked: Any, capped: Any) -> None:
+    path.radiance += dr.select(shadow.active & ~blocked, shadow.radiance, 0.0)
+    path.capped[capped] += 1
+
+
+def _direct(
+    world: World, path: Path, si: Any, point: Any, light: LaneLight, transport: Transport
+) -> Shadow | None:
+    """Direct light that a surface point sends along a path, by next-event estimation: where nothing shadows,
+    it is added to the path, else it is up to the ray returned."""
     if light.kind == "constant":
-        return mi.Spectrum(0.0)
+        return None
     if light.kind == "delta":
         omega, incoming = light.omega_i, light.inverse_irradiance
     else:
@@ -219,68 +266,60 @@ def _direct(world: World, path: Path, si: Any, point: Any, light: LaneLight, tra
         incoming = incoming / (density + pdf if transport.bsdf_sampling else density)
     # Written so that NaN counts as light: it must reach the value, where it is found and drawn again.
     lit = path.active & ~(dr.max(value) <= 0)
+    radiance = path.throughput * (value * incoming)
     if transport.shadowing:
-        lit &= ~_shadowed(world, path, si, omega, lit, transport)
-    return dr.select(lit, value * incoming, 0.0)
+        return Shadow(world.field.leave(si, omega), dr.dot(si.n, omega) < 0, lit, radiance)
+    path.radiance += dr.select(lit, radiance, 0.0)
+    return None
 
 
-def _shadowed(world: World, path: Path, si: Any, omega: Any, lit: Any, transport: Transport) -> Any:
-    """Lanes whose light is blocked."""
-    holes = world.surface if world.surface.parts.opacity else None
-    blocked, _, capped, path.rng = occluded(
-        world.field,
-        world.field.leave(si, omega),
-        lit,
-        transport.max_crossings,
-        dr.dot(si.n, omega) < 0,
-        holes,
-        path.rng,
-    )
-    path.capped[capped] += 1
-    return blocked
-
-
-def _sky(path: Path, way: Bounce, light: LaneLight, escaped: Any, transport: Transport) -> Any:
+def _sky(path: Path, onward: Onward, light: LaneLight, escaped: Any, transport: Transport) -> Any:
     """Light that BSDF sampling found: what arrives along rays that left the tile upwards."""
     if light.kind == "delta" or not (transport.bsdf_sampling or light.kind == "constant"):
         return mi.Spectrum(0.0)
-    d = way.ray.d
-    share = dr.select(dr.isinf(way.pdf), 1.0, way.pdf / (way.pdf + light.sampling_density(d)))
+    d = onward.ray.d
+    share = dr.select(dr.isinf(onward.pdf), 1.0, onward.pdf / (onward.pdf + light.sampling_density(d)))
     found = escaped & (path.depth > 0) & (d.z > 0)
     return dr.select(found, path.throughput * (light.radiance(d) * share), 0.0)
 
 
 def _follow(
-    world: World, path: Path, way: Bounce, light: LaneLight, transport: Transport, limit: Any
+    world: World,
+    path: Path,
+    onward: Onward,
+    shadow: Shadow | None,
+    light: LaneLight,
+    transport: Transport,
+    limit: Any,
 ) -> None:
     """Take paths along their rays to the next place, or to the sky."""
-    si, capped = _visible(world, path, way, transport)
+    si, capped = _visible(world, path, onward, shadow, transport)
     path.capped[capped] += 1
     escaped = path.active & ~si.is_valid() & ~capped
-    downward = escaped & (way.ray.d.z <= 0)
+    downward = escaped & (onward.ray.d.z <= 0)
     if world.surface.parts.opacity:
         path.passed |= downward & (path.depth == 0)
     else:
         path.lost |= downward
-    path.radiance += _sky(path, way, light, escaped, transport)
+    path.radiance += _sky(path, onward, light, escaped, transport)
     path.active &= si.is_valid() & (path.depth < limit)
-    path.p, path.n, path.d = mi.Point3f(si.p), mi.Normal3f(si.n), mi.Vector3f(way.ray.d)
+    path.p, path.n, path.d = mi.Point3f(si.p), mi.Normal3f(si.n), mi.Vector3f(onward.ray.d)
 
 
 def _interact(
     world: World, path: Path, light: LaneLight, transport: Transport, limit: Any, roulette: Any
-) -> Bounce:
-    """One surface interaction of every path: its direct light, and where the path goes on."""
+) -> tuple[Onward, Shadow | None]:
+    """One surface interaction of every path: where it goes on, and its ray towards the light."""
     si = interaction(path.p, path.n, path.d, world.field.size, path.active)
     point = world.surface.at(si, -path.d)
-    path.radiance += path.throughput * _direct(world, path, si, point, light, transport)
+    shadow = _direct(world, path, si, point, light, transport)
     path.depth[path.active] += 1
     if not transport.bsdf_sampling and light.kind != "constant":
         path.active &= path.depth < limit
     omega, weight, pdf = point.sample(path.rng.next_1d(), path.rng.next_2d())
     path.throughput *= weight
     _roulette(path, roulette)
-    return Bounce(world.field.leave(si, omega), dr.dot(si.n, omega) < 0, pdf)
+    return Onward(world.field.leave(si, omega), dr.dot(si.n, omega) < 0, pdf), shadow
 
 
 def _roulette(path: Path, begin: Any) -> None:
@@ -333,11 +372,14 @@ def trace(
         mi.Bool(False),
         mi.Bool(active),
     )
-    _follow(world, path, Bounce(ray, mi.Bool(False), mi.Float(dr.inf)), light, transport, limit)
-    way = _interact(world, path, light, transport, limit, roulette)
+    first = Onward(ray, mi.Bool(False), mi.Float(dr.inf))
+    _follow(world, path, first, None, light, transport, limit)
+    onward, shadow = _interact(world, path, light, transport, limit, roulette)
     if not (transport.interreflection or transport.bsdf_sampling or light.kind == "constant"):
+        if shadow is not None:
+            _shadowed(world, path, shadow, transport)
         return path
-    _follow(world, path, way, light, transport, limit)
+    _follow(world, path, onward, shadow, light, transport, limit)
     if not transport.interreflection:
         return path
     dr.eval(path)
@@ -369,6 +411,6 @@ def _loop(
 ) -> Path:
     """Follow paths that stand on the surface to their ends."""
     while dr.hint(path.active, exclude=[world, light, transport, limit, roulette]):
-        way = _interact(world, path, light, transport, limit, roulette)
-        _follow(world, path, way, light, transport, limit)
+        onward, shadow = _interact(world, path, light, transport, limit, roulette)
+        _follow(world, path, onward, shadow, light, transport, limit)
     return path
