@@ -385,10 +385,13 @@ def trace(
     dr.eval(path)
     going = dr.compress(path.active)
     if len(going):
-        rest = _loop(world, _picked(path, going), _picked(light, going), transport, limit, roulette)
-        dr.scatter(path.radiance, rest.radiance, going)
-        dr.scatter(path.capped, rest.capped, going)
-        dr.scatter(path.lost, rest.lost, going)
+        rest = _picked(path, going)
+        rest.radiance, rest.capped, rest.lost = mi.Spectrum(0.0), mi.UInt32(0), mi.Bool(False)
+        rest = _loop(world, rest, _picked(light, going), transport, limit, roulette)
+        dr.eval(rest.radiance, rest.capped, rest.lost)
+        path.radiance += _spread(rest.radiance, going, dr.width(path.active))
+        path.capped += _spread(rest.capped, going, dr.width(path.active))
+        path.lost |= _spread(rest.lost, going, dr.width(path.active))
     return path
 
 
@@ -403,6 +406,13 @@ def _picked(state: Any, lanes: Any) -> Any:
         return dr.gather(type(value), value, lanes)
 
     return replace(state, **{f.name: pick(getattr(state, f.name)) for f in fields(state)})
+
+
+def _spread(values: Any, lanes: Any, width: int) -> Any:
+    """Values of some lanes among zeros."""
+    out = dr.zeros(type(values), width)
+    dr.scatter(out, values, lanes)
+    return out
 
 
 @dr.syntax
