@@ -9,6 +9,7 @@ from cyclopts import Parameter
 
 from mbtf_gen.console import CONSOLE, Console, clock, new_app
 from mbtf_gen.errors import InputError, UsageError
+from mbtf_gen.quality import Quality, as_assignments
 
 app = new_app("mbtf-fit", "Fit neural materials to multi-resolution BTF (MBTF) data.")
 
@@ -29,6 +30,7 @@ def fit(
     /,
     *,
     output: Output = Path("material"),
+    quality: Quality | None = None,
     model: Literal["neumip", "neumip-baseline", "hierarchical"] | None = None,
     time: str | None = None,
     steps: int | None = None,
@@ -51,6 +53,8 @@ def fit(
         Folder made by mbtf-gen.
     output
         Folder of the material.
+    quality
+        Training time and size that belong together; other options change single ones.
     model
         Model to fit. Default: neumip
     time
@@ -78,6 +82,7 @@ def fit(
     from mbtf_gen.settings import resolve
 
     from .config import FitConfig
+    from .quality import FITTER
 
     flags = {
         "model": model,
@@ -89,7 +94,8 @@ def fit(
         "device": device,
     }
     # Time asked for on the command line takes the place of steps in a file.
-    assigned = [*(assignments or []), *(["training.steps=null"] if time is not None else [])]
+    assigned = as_assignments(FITTER[quality]) if quality else []
+    assigned += [*(assignments or []), *(["training.steps=null"] if time is not None else [])]
     resolved = resolve(FitConfig, file=config, assignments=assigned, flags=flags)
     training = resolved.training
     budget = format_duration(training.time) if training.steps is None else f"{training.steps} steps"
@@ -98,6 +104,10 @@ def fit(
     console.note(
         f"{shards} -> {output}: {resolved.model}, training for {budget} (change it with --time or --steps)"
     )
+    from .native import missing_reason
+
+    if missing_reason():
+        console.note(f"note: training runs in PyTorch, not in the compiled kernel ({missing_reason()})")
     with console.progress(total=100, label="fitting", unit="%") as bar:
         result = fit(
             resolved,
@@ -135,7 +145,8 @@ def _describe_fit(data: dict[str, Any]) -> str:
     rate = training["steps"] * training["batch"] / max(training["seconds"], 1e-9)
     lines = [
         f"{data['material']}: {data['model']}, {training['steps']} steps of {training['batch']} queries in "
-        f"{clock(training['seconds'])} on {training['device']} ({rate / 1e6:.2f} M queries/s)",
+        f"{clock(training['seconds'])} on {training['device']} by {training.get('path', 'pytorch')} "
+        f"({rate / 1e6:.2f} M queries/s)",
         *_describe_errors(data["errors"]),
     ]
     return "\n".join(lines)
@@ -287,6 +298,7 @@ def _shards_info(path: Path) -> tuple[dict[str, Any], str]:
 def _material_info(path: Path) -> tuple[dict[str, Any], str]:
     from .material import Material
     from .material_format import WEIGHTS_NAME
+    from .native import describe
 
     material = Material.load(path)
     description = material.description
@@ -301,6 +313,7 @@ def _material_info(path: Path) -> tuple[dict[str, Any], str]:
         f"{weights['network_weights']} network weights, {weights['texels']} numbers in textures, "
         f"{size / 1e6:.2f} MB",
         f"trained {training['steps']} steps of {training['batch']} in {clock(training['seconds'])}",
+        f"this machine's CPU evaluates by: {describe()}",
         *_describe_errors(training["errors"]),
         f"conformance: {description['conformance']['count']} queries, largest deviation {deviation:.2g}",
     ]
