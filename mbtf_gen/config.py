@@ -116,7 +116,7 @@ class TransportSection(Settings):
     """How light paths are followed."""
 
     max_depth: int = Field(0, ge=0, le=1000, description="surface interactions per path; 0: no limit")
-    roulette_depth: int = Field(3, ge=1, le=1000, description="interactions before Russian roulette begins")
+    roulette_depth: int = Field(1, ge=1, le=1000, description="interactions before Russian roulette begins")
     max_crossings: int = Field(4096, ge=1, description="tile borders that one ray may cross")
 
 

@@ -75,7 +75,7 @@ class EffectsPlan:
     effects: tuple[Effect, ...]
     max_depth: int = 0
     cap_cost: float = 0.0
-    roulette_depth: int = 3
+    roulette_depth: int = 1
     mode: str = "auto"
     tolerance: float = 0.0
     closed_form: bool = False

@@ -37,6 +37,7 @@ class Estimates:
         crossings
     nonfinite : samples that came out non-finite and were drawn again
     bad_samples : the first of them, at most ``MOST_LOCATED``
+    spp : (n,) int64, paths of each query, both halves together; None where they are all the same
     """
 
     value_a: NDArray[np.float32]
@@ -47,6 +48,7 @@ class Estimates:
     capped: int
     nonfinite: int
     bad_samples: tuple[BadSample, ...] = ()
+    spp: NDArray[np.int64] | None = None
 
 
 @dataclass(frozen=True)

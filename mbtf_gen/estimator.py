@@ -80,6 +80,7 @@ class Estimator:
         source: RaySource | None = None,
         limit: int | None = None,
         roulette: int | None = None,
+        numbers: NDArray[np.uint32] | None = None,
     ) -> Estimates:
         """Both halves of each query (one leading axis), `spp` paths together.
 
@@ -88,6 +89,8 @@ class Estimator:
         source : where rays come from; the query sensor by default
         limit, roulette : other numbers of surface interactions at which paths end, and at which roulette
             begins, for the same kernel
+        numbers : (n,) numbers of the queries in their shard, which decide their random numbers; by default
+            0, 1, 2, …
 
         Raises
         ------
@@ -98,6 +101,7 @@ class Estimator:
         self._limit = dr.opaque(mi.UInt32, self.transport.limit if limit is None else limit)
         self._roulette = dr.opaque(mi.UInt32, self.transport.roulette_depth if roulette is None else roulette)
         n = len(queries.sigma)
+        self._numbers = np.arange(n, dtype=np.uint32) if numbers is None else numbers
         per_launch = max(1, self.launch // spp)
         parts = [
             self._batch(
@@ -119,6 +123,7 @@ class Estimator:
     def _batch(self, queries: Queries, rows: slice, spp: int, stream: Stream, source: RaySource) -> Estimates:
         part = Queries(queries.u[rows], queries.sigma[rows], queries.omega_i[rows], queries.omega_o[rows])
         source.set_queries(part, rows.start)
+        self._batch_numbers = mi.UInt32(self._numbers[rows])
         count = len(part.sigma)
         omega_i = mi.Vector3f(part.omega_i.T.copy())
         if self.light is None:
@@ -149,7 +154,7 @@ class Estimator:
         if len(bad):
             raise PartialError(
                 f"{len(bad)} samples stay NaN or infinite after {MAX_RESAMPLES} draws, first at "
-                f"query {rows.start + int(bad[0]) // spp} ({located[0].effect})",
+                f"query {self._numbers[rows.start + int(bad[0]) // spp]} ({located[0].effect})",
                 where=f"{stream.split} shard {stream.shard}",
                 cure="check the material's values",
             )
@@ -186,7 +191,9 @@ class Estimator:
         self._limit = full
         direct = np.isin(np.arange(len(bad)), self._nonfinite(short))
         return tuple(
-            BadSample(first + int(lane) // spp, "direct light" if at_once else "interreflection")
+            BadSample(
+                int(self._numbers[first + int(lane) // spp]), "direct light" if at_once else "interreflection"
+            )
             for lane, at_once in zip(bad, direct, strict=True)
         )
 
@@ -229,7 +236,9 @@ class Estimator:
                 )
                 for shift in (0, 32)
             ]
-            return sequence(words[0], words[1], lane // spp + dr.opaque(mi.UInt32, first), lane % half)
+            return sequence(
+                words[0], words[1], dr.gather(mi.UInt32, self._batch_numbers, lane // spp), lane % half
+            )
 
         xi = generator(lanes, Purpose.FOOTPRINT).next_2d()
         point = source.footprint(lanes // spp, xi)

@@ -28,9 +28,6 @@ LONGEST_REACH = 0.45
 # Light found by next-event estimation alone keeps its variance when the narrowest lobe of the surface, about
 # 2α wide, is so many times wider than the light's.
 WIDER = 4.0
-# Where nothing reflects more, what comes after the first interaction is so little of the value that roulette
-# from there on saves more time than it costs in variance.
-DARK = 0.25
 # Runs of fewer paths are done before a pilot has paid for itself.
 SMALL_RUN = 2_000_000
 # Deepest cap on surface interactions that is tried.
@@ -85,8 +82,6 @@ def plan_effects(job: Job, *, pilots: bool = True) -> EffectsPlan:
     plan = _of_relief(look, wish, decided, costs, left)
     if wish.base != "all" and _known_exactly(look, plan):
         plan = replace(plan, closed_form=True)
-    if wish.base != "all" and look.lambert and look.albedo.max() <= DARK:
-        plan = replace(plan, roulette_depth=1)
     return replace(plan, mode=job.config.effects.mode, tolerance=tolerance)
 
 

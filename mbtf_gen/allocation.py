@@ -1,0 +1,177 @@
+r"""Which queries get how many paths: more where a pilot expects more noise.
+
+For a given number of paths in all, the mean squared error over queries is smallest when the paths of a query
+are in proportion to the standard deviation of one path (Neyman 1934). That deviation is not known, but much
+of it follows from level and directions. A pilot before the run, with random numbers of its own, fits
+
+    ln s = quadratic polynomial of (l, ln cos θi, ln cos θo, ω_i·ω_o sideways, ln of the half vector's slope,
+                                    azimuths)
+
+and the counts of every query of every shard follow from these weights, which the manifest keeps. So the
+counts never look at the paths that they count: every half stays unbiased, the halves stay independent, and a
+shard can be made alone.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .estimates import MOST_LOCATED, Estimates, Stream
+from .queries import Queries
+
+if TYPE_CHECKING:
+    from .simulation import MeanEstimator
+
+F64 = NDArray[np.float64]
+
+# Queries of the pilot and paths of each; a million paths tell little more.
+PILOT_QUERIES, PILOT_SPP = 16384, 16
+# Least expected deviation over the mean one: where the pilot saw little noise there may be some.
+FLOOR = 0.125
+# Counts are powers of two, which fill the nets of the sequences, from one path in each half.
+FEWEST = 2
+MOST_OVER_MEAN = 64
+_STEPS = 40
+_RIDGE = 1e-3
+
+
+def _features(queries: Queries) -> list[F64]:
+    """What the polynomial is of, one array (n,) each, all of order one."""
+    wi, wo = queries.omega_i.astype(np.float64), queries.omega_o.astype(np.float64)
+    level = -np.log2(2.0 * queries.sigma.astype(np.float64))
+    half = wi + wo
+    length = np.sqrt(half[:, 0] ** 2 + half[:, 1] ** 2 + half[:, 2] ** 2)
+    return [
+        level / 8.0,
+        np.log(wi[:, 2]),
+        np.log(wo[:, 2]),
+        wi[:, 0] * wo[:, 0] + wi[:, 1] * wo[:, 1],
+        0.25 * np.log(1.001 - half[:, 2] / length),
+        wi[:, 0],
+        wi[:, 1],
+        wo[:, 0],
+        wo[:, 1],
+    ]
+
+
+def _terms(queries: Queries) -> list[F64]:
+    """1, the features, and their products in pairs."""
+    base = _features(queries)
+    products = [base[i] * base[j] for i in range(len(base)) for j in range(i, len(base))]
+    return [np.ones(len(queries.sigma)), *base, *products]
+
+
+def fit_log_linear(terms: list[F64], target: F64) -> F64:
+    """Weights w that make ``exp(Σ w·term)`` the mean of a non-negative target (n,): Poisson regression with
+    a small ridge, by Newton's method. It weighs large and small targets alike in proportion to their mean and
+    needs no distribution beyond that."""
+    x = np.stack(terms, axis=1)
+    weights = np.zeros(x.shape[1])
+    scale = float(target.mean())
+    if scale <= 0.0:
+        return weights
+    y = target / scale
+    ridge = _RIDGE * len(y) * np.r_[1e-9, np.ones(x.shape[1] - 1)]
+    for _ in range(_STEPS):
+        mean = np.exp(np.clip(x @ weights, -20.0, 20.0))
+        slope = x.T @ (y - mean) - ridge * weights
+        step = np.linalg.solve((x * mean[:, None]).T @ x + np.diag(ridge), slope)
+        weights = weights + np.clip(step, -1.0, 1.0)
+        if np.abs(step).max() < 1e-6:
+            break
+    weights[0] += np.log(scale)
+    return weights
+
+
+@dataclass(frozen=True)
+class Allocation:
+    """Expected deviations of single paths, and the counts that follow.
+
+    Attributes
+    ----------
+    weights : of the polynomial's terms, for ln s with s relative to the mean deviation over the run's queries
+    scale : factor on s that makes the counts' mean the wanted one, over the run's queries
+    gain : mean squared error of equal counts over that of these, as the pilot's own data have it
+    """
+
+    weights: tuple[float, ...]
+    scale: float
+    gain: float
+
+    def deviation(self, queries: Queries) -> F64:
+        """Expected deviation s (n,) of one path, relative to the mean one over the run's queries."""
+        # Term by term: a matrix product may round differently for other numbers of rows.
+        total = np.zeros(len(queries.sigma))
+        for weight, term in zip(self.weights, _terms(queries), strict=True):
+            total += weight * term
+        return np.maximum(np.exp(np.clip(total, -20.0, 20.0)), FLOOR)
+
+    def counts(self, queries: Queries, spp: int) -> NDArray[np.int64]:
+        """Paths (n,) of queries for a mean of `spp` over the run, powers of two."""
+        return _round_counts(self.deviation(queries) * (self.scale * spp), spp)
+
+    def to_manifest(self) -> dict[str, Any]:
+        """Plain data for the manifest."""
+        return {"weights": list(self.weights), "scale": self.scale, "gain": self.gain}
+
+
+def _round_counts(wanted: F64, spp: int) -> NDArray[np.int64]:
+    # The nearest power of two in the sense of ratios.
+    power = np.rint(np.log2(np.maximum(wanted, 1e-9)))
+    most = math.floor(math.log2(MOST_OVER_MEAN * spp))
+    return np.exp2(np.clip(power, math.log2(FEWEST), most)).astype(np.int64)
+
+
+def fit_allocation(queries: Queries, estimates: Estimates, spp: int) -> Allocation:
+    """Allocation from a pilot's queries (one leading axis) and estimates, for a mean of `spp` paths."""
+    difference = estimates.value_a.astype(np.float64) - estimates.value_b
+    noise = np.sqrt(np.mean(difference**2, axis=-1))
+    terms = _terms(queries)
+    weights = fit_log_linear(terms, noise)
+    flat = Allocation(tuple(weights), 1.0, 1.0)
+    raw = np.exp(np.clip(np.stack(terms, axis=1) @ weights, -700.0, 700.0))
+    weights[0] -= np.log(max(float(raw.mean()), 1e-300))
+    flat = Allocation(tuple(float(w) for w in weights), 1.0, 1.0)
+    s = flat.deviation(queries)
+    low, high = 1e-3, 1e3
+    for _ in range(60):
+        scale = math.sqrt(low * high)
+        if _round_counts(s * (scale * spp), spp).mean() > spp:
+            high = scale
+        else:
+            low = scale
+    counts = _round_counts(s * (low * spp), spp)
+    variance = noise**2
+    gain = float(variance.mean() / max(float((variance * spp / counts).mean()), 1e-300))
+    return Allocation(flat.weights, low, gain if variance.any() else 1.0)
+
+
+def estimate_counts(
+    estimator: MeanEstimator, queries: Queries, counts: NDArray[np.int64], stream: Stream
+) -> Estimates:
+    """Estimates with `counts` (n,) paths per query, in groups of equal counts."""
+    n = len(queries.sigma)
+    value = np.zeros((2, n, 3), np.float32)
+    transmittance: NDArray[np.float32] | None = None
+    totals = {"paths": 0, "lost": 0, "capped": 0, "nonfinite": 0}
+    bad: list[Any] = []
+    for spp in np.unique(counts):
+        rows = np.flatnonzero(counts == spp)
+        part = Queries(queries.u[rows], queries.sigma[rows], queries.omega_i[rows], queries.omega_o[rows])
+        found = estimator.estimate(part, int(spp), stream, numbers=rows.astype(np.uint32))
+        value[0, rows], value[1, rows] = found.value_a, found.value_b
+        if found.transmittance is not None:
+            if transmittance is None:
+                transmittance = np.zeros(n, np.float32)
+            transmittance[rows] = found.transmittance
+        for key in totals:
+            totals[key] += getattr(found, key)
+        bad += found.bad_samples
+    return Estimates(
+        value[0], value[1], transmittance, **totals, bad_samples=tuple(bad[:MOST_LOCATED]), spp=counts
+    )
