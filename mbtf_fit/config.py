@@ -99,6 +99,8 @@ PRESETS: dict[str, dict[str, Any]] = {
             "output": "fourth-root",
             "encoding": {"position": 10, "direction": 4},
         },
+        # Whole buffers are held out, and each has one light, view and footprint.
+        "held_out": {"queries": 0.05},
     },
 }
 
