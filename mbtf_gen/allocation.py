@@ -10,21 +10,26 @@ of it follows from level and directions. A pilot before the run, with random num
 and the counts of every query of every shard follow from these weights, which the manifest keeps. So the
 counts never look at the paths that they count: every half stays unbiased, the halves stay independent, and a
 shard can be made alone.
+
+The same pilot fits the mean value over directions. The mean of M over positions is the tile mean whatever the
+footprint, so this is a smooth estimate of the tile mean at any pair of directions.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .estimates import MOST_LOCATED, Estimates, Stream
+from .estimates import MOST_LOCATED, BadSample, Estimates, Stream
 from .queries import Queries
 
 if TYPE_CHECKING:
+    from .effects import EffectsPlan
+    from .generation import Job
     from .simulation import MeanEstimator
 
 F64 = NDArray[np.float64]
@@ -59,9 +64,9 @@ def _features(queries: Queries) -> list[F64]:
     ]
 
 
-def _terms(queries: Queries) -> list[F64]:
-    """1, the features, and their products in pairs."""
-    base = _features(queries)
+def _terms(queries: Queries, *, levels: bool = True) -> list[F64]:
+    """1, the features (the level among them or not), and their products in pairs."""
+    base = _features(queries)[0 if levels else 1 :]
     products = [base[i] * base[j] for i in range(len(base)) for j in range(i, len(base))]
     return [np.ones(len(queries.sigma)), *base, *products]
 
@@ -90,34 +95,55 @@ def fit_log_linear(terms: list[F64], target: F64) -> F64:
 
 @dataclass(frozen=True)
 class Allocation:
-    """Expected deviations of single paths, and the counts that follow.
+    """What a pilot expects of queries, and the counts of paths that follow.
 
     Attributes
     ----------
-    weights : of the polynomial's terms, for ln s with s relative to the mean deviation over the run's queries
-    scale : factor on s that makes the counts' mean the wanted one, over the run's queries
+    weights : of the polynomial's terms, for ln s with s the deviation of one path, in 1/sr
+    typical : mean of s over the run's queries, in 1/sr; 0 where nothing is noisy
+    scale : factor that makes the counts' mean the wanted one, over the run's queries
     gain : mean squared error of equal counts over that of these, as the pilot's own data have it
+    mean_weights : of the terms without the level, for ln of the tile mean, in 1/sr
     """
 
     weights: tuple[float, ...]
+    typical: float
     scale: float
     gain: float
+    mean_weights: tuple[float, ...]
 
     def deviation(self, queries: Queries) -> F64:
-        """Expected deviation s (n,) of one path, relative to the mean one over the run's queries."""
-        # Term by term: a matrix product may round differently for other numbers of rows.
-        total = np.zeros(len(queries.sigma))
-        for weight, term in zip(self.weights, _terms(queries), strict=True):
-            total += weight * term
-        return np.maximum(np.exp(np.clip(total, -20.0, 20.0)), FLOOR)
+        """Expected deviation s (n,) of one path, 1/sr."""
+        return np.maximum(_evaluate(self.weights, _terms(queries)), FLOOR * self.typical)
+
+    def tile_mean(self, queries: Queries) -> F64:
+        """Expected tile mean (n,) at the queries' directions, 1/sr."""
+        return _evaluate(self.mean_weights, _terms(queries, levels=False))
 
     def counts(self, queries: Queries, spp: int) -> NDArray[np.int64]:
         """Paths (n,) of queries for a mean of `spp` over the run, powers of two."""
-        return _round_counts(self.deviation(queries) * (self.scale * spp), spp)
+        if self.typical <= 0.0:
+            return np.full(len(queries.sigma), spp, np.int64)
+        return _round_counts(self.deviation(queries) * (self.scale * spp / self.typical), spp)
 
     def to_manifest(self) -> dict[str, Any]:
         """Plain data for the manifest."""
-        return {"weights": list(self.weights), "scale": self.scale, "gain": self.gain}
+        return asdict(self)
+
+    @classmethod
+    def from_manifest(cls, data: dict[str, Any]) -> Allocation:
+        """Inverse of :meth:`to_manifest`."""
+        names = ("typical", "scale", "gain")
+        weights, mean = (tuple(data[name]) for name in ("weights", "mean_weights"))
+        return cls(weights=weights, mean_weights=mean, **{name: data[name] for name in names})
+
+
+def _evaluate(weights: tuple[float, ...], terms: list[F64]) -> F64:
+    # Term by term: a matrix product may round differently for other numbers of rows.
+    total = np.zeros(len(terms[0]))
+    for weight, term in zip(weights, terms, strict=True):
+        total += weight * term
+    return np.exp(np.clip(total, -60.0, 60.0))
 
 
 def _round_counts(wanted: F64, spp: int) -> NDArray[np.int64]:
@@ -127,28 +153,38 @@ def _round_counts(wanted: F64, spp: int) -> NDArray[np.int64]:
     return np.exp2(np.clip(power, math.log2(FEWEST), most)).astype(np.int64)
 
 
-def fit_allocation(queries: Queries, estimates: Estimates, spp: int) -> Allocation:
-    """Allocation from a pilot's queries (one leading axis) and estimates, for a mean of `spp` paths."""
+def fit_allocation(queries: Queries, estimates: Estimates, paths: int, spp: int) -> Allocation:
+    """Allocation from a pilot's queries (one leading axis) and estimates of `paths` paths each, for a mean of
+    `spp` paths."""
     difference = estimates.value_a.astype(np.float64) - estimates.value_b
     noise = np.sqrt(np.mean(difference**2, axis=-1))
-    terms = _terms(queries)
-    weights = fit_log_linear(terms, noise)
-    flat = Allocation(tuple(weights), 1.0, 1.0)
-    raw = np.exp(np.clip(np.stack(terms, axis=1) @ weights, -700.0, 700.0))
-    weights[0] -= np.log(max(float(raw.mean()), 1e-300))
-    flat = Allocation(tuple(float(w) for w in weights), 1.0, 1.0)
-    s = flat.deviation(queries)
+    value = 0.5 * np.mean(estimates.value_a.astype(np.float64) + estimates.value_b, axis=-1)
+    weights = fit_log_linear(_terms(queries), noise * (0.5 * math.sqrt(paths)))
+    mean_weights = fit_log_linear(_terms(queries, levels=False), value)
+    expected = _evaluate(tuple(weights), _terms(queries)) if noise.any() else np.zeros(len(noise))
+    flat = Allocation(tuple(weights.tolist()), float(expected.mean()), 1.0, 1.0, tuple(mean_weights.tolist()))
+    if not noise.any():
+        return flat
     low, high = 1e-3, 1e3
     for _ in range(60):
-        scale = math.sqrt(low * high)
-        if _round_counts(s * (scale * spp), spp).mean() > spp:
-            high = scale
+        middle = math.sqrt(low * high)
+        if replace(flat, scale=middle).counts(queries, spp).mean() > spp:
+            high = middle
         else:
-            low = scale
-    counts = _round_counts(s * (low * spp), spp)
-    variance = noise**2
-    gain = float(variance.mean() / max(float((variance * spp / counts).mean()), 1e-300))
-    return Allocation(flat.weights, low, gain if variance.any() else 1.0)
+            low = middle
+    fitted = replace(flat, scale=low)
+    ratio = spp / fitted.counts(queries, spp)
+    return replace(fitted, gain=float(np.mean(noise**2) / np.mean(noise**2 * ratio)))
+
+
+def measure_allocation(job: Job, plan: EffectsPlan) -> Allocation:
+    """Allocation of a job under an effects plan, by a pilot with random numbers of its own."""
+    from .pilot import pilot_queries
+
+    queries = pilot_queries(job, PILOT_QUERIES)
+    # Shard 0 of the pilots' split is that of the effects plan.
+    estimates = job.estimator(plan).estimate(queries, PILOT_SPP, Stream(job.config.seed, "pilot", 1))
+    return fit_allocation(queries, estimates, PILOT_SPP, job.config.queries.spp)
 
 
 def estimate_counts(
@@ -158,8 +194,8 @@ def estimate_counts(
     n = len(queries.sigma)
     value = np.zeros((2, n, 3), np.float32)
     transmittance: NDArray[np.float32] | None = None
-    totals = {"paths": 0, "lost": 0, "capped": 0, "nonfinite": 0}
-    bad: list[Any] = []
+    paths = lost = capped = nonfinite = 0
+    bad: list[BadSample] = []
     for spp in np.unique(counts):
         rows = np.flatnonzero(counts == spp)
         part = Queries(queries.u[rows], queries.sigma[rows], queries.omega_i[rows], queries.omega_o[rows])
@@ -169,9 +205,8 @@ def estimate_counts(
             if transmittance is None:
                 transmittance = np.zeros(n, np.float32)
             transmittance[rows] = found.transmittance
-        for key in totals:
-            totals[key] += getattr(found, key)
+        paths, lost = paths + found.paths, lost + found.lost
+        capped, nonfinite = capped + found.capped, nonfinite + found.nonfinite
         bad += found.bad_samples
-    return Estimates(
-        value[0], value[1], transmittance, **totals, bad_samples=tuple(bad[:MOST_LOCATED]), spp=counts
-    )
+    located = tuple(bad[:MOST_LOCATED])
+    return Estimates(value[0], value[1], transmittance, paths, lost, capped, nonfinite, located, spp=counts)

@@ -81,6 +81,7 @@ class Estimator:
         limit: int | None = None,
         roulette: int | None = None,
         numbers: NDArray[np.uint32] | None = None,
+        path_variance: bool = False,
     ) -> Estimates:
         """Both halves of each query (one leading axis), `spp` paths together.
 
@@ -91,6 +92,7 @@ class Estimator:
             begins, for the same kernel
         numbers : (n,) numbers of the queries in their shard, which decide their random numbers; by default
             0, 1, 2, …
+        path_variance : find the sample variance of single paths too
 
         Raises
         ------
@@ -101,6 +103,7 @@ class Estimator:
         self._limit = dr.opaque(mi.UInt32, self.transport.limit if limit is None else limit)
         self._roulette = dr.opaque(mi.UInt32, self.transport.roulette_depth if roulette is None else roulette)
         n = len(queries.sigma)
+        self._path_variance = path_variance
         self._numbers = np.arange(n, dtype=np.uint32) if numbers is None else numbers
         per_launch = max(1, self.launch // spp)
         parts = [
@@ -118,6 +121,7 @@ class Estimator:
             sum(p.capped for p in parts),
             sum(p.nonfinite for p in parts),
             tuple(b for p in parts for b in p.bad_samples)[:MOST_LOCATED],
+            path_variance=np.concatenate([p.path_variance for p in parts]) if path_variance else None,
         )
 
     def _batch(self, queries: Queries, rows: slice, spp: int, stream: Stream, source: RaySource) -> Estimates:
@@ -159,7 +163,8 @@ class Estimator:
                 cure="check the material's values",
             )
         half = spp // 2
-        mean = dr.block_reduce(dr.ReduceOp.Add, radiance, half, mode="evaluated") * (1.0 / half)
+        mean = dr.block_reduce(dr.ReduceOp.Add, radiance, half, mode="evaluated")
+        mean *= dr.opaque(mi.Float, 1.0 / half)
         values = np.array(mean, np.float32).T.reshape(count, 2, 3)
         return Estimates(
             np.ascontiguousarray(values[:, 0]),
@@ -170,6 +175,7 @@ class Estimator:
             capped,
             nonfinite,
             located,
+            path_variance=self._variances(radiance, spp) if self._path_variance else None,
         )
 
     def _located(
@@ -201,6 +207,15 @@ class Estimator:
         total = dr.block_reduce(dr.ReduceOp.Add, passed, spp, mode="evaluated")
         return np.array(total * (1.0 / spp), np.float32)
 
+    def _variances(self, radiance: Any, spp: int) -> NDArray[np.float32]:
+        def total(x: Any) -> NDArray[np.float64]:
+            return np.array(dr.block_reduce(dr.ReduceOp.Add, x, spp, mode="evaluated"), np.float64)
+
+        square = total(dr.squared_norm(radiance))
+        return (((square - (total(radiance) ** 2).sum(axis=0) / spp) / (3 * (spp - 1))).clip(0)).astype(
+            np.float32
+        )
+
     def _nonfinite(self, radiance: Any) -> NDArray[np.uint32]:
         finite = dr.isfinite(radiance.x) & dr.isfinite(radiance.y) & dr.isfinite(radiance.z)
         if dr.all(finite)[0]:
@@ -220,35 +235,46 @@ class Estimator:
     ) -> tuple[Any, Any, int, int]:
         """Radiance of the given lanes (query · spp + path) and, where there are holes, whether they passed
         through the tile, in their order; counts of lost and capped rays."""
-        half = spp // 2
+        # Numbers of paths are kept out of the kernel's code: one kernel serves all of them.
+        paths, half = dr.opaque(mi.UInt32, spp), dr.opaque(mi.UInt32, spp // 2)
+        reciprocal = dr.opaque(mi.Float64, 1.0 / spp)
+
+        def query_of(lane: Any) -> Any:
+            # Exact for 32-bit numbers, and faster than their division.
+            return mi.UInt32((mi.Float64(lane) + 0.5) * reciprocal)
 
         def generator(lane: Any, purpose: Purpose) -> Any:
+            query = query_of(lane)
+            path = lane - query * paths
+            second = path >= half
             # Both halves take the same points of sequences of other streams.
             a, b = (
-                stream_key(stream.root, stream_number(stream.split, stream.shard, purpose, attempt, h))
+                stream_key(
+                    stream.root,
+                    stream_number(stream.split, stream.shard, purpose, stream.first_pass + attempt, h),
+                )
                 for h in (0, 1)
             )
             words = [
                 dr.select(
-                    (lane // half) % 2 == 0,
-                    dr.opaque(mi.UInt32, a >> shift & 0xFFFFFFFF),
+                    second,
                     dr.opaque(mi.UInt32, b >> shift & 0xFFFFFFFF),
+                    dr.opaque(mi.UInt32, a >> shift & 0xFFFFFFFF),
                 )
                 for shift in (0, 32)
             ]
-            return sequence(
-                words[0], words[1], dr.gather(mi.UInt32, self._batch_numbers, lane // spp), lane % half
-            )
+            number = dr.gather(mi.UInt32, self._batch_numbers, query)
+            return sequence(words[0], words[1], number, dr.select(second, path - half, path))
 
         xi = generator(lanes, Purpose.FOOTPRINT).next_2d()
-        point = source.footprint(lanes // spp, xi)
+        point = source.footprint(query_of(lanes), xi)
         cell = mi.Vector2u((point - dr.floor(point)) * 256.0)
         key = _spread_bits(cell.x) | (_spread_bits(cell.y) << 1)
         dr.eval(point, key)
         order = mi.UInt32(np.argsort(np.array(key).astype(np.uint16), kind="stable").astype(np.uint32))
 
         lane = dr.gather(mi.UInt32, lanes, order)
-        query = lane // spp
+        query = query_of(lane)
         ray = source.ray(query, dr.gather(mi.Point2f, point, order))
         if self.light is None:
             light = LaneLight("constant")

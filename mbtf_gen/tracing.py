@@ -32,9 +32,9 @@ from .periodic import Period, closest_hit, leave, occluded, straight
 # in two hundred each.
 PATIENCE = 64
 LATE_SURVIVAL = 0.995
-# Paths whose light cannot matter much for the value are the ones to end: what comes after the first interaction
-# takes half of the time and brings a tenth of the variance. Survival is this often the throughput, at most one:
-# measured cheaper than 1 and 4 on stone, cloth, metal and bark (docs/accuracy.md).
+# What comes after the first interaction takes half of the time and brings a tenth of the variance. Paths
+# survive with this multiple of their throughput, at most one: on stone, cloth, metal and bark 2 was cheaper
+# than 1 and 4.
 SURVIVAL_PER_THROUGHPUT = 2.0
 NO_LIMIT = 0xFFFFFFFF
 
