@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_gen.allocation import estimate_counts, measure_allocation
+from mbtf_gen.allocation import measure_allocation
 from mbtf_gen.config import GeneratorConfig
 from mbtf_gen.engine import load_mitsuba
 from mbtf_gen.errors import MbtfError
@@ -99,9 +99,8 @@ def sides(job: Job, count: int, spp: int) -> tuple[dict[str, Callable[[int], Est
                 tracing.SURVIVAL_PER_THROUGHPUT = 1.0
             estimator.transport = replace(usual, roulette_depth=LATE if late else usual.roulette_depth)
             try:
-                if each is None:
-                    return estimator.estimate(queries, spp, stream)
-                return estimate_counts(estimator, queries, each, stream)
+                found: Estimates = estimator.estimate(queries, spp if each is None else each, stream)
+                return found
             finally:
                 module.sequence, tracing.SURVIVAL_PER_THROUGHPUT = low_discrepancy, survival
 

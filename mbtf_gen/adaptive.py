@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .allocation import FEWEST, estimate_counts
+from .allocation import FEWEST
 from .estimates import Estimates, Stream, TargetReached
 from .queries import Queries
 
@@ -56,15 +56,18 @@ def estimate_shard(
     effects : the run's plan, with its allocation
     """
     allocation = effects.allocation
+    found: Estimates
     if effects.closed_form or allocation is None:
-        found: Estimates = estimator.estimate(queries, spp, stream)
+        found = estimator.estimate(queries, spp, stream)
         return found
     if target is None:
-        return estimate_counts(estimator, queries, allocation.counts(queries, spp), stream)
+        found = estimator.estimate(queries, allocation.counts(queries, spp), stream)
+        return found
     pilot = estimator.estimate(queries, PILOT_SPP, replace(stream, first_pass=PILOT_PASS), path_variance=True)
     expected = allocation.deviation(queries), allocation.tile_mean(queries)
     wanted = wanted_paths(pilot, PILOT_SPP, *expected, target.error)
-    found = estimate_counts(estimator, queries, round_up(np.minimum(wanted, target.cap), target.cap), stream)
+    counts = round_up(np.minimum(wanted, target.cap), target.cap)
+    found = estimator.estimate(queries, counts, stream)
     return replace(
         found,
         paths=found.paths + pilot.paths,
@@ -95,8 +98,8 @@ def _values(estimates: Estimates) -> F64:
 
 
 def round_up(wanted: F64, cap: int) -> NDArray[np.int64]:
-    """The next number of paths that is a power of two or three times one, from ``FEWEST`` to `cap`: few
-    different ones, so that queries of one count fill a launch."""
+    """The next number of paths that is a power of two or three times one, which fill nets of points, from
+    ``FEWEST`` to `cap`."""
     power = np.ceil(np.log2(np.maximum(wanted, FEWEST)))
     whole = np.exp2(power)
     # 1.5 halves of a net: even, so that both halves have the same.

@@ -24,13 +24,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .estimates import MOST_LOCATED, BadSample, Estimates, Stream
+from .estimates import Estimates, Stream
 from .queries import Queries
 
 if TYPE_CHECKING:
     from .effects import EffectsPlan
     from .generation import Job
-    from .simulation import MeanEstimator
 
 F64 = NDArray[np.float64]
 
@@ -185,28 +184,3 @@ def measure_allocation(job: Job, plan: EffectsPlan) -> Allocation:
     # Shard 0 of the pilots' split is that of the effects plan.
     estimates = job.estimator(plan).estimate(queries, PILOT_SPP, Stream(job.config.seed, "pilot", 1))
     return fit_allocation(queries, estimates, PILOT_SPP, job.config.queries.spp)
-
-
-def estimate_counts(
-    estimator: MeanEstimator, queries: Queries, counts: NDArray[np.int64], stream: Stream
-) -> Estimates:
-    """Estimates with `counts` (n,) paths per query, in groups of equal counts."""
-    n = len(queries.sigma)
-    value = np.zeros((2, n, 3), np.float32)
-    transmittance: NDArray[np.float32] | None = None
-    paths = lost = capped = nonfinite = 0
-    bad: list[BadSample] = []
-    for spp in np.unique(counts):
-        rows = np.flatnonzero(counts == spp)
-        part = Queries(queries.u[rows], queries.sigma[rows], queries.omega_i[rows], queries.omega_o[rows])
-        found = estimator.estimate(part, int(spp), stream, numbers=rows.astype(np.uint32))
-        value[0, rows], value[1, rows] = found.value_a, found.value_b
-        if found.transmittance is not None:
-            if transmittance is None:
-                transmittance = np.zeros(n, np.float32)
-            transmittance[rows] = found.transmittance
-        paths, lost = paths + found.paths, lost + found.lost
-        capped, nonfinite = capped + found.capped, nonfinite + found.nonfinite
-        bad += found.bad_samples
-    located = tuple(bad[:MOST_LOCATED])
-    return Estimates(value[0], value[1], transmittance, paths, lost, capped, nonfinite, located, spp=counts)

@@ -20,10 +20,8 @@ if TYPE_CHECKING:
 class MeanEstimator(Protocol):
     """Estimates M at queries."""
 
-    def estimate(
-        self, queries: Queries, spp: int, stream: Stream, *, numbers: NDArray[np.uint32] | None = None
-    ) -> Estimates:
-        """Both halves of each query; `numbers` of the queries in their shard, by default 0, 1, 2, …"""
+    def estimate(self, queries: Queries, spp: int | NDArray[np.int64], stream: Stream) -> Estimates:
+        """Both halves of each query; paths of all or of each."""
 
 
 class ClosedForm:
@@ -37,9 +35,7 @@ class ClosedForm:
     def __init__(self, albedo: NDArray[np.float64]) -> None:
         self.value = (np.asarray(albedo, np.float64) / np.pi).astype(np.float32)
 
-    def estimate(
-        self, queries: Queries, spp: int, stream: Stream, *, numbers: NDArray[np.uint32] | None = None
-    ) -> Estimates:
+    def estimate(self, queries: Queries, spp: int | NDArray[np.int64], stream: Stream) -> Estimates:
         """Both halves of each query (one leading axis), equal."""
         value = np.broadcast_to(self.value, (len(queries.sigma), 3))
         return Estimates(value.copy(), value.copy(), None, 0, 0, 0, 0)

@@ -36,12 +36,18 @@ class FewBrightPaths:
         seed = [stream.root, stream.shard, stream.first_pass, spp]
         return np.where(np.random.default_rng(seed).random((n, spp)) < RARE, BRIGHT, DIM)
 
-    def estimate(self, queries: Queries, spp: int, stream: Stream, **options: Any) -> Estimates:
-        y = self.paths(len(queries.sigma), spp, stream)
-        a, b = (np.repeat(h.mean(axis=1)[:, None], 3, axis=1) for h in np.split(y, 2, axis=1))
-        variance = y.var(axis=1, ddof=1).astype(np.float32)
+    def estimate(self, queries: Queries, spp: Any, stream: Stream, **options: Any) -> Estimates:
+        n = len(queries.sigma)
+        counts = np.broadcast_to(np.asarray(spp), (n,))
+        value, variance = np.zeros((2, n, 3), np.float32), np.zeros(n, np.float32)
+        for count in np.unique(counts):
+            rows = np.flatnonzero(counts == count)
+            y = self.paths(len(rows), int(count), stream)
+            value[:, rows] = np.stack([h.mean(axis=1) for h in np.split(y, 2, axis=1)])[..., None]
+            variance[rows] = y.var(axis=1, ddof=1)
+        every = None if isinstance(spp, int) else counts
         return Estimates(
-            a.astype(np.float32), b.astype(np.float32), None, y.size, 0, 0, 0, path_variance=variance
+            value[0], value[1], None, int(counts.sum()), 0, 0, 0, spp=every, path_variance=variance
         )
 
 

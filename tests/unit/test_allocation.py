@@ -3,21 +3,14 @@
 from __future__ import annotations
 
 import json
-from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from mbtf_gen.adaptive import PRIOR_PATHS, round_up, wanted_paths
-from mbtf_gen.allocation import (
-    FLOOR,
-    Allocation,
-    estimate_counts,
-    fit_allocation,
-    fit_log_linear,
-)
-from mbtf_gen.estimates import BadSample, Estimates, Stream
+from mbtf_gen.allocation import FLOOR, Allocation, fit_allocation, fit_log_linear
+from mbtf_gen.estimates import Estimates
 from mbtf_gen.levels import Lattice
 from mbtf_gen.queries import Mixture, Queries, QueryPlan
 
@@ -108,27 +101,6 @@ def test_no_noise_and_little_noise() -> None:
     lonely[3] = 1.0
     found = fit_allocation(q, Estimates(lonely, value, None, 0, 0, 0, 0), SPP, SPP)
     assert found.deviation(q).min() >= FLOOR * found.typical > 0
-
-
-class Recorder:
-    """Stands in for an estimator: values say with which number and how many paths a query was asked for."""
-
-    def estimate(self, queries: Queries, spp: int, stream: Stream, **options: Any) -> Estimates:
-        numbers = options["numbers"]
-        value = np.stack([queries.sigma, numbers, np.full(len(numbers), spp)], axis=1).astype(np.float32)
-        bad = tuple(BadSample(int(n), "direct light") for n in numbers[:1])
-        return Estimates(value, -value, queries.u[:, 0], spp * len(numbers), 1, 2, 3, bad)
-
-
-def test_groups_of_equal_counts_come_back_in_the_order_of_the_queries() -> None:
-    q = some_queries(300)
-    counts = np.random.default_rng(0).choice([2, 8, 64], 300)
-    found = estimate_counts(Recorder(), q, counts, Stream(0, "train", 0))
-    np.testing.assert_array_equal(found.value_a, np.stack([q.sigma, np.arange(300), counts], axis=1))
-    np.testing.assert_array_equal(found.value_b, -found.value_a)
-    np.testing.assert_array_equal(found.transmittance, q.u[:, 0])
-    assert (found.paths, found.lost, found.capped, found.nonfinite) == (counts.sum(), 3, 6, 9)
-    assert {b.query for b in found.bad_samples} == {int(np.flatnonzero(counts == c)[0]) for c in (2, 8, 64)}
 
 
 def test_counts_under_a_target_are_rounded_up() -> None:
