@@ -48,6 +48,14 @@ def _spread_bits(x: Any) -> Any:
     return (x | (x << 1)) & 0x5555
 
 
+def _aligned(numbers: NDArray[Any]) -> Any:
+    """Lane numbers as a copy: memory borrowed from NumPy is aligned by chance, and kernels that read it are
+    compiled for either case."""
+    copied = mi.UInt32(numbers.astype(np.uint32)) + dr.opaque(mi.UInt32, 0)
+    dr.eval(copied)
+    return copied
+
+
 def _launches(counts: NDArray[np.int64], launch: int) -> list[slice]:
     """Consecutive queries that together have at most `launch` paths, or one query that has more."""
     ends = np.cumsum(counts)
@@ -82,11 +90,8 @@ class Lanes:
     def of(cls, first: int, counts: NDArray[np.int64]) -> Lanes:
         """Lanes of queries that follow each other."""
         starts = np.cumsum(counts) - counts
-        query, start, half = (
-            mi.UInt32(x.astype(np.uint32))
-            for x in (np.repeat(np.arange(len(counts)), counts), starts, counts // 2)
-        )
-        return cls(first, counts, starts, query, start, half)
+        query = np.repeat(np.arange(len(counts)), counts)
+        return cls(first, counts, starts, *(_aligned(x) for x in (query, starts, counts // 2)))
 
     def number(self, lane: int) -> int:
         """Number in the shard of a lane's query."""
@@ -184,6 +189,9 @@ class Estimator:
             inverse = mi.Float(0.0)
         else:
             inverse = mi.Float((1.0 / self.light.irradiance(part.omega_i)).astype(np.float32))
+        # Before any kernel reads them: their places in NumPy's array, and so the number of queries, would be
+        # a part of it.
+        dr.eval(omega_i, inverse)
         lanes = Lanes.of(rows.start, counts)
 
         def trace_lanes(which: Any, attempt: int) -> tuple[Any, Any, int, int]:
@@ -300,7 +308,7 @@ class Estimator:
         cell = mi.Vector2u((point - dr.floor(point)) * 256.0)
         key = _spread_bits(cell.x) | (_spread_bits(cell.y) << 1)
         dr.eval(point, key)
-        order = mi.UInt32(np.argsort(np.array(key).astype(np.uint16), kind="stable").astype(np.uint32))
+        order = _aligned(np.argsort(np.array(key).astype(np.uint16), kind="stable"))
 
         lane = dr.gather(mi.UInt32, which, order)
         query = dr.gather(mi.UInt32, lanes.query, lane)
