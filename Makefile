@@ -11,11 +11,11 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/installed-from-pyproject
 PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input --retries 8 --timeout 60
 
-.PHONY: help install demo test lint format test-slow assets clean
+.PHONY: help install demo test lint format test-slow docs assets clean
 
 help:
 	@sed -n '1,3p' Makefile | cut -c3-
-	@echo "also: install lint format test-slow assets clean"
+	@echo "also: install lint format test-slow docs assets clean"
 
 install: $(INSTALLED)
 
@@ -53,9 +53,14 @@ format: $(INSTALLED)
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
 
+docs: $(INSTALLED)
+	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet -b html docs docs/_build/html
+	@echo "documentation: docs/_build/html/index.html"
+
 test: lint
 	$(BIN)/python -m pytest -q -m "not slow"
 	$(BIN)/mbtf-pipeline run pipelines/ci.yaml --force --quiet
+	$(MAKE) docs
 
 test-slow: $(INSTALLED)
 	$(BIN)/python -m pytest -q -m slow
@@ -64,4 +69,4 @@ assets: $(INSTALLED)
 	$(BIN)/python assets/make_assets.py
 
 clean:
-	rm -rf $(VENV) out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) out build docs/_build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache

@@ -215,7 +215,8 @@ def _shards_info(path: Path) -> tuple[dict[str, Any], str]:
 
 
 def _material_info(path: Path) -> tuple[dict[str, Any], str]:
-    from .material import WEIGHTS_NAME, Material
+    from .material import Material
+    from .material_format import WEIGHTS_NAME
 
     material = Material.load(path)
     description = material.description

@@ -20,7 +20,8 @@ from mbtf_gen.stats import unexplained_variance
 from .config import FitConfig
 from .data import Partition, Queries, data_hash, load_training, open_data
 from .evaluation import judge
-from .material import DESCRIPTION_NAME, WEIGHTS_NAME, Material, export
+from .material import Material, export
+from .material_format import DESCRIPTION_NAME, WEIGHTS_NAME
 from .memory import keep_freed_memory
 from .models import MODELS, build_model
 from .storage import read_tensors, write_tensors

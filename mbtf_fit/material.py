@@ -4,73 +4,35 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from pydantic import BaseModel, Field
 
-from mbtf_gen.atomic import digest, read_json, write_json
+from mbtf_gen.atomic import digest, write_json
 from mbtf_gen.directions import from_projected_disk
 from mbtf_gen.errors import InputError
-from mbtf_gen.levels import MAX_LEVEL, Lattice, sigma_of_level
+from mbtf_gen.levels import Lattice, sigma_of_level
 from mbtf_gen.schema import CONVENTIONS
-from mbtf_gen.settings import build, check_document
+from mbtf_gen.settings import build
 
 from .config import FitConfig
 from .data import Queries
 from .inference import evaluate_in_chunks, predict
+from .material_format import (
+    CONFORMANCE,
+    CONFORMANCE_COUNT,
+    DESCRIPTION_NAME,
+    FORMAT_NAME,
+    MATERIAL_CONVENTIONS,
+    SCHEMA_VERSION,
+    WEIGHTS_NAME,
+    check_conformance,
+    read_description,
+)
 from .models import NeuralMaterial, build_model
 from .storage import read_tensors, write_tensors
-
-FORMAT_NAME = "mbtf-material"
-SCHEMA_VERSION = 1
-DESCRIPTION_NAME = "material.json"
-WEIGHTS_NAME = "weights.safetensors"
-# Queries with expected values that every exported material carries.
-CONFORMANCE_COUNT = 256
-_CONFORMANCE = ("u", "sigma", "omega_i", "omega_o", "rgb")
-
-
-class _Weights(BaseModel):
-    sha256: str
-    network_weights: int
-    texels: int
-
-
-class _Levels(BaseModel):
-    finest: Annotated[int, Field(strict=True, ge=0, le=MAX_LEVEL)]
-
-
-class _Tile(BaseModel):
-    aspect: Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)]
-
-
-class _Conformance(BaseModel):
-    count: int
-
-
-class _Training(BaseModel):
-    steps: int
-    batch: int
-    seconds: float
-    device: str
-    threads: int
-    errors: dict[str, Any]
-
-
-class _Description(BaseModel):
-    """What readers of ``material.json`` rely on; it holds more."""
-
-    model: str
-    config: dict[str, Any]
-    weights: _Weights
-    levels: _Levels
-    tile: _Tile
-    conformance: _Conformance
-    training: _Training
-    data: dict[str, Any]
 
 
 def conformance_queries(lattice: Lattice) -> dict[str, NDArray[np.float32]]:
@@ -124,48 +86,23 @@ class Material:
         ------
         InputError : missing, damaged, or of another schema
         """
-        folder = Path(folder)
-        if not folder.is_dir():
-            raise InputError("no such folder", where=folder)
-        path = folder / DESCRIPTION_NAME
-        if not path.exists():
-            raise InputError(
-                f"no {DESCRIPTION_NAME} in it",
-                where=folder,
-                cure="make a material with: mbtf-fit SHARDS -o FOLDER",
-            )
-        description = read_json(path)
-        if description.get("format") != FORMAT_NAME:
-            raise InputError(f"does not describe a material ({FORMAT_NAME})", where=path)
-        if description.get("schema") != SCHEMA_VERSION:
-            raise InputError(
-                f"material of schema {description.get('schema')}; this version reads schema {SCHEMA_VERSION}",
-                where=path,
-                cure="fit it again with this version of mbtf-fit",
-            )
-        check_document(_Description, description, path, "fit it again, or fetch it again from where it came")
-        weights = folder / WEIGHTS_NAME
-        if not weights.is_file() or digest(weights) != description["weights"]["sha256"]:
-            raise InputError("is missing or not the file that material.json describes", where=weights)
-        config = build(FitConfig, description["config"], source=str(path))
+        description, weights = read_description(Path(folder))
+        config = build(FitConfig, description["config"], source=str(weights.with_name(DESCRIPTION_NAME)))
         lattice = Lattice(description["levels"]["finest"], description["tile"]["aspect"])
         # Before memory is taken for a model that the weights cannot fill.
         if 4 * lattice.texels() * config.network.channels > weights.stat().st_size:
             raise InputError("is too small for the levels that material.json describes", where=weights)
         model = build_model(config.model, lattice, **config.network.model_dump())
         tensors, _ = read_tensors(weights, device)
-        missing = [name for name in _CONFORMANCE if f"conformance.{name}" not in tensors]
-        if missing:
-            raise InputError(f"lacks the tensor 'conformance.{missing[0]}'", where=weights)
-        conformance = {
-            name: tensors.pop(f"conformance.{name}").float().cpu().numpy() for name in _CONFORMANCE
-        }
-        wanted = {"u": (2,), "sigma": (), "omega_i": (3,), "omega_o": (3,), "rgb": (3,)}
-        for name, array in conformance.items():
-            if array.shape != (description["conformance"]["count"], *wanted[name]):
-                raise InputError(
-                    f"its tensor 'conformance.{name}' has the shape {array.shape}", where=weights
-                )
+        conformance = check_conformance(
+            {
+                n: tensors.pop(f"conformance.{n}").float().cpu().numpy()
+                for n in CONFORMANCE
+                if f"conformance.{n}" in tensors
+            },
+            description,
+            weights,
+        )
         model.to(device).requires_grad_(False)
         model.load_weights(tensors)
         return cls(model, config, description, conformance)
@@ -204,7 +141,7 @@ class Material:
 
     def deviation(self) -> float:
         """Largest difference between the stored conformance values and what is evaluated here, in 1/sr."""
-        found = self.evaluate(*(self.conformance[name] for name in _CONFORMANCE[:-1]))
+        found = self.evaluate(*(self.conformance[name] for name in CONFORMANCE[:-1]))
         return float(np.abs(found - self.conformance["rgb"]).max())
 
 
@@ -245,7 +182,7 @@ def export(
             "schema": SCHEMA_VERSION,
             "model": model.name,
             "formula": model.formula(),
-            "conventions": CONVENTIONS | _CONVENTIONS,
+            "conventions": CONVENTIONS | MATERIAL_CONVENTIONS,
             "tile": {"aspect": lattice.aspect},
             "levels": {
                 "finest": lattice.finest,
@@ -261,7 +198,7 @@ def export(
             },
             "conformance": {
                 "count": CONFORMANCE_COUNT,
-                "tensors": [f"conformance.{name}" for name in _CONFORMANCE],
+                "tensors": [f"conformance.{name}" for name in CONFORMANCE],
                 "tolerance": 1e-4,
                 "note": "evaluating the first four must give the fifth within tolerance * max(1, value)",
             },
@@ -271,13 +208,3 @@ def export(
         },
     )
     return Material.load(folder)
-
-
-_CONVENTIONS = {
-    "textures": "weights of a texture are (rows, columns, channels); row 0 is the side v -> 1; texel centres "
-    "at ((i+1/2)/W, 1-(j+1/2)/H); bilinear between them, wrapped in both directions",
-    "blending": "level l = clamp(-log2(2 sigma), 0, k); features are (1-frac(l)) * level floor(l) + "
-    "frac(l) * level floor(l)+1",
-    "networks": "x -> weight x + bias, ReLU after every layer but the last; weight is (outputs, inputs)",
-    "clamp": "values below 0 are set to 0",
-}

@@ -47,7 +47,7 @@ class MbtfError(Exception):
 
     @property
     def message(self) -> str:
-        """`where: what. cure`, one line."""
+        """Where and what on one line, the cure on a second."""
         text = f"{self.where}: {self.what}" if self.where else self.what
         return f"{text}\n  {self.cure}" if self.cure else text
 

@@ -19,7 +19,7 @@ from .estimates import MOST_LOCATED, BadSample, Estimates, Stream
 from .light import LightKernel
 from .queries import Queries
 from .scene import CLEARANCE, Tile
-from .seeds import Purpose, path_generator, stream_number
+from .seeds import Purpose, sequence, stream_key, stream_number
 from .tracing import LaneLight, Transport, trace
 
 # Paths per launch: enough to fill any machine, few enough to stay small in memory.
@@ -216,16 +216,22 @@ class Estimator:
         half = spp // 2
 
         def generator(lane: Any, purpose: Purpose) -> Any:
-            # The path's number within its half of the shard; both halves use the same numbers in other
-            # streams.
-            query = mi.UInt64(lane // spp) + dr.opaque(mi.UInt64, first)
-            path = query * half + mi.UInt64(lane % half)
-            a, b = (stream_number(stream.split, stream.shard, purpose, attempt, h) for h in (0, 1))
-            number = dr.select((lane // half) % 2 == 0, dr.opaque(mi.UInt64, a), dr.opaque(mi.UInt64, b))
-            return path_generator(stream.root, number, path)
+            # Both halves take the same points of sequences of other streams.
+            a, b = (
+                stream_key(stream.root, stream_number(stream.split, stream.shard, purpose, attempt, h))
+                for h in (0, 1)
+            )
+            words = [
+                dr.select(
+                    (lane // half) % 2 == 0,
+                    dr.opaque(mi.UInt32, a >> shift & 0xFFFFFFFF),
+                    dr.opaque(mi.UInt32, b >> shift & 0xFFFFFFFF),
+                )
+                for shift in (0, 32)
+            ]
+            return sequence(words[0], words[1], lane // spp + dr.opaque(mi.UInt32, first), lane % half)
 
-        rng = generator(lanes, Purpose.FOOTPRINT)
-        xi = mi.Point2f(rng.next_float32(), rng.next_float32())
+        xi = generator(lanes, Purpose.FOOTPRINT).next_2d()
         point = source.footprint(lanes // spp, xi)
         cell = mi.Vector2u((point - dr.floor(point)) * 256.0)
         key = _spread_bits(cell.x) | (_spread_bits(cell.y) << 1)

@@ -95,7 +95,7 @@ def closest_hit(
     ----------
     flags : which parts of the surface interaction are wanted
     holes : ``holes.opacity(si)``, the chance that a hit stops the ray; None where nothing lets rays through
-    rng : random numbers that decide it
+    rng : :class:`~mbtf_gen.sampling.Points` that decide it
 
     Returns
     -------
@@ -114,7 +114,7 @@ def closest_hit(
         ends = side >= rise
         if dr.hint(holes is not None, mode="scalar"):
             si = found.compute_surface_interaction(ray, mi.RayFlags.UV, stop)
-            passes = stop & (rng.next_float32() >= holes.opacity(si))
+            passes = stop & (rng.chance() >= holes.opacity(si))
             onward = dr.select(passes, leave(period, si, ray.d).o, onward)
             ends &= ~passes
             stop &= ~passes
@@ -158,7 +158,7 @@ def occluded(
             found = scene.ray_intersect_preliminary(ray, False, searching)
             stop = searching & found.is_valid()
             si = found.compute_surface_interaction(ray, mi.RayFlags.UV, stop)
-            passes = stop & (rng.next_float32() >= holes.opacity(si))
+            passes = stop & (rng.chance() >= holes.opacity(si))
             onward = dr.select(passes, leave(period, si, ray.d).o, onward)
             ends &= ~passes
             stop &= ~passes

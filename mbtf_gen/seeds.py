@@ -1,17 +1,20 @@
 """Random streams, an injective function of (root seed, split, shard, purpose, pass, half).
 
 Queries are drawn with NumPy's Philox, a counter-based generator whose key holds all of these numbers
-unhashed. Paths are drawn inside kernels with PCG32 (O'Neill 2014), one generator per path: its sequence
-number holds the fields other than the root seed, its start all of them and the path's number, hashed, so that
-no value depends on how paths are grouped into launches.
+unhashed. Paths draw from low-discrepancy sequences inside kernels (:mod:`mbtf_gen.sampling`), one for each
+half of each query: the fields are hashed into a key of 64 bits, from which queries of one stream derive keys
+that differ from each other, so that no value depends on how paths are grouped into launches.
 """
 
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from .sampling import Points
 
 MAX_SHARDS = 1 << 28
 # Data splits, reference pictures and pilots draw from streams of their own.
@@ -47,28 +50,35 @@ def numpy_generator(
     return np.random.Generator(np.random.Philox(key=key))
 
 
-def _mix(x: Any) -> Any:
-    """The finaliser of MurmurHash3 (Appleby), a bijection of ``mi.UInt64``."""
-    import mitsuba as mi
+_WORD = (1 << 64) - 1
 
-    x = (x ^ (x >> 33)) * mi.UInt64(0xFF51AFD7ED558CCD)
-    x = (x ^ (x >> 33)) * mi.UInt64(0xC4CEB9FE1A85EC53)
+
+def _mix(x: int) -> int:
+    """The finaliser of MurmurHash3 (Appleby), a bijection of 64-bit numbers."""
+    x = (x ^ (x >> 33)) * 0xFF51AFD7ED558CCD & _WORD
+    x = (x ^ (x >> 33)) * 0xC4CEB9FE1A85EC53 & _WORD
     return x ^ (x >> 33)
 
 
-def path_generator(root: int, stream: Any, lane: Any) -> Any:
-    """PCG32 inside a kernel, one per lane.
+def stream_key(root: int, number: int) -> int:
+    """64-bit key of the paths of a stream; `number` from :func:`stream_number`."""
+    # Each is hashed before the next is added: neighbouring root seeds share nothing then.
+    return _mix(_mix(number + 1) + root & _WORD)
+
+
+def sequence(key: Any, salt: Any, query: Any, index: Any) -> Points:
+    """Points inside a kernel, one sequence per query of a stream.
 
     Parameters
     ----------
-    root : root seed; stream : ``mi.UInt64``, numbers from :func:`stream_number`, one or one per lane
-    lane : ``mi.UInt64``, number of the path within its stream
+    key, salt : ``mi.UInt32``, lower and upper half of :func:`stream_key`, one or one per lane
+    query : ``mi.UInt32``, number of the query in its shard; index : of the path within its half of the query
     """
-    import drjit as dr
     import mitsuba as mi
 
-    # PCG32 sequences of different numbers that start from one state stay a constant apart, the same for every
-    # start, and are anything but independent. So every field goes into the start, each hashed before the next
-    # is added: neighbouring root seeds then share nothing either.
-    key = _mix(_mix(stream + mi.UInt64(1)) + dr.opaque(mi.UInt64, root))
-    return mi.PCG32(initstate=_mix(key + lane * mi.UInt64(0x9E3779B97F4A7C15)), initseq=stream)
+    from .sampling import Points, mix
+
+    # Both are bijections of the query's number, and unrelated ones.
+    return Points(
+        mix(query ^ key), mix(query * mi.UInt32(0x2C1B3C6D) + salt), mi.UInt32(index), mi.UInt32(query) * 0
+    )

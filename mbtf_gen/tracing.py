@@ -156,7 +156,7 @@ class Path:
     throughput : weight of what is still to be found
     pdf : density with which the last bounce chose its direction; infinite for mirrors and for the first ray
     depth : surface interactions so far
-    rng : random numbers
+    rng : random numbers, :class:`~mbtf_gen.sampling.Points`
     capped : rays cut off at the cap on crossings
     lost : rays that went down and met nothing
     passed : the first ray went through the tile
@@ -173,10 +173,6 @@ class Path:
     lost: Any
     passed: Any
     active: Any
-
-
-def _next_2d(rng: Any) -> Any:
-    return mi.Point2f(rng.next_float32(), rng.next_float32())
 
 
 def _on_plane(world: World, ray: Any, active: Any) -> Any:
@@ -204,7 +200,7 @@ def _visible(world: World, path: Path, transport: Transport) -> tuple[Any, Any, 
     if not transport.displacement:
         si = _on_plane(world, path.ray, path.active)
         if holes is not None:
-            si.t = dr.select(path.rng.next_float32() < holes.opacity(si), si.t, dr.inf)
+            si.t = dr.select(path.rng.chance() < holes.opacity(si), si.t, dr.inf)
         capped = mi.Bool(False)
     elif transport.neighbours or holes is not None:
         si, _, capped, path.rng = closest_hit(
@@ -232,7 +228,7 @@ def _direct(world: World, path: Path, si: Any, point: Any, light: LaneLight, tra
     if light.kind == "delta":
         omega, incoming = light.omega_i, light.inverse_irradiance
     else:
-        omega = light.sample(_next_2d(path.rng))
+        omega = light.sample(path.rng.next_2d())
         incoming = light.radiance(omega)
     value, pdf = point.eval_pdf(omega)
     if light.kind == "lobe":
@@ -288,7 +284,7 @@ def _interaction(
         return path
     if not transport.bsdf_sampling and light.kind != "constant":
         path.active &= path.depth < limit
-    omega, weight, path.pdf = point.sample(path.rng.next_float32(), _next_2d(path.rng))
+    omega, weight, path.pdf = point.sample(path.rng.next_1d(), path.rng.next_2d())
     path.ray = leave(world.period, si, omega)
     path.throughput *= weight
     _roulette(path, roulette)
@@ -302,7 +298,7 @@ def _roulette(path: Path, begin: Any) -> None:
     path.active &= strongest > 0
     longest = dr.select(path.depth < PATIENCE, 1.0, LATE_SURVIVAL)
     survival = dr.select(path.depth >= begin, dr.minimum(strongest, longest), 1.0)
-    path.active &= path.rng.next_float32() < survival
+    path.active &= path.rng.next_1d() < survival
     path.throughput *= dr.rcp(survival)
 
 

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from support.scenes import mi, queries
 
-from mbtf_gen.seeds import Purpose, path_generator, stream_number
+from mbtf_gen.seeds import Purpose, sequence, stream_key, stream_number
 from mbtf_gen.stats import Rectangle, chi_square_test, mean_estimate, z_test
 
 N = 1 << 18
@@ -19,9 +19,10 @@ def points(sigma: float, aspect: float) -> NDArray[np.float64]:
     """uv (N, 2) of sampled footprint points, not wrapped."""
     sensor = mi.load_dict({"type": "mbtf_queries", "aspect": aspect})
     sensor.set_queries(queries(CENTRE, sigma, [0, 0, 1], [0, 0, 1], 1))
-    number = mi.UInt64(stream_number("test", 2, Purpose.FOOTPRINT))
-    generator = path_generator(4, number, dr.arange(mi.UInt64, N))
-    xi = mi.Point2f(generator.next_float32(), generator.next_float32())
+    key = stream_key(4, stream_number("test", 2, Purpose.FOOTPRINT))
+    # The first point of many queries: points of one query are no independent sample.
+    words = (mi.UInt32(key & 0xFFFFFFFF), mi.UInt32(key >> 32))
+    xi = sequence(*words, dr.arange(mi.UInt32, N), 0).next_2d()
     return np.array(sensor.footprint(dr.zeros(mi.UInt32, N), xi), np.float64).T
 
 

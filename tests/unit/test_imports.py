@@ -36,7 +36,7 @@ VOCABULARY = {
     "mbtf_gen.stats",
 }
 # The fitted material as a renderer's plugin: the one place of the fitter that knows the renderer.
-PLUGIN = "mbtf_fit.mitsuba_plugin"
+PLUGIN = "mbtf_fit.plugin"
 
 
 def module_name(path: Path, root: Path = ROOT) -> str:
@@ -104,8 +104,8 @@ def test_imports_run_one_way() -> None:
         ("mbtf_fit.a.b", "from mbtf_pipeline.stages import run", True),
         ("mbtf_gen.a.b", "from ..errors import InputError", False),
         ("mbtf_fit.a", "import drjit as dr", True),
-        ("mbtf_fit.mitsuba_plugin.a", "import drjit as dr", False),
-        ("mbtf_fit.mitsuba_plugin.a", "import torch", True),
+        ("mbtf_fit.plugin.a", "import drjit as dr", False),
+        ("mbtf_fit.plugin.a", "import torch", True),
         ("mbtf_pipeline.a", "import mbtf_fit, mbtf_gen, torch", False),
     ],
 )

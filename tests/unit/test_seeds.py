@@ -9,10 +9,12 @@ import pytest
 from numpy.typing import NDArray
 
 from mbtf_gen.engine import load_mitsuba
-from mbtf_gen.seeds import MAX_SHARDS, Purpose, numpy_generator, path_generator, stream_number
+from mbtf_gen.seeds import MAX_SHARDS, Purpose, numpy_generator, sequence, stream_key, stream_number
 from mbtf_gen.stats import Rectangle, chi_square_test, sidak
 
 mi = load_mitsuba()
+
+from mbtf_gen.sampling import Points  # noqa: E402
 
 SHARDS = [0, 1, 2, 3, 255, 256, 4095, 4096, 65535, 65536, MAX_SHARDS - 2, MAX_SHARDS - 1]
 PASSES = [0, 1, 2, 3, 15, 16, 2047, 4095]
@@ -24,7 +26,6 @@ def test_stream_numbers_are_distinct_and_fit_the_key() -> None:
     numbers = [stream_number(*fields) for fields in FIELDS]
     assert len(set(numbers)) == len(FIELDS) == 3 * len(SHARDS) * len(Purpose) * len(PASSES) * 2
     assert min(numbers) >= 0
-    # PCG32 keeps 63 bits of a sequence number.
     assert max(numbers) < 1 << 47
 
 
@@ -48,10 +49,23 @@ def test_numpy_generators_differ_in_every_field() -> None:
     assert len(first) == len(fields)
 
 
+def test_path_keys_differ_in_every_field_and_in_the_root_seed() -> None:
+    numbers = [stream_number(*fields) for fields in FIELDS[::7]]
+    keys = {stream_key(root, number) for root in (0, 1, 2, 2**62) for number in numbers}
+    assert len(keys) == 4 * len(numbers)
+    assert max(keys) < 1 << 64
+
+
+def points(root: int, number: int, query: NDArray[np.uint32], index: NDArray[np.uint32]) -> Points:
+    """Sequences of paths of a stream."""
+    key = stream_key(root, number)
+    return sequence(mi.UInt32(key & 0xFFFFFFFF), mi.UInt32(key >> 32), mi.UInt32(query), mi.UInt32(index))
+
+
 def draws(root: int, number: int, count: int) -> NDArray[np.float64]:
-    """(count, LANES) numbers in [0, 1) of the first `LANES` paths of a stream."""
-    generator = path_generator(root, mi.UInt64(number), mi.UInt64(np.arange(LANES, dtype=np.uint64)))
-    return np.array([np.array(generator.next_float32(), np.float64) for _ in range(count)])
+    """(count, LANES) numbers in [0, 1) of the first path of the first `LANES` queries of a stream."""
+    drawn = points(root, number, np.arange(LANES, dtype=np.uint32), np.zeros(LANES, np.uint32))
+    return np.array([np.array(drawn.next_1d(), np.float64) for _ in range(count)])
 
 
 BASE = (0, "train", 0, Purpose.PATH, 0, 0)
@@ -85,7 +99,7 @@ def test_neighbouring_root_seeds_share_no_path(step: int) -> None:
     assert not np.any((zero == shifted).all(axis=0))
 
 
-def test_paths_of_one_stream_are_independent() -> None:
+def test_queries_of_one_stream_are_independent() -> None:
     drawn = draws(0, stream_number(*BASE[1:]), 20)
     p = [
         chi_square_test(np.column_stack(pair), lambda q: np.ones(len(q)), Rectangle(), (16, 16)).p_value
@@ -95,11 +109,20 @@ def test_paths_of_one_stream_are_independent() -> None:
     assert sidak(p).min() > 1e-3
 
 
+def test_all_queries_of_a_stream_have_keys_of_their_own() -> None:
+    drawn = points(3, stream_number(*BASE[1:]), np.arange(1 << 20, dtype=np.uint32), np.zeros(1, np.uint32))
+    key, salt = (np.array(word, np.uint64) for word in (drawn.key, drawn.salt))
+    # Two unrelated orders of the same numbers: pairs agree in neither half.
+    assert len(np.unique(key)) == len(np.unique(salt)) == 1 << 20
+    assert abs(np.corrcoef(key.astype(float), salt.astype(float))[0, 1]) < 5e-3
+
+
 def test_a_path_does_not_depend_on_its_launch() -> None:
-    lanes = np.array([5, 70000, 3, 2**40], np.uint64)
+    query = np.array([5, 70000, 3, 2**32 - 1], np.uint32)
+    index = np.array([0, 3, 900, 2**31], np.uint32)
     number = stream_number(*BASE[1:])
-    together = np.array(path_generator(9, mi.UInt64(number), mi.UInt64(lanes)).next_uint32())
+    together = np.array(points(9, number, query, index).next_2d()).T
     alone = [
-        np.array(path_generator(9, mi.UInt64(number), mi.UInt64(lane)).next_uint32())[0] for lane in lanes
+        np.array(points(9, number, query[i : i + 1], index[i : i + 1]).next_2d())[:, 0] for i in range(4)
     ]
-    assert together.tolist() == alone
+    assert together.tolist() == [x.tolist() for x in alone]
