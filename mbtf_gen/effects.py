@@ -21,6 +21,7 @@ EFFECTS: dict[str, str] = {
     "specular": "specular lobe",
     "metallic": "metallic",
     "coat": "clear coat",
+    "sheen": "sheen",
     "normal": "normal map",
     "opacity": "opacity",
     "fibres": "fibre scattering",

@@ -55,7 +55,8 @@ def estimator_of(job: Job, plan: EffectsPlan, tiles: dict[Any, Any]) -> Any:
     from .scene import APRON_SHARE, build_tile
     from .tracing import Transport
 
-    parts = tuple(plan.on(n) for n in ("masking", "specular", "metallic", "coat", "normal", "opacity"))
+    of_surface = ("specular", "metallic", "coat", "sheen", "normal", "opacity")
+    parts = tuple(plan.on(n) for n in ("masking", *of_surface))
     apron = APRON_SHARE
     if plan.on("masking") and not plan.on("neighbours"):
         from .planning import reach_of
