@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 
 from mbtf_gen.config import GeneratorConfig
-from mbtf_gen.effects import Effect, EffectsPlan
+from mbtf_gen.effects import EffectsPlan
 from mbtf_gen.estimates import Estimates, Stream
 from mbtf_gen.generation import Job
 from mbtf_gen.material import Material, load_material
@@ -186,7 +186,7 @@ def costs_of(name: str, material: Material, queries: int, spp: int) -> list[dict
             truth(values(unlimited), values(unlimited, plan.max_depth)),
         )
     for effect in plan.effects:
-        if not effect.on and effect.present and _can_be_on(plan, effect):
+        if not effect.on and effect.present and (plan.on("masking") or effect.name == "masking"):
             whole = replace(
                 plan, effects=tuple(replace(e, on=True) if e.name == effect.name else e for e in plan.effects)
             )
@@ -194,7 +194,7 @@ def costs_of(name: str, material: Material, queries: int, spp: int) -> list[dict
             pair = values(whole, fewer=fewer), values(plan, fewer=fewer)
             row(effect.name, "off", effect.cost or 0.0, 0.0, truth(*pair))
     for effect in measured(job, plan).effects:
-        if effect.on:
+        if effect.on and effect.cost is not None:
             row(
                 effect.name,
                 "on",
@@ -203,13 +203,6 @@ def costs_of(name: str, material: Material, queries: int, spp: int) -> list[dict
                 truth(base, values(without(plan, effect.name))),
             )
     return rows
-
-
-def _can_be_on(plan: EffectsPlan, effect: Effect) -> bool:
-    """Whether the plan with this effect can be traced: nothing else needs to be on for it."""
-    return effect.name == "masking" or (
-        plan.on("masking") and (effect.name != "mis" or plan.on("neighbours"))
-    )
 
 
 def costs(cases: dict[str, Material], queries: int, spp: int) -> int:

@@ -16,12 +16,13 @@ from torch import Tensor
 from mbtf_gen.errors import InputError
 
 from .blur import annealed_sigma
+from .buffers import Crops, TrainingBuffers
 from .config import FitConfig, TrainingSection
 from .data import Queries, TrainingQueries
 from .inference import predict
 from .losses import Loss, relative_error, squared_error
 from .models import NeuralMaterial
-from .parallel import Workers
+from .parallel import Batch, Workers
 
 # Decay of Adam's running means of the gradient and of its square.
 BETAS = (0.8, 0.95)
@@ -64,7 +65,9 @@ class Trainer:
     progress : how far it is
     """
 
-    def __init__(self, config: FitConfig, model: NeuralMaterial, queries: TrainingQueries) -> None:
+    def __init__(
+        self, config: FitConfig, model: NeuralMaterial, queries: TrainingQueries | TrainingBuffers
+    ) -> None:
         self.config = config
         self.model = model
         self.queries = queries
@@ -91,19 +94,9 @@ class Trainer:
             return min(1.0, self.progress.step / training.steps)
         return min(1.0, self.progress.seconds / training.time)
 
-    def _batches(self) -> Iterator[TrainingQueries]:
-        """Endless batches from the current step on: every epoch all slices in a new order.
-
-        The layout promises queries in random order, so that consecutive ones are a batch. Each epoch's slices
-        start at another row.
-        """
-        count = len(self.queries) // self.batch
-        while True:
-            epoch, done = divmod(self.progress.step, count)
-            random = np.random.Generator(np.random.Philox(key=[self.config.seed, epoch]))
-            start = int(random.integers(len(self.queries) - count * self.batch + 1))
-            for i in random.permutation(count)[done:]:
-                yield self.queries.slice(start + i * self.batch, start + (i + 1) * self.batch)
+    def _batches(self) -> Iterator[Batch]:
+        """Endless batches from the current step on."""
+        return self.queries.batches(self.batch, self.config.seed, self.progress.step, self.model.margin)
 
     def train(self, seconds: float) -> bool:
         """Train for about so long, or until the budget is spent; returns whether it is.
@@ -135,7 +128,7 @@ class Trainer:
             cure=f"lower the rate: --rate {self.config.training.rate / 3:.1g} --overwrite",
         )
 
-    def _guarded_step(self, batch: TrainingQueries, workers: Workers) -> Tensor:
+    def _guarded_step(self, batch: Batch, workers: Workers) -> Tensor:
         try:
             return self._step(batch, workers)
         except (RuntimeError, IndexError):
@@ -152,11 +145,12 @@ class Trainer:
             t.blurred(max(sigma, blur.offset) if t.moves_lookups else sigma) for t in self.model.textures()
         ]
 
-    def _loss(self, batch: TrainingQueries) -> Tensor:
-        prediction = self.model(batch.u, batch.sigma, batch.omega_i, batch.omega_o)
+    def _loss(self, batch: Batch) -> Tensor:
+        evaluate = self.model.crops if isinstance(batch, Crops) else self.model
+        prediction = evaluate(batch.u, batch.sigma, batch.omega_i, batch.omega_o)
         return self.loss(prediction, batch.value)
 
-    def _step(self, batch: TrainingQueries, workers: Workers) -> Tensor:
+    def _step(self, batch: Batch, workers: Workers) -> Tensor:
         training = self.config.training
         factor = rate_factor(training, self.progress.step, self.share)
         for group, rate in zip(

@@ -149,7 +149,7 @@ def measured(job: Job, plan: EffectsPlan, spp: int = PILOT_SPP) -> EffectsPlan:
     pilot = Pilot(job, plan, spp)
 
     def look(effect: Effect) -> Effect:
-        if not effect.on:
+        if not effect.on or not effect.present:
             return effect
         cut = without(plan, effect.name)
         gone = [

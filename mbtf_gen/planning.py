@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 # that lies beyond them on one side.
 LOBE_TAIL = 3.5
 LOBE_TAIL_SHARE = 2.4e-4
-# A ray may leave the tile sideways by this share of its shorter side before it needs the neighbours.
-LONGEST_REACH = 0.45
 # Light found by next-event estimation alone keeps its variance when the narrowest lobe of the surface, about
 # 2α wide, is so many times wider than the light's.
 WIDER = 4.0
@@ -301,12 +299,9 @@ def _of_relief(
         left -= shadowing.cost
         shadowing = replace(shadowing, on=False)
     decided["shadowing"] = wish.decide(shadowing)
-    decided["neighbours"] = Effect("neighbours", True, "rays re-enter the tile")
+    decided["neighbours"] = wish.decide(_neighbours(look))
     decided["interreflection"] = Effect("interreflection", True, "not looked at")
     decided["interreflection"], cap, cost = _interreflection(look, wish, decided, left)
-    bounces_left_out = 0.0 if decided["interreflection"].on else decided["interreflection"].cost or 0.0
-    left -= cost + bounces_left_out
-    decided["neighbours"] = wish.decide(_neighbours(look, decided, left))
     return _assemble(job, _consistent(decided, wish), cap, cost)
 
 
@@ -407,28 +402,18 @@ def _interreflection(
     return replace(found, reason=f"{reason}; no limit, Russian roulette ends paths"), 0, 0.0
 
 
-def _neighbours(look: _Look, decided: dict[str, Effect], left: float) -> Effect:
+def _neighbours(look: _Look) -> Effect:
+    """How far view and light rays move sideways within the relief. The tile repeats by construction, at no
+    cost: nothing to switch."""
     job = look.job
-    if decided["interreflection"].on or decided["mis"].on:
-        return Effect("neighbours", True, "scattered rays go anywhere")
-    reach = reach_of(job)
-    limit = LONGEST_REACH * min(1.0, job.grid.aspect)
-    if reach <= limit and look.below_lowest <= left:
-        reason = f"no ray moves sideways by more than {100.0 * reach:.2g} % of the tile's width"
-        return Effect("neighbours", False, reason, look.below_lowest, "bound")
-    reason = (
-        f"rays move sideways by up to {reach:.2g} tile widths"
-        if np.isfinite(reach)
-        else "light from the horizon"
-    )
-    return Effect("neighbours", True, reason)
-
-
-def reach_of(job: Job) -> float:
-    """How far, in tile widths, view rays and light rays move sideways within the relief."""
     view = float(np.arcsin(job.config.queries.min_cos))
-    lowest = min(view, view - LOBE_TAIL * float(np.radians(job.config.light.width)))
-    return float(job.grid.relief / np.tan(lowest)) if lowest > 0 else float("inf")
+    lowest = min(view, look.lowest_light)
+    if lowest > 0:
+        tiles = job.grid.relief / np.tan(lowest) / min(1.0, job.grid.aspect)
+        reason = f"view and light rays cross up to {tiles:.2g} tiles; repeating the tile costs nothing"
+    else:
+        reason = "light from the horizon crosses any number of tiles; repeating the tile costs nothing"
+    return Effect("neighbours", True, reason, present=False)
 
 
 def _consistent(decided: dict[str, Effect], wish: Wish) -> dict[str, Effect]:
@@ -443,9 +428,6 @@ def _consistent(decided: dict[str, Effect], wish: Wish) -> dict[str, Effect]:
     if not decided["masking"].on:
         for name in OF_RELIEF[1:]:
             off(name, EFFECTS["masking"])
-    elif not decided["neighbours"].on:
-        off("interreflection", EFFECTS["neighbours"])
-        off("mis", EFFECTS["neighbours"])
     return decided
 
 

@@ -126,7 +126,6 @@ CASES = [
     ("masking", "grey relief", "faint relief"),
     ("shadowing", "grey relief", "gentle relief"),
     ("interreflection", "white relief", "gentle relief"),
-    ("neighbours", "grey relief", "gentle relief"),
     ("specular", "glossy relief", "grey relief"),
     ("metallic", "metal relief", "glossy relief"),
     ("normal", "normal map on a plane", "grey relief"),
@@ -146,7 +145,6 @@ def test_an_effect_is_on_where_it_matters_and_off_where_not(name: str, needed: s
     assert not planned(idle)[1].on(name)
     full, cut = estimates(job, plan), estimates(job, without(plan, name))
     cost, cautious = relative_change(full, cut)
-    # Neighbours are left out only together with what needs them; here their own share is what counts.
     assert cost > 2 * plan.tolerance
     assert cautious - cost < 0.5 * cost
 

@@ -132,18 +132,6 @@ def test_the_change_is_relative_to_the_mean_and_free_of_noise() -> None:
     assert upper > cost
 
 
-def test_without_neighbours_nothing_is_sampled_from_the_surface() -> None:
-    """Rays that go anywhere need the neighbours; the plan without them can be traced."""
-    stuff = replace(lambert(waves(32, 32), 0.05), roughness=0.05, specular=0.5, metallic=0.0)
-    job = job_of(stuff, transport={"max_depth": 0})
-    plan = plan_effects(job)
-    assert plan.on("mis")
-    cut = without(plan, "neighbours")
-    assert not cut.on("mis")
-    assert not cut.on("interreflection")
-    assert np.all(np.isfinite(estimates(job, cut).value_a))
-
-
 def test_the_tolerance_is_shared_not_spent_twice() -> None:
     """Two effects that fit one by one but not together: one of them stays."""
     normal = tilted(32, 32)

@@ -85,7 +85,19 @@ def test_what_needs_an_effect_goes_with_it() -> None:
     assert on(plan_effects(job_of(LAMBERT, "-masking"))) == set()
     with pytest.raises(UsageError, match="'shadowing' needs 'parallax and masking'"):
         plan_effects(job_of(LAMBERT, "-masking,+shadowing"))
-    assert not plan_effects(job_of(LAMBERT, "all,-neighbours")).on("interreflection")
+
+
+def test_the_tile_repeats_by_construction() -> None:
+    with pytest.raises(UsageError, match="cannot be left out"):
+        plan_effects(job_of(LAMBERT, "-neighbours"))
+    low = plan_effects(job_of(LAMBERT, queries={"min_cos": 0.2}, light={"width": 0.0}), pilots=False)
+    # A relief of 0.1 seen from 11.5 degrees.
+    assert "up to 0.49 tiles" in low["neighbours"].reason
+    assert (
+        "any number"
+        in plan_effects(job_of(LAMBERT, queries={"min_cos": 0.01}), pilots=False)["neighbours"].reason
+    )
+    assert not plan_effects(job_of(FLAT)).on("neighbours")
 
 
 @pytest.mark.parametrize("name", ["specular", "metallic", "coat", "sheen", "normal", "opacity", "fibres"])
