@@ -286,7 +286,7 @@ def _of_relief(
         costs.masking if costs else None,
         "pilot",
     )
-    bounces = _bounce_bound(look)
+    bounces = _bounce_bound(look) if costs is not None and costs.masking <= left else 0.0
     if costs is not None and costs.masking + bounces <= left:
         # Without the displaced tile its other effects go too; their costs are in the sum.
         masking = replace(masking, on=False, cost=costs.masking + bounces)

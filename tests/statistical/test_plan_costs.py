@@ -146,11 +146,10 @@ def test_the_tolerance_is_shared_not_spent_twice() -> None:
 
 
 def test_the_cost_of_holes_is_that_of_a_run() -> None:
-    """Root mean square, shadows of the veil included: little of the tile lets light through, but there all
-    of it changes. The mean change is a sixth of it."""
-    opacity = np.ones((64, 64))
-    opacity[20:28, 10:40] = 0.3
-    stuff = lambert(waves(64, 64), 0.25, opacity=opacity)
+    """Crests that let most light through are little of what is seen from above, but they shade the rest."""
+    heights = waves(64, 64)
+    opacity = np.where(heights > np.quantile(heights, 0.8), 0.3, 1.0)
+    stuff = lambert(heights, 0.4, opacity=opacity)
     job = finest_job(stuff, "all")
     plan = plan_effects(job)
     found = relative_change(estimates(job, plan, 32), estimates(job, without(plan, "opacity"), 32))[0]
