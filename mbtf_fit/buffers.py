@@ -22,7 +22,7 @@ from mbtf_gen.levels import Lattice, level_of_sigma
 from mbtf_gen.shard_files import read_shard
 
 from .config import HeldOutSection
-from .data import MAX_HELD_OUT, Partition, Queries, in_region, read_checked
+from .data import MAX_HELD_OUT, SAMPLE, Partition, Queries, in_region, read_checked
 
 # Places along each side of a crop that are compared with values.
 CROP = 32
@@ -186,6 +186,7 @@ def load_buffers(data: Dataset, held_out: HeldOutSection, seed: int) -> Partitio
     u, value = np.empty((*shape, 2), np.float32), np.empty((*shape, 3), np.float32)
     sigma, omega = np.empty(count, np.float32), np.empty((2, count, 3), np.float32)
     out: tuple[list[Queries], list[Queries]] = ([], [])
+    sample: list[Queries] = []
     read = filled = 0
     for shard in shards:
         buffers = read_checked(shard)
@@ -194,6 +195,7 @@ def load_buffers(data: Dataset, held_out: HeldOutSection, seed: int) -> Partitio
         for group, mark in zip(out, (1, 2), strict=True):
             group.append(buffers.take(np.flatnonzero(mine == mark)))
         kept = np.flatnonzero(mine == 0)
+        sample.append(_some(buffers.take(kept), -(-SAMPLE * len(kept) // count), random))
         part = slice(filled, filled + len(kept))
         u[part], sigma[part] = buffers.u[kept], buffers.sigma[kept, 0, 0]
         omega[0, part], omega[1, part] = buffers.omega_i[kept, 0, 0], buffers.omega_o[kept, 0, 0]
@@ -208,4 +210,5 @@ def load_buffers(data: Dataset, held_out: HeldOutSection, seed: int) -> Partitio
         torch.from_numpy(value),
         strides(data.lattice, sigma),
     )
-    return Partition(training, *(_some(Queries.join(group), MAX_HELD_OUT, random) for group in out))
+    kept_out = [_some(Queries.join(group), MAX_HELD_OUT, random) for group in out]
+    return Partition(training, kept_out[0], kept_out[1], Queries.join(sample))

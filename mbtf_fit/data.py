@@ -109,13 +109,17 @@ class Partition:
     training : what is trained on, in the order of the shards; whole buffers in the image layout
     held_out_queries : a random share of the queries outside the held-out region
     held_out_directions : queries with light or view in the held-out region; at most `MAX_HELD_OUT`
+    sample : some of what is trained on, with both halves; about `SAMPLE` queries from all shards
     """
 
     training: TrainingQueries | TrainingBuffers
     held_out_queries: Queries
     held_out_directions: Queries
+    sample: Queries
 
 
+# Training queries that stand for all of them where both halves are wanted.
+SAMPLE = 1 << 16
 # Held-out queries that are kept for evaluation; the rest of them is dropped, never trained on.
 MAX_HELD_OUT = 1 << 16
 
@@ -210,6 +214,7 @@ def load_training(data: Dataset, held_out: HeldOutSection, seed: int) -> Partiti
     columns = {"u": (2,), "sigma": (), "omega_i": (3,), "omega_o": (3,), "value": (3,)}
     store = {name: np.empty((total, *shape), np.float32) for name, shape in columns.items()}
     kept_out: tuple[list[Queries], list[Queries]] = ([], [])
+    sample: list[Queries] = []
     filled = 0
     for index, shard in enumerate(shards):
         queries = read_checked(shard)
@@ -218,6 +223,8 @@ def load_training(data: Dataset, held_out: HeldOutSection, seed: int) -> Partiti
             wanted = MAX_HELD_OUT - sum(map(len, group))
             group.append(queries.take(np.flatnonzero(marks == mark)[:wanted]))
         rows = np.flatnonzero(marks == 0)
+        # The layout promises a random order: the first ones are as good as any.
+        sample.append(queries.take(rows[: -(-SAMPLE * len(rows) // total)]))
         part = slice(filled, filled + len(rows))
         for name in ("u", "sigma", "omega_i", "omega_o"):
             np.take(getattr(queries, name), rows, axis=0, out=store[name][part], mode="clip")
@@ -231,7 +238,7 @@ def load_training(data: Dataset, held_out: HeldOutSection, seed: int) -> Partiti
             cure="lower held_out.queries and held_out.radius",
         )
     training = TrainingQueries(**{name: torch.from_numpy(array[:filled]) for name, array in store.items()})
-    return Partition(training, *(Queries.join(group) for group in kept_out))
+    return Partition(training, *(Queries.join(group) for group in (*kept_out, sample)))
 
 
 def load_split(data: Dataset, split: Split, limit: int | None = None) -> Queries:

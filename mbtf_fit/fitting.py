@@ -25,6 +25,7 @@ from .material import Material, export
 from .material_format import DESCRIPTION_NAME, WEIGHTS_NAME
 from .memory import keep_freed_memory
 from .models import MODELS, build_model
+from .noise import NoiseModel, typical_value
 from .storage import make_folder, read_tensors, write_tensors
 from .training import Trainer
 
@@ -207,9 +208,10 @@ def _claim(out: Path, identity: dict[str, Any], config: FitConfig, overwrite: bo
 
 def _trainer(config: FitConfig, data: Dataset, partition: Partition, device: torch.device) -> Trainer:
     model = build_model(config.model, data.lattice, **config.network.model_dump())
-    unit = float(partition.training.value.mean())
-    model.initialise(torch.Generator().manual_seed(config.seed), unit if unit > 0 else 1.0)
-    return Trainer(config, model.to(device), partition.training.to(device))
+    unit = typical_value(partition.training.value.numpy())
+    model.initialise(torch.Generator().manual_seed(config.seed), unit)
+    noise = NoiseModel.of(partition.sample, data.lattice, unit)
+    return Trainer(config, model.to(device), partition.training.to(device), noise)
 
 
 def _resume(trainer: Trainer, out: Path) -> bool:

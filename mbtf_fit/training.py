@@ -20,8 +20,9 @@ from .buffers import Crops, TrainingBuffers
 from .config import FitConfig, TrainingSection
 from .data import Queries, TrainingQueries
 from .inference import predict
-from .losses import Loss, relative_error, squared_error
+from .losses import Objective
 from .models import NeuralMaterial
+from .noise import NoiseModel
 from .parallel import Batch, Workers
 
 # Decay of Adam's running means of the gradient and of its square.
@@ -59,6 +60,7 @@ class Trainer:
     ----------
     model : initialised, on the device
     queries : on the device
+    noise : model of their noise; :meth:`NoiseModel.silent` where there is none
 
     Attributes
     ----------
@@ -66,7 +68,11 @@ class Trainer:
     """
 
     def __init__(
-        self, config: FitConfig, model: NeuralMaterial, queries: TrainingQueries | TrainingBuffers
+        self,
+        config: FitConfig,
+        model: NeuralMaterial,
+        queries: TrainingQueries | TrainingBuffers,
+        noise: NoiseModel,
     ) -> None:
         self.config = config
         self.model = model
@@ -75,16 +81,7 @@ class Trainer:
         self.batch = min(config.training.batch, len(queries))
         texels, weights = model.parameter_groups()
         self.optimiser = torch.optim.Adam([{"params": texels}, {"params": weights}], betas=BETAS, fused=True)
-        self.loss = self._choose_loss()
-
-    def _choose_loss(self) -> Loss:
-        value = self.queries.value
-        if self.config.training.loss == "relative":
-            return relative_error(float(value.mean()) or 1.0)
-        variance = float(value.var(0, correction=0).mean()) if len(value) > 1 else 0.0
-        power = float(value.square().mean())
-        # Of constant data the variance is rounding error: measure by the values themselves.
-        return squared_error(variance if variance > 1e-6 * power else power or 1.0)
+        self.loss = Objective(config.training, noise)
 
     @property
     def share(self) -> float:
@@ -148,7 +145,7 @@ class Trainer:
     def _loss(self, batch: Batch) -> Tensor:
         evaluate = self.model.crops if isinstance(batch, Crops) else self.model
         prediction = evaluate(batch.u, batch.sigma, batch.omega_i, batch.omega_o)
-        return self.loss(prediction, batch.value)
+        return self.loss(prediction, batch)
 
     def _step(self, batch: Batch, workers: Workers) -> Tensor:
         training = self.config.training

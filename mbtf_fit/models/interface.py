@@ -54,7 +54,8 @@ class NeuralMaterial(nn.Module, ABC):
 
     @abstractmethod
     def initialise(self, generator: torch.Generator, unit: float) -> None:
-        """Draw all parameters anew; `unit` is the typical value of the data in 1/sr."""
+        """Draw all parameters anew; `unit` is the typical value of the data in 1/sr, 0
+        for black data: values are multiples of it, so that black is fitted exactly."""
 
     @abstractmethod
     def stage1(self, u: Tensor, sigma: Tensor, omega_o: Tensor) -> Tensor:
