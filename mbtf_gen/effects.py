@@ -22,6 +22,7 @@ EFFECTS: dict[str, str] = {
     "specular": "specular lobe",
     "metallic": "metallic",
     "coat": "clear coat",
+    "sheen": "sheen",
     "normal": "normal map",
     "opacity": "opacity",
     "fibres": "fibre scattering",
@@ -155,12 +156,15 @@ class Wish:
 
         Raises
         ------
-        UsageError : asked for by name, but the material does not have it
+        UsageError : asked for by name, but the material does not have it; or asked away, but it stays
         """
         name = effect.name
         if not effect.present:
-            if self.forced.get(name) and not effect.on:
+            asked = self.forced.get(name, effect.on)
+            if asked and not effect.on:
                 raise UsageError(f"the material has none: {effect.reason}", where=f"--effects +{name}")
+            if effect.on and not asked:
+                raise UsageError(f"cannot be left out: {effect.reason}", where=f"--effects -{name}")
             return effect
         on = self.forced.get(name, effect.on if self.base == "auto" else self.base == "all")
         if on == effect.on:

@@ -55,7 +55,8 @@ def estimator_of(job: Job, plan: EffectsPlan, tiles: dict[Any, Any]) -> Any:
     from .scene import build_tile
     from .tracing import Transport
 
-    parts = tuple(plan.on(n) for n in ("masking", "specular", "metallic", "coat", "normal", "opacity"))
+    of_surface = ("specular", "metallic", "coat", "sheen", "normal", "opacity")
+    parts = tuple(plan.on(n) for n in ("masking", *of_surface))
     if parts not in tiles:
         tiles[parts] = build_tile(job.grid, bsdf_of(job.material, plan, _slopes(job, plan)))
     config = job.config

@@ -28,7 +28,7 @@ class Summary:
     ----------
     queries : finished, of all splits; splits : the same by split
     paths, seconds : traced in this run, and its duration
-    writing_seconds : what writing and digesting took beside the rendering
+    writing_seconds : processor time that writing and digesting took beside the rendering
     waiting_seconds : how long rendering waited for it
     shard_seconds : of all finished shards, over all runs
     relative_error : pooled relative standard error of the stored training values, √(mean variance) / mean
