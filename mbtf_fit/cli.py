@@ -29,7 +29,7 @@ def fit(
     /,
     *,
     output: Output = Path("material"),
-    model: Literal["neumip", "neumip-baseline"] | None = None,
+    model: Literal["neumip", "neumip-baseline", "hierarchical"] | None = None,
     time: str | None = None,
     steps: int | None = None,
     batch: int | None = None,

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, PlainSerializer
+from pydantic import BeforeValidator, Field, PlainSerializer, model_validator
 
 from mbtf_gen.durations import format_duration, parse_duration
 from mbtf_gen.settings import Settings
 
-ModelName = Literal["neumip-baseline", "neumip"]
+ModelName = Literal["neumip-baseline", "neumip", "hierarchical"]
+OutputMap = Literal["exp-1", "exp", "identity", "softplus", "fourth-root"]
 LossName = Literal["relative", "squared"]
 
 Duration = Annotated[
@@ -19,12 +21,33 @@ Duration = Annotated[
 ]
 
 
+class EncodingSection(Settings):
+    """What networks see of positions and directions: sines and cosines of doubling frequencies."""
+
+    position: int = Field(0, ge=0, le=16, description="bands of the position; 0: it is not encoded")
+    direction: int = Field(0, ge=0, le=16, description="bands of a direction; 0: its coordinates")
+    pi: bool = Field(True, description="sin(2^k π p), which repeats with the tile; else sin(2^k p)")
+    raw: bool = Field(False, description="whether encoded coordinates are also given as they are")
+    lifted: bool = Field(False, description="directions as (x, y, z) rather than (x, y)")
+
+
 class NetworkSection(Settings):
-    """Size of the model; the defaults are the paper's."""
+    """Architecture of the model; unset keys are as the model's paper has them."""
 
     channels: int = Field(7, ge=1, le=64, description="features per texel")
     width: int = Field(25, ge=1, le=512, description="features of the hidden layers")
-    layers: int = Field(4, ge=2, le=16, description="layers of each network")
+    layers: int = Field(4, ge=2, le=16, description="layers of each fully connected network")
+    decoder: Literal["mlp", "inception"] = Field("mlp", description="network that answers the value")
+    activation: Literal["relu", "leaky-relu", "sine"] = Field("relu", description="between layers")
+    outputs: Literal[3, 6] = Field(3, description="3: RGB; 6: YUV and a gate, as the published code has it")
+    output: OutputMap = Field("exp-1", description="from the network's answer to the value")
+    offset: Literal["depth", "direct", "none"] = Field(
+        "depth", description="a length along the view, two numbers, or no offset"
+    )
+    blending: Literal["blend", "concatenate"] = Field(
+        "blend", description="two neighbouring levels: their weighted sum, or both side by side"
+    )
+    encoding: EncodingSection = EncodingSection()
 
 
 class BlurSection(Settings):
@@ -67,6 +90,28 @@ class HeldOutSection(Settings):
     )
 
 
+# What a model's paper asks for, where that is not the sections' own default.
+PRESETS: dict[str, dict[str, Any]] = {
+    "neumip-baseline": {"network": {"offset": "none"}},
+    "hierarchical": {
+        "network": {
+            "decoder": "inception",
+            "output": "fourth-root",
+            "encoding": {"position": 10, "direction": 4},
+        },
+    },
+}
+
+
+def _over(base: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """`given` laid over `base`, section by section."""
+    out = dict(base)
+    for key, value in given.items():
+        under = out.get(key)
+        out[key] = _over(under, value) if isinstance(under, Mapping) and isinstance(value, Mapping) else value
+    return out
+
+
 class FitConfig(Settings):
     """Everything ``mbtf-fit`` needs besides the shards."""
 
@@ -77,6 +122,26 @@ class FitConfig(Settings):
     held_out: HeldOutSection = HeldOutSection()
     seed: int = Field(0, ge=0, lt=1 << 63, description="of the first parameters and the order of batches")
     device: Literal["auto", "cpu", "cuda"] = Field("auto", description="auto: cuda where there is one")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _preset(cls, data: Any) -> Any:
+        """Fill what is not given as the model has it."""
+        if not isinstance(data, Mapping):
+            return data
+        name = data.get("model", cls.model_fields["model"].default)
+        return _over(PRESETS.get(name, {}) if isinstance(name, str) else {}, data)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> FitConfig:
+        network = self.network
+        if self.model == "neumip-baseline" and network.offset != "none":
+            raise ValueError("neumip-baseline has no offset: choose the model neumip, or network.offset none")
+        if self.model != "hierarchical" and network.decoder == "inception":
+            raise ValueError(
+                "the inception decoder looks at neighbouring queries: choose the model hierarchical for it"
+            )
+        return self
 
     def fields(self) -> dict[str, Any]:
         """What the fit depends on, as plain data: everything but the device."""

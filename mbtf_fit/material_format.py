@@ -128,6 +128,8 @@ MATERIAL_CONVENTIONS = {
     "at ((i+1/2)/W, 1-(j+1/2)/H); bilinear between them, wrapped in both directions",
     "blending": "level l = clamp(-log2(2 sigma), 0, k); features are (1-frac(l)) * level floor(l) + "
     "frac(l) * level floor(l)+1",
-    "networks": "x -> weight x + bias, ReLU after every layer but the last; weight is (outputs, inputs)",
+    "networks": "x -> weight x + bias, after every layer but the last the activation that config.network "
+    "names: relu, leaky-relu (slope 0.01 below 0) or sine; weight is (outputs, inputs), of a convolution "
+    "(outputs, inputs, rows, columns)",
     "clamp": "values below 0 are set to 0",
 }

@@ -24,6 +24,7 @@ _PUBLIC = {
     "generate": "generation",
     "load_material": "material",
     "render_reference": "reference",
+    "repair": "repairs",
     "verify": "verification",
 }
 
@@ -38,6 +39,7 @@ __all__ = [
     "generate",
     "load_material",
     "render_reference",
+    "repair",
     "verify",
 ]
 

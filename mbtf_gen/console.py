@@ -39,7 +39,9 @@ import logging
 import math
 import os
 import re
+import signal
 import sys
+import threading
 import time
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
@@ -53,6 +55,7 @@ from .errors import (
     EXIT_INTERRUPTED,
     EXIT_OK,
     EXIT_USAGE,
+    Interrupted,
     MbtfError,
     UsageError,
     printable,
@@ -236,6 +239,42 @@ class Console:
             bar._close()
 
 
+@contextlib.contextmanager
+def going_on(kept: str, cure: str = "the same command goes on from there") -> Iterator[None]:
+    """Work that an interruption does not lose; says so where one comes.
+
+    Parameters
+    ----------
+    kept : what is kept, for the message; cure : how to go on
+
+    Raises
+    ------
+    Interrupted : in place of KeyboardInterrupt
+    """
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise Interrupted(f"interrupted; {kept}", cure=cure) from None
+
+
+def _interrupt(number: int, frame: object) -> None:
+    raise KeyboardInterrupt
+
+
+@contextlib.contextmanager
+def _ended_like_interrupted() -> Iterator[None]:
+    """Have the system's request to end (SIGTERM, as batch systems send it) end the work as Ctrl-C does."""
+    usual = threading.current_thread() is threading.main_thread()
+    usual = usual and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    if usual:
+        signal.signal(signal.SIGTERM, _interrupt)
+    try:
+        yield
+    finally:
+        if usual:
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
 # Default of every command's `console` parameter: text, with progress.
 CONSOLE = Console()
 
@@ -373,7 +412,8 @@ def run(app: App, argv: Sequence[str] | None = None) -> int:
             stream.reconfigure(errors="replace")
     try:
         tokens = _command_first(app, _join_negative_pairs(tokens))
-        result = app(tokens)
+        with _ended_like_interrupted():
+            result = app(tokens)
         sys.stdout.flush()
         return result if type(result) is int else EXIT_OK
     except MbtfError as error:

@@ -76,6 +76,12 @@ class PartialError(MbtfError):
     exit_code = EXIT_PARTIAL
 
 
+class Interrupted(MbtfError):
+    """The user or the system ended the run (exit code 130); what was done is kept."""
+
+    exit_code = EXIT_INTERRUPTED
+
+
 def reason(fault: BaseException | str | None, longest: int = 160) -> str:
     """What another library said went wrong, fit to stand in brackets within a message: one line, at most
     `longest` characters."""

@@ -5,8 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -14,29 +13,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .atomic import digest, write_json
 from .config import GeneratorConfig, count_queries
 from .effects import EffectsPlan
 from .errors import PartialError, UsageError
-from .estimates import Stream
 from .heightfield import HeightGrid
 from .levels import Lattice
-from .locks import shard_lock
 from .manifest import ShardEntry, build_manifest
 from .material import Material, load_material
-from .output_folder import open_folder
+from .output_folder import holds, open_folder
 from .planning import SMALL_RUN, plan_effects, simulated
 from .queries import Mixture, QueryPlan
-from .schema import FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, SPLITS, Split
-from .shard_files import shard_suffix, write_shard
+from .schema import SPLITS, Split
+from .shard_files import shard_suffix
+from .shard_making import ProgressCallback, busy_message, make_shards
 from .simulation import estimator_of
 from .slopes import residual_slopes
-from .summary import Summary, finish, planned_effects, refuse_nonfinite
-from .verification import is_finished, sidecar_of
+from .summary import Summary, finish, planned_effects
+from .verification import is_finished
 
 log = logging.getLogger(__name__)
-
-ProgressCallback = Callable[[float, str], None]
 
 # A folder and a manifest of more are of no use to anyone.
 MAX_SHARD_FILES = 1_000_000
@@ -118,6 +113,10 @@ class Job:
         """Paths that a shard takes."""
         return self._queries(entry) * self.spp(entry.split)
 
+    def all_paths(self) -> int:
+        """Paths of the whole data set."""
+        return sum(self.paths(entry) for split in SPLITS for entry in self.shards(split))
+
     def queries(self, split: Split) -> int:
         """Queries of a split, whole buffers counted in the image layout."""
         return sum(self._queries(entry) for entry in self.shards(split))
@@ -165,69 +164,13 @@ def build_estimator(config: GeneratorConfig, material: Material) -> Any:
 def _agreed_effects(job: Job, folder: Path, entries: list[ShardEntry], overwrite: bool) -> EffectsPlan:
     """Claim the folder and say which effects are simulated: as its manifest says where it has one, so that
     all shards of a data set show the same, whichever machine makes them."""
-    existing = folder / MANIFEST_NAME
-    if existing.exists() and not overwrite:
-        open_folder(job, folder, build_manifest(job, entries, None), overwrite)
-    else:
-        large = sum(job.paths(entry) for entry in entries) >= SMALL_RUN
-        open_folder(job, folder, build_manifest(job, entries, plan_effects(job, pilots=large)), overwrite)
+    like = build_manifest(job, entries, None)
+
+    def begin() -> dict[str, Any]:
+        return build_manifest(job, entries, plan_effects(job, pilots=job.all_paths() >= SMALL_RUN))
+
+    open_folder(job, folder, like, begin, overwrite)
     return planned_effects(folder)
-
-
-def _sidecar(job: Job, entry: ShardEntry, path: Path, estimates: Any, seconds: float) -> dict[str, Any]:
-    a = estimates.value_a.astype(np.float64)
-    b = estimates.value_b.astype(np.float64)
-    return {
-        "format": FORMAT_NAME,
-        "schema": SCHEMA_VERSION,
-        "config_hash": job.config_hash,
-        "file": path.name,
-        "split": entry.split,
-        "index": entry.index,
-        "rows": entry.rows,
-        "bytes": path.stat().st_size,
-        "sha256": digest(path),
-        "seed": {"root": job.config.seed, "split": entry.split, "shard": entry.index},
-        "spp": job.spp(entry.split),
-        "queries": len(a),
-        "paths": estimates.paths,
-        "seconds": round(seconds, 4),
-        "quarantined": {
-            "nonfinite_samples": estimates.nonfinite,
-            "lost_rays": estimates.lost,
-            "capped_rays": estimates.capped,
-            "nonfinite_at": [asdict(bad) for bad in estimates.bad_samples],
-        },
-        "statistics": {
-            "mean_value": (0.5 * (a + b)).mean(axis=0).tolist(),
-            "mean_variance": (0.25 * (a - b) ** 2).mean(axis=0).tolist(),
-        },
-    }
-
-
-def _make_shard(job: Job, plan: QueryPlan, estimator: Any, entry: ShardEntry, path: Path) -> dict[str, Any]:
-    start = time.perf_counter()
-    queries = plan.draw(entry.split, entry.index, entry.rows)
-    flat = queries.flat()
-    spp = job.spp(entry.split)
-    estimates = estimator.estimate(flat, spp, Stream(job.config.seed, entry.split, entry.index))
-    lead, through = queries.lead, estimates.transmittance
-    write_shard(
-        path,
-        {
-            "u": queries.u,
-            "sigma": queries.sigma,
-            "omega_i": queries.omega_i,
-            "omega_o": queries.omega_o,
-            "value_a": estimates.value_a.reshape(*lead, 3),
-            "value_b": estimates.value_b.reshape(*lead, 3),
-            "spp": np.full(lead, spp, np.float32),
-            **({} if through is None else {"transmittance": through.reshape(lead)}),
-        },
-    )
-    record = _sidecar(job, entry, path, estimates, time.perf_counter() - start)
-    write_json(sidecar_of(path), record)
-    return record
 
 
 def paths_left(job: Job, folder: str | Path, slice_index: int = 1, slice_count: int = 1) -> int:
@@ -254,7 +197,8 @@ def generate(
     Parameters
     ----------
     folder : output; an unfinished data set of the same configuration there is resumed
-    overwrite : replace a data set of another configuration
+    overwrite : replace what is there; slices keep a data set of the same configuration, which others of
+        them may have begun
     slice_index, slice_count : make only shards i with ``i % slice_count == slice_index - 1``
     progress : called with (paths traced so far in this run, note), see :func:`paths_left`
     job : the configuration with its material loaded, where the caller has it already
@@ -268,33 +212,18 @@ def generate(
     folder = Path(folder)
     start = time.perf_counter()
     job = job or Job.prepare(config)
-    plan = job.plan()
     entries = [e for split in SPLITS for e in job.shards(split)]
+    overwrite = overwrite and not (slice_count > 1 and holds(folder, job.config_hash))
     effects = _agreed_effects(job, folder, entries, overwrite)
-    paths, busy, made = 0, [], []
-    estimator: Any = None
-    for entry in job.slice(slice_index, slice_count):
-        path = folder / entry.file
-        if not is_finished(path, entry.rows, job.config_hash):
-            with shard_lock(path) as held:
-                if not held:
-                    busy.append(entry.file)
-                elif not is_finished(path, entry.rows, job.config_hash):
-                    for stale in folder.glob(f".{path.stem}.*.tmp"):
-                        stale.unlink(missing_ok=True)
-                    if estimator is None:
-                        estimator = job.estimator(effects)
-                    record = _make_shard(job, plan, estimator, entry, path)
-                    paths += record["paths"]
-                    made.append(record)
-                    # More than the whole data set may have: the rest cannot mend that.
-                    refuse_nonfinite(made, sum(job.paths(e) for e in entries), folder)
-        if progress is not None:
-            progress(paths, f"{paths / max(time.perf_counter() - start, 1e-9) / 1e6:.2f} M paths/s")
-    if busy:
+    made = make_shards(job, folder, job.slice(slice_index, slice_count), effects, progress=progress)
+    if made.busy:
         raise PartialError(
-            f"{len(busy)} shard(s) are being written by another process, first {busy[0]}",
-            where=folder,
-            cure="wait for it, then run the same command again",
+            busy_message(made.busy), where=folder, cure="wait for it, then run the same command again"
         )
-    return finish(folder, paths=paths, seconds=time.perf_counter() - start)
+    return finish(
+        folder,
+        paths=made.paths,
+        seconds=time.perf_counter() - start,
+        writing=made.writing,
+        waiting=made.waiting,
+    )

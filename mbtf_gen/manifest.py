@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from .effects import EffectsPlan
 from .levels import sigma_of_level
 from .schema import ARRAYS, CONVENTIONS, FORMAT_NAME, SCHEMA_VERSION, SPLITS, Split
+from .settings import dump_yaml
 
 if TYPE_CHECKING:
     from .generation import Job
@@ -37,10 +41,17 @@ def software_versions() -> dict[str, str]:
     return out
 
 
+def effects_digest(effects: Mapping[str, Any]) -> str:
+    """SHA-256 of an effects plan as the manifest holds it, hexadecimal: sidecars name the plan by it."""
+    text = json.dumps(effects, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
 def build_manifest(job: Job, entries: list[ShardEntry], effects: EffectsPlan | None) -> dict[str, Any]:
     """Manifest of a data set that is about to be made (``complete`` is false); without effects where they
     are not known yet."""
     config, material, lattice = job.config, job.material, job.lattice
+    plain = config.model_dump(mode="json")
     grid = job.grid
     plan = job.plan()
     rows, columns = lattice.shape()
@@ -50,7 +61,8 @@ def build_manifest(job: Job, entries: list[ShardEntry], effects: EffectsPlan | N
         "schema": SCHEMA_VERSION,
         "complete": False,
         "config_hash": job.config_hash,
-        "config": config.model_dump(mode="json"),
+        "config": plain,
+        "config_yaml": hashlib.sha256(dump_yaml(plain).encode()).hexdigest(),
         "inputs": dict(sorted(material.digests.items())),
         "conventions": CONVENTIONS,
         "tile": {

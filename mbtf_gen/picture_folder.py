@@ -17,7 +17,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from .atomic import read_json, write_json, write_text
+from .atomic import TEMPORARY, read_json, write_json, write_text
 from .errors import InputError
 from .schema import CONFIG_NAME
 from .settings import check_document, differences, dump_yaml, in_short
@@ -30,7 +30,7 @@ _OURS = (CONFIG_NAME, RECORD_NAME)
 
 def _is_leftover(name: str, files: Iterable[str]) -> bool:
     """Whether a file is what a kill leaves of writing one of `files`."""
-    match = re.fullmatch(r"\.(.+)\.\d+\.tmp", name)
+    match = re.fullmatch(rf"\.(.+?){TEMPORARY}", name)
     return match is not None and match[1] in files
 
 

@@ -16,14 +16,13 @@ import numpy as np
 from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 
-from .atomic import write_file, write_through
+from .atomic import Stored, write_chunks, write_through
 from .errors import InputError, reason
+from .npz_writing import npz_chunks
 from .schema import ARRAY, ARRAYS, ArrayFormat
 
 Arrays = dict[str, NDArray[np.float32]]
 
-# Offsets of members are multiples of this, so that mapped arrays are aligned for any use.
-_ALIGNMENT = 64
 # Width of the EXR images that shuffled queries are folded into.
 _FOLD_WIDTH = 1024
 # An EXR header that claims more is damaged.
@@ -65,25 +64,11 @@ def _common_lead(arrays: Mapping[str, NDArray[np.float32]], where: object) -> tu
     return lead
 
 
-def write_npz(path: Path, arrays: Mapping[str, NDArray[np.float32]]) -> None:
+def write_npz(path: Path, arrays: Mapping[str, NDArray[np.float32]]) -> Stored:
     """Write a shard as npz, atomically; the bytes depend on the arrays alone."""
     check_arrays(arrays, path)
-
-    def write(stream: BinaryIO) -> None:
-        with zipfile.ZipFile(stream, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
-            for spec in ARRAYS:
-                if spec.name not in arrays:
-                    continue
-                array = np.ascontiguousarray(arrays[spec.name], spec.dtype)
-                info = zipfile.ZipInfo(f"{spec.name}.npy")
-                # Local header: 30 bytes, name, 20 bytes of zip64 sizes; an extra field of ours fills up.
-                fixed = stream.tell() + 30 + len(info.filename) + 20
-                padding = -(fixed + 4) % _ALIGNMENT
-                info.extra = b"\x4d\x54" + padding.to_bytes(2, "little") + bytes(padding)
-                with archive.open(info, "w", force_zip64=True) as member:
-                    npy_format.write_array(member, array, version=(1, 0), allow_pickle=False)
-
-    write_file(path, write)
+    present = ((s.name, np.ascontiguousarray(arrays[s.name], s.dtype)) for s in ARRAYS if s.name in arrays)
+    return write_chunks(path, npz_chunks(present))
 
 
 def read_npz(path: Path, names: Iterable[str] | None = None, *, mapped: bool = True) -> Arrays:
@@ -156,7 +141,7 @@ def _fold(array: NDArray[np.float32], lead: tuple[int, ...]) -> NDArray[np.float
     return array.reshape(lead[0] * lead[1], lead[2], *trailing)
 
 
-def write_exr(path: Path, arrays: Mapping[str, NDArray[np.float32]]) -> None:
+def write_exr(path: Path, arrays: Mapping[str, NDArray[np.float32]]) -> Stored:
     """Write a shard as one EXR image with a named float32 channel per component, atomically.
 
     The header's string ``mbtf.lead`` holds the leading axes ("n" or "items,rows,columns").
@@ -176,7 +161,7 @@ def write_exr(path: Path, arrays: Mapping[str, NDArray[np.float32]]) -> None:
         "type": OpenEXR.scanlineimage,
         "mbtf.lead": ",".join(str(n) for n in lead),
     }
-    write_through(path, lambda temporary: OpenEXR.File(header, channels).write(str(temporary)))
+    return write_through(path, lambda temporary: OpenEXR.File(header, channels).write(str(temporary)))
 
 
 def read_exr(path: Path, names: Iterable[str] | None = None) -> Arrays:
@@ -217,9 +202,9 @@ def shard_suffix(array_format: ArrayFormat) -> str:
     return f".{array_format}"
 
 
-def write_shard(path: Path, arrays: Mapping[str, NDArray[np.float32]]) -> None:
-    """Write a shard in the format that its suffix names."""
-    (write_exr if path.suffix == ".exr" else write_npz)(path, arrays)
+def write_shard(path: Path, arrays: Mapping[str, NDArray[np.float32]]) -> Stored:
+    """Write a shard in the format that its suffix names, atomically; its size and digest."""
+    return (write_exr if path.suffix == ".exr" else write_npz)(path, arrays)
 
 
 def read_shard(path: Path, names: Iterable[str] | None = None, *, mapped: bool = True) -> Arrays:

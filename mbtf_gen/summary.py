@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import numpy as np
 from pydantic import BaseModel, Field
 
-from .atomic import read_json, write_json
+from .atomic import write_sealed
 from .dataset import Dataset
 from .effects import EFFECTS, EffectsPlan
-from .errors import PartialError
+from .locks import brief_lock
 from .manifest import software_versions
+from .output_folder import read_manifest, sweep
 from .schema import MANIFEST_NAME
 from .settings import check_document
-from .verification import is_finished, sidecar_of
+from .tally import COUNTS, Tally, refuse_nonfinite
+from .verification import finished_record, sidecar_of
 
 
 @dataclass(frozen=True)
@@ -28,6 +28,8 @@ class Summary:
     ----------
     queries : finished, of all splits; splits : the same by split
     paths, seconds : traced in this run, and its duration
+    writing_seconds : what writing and digesting took beside the rendering
+    waiting_seconds : how long rendering waited for it
     relative_error : pooled relative standard error of the stored training values, √(mean variance) / mean
         value
     mean_value : mean training value per channel, 1/sr
@@ -41,6 +43,8 @@ class Summary:
     paths: int
     seconds: float
     paths_per_second: float
+    writing_seconds: float
+    waiting_seconds: float
     relative_error: float
     mean_value: list[float]
     lost: int
@@ -101,17 +105,14 @@ class _Quarantined(BaseModel):
 class _Made(BaseModel):
     """What :func:`finish` relies on of a shard's sidecar."""
 
+    split: str
+    file: str
     queries: Annotated[int, Field(ge=1)]
     paths: int
     seconds: _Number
     statistics: _Statistics
     quarantined: _Quarantined
 
-
-# A run fails beyond this share of non-finite samples, but not for so few that chance may bring them: at one
-# expected, more than four come once in three hundred runs.
-NONFINITE_SHARE = 1e-6
-NONFINITE_FEW = 4
 
 _MEND = "look for damage with: mbtf-gen verify"
 
@@ -123,99 +124,92 @@ def planned_effects(folder: Path) -> EffectsPlan:
     ------
     InputError : a damaged manifest
     """
-    manifest = read_json(folder / MANIFEST_NAME)
+    manifest = read_manifest(folder)
     check_document(_Plan, manifest, folder / MANIFEST_NAME, _MEND)
     return EffectsPlan.from_manifest(manifest["effects"])
 
 
-def refuse_nonfinite(records: Sequence[Mapping[str, Any]], paths: int, folder: Path) -> None:
-    """Refuse shards with more non-finite samples than a data set may have.
+def finish(
+    folder: str | Path,
+    *,
+    paths: int = 0,
+    seconds: float = 0.0,
+    writing: float = 0.0,
+    waiting: float = 0.0,
+) -> Summary:
+    """Complete the manifest when every shard is there, and summarise (``mbtf-gen merge``).
 
     Parameters
     ----------
-    records : sidecars of shards
-    paths : of the whole data set
-
-    Raises
-    ------
-    PartialError : more than ``NONFINITE_FEW`` and more than ``NONFINITE_SHARE`` of the paths; says where
-    """
-    count = sum(r["quarantined"]["nonfinite_samples"] for r in records)
-    if count <= max(NONFINITE_FEW, NONFINITE_SHARE * paths):
-        return
-    where = [(r["file"], bad) for r in records for bad in r["quarantined"]["nonfinite_at"]]
-    first = "; ".join(f"{file} query {bad['query']}, {bad['effect']}" for file, bad in where[:3])
-    raise PartialError(
-        f"{count} of {paths} samples were NaN or infinite, more than 1 in 10⁶: {first}",
-        where=folder,
-        cure="check the material's values, then run again with --overwrite",
-    )
-
-
-def finish(folder: str | Path, *, paths: int = 0, seconds: float = 0.0) -> Summary:
-    """Complete the manifest when every shard is there, and summarise (``mbtf-gen merge``).
+    paths, seconds, writing, waiting : of the run that ends, see :class:`Summary`
 
     Raises
     ------
     InputError : no data set there, or damaged documents
-    PartialError : too many non-finite samples
+    PartialError : too many non-finite samples, or the folder cannot be written
     """
     folder = Path(folder)
-    manifest = Dataset.open(folder).manifest
-    check_document(_Plan, manifest, folder / MANIFEST_NAME, _MEND)
-    records: dict[str, list[dict[str, Any]]] = {}
-    complete = True
-    for split, content in manifest["splits"].items():
+    path = folder / MANIFEST_NAME
+    Dataset.open(folder)
+    manifest = read_manifest(folder)
+    check_document(_Plan, manifest, path, _MEND)
+    tally, complete = Tally(), True
+    for content in manifest["splits"].values():
         for entry in content["shards"]:
-            if is_finished(folder / entry["file"], entry["rows"], manifest["config_hash"]):
-                sidecar = sidecar_of(folder / entry["file"])
-                record = read_json(sidecar)
-                check_document(_Made, record, sidecar, _MEND)
-                records.setdefault(split, []).append(record)
-            else:
+            file = folder / entry["file"]
+            record = finished_record(file, entry["rows"], manifest["config_hash"])
+            if record is None:
                 complete = False
-    flat = [r for rs in records.values() for r in rs]
+            else:
+                check_document(_Made, record, sidecar_of(file), _MEND)
+                tally.add(record)
     if complete:
-        refuse_nonfinite(flat, sum(r["paths"] for r in flat), folder)
-    train = records.get("train", [])
-    weights = np.array([r["queries"] for r in train], np.float64)
-    if len(train):
-        mean = np.average([r["statistics"]["mean_value"] for r in train], axis=0, weights=weights)
-        variance = np.average([r["statistics"]["mean_variance"] for r in train], axis=0, weights=weights)
-        relative = float(np.sqrt(variance.mean()) / mean.mean()) if mean.mean() > 0 else 0.0
-    else:
-        mean, relative = np.zeros(3), 0.0
-    counts = {
-        k: sum(r["quarantined"][k] for r in flat) for k in ("nonfinite_samples", "lost_rays", "capped_rays")
-    }
+        refuse_nonfinite(tally, tally.paths, folder)
     summary = Summary(
         folder=str(folder),
         complete=complete,
-        queries=sum(r["queries"] for r in flat),
-        splits={split: sum(r["queries"] for r in records.get(split, [])) for split in manifest["splits"]},
+        queries=tally.queries.total(),
+        splits={split: tally.queries[split] for split in manifest["splits"]},
         paths=paths,
         seconds=round(seconds, 3),
         paths_per_second=round(paths / seconds, 1) if seconds > 0 else 0.0,
-        relative_error=relative,
-        mean_value=[float(m) for m in mean],
-        lost=counts["lost_rays"],
-        capped=counts["capped_rays"],
-        nonfinite=counts["nonfinite_samples"],
+        writing_seconds=round(writing, 3),
+        waiting_seconds=round(waiting, 3),
+        relative_error=tally.relative_error(),
+        mean_value=tally.mean_value(),
+        lost=tally.counts["lost_rays"],
+        capped=tally.counts["capped_rays"],
+        nonfinite=tally.counts["nonfinite_samples"],
         effects=[e["effect"] for e in manifest["effects"]["effects"] if e["on"]],
     )
     if complete and not manifest["complete"]:
-        manifest["complete"] = True
-        manifest["software"] = software_versions()
-        manifest["summary"] = {
-            "queries": summary.queries,
-            "paths": sum(r["paths"] for r in flat),
-            "shard_seconds": round(sum(r["seconds"] for r in flat), 3),
-            "relative_error": summary.relative_error,
-            "mean_value": summary.mean_value,
-            **counts,
-        }
-        write_json(folder / MANIFEST_NAME, manifest)
+        complete_manifest(folder, tally)
     return summary
+
+
+def complete_manifest(folder: Path, tally: Tally) -> None:
+    """Say in the manifest that every shard is there, and what they hold together; clear away what killed runs
+    left.
+
+    Raises
+    ------
+    PartialError : the folder cannot be written
+    """
+    with brief_lock(folder / MANIFEST_NAME):
+        manifest = read_manifest(folder)
+        if not manifest["complete"]:
+            manifest["complete"] = True
+            manifest["software"] = software_versions()
+            manifest["summary"] = {
+                "queries": tally.queries.total(),
+                "paths": tally.paths,
+                "shard_seconds": round(tally.seconds, 3),
+                "relative_error": tally.relative_error(),
+                "mean_value": tally.mean_value(),
+                **{name: tally.counts[name] for name in COUNTS},
+            }
+            write_sealed(folder / MANIFEST_NAME, manifest)
+    sweep(folder)
 
 
 def summary_dict(summary: Summary) -> dict[str, Any]:

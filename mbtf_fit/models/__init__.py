@@ -6,15 +6,28 @@ from typing import Any
 
 from mbtf_gen.levels import Lattice
 
+from ..config import FitConfig
+from .hierarchical import Hierarchical
 from .interface import NeuralMaterial
 from .neumip import Neumip, NeumipBaseline
+from .textured import TexturedMaterial
 
-MODELS: dict[str, type[NeuralMaterial]] = {m.name: m for m in (NeumipBaseline, Neumip)}
-
-
-def build_model(name: str, lattice: Lattice, **architecture: Any) -> NeuralMaterial:
-    """An uninitialised model; `architecture` are its constructor's keyword parameters."""
-    return MODELS[name](lattice, **architecture)
+MODELS: dict[str, type[TexturedMaterial]] = {m.name: m for m in (NeumipBaseline, Neumip, Hierarchical)}
 
 
-__all__ = ["MODELS", "Neumip", "NeumipBaseline", "NeuralMaterial", "build_model"]
+def build_model(name: str, lattice: Lattice, **network: Any) -> TexturedMaterial:
+    """An uninitialised model; `network` are keys of the configuration's section of that name, the others as
+    the model has them."""
+    config = FitConfig.model_validate({"model": name, "network": network})
+    return MODELS[name](lattice, config.network)
+
+
+__all__ = [
+    "MODELS",
+    "Hierarchical",
+    "Neumip",
+    "NeumipBaseline",
+    "NeuralMaterial",
+    "TexturedMaterial",
+    "build_model",
+]

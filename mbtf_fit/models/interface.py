@@ -12,29 +12,40 @@ from mbtf_gen.errors import InputError
 from mbtf_gen.levels import Lattice
 from mbtf_gen.schema import Layout
 
+from ..config import NetworkSection
+from .inception import InceptionDecoder
 from .mlp import Mlp
 from .textures import FeatureTextures
 
+# Modules that give and take their numbers by name.
+_PARTS = (FeatureTextures, Mlp, InceptionDecoder)
+
 
 class NeuralMaterial(nn.Module, ABC):
-    """A model of ``M(u, σ, ω_i, ω_o)`` in two stages.
+    """A model of ``M(u, σ, ω_i, ω_o)`` in two stages, a function of each query alone.
 
     Stage 1 depends on the view alone and is shared by all lights; stage 2 is evaluated once per light.
-    Arrays are (n, ...) in the ``shuffled`` layout and (items, rows, columns, ...) in the ``image`` layout.
 
     Attributes
     ----------
     name : by which configurations and materials call the model
     layout : layout of the shards that it is trained on
     lattice : texel grids of the tile
+    network : its architecture
     """
 
     name: ClassVar[str]
     layout: ClassVar[Layout]
 
-    def __init__(self, lattice: Lattice) -> None:
+    def __init__(self, lattice: Lattice, network: NetworkSection) -> None:
         super().__init__()
         self.lattice = lattice
+        self.network = network
+
+    @property
+    def positions(self) -> int:
+        """Places at which stage 1 reads the textures for one query."""
+        return 1
 
     @abstractmethod
     def initialise(self, generator: torch.Generator, unit: float) -> None:
@@ -42,19 +53,19 @@ class NeuralMaterial(nn.Module, ABC):
 
     @abstractmethod
     def stage1(self, u: Tensor, sigma: Tensor, omega_o: Tensor) -> Tensor:
-        """Features (..., f) at uv positions `u` (..., 2), footprints `sigma` (...) in tile widths, seen from
-        `omega_o` (..., 3)."""
+        """Features (n, ...) at uv positions `u` (n, 2), footprints `sigma` (n,) in tile widths, seen from
+        `omega_o` (n, 3)."""
 
     @abstractmethod
     def stage2(self, features: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
-        """Value (..., 3) in 1/sr under light from `omega_i` (..., 3). Not clamped: it may fall below zero."""
+        """Value (n, 3) in 1/sr under light from `omega_i` (n, 3). Not clamped: it may fall below zero."""
 
     def forward(self, u: Tensor, sigma: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
         """Both stages."""
         return self.stage2(self.stage1(u, sigma, omega_o), omega_i, omega_o)
 
     def offset(self, u: Tensor, omega_o: Tensor) -> Tensor:
-        """By how much the model moves its lookup, (..., 2) in tile widths; zero where it does not."""
+        """By how much the model moves its lookup, (n, 2) in tile widths; zero where it does not."""
         return torch.zeros_like(u)
 
     def textures(self) -> list[FeatureTextures]:
@@ -73,10 +84,11 @@ class NeuralMaterial(nn.Module, ABC):
 
     def weights(self) -> dict[str, Tensor]:
         """All numbers of the model by name, as it evaluates now: textures blurred, one tensor (rows, columns,
-        channels) per level; network layers as ``NAME.0.weight`` (outputs, inputs) and ``NAME.0.bias``."""
+        channels) per level; network layers as ``NAME.0.weight`` (outputs, inputs) and ``NAME.0.bias``,
+        convolutions as ``NAME.weight`` (outputs, inputs, rows, columns)."""
         out = {name: buffer.detach().clone() for name, buffer in self.named_buffers()}
         for name, module in self.named_modules():
-            if isinstance(module, FeatureTextures | Mlp):
+            if isinstance(module, _PARTS):
                 out |= {f"{name}.{key}": tensor for key, tensor in module.export().items()}
         return out
 
@@ -95,7 +107,7 @@ class NeuralMaterial(nn.Module, ABC):
             for name, buffer in self.named_buffers():
                 buffer.copy_(tensors[name])
             for name, module in self.named_modules():
-                if isinstance(module, FeatureTextures | Mlp):
+                if isinstance(module, _PARTS):
                     module.load({k.removeprefix(f"{name}."): t for k, t in tensors.items()})
 
     def level(self, sigma: Tensor) -> Tensor:

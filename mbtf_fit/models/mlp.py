@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
+
+Activation = Literal["relu", "leaky-relu", "sine"]
+# Slope of leaky-relu below zero.
+LEAK = 0.01
+ACTIVATIONS: dict[Activation, Callable[[Tensor], Tensor]] = {
+    "relu": torch.relu,
+    "leaky-relu": lambda x: nn.functional.leaky_relu(x, LEAK),
+    "sine": torch.sin,
+}
 
 
 class _FusedMlp(torch.autograd.Function):
@@ -46,22 +55,23 @@ class _FusedMlp(torch.autograd.Function):
 
 
 class Mlp(nn.Module):
-    """Fully connected network with ReLU between its layers and none after the last.
+    """Fully connected network with an activation between its layers and none after the last.
 
     Parameters
     ----------
     widths : features of the input, of each hidden layer, and of the output
     """
 
-    def __init__(self, widths: Sequence[int]) -> None:
+    def __init__(self, widths: Sequence[int], activation: Activation = "relu") -> None:
         super().__init__()
+        self.activation: Activation = activation
         pairs = list(pairwise(widths))
         self.weights = nn.ParameterList(nn.Parameter(torch.empty(o, i)) for i, o in pairs)
         self.biases = nn.ParameterList(nn.Parameter(torch.empty(o)) for _, o in pairs)
 
     def initialise(self, generator: torch.Generator, last_gain: float = 1.0) -> None:
-        """Weights normal with variance 2/inputs before a ReLU (He et al. 2015), `last_gain`²/inputs in the
-        last layer; biases 0.
+        """Weights normal with variance 2/inputs before an activation (He et al. 2015; behind a sine, whose
+        variance is ½, it is the same), `last_gain`²/inputs in the last layer; biases 0.
 
         The papers state no initialisation. PyTorch's own (uniform, with random biases) left half of a 25-wide
         layer without a gradient for good at the learning rates used here.
@@ -76,6 +86,11 @@ class Mlp(nn.Module):
     def count(self) -> int:
         """Number of weights, biases included."""
         return sum(p.numel() for p in self.parameters())
+
+    @property
+    def last_bias(self) -> Tensor:
+        """Biases of the outputs."""
+        return self.biases[-1]
 
     def export(self) -> dict[str, Tensor]:
         """``0.weight`` (outputs, inputs), ``0.bias`` (outputs,), ``1.weight``, …"""
@@ -95,6 +110,8 @@ class Mlp(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(n, inputs) → (n, outputs); differentiable once."""
+        if self.activation != "relu":
+            return self.reference(x)
         parameters = [p for pair in zip(self.weights, self.biases, strict=True) for p in pair]
         out: Tensor = _FusedMlp.apply(x, *parameters)
         return out
@@ -104,5 +121,5 @@ class Mlp(nn.Module):
         last = len(self.weights) - 1
         for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             x = nn.functional.linear(x, weight, bias)
-            x = x if k == last else torch.relu(x)
+            x = x if k == last else ACTIVATIONS[self.activation](x)
         return x

@@ -1,13 +1,20 @@
-"""``mbtf-gen merge`` and ``verify``: folders of shards that exist."""
+"""``mbtf-gen merge``, ``verify`` and ``repair``: folders of shards that exist."""
 
 from __future__ import annotations
 
+import time
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
-from ..console import CONSOLE, Console
+from cyclopts import Parameter
+
+from ..console import CONSOLE, Console, clock, going_on
 from ..errors import EXIT_BAD_INPUT, EXIT_OK
 from .generate import describe
+
+if TYPE_CHECKING:
+    from ..repairs import Repaired
 
 
 def merge(folder: Path, /, *, console: Console = CONSOLE) -> int:
@@ -29,7 +36,7 @@ def merge(folder: Path, /, *, console: Console = CONSOLE) -> int:
 
 
 def verify(folder: Path, /, *, console: Console = CONSOLE) -> int:
-    """Check every shard of a data set against its digest and the manifest.
+    """Check every byte of a data set against its digests and the manifest.
 
     Parameters
     ----------
@@ -39,13 +46,73 @@ def verify(folder: Path, /, *, console: Console = CONSOLE) -> int:
     from ..dataset import Dataset
     from ..verification import verify
 
+    start = time.perf_counter()
     faults = verify(folder)
+    seconds = time.perf_counter() - start
     dataset = Dataset.open(folder)
-    count = sum(len(s["shards"]) for s in dataset.manifest["splits"].values())
+    files = [folder / e["file"] for s in dataset.manifest["splits"].values() for e in s["shards"]]
+    read = sum(path.stat().st_size for path in files if path.exists())
     lines = [f"{folder / f.file}: {f.what}; {f.cure}" for f in faults if not f.absent]
     if absent := [f for f in faults if f.absent]:
-        missing = f"{len(absent)} of {count} shards are missing, first {absent[0].file}"
+        missing = f"{len(absent)} of {len(files)} shards are missing, first {absent[0].file}"
         lines.insert(0, f"{folder}: {missing}; {absent[0].cure}")
-    data = {"folder": folder, "shards": count, "faults": [asdict(f) for f in faults]}
-    console.report(data, "\n".join(lines) or f"{folder}: {count} shards, all intact")
+    data = {
+        "folder": folder,
+        "shards": len(files),
+        "bytes": read,
+        "seconds": round(seconds, 3),
+        "faults": [asdict(f) for f in faults],
+    }
+    console.report(data, "\n".join(lines) or f"{folder}: {len(files)} shards, all intact")
+    console.note(f"{read / 1e6:.1f} MB read in {clock(seconds)} ({read / 1e6 / max(seconds, 1e-9):.0f} MB/s)")
     return EXIT_BAD_INPUT if faults else EXIT_OK
+
+
+def repair(
+    folder: Path,
+    /,
+    *,
+    material: str | None = None,
+    dry_run: Annotated[bool, Parameter(negative="")] = False,
+    console: Console = CONSOLE,
+) -> int:
+    """Make again what verify condemns: the data set is then the undisturbed one.
+
+    Parameters
+    ----------
+    folder
+        Folder of shards.
+    material
+        Where the material lies now. Default: where it lay when the data set was made
+    dry_run
+        Only say what would be done.
+    """
+    from ..repairs import Damage, Repaired
+
+    damage = Damage(folder, material)
+    if dry_run:
+        shards = [entry.file for entry in damage.entries]
+        done = Repaired(str(folder), damage.faults, shards, damage.documents, damage.left, False, 0, 0.0)
+    else:
+        with (
+            going_on(f"{folder}: what was made again is kept"),
+            console.progress(damage.paths, "repairing", "paths") as bar,
+        ):
+            done = damage.mend(bar.update)
+    data = {"dry_run": dry_run, **asdict(done)}
+    console.report(data, _describe_repair(done, dry_run))
+    return EXIT_BAD_INPUT if done.left else EXIT_OK
+
+
+def _describe_repair(done: Repaired, dry_run: bool) -> str:
+    verb, wrote = ("would be made", "would be written") if dry_run else ("made", "written")
+    lines = [f"{done.folder}/{f.file}: {f.what}" for f in done.faults if not f.absent and f not in done.left]
+    if done.shards:
+        first = ", ".join(done.shards[:5]) + (", …" if len(done.shards) > 5 else "")
+        lines.append(f"{done.folder}: {len(done.shards)} shards {verb} again ({first})")
+    if done.documents:
+        lines.append(f"{done.folder}: {' and '.join(done.documents)} {wrote} again")
+    if not done.shards and not done.documents:
+        lines.append(f"{done.folder}: nothing to mend")
+    lines += [f"{done.folder}/{f.file}: {f.what}, left alone; {f.cure}" for f in done.left]
+    return "\n".join(lines)

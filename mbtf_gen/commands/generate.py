@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from ..console import CONSOLE, Console, clock
+from ..console import CONSOLE, Console, clock, going_on
 from ..errors import UsageError
 from ..schema import Tiling
 from .common import Output, Set, general, resolve_config
@@ -124,7 +124,10 @@ def generate(
         f"queries, finest level {job.lattice.finest}"
     )
     total = paths_left(job, folder, *part)
-    with console.progress(total=total, label="generating", unit="paths") as bar:
+    with (
+        going_on(f"the shards that are finished are kept in {folder}"),
+        console.progress(total=total, label="generating", unit="paths") as bar,
+    ):
         summary = generate(
             resolved,
             folder,
@@ -144,7 +147,8 @@ def describe(summary: Any, *, ran: bool = True) -> str:
     work = "nothing left to do"
     if summary.paths:
         speed = f"{summary.paths_per_second / 1e6:.2f} M paths/s"
-        work = f"{summary.paths} paths in {clock(summary.seconds)} ({speed})"
+        disk = f"{summary.waiting_seconds:.1f} s of it waiting for the disk"
+        work = f"{summary.paths} paths in {clock(summary.seconds)} ({speed}), {disk}"
     lines = [
         f"{summary.folder}: {counts} queries, {state}",
         *([f"  this run: {work}"] if ran else []),

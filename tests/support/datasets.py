@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_gen.atomic import write_json
+from mbtf_gen.atomic import sealed
 from mbtf_gen.config import GeneratorConfig
 from mbtf_gen.dataset import Dataset
-from mbtf_gen.generation import Job, _sidecar
+from mbtf_gen.estimates import Estimates
+from mbtf_gen.generation import Job
 from mbtf_gen.manifest import build_manifest
 from mbtf_gen.output_folder import open_folder
 from mbtf_gen.planning import simulated
 from mbtf_gen.queries import Queries
 from mbtf_gen.schema import SPLITS
-from mbtf_gen.shard_files import write_shard
+from mbtf_gen.shard_making import Rendered, store_shard
 from mbtf_gen.summary import finish
-from mbtf_gen.verification import sidecar_of
 
 F32 = NDArray[np.float32]
 NOISE = 0.05
@@ -47,33 +48,22 @@ def write_dataset(folder: Path, *, rows: int = 4, columns: int = 8, **options: A
     config = GeneratorConfig.model_validate({"material": str(heights), **options})
     job = Job.prepare(config)
     entries = [entry for split in SPLITS for entry in job.shards(split)]
-    open_folder(job, folder, build_manifest(job, entries, simulated(job)), False)
+    effects = simulated(job)
+    manifest = build_manifest(job, entries, effects)
+    open_folder(job, folder, manifest, lambda: manifest, False)
     for number, entry in enumerate(entries):
         queries = job.plan().draw(entry.split, entry.index, entry.rows)
         truth, rng = formula(queries), np.random.default_rng(number)
-        halves = [(truth * (1 + NOISE * rng.normal(size=truth.shape))).astype(np.float32) for _ in range(2)]
-        path = folder / entry.file
-        write_shard(
-            path,
-            {
-                "u": queries.u,
-                "sigma": queries.sigma,
-                "omega_i": queries.omega_i,
-                "omega_o": queries.omega_o,
-                "value_a": halves[0],
-                "value_b": halves[1],
-                "spp": np.full(queries.lead, job.spp(entry.split), np.float32),
-            },
-        )
-        made = SimpleNamespace(
-            value_a=halves[0].reshape(-1, 3),
-            value_b=halves[1].reshape(-1, 3),
-            paths=queries.sigma.size * job.spp(entry.split),
-            nonfinite=0,
-            lost=0,
-            capped=0,
-            bad_samples=(),
-        )
-        write_json(sidecar_of(path), _sidecar(job, entry, path, made, 0.1))
+        a, b = ((truth * (1 + NOISE * rng.normal(size=truth.shape))).astype(np.float32) for _ in range(2))
+        paths = queries.sigma.size * job.spp(entry.split)
+        made = Estimates(a.reshape(-1, 3), b.reshape(-1, 3), None, paths, 0, 0, 0)
+        store_shard(job, Rendered(entry, queries, made, 0.1), folder / entry.file, effects)
     finish(folder)
     return Dataset.open(folder)
+
+
+def edit(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """Change a manifest or a sidecar by hand, its checksum with it."""
+    document = json.loads(path.read_text())
+    change(document)
+    path.write_bytes(sealed(document))

@@ -22,12 +22,15 @@ GAP = "…"
 
 # Exceptions that are no message to a user: of Python's own protocols, and of what cannot happen.
 _SILENT = {"AttributeError", "AssertionError", "KeyError"}
-_ERRORS = {"UsageError", "InputError", "EngineError", "PartialError"}
+_ERRORS = {"UsageError", "InputError", "EngineError", "PartialError", "Interrupted"}
 # Functions whose results become messages: module.function → position in a returned tuple, None for the whole.
 _SAYERS = {
     "mbtf_gen.settings._explain": 1,
     "mbtf_gen.wording.explain": None,
-    "mbtf_gen.verification.shard_fault": None,
+    "mbtf_gen.verification._record_of": None,
+    "mbtf_gen.verification._content_fault": None,
+    "mbtf_gen.verification.examine": 1,
+    "mbtf_gen.shard_making.busy_message": None,
     "mbtf_gen.console._usage_message": None,
 }
 # What a helper's results are followed into.

@@ -14,6 +14,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 from support.commands import Done, finished, run_all, start
+from support.datasets import edit
 
 from mbtf_gen.dataset import Dataset
 from mbtf_gen.shard_files import read_exr
@@ -138,8 +139,7 @@ def batch(work: Path, whole: Path) -> dict[str, Done]:
     shutil.copytree(whole, work / "replaced")
     shutil.copytree(whole, work / "unmerged")
     (work / "unmerged/test-00001.npz").unlink()
-    manifest = work / "unmerged/manifest.json"
-    manifest.write_text(manifest.read_text().replace('"complete": true', '"complete": false'))
+    edit(work / "unmerged/manifest.json", lambda manifest: manifest.update(complete=False))
     few = "--queries 2/texel --test-queries 100 --spp 2 --test-spp 2 --seed 3 --json"
     image = f"{few} --layout image --set output.shard_queries=256"
     lines = {

@@ -19,7 +19,8 @@ from mbtf_gen.engine import load_mitsuba
 from mbtf_gen.errors import InputError, PartialError, UsageError
 from mbtf_gen.generation import Job, generate, paths_left
 from mbtf_gen.locks import shard_lock
-from mbtf_gen.summary import finish, refuse_nonfinite
+from mbtf_gen.summary import finish
+from mbtf_gen.tally import Tally, refuse_nonfinite
 from mbtf_gen.verification import sidecar_of, verify
 
 load_mitsuba()
@@ -125,9 +126,11 @@ def test_too_many_nonfinite_samples_fail_the_run_and_name_their_place(
     ("count", "paths", "refused"), [(4, 1, False), (5, 4_999_999, True), (5, 5_000_000, False)]
 )
 def test_one_sample_in_a_million_may_be_nonfinite(count: int, paths: int, refused: bool) -> None:
-    quarantined = {"nonfinite_samples": count, "nonfinite_at": []}
+    tally = Tally()
+    quarantined = {"nonfinite_samples": count, "lost_rays": 0, "capped_rays": 0, "nonfinite_at": []}
+    tally.add_quarantined("train-00000.npz", quarantined)
     with pytest.raises(PartialError) if refused else contextlib.nullcontext():
-        refuse_nonfinite([{"file": "train-00000.npz", "quarantined": quarantined}], paths, Path("out"))
+        refuse_nonfinite(tally, paths, Path("out"))
 
 
 def test_the_same_command_resumes_without_rendering(
@@ -166,15 +169,15 @@ def test_what_a_kill_leaves_is_cleared_away(config: GeneratorConfig, engine: For
     out = tmp_path / "out"
     # Killed while the manifest was written: the folder holds a temporary file alone.
     out.mkdir()
-    (out / ".manifest.json.123.tmp").write_text("{")
+    (out / ".manifest.json.0123abcd-123.tmp").write_text("{")
     generate(config, out)
     # Killed between manifest and configuration, within a shard, and between a shard and its sidecar.
     (out / "config.yaml").unlink()
     (out / FILES[0]).unlink()
-    (out / f".{FILES[0]}.99999999.tmp").write_bytes(b"half")
+    (out / f".{FILES[0]}.0123abcd-99999999.tmp").write_bytes(b"half")
     sidecar_of(out / FILES[0]).unlink()
     sidecar_of(out / FILES[1]).unlink()
-    (out / ".train-00001.json.99999999.tmp").write_text("{")
+    (out / ".train-00001.json.0123abcd-99999999.tmp").write_text("{")
     assert generate(config, out).complete
     assert verify(out) == []
     assert (out / "config.yaml").exists()

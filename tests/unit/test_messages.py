@@ -35,19 +35,28 @@ def test_every_group_of_messages_is_explained() -> None:
 # Functions whose message is what another one said: of this project (collected there), of the validator,
 # Mitsuba or the system (shown as it is), or a text chosen by the caller.
 RELAYS = {
+    "mbtf_gen/atomic.py": {"_temporary", "remove_file"},
     "mbtf_gen/commands/selftest.py": {"selftest"},
     "mbtf_gen/config.py": {"_effects"},
     "mbtf_gen/console.py": {"_usage_message", "run"},
     "mbtf_gen/engine.py": {"_llvm_error", "check_llvm", "load_mitsuba"},
-    "mbtf_gen/generation.py": {"plan", "prepare"},
+    "mbtf_gen/generation.py": {"generate", "plan", "prepare"},
+    "mbtf_gen/locks.py": {"take_lock"},
     "mbtf_gen/map_names.py": {"_lost_warning", "find_maps"},
     "mbtf_gen/material.py": {"_assemble", "_heights"},
     "mbtf_gen/material_checks.py": {
         *("flat_warning", "orientation_warning", "relief_warning", "seam_warning", "suggestion_warning"),
     },
+    "mbtf_gen/output_folder.py": {"_clear", "read_manifest"},
+    "mbtf_gen/repairs.py": {"faults", "job", "mend"},
     "mbtf_gen/selftest_checks.py": {"_cuda"},
     "mbtf_gen/settings.py": {"_explain", "build"},
-    "mbtf_gen/verification.py": {"shard_fault", "verify"},
+    "mbtf_gen/verification.py": {
+        "_content_fault",
+        "_manifest_faults",
+        "_record_of",
+        "examine",
+    },
     "mbtf_gen/wording.py": {"explain"},
 }
 

@@ -69,8 +69,8 @@ def test_overwrite_removes_its_own_files_and_nothing_else(tmp_path: Path) -> Non
     out = tmp_path / "out"
     make(claim(out), "a.exr", "a.png")
     (out / "b.png").write_bytes(b"written, not yet recorded")
-    (out / ".b.png.99.tmp").write_bytes(b"half")
-    mine = {"notes.txt": b"kept", "c.png": b"kept", ".c.png.99.tmp": b"kept", ".b.png.swp": b"kept"}
+    (out / ".b.png.0123abcd-99.tmp").write_bytes(b"half")
+    mine = {"notes.txt": b"kept", "c.png": b"kept", ".c.png.0123abcd-99.tmp": b"kept", ".b.png.swp": b"kept"}
     for name, content in mine.items():
         (out / name).write_bytes(content)
     other = {**CONFIG, "reference": {"size": 16, "spp": 4}}
@@ -84,10 +84,10 @@ def test_a_killed_run_is_gone_on_with(tmp_path: Path) -> None:
     out = tmp_path / "out"
     # Killed while the record was written, then between record and configuration, then within a picture.
     out.mkdir()
-    (out / ".pictures.json.7.tmp").write_text("{")
+    (out / ".pictures.json.0123abcd-7.tmp").write_text("{")
     claim(out)
     (out / "config.yaml").unlink()
-    (out / ".a.exr.7.tmp").write_bytes(b"half")
+    (out / ".a.exr.0123abcd-7.tmp").write_bytes(b"half")
     claim(out)
     assert sorted(listing(out)) == ["config.yaml", "pictures.json"]
 

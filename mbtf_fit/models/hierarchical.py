@@ -1,0 +1,122 @@
+"""The hierarchical neural material.
+
+Xue, Zhao, Jensen, Montazeri: *A Hierarchical Architecture for Neural Materials*, Computer Graphics Forum
+2024: NeuMIP's pyramid and offset, positions and directions as sines and cosines, a decoder of Inception
+modules that sees neighbouring queries, and the fourth root of the value as its answer.
+
+What is done here in its own way:
+
+- **The neighbours are places of the material, not of a picture.** The decoder reads a grid of 9 × 9 places
+around
+  the query, one texel apart, of the level nearest to its footprint. So the value is a function of the query
+  alone, as every renderer needs it; in the paper it depends on which queries happen to stand beside it.
+- The grid wraps around the tile; the published code pads with zeros.
+- Training reads the same grids out of buffers, whose queries stand one per texel at random places within it;
+where
+  they stand at the texels' centres, training and evaluation give the same numbers.
+- Positions are encoded as ``p = 2u - 1`` with π, so that nothing jumps at the tile's seam, and before the
+offset
+  moves them; raw coordinates are not kept (``network.encoding`` has the published code's choices).
+- The answer x stands for the value ``unit · x|x|³``, an odd function.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from mbtf_gen.schema import Layout
+
+from .inception import InceptionDecoder
+from .mlp import Mlp
+from .textured import TexturedMaterial
+
+
+class Hierarchical(TexturedMaterial):
+    """Textures, offset, and a decoder that sees a neighbourhood in material space.
+
+    With ``network.decoder: mlp`` the neighbourhood is the query alone.
+    """
+
+    name = "hierarchical"
+    layout: ClassVar[Layout] = "image"
+
+    def _make_decoder(self, features: int, directions: int) -> Mlp | InceptionDecoder:
+        network = self.network
+        if network.decoder == "mlp":
+            hidden = [network.width] * (network.layers - 1)
+            return Mlp([features + directions, *hidden, network.outputs], network.activation)
+        return InceptionDecoder(
+            features, directions, network.width, network.layers - 2, network.outputs, network.activation
+        )
+
+    @property
+    def margin(self) -> int:
+        """Places on each side of the query that the decoder sees."""
+        return self.decoder.margin if isinstance(self.decoder, InceptionDecoder) else 0
+
+    @property
+    def positions(self) -> int:
+        return (2 * self.margin + 1) ** 2
+
+    def nearest_shape(self, sigma: Tensor) -> Tensor:
+        """(rows, columns) of the level nearest to footprints (n,): (n, 2), whole numbers."""
+        shapes = torch.tensor([self.lattice.shape(s) for s in range(self.lattice.finest + 1)])
+        nearest = (self.level(sigma) + 0.5).floor().long()
+        return shapes.to(sigma.device)[nearest]
+
+    def neighbourhood(self, u: Tensor, sigma: Tensor) -> Tensor:
+        """Places (n, 2·margin+1, 2·margin+1, 2) around `u` (n, 2), a texel of the nearest level apart: image
+        rows downwards, columns to the right."""
+        rows, columns = self.nearest_shape(sigma).to(u.dtype).unbind(1)
+        steps = torch.arange(-self.margin, self.margin + 1, dtype=u.dtype, device=u.device)
+        along_u = u[:, :1] + steps / columns[:, None]
+        along_v = u[:, 1:] - steps / rows[:, None]
+        size = len(steps)
+        return torch.stack(
+            [along_u[:, None].expand(-1, size, -1), along_v[:, :, None].expand(-1, -1, size)], -1
+        )
+
+    def see(self, u: Tensor, sigma: Tensor, omega_o: Tensor) -> Tensor:
+        """Features (items, rows, columns, f) at places (items, rows, columns, 2) that share footprint
+        (items,) and view (items, 3)."""
+        items, rows, columns, _ = u.shape
+        places = rows * columns
+        features = self.features(
+            u.reshape(-1, 2), sigma.repeat_interleave(places), omega_o.repeat_interleave(places, 0)
+        )
+        return features.view(items, rows, columns, -1)
+
+    def answer(self, features: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
+        """Values (items, rows-2·margin, columns-2·margin, 3) of features (items, rows, columns, f) that share
+        light and view (items, 3)."""
+        directions = self.directions(omega_i, omega_o)
+        if isinstance(self.decoder, InceptionDecoder):
+            return self.to_value(self.decoder(features, directions))
+        items, rows, columns, _ = features.shape
+        repeated = directions[:, None, None].expand(items, rows, columns, -1)
+        x: Tensor = self.decoder(torch.cat([features, repeated], -1).flatten(0, 2))
+        return self.to_value(x).view(items, rows, columns, 3)
+
+    def stage1(self, u: Tensor, sigma: Tensor, omega_o: Tensor) -> Tensor:
+        return self.see(self.neighbourhood(u, sigma), sigma, omega_o)
+
+    def stage2(self, features: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
+        return self.answer(features, omega_i, omega_o)[:, 0, 0]
+
+    def formula(self) -> dict[str, str]:
+        if self.margin == 0:
+            return super().formula()
+        size = 2 * self.margin + 1
+        level = "level s = floor(clamp(-log2(2 sigma), 0, k) + 1/2), of rows(s) x columns(s) texels"
+        return {
+            "places": f"a grid of {size} x {size} places (u + i / columns(s), v - j / rows(s)), i and j = "
+            f"-{self.margin}..{self.margin}, at {level}; each is u in what follows, up to features",
+            **super().formula(),
+            "x": "decoder(features at all places, light, view) at the middle: 1x1 convolution 'first' over "
+            "(features, light, view); Inception modules 0, 1, ...; 1x1 convolution 'last'; no padding. A "
+            "module joins one(x), three(before3(x)), five(before5(x)) and pooled(3x3 maximum of x); an "
+            "activation follows every convolution but the last",
+        }

@@ -1,0 +1,141 @@
+"""What all models have in common: a pyramid of learned textures, read at a place that the view moves."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+
+import torch
+from torch import Tensor, nn
+
+from mbtf_gen.levels import Lattice
+
+from ..config import NetworkSection
+from .encodings import direction_size, encode_direction, encode_position, encoding_formula, position_size
+from .inception import InceptionDecoder
+from .interface import NeuralMaterial
+from .lookup import coarse_level
+from .mlp import Mlp
+from .outputs import output_formula, start_of, to_value
+from .textures import FeatureTextures
+
+# Standard deviation of the features that training starts from.
+FEATURE_SCALE = 0.1
+# Tile widths per unit that the offset network answers.
+OFFSET_SCALE = 0.1
+# Cosine below which the offset grows no further towards grazing views.
+GRAZING = 0.6
+
+
+class TexturedMaterial(NeuralMaterial):
+    """Pyramid, offset and output map; sub-classes say how features are decoded.
+
+    Parameters
+    ----------
+    lattice : texel grids of the tile
+    network : the architecture
+    """
+
+    def __init__(self, lattice: Lattice, network: NetworkSection) -> None:
+        super().__init__(lattice, network)
+        self.pyramid = FeatureTextures(lattice, range(lattice.finest + 1), network.channels)
+        self.decoder = self._make_decoder(
+            network.channels * (2 if network.blending == "concatenate" else 1)
+            + position_size(network.encoding),
+            2 * direction_size(network.encoding),
+        )
+        self.unit: Tensor
+        self.register_buffer("unit", torch.ones(()))
+        if network.offset != "none":
+            self.offset_texture = FeatureTextures(
+                lattice, [lattice.finest], network.channels, moves_lookups=True
+            )
+            answers = 1 if network.offset == "depth" else 2
+            hidden = [network.width] * (network.layers - 1)
+            self.offset_network = Mlp([network.channels + 2, *hidden, answers], network.activation)
+
+    @abstractmethod
+    def _make_decoder(self, features: int, directions: int) -> Mlp | InceptionDecoder:
+        """The decoder of so many features (encoded position included) and encoded coordinates of light and
+        view."""
+
+    def initialise(self, generator: torch.Generator, unit: float) -> None:
+        nn.init.normal_(self.pyramid.texels, std=FEATURE_SCALE, generator=generator)
+        self.decoder.initialise(generator)
+        with torch.no_grad():
+            start = start_of(self.network.output, self.network.outputs)
+            self.decoder.last_bias.copy_(torch.tensor(start))
+        self.unit.fill_(unit)
+        if self.network.offset != "none":
+            nn.init.zeros_(self.offset_texture.texels)
+            self.offset_network.initialise(generator)
+
+    def offset(self, u: Tensor, omega_o: Tensor) -> Tensor:
+        if self.network.offset == "none":
+            return torch.zeros_like(u)
+        seen = torch.cat([self.offset_texture(u), omega_o[:, :2]], 1)
+        r: Tensor = OFFSET_SCALE * self.offset_network(seen)
+        if self.network.offset == "direct":
+            return r
+        return r * (omega_o[:, :2] / omega_o[:, 2:].clamp_min(GRAZING))
+
+    def read(self, u: Tensor, level: Tensor) -> Tensor:
+        """Features of the pyramid at `u` (n, 2) and fractional levels (n,), without offset: (n, f)."""
+        features: Tensor
+        if self.network.blending == "blend":
+            features = self.pyramid(u, level)
+            return features
+        coarse, weight = coarse_level(level, self.lattice.finest + 1)
+        low = (1 - weight)[:, None] * self.pyramid(u, coarse)
+        high = weight[:, None] * self.pyramid(u, coarse + 1)
+        # Every level keeps its side, so that nothing jumps where the coarser level becomes the finer one.
+        odd = (coarse.remainder(2) == 1)[:, None]
+        return torch.cat([torch.where(odd, high, low), torch.where(odd, low, high)], 1)
+
+    def features(self, u: Tensor, sigma: Tensor, omega_o: Tensor) -> Tensor:
+        """What the decoder sees of single places `u` (n, 2), footprints (n,) and views (n, 3): (n, f)."""
+        moved = u
+        if self.network.offset != "none":
+            moved = u + self.offset(u, omega_o) / u.new_tensor([1.0, self.lattice.aspect])
+        features = self.read(moved, self.level(sigma))
+        if self.network.encoding.position == 0:
+            return features
+        return torch.cat([features, encode_position(u, self.network.encoding)], 1)
+
+    def directions(self, omega_i: Tensor, omega_o: Tensor) -> Tensor:
+        """What the decoder sees of light and view (n, 3): (n, d)."""
+        options = self.network.encoding
+        return torch.cat([encode_direction(omega_i, options), encode_direction(omega_o, options)], 1)
+
+    def to_value(self, x: Tensor) -> Tensor:
+        """Values (..., 3) in 1/sr of the decoder's answers."""
+        return to_value(x, self.unit, self.network.output)
+
+    def formula(self) -> dict[str, str]:
+        network, encoding = self.network, self.network.encoding
+        omega = "(x, y, z)" if encoding.lifted else "(x, y)"
+        r = "offset_network(texture offset_texture.0 at u, omega_o.x, omega_o.y)"
+        out: dict[str, str] = {}
+        if network.offset == "depth":
+            out["r"] = f"{OFFSET_SCALE} * {r}"
+            out["offset"] = f"r / max(omega_o.z, {GRAZING}) * (omega_o.x, omega_o.y), in tile widths"
+        elif network.offset == "direct":
+            out["offset"] = f"{OFFSET_SCALE} * {r}, in tile widths"
+        place = "u"
+        if out:
+            out["u'"] = "u + offset / (1, aspect)"
+            place = "u'"
+        textures = f"the textures pyramid.0 ... pyramid.k (level 0 to k) at {place}"
+        if network.blending == "blend":
+            out["features"] = f"{textures}, blended by level"
+        else:
+            out["features"] = (
+                f"{textures}, of the two levels that are blended: each times its weight, first the even "
+                "level, then the odd one"
+            )
+        if encoding.position:
+            p = encoding_formula("p = 2 (u mod 1) - 1", encoding.position, encoding)
+            out["features"] += f"; then the position u encoded: {p}"
+        out["light, view"] = encoding_formula(f"{omega} of omega_i, of omega_o", encoding.direction, encoding)
+        out["x"] = "decoder(features, light, view)"
+        out["value"] = output_formula(network.output, network.outputs)
+        return out
