@@ -1,4 +1,5 @@
-"""Fitted materials as Mitsuba BSDFs (``mbtf``), and a path tracer that hands them their footprints (``mbtf_path``).
+"""Fitted materials as Mitsuba BSDFs (``mbtf``), and a path tracer that hands them footprints
+(``mbtf_path``).
 
     import mitsuba as mi
     mi.set_variant("llvm_ad_rgb")

@@ -1,7 +1,7 @@
 """``mbtf``: a fitted material as a BSDF of Mitsuba.
 
-The material's value M is the radiance that leaves under light of unit irradiance, in 1/sr: the BSDF's value f,
-averaged over the footprint and over the light kernel of the data. ``eval`` therefore is ``M cos θ_i``.
+The material's value M is the radiance that leaves under light of unit irradiance, in 1/sr: the BSDF's value
+f, averaged over the footprint and over the light kernel of the data. ``eval`` therefore is ``M cos θ_i``.
 """
 
 from __future__ import annotations
@@ -25,13 +25,15 @@ from .network import Arithmetic
 from .registration import BSDF_NAME
 from .stored import StoredMaterial, read_material
 
-# Length of the directions' projection on the surface beyond which no material has data: lower ones are answered by
-# the lowest (see docs/rendering.md).
+# Length of the directions' projection on the surface beyond which no material has data: lower directions are
+# answered by the lowest that have some (see docs/rendering.md).
 LARGEST_SINE = 0.99**0.5
 # Largest deviation from the conformance values, as a share of max(value, their mean), that loading accepts.
 TOLERANCE = {"unrolled": 1e-4, "cooperative": 1e-4, "half": 5e-2}
 
-_log = logging.getLogger("mbtf")
+_log = logging.getLogger(__name__)
+# Materials whose missing footprint was told.
+_warned: set[Path] = set()
 
 
 class Cones:
@@ -42,7 +44,8 @@ class Cones:
 
 @dataclass(frozen=True)
 class Frame:
-    """The tile's frame at hits, as a turn (and perhaps a reflection) of the shading frame about its normal."""
+    """The tile's frame at hits, as a turn (and perhaps a reflection) of the shading frame about the
+    normal."""
 
     c: Any
     s: Any
@@ -97,7 +100,9 @@ class MbtfBSDF(mi.BSDF):
     def __init__(self, props: Any) -> None:
         super().__init__(props)
         if "material" not in props:
-            raise UsageError("names no material", where=self._place(props), cure="give it: 'material': 'folder/'")
+            raise UsageError(
+                "names no material", where=self._place(props), cure="give it: 'material': 'folder/'"
+            )
         folder = Path(str(mi.file_resolver().resolve(str(props["material"]))))
         stored = read_material(folder)
         self.lattice = stored.lattice
@@ -111,7 +116,6 @@ class MbtfBSDF(mi.BSDF):
         self.sigma_given = "sigma" in props
         self.sigma = self._positive(props, "sigma", stored.lattice.sigma_range[0])
         self.folder = folder
-        self._warned = False
         flags = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide | mi.BSDFFlags.SpatiallyVarying
         flags |= mi.BSDFFlags.Anisotropic
         self.m_components = [flags]
@@ -130,15 +134,18 @@ class MbtfBSDF(mi.BSDF):
     def _choice(self, props: Any, name: str, choices: tuple[str, ...]) -> Any:
         value = props.get(name, None)
         if value is not None and value not in choices:
-            raise UsageError(f"{name} must be one of {', '.join(choices)}, not {value}", where=self._place(props))
+            raise UsageError(
+                f"{name} must be one of {', '.join(choices)}, not {value}", where=self._place(props)
+            )
         return value
 
     def _warn_once(self) -> None:
-        if Cones.carried or self.sigma_given or self._warned:
+        if Cones.carried or self.sigma_given or self.folder in _warned:
             return
-        self._warned = True
+        _warned.add(self.folder)
         _log.warning(
-            "%s: the integrator hands over no footprint; the finest level is read (use 'mbtf_path', or set 'sigma')",
+            "%s: the integrator hands over no footprint, so the finest level is read: use the integrator "
+            "'mbtf_path', or set 'sigma'",
             self.folder,
         )
 
@@ -243,7 +250,7 @@ def _check_conformance(evaluator: Evaluator, stored: StoredMaterial) -> None:
     worst = float(np.max(np.abs(found - wanted) / scale))
     if not worst <= TOLERANCE[evaluator.arithmetic]:
         raise InputError(
-            f"the renderer's plugin gives other values than its conformance queries ({100 * worst:.2g} % off)",
+            f"the renderer's plugin does not give its conformance values ({100 * worst:.2g} % off)",
             where=stored.folder,
             cure="it was fitted by another version: fit it again, or use that version's plugin",
         )

@@ -13,12 +13,13 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .encodings import encode_direction, encode_position, to_value
 from .network import Arithmetic, Network, count_weights, default_arithmetic
 from .stored import F32, StoredMaterial
 from .textures import Textures
 
-# Of the model's definition: tile widths per unit that the offset network answers, and the cosine below which the
-# offset grows no further.
+# Of the model's definition: tile widths per unit that the offset network answers, and the cosine below which
+# the offset grows no further.
 OFFSET_SCALE = 0.1
 GRAZING = 0.6
 
@@ -34,15 +35,16 @@ class Evaluator:
 
     def __init__(self, stored: StoredMaterial, arithmetic: Arithmetic | None = None) -> None:
         self.lattice = stored.lattice
+        self.network = stored.network
         self.unit = stored.unit
         weights = count_weights(stored.decoder) + count_weights(stored.offset_network or [])
         self.arithmetic: Arithmetic = default_arithmetic(weights) if arithmetic is None else arithmetic
         self.pyramid = Textures(stored.pyramid)
-        self.decoder = Network(stored.decoder, self.arithmetic)
+        self.decoder = Network(stored.decoder, self.arithmetic, stored.network.activation)
         self.offset_texture: Textures | None = None
         if stored.offset_texture is not None and stored.offset_network is not None:
             self.offset_texture = Textures([stored.offset_texture])
-            self.offset_network = Network(stored.offset_network, self.arithmetic)
+            self.offset_network = Network(stored.offset_network, self.arithmetic, stored.network.activation)
 
     def level(self, sigma: Any) -> Any:
         """Fractional level of footprints in tile widths."""
@@ -50,16 +52,23 @@ class Evaluator:
 
     def features(self, u: Any, level: Any, omega_o: Any) -> list[Any]:
         """Stage 1, shared by all lights: features at uv positions (Point2f), seen from unit vectors."""
+        moved = u
         if self.offset_texture is not None:
-            (r,) = self.offset_network([*self.offset_texture(u), omega_o.x, omega_o.y])
-            r *= OFFSET_SCALE / dr.maximum(omega_o.z, GRAZING)
-            u = mi.Point2f(dr.fma(r, omega_o.x, u.x), dr.fma(r * (1.0 / self.lattice.aspect), omega_o.y, u.y))
-        return self.pyramid(u, level)
+            r = self.offset_network([*self.offset_texture.first(u), omega_o.x, omega_o.y])
+            if len(r) == 1:
+                r = [r[0] * (omega / dr.maximum(omega_o.z, GRAZING)) for omega in (omega_o.x, omega_o.y)]
+            x, y = r
+            moved = mi.Point2f(
+                dr.fma(x, OFFSET_SCALE, u.x), dr.fma(y, OFFSET_SCALE / self.lattice.aspect, u.y)
+            )
+        read = self.pyramid.blended if self.network.blending == "blend" else self.pyramid.side_by_side
+        return [*read(moved, level), *encode_position(u, self.network.encoding)]
 
     def value(self, features: list[Any], omega_i: Any, omega_o: Any) -> Any:
         """Stage 2: value (Color3f) in 1/sr, at least 0."""
-        x = self.decoder([*features, omega_i.x, omega_i.y, omega_o.x, omega_o.y])
-        return mi.Color3f(*(dr.maximum(self.unit * (dr.exp(v) - 1.0), 0.0) for v in x))
+        options = self.network.encoding
+        directions = [*encode_direction(omega_i, options), *encode_direction(omega_o, options)]
+        return to_value(self.decoder([*features, *directions]), self.unit, self.network)
 
     def evaluate(self, u: ArrayLike, sigma: ArrayLike, omega_i: ArrayLike, omega_o: ArrayLike) -> F32:
         """Values (n, 3) in 1/sr at arrays of queries, as :meth:`mbtf_fit.Material.evaluate` gives them."""

@@ -1,10 +1,10 @@
 """``mbtf_path``: a path tracer that carries ray cones, so that ``mbtf`` knows its footprint at every hit.
 
-A cone has a width, the side of the square that a pixel covers across the ray, and a spread, by which the width
-grows per unit of length (Amanatides 1984; Akenine-Möller et al. 2019). Both start from the sensor's ray
-differentials, whole pixels. At a hit the square projected onto the surface is written to
-``si.duv_dx`` and ``si.duv_dy``; stock integrators leave these at zero. Surfaces are taken as flat: curvature does
-not widen the cone. A scattered ray's cone is at least as wide as the density of its direction calls for.
+A cone has a width, the side of the square that a pixel covers across the ray, and a spread, by which the
+width grows per unit of length (Amanatides 1984; Akenine-Möller et al. 2019). Both start from the sensor's ray
+differentials, whole pixels. At a hit the square projected onto the surface is written to ``si.duv_dx`` and
+``si.duv_dy``; stock integrators leave these at zero. Surfaces are taken as flat: curvature does not widen
+the cone. A scattered ray's cone is at least as wide as the density of its direction calls for.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from mbtf_gen.errors import UsageError
 from .bsdf import Cones
 from .scene import check_scene
 
-# Spread of a scattered ray's cone, as a share of 1/√density: what a direction drawn with that density stands for
-# is filtered by a quarter of its distance to the next one, along each axis.
+# Spread of a scattered ray's cone, as a share of 1/√density, the side of the solid angle that a direction of
+# that density stands for.
 SCATTERED = 0.25
 
 
@@ -105,7 +105,7 @@ class ConePath(mi.SamplingIntegrator):
         depth, eta = mi.UInt32(0), mi.Float(1.0)
         pdf, specular = mi.Float(1.0), mi.Bool(True)
         last = dr.zeros(mi.Interaction3f)
-        valid = mi.Bool(False)
+        valid = mi.Bool((not self.hidden) and scene.environment() is not None)
         hidden, most, roulette = mi.Bool(self.hidden), mi.UInt32(self.max_depth), mi.UInt32(self.rr_depth)
         context = mi.BSDFContext()
         while active:
@@ -140,7 +140,9 @@ class ConePath(mi.SamplingIntegrator):
             pdf = dr.select(through, pdf, bs.pdf)
             specular = dr.select(through, specular, delta)
             spread = dr.select(
-                delta | through | ~active, spread, dr.maximum(spread, SCATTERED * dr.rsqrt(dr.maximum(bs.pdf, 1e-6)))
+                delta | through | ~active,
+                spread,
+                dr.maximum(spread, SCATTERED * dr.rsqrt(dr.maximum(bs.pdf, 1e-6))),
             )
             ray = si.spawn_ray(si.to_world(bs.wo))
             depth[si.is_valid()] += 1
@@ -149,4 +151,4 @@ class ConePath(mi.SamplingIntegrator):
             played = depth >= roulette
             throughput[played] *= dr.rcp(dr.maximum(keep, 1e-6))
             active &= (most_left != 0.0) & (~played | (sampler.next_1d(active) < keep))
-        return dr.select(valid | ~hidden, radiance, radiance), valid
+        return radiance, valid

@@ -30,20 +30,26 @@ FIRST_SHARE = 0.5
 # Smallest α: below it, single precision and the values' own blur leave nothing to gain.
 SMALLEST_ALPHA = 0.03
 # Samples, of a texel's own, that the first lobe counts for.
-PRIOR = 4.0
+PRIOR = 1.5
 # Shares to choose from; the cosine always keeps some, so that no value is out of reach.
 SHARES = (0.0, 0.15, 0.3, 0.45, 0.6, 0.75, 0.9)
 # Weight of the level's mean in that choice.
 LEVEL_SAY = 0.5
+# What a share of one must gain at least: small gains are noise.
+DOUBT = 0.1
 # Lanes per launch.
 _LANES = 1 << 22
 
 
 def fit_lobes(stored: StoredMaterial) -> list[F32]:
     """Numbers of the lobes (rows, columns, 8) of each level up to :data:`FINEST`, in a second or two."""
-    lattice = stored.lattice
     # The one arithmetic whose kernels do not depend on the material: they are compiled once.
-    evaluator = Evaluator(stored, "cooperative")
+    return lobes_of(Evaluator(stored, "cooperative"))
+
+
+def lobes_of(evaluator: Evaluator) -> list[F32]:
+    """The same for anything that answers as an evaluator does."""
+    lattice = evaluator.lattice
     out = []
     for level in range(min(lattice.finest, FINEST) + 1):
         rows, columns = lattice.shape(level)
@@ -140,7 +146,9 @@ def _iterate(weight: Any, viewer: Any, light: Any, texel: Any, count: int) -> An
     return buffer
 
 
-def _best_shares(buffer: Any, wanted: Any, start: Any, viewer: Any, light: Any, texel: Any, count: int) -> F32:
+def _best_shares(
+    buffer: Any, wanted: Any, start: Any, viewer: Any, light: Any, texel: Any, count: int
+) -> F32:
     """Share (count, 3) of the lobe in each band: that of :data:`SHARES` with the least second moment of
     ``wanted / density``, which counts what the lobe loses below the surface."""
     lobe = mixture_of(buffer, texel, viewer).lobe.density(light, viewer)
@@ -152,6 +160,7 @@ def _best_shares(buffer: Any, wanted: Any, start: Any, viewer: Any, light: Any, 
             moments[:, k, c] = np.array(dr.block_sum(dr.select(band == k, moment, 0.0), SAMPLES))
     # Few samples choose badly: the level's mean has a say.
     relative = moments / np.maximum(moments.mean(-1, keepdims=True), 1e-30)
-    best = np.argmin(relative + LEVEL_SAY * relative.mean(0), -1)
+    cost = (relative + LEVEL_SAY * relative.mean(0)) * (1.0 + DOUBT * np.array(SHARES))
+    best = np.argmin(cost, -1)
     out: F32 = np.array(SHARES, np.float32)[best]
     return out

@@ -2,9 +2,9 @@ r"""Where a material reflects to: a mixture of two densities per texel, for impo
 
 One is the cosine-weighted hemisphere, the other reflects the view at the visible normals of an anisotropic,
 tilted GGX distribution. Its slopes are ``s = L t + s0`` with t distributed as ``1/(π (1+|t|²)²)``. The normal
-``(-s, 1)`` is then ``K (-t, 1)`` with ``K = [[L, -s0], [0, 1]]``, so that the normals visible from ω are the images
-of the normals of a unit GGX visible from ``ω' = Kᵀω`` (Heitz 2018; there without the tilt), and the density
-of the reflected direction is
+``(-s, 1)`` is then ``K (-t, 1)`` with ``K = [[L, -s0], [0, 1]]``, so that the normals visible from ω are the
+images of the normals of a unit GGX visible from ``ω' = Kᵀω`` (Heitz 2018; there without the tilt), and the
+density of the reflected direction is
 
     p(ω_i) = D(h) / (2 (|ω'| + ω'_z)),   D(h) = 1 / (π |det L| (1+|t|²)² h_z⁴).
 
@@ -34,7 +34,9 @@ BANDS = (0.35, 0.7)
 
 def band_of(cosine: Any) -> Any:
     """Number of the band of a view's cosine."""
-    return dr.select(cosine < BANDS[0], mi.UInt32(0), dr.select(cosine < BANDS[1], mi.UInt32(1), mi.UInt32(2)))
+    return dr.select(
+        cosine < BANDS[0], mi.UInt32(0), dr.select(cosine < BANDS[1], mi.UInt32(1), mi.UInt32(2))
+    )
 
 
 @dataclass(frozen=True)
@@ -81,7 +83,9 @@ class Lobe:
         t = visible_normal(dr.normalize(self._stretched(viewer)), 1.0, xi)
         half = dr.normalize(
             mi.Vector3f(
-                dr.fma(self.l11, t.x, -self.x * t.z), dr.fma(self.l21, t.x, self.l22 * t.y) - self.y * t.z, t.z
+                dr.fma(self.l11, t.x, -self.x * t.z),
+                dr.fma(self.l21, t.x, self.l22 * t.y) - self.y * t.z,
+                t.z,
             )
         )
         return 2.0 * dr.dot(viewer, half) * half - viewer

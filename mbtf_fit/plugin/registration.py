@@ -40,10 +40,14 @@ def register() -> None:
     if variant == _registered:
         return
     if variant not in VARIANTS:
-        raise UsageError(f"the plugin '{BSDF_NAME}' does not run in the variant {variant}", cure=f"set {VARIANTS[0]} or {VARIANTS[1]}")
+        raise UsageError(
+            f"the plugin '{BSDF_NAME}' does not run in the variant {variant}",
+            cure=f"set {VARIANTS[0]} or {VARIANTS[1]}",
+        )
     if _registered is not None:
         raise EngineError(
-            f"the plugin '{BSDF_NAME}' is registered with the variant {_registered}", cure="use one variant per process"
+            f"the plugin '{BSDF_NAME}' is registered with the variant {_registered}",
+            cure="use one variant per process",
         )
     from .bsdf import MbtfBSDF
     from .integrator import ConePath

@@ -11,17 +11,14 @@ from numpy.typing import NDArray
 
 from mbtf_gen.errors import InputError, reason
 from mbtf_gen.levels import Lattice
+from mbtf_gen.settings import build
 
+from ..config import FitConfig, NetworkSection
 from ..material_format import CONFORMANCE, DESCRIPTION_NAME, check_conformance, read_description
 
 F32 = NDArray[np.float32]
 # (weight (outputs, inputs), bias (outputs,)) of each layer.
 Layers = list[tuple[F32, F32]]
-MODELS = ("neumip", "neumip-baseline")
-# Options of `config.network` that change how a value is computed, and the choices that are implemented here;
-# sizes may be anything.
-_SIZES = ("channels", "width", "layers")
-_CHOICES: dict[str, tuple[object, ...]] = {}
 
 
 @dataclass(frozen=True)
@@ -32,17 +29,17 @@ class StoredMaterial:
     ----------
     folder : where it lies
     lattice : texel grids of the tile
-    digest : SHA-256 of the weights' file
+    network : its architecture
     pyramid : (rows, columns, channels) of each level, coarsest first
     decoder : layers of the network that gives the value
-    offset_texture, offset_network : those of the neural offset; None for a model without
+    offset_texture, offset_network : those of the neural offset; None without one
     unit : factor of the value, 1/sr
     conformance : queries ``u``, ``sigma``, ``omega_i``, ``omega_o`` and their values ``rgb`` (n, 3)
     """
 
     folder: Path
     lattice: Lattice
-    digest: str
+    network: NetworkSection
     pyramid: list[F32]
     decoder: Layers
     offset_texture: F32 | None
@@ -60,25 +57,30 @@ def read_material(folder: str | Path) -> StoredMaterial:
     """
     folder = Path(folder)
     description, weights = read_description(folder)
-    place = folder / DESCRIPTION_NAME
-    _refuse_unknown(description, place)
+    network = _supported(description, folder / DESCRIPTION_NAME)
     tensors = _read_tensors(weights)
     lattice = Lattice(description["levels"]["finest"], description["tile"]["aspect"])
-    stored = {name: tensors[f"conformance.{name}"] for name in CONFORMANCE if f"conformance.{name}" in tensors}
+    stored = {
+        name: tensors[f"conformance.{name}"] for name in CONFORMANCE if f"conformance.{name}" in tensors
+    }
     conformance = check_conformance(stored, description, weights)
     reader = _Reader(tensors, weights)
     pyramid = [reader.texture(f"pyramid.{s}", lattice.shape(s)) for s in range(lattice.finest + 1)]
     channels = pyramid[0].shape[2]
     offset_texture, offset_network = None, None
-    if description["model"] == "neumip":
+    if network.offset != "none":
         offset_texture = reader.texture("offset_texture.0", lattice.shape())
-        offset_network = reader.layers("offset_network", offset_texture.shape[2] + 2, 1)
+        answers = 1 if network.offset == "depth" else 2
+        offset_network = reader.layers("offset_network", offset_texture.shape[2] + 2, answers)
+    features = channels * (2 if network.blending == "concatenate" else 1)
+    directions = 2 * _size(3 if network.encoding.lifted else 2, network.encoding.direction, network)
+    position = _size(2, network.encoding.position, network) if network.encoding.position else 0
     return StoredMaterial(
         folder,
         lattice,
-        str(description["weights"]["sha256"]),
+        network,
         pyramid,
-        reader.layers("decoder", channels + 4, 3),
+        reader.layers("decoder", features + position + directions, network.outputs),
         offset_texture,
         offset_network,
         float(reader.take("unit", ())),
@@ -86,22 +88,21 @@ def read_material(folder: str | Path) -> StoredMaterial:
     )
 
 
-def _refuse_unknown(description: dict[str, Any], place: Path) -> None:
-    model = description["model"]
-    if model not in MODELS:
+def _size(coordinates: int, bands: int, network: NetworkSection) -> int:
+    """Numbers that encode so many coordinates."""
+    return coordinates * (2 * bands + network.encoding.raw) if bands else coordinates
+
+
+def _supported(description: dict[str, Any], place: Path) -> NetworkSection:
+    """The architecture, or a refusal."""
+    config = build(FitConfig, description["config"], source=str(place))
+    if config.network.decoder != "mlp":
         raise InputError(
-            f"the renderer's plugin cannot evaluate the model '{model}'",
+            f"the renderer's plugin cannot evaluate '{config.model}', which looks at neighbouring queries",
             where=place,
-            cure=f"it knows {' and '.join(MODELS)}",
+            cure="fit the model neumip or neumip-baseline to the same shards",
         )
-    network = description["config"].get("network", {})
-    for name, value in network.items() if isinstance(network, dict) else ():
-        if name not in _SIZES and value not in _CHOICES.get(name, ()):
-            raise InputError(
-                f"the renderer's plugin cannot evaluate a network with {name}: {value}",
-                where=place,
-                cure="fit the material without it",
-            )
+    return config.network
 
 
 def _read_tensors(path: Path) -> dict[str, NDArray[Any]]:
@@ -124,7 +125,9 @@ class _Reader:
         array = self.tensors.get(name)
         if array is None:
             raise InputError(f"lacks the tensor '{name}'", where=self.path)
-        if len(shape) != array.ndim or any(s is not None and s != t for s, t in zip(shape, array.shape, strict=True)):
+        if len(shape) != array.ndim or any(
+            s is not None and s != t for s, t in zip(shape, array.shape, strict=True)
+        ):
             raise InputError(f"its tensor '{name}' has the shape {array.shape}", where=self.path)
         out: F32 = np.array(array, np.float32, order="C")
         if not np.isfinite(out).all():

@@ -19,6 +19,11 @@ from .stored import F32
 GROUP = 4
 
 
+def _in_image(u: Any) -> Any:
+    """Position in the image, from its left and its top, in [0, 1]."""
+    return mi.Point2f(u.x - dr.floor(u.x), 1.0 - (u.y - dr.floor(u.y)))
+
+
 class Textures:
     """Textures of consecutive levels, coarsest first.
 
@@ -31,35 +36,51 @@ class Textures:
         self.channels = levels[0].shape[2]
         self.groups = -(-self.channels // GROUP)
         padded = [
-            np.pad(level, ((0, 0), (0, 0), (0, self.groups * GROUP - self.channels))).reshape(-1) for level in levels
+            np.pad(level, ((0, 0), (0, 0), (0, self.groups * GROUP - self.channels))).reshape(-1)
+            for level in levels
         ]
         self.shapes = [level.shape[:2] for level in levels]
         starts = np.cumsum([0, *(rows * columns for rows, columns in self.shapes)])
         self.buffer = mi.Float(np.concatenate(padded))
-        table = [[rows, columns, start, 0] for (rows, columns), start in zip(self.shapes, starts, strict=False)]
+        table = [
+            [rows, columns, start, 0] for (rows, columns), start in zip(self.shapes, starts, strict=False)
+        ]
         self._table = mi.UInt32(np.array(table, np.uint32).reshape(-1))
         dr.eval(self.buffer, self._table)
 
-    def __call__(self, u: Any, level: Any = None) -> list[Any]:
-        """Features at uv positions, blended between two levels.
+    def first(self, u: Any) -> list[Any]:
+        """Features of the first level at uv positions (Point2f), any real numbers: textures are periodic."""
+        rows, columns = self.shapes[0]
+        place = (mi.UInt32(rows), mi.UInt32(columns), mi.UInt32(0))
+        return self._bilinear(_in_image(u), *place, None, [0.0] * self.channels)
 
-        Parameters
-        ----------
-        u : Point2f, any real numbers: the textures are periodic
-        level : fractional number of the level, from 0 for the first; None reads the first level alone
-        """
-        x = mi.Point2f(u.x - dr.floor(u.x), 1.0 - (u.y - dr.floor(u.y)))
-        if len(self.shapes) == 1 or level is None:
-            rows, columns = self.shapes[0]
-            return self._bilinear(x, mi.UInt32(rows), mi.UInt32(columns), mi.UInt32(0), None, [0.0] * self.channels)
+    def blended(self, u: Any, level: Any) -> list[Any]:
+        """Features between two levels: (1 - frac(level)) of the coarser, frac(level) of the finer one."""
+        if len(self.shapes) == 1:
+            return self.first(u)
+        coarse, weight = self._coarse(level)
+        return self._level(u, coarse + 1, weight, self._level(u, coarse, 1.0 - weight, [0.0] * self.channels))
+
+    def side_by_side(self, u: Any, level: Any) -> list[Any]:
+        """The same two terms, not added: that of the even level, then that of the odd one."""
+        none = [0.0] * self.channels
+        if len(self.shapes) == 1:
+            return [*self.first(u), *(mi.Float(v) for v in none)]
+        coarse, weight = self._coarse(level)
+        low, high = self._level(u, coarse, 1.0 - weight, none), self._level(u, coarse + 1, weight, none)
+        odd = (coarse & 1) == 1
+        both = list(zip(low, high, strict=True))
+        return [dr.select(odd, h, v) for v, h in both] + [dr.select(odd, v, h) for v, h in both]
+
+    def _coarse(self, level: Any) -> tuple[Any, Any]:
+        """(coarser level, weight of the finer one)."""
         level = dr.clip(level, 0.0, len(self.shapes) - 1.0)
         coarse = dr.minimum(mi.UInt32(level), len(self.shapes) - 2)
-        fine_weight = level - mi.Float(coarse)
-        out: list[Any] = [0.0] * self.channels
-        for index, scale in ((coarse, 1.0 - fine_weight), (coarse + 1, fine_weight)):
-            rows, columns, start, _ = dr.gather(mi.Vector4u, self._table, index)
-            out = self._bilinear(x, rows, columns, start, scale, out)
-        return out
+        return coarse, level - mi.Float(coarse)
+
+    def _level(self, u: Any, level: Any, scale: Any, out: list[Any]) -> list[Any]:
+        rows, columns, start, _ = dr.gather(mi.Vector4u, self._table, level)
+        return self._bilinear(_in_image(u), rows, columns, start, scale, out)
 
     def _bilinear(self, x: Any, rows: Any, columns: Any, start: Any, scale: Any, out: list[Any]) -> list[Any]:
         """`out` plus the texture of one level times a scale, at image positions x in [0, 1]."""
