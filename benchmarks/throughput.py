@@ -106,9 +106,10 @@ def stock_run(material: Material, grid: HeightGrid, count: int, spp: int) -> Cal
     import mitsuba as mi
 
     from mbtf_gen.bsdf import bsdf_of
-    from mbtf_gen.scene import LONG_SIDE, mesh_of_grid
+    from mbtf_gen.scene import unit_of
+    from mbtf_gen.stock import mesh_of_grid
 
-    unit = LONG_SIDE / max(1.0, grid.aspect)
+    unit = unit_of(grid.aspect)
     columns = max(1, round((count / grid.aspect) ** 0.5))
     rows = max(1, count // columns)
     half = 0.5 * unit

@@ -173,6 +173,76 @@ def evaluate(material: Path, shards: Path, /, *, console: Console = CONSOLE) -> 
     )
 
 
+@app.command(name="export")
+def export_material(
+    material: Path,
+    /,
+    *,
+    to: Annotated[
+        list[Literal["exr", "json", "material"]] | None, Parameter(name="--to", negative="")
+    ] = None,
+    output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
+    half: Annotated[bool, Parameter(negative="")] = False,
+    console: Console = CONSOLE,
+) -> None:
+    """Write a material in forms that other programs read: mbtf-fit export material/ --to exr
+
+    exr: the latent textures, a part per level and a channel per feature. json: the networks as a list of
+    layers, with formulas, conventions and queries with expected values. material: another material folder.
+
+    Parameters
+    ----------
+    material
+        Folder made by mbtf-fit.
+    to
+        exr, json or material. Repeatable. Default: exr and json
+    output
+        Folder to write to. Default: the material's own
+    half
+        Round all weights and texels to 16 bits, and print the error of that.
+    """
+    from .exports import LAYERS_NAME, TEXTURES_NAME, to_half, write_layers, write_textures
+    from .material import Material, export
+    from .material_format import DESCRIPTION_NAME, WEIGHTS_NAME
+    from .storage import make_folder
+
+    wanted = list(dict.fromkeys(to or ["exr", "json"]))
+    folder = material if output is None else output
+    loaded = Material.load(material)
+    if "material" in wanted and folder.is_dir() and any(folder.iterdir()):
+        raise InputError(
+            "holds something already", where=folder, cure="name a new folder with -o for --to material"
+        )
+    written, error = loaded, None
+    if half:
+        written, error = to_half(loaded)
+    make_folder(folder)
+    files = []
+    if "exr" in wanted:
+        write_textures(written, folder / TEXTURES_NAME, half=half)
+        files.append(TEXTURES_NAME)
+    if "json" in wanted:
+        write_layers(written, folder / LAYERS_NAME, half=half)
+        files.append(LAYERS_NAME)
+    if "material" in wanted:
+        description = loaded.description
+        export(
+            written.model,
+            written.config,
+            folder,
+            data=description["data"],
+            training=description["training"],
+            half=half,
+        )
+        files += [WEIGHTS_NAME, DESCRIPTION_NAME]
+    sizes = {name: (folder / name).stat().st_size for name in files}
+    lines = [f"{folder / name}: {size / 1e6:.3f} MB" for name, size in sizes.items()]
+    console.report(
+        {"folder": folder, "files": sizes, "half": None if error is None else error.as_dict()},
+        "\n".join([*lines, *([] if error is None else [str(error)])]),
+    )
+
+
 @app.command
 def info(path: Path, /, *, console: Console = CONSOLE) -> None:
     """What a material or a data set holds.

@@ -14,7 +14,8 @@ from mbtf_gen.settings import Settings
 
 ModelName = Literal["neumip-baseline", "neumip", "hierarchical"]
 OutputMap = Literal["exp-1", "exp", "identity", "softplus", "fourth-root"]
-LossName = Literal["relative", "squared"]
+LossKind = Literal["relative", "squared", "linear", "log", "fourth-root", "gradient"]
+Correction = Literal["none", "second-order", "linear"]
 
 Duration = Annotated[
     float, BeforeValidator(parse_duration), PlainSerializer(format_duration, when_used="json")
@@ -64,13 +65,28 @@ class BlurSection(Settings):
     )
 
 
+class LossTerm(Settings):
+    """One term of what is minimised; ``docs/fitting.md`` has the formulas."""
+
+    kind: LossKind
+    weight: float = Field(1.0, gt=0, le=1e6)
+
+
 class TrainingSection(Settings):
     """How long and how a model is trained."""
 
     time: Duration = Field(120.0, description="budget: 90s, 2min, 1h")
     steps: int | None = Field(None, ge=1, description="train this many steps, however long they take")
     batch: int = Field(1 << 15, ge=1, le=1 << 24, description="queries per step")
-    loss: LossName = Field("relative", description="relative (highlights do not drown the rest) or squared")
+    losses: tuple[LossTerm, ...] = Field(
+        (LossTerm(kind="relative", weight=1.0),),
+        min_length=1,
+        description="what is minimised: {kind, weight}, added up",
+    )
+    correction: Correction = Field("linear", description="of the bias that noise leaves in curved losses")
+    robust: float | None = Field(
+        10.0, gt=0, description="errors beyond so many times noise and value count linearly; null: never"
+    )
     rate: float = Field(3e-2, gt=0, lt=1, description="largest learning rate of the networks (Adam)")
     texture_rate: float = Field(1e-2, gt=0, lt=1, description="largest learning rate of the textures")
     final_rate: float = Field(0.01, gt=0, le=1, description="share of the rates that is left at the end")
@@ -99,6 +115,8 @@ PRESETS: dict[str, dict[str, Any]] = {
             "output": "fourth-root",
             "encoding": {"position": 10, "direction": 4},
         },
+        # Whole buffers are held out, and each has one light, view and footprint.
+        "held_out": {"queries": 0.05},
     },
 }
 

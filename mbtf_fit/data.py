@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -19,12 +19,17 @@ from mbtf_gen.shard_files import Arrays, read_shard
 
 from .config import HeldOutSection
 
+if TYPE_CHECKING:
+    from .buffers import TrainingBuffers
+
 _NEEDED = ("u", "sigma", "omega_i", "omega_o", "value_a", "value_b")
 
 
 @dataclass(frozen=True)
 class Queries:
     """Queries with both estimates of their value, float32 NumPy arrays.
+
+    Buffers of the image layout have (items, rows, columns) in place of n, until :meth:`flat`.
 
     Attributes
     ----------
@@ -47,6 +52,12 @@ class Queries:
         found = list(parts)
         return cls(**{f.name: np.concatenate([getattr(p, f.name) for p in found]) for f in fields(cls)})
 
+    def flat(self) -> Queries:
+        """The same queries with one leading axis."""
+        lead = self.sigma.ndim
+        arrays = {f.name: getattr(self, f.name) for f in fields(self)}
+        return Queries(**{name: a.reshape(-1, *a.shape[lead:]) for name, a in arrays.items()})
+
     def take(self, rows: Any) -> Queries:
         """Some of the queries: a slice, an index array or a mask."""
         return Queries(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
@@ -65,6 +76,21 @@ class TrainingQueries:
     def __len__(self) -> int:
         return len(self.sigma)
 
+    def batches(self, size: int, seed: int, step: int, margin: int = 0) -> Iterator[TrainingQueries]:
+        """Endless batches of `size` queries from a step on: every epoch all slices in a new order.
+
+        The layout promises queries in random order, so that consecutive ones are a batch. Each epoch's slices
+        start at another row. Single queries have no `margin`.
+        """
+        count = len(self) // size
+        while True:
+            epoch, done = divmod(step, count)
+            random = np.random.Generator(np.random.Philox(key=[seed, epoch]))
+            start = int(random.integers(len(self) - count * size + 1))
+            for i in random.permutation(count)[done:]:
+                yield self.slice(start + i * size, start + (i + 1) * size)
+            step += count - done
+
     def slice(self, start: int, stop: int) -> TrainingQueries:
         """Consecutive queries, without copying."""
         return TrainingQueries(*(getattr(self, f.name)[start:stop] for f in fields(self)))
@@ -80,22 +106,26 @@ class Partition:
 
     Attributes
     ----------
-    training : what is trained on, in the order of the shards
+    training : what is trained on, in the order of the shards; whole buffers in the image layout
     held_out_queries : a random share of the queries outside the held-out region
     held_out_directions : queries with light or view in the held-out region; at most `MAX_HELD_OUT`
+    sample : some of what is trained on, with both halves; about `SAMPLE` queries from all shards
     """
 
-    training: TrainingQueries
+    training: TrainingQueries | TrainingBuffers
     held_out_queries: Queries
     held_out_directions: Queries
+    sample: Queries
 
 
+# Training queries that stand for all of them where both halves are wanted.
+SAMPLE = 1 << 16
 # Held-out queries that are kept for evaluation; the rest of them is dropped, never trained on.
 MAX_HELD_OUT = 1 << 16
 
 
 def open_data(folder: str | Path, layout: Layout, model: str) -> Dataset:
-    """Open a folder of shards for a model that needs a layout.
+    """Open a folder of shards to train a model that needs a layout.
 
     Raises
     ------
@@ -116,7 +146,7 @@ def data_hash(data: Dataset) -> str:
     return str(data.manifest.get("config_hash", ""))
 
 
-def _read(shard: Shard) -> Queries:
+def read_checked(shard: Shard) -> Queries:
     """One shard, every number checked.
 
     Raises
@@ -165,10 +195,16 @@ def _marks(held_out: HeldOutSection, queries: Queries, seed: int, shard: int) ->
 def load_training(data: Dataset, held_out: HeldOutSection, seed: int) -> Partition:
     """Read the train split and divide it; the division depends on the data and `seed` alone.
 
+    In the image layout whole buffers are held out (:func:`~mbtf_fit.buffers.load_buffers`).
+
     Raises
     ------
     InputError : no queries to train on, NaN or infinity in a shard, damaged shards
     """
+    if data.layout == "image":
+        from .buffers import load_buffers
+
+        return load_buffers(data, held_out, seed)
     shards = data.shards("train")
     total = sum(shard.rows for shard in shards)
     if total == 0:
@@ -178,14 +214,17 @@ def load_training(data: Dataset, held_out: HeldOutSection, seed: int) -> Partiti
     columns = {"u": (2,), "sigma": (), "omega_i": (3,), "omega_o": (3,), "value": (3,)}
     store = {name: np.empty((total, *shape), np.float32) for name, shape in columns.items()}
     kept_out: tuple[list[Queries], list[Queries]] = ([], [])
+    sample: list[Queries] = []
     filled = 0
     for index, shard in enumerate(shards):
-        queries = _read(shard)
+        queries = read_checked(shard)
         marks = _marks(held_out, queries, seed, index)
         for group, mark in zip(kept_out, (1, 2), strict=True):
             wanted = MAX_HELD_OUT - sum(map(len, group))
             group.append(queries.take(np.flatnonzero(marks == mark)[:wanted]))
         rows = np.flatnonzero(marks == 0)
+        # The layout promises a random order: the first ones are as good as any.
+        sample.append(queries.take(rows[: -(-SAMPLE * len(rows) // total)]))
         part = slice(filled, filled + len(rows))
         for name in ("u", "sigma", "omega_i", "omega_o"):
             np.take(getattr(queries, name), rows, axis=0, out=store[name][part], mode="clip")
@@ -199,7 +238,7 @@ def load_training(data: Dataset, held_out: HeldOutSection, seed: int) -> Partiti
             cure="lower held_out.queries and held_out.radius",
         )
     training = TrainingQueries(**{name: torch.from_numpy(array[:filled]) for name, array in store.items()})
-    return Partition(training, *(Queries.join(group) for group in kept_out))
+    return Partition(training, *(Queries.join(group) for group in (*kept_out, sample)))
 
 
 def load_split(data: Dataset, split: Split, limit: int | None = None) -> Queries:
@@ -213,7 +252,7 @@ def load_split(data: Dataset, split: Split, limit: int | None = None) -> Queries
     for shard in data.shards(split):
         left = None if limit is None else limit - sum(map(len, parts))
         if left is None or left > 0:
-            parts.append(_read(shard).take(slice(left)))
+            parts.append(read_checked(shard).flat().take(slice(left)))
     if not parts or not sum(map(len, parts)):
         raise InputError(f"its {split} split holds no queries", where=data.folder)
     return Queries.join(parts)

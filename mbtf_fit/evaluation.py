@@ -24,7 +24,7 @@ from mbtf_gen.stats import (
     unexplained_variance,
 )
 
-from .data import Partition, Queries, load_split, load_training, open_data
+from .data import Partition, Queries, load_split, load_training
 
 if TYPE_CHECKING:
     from .material import Material
@@ -147,13 +147,14 @@ def evaluate(material: Material, shards: str | Path) -> dict[str, SplitErrors]:
     """Errors of a fitted material on the splits of a data set: ``test``, and what was held out of ``train``.
 
     The held-out queries are those that the material's own configuration keeps out; on another data set than
-    the material was made from they are just queries.
+    the material was made from they are just queries. Either layout will do: a value depends on its query
+    alone.
 
     Raises
     ------
-    InputError : shards missing, damaged, or of another layout or aspect
+    InputError : shards missing, damaged, or of another aspect
     """
-    data = open_data(shards, material.model.layout, material.model.name)
+    data = Dataset.open(shards)
     if data.lattice.aspect != material.lattice.aspect:
         raise InputError(
             f"its tile has the aspect {data.lattice.aspect:g}, the material's {material.lattice.aspect:g}",

@@ -20,18 +20,29 @@ from mbtf_gen.stats import unexplained_variance
 from .config import FitConfig
 from .data import Partition, Queries, data_hash, load_training, open_data
 from .evaluation import judge
+from .exports import LAYERS_NAME, TEXTURES_NAME
 from .material import Material, export
 from .material_format import DESCRIPTION_NAME, WEIGHTS_NAME
 from .memory import keep_freed_memory
 from .models import MODELS, build_model
-from .storage import read_tensors, write_tensors
+from .noise import NoiseModel, typical_value
+from .storage import make_folder, read_tensors, write_tensors
 from .training import Trainer
 
 FIT_NAME = "fit.json"
 CONFIG_NAME = "config.yaml"
 METRICS_NAME = "metrics.jsonl"
 CHECKPOINT_NAME = "checkpoint.safetensors"
-_OWN_FILES = (FIT_NAME, CONFIG_NAME, METRICS_NAME, CHECKPOINT_NAME, DESCRIPTION_NAME, WEIGHTS_NAME)
+_OWN_FILES = (
+    FIT_NAME,
+    CONFIG_NAME,
+    METRICS_NAME,
+    CHECKPOINT_NAME,
+    DESCRIPTION_NAME,
+    WEIGHTS_NAME,
+    LAYERS_NAME,
+    TEXTURES_NAME,
+)
 _FORMAT = "mbtf-fit"
 _SCHEMA = 1
 # Seconds of training between two looks at held-out queries, and between two checkpoints.
@@ -190,19 +201,17 @@ def _claim(out: Path, identity: dict[str, Any], config: FitConfig, overwrite: bo
         # The description goes first: without it nothing else passes for a finished material.
         for name in (DESCRIPTION_NAME, *_OWN_FILES):
             (out / name).unlink(missing_ok=True)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot be made ({error.strerror})", where=out) from None
+    make_folder(out)
     write_text(out / CONFIG_NAME, dump_yaml(config.model_dump(mode="json")))
     write_json(out / FIT_NAME, identity)
 
 
 def _trainer(config: FitConfig, data: Dataset, partition: Partition, device: torch.device) -> Trainer:
     model = build_model(config.model, data.lattice, **config.network.model_dump())
-    unit = float(partition.training.value.mean())
-    model.initialise(torch.Generator().manual_seed(config.seed), unit if unit > 0 else 1.0)
-    return Trainer(config, model.to(device), partition.training.to(device))
+    unit = typical_value(partition.training.value.numpy())
+    model.initialise(torch.Generator().manual_seed(config.seed), unit)
+    noise = NoiseModel.of(partition.sample, data.lattice, unit)
+    return Trainer(config, model.to(device), partition.training.to(device), noise)
 
 
 def _resume(trainer: Trainer, out: Path) -> bool:
@@ -230,7 +239,8 @@ def _resume(trainer: Trainer, out: Path) -> bool:
 
 
 def _train(trainer: Trainer, held_out: Queries, out: Path, progress: ProgressCallback) -> None:
-    glance = held_out.take(slice(_GLANCE))
+    # Looking costs time, of a model of neighbourhoods more than of the others.
+    glance = held_out.take(slice(max(_GLANCE // trainer.model.positions, _GLANCE // 16)))
     saved = time.perf_counter()
     done = trainer.share >= 1.0
     while not done:

@@ -16,14 +16,18 @@ _CHUNK = 1 << 15
 
 
 def evaluate_in_chunks(
-    function: Callable[..., Tensor], device: torch.device, outputs: int, *arrays: ArrayLike
+    function: Callable[..., Tensor],
+    device: torch.device,
+    outputs: int,
+    *arrays: ArrayLike,
+    chunk: int = _CHUNK,
 ) -> NDArray[np.float32]:
-    """Apply a function of tensors (n, ...) to arrays (n, ...), piece by piece: (n, outputs)."""
+    """Apply a function of tensors (n, ...) to arrays (n, ...), `chunk` at a time: (n, outputs)."""
     inputs = [np.asarray(a, np.float32) for a in arrays]
     out = np.empty((len(inputs[0]), outputs), np.float32)
     with torch.no_grad():
-        for start in range(0, len(out), _CHUNK):
-            part = slice(start, start + _CHUNK)
+        for start in range(0, len(out), chunk):
+            part = slice(start, start + chunk)
             # A copy: memory-mapped shards are read-only, which tensors cannot be.
             tensors = (torch.from_numpy(np.array(a[part], order="C")).to(device) for a in inputs)
             out[part] = function(*tensors).cpu().numpy()
@@ -35,6 +39,7 @@ def predict(
 ) -> NDArray[np.float32]:
     """Values (n, 3) in 1/sr of a model, clamped at 0 as materials are."""
     device = next(model.parameters()).device
+    arrays = (u, sigma, omega_i, omega_o)
     return evaluate_in_chunks(
-        lambda *arrays: model(*arrays).clamp_min_(0), device, 3, u, sigma, omega_i, omega_o
+        lambda *a: model(*a).clamp_min(0), device, 3, *arrays, chunk=max(1, _CHUNK // model.positions)
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,7 @@ from .material_format import (
     check_conformance,
     read_description,
 )
-from .models import NeuralMaterial, build_model
+from .models import NeuralMaterial, TexturedMaterial, build_model
 from .storage import read_tensors, write_tensors
 
 
@@ -73,7 +74,7 @@ class Material:
     conformance : the stored queries with their expected values ``rgb`` (n, 3)
     """
 
-    model: NeuralMaterial
+    model: TexturedMaterial
     config: FitConfig
     description: dict[str, Any]
     conformance: dict[str, NDArray[np.float32]]
@@ -90,7 +91,8 @@ class Material:
         config = build(FitConfig, description["config"], source=str(weights.with_name(DESCRIPTION_NAME)))
         lattice = Lattice(description["levels"]["finest"], description["tile"]["aspect"])
         # Before memory is taken for a model that the weights cannot fill.
-        if 4 * lattice.texels() * config.network.channels > weights.stat().st_size:
+        number = 2 if description["weights"].get("dtype") == "float16" else 4
+        if number * lattice.texels() * config.network.channels > weights.stat().st_size:
             raise InputError("is too small for the levels that material.json describes", where=weights)
         model = build_model(config.model, lattice, **config.network.model_dump())
         tensors, _ = read_tensors(weights, device)
@@ -145,6 +147,16 @@ class Material:
         return float(np.abs(found - self.conformance["rgb"]).max())
 
 
+def conformance_values(
+    model: NeuralMaterial, queries: Mapping[str, NDArray[np.float32]]
+) -> NDArray[np.float32]:
+    """Expected values (n, 3) of conformance queries."""
+    device = next(model.parameters()).device
+    with torch.no_grad():
+        rgb = model(*(torch.from_numpy(queries[name]).to(device) for name in CONFORMANCE[:-1]))
+    return np.asarray(rgb.clamp_min(0).cpu().numpy())
+
+
 def export(
     model: NeuralMaterial,
     config: FitConfig,
@@ -152,6 +164,7 @@ def export(
     *,
     data: dict[str, Any],
     training: dict[str, Any],
+    half: bool = False,
 ) -> Material:
     """Write a model as a material and return it as read back.
 
@@ -159,6 +172,7 @@ def export(
     ----------
     data : what identifies the data set
     training : summary of the training: steps, seconds, errors
+    half : store 16-bit floats; the model's numbers are such already
 
     Raises
     ------
@@ -167,13 +181,13 @@ def export(
     lattice = model.lattice
     queries = conformance_queries(lattice)
     weights = model.weights()
-    device = next(model.parameters()).device
-    with torch.no_grad():
-        rgb = model(*(torch.from_numpy(a).to(device) for a in queries.values())).clamp_min(0).cpu()
+    if half:
+        weights = {name: tensor.half() if tensor.ndim else tensor for name, tensor in weights.items()}
+    queries["rgb"] = conformance_values(model, queries)
     conformance = {f"conformance.{k}": torch.from_numpy(v) for k, v in queries.items()}
     path = folder / WEIGHTS_NAME
     # The description names the weights' digest, so it comes last: a folder with one is complete.
-    write_tensors(path, {**weights, **conformance, "conformance.rgb": rgb}, {})
+    write_tensors(path, {**weights, **conformance}, {})
     shape = {name: list(tensor.shape) for name, tensor in weights.items()}
     write_json(
         folder / DESCRIPTION_NAME,
@@ -191,7 +205,7 @@ def export(
             "weights": {
                 "file": WEIGHTS_NAME,
                 "sha256": digest(path),
-                "dtype": "float32",
+                "dtype": "float16" if half else "float32",
                 "shapes": shape,
                 "network_weights": sum(p.numel() for p in model.parameter_groups()[1]),
                 "texels": sum(p.numel() for p in model.parameter_groups()[0]),

@@ -11,16 +11,19 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from types import TracebackType
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from .buffers import Crops
 from .data import TrainingQueries
 
 # Python itself is busy for a part of each step, and one thread at a time: more than these do not pay.
 MAX_THREADS = 4
 
-Loss = Callable[[TrainingQueries], Tensor]
+Batch = TrainingQueries | Crops
+Loss = Callable[[Any], Tensor]
 
 
 class Workers:
@@ -53,9 +56,7 @@ class Workers:
         torch.set_num_threads(self._cores)
         torch.set_float32_matmul_precision(self._precision)
 
-    def gradients(
-        self, loss: Loss, batch: TrainingQueries, inputs: Sequence[Tensor]
-    ) -> tuple[Tensor, list[Tensor]]:
+    def gradients(self, loss: Loss, batch: Batch, inputs: Sequence[Tensor]) -> tuple[Tensor, list[Tensor]]:
         """Mean loss of a batch, and its gradients by `inputs`.
 
         Parameters
@@ -64,9 +65,9 @@ class Workers:
         """
         n = len(batch)
         edges = [n * k // self.count for k in range(self.count + 1)]
-        parts = [batch.slice(a, b) for a, b in pairwise(edges) if b > a]
+        parts: list[Batch] = [batch.slice(a, b) for a, b in pairwise(edges) if b > a]
 
-        def work(part: TrainingQueries) -> tuple[Tensor, tuple[Tensor, ...]]:
+        def work(part: Batch) -> tuple[Tensor, tuple[Tensor, ...]]:
             value = loss(part) * (len(part) / n)
             return value.detach(), torch.autograd.grad(value, inputs)
 

@@ -16,12 +16,14 @@ from torch import Tensor
 from mbtf_gen.errors import InputError
 
 from .blur import annealed_sigma
+from .buffers import Crops, TrainingBuffers
 from .config import FitConfig, TrainingSection
 from .data import Queries, TrainingQueries
 from .inference import predict
-from .losses import Loss, relative_error, squared_error
+from .losses import Objective
 from .models import NeuralMaterial
-from .parallel import Workers
+from .noise import NoiseModel
+from .parallel import Batch, Workers
 
 # Decay of Adam's running means of the gradient and of its square.
 BETAS = (0.8, 0.95)
@@ -58,13 +60,20 @@ class Trainer:
     ----------
     model : initialised, on the device
     queries : on the device
+    noise : model of their noise; :meth:`NoiseModel.silent` where there is none
 
     Attributes
     ----------
     progress : how far it is
     """
 
-    def __init__(self, config: FitConfig, model: NeuralMaterial, queries: TrainingQueries) -> None:
+    def __init__(
+        self,
+        config: FitConfig,
+        model: NeuralMaterial,
+        queries: TrainingQueries | TrainingBuffers,
+        noise: NoiseModel,
+    ) -> None:
         self.config = config
         self.model = model
         self.queries = queries
@@ -72,16 +81,7 @@ class Trainer:
         self.batch = min(config.training.batch, len(queries))
         texels, weights = model.parameter_groups()
         self.optimiser = torch.optim.Adam([{"params": texels}, {"params": weights}], betas=BETAS, fused=True)
-        self.loss = self._choose_loss()
-
-    def _choose_loss(self) -> Loss:
-        value = self.queries.value
-        if self.config.training.loss == "relative":
-            return relative_error(float(value.mean()) or 1.0)
-        variance = float(value.var(0, correction=0).mean()) if len(value) > 1 else 0.0
-        power = float(value.square().mean())
-        # Of constant data the variance is rounding error: measure by the values themselves.
-        return squared_error(variance if variance > 1e-6 * power else power or 1.0)
+        self.loss = Objective(config.training, noise)
 
     @property
     def share(self) -> float:
@@ -91,19 +91,9 @@ class Trainer:
             return min(1.0, self.progress.step / training.steps)
         return min(1.0, self.progress.seconds / training.time)
 
-    def _batches(self) -> Iterator[TrainingQueries]:
-        """Endless batches from the current step on: every epoch all slices in a new order.
-
-        The layout promises queries in random order, so that consecutive ones are a batch. Each epoch's slices
-        start at another row.
-        """
-        count = len(self.queries) // self.batch
-        while True:
-            epoch, done = divmod(self.progress.step, count)
-            random = np.random.Generator(np.random.Philox(key=[self.config.seed, epoch]))
-            start = int(random.integers(len(self.queries) - count * self.batch + 1))
-            for i in random.permutation(count)[done:]:
-                yield self.queries.slice(start + i * self.batch, start + (i + 1) * self.batch)
+    def _batches(self) -> Iterator[Batch]:
+        """Endless batches from the current step on."""
+        return self.queries.batches(self.batch, self.config.seed, self.progress.step, self.model.margin)
 
     def train(self, seconds: float) -> bool:
         """Train for about so long, or until the budget is spent; returns whether it is.
@@ -135,7 +125,7 @@ class Trainer:
             cure=f"lower the rate: --rate {self.config.training.rate / 3:.1g} --overwrite",
         )
 
-    def _guarded_step(self, batch: TrainingQueries, workers: Workers) -> Tensor:
+    def _guarded_step(self, batch: Batch, workers: Workers) -> Tensor:
         try:
             return self._step(batch, workers)
         except (RuntimeError, IndexError):
@@ -152,11 +142,12 @@ class Trainer:
             t.blurred(max(sigma, blur.offset) if t.moves_lookups else sigma) for t in self.model.textures()
         ]
 
-    def _loss(self, batch: TrainingQueries) -> Tensor:
-        prediction = self.model(batch.u, batch.sigma, batch.omega_i, batch.omega_o)
-        return self.loss(prediction, batch.value)
+    def _loss(self, batch: Batch) -> Tensor:
+        evaluate = self.model.crops if isinstance(batch, Crops) else self.model
+        prediction = evaluate(batch.u, batch.sigma, batch.omega_i, batch.omega_o)
+        return self.loss(prediction, batch)
 
-    def _step(self, batch: TrainingQueries, workers: Workers) -> Tensor:
+    def _step(self, batch: Batch, workers: Workers) -> Tensor:
         training = self.config.training
         factor = rate_factor(training, self.progress.step, self.share)
         for group, rate in zip(

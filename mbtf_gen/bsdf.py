@@ -91,10 +91,9 @@ class SurfaceBSDF(mi.BSDF):
 class MitsubaSurface:
     """A BSDF of Mitsuba, as the generator's loop asks for it."""
 
-    ray_flags = mi.RayFlags.All
-
     def __init__(self, bsdf: Any) -> None:
         self.bsdf = bsdf
+        self.transmits = bool(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Transmission))
         self.parts = SurfaceParts()
 
     def at(self, si: Any, towards_viewer: Any) -> MitsubaPoint:

@@ -2,8 +2,8 @@
 
 Mesh vertices sit on texel centres of the grid, ``uv = ((i+½)/W, 1-(j+½)/H)``, heights are
 ``z = height · (h - max h)``, and the cell between the last and the first column (row) closes the period.
-Around the period lies an apron of repeated cells, so that a ray near the period's border always meets surface
-on both sides of it.
+Meshes for other renderers may have an apron of repeated cells around the period, so that a ray near its
+border meets surface on both sides of it.
 """
 
 from __future__ import annotations

@@ -52,18 +52,12 @@ def estimator_of(job: Job, plan: EffectsPlan, tiles: dict[Any, Any]) -> Any:
     from .bsdf import bsdf_of
     from .estimator import Estimator
     from .light import LightKernel
-    from .scene import APRON_SHARE, build_tile
+    from .scene import build_tile
     from .tracing import Transport
 
     parts = tuple(plan.on(n) for n in ("masking", "specular", "metallic", "coat", "normal", "opacity"))
-    apron = APRON_SHARE
-    if plan.on("masking") and not plan.on("neighbours"):
-        from .planning import reach_of
-
-        apron = min(0.5, reach_of(job) / min(1.0, job.grid.aspect) + 0.02)
-    key = (*parts, apron)
-    if key not in tiles:
-        tiles[key] = build_tile(job.grid, bsdf_of(job.material, plan, _slopes(job, plan)), apron)
+    if parts not in tiles:
+        tiles[parts] = build_tile(job.grid, bsdf_of(job.material, plan, _slopes(job, plan)))
     config = job.config
     transport = Transport(
         plan.max_depth,
@@ -72,10 +66,9 @@ def estimator_of(job: Job, plan: EffectsPlan, tiles: dict[Any, Any]) -> Any:
         displacement=plan.on("masking"),
         shadowing=plan.on("shadowing"),
         interreflection=plan.on("interreflection"),
-        neighbours=plan.on("neighbours"),
         bsdf_sampling=plan.on("mis"),
     )
-    return Estimator(tiles[key], LightKernel(config.light.width), transport)
+    return Estimator(tiles[parts], LightKernel(config.light.width), transport)
 
 
 def _slopes(job: Job, plan: EffectsPlan) -> NDArray[np.float64] | None:

@@ -125,11 +125,11 @@ class Surface:
         along u and y, in tile widths per tile width) are added to the mesh's own.
     """
 
-    ray_flags = mi.RayFlags.UV
-
     def __init__(self, parts: SurfaceParts, textures: dict[str, Any]) -> None:
         self.parts = parts
         self.textures = textures
+        # Whether rays may end up below the surface.
+        self.transmits = parts.opacity
         glossy = parts.specular or parts.metallic or parts.coat
         self.tables = energy_tables(mi.variant()) if glossy else None
 

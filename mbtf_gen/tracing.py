@@ -25,7 +25,8 @@ from typing import Any, Literal
 import drjit as dr
 import mitsuba as mi
 
-from .periodic import Period, closest_hit, leave, occluded, straight
+from .field import HeightField, closest_hit, occluded
+from .hits import interaction
 
 # Roulette leaves paths of throughput one alone, for dividing by a survival chance below it makes their
 # weights grow without bound in white cracks; only after this many interactions they end with a chance of one
@@ -47,7 +48,6 @@ class Transport:
     displacement : rays meet the displaced tile; otherwise the reference plane, where nothing shadows
     shadowing : light rays are tested for occluders
     interreflection : paths go on after their first interaction
-    neighbours : rays that leave the apron re-enter the tile; otherwise no ray may reach its end
     bsdf_sampling : light is also found by sampling the surface
     """
 
@@ -57,16 +57,11 @@ class Transport:
     displacement: bool = True
     shadowing: bool = True
     interreflection: bool = True
-    neighbours: bool = True
     bsdf_sampling: bool = True
 
     def __post_init__(self) -> None:
-        if not self.displacement and (self.shadowing or self.interreflection or self.neighbours):
-            raise ValueError("a plane has no shadows, no interreflection and no neighbours")
-        if self.interreflection and not self.neighbours:
-            raise ValueError("interreflected rays may leave sideways and need the neighbours")
-        if self.displacement and self.bsdf_sampling and not self.neighbours:
-            raise ValueError("rays sampled from the surface may leave sideways and need the neighbours")
+        if not self.displacement and (self.shadowing or self.interreflection):
+            raise ValueError("a plane has no shadows and no interreflection")
 
     @property
     def limit(self) -> int:
@@ -76,7 +71,7 @@ class Transport:
         return self.max_depth or NO_LIMIT
 
 
-PLANE = Transport(displacement=False, shadowing=False, interreflection=False, neighbours=False)
+PLANE = Transport(displacement=False, shadowing=False, interreflection=False)
 
 
 @dataclass(frozen=True)
@@ -130,19 +125,16 @@ class LaneLight:
 
 @dataclass(frozen=True)
 class World:
-    """What rays meet: the scene of the tile, how it repeats, how it reflects, and how the plane is laid out.
+    """What rays meet: the displaced tile, and how it reflects.
 
     Attributes
     ----------
-    scene, period : see :class:`~mbtf_gen.scene.Tile`
+    field : the tile's shape, and its size
     surface : reflects; see :mod:`mbtf_gen.surface`
-    size : (x, y) lengths of the tile in scene units, opaque
     """
 
-    scene: Any
-    period: Period
+    field: HeightField
     surface: Any
-    size: tuple[Any, Any]
 
 
 @dataclass
@@ -152,6 +144,7 @@ class Path:
     Attributes
     ----------
     ray : next ray to follow
+    below : it starts below the surface
     radiance : found so far
     throughput : weight of what is still to be found
     pdf : density with which the last bounce chose its direction; infinite for mirrors and for the first ray
@@ -164,6 +157,7 @@ class Path:
     """
 
     ray: Any
+    below: Any
     radiance: Any
     throughput: Any
     pdf: Any
@@ -177,18 +171,10 @@ class Path:
 
 def _on_plane(world: World, ray: Any, active: Any) -> Any:
     """Hits of rays on the reference plane."""
-    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray))
     t = -ray.o.z / ray.d.z
-    si.t = dr.select(active & (ray.d.z < 0), t, dr.inf)
-    si.p = ray(t)
-    si.n = mi.Normal3f(0, 0, 1)
-    si.sh_frame = mi.Frame3f(mi.Normal3f(0, 0, 1))
-    si.dp_du = mi.Vector3f(1, 0, 0)
-    si.dp_dv = mi.Vector3f(0, -1, 0)
-    si.wi = si.to_local(-ray.d)
-    # Mitsuba's bitmaps have row 0 at v = 0, ours at v → 1.
-    si.uv = mi.Point2f(si.p.x / world.size[0] + 0.5, 0.5 - si.p.y / world.size[1])
-    return si
+    p, size = ray(t), world.field.size
+    uv = mi.Point2f(p.x / size[0] + 0.5, 0.5 - p.y / size[1])
+    return interaction(p, mi.Normal3f(0, 0, 1), uv, ray.d, size, active & (ray.d.z < 0))
 
 
 def _visible(world: World, path: Path, transport: Transport) -> tuple[Any, Any, Any]:
@@ -196,27 +182,15 @@ def _visible(world: World, path: Path, transport: Transport) -> tuple[Any, Any, 
     lanes that passed through the tile)."""
     parts = world.surface.parts
     holes = world.surface if parts.opacity else None
-    flags = int(world.surface.ray_flags)
     if not transport.displacement:
         si = _on_plane(world, path.ray, path.active)
         if holes is not None:
             si.t = dr.select(path.rng.chance() < holes.opacity(si), si.t, dr.inf)
         capped = mi.Bool(False)
-    elif transport.neighbours or holes is not None:
-        si, _, capped, path.rng = closest_hit(
-            world.scene,
-            world.period,
-            path.ray,
-            path.active,
-            transport.max_crossings,
-            flags,
-            holes,
-            path.rng,
-        )
     else:
-        ray = straight(world.period, path.ray)
-        si = world.scene.ray_intersect(ray, flags, False, path.active)
-        capped = mi.Bool(False)
+        si, _, capped, path.rng = closest_hit(
+            world.field, path.ray, path.active, transport.max_crossings, path.below, holes, path.rng
+        )
     downward = path.active & ~si.is_valid() & ~capped & (path.ray.d.z <= 0)
     return si, capped, downward
 
@@ -237,18 +211,21 @@ def _direct(world: World, path: Path, si: Any, point: Any, light: LaneLight, tra
     # Written so that NaN counts as light: it must reach the value, where it is found and drawn again.
     lit = path.active & ~(dr.max(value) <= 0)
     if transport.shadowing:
-        blocked = _shadowed(world, path, leave(world.period, si, omega), lit, transport)
-        lit &= ~blocked
+        lit &= ~_shadowed(world, path, si, omega, lit, transport)
     return dr.select(lit, value * incoming, 0.0)
 
 
-def _shadowed(world: World, path: Path, ray: Any, lit: Any, transport: Transport) -> Any:
+def _shadowed(world: World, path: Path, si: Any, omega: Any, lit: Any, transport: Transport) -> Any:
     """Lanes whose light is blocked."""
     holes = world.surface if world.surface.parts.opacity else None
-    if not transport.neighbours and holes is None:
-        return world.scene.ray_test(straight(world.period, ray), False, lit)
     blocked, _, capped, path.rng = occluded(
-        world.scene, world.period, ray, lit, transport.max_crossings, holes, path.rng
+        world.field,
+        world.field.leave(si, omega),
+        lit,
+        transport.max_crossings,
+        dr.dot(si.n, omega) < 0,
+        holes,
+        path.rng,
     )
     path.capped[capped] += 1
     return blocked
@@ -285,7 +262,8 @@ def _interaction(
     if not transport.bsdf_sampling and light.kind != "constant":
         path.active &= path.depth < limit
     omega, weight, path.pdf = point.sample(path.rng.next_1d(), path.rng.next_2d())
-    path.ray = leave(world.period, si, omega)
+    path.ray = world.field.leave(si, omega)
+    path.below = dr.dot(si.n, omega) < 0
     path.throughput *= weight
     _roulette(path, roulette)
     return path
@@ -328,6 +306,7 @@ def trace(
     """
     path = Path(
         mi.Ray3f(ray),
+        mi.Bool(False),
         mi.Spectrum(0.0),
         mi.Spectrum(1.0),
         mi.Float(dr.inf),

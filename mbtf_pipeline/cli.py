@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 
 from mbtf_gen.console import CONSOLE, Console, clock, new_app
-from mbtf_gen.errors import InputError, MbtfError
+from mbtf_gen.errors import InputError, MbtfError, UsageError
 
 if TYPE_CHECKING:
     from .run import RunResult
@@ -154,3 +154,73 @@ def report(folder: Path, /, *, console: Console = CONSOLE) -> None:
     path = rerender(folder)
     size = path.stat().st_size
     console.report({"report": path, "bytes": size}, f"{path}: {size / 1e6:.1f} MB")
+
+
+@app.command
+def cost(
+    recipe: Path,
+    /,
+    *,
+    output: Output = None,
+    time: str = "10min",
+    seed: int | None = None,
+    assignments: Set | None = None,
+    console: Console = CONSOLE,
+) -> None:
+    """Measure what accuracy costs in time, on this material and machine: mbtf-pipeline cost RECIPE
+
+    Writes cost.html, cost.csv and PNGs. The same command again goes on where it stopped; a longer time adds
+    to what was measured.
+
+    Parameters
+    ----------
+    recipe
+        YAML file; its material and generator are studied.
+    output
+        Folder of the study. Default: out/NAME-cost
+    time
+        Budget: 90s, 10min, 1h.
+    seed
+        Of queries, paths and first weights. Default: the recipe's
+    """
+    from mbtf_gen.durations import parse_duration
+
+    from .cost.page import whole_chains, write_page
+    from .cost.study import run_study
+    from .recipe import load_recipe
+
+    try:
+        budget = parse_duration(time)
+    except ValueError as error:
+        raise UsageError(str(error), where="--time") from None
+    loaded = load_recipe(recipe, assignments or [])
+    folder = output if output is not None else loaded.folder.with_name(f"{loaded.folder.name}-cost")
+    command = ["mbtf-pipeline", "cost", str(recipe), "--time", time]
+    command += ["-o", str(output)] if output is not None else []
+    command += ["--seed", str(seed)] if seed is not None else []
+    command += [part for a in assignments or [] for part in ("--set", a)]
+    with console.progress(total=100, label="cost", unit="%") as bar:
+        study = run_study(
+            loaded,
+            folder,
+            budget=budget,
+            seed=seed,
+            command=shlex.join(command),
+            tell=lambda share, note: bar.update(round(100 * share, 1), note),
+        )
+    page = write_page(study)
+    from .cost.front import pareto_front
+
+    front = pareto_front(whole_chains(study.points))
+    lines = [f"{page}: {len(study.points)} settings measured, {len(study.skipped)} not for lack of time"]
+    lines += [f"  {p.seconds.value:.0f} s: unexplained variance {p.error}   {p.command}" for p in front]
+    data = {
+        "page": page,
+        "points": len(study.points),
+        "skipped": study.skipped,
+        "front": [
+            {"seconds": p.seconds.value, "unexplained": p.error.as_dict(), "command": p.command}
+            for p in front
+        ],
+    }
+    console.report(data, "\n".join(lines))

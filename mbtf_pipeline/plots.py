@@ -7,9 +7,12 @@ import io
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from mbtf_gen.atomic import write_through
 
 # Okabe and Ito (2008), without black and yellow: told apart under every common colour-vision deficiency.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
@@ -29,6 +32,20 @@ _HEIGHT = 3.3
 def colour(index: int) -> str:
     """Colour of the fit with the given number."""
     return COLOURS[index % len(COLOURS)]
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """A named set of points: x, y and names (n,), and standard errors of both (n,)."""
+
+    name: str
+    x: Sequence[float]
+    y: Sequence[float]
+    x_error: Sequence[float]
+    y_error: Sequence[float]
+    labels: Sequence[str]
+    joined: bool = True
+    hollow: bool = False
 
 
 @dataclass(frozen=True)
@@ -145,6 +162,78 @@ def _ends(values: Sequence[float]) -> tuple[float, float]:
     """How far a logarithmic axis may reach for these values, of which those above zero count."""
     positive = [v for v in values if v > 0]
     return (min(positive) / _REACH, max(positive) * _REACH) if positive else (0.1, 1.0)
+
+
+def scatter(
+    clouds: Sequence[Cloud],
+    x: str,
+    y: str,
+    label: str,
+    *,
+    front: Sequence[tuple[float, float]] = (),
+    png: Path | None = None,
+) -> str:
+    """Points with error bars on logarithmic axes, each with its name, and a front as a stepped line.
+
+    Parameters
+    ----------
+    png : also written there, on white
+    """
+    with _style(label):
+        figure = _scatter(clouds, x, y, front)
+        if png is not None:
+            _write_png(figure, png)
+        return _svg(figure, label)
+
+
+def _write_png(figure: Any, path: Path) -> None:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    write_through(
+        path,
+        lambda temporary: FigureCanvasAgg(figure).figure.savefig(
+            temporary, format="png", dpi=160, facecolor="white", metadata={"Software": None}
+        ),
+    )
+
+
+def _scatter(clouds: Sequence[Cloud], x: str, y: str, front: Sequence[tuple[float, float]]) -> Any:
+    figure = _figure(7.2, 4.2)
+    axes = _axes(figure, x, y, logx=True, logy=True)
+    floor = _ends([v for cloud in clouds for v in cloud.y])[0]
+    for index, cloud in enumerate(clouds):
+        xs, ys = np.asarray(cloud.x, float), np.maximum(np.asarray(cloud.y, float), floor)
+        bars = np.minimum(np.asarray(cloud.y_error, float), 0.95 * ys)
+        axes.errorbar(
+            xs,
+            ys,
+            xerr=np.minimum(np.asarray(cloud.x_error, float), 0.95 * xs),
+            yerr=bars,
+            fmt=MARKERS[index % len(MARKERS)],
+            color=colour(index),
+            markerfacecolor="none" if cloud.hollow else colour(index),
+            markersize=6,
+            capsize=2.5,
+            linewidth=1.1,
+            label=cloud.name,
+        )
+        if cloud.joined:
+            axes.plot(xs, ys, color=colour(index), linewidth=0.8, alpha=0.5)
+        for at_x, at_y, text in zip(xs, ys, cloud.labels, strict=True):
+            axes.annotate(
+                text, (at_x, at_y), (6, 4), textcoords="offset points", fontsize=7.5, color=colour(index)
+            )
+    if front:
+        fx, fy = np.asarray(front, float).T
+        axes.step(fx, fy, where="post", color=_INK, linewidth=1.3, linestyle=(0, (4, 2)), label="front")
+    axes.margins(y=0.12)
+    # Room for the last point's name.
+    left, right = axes.get_xlim()
+    axes.set_xlim(left, right * (right / left) ** 0.25)
+    for axis in (axes.xaxis, axes.yaxis):
+        _plain_ticks(axis)
+    axes.legend(frameon=False, fontsize=8.5)
+    return figure
 
 
 def points(

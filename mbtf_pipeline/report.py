@@ -37,7 +37,8 @@ _TABLE = """
 """
 
 
-def _environment() -> Any:
+def page_environment() -> Any:
+    """Jinja environment of pages, with ``table`` as a function."""
     from jinja2 import Environment, StrictUndefined
     from markupsafe import Markup
 
@@ -112,14 +113,15 @@ def _render(
         "encoding": embedded.encoding.describe(embedded.coding),
         "stops": EXPOSURE_STOPS,
         "viewer": _viewer(comparison, shown, embedded, white),
-        "style": _template("report.css"),
-        "script": _template("report.js"),
+        "style": template("report.css"),
+        "script": template("report.js"),
     }
-    html: str = _environment().from_string(_template("report.html")).render(context, **pictures)
+    html: str = page_environment().from_string(template("report.html")).render(context, **pictures)
     return html
 
 
-def _template(name: str) -> str:
+def template(name: str) -> str:
+    """Text of a file of ``templates/``."""
     return (files("mbtf_pipeline") / "templates" / name).read_text(encoding="utf-8")
 
 

@@ -91,8 +91,8 @@ def is_run(folder: Path) -> bool:
 
 
 @contextlib.contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Hold a run's folder against other runs.
+def locked(folder: Path, record: str = RUN_NAME) -> Iterator[None]:
+    """Hold a folder against other runs; `record` is the file that stands for it.
 
     Raises
     ------
@@ -100,7 +100,7 @@ def locked(folder: Path) -> Iterator[None]:
     """
     from mbtf_gen.locks import shard_lock
 
-    with shard_lock(folder / RUN_NAME) as held:
+    with shard_lock(folder / record) as held:
         if not held:
             raise PartialError(
                 "another run is at work here",

@@ -191,7 +191,7 @@ def periodic(plot: Any) -> Any:
     start = 0.56
     pieces = 0
     while pieces < 4:
-        t = np.linspace(0, 1.12 - start, 20001)
+        t = np.linspace(0, 1.0 - start, 20001)
         z = height + slope * t
         blocked = np.nonzero(z < relief(start + t))[0]
         last = int(blocked[0]) if len(blocked) else len(t) - 1
@@ -209,8 +209,6 @@ def periodic(plot: Any) -> Any:
         axes.plot([border, border], [-0.42, 0.03], color=GREY, ls=":", lw=1)
         axes.text(border, 0.035, name, ha="center", va="bottom", color=GREY, fontsize=9)
     axes.set_xlim(-0.13, 1.13)
-    axes.text(1.06, -0.4, "apron", ha="center", va="bottom", color=GREY, fontsize=9)
-    axes.text(-0.06, -0.4, "apron", ha="center", va="bottom", color=GREY, fontsize=9)
     bare(axes)
     return figure
 

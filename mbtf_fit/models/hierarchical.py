@@ -57,10 +57,6 @@ class Hierarchical(TexturedMaterial):
         """Places on each side of the query that the decoder sees."""
         return self.decoder.margin if isinstance(self.decoder, InceptionDecoder) else 0
 
-    @property
-    def positions(self) -> int:
-        return (2 * self.margin + 1) ** 2
-
     def nearest_shape(self, sigma: Tensor) -> Tensor:
         """(rows, columns) of the level nearest to footprints (n,): (n, 2), whole numbers."""
         shapes = torch.tensor([self.lattice.shape(s) for s in range(self.lattice.finest + 1)])
@@ -99,6 +95,9 @@ class Hierarchical(TexturedMaterial):
         repeated = directions[:, None, None].expand(items, rows, columns, -1)
         x: Tensor = self.decoder(torch.cat([features, repeated], -1).flatten(0, 2))
         return self.to_value(x).view(items, rows, columns, 3)
+
+    def crops(self, u: Tensor, sigma: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
+        return self.answer(self.see(u, sigma, omega_o), omega_i, omega_o)
 
     def stage1(self, u: Tensor, sigma: Tensor, omega_o: Tensor) -> Tensor:
         return self.see(self.neighbourhood(u, sigma), sigma, omega_o)

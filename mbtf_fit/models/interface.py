@@ -43,13 +43,19 @@ class NeuralMaterial(nn.Module, ABC):
         self.network = network
 
     @property
+    def margin(self) -> int:
+        """Places on each side of a query that the value depends on, one texel of the nearest level apart."""
+        return 0
+
+    @property
     def positions(self) -> int:
         """Places at which stage 1 reads the textures for one query."""
-        return 1
+        return (2 * self.margin + 1) ** 2
 
     @abstractmethod
     def initialise(self, generator: torch.Generator, unit: float) -> None:
-        """Draw all parameters anew; `unit` is the typical value of the data in 1/sr."""
+        """Draw all parameters anew; `unit` is the typical value of the data in 1/sr, 0
+        for black data: values are multiples of it, so that black is fitted exactly."""
 
     @abstractmethod
     def stage1(self, u: Tensor, sigma: Tensor, omega_o: Tensor) -> Tensor:
@@ -63,6 +69,19 @@ class NeuralMaterial(nn.Module, ABC):
     def forward(self, u: Tensor, sigma: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
         """Both stages."""
         return self.stage2(self.stage1(u, sigma, omega_o), omega_i, omega_o)
+
+    def crops(self, u: Tensor, sigma: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
+        """Values (items, rows, columns, 3) of crops of buffers, as in training.
+
+        Parameters
+        ----------
+        u : (items, rows+2·margin, columns+2·margin, 2) places
+        sigma : (items,); omega_i, omega_o : (items, 3), shared by an item's places
+        """
+        places = u.shape[1] * u.shape[2]
+        each = (a.repeat_interleave(places, 0) for a in (sigma, omega_i, omega_o))
+        value: Tensor = self(u.reshape(-1, 2), *each)
+        return value.view(*u.shape[:3], 3)
 
     def offset(self, u: Tensor, omega_o: Tensor) -> Tensor:
         """By how much the model moves its lookup, (n, 2) in tile widths; zero where it does not."""

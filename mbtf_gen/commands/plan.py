@@ -21,6 +21,8 @@ def plan(
     material: str | None = None,
     /,
     *,
+    queries: str | None = None,
+    spp: int | None = None,
     effects: str | None = None,
     tolerance: float | None = None,
     height: float | None = None,
@@ -37,12 +39,17 @@ def plan(
 ) -> None:
     """Say which effects of light a run would simulate, why, and what leaving each one out costs.
 
-    A cost is the root mean square change of M over the run's queries, relative to its mean value.
+    A cost is the root mean square change of M over the run's queries, relative to its mean value. Then what
+    the run will take in time and disk space, and how noisy its values will be, from a pilot on this machine.
 
     Parameters
     ----------
     material
         Height map, folder of maps, or material.yaml.
+    queries
+        Training queries of the run that is forecast: N, or N/texel of the finest level. Default: 100/texel
+    spp
+        Paths per training query, both halves together (even). Default: 4
     effects
         auto, all, none, then +x or -x: effects of light to simulate. Default: auto
     tolerance
@@ -62,13 +69,15 @@ def plan(
     seed
         Root seed. Default: 0
     measure
-        Measure the cost of every effect that is on, by a small run without it.
+        Measure the cost of every effect that is on by a small run without it, and forecast the run.
     config
         YAML file with the options.
     """
     from ..config import GeneratorConfig
 
     flags = {
+        "--queries": ("queries.train", queries),
+        "--spp": ("queries.spp", spp),
         "--effects": ("effects.mode", effects),
         "--tolerance": ("effects.tolerance", tolerance),
         "--min-cos": ("queries.min_cos", min_cos),
@@ -83,9 +92,15 @@ def plan(
 
     job = Job.prepare(resolved)
     found = plan_effects(job)
-    if measure:
-        found = measured(job, found)
-    console.report(found.to_manifest(), table(found))
+    if not measure:
+        console.report({**found.to_manifest(), "forecast": None}, table(found))
+        return
+    from ..forecast import forecast
+
+    expected = forecast(job, found)
+    found = measured(job, found)
+    data = {**found.to_manifest(), "forecast": expected.as_dict()}
+    console.report(data, f"{table(found)}\n{expected.describe()}")
 
 
 def table(plan: EffectsPlan) -> str:

@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 from support.scenes import build_tile, lambert, mi, rocks
 
+from mbtf_gen.field import closest_hit
 from mbtf_gen.heightfield import HeightGrid
-from mbtf_gen.periodic import closest_hit
 from mbtf_gen.scene import CLEARANCE
 
 RAYS = 10_000_000
@@ -24,7 +24,7 @@ def misses(grid: HeightGrid, uv: NDArray[np.float64], direction: NDArray[np.floa
     for part in range(0, len(uv), 1 << 20):
         o, d = (np.ascontiguousarray(x[part : part + (1 << 20)].T, np.float32) for x in (origin, direction))
         si, _, capped, _ = closest_hit(
-            tile.scene, tile.period, mi.Ray3f(mi.Point3f(o), mi.Vector3f(d)), mi.Bool(True), 4096
+            tile.world.field, mi.Ray3f(mi.Point3f(o), mi.Vector3f(d)), mi.Bool(True), 4096
         )
         total += int(np.sum(~np.array(si.is_valid()))) + int(np.sum(np.array(capped)))
     return total

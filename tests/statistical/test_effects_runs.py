@@ -61,7 +61,7 @@ REACHES = [
 def test_without_neighbours_rays_still_meet_all_they_would(
     shape: tuple[int, int], scale: float, options: dict[str, Any]
 ) -> None:
-    """The apron alone is as good as the repeated tile, for one set of random numbers path by path."""
+    """The tile alone is as good as the repeated one, for one set of random numbers path by path."""
     job = job_of(lambert(noise(*shape), scale), "all,-interreflection,-mis", **options)
     assert 0.42 * min(1.0, job.grid.aspect) < reach_of(job) <= 0.45 * min(1.0, job.grid.aspect)
     plan = plan_effects(job)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ from support.scenes import (
     DIRECT,
     HeightGrid,
     LightKernel,
-    Transport,
     build_tile,
     direction,
     estimate,
@@ -23,9 +21,7 @@ from support.scenes import (
     tile_mean_queries,
 )
 
-from mbtf_gen.bsdf import surface_of
-from mbtf_gen.estimator import Estimator, Stream
-from mbtf_gen.periodic import closest_hit, occluded
+from mbtf_gen.field import closest_hit, occluded
 from mbtf_gen.stats import mean_of_halves
 
 MIRROR = {"type": "conductor", "material": "none"}
@@ -43,43 +39,31 @@ def test_a_mirror_shows_the_light_itself(width: float) -> None:
     np.testing.assert_allclose([e.value_a, e.value_b], expected, rtol=1e-3)
 
 
-def void(normal: tuple[float, float, float], bsdf: dict[str, Any]) -> Any:
-    """A tile in which nothing is left but one huge facet through the origin."""
-    tile = build_tile(HeightGrid(np.array([[0.0, -30.0], [-30.0, -30.0]]), 1.0), lambert(0.5))
-    facet = {
-        "type": "rectangle",
-        "to_world": mi.ScalarTransform4f().look_at([0, 0, 0], list(normal), [0, 1, 0])
-        @ mi.ScalarTransform4f().scale(8.0),
-        "bsdf": bsdf,
-    }
-    scene = mi.load_dict({"type": "scene", "facet": facet})
-    surface = surface_of(scene.shapes()[0].bsdf())
-    return replace(tile, world=replace(tile.world, scene=scene, surface=surface))
-
-
-def test_rays_lost_below_the_horizon_bring_no_light_and_are_counted() -> None:
-    """A facet tilted by 45° sees (1 + cos 45°)/2 of the sky; what it sends down is lost."""
-    n, spp = 4000, 16
-    tile = void((1.0, 0.0, 1.0), lambert(1.0))
-    q = queries([0.5, 0.5], 1e-6, [0, 0, 1], [0, 0, 1], n)
-    e = Estimator(tile, None, Transport(max_depth=1)).estimate(q, spp, Stream(0, "test", 0))
-    mean = mean_of_halves(e.value_a[:, 0], e.value_b[:, 0])
-    seen = 0.5 * (1 + np.sqrt(0.5))
-    assert abs(mean.value - seen) < 4 * mean.error < 0.01
-    assert e.lost == pytest.approx((1 - seen) * n * spp, rel=0.05)
-
-
 def test_rays_that_meet_nothing_are_black_and_counted() -> None:
-    tile = void((0.0, 0.0, 1.0), lambert(1.0))
-    n = 1000
+    """A user's BSDF that lets rays through in the middle half of the tile: they never come back."""
+    through = np.ones((8, 8, 1), np.float32)
+    through[2:6, 2:6] = 0.0
+    bitmap = {"type": "bitmap", "bitmap": mi.Bitmap(through), "raw": True, "filter_type": "nearest"}
+    n, spp = 1000, 4
     u = np.random.default_rng(0).random((n, 2))
-    e = Estimator(tile, None, Transport()).estimate(
-        queries(u, 1e-6, [0, 0, 1], [0, 0, 1], n), 4, Stream(0, "test", 0)
-    )
-    # The facet covers the middle half of the tile in both directions.
-    hit = np.all(np.abs(u - 0.5) < 0.25, axis=1)
-    np.testing.assert_allclose(e.value_a[:, 0], hit, atol=1e-5)
-    assert e.lost == 4 * np.sum(~hit)
+    q = queries(u, 1e-6, [0, 0, 1], direction(70, 20), n)
+    e = estimate(flat(), {"type": "mask", "opacity": bitmap, "bsdf": lambert(1.0)}, None, q, spp)
+    solid = ~np.all(np.abs(u - 0.5) < 0.25, axis=1)
+    np.testing.assert_allclose(e.value_a[:, 0], solid, atol=1e-5)
+    assert e.lost == spp * np.sum(~solid)
+
+
+def test_rays_below_the_surface_meet_it_from_below() -> None:
+    """White, but half of the rays go through, in and out of ridges: every path ends in the sky or is lost
+    below; nothing is swallowed on the way."""
+    n, spp = 4000, 16
+    white = {"type": "twosided", "bsdf": lambert(1.0)}
+    ridges = HeightGrid(np.tile([0.0, -0.5], (2, 1)), 1.0)
+    q = tile_mean_queries([0, 0, 1], direction(30, 0), n)
+    e = estimate(ridges, {"type": "mask", "opacity": 0.5, "bsdf": white}, None, q, spp)
+    seen = 0.5 * (e.value_a.mean() + e.value_b.mean())
+    assert 0.1 < seen < 0.9
+    assert seen + e.lost / (n * spp) == pytest.approx(1.0, abs=1e-3)
 
 
 @pytest.mark.parametrize("cap", [0, 5, 100])
@@ -89,11 +73,11 @@ def test_endless_rays_end_at_the_cap(cap: int) -> None:
     tile = build_tile(TROUGH, lambert(0.5))
     z = -0.9 * tile.unit
     ray = mi.Ray3f(mi.Point3f([0.0, 0.5], 0.0, z), mi.Vector3f(0.0, [1.0, -1.0], 0.0))
-    si, crossings, capped, _ = closest_hit(tile.scene, tile.period, ray, mi.Bool(True), cap)
+    si, crossings, capped, _ = closest_hit(tile.world.field, ray, mi.Bool(True), cap)
     assert not np.any(np.array(si.is_valid()))
     assert np.all(np.array(capped))
     assert list(np.array(crossings)) == [cap, cap]
-    blocked, crossings, capped, _ = occluded(tile.scene, tile.period, ray, mi.Bool(True), cap)
+    blocked, crossings, capped, _ = occluded(tile.world.field, ray, mi.Bool(True), cap)
     assert np.all(np.array(blocked))
     assert np.all(np.array(capped))
     assert list(np.array(crossings)) == [cap, cap]
@@ -102,7 +86,7 @@ def test_endless_rays_end_at_the_cap(cap: int) -> None:
 def test_rays_that_leave_upwards_are_neither_capped_nor_occluded() -> None:
     tile = build_tile(TROUGH, lambert(0.5))
     ray = mi.Ray3f(mi.Point3f(0.0, 0.0, -0.1 * tile.unit), mi.Vector3f(0.0, [1.0, -0.6], [0.1, 0.8]))
-    blocked, crossings, capped, _ = occluded(tile.scene, tile.period, ray, mi.Bool(True), 4096)
+    blocked, crossings, capped, _ = occluded(tile.world.field, ray, mi.Bool(True), 4096)
     assert not np.any(np.array(blocked | capped))
     # 0.1 tile widths up at a slope of 0.1 is one tile width along; the steep ray crosses none.
     assert list(np.array(crossings)) == [1, 0]

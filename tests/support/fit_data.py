@@ -5,10 +5,17 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from mbtf_fit.config import FitConfig
+from mbtf_fit.data import TrainingQueries
+from mbtf_fit.models import build_model
+from mbtf_fit.noise import NoiseModel, typical_value
+from mbtf_fit.training import Trainer
 from mbtf_gen.directions import from_projected_disk
 from mbtf_gen.levels import Lattice, sigma_of_level
 from mbtf_gen.schema import FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION
@@ -97,3 +104,30 @@ def write_data(
     }
     (folder / MANIFEST_NAME).write_text(json.dumps(manifest))
     return folder
+
+
+def training_queries(arrays: dict[str, F32], value: NDArray[np.floating]) -> TrainingQueries:
+    """Queries with their values (n, 3), as training reads them."""
+    return TrainingQueries(*(torch.from_numpy(np.asarray(a, np.float32)) for a in (*arrays.values(), value)))
+
+
+def make_trainer(
+    queries: TrainingQueries,
+    lattice: Lattice,
+    model: str = "neumip",
+    noise: NoiseModel | None = None,
+    **training: Any,
+) -> Trainer:
+    """A trainer of a fresh model on queries; without noise unless a model of it is given."""
+    config = FitConfig.model_validate({"model": model, "training": training})
+    scale = typical_value(queries.value.numpy())
+    network = build_model(model, lattice)
+    network.initialise(torch.Generator().manual_seed(0), scale)
+    return Trainer(config, network, queries, noise or NoiseModel.silent(scale, lattice))
+
+
+def train_fully(trainer: Trainer) -> Trainer:
+    """Train until the budget is spent."""
+    while not trainer.train(10.0):
+        pass
+    return trainer

@@ -35,6 +35,26 @@ def material(shards: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def test_export_writes_what_it_says(material: Path, tmp_path: Path, run_python: RunPython) -> None:
+    out = tmp_path / "export"
+    done = run_python("-m", "mbtf_fit", "export", str(material), "--half", "-o", str(out), "--json")
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["files"] == {p.name: p.stat().st_size for p in out.iterdir()}
+    assert set(found["files"]) == {"textures.exr", "layers.json"}
+    assert 0 < found["half"]["relative"] < 0.01
+    again = tmp_path / "half"
+    done = run_python(
+        "-m", "mbtf_fit", "export", str(material), "--to", "material", "--half", "-o", str(again)
+    )
+    assert done.returncode == 0, done.stderr
+    assert "half precision: rms error" in done.stdout
+    done = run_python("-m", "mbtf_fit", "info", str(again))
+    assert "largest deviation 0" in done.stdout
+    message = fails(run_python, 3, "export", str(material), "--to", "material")
+    assert "name a new folder with -o" in message
+
+
 def fails(run_python: RunPython, code: int, *arguments: str) -> str:
     """What a failing command says: at most two lines, no traceback, nothing on standard output."""
     done = run_python("-m", "mbtf_fit", *arguments)

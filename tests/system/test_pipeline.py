@@ -228,3 +228,27 @@ def test_the_report_can_be_written_again(
     assert run(app, ["report", str(folder)]) == 0
     assert (folder / "report.html").exists()
     assert again() == {}
+
+
+def test_cost_study_measures_reports_and_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from mbtf_pipeline.cli import app
+
+    out = tmp_path / "study"
+    command = ["cost", str(RECIPE), "--time", "6s", "-o", str(out), "--json", "--quiet"]
+    assert run(app, command) == 0
+    first = json.loads(capsys.readouterr().out)
+    assert first["points"] >= 2
+    points = {p: p.read_bytes() for p in (out / "points").iterdir()}
+    assert len(points) == first["points"]
+    html = (out / "cost.html").read_text()
+    assert not loads(html).external
+    assert "Paths per query" in html
+    rows = (out / "cost.csv").read_text().splitlines()
+    assert len(rows) == 1 + first["points"]
+    assert (out / "paths.png").stat().st_size > 1000
+    # The same again: what was measured is kept, and more is added.
+    assert run(app, command) == 0
+    second = json.loads(capsys.readouterr().out)
+    assert second["points"] >= first["points"]
+    assert all(p.read_bytes() == content for p, content in points.items())
+    assert not (out / ".work").exists()

@@ -5,14 +5,14 @@ from __future__ import annotations
 from itertools import islice
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
-from support.fit_data import parallax, random_queries
+from support.fit_data import make_trainer, parallax, random_queries, train_fully, training_queries
 
 import mbtf_fit.parallel
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data import TrainingQueries
-from mbtf_fit.models import build_model
 from mbtf_fit.parallel import Workers
 from mbtf_fit.storage import read_tensors, write_tensors
 from mbtf_fit.training import Trainer, rate_factor
@@ -23,25 +23,12 @@ LATTICE = Lattice(3)
 
 
 def queries(n: int = 5000) -> TrainingQueries:
-    import numpy as np
-
     arrays = random_queries(np.random.default_rng(0), n, LATTICE)
-    value = parallax(*arrays.values()).astype(np.float32)
-    return TrainingQueries(*(torch.from_numpy(a) for a in (*arrays.values(), value)))
+    return training_queries(arrays, parallax(*arrays.values()))
 
 
 def trainer(data: TrainingQueries, model: str = "neumip", **training: Any) -> Trainer:
-    options = {"steps": 40, "batch": 1000, "warmup": 5, **training}
-    config = FitConfig.model_validate({"model": model, "training": options})
-    network = build_model(model, LATTICE)
-    network.initialise(torch.Generator().manual_seed(0), 0.1)
-    return Trainer(config, network, data)
-
-
-def finish(t: Trainer) -> Trainer:
-    while not t.train(10.0):
-        pass
-    return t
+    return make_trainer(data, LATTICE, model, **{"steps": 40, "batch": 1000, "warmup": 5, **training})
 
 
 @pytest.mark.parametrize("model", ["neumip", "neumip-baseline"])
@@ -50,7 +37,7 @@ def test_training_lowers_the_loss(model: str) -> None:
     t = trainer(data, model, steps=150)
     with torch.no_grad():
         first = t._loss(data).item()
-    finish(t)
+    train_fully(t)
     assert t.progress.step == 150
     assert t.progress.loss < 0.3 * first
 
@@ -69,12 +56,12 @@ def test_every_epoch_takes_each_query_at_most_once() -> None:
 
 
 def test_fewer_queries_than_a_batch_make_one_batch() -> None:
-    assert finish(trainer(queries(30), steps=3)).progress.step == 3
+    assert train_fully(trainer(queries(30), steps=3)).progress.step == 3
 
 
 def test_a_resumed_training_ends_with_the_same_numbers(tmp_path: Any) -> None:
     data = queries()
-    whole = finish(trainer(data))
+    whole = train_fully(trainer(data))
     half = trainer(data)
     while half.progress.step < 13:
         half.train(0.0)
@@ -83,7 +70,7 @@ def test_a_resumed_training_ends_with_the_same_numbers(tmp_path: Any) -> None:
     resumed = trainer(data)
     resumed.restore(*read_tensors(path))
     assert resumed.progress == half.progress
-    finish(resumed)
+    train_fully(resumed)
     for mine, other in zip(resumed.model.parameters(), whole.model.parameters(), strict=True):
         assert torch.equal(mine, other)
     with torch.no_grad():
@@ -121,7 +108,7 @@ def test_rates_rise_and_fall() -> None:
 
 
 def test_a_budget_of_time_ends_training_and_its_annealing() -> None:
-    t = finish(trainer(queries(), steps=None, time=0.3))
+    t = train_fully(trainer(queries(), steps=None, time=0.3))
     assert t.share == 1.0
     assert t.progress.seconds >= 0.3
     pyramid, offset = t.model.textures()
@@ -136,4 +123,4 @@ def test_divergence_is_one_clear_error(poison: str) -> None:
     with torch.no_grad():
         t.model.get_parameter(poison).fill_(torch.nan)
     with pytest.raises(InputError, match=r"diverged.*\n.*--rate 0\.01 "):
-        finish(t)
+        train_fully(t)

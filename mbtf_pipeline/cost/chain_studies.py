@@ -1,0 +1,82 @@
+"""Which chains are measured within a time budget."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+from .chains import Chain
+
+# Shares of the budget; the generator's own studies take GENERATOR, what is left over is for starting up.
+GENERATOR, DATA, FIT, WHOLE = 0.2, 0.2, 0.2, 0.33
+# The shortest whole chain, seconds, and the share of it that generates.
+SHORTEST = 60.0
+SPLITS = (0.25, 0.5, 0.75)
+PATHS = (2, 4, 16, 64)
+# Path budgets at which they are compared, of the largest.
+PATH_SHARES = (0.4, 1.6)
+MODELS = ("neumip", "neumip-baseline")
+WIDTHS = (16, 40)
+_FEWEST_QUERIES = 20_000
+
+# Seconds that a query of so many paths takes to generate.
+Price = Callable[[int], float]
+
+
+def _queries(seconds: float, spp: int, price: Price) -> int:
+    """Queries that so many seconds buy, rounded to two digits."""
+    count = max(_FEWEST_QUERIES, seconds / price(spp))
+    digits = 10 ** max(0, len(str(int(count))) - 2)
+    return int(round(count / digits) * digits)
+
+
+def _fit(model: str, seconds: float, width: int | None = None) -> dict[str, object]:
+    network = {} if width is None else {"network": {"width": width}}
+    return {"model": model, "training": {"time": f"{seconds:.3g}s"}, **network}
+
+
+def chains(budget: float, spp: int, price: Price) -> Iterator[Chain]:
+    """All chains that a budget in seconds allows.
+
+    Parameters
+    ----------
+    spp : paths per query of the recipe
+    price : seconds that a query takes to generate, by its number of paths
+    """
+    yield from _whole(WHOLE * budget, spp, price)
+    # On average a point of this study generates for a third of its time and trains for the rest.
+    each = DATA * budget / (len(PATHS) * len(PATH_SHARES))
+    paths = spp * _queries(each / 3, spp, price)
+    for n in PATHS:
+        for share in PATH_SHARES:
+            queries = max(_FEWEST_QUERIES, int(share * paths) // n)
+            name = f"{queries * n / 1e6:.3g} M paths"
+            yield Chain("data", f"{n} paths/query", name, queries, n, _fit("neumip", 2 * each / 3))
+    yield from _fits(FIT * budget, spp, price)
+
+
+def _whole(budget: float, spp: int, price: Price) -> Iterator[Chain]:
+    total = SHORTEST
+    spent = 0.0
+    while spent == 0.0 or spent + len(SPLITS) * total <= budget:
+        for share in SPLITS:
+            queries = _queries(share * total, spp, price)
+            name = f"{share:.0%} of {total:g} s generating"
+            yield Chain(
+                "chain", f"{total:g} s in all", name, queries, spp, _fit("neumip", (1 - share) * total)
+            )
+        spent += len(SPLITS) * total
+        total *= 2
+
+
+def _fits(budget: float, spp: int, price: Price) -> Iterator[Chain]:
+    """Models and sizes over training time, on one data set."""
+    unit = budget / 12
+    queries = _queries(1.5 * unit, spp, price)
+    for model in MODELS:
+        for share in (0.5, 1, 2) if model == MODELS[0] else (1, 2):
+            seconds = share * unit
+            yield Chain("fit", model, f"{seconds:.3g} s", queries, spp, _fit(model, seconds))
+    for width in WIDTHS:
+        seconds = 2 * unit
+        name = f"{seconds:.3g} s"
+        yield Chain("fit", f"neumip, {width} wide", name, queries, spp, _fit("neumip", seconds, width))

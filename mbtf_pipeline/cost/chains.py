@@ -1,0 +1,225 @@
+"""Whole chains: data of a size, a fit of a length, and the error that is left on test queries.
+
+Every chain is measured on the same test queries, which no training sees. Its parts are the generator and the
+fitter themselves, called as the programs call them; nothing is simulated or extrapolated.
+"""
+
+from __future__ import annotations
+
+import shutil
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbtf_gen.config import GeneratorConfig
+from mbtf_gen.durations import parse_duration
+from mbtf_gen.stats import Estimate, unexplained_variance
+
+from ..stages import hash_of
+from .points import Point
+
+# A picture of 1080p with one query per pixel.
+PIXELS = 1920 * 1080
+# Queries of one timed evaluation, and how often it is timed.
+_TIMED_QUERIES = 1 << 18
+_TIMED = 3
+# Training queries of the data set that is made for its test split alone.
+_FEWEST = "64"
+
+
+@dataclass(frozen=True)
+class Chain:
+    """One chain to measure.
+
+    Attributes
+    ----------
+    study, series, name : see :class:`~mbtf_pipeline.cost.points.Point`
+    queries, spp : training queries, and paths of each
+    fit : options of the fitter, as its configuration has them
+    """
+
+    study: str
+    series: str
+    name: str
+    queries: int
+    spp: int
+    fit: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def key(self) -> dict[str, Any]:
+        """What the point depends on besides the study's basis."""
+        return {"queries": self.queries, "spp": self.spp, "fit": self.fit}
+
+    def seconds(self, price: Callable[[int], float], *, data: bool = True) -> float:
+        """What it will take, where a query of so many paths takes ``price(paths)`` seconds to generate;
+        `data`: the data are still to be made."""
+        return data * self.queries * price(self.spp) + parse_duration(self.fit["training"]["time"])
+
+
+@dataclass(frozen=True)
+class _Data:
+    """A data set that was made, and the seconds it took, planning and start included."""
+
+    folder: Path
+    seconds: float
+
+
+class Workshop:
+    """Makes data and fits in a folder of the study, and keeps data that several chains share.
+
+    Parameters
+    ----------
+    config : the recipe's generator
+    folder : to work in; what lies there is removed by :meth:`clear`
+    command : of the generator with the study's configuration, to which a chain adds its own options
+    progress : called with a note
+    """
+
+    def __init__(
+        self, config: GeneratorConfig, folder: Path, command: str, progress: Callable[[str], None]
+    ) -> None:
+        self.config = config
+        self.folder = folder
+        self.command = command
+        self.progress = progress
+        self._made: dict[str, _Data] = {}
+        self._test: Any = None
+
+    def clear(self) -> None:
+        """Remove data and fits; points hold what was measured on them."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _generate(self, queries: str, spp: int, test: str, test_spp: int, name: str) -> _Data:
+        """A data set, made anew: what an interrupted study left behind was not timed."""
+        from mbtf_gen.generation import generate
+
+        data = self.config.model_dump(mode="json")
+        data["queries"] |= {
+            "train": queries,
+            "spp": spp,
+            "test": test,
+            "test_spp": test_spp,
+            "layout": "shuffled",
+        }
+        config = GeneratorConfig.model_validate(data)
+        folder = self.folder / f"{name}-{hash_of(data)[:12]}"
+        shutil.rmtree(folder, ignore_errors=True)
+        start = time.perf_counter()
+        generate(config, folder)
+        return _Data(folder, time.perf_counter() - start)
+
+    def data(self, queries: int, spp: int) -> _Data:
+        """Training data of a size."""
+        key = f"{queries}-{spp}"
+        if key not in self._made:
+            self.progress(f"{queries / 1e6:.2f} M queries of {spp} paths")
+            self._made[key] = self._generate(str(queries), spp, _FEWEST, 2, "data")
+        return self._made[key]
+
+    def has(self, chain: Chain) -> bool:
+        """Whether the data of a chain are there."""
+        return f"{chain.queries}-{chain.spp}" in self._made
+
+    def forget(self, queries: int, spp: int) -> None:
+        """Remove training data that no other chain needs."""
+        made = self._made.pop(f"{queries}-{spp}", None)
+        if made is not None:
+            shutil.rmtree(made.folder, ignore_errors=True)
+
+    def test(self) -> Any:
+        """The test queries that all chains are judged by."""
+        if self._test is None:
+            from mbtf_fit.data import load_split
+            from mbtf_gen.dataset import Dataset
+
+            queries = self.config.queries
+            self.progress("test queries")
+            made = self._generate(_FEWEST, 2, queries.test, queries.test_spp, "test")
+            self._test = load_split(Dataset.open(made.folder), "test")
+        return self._test
+
+    def measure(self, chain: Chain) -> Point:
+        """Make the data, fit, and judge."""
+        from mbtf_fit import FitConfig, fit
+
+        test = self.test()
+        data = self.data(chain.queries, chain.spp)
+        self.progress(f"{chain.study}: {chain.series}, {chain.name}")
+        config = FitConfig.model_validate({**chain.fit, "seed": self.config.seed})
+        out = self.folder / f"fit-{hash_of(chain.key)[:12]}"
+        shutil.rmtree(out, ignore_errors=True)
+        result = fit(config, data.folder, out)
+        material = result.material
+        error = _missed(material.predict(test), test)
+        details = {
+            "queries": float(chain.queries),
+            "spp": float(chain.spp),
+            "generation_seconds": data.seconds,
+            "training_seconds": result.seconds,
+            "total_seconds": data.seconds + result.total_seconds,
+            "evaluation_ms_1080p": 1e3 * _evaluation_seconds(material, test),
+            "bytes": float(sum(p.stat().st_size for p in out.glob("weights*"))),
+            "half_error": _missed(_half(material).predict(test), test).value,
+        }
+        shutil.rmtree(out, ignore_errors=True)
+        price = {"data": "generation_seconds", "fit": "training_seconds"}.get(chain.study, "total_seconds")
+        return Point(
+            chain.study,
+            chain.series,
+            chain.name,
+            {"queries.train": str(chain.queries), "queries.spp": chain.spp, **_flat(chain.fit)},
+            self._command(chain),
+            Estimate(details[price], 0.0, 1),
+            error,
+            details=details,
+        )
+
+    def _command(self, chain: Chain) -> str:
+        flags = "".join(f" --set {name}={value}" for name, value in _flat(chain.fit).items())
+        return (
+            f"{self.command} --queries {chain.queries} --spp {chain.spp} -o shards/ && "
+            f"mbtf-fit shards/{flags} -o material/"
+        )
+
+
+def _flat(options: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested options by dotted name."""
+    out: dict[str, Any] = {}
+    for name, value in options.items():
+        out |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+    return out
+
+
+def _missed(prediction: NDArray[np.float32], test: Any) -> Estimate:
+    return unexplained_variance(prediction, test.value_a, test.value_b)
+
+
+def _half(material: Any) -> Any:
+    """The material with its numbers rounded to half precision, evaluated in single."""
+    import copy
+
+    import torch
+
+    rounded = copy.deepcopy(material)
+    with torch.no_grad():
+        for parameter in rounded.model.parameters():
+            parameter.copy_(parameter.half().float())
+    return rounded
+
+
+def _evaluation_seconds(material: Any, test: Any) -> float:
+    """Seconds for one query per pixel of 1080p, at random queries."""
+    rows = np.resize(np.arange(len(test)), _TIMED_QUERIES)
+    arrays = [getattr(test, name)[rows] for name in ("u", "sigma", "omega_i", "omega_o")]
+    took = []
+    for _ in range(_TIMED + 1):
+        start = time.perf_counter()
+        material.evaluate(*arrays)
+        took.append(time.perf_counter() - start)
+    return statistics.median(took[1:]) * PIXELS / _TIMED_QUERIES

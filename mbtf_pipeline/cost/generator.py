@@ -1,0 +1,190 @@
+"""The generator's trades: error of M against seconds, split into bias and noise.
+
+A setting is compared with a converged reference at the same queries. With halves a, b of the setting and
+r, s of the reference, (a, r) independent of (b, s), ``E[(a - r)(b - s)]`` is the squared bias, free of the
+noise of both. Within a half both use the same random numbers, so that most of the noise cancels in the
+differences and small biases are seen. ``E[(a - b)²/4]`` is the variance of the setting's own noise. Both are
+given as root mean squares relative to the mean value of the reference.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbtf_gen.config import GeneratorConfig
+from mbtf_gen.estimates import Stream
+from mbtf_gen.generation import Job
+from mbtf_gen.material import Material
+from mbtf_gen.planning import plan_effects
+from mbtf_gen.queries import Queries
+from mbtf_gen.stats import Estimate, mean_estimate
+
+# Queries of one piece of the reference, and paths that it and the setting get at each.
+BIAS_QUERIES = 16384
+BIAS_SPP = 64
+_MOST_BIAS_PIECES = 16
+# Paths of one timed piece.
+_PIECE_PATHS = 1 << 19
+_FEWEST_PIECES = 4
+# Half-width of a 95 % interval, relative, at which measuring stops; and the bias below which none is looked
+# for.
+_HALF_WIDTH = 0.1
+_NEGLIGIBLE = 0.005
+# Shards, of this many queries, that stand for the study's streams of random numbers.
+_SHARD = 1 << 14
+_FIRST_REFERENCE = 5_001
+_FIRST_PIECE = 10_001
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A setting's price and error.
+
+    Attributes
+    ----------
+    seconds : per million queries
+    bias, noise, error : root mean squares relative to the reference's mean value; no bias where setting and
+        reference trace the same
+    """
+
+    seconds: Estimate
+    bias: Estimate | None
+    noise: Estimate
+    error: Estimate
+
+
+@dataclass(frozen=True)
+class _Reference:
+    """Queries and both halves (n, 3) of the reference's values there."""
+
+    queries: Queries
+    a: NDArray[np.float64]
+    b: NDArray[np.float64]
+
+
+@dataclass
+class Bench:
+    """One material and configuration, and what settings of it are compared with.
+
+    Parameters
+    ----------
+    config : the recipe's generator; its level is fixed, so that every setting answers the same queries
+    seed : of queries and paths
+    """
+
+    config: GeneratorConfig
+    material: Material
+    seed: int
+    _references: dict[str, _Reference] = field(default_factory=dict, repr=False)
+
+    def job(self, changes: dict[str, Any]) -> Job:
+        """The job of the configuration with options changed, by dotted name."""
+        data = self.config.model_dump(mode="json")
+        levels = Job.of(self.config, self.material).lattice.finest
+        fixed = {
+            "queries.levels": levels,
+            "queries.layout": "shuffled",
+            "output.shard_queries": _SHARD,
+        }
+        for name, value in {**fixed, **changes}.items():
+            section, _, key = name.rpartition(".")
+            (data[section] if section else data)[key] = value
+        return Job.of(GeneratorConfig.model_validate({**data, "seed": self.seed}), self.material)
+
+    def queries(self, job: Job, shard: int, count: int) -> Queries:
+        """Queries as a test split has them, one leading axis."""
+        return job.plan().draw("test", shard, count)
+
+    def reference(self, changes: dict[str, Any], piece: int) -> _Reference:
+        """One piece of the converged reference with these options."""
+        key = f"{sorted(changes.items())!r} {piece}"
+        if key not in self._references:
+            job = self.job({"effects.mode": "all", "transport.max_depth": 0, **changes})
+            queries = self.queries(job, _FIRST_REFERENCE + piece, BIAS_QUERIES)
+            found = job.estimator(plan_effects(job)).estimate(queries, BIAS_SPP, self._stream(piece))
+            a, b = found.value_a.astype(np.float64), found.value_b.astype(np.float64)
+            self._references[key] = _Reference(queries, a, b)
+        return self._references[key]
+
+    def _stream(self, piece: int) -> Stream:
+        return Stream(self.seed, "test", _FIRST_REFERENCE + piece)
+
+    def measure(self, changes: dict[str, Any], against: dict[str, Any] | None, seconds: float) -> Measured:
+        """Price and error of a setting.
+
+        Parameters
+        ----------
+        changes : options of the setting; against : options of the reference, or None where the setting only
+            takes another number of paths, which leaves no bias
+        seconds : spent on each of timing and bias at most; less where the error bars are small before
+        """
+        job = self.job(changes)
+        estimator = job.estimator(plan_effects(job))
+        first = self.reference(against or {}, 0)
+        mean = float((first.a + first.b).mean() / 2)
+        noise, price = self._noise(job, estimator, job.config.queries.spp, seconds, mean)
+        if against is None:
+            return Measured(price, None, _root(noise), _root(noise))
+        bias = self._bias(estimator, against, seconds, mean)
+        return Measured(price, _root(bias), _root(noise), _root(_total(bias, noise)))
+
+    def _bias(self, estimator: Any, against: dict[str, Any], seconds: float, mean: float) -> Estimate:
+        """Squared bias relative to the mean value squared."""
+        began = time.perf_counter()
+        squares: list[NDArray[np.float64]] = []
+        while True:
+            piece = len(squares)
+            reference = self.reference(against, piece)
+            found = estimator.estimate(reference.queries, BIAS_SPP, self._stream(piece))
+            a, b = found.value_a.astype(np.float64), found.value_b.astype(np.float64)
+            squares.append(((a - reference.a) * (b - reference.b)).mean(axis=1) / mean**2)
+            square = mean_estimate(np.concatenate(squares))
+            sure = 1.96 * square.error <= max(2 * _HALF_WIDTH * square.value, _NEGLIGIBLE**2)
+            late = time.perf_counter() - began > seconds or len(squares) == _MOST_BIAS_PIECES
+            if sure or late:
+                return square
+
+    def _noise(
+        self, job: Job, estimator: Any, spp: int, seconds: float, mean: float
+    ) -> tuple[Estimate, Estimate]:
+        """Variance of one query's noise relative to the mean value squared, and seconds per million
+        queries; the first piece, which may compile, is not timed."""
+        count = max(1, _PIECE_PATHS // spp)
+        squares: list[NDArray[np.float64]] = []
+        prices: list[float] = []
+        began = time.perf_counter()
+        piece = 0
+        while True:
+            queries = self.queries(job, _FIRST_PIECE + piece, count)
+            start = time.perf_counter()
+            found = estimator.estimate(queries, spp, Stream(self.seed, "test", _FIRST_PIECE + piece))
+            took = time.perf_counter() - start
+            difference = found.value_a.astype(np.float64) - found.value_b
+            squares.append((difference**2 / 4.0).mean(axis=1) / mean**2)
+            if piece:
+                prices.append(took / len(difference) * 1e6)
+            piece += 1
+            variance = mean_estimate(np.concatenate(squares))
+            sure = 1.96 * variance.error <= 2 * _HALF_WIDTH * variance.value or variance.value == 0
+            if piece >= _FEWEST_PIECES and (sure or time.perf_counter() - began > seconds):
+                return variance, mean_estimate(prices)
+
+
+def _total(bias: Estimate, noise: Estimate) -> Estimate:
+    """Mean squared error from its parts; a squared bias that noise made negative counts as none."""
+    return Estimate(max(bias.value, 0.0) + noise.value, math.hypot(bias.error, noise.error), noise.n)
+
+
+def _root(square: Estimate) -> Estimate:
+    """Root of a measured square. Where the square is not told from zero its root has no error bar of first
+    order: the bar is then the root of the square's own bar."""
+    value = math.sqrt(max(square.value, 0.0))
+    if square.value <= 2.0 * square.error:
+        return Estimate(value, math.sqrt(square.error), square.n)
+    return Estimate(value, square.error / (2.0 * value), square.n)

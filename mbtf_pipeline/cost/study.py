@@ -1,0 +1,197 @@
+"""A cost study: measures what accuracy costs, within a time budget, and goes on where it stopped."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from mbtf_gen.atomic import read_json, write_json, write_text
+from mbtf_gen.errors import InputError
+from mbtf_gen.material import load_material
+from mbtf_gen.settings import dump_yaml
+
+from ..recipe import Recipe
+from ..run_folder import locked, machine
+from .chain_studies import GENERATOR, chains
+from .chains import Workshop
+from .generator import Bench
+from .generator_studies import generator_tasks
+from .points import Point, PointFolder
+
+STUDY_NAME = "study.json"
+STUDY_FORMAT = "mbtf-cost"
+STUDY_SCHEMA = 1
+CONFIG_NAME = "generate.yaml"
+WORK = ".work"
+# Share of the budget that is kept for whole chains while the generator is studied.
+_RESERVED = 0.7
+# Settings that the generator's share of the budget is divided among.
+_SETTINGS = 32
+
+Tell = Callable[[float, str], None]
+
+
+@dataclass
+class Study:
+    """What a study has measured.
+
+    Attributes
+    ----------
+    folder : of the study
+    description : name, command, budget, seed, machine, and when it was made
+    points : in the order of measurement
+    skipped : names of settings for which no time was left
+    """
+
+    folder: Path
+    description: dict[str, Any]
+    points: list[Point] = field(default_factory=list)
+    skipped: list[str] = field(default_factory=list)
+
+
+def claim(folder: Path) -> None:
+    """Make a study's folder, or take an empty one or one that holds a study.
+
+    Raises
+    ------
+    InputError : it holds something else
+    """
+    if folder.exists() and not folder.is_dir():
+        raise InputError("is a file, not a folder", where=folder)
+    seen = folder.exists() and any(not p.name.startswith(".") for p in folder.iterdir())
+    if seen and not _is_study(folder):
+        raise InputError(
+            "is not empty and holds no cost study", where=folder, cure="choose another folder with -o"
+        )
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot be made ({error.strerror})", where=folder) from None
+
+
+def _is_study(folder: Path) -> bool:
+    try:
+        return bool(read_json(folder / STUDY_NAME).get("format") == STUDY_FORMAT)
+    except InputError:
+        return False
+
+
+def run_study(
+    recipe: Recipe,
+    folder: Path,
+    *,
+    budget: float,
+    seed: int | None = None,
+    command: str = "",
+    tell: Tell | None = None,
+) -> Study:
+    """Measure what the budget allows; points that were measured before are kept.
+
+    Parameters
+    ----------
+    recipe : its material and generator are studied; fits and comparison are not used
+    budget : seconds for everything, points that are done already counted as free
+    seed : of queries, paths and first weights; the recipe's by default
+    tell : called with (share of the budget spent, note)
+
+    Raises
+    ------
+    InputError : the material or the folder cannot be used
+    PartialError : another process is at work in the folder, or the disk is full; the same command goes on
+    """
+    begin = time.perf_counter()
+    config = recipe.generate
+    if seed is not None:
+        config = config.model_copy(update={"seed": seed})
+    material = load_material(Path(config.material), config.geometry.tile)
+    claim(folder)
+
+    def note(text: str) -> None:
+        if tell is not None:
+            tell(min(1.0, (time.perf_counter() - begin) / budget), text)
+
+    def left() -> float:
+        return budget - (time.perf_counter() - begin)
+
+    with locked(folder, STUDY_NAME):
+        description = {
+            "format": STUDY_FORMAT,
+            "schema": STUDY_SCHEMA,
+            "name": recipe.name,
+            "command": command,
+            "budget": budget,
+            "seed": config.seed,
+            "material": config.material,
+            "queries": config.queries.model_dump(mode="json"),
+            "made": time.strftime("%Y-%m-%d"),
+            "machine": machine(),
+        }
+        write_json(folder / STUDY_NAME, description)
+        data = config.model_dump(mode="json")
+        write_text(folder / CONFIG_NAME, dump_yaml(data))
+        study = Study(folder, description)
+        store = PointFolder(folder, {"config": config.hash(material.digests)})
+        bench = Bench(config, material, config.seed)
+        each = 0.5 * GENERATOR * budget / _SETTINGS
+        for task in generator_tasks(bench):
+            point = store.get(task.study, task.key)
+            if point is None and left() > _RESERVED * budget:
+                note(f"{task.study}: {task.name}")
+                point = task.run(bench, each)
+                store.put(task.key, point)
+            _keep(study, point, f"{task.study}: {task.name}")
+        price = _price(study.points, config.queries.spp)
+        if price is not None:
+            _measure_chains(study, store, config, budget, price, left, note)
+    return study
+
+
+def _keep(study: Study, point: Point | None, name: str) -> None:
+    if point is None:
+        study.skipped.append(name)
+    else:
+        study.points.append(point)
+
+
+def _price(points: Iterable[Point], spp: int) -> Callable[[int], float] | None:
+    """Seconds per query by its paths, from those that were measured: the nearest number of paths, in
+    proportion."""
+    known = {int(p.setting["queries.spp"]): p.seconds.value * 1e-6 for p in points if p.study == "paths"}
+    if not known:
+        return None
+
+    def price(paths: int) -> float:
+        nearest = min(known, key=lambda n: abs(n - paths))
+        return known[nearest] * (paths / nearest if nearest != paths else 1.0)
+
+    return price
+
+
+def _measure_chains(
+    study: Study,
+    store: PointFolder,
+    config: Any,
+    budget: float,
+    price: Callable[[int], float],
+    left: Callable[[], float],
+    note: Callable[[str], None],
+) -> None:
+    command = f"mbtf-gen {config.material} --config {study.folder / CONFIG_NAME}"
+    work = Workshop(config, study.folder / WORK, command, note)
+    # Prices are those of stored points: a study that goes on has the same tasks.
+    tasks = list(chains(budget, config.queries.spp, price))
+    needed = [(t.queries, t.spp) for t in tasks]
+    try:
+        for number, task in enumerate(tasks):
+            point = store.get(task.study, task.key)
+            if point is None and left() > task.seconds(price, data=not work.has(task)):
+                point = work.measure(task)
+                store.put(task.key, point)
+            _keep(study, point, f"{task.study}: {task.series}, {task.name}")
+            if (task.queries, task.spp) not in needed[number + 1 :]:
+                work.forget(task.queries, task.spp)
+    finally:
+        work.clear()

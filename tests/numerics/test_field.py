@@ -1,0 +1,105 @@
+"""Rays over the height field meet what Embree meets on a mesh of many tiles."""
+
+from __future__ import annotations
+
+import drjit as dr
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from support.scenes import HeightGrid, build_tile, lambert, mi, rocks
+
+from mbtf_gen.field import HeightField, closest_hit, occluded
+from mbtf_gen.stock import mesh_of_grid
+
+N = 200_000
+
+
+def needles() -> HeightGrid:
+    z = np.where(np.random.default_rng(5).random((24, 24)) < 0.1, 0.0, -0.4)
+    return HeightGrid(z, 1.0)
+
+
+def odd() -> HeightGrid:
+    return HeightGrid(rocks(64).z[:23, :37], 23 / 37)
+
+
+GRIDS = [rocks(64), odd(), needles(), HeightGrid(np.array([[0.0, -0.3]]), 0.5)]
+NAMES = ["rocks", "23 x 37", "needles", "1 x 2"]
+
+
+def rays(rng: np.random.Generator, grid: HeightGrid, unit: float) -> tuple[NDArray, NDArray]:
+    """Origins (n, 3) within the tile, above the relief; directions (n, 3) downwards, no lower than 6°."""
+    o = np.column_stack([(rng.random((N, 2)) - 0.5) * (unit, unit * grid.aspect), np.full(N, 0.1)])
+    z = rng.uniform(0.1, 1.0, N)
+    phi = 2 * np.pi * rng.random(N)
+    r = np.sqrt(1 - z * z)
+    return o, np.stack([r * np.cos(phi), r * np.sin(phi), -z], axis=-1)
+
+
+def ray_of(o: NDArray, d: NDArray) -> mi.Ray3f:
+    arrays = (np.ascontiguousarray(a.T, np.float32) for a in (o, d))
+    return mi.Ray3f(*(t(a) for t, a in zip((mi.Point3f, mi.Vector3f), arrays, strict=True)))
+
+
+@pytest.mark.parametrize("grid", GRIDS, ids=NAMES)
+def test_hits_and_shadows_are_those_of_the_mesh(grid: HeightGrid) -> None:
+    rng = np.random.default_rng(0)
+    tile = build_tile(grid, lambert(0.5))
+    rows, columns = grid.z.shape
+    around = round(5 / grid.aspect)
+    mesh = mesh_of_grid(grid, tile.unit, (around * rows, around * columns), mi.load_dict(lambert(0.5)))
+    scene = mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, "mesh": mesh})
+    ray = ray_of(*rays(rng, grid, tile.unit))
+    expected = scene.ray_intersect(ray)
+    found, _, capped, _ = closest_hit(tile.world.field, ray, mi.Bool(True), 100)
+    assert np.all(np.array(expected.is_valid()))
+    assert np.all(np.array(found.is_valid()))
+    assert not np.any(np.array(capped))
+    period = np.array([[tile.unit], [tile.unit * grid.aspect]])
+    gap = np.array(expected.p) - np.array(found.p)
+    gap[:2] -= np.round(gap[:2] / period) * period
+    far = np.abs(gap).max(axis=0) > 2e-4 * tile.unit
+    turned = np.abs(np.array(expected.n) - np.array(found.n)).max(axis=0) > 1e-4
+    # Rays through edges and over the rims of ridges, where rounding decides.
+    assert np.mean(far) < 1e-4
+    assert np.mean(turned) < 1e-3
+    u = np.array(found.uv) - np.array(expected.uv)
+    assert np.mean(np.abs(u - np.round(u)).max(axis=0) > 2e-4) < 1e-4
+
+    light = np.array([0.75, -0.55, 0.37]) * (rng.choice([-1, 1], (N, 1)) * [1, 1, 0] + [0, 0, 1])
+    shadow = tile.world.field.leave(found, ray_of(light, light).d)
+    blocked, _, capped, _ = occluded(tile.world.field, shadow, mi.Bool(True), 100)
+    assert not np.any(np.array(capped))
+    truth = np.array(scene.ray_test(shadow))
+    assert 0.02 < truth.mean() < 0.98
+    assert np.mean(np.array(blocked) != truth) < 1e-3
+
+
+def test_rays_from_below_meet_the_surface_from_below() -> None:
+    """Turned over, what lies below is what lies above: the same hits at mirrored places."""
+    grid = rocks(64)
+    rng = np.random.default_rng(1)
+    upside_down = HeightGrid.from_map(grid.z, -1.0)
+    field, mirrored = (HeightField.of(g, 32.0, True) for g in (grid, upside_down))
+    o, d = rays(rng, grid, 32.0)
+    o[:, 2] = 0.1
+    expected = closest_hit(mirrored, ray_of(o, d), mi.Bool(True), 100)[0]
+    flip = np.array([1.0, 1.0, -1.0])
+    o[:, 2] += 32.0 * grid.relief
+    found = closest_hit(field, ray_of(o * flip, d * flip), mi.Bool(True), 100, mi.Bool(True))[0]
+    assert np.all(np.array(found.is_valid()))
+    back = np.array(found.p).T * flip - [0, 0, 32.0 * grid.relief]
+    # The table's triangles meet along the same diagonals, whichever side is up.
+    assert np.mean(np.abs(back - np.array(expected.p).T).max(axis=1) > 1e-3) < 1e-4
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_rays_that_are_not_finite_end(bad: float) -> None:
+    """Nothing is read from outside the table, and no kernel runs for ever."""
+    field = HeightField.of(rocks(16), 32.0, False)
+    for place in range(6):
+        o, d = np.array([[0.0, 0.0, 0.1]]), np.array([[0.3, 0.4, -0.5]])
+        (o if place < 3 else d)[0, place % 3] = bad
+        si, crossings, capped, _ = closest_hit(field, ray_of(o, d), mi.Bool(True), 50)
+        dr.eval(si, crossings, capped)
+        assert int(crossings[0]) <= 50

@@ -1,0 +1,74 @@
+"""Small data sets of the image layout of known functions, written as shards."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from mbtf_gen.levels import Lattice, sigma_of_level, texel_centres
+from mbtf_gen.schema import FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION
+from mbtf_gen.shard_files import write_shard
+
+from .fit_data import F32, Function, random_directions
+
+
+def random_buffers(
+    random: np.random.Generator, items: int, lattice: Lattice, *, regular: bool = False
+) -> dict[str, F32]:
+    """Buffers of all levels and directions: one query per finest texel, at its centre or anywhere in it."""
+    rows, columns = lattice.shape()
+    shape = (items, rows, columns)
+    jitter = np.zeros((*shape, 2)) if regular else random.random((*shape, 2)) - 0.5
+    u = texel_centres(rows, columns) + jitter / [columns, rows]
+    sigma = sigma_of_level(lattice.finest * random.random(items))[:, None, None]
+    omega = (random_directions(random, items)[:, None, None] for _ in range(2))
+    spread = [np.broadcast_to(sigma, shape), *(np.broadcast_to(o, (*shape, 3)) for o in omega)]
+    names = ("u", "sigma", "omega_i", "omega_o")
+    arrays = (u, *spread)
+    return {n: np.ascontiguousarray(a, np.float32) for n, a in zip(names, arrays, strict=True)}
+
+
+def write_buffers(
+    folder: Path,
+    function: Function,
+    *,
+    train: int = 60,
+    test: int = 3,
+    finest: int = 3,
+    aspect: float = 1.0,
+    noise: float = 0.0,
+    seed: int = 0,
+) -> Path:
+    """Write so many buffers of a known function, in two shards, with independent noise in both halves."""
+    folder.mkdir(parents=True, exist_ok=True)
+    lattice, random = Lattice(finest, aspect), np.random.default_rng(seed)
+    splits: dict[str, dict[str, object]] = {}
+    for split, counts in (("train", (train // 2, train - train // 2)), ("test", (test,))):
+        entries = []
+        for index, items in enumerate(counts):
+            queries = random_buffers(random, items, lattice)
+            shape = queries["sigma"].shape
+            flat = (a.reshape(-1, *a.shape[3:]) for a in queries.values())
+            value = function(*flat).reshape(*shape, 3)
+            halves = {
+                f"value_{half}": (value + noise * random.standard_normal(value.shape)).astype(np.float32)
+                for half in "ab"
+            }
+            name = f"{split}-{index:05d}.npz"
+            write_shard(folder / name, {**queries, **halves, "spp": np.full(shape, 2, np.float32)})
+            (folder / name).with_suffix(".json").write_text(json.dumps({"rows": items}))
+            entries.append({"file": name, "rows": items})
+        splits[split] = {"queries": sum(counts), "shards": entries}
+    manifest = {
+        "format": FORMAT_NAME,
+        "schema": SCHEMA_VERSION,
+        "config_hash": f"buffers-{function.__name__}-{seed}-{noise}",
+        "layout": "image",
+        "levels": {"finest": finest},
+        "tile": {"aspect": aspect},
+        "splits": splits,
+    }
+    (folder / MANIFEST_NAME).write_text(json.dumps(manifest))
+    return folder
