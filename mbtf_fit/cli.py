@@ -9,6 +9,7 @@ from cyclopts import Parameter
 
 from mbtf_gen.console import CONSOLE, Console, clock, new_app
 from mbtf_gen.errors import InputError, UsageError
+from mbtf_gen.quality import Quality, as_assignments
 
 app = new_app("mbtf-fit", "Fit neural materials to multi-resolution BTF (MBTF) data.")
 
@@ -29,6 +30,7 @@ def fit(
     /,
     *,
     output: Output = Path("material"),
+    quality: Quality | None = None,
     model: Literal["neumip", "neumip-baseline", "hierarchical"] | None = None,
     time: str | None = None,
     steps: int | None = None,
@@ -51,6 +53,8 @@ def fit(
         Folder made by mbtf-gen.
     output
         Folder of the material.
+    quality
+        Training time and size that belong together; other options change single ones.
     model
         Model to fit. Default: neumip
     time
@@ -78,6 +82,7 @@ def fit(
     from mbtf_gen.settings import resolve
 
     from .config import FitConfig
+    from .quality import FITTER
 
     flags = {
         "model": model,
@@ -89,7 +94,8 @@ def fit(
         "device": device,
     }
     # Time asked for on the command line takes the place of steps in a file.
-    assigned = [*(assignments or []), *(["training.steps=null"] if time is not None else [])]
+    assigned = as_assignments(FITTER[quality]) if quality else []
+    assigned += [*(assignments or []), *(["training.steps=null"] if time is not None else [])]
     resolved = resolve(FitConfig, file=config, assignments=assigned, flags=flags)
     training = resolved.training
     budget = format_duration(training.time) if training.steps is None else f"{training.steps} steps"

@@ -95,7 +95,9 @@ def _size(coordinates: int, bands: int, network: NetworkSection) -> int:
 
 def _supported(description: dict[str, Any], place: Path) -> NetworkSection:
     """The architecture, or a refusal."""
-    config = build(FitConfig, description["config"], source=str(place))
+    # How it was trained is no concern of a renderer.
+    named = {key: description["config"][key] for key in ("model", "network") if key in description["config"]}
+    config = build(FitConfig, named, source=str(place))
     if config.network.decoder != "mlp":
         raise InputError(
             f"the renderer's plugin cannot evaluate '{config.model}', which looks at neighbouring queries",
