@@ -3,8 +3,8 @@
 From the repository's root, after ``make demo``: ``.venv/bin/python docs/pictures/make_zoom_series.py``.
 Rows: path-traced pixels of the micro-geometry (``mbtf-gen reference --kind pixel``, its command is printed);
 the material with footprints (``mbtf_path``); the material at its finest level everywhere, as stock
-integrators read it. One ray per pixel shows aliasing as it is. Printed: RMS difference from the reference as a
-share of its mean.
+integrators read it. One ray per pixel shows aliasing as it is. Printed: RMS difference from the reference as
+a share of its mean.
 """
 
 from __future__ import annotations
