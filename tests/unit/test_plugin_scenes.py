@@ -153,7 +153,7 @@ def test_nothing_is_seen_from_below_or_lit_from_below(material: tuple[Path, Mate
     assert shown(mesh).mean() > 0.02
     assert shown(mesh, light=below).max() == 0
     under = Camera(**{**CAMERA.__dict__, "elevation": -50.0})
-    assert shown(mesh, under, below).max() == 0
+    assert shown(mesh, under, below).max() == shown(mesh, under, LIGHT).max() == 0
     both = plane({"type": "twosided", "bsdf": bsdf(material[0])})
     assert shown(both, under, below).mean() > 0.02
 
