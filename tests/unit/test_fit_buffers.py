@@ -45,10 +45,12 @@ def buffers(lattice: Lattice, levels: list[float], *, regular: bool) -> Training
 
 def test_whole_buffers_are_held_out(tmp_path: Path) -> None:
     folder = write_buffers(tmp_path / "d", parallax, train=60)
-    part = partition(folder)
+    many = HeldOutSection(queries=0.4, radius=0.3)
+    part = partition(folder, many)
     training = buffers_of(part)
-    assert not in_region(HELD_OUT, training.omega_i.numpy()).any()
-    assert not in_region(HELD_OUT, training.omega_o.numpy()).any()
+    for q in (training, part.held_out_queries):
+        for omega in (q.omega_i, q.omega_o):
+            assert not in_region(many, np.asarray(omega)).any()
     out = part.held_out_directions
     assert (in_region(HELD_OUT, out.omega_i) | in_region(HELD_OUT, out.omega_o)).all()
     kept = {row.tobytes() for row in training.omega_i.numpy()}
@@ -56,10 +58,10 @@ def test_whole_buffers_are_held_out(tmp_path: Path) -> None:
     parts = (training, part.held_out_queries, out)
     assert [64 * len(s) for s in (kept, *held)] == [len(p) for p in parts]
     assert len(kept | held[0] | held[1]) == 60
-    assert len(held[0]) == round(0.1 * (60 - len(held[1])))
-    again = partition(folder)
+    assert len(held[0]) == round(0.4 * (60 - len(held[1])))
+    again = partition(folder, many)
     np.testing.assert_array_equal(again.held_out_queries.u, part.held_out_queries.u)
-    other = {row.tobytes() for row in partition(folder, seed=1).held_out_queries.omega_i}
+    other = {row.tobytes() for row in partition(folder, many, seed=1).held_out_queries.omega_i}
     assert other != held[0]
 
 
