@@ -149,6 +149,7 @@ def fit(
         "loss": trainer.progress.loss,
         "device": str(device),
         "threads": torch.get_num_threads(),
+        "path": trainer.path,
         "torch": torch.__version__,
     }
     errors = judge(trainer.predict, data, partition)
