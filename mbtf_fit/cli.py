@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
 from mbtf_gen.console import CONSOLE, Console, clock, new_app
-from mbtf_gen.errors import InputError, UsageError
+from mbtf_gen.errors import InputError, PartialError, UsageError
+
+if TYPE_CHECKING:
+    from .config import FitConfig
 
 app = new_app("mbtf-fit", "Fit neural materials to multi-resolution BTF (MBTF) data.")
 
@@ -20,6 +23,7 @@ _SPLITS = {
     "test": "test",
     "held_out_queries": "held-out queries",
     "held_out_directions": "held-out directions",
+    "training": "training queries",
 }
 
 
@@ -29,6 +33,8 @@ def fit(
     /,
     *,
     output: Output = Path("material"),
+    many: Annotated[list[Path] | None, Parameter(consume_multiple=True, negative="")] = None,
+    processes: int | None = None,
     model: Literal["neumip", "neumip-baseline", "hierarchical"] | None = None,
     time: str | None = None,
     steps: int | None = None,
@@ -50,7 +56,12 @@ def fit(
     shards
         Folder made by mbtf-gen.
     output
-        Folder of the material.
+        Folder of the material; with --many, of a folder per material.
+    many
+        Fit several data sets instead: folders made by mbtf-gen, folders of such folders, or text files with
+        one folder per line. A failure stops none of the others.
+    processes
+        With --many, fits that run side by side. Default: one per GPU, or 1
     model
         Model to fit. Default: neumip
     time
@@ -70,7 +81,11 @@ def fit(
     overwrite
         Replace a fit of another configuration.
     """
-    if shards is None:
+    if many is not None and shards is not None:
+        raise UsageError("--many takes all data sets", cure=f"mbtf-fit --many {shards} ... -o materials/")
+    if processes is not None and (many is None or processes < 1):
+        raise UsageError("--processes is a positive number that goes with --many")
+    if shards is None and many is None:
         raise UsageError("no shards given", cure="mbtf-fit shards/ -o material/")
     if time is not None and steps is not None:
         raise UsageError("--time and --steps exclude each other", cure="give one of them")
@@ -93,6 +108,10 @@ def fit(
     resolved = resolve(FitConfig, file=config, assignments=assigned, flags=flags)
     training = resolved.training
     budget = format_duration(training.time) if training.steps is None else f"{training.steps} steps"
+    if many is not None:
+        _fit_many(resolved, many, output, processes, overwrite, console)
+        return
+    assert shards is not None
     from .fitting import fit
 
     console.note(
@@ -110,24 +129,91 @@ def fit(
     console.report(data, _describe_fit(data))
 
 
+def _fit_many(
+    config: FitConfig,
+    many: list[Path],
+    output: Path,
+    processes: int | None,
+    overwrite: bool,
+    console: Console,
+) -> None:
+    from .many import Outcome, find_data, fit_many, name_materials
+
+    shards = find_data(many)
+    folders = name_materials(shards, output)
+    if processes is None:
+        import torch
+
+        processes = max(1, torch.cuda.device_count()) if config.device != "cpu" else 1
+    console.note(f"{len(shards)} data sets -> {output}: {config.model}, {processes} at a time")
+    with console.progress(total=len(shards), label="fitting", unit="data sets") as bar:
+
+        def finished(outcome: Outcome) -> None:
+            bar.advance(1, f"{outcome.folder.name}: {'failed' if outcome.error else 'done'}")
+
+        outcomes = fit_many(
+            config, shards, folders, processes=processes, overwrite=overwrite, finished=finished
+        )
+    rows = [["material", "unexplained variance, test", "steps", "training"]]
+    for outcome in outcomes:
+        if outcome.result is None:
+            rows.append([outcome.folder.name, "failed", "-", "-"])
+            continue
+        training, errors = outcome.result["training"], outcome.result["errors"]
+        test = errors.get("test") or next(iter(errors.values()))
+        rows.append(
+            [
+                outcome.folder.name,
+                _number(test["unexplained"]),
+                str(training["steps"]),
+                clock(training["seconds"]),
+            ]
+        )
+    console.report({"fits": [o.as_dict() for o in outcomes]}, _table(rows))
+    failed = [o for o in outcomes if o.error is not None]
+    for outcome in failed:
+        console.note(f"{outcome.shards}: {outcome.error}")
+    if failed:
+        raise PartialError(
+            f"{len(failed)} of {len(outcomes)} fits failed",
+            where=output,
+            cure="the same command again takes up what is not finished",
+        )
+
+
+def _table(rows: list[list[str]]) -> str:
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ("  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)) for row in rows)
+    return "\n".join(line.rstrip() for line in lines)
+
+
 def _describe_errors(errors: dict[str, Any]) -> list[str]:
-    lines = []
-    for name, split in errors.items():
-        share = _number(split["unexplained"])
-        lines.append(f"{_SPLITS[name]}: unexplained variance {share} ({split['n']} queries)")
-    test = errors.get("test") or next(iter(errors.values()), None)
-    if test is not None:
-        levels = "  ".join(f"{level}: {_number(e['unexplained'])}" for level, e in test["levels"].items())
-        bands = "  ".join(f"{band}: {_number(e['unexplained'])}" for band, e in test["elevations"].items())
-        lines += [f"  by level of detail  {levels}", f"  by lowest cosine  {bands}"]
-    return lines
+    """A table: overall, by level of detail and by lowest cosine; a column per split, with error bars."""
+    splits = list(errors)
+    rows = [["unexplained variance", *(_SPLITS[name] for name in splits)]]
+    rows.append(["all", *(_number(errors[name]["unexplained"]) for name in splits)])
+    for grouping, label in (("levels", "level"), ("elevations", "cosine")):
+        groups = {group: None for name in splits for group in errors[name][grouping]}
+        for group in sorted(groups, key=lambda g: float(g.split("-")[0])):
+            found = [errors[name][grouping].get(group) for name in splits]
+            rows.append(
+                [f"{label} {group}", *("-" if e is None else _number(e["unexplained"]) for e in found)]
+            )
+    rows.append(["queries", *(str(errors[name]["n"]) for name in splits)])
+    return _table(rows).splitlines()
 
 
 def _number(estimate: dict[str, Any]) -> str:
     if estimate["value"] is None:
-        return "undefined (too few or too noisy queries to tell the variance)"
+        return "undefined"
     error = "?" if estimate["error"] is None else f"{estimate['error']:.3f}"
     return f"{estimate['value']:.3f} ± {error}"
+
+
+def _describe_coverage(coverage: dict[str, float]) -> str:
+    """Which levels gradients have reached."""
+    partly = [f"{share:.1%} of level {level}" for level, share in coverage.items() if share < 1]
+    return f"gradients reached every texel{', but only ' + ', '.join(partly) if partly else ''}"
 
 
 def _describe_fit(data: dict[str, Any]) -> str:
@@ -136,6 +222,7 @@ def _describe_fit(data: dict[str, Any]) -> str:
     lines = [
         f"{data['material']}: {data['model']}, {training['steps']} steps of {training['batch']} queries in "
         f"{clock(training['seconds'])} on {training['device']} ({rate / 1e6:.2f} M queries/s)",
+        _describe_coverage(training["coverage"]),
         *_describe_errors(data["errors"]),
     ]
     return "\n".join(lines)
