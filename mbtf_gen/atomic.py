@@ -230,15 +230,19 @@ def write_sealed(path: Path, data: Mapping[str, Any]) -> None:
     write_chunks(path, [content])
 
 
-def read_sealed(path: Path) -> dict[str, Any]:
+def read_sealed(path: Path, cure: str = "") -> dict[str, Any]:
     """JSON object of a sealed document, its checksum left out.
+
+    Parameters
+    ----------
+    cure : what to do about a document that is damaged
 
     Raises
     ------
     InputError : missing, unreadable, not a JSON object, or not what was written
     """
     content = _content(path)
-    data = _parsed(content, path)
+    data = _parsed(content, path, cure)
     head = content[: -len(_SEAL_TAIL) - _DIGITS]
     zeros = hashlib.sha256(_with_digits(content, b"0" * _DIGITS)).hexdigest()
     if (
@@ -246,7 +250,7 @@ def read_sealed(path: Path) -> dict[str, Any]:
         or not head.endswith(_SEAL_HEAD)
         or content[len(head) : len(head) + _DIGITS] != zeros.encode()
     ):
-        raise InputError("has changed since it was written (its checksum differs)", where=path)
+        raise InputError("has changed since it was written (its checksum differs)", where=path, cure=cure)
     del data[CHECKSUM]
     return data
 
@@ -260,13 +264,13 @@ def _content(path: Path) -> bytes:
         raise InputError(f"cannot be read ({error.strerror})", where=path) from None
 
 
-def _parsed(content: bytes, path: Path) -> dict[str, Any]:
+def _parsed(content: bytes, path: Path, cure: str = "") -> dict[str, Any]:
     try:
         data = json.loads(content.decode(), parse_constant=_refuse_constant)
     except (ValueError, RecursionError) as error:
-        raise InputError(f"not readable as JSON ({reason(error)})", where=path) from None
+        raise InputError(f"not readable as JSON ({reason(error)})", where=path, cure=cure) from None
     if not isinstance(data, dict):
-        raise InputError("must hold a JSON object", where=path)
+        raise InputError("must hold a JSON object", where=path, cure=cure)
     return data
 
 

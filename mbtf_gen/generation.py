@@ -220,10 +220,17 @@ def generate(
         raise PartialError(
             busy_message(made.busy), where=folder, cure="wait for it, then run the same command again"
         )
-    return finish(
+    summary = finish(
         folder,
         paths=made.paths,
         seconds=time.perf_counter() - start,
         writing=made.writing,
         waiting=made.waiting,
     )
+    if slice_count == 1 and not summary.complete:
+        raise PartialError(
+            "shards that were finished are gone or cannot be read",
+            where=folder,
+            cure="run the same command again",
+        )
+    return summary

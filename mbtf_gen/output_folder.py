@@ -44,10 +44,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     ------
     InputError : missing, unreadable, or changed
     """
-    try:
-        return read_sealed(folder / MANIFEST_NAME)
-    except InputError as error:
-        raise InputError(error.what, where=error.where, cure="mend it with: mbtf-gen repair FOLDER") from None
+    return read_sealed(folder / MANIFEST_NAME, "mend it with: mbtf-gen repair FOLDER")
 
 
 def holds(folder: Path, config_hash: str) -> bool:

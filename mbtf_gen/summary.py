@@ -184,12 +184,13 @@ def finish(
     )
     if complete and not manifest["complete"]:
         complete_manifest(folder, tally)
+    if complete:
+        sweep(folder)
     return summary
 
 
 def complete_manifest(folder: Path, tally: Tally) -> None:
-    """Say in the manifest that every shard is there, and what they hold together; clear away what killed runs
-    left.
+    """Say in the manifest that every shard is there, and what they hold together.
 
     Raises
     ------
@@ -209,7 +210,6 @@ def complete_manifest(folder: Path, tally: Tally) -> None:
                 **{name: tally.counts[name] for name in COUNTS},
             }
             write_sealed(folder / MANIFEST_NAME, manifest)
-    sweep(folder)
 
 
 def summary_dict(summary: Summary) -> dict[str, Any]:

@@ -47,7 +47,7 @@ RELAYS = {
     "mbtf_gen/material_checks.py": {
         *("flat_warning", "orientation_warning", "relief_warning", "seam_warning", "suggestion_warning"),
     },
-    "mbtf_gen/output_folder.py": {"_clear", "read_manifest"},
+    "mbtf_gen/output_folder.py": {"_clear"},
     "mbtf_gen/repairs.py": {"faults", "job", "mend"},
     "mbtf_gen/selftest_checks.py": {"_cuda"},
     "mbtf_gen/settings.py": {"_explain", "build"},

@@ -1,0 +1,193 @@
+"""Whatever happens to a run or its files: one clear message, and the same command gives the same data set."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import re
+import shutil
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from conftest import RunPython
+from support.datasets import edit
+from support.file_operations import FileOperations, Operation
+from support.small_runs import command, contents, die, ending, generate, in_child, noisy_plane
+
+from mbtf_gen.simulation import ClosedForm
+
+ERRORS = (errno.EIO, errno.ENOSPC, errno.EACCES, errno.EMFILE)
+PARTIAL_OR_INPUT = (3, 4)
+
+
+@pytest.fixture(autouse=True)
+def fast_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Values without a renderer, and no waiting for the disk: the system is not going to fail here."""
+    monkeypatch.setattr(ClosedForm, "estimate", noisy_plane)
+    monkeypatch.setattr(os, "fsync", lambda handle: None)
+
+
+@pytest.fixture
+def small(tmp_path: Path) -> Small:
+    """A run of three shards, its folder not there yet."""
+    return Small(tmp_path)
+
+
+class Small:
+    """A run of three shards.
+
+    Attributes
+    ----------
+    line : command line; out : its folder; whole : folder of an undisturbed run; expected : its contents
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.whole, self.out = folder / "whole", folder / "out"
+        self.line = command(folder, self.out, train=60)
+        assert generate(command(folder, self.whole, train=60)) == 0
+        self.expected = contents(self.whole)
+
+    def absent(self) -> None:
+        shutil.rmtree(self.out, ignore_errors=True)
+
+    def unmerged(self) -> None:
+        """Every shard is there, the manifest does not say so."""
+        self.absent()
+        shutil.copytree(self.whole, self.out)
+        edit(self.out / "manifest.json", lambda manifest: manifest.update(complete=False, summary=None))
+
+    def damaged(self) -> None:
+        """A shard, a sidecar, the configuration, and what a kill leaves."""
+        self.absent()
+        shutil.copytree(self.whole, self.out)
+        for name, at in (("train-00000.npz", 900), ("test-00000.json", 300), ("config.yaml", 40)):
+            flip(self.out / name, at)
+        (self.out / ".train-00001.lock").write_text("{}")
+        (self.out / ".train-00001.json.0123abcd-9.tmp").write_text("{")
+
+    def disowned(self) -> None:
+        """As before, and the manifest is damaged."""
+        self.damaged()
+        (self.out / "config.yaml").write_bytes((self.whole / "config.yaml").read_bytes())
+        flip(self.out / "manifest.json", 2000)
+
+
+def flip(path: Path, at: int, mask: int = 1) -> None:
+    content = bytearray(path.read_bytes())
+    content[at] ^= mask
+    path.write_bytes(content)
+
+
+def alike(operation: Operation) -> Operation:
+    """What one operation has in common with those on other shards."""
+    return operation[0], re.sub(r"(train|test)-\d+", "shard", operation[1]), operation[2]
+
+
+def operations(line: list[str], small: Small, prepare: Callable[[], None], thorough: bool) -> list[Operation]:
+    """What a command does below the folder; where not `thorough`, one of every third sort."""
+    prepare()
+    with FileOperations(small.out) as watch:
+        assert generate(line) == 0
+    assert contents(small.out) == small.expected
+    assert len(set(watch.seen)) == len(watch.seen) > 20
+    return (
+        watch.seen if thorough else list({alike(operation): operation for operation in watch.seen}.values())
+    )
+
+
+COMMANDS = {
+    "run": (Small.absent, lambda s: s.line),
+    "merge": (Small.unmerged, lambda s: ["merge", str(s.out)]),
+    "repair": (Small.damaged, lambda s: ["repair", str(s.out), "-q"]),
+    "repair of the manifest": (Small.disowned, lambda s: ["repair", str(s.out), "-q"]),
+    "overwrite": (Small.unmerged, lambda s: [*s.line, "--overwrite"]),
+}
+# The normal suite tries a sample of the commands that write most, the slow one everything.
+thoroughly = pytest.mark.parametrize(
+    ("name", "thorough"),
+    [
+        *((name, False) for name in ("run", "merge", "repair")),
+        *(pytest.param(name, True, marks=pytest.mark.slow) for name in COMMANDS),
+    ],
+)
+
+
+@thoroughly
+def test_any_file_operation_may_fail(
+    name: str, thorough: bool, small: Small, capsys: pytest.CaptureFixture[str]
+) -> None:
+    prepare, line_of = COMMANDS[name]
+    line = line_of(small)
+    refused = 0
+    for index, operation in enumerate(operations(line, small, lambda: prepare(small), thorough)):
+        for number in ERRORS if thorough else (ERRORS[index % len(ERRORS)],):
+            prepare(small)
+            capsys.readouterr()
+
+            def fail(now: Operation, at: Operation = operation, number: int = number) -> None:
+                if now == at:
+                    raise OSError(number, os.strerror(number), str(small.out / now[1]))
+
+            with FileOperations(small.out, fail) as watch:
+                code = generate(line)
+            captured = capsys.readouterr()
+            said = [x for x in captured.err.splitlines() if not x.startswith("warning: ")]
+            where = f"{operation} {errno.errorcode[number]}: {code} {said}"
+            assert operation in watch.seen
+            if code == 4 and not said:
+                assert "unfinished" in captured.out, where
+            elif code:
+                refused += 1
+                assert code in PARTIAL_OR_INPUT, where
+                assert 1 <= len(said) <= 2, where
+                assert said[0].startswith(f"error: {small.out}"), where
+            else:
+                # It did not matter, as for a lock that stays behind.
+                assert said == [], where
+            assert generate(line) == 0, where
+            assert contents(small.out) == small.expected, where
+    assert refused > 3
+
+
+@thoroughly
+def test_a_kill_at_any_file_operation_loses_nothing(name: str, thorough: bool, small: Small) -> None:
+    prepare, line_of = COMMANDS[name]
+    line = line_of(small)
+    killed = 0
+    for operation in operations(line, small, lambda: prepare(small), thorough):
+        prepare(small)
+
+        def kill(now: Operation, at: Operation = operation) -> None:
+            if now == at:
+                die()
+
+        def act(kill: Callable[[Operation], None] = kill) -> int:
+            with FileOperations(small.out, kill):
+                return generate(line)
+
+        assert ending(in_child(act)) == -signal.SIGKILL, operation
+        killed += 1
+        assert generate(line) == 0, operation
+        assert contents(small.out) == small.expected, operation
+    assert killed > 3
+
+
+@pytest.mark.parametrize(
+    "amounts",
+    [
+        "--kills 6 --flips 200 --repairs 5 --rendered 0",
+        pytest.param("--kills 150 --flips 3000 --repairs 60 --rendered 6", marks=pytest.mark.slow),
+    ],
+)
+def test_random_kills_lose_nothing_and_random_damage_is_found(amounts: str, run_python: RunPython) -> None:
+    script = Path(__file__).parents[2] / "benchmarks/crash_safety.py"
+    done = run_python(str(script), *amounts.split())
+    assert done.returncode == 0, done.stdout + done.stderr
+    figures = json.loads(done.stdout.splitlines()[-1])
+    assert figures["lost or not found"] == 0
+    assert figures["killed"]["kills"] >= 6
+    assert figures["killed"]["data sets"] > 0
+    assert figures["damaged"]["cuts"] > 0
