@@ -2,11 +2,11 @@
 
     python benchmarks/fit_losses.py
 
-One true value, many noisy ones around it: gamma noise, never negative and skewed as that of light paths, of a
-relative deviation of 0.3, 0.8 and 1.5 (a query of many, of some and of few paths). The prediction that minimises
-the mean loss is what training tends to; its distance from the true value is the bias. The variance model knows
-the noise, the robust rule is at its default. The rows "weighed by ..." are what weights from a query's own noisy
-value would do.
+One true value, many noisy ones around it: gamma noise, never negative and skewed as that of light paths, of
+a relative deviation of 0.3, 0.8 and 1.5 (a query of many, of some and of few paths). The prediction that
+minimises the mean loss is what training tends to; its distance from the true value is the bias. The variance
+model knows the noise, the robust rule is at its default. The rows "weighed by ..." show what weights from a
+query's own noisy value would do.
 
 The last line is one JSON object: figures, and the bar they are held to. Exit code 1 where it is missed.
 """

@@ -3,12 +3,13 @@
     python benchmarks/fit_sweep.py [--shards FOLDER] [--out FOLDER] [--time 100s] [--only NAME ...]
 
 Without ``--shards`` the yardstick's data set is made first (minutes; its maps lie beside the project). Every
-configuration of `SWEEP` is trained for the same time and judged on the test split: unexplained variance, noise-free.
-Prints one line each, and writes ``sweep.png`` (error of the held-out queries over seconds) and ``sweep.json`` into
-``--out``; configurations that the file already holds are not trained again, so that a sweep may be made in parts.
+configuration of `SWEEP` is trained for the same time and judged on the test split: unexplained variance,
+noise-free. Prints one line each, and writes ``sweep.png`` (error of the held-out queries over seconds) and
+``sweep.json`` into ``--out``; configurations that the file already holds are not trained again, so that a
+sweep may be made in parts.
 
-The last line is one JSON object with the figures; the bar: no other configuration of a model of the default's size
-is clearly better than the default.
+The last line is one JSON object with the figures; the bar: no other configuration of a model of the default's
+size is clearly better than the default.
 """
 
 from __future__ import annotations

@@ -9,6 +9,9 @@ from cyclopts import Parameter
 
 from mbtf_gen.console import CONSOLE, Console, clock, new_app
 from mbtf_gen.errors import InputError, PartialError, UsageError
+from mbtf_gen.quality import Quality, as_assignments
+
+from .wording import describe_errors, describe_fit, number, table
 
 if TYPE_CHECKING:
     from .config import FitConfig
@@ -19,12 +22,6 @@ Set = Annotated[
     list[str], Parameter(name="--set", help="Set any option of the configuration, a.b=c. Repeatable.")
 ]
 Output = Annotated[Path, Parameter(name=["--output", "-o"])]
-_SPLITS = {
-    "test": "test",
-    "held_out_queries": "held-out queries",
-    "held_out_directions": "held-out directions",
-    "training": "training queries",
-}
 
 
 @app.default
@@ -35,6 +32,7 @@ def fit(
     output: Output = Path("material"),
     many: Annotated[list[Path] | None, Parameter(consume_multiple=True, negative="")] = None,
     processes: int | None = None,
+    quality: Quality | None = None,
     model: Literal["neumip", "neumip-baseline", "hierarchical"] | None = None,
     time: str | None = None,
     steps: int | None = None,
@@ -62,6 +60,8 @@ def fit(
         one folder per line. A failure stops none of the others.
     processes
         With --many, fits that run side by side. Default: one per GPU, or 1
+    quality
+        Training time and size that belong together; other options change single ones.
     model
         Model to fit. Default: neumip
     time
@@ -93,6 +93,7 @@ def fit(
     from mbtf_gen.settings import resolve
 
     from .config import FitConfig
+    from .quality import FITTER
 
     flags = {
         "model": model,
@@ -104,7 +105,8 @@ def fit(
         "device": device,
     }
     # Time asked for on the command line takes the place of steps in a file.
-    assigned = [*(assignments or []), *(["training.steps=null"] if time is not None else [])]
+    assigned = as_assignments(FITTER[quality]) if quality else []
+    assigned += [*(assignments or []), *(["training.steps=null"] if time is not None else [])]
     resolved = resolve(FitConfig, file=config, assignments=assigned, flags=flags)
     training = resolved.training
     budget = format_duration(training.time) if training.steps is None else f"{training.steps} steps"
@@ -126,7 +128,7 @@ def fit(
             progress=lambda share, note: bar.update(round(100 * share, 1), note),
         )
     data = result.as_dict()
-    console.report(data, _describe_fit(data))
+    console.report(data, describe_fit(data))
 
 
 def _fit_many(
@@ -164,12 +166,12 @@ def _fit_many(
         rows.append(
             [
                 outcome.folder.name,
-                _number(test["unexplained"]),
+                number(test["unexplained"]),
                 str(training["steps"]),
                 clock(training["seconds"]),
             ]
         )
-    console.report({"fits": [o.as_dict() for o in outcomes]}, _table(rows))
+    console.report({"fits": [o.as_dict() for o in outcomes]}, table(rows))
     failed = [o for o in outcomes if o.error is not None]
     for outcome in failed:
         console.note(f"{outcome.shards}: {outcome.error}")
@@ -179,53 +181,6 @@ def _fit_many(
             where=output,
             cure="the same command again takes up what is not finished",
         )
-
-
-def _table(rows: list[list[str]]) -> str:
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = ("  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)) for row in rows)
-    return "\n".join(line.rstrip() for line in lines)
-
-
-def _describe_errors(errors: dict[str, Any]) -> list[str]:
-    """A table: overall, by level of detail and by lowest cosine; a column per split, with error bars."""
-    splits = list(errors)
-    rows = [["unexplained variance", *(_SPLITS[name] for name in splits)]]
-    rows.append(["all", *(_number(errors[name]["unexplained"]) for name in splits)])
-    for grouping, label in (("levels", "level"), ("elevations", "cosine")):
-        groups = {group: None for name in splits for group in errors[name][grouping]}
-        for group in sorted(groups, key=lambda g: float(g.split("-")[0])):
-            found = [errors[name][grouping].get(group) for name in splits]
-            rows.append(
-                [f"{label} {group}", *("-" if e is None else _number(e["unexplained"]) for e in found)]
-            )
-    rows.append(["queries", *(str(errors[name]["n"]) for name in splits)])
-    return _table(rows).splitlines()
-
-
-def _number(estimate: dict[str, Any]) -> str:
-    if estimate["value"] is None:
-        return "undefined"
-    error = "?" if estimate["error"] is None else f"{estimate['error']:.3f}"
-    return f"{estimate['value']:.3f} ± {error}"
-
-
-def _describe_coverage(coverage: dict[str, float]) -> str:
-    """Which levels gradients have reached."""
-    partly = [f"{share:.1%} of level {level}" for level, share in coverage.items() if share < 1]
-    return f"gradients reached every texel{', but only ' + ', '.join(partly) if partly else ''}"
-
-
-def _describe_fit(data: dict[str, Any]) -> str:
-    training = data["training"]
-    rate = training["steps"] * training["batch"] / max(training["seconds"], 1e-9)
-    lines = [
-        f"{data['material']}: {data['model']}, {training['steps']} steps of {training['batch']} queries in "
-        f"{clock(training['seconds'])} on {training['device']} ({rate / 1e6:.2f} M queries/s)",
-        _describe_coverage(training["coverage"]),
-        *_describe_errors(data["errors"]),
-    ]
-    return "\n".join(lines)
 
 
 @app.command
@@ -256,7 +211,7 @@ def evaluate(material: Path, shards: Path, /, *, console: Console = CONSOLE) -> 
     errors = {name: e.as_dict() for name, e in evaluate(loaded, shards).items()}
     console.report(
         {"material": material, "shards": shards, "foreign_inputs": foreign, "errors": errors},
-        "\n".join([f"{material}: {loaded.config.model} on {shards}", *_describe_errors(errors)]),
+        "\n".join([f"{material}: {loaded.config.model} on {shards}", *describe_errors(errors)]),
     )
 
 
@@ -388,7 +343,7 @@ def _material_info(path: Path) -> tuple[dict[str, Any], str]:
         f"{weights['network_weights']} network weights, {weights['texels']} numbers in textures, "
         f"{size / 1e6:.2f} MB",
         f"trained {training['steps']} steps of {training['batch']} in {clock(training['seconds'])}",
-        *_describe_errors(training["errors"]),
+        *describe_errors(training["errors"]),
         f"conformance: {description['conformance']['count']} queries, largest deviation {deviation:.2g}",
     ]
     return {

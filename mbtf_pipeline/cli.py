@@ -10,6 +10,7 @@ from cyclopts import Parameter
 
 from mbtf_gen.console import CONSOLE, Console, clock, new_app
 from mbtf_gen.errors import InputError, MbtfError, UsageError
+from mbtf_gen.quality import Quality
 
 if TYPE_CHECKING:
     from .run import RunResult
@@ -27,6 +28,7 @@ def run(
     /,
     *,
     output: Output = None,
+    quality: Quality | None = None,
     force: Annotated[bool, Parameter(negative="")] = False,
     assignments: Set | None = None,
     console: Console = CONSOLE,
@@ -41,14 +43,18 @@ def run(
         YAML file.
     output
         Folder of the run. Default: out/NAME
+    quality
+        Sizes and times of all stages, in place of the recipe's.
     force
         Run every stage, also those that are up to date.
     """
+    from .quality import quality_assignments
     from .recipe import load_recipe
     from .run import run_recipe
 
-    loaded = load_recipe(recipe, assignments or [])
+    loaded = load_recipe(recipe, [*quality_assignments(recipe, quality), *(assignments or [])])
     command = ["mbtf-pipeline", "run", str(recipe)]
+    command += ["--quality", quality] if quality is not None else []
     command += ["-o", str(output)] if output is not None else []
     command += [part for a in assignments or [] for part in ("--set", a)]
     result = run_recipe(loaded, output, force=force, command=shlex.join(command), console=console)

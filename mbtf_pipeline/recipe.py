@@ -166,6 +166,19 @@ def load_recipe(path: Path, assignments: Sequence[str] = ()) -> Recipe:
     return recipe.model_copy(update={"generate": generate})
 
 
+def fit_names(path: Path) -> list[str]:
+    """Dotted names of the fits of a recipe's file: ``fit``, or ``fit.NAME`` of each.
+
+    Raises
+    ------
+    InputError : the file cannot be read
+    """
+    fits = read_yaml(_find(path)).get("fit")
+    if not isinstance(fits, Mapping) or _is_single(fits):
+        return ["fit"]
+    return [f"fit.{name}" for name in fits]
+
+
 # Materials that are published and not part of the project, by the name of their folder.
 _PUBLISHED = {"rock_cliff": "ambientCG Rock023 (CC0, https://ambientcg.com/view?id=Rock023)"}
 

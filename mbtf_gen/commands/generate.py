@@ -10,6 +10,7 @@ from cyclopts import Parameter
 
 from ..console import CONSOLE, Console, clock, going_on
 from ..errors import UsageError
+from ..quality import GENERATOR, Quality, as_assignments
 from ..schema import Tiling
 from .common import Output, Set, general, resolve_config
 
@@ -28,6 +29,7 @@ def generate(
     /,
     *,
     output: Output = None,
+    quality: Quality | None = None,
     queries: str | None = None,
     test_queries: str | None = None,
     spp: int | None = None,
@@ -59,6 +61,8 @@ def generate(
         Height map, folder of maps, or material.yaml.
     output
         Folder of shards. Default: shards/
+    quality
+        Numbers of queries and paths that belong together; other options change single ones.
     queries
         Training queries: N, or N/texel of the finest level. Default: 100/texel
     test_queries
@@ -112,7 +116,8 @@ def generate(
             height=height, mesh=mesh, tile=tile, light_width=light_width, max_depth=max_depth, seed=seed
         ),
     }
-    resolved = resolve_config(GeneratorConfig, material, config, assignments or [], flags)
+    assigned = [*as_assignments(GENERATOR[quality] if quality else {}), *(assignments or [])]
+    resolved = resolve_config(GeneratorConfig, material, config, assigned, flags)
     part = _slice(shards)
     from ..generation import Job, generate, paths_left
     from ..summary import summary_dict

@@ -1,0 +1,45 @@
+"""Qualities: settings that belong together, from a first look to the papers' sizes.
+
+A quality is laid over the configuration file and under ``--set`` and flags. What each costs and reaches was
+measured by ``benchmarks/quality.py``; docs/cost.md shows the table.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+Quality = Literal["draft", "standard", "high", "paper"]
+
+# The generator's options by quality, dotted names.
+GENERATOR: dict[Quality, dict[str, Any]] = {
+    "draft": {
+        "queries.train": "100/texel",
+        "queries.spp": 4,
+        "queries.test": "8192",
+        "queries.test_spp": 64,
+    },
+    "standard": {
+        "queries.train": "400/texel",
+        "queries.spp": 4,
+        "queries.test": "32768",
+        "queries.test_spp": 128,
+    },
+    "high": {
+        "queries.train": "1600/texel",
+        "queries.spp": 4,
+        "queries.test": "65536",
+        "queries.test_spp": 512,
+    },
+    # Kuznetsov et al. 2021: 200 to 400 queries per texel of 64 paths.
+    "paper": {
+        "queries.train": "400/texel",
+        "queries.spp": 64,
+        "queries.test": "65536",
+        "queries.test_spp": 1024,
+    },
+}
+
+
+def as_assignments(options: dict[str, Any], prefix: str = "") -> list[str]:
+    """Options as ``a.b=c`` of ``--set``."""
+    return [f"{prefix}{name}={'null' if value is None else value}" for name, value in options.items()]
