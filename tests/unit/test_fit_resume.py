@@ -15,7 +15,7 @@ from mbtf_fit.config import FitConfig
 from mbtf_fit.fitting import fit, read_history
 from mbtf_fit.training import Trainer
 
-STEPS = 24
+STEPS = 14
 
 
 class Killed(BaseException):
@@ -34,7 +34,7 @@ def config(memory: str = "1GB") -> FitConfig:
 
 @pytest.fixture
 def often(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Look every step, save every third or so."""
+    """Look and save after every step."""
     monkeypatch.setattr(mbtf_fit.fitting, "_REPORT_SECONDS", 0.0)
     monkeypatch.setattr(mbtf_fit.fitting, "_CHECKPOINT_SECONDS", 0.0)
 
@@ -48,7 +48,7 @@ def test_killed_at_random_steps_it_ends_with_the_same_bits(
     out, step, kills = tmp_path / "killed", Trainer._step, 0
     saved = mbtf_fit.fitting.write_tensors
     while not (out / "material.json").exists():
-        left = int(random.integers(1, 9))
+        left = int(random.integers(1, 7))
 
         def dying(self: Trainer, *arguments: Any) -> torch.Tensor:
             nonlocal left
@@ -69,7 +69,7 @@ def test_killed_at_random_steps_it_ends_with_the_same_bits(
         except Killed:
             kills += 1
             assert kills < 200
-    assert kills >= 3
+    assert kills >= 2
     mine, other = found.material.model.weights(), whole.material.model.weights()
     assert all(torch.equal(mine[name], other[name]) for name in other)
     assert found.errors == whole.errors
