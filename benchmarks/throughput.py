@@ -3,14 +3,18 @@
     python benchmarks/throughput.py [--material PATH] [--runs 5] [--queries 262144] [--spp 16]
 
 **ours**: random 7D queries (σ over all levels, both directions uniform on the projected disk) against a tile
-of 512² cells, ``principled`` with bitmaps of colour and roughness, light of 1° RMS, at most 6 interactions.
+of 512² cells with bitmaps of colour and roughness, light of 1° RMS, at most 6 interactions.
 **stock**: ``mi.render`` with the ``path`` integrator, one directional light, the same mesh as a single tile
 seen straight from above by an orthographic camera, as many paths, the same limits on depth: coherent rays,
 every one of which hits. It is what the renderer can do at best, not a goal for random queries.
 
+Both sides reflect by ``mbtf_surface`` with the same maps, and end paths by the same rule and depth. Variance
+× time is the noise of a query (a pixel) of `spp` paths, relative to the mean, times the seconds of the run;
+queries and pixels do not show the same, so only figures of one side are to be compared with each other.
+
 The two alternate, run by run, after one run of each that compiles the kernels. The last line is one JSON
-object: figures, and the bar they are held to. Exit code 1 where the bar is missed; on other than two cores
-it is only reported.
+object: figures, and the bar they are held to, which is the ratio of the two rates. Exit code 1 where the bar
+is missed; on other than two cores it is only reported.
 """
 
 from __future__ import annotations
@@ -40,9 +44,13 @@ MESH = 512
 DEPTH = 6
 ROULETTE = 3
 LIGHT_WIDTH = 1.0
-# Million paths per second on two cores.
-BAR = 0.9
+# Our rate over the stock rate, on two cores; the aim is 1.
+BAR = 0.75
 BAR_CORES = 2
+
+
+# (seconds, variance over the squared mean of one query or pixel) of a run of a given number.
+Run = Callable[[int], tuple[float, float]]
 
 
 def noise(rng: np.random.Generator, cutoff: float) -> NDArray[np.float64]:
@@ -72,8 +80,8 @@ def rocky() -> Material:
     )
 
 
-def our_run(material: Material, grid: HeightGrid, count: int, spp: int) -> Callable[[int], float]:
-    """A function of the run's number that traces `count` queries and returns the seconds it took."""
+def our_run(material: Material, grid: HeightGrid, count: int, spp: int) -> Run:
+    """A function of the run's number that traces `count` queries."""
     from mbtf_gen.bsdf import bsdf_of
     from mbtf_gen.estimator import Estimator, Stream
     from mbtf_gen.light import LightKernel
@@ -88,19 +96,20 @@ def our_run(material: Material, grid: HeightGrid, count: int, spp: int) -> Calla
     # which are faster.
     plan = QueryPlan(lattice, Mixture(1.0, 0.0), 0.1, "shuffled", 0, count)
 
-    def run(number: int) -> float:
+    def run(number: int) -> tuple[float, float]:
         queries = plan.draw("train", number, count)
         start = time.perf_counter()
         estimates = estimator.estimate(queries, spp, Stream(0, "train", number))
         seconds = time.perf_counter() - start
         if estimates.lost or not estimates.value_a.mean() > 0:
             raise SystemExit("rays were lost, or the picture is black: the figures mean nothing")
-        return seconds
+        a, b = estimates.value_a.astype(np.float64), estimates.value_b.astype(np.float64)
+        return seconds, float(np.mean((a - b) ** 2) / np.mean(a + b) ** 2)
 
     return run
 
 
-def stock_run(material: Material, grid: HeightGrid, count: int, spp: int) -> Callable[[int], float]:
+def stock_run(material: Material, grid: HeightGrid, count: int, spp: int) -> Run:
     """The same for ``mi.render`` and a picture of `count` pixels."""
     import drjit as dr
     import mitsuba as mi
@@ -142,16 +151,25 @@ def stock_run(material: Material, grid: HeightGrid, count: int, spp: int) -> Cal
         }
     )
 
-    def run(number: int) -> float:
+    last: NDArray[np.float64] | None = None
+
+    def run(number: int) -> tuple[float, float]:
+        nonlocal last
         start = time.perf_counter()
         picture = mi.render(scene, seed=number)
         dr.eval(picture)
         dr.sync_thread()
         seconds = time.perf_counter() - start
-        if not float(np.array(picture).mean()) > 0:
+        image = np.array(picture, np.float64)
+        if not image.mean() > 0:
             raise SystemExit("the stock picture is black: the figures mean nothing")
+        # From this run's picture and the one before, of other random numbers.
+        variance = (
+            float("nan") if last is None else float(np.mean((image - last) ** 2) / 2 / image.mean() ** 2)
+        )
+        last = image
         # As if it had exactly as many paths as ours.
-        return seconds * count / (rows * columns)
+        return seconds * count / (rows * columns), variance
 
     return run
 
@@ -188,29 +206,39 @@ def main() -> int:
     makers: dict[str, Any] = {"ours": our_run, "stock": stock_run}
     runs = {name: make(material, grid, arguments.queries, arguments.spp) for name, make in makers.items()}
     seconds: dict[str, list[float]] = {name: [] for name in runs}
+    variances: dict[str, list[float]] = {name: [] for name in runs}
     for number in range(-1, arguments.runs):
         for name, run in runs.items():
-            took = run(number + 1)
+            took, variance = run(number + 1)
             if number >= 0:
                 seconds[name].append(took)
+                variances[name].append(variance)
                 print(f"run {number + 1}: {name:5s} {took:.2f} s", file=sys.stderr)
     paths = arguments.queries * arguments.spp
     figures = {name: spread(took, paths) for name, took in seconds.items()}
     cores = dr.thread_count()
+    products = {
+        name: float(f"{statistics.median(seconds[name]) * statistics.mean(variances[name]):.3g}")
+        for name in runs
+    }
     for name, rates in figures.items():
-        print(f"{name:5s} {rates['median']:.2f} M paths/s ({rates['min']:.2f} to {rates['max']:.2f})")
+        print(
+            f"{name:5s} {rates['median']:.2f} M paths/s ({rates['min']:.2f} to {rates['max']:.2f}), "
+            f"relative variance x time {products[name]:.3g} s"
+        )
     ratio = round(figures["ours"]["median"] / figures["stock"]["median"], 3)
     print(f"ours / stock {ratio:.2f}; {cores} threads, {paths} paths per run")
-    met = figures["ours"]["median"] >= BAR
+    met = ratio >= BAR
     report = {
         "figures": {
             "million_paths_per_second": figures,
             "ours_over_stock": ratio,
+            "relative_variance_times_seconds": products,
             "threads": cores,
             "paths_per_run": paths,
             "material": str(arguments.material) if arguments.material else "own relief",
         },
-        "bars": {"ours_median_on_two_cores": BAR},
+        "bars": {"ours_over_stock_on_two_cores": BAR},
         "met": met if cores == BAR_CORES else None,
     }
     print(json.dumps(report))

@@ -47,6 +47,14 @@ def _spread_bits(x: Any) -> Any:
     return (x | (x << 1)) & 0x5555
 
 
+def _aligned(numbers: NDArray[Any]) -> Any:
+    """Lane numbers as a copy: memory borrowed from NumPy is aligned by chance, and kernels that read it are
+    compiled for either case."""
+    copied = mi.UInt32(numbers.astype(np.uint32)) + dr.opaque(mi.UInt32, 0)
+    dr.eval(copied)
+    return copied
+
+
 class Estimator:
     """Traces queries against one tile.
 
@@ -125,6 +133,9 @@ class Estimator:
             inverse = mi.Float(0.0)
         else:
             inverse = mi.Float((1.0 / self.light.irradiance(part.omega_i)).astype(np.float32))
+        # Before any kernel reads them: their places in NumPy's array, and so the number of queries, would be
+        # a part of it.
+        dr.eval(omega_i, inverse)
         lanes = dr.arange(mi.UInt32, count * spp)
 
         def trace_lanes(which: Any, attempt: int) -> tuple[Any, Any, int, int]:
@@ -236,7 +247,7 @@ class Estimator:
         cell = mi.Vector2u((point - dr.floor(point)) * 256.0)
         key = _spread_bits(cell.x) | (_spread_bits(cell.y) << 1)
         dr.eval(point, key)
-        order = mi.UInt32(np.argsort(np.array(key).astype(np.uint16), kind="stable").astype(np.uint32))
+        order = _aligned(np.argsort(np.array(key).astype(np.uint16), kind="stable"))
 
         lane = dr.gather(mi.UInt32, lanes, order)
         query = lane // spp

@@ -204,7 +204,11 @@ def _cell(position: Any, low: Any, length: Any, cells: Any) -> tuple[Any, Any]:
 
 
 def _step(field: HeightField, walk: Walk, slant: Slant, max_crossings: Any) -> Walk:
-    """Look at one block: go past it, or down to the next level, or end."""
+    """Look at one block: go past it, or down to the next level, or end.
+
+    Rays that have met the surface stay where they are; those that have ended otherwise may go on, but nothing
+    comes of it.
+    """
     # The block, and the ray's place in it.
     mask = -(mi.Int32(1) << walk.level)
     left, low = walk.column & mask, walk.row & mask
@@ -230,7 +234,7 @@ def _step(field: HeightField, walk: Walk, slant: Slant, max_crossings: Any) -> W
     under = (diagonal > 0) & (diagonal < end) & (dr.fma(diagonal, slope, here) <= 0)
     # Written so that NaN counts as a hit: it must reach the value, where it is found and drawn again.
     free = (dr.fma(end, slope, here) - fold > 0) & (leaf | (here > 0)) & ~under
-    walk.hit = leaf & ~free
+    walk.hit |= walk.searching & leaf & ~free
 
     # Past the block, into the next cell.
     end = dr.select(free, end, 0.0)
@@ -253,10 +257,10 @@ def _step(field: HeightField, walk: Walk, slant: Slant, max_crossings: Any) -> W
     gone = slant.rising & (walk.z >= field.top)
     if field.two_sided:
         gone = (gone & (slant.side > 0)) | (~slant.rising & (walk.z <= field.bottom) & (slant.side < 0))
-    crossed = ((walk.column != i) | (walk.row != j)) & ~gone
-    walk.capped = crossed & (walk.crossings >= max_crossings)
+    crossed = ((walk.column != i) | (walk.row != j)) & walk.searching & ~gone
+    walk.capped |= crossed & (walk.crossings >= max_crossings)
     walk.crossings += dr.select(crossed & ~walk.capped, mi.UInt32(1), 0)
-    walk.searching = ~walk.hit & ~gone & ~walk.capped
+    walk.searching &= ~walk.hit & ~gone & ~walk.capped
     return walk
 
 
@@ -284,8 +288,7 @@ def _surface(field: HeightField, walk: Walk, slant: Slant, d: Any) -> Any:
         dr.fma(t, slant.z, walk.z),
     )
     n = dr.normalize(mi.Normal3f(-(node.y + fold) / field.cell[0], -(node.z + fold) / field.cell[1], 1.0))
-    u, v = (x + 0.5) / mi.Float(field.columns), (y + 0.5) / mi.Float(field.rows)
-    return interaction(p, n, mi.Point2f(u, 1.0 - v), d, field.size, walk.hit)
+    return interaction(p, n, d, field.size, walk.hit)
 
 
 @dr.syntax
@@ -294,6 +297,18 @@ def _follow(field: HeightField, walk: Walk, slant: Slant, max_crossings: int) ->
     while dr.hint(walk.searching, exclude=[field, slant]):
         walk = _step(field, walk, slant, max_crossings)
     return walk
+
+
+@dr.syntax
+def _follow_two(
+    field: HeightField, one: Walk, slant_one: Slant, two: Walk, slant_two: Slant, max_crossings: int
+) -> tuple[Walk, Walk]:
+    """:func:`_follow` for two rays of each lane at a time. A step of one ray is a chain of instructions that
+    wait for each other; those of two rays fill each other's gaps."""
+    while dr.hint(one.searching | two.searching, exclude=[field, slant_one, slant_two]):
+        one = _step(field, one, slant_one, max_crossings)
+        two = _step(field, two, slant_two, max_crossings)
+    return one, two
 
 
 @dr.syntax
@@ -362,3 +377,26 @@ def occluded(
     """
     walk, _, rng = _search(field, ray, active, max_crossings, below, holes, rng)
     return walk.hit | walk.capped, walk.crossings, walk.capped, rng
+
+
+def hit_and_shadow(
+    field: HeightField,
+    ray: Any,
+    active: Any,
+    shadow_ray: Any,
+    shadow_active: Any,
+    max_crossings: int,
+    below: Any = False,
+    shadow_below: Any = False,
+) -> tuple[Any, Any, Any, Any]:
+    """:func:`closest_hit` of a ray and :func:`occluded` of another at once, where there are no holes.
+
+    Returns
+    -------
+    (surface interaction; lanes whose ray hit the cap; occluded; lanes whose other ray hit the cap)
+    """
+    walk, slant = _start(field, ray, active, below)
+    shadow, shadow_slant = _start(field, shadow_ray, shadow_active, shadow_below)
+    walk, shadow = _follow_two(field, walk, slant, shadow, shadow_slant, max_crossings)
+    hit = _surface(field, walk, slant, ray.d)
+    return hit, walk.capped, shadow.hit | shadow.capped, shadow.capped

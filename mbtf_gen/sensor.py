@@ -55,6 +55,7 @@ class QuerySensor(mi.Sensor):
         self.u = mi.Point2f(queries.u.T.copy())
         self.sigma = mi.Float(queries.sigma)
         self.omega_o = mi.Vector3f(queries.omega_o.T.copy())
+        dr.eval(self.u, self.sigma, self.omega_o)
 
     def footprint(self, query: Any, xi: Any) -> Any:
         """uv of a point of the footprint of the given queries, not wrapped; `xi` in [0,1)²."""

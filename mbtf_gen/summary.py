@@ -30,6 +30,7 @@ class Summary:
     paths, seconds : traced in this run, and its duration
     writing_seconds : what writing and digesting took beside the rendering
     waiting_seconds : how long rendering waited for it
+    shard_seconds : of all finished shards, over all runs
     relative_error : pooled relative standard error of the stored training values, √(mean variance) / mean
         value
     mean_value : mean training value per channel, 1/sr
@@ -45,6 +46,7 @@ class Summary:
     paths_per_second: float
     writing_seconds: float
     waiting_seconds: float
+    shard_seconds: float
     relative_error: float
     mean_value: list[float]
     lost: int
@@ -175,6 +177,7 @@ def finish(
         paths_per_second=round(paths / seconds, 1) if seconds > 0 else 0.0,
         writing_seconds=round(writing, 3),
         waiting_seconds=round(waiting, 3),
+        shard_seconds=round(tally.seconds, 3),
         relative_error=tally.relative_error(),
         mean_value=tally.mean_value(),
         lost=tally.counts["lost_rays"],

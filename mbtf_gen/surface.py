@@ -215,16 +215,16 @@ class SurfacePoint:
         coat, lobe, several = mi.Float(0.0), mi.Float(0.0), mi.Float(0.0)
         if self.parts.specular or self.parts.metallic:
             # Energies towards the viewer.
-            strong = dr.mean(self.lobe.share(self.lobe.towards_viewer))
-            broad = dr.mean(self.base * (1.0 - self.metallic)) * self.left
-            again = dr.mean(self.returned) * self.lost if self.parts.metallic else mi.Float(0.0)
+            strong = _mean(self.lobe.share(self.lobe.towards_viewer))
+            broad = _mean(self.base * (1.0 - self.metallic)) * self.left
+            again = _mean(self.returned) * self.lost if self.parts.metallic else mi.Float(0.0)
             lobe = dr.clip(strong / dr.maximum(strong + broad + again, 1e-6), *LOBE_CHANCES)
             lobe = dr.select(broad + again > 0, lobe, 1.0)
             if self.parts.metallic:
                 several = (1.0 - lobe) * again / dr.maximum(broad + again, 1e-12)
         if self.parts.coat:
-            share = self.coat_weight * dr.mean(self.coat.share(self.coat.towards_viewer))
-            coat = dr.clip(share / dr.maximum(share + (1.0 - share) * dr.mean(self.base), 1e-6), 0.05, 0.9)
+            share = self.coat_weight * _mean(self.coat.share(self.coat.towards_viewer))
+            coat = dr.clip(share / dr.maximum(share + (1.0 - share) * _mean(self.base), 1e-6), 0.05, 0.9)
             coat = dr.select(self.coat_weight > 0, coat, 0.0)
             lobe *= 1.0 - coat
             several *= 1.0 - coat
@@ -232,8 +232,8 @@ class SurfacePoint:
 
     def _below_coat(self, cosine: Any) -> Any:
         """What the coat lets through of both directions."""
-        viewer = 1.0 - self.coat_weight * dr.mean(self.coat.share(self.coat.towards_viewer))
-        light = 1.0 - self.coat_weight * dr.mean(
+        viewer = 1.0 - self.coat_weight * _mean(self.coat.share(self.coat.towards_viewer))
+        light = 1.0 - self.coat_weight * _mean(
             self.coat.share(self.coat.tables.at(cosine, self.coat.roughness))
         )
         return viewer * light
@@ -304,6 +304,12 @@ class SurfacePoint:
                 # A direction of NaN would meet nothing and bring no light.
                 weight = dr.select(dr.isnan(self.wi.z), dr.nan, weight)
         return omega, dr.select(good, weight, 0.0), dr.select(good, pdf, 0.0)
+
+
+def _mean(colour: Any) -> Any:
+    """Mean of a colour's channels; `dr.mean` makes the number of lanes a part of the kernel, so that every
+    launch of another size would be compiled anew."""
+    return (colour.x + colour.y + colour.z) * (1.0 / 3.0)
 
 
 def _tilted(si: Any, slopes: Any, towards_viewer: Any) -> Any:

@@ -19,13 +19,13 @@ horizon.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, Literal
 
 import drjit as dr
 import mitsuba as mi
 
-from .field import HeightField, closest_hit, occluded
+from .field import HeightField, closest_hit, hit_and_shadow, occluded
 from .hits import interaction
 
 # Roulette leaves paths of throughput one alone, for dividing by a survival chance below it makes their
@@ -139,15 +139,14 @@ class World:
 
 @dataclass
 class Path:
-    """State of lanes' paths.
+    """State of lanes' paths between two surface interactions: at a place that their last ray met.
 
     Attributes
     ----------
-    ray : next ray to follow
-    below : it starts below the surface
+    p, n : the place, in scene units, and the surface's normal there
+    d : direction of the ray that met it
     radiance : found so far
     throughput : weight of what is still to be found
-    pdf : density with which the last bounce chose its direction; infinite for mirrors and for the first ray
     depth : surface interactions so far
     rng : random numbers, :class:`~mbtf_gen.sampling.Points`
     capped : rays cut off at the cap on crossings
@@ -156,11 +155,11 @@ class Path:
     active : lanes that go on
     """
 
-    ray: Any
-    below: Any
+    p: Any
+    n: Any
+    d: Any
     radiance: Any
     throughput: Any
-    pdf: Any
     depth: Any
     rng: Any
     capped: Any
@@ -169,36 +168,93 @@ class Path:
     active: Any
 
 
+@dataclass(frozen=True)
+class Onward:
+    """Rays on their way to the next place.
+
+    Attributes
+    ----------
+    ray : the ray
+    below : it starts below the surface
+    pdf : density with which its direction was chosen; infinite for mirrors and for the first ray
+    """
+
+    ray: Any
+    below: Any
+    pdf: Any
+
+
+@dataclass(frozen=True)
+class Shadow:
+    """Rays towards the light, which bring its light unless something is in their way.
+
+    Attributes
+    ----------
+    ray, below : as of :class:`Onward`
+    active : lanes that have such a ray
+    radiance : what it brings
+    """
+
+    ray: Any
+    below: Any
+    active: Any
+    radiance: Any
+
+
 def _on_plane(world: World, ray: Any, active: Any) -> Any:
     """Hits of rays on the reference plane."""
-    t = -ray.o.z / ray.d.z
-    p, size = ray(t), world.field.size
-    uv = mi.Point2f(p.x / size[0] + 0.5, 0.5 - p.y / size[1])
-    return interaction(p, mi.Normal3f(0, 0, 1), uv, ray.d, size, active & (ray.d.z < 0))
+    p = ray(-ray.o.z / ray.d.z)
+    return interaction(p, mi.Normal3f(0, 0, 1), ray.d, world.field.size, active & (ray.d.z < 0))
 
 
-def _visible(world: World, path: Path, transport: Transport) -> tuple[Any, Any, Any]:
-    """Parallax and masking, periodic neighbours, holes: (what a path's ray meets, lanes that hit the cap,
-    lanes that passed through the tile)."""
-    parts = world.surface.parts
-    holes = world.surface if parts.opacity else None
-    if not transport.displacement:
-        si = _on_plane(world, path.ray, path.active)
-        if holes is not None:
-            si.t = dr.select(path.rng.chance() < holes.opacity(si), si.t, dr.inf)
-        capped = mi.Bool(False)
-    else:
+def _visible(
+    world: World, path: Path, onward: Onward, shadow: Shadow | None, transport: Transport
+) -> tuple[Any, Any]:
+    """Parallax and masking, shadowing, periodic neighbours, holes: (what paths' rays meet, lanes that hit the
+    cap). Light of shadow rays that meet nothing is added to the paths."""
+    holes = world.surface if world.surface.parts.opacity else None
+    field, most = world.field, transport.max_crossings
+    if shadow is None:
+        if not transport.displacement:
+            si = _on_plane(world, onward.ray, path.active)
+            if holes is not None:
+                si.t = dr.select(path.rng.chance() < holes.opacity(si), si.t, dr.inf)
+            return si, mi.Bool(False)
         si, _, capped, path.rng = closest_hit(
-            world.field, path.ray, path.active, transport.max_crossings, path.below, holes, path.rng
+            field, onward.ray, path.active, most, onward.below, holes, path.rng
         )
-    downward = path.active & ~si.is_valid() & ~capped & (path.ray.d.z <= 0)
-    return si, capped, downward
+        return si, capped
+    if holes is None:
+        si, capped, blocked, shadow_capped = hit_and_shadow(
+            field, onward.ray, path.active, shadow.ray, shadow.active, most, onward.below, shadow.below
+        )
+        _light_up(path, shadow, blocked, shadow_capped)
+        return si, capped
+    _shadowed(world, path, shadow, transport)
+    return _visible(world, path, onward, None, transport)
 
 
-def _direct(world: World, path: Path, si: Any, point: Any, light: LaneLight, transport: Transport) -> Any:
-    """Direct light that a surface point sends along a path, by next-event estimation; with shadowing."""
+def _shadowed(world: World, path: Path, shadow: Shadow, transport: Transport) -> None:
+    """Shadowing alone, for paths that end."""
+    holes = world.surface if world.surface.parts.opacity else None
+    blocked, _, capped, path.rng = occluded(
+        world.field, shadow.ray, shadow.active, transport.max_crossings, shadow.below, holes, path.rng
+    )
+    _light_up(path, shadow, blocked, capped)
+
+
+def _light_up(path: Path, shadow: Shadow, blocked: Any, capped: Any) -> None:
+    path.radiance += dr.select(shadow.active & ~blocked, shadow.radiance, 0.0)
+    path.capped[capped] += 1
+
+
+def _direct(
+    world: World, path: Path, si: Any, point: Any, light: LaneLight, transport: Transport
+) -> Shadow | None:
+    """Direct light that a surface point sends along a path, by next-event estimation: where nothing shadows,
+    it is added to the path, else it is up to the ray returned."""
     if light.kind == "constant":
-        return mi.Spectrum(0.0)
+        return None
     if light.kind == "delta":
         omega, incoming = light.omega_i, light.inverse_irradiance
     else:
@@ -210,63 +266,60 @@ def _direct(world: World, path: Path, si: Any, point: Any, light: LaneLight, tra
         incoming = incoming / (density + pdf if transport.bsdf_sampling else density)
     # Written so that NaN counts as light: it must reach the value, where it is found and drawn again.
     lit = path.active & ~(dr.max(value) <= 0)
+    radiance = path.throughput * (value * incoming)
     if transport.shadowing:
-        lit &= ~_shadowed(world, path, si, omega, lit, transport)
-    return dr.select(lit, value * incoming, 0.0)
+        return Shadow(world.field.leave(si, omega), dr.dot(si.n, omega) < 0, lit, radiance)
+    path.radiance += dr.select(lit, radiance, 0.0)
+    return None
 
 
-def _shadowed(world: World, path: Path, si: Any, omega: Any, lit: Any, transport: Transport) -> Any:
-    """Lanes whose light is blocked."""
-    holes = world.surface if world.surface.parts.opacity else None
-    blocked, _, capped, path.rng = occluded(
-        world.field,
-        world.field.leave(si, omega),
-        lit,
-        transport.max_crossings,
-        dr.dot(si.n, omega) < 0,
-        holes,
-        path.rng,
-    )
-    path.capped[capped] += 1
-    return blocked
-
-
-def _sky(path: Path, light: LaneLight, escaped: Any, transport: Transport) -> Any:
+def _sky(path: Path, onward: Onward, light: LaneLight, escaped: Any, transport: Transport) -> Any:
     """Light that BSDF sampling found: what arrives along rays that left the tile upwards."""
     if light.kind == "delta" or not (transport.bsdf_sampling or light.kind == "constant"):
         return mi.Spectrum(0.0)
-    d = path.ray.d
-    share = dr.select(dr.isinf(path.pdf), 1.0, path.pdf / (path.pdf + light.sampling_density(d)))
+    d = onward.ray.d
+    share = dr.select(dr.isinf(onward.pdf), 1.0, onward.pdf / (onward.pdf + light.sampling_density(d)))
     found = escaped & (path.depth > 0) & (d.z > 0)
     return dr.select(found, path.throughput * (light.radiance(d) * share), 0.0)
 
 
-def _interaction(
-    world: World, path: Path, light: LaneLight, transport: Transport, limit: Any, roulette: Any, last: bool
-) -> Path:
-    """One surface interaction of every path; `last`: no path goes on after it."""
-    si, capped, downward = _visible(world, path, transport)
+def _follow(
+    world: World,
+    path: Path,
+    onward: Onward,
+    shadow: Shadow | None,
+    light: LaneLight,
+    transport: Transport,
+    limit: Any,
+) -> None:
+    """Take paths along their rays to the next place, or to the sky."""
+    si, capped = _visible(world, path, onward, shadow, transport)
     path.capped[capped] += 1
+    escaped = path.active & ~si.is_valid() & ~capped
+    downward = escaped & (onward.ray.d.z <= 0)
     if world.surface.parts.opacity:
         path.passed |= downward & (path.depth == 0)
     else:
         path.lost |= downward
-    path.radiance += _sky(path, light, path.active & ~si.is_valid() & ~capped, transport)
+    path.radiance += _sky(path, onward, light, escaped, transport)
     path.active &= si.is_valid() & (path.depth < limit)
+    path.p, path.n, path.d = mi.Point3f(si.p), mi.Normal3f(si.n), mi.Vector3f(onward.ray.d)
 
-    point = world.surface.at(si, -path.ray.d)
-    path.radiance += path.throughput * _direct(world, path, si, point, light, transport)
+
+def _interact(
+    world: World, path: Path, light: LaneLight, transport: Transport, limit: Any, roulette: Any
+) -> tuple[Onward, Shadow | None]:
+    """One surface interaction of every path: where it goes on, and its ray towards the light."""
+    si = interaction(path.p, path.n, path.d, world.field.size, path.active)
+    point = world.surface.at(si, -path.d)
+    shadow = _direct(world, path, si, point, light, transport)
     path.depth[path.active] += 1
-    if last:
-        return path
     if not transport.bsdf_sampling and light.kind != "constant":
         path.active &= path.depth < limit
-    omega, weight, path.pdf = point.sample(path.rng.next_1d(), path.rng.next_2d())
-    path.ray = world.field.leave(si, omega)
-    path.below = dr.dot(si.n, omega) < 0
+    omega, weight, pdf = point.sample(path.rng.next_1d(), path.rng.next_2d())
     path.throughput *= weight
     _roulette(path, roulette)
-    return path
+    return Onward(world.field.leave(si, omega), dr.dot(si.n, omega) < 0, pdf), shadow
 
 
 def _roulette(path: Path, begin: Any) -> None:
@@ -280,7 +333,6 @@ def _roulette(path: Path, begin: Any) -> None:
     path.throughput *= dr.rcp(survival)
 
 
-@dr.syntax
 def trace(
     world: World,
     ray: Any,
@@ -293,11 +345,14 @@ def trace(
 ) -> Path:
     """Follow paths to their ends.
 
+    All lanes take the first interaction side by side, in one kernel without a loop over paths; those that
+    meet the surface again are gathered and go on in a second one. Otherwise most lanes would idle beside a
+    few long paths.
+
     Parameters
     ----------
     limit, roulette : largest number of surface interactions of a path, and those before roulette begins;
-        opaque,
-        so that they are not part of the kernel
+        opaque, so that they are not part of the kernel
 
     Returns
     -------
@@ -305,11 +360,11 @@ def trace(
     ``capped``
     """
     path = Path(
-        mi.Ray3f(ray),
-        mi.Bool(False),
+        mi.Point3f(0.0),
+        mi.Normal3f(0.0, 0.0, 1.0),
+        mi.Vector3f(0.0, 0.0, -1.0),
         mi.Spectrum(0.0),
         mi.Spectrum(1.0),
-        mi.Float(dr.inf),
         mi.UInt32(0),
         rng,
         mi.UInt32(0),
@@ -317,10 +372,55 @@ def trace(
         mi.Bool(False),
         mi.Bool(active),
     )
-    once = not (transport.interreflection or transport.bsdf_sampling or light.kind == "constant")
-    if dr.hint(once, mode="scalar"):
-        path = _interaction(world, path, light, transport, limit, roulette, True)
-    else:
-        while dr.hint(path.active, exclude=[world, light, transport, limit, roulette]):
-            path = _interaction(world, path, light, transport, limit, roulette, False)
+    first = Onward(ray, mi.Bool(False), mi.Float(dr.inf))
+    _follow(world, path, first, None, light, transport, limit)
+    onward, shadow = _interact(world, path, light, transport, limit, roulette)
+    if not (transport.interreflection or transport.bsdf_sampling or light.kind == "constant"):
+        if shadow is not None:
+            _shadowed(world, path, shadow, transport)
+        return path
+    _follow(world, path, onward, shadow, light, transport, limit)
+    if not transport.interreflection:
+        return path
+    dr.eval(path)
+    going = dr.compress(path.active)
+    if len(going):
+        rest = _picked(path, going)
+        rest.radiance, rest.capped, rest.lost = mi.Spectrum(0.0), mi.UInt32(0), mi.Bool(False)
+        rest = _loop(world, rest, _picked(light, going), transport, limit, roulette)
+        dr.eval(rest.radiance, rest.capped, rest.lost)
+        path.radiance += _spread(rest.radiance, going, dr.width(path.active))
+        path.capped += _spread(rest.capped, going, dr.width(path.active))
+        path.lost |= _spread(rest.lost, going, dr.width(path.active))
+    return path
+
+
+def _picked(state: Any, lanes: Any) -> Any:
+    """Some lanes of a dataclass of arrays; what is no array stays as it is."""
+
+    def pick(value: Any) -> Any:
+        if is_dataclass(value):
+            return _picked(value, lanes)
+        if not dr.is_array_v(value) or dr.width(value) == 1:
+            return value
+        return dr.gather(type(value), value, lanes)
+
+    return replace(state, **{f.name: pick(getattr(state, f.name)) for f in fields(state)})
+
+
+def _spread(values: Any, lanes: Any, width: int) -> Any:
+    """Values of some lanes among zeros."""
+    out = dr.zeros(type(values), width)
+    dr.scatter(out, values, lanes)
+    return out
+
+
+@dr.syntax
+def _loop(
+    world: World, path: Path, light: LaneLight, transport: Transport, limit: Any, roulette: Any
+) -> Path:
+    """Follow paths that stand on the surface to their ends."""
+    while dr.hint(path.active, exclude=[world, light, transport, limit, roulette]):
+        onward, shadow = _interact(world, path, light, transport, limit, roulette)
+        _follow(world, path, onward, shadow, light, transport, limit)
     return path

@@ -145,6 +145,14 @@ def generate(
     console.report(summary_dict(summary), describe(summary))
 
 
+def _price(summary: Any) -> str:
+    """What halving the noise of every value would take: its variance falls at least like one over the number
+    of paths."""
+    if not summary.complete or summary.relative_error <= 0:
+        return ""
+    return f"; halving it would take about {clock(3.0 * summary.shard_seconds)} more (four times the paths)"
+
+
 def describe(summary: Any, *, ran: bool = True) -> str:
     """What a folder of shards holds and, where it `ran`, what the run added."""
     state = "complete" if summary.complete else "unfinished: run the other slices, then mbtf-gen merge"
@@ -158,7 +166,7 @@ def describe(summary: Any, *, ran: bool = True) -> str:
         f"{summary.folder}: {counts} queries, {state}",
         *([f"  this run: {work}"] if ran else []),
         f"  mean value {sum(summary.mean_value) / 3:.4g} 1/sr, "
-        f"pooled noise of a training query {summary.relative_error:.1%} of the mean",
+        f"pooled noise of a training query {summary.relative_error:.1%} of the mean{_price(summary)}",
         f"  simulated: {', '.join(summary.effects) or 'nothing beyond a flat Lambert plane'}",
     ]
     odd = [

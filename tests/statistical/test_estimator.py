@@ -54,6 +54,27 @@ def test_values_differ_between_streams_and_are_uncorrelated() -> None:
         assert abs(np.corrcoef(x, y)[0, 1]) < 4.5 / np.sqrt(n)
 
 
+def test_launches_of_any_size_share_their_kernels() -> None:
+    """Compiling takes seconds, a launch tenths of one: nothing of a launch may be part of its kernels."""
+    surface = {"type": "mbtf_surface", "roughness": 0.3, "specular": 0.5, "metallic": 0.4, "coat": 0.3}
+    e = Estimator(build_tile(rocks(32), surface), LightKernel(5.0), Transport())
+    e.estimate(same_query(300), 8, Stream(0, "train", 0))
+    # Another number of queries, of another relief, with other limits on the paths.
+    other = Estimator(build_tile(rocks(48, 0.1), surface), LightKernel(2.0), Transport(7, 2))
+    before = dr.flag(dr.JitFlag.KernelHistory)
+    dr.set_flag(dr.JitFlag.KernelHistory, True)
+    try:
+        dr.kernel_history()
+        other.estimate(same_query(411), 8, Stream(3, "test", 5))
+        kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+    finally:
+        dr.set_flag(dr.JitFlag.KernelHistory, before)
+    # Small ones prepare and collect; the two large ones trace.
+    large = [k for k in kernels if k["operation_count"] > 1000]
+    assert len(large) == 2
+    assert all(k["cache_hit"] for k in large)
+
+
 def test_values_do_not_depend_on_the_size_of_launches() -> None:
     q = same_query(1000)
     whole, pieces = (estimator(launch).estimate(q, 8, Stream(0, "train", 0)) for launch in (1 << 20, 1 << 11))
