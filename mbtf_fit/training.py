@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from itertools import pairwise
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import torch
@@ -126,14 +126,14 @@ class Trainer:
                     # A lookup at NaN has no texel and fails before the loss could show it.
                     if all(bool(p.isfinite().all()) for p in self.model.parameters()):
                         raise
-                    raise self._divergence(first, losses, health) from None
+                    self._stop_diverged(first, losses, health)
                 health.append(self._health())
                 self.progress.step += 1
                 self.progress.seconds += time.perf_counter() - start
         if losses:
             self.progress.loss = float(torch.stack(losses).mean())
             if not math.isfinite(self.progress.loss + float(torch.stack(health).sum())):
-                raise self._divergence(first, losses, health)
+                self._stop_diverged(first, losses, health)
         return self.share >= 1.0
 
     def _health(self) -> Tensor:
@@ -141,8 +141,13 @@ class Trainer:
         with torch.no_grad():
             return torch.stack([p.sum() for p in self.model.parameter_groups()[1]]).sum()
 
-    def _divergence(self, first: int, losses: list[Tensor], health: list[Tensor]) -> InputError:
-        """The error that names the first bad batch of the steps since `first`."""
+    def _stop_diverged(self, first: int, losses: list[Tensor], health: list[Tensor]) -> NoReturn:
+        """Name the first bad batch of the steps since `first`.
+
+        Raises
+        ------
+        InputError : always
+        """
         good = 0
         for loss, weights in zip(losses, health, strict=False):
             if not math.isfinite(float(loss) + float(weights)):
@@ -151,10 +156,10 @@ class Trainer:
         step = first + good
         numbers = self.queries.numbers(self.batch, self.config.seed, step)
         named = f", {self.selection.describe(numbers)}," if self.selection is not None else ""
-        return InputError(
+        raise InputError(
             f"training diverged at step {step + 1}: its batch{named} left numbers that are not finite",
             cure=f"lower the rate: --rate {self.config.training.rate / 3:.1g} --overwrite",
-        )
+        ) from None
 
     def _tables(self) -> list[Tensor]:
         """The textures through the blur of this moment."""
