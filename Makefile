@@ -20,7 +20,7 @@ help:
 install: $(INSTALLED)
 
 # One pip command resolves everything together, so that the pins of pyproject.toml hold for all of it.
-$(INSTALLED): pyproject.toml
+$(INSTALLED): pyproject.toml setup.py $(wildcard mbtf_fit/native/src/*)
 	@python=""; \
 	for candidate in "$${PYTHON:-}" python3.11 python3.12 python3.13 python3 python; do \
 	  if [ -n "$$candidate" ] && "$$candidate" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then \

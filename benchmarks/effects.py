@@ -1,11 +1,21 @@
-"""Speed of ``--effects auto`` against ``--effects all``, planning included, and whether their values agree.
+"""Speed of ``--effects auto`` against ``--effects all``, planning included, and whether their values agree;
+with ``--costs``, whether what the plan states about costs is true.
 
     python benchmarks/effects.py [MATERIAL ...] [--only] [--queries N] [--spp N] [--rounds N]
+    python benchmarks/effects.py [MATERIAL ...] [--only] --costs
 
 For made surfaces (flat Lambert, black, dark, mid-grey), the project's assets and every material given it
 prints the time of both, their ratio, what auto leaves out with the cost that the plan
-states, and the cost measured: the RMS change of M, free of noise, relative to its mean. The last line is
-a JSON object.
+states, and the cost measured: the RMS change of M, free of noise, relative to its mean.
+
+``--costs`` measures for each material, with many paths at queries of their own, what leaving out each effect
+that is off, or that has a cap, really costs; no bound of the plan may lie below it by more than two standard
+errors. Both sides use the same random numbers: a path that neither setting changes cancels exactly, and of a
+cap only the light gathered beyond it is left. Where the plan says that nothing changes, what is measured is
+noise alone: more paths of fewer queries make it small. Effects that stay on are measured as ``mbtf-gen plan``
+does, too, and its figures, which decide nothing, compared.
+
+The last line is a JSON object.
 """
 
 from __future__ import annotations
@@ -14,6 +24,7 @@ import argparse
 import json
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -25,8 +36,8 @@ from mbtf_gen.effects import EffectsPlan
 from mbtf_gen.estimates import Estimates, Stream
 from mbtf_gen.generation import Job
 from mbtf_gen.material import Material, load_material
-from mbtf_gen.pilot import relative_change
-from mbtf_gen.planning import plan_effects
+from mbtf_gen.pilot import PILOT_ROULETTE, measured, relative_change
+from mbtf_gen.planning import plan_effects, without
 
 ASSETS = Path(__file__).parents[1] / "assets"
 # Ratio of the times, auto over all, that the surfaces are held to: at least 20 times faster, or never slower
@@ -108,20 +119,119 @@ def compare(name: str, material: Material, queries: int, spp: int, rounds: int) 
     return row
 
 
+def truth(full: Estimates, cut: Estimates) -> tuple[float, float, float]:
+    """RMS change relative to the mean, less and plus two standard errors of the mean square: (measured, at
+    least, at most)."""
+    a, b = ((x - y).astype(np.float64) for x, y in ((full.value_a, cut.value_a), (full.value_b, cut.value_b)))
+    square = np.mean(a * b, axis=1)
+    mean = 0.5 * float(np.mean(full.value_a + full.value_b))
+    spread = 2.0 * float(square.std()) / np.sqrt(len(square))
+    found, low, high = (np.sqrt(max(square.mean() + d, 0.0)) / mean for d in (0.0, -spread, spread))
+    return float(found), float(low), float(high)
+
+
+def verdict(stated: float, low: float, high: float) -> str:
+    """Of a bound, against what was measured."""
+    if low > stated:
+        return "WRONG"
+    if stated == 0.0:
+        return "no change seen"
+    return "holds" if high <= stated else "not refuted"
+
+
+def costs_of(name: str, material: Material, queries: int, spp: int) -> list[dict[str, Any]]:
+    """Stated and true costs of one material, printed as they come."""
+    job = Job.of(GeneratorConfig.model_validate({"material": "benchmark"}), material)
+    plan = plan_effects(job)
+
+    def values(plan: EffectsPlan, limit: int | None = None, fewer: int = 1) -> Estimates:
+        asked = job.plan().draw("test", 0, queries // fewer).flat()
+        found: Estimates = job.estimator(plan).estimate(
+            asked, spp * fewer**2, Stream(7, "test", 0), limit=limit, roulette=PILOT_ROULETTE
+        )
+        return found
+
+    rows = []
+
+    def row(effect: str, state: str, stated: float, error: float, found: tuple[float, float, float]) -> None:
+        bound = state != "on"
+        rows.append(
+            {
+                "material": name,
+                "effect": effect,
+                "state": state,
+                "stated": stated,
+                "stated_error": error,
+                "measured": found[0],
+                "at_least": found[1],
+                "at_most": found[2],
+                "verdict": verdict(stated, found[1], found[2]) if bound else None,
+            }
+        )
+        says = f"{'<' if bound else ' '} {stated:.2g}" + (f" ± {error:.1g}" if error else "")
+        seen = f"{found[0]:.3g} ({found[1]:.3g} ... {found[2]:.3g})"
+        print(
+            f"{name:<16} {effect:<16} {state:<8} {says:<18} {seen:<36} {rows[-1]['verdict'] or ''}",
+            flush=True,
+        )
+
+    base = values(plan)
+    if plan.cap_cost:
+        unlimited = replace(plan, max_depth=0)
+        row(
+            "interreflection",
+            f"cap {plan.max_depth}",
+            plan.cap_cost,
+            0.0,
+            truth(values(unlimited), values(unlimited, plan.max_depth)),
+        )
+    for effect in plan.effects:
+        if not effect.on and effect.present and (plan.on("masking") or effect.name == "masking"):
+            whole = replace(
+                plan, effects=tuple(replace(e, on=True) if e.name == effect.name else e for e in plan.effects)
+            )
+            fewer = 8 if effect.known == "exact" else 1
+            pair = values(whole, fewer=fewer), values(plan, fewer=fewer)
+            row(effect.name, "off", effect.cost or 0.0, 0.0, truth(*pair))
+    for effect in measured(job, plan).effects:
+        if effect.on and effect.cost is not None:
+            row(
+                effect.name,
+                "on",
+                effect.cost or 0.0,
+                effect.error,
+                truth(base, values(without(plan, effect.name))),
+            )
+    return rows
+
+
+def costs(cases: dict[str, Material], queries: int, spp: int) -> int:
+    """Print the table of costs; 1 where a bound is wrong."""
+    print(f"{'material':<16} {'effect':<16} {'':<8} {'plan states':<18} measured (two standard errors)")
+    rows = [row for name, material in cases.items() for row in costs_of(name, material, queries, spp)]
+    met = all(row["verdict"] != "WRONG" for row in rows)
+    print(json.dumps({"figures": rows, "bars": {"wrong bounds": 0}, "met": met}))
+    return 0 if met else 1
+
+
 def main() -> int:
     """Print the table; 1 where a bar is missed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("materials", nargs="*", type=Path, help="besides the project's assets")
     parser.add_argument("--only", action="store_true", help="the given materials without the assets")
-    parser.add_argument("--queries", type=int, default=1 << 20)
-    parser.add_argument("--spp", type=int, default=4)
+    parser.add_argument("--queries", type=int, help="default: 2^20, or 2^14 for costs")
+    parser.add_argument("--spp", type=int, help="default: 4, or 64 for costs")
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--costs", action="store_true", help="measure what the plan states")
     options = parser.parse_args()
     assets = sorted(p.parent for p in ASSETS.glob("*/height.exr"))
     folders = [*assets, *options.materials] if not options.only else options.materials
-    cases = surfaces() | {folder.name: load_material(folder) for folder in folders}
-    print(f"{'':<20} {'auto':>10} {'all':>10}  speed-up ({options.queries} queries, {options.spp} paths)")
-    rows = [compare(n, m, options.queries, options.spp, options.rounds) for n, m in cases.items()]
+    loaded = {folder.name: load_material(folder) for folder in folders}
+    if options.costs:
+        return costs(loaded, options.queries or 1 << 14, options.spp or 64)
+    queries, spp = options.queries or 1 << 20, options.spp or 4
+    print(f"{'':<20} {'auto':>10} {'all':>10}  speed-up ({queries} queries, {spp} paths)")
+    rows = [compare(n, m, queries, spp, options.rounds) for n, m in (surfaces() | loaded).items()]
     met = all(row["bar"] is None or row["ratio"] <= row["bar"] for row in rows)
     print(
         json.dumps({"figures": rows, "bars": {f"{n}: auto over all": b for n, b in BARS.items()}, "met": met})

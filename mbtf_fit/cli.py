@@ -119,6 +119,10 @@ def fit(
     console.note(
         f"{shards} -> {output}: {resolved.model}, training for {budget} (change it with --time or --steps)"
     )
+    from .native import missing_reason
+
+    if missing_reason():
+        console.note(f"note: training runs in PyTorch, not in the compiled kernel ({missing_reason()})")
     with console.progress(total=100, label="fitting", unit="%") as bar:
         result = fit(
             resolved,
@@ -329,6 +333,7 @@ def _shards_info(path: Path) -> tuple[dict[str, Any], str]:
 def _material_info(path: Path) -> tuple[dict[str, Any], str]:
     from .material import Material
     from .material_format import WEIGHTS_NAME
+    from .native import describe
 
     material = Material.load(path)
     description = material.description
@@ -343,6 +348,7 @@ def _material_info(path: Path) -> tuple[dict[str, Any], str]:
         f"{weights['network_weights']} network weights, {weights['texels']} numbers in textures, "
         f"{size / 1e6:.2f} MB",
         f"trained {training['steps']} steps of {training['batch']} in {clock(training['seconds'])}",
+        f"this machine's CPU evaluates by: {describe()}",
         *describe_errors(training["errors"]),
         f"conformance: {description['conformance']['count']} queries, largest deviation {deviation:.2g}",
     ]

@@ -160,6 +160,7 @@ def fit(
         "coverage": {str(level): share for level, share in trainer.coverage().items()},
         "device": str(device),
         "threads": torch.get_num_threads(),
+        "path": trainer.path,
         "torch": torch.__version__,
     }
     errors = judge(trainer.predict, data, partition)

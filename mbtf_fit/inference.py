@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -10,9 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from .models import NeuralMaterial
+from .native import Kernel, kernel
+from .native.library import QueryPointers
+from .native.model import NativeModel, unsupported_reason
 
 # Queries that are evaluated at a time: bounds memory and keeps activations in the cache.
 _CHUNK = 1 << 15
+# Queries that a thread of its own pays for.
+_SHARE = 1 << 12
 
 
 def evaluate_in_chunks(
@@ -38,8 +45,35 @@ def predict(
     model: NeuralMaterial, u: ArrayLike, sigma: ArrayLike, omega_i: ArrayLike, omega_o: ArrayLike
 ) -> NDArray[np.float32]:
     """Values (n, 3) in 1/sr of a model, clamped at 0 as materials are."""
+    found = kernel()
+    if found is not None and unsupported_reason(model) is None:
+        return _predict_natively(found, model, u, sigma, omega_i, omega_o)
     device = next(model.parameters()).device
     arrays = (u, sigma, omega_i, omega_o)
     return evaluate_in_chunks(
         lambda *a: model(*a).clamp_min(0), device, 3, *arrays, chunk=max(1, _CHUNK // model.positions)
     )
+
+
+def _predict_natively(found: Kernel, model: NeuralMaterial, *arrays: ArrayLike) -> NDArray[np.float32]:
+    inputs = [np.ascontiguousarray(a, np.float32) for a in arrays]
+    n = len(inputs[1])
+    shapes = [(n, 2), (n,), (n, 3), (n, 3)]
+    if [a.shape for a in inputs] != shapes:
+        raise ValueError(f"queries of the shapes {[a.shape for a in inputs]}, not {shapes}")
+    native = NativeModel(found, model)
+    out = np.empty((n, 3), np.float32)
+
+    def share(start: int, stop: int) -> None:
+        addresses = (a.ctypes.data + start * a.strides[0] for a in inputs)
+        queries = QueryPointers(stop - start, *addresses)
+        native.forward(queries, native.state(1), out.ctypes.data + start * out.strides[0], clamp=True)
+
+    count = max(1, min(torch.get_num_threads(), n // _SHARE))
+    edges = [n * k // count for k in range(count + 1)]
+    if count == 1:
+        share(0, n)
+    else:
+        with ThreadPoolExecutor(count) as pool:
+            list(pool.map(lambda edge: share(*edge), pairwise(edges)))
+    return out

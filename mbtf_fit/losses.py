@@ -181,6 +181,22 @@ _TERMS: dict[LossKind, Callable[[Tensor, Tensor, Tensor, Tensor | None, Correcti
 _STRAIGHT: tuple[LossKind, ...] = ("relative", "squared")
 
 
+@dataclass(frozen=True)
+class Quadratic:
+    """A loss that is ``(relative / (p² + s²) + squared / s²)·d²``, ``d = p - t`` held within
+    ``±√(b₀ + b₁|p| + b₂p²)``, all but d held still under differentiation.
+
+    Attributes
+    ----------
+    relative, squared : weights; scale : s in 1/sr; bound : b, or None for none
+    """
+
+    relative: float
+    squared: float
+    scale: float
+    bound: tuple[float, float, float] | None
+
+
 class Objective:
     """The sum of a configuration's terms, for data of one noise model.
 
@@ -199,6 +215,19 @@ class Objective:
         self._unit = noise.scale if noise.scale > 0 else 1.0
         straight = all(term.kind in _STRAIGHT for term in training.losses)
         self._needs_variance = training.correction != "none" and not straight
+
+    def quadratic(self) -> Quadratic | None:
+        """The same loss in the form that the compiled kernel knows; None where it has none."""
+        weights = {term: sum(w for w, t in self._terms if t is term) for _, term in self._terms}
+        relative_weight, squared_weight = (weights.pop(_TERMS[kind], 0.0) for kind in _STRAIGHT)
+        if weights:
+            return None
+        bound = None
+        if self._robust is not None:
+            c0, c1, c2 = (self._robust**2 * float(c) for c in self._noise.overall)
+            scale = self._noise.scale
+            bound = ((self._robust**2 + c0) * scale**2, c1 * scale, c2)
+        return Quadratic(relative_weight, squared_weight, self._unit, bound)
 
     def __call__(self, prediction: Tensor, queries: TrainingQueries | Crops) -> Tensor:
         """Weighted sum of the terms' means for predictions (n, 3), or (items, rows, columns, 3)."""

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from types import TracebackType
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -21,6 +21,10 @@ from .data import TrainingQueries
 
 # Python itself is busy for a part of each step, and one thread at a time: more than these do not pay.
 MAX_THREADS = 4
+# The kernel leaves the interpreter alone; its threads have sums of gradients each.
+MAX_KERNEL_THREADS = 32
+
+T = TypeVar("T")
 
 Batch = TrainingQueries | Crops
 Loss = Callable[[Any], Tensor]
@@ -32,13 +36,15 @@ class Workers:
     Parameters
     ----------
     device : on CUDA one thread does it all
-    threads : at most so many; by default as many as cores, at most `MAX_THREADS`
+    threads : at most so many; by default as many as cores
+    limit : no more than these in any case
     """
 
-    def __init__(self, device: torch.device, threads: int | None = None) -> None:
+    def __init__(self, device: torch.device, threads: int | None = None, *, limit: int | None = None) -> None:
         self._cores = torch.get_num_threads()
         self._precision = torch.get_float32_matmul_precision()
-        self.count = 1 if device.type == "cuda" else min(threads or self._cores, MAX_THREADS)
+        most = MAX_THREADS if limit is None else limit
+        self.count = 1 if device.type == "cuda" else min(threads or self._cores, most)
         self._pool = ThreadPoolExecutor(self.count) if self.count > 1 else None
 
     def __enter__(self) -> Workers:
@@ -55,6 +61,11 @@ class Workers:
             self._pool.shutdown()
         torch.set_num_threads(self._cores)
         torch.set_float32_matmul_precision(self._precision)
+
+    def each(self, work: Callable[[int], T]) -> list[T]:
+        """``work(k)`` for every thread k, run side by side; answers in this order."""
+        parts = range(self.count)
+        return list(map(work, parts) if self._pool is None else self._pool.map(work, parts))
 
     def gradients(self, loss: Loss, batch: Batch, inputs: Sequence[Tensor]) -> tuple[Tensor, list[Tensor]]:
         """Mean loss of a batch, and its gradients by `inputs`.

@@ -23,8 +23,11 @@ from .data import Queries, TrainingQueries
 from .inference import predict
 from .losses import Objective
 from .models import NeuralMaterial
+from .native import kernel
+from .native.model import unsupported_reason
+from .native.stepper import NativeStepper
 from .noise import NoiseModel
-from .parallel import Batch, Workers
+from .parallel import MAX_KERNEL_THREADS, Batch, Workers
 from .streaming import Selection, StreamedQueries
 
 # Decay of Adam's running means of the gradient and of its square.
@@ -90,6 +93,17 @@ class Trainer:
         texels, weights = model.parameter_groups()
         self.optimiser = torch.optim.Adam([{"params": texels}, {"params": weights}], betas=BETAS, fused=True)
         self.loss = Objective(config.training, noise)
+        found = kernel()
+        self._stepper = (
+            NativeStepper(found, model, self.optimiser)
+            if found is not None and unsupported_reason(model) is None
+            else None
+        )
+
+    @property
+    def path(self) -> str:
+        """What computes the steps: ``kernel`` and its instruction set, or ``pytorch``."""
+        return "pytorch" if self._stepper is None else f"kernel {self._stepper.kernel.name}"
 
     @property
     def share(self) -> float:
@@ -115,7 +129,8 @@ class Trainer:
         losses: list[Tensor] = []
         health: list[Tensor] = []
         batches = self._batches()
-        with Workers(self.device) as workers:
+        limit = None if self._stepper is None else MAX_KERNEL_THREADS
+        with Workers(self.device, limit=limit) as workers:
             while self.share < 1.0 and not (self.stop and losses):
                 start = time.perf_counter()
                 if start >= until and losses:
@@ -161,13 +176,15 @@ class Trainer:
             cure=f"lower the rate: --rate {self.config.training.rate / 3:.1g} --overwrite",
         ) from None
 
-    def _tables(self) -> list[Tensor]:
-        """The textures through the blur of this moment."""
+    def _sigmas(self) -> list[float]:
+        """Blur of each texture at this moment, in texels of the finest level."""
         blur = self.config.training.blur
         sigma = annealed_sigma(self.share / blur.share, blur.start, blur.end)
-        return [
-            t.blurred(max(sigma, blur.offset) if t.moves_lookups else sigma) for t in self.model.textures()
-        ]
+        return [max(sigma, blur.offset) if t.moves_lookups else sigma for t in self.model.textures()]
+
+    def _tables(self) -> list[Tensor]:
+        """The textures through the blur of this moment."""
+        return [t.blurred(sigma) for t, sigma in zip(self.model.textures(), self._sigmas(), strict=True)]
 
     def _loss(self, batch: Batch) -> Tensor:
         evaluate = self.model.crops if isinstance(batch, Crops) else self.model
@@ -181,6 +198,8 @@ class Trainer:
             self.optimiser.param_groups, (training.texture_rate, training.rate), strict=True
         ):
             group["lr"] = rate * factor
+        if self._stepper is not None and not isinstance(batch, Crops):
+            return self._stepper.step(self.loss, batch, self._sigmas(), workers)
         texels, weights = self.model.parameter_groups()
         # Queries read detached tables; what they give goes back through the blur once, for all of them.
         tables = self._tables()

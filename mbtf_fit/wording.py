@@ -54,7 +54,8 @@ def describe_fit(data: dict[str, Any]) -> str:
     rate = training["steps"] * training["batch"] / max(training["seconds"], 1e-9)
     lines = [
         f"{data['material']}: {data['model']}, {training['steps']} steps of {training['batch']} queries in "
-        f"{clock(training['seconds'])} on {training['device']} ({rate / 1e6:.2f} M queries/s)",
+        f"{clock(training['seconds'])} on {training['device']} by {training.get('path', 'pytorch')} "
+        f"({rate / 1e6:.2f} M queries/s)",
         describe_coverage(training["coverage"]),
         *describe_errors(data["errors"]),
     ]

@@ -21,23 +21,40 @@ if TYPE_CHECKING:
     from .material import Material
 
 # Parameters of ``mbtf_surface``: textures or numbers.
-NAMES = ("base_color", "roughness", "metallic", "specular", "coat", "coat_roughness", "slopes", "opacity")
+NAMES = (
+    "base_color",
+    "roughness",
+    "metallic",
+    "specular",
+    "coat",
+    "coat_roughness",
+    "sheen",
+    "sheen_color",
+    "sheen_roughness",
+    "slopes",
+    "opacity",
+)
 
 
 class SurfaceBSDF(mi.BSDF):
     """``mbtf_surface``: the project's surface as a BSDF of Mitsuba.
 
     Plugin parameters: the names of :data:`NAMES`, each a texture or a number. The terms simulated are those
-    whose parameters are given: ``specular`` (with ``roughness``), ``metallic``, ``coat``, ``slopes``. Opacity
-    needs the generator's own loop and is not a part of the plugin.
+    whose parameters are given: ``specular`` (with ``roughness``), ``metallic``, ``coat``, ``sheen``,
+    ``slopes``. Opacity needs the generator's own loop and is not a part of the plugin.
     """
 
     def __init__(self, props: Any) -> None:
         super().__init__(props)
         textures = {name: props.get_texture(name) for name in NAMES if name in props}
-        if "base_color" not in textures:
-            textures["base_color"] = props.get_texture("base_color", 0.5)
-        for name, number in (("roughness", 0.5), ("coat_roughness", 0.1)):
+        numbers = {
+            "base_color": 0.5,
+            "roughness": 0.5,
+            "coat_roughness": 0.1,
+            "sheen_color": 1.0,
+            "sheen_roughness": 0.3,
+        }
+        for name, number in numbers.items():
             if name not in textures:
                 textures[name] = props.get_texture(name, number)
         parts = SurfaceParts(
@@ -45,6 +62,7 @@ class SurfaceBSDF(mi.BSDF):
             specular="specular" in textures,
             metallic="metallic" in textures,
             coat="coat" in textures,
+            sheen="sheen" in textures,
             slopes="slopes" in textures,
             opacity="opacity" in textures,
         )
@@ -179,6 +197,10 @@ def bsdf_of(
     if material.coat is not None and on("coat"):
         out["coat"] = _scalar(material.coat)
         out["coat_roughness"] = _scalar(material.coat_roughness)
+    if material.sheen is not None and on("sheen"):
+        out["sheen"] = _scalar(material.sheen)
+        out["sheen_color"] = _colour(1.0 if material.sheen_color is None else material.sheen_color)
+        out["sheen_roughness"] = _scalar(material.sheen_roughness)
     if slopes is not None:
         out["slopes"] = _texture(np.concatenate([slopes, np.zeros_like(slopes[..., :1])], axis=-1))
     if plan is not None and plan.on("opacity"):

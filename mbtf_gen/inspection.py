@@ -109,6 +109,9 @@ def _constants(material: Material) -> dict[str, Any]:
         "specular": material.specular,
         "clearcoat": material.coat,
         "clearcoat_roughness": material.coat_roughness,
+        "sheen": material.sheen,
+        "sheen_color": material.sheen_color,
+        "sheen_roughness": material.sheen_roughness,
         "opacity": material.opacity,
     }
     return {n: np.asarray(v).tolist() for n, v in values.items() if v is not None and np.ndim(v) < 2}

@@ -22,6 +22,9 @@ USES = {
     "specular": "strength of the dielectric lobe",
     "clearcoat": "share under a clear coat",
     "clearcoat_roughness": "width of the coat's lobe",
+    "sheen": "weight of a sheen on top",
+    "sheen_color": "colour of the sheen",
+    "sheen_roughness": "how far the sheen spreads",
     "normal": "slopes that the mesh lacks",
     "opacity": "holes",
 }
@@ -35,8 +38,9 @@ _KINDS = {1: "grey", 2: "grey+alpha", 3: "RGB", 4: "RGBA"}
 def inspection_text(found: dict[str, Any], name: str) -> str:
     """Text for people; the longest lists are cut to keep it on one screen."""
     name = name if len(name) <= _NAME else f"…{name[1 - _NAME :]}"
-    coat = " under a clear coat" if {"clearcoat"} & {*found["maps"], *found["constants"]} else ""
-    surface = f"{found['surface']}{coat}"
+    given = {*found["maps"], *found["constants"]}
+    layers = [text for role, text in (("clearcoat", "a clear coat"), ("sheen", "a sheen")) if role in given]
+    surface = f"{found['surface']}{' under ' + ' and '.join(layers) if layers else ''}"
     head = [f"{name}: tile 1 x {found['aspect']:g}, surface {surface}, tile={found['tile']}", ""]
     body = [*_maps(found), *_unused(found), "", *_geometry(found), *_colour(found), *_normal(found)]
     room = LINES - len(head) - len(body) - 2

@@ -99,6 +99,19 @@ def lobe_irradiance(kappa: float, elevation: ArrayLike) -> NDArray[np.float64]:
     return total.reshape(np.shape(elevation))
 
 
+@lru_cache(maxsize=16)
+def _lobe(width_deg: float) -> tuple[float, Any]:
+    """Concentration of a lobe, and its irradiance as a spline over the elevation; a fifth of a second."""
+    from scipy.interpolate import CubicSpline
+
+    kappa = concentration(width_deg)
+    # Dense where the lobe crosses the horizon, where E departs from sin(elevation).
+    near = np.linspace(0.0, min(10.0 * np.radians(width_deg), np.pi / 2), 1025)
+    far = np.linspace(near[-1], np.pi / 2, 1025)[1:] if near[-1] < np.pi / 2 else np.zeros(0)
+    elevation = np.concatenate([near, far])
+    return kappa, CubicSpline(elevation, lobe_irradiance(kappa, elevation))
+
+
 @dataclass(frozen=True)
 class LightKernel:
     """Smoothed directional light of a given width.
@@ -121,23 +134,14 @@ class LightKernel:
             raise ValueError(
                 f"light width must be 0 or {MIN_WIDTH_DEG}..{MAX_WIDTH_DEG} degrees, not {self.width_deg}"
             )
-        object.__setattr__(self, "kappa", concentration(float(self.width_deg)))
-        object.__setattr__(self, "_table", self._tabulate())
+        kappa, table = _lobe(float(self.width_deg))
+        object.__setattr__(self, "kappa", kappa)
+        object.__setattr__(self, "_table", table)
 
     @property
     def is_delta(self) -> bool:
         """True for width 0."""
         return self.width_deg == 0
-
-    def _tabulate(self) -> Any:
-        from scipy.interpolate import CubicSpline
-
-        # Dense where the lobe crosses the horizon, where E departs from sin(elevation).
-        scale = np.radians(self.width_deg)
-        near = np.linspace(0.0, min(10.0 * scale, np.pi / 2), 1025)
-        far = np.linspace(near[-1], np.pi / 2, 1025)[1:] if near[-1] < np.pi / 2 else np.zeros(0)
-        elevation = np.concatenate([near, far])
-        return CubicSpline(elevation, lobe_irradiance(self.kappa, elevation))
 
     def irradiance(self, omega_i: ArrayLike) -> NDArray[np.float64]:
         """Irradiance E of the unnormalised lobe for directions (..., 3) with z ≥ 0; the divisor of L."""

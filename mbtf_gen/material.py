@@ -46,6 +46,7 @@ DEFAULT_ROUGHNESS = 0.5
 DEFAULT_METALLIC = 0.0
 DEFAULT_SPECULAR = 0.5
 DEFAULT_COAT_ROUGHNESS = 0.1
+DEFAULT_SHEEN_ROUGHNESS = 0.3
 # Mesh cells across the tile, at most, unless asked for.
 DEFAULT_MESH = 512
 _YAML = ("material.yaml", "material.yml")
@@ -66,6 +67,9 @@ class Material:
     basecolor : (h, w, 3) or (3,), linear Rec.709 in [0, 1]
     roughness, metallic, specular : (h, w) or one number in [0, 1]; all three None for Lambert
     coat, coat_roughness : clear coat's share and roughness, (h, w) or one number in [0, 1]; None without one
+    sheen, sheen_roughness : weight of a sheen on top of it all and its roughness, (h, w) or one number in
+        [0, 1]; None without one
+    sheen_color : (h, w, 3) or (3,), linear Rec.709 in [0, 1]; None for white, or without sheen
     normal : (h, w, 3) unit vectors, x along u and y along v (OpenGL); None without a map
     opacity : (h, w) or one number in [0, 1]; None where nothing is transparent
     bsdf : Mitsuba dictionary that stands in place of the maps, or None
@@ -90,6 +94,9 @@ class Material:
     specular: Share = None
     coat: Share = None
     coat_roughness: Share = None
+    sheen: Share = None
+    sheen_color: Colour | None = None
+    sheen_roughness: Share = None
     normal: NDArray[np.float32] | None = None
     opacity: Share = None
     bsdf: dict[str, Any] | None = None
@@ -215,7 +222,10 @@ def _assemble(spec: MaterialFile, folder: Path, found: FoundMaps, tile: Tiling) 
     if spec.bsdf is not None:
         load.notes.append(f"surface: the BSDF '{spec.bsdf['type']}' of the material file")
     elif roughness is None and metallic is None and specular is None:
-        under = " under a clear coat" if spec.clearcoat is not None else ""
+        layers = [
+            n for n, on in (("a clear coat", spec.clearcoat), ("a sheen", spec.sheen)) if on is not None
+        ]
+        under = f" under {' and '.join(layers)}" if layers else ""
         load.notes.append(f"surface: Lambert{under}, because no roughness, metallic or specular is given")
     else:
         constants = {
@@ -227,7 +237,7 @@ def _assemble(spec: MaterialFile, folder: Path, found: FoundMaps, tile: Tiling) 
         filled = [f"{name} {constants[name]}" for name, value in given.items() if value is None]
         roughness, metallic, specular = (constants[n] if v is None else v for n, v in given.items())
         load.notes.append(f"surface: glossy{', constants ' + ', '.join(filled) if filled else ''}")
-    basecolor = load.colour(spec.basecolor) if spec.bsdf is None else np.full(3, DEFAULT_COLOUR)
+    basecolor = load.base_colour(spec.basecolor) if spec.bsdf is None else np.full(3, DEFAULT_COLOUR)
     normal, convention, fit = None, None, None
     if spec.normal is not None:
         normal, convention, fit = _normals(spec, spec.normal, load, height, scale)
@@ -237,6 +247,10 @@ def _assemble(spec: MaterialFile, folder: Path, found: FoundMaps, tile: Tiling) 
     coat, coat_roughness = (load.share(n, getattr(spec, n)) for n in ("clearcoat", "clearcoat_roughness"))
     if coat is not None and coat_roughness is None:
         coat_roughness = DEFAULT_COAT_ROUGHNESS
+    sheen, sheen_roughness = (load.share(n, getattr(spec, n)) for n in ("sheen", "sheen_roughness"))
+    sheen_color = None if spec.sheen_color is None else load.colour("sheen_color", spec.sheen_color)
+    if sheen is not None and sheen_roughness is None:
+        sheen_roughness = DEFAULT_SHEEN_ROUGHNESS
     bsdf = None
     if spec.bsdf is not None:
         bsdf, load.settings["bsdf"] = _bsdf(plain(spec.bsdf), load)
@@ -254,6 +268,9 @@ def _assemble(spec: MaterialFile, folder: Path, found: FoundMaps, tile: Tiling) 
         specular=specular,
         coat=coat,
         coat_roughness=coat_roughness,
+        sheen=sheen,
+        sheen_color=sheen_color,
+        sheen_roughness=sheen_roughness,
         normal=normal,
         opacity=opacity,
         bsdf=bsdf,

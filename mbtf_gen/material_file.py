@@ -108,7 +108,12 @@ class NormalEntry(Settings):
 
 
 # What a BSDF of the user's own stands in place of.
-_REFLECTANCE = ("basecolor", "roughness", "metallic", "specular", "clearcoat", "clearcoat_roughness")
+_REFLECTANCE = (
+    *("basecolor", "roughness", "metallic", "specular", "clearcoat", "clearcoat_roughness"),
+    *("sheen", "sheen_color", "sheen_roughness"),
+)
+# Keys that say more about another key.
+_GOES_WITH = {"clearcoat_roughness": "clearcoat", "sheen_color": "sheen", "sheen_roughness": "sheen"}
 
 
 class MaterialFile(Settings):
@@ -121,6 +126,9 @@ class MaterialFile(Settings):
     specular: ShareEntry | None = Field(None, description="strength of the dielectric lobe; default 0.5")
     clearcoat: ShareEntry | None = Field(None, description="share of a clear coat over it all; default 0")
     clearcoat_roughness: ShareEntry | None = Field(None, description="of the coat; default 0.1")
+    sheen: ShareEntry | None = Field(None, description="weight of a sheen on top of it all; default 0")
+    sheen_color: ColourEntry | None = Field(None, description="of the sheen; default white")
+    sheen_roughness: ShareEntry | None = Field(None, description="of the sheen; default 0.3")
     normal: NormalEntry | None = Field(None, description="tangent-space normal map")
     opacity: ShareEntry | None = Field(None, description="1 opaque to 0 hole; default: opaque")
     bsdf: dict[str, Any] | None = Field(
@@ -132,8 +140,9 @@ class MaterialFile(Settings):
         given = [n for n in _REFLECTANCE if getattr(self, n) is not None]
         if self.bsdf is not None and given:
             raise ValueError(f"'bsdf' stands in place of {', '.join(given)}; give one or the other")
-        if self.clearcoat_roughness is not None and self.clearcoat is None:
-            raise ValueError("'clearcoat_roughness' goes with 'clearcoat'")
+        for name, other in _GOES_WITH.items():
+            if getattr(self, name) is not None and getattr(self, other) is None:
+                raise ValueError(f"'{name}' goes with '{other}'")
         if self.bsdf is not None and not isinstance(self.bsdf.get("type"), str):
             raise ValueError("'bsdf' needs a 'type', such as diffuse")
         return self

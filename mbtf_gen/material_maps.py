@@ -27,6 +27,8 @@ _SIGNED = -0.05
 # Components beyond this are no normal's, whatever its encoding and its rounding.
 _LONGEST = 1.5
 _NORMALS = "its pixels are (n+1)/2, or the components of n themselves in a float image"
+# What maps of colours are called.
+_COLOURS = {"basecolor": "base colour", "sheen_color": "sheen's colour"}
 # A smaller share of normals that point into the surface is not worth a word.
 _STRAY = 1e-4
 _FileEntry = HeightEntry | ColourEntry | ShareEntry | NormalEntry
@@ -140,29 +142,33 @@ class MapLoader:
             self.settings[f"{role}.encoding"] = [entry.colourspace, entry.invert]
         return float(numbers[0, 0]) if numbers.shape == (1, 1) else numbers
 
-    def colour(self, entry: ColourEntry | None) -> Colour:
-        """(h, w, 3) or (3,) linear colour."""
+    def base_colour(self, entry: ColourEntry | None) -> Colour:
+        """(h, w, 3) or (3,) linear base colour; grey where none is given."""
         if entry is None:
             self.notes.append(f"base colour: {DEFAULT_COLOUR} grey, none is given")
             return np.full(3, DEFAULT_COLOUR)
+        return self.colour("basecolor", entry)
+
+    def colour(self, role: str, entry: ColourEntry) -> Colour:
+        """(h, w, 3) or (3,) linear colour."""
         if entry.file is None:
             value = np.asarray(entry.value, np.float64)
             value = np.asarray(srgb_to_linear(value) if entry.colourspace == "srgb" else value)
-            self.settings["basecolor"] = value.tolist()
+            self.settings[role] = value.tolist()
             return value
-        image = self.image("basecolor", entry)
+        image = self.image(role, entry)
         pixels = image.pixels
         if pixels.shape[2] in (2, 4) and np.any(pixels[..., -1] != 1.0):
-            self.warnings.append(f"{image.path}: the alpha channel of the base colour is not used")
+            self.warnings.append(f"{image.path}: the alpha channel of the {_COLOURS[role]} is not used")
         rgb = pixels[..., :3] if pixels.shape[2] > 2 else np.repeat(pixels[..., :1], 3, axis=2)
-        rgb = self._within("basecolor", rgb, np.any((rgb < -_ROUNDING) | (rgb > 1 + _ROUNDING), axis=-1))
-        space = self._colour_space(image, entry)
-        self.facts["basecolor"] = replace(self.facts["basecolor"], colourspace=space)
-        self.settings["basecolor"] = space
+        rgb = self._within(role, rgb, np.any((rgb < -_ROUNDING) | (rgb > 1 + _ROUNDING), axis=-1))
+        space = self._colour_space(role, image, entry)
+        self.facts[role] = replace(self.facts[role], colourspace=space)
+        self.settings[role] = space
         linear = (srgb_to_linear(rgb) if space == "srgb" else rgb).astype(np.float32)
         return linear[0, 0] if image.shape == (1, 1) else linear
 
-    def _colour_space(self, image: Image, entry: ColourEntry) -> ColourSpace:
+    def _colour_space(self, role: str, image: Image, entry: ColourEntry) -> ColourSpace:
         """What is asked for, else linear if the file says so, else sRGB for integers, linear for floats."""
         space: ColourSpace = "linear" if image.bits is None else "srgb"
         why = "the default for " + ("floats" if image.bits is None else "integers")
@@ -176,7 +182,7 @@ class MapLoader:
                 f"{'sRGB' if space == 'srgb' else 'linear'}; convert it to sRGB"
             )
         shown = "sRGB" if space == "srgb" else "linear"
-        self.notes.append(f"base colour: {image.path.name} read as {shown} ({why})")
+        self.notes.append(f"{_COLOURS[role]}: {image.path.name} read as {shown} ({why})")
         return space
 
     def normals(self, entry: NormalEntry) -> NDArray[np.float32]:

@@ -13,19 +13,34 @@ import drjit as dr
 import mitsuba as mi
 
 # A lobe of a smaller α is narrower than any light kernel: the surface is a mirror there.
-MIRROR_ALPHA = 1.0e-4
+MIRROR_ALPHA = 1.0e-5
 # Nodes of the energy tables over the cosine and over roughness √α, and quadrature points of each node.
-TABLE_COSINES, TABLE_ROUGHNESSES = 64, 48
+TABLE_COSINES, TABLE_ROUGHNESSES = 64, 50
 TABLE_POINTS = 1 << 13
 # Square root of the first row's roughness, which is the least that is no mirror.
 FIRST_ROW = MIRROR_ALPHA**0.25
 
 
-def distribution(h: Any, alpha: Any) -> Any:
-    """Density D(h) of microfacet normals in 1/sr, for h with z > 0."""
+def half_tangent2(wi: Any, wo: Any) -> Any:
+    """Squared tangent of the angle between the half vector of unit directions, z > 0 of both, and the normal.
+
+    The half vector's slope is (wi + wo).xy/(μi + μo). Its part within the plane of incidence cancels at
+    grazing angles, where narrow lobes would have no digits left; from |a|² - |b|² = (a+b)·(a-b) of the
+    horizontal parts a of wi and b of -wo it is (μo - μi)/|a+b|, which keeps them.
+    """
+    sx, sy = wi.x + wo.x, wi.y + wo.y
+    up = dr.rcp(wi.z + wo.z)
+    plain = (dr.square(sx) + dr.square(sy)) * dr.square(up)
+    length2 = dr.square(wi.x - wo.x) + dr.square(wi.y - wo.y)
+    across = 2.0 * up * dr.fma(wi.x, sy, -wi.y * sx)
+    split = (dr.square(wo.z - wi.z) + dr.square(across)) / length2
+    return dr.select(length2 > 0.25, split, plain)
+
+
+def distribution(tangent2: Any, alpha: Any) -> Any:
+    """Density D(h) of microfacet normals in 1/sr, by the squared tangent of h's angle to the normal."""
     a2 = alpha * alpha
-    # From the sine: a narrow lobe has no cosines left in single precision.
-    k = (h.x * h.x + h.y * h.y) / a2 + h.z * h.z
+    k = (1.0 + tangent2 / a2) / (1.0 + tangent2)
     return dr.rcp(dr.pi * a2 * k * k)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,6 +20,14 @@ PILOT_QUERIES, PILOT_SPP = 8192, 4
 # Interactions before roulette: late ones that few paths reach with great weights would hardly be seen by both
 # halves of any query.
 PILOT_ROULETTE = 12
+# Queries that change more than any that was seen hold, of the mean square, about so many times the share of
+# the largest one: α/(α-1) of it where the tail falls off like a power α, 10 for one as heavy as α = 1.1.
+UNSEEN = 10.0
+# Where fewer queries change, the largest change may be one that none of them shows: it is taken to be as
+# large as the mean value.
+FEW = 8
+# What happens to none of n queries happens to a share of less than 3/n, but for one chance in twenty.
+NONE_OF = 3.0
 
 
 def pilot_queries(job: Job, count: int = PILOT_QUERIES) -> Queries:
@@ -30,23 +38,78 @@ def pilot_queries(job: Job, count: int = PILOT_QUERIES) -> Queries:
     return Queries(flat.u[some], flat.sigma[some], flat.omega_i[some], flat.omega_o[some])
 
 
+@dataclass(frozen=True)
+class Change:
+    """What leaving something out changed in a sample of queries, relative to the mean value.
+
+    Attributes
+    ----------
+    count : queries; changed : those with any change
+    square, error : mean square change, the product of the halves' changes, which is free of noise, and its
+        standard error
+    shift, shift_error : mean change and its standard error
+    largest : largest change of any query
+    """
+
+    count: int
+    changed: int
+    square: float
+    error: float
+    shift: float
+    shift_error: float
+    largest: float
+
+    @classmethod
+    def of(cls, full: Estimates, cut: Estimates) -> Change:
+        """Of queries estimated twice."""
+        a = (full.value_a - cut.value_a).astype(np.float64)
+        b = (full.value_b - cut.value_b).astype(np.float64)
+        mean = 0.5 * float(np.mean(full.value_a + full.value_b))
+        n = len(a)
+        if mean <= 0.0:
+            return cls(n, 0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        square = np.mean(a * b, axis=-1) / mean**2
+        change = 0.5 * np.mean(a + b, axis=-1) / mean
+        return cls(
+            n,
+            int(np.count_nonzero(change)),
+            float(square.mean()),
+            float(square.std()) / np.sqrt(n),
+            float(change.mean()),
+            float(change.std()) / np.sqrt(n),
+            float(np.sqrt(max(np.abs(square).max(), (change**2).max()))),
+        )
+
+    @property
+    def cost(self) -> float:
+        """Root mean square change."""
+        return float(np.sqrt(max(self.square, 0.0)))
+
+    @property
+    def upper(self) -> float:
+        """The same plus :data:`CAUTION` standard errors. A root mean square is no smaller than the mean
+        change, which is seen also where it is too rare for both halves to show it."""
+        square = max(self.square, 0.0) + CAUTION * self.error
+        return max(float(np.sqrt(square)), abs(self.shift) + CAUTION * self.shift_error)
+
+    def bound(self, most: float = np.inf) -> float:
+        """What the cost is not above, changes that are rarer than the sample shows included.
+
+        Parameters
+        ----------
+        most : no query changes by more than this. The mean square is then no more than that times the mean.
+        """
+        largest = self.largest if self.changed >= FEW else max(self.largest, 1.0)
+        seen = self.upper**2 + UNSEEN * largest**2 / self.count
+        mean = abs(self.shift) + CAUTION * self.shift_error + NONE_OF * largest / self.count
+        return float(np.sqrt(min(seen, most * mean)))
+
+
 def relative_change(full: Estimates, cut: Estimates) -> tuple[float, float]:
-    """(estimate, estimate plus :data:`CAUTION` standard errors) of the RMS change over queries and channels,
-    relative to the mean value of `full`. The product of the halves' changes is free of noise. A root mean
-    square is no smaller than the mean change, which is seen also where it is too rare for both halves to
-    show it."""
-    a = (full.value_a - cut.value_a).astype(np.float64)
-    b = (full.value_b - cut.value_b).astype(np.float64)
-    mean = 0.5 * float(np.mean(full.value_a + full.value_b))
-    if mean <= 0.0:
-        return 0.0, 0.0
-    square = np.mean(a * b, axis=-1)
-    error = float(square.std()) / np.sqrt(len(square))
-    low = max(float(square.mean()), 0.0)
-    change = 0.5 * np.mean(a + b, axis=-1)
-    shift = abs(float(change.mean())) + CAUTION * float(change.std()) / np.sqrt(len(change))
-    high = max(float(np.sqrt(low + CAUTION * error)), shift)
-    return float(np.sqrt(low)) / mean, high / mean
+    """(cost, the same plus :data:`CAUTION` standard errors) of queries estimated with and without
+    something."""
+    change = Change.of(full, cut)
+    return change.cost, change.upper
 
 
 class Pilot:
@@ -68,13 +131,13 @@ class Pilot:
         )
         return found
 
-    def cost_of_limit(self, limit: int) -> tuple[float, float]:
-        """(estimate, cautious estimate) of the cost of a limit on surface interactions; the same kernel."""
-        return relative_change(self.full, self._run(self.estimator, limit))
+    def limited(self, limit: int) -> Change:
+        """What a limit on surface interactions changes; the same kernel."""
+        return Change.of(self.full, self._run(self.estimator, limit))
 
-    def cost_of(self, plan: EffectsPlan) -> tuple[float, float]:
-        """(estimate, cautious estimate) of the cost of another plan in place of this one."""
-        return relative_change(self.full, self._run(self.job.estimator(plan)))
+    def changed(self, plan: EffectsPlan) -> Change:
+        """What another plan in place of this one changes."""
+        return Change.of(self.full, self._run(self.job.estimator(plan)))
 
 
 def measured(job: Job, plan: EffectsPlan, spp: int = PILOT_SPP) -> EffectsPlan:
@@ -86,14 +149,19 @@ def measured(job: Job, plan: EffectsPlan, spp: int = PILOT_SPP) -> EffectsPlan:
     pilot = Pilot(job, plan, spp)
 
     def look(effect: Effect) -> Effect:
-        if not effect.on:
+        if not effect.on or not effect.present:
             return effect
         cut = without(plan, effect.name)
         gone = [
             EFFECTS[e.name] for e in plan.effects if e.on and not cut.on(e.name) and e.name != effect.name
         ]
-        reason = f"{effect.reason}; its cost is that of {' and '.join(gone)} too" if gone else effect.reason
-        cost, upper = pilot.cost_of(cut)
-        return replace(effect, reason=reason, cost=cost, error=(upper - cost) / CAUTION, known="pilot")
+        reason = f"{effect.reason}; with it would go {_listed(gone)}" if gone else effect.reason
+        change = pilot.changed(cut)
+        error = (change.upper - change.cost) / CAUTION
+        return replace(effect, reason=reason, cost=change.cost, error=error, known="pilot")
 
     return replace(plan, effects=tuple(look(e) for e in plan.effects))
+
+
+def _listed(names: list[str]) -> str:
+    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,23 +20,28 @@ from .relief_costs import POINTS, ReliefCosts, largest_slope, relief_costs
 
 if TYPE_CHECKING:
     from .generation import Job
+    from .material import Material
+    from .material_maps import Share
 
 # Standard deviations of the light lobe beyond which nothing of it is looked for, and the share of a Gaussian
 # that lies beyond them on one side.
 LOBE_TAIL = 3.5
 LOBE_TAIL_SHARE = 2.4e-4
-# A ray may leave the tile sideways by this share of its shorter side before it needs the neighbours.
-LONGEST_REACH = 0.45
 # Light found by next-event estimation alone keeps its variance when the narrowest lobe of the surface, about
 # 2α wide, is so many times wider than the light's.
 WIDER = 4.0
-# Where nothing reflects more, what comes after the first interaction is so little of the value that roulette
-# from there on saves more time than it costs in variance.
-DARK = 0.25
 # Runs of fewer paths are done before a pilot has paid for itself.
 SMALL_RUN = 2_000_000
 # Deepest cap on surface interactions that is tried.
 DEEPEST_CAP = 4
+# A gloss, coat or sheen of less strength may be too faint to matter, and is looked at.
+FAINT = 0.05
+# Layers that may be faint: the factor from their values to their strength. A specular of 1/4, F0 = 2 %, is
+# the first that reflects everything at grazing angles.
+LAYERS = {"specular": 4.0, "metallic": math.inf, "coat": 1.0, "sheen": 1.0}
+# What a faint layer costs, over the share of a full one's cost that its strength says: both are equal but for
+# light that meets the layer more than once.
+FAINT_CAUTION = 2.0
 
 
 @dataclass(frozen=True)
@@ -78,15 +85,18 @@ def plan_effects(job: Job, *, pilots: bool = True) -> EffectsPlan:
     wish = Wish.parse(job.config.effects.mode)
     look = _look(job, pilots)
     tolerance = job.config.effects.tolerance
+    reflecting = _surface(look, [n for n in LAYERS if wish.base == "auto" and n not in wish.forced])
+    decided = {e.name: wish.decide(e) for e in _affordable(reflecting, tolerance)}
+    left = tolerance - sum(e.cost or 0.0 for e in decided.values() if not e.on)
+    if not any(e.on for e in decided.values()):
+        look = replace(look, lambert=True)
     costs = _relief(look)
-    of_surface = [*_surface(look), _normal(look, costs), _opacity(look), _fibres()]
-    decided = {e.name: wish.decide(e) for e in _affordable(of_surface, tolerance)}
+    others = _affordable([_normal(look, costs), _opacity(look, costs), _fibres()], left)
+    decided |= {e.name: wish.decide(e) for e in others}
     left = tolerance - sum(e.cost or 0.0 for e in decided.values() if not e.on)
     plan = _of_relief(look, wish, decided, costs, left)
     if wish.base != "all" and _known_exactly(look, plan):
         plan = replace(plan, closed_form=True)
-    if wish.base != "all" and look.lambert and look.albedo.max() <= DARK:
-        plan = replace(plan, roulette_depth=1)
     return replace(plan, mode=job.config.effects.mode, tolerance=tolerance)
 
 
@@ -95,7 +105,7 @@ def simulated(job: Job) -> EffectsPlan:
     wish = Wish.parse(job.config.effects.mode)
     look = _look(job, False)
     flat = job.grid.relief == 0.0
-    effects = [*_surface(look), _normal(look, None), _opacity(look), _fibres()]
+    effects = [*_surface(look), _normal(look, None), _opacity(look, None), _fibres()]
     effects += [Effect(name, not flat, "flat" if flat else "a relief") for name in OF_RELIEF]
     effects.append(Effect("mis", True, "reference"))
     decided = _consistent({e.name: wish.decide(e) for e in effects}, wish)
@@ -111,22 +121,23 @@ def _look(job: Job, pilots: bool) -> _Look:
     return _Look(
         job,
         albedo,
-        material.is_lambert and material.coat is None,
+        material.is_lambert and material.coat is None and material.sheen is None,
         own,
         pilots,
     )
 
 
 def _relief(look: _Look) -> ReliefCosts | None:
-    """Costs of the relief's effects for a Lambert surface; None on a plane."""
+    """Costs of the relief's effects and the normal map for a Lambert surface; None where there are none."""
     job = look.job
-    if job.grid.relief == 0.0 or not look.albedo.any() or not look.pilots:
+    nothing = job.grid.relief == 0.0 and job.residual is None
+    if nothing or not look.lambert or not look.albedo.any() or not look.pilots:
         return None
     residual = job.residual[0] if job.residual is not None else None
     kernel = LightKernel(job.config.light.width)
     queries = pilot_queries(job, POINTS)
     omega_i, omega_o = queries.omega_i.astype(np.float64), queries.omega_o.astype(np.float64)
-    return relief_costs(job.grid, omega_i, omega_o, kernel, look.albedo, residual)
+    return relief_costs(job.grid, omega_i, omega_o, kernel, look.albedo, residual, _through(look))
 
 
 def _affordable(effects: list[Effect], tolerance: float) -> list[Effect]:
@@ -141,35 +152,63 @@ def _affordable(effects: list[Effect], tolerance: float) -> list[Effect]:
     return list(out.values())
 
 
-def _surface(look: _Look) -> list[Effect]:
-    """Specular lobe, metal, coat."""
+def _surface(look: _Look, questioned: Sequence[str] = ()) -> list[Effect]:
+    """Specular lobe, metal, coat, sheen; `questioned` are measured where they are faint."""
     material = look.job.material
     if look.own_bsdf:
         reason = f"the material's own BSDF '{(material.bsdf or {})['type']}', not analysed"
         on = Effect("specular", True, reason, present=False)
-        return [on, *(Effect(n, False, reason, 0.0, "exact", False) for n in ("metallic", "coat"))]
-    metal = 0.0 if material.metallic is None else float(np.max(material.metallic))
-    specular = 0.0 if material.specular is None else float(np.max(material.specular))
+        others = ("metallic", "coat", "sheen")
+        return [on, *(Effect(n, False, reason, 0.0, "exact", False) for n in others)]
+    strengths = _strengths(material)
+    words = {
+        "specular": ("F0 up to {:.2g} %", "specular is 0 everywhere", 0.08 * 100.0),
+        "metallic": ("metallic up to {:.2g}", "no metal anywhere", 1.0),
+        "coat": ("covers up to {:.2g} %", "none is given", 100.0),
+        "sheen": ("weight up to {:.2g}", "none is given", 1.0),
+    }
     out = []
-    if look.lambert:
-        reason = "Lambert: no roughness, metallic or specular is given"
-        out.append(Effect("specular", False, reason, 0.0, "exact", False))
-    elif specular == 0.0:
-        out.append(Effect("specular", False, "specular is 0 everywhere", 0.0, "exact", False))
-    else:
-        out.append(Effect("specular", True, f"specular up to {specular:.3g}"))
-    out.append(
-        Effect("metallic", True, f"metallic up to {metal:.3g}")
-        if metal > 0
-        else Effect("metallic", False, "no metal anywhere", 0.0, "exact", False)
-    )
-    coat = 0.0 if material.coat is None else float(np.max(material.coat))
-    out.append(
-        Effect("coat", True, f"coat up to {coat:.3g}")
-        if coat > 0
-        else Effect("coat", False, "none is given", 0.0, "exact", False)
-    )
+    for name, (text, absent, unit) in words.items():
+        strength = strengths[name]
+        if strength > 0.0:
+            faint = name in questioned and strength * LAYERS[name] < FAINT
+            cost = _faint_cost(look, name, strength * LAYERS[name]) if faint else None
+            out.append(Effect(name, True, text.format(strength * unit), cost, "pilot" if faint else "asked"))
+        else:
+            if name == "specular" and material.specular is None:
+                absent = "Lambert: no roughness, metallic or specular is given"
+            out.append(Effect(name, False, absent, 0.0, "exact", False))
     return out
+
+
+def _strengths(material: Material) -> dict[str, float]:
+    """Largest value of each of the surface's terms."""
+    sheen = 0.0 if material.sheen is None else float(np.max(material.sheen))
+    if material.sheen_color is not None:
+        sheen *= float(np.max(material.sheen_color))
+
+    def largest(share: Share) -> float:
+        return 0.0 if share is None else float(np.max(share))
+
+    return {
+        "specular": largest(material.specular),
+        "metallic": largest(material.metallic),
+        "coat": largest(material.coat),
+        "sheen": sheen,
+    }
+
+
+def _faint_cost(look: _Look, name: str, strength: float) -> float | None:
+    """Cost of leaving out a faint layer: noise would hide it, so it is measured at full strength, of which
+    the light that it changes is a share."""
+    if not look.pilots:
+        return None
+    material = look.job.material
+    scaled: dict[str, Any] = {name: np.asarray(getattr(material, name)) / strength}
+    full = replace(material, **scaled)
+    job = type(look.job).of(look.job.config, full)
+    plan = simulated(job)
+    return FAINT_CAUTION * strength * Pilot(job, plan).changed(without(plan, name)).bound()
 
 
 def _normal(look: _Look, costs: ReliefCosts | None) -> Effect:
@@ -181,33 +220,40 @@ def _normal(look: _Look, costs: ReliefCosts | None) -> Effect:
         return Effect("normal", False, reason, 0.0, "exact", False)
     slopes, share = job.residual
     rms = float(np.sqrt(np.mean(np.sum(slopes**2, axis=-1))))
-    reason = f"residual slopes of {np.degrees(np.arctan(rms)):.2g} degrees (RMS)"
+    reason = f"adds slopes of {np.degrees(np.arctan(rms)):.2g}° (RMS)"
     if job.config.effects.normal == "residual" and job.grid.relief > 0:
-        reason += f"; the map repeats {share:.2g} of the relief's slopes"
+        reason += f"; of the relief's own, {100.0 * share:.0f} % are in the map and count once"
     if rms == 0.0:
         return Effect("normal", False, reason, 0.0, "exact")
-    # The estimate shades Lambert; lobes are steeper functions of the normal.
-    known = costs is not None and look.lambert
-    return Effect("normal", True, reason, costs.normal if costs and known else None, "pilot")
+    return Effect("normal", True, reason, costs.normal if costs else None, "pilot")
 
 
-def _opacity(look: _Look) -> Effect:
-    opacity = look.job.material.opacity
-    if opacity is None or look.own_bsdf:
-        return Effect("opacity", False, "no map" if opacity is None else "own BSDF", 0.0, "exact", False)
-    through = 1.0 - np.asarray(opacity, np.float64)
-    if not through.any():
-        return Effect("opacity", False, "opaque everywhere", 0.0, "exact", False)
-    rows, columns = (
-        max(a, b) for a, b in zip(np.shape(opacity) or (1, 1), look.albedo.shape[:2], strict=True)
-    )
-    through = np.asarray(resample(np.atleast_2d(through), rows, columns), np.float64)[..., None]
+def _opacity(look: _Look, costs: ReliefCosts | None) -> Effect:
+    through = _through(look)
+    if through is None:
+        opacity = look.job.material.opacity
+        reason = "no map" if opacity is None else "own BSDF" if look.own_bsdf else "opaque everywhere"
+        return Effect("opacity", False, reason, 0.0, "exact", False)
+    reason = f"{100.0 * through.mean():.2g} % of the rays that meet the surface pass"
+    if not look.lambert:
+        return Effect("opacity", True, reason)
+    if look.job.grid.relief > 0.0:
+        return Effect("opacity", True, reason, costs.opacity if costs else None, "pilot")
+    # A plane's M is its colour, less what passes.
+    rows, columns = (max(a, b) for a, b in zip(through.shape, look.albedo.shape[:2], strict=True))
+    passed = np.asarray(resample(through, rows, columns), np.float64)[..., None]
     colour = np.asarray(resample(look.albedo, rows, columns), np.float64)
-    mean = float(np.mean((1.0 - through) * colour))
-    # Twice the share of the light that holes take: neighbouring facets may be lit that much more strongly.
-    lost = 2.0 * float(np.sqrt(np.mean((through * colour) ** 2)))
-    cost = lost / mean if mean > 0 and look.lambert else None
-    return Effect("opacity", True, f"{through.mean():.1%} of the area lets light through", cost, "pilot")
+    mean = float(np.mean((1.0 - passed) * colour))
+    cost = float(np.sqrt(np.mean((passed * colour) ** 2))) / mean if mean > 0 else None
+    return Effect("opacity", True, reason, cost, "bound")
+
+
+def _through(look: _Look) -> NDArray[np.float64] | None:
+    """(h, w) share of the rays that pass; None where all is opaque."""
+    opacity = look.job.material.opacity
+    if opacity is None or look.own_bsdf or np.all(np.asarray(opacity) == 1.0):
+        return None
+    return 1.0 - np.atleast_2d(np.asarray(opacity, np.float64))
 
 
 def _fibres() -> Effect:
@@ -221,7 +267,7 @@ def _of_relief(
     job = look.job
     cap = job.config.transport.max_depth
     decided["mis"] = wish.decide(_mis(look))
-    black = not look.albedo.any() and look.lambert and not (decided["coat"].on or decided["opacity"].on)
+    black = not look.albedo.any() and look.lambert and not decided["opacity"].on
     if job.grid.relief == 0.0 or black:
         reason = "flat" if job.grid.relief == 0.0 else "black: nothing is reflected"
         for name in OF_RELIEF:
@@ -231,12 +277,12 @@ def _of_relief(
     masking = Effect(
         "masking",
         True,
-        f"relief of {job.grid.relief:.4g} tile widths",
+        f"a relief {100.0 * job.grid.relief:.2g} % of the tile's width deep",
         costs.masking if costs else None,
         "pilot",
     )
-    bounces = _bounce_bound(look)
-    if costs is not None and look.lambert and costs.masking + bounces <= left:
+    bounces = _bounce_bound(look) if costs is not None and costs.masking <= left else 0.0
+    if costs is not None and costs.masking + bounces <= left:
         # Without the displaced tile its other effects go too; their costs are in the sum.
         masking = replace(masking, on=False, cost=costs.masking + bounces)
         for name in OF_RELIEF[1:]:
@@ -244,30 +290,23 @@ def _of_relief(
         decided["masking"] = wish.decide(masking)
         return _assemble(job, _consistent(decided, wish), cap)
     decided["masking"] = wish.decide(masking)
-    # The estimate shades Lambert: for lobes only the bound counts.
-    sure = look.lambert or shadowing.known == "bound"
-    if sure and shadowing.cost is not None and shadowing.cost <= left / 2:
+    if shadowing.cost is not None and shadowing.cost <= left / 2:
         left -= shadowing.cost
         shadowing = replace(shadowing, on=False)
     decided["shadowing"] = wish.decide(shadowing)
-    decided["neighbours"] = Effect("neighbours", True, "rays re-enter the tile")
+    decided["neighbours"] = wish.decide(_neighbours(look))
     decided["interreflection"] = Effect("interreflection", True, "not looked at")
     decided["interreflection"], cap, cost = _interreflection(look, wish, decided, left)
-    bounces_left_out = 0.0 if decided["interreflection"].on else decided["interreflection"].cost or 0.0
-    left -= cost + bounces_left_out
-    decided["neighbours"] = wish.decide(_neighbours(look, decided, left))
     return _assemble(job, _consistent(decided, wish), cap, cost)
 
 
 def _shadowing(look: _Look, costs: ReliefCosts | None) -> Effect:
-    angle = np.degrees(np.arctan(look.steepest))
     lowest = look.lowest_light
     if lowest > 0 and look.steepest <= np.tan(lowest):
-        reason = (
-            f"no slope exceeds {angle:.2g} degrees, the light stays above {np.degrees(lowest):.2g} degrees"
-        )
+        reason = f"slopes up to {_degrees(look.steepest)}, light no lower than {_degrees(np.tan(lowest))}"
         return Effect("shadowing", True, reason, look.below_lowest, "bound")
-    reason = f"slopes up to {angle:.0f} degrees, light down to {np.degrees(max(lowest, 0.0)):.2g} degrees"
+    low = "the horizon" if lowest <= 0 else _degrees(np.tan(lowest))
+    reason = f"slopes up to {_degrees(look.steepest)}, light down to {low}"
     return Effect("shadowing", True, reason, costs.shadowing if costs else None, "pilot")
 
 
@@ -281,26 +320,40 @@ def _mis(look: _Look) -> Effect:
         return Effect("mis", True, "the material's own BSDF, not analysed")
     if look.lambert:
         if job.config.light.width <= 20.0:
-            reason = f"Lambert under a light of {job.config.light.width:g} degrees: no bias, no more variance"
+            reason = f"Lambert under a light of {job.config.light.width:g}°: sampling the light is best"
             return Effect("mis", False, reason, 0.0, "exact")
         return Effect("mis", True, "a wide light")
-    smoothest = 1.0 if job.material.is_lambert else float(np.min(np.asarray(job.material.roughness)))
-    if job.material.coat is not None:
-        smoothest = min(smoothest, float(np.min(np.asarray(job.material.coat_roughness))))
-    lobe = 2.0 * smoothest**2
-    text = f"narrowest lobe {np.degrees(lobe):.2g} degrees, light {job.config.light.width:g}"
-    if lobe >= WIDER * width:
-        return Effect("mis", False, f"{text}: no bias, hardly more variance", 0.0, "exact")
+    material = job.material
+    lobes = [2.0] if material.is_lambert else [2.0 * float(np.min(np.asarray(material.roughness))) ** 2]
+    if material.coat is not None:
+        lobes.append(2.0 * float(np.min(np.asarray(material.coat_roughness))) ** 2)
+    if material.sheen is not None:
+        # Fibres stand within √α of upright.
+        lobes.append(float(np.min(np.asarray(material.sheen_roughness))))
+    text = f"narrowest lobe {np.degrees(min(lobes)):.2g}°, light {job.config.light.width:g}°"
+    if min(lobes) >= WIDER * width:
+        return Effect("mis", False, f"{text}: sampling the light alone finds it as well", 0.0, "exact")
     return Effect("mis", True, text)
 
 
+def _degrees(slope: float) -> str:
+    angle = float(np.degrees(np.arctan(slope)))
+    return f"{angle:.0f}°" if angle >= 10.0 else f"{angle:.1g}°"
+
+
 def _bounce_bound(look: _Look) -> float:
-    """Interreflection over direct light on a gentle relief: facets of slope s see others only within
-    2·atan(s) of their planes, a share sin² of their cosine-weighted view, and these are lit at most by
-    1/cos."""
-    share = np.sin(min(2.0 * np.arctan(look.steepest), 0.5 * np.pi)) ** 2
-    brightest = 1.0 / look.job.config.queries.min_cos
-    return float(look.albedo.max() * share * brightest)
+    """Interreflection on a gentle relief, at most: facets of slope s see others only within 2·atan(s) of
+    their planes, a share sin² of their cosine-weighted view; no facet is lit by more than 1/E, E being the
+    irradiance of a lobe of unit strength on the plane; and what is bright may be little of the tile, so that
+    the root mean square is more than the mean."""
+    job, albedo = look.job, look.albedo
+    brightest = float(albedo.max())
+    share = brightest * np.sin(min(2.0 * np.arctan(look.steepest), 0.5 * np.pi)) ** 2
+    low = job.config.queries.min_cos
+    direction = np.array([[np.sqrt(1.0 - low * low), 0.0, low]])
+    strongest = 1.0 / float(LightKernel(job.config.light.width).irradiance(direction)[0])
+    uneven = float(np.sqrt(np.mean(albedo**2))) / max(float(np.mean(albedo)), 1e-12)
+    return float(uneven * strongest * share / max(1.0 - share, 1e-12))
 
 
 def _interreflection(
@@ -315,46 +368,47 @@ def _interreflection(
     if "interreflection" in wish.forced or wish.base != "auto" or not decided["masking"].on:
         effect = wish.decide(replace(effect, reason="a relief"))
         return effect, asked, 0.0
+    most = _bounce_bound(look) if look.lambert else np.inf
+    reason = "light from facet to facet"
+    if most <= left:
+        reason = f"{reason}, of which slopes up to {_degrees(look.steepest)} let little pass"
+        return Effect("interreflection", False, reason, most, "bound"), 1, 0.0
     if not look.pilots:
         return replace(effect, reason="a relief; the run is too small for a pilot"), asked, 0.0
     pilot = Pilot(look.job, _assemble(look.job, _consistent(dict(decided), wish), asked))
-    cost, upper = pilot.cost_of_limit(1)
-    reason = "light from facet to facet"
+    change = pilot.limited(1)
+    cost, upper = change.cost, change.bound(most)
     if upper <= left:
         return Effect("interreflection", False, reason, upper, "pilot"), 1, 0.0
     found = Effect("interreflection", True, reason, cost, "pilot")
     if asked:
         return found, asked, 0.0
-    # Every further interaction keeps no more than the brightest reflectance of the light.
+    # Every further interaction keeps about so much of the light: caps that cannot do are not tried.
     brightest = float(look.albedo.max())
     for cap in range(2, DEEPEST_CAP + 1):
         if cost * brightest ** (cap - 1) > 2.0 * left:
             continue
-        _, upper = pilot.cost_of_limit(cap)
+        upper = pilot.limited(cap).bound()
         if upper <= left:
-            reason += f"; at most {cap} interactions, cutting the rest costs below {upper:.1g}"
+            reason += (
+                f"; paths end after {cap} interactions, more would bring less than {100.0 * upper:.1g} %"
+            )
             return replace(found, reason=reason), cap, upper
-    return replace(found, reason=reason + "; no depth limit, Russian roulette"), 0, 0.0
+    return replace(found, reason=f"{reason}; no limit, Russian roulette ends paths"), 0, 0.0
 
 
-def _neighbours(look: _Look, decided: dict[str, Effect], left: float) -> Effect:
+def _neighbours(look: _Look) -> Effect:
+    """How far view and light rays move sideways within the relief. The tile repeats by construction, at no
+    cost: nothing to switch."""
     job = look.job
-    if decided["interreflection"].on or decided["mis"].on:
-        return Effect("neighbours", True, "scattered rays go anywhere")
-    reach = reach_of(job)
-    limit = LONGEST_REACH * min(1.0, job.grid.aspect)
-    if reach <= limit and look.below_lowest <= left:
-        reason = f"rays move sideways by at most {reach:.2g} tile widths"
-        return Effect("neighbours", False, reason, look.below_lowest, "bound")
-    reason = f"rays cross up to {reach:.3g} tile widths" if np.isfinite(reach) else "light from the horizon"
-    return Effect("neighbours", True, reason)
-
-
-def reach_of(job: Job) -> float:
-    """How far, in tile widths, view rays and light rays move sideways within the relief."""
     view = float(np.arcsin(job.config.queries.min_cos))
-    lowest = min(view, view - LOBE_TAIL * float(np.radians(job.config.light.width)))
-    return float(job.grid.relief / np.tan(lowest)) if lowest > 0 else float("inf")
+    lowest = min(view, look.lowest_light)
+    if lowest > 0:
+        tiles = job.grid.relief / np.tan(lowest) / min(1.0, job.grid.aspect)
+        reason = f"view and light rays cross up to {tiles:.2g} tiles; repeating the tile costs nothing"
+    else:
+        reason = "light from the horizon crosses any number of tiles; repeating the tile costs nothing"
+    return Effect("neighbours", True, reason, present=False)
 
 
 def _consistent(decided: dict[str, Effect], wish: Wish) -> dict[str, Effect]:
@@ -369,9 +423,6 @@ def _consistent(decided: dict[str, Effect], wish: Wish) -> dict[str, Effect]:
     if not decided["masking"].on:
         for name in OF_RELIEF[1:]:
             off(name, EFFECTS["masking"])
-    elif not decided["neighbours"].on:
-        off("interreflection", EFFECTS["neighbours"])
-        off("mis", EFFECTS["neighbours"])
     return decided
 
 
@@ -389,7 +440,7 @@ def _assemble(job: Job, decided: dict[str, Effect], cap: int, cost: float = 0.0)
 
 def _known_exactly(look: _Look, plan: EffectsPlan) -> bool:
     """A plane of one Lambert colour, or black: M follows without tracing."""
-    if any(plan.on(n) for n in ("specular", "metallic", "coat", "opacity")) or look.own_bsdf:
+    if any(plan.on(n) for n in ("specular", "metallic", "coat", "sheen", "opacity")) or look.own_bsdf:
         return False
     base = np.asarray(look.job.material.basecolor)
     if not base.any():

@@ -37,11 +37,13 @@ class ReliefCosts:
     masking : the plane with the mesh's slopes in place of the displaced tile, shadows left out too
     shadowing : the displaced tile without shadows
     normal : shading without the given residual slopes
+    opacity : surface and occluders opaque throughout
     """
 
     masking: float
     shadowing: float
     normal: float
+    opacity: float
 
 
 def largest_slope(grid: HeightGrid) -> float:
@@ -76,6 +78,8 @@ def _march(
 ) -> tuple[F64, NDArray[np.bool_]]:
     """First points (n, 3) where rays dip below the heights, and which rays do before they leave the
     relief."""
+    if relief == 0.0:
+        return origin, np.zeros(len(origin), bool)
     horizontal = np.hypot(direction[:, 0], direction[:, 1])
     # A step moves at most one cell sideways and a fiftieth of the relief up or down.
     pace = 1.0 / np.maximum(horizontal / step, np.abs(direction[:, 2]) / (0.02 * relief))
@@ -108,16 +112,18 @@ def relief_costs(
     kernel: LightKernel,
     albedo: F64,
     residual: F64 | None = None,
+    through: F64 | None = None,
 ) -> ReliefCosts:
     """Estimate costs from pairs of directions.
 
     Parameters
     ----------
-    grid : heights, relief > 0
+    grid : heights
     omega_i, omega_o : (n, 3) directions as the run draws them
     kernel : light around omega_i
     albedo : (h, w, channels) reflectance, any resolution
     residual : (h, w, 2) slopes that a normal map adds
+    through : (h, w) share of the rays that pass through the surface
     """
     heights = _Field(grid.z, grid.aspect)
     slopes = _Field(height_slopes(grid), grid.aspect)
@@ -132,7 +138,7 @@ def relief_costs(
     start[:, 2] = heights(met[:, 0], met[:, 1]) + 0.02 * grid.relief
     light, irradiance = kernel.sample(omega_i, rng), kernel.irradiance(omega_i)
     up = np.column_stack([light[:, :2], np.maximum(light[:, 2], 1e-6)])
-    _, blocked = _march(heights, start, up, step, grid.relief)
+    occluder, blocked = _march(heights, start, up, step, grid.relief)
     shadowed = blocked[:, None]
 
     there = slopes(met[:, 0], met[:, 1])
@@ -153,4 +159,14 @@ def relief_costs(
                 shadowed, 0.0, colour(met[:, 0], met[:, 1]) * _lambert(tilted, light, irradiance) - shade
             )
         )
-    return ReliefCosts(cost(here - value), cost(shade - value), normal)
+    opacity = 0.0
+    if through is not None:
+        passing = _Field(through, grid.aspect)
+        seen, lit = (passing(p[:, 0], p[:, 1])[:, None] for p in (met, occluder))
+        # What lies behind a hole is another place of the same relief, lit about as much: their squares add.
+        behind = np.roll(value, 1, axis=0)
+        with_holes = (1.0 - seen) * np.where(shadowed, lit, 1.0) * shade
+        change = np.sqrt((with_holes - value) ** 2 + (seen * behind) ** 2)
+        # Relative to what holes leave.
+        opacity = cost(change) * mean / max(float(with_holes.mean()), 1e-12)
+    return ReliefCosts(cost(here - value), cost(shade - value), normal, opacity)

@@ -6,6 +6,7 @@ A shard is a mapping of array name to array; all arrays share their leading axes
 
 from __future__ import annotations
 
+import errno
 import math
 import zipfile
 from collections.abc import Iterable, Mapping
@@ -161,7 +162,15 @@ def write_exr(path: Path, arrays: Mapping[str, NDArray[np.float32]]) -> Stored:
         "type": OpenEXR.scanlineimage,
         "mbtf.lead": ",".join(str(n) for n in lead),
     }
-    return write_through(path, lambda temporary: OpenEXR.File(header, channels).write(str(temporary)))
+
+    def write(temporary: Path) -> None:
+        try:
+            OpenEXR.File(header, channels).write(str(temporary))
+        except RuntimeError as error:
+            # What the system said stands behind the library's words, which end with the file's name.
+            raise OSError(errno.EIO, reason(str(error).rpartition('". ')[2].rstrip("."))) from None
+
+    return write_through(path, write)
 
 
 def read_exr(path: Path, names: Iterable[str] | None = None) -> Arrays:

@@ -13,17 +13,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .adaptive import estimate_shard
 from .atomic import Stored, remove_file, write_sealed
 from .effects import EffectsPlan
 from .estimates import Estimates, Stream
 from .locks import Lock, lock_owner, take_lock
 from .manifest import ShardEntry, effects_digest
+from .output_folder import sweep
 from .queries import Queries
 from .schema import FORMAT_NAME, SCHEMA_VERSION
 from .shard_files import write_shard
 from .shard_writer import ShardWriter
 from .tally import Tally, refuse_nonfinite
-from .verification import finished_record, shard_fault, sidecar_of
+from .verification import finished_record, sidecar_of
 
 if TYPE_CHECKING:
     from .generation import Job
@@ -66,7 +68,9 @@ class Claims:
     ) -> None:
         self.busy: list[Path] = []
         self._job, self._folder, self._entries = job, folder, entries
-        self._condemned, self._skipped = condemned, skipped
+        self._skipped = skipped
+        # What is condemned is another one once somebody has made it again.
+        self._stamps = {file: _stamp(folder / file) for file in condemned}
         self._held: set[Lock] = set()
 
     def __enter__(self) -> Claims:
@@ -82,17 +86,14 @@ class Claims:
         self._held.discard(lock)
 
     def _finished(self, entry: ShardEntry, path: Path) -> dict[str, Any] | None:
-        record = finished_record(path, entry.rows, self._job.config_hash)
-        if record is None or entry.file not in self._condemned:
-            return record
-        return record if shard_fault(path, entry.rows, self._job.config_hash) is None else None
+        if entry.file in self._stamps and self._stamps[entry.file] == _stamp(path):
+            return None
+        return finished_record(path, entry.rows, self._job.config_hash)
 
     def __iter__(self) -> Iterator[Claim]:
         for entry in self._entries:
             path = self._folder / entry.file
-            record = None
-            if entry.file not in self._condemned:
-                record = self._finished(entry, path)
+            record = self._finished(entry, path)
             if record is None:
                 lock = take_lock(path)
                 if lock is None:
@@ -107,6 +108,15 @@ class Claims:
                     self._held.discard(lock)
                     lock.release()
             self._skipped(record)
+
+
+def _stamp(path: Path) -> tuple[int, int] | None:
+    """What tells a sidecar from one that was written later; None without one."""
+    try:
+        found = sidecar_of(path).stat()
+    except OSError:
+        return None
+    return found.st_ino, found.st_mtime_ns
 
 
 @dataclass(frozen=True)
@@ -127,7 +137,7 @@ class Made:
     ----------
     paths : traced; shards : their files; busy : files left to other processes
     seconds : in all
-    writing : seconds that writing and digesting took beside the rendering
+    writing : processor seconds that writing and digesting took beside the rendering
     waiting : seconds that rendering waited for it
     """
 
@@ -176,6 +186,8 @@ def make_shards(
     def store(shard: Rendered, path: Path) -> None:
         records.append(store_shard(job, shard, path, effects))
 
+    # What killed runs left takes room that may be wanting.
+    sweep(folder)
     plan = job.plan()
     estimator: Any = None
     with ExitStack() as stack:
@@ -188,8 +200,9 @@ def make_shards(
             began = time.perf_counter()
             queries = drawn.result()
             entry = claim.entry
-            estimates = estimator.estimate(
-                queries.flat(), job.spp(entry.split), Stream(job.config.seed, entry.split, entry.index)
+            stream = Stream(job.config.seed, entry.split, entry.index)
+            estimates = estimate_shard(
+                estimator, queries.flat(), job.spp(entry.split), job.target(entry.split), stream, effects
             )
             shard = Rendered(entry, queries, estimates, time.perf_counter() - began)
             writer.submit(partial(store, shard, claim.path), claim.lock.release)
@@ -222,13 +235,11 @@ def _one_ahead(
 
 def store_shard(job: Job, shard: Rendered, path: Path, effects: EffectsPlan) -> dict[str, Any]:
     """Write a shard and its sidecar; returns the sidecar."""
-    for stale in path.parent.glob(f".{path.stem}.*.tmp"):
-        remove_file(stale)
     # A sidecar of before would vouch for the new file if this run were killed between the two.
     remove_file(sidecar_of(path))
     queries, estimates = shard.queries, shard.estimates
     lead, through = queries.lead, estimates.transmittance
-    spp = job.spp(shard.entry.split)
+    spp = job.spp(shard.entry.split) if estimates.spp is None else estimates.spp.reshape(lead)
     stored = write_shard(
         path,
         {
@@ -238,7 +249,7 @@ def store_shard(job: Job, shard: Rendered, path: Path, effects: EffectsPlan) -> 
             "omega_o": queries.omega_o,
             "value_a": estimates.value_a.reshape(*lead, 3),
             "value_b": estimates.value_b.reshape(*lead, 3),
-            "spp": np.full(lead, spp, np.float32),
+            "spp": np.broadcast_to(np.asarray(spp, np.float32), lead).copy(),
             **({} if through is None else {"transmittance": through.reshape(lead)}),
         },
     )
@@ -260,8 +271,8 @@ def quarantined(estimates: Estimates) -> dict[str, Any]:
 def sidecar(job: Job, shard: Rendered, file: str, stored: Stored, effects: EffectsPlan) -> dict[str, Any]:
     """Content of a shard's sidecar."""
     entry, estimates = shard.entry, shard.estimates
-    a = estimates.value_a.astype(np.float64)
-    b = estimates.value_b.astype(np.float64)
+    a, b = estimates.value_a, estimates.value_b
+    difference = (a - b).astype(np.float64)
     return {
         "format": FORMAT_NAME,
         "schema": SCHEMA_VERSION,
@@ -279,9 +290,10 @@ def sidecar(job: Job, shard: Rendered, file: str, stored: Stored, effects: Effec
         "paths": estimates.paths,
         "seconds": round(shard.seconds, 4),
         "quarantined": quarantined(estimates),
+        "target": None if estimates.target is None else asdict(estimates.target),
         "statistics": {
-            "mean_value": (0.5 * (a + b)).mean(axis=0).tolist(),
-            "mean_variance": (0.25 * (a - b) ** 2).mean(axis=0).tolist(),
+            "mean_value": (0.5 * sum(half.mean(axis=0, dtype=np.float64) for half in (a, b))).tolist(),
+            "mean_variance": (0.25 * np.square(difference).mean(axis=0)).tolist(),
         },
     }
 

@@ -26,7 +26,7 @@ class ShardWriter:
 
     Attributes
     ----------
-    busy : seconds spent writing
+    busy : processor seconds spent writing
     waited : seconds that the other side waited for it
     """
 
@@ -79,7 +79,7 @@ class ShardWriter:
             if task is None:
                 return
             write, after = task
-            start = time.perf_counter()
+            start = time.thread_time()
             try:
                 if self._error is None:
                     write()
@@ -87,4 +87,4 @@ class ShardWriter:
                 self._error = error
             finally:
                 after()
-                self.busy += time.perf_counter() - start
+                self.busy += time.thread_time() - start

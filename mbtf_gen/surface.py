@@ -11,7 +11,8 @@ the hemisphere). The diffuse term takes what the lobe leaves over (Kelemen and S
 one gives back what scatters several times between metal facets (Kulla and Conty 2017), with
 ``Fms = F̄²Ā/(1-F̄(1-Ā))``. Both are reciprocal, and a white surface reflects exactly everything. A clear
 coat of F0 = 4 % takes its share c·E_c of both directions from what lies below: ``f = c·f_c +
-(1-cE_c(μi))(1-cE_c(μo))·f``.
+(1-cE_c(μi))(1-cE_c(μo))·f``. Sheen, of weight w and colour k, lies on top of it all and takes its share once,
+at the direction where it is larger: ``f = w·k·f_s + min(t(μi), t(μo))·f`` with ``t = 1 - w·max(k)·E_s``.
 
 What a material does not have costs nothing: terms without maps or constants are left out when the kernel is
 built.
@@ -31,6 +32,7 @@ from .microfacet import (
     EnergyTables,
     distribution,
     grazing_reflectance,
+    half_tangent2,
     is_mirror,
     lost_light,
     lost_light_pdf,
@@ -38,6 +40,7 @@ from .microfacet import (
     smith,
     visible_normal,
 )
+from .sheen import SheenTables, sheen_value
 
 COAT_REFLECTANCE = 0.04
 # A shading normal that would face away from the viewer is bent until its cosine is this.
@@ -50,6 +53,12 @@ LOBE_CHANCES = (0.1, 0.98)
 def energy_tables(variant: str) -> EnergyTables:
     """Tables of the current Mitsuba variant, made once per process."""
     return EnergyTables()
+
+
+@cache
+def sheen_tables(variant: str) -> SheenTables:
+    """Tables of the current Mitsuba variant, made once per process."""
+    return SheenTables()
 
 
 @dataclass(frozen=True)
@@ -84,12 +93,12 @@ class Lobe:
 
     def value_pdf(self, wi: Any, wo: Any) -> tuple[Any, Any]:
         """(f·μo, density of sampling wo); 0 for mirrors."""
-        h = dr.normalize(wi + wo)
         alpha = self.alpha
-        d = dr.select(self.mirror, 0.0, distribution(h, alpha))
+        d = dr.select(self.mirror, 0.0, distribution(half_tangent2(wi, wo), alpha))
         si, so = smith(wi.z, alpha), smith(wo.z, alpha)
         rest = d / (4.0 * wi.z)
-        return self.fresnel(dr.dot(wi, h)) * (rest / (1.0 + si + so)), rest / (1.0 + si)
+        cosine = dr.dot(wi, dr.normalize(wi + wo))
+        return self.fresnel(cosine) * (rest / (1.0 + si + so)), rest / (1.0 + si)
 
     def sample(self, wi: Any, xi: Any) -> tuple[Any, Any]:
         """(wo, weight f·μo/density of this lobe alone); exact for mirrors."""
@@ -109,6 +118,7 @@ class SurfaceParts:
     specular: bool = False
     metallic: bool = False
     coat: bool = False
+    sheen: bool = False
     slopes: bool = False
     opacity: bool = False
 
@@ -120,9 +130,9 @@ class Surface:
     ----------
     parts : terms that are simulated
     textures : ``base_color``, ``roughness``, ``metallic``, ``specular``, ``coat``, ``coat_roughness``,
-        ``slopes``,
-        ``opacity`` → Mitsuba textures; those that no term needs may be missing. `slopes` (residual slopes
-        along u and y, in tile widths per tile width) are added to the mesh's own.
+        ``sheen``, ``sheen_color``, ``sheen_roughness``, ``slopes``, ``opacity`` → Mitsuba textures; those
+        that no term needs may be missing. `slopes` (residual slopes along u and y, in tile widths per tile
+        width) are added to the mesh's own.
     """
 
     def __init__(self, parts: SurfaceParts, textures: dict[str, Any]) -> None:
@@ -132,6 +142,7 @@ class Surface:
         self.transmits = parts.opacity
         glossy = parts.specular or parts.metallic or parts.coat
         self.tables = energy_tables(mi.variant()) if glossy else None
+        self.sheen_tables = sheen_tables(mi.variant()) if parts.sheen else None
 
     def at(self, si: Any, towards_viewer: Any) -> SurfacePoint:
         """The surface at hits; `si` needs p, n, uv and its validity."""
@@ -165,6 +176,10 @@ class SurfacePoint:
             self._lobe(maps, si)
         if parts.coat:
             self._coat(maps, si)
+        if parts.sheen:
+            assert surface.sheen_tables is not None
+            self.sheen_tables = surface.sheen_tables
+            self._sheen(maps, si)
 
     def _lobe(self, maps: dict[str, Any], si: Any) -> None:
         roughness = dr.clip(maps["roughness"].eval_1(si), 0.0, 1.0)
@@ -196,8 +211,14 @@ class SurfacePoint:
         self.coat_weight = maps["coat"].eval_1(si)
         self.coat = Lobe(roughness, mi.Color3f(COAT_REFLECTANCE), mi.Color3f(1.0), tables, pair)
 
+    def _sheen(self, maps: dict[str, Any], si: Any) -> None:
+        self.sheen_roughness = dr.clip(maps["sheen_roughness"].eval_1(si), 0.0, 1.0)
+        self.sheen = maps["sheen"].eval_1(si) * maps["sheen_color"].eval(si)
+        self.sheen_area, albedo = self.sheen_tables.at(self.wi.z, self.sheen_roughness)
+        self.sheen_share = dr.max(self.sheen) * albedo
+
     def _broad(self, cosine: Any) -> Any:
-        """π·f of everything but the lobes, for the cosine of wo."""
+        """π·f of everything but coat, lobes and sheen, for the cosine of wo."""
         diffuse = self.base * (1.0 - self.metallic)
         if not (self.parts.specular or self.parts.metallic):
             return diffuse
@@ -209,15 +230,18 @@ class SurfacePoint:
             value += self.several * (self.lost * lost)
         return value
 
-    def _chances(self) -> tuple[Any, Any, Any]:
-        """Chances with which sampling chooses (the coat, the lobe, what metal scatters several times); the
-        rest is cosine-distributed."""
-        coat, lobe, several = mi.Float(0.0), mi.Float(0.0), mi.Float(0.0)
+    def _chances(self) -> tuple[Any, Any, Any, Any]:
+        """Chances with which sampling chooses (sheen, the coat, the lobe, what metal scatters several
+        times); the rest is cosine-distributed."""
+        sheen, coat, lobe, several = (mi.Float(0.0) for _ in range(4))
+        # Energy that goes towards the viewer, about.
+        below = _mean(self.base)
         if self.parts.specular or self.parts.metallic:
             # Energies towards the viewer.
             strong = _mean(self.lobe.share(self.lobe.towards_viewer))
             broad = _mean(self.base * (1.0 - self.metallic)) * self.left
             again = _mean(self.returned) * self.lost if self.parts.metallic else mi.Float(0.0)
+            below = dr.maximum(below, strong)
             lobe = dr.clip(strong / dr.maximum(strong + broad + again, 1e-6), *LOBE_CHANCES)
             lobe = dr.select(broad + again > 0, lobe, 1.0)
             if self.parts.metallic:
@@ -226,9 +250,17 @@ class SurfacePoint:
             share = self.coat_weight * _mean(self.coat.share(self.coat.towards_viewer))
             coat = dr.clip(share / dr.maximum(share + (1.0 - share) * _mean(self.base), 1e-6), 0.05, 0.9)
             coat = dr.select(self.coat_weight > 0, coat, 0.0)
+            below = dr.maximum(below, share)
             lobe *= 1.0 - coat
             several *= 1.0 - coat
-        return coat, lobe, several
+        if self.parts.sheen:
+            # Twice its energy, for even samples fit it less well than those of the other terms.
+            share = 2.0 * self.sheen_share
+            rest = (1.0 - self.sheen_share) * below
+            sheen = dr.clip(share / dr.maximum(share + rest, 1e-6), 0.05, 0.9)
+            sheen = dr.select(dr.max(self.sheen) > 0, sheen, 0.0)
+            coat, lobe, several = (c * (1.0 - sheen) for c in (coat, lobe, several))
+        return sheen, coat, lobe, several
 
     def _below_coat(self, cosine: Any) -> Any:
         """What the coat lets through of both directions."""
@@ -238,11 +270,16 @@ class SurfacePoint:
         )
         return viewer * light
 
+    def _below_sheen(self, albedo: Any) -> Any:
+        """What sheen leaves of both directions, its albedo towards the light given: its larger share of the
+        two is taken once, so that the rest is reciprocal and together no more than what comes in."""
+        return 1.0 - dr.maximum(self.sheen_share, dr.max(self.sheen) * albedo)
+
     def _local(self, wo: Any) -> tuple[Any, Any]:
         """(f·μo, density) for local wo with z > 0, without mirrors."""
-        chance_coat, chance, chance_several = self._chances()
+        chance_sheen, chance_coat, chance, chance_several = self._chances()
         value = self._broad(wo.z) * (dr.inv_pi * wo.z)
-        pdf = (1.0 - chance_coat - chance - chance_several) * (dr.inv_pi * wo.z)
+        pdf = (1.0 - chance_sheen - chance_coat - chance - chance_several) * (dr.inv_pi * wo.z)
         if self.parts.metallic:
             pdf += chance_several * lost_light_pdf(wo.z, self.lobe.alpha)
         if self.parts.specular or self.parts.metallic:
@@ -253,6 +290,11 @@ class SurfacePoint:
             coat, coat_pdf = self.coat.value_pdf(self.wi, wo)
             value = value * self._below_coat(wo.z) + self.coat_weight * coat
             pdf += chance_coat * coat_pdf
+        if self.parts.sheen:
+            area, albedo = self.sheen_tables.at(wo.z, self.sheen_roughness)
+            sheen = sheen_value(self.wi, wo, self.sheen_roughness, self.sheen_area, area)
+            value = value * self._below_sheen(albedo) + self.sheen * sheen
+            pdf += chance_sheen * (0.5 * dr.inv_pi)
         return value, pdf
 
     def _leaves(self, wo: Any, omega: Any) -> Any:
@@ -269,7 +311,7 @@ class SurfacePoint:
 
     def sample(self, xi_lobe: Any, xi: Any) -> tuple[Any, Any, Any]:
         """(direction, weight f·cos/density, density; infinite for a mirrored direction)."""
-        chance_coat, chance, chance_several = self._chances()
+        chance_sheen, chance_coat, chance, chance_several = self._chances()
         wo = mi.warp.square_to_cosine_hemisphere(xi)
         mirrored = mi.Bool(False)
         single = mi.Color3f(0.0)
@@ -285,16 +327,21 @@ class SurfacePoint:
             if self.parts.coat:
                 single *= self._below_coat(dr.maximum(wo.z, 1e-6))
         if self.parts.coat:
-            chosen = xi_lobe > 1.0 - chance_coat
+            chosen = (xi_lobe > 1.0 - chance_coat - chance_sheen) & (xi_lobe <= 1.0 - chance_sheen)
             wo_coat, weight = self.coat.sample(self.wi, xi)
             wo = dr.select(chosen, wo_coat, wo)
             flat = chosen & self.coat.mirror
             single = dr.select(flat, self.coat_weight * weight / dr.maximum(chance_coat, 1e-6), single)
             mirrored = (mirrored & ~chosen) | flat
+        if self.parts.sheen:
+            chosen = xi_lobe > 1.0 - chance_sheen
+            wo = dr.select(chosen, mi.warp.square_to_uniform_hemisphere(xi), wo)
+            albedo = self.sheen_tables.at(dr.maximum(wo.z, 1e-6), self.sheen_roughness)[1]
+            single *= self._below_sheen(albedo)
         omega = self.frame.to_world(wo)
         good = self._leaves(wo, omega)
         wo.z = dr.maximum(wo.z, 1e-6)
-        if self.parts.specular or self.parts.metallic or self.parts.coat:
+        if self.parts.specular or self.parts.metallic or self.parts.coat or self.parts.sheen:
             value, pdf = self._local(wo)
             weight = dr.select(mirrored, single, value / dr.maximum(pdf, 1e-30))
             pdf = dr.select(mirrored, dr.inf, pdf)

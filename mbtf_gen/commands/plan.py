@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -39,7 +40,7 @@ def plan(
 ) -> None:
     """Say which effects of light a run would simulate, why, and what leaving each one out costs.
 
-    A cost is the root mean square change of M over the run's queries, relative to its mean value. Then what
+    A cost is the root mean square change of M over the run's queries, in percent of its mean value. Then what
     the run will take in time and disk space, and how noisy its values will be, from a pilot on this machine.
 
     Parameters
@@ -53,7 +54,7 @@ def plan(
     effects
         auto, all, none, then +x or -x: effects of light to simulate. Default: auto
     tolerance
-        Cost of all effects left out together. Default: 0.005
+        Cost of all effects left out together, a share of the mean value. Default: 0.005
     height
         Factor on the stored heights, in tile widths. Default: the material's own
     mesh
@@ -109,8 +110,8 @@ def table(plan: EffectsPlan) -> str:
     for effect in plan.effects:
         lines += _row(effect)
     left = plan.cost
-    share = "nothing" if left == 0 else f"at most {left:.2g} of the mean value"
-    lines.append(f"left out together: {share} (tolerance {plan.tolerance:g})")
+    share = "nothing" if left == 0 else f"at most {_percent(left)}"
+    lines.append(f"left out together: {share}, of {_percent(plan.tolerance)} allowed (--tolerance)")
     if plan.closed_form:
         lines.append("M is known in closed form: nothing is traced")
     elif plan.max_depth:
@@ -131,11 +132,22 @@ def cost_text(effect: Any) -> str:
     """The cost of leaving an effect out, and how it is known."""
     if effect.cost is None:
         return "-"
-    if effect.known == "exact":
-        return "0 exactly" if effect.cost == 0 else f"{effect.cost:.2g} exactly"
-    if effect.known == "bound":
-        return f"< {effect.cost:.2g}"
+    if effect.known == "exact" and effect.cost == 0:
+        return "0 exactly"
+    if effect.known == "bound" or (effect.known == "pilot" and not effect.on):
+        return f"< {_percent(effect.cost)}"
     if effect.error:
         low = effect.cost < 2.0 * effect.error
-        return f"< {effect.cost + 2 * effect.error:.2g}" if low else f"{effect.cost:.2g} ± {effect.error:.1g}"
-    return f"~ {effect.cost:.2g}"
+        if low:
+            return f"< {_percent(effect.cost + 2 * effect.error)}"
+        return f"{_percent(effect.cost)[:-2]} ± {_percent(effect.error, 1)}"
+    return f"~ {_percent(effect.cost)}"
+
+
+def _percent(share: float, digits: int = 2) -> str:
+    """A share in percent, rounded to some digits but written out."""
+    percent = 100.0 * share
+    if percent <= 0.0:
+        return "0 %"
+    places = max(0, digits - 1 - math.floor(math.log10(percent)))
+    return f"{round(percent, digits - 1 - math.floor(math.log10(percent))):.{places}f} %"

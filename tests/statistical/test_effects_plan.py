@@ -86,6 +86,16 @@ SCENES: dict[str, tuple[Material, dict[str, Any]]] = {
     "metal relief": (material(0.1, 0.9, **{**GLOSS, "metallic": 1.0}), {}),
     "wide light": (material(0.1, 0.5), {"width": 10.0}),
     "delta light": (material(0.1, 0.5), {"width": 0.0}),
+    "mirror relief": (material(0.02, 0.9, roughness=0.0, specular=0.5, metallic=1.0), {"width": 10.0}),
+    "coated relief": (material(0.1, 0.3, coat=1.0, coat_roughness=0.4), {}),
+    "velvet relief": (material(0.1, 0.3, sheen=1.0, sheen_roughness=0.3), {}),
+    "holed relief": (material(0.1, 0.5, opacity=np.where(np.median(ROCKS) > ROCKS, 0.2, 1.0)), {}),
+    # Layers so faint that they are not simulated.
+    "faint gloss": (material(0.1, 0.5, roughness=0.5, specular=2e-4, metallic=0.0), {"min_cos": 0.3}),
+    "faint coat": (material(0.1, 0.5, coat=1e-4, coat_roughness=0.3), {"min_cos": 0.3}),
+    "faint sheen": (material(0.1, 0.5, sheen=2e-4, sheen_roughness=0.5), {"min_cos": 0.3}),
+    "faint normal map": (material(0.0, pattern(), normal=bumps(2e-4)), {"min_cos": 0.3}),
+    "faint holes": (material(0.1, 0.5, opacity=np.full((4, 4), 0.9995)), {"min_cos": 0.3}),
 }
 
 
@@ -116,10 +126,15 @@ CASES = [
     ("masking", "grey relief", "faint relief"),
     ("shadowing", "grey relief", "gentle relief"),
     ("interreflection", "white relief", "gentle relief"),
-    ("neighbours", "grey relief", "gentle relief"),
     ("specular", "glossy relief", "grey relief"),
     ("metallic", "metal relief", "glossy relief"),
     ("normal", "normal map on a plane", "grey relief"),
+    ("normal", "normal map on a plane", "faint normal map"),
+    ("mis", "mirror relief", "glossy relief"),
+    ("specular", "glossy relief", "faint gloss"),
+    ("coat", "coated relief", "faint coat"),
+    ("sheen", "velvet relief", "faint sheen"),
+    ("opacity", "holed relief", "faint holes"),
 ]
 
 
@@ -130,7 +145,6 @@ def test_an_effect_is_on_where_it_matters_and_off_where_not(name: str, needed: s
     assert not planned(idle)[1].on(name)
     full, cut = estimates(job, plan), estimates(job, without(plan, name))
     cost, cautious = relative_change(full, cut)
-    # Neighbours are left out only together with what needs them; here their own share is what counts.
     assert cost > 2 * plan.tolerance
     assert cautious - cost < 0.5 * cost
 

@@ -13,6 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mbtf_gen import generation
+from mbtf_gen.atomic import write_sealed
 from mbtf_gen.config import GeneratorConfig
 from mbtf_gen.dataset import Dataset
 from mbtf_gen.effects import EffectsPlan
@@ -21,7 +22,7 @@ from mbtf_gen.estimates import Estimates, Stream
 from mbtf_gen.generation import Job, generate
 from mbtf_gen.material import Material
 from mbtf_gen.pilot import pilot_queries
-from mbtf_gen.planning import plan_effects, reach_of, without
+from mbtf_gen.planning import plan_effects, without
 from mbtf_gen.queries import Queries
 
 load_mitsuba()
@@ -48,52 +49,11 @@ def job_of(stuff: Material, mode: str = "auto", **options: Any) -> Job:
     return Job.of(GeneratorConfig.model_validate(data), stuff)
 
 
-# Reliefs whose rays reach nearly as far as is allowed without neighbours: 0.45 of the shorter side.
-REACHES = [
-    ((24, 24), 0.0440, {"queries": {"min_cos": 0.1}, "light": {"width": 0.0}}),
-    ((12, 24), 0.0220, {"queries": {"min_cos": 0.1}, "light": {"width": 0.0}}),
-    ((48, 24), 0.0440, {"queries": {"min_cos": 0.1}, "light": {"width": 0.0}}),
-    ((24, 24), 0.0820, {"queries": {"min_cos": 0.3}, "light": {"width": 2.0}}),
-]
-
-
-@pytest.mark.parametrize(("shape", "scale", "options"), REACHES, ids=["square", "wide", "tall", "lobe"])
-def test_without_neighbours_rays_still_meet_all_they_would(
-    shape: tuple[int, int], scale: float, options: dict[str, Any]
-) -> None:
-    """The tile alone is as good as the repeated one, for one set of random numbers path by path."""
-    job = job_of(lambert(noise(*shape), scale), "all,-interreflection,-mis", **options)
-    assert 0.42 * min(1.0, job.grid.aspect) < reach_of(job) <= 0.45 * min(1.0, job.grid.aspect)
-    plan = plan_effects(job)
-    assert plan.on("neighbours")
-    q = pilot_queries(job, 30_000)
-    # The same job, so that tiles it keeps are told apart.
-    full = job.estimator(plan).estimate(q, 2, STREAM)
-    alone = job.estimator(without(plan, "neighbours")).estimate(q, 2, STREAM)
-    assert alone.lost == 0
-    assert np.mean(np.any(full.value_a != alone.value_a, axis=1)) < 1e-3
-    np.testing.assert_allclose(alone.value_a.mean(axis=0), full.value_a.mean(axis=0), rtol=1e-3)
-
-
-@pytest.mark.parametrize("aspect", [0.5, 1.0])
-def test_rays_that_reach_too_far_keep_the_neighbours(aspect: float) -> None:
-    """0.45 of the shorter side is the limit, for the lowest light of the lobe as well."""
-    shape = (round(24 * aspect), 24)
-    for scale, width, on in ((0.043, 0.0, False), (0.047, 0.0, True), (0.03, 1.0, True)):
-        job = job_of(
-            lambert(noise(*shape), scale * aspect),
-            queries={"min_cos": 0.1},
-            light={"width": width},
-            transport={"max_depth": 1},
-        )
-        assert plan_effects(job).on("neighbours") == on, (scale, width)
-
-
 OPACITY = np.where(np.random.default_rng(2).random((8, 8)) < 0.4, 0.2, 1.0)
 
 
 @pytest.mark.parametrize(
-    "mode", ["all", "all,-interreflection,-mis", "none,+opacity", "all,-opacity,-neighbours"]
+    "mode", ["all", "all,-interreflection,-mis", "none,+opacity", "all,-opacity,-shadowing"]
 )
 def test_values_do_not_depend_on_launches_whatever_is_simulated(mode: str) -> None:
     job = job_of(lambert(noise(16, 16), 0.05, opacity=OPACITY), mode)
@@ -180,7 +140,7 @@ def test_resumed_and_sliced_runs_follow_the_plan_of_the_manifest(
     manifest = json.loads((out / "manifest.json").read_text())
     stored = replace(first, max_depth=7, roulette_depth=5)
     manifest["effects"] = stored.to_manifest()
-    (out / "manifest.json").write_text(json.dumps(manifest))
+    write_sealed(out / "manifest.json", manifest)
 
     def never(job: Job) -> EffectsPlan:
         raise AssertionError("planned again although the manifest has a plan")

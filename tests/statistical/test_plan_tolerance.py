@@ -96,7 +96,7 @@ def test_auto_is_all_within_the_tolerance(scene: str) -> None:
     assert 2 * cost - upper < job.config.effects.tolerance
 
 
-@pytest.mark.parametrize("mode", ["-masking", "-neighbours", "all,-neighbours"])
+@pytest.mark.parametrize("mode", ["-masking", "all,-masking"])
 def test_pictures_follow_what_is_asked_away(mode: str) -> None:
     """What needs an effect goes with it there, too."""
     job = job_of(stuff(fractal(16, 2.0), 0.1), mode)
@@ -105,7 +105,7 @@ def test_pictures_follow_what_is_asked_away(mode: str) -> None:
 
 @pytest.mark.parametrize("tolerance", [0.0, 1e-4])
 def test_no_plan_exceeds_its_tolerance(tolerance: float) -> None:
-    """The bounds of shadowing and neighbours (a lobe's tail) count, too."""
+    """The bound of shadowing (a lobe's tail) counts, too."""
     job = job_of(
         stuff(fractal(64, 3.0), 0.002),
         effects={"tolerance": tolerance},

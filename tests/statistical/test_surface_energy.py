@@ -18,8 +18,9 @@ from mbtf_gen.surface import SurfaceParts
 Array = NDArray[np.float64]
 METAL = SurfaceParts(metallic=True)
 GLOSSY = SurfaceParts(specular=True, metallic=True)
+COATED = SurfaceParts(specular=True, metallic=True, coat=True)
 
-ROUGHNESS = (0.0, 0.005, 0.013, 0.02, 0.1, 0.3, 0.5, 1.0)
+ROUGHNESS = (0.0, 0.0033, 0.005, 0.013, 0.02, 0.1, 0.3, 0.5, 1.0)
 COSINES = (1.0, 0.5, 0.1, 1e-2, 1e-3, 1e-4)
 # Interpolation of the energy tables is off by 8e-4 at most, the points of the integral by as much.
 TOLERANCE = 2e-3
@@ -28,14 +29,16 @@ TOLERANCE = 2e-3
 def albedos(rows: Array, parts: SurfaceParts, points: int = 1 << 12) -> tuple[Array, Array]:
     """(∫ f μo dωo, greatest sampling weight) of surfaces seen from given cosines.
 
-    Columns of `rows`: roughness, metallic, specular, coat, coat roughness, base, cosine. Each branch of the
-    sampler is fed its own low-discrepancy points, by way of the third coordinate.
+    Columns of `rows`: roughness, metallic, specular, coat, coat roughness, base, cosine, and with sheen its
+    weight and roughness. Each branch of the sampler is fed its own low-discrepancy points, by way of the
+    third coordinate.
     """
     xi = sobol(points, 3, seed=11)
     energy, greatest = [], []
     for part in np.array_split(rows, max(1, len(rows) * points // (1 << 22))):
         names = ("roughness", "metallic", "specular", "coat", "coat_roughness", "base_color", "cosine")
-        lanes = {n: np.repeat(part[:, k], points) for k, n in enumerate(names)}
+        names += ("sheen", "sheen_roughness")
+        lanes = {n: np.repeat(c, points) for n, c in zip(names, part.T, strict=False)}
         wi = towards(lanes.pop("cosine"))
         chosen, u, v = (mi.Float(np.tile(xi[:, k], len(part))) for k in range(3))
         weight = np.array(point(parts, wi, **lanes).sample(chosen, mi.Point2f(u, v))[1].x, np.float64)
@@ -69,7 +72,7 @@ def test_white_surfaces_return_what_they_receive() -> None:
 
 def test_coated_surfaces_return_at_most_what_they_receive() -> None:
     rows = sweep((0.5, 1.0))
-    energy, greatest = albedos(rows, ALL, 1 << 11)
+    energy, greatest = albedos(rows, COATED, 1 << 11)
     assert energy.max() < 1 + TOLERANCE, rows[energy.argmax()]
     # A coat keeps light that tries to leave: of a mirror, whose light passes it twice alike, up to a quarter
     # where E_c = 1/2, for E_c + (1-E_c)² ≥ 3/4; of broad light seen from above no more than a tenth.
@@ -77,6 +80,70 @@ def test_coated_surfaces_return_at_most_what_they_receive() -> None:
     assert energy[white].min() > 0.75 - TOLERANCE
     assert energy[white & (rows[:, 6] == 1)].min() > 0.9
     assert greatest.max() < 10
+
+
+def test_surfaces_under_sheen_return_at_most_what_they_receive() -> None:
+    """Whatever lies below, and hardly less of a white base."""
+    binary = (0.0, 1.0)
+    below = itertools.product((0.0, 0.4), binary, (0.0, 0.5), binary, (0.2,), binary)
+    grid = itertools.product(below, COSINES, (1.0,), (0.07, 0.3, 1.0))
+    rows = np.array([(*lower, *rest) for lower, *rest in grid], np.float64)
+    energy, greatest = albedos(rows, ALL, 1 << 13)
+    assert energy.max() < 1 + TOLERANCE, rows[energy.argmax()]
+    assert greatest.max() < 12, rows[greatest.argmax()]
+    # What is lost comes in steeply and would leave low, where sheen takes more: up to a seventh.
+    lambert = (rows[:, 1] == 0) & (rows[:, 2] == 0) & (rows[:, 3] == 0)
+    assert 0.85 < energy[lambert & (rows[:, 5] == 1)].min() < 0.99
+    # At the horizon sheen of weight 1 returns everything by itself.
+    black = lambert & (rows[:, 5] == 0) & (rows[:, 6] == 1e-4) & (rows[:, 7] == 1)
+    assert energy[black].min() > 0.95
+
+
+@pytest.mark.parametrize("roughness", [0.1, 0.3, 0.45, 1.0])
+@pytest.mark.parametrize("cosine", [1.0, 0.5, 0.1, 1e-2])
+def test_sheen_takes_from_the_base_what_it_reflects(roughness: float, cosine: float) -> None:
+    """Against a quadrature of the textbook: D of Estevez and Kulla 2017, masked as Smith's theory says; the
+    base gets what is left at the direction, of view and light, where that is less."""
+    x, w = np.polynomial.legendre.leggauss(160)
+    t, phi = np.meshgrid(0.5 * (x + 1), 0.5 * np.pi * (x + 1), indexing="ij")
+    mu = t**2
+    measure = np.outer(0.5 * w, np.pi * w) * 2 * t * mu
+    reflected = np.array([textbook_sheen(c, mu, phi, roughness) for c in (cosine,)])[0]
+    share = float(np.sum(reflected * measure))
+    nodes = t[::8, 0] ** 2
+    shares = [float(np.sum(textbook_sheen(c, mu, phi, roughness) * measure)) for c in nodes]
+    left = 1 - np.maximum(share, np.interp(t[:, 0] ** 2, nodes, shares))
+    base = float(np.sum(left * 0.5 * w * 2 * t[:, 0] * 2 * t[:, 0] ** 2))
+    rows = np.array([[0.5, 0, 0, 0, 0.3, b, cosine, 1.0, roughness] for b in (0.0, 0.5, 1.0)])
+    energy, _ = albedos(rows, SurfaceParts(sheen=True), 1 << 15)
+    np.testing.assert_allclose(energy, share + np.array([0.0, 0.5, 1.0]) * base, atol=4e-3)
+
+
+def textbook_sheen(cosine: float, mu: Array, phi: Array, roughness: float) -> Array:
+    """D G2/(4 μi μo) with Λ from its definition: facets' projected area over the plane's, less one."""
+    n = 1 / roughness**2
+    theta = (np.arange(1500) + 0.5) / 1500 * np.pi / 2
+    around = (np.arange(128) + 0.5) / 128 * np.pi
+    weight = (2 + n) / (2 * np.pi) * np.sin(theta) ** (n + 1) * (np.pi / 2 / 1500) * (2 * np.pi / 128)
+
+    def area(c: Array) -> Array:
+        s = np.sqrt(1 - c**2)
+        facing = c[:, None, None] * np.cos(theta)[:, None] + s[:, None, None] * np.sin(theta)[
+            :, None
+        ] * np.cos(around)
+        return np.asarray(np.maximum(facing, 0).sum(axis=2) @ weight)
+
+    grid = np.sin(np.linspace(0, np.pi / 2, 40)) ** 2
+    areas = area(grid)
+
+    def capital_lambda(c: Any) -> Any:
+        return np.interp(np.arcsin(np.sqrt(c)), np.linspace(0, np.pi / 2, 40), areas) / c - 1
+
+    wi, wo = towards(cosine), towards(mu, np.degrees(phi))
+    h = wi + wo
+    h /= np.linalg.norm(h, axis=-1, keepdims=True)
+    d = (2 + n) / (2 * np.pi) * (1 - h[..., 2] ** 2).clip(0) ** (n / 2)
+    return np.asarray(d / (1 + capital_lambda(cosine) + capital_lambda(mu)) / (4 * cosine * mu))
 
 
 def stock_albedo(bsdf: dict[str, Any], cosine: float, points: int = 1 << 14) -> float:
@@ -131,9 +198,10 @@ def brdf(parts: SurfaceParts, wi: Array, wo: Array, **maps: Any) -> Array:
         (METAL, {"metallic": 1.0}),
         (GLOSSY, {"metallic": 0.4}),
         (SurfaceParts(coat=True), {"coat": 0.8}),
-        (ALL, {"metallic": 0.4, "coat": 0.5}),
+        (SurfaceParts(sheen=True), {"sheen": 0.8, "sheen_color": np.array([[1.0], [0.5], [0.2]])}),
+        (ALL, {"metallic": 0.4, "coat": 0.5, "sheen": 0.7}),
     ],
-    ids=["diffuse", "dielectric", "lobe", "metal", "mixture", "coat", "all"],
+    ids=["diffuse", "dielectric", "lobe", "metal", "mixture", "coat", "sheen", "all"],
 )
 def test_value_is_reciprocal(parts: SurfaceParts, maps: dict[str, Any], roughness: float) -> None:
     one, other = random_directions(4000, 1), random_directions(4000, 2)
@@ -143,6 +211,7 @@ def test_value_is_reciprocal(parts: SurfaceParts, maps: dict[str, Any], roughnes
     other /= np.linalg.norm(other, axis=1, keepdims=True)
     colour = np.array([[0.9], [0.5], [0.1]])
     given = {"base_color": colour, "roughness": roughness, "coat_roughness": 0.7 * roughness, **maps}
+    given["sheen_roughness"] = roughness
     there, back = brdf(parts, one, other, **given), brdf(parts, other, one, **given)
     np.testing.assert_allclose(there, back, rtol=1e-3, atol=1e-6)
 

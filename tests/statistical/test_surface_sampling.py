@@ -3,6 +3,7 @@ judge, and Mitsuba's path integrator a second one."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ DIFFUSE = SurfaceParts()
 SPECULAR = SurfaceParts(specular=True)
 METAL = SurfaceParts(specular=True, metallic=True)
 COAT = SurfaceParts(coat=True)
+SHEEN = SurfaceParts(sheen=True)
 
 
 def tilt(along_x: float, along_y: float) -> dict[str, Any]:
@@ -30,7 +32,7 @@ def tilt(along_x: float, along_y: float) -> dict[str, Any]:
 
 
 def sloping(parts: SurfaceParts) -> SurfaceParts:
-    return SurfaceParts(parts.diffuse, parts.specular, parts.metallic, parts.coat, slopes=True)
+    return replace(parts, slopes=True)
 
 
 class Hemisphere:
@@ -115,6 +117,8 @@ CASES: list[tuple[str, SurfaceParts, dict[str, Any]]] = [
     ("dark metal", METAL, {"roughness": 0.6, "metallic": 1.0, "base_color": 0.2}),
     ("half metal tilted", sloping(METAL), {"roughness": 0.4, "metallic": 0.5, **tilt(0.3, 0.3)}),
     ("coat", COAT, {"coat_roughness": 0.2}),
+    *((f"sheen {r}", SHEEN, {"sheen_roughness": r, "base_color": 0.6}) for r in (0.07, 0.3, 1.0)),
+    ("sheen tilted", sloping(SHEEN), {"sheen": 0.5, **tilt(0.4, 0.2)}),
     ("everything", ALL, {"roughness": 0.5, "coat_roughness": 0.1, "metallic": 0.4, "base_color": 0.7}),
 ]
 
@@ -132,6 +136,7 @@ FAULTS = {
     "specular 0.2": {"roughness": 0.22},
     "metal 1.0": {"metallic": 0.9},
     "coat": {"coat_roughness": 0.24},
+    "sheen 1.0": {"sheen": 0.8},
 }
 
 
@@ -174,7 +179,7 @@ def plugin(**values: Any) -> dict[str, Any]:
 
 def test_plugin_answers_as_the_surface_does() -> None:
     bsdf = mi.load_dict(
-        plugin(base_color=(0.7, 0.7, 0.7), roughness=0.4, metallic=0.3, specular=0.6, coat=0.5)
+        plugin(base_color=(0.7, 0.7, 0.7), roughness=0.4, metallic=0.3, specular=0.6, coat=0.5, sheen=0.4)
     )
     xi = sobol(1 << 10, 3)
     wi = towards(0.5, 30)
@@ -187,6 +192,8 @@ def test_plugin_answers_as_the_surface_does() -> None:
         specular=0.6,
         coat=0.5,
         coat_roughness=0.1,
+        sheen=0.4,
+        sheen_roughness=0.3,
     )
     si = dr.zeros(mi.SurfaceInteraction3f, len(xi))
     si.n = mi.Normal3f(0, 0, 1)

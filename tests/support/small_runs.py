@@ -33,7 +33,7 @@ def command(
     material = folder / "plane.npy"
     if not material.exists():
         np.save(material, np.full((4, 8), 0.5))
-    sizes = f"--queries {train} --test-queries 30 --set output.shard_queries=40 --format {suffix}"
+    sizes = f"--queries {train} --test-queries 30 --set output.shard_queries=40"
     return [str(material), *sizes.split(), "-o", str(output), "-q"]
 
 

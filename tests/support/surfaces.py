@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from mbtf_gen.surface import Surface, SurfaceParts, SurfacePoint
 from support.scenes import mi
 
-ALL = SurfaceParts(diffuse=True, specular=True, metallic=True, coat=True)
+ALL = SurfaceParts(diffuse=True, specular=True, metallic=True, coat=True, sheen=True)
 
 
 class LaneTexture:
@@ -47,7 +47,8 @@ def towards(cosine: ArrayLike, azimuth: ArrayLike = 0.0) -> NDArray[np.float64]:
 def point(parts: SurfaceParts, wi: NDArray[np.float64], **maps: ArrayLike) -> SurfacePoint:
     """A surface on the plane z = 0 seen from directions `wi` (n, 3), one per lane.
 
-    Maps not given: base colour 1, specular 1/2, metallic 0, coat 1, both roughnesses 0.3.
+    Maps not given: base colour 1, specular 1/2, metallic 0, coat 1, white sheen of weight 1, all roughnesses
+    0.3.
     """
     import drjit as dr
 
@@ -58,6 +59,9 @@ def point(parts: SurfaceParts, wi: NDArray[np.float64], **maps: ArrayLike) -> Su
         "coat": 1.0,
         "roughness": 0.3,
         "coat_roughness": 0.3,
+        "sheen": 1.0,
+        "sheen_color": 1.0,
+        "sheen_roughness": 0.3,
         "slopes": np.zeros((3, 1)),
         **maps,
     }

@@ -8,6 +8,8 @@ import os
 import re
 import shutil
 import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,7 +19,10 @@ from support.datasets import edit
 from support.file_operations import FileOperations, Operation
 from support.small_runs import command, contents, die, ending, generate, in_child, noisy_plane
 
+from mbtf_gen.estimates import Estimates, Stream
+from mbtf_gen.queries import Queries
 from mbtf_gen.simulation import ClosedForm
+from mbtf_gen.verification import is_finished, verify
 
 ERRORS = (errno.EIO, errno.ENOSPC, errno.EACCES, errno.EMFILE)
 PARTIAL_OR_INPUT = (3, 4)
@@ -42,6 +47,7 @@ class Small:
     Attributes
     ----------
     line : command line; out : its folder; whole : folder of an undisturbed run; expected : its contents
+    hash : of the configuration
     """
 
     def __init__(self, folder: Path) -> None:
@@ -49,6 +55,7 @@ class Small:
         self.line = command(folder, self.out, train=60)
         assert generate(command(folder, self.whole, train=60)) == 0
         self.expected = contents(self.whole)
+        self.hash = self.expected["manifest.json"]["config_hash"]
 
     def absent(self) -> None:
         shutil.rmtree(self.out, ignore_errors=True)
@@ -173,6 +180,100 @@ def test_a_kill_at_any_file_operation_loses_nothing(name: str, thorough: bool, s
         assert generate(line) == 0, operation
         assert contents(small.out) == small.expected, operation
     assert killed > 3
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("name", ["run", "repair"])
+def test_an_interruption_keeps_what_was_rendered_and_says_how_to_go_on(
+    name: str,
+    number: signal.Signals,
+    small: Small,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    prepare, line_of = COMMANDS[name]
+    prepare(small)
+    line, rendered = line_of(small), 0
+
+    def interrupted(self: ClosedForm, queries: Queries, spp: int, stream: Stream) -> Estimates:
+        nonlocal rendered
+        if rendered == 1:
+            os.kill(os.getpid(), number)
+        rendered += 1
+        return noisy_plane(self, queries, spp, stream)
+
+    capsys.readouterr()
+    with monkeypatch.context() as patch:
+        patch.setattr(ClosedForm, "estimate", interrupted)
+        assert generate(line) == 130
+    said = [x for x in capsys.readouterr().err.splitlines() if not x.startswith("warning: ")]
+    assert len(said) == 2
+    assert said[0].startswith("error: interrupted; ")
+    assert "is kept" in said[0] or "are kept" in said[0]
+    assert said[1] == "  the same command goes on from there"
+    # The shard that was rendered, and no other one of those to make.
+    assert rendered == 1
+    assert is_finished(small.out / "train-00000.npz", 40, small.hash)
+    assert not is_finished(small.out / "test-00000.npz", 30, small.hash)
+    assert (small.out / "train-00000.npz").read_bytes() == small.expected["train-00000.npz"]
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    assert generate(line) == 0
+    assert contents(small.out) == small.expected
+
+
+def test_two_runs_at_once_make_every_shard_once(tmp_path: Path) -> None:
+    assert generate(command(tmp_path, tmp_path / "whole", train=600)) == 0
+    line = command(tmp_path, tmp_path / "out", train=600)
+    children = [in_child(lambda: generate(line)) for _ in range(3)]
+    # A shard that another one still writes at the end is left to it.
+    assert {ending(child) for child in children} <= {0, 4}
+    assert generate(line) == 0
+    assert contents(tmp_path / "out") == contents(tmp_path / "whole")
+
+
+def test_any_slices_merged_are_the_whole(tmp_path: Path) -> None:
+    assert generate(command(tmp_path, tmp_path / "whole", train=600)) == 0
+    line = command(tmp_path, tmp_path / "out", train=600)
+    for index in (3, 1, 7, 2, 6, 5, 4):
+        assert generate([*line, "--shards", f"{index}/7", "--overwrite"]) == 0
+    assert generate(["merge", str(tmp_path / "out")]) == 0
+    assert contents(tmp_path / "out") == contents(tmp_path / "whole")
+
+
+# Runs the program on a file system of 60 kB, gives it more room, and runs it again.
+FULL = """
+set -e
+mount -t tmpfs -o size=60k none full
+status=0
+"$@" 2> said || status=$?
+mount -o remount,size=10m full
+"$@" 2> said-again
+cp -r full/out out
+echo $status
+"""
+
+
+@pytest.mark.skipif(shutil.which("unshare") is None, reason="no unshare: no file system to fill")
+@pytest.mark.parametrize("suffix", ["npz", "exr"])
+def test_a_full_disk_ends_in_one_message_and_room_mends_it(suffix: str, tmp_path: Path) -> None:
+    spaces = ["unshare", "--user", "--map-root-user", "--mount"]
+    (tmp_path / "full").mkdir()
+    probe = subprocess.run([*spaces, "mount", "-t", "tmpfs", "none", tmp_path / "full"], capture_output=True)
+    if probe.returncode:
+        pytest.skip("no file system can be mounted here")
+    # The noise of the fixtures does not reach another program: values of a plane, all alike.
+    program = [sys.executable, "-m", "mbtf_gen", *command(tmp_path, tmp_path / "full/out", train=1500)]
+    program += ["--format", suffix]
+    done = subprocess.run(
+        [*spaces, "sh", "-c", FULL, "sh", *program], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == "4"
+    said = [x for x in (tmp_path / "said").read_text().splitlines() if not x.startswith("warning: ")]
+    assert len(said) == 2, said
+    assert "No space left on device" in said[0]
+    assert verify(tmp_path / "out") == []
+    assert not list((tmp_path / "out").glob(".*"))
 
 
 @pytest.mark.parametrize(

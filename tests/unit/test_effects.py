@@ -22,7 +22,7 @@ NORMAL = np.broadcast_to(np.float32([0.6, 0.0, 0.8]), (4, 4, 3))
 
 
 def job_of(material: Material, mode: str = "auto", **options: Any) -> Job:
-    sections = {"effects": {"mode": mode}, **options}
+    sections: dict[str, Any] = {"effects": {"mode": mode}, **options}
     return Job.of(GeneratorConfig.model_validate({"material": "m", **sections}), material)
 
 
@@ -85,10 +85,22 @@ def test_what_needs_an_effect_goes_with_it() -> None:
     assert on(plan_effects(job_of(LAMBERT, "-masking"))) == set()
     with pytest.raises(UsageError, match="'shadowing' needs 'parallax and masking'"):
         plan_effects(job_of(LAMBERT, "-masking,+shadowing"))
-    assert not plan_effects(job_of(LAMBERT, "all,-neighbours")).on("interreflection")
 
 
-@pytest.mark.parametrize("name", ["specular", "metallic", "coat", "normal", "opacity", "fibres"])
+def test_the_tile_repeats_by_construction() -> None:
+    with pytest.raises(UsageError, match="cannot be left out"):
+        plan_effects(job_of(LAMBERT, "-neighbours"))
+    low = plan_effects(job_of(LAMBERT, queries={"min_cos": 0.2}, light={"width": 0.0}), pilots=False)
+    # A relief of 0.1 seen from 11.5 degrees.
+    assert "up to 0.49 tiles" in low["neighbours"].reason
+    assert (
+        "any number"
+        in plan_effects(job_of(LAMBERT, queries={"min_cos": 0.01}), pilots=False)["neighbours"].reason
+    )
+    assert not plan_effects(job_of(FLAT)).on("neighbours")
+
+
+@pytest.mark.parametrize("name", ["specular", "metallic", "coat", "sheen", "normal", "opacity", "fibres"])
 def test_what_a_material_lacks_cannot_be_asked_for(name: str) -> None:
     with pytest.raises(UsageError, match="the material has none"):
         plan_effects(job_of(LAMBERT, f"+{name}"))
@@ -141,6 +153,21 @@ def test_black_under_a_coat_is_not_black() -> None:
     assert on(plan) >= {*OF_RELIEF, "coat"}
 
 
+GLOSS: dict[str, Any] = {"roughness": 0.5, "specular": 0.5, "metallic": 0.0}
+
+
+@pytest.mark.parametrize("more", [GLOSS, COAT, {**GLOSS, **COAT}, {"sheen": 1.0, "sheen_roughness": 0.3}])
+def test_costs_of_lambert_are_not_stated_for_gloss(more: dict[str, Any]) -> None:
+    """Estimates shade Lambert; on anything else they would be wrong by any factor."""
+    stuff = replace(LAMBERT, normal=NORMAL, opacity=np.full((2, 2), 0.999), **more)
+    everything = dict.fromkeys(("masking", "shadowing", "normal", "opacity"))
+    plan = plan_effects(job_of(stuff, transport={"max_depth": 1}, effects={"mode": "all"}))
+    assert {name: plan[name].cost for name in everything} == everything
+    lambert = replace(LAMBERT, normal=NORMAL, opacity=np.full((2, 2), 0.999))
+    plan = plan_effects(job_of(lambert, transport={"max_depth": 1}))
+    assert all(plan[name].cost for name in everything)
+
+
 def test_the_smoothest_place_decides_how_light_is_found() -> None:
     """A light of one degree against lobes of 2α; Lambert needs no second way."""
     dull = {"roughness": 0.6, "specular": 0.5, "metallic": 0.0}
@@ -150,6 +177,9 @@ def test_the_smoothest_place_decides_how_light_is_found() -> None:
     assert plan_effects(job_of(replace(FLAT, **{**dull, "roughness": patch}))).on("mis")
     assert plan_effects(job_of(replace(FLAT, **dull, coat=1.0, coat_roughness=0.05))).on("mis")
     assert not plan_effects(job_of(FLAT, "+masking")).on("mis")
+    sheen = {"sheen": 0.5, "sheen_roughness": 0.5}
+    assert not plan_effects(job_of(replace(FLAT, **sheen))).on("mis")
+    assert plan_effects(job_of(replace(FLAT, **{**sheen, "sheen_roughness": 0.05}))).on("mis")
 
 
 def test_the_configured_roulette_and_cap_reach_the_plan() -> None:

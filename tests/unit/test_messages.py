@@ -51,6 +51,7 @@ RELAYS = {
     "mbtf_gen/repairs.py": {"faults", "job", "mend"},
     "mbtf_gen/selftest_checks.py": {"_cuda"},
     "mbtf_gen/settings.py": {"_explain", "build"},
+    "mbtf_gen/shard_files.py": {"write"},
     "mbtf_gen/verification.py": {
         "_content_fault",
         "_manifest_faults",

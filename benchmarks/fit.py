@@ -1,0 +1,348 @@
+"""Samples per second of training and of inference, beside the straightforward way in PyTorch.
+
+    python benchmarks/fit.py [--finest 8] [--batch 65536] [--rounds 3]
+
+``neumip`` with a pyramid of 256² and batches of 2^16. Three ways to do the same arithmetic:
+
+**plain**: as one writes it down (class ``Plain`` below): one tensor per level, blurred by FFT while the blur
+is annealed; each level read by the queries that blend it, four texels at a time; ``torch.nn.Linear``,
+autograd, ``torch.optim.Adam``. Texels are read by indexing or by ``grid_sample``, whichever is
+faster. All cores.
+**pytorch**: the fitter's own path where the compiled kernel is missing.
+**kernel**: the compiled kernel, where it is there.
+
+A round takes one step of each way at ten moments of the annealing, spread evenly over training, so that a
+round's mean is that of a whole training; the ways take turns, so that whatever slows the machine slows all.
+Figures are those of the median round. Before that the three are checked to evaluate the same model alike.
+
+The last line is one JSON object: figures, and the bars they are held to. Exit code 1 where a bar is missed;
+on other than two cores, or without the kernel, they are only reported.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from mbtf_fit.blur import NEGLIGIBLE, annealed_sigma
+from mbtf_fit.config import FitConfig
+from mbtf_fit.data import TrainingQueries
+from mbtf_fit.inference import predict
+from mbtf_fit.memory import keep_freed_memory
+from mbtf_fit.models import build_model
+from mbtf_fit.models.neumip import Neumip
+from mbtf_fit.native import library
+from mbtf_fit.noise import NoiseModel
+from mbtf_fit.parallel import MAX_KERNEL_THREADS, Workers
+from mbtf_fit.training import BETAS, Trainer
+from mbtf_gen.directions import from_projected_disk
+from mbtf_gen.levels import Lattice, sigma_of_level
+
+# Times the plain way's samples per second, on two cores.
+BARS = {"training": 3.0, "inference": 2.0}
+BAR_CORES = 2
+# Moments of training at which a step is timed, as shares of the budget.
+MOMENTS = [0.05 + 0.1 * k for k in range(10)]
+STEPS = 10_000
+
+
+def by_index(texture: Tensor, u: Tensor) -> Tensor:
+    """Bilinear lookup in a periodic texture (rows, columns, channels) at u (n, 2), texel by texel."""
+    rows, columns, _ = texture.shape
+    x, y = u[:, 0] * columns - 0.5, (1 - u[:, 1]) * rows - 0.5
+    i, j = x.floor(), y.floor()
+    fx, fy = (x - i)[:, None], (y - j)[:, None]
+    left, top = i.long() % columns, j.long() % rows
+    right, bottom = (left + 1) % columns, (top + 1) % rows
+    upper = (1 - fx) * texture[top, left] + fx * texture[top, right]
+    lower = (1 - fx) * texture[bottom, left] + fx * texture[bottom, right]
+    return (1 - fy) * upper + fy * lower
+
+
+def by_grid_sample(texture: Tensor, u: Tensor) -> Tensor:
+    """The same by PyTorch's own function, which does not wrap: one texel more on every side does."""
+    rows, columns, channels = texture.shape
+    image = nn.functional.pad(texture.permute(2, 0, 1)[None], (1, 1, 1, 1), mode="circular")
+    at = u - u.floor()
+    x = (2 * at[:, 0] - 1) * columns / (columns + 2)
+    y = (1 - 2 * at[:, 1]) * rows / (rows + 2)
+    grid = torch.stack([x, y], 1).view(1, 1, -1, 2)
+    found = nn.functional.grid_sample(image, grid, mode="bilinear", align_corners=False)
+    return found.view(channels, -1).t()
+
+
+def blur_by_fft(texture: Tensor, sigma: float) -> Tensor:
+    """A periodic texture (rows, columns, channels) through a Gaussian of `sigma` texels."""
+    rows, columns, _ = texture.shape
+    fy, fx = torch.fft.fftfreq(rows)[:, None], torch.fft.rfftfreq(columns)[None, :]
+    transfer = torch.exp(-2 * (torch.pi * sigma) ** 2 * (fx**2 + fy**2))
+    spectrum = torch.fft.rfft2(texture, dim=(0, 1)) * transfer[..., None]
+    return torch.fft.irfft2(spectrum, s=(rows, columns), dim=(0, 1))
+
+
+def network(inputs: int, outputs: int) -> nn.Sequential:
+    """The paper's networks: four layers, 25 features."""
+    sizes = [inputs, 25, 25, 25, outputs]
+    layers: list[nn.Module] = []
+    for a, b in pairwise(sizes):
+        layers += [nn.Linear(a, b), nn.ReLU()]
+    return nn.Sequential(*layers[:-1])
+
+
+class Plain(nn.Module):
+    """``neumip`` as plain PyTorch.
+
+    Parameters
+    ----------
+    read : bilinear lookup in one texture
+    """
+
+    def __init__(self, lattice: Lattice, unit: float, read: Callable[[Tensor, Tensor], Tensor]) -> None:
+        super().__init__()
+        self.lattice, self.unit, self.read = lattice, unit, read
+        shapes = [lattice.shape(s) for s in range(lattice.finest + 1)]
+        self.pyramid = nn.ParameterList(nn.Parameter(torch.empty(*shape, 7)) for shape in shapes)
+        self.offset_texture = nn.Parameter(torch.empty(*shapes[-1], 7))
+        self.decoder, self.offset_network = network(11, 3), network(9, 1)
+        self.seconds: dict[str, float] = defaultdict(float)
+        self._mark = 0.0
+
+    def take(self, model: Neumip) -> None:
+        """Take over the weights of the fitter's model."""
+        weights = model.weights()
+        with torch.no_grad():
+            for s, texture in enumerate(self.pyramid):
+                texture.copy_(weights[f"pyramid.{s}"])
+            self.offset_texture.copy_(weights["offset_texture.0"])
+            for name in ("decoder", "offset_network"):
+                for k, layer in enumerate(getattr(self, name)[::2]):
+                    layer.weight.copy_(weights[f"{name}.{k}.weight"])
+                    layer.bias.copy_(weights[f"{name}.{k}.bias"])
+
+    def mark(self, part: str | None = None) -> None:
+        """Count the time since the last mark as a part's."""
+        now = time.perf_counter()
+        if part is not None:
+            self.seconds[part] += now - self._mark
+        self._mark = now
+
+    def forward(self, q: TrainingQueries, sigma: float, offset_sigma: float) -> Tensor:
+        """Values (n, 3), textures blurred by `sigma` texels of the finest level."""
+        self.mark()
+        columns = self.lattice.shape()[1]
+        pyramid = list(self.pyramid)
+        for s, texture in enumerate(pyramid):
+            local = sigma * texture.shape[1] / columns
+            if local >= NEGLIGIBLE:
+                pyramid[s] = blur_by_fft(texture, local)
+        offset_texture = self.offset_texture
+        if offset_sigma > 0:
+            offset_texture = blur_by_fft(offset_texture, offset_sigma)
+        self.mark("blur")
+        seen = self.read(offset_texture, q.u)
+        self.mark("lookups")
+        r = 0.1 * self.offset_network(torch.cat([seen, q.omega_o[:, :2]], 1))
+        self.mark("networks")
+        step = r * q.omega_o[:, :2] / q.omega_o[:, 2:].clamp_min(0.6)
+        u = q.u + step / torch.tensor([1.0, self.lattice.aspect])
+        level = (-torch.log2(2 * q.sigma)).clamp(0, self.lattice.finest)
+        features = torch.zeros(len(u), 7)
+        for s, texture in enumerate(pyramid):
+            weight = (1 - (level - s).abs()).clamp_min(0)
+            rows = weight.nonzero()[:, 0]
+            part = weight[rows, None] * self.read(texture, u[rows])
+            features = features.index_add(0, rows, part)
+        self.mark("lookups")
+        x = self.decoder(torch.cat([features, q.omega_i[:, :2], q.omega_o[:, :2]], 1))
+        value = self.unit * torch.expm1(x)
+        self.mark("networks")
+        return value
+
+
+def random_batch(random: np.random.Generator, n: int, lattice: Lattice) -> TrainingQueries:
+    """Queries of all levels and directions, of values between 0.1 and 0.3."""
+    disk = np.sqrt(0.99 * random.random((2, n, 1)))
+    angle = 2 * np.pi * random.random((2, n, 1))
+    omega = from_projected_disk(disk * np.concatenate([np.cos(angle), np.sin(angle)], -1))
+    sigma = sigma_of_level(lattice.finest * random.random(n))
+    arrays = (random.random((n, 2)), sigma, *omega, 0.1 + 0.2 * random.random((n, 3)))
+    return TrainingQueries(*(torch.from_numpy(np.ascontiguousarray(a, np.float32)) for a in arrays))
+
+
+def use_kernel(yes: bool) -> None:
+    """Let everything that follows use the kernel, or not."""
+    os.environ[library.ENVIRONMENT] = "auto" if yes else "off"
+    library.reload()
+
+
+class Plainly:
+    """Trains ``Plain``: one call, one step."""
+
+    def __init__(self, model: Plain, config: FitConfig, unit: float) -> None:
+        self.model, self.config, self.unit = model, config, unit
+        training = config.training
+        texels = [*model.pyramid, model.offset_texture]
+        weights = [*model.decoder.parameters(), *model.offset_network.parameters()]
+        self.optimiser = torch.optim.Adam(
+            [{"params": texels, "lr": training.texture_rate}, {"params": weights, "lr": training.rate}],
+            betas=BETAS,
+        )
+
+    def __call__(self, batch: TrainingQueries, share: float) -> None:
+        blur = self.config.training.blur
+        sigma = annealed_sigma(share / blur.share, blur.start, blur.end)
+        p = self.model(batch, sigma, max(sigma, blur.offset))
+        loss = ((p - batch.value) ** 2 / (p.detach() ** 2 + self.unit**2)).mean()
+        self.optimiser.zero_grad()
+        loss.backward()
+        self.model.mark("backward")
+        self.optimiser.step()
+        self.model.mark("Adam")
+
+
+class Ours:
+    """The fitter's trainer, taken to any moment: one call, one step."""
+
+    def __init__(self, model: Neumip, config: FitConfig, queries: TrainingQueries, kernel: bool) -> None:
+        use_kernel(kernel)
+        unit = float(queries.value.mean())
+        self.trainer = Trainer(config, model, queries, NoiseModel.silent(unit, model.lattice))
+        self.path = self.trainer.path
+        self.limit = MAX_KERNEL_THREADS if kernel else None
+
+    def __call__(self, batch: TrainingQueries, share: float) -> None:
+        self.trainer.progress.step = round(share * STEPS)
+        self.trainer._step(batch, self.workers)
+
+    def __enter__(self) -> Ours:
+        self.workers = Workers(torch.device("cpu"), limit=self.limit)
+        self.workers.__enter__()
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self.workers.__exit__(None, None, None)
+
+
+def seconds(work: Callable[[], Any]) -> float:
+    """Wall time of a call."""
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--finest", type=int, default=8, help="finest level: 2^k texels across")
+    parser.add_argument("--batch", type=int, default=1 << 16, help="queries per step")
+    parser.add_argument("--rounds", type=int, default=3, help="timed rounds")
+    arguments = parser.parse_args()
+    lattice, n = Lattice(arguments.finest), arguments.batch
+    # The fitter does so for its own path; the plain way has it too.
+    keep_freed_memory()
+    config = FitConfig.model_validate({"training": {"steps": STEPS, "batch": n}})
+    queries = random_batch(np.random.default_rng(0), n * len(MOMENTS), lattice)
+    batches = [queries.slice(k * n, (k + 1) * n) for k in range(len(MOMENTS))]
+    unit = float(queries.value.mean())
+
+    def fresh() -> Neumip:
+        model = build_model("neumip", lattice)
+        assert isinstance(model, Neumip)
+        model.initialise(torch.Generator().manual_seed(0), unit)
+        return model
+
+    plains = {}
+    for read in (by_index, by_grid_sample):
+        plain = Plain(lattice, unit, read)
+        plain.take(fresh())
+        step = Plainly(plain, config, unit)
+        step(batches[0], 0.5)
+        plains[read.__name__] = (seconds(lambda s=step: s(batches[1], 0.5)), step)
+    reader = min(plains, key=lambda name: plains[name][0])
+    plainly = plains[reader][1]
+    plainly.model.take(fresh())
+    plainly.model.seconds.clear()
+
+    pytorch = Ours(fresh(), config, queries, kernel=False)
+    kernel = Ours(fresh(), config, queries, kernel=True)
+    ours = {"pytorch": pytorch} | ({"kernel": kernel} if kernel.path != "pytorch" else {})
+    checked, model = batches[0].slice(0, 4096), fresh()
+    arrays = [a.numpy() for a in (checked.u, checked.sigma, checked.omega_i, checked.omega_o)]
+    with torch.no_grad():
+        expected = plainly.model(checked, 0.0, 0.0).clamp_min(0).numpy()
+    for way in ours:
+        use_kernel(way == "kernel")
+        if not np.allclose(predict(model, *arrays), expected, atol=1e-4 * unit, rtol=1e-4):
+            raise SystemExit(f"{way} and plain evaluate different models: the figures mean nothing")
+
+    training: dict[str, list[float]] = defaultdict(list)
+    inference: dict[str, list[float]] = defaultdict(list)
+    whole = [a.numpy() for a in (queries.u, queries.sigma, queries.omega_i, queries.omega_o)]
+
+    def plain_inference() -> None:
+        with torch.no_grad():
+            for batch in batches:
+                plainly.model(batch, 0.0, 0.0).clamp_min(0)
+
+    for number in range(arguments.rounds + 1):
+        if number == 1:
+            plainly.model.seconds.clear()
+        times = {"plain": seconds(lambda: [plainly(b, m) for b, m in zip(batches, MOMENTS, strict=True)])}
+        shares = dict(plainly.model.seconds)
+        for way, step in ours.items():
+            with step:
+                times[way] = seconds(lambda s=step: [s(b, m) for b, m in zip(batches, MOMENTS, strict=True)])
+        evaluations = {"plain": seconds(plain_inference)}
+        plainly.model.seconds = defaultdict(float, shares)
+        for way in ours:
+            use_kernel(way == "kernel")
+            evaluations[way] = seconds(lambda: predict(model, *whole))
+        if number > 0:  # the first round warms up
+            for way in times:
+                training[way].append(times[way])
+                inference[way].append(evaluations[way])
+    parts = plainly.model.seconds
+    total = sum(parts.values())
+    divided = ", ".join(f"{name} {time / total:.0%}" for name, time in parts.items())
+    print(f"plain way ({reader}): {divided} of a step", file=sys.stderr)
+    rates = {
+        kind: {way: len(queries) / statistics.median(found) for way, found in measured.items()}
+        for kind, measured in (("training", training), ("inference", inference))
+    }
+    best = "kernel" if "kernel" in ours else "pytorch"
+    ratios = {kind: found[best] / found["plain"] for kind, found in rates.items()}
+    print(f"{lattice.shape()[1]}² pyramid, batch {n}, {torch.get_num_threads()} threads, {kernel.path}")
+    for kind, found in rates.items():
+        line = "  ".join(
+            f"{way} {rate / 1e6:.2f} M samples/s ({rate / found['plain']:.1f}x)"
+            for way, rate in found.items()
+        )
+        print(f"{kind:10s} {line}")
+    judged = torch.get_num_threads() == BAR_CORES and "kernel" in ours
+    met = all(ratios[kind] >= bar for kind, bar in BARS.items()) if judged else None
+    figures = {
+        "samples_per_second": rates,
+        "ratios": ratios,
+        "path": kernel.path,
+        "plain_shares": {name: time / total for name, time in parts.items()},
+        "plain_lookup": reader,
+        "rounds": {"training": dict(training), "inference": dict(inference)},
+        "threads": torch.get_num_threads(),
+    }
+    print(json.dumps({"figures": figures, "bars": BARS, "met": met}))
+    return 1 if met is False else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,11 @@
+"""The compiled kernel: forward and backward of the NeuMIP models, blur and Adam on CPUs.
+
+Written in C, compiled when the package is installed (``setup.py``), called through ctypes. Where it is
+missing, everything runs in PyTorch; the tests hold the two equal.
+"""
+
+from __future__ import annotations
+
+from .library import Kernel, describe, kernel, missing_reason
+
+__all__ = ["Kernel", "describe", "kernel", "missing_reason"]

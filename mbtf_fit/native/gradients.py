@@ -1,0 +1,159 @@
+"""Gradients of a batch by the kernel: every thread works through its share of the queries.
+
+The quadratic losses are the kernel's own: it goes forward and backward block by block. With any other loss a
+share is cut into pieces: each goes forward, through the loss in PyTorch, and backward while its activations
+are still in the cache. Each thread adds to sums of its own; they are added up in a fixed order, so that the
+result depends on the number of threads and on nothing else about them.
+"""
+
+from __future__ import annotations
+
+import ctypes
+
+import torch
+from torch import Tensor
+
+from ..data import TrainingQueries
+from ..losses import Objective, Quadratic
+from ..parallel import Workers
+from .library import GradientSums, QuadraticLoss, QueryPointers
+from .model import NativeModel, aligned, networks, parameters_of, pointers
+
+# Bytes of activations that a piece may have: about what a core has of the last cache.
+_PIECE_BYTES = 6 << 20
+
+
+def query_pointers(batch: TrainingQueries, start: int, stop: int) -> QueryPointers:
+    """Where queries [start, stop) of a batch lie; its tensors are contiguous float32."""
+    arrays = (batch.u, batch.sigma, batch.omega_i, batch.omega_o)
+    return QueryPointers(stop - start, *(a.data_ptr() + 4 * start * a.stride(0) for a in arrays))
+
+
+class _Sums:
+    """What one thread adds to, and its working memory."""
+
+    def __init__(self, native: NativeModel, piece: int) -> None:
+        lanes = native.kernel.lanes
+        self.textures = [
+            aligned(t.packing.texels * (-(-t.texels.shape[1] // 8) * 8)) for t in native.textures
+        ]
+        self.networks = [aligned(lanes * network.count) for network in networks(native.model)]
+        self.state = native.state(piece)
+        self.scratch = aligned(int(native.kernel.library.mbtf_scratch_floats()))
+        self.out = torch.empty(max(piece, 2 * native.kernel.block), 3)
+        addresses = [t.data_ptr() for t in self.textures], [t.data_ptr() for t in self.networks]
+        texture, network = ([*a, 0][:2] for a in addresses)
+        self.pointers = GradientSums(*texture, *network)
+
+
+class NativeGradients:
+    """Computes gradients of one model for many batches; holds the memory for it.
+
+    Parameters
+    ----------
+    native : the model
+
+    Attributes
+    ----------
+    textures, networks : gradients by the tables and by the weights of each network, of the last batch
+    """
+
+    def __init__(self, native: NativeModel) -> None:
+        self.native = native
+        block = native.kernel.block
+        per_block = 4 * native.kernel.library.mbtf_state_floats(ctypes.byref(native.description))
+        self.piece = block * max(4, _PIECE_BYTES // per_block)
+        self._sums: list[_Sums] = []
+        self.textures = [torch.empty_like(t.texels) for t in native.textures]
+        self.networks = [[torch.empty_like(p) for p in parameters_of(n)] for n in networks(native.model)]
+
+    def compute(self, objective: Objective, batch: TrainingQueries, workers: Workers) -> Tensor:
+        """Mean loss of a batch; the gradients by tables and weights are left in :attr:`textures` and
+        :attr:`networks`."""
+        n, count = len(batch), workers.count
+        if len(self._sums) != count:
+            self._sums = [_Sums(self.native, self.piece) for _ in range(count)]
+        edges = [n * k // count for k in range(count + 1)]
+        self.native.refresh()
+
+        quadratic = objective.quadratic()
+
+        def share(k: int) -> Tensor:
+            if quadratic is not None:
+                return self._learn(self._sums[k], quadratic, batch, edges[k], edges[k + 1])
+            total = torch.zeros(())
+            for start in range(edges[k], edges[k + 1], self.piece):
+                stop = min(start + self.piece, edges[k + 1])
+                total += self._piece(self._sums[k], objective, batch, start, stop)
+            return total
+
+        losses = workers.each(share)
+        for k, gradients in enumerate(self.networks):
+            self._collect_network(k, gradients)
+        workers.each(self._collect_textures)
+        # Always added in the same order: the sum does not depend on who was first.
+        total = losses[0]
+        for loss in losses[1:]:
+            total = total + loss
+        return total
+
+    def _learn(self, sums: _Sums, loss: Quadratic, batch: TrainingQueries, start: int, stop: int) -> Tensor:
+        native = self.native
+        bounded = loss.bound is not None
+        bound = (ctypes.c_float * 3)(*(loss.bound or (0.0, 0.0, 0.0)))
+        form = QuadraticLoss(loss.relative, loss.squared, loss.scale, bound, bounded)
+        queries = query_pointers(batch, start, stop)
+        share = 1.0 / (3 * len(batch))
+        total = native.kernel.library.mbtf_learn(
+            native.kernel.variant,
+            ctypes.byref(native.description),
+            ctypes.byref(queries),
+            batch.value.data_ptr() + 12 * start,
+            ctypes.byref(form),
+            share,
+            sums.state.data_ptr(),
+            sums.scratch.data_ptr(),
+            sums.out.data_ptr(),
+            ctypes.byref(sums.pointers),
+        )
+        return torch.tensor(share * total)
+
+    def _piece(
+        self, sums: _Sums, objective: Objective, batch: TrainingQueries, start: int, stop: int
+    ) -> Tensor:
+        native, part = self.native, batch.slice(start, stop)
+        queries = query_pointers(batch, start, stop)
+        out = sums.out[: len(part)]
+        native.forward(queries, sums.state, out.data_ptr(), keep=True)
+        prediction = out.detach().requires_grad_()
+        loss = objective(prediction, part) * (len(part) / len(batch))
+        (by_value,) = torch.autograd.grad(loss, prediction)
+        native.kernel.library.mbtf_backward(
+            native.kernel.variant,
+            ctypes.byref(native.description),
+            ctypes.byref(queries),
+            sums.state.data_ptr(),
+            by_value.contiguous().data_ptr(),
+            sums.scratch.data_ptr(),
+            ctypes.byref(sums.pointers),
+        )
+        return loss.detach()
+
+    def _collect_network(self, k: int, gradients: list[Tensor]) -> None:
+        description = (self.native.description.decoder, self.native.description.offset)[k]
+        self.native.kernel.library.mbtf_collect_weights(
+            ctypes.byref(description),
+            pointers([s.networks[k] for s in self._sums]),
+            len(self._sums),
+            pointers(gradients),
+        )
+
+    def _collect_textures(self, part: int) -> None:
+        kernel, count = self.native.kernel, len(self._sums)
+        for k, gradient in enumerate(self.textures):
+            texels, channels = gradient.shape
+            edges = [texels * part // count, texels * (part + 1) // count]
+            sums = pointers([s.textures[k] for s in self._sums])
+            kernel.library.mbtf_collect(
+                kernel.variant, sums, len(self._sums), channels, *edges, gradient.data_ptr()
+            )

@@ -1,0 +1,170 @@
+"""A PyTorch model as the kernel sees it."""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..models import NeuralMaterial
+from ..models.mlp import Mlp
+from ..models.neumip import Neumip, NeumipBaseline
+from ..models.textured import GRAZING, OFFSET_SCALE
+from ..models.textures import FeatureTextures
+from .library import (
+    MAX_CHANNELS,
+    MAX_LAYERS,
+    MAX_LEVELS,
+    MAX_WIDTH,
+    Kernel,
+    Model,
+    Network,
+    QueryPointers,
+    Textures,
+)
+
+# Options of the architecture that the kernel knows, and their values; any size within its limits will do.
+_KNOWN: dict[str, tuple[Any, ...]] = {
+    "decoder": ("mlp",),
+    "activation": ("relu",),
+    "outputs": (3,),
+    "output": ("exp-1",),
+    "offset": ("depth", "none"),
+    "blending": ("blend",),
+    "encoding": ({"position": 0, "direction": 0, "pi": True, "raw": False, "lifted": False},),
+}
+_SIZES = {"channels", "width", "layers"}
+
+
+def unsupported_reason(model: NeuralMaterial) -> str | None:
+    """Why the kernel cannot evaluate a model, in some words; None where it can."""
+    if type(model) not in (Neumip, NeumipBaseline):
+        return f"it does not know the model {model.name}"
+    options = model.network.model_dump()
+    for name, known in _KNOWN.items():
+        if options.pop(name) not in known:
+            return f"it does not know network.{name}={getattr(model.network, name)}"
+    if options.keys() - _SIZES:
+        return f"it does not know network.{min(options.keys() - _SIZES)}"
+    tensors = [*model.parameters(), *(t.table for t in model.textures())]
+    if any(t.device.type != "cpu" or t.dtype != torch.float32 for t in tensors):
+        return "it runs on CPUs, in float32"
+    for network in networks(model):
+        if len(network.weights) > MAX_LAYERS or max(max(w.shape) for w in network.weights) > MAX_WIDTH:
+            return f"its networks have at most {MAX_LAYERS} layers of {MAX_WIDTH} features"
+    for texture in model.textures():
+        if texture.texels.shape[1] > MAX_CHANNELS or len(texture.packing.shapes) > MAX_LEVELS:
+            return f"its textures have at most {MAX_LEVELS} levels of {MAX_CHANNELS} channels"
+        if texture.packing.texels >= 1 << 31:
+            return "its textures have less than 2^31 texels"
+    return None
+
+
+def networks(model: NeuralMaterial) -> list[Mlp]:
+    """The networks that the kernel evaluates: the decoder, then the offset's where there is one."""
+    assert isinstance(model, Neumip)
+    assert isinstance(model.decoder, Mlp)
+    return [model.decoder, *([] if model.network.offset == "none" else [model.offset_network])]
+
+
+def parameters_of(network: Mlp) -> list[Tensor]:
+    """Weight 0, bias 0, weight 1, ..."""
+    return [p for pair in zip(network.weights, network.biases, strict=True) for p in pair]
+
+
+def pointers(tensors: list[Tensor]) -> Any:
+    """Addresses of tensors, as the kernel takes them."""
+    return (ctypes.c_void_p * len(tensors))(*(t.data_ptr() for t in tensors))
+
+
+def aligned(floats: int) -> Tensor:
+    """Zeros (floats,) that begin at a cache line."""
+    whole = torch.zeros(floats + 16)
+    skip = (-whole.data_ptr() // 4) % 16
+    return whole[skip : skip + floats]
+
+
+class NativeModel:
+    """A model that :func:`unsupported_reason` lets pass, evaluated by the kernel.
+
+    Holds no numbers of its own: :meth:`refresh` takes over what the model reads and weighs now.
+
+    Attributes
+    ----------
+    description : as the C functions take it
+    """
+
+    def __init__(self, kernel: Kernel, model: NeuralMaterial) -> None:
+        self.kernel = kernel
+        self.model = model
+        self.description = Model()
+        self.description.offset_scale, self.description.grazing = OFFSET_SCALE, GRAZING
+        self.description.aspect = model.lattice.aspect
+        self._packed: list[Tensor] = []
+        for network, target in zip(networks(model), self._targets(), strict=False):
+            widths = [network.weights[0].shape[1], *(len(w) for w in network.weights)]
+            target.layers, target.wanted = len(network.weights), model.textures()[0].texels.shape[1]
+            target.widths[: len(widths)] = widths
+            packed = aligned(kernel.library.mbtf_packed_floats(ctypes.byref(target)))
+            target.packed = packed.data_ptr()
+            self._packed.append(packed)
+        for texture, place in zip(model.textures(), self._places(), strict=False):
+            shapes = texture.packing.shapes
+            place.levels, place.channels = len(shapes), texture.texels.shape[1]
+            place.rows[: len(shapes)] = [rows for rows, _ in shapes]
+            place.columns[: len(shapes)] = [columns for _, columns in shapes]
+            place.starts[: len(shapes) + 1] = texture.packing.starts
+        self.refresh()
+
+    def _targets(self) -> list[Network]:
+        return [self.description.decoder, self.description.offset]
+
+    def _places(self) -> list[Textures]:
+        return [self.description.pyramid, self.description.offset_texture]
+
+    def refresh(self) -> None:
+        """Take over the weights, and the tables that lookups read."""
+        library, variant = self.kernel.library, self.kernel.variant
+        assert isinstance(self.model, Neumip)
+        self.description.unit = float(self.model.unit)
+        self._kept: list[Tensor] = []
+        for network, target, packed in zip(networks(self.model), self._targets(), self._packed, strict=False):
+            held = [p.detach().contiguous() for p in parameters_of(network)]
+            library.mbtf_pack(variant, ctypes.byref(target), pointers(held), packed.data_ptr())
+        for texture, place in zip(self.model.textures(), self._places(), strict=False):
+            table = texture.table.detach().contiguous()
+            self._kept.append(table)
+            place.table = table.data_ptr()
+
+    @property
+    def textures(self) -> list[FeatureTextures]:
+        """The model's textures: the pyramid, then the offset's."""
+        return self.model.textures()
+
+    def state(self, queries: int) -> Tensor:
+        """Memory for the activations of so many queries."""
+        blocks = -(-queries // self.kernel.block)
+        return aligned(blocks * int(self.kernel.library.mbtf_state_floats(ctypes.byref(self.description))))
+
+    def forward(
+        self,
+        queries: QueryPointers,
+        state: Tensor,
+        out: int,
+        *,
+        clamp: bool = False,
+        keep: bool = False,
+    ) -> None:
+        """Values (n, 3), written to the address `out`; `keep` activations of all blocks for backward, else
+        `state` needs room for one block."""
+        self.kernel.library.mbtf_forward(
+            self.kernel.variant,
+            ctypes.byref(self.description),
+            ctypes.byref(queries),
+            clamp,
+            keep,
+            state.data_ptr(),
+            out,
+        )

@@ -1,0 +1,70 @@
+/* The fitter's kernel: what Python hands over, and what is compiled once per instruction set.
+ *
+ * Everything is float32. Queries are processed in blocks of BLOCK; within a block an activation is a row of
+ * BLOCK floats, so that each instruction works on neighbouring queries. Functions never allocate, keep no
+ * state and start no threads: callers hand over memory and call them from as many threads as they like.
+ */
+#ifndef MBTF_KERNEL_H
+#define MBTF_KERNEL_H
+
+#include <stdint.h>
+
+#define BLOCK 128
+#define MAX_CHANNELS 64
+#define MAX_WIDTH 128
+#define MAX_LAYERS 16
+#define MAX_LEVELS 16
+/* Floats that a vector register may hold at most; a weight's gradient is kept as so many partial sums. */
+#define LANES 16
+
+/* A fully connected network: `layers` matrices between `layers + 1` widths, packed by mbtf_pack. Gradients are
+ * computed of its first `wanted` inputs. */
+typedef struct {
+    int32_t layers, wanted;
+    int32_t widths[MAX_LAYERS + 1];
+    const float *packed;
+} mbtf_network;
+
+/* Periodic textures of some levels, one after the other: rows of `channels` floats. */
+typedef struct {
+    int32_t levels;
+    int32_t channels;
+    int32_t rows[MAX_LEVELS], columns[MAX_LEVELS];
+    int64_t starts[MAX_LEVELS + 1];
+    const float *table;
+} mbtf_textures;
+
+/* neumip, or neumip-baseline where offset.layers is 0. */
+typedef struct {
+    mbtf_textures pyramid, offset_texture;
+    mbtf_network decoder, offset;
+    float unit, offset_scale, grazing, aspect;
+} mbtf_model;
+
+/* u (n, 2), sigma (n), omega_i and omega_o (n, 3). */
+typedef struct {
+    int64_t n;
+    const float *u, *sigma, *omega_i, *omega_o;
+} mbtf_queries;
+
+/* Sums that one thread adds to. Texture rows are padded to a multiple of 8 floats, weights are LANES
+ * partial sums each. */
+typedef struct {
+    float *pyramid, *offset_texture, *decoder, *offset;
+} mbtf_gradients;
+
+/* Loss of a prediction p on a value t that the kernel takes by itself, the mean over queries and colours of
+ *     (relative / (p² + scale²) + squared / scale²) · d²,   d = p - t,
+ * p held still in the weight and in the bound on d:
+ *     |d| <= √(bound[0] + bound[1] |p| + bound[2] p²)   where `bounded`. */
+typedef struct {
+    float relative, squared, scale, bound[3];
+    int32_t bounded;
+} mbtf_loss;
+
+/* Optimiser of one tensor: Adam (Kingma and Ba 2015) with the corrections of its means worked in. */
+typedef struct {
+    float rate, beta1, beta2, epsilon, root_correction2;
+} mbtf_adam_step;
+
+#endif

@@ -1,0 +1,65 @@
+"""One step of training by the kernel."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from ..data import TrainingQueries
+from ..losses import Objective
+from ..models import NeuralMaterial
+from ..parallel import Workers
+from .adam import adam
+from .blur import Blur
+from .gradients import NativeGradients
+from .library import Kernel
+from .model import NativeModel, networks, parameters_of
+
+
+class NativeStepper:
+    """Takes steps of training on one model.
+
+    Parameters
+    ----------
+    model : that the kernel can evaluate
+    optimiser : keeps the state; what it says of rates and decays holds
+    """
+
+    def __init__(self, kernel: Kernel, model: NeuralMaterial, optimiser: torch.optim.Adam) -> None:
+        self.kernel = kernel
+        self.model = model
+        self.optimiser = optimiser
+        self._native = NativeModel(kernel, model)
+        self._gradients = NativeGradients(self._native)
+        texels = [texture.texels for texture in model.textures()]
+        self._tables = [torch.empty_like(t) for t in texels]
+        self._between = [torch.empty_like(t) for t in texels]
+        self._blurred = [torch.empty_like(t) for t in texels]
+
+    def step(
+        self, objective: Objective, batch: TrainingQueries, sigmas: Sequence[float], workers: Workers
+    ) -> Tensor:
+        """One step on a batch, textures blurred by `sigmas` texels of the finest level; its mean loss."""
+        textures = self.model.textures()
+        blurs = [Blur(self.kernel, t, sigma) for t, sigma in zip(textures, sigmas, strict=True)]
+        for texture, blur, between, table in zip(textures, blurs, self._between, self._tables, strict=True):
+            if blur.idle:
+                texture.read(texture.texels)
+            else:
+                blur.apply(texture.texels.detach(), between, table, workers)
+                texture.read(table)
+        loss = self._gradients.compute(objective, batch, workers)
+        found: dict[Tensor, Tensor] = {}
+        for k, (texture, blur) in enumerate(zip(textures, blurs, strict=True)):
+            gradient = self._gradients.textures[k]
+            if not blur.idle:
+                # A symmetric kernel is its own transpose.
+                blur.apply(gradient, self._between[k], self._blurred[k], workers)
+                gradient = self._blurred[k]
+            found[texture.texels] = gradient
+        for network, gradients in zip(networks(self.model), self._gradients.networks, strict=True):
+            found.update(zip(parameters_of(network), gradients, strict=True))
+        adam(self.kernel, self.optimiser, found, workers)
+        return loss
