@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -51,7 +52,8 @@ def test_export_writes_what_it_says(material: Path, tmp_path: Path, run_python: 
     assert done.returncode == 0, done.stderr
     assert "half precision: rms error" in done.stdout
     done = run_python("-m", "mbtf_fit", "info", str(again))
-    assert "largest deviation 0" in done.stdout
+    # The kernel and PyTorch round in another order.
+    assert re.search(r"largest deviation (0|\S+e-0[7-9])$", done.stdout, re.MULTILINE), done.stdout
     message = fails(run_python, 3, "export", str(material), "--to", "material")
     assert "name a new folder with -o" in message
 
