@@ -20,6 +20,7 @@ from .schema import SCHEMA_VERSION, ArrayFormat, Layout, Tiling
 from .settings import FileName, Settings
 from .slopes import NormalMode
 
+_PERCENT = re.compile(r"^\s*(\d+(?:\.\d*)?|\.\d+)\s*%\s*$")
 _COUNT = re.compile(r"^\s*(\d+(?:\.\d+)?(?:[eE][+]?\d+)?)\s*(/\s*texel)?\s*$")
 
 
@@ -52,6 +53,13 @@ def _count(text: Any) -> str:
     number, per_texel = parse_count(text)
     digits = str(int(number)) if number == int(number) else repr(number)
     return f"{digits}/texel" if per_texel else digits
+
+
+def _share(text: Any) -> Any:
+    """A share as a number, also from ``2%``."""
+    if isinstance(text, str) and (match := _PERCENT.match(text)):
+        return float(match[1]) / 100.0
+    return text
 
 
 def _even(spp: int) -> int:
@@ -96,8 +104,19 @@ class QueriesSection(Settings):
 
     train: Count = Field("100/texel", description="N or N/texel (texels of the finest level)")
     test: Count = Field("8192", description="N or N/texel")
-    spp: Paths = Field(4, description="paths per training query, both halves together")
-    test_spp: Paths = Field(256, description="paths per test query, both halves together")
+    spp: Paths = Field(4, description="mean number of paths per training query, both halves together")
+    test_spp: Paths = Field(256, description="mean number of paths per test query, both halves together")
+    allocation: Literal["noise", "even"] = Field(
+        "noise", description="which queries get more paths: those where a pilot expects more noise, or none"
+    )
+    target_error: Annotated[float | None, BeforeValidator(_share)] = Field(
+        None,
+        gt=0,
+        lt=1,
+        description="error of every training value relative to max(value, tile mean), such as 2%; in place "
+        "of a mean number of paths",
+    )
+    cap: Paths = Field(1024, description="most paths per query under a target error")
     levels: int | None = Field(None, ge=0, le=14, description="finest level k; default: from the map's width")
     mixture: MixtureSection = MixtureSection()
     min_cos: float = Field(0.1, gt=0, lt=1, description="smallest cosine of both directions to the normal")
@@ -116,7 +135,7 @@ class TransportSection(Settings):
     """How light paths are followed."""
 
     max_depth: int = Field(0, ge=0, le=1000, description="surface interactions per path; 0: no limit")
-    roulette_depth: int = Field(3, ge=1, le=1000, description="interactions before Russian roulette begins")
+    roulette_depth: int = Field(1, ge=1, le=1000, description="interactions before Russian roulette begins")
     max_crossings: int = Field(4096, ge=1, description="tile borders that one ray may cross")
 
 

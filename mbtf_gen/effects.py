@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
+from .allocation import Allocation
 from .errors import UsageError
 
 # Effects by name, in the order in which light meets them, and what they are called.
@@ -71,15 +72,17 @@ class EffectsPlan:
     mode : what was asked for
     tolerance : allowed cost of all effects left out together
     closed_form : M is known without tracing anything
+    allocation : which queries get how many paths; None where all get the same
     """
 
     effects: tuple[Effect, ...]
     max_depth: int = 0
     cap_cost: float = 0.0
-    roulette_depth: int = 3
+    roulette_depth: int = 1
     mode: str = "auto"
     tolerance: float = 0.0
     closed_form: bool = False
+    allocation: Allocation | None = None
 
     def __getitem__(self, name: str) -> Effect:
         return next(e for e in self.effects if e.name == name)
@@ -104,6 +107,7 @@ class EffectsPlan:
             "cap_cost": self.cap_cost,
             "roulette_depth": self.roulette_depth,
             "closed_form": self.closed_form,
+            "allocation": None if self.allocation is None else self.allocation.to_manifest(),
             "effects": effects,
         }
 
@@ -112,7 +116,9 @@ class EffectsPlan:
         """Inverse of :meth:`to_manifest`."""
         effects = tuple(Effect(**{k: v for k, v in e.items() if k != "effect"}) for e in data["effects"])
         names = ("max_depth", "cap_cost", "roulette_depth", "mode", "tolerance", "closed_form")
-        return cls(effects, **{name: data[name] for name in names})
+        stored = data["allocation"]
+        allocation = None if stored is None else Allocation.from_manifest(stored)
+        return cls(effects, **{name: data[name] for name in names}, allocation=allocation)
 
 
 @dataclass(frozen=True)

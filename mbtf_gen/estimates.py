@@ -26,6 +26,23 @@ class BadSample:
 
 
 @dataclass(frozen=True)
+class TargetReached:
+    """How close a batch of queries came to a target error, relative to max(value, tile mean).
+
+    Attributes
+    ----------
+    queries : in all; missed : those that would have needed more paths than the cap
+    worst : largest error that the pilot expects of one of those that missed; 0 where none did
+    square : mean square of the relative error reached, from the stored halves
+    """
+
+    queries: int
+    missed: int
+    worst: float
+    square: float
+
+
+@dataclass(frozen=True)
 class Estimates:
     """Estimates of a batch of queries.
 
@@ -37,6 +54,10 @@ class Estimates:
         crossings
     nonfinite : samples that came out non-finite and were drawn again
     bad_samples : the first of them, at most ``MOST_LOCATED``
+    spp : (n,) int64, paths of each query, both halves together; None where they are all the same
+    path_variance : (n,) float32, sample variance of the query's single paths, mean over channels; None where
+        it was not asked for
+    target : what a run to a target error reached
     """
 
     value_a: NDArray[np.float32]
@@ -47,12 +68,19 @@ class Estimates:
     capped: int
     nonfinite: int
     bad_samples: tuple[BadSample, ...] = ()
+    spp: NDArray[np.int64] | None = None
+    path_variance: NDArray[np.float32] | None = None
+    target: TargetReached | None = None
 
 
 @dataclass(frozen=True)
 class Stream:
-    """Which random numbers to use: split and number of the shard under a root seed."""
+    """Which random numbers to use: split and number of the shard under a root seed, and the first pass.
+
+    A pass draws all paths anew; those after the first are for paths that came out non-finite.
+    """
 
     root: int
     split: str
     shard: int
+    first_pass: int = 0

@@ -7,6 +7,7 @@ shard alone, so values do not depend on how queries are grouped into launches.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import drjit as dr
@@ -55,6 +56,56 @@ def _aligned(numbers: NDArray[Any]) -> Any:
     return copied
 
 
+def _launches(counts: NDArray[np.int64], launch: int) -> list[slice]:
+    """Consecutive queries that together have at most `launch` paths, or one query that has more."""
+    ends = np.cumsum(counts)
+    out, start, traced = [], 0, 0
+    while start < len(counts):
+        stop = max(start + 1, int(np.searchsorted(ends, traced + launch, side="right")))
+        out.append(slice(start, stop))
+        start, traced = stop, int(ends[stop - 1])
+    return out
+
+
+@dataclass(frozen=True)
+class Lanes:
+    """The lanes of a launch: all paths of its queries, one query after the other.
+
+    Attributes
+    ----------
+    first : number of the first query in the shard
+    counts : (n,) paths of each query; starts : (n,) its first lane
+    query : ``mi.UInt32``, query of each lane
+    start, half : ``mi.UInt32``, of each query its first lane and the paths of one half
+    """
+
+    first: int
+    counts: NDArray[np.int64]
+    starts: NDArray[np.int64]
+    query: Any
+    start: Any
+    half: Any
+
+    @classmethod
+    def of(cls, first: int, counts: NDArray[np.int64]) -> Lanes:
+        """Lanes of queries that follow each other."""
+        starts = np.cumsum(counts) - counts
+        query = np.repeat(np.arange(len(counts)), counts)
+        return cls(first, counts, starts, *(_aligned(x) for x in (query, starts, counts // 2)))
+
+    def number(self, lane: int) -> int:
+        """Number in the shard of a lane's query."""
+        return self.first + int(np.searchsorted(self.starts, lane, side="right")) - 1
+
+    def halves(self, x: Any) -> NDArray[np.float64]:
+        """Means over both halves of each query of numbers per lane: (n, 2, channels)."""
+        edges = np.stack([self.starts, self.starts + self.counts // 2], axis=1).ravel()
+        values = np.atleast_2d(np.array(x, np.float32))
+        # In the order of the lanes, so that no sum depends on threads or launches.
+        total = np.add.reduceat(values, edges, axis=1, dtype=np.float64)
+        return total.T.reshape(len(self.counts), 2, -1) / (self.counts // 2)[:, None, None]
+
+
 class Estimator:
     """Traces queries against one tile.
 
@@ -83,51 +134,56 @@ class Estimator:
     def estimate(
         self,
         queries: Queries,
-        spp: int,
+        spp: int | NDArray[np.int64],
         stream: Stream,
         source: RaySource | None = None,
         limit: int | None = None,
         roulette: int | None = None,
+        path_variance: bool = False,
     ) -> Estimates:
-        """Both halves of each query (one leading axis), `spp` paths together.
+        """Both halves of each query (one leading axis).
 
         Parameters
         ----------
+        spp : paths of every query, or of each (n,), both halves together
         source : where rays come from; the query sensor by default
         limit, roulette : other numbers of surface interactions at which paths end, and at which roulette
             begins, for the same kernel
+        path_variance : find the sample variance of single paths too
 
         Raises
         ------
         PartialError : samples stay non-finite after several draws; says where
         """
-        if spp < 2 or spp % 2:
+        n = len(queries.sigma)
+        counts = np.full(n, spp, np.int64) if isinstance(spp, int) else spp
+        if n and (counts.min() < 2 or (counts % 2).any()):
             raise ValueError(f"spp must be even, for two equal halves, not {spp}")
         self._limit = dr.opaque(mi.UInt32, self.transport.limit if limit is None else limit)
         self._roulette = dr.opaque(mi.UInt32, self.transport.roulette_depth if roulette is None else roulette)
-        n = len(queries.sigma)
-        per_launch = max(1, self.launch // spp)
+        self._path_variance = path_variance
         parts = [
-            self._batch(
-                queries, slice(start, min(start + per_launch, n)), spp, stream, source or self._sensor
-            )
-            for start in range(0, n, per_launch)
+            self._batch(queries, rows, counts[rows], stream, source or self._sensor)
+            for rows in _launches(counts, self.launch)
         ]
         return Estimates(
             np.concatenate([p.value_a for p in parts]),
             np.concatenate([p.value_b for p in parts]),
             np.concatenate([p.transmittance for p in parts]) if self.holes else None,
-            n * spp,
+            int(counts.sum()),
             sum(p.lost for p in parts),
             sum(p.capped for p in parts),
             sum(p.nonfinite for p in parts),
             tuple(b for p in parts for b in p.bad_samples)[:MOST_LOCATED],
+            spp=None if isinstance(spp, int) else counts,
+            path_variance=np.concatenate([p.path_variance for p in parts]) if path_variance else None,
         )
 
-    def _batch(self, queries: Queries, rows: slice, spp: int, stream: Stream, source: RaySource) -> Estimates:
+    def _batch(
+        self, queries: Queries, rows: slice, counts: NDArray[np.int64], stream: Stream, source: RaySource
+    ) -> Estimates:
         part = Queries(queries.u[rows], queries.sigma[rows], queries.omega_i[rows], queries.omega_o[rows])
         source.set_queries(part, rows.start)
-        count = len(part.sigma)
         omega_i = mi.Vector3f(part.omega_i.T.copy())
         if self.light is None:
             inverse = mi.Float(0.0)
@@ -136,15 +192,15 @@ class Estimator:
         # Before any kernel reads them: their places in NumPy's array, and so the number of queries, would be
         # a part of it.
         dr.eval(omega_i, inverse)
-        lanes = dr.arange(mi.UInt32, count * spp)
+        lanes = Lanes.of(rows.start, counts)
 
         def trace_lanes(which: Any, attempt: int) -> tuple[Any, Any, int, int]:
-            return self._trace(source, which, rows.start, spp, stream, omega_i, inverse, attempt)
+            return self._trace(source, lanes, which, stream, omega_i, inverse, attempt)
 
-        radiance, passed, lost, capped = trace_lanes(lanes, 0)
+        radiance, passed, lost, capped = trace_lanes(dr.arange(mi.UInt32, int(counts.sum())), 0)
         bad = self._nonfinite(radiance)
         nonfinite = 0
-        located = self._located(source, bad[:MOST_LOCATED], rows.start, spp, stream, omega_i, inverse)
+        located = self._located(source, lanes, bad[:MOST_LOCATED], stream, omega_i, inverse)
         for attempt in range(1, MAX_RESAMPLES + 1):
             if not len(bad):
                 break
@@ -160,30 +216,28 @@ class Estimator:
         if len(bad):
             raise PartialError(
                 f"{len(bad)} samples stay NaN or infinite after {MAX_RESAMPLES} draws, first at "
-                f"query {rows.start + int(bad[0]) // spp} ({located[0].effect})",
+                f"query {lanes.number(int(bad[0]))} ({located[0].effect})",
                 where=f"{stream.split} shard {stream.shard}",
                 cure="check the material's values",
             )
-        half = spp // 2
-        mean = dr.block_reduce(dr.ReduceOp.Add, radiance, half, mode="evaluated") * (1.0 / half)
-        values = np.array(mean, np.float32).T.reshape(count, 2, 3)
+        values = lanes.halves(radiance)
         return Estimates(
-            np.ascontiguousarray(values[:, 0]),
-            np.ascontiguousarray(values[:, 1]),
-            self._shares(passed, spp) if self.holes else None,
-            count * spp,
+            values[:, 0].astype(np.float32),
+            values[:, 1].astype(np.float32),
+            lanes.halves(passed).mean(axis=(1, 2)).astype(np.float32) if self.holes else None,
+            int(counts.sum()),
             lost,
             capped,
             nonfinite,
             located,
+            path_variance=self._variances(lanes, radiance, values) if self._path_variance else None,
         )
 
     def _located(
         self,
         source: RaySource,
+        lanes: Lanes,
         bad: NDArray[np.uint32],
-        first: int,
-        spp: int,
         stream: Stream,
         omega_i: Any,
         inverse: Any,
@@ -193,17 +247,19 @@ class Estimator:
         if not len(bad):
             return ()
         full, self._limit = self._limit, dr.opaque(mi.UInt32, 1)
-        short = self._trace(source, mi.UInt32(bad), first, spp, stream, omega_i, inverse, 0)[0]
+        short = self._trace(source, lanes, mi.UInt32(bad), stream, omega_i, inverse, 0)[0]
         self._limit = full
         direct = np.isin(np.arange(len(bad)), self._nonfinite(short))
         return tuple(
-            BadSample(first + int(lane) // spp, "direct light" if at_once else "interreflection")
+            BadSample(lanes.number(int(lane)), "direct light" if at_once else "interreflection")
             for lane, at_once in zip(bad, direct, strict=True)
         )
 
-    def _shares(self, passed: Any, spp: int) -> NDArray[np.float32]:
-        total = dr.block_reduce(dr.ReduceOp.Add, passed, spp, mode="evaluated")
-        return np.array(total * (1.0 / spp), np.float32)
+    def _variances(self, lanes: Lanes, radiance: Any, values: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Sample variance of each query's paths, mean over channels."""
+        square = lanes.halves(dr.squared_norm(radiance)).mean(axis=(1, 2)) / 3.0
+        spread = square - np.mean(values.mean(axis=1) ** 2, axis=-1)
+        return np.maximum(spread * lanes.counts / (lanes.counts - 1), 0.0).astype(np.float32)
 
     def _nonfinite(self, radiance: Any) -> NDArray[np.uint32]:
         finite = dr.isfinite(radiance.x) & dr.isfinite(radiance.y) & dr.isfinite(radiance.z)
@@ -214,43 +270,48 @@ class Estimator:
     def _trace(
         self,
         source: RaySource,
-        lanes: Any,
-        first: int,
-        spp: int,
+        lanes: Lanes,
+        which: Any,
         stream: Stream,
         omega_i: Any,
         inverse: Any,
         attempt: int,
     ) -> tuple[Any, Any, int, int]:
-        """Radiance of the given lanes (query · spp + path) and, where there are holes, whether they passed
-        through the tile, in their order; counts of lost and capped rays."""
-        half = spp // 2
+        """Radiance of some of the lanes and, where there are holes, whether they passed through the tile, in
+        their order; counts of lost and capped rays."""
 
-        def generator(lane: Any, purpose: Purpose) -> Any:
+        def generator(lane: Any, query: Any, purpose: Purpose) -> Any:
+            path = lane - dr.gather(mi.UInt32, lanes.start, query)
+            half = dr.gather(mi.UInt32, lanes.half, query)
+            second = path >= half
             # Both halves take the same points of sequences of other streams.
             a, b = (
-                stream_key(stream.root, stream_number(stream.split, stream.shard, purpose, attempt, h))
+                stream_key(
+                    stream.root,
+                    stream_number(stream.split, stream.shard, purpose, stream.first_pass + attempt, h),
+                )
                 for h in (0, 1)
             )
             words = [
                 dr.select(
-                    (lane // half) % 2 == 0,
-                    dr.opaque(mi.UInt32, a >> shift & 0xFFFFFFFF),
+                    second,
                     dr.opaque(mi.UInt32, b >> shift & 0xFFFFFFFF),
+                    dr.opaque(mi.UInt32, a >> shift & 0xFFFFFFFF),
                 )
                 for shift in (0, 32)
             ]
-            return sequence(words[0], words[1], lane // spp + dr.opaque(mi.UInt32, first), lane % half)
+            number = query + dr.opaque(mi.UInt32, lanes.first)
+            return sequence(words[0], words[1], number, dr.select(second, path - half, path))
 
-        xi = generator(lanes, Purpose.FOOTPRINT).next_2d()
-        point = source.footprint(lanes // spp, xi)
+        query = dr.gather(mi.UInt32, lanes.query, which)
+        point = source.footprint(query, generator(which, query, Purpose.FOOTPRINT).next_2d())
         cell = mi.Vector2u((point - dr.floor(point)) * 256.0)
         key = _spread_bits(cell.x) | (_spread_bits(cell.y) << 1)
         dr.eval(point, key)
         order = _aligned(np.argsort(np.array(key).astype(np.uint16), kind="stable"))
 
-        lane = dr.gather(mi.UInt32, lanes, order)
-        query = lane // spp
+        lane = dr.gather(mi.UInt32, which, order)
+        query = dr.gather(mi.UInt32, lanes.query, lane)
         ray = source.ray(query, dr.gather(mi.Point2f, point, order))
         if self.light is None:
             light = LaneLight("constant")
@@ -268,14 +329,14 @@ class Estimator:
             self.transport,
             self._limit,
             self._roulette,
-            generator(lane, Purpose.PATH),
+            generator(lane, query, Purpose.PATH),
             mi.Bool(True),
         )
-        radiance = dr.zeros(mi.Color3f, dr.width(lanes))
+        radiance = dr.zeros(mi.Color3f, dr.width(which))
         dr.scatter(radiance, path.radiance, order)
         passed = None
         if self.holes:
-            passed = dr.zeros(mi.Float, dr.width(lanes))
+            passed = dr.zeros(mi.Float, dr.width(which))
             dr.scatter(passed, dr.select(path.passed, 1.0, 0.0), order)
         dr.eval(radiance, passed, path.lost, path.capped)
         return radiance, passed, int(dr.count(path.lost)[0]), int(dr.sum(path.capped)[0])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .adaptive import Target
+from .allocation import measure_allocation
 from .config import GeneratorConfig, count_queries
 from .effects import EffectsPlan
 from .errors import PartialError, UsageError
@@ -109,6 +111,13 @@ class Job:
         """Paths per query of a split, both halves together."""
         return self.config.queries.spp if split == "train" else self.config.queries.test_spp
 
+    def target(self, split: Split) -> Target | None:
+        """Error to reach in place of a number of paths."""
+        error = self.config.queries.target_error
+        if split != "train" or error is None:
+            return None
+        return Target(error, self.config.queries.cap)
+
     def paths(self, entry: ShardEntry) -> int:
         """Paths that a shard takes."""
         return self._queries(entry) * self.spp(entry.split)
@@ -161,13 +170,23 @@ def build_estimator(config: GeneratorConfig, material: Material) -> Any:
     return job.estimator(simulated(job))
 
 
+def plan_run(job: Job) -> EffectsPlan:
+    """Effects that a run simulates, and which queries get how many paths; by pilots where they pay."""
+    large = job.all_paths() >= SMALL_RUN
+    plan = plan_effects(job, pilots=large)
+    queries = job.config.queries
+    if plan.closed_form or (queries.target_error is None and not (large and queries.allocation == "noise")):
+        return plan
+    return replace(plan, allocation=measure_allocation(job, plan))
+
+
 def _agreed_effects(job: Job, folder: Path, entries: list[ShardEntry], overwrite: bool) -> EffectsPlan:
     """Claim the folder and say which effects are simulated: as its manifest says where it has one, so that
     all shards of a data set show the same, whichever machine makes them."""
     like = build_manifest(job, entries, None)
 
     def begin() -> dict[str, Any]:
-        return build_manifest(job, entries, plan_effects(job, pilots=job.all_paths() >= SMALL_RUN))
+        return build_manifest(job, entries, plan_run(job))
 
     open_folder(job, folder, like, begin, overwrite)
     return planned_effects(folder)

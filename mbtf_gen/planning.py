@@ -30,9 +30,6 @@ LOBE_TAIL_SHARE = 2.4e-4
 # Light found by next-event estimation alone keeps its variance when the narrowest lobe of the surface, about
 # 2α wide, is so many times wider than the light's.
 WIDER = 4.0
-# Where nothing reflects more, what comes after the first interaction is so little of the value that roulette
-# from there on saves more time than it costs in variance.
-DARK = 0.25
 # Runs of fewer paths are done before a pilot has paid for itself.
 SMALL_RUN = 2_000_000
 # Deepest cap on surface interactions that is tried.
@@ -100,8 +97,6 @@ def plan_effects(job: Job, *, pilots: bool = True) -> EffectsPlan:
     plan = _of_relief(look, wish, decided, costs, left)
     if wish.base != "all" and _known_exactly(look, plan):
         plan = replace(plan, closed_form=True)
-    if wish.base != "all" and look.lambert and look.albedo.max() <= DARK:
-        plan = replace(plan, roulette_depth=1)
     return replace(plan, mode=job.config.effects.mode, tolerance=tolerance)
 
 

@@ -21,10 +21,9 @@ from .config import GeneratorConfig
 from .dataset import Dataset
 from .effects import EffectsPlan
 from .errors import InputError, MbtfError, PartialError
-from .generation import Job
+from .generation import Job, plan_run
 from .locks import brief_lock
 from .manifest import ShardEntry, build_manifest, effects_digest
-from .planning import SMALL_RUN, plan_effects
 from .schema import CONFIG_NAME, FORMAT_NAME, MANIFEST_NAME, SPLITS
 from .settings import differences, dump_yaml, in_short, read_yaml
 from .shard_making import ProgressCallback, busy_message, make_shards
@@ -176,7 +175,7 @@ class Damage:
         """
         if self._manifest is not None:
             return planned_effects(self.folder)
-        plan = plan_effects(self.job, pilots=self.job.all_paths() >= SMALL_RUN)
+        plan = plan_run(self.job)
         if effects_digest(plan.to_manifest()) != self._witness[1]:
             raise InputError(
                 "cannot be restored: the effects plan comes out otherwise here",

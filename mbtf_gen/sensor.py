@@ -32,6 +32,15 @@ def ray_through(point: Any, omega_o: Any, unit: Any, aspect: Any, start: Any) ->
     return mi.Ray3f(dr.fma(omega_o, start / omega_o.z, plane), -omega_o)
 
 
+def standard_normal(xi: Any) -> Any:
+    """Point of the standard normal distribution in the plane, from `xi` in [0,1)²: the inverse distribution
+    function of each axis, so that well-spread numbers give well-spread points (polar coordinates tear
+    neighbours apart)."""
+    # Centres of cells of 2^-24: symmetric, and never at the infinite ends.
+    centred = xi * 2.0 - (1.0 - 2.0**-24)
+    return dr.sqrt(2.0) * dr.erfinv(centred)
+
+
 class QuerySensor(mi.Sensor):
     """``mbtf_queries``: rays of a batch of queries.
 
@@ -61,7 +70,7 @@ class QuerySensor(mi.Sensor):
         """uv of a point of the footprint of the given queries, not wrapped; `xi` in [0,1)²."""
         u = dr.gather(mi.Point2f, self.u, query)
         spread = dr.gather(mi.Float, self.sigma, query)
-        offset = mi.warp.square_to_std_normal(xi) * spread
+        offset = standard_normal(xi) * spread
         return mi.Point2f(u + mi.Vector2f(offset.x, offset.y / self.aspect))
 
     def ray(self, query: Any, point: Any) -> Any:

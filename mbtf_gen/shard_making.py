@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .adaptive import estimate_shard
 from .atomic import Stored, remove_file, write_sealed
 from .effects import EffectsPlan
 from .estimates import Estimates, Stream
@@ -199,8 +200,9 @@ def make_shards(
             began = time.perf_counter()
             queries = drawn.result()
             entry = claim.entry
-            estimates = estimator.estimate(
-                queries.flat(), job.spp(entry.split), Stream(job.config.seed, entry.split, entry.index)
+            stream = Stream(job.config.seed, entry.split, entry.index)
+            estimates = estimate_shard(
+                estimator, queries.flat(), job.spp(entry.split), job.target(entry.split), stream, effects
             )
             shard = Rendered(entry, queries, estimates, time.perf_counter() - began)
             writer.submit(partial(store, shard, claim.path), claim.lock.release)
@@ -237,7 +239,7 @@ def store_shard(job: Job, shard: Rendered, path: Path, effects: EffectsPlan) -> 
     remove_file(sidecar_of(path))
     queries, estimates = shard.queries, shard.estimates
     lead, through = queries.lead, estimates.transmittance
-    spp = job.spp(shard.entry.split)
+    spp = job.spp(shard.entry.split) if estimates.spp is None else estimates.spp.reshape(lead)
     stored = write_shard(
         path,
         {
@@ -247,7 +249,7 @@ def store_shard(job: Job, shard: Rendered, path: Path, effects: EffectsPlan) -> 
             "omega_o": queries.omega_o,
             "value_a": estimates.value_a.reshape(*lead, 3),
             "value_b": estimates.value_b.reshape(*lead, 3),
-            "spp": np.full(lead, spp, np.float32),
+            "spp": np.broadcast_to(np.asarray(spp, np.float32), lead).copy(),
             **({} if through is None else {"transmittance": through.reshape(lead)}),
         },
     )
@@ -288,6 +290,7 @@ def sidecar(job: Job, shard: Rendered, file: str, stored: Stored, effects: Effec
         "paths": estimates.paths,
         "seconds": round(shard.seconds, 4),
         "quarantined": quarantined(estimates),
+        "target": None if estimates.target is None else asdict(estimates.target),
         "statistics": {
             "mean_value": (0.5 * sum(half.mean(axis=0, dtype=np.float64) for half in (a, b))).tolist(),
             "mean_variance": (0.25 * np.square(difference).mean(axis=0)).tolist(),

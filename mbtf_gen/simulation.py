@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 class MeanEstimator(Protocol):
     """Estimates M at queries."""
 
-    def estimate(self, queries: Queries, spp: int, stream: Stream) -> Estimates:
-        """Both halves of each query."""
+    def estimate(self, queries: Queries, spp: int | NDArray[np.int64], stream: Stream) -> Estimates:
+        """Both halves of each query; paths of all or of each."""
 
 
 class ClosedForm:
@@ -35,7 +35,7 @@ class ClosedForm:
     def __init__(self, albedo: NDArray[np.float64]) -> None:
         self.value = (np.asarray(albedo, np.float64) / np.pi).astype(np.float32)
 
-    def estimate(self, queries: Queries, spp: int, stream: Stream) -> Estimates:
+    def estimate(self, queries: Queries, spp: int | NDArray[np.int64], stream: Stream) -> Estimates:
         """Both halves of each query (one leading axis), equal."""
         value = np.broadcast_to(self.value, (len(queries.sigma), 3))
         return Estimates(value.copy(), value.copy(), None, 0, 0, 0, 0)

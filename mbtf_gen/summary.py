@@ -35,6 +35,8 @@ class Summary:
         value
     mean_value : mean training value per channel, 1/sr
     lost, capped, nonfinite : rays lost or capped, samples drawn again, over all shards
+    target : under a target error, the RMS error reached, and how many queries missed it, their share, and the
+        worst one's error
     """
 
     folder: str
@@ -53,6 +55,7 @@ class Summary:
     capped: int
     nonfinite: int
     effects: list[str]
+    target: dict[str, float] | None
 
 
 _Number = Annotated[float, Field(allow_inf_nan=False)]
@@ -70,6 +73,21 @@ class _Effect(BaseModel):
     present: bool
 
 
+class _Allocation(BaseModel):
+    weights: list[_Number]
+    typical: _Number
+    scale: _Number
+    gain: _Number
+    mean_weights: list[_Number]
+
+
+class _Target(BaseModel):
+    queries: Annotated[int, Field(ge=1)]
+    missed: int
+    worst: _Number
+    square: _Number
+
+
 class _Effects(BaseModel):
     mode: str
     tolerance: _Number
@@ -77,6 +95,7 @@ class _Effects(BaseModel):
     cap_cost: _Number
     roulette_depth: int
     closed_form: bool
+    allocation: _Allocation | None
     effects: Annotated[list[_Effect], Field(min_length=len(EFFECTS), max_length=len(EFFECTS))]
 
 
@@ -114,6 +133,7 @@ class _Made(BaseModel):
     seconds: _Number
     statistics: _Statistics
     quarantined: _Quarantined
+    target: _Target | None
 
 
 _MEND = "look for damage with: mbtf-gen verify"
@@ -184,6 +204,7 @@ def finish(
         capped=tally.counts["capped_rays"],
         nonfinite=tally.counts["nonfinite_samples"],
         effects=[e["effect"] for e in manifest["effects"]["effects"] if e["on"]],
+        target=tally.target(),
     )
     if complete and not manifest["complete"]:
         complete_manifest(folder, tally)
@@ -210,6 +231,7 @@ def complete_manifest(folder: Path, tally: Tally) -> None:
                 "shard_seconds": round(tally.seconds, 3),
                 "relative_error": tally.relative_error(),
                 "mean_value": tally.mean_value(),
+                "target": tally.target(),
                 **{name: tally.counts[name] for name in COUNTS},
             }
             write_sealed(folder / MANIFEST_NAME, manifest)

@@ -41,6 +41,8 @@ class Tally:
         self.located: list[str] = []
         self._value = np.zeros(3)
         self._variance = np.zeros(3)
+        self._aimed = self._missed = 0
+        self._worst = self._square = 0.0
 
     def add(self, record: Mapping[str, Any]) -> None:
         """Add a shard by its sidecar."""
@@ -48,6 +50,12 @@ class Tally:
         self.paths += record["paths"]
         self.seconds += record["seconds"]
         self.add_quarantined(record["file"], record["quarantined"])
+        target = record["target"]
+        if target is not None:
+            self._aimed += target["queries"]
+            self._missed += target["missed"]
+            self._worst = max(self._worst, target["worst"])
+            self._square += target["queries"] * target["square"]
         if record["split"] == "train":
             self._value += record["queries"] * np.asarray(record["statistics"]["mean_value"])
             self._variance += record["queries"] * np.asarray(record["statistics"]["mean_variance"])
@@ -67,6 +75,18 @@ class Tally:
     def mean_value(self) -> list[float]:
         """Mean training value per channel, 1/sr; 0 without any."""
         return [float(v) for v in self._value / max(self.train, 1)]
+
+    def target(self) -> dict[str, float] | None:
+        """What a run to a target error reached: RMS error, queries that missed it and their share, and the
+        worst one's error; None without a target."""
+        if not self._aimed:
+            return None
+        return {
+            "reached": float(np.sqrt(self._square / self._aimed)),
+            "missed": self._missed,
+            "share": self._missed / self._aimed,
+            "worst": self._worst,
+        }
 
     def relative_error(self) -> float:
         """Pooled relative standard error of the training values, √(mean variance) / mean value."""

@@ -33,6 +33,7 @@ def generate(
     queries: str | None = None,
     test_queries: str | None = None,
     spp: int | None = None,
+    target_error: str | None = None,
     test_spp: int | None = None,
     height: float | None = None,
     mesh: int | None = None,
@@ -68,9 +69,11 @@ def generate(
     test_queries
         Test queries, made besides the training queries: N or N/texel. Default: 8192
     spp
-        Paths per training query, both halves together (even). Default: 4
+        Mean number of paths per training query, both halves together (even). Default: 4
+    target_error
+        Error of every training value relative to max(value, tile mean), such as 2%, in place of --spp.
     test_spp
-        Paths per test query, both halves together (even). Default: 256
+        Mean number of paths per test query, both halves together (even). Default: 256
     height
         Factor on the stored heights, in tile widths. Default: the material's own
     mesh
@@ -106,6 +109,7 @@ def generate(
         "--queries": ("queries.train", queries),
         "--test-queries": ("queries.test", test_queries),
         "--spp": ("queries.spp", spp),
+        "--target-error": ("queries.target_error", target_error),
         "--test-spp": ("queries.test_spp", test_spp),
         "--levels": ("queries.levels", levels),
         "--min-cos": ("queries.min_cos", min_cos),
@@ -145,6 +149,19 @@ def generate(
     console.report(summary_dict(summary), describe(summary))
 
 
+def _target_line(summary: Any) -> list[str]:
+    target = summary.target
+    if target is None:
+        return []
+    line = f"  error of a training value: {target['reached']:.2%} of max(value, tile mean), RMS"
+    if target["missed"]:
+        line += (
+            f"; {target['missed']} queries ({target['share']:.2%}) stopped at the cap, the worst at "
+            f"{target['worst']:.1%}"
+        )
+    return [line]
+
+
 def _price(summary: Any) -> str:
     """What halving the noise of every value would take: its variance falls at least like one over the number
     of paths."""
@@ -167,6 +184,7 @@ def describe(summary: Any, *, ran: bool = True) -> str:
         *([f"  this run: {work}"] if ran else []),
         f"  mean value {sum(summary.mean_value) / 3:.4g} 1/sr, "
         f"pooled noise of a training query {summary.relative_error:.1%} of the mean{_price(summary)}",
+        *_target_line(summary),
         f"  simulated: {', '.join(summary.effects) or 'nothing beyond a flat Lambert plane'}",
     ]
     odd = [

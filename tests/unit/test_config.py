@@ -183,6 +183,9 @@ def test_hash_covers_every_option_but_the_materials_name(tmp_path: Path) -> None
                 "test": "3",
                 "spp": 8,
                 "test_spp": 8,
+                "allocation": "even",
+                "target_error": "5%",
+                "cap": 64,
                 "levels": 1,
                 "mixture": {"finest": 0.3},
                 "min_cos": 0.2,
@@ -212,3 +215,15 @@ def test_a_material_constant_changes_the_hash(tmp_path: Path) -> None:
         (folder / "material.yaml").write_text(f"height: height.npy\nbasecolor: basecolor.npy\n{text}\n")
         hashes.add(config_hash(folder))
     assert len(hashes) == 4
+
+
+@pytest.mark.parametrize(("text", "share"), [("2%", 0.02), (" 2.5 % ", 0.025), (0.02, 0.02), ("0.02", 0.02)])
+def test_a_target_error_is_a_share_or_per_cent(text: str | float, share: float) -> None:
+    config = GeneratorConfig.model_validate({"material": "m", "queries": {"target_error": text}})
+    assert config.queries.target_error == pytest.approx(share)
+
+
+@pytest.mark.parametrize("text", ["0", "100%", "-1%", "much", "2%%", "nan"])
+def test_other_target_errors_are_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="target_error"):
+        GeneratorConfig.model_validate({"material": "m", "queries": {"target_error": text}})

@@ -1,0 +1,116 @@
+r"""Paths of a shard's queries: a mean number of them, or as many as a target error takes.
+
+Under a target ε every query first gets a pilot of its own, with random numbers of its own, that is thrown
+away. The variance of one path is taken from the sample variance V of the pilot's ν + 1 paths and what the
+run's allocation expects of such a query, s²:
+
+    v = (ν V + ν₀ s²) / (ν + ν₀)
+
+so that a pilot that happened to miss a few bright paths does not stop the query at once. From v follow the
+paths that bring the standard error to ε · max(value, tile mean), rounded up, and at most the cap. The counts
+depend on the pilot alone, and the stored paths are drawn afresh: values are unbiased, their halves are
+independent. Stopping when the paths drawn so far look good enough would be neither: it stops early where they
+missed the light.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .allocation import FEWEST
+from .estimates import Estimates, Stream, TargetReached
+from .queries import Queries
+
+if TYPE_CHECKING:
+    from .effects import EffectsPlan
+
+F64 = NDArray[np.float64]
+
+# Paths of a query's own pilot, and how many paths the run's expectation counts for beside it.
+PILOT_SPP = 16
+PRIOR_PATHS = 8
+# Pilots draw in these passes, which the stored paths never reach.
+PILOT_PASS = 1024
+
+
+@dataclass(frozen=True)
+class Target:
+    """Standard error of every value to reach, relative to max(value, tile mean), with at most `cap` paths."""
+
+    error: float
+    cap: int
+
+
+def estimate_shard(
+    estimator: Any, queries: Queries, spp: int, target: Target | None, stream: Stream, effects: EffectsPlan
+) -> Estimates:
+    """Both halves of a shard's queries (one leading axis).
+
+    Parameters
+    ----------
+    spp : mean number of paths where there is no target
+    effects : the run's plan, with its allocation
+    """
+    allocation = effects.allocation
+    found: Estimates
+    if effects.closed_form or allocation is None:
+        found = estimator.estimate(queries, spp, stream)
+        return found
+    if target is None:
+        found = estimator.estimate(queries, allocation.counts(queries, spp), stream)
+        return found
+    pilot = estimator.estimate(queries, PILOT_SPP, replace(stream, first_pass=PILOT_PASS), path_variance=True)
+    expected = allocation.deviation(queries), allocation.tile_mean(queries)
+    wanted = wanted_paths(pilot, PILOT_SPP, *expected, target.error)
+    counts = round_up(np.minimum(wanted, target.cap), target.cap)
+    found = estimator.estimate(queries, counts, stream)
+    return replace(
+        found,
+        paths=found.paths + pilot.paths,
+        lost=found.lost + pilot.lost,
+        capped=found.capped + pilot.capped,
+        nonfinite=found.nonfinite + pilot.nonfinite,
+        target=_reached(found, wanted, expected[1], target),
+    )
+
+
+def wanted_paths(pilot: Estimates, paths: int, deviation: F64, tile_mean: F64, error: float) -> F64:
+    """Paths (n,) that queries need for a relative error, after a pilot of `paths` each.
+
+    Parameters
+    ----------
+    deviation, tile_mean : (n,) what the run's allocation expects
+    """
+    assert pilot.path_variance is not None
+    own = paths - 1
+    variance = (own * pilot.path_variance + PRIOR_PATHS * deviation**2) / (own + PRIOR_PATHS)
+    allowed = error * np.maximum(_values(pilot), tile_mean)
+    return np.divide(variance, allowed**2, out=np.zeros(len(variance)), where=allowed > 0)
+
+
+def _values(estimates: Estimates) -> F64:
+    """Mean over channels and halves (n,)."""
+    return 0.5 * np.mean(estimates.value_a.astype(np.float64) + estimates.value_b, axis=-1)
+
+
+def round_up(wanted: F64, cap: int) -> NDArray[np.int64]:
+    """The next number of paths that is a power of two or three times one, which fill nets of points, from
+    ``FEWEST`` to `cap`."""
+    power = np.ceil(np.log2(np.maximum(wanted, FEWEST)))
+    whole = np.exp2(power)
+    # 1.5 halves of a net: even, so that both halves have the same.
+    between = np.where(power >= 3, 0.75 * whole, whole)
+    return np.minimum(np.where(wanted <= between, between, whole), cap).astype(np.int64)
+
+
+def _reached(found: Estimates, wanted: F64, tile_mean: F64, target: Target) -> TargetReached:
+    missed = wanted > target.cap
+    scale = np.maximum(_values(found), tile_mean)
+    error = np.mean((0.5 * (found.value_a.astype(np.float64) - found.value_b)) ** 2, axis=-1)
+    relative = np.divide(error, scale**2, out=np.zeros(len(error)), where=scale > 0)
+    worst = target.error * float(np.sqrt(wanted.max() / target.cap)) if missed.any() else 0.0
+    return TargetReached(len(wanted), int(missed.sum()), worst, float(relative.mean()))

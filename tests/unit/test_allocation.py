@@ -1,0 +1,121 @@
+"""Which queries get how many paths: fitted expectations, counts, and what a target error calls for."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mbtf_gen.adaptive import PRIOR_PATHS, round_up, wanted_paths
+from mbtf_gen.allocation import FLOOR, Allocation, fit_allocation, fit_log_linear
+from mbtf_gen.estimates import Estimates
+from mbtf_gen.levels import Lattice
+from mbtf_gen.queries import Mixture, Queries, QueryPlan
+
+SPP = 16
+
+
+def some_queries(n: int = 20_000, shard: int = 0) -> Queries:
+    return QueryPlan(Lattice(6), Mixture(0.6, 0.4), 0.1, "shuffled", 0, n).draw("train", shard, n)
+
+
+def deviation(q: Queries) -> NDArray[np.float64]:
+    """Noisy at fine levels and low lights."""
+    level = -np.log2(2.0 * q.sigma.astype(np.float64))
+    return np.asarray(0.05 * np.exp(0.3 * level) / q.omega_i[:, 2].astype(np.float64))
+
+
+def pilot(q: Queries, paths: int = SPP, seed: int = 0) -> Estimates:
+    """Values whose noise has the deviation above, around a tile mean of 0.2 · ω_o,z."""
+    rng = np.random.default_rng(seed)
+    noise = deviation(q)[:, None] * np.sqrt(2.0 / paths)
+    a, b = (
+        (0.2 * q.omega_o[:, 2:] + noise * rng.normal(size=(len(q.sigma), 3))).astype(np.float32)
+        for _ in range(2)
+    )
+    return Estimates(a, b, None, 0, 0, 0, 0)
+
+
+@pytest.fixture(scope="module")
+def fitted() -> Allocation:
+    q = some_queries()
+    return fit_allocation(q, pilot(q), SPP, SPP)
+
+
+def test_a_log_linear_mean_is_recovered() -> None:
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=20_000)
+    weights = fit_log_linear([np.ones_like(x), x], np.exp(0.5 * x - 3.0) * rng.exponential(size=len(x)))
+    assert weights == pytest.approx([-3.0, 0.5], abs=0.05)
+    assert not fit_log_linear([np.ones_like(x), x], np.zeros_like(x)).any()
+
+
+def test_expected_deviations_and_means_follow_the_pilot(fitted: Allocation) -> None:
+    q = some_queries(4000, shard=1)
+    # The mean of |N(0, 1)| over three channels' root mean square is within a tenth of the deviation.
+    ratio = fitted.deviation(q) / deviation(q)
+    assert np.quantile(ratio, [0.02, 0.98]) == pytest.approx([0.92, 0.92], rel=0.2)
+    assert fitted.tile_mean(q) / (0.2 * q.omega_o[:, 2]) == pytest.approx(np.ones(4000), rel=0.35)
+
+
+def test_counts_are_powers_of_two_about_the_wanted_mean(fitted: Allocation) -> None:
+    q = some_queries(shard=2)
+    for spp in (SPP, 256):
+        counts = fitted.counts(q, spp)
+        assert counts.mean() == pytest.approx(spp, rel=0.06)
+        assert (np.log2(counts) % 1 == 0).all()
+        assert counts.min() >= 2
+    # In proportion to the deviation, to the nearest power of two.
+    share = fitted.counts(q, 256) / fitted.deviation(q)
+    assert share.max() / share.min() < 2.0001
+
+
+def test_they_make_errors_smaller_and_the_gain_says_by_how_much(fitted: Allocation) -> None:
+    q = some_queries(shard=3)
+    variance = deviation(q) ** 2
+    gain = np.mean(variance / SPP) / np.mean(variance / fitted.counts(q, SPP))
+    assert gain > 1.3
+    assert fitted.gain == pytest.approx(gain, rel=0.1)
+
+
+def test_counts_of_a_query_do_not_depend_on_the_others(fitted: Allocation) -> None:
+    q = some_queries(1000)
+    some = Queries(q.u[7:9], q.sigma[7:9], q.omega_i[7:9], q.omega_o[7:9])
+    assert (fitted.deviation(some) == fitted.deviation(q)[7:9]).all()
+    assert (fitted.counts(some, SPP) == fitted.counts(q, SPP)[7:9]).all()
+
+
+def test_an_allocation_survives_the_manifest(fitted: Allocation) -> None:
+    assert Allocation.from_manifest(json.loads(json.dumps(fitted.to_manifest()))) == fitted
+
+
+def test_no_noise_and_little_noise() -> None:
+    q = some_queries(500)
+    value = np.full((500, 3), 0.1, np.float32)
+    silent = fit_allocation(q, Estimates(value, value, None, 0, 0, 0, 0), SPP, SPP)
+    assert (silent.counts(q, SPP) == SPP).all()
+    assert silent.gain == 1.0
+    lonely = value.copy()
+    lonely[3] = 1.0
+    found = fit_allocation(q, Estimates(lonely, value, None, 0, 0, 0, 0), SPP, SPP)
+    assert found.deviation(q).min() >= FLOOR * found.typical > 0
+
+
+def test_counts_under_a_target_are_rounded_up() -> None:
+    wanted = np.array([0.0, 2.0, 2.1, 4.1, 6.0, 6.1, 9.0, 12.1, 500.0, 1e9])
+    assert round_up(wanted, 1000).tolist() == [2, 2, 4, 6, 6, 8, 12, 16, 512, 1000]
+
+
+def test_paths_for_a_target_error() -> None:
+    n = 4
+    value = np.array([0.1, 0.4, 0.0, 0.1], np.float32)[:, None].repeat(3, axis=1)
+    variance = np.array([0.01, 0.01, 0.0, 0.01], np.float32)
+    found = Estimates(value, value, None, 0, 0, 0, 0, path_variance=variance)
+    wanted = wanted_paths(found, 16, np.full(n, 0.1), np.array([0.2, 0.2, 0.2, 0.0]), 0.05)
+    # Where pilot and expectation agree, the variance over the square of what is allowed.
+    assert wanted[:2] == pytest.approx([0.01 / (0.05 * 0.2) ** 2, 0.01 / (0.05 * 0.4) ** 2])
+    # A pilot that saw nothing does not overrule the expectation.
+    assert wanted[2] == pytest.approx(0.01 * PRIOR_PATHS / (15 + PRIOR_PATHS) / (0.05 * 0.2) ** 2)
+    assert wanted[3] == pytest.approx(0.01 / (0.05 * 0.1) ** 2)
