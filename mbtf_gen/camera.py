@@ -9,7 +9,7 @@ agree near normal incidence.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,14 @@ PixelKind = Literal["query", "pixel"]
 PIXEL_SIGMA = 0.5
 # Pixels that see the plane under a smaller cosine than this are refused: their footprints have no end.
 SMALLEST_COSINE = 0.01
+
+
+def pixel_sigma(area: Any) -> Any:
+    """σ of a pixel that sees the given area: the geometric mean of the two radii of its projected Gaussian.
+
+    Works on numbers and on arrays of NumPy and Dr.Jit; areas in squared tile widths give tile widths.
+    """
+    return PIXEL_SIGMA * area**0.5
 
 
 @dataclass(frozen=True)
@@ -108,7 +116,7 @@ class Camera:
         shape = (self.rows, self.columns)
         return Queries(
             np.mod(point[..., :2] / (1.0, aspect), 1.0).astype(np.float32) % np.float32(1.0),
-            (PIXEL_SIGMA * np.sqrt(area)).astype(np.float32),
+            pixel_sigma(area).astype(np.float32),
             np.broadcast_to(np.asarray(omega_i, np.float32), (*shape, 3)).copy(),
             (-direction).astype(np.float32),
         )

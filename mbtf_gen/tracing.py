@@ -37,6 +37,10 @@ LATE_SURVIVAL = 0.995
 # survive with this multiple of their throughput, at most one: on stone, cloth, metal and bark 2 was cheaper
 # than 1 and 4.
 SURVIVAL_PER_THROUGHPUT = 2.0
+# Paths along a lobe this narrow (density in 1/sr) may bring all of the light, which light sampling misses:
+# roulette waits for them so many interactions more.
+NARROW = 4.0
+NARROW_WAIT = 2
 NO_LIMIT = 0xFFFFFFFF
 
 
@@ -322,17 +326,18 @@ def _interact(
         path.active &= path.depth < limit
     omega, weight, pdf = point.sample(path.rng.next_1d(), path.rng.next_2d())
     path.throughput *= weight
-    _roulette(path, roulette)
+    _roulette(path, pdf, roulette)
     return Onward(world.field.leave(si, omega), dr.dot(si.n, omega) < 0, pdf), shadow
 
 
-def _roulette(path: Path, begin: Any) -> None:
+def _roulette(path: Path, pdf: Any, begin: Any) -> None:
     strongest = dr.max(path.throughput)
     # A path of NaN throughput would end here as if it were black.
     path.radiance[path.active & dr.isnan(strongest)] = mi.Spectrum(dr.nan)
     path.active &= strongest > 0
     longest = dr.select(path.depth < PATIENCE, 1.0, LATE_SURVIVAL)
     likely = dr.minimum(SURVIVAL_PER_THROUGHPUT * strongest, longest)
+    begin = dr.select(pdf > NARROW, begin + NARROW_WAIT, begin)
     survival = dr.select(path.depth >= begin, likely, 1.0)
     path.active &= path.rng.next_1d() < survival
     path.throughput *= dr.rcp(survival)

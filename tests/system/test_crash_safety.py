@@ -182,6 +182,21 @@ def test_a_kill_at_any_file_operation_loses_nothing(name: str, thorough: bool, s
     assert killed > 3
 
 
+def test_a_sidecar_never_vouches_for_a_later_shard(small: Small) -> None:
+    """The shard is gone, its sidecar not: it goes before another shard takes the name."""
+    small.damaged()
+    (small.out / "train-00001.npz").unlink()
+    with FileOperations(small.out) as watch:
+        assert generate(["repair", str(small.out), "-q"]) == 0
+    for stem in ("train-00000", "train-00001"):
+        order = [
+            watch.seen.index(("unlink", f"{stem}.json", 1)),
+            watch.seen.index(("replace", f".{stem}.npz.tmp", 1)),
+            watch.seen.index(("replace", f".{stem}.json.tmp", 1)),
+        ]
+        assert order == sorted(order)
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("name", ["run", "repair"])
 def test_an_interruption_keeps_what_was_rendered_and_says_how_to_go_on(

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import itertools
+import json
 import os
 import signal
+import stat
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from typing import BinaryIO
 
@@ -162,3 +166,101 @@ def test_digests_are_sha256(tmp_path: Path) -> None:
     path = tmp_path / "a"
     path.write_bytes(b"mbtf" * 99999)
     assert atomic.digest(path) == hashlib.sha256(b"mbtf" * 99999).hexdigest()
+
+
+def test_of_several_creators_one_wins_and_its_content_stays(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    gate, won = threading.Barrier(8), []
+
+    def create(number: int) -> None:
+        # Temporary names are a process's own; threads stand in for processes here.
+        gate.wait()
+        if atomic.create_file(path.with_name("a"), str(number).encode() * 1000):
+            won.append(number)
+
+    names = itertools.count()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(atomic, "temporary_of", lambda p: p.with_name(f".a.{next(names)}.tmp"))
+        threads = [threading.Thread(target=create, args=(n,)) for n in range(8)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    assert len(won) == 1
+    assert path.read_bytes() == str(won[0]).encode() * 1000
+    assert no_leftovers(tmp_path)
+
+
+@pytest.mark.parametrize("number", [errno.EPERM, errno.EOPNOTSUPP])
+def test_without_hard_links_files_are_created_all_the_same(
+    number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def unsupported(*_: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(atomic.os, "link", unsupported)
+    assert atomic.create_file(tmp_path / "a", b"first")
+    assert not atomic.create_file(tmp_path / "a", b"second")
+    assert (tmp_path / "a").read_bytes() == b"first"
+    assert no_leftovers(tmp_path)
+
+
+def test_a_leftover_that_is_the_file_itself_does_not_spoil_it(tmp_path: Path) -> None:
+    """A kill between link and unlink leaves two names of one file; a process of the same number follows."""
+    path = tmp_path / "a"
+    path.write_bytes(b"whole")
+    os.link(path, atomic.temporary_of(path))
+    assert not atomic.create_file(path, b"other content")
+    assert path.read_bytes() == b"whole"
+    assert no_leftovers(tmp_path)
+
+
+def test_any_changed_byte_of_a_sealed_document_is_found(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    data = {"name": "α", "rows": [1, 2.5, None], "checksum": "of before", "nested": {"zeros": "0" * 64}}
+    atomic.write_sealed(path, data)
+    assert atomic.read_sealed(path) == {k: v for k, v in data.items() if k != "checksum"}
+    content = path.read_bytes()
+    for at in range(len(content)):
+        for mask in (1, 0x20, 0x80):
+            changed = bytearray(content)
+            changed[at] ^= mask
+            path.write_bytes(changed)
+            with pytest.raises(InputError):
+                atomic.read_sealed(path)
+    for changed in (content[:-1], content + b" ", content.replace(b"\n", b"\r\n"), b"{}"):
+        path.write_bytes(changed)
+        with pytest.raises(InputError):
+            atomic.read_sealed(path)
+
+
+def test_the_checksum_is_that_of_the_file_with_its_digits_at_zero(tmp_path: Path) -> None:
+    atomic.write_sealed(tmp_path / "a.json", {"rows": 3})
+    content = (tmp_path / "a.json").read_bytes()
+    stored = json.loads(content)["checksum"]
+    assert stored == hashlib.sha256(content.replace(stored.encode(), b"0" * 64)).hexdigest()
+    assert list(json.loads(content)) == ["rows", "checksum"]
+
+
+def test_pieces_are_digested_as_they_are_written(tmp_path: Path) -> None:
+    pieces = [b"abc", memoryview(b"x" * 100_000), b"", bytearray(b"z")]
+    stored = atomic.write_chunks(tmp_path / "a", pieces)
+    content = (tmp_path / "a").read_bytes()
+    assert content == b"".join(pieces)
+    assert stored == atomic.Stored(len(content), hashlib.sha256(content).hexdigest())
+
+
+@pytest.mark.parametrize("number", [errno.EIO, errno.ENOSPC])
+def test_a_folder_that_fails_to_sync_is_a_failure(
+    number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = os.fsync
+
+    def fails(handle: int) -> None:
+        if stat.S_ISDIR(os.fstat(handle).st_mode):
+            raise OSError(number, os.strerror(number))
+        real(handle)
+
+    monkeypatch.setattr(atomic.os, "fsync", fails)
+    with pytest.raises(PartialError):
+        atomic.write_text(tmp_path / "a", "text")

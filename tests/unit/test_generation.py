@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 import shutil
 from pathlib import Path
@@ -13,12 +14,14 @@ import pytest
 from support.datasets import formula
 
 from mbtf_gen import generation
+from mbtf_gen.atomic import create_file, sealed
 from mbtf_gen.config import GeneratorConfig
 from mbtf_gen.dataset import Dataset
 from mbtf_gen.engine import load_mitsuba
 from mbtf_gen.errors import InputError, PartialError, UsageError
 from mbtf_gen.generation import Job, generate, paths_left
 from mbtf_gen.locks import shard_lock
+from mbtf_gen.manifest import build_manifest
 from mbtf_gen.summary import finish
 from mbtf_gen.tally import Tally, refuse_nonfinite
 from mbtf_gen.verification import sidecar_of, verify
@@ -318,7 +321,28 @@ def test_paths_left_are_those_that_the_run_will_trace(
     assert paths_left(image, out) == 4 * 32 * 2 + 32 * 4
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 5])
+def test_of_two_writers_that_begin_at_once_the_second_adopts_the_plan_of_the_first(
+    config: GeneratorConfig, engine: Formula, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another process, whose plan differs, writes its manifest while this one plans."""
+    out, job = tmp_path / "out", Job.prepare(config)
+    entries = job.shards("train") + job.shards("test")
+    other = generation.simulated(job)
+    other = dataclasses.replace(other, cap_cost=0.125)
+
+    def plan(job: Job, pilots: bool) -> Any:
+        out.mkdir()
+        assert create_file(out / "manifest.json", sealed(build_manifest(job, entries, other)))
+        return generation.simulated(job)
+
+    monkeypatch.setattr(generation, "plan_effects", plan)
+    assert generate(config, out).complete
+    assert json.loads((out / "manifest.json").read_text())["effects"] == other.to_manifest()
+    assert other.to_manifest() != generation.simulated(job).to_manifest()
+    assert verify(out) == []
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5, 7])
 def test_slices_share_the_work_without_gap_or_overlap(
     count: int, config: GeneratorConfig, engine: Formula, tmp_path: Path
 ) -> None:

@@ -14,7 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from mbtf_gen.locks import STALE_SECONDS, shard_lock
+from mbtf_gen.errors import PartialError
+from mbtf_gen.locks import STALE_SECONDS, Lock, brief_lock, lock_owner, shard_lock, take_lock
 
 
 def lock_of(shard: Path) -> Path:
@@ -157,3 +158,53 @@ def test_locks_of_other_machines_count_by_age(shard: Path) -> None:
     plant(shard, text, age=STALE_SECONDS + 60)
     with shard_lock(shard) as held:
         assert held
+
+
+def test_without_advisory_locks_a_living_process_keeps_its_lock(
+    shard: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def unsupported(handle: int, operation: int) -> None:
+        raise OSError(errno.ENOSYS, "not implemented")
+
+    monkeypatch.setattr("fcntl.flock", unsupported)
+    plant(shard, owner(socket.gethostname(), os.getppid()))
+    with shard_lock(shard) as held:
+        assert not held
+    plant(shard, owner(socket.gethostname(), 2**31 - 1))
+    with shard_lock(shard) as held:
+        assert held
+
+
+def test_a_lock_says_who_holds_it_and_for_how_long(shard: Path) -> None:
+    assert lock_owner(shard) is None
+    since = time.time() - 7300
+    plant(shard, json.dumps({"host": "oak", "process": 12, "since": since}))
+    assert str(lock_owner(shard)) == "process 12 on oak, for 2 h"
+    for text in ("", "{", '{"host": "oak"}', '{"host": "oak", "process": "x", "since": 0}'):
+        plant(shard, text)
+        assert lock_owner(shard) is None
+
+
+def test_a_sign_of_life_keeps_other_machines_out(shard: Path) -> None:
+    lock = take_lock(shard)
+    assert lock is not None
+    os.utime(lock_of(shard), (0, 0))
+    Lock.renew()
+    assert time.time() - lock_of(shard).stat().st_mtime < 60
+    lock.release()
+    lock.release()
+    assert not lock_of(shard).exists()
+
+
+def test_a_brief_lock_is_waited_for_but_not_for_ever(shard: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    held = take_lock(shard)
+    assert held is not None
+    threading.Timer(0.1, held.release).start()
+    with brief_lock(shard):
+        pass
+    held = take_lock(shard)
+    assert held is not None
+    monkeypatch.setattr("mbtf_gen.locks._PATIENCE_SECONDS", 0.05)
+    with pytest.raises(PartialError, match=f"process {os.getpid()} on"), brief_lock(shard):
+        pass
+    held.release()

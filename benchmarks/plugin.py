@@ -1,0 +1,150 @@
+"""One 1080p picture's queries, evaluated by the Mitsuba plugin and by PyTorch.
+
+    python benchmarks/plugin.py [--material FOLDER] [--runs 7] [--levels 9] [--threads N]
+
+The queries are those of a perspective picture of the plane: 1920 × 1080 positions, footprints and views, one
+light. **unrolled** and **cooperative** are the plugin's ways to evaluate networks, ``unrolled`` its default
+on a CPU; **pytorch** is ``Material.evaluate``. All three alternate in one process, after a first run of each
+that compiles: its time is reported as well, from an empty kernel cache. The material is a ``neumip`` of the
+paper's size with random weights, or one given: the time does not depend on the weights.
+
+The last line is one JSON object: figures, and the bars they are held to. Exit code 1 where a bar is missed;
+with other than two threads they are only reported.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+# Before drjit is imported: kernels are compiled anew.
+_CACHE = tempfile.TemporaryDirectory(prefix="mbtf-kernels-")
+os.environ["DRJIT_CACHE_DIR"] = _CACHE.name
+
+import numpy as np  # noqa: E402
+
+from mbtf_gen.camera import Camera  # noqa: E402
+from mbtf_gen.directions import from_angles  # noqa: E402
+from mbtf_gen.engine import load_mitsuba  # noqa: E402
+
+# Least ratio of PyTorch's time to the plugin's, most seconds of a first run, most deviation from conformance.
+FASTER, COMPILE, DEVIATION = 3.0, 10.0, 1e-4
+BAR_THREADS = 2
+
+
+def say(line: str) -> None:
+    """One line to standard error."""
+    print(line, file=sys.stderr, flush=True)
+
+
+def random_material(folder: Path, levels: int) -> None:
+    """Export an untrained ``neumip`` of the paper's size."""
+    import torch
+
+    from mbtf_fit.config import FitConfig
+    from mbtf_fit.material import export
+    from mbtf_fit.models import build_model
+    from mbtf_gen.levels import Lattice
+
+    model = build_model("neumip", Lattice(levels))
+    model.initialise(torch.Generator().manual_seed(0), 0.2)
+    training = {"steps": 0, "batch": 1, "seconds": 0.0, "device": "cpu", "threads": 1, "errors": {}}
+    export(model, FitConfig(), folder, data={}, training=training)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--material", type=Path)
+    parser.add_argument("--runs", type=int, default=7)
+    parser.add_argument("--levels", type=int, default=9)
+    parser.add_argument("--threads", type=int, default=len(os.sched_getaffinity(0)))
+    options = parser.parse_args()
+    mi = load_mitsuba()
+    import drjit as dr
+    import torch
+
+    import mbtf_fit.plugin
+    from mbtf_fit import Material
+    from mbtf_fit.plugin import Evaluator, read_material
+
+    mbtf_fit.plugin.register()
+    torch.set_num_threads(options.threads)
+    dr.set_thread_count(options.threads)
+    with tempfile.TemporaryDirectory(prefix="mbtf-material-") as made:
+        folder = options.material or Path(made)
+        if options.material is None:
+            random_material(folder, options.levels)
+        material, stored = Material.load(folder), read_material(folder)
+    queries = Camera(elevation=45, span=4.0, rows=1080, columns=1920).queries(from_angles(40, 30)).flat()
+    arrays = (queries.u, queries.sigma, queries.omega_i, queries.omega_o)
+    u = mi.Point2f(queries.u.T)
+    sigma = mi.Float(queries.sigma)
+    light, view = mi.Vector3f(queries.omega_i.T), mi.Vector3f(queries.omega_o.T)
+    dr.eval(u, sigma, light, view)
+
+    def plugin(arithmetic: Any) -> Callable[[], None]:
+        evaluator = Evaluator(stored, arithmetic)
+
+        def run() -> None:
+            value = evaluator.value(evaluator.features(u, evaluator.level(sigma), view), light, view)
+            dr.eval(value)
+            dr.sync_thread()
+
+        return run
+
+    ways: dict[str, Callable[[], Any]] = {
+        "unrolled": plugin("unrolled"),
+        "cooperative": plugin("cooperative"),
+        "pytorch": lambda: material.evaluate(*arrays),
+    }
+    first: dict[str, float] = {}
+    seconds: dict[str, list[float]] = {name: [] for name in ways}
+    for run in range(options.runs + 1):
+        for name, way in ways.items():
+            start = time.perf_counter()
+            way()
+            passed = time.perf_counter() - start
+            if run:
+                seconds[name].append(passed)
+            else:
+                first[name] = passed
+    median = {name: statistics.median(s) for name, s in seconds.items()}
+    for name, values in seconds.items():
+        say(
+            f"{name:12} median {1e3 * median[name]:6.1f} ms "
+            f"({1e3 * min(values):.0f} to {1e3 * max(values):.0f}), "
+            f"{queries.sigma.size / median[name] / 1e6:5.1f} M queries/s, first run {first[name]:.2f} s"
+        )
+    wanted = stored.conformance["rgb"]
+    found = Evaluator(stored, "unrolled").evaluate(
+        *(stored.conformance[name] for name in ("u", "sigma", "omega_i", "omega_o"))
+    )
+    deviation = float((np.abs(found - wanted) / np.maximum(wanted, max(wanted.mean(), 1e-9))).max())
+    ratio = median["pytorch"] / median["unrolled"]
+    say(f"unrolled {ratio:.1f} times as fast as PyTorch; deviation on conformance queries {deviation:.1e}")
+    held = ratio >= FASTER and first["unrolled"] <= COMPILE and deviation <= DEVIATION
+    figures = {
+        "milliseconds": {name: round(1e3 * value, 1) for name, value in median.items()},
+        "first_run_seconds": {name: round(value, 2) for name, value in first.items()},
+        "times_pytorch": round(ratio, 2),
+        "conformance_deviation": deviation,
+        "threads": options.threads,
+        "bars": {"times_pytorch": FASTER, "first_run_seconds": COMPILE, "conformance_deviation": DEVIATION},
+        "held": held,
+    }
+    print(json.dumps(figures))
+    return int(not held and options.threads == BAR_THREADS)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,125 @@
+"""Makes docs/pictures/zoom_series.png: a fitted material in Mitsuba beside truly filtered pictures.
+
+From the repository's root, after ``make demo``: ``.venv/bin/python docs/pictures/make_zoom_series.py``.
+Rows: path-traced pixels of the micro-geometry (``mbtf-gen reference --kind pixel``, its command is printed);
+the material with footprints (``mbtf_path``); the material at its finest level everywhere, as stock
+integrators read it. One ray per pixel shows aliasing as it is. Printed: RMS difference from the reference as
+a share of its mean.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from mbtf_gen.camera import Camera
+from mbtf_gen.directions import from_angles
+from mbtf_gen.engine import load_mitsuba
+from mbtf_gen.reference import auto_exposure, to_display
+from mbtf_gen.shard_files import read_exr
+
+ROOT = Path(__file__).parents[2]
+MATERIAL = ROOT / "out" / "quickstart" / "fits" / "neumip"
+SPANS = (0.5, 2.0, 8.0, 32.0, 128.0)
+VIEW, LIGHT, SIZE, SPP = (60.0, -90.0), (45.0, 45.0), 160, 64
+# As the recipe generates its data.
+OPTIONS = ("--mesh", "256", "--light-width", "5")
+ROWS = ("reference, 0.5 tiles wide", "material, mbtf_path", "material, finest level")
+GAP, CAPTION = 6, 24
+
+
+def reference(span: float) -> NDArray[np.float64]:
+    """Truly filtered pixels (SIZE, SIZE, 3)."""
+    words = ["reference", "assets/turtle_shell", "--view", "{:g},{:g}".format(*VIEW)]
+    words += ["--light", "{:g},{:g}".format(*LIGHT), "--spans", f"{span:g}", "--size", str(SIZE)]
+    words += ["--spp", str(SPP), "--kind", "pixel", *OPTIONS]
+    print("mbtf-gen", *words, flush=True)
+    with tempfile.TemporaryDirectory() as folder:
+        output = Path(folder) / "pictures"
+        command = [sys.executable, "-m", "mbtf_gen", *words, "-o", str(output), "--quiet"]
+        subprocess.run(command, check=True, cwd=ROOT, stdout=subprocess.DEVNULL)
+        (picture,) = output.glob("*.exr")
+        arrays = read_exr(picture)
+    out: NDArray[np.float64] = 0.5 * (arrays["value_a"] + arrays["value_b"]).reshape(SIZE, SIZE, 3)
+    return out
+
+
+def rendered(mi: Any, span: float, integrator: str) -> NDArray[np.float64]:
+    """The material on a plane under a delta light of unit irradiance, a ray through each pixel's centre."""
+    import drjit as dr
+
+    camera = Camera(VIEW[0], VIEW[1], span=span, rows=SIZE, columns=SIZE)
+    omega_i = from_angles(*LIGHT)
+    half = 4.0 * span + 1.0
+    to_world = mi.ScalarTransform4f().scale([half, half, 1.0])
+    # The rectangle's texture coordinates run from 0 to 1; row 0 of images lies at v = 0.
+    bsdf = {"type": "mbtf", "material": str(MATERIAL), "uv_scale": 2.0 * half}
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "plane": {
+                "type": "rectangle",
+                "to_world": to_world @ mi.ScalarTransform4f().scale([1.0, -1.0, 1.0]),
+                "bsdf": bsdf,
+            },
+            "light": {
+                "type": "directional",
+                "direction": [-float(c) for c in omega_i],
+                "irradiance": float(1.0 / omega_i[2]),
+            },
+            "sensor": {
+                "type": "perspective",
+                "fov": camera.field_of_view,
+                "to_world": mi.ScalarTransform4f().look_at(
+                    list(map(float, camera.position)), [*camera.target, 0.0], [0.0, 0.0, 1.0]
+                ),
+                "film": {"type": "hdrfilm", "width": SIZE, "height": SIZE},
+            },
+        }
+    )
+    index = dr.arange(mi.UInt32, SIZE * SIZE)
+    centre = mi.Point2f(mi.Float(index % SIZE) + 0.5, mi.Float(index // SIZE) + 0.5) / SIZE
+    ray, _ = scene.sensors()[0].sample_ray_differential(0.0, 0.5, centre, mi.Point2f(0.5))
+    sampler = mi.load_dict({"type": "independent", "sample_count": 1})
+    sampler.seed(0, SIZE * SIZE)
+    value, _, _ = mi.load_dict({"type": integrator, "max_depth": 2}).sample(scene, sampler, ray)
+    out: NDArray[np.float64] = np.array(value, np.float64).T.reshape(SIZE, SIZE, 3)
+    return out
+
+
+def main() -> None:
+    """Write the sheet."""
+    mi = load_mitsuba()
+    import mbtf_fit.plugin
+
+    mbtf_fit.plugin.register()
+    sheet = Image.new("RGB", (len(SPANS) * (SIZE + GAP) - GAP, 3 * (SIZE + CAPTION)), (255, 255, 255))
+    draw = ImageDraw.Draw(sheet)
+    for column, span in enumerate(SPANS):
+        truth = reference(span)
+        pictures = (truth, rendered(mi, span, "mbtf_path"), rendered(mi, span, "path"))
+        exposure = auto_exposure(truth.astype(np.float32))
+        for row, (name, picture) in enumerate(zip(ROWS, pictures, strict=True)):
+            place = (column * (SIZE + GAP), row * (SIZE + CAPTION))
+            caption = name if column == 0 else f"{span:g} tiles wide" if row == 0 else ""
+            draw.text((place[0] + 2, place[1] + 3), caption, (30, 30, 30), ImageFont.load_default(12))
+            display = to_display(picture.astype(np.float32), exposure)
+            sheet.paste(Image.fromarray(display), (place[0], place[1] + CAPTION))
+            error = float(np.sqrt(((picture - truth) ** 2).mean())) / truth.mean()
+            mean = picture.mean() / truth.mean()
+            print(
+                f"{span:6g} tiles wide, {name:26} RMS {error:.3f} of the mean, mean {mean:.3f} of it",
+                flush=True,
+            )
+    sheet.save(Path(__file__).with_name("zoom_series.png"), optimize=True)
+
+
+if __name__ == "__main__":
+    main()

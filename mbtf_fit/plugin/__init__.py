@@ -1,0 +1,43 @@
+"""Fitted materials as Mitsuba BSDFs (``mbtf``), and a path tracer that hands them footprints
+(``mbtf_path``).
+
+    import mitsuba as mi
+    mi.set_variant("llvm_ad_rgb")
+    import mbtf_fit.plugin
+    bsdf = mi.load_dict({"type": "mbtf", "material": "material/"})
+
+Importing the package registers its plugins with the variant that is set; where none is set yet, call
+:func:`register` once it is. PyTorch is not needed, and never imported.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+_PUBLIC = {
+    "Evaluator": "evaluator",
+    "StoredMaterial": "stored",
+    "check_scene": "scene",
+    "load_scene": "scene",
+    "read_material": "stored",
+    "register": "registration",
+}
+
+__all__ = ["Evaluator", "StoredMaterial", "check_scene", "load_scene", "read_material", "register"]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _PUBLIC:
+        return getattr(import_module(f".{_PUBLIC[name]}", __name__), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def _register_if_set() -> None:
+    from .registration import register, variant_is_set
+
+    if variant_is_set():
+        register()
+
+
+_register_if_set()

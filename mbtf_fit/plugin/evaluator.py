@@ -1,0 +1,79 @@
+"""M(u, σ, ω_i, ω_o) of a stored material, inside Dr.Jit kernels.
+
+The formulas are those that the material folder states (``formula`` and ``conventions`` in its
+``material.json``); what they mean stands in :mod:`mbtf_fit.models.neumip`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .encodings import encode_direction, encode_position, to_value
+from .network import Arithmetic, Network, count_weights, default_arithmetic
+from .stored import F32, StoredMaterial
+from .textures import Textures
+
+# Of the model's definition: tile widths per unit that the offset network answers, and the cosine below which
+# the offset grows no further.
+OFFSET_SCALE = 0.1
+GRAZING = 0.6
+
+
+class Evaluator:
+    """A material, ready to be evaluated for lanes of queries.
+
+    Parameters
+    ----------
+    stored : its weights
+    arithmetic : how networks are evaluated; by default what suits variant and size
+    """
+
+    def __init__(self, stored: StoredMaterial, arithmetic: Arithmetic | None = None) -> None:
+        self.lattice = stored.lattice
+        self.network = stored.network
+        self.unit = stored.unit
+        weights = count_weights(stored.decoder) + count_weights(stored.offset_network or [])
+        self.arithmetic: Arithmetic = default_arithmetic(weights) if arithmetic is None else arithmetic
+        self.pyramid = Textures(stored.pyramid)
+        self.decoder = Network(stored.decoder, self.arithmetic, stored.network.activation)
+        self.offset_texture: Textures | None = None
+        if stored.offset_texture is not None and stored.offset_network is not None:
+            self.offset_texture = Textures([stored.offset_texture])
+            self.offset_network = Network(stored.offset_network, self.arithmetic, stored.network.activation)
+
+    def level(self, sigma: Any) -> Any:
+        """Fractional level of footprints in tile widths."""
+        return dr.clip(-dr.log2(2.0 * sigma), 0.0, float(self.lattice.finest))
+
+    def features(self, u: Any, level: Any, omega_o: Any) -> list[Any]:
+        """Stage 1, shared by all lights: features at uv positions (Point2f), seen from unit vectors."""
+        moved = u
+        if self.offset_texture is not None:
+            r = self.offset_network([*self.offset_texture.first(u), omega_o.x, omega_o.y])
+            if len(r) == 1:
+                r = [r[0] * (omega / dr.maximum(omega_o.z, GRAZING)) for omega in (omega_o.x, omega_o.y)]
+            x, y = r
+            moved = mi.Point2f(
+                dr.fma(x, OFFSET_SCALE, u.x), dr.fma(y, OFFSET_SCALE / self.lattice.aspect, u.y)
+            )
+        read = self.pyramid.blended if self.network.blending == "blend" else self.pyramid.side_by_side
+        return [*read(moved, level), *encode_position(u, self.network.encoding)]
+
+    def value(self, features: list[Any], omega_i: Any, omega_o: Any) -> Any:
+        """Stage 2: value (Color3f) in 1/sr, at least 0."""
+        options = self.network.encoding
+        directions = [*encode_direction(omega_i, options), *encode_direction(omega_o, options)]
+        return to_value(self.decoder([*features, *directions]), self.unit, self.network)
+
+    def evaluate(self, u: ArrayLike, sigma: ArrayLike, omega_i: ArrayLike, omega_o: ArrayLike) -> F32:
+        """Values (n, 3) in 1/sr at arrays of queries, as :meth:`mbtf_fit.Material.evaluate` gives them."""
+        place = mi.Point2f(np.asarray(u, np.float32).T)
+        lights, views = (mi.Vector3f(np.asarray(w, np.float32).T) for w in (omega_i, omega_o))
+        features = self.features(place, self.level(mi.Float(np.asarray(sigma, np.float32))), views)
+        out: F32 = np.array(self.value(features, lights, views), np.float32).T
+        return out

@@ -1,0 +1,58 @@
+"""Material folders of known weights, exported without training."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from mbtf_fit.config import FitConfig
+from mbtf_fit.material import Material, export
+from mbtf_fit.models import build_model
+from mbtf_gen.levels import Lattice
+
+_TRAINING = {"steps": 0, "batch": 1, "seconds": 0.0, "device": "cpu", "threads": 1, "errors": {}}
+
+
+def write_material(
+    folder: Path,
+    *,
+    model: str = "neumip",
+    network: dict[str, Any] | None = None,
+    finest: int = 3,
+    aspect: float = 1.0,
+    constant: tuple[float, float, float] | None = None,
+    weights: dict[str, torch.Tensor] | None = None,
+    contrast: float = 0.5,
+    brightness: float = 0.3,
+    seed: int = 0,
+) -> Material:
+    """Write a material of random weights that all matter, and return it as read back.
+
+    Parameters
+    ----------
+    constant : the value, in 1/sr, everywhere, in place of random weights; for models of three outputs
+    weights : tensors by name that replace those of the model
+    contrast : standard deviation of the features
+    brightness : mean of all biases
+    """
+    config = FitConfig.model_validate({"model": model, "network": network or {}})
+    torch.manual_seed(seed)
+    built = build_model(model, Lattice(finest, aspect), **(network or {}))
+    built.initialise(torch.Generator().manual_seed(seed), 0.2)
+    tensors = built.weights()
+    for name, tensor in tensors.items():
+        if "texture" in name or "pyramid" in name:
+            tensors[name] = contrast * torch.randn_like(tensor)
+        elif "bias" in name:
+            tensors[name] = brightness + 0.1 * torch.randn_like(tensor)
+    if constant is not None:
+        last = max(int(name.split(".")[1]) for name in tensors if name.startswith("decoder."))
+        tensors["unit"] = torch.ones(())
+        tensors[f"decoder.{last}.weight"] = torch.zeros_like(tensors[f"decoder.{last}.weight"])
+        tensors[f"decoder.{last}.bias"] = torch.log1p(torch.tensor(constant, dtype=torch.float32))
+    tensors |= weights or {}
+    built.load_weights(tensors)
+    folder.mkdir(parents=True, exist_ok=True)
+    return export(built, config, folder, data={"hash": "0" * 64}, training=_TRAINING)

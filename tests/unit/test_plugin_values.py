@@ -1,0 +1,135 @@
+"""The plugin's evaluator gives the values of the PyTorch model, for every option, level, seam and shape."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.damage import check_message
+from support.fit_data import random_queries
+from support.plugin_materials import write_material
+from support.scenes import mi
+
+from mbtf_fit.models import mlp, outputs, textured
+from mbtf_gen.errors import InputError
+from mbtf_gen.levels import Lattice
+
+assert mi.variant()
+
+from mbtf_fit.plugin import encodings, evaluator, network  # noqa: E402
+from mbtf_fit.plugin.evaluator import Evaluator  # noqa: E402
+from mbtf_fit.plugin.stored import read_material  # noqa: E402
+
+VARIANTS: dict[str, dict[str, Any]] = {
+    "neumip": {},
+    "baseline": {"model": "neumip-baseline"},
+    "tall tile": {"aspect": 2.3},
+    "flat tile": {"aspect": 0.1},
+    "one texel": {"finest": 0},
+    "six outputs": {"network": {"outputs": 6}},
+    "direct offset": {"network": {"offset": "direct", "activation": "leaky-relu", "output": "softplus"}},
+    "concatenated": {"network": {"blending": "concatenate", "activation": "sine", "output": "exp"}},
+    "concatenated, one texel": {"finest": 0, "network": {"blending": "concatenate"}},
+    "encoded": {
+        "network": {"encoding": {"position": 2, "direction": 2, "raw": True, "lifted": True, "pi": False}}
+    },
+    "encoded with pi": {"network": {"encoding": {"position": 3, "direction": 1}, "output": "identity"}},
+    "fourth root": {"network": {"output": "fourth-root", "channels": 9, "width": 8, "layers": 2}},
+}
+UNROLLED = ("fourth root", "encoded")
+
+
+def deviation(found: np.ndarray, wanted: np.ndarray) -> float:
+    """Largest difference as a share of max(value, mean)."""
+    return float((np.abs(found - wanted) / np.maximum(wanted, wanted.mean())).max())
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_conformance_and_random_queries(name: str, tmp_path: Path) -> None:
+    options = VARIANTS[name]
+    material = write_material(tmp_path, **options)
+    # Unrolled kernels take a second to compile.
+    plugin = Evaluator(read_material(tmp_path), "unrolled" if name in UNROLLED else "cooperative")
+    stored = material.conformance
+    queries = [stored[k] for k in ("u", "sigma", "omega_i", "omega_o")]
+    assert stored["rgb"].std() > 0.01
+    assert deviation(plugin.evaluate(*queries), stored["rgb"]) < 1e-4
+    drawn = random_queries(np.random.default_rng(3), 4000, Lattice(material.lattice.finest))
+    drawn["u"] = 5 * drawn["u"] - 2
+    drawn["sigma"] *= np.float32(1.5)
+    found, wanted = plugin.evaluate(*drawn.values()), material.evaluate(*drawn.values())
+    assert deviation(found, wanted) < 1e-4
+
+
+def test_the_networks_of_the_paper_unrolled_and_in_half_precision(tmp_path: Path) -> None:
+    material = write_material(tmp_path)
+    stored = material.conformance
+    queries = [stored[k] for k in ("u", "sigma", "omega_i", "omega_o")]
+    weights = read_material(tmp_path)
+    assert deviation(Evaluator(weights, "unrolled").evaluate(*queries), stored["rgb"]) < 1e-4
+    half = deviation(Evaluator(weights, "half").evaluate(*queries), stored["rgb"])
+    assert 1e-5 < half < 1e-2
+
+
+def test_constants_are_those_of_the_models() -> None:
+    assert evaluator.OFFSET_SCALE == textured.OFFSET_SCALE
+    assert evaluator.GRAZING == textured.GRAZING
+    assert network.LEAK == mlp.LEAK
+    assert encodings.RGB_OF_YUV == outputs._RGB_OF_YUV
+    assert encodings.GATE == outputs._GATE
+
+
+def test_what_looks_at_neighbours_is_refused(tmp_path: Path) -> None:
+    write_material(tmp_path)
+    path = tmp_path / "material.json"
+    description = json.loads(path.read_text())
+    description["model"] = "hierarchical"
+    description["config"] |= {"model": "hierarchical", "network": {}}
+    path.write_text(json.dumps(description))
+    with pytest.raises(InputError, match="cannot evaluate 'hierarchical'") as caught:
+        read_material(tmp_path)
+    check_message(caught.value)
+
+
+def test_folders_that_are_no_material_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such folder"):
+        read_material(tmp_path / "none")
+    with pytest.raises(InputError, match=r"no material\.json"):
+        read_material(tmp_path)
+    write_material(tmp_path)
+    path = tmp_path / "material.json"
+    text = path.read_text()
+    path.write_text(text.replace('"schema": 1', '"schema": 7'))
+    with pytest.raises(InputError, match="schema 7; this version reads schema 1"):
+        read_material(tmp_path)
+    path.write_text(text)
+    weights = tmp_path / "weights.safetensors"
+    content = bytearray(weights.read_bytes())
+    content[-1] ^= 1
+    weights.write_bytes(content)
+    with pytest.raises(InputError, match="not the file that"):
+        read_material(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("network", "fault"),
+    [
+        ({"channels": 7, "outputs": 6}, "has 3 outputs, not 6"),
+        ({"encoding": {"direction": 2}}, "has the shape"),
+        ({"activation": "gelu"}, "activation"),
+    ],
+)
+def test_weights_of_another_architecture_are_refused(
+    network: dict[str, Any], fault: str, tmp_path: Path
+) -> None:
+    write_material(tmp_path)
+    path = tmp_path / "material.json"
+    description = json.loads(path.read_text())
+    description["config"]["network"] |= network
+    path.write_text(json.dumps(description))
+    with pytest.raises(InputError, match=fault) as caught:
+        read_material(tmp_path)
+    check_message(caught.value)
