@@ -22,7 +22,8 @@ from mbtf_gen.levels import Lattice, level_of_sigma
 from mbtf_gen.shard_files import read_shard
 
 from .config import HeldOutSection
-from .data import MAX_HELD_OUT, SAMPLE, Partition, Queries, in_region, read_checked
+from .data import MAX_HELD_OUT, SAMPLE, Partition, Queries, in_region, mean_value, read_checked
+from .streaming import Selection
 
 # Places along each side of a crop that are compared with values.
 CROP = 32
@@ -117,17 +118,26 @@ class TrainingBuffers:
     def batches(self, size: int, seed: int, step: int, margin: int) -> Iterator[Crops]:
         """Endless batches of at most about `size` queries from a step on: crops of buffers, each buffer once
         before any comes twice."""
+        rows, columns = self.u.shape[1:3]
+        while True:
+            buffer, side = self._chosen(size, seed, step)
+            origin = _philox(seed, 2 * step + 1).integers(0, (rows, columns), (len(buffer), 2))
+            yield self.crop(buffer, origin, side, margin)
+            step += 1
+
+    def _chosen(self, size: int, seed: int, step: int) -> tuple[NDArray[np.int64], int]:
+        """(buffers of a batch, places along each side of its crops)."""
         count, rows, columns = self.u.shape[:3]
         side = min(CROP, rows, columns, max(1, round(size**0.5)))
         items = max(1, size // side**2)
-        while True:
-            places = np.arange(step * items, (step + 1) * items)
-            sweeps, position = np.divmod(places, count)
-            order = {int(s): _philox(seed, 2 * int(s)).permutation(count) for s in np.unique(sweeps)}
-            buffer = np.array([order[int(s)][p] for s, p in zip(sweeps, position, strict=True)])
-            origin = _philox(seed, 2 * step + 1).integers(0, (rows, columns), (items, 2))
-            yield self.crop(buffer, origin, side, margin)
-            step += 1
+        places = np.arange(step * items, (step + 1) * items)
+        sweeps, position = np.divmod(places, count)
+        order = {int(s): _philox(seed, 2 * int(s)).permutation(count) for s in np.unique(sweeps)}
+        return np.array([order[int(s)][p] for s, p in zip(sweeps, position, strict=True)]), side
+
+    def numbers(self, size: int, seed: int, step: int) -> list[range]:
+        """Numbers of the buffers that the batch of a step is cut from."""
+        return [range(k, k + 1) for k in sorted(set(self._chosen(size, seed, step)[0].tolist()))]
 
 
 def _philox(seed: int, stream: int) -> np.random.Generator:
@@ -187,6 +197,7 @@ def load_buffers(data: Dataset, held_out: HeldOutSection, seed: int) -> Partitio
     sigma, omega = np.empty(count, np.float32), np.empty((2, count, 3), np.float32)
     out: tuple[list[Queries], list[Queries]] = ([], [])
     sample: list[Queries] = []
+    selection = Selection()
     read = filled = 0
     for shard in shards:
         buffers = read_checked(shard)
@@ -195,12 +206,12 @@ def load_buffers(data: Dataset, held_out: HeldOutSection, seed: int) -> Partitio
         for group, mark in zip(out, (1, 2), strict=True):
             group.append(buffers.take(np.flatnonzero(mine == mark)))
         kept = np.flatnonzero(mine == 0)
+        selection.add(shard.path, mine == 0)
         sample.append(_some(buffers.take(kept), -(-SAMPLE * len(kept) // count), random))
         part = slice(filled, filled + len(kept))
         u[part], sigma[part] = buffers.u[kept], buffers.sigma[kept, 0, 0]
         omega[0, part], omega[1, part] = buffers.omega_i[kept, 0, 0], buffers.omega_o[kept, 0, 0]
-        half = np.float32(0.5)
-        np.add(half * buffers.value_a[kept], half * buffers.value_b[kept], out=value[part])
+        value[part] = mean_value(buffers.value_a[kept], buffers.value_b[kept])
         filled += len(kept)
     training = TrainingBuffers(
         torch.from_numpy(u),
@@ -211,4 +222,4 @@ def load_buffers(data: Dataset, held_out: HeldOutSection, seed: int) -> Partitio
         strides(data.lattice, sigma),
     )
     kept_out = [_some(Queries.join(group), MAX_HELD_OUT, random) for group in out]
-    return Partition(training, kept_out[0], kept_out[1], Queries.join(sample))
+    return Partition(training, kept_out[0], kept_out[1], Queries.join(sample), selection)

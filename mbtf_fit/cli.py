@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
 from mbtf_gen.console import CONSOLE, Console, clock, new_app
-from mbtf_gen.errors import InputError, UsageError
+from mbtf_gen.errors import InputError, PartialError, UsageError
 from mbtf_gen.quality import Quality, as_assignments
+
+from .wording import describe_errors, describe_fit, number, table
+
+if TYPE_CHECKING:
+    from .config import FitConfig
 
 app = new_app("mbtf-fit", "Fit neural materials to multi-resolution BTF (MBTF) data.")
 
@@ -17,11 +22,6 @@ Set = Annotated[
     list[str], Parameter(name="--set", help="Set any option of the configuration, a.b=c. Repeatable.")
 ]
 Output = Annotated[Path, Parameter(name=["--output", "-o"])]
-_SPLITS = {
-    "test": "test",
-    "held_out_queries": "held-out queries",
-    "held_out_directions": "held-out directions",
-}
 
 
 @app.default
@@ -30,6 +30,8 @@ def fit(
     /,
     *,
     output: Output = Path("material"),
+    many: Annotated[list[Path] | None, Parameter(consume_multiple=True, negative="")] = None,
+    processes: int | None = None,
     quality: Quality | None = None,
     model: Literal["neumip", "neumip-baseline", "hierarchical"] | None = None,
     time: str | None = None,
@@ -52,7 +54,12 @@ def fit(
     shards
         Folder made by mbtf-gen.
     output
-        Folder of the material.
+        Folder of the material; with --many, of a folder per material.
+    many
+        Fit several data sets instead: folders made by mbtf-gen, folders of such folders, or text files with
+        one folder per line. A failure stops none of the others.
+    processes
+        With --many, fits that run side by side. Default: one per GPU, or 1
     quality
         Training time and size that belong together; other options change single ones.
     model
@@ -74,7 +81,11 @@ def fit(
     overwrite
         Replace a fit of another configuration.
     """
-    if shards is None:
+    if many is not None and shards is not None:
+        raise UsageError("--many takes all data sets", cure=f"mbtf-fit --many {shards} ... -o materials/")
+    if processes is not None and (many is None or processes < 1):
+        raise UsageError("--processes is a positive number that goes with --many")
+    if shards is None and many is None:
         raise UsageError("no shards given", cure="mbtf-fit shards/ -o material/")
     if time is not None and steps is not None:
         raise UsageError("--time and --steps exclude each other", cure="give one of them")
@@ -99,6 +110,10 @@ def fit(
     resolved = resolve(FitConfig, file=config, assignments=assigned, flags=flags)
     training = resolved.training
     budget = format_duration(training.time) if training.steps is None else f"{training.steps} steps"
+    if many is not None:
+        _fit_many(resolved, many, output, processes, overwrite, console)
+        return
+    assert shards is not None
     from .fitting import fit
 
     console.note(
@@ -117,39 +132,59 @@ def fit(
             progress=lambda share, note: bar.update(round(100 * share, 1), note),
         )
     data = result.as_dict()
-    console.report(data, _describe_fit(data))
+    console.report(data, describe_fit(data))
 
 
-def _describe_errors(errors: dict[str, Any]) -> list[str]:
-    lines = []
-    for name, split in errors.items():
-        share = _number(split["unexplained"])
-        lines.append(f"{_SPLITS[name]}: unexplained variance {share} ({split['n']} queries)")
-    test = errors.get("test") or next(iter(errors.values()), None)
-    if test is not None:
-        levels = "  ".join(f"{level}: {_number(e['unexplained'])}" for level, e in test["levels"].items())
-        bands = "  ".join(f"{band}: {_number(e['unexplained'])}" for band, e in test["elevations"].items())
-        lines += [f"  by level of detail  {levels}", f"  by lowest cosine  {bands}"]
-    return lines
+def _fit_many(
+    config: FitConfig,
+    many: list[Path],
+    output: Path,
+    processes: int | None,
+    overwrite: bool,
+    console: Console,
+) -> None:
+    from .many import Outcome, find_data, fit_many, name_materials
 
+    shards = find_data(many)
+    folders = name_materials(shards, output)
+    if processes is None:
+        import torch
 
-def _number(estimate: dict[str, Any]) -> str:
-    if estimate["value"] is None:
-        return "undefined (too few or too noisy queries to tell the variance)"
-    error = "?" if estimate["error"] is None else f"{estimate['error']:.3f}"
-    return f"{estimate['value']:.3f} ± {error}"
+        processes = max(1, torch.cuda.device_count()) if config.device != "cpu" else 1
+    console.note(f"{len(shards)} data sets -> {output}: {config.model}, {processes} at a time")
+    with console.progress(total=len(shards), label="fitting", unit="data sets") as bar:
 
+        def finished(outcome: Outcome) -> None:
+            bar.advance(1, f"{outcome.folder.name}: {'failed' if outcome.error else 'done'}")
 
-def _describe_fit(data: dict[str, Any]) -> str:
-    training = data["training"]
-    rate = training["steps"] * training["batch"] / max(training["seconds"], 1e-9)
-    lines = [
-        f"{data['material']}: {data['model']}, {training['steps']} steps of {training['batch']} queries in "
-        f"{clock(training['seconds'])} on {training['device']} by {training.get('path', 'pytorch')} "
-        f"({rate / 1e6:.2f} M queries/s)",
-        *_describe_errors(data["errors"]),
-    ]
-    return "\n".join(lines)
+        outcomes = fit_many(
+            config, shards, folders, processes=processes, overwrite=overwrite, finished=finished
+        )
+    rows = [["material", "unexplained variance, test", "steps", "training"]]
+    for outcome in outcomes:
+        if outcome.result is None:
+            rows.append([outcome.folder.name, "failed", "-", "-"])
+            continue
+        training, errors = outcome.result["training"], outcome.result["errors"]
+        test = errors.get("test") or next(iter(errors.values()))
+        rows.append(
+            [
+                outcome.folder.name,
+                number(test["unexplained"]),
+                str(training["steps"]),
+                clock(training["seconds"]),
+            ]
+        )
+    console.report({"fits": [o.as_dict() for o in outcomes]}, table(rows))
+    failed = [o for o in outcomes if o.error is not None]
+    for outcome in failed:
+        console.note(f"{outcome.shards}: {outcome.error}")
+    if failed:
+        raise PartialError(
+            f"{len(failed)} of {len(outcomes)} fits failed",
+            where=output,
+            cure="the same command again takes up what is not finished",
+        )
 
 
 @app.command
@@ -180,7 +215,7 @@ def evaluate(material: Path, shards: Path, /, *, console: Console = CONSOLE) -> 
     errors = {name: e.as_dict() for name, e in evaluate(loaded, shards).items()}
     console.report(
         {"material": material, "shards": shards, "foreign_inputs": foreign, "errors": errors},
-        "\n".join([f"{material}: {loaded.config.model} on {shards}", *_describe_errors(errors)]),
+        "\n".join([f"{material}: {loaded.config.model} on {shards}", *describe_errors(errors)]),
     )
 
 
@@ -314,7 +349,7 @@ def _material_info(path: Path) -> tuple[dict[str, Any], str]:
         f"{size / 1e6:.2f} MB",
         f"trained {training['steps']} steps of {training['batch']} in {clock(training['seconds'])}",
         f"this machine's CPU evaluates by: {describe()}",
-        *_describe_errors(training["errors"]),
+        *describe_errors(training["errors"]),
         f"conformance: {description['conformance']['count']} queries, largest deviation {deviation:.2g}",
     ]
     return {

@@ -12,6 +12,8 @@ from pydantic import BeforeValidator, Field, PlainSerializer, model_validator
 from mbtf_gen.durations import format_duration, parse_duration
 from mbtf_gen.settings import Settings
 
+from .sizes import format_size, parse_size
+
 ModelName = Literal["neumip-baseline", "neumip", "hierarchical"]
 OutputMap = Literal["exp-1", "exp", "identity", "softplus", "fourth-root"]
 LossKind = Literal["relative", "squared", "linear", "log", "fourth-root", "gradient"]
@@ -20,6 +22,7 @@ Correction = Literal["none", "second-order", "linear"]
 Duration = Annotated[
     float, BeforeValidator(parse_duration), PlainSerializer(format_duration, when_used="json")
 ]
+Size = Annotated[float, BeforeValidator(parse_size), PlainSerializer(format_size, when_used="json")]
 
 
 class EncodingSection(Settings):
@@ -94,6 +97,15 @@ class TrainingSection(Settings):
     blur: BlurSection = BlurSection()
 
 
+class DataSection(Settings):
+    """How the data are read; what is fitted does not depend on it."""
+
+    memory: Size = Field(
+        4e9,
+        description="training queries that take more are left on disk and read as needed: 500MB, 4GB",
+    )
+
+
 class HeldOutSection(Settings):
     """Queries of the train split that are kept for judging, never trained on."""
 
@@ -138,6 +150,7 @@ class FitConfig(Settings):
     network: NetworkSection = NetworkSection()
     training: TrainingSection = TrainingSection()
     held_out: HeldOutSection = HeldOutSection()
+    data: DataSection = DataSection()
     seed: int = Field(0, ge=0, lt=1 << 63, description="of the first parameters and the order of batches")
     device: Literal["auto", "cpu", "cuda"] = Field("auto", description="auto: cuda where there is one")
 
@@ -162,8 +175,8 @@ class FitConfig(Settings):
         return self
 
     def fields(self) -> dict[str, Any]:
-        """What the fit depends on, as plain data: everything but the device."""
-        return self.model_dump(mode="json", exclude={"device"})
+        """What the fit depends on, as plain data: everything but device and memory."""
+        return self.model_dump(mode="json", exclude={"device", "data"})
 
     def hash(self, data_hash: str) -> str:
         """SHA-256 over :meth:`fields` and the data set's own hash, hexadecimal."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -21,8 +22,9 @@ from .config import HeldOutSection
 
 if TYPE_CHECKING:
     from .buffers import TrainingBuffers
+    from .streaming import Selection, StreamedQueries
 
-_NEEDED = ("u", "sigma", "omega_i", "omega_o", "value_a", "value_b")
+NEEDED = ("u", "sigma", "omega_i", "omega_o", "value_a", "value_b")
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,26 @@ class Queries:
         return Queries(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
 
+def batch_starts(total: int, size: int, seed: int, step: int) -> Iterator[int]:
+    """Number of the first query of each batch of `size` of `total` queries, from a step on, endlessly: every
+    epoch all slices in a new order, each epoch's slices from another query on."""
+    count = total // size
+    while True:
+        epoch, done = divmod(step, count)
+        random = np.random.Generator(np.random.Philox(key=[seed, epoch]))
+        start = int(random.integers(total - count * size + 1))
+        for i in random.permutation(count)[done:]:
+            yield start + int(i) * size
+        step += count - done
+
+
+def mean_value(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Mean of both halves; no sum that could overflow."""
+    half = np.float32(0.5)
+    out: NDArray[np.float32] = half * a + half * b
+    return out
+
+
 @dataclass(frozen=True)
 class TrainingQueries:
     """Queries as training reads them: contiguous tensors on the device, value the mean of both halves."""
@@ -79,17 +101,16 @@ class TrainingQueries:
     def batches(self, size: int, seed: int, step: int, margin: int = 0) -> Iterator[TrainingQueries]:
         """Endless batches of `size` queries from a step on: every epoch all slices in a new order.
 
-        The layout promises queries in random order, so that consecutive ones are a batch. Each epoch's slices
-        start at another row. Single queries have no `margin`.
+        The layout promises queries in random order, so that consecutive ones are a batch. Single queries have
+        no `margin`.
         """
-        count = len(self) // size
-        while True:
-            epoch, done = divmod(step, count)
-            random = np.random.Generator(np.random.Philox(key=[seed, epoch]))
-            start = int(random.integers(len(self) - count * size + 1))
-            for i in random.permutation(count)[done:]:
-                yield self.slice(start + i * size, start + (i + 1) * size)
-            step += count - done
+        for start in batch_starts(len(self), size, seed, step):
+            yield self.slice(start, start + size)
+
+    def numbers(self, size: int, seed: int, step: int) -> list[range]:
+        """Numbers of the queries in the batch of a step."""
+        start = next(batch_starts(len(self), size, seed, step))
+        return [range(start, start + size)]
 
     def slice(self, start: int, stop: int) -> TrainingQueries:
         """Consecutive queries, without copying."""
@@ -106,18 +127,23 @@ class Partition:
 
     Attributes
     ----------
-    training : what is trained on, in the order of the shards; whole buffers in the image layout
+    training : what is trained on, in the order of the shards; whole buffers in the image layout; left on disk
+        where it does not fit into the memory allowed
     held_out_queries : a random share of the queries outside the held-out region
     held_out_directions : queries with light or view in the held-out region; at most `MAX_HELD_OUT`
     sample : some of what is trained on, with both halves; about `SAMPLE` queries from all shards
+    selection : which rows of which shards are trained on: queries, or buffers in the image layout
     """
 
-    training: TrainingQueries | TrainingBuffers
+    training: TrainingQueries | TrainingBuffers | StreamedQueries
     held_out_queries: Queries
     held_out_directions: Queries
     sample: Queries
+    selection: Selection
 
 
+# Bytes of a training query in memory.
+QUERY_BYTES = 48
 # Training queries that stand for all of them where both halves are wanted.
 SAMPLE = 1 << 16
 # Held-out queries that are kept for evaluation; the rest of them is dropped, never trained on.
@@ -153,7 +179,7 @@ def read_checked(shard: Shard) -> Queries:
     ------
     InputError : NaN or infinity, or another number of rows than its sidecar says
     """
-    arrays: Arrays = read_shard(shard.path, _NEEDED)
+    arrays: Arrays = read_shard(shard.path, NEEDED)
     rows = len(arrays["sigma"])
     if rows != shard.rows:
         raise InputError(
@@ -192,53 +218,76 @@ def _marks(held_out: HeldOutSection, queries: Queries, seed: int, shard: int) ->
     return np.where(region, np.int8(2), marks)
 
 
-def load_training(data: Dataset, held_out: HeldOutSection, seed: int) -> Partition:
+def load_training(data: Dataset, held_out: HeldOutSection, seed: int, memory: float = math.inf) -> Partition:
     """Read the train split and divide it; the division depends on the data and `seed` alone.
 
     In the image layout whole buffers are held out (:func:`~mbtf_fit.buffers.load_buffers`).
 
+    Parameters
+    ----------
+    memory : bytes that training queries may take; more are left on disk, and read as batches need them
+
     Raises
     ------
-    InputError : no queries to train on, NaN or infinity in a shard, damaged shards
+    InputError : no queries to train on, NaN or infinity in a shard, damaged shards; too many for memory, in
+        shards that cannot be mapped
     """
     if data.layout == "image":
         from .buffers import load_buffers
 
         return load_buffers(data, held_out, seed)
+    from .streaming import Selection, StreamedQueries
+
     shards = data.shards("train")
     total = sum(shard.rows for shard in shards)
     if total == 0:
         raise InputError(
             "its train split holds no queries", where=data.folder, cure="generate some: --queries"
         )
+    streamed = total * QUERY_BYTES > memory
+    if streamed and any(shard.path.suffix == ".exr" for shard in shards):
+        raise InputError(
+            f"its {total} queries take {total * QUERY_BYTES / 1e9:.3g} GB, more than data.memory allows, and "
+            "EXR shards cannot be read in parts",
+            where=data.folder,
+            cure="raise data.memory, or generate with: mbtf-gen ... --format npz",
+        )
     columns = {"u": (2,), "sigma": (), "omega_i": (3,), "omega_o": (3,), "value": (3,)}
-    store = {name: np.empty((total, *shape), np.float32) for name, shape in columns.items()}
+    room = 0 if streamed else total
+    store = {name: np.empty((room, *shape), np.float32) for name, shape in columns.items()}
     kept_out: tuple[list[Queries], list[Queries]] = ([], [])
     sample: list[Queries] = []
-    filled = 0
+    selection = Selection()
     for index, shard in enumerate(shards):
         queries = read_checked(shard)
         marks = _marks(held_out, queries, seed, index)
         for group, mark in zip(kept_out, (1, 2), strict=True):
             wanted = MAX_HELD_OUT - sum(map(len, group))
             group.append(queries.take(np.flatnonzero(marks == mark)[:wanted]))
+        selection.add(shard.path, marks == 0)
         rows = np.flatnonzero(marks == 0)
         # The layout promises a random order: the first ones are as good as any.
         sample.append(queries.take(rows[: -(-SAMPLE * len(rows) // total)]))
-        part = slice(filled, filled + len(rows))
+        if streamed:
+            continue
+        part = slice(selection.starts[-2], selection.starts[-1])
         for name in ("u", "sigma", "omega_i", "omega_o"):
             np.take(getattr(queries, name), rows, axis=0, out=store[name][part], mode="clip")
-        half = np.float32(0.5)
-        np.add(half * queries.value_a[rows], half * queries.value_b[rows], out=store["value"][part])
-        filled += len(rows)
-    if filled == 0:
+        store["value"][part] = mean_value(queries.value_a[rows], queries.value_b[rows])
+    if len(selection) == 0:
         raise InputError(
             f"all {total} queries of its train split are held out",
             where=data.folder,
             cure="lower held_out.queries and held_out.radius",
         )
-    training = TrainingQueries(**{name: torch.from_numpy(array[:filled]) for name, array in store.items()})
-    return Partition(training, *(Queries.join(group) for group in (*kept_out, sample)))
+    training: TrainingQueries | StreamedQueries
+    if streamed:
+        training = StreamedQueries(selection)
+    else:
+        filled = {name: torch.from_numpy(array[: len(selection)]) for name, array in store.items()}
+        training = TrainingQueries(**filled)
+    joined = [Queries.join(group) for group in (*kept_out, sample)]
+    return Partition(training, joined[0], joined[1], joined[2], selection)
 
 
 def load_split(data: Dataset, split: Split, limit: int | None = None) -> Queries:

@@ -113,8 +113,12 @@ def split_errors(predict: Predict, queries: Queries, lattice: Lattice) -> SplitE
 
 
 def judge(predict: Predict, data: Dataset, partition: Partition) -> dict[str, SplitErrors]:
-    """Errors of a prediction on ``test``, ``held_out_queries`` and ``held_out_directions``; a set without
-    queries is left out.
+    """Errors of a prediction on ``test``, ``held_out_queries``, ``held_out_directions``, and on ``training``
+    queries; a set without queries is left out.
+
+    The last is what the fit made of data that it knows. It is free of their noise like the others, but a fit
+    that follows the noise of its own data comes out better there than it is, by twice the covariance of
+    prediction and noise: the distance to the held-out queries is what it overfits by.
 
     Raises
     ------
@@ -125,6 +129,7 @@ def judge(predict: Predict, data: Dataset, partition: Partition) -> dict[str, Sp
         parts["test"] = load_split(data, "test")
     parts["held_out_queries"] = partition.held_out_queries
     parts["held_out_directions"] = partition.held_out_directions
+    parts["training"] = partition.sample
     found = {name: split_errors(predict, queries, data.lattice) for name, queries in parts.items()}
     return {name: errors for name, errors in found.items() if errors is not None}
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import signal
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +21,7 @@ from mbtf_gen.settings import differences, dump_yaml, in_short
 from mbtf_gen.stats import unexplained_variance
 
 from .config import FitConfig
-from .data import Partition, Queries, data_hash, load_training, open_data
+from .data import Partition, Queries, data_hash, load_training, mean_value, open_data
 from .evaluation import judge
 from .exports import LAYERS_NAME, TEXTURES_NAME
 from .material import Material, export
@@ -131,13 +134,20 @@ def fit(
     begin = time.perf_counter()
     device = choose_device(config.device)
     out = Path(out)
-    data = open_data(shards, MODELS[config.model].layout, config.model)
+    layout = MODELS[config.model].layout
+    if layout != "image" and any(term.kind == "gradient" for term in config.training.losses):
+        raise InputError(
+            f"the gradient loss compares neighbours, which {config.model} never sees together",
+            where="training.losses",
+            cure="take another loss, or a model that learns from the image layout",
+        )
+    data = open_data(shards, layout, config.model)
     identity = _identity(config, data)
     _claim(out, identity, config, overwrite)
     if (out / DESCRIPTION_NAME).exists():
         return _finished(out, time.perf_counter() - begin)
     keep_freed_memory()
-    partition = load_training(data, config.held_out, config.seed)
+    partition = load_training(data, config.held_out, config.seed, config.data.memory)
     trainer = _trainer(config, data, partition, device)
     resumed = _resume(trainer, out)
     _train(trainer, partition.held_out_queries, out, progress or (lambda share, note: None))
@@ -147,6 +157,7 @@ def fit(
         "queries": len(partition.training),
         "seconds": round(trainer.progress.seconds, 3),
         "loss": trainer.progress.loss,
+        "coverage": {str(level): share for level, share in trainer.coverage().items()},
         "device": str(device),
         "threads": torch.get_num_threads(),
         "path": trainer.path,
@@ -209,10 +220,10 @@ def _claim(out: Path, identity: dict[str, Any], config: FitConfig, overwrite: bo
 
 def _trainer(config: FitConfig, data: Dataset, partition: Partition, device: torch.device) -> Trainer:
     model = build_model(config.model, data.lattice, **config.network.model_dump())
-    unit = typical_value(partition.training.value.numpy())
+    unit = typical_value(mean_value(partition.sample.value_a, partition.sample.value_b))
     model.initialise(torch.Generator().manual_seed(config.seed), unit)
     noise = NoiseModel.of(partition.sample, data.lattice, unit)
-    return Trainer(config, model.to(device), partition.training.to(device), noise)
+    return Trainer(config, model.to(device), partition.training.to(device), noise, partition.selection)
 
 
 def _resume(trainer: Trainer, out: Path) -> bool:
@@ -244,15 +255,38 @@ def _train(trainer: Trainer, held_out: Queries, out: Path, progress: ProgressCal
     glance = held_out.take(slice(max(_GLANCE // trainer.model.positions, _GLANCE // 16)))
     saved = time.perf_counter()
     done = trainer.share >= 1.0
-    while not done:
-        done = trainer.train(_REPORT_SECONDS)
-        record = _record(trainer, glance)
-        with (out / METRICS_NAME).open("a", encoding="utf-8") as stream:
-            stream.write(json.dumps(record) + "\n")
-        progress(trainer.share, _note(record))
-        if time.perf_counter() - saved > _CHECKPOINT_SECONDS or done:
-            write_tensors(out / CHECKPOINT_NAME, *trainer.state())
-            saved = time.perf_counter()
+    with _finishing_steps(trainer):
+        while not (done or trainer.stop):
+            done = trainer.train(_REPORT_SECONDS)
+            record = _record(trainer, glance)
+            with (out / METRICS_NAME).open("a", encoding="utf-8") as stream:
+                stream.write(json.dumps(record) + "\n")
+            progress(trainer.share, _note(record))
+            if time.perf_counter() - saved > _CHECKPOINT_SECONDS or done or trainer.stop:
+                write_tensors(out / CHECKPOINT_NAME, *trainer.state())
+                saved = time.perf_counter()
+    if trainer.stop:
+        raise KeyboardInterrupt
+
+
+@contextmanager
+def _finishing_steps(trainer: Trainer) -> Iterator[None]:
+    """Let the first Ctrl-C end training after the present step, so that a checkpoint loses nothing; the
+    second one acts at once."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def stop(number: int, frame: object) -> None:
+        if trainer.stop:
+            raise KeyboardInterrupt
+        trainer.stop = True
+
+    before = signal.signal(signal.SIGINT, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _record(trainer: Trainer, glance: Queries) -> dict[str, Any]:

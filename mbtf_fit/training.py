@@ -6,7 +6,8 @@ import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
-from typing import Any
+from itertools import pairwise
+from typing import Any, NoReturn
 
 import numpy as np
 import torch
@@ -27,6 +28,7 @@ from .native.model import unsupported_reason
 from .native.stepper import NativeStepper
 from .noise import NoiseModel
 from .parallel import MAX_KERNEL_THREADS, Batch, Workers
+from .streaming import Selection, StreamedQueries
 
 # Decay of Adam's running means of the gradient and of its square.
 BETAS = (0.8, 0.95)
@@ -64,23 +66,29 @@ class Trainer:
     model : initialised, on the device
     queries : on the device
     noise : model of their noise; :meth:`NoiseModel.silent` where there is none
+    selection : which rows of which shards the queries are, to name a bad batch by
 
     Attributes
     ----------
     progress : how far it is
+    stop : set it to end :meth:`train` after the present step
     """
 
     def __init__(
         self,
         config: FitConfig,
         model: NeuralMaterial,
-        queries: TrainingQueries | TrainingBuffers,
+        queries: TrainingQueries | TrainingBuffers | StreamedQueries,
         noise: NoiseModel,
+        selection: Selection | None = None,
     ) -> None:
         self.config = config
         self.model = model
         self.queries = queries
+        self.selection = selection
+        self.device = next(model.parameters()).device
         self.progress = Progress()
+        self.stop = False
         self.batch = min(config.training.batch, len(queries))
         texels, weights = model.parameter_groups()
         self.optimiser = torch.optim.Adam([{"params": texels}, {"params": weights}], betas=BETAS, fused=True)
@@ -114,40 +122,59 @@ class Trainer:
 
         Raises
         ------
-        InputError : the loss is no longer finite
+        InputError : the loss or a weight is no longer finite
         """
         until = time.perf_counter() + seconds
+        first = self.progress.step
         losses: list[Tensor] = []
+        health: list[Tensor] = []
         batches = self._batches()
         limit = None if self._stepper is None else MAX_KERNEL_THREADS
-        with Workers(self.queries.u.device, limit=limit) as workers:
-            while self.share < 1.0:
+        with Workers(self.device, limit=limit) as workers:
+            while self.share < 1.0 and not (self.stop and losses):
                 start = time.perf_counter()
                 if start >= until and losses:
                     break
-                losses.append(self._guarded_step(next(batches), workers))
+                try:
+                    losses.append(self._step(next(batches), workers))
+                except (RuntimeError, IndexError):
+                    # A lookup at NaN has no texel and fails before the loss could show it.
+                    if all(bool(p.isfinite().all()) for p in self.model.parameters()):
+                        raise
+                    self._stop_diverged(first, losses, health)
+                health.append(self._health())
                 self.progress.step += 1
                 self.progress.seconds += time.perf_counter() - start
         if losses:
             self.progress.loss = float(torch.stack(losses).mean())
-            if not math.isfinite(self.progress.loss):
-                raise self._divergence()
+            if not math.isfinite(self.progress.loss + float(torch.stack(health).sum())):
+                self._stop_diverged(first, losses, health)
         return self.share >= 1.0
 
-    def _divergence(self) -> InputError:
-        return InputError(
-            f"training diverged: the loss is no longer finite near step {self.progress.step}",
-            cure=f"lower the rate: --rate {self.config.training.rate / 3:.1g} --overwrite",
-        )
+    def _health(self) -> Tensor:
+        """A number that is finite when the networks' weights are."""
+        with torch.no_grad():
+            return torch.stack([p.sum() for p in self.model.parameter_groups()[1]]).sum()
 
-    def _guarded_step(self, batch: Batch, workers: Workers) -> Tensor:
-        try:
-            return self._step(batch, workers)
-        except (RuntimeError, IndexError):
-            # A lookup at NaN has no texel and fails before the loss could show it.
-            if all(bool(p.isfinite().all()) for p in self.model.parameters()):
-                raise
-            raise self._divergence() from None
+    def _stop_diverged(self, first: int, losses: list[Tensor], health: list[Tensor]) -> NoReturn:
+        """Name the first bad batch of the steps since `first`.
+
+        Raises
+        ------
+        InputError : always
+        """
+        good = 0
+        for loss, weights in zip(losses, health, strict=False):
+            if not math.isfinite(float(loss) + float(weights)):
+                break
+            good += 1
+        step = first + good
+        numbers = self.queries.numbers(self.batch, self.config.seed, step)
+        named = f", {self.selection.describe(numbers)}," if self.selection is not None else ""
+        raise InputError(
+            f"training diverged at step {step + 1}: its batch{named} left numbers that are not finite",
+            cure=f"lower the rate: --rate {self.config.training.rate / 3:.1g} --overwrite",
+        ) from None
 
     def _sigmas(self) -> list[float]:
         """Blur of each texture at this moment, in texels of the finest level."""
@@ -194,6 +221,16 @@ class Trainer:
             for texture, table in zip(self.model.textures(), self._tables(), strict=True):
                 texture.read(table)
         return predict(self.model, queries.u, queries.sigma, queries.omega_i, queries.omega_o)
+
+    def coverage(self) -> dict[int, float]:
+        """Level → share of its texels that gradients have reached, of the pyramid."""
+        pyramid = max(self.model.textures(), key=lambda t: len(t.packing.shapes))
+        moment = self.optimiser.state.get(pyramid.texels, {}).get("exp_avg_sq")
+        starts = pyramid.packing.starts
+        return {
+            s: 0.0 if moment is None else float((moment[a:b] > 0).any(1).float().mean())
+            for s, (a, b) in enumerate(pairwise(starts))
+        }
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """(tensors, plain data) that :meth:`restore` takes up again."""

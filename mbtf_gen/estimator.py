@@ -1,7 +1,7 @@
 """Monte Carlo estimates of M at queries: two independent halves per query.
 
 Paths of one launch are traced in the order of the place where they meet the reference plane (a 16-bit Morton
-key), which doubles the speed of incoherent queries. The random numbers of a path depend on its number in the
+key), which makes incoherent queries a tenth faster. The random numbers of a path depend on its number in the
 shard alone, so values do not depend on how queries are grouped into launches.
 """
 

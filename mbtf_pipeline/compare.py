@@ -120,6 +120,7 @@ _SPLITS = {
     "test": "test",
     "held_out_queries": "held-out queries",
     "held_out_directions": "held-out directions",
+    "training": "training queries",
 }
 
 

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from support.scenes import HeightGrid, build_tile, lambert, mi, rocks
 
-from mbtf_gen.field import HeightField, closest_hit, occluded
+from mbtf_gen.field import HeightField, closest_hit, hit_and_shadow, occluded
 from mbtf_gen.stock import mesh_of_grid
 
 N = 200_000
@@ -91,6 +91,30 @@ def test_rays_from_below_meet_the_surface_from_below() -> None:
     back = np.array(found.p).T * flip - [0, 0, 32.0 * grid.relief]
     # The table's triangles meet along the same diagonals, whichever side is up.
     assert np.mean(np.abs(back - np.array(expected.p).T).max(axis=1) > 1e-3) < 1e-4
+
+
+def test_two_rays_at_once_are_as_each_alone() -> None:
+    """One ray may end, at the cap too, while the other goes on: what it has found stays as it is."""
+    grid, rng = rocks(64), np.random.default_rng(2)
+    field = HeightField.of(grid, 32.0, False)
+    n = N // 4
+    o, d = (a[:n] for a in rays(rng, grid, 32.0))
+    o[:, 2] = -0.5 * 32.0 * grid.relief * rng.random(n)
+    # Nearly level, down and up, so that many reach the cap.
+    d[:, 2] *= 0.2 * rng.choice([-1, 1], n)
+    one, two = ray_of(o, d), ray_of(o, d[::-1])
+    active = [mi.Bool(rng.random(n) < 0.8) for _ in range(2)]
+    si, capped, blocked, shadow_capped = hit_and_shadow(field, one, active[0], two, active[1], 1)
+    alone, _, alone_capped, _ = closest_hit(field, one, active[0], 1)
+    other, _, other_capped, _ = occluded(field, two, active[1], 1)
+    for pair in ((si.is_valid(), alone.is_valid()), (capped, alone_capped), (shadow_capped, other_capped)):
+        first, second = (np.array(x) for x in pair)
+        assert 0.005 < second.mean() < 0.9
+        assert np.mean(first != second) < 1e-4
+    assert np.mean(np.array(blocked) != np.array(other)) < 1e-4
+    both = np.array(si.is_valid()) & np.array(alone.is_valid())
+    gap = (np.array(si.p) - np.array(alone.p))[:, both]
+    assert np.mean(np.abs(gap).max(axis=0) > 1e-3) < 1e-4
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])

@@ -32,7 +32,8 @@ def material(shards: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "training for 5 steps (change it with --time or --steps)" in done.stderr
-    assert "test: unexplained variance" in done.stdout
+    assert "unexplained variance  test" in done.stdout
+    assert "gradients reached every texel" in done.stdout
     return folder
 
 
@@ -77,7 +78,7 @@ def test_json_is_one_object(shards: Path, material: Path, tmp_path: Path, run_py
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     assert found["training"]["steps"] == 5
-    assert set(found["errors"]) == {"test", "held_out_queries", "held_out_directions"}
+    assert set(found["errors"]) == {"test", "held_out_queries", "held_out_directions", "training"}
     for arguments in (
         ["evaluate", str(material), str(shards)],
         ["info", str(material)],
@@ -108,8 +109,8 @@ def test_another_material_s_data_are_warned_of(tmp_path: Path, run_python: RunPy
 
 def test_evaluate_and_info_speak_to_people(shards: Path, material: Path, run_python: RunPython) -> None:
     done = run_python("-m", "mbtf_fit", "evaluate", str(material), str(shards))
-    assert "held-out directions: unexplained variance" in done.stdout
-    assert "by level of detail" in done.stdout
+    for word in ("held-out directions", "training queries", "level 3", "cosine 0.7-1"):
+        assert word in done.stdout
     done = run_python("-m", "mbtf_fit", "info", str(material))
     assert "3254 network weights" in done.stdout
     assert "conformance: 256 queries" in done.stdout

@@ -166,7 +166,7 @@ def test_errors_of_a_perfect_prediction_are_zero(data: Path) -> None:
 
 def test_evaluation_repeats_the_errors_of_the_fit(fitted: FitResult, data: Path) -> None:
     again = {name: e.as_dict() for name, e in evaluate(fitted.material, data).items()}
-    assert set(again) == {"test", "held_out_queries", "held_out_directions"}
+    assert set(again) == {"test", "held_out_queries", "held_out_directions", "training"}
     for name, errors in again.items():
         stored = fitted.errors[name]
         assert errors["n"] == stored["n"]

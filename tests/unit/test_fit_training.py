@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import islice
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from mbtf_fit.config import FitConfig
 from mbtf_fit.data import TrainingQueries
 from mbtf_fit.parallel import Workers
 from mbtf_fit.storage import read_tensors, write_tensors
+from mbtf_fit.streaming import Selection
 from mbtf_fit.training import Trainer, rate_factor
 from mbtf_gen.errors import InputError
 from mbtf_gen.levels import Lattice
@@ -122,5 +124,36 @@ def test_divergence_is_one_clear_error(poison: str) -> None:
     t = trainer(queries())
     with torch.no_grad():
         t.model.get_parameter(poison).fill_(torch.nan)
-    with pytest.raises(InputError, match=r"diverged.*\n.*--rate 0\.01 "):
+    with pytest.raises(InputError, match=r"diverged at step 1: its batch .*\n.*--rate 0\.01 "):
         train_fully(t)
+
+
+def test_divergence_names_the_first_bad_batch() -> None:
+    """The step, the shard and the rows, counted without what is held out."""
+    data = queries()
+    selection = Selection()
+    chosen = np.ones(3000, bool)
+    chosen[:7] = False
+    selection.add(Path("train-00000.npz"), chosen)
+    selection.add(Path("train-00001.npz"), np.ones(2007, bool))
+    data.value[4200] = torch.inf
+    t = make_trainer(data, LATTICE, steps=40, batch=100, robust=None)
+    t.selection = selection
+    step, numbers = next((k, n) for k in range(50) for n in data.numbers(100, 0, k) if 4200 in n)
+    # Number 4200 is row 1207 of the second shard.
+    first, last = numbers.start - 2993, numbers.stop - 1 - 2993
+    with pytest.raises(InputError, match=rf"at step {step + 1}: .*train-00001\.npz rows {first}-{last},"):
+        train_fully(t)
+
+
+def test_coverage_counts_texels_that_gradients_have_reached() -> None:
+    t = trainer(queries(), "neumip-baseline", blur={"start": 0.0})
+    assert set(t.coverage().values()) == {0.0}
+    # Only the lower left quarter, at the finest level.
+    t.queries.u[:] = 0.5 * t.queries.u
+    t.queries.sigma[:] = 0.5 * 2.0**-3
+    train_fully(t)
+    found = t.coverage()
+    assert found[0] == found[1] == 0.0
+    # 5 of 8 texels each way are read, and the one before the first.
+    assert found[3] == pytest.approx((6 / 8) ** 2, abs=0.1)

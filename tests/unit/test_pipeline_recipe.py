@@ -91,7 +91,7 @@ def test_a_fit_without_a_model_has_the_model_of_its_name(tmp_path: Path) -> None
         (HEAD + "fit:\n  modle: neumip\n", 6, "did you mean 'model'"),
         (NAMED.replace("time: 5s", "tmie: 5s"), 10, "did you mean 'time'"),
         (NAMED.replace("model: neumip-baseline", "model: neural"), 8, "neumip-baseline"),
-        (HEAD + "fit:\n  other:\n", 6, "'neumip-baseline' or 'neumip'"),
+        (HEAD + "fit:\n  other:\n", 6, "'neumip' or 'hierarchical'"),
         (HEAD + "fit: {}\n", 5, "names no fit"),
         (SINGLE.replace("small", "a/b"), 1, "'name'"),
         (SINGLE + "compare:\n  views:\n  - {elevation: 3}\n", 8, "at least"),

@@ -1,0 +1,62 @@
+"""What the fitter says about its results, in words and tables."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mbtf_gen.console import clock
+
+_SPLITS = {
+    "test": "test",
+    "held_out_queries": "held-out queries",
+    "held_out_directions": "held-out directions",
+    "training": "training queries",
+}
+
+
+def table(rows: list[list[str]]) -> str:
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ("  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)) for row in rows)
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def describe_errors(errors: dict[str, Any]) -> list[str]:
+    """A table: overall, by level of detail and by lowest cosine; a column per split, with error bars."""
+    splits = list(errors)
+    rows = [["unexplained variance", *(_SPLITS[name] for name in splits)]]
+    rows.append(["all", *(number(errors[name]["unexplained"]) for name in splits)])
+    for grouping, label in (("levels", "level"), ("elevations", "cosine")):
+        groups = {group: None for name in splits for group in errors[name][grouping]}
+        for group in sorted(groups, key=lambda g: float(g.split("-")[0])):
+            found = [errors[name][grouping].get(group) for name in splits]
+            rows.append(
+                [f"{label} {group}", *("-" if e is None else number(e["unexplained"]) for e in found)]
+            )
+    rows.append(["queries", *(str(errors[name]["n"]) for name in splits)])
+    return table(rows).splitlines()
+
+
+def number(estimate: dict[str, Any]) -> str:
+    if estimate["value"] is None:
+        return "undefined"
+    error = "?" if estimate["error"] is None else f"{estimate['error']:.3f}"
+    return f"{estimate['value']:.3f} ± {error}"
+
+
+def describe_coverage(coverage: dict[str, float]) -> str:
+    """Which levels gradients have reached."""
+    partly = [f"{share:.1%} of level {level}" for level, share in coverage.items() if share < 1]
+    return f"gradients reached every texel{', but only ' + ', '.join(partly) if partly else ''}"
+
+
+def describe_fit(data: dict[str, Any]) -> str:
+    training = data["training"]
+    rate = training["steps"] * training["batch"] / max(training["seconds"], 1e-9)
+    lines = [
+        f"{data['material']}: {data['model']}, {training['steps']} steps of {training['batch']} queries in "
+        f"{clock(training['seconds'])} on {training['device']} by {training.get('path', 'pytorch')} "
+        f"({rate / 1e6:.2f} M queries/s)",
+        describe_coverage(training["coverage"]),
+        *describe_errors(data["errors"]),
+    ]
+    return "\n".join(lines)
