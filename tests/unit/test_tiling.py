@@ -119,7 +119,8 @@ class TestMaterial:
         np.save(tmp_path / "color.npy", np.random.default_rng(0).random((72, 96, 3)))
         (tmp_path / "material.yaml").write_text(
             "height: height.png\nnormal: normal_dx.png\nroughness: rough.png\nbasecolor: color.npy\n"
-            "opacity: {file: color.npy, channel: G}\n"
+            "opacity: {file: color.npy, channel: G}\nsheen_color: color.npy\n"
+            + "".join(f"{name}: rough.png\n" for name in ("clearcoat", "clearcoat_roughness", "sheen"))
         )
         return tmp_path
 
@@ -132,7 +133,9 @@ class TestMaterial:
     def test_mirror_treats_all_maps_alike(self, folder: Path) -> None:
         plain, mirrored = load_material(folder), load_material(folder, "mirror")
         assert mirrored.height.shape == (144, 192)
-        assert np.shape(mirrored.roughness) == (72, 96)
+        for numbers in (mirrored.roughness, mirrored.coat, mirrored.coat_roughness, mirrored.sheen):
+            assert np.shape(numbers) == (72, 96)
+        assert np.shape(mirrored.sheen_color) == (144, 192, 3)
         assert mirrored.basecolor.shape == (144, 192, 3)
         assert np.shape(mirrored.opacity) == (144, 192)
         assert mirrored.metallic == 0.0
@@ -149,7 +152,7 @@ class TestMaterial:
 
     def test_blend_treats_all_maps_alike(self, folder: Path) -> None:
         plain, blended = load_material(folder), load_material(folder, "blend")
-        for name in ("height", "roughness", "basecolor", "opacity", "normal"):
+        for name in ("height", "roughness", "basecolor", "opacity", "normal", "coat", "sheen", "sheen_color"):
             before, after = getattr(plain, name), getattr(blended, name)
             assert np.shape(after) == np.shape(before)
             rows, columns = np.shape(before)[:2]
