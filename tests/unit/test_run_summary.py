@@ -24,6 +24,7 @@ SUMMARY = Summary(
     capped=0,
     nonfinite=0,
     effects=["parallax and masking"],
+    target=None,
 )
 
 
