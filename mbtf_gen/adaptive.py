@@ -7,7 +7,9 @@ run's allocation expects of such a query, s²:
     v = (ν V + ν₀ s²) / (ν + ν₀)
 
 so that a pilot that happened to miss a few bright paths does not stop the query at once. From v follow the
-paths that bring the standard error to ε · max(value, tile mean), rounded up, and at most the cap. The counts
+paths that bring the standard error to ε · max(value, tile mean), rounded up, and at most the cap. The value
+is the pilot's, drawn towards the tile mean as far as its own error leaves the difference in doubt (James and
+Stein 1961): a pilot with one bright path would otherwise allow the query a greater error for it. The counts
 depend on the pilot alone, and the stored paths are drawn afresh: values are unbiased, their halves are
 independent. Stopping when the paths drawn so far look good enough would be neither: it stops early where they
 missed the light.
@@ -33,6 +35,9 @@ F64 = NDArray[np.float64]
 # Paths of a query's own pilot, and how many paths the run's expectation counts for beside it.
 PILOT_SPP = 16
 PRIOR_PATHS = 8
+# A value's excess over the tile mean shrinks by this many of its squared standard errors: as many as leave
+# nothing of an excess that one path of the pilot brought, whose squared error is 15/23 of its square.
+DOUBT = 23 / 15
 # Pilots draw in these passes, which the stored paths never reach.
 PILOT_PASS = 1024
 
@@ -65,7 +70,7 @@ def estimate_shard(
         return found
     pilot = estimator.estimate(queries, PILOT_SPP, replace(stream, first_pass=PILOT_PASS), path_variance=True)
     expected = allocation.deviation(queries), allocation.tile_mean(queries)
-    wanted = wanted_paths(pilot, PILOT_SPP, *expected, target.error)
+    wanted, scale = wanted_paths(pilot, PILOT_SPP, *expected, target.error)
     counts = round_up(np.minimum(wanted, target.cap), target.cap)
     found = estimator.estimate(queries, counts, stream)
     return replace(
@@ -74,12 +79,15 @@ def estimate_shard(
         lost=found.lost + pilot.lost,
         capped=found.capped + pilot.capped,
         nonfinite=found.nonfinite + pilot.nonfinite,
-        target=_reached(found, wanted, expected[1], target),
+        target=_reached(found, wanted, scale, target),
     )
 
 
-def wanted_paths(pilot: Estimates, paths: int, deviation: F64, tile_mean: F64, error: float) -> F64:
-    """Paths (n,) that queries need for a relative error, after a pilot of `paths` each.
+def wanted_paths(
+    pilot: Estimates, paths: int, deviation: F64, tile_mean: F64, error: float
+) -> tuple[F64, F64]:
+    """Paths (n,) that queries need for a relative error, after a pilot of `paths` each, and the value (n,),
+    1/sr, that the error is relative to: no less than the tile mean.
 
     Parameters
     ----------
@@ -88,8 +96,11 @@ def wanted_paths(pilot: Estimates, paths: int, deviation: F64, tile_mean: F64, e
     assert pilot.path_variance is not None
     own = paths - 1
     variance = (own * pilot.path_variance + PRIOR_PATHS * deviation**2) / (own + PRIOR_PATHS)
-    allowed = error * np.maximum(_values(pilot), tile_mean)
-    return np.divide(variance, allowed**2, out=np.zeros(len(variance)), where=allowed > 0)
+    excess = np.maximum(_values(pilot) - tile_mean, 0.0)
+    doubt = np.divide(DOUBT * variance / paths, excess, out=np.zeros(len(excess)), where=excess > 0)
+    scale = tile_mean + np.maximum(excess - doubt, 0.0)
+    allowed = error * scale
+    return np.divide(variance, allowed**2, out=np.zeros(len(variance)), where=allowed > 0), scale
 
 
 def _values(estimates: Estimates) -> F64:
@@ -107,9 +118,9 @@ def round_up(wanted: F64, cap: int) -> NDArray[np.int64]:
     return np.minimum(np.where(wanted <= between, between, whole), cap).astype(np.int64)
 
 
-def _reached(found: Estimates, wanted: F64, tile_mean: F64, target: Target) -> TargetReached:
+def _reached(found: Estimates, wanted: F64, scale: F64, target: Target) -> TargetReached:
+    # Over values that the stored paths do not enter: a bright path among them would divide its own error.
     missed = wanted > target.cap
-    scale = np.maximum(_values(found), tile_mean)
     error = np.mean((0.5 * (found.value_a.astype(np.float64) - found.value_b)) ** 2, axis=-1)
     relative = np.divide(error, scale**2, out=np.zeros(len(error)), where=scale > 0)
     worst = target.error * float(np.sqrt(wanted.max() / target.cap)) if missed.any() else 0.0

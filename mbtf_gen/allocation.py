@@ -17,6 +17,7 @@ footprint, so this is a smooth estimate of the tile mean at any pair of directio
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
 
 F64 = NDArray[np.float64]
 
+log = logging.getLogger(__name__)
+
 # Queries of the pilot and paths of each; a million paths tell little more.
 PILOT_QUERIES, PILOT_SPP = 16384, 16
 # Least expected deviation over the mean one: where the pilot saw little noise there may be some.
@@ -40,8 +43,10 @@ FLOOR = 0.125
 # Counts are powers of two, which fill the nets of the sequences, from one path in each half.
 FEWEST = 2
 MOST_OVER_MEAN = 64
-_STEPS = 40
 _RIDGE = 1e-3
+# Newton's method ends where a step would gain less than this per target, or has failed after so many steps or
+# where no part of a step down to the least helps.
+_CONVERGED, _STEPS, _LEAST_PART = 1e-10, 50, 1e-9
 
 
 def _features(queries: Queries) -> list[F64]:
@@ -70,26 +75,44 @@ def _terms(queries: Queries, *, levels: bool = True) -> list[F64]:
     return [np.ones(len(queries.sigma)), *base, *products]
 
 
-def fit_log_linear(terms: list[F64], target: F64) -> F64:
+def fit_log_linear(terms: list[F64], target: F64) -> F64 | None:
     """Weights w that make ``exp(Σ w·term)`` the mean of a non-negative target (n,): Poisson regression with
-    a small ridge, by Newton's method. It weighs large and small targets alike in proportion to their mean and
-    needs no distribution beyond that."""
+    a small ridge (per target, on every weight but the first), None where it did not converge.
+
+    It weighs large and small targets alike in proportion to their mean and needs no distribution beyond that.
+    The first term is the constant, so the mean of the fit over the data is that of the target. Newton's steps
+    are halved until they decrease the penalised likelihood, which is convex: whole ones overshoot where the
+    targets have a sharp peak.
+    """
     x = np.stack(terms, axis=1)
     weights = np.zeros(x.shape[1])
     scale = float(target.mean())
     if scale <= 0.0:
         return weights
     y = target / scale
-    ridge = _RIDGE * len(y) * np.r_[1e-9, np.ones(x.shape[1] - 1)]
+    penalty = _RIDGE * len(y) * np.r_[1e-9, np.ones(x.shape[1] - 1)]
+
+    def loss(w: F64) -> float:
+        line = x @ w
+        with np.errstate(over="ignore"):
+            return float(np.sum(np.exp(line) - y * line) + 0.5 * np.sum(penalty * w**2))
+
+    now = loss(weights)
     for _ in range(_STEPS):
-        mean = np.exp(np.clip(x @ weights, -20.0, 20.0))
-        slope = x.T @ (y - mean) - ridge * weights
-        step = np.linalg.solve((x * mean[:, None]).T @ x + np.diag(ridge), slope)
-        weights = weights + np.clip(step, -1.0, 1.0)
-        if np.abs(step).max() < 1e-6:
-            break
-    weights[0] += np.log(scale)
-    return weights
+        mean = np.exp(x @ weights)
+        slope = x.T @ (y - mean) - penalty * weights
+        step = np.linalg.solve((x * mean[:, None]).T @ x + np.diag(penalty), slope)
+        gain = float(slope @ step)
+        if gain < _CONVERGED * len(y):
+            weights[0] += np.log(scale)
+            return weights
+        part = 1.0
+        while not (after := loss(weights + part * step)) < now - 1e-4 * part * gain:
+            part *= 0.5
+            if part < _LEAST_PART:
+                return None
+        weights, now = weights + part * step, after
+    return None
 
 
 @dataclass(frozen=True)
@@ -99,7 +122,8 @@ class Allocation:
     Attributes
     ----------
     weights : of the polynomial's terms, for ln s with s the deviation of one path, in 1/sr
-    typical : mean of s over the run's queries, in 1/sr; 0 where nothing is noisy
+    typical : mean of s over the run's queries, in 1/sr; 0 where all queries get the same number of paths:
+        where nothing is noisy, and where the fit of s did not converge
     scale : factor that makes the counts' mean the wanted one, over the run's queries
     gain : mean squared error of equal counts over that of these, as the pilot's own data have it
     mean_weights : of the terms without the level, for ln of the tile mean, in 1/sr
@@ -145,6 +169,12 @@ def _evaluate(weights: tuple[float, ...], terms: list[F64]) -> F64:
     return np.exp(np.clip(total, -60.0, 60.0))
 
 
+def _constant(terms: list[F64], value: float) -> F64:
+    weights = np.zeros(len(terms))
+    weights[0] = math.log(value)
+    return weights
+
+
 def _round_counts(wanted: F64, spp: int) -> NDArray[np.int64]:
     # The nearest power of two in the sense of ratios.
     power = np.rint(np.log2(np.maximum(wanted, 1e-9)))
@@ -152,17 +182,40 @@ def _round_counts(wanted: F64, spp: int) -> NDArray[np.int64]:
     return np.exp2(np.clip(power, math.log2(FEWEST), most)).astype(np.int64)
 
 
+def fit_deviation(terms: list[F64], size: F64) -> F64 | None:
+    """Weights of ln √E(size²) for sizes (n,) of differences; None where the fit did not converge.
+
+    The fit of the mean size is scaled so that the mean of its squares is that of the sizes' squares: means
+    fall short of root mean squares by a tenth or so for normal noise, and by factors for that of a few bright
+    paths. A fit of the squares themselves would follow the few largest.
+    """
+    weights = fit_log_linear(terms, size)
+    if weights is not None and size.any():
+        fitted = _evaluate(tuple(weights), terms)
+        weights[0] += 0.5 * math.log(float(np.sum(size**2) / np.sum(fitted**2)))
+    return weights
+
+
 def fit_allocation(queries: Queries, estimates: Estimates, paths: int, spp: int) -> Allocation:
     """Allocation from a pilot's queries (one leading axis) and estimates of `paths` paths each, for a mean of
-    `spp` paths."""
+    `spp` paths. Where a fit does not converge it is a constant, with a warning."""
     difference = estimates.value_a.astype(np.float64) - estimates.value_b
     noise = np.sqrt(np.mean(difference**2, axis=-1))
     value = 0.5 * np.mean(estimates.value_a.astype(np.float64) + estimates.value_b, axis=-1)
-    weights = fit_log_linear(_terms(queries), noise * (0.5 * math.sqrt(paths)))
-    mean_weights = fit_log_linear(_terms(queries, levels=False), value)
-    expected = _evaluate(tuple(weights), _terms(queries)) if noise.any() else np.zeros(len(noise))
-    flat = Allocation(tuple(weights.tolist()), float(expected.mean()), 1.0, 1.0, tuple(mean_weights.tolist()))
-    if not noise.any():
+    terms, flat_terms = _terms(queries), _terms(queries, levels=False)
+    mean_weights = fit_log_linear(flat_terms, value)
+    if mean_weights is None:
+        log.warning("the fit of the tile mean over directions did not converge; taken to be constant")
+        mean_weights = _constant(flat_terms, float(value.mean()))
+    sizes = noise * (0.5 * math.sqrt(paths))
+    weights = fit_deviation(terms, sizes)
+    even = weights is None or not noise.any()
+    if weights is None:
+        log.warning("the fit of the noise over queries did not converge; expected to be the same for all")
+        weights = _constant(terms, math.sqrt(float(np.mean(sizes**2))))
+    typical = 0.0 if even else float(_evaluate(tuple(weights), terms).mean())
+    flat = Allocation(tuple(weights.tolist()), typical, 1.0, 1.0, tuple(mean_weights.tolist()))
+    if even:
         return flat
     low, high = 1e-3, 1e3
     for _ in range(60):

@@ -73,6 +73,35 @@ def test_values_of_a_skewed_scene_are_unbiased(skewed: tuple[Queries, EffectsPla
     assert z_test(mean_estimate((a - TRUTH) * (b - TRUTH))).p_value > 1e-3
 
 
+def test_a_skewed_scene_comes_near_its_target_and_what_is_reported_is_so(
+    skewed: tuple[Queries, EffectsPlan],
+) -> None:
+    q, plan = skewed
+    e = estimate_shard(FewBrightPaths(), q, 4, Target(0.2, 8192), Stream(1, "train", 0), plan)
+    value = 0.5 * (e.value_a[:, 0].astype(np.float64) + e.value_b[:, 0])
+    error = float(np.sqrt(np.mean((value - TRUTH) ** 2))) / TRUTH
+    assert 0.2 < error < 1.5 * 0.2
+    assert e.target is not None
+    assert np.sqrt(e.target.square) == pytest.approx(error, rel=0.2)
+    # What the pilot expects of a path is its root mean square deviation.
+    assert plan.allocation is not None
+    s = plan.allocation.deviation(q)
+    assert np.sqrt(np.mean(s**2)) == pytest.approx(np.sqrt(RARE * (1 - RARE)) * (BRIGHT - DIM), rel=0.05)
+
+
+def test_what_is_reported_does_not_hide_errors_that_the_cap_leaves(
+    skewed: tuple[Queries, EffectsPlan],
+) -> None:
+    """Bright paths among few make large values: an error divided by them would never be above one or so."""
+    q, plan = skewed
+    e = estimate_shard(FewBrightPaths(), q, 4, Target(0.2, 8), Stream(1, "train", 0), plan)
+    value = 0.5 * (e.value_a[:, 0].astype(np.float64) + e.value_b[:, 0])
+    error = float(np.sqrt(np.mean((value - TRUTH) ** 2))) / TRUTH
+    assert error > 1.0
+    assert e.target is not None
+    assert np.sqrt(e.target.square) == pytest.approx(error, rel=0.15)
+
+
 def test_stopping_when_the_paths_so_far_look_good_is_biased() -> None:
     """What the pilot is thrown away for: the same rule on the stored paths themselves."""
     y = FewBrightPaths().paths(N, 512, Stream(1, "train", 0))
