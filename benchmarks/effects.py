@@ -37,7 +37,7 @@ from mbtf_gen.estimates import Estimates, Stream
 from mbtf_gen.generation import Job
 from mbtf_gen.material import Material, load_material
 from mbtf_gen.pilot import PILOT_ROULETTE, measured, relative_change
-from mbtf_gen.planning import plan_effects, without
+from mbtf_gen.planning import SMALL_RUN, plan_effects, without
 
 ASSETS = Path(__file__).parents[1] / "assets"
 # Ratio of the times, auto over all, that the surfaces are held to: at least 20 times faster, or never slower
@@ -70,7 +70,8 @@ def run(
     job = Job.of(config, material)
     asked = job.plan().draw("train", 0, queries)
     start = time.perf_counter()
-    plan = plan_effects(job)
+    # Pilots where a run of this size takes them.
+    plan = plan_effects(job, pilots=queries * spp >= SMALL_RUN)
     found: Estimates = job.estimator(plan).estimate(asked, spp, Stream(seed, "train", 0))
     return time.perf_counter() - start, plan, found
 

@@ -268,6 +268,9 @@ def _ended_like_interrupted() -> Iterator[None]:
     usual = usual and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
     if usual:
         signal.signal(signal.SIGTERM, _interrupt)
+        # A renderer that ran in this process may have left a handler behind Python's back, which points to
+        # what is gone by now.
+        signal.signal(signal.SIGINT, signal.getsignal(signal.SIGINT) or signal.default_int_handler)
     try:
         yield
     finally:

@@ -31,7 +31,7 @@ LOBE_TAIL_SHARE = 2.4e-4
 # 2α wide, is so many times wider than the light's.
 WIDER = 4.0
 # Runs of fewer paths are done before a pilot has paid for itself.
-SMALL_RUN = 2_000_000
+SMALL_RUN = 10_000_000
 # Deepest cap on surface interactions that is tried.
 DEEPEST_CAP = 4
 # A gloss, coat or sheen of less strength may be too faint to matter, and is looked at.

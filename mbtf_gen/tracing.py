@@ -37,6 +37,8 @@ LATE_SURVIVAL = 0.995
 # survive with this multiple of their throughput, at most one: on stone, cloth, metal and bark 2 was cheaper
 # than 1 and 4.
 SURVIVAL_PER_THROUGHPUT = 2.0
+# Random numbers are multiples of 2^-24, of which smaller chances would be a coarse approximation.
+LEAST_SURVIVAL = 2.0**-10
 # Paths along a lobe this narrow (density in 1/sr) may bring all of the light, which light sampling misses:
 # roulette waits for them so many interactions more.
 NARROW = 4.0
@@ -257,7 +259,7 @@ def _light_up(path: Path, shadow: Shadow, blocked: Any, capped: Any) -> None:
 
 
 def _direct(
-    world: World, path: Path, si: Any, point: Any, light: LaneLight, transport: Transport
+    world: World, path: Path, si: Any, point: Any, light: LaneLight, transport: Transport, begin: Any
 ) -> Shadow | None:
     """Direct light that a surface point sends along a path, by next-event estimation: where nothing shadows,
     it is added to the path, else it is up to the ray returned."""
@@ -271,7 +273,10 @@ def _direct(
     value, pdf = point.eval_pdf(omega)
     if light.kind == "lobe":
         density = light.sampling_density(omega)
-        incoming = incoming / (density + pdf if transport.bsdf_sampling else density)
+        if transport.bsdf_sampling:
+            strongest = dr.max(path.throughput * value) / dr.maximum(pdf, 1e-30)
+            density = density + _survival(strongest, path.depth + 1, pdf, begin) * pdf
+        incoming = incoming / density
     # Written so that NaN counts as light: it must reach the value, where it is found and drawn again.
     lit = path.active & ~(dr.max(value) <= 0)
     radiance = path.throughput * (value * incoming)
@@ -320,27 +325,38 @@ def _interact(
     """One surface interaction of every path: where it goes on, and its ray towards the light."""
     si = interaction(path.p, path.n, path.d, world.field.size, path.active)
     point = world.surface.at(si, -path.d)
-    shadow = _direct(world, path, si, point, light, transport)
+    shadow = _direct(world, path, si, point, light, transport, roulette)
     path.depth[path.active] += 1
     if not transport.bsdf_sampling and light.kind != "constant":
         path.active &= path.depth < limit
     omega, weight, pdf = point.sample(path.rng.next_1d(), path.rng.next_2d())
     path.throughput *= weight
-    _roulette(path, pdf, roulette)
+    pdf = pdf * _roulette(path, pdf, roulette)
     return Onward(world.field.leave(si, omega), dr.dot(si.n, omega) < 0, pdf), shadow
 
 
-def _roulette(path: Path, pdf: Any, begin: Any) -> None:
+def _survival(strongest: Any, depth: Any, pdf: Any, begin: Any) -> Any:
+    """Chance that roulette lets a path of a throughput go on in a direction of a density.
+
+    The balance heuristic counts with it on both sides: otherwise light that surface sampling was to find
+    would hang, on dark surfaces, on the few paths that survive, with great weights.
+    """
+    longest = dr.select(depth < PATIENCE, 1.0, LATE_SURVIVAL)
+    likely = dr.clip(SURVIVAL_PER_THROUGHPUT * strongest, LEAST_SURVIVAL, longest)
+    begin = dr.select(pdf > NARROW, begin + NARROW_WAIT, begin)
+    return dr.select(depth >= begin, likely, 1.0)
+
+
+def _roulette(path: Path, pdf: Any, begin: Any) -> Any:
+    """End paths by chance; returns the chances of those that go on."""
     strongest = dr.max(path.throughput)
     # A path of NaN throughput would end here as if it were black.
     path.radiance[path.active & dr.isnan(strongest)] = mi.Spectrum(dr.nan)
     path.active &= strongest > 0
-    longest = dr.select(path.depth < PATIENCE, 1.0, LATE_SURVIVAL)
-    likely = dr.minimum(SURVIVAL_PER_THROUGHPUT * strongest, longest)
-    begin = dr.select(pdf > NARROW, begin + NARROW_WAIT, begin)
-    survival = dr.select(path.depth >= begin, likely, 1.0)
+    survival = _survival(strongest, path.depth, pdf, begin)
     path.active &= path.rng.next_1d() < survival
     path.throughput *= dr.rcp(survival)
+    return survival
 
 
 def trace(
@@ -382,6 +398,9 @@ def trace(
         mi.Bool(False),
         mi.Bool(active),
     )
+    if light.kind == "constant":
+        # Only surface sampling finds this light: the first ray that may is not left to chance.
+        roulette = roulette + 1
     first = Onward(ray, mi.Bool(False), mi.Float(dr.inf))
     _follow(world, path, first, None, light, transport, limit)
     onward, shadow = _interact(world, path, light, transport, limit, roulette)

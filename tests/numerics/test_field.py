@@ -23,8 +23,21 @@ def odd() -> HeightGrid:
     return HeightGrid(rocks(64).z[:23, :37], 23 / 37)
 
 
-GRIDS = [rocks(64), odd(), needles(), HeightGrid(np.array([[0.0, -0.3]]), 0.5)]
-NAMES = ["rocks", "23 x 37", "needles", "1 x 2"]
+def narrow(rows: int, columns: int, aspect: float) -> HeightGrid:
+    """Cells that are not square, with slopes along both axes."""
+    heights = np.random.default_rng(5).random((rows, columns))
+    return HeightGrid(0.2 * (heights - heights.max()), aspect)
+
+
+GRIDS = [
+    rocks(64),
+    odd(),
+    needles(),
+    HeightGrid(np.array([[0.0, -0.3]]), 0.5),
+    narrow(7, 3, 0.31),
+    narrow(9, 1, 0.6),
+]
+NAMES = ["rocks", "23 x 37", "needles", "1 x 2", "7 x 3", "9 x 1"]
 
 
 def rays(rng: np.random.Generator, grid: HeightGrid, unit: float) -> tuple[NDArray, NDArray]:

@@ -71,7 +71,7 @@ def test_positions_may_be_counted_from_far_away(shift: tuple[float, float]) -> N
     """u + whole tiles: single precision holds multiples of 1/1024 up to 16384 exactly."""
     u = positions()
     here, there = values(RELIEF, u), values(RELIEF, u + shift)
-    assert np.mean(np.abs(here - there) > 1e-3 * here.mean()) < 0.02
+    assert np.mean(np.abs(here - there) > 1e-3 * here.mean()) < 0.03
     assert abs(paired_difference(there, here).value) < 2e-3 * here.mean()
 
 

@@ -20,6 +20,9 @@ COSINES = st.floats(-4.0, 0.0)
 @settings(max_examples=30)
 @example(0.0, -4.0, -4.0, -9.0, (1, 1), 0.5, -8.0)
 @example(45.0, -4.0, 0.0, 3.0, (1, 7), 0.5, 0.0)
+@example(1.0, 0.0, 0.0, -1.0, (1, 1), 0.0, -3.0)
+@example(45.0, 0.0, 0.0, -1.0, (1, 1), 0.0, -2.0)
+@example(45.0, 0.0, 0.0, -1.0, (1, 1), 0.0, -8.0)
 @given(
     st.sampled_from(WIDTHS),
     COSINES,

@@ -54,6 +54,19 @@ def test_roulette_changes_nothing_but_the_noise(light: LightKernel | None) -> No
     assert z_test(first, second).p_value > 1e-3
 
 
+@pytest.mark.parametrize("albedo", [0.02, 0.7])
+@pytest.mark.parametrize("width", [1.0, 20.0])
+def test_roulette_leaves_direct_light_alone(albedo: float, width: float) -> None:
+    """Light that surface sampling finds must not hang on the few paths that roulette spares."""
+    q = tile_mean_queries(direction(40, 60), direction(55, 200), 8_000)
+    early, late = (
+        estimate(rocks(), lambert(albedo), LightKernel(width), q, 8, transport=Transport(roulette_depth=r))
+        for r in (1, 1000)
+    )
+    noise = [float(np.mean((e.value_a.astype(np.float64) - e.value_b) ** 2)) for e in (early, late)]
+    assert noise[0] < 2.0 * noise[1]
+
+
 def tile_mean(
     grid: HeightGrid, bsdf: Any, omega_i: NDArray[np.float64], omega_o: NDArray[np.float64], seed: int
 ) -> Estimate:
