@@ -147,13 +147,13 @@ def test_a_manifest_is_not_restored_without_witnesses(out: Path) -> None:
 def test_a_manifest_is_not_restored_with_other_effects(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     flip(out / "manifest.json", 90)
 
-    def otherwise(job: repairs.Job, pilots: bool) -> object:
+    def otherwise(job: repairs.Job) -> object:
         config = job.config.model_copy(
             update={"effects": job.config.effects.model_copy(update={"mode": "all"})}
         )
         return simulated(repairs.Job.of(config, job.material))
 
-    monkeypatch.setattr(repairs, "plan_effects", otherwise)
+    monkeypatch.setattr(repairs, "plan_run", otherwise)
     with pytest.raises(InputError, match="comes out otherwise"):
         repair(out)
 
