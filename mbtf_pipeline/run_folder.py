@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from mbtf_gen.atomic import read_json, write_json
@@ -33,6 +33,24 @@ def clear(folder: Path) -> None:
         shutil.rmtree(folder)
 
 
+def take(folder: Path, ours: Callable[[Path], bool], refusal: InputError) -> None:
+    """Make a folder, or take one that is empty or ours.
+
+    Raises
+    ------
+    InputError : `refusal`, where it holds something else; or it cannot be made
+    """
+    if folder.exists() and not folder.is_dir():
+        raise InputError("is a file, not a folder", where=folder)
+    seen = folder.exists() and any(not path.name.startswith(".") for path in folder.iterdir())
+    if seen and not ours(folder):
+        raise refusal
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot be made ({error.strerror})", where=folder) from None
+
+
 def claim(folder: Path) -> None:
     """Make a run's folder, or take an empty one or one that holds a run.
 
@@ -40,15 +58,8 @@ def claim(folder: Path) -> None:
     ------
     InputError : it holds something else
     """
-    if folder.exists() and not folder.is_dir():
-        raise InputError("is a file, not a folder", where=folder)
-    seen = folder.exists() and any(not path.name.startswith(".") for path in folder.iterdir())
-    if seen and not is_run(folder):
-        raise InputError("is not empty and holds no run", where=folder, cure="choose another folder with -o")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot be made ({error.strerror})", where=folder) from None
+    cure = "choose another folder with -o"
+    take(folder, is_run, InputError("is not empty and holds no run", where=folder, cure=cure))
 
 
 def describe(folder: Path, recipe: Recipe, command: str) -> None:

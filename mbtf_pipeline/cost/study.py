@@ -14,7 +14,7 @@ from mbtf_gen.material import load_material
 from mbtf_gen.settings import dump_yaml
 
 from ..recipe import Recipe
-from ..run_folder import locked, machine
+from ..run_folder import locked, machine, take
 from .chain_studies import GENERATOR, chains
 from .chains import Workshop
 from .generator import Bench
@@ -59,17 +59,8 @@ def claim(folder: Path) -> None:
     ------
     InputError : it holds something else
     """
-    if folder.exists() and not folder.is_dir():
-        raise InputError("is a file, not a folder", where=folder)
-    seen = folder.exists() and any(not p.name.startswith(".") for p in folder.iterdir())
-    if seen and not _is_study(folder):
-        raise InputError(
-            "is not empty and holds no cost study", where=folder, cure="choose another folder with -o"
-        )
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot be made ({error.strerror})", where=folder) from None
+    cure = "choose another folder with -o"
+    take(folder, _is_study, InputError("is not empty and holds no cost study", where=folder, cure=cure))
 
 
 def _is_study(folder: Path) -> bool:
