@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from .console import clock
 from .effects import EffectsPlan
 from .estimates import Stream
+from .pilot import pilot_queries
 from .schema import ARRAYS, SPLITS, Split
 from .stats import pooled_error
 
@@ -113,11 +114,7 @@ def _piece(job: Job, estimator: Any, split: Split, number: int) -> tuple[float, 
     """(paths per second, both halves) of one piece of a split's queries, from streams of the pilot's own."""
     spp = job.spp(split)
     count = max(1, min(_PIECE_PATHS // spp, max(1, job.queries(split))))
-    image = job.config.queries.layout == "image"
-    rows = max(1, count // job.lattice.texels()) if image else count
-    queries = job.plan().draw("pilot", number, rows).flat()
-    if image and len(queries.sigma) > count:
-        queries = type(queries)(*(getattr(queries, n)[:count] for n in ("u", "sigma", "omega_i", "omega_o")))
+    queries = pilot_queries(job, count, number)
     start = time.perf_counter()
     found = estimator.estimate(queries, spp, Stream(job.config.seed, "pilot", number))
     took = max(time.perf_counter() - start, 1e-9)

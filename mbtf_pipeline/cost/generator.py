@@ -81,7 +81,9 @@ class Bench:
     config: GeneratorConfig
     material: Material
     seed: int
-    _references: dict[str, _Reference] = field(default_factory=dict, repr=False)
+    # By the reference's options: its job and estimator, and by options and number its pieces.
+    _judges: dict[str, tuple[Job, Any]] = field(default_factory=dict, repr=False)
+    _references: dict[tuple[str, int], _Reference] = field(default_factory=dict, repr=False)
 
     def job(self, changes: dict[str, Any]) -> Job:
         """The job of the configuration with options changed, by dotted name."""
@@ -103,14 +105,17 @@ class Bench:
 
     def reference(self, changes: dict[str, Any], piece: int) -> _Reference:
         """One piece of the converged reference with these options."""
-        key = f"{sorted(changes.items())!r} {piece}"
-        if key not in self._references:
-            job = self.job({"effects.mode": "all", "transport.max_depth": 0, **changes})
+        setting = repr(sorted(changes.items()))
+        if (setting, piece) not in self._references:
+            if setting not in self._judges:
+                job = self.job({"effects.mode": "all", "transport.max_depth": 0, **changes})
+                self._judges[setting] = job, job.estimator(plan_effects(job))
+            job, estimator = self._judges[setting]
             queries = self.queries(job, _FIRST_REFERENCE + piece, BIAS_QUERIES)
-            found = job.estimator(plan_effects(job)).estimate(queries, BIAS_SPP, self._stream(piece))
+            found = estimator.estimate(queries, BIAS_SPP, self._stream(piece))
             a, b = found.value_a.astype(np.float64), found.value_b.astype(np.float64)
-            self._references[key] = _Reference(queries, a, b)
-        return self._references[key]
+            self._references[setting, piece] = _Reference(queries, a, b)
+        return self._references[setting, piece]
 
     def _stream(self, piece: int) -> Stream:
         return Stream(self.seed, "test", _FIRST_REFERENCE + piece)
