@@ -2,7 +2,7 @@
 
 It takes either one direction (parameter ``direction``, towards the light) or the ``omega_i`` of a batch of
 queries, which it finds by the query number that :class:`~mbtf_gen.sensor.QuerySensor` writes into the rays'
-time. The formulas are those of :class:`~mbtf_gen.tracing.LaneLight`, which the generator's own loop uses.
+time. The formulas are those of :class:`~mbtf_gen.lane_light.LaneLight`, which the generator's own loop uses.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .lane_light import LaneLight
 from .light import LightKernel
-from .tracing import LaneLight
 
 # Scene units that stock integrators search for occluders. Mitsuba tells an emitter written in Python nothing
 # of the scene's size, so it is a constant: thousands of tiles, and still exact to 1e-7 in direction.

@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 
 from .errors import PartialError
 from .estimates import MOST_LOCATED, BadSample, Estimates, Stream
+from .lane_light import LaneLight
 from .light import LightKernel
 from .queries import Queries
 from .scene import CLEARANCE, Tile
 from .seeds import Purpose, sequence, stream_key, stream_number
-from .tracing import LaneLight, Transport, trace
+from .tracing import Transport, trace
 
 # Paths per launch: enough to fill any machine, few enough to stay small in memory.
 LAUNCH_PATHS = 1 << 20

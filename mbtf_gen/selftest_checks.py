@@ -172,7 +172,7 @@ def _irradiance(round_number: int) -> Cases:
     mi = load_mitsuba()
     import drjit as dr
 
-    from .tracing import LaneLight
+    from .lane_light import LaneLight
 
     n, out = 100_000, {}
     rng = np.random.default_rng([3, round_number])

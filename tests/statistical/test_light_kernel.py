@@ -7,9 +7,9 @@ import pytest
 from numpy.typing import NDArray
 from support.scenes import mi
 
+from mbtf_gen.lane_light import LaneLight
 from mbtf_gen.light import LightKernel, concentration, rms_angle_deg
 from mbtf_gen.stats import Cap, Rectangle, chi_square_test
-from mbtf_gen.tracing import LaneLight
 
 WIDTHS = [0.05, 0.3, 1.0, 5.0, 15.0, 30.0]
 ELEVATIONS = [1e-4, 0.01, 0.1, 0.5, 1.0, 3.0, 10.0, 30.0, 60.0, 89.9]
