@@ -111,8 +111,9 @@ def _values(estimates: Estimates) -> F64:
 def round_up(wanted: F64, cap: int) -> NDArray[np.int64]:
     """The next number of paths that is a power of two or three times one, which fill nets of points, from
     ``FEWEST`` to `cap`."""
-    power = np.ceil(np.log2(np.maximum(wanted, FEWEST)))
-    whole = np.exp2(power)
+    fraction, power = np.frexp(np.maximum(wanted, FEWEST))
+    power = np.where(fraction == 0.5, power - 1, power)
+    whole = np.ldexp(1.0, power)
     # 1.5 halves of a net: even, so that both halves have the same.
     between = np.where(power >= 3, 0.75 * whole, whole)
     return np.minimum(np.where(wanted <= between, between, whole), cap).astype(np.int64)

@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from conftest import RunPython
 from numpy.typing import NDArray
 
 from mbtf_gen.adaptive import DOUBT, PRIOR_PATHS, round_up, wanted_paths
@@ -134,6 +135,48 @@ def test_counts_of_a_query_do_not_depend_on_the_others(fitted: Allocation) -> No
     some = Queries(q.u[7:9], q.sigma[7:9], q.omega_i[7:9], q.omega_o[7:9])
     assert (fitted.deviation(some) == fitted.deviation(q)[7:9]).all()
     assert (fitted.counts(some, SPP) == fitted.counts(q, SPP)[7:9]).all()
+
+
+# Counts by a manifest's weights, and by a pilot of its own for a target error; prints NumPy's features in use
+# and the digest of all bits, those of the expectations too, where the last bit shows.
+CODE = """
+import hashlib, json, sys
+import numpy as np
+from mbtf_gen.adaptive import round_up, wanted_paths
+from mbtf_gen.allocation import Allocation
+from mbtf_gen.estimates import Estimates
+from mbtf_gen.levels import Lattice
+from mbtf_gen.queries import Mixture, QueryPlan
+n = 20000
+allocation = Allocation.from_manifest(json.loads(sys.argv[1]))
+q = QueryPlan(Lattice(6), Mixture(0.6, 0.4), 0.1, "shuffled", 0, n).draw("train", 3, n)
+rng = np.random.Generator(np.random.Philox(5))
+a, b, v = (0.3 * rng.random((n, k), dtype=np.float32) for k in (3, 3, 1))
+pilot = Estimates(a, b, None, 0, 0, 0, 0, path_variance=v[:, 0])
+expected = allocation.deviation(q), allocation.tile_mean(q)
+wanted, scale = wanted_paths(pilot, 16, *expected, 0.05)
+h = hashlib.sha256()
+for array in (*expected, wanted, scale, allocation.counts(q, 16), round_up(wanted, 1000)):
+    h.update(array.tobytes())
+found = np.show_config(mode="dicts")["SIMD Extensions"].get("found", [])
+print(json.dumps({"found": found, "digest": h.hexdigest()}))
+"""
+
+
+def test_counts_do_not_depend_on_the_processors_features(fitted: Allocation, run_python: RunPython) -> None:
+    def counted(features: list[str] | None) -> tuple[list[str], str]:
+        disabled = None if features is None else " ".join(features)
+        done = run_python("-c", CODE, json.dumps(fitted.to_manifest()), NPY_DISABLE_CPU_FEATURES=disabled)
+        assert done.returncode == 0, done.stderr
+        answer = json.loads(done.stdout)
+        return answer["found"], answer["digest"]
+
+    found, digest = counted(None)
+    if not found:
+        pytest.skip("NumPy uses no optional features of this processor")
+    left, again = counted(found)
+    assert len(left) < len(found)
+    assert again == digest
 
 
 def test_an_allocation_survives_the_manifest(fitted: Allocation) -> None:
