@@ -30,6 +30,7 @@ from .pictures import (
     write_preview,
 )
 from .recipe import CompareSection
+from .stock import pick_scene, write_stock
 from .timing import measure_timing, timed
 from .visible import visible_difference
 
@@ -85,10 +86,13 @@ def compare(
 
     if section.st_lpips:
         require()
+    if section.stock:
+        pick_scene(section)
     (out / PICTURES).mkdir(parents=True, exist_ok=True)
     materials = {name: Material.load(folder) for name, folder in fits.items()}
     start = time.perf_counter()
-    estimator = build_estimator(generate, load_material(generate.material))
+    material = load_material(Path(generate.material), generate.geometry.tile)
+    estimator = build_estimator(generate, material)
     rendered = _render(section, estimator, progress)
     seconds = {"references": time.perf_counter() - start}
     # The white point is that of what is compared with; without a query reference, of what there is.
@@ -117,6 +121,8 @@ def compare(
         "offsets": offsets,
         "seconds": {k: round(v, 3) for k, v in seconds.items()},
     }
+    if section.stock:
+        record["stock"] = write_stock(section, generate, material, white, out)
     if section.timing:
         record["timing"] = _timings(fits)
     write_json(out / COMPARISON_NAME, record)
