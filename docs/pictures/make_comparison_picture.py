@@ -35,7 +35,8 @@ def main() -> None:
     panels = [split(scene) for scene in SCENES]
     gap = np.full((panels[0].shape[0], GAP, 3), 255, np.uint8)
     row = [part for panel in panels for part in (panel, gap)][:-1]
-    Image.fromarray(np.concatenate(row, axis=1)).save(Path(__file__).with_name("comparison.png"), optimize=True)
+    picture = Image.fromarray(np.concatenate(row, axis=1))
+    picture.save(Path(__file__).with_name("comparison.png"), optimize=True)
 
 
 if __name__ == "__main__":
