@@ -88,10 +88,10 @@ def timing(runs: Sequence[Run]) -> list[Table]:
         "Milliseconds for one query per pixel of 1920 × 1080, medians of three timings after one that is "
         "not counted. The first number is of evaluation as a material does it (on a processor a compiled "
         "kernel where the model has one); the others are of PyTorch, part by part. Stage 1, offset and "
-        "lookup, depends on the view alone and is done once for all lights; stage 2 once per light. "
-        "An eighth of the pixels is evaluated, of models that read many places for one query as many "
-        "fewer, and the times are scaled. For comparison: Kuznetsov et al. 2021 state 5 ms for NeuMIP and 92 ms for Rainer et al. "
-        "2019 on an RTX 2080 Ti, Xue et al. 2024 35 ms against NeuMIP’s 28 ms for 512 × 512 on a V100: "
-        "other machines, so only their ratios compare."
+        "lookup, depends on the view alone and is done once for all lights; stage 2 once per light. An "
+        "eighth of the pixels is evaluated, of models that read many places for one query as many fewer, "
+        "and the times are scaled. For comparison: Kuznetsov et al. 2021 state 5 ms for NeuMIP and 92 ms "
+        "for Rainer et al. 2019 on an RTX 2080 Ti, Xue et al. 2024 35 ms against NeuMIP’s 28 ms for 512 × "
+        "512 on a V100: other machines, so only their ratios compare."
     )
     return [Table("timing", "Time of one evaluation of 1080p", text, columns, rows)]
