@@ -183,10 +183,18 @@ def build_estimator(config: GeneratorConfig, material: Material) -> Any:
 
 def plan_run(job: Job) -> EffectsPlan:
     """Effects that a run simulates, and which queries get how many paths; by pilots where they pay."""
-    large = job.all_paths() >= SMALL_RUN
-    plan = plan_effects(job, pilots=large)
+    return allocated(job, plan_effects(job, pilots=_is_large(job)))
+
+
+def _is_large(job: Job) -> bool:
+    return job.all_paths() >= SMALL_RUN
+
+
+def allocated(job: Job, plan: EffectsPlan) -> EffectsPlan:
+    """A plan with the allocation of a run under it: by a pilot under a target error and in large runs."""
     queries = job.config.queries
-    if plan.closed_form or (queries.target_error is None and not (large and queries.allocation == "noise")):
+    wanted = queries.target_error is not None or (_is_large(job) and queries.allocation == "noise")
+    if plan.closed_form or not wanted:
         return plan
     return replace(plan, allocation=measure_allocation(job, plan))
 
@@ -230,7 +238,7 @@ def generate(
     overwrite : replace what is there; slices keep a data set of the same configuration, which others of
         them may have begun
     slice_index, slice_count : make only shards i with ``i % slice_count == slice_index - 1``
-    progress : called with (paths traced so far in this run, note), see :func:`paths_left`
+    progress : called with (paths so far in this run, as planned, note), see :func:`paths_left`
     job : the configuration with its material loaded, where the caller has it already
 
     Raises
