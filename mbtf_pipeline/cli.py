@@ -106,7 +106,7 @@ def _run_paper(
         "skipped": missing,
     }
     size = done.record["size"]
-    console.report(data, f"{done.page}: {size} size, {len(planned)} materials and variants{skipped}")
+    console.report(data, f"{done.page}: {size} size, {len(planned)} runs{skipped}")
 
 
 def _summary(result: RunResult) -> dict[str, Any]:
