@@ -11,6 +11,7 @@ from mbtf_gen.console import CONSOLE, Console, clock, new_app
 from mbtf_gen.errors import InputError, PartialError, UsageError
 from mbtf_gen.quality import Quality, as_assignments
 
+from .plugin.preview.command import preview
 from .wording import describe_errors, describe_fit, number, table
 
 if TYPE_CHECKING:
@@ -287,6 +288,9 @@ def export_material(
         {"folder": folder, "files": sizes, "half": None if error is None else error.as_dict()},
         "\n".join([*lines, *([] if error is None else [str(error)])]),
     )
+
+
+app.command(preview)
 
 
 @app.command

@@ -31,8 +31,9 @@ from .hits import interaction
 _TINY = 1e-18
 # Levels at which rays begin: those from above the relief, and those that leave a surface.
 _START_ABOVE, _START_WITHIN = 4, 0
-# Ray offset over the largest coordinate: a few units in the last place of single precision.
-_RELATIVE_OFFSET = 2.0e-6
+# Ray offset over the largest coordinate: a few units in the last place of single precision. Four times as
+# much made points on a tile 64 times as long as wide a thousandth too bright.
+_RELATIVE_OFFSET = 5.0e-7
 
 
 @dataclass(frozen=True)

@@ -172,10 +172,18 @@ def build_estimator(config: GeneratorConfig, material: Material) -> Any:
 
 def plan_run(job: Job) -> EffectsPlan:
     """Effects that a run simulates, and which queries get how many paths; by pilots where they pay."""
-    large = job.all_paths() >= SMALL_RUN
-    plan = plan_effects(job, pilots=large)
+    return allocated(job, plan_effects(job, pilots=_is_large(job)))
+
+
+def _is_large(job: Job) -> bool:
+    return job.all_paths() >= SMALL_RUN
+
+
+def allocated(job: Job, plan: EffectsPlan) -> EffectsPlan:
+    """A plan with the allocation of a run under it: by a pilot under a target error and in large runs."""
     queries = job.config.queries
-    if plan.closed_form or (queries.target_error is None and not (large and queries.allocation == "noise")):
+    wanted = queries.target_error is not None or (_is_large(job) and queries.allocation == "noise")
+    if plan.closed_form or not wanted:
         return plan
     return replace(plan, allocation=measure_allocation(job, plan))
 

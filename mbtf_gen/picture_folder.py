@@ -76,21 +76,24 @@ class PictureFolder:
         config: Mapping[str, Any],
         inputs: Mapping[str, str],
         overwrite: bool = False,
+        command: str = "",
     ) -> PictureFolder:
         """Claim a folder that is new, empty, of the same configuration, or to be replaced.
 
         Parameters
         ----------
-        kind : the command whose pictures these are
+        kind : what pictures these are, as the record says it
         files : names of all files that it may write there
         config : resolved options, written beside the pictures; all but ``material`` decide what they show
         inputs : what else decides it: digests of the input files, by role
         overwrite : remove what the folder's record lists, and start anew
+        command : that makes these pictures, for messages; by default ``mbtf-gen`` and the kind
 
         Raises
         ------
         InputError : the folder holds something else
         """
+        command = command or f"mbtf-gen {kind}"
         depends = {**{k: v for k, v in config.items() if k != "material"}, "inputs": dict(inputs)}
         if path.exists() and not path.is_dir():
             raise InputError("is a file, not a folder", where=path)
@@ -99,7 +102,7 @@ class PictureFolder:
             old = read_json(existing)
             if old.get("format") != FORMAT_NAME or old.get("kind") != kind:
                 raise InputError(
-                    f"holds pictures of something else than mbtf-gen {kind}",
+                    f"holds pictures of something else than {command}",
                     where=path,
                     cure="choose another folder with -o",
                 )
@@ -120,7 +123,7 @@ class PictureFolder:
             cls(path, old)._clear()
         elif path.exists() and any(not _is_leftover(p.name, _OURS) for p in path.iterdir()):
             raise InputError(
-                f"is not empty and holds no pictures of mbtf-gen {kind}",
+                f"is not empty and holds no pictures of {command}",
                 where=path,
                 cure="choose another folder with -o",
             )

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import statistics
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +15,10 @@ from mbtf_gen.atomic import write_json
 from mbtf_gen.config import GeneratorConfig
 from mbtf_gen.directions import from_angles
 
-from .flip import flip
 from .metrics import DEFINITIONS, Score, halves_score, score, white_point
 from .offsets import write_offsets
+from .on_data import errors_on_data
+from .perceptual import require
 from .pictures import (
     PICTURES,
     Scene,
@@ -30,6 +30,9 @@ from .pictures import (
     write_preview,
 )
 from .recipe import CompareSection
+from .stock import pick_scene, write_stock
+from .timing import measure_timing, timed
+from .visible import visible_difference
 
 if TYPE_CHECKING:
     from mbtf_fit import Material
@@ -40,13 +43,12 @@ if TYPE_CHECKING:
 COMPARISON_NAME = "comparison.json"
 COMPARISON_FORMAT = "mbtf-comparison"
 # Raised when the record or what lies beside it changes; part of what the stage depends on.
-COMPARISON_SCHEMA = 3
+COMPARISON_SCHEMA = 4
 
 F32 = NDArray[np.float32]
 Progress = Callable[[str], None]
-T = TypeVar("T")
-# Timings of one picture's evaluation, whose median is recorded.
-_TIMINGS = 3
+# One query per pixel of 1080p is what timings are for.
+_TIMED_PIXELS = 1920 * 1080
 
 
 def steps(compare: CompareSection, fits: int) -> int:
@@ -82,20 +84,28 @@ def compare(
     from mbtf_gen.generation import build_estimator
     from mbtf_gen.material import load_material
 
+    if section.st_lpips:
+        require()
+    if section.stock:
+        pick_scene(section)
     (out / PICTURES).mkdir(parents=True, exist_ok=True)
     materials = {name: Material.load(folder) for name, folder in fits.items()}
     start = time.perf_counter()
-    estimator = build_estimator(generate, load_material(generate.material))
+    material = load_material(Path(generate.material), generate.geometry.tile)
+    estimator = build_estimator(generate, material)
     rendered = _render(section, estimator, progress)
     seconds = {"references": time.perf_counter() - start}
     # The white point is that of what is compared with; without a query reference, of what there is.
     white = white_point([next(iter(images.values())).value for _, images in rendered])
     start = time.perf_counter()
-    pictures = [_picture(scene, images, materials, white, out, progress) for scene, images in rendered]
+    learned = section.st_lpips
+    pictures = [
+        _picture(scene, images, materials, white, learned, out, progress) for scene, images in rendered
+    ]
     seconds["fits"] = time.perf_counter() - start
     data = Dataset.open(shards)
     offsets = write_offsets(estimator, materials, section.offset_views, data.lattice, out)
-    record = {
+    record: dict[str, Any] = {
         "format": COMPARISON_FORMAT,
         "schema": COMPARISON_SCHEMA,
         "fits": list(fits),
@@ -107,30 +117,28 @@ def compare(
         "test_spp": data.manifest["splits"]["test"]["spp"],
         "definitions": DEFINITIONS,
         "pictures": pictures,
-        "test": {name: _on_data(material) for name, material in materials.items()},
+        "test": errors_on_data(materials, data),
         "offsets": offsets,
         "seconds": {k: round(v, 3) for k, v in seconds.items()},
     }
+    if section.stock:
+        record["stock"] = write_stock(section, generate, material, white, out)
+    if section.timing:
+        record["timing"] = _timings(fits)
     write_json(out / COMPARISON_NAME, record)
     return record
 
 
-# Splits in the report's words.
-_SPLITS = {
-    "test": "test",
-    "held_out_queries": "held-out queries",
-    "held_out_directions": "held-out directions",
-    "training": "training queries",
-}
+def _timings(fits: Mapping[str, Path]) -> dict[str, list[dict[str, Any]]]:
+    """Times of every fit, on the processor and, where there is one, on the GPU."""
+    import torch
 
+    from mbtf_fit import Material
 
-def _on_data(material: Material) -> dict[str, Any]:
-    """Errors on the splits, as the fit measured them when it was done, and the material's size."""
-    errors, weights = material.description["training"]["errors"], material.description["weights"]
+    devices = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
     return {
-        "splits": {_SPLITS[name]: found for name, found in errors.items()},
-        "network_weights": weights["network_weights"],
-        "texels": weights["texels"],
+        name: [measure_timing(Material.load(folder, d), _TIMED_PIXELS, d) for d in devices]
+        for name, folder in fits.items()
     }
 
 
@@ -159,22 +167,12 @@ def _render(
     return out
 
 
-def timed(work: Callable[[], T]) -> tuple[T, float]:
-    """What `work` returns, and the median of several timings in seconds, after one that is not counted."""
-    result = work()
-    seconds = []
-    for _ in range(_TIMINGS):
-        start = time.perf_counter()
-        work()
-        seconds.append(time.perf_counter() - start)
-    return result, statistics.median(seconds)
-
-
 def _picture(
     scene: Scene,
     images: Mapping[PixelKind, ReferenceImage],
     materials: Mapping[str, Material],
     white: float,
+    learned: bool,
     out: Path,
     progress: Progress,
 ) -> dict[str, Any]:
@@ -194,7 +192,8 @@ def _picture(
         between = halves_score((query.value_a, query.value_b), pixel.value_a, pixel.value_b)
         record["between_references"] = between.as_dict()
     main_kind, main = next(iter(images.items()))
-    record["references"][main_kind]["flip"] = flip(main.value_a, main.value_b, white).as_dict()
+    noise_alone = visible_difference(main.value_a, main.value_b, white, learned=learned)
+    record["references"][main_kind] |= noise_alone.as_dict()
     queries = main.queries
     level = level_of_sigma(queries.sigma)
     record["levels"] = [round(float(level.min()), 3), round(float(level.max()), 3)]
@@ -211,13 +210,13 @@ def _picture(
         errors: dict[str, Score] = {
             kind: score(value, image.value_a, image.value_b) for kind, image in images.items()
         }
-        visible = flip(value, main.value, white)
-        write_map(out / file, visible.hdr_map)
+        visible = visible_difference(value, main.value, white, learned=learned)
+        write_map(out / file, visible.flip.hdr_map)
         record["fits"][name] = {
             "file": file,
             "seconds": round(seconds, 4),
             "errors": {kind: s.as_dict(white) for kind, s in errors.items()},
-            "flip": visible.as_dict(),
+            **visible.as_dict(),
         }
         if values:
             halves = [x.reshape(-1, 3) for x in (main.value_a, main.value_b)]

@@ -17,6 +17,8 @@ from numpy.typing import ArrayLike
 from mbtf_gen.stats import Estimate, mean_estimate, noise_free_mse
 
 from .flip import DEFINITION as FLIP_DEFINITION
+from .perceptual import DEFINITION as ST_LPIPS_DEFINITION
+from .ssim import DEFINITION as SSIM_DEFINITION
 
 # Floor of the relative error's denominator, as a share of the picture's mean value.
 RELATIVE_FLOOR = 0.1
@@ -29,6 +31,8 @@ DEFINITIONS: dict[str, str] = {
     "relative_mse": "mean of (p-a)(p-b) / (t² + (0.1 m)²), t = (a+b)/2 per pixel and channel, m the "
     "picture's mean value",
     "flip": FLIP_DEFINITION,
+    "ssim": SSIM_DEFINITION,
+    "st_lpips": ST_LPIPS_DEFINITION,
     "error_bar": "one standard error, from the scatter over the picture's pixels or the data's queries; a "
     "value within two of its own is printed as below two error bars, with the bar",
 }

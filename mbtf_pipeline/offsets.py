@@ -90,6 +90,13 @@ def _correlation(x: F32, y: F32) -> float | None:
     return float(a @ b) / norm if norm > 1e-20 else None
 
 
+def _slope(x: F32, y: F32) -> float | None:
+    """Slope of the line through y over x, both less their means; None where x is constant."""
+    a, b = (v.astype(np.float64).ravel() - v.mean(dtype=np.float64) for v in (x, y))
+    square = float(a @ a)
+    return float(a @ b) / square if square > 1e-20 else None
+
+
 def write_offsets(
     estimator: Estimator,
     materials: Mapping[str, Material],
@@ -98,6 +105,10 @@ def write_offsets(
     out: Path,
 ) -> list[dict[str, Any]]:
     """Write traced and learned offsets of every view below `out`; plain data about them.
+
+    Of displacements towards the viewer ``spread`` is the standard deviation over the tile in tile widths; of
+    learned ones ``correlation`` is that with the traced, and ``slope`` that of the line through them over the
+    traced, which is 1 for the same size.
 
     Models that move nothing are left out; without any that does, nothing is written.
     """
@@ -119,12 +130,19 @@ def write_offsets(
         truth = traced_offset(estimator, u, direction)
         file = f"{OFFSETS}/v{number}-traced.exr"
         _write(out / file, truth.reshape(rows, columns, 2))
+        along = towards_view(truth, view)
         record: dict[str, Any] = {"view": view.model_dump(), "traced": file, "fits": {}}
+        record["spread"] = float(along.std(dtype=np.float64))
         for name, offsets in learned.items():
             offset = offsets[number - 1]
             file = f"{OFFSETS}/v{number}-{fit_name(name)}.exr"
             _write(out / file, offset.reshape(rows, columns, 2))
-            agreement = _correlation(towards_view(offset, view), towards_view(truth, view))
-            record["fits"][name] = {"file": file, "correlation": agreement}
+            moved = towards_view(offset, view)
+            record["fits"][name] = {
+                "file": file,
+                "correlation": _correlation(moved, along),
+                "slope": _slope(along, moved),
+                "spread": float(moved.std(dtype=np.float64)),
+            }
         records.append(record)
     return records

@@ -70,6 +70,13 @@ class CompareSection(Settings):
         [View(elevation=30, azimuth=a) for a in (-90, 0, 90, 180)],
         description="views whose learned offsets are drawn",
     )
+    st_lpips: bool = Field(
+        False, description="measure ST-LPIPS, too; its weights are the optional extra `perceptual`"
+    )
+    stock: bool = Field(
+        False, description="render one reference again with stock parts of Mitsuba, as a check from outside"
+    )
+    timing: bool = Field(False, description="time an evaluation of 1080p, part by part")
     seed: int = Field(0, ge=0, lt=1 << 63, description="root seed of the pictures")
 
 

@@ -27,7 +27,7 @@ from .run_folder import COMPARE, FITS, REPORT, RUN_NAME, SHARDS
 from .wording import BELOW
 
 # Raised when the page changes; part of what the report's stage depends on.
-LAYOUT = 3
+LAYOUT = 4
 
 _TABLE = """
 <table><thead><tr>{% for h in t.head %}<th>{{ h }}</th>{% endfor %}</tr></thead><tbody>

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from .plots import points
-from .report_pictures import flip_texts
+from .visible import measured, visible_text
 from .wording import data_errors, decibel, error_text, estimate, short_direction
 
 UNEXPLAINED = "unexplained variance"
@@ -16,6 +16,8 @@ _TERMS = {
     "psnr": "PSNR",
     "relative_mse": "relative MSE",
     "flip": "FLIP",
+    "ssim": "SSIM",
+    "st_lpips": "ST-LPIPS",
     "error_bar": "error bar",
 }
 
@@ -155,6 +157,7 @@ def _pictures_table(comparison: Mapping[str, Any]) -> dict[str, Any]:
     """One row per picture and fit, errors against each kind of reference."""
     kinds = comparison["kinds"]
     main = main_kind(comparison)
+    visible = measured(comparison["pictures"], comparison["fits"])
     rows = []
     for picture in comparison["pictures"]:
         for fit in comparison["fits"]:
@@ -168,12 +171,12 @@ def _pictures_table(comparison: Mapping[str, Any]) -> dict[str, Any]:
                     decibel(errors["psnr"], errors["mse"]),
                     error_text(estimate(errors["relative_mse"])),
                 ]
-            row += [flip_texts(picture, main, [made], key)[0] for key in ("ldr", "hdr")]
+            row += [visible_text(m, made, picture["references"][main]) for m in visible]
             rows.append(row)
     measures = ("MSE [10⁻³/sr²]", "PSNR", "relative MSE")
     heads = [f"{m}, {kind} reference" for kind in kinds for m in measures]
-    heads += ["LDR-FLIP", "HDR-FLIP"]
-    title = f"Pictures (PSNR’s peak and FLIP’s 0 EV: {comparison['white']:.3g} 1/sr is white)"
+    heads += [m.title for m in visible]
+    title = f"Pictures (PSNR’s peak and 0 EV: {comparison['white']:.3g} 1/sr is white)"
     return {"title": title, "head": ["view", "light", "tiles across", "fit", *heads], "rows": rows}
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from .embed import F32, Field, Gallery
 from .maps import Palette, common_scale, gradient, local_error, ticks
 from .pictures import read_halves, read_map, read_picture
+from .visible import measured, visible_text
 from .wording import decibel, direction, error_text, estimate, levels, short_direction, width
 
 # Sides that a picture's name and caption tell apart.
@@ -267,21 +268,15 @@ class _Sheet:
             ["PSNR", *(decibel(e["psnr"], e["mse"]) for e in errors)],
         ]
         if kind == self._kinds[0]:
-            rows += [[f"{key.upper()}-FLIP", *flip_texts(picture, kind, made, key)] for key in ("ldr", "hdr")]
+            reference = picture["references"][kind]
+            rows += [
+                [m.title, *(visible_text(m, record, reference) for record in made)]
+                for m in measured([picture], self._comparison["fits"])
+            ]
             if len(made) > 1:
                 cells = (error_text(estimate(m["mse_less_first"]), 1e3) for m in made[1:])
                 rows.append([f"MSE less {self._comparison['fits'][0]}’s [10⁻³/sr²]", "–", *cells])
         return rows
-
-
-def flip_texts(picture: Mapping[str, Any], kind: str, made: list[Mapping[str, Any]], key: str) -> list[str]:
-    """FLIP of each fit; where it is no more than what noise alone gives, that is said."""
-    noise = picture["references"][kind]["flip"][key]
-    return [
-        f"{m['flip'][key]:.3f}"
-        + (f", not above noise alone ({noise:.3f})" if m["flip"][key] <= noise else "")
-        for m in made
-    ]
 
 
 def _reader(path: Path) -> Callable[[], F32]:

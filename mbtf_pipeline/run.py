@@ -9,6 +9,7 @@ from typing import Any
 
 from mbtf_fit.config import FitConfig
 from mbtf_gen.atomic import read_json
+from mbtf_gen.config import GeneratorConfig
 from mbtf_gen.console import Console, clock
 from mbtf_gen.errors import InputError
 
@@ -29,7 +30,44 @@ def fit_stage(name: str) -> str:
 
 def stage_names(recipe: Recipe) -> list[str]:
     """Stages of a recipe in the order in which they run."""
-    return [GENERATE_STAGE, *(fit_stage(name) for name in recipe.fit), COMPARE_STAGE, REPORT_STAGE]
+    data = [d.stage for d in data_sets(recipe)]
+    return [*data, *(fit_stage(name) for name in recipe.fit), COMPARE_STAGE, REPORT_STAGE]
+
+
+@dataclass(frozen=True)
+class DataSet:
+    """A data set of a run.
+
+    Attributes
+    ----------
+    stage : that makes it; sub : its folder in the run's
+    config : of the generator
+    """
+
+    stage: str
+    sub: str
+    config: GeneratorConfig
+
+
+def layout_of(config: FitConfig) -> str:
+    """Layout that a fit's model learns from."""
+    from mbtf_fit.models import MODELS
+
+    return MODELS[config.model].layout
+
+
+def data_sets(recipe: Recipe) -> list[DataSet]:
+    """The recipe's own data set first, then one of the other layout where a model learns from that.
+
+    The second one has as many training queries. All fits are judged by the test split of the first.
+    """
+    out = [DataSet(GENERATE_STAGE, SHARDS, recipe.generate)]
+    own = recipe.generate.queries.layout
+    for layout in sorted({layout_of(config) for config in recipe.fit.values()} - {own}):
+        queries = recipe.generate.queries.model_copy(update={"layout": layout, "test": "1"})
+        config = recipe.generate.model_copy(update={"queries": queries})
+        out.append(DataSet(f"{GENERATE_STAGE} {layout}", f"{SHARDS}-{layout}", config))
+    return out
 
 
 @dataclass(frozen=True)
@@ -60,14 +98,17 @@ class _Run:
     def stages(self, inputs: Inputs) -> list[Stage]:
         """All stages; `inputs` are the digests of the material's files by role."""
         recipe = self.recipe
-        generate = recipe.generate.model_dump(mode="json", exclude={"material"})
         fits = [fit_stage(name) for name in recipe.fit]
-        out = [Stage(GENERATE_STAGE, (), generate, inputs, self._files(SHARDS), self._generate)]
+        out: list[Stage] = []
+        for data in data_sets(recipe):
+            generate = data.config.model_dump(mode="json", exclude={"material"})
+            out.append(Stage(data.stage, (), generate, inputs, self._files(data.sub), self._generate(data)))
         for name, config in recipe.fit.items():
-            options = config.fields()
-            run = self._fit(name)
+            data = self._data_of(config)
             files = self._files(f"{FITS}/{name}")
-            out.append(Stage(fit_stage(name), (GENERATE_STAGE,), options, {}, files, run))
+            out.append(
+                Stage(fit_stage(name), (data.stage,), config.fields(), {}, files, self._fit(name, data))
+            )
         compared = {"record": COMPARISON_SCHEMA, **recipe.compare.model_dump(mode="json")}
         needs = (GENERATE_STAGE, *fits)
         out.append(Stage(COMPARE_STAGE, needs, compared, {}, self._files(COMPARE), self._compare))
@@ -90,35 +131,43 @@ class _Run:
             if p.is_file() and not any(part.startswith(".") for part in p.relative_to(top).parts)
         ]
 
-    def _generate(self, decision: Decision) -> dict[str, Any]:
-        from mbtf_gen.generation import Job, generate, paths_left
-        from mbtf_gen.schema import MANIFEST_NAME
-        from mbtf_gen.summary import summary_dict
-        from mbtf_gen.verification import sidecar_of
+    def _data_of(self, config: FitConfig) -> DataSet:
+        """The data set that a fit learns from."""
+        layout = layout_of(config)
+        return next(d for d in data_sets(self.recipe) if d.config.queries.layout == layout)
 
-        job = Job.prepare(self.recipe.generate)
-        shards = self.folder / SHARDS
-        manifest = shards / MANIFEST_NAME
-        for path in decision.damaged:
-            path.unlink(missing_ok=True)
-            sidecar_of(path).unlink(missing_ok=True)
-        if (
-            decision.forced
-            or not manifest.exists()
-            or read_json(manifest).get("config_hash") != job.config_hash
-        ):
-            clear(shards)
-        with self.console.progress(paths_left(job, shards), "generate", "paths") as bar:
-            summary = generate(
-                self.recipe.generate, shards, progress=lambda done, note: bar.update(done, note), job=job
-            )
-        return summary_dict(summary)
+    def _generate(self, data: DataSet) -> Callable[[Decision], dict[str, Any]]:
+        def run(decision: Decision) -> dict[str, Any]:
+            from mbtf_gen.generation import Job, generate, paths_left
+            from mbtf_gen.schema import MANIFEST_NAME
+            from mbtf_gen.summary import summary_dict
+            from mbtf_gen.verification import sidecar_of
 
-    def _fit(self, name: str) -> Callable[[Decision], dict[str, Any]]:
+            job = Job.prepare(data.config)
+            shards = self.folder / data.sub
+            manifest = shards / MANIFEST_NAME
+            for path in decision.damaged:
+                path.unlink(missing_ok=True)
+                sidecar_of(path).unlink(missing_ok=True)
+            if (
+                decision.forced
+                or not manifest.exists()
+                or read_json(manifest).get("config_hash") != job.config_hash
+            ):
+                clear(shards)
+            with self.console.progress(paths_left(job, shards), data.stage, "paths") as bar:
+                summary = generate(
+                    data.config, shards, progress=lambda done, note: bar.update(done, note), job=job
+                )
+            return summary_dict(summary)
+
+        return run
+
+    def _fit(self, name: str, data: DataSet) -> Callable[[Decision], dict[str, Any]]:
         def run(decision: Decision) -> dict[str, Any]:
             from mbtf_fit import fit
 
-            config, shards, out = self.recipe.fit[name], self.folder / SHARDS, self.folder / FITS / name
+            config, shards, out = self.recipe.fit[name], self.folder / data.sub, self.folder / FITS / name
             if decision.reason != NOT_RUN or not _unfinished(out, config, shards):
                 clear(out)
             budget, unit = (

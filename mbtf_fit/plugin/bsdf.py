@@ -29,7 +29,7 @@ from .stored import StoredMaterial, read_material
 # answered by the lowest that have some (see docs/rendering.md).
 LARGEST_SINE = 0.99**0.5
 # Largest deviation from the conformance values, as a share of max(value, their mean), that loading accepts.
-TOLERANCE = {"unrolled": 1e-4, "cooperative": 1e-4, "half": 5e-2}
+TOLERANCE = {"unrolled": 1e-4, "cooperative": 1e-4, "half": 1e-2}
 
 _log = logging.getLogger(__name__)
 # Materials whose missing footprint was told.
@@ -252,5 +252,7 @@ def _check_conformance(evaluator: Evaluator, stored: StoredMaterial) -> None:
         raise InputError(
             f"the renderer's plugin does not give its conformance values ({100 * worst:.2g} % off)",
             where=stored.folder,
-            cure="it was fitted by another version: fit it again, or use that version's plugin",
+            cure="set 'networks' to 'unrolled': half precision is too coarse for this material"
+            if evaluator.arithmetic == "half"
+            else "it was fitted by another version: fit it again, or use that version's plugin",
         )

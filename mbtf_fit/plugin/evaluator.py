@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .encodings import encode_direction, encode_position, to_value
-from .network import Arithmetic, Network, count_weights, default_arithmetic
+from .network import MOST_UNROLLED, Arithmetic, Network, count_weights, default_arithmetic
 from .stored import F32, StoredMaterial
 from .textures import Textures
 
@@ -44,7 +44,14 @@ class Evaluator:
         self.offset_texture: Textures | None = None
         if stored.offset_texture is not None and stored.offset_network is not None:
             self.offset_texture = Textures([stored.offset_texture])
-            self.offset_network = Network(stored.offset_network, self.arithmetic, stored.network.activation)
+            self.offset_network = Network(
+                stored.offset_network, self._offset_arithmetic(stored), stored.network.activation
+            )
+
+    def _offset_arithmetic(self, stored: StoredMaterial) -> Arithmetic:
+        """Single precision where it is affordable: small errors of the place are large ones of the value."""
+        small = count_weights(stored.offset_network or []) <= MOST_UNROLLED
+        return "unrolled" if self.arithmetic == "half" and small else self.arithmetic
 
     def level(self, sigma: Any) -> Any:
         """Fractional level of footprints in tile widths."""

@@ -3,7 +3,8 @@
 - ``unrolled``: multiply-adds with the weights as literals of the kernel. Fastest on a CPU: the features stay
   in registers and no weight is loaded twice. The kernel is compiled for one material.
 - ``cooperative``: :mod:`drjit.nn` cooperative vectors in single precision; one kernel for all materials.
-- ``half``: the same in half precision, what tensor cores of GPUs need.
+- ``half``: the same in half precision, what tensor cores of GPUs need. The first layer is unrolled in single
+  precision: half of the error, and most of an offset's, would come from rounding what the network sees.
 """
 
 from __future__ import annotations
@@ -50,14 +51,18 @@ class Network:
         self.layers = layers
         self.activation = activation
         self.arithmetic = arithmetic
-        if arithmetic != "unrolled":
+        # Layers that are unrolled; the others are cooperative.
+        self._single = {"unrolled": len(layers), "cooperative": 0, "half": 1}[arithmetic]
+        rest = layers[self._single :]
+        if rest:
             tensor = mi.TensorXf16 if arithmetic == "half" else mi.TensorXf
-            parts = [tensor(array) for weight, bias in layers for array in (weight, bias[:, None])]
+            parts = [tensor(array) for weight, bias in rest for array in (weight, bias[:, None])]
             self._views = nn.pack(*parts, layout="inference")
 
     def __call__(self, inputs: Sequence[Any]) -> list[Any]:
         """Outputs of the last layer for lanes' inputs."""
-        return self._unrolled(inputs) if self.arithmetic == "unrolled" else self._cooperative(inputs)
+        x = self._unrolled(inputs)
+        return x if self._single == len(self.layers) else self._cooperative(x)
 
     def _activated(self, x: Any) -> Any:
         """Activation of a number per lane, or of a cooperative vector where it is ``relu``."""
@@ -67,7 +72,7 @@ class Network:
 
     def _unrolled(self, inputs: Sequence[Any]) -> list[Any]:
         x = list(inputs)
-        for k, (weight, bias) in enumerate(self.layers):
+        for k, (weight, bias) in enumerate(self.layers[: self._single]):
             y = []
             for row, b in zip(weight.tolist(), bias.tolist(), strict=True):
                 total = mi.Float(b)
@@ -80,8 +85,9 @@ class Network:
     def _cooperative(self, inputs: Sequence[Any]) -> list[Any]:
         number = mi.Float16 if self.arithmetic == "half" else mi.Float
         x = nn.CoopVec(*(number(value) for value in inputs))
-        for k in range(len(self.layers)):
+        count = len(self.layers) - self._single
+        for k in range(count):
             x = nn.matvec(self._views[2 * k], x, self._views[2 * k + 1])
-            if k < len(self.layers) - 1:
+            if k < count - 1:
                 x = self._activated(x) if self.activation == "relu" else nn.CoopVec(*map(self._activated, x))
         return [mi.Float(value) for value in x]

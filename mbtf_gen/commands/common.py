@@ -97,3 +97,18 @@ def angles(text: str | None, flag: str) -> dict[str, float] | None:
     if not 0 < elevation <= 90:
         raise UsageError(f"elevation {elevation:g} must lie above 0 and at most at 90 degrees", where=flag)
     return {"elevation": elevation, "azimuth": azimuth}
+
+
+def numbers(text: str | None, flag: str) -> list[float] | None:
+    """Numbers of a list such as ``1,2,4``.
+
+    Raises
+    ------
+    UsageError : not of that form
+    """
+    if text is None:
+        return None
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        raise UsageError(f"'{text}' must be numbers separated by commas, such as 1,2,4", where=flag) from None

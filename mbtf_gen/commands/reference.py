@@ -8,20 +8,8 @@ from typing import Annotated, Any, Literal
 from cyclopts import Parameter
 
 from ..console import CONSOLE, Console
-from ..errors import UsageError
 from ..schema import Tiling
-from .common import Output, Set, angles, general, resolve_config
-
-
-def _widths(text: str | None) -> list[float] | None:
-    if text is None:
-        return None
-    try:
-        return [float(width) for width in text.split(",")]
-    except ValueError:
-        raise UsageError(
-            f"'{text}' must be numbers separated by commas, such as 1,2,4", where="--spans"
-        ) from None
+from .common import Output, Set, angles, general, numbers, resolve_config
 
 
 def reference(
@@ -88,7 +76,7 @@ def reference(
     flags = {
         "--view": ("reference.view", angles(view, "--view")),
         "--light": ("reference.light", angles(light, "--light")),
-        "--spans": ("reference.spans", _widths(spans)),
+        "--spans": ("reference.spans", numbers(spans, "--spans")),
         "--size": ("reference.size", size),
         "--spp": ("reference.spp", spp),
         "--kind": ("reference.kind", kind),

@@ -130,6 +130,14 @@ def test_the_data_are_synced_before_the_rename(tmp_path: Path, monkeypatch: pyte
     events.clear()
     atomic.write_through(tmp_path / "b", lambda temporary: temporary.touch())
     assert events == ["fsync", "replace", "fsync"]
+    events.clear()
+    link = os.link
+    monkeypatch.setattr(atomic.os, "link", lambda *a: events.append("link") or link(*a))
+    assert atomic.create_file(tmp_path / "c", b"text")
+    assert events == ["fsync", "link", "fsync"]
+    events.clear()
+    atomic.remove_file(tmp_path / "a")
+    assert events == ["fsync"]
 
 
 def test_json_goes_there_and_back(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from mbtf_pipeline import compare
+from mbtf_pipeline import timing
 from mbtf_pipeline.fit_records import History
 from mbtf_pipeline.report_errors import error_context, group_label
 from mbtf_pipeline.report_time import _comparison, _fits
@@ -87,7 +87,7 @@ def test_the_first_evaluation_and_an_odd_one_are_not_counted(monkeypatch: pytest
         now[0] += next(costs)
         return "value"
 
-    monkeypatch.setattr(compare.time, "perf_counter", lambda: now[0])
-    value, seconds = compare.timed(work)
+    monkeypatch.setattr(timing.time, "perf_counter", lambda: now[0])
+    value, seconds = timing.timed(work)
     assert value == "value"
     assert seconds == pytest.approx(0.2)

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from mbtf_gen.stats import Estimate
-from mbtf_pipeline.report_pictures import flip_texts
+from mbtf_pipeline.visible import MEASURES, measured, visible_text
 from mbtf_pipeline.wording import data_errors, decibel, error_text, levels, percent
 
 
@@ -43,10 +43,18 @@ def test_no_decibels_for_an_error_that_may_be_none() -> None:
     )
 
 
-def test_flip_that_noise_explains() -> None:
-    picture = {"references": {"query": {"flip": {"hdr": 0.1}}}}
-    made = [{"flip": {"hdr": 0.09}}, {"flip": {"hdr": 0.2}}]
-    assert flip_texts(picture, "query", made, "hdr") == ["0.090, not above noise alone (0.100)", "0.200"]
+def test_visible_differences_that_noise_explains() -> None:
+    hdr, ssim, learned = MEASURES[1], MEASURES[2], MEASURES[3]
+    noise = {"flip": {"hdr": 0.1}, "ssim": 0.9, "st_lpips": None}
+    close = {"flip": {"hdr": 0.09}, "ssim": 0.93, "st_lpips": None}
+    far = {"flip": {"hdr": 0.2}, "ssim": 0.8, "st_lpips": None}
+    texts = [visible_text(hdr, record, noise) for record in (close, far)]
+    assert texts == ["0.090, not above noise alone (0.100)", "0.200"]
+    # The larger SSIM is the smaller difference.
+    texts = [visible_text(ssim, record, noise) for record in (close, far)]
+    assert texts == ["0.930, not above noise alone (0.900)", "0.800"]
+    assert visible_text(learned, far, noise) == "–"
+    assert [m.title for m in measured([{"fits": {"a": far}}], ["a"])] == ["HDR-FLIP", "SSIM"]
 
 
 def test_levels_finer_than_the_data_are_named() -> None:

@@ -1,8 +1,8 @@
-"""Makes docs/pictures/readme.png from a finished quickstart run: reference left of each seam, fitted
+"""Makes docs/pictures/comparison.png from a finished quickstart run: reference left of each seam, fitted
 material right of it.
 
 Run after ``make demo``, from the repository's root: ``.venv/bin/python
-docs/pictures/make_readme_picture.py``.
+docs/pictures/make_comparison_picture.py``.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ def main() -> None:
     panels = [split(scene) for scene in SCENES]
     gap = np.full((panels[0].shape[0], GAP, 3), 255, np.uint8)
     row = [part for panel in panels for part in (panel, gap)][:-1]
-    Image.fromarray(np.concatenate(row, axis=1)).save(Path(__file__).with_name("readme.png"), optimize=True)
+    picture = Image.fromarray(np.concatenate(row, axis=1))
+    picture.save(Path(__file__).with_name("comparison.png"), optimize=True)
 
 
 if __name__ == "__main__":

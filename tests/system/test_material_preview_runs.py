@@ -1,0 +1,44 @@
+"""``mbtf-fit preview`` in a process that can import neither PyTorch nor reach a network."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from conftest import RunPython
+from PIL import Image
+from support.plugin_materials import write_material
+
+BLOCKED = """
+import socket, sys
+for name in ("torch", "scipy", "trimesh", "pyvista"):
+    sys.modules[name] = None  # importing it fails
+def refuse(*a, **k):
+    raise AssertionError("the network was asked for")
+socket.socket.connect = refuse
+from mbtf_fit.__main__ import main
+sys.argv = ["mbtf-fit", *sys.argv[1:]]
+sys.exit(main())
+"""
+SMALL = ("--size", "64", "--turn-size", "16", "--frames", "2", "--spp", "1", "--set", "sheet.spans=[1, 3]")
+
+
+def test_pictures_without_pytorch_kept_and_refused(tmp_path: Path, run_python: RunPython) -> None:
+    write_material(tmp_path / "material", finest=1)
+    words = ("preview", str(tmp_path / "material"), "-o", str(tmp_path / "out"))
+    done = run_python("-c", BLOCKED, *words, *SMALL, "--json")
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert [Path(p["file"]).name for p in report["pictures"]] == ["sheet.png", "turntable.gif"]
+    assert not any(p["kept"] for p in report["pictures"])
+    with Image.open(tmp_path / "out/turntable.gif") as turn:
+        assert (turn.size, turn.n_frames) == ((16, 16), 2)
+    with Image.open(tmp_path / "out/sheet.png") as sheet:
+        assert sheet.width > 6 * 64
+    (tmp_path / "out/turntable.gif").unlink()
+    again = json.loads(run_python("-c", BLOCKED, *words, *SMALL, "--json").stdout)
+    assert [p["kept"] for p in again["pictures"]] == [True, False]
+    other = run_python("-c", BLOCKED, *words, *SMALL, "--tiles", "5")
+    assert other.returncode == 3
+    assert "holds pictures of another configuration: turntable.tiles: 8 -> 5" in other.stderr
+    assert len(other.stderr.splitlines()) <= 2
