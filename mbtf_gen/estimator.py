@@ -107,8 +107,8 @@ class Lanes:
         """Lanes of queries that follow each other."""
         starts = np.cumsum(counts) - counts
         query = np.repeat(np.arange(len(counts), dtype=np.uint32), counts)
-        columns = (_aligned(x) for x in (query, starts, counts // 2))
-        return cls(first, counts, starts, *columns, _slopes(queries))
+        columns = [*(_aligned(x) for x in (query, starts, counts // 2)), _slopes(queries)]
+        return cls(first, counts, starts, *columns)
 
     def number(self, lane: int) -> int:
         """Number in the shard of a lane's query."""
