@@ -227,7 +227,7 @@ def generate(
     overwrite : replace what is there; slices keep a data set of the same configuration, which others of
         them may have begun
     slice_index, slice_count : make only shards i with ``i % slice_count == slice_index - 1``
-    progress : called with (paths traced so far in this run, note), see :func:`paths_left`
+    progress : called with (paths so far in this run, as planned, note), see :func:`paths_left`
     job : the configuration with its material loaded, where the caller has it already
 
     Raises

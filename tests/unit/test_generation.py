@@ -109,6 +109,25 @@ def test_a_run_is_complete_and_counts(config: GeneratorConfig, engine: Formula, 
     assert not list((tmp_path / "out").glob(".*"))
 
 
+def test_progress_ends_where_it_was_to_end_whatever_queries_took(
+    config: GeneratorConfig, engine: Formula, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As under a target error: time left follows from the share that is done."""
+    real = Formula.estimate
+
+    def more(self: Formula, *arguments: Any) -> Estimates:
+        found: Estimates = real(self, *arguments)
+        return dataclasses.replace(found, paths=7 * found.paths)
+
+    monkeypatch.setattr(Formula, "estimate", more)
+    seen: list[float] = []
+    left = paths_left(Job.prepare(config), tmp_path / "out")
+    summary = generate(config, tmp_path / "out", progress=lambda done, note: seen.append(done))
+    assert seen == [80, 160, 200, 320]
+    assert seen[-1] == left
+    assert summary.paths == 7 * 320
+
+
 def test_too_many_nonfinite_samples_fail_the_run_and_name_their_place(
     config: GeneratorConfig, engine: Formula, tmp_path: Path
 ) -> None:
