@@ -250,6 +250,13 @@ def test_the_checksum_is_that_of_the_file_with_its_digits_at_zero(tmp_path: Path
     assert list(json.loads(content)) == ["rows", "checksum"]
 
 
+def test_what_a_library_wrote_is_digested_not_what_it_replaces(tmp_path: Path) -> None:
+    for content in (b"old", b"newer"):
+        stored = atomic.write_through(tmp_path / "a", lambda temporary, c=content: temporary.write_bytes(c))
+        assert stored == atomic.Stored(len(content), hashlib.sha256(content).hexdigest())
+        assert (tmp_path / "a").read_bytes() == content
+
+
 def test_pieces_are_digested_as_they_are_written(tmp_path: Path) -> None:
     pieces = [b"abc", memoryview(b"x" * 100_000), b"", bytearray(b"z")]
     stored = atomic.write_chunks(tmp_path / "a", pieces)
