@@ -1,11 +1,14 @@
 """Many noisy queries or few clean ones? Held-out error of a fit at equal numbers of paths.
 
-    python benchmarks/query_split.py [MATERIAL ...] [--paths 2e6 --paths 8e6] [--spp 2 ...] [--time 15s]
-                                     [--levels 6] [--height H] [--plot FILE]
+    python benchmarks/query_split.py [MATERIAL ...] [--paths 1.6e6 --paths 6.4e6] [--spp 2 ...] [--steps N]
+                                     [--levels 6] [--height H] [--keep FILE] [--plot FILE]
 
 For every material (by default three of ``assets/``), budget of paths and number of paths per query a data set
-is made, a ``neumip`` trained on it for the same time, and judged by test queries that all share. Prints the
-unexplained variance, and for each budget the number of paths per query that left least.
+is made, a ``neumip`` trained on it for the same number of steps, and judged by test queries that all share.
+No figure depends on the machine's speed. At 64² texels the default budgets are those of the qualities
+``draft`` and ``standard``. Prints the unexplained variance, and for each budget the number of paths per query
+that left least. ``--keep`` writes every point to a file as soon as it is measured, and takes over those that
+stand there already, so that a run may be interrupted.
 
 The last line is one JSON object.
 """
@@ -22,7 +25,6 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_gen.config import GeneratorConfig
-from mbtf_gen.durations import parse_duration
 from mbtf_gen.errors import MbtfError
 from mbtf_pipeline.cost.chains import Chain, Workshop
 from mbtf_pipeline.plots import Cloud, scatter
@@ -30,7 +32,33 @@ from mbtf_pipeline.plots import Cloud, scatter
 ROOT = Path(__file__).resolve().parents[1]
 ASSETS = ("cliff_rock", "straight_wool", "turtle_shell")
 SPP = (2, 4, 8, 16, 64, 256)
-PATHS = (2e6, 8e6)
+PATHS = (1.6e6, 6.4e6)
+# What makes a point another one.
+KEY = ("material", "height", "levels", "steps", "paths", "spp")
+
+
+class Kept:
+    """Points that were measured, one JSON object per line of a file; nothing is kept without one."""
+
+    def __init__(self, path: Path | None) -> None:
+        self._path = path
+        lines = path.read_text().splitlines() if path is not None and path.exists() else []
+        self._rows = {self._key(row): row for row in map(json.loads, lines)}
+
+    @staticmethod
+    def _key(row: dict[str, Any]) -> tuple[Any, ...]:
+        return tuple(row[name] for name in KEY)
+
+    def find(self, row: dict[str, Any]) -> dict[str, Any] | None:
+        """The point of a key, if it was measured before."""
+        return self._rows.get(self._key(row))
+
+    def add(self, row: dict[str, Any]) -> None:
+        """Keep a point."""
+        self._rows[self._key(row)] = row
+        if self._path is not None:
+            with self._path.open("a", encoding="utf-8") as stream:
+                stream.write(json.dumps(row) + "\n")
 
 
 def measure(
@@ -39,7 +67,8 @@ def measure(
     levels: int,
     budgets: Sequence[float],
     spps: Sequence[int],
-    time: str,
+    steps: int,
+    kept: Kept,
 ) -> list[dict[str, Any]]:
     """One row per budget and number of paths per query."""
     config = GeneratorConfig.model_validate(
@@ -50,28 +79,26 @@ def measure(
         }
     )
     rows = []
-    fit = {"model": "neumip", "training": {"time": time}}
+    fit = {"model": "neumip", "training": {"steps": steps}}
     with tempfile.TemporaryDirectory() as work:
         shop = Workshop(
             config, Path(work), "", lambda note: print(f"{material.name}: {note}", file=sys.stderr)
         )
         for budget in budgets:
             for spp in spps:
-                queries = max(1, int(budget) // spp)
-                point = shop.measure(Chain("data", f"{budget:g} paths", f"{spp}", queries, spp, fit))
-                shop.forget(queries, spp)
-                rows.append(
-                    {
-                        "material": material.name,
-                        "paths": int(budget),
-                        "spp": spp,
-                        "queries": queries,
-                        "unexplained": point.error.as_dict(),
-                        "generation_seconds": round(point.details["generation_seconds"], 2),
-                    }
-                )
+                key = dict(zip(KEY, (material.name, height, levels, steps, int(budget), spp), strict=True))
+                row = kept.find(key)
+                if row is None:
+                    queries = max(1, int(budget) // spp)
+                    point = shop.measure(Chain("data", f"{budget:g} paths", f"{spp}", queries, spp, fit))
+                    shop.forget(queries, spp)
+                    row = {**key, "queries": queries, "unexplained": point.error.as_dict()}
+                    kept.add(row)
+                rows.append(row)
+                left = row["unexplained"]
                 print(
-                    f"{material.name:16s} {budget / 1e6:6.1f} M paths  {spp:4d} per query  {point.error}",
+                    f"{material.name:16s} {budget / 1e6:6.1f} M paths  {spp:4d} per query  "
+                    f"{left['value']:.4f} ± {left['error']:.4f}",
                     flush=True,
                 )
     return rows
@@ -111,14 +138,15 @@ def main() -> int:
     parser.add_argument("materials", nargs="*", type=Path)
     parser.add_argument("--paths", type=float, action="append", help="budget of paths; repeatable")
     parser.add_argument("--spp", type=int, action="append", help="paths per query; repeatable")
-    parser.add_argument("--time", default="15s", help="training time of each fit")
+    parser.add_argument("--steps", type=int, default=1000, help="training steps of each fit")
     parser.add_argument("--levels", type=int, default=6)
     parser.add_argument("--height", type=float, help="factor on the stored heights")
+    parser.add_argument("--keep", type=Path, help="file of the points that were measured, to go on from")
     parser.add_argument("--plot", type=Path, help="PNG of the table")
     arguments = parser.parse_args()
     rows: list[dict[str, Any]] = []
     try:
-        parse_duration(arguments.time)
+        kept = Kept(arguments.keep)
         for material in arguments.materials or [ROOT / "assets" / name for name in ASSETS]:
             rows += measure(
                 material,
@@ -126,7 +154,8 @@ def main() -> int:
                 arguments.levels,
                 arguments.paths or PATHS,
                 arguments.spp or SPP,
-                arguments.time,
+                arguments.steps,
+                kept,
             )
     except (MbtfError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)

@@ -7,9 +7,9 @@ of it follows from level and directions. A pilot before the run, with random num
     ln s = quadratic polynomial of (l, ln cos θi, ln cos θo, ω_i·ω_o sideways, ln of the half vector's slope,
                                     azimuths)
 
-and the counts of every query of every shard follow from these weights, which the manifest keeps. So the
-counts never look at the paths that they count: every half stays unbiased, the halves stay independent, and a
-shard can be made alone.
+and the counts of every query of every shard follow from these weights, which the manifest keeps, by exactly
+rounded operations. So the counts never look at the paths that they count: every half stays unbiased, the
+halves stay independent, and a shard can be made alone, on any machine.
 
 The same pilot fits the mean value over directions. The mean of M over positions is the tile mean whatever the
 footprint, so this is a smooth estimate of the tile mean at any pair of directions.
@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from . import exact
 from .estimates import Estimates, Stream
 from .queries import Queries
 
@@ -52,15 +53,15 @@ _CONVERGED, _STEPS, _LEAST_PART = 1e-10, 50, 1e-9
 def _features(queries: Queries) -> list[F64]:
     """What the polynomial is of, one array (n,) each, all of order one."""
     wi, wo = queries.omega_i.astype(np.float64), queries.omega_o.astype(np.float64)
-    level = -np.log2(2.0 * queries.sigma.astype(np.float64))
+    level = -exact.log(2.0 * queries.sigma.astype(np.float64)) / math.log(2.0)
     half = wi + wo
     length = np.sqrt(half[:, 0] ** 2 + half[:, 1] ** 2 + half[:, 2] ** 2)
     return [
         level / 8.0,
-        np.log(wi[:, 2]),
-        np.log(wo[:, 2]),
+        exact.log(wi[:, 2]),
+        exact.log(wo[:, 2]),
         wi[:, 0] * wo[:, 0] + wi[:, 1] * wo[:, 1],
-        0.25 * np.log(1.001 - half[:, 2] / length),
+        0.25 * exact.log(1.001 - half[:, 2] / length),
         wi[:, 0],
         wi[:, 1],
         wo[:, 0],
@@ -166,7 +167,7 @@ def _evaluate(weights: tuple[float, ...], terms: list[F64]) -> F64:
     total = np.zeros(len(terms[0]))
     for weight, term in zip(weights, terms, strict=True):
         total += weight * term
-    return np.exp(np.clip(total, -60.0, 60.0))
+    return exact.exp(np.clip(total, -60.0, 60.0))
 
 
 def _constant(terms: list[F64], value: float) -> F64:
@@ -177,9 +178,9 @@ def _constant(terms: list[F64], value: float) -> F64:
 
 def _round_counts(wanted: F64, spp: int) -> NDArray[np.int64]:
     # The nearest power of two in the sense of ratios.
-    power = np.rint(np.log2(np.maximum(wanted, 1e-9)))
+    power = np.rint(exact.log(np.maximum(wanted, 1e-9)) / math.log(2.0))
     most = math.floor(math.log2(MOST_OVER_MEAN * spp))
-    return np.exp2(np.clip(power, math.log2(FEWEST), most)).astype(np.int64)
+    return np.int64(1) << np.clip(power, math.log2(FEWEST), most).astype(np.int64)
 
 
 def fit_deviation(terms: list[F64], size: F64) -> F64 | None:

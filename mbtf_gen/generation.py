@@ -80,14 +80,25 @@ class Job:
         except ValueError as error:
             raise UsageError(str(error), where="queries.mixture") from None
         return QueryPlan(
-            self.lattice, mixture, queries.min_cos, queries.layout, self.config.seed, self._shard_rows()
+            self.lattice,
+            mixture,
+            queries.min_cos,
+            queries.layout,
+            self.config.seed,
+            self._shard_rows(),
+            queries.window,
         )
 
+    @property
+    def places(self) -> int:
+        """Queries per row of a shard: one, or those of a buffer."""
+        queries = self.config.queries
+        if queries.layout == "shuffled":
+            return 1
+        return self.lattice.texels() if queries.window is None else queries.window**2
+
     def _shard_rows(self) -> int:
-        per_shard = self.config.output.shard_queries
-        if self.config.queries.layout == "image":
-            return max(1, per_shard // self.lattice.texels())
-        return per_shard
+        return max(1, self.config.output.shard_queries // self.places)
 
     @cached_property
     def grid(self) -> HeightGrid:
@@ -131,7 +142,7 @@ class Job:
         return sum(self._queries(entry) for entry in self.shards(split))
 
     def _queries(self, entry: ShardEntry) -> int:
-        return entry.rows * (self.lattice.texels() if self.config.queries.layout == "image" else 1)
+        return entry.rows * self.places
 
     def slice(self, index: int, count: int) -> list[ShardEntry]:
         """Shards of slice number `index` (from 1) of `count`: every `count`-th of all splits' shards."""
@@ -148,7 +159,7 @@ class Job:
         wanted = self.config.queries.train if split == "train" else self.config.queries.test
         rows = count_queries(wanted, self.lattice.texels())
         if self.config.queries.layout == "image":
-            rows = max(1, math.ceil(rows / self.lattice.texels()))
+            rows = max(1, math.ceil(rows / self.places))
         size = self._shard_rows()
         if rows > size * MAX_SHARD_FILES:
             raise UsageError(
@@ -172,10 +183,18 @@ def build_estimator(config: GeneratorConfig, material: Material) -> Any:
 
 def plan_run(job: Job) -> EffectsPlan:
     """Effects that a run simulates, and which queries get how many paths; by pilots where they pay."""
-    large = job.all_paths() >= SMALL_RUN
-    plan = plan_effects(job, pilots=large)
+    return allocated(job, plan_effects(job, pilots=_is_large(job)))
+
+
+def _is_large(job: Job) -> bool:
+    return job.all_paths() >= SMALL_RUN
+
+
+def allocated(job: Job, plan: EffectsPlan) -> EffectsPlan:
+    """A plan with the allocation of a run under it: by a pilot under a target error and in large runs."""
     queries = job.config.queries
-    if plan.closed_form or (queries.target_error is None and not (large and queries.allocation == "noise")):
+    wanted = queries.target_error is not None or (_is_large(job) and queries.allocation == "noise")
+    if plan.closed_form or not wanted:
         return plan
     return replace(plan, allocation=measure_allocation(job, plan))
 
@@ -219,7 +238,7 @@ def generate(
     overwrite : replace what is there; slices keep a data set of the same configuration, which others of
         them may have begun
     slice_index, slice_count : make only shards i with ``i % slice_count == slice_index - 1``
-    progress : called with (paths traced so far in this run, note), see :func:`paths_left`
+    progress : called with (paths so far in this run, as planned, note), see :func:`paths_left`
     job : the configuration with its material loaded, where the caller has it already
 
     Raises

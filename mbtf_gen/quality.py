@@ -13,8 +13,8 @@ Quality = Literal["draft", "standard", "high", "paper"]
 # The generator's options by quality, dotted names.
 GENERATOR: dict[Quality, dict[str, Any]] = {
     "draft": {
-        "queries.train": "100/texel",
-        "queries.spp": 4,
+        "queries.train": "200/texel",
+        "queries.spp": 2,
         "queries.test": "8192",
         "queries.test_spp": 64,
     },

@@ -1,7 +1,7 @@
 """The displaced tile, ready to be traced: its shape and its surface, centred on the origin.
 
 Scene units: the longer side of the tile is 32 units, where single precision resolves 2e-6 and hit points are
-exact enough for a ray offset of 1e-6 tile widths.
+exact enough for a ray offset of 8e-6 units.
 """
 
 from __future__ import annotations

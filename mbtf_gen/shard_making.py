@@ -163,7 +163,8 @@ def make_shards(
     Parameters
     ----------
     condemned : files to make again although they pass for finished
-    progress : called with (paths traced so far, note), once per shard
+    progress : called with (paths so far, note), once per shard; counted as planned, whatever a target error
+        or an allocation made of them
 
     Raises
     ------
@@ -173,7 +174,7 @@ def make_shards(
     reached, mine = Tally(), Tally()
     made = Made(0, [], [], 0.0, 0.0, 0.0)
     records: list[dict[str, Any]] = []
-    everything = job.all_paths()
+    planned, everything = 0, job.all_paths()
 
     def report(record: dict[str, Any] | None = None) -> None:
         for done in [*([] if record is None else [record]), *(records.pop() for _ in range(len(records)))]:
@@ -181,7 +182,7 @@ def make_shards(
         if progress is not None:
             rate = made.paths / max(time.perf_counter() - start, 1e-9)
             error = f", noise {reached.relative_error():.2%}" if reached.train else ""
-            progress(made.paths, f"{rate / 1e6:.2f} M paths/s{error}")
+            progress(planned, f"{rate / 1e6:.2f} M paths/s{error}")
 
     def store(shard: Rendered, path: Path) -> None:
         records.append(store_shard(job, shard, path, effects))
@@ -208,6 +209,7 @@ def make_shards(
             writer.submit(partial(store, shard, claim.path), claim.lock.release)
             claims.hand_on(claim.lock)
             made.paths += estimates.paths
+            planned += job.paths(entry)
             made.shards.append(entry.file)
             report()
             mine.add_quarantined(entry.file, quarantined(estimates))

@@ -29,6 +29,7 @@ def run(
     *,
     output: Output = None,
     quality: Quality | None = None,
+    quick: Annotated[bool, Parameter(negative="")] = False,
     force: Annotated[bool, Parameter(negative="")] = False,
     assignments: Set | None = None,
     console: Console = CONSOLE,
@@ -45,9 +46,21 @@ def run(
         Folder of the run. Default: out/NAME
     quality
         Sizes and times of all stages, in place of the recipe's.
+    quick
+        The quick size of a paper recipe: minutes in place of hours.
     force
         Run every stage, also those that are up to date.
     """
+    from .paper.recipe import is_paper_recipe
+
+    if is_paper_recipe(recipe):
+        if quality is not None:
+            cure = "leave it out; --quick is the small size"
+            raise UsageError("a paper recipe has sizes of its own", where="--quality", cure=cure)
+        _run_paper(recipe, output, quick, force, assignments or [], console)
+        return
+    if quick:
+        raise UsageError("only paper recipes have a quick size", where="--quick", cure="use --quality draft")
     from .quality import quality_assignments
     from .recipe import load_recipe
     from .run import run_recipe
@@ -59,6 +72,41 @@ def run(
     command += [part for a in assignments or [] for part in ("--set", a)]
     result = run_recipe(loaded, output, force=force, command=shlex.join(command), console=console)
     console.report(_summary(result), _describe(result))
+
+
+def _run_paper(
+    file: Path, output: Path | None, quick: bool, force: bool, assignments: list[str], console: Console
+) -> None:
+    from .paper.recipe import load_paper_recipe, plan
+    from .paper.suite import run_paper
+
+    paper = load_paper_recipe(file, assignments)
+    planned, missing = plan(paper, file, quick)
+    folder = output if output is not None else paper.folder(quick)
+    command = ["mbtf-pipeline", "run", str(file), *(["--quick"] if quick else [])]
+    command += ["-o", str(output)] if output is not None else []
+    command += [part for a in assignments for part in ("--set", a)]
+    done = run_paper(
+        paper,
+        planned,
+        missing,
+        folder,
+        quick=quick,
+        command=shlex.join(command),
+        force=force,
+        console=console,
+    )
+    skipped = f", {len(missing)} skipped: {', '.join(missing)}" if missing else ""
+    data = {
+        "folder": done.folder,
+        "page": done.page,
+        "size": done.record["size"],
+        "tables": done.tables,
+        "runs": [one.name for one in planned],
+        "skipped": missing,
+    }
+    size = done.record["size"]
+    console.report(data, f"{done.page}: {size} size, {len(planned)} runs{skipped}")
 
 
 def _summary(result: RunResult) -> dict[str, Any]:
@@ -118,6 +166,7 @@ def list_recipes(
 
 
 def _entry(path: Path, verbose: bool) -> dict[str, Any]:
+    from .paper.recipe import is_paper_recipe, load_paper_recipe
     from .recipe import load_recipe
 
     entry: dict[str, Any] = {
@@ -128,6 +177,10 @@ def _entry(path: Path, verbose: bool) -> dict[str, Any]:
         "stages": {},
     }
     try:
+        if is_paper_recipe(path):
+            paper = load_paper_recipe(path, [])
+            about = {"name": paper.name, "description": paper.description}
+            return entry | about | {"folder": str(paper.folder(False))}
         recipe = load_recipe(path)
         entry |= {"name": recipe.name, "description": recipe.description, "folder": str(recipe.folder)}
         if verbose:
@@ -148,16 +201,17 @@ def _without(path: Path, message: str) -> str:
 
 @app.command
 def report(folder: Path, /, *, console: Console = CONSOLE) -> None:
-    """Write the report of a finished run again.
+    """Write the report of a finished run again, or the page and tables of a paper recipe.
 
     Parameters
     ----------
     folder
         Folder of the run.
     """
+    from .paper.suite import is_paper, write_again
     from .run import rerender
 
-    path = rerender(folder)
+    path = write_again(folder) if is_paper(folder) else rerender(folder)
     size = path.stat().st_size
     console.report({"report": path, "bytes": size}, f"{path}: {size / 1e6:.1f} MB")
 

@@ -26,6 +26,8 @@ LIGHTS = (1, 4, 16)
 _CHUNK = 1 << 15
 _TIMINGS = 3
 _SEED = 7
+# One of so many pixels is evaluated, and times are scaled: they grow with the number of queries alone.
+_THIN = 8
 
 T = TypeVar("T")
 
@@ -89,8 +91,8 @@ def _once(work: Callable[[], Any]) -> Callable[[], None]:
 def measure_timing(material: Material, pixels: int, device: str = "cpu") -> dict[str, Any]:
     """Milliseconds of one evaluation per pixel and their parts, plain data.
 
-    Models that read many places for one query are timed at as many queries fewer, and the time is scaled;
-    ``queries`` says how many were evaluated.
+    An eighth of the pixels is evaluated, and where a model reads many places for one query as many fewer; the
+    times are scaled, ``queries`` says how many were evaluated.
 
     Parameters
     ----------
@@ -98,7 +100,7 @@ def measure_timing(material: Material, pixels: int, device: str = "cpu") -> dict
     pixels : queries that the times are for
     """
     model = material.model
-    count = max(1, pixels // model.positions)
+    count = max(1, pixels // (_THIN * model.positions))
     work = Workload.random(count, model.lattice.finest, device)
     size = max(1, _CHUNK // model.positions)
     scale = 1e3 * pixels / count
@@ -136,6 +138,8 @@ def _first_features(material: Material, work: Workload, size: int) -> Any:
 
 def _parts(material: Material) -> dict[str, Callable[..., Any]]:
     """What stage 1 does, part by part, at one place per position that the model reads."""
+    from mbtf_fit.models.encodings import encode_position
+
     model = material.model
     around = model.positions
 
@@ -153,4 +157,7 @@ def _parts(material: Material) -> dict[str, Callable[..., Any]]:
 
         out["offset network"] = offset_network
     out["pyramid"] = lambda u, s, i, o: model.read(spread(u), model.level(spread(s)))
+    encoding = model.network.encoding
+    if encoding.position:
+        out["encoding"] = lambda u, s, i, o: encode_position(spread(u), encoding)
     return out

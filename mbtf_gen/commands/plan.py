@@ -24,6 +24,7 @@ def plan(
     *,
     queries: str | None = None,
     spp: int | None = None,
+    target_error: str | None = None,
     effects: str | None = None,
     tolerance: float | None = None,
     height: float | None = None,
@@ -51,6 +52,8 @@ def plan(
         Training queries of the run that is forecast: N, or N/texel of the finest level. Default: 100/texel
     spp
         Paths per training query, both halves together (even). Default: 4
+    target_error
+        Error of every training value to reach, relative to max(value, tile mean), such as 2%.
     effects
         auto, all, none, then +x or -x: effects of light to simulate. Default: auto
     tolerance
@@ -79,6 +82,7 @@ def plan(
     flags = {
         "--queries": ("queries.train", queries),
         "--spp": ("queries.spp", spp),
+        "--target-error": ("queries.target_error", target_error),
         "--effects": ("effects.mode", effects),
         "--tolerance": ("effects.tolerance", tolerance),
         "--min-cos": ("queries.min_cos", min_cos),
@@ -97,11 +101,12 @@ def plan(
         console.report({**found.to_manifest(), "forecast": None}, table(found))
         return
     from ..forecast import forecast
+    from ..generation import allocated
 
-    expected = forecast(job, found)
+    expected = forecast(job, allocated(job, found))
     found = measured(job, found)
     data = {**found.to_manifest(), "forecast": expected.as_dict()}
-    console.report(data, f"{table(found)}\n{expected.describe()}")
+    console.report(data, f"{table(found)}\n{expected.describe(job.target('train'))}")
 
 
 def table(plan: EffectsPlan) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from numpy.typing import NDArray
 from support.scenes import HeightGrid, build_tile, lambert, mi, rocks
 
 from mbtf_gen.field import HeightField, closest_hit, hit_and_shadow, occluded
+from mbtf_gen.seeds import sequence
 from mbtf_gen.stock import mesh_of_grid
 
 N = 200_000
@@ -128,6 +131,95 @@ def test_two_rays_at_once_are_as_each_alone() -> None:
     both = np.array(si.is_valid()) & np.array(alone.is_valid())
     gap = (np.array(si.p) - np.array(alone.p))[:, both]
     assert np.mean(np.abs(gap).max(axis=0) > 1e-3) < 1e-4
+
+
+def test_grazing_rays_and_rays_that_bounced_meet_what_the_mesh_has() -> None:
+    """First hits of rays down to a cosine of 1e-3, and what rays meet that leave those places at random: the
+    second bounce. Embree counts positions from far away at grazing angles, so a few may differ."""
+    grid, around = HeightGrid(rocks(16).z * 0.15, 1.0), 26
+    tile = build_tile(grid, lambert(0.5))
+    n = N // 2
+    mesh = mesh_of_grid(grid, tile.unit, (around * 16, around * 16), mi.load_dict(lambert(0.5)))
+    scene = mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, "mesh": mesh})
+    rng = np.random.default_rng(4)
+    o, d = (a[:n] for a in rays(rng, grid, tile.unit))
+    o[:, 2] = 1e-3
+    z = np.exp(rng.uniform(np.log(1e-3), np.log(0.1), n))
+    d = np.column_stack([d[:, :2] * (np.sqrt(1 - z * z) / np.hypot(*d[:, :2].T))[:, None], -z])
+
+    def compared(ray: mi.Ray3f, most: float) -> tuple[Any, NDArray]:
+        expected = scene.ray_intersect(ray)
+        found, _, capped, _ = closest_hit(tile.world.field, ray, mi.Bool(True), 4096)
+        assert not np.any(np.array(capped))
+        met = np.array(found.is_valid())
+        # Rays that leave upwards leave the mesh as well.
+        assert np.mean(met != np.array(expected.is_valid())) < most
+        gap = np.array(expected.p) - np.array(found.p)
+        gap[:2] -= np.round(gap[:2] / tile.unit) * tile.unit
+        wrong = (np.abs(gap).max(axis=0) > 1e-3 * tile.unit) & met & np.array(expected.is_valid())
+        assert np.mean(wrong) < most
+        return found, met
+
+    first, met = compared(ray_of(o, d), 2e-3)
+    assert met.all()
+    # Into the upper half space about the normal, half of them nearly level.
+    d = rng.normal(size=(n, 3)) * np.where(rng.random((n, 1)) < 0.5, [[1, 1, 0.02]], [[1, 1, 1]])
+    normal = np.array(first.n).T
+    d *= np.sign(np.sum(d * normal, axis=1))[:, None]
+    d /= np.linalg.norm(d, axis=1)[:, None]
+    _, met = compared(tile.world.field.leave(first, ray_of(d, d).d), 2e-3)
+    assert 0.2 < met.mean() < 0.9
+
+
+class Sieve:
+    """Stops a share of the rays."""
+
+    def __init__(self, share: float) -> None:
+        self.share = share
+
+    def opacity(self, si: Any) -> Any:
+        return mi.Float(self.share)
+
+
+def numbers(n: int) -> Any:
+    return sequence(mi.UInt32(1), mi.UInt32(2), dr.arange(mi.UInt32, n), mi.UInt32(0))
+
+
+def test_borders_are_counted_through_holes() -> None:
+    """A ray that passes through holes has crossed as many borders as a straight line to where it ends, and
+    the cap cuts just those that cross more."""
+    grid, n = rocks(32), 20_000
+    field = HeightField.of(grid, 32.0, True)
+    rng = np.random.default_rng(3)
+    o, d = (a[:n] for a in rays(rng, grid, 32.0))
+    o[:, 2] = -0.4 * 32.0 * grid.relief
+    d[:, 2] *= -0.03 * rng.choice([-1, 1], n)
+    d /= np.linalg.norm(d, axis=1)[:, None]
+    ray, below = ray_of(o, d), mi.Bool(False)
+
+    def run(most: int) -> tuple[Any, NDArray, NDArray]:
+        si, crossings, capped, _ = closest_hit(
+            field, ray, mi.Bool(True), most, below, Sieve(0.15), numbers(n)
+        )
+        return si, np.array(crossings), np.array(capped)
+
+    si, crossings, capped = run(1000)
+    met = np.array(si.is_valid())
+    assert not capped.any()
+    assert 0.3 < met.mean() < 0.9
+    t = (np.array(si.p)[2] - o[:, 2]) / d[:, 2]
+    end = o[:, :2] + t[:, None] * d[:, :2]
+    # The border runs through vertices, which are texel centres.
+    low = -16.0 + 0.5
+    borders = np.abs(np.floor((end - low) / 32.0) - np.floor((o[:, :2] - low) / 32.0)).sum(axis=1)
+    # Nearly level rays are moved along by what lifts them off the surface.
+    assert np.mean(crossings[met] != borders[met]) < 1e-2
+    assert crossings[met].max() > 5
+    for most in (0, 2):
+        _, fewer, cut = run(most)
+        assert 0.05 < cut.mean() < 0.95
+        assert (cut == (crossings > most)).all()
+        assert (fewer == np.minimum(crossings, most)).all()
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])

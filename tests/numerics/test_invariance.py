@@ -66,6 +66,37 @@ def test_the_border_may_lie_anywhere(rows: int, columns: int) -> None:
     assert abs(paired_difference(there, here).value) < 1e-3 * here.mean()
 
 
+@pytest.mark.parametrize("along", [0, 1], ids=["tall", "long"])
+def test_a_tile_may_be_many_times_as_long_as_wide(along: int) -> None:
+    """A tile and 64 of it in a row, counted as one: the same values, and no energy made or lost, although
+    coordinates along it have fewer digits left for the steps off the surface."""
+    count = 64
+    row = np.concatenate([RELIEF.z] * count, axis=along)
+    # Lengths are in widths of the tile.
+    scale = 1.0 if along == 0 else 1.0 / count
+    many = HeightGrid(row * scale, count if along == 0 else 1.0 / count)
+    u = positions()
+    n = len(u)
+    place = np.random.default_rng(1).integers(0, count, n)
+    v = u.copy()
+    v[:, 1 - along] = (place + u[:, 1 - along]) / count
+
+    def of(grid: HeightGrid, u: NDArray[np.float64], sigma: float) -> NDArray[np.float64]:
+        q = queries(u, sigma, LIGHT, VIEW, n)
+        e = estimate(grid, lambert(0.7), LightKernel(0.0), q, 16, transport=Transport(max_depth=4))
+        assert e.lost == 0
+        return 0.5 * (e.value_a + e.value_b)[:, 0].astype(np.float64)
+
+    here, there = of(RELIEF, u, 0.01), of(many, v, 0.01 * scale)
+    assert np.mean(np.abs(here - there) > 0.02 * here.mean()) < 0.015
+    assert abs(paired_difference(there, here).value) < 4e-4 * here.mean()
+    for view in (direction(80, 0), direction(3, 77)):
+        q = queries(np.random.default_rng(0).random((n, 2)), 0.3 * scale, [0, 0, 1], view, n)
+        e = estimate(many, lambert(1.0), None, q, 16)
+        np.testing.assert_allclose([e.value_a.mean(), e.value_b.mean()], 1.0, atol=1e-3)
+        assert e.lost <= 2
+
+
 @pytest.mark.parametrize("shift", [(1.0, 0.0), (-3.0, 2.0), (1000.0, -1000.0)])
 def test_positions_may_be_counted_from_far_away(shift: tuple[float, float]) -> None:
     """u + whole tiles: single precision holds multiples of 1/1024 up to 16384 exactly."""

@@ -6,9 +6,11 @@ import json
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from support.small_runs import contents
 
 from mbtf_gen.adaptive import Target, estimate_shard
 from mbtf_gen.allocation import fit_allocation
@@ -17,10 +19,12 @@ from mbtf_gen.dataset import Dataset
 from mbtf_gen.effects import EffectsPlan
 from mbtf_gen.engine import load_mitsuba
 from mbtf_gen.estimates import Estimates, Stream
-from mbtf_gen.generation import generate
+from mbtf_gen.generation import Job, generate, plan_run
 from mbtf_gen.levels import Lattice
+from mbtf_gen.planning import plan_effects
 from mbtf_gen.queries import Mixture, Queries, QueryPlan
 from mbtf_gen.stats import mean_estimate, noise_free_mse, z_test
+from mbtf_gen.summary import finish
 
 load_mitsuba()
 
@@ -80,7 +84,7 @@ def test_a_skewed_scene_comes_near_its_target_and_what_is_reported_is_so(
     e = estimate_shard(FewBrightPaths(), q, 4, Target(0.2, 8192), Stream(1, "train", 0), plan)
     value = 0.5 * (e.value_a[:, 0].astype(np.float64) + e.value_b[:, 0])
     error = float(np.sqrt(np.mean((value - TRUTH) ** 2))) / TRUTH
-    assert 0.2 < error < 1.5 * 0.2
+    assert 0.2 < error < 1.2 * 0.2
     assert e.target is not None
     assert np.sqrt(e.target.square) == pytest.approx(error, rel=0.2)
     # What the pilot expects of a path is its root mean square deviation.
@@ -157,12 +161,66 @@ def test_the_error_reached_is_what_was_asked_for(config: GeneratorConfig, tmp_pa
     assert manifest["effects"]["allocation"]["typical"] > 0
 
 
-def test_slices_make_the_same_data(config: GeneratorConfig, tmp_path: Path) -> None:
-    for index in (2, 1):
-        generate(config, tmp_path / "parts", slice_index=index, slice_count=2)
+def of_kind(config: GeneratorConfig, kind: str) -> GeneratorConfig:
+    """Eight shards, with a target error or a mean number of paths."""
+    data = config.model_dump()
+    data["output"]["shard_queries"] = 220
+    if kind == "noise":
+        data["queries"] |= {"target_error": None, "spp": 8}
+    return GeneratorConfig.model_validate(data)
+
+
+@pytest.fixture
+def small_pilots(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every run is worth a pilot, and pilots are short."""
+    monkeypatch.setattr("mbtf_gen.generation.SMALL_RUN", 0)
+    monkeypatch.setattr("mbtf_gen.allocation.PILOT_QUERIES", 1024)
+    monkeypatch.setattr("mbtf_gen.generation.plan_effects", lambda job, pilots: plan_effects(job))
+
+
+@pytest.mark.parametrize("kind", ["target", "noise"])
+def test_any_slices_merged_are_the_whole(
+    kind: str, config: GeneratorConfig, small_pilots: None, tmp_path: Path
+) -> None:
+    """Seven of them, in any order: the same numbers of paths for every query, and the same values."""
+    config = of_kind(config, kind)
+    for index in (4, 2, 7, 1, 6, 3, 5):
+        generate(config, tmp_path / "parts", slice_index=index, slice_count=7)
+    assert finish(tmp_path / "parts").complete
     generate(config, tmp_path / "whole")
-    for name in ("train-00000.npz", "train-00001.npz", "train-00002.npz", "test-00000.npz"):
-        assert (tmp_path / "parts" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+    parts, whole = (contents(tmp_path / name) for name in ("parts", "whole"))
+    assert parts == whole
+    assert whole["manifest.json"]["effects"]["allocation"] is not None
+    assert len([name for name in whole if name.endswith(".npz")]) == 8
+    assert len(np.unique(Dataset.open(tmp_path / "whole").load("train")["spp"])) > 3
+
+
+@pytest.mark.parametrize("kind", ["target", "noise"])
+def test_counts_do_not_depend_on_launches_or_threads(
+    kind: str, config: GeneratorConfig, small_pilots: None
+) -> None:
+    job = Job.prepare(of_kind(config, kind))
+    plan = plan_run(job)
+    n = 600
+    q = job.plan().draw("train", 1, n)
+    estimator = job.estimator(plan)
+    before, found = dr.thread_count(), []
+    try:
+        for launch, threads in ((1 << 20, 3), (1 << 9, 1), (777, 3)):
+            dr.set_thread_count(threads)
+            estimator.launch = launch
+            stream = Stream(job.config.seed, "train", 1)
+            found.append(estimate_shard(estimator, q, job.spp("train"), job.target("train"), stream, plan))
+    finally:
+        dr.set_thread_count(before)
+    one = found[0]
+    assert one.spp is not None
+    assert len(np.unique(one.spp)) > 3
+    for other in found[1:]:
+        assert (other.spp == one.spp).all()
+        assert (other.value_a == one.value_a).all()
+        assert (other.value_b == one.value_b).all()
+        assert other.target == one.target
 
 
 def test_a_closed_form_needs_no_paths(tmp_path: Path) -> None:

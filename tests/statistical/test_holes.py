@@ -71,6 +71,38 @@ def test_holes_lie_where_the_map_says() -> None:
     assert (e.value_a[~inside] > 0).all()
 
 
+def test_paths_cut_at_the_cap_have_not_passed() -> None:
+    """Where nothing stops a ray, each passes or is cut, and all are counted."""
+    n, spp = 1000, 4
+    q = queries((0.5, 0.5), 0.3, direction(50, 20), direction(8, 200), n)
+    tile = sheet(rocks(), np.zeros((4, 4)))
+    e = Estimator(tile, LightKernel(2.0), Transport(max_crossings=1)).estimate(q, spp, Stream(5, "test", 0))
+    assert e.transmittance is not None
+    assert 0.1 * n * spp < e.capped < 0.9 * n * spp
+    assert float(e.transmittance.sum(dtype=np.float64)) * spp + e.capped == n * spp
+    assert not e.value_a.any()
+    assert e.lost == 0
+
+
+def test_a_path_that_is_drawn_again_passes_or_does_not() -> None:
+    """The transmittance is that of the paths that are stored: with one path per half, the share of halves
+    that saw nothing."""
+    n, bad = 4000, 0.1
+    pixels = np.full((1, 20, 3), 0.5, np.float32)
+    pixels[:, :2] = np.nan
+    colour = {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True, "filter_type": "nearest"}
+    tile = build_tile(flat(), {"type": "mbtf_surface", "base_color": colour, "opacity": 0.5})
+    q = queries((0.5, 0.5), 4.0, direction(50, 20), direction(60, 200), n)
+    e = Estimator(tile, LightKernel(2.0), PLANE).estimate(q, 2, Stream(5, "test", 0))
+    assert e.transmittance is not None
+    assert e.nonfinite == pytest.approx(2 * n * 0.5 * bad / (1 - 0.5 * bad), rel=0.2)
+    halves = np.stack([e.value_a, e.value_b])[..., 0]
+    np.testing.assert_array_equal(e.transmittance, (halves == 0).mean(axis=0))
+    # Of the paths that may be stored, more pass than of all.
+    expected = 0.5 / (1 - 0.5 * bad)
+    assert abs(e.transmittance.mean() - expected) < 4 * np.sqrt(expected * (1 - expected) / (2 * n))
+
+
 def test_an_opaque_map_changes_nothing() -> None:
     """Whether a hit lets a ray through is no dimension of a path's sequence."""
     closed = sheet(rocks(), np.ones((4, 4)))

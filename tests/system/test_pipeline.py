@@ -7,13 +7,13 @@ import json
 import re
 import subprocess
 import sys
-from html.parser import HTMLParser
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from support.pages import loads
 
 from mbtf_gen.console import run
 from mbtf_pipeline.pictures import read_picture
@@ -21,47 +21,6 @@ from mbtf_pipeline.pictures import read_picture
 ROOT = Path(__file__).resolve().parents[2]
 RECIPE = ROOT / "pipelines" / "ci.yaml"
 STAGES = ["generate", "fit neumip", "compare", "report"]
-
-
-class Loads(HTMLParser):
-    """Collects everything a page would load, and its pictures."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.external: list[str] = []
-        self.pictures: list[str] = []
-        self.style = ""
-        self._open: list[str] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        # Data for a script are read by it, never run; what it may load stands in the script.
-        inert = tag == "script" and ("type", "application/json") in attrs
-        self._open.append("data" if inert else tag)
-        for name, value in attrs:
-            if name == "style":
-                self._css(value or "")
-            if name in ("src", "href", "xlink:href", "srcset", "data", "poster", "action", "background"):
-                if tag == "img" and name == "src":
-                    self.pictures.append(value or "")
-                if not (value or "").startswith(("data:", "#")):
-                    self.external.append(f"{tag} {name}={value}")
-
-    def handle_data(self, data: str) -> None:
-        if self._open and self._open[-1] == "style":
-            self._css(data)
-        elif self._open and self._open[-1] == "script":
-            self.external += re.findall(r"(?:fetch|import|XMLHttpRequest|WebSocket|https?:)[^\n]*", data)
-
-    def _css(self, text: str) -> None:
-        self.external += re.findall(r"@import[^;]*", text)
-        found = re.findall(r"url\(\s*['\"]?([^)'\"]*)", text)
-        self.external += [url for url in found if not url.startswith(("data:", "#"))]
-
-
-def loads(html: str) -> Loads:
-    parser = Loads()
-    parser.feed(html)
-    return parser
 
 
 @pytest.mark.parametrize(

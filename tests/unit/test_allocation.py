@@ -6,9 +6,17 @@ import json
 
 import numpy as np
 import pytest
+from conftest import RunPython
 from numpy.typing import NDArray
 
-from mbtf_gen.adaptive import DOUBT, PRIOR_PATHS, round_up, wanted_paths
+from mbtf_gen.adaptive import (
+    DOUBT,
+    MOST_CORRECTION,
+    PRIOR_PATHS,
+    correction,
+    round_up,
+    wanted_paths,
+)
 from mbtf_gen.allocation import FLOOR, Allocation, _evaluate, _terms, fit_allocation, fit_log_linear
 from mbtf_gen.estimates import Estimates
 from mbtf_gen.levels import Lattice
@@ -136,6 +144,48 @@ def test_counts_of_a_query_do_not_depend_on_the_others(fitted: Allocation) -> No
     assert (fitted.counts(some, SPP) == fitted.counts(q, SPP)[7:9]).all()
 
 
+# Counts by a manifest's weights, and by a pilot of its own for a target error; prints NumPy's features in use
+# and the digest of all bits, those of the expectations too, where the last bit shows.
+CODE = """
+import hashlib, json, sys
+import numpy as np
+from mbtf_gen.adaptive import round_up, wanted_paths
+from mbtf_gen.allocation import Allocation
+from mbtf_gen.estimates import Estimates
+from mbtf_gen.levels import Lattice
+from mbtf_gen.queries import Mixture, QueryPlan
+n = 20000
+allocation = Allocation.from_manifest(json.loads(sys.argv[1]))
+q = QueryPlan(Lattice(6), Mixture(0.6, 0.4), 0.1, "shuffled", 0, n).draw("train", 3, n)
+rng = np.random.Generator(np.random.Philox(5))
+a, b, v = (0.3 * rng.random((n, k), dtype=np.float32) for k in (3, 3, 1))
+pilot = Estimates(a, b, None, 0, 0, 0, 0, path_variance=v[:, 0])
+expected = allocation.deviation(q), allocation.tile_mean(q)
+wanted, scale = wanted_paths(pilot, 16, *expected, 0.05)
+h = hashlib.sha256()
+for array in (*expected, wanted, scale, allocation.counts(q, 16), round_up(wanted, 1000)):
+    h.update(array.tobytes())
+found = np.show_config(mode="dicts")["SIMD Extensions"].get("found", [])
+print(json.dumps({"found": found, "digest": h.hexdigest()}))
+"""
+
+
+def test_counts_do_not_depend_on_the_processors_features(fitted: Allocation, run_python: RunPython) -> None:
+    def counted(features: list[str] | None) -> tuple[list[str], str]:
+        disabled = None if features is None else " ".join(features)
+        done = run_python("-c", CODE, json.dumps(fitted.to_manifest()), NPY_DISABLE_CPU_FEATURES=disabled)
+        assert done.returncode == 0, done.stderr
+        answer = json.loads(done.stdout)
+        return answer["found"], answer["digest"]
+
+    found, digest = counted(None)
+    if not found:
+        pytest.skip("NumPy uses no optional features of this processor")
+    left, again = counted(found)
+    assert len(left) < len(found)
+    assert again == digest
+
+
 def test_an_allocation_survives_the_manifest(fitted: Allocation) -> None:
     assert Allocation.from_manifest(json.loads(json.dumps(fitted.to_manifest()))) == fitted
 
@@ -164,13 +214,41 @@ def test_paths_for_a_target_error() -> None:
     found = Estimates(value, value, None, 0, 0, 0, 0, path_variance=variance)
     wanted, scale = wanted_paths(found, 16, np.full(n, 0.1), np.array([0.2, 0.2, 0.2, 0.0]), 0.05)
     # The tile mean, or a value that is well above it.
-    assert scale == pytest.approx([0.2, 2.0, 0.2, 0.1], rel=0.1)
+    assert scale == pytest.approx([0.2, 2.0, 0.2, 0.1], rel=0.15)
     # Where pilot and expectation agree, the variance over the square of what is allowed.
     shrunken = 2.0 - DOUBT * 0.01 / 16 / 1.8
     assert wanted[:2] == pytest.approx([0.01 / (0.05 * 0.2) ** 2, 0.01 / (0.05 * shrunken) ** 2])
     # A pilot that saw nothing does not overrule the expectation.
     assert wanted[2] == pytest.approx(0.01 * PRIOR_PATHS / (15 + PRIOR_PATHS) / (0.05 * 0.2) ** 2)
     assert wanted[3] == pytest.approx(0.01 / (0.05 * (0.1 - DOUBT * 0.01 / 16 / 0.1)) ** 2)
+
+
+def test_an_expectation_that_falls_short_of_the_pilots_is_raised() -> None:
+    """In proportion to the tile mean's square, and by no more than a factor; one path decides nothing."""
+    rng = np.random.default_rng(0)
+    n = 4000
+    mean = np.exp(rng.normal(size=n))
+    deviation = 0.3 * mean
+    for factor, expected in ((0.5, 1.0), (1.5, 1.5), (9.0, MOST_CORRECTION)):
+        variance = (factor * deviation) ** 2 * rng.exponential(size=n)
+        assert correction(variance, deviation, mean) == pytest.approx(expected, rel=0.05)
+        variance[7] = 1e6
+        assert correction(variance, deviation, mean) == pytest.approx(expected, rel=0.08)
+    # Where the dark ones are the noisy ones, they count.
+    dark = mean < np.median(mean)
+    assert correction(np.where(dark, 2.0, 0.7) * deviation**2, deviation, mean) == pytest.approx(
+        1.16, rel=0.02
+    )
+    # Too few say nothing; nor does black.
+    assert correction(9.0 * deviation[:100] ** 2, deviation[:100], mean[:100]) == 1.0
+    assert correction(np.zeros(n), np.zeros(n), np.zeros(n)) == 1.0
+    found = Estimates(
+        *np.zeros((2, n, 3), np.float32), None, 0, 0, 0, 0, path_variance=np.zeros(n, np.float32)
+    )
+    assert found.path_variance is not None
+    found.path_variance[:] = (1.5 * deviation) ** 2
+    wanted, _ = wanted_paths(found, 16, deviation, mean, 0.05)
+    assert wanted == pytest.approx(np.full(n, (1.5 * 0.3 / 0.05) ** 2), rel=1e-5)
 
 
 def test_one_bright_path_of_a_pilot_allows_no_larger_error() -> None:

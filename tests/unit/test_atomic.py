@@ -130,6 +130,14 @@ def test_the_data_are_synced_before_the_rename(tmp_path: Path, monkeypatch: pyte
     events.clear()
     atomic.write_through(tmp_path / "b", lambda temporary: temporary.touch())
     assert events == ["fsync", "replace", "fsync"]
+    events.clear()
+    link = os.link
+    monkeypatch.setattr(atomic.os, "link", lambda *a: events.append("link") or link(*a))
+    assert atomic.create_file(tmp_path / "c", b"text")
+    assert events == ["fsync", "link", "fsync"]
+    events.clear()
+    atomic.remove_file(tmp_path / "a")
+    assert events == ["fsync"]
 
 
 def test_json_goes_there_and_back(tmp_path: Path) -> None:
@@ -240,6 +248,13 @@ def test_the_checksum_is_that_of_the_file_with_its_digits_at_zero(tmp_path: Path
     stored = json.loads(content)["checksum"]
     assert stored == hashlib.sha256(content.replace(stored.encode(), b"0" * 64)).hexdigest()
     assert list(json.loads(content)) == ["rows", "checksum"]
+
+
+def test_what_a_library_wrote_is_digested_not_what_it_replaces(tmp_path: Path) -> None:
+    for content in (b"old", b"newer"):
+        stored = atomic.write_through(tmp_path / "a", lambda temporary, c=content: temporary.write_bytes(c))
+        assert stored == atomic.Stored(len(content), hashlib.sha256(content).hexdigest())
+        assert (tmp_path / "a").read_bytes() == content
 
 
 def test_pieces_are_digested_as_they_are_written(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mbtf_gen.exact import exp2, sincos_turns
+from mbtf_gen.exact import exp, exp2, log, sincos_turns
 
 TOLERANCE = 1e-14
 
@@ -41,9 +41,20 @@ def test_powers_of_two_are_those_of_numpy() -> None:
     np.testing.assert_array_equal(exp2(whole.astype(np.float64)), np.ldexp(1.0, whole))
 
 
+def test_exponentials_and_logarithms_are_those_of_numpy() -> None:
+    rng = np.random.default_rng(3)
+    x = np.concatenate([rng.uniform(-60, 60, 20_000), [0.0]])
+    np.testing.assert_allclose(exp(x), np.exp(x), rtol=TOLERANCE)
+    y = np.concatenate([np.exp(x), np.nextafter(1.0, [0.0, 2.0]), [1e-300, 1e300]])
+    np.testing.assert_allclose(log(y), np.log(y), rtol=TOLERANCE)
+    assert log(np.array([1.0]))[0] == 0.0
+    whole = np.arange(-900, 900)
+    assert (np.rint(log(np.ldexp(1.0, whole)) / np.log(2.0)) == whole).all()
+
+
 def test_any_shape_is_taken() -> None:
     x = np.linspace(-1, 1, 24).reshape(2, 3, 4)
-    assert exp2(x).shape == x.shape
+    assert exp2(x).shape == exp(x).shape == log(x + 2.0).shape == x.shape
     assert all(part.shape == x.shape for part in sincos_turns(x))
     np.testing.assert_array_equal(exp2(x).ravel(), exp2(x.ravel()))
 

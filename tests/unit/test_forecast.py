@@ -15,7 +15,7 @@ from mbtf_gen.config import GeneratorConfig
 from mbtf_gen.dataset import Dataset
 from mbtf_gen.estimates import Estimates, Stream
 from mbtf_gen.forecast import forecast, row_bytes, size_text
-from mbtf_gen.generation import Job
+from mbtf_gen.generation import Job, allocated
 from mbtf_gen.material import Material
 from mbtf_gen.planning import plan_effects
 from mbtf_gen.queries import Queries
@@ -38,14 +38,18 @@ class Fake:
     def __init__(self, clock: Clock) -> None:
         self.clock = clock
 
-    def estimate(self, queries: Queries, spp: int, stream: Stream) -> Estimates:
+    def estimate(self, queries: Queries, spp: Any, stream: Stream, path_variance: bool = False) -> Estimates:
         assert stream.split == "pilot"
-        rng = np.random.default_rng([stream.shard, spp])
+        rng = np.random.default_rng([stream.shard, stream.first_pass])
         n = len(queries.sigma)
-        self.clock.now += n * spp / RATE
-        noise = 0.8 * math.sqrt(2.0 / spp)
+        counts = np.broadcast_to(np.asarray(spp, np.int64), (n,))
+        paths = int(counts.sum())
+        self.clock.now += paths / RATE
+        noise = 0.8 * np.sqrt(2.0 / counts)[:, None]
         a, b = ((0.25 + noise * rng.normal(size=(n, 3))).astype(np.float32) for _ in range(2))
-        return Estimates(a, b, None, n * spp, 0, 0, 0)
+        every = None if isinstance(spp, int) else counts
+        variance = np.full(n, 0.8**2, np.float32) if path_variance else None
+        return Estimates(a, b, None, paths, 0, 0, 0, spp=every, path_variance=variance)
 
 
 def job_of(**queries: Any) -> Job:
@@ -71,6 +75,27 @@ def test_seconds_and_noise(faked: None, layout: str) -> None:
     noise = 0.8 / math.sqrt(8) / 0.25
     assert abs(found.relative_error - noise) < 5 * found.relative_error_se
     assert found.relative_error_se < 0.02 * noise
+
+
+def test_a_target_error_decides_paths_and_seconds(faked: None) -> None:
+    """All queries need the paths that bring 0.8 to 8 % of 0.25 or so, unless the cap is lower."""
+    for cap, missed in ((8192, 0.0), (512, 1.0)):
+        job = job_of(train="1000000", test="20000", test_spp=64, target_error="8%", cap=cap)
+        plan = allocated(job, plan_effects(job, pilots=False))
+        found = forecast(job, plan, seconds=0.0)
+        # 1600, rounded up to a power of two or three times one; less where a pilot's value is large.
+        assert found.missed == pytest.approx(missed, abs=0.02)
+        stored = found.paths_per_query
+        assert stored == pytest.approx(min(2048, cap), rel=0.03)
+        # No piece is many times as large as those of other runs.
+        assert found.pilot_seconds < 10 * (1 << 19) / RATE
+        # The pilots of the queries are paths, too.
+        assert found.paths == pytest.approx(1e6 * (stored + 16) + 2e4 * 64, rel=1e-3)
+        assert found.seconds == pytest.approx(found.paths / RATE, rel=1e-3)
+        assert found.relative_error == pytest.approx(0.8 / np.sqrt(stored) / 0.25, rel=0.1)
+        said = found.describe(job.target("train")).splitlines()
+        assert f"{stored:.0f} paths per training query for an error of 8.00% of" in said[1]
+        assert said[1].endswith("of the queries stop at the cap of 512") == bool(missed)
 
 
 def test_bytes_are_those_of_the_arrays(tmp_path: Path) -> None:

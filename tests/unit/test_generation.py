@@ -84,6 +84,10 @@ def test_shards_cover_the_wanted_rows(config: GeneratorConfig) -> None:
     # Image layout: whole buffers, 32 texels each; 100 queries are four of them, one per shard.
     image = Job.prepare(changed(config, queries={"layout": "image"}))
     assert [(e.file, e.rows) for e in image.shards("train")] == [(f"train-{i:05d}.npz", 1) for i in range(4)]
+    # Windows of 9 places: 100 queries are twelve of them, four per shard of 40 queries.
+    windows = Job.prepare(changed(config, queries={"layout": "image", "window": 3}))
+    assert [e.rows for e in windows.shards("train")] == [4, 4, 4]
+    assert windows.queries("train") == 108
     per_texel = Job.prepare(changed(config, queries={"train": "3/texel"}))
     assert sum(e.rows for e in per_texel.shards("train")) == 96
 
@@ -107,6 +111,25 @@ def test_a_run_is_complete_and_counts(config: GeneratorConfig, engine: Formula, 
     assert set(data["spp"]) == {2.0}
     assert verify(tmp_path / "out") == []
     assert not list((tmp_path / "out").glob(".*"))
+
+
+def test_progress_ends_where_it_was_to_end_whatever_queries_took(
+    config: GeneratorConfig, engine: Formula, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As under a target error: time left follows from the share that is done."""
+    real = Formula.estimate
+
+    def more(self: Formula, *arguments: Any) -> Estimates:
+        found: Estimates = real(self, *arguments)
+        return dataclasses.replace(found, paths=7 * found.paths)
+
+    monkeypatch.setattr(Formula, "estimate", more)
+    seen: list[float] = []
+    left = paths_left(Job.prepare(config), tmp_path / "out")
+    summary = generate(config, tmp_path / "out", progress=lambda done, note: seen.append(done))
+    assert seen == [80, 160, 200, 320]
+    assert seen[-1] == left
+    assert summary.paths == 7 * 320
 
 
 def test_too_many_nonfinite_samples_fail_the_run_and_name_their_place(

@@ -12,9 +12,12 @@ from pydantic import BaseModel
 
 from mbtf_fit.config import FitConfig
 from mbtf_gen.config import GeneratorConfig
+from mbtf_pipeline.paper.recipe import Layer, PaperRecipe, TableName
 from mbtf_pipeline.recipe import CompareSection, Recipe, ReportSection
 
-TEXT = (Path(__file__).resolve().parents[2] / "docs" / "recipes.md").read_text()
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+TEXT = (DOCS / "recipes.md").read_text()
+PAPER = (DOCS / "paper.md").read_text()
 
 
 def keys(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
@@ -28,9 +31,9 @@ def keys(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
             yield f"{prefix}{name}"
 
 
-def documented(heading: str) -> list[str]:
+def documented(heading: str, text: str = TEXT) -> list[str]:
     """Keys in the first column of the table under a heading."""
-    section = TEXT.split(f"\n{heading}\n")[1].split("\n#")[0]
+    section = text.split(f"\n{heading}\n")[1].split("\n#")[0]
     rows = [line.split("|")[1] for line in section.splitlines() if line.startswith("| `")]
     return [key for row in rows for key in re.findall(r"`([^`]+)`", row)]
 
@@ -47,3 +50,15 @@ def documented(heading: str) -> list[str]:
 )
 def test_every_key_is_documented(heading: str, model: type[BaseModel]) -> None:
     assert sorted(documented(heading)) == sorted(keys(model))
+
+
+@pytest.mark.parametrize(("heading", "model"), [("## The file", PaperRecipe), ("### Layers", Layer)])
+def test_every_key_of_a_paper_recipe_is_documented(heading: str, model: type[BaseModel]) -> None:
+    assert sorted(documented(heading, PAPER)) == sorted(model.model_fields)
+
+
+def test_every_table_and_every_paper_recipe_is_documented() -> None:
+    for table in typing.get_args(TableName):
+        assert f"`{table}`" in PAPER
+    for path in (DOCS.parent / "pipelines").glob("paper_*.yaml"):
+        assert f"| `pipelines/{path.name}` |" in PAPER

@@ -93,15 +93,42 @@ def test_the_order_of_points_differs_between_dimensions() -> None:
 
 
 def test_halves_are_independent() -> None:
-    a, b = (pairs(points(1 << 14, 4, half), 4) for half in (0, 1))
-    p = [
-        chi_square_test(np.column_stack([a[:, i, k], b[:, j, k]]), uniform, Rectangle(), (16, 16)).p_value
-        for i, j, k in itertools.product((0, 3), (0, 3), (0, 1))
-    ]
+    """In each of the first dimensions, and of one dimension from another."""
+    first, second = (points(1 << 13, 4, half) for half in (0, 1))
+    a, b = ([pairs(drawn, 4) for _ in range(4)] for drawn in (first, second))
+    p = []
+    for m, n in [(0, 0), (1, 1), (2, 2), (3, 3), (0, 2), (3, 1)]:
+        p += [
+            chi_square_test(
+                np.column_stack([a[m][:, i, k], b[n][:, j, k]]), uniform, Rectangle(), (16, 16)
+            ).p_value
+            for i, j, k in itertools.product((0, 3), (0, 3), (0, 1))
+        ]
+        # Means over a half as well, which within one net hardly vary.
+        product = [(a[m][..., k].mean(axis=1) - 0.5) * (b[n][..., k].mean(axis=1) - 0.5) for k in (0, 1)]
+        p += [z_test(mean_estimate(x)).p_value for x in product]
     assert sidak(p).min() > 1e-3
-    # Means over a half as well, which within one net hardly vary.
-    product = [(a[..., k].mean(axis=1) - 0.5) * (b[..., k].mean(axis=1) - 0.5) for k in (0, 1)]
-    assert min(z_test(mean_estimate(x)).p_value for x in product) > 1e-3
+
+
+@pytest.mark.parametrize("length", [3, 5, 6, 7])
+def test_lengths_that_fill_no_net_are_unbiased_and_no_worse_than_independent_points(length: int) -> None:
+    """Halves of 3 · 2^m paths, as counts under a target error have them, and other odd ones."""
+    first, second = (points(1 << 13, length, half) for half in (0, 1))
+    exact = (1 - np.cos(3.0)) / 3.0 * (np.e - 1)
+    means = []
+    for drawn in (first, second):
+        drawn.next_2d()
+        xy = pairs(drawn, length)
+        value = np.sin(3.0 * xy[..., 0]) * np.exp(xy[..., 1])
+        means.append(value.mean(axis=1) - exact)
+        assert z_test(mean_estimate(means[-1])).p_value > 1e-3
+        assert means[-1].var() < value.var() / length
+        # The net within them is whole.
+        net = 1 << (length.bit_length() - 1)
+        for start in range(0, length - net + 1, net):
+            column = np.sort(np.floor(xy[:, start : start + net, 0] * net), axis=1)
+            assert (column == np.arange(net)).all()
+    assert z_test(mean_estimate(means[0] * means[1])).p_value > 1e-3
 
 
 def test_a_smooth_integral_converges_faster_than_independent_points() -> None:

@@ -1,0 +1,63 @@
+"""Numbers that papers print, for ratios that stand beside measured ones. Nothing here was measured by us.
+
+Their data, light and units are their own, so only ratios between methods on the same material compare, and
+those of a material of the same name are still of another material.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+NEUMIP = "Kuznetsov et al. 2021"
+HIERARCHICAL = "Xue et al. 2024"
+
+# MSE ×10⁻³ by material: NeuMIP without and with offset, Rainer et al. 2019, Rainer et al. 2020.
+_NEUMIP_MSE: dict[str, tuple[float, float, float, float]] = {
+    "twisted_wool": (11.31, 3.98, 12.79, 19.03),
+    "straight_wool": (1.04, 0.39, 2.30, 1.92),
+    "turtle_shell": (3.35, 1.31, 2.83, 4.84),
+    "cliff_rock": (6.00, 2.00, 7.89, 10.26),
+    "insulation_foam": (9.18, 3.90, 10.04, 21.75),
+}
+_COLUMNS = ("neumip-baseline", "neumip", "rainer2019", "rainer2020")
+# PSNR in dB: the hierarchical model, NeuMIP.
+_HIERARCHICAL_PSNR: dict[str, tuple[float, float]] = {"turtle_shell": (32.18, 30.79)}
+# MSE ×10⁻³ of twisted wool with offset by level of zoom, from the finest on.
+_ZOOM_MSE = (3.98, 2.10, 1.47, 1.07, 0.74, 1.16, 1.17, 1.08)
+
+# Network weights by model.
+WEIGHTS: dict[str, tuple[str, str]] = {
+    "neumip": ("3332; 3254 with the three outputs that the text describes", NEUMIP),
+    "hierarchical": ("about 6500 to 7100, decoder", HIERARCHICAL),
+}
+# Methods without a model here: title, decoder weights, latent channels, as Kuznetsov et al. 2021 count them.
+NOT_HERE: dict[str, tuple[str, int, int]] = {
+    "rainer2019": ("Rainer et al. 2019", 35725, 14),
+    "rainer2020": ("Rainer et al. 2020", 38269, 38),
+}
+
+
+@dataclass(frozen=True)
+class Published:
+    """A published ratio and where it stands."""
+
+    ratio: float
+    source: str
+
+
+def mse_ratio(material: str, method: str, base: str) -> Published | None:
+    """MSE of a method over that of another on a paper's material of this name; None where no paper says."""
+    row = _NEUMIP_MSE.get(material)
+    if row is not None and method in _COLUMNS and base in _COLUMNS:
+        return Published(row[_COLUMNS.index(method)] / row[_COLUMNS.index(base)], NEUMIP)
+    pair = _HIERARCHICAL_PSNR.get(material)
+    if pair is not None and (method, base) == ("hierarchical", "neumip"):
+        return Published(10.0 ** ((pair[1] - pair[0]) / 10.0), f"{HIERARCHICAL}, from PSNR")
+    return None
+
+
+def level_ratios(material: str, method: str) -> list[Published] | None:
+    """MSE at each level over that at the finest, from the finest on; None where no paper says."""
+    if (material, method) != ("twisted_wool", "neumip"):
+        return None
+    return [Published(value / _ZOOM_MSE[0], f"{NEUMIP}, Table 3") for value in _ZOOM_MSE]
