@@ -144,6 +144,13 @@ def test_too_many_nonfinite_samples_fail_the_run_and_name_their_place(
     assert not json.loads((tmp_path / "out/manifest.json").read_text())["complete"]
 
 
+def test_samples_are_held_against_all_paths_that_a_target_error_may_take(config: GeneratorConfig) -> None:
+    """A run is not stopped for samples that are few among its paths."""
+    assert Job.prepare(config).most_paths() == Job.prepare(config).all_paths() == 320
+    aimed = Job.prepare(changed(config, queries={"target_error": 0.02, "cap": 128}))
+    assert aimed.most_paths() == 100 * (128 + 16) + 30 * 4
+
+
 @pytest.mark.parametrize(
     ("count", "paths", "refused"), [(4, 1, False), (5, 4_999_999, True), (5, 5_000_000, False)]
 )
