@@ -1,9 +1,12 @@
 """The image layout in memory: whole buffers, and the crops of them that a batch is made of.
 
-A buffer holds one query per texel of the finest level, all with the same light, view and footprint. A crop
-takes every d-th row and column of it, d as wide as a texel of the level nearest to the footprint, so that
-neighbours in a crop are as far apart as the places that a model of neighbourhoods looks at. Rows and columns
-wrap around, as the tile does.
+A buffer's queries share light, view and footprint. A whole buffer holds one query per texel of the finest
+level; a crop takes every d-th row and column of it, d as wide as a texel of the level nearest to the
+footprint, so that neighbours in a crop are as far apart as the places that a model of neighbourhoods looks
+at. Rows and columns wrap around, as the tile does.
+
+A window is a grid of places one texel of that level apart, exactly as a model of neighbourhoods looks at
+them; a crop is a part of it, and its margin goes on beyond the border.
 """
 
 from __future__ import annotations
@@ -60,12 +63,19 @@ class Crops:
         return Crops(self.u[part], self.sigma[part], self.omega_i[part], self.omega_o[part], self.value[part])
 
 
+def nearest_shapes(lattice: Lattice, sigma: NDArray[np.float32]) -> NDArray[np.int64]:
+    """(rows, columns) of the level nearest to footprints (n,): (n, 2)."""
+    shapes = np.array([lattice.shape(s) for s in range(lattice.finest + 1)])
+    nearest = np.floor(np.clip(level_of_sigma(sigma), 0, lattice.finest) + 0.5).astype(np.int64)
+    out: NDArray[np.int64] = shapes[nearest]
+    return out
+
+
 def strides(lattice: Lattice, sigma: NDArray[np.float32]) -> NDArray[np.int64]:
     """(rows, columns) of the finest level per texel of the level nearest to footprints (n,): (n, 2), at least
     1."""
-    shapes = np.array([lattice.shape(s) for s in range(lattice.finest + 1)])
-    nearest = np.floor(np.clip(level_of_sigma(sigma), 0, lattice.finest) + 0.5).astype(np.int64)
-    return np.maximum(1, np.round(shapes[-1] / shapes[nearest])).astype(np.int64)
+    shape = np.array(lattice.shape())
+    return np.maximum(1, np.round(shape / nearest_shapes(lattice, sigma))).astype(np.int64)
 
 
 @dataclass(frozen=True)
@@ -77,6 +87,7 @@ class TrainingBuffers:
     u : (buffers, rows, columns, 2); value : (buffers, rows, columns, 3) in 1/sr
     sigma : (buffers,); omega_i, omega_o : (buffers, 3)
     stride : (buffers, 2) rows and columns between neighbours of a crop
+    extent : (buffers, 2) rows and columns of the level that windows lie on; None for whole buffers
     """
 
     u: Tensor
@@ -85,6 +96,7 @@ class TrainingBuffers:
     omega_o: Tensor
     value: Tensor
     stride: NDArray[np.int64]
+    extent: NDArray[np.int64] | None = None
 
     def __len__(self) -> int:
         """Queries in all."""
@@ -95,7 +107,7 @@ class TrainingBuffers:
         u, sigma, omega_i, omega_o, value = (
             t.to(device) for t in (self.u, self.sigma, self.omega_i, self.omega_o, self.value)
         )
-        return TrainingBuffers(u, sigma, omega_i, omega_o, value, self.stride)
+        return TrainingBuffers(u, sigma, omega_i, omega_o, value, self.stride, self.extent)
 
     def crop(self, buffer: NDArray[np.int64], origin: NDArray[np.int64], size: int, margin: int) -> Crops:
         """Crops of `size` × `size` places of buffers (items,), the first place at `origin` (items, 2), row
@@ -110,13 +122,29 @@ class TrainingBuffers:
         at = torch.from_numpy(place).to(self.u.device)
         inner = at[:, margin : margin + size, margin : margin + size]
         chosen = torch.from_numpy(buffer).to(self.u.device)
+        if self.extent is None:
+            u = self.u.view(-1, 2)[at]
+        else:
+            u = self._grid(chosen, self.extent[buffer], origin, size, margin)
         return Crops(
-            self.u.view(-1, 2)[at],
+            u,
             self.sigma[chosen],
             self.omega_i[chosen],
             self.omega_o[chosen],
             self.value.view(-1, 3)[inner],
         )
+
+    def _grid(
+        self, chosen: Tensor, extent: NDArray[np.int64], origin: NDArray[np.int64], size: int, margin: int
+    ) -> Tensor:
+        """Places (items, size+2·margin, size+2·margin, 2) of crops of windows, beyond their borders too."""
+        steps = np.arange(-margin, size + margin)
+        down, across = ((origin[:, k, None] + steps) / extent[:, k, None] for k in (0, 1))
+        first = self.u[chosen, 0, 0].cpu().numpy().astype(np.float64)
+        u, v = first[:, :1] + across, first[:, 1:] - down
+        shape = (len(u), len(steps), len(steps))
+        grid = np.stack([np.broadcast_to(u[:, None], shape), np.broadcast_to(v[:, :, None], shape)], -1)
+        return torch.from_numpy(grid % 1.0).to(self.u)
 
     def batches(self, size: int, seed: int, step: int, margin: int) -> Iterator[Crops]:
         """Endless batches of at most about `size` queries from a step on: crops of buffers, each buffer once
@@ -124,6 +152,8 @@ class TrainingBuffers:
         rows, columns = self.u.shape[1:3]
         while True:
             buffer, side = self._chosen(size, seed, step)
+            if self.extent is not None:
+                rows, columns = (n - side + 1 for n in self.u.shape[1:3])
             origin = _philox(seed, 2 * step + 1).integers(0, (rows, columns), (len(buffer), 2))
             yield self.crop(buffer, origin, side, margin)
             step += 1
@@ -195,7 +225,8 @@ def load_buffers(data: Dataset, held_out: HeldOutSection, seed: int) -> Partitio
             where=data.folder,
             cure="lower held_out.queries and held_out.radius",
         )
-    shape = (count, *data.lattice.shape())
+    window = data.window
+    shape = (count, *(data.lattice.shape() if window is None else (window, window)))
     u, value = np.empty((*shape, 2), np.float32), np.empty((*shape, 3), np.float32)
     sigma, omega = np.empty(count, np.float32), np.empty((2, count, 3), np.float32)
     out: tuple[list[Queries], list[Queries]] = ([], [])
@@ -222,7 +253,8 @@ def load_buffers(data: Dataset, held_out: HeldOutSection, seed: int) -> Partitio
         torch.from_numpy(omega[0]),
         torch.from_numpy(omega[1]),
         torch.from_numpy(value),
-        strides(data.lattice, sigma),
+        strides(data.lattice, sigma) if window is None else np.ones((count, 2), np.int64),
+        None if window is None else nearest_shapes(data.lattice, sigma),
     )
     kept_out = [_some(Queries.join(group), HELD_OUT, random) for group in out]
     return Partition(training, kept_out[0], kept_out[1], Queries.join(sample), selection)

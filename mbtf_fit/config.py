@@ -93,6 +93,9 @@ class TrainingSection(Settings):
     rate: float = Field(3e-2, gt=0, lt=1, description="largest learning rate of the networks (Adam)")
     texture_rate: float = Field(1e-2, gt=0, lt=1, description="largest learning rate of the textures")
     final_rate: float = Field(0.01, gt=0, le=1, description="share of the rates that is left at the end")
+    decay: float = Field(
+        0.0, ge=0, le=10, description="pull of texels towards 0: by rate times this per step"
+    )
     warmup: int = Field(100, ge=0, description="steps over which the rates rise")
     blur: BlurSection = BlurSection()
 

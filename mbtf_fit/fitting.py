@@ -31,6 +31,7 @@ from .models import MODELS, build_model
 from .noise import NoiseModel, typical_value
 from .storage import make_folder, read_tensors, write_tensors
 from .training import Trainer
+from .transmittance import TRANSMITTANCE_NAME, fit_transmittance
 
 FIT_NAME = "fit.json"
 CONFIG_NAME = "config.yaml"
@@ -43,6 +44,7 @@ _OWN_FILES = (
     CHECKPOINT_NAME,
     DESCRIPTION_NAME,
     WEIGHTS_NAME,
+    TRANSMITTANCE_NAME,
     LAYERS_NAME,
     TEXTURES_NAME,
 )
@@ -115,6 +117,7 @@ def fit(
     *,
     overwrite: bool = False,
     progress: ProgressCallback | None = None,
+    partition: Partition | None = None,
 ) -> FitResult:
     """Fit a model to a data set and export it as a material.
 
@@ -124,6 +127,8 @@ def fit(
     out : folder of the material; an unfinished fit of the same configuration and data there is resumed, a
         finished one is left as it is
     overwrite : replace a fit of another configuration
+    partition : the train split as :func:`~mbtf_fit.data.load_training` gave it for these data, held-out
+        settings and seed, for several fits of one data set; read here by default
 
     Raises
     ------
@@ -147,7 +152,8 @@ def fit(
     if (out / DESCRIPTION_NAME).exists():
         return _finished(out, time.perf_counter() - begin)
     keep_freed_memory()
-    partition = load_training(data, config.held_out, config.seed, config.data.memory)
+    if partition is None:
+        partition = load_training(data, config.held_out, config.seed, config.data.memory)
     trainer = _trainer(config, data, partition, device)
     resumed = _resume(trainer, out)
     _train(trainer, partition.held_out_queries, out, progress or (lambda share, note: None))
@@ -165,7 +171,8 @@ def fit(
     }
     errors = judge(trainer.predict, data, partition)
     training["errors"] = {name: e.as_dict() for name, e in errors.items()}
-    export(trainer.model, config, out, data=identity["data"], training=training)
+    holes = fit_transmittance(data)
+    export(trainer.model, config, out, data=identity["data"], training=training, holes=holes)
     (out / CHECKPOINT_NAME).unlink(missing_ok=True)
     return _finished(out, time.perf_counter() - begin, resumed=resumed)
 

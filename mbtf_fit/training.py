@@ -198,6 +198,7 @@ class Trainer:
             self.optimiser.param_groups, (training.texture_rate, training.rate), strict=True
         ):
             group["lr"] = rate * factor
+        self._decay(training.texture_rate * factor)
         if self._stepper is not None and not isinstance(batch, Crops):
             return self._stepper.step(self.loss, batch, self._sigmas(), workers)
         texels, weights = self.model.parameter_groups()
@@ -214,6 +215,14 @@ class Trainer:
             p.grad = g
         self.optimiser.step()
         return loss
+
+    def _decay(self, rate: float) -> None:
+        """Pull texels towards 0, apart from their gradients (Loshchilov and Hutter, ICLR 2019)."""
+        decay = self.config.training.decay
+        if decay > 0:
+            with torch.no_grad():
+                for texels in self.model.parameter_groups()[0]:
+                    texels.mul_(1.0 - rate * decay)
 
     def predict(self, queries: Queries) -> NDArray[np.float32]:
         """Values (n, 3) of the model as it is now, read through the current blur."""

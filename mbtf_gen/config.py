@@ -121,6 +121,13 @@ class QueriesSection(Settings):
     mixture: MixtureSection = MixtureSection()
     min_cos: float = Field(0.1, gt=0, lt=1, description="smallest cosine of both directions to the normal")
     layout: Layout = "shuffled"
+    window: int | None = Field(
+        None,
+        ge=1,
+        le=256,
+        description="image layout: so many places along each side of a buffer, a texel of the level nearest "
+        "to its footprint apart; default: one place in every texel of the finest level",
+    )
 
 
 class LightSection(Settings):

@@ -50,6 +50,7 @@ class _Manifest(BaseModel):
     levels: _Levels
     tile: _Tile
     splits: dict[str, _Split]
+    window: _Count | None = None
 
 
 class _Sidecar(BaseModel):
@@ -118,6 +119,12 @@ class Dataset:
         """``shuffled`` or ``image``."""
         layout: Layout = self.manifest["layout"]
         return layout
+
+    @property
+    def window(self) -> int | None:
+        """Places along each side of a buffer; None: buffers are whole finest lattices."""
+        window: int | None = self.manifest.get("window")
+        return window
 
     @property
     def lattice(self) -> Lattice:

@@ -80,14 +80,25 @@ class Job:
         except ValueError as error:
             raise UsageError(str(error), where="queries.mixture") from None
         return QueryPlan(
-            self.lattice, mixture, queries.min_cos, queries.layout, self.config.seed, self._shard_rows()
+            self.lattice,
+            mixture,
+            queries.min_cos,
+            queries.layout,
+            self.config.seed,
+            self._shard_rows(),
+            queries.window,
         )
 
+    @property
+    def places(self) -> int:
+        """Queries per row of a shard: one, or those of a buffer."""
+        queries = self.config.queries
+        if queries.layout == "shuffled":
+            return 1
+        return self.lattice.texels() if queries.window is None else queries.window**2
+
     def _shard_rows(self) -> int:
-        per_shard = self.config.output.shard_queries
-        if self.config.queries.layout == "image":
-            return max(1, per_shard // self.lattice.texels())
-        return per_shard
+        return max(1, self.config.output.shard_queries // self.places)
 
     @cached_property
     def grid(self) -> HeightGrid:
@@ -140,7 +151,7 @@ class Job:
         return sum(self._queries(entry) for entry in self.shards(split))
 
     def _queries(self, entry: ShardEntry) -> int:
-        return entry.rows * (self.lattice.texels() if self.config.queries.layout == "image" else 1)
+        return entry.rows * self.places
 
     def slice(self, index: int, count: int) -> list[ShardEntry]:
         """Shards of slice number `index` (from 1) of `count`: every `count`-th of all splits' shards."""
@@ -157,7 +168,7 @@ class Job:
         wanted = self.config.queries.train if split == "train" else self.config.queries.test
         rows = count_queries(wanted, self.lattice.texels())
         if self.config.queries.layout == "image":
-            rows = max(1, math.ceil(rows / self.lattice.texels()))
+            rows = max(1, math.ceil(rows / self.places))
         size = self._shard_rows()
         if rows > size * MAX_SHARD_FILES:
             raise UsageError(

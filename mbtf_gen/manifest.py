@@ -85,6 +85,7 @@ def build_manifest(job: Job, entries: list[ShardEntry], effects: EffectsPlan | N
             "mixture": {"log_uniform": plan.mixture.log_uniform, "finest": plan.mixture.finest},
         },
         "layout": plan.layout,
+        "window": plan.window,
         "array_format": config.output.format,
         "arrays": {
             a.name: {"shape": [*lead, *a.trailing], "unit": a.unit, "meaning": a.meaning}
@@ -94,8 +95,7 @@ def build_manifest(job: Job, entries: list[ShardEntry], effects: EffectsPlan | N
         "effects": None if effects is None else effects.to_manifest(),
         "splits": {
             split: {
-                "queries": sum(e.rows for e in entries if e.split == split)
-                * (lattice.texels() if plan.layout == "image" else 1),
+                "queries": sum(e.rows for e in entries if e.split == split) * job.places,
                 "spp": job.spp(split),
                 "shards": [{"file": e.file, "rows": e.rows} for e in entries if e.split == split],
             }

@@ -17,6 +17,7 @@ from .exact import exp2, sincos_turns
 from .levels import Lattice
 from .schema import Layout
 from .seeds import Purpose, numpy_generator
+from .stats import level_groups
 
 F32 = NDArray[np.float32]
 
@@ -82,6 +83,13 @@ class Mixture:
         )
 
 
+def _rounded(u: NDArray[np.float64], v: NDArray[np.float64]) -> F32:
+    """Positions (..., 2) in [0, 1)."""
+    uv = np.stack([u, v], axis=-1).astype(np.float32)
+    # Rounding to float32 can reach 1, which is 0 on the torus.
+    return np.where(uv >= 1.0, np.float32(0.0), uv)
+
+
 @dataclass(frozen=True)
 class QueryPlan:
     """Draws the queries of any shard on its own.
@@ -90,6 +98,8 @@ class QueryPlan:
     ----------
     lattice : texel grids; mixture : over levels; min_cos : smallest cosine of both directions
     layout : ``shuffled`` or ``image``; root : root seed; shard_rows : queries (or buffers) per full shard
+    window : places along each side of a buffer, one texel of the level nearest to its footprint apart; None:
+        one place in each texel of the finest level
     """
 
     lattice: Lattice
@@ -98,9 +108,11 @@ class QueryPlan:
     layout: Layout
     root: int
     shard_rows: int
+    window: int | None = None
 
     def draw(self, split: str, shard: int, rows: int) -> Queries:
-        """Queries of one shard: `rows` queries, or `rows` buffers of the finest lattice."""
+        """Queries of one shard: `rows` queries, or `rows` buffers, each of the finest lattice or of a window
+        of the lattice nearest to its footprint."""
         generator = numpy_generator(self.root, split, shard, Purpose.QUERIES)
         sigma = self._sigma(generator, rows)
         omega_i = self._directions(generator, rows)
@@ -108,10 +120,15 @@ class QueryPlan:
         if self.layout == "shuffled":
             texel = self._texels(split, shard * self.shard_rows, rows)
             return Queries(self._positions(generator, texel), sigma, omega_i, omega_o)
-        shape = (rows, *self.lattice.shape())
-        texel = np.broadcast_to(np.arange(self.lattice.texels()).reshape(shape[1:]), shape)
+        if self.window is None:
+            shape = (rows, *self.lattice.shape())
+            texel = np.broadcast_to(np.arange(self.lattice.texels()).reshape(shape[1:]), shape)
+            positions = self._positions(generator, texel)
+        else:
+            shape = (rows, self.window, self.window)
+            positions = self._window(generator, sigma, self.window)
         return Queries(
-            self._positions(generator, texel),
+            positions,
             np.ascontiguousarray(np.broadcast_to(sigma[:, None, None], shape)),
             np.ascontiguousarray(np.broadcast_to(omega_i[:, None, None], (*shape, 3))),
             np.ascontiguousarray(np.broadcast_to(omega_o[:, None, None], (*shape, 3))),
@@ -131,15 +148,27 @@ class QueryPlan:
             position, left = position + take, left - take
         return np.concatenate(parts)
 
+    def _window(self, generator: np.random.Generator, sigma: F32, size: int) -> F32:
+        """Places (n, size, size, 2): grids, one texel of the level nearest to footprints (n,) between
+        neighbours, that begin anywhere and go around the tile."""
+        shapes = np.array([self.lattice.shape(s) for s in range(self.lattice.finest + 1)])
+        extent = shapes[level_groups(sigma, self.lattice.finest)]
+        start = generator.random((len(sigma), 2, 1))
+        down, across = (start[:, k] + np.arange(size) / extent[:, k, None] for k in (0, 1))
+        shape = (len(sigma), size, size)
+        u, v = (
+            np.broadcast_to(across[:, None] % 1.0, shape),
+            np.broadcast_to(1 - down[:, :, None] % 1.0, shape),
+        )
+        return _rounded(u, v)
+
     def _positions(self, generator: np.random.Generator, texel: NDArray[np.int64]) -> F32:
         rows, columns = self.lattice.shape()
         j, i = np.divmod(texel, columns)
         jitter = generator.random((*texel.shape, 2))
         u = (i + jitter[..., 0]) / columns
         v = 1.0 - (j + jitter[..., 1]) / rows
-        uv = np.stack([u, v], axis=-1).astype(np.float32)
-        # Rounding to float32 can reach 1, which is 0 on the torus.
-        return np.where(uv >= 1.0, np.float32(0.0), uv)
+        return _rounded(u, v)
 
     def _sigma(self, generator: np.random.Generator, rows: int) -> F32:
         strata = (generator.permutation(rows) + generator.random(rows)) / rows

@@ -27,6 +27,9 @@ def teacher() -> TexturedMaterial:
     model.initialise(generator, 0.1)
     for texture in model.textures():
         torch.nn.init.normal_(texture.texels, 0.0, 0.5, generator=generator)
+    # Values are positive on average, as those of materials are: exp(x) - 1 in negative units could not rise.
+    with torch.no_grad():
+        model.decoder.last_bias.fill_(1.0)
     return model
 
 
@@ -57,10 +60,10 @@ def finish(t: Trainer) -> None:
 
 
 def relative_error(model: TexturedMaterial, data: TrainingQueries) -> float:
-    """Mean squared error over mean square."""
+    """Root of the mean squared error over the mean square."""
     with torch.no_grad():
         found = model(data.u, data.sigma, data.omega_i, data.omega_o)
-    return float((found - data.value).square().mean() / data.value.square().mean())
+    return float((found - data.value).square().mean() / data.value.square().mean()) ** 0.5
 
 
 def test_a_teachers_data_give_no_loss_at_its_parameters() -> None:
@@ -74,25 +77,33 @@ def test_a_teachers_data_give_no_loss_at_its_parameters() -> None:
         assert float(t._loss(data)) > 0.0
 
 
-def test_a_perturbed_teacher_returns() -> None:
-    data, unseen = answers(teacher(), 12_000, 0), answers(teacher(), 5000, 9)
+@pytest.mark.parametrize(
+    ("queries", "steps", "bound"),
+    [(12_000, 250, 3e-3), pytest.param(60_000, 4000, 1e-4, marks=[pytest.mark.slow])],
+)
+def test_a_perturbed_teacher_returns(queries: int, steps: int, bound: float) -> None:
+    data, unseen = answers(teacher(), queries, 0), answers(teacher(), 5000, 9)
     model = teacher()
     generator = torch.Generator().manual_seed(5)
     with torch.no_grad():
         for p in model.parameters():
             p.add_(0.03 * p.std(correction=0) * torch.randn(p.shape, generator=generator))
     before = relative_error(model, unseen)
-    finish(trainer(model, data, steps=250, batch=2000, rate=2e-3, texture_rate=2e-3, final_rate=1e-4))
-    assert before > 2e-3
-    assert relative_error(model, unseen) < 1e-4
+    finish(trainer(model, data, steps=steps, batch=2000, rate=2e-3, texture_rate=2e-3, final_rate=1e-4))
+    assert before > 5 * bound
+    assert relative_error(model, unseen) < bound
 
 
-@pytest.mark.parametrize(("steps", "bound"), [(150, 0.3), pytest.param(3000, 0.01, marks=[pytest.mark.slow])])
+@pytest.mark.parametrize(
+    ("steps", "bound"), [(150, 0.15), pytest.param(3000, 0.07, marks=[pytest.mark.slow])]
+)
 def test_a_random_start_approaches_the_teacher(steps: int, bound: float) -> None:
-    data, unseen = answers(teacher(), 20_000, 0), answers(teacher(), 5000, 9)
+    data, unseen = answers(teacher(), 60_000, 0), answers(teacher(), 5000, 9)
     model = build_model("neumip", LATTICE)
     model.initialise(torch.Generator().manual_seed(7), float(data.value.mean()))
-    finish(trainer(model, data, steps=steps, batch=2000, rate=1e-2, texture_rate=2e-2, final_rate=1e-3))
+    finish(trainer(model, data, steps=steps, batch=2000, rate=3e-2, texture_rate=1e-2, final_rate=1e-3))
+    # The mean value alone leaves more than 0.3.
+    assert float(data.value.std() / data.value.square().mean().sqrt()) > 0.3
     assert relative_error(model, unseen) < bound
 
 

@@ -190,6 +190,7 @@ def test_hash_covers_every_option_but_the_materials_name(tmp_path: Path) -> None
                 "mixture": {"finest": 0.3},
                 "min_cos": 0.2,
                 "layout": "image",
+                "window": 8,
             }.items()
         ),
     ]

@@ -12,13 +12,14 @@ from support.buffer_data import random_buffers, write_buffers
 from support.fit_data import constant, parallax, random_queries, write_data
 
 from mbtf_fit import FitConfig, Material, evaluate, fit
-from mbtf_fit.buffers import TrainingBuffers, load_buffers, strides
+from mbtf_fit.buffers import TrainingBuffers, load_buffers, nearest_shapes, strides
 from mbtf_fit.config import HeldOutSection
 from mbtf_fit.data import Partition, in_region, load_split
 from mbtf_fit.models import Hierarchical, build_model
 from mbtf_gen.dataset import Dataset
 from mbtf_gen.errors import InputError
 from mbtf_gen.levels import Lattice, sigma_of_level
+from mbtf_gen.queries import Mixture, QueryPlan
 
 HELD_OUT = HeldOutSection(queries=0.1, radius=0.3)
 
@@ -130,9 +131,52 @@ def test_batches_take_every_buffer_and_resume_anywhere() -> None:
     assert len(many.sigma.unique()) == 5
 
 
+def windows(lattice: Lattice, size: int, count: int) -> TrainingBuffers:
+    """Windows as the generator draws them; the value's first channel numbers the queries."""
+    q = QueryPlan(lattice, Mixture(1, 0), 0.2, "image", 3, count, window=size).draw("train", 0, count)
+    sigma = q.sigma[:, 0, 0]
+    number = np.arange(q.sigma.size, dtype=np.float32).reshape(q.sigma.shape)
+    value = np.stack([number, 0 * number, 0 * number], -1)
+    arrays = (q.u, sigma, q.omega_i[:, 0, 0], q.omega_o[:, 0, 0], value)
+    tensors = [torch.from_numpy(np.ascontiguousarray(a)) for a in arrays]
+    ones = np.ones((count, 2), np.int64)
+    return TrainingBuffers(*tensors[:5], ones, nearest_shapes(lattice, sigma))  # type: ignore[arg-type,call-arg]
+
+
+def test_crops_of_windows_go_on_beyond_their_border() -> None:
+    lattice = Lattice(4, 0.5)
+    data = windows(lattice, 6, 30)
+    origin = np.array([[k % 3, k // 3 % 3] for k in range(30)])
+    crops = data.crop(np.arange(30), origin, 4, 3)
+    assert crops.u.shape == (30, 10, 10, 2)
+    number = crops.value[..., 0].long()
+    assert number[5, 0, 0] == 5 * 36 + 2 * 6 + 1
+    assert number[5, 1, 3] == 5 * 36 + 3 * 6 + 4
+    apart = crops.u[:, 3:7, 3:7] - data.u.view(-1, 2)[number]
+    torch.testing.assert_close(apart, apart.round(), atol=1e-6, rtol=0)
+    for item in range(30):
+        rows, columns = nearest_shapes(lattice, crops.sigma[item : item + 1].numpy())[0]
+        step = crops.u[item, 1:, 1:] - crops.u[item, :-1, :-1] - torch.tensor([1 / columns, -1 / rows])
+        torch.testing.assert_close(step, step.round().to(step.dtype), atol=1e-6, rtol=0)
+
+
+def test_batches_cut_windows_within_them() -> None:
+    data = windows(Lattice(4), 6, 8)
+    for batch in islice(data.batches(2 * 16, 0, 0, 2), 20):
+        assert batch.value.shape == (1, 6, 6, 3)
+    seen = set()
+    for batch in islice(data.batches(16, 0, 0, 2), 40):
+        assert batch.value.shape == (1, 4, 4, 3)
+        number = batch.value[0, ..., 0].long() % 36
+        assert (number == number[0, 0] + 6 * torch.arange(4)[:, None] + torch.arange(4)).all()
+        seen.add(int(number[0, 0]))
+    assert seen == {6 * j + i for j in range(3) for i in range(3)}
+
+
+@pytest.mark.parametrize("cut", ["whole", "windows"])
 @pytest.mark.parametrize("aspect", [1.0, 0.5])
 @pytest.mark.parametrize("decoder", ["inception", "mlp"])
-def test_training_and_evaluation_agree_on_regular_buffers(aspect: float, decoder: str) -> None:
+def test_training_and_evaluation_agree_on_regular_buffers(aspect: float, decoder: str, cut: str) -> None:
     """The answer of a crop is that of its queries one by one, in any order."""
     lattice = Lattice(4, aspect)
     model = build_model("hierarchical", lattice, decoder=decoder)
@@ -140,9 +184,11 @@ def test_training_and_evaluation_agree_on_regular_buffers(aspect: float, decoder
     model.initialise(torch.Generator().manual_seed(0), 0.1)
     torch.nn.init.normal_(model.pyramid.texels, generator=torch.Generator().manual_seed(1))
     torch.nn.init.normal_(model.offset_texture.texels, generator=torch.Generator().manual_seed(2))
-    data = buffers(lattice, [4.0, 3.0, 2.3, 1.0, 0.0], regular=True)
+    whole = cut == "whole"
+    data = buffers(lattice, [4.0, 3.0, 2.3, 1.0, 0.0], regular=True) if whole else windows(lattice, 6, 5)
     m = model.margin
-    crops = data.crop(np.arange(5), np.array([[0, 0], [3, 9], [1, 1], [7, 15], [5, 2]]), 6, m)
+    origin = np.array([[0, 0], [3, 9], [1, 1], [7, 15], [5, 2]]) if whole else np.zeros((5, 2), np.int64)
+    crops = data.crop(np.arange(5), origin, 6, m)
     with torch.no_grad():
         together = model.crops(crops.u, crops.sigma, crops.omega_i, crops.omega_o)
         order = torch.randperm(5 * 36)

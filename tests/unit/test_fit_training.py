@@ -109,6 +109,23 @@ def test_rates_rise_and_fall() -> None:
     assert rate_factor(training, 1000, 1.0) == pytest.approx(0.05)
 
 
+def test_texels_without_a_gradient_decay_with_the_rate() -> None:
+    arrays = random_queries(np.random.default_rng(0), 64, LATTICE)
+    arrays["sigma"][:] = 0.5
+    data = training_queries(arrays, parallax(*arrays.values()))
+    t = trainer(data, steps=5, decay=2.0, texture_rate=0.05, warmup=0, final_rate=0.1, blur={"start": 0.0})
+    first = t.model.textures()[0].texels.detach().clone()
+    rates = [0.05 * rate_factor(t.config.training, k, k / 5) for k in range(5)]
+    train_fully(t)
+    finest = t.model.textures()[0].packing.starts[-2]
+    expected = first[finest:] * np.prod([1 - 2.0 * rate for rate in rates])
+    torch.testing.assert_close(t.model.textures()[0].texels.detach()[finest:], expected)
+    weights = [p.detach().clone() for p in t.model.parameter_groups()[1]]
+    t._decay(0.1)
+    for before, after in zip(weights, t.model.parameter_groups()[1], strict=True):
+        torch.testing.assert_close(after.detach(), before, rtol=0, atol=0)
+
+
 def test_a_budget_of_time_ends_training_and_its_annealing() -> None:
     t = train_fully(trainer(queries(), steps=None, time=0.3))
     assert t.share == 1.0

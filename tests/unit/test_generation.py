@@ -84,6 +84,10 @@ def test_shards_cover_the_wanted_rows(config: GeneratorConfig) -> None:
     # Image layout: whole buffers, 32 texels each; 100 queries are four of them, one per shard.
     image = Job.prepare(changed(config, queries={"layout": "image"}))
     assert [(e.file, e.rows) for e in image.shards("train")] == [(f"train-{i:05d}.npz", 1) for i in range(4)]
+    # Windows of 9 places: 100 queries are twelve of them, four per shard of 40 queries.
+    windows = Job.prepare(changed(config, queries={"layout": "image", "window": 3}))
+    assert [e.rows for e in windows.shards("train")] == [4, 4, 4]
+    assert windows.queries("train") == 108
     per_texel = Job.prepare(changed(config, queries={"train": "3/texel"}))
     assert sum(e.rows for e in per_texel.shards("train")) == 96
 

@@ -112,6 +112,27 @@ def test_image_buffers_hold_every_texel_in_order_under_one_light_and_view(lattic
     assert len(np.unique(q.u[:, 0, 0], axis=0)) == 3
 
 
+@pytest.mark.parametrize("lattice", LATTICES, ids=lambda k: "x".join(map(str, k.shape())))
+def test_windows_are_grids_of_the_level_nearest_to_their_footprint(lattice: Lattice) -> None:
+    q = QueryPlan(lattice, Mixture(1, 0), 0.2, "image", 5, 40, window=5).draw("train", 1, 40)
+    assert q.lead == (40, 5, 5)
+    assert ((q.u >= 0) & (q.u < 1)).all()
+    for item in range(40):
+        for array in (q.sigma, q.omega_i, q.omega_o):
+            assert (array[item] == array[item, 0, 0]).all()
+        level = min(max(round(-np.log2(2 * float(q.sigma[item, 0, 0]))), 0), lattice.finest)
+        rows, columns = lattice.shape(level)
+        # Rows go down the tile, against v, and columns to the right; around the tile.
+        for axis, step in ((1, (1 / columns, 0)), (0, (0, -1 / rows))):
+            apart = np.diff(q.u[item].astype(np.float64), axis=axis) - step
+            np.testing.assert_allclose(apart, np.round(apart), atol=1e-6)
+    # They begin anywhere.
+    assert len(np.unique(q.u[:, 0, 0])) == 80
+    assert np.ptp(q.u[:, 0, 0], axis=0).min() > 0.7
+    other = QueryPlan(lattice, Mixture(1, 0), 0.2, "image", 5, 40, window=5).draw("train", 2, 40)
+    assert not equal(q, other)
+
+
 def equal(a: Queries, b: Queries) -> bool:
     return all(np.array_equal(getattr(a, n), getattr(b, n)) for n in ("u", "sigma", "omega_i", "omega_o"))
 
