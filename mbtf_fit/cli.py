@@ -44,6 +44,7 @@ def fit(
     config: Path | None = None,
     assignments: Set | None = None,
     overwrite: Annotated[bool, Parameter(negative="")] = False,
+    dry_run: Annotated[bool, Parameter(negative="")] = False,
     console: Console = CONSOLE,
 ) -> None:
     """Fit a material to a data set: mbtf-fit shards/ -o material/
@@ -81,7 +82,11 @@ def fit(
         YAML file with the options.
     overwrite
         Replace a fit of another configuration.
+    dry_run
+        Forecast time, error and size by two short fits on this machine, and write nothing.
     """
+    if dry_run and many is not None:
+        raise UsageError("--dry-run looks at one data set", cure="mbtf-fit shards/ --dry-run")
     if many is not None and shards is not None:
         raise UsageError("--many takes all data sets", cure=f"mbtf-fit --many {shards} ... -o materials/")
     if processes is not None and (many is None or processes < 1):
@@ -115,6 +120,14 @@ def fit(
         _fit_many(resolved, many, output, processes, overwrite, console)
         return
     assert shards is not None
+    if dry_run:
+        from .forecast import forecast_fit
+
+        expected = forecast_fit(resolved, shards)
+        console.report(
+            {"shards": shards, "model": resolved.model, "forecast": expected.as_dict()}, expected.describe()
+        )
+        return
     from .fitting import fit
 
     console.note(
@@ -133,7 +146,8 @@ def fit(
             progress=lambda share, note: bar.update(round(100 * share, 1), note),
         )
     data = result.as_dict()
-    console.report(data, describe_fit(data))
+    price = [result.price.describe()] if result.price is not None else []
+    console.report(data, "\n".join([describe_fit(data), *price]))
 
 
 def _fit_many(
@@ -252,6 +266,7 @@ def export_material(
     from .material import Material, export
     from .material_format import DESCRIPTION_NAME, WEIGHTS_NAME
     from .storage import make_folder
+    from .transmittance import TRANSMITTANCE_NAME, read_transmittance
 
     wanted = list(dict.fromkeys(to or ["exr", "json"]))
     folder = material if output is None else output
@@ -273,6 +288,7 @@ def export_material(
         files.append(LAYERS_NAME)
     if "material" in wanted:
         description = loaded.description
+        holes = read_transmittance(material, description)
         export(
             written.model,
             written.config,
@@ -280,8 +296,9 @@ def export_material(
             data=description["data"],
             training=description["training"],
             half=half,
+            holes=holes,
         )
-        files += [WEIGHTS_NAME, DESCRIPTION_NAME]
+        files += [WEIGHTS_NAME, DESCRIPTION_NAME, *([TRANSMITTANCE_NAME] if holes is not None else [])]
     sizes = {name: (folder / name).stat().st_size for name in files}
     lines = [f"{folder / name}: {size / 1e6:.3f} MB" for name, size in sizes.items()]
     console.report(

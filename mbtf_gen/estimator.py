@@ -1,8 +1,8 @@
 """Monte Carlo estimates of M at queries: two independent halves per query.
 
-Paths of one launch are traced in the order of the place where they meet the reference plane (a 16-bit Morton
-key), which makes incoherent queries a tenth faster. The random numbers of a path depend on its number in the
-shard alone, so values do not depend on how queries are grouped into launches.
+Paths of one launch are traced in an order in which neighbours meet the reference plane near each other and
+look and are lit as steeply, so that their rays take about as many steps. The random numbers of a path depend
+on its number in the shard alone, so values do not depend on how queries are grouped into launches.
 """
 
 from __future__ import annotations
@@ -43,10 +43,23 @@ class RaySource(Protocol):
         """Ray through such a point, in scene units."""
 
 
-def _spread_bits(x: Any) -> Any:
-    x = (x | (x << 4)) & 0x0F0F
-    x = (x | (x << 2)) & 0x3333
-    return (x | (x << 1)) & 0x5555
+def _place(point: Any) -> Any:
+    """Upper half of a path's place in the order: 8 bits of a Morton curve over the tile."""
+    cell = mi.Vector2u((point - dr.floor(point)) * 16.0)
+
+    def spread(x: Any) -> Any:
+        x = (x | (x << 2)) & 0x33
+        return (x | (x << 1)) & 0x55
+
+    return (spread(cell.x) | (spread(cell.y) << 1)) << 8
+
+
+def _slopes(queries: Queries) -> Any:
+    """Lower half: 4 bits of the cosine of either direction, the view's first."""
+    view, light = (
+        np.clip(16.0 * omega[:, 2], 0, 15).astype(np.uint32) for omega in (queries.omega_o, queries.omega_i)
+    )
+    return _aligned(view << 4 | light)
 
 
 def _aligned(numbers: NDArray[Any]) -> Any:
@@ -78,6 +91,7 @@ class Lanes:
     counts : (n,) paths of each query; starts : (n,) its first lane
     query : ``mi.UInt32``, query of each lane
     start, half : ``mi.UInt32``, of each query its first lane and the paths of one half
+    slopes : ``mi.UInt32``, of each query what its directions add to its paths' place in the order
     """
 
     first: int
@@ -86,25 +100,41 @@ class Lanes:
     query: Any
     start: Any
     half: Any
+    slopes: Any
 
     @classmethod
-    def of(cls, first: int, counts: NDArray[np.int64]) -> Lanes:
+    def of(cls, first: int, counts: NDArray[np.int64], queries: Queries) -> Lanes:
         """Lanes of queries that follow each other."""
         starts = np.cumsum(counts) - counts
-        query = np.repeat(np.arange(len(counts)), counts)
-        return cls(first, counts, starts, *(_aligned(x) for x in (query, starts, counts // 2)))
+        query = np.repeat(np.arange(len(counts), dtype=np.uint32), counts)
+        columns = [*(_aligned(x) for x in (query, starts, counts // 2)), _slopes(queries)]
+        return cls(first, counts, starts, *columns)
 
     def number(self, lane: int) -> int:
         """Number in the shard of a lane's query."""
         return self.first + int(np.searchsorted(self.starts, lane, side="right")) - 1
 
     def halves(self, x: Any) -> NDArray[np.float64]:
-        """Means over both halves of each query of numbers per lane: (n, 2, channels)."""
-        edges = np.stack([self.starts, self.starts + self.counts // 2], axis=1).ravel()
-        values = np.atleast_2d(np.array(x, np.float32))
-        # In the order of the lanes, so that no sum depends on threads or launches.
-        total = np.add.reduceat(values, edges, axis=1, dtype=np.float64)
-        return total.T.reshape(len(self.counts), 2, -1) / (self.counts // 2)[:, None, None]
+        """Means over both halves of each query of numbers per lane, a ``mi.Float`` or one per channel:
+        (n, 2, channels)."""
+        which = dr.arange(mi.UInt32, 2 * len(self.counts))
+        query, second = which >> 1, which & 1
+        half = dr.gather(mi.UInt32, self.half, query)
+        begin = dr.gather(mi.UInt32, self.start, query) + second * half
+        totals = [_sum_of(channel, begin, begin + half) for channel in (x if dr.depth_v(x) == 2 else [x])]
+        dr.eval(totals)
+        total = np.stack([np.array(t) for t in totals], axis=-1)
+        return total.reshape(len(self.counts), 2, -1) / (self.counts // 2)[:, None, None]
+
+
+@dr.syntax
+def _sum_of(x: Any, lane: Any, end: Any) -> Any:
+    """Sums of numbers from one lane to another, in their order: none depends on threads or launches."""
+    total, lane = mi.Float64(0.0), mi.UInt32(lane)
+    while dr.hint(lane < end, exclude=[x, end]):
+        total += mi.Float64(dr.gather(mi.Float, x, lane))
+        lane += 1
+    return total
 
 
 class Estimator:
@@ -193,19 +223,20 @@ class Estimator:
         # Before any kernel reads them: their places in NumPy's array, and so the number of queries, would be
         # a part of it.
         dr.eval(omega_i, inverse)
-        lanes = Lanes.of(rows.start, counts)
+        lanes = Lanes.of(rows.start, counts, part)
 
         def trace_lanes(which: Any, attempt: int) -> tuple[Any, Any, int, int]:
             return self._trace(source, lanes, which, stream, omega_i, inverse, attempt)
 
-        radiance, passed, lost, capped = trace_lanes(dr.arange(mi.UInt32, int(counts.sum())), 0)
-        bad = self._nonfinite(radiance)
-        nonfinite = 0
+        radiance, passed, lost, capped = trace_lanes(None, 0)
+        values = lanes.halves(radiance)
+        # Few launches have bad samples: their paths are looked through only then.
+        bad = np.zeros(0, np.uint32) if np.isfinite(values).all() else self._nonfinite(radiance)
+        found = nonfinite = len(bad)
         located = self._located(source, lanes, bad[:MOST_LOCATED], stream, omega_i, inverse)
         for attempt in range(1, MAX_RESAMPLES + 1):
             if not len(bad):
                 break
-            nonfinite += len(bad)
             again, through, more_lost, more_capped = trace_lanes(mi.UInt32(bad), attempt)
             dr.scatter(radiance, again, mi.UInt32(bad))
             dr.eval(radiance)
@@ -214,6 +245,7 @@ class Estimator:
                 dr.eval(passed)
             lost, capped = lost + more_lost, capped + more_capped
             bad = bad[self._nonfinite(again)]
+            nonfinite += len(bad)
         if len(bad):
             raise PartialError(
                 f"{len(bad)} samples stay NaN or infinite after {MAX_RESAMPLES} draws, first at "
@@ -221,7 +253,8 @@ class Estimator:
                 where=f"{stream.split} shard {stream.shard}",
                 cure="check the material's values",
             )
-        values = lanes.halves(radiance)
+        if found:
+            values = lanes.halves(radiance)
         return Estimates(
             values[:, 0].astype(np.float32),
             values[:, 1].astype(np.float32),
@@ -278,8 +311,8 @@ class Estimator:
         inverse: Any,
         attempt: int,
     ) -> tuple[Any, Any, int, int]:
-        """Radiance of some of the lanes and, where there are holes, whether they passed through the tile, in
-        their order; counts of lost and capped rays."""
+        """Radiance of some of the lanes (all, if None) and, where there are holes, whether they passed
+        through the tile, in their order; counts of lost and capped rays."""
 
         def generator(lane: Any, query: Any, purpose: Purpose) -> Any:
             path = lane - dr.gather(mi.UInt32, lanes.start, query)
@@ -304,14 +337,17 @@ class Estimator:
             number = query + dr.opaque(mi.UInt32, lanes.first)
             return sequence(words[0], words[1], number, dr.select(second, path - half, path))
 
-        query = dr.gather(mi.UInt32, lanes.query, which)
+        everything = which is None
+        if everything:
+            which, query = dr.arange(mi.UInt32, int(lanes.counts.sum())), lanes.query
+        else:
+            query = dr.gather(mi.UInt32, lanes.query, which)
         point = source.footprint(query, generator(which, query, Purpose.FOOTPRINT).next_2d())
-        cell = mi.Vector2u((point - dr.floor(point)) * 256.0)
-        key = _spread_bits(cell.x) | (_spread_bits(cell.y) << 1)
+        key = _place(point) | dr.gather(mi.UInt32, lanes.slopes, query)
         dr.eval(point, key)
         order = _aligned(np.argsort(np.array(key).astype(np.uint16), kind="stable"))
 
-        lane = dr.gather(mi.UInt32, which, order)
+        lane = order if everything else dr.gather(mi.UInt32, which, order)
         query = dr.gather(mi.UInt32, lanes.query, lane)
         ray = source.ray(query, dr.gather(mi.Point2f, point, order))
         if self.light is None:

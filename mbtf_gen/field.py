@@ -30,7 +30,7 @@ from .hits import interaction
 # Directions are kept from being exactly parallel to an axis by this much per unit, lest 0/0 arise.
 _TINY = 1e-18
 # Levels at which rays begin: those from above the relief, and those that leave a surface.
-_START_ABOVE, _START_WITHIN = 3, 1
+_START_ABOVE, _START_WITHIN = 4, 0
 # Ray offset over the largest coordinate: a few units in the last place of single precision. Four times as
 # much made points on a tile 64 times as long as wide a thousandth too bright.
 _RELATIVE_OFFSET = 5.0e-7
@@ -45,18 +45,20 @@ class HeightField:
     ----------
     nodes : rows of :class:`~mbtf_gen.field_nodes.NodeTable`; where rays may be below the surface, followed by
         the table of planes below it
-    columns, rows, columns_log2, both_log2, finest, below : where rows of the table stand; `below` is the
-        number of the second table's first row, 0 where there is none
+    columns, rows, cells, columns_log2, both_log2, finest, below : where rows of the table stand; `below` is
+        the number of the second table's first row, 0 where there is none
     low : (x, y) of the first vertex; cell, size : (x, y) lengths of a cell and of the
         tile
     bottom, top : z of the lowest and of the highest vertex
     offset : distance from the surface at which a ray that leaves it starts
     two_sided : rays may be below the surface
+    powers : columns and rows are powers of two, which makes a step a seventh shorter
     """
 
     nodes: Any
     columns: Any
     rows: Any
+    cells: Any
     columns_log2: Any
     both_log2: Any
     finest: Any
@@ -68,6 +70,7 @@ class HeightField:
     top: Any
     offset: Any
     two_sided: bool
+    powers: bool
 
     @classmethod
     def of(cls, grid: HeightGrid, unit: float, two_sided: bool) -> HeightField:
@@ -94,6 +97,7 @@ class HeightField:
             nodes,
             count(columns),
             count(rows),
+            count(rows * columns),
             count(table.columns_log2),
             count(table.columns_log2 + table.rows_log2),
             count(table.finest),
@@ -105,6 +109,7 @@ class HeightField:
             number(float(z.max())),
             number(_RELATIVE_OFFSET * extent),
             two_sided,
+            1 << table.columns_log2 == columns and 1 << table.rows_log2 == rows,
         )
 
     def leave(self, si: Any, d: Any) -> Any:
@@ -204,6 +209,13 @@ def _cell(position: Any, low: Any, length: Any, cells: Any) -> tuple[Any, Any]:
     return cell, p - mi.Float(cell)
 
 
+def _above(z: Any, x: Any, y: Any, slant: Slant, node: Any) -> tuple[Any, Any]:
+    """(height above a node's plane, or below it on the lower side; what is won per scene unit of the way)."""
+    here = z - dr.fma(x, node.y, dr.fma(y, node.z, node.x))
+    slope = dr.fma(-slant.x, node.y, dr.fma(-slant.y, node.z, slant.z))
+    return slant.side * here, slant.side * slope
+
+
 def _step(field: HeightField, walk: Walk, slant: Slant, max_crossings: Any) -> Walk:
     """Look at one block: go past it, or down to the next level, or end.
 
@@ -211,14 +223,19 @@ def _step(field: HeightField, walk: Walk, slant: Slant, max_crossings: Any) -> W
     comes of it.
     """
     # The block, and the ray's place in it.
-    mask = -(mi.Int32(1) << walk.level)
-    left, low = walk.column & mask, walk.row & mask
-    width, height = dr.minimum(-mask, field.columns - left), dr.minimum(-mask, field.rows - low)
-    x, y = mi.Float(walk.column - left) + walk.x, mi.Float(walk.row - low) + walk.y
+    size = mi.Int32(1) << walk.level
+    i, j = walk.column & (size - 1), walk.row & (size - 1)
+    left, low = walk.column - i, walk.row - j
+    x, y = mi.Float(i) + walk.x, mi.Float(j) + walk.y
     leaf = walk.level == 0
-    block = (mi.Int32(1) << (field.both_log2 - 2 * walk.level)) + field.columns * field.rows
-    block += ((walk.row >> walk.level) << (field.columns_log2 - walk.level)) + (walk.column >> walk.level)
-    index = dr.select(leaf, walk.row * field.columns + walk.column, block)
+    first = (mi.Int32(1) << (field.both_log2 - 2 * walk.level)) + field.cells
+    index = (walk.row >> walk.level << (field.columns_log2 - walk.level)) + (walk.column >> walk.level)
+    if field.powers:
+        width = height = size
+        index += dr.select(leaf, 0, first)
+    else:
+        width, height = dr.minimum(size, field.columns - left), dr.minimum(size, field.rows - low)
+        index = dr.select(leaf, walk.row * field.columns + walk.column, index + first)
     if field.two_sided:
         index += dr.select(slant.side < 0, field.below, 0)
     node = dr.gather(mi.Vector4f, field.nodes, index)
@@ -227,8 +244,7 @@ def _step(field: HeightField, walk: Walk, slant: Slant, max_crossings: Any) -> W
     to_x = (dr.select(slant.right, mi.Float(width), 0.0) - x) * slant.over_x
     to_y = (dr.select(slant.up, mi.Float(height), 0.0) - y) * slant.over_y
     end = dr.maximum(dr.minimum(to_x, to_y), 0.0)
-    here = slant.side * (walk.z - (node.x + x * node.y + y * node.z))
-    slope = slant.side * (slant.z - slant.x * node.y - slant.y * node.z)
+    here, slope = _above(walk.z, x, y, slant, node)
     across = x + y - 1.0
     fold = slant.side * (dr.maximum(dr.fma(end, slant.both, across), 0.0) * node.w)
     diagonal = across * slant.over_both
@@ -253,15 +269,19 @@ def _step(field: HeightField, walk: Walk, slant: Slant, max_crossings: Any) -> W
     walk.level = dr.select(free, above, dr.maximum(walk.level - 1, 0))
 
     # Modulo the period.
-    walk.column = dr.select(i < 0, field.columns - 1, dr.select(i >= field.columns, 0, i))
-    walk.row = dr.select(j < 0, field.rows - 1, dr.select(j >= field.rows, 0, j))
+    if field.powers:
+        walk.column, walk.row = i & (field.columns - 1), j & (field.rows - 1)
+    else:
+        walk.column = dr.select(i < 0, field.columns - 1, dr.select(i >= field.columns, 0, i))
+        walk.row = dr.select(j < 0, field.rows - 1, dr.select(j >= field.rows, 0, j))
     gone = slant.rising & (walk.z >= field.top)
     if field.two_sided:
         gone = (gone & (slant.side > 0)) | (~slant.rising & (walk.z <= field.bottom) & (slant.side < 0))
-    crossed = ((walk.column != i) | (walk.row != j)) & walk.searching & ~gone
+    walk.searching &= ~walk.hit & ~gone
+    crossed = walk.searching & ((walk.column != i) | (walk.row != j))
     walk.capped |= crossed & (walk.crossings >= max_crossings)
     walk.crossings += dr.select(crossed & ~walk.capped, mi.UInt32(1), 0)
-    walk.searching &= ~walk.hit & ~gone & ~walk.capped
+    walk.searching &= ~walk.capped
     return walk
 
 
@@ -269,8 +289,7 @@ def _surface(field: HeightField, walk: Walk, slant: Slant, d: Any) -> Any:
     """Surface interactions of lanes that meet the surface within their cell."""
     index = walk.row * field.columns + walk.column
     node = dr.gather(mi.Vector4f, field.nodes, index)
-    here = walk.z - (node.x + walk.x * node.y + walk.y * node.z)
-    slope = slant.z - slant.x * node.y - slant.y * node.z
+    here, slope = _above(walk.z, walk.x, walk.y, slant, node)
     to_x = (dr.select(slant.right, 1.0, 0.0) - walk.x) * slant.over_x
     to_y = (dr.select(slant.up, 1.0, 0.0) - walk.y) * slant.over_y
     end = dr.maximum(dr.minimum(to_x, to_y), 0.0)
@@ -278,10 +297,11 @@ def _surface(field: HeightField, walk: Walk, slant: Slant, d: Any) -> Any:
     diagonal = across * slant.over_both
     # The triangle in which the ray enters the cell, or the other one.
     second = (across > 0) | ((across == 0) & (slant.both > 0))
-    passes = (diagonal > 0) & (diagonal < end) & (slant.side * dr.fma(diagonal, slope, here) > 0)
+    passes = (diagonal > 0) & (diagonal < end) & (dr.fma(diagonal, slope, here) > 0)
     second ^= passes
     fold = dr.select(second, node.w, 0.0)
-    t = dr.clip((here - across * fold) / (slant.both * fold - slope), 0.0, end)
+    bend = slant.side * fold
+    t = dr.clip((here - across * bend) / (slant.both * bend - slope), 0.0, end)
     x, y = mi.Float(walk.column) + dr.fma(t, slant.x, walk.x), mi.Float(walk.row) + dr.fma(t, slant.y, walk.y)
     p = mi.Point3f(
         dr.fma(x, field.cell[0], field.low[0]),

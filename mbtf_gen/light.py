@@ -26,6 +26,9 @@ MAX_WIDTH_DEG = 45.0
 MIN_WIDTH_DEG = 0.01
 
 
+# The horizon cuts nothing that counts from lobes that stand this many widths above it.
+NEAR_WIDTHS = 10.0
+
 # Worked out once: nodes of high order take a tenth of a second.
 _gauss = cache(np.polynomial.legendre.leggauss)
 
@@ -101,14 +104,12 @@ def lobe_irradiance(kappa: float, elevation: ArrayLike) -> NDArray[np.float64]:
 
 @lru_cache(maxsize=16)
 def _lobe(width_deg: float) -> tuple[float, Any]:
-    """Concentration of a lobe, and its irradiance as a spline over the elevation; a fifth of a second."""
+    """Concentration of a lobe, and its irradiance as a spline over low elevations; a fifth of a second."""
     from scipy.interpolate import CubicSpline
 
     kappa = concentration(width_deg)
-    # Dense where the lobe crosses the horizon, where E departs from sin(elevation).
-    near = np.linspace(0.0, min(10.0 * np.radians(width_deg), np.pi / 2), 1025)
-    far = np.linspace(near[-1], np.pi / 2, 1025)[1:] if near[-1] < np.pi / 2 else np.zeros(0)
-    elevation = np.concatenate([near, far])
+    # Dense, for E departs from sin(elevation) here.
+    elevation = np.linspace(0.0, min(NEAR_WIDTHS * np.radians(width_deg), np.pi / 2), 2049)
     return kappa, CubicSpline(elevation, lobe_irradiance(kappa, elevation))
 
 
@@ -148,7 +149,13 @@ class LightKernel:
         w = np.asarray(omega_i, np.float64)
         if self.is_delta:
             return w[..., 2].copy()
-        return np.asarray(self._table(np.arctan2(w[..., 2], np.hypot(w[..., 0], w[..., 1]))))
+        # Where nothing of the lobe is cut off: its mean cosine.
+        out = np.array(w[..., 2] * (1.0 / np.tanh(self.kappa) - 1.0 / self.kappa))
+        widest = NEAR_WIDTHS * np.radians(self.width_deg)
+        near = w[..., 2] < (np.sin(widest) if widest < np.pi / 2 else np.inf)
+        low = w[near]
+        out[near] = self._table(np.arctan2(low[..., 2], np.hypot(low[..., 0], low[..., 1])))
+        return out
 
     def density(self, omega: ArrayLike, omega_i: ArrayLike) -> NDArray[np.float64]:
         """Lobe p(ω) in 1/sr for directions (..., 3), not cut at the horizon. Not defined for a delta

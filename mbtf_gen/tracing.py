@@ -358,7 +358,8 @@ def trace(
     _follow(world, path, onward, shadow, light, transport, limit)
     if not transport.interreflection:
         return path
-    dr.eval(path)
+    # Lights too: the second kernel reads those of its lanes.
+    dr.eval(path, light)
     going = dr.compress(path.active)
     if len(going):
         rest = _picked(path, going)

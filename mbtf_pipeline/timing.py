@@ -138,6 +138,8 @@ def _first_features(material: Material, work: Workload, size: int) -> Any:
 
 def _parts(material: Material) -> dict[str, Callable[..., Any]]:
     """What stage 1 does, part by part, at one place per position that the model reads."""
+    from mbtf_fit.models.encodings import encode_position
+
     model = material.model
     around = model.positions
 
@@ -155,4 +157,7 @@ def _parts(material: Material) -> dict[str, Callable[..., Any]]:
 
         out["offset network"] = offset_network
     out["pyramid"] = lambda u, s, i, o: model.read(spread(u), model.level(spread(s)))
+    encoding = model.network.encoding
+    if encoding.position:
+        out["encoding"] = lambda u, s, i, o: encode_position(spread(u), encoding)
     return out

@@ -57,9 +57,8 @@ def decibel(psnr: Mapping[str, Any], mse: Mapping[str, Any]) -> str:
     e, error = estimate(psnr), estimate(mse)
     if not math.isfinite(e.value):
         return f"error {BELOW}"
-    if below_bar(error):
-        return f"error {BELOW} ({e} dB)"
-    return f"{e} dB"
+    text = f"{e} dB".replace("-", "−")
+    return f"error {BELOW} ({text})" if below_bar(error) else text
 
 
 def direction(d: Mapping[str, float]) -> str:

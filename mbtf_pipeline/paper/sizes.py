@@ -46,7 +46,7 @@ def weights(runs: Sequence[Run]) -> list[Table]:
     return [Table("weights", "Weights", text, columns, rows)]
 
 
-_PARTS = ("offset texture", "offset network", "pyramid")
+_PARTS = ("offset texture", "offset network", "pyramid", "encoding")
 
 
 def timing(runs: Sequence[Run]) -> list[Table]:
@@ -71,17 +71,18 @@ def timing(runs: Sequence[Run]) -> list[Table]:
                     ]
                 )
     for title, _, _ in NOT_HERE.values():
-        rows.append([title, NOT_BUILT, *([None] * (len(lights) + 7))])
+        rows.append([title, NOT_BUILT, *([None] * (len(_PARTS) + len(lights) + 4))])
     columns = [
         Column("method", "method"),
         Column("device", "device"),
-        Column("as a material evaluates", "evaluate_ms", digits=".1f"),
-        Column("offset texture", "offset_texture_ms", digits=".1f"),
-        Column("offset network", "offset_network_ms", digits=".1f"),
-        Column("pyramid", "pyramid_ms", digits=".1f"),
-        Column("stage 1 (per view)", "stage1_ms", digits=".1f"),
-        Column("stage 2 (per light): decoder", "stage2_ms", digits=".1f"),
-        *(Column(f"{n} light{'s' if n != '1' else ''}", f"lights_{n}_ms", digits=".1f") for n in lights),
+        Column("as a material evaluates", "evaluate_ms", digits=",.1f"),
+        Column("offset texture", "offset_texture_ms", digits=",.1f"),
+        Column("offset network", "offset_network_ms", digits=",.1f"),
+        Column("pyramid", "pyramid_ms", digits=",.1f"),
+        Column("encoded position", "encoding_ms", digits=",.1f"),
+        Column("stage 1 (per view)", "stage1_ms", digits=",.1f"),
+        Column("stage 2 (per light): decoder", "stage2_ms", digits=",.1f"),
+        *(Column(f"{n} light{'s' if n != '1' else ''}", f"lights_{n}_ms", digits=",.1f") for n in lights),
         Column("queries timed", "queries"),
     ]
     text = (

@@ -84,6 +84,7 @@ def run_paper(
         "tables": list(paper.tables),
         "skipped": dict(missing),
         "machine": machine(),
+        "planned": len(planned),
         "runs": [],
     }
     write_json(folder / PAPER_NAME, record)
@@ -94,17 +95,17 @@ def run_paper(
             console.note(f"{one.name}: run {number} of {len(planned)}")
             run_recipe(one.recipe, folder / RUNS / one.name, force=force, command=command, console=console)
             record["runs"].append({"material": one.material, "variant": one.variant, "name": one.name})
-        write_json(folder / PAPER_NAME, record)
+            write_json(folder / PAPER_NAME, record)
         page, tables = write_page(folder, record)
     return Paper(folder, page, tables, record)
 
 
 def write_again(folder: Path) -> Path:
-    """Write page and tables of finished runs again; returns the page's path.
+    """Write page and tables of the runs that are finished again; returns the page's path.
 
     Raises
     ------
-    InputError : a run is not finished, or damaged
+    InputError : no run is finished, or one is damaged
     """
     from .page import write_page
 

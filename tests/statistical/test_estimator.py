@@ -60,7 +60,8 @@ def test_launches_of_any_size_share_their_kernels() -> None:
     e = Estimator(build_tile(rocks(32), surface), LightKernel(5.0), Transport())
     e.estimate(same_query(300), 8, Stream(0, "train", 0))
     # Another number of queries, of another relief, with other limits on the paths.
-    other = Estimator(build_tile(rocks(48, 0.1), surface), LightKernel(2.0), Transport(7, 2))
+    # (Reliefs whose sides are no powers of two have kernels of their own.)
+    other = Estimator(build_tile(rocks(64, 0.1), surface), LightKernel(2.0), Transport(7, 2))
     before = dr.flag(dr.JitFlag.KernelHistory)
     dr.set_flag(dr.JitFlag.KernelHistory, True)
     try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -123,6 +124,20 @@ def test_the_page_can_be_written_again(made: Path) -> None:
     rows.unlink()
     assert run(app, ["report", str(made / "out")]) == 0
     assert (page.read_bytes(), rows.read_bytes()) == before
+
+
+def test_an_interrupted_recipe_has_a_page_that_says_so(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(made / "out", tmp_path / "out")
+    record = tmp_path / "out" / "paper.json"
+    data = json.loads(record.read_text()) | {"planned": 3}
+    record.write_text(json.dumps(data))
+    assert run(app, ["report", str(tmp_path / "out")]) == 0
+    assert "1 of 3 runs are finished" in (tmp_path / "out" / "paper.html").read_text()
+    record.write_text(json.dumps(data | {"runs": []}))
+    assert run(app, ["report", str(tmp_path / "out")]) == 3
+    assert "has no finished run" in capsys.readouterr().err
 
 
 def test_a_folder_of_something_else_is_left_alone(made: Path, capsys: pytest.CaptureFixture[str]) -> None:

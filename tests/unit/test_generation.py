@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from support.datasets import formula
 
-from mbtf_gen import generation
+from mbtf_gen import generation, shard_making
 from mbtf_gen.atomic import create_file, sealed
 from mbtf_gen.config import GeneratorConfig
 from mbtf_gen.dataset import Dataset
@@ -146,6 +146,13 @@ def test_too_many_nonfinite_samples_fail_the_run_and_name_their_place(
     with pytest.raises(PartialError, match="8 of 320"):
         finish(tmp_path / "out")
     assert not json.loads((tmp_path / "out/manifest.json").read_text())["complete"]
+
+
+def test_samples_are_held_against_all_paths_that_a_target_error_may_take(config: GeneratorConfig) -> None:
+    """A run is not stopped for samples that are few among its paths."""
+    assert Job.prepare(config).most_paths() == Job.prepare(config).all_paths() == 320
+    aimed = Job.prepare(changed(config, queries={"target_error": 0.02, "cap": 128}))
+    assert aimed.most_paths() == 100 * (128 + 16) + 30 * 4
 
 
 @pytest.mark.parametrize(
@@ -393,6 +400,28 @@ def test_a_shard_that_another_process_writes_is_left_to_it(
             generate(config, out)
         assert sorted(contents(out)) == sorted(set(FILES) - {FILES[1]})
     assert generate(config, out).complete
+
+
+def test_a_shard_that_was_finished_before_its_lock_was_had_is_not_made_again(
+    config: GeneratorConfig, engine: Formula, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between the look at a shard and its lock another process may finish it and let go."""
+    whole, out = tmp_path / "whole", tmp_path / "out"
+    generate(config, whole)
+    engine.asked.clear()
+    take = shard_making.take_lock
+
+    def late(path: Path) -> Any:
+        if path.name == FILES[1]:
+            for name in (path.name, sidecar_of(path).name):
+                shutil.copy(whole / name, out / name)
+        return take(path)
+
+    monkeypatch.setattr(shard_making, "take_lock", late)
+    assert generate(config, out).complete
+    assert engine.asked == [("train", 0), ("train", 2), ("test", 0)]
+    assert contents(out) == contents(whole)
+    assert not list(out.glob(".*"))
 
 
 def test_the_sidecar_says_what_the_shard_holds(

@@ -80,7 +80,7 @@ def test_all_fits_are_judged_by_the_same_test_queries(tmp_path: Path) -> None:
     [
         ("neumip-baseline", ["pyramid"]),
         ("neumip", ["offset texture", "offset network", "pyramid"]),
-        ("hierarchical", ["offset texture", "offset network", "pyramid"]),
+        ("hierarchical", ["offset texture", "offset network", "pyramid", "encoding"]),
     ],
 )
 def test_times_are_scaled_to_all_pixels(

@@ -36,6 +36,7 @@ def test_no_decibels_for_an_error_that_may_be_none() -> None:
     mse = {"value": 1e-4, "error": 1e-6, "n": 9}
     psnr = {"value": 40.0, "error": 0.2, "n": 9}
     assert decibel(psnr, mse) == "40.0 ± 0.2 dB"
+    assert decibel({**psnr, "value": -3.0}, mse) == "−3.0 ± 0.2 dB"
     assert decibel(psnr, {**mse, "error": 1e-4}).startswith("error below two error bars")
     assert (
         decibel({"value": None, "error": None, "n": 9}, {**mse, "value": -1e-4})
