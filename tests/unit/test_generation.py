@@ -400,12 +400,10 @@ def test_what_another_process_is_writing_is_not_replaced(
     out = tmp_path / "out"
     generate(config, out)
     before = {p.name: p.read_bytes() for p in out.iterdir()}
-    with (
-        shard_lock(out / FILES[1]) as held,
-        pytest.raises(PartialError, match="is being written by another process"),
-    ):
+    with shard_lock(out / FILES[1]) as held:
         assert held
-        generate(changed(config, seed=7), out, overwrite=True)
+        with pytest.raises(PartialError, match="is being written by another process"):
+            generate(changed(config, seed=7), out, overwrite=True)
     assert {p.name: p.read_bytes() for p in out.iterdir()} == before
     assert generate(changed(config, seed=7), out, overwrite=True).complete
 
