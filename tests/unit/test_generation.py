@@ -372,6 +372,42 @@ def test_of_two_writers_that_begin_at_once_the_second_adopts_the_plan_of_the_fir
     assert verify(out) == []
 
 
+def test_of_two_writers_that_begin_different_data_sets_at_once_the_second_is_refused(
+    config: GeneratorConfig, engine: Formula, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, another = tmp_path / "out", Job.prepare(changed(config, queries={"spp": 8}))
+    content = sealed(
+        build_manifest(
+            another, another.shards("train") + another.shards("test"), generation.simulated(another)
+        )
+    )
+
+    def plan(job: Job, pilots: bool) -> Any:
+        out.mkdir()
+        assert create_file(out / "manifest.json", content)
+        return generation.simulated(job)
+
+    monkeypatch.setattr(generation, "plan_effects", plan)
+    with pytest.raises(InputError, match=r"another configuration: queries\.spp"):
+        generate(config, out)
+    assert (out / "manifest.json").read_bytes() == content
+    assert not contents(out)
+
+
+def test_what_another_process_is_writing_is_not_replaced(
+    config: GeneratorConfig, engine: Formula, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    generate(config, out)
+    before = {p.name: p.read_bytes() for p in out.iterdir()}
+    with shard_lock(out / FILES[1]) as held:
+        assert held
+        with pytest.raises(PartialError, match="is being written by another process"):
+            generate(changed(config, seed=7), out, overwrite=True)
+    assert {p.name: p.read_bytes() for p in out.iterdir()} == before
+    assert generate(changed(config, seed=7), out, overwrite=True).complete
+
+
 @pytest.mark.parametrize("count", [1, 2, 3, 5, 7])
 def test_slices_share_the_work_without_gap_or_overlap(
     count: int, config: GeneratorConfig, engine: Formula, tmp_path: Path
