@@ -252,6 +252,7 @@ def export_material(
     from .material import Material, export
     from .material_format import DESCRIPTION_NAME, WEIGHTS_NAME
     from .storage import make_folder
+    from .transmittance import TRANSMITTANCE_NAME, read_transmittance
 
     wanted = list(dict.fromkeys(to or ["exr", "json"]))
     folder = material if output is None else output
@@ -273,6 +274,7 @@ def export_material(
         files.append(LAYERS_NAME)
     if "material" in wanted:
         description = loaded.description
+        holes = read_transmittance(material, description)
         export(
             written.model,
             written.config,
@@ -280,8 +282,9 @@ def export_material(
             data=description["data"],
             training=description["training"],
             half=half,
+            holes=holes,
         )
-        files += [WEIGHTS_NAME, DESCRIPTION_NAME]
+        files += [WEIGHTS_NAME, DESCRIPTION_NAME, *([TRANSMITTANCE_NAME] if holes is not None else [])]
     sizes = {name: (folder / name).stat().st_size for name in files}
     lines = [f"{folder / name}: {size / 1e6:.3f} MB" for name, size in sizes.items()]
     console.report(

@@ -31,6 +31,7 @@ from .models import MODELS, build_model
 from .noise import NoiseModel, typical_value
 from .storage import make_folder, read_tensors, write_tensors
 from .training import Trainer
+from .transmittance import TRANSMITTANCE_NAME, fit_transmittance
 
 FIT_NAME = "fit.json"
 CONFIG_NAME = "config.yaml"
@@ -43,6 +44,7 @@ _OWN_FILES = (
     CHECKPOINT_NAME,
     DESCRIPTION_NAME,
     WEIGHTS_NAME,
+    TRANSMITTANCE_NAME,
     LAYERS_NAME,
     TEXTURES_NAME,
 )
@@ -169,7 +171,8 @@ def fit(
     }
     errors = judge(trainer.predict, data, partition)
     training["errors"] = {name: e.as_dict() for name, e in errors.items()}
-    export(trainer.model, config, out, data=identity["data"], training=training)
+    holes = fit_transmittance(data)
+    export(trainer.model, config, out, data=identity["data"], training=training, holes=holes)
     (out / CHECKPOINT_NAME).unlink(missing_ok=True)
     return _finished(out, time.perf_counter() - begin, resumed=resumed)
 

@@ -34,6 +34,7 @@ from .material_format import (
 )
 from .models import NeuralMaterial, TexturedMaterial, build_model
 from .storage import read_tensors, write_tensors
+from .transmittance import TRANSMITTANCE_NAME, Transmittance, write_transmittance
 
 
 def conformance_queries(lattice: Lattice) -> dict[str, NDArray[np.float32]]:
@@ -165,6 +166,7 @@ def export(
     data: dict[str, Any],
     training: dict[str, Any],
     half: bool = False,
+    holes: Transmittance | None = None,
 ) -> Material:
     """Write a model as a material and return it as read back.
 
@@ -173,12 +175,17 @@ def export(
     data : what identifies the data set
     training : summary of the training: steps, seconds, errors
     half : store 16-bit floats; the model's numbers are such already
+    holes : what the material lets through; None for one without holes
 
     Raises
     ------
     PartialError : the folder cannot be written
     """
     lattice = model.lattice
+    stated: dict[str, Any] = {}
+    if holes is not None:
+        write_transmittance(holes, folder / TRANSMITTANCE_NAME)
+        stated["holes"] = {"file": TRANSMITTANCE_NAME, "sha256": digest(folder / TRANSMITTANCE_NAME)}
     queries = conformance_queries(lattice)
     weights = model.weights()
     if half:
@@ -216,6 +223,7 @@ def export(
                 "tolerance": 1e-4,
                 "note": "evaluating the first four must give the fifth within tolerance * max(1, value)",
             },
+            **stated,
             "config": config.model_dump(mode="json"),
             "data": data,
             "training": training,

@@ -13,6 +13,7 @@ from mbtf_gen.errors import InputError, MbtfError, UsageError
 from mbtf_gen.quality import Quality
 
 if TYPE_CHECKING:
+    from .recipe import Recipe
     from .run import RunResult
 
 app = new_app("mbtf-pipeline", "Run recipes: generate, fit, compare, report.")
@@ -29,6 +30,7 @@ def run(
     *,
     output: Output = None,
     quality: Quality | None = None,
+    budget: str | None = None,
     quick: Annotated[bool, Parameter(negative="")] = False,
     force: Annotated[bool, Parameter(negative="")] = False,
     assignments: Set | None = None,
@@ -46,6 +48,9 @@ def run(
         Folder of the run. Default: out/NAME
     quality
         Sizes and times of all stages, in place of the recipe's.
+    budget
+        Time for generating and training together: 90s, 10min, 1h. Pilots on this machine split it; it takes
+        the place of the recipe's queries and training times. Comparison and report come on top.
     quick
         The quick size of a paper recipe: minutes in place of hours.
     force
@@ -57,6 +62,9 @@ def run(
         if quality is not None:
             cure = "leave it out; --quick is the small size"
             raise UsageError("a paper recipe has sizes of its own", where="--quality", cure=cure)
+        if budget is not None:
+            cure = "leave it out; --quick is the small size"
+            raise UsageError("a paper recipe has times of its own", where="--budget", cure=cure)
         _run_paper(recipe, output, quick, force, assignments or [], console)
         return
     if quick:
@@ -68,10 +76,27 @@ def run(
     loaded = load_recipe(recipe, [*quality_assignments(recipe, quality), *(assignments or [])])
     command = ["mbtf-pipeline", "run", str(recipe)]
     command += ["--quality", quality] if quality is not None else []
+    command += ["--budget", budget] if budget is not None else []
     command += ["-o", str(output)] if output is not None else []
     command += [part for a in assignments or [] for part in ("--set", a)]
+    if budget is not None:
+        loaded = _budgeted(loaded, budget, output, shlex.join(command), console)
     result = run_recipe(loaded, output, force=force, command=shlex.join(command), console=console)
     console.report(_summary(result), _describe(result))
+
+
+def _budgeted(loaded: Recipe, budget: str, output: Path | None, command: str, console: Console) -> Recipe:
+    from mbtf_gen.durations import parse_duration
+
+    from .budget import split_budget, within_budget
+
+    try:
+        seconds = parse_duration(budget)
+    except ValueError as error:
+        raise UsageError(str(error), where="--budget") from None
+    split = split_budget(loaded, seconds, output or loaded.folder, command, console.note)
+    console.note(split.describe())
+    return within_budget(loaded, split)
 
 
 def _run_paper(

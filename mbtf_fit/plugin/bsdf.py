@@ -120,6 +120,12 @@ class MbtfBSDF(mi.BSDF):
         flags |= mi.BSDFFlags.Anisotropic
         self.m_components = [flags]
         self.m_flags = flags
+        self.has_holes = stored.holes is not None
+        if self.has_holes:
+            through = mi.BSDFFlags.Null | mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide
+            through |= mi.BSDFFlags.SpatiallyVarying
+            self.m_components = [flags, through]
+            self.m_flags = flags | through
 
     @staticmethod
     def _place(props: Any) -> str:
@@ -165,38 +171,50 @@ class MbtfBSDF(mi.BSDF):
         return View(self, si, frame, frame.to_tile(si.wi))
 
     def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
-        """Direction and weight f·cos/density."""
+        """Direction and weight: f·cos/density of what is reflected; 1 of what passes through a hole, which
+        happens with the probability of the transmittance."""
         view = self._view(si)
-        wo = view.mixture().sample(sample1, sample2)
-        good = active & (view.wi.z > 0) & (wo.z > 0)
+        hole = view.hole(ctx)
+        passes = active & (sample1 < hole)
+        again = dr.clip((sample1 - hole) / dr.maximum(1.0 - hole, 1e-6), 0.0, 1.0)
+        wo = view.mixture().sample(again, sample2)
+        good = active & ~passes & view.reflects(ctx) & (view.wi.z > 0) & (wo.z > 0)
         wo = dr.select(good, wo, mi.Vector3f(0, 0, 1))
         value, pdf = view.eval_pdf(ctx, wo)
+        pdf *= 1.0 - hole
         good &= pdf > 0
         bs = dr.zeros(mi.BSDFSample3f, dr.width(wo))
-        bs.wo = view.frame.to_local(wo)
-        bs.pdf = dr.select(good, pdf, 0.0)
+        bs.wo = dr.select(passes, -si.wi, view.frame.to_local(wo))
+        bs.pdf = dr.select(passes, hole, dr.select(good, pdf, 0.0))
         bs.eta = 1.0
-        bs.sampled_type = mi.UInt32(int(mi.BSDFFlags.GlossyReflection))
-        bs.sampled_component = mi.UInt32(0)
-        return bs, dr.select(good, value / pdf, 0.0)
+        bs.sampled_type = dr.select(
+            passes, mi.UInt32(int(mi.BSDFFlags.Null)), mi.UInt32(int(mi.BSDFFlags.GlossyReflection))
+        )
+        bs.sampled_component = dr.select(passes, mi.UInt32(1), mi.UInt32(0))
+        return bs, dr.select(passes, 1.0, dr.select(good, value / pdf, 0.0))
 
     def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
         """(f·cos, density) of a local direction."""
         view = self._view(si)
-        good = active & (view.wi.z > 0) & (wo.z > 0)
+        good = active & view.reflects(ctx) & (view.wi.z > 0) & (wo.z > 0)
         value, pdf = view.eval_pdf(ctx, view.frame.to_tile(wo))
-        return dr.select(good, value, 0.0), dr.select(good, pdf, 0.0)
+        return dr.select(good, value, 0.0), dr.select(good, pdf * (1.0 - view.hole(ctx)), 0.0)
 
     def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
         """f·cos of a local direction."""
         view = self._view(si)
         value = view.value(ctx, view.frame.to_tile(wo))
-        return dr.select(active & (view.wi.z > 0) & (wo.z > 0), value, 0.0)
+        return dr.select(active & view.reflects(ctx) & (view.wi.z > 0) & (wo.z > 0), value, 0.0)
 
     def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
         """Density of a local direction."""
         view = self._view(si)
-        return dr.select(active & (wo.z > 0), view.mixture().density(view.frame.to_tile(wo)), 0.0)
+        pdf = view.mixture().density(view.frame.to_tile(wo)) * (1.0 - view.hole(ctx))
+        return dr.select(active & view.reflects(ctx) & (wo.z > 0), pdf, 0.0)
+
+    def eval_null_transmission(self, si: Any, active: Any = True) -> Any:
+        """Share that passes straight through holes."""
+        return dr.select(active, mi.Color3f(self._view(si).transmittance()), 0.0)
 
     def traverse(self, callback: Any) -> None:
         """Parameters: the textures' texels (all levels, padded to whole groups), ``uv_scale``, ``sigma``."""
@@ -219,6 +237,22 @@ class View:
     si: Any
     frame: Frame
     wi: Any
+
+    def transmittance(self) -> Any:
+        """Share of the footprint that is seen through holes."""
+        bsdf = self.bsdf
+        level = bsdf.evaluator.level(bsdf.footprint(self.si))
+        return bsdf.evaluator.transmittance(bsdf.place(self.si), level, self.wi)
+
+    def reflects(self, ctx: Any) -> bool:
+        """Whether the context asks for what is reflected."""
+        return bool(ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0))
+
+    def hole(self, ctx: Any) -> Any:
+        """Probability of passing through: the transmittance, where the context asks for it."""
+        if not (self.bsdf.has_holes and ctx.is_enabled(mi.BSDFFlags.Null, 1)):
+            return mi.Float(0.0)
+        return self.transmittance()
 
     def mixture(self) -> Mixture:
         """Density that directions are drawn from."""

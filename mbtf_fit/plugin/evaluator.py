@@ -40,6 +40,7 @@ class Evaluator:
         weights = count_weights(stored.decoder) + count_weights(stored.offset_network or [])
         self.arithmetic: Arithmetic = default_arithmetic(weights) if arithmetic is None else arithmetic
         self.pyramid = Textures(stored.pyramid)
+        self.holes = None if stored.holes is None else Textures(stored.holes)
         self.decoder = Network(stored.decoder, self.arithmetic, stored.network.activation)
         self.offset_texture: Textures | None = None
         if stored.offset_texture is not None and stored.offset_network is not None:
@@ -76,6 +77,16 @@ class Evaluator:
         options = self.network.encoding
         directions = [*encode_direction(omega_i, options), *encode_direction(omega_o, options)]
         return to_value(self.decoder([*features, *directions]), self.unit, self.network)
+
+    def transmittance(self, u: Any, level: Any, omega_o: Any) -> Any:
+        """Share of the footprint that is seen through holes, of unit vectors on either side of the plane: a
+        line passes both ways. The formula is that of :mod:`mbtf_fit.transmittance`."""
+        if self.holes is None:
+            return mi.Float(0.0)
+        x, y = (dr.mulsign(w, omega_o.z) for w in (omega_o.x, omega_o.y))
+        c = self.holes.blended(u, level)
+        value = c[0] + c[1] * x + c[2] * y + c[3] * x * x + c[4] * x * y + c[5] * y * y
+        return dr.clip(value, 0.0, 1.0)
 
     def evaluate(self, u: ArrayLike, sigma: ArrayLike, omega_i: ArrayLike, omega_o: ArrayLike) -> F32:
         """Values (n, 3) in 1/sr at arrays of queries, as :meth:`mbtf_fit.Material.evaluate` gives them."""

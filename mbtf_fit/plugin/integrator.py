@@ -56,6 +56,12 @@ def camera_cone(ray: Any, samples: int) -> tuple[Any, Any]:
     return tuple(scale * dr.sqrt(dr.abs(dr.dot(area, ray.d))) for area in (width, spread))
 
 
+def lets_through(scene: Any) -> bool:
+    """Whether light may pass straight through a surface of the scene; True where that cannot be told."""
+    surfaces = [shape.bsdf() for shape in scene.shapes()]
+    return any(bsdf is None or mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in surfaces)
+
+
 class ConePath(mi.SamplingIntegrator):
     """Path tracing with emitter sampling and multiple importance sampling, with ray cones.
 
@@ -92,14 +98,17 @@ class ConePath(mi.SamplingIntegrator):
         width, spread = camera_cone(ray, sampler.sample_count())
         Cones.carried = True
         try:
-            value, valid = self._trace(scene, sampler, mi.Ray3f(ray), width, spread, mi.Bool(active))
+            first = mi.Ray3f(ray)
+            value, valid = self._trace(
+                scene, sampler, first, width, spread, mi.Bool(active), lets_through(scene)
+            )
         finally:
             Cones.carried = False
         return value, valid, []
 
     @dr.syntax
     def _trace(
-        self, scene: Any, sampler: Any, ray: Any, width: Any, spread: Any, active: Any
+        self, scene: Any, sampler: Any, ray: Any, width: Any, spread: Any, active: Any, holes: bool
     ) -> tuple[Any, Any]:
         radiance, throughput = mi.Spectrum(0.0), mi.Spectrum(1.0)
         depth, eta = mi.UInt32(0), mi.Float(1.0)
@@ -124,8 +133,10 @@ class ConePath(mi.SamplingIntegrator):
             si = write_footprint(si, ray, width)
             bsdf = si.bsdf()
             smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-            ds, light = scene.sample_emitter_direction(si, sampler.next_2d(active), True, smooth)
+            ds, light = scene.sample_emitter_direction(si, sampler.next_2d(active), not holes, smooth)
             smooth &= ds.pdf > 0
+            if dr.hint(holes, mode="scalar"):
+                light *= self._through(scene, si, ds, width, smooth)
             wo = si.to_local(ds.d)
             value, density = bsdf.eval_pdf(context, si, wo, smooth)
             weight = dr.select(ds.delta, 1.0, ds.pdf / (ds.pdf + density))
@@ -152,3 +163,20 @@ class ConePath(mi.SamplingIntegrator):
             throughput[played] *= dr.rcp(dr.maximum(keep, 1e-6))
             active &= (most_left != 0.0) & (~played | (sampler.next_1d(active) < keep))
         return radiance, valid
+
+    @dr.syntax
+    def _through(self, scene: Any, si: Any, ds: Any, width: Any, active: Any) -> Any:
+        """Share of an emitter's light that reaches a hit, through the holes of what lies between."""
+        share, active = mi.Spectrum(1.0), mi.Bool(active)
+        ray = si.spawn_ray_to(ds.p)
+        while active:
+            hit = scene.ray_intersect(ray, mi.RayFlags.All, False, active)
+            active &= hit.is_valid()
+            bsdf = hit.bsdf()
+            passes = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
+            # As wide as where the light arrives: what is near is seen as it is there.
+            hit = write_footprint(hit, ray, width)
+            share[active] *= dr.select(passes, bsdf.eval_null_transmission(hit, passes), 0.0)
+            active &= dr.max(share) > 0.0
+            ray = hit.spawn_ray_to(ds.p)
+        return share

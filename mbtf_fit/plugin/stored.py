@@ -15,6 +15,7 @@ from mbtf_gen.settings import build
 
 from ..config import FitConfig, NetworkSection
 from ..material_format import CONFORMANCE, DESCRIPTION_NAME, check_conformance, read_description
+from ..transmittance import read_transmittance
 
 F32 = NDArray[np.float32]
 # (weight (outputs, inputs), bias (outputs,)) of each layer.
@@ -34,6 +35,7 @@ class StoredMaterial:
     decoder : layers of the network that gives the value
     offset_texture, offset_network : those of the neural offset; None without one
     unit : factor of the value, 1/sr
+    holes : (rows, columns, 6) coefficients of the transmittance of each level; None without holes
     conformance : queries ``u``, ``sigma``, ``omega_i``, ``omega_o`` and their values ``rgb`` (n, 3)
     """
 
@@ -45,6 +47,7 @@ class StoredMaterial:
     offset_texture: F32 | None
     offset_network: Layers | None
     unit: float
+    holes: list[F32] | None
     conformance: dict[str, F32]
 
 
@@ -65,6 +68,7 @@ def read_material(folder: str | Path) -> StoredMaterial:
     }
     conformance = check_conformance(stored, description, weights)
     reader = _Reader(tensors, weights)
+    holes = read_transmittance(folder, description)
     pyramid = [reader.texture(f"pyramid.{s}", lattice.shape(s)) for s in range(lattice.finest + 1)]
     channels = pyramid[0].shape[2]
     offset_texture, offset_network = None, None
@@ -84,6 +88,7 @@ def read_material(folder: str | Path) -> StoredMaterial:
         offset_texture,
         offset_network,
         float(reader.take("unit", ())),
+        None if holes is None else holes.levels,
         conformance,
     )
 

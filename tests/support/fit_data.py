@@ -71,8 +71,14 @@ def write_data(
     layout: str = "shuffled",
     schema: int = SCHEMA_VERSION,
     seed: int = 0,
+    through: Callable[[F32, F32, F32], NDArray[np.float64]] | None = None,
 ) -> Path:
-    """Write a data set of a known function with independent noise in both halves; returns its folder."""
+    """Write a data set of a known function with independent noise in both halves; returns its folder.
+
+    Parameters
+    ----------
+    through : transmittance at u, σ and view, of a material with holes
+    """
     folder.mkdir(parents=True, exist_ok=True)
     lattice = Lattice(finest, aspect)
     random = np.random.default_rng(seed)
@@ -88,6 +94,9 @@ def write_data(
                 for half in "ab"
             }
             arrays = {**queries, **halves, "spp": np.full(n, 2, np.float32)}
+            if through is not None:
+                seen = through(queries["u"], queries["sigma"], queries["omega_o"])
+                arrays["transmittance"] = seen.astype(np.float32)
             name = f"{split}-{index:05d}{suffix}"
             write_shard(folder / name, arrays)
             (folder / name).with_suffix(".json").write_text(json.dumps({"rows": n}))
@@ -102,6 +111,8 @@ def write_data(
         "tile": {"aspect": aspect},
         "splits": splits,
     }
+    if through is not None:
+        manifest["arrays"] = {"transmittance": {}}
     (folder / MANIFEST_NAME).write_text(json.dumps(manifest))
     return folder
 

@@ -10,6 +10,7 @@ import torch
 from mbtf_fit.config import FitConfig
 from mbtf_fit.material import Material, export
 from mbtf_fit.models import build_model
+from mbtf_fit.transmittance import Transmittance
 from mbtf_gen.levels import Lattice
 
 _TRAINING = {"steps": 0, "batch": 1, "seconds": 0.0, "device": "cpu", "threads": 1, "errors": {}}
@@ -27,6 +28,7 @@ def write_material(
     contrast: float = 0.5,
     brightness: float = 0.3,
     seed: int = 0,
+    holes: Transmittance | None = None,
 ) -> Material:
     """Write a material of random weights that all matter, and return it as read back.
 
@@ -36,6 +38,7 @@ def write_material(
     weights : tensors by name that replace those of the model
     contrast : standard deviation of the features
     brightness : mean of all biases
+    holes : what the material lets through
     """
     config = FitConfig.model_validate({"model": model, "network": network or {}})
     torch.manual_seed(seed)
@@ -55,4 +58,4 @@ def write_material(
     tensors |= weights or {}
     built.load_weights(tensors)
     folder.mkdir(parents=True, exist_ok=True)
-    return export(built, config, folder, data={"hash": "0" * 64}, training=_TRAINING)
+    return export(built, config, folder, data={"hash": "0" * 64}, training=_TRAINING, holes=holes)

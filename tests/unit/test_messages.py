@@ -59,7 +59,7 @@ RELAYS = {
         "examine",
     },
     "mbtf_gen/wording.py": {"explain"},
-    "mbtf_pipeline/cli.py": {"cost"},
+    "mbtf_pipeline/cli.py": {"_budgeted", "cost"},
 }
 
 

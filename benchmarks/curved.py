@@ -1,0 +1,431 @@
+"""Fitted materials on curved objects, beside the same objects really displaced, at equal view.
+
+    python benchmarks/curved.py [--work out/plugin_materials] [--size 256] [--spp 128] [--picture FILE]
+
+The objects (a sphere, a cow and a draped cloth) and the environment maps lie beside the project, in
+``../shared/data``; a scene whose files or fit are missing is left out by name. The fits are those of
+``plugin_materials.py``, which makes them. For every scene
+
+- the **reference** is the object's mesh in triangles finer than the maps' texels of interest, each vertex
+  moved along the normal by the height map, scaled by the size that a tile has there; Mitsuba's ``path`` with
+  the material's own surface;
+- the **material** is the smooth mesh with ``mbtf`` in ``mbtf_path``. Its footprint is the pixels' Gaussian
+  filter already, so the film has a box; the reference's film has the Gaussian.
+
+What is compared, with both sides' noise taken out (two independent halves each):
+
+- **interior**: pixels well inside both outlines that see the smooth surface under a cosine of at least 0.35.
+  Ratio of the means, and the RMS difference as a share of the mean, per pixel and of means over 4 x 4 and
+  16 x 16 pixels;
+- **rim**: the same ratio for the other pixels that both sides cover;
+- **outline**: by how much the displaced object's outline lies inside the smooth one's, in pixels, beside the
+  relief's depth in pixels. A fitted material does not change the outline.
+
+The last line is one JSON object: figures, and the bars they are held to. Exit code 1 where a bar is missed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbtf_gen.engine import load_mitsuba
+from mbtf_gen.reference import auto_exposure, to_display
+
+F64 = NDArray[np.float64]
+ROOT = Path(__file__).resolve().parents[1]
+DATA = ROOT.parent / "shared" / "data"
+# Means of the interior, as a share; RMS of 16 x 16 pixels as a share of the mean.
+BARS = {"mean": 0.05, "rms_16": 0.1}
+LOWEST, MARGIN, BLOCKS = 0.35, 4, (1, 4, 16)
+FIELD_OF_VIEW = 28.0
+# Most triangles of a displaced mesh, and triangles along an edge of the smooth one.
+MOST, SMOOTH = 3_000_000, 4
+
+
+@dataclass(frozen=True)
+class Scene:
+    """An object, what it is made of, and from where it is seen.
+
+    Attributes
+    ----------
+    tiles : tiles per unit of the object's texture coordinates, along both
+    towards : direction to the camera in the object's axes; y is up
+    across : half the width of the picture, in radii of the ball around the object
+    """
+
+    name: str
+    file: str
+    material: str
+    environment: str
+    tiles: tuple[float, float]
+    towards: tuple[float, float, float]
+    across: float
+
+
+SCENES = (
+    # What is left where nothing is curved.
+    Scene("plane", "", "turtle_shell", "studio.exr", (5, 5), (0.1, 1.0, 0.9), 0.8),
+    # Its coordinates run once around and once from pole to pole.
+    Scene("sphere", "materialx_sphere.obj", "turtle_shell", "studio.exr", (10, 5), (0.5, 0.35, 1.0), 1.06),
+    Scene(
+        "sphere, finer",
+        "materialx_sphere.obj",
+        "turtle_shell",
+        "studio.exr",
+        (20, 10),
+        (0.5, 0.35, 1.0),
+        1.06,
+    ),
+    Scene("cow", "spot_cow.obj", "cliff_rock", "park.exr", (12, 12), (-1.0, 0.35, -0.8), 0.85),
+    Scene("cloth", "pbdsock_cloth.obj", "twisted_wool", "studio.exr", (24, 24), (0.35, 0.25, 1.0), 0.8),
+)
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A smooth triangle mesh with texture coordinates, in a ball of radius 1 about the origin.
+
+    Attributes
+    ----------
+    place, normal : (n, 3)
+    uv : (n, 2) in tile widths, v downwards as the rows of images go
+    size : (n,) length of a tile width on the surface
+    faces : (m, 3)
+    """
+
+    place: F64
+    normal: F64
+    uv: F64
+    size: F64
+    faces: NDArray[np.int64]
+
+
+def load_object(scene: Scene) -> Surface:
+    """The object as its file has it, with normals and tile sizes that are the same on both sides of seams."""
+    import trimesh
+
+    if scene.file:
+        mesh = trimesh.load(DATA / "objects" / scene.file, process=False)
+        place, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+        wide = np.asarray(mesh.visual.uv, np.float64)
+    else:
+        place, wide, faces = _square(40)
+    place = place - 0.5 * (place.min(0) + place.max(0))
+    place /= np.linalg.norm(place, axis=1).max()
+    uv = wide * (1.0, -1.0) * scene.tiles
+    corner, wide = place[faces], uv[faces]
+    cross = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    a, b = wide[:, 1] - wide[:, 0], wide[:, 2] - wide[:, 0]
+    flat = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    area = np.linalg.norm(cross, axis=1)
+    _, same = np.unique(np.round(place, 6), axis=0, return_inverse=True)
+    same = same.ravel()
+
+    def gathered(per_face: F64) -> F64:
+        out = np.zeros((same.max() + 1, *per_face.shape[1:]))
+        for k in range(3):
+            np.add.at(out, same[faces[:, k]], per_face)
+        return out[same]
+
+    normal = gathered(cross)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
+    size = np.sqrt(gathered(area) / np.maximum(gathered(flat), 1e-20))
+    return Surface(place, normal, uv, size, faces)
+
+
+def _square(n: int) -> tuple[F64, F64, NDArray[np.int64]]:
+    """A horizontal square of n x n cells: vertices, texture coordinates, triangles."""
+    i, j = (x.ravel() for x in np.meshgrid(np.arange(n + 1), np.arange(n + 1)))
+    uv = np.stack([i, j], -1) / n
+    corner = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).ravel()
+    right, up = corner + 1, corner + n + 1
+    faces = np.concatenate([np.stack([corner, right, up + 1], -1), np.stack([corner, up + 1, up], -1)])
+    return np.stack([uv[:, 0], np.zeros(len(uv)), -uv[:, 1]], -1), uv, faces
+
+
+def refined(surface: Surface, n: int) -> Surface:
+    """Every triangle cut into n², and rounded by its vertices' normals (Phong tessellation, Boubekeur and
+    Alexa 2008)."""
+    steps = np.array([(i, j) for i in range(n + 1) for j in range(n + 1 - i)])
+    weights = np.concatenate([steps, n - steps.sum(1, keepdims=True)], 1) / n
+    number = {tuple(s): k for k, s in enumerate(steps)}
+    pattern = []
+    for i in range(n):
+        for j in range(n - i):
+            pattern.append((number[i, j], number[i + 1, j], number[i, j + 1]))
+            if i + j < n - 1:
+                pattern.append((number[i + 1, j], number[i + 1, j + 1], number[i, j + 1]))
+    count = len(weights)
+
+    def mixed(array: F64) -> F64:
+        corners = array[surface.faces].astype(np.float32)
+        return np.einsum("wk,fk...->fw...", weights.astype(np.float32), corners).reshape(-1, *array.shape[1:])
+
+    place, normal = mixed(surface.place), mixed(surface.normal)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
+    rounded = np.zeros_like(place)
+    for k in range(3):
+        at = np.repeat(surface.place[surface.faces[:, k]], count, axis=0)
+        to = np.repeat(surface.normal[surface.faces[:, k]], count, axis=0)
+        onto = place - ((place - at) * to).sum(1, keepdims=True) * to
+        rounded += np.tile(weights[:, k], len(surface.faces))[:, None] * onto
+    place = 0.25 * place + 0.75 * rounded
+    # Same vertices of neighbouring triangles are rounded alike, so that no crack opens.
+    place = np.round(place, 7)
+    first = count * np.arange(len(surface.faces))[:, None, None]
+    faces = (first + np.array(pattern)).reshape(-1, 3)
+    return Surface(place, normal, mixed(surface.uv), mixed(surface.size), faces)
+
+
+def displaced(surface: Surface, grid: Any) -> Surface:
+    """Vertices moved along their normals by the tile's heights."""
+    from scipy.ndimage import map_coordinates
+
+    rows, columns = grid.z.shape
+    row = np.mod(surface.uv[:, 1] / grid.aspect, 1.0) * rows - 0.5
+    column = np.mod(surface.uv[:, 0], 1.0) * columns - 0.5
+    height = map_coordinates(grid.z, [row, column], order=1, mode="grid-wrap")
+    place = surface.place + (height * surface.size)[:, None] * surface.normal
+    return Surface(place, surface.normal, surface.uv, surface.size, surface.faces)
+
+
+def mesh_of(mi: Any, surface: Surface, bsdf: Any, *, smooth: bool, aspect: float = 1.0) -> Any:
+    """Mitsuba's mesh; texture coordinates are divided by (1, aspect)."""
+    properties = mi.Properties()
+    properties["bsdf"] = bsdf
+    properties["face_normals"] = not smooth
+    mesh = mi.Mesh(
+        "object",
+        len(surface.place),
+        len(surface.faces),
+        has_vertex_normals=smooth,
+        has_vertex_texcoords=True,
+        props=properties,
+    )
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = surface.place.astype(np.float32).ravel()
+    parameters["vertex_texcoords"] = (surface.uv / (1.0, aspect)).astype(np.float32).ravel()
+    parameters["faces"] = surface.faces.astype(np.uint32).ravel()
+    if smooth:
+        parameters["vertex_normals"] = surface.normal.astype(np.float32).ravel()
+    parameters.update()
+    return mesh
+
+
+def scene_of(mi: Any, scene: Scene, mesh: Any, size: int, pixels: str) -> Any:
+    """The object under its environment, with a filter of the pixels."""
+    stored = mi.Bitmap(str(DATA / "env" / scene.environment))
+    # Lossy compression has left a few numbers below zero.
+    light = np.array(stored.convert(component_format=mi.Struct.Type.Float32))
+    light = np.maximum(light[..., :3], 0.0)
+    towards = np.array(scene.towards) / np.linalg.norm(scene.towards)
+    origin = [float(c) for c in towards * scene.across / np.tan(np.radians(FIELD_OF_VIEW / 2))]
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "object": mesh,
+            "light": {"type": "envmap", "bitmap": mi.Bitmap(light), "scale": 1.0 / float(light.mean())},
+            "sensor": {
+                "type": "perspective",
+                "fov": FIELD_OF_VIEW,
+                "to_world": mi.ScalarTransform4f().look_at(origin, [0, 0, 0], [0, 1, 0]),
+                "film": {
+                    "type": "hdrfilm",
+                    "width": size,
+                    "height": size,
+                    "pixel_format": "rgb",
+                    "rfilter": {"type": pixels},
+                },
+                "sampler": {"type": "independent"},
+            },
+        }
+    )
+
+
+def halves(mi: Any, scene: Any, integrator: str, spp: int) -> tuple[F64, F64]:
+    """Two independent pictures (size, size, 3) of spp/2 paths per pixel."""
+    tracer = mi.load_dict({"type": integrator, "max_depth": 12, "hide_emitters": True})
+    a, b = (
+        np.array(mi.render(scene, integrator=tracer, spp=spp // 2, seed=seed), np.float64) for seed in (1, 2)
+    )
+    return a, b
+
+
+def seen(mi: Any, scene: Any, size: int, fine: int) -> tuple[NDArray[np.bool_], F64]:
+    """What rays on a grid of `fine` per pixel along both sides meet, and the cosine they see it under."""
+    import drjit as dr
+
+    n = size * fine
+    index = dr.arange(mi.UInt32, n * n)
+    at = mi.Point2f(mi.Float(index % n) + 0.5, mi.Float(index // n) + 0.5) / n
+    ray, _ = scene.sensors()[0].sample_ray(0.0, 0.5, at, mi.Point2f(0.5))
+    si = scene.ray_intersect(ray)
+    hit = np.array(si.is_valid()).reshape(n, n)
+    cosine = np.where(hit, np.array(dr.abs(dr.dot(si.sh_frame.n, ray.d))).reshape(n, n), 0.0)
+    return hit, cosine
+
+
+def shrunk(mask: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
+    """Mask without what lies within so many pixels of its outside."""
+    from scipy.ndimage import binary_erosion
+
+    return np.asarray(binary_erosion(mask, iterations=by) if by else mask)
+
+
+def rms(a: tuple[F64, F64], b: tuple[F64, F64], mask: NDArray[np.bool_], block: int) -> float:
+    """RMS difference of means over whole blocks of pixels inside a mask, as a share of the mean, without
+    the noise."""
+
+    def means(picture: F64) -> F64:
+        side = len(picture) // block * block
+        cut = picture[:side, :side].reshape(side // block, block, side // block, block, -1)
+        return cut.mean((1, 3))
+
+    whole = means(mask[..., None].astype(np.float64))[..., 0] == 1.0
+    if not whole.any():
+        return float("nan")
+    first, second = (means(x - y)[whole] for x, y in zip(a, b, strict=True))
+    level = means((b[0] + b[1]) / 2)[whole].mean()
+    return float(np.sqrt(max(0.0, (first * second).mean())) / level)
+
+
+def compare(mi: Any, scene: Scene, folder: Path, size: int, spp: int) -> tuple[dict[str, Any], list[F64]]:
+    """Figures of a scene, and its two pictures."""
+    from mbtf_gen.bsdf import bsdf_of
+    from mbtf_gen.material import load_material
+    from mbtf_gen.scene import register_plugins
+
+    register_plugins()
+    material = load_material(ROOT / "assets" / scene.material)
+    # The mesh that the data were made with.
+    grid = material.grid(None, 256)
+    rough = load_object(scene)
+    n = int(np.sqrt(MOST / len(rough.faces)))
+    base = refined(rough, SMOOTH)
+    plugin = {"type": "mbtf", "material": str(folder)}
+    fitted = scene_of(mi, scene, mesh_of(mi, base, mi.load_dict(plugin), smooth=True), size, "box")
+    covered, cosine = seen(mi, fitted, size, 1)
+    smooth_area = seen(mi, fitted, size, 4)[0].sum() / 16
+    found = halves(mi, fitted, "mbtf_path", spp)
+    del fitted
+    fine = displaced(refined(rough, n), grid)
+    surface = mi.load_dict(bsdf_of(material, None, None))
+    real = scene_of(mi, scene, mesh_of(mi, fine, surface, smooth=False, aspect=grid.aspect), size, "gaussian")
+    met, _ = seen(mi, real, size, 1)
+    area = seen(mi, real, size, 4)[0].sum() / 16
+    true = halves(mi, real, "path", spp)
+    both = shrunk(covered & met, MARGIN)
+    inside = both & shrunk(covered & (cosine >= LOWEST), MARGIN)
+    rim = covered & met & ~inside
+    edge = covered & ~shrunk(covered, 1)
+    pixel = 2 * scene.across / size
+
+    def mean(pair: tuple[F64, F64], mask: NDArray[np.bool_]) -> float:
+        return float((pair[0] + pair[1])[mask].mean() / 2)
+
+    figures = {
+        "scene": scene.name,
+        "material": scene.material,
+        "triangles": len(fine.faces),
+        "interior_pixels": int(inside.sum()),
+        "interior_mean_ratio": mean(found, inside) / mean(true, inside),
+        **{f"rms_{block}": rms(found, true, inside, block) for block in BLOCKS},
+        "rim_mean_ratio": mean(found, rim) / mean(true, rim),
+        "outline_pixels": float((smooth_area - area) / max(1, edge.sum())),
+        "relief_pixels": float(np.median(base.size) * grid.relief / pixel),
+        "mean_depth_pixels": float(-np.median(base.size) * grid.z.mean() / pixel),
+    }
+    return figures, [(true[0] + true[1]) / 2, (found[0] + found[1]) / 2]
+
+
+def draw(rows: list[tuple[dict[str, Any], list[F64]]], path: Path) -> None:
+    """Reference, material, and their difference, a row per scene."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    size, gap, caption = len(rows[0][1][0]), 6, 24
+    titles = (
+        "displaced geometry, path-traced",
+        "fitted material on the smooth mesh",
+        "difference (grey: none)",
+    )
+    sheet = Image.new(
+        "RGB", (3 * (size + gap) - gap, caption + len(rows) * (size + gap) - gap), (255, 255, 255)
+    )
+    pen = ImageDraw.Draw(sheet)
+    for column, title in enumerate(titles):
+        pen.text((column * (size + gap) + 2, 4), title, (30, 30, 30), ImageFont.load_default(13))
+    for row, (_, (true, found)) in enumerate(rows):
+        lit = true[true.max(-1) > 0]
+        exposure = auto_exposure(lit.astype(np.float32))
+        difference = np.clip(0.5 + 0.5 * exposure * (found - true).mean(-1, keepdims=True), 0, 1)
+        pictures = [to_display(p.astype(np.float32), exposure) for p in (true, found)]
+        pictures.append(np.repeat(np.round(255 * difference).astype(np.uint8), 3, -1))
+        for column, picture in enumerate(pictures):
+            sheet.paste(Image.fromarray(picture), (column * (size + gap), caption + row * (size + gap)))
+    sheet.save(path, optimize=True)
+
+
+def line(f: dict[str, Any]) -> str:
+    """A scene's figures as text."""
+    return (
+        f"{f['scene']:13} {f['material']:13} interior mean {f['interior_mean_ratio']:.3f}, RMS "
+        + " ".join(f"{f[f'rms_{b}']:.3f} ({b} px)" for b in BLOCKS)
+        + f"; rim mean {f['rim_mean_ratio']:.3f}; outline {f['outline_pixels']:.2f} px inside, relief "
+        f"{f['relief_pixels']:.1f} px, mean depth {f['mean_depth_pixels']:.1f} px"
+    )
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--work", type=Path, default=ROOT / "out" / "plugin_materials")
+    parser.add_argument("--size", type=int, default=256)
+    parser.add_argument("--spp", type=int, default=128)
+    parser.add_argument("--scene", action="append", choices=[s.name for s in SCENES])
+    parser.add_argument("--picture", type=Path)
+    options = parser.parse_args()
+    mi = load_mitsuba()
+    import mbtf_fit.plugin
+
+    mbtf_fit.plugin.register()
+    rows = []
+    for scene in SCENES:
+        if options.scene and scene.name not in options.scene:
+            continue
+        folder = options.work / "materials" / scene.material
+        needed = (
+            folder / "material.json",
+            *([DATA / "objects" / scene.file] if scene.file else []),
+            DATA / "env" / scene.environment,
+        )
+        missing = [str(path) for path in needed if not path.exists()]
+        if missing:
+            print(f"{scene.name}: left out, {missing[0]} is missing", file=sys.stderr)
+            continue
+        rows.append(compare(mi, scene, folder, options.size, options.spp))
+        print(line(rows[-1][0]), file=sys.stderr, flush=True)
+    if not rows:
+        raise SystemExit("nothing to compare")
+    if options.picture:
+        draw(rows, options.picture)
+    figures = [f for f, _ in rows]
+    worst = {
+        "mean": max(abs(f["interior_mean_ratio"] - 1.0) for f in figures),
+        "rms_16": max(f["rms_16"] for f in figures),
+    }
+    held = all(worst[name] <= bar for name, bar in BARS.items())
+    print(json.dumps({"figures": worst, "bars": BARS, "held": held, "scenes": figures}))
+    return int(not held)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,333 @@
+"""What the renderer's plugin does with fitted materials: sampling, energy, precision, first picture.
+
+    python benchmarks/plugin_materials.py [MATERIAL ...] [--work out/plugin_materials] [--time 80s] [--only]
+
+MATERIAL is what ``mbtf-gen`` takes; by default the five of ``assets/`` and the texture sets in
+``../shared/data/materials``, which are left out by name where they are missing. Data (128 x 128 texels, 200
+queries per texel) and fits are made in ``--work`` where they are not there yet, two or three minutes each;
+``--only`` takes those that are there. Every material is then measured in a process of its own, with an
+empty kernel cache:
+
+- **first picture**: seconds from loading the material to its first 1080p picture of a plane, compilation and
+  the fit of the lobes included.
+- **conformance**: largest deviation from the material's own values, in single and in half precision.
+- **χ²** of the plugin's samples at 32 random positions, footprints and views; the smallest p of all
+  materials is corrected for their number (Šidák).
+- **variance** of the light reflected under a constant sky by cosine sampling, over that by the lobes.
+- **energy**: what the tile's mean reflects, by elevation of the light, beside the reference that
+  ``mbtf-gen`` traces for the same queries; the error bar is that of the paired difference.
+
+The last line is one JSON object: figures, and the bars they are held to. Exit code 1 where a bar is missed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbtf_gen.directions import from_angles, from_projected_disk
+
+ROOT = Path(__file__).resolve().parents[1]
+ASSETS = ("turtle_shell", "cliff_rock", "twisted_wool", "straight_wool", "insulation_foam")
+TEXTURES = ("metal_plate", "leather_fine", "knit_fabric", "rock_cliff", "stone_bricks", "tree_bark")
+# Materials whose gloss carries most of what varies: smooth over dark. Leather is as smooth, but bright.
+GLOSSY = ("turtle_shell", "stone_bricks", "tree_bark")
+# First picture in seconds, deviations, χ² after correction, variance ratio of glossy materials.
+BARS = {
+    "first_picture": 10.0,
+    "single": 1e-4,
+    "half": 1e-2,
+    "chi_square": 0.01,
+    "variance": 2.0,
+    "energy": 3.0,
+}
+PLACES, SAMPLES = 32, 60_000
+ELEVATIONS = (10.0, 20.0, 35.0, 50.0, 65.0, 85.0)
+ENERGY_QUERIES, ENERGY_SPP = 4096, 64
+# Views under smaller cosines are left out of energies: a 26th of a hemisphere's.
+LOWEST = 0.2
+
+
+def random_views(random: np.random.Generator, n: int) -> NDArray[np.float64]:
+    """(n, 3), uniform on the projected disk down to a cosine of 0.1."""
+    angle, radius = 2 * np.pi * random.random(n), np.sqrt(0.99 * random.random(n))
+    return from_projected_disk(np.stack([radius * np.cos(angle), radius * np.sin(angle)], -1))
+
+
+def hits(mi: Any, dr: Any, aspect: float, u: Any, sigma: Any, views: Any, each: int) -> Any:
+    """Surface interactions on the tile, `each` for every row."""
+    n = len(sigma)
+    index = dr.arange(mi.UInt32, n * each) // each
+
+    def lanes(array: Any) -> Any:
+        return dr.gather(mi.Float, mi.Float(np.ascontiguousarray(array, np.float32)), index)
+
+    si = dr.zeros(mi.SurfaceInteraction3f, n * each)
+    si.n = mi.Normal3f(0, 0, 1)
+    si.sh_frame = mi.Frame3f(si.n)
+    si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, -1, 0)
+    si.uv = mi.Point2f(lanes(u[:, 0]), aspect * (1.0 - lanes(u[:, 1])))
+    # A square pixel of two standard deviations.
+    si.duv_dx, si.duv_dy = mi.Vector2f(2 * lanes(sigma), 0), mi.Vector2f(0, 2 * lanes(sigma))
+    si.wi = mi.Vector3f(lanes(views[:, 0]), lanes(views[:, 1]), lanes(views[:, 2]))
+    return si
+
+
+def uniform(mi: Any, n: int, seed: int) -> tuple[Any, Any]:
+    """(choice, point) of the unit cube."""
+    xi = np.random.default_rng(seed).random((3, n), np.float32)
+    return mi.Float(xi[0]), mi.Point2f(xi[1:])
+
+
+def chi_squares(mi: Any, dr: Any, bsdf: Any) -> list[float]:
+    """p-values of the samples at random places, footprints and views."""
+    from mbtf_gen.stats import Cap, chi_square_test
+
+    random = np.random.default_rng(11)
+    lattice, context = bsdf.lattice, mi.BSDFContext()
+    u, views = random.random((PLACES, 2)), random_views(random, PLACES)
+    sigma = 0.5 * np.exp2(-lattice.finest * random.random(PLACES))
+    out = []
+    for k in range(PLACES):
+        one = (u[k : k + 1], sigma[k : k + 1], views[k : k + 1])
+        si = hits(mi, dr, lattice.aspect, *one, SAMPLES)
+        bs, _ = bsdf.sample(context, si, *uniform(mi, SAMPLES, 100 + k))
+        # What fell below the surface was thrown away.
+        drawn = np.where(np.array(bs.pdf) > 0, np.array(bs.wo), [[0.0], [0.0], [-1.0]]).T
+
+        def density(w: Any, one: Any = one) -> NDArray[np.float64]:
+            place = hits(mi, dr, lattice.aspect, *one, len(w))
+            return np.array(bsdf.pdf(context, place, mi.Vector3f(w.T.astype(np.float32))), np.float64)
+
+        out.append(chi_square_test(drawn, density, Cap(cos_min=0.0), bins=(16, 32)).p_value)
+    return out
+
+
+def variance_of(mi: Any, dr: Any, bsdf: Any, each: int = 2048, places: int = 512) -> tuple[float, float]:
+    """(mean, mean variance of one sample) of the light reflected under a constant sky, over random places."""
+    random = np.random.default_rng(12)
+    sigma = 0.5 * np.exp2(-bsdf.lattice.finest * random.random(places))
+    si = hits(
+        mi, dr, bsdf.lattice.aspect, random.random((places, 2)), sigma, random_views(random, places), each
+    )
+    _, weight = bsdf.sample(mi.BSDFContext(), si, *uniform(mi, places * each, 13))
+    x = np.array(mi.luminance(mi.Color3f(weight)), np.float64).reshape(places, each)
+    return float(x.mean()), float(x.var(1, ddof=1).mean())
+
+
+def energies(material: Path, shards: Path, evaluator: Any) -> list[dict[str, float]]:
+    """Reflected share by elevation of the light: fit, reference, error of their difference."""
+    from mbtf_gen.config import GeneratorConfig
+    from mbtf_gen.dataset import Dataset
+    from mbtf_gen.estimator import Stream
+    from mbtf_gen.generation import build_estimator
+    from mbtf_gen.material import load_material
+    from mbtf_gen.queries import Queries
+
+    config = GeneratorConfig.model_validate(Dataset.open(shards).manifest["config"])
+    estimator = build_estimator(config, load_material(material, config.geometry.tile))
+    random = np.random.default_rng([14, zlib.crc32(material.name.encode())])
+    n, rows = ENERGY_QUERIES, []
+    for k, elevation in enumerate(ELEVATIONS):
+        angle, radius = 2 * np.pi * random.random(n), np.sqrt((1 - LOWEST**2) * random.random(n))
+        views = from_projected_disk(np.stack([radius * np.cos(angle), radius * np.sin(angle)], -1))
+        turned = 2 * np.pi * random.random(n)
+        flat = np.cos(np.radians(elevation))
+        lights = np.stack(
+            [flat * np.cos(turned), flat * np.sin(turned), np.full(n, from_angles(elevation, 0.0)[2])], -1
+        )
+        queries = Queries(
+            *(a.astype(np.float32) for a in (random.random((n, 2)), np.full(n, 0.5), lights, views))
+        )
+        traced = estimator.estimate(queries, ENERGY_SPP, Stream(1, "reference", k))
+        share = np.pi * (1 - LOWEST**2)
+        true = share * 0.5 * (traced.value_a + traced.value_b).mean(-1)
+        fit = share * evaluator.evaluate(queries.u, queries.sigma, lights, views).mean(-1)
+        difference = (fit - true).astype(np.float64)
+        rows.append(
+            {
+                "elevation": elevation,
+                "fit": float(fit.mean()),
+                "reference": float(true.mean()),
+                "error": float(difference.std(ddof=1) / np.sqrt(n)),
+            }
+        )
+    return rows
+
+
+def plane_scene(mi: Any, bsdf: Any) -> Any:
+    """Forty tiles across, seen at 45 degrees in 1080p under the sun and a sky."""
+    flip = mi.ScalarTransform4f().scale([20.0, -20.0, 1.0])
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "plane": {"type": "rectangle", "to_world": flip, "bsdf": bsdf},
+            "sun": {"type": "directional", "direction": [0.5, 0.3, -0.8], "irradiance": 2.0},
+            "sky": {"type": "constant", "radiance": 0.3},
+            "sensor": {
+                "type": "perspective",
+                "fov": 40,
+                "to_world": mi.ScalarTransform4f().look_at([0, -12, 12], [0, 0, 0], [0, 0, 1]),
+                "film": {"type": "hdrfilm", "width": 1920, "height": 1080},
+            },
+        }
+    )
+
+
+def deviation(evaluator: Any, stored: Any) -> float:
+    """Largest deviation from the conformance values, as a share of max(value, mean)."""
+    wanted = stored.conformance["rgb"]
+    found = evaluator.evaluate(*(stored.conformance[name] for name in ("u", "sigma", "omega_i", "omega_o")))
+    return float((np.abs(found - wanted) / np.maximum(wanted, max(wanted.mean(), 1e-9))).max())
+
+
+def measure(source: Path, shards: Path, folder: Path) -> dict[str, Any]:
+    """All figures of one material; the kernel cache is empty."""
+    from mbtf_gen.engine import load_mitsuba
+
+    mi = load_mitsuba()
+    import drjit as dr
+
+    import mbtf_fit.plugin
+    from mbtf_fit.plugin import Evaluator, read_material
+
+    mbtf_fit.plugin.register()
+    start = time.perf_counter()
+    plugin = {"type": "mbtf", "material": str(folder), "uv_scale": 40.0}
+    scene = plane_scene(mi, plugin)
+    loaded = time.perf_counter()
+    tracer = mi.load_dict({"type": "mbtf_path", "max_depth": 2})
+    np.array(mi.render(scene, integrator=tracer, spp=1))
+    first = time.perf_counter()
+    np.array(mi.render(scene, integrator=tracer, spp=1, seed=1))
+    again = time.perf_counter()
+    bsdf = mi.load_dict({"type": "mbtf", "material": str(folder), "sigma": 0.01})
+    flat = mi.load_dict({"type": "mbtf", "material": str(folder), "sampling": "cosine", "sigma": 0.01})
+    stored = read_material(folder)
+    mean, variance = variance_of(mi, dr, bsdf)
+    flat_mean, flat_variance = variance_of(mi, dr, flat)
+    return {
+        "material": source.name,
+        "load_seconds": loaded - start,
+        "first_picture_seconds": first - start,
+        "picture_seconds": again - first,
+        "single": deviation(bsdf.evaluator, stored),
+        "half": deviation(Evaluator(stored, "half"), stored),
+        "chi_square": chi_squares(mi, dr, bsdf),
+        "reflected": [mean, flat_mean],
+        "variance_ratio": flat_variance / variance,
+        "energy": energies(source, shards, bsdf.evaluator),
+    }
+
+
+def prepare(source: Path, work: Path, budget: str, only: bool) -> tuple[Path, Path] | None:
+    """(shards, material) of a material, made where they are missing; None where they may not be made.
+
+    Raises
+    ------
+    SystemExit : generator or fitter failed; their message was shown
+    """
+    shards, folder = work / "shards" / source.name, work / "materials" / source.name
+    if not (folder / "material.json").exists():
+        if only:
+            return None
+        options = ["--levels", "7", "--mesh", "256", "--queries", "200/texel", "--spp", "4", "--quiet"]
+        options += ["--set", "queries.test=16384", "--set", "queries.test_spp=128"]
+        for words in (
+            ["mbtf_gen", str(source), "-o", str(shards), *options],
+            ["mbtf_fit", str(shards), "-o", str(folder), "--time", budget, "--quiet"],
+        ):
+            if subprocess.run([sys.executable, "-m", *words], stdout=sys.stderr, cwd=ROOT).returncode:
+                raise SystemExit(f"{' '.join(words)} failed")
+    return shards, folder
+
+
+def row_of(figures: dict[str, Any]) -> str:
+    """A material's line of the table."""
+    worst = max(figures["energy"], key=lambda e: (e["fit"] - e["reference"]) / e["error"])
+    return (
+        f"{figures['material']:16} first picture {figures['first_picture_seconds']:5.1f} s  deviation "
+        f"{figures['single']:.0e} half {figures['half']:.0e}  least p of {PLACES} "
+        f"{min(figures['chi_square']):.4f}  variance ratio {figures['variance_ratio']:5.2f}  energy at most "
+        f"{worst['fit']:.4f} for {worst['reference']:.4f} ± {worst['error']:.4f} ({worst['elevation']:g}°)"
+    )
+
+
+def verdict(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """The figures that the bars are held to."""
+    least = min(p for r in rows for p in r["chi_square"])
+    tests = sum(len(r["chi_square"]) for r in rows)
+    excess = [(e["fit"] - e["reference"]) / e["error"] for r in rows for e in r["energy"]]
+    return {
+        "first_picture": max(r["first_picture_seconds"] for r in rows),
+        "single": max(r["single"] for r in rows),
+        "half": max(r["half"] for r in rows),
+        "chi_square": float(-np.expm1(tests * np.log1p(-least))),
+        "variance": min((r["variance_ratio"] for r in rows if r["material"] in GLOSSY), default=None),
+        "energy": max(excess),
+    }
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("materials", nargs="*", type=Path)
+    parser.add_argument("--work", type=Path, default=ROOT / "out" / "plugin_materials")
+    parser.add_argument("--time", default="80s")
+    parser.add_argument("--only", action="store_true")
+    parser.add_argument("--one", nargs=3, type=Path, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.one:
+        print(json.dumps(measure(*options.one)))
+        return 0
+    wanted = options.materials or [
+        *(ROOT / "assets" / name for name in ASSETS),
+        *(ROOT.parent / "shared" / "data" / "materials" / name for name in TEXTURES),
+    ]
+    rows = []
+    for source in wanted:
+        if not source.exists():
+            print(f"{source.name}: left out, {source} is missing", file=sys.stderr)
+            continue
+        made = prepare(source, options.work, options.time, options.only)
+        if made is None:
+            print(f"{source.name}: left out, not fitted in {options.work}", file=sys.stderr)
+            continue
+        with tempfile.TemporaryDirectory(prefix="mbtf-kernels-") as cache:
+            done = subprocess.run(
+                [sys.executable, __file__, "--one", str(source), *map(str, made)],
+                stdout=subprocess.PIPE,
+                text=True,
+                env={**os.environ, "DRJIT_CACHE_DIR": cache},
+            )
+        if done.returncode:
+            raise SystemExit(f"{source.name} failed")
+        rows.append(json.loads(done.stdout.splitlines()[-1]))
+        print(row_of(rows[-1]), file=sys.stderr, flush=True)
+    if not rows:
+        raise SystemExit("nothing to measure")
+    figures = verdict(rows)
+    above = ("chi_square", "variance")
+    missed = [
+        name
+        for name, bar in BARS.items()
+        if (value := figures[name]) is not None and (value < bar if name in above else value > bar)
+    ]
+    print(json.dumps({"figures": figures, "bars": BARS, "missed": missed, "materials": rows}))
+    return int(bool(missed))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,232 @@
+"""A total time for generating and training, split so that little error is left: pilot chains on this very
+material and machine, then one allocation.
+
+Of a budget B, three chains of the smallest length B_p each generate for another share of it and train for the
+rest; the share of the least error, by a parabola through the three, is taken for what is left of the budget.
+Error changes slowly about its least value, so a rough share is enough. Budgets too short for pilots take a
+fixed share.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mbtf_fit.config import FitConfig
+from mbtf_gen.atomic import read_json, write_json
+from mbtf_gen.config import GeneratorConfig
+from mbtf_gen.console import clock
+from mbtf_gen.durations import format_duration
+from mbtf_gen.errors import InputError, UsageError
+
+from .cost.chains import Chain, Workshop
+from .recipe import Recipe
+from .run import layout_of
+from .run_folder import claim, describe, locked
+from .stages import hash_of
+
+if TYPE_CHECKING:
+    from mbtf_gen.forecast import Forecast
+
+BUDGET_NAME = "budget.json"
+BUDGET_FORMAT = "mbtf-budget"
+BUDGET_SCHEMA = 1
+# Shares of a chain's time that its pilots generate for, and the one taken without pilots.
+SHARES = (0.15, 0.35, 0.6)
+USUAL_SHARE = 0.35
+# Shares that may come out.
+LEAST_SHARE, LARGEST_SHARE = 0.08, 0.75
+# Share of the budget that one pilot chain takes, and its shortest length in seconds.
+PILOT, SHORTEST_PILOT = 0.04, 10.0
+# The shortest budget worth splitting, seconds: below it starting up takes most.
+SHORTEST = 60.0
+# Test queries of the pilot chains and paths of each.
+_TEST, _TEST_SPP = "8192", 64
+_FEWEST_QUERIES = 4096
+# However long looking took, this share of the budget is spent.
+_LEAST_LEFT = 0.25
+
+
+@dataclass(frozen=True)
+class Split:
+    """How a budget is spent.
+
+    Attributes
+    ----------
+    queries : training queries to generate
+    generating, training : seconds meant for either; training is over all fits
+    share : of generating in what the pilots left over
+    pilots : (share, unexplained variance) of the pilot chains; none for short budgets
+    pilot_seconds : what forecast and pilots took
+    """
+
+    queries: int
+    generating: float
+    training: float
+    share: float
+    pilots: tuple[tuple[float, float], ...]
+    pilot_seconds: float
+
+    def describe(self) -> str:
+        """One line."""
+        tried = ", ".join(f"{share:.0%} {error:.3f}" for share, error in self.pilots)
+        how = f"pilots' unexplained variance by share of generating: {tried}" if tried else "a fixed share"
+        return (
+            f"budget: {clock(self.generating)} for {self.queries} queries, {clock(self.training)} of "
+            f"training, after {clock(self.pilot_seconds)} of looking ({self.share:.0%} generating; {how})"
+        )
+
+
+def best_share(pilots: Sequence[tuple[float, float]]) -> float:
+    """Share of the least error by a parabola through three (share, error), both in logarithms; the best of
+    them where it has no least value, and always within the shares that may come out."""
+    (x0, y0), (x1, y1), (x2, y2) = ((math.log(x), math.log(max(y, 1e-12))) for x, y in pilots)
+    left, right = (y1 - y0) / (x1 - x0), (y2 - y1) / (x2 - x1)
+    bend = (right - left) / (x2 - x0)
+    if bend > 0:
+        vertex = math.exp(0.5 * (x0 + x1 - left / bend))
+    else:
+        vertex = min(pilots, key=lambda p: p[1])[0]
+    # What lies outside of the pilots is a guess: no more than half a step beyond them.
+    low, high = pilots[0][0], pilots[-1][0]
+    vertex = min(max(vertex, low / math.sqrt(pilots[1][0] / low)), high * math.sqrt(high / pilots[1][0]))
+    return min(max(vertex, LEAST_SHARE), LARGEST_SHARE)
+
+
+def split_budget(
+    recipe: Recipe, budget: float, folder: Path, command: str, tell: Callable[[str], None]
+) -> Split:
+    """How to spend a budget in seconds on a recipe; remembered in the run's folder, so that the same command
+    goes on with the same split.
+
+    Parameters
+    ----------
+    command : what the run is described by
+    tell : called with a note after every pilot chain
+
+    Raises
+    ------
+    UsageError : the budget is too short, or a model of the recipe learns from another layout
+    InputError : the folder holds something else
+    PartialError : something else works in it
+    """
+    if budget < SHORTEST:
+        raise UsageError(
+            f"{format_duration(budget)} is too short to split: starting up takes most of it",
+            where="--budget",
+            cure=f"give {format_duration(SHORTEST)} or more",
+        )
+    if any(layout_of(fit) != "shuffled" for fit in recipe.fit.values()):
+        raise UsageError(
+            "only models of the shuffled layout can share a budget",
+            where="--budget",
+            cure="leave out the fits of 'hierarchical'",
+        )
+    asked = recipe.model_dump(mode="json", include={"generate", "fit"})
+    key = hash_of({"schema": BUDGET_SCHEMA, "budget": budget, "recipe": asked})
+    claim(folder)
+    with locked(folder):
+        split = _remembered(folder, key)
+        if split is None:
+            describe(folder, recipe, command)
+            split = _plan(recipe, budget, tell)
+            write_json(folder / BUDGET_NAME, {"format": BUDGET_FORMAT, "key": key, **asdict(split)})
+    return split
+
+
+def _remembered(folder: Path, key: str) -> Split | None:
+    path = folder / BUDGET_NAME
+    if not path.exists():
+        return None
+    try:
+        data = read_json(path)
+        if data.pop("format") != BUDGET_FORMAT or data.pop("key") != key:
+            return None
+        return Split(**data | {"pilots": tuple((p[0], p[1]) for p in data["pilots"])})
+    except (InputError, KeyError, TypeError, IndexError):
+        return None
+
+
+def _plan(recipe: Recipe, budget: float, tell: Callable[[str], None]) -> Split:
+    from mbtf_gen.forecast import forecast
+    from mbtf_gen.generation import Job, allocated
+    from mbtf_gen.planning import plan_effects
+
+    began = time.perf_counter()
+    job = Job.of(recipe.generate, _material(recipe.generate))
+    expected = forecast(job, allocated(job, plan_effects(job, pilots=False)))
+    price, test = _prices(expected, job.queries("train"), job.queries("test") * job.spp("test"))
+    pilots: list[tuple[float, float]] = []
+    length = PILOT * budget
+    if length >= SHORTEST_PILOT:
+        pilots = _pilots(recipe, length, price, tell)
+    share = best_share(pilots) if pilots else USUAL_SHARE
+    looked = time.perf_counter() - began
+    left = max(budget - looked - test - expected.start, _LEAST_LEFT * budget)
+    generating = share * left
+    return Split(
+        _two_digits(max(_FEWEST_QUERIES, generating / price)),
+        round(generating + test + expected.start, 1),
+        round((1 - share) * left, 1),
+        round(share, 3),
+        tuple(pilots),
+        round(looked, 1),
+    )
+
+
+def _material(config: GeneratorConfig) -> Any:
+    from mbtf_gen.material import load_material
+
+    return load_material(Path(config.material), config.geometry.tile)
+
+
+def _prices(expected: Forecast, queries: int, test_paths: int) -> tuple[float, float]:
+    """(seconds of a training query, seconds of the test split)."""
+    training = (expected.paths - test_paths) / expected.paths_per_second
+    return training / queries, max(0.0, expected.seconds - training)
+
+
+def _two_digits(count: float) -> int:
+    digits = 10 ** max(0, len(str(int(count))) - 2)
+    return max(digits, int(count / digits) * digits)
+
+
+def _pilots(
+    recipe: Recipe, length: float, price: float, tell: Callable[[str], None]
+) -> list[tuple[float, float]]:
+    name, fit = next(iter(recipe.fit.items()))
+    with tempfile.TemporaryDirectory(prefix="mbtf-budget-") as work:
+        data = recipe.generate.model_dump(mode="json")
+        data["queries"] |= {"test": _TEST, "test_spp": _TEST_SPP}
+        workshop = Workshop(GeneratorConfig.model_validate(data), Path(work), "", lambda note: None)
+        out = []
+        for share in SHARES:
+            queries = _two_digits(max(_FEWEST_QUERIES, share * length / price))
+            options = _with_time(fit, (1 - share) * length).fields()
+            chain = Chain("chain", name, f"{share:.0%}", queries, recipe.generate.queries.spp, options)
+            out.append((share, workshop.measure(chain).error.value))
+            tell(f"pilot: {share:.0%} of {length:.0f} s generating leaves {out[-1][1]:.3f}")
+        return out
+
+
+def _with_time(fit: FitConfig, seconds: float) -> FitConfig:
+    return FitConfig.model_validate(
+        {**fit.model_dump(), "training": {**fit.training.model_dump(), "time": seconds, "steps": None}}
+    )
+
+
+def within_budget(recipe: Recipe, split: Split) -> Recipe:
+    """The recipe with the queries and training times of a split."""
+    queries = recipe.generate.queries.model_copy(update={"train": str(split.queries)})
+    each = max(1.0, round(split.training / len(recipe.fit), 1))
+    return recipe.model_copy(
+        update={
+            "generate": recipe.generate.model_copy(update={"queries": queries}),
+            "fit": {name: _with_time(fit, each) for name, fit in recipe.fit.items()},
+        }
+    )

@@ -1,0 +1,136 @@
+"""A budget is spent as it says, and the same command spends it the same way."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from mbtf_gen.durations import parse_duration
+from mbtf_gen.errors import InputError, UsageError
+from mbtf_gen.stats import Estimate
+from mbtf_pipeline import budget as module
+from mbtf_pipeline.budget import (
+    LARGEST_SHARE,
+    LEAST_SHARE,
+    SHARES,
+    USUAL_SHARE,
+    best_share,
+    split_budget,
+    within_budget,
+)
+from mbtf_pipeline.recipe import Recipe, load_recipe
+
+ROOT = Path(__file__).parents[2]
+# Seconds of a training query, of the test split, and of starting.
+PRICE, TEST, START = 2e-6, 3.0, 1.5
+
+
+def recipe(**fits: str) -> Recipe:
+    said = [f"fit.{name}.model={model}" for name, model in fits.items()]
+    return load_recipe(ROOT / "pipelines" / "quickstart.yaml", said)
+
+
+@pytest.fixture
+def measured(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, float]]:
+    """Neither forecasts nor pilots run: prices are as above, the clock stands still, and a chain's error is
+    least where half of its time generates. Gives (queries, training seconds) of the chains asked for."""
+    chains: list[tuple[int, float]] = []
+
+    def forecast(job: Any, plan: Any) -> Any:
+        queries, test = job.queries("train"), job.queries("test") * job.spp("test")
+        rate = job.spp("train") / PRICE
+        train = queries * job.spp("train")
+        seconds = train / rate + TEST
+        return SimpleNamespace(paths=train + test, paths_per_second=rate, seconds=seconds, start=START)
+
+    def measure(self: Any, chain: Any) -> Any:
+        generating, training = chain.queries * PRICE, parse_duration(chain.fit["training"]["time"])
+        chains.append((chain.queries, training))
+        error = 0.1 * math.exp(math.log(generating / training) ** 2)
+        return SimpleNamespace(error=Estimate(error, 0.01, 10))
+
+    monkeypatch.setattr("mbtf_gen.forecast.forecast", forecast)
+    monkeypatch.setattr("mbtf_gen.generation.allocated", lambda job, plan: plan)
+    monkeypatch.setattr("mbtf_pipeline.cost.chains.Workshop.measure", measure)
+    monkeypatch.setattr(module.time, "perf_counter", lambda: 0.0)
+    return chains
+
+
+@pytest.mark.parametrize("best", [0.1, 0.2, 0.35, 0.5])
+def test_the_share_is_where_a_parabola_is_least(best: float) -> None:
+    pilots = [(s, 0.3 * math.exp(0.2 * math.log(s / best) ** 2)) for s in SHARES]
+    assert best_share(pilots) == pytest.approx(best)
+
+
+def test_shares_that_no_pilot_speaks_for_are_not_taken() -> None:
+    # Errors that only rise, only fall, or have a greatest value; one that noise made negative.
+    for errors in ((1, 2, 4), (4, 2, 1), (1, 3, 1.5), (1.5, 3, 1), (0.1, -0.01, 0.2)):
+        share = best_share(list(zip(SHARES, errors, strict=True)))
+        assert LEAST_SHARE <= share <= LARGEST_SHARE
+        assert SHARES[0] / 1.6 < share < SHARES[-1] * 1.4
+    assert best_share([(0.15, 1.0), (0.35, 3.0), (0.6, 1.5)]) == 0.15
+
+
+def test_long_budgets_are_split_by_pilots(measured: list[tuple[int, float]], tmp_path: Path) -> None:
+    notes: list[str] = []
+    split = split_budget(recipe(), 1000.0, tmp_path / "run", "command", notes.append)
+    assert [t for _, t in measured] == pytest.approx([40 * (1 - s) for s in SHARES], rel=0.01)
+    assert [n * PRICE for n, _ in measured] == pytest.approx([40 * s for s in SHARES], rel=0.1)
+    assert len(notes) == len(split.pilots) == 3
+    # Half and half by the pilots; queries are rounded down to two digits.
+    assert split.share == pytest.approx(0.5, abs=0.06)
+    left = 1000.0 - TEST - START
+    assert split.generating == pytest.approx(split.share * left + TEST + START, rel=1e-3)
+    assert split.training == pytest.approx((1 - split.share) * left, rel=1e-3)
+    assert 0.9 * split.share * left < split.queries * PRICE <= split.share * left + 1e-6
+
+
+def test_short_budgets_take_the_usual_share(measured: list[tuple[int, float]], tmp_path: Path) -> None:
+    split = split_budget(recipe(), 100.0, tmp_path / "run", "command", lambda note: None)
+    assert not measured
+    assert split.share == USUAL_SHARE
+    assert split.generating + split.training == pytest.approx(100.0, abs=0.2)
+
+
+def test_fits_share_the_time_of_training(measured: list[tuple[int, float]], tmp_path: Path) -> None:
+    asked = recipe()
+    split = split_budget(asked, 100.0, tmp_path / "run", "command", lambda note: None)
+    spent = within_budget(asked, split)
+    assert spent.generate.queries.train == str(split.queries)
+    assert len(spent.fit) == 2
+    assert sum(fit.training.time for fit in spent.fit.values()) == pytest.approx(split.training, abs=0.2)
+    assert all(fit.training.steps is None for fit in spent.fit.values())
+    # Everything else is the recipe's.
+    assert spent.compare == asked.compare
+    assert spent.generate.light == asked.generate.light
+
+
+def test_the_same_command_goes_on_with_the_same_split(
+    measured: list[tuple[int, float]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "run"
+    first = split_budget(recipe(), 1000.0, folder, "command", lambda note: None)
+    monkeypatch.setattr(f"{__name__}.PRICE", 3e-6)
+    assert split_budget(recipe(), 1000.0, folder, "command", lambda note: None) == first
+    # Another budget, other options, or a damaged record: looked at anew.
+    assert split_budget(recipe(), 900.0, folder, "command", lambda note: None) != first
+    again = split_budget(recipe(), 1000.0, folder, "command", lambda note: None)
+    assert again.queries < first.queries
+    (folder / module.BUDGET_NAME).write_text('{"format": "mbtf-budget"}')
+    assert split_budget(recipe(), 1000.0, folder, "command", lambda note: None) == again
+
+
+def test_what_cannot_be_split_is_refused(measured: list[tuple[int, float]], tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="too short"):
+        split_budget(recipe(), 5.0, tmp_path / "run", "command", lambda note: None)
+    with pytest.raises(UsageError, match="layout"):
+        split_budget(recipe(h="hierarchical"), 100.0, tmp_path / "run", "command", lambda note: None)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "file").write_text("")
+    with pytest.raises(InputError, match="holds no run"):
+        split_budget(recipe(), 100.0, tmp_path / "other", "command", lambda note: None)
+    assert not (tmp_path / "run").exists()

@@ -1,0 +1,93 @@
+"""What a material lets through: found from data, written, read back, refused when damaged."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.damage import check_message
+from support.fit_data import constant, random_queries, write_data
+
+from mbtf_fit.config import FitConfig
+from mbtf_fit.fitting import fit
+from mbtf_fit.material_format import read_description
+from mbtf_fit.transmittance import (
+    TRANSMITTANCE_NAME,
+    Transmittance,
+    fit_transmittance,
+    read_transmittance,
+)
+from mbtf_gen.dataset import Dataset
+from mbtf_gen.errors import InputError
+from mbtf_gen.levels import Lattice
+
+
+def lace(u: np.ndarray, sigma: np.ndarray, omega_o: np.ndarray) -> np.ndarray:
+    """Holes towards one side of the tile that close at grazing views, on one side more than on the other."""
+    fade = np.exp(-2 * (np.pi * sigma) ** 2)
+    wave = fade * np.sin(2 * np.pi * u[:, 0]) + 0.5 * fade * np.cos(2 * np.pi * u[:, 1])
+    x, y = omega_o[:, 0], omega_o[:, 1]
+    return np.asarray((0.45 + 0.2 * wave) * (1 - 0.7 * (x * x + y * y)) + 0.1 * x - 0.05 * y)
+
+
+def test_a_known_transmittance_is_found(tmp_path: Path) -> None:
+    data = Dataset.open(
+        write_data(tmp_path, constant(0.2), train=120_000, finest=4, aspect=0.5, through=lace)
+    )
+    model = fit_transmittance(data)
+    assert model is not None
+    q = random_queries(np.random.default_rng(9), 4000, data.lattice)
+    found = model.evaluate(q["u"] + np.float32(2.0), q["sigma"], q["omega_o"])
+    wanted = lace(q["u"], q["sigma"], q["omega_o"])
+    assert wanted.std() > 0.1
+    assert np.sqrt(np.mean((found - wanted) ** 2)) < 0.035
+    fine = q["sigma"] < 0.045
+    assert np.sqrt(np.mean((found - wanted)[fine] ** 2)) < 0.02
+
+
+def test_few_queries_fall_back_on_coarser_levels(tmp_path: Path) -> None:
+    """No texel of an empty neighbourhood is left without a value."""
+    data = Dataset.open(
+        write_data(tmp_path, constant(0.2), train=200, finest=6, through=lambda u, s, o: 0.6 + 0 * s)
+    )
+    model = fit_transmittance(data)
+    assert model is not None
+    q = random_queries(np.random.default_rng(9), 500, data.lattice)
+    assert np.abs(model.evaluate(q["u"], q["sigma"], q["omega_o"]) - 0.6).max() < 0.1
+
+
+def test_a_fit_writes_it_beside_the_weights_and_only_for_holes(tmp_path: Path) -> None:
+    config = FitConfig.model_validate({"training": {"steps": 2, "batch": 256}})
+    write_data(tmp_path / "solid", constant(0.2), train=600, test=64)
+    write_data(tmp_path / "lace", constant(0.2), train=600, test=64, through=lace)
+    fit(config, tmp_path / "solid", tmp_path / "a")
+    assert not (tmp_path / "a" / TRANSMITTANCE_NAME).exists()
+    assert read_transmittance(tmp_path / "a", read_description(tmp_path / "a")[0]) is None
+    fit(config, tmp_path / "lace", tmp_path / "b")
+    description, _ = read_description(tmp_path / "b")
+    read = read_transmittance(tmp_path / "b", description)
+    fitted = fit_transmittance(Dataset.open(tmp_path / "lace"))
+    assert read is not None
+    assert fitted is not None
+    for mine, theirs in zip(read.levels, fitted.levels, strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+    path = tmp_path / "b" / TRANSMITTANCE_NAME
+    content = bytearray(path.read_bytes())
+    content[-1] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="not the file that") as caught:
+        read_transmittance(tmp_path / "b", description)
+    check_message(caught.value)
+
+
+def test_a_view_is_a_line_through_the_plane() -> None:
+    """Nothing but the polynomial of the view's projection, at a texel's centre, clamped."""
+    lattice = Lattice(0)
+    texel = np.array([0.5, 0.2, -0.1, -0.3, 0.4, 0.1], np.float32).reshape(1, 1, 6)
+    model = Transmittance(lattice, [texel])
+    omega = np.array([[0.6, -0.3, 0.74], [0.0, 0.0, 1.0]])
+    x, y = omega[0, :2]
+    wanted = 0.5 + 0.2 * x - 0.1 * y - 0.3 * x * x + 0.4 * x * y + 0.1 * y * y
+    np.testing.assert_allclose(model.evaluate([[0.1, 0.9]] * 2, [0.3] * 2, omega), [wanted, 0.5], rtol=1e-6)
+    assert Transmittance(lattice, [8 * texel]).evaluate([[0.1, 0.9]], [0.3], omega[1:])[0] == 1.0
