@@ -92,8 +92,8 @@ class Agreement:
 
 
 def agree(mean: Estimate, square: Estimate) -> bool:
-    """Whether relative differences of mean, and mean square over pixels, lie within their tolerances or within
-    three of their error bars."""
+    """Whether relative differences, of the means and mean square over pixels, lie within their tolerances or
+    within three of their error bars."""
     if square.value > max(RMS_TOLERANCE**2, BARS * square.error):
         return False
     return abs(mean.value) <= max(MEAN_TOLERANCE, BARS * mean.error)
