@@ -21,8 +21,11 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from mbtf_fit import FitConfig, Material, evaluate, fit
+from mbtf_fit import FitConfig, Material, fit
+from mbtf_fit.data import load_split
+from mbtf_fit.evaluation import split_errors
 from mbtf_gen.config import GeneratorConfig
+from mbtf_gen.dataset import Dataset
 from mbtf_gen.errors import MbtfError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -75,7 +78,10 @@ def train(name: str, model: str, steps: int, out: Path) -> dict[str, Any]:
     result = fit(config, shards, out / f"{name}-{model}-{steps}", progress=progress)
     test = result.errors["test"]
     if layout == "image":
-        test = evaluate(Material.load(result.folder), judge)["test"].as_dict()
+        truth = Dataset.open(judge)
+        found = split_errors(Material.load(result.folder).predict, load_split(truth, "test"), truth.lattice)
+        assert found is not None
+        test = found.as_dict()
     return {
         "unexplained": test["unexplained"],
         "levels": {level: e["unexplained"]["value"] for level, e in test["levels"].items()},

@@ -138,7 +138,7 @@ def main() -> int:
     parser.add_argument("materials", nargs="*", type=Path)
     parser.add_argument("--paths", type=float, action="append", help="budget of paths; repeatable")
     parser.add_argument("--spp", type=int, action="append", help="paths per query; repeatable")
-    parser.add_argument("--steps", type=int, default=1000, help="training steps of each fit")
+    parser.add_argument("--steps", type=int, default=400, help="training steps of each fit")
     parser.add_argument("--levels", type=int, default=6)
     parser.add_argument("--height", type=float, help="factor on the stored heights")
     parser.add_argument("--keep", type=Path, help="file of the points that were measured, to go on from")

@@ -44,6 +44,7 @@ def fit(
     config: Path | None = None,
     assignments: Set | None = None,
     overwrite: Annotated[bool, Parameter(negative="")] = False,
+    dry_run: Annotated[bool, Parameter(negative="")] = False,
     console: Console = CONSOLE,
 ) -> None:
     """Fit a material to a data set: mbtf-fit shards/ -o material/
@@ -81,7 +82,11 @@ def fit(
         YAML file with the options.
     overwrite
         Replace a fit of another configuration.
+    dry_run
+        Forecast time, error and size by two short fits on this machine, and write nothing.
     """
+    if dry_run and many is not None:
+        raise UsageError("--dry-run looks at one data set", cure="mbtf-fit shards/ --dry-run")
     if many is not None and shards is not None:
         raise UsageError("--many takes all data sets", cure=f"mbtf-fit --many {shards} ... -o materials/")
     if processes is not None and (many is None or processes < 1):
@@ -115,6 +120,14 @@ def fit(
         _fit_many(resolved, many, output, processes, overwrite, console)
         return
     assert shards is not None
+    if dry_run:
+        from .forecast import forecast_fit
+
+        expected = forecast_fit(resolved, shards)
+        console.report(
+            {"shards": shards, "model": resolved.model, "forecast": expected.as_dict()}, expected.describe()
+        )
+        return
     from .fitting import fit
 
     console.note(
@@ -133,7 +146,8 @@ def fit(
             progress=lambda share, note: bar.update(round(100 * share, 1), note),
         )
     data = result.as_dict()
-    console.report(data, describe_fit(data))
+    price = [result.price.describe()] if result.price is not None else []
+    console.report(data, "\n".join([describe_fit(data), *price]))
 
 
 def _fit_many(

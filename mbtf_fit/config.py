@@ -60,6 +60,9 @@ class BlurSection(Settings):
     start: float = Field(8.0, ge=0, le=256, description="texels of the finest level; 0: no blur")
     end: float = Field(0.25, gt=0, le=256, description="texels of the finest level")
     share: float = Field(0.5, gt=0, le=1, description="of the budget")
+    floor: float = Field(
+        0.0, ge=0, le=256, description="blur of the pyramid that always stays, texels of the finest level"
+    )
     offset: float = Field(
         2.0,
         ge=0,

@@ -29,6 +29,7 @@ from .material_format import DESCRIPTION_NAME, WEIGHTS_NAME
 from .memory import keep_freed_memory
 from .models import MODELS, build_model
 from .noise import NoiseModel, typical_value
+from .price import Price, price_of
 from .storage import make_folder, read_tensors, write_tensors
 from .training import Trainer
 from .transmittance import TRANSMITTANCE_NAME, fit_transmittance
@@ -92,7 +93,13 @@ class FitResult:
             "resumed": self.resumed,
             "training": self.material.description["training"],
             "errors": self.errors,
+            "price": None if self.price is None else self.price.as_dict(),
         }
+
+    @property
+    def price(self) -> Price | None:
+        """What the last seconds bought; None where the history does not tell."""
+        return price_of(self.history, self.errors)
 
 
 def choose_device(name: str) -> torch.device:
@@ -154,7 +161,7 @@ def fit(
     keep_freed_memory()
     if partition is None:
         partition = load_training(data, config.held_out, config.seed, config.data.memory)
-    trainer = _trainer(config, data, partition, device)
+    trainer = prepare_trainer(config, data, partition, device)
     resumed = _resume(trainer, out)
     _train(trainer, partition.held_out_queries, out, progress or (lambda share, note: None))
     training = {
@@ -225,7 +232,8 @@ def _claim(out: Path, identity: dict[str, Any], config: FitConfig, overwrite: bo
     write_json(out / FIT_NAME, identity)
 
 
-def _trainer(config: FitConfig, data: Dataset, partition: Partition, device: torch.device) -> Trainer:
+def prepare_trainer(config: FitConfig, data: Dataset, partition: Partition, device: torch.device) -> Trainer:
+    """A trainer at its first step, for the model and the data of a configuration."""
     model = build_model(config.model, data.lattice, **config.network.model_dump())
     unit = typical_value(mean_value(partition.sample.value_a, partition.sample.value_b))
     model.initialise(torch.Generator().manual_seed(config.seed), unit)

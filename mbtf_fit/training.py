@@ -180,7 +180,7 @@ class Trainer:
         """Blur of each texture at this moment, in texels of the finest level."""
         blur = self.config.training.blur
         sigma = annealed_sigma(self.share / blur.share, blur.start, blur.end)
-        return [max(sigma, blur.offset) if t.moves_lookups else sigma for t in self.model.textures()]
+        return [max(sigma, blur.offset if t.moves_lookups else blur.floor) for t in self.model.textures()]
 
     def _tables(self) -> list[Tensor]:
         """The textures through the blur of this moment."""

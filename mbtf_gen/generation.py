@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .adaptive import Target
+from .adaptive import PILOT_SPP, Target
 from .allocation import measure_allocation
 from .config import GeneratorConfig, count_queries
 from .effects import EffectsPlan
@@ -136,6 +136,15 @@ class Job:
     def all_paths(self) -> int:
         """Paths of the whole data set."""
         return sum(self.paths(entry) for split in SPLITS for entry in self.shards(split))
+
+    def most_paths(self) -> int:
+        """Paths that the whole data set may take: under a target error what pilots and cap allow."""
+        total = 0
+        for split in SPLITS:
+            target = self.target(split)
+            most = self.spp(split) if target is None else target.cap + PILOT_SPP
+            total += self.queries(split) * most
+        return total
 
     def queries(self, split: Split) -> int:
         """Queries of a split, whole buffers counted in the image layout."""

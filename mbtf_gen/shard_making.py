@@ -174,7 +174,7 @@ def make_shards(
     reached, mine = Tally(), Tally()
     made = Made(0, [], [], 0.0, 0.0, 0.0)
     records: list[dict[str, Any]] = []
-    planned, everything = 0, job.all_paths()
+    planned, everything = 0, job.most_paths()
 
     def report(record: dict[str, Any] | None = None) -> None:
         for done in [*([] if record is None else [record]), *(records.pop() for _ in range(len(records)))]:

@@ -13,7 +13,7 @@ from support.fit_data import make_trainer, parallax, random_queries, train_fully
 
 import mbtf_fit.parallel
 from mbtf_fit.config import FitConfig
-from mbtf_fit.data import TrainingQueries
+from mbtf_fit.data import Queries, TrainingQueries
 from mbtf_fit.parallel import Workers
 from mbtf_fit.storage import read_tensors, write_tensors
 from mbtf_fit.streaming import Selection
@@ -134,6 +134,18 @@ def test_a_budget_of_time_ends_training_and_its_annealing() -> None:
     tables = t._tables()
     assert tables[0] is pyramid.texels
     torch.testing.assert_close(tables[1], offset.blurred(2.0))
+
+
+def test_the_blur_of_the_pyramid_ends_at_its_floor_and_the_offset_keeps_its_own() -> None:
+    t = train_fully(trainer(queries(), blur={"floor": 0.7, "offset": 0.3}))
+    pyramid, offset = t.model.textures()
+    for found, expected in zip(t._tables(), (pyramid.blurred(0.7), offset.blurred(0.3)), strict=True):
+        torch.testing.assert_close(found, expected)
+    # Materials hold what is read, blur included.
+    value = queries(10).value.numpy()
+    arrays = random_queries(np.random.default_rng(0), 10, LATTICE)
+    t.predict(Queries(**arrays, value_a=value, value_b=value))
+    torch.testing.assert_close(pyramid.export()["3"].reshape(64, -1), pyramid.blurred(0.7)[-64:].detach())
 
 
 @pytest.mark.parametrize("poison", ["pyramid.texels", "offset_texture.texels", "offset_network.biases.3"])

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from support.datasets import formula
 
-from mbtf_gen import generation
+from mbtf_gen import generation, shard_making
 from mbtf_gen.atomic import create_file, sealed
 from mbtf_gen.config import GeneratorConfig
 from mbtf_gen.dataset import Dataset
@@ -146,6 +146,13 @@ def test_too_many_nonfinite_samples_fail_the_run_and_name_their_place(
     with pytest.raises(PartialError, match="8 of 320"):
         finish(tmp_path / "out")
     assert not json.loads((tmp_path / "out/manifest.json").read_text())["complete"]
+
+
+def test_samples_are_held_against_all_paths_that_a_target_error_may_take(config: GeneratorConfig) -> None:
+    """A run is not stopped for samples that are few among its paths."""
+    assert Job.prepare(config).most_paths() == Job.prepare(config).all_paths() == 320
+    aimed = Job.prepare(changed(config, queries={"target_error": 0.02, "cap": 128}))
+    assert aimed.most_paths() == 100 * (128 + 16) + 30 * 4
 
 
 @pytest.mark.parametrize(
@@ -365,6 +372,42 @@ def test_of_two_writers_that_begin_at_once_the_second_adopts_the_plan_of_the_fir
     assert verify(out) == []
 
 
+def test_of_two_writers_that_begin_different_data_sets_at_once_the_second_is_refused(
+    config: GeneratorConfig, engine: Formula, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, another = tmp_path / "out", Job.prepare(changed(config, queries={"spp": 8}))
+    content = sealed(
+        build_manifest(
+            another, another.shards("train") + another.shards("test"), generation.simulated(another)
+        )
+    )
+
+    def plan(job: Job, pilots: bool) -> Any:
+        out.mkdir()
+        assert create_file(out / "manifest.json", content)
+        return generation.simulated(job)
+
+    monkeypatch.setattr(generation, "plan_effects", plan)
+    with pytest.raises(InputError, match=r"another configuration: queries\.spp"):
+        generate(config, out)
+    assert (out / "manifest.json").read_bytes() == content
+    assert not contents(out)
+
+
+def test_what_another_process_is_writing_is_not_replaced(
+    config: GeneratorConfig, engine: Formula, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    generate(config, out)
+    before = {p.name: p.read_bytes() for p in out.iterdir()}
+    with shard_lock(out / FILES[1]) as held:
+        assert held
+        with pytest.raises(PartialError, match="is being written by another process"):
+            generate(changed(config, seed=7), out, overwrite=True)
+    assert {p.name: p.read_bytes() for p in out.iterdir()} == before
+    assert generate(changed(config, seed=7), out, overwrite=True).complete
+
+
 @pytest.mark.parametrize("count", [1, 2, 3, 5, 7])
 def test_slices_share_the_work_without_gap_or_overlap(
     count: int, config: GeneratorConfig, engine: Formula, tmp_path: Path
@@ -393,6 +436,28 @@ def test_a_shard_that_another_process_writes_is_left_to_it(
             generate(config, out)
         assert sorted(contents(out)) == sorted(set(FILES) - {FILES[1]})
     assert generate(config, out).complete
+
+
+def test_a_shard_that_was_finished_before_its_lock_was_had_is_not_made_again(
+    config: GeneratorConfig, engine: Formula, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between the look at a shard and its lock another process may finish it and let go."""
+    whole, out = tmp_path / "whole", tmp_path / "out"
+    generate(config, whole)
+    engine.asked.clear()
+    take = shard_making.take_lock
+
+    def late(path: Path) -> Any:
+        if path.name == FILES[1]:
+            for name in (path.name, sidecar_of(path).name):
+                shutil.copy(whole / name, out / name)
+        return take(path)
+
+    monkeypatch.setattr(shard_making, "take_lock", late)
+    assert generate(config, out).complete
+    assert engine.asked == [("train", 0), ("train", 2), ("test", 0)]
+    assert contents(out) == contents(whole)
+    assert not list(out.glob(".*"))
 
 
 def test_the_sidecar_says_what_the_shard_holds(

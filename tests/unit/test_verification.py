@@ -154,6 +154,12 @@ def test_a_broken_sidecar_is_a_fault_not_an_abort(copy: Path, text: str) -> None
     assert not is_finished(shard(copy), 40, "any")
 
 
+def test_a_shard_that_shows_other_effects_is_found(copy: Path) -> None:
+    edit(copy / "train-00001.json", lambda record: record.update(effects="0" * 64))
+    found = [(f.file.partition(".")[0], f.what) for f in verify(copy)]
+    assert found == [("train-00001", "was made under another effects plan")]
+
+
 def test_an_unfinished_manifest_is_found(copy: Path) -> None:
     edit(copy / "manifest.json", lambda manifest: manifest.update(complete=False))
     assert "not complete" in faults(copy)["manifest.json"]

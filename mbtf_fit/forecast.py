@@ -1,0 +1,121 @@
+"""What a fit will take and reach, from short fits of the same data on this very machine, before it starts."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from mbtf_gen.console import clock
+from mbtf_gen.stats import unexplained_variance
+
+from .config import FitConfig
+from .data import load_training, open_data
+from .fitting import choose_device, prepare_trainer
+from .memory import keep_freed_memory
+from .models import MODELS
+
+# Seconds of the two pilot fits; each runs through the whole schedule in its time.
+PILOT_SECONDS = (4.0, 8.0)
+# Every doubling of the time gains this share of what the one before gained, in the logarithm of the error:
+# the model's size and the data end what training can reach.
+PERSISTENCE = 0.75
+# Held-out queries that pilots are judged by.
+_GLANCE = 1 << 14
+# Bytes of a number in the material's file.
+_NUMBER = 4
+
+
+@dataclass(frozen=True)
+class FitForecast:
+    """What is expected of a fit.
+
+    Attributes
+    ----------
+    seconds : of training; loading : of reading the data
+    steps : that the time is enough for
+    queries_per_second : trained on
+    unexplained : variance of held-out queries that it will miss; None where nothing is held out
+    at_most : the same after the longer pilot
+    bytes : of the material's numbers
+    pilot_seconds : what the forecast took, loading included
+    """
+
+    seconds: float
+    loading: float
+    steps: int
+    queries_per_second: float
+    unexplained: float | None
+    at_most: float | None
+    bytes: int
+    pilot_seconds: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data for JSON."""
+        return asdict(self)
+
+    def describe(self) -> str:
+        """Two lines."""
+        size = f"{self.bytes / 1e6:.2f} MB"
+        lines = [
+            f"forecast: {clock(self.seconds)} of training, {self.steps} steps at "
+            f"{self.queries_per_second / 1e6:.2f} M queries/s, after {self.loading:.0f} s of loading; {size}"
+        ]
+        if self.unexplained is not None:
+            lines.append(
+                f"unexplained variance of held-out queries about {self.unexplained:.2f}; "
+                f"{self.at_most:.2f} after {clock(PILOT_SECONDS[1])}"
+            )
+        return "\n".join(lines)
+
+
+def extrapolated(short: float, long: float, doublings: float) -> float:
+    """Error after so many doublings of the longer pilot's time, from those of both pilots (one doubling
+    apart), of which each gains `PERSISTENCE` of what the one before gained; never above the longer pilot's,
+    however short the budget."""
+    gain = max(0.0, math.log(short / long)) if min(short, long) > 0 else 0.0
+    total = PERSISTENCE * (1.0 - PERSISTENCE ** max(doublings, 0.0)) / (1.0 - PERSISTENCE)
+    return long * math.exp(-gain * total)
+
+
+def forecast_fit(config: FitConfig, shards: str | Path) -> FitForecast:
+    """Fit twice, briefly, and say what the fit of a configuration will take; nothing is written.
+
+    Raises
+    ------
+    InputError : shards cannot be used
+    EngineError : the device is not there
+    """
+    began = time.perf_counter()
+    device = choose_device(config.device)
+    data = open_data(shards, MODELS[config.model].layout, config.model)
+    keep_freed_memory()
+    partition = load_training(data, config.held_out, config.seed, config.data.memory)
+    loading = time.perf_counter() - began
+    held_out = partition.held_out_queries
+    found: list[float] = []
+    for seconds in PILOT_SECONDS:
+        training = config.training.model_copy(update={"time": seconds, "steps": None})
+        pilot = config.model_copy(update={"training": training})
+        trainer = prepare_trainer(pilot, data, partition, device)
+        while not trainer.train(math.inf):
+            pass
+        glance = held_out.take(slice(max(_GLANCE // trainer.model.positions, _GLANCE // 16)))
+        if len(glance):
+            found.append(unexplained_variance(trainer.predict(glance), glance.value_a, glance.value_b).value)
+    rate = trainer.progress.step / trainer.progress.seconds
+    steps = config.training.steps
+    total = config.training.time if steps is None else steps / rate
+    numbers = sum(p.numel() for p in trainer.model.parameters())
+    return FitForecast(
+        seconds=total,
+        loading=loading,
+        steps=round(total * rate) if steps is None else steps,
+        queries_per_second=rate * trainer.batch,
+        unexplained=extrapolated(found[0], found[1], math.log2(total / PILOT_SECONDS[1])) if found else None,
+        at_most=found[-1] if found else None,
+        bytes=_NUMBER * numbers,
+        pilot_seconds=time.perf_counter() - began,
+    )

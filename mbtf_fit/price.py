@@ -1,0 +1,103 @@
+"""What a fit's last seconds bought, and where the next ones are best spent."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from mbtf_gen.console import clock
+
+# The record that stands for the middle of training lies between these shares of it.
+_MIDDLE = (0.35, 0.65)
+# A difference counts where it is so many standard errors.
+_CLEAR = 2.0
+# More doublings of the time than these are as good as never.
+_MOST_DOUBLINGS = 12.0
+
+
+@dataclass(frozen=True)
+class Price:
+    """How the error of held-out queries fell, and what of it is for want of data.
+
+    Attributes
+    ----------
+    half, half_error : unexplained variance at half of the training time, and its standard error
+    end, end_error : at its end
+    halving : seconds of training more that would halve it if every doubling of the time went on to divide it
+        as the last one did; None where that did not clearly help. Rates that fall towards the end of training
+        flatter the last doubling, so this is a lower bound
+    noise_share : share of the error that is the noise of the training queries, which the fit has learned;
+        None where it is not clearly above zero
+    """
+
+    half: float
+    half_error: float
+    end: float
+    end_error: float
+    halving: float | None
+    noise_share: float | None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data for JSON."""
+        return asdict(self)
+
+    def describe(self) -> str:
+        """One line, or two."""
+        lines = [
+            f"held-out queries {self.half:.3f} ± {self.half_error:.3f} at half of the time, "
+            f"{self.end:.3f} ± {self.end_error:.3f} at its end"
+        ]
+        if self.halving is None:
+            lines[0] += ": more training alone would not help much"
+        else:
+            lines[0] += f"; halving that would take {clock(self.halving)} more at the least"
+        if self.noise_share is not None:
+            lines.append(
+                f"{self.noise_share:.0%} of the error is learned noise of the training queries: more "
+                "queries, or more paths per query, would take it away"
+            )
+        return "\n".join(lines)
+
+
+def price_of(history: list[dict[str, Any]], errors: dict[str, Any]) -> Price | None:
+    """Price of a finished fit; None where its history does not tell.
+
+    Parameters
+    ----------
+    history : records of the looks at held-out queries, with ``share``, ``seconds``, ``held_out`` and its
+        ``held_out_error``
+    errors : of the finished fit by split, as plain data
+    """
+    known = [r for r in history if _number(r.get("held_out")) and _number(r.get("held_out_error"))]
+    middle = [r for r in known if _MIDDLE[0] <= r.get("share", -1.0) <= _MIDDLE[1]]
+    if not middle or known[-1].get("share", 0.0) < 1.0:
+        return None
+    last, half = known[-1], min(middle, key=lambda r: abs(r["share"] - 0.5))
+    before, after = half["held_out"], last["held_out"]
+    spread = math.hypot(half["held_out_error"], last["held_out_error"])
+    halving = None
+    # Both looks are at the same queries, so this asks for more than it must.
+    if after > 0 and before - after > _CLEAR * spread:
+        doublings = math.log(2.0) / math.log(before / after) * math.log2(last["seconds"] / half["seconds"])
+        if doublings < _MOST_DOUBLINGS:
+            halving = last["seconds"] * (2.0**doublings - 1.0)
+    return Price(before, half["held_out_error"], after, last["held_out_error"], halving, _noise_share(errors))
+
+
+def _number(x: Any) -> bool:
+    return isinstance(x, int | float) and math.isfinite(x)
+
+
+def _noise_share(errors: dict[str, Any]) -> float | None:
+    """A fit that has learned the noise of its training queries misses held-out ones by the variance of what
+    it has learned, and seems to miss the training queries by as much less: the difference is twice that."""
+    found = [errors.get(name, {}).get("unexplained", {}) for name in ("held_out_queries", "training")]
+    if not all(_number(e.get(k)) for e in found for k in ("value", "error")):
+        return None
+    held_out, training = found
+    learned = 0.5 * (held_out["value"] - training["value"])
+    spread = 0.5 * math.hypot(held_out["error"], training["error"])
+    if held_out["value"] <= 0 or learned <= _CLEAR * spread:
+        return None
+    return min(1.0, float(learned / held_out["value"]))

@@ -1,0 +1,56 @@
+"""Forecasts of fits: the arithmetic, and short fits that write nothing."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+from support.fit_data import parallax, write_data
+
+import mbtf_fit.forecast as module
+from mbtf_fit import fit
+from mbtf_fit.config import FitConfig
+from mbtf_fit.forecast import PERSISTENCE, extrapolated, forecast_fit
+
+
+@pytest.fixture(scope="module")
+def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_data(tmp_path_factory.mktemp("data") / "shards", parallax, train=6000, noise=0.01)
+
+
+def test_every_doubling_gains_a_share_of_the_one_before() -> None:
+    gain = math.log(0.8 / 0.6)
+    one, two = (extrapolated(0.8, 0.6, doublings) for doublings in (1, 2))
+    assert math.log(0.6 / one) == pytest.approx(PERSISTENCE * gain)
+    assert math.log(one / two) == pytest.approx(PERSISTENCE**2 * gain)
+    # In the end all of them together gain a finite part.
+    assert extrapolated(0.8, 0.6, 60) == pytest.approx(0.6 * (0.6 / 0.8) ** (PERSISTENCE / (1 - PERSISTENCE)))
+
+
+def test_what_pilots_do_not_show_is_not_promised() -> None:
+    assert extrapolated(0.5, 0.6, 3) == 0.6
+    assert extrapolated(0.8, 0.6, -2) == 0.6
+    assert extrapolated(0.1, -0.01, 3) == -0.01
+
+
+@pytest.mark.parametrize("options", [{"time": "3s"}, {"steps": 12}])
+def test_a_forecast_is_of_the_fit_that_follows(
+    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: dict[str, object]
+) -> None:
+    monkeypatch.setattr(module, "PILOT_SECONDS", (0.05, 0.1))
+    config = FitConfig.model_validate({"training": {"batch": 500, "warmup": 3, **options}})
+    before = sorted(tmp_path.rglob("*")), sorted(shards.rglob("*"))
+    found = forecast_fit(config, shards)
+    assert (sorted(tmp_path.rglob("*")), sorted(shards.rglob("*"))) == before
+    assert found.steps == pytest.approx(found.seconds * found.queries_per_second / 500, abs=0.5)
+    assert found.seconds == 3.0 if "time" in options else found.steps == 12
+    assert found.unexplained is not None
+    assert found.at_most is not None
+    assert found.unexplained <= found.at_most
+    assert len(found.describe().splitlines()) == 2
+    if "steps" in options:
+        fit(config, shards, tmp_path / "material")
+        # Names and shapes stand before the numbers, conformance queries beside them.
+        size = (tmp_path / "material" / "weights.safetensors").stat().st_size
+        assert found.bytes < size < found.bytes + 20480
