@@ -43,7 +43,8 @@ ASSETS = ("turtle_shell", "cliff_rock", "twisted_wool", "straight_wool", "insula
 TEXTURES = ("metal_plate", "leather_fine", "knit_fabric", "rock_cliff", "stone_bricks", "tree_bark")
 # Materials whose gloss carries most of what varies: smooth over dark. Leather is as smooth, but bright.
 GLOSSY = ("turtle_shell", "stone_bricks", "tree_bark")
-# First picture in seconds, deviations, χ² after correction, variance ratio of glossy materials.
+# First picture in seconds, deviations, χ² after correction, variance ratio of glossy materials, and what
+# energies have too much, in standard errors.
 BARS = {
     "first_picture": 10.0,
     "single": 1e-4,
@@ -276,6 +277,7 @@ def verdict(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "chi_square": float(-np.expm1(tests * np.log1p(-least))),
         "variance": min((r["variance_ratio"] for r in rows if r["material"] in GLOSSY), default=None),
         "energy": max(excess),
+        "energy_share": max(e["fit"] / e["reference"] - 1.0 for r in rows for e in r["energy"]),
     }
 
 
