@@ -73,10 +73,11 @@ def _size(material: Material) -> dict[str, Any]:
     """Numbers of a material: of its networks, one by one, and of its textures."""
     weights = material.description["weights"]
     networks: dict[str, int] = {}
-    for name, tensor in material.model.weights().items():
-        part = name.split(".")[0]
-        if part not in ("pyramid", "offset_texture", "unit"):
-            networks[part] = networks.get(part, 0) + tensor.numel()
+    textures = {id(texture.texels) for texture in material.model.textures()}
+    for name, parameter in material.model.named_parameters():
+        if id(parameter) not in textures:
+            part = name.split(".")[0]
+            networks[part] = networks.get(part, 0) + parameter.numel()
     return {
         "network_weights": weights["network_weights"],
         "networks": networks,

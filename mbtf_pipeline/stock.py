@@ -42,6 +42,8 @@ LOWEST_VIEW, LOWEST_LIGHT = 75.0, 30.0
 _BLOCK = 8
 # Differences that do not matter, relative to the mean value: of the mean, and root mean square over pixels.
 MEAN_TOLERANCE, RMS_TOLERANCE = 0.005, 0.02
+# Error bars that a larger difference may lie within: of dozens of comparisons some exceed two by chance.
+BARS = 3.0
 # Parts of a material that Lambert has none of.
 _BARE = (
     "roughness",
@@ -77,9 +79,8 @@ class Agreement:
 
     @property
     def agrees(self) -> bool:
-        """Whether both differences lie within their tolerances or within two of their error bars."""
-        square = self.square.value <= max(RMS_TOLERANCE**2, 2 * self.square.error)
-        return square and abs(self.mean.value) <= max(MEAN_TOLERANCE, 2 * self.mean.error)
+        """:func:`agree` of its two differences."""
+        return agree(self.mean, self.square)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data, without the pictures."""
@@ -87,8 +88,15 @@ class Agreement:
             "surface": self.surface,
             "mean": self.mean.as_dict(),
             "square": self.square.as_dict(),
-            "agrees": self.agrees,
         }
+
+
+def agree(mean: Estimate, square: Estimate) -> bool:
+    """Whether relative differences, of the means and mean square over pixels, lie within their tolerances or
+    within three of their error bars."""
+    if square.value > max(RMS_TOLERANCE**2, BARS * square.error):
+        return False
+    return abs(mean.value) <= max(MEAN_TOLERANCE, BARS * mean.error)
 
 
 def agreement(surface: str, ours: tuple[F64, F64], stock: tuple[F64, F64], margin: int = 0) -> Agreement:

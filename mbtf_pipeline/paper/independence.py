@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from mbtf_gen.stats import Estimate
 
-from ..stock import MEAN_TOLERANCE, RMS_TOLERANCE
+from ..stock import MEAN_TOLERANCE, RMS_TOLERANCE, agree
 from ..wording import direction, estimate
 from .cells import Cell, Column, Figure, Table
 from .figures import difference, picture
@@ -45,7 +45,7 @@ def independence(runs: Sequence[Run]) -> list[Table]:
                     estimate(found["mean"]),
                     _rms_text(square),
                     math.sqrt(max(0.0, 2.0 * square.error)),
-                    "agree" if found["agrees"] else "DIFFER",
+                    "agree" if agree(estimate(found["mean"]), square) else "DIFFER",
                 ]
             )
             ours, stock = (run.picture(found["files"][route]) for route in ("ours", "stock"))
@@ -71,7 +71,7 @@ def independence(runs: Sequence[Run]) -> list[Table]:
         "alone everything is stock, the surface, too (diffuse); the full surface is the project’s in "
         "both, under stock everything else. Holes are left out. The two agree where the means differ by "
         f"less than {100 * MEAN_TOLERANCE:g} % and pixels by less than {100 * RMS_TOLERANCE:g} % RMS, or "
-        "by less than two error bars; the last but one column is the smallest RMS difference that the "
+        "by less than three error bars; the last but one column is the smallest RMS difference that the "
         "noise would let be seen."
     )
     return [Table("independence", "References by stock parts", text, columns, rows, figures=figures)]

@@ -93,7 +93,7 @@ def _figures(runs: Sequence[Run]) -> list[tuple[str, list[Figure]]]:
         for fit in run.fits:
             made = shown["fits"][fit]
             psnr = made["errors"][run.kind]["psnr"]["value"]
-            line = "" if psnr is None else f"{psnr:.1f} dB"
+            line = "" if psnr is None else f"{psnr:.1f} dB".replace("-", "−")
             row.append(Figure(picture(run.picture(made["file"])), fit, [line]))
         out.append((name_of(run.material), row))
     return out

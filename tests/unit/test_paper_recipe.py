@@ -108,7 +108,10 @@ def test_ordinary_and_paper_recipes_are_told_apart(
     from mbtf_pipeline.cli import app
 
     assert SHIPPED
-    assert [is_paper_recipe(p) for p in (SHIPPED[0], PIPELINES / "ci.yaml", tmp_path)] == [True, False, False]
+    ordinary = tmp_path / "without-fit.yaml"
+    ordinary.write_text("name: r\ngenerate: {material: m}\n")
+    files = (SHIPPED[0], PIPELINES / "ci.yaml", ordinary, tmp_path)
+    assert [is_paper_recipe(p) for p in files] == [True, False, False, False]
     assert run(app, ["run", str(PIPELINES / "ci.yaml"), "--quick"]) == 2
     assert "only paper recipes have a quick size" in capsys.readouterr().err
     assert run(app, ["run", str(SHIPPED[0]), "--quality", "draft"]) == 2

@@ -72,6 +72,7 @@ def test_all_fits_are_judged_by_the_same_test_queries(tmp_path: Path) -> None:
     # Noise that both share cancels: the bar is that of the difference.
     assert less["error"] < found["a"]["splits"]["test"]["mse"]["error"]
     assert set(less["levels"]) == {"0", "1", "2", "3"}
+    assert all(e["value"] + 4 * e["error"] < 0 for e in less["levels"].values())
     assert "mse_less_first" not in found["a"]
 
 
