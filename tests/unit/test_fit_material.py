@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,9 @@ from safetensors.numpy import load_file
 from support.fit_data import constant, parallax, random_queries, write_data
 
 from mbtf_fit import FitConfig, FitResult, Material, evaluate, fit, read_history
+from mbtf_fit.data import load_training
 from mbtf_fit.evaluation import split_errors
+from mbtf_gen.dataset import Dataset
 from mbtf_gen.errors import EngineError, InputError
 from mbtf_gen.levels import Lattice
 
@@ -185,6 +188,17 @@ def test_the_history_records_the_training(fitted: FitResult) -> None:
     assert history[-1]["step"] == 30
     assert history[-1]["share"] == 1.0
     assert {"seconds", "loss", "held_out", "held_out_error", "queries_per_second"} <= set(history[-1])
+
+
+def test_data_that_were_read_before_give_the_same_fit(fitted: FitResult, data: Path, tmp_path: Path) -> None:
+    default = config()
+    partition = load_training(Dataset.open(data), default.held_out, default.seed)
+    again = fit(default, data, tmp_path / "m", partition=partition)
+    assert again.errors == fitted.errors
+    # They are what is trained on and judged by, whatever the folder holds.
+    few = dataclasses.replace(partition, held_out_queries=partition.held_out_queries.take(slice(7)))
+    other = fit(default, data, tmp_path / "o", partition=few)
+    assert other.errors["held_out_queries"]["unexplained"]["n"] == 7
 
 
 def test_the_same_fit_again_is_left_as_it_is(data: Path, tmp_path: Path) -> None:
