@@ -83,6 +83,14 @@ def test_half_precision_keeps_to_a_hundredth(options: dict[str, Any], tmp_path: 
     assert 1e-5 < deviation(half.evaluate(*drawn.values()), material.evaluate(*drawn.values())) < 1e-2
 
 
+def test_half_precision_does_not_round_what_the_network_sees() -> None:
+    """A difference of 2⁻¹², which half precision cannot hold beside 1, is seen by the first layer."""
+    one = np.ones((1, 1), np.float32)
+    layers = [(one, np.full(1, -1.0, np.float32)), (4096 * one, np.zeros(1, np.float32))]
+    (found,) = network.Network(layers, "half")([mi.Float(1.0 + 2.0**-12)])
+    assert found[0] == 1.0
+
+
 def test_constants_are_those_of_the_models() -> None:
     assert evaluator.OFFSET_SCALE == textured.OFFSET_SCALE
     assert evaluator.GRAZING == textured.GRAZING
