@@ -57,7 +57,9 @@ class NetworkSection(Settings):
 class BlurSection(Settings):
     """Blur annealing of the textures: σ falls from `start` to `end` within `share` of the budget."""
 
-    start: float = Field(8.0, ge=0, le=256, description="texels of the finest level; 0: no blur")
+    start: float = Field(
+        8.0, ge=0, le=256, description="texels of the finest level, at most an eighth of the tile; 0: no blur"
+    )
     end: float = Field(0.25, gt=0, le=256, description="texels of the finest level")
     share: float = Field(0.5, gt=0, le=1, description="of the budget")
     floor: float = Field(

@@ -32,6 +32,9 @@ from .streaming import Selection, StreamedQueries
 
 # Decay of Adam's running means of the gradient and of its square.
 BETAS = (0.8, 0.95)
+# Blur at its widest, in tile widths. Half a tile of blur left so little to find in textures of 16 x 16 texels
+# that offsets wandered off before they became sharp: three of eight fits ended no better than without.
+WIDEST_BLUR = 0.125
 
 
 def rate_factor(training: TrainingSection, step: int, share: float) -> float:
@@ -179,7 +182,8 @@ class Trainer:
     def _sigmas(self) -> list[float]:
         """Blur of each texture at this moment, in texels of the finest level."""
         blur = self.config.training.blur
-        sigma = annealed_sigma(self.share / blur.share, blur.start, blur.end)
+        start = min(blur.start, max(WIDEST_BLUR * min(self.model.lattice.shape()), blur.end))
+        sigma = annealed_sigma(self.share / blur.share, start, blur.end)
         return [max(sigma, blur.offset if t.moves_lookups else blur.floor) for t in self.model.textures()]
 
     def _tables(self) -> list[Tensor]:

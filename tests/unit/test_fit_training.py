@@ -33,6 +33,29 @@ def trainer(data: TrainingQueries, model: str = "neumip", **training: Any) -> Tr
     return make_trainer(data, LATTICE, model, **{"steps": 40, "batch": 1000, "warmup": 5, **training})
 
 
+@pytest.mark.parametrize(
+    ("shape", "asked", "start"),
+    [
+        ((16, 16), 8.0, 2.0),
+        ((64, 64), 8.0, 8.0),
+        ((64, 16), 8.0, 2.0),
+        ((64, 64), 3.0, 3.0),
+        ((16, 16), 0.0, 0.0),
+    ],
+)
+def test_blur_begins_at_an_eighth_of_the_tile_at_most(
+    shape: tuple[int, int], asked: float, start: float
+) -> None:
+    """Wider blur leaves nothing to find: offsets wander off and textures become sharp where they are."""
+    lattice = Lattice.for_map(*shape)
+    arrays = random_queries(np.random.default_rng(0), 500, lattice)
+    data = training_queries(arrays, parallax(*arrays.values()))
+    blur = {"start": asked, "end": 0.25, "offset": 0.5}
+    t = make_trainer(data, lattice, "neumip", steps=40, batch=100, blur=blur)
+    sigmas = t._sigmas()
+    assert sigmas == [start if not x.moves_lookups else max(start, 0.5) for x in t.model.textures()]
+
+
 @pytest.mark.parametrize("model", ["neumip", "neumip-baseline"])
 def test_training_lowers_the_loss(model: str) -> None:
     data = queries()
