@@ -37,7 +37,7 @@ class FitForecast:
     seconds : of training; loading : of reading the data
     steps : that the time is enough for
     queries_per_second : trained on
-    unexplained : variance of held-out queries that it will miss; None where nothing is held out or has variance
+    unexplained : variance of held-out queries that it will miss; None where nothing is held out, or varies
     at_most : the same after the longer pilot
     bytes : of the material's numbers
     pilot_seconds : what the forecast took, loading included
