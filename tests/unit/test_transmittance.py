@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.buffer_data import write_buffers
 from support.damage import check_message
 from support.fit_data import constant, random_queries, write_data
 from support.plugin_materials import write_material
@@ -46,6 +47,17 @@ def test_a_known_transmittance_is_found(tmp_path: Path) -> None:
     assert np.sqrt(np.mean((found - wanted) ** 2)) < 0.035
     fine = q["sigma"] < 0.045
     assert np.sqrt(np.mean((found - wanted)[fine] ** 2)) < 0.02
+
+
+@pytest.mark.parametrize("window", [None, 4])
+def test_buffers_tell_the_same(tmp_path: Path, window: int | None) -> None:
+    folder = write_buffers(tmp_path, constant(0.2), train=1500, through=lace, window=window)
+    data = Dataset.open(folder)
+    model = fit_transmittance(data)
+    assert model is not None
+    q = random_queries(np.random.default_rng(9), 4000, data.lattice)
+    found = model.evaluate(q["u"], q["sigma"], q["omega_o"])
+    assert np.sqrt(np.mean((found - lace(q["u"], q["sigma"], q["omega_o"])) ** 2)) < 0.05
 
 
 def test_few_queries_fall_back_on_coarser_levels(tmp_path: Path) -> None:
