@@ -18,7 +18,7 @@ from mbtf_gen.atomic import read_json, write_json, write_text
 from mbtf_gen.dataset import Dataset
 from mbtf_gen.errors import EngineError, InputError
 from mbtf_gen.settings import differences, dump_yaml, in_short
-from mbtf_gen.stats import unexplained_variance
+from mbtf_gen.stats import pooled_variance, unexplained_variance
 
 from .config import FitConfig
 from .data import Partition, Queries, data_hash, load_training, mean_value, open_data
@@ -99,7 +99,7 @@ class FitResult:
     @property
     def price(self) -> Price | None:
         """What the last seconds bought; None where the history does not tell."""
-        return price_of(self.history, self.errors)
+        return price_of(self.history, self.errors, self.material.description["training"].get("noise"))
 
 
 def choose_device(name: str) -> torch.device:
@@ -178,10 +178,16 @@ def fit(
     }
     errors = judge(trainer.predict, data, partition)
     training["errors"] = {name: e.as_dict() for name, e in errors.items()}
+    training["noise"] = _noise(partition.sample, errors["training"].overall.variance.value)
     holes = fit_transmittance(data)
     export(trainer.model, config, out, data=identity["data"], training=training, holes=holes)
     (out / CHECKPOINT_NAME).unlink(missing_ok=True)
     return _finished(out, time.perf_counter() - begin, resumed=resumed)
+
+
+def _noise(sample: Queries, variance: float) -> float | None:
+    """Variance of the noise in values over that of the values; None where these have none."""
+    return pooled_variance(sample.value_a, sample.value_b).value / variance if variance > 0 else None
 
 
 def _identity(config: FitConfig, data: Dataset) -> dict[str, Any]:

@@ -37,7 +37,7 @@ class FitForecast:
     seconds : of training; loading : of reading the data
     steps : that the time is enough for
     queries_per_second : trained on
-    unexplained : variance of held-out queries that it will miss; None where nothing is held out
+    unexplained : variance of held-out queries that it will miss; None where nothing is held out, or varies
     at_most : the same after the longer pilot
     bytes : of the material's numbers
     pilot_seconds : what the forecast took, loading included
@@ -105,6 +105,8 @@ def forecast_fit(config: FitConfig, shards: str | Path) -> FitForecast:
         glance = held_out.take(slice(max(_GLANCE // trainer.model.positions, _GLANCE // 16)))
         if len(glance):
             found.append(unexplained_variance(trainer.predict(glance), glance.value_a, glance.value_b).value)
+    if not all(map(math.isfinite, found)):
+        found.clear()
     rate = trainer.progress.step / trainer.progress.seconds
     steps = config.training.steps
     total = config.training.time if steps is None else steps / rate

@@ -33,6 +33,10 @@ class _Weights(BaseModel):
     texels: int
 
 
+class _Holes(BaseModel):
+    sha256: str
+
+
 class _Levels(BaseModel):
     finest: Annotated[int, Field(strict=True, ge=0, le=MAX_LEVEL)]
 
@@ -65,6 +69,7 @@ class _Description(BaseModel):
     conformance: _Conformance
     training: _Training
     data: dict[str, Any]
+    holes: _Holes | None = None
 
 
 def read_description(folder: Path) -> tuple[dict[str, Any], Path]:

@@ -60,7 +60,9 @@ class Price:
         return "\n".join(lines)
 
 
-def price_of(history: list[dict[str, Any]], errors: dict[str, Any]) -> Price | None:
+def price_of(
+    history: list[dict[str, Any]], errors: dict[str, Any], noise: float | None = None
+) -> Price | None:
     """Price of a finished fit; None where its history does not tell.
 
     Parameters
@@ -68,6 +70,7 @@ def price_of(history: list[dict[str, Any]], errors: dict[str, Any]) -> Price | N
     history : records of the looks at held-out queries, with ``share``, ``seconds``, ``held_out`` and its
         ``held_out_error``
     errors : of the finished fit by split, as plain data
+    noise : variance of the noise in the training values over that of the values; None where it is not known
     """
     known = [r for r in history if _number(r.get("held_out")) and _number(r.get("held_out_error"))]
     middle = [r for r in known if _MIDDLE[0] <= r.get("share", -1.0) <= _MIDDLE[1]]
@@ -82,21 +85,23 @@ def price_of(history: list[dict[str, Any]], errors: dict[str, Any]) -> Price | N
         doublings = math.log(2.0) / math.log(before / after) * math.log2(last["seconds"] / half["seconds"])
         if doublings < _MOST_DOUBLINGS:
             halving = last["seconds"] * (2.0**doublings - 1.0)
-    return Price(before, half["held_out_error"], after, last["held_out_error"], halving, _noise_share(errors))
+    share = _noise_share(errors, noise)
+    return Price(before, half["held_out_error"], after, last["held_out_error"], halving, share)
 
 
 def _number(x: Any) -> bool:
     return isinstance(x, int | float) and math.isfinite(x)
 
 
-def _noise_share(errors: dict[str, Any]) -> float | None:
+def _noise_share(errors: dict[str, Any], noise: float | None) -> float | None:
     """A fit that has learned the noise of its training queries misses held-out ones by the variance of what
-    it has learned, and seems to miss the training queries by as much less: the difference is twice that."""
+    it has learned, and seems to miss the training queries by as much less: the difference is twice that.
+    Few queries without noise part the two as well, so no more is called learned than there is."""
     found = [errors.get(name, {}).get("unexplained", {}) for name in ("held_out_queries", "training")]
-    if not all(_number(e.get(k)) for e in found for k in ("value", "error")):
+    if noise is None or not all(_number(e.get(k)) for e in found for k in ("value", "error")):
         return None
     held_out, training = found
-    learned = 0.5 * (held_out["value"] - training["value"])
+    learned = min(0.5 * (held_out["value"] - training["value"]), noise)
     spread = 0.5 * math.hypot(held_out["error"], training["error"])
     if held_out["value"] <= 0 or learned <= _CLEAR * spread:
         return None

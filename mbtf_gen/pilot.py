@@ -32,11 +32,11 @@ NONE_OF = 3.0
 
 def pilot_queries(job: Job, count: int = PILOT_QUERIES, shard: int = 0) -> Queries:
     """`count` queries drawn like the run's (one leading axis), from a stream of their own; others for every
-    `shard`."""
-    rows = count if job.config.queries.layout == "shuffled" else max(1, count // job.places)
-    flat = job.plan().draw("pilot", shard, rows).flat()
-    some = slice(0, None, max(1, len(flat.sigma) // count))
-    return Queries(flat.u[some], flat.sigma[some], flat.omega_i[some], flat.omega_o[some])
+    `shard`.
+
+    Whatever the layout, each has a footprint and directions of its own: a few buffers would be a few.
+    """
+    return replace(job.plan(), layout="shuffled", window=None).draw("pilot", shard, count)
 
 
 @dataclass(frozen=True)

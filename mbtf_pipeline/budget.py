@@ -89,13 +89,12 @@ def best_share(pilots: Sequence[tuple[float, float]]) -> float:
     left, right = (y1 - y0) / (x1 - x0), (y2 - y1) / (x2 - x1)
     bend = (right - left) / (x2 - x0)
     if bend > 0:
-        vertex = math.exp(0.5 * (x0 + x1 - left / bend))
+        vertex = 0.5 * (x0 + x1 - left / bend)
     else:
-        vertex = min(pilots, key=lambda p: p[1])[0]
+        vertex = math.log(min(pilots, key=lambda p: p[1])[0])
     # What lies outside of the pilots is a guess: no more than half a step beyond them.
-    low, high = pilots[0][0], pilots[-1][0]
-    vertex = min(max(vertex, low / math.sqrt(pilots[1][0] / low)), high * math.sqrt(high / pilots[1][0]))
-    return min(max(vertex, LEAST_SHARE), LARGEST_SHARE)
+    vertex = min(max(vertex, x0 - 0.5 * (x1 - x0)), x2 + 0.5 * (x2 - x1))
+    return min(max(math.exp(vertex), LEAST_SHARE), LARGEST_SHARE)
 
 
 def split_budget(
@@ -165,6 +164,8 @@ def _plan(recipe: Recipe, budget: float, tell: Callable[[str], None]) -> Split:
     length = PILOT * budget
     if length >= SHORTEST_PILOT:
         pilots = _pilots(recipe, length, price, tell)
+    # Data without variance, such as those of an even plane, leave nothing to be unexplained.
+    pilots = pilots if all(math.isfinite(error) for _, error in pilots) else []
     share = best_share(pilots) if pilots else USUAL_SHARE
     looked = time.perf_counter() - began
     left = max(budget - looked - test - expected.start, _LEAST_LEFT * budget)

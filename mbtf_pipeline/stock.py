@@ -104,8 +104,9 @@ def agreement(surface: str, ours: tuple[F64, F64], stock: tuple[F64, F64], margi
 
     Parameters
     ----------
-    margin : pixels along every edge that are left out
+    margin : pixels along every edge that are left out; fewer in pictures that would have none left
     """
+    margin = min(margin, (min(ours[0].shape[:2]) - 1) // 2)
     inner = slice(margin, -margin if margin else None)
     a1, b1, a2, b2 = (_blocks(x[inner, inner]) for x in (*ours, *stock))
     mean = float((a1 + b1 + a2 + b2).mean() / 4.0)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from mbtf_gen.stats import Estimate
 
-from ..stock import MEAN_TOLERANCE, RMS_TOLERANCE, agree
+from ..stock import BARS, MEAN_TOLERANCE, RMS_TOLERANCE, agree
 from ..wording import direction, estimate
 from .cells import Cell, Column, Figure, Table
 from .figures import difference, picture
@@ -44,7 +44,7 @@ def independence(runs: Sequence[Run]) -> list[Table]:
                     _ROUTES[found["surface"]],
                     estimate(found["mean"]),
                     _rms_text(square),
-                    math.sqrt(max(0.0, 2.0 * square.error)),
+                    math.sqrt(BARS * square.error),
                     "agree" if agree(estimate(found["mean"]), square) else "DIFFER",
                 ]
             )

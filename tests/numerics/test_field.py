@@ -23,7 +23,7 @@ def needles() -> HeightGrid:
 
 
 def odd() -> HeightGrid:
-    return HeightGrid(rocks(64).z[:23, :37], 23 / 37)
+    return HeightGrid.from_map(rocks(64).z[:23, :37], 1.0)
 
 
 def narrow(rows: int, columns: int, aspect: float) -> HeightGrid:
@@ -39,8 +39,9 @@ GRIDS = [
     HeightGrid(np.array([[0.0, -0.3]]), 0.5),
     narrow(7, 3, 0.31),
     narrow(9, 1, 0.6),
+    narrow(4, 16, 0.25),
 ]
-NAMES = ["rocks", "23 x 37", "needles", "1 x 2", "7 x 3", "9 x 1"]
+NAMES = ["rocks", "23 x 37", "needles", "1 x 2", "7 x 3", "9 x 1", "4 x 16"]
 
 
 def rays(rng: np.random.Generator, grid: HeightGrid, unit: float) -> tuple[NDArray, NDArray]:
@@ -91,11 +92,11 @@ def test_hits_and_shadows_are_those_of_the_mesh(grid: HeightGrid) -> None:
     assert np.mean(np.array(blocked) != truth) < 1e-3
 
 
-def test_rays_from_below_meet_the_surface_from_below() -> None:
+@pytest.mark.parametrize("grid", [rocks(64), odd()], ids=["rocks", "23 x 37"])
+def test_rays_from_below_meet_the_surface_from_below(grid: HeightGrid) -> None:
     """Turned over, what lies below is what lies above: the same hits at mirrored places."""
-    grid = rocks(64)
     rng = np.random.default_rng(1)
-    upside_down = HeightGrid.from_map(grid.z, -1.0)
+    upside_down = HeightGrid.from_map(grid.z, -1.0, grid.aspect)
     field, mirrored = (HeightField.of(g, 32.0, True) for g in (grid, upside_down))
     o, d = rays(rng, grid, 32.0)
     o[:, 2] = 0.1

@@ -136,6 +136,8 @@ def test_samples_pass_or_reflect_with_the_density_that_is_stated(lace: dict[str,
     value, pdf = bsdf.eval_pdf(context, si, bs.wo)
     kept = ~null & (np.array(bs.pdf) > 0)
     np.testing.assert_allclose(np.array(pdf)[kept], np.array(bs.pdf)[kept], rtol=1e-3)
+    for alike, found in ((bsdf.eval(context, si, bs.wo), value), (bsdf.pdf(context, si, bs.wo), pdf)):
+        np.testing.assert_allclose(np.array(alike)[..., kept], np.array(found)[..., kept], rtol=1e-5)
     ratio = np.array(value)[:, kept] / np.array(pdf)[kept]
     np.testing.assert_allclose(np.array(weight)[:, kept], ratio, rtol=1e-3)
     # All of the light is found by either kind of direction alone.

@@ -88,6 +88,15 @@ def test_noise_of_both_sides_drops_out() -> None:
     assert not other.agrees
 
 
+@pytest.mark.parametrize("size", [1, 8, 9])
+def test_small_pictures_keep_pixels_to_compare(size: int) -> None:
+    """Recipes may ask for pictures of eight pixels, whose edges would be all of them."""
+    one = np.ones((size, size, 3))
+    found = agreement("", (one, one), (1.5 * one, 1.5 * one), margin=4)
+    assert found.mean.value == pytest.approx(-0.4)
+    assert found.square.value == pytest.approx(0.16)
+
+
 def test_grazing_comparisons_are_refused() -> None:
     low = CompareSection.model_validate({"views": [{"elevation": 40}], "lights": [{"elevation": 50}]})
     with pytest.raises(UsageError, match="stock parts want a view"):

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from mbtf_gen.levels import Lattice, sigma_of_level, texel_centres
+from mbtf_gen.queries import Mixture, QueryPlan
 from mbtf_gen.schema import FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION
 from mbtf_gen.shard_files import write_shard
 
@@ -40,8 +43,16 @@ def write_buffers(
     aspect: float = 1.0,
     noise: float = 0.0,
     seed: int = 0,
+    window: int | None = None,
+    through: Callable[[F32, F32, F32], Any] | None = None,
 ) -> Path:
-    """Write so many buffers of a known function, in two shards, with independent noise in both halves."""
+    """Write so many buffers of a known function, in two shards, with independent noise in both halves.
+
+    Parameters
+    ----------
+    window : places along each side of a buffer; None: whole buffers
+    through : transmittance at u, σ and view, of a material with holes
+    """
     folder.mkdir(parents=True, exist_ok=True)
     lattice, random = Lattice(finest, aspect), np.random.default_rng(seed)
     splits: dict[str, dict[str, object]] = {}
@@ -49,19 +60,25 @@ def write_buffers(
         entries = []
         for index, items in enumerate(counts):
             queries = random_buffers(random, items, lattice)
+            if window is not None:
+                plan = QueryPlan(lattice, Mixture(1, 0), 0.1, "image", seed, items, window)
+                queries = {name: getattr(plan.draw(split, index, items), name) for name in queries}
             shape = queries["sigma"].shape
-            flat = (a.reshape(-1, *a.shape[3:]) for a in queries.values())
-            value = function(*flat).reshape(*shape, 3)
+            flat = {name: a.reshape(-1, *a.shape[3:]) for name, a in queries.items()}
+            value = function(*flat.values()).reshape(*shape, 3)
             halves = {
                 f"value_{half}": (value + noise * random.standard_normal(value.shape)).astype(np.float32)
                 for half in "ab"
             }
+            if through is not None:
+                seen = through(flat["u"], flat["sigma"], flat["omega_o"])
+                halves["transmittance"] = seen.reshape(shape).astype(np.float32)
             name = f"{split}-{index:05d}.npz"
             write_shard(folder / name, {**queries, **halves, "spp": np.full(shape, 2, np.float32)})
             (folder / name).with_suffix(".json").write_text(json.dumps({"rows": items}))
             entries.append({"file": name, "rows": items})
         splits[split] = {"queries": sum(counts), "shards": entries}
-    manifest = {
+    manifest: dict[str, Any] = {
         "format": FORMAT_NAME,
         "schema": SCHEMA_VERSION,
         "config_hash": f"buffers-{function.__name__}-{seed}-{noise}",
@@ -69,6 +86,9 @@ def write_buffers(
         "levels": {"finest": finest},
         "tile": {"aspect": aspect},
         "splits": splits,
+        "window": window,
     }
+    if through is not None:
+        manifest["arrays"] = {"transmittance": {}}
     (folder / MANIFEST_NAME).write_text(json.dumps(manifest))
     return folder

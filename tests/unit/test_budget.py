@@ -7,6 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from mbtf_gen.durations import parse_duration
@@ -73,6 +74,26 @@ def test_shares_that_no_pilot_speaks_for_are_not_taken() -> None:
         assert LEAST_SHARE <= share <= LARGEST_SHARE
         assert SHARES[0] / 1.6 < share < SHARES[-1] * 1.4
     assert best_share([(0.15, 1.0), (0.35, 3.0), (0.6, 1.5)]) == 0.15
+
+
+def test_errors_that_follow_a_power_of_the_share_have_no_least_value() -> None:
+    """In logarithms they lie on a line but for rounding, whose bend may point either way."""
+    for power in np.linspace(-1.0, 1.0, 41):
+        share = best_share([(s, 0.2 * s**power) for s in SHARES])
+        assert LEAST_SHARE <= share <= LARGEST_SHARE
+        if abs(power) > 0.01:
+            assert (share <= SHARES[0]) == (power > 0)
+
+
+def test_pilots_that_have_nothing_to_explain_do_not_decide(
+    measured: list[tuple[int, float]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The data of an even plane have no variance that an error could be a share of."""
+    nothing = SimpleNamespace(error=Estimate(math.nan, math.inf, 10))
+    monkeypatch.setattr("mbtf_pipeline.cost.chains.Workshop.measure", lambda self, chain: nothing)
+    split = split_budget(recipe(), 1000.0, tmp_path / "run", "command", lambda note: None)
+    assert split.share == USUAL_SHARE
+    assert split.pilots == ()
 
 
 def test_long_budgets_are_split_by_pilots(measured: list[tuple[int, float]], tmp_path: Path) -> None:

@@ -160,6 +160,19 @@ def test_crops_of_windows_go_on_beyond_their_border() -> None:
         torch.testing.assert_close(step, step.round().to(step.dtype), atol=1e-6, rtol=0)
 
 
+def test_windows_are_read_with_the_grids_that_they_lie_on(tmp_path: Path) -> None:
+    folder = write_buffers(tmp_path / "d", parallax, train=20, finest=4, aspect=0.5, window=5)
+    data = buffers_of(partition(folder, HeldOutSection(queries=0, radius=0)))
+    assert data.u.shape == (20, 5, 5, 2)
+    crops = data.crop(np.arange(20), np.ones((20, 2), np.int64), 3, 2)
+    torch.testing.assert_close(crops.value, data.value[:, 1:4, 1:4])
+    shapes = nearest_shapes(Lattice(4, 0.5), data.sigma.numpy())
+    assert len(np.unique(shapes, axis=0)) > 3
+    for u, (rows, columns) in zip(crops.u, shapes, strict=True):
+        step = u[1:, 1:] - u[:-1, :-1] - torch.tensor([1 / columns, -1 / rows])
+        torch.testing.assert_close(step, step.round().to(step.dtype), atol=1e-6, rtol=0)
+
+
 def test_batches_cut_windows_within_them() -> None:
     data = windows(Lattice(4), 6, 8)
     for batch in islice(data.batches(2 * 16, 0, 0, 2), 20):

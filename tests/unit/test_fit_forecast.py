@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 
 import pytest
-from support.fit_data import parallax, write_data
+from support.fit_data import constant, parallax, write_data
 
 import mbtf_fit.forecast as module
 from mbtf_fit import fit
@@ -54,3 +54,12 @@ def test_a_forecast_is_of_the_fit_that_follows(
         # Names and shapes stand before the numbers, conformance queries beside them.
         size = (tmp_path / "material" / "weights.safetensors").stat().st_size
         assert found.bytes < size < found.bytes + 20480
+
+
+def test_data_without_variance_have_none_to_forecast(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "PILOT_SECONDS", (0.05, 0.1))
+    config = FitConfig.model_validate({"training": {"batch": 500, "time": "3s"}})
+    found = forecast_fit(config, write_data(tmp_path, constant(0.2), train=2000))
+    assert found.unexplained is None
+    assert found.at_most is None
+    assert "nan" not in found.describe()

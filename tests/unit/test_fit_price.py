@@ -56,14 +56,24 @@ def test_a_gain_below_its_error_bar_promises_nothing() -> None:
 def test_half_of_the_distance_to_the_training_queries_is_learned_noise() -> None:
     # Least squares with k free numbers and noise s² in n queries misses others by s²k/n, and seems to miss
     # its own by -s²k/n.
-    found = price_of(history(0.5), errors(0.2 + 0.05, 0.2 - 0.05))
+    found = price_of(history(0.5), errors(0.2 + 0.05, 0.2 - 0.05), 0.3)
     assert found is not None
     assert found.noise_share == pytest.approx(0.05 / 0.25)
     assert "20% of the error is learned noise" in found.describe()
     for same in (errors(0.25, 0.248), errors(0.25, 0.3), {}, errors(math.nan, 0.1)):
-        other = price_of(history(0.5), same)
+        other = price_of(history(0.5), same, 0.3)
         assert other is not None
         assert other.noise_share is None
+
+
+@pytest.mark.parametrize(
+    ("noise", "share"), [(None, None), (0.0, None), (0.03, 0.12), (0.05, 0.2), (1.0, 0.2)]
+)
+def test_no_more_noise_is_learned_than_there_is(noise: float | None, share: float | None) -> None:
+    """Few queries without noise leave the same distance: what lies between them was not learned."""
+    found = price_of(history(0.5), errors(0.25, 0.15), noise)
+    assert found is not None
+    assert found.noise_share == (share if share is None else pytest.approx(share))
 
 
 def test_histories_that_do_not_tell_give_no_price() -> None:

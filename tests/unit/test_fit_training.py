@@ -132,11 +132,13 @@ def test_rates_rise_and_fall() -> None:
     assert rate_factor(training, 1000, 1.0) == pytest.approx(0.05)
 
 
-def test_texels_without_a_gradient_decay_with_the_rate() -> None:
+@pytest.mark.parametrize("compiled", [True, False])
+def test_texels_without_a_gradient_decay_with_the_rate(compiled: bool) -> None:
     arrays = random_queries(np.random.default_rng(0), 64, LATTICE)
     arrays["sigma"][:] = 0.5
     data = training_queries(arrays, parallax(*arrays.values()))
     t = trainer(data, steps=5, decay=2.0, texture_rate=0.05, warmup=0, final_rate=0.1, blur={"start": 0.0})
+    t._stepper = t._stepper if compiled else None
     first = t.model.textures()[0].texels.detach().clone()
     rates = [0.05 * rate_factor(t.config.training, k, k / 5) for k in range(5)]
     train_fully(t)

@@ -17,6 +17,7 @@ from mbtf_gen.estimates import Estimates, Stream
 from mbtf_gen.forecast import forecast, row_bytes, size_text
 from mbtf_gen.generation import Job, allocated
 from mbtf_gen.material import Material
+from mbtf_gen.pilot import pilot_queries
 from mbtf_gen.planning import plan_effects
 from mbtf_gen.queries import Queries
 
@@ -56,6 +57,15 @@ def job_of(**queries: Any) -> Job:
     heights = np.random.default_rng(0).random((16, 16))
     material = Material(heights, height_scale=0.1, height_bits=None, basecolor=np.array([0.5, 0.5, 0.5]))
     return Job.of(GeneratorConfig.model_validate({"material": "m", "queries": queries}), material)
+
+
+@pytest.mark.parametrize("options", [{}, {"layout": "image"}, {"layout": "image", "window": 12}])
+def test_pilots_ask_in_many_directions_whatever_the_layout(options: dict[str, Any]) -> None:
+    """A buffer of the image layout has one pair of directions and one footprint, however many places."""
+    queries = pilot_queries(job_of(**options), 200, 1)
+    assert queries.u.shape == (200, 2)
+    for array in (queries.sigma[:, None], queries.omega_i, queries.omega_o):
+        assert len(np.unique(array, axis=0)) > 190
 
 
 @pytest.fixture

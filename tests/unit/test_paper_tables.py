@@ -202,10 +202,17 @@ def test_pictures_by_stock_parts_agree_or_differ(tmp_path: Path, monkeypatch: py
         for s, square in (("base colour", 1e-5), ("full", 4e-2))
     ]
     stock = {"view": direction, "light": direction, "surfaces": surfaces}
-    same, other = rows_of(independence([make(tmp_path, stock=stock)])[0])
+    table = independence([make(tmp_path, stock=stock)])[0]
+    same, other = rows_of(table)
     rms = "RMS difference, noise-free [% of the mean]"
     assert (same["verdict"], same[rms]) == ("agree", "below 1.6 %")
     assert (other["verdict"], other[rms]) == ("DIFFER", "20.00 ± 0.03 %")
+    # What would be seen is where the verdict changes.
+    surfaces[0]["square"] = number(0.0, 1e-3)
+    seen = float(csv_of(independence([make(tmp_path, stock=stock)])[0])[0]["rms_seen"])
+    for factor, verdict in ((0.99, "agree"), (1.01, "DIFFER")):
+        surfaces[0]["square"] = number((factor * seen) ** 2, 1e-3)
+        assert rows_of(independence([make(tmp_path, stock=stock)])[0])[0]["verdict"] == verdict
 
 
 def test_cells_print_for_readers_and_store_for_programs() -> None:

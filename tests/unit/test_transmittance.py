@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+from support.buffer_data import write_buffers
 from support.damage import check_message
 from support.fit_data import constant, random_queries, write_data
+from support.plugin_materials import write_material
 
 from mbtf_fit.config import FitConfig
 from mbtf_fit.fitting import fit
@@ -46,6 +49,17 @@ def test_a_known_transmittance_is_found(tmp_path: Path) -> None:
     assert np.sqrt(np.mean((found - wanted)[fine] ** 2)) < 0.02
 
 
+@pytest.mark.parametrize("window", [None, 4])
+def test_buffers_tell_the_same(tmp_path: Path, window: int | None) -> None:
+    folder = write_buffers(tmp_path, constant(0.2), train=1500, through=lace, window=window)
+    data = Dataset.open(folder)
+    model = fit_transmittance(data)
+    assert model is not None
+    q = random_queries(np.random.default_rng(9), 4000, data.lattice)
+    found = model.evaluate(q["u"], q["sigma"], q["omega_o"])
+    assert np.sqrt(np.mean((found - lace(q["u"], q["sigma"], q["omega_o"])) ** 2)) < 0.05
+
+
 def test_few_queries_fall_back_on_coarser_levels(tmp_path: Path) -> None:
     """No texel of an empty neighbourhood is left without a value."""
     data = Dataset.open(
@@ -79,6 +93,16 @@ def test_a_fit_writes_it_beside_the_weights_and_only_for_holes(tmp_path: Path) -
     with pytest.raises(InputError, match="not the file that") as caught:
         read_transmittance(tmp_path / "b", description)
     check_message(caught.value)
+
+
+def test_a_description_that_does_not_say_which_file_is_refused(tmp_path: Path) -> None:
+    write_material(tmp_path, finest=0, holes=Transmittance(Lattice(0), [np.zeros((1, 1, 6), np.float32)]))
+    whole = json.loads((tmp_path / "material.json").read_text())
+    for holes in ({}, [], "x", {"sha256": 5}):
+        (tmp_path / "material.json").write_text(json.dumps(whole | {"holes": holes}))
+        with pytest.raises(InputError, match="is damaged") as caught:
+            read_transmittance(tmp_path, read_description(tmp_path)[0])
+        check_message(caught.value)
 
 
 def test_a_view_is_a_line_through_the_plane() -> None:
