@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, PlainSerializer, model_validator
 
 from mbtf_gen.durations import format_duration, parse_duration
-from mbtf_gen.settings import Settings
+from mbtf_gen.settings import Settings, laid_over
 
 from .sizes import format_size, parse_size
 
@@ -141,15 +141,6 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 
 
-def _over(base: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """`given` laid over `base`, section by section."""
-    out = dict(base)
-    for key, value in given.items():
-        under = out.get(key)
-        out[key] = _over(under, value) if isinstance(under, Mapping) and isinstance(value, Mapping) else value
-    return out
-
-
 class FitConfig(Settings):
     """Everything ``mbtf-fit`` needs besides the shards."""
 
@@ -169,7 +160,7 @@ class FitConfig(Settings):
         if not isinstance(data, Mapping):
             return data
         name = data.get("model", cls.model_fields["model"].default)
-        return _over(PRESETS.get(name, {}) if isinstance(name, str) else {}, data)
+        return laid_over(PRESETS.get(name, {}) if isinstance(name, str) else {}, data)
 
     @model_validator(mode="after")
     def _consistent(self) -> FitConfig:

@@ -18,7 +18,7 @@ from mbtf_gen.atomic import read_json, write_json, write_text
 from mbtf_gen.dataset import Dataset
 from mbtf_gen.errors import EngineError, InputError
 from mbtf_gen.settings import differences, dump_yaml, in_short
-from mbtf_gen.stats import pooled_variance, unexplained_variance
+from mbtf_gen.stats import Estimate, pooled_variance, unexplained_variance
 
 from .config import FitConfig
 from .data import Partition, Queries, data_hash, load_training, mean_value, open_data
@@ -272,8 +272,7 @@ def _resume(trainer: Trainer, out: Path) -> bool:
 
 
 def _train(trainer: Trainer, held_out: Queries, out: Path, progress: ProgressCallback) -> None:
-    # Looking costs time, of a model of neighbourhoods more than of the others.
-    glance = held_out.take(slice(max(_GLANCE // trainer.model.positions, _GLANCE // 16)))
+    glance = glance_of(trainer, held_out)
     saved = time.perf_counter()
     done = trainer.share >= 1.0
     with _finishing_steps(trainer):
@@ -310,6 +309,17 @@ def _finishing_steps(trainer: Trainer) -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
+def glance_of(trainer: Trainer, held_out: Queries) -> Queries:
+    """The held-out queries that are looked at while training. Looking costs time, of a model of
+    neighbourhoods more than of the others."""
+    return held_out.take(slice(max(_GLANCE // trainer.model.positions, _GLANCE // 16)))
+
+
+def missed(trainer: Trainer, queries: Queries) -> Estimate:
+    """Unexplained variance of queries by the model as it is now."""
+    return unexplained_variance(trainer.predict(queries), queries.value_a, queries.value_b)
+
+
 def _record(trainer: Trainer, glance: Queries) -> dict[str, Any]:
     state = trainer.progress
     record: dict[str, Any] = {
@@ -322,7 +332,7 @@ def _record(trainer: Trainer, glance: Queries) -> dict[str, Any]:
         "queries_per_second": round(state.step * trainer.batch / max(state.seconds, 1e-9)),
     }
     if len(glance):
-        found = unexplained_variance(trainer.predict(glance), glance.value_a, glance.value_b).as_dict()
+        found = missed(trainer, glance).as_dict()
         record |= {"held_out": found["value"], "held_out_error": found["error"]}
     return record
 

@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_gen.console import clock
-from mbtf_gen.stats import unexplained_variance
 
 from .config import FitConfig
 from .data import load_training, open_data
-from .fitting import choose_device, prepare_trainer
+from .fitting import choose_device, glance_of, missed, prepare_trainer
 from .memory import keep_freed_memory
 from .models import MODELS
 
@@ -22,8 +21,6 @@ PILOT_SECONDS = (4.0, 8.0)
 # Every doubling of the time gains this share of what the one before gained, in the logarithm of the error:
 # the model's size and the data end what training can reach.
 PERSISTENCE = 0.75
-# Held-out queries that pilots are judged by.
-_GLANCE = 1 << 14
 # Bytes of a number in the material's file.
 _NUMBER = 4
 
@@ -94,7 +91,6 @@ def forecast_fit(config: FitConfig, shards: str | Path) -> FitForecast:
     keep_freed_memory()
     partition = load_training(data, config.held_out, config.seed, config.data.memory)
     loading = time.perf_counter() - began
-    held_out = partition.held_out_queries
     found: list[float] = []
     for seconds in PILOT_SECONDS:
         training = config.training.model_copy(update={"time": seconds, "steps": None})
@@ -102,9 +98,8 @@ def forecast_fit(config: FitConfig, shards: str | Path) -> FitForecast:
         trainer = prepare_trainer(pilot, data, partition, device)
         while not trainer.train(math.inf):
             pass
-        glance = held_out.take(slice(max(_GLANCE // trainer.model.positions, _GLANCE // 16)))
-        if len(glance):
-            found.append(unexplained_variance(trainer.predict(glance), glance.value_a, glance.value_b).value)
+        if len(glance := glance_of(trainer, partition.held_out_queries)):
+            found.append(missed(trainer, glance).value)
     if not all(map(math.isfinite, found)):
         found.clear()
     rate = trainer.progress.step / trainer.progress.seconds

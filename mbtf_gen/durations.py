@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 
+from .errors import UsageError
+
 _DURATION = re.compile(r"^\s*(\d+(?:\.\d+)?)\s*(s|sec|min|m|h)?\s*$")
 _SECONDS = {"s": 1.0, "sec": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0, None: 1.0}
 
@@ -22,6 +24,19 @@ def parse_duration(text: str | float) -> float:
     if not 0 < seconds <= 1e7:
         raise ValueError("must be a positive duration of at most 1e7 seconds")
     return seconds
+
+
+def asked_duration(text: str, flag: str) -> float:
+    """Seconds of a duration given with a flag of the command line.
+
+    Raises
+    ------
+    UsageError : it is none; names the flag
+    """
+    try:
+        return parse_duration(text)
+    except ValueError as error:
+        raise UsageError(str(error), where=flag) from None
 
 
 def format_duration(seconds: float) -> str:

@@ -232,7 +232,7 @@ class Estimator:
         values = lanes.halves(radiance)
         # Few launches have bad samples: their paths are looked through only then.
         bad = np.zeros(0, np.uint32) if np.isfinite(values).all() else self._nonfinite(radiance)
-        found = nonfinite = len(bad)
+        nonfinite = len(bad)
         located = self._located(source, lanes, bad[:MOST_LOCATED], stream, omega_i, inverse)
         for attempt in range(1, MAX_RESAMPLES + 1):
             if not len(bad):
@@ -253,7 +253,7 @@ class Estimator:
                 where=f"{stream.split} shard {stream.shard}",
                 cure="check the material's values",
             )
-        if found:
+        if nonfinite:
             values = lanes.halves(radiance)
         return Estimates(
             values[:, 0].astype(np.float32),

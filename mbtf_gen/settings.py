@@ -273,6 +273,17 @@ def merge(base: Any, path: Sequence[str], value: Any) -> None:
     base[path[-1]] = value
 
 
+def laid_over(base: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """A new mapping: `given` laid over `base`, section by section."""
+    out = dict(base)
+    for key, value in given.items():
+        under = out.get(key)
+        if isinstance(under, Mapping) and isinstance(value, Mapping):
+            value = laid_over(under, value)
+        out[key] = value
+    return out
+
+
 def resolve(
     model: type[S],
     *,

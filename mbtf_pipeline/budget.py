@@ -1,10 +1,9 @@
 """A total time for generating and training, split so that little error is left: pilot chains on this very
 material and machine, then one allocation.
 
-Of a budget B, three chains of the smallest length B_p each generate for another share of it and train for the
-rest; the share of the least error, by a parabola through the three, is taken for what is left of the budget.
-Error changes slowly about its least value, so a rough share is enough. Budgets too short for pilots take a
-fixed share.
+Three short chains each generate for another share of their time and train for the rest; the share of the
+least error, by a parabola through the three, is taken for what is left of the budget. Error changes slowly
+about its least value, so a rough share is enough. Budgets too short for pilots take a fixed share.
 """
 
 from __future__ import annotations

@@ -86,14 +86,11 @@ def run(
 
 
 def _budgeted(loaded: Recipe, budget: str, output: Path | None, command: str, console: Console) -> Recipe:
-    from mbtf_gen.durations import parse_duration
+    from mbtf_gen.durations import asked_duration
 
     from .budget import split_budget, within_budget
 
-    try:
-        seconds = parse_duration(budget)
-    except ValueError as error:
-        raise UsageError(str(error), where="--budget") from None
+    seconds = asked_duration(budget, "--budget")
     split = split_budget(loaded, seconds, output or loaded.folder, command, console.note)
     console.note(split.describe())
     return within_budget(loaded, split)
@@ -268,16 +265,13 @@ def cost(
     seed
         Of queries, paths and first weights. Default: the recipe's
     """
-    from mbtf_gen.durations import parse_duration
+    from mbtf_gen.durations import asked_duration
 
     from .cost.page import whole_chains, write_page
     from .cost.study import run_study
     from .recipe import load_recipe
 
-    try:
-        budget = parse_duration(time)
-    except ValueError as error:
-        raise UsageError(str(error), where="--time") from None
+    budget = asked_duration(time, "--time")
     loaded = load_recipe(recipe, assignments or [])
     folder = output if output is not None else loaded.folder.with_name(f"{loaded.folder.name}-cost")
     command = ["mbtf-pipeline", "cost", str(recipe), "--time", time]

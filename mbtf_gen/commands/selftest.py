@@ -21,12 +21,9 @@ def selftest(*, report: Path | None = None, time: str = "2min", console: Console
         About how long to measure: 90s, 2min, 1h. Each check runs at least once; longer means smaller
         statistical errors.
     """
-    from ..durations import parse_duration
+    from ..durations import asked_duration
 
-    try:
-        seconds = parse_duration(time)
-    except ValueError as error:
-        raise UsageError(str(error), where="--time") from None
+    seconds = asked_duration(time, "--time")
     if report is not None and report.suffix not in (".md", ".html"):
         raise UsageError(f"'{report.name}' must end in .md or .html", where="--report")
     from ..engine import load_mitsuba

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -11,7 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field
 
 from mbtf_gen.errors import InputError
-from mbtf_gen.settings import Settings, build, read_yaml, resolve
+from mbtf_gen.settings import Settings, build, laid_over, read_yaml, resolve
 
 from ..perceptual import weights_file
 from ..recipe import Name, Recipe
@@ -98,15 +97,6 @@ def load_paper_recipe(path: Path, assignments: list[str]) -> PaperRecipe:
     return resolve(PaperRecipe, file=path, assignments=assignments)
 
 
-def _over(base: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """`given` laid over `base`, mapping by mapping."""
-    out = dict(base)
-    for key, value in given.items():
-        under = out.get(key)
-        out[key] = _over(under, value) if isinstance(under, Mapping) and isinstance(value, Mapping) else value
-    return out
-
-
 def plan(paper: PaperRecipe, path: Path, quick: bool) -> tuple[list[Planned], dict[str, str]]:
     """All ordinary recipes in the order in which they run, and materials that are not there with where they
     were looked for. A material's path lies relative to the recipe's file.
@@ -143,9 +133,9 @@ def plan(paper: PaperRecipe, path: Path, quick: bool) -> tuple[list[Planned], di
 def _compose(layers: list[Layer], material: str, variant: str, file: Path, path: Path) -> Recipe:
     data: dict[str, Any] = {}
     for layer in layers:
-        data = _over(data, layer.model_dump(mode="json"))
+        data = laid_over(data, layer.model_dump(mode="json"))
     each = data.pop("each_fit")
-    data["fit"] = {name: _over(each, {"model": name, **(own or {})}) for name, own in data["fit"].items()}
+    data["fit"] = {name: laid_over(each, {"model": name, **(own or {})}) for name, own in data["fit"].items()}
     data["generate"]["material"] = str(file)
     # The optional measure is taken where its weights are there; the page says where they are not.
     data["compare"] = {"st_lpips": weights_file() is not None, **data["compare"]}

@@ -36,9 +36,9 @@ def test_every_group_of_messages_is_explained() -> None:
 # Mitsuba or the system (shown as it is), or a text chosen by the caller.
 RELAYS = {
     "mbtf_gen/atomic.py": {"_temporary", "remove_file"},
-    "mbtf_gen/commands/selftest.py": {"selftest"},
     "mbtf_gen/config.py": {"_effects"},
     "mbtf_gen/console.py": {"_usage_message", "run"},
+    "mbtf_gen/durations.py": {"asked_duration"},
     "mbtf_gen/engine.py": {"_llvm_error", "check_llvm", "load_mitsuba"},
     "mbtf_gen/generation.py": {"generate", "plan", "prepare"},
     "mbtf_gen/locks.py": {"take_lock"},
@@ -59,7 +59,6 @@ RELAYS = {
         "examine",
     },
     "mbtf_gen/wording.py": {"explain"},
-    "mbtf_pipeline/cli.py": {"_budgeted", "cost"},
 }
 
 
