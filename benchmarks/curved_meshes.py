@@ -38,9 +38,9 @@ def load_object(file: Path | None, tiles: tuple[float, float]) -> Surface:
     ----------
     tiles : tiles per unit of its texture coordinates, along both
     """
-    import trimesh
-
     if file is not None:
+        import trimesh
+
         mesh = trimesh.load(file, process=False)
         place, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
         wide = np.asarray(mesh.visual.uv, np.float64)
