@@ -46,11 +46,11 @@ from mbtf_gen.reference import auto_exposure, to_display
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT.parent / "shared" / "data"
-# Means of the interior, as a share; RMS of 16 x 16 pixels as a share of the mean; the plane's mean beside what
-# the fit makes of the same light.
+# Means of the interior, as a share; RMS of 16 x 16 pixels as a share of the mean; the plane's mean beside
+# what the fit makes of the same light.
 BARS = {"mean": 0.05, "rms_16": 0.1, "flat": 0.01}
 # Cosine of light that counts as grazing, and largest stretch and share of such light of easy places.
-GRAZING, EASY = 0.3, (1.25, 0.1)
+GRAZING, EASY = 0.3, (1.25, 0.3)
 LOWEST, MARGIN, BLOCKS = 0.35, 4, (1, 4, 16)
 FIELD_OF_VIEW = 28.0
 # Triangles along an edge of the object's that the smooth mesh has.
@@ -198,7 +198,8 @@ def fit_alone(
 
 def hard_places(mi: Any, scene: Any, size: int) -> tuple[F64, F64]:
     """Of what pixels' centres see on the smooth object: by how much its texture coordinates are stretched,
-    longest side over shortest, and the share of the environment above a cosine of -0.3 that lies under 0.3."""
+    longest side over shortest, and what share of the light that comes from above a cosine of -0.3 comes from
+    below 0.3."""
     import drjit as dr
 
     n, each = size * size, 64
@@ -296,7 +297,7 @@ def compare(mi: Any, scene: Scene, folder: Path, size: int, spp: int) -> tuple[d
     pixel = 2 * scene.across / size
 
     def mean(pair: tuple[F64, F64], mask: NDArray[np.bool_]) -> float:
-        return float((pair[0] + pair[1])[mask].mean() / 2)
+        return float((pair[0] + pair[1])[mask].mean() / 2) if mask.any() else float("nan")
 
     figures = {
         "scene": scene.name,

@@ -46,7 +46,7 @@ def test_a_displaced_plane_is_the_tiles_own_mesh(meshes: Any, tiles: tuple[float
     assert (cross[:, 1] > -1e-9).all()
     middle = found.uv[found.faces].mean(1)
     whole = (np.floor(middle / (1.0, grid.aspect)) == (1.0, -2.0 if tiles[1] > 0 else 1.0)).all(1)
-    assert abs(cross[:, 1].sum() / 2 / abs(tiles[0] * tiles[1]) - 1) < 1e-3
+    assert abs(cross[:, 1].sum() / 2 / abs(tiles[0] * tiles[1]) - 1) < 5e-3
     tile = tile_mesh(grid)
     wanted = crosses(np.asarray(tile.vertices), np.asarray(tile.faces))
     inner = cross[whole]

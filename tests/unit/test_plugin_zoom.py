@@ -89,5 +89,5 @@ def test_mean_and_contrast_are_those_of_filtered_pixels(
     )
     wanted = np.expm1(fine[row, column])
     assert found.mean() == pytest.approx(wanted.mean(), rel=0.01)
-    # Between two coarse levels a blend is no Gaussian: what is left of contrast there is off by as much again.
-    assert found.std() == pytest.approx(wanted.std(), rel=0.12, abs=8e-3 * wanted.mean())
+    # Between two coarse levels a blend is no Gaussian, which little contrast shows.
+    assert found.std() == pytest.approx(wanted.std(), rel=0.12, abs=0.025 * wanted.mean())
