@@ -165,6 +165,9 @@ class FitConfig(Settings):
 
     version: Literal[1] = 1
     model: ModelName = Field("neumip", description="model by name")
+    start: str | None = Field(
+        None, description="folder of a material whose textures and offset training starts from"
+    )
     network: NetworkSection = NetworkSection()
     training: TrainingSection = TrainingSection()
     held_out: HeldOutSection = HeldOutSection()
