@@ -180,8 +180,8 @@ def paths_of(quality: str, levels: int) -> float:
 def paper(chains: list[Chain], levels: int) -> tuple[Chain | None, str]:
     """`paper` for the material that `high` was measured on, and how its figures follow."""
     law = (
-        "Generating: seconds of `high` times the ratio of their numbers of paths; data: times that of their "
-        "queries. Training: 30 000 steps of 2²⁰ queries at the rate of `standard`. Error: every doubling of "
+        "Of `paper`, generating: seconds of `high` times the ratio of their numbers of paths; data: times that "
+        "of their queries. Training: 30 000 steps of 2²⁰ queries at the rate of `standard`. Error: every doubling of "
         f"the training time gains {PERSISTENCE:g} of what the one before gained in the logarithm, so that "
         "E_paper = E_standard · (E_high / E_standard)^((1 − q^p) / (1 − q^h)), "
         f"q = {PERSISTENCE:g}, where h and p doublings lie between the training times of `standard` and of "

@@ -36,6 +36,7 @@ class FitForecast:
     queries_per_second : trained on
     unexplained : variance of held-out queries that it will miss; None where nothing is held out, or varies
     at_most : the same after the longer pilot
+    pilots : the same after each of them; none where nothing is held out, or varies
     bytes : of the material's numbers
     pilot_seconds : what the forecast took, loading included
     """
@@ -46,6 +47,7 @@ class FitForecast:
     queries_per_second: float
     unexplained: float | None
     at_most: float | None
+    pilots: tuple[float, ...]
     bytes: int
     pilot_seconds: float
 
@@ -115,6 +117,7 @@ def forecast_fit(config: FitConfig, shards: str | Path) -> FitForecast:
         queries_per_second=rate * trainer.batch,
         unexplained=extrapolated(found[0], found[1], math.log2(total / PILOT_SECONDS[1])) if found else None,
         at_most=found[-1] if found else None,
+        pilots=tuple(found),
         bytes=_NUMBER * numbers,
         pilot_seconds=time.perf_counter() - began,
     )

@@ -250,7 +250,7 @@ def _scatter(clouds: Sequence[Cloud], x: str, y: str, front: Sequence[tuple[floa
         _plain_ticks(axis)
     # Above the plot, where it hides no point.
     marks, names = zip(*handles, strict=True)
-    figure.legend(marks, names, loc="outside upper left", frameon=False, fontsize=8.5, ncols=3)
+    figure.legend(marks, names, loc="outside upper left", frameon=False, fontsize=8.5, ncols=4)
     place_names(figure, axes, named, shown, lines)
     return figure
 

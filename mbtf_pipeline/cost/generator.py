@@ -158,7 +158,7 @@ class Bench:
         noise, price = self._noise(job, trace, spp, seconds, mean)
         if against is None:
             return Measured(price, None, _root(noise), _root(noise))
-        bias = self._bias(estimator, against, seconds, mean)
+        bias = self.bias(estimator, against, seconds)
         return Measured(price, _root(bias), _root(noise), _root(_total(bias, noise)))
 
     def measure_counts(self, changes: dict[str, Any], adaptive: bool, seconds: float) -> Measured:
@@ -206,14 +206,21 @@ class Bench:
             if _sure(variance) or late:
                 return variance
 
-    def _bias(self, estimator: Any, against: dict[str, Any], seconds: float, mean: float) -> Estimate:
-        """Squared bias relative to the mean value squared."""
+    def bias(self, estimator: Any, against: dict[str, Any], seconds: float, spp: int = BIAS_SPP) -> Estimate:
+        """Squared bias relative to the mean value squared.
+
+        Parameters
+        ----------
+        against : options of the reference
+        spp : paths of the estimator at each query; the bias does not depend on them, its error bar does
+        """
+        mean = self.reference(against, 0).mean
         began = time.perf_counter()
         squares: list[NDArray[np.float64]] = []
         while True:
             piece = len(squares)
             reference = self.reference(against, piece)
-            found = estimator.estimate(reference.queries, BIAS_SPP, self._stream(piece))
+            found = estimator.estimate(reference.queries, spp, self._stream(piece))
             a, b = found.value_a.astype(np.float64), found.value_b.astype(np.float64)
             squares.append(((a - reference.a) * (b - reference.b)).mean(axis=1) / mean**2)
             square = mean_estimate(np.concatenate(squares))
