@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -335,8 +336,8 @@ def test_the_page_shows_the_front_with_commands_and_what_is_biased(tmp_path: Pat
 
     points = [
         made("fit", 10.0, 0.3), made("fit", 20.0, 0.2), made("fit", 20.0, 0.4, "neumip-baseline"),
-        setting("1 interactions", Estimate(0.05, 0.004, 9)), setting("2 interactions", Estimate(0.002, 0.003, 9)),
-        setting("no limit", Estimate(0.0, 0.0, 9)),
+        setting("1 interactions", Estimate(0.05, 0.004, 9)),
+        setting("2 interactions", Estimate(0.002, 0.003, 9)), setting("no limit", Estimate(0.0, 0.0, 9)),
     ]  # fmt: skip
     description = {
         "name": "a study", "machine": {"system": "a machine"}, "made": "today", "budget": 600.0,
@@ -355,4 +356,4 @@ def test_the_page_shows_the_front_with_commands_and_what_is_biased(tmp_path: Pat
     assert "<td>&lt; 0.6 %</td>" in bounces
     assert "<td>0 %</td>" in bounces
     assert "at most 0.6 % of the mean value" in bounces
-    assert "nan" not in page.lower().replace("finance", "")
+    assert not re.search(r"\bnan\b", page)
