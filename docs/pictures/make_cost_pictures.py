@@ -81,8 +81,8 @@ def table(studies: list[Path]) -> str:
         lines += [
             f"`{folder.name}`, {where}:",
             "",
-            "| in all | generating | training | queries × paths | unexplained variance |",
-            "|---|---|---|---|---|",
+            "| in all | generating | training | queries × paths | model | unexplained variance |",
+            "|---|---|---|---|---|---|",
         ]
         front = whole_chains(folder)
         for r in front:
@@ -90,6 +90,7 @@ def table(studies: list[Path]) -> str:
                 f"| {float(r['total_seconds']):.0f} s | {float(r['generation_seconds']):.1f} s "
                 f"| {float(r['training_seconds']):.1f} s "
                 f"| {float(r['queries']) / 1e6:.2g} M × {float(r['spp']):g} "
+                f"| {r['series'] if r['study'] == 'fit' else 'neumip'} "
                 f"| {float(r['error']):.3f} ± {float(r['error_se']):.3f} |"
             )
         command = front[-1]["command"].replace(str(folder), f"out/cost/{folder.name}")

@@ -58,8 +58,8 @@ def chains(budget: float, spp: int, price: Price) -> Iterator[Chain]:
 
 
 def _whole(budget: float, spp: int, price: Price) -> Iterator[Chain]:
-    """Chains planned for one minute in all, two, four, … as far as the budget goes; what is left goes to other splits
-    of them, the shortest first."""
+    """Chains planned for one minute in all, two, four, … as far as the budget goes; what is left goes to
+    other splits of them, the shortest first."""
     totals = [SHORTEST]
     while sum(totals) + 2 * totals[-1] <= budget:
         totals.append(2 * totals[-1])
