@@ -192,12 +192,14 @@ def scatter(
 def _write_png(figure: Any, path: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
+    figure.patch.set_alpha(1.0)
     write_through(
         path,
         lambda temporary: FigureCanvasAgg(figure).figure.savefig(
             temporary, format="png", dpi=160, facecolor="white", metadata={"Software": None}
         ),
     )
+    figure.patch.set_alpha(0.0)
 
 
 def _scatter(clouds: Sequence[Cloud], x: str, y: str, front: Sequence[tuple[float, float]]) -> Any:

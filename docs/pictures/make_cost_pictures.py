@@ -31,7 +31,7 @@ PLOTS = (
     "mesh",
     "light",
 )
-WIDTH, TITLE, GAP, COLUMNS, COLOURS = 800, 30, 12, 2, 48
+WIDTH, TITLE, GAP, COLUMNS, COLOURS = 800, 30, 12, 2, 256
 BEGIN, END = "<!-- fronts: begin -->", "<!-- fronts: end -->"
 
 
@@ -42,7 +42,9 @@ def sheet(plot: str, studies: list[Path]) -> Path | None:
         return None
     pictures = []
     for folder in found:
-        picture = Image.open(folder / f"{plot}.png").convert("RGB")
+        drawn = Image.open(folder / f"{plot}.png").convert("RGBA")
+        white = Image.new("RGBA", drawn.size, (255, 255, 255, 255))
+        picture = Image.alpha_composite(white, drawn).convert("RGB")
         height = round(picture.height * WIDTH / picture.width)
         pictures.append(picture.resize((WIDTH, height), Image.Resampling.LANCZOS))
     columns = min(COLUMNS, len(found))
@@ -55,7 +57,7 @@ def sheet(plot: str, studies: list[Path]) -> Path | None:
         draw.text((x + 12, y + 4), folder.name, (30, 30, 30), ImageFont.load_default(20))
         out.paste(picture, (x, y + TITLE))
     path = OUT / f"{plot}.png"
-    out.quantize(COLOURS, dither=Image.Dither.NONE).save(path, optimize=True)
+    out.quantize(COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(path, optimize=True)
     return path
 
 
