@@ -67,8 +67,8 @@ class Forecast:
         """One line, two under a target error."""
         line = (
             f"forecast: {clock(self.seconds)} of tracing and writing ({self.paths_per_second / 1e6:.2f} M "
-            f"paths/s traced, after {self.start:.0f} s of starting), {size_text(self.bytes)}, noise of one training value "
-            f"{self.relative_error:.0%} of the mean value"
+            f"paths/s traced, after {self.start:.0f} s of starting), {size_text(self.bytes)}, noise of "
+            f"one training value {self.relative_error:.0%} of the mean value"
         )
         if target is None:
             return line
