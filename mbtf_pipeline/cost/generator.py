@@ -10,6 +10,7 @@ given as root mean squares relative to the mean value of the reference.
 from __future__ import annotations
 
 import math
+import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -34,7 +35,7 @@ BIAS_SPP = 64
 _MOST_BIAS_PIECES = 16
 # Paths of one timed piece.
 _PIECE_PATHS = 1 << 19
-_FEWEST_PIECES = 4
+_FEWEST_PIECES = 8
 # Half-width of a 95 % interval, relative, at which measuring stops; and the bias below which none is looked
 # for.
 _HALF_WIDTH = 0.1
@@ -251,7 +252,15 @@ class Bench:
             piece += 1
             variance = mean_estimate(np.concatenate(squares))
             if piece >= _FEWEST_PIECES and (_sure(variance) or time.perf_counter() - began > seconds):
-                return variance, mean_estimate(prices)
+                return variance, _typical(prices)
+
+
+def _typical(prices: list[float]) -> Estimate:
+    """Median, which other work on the machine moves little, and its standard error from the median absolute
+    deviation, both as for normal scatter."""
+    middle = statistics.median(prices)
+    deviation = 1.4826 * statistics.median(abs(p - middle) for p in prices)
+    return Estimate(middle, 1.2533 * deviation / math.sqrt(len(prices)), len(prices))
 
 
 def _sure(variance: Estimate) -> bool:

@@ -360,3 +360,12 @@ def test_the_page_shows_the_front_with_commands_and_what_is_biased(tmp_path: Pat
     assert "<td>0 %</td>" in bounces
     assert "at most 0.6 % of the mean value" in bounces
     assert not re.search(r"\bnan\b", page)
+
+
+def test_other_work_on_the_machine_does_not_change_the_price() -> None:
+    from mbtf_pipeline.cost.generator import _typical
+
+    quiet = [1.0, 1.02, 0.98, 1.01, 0.99, 1.0, 1.03]
+    found = _typical([*quiet, 9.0])
+    assert abs(found.value - 1.0) < 0.02
+    assert 0.0 < found.error < 0.02
