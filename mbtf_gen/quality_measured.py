@@ -130,6 +130,8 @@ _HEAD = (
 
 def markdown_table(found: Expected, qualities: Sequence[str]) -> str:
     """The table of docs/cost.md, and how what is extrapolated follows."""
+    if not found.chains:
+        return "No figures are stored."
     rows = ["| " + " | ".join(_HEAD) + " |", "|" + "---|" * len(_HEAD)]
     for quality in qualities:
         for c in found.of(quality):
