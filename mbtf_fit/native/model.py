@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ..models import NeuralMaterial
+from ..models.encodings import direction_size
 from ..models.mlp import Mlp
 from ..models.neumip import Neumip, NeumipBaseline
 from ..models.textured import GRAZING, OFFSET_SCALE
@@ -33,7 +34,9 @@ _KNOWN: dict[str, tuple[Any, ...]] = {
     "output": ("exp-1",),
     "offset": ("depth", "none"),
     "blending": ("blend",),
-    "encoding": ({"position": 0, "direction": 0, "pi": True, "raw": False, "lifted": False},),
+    "encoding": tuple(
+        {"position": 0, "direction": 0, "pi": True, "raw": False, "lifted": lifted} for lifted in (False, True)
+    ),
 }
 _SIZES = {"channels", "width", "layers"}
 
@@ -102,6 +105,7 @@ class NativeModel:
         self.description = Model()
         self.description.offset_scale, self.description.grazing = OFFSET_SCALE, GRAZING
         self.description.aspect = model.lattice.aspect
+        self.description.coordinates = direction_size(model.network.encoding)
         self._packed: list[Tensor] = []
         for network, target in zip(networks(model), self._targets(), strict=False):
             widths = [network.weights[0].shape[1], *(len(w) for w in network.weights)]
