@@ -35,7 +35,8 @@ _KNOWN: dict[str, tuple[Any, ...]] = {
     "offset": ("depth", "none"),
     "blending": ("blend",),
     "encoding": tuple(
-        {"position": 0, "direction": 0, "pi": True, "raw": False, "lifted": lifted} for lifted in (False, True)
+        {"position": 0, "direction": 0, "pi": True, "raw": False, "lifted": lifted}
+        for lifted in (False, True)
     ),
 }
 _SIZES = {"channels", "width", "layers"}
