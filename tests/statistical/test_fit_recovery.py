@@ -100,7 +100,7 @@ WIDE = {"width": 64, "channels": 16}
 @pytest.mark.parametrize(
     ("network", "queries", "steps", "rate", "bound"),
     [
-        ({}, 60_000, 150, 3e-2, 0.18),
+        ({}, 60_000, 150, 3e-2, 0.12),
         pytest.param({}, 60_000, 3000, 3e-2, 0.033, marks=[pytest.mark.slow]),
         pytest.param(WIDE, 200_000, 8000, 1e-2, 0.01, marks=[pytest.mark.slow]),
     ],
