@@ -169,5 +169,5 @@ def evaluate(material: Material, shards: str | Path) -> dict[str, SplitErrors]:
             f"its tile has the aspect {data.lattice.aspect:g}, the material's {material.lattice.aspect:g}",
             where=data.folder,
         )
-    partition = load_training(data, material.config.held_out, material.config.seed)
+    partition = load_training(data, material.config.held_out, material.config.seed, memory=None)
     return judge(material.predict, data, partition)

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..config import EncodingSection
 from ..models import NeuralMaterial
 from ..models.encodings import direction_size
 from ..models.mlp import Mlp
@@ -34,10 +35,7 @@ _KNOWN: dict[str, tuple[Any, ...]] = {
     "output": ("exp-1",),
     "offset": ("depth", "none"),
     "blending": ("blend",),
-    "encoding": tuple(
-        {"position": 0, "direction": 0, "pi": True, "raw": False, "lifted": lifted}
-        for lifted in (False, True)
-    ),
+    "encoding": tuple(EncodingSection(lifted=lifted).model_dump() for lifted in (False, True)),
 }
 _SIZES = {"channels", "width", "layers"}
 

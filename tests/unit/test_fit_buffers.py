@@ -12,9 +12,11 @@ from support.buffer_data import random_buffers, write_buffers
 from support.fit_data import constant, parallax, random_queries, write_data
 
 from mbtf_fit import FitConfig, Material, evaluate, fit
-from mbtf_fit.buffers import TrainingBuffers, load_buffers, nearest_shapes, strides
+from mbtf_fit.buffers import Crops, TrainingBuffers, load_buffers, nearest_shapes, strides
 from mbtf_fit.config import HeldOutSection
-from mbtf_fit.data import Partition, in_region, load_split
+from mbtf_fit.data import Partition, Queries, in_region, load_split
+from mbtf_fit.evaluation import judge
+from mbtf_fit.fitting import prepare_trainer
 from mbtf_fit.models import Hierarchical, build_model
 from mbtf_gen.dataset import Dataset
 from mbtf_gen.errors import InputError
@@ -64,6 +66,36 @@ def test_whole_buffers_are_held_out(tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.held_out_queries.u, part.held_out_queries.u)
     other = {row.tobytes() for row in partition(folder, many, seed=1).held_out_queries.omega_i}
     assert other != held[0]
+
+
+def test_the_sample_is_of_buffers_that_are_trained_on(tmp_path: Path) -> None:
+    """Equally many queries of each."""
+    part = partition(
+        write_buffers(tmp_path / "d", parallax, train=60), HeldOutSection(queries=0.4, radius=0.3)
+    )
+    kept = {row.tobytes() for row in buffers_of(part).omega_i.numpy()}
+    sampled = [row.tobytes() for row in part.sample.omega_i]
+    assert set(sampled) == kept
+    assert len({sampled.count(k) for k in kept}) == 1
+
+
+def test_training_buffers_are_judged_by_a_quarter_of_their_sample(tmp_path: Path) -> None:
+    """Of all buffers alike: neighbourhoods take their time."""
+    data = Dataset.open(write_buffers(tmp_path / "d", parallax, train=20, test=1))
+    part = load_buffers(data, HeldOutSection(queries=0.1, radius=0), 0)
+    asked: list[Queries] = []
+
+    def answer(queries: Queries) -> np.ndarray:
+        asked.append(queries)
+        return 0.5 * (queries.value_a + queries.value_b)
+
+    found = judge(answer, data, part)
+    assert list(found) == ["test", "held_out_queries", "training"]
+    assert found["test"].overall.n == 64
+    assert found["held_out_queries"].overall.n == len(part.held_out_queries)
+    assert found["training"].overall.n == len(part.sample) // 4
+    lights = np.unique(asked[-1].omega_i, axis=0)
+    assert len(lights) == len(np.unique(part.sample.omega_i, axis=0)) == 18
 
 
 def test_some_buffer_is_held_out_where_any_shall_be(tmp_path: Path) -> None:
@@ -184,6 +216,20 @@ def test_batches_cut_windows_within_them() -> None:
         assert (number == number[0, 0] + 6 * torch.arange(4)[:, None] + torch.arange(4)).all()
         seen.add(int(number[0, 0]))
     assert seen == {6 * j + i for j in range(3) for i in range(3)}
+
+
+@pytest.mark.parametrize("window", [None, 6])
+def test_smaller_crops_make_batches_of_more_lights_and_views(tmp_path: Path, window: int | None) -> None:
+    folder = write_buffers(tmp_path / "d", constant(0.1), train=40, window=window)
+    for crop, shape in ((2, (16, 2, 2, 3)), (4, (4, 4, 4, 3))):
+        training = {"steps": 1, "batch": 64, "crop": crop}
+        config = FitConfig.model_validate({"model": "hierarchical", "training": training})
+        data = Dataset.open(folder)
+        part = load_buffers(data, config.held_out, 0)
+        batch = next(prepare_trainer(config, data, part, torch.device("cpu"))._batches())
+        assert isinstance(batch, Crops)
+        assert batch.value.shape == shape
+        assert len(batch.omega_i.unique(dim=0)) == shape[0]
 
 
 @pytest.mark.parametrize("cut", ["whole", "windows"])

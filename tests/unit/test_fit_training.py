@@ -133,6 +133,29 @@ def test_rates_rise_and_fall() -> None:
 
 
 @pytest.mark.parametrize("compiled", [True, False])
+def test_textures_and_networks_learn_at_their_own_rates(compiled: bool) -> None:
+    """The first step of Adam is as long as the rate, whatever the gradient."""
+    rates = {"texture_rate": 1e-3, "rate": 1e-4, "warmup": 0}
+    t = trainer(queries(), steps=1, blur={"start": 0.0, "offset": 0.0}, **rates)
+    t._stepper = t._stepper if compiled else None
+    groups = t.model.parameter_groups()
+    before = [[p.detach().clone() for p in group] for group in groups]
+    train_fully(t)
+    for group, old, rate in zip(groups, before, (1e-3, 1e-4), strict=True):
+        longest = max(float((p.detach() - q).abs().max()) for p, q in zip(group, old, strict=True))
+        assert longest == pytest.approx(rate, rel=0.01)
+
+
+def test_the_blur_is_over_with_its_share_of_the_budget() -> None:
+    t = trainer(queries(10), blur={"start": 1.0, "end": 0.25, "share": 0.25, "offset": 0.0})
+    found = []
+    for step in (0, 5, 9, 10, 40):
+        t.progress.step = step
+        found.append(t._sigmas()[0])
+    assert found == pytest.approx([1.0, 0.5, 0.25**0.9, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("compiled", [True, False])
 def test_texels_without_a_gradient_decay_with_the_rate(compiled: bool) -> None:
     arrays = random_queries(np.random.default_rng(0), 64, LATTICE)
     arrays["sigma"][:] = 0.5
@@ -180,6 +203,23 @@ def test_divergence_is_one_clear_error(poison: str) -> None:
         t.model.get_parameter(poison).fill_(torch.nan)
     with pytest.raises(InputError, match=r"diverged at step 1: its batch .*\n.*--rate 0\.01 "):
         train_fully(t)
+
+
+def test_weights_that_the_last_step_spoils_are_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its loss was that of the weights before, and finite."""
+    step = Trainer._step
+
+    def spoiling(self: Trainer, *arguments: Any) -> torch.Tensor:
+        loss = step(self, *arguments)
+        if self.progress.step == 2:
+            with torch.no_grad():
+                self.model.parameter_groups()[1][0].fill_(torch.inf)
+        assert bool(loss.isfinite())
+        return loss
+
+    monkeypatch.setattr(Trainer, "_step", spoiling)
+    with pytest.raises(InputError, match="diverged at step 3"):
+        train_fully(trainer(queries(), steps=3))
 
 
 def test_divergence_names_the_first_bad_batch() -> None:
