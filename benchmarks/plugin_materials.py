@@ -56,8 +56,6 @@ BARS = {
 PLACES, SAMPLES = 32, 60_000
 ELEVATIONS = (10.0, 20.0, 35.0, 50.0, 65.0, 85.0)
 ENERGY_QUERIES, ENERGY_SPP = 4096, 64
-# Views under smaller cosines are left out of energies: a 26th of a hemisphere's.
-LOWEST = 0.2
 
 
 def random_views(random: np.random.Generator, n: int) -> NDArray[np.float64]:
@@ -128,7 +126,8 @@ def variance_of(mi: Any, dr: Any, bsdf: Any, each: int = 2048, places: int = 512
 
 
 def energies(material: Path, shards: Path, evaluator: Any) -> list[dict[str, float]]:
-    """Reflected share by elevation of the light: fit, reference, error of their difference."""
+    """Reflected share by elevation of the light: fit, reference, error of their difference. Of views, those
+    that the data have, and of elevations too."""
     from mbtf_gen.config import GeneratorConfig
     from mbtf_gen.dataset import Dataset
     from mbtf_gen.estimator import Stream
@@ -139,9 +138,11 @@ def energies(material: Path, shards: Path, evaluator: Any) -> list[dict[str, flo
     config = GeneratorConfig.model_validate(Dataset.open(shards).manifest["config"])
     estimator = build_estimator(config, load_material(material, config.geometry.tile))
     random = np.random.default_rng([14, zlib.crc32(material.name.encode())])
-    n, rows = ENERGY_QUERIES, []
+    n, rows, lowest = ENERGY_QUERIES, [], config.queries.min_cos
     for k, elevation in enumerate(ELEVATIONS):
-        angle, radius = 2 * np.pi * random.random(n), np.sqrt((1 - LOWEST**2) * random.random(n))
+        if np.sin(np.radians(elevation)) < lowest:
+            continue
+        angle, radius = 2 * np.pi * random.random(n), np.sqrt((1 - lowest**2) * random.random(n))
         views = from_projected_disk(np.stack([radius * np.cos(angle), radius * np.sin(angle)], -1))
         turned = 2 * np.pi * random.random(n)
         flat = np.cos(np.radians(elevation))
@@ -152,7 +153,7 @@ def energies(material: Path, shards: Path, evaluator: Any) -> list[dict[str, flo
             *(a.astype(np.float32) for a in (random.random((n, 2)), np.full(n, 0.5), lights, views))
         )
         traced = estimator.estimate(queries, ENERGY_SPP, Stream(1, "reference", k))
-        share = np.pi * (1 - LOWEST**2)
+        share = np.pi * (1 - lowest**2)
         true = share * 0.5 * (traced.value_a + traced.value_b).mean(-1)
         fit = share * evaluator.evaluate(queries.u, queries.sigma, lights, views).mean(-1)
         difference = (fit - true).astype(np.float64)

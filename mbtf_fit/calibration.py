@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,14 +40,15 @@ MOST = 1 << 22
 _CHUNK = 1 << 18
 # Points per level.
 POINTS = 1 << 17
-# What is expected of factors beforehand: second differences between knots, and distance from 1.
-CURVATURE, DISTANCE = 0.01, 0.05
+# What may be expected of factors beforehand: second differences between knots, and distances from 1.
+CURVATURES, DISTANCES = (0.0003, 0.001, 0.003, 0.01), (0.003, 0.01, 0.03, 0.1)
+_SECOND = np.diff(np.eye(KNOTS), 2, axis=0)
 # Error of means over points, relative.
 POINT_ERROR = 5e-4
 # Factors stay within this and its inverse.
 LARGEST = 2.0
 # G_i and G_o depend on each other: how often they are solved in turn.
-ROUNDS = 3
+ROUNDS = 2
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -71,14 +73,11 @@ class _Hats:
         """Σ φ_j x of numbers (n,): (knots,)."""
         return self._at(0, (1 - self.inside) * x) + self._at(1, self.inside * x)
 
-    def squares(self, x: F64) -> F64:
-        """Σ φ_j² x."""
-        return self._at(0, (1 - self.inside) ** 2 * x) + self._at(1, self.inside**2 * x)
-
     def products(self, x: F64) -> F64:
         """Σ φ_j φ_k x: (knots, knots)."""
+        own = self._at(0, (1 - self.inside) ** 2 * x) + self._at(1, self.inside**2 * x)
         beside = self._at(0, self.inside * (1 - self.inside) * x)[:-1]
-        return np.diag(self.squares(x)) + np.diag(beside, 1) + np.diag(beside, -1)
+        return np.diag(own) + np.diag(beside, 1) + np.diag(beside, -1)
 
     def read(self, table: F64) -> F64:
         """A table's (knots,) factors at the cosines."""
@@ -100,16 +99,30 @@ def points(count: int, largest: float) -> tuple[F32, F32, F32]:
     return x[:, :2].astype(np.float32), omega[:, 0].astype(np.float32), omega[:, 1].astype(np.float32)
 
 
-def solve(products: F64, target: F64, variance: F64) -> F64:
-    """Factors (knots,) with ``products · factors ≈ target``, whose errors have these variances, as likely as
-    they can be among smooth ones near 1."""
-    second = np.diff(np.eye(KNOTS), 2, axis=0)
-    # Where nothing arrives nothing is known.
-    weight = 1.0 / np.maximum(variance, 1e-300)
-    matrix = (products.T * weight) @ products
-    matrix += second.T @ second / CURVATURE**2 + np.eye(KNOTS) / DISTANCE**2
-    right = (products.T * weight) @ (target - products.sum(1))
-    return np.clip(1.0 + np.linalg.solve(matrix, right), 1.0 / LARGEST, LARGEST)
+def solve(products: F64, target: F64, covariance: F64) -> F64:
+    """The likeliest factors (knots,) with ``products · factors ≈ target``, whose errors have this covariance.
+
+    Of the expectations in :data:`CURVATURES` and :data:`DISTANCES` the pair is taken under which the data are
+    likeliest (empirical Bayes): what noise explains as well is left at 1.
+    """
+    scale = float(np.abs(products).sum())
+    if scale == 0:
+        return np.ones(KNOTS)
+    products, target, covariance = products / scale, target / scale, covariance / scale**2
+    missing = target - products.sum(1)
+    # Knots that nothing is near to have neither products nor errors.
+    covariance = covariance + np.diag((POINT_ERROR * target) ** 2 + 1e-12)
+    best = -np.inf
+    factors: F64 = np.ones(KNOTS)
+    for curvature, distance in product(CURVATURES, DISTANCES):
+        precision = _SECOND.T @ _SECOND / curvature**2 + np.eye(KNOTS) / distance**2
+        along = np.linalg.solve(precision, products.T)
+        total = products @ along + covariance
+        weighed = np.linalg.solve(total, missing)
+        likelihood = -float(np.linalg.slogdet(total)[1] + missing @ weighed)
+        if likelihood > best:
+            best, factors = likelihood, np.asarray(1.0 + along @ weighed, np.float64)
+    return np.clip(factors, 1.0 / LARGEST, LARGEST)
 
 
 def fit_gains(
@@ -129,7 +142,7 @@ def fit_gains(
     bound : largest errors of predictions (n, 3) that count; None where all do
     """
     used = min(len(queries), MOST)
-    sums, squares = np.zeros((2, KNOTS, 3)), np.zeros((2, KNOTS, 3))
+    sums, squares = np.zeros((2, KNOTS, 3)), np.zeros((2, 3, KNOTS, KNOTS))
     largest, sigmas = 0.0, np.empty(0, np.float32)
     for start in range(0, used, _CHUNK):
         part = queries.slice(start, min(start + _CHUNK, used))
@@ -143,7 +156,7 @@ def fit_gains(
             hats = _Hats.of(omega)
             for c in range(3):
                 sums[k, :, c] += hats.sums(missed[:, c])
-                squares[k, :, c] += hats.squares(missed[:, c] ** 2)
+                squares[k, c] += hats.products(missed[:, c] ** 2)
             largest = max(largest, float(np.hypot(omega[:, 0], omega[:, 1]).max()))
         sigmas = sigma if len(sigmas) == 0 else sigmas
     u, light, view = points(POINTS, min(largest, 1.0))
@@ -159,7 +172,6 @@ def fit_gains(
             for k in (0, 1) * ROUNDS:
                 mine, other = both[k], both[1 - k].read(tables[1 - k, s, :, c])
                 target = sums[k, :, c] / used + mine.sums(as_data[:, c]) / n
-                variance = squares[k, :, c] / used**2 + (POINT_ERROR * target) ** 2
                 products = mine.products(value[:, c] * other) / n
-                tables[k, s, :, c] = solve(products, target, variance)
+                tables[k, s, :, c] = solve(products, target, squares[k, c] / used**2)
     return tables.astype(np.float32)

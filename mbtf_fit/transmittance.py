@@ -26,9 +26,9 @@ TRANSMITTANCE_NAME = "transmittance.safetensors"
 COEFFICIENTS = 6
 # For a reader of an export.
 FORMULA = (
-    "share of the footprint that is seen through holes: clamp(c0 + c1 x + c2 y + c3 x^2 + c4 x y + c5 y^2, 0, "
-    "1), where x, y = omega_o.x, omega_o.y and c = the textures transmittance.0 ... transmittance.k at u (not "
-    "moved by any offset), blended by level as features are; a view from below sees the same share as the "
+    "share of the footprint that is seen through holes: clamp(c0 + c1 x + c2 y + c3 x^2 + c4 x y + c5 y^2, "
+    "0, 1), where x, y = omega_o.x, omega_o.y and c = the textures transmittance.0 ... transmittance.k at u "
+    "(not moved by any offset), blended by level as features are; a view from below sees the share of the "
     "opposite one from above; values are premultiplied: they hold what comes back, and nothing of what passes"
 )
 

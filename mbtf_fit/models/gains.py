@@ -8,8 +8,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-# Along the cosine: 0, 1/8, ..., 1.
-KNOTS = 9
+# Along the cosine: 0, 1/16, ..., 1.
+KNOTS = 17
 
 
 def look_up_gain(table: Tensor, level: Tensor, cosine: Tensor) -> Tensor:
