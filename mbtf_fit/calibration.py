@@ -38,12 +38,20 @@ from .streaming import StreamedQueries
 # Training queries that are looked at, at most, and at a time.
 MOST = 1 << 22
 _CHUNK = 1 << 18
-# Points per level.
+# Points per level, at most; fewer where queries are few, for what they say is then less certain by far.
 POINTS = 1 << 17
+_LEAST_POINTS = 1 << 12
 # What may be expected of factors beforehand: second differences between knots, and distances from 1.
 CURVATURES, DISTANCES = (0.0003, 0.001, 0.003, 0.01), (0.003, 0.01, 0.03, 0.1)
 _SECOND = np.diff(np.eye(KNOTS), 2, axis=0)
-# Error of means over points, relative.
+# The covariances of factors that go with them: (pairs, knots, knots).
+_PRIORS = np.stack(
+    [
+        np.linalg.inv(_SECOND.T @ _SECOND / curvature**2 + np.eye(KNOTS) / distance**2)
+        for curvature, distance in product(CURVATURES, DISTANCES)
+    ]
+)
+# Relative error of means over so many points; it falls with the root of their number, at least.
 POINT_ERROR = 5e-4
 # Factors stay within this and its inverse.
 LARGEST = 2.0
@@ -111,17 +119,12 @@ def solve(products: F64, target: F64, covariance: F64) -> F64:
     products, target, covariance = products / scale, target / scale, covariance / scale**2
     missing = target - products.sum(1)
     # Knots that nothing is near to have neither products nor errors.
-    covariance = covariance + np.diag((POINT_ERROR * target) ** 2 + 1e-12)
-    best = -np.inf
-    factors: F64 = np.ones(KNOTS)
-    for curvature, distance in product(CURVATURES, DISTANCES):
-        precision = _SECOND.T @ _SECOND / curvature**2 + np.eye(KNOTS) / distance**2
-        along = np.linalg.solve(precision, products.T)
-        total = products @ along + covariance
-        weighed = np.linalg.solve(total, missing)
-        likelihood = -float(np.linalg.slogdet(total)[1] + missing @ weighed)
-        if likelihood > best:
-            best, factors = likelihood, np.asarray(1.0 + along @ weighed, np.float64)
+    covariance = covariance + 1e-12 * np.eye(KNOTS)
+    along = _PRIORS @ products.T
+    total = products @ along + covariance
+    weighed = np.linalg.solve(total, missing[:, None])[..., 0]
+    best = int(np.argmin(np.linalg.slogdet(total)[1] + weighed @ missing))
+    factors = 1.0 + along[best] @ weighed[best]
     return np.clip(factors, 1.0 / LARGEST, LARGEST)
 
 
@@ -159,7 +162,8 @@ def fit_gains(
                 squares[k, c] += hats.products(missed[:, c] ** 2)
             largest = max(largest, float(np.hypot(omega[:, 0], omega[:, 1]).max()))
         sigmas = sigma if len(sigmas) == 0 else sigmas
-    u, light, view = points(POINTS, min(largest, 1.0))
+    count = min(POINTS, max(_LEAST_POINTS, 2 * used))
+    u, light, view = points(count, min(largest, 1.0))
     seen = ~(in_region(held_out, light) | in_region(held_out, view))
     u, light, view = u[seen], light[seen], view[seen]
     both, n = (_Hats.of(light), _Hats.of(view)), len(u)
@@ -173,5 +177,6 @@ def fit_gains(
                 mine, other = both[k], both[1 - k].read(tables[1 - k, s, :, c])
                 target = sums[k, :, c] / used + mine.sums(as_data[:, c]) / n
                 products = mine.products(value[:, c] * other) / n
-                tables[k, s, :, c] = solve(products, target, squares[k, c] / used**2)
+                own = np.diag((POINT_ERROR * target) ** 2 * (POINTS / count))
+                tables[k, s, :, c] = solve(products, target, squares[k, c] / used**2 + own)
     return tables.astype(np.float32)
