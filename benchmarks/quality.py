@@ -1,41 +1,82 @@
 """What the qualities cost and reach: the whole chain of each material at a quality.
 
-    python benchmarks/quality.py [MATERIAL ...] [--quality draft] [--levels 7] [--store FILE]
+    python benchmarks/quality.py --out FOLDER [--only MATERIAL:QUALITY ...] [--levels 7] [--store] [--check]
 
-Runs ``mbtf-pipeline run`` in a process of its own on each material (by default the five of ``assets/``) at
-each quality asked for (repeatable), and prints its seconds, start-up included, the unexplained variance of
-test queries, and the bytes of data and material. ``--store`` writes the figures with date and machine.
+Runs ``mbtf-pipeline run`` in a process of its own for every material and quality of the table in
+docs/cost.md: ``draft`` and ``standard`` on the six texture sets that lie beside the project, ``high`` on one.
+``--only`` (repeatable) names single ones, also of ``assets/``, such as ``turtle_shell:draft``. Printed: its
+seconds, start-up, pictures and report included, the unexplained variance of test queries, and the bytes of
+data and material. Each is kept in FOLDER as soon as it is measured and not measured again, so the same
+command goes on where it stopped.
+
+``--store`` writes what FOLDER holds to ``mbtf_gen/quality_measured.json``, from which help texts and
+``mbtf-gen plan`` speak, and the table of docs/cost.md; ``paper``, a GPU's work, is extrapolated there from
+``standard`` and ``high``. ``--check`` holds what FOLDER holds against the stored figures instead.
 
 The last line is one JSON object: figures, and the bars they are held to (a draft takes at most a minute, a
-standard run ten, on two cores, at 128 x 128 texels). Exit code 1 where a bar is missed.
+standard run ten, on two cores, at 128 x 128 texels; under ``--check`` seconds within 30 % and errors within a
+factor 1.5 of the stored ones). Exit code 1 where a bar is missed.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
+import shutil
 import subprocess
 import sys
-import tempfile
 import time
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, get_args
 
-from mbtf_gen.quality import Quality
+from mbtf_fit.config import FitConfig
+from mbtf_fit.forecast import PERSISTENCE, extrapolated
+from mbtf_fit.quality import FITTER
+from mbtf_gen.config import GeneratorConfig, count_queries
+from mbtf_gen.quality import GENERATOR, Quality, as_assignments
+from mbtf_gen.quality_measured import FORMAT, STORED, Chain, markdown_table, read_expected
+from mbtf_gen.settings import resolve
+from mbtf_pipeline.fit_records import read_training
 from mbtf_pipeline.run_folder import machine
 
 ROOT = Path(__file__).resolve().parents[1]
-ASSETS = ("cliff_rock", "insulation_foam", "straight_wool", "turtle_shell", "twisted_wool")
+TEXTURE_SETS = ROOT.parent / "shared" / "data" / "materials"
+# Factor on the heights of each set: fine structure is exaggerated so that it shows.
+HEIGHTS: dict[str, float] = {
+    "knit_fabric": 0.05,
+    "leather_fine": 0.02,
+    "metal_plate": 0.05,
+    "rock_cliff": 0.12,
+    "stone_bricks": 0.06,
+    "tree_bark": 0.1,
+}
+# The set that `high` is measured on, and `paper` extrapolated for.
+LONG = "rock_cliff"
 # Seconds of the whole chain.
 BARS = {"draft": 60.0, "standard": 600.0}
 BAR_LEVELS = 7
+# Largest factors between a stored figure and another run.
+CHECK = {"seconds": 1.3, "error": 1.5}
+QUALITIES: tuple[str, ...] = get_args(Quality)
+PAGE = ROOT / "docs" / "cost.md"
+BEGIN, END = "<!-- qualities: begin -->", "<!-- qualities: end -->"
 RECIPE = """\
 name: quality
 generate:
   material: {material}
+  geometry: {{height: {height}}}
   queries: {{levels: {levels}}}
 fit: {{model: neumip}}
 """
+
+
+def source(name: str) -> tuple[Path, float | None]:
+    """Folder of a material and the factor on its heights."""
+    if name in HEIGHTS:
+        return TEXTURE_SETS / name, HEIGHTS[name]
+    return ROOT / "assets" / name, None
 
 
 def folder_bytes(folder: Path) -> int:
@@ -43,16 +84,21 @@ def folder_bytes(folder: Path) -> int:
     return sum(p.stat().st_size for p in folder.rglob("*") if p.is_file())
 
 
-def run(material: Path, quality: str, levels: int, work: Path) -> dict[str, Any]:
-    """One chain, timed from outside.
+def run(name: str, quality: str, levels: int, work: Path) -> Chain:
+    """One chain, timed from outside; what an interrupted one left in `work` was not, and is removed.
 
     Raises
     ------
     SystemExit : the chain failed; its message is shown
     """
-    recipe = work / "recipe.yaml"
-    recipe.write_text(RECIPE.format(material=json.dumps(str(material.resolve())), levels=levels))
-    out = work / f"{material.name}-{quality}"
+    material, height = source(name)
+    shutil.rmtree(work, ignore_errors=True)
+    work.mkdir(parents=True)
+    recipe, out = work / "recipe.yaml", work / "run"
+    text = RECIPE.format(
+        material=json.dumps(str(material)), levels=levels, height="null" if height is None else height
+    )
+    recipe.write_text(text, encoding="utf-8")
     command = [sys.executable, "-m", "mbtf_pipeline", "run", str(recipe), "--quality", quality]
     start = time.perf_counter()
     done = subprocess.run(
@@ -60,57 +106,187 @@ def run(material: Path, quality: str, levels: int, work: Path) -> dict[str, Any]
     )
     seconds = time.perf_counter() - start
     if done.returncode:
-        raise SystemExit(f"{material} at {quality} ended with exit code {done.returncode}")
+        raise SystemExit(f"{name} at {quality} ended with exit code {done.returncode}")
     summary = json.loads(done.stdout)
-    return {
-        "material": material.name,
-        "quality": quality,
-        "levels": levels,
-        "seconds": round(seconds, 1),
-        "stages": {name: round(stage["seconds"], 1) for name, stage in summary["stages"].items()},
-        "unexplained": summary["test"]["neumip"]["unexplained_variance"],
-        "data_bytes": folder_bytes(out / "shards"),
-        "material_bytes": sum(p.stat().st_size for p in (out / "fits" / "neumip").glob("weights*")),
-    }
-
-
-def line(row: dict[str, Any]) -> str:
-    """A row as text."""
-    missed = row["unexplained"]
-    stages = "  ".join(f"{name} {seconds:g}" for name, seconds in row["stages"].items())
-    return (
-        f"{row['material']:18s} {row['quality']:9s} {row['seconds']:7.1f} s  unexplained "
-        f"{missed['value']:.3f} ± {missed['error']:.3f}  data {row['data_bytes'] / 1e6:.0f} MB  material "
-        f"{row['material_bytes'] / 1e6:.2f} MB  ({stages})"
+    stages = {stage: record["seconds"] for stage, record in summary["stages"].items()}
+    print(f"{name}: {json.dumps({k: round(v, 1) for k, v in stages.items()})}", file=sys.stderr)
+    missed = summary["test"]["neumip"]["unexplained_variance"]
+    fit = out / "fits" / "neumip"
+    found = Chain(
+        name,
+        quality,
+        height,
+        round(seconds, 1),
+        round(stages["generate"], 1),
+        round(sum(s for stage, s in stages.items() if stage.startswith("fit")), 1),
+        round(missed["value"], 4),
+        round(missed["error"], 4),
+        folder_bytes(out / "shards"),
+        sum(p.stat().st_size for p in fit.glob("weights*")),
+        round(read_training(fit).samples_per_second),
     )
+    shutil.rmtree(work)
+    return found
+
+
+def line(c: Chain) -> str:
+    """A chain as text."""
+    return (
+        f"{c.material:16s} {c.quality:9s} {c.seconds:7.1f} s (generate {c.generate:.1f}, fit {c.fit:.1f})  "
+        f"unexplained {c.unexplained:.3f} ± {c.unexplained_error:.3f}  data {c.data_bytes / 1e6:.0f} MB  "
+        f"material {c.material_bytes / 1e6:.2f} MB"
+    )
+
+
+def wanted(only: list[str] | None) -> list[tuple[str, str]]:
+    """(material, quality) to measure.
+
+    Raises
+    ------
+    SystemExit : a name that is none
+    """
+    if not only:
+        return [(name, q) for q in ("draft", "standard") for name in HEIGHTS] + [(LONG, "high")]
+    out = []
+    for text in only:
+        name, _, quality = text.partition(":")
+        if quality not in QUALITIES or not source(name)[0].is_dir():
+            raise SystemExit(f"--only {text}: must be MATERIAL:QUALITY, such as rock_cliff:draft")
+        out.append((name, quality))
+    return out
+
+
+def kept(folder: Path, levels: int) -> list[Chain]:
+    """Chains that were measured at these levels, in the order of the table."""
+    found = []
+    for path in folder.glob(f"*-{levels}.json"):
+        found.append(Chain(**json.loads(path.read_text(encoding="utf-8"))))
+    return sorted(found, key=lambda c: (QUALITIES.index(c.quality), c.material))
+
+
+def paths_of(quality: str, levels: int) -> float:
+    """Paths of a quality's data set of a square material, and those of its test split."""
+    config = resolve(
+        GeneratorConfig,
+        assignments=["material=m", *as_assignments(GENERATOR[quality])],  # type: ignore[index]
+    ).queries
+    texels = 4**levels
+    return (
+        count_queries(config.train, texels) * config.spp
+        + count_queries(config.test, texels) * config.test_spp
+    )
+
+
+def paper(chains: list[Chain], levels: int) -> tuple[Chain | None, str]:
+    """`paper` for the material that `high` was measured on, and how its figures follow."""
+    law = (
+        "Generating: seconds of `high` times the ratio of their numbers of paths; data: times that of their "
+        "queries. Training: 30 000 steps of 2²⁰ queries at the rate of `standard`. Error: every doubling of "
+        f"the training time gains {PERSISTENCE:g} of what the one before gained in the logarithm, so that "
+        "E_paper = E_standard · (E_high / E_standard)^((1 − q^p) / (1 − q^h)), "
+        f"q = {PERSISTENCE:g}, where h and p doublings lie between the training times of `standard` and of "
+        "`high` and `paper`; that `paper` has other data and `high` a wider network is left out of account"
+    )
+    known = {(c.material, c.quality): c for c in chains}
+    found = [c for c in chains if c.quality == "high" and (c.material, "standard") in known]
+    if not found:
+        return None, law
+    high, standard = found[0], known[found[0].material, "standard"]
+    config = resolve(FitConfig, assignments=as_assignments(FITTER["paper"]))
+    assert config.training.steps is not None
+    samples = config.training.steps * config.training.batch
+    fit = samples / standard.queries_per_second
+    generate = high.generate * paths_of("paper", levels) / paths_of("high", levels)
+    apart, doublings = (math.log2(seconds / standard.fit) for seconds in (high.fit, fit))
+    queries = {
+        q: count_queries(GENERATOR[q]["queries.train"], 4**levels) + int(GENERATOR[q]["queries.test"])
+        for q in ("high", "paper")
+    }
+    return (
+        Chain(
+            high.material,
+            "paper",
+            high.height,
+            round(high.seconds - high.generate - high.fit + generate + fit),
+            round(generate),
+            round(fit),
+            round(
+                extrapolated(standard.unexplained, high.unexplained, doublings - apart, apart=apart),
+                3,
+            ),
+            0.0,
+            round(high.data_bytes * queries["paper"] / queries["high"]),
+            standard.material_bytes,
+            standard.queries_per_second,
+        ),
+        law,
+    )
+
+
+def store(chains: list[Chain], levels: int) -> None:
+    """Write the figures beside the package's code, and their table into the documentation."""
+    guess, law = paper(chains, levels)
+    data = {
+        "format": FORMAT,
+        "command": "python benchmarks/quality.py --out out/quality --store",
+        "date": time.strftime("%Y-%m-%d"),
+        "machine": machine()["system"],
+        "levels": levels,
+        "chains": [asdict(c) for c in chains],
+        "extrapolated": [] if guess is None else [asdict(guess)],
+        "law": law,
+    }
+    STORED.write_text(json.dumps(data, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    text = PAGE.read_text(encoding="utf-8")
+    before, rest = text.split(BEGIN)
+    table = markdown_table(read_expected(STORED), QUALITIES)
+    PAGE.write_text(f"{before}{BEGIN}\n\n{table}\n\n{END}{rest.split(END)[1]}", encoding="utf-8")
+
+
+def check(chains: list[Chain]) -> list[dict[str, Any]]:
+    """Factors between the stored figures and these."""
+    stored = {(c.material, c.quality): c for c in read_expected(STORED).chains}
+    out = []
+    for c in chains:
+        other = stored.get((c.material, c.quality))
+        if other is not None:
+            pairs = {"seconds": (c.seconds, other.seconds), "error": (c.unexplained, other.unexplained)}
+            factors = {name: max(a / b, b / a) for name, (a, b) in pairs.items()}
+            out.append({"material": c.material, "quality": c.quality, "factors": factors})
+    return out
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("materials", nargs="*", type=Path)
-    parser.add_argument("--quality", action="append", choices=get_args(Quality))
+    parser.add_argument("--out", type=Path, required=True, help="folder that keeps what was measured")
+    parser.add_argument("--only", action="append", help="MATERIAL:QUALITY (repeatable)")
     parser.add_argument("--levels", type=int, default=BAR_LEVELS, help="finest level: 2^levels texels")
-    parser.add_argument("--store", type=Path, help="JSON file for the figures")
+    parser.add_argument(
+        "--store", action="store_true", help="write the package's figures and the docs' table"
+    )
+    parser.add_argument("--check", action="store_true", help="hold the figures against the stored ones")
     arguments = parser.parse_args()
-    materials = arguments.materials or [ROOT / "assets" / name for name in ASSETS]
-    rows = []
-    for material in materials:
-        for quality in arguments.quality or ["draft"]:
-            with tempfile.TemporaryDirectory() as work:
-                rows.append(run(material, quality, arguments.levels, Path(work)))
-            print(line(rows[-1]), flush=True)
-    held = [r for r in rows if r["quality"] in BARS and r["levels"] <= BAR_LEVELS]
-    met = all(r["seconds"] <= BARS[r["quality"]] for r in held)
-    report = {
-        "figures": rows,
-        "bars": BARS,
-        "met": met,
-        "date": time.strftime("%Y-%m-%d"),
-        "machine": machine(),
-    }
-    if arguments.store is not None:
-        arguments.store.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-    print(json.dumps(report))
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    for name, quality in wanted(arguments.only):
+        path = arguments.out / f"{name}-{quality}-{arguments.levels}.json"
+        if path.exists():
+            continue
+        if not source(name)[0].is_dir():
+            print(f"{name}: left out, {source(name)[0]} is missing", file=sys.stderr)
+            continue
+        found = run(name, quality, arguments.levels, arguments.out / ".work")
+        path.write_text(json.dumps(asdict(found)) + "\n", encoding="utf-8")
+        print(line(found), flush=True)
+    chains = kept(arguments.out, arguments.levels)
+    held = [c for c in chains if c.quality in BARS and arguments.levels <= BAR_LEVELS]
+    met = all(c.seconds <= BARS[c.quality] for c in held)
+    report: dict[str, Any] = {"figures": [asdict(c) for c in chains], "bars": {**BARS}}
+    if arguments.check:
+        report |= {"beside_stored": check(chains), "bars": {**BARS, **CHECK}}
+        met &= all(f <= CHECK[name] for row in report["beside_stored"] for name, f in row["factors"].items())
+    if arguments.store:
+        store(chains, arguments.levels)
+    print(json.dumps({**report, "met": met, "machine": machine()}))
     return 0 if met else 1
 
 

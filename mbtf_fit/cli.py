@@ -9,7 +9,7 @@ from cyclopts import Parameter
 
 from mbtf_gen.console import CONSOLE, Console, clock, new_app
 from mbtf_gen.errors import InputError, PartialError, UsageError
-from mbtf_gen.quality import Quality, as_assignments
+from mbtf_gen.quality import Quality, as_assignments, quality_help
 
 from .plugin.preview.command import preview
 from .wording import describe_errors, describe_fit, describe_transmittance, number, table
@@ -23,6 +23,12 @@ Set = Annotated[
     list[str], Parameter(name="--set", help="Set any option of the configuration, a.b=c. Repeatable.")
 ]
 Output = Annotated[Path, Parameter(name=["--output", "-o"])]
+QualityOption = Annotated[
+    Quality,
+    Parameter(
+        help=quality_help("Training time and size that belong together; other options change single ones.")
+    ),
+]
 
 
 @app.default
@@ -33,7 +39,7 @@ def fit(
     output: Output = Path("material"),
     many: Annotated[list[Path] | None, Parameter(consume_multiple=True, negative="")] = None,
     processes: int | None = None,
-    quality: Quality | None = None,
+    quality: QualityOption | None = None,
     model: Literal["neumip", "neumip-baseline", "hierarchical"] | None = None,
     time: str | None = None,
     steps: int | None = None,
@@ -62,8 +68,6 @@ def fit(
         one folder per line. A failure stops none of the others.
     processes
         With --many, fits that run side by side. Default: one per GPU, or 1
-    quality
-        Training time and size that belong together; other options change single ones.
     model
         Model to fit. Default: neumip
     time

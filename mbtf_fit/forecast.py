@@ -68,13 +68,15 @@ class FitForecast:
         return "\n".join(lines)
 
 
-def extrapolated(short: float, long: float, doublings: float) -> float:
-    """Error after so many doublings of the longer pilot's time, from those of both pilots (one doubling
-    apart), of which each gains `PERSISTENCE` of what the one before gained; never above the longer pilot's,
-    however short the budget."""
+def extrapolated(
+    short: float, long: float, doublings: float, *, apart: float = 1.0, persistence: float = PERSISTENCE
+) -> float:
+    """Error after so many doublings of the longer fit's time, from those of two fits, `apart` doublings from
+    each other, of which each gains `persistence` of what the one before gained, in the logarithm; never above
+    the longer fit's, however short the budget."""
     gain = max(0.0, math.log(short / long)) if min(short, long) > 0 else 0.0
-    total = PERSISTENCE * (1.0 - PERSISTENCE ** max(doublings, 0.0)) / (1.0 - PERSISTENCE)
-    return long * math.exp(-gain * total)
+    ratio = persistence**apart / (1.0 - persistence**apart)
+    return long * math.exp(-gain * ratio * (1.0 - persistence ** max(doublings, 0.0)))
 
 
 def forecast_fit(config: FitConfig, shards: str | Path) -> FitForecast:

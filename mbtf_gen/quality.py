@@ -1,12 +1,14 @@
 """Qualities: settings that belong together, from a first look to the papers' sizes.
 
 A quality is laid over the configuration file and under ``--set`` and flags. What each costs and reaches was
-measured by ``benchmarks/quality.py``; docs/cost.md shows the table.
+measured by ``benchmarks/quality.py``; see :mod:`mbtf_gen.quality_measured`.
 """
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, Literal, get_args
+
+from .quality_measured import help_lines
 
 Quality = Literal["draft", "standard", "high", "paper"]
 
@@ -38,6 +40,11 @@ GENERATOR: dict[Quality, dict[str, Any]] = {
         "queries.test_spp": 1024,
     },
 }
+
+
+def quality_help(what: str) -> str:
+    """Help text of ``--quality``: what it sets, and what each quality was measured to cost and to reach."""
+    return f"{what} {help_lines(get_args(Quality))}"
 
 
 def as_assignments(options: dict[str, Any], prefix: str = "") -> list[str]:

@@ -3,12 +3,15 @@ material and machine, then one allocation.
 
 Three short chains each generate for another share of their time and train for the rest; the share of the
 least error, by a parabola through the three, is taken for what is left of the budget. Error changes slowly
-about its least value, so a rough share is enough. Budgets too short for pilots take a fixed share.
+about its least value, so a rough share is enough. Budgets too short for pilots take a fixed share. Where
+queries cost next to nothing, disk and memory bound their number, and training gets the time.
 """
 
 from __future__ import annotations
 
 import math
+import os
+import shutil
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -45,8 +48,12 @@ PILOT, SHORTEST_PILOT = 0.04, 10.0
 # The shortest budget worth splitting, seconds: below it starting up takes most.
 SHORTEST = 60.0
 # Test queries of the pilot chains and paths of each.
-_TEST, _TEST_SPP = "8192", 64
+_TEST, _TEST_SPP = "32768", 16
 _FEWEST_QUERIES = 4096
+# Seconds that a query takes at the least: that of a closed form, written to disk.
+_CHEAPEST = 1e-8
+# Shares of the free disk space and of the machine's memory that training queries may take.
+_DISK, _MEMORY = 0.25, 0.5
 # However long looking took, this share of the budget is spent.
 _LEAST_LEFT = 0.25
 
@@ -107,6 +114,9 @@ def split_budget(
     command : what the run is described by
     tell : called with a note after every pilot chain
 
+    Training queries take at most a quarter of the free disk space, and no more memory than ``data.memory`` of
+    the fits or half of the machine's, whichever is more: beyond both, training would wait for the disk.
+
     Raises
     ------
     UsageError : the budget is too short, or a model of the recipe learns from another layout
@@ -132,7 +142,7 @@ def split_budget(
         split = _remembered(folder, key)
         if split is None:
             describe(folder, recipe, command)
-            split = _plan(recipe, budget, tell)
+            split = _plan(recipe, budget, folder, tell)
             write_json(folder / BUDGET_NAME, {"format": BUDGET_FORMAT, "key": key, **asdict(split)})
     return split
 
@@ -150,7 +160,32 @@ def _remembered(folder: Path, key: str) -> Split | None:
         return None
 
 
-def _plan(recipe: Recipe, budget: float, tell: Callable[[str], None]) -> Split:
+def most_queries(recipe: Recipe, folder: Path) -> int:
+    """Training queries that disk and memory hold.
+
+    Parameters
+    ----------
+    folder : that they are written to; it exists
+    """
+    from mbtf_fit.data import QUERY_BYTES
+    from mbtf_gen.forecast import row_bytes
+
+    on_disk = _DISK * shutil.disk_usage(folder).free / row_bytes(holes=True)
+    loaded = min(fit.data.memory for fit in recipe.fit.values()) / QUERY_BYTES
+    # What is read from disk goes through the file system's memory.
+    mapped = _MEMORY * physical_memory() / row_bytes(holes=True)
+    return max(_FEWEST_QUERIES, int(min(on_disk, max(loaded, mapped))))
+
+
+def physical_memory() -> float:
+    """Bytes of the machine's memory; infinite where it does not say."""
+    try:
+        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    except (AttributeError, ValueError, OSError):
+        return math.inf
+
+
+def _plan(recipe: Recipe, budget: float, folder: Path, tell: Callable[[str], None]) -> Split:
     from mbtf_gen.forecast import forecast
     from mbtf_gen.generation import Job, allocated
     from mbtf_gen.planning import plan_effects
@@ -168,11 +203,12 @@ def _plan(recipe: Recipe, budget: float, tell: Callable[[str], None]) -> Split:
     share = best_share(pilots) if pilots else USUAL_SHARE
     looked = time.perf_counter() - began
     left = max(budget - looked - test - expected.start, _LEAST_LEFT * budget)
-    generating = share * left
+    wanted, most = max(_FEWEST_QUERIES, share * left / price), most_queries(recipe, folder)
+    generating = share * left if wanted <= most else most * price
     return Split(
-        _two_digits(max(_FEWEST_QUERIES, generating / price)),
+        _two_digits(min(wanted, most)),
         round(generating + test + expected.start, 1),
-        round((1 - share) * left, 1),
+        round(left - generating, 1),
         round(share, 3),
         tuple(pilots),
         round(looked, 1),
@@ -188,7 +224,8 @@ def _material(config: GeneratorConfig) -> Any:
 def _prices(expected: Forecast, queries: int, test_paths: int) -> tuple[float, float]:
     """(seconds of a training query, seconds of the test split)."""
     training = (expected.paths - test_paths) / expected.paths_per_second
-    return training / queries, max(0.0, expected.seconds - training)
+    # What has a closed form takes no time that could be told from none.
+    return max(training / queries, _CHEAPEST), max(0.0, expected.seconds - training)
 
 
 def _two_digits(count: float) -> int:
@@ -205,8 +242,9 @@ def _pilots(
         data["queries"] |= {"test": _TEST, "test_spp": _TEST_SPP}
         workshop = Workshop(GeneratorConfig.model_validate(data), Path(work), "", lambda note: None)
         out = []
+        most = most_queries(recipe, Path(work))
         for share in SHARES:
-            queries = _two_digits(max(_FEWEST_QUERIES, share * length / price))
+            queries = _two_digits(min(max(_FEWEST_QUERIES, share * length / price), most))
             options = _with_time(fit, (1 - share) * length).fields()
             chain = Chain("chain", name, f"{share:.0%}", queries, recipe.generate.queries.spp, options)
             out.append((share, workshop.measure(chain).error.value))

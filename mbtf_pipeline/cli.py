@@ -10,7 +10,7 @@ from cyclopts import Parameter
 
 from mbtf_gen.console import CONSOLE, Console, clock, new_app
 from mbtf_gen.errors import InputError, MbtfError, UsageError
-from mbtf_gen.quality import Quality
+from mbtf_gen.quality import Quality, quality_help
 
 if TYPE_CHECKING:
     from .recipe import Recipe
@@ -20,6 +20,9 @@ app = new_app("mbtf-pipeline", "Run recipes: generate, fit, compare, report.")
 
 Set = Annotated[list[str], Parameter(name="--set", help="Set any option of the recipe, a.b=c. Repeatable.")]
 Output = Annotated[Path | None, Parameter(name=["--output", "-o"])]
+QualityOption = Annotated[
+    Quality, Parameter(help=quality_help("Sizes and times of all stages, in place of the recipe's."))
+]
 _FOLDER = Path("pipelines")
 
 
@@ -29,7 +32,7 @@ def run(
     /,
     *,
     output: Output = None,
-    quality: Quality | None = None,
+    quality: QualityOption | None = None,
     budget: str | None = None,
     quick: Annotated[bool, Parameter(negative="")] = False,
     force: Annotated[bool, Parameter(negative="")] = False,
@@ -46,8 +49,6 @@ def run(
         YAML file.
     output
         Folder of the run. Default: out/NAME
-    quality
-        Sizes and times of all stages, in place of the recipe's.
     budget
         Time for generating and training together: 90s, 10min, 1h. Pilots on this machine split it; it takes
         the place of the recipe's queries and training times. Comparison and report come on top.

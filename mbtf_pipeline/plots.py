@@ -7,12 +7,15 @@ import io
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mbtf_gen.atomic import write_through
+
+from .labels import Named, place_names
 
 # Okabe and Ito (2008), without black and yellow: told apart under every common colour-vision deficiency.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
@@ -201,38 +204,54 @@ def _scatter(clouds: Sequence[Cloud], x: str, y: str, front: Sequence[tuple[floa
     figure = _figure(7.2, 4.2)
     axes = _axes(figure, x, y, logx=True, logy=True)
     floor = _ends([v for cloud in clouds for v in cloud.y])[0]
+    shown: list[tuple[float, float]] = []
+    named: list[Named] = []
+    lines: list[tuple[tuple[float, float], tuple[float, float]]] = []
+    handles = []
     for index, cloud in enumerate(clouds):
         xs, ys = np.asarray(cloud.x, float), np.maximum(np.asarray(cloud.y, float), floor)
-        bars = np.minimum(np.asarray(cloud.y_error, float), 0.95 * ys)
-        axes.errorbar(
+        across = np.minimum(np.asarray(cloud.x_error, float), 0.95 * xs)
+        upright = np.minimum(np.asarray(cloud.y_error, float), 0.95 * ys)
+        drawn = axes.errorbar(
             xs,
             ys,
-            xerr=np.minimum(np.asarray(cloud.x_error, float), 0.95 * xs),
-            yerr=bars,
+            xerr=across,
+            yerr=upright,
             fmt=MARKERS[index % len(MARKERS)],
             color=colour(index),
             markerfacecolor="none" if cloud.hollow else colour(index),
             markersize=6,
             capsize=2.5,
             linewidth=1.1,
-            label=cloud.name,
         )
+        handles.append((drawn.lines[0], cloud.name))
         if cloud.joined:
             axes.plot(xs, ys, color=colour(index), linewidth=0.8, alpha=0.5)
-        for at_x, at_y, text in zip(xs, ys, cloud.labels, strict=True):
-            axes.annotate(
-                text, (at_x, at_y), (6, 4), textcoords="offset points", fontsize=7.5, color=colour(index)
-            )
+        for at_x, at_y, dx, dy in zip(xs, ys, across, upright, strict=True):
+            lines += [((at_x - dx, at_y), (at_x + dx, at_y)), ((at_x, at_y - dy), (at_x, at_y + dy))]
+        shown += list(zip(xs, ys, strict=True))
+        named += [
+            Named(at_x, at_y, text, colour(index))
+            for at_x, at_y, text in zip(xs, ys, cloud.labels, strict=True)
+            if text
+        ]
     if front:
         fx, fy = np.asarray(front, float).T
-        axes.step(fx, fy, where="post", color=_INK, linewidth=1.3, linestyle=(0, (4, 2)), label="front")
-    axes.margins(y=0.12)
-    # Room for the last point's name.
+        drawn = axes.step(fx, fy, where="post", color=_INK, linewidth=1.3, linestyle=(0, (4, 2)))
+        handles.append((drawn[0], "front"))
+        for (x0, y0), (x1, y1) in pairwise(front):
+            lines += [((x0, y0), (x1, y0)), ((x1, y0), (x1, y1))]
+    axes.margins(y=0.1)
+    # Room for names on either side.
     left, right = axes.get_xlim()
-    axes.set_xlim(left, right * (right / left) ** 0.25)
+    reach = right / left
+    axes.set_xlim(left / reach**0.06, right * reach**0.2)
     for axis in (axes.xaxis, axes.yaxis):
         _plain_ticks(axis)
-    axes.legend(frameon=False, fontsize=8.5)
+    # Above the plot, where it hides no point.
+    marks, names = zip(*handles, strict=True)
+    figure.legend(marks, names, loc="outside upper left", frameon=False, fontsize=8.5, ncols=3)
+    place_names(figure, axes, named, shown, lines)
     return figure
 
 

@@ -32,7 +32,10 @@ LAYOUT = 4
 _TABLE = """
 <table><thead><tr>{% for h in t.head %}<th>{{ h }}</th>{% endfor %}</tr></thead><tbody>
 {% for row in t.rows %}<tr>
-{%- for cell in row %}<td{{ ' class=long' if cell is in_words }}>{{ cell }}</td>{% endfor %}</tr>
+{%- for cell in row %}
+{%- if cell is command %}<td class=command><code>{{ cell }}</code></td>
+{%- else %}<td{{ ' class=long' if cell is in_words }}>{{ cell }}</td>{% endif %}
+{%- endfor %}</tr>
 {% endfor %}</tbody></table>
 """
 
@@ -44,6 +47,7 @@ def page_environment() -> Any:
 
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
     environment.tests["in_words"] = lambda cell: BELOW in cell
+    environment.tests["command"] = lambda cell: cell.startswith("mbtf-")
     table = environment.from_string(_TABLE)
     environment.globals["table"] = lambda t: Markup(table.render(t=t))
     return environment

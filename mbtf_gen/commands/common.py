@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 from cyclopts import Parameter
 
 from ..errors import UsageError
+from ..quality import Quality, quality_help
 from ..schema import Tiling
 
 if TYPE_CHECKING:
@@ -20,6 +21,14 @@ Set = Annotated[
     list[str], Parameter(name="--set", help="Set any option of the configuration, a.b=c. Repeatable.")
 ]
 Output = Annotated[Path | None, Parameter(name=["--output", "-o"])]
+QualityOption = Annotated[
+    Quality,
+    Parameter(
+        help=quality_help(
+            "Numbers of queries and paths that belong together; other options change single ones."
+        )
+    ),
+]
 
 Flags = Mapping[str, tuple[str, Any]]
 

@@ -10,9 +10,9 @@ from cyclopts import Parameter
 
 from ..console import CONSOLE, Console, clock, going_on
 from ..errors import UsageError
-from ..quality import GENERATOR, Quality, as_assignments
+from ..quality import GENERATOR, as_assignments
 from ..schema import Tiling
-from .common import Output, Set, general, resolve_config
+from .common import Output, QualityOption, Set, general, resolve_config
 
 _SPLIT_WORDS = {"train": "training"}
 
@@ -29,7 +29,7 @@ def generate(
     /,
     *,
     output: Output = None,
-    quality: Quality | None = None,
+    quality: QualityOption | None = None,
     queries: str | None = None,
     test_queries: str | None = None,
     spp: int | None = None,
@@ -62,8 +62,6 @@ def generate(
         Height map, folder of maps, or material.yaml.
     output
         Folder of shards. Default: shards/
-    quality
-        Numbers of queries and paths that belong together; other options change single ones.
     queries
         Training queries: N, or N/texel of the finest level. Default: 100/texel
     test_queries

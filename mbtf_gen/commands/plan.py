@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..console import CONSOLE, Console
+from ..quality import GENERATOR, as_assignments
+from ..quality_measured import expected as expected_of
 from ..schema import Tiling
-from .common import Set, general, resolve_config
+from .common import QualityOption, Set, general, resolve_config
 
 if TYPE_CHECKING:
     from ..effects import Effect, EffectsPlan
@@ -22,6 +24,7 @@ def plan(
     material: str | None = None,
     /,
     *,
+    quality: QualityOption | None = None,
     queries: str | None = None,
     spp: int | None = None,
     target_error: str | None = None,
@@ -90,7 +93,8 @@ def plan(
             height=height, mesh=mesh, tile=tile, light_width=light_width, max_depth=max_depth, seed=seed
         ),
     }
-    resolved = resolve_config(GeneratorConfig, material, config, assignments or [], flags)
+    assigned = [*as_assignments(GENERATOR[quality] if quality else {}), *(assignments or [])]
+    resolved = resolve_config(GeneratorConfig, material, config, assigned, flags)
     from ..generation import Job
     from ..pilot import measured
     from ..planning import plan_effects
@@ -106,7 +110,14 @@ def plan(
     expected = forecast(job, allocated(job, found))
     found = measured(job, found)
     data = {**found.to_manifest(), "forecast": expected.as_dict()}
-    console.report(data, f"{table(found)}\n{expected.describe(job.target('train'))}")
+    text = f"{table(found)}\n{expected.describe(job.target('train'))}"
+    if quality is not None and (measured_line := expected_of().line(quality)) is not None:
+        texels = 1 << expected_of().levels
+        text += (
+            f"\nwhole chains to material and report on {expected_of().machine}, {texels} x {texels} texels: "
+            f"{measured_line}"
+        )
+    console.report(data, text)
 
 
 def table(plan: EffectsPlan) -> str:

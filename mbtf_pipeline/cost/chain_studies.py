@@ -7,10 +7,13 @@ from collections.abc import Callable, Iterator
 from .chains import Chain
 
 # Shares of the budget; the generator's own studies take GENERATOR, what is left over is for starting up.
-GENERATOR, DATA, FIT, WHOLE = 0.2, 0.2, 0.2, 0.33
-# The shortest whole chain, seconds, and the share of it that generates.
+GENERATOR, DATA, FIT, WHOLE = 0.2, 0.18, 0.2, 0.35
+# The shortest whole chain, seconds, the share of every chain that generates, and other shares that are tried.
 SHORTEST = 60.0
-SPLITS = (0.25, 0.5, 0.75)
+SHARE = 0.35
+OTHER_SHARES = (0.6, 0.15)
+# Seeds of the fits that show how far fits scatter.
+SEEDS = (1, 2, 3)
 PATHS = (2, 4, 16, 64)
 # Path budgets at which they are compared, of the largest.
 PATH_SHARES = (0.4, 1.6)
@@ -55,22 +58,27 @@ def chains(budget: float, spp: int, price: Price) -> Iterator[Chain]:
 
 
 def _whole(budget: float, spp: int, price: Price) -> Iterator[Chain]:
-    total = SHORTEST
-    spent = 0.0
-    while spent == 0.0 or spent + len(SPLITS) * total <= budget:
-        for share in SPLITS:
-            queries = _queries(share * total, spp, price)
-            name = f"{share:.0%} of {total:g} s generating"
-            yield Chain(
-                "chain", f"{total:g} s in all", name, queries, spp, _fit("neumip", (1 - share) * total)
-            )
-        spent += len(SPLITS) * total
-        total *= 2
+    """Chains of one minute in all, two, four, … as far as the budget goes; what is left goes to other splits
+    of them, the shortest first."""
+    totals = [SHORTEST]
+    while sum(totals) + 2 * totals[-1] <= budget:
+        totals.append(2 * totals[-1])
+    wanted = [(total, SHARE) for total in totals]
+    spent = sum(totals)
+    for total in totals:
+        for share in OTHER_SHARES:
+            if spent + total <= budget:
+                wanted.append((total, share))
+                spent += total
+    for total, share in wanted:
+        queries = _queries(share * total, spp, price)
+        fit = _fit("neumip", (1 - share) * total)
+        yield Chain("chain", f"{share:.0%} of the time generating", f"{total:g} s", queries, spp, fit)
 
 
 def _fits(budget: float, spp: int, price: Price) -> Iterator[Chain]:
     """Models and sizes over training time, on one data set."""
-    unit = budget / 12
+    unit = budget / 13.5
     queries = _queries(1.5 * unit, spp, price)
     for model in MODELS:
         for share in (0.5, 1, 2) if model == MODELS[0] else (1, 2):
@@ -80,3 +88,6 @@ def _fits(budget: float, spp: int, price: Price) -> Iterator[Chain]:
         seconds = 2 * unit
         name = f"{seconds:.3g} s"
         yield Chain("fit", f"neumip, {width} wide", name, queries, spp, _fit("neumip", seconds, width))
+    for seed in SEEDS:
+        fit = {**_fit(MODELS[0], 0.5 * unit), "seed": seed}
+        yield Chain("seeds", MODELS[0], f"seed {seed}", queries, spp, fit)

@@ -151,12 +151,15 @@ class Workshop:
         test = self.test()
         data = self.data(chain.queries, chain.spp)
         self.progress(f"{chain.study}: {chain.series}, {chain.name}")
-        config = FitConfig.model_validate({**chain.fit, "seed": self.config.seed})
+        config = FitConfig.model_validate({"seed": self.config.seed, **chain.fit})
         out = self.folder / f"fit-{hash_of(chain.key)[:12]}"
         shutil.rmtree(out, ignore_errors=True)
         result = fit(config, data.folder, out)
         material = result.material
         error = _missed(material.predict(test), test)
+        half = _missed(_half(material).predict(test), test)
+        size = sum(p.stat().st_size for p in out.glob("weights*"))
+        numbers = sum(p.numel() for p in material.model.parameters())
         details = {
             "queries": float(chain.queries),
             "spp": float(chain.spp),
@@ -164,23 +167,30 @@ class Workshop:
             "training_seconds": result.seconds,
             "total_seconds": data.seconds + result.total_seconds,
             "evaluation_ms_1080p": 1e3 * _evaluation_seconds(material, test),
-            "bytes": float(sum(p.stat().st_size for p in out.glob("weights*"))),
-            "half_error": _missed(_half(material).predict(test), test).value,
+            "bytes": float(size),
+            "half_bytes": float(size - 2 * numbers),
+            "half_error": half.value,
+            "half_error_se": half.error,
         }
         shutil.rmtree(out, ignore_errors=True)
-        price = {"data": "generation_seconds", "fit": "training_seconds"}.get(chain.study, "total_seconds")
+        price = {
+            "data": "generation_seconds",
+            "fit": "training_seconds",
+            "seeds": "training_seconds",
+        }.get(chain.study, "total_seconds")
         return Point(
             chain.study,
             chain.series,
             chain.name,
             {"queries.train": str(chain.queries), "queries.spp": chain.spp, **_flat(chain.fit)},
-            self._command(chain),
+            "",
             Estimate(details[price], 0.0, 1),
             error,
             details=details,
         )
 
-    def _command(self, chain: Chain) -> str:
+    def command_of(self, chain: Chain) -> str:
+        """What makes a chain with the programs."""
         flags = "".join(f" --set {name}={value}" for name, value in _flat(chain.fit).items())
         return (
             f"{self.command} --queries {chain.queries} --spp {chain.spp} -o shards/ && "

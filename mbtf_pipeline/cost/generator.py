@@ -11,14 +11,17 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_gen.adaptive import estimate_shard
+from mbtf_gen.allocation import Allocation, measure_allocation
 from mbtf_gen.config import GeneratorConfig
-from mbtf_gen.estimates import Stream
+from mbtf_gen.estimates import Estimates, Stream
 from mbtf_gen.generation import Job
 from mbtf_gen.material import Material
 from mbtf_gen.planning import plan_effects
@@ -40,6 +43,11 @@ _NEGLIGIBLE = 0.005
 _SHARD = 1 << 14
 _FIRST_REFERENCE = 5_001
 _FIRST_PIECE = 10_001
+# Queries that tell how many paths adaptive counts take, and the fewest of a piece.
+_LOOK, _FEWEST_IN_PIECE = 2048, 1024
+
+# Estimates queries with a stream's random numbers.
+Trace = Callable[[Queries, Stream], Estimates]
 
 
 @dataclass(frozen=True)
@@ -51,12 +59,16 @@ class Measured:
     seconds : per million queries
     bias, noise, error : root mean squares relative to the reference's mean value; no bias where setting and
         reference trace the same
+    relative : root mean square of the noise of each query over max(value, tile mean), and paths : mean per
+        query, where they were asked for
     """
 
     seconds: Estimate
     bias: Estimate | None
     noise: Estimate
     error: Estimate
+    relative: Estimate | None = None
+    paths: float | None = None
 
 
 @dataclass(frozen=True)
@@ -66,6 +78,11 @@ class _Reference:
     queries: Queries
     a: NDArray[np.float64]
     b: NDArray[np.float64]
+
+    @property
+    def mean(self) -> float:
+        """Mean value, which errors are relative to."""
+        return float((self.a + self.b).mean() / 2)
 
 
 @dataclass
@@ -131,13 +148,63 @@ class Bench:
         """
         job = self.job(changes)
         estimator = job.estimator(plan_effects(job))
-        first = self.reference(against or {}, 0)
-        mean = float((first.a + first.b).mean() / 2)
-        noise, price = self._noise(job, estimator, job.config.queries.spp, seconds, mean)
+        mean = self.reference(against or {}, 0).mean
+        spp = job.spp("train")
+
+        def trace(queries: Queries, stream: Stream) -> Estimates:
+            found: Estimates = estimator.estimate(queries, spp, stream)
+            return found
+
+        noise, price = self._noise(job, trace, spp, seconds, mean)
         if against is None:
             return Measured(price, None, _root(noise), _root(noise))
         bias = self._bias(estimator, against, seconds, mean)
         return Measured(price, _root(bias), _root(noise), _root(_total(bias, noise)))
+
+    def measure_counts(self, changes: dict[str, Any], adaptive: bool, seconds: float) -> Measured:
+        """Price and noise where queries get the same number of paths, or each its own: `adaptive` with the
+        run's allocation, whose pilot is not timed, as it is once for a whole data set.
+
+        Parameters
+        ----------
+        seconds : spent on each of both measures of the noise at most
+        """
+        job = self.job(changes)
+        plan = plan_effects(job)
+        estimator = job.estimator(plan)
+        allocation = measure_allocation(job, plan)
+        chosen = replace(plan, allocation=allocation if adaptive else None)
+        target, spp = job.target("train"), job.spp("train")
+
+        def trace(queries: Queries, stream: Stream) -> Estimates:
+            return estimate_shard(estimator, queries, spp, target, stream, chosen)
+
+        first = self.reference({}, 0)
+        look = trace(_first(first.queries, _LOOK), Stream(self.seed, "test", _FIRST_PIECE))
+        paths = max(look.paths, 1) / len(look.value_a)
+        noise, price = self._noise(job, trace, paths, seconds, first.mean)
+        relative = self._relative(trace, paths, seconds, allocation)
+        return Measured(price, None, _root(noise), _root(noise), _root(relative), paths)
+
+    def _relative(self, trace: Trace, paths: float, seconds: float, allocation: Allocation) -> Estimate:
+        """Variance of one query's noise over the square of max(value, tile mean); values are those of the
+        reference, which no path of the setting enters."""
+        count = int(min(max(_PIECE_PATHS / paths, _FEWEST_IN_PIECE), BIAS_QUERIES))
+        squares: list[NDArray[np.float64]] = []
+        began = time.perf_counter()
+        while True:
+            piece = len(squares)
+            reference = self.reference({}, piece)
+            queries = _first(reference.queries, count)
+            found = trace(queries, Stream(self.seed, "test", _FIRST_PIECE + piece))
+            value = 0.5 * (reference.a + reference.b)[:count].mean(axis=1)
+            scale = np.maximum(value, allocation.tile_mean(queries))
+            square = ((found.value_a.astype(np.float64) - found.value_b) ** 2 / 4.0).mean(axis=1)
+            squares.append(np.divide(square, scale**2, out=np.zeros(len(square)), where=scale > 0))
+            variance = mean_estimate(np.concatenate(squares))
+            late = time.perf_counter() - began > seconds or len(squares) == _MOST_BIAS_PIECES
+            if _sure(variance) or late:
+                return variance
 
     def _bias(self, estimator: Any, against: dict[str, Any], seconds: float, mean: float) -> Estimate:
         """Squared bias relative to the mean value squared."""
@@ -156,11 +223,11 @@ class Bench:
                 return square
 
     def _noise(
-        self, job: Job, estimator: Any, spp: int, seconds: float, mean: float
+        self, job: Job, trace: Trace, paths: float, seconds: float, mean: float
     ) -> tuple[Estimate, Estimate]:
         """Variance of one query's noise relative to the mean value squared, and seconds per million
-        queries; the first piece, which may compile, is not timed."""
-        count = max(1, _PIECE_PATHS // spp)
+        queries of about so many paths; the first piece, which may compile, is not timed."""
+        count = max(1, round(_PIECE_PATHS / paths))
         squares: list[NDArray[np.float64]] = []
         prices: list[float] = []
         began = time.perf_counter()
@@ -168,7 +235,7 @@ class Bench:
         while True:
             queries = self.queries(job, _FIRST_PIECE + piece, count)
             start = time.perf_counter()
-            found = estimator.estimate(queries, spp, Stream(self.seed, "test", _FIRST_PIECE + piece))
+            found = trace(queries, Stream(self.seed, "test", _FIRST_PIECE + piece))
             took = time.perf_counter() - start
             difference = found.value_a.astype(np.float64) - found.value_b
             squares.append((difference**2 / 4.0).mean(axis=1) / mean**2)
@@ -176,9 +243,17 @@ class Bench:
                 prices.append(took / len(difference) * 1e6)
             piece += 1
             variance = mean_estimate(np.concatenate(squares))
-            sure = 1.96 * variance.error <= 2 * _HALF_WIDTH * variance.value or variance.value == 0
-            if piece >= _FEWEST_PIECES and (sure or time.perf_counter() - began > seconds):
+            if piece >= _FEWEST_PIECES and (_sure(variance) or time.perf_counter() - began > seconds):
                 return variance, mean_estimate(prices)
+
+
+def _sure(variance: Estimate) -> bool:
+    """Whether the 95 % interval of a variance's root is as narrow as wanted."""
+    return 1.96 * variance.error <= 2 * _HALF_WIDTH * variance.value or variance.value == 0
+
+
+def _first(queries: Queries, count: int) -> Queries:
+    return Queries(queries.u[:count], queries.sigma[:count], queries.omega_i[:count], queries.omega_o[:count])
 
 
 def _total(bias: Estimate, noise: Estimate) -> Estimate:

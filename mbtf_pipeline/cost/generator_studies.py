@@ -6,12 +6,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-from mbtf_gen.effects import EFFECTS
 from mbtf_gen.planning import plan_effects
 
 from .generator import Bench
 from .points import Point
 
+# Paths per query at which adaptive counts are held against equal ones, and target errors.
+COUNTS = (4, 16, 64)
+TARGETS = ("40%", "20%", "10%")
 PATHS = (2, 4, 8, 16, 32, 64, 128)
 DEPTHS = (1, 2, 3, 4, 6, 0)
 MESH_SHARES = (0.25, 0.5, 1.0, 2.0)
@@ -44,29 +46,41 @@ class GeneratorTask:
 
     def run(self, bench: Bench, seconds: float) -> Point:
         """Measure it, timing for at most so many seconds."""
-        found = bench.measure(self.changes, self.against, seconds)
+        if self.study == "adaptive":
+            even = self.changes.get("queries.allocation") == "even"
+            found = bench.measure_counts(self.changes, not even, seconds)
+        else:
+            found = bench.measure(self.changes, self.against, seconds)
+        details = {}
+        if found.relative is not None and found.paths is not None:
+            details = {
+                "relative": found.relative.value,
+                "relative_se": found.relative.error,
+                "paths": found.paths,
+            }
         return Point(
             self.study,
             self.series,
             self.name,
             self.changes,
-            command_of(bench.config.material, self.changes),
+            "",
             found.seconds,
             found.error,
             found.bias,
             found.noise,
+            details,
         )
 
-
-def command_of(material: str, changes: dict[str, Any]) -> str:
-    """The generator's command with these options."""
-    sets = "".join(f" --set {name}={value}" for name, value in changes.items())
-    return f"mbtf-gen {material}{sets} -o shards/"
+    def command(self, generator: str) -> str:
+        """What measures it with the program: its command with the study's configuration, and the setting."""
+        sets = "".join(f" --set {name}={value}" for name, value in self.changes.items())
+        return f"{generator}{sets} -o shards/"
 
 
 def generator_tasks(bench: Bench) -> Iterator[GeneratorTask]:
     """All settings, the most telling first: a study that runs out of time has measured those."""
     yield from (GeneratorTask("paths", "fixed", f"{n} paths", {"queries.spp": n}, None) for n in PATHS)
+    yield from _counts()
     yield from _effects(bench)
     for depth in DEPTHS:
         name = f"{depth} interactions" if depth else "no limit"
@@ -79,14 +93,26 @@ def generator_tasks(bench: Bench) -> Iterator[GeneratorTask]:
         yield GeneratorTask("light", "width", f"{degrees:g} degrees", {"light.width": degrees})
 
 
+def _counts() -> Iterator[GeneratorTask]:
+    kinds = (("even", "the same for every query"), ("noise", "more where more noise is expected"))
+    for allocation, series in kinds:
+        for n in COUNTS:
+            changes = {"queries.spp": n, "queries.allocation": allocation}
+            yield GeneratorTask("adaptive", series, f"{n}", changes, None)
+    for error in TARGETS:
+        changes = {"queries.target_error": error}
+        yield GeneratorTask("adaptive", "a target error", error.replace("%", " %"), changes, None)
+
+
 def _effects(bench: Bench) -> Iterator[GeneratorTask]:
     everything = plan_effects(bench.job({"effects.mode": "all"}), pilots=False)
     yield GeneratorTask("effects", "effects", "auto", {"effects.mode": "auto"})
     yield GeneratorTask("effects", "effects", "all", {"effects.mode": "all"})
-    for name in EFFECTS:
-        if everything.on(name):
-            mode = f"all,-{name}"
-            yield GeneratorTask("effects", "effects", f"without {name}", {"effects.mode": mode})
+    for effect in everything.effects:
+        # Some are not there to be switched: the tile repeats by construction.
+        if effect.on and effect.present:
+            mode = f"all,-{effect.name}"
+            yield GeneratorTask("effects", "effects", f"without {effect.name}", {"effects.mode": mode})
 
 
 def _meshes(bench: Bench) -> Iterator[GeneratorTask]:

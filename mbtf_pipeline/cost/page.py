@@ -3,137 +3,146 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from mbtf_gen.atomic import write_text
 from mbtf_gen.console import clock
+from mbtf_gen.stats import Estimate
 
-from ..plots import Cloud, scatter
 from ..report import page_environment, template
+from .figures import (
+    bias_figures,
+    count_figures,
+    data_figures,
+    fit_figures,
+    front_figures,
+    noise_figures,
+)
 from .front import marginal_price, pareto_front
 from .points import Point
+from .scatter import seed_scatter
 from .study import Study
 from .tables import chain_table, generator_table, to_csv
 
 CSV_NAME, PAGE_NAME = "cost.csv", "cost.html"
+# Half-width of a 95 % interval, relative, that a study aims at.
+HALF_WIDTH = 0.1
 
-# Studies of the generator: title, and what to read from the plot.
-_GENERATOR = {
+Figures = Callable[[Sequence[Point], str, Path], list[dict[str, Any]]]
+Table = Callable[[Sequence[Point]], dict[str, Any]]
+# Studies: title, what to read from the plot, its plots, its table.
+_STUDIES: dict[str, tuple[str, str, Figures, Table]] = {
+    "data": (
+        "Queries or paths?",
+        "Data of equal numbers of paths, divided among many noisy or few clean queries; one fit of equal "
+        "length each.",
+        data_figures,
+        chain_table,
+    ),
+    "fit": (
+        "Models and sizes",
+        "On one data set: what training time buys for each model and size, what they cost when they are "
+        "evaluated, and how large they are.",
+        fit_figures,
+        chain_table,
+    ),
     "paths": (
         "Paths per query",
         "More paths buy less noise; there is no bias to buy off. Independent samples would fall along a "
         "slope of −½ (error against seconds); better points fall faster.",
+        noise_figures,
+        generator_table,
+    ),
+    "adaptive": (
+        "The same paths for all, or as many as each needs",
+        "Equal numbers of paths, numbers in proportion to the noise that a pilot expects (what runs do by "
+        "themselves), and as many as a target error takes, the queries’ own pilots included.",
+        count_figures,
+        generator_table,
     ),
     "effects": (
         "Effects",
         "What each effect costs in time, and what leaving it out costs in accuracy: its bias does not go "
         "away with more paths.",
+        bias_figures,
+        generator_table,
     ),
-    "bounces": ("Surface interactions", "A cap saves time and leaves a bias; no limit leaves none."),
+    "bounces": (
+        "Surface interactions",
+        "A cap saves time and leaves a bias; no limit leaves none.",
+        bias_figures,
+        generator_table,
+    ),
     "mesh": (
         "Mesh",
         "Bias against the finest mesh that was tried. It is part of what the material is: a coarser mesh is "
         "another, smoother surface.",
+        bias_figures,
+        generator_table,
     ),
     "light": (
         "Width of the light",
         "Another width is another quantity: a wider lobe blurs highlights and shadows (bias against the "
         "recipe’s width), and has less noise.",
-    ),
-    "adaptive": ("Adaptive paths", "Paths chosen per query for a target error, against the same for all."),
-}
-_CHAINS = {
-    "data": (
-        "Queries or paths?",
-        "Data of equal numbers of paths, divided among many noisy or few clean queries; one fit of equal "
-        "length each.",
-        "seconds of generating",
-    ),
-    "fit": (
-        "Models and sizes",
-        "On one data set: what training time buys for each model and size.",
-        "seconds of training",
+        bias_figures,
+        generator_table,
     ),
 }
-
-
-def _clouds(points: Sequence[Point], *, parts: bool) -> list[Cloud]:
-    """Points as clouds: total error, or noise and bias apart."""
-    if not parts:
-        names = list(dict.fromkeys(p.series for p in points))
-        return [_cloud(n, [p for p in points if p.series == n], "error") for n in names]
-    return [
-        _cloud("bias, where it is told from zero", [p for p in points if _told(p)], "bias"),
-        _cloud("noise", points, "noise", hollow=True, labelled=False),
-    ]
-
-
-def _told(point: Point) -> bool:
-    return point.bias is not None and point.bias.value > 2 * point.bias.error
-
-
-def _cloud(
-    name: str, points: Sequence[Point], part: str, *, hollow: bool = False, labelled: bool = True
-) -> Cloud:
-    ordered = sorted(points, key=lambda p: p.seconds.value)
-    estimates = [getattr(p, part) for p in ordered]
-    return Cloud(
-        name,
-        [p.seconds.value for p in ordered],
-        [e.value for e in estimates],
-        [p.seconds.error for p in ordered],
-        [e.error if math.isfinite(e.error) else 0.0 for e in estimates],
-        [p.name if labelled else "" for p in ordered],
-        joined=part == "error",
-        hollow=hollow,
-    )
-
-
-def _generator_part(study: Study, name: str) -> dict[str, Any] | None:
-    points = [p for p in study.points if p.study == name]
-    if not points:
-        return None
-    title, text = _GENERATOR[name]
-    parts = name not in ("paths", "adaptive")
-    clouds = [c for c in _clouds(points, parts=parts) if len(c.x)]
-    svg = scatter(
-        clouds,
-        "seconds per million queries",
-        "RMS error relative to the mean value",
-        f"cost {name}",
-        png=study.folder / f"{name}.png",
-    )
-    return {"id": name, "title": title, "text": text, "svg": svg, "table": generator_table(points)}
-
-
-def _chain_part(study: Study, name: str) -> dict[str, Any] | None:
-    points = [p for p in study.points if p.study == name]
-    if not points:
-        return None
-    title, text, x = _CHAINS[name]
-    svg = scatter(
-        _clouds(points, parts=False),
-        x,
-        "unexplained variance of test queries",
-        f"cost {name}",
-        png=study.folder / f"{name}.png",
-    )
-    return {"id": name, "title": title, "text": text, "svg": svg, "table": chain_table(points)}
 
 
 def whole_chains(points: Sequence[Point]) -> list[Point]:
     """All chains that were measured, whatever their study, by what they cost in all."""
-    from dataclasses import replace
-
-    from mbtf_gen.stats import Estimate
-
     return [
         replace(p, seconds=Estimate(p.details["total_seconds"], 0.0, 1))
         for p in points
-        if "total_seconds" in p.details
+        if "total_seconds" in p.details and p.study != "seeds"
     ]
+
+
+def paths_slope(points: Sequence[Point]) -> Estimate | None:
+    """Power of the number of paths with which the noise's variance falls, from a line through logarithms
+    weighted by their error bars; None where there are fewer than three."""
+    known = [
+        (math.log(p.setting["queries.spp"]), 2 * math.log(p.noise.value), 2 * p.noise.relative_error)
+        for p in points
+        if p.study == "paths" and p.noise is not None and p.noise.value > 0 and p.noise.error > 0
+    ]
+    if len(known) < 3:
+        return None
+    weights = [1 / e**2 for _, _, e in known]
+    total = sum(weights)
+    mean_x, mean_y = (sum(w * k[i] for w, k in zip(weights, known, strict=True)) / total for i in (0, 1))
+    spread = sum(w * (x - mean_x) ** 2 for w, (x, _, _) in zip(weights, known, strict=True))
+    slope = sum(w * (x - mean_x) * (y - mean_y) for w, (x, y, _) in zip(weights, known, strict=True)) / spread
+    return Estimate(slope, math.sqrt(1 / spread), len(known))
+
+
+def half_widths(points: Sequence[Point]) -> tuple[int, int]:
+    """(errors whose 95 % interval is within `HALF_WIDTH` of them, all)."""
+    widths = [1.96 * p.error.relative_error for p in points if p.study != "seeds" and p.error.value > 0]
+    return sum(w <= HALF_WIDTH for w in widths), len(widths)
+
+
+def _part(study: Study, name: str) -> dict[str, Any] | None:
+    points = [p for p in study.points if p.study == name]
+    if not points:
+        return None
+    title, text, figures, table = _STUDIES[name]
+    if name == "paths" and (slope := paths_slope(points)) is not None:
+        text += (
+            f" Here the noise’s variance falls with the power {slope.scaled(-1.0)} of the number of paths."
+        )
+    return {
+        "id": name,
+        "title": title,
+        "text": text,
+        "figures": figures(points, name, study.folder),
+        "table": table(points),
+        "open": False,
+    }
 
 
 def _front_part(study: Study) -> dict[str, Any] | None:
@@ -142,14 +151,6 @@ def _front_part(study: Study) -> dict[str, Any] | None:
         return None
     front = pareto_front(chains)
     price = marginal_price(front)
-    svg = scatter(
-        _clouds(chains, parts=False),
-        "seconds in all, from height map to material",
-        "unexplained variance of test queries",
-        "cost front",
-        front=[(p.seconds.value, p.error.value) for p in front],
-        png=study.folder / "front.png",
-    )
     text = "Every chain that was measured, and those that nothing beats in both time and error."
     if price is not None:
         seconds, power = price
@@ -157,17 +158,22 @@ def _front_part(study: Study) -> dict[str, Any] | None:
             f" Along the front the error falls with the power {power:.2f} of time: halving the last one’s "
             f"would take about {clock(seconds)} more."
         )
-    return {"id": "front", "title": "The whole chain", "text": text, "svg": svg, "table": chain_table(front)}
+    return {
+        "id": "front",
+        "title": "The whole chain",
+        "text": text,
+        "figures": front_figures(chains, study.folder),
+        "table": chain_table(front),
+        "open": True,
+    }
 
 
 def write_page(study: Study) -> Path:
     """Write CSV, page and pictures into the study's folder; returns the page's path."""
     write_text(study.folder / CSV_NAME, to_csv(study.points))
-    parts = [
-        _front_part(study),
-        *(_chain_part(study, name) for name in _CHAINS),
-        *(_generator_part(study, name) for name in _GENERATOR),
-    ]
+    parts = [_front_part(study), *(_part(study, name) for name in _STUDIES)]
+    scatter = seed_scatter(study.points)
+    held, known = half_widths(study.points)
     html: str = (
         page_environment()
         .from_string(template("cost.html"))
@@ -177,6 +183,13 @@ def write_page(study: Study) -> Path:
             budget=clock(study.description["budget"]),
             parts=[p for p in parts if p is not None],
             skipped=study.skipped,
+            scatter=(
+                ""
+                if scatter is None
+                else f"; those of fits hold {scatter.value:.1%} for the scatter between seeds, as "
+                f"{scatter.n} fits of the shortest kind show it"
+            ),
+            widths=f"{held} of {known} errors are known to within a tenth (95 %).",
         )
     )
     path = study.folder / PAGE_NAME

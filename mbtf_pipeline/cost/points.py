@@ -15,7 +15,7 @@ from ..stages import hash_of
 
 POINT_FORMAT = "mbtf-cost-point"
 # Raised when a point is measured in another way: what an earlier version measured is measured again.
-POINT_SCHEMA = 1
+POINT_SCHEMA = 2
 POINTS = "points"
 
 

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from mbtf_gen.atomic import read_json, write_json, write_text
+from mbtf_gen.config import GeneratorConfig, count_queries
 from mbtf_gen.errors import InputError
-from mbtf_gen.material import load_material
+from mbtf_gen.generation import Job
+from mbtf_gen.material import Material, load_material
 from mbtf_gen.settings import dump_yaml
 
 from ..recipe import Recipe
@@ -20,6 +22,7 @@ from .chains import Workshop
 from .generator import Bench
 from .generator_studies import generator_tasks
 from .points import Point, PointFolder
+from .scatter import with_scatter
 
 STUDY_NAME = "study.json"
 STUDY_FORMAT = "mbtf-cost"
@@ -29,7 +32,10 @@ WORK = ".work"
 # Share of the budget that is kept for whole chains while the generator is studied.
 _RESERVED = 0.7
 # Settings that the generator's share of the budget is divided among.
-_SETTINGS = 32
+_SETTINGS = 42
+# Paths of a test query of whole chains: the recipe's paths go to more queries. Halves need no more, for
+# errors are free of noise; what limits them is how they vary over queries.
+_TEST_PATHS, _MOST_TEST_QUERIES = 16, 1 << 18
 
 Tell = Callable[[float, str], None]
 
@@ -126,28 +132,43 @@ def run_study(
         study = Study(folder, description)
         store = PointFolder(folder, {"config": config.hash(material.digests)})
         bench = Bench(config, material, config.seed)
+        generator = f"mbtf-gen {config.material} --config {folder / CONFIG_NAME}"
         each = 0.5 * GENERATOR * budget / _SETTINGS
         for task in generator_tasks(bench):
             point = store.get(task.study, task.key)
             if point is None and left() > _RESERVED * budget:
-                note(f"{task.study}: {task.name}")
+                note(f"{task.study}: {task.series}, {task.name}")
                 point = task.run(bench, each)
                 store.put(task.key, point)
-            _keep(study, point, f"{task.study}: {task.name}")
-        price = _price(study.points, config.queries.spp)
+            _keep(study, point, f"{task.study}: {task.series}, {task.name}", task.command(generator))
+        price = _price(study.points)
         if price is not None:
-            _measure_chains(study, store, config, budget, price, left, note)
-    return study
+            judged = _tested(config, material)
+            work = Workshop(judged, folder / WORK, generator, note)
+            _measure_chains(study, store, work, budget, price, left)
+    return replace(study, points=with_scatter(study.points))
 
 
-def _keep(study: Study, point: Point | None, name: str) -> None:
+def _tested(config: GeneratorConfig, material: Material) -> GeneratorConfig:
+    """The configuration with the paths of its test split divided among more queries, up to a number that is
+    made in seconds."""
+    queries = config.queries
+    spp = min(queries.test_spp, _TEST_PATHS)
+    count = count_queries(queries.test, Job.of(config, material).lattice.texels()) * queries.test_spp // spp
+    test = str(min(count, _MOST_TEST_QUERIES))
+    changed = queries.model_copy(update={"test": test, "test_spp": spp})
+    return config.model_copy(update={"queries": changed})
+
+
+def _keep(study: Study, point: Point | None, name: str, command: str) -> None:
+    """Take a point up; its command names the study's folder, which may have moved since it was measured."""
     if point is None:
         study.skipped.append(name)
     else:
-        study.points.append(point)
+        study.points.append(replace(point, command=command))
 
 
-def _price(points: Iterable[Point], spp: int) -> Callable[[int], float] | None:
+def _price(points: Iterable[Point]) -> Callable[[int], float] | None:
     """Seconds per query by its paths, from those that were measured: the nearest number of paths, in
     proportion."""
     known = {int(p.setting["queries.spp"]): p.seconds.value * 1e-6 for p in points if p.study == "paths"}
@@ -164,16 +185,13 @@ def _price(points: Iterable[Point], spp: int) -> Callable[[int], float] | None:
 def _measure_chains(
     study: Study,
     store: PointFolder,
-    config: Any,
+    work: Workshop,
     budget: float,
     price: Callable[[int], float],
     left: Callable[[], float],
-    note: Callable[[str], None],
 ) -> None:
-    command = f"mbtf-gen {config.material} --config {study.folder / CONFIG_NAME}"
-    work = Workshop(config, study.folder / WORK, command, note)
     # Prices are those of stored points: a study that goes on has the same tasks.
-    tasks = list(chains(budget, config.queries.spp, price))
+    tasks = list(chains(budget, work.config.queries.spp, price))
     needed = [(t.queries, t.spp) for t in tasks]
     try:
         for number, task in enumerate(tasks):
@@ -181,7 +199,8 @@ def _measure_chains(
             if point is None and left() > task.seconds(price, data=not work.has(task)):
                 point = work.measure(task)
                 store.put(task.key, point)
-            _keep(study, point, f"{task.study}: {task.series}, {task.name}")
+            name = f"{task.study}: {task.series}, {task.name}"
+            _keep(study, point, name, work.command_of(task))
             if (task.queries, task.spp) not in needed[number + 1 :]:
                 work.forget(task.queries, task.spp)
     finally:

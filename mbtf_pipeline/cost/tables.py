@@ -20,7 +20,11 @@ _DETAILS = (
     "total_seconds",
     "evaluation_ms_1080p",
     "bytes",
+    "half_bytes",
     "half_error",
+    "relative",
+    "relative_se",
+    "paths",
 )
 COLUMNS = (
     "study",
@@ -62,6 +66,8 @@ def to_csv(points: Sequence[Point]) -> str:
 def _percent(e: Estimate | None) -> str:
     if e is None or not math.isfinite(e.value):
         return "–"
+    if e.value == e.error == 0:
+        return "0 %"
     if e.value <= 2 * e.error:
         return f"< {100 * 2 * max(e.error, e.value):.2g} %"
     return f"{e.scaled(100.0)} %"
@@ -72,13 +78,23 @@ def _seconds(e: Estimate) -> str:
 
 
 def generator_table(points: Sequence[Point]) -> dict[str, Any]:
-    """Settings of the generator: price, bias, noise, both."""
-    head = ["setting", "seconds per million queries", "bias", "noise", "error", "command"]
-    rows = [
-        [p.name, _seconds(p.seconds), _percent(p.bias), _percent(p.noise), _percent(p.error), p.command]
-        for p in points
-    ]
-    return {"title": "", "head": head, "rows": rows}
+    """Settings of the generator: price, bias, noise, both; for ways to count paths how many there were and
+    the noise relative to each value in place of bias and total."""
+    counts = any("relative" in p.details for p in points)
+    head = ["setting", "seconds per million queries"]
+    counted = ["paths per query", "noise", "noise ÷ max(value, tile mean)"]
+    head += counted if counts else ["bias", "noise", "error"]
+    rows = []
+    for p in points:
+        row = [f"{p.series}, {p.name}" if counts else p.name, _seconds(p.seconds)]
+        if counts:
+            d = p.details
+            relative = Estimate(d["relative"], d["relative_se"], 1)
+            row += [f"{d['paths']:.0f}", _percent(p.noise), _percent(relative)]
+        else:
+            row += [_percent(p.bias), _percent(p.noise), _percent(p.error)]
+        rows.append([*row, p.command])
+    return {"title": "", "head": [*head, "command"], "rows": rows}
 
 
 def chain_table(points: Sequence[Point]) -> dict[str, Any]:
@@ -93,6 +109,7 @@ def chain_table(points: Sequence[Point]) -> dict[str, Any]:
         "the same in half precision",
         "1080p, ms",
         "MB",
+        "MB in half",
         "command",
     ]
     rows = []
@@ -109,6 +126,7 @@ def chain_table(points: Sequence[Point]) -> dict[str, Any]:
                 f"{d['half_error']:.4g}",
                 f"{d['evaluation_ms_1080p']:.0f}",
                 f"{d['bytes'] / 1e6:.2f}",
+                f"{d['half_bytes'] / 1e6:.2f}",
                 p.command,
             ]
         )

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mbtf_fit.data import QUERY_BYTES
 from mbtf_gen.durations import parse_duration
 from mbtf_gen.errors import InputError, UsageError
 from mbtf_gen.stats import Estimate
@@ -58,6 +59,8 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, float]]:
     monkeypatch.setattr("mbtf_gen.generation.allocated", lambda job, plan: plan)
     monkeypatch.setattr("mbtf_pipeline.cost.chains.Workshop.measure", measure)
     monkeypatch.setattr(module.time, "perf_counter", lambda: 0.0)
+    monkeypatch.setattr(module.shutil, "disk_usage", lambda path: SimpleNamespace(free=1e15))
+    monkeypatch.setattr(module, "physical_memory", lambda: 1e15)
     return chains
 
 
@@ -115,6 +118,26 @@ def test_short_budgets_take_the_usual_share(measured: list[tuple[int, float]], t
     assert not measured
     assert split.share == USUAL_SHARE
     assert split.generating + split.training == pytest.approx(100.0, abs=0.2)
+
+
+@pytest.mark.parametrize("scarce", ["disk", "memory"])
+def test_disk_and_memory_bound_the_queries(
+    measured: list[tuple[int, float]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scarce: str
+) -> None:
+    """Queries that cost next to nothing would fill the disk in any time, which goes to training instead."""
+    monkeypatch.setattr(f"{__name__}.PRICE", 1e-12)
+    if scarce == "disk":
+        monkeypatch.setattr(module.shutil, "disk_usage", lambda path: SimpleNamespace(free=8e7))
+    else:
+        monkeypatch.setattr(module, "physical_memory", lambda: 10e6)
+    asked = load_recipe(ROOT / "pipelines" / "quickstart.yaml", ["fit.neumip.data.memory=20 MB"])
+    split = split_budget(asked, 1000.0, tmp_path / "run", "command", lambda note: None)
+    # A quarter of the disk, 68 bytes a query; or what the fit may hold, more than half the memory.
+    most = 20e6 / (68 if scarce == "disk" else QUERY_BYTES)
+    assert 0.9 * most < split.queries <= most
+    assert [n for n, _ in measured] == [split.queries] * 3
+    assert split.generating + split.training == pytest.approx(1000.0, abs=0.5)
+    assert split.training > 990.0
 
 
 def test_fits_share_the_time_of_training(measured: list[tuple[int, float]], tmp_path: Path) -> None:

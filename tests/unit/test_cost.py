@@ -15,12 +15,16 @@ from mbtf_gen.config import GeneratorConfig
 from mbtf_gen.estimates import Estimates, Stream
 from mbtf_gen.generation import Job
 from mbtf_gen.material import Material
+from mbtf_gen.planning import plan_effects
 from mbtf_gen.queries import Queries
 from mbtf_gen.stats import Estimate
 from mbtf_pipeline.cost.chain_studies import DATA, FIT, GENERATOR, SHORTEST, WHOLE, chains
 from mbtf_pipeline.cost.front import marginal_price, pareto_front
 from mbtf_pipeline.cost.generator import Bench
+from mbtf_pipeline.cost.generator_studies import COUNTS, TARGETS, generator_tasks
+from mbtf_pipeline.cost.page import half_widths, paths_slope
 from mbtf_pipeline.cost.points import Point, PointFolder
+from mbtf_pipeline.cost.scatter import seed_scatter, with_scatter
 from mbtf_pipeline.cost.tables import COLUMNS, to_csv
 
 NOISE = 0.8  # standard deviation of one path, relative to the value
@@ -33,19 +37,24 @@ class Fake:
     def __init__(self, job: Job) -> None:
         self.shift = SHIFT if job.config.transport.max_depth == 1 else 0.0
 
-    def estimate(self, queries: Queries, spp: int, stream: Stream) -> Estimates:
+    def estimate(
+        self, queries: Queries, spp: Any, stream: Stream, *, path_variance: bool = False
+    ) -> Estimates:
         # Other paths have other noise, as where another setting takes other turns.
-        rng = np.random.default_rng([stream.root, stream.shard, len(queries.sigma), self.shift > 0])
+        key = [stream.root, stream.shard, stream.first_pass, len(queries.sigma), self.shift > 0]
+        rng = np.random.default_rng(key)
+        each = np.broadcast_to(spp, len(queries.sigma))
         truth = 0.2 + 0.1 * queries.u[:, :1]
         # The bias has either sign: what counts is its square, query by query.
         sign = np.where(queries.u[:, 1:] < 0.5, -1.0, 1.0)
         halves = [
             truth * (1 + self.shift * sign)
-            + 0.25 * NOISE * rng.normal(size=(len(truth), 3)) / math.sqrt(spp / 2)
+            + 0.25 * NOISE * rng.normal(size=(len(truth), 3)) / np.sqrt(each[:, None] / 2)
             for _ in range(2)
         ]
         a, b = (h.astype(np.float32) for h in halves)
-        return Estimates(a, b, None, len(truth) * spp, 0, 0, 0)
+        known = np.full(len(truth), (0.25 * NOISE) ** 2, np.float32) if path_variance else None
+        return Estimates(a, b, None, int(each.sum()), 0, 0, 0, path_variance=known)
 
 
 @pytest.fixture
@@ -77,6 +86,29 @@ def test_an_unbiased_setting_shows_no_bias(bench: Bench) -> None:
     assert bench.measure({"queries.spp": 8}, None, 0.0).bias is None
 
 
+def test_adaptive_counts_are_measured_by_both_kinds_of_error(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Values of known noise, the same for all: a target error takes the paths that bring it."""
+    monkeypatch.setattr(
+        "mbtf_pipeline.cost.generator.plan_effects", lambda job: plan_effects(job, pilots=False)
+    )
+    even = bench.measure_counts({"queries.spp": 16, "queries.allocation": "even"}, False, 0.0)
+    assert even.bias is None
+    assert even.paths == 16
+    assert abs(even.noise.value - NOISE / 4) < 4 * even.noise.error
+    assert even.relative is not None
+    # Deviation 0.2 of one path over values of 0.2 to 0.3, or over their mean 0.25 where that is more.
+    scale = np.maximum(0.2 + 0.1 * np.linspace(0, 1, 10001), 0.25)
+    truth = 0.25 * NOISE / 4 * math.sqrt(np.mean(scale**-2.0))
+    assert abs(even.relative.value - truth) < 4 * even.relative.error + 0.02 * truth
+    aimed = bench.measure_counts({"queries.target_error": "10%"}, True, 0.0)
+    assert aimed.relative is not None
+    assert aimed.paths is not None
+    assert 0.08 < aimed.relative.value < 0.1
+    assert aimed.paths > 4 * (NOISE / 0.4) ** 2 + 16
+
+
 def test_seeds_change_the_measurement_and_nothing_else_does(bench: Bench) -> None:
     again = Bench(bench.config, bench.material, 0)
     other = Bench(bench.config, bench.material, 1)
@@ -84,6 +116,36 @@ def test_seeds_change_the_measurement_and_nothing_else_does(bench: Bench) -> Non
     assert noise[0] == noise[1]
     assert noise[0].value != noise[2].value
     assert abs(noise[0].value - noise[2].value) < 4 * math.hypot(noise[0].error, noise[2].error)
+
+
+def test_every_setting_is_one_that_the_generator_takes(bench: Bench) -> None:
+    """Effects that cannot be left out are not asked away."""
+    tasks = list(generator_tasks(bench))
+    for task in tasks:
+        plan_effects(bench.job(task.changes), pilots=False)
+    names = {t.name for t in tasks if t.study == "effects"}
+    assert {"auto", "all", "without shadowing", "without interreflection"} <= names
+    assert "without neighbours" not in names
+    assert sum(t.study == "adaptive" for t in tasks) == 2 * len(COUNTS) + len(TARGETS)
+
+
+def test_the_slope_of_the_noise_is_that_of_its_variance() -> None:
+    one = Estimate(1.0, 0.0, 1)
+    points = [
+        Point("paths", "", "", {"queries.spp": n}, "", one, one, noise=Estimate(e, 0.01 * e, 9))
+        for n, e in ((n, 2.0 * n**-0.6) for n in (2, 8, 32))
+    ]
+    slope = paths_slope(points)
+    assert slope is not None
+    assert slope.value == pytest.approx(-1.2)
+    # All bars are alike, 2 % of the variance: that of the slope of a line.
+    assert slope.error == pytest.approx(0.02 / math.sqrt(2 * math.log(4) ** 2))
+    assert paths_slope(points[:2]) is None
+
+
+def test_half_widths_are_those_of_95_percent() -> None:
+    # All bars are 0.01: 4 % of 0.5, 20 % of 0.1.
+    assert half_widths([point(1, 0.5), point(1, 0.1), point(1, 0.5, "seeds")]) == (1, 2)
 
 
 def point(seconds: float, error: float, study: str = "chain", **details: float) -> Point:
@@ -149,26 +211,61 @@ def test_csv_holds_every_number_with_its_error() -> None:
     assert rows[0]["bias"] == rows[1]["error"] == ""
 
 
-@pytest.mark.parametrize("budget", [600.0, 3600.0])
+@pytest.mark.parametrize("budget", [600.0, 900.0, 3600.0])
 def test_chains_fit_into_their_budget(budget: float) -> None:
     def price(spp: int) -> float:
         return spp * 5e-7
 
     found = list(chains(budget, 4, price))
-    assert {c.study for c in found} == {"chain", "data", "fit"}
+    assert {c.study for c in found} == {"chain", "data", "fit", "seeds"}
     made: set[tuple[int, int]] = set()
-    spent = dict.fromkeys(("data", "fit", "chain"), 0.0)
+    spent = dict.fromkeys(("data", "fit", "chain", "seeds"), 0.0)
     for chain in found:
         spent[chain.study] += chain.seconds(price, data=(chain.queries, chain.spp) not in made)
         made.add((chain.queries, chain.spp))
+    spent["fit"] += spent.pop("seeds")
     assert 0.4 * budget < sum(spent.values()) < (1.0 - GENERATOR) * budget
     for study, share in (("data", DATA), ("fit", FIT), ("chain", WHOLE)):
         assert spent[study] <= 1.05 * share * budget
     # Equal numbers of paths are compared, whatever their number per query.
     budgets = {c.queries * c.spp for c in found if c.study == "data"}
     assert len(budgets) == 2
+    # From a minute upwards, each twice as long as the one before, as far as the budget goes.
     whole = [c for c in found if c.study == "chain"]
-    assert min(c.seconds(price) for c in whole) == pytest.approx(SHORTEST, rel=0.1)
+    totals = sorted({round(c.seconds(price) / SHORTEST) for c in whole})
+    assert totals == [2**n for n in range(len(totals))]
+    assert sum(totals) <= WHOLE * budget / SHORTEST < sum(totals) + 2 * totals[-1]
+    # Fits of other seeds are of a setting that was measured, on its data.
+    (like,) = (c for c in found if c.study == "fit" and c.name == f"{0.5 * FIT * budget / 13.5:.3g} s")
+    others = [c for c in found if c.study == "seeds"]
+    assert all(c.fit == {**like.fit, "seed": c.fit["seed"]} for c in others)
+    assert all((c.queries, c.spp) == (like.queries, like.spp) for c in others)
+    assert {c.fit["seed"] for c in others} == {1, 2, 3}
+
+
+SETTING = {"queries.train": "100", "training.time": "5s"}
+
+
+def fitted(error: float, study: str = "fit", **more: Any) -> Point:
+    """A fit's point."""
+    five = Estimate(5.0, 0.0, 1)
+    return Point(study, "neumip", "a fit", SETTING | more, "", five, Estimate(error, 0.01, 9))
+
+
+def test_bars_of_fits_hold_the_scatter_of_seeds() -> None:
+    seeds = [fitted(e, "seeds", seed=n) for n, e in enumerate((0.22, 0.18, 0.21), start=1)]
+    points = [fitted(0.2), *seeds, point(60, 0.4), point(8, 0.3, "paths")]
+    scatter = seed_scatter(points)
+    assert scatter is not None
+    assert scatter.value == pytest.approx(np.std(np.log([0.2, 0.22, 0.18, 0.21]), ddof=1))
+    widened = with_scatter(points)
+    assert widened[-2].error.error == pytest.approx(math.hypot(0.01, 0.4 * scatter.value))
+    # The generator's errors are not those of fits.
+    assert widened[-1] == points[-1]
+    # Another setting's error is no part of it, and two values are too few to tell.
+    assert seed_scatter([*points, fitted(9.0, **{"training.time": "9s"})]) == scatter
+    assert seed_scatter(points[:2]) is None
+    assert with_scatter(points[:2]) == points[:2]
 
 
 def test_a_study_of_a_folder_with_something_else_in_it_is_refused(tmp_path: Path) -> None:
