@@ -42,7 +42,7 @@ _CHUNK = 1 << 18
 POINTS = 1 << 17
 _LEAST_POINTS = 1 << 12
 # What may be expected of factors beforehand: second differences between knots, and distances from 1.
-CURVATURES, DISTANCES = (0.0003, 0.001, 0.003, 0.01), (0.003, 0.01, 0.03, 0.1)
+CURVATURES, DISTANCES = (0.0003, 0.001, 0.003, 0.01), (0.003, 0.01, 0.03)
 _SECOND = np.diff(np.eye(KNOTS), 2, axis=0)
 # The covariances of factors that go with them: (pairs, knots, knots).
 _PRIORS = np.stack(

@@ -53,7 +53,7 @@ def data(n: int, noise: float, seed: int = 0) -> TrainingQueries:
 def excess(gain: F32 | None, sigma: float, axis: int) -> F32:
     """(wrong · gain) over truth, minus 1, by six bands of light's (0) or view's (1) elevation."""
     random = np.random.default_rng(7)
-    q = random_queries(random, 200_000, LATTICE)
+    q = random_queries(random, 60_000, LATTICE)
     q["sigma"] = np.full_like(q["sigma"], sigma)
     value = wrong(*q.values()).astype(np.float64)
     if gain is not None:
@@ -72,17 +72,17 @@ def nothing(prediction: torch.Tensor) -> None:
 
 def test_means_at_each_elevation_become_those_of_the_data() -> None:
     """Of light and view, at every level, per colour, under skewed noise; held-out directions included."""
-    gain = fit_gains(wrong, LATTICE, data(400_000, 1.0), HELD_OUT, nothing)
+    gain = fit_gains(wrong, LATTICE, data(150_000, 0.5), HELD_OUT, nothing)
     assert gain.shape == (2, 4, KNOTS, 3)
-    for sigma in (0.5, 0.09, 0.0625):
+    for sigma in (0.5, 0.09):
         for axis in (0, 1):
             assert np.abs(excess(None, sigma, axis)).max() > 0.1
-            assert np.abs(excess(gain, sigma, axis)).max() < 0.012
-            assert np.abs(excess(gain, sigma, axis)).mean() < 0.004
+            assert np.abs(excess(gain, sigma, axis)).max() < 0.02
+            assert np.abs(excess(gain, sigma, axis)).mean() < 0.006
 
 
 def test_data_that_say_little_change_little() -> None:
-    gain = fit_gains(truth, LATTICE, data(300, 20.0), HELD_OUT, nothing)
+    gain = fit_gains(truth, LATTICE, data(3000, 3.0), HELD_OUT, nothing)
     assert np.abs(gain - 1).max() < 0.06
     # Where no data lie, and in black ones.
     black = fit_gains(
@@ -96,7 +96,7 @@ def test_a_wild_value_does_not_decide() -> None:
     kept = fit_gains(truth, LATTICE, queries, HELD_OUT, lambda p: 2.0 + 0 * p)
     queries.value[17] = 1e6
     found = fit_gains(truth, LATTICE, queries, HELD_OUT, lambda p: 2.0 + 0 * p)
-    np.testing.assert_allclose(found, kept, atol=2e-3)
+    np.testing.assert_allclose(found, kept, atol=0.02)
 
 
 def random_gain(levels: int, knots: int = 5) -> torch.Tensor:
@@ -156,13 +156,14 @@ def test_a_fit_is_calibrated_unless_told_otherwise(tmp_path: Path) -> None:
     def bright(u: F32, sigma: F32, omega_i: F32, omega_o: F32) -> F32:
         return np.asarray(np.stack([0.2 + 0.6 * omega_i[:, 2] ** 4] * 3, -1))
 
-    folder = write_data(tmp_path / "shards", bright, train=60_000, test=2000, noise=0.1)
-    q = random_queries(np.random.default_rng(4), 20_000, Lattice(3))
-    q["omega_i"][:] = [0.0, 0.6, 0.8]
+    folder = write_data(tmp_path / "shards", bright, train=20_000, test=500, noise=0.1)
+    q = random_queries(np.random.default_rng(4), 10_000, Lattice(3))
+    q["omega_i"][:, 2] = 0.8
+    q["omega_i"][:, :2] *= 0.6 / np.linalg.norm(q["omega_i"][:, :2], axis=1, keepdims=True)
     wanted = 0.2 + 0.6 * 0.8**4
     off = {}
     for calibrate in (True, False):
-        training = {"steps": 30, "batch": 2000, "calibrate": calibrate}
+        training = {"steps": 15, "batch": 2000, "calibrate": calibrate}
         result = fit(FitConfig.model_validate({"training": training}), folder, tmp_path / str(calibrate))
         model = result.material.model
         assert isinstance(model, Neumip)
@@ -170,5 +171,5 @@ def test_a_fit_is_calibrated_unless_told_otherwise(tmp_path: Path) -> None:
         assert ("gain" in result.material.description["formula"]) == calibrate
         off[calibrate] = abs(float(predict(model, *q.values()).mean()) / wanted - 1)
         assert result.material.deviation() < 1e-5
-    assert off[False] > 0.01
-    assert off[True] < 0.004
+    assert off[False] > 0.03
+    assert off[True] < 0.01

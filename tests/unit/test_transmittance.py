@@ -177,8 +177,10 @@ def test_errors_hold_the_noise_of_the_data_and_say_how_much(tmp_path: Path) -> N
     assert list(found) == ["test", "held_out", "training"]
     for error in found.values():
         assert error.noise.value == pytest.approx(0.3 * 0.7 / 4, rel=0.08)
-        assert error.mse.value == pytest.approx(error.noise.value, rel=0.08)
-        assert error.variance == pytest.approx(error.noise.value, rel=0.08)
+        # Some hundreds are held out.
+        few = 0.2 if error.n < 5000 else 0.05
+        assert error.mse.value == pytest.approx(error.noise.value, rel=few)
+        assert error.variance == pytest.approx(error.noise.value, rel=few)
     text = describe_transmittance(stated)
     assert len(text) == 3
     assert "noise of the data at most 0.2" in text[0]
