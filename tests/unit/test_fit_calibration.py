@@ -163,7 +163,7 @@ def test_a_fit_is_calibrated_unless_told_otherwise(tmp_path: Path) -> None:
     wanted = 0.2 + 0.6 * 0.8**4
     off = {}
     for calibrate in (True, False):
-        training = {"steps": 15, "batch": 2000, "calibrate": calibrate}
+        training = {"steps": 40, "batch": 2000, "calibrate": calibrate}
         result = fit(FitConfig.model_validate({"training": training}), folder, tmp_path / str(calibrate))
         model = result.material.model
         assert isinstance(model, Neumip)
@@ -171,5 +171,5 @@ def test_a_fit_is_calibrated_unless_told_otherwise(tmp_path: Path) -> None:
         assert ("gain" in result.material.description["formula"]) == calibrate
         off[calibrate] = abs(float(predict(model, *q.values()).mean()) / wanted - 1)
         assert result.material.deviation() < 1e-5
-    assert off[False] > 0.03
-    assert off[True] < 0.01
+    assert off[False] > 0.08
+    assert off[True] < 0.03
