@@ -218,14 +218,17 @@ def _marks(held_out: HeldOutSection, queries: Queries, seed: int, shard: int) ->
     return np.where(region, np.int8(2), marks)
 
 
-def load_training(data: Dataset, held_out: HeldOutSection, seed: int, memory: float = math.inf) -> Partition:
+def load_training(
+    data: Dataset, held_out: HeldOutSection, seed: int, memory: float | None = math.inf
+) -> Partition:
     """Read the train split and divide it; the division depends on the data and `seed` alone.
 
     In the image layout whole buffers are held out (:func:`~mbtf_fit.buffers.load_buffers`).
 
     Parameters
     ----------
-    memory : bytes that training queries may take; more are left on disk, and read as batches need them
+    memory : bytes that training queries may take; more are left on disk, and read as batches need them; None
+        leaves them there in any case, for who does not train
 
     Raises
     ------
@@ -244,8 +247,8 @@ def load_training(data: Dataset, held_out: HeldOutSection, seed: int, memory: fl
         raise InputError(
             "its train split holds no queries", where=data.folder, cure="generate some: --queries"
         )
-    streamed = total * QUERY_BYTES > memory
-    if streamed and any(shard.path.suffix == ".exr" for shard in shards):
+    streamed = memory is None or total * QUERY_BYTES > memory
+    if memory is not None and streamed and any(shard.path.suffix == ".exr" for shard in shards):
         raise InputError(
             f"its {total} queries take {total * QUERY_BYTES / 1e9:.3g} GB, more than data.memory allows, and "
             "EXR shards cannot be read in parts",

@@ -184,7 +184,7 @@ def evaluate(material: Material, shards: str | Path) -> Evaluation:
             f"its tile has the aspect {data.lattice.aspect:g}, the material's {material.lattice.aspect:g}",
             where=data.folder,
         )
-    partition = load_training(data, material.config.held_out, material.config.seed)
+    partition = load_training(data, material.config.held_out, material.config.seed, memory=None)
     through = None
     if material.holes is not None and has_holes(data):
         through = judge_transmittance(material.holes, data, partition.selection)

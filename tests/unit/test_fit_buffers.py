@@ -14,7 +14,8 @@ from support.fit_data import constant, parallax, random_queries, write_data
 from mbtf_fit import FitConfig, Material, evaluate, fit
 from mbtf_fit.buffers import TrainingBuffers, load_buffers, nearest_shapes, strides
 from mbtf_fit.config import HeldOutSection
-from mbtf_fit.data import Partition, in_region, load_split
+from mbtf_fit.data import Partition, Queries, in_region, load_split
+from mbtf_fit.evaluation import judge
 from mbtf_fit.models import Hierarchical, build_model
 from mbtf_gen.dataset import Dataset
 from mbtf_gen.errors import InputError
@@ -64,6 +65,36 @@ def test_whole_buffers_are_held_out(tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.held_out_queries.u, part.held_out_queries.u)
     other = {row.tobytes() for row in partition(folder, many, seed=1).held_out_queries.omega_i}
     assert other != held[0]
+
+
+def test_the_sample_is_of_buffers_that_are_trained_on(tmp_path: Path) -> None:
+    """Equally many queries of each."""
+    part = partition(
+        write_buffers(tmp_path / "d", parallax, train=60), HeldOutSection(queries=0.4, radius=0.3)
+    )
+    kept = {row.tobytes() for row in buffers_of(part).omega_i.numpy()}
+    sampled = [row.tobytes() for row in part.sample.omega_i]
+    assert set(sampled) == kept
+    assert len({sampled.count(k) for k in kept}) == 1
+
+
+def test_training_buffers_are_judged_by_a_quarter_of_their_sample(tmp_path: Path) -> None:
+    """Of all buffers alike: neighbourhoods take their time."""
+    data = Dataset.open(write_buffers(tmp_path / "d", parallax, train=20, test=1))
+    part = load_buffers(data, HeldOutSection(queries=0.1, radius=0), 0)
+    asked: list[Queries] = []
+
+    def answer(queries: Queries) -> np.ndarray:
+        asked.append(queries)
+        return 0.5 * (queries.value_a + queries.value_b)
+
+    found = judge(answer, data, part)
+    assert list(found) == ["test", "held_out_queries", "training"]
+    assert found["test"].overall.n == 64
+    assert found["held_out_queries"].overall.n == len(part.held_out_queries)
+    assert found["training"].overall.n == len(part.sample) // 4
+    lights = np.unique(asked[-1].omega_i, axis=0)
+    assert len(lights) == len(np.unique(part.sample.omega_i, axis=0)) == 18
 
 
 def test_some_buffer_is_held_out_where_any_shall_be(tmp_path: Path) -> None:

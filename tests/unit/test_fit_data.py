@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from support.fit_data import constant, parallax, write_data
 
 from mbtf_fit.config import HeldOutSection
-from mbtf_fit.data import Partition, Queries, in_region, load_split, load_training, open_data
+from mbtf_fit.data import Partition, Queries, batch_starts, in_region, load_split, load_training, open_data
 from mbtf_gen.dataset import Dataset
 from mbtf_gen.errors import InputError
 
@@ -39,6 +40,35 @@ def test_every_query_is_either_trained_on_or_held_out(tmp_path: Path) -> None:
     assert sum(map(len, sets)) == 3000
     assert set.union(*sets) == keys(load_split(Dataset.open(folder), "train"))
     assert 200 < len(sets[1]) < 400
+
+
+def test_the_sample_is_of_what_is_trained_on(tmp_path: Path) -> None:
+    """It says how good a fit is on data that it knows, and how noisy they are: no held-out query is in it."""
+    part = partition(write_data(tmp_path / "d", parallax, train=3000))
+    t = part.training
+    trained = rows(t.u.numpy(), t.sigma.numpy(), t.omega_i.numpy())
+    assert keys(part.sample) == trained
+
+
+@pytest.mark.parametrize(("total", "size"), [(10, 4), (9, 5), (8, 8), (7, 1)])
+def test_no_query_is_left_out_for_good(total: int, size: int) -> None:
+    """Where batches do not come out even, each epoch leaves out others."""
+    starts = list(islice(batch_starts(total, size, 0, 0), 60 * (total // size)))
+    assert {k for start in starts for k in range(start, start + size)} == set(range(total))
+
+
+def test_the_order_of_batches_follows_the_seed() -> None:
+    first, again, other = (list(islice(batch_starts(1000, 10, seed, 0), 50)) for seed in (0, 0, 1))
+    assert first == again != other
+
+
+def test_shards_are_divided_each_in_its_own_way(tmp_path: Path) -> None:
+    """Rows of equal number share no fate."""
+    folder = write_data(tmp_path / "d", parallax, train=2000)
+    t = partition(folder, held_out=HeldOutSection(queries=0.3, radius=0)).selection
+    kept = [{int(row) for _, some in t.pieces(*t.starts[k : k + 2]) for row in some} for k in (0, 1)]
+    # Of rows that the one keeps the other keeps 70 % too.
+    assert 0.6 < len(kept[0] & kept[1]) / len(kept[0]) < 0.8
 
 
 def test_held_out_directions_are_never_trained_on(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from mbtf_fit.models.neumip import Neumip
 from mbtf_fit.native import library
 from mbtf_fit.native.adam import adam
 from mbtf_fit.native.blur import blur_table
-from mbtf_fit.native.gradients import NativeGradients
+from mbtf_fit.native.gradients import NativeGradients, query_pointers
 from mbtf_fit.native.library import Kernel, variants
 from mbtf_fit.native.model import _KNOWN, _SIZES, NativeModel, networks, parameters_of, unsupported_reason
 from mbtf_fit.noise import NoiseModel
@@ -153,6 +153,53 @@ def test_values_and_gradients_are_those_of_the_reference(
 
 
 @needs_kernel
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_the_largest_networks_are_those_of_the_reference(variant: str) -> None:
+    """As many channels, features and layers as it says that it takes."""
+    model = random_model("neumip", LATTICE, channels=64, width=128, layers=16)
+    assert unsupported_reason(model) is None
+    with torch.no_grad():
+        for network in networks(model):
+            # So many layers of weights drawn anew would answer beyond what exp can take.
+            network.weights[-1] *= 1e-3
+    batch, loss = random_batch(200), objective()
+    exact_loss, expected = exact_gradients(model, loss, batch)
+    value, gradients = kernel_gradients(variant, model, loss, batch)
+    torch.testing.assert_close(value.double(), exact_loss, rtol=1e-4, atol=1e-8)
+    assert_gradients_alike(model, gradients, expected)
+
+
+@needs_kernel
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_answers_of_any_size_become_values(variant: str) -> None:
+    """exp(x) - 1 to single precision, from where only the -1 is left to where it is infinite, and near 0
+    where the two cancel; its slope likewise."""
+    model = build_model("neumip-baseline", LATTICE, layers=2)
+    small = 10.0 ** np.arange(-9, 1)
+    answers = np.concatenate([[-200, -87.1, 88.2, 88.8, 200], np.linspace(-86.9, 88.2, 66), small, -small])
+    native, batch = NativeModel(kernel_of(variant), model), random_batch(1)
+    loss = objective(losses=[{"kind": "squared"}], robust=None)
+    with torch.no_grad():
+        for p in model.parameters():
+            p.zero_()
+    for x in torch.from_numpy(answers.astype(np.float32)).view(-1, 1).expand(-1, 3):
+        with torch.no_grad():
+            model.decoder.last_bias.copy_(x)
+        native.refresh()
+        found = torch.empty(1, 3)
+        native.forward(query_pointers(batch, 0, 1), native.state(1), found.data_ptr())
+        exact = torch.expm1(x.double())[None]
+        # Infinite a little early.
+        torch.testing.assert_close(found.double(), torch.where(x > 88.3, torch.inf, exact), rtol=3e-7, atol=0)
+        if abs(float(x[0])) < 20:
+            _, expected = exact_gradients(model, loss, batch)
+            _, gradients = kernel_gradients(variant, model, loss, batch)
+            mine = gradients[model.decoder.last_bias].double()
+            # The slope is good to 2e-7, of which the loss makes some hundred times as much.
+            torch.testing.assert_close(mine, expected[-1], rtol=1e-5, atol=2e-5)
+
+
+@needs_kernel
 @pytest.mark.parametrize("kind", ["log", "fourth-root"])
 def test_any_other_loss_goes_through_pytorch_piece_by_piece(
     kind: str, monkeypatch: pytest.MonkeyPatch
@@ -199,6 +246,12 @@ def test_threads_change_no_more_than_rounding_and_the_same_number_of_them_nothin
         for other in (found[1], found[3]):
             assert_alike(other[1][p], found[0][1][p].double(), 1e-5)
     assert found[1][0] == found[2][0]
+    # More threads than queries: some have nothing to do.
+    few = random_batch(2)
+    one, three = (kernel_gradients(VARIANTS[0], model, loss, few, threads) for threads in (1, 3))
+    torch.testing.assert_close(one[0], three[0])
+    for p in model.parameters():
+        assert_alike(three[1][p], one[1][p].double(), 1e-5)
 
 
 @needs_kernel

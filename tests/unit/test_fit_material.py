@@ -16,6 +16,7 @@ from support.fit_data import constant, parallax, random_queries, write_data
 from mbtf_fit import FitConfig, FitResult, Material, evaluate, fit, read_history
 from mbtf_fit.data import load_training
 from mbtf_fit.evaluation import split_errors
+from mbtf_fit.fitting import prepare_trainer
 from mbtf_gen.dataset import Dataset
 from mbtf_gen.errors import EngineError, InputError
 from mbtf_gen.levels import Lattice
@@ -43,6 +44,18 @@ def test_a_homogeneous_constant_is_fitted(model: str, tmp_path: Path) -> None:
     found = result.material.evaluate(*random_queries(np.random.default_rng(5), 500, Lattice(3)).values())
     assert found.mean() == pytest.approx(0.25, abs=0.003)
     assert np.sqrt(((found - 0.25) ** 2).mean()) < 0.01
+
+
+def test_the_first_parameters_follow_the_seed(data: Path) -> None:
+    opened = Dataset.open(data)
+    partition = load_training(opened, config().held_out, 0)
+    first, again, other = (
+        prepare_trainer(config(seed=seed), opened, partition, torch.device("cpu")).model.weights()
+        for seed in (0, 0, 1)
+    )
+    assert all(torch.equal(first[name], again[name]) for name in first)
+    for name in ("pyramid.3", "decoder.0.weight", "offset_network.0.weight"):
+        assert not torch.equal(first[name], other[name]), name
 
 
 def test_black_data_are_fitted(tmp_path: Path) -> None:
@@ -168,7 +181,7 @@ def test_errors_of_a_perfect_prediction_are_zero(data: Path) -> None:
 
 
 def test_evaluation_repeats_the_errors_of_the_fit(fitted: FitResult, data: Path) -> None:
-    again = {name: e.as_dict() for name, e in evaluate(fitted.material, data).items()}
+    again = {name: e.as_dict() for name, e in evaluate(fitted.material, data).values.items()}
     assert set(again) == {"test", "held_out_queries", "held_out_directions", "training"}
     for name, errors in again.items():
         stored = fitted.errors[name]

@@ -258,6 +258,31 @@ def test_encodings_are_sines_and_cosines_of_doubling_frequencies() -> None:
 
 
 @variants
+def test_training_starts_as_the_documentation_says(variant: str) -> None:
+    """Features of 0.1·N(0,1), no offset texture; variance-preserving weights, biases 0 but the answer's."""
+    name, options = VARIANTS[variant]
+    model = build_model(name, Lattice(5), **{**options, "width": 128}).requires_grad_(False)
+    model.initialise(torch.Generator().manual_seed(0), 0.2)
+    assert float(model.unit) == pytest.approx(0.2)
+    assert float(model.pyramid.texels.std()) == pytest.approx(0.1, rel=0.05)
+    if model.network.offset != "none":
+        assert not model.offset_texture.texels.any()
+    weights = model.weights()
+    for network in ("decoder", "offset_network"):
+        mine = [key for key in weights if key.startswith(network)]
+        for key in mine:
+            tensor, last = weights[key], key in mine[-2:]
+            if key.endswith(".bias"):
+                start = START[model.network.output] if last and network == "decoder" else 0.0
+                assert float(tensor[0]) == pytest.approx(start)
+                assert not tensor[3 if last else 0 :].any()
+            else:
+                variance = float(tensor.double().square().mean()) * tensor[0].numel()
+                # Of so many numbers, to four standard errors.
+                assert variance == pytest.approx(1 if last else 2, rel=4 * (2 / tensor.numel()) ** 0.5), key
+
+
+@variants
 def test_the_formula_names_what_the_export_holds(variant: str) -> None:
     model = random_model(variant)
     text = " ".join(model.formula().values())

@@ -9,8 +9,10 @@ import pytest
 from conftest import RunPython
 from support.fit_data import parallax, write_data
 
+import mbtf_fit.evaluation
 from mbtf_fit.config import FitConfig, HeldOutSection
-from mbtf_fit.data import load_training
+from mbtf_fit.data import Partition, load_training
+from mbtf_fit.evaluation import Predict, SplitErrors
 from mbtf_fit.fitting import fit
 from mbtf_fit.sizes import format_size, parse_size
 from mbtf_fit.streaming import Selection, StreamedQueries
@@ -45,6 +47,26 @@ def test_a_fit_from_disk_is_the_same_fit(tmp_path: Path) -> None:
         material = fit(config, shards, tmp_path / memory).material
         found.append(material.model.weights())
     assert all((found[0][name] == found[1][name]).all() for name in found[0])
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".exr"])
+def test_evaluation_leaves_training_queries_on_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str
+) -> None:
+    """Data that a fit streams can be evaluated too, and are judged by the same queries."""
+    folder = write_data(tmp_path / "d", parallax, train=3000, test=500, suffix=suffix)
+    config = FitConfig.model_validate({"training": {"steps": 2, "batch": 500}})
+    result = fit(config, folder, tmp_path / "m")
+    judged, found = mbtf_fit.evaluation.judge, []
+
+    def watched(predict: Predict, data: Dataset, partition: Partition) -> dict[str, SplitErrors]:
+        found.append(partition.training)
+        return judged(predict, data, partition)
+
+    monkeypatch.setattr(mbtf_fit.evaluation, "judge", watched)
+    errors = {name: e.as_dict() for name, e in mbtf_fit.evaluation.evaluate(result.material, folder).items()}
+    assert isinstance(found[0], StreamedQueries)
+    assert {name: e["n"] for name, e in errors.items()} == {n: e["n"] for n, e in result.errors.items()}
 
 
 def test_rows_are_found_among_any_that_are_left_out() -> None:

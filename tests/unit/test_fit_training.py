@@ -133,6 +133,29 @@ def test_rates_rise_and_fall() -> None:
 
 
 @pytest.mark.parametrize("compiled", [True, False])
+def test_textures_and_networks_learn_at_their_own_rates(compiled: bool) -> None:
+    """The first step of Adam is as long as the rate, whatever the gradient."""
+    rates = {"texture_rate": 1e-3, "rate": 1e-4, "warmup": 0}
+    t = trainer(queries(), steps=1, blur={"start": 0.0, "offset": 0.0}, **rates)
+    t._stepper = t._stepper if compiled else None
+    groups = t.model.parameter_groups()
+    before = [[p.detach().clone() for p in group] for group in groups]
+    train_fully(t)
+    for group, old, rate in zip(groups, before, (1e-3, 1e-4), strict=True):
+        longest = max(float((p.detach() - q).abs().max()) for p, q in zip(group, old, strict=True))
+        assert longest == pytest.approx(rate, rel=0.01)
+
+
+def test_the_blur_is_over_with_its_share_of_the_budget() -> None:
+    t = trainer(queries(10), blur={"start": 1.0, "end": 0.25, "share": 0.25, "offset": 0.0})
+    found = []
+    for step in (0, 5, 9, 10, 40):
+        t.progress.step = step
+        found.append(t._sigmas()[0])
+    assert found == pytest.approx([1.0, 0.5, 0.25**0.9, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("compiled", [True, False])
 def test_texels_without_a_gradient_decay_with_the_rate(compiled: bool) -> None:
     arrays = random_queries(np.random.default_rng(0), 64, LATTICE)
     arrays["sigma"][:] = 0.5
