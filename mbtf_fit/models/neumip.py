@@ -94,7 +94,7 @@ class Neumip(TexturedMaterial):
             wanted = (2, self.lattice.finest + 1, gain.shape[2] if gain.ndim == 4 else 0, 3)
             if gain.shape != wanted or wanted[2] < 2:
                 raise InputError(f"the weights do not fit the model {self.name}: 'gain'")
-        self.gain = None if gain is None else gain.clone()
+        self.gain = None if gain is None else gain.float().clone()
         super().load_weights(tensors)
 
     def formula(self) -> dict[str, str]:

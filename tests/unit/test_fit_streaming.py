@@ -64,7 +64,8 @@ def test_evaluation_leaves_training_queries_on_disk(
         return judged(predict, data, partition)
 
     monkeypatch.setattr(mbtf_fit.evaluation, "judge", watched)
-    errors = {name: e.as_dict() for name, e in mbtf_fit.evaluation.evaluate(result.material, folder).items()}
+    found = mbtf_fit.evaluation.evaluate(result.material, folder).values
+    errors = {name: e.as_dict() for name, e in found.items()}
     assert isinstance(found[0], StreamedQueries)
     assert {name: e["n"] for name, e in errors.items()} == {n: e["n"] for n, e in result.errors.items()}
 
