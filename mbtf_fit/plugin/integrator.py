@@ -151,7 +151,7 @@ class ConePath(mi.SamplingIntegrator):
             pdf = dr.select(through, pdf, bs.pdf)
             specular = dr.select(through, specular, delta)
             spread = dr.select(
-                delta | ~active,
+                delta | through | ~active,
                 spread,
                 dr.maximum(spread, SCATTERED * dr.rsqrt(dr.maximum(bs.pdf, 1e-6))),
             )
