@@ -13,7 +13,8 @@ empty kernel cache:
 - **conformance**: largest deviation from the material's own values, in single and in half precision.
 - **χ²** of the plugin's samples at 32 random positions, footprints and views; the smallest p of all
   materials is corrected for their number (Šidák).
-- **variance** of the light reflected under a constant sky by cosine sampling, over that by the lobes.
+- **variance** of the light reflected under a constant sky by cosine sampling, over that by the lobes; the bar
+  is for glossy materials, told by their maps and by what the cosine leaves to be gained.
 - **energy**: what the tile's mean reflects, by elevation of the light, beside the reference that
   ``mbtf-gen`` traces for the same queries; the error bar is that of the paired difference.
 
@@ -41,8 +42,11 @@ from mbtf_gen.directions import from_angles, from_projected_disk
 ROOT = Path(__file__).resolve().parents[1]
 ASSETS = ("turtle_shell", "cliff_rock", "twisted_wool", "straight_wool", "insulation_foam")
 TEXTURES = ("metal_plate", "leather_fine", "knit_fabric", "rock_cliff", "stone_bricks", "tree_bark")
-# Materials whose gloss carries most of what varies: smooth over dark. Leather is as smooth, but bright.
-GLOSSY = ("turtle_shell", "stone_bricks", "tree_bark")
+# What counts as glossy: at least this share of what the maps reflect is specular, the median roughness is at
+# most this, and light sampled by the cosine alone varies by at least this, as a relative variance.
+GLOSSY_SHARE, GLOSSY_ROUGHNESS, GLOSSY_VARIANCE = 0.33, 0.65, 0.1
+# What a dielectric of index 1.5 reflects of light from everywhere.
+FRESNEL = 0.092
 # First picture in seconds, deviations, χ² after correction, variance ratio of glossy materials, and what
 # energies have too much, in standard errors.
 BARS = {
@@ -168,6 +172,29 @@ def energies(material: Path, shards: Path, evaluator: Any) -> list[dict[str, flo
     return rows
 
 
+def gloss(source: Path, config: dict[str, Any]) -> dict[str, float]:
+    """Share of what the material's maps reflect that is specular, and their median roughness; 1 for
+    Lambert."""
+    from mbtf_gen.material import load_material
+
+    maps = load_material(source, config["geometry"]["tile"])
+    if maps.roughness is None:
+        return {"specular_share": 0.0, "roughness": 1.0}
+    colour = float(np.mean(maps.basecolor @ np.array([0.2126, 0.7152, 0.0722])))
+    metal = 0.0 if maps.metallic is None else float(np.mean(maps.metallic))
+    specular, diffuse = (1 - metal) * FRESNEL + metal * colour, (1 - metal) * (1 - FRESNEL) * colour
+    return {"specular_share": specular / (specular + diffuse), "roughness": float(np.median(maps.roughness))}
+
+
+def is_glossy(row: dict[str, Any]) -> bool:
+    """Whether a material's figures make it a glossy one."""
+    return bool(
+        row["specular_share"] >= GLOSSY_SHARE
+        and row["roughness"] <= GLOSSY_ROUGHNESS
+        and row["cosine_variance"] >= GLOSSY_VARIANCE
+    )
+
+
 def plane_scene(mi: Any, bsdf: Any) -> Any:
     """Forty tiles across, seen at 45 degrees in 1080p under the sun and a sky."""
     flip = mi.ScalarTransform4f().scale([20.0, -20.0, 1.0])
@@ -203,6 +230,7 @@ def measure(source: Path, shards: Path, folder: Path) -> dict[str, Any]:
 
     import mbtf_fit.plugin
     from mbtf_fit.plugin import Evaluator, read_material
+    from mbtf_gen.dataset import Dataset
 
     mbtf_fit.plugin.register()
     start = time.perf_counter()
@@ -229,6 +257,8 @@ def measure(source: Path, shards: Path, folder: Path) -> dict[str, Any]:
         "chi_square": chi_squares(mi, dr, bsdf),
         "reflected": [mean, flat_mean],
         "variance_ratio": flat_variance / variance,
+        "cosine_variance": flat_variance / flat_mean**2,
+        **gloss(source, Dataset.open(shards).manifest["config"]),
         "energy": energies(source, shards, bsdf.evaluator),
     }
 
@@ -276,7 +306,7 @@ def verdict(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "single": max(r["single"] for r in rows),
         "half": max(r["half"] for r in rows),
         "chi_square": float(-np.expm1(tests * np.log1p(-least))),
-        "variance": min((r["variance_ratio"] for r in rows if r["material"] in GLOSSY), default=None),
+        "variance": min((r["variance_ratio"] for r in rows if is_glossy(r)), default=None),
         "energy": max(excess),
         "energy_share": max(e["fit"] / e["reference"] - 1.0 for r in rows for e in r["energy"]),
     }
