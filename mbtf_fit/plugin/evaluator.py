@@ -73,7 +73,8 @@ class Evaluator:
                 dr.fma(x, OFFSET_SCALE, u.x), dr.fma(y, OFFSET_SCALE / self.lattice.aspect, u.y)
             )
         read = self.pyramid.blended if self.network.blending == "blend" else self.pyramid.side_by_side
-        features = [*read(moved, level), *encode_position(u, self.network.encoding)]
+        encoded = encode_position(u, level, self.lattice.aspect, self.network.encoding)
+        features = [*read(moved, level), *encoded]
         return features if self.gains is None else [*features, *self.gains.by_view(level, omega_o.z), level]
 
     def value(self, features: list[Any], omega_i: Any, omega_o: Any) -> Any:
