@@ -88,12 +88,13 @@ class Neumip(TexturedMaterial):
         return by_light * by_view
 
     def load_weights(self, tensors: dict[str, Tensor]) -> None:
-        gain = tensors.get("gain")
+        name = "gain"
+        gain = tensors.get(name)
         if gain is not None:
             # Of any number of knots.
             wanted = (2, self.lattice.finest + 1, gain.shape[2] if gain.ndim == 4 else 0, 3)
             if gain.shape != wanted or wanted[2] < 2:
-                raise InputError(f"the weights do not fit the model {self.name}: 'gain'")
+                raise InputError(f"the weights do not fit the model {self.name}: '{name}'")
         self.gain = None if gain is None else gain.float().clone()
         super().load_weights(tensors)
 

@@ -92,10 +92,10 @@ def test_data_that_say_little_change_little() -> None:
     np.testing.assert_allclose(black, 1.0)
 
 
-def test_a_wild_value_does_not_decide() -> None:
+def test_wild_values_do_not_decide() -> None:
     queries = data(50_000, 0.5)
     kept = fit_gains(wrong, LATTICE, queries, HELD_OUT, lambda p: 2.0 + 0 * p)
-    queries.value[17] = 1e6
+    queries.value[::2500] = 1e6
     found = fit_gains(wrong, LATTICE, queries, HELD_OUT, lambda p: 2.0 + 0 * p)
     np.testing.assert_allclose(found, kept, atol=0.02)
 
