@@ -9,6 +9,7 @@ from cyclopts import Parameter
 
 from mbtf_gen.console import CONSOLE, Console, clock, new_app
 from mbtf_gen.errors import InputError, PartialError, UsageError
+from mbtf_gen.near import near_miss
 from mbtf_gen.quality import Quality, as_assignments, quality_help
 
 from .plugin.preview.command import preview
@@ -324,7 +325,7 @@ def info(path: Path, /, *, console: Console = CONSOLE) -> None:
         Folder made by mbtf-fit or by mbtf-gen.
     """
     if not path.is_dir():
-        raise InputError("no such folder", where=path)
+        raise InputError("no such folder", where=path, cure=near_miss(path, Path.is_dir))
     from mbtf_gen.schema import MANIFEST_NAME
 
     data, text = _shards_info(path) if (path / MANIFEST_NAME).exists() else _material_info(path)

@@ -184,6 +184,8 @@ def scene_of(folder: Path | str, **options: Any) -> dict[str, Any]:
         ({"sigma": 0.0}, "sigma must be a positive number, not 0", UsageError),
         ({"networks": "exact"}, "networks must be one of unrolled, cooperative, half, not exact", UsageError),
         ({"sampling": "uniform"}, "sampling must be one of lobes, cosine, not uniform", UsageError),
+        ({"uvscale": 4.0}, "has no parameter 'uvscale'\n  did you mean 'uv_scale'?", UsageError),
+        ({"colour": 4.0}, "has no parameter 'colour'\n  it has: material, uv_scale", UsageError),
     ],
 )
 def test_faults_of_a_scene_are_one_clear_line(
