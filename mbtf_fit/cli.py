@@ -134,10 +134,14 @@ def fit(
         )
         return
     from .fitting import fit
+    from .material_format import DESCRIPTION_NAME
 
-    console.note(
-        f"{shards} -> {output}: {resolved.model}, training for {budget} (change it with --time or --steps)"
-    )
+    finished = not overwrite and (output / DESCRIPTION_NAME).exists()
+    if not finished:
+        console.note(
+            f"{shards} -> {output}: {resolved.model}, training for {budget} "
+            "(change it with --time or --steps)"
+        )
     from .native import missing_reason
 
     if missing_reason():
@@ -150,6 +154,8 @@ def fit(
             overwrite=overwrite,
             progress=lambda share, note: bar.update(round(100 * share, 1), note),
         )
+    if finished:
+        console.note(f"{output}: this fit is finished, nothing was trained; --overwrite trains it again")
     data = result.as_dict()
     price = [result.price.describe()] if result.price is not None else []
     console.report(data, "\n".join([describe_fit(data), *price]))

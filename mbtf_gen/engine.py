@@ -70,7 +70,7 @@ def load_mitsuba(variant: str = CPU_VARIANT) -> Any:
 
 
 def refuse_old_llvm() -> None:
-    """Refuse the LLVM that Dr.Jit has bound to where it is too old: it would abort the process at some kernel.
+    """Refuse the LLVM that Dr.Jit has bound to where it is too old: some kernel would abort the process.
 
     That happens where Dr.Jit was imported before this package, which says where a newer one lies.
 

@@ -32,7 +32,8 @@ def register() -> None:
     Raises
     ------
     UsageError : no variant is set, or one that the plugins do not run in
-    EngineError : they are registered with another variant already, or Dr.Jit has bound to an LLVM that is too old
+    EngineError : they are registered with another variant already, or Dr.Jit has bound to an old
+        LLVM
     """
     global _registered
     if not variant_is_set():

@@ -47,7 +47,8 @@ def test_the_example_of_the_documentation_runs(tmp_path: Path, run_python: RunPy
     page = (PROJECT / "docs" / "rendering.md").read_text(encoding="utf-8")
     example = page.split("```python\n")[1].split("```")[0]
     quick = example.replace("spp=64", "spp=1").replace("[0, 0, 1])", "[0, 0, 1]), **SMALL")
-    assert quick.count("SMALL") == 1 and quick.count("spp=1") == 1
+    assert quick.count("SMALL") == 1
+    assert quick.count("spp=1") == 1
     small = 'SMALL = {"film": {"type": "hdrfilm", "width": 8, "height": 8}}\n'
     done = run_python("-c", MOVE + small + quick, str(tmp_path), DRJIT_LIBLLVM_PATH=None)
     assert done.returncode == 0, done.stderr
