@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 import tempfile
 from pathlib import Path
@@ -29,7 +30,7 @@ from mbtf_pipeline.recipe import Recipe
 ROOT = Path(__file__).resolve().parents[1]
 ASSETS = ("turtle_shell", "cliff_rock")
 SPLITS = (0.1, 0.2, 0.35, 0.5, 0.7)
-TEST, TEST_SPP = "16384", 128
+TEST, TEST_SPP = "131072", 16
 BAR = 1.2
 
 
@@ -54,17 +55,16 @@ def measure(material: Path, seconds: float, splits: list[float], levels: int, wo
     )
     found = split_budget(recipe, seconds, work / "run", "", lambda note: print(note, file=sys.stderr))
     print(f"{material.name}: {found.describe()}", file=sys.stderr)
-    # What generating a query takes by the same forecast; the grid's chains pay for no pilots.
-    start = found.generating - found.share * (seconds - found.pilot_seconds)
-    price = (found.generating - start) / found.queries
+    # What starting up, the test split and a query take by the same forecast; the grid's chains pay for no
+    # pilots.
+    start = (found.generating - found.share * (seconds - found.pilot_seconds)) / (1 - found.share)
+    price, left = (found.generating - start) / found.queries, seconds - start
     workshop = Workshop(recipe.generate, work / "chains", "", lambda note: None)
     rows = []
     for share in [*splits, None]:
         split = found
         if share is not None:
-            split = Split(
-                int(share * seconds / price), share * seconds, (1 - share) * seconds, share, (), 0.0
-            )
+            split = Split(int(share * left / price), share * left, (1 - share) * left, share, (), 0.0)
         point = workshop.measure(chain(recipe, split))
         workshop.forget(split.queries, recipe.generate.queries.spp)
         took = point.details["total_seconds"] + (found.pilot_seconds if share is None else 0.0)
@@ -82,7 +82,7 @@ def measure(material: Path, seconds: float, splits: list[float], levels: int, wo
     workshop.clear()
     best = min(rows[:-1], key=lambda row: row["unexplained"])
     ratio = rows[-1]["unexplained"] / best["unexplained"]
-    spread = ratio * ((rows[-1]["error"] / rows[-1]["unexplained"]) ** 2) ** 0.5
+    spread = ratio * math.hypot(*(row["error"] / row["unexplained"] for row in (best, rows[-1])))
     return {"material": material.name, "rows": rows, "ratio": ratio, "ratio_error": spread}
 
 

@@ -6,9 +6,10 @@ The objects (a sphere, a cow and a draped cloth) and the environment maps lie be
 ``../shared/data``; a scene whose files or fit are missing is left out by name. The fits are those of
 ``plugin_materials.py``, which makes them. For every scene
 
-- the **reference** is the object's mesh, in triangles about as fine as the heights that the data were made
-  with (coarser ones would smooth the relief); each vertex is moved along the normal by the height map, scaled
-  by the size that a tile has there; Mitsuba's ``path`` with the material's own surface;
+- the **reference** is the tile's own mesh, that the data were made with, laid over the object; each vertex is
+  moved along the normal by its height, scaled by the size that a tile has there; Mitsuba's ``path`` with the
+  material's own surface. Heights looked up at other places than the tile's vertices would give a smoother
+  relief: several per cent brighter where it is rough from texel to texel;
 - the **material** is the smooth mesh with ``mbtf`` in ``mbtf_path``. Its footprint is the pixels' Gaussian
   filter already, so the film has a box; the reference's film has the Gaussian.
 
@@ -17,6 +18,9 @@ What is compared, with both sides' noise taken out (two independent halves each)
 - **interior**: pixels well inside both outlines that see the smooth surface under a cosine of at least 0.35.
   Ratio of the means, and the RMS difference as a share of the mean, per pixel and of means over 4 x 4 and
   16 x 16 pixels;
+- **of the fit**: ratio of what the fit and ``mbtf-gen`` make of the same direct light at the same queries.
+  What is left of the interior's ratio beside this one comes from bending;
+- **easy**: the interior's ratio where texture coordinates are hardly stretched and little light is grazing;
 - **rim**: the same ratio for the other pixels that both sides cover;
 - **outline**: by how much the displaced object's outline lies inside the smooth one's, in pixels, beside the
   relief's depth in pixels. A fitted material does not change the outline.
@@ -34,20 +38,25 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from curved_meshes import F64, Surface, displaced, load_object, refined
 from numpy.typing import NDArray
 
 from mbtf_gen.engine import load_mitsuba
 from mbtf_gen.reference import auto_exposure, to_display
 
-F64 = NDArray[np.float64]
 ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT.parent / "shared" / "data"
-# Means of the interior, as a share; RMS of 16 x 16 pixels as a share of the mean.
-BARS = {"mean": 0.05, "rms_16": 0.1}
+# Means of the interior, as a share; RMS of 16 x 16 pixels as a share of the mean; the plane's mean beside
+# what the fit makes of the same light.
+BARS = {"mean": 0.05, "rms_16": 0.1, "flat": 0.01}
+# Cosine of light that counts as grazing, and largest stretch and share of such light of easy places.
+GRAZING, EASY = 0.3, (1.25, 0.3)
 LOWEST, MARGIN, BLOCKS = 0.35, 4, (1, 4, 16)
 FIELD_OF_VIEW = 28.0
-# Most triangles of a displaced mesh, and triangles along an edge of the smooth one.
-MOST, SMOOTH = 3_000_000, 4
+# Triangles along an edge of the object's that the smooth mesh has.
+SMOOTH = 4
+# Cells of the mesh that plugin_materials.py makes its data with, and queries per figure.
+MESH, QUERIES = 256, 300_000
 
 
 @dataclass(frozen=True)
@@ -78,114 +87,6 @@ SCENES = (
     Scene("cow", "spot_cow.obj", "cliff_rock", "park.exr", (12, 12), (-1.0, 0.35, -0.8), 0.85),
     Scene("cloth", "pbdsock_cloth.obj", "twisted_wool", "studio.exr", (10, 10), (0.35, 0.25, 1.0), 0.8),
 )
-
-
-@dataclass(frozen=True)
-class Surface:
-    """A smooth triangle mesh with texture coordinates, in a ball of radius 1 about the origin.
-
-    Attributes
-    ----------
-    place, normal : (n, 3)
-    uv : (n, 2) in tile widths, v downwards as the rows of images go
-    size : (n,) length of a tile width on the surface
-    faces : (m, 3)
-    """
-
-    place: F64
-    normal: F64
-    uv: F64
-    size: F64
-    faces: NDArray[np.int64]
-
-
-def load_object(scene: Scene) -> Surface:
-    """The object as its file has it, with normals and tile sizes that are the same on both sides of seams."""
-    import trimesh
-
-    if scene.file:
-        mesh = trimesh.load(DATA / "objects" / scene.file, process=False)
-        place, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
-        wide = np.asarray(mesh.visual.uv, np.float64)
-    else:
-        place, wide, faces = _square(40)
-    place = place - 0.5 * (place.min(0) + place.max(0))
-    place /= np.linalg.norm(place, axis=1).max()
-    uv = wide * (1.0, -1.0) * scene.tiles
-    corner, wide = place[faces], uv[faces]
-    cross = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    a, b = wide[:, 1] - wide[:, 0], wide[:, 2] - wide[:, 0]
-    flat = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
-    area = np.linalg.norm(cross, axis=1)
-    _, same = np.unique(np.round(place, 6), axis=0, return_inverse=True)
-    same = same.ravel()
-
-    def gathered(per_face: F64) -> F64:
-        out = np.zeros((same.max() + 1, *per_face.shape[1:]))
-        for k in range(3):
-            np.add.at(out, same[faces[:, k]], per_face)
-        return out[same]
-
-    normal = gathered(cross)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
-    size = np.sqrt(gathered(area) / np.maximum(gathered(flat), 1e-20))
-    return Surface(place, normal, uv, size, faces)
-
-
-def _square(n: int) -> tuple[F64, F64, NDArray[np.int64]]:
-    """A horizontal square of n x n cells: vertices, texture coordinates, triangles."""
-    i, j = (x.ravel() for x in np.meshgrid(np.arange(n + 1), np.arange(n + 1)))
-    uv = np.stack([i, j], -1) / n
-    corner = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).ravel()
-    right, up = corner + 1, corner + n + 1
-    faces = np.concatenate([np.stack([corner, right, up + 1], -1), np.stack([corner, up + 1, up], -1)])
-    return np.stack([uv[:, 0], np.zeros(len(uv)), -uv[:, 1]], -1), uv, faces
-
-
-def refined(surface: Surface, n: int) -> Surface:
-    """Every triangle cut into n², and rounded by its vertices' normals (Phong tessellation, Boubekeur and
-    Alexa 2008)."""
-    steps = np.array([(i, j) for i in range(n + 1) for j in range(n + 1 - i)])
-    weights = np.concatenate([steps, n - steps.sum(1, keepdims=True)], 1) / n
-    number = {tuple(s): k for k, s in enumerate(steps)}
-    pattern = []
-    for i in range(n):
-        for j in range(n - i):
-            pattern.append((number[i, j], number[i + 1, j], number[i, j + 1]))
-            if i + j < n - 1:
-                pattern.append((number[i + 1, j], number[i + 1, j + 1], number[i, j + 1]))
-    count = len(weights)
-
-    def mixed(array: F64) -> F64:
-        corners = array[surface.faces].astype(np.float32)
-        return np.einsum("wk,fk...->fw...", weights.astype(np.float32), corners).reshape(-1, *array.shape[1:])
-
-    place, normal = mixed(surface.place), mixed(surface.normal)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
-    rounded = np.zeros_like(place)
-    for k in range(3):
-        at = np.repeat(surface.place[surface.faces[:, k]], count, axis=0)
-        to = np.repeat(surface.normal[surface.faces[:, k]], count, axis=0)
-        onto = place - ((place - at) * to).sum(1, keepdims=True) * to
-        rounded += np.tile(weights[:, k], len(surface.faces))[:, None] * onto
-    place = 0.25 * place + 0.75 * rounded
-    # Same vertices of neighbouring triangles are rounded alike, so that no crack opens.
-    place = np.round(place, 7)
-    first = count * np.arange(len(surface.faces))[:, None, None]
-    faces = (first + np.array(pattern)).reshape(-1, 3)
-    return Surface(place, normal, mixed(surface.uv), mixed(surface.size), faces)
-
-
-def displaced(surface: Surface, grid: Any) -> Surface:
-    """Vertices moved along their normals by the tile's heights."""
-    from scipy.ndimage import map_coordinates
-
-    rows, columns = grid.z.shape
-    row = np.mod(surface.uv[:, 1] / grid.aspect, 1.0) * rows - 0.5
-    column = np.mod(surface.uv[:, 0], 1.0) * columns - 0.5
-    height = map_coordinates(grid.z, [row, column], order=1, mode="grid-wrap")
-    place = surface.place + (height * surface.size)[:, None] * surface.normal
-    return Surface(place, surface.normal, surface.uv, surface.size, surface.faces)
 
 
 def mesh_of(mi: Any, surface: Surface, bsdf: Any, *, smooth: bool, aspect: float = 1.0) -> Any:
@@ -250,6 +151,76 @@ def halves(mi: Any, scene: Any, integrator: str, spp: int) -> tuple[F64, F64]:
     return a, b
 
 
+def fit_alone(
+    mi: Any, scene: Any, bsdf: Any, estimator: Any, inside: NDArray[np.bool_]
+) -> tuple[float, float]:
+    """What the fit makes of the scene's direct light, beside what ``mbtf-gen`` traces for the same queries.
+
+    Random places that the camera sees, and light that reaches them on the smooth object: (ratio of the
+    radiances, its error). What is left of a difference of pictures comes from bending.
+    """
+    import drjit as dr
+
+    from mbtf_fit.plugin.bsdf import Frame, clamped
+    from mbtf_fit.plugin.integrator import camera_cone, write_footprint
+    from mbtf_gen.estimator import Stream
+    from mbtf_gen.queries import Queries
+
+    random, size = np.random.default_rng(5), len(inside)
+    pixel = mi.UInt32(random.choice(np.flatnonzero(inside), QUERIES).astype(np.uint32))
+    x, y, s, t = (mi.Float(v) for v in random.random((4, QUERIES), np.float32))
+    at = mi.Point2f(mi.Float(pixel % size) + x, mi.Float(pixel // size) + y) / size
+    ray, _ = scene.sensors()[0].sample_ray_differential(0.0, 0.5, at, mi.Point2f(0.5))
+    width, spread = camera_cone(ray, 1)
+    si = scene.ray_intersect(ray)
+    si = write_footprint(si, ray, dr.fma(spread, si.t, width))
+    ds, arriving = scene.sample_emitter_direction(si, mi.Point2f(s, t), True)
+    frame = Frame.at(si)
+    views, lights = clamped(frame.to_tile(si.wi)), frame.to_tile(si.to_local(ds.d))
+    good = si.is_valid() & (si.wi.z > 0) & (lights.z > 1e-3) & (dr.max(arriving) > 0)
+    weight = np.array(arriving * lights.z).T
+    rows = np.flatnonzero(np.array(good))
+
+    def array(value: Any) -> Any:
+        return np.ascontiguousarray(np.array(value, np.float32).T[rows])
+
+    u = array(bsdf.place(si))
+    queries = Queries(u - np.floor(u), array(bsdf.footprint(si)), array(lights), array(views))
+    queries.u[queries.u >= 1.0] = 0.0
+    traced = estimator.estimate(queries, 4, Stream(1, "reference", 0))
+    low = np.array(clamped(mi.Vector3f(queries.omega_i.T))).T
+    fit = bsdf.evaluator.evaluate(queries.u, queries.sigma, low, queries.omega_o)
+    true = (0.5 * (traced.value_a + traced.value_b) * weight[rows]).mean(-1).astype(np.float64)
+    found = (fit * weight[rows]).mean(-1).astype(np.float64)
+    ratio = found.sum() / true.sum()
+    return float(ratio), float(np.sqrt(((found - ratio * true) ** 2).sum()) / true.sum())
+
+
+def hard_places(mi: Any, scene: Any, size: int) -> tuple[F64, F64]:
+    """Of what pixels' centres see on the smooth object: by how much its texture coordinates are stretched,
+    longest side over shortest, and what share of the light that comes from above a cosine of -0.3 comes from
+    below 0.3."""
+    import drjit as dr
+
+    n, each = size * size, 64
+    index = dr.arange(mi.UInt32, n)
+    at = mi.Point2f(mi.Float(index % size) + 0.5, mi.Float(index // size) + 0.5) / size
+    ray, _ = scene.sensors()[0].sample_ray(0.0, 0.5, at, mi.Point2f(0.5))
+    si = scene.ray_intersect(ray)
+    sides = np.stack([np.array(si.dp_du).T, np.array(si.dp_dv).T], -1)
+    value = np.linalg.svd(np.nan_to_num(sides), compute_uv=False)
+    low, all_ = np.zeros(n), np.full(n, 1e-20)
+    xi = np.random.default_rng(6).random((each, 2), np.float32)
+    for s, t in xi:
+        point = mi.Point2f(dr.full(mi.Float, float(s), n), float(t))
+        ds, arriving = scene.sample_emitter_direction(si, point, False)
+        cosine, power = np.array(dr.dot(ds.d, si.sh_frame.n)), np.array(mi.luminance(arriving))
+        all_ += power * (cosine > -GRAZING)
+        low += power * (np.abs(cosine) < GRAZING)
+    stretch = value[:, 0] / np.maximum(value[:, 1], 1e-9)
+    return stretch.reshape(size, size), (low / all_).reshape(size, size)
+
+
 def seen(mi: Any, scene: Any, size: int, fine: int) -> tuple[NDArray[np.bool_], F64]:
     """What rays on a grid of `fine` per pixel along both sides meet, and the cosine they see it under."""
     import drjit as dr
@@ -291,36 +262,42 @@ def rms(a: tuple[F64, F64], b: tuple[F64, F64], mask: NDArray[np.bool_], block: 
 def compare(mi: Any, scene: Scene, folder: Path, size: int, spp: int) -> tuple[dict[str, Any], list[F64]]:
     """Figures of a scene, and its two pictures."""
     from mbtf_gen.bsdf import bsdf_of
+    from mbtf_gen.config import GeneratorConfig
+    from mbtf_gen.generation import build_estimator
     from mbtf_gen.material import load_material
     from mbtf_gen.scene import register_plugins
 
     register_plugins()
     material = load_material(ROOT / "assets" / scene.material)
     # The mesh that the data were made with.
-    grid = material.grid(None, 256)
-    rough = load_object(scene)
-    n = int(np.sqrt(MOST / len(rough.faces)))
+    grid = material.grid(None, MESH)
+    rough = load_object(DATA / "objects" / scene.file if scene.file else None, scene.tiles)
     base = refined(rough, SMOOTH)
-    plugin = {"type": "mbtf", "material": str(folder)}
-    fitted = scene_of(mi, scene, mesh_of(mi, base, mi.load_dict(plugin), smooth=True), size, "box")
+    bsdf = mi.load_dict({"type": "mbtf", "material": str(folder)})
+    fitted = scene_of(mi, scene, mesh_of(mi, base, bsdf, smooth=True), size, "box")
     covered, cosine = seen(mi, fitted, size, 1)
     smooth_area = seen(mi, fitted, size, 4)[0].sum() / 16
     found = halves(mi, fitted, "mbtf_path", spp)
+    facing = shrunk(covered & (cosine >= LOWEST), MARGIN)
+    config = GeneratorConfig.model_validate({"material": scene.material, "geometry": {"mesh": MESH}})
+    alone, error = fit_alone(mi, fitted, bsdf, build_estimator(config, material), facing)
+    stretch, low = hard_places(mi, fitted, size)
     del fitted
-    fine = displaced(refined(rough, n), grid)
+    fine = displaced(rough, grid)
     surface = mi.load_dict(bsdf_of(material, None, None))
     real = scene_of(mi, scene, mesh_of(mi, fine, surface, smooth=False, aspect=grid.aspect), size, "gaussian")
     met, _ = seen(mi, real, size, 1)
     area = seen(mi, real, size, 4)[0].sum() / 16
     true = halves(mi, real, "path", spp)
     both = shrunk(covered & met, MARGIN)
-    inside = both & shrunk(covered & (cosine >= LOWEST), MARGIN)
+    inside = both & facing
+    easy = inside & (stretch < EASY[0]) & (low < EASY[1])
     rim = covered & met & ~inside
     edge = covered & ~shrunk(covered, 1)
     pixel = 2 * scene.across / size
 
     def mean(pair: tuple[F64, F64], mask: NDArray[np.bool_]) -> float:
-        return float((pair[0] + pair[1])[mask].mean() / 2)
+        return float((pair[0] + pair[1])[mask].mean() / 2) if mask.any() else float("nan")
 
     figures = {
         "scene": scene.name,
@@ -328,6 +305,10 @@ def compare(mi: Any, scene: Scene, folder: Path, size: int, spp: int) -> tuple[d
         "triangles": len(fine.faces),
         "interior_pixels": int(inside.sum()),
         "interior_mean_ratio": mean(found, inside) / mean(true, inside),
+        "easy_share": float(easy.sum() / inside.sum()),
+        "easy_mean_ratio": mean(found, easy) / mean(true, easy),
+        "fit_ratio": alone,
+        "fit_ratio_error": error,
         **{f"rms_{block}": rms(found, true, inside, block) for block in BLOCKS},
         "rim_mean_ratio": mean(found, rim) / mean(true, rim),
         "outline_pixels": float((smooth_area - area) / max(1, edge.sum())),
@@ -363,7 +344,9 @@ def draw(rows: list[tuple[dict[str, Any], list[F64]]], path: Path) -> None:
 def line(f: dict[str, Any]) -> str:
     """A scene's figures as text."""
     return (
-        f"{f['scene']:13} {f['material']:13} interior mean {f['interior_mean_ratio']:.3f}, RMS "
+        f"{f['scene']:13} {f['material']:13} interior mean {f['interior_mean_ratio']:.3f} "
+        f"(of the fit {f['fit_ratio']:.3f} ± {f['fit_ratio_error']:.3f}; where easy, "
+        f"{f['easy_share']:.2f} of it, {f['easy_mean_ratio']:.3f}), RMS "
         + " ".join(f"{f[f'rms_{b}']:.3f} ({b} px)" for b in BLOCKS)
         + f"; rim mean {f['rim_mean_ratio']:.3f}; outline {f['outline_pixels']:.2f} px inside, relief "
         f"{f['relief_pixels']:.1f} px, mean depth {f['mean_depth_pixels']:.1f} px"
@@ -408,8 +391,12 @@ def main() -> int:
     worst = {
         "mean": max(abs(f["interior_mean_ratio"] - 1.0) for f in figures),
         "rms_16": max(f["rms_16"] for f in figures),
+        "flat": max(
+            (abs(f["interior_mean_ratio"] / f["fit_ratio"] - 1.0) for f in figures if f["scene"] == "plane"),
+            default=None,
+        ),
     }
-    held = all(worst[name] <= bar for name, bar in BARS.items())
+    held = all(value is None or value <= BARS[name] for name, value in worst.items())
     print(json.dumps({"figures": worst, "bars": BARS, "held": held, "scenes": figures}))
     return int(not held)
 

@@ -41,7 +41,7 @@ MATERIALS: dict[str, tuple[Path, float | None]] = {
     "tree_bark": (TEXTURE_SETS / "tree_bark", 0.1),
 }
 # Places along each side of a buffer of the image layout.
-WINDOW = 16
+WINDOW = 4
 
 
 def make_data(name: str, folder: Path, layout: str) -> Path:
@@ -50,7 +50,7 @@ def make_data(name: str, folder: Path, layout: str) -> Path:
 
     material, height = MATERIALS[name]
     queries: dict[str, Any] = {"train": "600/texel", "spp": 4, "levels": 6, "min_cos": 0.2, "test_spp": 256}
-    queries |= {"test": "16384"} if layout == "shuffled" else {"test": "1024", "layout": "image"}
+    queries |= {"test": "16384"} if layout == "shuffled" else {"test": "256", "layout": "image"}
     if layout == "image":
         queries["window"] = WINDOW
     config = GeneratorConfig.model_validate(

@@ -180,12 +180,13 @@ def paths_of(quality: str, levels: int) -> float:
 def paper(chains: list[Chain], levels: int) -> tuple[Chain | None, str]:
     """`paper` for the material that `high` was measured on, and how its figures follow."""
     law = (
-        "Generating: seconds of `high` times the ratio of their numbers of paths; data: times that of their "
-        "queries. Training: 30 000 steps of 2²⁰ queries at the rate of `standard`. Error: every doubling of "
-        f"the training time gains {PERSISTENCE:g} of what the one before gained in the logarithm, so that "
-        "E_paper = E_standard · (E_high / E_standard)^((1 − q^p) / (1 − q^h)), "
-        f"q = {PERSISTENCE:g}, where h and p doublings lie between the training times of `standard` and of "
-        "`high` and `paper`; that `paper` has other data and `high` a wider network is left out of account"
+        "Of `paper`, generating takes the seconds of `high` times the ratio of their numbers of paths, data "
+        "the bytes times that of their queries, and training 30 000 steps of 2²⁰ queries at the rate of "
+        "`standard`. In the error's logarithm every doubling of the training time gains "
+        f"q = {PERSISTENCE:g} of what the one before gained: "
+        "E_paper = E_standard · (E_high / E_standard)^((1 − q^p) / (1 − q^h)), where training takes 2^h "
+        "and 2^p times as long in `high` and `paper` as in `standard`. That `paper` has fewer, cleaner "
+        "queries and `high` a wider network is left out of account"
     )
     known = {(c.material, c.quality): c for c in chains}
     found = [c for c in chains if c.quality == "high" and (c.material, "standard") in known]

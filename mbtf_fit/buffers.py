@@ -12,7 +12,7 @@ them; a crop is a part of it, and its margin goes on beyond the border.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -28,8 +28,6 @@ from .config import HeldOutSection
 from .data import SAMPLE, Partition, Queries, in_region, mean_value, read_checked
 from .streaming import Selection
 
-# Places along each side of a crop that are compared with values.
-CROP = 32
 # Held-out queries of each kind: those of a buffer have everything in common but their place, so more say
 # little.
 HELD_OUT = 1 << 14
@@ -88,6 +86,7 @@ class TrainingBuffers:
     sigma : (buffers,); omega_i, omega_o : (buffers, 3)
     stride : (buffers, 2) rows and columns between neighbours of a crop
     extent : (buffers, 2) rows and columns of the level that windows lie on; None for whole buffers
+    side : places along each side of a batch's crops that are compared with values, at most
     """
 
     u: Tensor
@@ -97,6 +96,7 @@ class TrainingBuffers:
     value: Tensor
     stride: NDArray[np.int64]
     extent: NDArray[np.int64] | None = None
+    side: int = 32
 
     def __len__(self) -> int:
         """Queries in all."""
@@ -107,7 +107,7 @@ class TrainingBuffers:
         u, sigma, omega_i, omega_o, value = (
             t.to(device) for t in (self.u, self.sigma, self.omega_i, self.omega_o, self.value)
         )
-        return TrainingBuffers(u, sigma, omega_i, omega_o, value, self.stride, self.extent)
+        return replace(self, u=u, sigma=sigma, omega_i=omega_i, omega_o=omega_o, value=value)
 
     def crop(self, buffer: NDArray[np.int64], origin: NDArray[np.int64], size: int, margin: int) -> Crops:
         """Crops of `size` × `size` places of buffers (items,), the first place at `origin` (items, 2), row
@@ -161,7 +161,7 @@ class TrainingBuffers:
     def _chosen(self, size: int, seed: int, step: int) -> tuple[NDArray[np.int64], int]:
         """(buffers of a batch, places along each side of its crops)."""
         count, rows, columns = self.u.shape[:3]
-        side = min(CROP, rows, columns, max(1, round(size**0.5)))
+        side = min(self.side, rows, columns, max(1, round(size**0.5)))
         items = max(1, size // side**2)
         places = np.arange(step * items, (step + 1) * items)
         sweeps, position = np.divmod(places, count)

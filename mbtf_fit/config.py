@@ -30,9 +30,14 @@ class EncodingSection(Settings):
 
     position: int = Field(0, ge=0, le=16, description="bands of the position; 0: it is not encoded")
     direction: int = Field(0, ge=0, le=16, description="bands of a direction; 0: its coordinates")
-    pi: bool = Field(True, description="sin(2^k π p), which repeats with the tile; else sin(2^k p)")
+    pi: bool = Field(True, description="position: sin(2^k π p), which repeats with the tile; else sin(2^k p)")
+    direction_pi: bool = Field(
+        True, description="direction: likewise; π makes opposite grazing directions look alike"
+    )
     raw: bool = Field(False, description="whether encoded coordinates are also given as they are")
     lifted: bool = Field(False, description="directions as (x, y, z) rather than (x, y)")
+    damped: bool = Field(False, description="band k divided by 2^k, so that all are equally steep")
+    filtered: bool = Field(False, description="position: bands averaged over the query's footprint")
 
 
 class NetworkSection(Settings):
@@ -86,6 +91,13 @@ class TrainingSection(Settings):
     time: Duration = Field(120.0, description="budget: 90s, 2min, 1h")
     steps: int | None = Field(None, ge=1, description="train this many steps, however long they take")
     batch: int = Field(1 << 15, ge=1, le=1 << 24, description="queries per step")
+    crop: int = Field(
+        32,
+        ge=1,
+        le=256,
+        description="image layout: places on each side of the parts of buffers that a batch is made of, at "
+        "most; smaller ones make a batch of more lights and views, and read more for each place",
+    )
     losses: tuple[LossTerm, ...] = Field(
         (LossTerm(kind="relative", weight=1.0),),
         min_length=1,
@@ -126,14 +138,21 @@ class HeldOutSection(Settings):
     )
 
 
-# What a model's paper asks for, where that is not the sections' own default.
+# What a model's paper asks for, where that is not the sections' own default; what is not the paper's was
+# measured (``docs/models.md``).
 PRESETS: dict[str, dict[str, Any]] = {
     "neumip-baseline": {"network": {"offset": "none"}},
     "hierarchical": {
         "network": {
             "decoder": "inception",
             "output": "fourth-root",
-            "encoding": {"position": 10, "direction": 4},
+            "encoding": {
+                "position": 10,
+                "direction": 4,
+                "direction_pi": False,
+                "damped": True,
+                "filtered": True,
+            },
         },
         # Whole buffers are held out, and each has one light, view and footprint.
         "held_out": {"queries": 0.05},
@@ -146,6 +165,9 @@ class FitConfig(Settings):
 
     version: Literal[1] = 1
     model: ModelName = Field("neumip", description="model by name")
+    start: str | None = Field(
+        None, description="folder of a material whose textures and offset training starts from"
+    )
     network: NetworkSection = NetworkSection()
     training: TrainingSection = TrainingSection()
     held_out: HeldOutSection = HeldOutSection()

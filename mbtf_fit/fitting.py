@@ -30,6 +30,7 @@ from .memory import keep_freed_memory
 from .models import MODELS, build_model
 from .noise import NoiseModel, typical_value
 from .price import Price, price_of
+from .start import digest_of, take_over
 from .storage import make_folder, read_tensors, write_tensors
 from .training import Trainer
 from .transmittance import TRANSMITTANCE_NAME, fit_transmittance
@@ -155,6 +156,8 @@ def fit(
         )
     data = open_data(shards, layout, config.model)
     identity = _identity(config, data)
+    if config.start is not None:
+        identity["config_hash"] = f"{identity['config_hash']}-{digest_of(config.start)}"
     _claim(out, identity, config, overwrite)
     if (out / DESCRIPTION_NAME).exists():
         return _finished(out, time.perf_counter() - begin)
@@ -239,10 +242,17 @@ def _claim(out: Path, identity: dict[str, Any], config: FitConfig, overwrite: bo
 
 
 def prepare_trainer(config: FitConfig, data: Dataset, partition: Partition, device: torch.device) -> Trainer:
-    """A trainer at its first step, for the model and the data of a configuration."""
+    """A trainer at its first step, for the model and the data of a configuration.
+
+    Raises
+    ------
+    InputError : the material to start from is not there, or has other textures
+    """
     model = build_model(config.model, data.lattice, **config.network.model_dump())
     unit = typical_value(mean_value(partition.sample.value_a, partition.sample.value_b))
     model.initialise(torch.Generator().manual_seed(config.seed), unit)
+    if config.start is not None:
+        take_over(model, config.start)
     noise = NoiseModel.of(partition.sample, data.lattice, unit)
     return Trainer(config, model.to(device), partition.training.to(device), noise, partition.selection)
 

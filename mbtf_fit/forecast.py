@@ -19,8 +19,10 @@ from .models import MODELS
 # Seconds of the two pilot fits; each runs through the whole schedule in its time.
 PILOT_SECONDS = (4.0, 8.0)
 # Every doubling of the time gains this share of what the one before gained, in the logarithm of the error:
-# the model's size and the data end what training can reach.
-PERSISTENCE = 0.75
+# the model's size and the data end what training can reach. In docs/cost.md's studies of turtle_shell and
+# twisted_wool fits of 4.4, 8.9 and 18 s on the same data have 0.5 each; their chains of 39 and 78 s, on more
+# data, 0.57 to 0.71. benchmarks/forecasts.py finds it anew.
+PERSISTENCE = 0.6
 # Bytes of a number in the material's file.
 _NUMBER = 4
 
@@ -36,6 +38,7 @@ class FitForecast:
     queries_per_second : trained on
     unexplained : variance of held-out queries that it will miss; None where nothing is held out, or varies
     at_most : the same after the longer pilot
+    pilots : the same after each of them; none where nothing is held out, or varies
     bytes : of the material's numbers
     pilot_seconds : what the forecast took, loading included
     """
@@ -46,6 +49,7 @@ class FitForecast:
     queries_per_second: float
     unexplained: float | None
     at_most: float | None
+    pilots: tuple[float, ...]
     bytes: int
     pilot_seconds: float
 
@@ -115,6 +119,7 @@ def forecast_fit(config: FitConfig, shards: str | Path) -> FitForecast:
         queries_per_second=rate * trainer.batch,
         unexplained=extrapolated(found[0], found[1], math.log2(total / PILOT_SECONDS[1])) if found else None,
         at_most=found[-1] if found else None,
+        pilots=tuple(found),
         bytes=_NUMBER * numbers,
         pilot_seconds=time.perf_counter() - began,
     )

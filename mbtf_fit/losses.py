@@ -125,9 +125,12 @@ def absolute(error: Tensor, noise: Tensor | None) -> Tensor:
 def absolute_gradient(error: Tensor, noise: Tensor | None) -> Tensor:
     """Mean :func:`absolute` of the differences between neighbours along rows and columns of buffers (items,
     rows, columns, 3)."""
-    total = error.new_zeros(())
+    # A single row or column has no neighbours along it: nothing to compare there, not even a mean.
+    total = 0.0 * error.sum()
     for axis in (1, 2):
         n = error.shape[axis] - 1
+        if n == 0:
+            continue
         both = None if noise is None else noise.narrow(axis, 0, n) + noise.narrow(axis, 1, n)
         total = total + absolute(error.narrow(axis, 1, n) - error.narrow(axis, 0, n), both)
     return total / 2

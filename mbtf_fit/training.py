@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from typing import Any, NoReturn
 
@@ -87,6 +87,8 @@ class Trainer:
     ) -> None:
         self.config = config
         self.model = model
+        if isinstance(queries, TrainingBuffers):
+            queries = replace(queries, side=config.training.crop)
         self.queries = queries
         self.selection = selection
         self.device = next(model.parameters()).device

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import math
+import os
 import statistics
+import tempfile
 import time
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,9 +17,11 @@ from numpy.typing import NDArray
 from .adaptive import Target, estimate_shard
 from .console import clock
 from .effects import EffectsPlan
-from .estimates import Stream
+from .estimates import Estimates, Stream
 from .pilot import pilot_queries
+from .queries import Queries
 from .schema import ARRAYS, SPLITS, Split
+from .shard_files import write_shard
 from .stats import pooled_error
 
 if TYPE_CHECKING:
@@ -33,7 +38,9 @@ class Forecast:
 
     Attributes
     ----------
-    seconds : of tracing, once kernels are compiled; start : of loading, compiling and the pilot's first piece
+    seconds : of tracing, once kernels are compiled, and what drawing queries and writing take beside it
+    start : of loading, compiling and the pilot's first piece
+    query_seconds : of a training query, all told
     paths : of all splits, under a target error with those of the queries' own pilots
     paths_per_second : of the training split, in the pilot
     paths_per_query : mean over the training split, pilots not counted
@@ -46,6 +53,7 @@ class Forecast:
 
     seconds: float
     start: float
+    query_seconds: float
     paths: int
     paths_per_second: float
     paths_per_query: float
@@ -58,9 +66,9 @@ class Forecast:
     def describe(self, target: Target | None = None) -> str:
         """One line, two under a target error."""
         line = (
-            f"forecast: {clock(self.seconds)} of tracing ({self.paths_per_second / 1e6:.2f} M paths/s, after "
-            f"{self.start:.0f} s of starting), {size_text(self.bytes)}, noise of one training value "
-            f"{self.relative_error:.0%} of the mean value"
+            f"forecast: {clock(self.seconds)} of tracing and writing ({self.paths_per_second / 1e6:.2f} M "
+            f"paths/s traced, after {self.start:.0f} s of starting), {size_text(self.bytes)}, noise of "
+            f"one training value {self.relative_error:.0%} of the mean value"
         )
         if target is None:
             return line
@@ -92,13 +100,14 @@ def row_bytes(holes: bool) -> int:
 @dataclass(frozen=True)
 class _Piece:
     """What one piece of a pilot took and gave: queries, paths in all and those that would be stored, queries
-    that missed a target, seconds, both halves."""
+    that missed a target, seconds of tracing, of drawing queries and writing, both halves."""
 
     queries: int
     paths: int
     stored: int
     missed: int
     seconds: float
+    beside: float
     value_a: NDArray[np.float32]
     value_b: NDArray[np.float32]
 
@@ -127,14 +136,16 @@ def forecast(job: Job, plan: EffectsPlan, seconds: float = 2.0) -> Forecast:
     tried = sum(p.queries for p in train)
     paths = round(job.queries("train") * sum(p.paths for p in train) / tried)
     rate = statistics.median(p.paths / p.seconds for p in train)
-    took = paths / rate
+    each = _query_seconds(train)
+    took = each * job.queries("train")
     if test := job.queries("test") * job.spp("test"):
         part = _pilot(job, plan, estimator, "test", 0.25 * seconds, _PIECE_PATHS // job.spp("test"))
-        took += test / statistics.median(p.paths / p.seconds for p in part)
+        took += _query_seconds(part) * job.queries("test")
     queries = sum(job.queries(split) for split in SPLITS)
     return Forecast(
         seconds=took,
         start=start,
+        query_seconds=each,
         paths=paths + test,
         paths_per_second=rate,
         paths_per_query=sum(p.stored for p in train) / tried,
@@ -149,15 +160,43 @@ def forecast(job: Job, plan: EffectsPlan, seconds: float = 2.0) -> Forecast:
 def _piece(job: Job, plan: EffectsPlan, estimator: Any, split: Split, number: int, count: int) -> _Piece:
     """About `count` queries of a split, estimated as the run does, from streams of the pilot's own."""
     spp, target = job.spp(split), job.target(split)
+    start = time.perf_counter()
     queries = pilot_queries(job, max(1, min(count, job.queries(split))), number)
     stream = Stream(job.config.seed, "pilot", number)
-    start = time.perf_counter()
+    drawn = time.perf_counter()
     found = estimate_shard(estimator, queries, spp, target, stream, plan)
-    took = max(time.perf_counter() - start, 1e-9)
+    traced = time.perf_counter()
+    _write(queries, found)
+    beside = drawn - start + time.perf_counter() - traced
+    took = max(traced - drawn, 1e-9)
     n = len(queries.sigma)
     stored = n * spp if found.spp is None else int(found.spp.sum())
     missed = 0 if found.target is None else found.target.missed
-    return _Piece(n, max(found.paths, stored), stored, missed, took, found.value_a, found.value_b)
+    return _Piece(n, max(found.paths, stored), stored, missed, took, beside, found.value_a, found.value_b)
+
+
+def _query_seconds(pieces: list[_Piece]) -> float:
+    """Seconds of a query: tracing keeps all processors busy, so what is drawn and written beside it takes its
+    time from them, shared among them."""
+    cores = os.cpu_count() or 1
+    tracing = statistics.median(p.seconds / p.queries for p in pieces)
+    beside = statistics.median(p.beside / p.queries for p in pieces)
+    return max(tracing + beside / cores, beside)
+
+
+def _write(queries: Queries, found: Estimates) -> None:
+    """Write a piece as a shard is written, and forget it."""
+    arrays = {
+        "u": queries.u,
+        "sigma": queries.sigma,
+        "omega_i": queries.omega_i,
+        "omega_o": queries.omega_o,
+        "value_a": found.value_a,
+        "value_b": found.value_b,
+        "spp": np.ones(len(queries.sigma), np.float32),
+    }
+    with tempfile.TemporaryDirectory(prefix="mbtf-forecast-") as folder:
+        write_shard(Path(folder) / "piece.npz", arrays)
 
 
 def _pilot(

@@ -129,7 +129,9 @@ _HEAD = (
 
 
 def markdown_table(found: Expected, qualities: Sequence[str]) -> str:
-    """The table of docs/cost.md."""
+    """The table of docs/cost.md, and how what is extrapolated follows."""
+    if not found.chains:
+        return "No figures are stored."
     rows = ["| " + " | ".join(_HEAD) + " |", "|" + "---|" * len(_HEAD)]
     for quality in qualities:
         for c in found.of(quality):
@@ -147,4 +149,6 @@ def markdown_table(found: Expected, qualities: Sequence[str]) -> str:
                 f"{c.material_bytes / 1e6:.2f} MB",
             )
             rows.append("| " + " | ".join(cells) + " |")
+    if found.extrapolated:
+        rows += ["", f"{found.law}."]
     return "\n".join(rows)

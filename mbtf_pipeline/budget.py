@@ -193,7 +193,7 @@ def _plan(recipe: Recipe, budget: float, folder: Path, tell: Callable[[str], Non
     began = time.perf_counter()
     job = Job.of(recipe.generate, _material(recipe.generate))
     expected = forecast(job, allocated(job, plan_effects(job, pilots=False)))
-    price, test = _prices(expected, job.queries("train"), job.queries("test") * job.spp("test"))
+    price, test = _prices(expected, job.queries("train"))
     pilots: list[tuple[float, float]] = []
     length = PILOT * budget
     if length >= SHORTEST_PILOT:
@@ -221,11 +221,11 @@ def _material(config: GeneratorConfig) -> Any:
     return load_material(Path(config.material), config.geometry.tile)
 
 
-def _prices(expected: Forecast, queries: int, test_paths: int) -> tuple[float, float]:
+def _prices(expected: Forecast, queries: int) -> tuple[float, float]:
     """(seconds of a training query, seconds of the test split)."""
-    training = (expected.paths - test_paths) / expected.paths_per_second
     # What has a closed form takes no time that could be told from none.
-    return max(training / queries, _CHEAPEST), max(0.0, expected.seconds - training)
+    price = max(expected.query_seconds, _CHEAPEST)
+    return price, max(0.0, expected.seconds - queries * price)
 
 
 def _two_digits(count: float) -> int:

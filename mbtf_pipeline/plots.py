@@ -192,12 +192,14 @@ def scatter(
 def _write_png(figure: Any, path: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
+    figure.patch.set_alpha(1.0)
     write_through(
         path,
         lambda temporary: FigureCanvasAgg(figure).figure.savefig(
             temporary, format="png", dpi=160, facecolor="white", metadata={"Software": None}
         ),
     )
+    figure.patch.set_alpha(0.0)
 
 
 def _scatter(clouds: Sequence[Cloud], x: str, y: str, front: Sequence[tuple[float, float]]) -> Any:
@@ -250,7 +252,7 @@ def _scatter(clouds: Sequence[Cloud], x: str, y: str, front: Sequence[tuple[floa
         _plain_ticks(axis)
     # Above the plot, where it hides no point.
     marks, names = zip(*handles, strict=True)
-    figure.legend(marks, names, loc="outside upper left", frameon=False, fontsize=8.5, ncols=3)
+    figure.legend(marks, names, loc="outside upper left", frameon=False, fontsize=8.5, ncols=4)
     place_names(figure, axes, named, shown, lines)
     return figure
 

@@ -159,5 +159,7 @@ def _parts(material: Material) -> dict[str, Callable[..., Any]]:
     out["pyramid"] = lambda u, s, i, o: model.read(spread(u), model.level(spread(s)))
     encoding = model.network.encoding
     if encoding.position:
-        out["encoding"] = lambda u, s, i, o: encode_position(spread(u), encoding)
+        out["encoding"] = lambda u, s, i, o: encode_position(
+            spread(u), model.level(spread(s)), model.lattice.aspect, encoding
+        )
     return out

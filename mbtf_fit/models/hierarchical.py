@@ -7,16 +7,16 @@ modules that sees neighbouring queries, and the fourth root of the value as its 
 What is done here in its own way:
 
 - **The neighbours are places of the material, not of a picture.** The decoder reads a grid of 9 × 9 places
-around
-  the query, one texel apart, of the level nearest to its footprint. So the value is a function of the query
-  alone, as every renderer needs it; in the paper it depends on which queries happen to stand beside it.
+  around the query, one texel apart, of the level nearest to its footprint. So the value is a function of the
+  query alone, as every renderer needs it; in the paper it depends on which queries happen to stand beside it.
 - The grid wraps around the tile; the published code pads with zeros.
 - Training reads the same grids out of buffers, whose queries stand one per texel at random places within it;
-where
-  they stand at the texels' centres, training and evaluation give the same numbers.
+  where they stand at the texels' centres, training and evaluation give the same numbers.
 - Positions are encoded as ``p = 2u - 1`` with π, so that nothing jumps at the tile's seam, and before the
-offset
-  moves them; raw coordinates are not kept (``network.encoding`` has the published code's choices).
+  offset moves them; raw coordinates are not kept.
+- Encodings are filtered by the footprint and damped, and directions go without π: as in the paper, they keep
+  short fits from learning (``docs/models.md``). ``network.encoding`` has the paper's and the published code's
+  choices.
 - The answer x stands for the value ``unit · x|x|³``, an odd function.
 """
 

@@ -96,10 +96,12 @@ class TexturedMaterial(NeuralMaterial):
         moved = u
         if self.network.offset != "none":
             moved = u + self.offset(u, omega_o) / u.new_tensor([1.0, self.lattice.aspect])
-        features = self.read(moved, self.level(sigma))
+        level = self.level(sigma)
+        features = self.read(moved, level)
         if self.network.encoding.position == 0:
             return features
-        return torch.cat([features, encode_position(u, self.network.encoding)], 1)
+        encoded = encode_position(u, level, self.lattice.aspect, self.network.encoding)
+        return torch.cat([features, encoded], 1)
 
     def directions(self, omega_i: Tensor, omega_o: Tensor) -> Tensor:
         """What the decoder sees of light and view (n, 3): (n, d)."""
@@ -133,9 +135,12 @@ class TexturedMaterial(NeuralMaterial):
                 "level, then the odd one"
             )
         if encoding.position:
-            p = encoding_formula("p = 2 (u mod 1) - 1", encoding.position, encoding)
+            spread = "; s = 2^-level / (1, aspect)" if encoding.filtered else ""
+            p = encoding_formula("p = 2 (u mod 1) - 1", encoding.position, encoding.pi, encoding, spread)
             out["features"] += f"; then the position u encoded: {p}"
-        out["light, view"] = encoding_formula(f"{omega} of omega_i, of omega_o", encoding.direction, encoding)
+        out["light, view"] = encoding_formula(
+            f"{omega} of omega_i, of omega_o", encoding.direction, encoding.direction_pi, encoding
+        )
         out["x"] = "decoder(features, light, view)"
         out["value"] = output_formula(network.output, network.outputs)
         return out

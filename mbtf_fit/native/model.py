@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..config import EncodingSection
 from ..models import NeuralMaterial
 from ..models.mlp import Mlp
 from ..models.neumip import Neumip, NeumipBaseline
@@ -33,7 +34,7 @@ _KNOWN: dict[str, tuple[Any, ...]] = {
     "output": ("exp-1",),
     "offset": ("depth", "none"),
     "blending": ("blend",),
-    "encoding": ({"position": 0, "direction": 0, "pi": True, "raw": False, "lifted": False},),
+    "encoding": (EncodingSection().model_dump(),),
 }
 _SIZES = {"channels", "width", "layers"}
 

@@ -19,26 +19,44 @@ RGB_OF_YUV = ((1.0, 0.0, 1.13983), (1.0, -0.39465, -0.58060), (1.0, 2.03211, 0.0
 GATE = 0.1
 
 
-def encode(p: Sequence[Any], bands: int, options: EncodingSection) -> list[Any]:
-    """Coordinates → [themselves,] sines of doubling frequencies, cosines; without bands themselves alone."""
+def encode(
+    p: Sequence[Any],
+    bands: int,
+    pi: bool,
+    options: EncodingSection,
+    spread: Sequence[Any] | None = None,
+) -> list[Any]:
+    """Coordinates → [themselves,] sines of doubling frequencies, cosines; without bands themselves alone.
+    With `spread`, their means over Gaussians of these standard deviations."""
     if bands == 0:
         return list(p)
-    unit = math.pi if options.pi else 1.0
-    pairs = [dr.sincos(x * (unit * 2.0**k)) for x in p for k in range(bands)]
+    unit = math.pi if pi else 1.0
+    frequencies = [unit * 2.0**k for k in range(bands)]
+    pairs = [dr.sincos(x * f) for x in p for f in frequencies]
+    if options.damped:
+        pairs = [(s * 0.5**k, c * 0.5**k) for (s, c), k in zip(pairs, [*range(bands)] * len(p), strict=True)]
+    if spread is not None:
+        left = [dr.exp(-0.5 * dr.square(s * f)) for s in spread for f in frequencies]
+        pairs = [(s * a, c * a) for (s, c), a in zip(pairs, left, strict=True)]
     return [*(p if options.raw else ()), *(s for s, _ in pairs), *(c for _, c in pairs)]
 
 
 def encode_direction(omega: Any, options: EncodingSection) -> list[Any]:
     """What networks see of a direction."""
     coordinates = [omega.x, omega.y, omega.z] if options.lifted else [omega.x, omega.y]
-    return encode(coordinates, options.direction, options)
+    return encode(coordinates, options.direction, options.direction_pi, options)
 
 
-def encode_position(u: Any, options: EncodingSection) -> list[Any]:
-    """What the decoder sees of a uv position: nothing without bands."""
+def encode_position(u: Any, level: Any, aspect: float, options: EncodingSection) -> list[Any]:
+    """What the decoder sees of a uv position at a fractional level: nothing without bands."""
     if options.position == 0:
         return []
-    return encode([2.0 * (x - dr.floor(x)) - 1.0 for x in (u.x, u.y)], options.position, options)
+    p = [2.0 * (x - dr.floor(x)) - 1.0 for x in (u.x, u.y)]
+    spread = None
+    if options.filtered:
+        across = dr.exp2(-level)
+        spread = [across, across / aspect]
+    return encode(p, options.position, options.pi, options, spread)
 
 
 def _mapped(x: Any, name: str) -> Any:

@@ -70,7 +70,8 @@ class Evaluator:
                 dr.fma(x, OFFSET_SCALE, u.x), dr.fma(y, OFFSET_SCALE / self.lattice.aspect, u.y)
             )
         read = self.pyramid.blended if self.network.blending == "blend" else self.pyramid.side_by_side
-        return [*read(moved, level), *encode_position(u, self.network.encoding)]
+        encoded = encode_position(u, level, self.lattice.aspect, self.network.encoding)
+        return [*read(moved, level), *encoded]
 
     def value(self, features: list[Any], omega_i: Any, omega_o: Any) -> Any:
         """Stage 2: value (Color3f) in 1/sr, at least 0."""

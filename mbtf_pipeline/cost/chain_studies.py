@@ -58,8 +58,8 @@ def chains(budget: float, spp: int, price: Price) -> Iterator[Chain]:
 
 
 def _whole(budget: float, spp: int, price: Price) -> Iterator[Chain]:
-    """Chains of one minute in all, two, four, … as far as the budget goes; what is left goes to other splits
-    of them, the shortest first."""
+    """Chains planned for one minute in all, two, four, … as far as the budget goes; what is left goes to
+    other splits of them, the shortest first."""
     totals = [SHORTEST]
     while sum(totals) + 2 * totals[-1] <= budget:
         totals.append(2 * totals[-1])
@@ -73,21 +73,27 @@ def _whole(budget: float, spp: int, price: Price) -> Iterator[Chain]:
     for total, share in wanted:
         queries = _queries(share * total, spp, price)
         fit = _fit("neumip", (1 - share) * total)
-        yield Chain("chain", f"{share:.0%} of the time generating", f"{total:g} s", queries, spp, fit)
+        yield Chain(
+            "chain", f"{share:.0%} of the time generating", f"planned for {total:g} s", queries, spp, fit
+        )
 
 
 def _fits(budget: float, spp: int, price: Price) -> Iterator[Chain]:
     """Models and sizes over training time, on one data set."""
     unit = budget / 13.5
     queries = _queries(1.5 * unit, spp, price)
-    for model in MODELS:
-        for share in (0.5, 1, 2) if model == MODELS[0] else (1, 2):
-            seconds = share * unit
-            yield Chain("fit", model, f"{seconds:.3g} s", queries, spp, _fit(model, seconds))
-    for width in WIDTHS:
-        seconds = 2 * unit
-        name = f"{seconds:.3g} s"
-        yield Chain("fit", f"neumip, {width} wide", name, queries, spp, _fit("neumip", seconds, width))
+
+    def chain(study: str, series: str, name: str, fit: dict[str, object]) -> Chain:
+        return Chain(study, series, name, queries, spp, fit)
+
+    shortest = 0.5 * unit
+    yield chain("fit", MODELS[0], f"{shortest:.3g} s", _fit(MODELS[0], shortest))
+    # Bars of all chains rest on these.
     for seed in SEEDS:
-        fit = {**_fit(MODELS[0], 0.5 * unit), "seed": seed}
-        yield Chain("seeds", MODELS[0], f"seed {seed}", queries, spp, fit)
+        yield chain("seeds", MODELS[0], f"seed {seed}", {**_fit(MODELS[0], shortest), "seed": seed})
+    for model in MODELS:
+        for seconds in (unit, 2 * unit):
+            yield chain("fit", model, f"{seconds:.3g} s", _fit(model, seconds))
+    for width in WIDTHS:
+        name = f"{2 * unit:.3g} s"
+        yield chain("fit", f"neumip, {width} wide", name, _fit("neumip", 2 * unit, width))

@@ -148,7 +148,10 @@ def fit_figures(points: Sequence[Point], name: str, folder: Path) -> list[dict[s
         return p.series
 
     def precise(kind: str, some: Sequence[Point], size: str, hollow: bool) -> Cloud:
-        return _cloud(kind, some, _error, detail(size), label=series, joined=False, hollow=hollow)
+        def kilobytes(p: Point) -> Estimate:
+            return detail(size)(p).scaled(1e-3)
+
+        return _cloud(kind, some, _error, kilobytes, label=series, joined=False, hollow=hollow)
 
     return [
         _figure(_by_series(points, _error), "seconds of training", ERROR_AXIS, name, folder),
@@ -165,7 +168,7 @@ def fit_figures(points: Sequence[Point], name: str, folder: Path) -> list[dict[s
                 precise("32-bit floats", longest, "bytes", False),
                 precise("the same in 16-bit floats", half, "half_bytes", True),
             ],
-            "bytes of the material",
+            "kilobytes of the material",
             ERROR_AXIS,
             f"{name}_bytes",
             folder,

@@ -10,6 +10,7 @@ given as root mean squares relative to the mean value of the reference.
 from __future__ import annotations
 
 import math
+import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -34,7 +35,7 @@ BIAS_SPP = 64
 _MOST_BIAS_PIECES = 16
 # Paths of one timed piece.
 _PIECE_PATHS = 1 << 19
-_FEWEST_PIECES = 4
+_FEWEST_PIECES = 8
 # Half-width of a 95 % interval, relative, at which measuring stops; and the bias below which none is looked
 # for.
 _HALF_WIDTH = 0.1
@@ -158,7 +159,7 @@ class Bench:
         noise, price = self._noise(job, trace, spp, seconds, mean)
         if against is None:
             return Measured(price, None, _root(noise), _root(noise))
-        bias = self._bias(estimator, against, seconds, mean)
+        bias = self.bias(estimator, against, seconds)
         return Measured(price, _root(bias), _root(noise), _root(_total(bias, noise)))
 
     def measure_counts(self, changes: dict[str, Any], adaptive: bool, seconds: float) -> Measured:
@@ -206,14 +207,21 @@ class Bench:
             if _sure(variance) or late:
                 return variance
 
-    def _bias(self, estimator: Any, against: dict[str, Any], seconds: float, mean: float) -> Estimate:
-        """Squared bias relative to the mean value squared."""
+    def bias(self, estimator: Any, against: dict[str, Any], seconds: float, spp: int = BIAS_SPP) -> Estimate:
+        """Squared bias relative to the mean value squared.
+
+        Parameters
+        ----------
+        against : options of the reference
+        spp : paths of the estimator at each query; the bias does not depend on them, its error bar does
+        """
+        mean = self.reference(against, 0).mean
         began = time.perf_counter()
         squares: list[NDArray[np.float64]] = []
         while True:
             piece = len(squares)
             reference = self.reference(against, piece)
-            found = estimator.estimate(reference.queries, BIAS_SPP, self._stream(piece))
+            found = estimator.estimate(reference.queries, spp, self._stream(piece))
             a, b = found.value_a.astype(np.float64), found.value_b.astype(np.float64)
             squares.append(((a - reference.a) * (b - reference.b)).mean(axis=1) / mean**2)
             square = mean_estimate(np.concatenate(squares))
@@ -244,7 +252,15 @@ class Bench:
             piece += 1
             variance = mean_estimate(np.concatenate(squares))
             if piece >= _FEWEST_PIECES and (_sure(variance) or time.perf_counter() - began > seconds):
-                return variance, mean_estimate(prices)
+                return variance, _typical(prices)
+
+
+def _typical(prices: list[float]) -> Estimate:
+    """Median, which other work on the machine moves little, and its standard error from the median absolute
+    deviation, both as for normal scatter."""
+    middle = statistics.median(prices)
+    deviation = 1.4826 * statistics.median(abs(p - middle) for p in prices)
+    return Estimate(middle, 1.2533 * deviation / math.sqrt(len(prices)), len(prices))
 
 
 def _sure(variance: Estimate) -> bool:

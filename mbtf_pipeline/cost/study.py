@@ -18,9 +18,9 @@ from mbtf_gen.settings import dump_yaml
 from ..recipe import Recipe
 from ..run_folder import locked, machine, take
 from .chain_studies import GENERATOR, chains
-from .chains import Workshop
+from .chains import Chain, Workshop
 from .generator import Bench
-from .generator_studies import generator_tasks
+from .generator_studies import GeneratorTask, generator_tasks
 from .points import Point, PointFolder
 from .scatter import with_scatter
 
@@ -140,7 +140,7 @@ def run_study(
                 note(f"{task.study}: {task.series}, {task.name}")
                 point = task.run(bench, each)
                 store.put(task.key, point)
-            _keep(study, point, f"{task.study}: {task.series}, {task.name}", task.command(generator))
+            _keep(study, point, task, task.command(generator))
         price = _price(study.points)
         if price is not None:
             judged = _tested(config, material)
@@ -160,12 +160,12 @@ def _tested(config: GeneratorConfig, material: Material) -> GeneratorConfig:
     return config.model_copy(update={"queries": changed})
 
 
-def _keep(study: Study, point: Point | None, name: str, command: str) -> None:
+def _keep(study: Study, point: Point | None, task: GeneratorTask | Chain, command: str) -> None:
     """Take a point up; its command names the study's folder, which may have moved since it was measured."""
     if point is None:
-        study.skipped.append(name)
+        study.skipped.append(f"{task.study}: {task.series}, {task.name}")
     else:
-        study.points.append(replace(point, command=command))
+        study.points.append(replace(point, series=task.series, name=task.name, command=command))
 
 
 def _price(points: Iterable[Point]) -> Callable[[int], float] | None:
@@ -199,8 +199,7 @@ def _measure_chains(
             if point is None and left() > task.seconds(price, data=not work.has(task)):
                 point = work.measure(task)
                 store.put(task.key, point)
-            name = f"{task.study}: {task.series}, {task.name}"
-            _keep(study, point, name, work.command_of(task))
+            _keep(study, point, task, work.command_of(task))
             if (task.queries, task.spp) not in needed[number + 1 :]:
                 work.forget(task.queries, task.spp)
     finally:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from mbtf_gen.stats import Estimate
 
-from ..stock import BARS, MEAN_TOLERANCE, RMS_TOLERANCE, agree
+from ..stock import BARS, LEAST_SQUARES, MEAN_TOLERANCE, RMS_TOLERANCE, verdict
 from ..wording import direction, estimate
 from .cells import Cell, Column, Figure, Table
 from .figures import difference, picture
@@ -43,9 +43,9 @@ def independence(runs: Sequence[Run]) -> list[Table]:
                     found["surface"],
                     _ROUTES[found["surface"]],
                     estimate(found["mean"]),
-                    _rms_text(square),
-                    math.sqrt(BARS * square.error),
-                    "agree" if agree(estimate(found["mean"]), square) else "DIFFER",
+                    _rms_text(square) if square.n >= LEAST_SQUARES else None,
+                    math.sqrt(BARS * square.error) if square.n >= LEAST_SQUARES else None,
+                    verdict(estimate(found["mean"]), square),
                 ]
             )
             ours, stock = (run.picture(found["files"][route]) for route in ("ours", "stock"))
@@ -71,8 +71,8 @@ def independence(runs: Sequence[Run]) -> list[Table]:
         "alone everything is stock, the surface, too (diffuse); the full surface is the project’s in "
         "both, under stock everything else. Holes are left out. The two agree where the means differ by "
         f"less than {100 * MEAN_TOLERANCE:g} % and pixels by less than {100 * RMS_TOLERANCE:g} % RMS, or "
-        "by less than three error bars; the last but one column is the smallest RMS difference that the "
-        "noise would let be seen."
+        "by less than three error bars, which pictures of less than 20 pixels a side are too small for; the "
+        "last but one column is the smallest RMS difference that the noise would let be seen."
     )
     return [Table("independence", "References by stock parts", text, columns, rows, figures=figures)]
 

@@ -50,13 +50,13 @@ def test_stock_parts_agree_with_and_without_gloss(glossy: Material) -> None:
     found = compare_with_stock(SECTION, config("unused"), glossy)
     assert [f.surface for f in found] == ["base colour", "full"]
     for f in found:
-        assert f.agrees, f.as_dict()
+        assert f.verdict == "agree", f.as_dict()
         # The bars could hide something only where they are wide.
         assert f.mean.error < 0.01
         assert f.square.error < 0.01
     # Gloss is no small part of the picture: without it there is another one.
     bare, full = (f.ours for f in found)
-    assert not agreement("", (bare, bare), (full, full)).agrees
+    assert agreement("", (bare, bare), (full, full)).verdict == "DIFFER"
 
 
 def test_a_picture_from_elsewhere_does_not_agree(glossy: Material, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -71,7 +71,7 @@ def test_a_picture_from_elsewhere_does_not_agree(glossy: Material, monkeypatch: 
 
     monkeypatch.setattr(stock, "render_stock", moved)
     found = compare_with_stock(SECTION, config("unused"), glossy)[0]
-    assert not found.agrees
+    assert found.verdict == "DIFFER"
     assert found.square.value > 10 * found.square.error
 
 
@@ -81,11 +81,11 @@ def test_noise_of_both_sides_drops_out() -> None:
     a, b, c, d = (truth + 0.3 * random.standard_normal(truth.shape) for _ in range(4))
     same = agreement("", (a, b), (c, d))
     assert abs(same.square.value) < 4 * same.square.error
-    assert same.agrees
+    assert same.verdict == "agree"
     wrong = truth + 0.2 * np.sign(random.standard_normal(truth.shape))
     other = agreement("", (a, b), (wrong, wrong))
     assert other.square.value == pytest.approx(0.04, abs=4 * other.square.error)
-    assert not other.agrees
+    assert other.verdict == "DIFFER"
 
 
 @pytest.mark.parametrize("size", [1, 8, 9])
@@ -95,6 +95,17 @@ def test_small_pictures_keep_pixels_to_compare(size: int) -> None:
     found = agreement("", (one, one), (1.5 * one, 1.5 * one), margin=4)
     assert found.mean.value == pytest.approx(-0.4)
     assert found.square.value == pytest.approx(0.16)
+
+
+@pytest.mark.parametrize(("size", "told"), [(8, False), (19, False), (20, True), (24, True), (48, True)])
+def test_small_pictures_are_told_apart_or_said_to_be_too_small(size: int, told: bool) -> None:
+    random = np.random.default_rng(7)
+    truth = 0.5 + random.random((size, size, 3))
+    a, b, c, d = (truth + 0.02 * random.standard_normal(truth.shape) for _ in range(4))
+    same = agreement("", (a, b), (c, d), margin=4)
+    other = agreement("", (a, b), (1.5 * c, 1.5 * d), margin=4)
+    expected = ("agree", "DIFFER") if told else ("too small to tell",) * 2
+    assert (same.verdict, other.verdict) == expected
 
 
 def test_grazing_comparisons_are_refused() -> None:

@@ -43,11 +43,8 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, float]]:
     chains: list[tuple[int, float]] = []
 
     def forecast(job: Any, plan: Any) -> Any:
-        queries, test = job.queries("train"), job.queries("test") * job.spp("test")
-        rate = job.spp("train") / PRICE
-        train = queries * job.spp("train")
-        seconds = train / rate + TEST
-        return SimpleNamespace(paths=train + test, paths_per_second=rate, seconds=seconds, start=START)
+        seconds = job.queries("train") * PRICE + TEST
+        return SimpleNamespace(query_seconds=PRICE, seconds=seconds, start=START)
 
     def measure(self: Any, chain: Any) -> Any:
         generating, training = chain.queries * PRICE, parse_duration(chain.fit["training"]["time"])

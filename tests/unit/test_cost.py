@@ -5,11 +5,13 @@ from __future__ import annotations
 import csv
 import io
 import math
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from mbtf_gen.config import GeneratorConfig
 from mbtf_gen.estimates import Estimates, Stream
@@ -284,4 +286,86 @@ def test_plots_name_their_axes_and_bars(tmp_path: Path) -> None:
     svg = scatter([cloud], "seconds", "error", "a plot", front=[(1.0, 0.5)], png=tmp_path / "a.png")
     for text in ("seconds", "error", "series", "first", "second", "front"):
         assert text in svg
-    assert (tmp_path / "a.png").read_bytes()[:4] == b"\x89PNG"
+    with Image.open(tmp_path / "a.png") as picture:
+        # On white, whatever lies behind it.
+        assert picture.convert("RGBA").getpixel((1, 1)) == (255, 255, 255, 255)
+
+
+def test_names_lie_on_no_point_and_on_no_other_name() -> None:
+    """Points of a cluster, close enough that names beside them would cover each other."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    from mbtf_pipeline.labels import Named, place_names
+
+    figure = Figure(figsize=(7, 4))
+    axes = figure.add_subplot()
+    spots = [(0.5, 0.5), (0.52, 0.5), (0.54, 0.51), (0.95, 0.5)]
+    axes.set(xlim=(0, 1), ylim=(0, 1))
+    line = ((0.4, 0.5), (0.6, 0.5))
+    place_names(figure, axes, [Named(*s, "a name of some length", "k") for s in spots], spots, [line])
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    boxes = [t.get_window_extent(renderer) for t in axes.texts]
+    assert len(boxes) == len(spots)
+    for number, box in enumerate(boxes):
+        assert not any(box.overlaps(other) for other in boxes[:number])
+        assert not any(box.contains(*axes.transData.transform(s)) for s in spots)
+        assert box.x1 <= axes.get_window_extent(renderer).x1
+        ends = [axes.transData.transform(end) for end in line]
+        across = box.x0 < ends[1][0] and box.x1 > ends[0][0]
+        assert not (across and box.y0 < ends[0][1] < box.y1)
+
+
+def made(study: str, seconds: float, error: float, series: str = "neumip", **details: float) -> Point:
+    """A chain's point as the workshop makes it."""
+    numbers = {
+        "queries": 1e6, "spp": 4.0, "generation_seconds": 3.0, "training_seconds": seconds,
+        "total_seconds": seconds + 4.0, "evaluation_ms_1080p": 250.0, "bytes": 1e6, "half_bytes": 5e5,
+        "half_error": error * 1.01, "half_error_se": 0.01,
+    }  # fmt: skip
+    spent, left = Estimate(seconds, 0.0, 1), Estimate(error, 0.01, 9)
+    return Point(
+        study, series, f"{seconds:g} s", {}, "mbtf-gen a && mbtf-fit b", spent, left, details=numbers
+    )
+
+
+def test_the_page_shows_the_front_with_commands_and_what_is_biased(tmp_path: Path) -> None:
+    from mbtf_pipeline.cost.page import write_page
+    from mbtf_pipeline.cost.study import Study
+
+    def setting(name: str, bias: Estimate) -> Point:
+        second, noise = Estimate(1.0, 0.1, 4), Estimate(0.5, 0.01, 9)
+        return Point("bounces", "interactions", name, {}, "mbtf-gen c", second, noise, bias, noise)
+
+    points = [
+        made("fit", 10.0, 0.3), made("fit", 20.0, 0.2), made("fit", 20.0, 0.4, "neumip-baseline"),
+        setting("1 interactions", Estimate(0.05, 0.004, 9)),
+        setting("2 interactions", Estimate(0.002, 0.003, 9)), setting("no limit", Estimate(0.0, 0.0, 9)),
+    ]  # fmt: skip
+    description = {
+        "name": "a study", "machine": {"system": "a machine"}, "made": "today", "budget": 600.0,
+        "material": "rock", "command": "mbtf-pipeline cost rock",
+    }  # fmt: skip
+    page = write_page(Study(tmp_path, description, points)).read_text()
+    names = {p.stem for p in tmp_path.glob("*.png")}
+    assert names == {"front", "fit", "fit_evaluation", "fit_bytes", "bounces"}
+    front = page.split('id="front"')[1].split("</section>")[0]
+    # Two of the three chains, in sight, each with a command that one click selects.
+    assert front.count("<td class=command><code>mbtf-gen a &amp;&amp; mbtf-fit b</code></td>") == 2
+    assert "<details>" not in front
+    bounces = page.split('id="bounces"')[1].split("</section>")[0]
+    # The bias that is told from zero has a bar, the other a limit, and what is the reference's own has none.
+    assert "<td>5.0 ± 0.4 %</td>" in bounces
+    assert "<td>&lt; 0.6 %</td>" in bounces
+    assert "<td>0 %</td>" in bounces
+    assert "at most 0.6 % of the mean value" in bounces
+    assert not re.search(r"\bnan\b", page)
+
+
+def test_other_work_on_the_machine_does_not_change_the_price() -> None:
+    from mbtf_pipeline.cost.generator import _typical
+
+    quiet = [1.0, 1.02, 0.98, 1.01, 0.99, 1.0, 1.03]
+    found = _typical([*quiet, 9.0])
+    assert abs(found.value - 1.0) < 0.02
+    assert 0.0 < found.error < 0.02

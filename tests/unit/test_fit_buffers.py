@@ -12,10 +12,11 @@ from support.buffer_data import random_buffers, write_buffers
 from support.fit_data import constant, parallax, random_queries, write_data
 
 from mbtf_fit import FitConfig, Material, evaluate, fit
-from mbtf_fit.buffers import TrainingBuffers, load_buffers, nearest_shapes, strides
+from mbtf_fit.buffers import Crops, TrainingBuffers, load_buffers, nearest_shapes, strides
 from mbtf_fit.config import HeldOutSection
 from mbtf_fit.data import Partition, Queries, in_region, load_split
 from mbtf_fit.evaluation import judge
+from mbtf_fit.fitting import prepare_trainer
 from mbtf_fit.models import Hierarchical, build_model
 from mbtf_gen.dataset import Dataset
 from mbtf_gen.errors import InputError
@@ -215,6 +216,20 @@ def test_batches_cut_windows_within_them() -> None:
         assert (number == number[0, 0] + 6 * torch.arange(4)[:, None] + torch.arange(4)).all()
         seen.add(int(number[0, 0]))
     assert seen == {6 * j + i for j in range(3) for i in range(3)}
+
+
+@pytest.mark.parametrize("window", [None, 6])
+def test_smaller_crops_make_batches_of_more_lights_and_views(tmp_path: Path, window: int | None) -> None:
+    folder = write_buffers(tmp_path / "d", constant(0.1), train=40, window=window)
+    for crop, shape in ((2, (16, 2, 2, 3)), (4, (4, 4, 4, 3))):
+        training = {"steps": 1, "batch": 64, "crop": crop}
+        config = FitConfig.model_validate({"model": "hierarchical", "training": training})
+        data = Dataset.open(folder)
+        part = load_buffers(data, config.held_out, 0)
+        batch = next(prepare_trainer(config, data, part, torch.device("cpu"))._batches())
+        assert isinstance(batch, Crops)
+        assert batch.value.shape == shape
+        assert len(batch.omega_i.unique(dim=0)) == shape[0]
 
 
 @pytest.mark.parametrize("cut", ["whole", "windows"])

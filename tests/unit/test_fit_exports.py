@@ -29,6 +29,19 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
         "hierarchical",
         {"decoder": "mlp", "channels": 11, "encoding": {"raw": True, "lifted": True}},
     ),
+    "encoded": (
+        "neumip",
+        {
+            "encoding": {
+                "position": 4,
+                "direction": 2,
+                "direction_pi": False,
+                "raw": True,
+                "damped": True,
+                "filtered": True,
+            }
+        },
+    ),
 }
 
 
@@ -105,13 +118,17 @@ class Reader:
             x = self.layer(layer["name"], x)
         return x
 
-    def encoded(self, p: F64, bands: int, options: dict[str, Any]) -> F64:
-        if not bands:
+    def encoded(self, p: F64, kind: str, options: dict[str, Any], spread: F64 | None = None) -> F64:
+        if not options[kind]:
             return p
-        angle = (p[..., None] * 2.0 ** np.arange(bands) * (np.pi if options["pi"] else 1)).reshape(
-            *p.shape[:-1], -1
-        )
-        return np.concatenate([*([p] if options["raw"] else []), np.sin(angle), np.cos(angle)], -1)
+        doubling = 2.0 ** np.arange(options[kind])
+        frequency = doubling * (np.pi if options["pi" if kind == "position" else "direction_pi"] else 1)
+        angle = (p[..., None] * frequency).reshape(*p.shape[:-1], -1)
+        left: Any = np.tile(1 / doubling, p.shape[-1]) if options["damped"] else 1.0
+        if spread is not None:
+            left = left * np.exp(-((spread[..., None] * frequency) ** 2) / 2).reshape(*spread.shape[:-1], -1)
+        parts = [left * np.sin(angle), left * np.cos(angle)]
+        return np.concatenate([*([p] if options["raw"] else []), *parts], -1)
 
     def value(self, options: dict[str, Any]) -> F64:
         document, encoding = self.document, options["encoding"]
@@ -146,9 +163,11 @@ class Reader:
             features = np.concatenate([np.where(odd, two, one), np.where(odd, one, two)], -1)
         if encoding["position"]:
             p = 2 * (places - np.floor(places)) - 1
-            features = np.concatenate([features, self.encoded(p, encoding["position"], encoding)], -1)
+            spread = 2.0 ** -level[:, None, None, None] / [1, document["tile"]["aspect"]]
+            encoded = self.encoded(p, "position", encoding, spread if encoding["filtered"] else None)
+            features = np.concatenate([features, encoded], -1)
         size = 3 if encoding["lifted"] else 2
-        lights = [self.encoded(o[:, :size], encoding["direction"], encoding) for o in (omega_i, omega_o)]
+        lights = [self.encoded(o[:, :size], "direction", encoding) for o in (omega_i, omega_o)]
         shared = np.concatenate(lights, -1)[:, None, None]
         x = np.concatenate([features, np.broadcast_to(shared, (*features.shape[:3], shared.shape[-1]))], -1)
         x = self.inception(x) if inception else self.network("decoder", x)

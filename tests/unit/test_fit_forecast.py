@@ -28,6 +28,16 @@ def test_every_doubling_gains_a_share_of_the_one_before() -> None:
     assert extrapolated(0.8, 0.6, 60) == pytest.approx(0.6 * (0.6 / 0.8) ** (PERSISTENCE / (1 - PERSISTENCE)))
 
 
+def test_fits_several_doublings_apart_follow_the_same_law() -> None:
+    """Errors of the law itself at 1, 2, 8 and 64 times: any two tell the third."""
+    eight = extrapolated(0.8, 0.6, 2)
+    end = extrapolated(0.8, 0.6, 5)
+    assert extrapolated(0.6, eight, 3, apart=2) == pytest.approx(end)
+    assert extrapolated(0.8, eight, 3, apart=3) == pytest.approx(end)
+    # Gains that last promise more.
+    assert extrapolated(0.8, 0.6, 5, persistence=0.9) < end < extrapolated(0.8, 0.6, 5, persistence=0.5)
+
+
 def test_what_pilots_do_not_show_is_not_promised() -> None:
     assert extrapolated(0.5, 0.6, 3) == 0.6
     assert extrapolated(0.8, 0.6, -2) == 0.6
@@ -47,7 +57,7 @@ def test_a_forecast_is_of_the_fit_that_follows(
     assert found.seconds == 3.0 if "time" in options else found.steps == 12
     assert found.unexplained is not None
     assert found.at_most is not None
-    assert found.unexplained <= found.at_most
+    assert found.unexplained <= found.at_most == found.pilots[1]
     assert len(found.describe().splitlines()) == 2
     if "steps" in options:
         fit(config, shards, tmp_path / "material")
@@ -62,4 +72,5 @@ def test_data_without_variance_have_none_to_forecast(tmp_path: Path, monkeypatch
     found = forecast_fit(config, write_data(tmp_path, constant(0.2), train=2000))
     assert found.unexplained is None
     assert found.at_most is None
+    assert found.pilots == ()
     assert "nan" not in found.describe()

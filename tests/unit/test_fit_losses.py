@@ -121,6 +121,38 @@ def test_terms_add_up_with_their_weights() -> None:
     torch.testing.assert_close(Objective(both, noise)(p, data), total)
 
 
+def test_corrected_absolute_terms_are_parabolas_of_the_noise() -> None:
+    """e²/2√(v + 0.01), e and v in units of the scale; of neighbours' differences v is that of both."""
+    e, v = 0.3 / SCALE, 0.04 / SCALE**2
+    loss = objective("linear", 0.04, robust=None)
+    found = loss(torch.full((5, 3), 1.0), queries(torch.full((5, 3), 1.3)))
+    assert float(found) == pytest.approx(e**2 / 2 / (v + 0.01) ** 0.5, rel=1e-5)
+    loss = objective("gradient", 0.04, robust=None)
+    value = torch.ones(1, 4, 4, 3, dtype=torch.float64)
+    value[:, ::2] += 1e-3
+    data = queries(value[:, 0, 0])
+    data = TrainingQueries(data.u, data.sigma, data.omega_i, data.omega_o, value)
+    slope = float(FourthRoot().slope(torch.tensor(1.0 / SCALE, dtype=torch.float64)))
+    edge, noise = slope * 1e-3 / SCALE, 2 * slope**2 * v
+    # All differences down the columns, none along the rows.
+    expected = edge**2 / 2 / (noise + 0.01) ** 0.5 / 2
+    assert float(loss(torch.ones_like(value), data)) == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize("shape", [(2, 1, 6, 3), (2, 6, 1, 3), (2, 1, 1, 3)])
+def test_a_single_row_of_places_has_gradients_along_it_alone(shape: tuple[int, ...]) -> None:
+    value = torch.rand(shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    data = queries(value[:, 0, 0])
+    data = TrainingQueries(data.u, data.sigma, data.omega_i, data.omega_o, value)
+    for correction in ("none", "linear"):
+        p = torch.zeros_like(value, requires_grad=True)
+        loss = objective("gradient", 0.01, correction=correction)(p, data)
+        (gradient,) = torch.autograd.grad(loss, p)
+        assert bool(loss.isfinite())
+        assert bool(gradient.isfinite().all())
+        assert bool(loss > 0) == (max(shape[1:3]) > 1)
+
+
 def test_the_gradient_term_sees_differences_of_neighbours_alone() -> None:
     """A constant error costs nothing; an edge costs what it is high."""
     value = torch.zeros(1, 4, 6, 3, dtype=torch.float64)

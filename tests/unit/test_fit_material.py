@@ -13,10 +13,12 @@ import torch
 from safetensors.numpy import load_file
 from support.fit_data import constant, parallax, random_queries, write_data
 
+import mbtf_fit.material
 from mbtf_fit import FitConfig, FitResult, Material, evaluate, fit, read_history
 from mbtf_fit.data import load_training
 from mbtf_fit.evaluation import split_errors
 from mbtf_fit.fitting import prepare_trainer
+from mbtf_fit.material import conformance_queries, export
 from mbtf_gen.dataset import Dataset
 from mbtf_gen.errors import EngineError, InputError
 from mbtf_gen.levels import Lattice
@@ -77,6 +79,8 @@ def test_the_folder_states_what_it_holds(fitted: FitResult) -> None:
     assert weights["pyramid.3"].shape == weights["offset_texture.0"].shape == (4, 8, 7)
     assert weights["conformance.rgb"].shape == (256, 3)
     assert description["training"]["steps"] == 30
+    held_out = [fitted.errors[name]["n"] for name in ("held_out_queries", "held_out_directions")]
+    assert description["training"]["queries"] == 8000 - sum(held_out)
     assert not (fitted.folder / "checkpoint.safetensors").exists()
     assert fitted.errors["test"]["n"] == 2000
 
@@ -119,6 +123,42 @@ def test_stored_weights_and_formula_suffice(fitted: FitResult) -> None:
     rgb = np.maximum(weights["unit"] * np.expm1(x), 0)
     np.testing.assert_allclose(rgb, weights["conformance.rgb"], atol=2e-6)
     assert fitted.material.deviation() < 1e-6
+
+
+@pytest.mark.parametrize("finest", [0, 4])
+def test_conformance_queries_go_to_the_limits(finest: int) -> None:
+    """Seams of the tile, footprints at both ends and beyond, light and view from straight above."""
+    lattice = Lattice(finest)
+    queries = conformance_queries(lattice)
+    assert ((queries["u"] >= 0) & (queries["u"] <= 1)).all()
+    for axis in (0, 1):
+        assert (queries["u"][:, axis] == 0).any()
+        assert (queries["u"][:, axis] > 0.998).any()
+    level = -np.log2(2 * queries["sigma"])
+    assert level.min() == -1
+    assert level.max() == finest + 1
+    assert {0, finest} <= set(level.tolist())
+    for name in ("omega_i", "omega_o"):
+        assert (queries[name][:, 2] == 1).any()
+        assert queries[name][:, 2].min() < 0.3
+        np.testing.assert_allclose(np.linalg.norm(queries[name], axis=1), 1, atol=1e-6)
+
+
+def test_expected_values_are_not_made_by_what_they_check(
+    fitted: FitResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A fault in fast evaluation shows as a deviation from what is stored."""
+    true = mbtf_fit.material.predict
+
+    def faulty(*arguments: Any) -> np.ndarray:
+        return true(*arguments) + np.float32(0.25)
+
+    monkeypatch.setattr(mbtf_fit.material, "predict", faulty)
+    material, description = fitted.material, fitted.material.description
+    facts = {name: description[name] for name in ("data", "training")}
+    again = export(material.model, material.config, tmp_path, **facts)
+    np.testing.assert_array_equal(again.conformance["rgb"], material.conformance["rgb"])
+    assert again.deviation() == pytest.approx(0.25, rel=1e-3)
 
 
 def test_evaluation_takes_any_number_of_queries(fitted: FitResult) -> None:

@@ -28,6 +28,7 @@ VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
         "neumip",
         {"encoding": {"position": 2, "direction": 2, "raw": True, "lifted": True, "pi": False}},
     ),
+    "filtered": ("neumip", {"encoding": {"position": 3, "direction": 1, "filtered": True, "damped": True}}),
     "identity": ("neumip-baseline", {"output": "identity", "channels": 3, "width": 8, "layers": 2}),
     "hierarchical": ("hierarchical", {}),
     "hierarchical, one module": ("hierarchical", {"layers": 3, "offset": "none", "outputs": 6, "width": 12}),
@@ -246,15 +247,45 @@ def test_encodings_are_sines_and_cosines_of_doubling_frequencies() -> None:
     pi = torch.pi
     u = torch.tensor([[0.75, -0.75]], dtype=F64)  # p = 0.5, -0.5
     expected = [(k * p, f) for f in (torch.sin, torch.cos) for p in (0.5, -0.5) for k in (pi, 2 * pi)]
-    found = encode_position(u, options)[0]
+    level = torch.zeros(1, dtype=F64)
+    found = encode_position(u, level, 1.0, options)[0]
     torch.testing.assert_close(found, torch.stack([f(torch.tensor(x, dtype=F64)) for x, f in expected]))
     omega = torch.tensor([[0.6, 0.0, 0.8]], dtype=F64)
-    kept = EncodingSection(direction=1, pi=False, raw=True, lifted=True)
+    kept = EncodingSection(direction=1, direction_pi=False, raw=True, lifted=True)
     s, c = omega.sin(), omega.cos()
     torch.testing.assert_close(encode_direction(omega, kept), torch.cat([omega, s, c], 1))
     for e in (options, kept, EncodingSection(), EncodingSection(position=3, raw=True)):
-        assert encode_position(u, e).shape[1] == position_size(e)
+        assert encode_position(u, level, 1.0, e).shape[1] == position_size(e)
         assert encode_direction(omega, e).shape[1] == direction_size(e)
+
+
+def test_damped_encodings_are_equally_steep() -> None:
+    options = EncodingSection(position=6, direction=4, direction_pi=False, damped=True)
+    h = 1e-6
+    up, tilt = torch.tensor([[0.0, 0.0, 1.0]], dtype=F64), torch.tensor([[h, h, 0.0]], dtype=F64)
+    rise = encode_direction(up + tilt, options) - encode_direction(up, options)
+    torch.testing.assert_close(rise[:, :8] / h, torch.ones(1, 8, dtype=F64))
+    u, level = torch.full((2, 2), 0.5, dtype=F64), torch.zeros(2, dtype=F64)
+    u[1] += h
+    below, above = encode_position(u, level, 1.0, options)
+    torch.testing.assert_close((above - below)[:12] / h, torch.full((12,), 2 * torch.pi, dtype=F64))
+
+
+def test_filtered_encodings_are_means_over_the_footprint() -> None:
+    """Footprints are Gaussians of a standard deviation of ``2^-level / 2`` tile widths; raw coordinates keep
+    their own mean."""
+    options = EncodingSection(position=4, raw=True)
+    aspect, u = 0.5, torch.tensor([[0.3, 0.6]], dtype=F64)
+    z = torch.linspace(-8, 8, 8001, dtype=F64)
+    weights = torch.exp(-0.5 * z**2)
+    for level in (0.0, 1.5, 4.0):
+        at = torch.full((1,), level, dtype=F64)
+        sigma = 0.5 * 2.0**-level / torch.tensor([1.0, aspect], dtype=F64)
+        around = encode_position(u + z[:, None] * sigma, at, aspect, options)
+        expected = (weights[:, None] * around).sum(0) / weights.sum()
+        found = encode_position(u, at, aspect, options.model_copy(update={"filtered": True}))[0]
+        torch.testing.assert_close(found[2:], expected[2:], atol=1e-9, rtol=0)
+        torch.testing.assert_close(found[:2], 2 * u[0] - 1)
 
 
 @variants

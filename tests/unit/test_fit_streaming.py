@@ -53,9 +53,12 @@ def test_a_fit_from_disk_is_the_same_fit(tmp_path: Path) -> None:
 def test_evaluation_leaves_training_queries_on_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str
 ) -> None:
-    """Data that a fit streams can be evaluated too, and are judged by the same queries."""
+    """Data that a fit streams can be evaluated too, and are judged by the queries that the fit held out."""
     folder = write_data(tmp_path / "d", parallax, train=3000, test=500, suffix=suffix)
-    config = FitConfig.model_validate({"training": {"steps": 2, "batch": 500}})
+    held_out = {"queries": 0.2, "radius": 0.3}
+    config = FitConfig.model_validate(
+        {"training": {"steps": 2, "batch": 500}, "held_out": held_out, "seed": 3}
+    )
     result = fit(config, folder, tmp_path / "m")
     judged, found = mbtf_fit.evaluation.judge, []
 
@@ -66,7 +69,10 @@ def test_evaluation_leaves_training_queries_on_disk(
     monkeypatch.setattr(mbtf_fit.evaluation, "judge", watched)
     errors = {name: e.as_dict() for name, e in mbtf_fit.evaluation.evaluate(result.material, folder).items()}
     assert isinstance(found[0], StreamedQueries)
-    assert {name: e["n"] for name, e in errors.items()} == {n: e["n"] for n, e in result.errors.items()}
+    assert set(errors) == set(result.errors)
+    for name, expected in result.errors.items():
+        assert errors[name]["n"] == expected["n"]
+        assert errors[name]["mse"]["value"] == pytest.approx(expected["mse"]["value"], rel=1e-3)
 
 
 def test_rows_are_found_among_any_that_are_left_out() -> None:

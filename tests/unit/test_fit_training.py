@@ -205,6 +205,23 @@ def test_divergence_is_one_clear_error(poison: str) -> None:
         train_fully(t)
 
 
+def test_weights_that_the_last_step_spoils_are_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its loss was that of the weights before, and finite."""
+    step = Trainer._step
+
+    def spoiling(self: Trainer, *arguments: Any) -> torch.Tensor:
+        loss = step(self, *arguments)
+        if self.progress.step == 2:
+            with torch.no_grad():
+                self.model.parameter_groups()[1][0].fill_(torch.inf)
+        assert bool(loss.isfinite())
+        return loss
+
+    monkeypatch.setattr(Trainer, "_step", spoiling)
+    with pytest.raises(InputError, match="diverged at step 3"):
+        train_fully(trainer(queries(), steps=3))
+
+
 def test_divergence_names_the_first_bad_batch() -> None:
     """The step, the shard and the rows, counted without what is held out."""
     data = queries()

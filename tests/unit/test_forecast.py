@@ -75,6 +75,27 @@ def faked(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Job, "estimator", lambda self, plan: Fake(clock))
 
 
+@pytest.mark.parametrize(("each", "share"), [(2e-6, 0.25), (1e-4, 1.0)])
+def test_writing_takes_its_share_of_the_processors(
+    monkeypatch: pytest.MonkeyPatch, each: float, share: float
+) -> None:
+    """Of four processors it takes a quarter of its time, unless it is what everything waits for."""
+    clock = Clock()
+
+    def write(queries: Queries, found: Estimates) -> None:
+        clock.now += each * len(queries.sigma)
+
+    monkeypatch.setattr(module, "time", clock)
+    monkeypatch.setattr(Job, "estimator", lambda self, plan: Fake(clock))
+    monkeypatch.setattr(module, "_write", write)
+    monkeypatch.setattr(module.os, "cpu_count", lambda: 4)
+    job = job_of(train="1000000", spp=8, test="20000", test_spp=64)
+    found = forecast(job, plan_effects(job, pilots=False), seconds=0.0)
+    tracing = 8 / RATE if share < 1.0 else 0.0
+    assert found.query_seconds == pytest.approx(tracing + share * each)
+    assert found.paths_per_second == pytest.approx(RATE)
+
+
 @pytest.mark.parametrize("layout", ["shuffled", "image"])
 def test_seconds_and_noise(faked: None, layout: str) -> None:
     job = job_of(train="1000000", spp=8, test="20000", test_spp=64, layout=layout)

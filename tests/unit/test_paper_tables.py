@@ -213,6 +213,10 @@ def test_pictures_by_stock_parts_agree_or_differ(tmp_path: Path, monkeypatch: py
     for factor, verdict in ((0.99, "agree"), (1.01, "DIFFER")):
         surfaces[0]["square"] = number((factor * seen) ** 2, 1e-3)
         assert rows_of(independence([make(tmp_path, stock=stock)])[0])[0]["verdict"] == verdict
+    # A single square of pixels has no error bar, and shows nothing.
+    surfaces[0] |= {key: {"value": 0.4, "error": None, "n": 1} for key in ("mean", "square")}
+    row = rows_of(independence([make(tmp_path, stock=stock)])[0])[0]
+    assert (row["verdict"], row[rms]) == ("too small to tell", "–")
 
 
 def test_cells_print_for_readers_and_store_for_programs() -> None:

@@ -37,6 +37,10 @@ VARIANTS: dict[str, dict[str, Any]] = {
         "network": {"encoding": {"position": 2, "direction": 2, "raw": True, "lifted": True, "pi": False}}
     },
     "encoded with pi": {"network": {"encoding": {"position": 3, "direction": 1}, "output": "identity"}},
+    "filtered": {"aspect": 0.5, "network": {"encoding": {"position": 4, "filtered": True}}},
+    "damped": {
+        "network": {"encoding": {"position": 3, "direction": 3, "direction_pi": False, "damped": True}}
+    },
     "fourth root": {"network": {"output": "fourth-root", "channels": 9, "width": 8, "layers": 2}},
 }
 UNROLLED = ("fourth root", "encoded")

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import get_args
 
@@ -11,6 +14,7 @@ from mbtf_fit.config import FitConfig
 from mbtf_fit.quality import FITTER
 from mbtf_gen.config import GeneratorConfig, count_queries
 from mbtf_gen.quality import GENERATOR, Quality, as_assignments
+from mbtf_gen.quality_measured import Chain, Expected, expected, markdown_table, read_expected
 from mbtf_gen.settings import resolve
 from mbtf_pipeline.quality import COMPARE, quality_assignments
 from mbtf_pipeline.recipe import load_recipe
@@ -59,6 +63,63 @@ def test_what_is_said_explicitly_wins(tmp_path: Path) -> None:
     resolved = resolve(FitConfig, file=file, assignments=as_assignments(FITTER["draft"]))
     assert resolved.training.steps is None
     assert resolved.training.time == 20
+
+
+CHAINS = (
+    Chain("rock", "draft", 0.1, 41.0, 5.0, 20.0, 0.314, 0.01, 10**8, 10**6, 3e6),
+    Chain("bark", "draft", None, 52.4, 6.0, 20.0, 0.62, 0.02, 10**8, 10**6, 3e6),
+    Chain("rock", "high", 0.1, 1800.0, 300.0, 1200.0, 0.05, 0.002, 10**9, 10**6, 3e6),
+)
+GUESS = Chain("rock", "paper", 0.1, 40000.0, 20000.0, 20000.0, 0.03, 0.0, 10**9, 10**6, 3e6)
+
+
+def written(folder: Path, chains: tuple[Chain, ...], guesses: tuple[Chain, ...]) -> Expected:
+    """Figures as the benchmark writes them, read back."""
+    path = folder / "figures.json"
+    head = {"date": "2001-02-03", "machine": "a machine", "command": "c", "levels": 7, "law": "as it comes"}
+    rows = {"chains": [asdict(c) for c in chains], "extrapolated": [asdict(c) for c in guesses]}
+    path.write_text(json.dumps({**head, **rows}))
+    return read_expected(path)
+
+
+def test_measured_qualities_are_told_from_guessed_ones(tmp_path: Path) -> None:
+    found = written(tmp_path, CHAINS, (GUESS,))
+    assert found.line("draft") == "draft 0:41 to 0:52 in all, 0.31 to 0.62 unexplained"
+    assert found.line("high") == "high 30:00 in all, 0.05 unexplained"
+    assert found.line("paper") == "paper 11:06:40 in all, 0.03 unexplained (extrapolated)"
+    assert found.line("standard") is None
+    rows = markdown_table(found, QUALITIES).splitlines()
+    assert rows[-1] == "as it comes."
+    assert [row.split(" | ")[0] for row in rows[2:-2]] == [
+        "| `draft`", "| `draft`", "| `high`", "| `paper`, extrapolated",
+    ]  # fmt: skip
+    assert "rock, relief 0.1 | 0:41 | 0:05 | 0:20 | 0.314 ± 0.010 | 100 MB | 1.00 MB |" in rows[2]
+    assert "| bark |" in rows[3]
+
+
+def test_the_documentation_shows_the_figures_that_are_stored() -> None:
+    page = (ROOT / "docs" / "cost.md").read_text(encoding="utf-8")
+    shown = page.split("<!-- qualities: begin -->")[1].split("<!-- qualities: end -->")[0].strip()
+    assert shown == markdown_table(expected(), QUALITIES)
+
+
+@pytest.mark.parametrize("program", ["mbtf-gen", "mbtf-fit", "mbtf-pipeline"])
+def test_help_says_what_qualities_cost(program: str, capsys: pytest.CaptureFixture[str]) -> None:
+    from mbtf_fit.cli import app as fit
+    from mbtf_gen.cli import app as generate
+    from mbtf_pipeline.cli import app as pipeline
+
+    app, words = {
+        "mbtf-gen": (generate, ["--help"]),
+        "mbtf-fit": (fit, ["--help"]),
+        "mbtf-pipeline": (pipeline, ["run", "--help"]),
+    }[program]
+    with contextlib.suppress(SystemExit):
+        app(words)
+    text = "".join(capsys.readouterr().out.replace("│", " ").split())
+    for quality in QUALITIES:
+        line = expected().line(quality)
+        assert line is None or "".join(line.split()) in text
 
 
 def test_no_quality_changes_nothing() -> None:

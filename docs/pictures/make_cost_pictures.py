@@ -1,0 +1,120 @@
+"""Makes the figures of docs/cost.md and docs/accuracy.md from folders of cost studies, and tables of fronts.
+
+From the repository's root, after the studies (the commands stand in docs/cost.md):
+``.venv/bin/python docs/pictures/make_cost_pictures.py out/cost/turtle_shell out/cost/twisted_wool …``.
+Every sheet shows one plot of all studies side by side; studies that did not get to it are left out of it.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+from pathlib import Path
+
+from PIL import Image, ImageDraw, ImageFont
+
+HERE = Path(__file__).parent
+PAGE = HERE.parent / "cost.md"
+OUT = HERE / "cost"
+PLOTS = (
+    "front",
+    "data",
+    "fit",
+    "fit_evaluation",
+    "fit_bytes",
+    "paths",
+    "adaptive",
+    "adaptive_relative",
+    "effects",
+    "bounces",
+    "mesh",
+    "light",
+)
+WIDTH, TITLE, GAP, COLUMNS, COLOURS = 800, 30, 12, 2, 256
+BEGIN, END = "<!-- fronts: begin -->", "<!-- fronts: end -->"
+
+
+def sheet(plot: str, studies: list[Path]) -> Path | None:
+    """One plot of all studies, each under its name."""
+    found = [folder for folder in studies if (folder / f"{plot}.png").exists()]
+    if not found:
+        return None
+    pictures = []
+    for folder in found:
+        drawn = Image.open(folder / f"{plot}.png").convert("RGBA")
+        white = Image.new("RGBA", drawn.size, (255, 255, 255, 255))
+        picture = Image.alpha_composite(white, drawn).convert("RGB")
+        height = round(picture.height * WIDTH / picture.width)
+        pictures.append(picture.resize((WIDTH, height), Image.Resampling.LANCZOS))
+    columns = min(COLUMNS, len(found))
+    rows = -(-len(found) // columns)
+    cell = (WIDTH + GAP, max(p.height for p in pictures) + TITLE)
+    out = Image.new("RGB", (columns * cell[0] - GAP, rows * cell[1]), (255, 255, 255))
+    draw = ImageDraw.Draw(out)
+    for number, (folder, picture) in enumerate(zip(found, pictures, strict=True)):
+        x, y = (number % columns) * cell[0], (number // columns) * cell[1]
+        draw.text((x + 12, y + 4), folder.name, (30, 30, 30), ImageFont.load_default(20))
+        out.paste(picture, (x, y + TITLE))
+    path = OUT / f"{plot}.png"
+    out.quantize(COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(path, optimize=True)
+    return path
+
+
+def whole_chains(folder: Path) -> list[dict[str, str]]:
+    """Rows of the study that lie on the front: nothing beats them in both time and error."""
+    with (folder / "cost.csv").open(encoding="utf-8", newline="") as stream:
+        rows = [
+            r for r in csv.DictReader(stream) if r["total_seconds"] and r["study"] != "seeds" and r["error"]
+        ]
+    front: list[dict[str, str]] = []
+    for row in sorted(rows, key=lambda r: (float(r["total_seconds"]), float(r["error"]))):
+        if not front or float(row["error"]) < float(front[-1]["error"]):
+            front.append(row)
+    return front
+
+
+def table(studies: list[Path]) -> str:
+    """The fronts of all studies as Markdown, with the commands that make their points."""
+    lines = []
+    for folder in studies:
+        study = json.loads((folder / "study.json").read_text(encoding="utf-8"))
+        where = f"{study['machine']['system']}, {study['made']}"
+        lines += [
+            f"`{folder.name}`, {where}:",
+            "",
+            "| in all | generating | training | queries × paths | model | unexplained variance |",
+            "|---|---|---|---|---|---|",
+        ]
+        front = whole_chains(folder)
+        for r in front:
+            lines.append(
+                f"| {float(r['total_seconds']):.0f} s | {float(r['generation_seconds']):.1f} s "
+                f"| {float(r['training_seconds']):.1f} s "
+                f"| {float(r['queries']) / 1e6:.2g} M × {float(r['spp']):g} "
+                f"| {r['series'] if r['study'] == 'fit' else 'neumip'} "
+                f"| {float(r['error']):.3f} ± {float(r['error_se']):.3f} |"
+            )
+        command = front[-1]["command"].replace(str(folder), f"out/cost/{folder.name}")
+        lines += ["", "The last one by itself:", "", f"    {command.replace(' && ', chr(10) + '    ')}", ""]
+    return "\n".join(lines)
+
+
+def main() -> int:
+    """Write the sheets and the table."""
+    studies = [Path(name) for name in sys.argv[1:]]
+    if not studies:
+        print(__doc__, file=sys.stderr)
+        return 2
+    OUT.mkdir(exist_ok=True)
+    for plot in PLOTS:
+        path = sheet(plot, studies)
+        if path is not None:
+            print(f"{path}: {path.stat().st_size / 1e3:.0f} kB")
+    before, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
+    PAGE.write_text(f"{before}{BEGIN}\n\n{table(studies)}\n{END}{rest.split(END)[1]}", encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
