@@ -207,6 +207,10 @@ def test_xml_is_loaded_and_refused_alike(material: tuple[Path, Material], tmp_pa
     file.write_text(text.format(tmp_path / "nothing"))
     with pytest.raises(InputError, match="nothing: no such folder"):
         load_scene(file)
+    with pytest.raises(
+        UsageError, match="mbtf_path: has no parameter 'maxdepth'\n  did you mean 'max_depth'"
+    ):
+        load_scene({"type": "scene", "integrator": {"type": "mbtf_path", "maxdepth": 3}})
     with pytest.raises(UsageError, match="names no material"):
         load_scene({"type": "scene", "ball": {"type": "sphere", "b": {"type": "mbtf"}}})
 
