@@ -30,6 +30,7 @@ from typing import Any
 
 from error_per_second import independent_points
 
+from mbtf_gen.engine import load_mitsuba
 from mbtf_gen.errors import MbtfError
 from mbtf_gen.material import load_material
 from mbtf_gen.planning import plan_effects
@@ -153,6 +154,7 @@ def main() -> int:
         if arguments.studies is not None:
             runs = [stored_rows(folder) for folder in arguments.studies]
         else:
+            load_mitsuba()
             slope, biases = independent(arguments.recipe, arguments.seconds)
             measured = [measure(arguments.recipe, s, arguments.seconds) for s in range(arguments.seeds)]
             runs = [rows_of(points) for points in measured]

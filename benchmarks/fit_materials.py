@@ -5,7 +5,7 @@
 For each material two data sets of as many queries and paths are made at 64 × 64 texels, one per layout, and
 ``neumip`` and ``neumip-baseline`` are trained for ``--steps`` steps of 32 768 queries. Both are judged by the
 same shuffled test queries. ``--hierarchical`` also trains ``hierarchical`` on windows of the image layout,
-and ``neumip`` for as many steps.
+and ``neumip`` for as many steps; ``--lifted`` also trains ``neumip`` with directions as (x, y, z).
 
 What is reached depends on steps alone: the call may share its processor, may be interrupted, and goes on
 where it was. Texture sets that are not there are skipped by name.
@@ -65,12 +65,20 @@ def make_data(name: str, folder: Path, layout: str) -> Path:
     return folder
 
 
+# Options of a model, under the name that its figures have.
+LIFTED = "neumip-lifted"
+OPTIONS: dict[str, dict[str, Any]] = {
+    LIFTED: {"model": "neumip", "network": {"encoding": {"lifted": True}}},
+}
+
+
 def train(name: str, model: str, steps: int, out: Path) -> dict[str, Any]:
     """Figures of one model on one material."""
     layout = "image" if model == "hierarchical" else "shuffled"
     judge = make_data(name, out / f"{name}-shuffled", "shuffled")
     shards = judge if layout == "shuffled" else make_data(name, out / f"{name}-image", "image")
-    config = FitConfig.model_validate({"model": model, "training": {"steps": steps}})
+    options = OPTIONS.get(model, {"model": model})
+    config = FitConfig.model_validate({**options, "training": {"steps": steps}})
 
     def progress(share: float, note: str) -> None:
         print(f"{name} {model} {share:4.0%} {note}", file=sys.stderr)
@@ -95,12 +103,15 @@ def main() -> int:
     parser.add_argument("--out", type=Path, required=True, help="folder to work in")
     parser.add_argument("--steps", type=int, default=1500)
     parser.add_argument("--hierarchical", type=int, help="steps of hierarchical; not trained by default")
+    parser.add_argument("--lifted", action="store_true", help=f"train {LIFTED}, too")
     parser.add_argument("--only", nargs="*", choices=list(MATERIALS), help="of these; all by default")
     arguments = parser.parse_args()
     record = arguments.out / "materials.json"
     arguments.out.mkdir(parents=True, exist_ok=True)
     found: dict[str, Any] = json.loads(record.read_text()) if record.exists() else {}
     runs = [("neumip-baseline", arguments.steps), ("neumip", arguments.steps)]
+    if arguments.lifted:
+        runs.append((LIFTED, arguments.steps))
     if arguments.hierarchical:
         runs += [("neumip", arguments.hierarchical), ("hierarchical", arguments.hierarchical)]
     for name in arguments.only or MATERIALS:

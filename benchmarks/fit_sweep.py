@@ -45,6 +45,9 @@ from mbtf_gen.errors import MbtfError
 from mbtf_gen.levels import Lattice
 
 PUBLISHED = [{"kind": "log"}, {"kind": "linear", "weight": 0.1}]
+# Directions as (x, y, z).
+LIFTED = {"lifted": True}
+SMOOTHED: dict[str, Any] = {"decay": 1.0, "blur": {"floor": 0.8}}
 # What differs from the default; "queries" differs in the data.
 SWEEP: dict[str, dict[str, Any]] = {
     "default": {},
@@ -60,9 +63,16 @@ SWEEP: dict[str, dict[str, Any]] = {
     "200/texel, 16 paths": {"queries": {"train": "200/texel", "spp": 16}},
     "40 % at the finest": {"queries": {"mixture": {"log_uniform": 0.6, "finest": 0.4}}},
     "width 40, channels 12": {"network": {"width": 40, "channels": 12}},
+    "lifted": {"network": {"encoding": LIFTED}},
+    "lifted, smoothed": {"network": {"encoding": LIFTED}, "training": SMOOTHED},
+    "lifted, 40, 12": {"network": {"width": 40, "channels": 12, "encoding": LIFTED}},
+    "lifted, 40, 12, smoothed": {
+        "network": {"width": 40, "channels": 12, "encoding": LIFTED},
+        "training": SMOOTHED,
+    },
 }
 # Configurations whose model is not the default's.
-OTHER = ("baseline", "width 40, channels 12")
+OTHER = [name for name, options in SWEEP.items() if options.keys() & {"model", "network"}]
 # How much better, in standard errors and in share of the variance, counts as clearly better.
 ERRORS, SHARE = 3.0, 0.01
 # Steps per moment whose time is taken, and rounds of which the median counts.

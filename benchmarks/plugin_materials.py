@@ -13,7 +13,8 @@ empty kernel cache:
 - **conformance**: largest deviation from the material's own values, in single and in half precision.
 - **χ²** of the plugin's samples at 32 random positions, footprints and views; the smallest p of all
   materials is corrected for their number (Šidák).
-- **variance** of the light reflected under a constant sky by cosine sampling, over that by the lobes.
+- **variance** of the light reflected under a constant sky by cosine sampling, over that by the lobes; the bar
+  is for glossy materials, told by their maps and by what the cosine leaves to be gained.
 - **energy**: what the tile's mean reflects, by elevation of the light, beside the reference that
   ``mbtf-gen`` traces for the same queries; the error bar is that of the paired difference.
 
@@ -41,8 +42,11 @@ from mbtf_gen.directions import from_angles, from_projected_disk
 ROOT = Path(__file__).resolve().parents[1]
 ASSETS = ("turtle_shell", "cliff_rock", "twisted_wool", "straight_wool", "insulation_foam")
 TEXTURES = ("metal_plate", "leather_fine", "knit_fabric", "rock_cliff", "stone_bricks", "tree_bark")
-# Materials whose gloss carries most of what varies: smooth over dark. Leather is as smooth, but bright.
-GLOSSY = ("turtle_shell", "stone_bricks", "tree_bark")
+# What counts as glossy: at least this share of what the maps reflect is specular, the median roughness is at
+# most this, and light sampled by the cosine alone varies by at least this, as a relative variance.
+GLOSSY_SHARE, GLOSSY_ROUGHNESS, GLOSSY_VARIANCE = 0.33, 0.65, 0.1
+# What a dielectric of index 1.5 reflects of light from everywhere.
+FRESNEL = 0.092
 # First picture in seconds, deviations, χ² after correction, variance ratio of glossy materials, and what
 # energies have too much, in standard errors.
 BARS = {
@@ -56,8 +60,6 @@ BARS = {
 PLACES, SAMPLES = 32, 60_000
 ELEVATIONS = (10.0, 20.0, 35.0, 50.0, 65.0, 85.0)
 ENERGY_QUERIES, ENERGY_SPP = 4096, 64
-# Views under smaller cosines are left out of energies: a 26th of a hemisphere's.
-LOWEST = 0.2
 
 
 def random_views(random: np.random.Generator, n: int) -> NDArray[np.float64]:
@@ -128,7 +130,8 @@ def variance_of(mi: Any, dr: Any, bsdf: Any, each: int = 2048, places: int = 512
 
 
 def energies(material: Path, shards: Path, evaluator: Any) -> list[dict[str, float]]:
-    """Reflected share by elevation of the light: fit, reference, error of their difference."""
+    """Reflected share by elevation of the light: fit, reference, error of their difference. Of views, those
+    that the data have, and of elevations too."""
     from mbtf_gen.config import GeneratorConfig
     from mbtf_gen.dataset import Dataset
     from mbtf_gen.estimator import Stream
@@ -139,9 +142,11 @@ def energies(material: Path, shards: Path, evaluator: Any) -> list[dict[str, flo
     config = GeneratorConfig.model_validate(Dataset.open(shards).manifest["config"])
     estimator = build_estimator(config, load_material(material, config.geometry.tile))
     random = np.random.default_rng([14, zlib.crc32(material.name.encode())])
-    n, rows = ENERGY_QUERIES, []
+    n, rows, lowest = ENERGY_QUERIES, [], config.queries.min_cos
     for k, elevation in enumerate(ELEVATIONS):
-        angle, radius = 2 * np.pi * random.random(n), np.sqrt((1 - LOWEST**2) * random.random(n))
+        if np.sin(np.radians(elevation)) < lowest:
+            continue
+        angle, radius = 2 * np.pi * random.random(n), np.sqrt((1 - lowest**2) * random.random(n))
         views = from_projected_disk(np.stack([radius * np.cos(angle), radius * np.sin(angle)], -1))
         turned = 2 * np.pi * random.random(n)
         flat = np.cos(np.radians(elevation))
@@ -152,7 +157,7 @@ def energies(material: Path, shards: Path, evaluator: Any) -> list[dict[str, flo
             *(a.astype(np.float32) for a in (random.random((n, 2)), np.full(n, 0.5), lights, views))
         )
         traced = estimator.estimate(queries, ENERGY_SPP, Stream(1, "reference", k))
-        share = np.pi * (1 - LOWEST**2)
+        share = np.pi * (1 - lowest**2)
         true = share * 0.5 * (traced.value_a + traced.value_b).mean(-1)
         fit = share * evaluator.evaluate(queries.u, queries.sigma, lights, views).mean(-1)
         difference = (fit - true).astype(np.float64)
@@ -165,6 +170,29 @@ def energies(material: Path, shards: Path, evaluator: Any) -> list[dict[str, flo
             }
         )
     return rows
+
+
+def gloss(source: Path, config: dict[str, Any]) -> dict[str, float]:
+    """Share of what the material's maps reflect that is specular, and their median roughness; 1 for
+    Lambert."""
+    from mbtf_gen.material import load_material
+
+    maps = load_material(source, config["geometry"]["tile"])
+    if maps.roughness is None:
+        return {"specular_share": 0.0, "roughness": 1.0}
+    colour = float(np.mean(maps.basecolor @ np.array([0.2126, 0.7152, 0.0722])))
+    metal = 0.0 if maps.metallic is None else float(np.mean(maps.metallic))
+    specular, diffuse = (1 - metal) * FRESNEL + metal * colour, (1 - metal) * (1 - FRESNEL) * colour
+    return {"specular_share": specular / (specular + diffuse), "roughness": float(np.median(maps.roughness))}
+
+
+def is_glossy(row: dict[str, Any]) -> bool:
+    """Whether a material's figures make it a glossy one."""
+    return bool(
+        row["specular_share"] >= GLOSSY_SHARE
+        and row["roughness"] <= GLOSSY_ROUGHNESS
+        and row["cosine_variance"] >= GLOSSY_VARIANCE
+    )
 
 
 def plane_scene(mi: Any, bsdf: Any) -> Any:
@@ -202,6 +230,7 @@ def measure(source: Path, shards: Path, folder: Path) -> dict[str, Any]:
 
     import mbtf_fit.plugin
     from mbtf_fit.plugin import Evaluator, read_material
+    from mbtf_gen.dataset import Dataset
 
     mbtf_fit.plugin.register()
     start = time.perf_counter()
@@ -228,6 +257,8 @@ def measure(source: Path, shards: Path, folder: Path) -> dict[str, Any]:
         "chi_square": chi_squares(mi, dr, bsdf),
         "reflected": [mean, flat_mean],
         "variance_ratio": flat_variance / variance,
+        "cosine_variance": flat_variance / flat_mean**2,
+        **gloss(source, Dataset.open(shards).manifest["config"]),
         "energy": energies(source, shards, bsdf.evaluator),
     }
 
@@ -275,7 +306,7 @@ def verdict(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "single": max(r["single"] for r in rows),
         "half": max(r["half"] for r in rows),
         "chi_square": float(-np.expm1(tests * np.log1p(-least))),
-        "variance": min((r["variance_ratio"] for r in rows if r["material"] in GLOSSY), default=None),
+        "variance": min((r["variance_ratio"] for r in rows if is_glossy(r)), default=None),
         "energy": max(excess),
         "energy_share": max(e["fit"] / e["reference"] - 1.0 for r in rows for e in r["energy"]),
     }

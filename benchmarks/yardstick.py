@@ -3,9 +3,9 @@
     python benchmarks/yardstick.py [--shards FOLDER] [--out FOLDER] [--time 100s] [--seed 0]
 
 Without ``--shards`` the data set of ``pipelines/rock_cliff.yaml`` is made first (minutes); its maps lie
-beside the project. Trains ``neumip`` and ``neumip-baseline`` for the same time and prints their unexplained
-variance on the test split (noise-free mean squared error over the variance of the test values), overall and
-by level.
+beside the project. Trains ``neumip``, ``neumip-baseline`` and a ``neumip`` of up to twice the cost of
+evaluation for the same time and prints their unexplained variance on the test split (noise-free mean squared
+error over the variance of the test values), overall and by level.
 
 The last line is one JSON object: figures, and the bars they are held to. Exit code 1 where a bar is missed.
 """
@@ -24,9 +24,17 @@ from mbtf_gen.errors import MbtfError
 
 ROOT = Path(__file__).resolve().parents[1]
 RECIPE = ROOT / "pipelines" / "rock_cliff.yaml"
-MODELS = ("neumip", "neumip-baseline")
-# neumip explains all but this share; the baseline misses at least so many times what neumip misses.
-BARS = {"neumip": 0.30, "baseline_over_neumip": 1.2}
+# What is trained, beside seed and time.
+MODELS: dict[str, dict[str, Any]] = {
+    "neumip": {},
+    "neumip-baseline": {"model": "neumip-baseline"},
+    "neumip-wide": {
+        "network": {"width": 40, "channels": 12, "encoding": {"lifted": True}},
+        "training": {"decay": 1.0, "blur": {"floor": 0.8}},
+    },
+}
+# Both explain all but this share; the baseline misses at least so many times what neumip misses.
+BARS = {"neumip": 0.30, "neumip-wide": 0.20, "baseline_over_neumip": 1.2}
 
 
 def make_shards(folder: Path) -> Path:
@@ -41,7 +49,9 @@ def make_shards(folder: Path) -> Path:
 
 def train(model: str, shards: Path, out: Path, time: str, seed: int) -> FitResult:
     """One fit, with a line per look at the held-out queries."""
-    config = FitConfig.model_validate({"model": model, "seed": seed, "training": {"time": time}})
+    options = MODELS[model]
+    training = options.get("training", {}) | {"time": time}
+    config = FitConfig.model_validate({**options, "seed": seed, "training": training})
 
     def progress(share: float, note: str) -> None:
         print(f"{model} {share:4.0%} {note}", file=sys.stderr)
@@ -84,7 +94,8 @@ def main() -> int:
         speed = found[model]["queries_per_second"] / 1e6
         print(f"{model:16s} misses {missed[model]:.3f}   by level  {levels}   {speed:.2f} M queries/s")
     ratio = missed["neumip-baseline"] / missed["neumip"]
-    met = missed["neumip"] <= BARS["neumip"] and ratio >= BARS["baseline_over_neumip"]
+    met = all(missed[model] <= BARS[model] for model in MODELS if model in BARS)
+    met = met and ratio >= BARS["baseline_over_neumip"]
     print(json.dumps({"figures": found, "baseline_over_neumip": ratio, "bars": BARS, "met": met}))
     return 0 if met else 1
 

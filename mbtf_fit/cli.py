@@ -13,7 +13,7 @@ from mbtf_gen.near import near_miss
 from mbtf_gen.quality import Quality, as_assignments, quality_help
 
 from .plugin.preview.command import preview
-from .wording import describe_errors, describe_fit, number, table
+from .wording import describe_errors, describe_fit, describe_transmittance, number, table
 
 if TYPE_CHECKING:
     from .config import FitConfig
@@ -238,10 +238,21 @@ def evaluate(material: Path, shards: Path, /, *, console: Console = CONSOLE) -> 
             f"({', '.join(foreign)} differ{'s' if len(foreign) == 1 else ''}); these errors say how far the "
             "two are apart, not how good the fit is"
         )
-    errors = {name: e.as_dict() for name, e in evaluate(loaded, shards).items()}
+    found = evaluate(loaded, shards)
+    errors = {name: e.as_dict() for name, e in found.values.items()}
+    through = (
+        None if found.transmittance is None else {n: e.as_dict() for n, e in found.transmittance.items()}
+    )
+    lines = [f"{material}: {loaded.config.model} on {shards}", *describe_errors(errors)]
     console.report(
-        {"material": material, "shards": shards, "foreign_inputs": foreign, "errors": errors},
-        "\n".join([f"{material}: {loaded.config.model} on {shards}", *describe_errors(errors)]),
+        {
+            "material": material,
+            "shards": shards,
+            "foreign_inputs": foreign,
+            "errors": errors,
+            **({} if through is None else {"transmittance": through}),
+        },
+        "\n".join(lines + describe_transmittance(through)),
     )
 
 
@@ -259,8 +270,9 @@ def export_material(
 ) -> None:
     """Write a material in forms that other programs read: mbtf-fit export material/ --to exr
 
-    exr: the latent textures, a part per level and a channel per feature. json: the networks as a list of
-    layers, with formulas, conventions and queries with expected values. material: another material folder.
+    exr: the latent textures, a part per level and a channel per feature, and those of the transmittance of a
+    material with holes. json: the networks as a list of layers, with formulas, conventions and queries with
+    expected values. material: another material folder.
 
     Parameters
     ----------
@@ -277,7 +289,7 @@ def export_material(
     from .material import Material, export
     from .material_format import DESCRIPTION_NAME, WEIGHTS_NAME
     from .storage import make_folder
-    from .transmittance import TRANSMITTANCE_NAME, read_transmittance
+    from .transmittance import TRANSMITTANCE_NAME
 
     wanted = list(dict.fromkeys(to or ["exr", "json"]))
     folder = material if output is None else output
@@ -299,7 +311,6 @@ def export_material(
         files.append(LAYERS_NAME)
     if "material" in wanted:
         description = loaded.description
-        holes = read_transmittance(material, description)
         export(
             written.model,
             written.config,
@@ -307,9 +318,9 @@ def export_material(
             data=description["data"],
             training=description["training"],
             half=half,
-            holes=holes,
+            holes=written.holes,
         )
-        files += [WEIGHTS_NAME, DESCRIPTION_NAME, *([TRANSMITTANCE_NAME] if holes is not None else [])]
+        files += [WEIGHTS_NAME, DESCRIPTION_NAME, *([TRANSMITTANCE_NAME] if loaded.holes else [])]
     sizes = {name: (folder / name).stat().st_size for name in files}
     lines = [f"{folder / name}: {size / 1e6:.3f} MB" for name, size in sizes.items()]
     console.report(
@@ -382,6 +393,7 @@ def _material_info(path: Path) -> tuple[dict[str, Any], str]:
         f"trained {training['steps']} steps of {training['batch']} in {clock(training['seconds'])}",
         f"this machine's CPU evaluates by: {describe()}",
         *describe_errors(training["errors"]),
+        *describe_transmittance(training.get("transmittance")),
         f"conformance: {description['conformance']['count']} queries, largest deviation {deviation:.2g}",
     ]
     return {

@@ -114,6 +114,9 @@ class TrainingSection(Settings):
         0.0, ge=0, le=10, description="pull of texels towards 0: by rate times this per step"
     )
     warmup: int = Field(100, ge=0, description="steps over which the rates rise")
+    calibrate: bool = Field(
+        True, description="at the end, set the mean reflectance at each elevation to that of the data"
+    )
     blur: BlurSection = BlurSection()
 
 

@@ -26,6 +26,7 @@ from mbtf_gen.stats import (
 
 from .buffers import HELD_OUT
 from .data import SAMPLE, Partition, Queries, load_split, load_training
+from .transmittance_fit import TransmittanceError, has_holes, judge_transmittance
 
 if TYPE_CHECKING:
     from .material import Material
@@ -152,7 +153,21 @@ def foreign_inputs(material: Material, shards: str | Path) -> list[str]:
     return [role for role in sorted({*trained, *given}) if trained.get(role) != given.get(role)]
 
 
-def evaluate(material: Material, shards: str | Path) -> dict[str, SplitErrors]:
+@dataclass(frozen=True)
+class Evaluation:
+    """Errors of a material on a data set.
+
+    Attributes
+    ----------
+    values : set of queries → errors
+    transmittance : the same of what passes through holes; None unless material and data have some
+    """
+
+    values: dict[str, SplitErrors]
+    transmittance: dict[str, TransmittanceError] | None
+
+
+def evaluate(material: Material, shards: str | Path) -> Evaluation:
     """Errors of a fitted material on the splits of a data set: ``test``, and what was held out of ``train``.
 
     The held-out queries are those that the material's own configuration keeps out; on another data set than
@@ -170,4 +185,7 @@ def evaluate(material: Material, shards: str | Path) -> dict[str, SplitErrors]:
             where=data.folder,
         )
     partition = load_training(data, material.config.held_out, material.config.seed, memory=None)
-    return judge(material.predict, data, partition)
+    through = None
+    if material.holes is not None and has_holes(data):
+        through = judge_transmittance(material.holes, data, partition.selection)
+    return Evaluation(judge(material.predict, data, partition), through)

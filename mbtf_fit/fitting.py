@@ -33,7 +33,8 @@ from .price import Price, price_of
 from .start import digest_of, take_over
 from .storage import make_folder, read_tensors, write_tensors
 from .training import Trainer
-from .transmittance import TRANSMITTANCE_NAME, fit_transmittance
+from .transmittance import TRANSMITTANCE_NAME
+from .transmittance_fit import fit_transmittance, judge_transmittance
 
 FIT_NAME = "fit.json"
 CONFIG_NAME = "config.yaml"
@@ -167,6 +168,7 @@ def fit(
     trainer = prepare_trainer(config, data, partition, device)
     resumed = _resume(trainer, out)
     _train(trainer, partition.held_out_queries, out, progress or (lambda share, note: None))
+    trainer.calibrate()
     training = {
         "steps": trainer.progress.step,
         "batch": trainer.batch,
@@ -182,7 +184,10 @@ def fit(
     errors = judge(trainer.predict, data, partition)
     training["errors"] = {name: e.as_dict() for name, e in errors.items()}
     training["noise"] = _noise(partition.sample, errors["training"].overall.variance.value)
-    holes = fit_transmittance(data)
+    holes = fit_transmittance(data, partition.selection)
+    if holes is not None:
+        through = judge_transmittance(holes, data, partition.selection)
+        training["transmittance"] = {name: e.as_dict() for name, e in through.items()}
     export(trainer.model, config, out, data=identity["data"], training=training, holes=holes)
     (out / CHECKPOINT_NAME).unlink(missing_ok=True)
     return _finished(out, time.perf_counter() - begin, resumed=resumed)

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from .models import NeuralMaterial
+from .models.neumip import Neumip
 from .native import Kernel, kernel
 from .native.library import QueryPointers
 from .native.model import NativeModel, unsupported_reason
@@ -56,6 +57,7 @@ def predict(
 
 
 def _predict_natively(found: Kernel, model: NeuralMaterial, *arrays: ArrayLike) -> NDArray[np.float32]:
+    assert isinstance(model, Neumip)
     inputs = [np.ascontiguousarray(a, np.float32) for a in arrays]
     n = len(inputs[1])
     shapes = [(n, 2), (n,), (n, 3), (n, 3)]
@@ -76,4 +78,6 @@ def _predict_natively(found: Kernel, model: NeuralMaterial, *arrays: ArrayLike) 
     else:
         with ThreadPoolExecutor(count) as pool:
             list(pool.map(lambda edge: share(*edge), pairwise(edges)))
+    if model.gain is not None:
+        out *= evaluate_in_chunks(model.gains, torch.device("cpu"), 3, *inputs[1:])
     return out

@@ -232,11 +232,15 @@ class Objective:
             bound = ((self._robust**2 + c0) * scale**2, c1 * scale, c2)
         return Quadratic(relative_weight, squared_weight, self._unit, bound)
 
+    def bound(self, prediction: Tensor) -> Tensor | None:
+        """Largest errors of predictions (n, 3) that pull in proportion; None where all do."""
+        return None if self._robust is None else self._robust * self._noise.spread(prediction)
+
     def __call__(self, prediction: Tensor, queries: TrainingQueries | Crops) -> Tensor:
         """Weighted sum of the terms' means for predictions (n, 3), or (items, rows, columns, 3)."""
         still, value = prediction.detach(), queries.value
-        if self._robust is not None:
-            bound = self._robust * self._noise.spread(still)
+        bound = self.bound(still)
+        if bound is not None:
             value = still + (value - still).clamp_(-bound, bound)
         variance = None
         if self._needs_variance:

@@ -34,7 +34,7 @@ from .material_format import (
 )
 from .models import NeuralMaterial, TexturedMaterial, build_model
 from .storage import read_tensors, write_tensors
-from .transmittance import TRANSMITTANCE_NAME, Transmittance, write_transmittance
+from .transmittance import TRANSMITTANCE_NAME, Transmittance, read_transmittance, write_transmittance
 
 
 def conformance_queries(lattice: Lattice) -> dict[str, NDArray[np.float32]]:
@@ -73,12 +73,14 @@ class Material:
     config : that it was fitted with
     description : content of ``material.json``
     conformance : the stored queries with their expected values ``rgb`` (n, 3)
+    holes : what it lets through; None for one without holes
     """
 
     model: TexturedMaterial
     config: FitConfig
     description: dict[str, Any]
     conformance: dict[str, NDArray[np.float32]]
+    holes: Transmittance | None = None
 
     @classmethod
     def load(cls, folder: str | Path, device: str = "cpu") -> Material:
@@ -108,7 +110,7 @@ class Material:
         )
         model.to(device).requires_grad_(False)
         model.load_weights(tensors)
-        return cls(model, config, description, conformance)
+        return cls(model, config, description, conformance, read_transmittance(Path(folder), description))
 
     @property
     def lattice(self) -> Lattice:

@@ -39,6 +39,7 @@ class Selection:
         self.starts: list[int] = [0]
         self._bits: list[NDArray[np.uint8]] = []
         self._counts: list[NDArray[np.int64]] = []
+        self._sizes: list[int] = []
 
     def __len__(self) -> int:
         return self.starts[-1]
@@ -47,9 +48,15 @@ class Selection:
         """Append a shard of which the `chosen` rows are trained on."""
         blocks = np.add.reduceat(chosen, np.arange(0, len(chosen), _BLOCK), dtype=np.int64)
         self.paths.append(path)
+        self._sizes.append(len(chosen))
         self._bits.append(np.packbits(chosen))
         self._counts.append(np.concatenate([[0], np.cumsum(blocks)]))
         self.starts.append(self.starts[-1] + int(self._counts[-1][-1]))
+
+    def masks(self) -> Iterator[tuple[Path, NDArray[np.bool_]]]:
+        """(shard, which of its rows are trained on)."""
+        for path, bits, size in zip(self.paths, self._bits, self._sizes, strict=True):
+            yield path, np.unpackbits(bits, count=size).astype(bool)
 
     def _rows(self, shard: int, start: int, stop: int) -> NDArray[np.int64]:
         counts = self._counts[shard]

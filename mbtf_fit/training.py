@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from itertools import pairwise
 from typing import Any, NoReturn
 
@@ -18,11 +19,12 @@ from mbtf_gen.errors import InputError
 
 from .blur import annealed_sigma
 from .buffers import Crops, TrainingBuffers
+from .calibration import fit_gains
 from .config import FitConfig, TrainingSection
 from .data import Queries, TrainingQueries
 from .inference import predict
 from .losses import Objective
-from .models import NeuralMaterial
+from .models import Neumip, NeuralMaterial
 from .native import kernel
 from .native.model import unsupported_reason
 from .native.stepper import NativeStepper
@@ -232,10 +234,28 @@ class Trainer:
 
     def predict(self, queries: Queries) -> NDArray[np.float32]:
         """Values (n, 3) of the model as it is now, read through the current blur."""
+        self._settle()
+        return predict(self.model, queries.u, queries.sigma, queries.omega_i, queries.omega_o)
+
+    def _settle(self) -> None:
+        """Let the textures be read through the current blur."""
         with torch.no_grad():
             for texture, table in zip(self.model.textures(), self._tables(), strict=True):
                 texture.read(table)
-        return predict(self.model, queries.u, queries.sigma, queries.omega_i, queries.omega_o)
+
+    def calibrate(self) -> None:
+        """Give the trained model the factors of :mod:`.calibration`, where it takes some and the
+        configuration does not forbid it."""
+        model = self.model
+        if not (self.config.training.calibrate and isinstance(model, Neumip)):
+            return
+        assert not isinstance(self.queries, TrainingBuffers)
+        self._settle()
+        model.gain = None
+        found = fit_gains(
+            partial(predict, model), model.lattice, self.queries, self.config.held_out, self.loss.bound
+        )
+        model.gain = torch.from_numpy(found).to(self.device)
 
     def coverage(self) -> dict[int, float]:
         """Level → share of its texels that gradients have reached, of the pyramid."""

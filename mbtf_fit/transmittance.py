@@ -1,4 +1,4 @@
-r"""What a material with holes lets through: a small model, fitted in closed form beside the networks.
+r"""What a material with holes lets through: a small model beside the networks.
 
 The data's ``transmittance`` is the share of a footprint that is seen through holes. It depends on position,
 footprint and view, not on the light. Here every texel of every level holds the coefficients of a quadratic
@@ -6,9 +6,7 @@ polynomial of the view's projection on the plane,
 
     T(u, σ, ω_o) = clamp(c_0 + c_1 x + c_2 y + c_3 x² + c_4 x y + c_5 y², 0, 1),  (x, y) = ω_o.xy
 
-read as features are: bilinear in a level, linear between two. A level's coefficients are the least-squares
-fit to the queries around each texel, drawn towards those of the next coarser level where queries are few
-(ridge regression).
+read as features are: bilinear in a level, linear between two. :mod:`mbtf_fit.transmittance_fit` finds them.
 """
 
 from __future__ import annotations
@@ -21,16 +19,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mbtf_gen.atomic import digest, write_file
-from mbtf_gen.dataset import Dataset
 from mbtf_gen.errors import InputError
 from mbtf_gen.levels import Lattice, level_of_sigma
 
 TRANSMITTANCE_NAME = "transmittance.safetensors"
 COEFFICIENTS = 6
-# Queries that the coarser level counts for.
-_PRIOR = 4.0
-# Trailing axes of the arrays that are read.
-TRAILING = {"u": (2,), "sigma": (), "omega_o": (3,), "transmittance": ()}
+# For a reader of an export.
+FORMULA = (
+    "share of the footprint that is seen through holes: clamp(c0 + c1 x + c2 y + c3 x^2 + c4 x y + c5 y^2, "
+    "0, 1), where x, y = omega_o.x, omega_o.y and c = the textures transmittance.0 ... transmittance.k at u "
+    "(not moved by any offset), blended by level as features are; a view from below sees the share of the "
+    "opposite one from above; values are premultiplied: they hold what comes back, and nothing of what passes"
+)
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -130,54 +130,3 @@ def read_transmittance(folder: Path, description: Mapping[str, Any]) -> Transmit
             raise InputError("does not hold the levels that material.json describes", where=path)
         levels.append(np.asarray(array, np.float32))
     return Transmittance(lattice, levels)
-
-
-def fit_transmittance(data: Dataset) -> Transmittance | None:
-    """Fit the model to a data set's training split; None for a material without holes."""
-    if "transmittance" not in data.manifest.get("arrays", {}):
-        return None
-    lattice = data.lattice
-    pairs = [(a, b) for a in range(COEFFICIENTS) for b in range(a, COEFFICIENTS)]
-    squares = [np.zeros((len(pairs), np.prod(lattice.shape(s)))) for s in range(lattice.finest + 1)]
-    products = [np.zeros((COEFFICIENTS, np.prod(lattice.shape(s)))) for s in range(lattice.finest + 1)]
-    for part in data.iterate("train", TRAILING):
-        u, sigma, omega_o, through = (part[name].reshape(-1, *shape) for name, shape in TRAILING.items())
-        level = np.clip(level_of_sigma(sigma.astype(np.float64)), 0.0, lattice.finest)
-        for s in range(lattice.finest + 1):
-            near = np.flatnonzero(np.abs(level - s) < 1.0)
-            if not len(near):
-                continue
-            texel, weight = corners(u[near], lattice.shape(s))
-            weight = weight * (1.0 - np.abs(level[near] - s))[:, None]
-            terms, count = basis(omega_o[near]), len(squares[s][0])
-            for k, (a, b) in enumerate(pairs):
-                w = weight * (terms[:, a] * terms[:, b])[:, None]
-                squares[s][k] += np.bincount(texel.ravel(), w.ravel(), count)
-            for a in range(COEFFICIENTS):
-                w = weight * (terms[:, a] * through[near].astype(np.float64))[:, None]
-                products[s][a] += np.bincount(texel.ravel(), w.ravel(), count)
-    levels: list[F32] = []
-    for s in range(lattice.finest + 1):
-        rows, columns = lattice.shape(s)
-        prior = _from_coarser(levels, lattice, s)
-        ridge = _PRIOR if levels else 1e-3
-        matrix = np.empty((rows * columns, COEFFICIENTS, COEFFICIENTS))
-        for k, (a, b) in enumerate(pairs):
-            matrix[:, a, b] = matrix[:, b, a] = squares[s][k]
-        matrix += ridge * np.eye(COEFFICIENTS)
-        solved = np.linalg.solve(matrix, (products[s].T + ridge * prior)[..., None])[..., 0]
-        levels.append(solved.astype(np.float32).reshape(rows, columns, COEFFICIENTS))
-    return Transmittance(lattice, levels)
-
-
-def _from_coarser(levels: list[F32], lattice: Lattice, s: int) -> F64:
-    """Coefficients (texels, 6) of the level before, at the texels of level `s`; zero for the first."""
-    rows, columns = lattice.shape(s)
-    if not levels:
-        return np.zeros((rows * columns, COEFFICIENTS))
-    v, u = np.meshgrid(
-        1.0 - (np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij"
-    )
-    texel, share = corners(np.stack([u.ravel(), v.ravel()], -1), lattice.shape(s - 1))
-    out: F64 = (levels[-1].reshape(-1, COEFFICIENTS)[texel] * share[..., None]).sum(1)
-    return out

@@ -11,6 +11,7 @@ _SPLITS = {
     "held_out_queries": "held-out queries",
     "held_out_directions": "held-out directions",
     "training": "training queries",
+    "held_out": "held out",
 }
 
 
@@ -51,6 +52,21 @@ def _remarks(errors: dict[str, Any]) -> list[str]:
     return found
 
 
+def describe_transmittance(errors: dict[str, Any] | None) -> list[str]:
+    """A line per set: root mean square error, and how much of it noise of the data may be; nothing for
+    materials without holes."""
+    lines = []
+    for name, e in (errors or {}).items():
+        rms, noise, spread = (
+            max(0.0, x) ** 0.5 for x in (e["mse"]["value"], e["noise"]["value"], e["variance"])
+        )
+        lines.append(
+            f"transmittance, {_SPLITS[name]}: rms error {rms:.3f}, of which noise of the data at most "
+            f"{noise:.3f} (values spread by {spread:.3f}; {e['n']} queries)"
+        )
+    return lines
+
+
 def number(estimate: dict[str, Any]) -> str:
     if estimate["value"] is None:
         return "undefined"
@@ -73,5 +89,6 @@ def describe_fit(data: dict[str, Any]) -> str:
         f"({rate / 1e6:.2f} M queries/s)",
         describe_coverage(training["coverage"]),
         *describe_errors(data["errors"]),
+        *describe_transmittance(training.get("transmittance")),
     ]
     return "\n".join(lines)

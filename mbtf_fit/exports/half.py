@@ -6,12 +6,14 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from mbtf_gen.errors import InputError
 
 from ..material import Material, conformance_values
 from ..models import build_model
+from ..transmittance import Transmittance
 
 
 @dataclass(frozen=True)
@@ -79,4 +81,17 @@ def to_half(material: Material) -> tuple[Material, HalfError]:
     difference = after.astype(np.float64) - before
     rms, power = float(np.sqrt((difference**2).mean())), float(np.sqrt((before**2).mean()))
     error = HalfError(len(before), float(np.abs(difference).max()), rms, rms / power if power else None)
-    return replace(material, model=model, conformance={**queries, "rgb": after}), error
+    return replace(
+        material, model=model, conformance={**queries, "rgb": after}, holes=_holes_to_half(material.holes)
+    ), error
+
+
+def _holes_to_half(holes: Transmittance | None) -> Transmittance | None:
+    """The same with coefficients rounded to 16 bits."""
+    if holes is None:
+        return None
+    levels = enumerate(holes.levels)
+    return Transmittance(
+        holes.lattice,
+        [round_to_half(f"transmittance.{s}", torch.from_numpy(a)).float().numpy() for s, a in levels],
+    )

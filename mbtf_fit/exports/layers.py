@@ -14,6 +14,7 @@ from mbtf_gen.schema import CONVENTIONS
 
 from ..material import Material
 from ..material_format import MATERIAL_CONVENTIONS
+from ..transmittance import FORMULA
 from .textures import TEXTURES_NAME, channel_names, texture_parts
 
 LAYERS_NAME = "layers.json"
@@ -58,9 +59,17 @@ def layers(material: Material, *, half: bool = False) -> dict[str, list[dict[str
     return out
 
 
+def _expected_transmittance(material: Material) -> dict[str, Any]:
+    """What passes through holes at the conformance queries, where there are some."""
+    if material.holes is None:
+        return {}
+    queries = (material.conformance[name] for name in ("u", "sigma", "omega_o"))
+    return {"transmittance": _numbers(material.holes.evaluate(*queries), False)}
+
+
 def write_layers(material: Material, path: Path, *, half: bool = False) -> None:
     """Write everything but the textures: layers, formulas and conventions in words, shapes, and the
-    conformance queries with their expected values.
+    conformance queries with their expected values. What a material lets through is stated likewise.
 
     Parameters
     ----------
@@ -71,10 +80,11 @@ def write_layers(material: Material, path: Path, *, half: bool = False) -> None:
     PartialError : the disk is full or the folder cannot be written
     """
     parts = {
-        name: {"shape": list(t.shape), "channels": channel_names(t.shape[2])}
+        name: {"shape": list(t.shape), "channels": channel_names(name, t.shape[2])}
         for name, t in texture_parts(material).items()
     }
     lattice = material.lattice
+    gain = material.model.weights().get("gain")
     document = {
         "format": FORMAT_NAME,
         "schema": SCHEMA_VERSION,
@@ -90,8 +100,11 @@ def write_layers(material: Material, path: Path, *, half: bool = False) -> None:
         "unit": _numbers(material.model.unit.cpu(), False),
         "textures": {"file": TEXTURES_NAME, "parts": parts},
         "networks": layers(material, half=half),
+        **({} if gain is None else {"gain": _numbers(gain.cpu(), half)}),
+        **({} if material.holes is None else {"transmittance": FORMULA}),
         "conformance": {
             **{name: _numbers(array, False) for name, array in material.conformance.items()},
+            **_expected_transmittance(material),
             "tolerance": material.description["conformance"]["tolerance"],
         },
     }

@@ -1,4 +1,7 @@
-"""Latent textures as one EXR file: a part per level, a channel per feature."""
+"""Latent textures as one EXR file: a part per level, a channel per feature.
+
+A material with holes has those of its transmittance besides, a channel per coefficient.
+"""
 
 from __future__ import annotations
 
@@ -12,21 +15,25 @@ from mbtf_gen.atomic import write_through
 from ..material import Material
 
 TEXTURES_NAME = "textures.exr"
+# What parts of the transmittance are called: this and a level.
+HOLES_PART = "transmittance."
 
 
-def channel_names(count: int) -> list[str]:
+def channel_names(part: str, count: int) -> list[str]:
     """``f0``, ``f1``, …, with as many digits as the last one has, so that their order is that of the
-    features."""
+    features; ``c0``, … of the transmittance's coefficients."""
     digits = len(str(count - 1))
-    return [f"f{k:0{digits}d}" for k in range(count)]
+    letter = "c" if part.startswith(HOLES_PART) else "f"
+    return [f"{letter}{k:0{digits}d}" for k in range(count)]
 
 
 def texture_parts(material: Material) -> dict[str, Any]:
     """Part → texture (rows, columns, channels), coarsest level first: ``pyramid.0``, …,
-    ``offset_texture.0``."""
-    return {
-        name: tensor.cpu().numpy() for name, tensor in material.model.weights().items() if tensor.ndim == 3
-    }
+    ``offset_texture.0``, ``transmittance.0``, …"""
+    weights, holes = material.model.weights(), material.holes
+    parts = {name: tensor.cpu().numpy() for name, tensor in weights.items() if tensor.ndim == 3}
+    levels = [] if holes is None else holes.levels
+    return parts | {f"{HOLES_PART}{s}": texels for s, texels in enumerate(levels)}
 
 
 def write_textures(material: Material, path: Path, *, half: bool = False) -> None:
@@ -50,7 +57,7 @@ def write_textures(material: Material, path: Path, *, half: bool = False) -> Non
     for name, texture in texture_parts(material).items():
         channels = {
             channel: np.ascontiguousarray(texture[..., k], kind)
-            for k, channel in enumerate(channel_names(texture.shape[2]))
+            for k, channel in enumerate(channel_names(name, texture.shape[2]))
         }
         header = {
             "compression": OpenEXR.ZIP_COMPRESSION,

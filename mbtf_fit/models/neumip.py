@@ -25,8 +25,12 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from mbtf_gen.errors import InputError
+from mbtf_gen.levels import Lattice
 from mbtf_gen.schema import Layout
 
+from ..config import NetworkSection
+from .gains import look_up_gain
 from .mlp import Mlp
 from .textured import TexturedMaterial
 
@@ -36,10 +40,20 @@ class Neumip(TexturedMaterial):
 
     ``u' = u + r / max(ω_o,z, 0.6) · ω_o,xy`` with ``r = F_off(T_off(u), ω_o,xy)``; T_off is one texture of
     the finest level.
+
+    Attributes
+    ----------
+    gain : (2, levels, knots, 3) factors by light's and by view's elevation, from
+        :mod:`mbtf_fit.calibration`; None for a model that was not calibrated
     """
 
     name = "neumip"
     layout: ClassVar[Layout] = "shuffled"
+
+    def __init__(self, lattice: Lattice, network: NetworkSection) -> None:
+        super().__init__(lattice, network)
+        self.gain: Tensor | None
+        self.register_buffer("gain", None)
 
     def _make_decoder(self, features: int, directions: int) -> Mlp:
         network = self.network
@@ -47,10 +61,55 @@ class Neumip(TexturedMaterial):
         return Mlp([features + directions, *hidden, network.outputs], network.activation)
 
     def stage1(self, u: Tensor, sigma: Tensor, omega_o: Tensor) -> Tensor:
-        return self.features(u, sigma, omega_o)
+        features = self.features(u, sigma, omega_o)
+        if self.gain is None:
+            return features
+        level = self.level(sigma)
+        by_view = look_up_gain(self.gain[1], level, omega_o[:, 2])
+        return torch.cat([features, by_view, level[:, None]], 1)
 
     def stage2(self, features: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
-        return self.to_value(self.decoder(torch.cat([features, self.directions(omega_i, omega_o)], 1)))
+        directions = self.directions(omega_i, omega_o)
+        if self.gain is None:
+            return self.to_value(self.decoder(torch.cat([features, directions], 1)))
+        features, by_view, level = features.tensor_split([-4, -1], 1)
+        value = self.to_value(self.decoder(torch.cat([features, directions], 1)))
+        return value * by_view * look_up_gain(self.gain[0], level[:, 0], omega_i[:, 2])
+
+    def gains(self, sigma: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
+        """The factors (n, 3) alone; 1 without calibration."""
+        if self.gain is None:
+            return torch.ones_like(omega_i)
+        level = self.level(sigma)
+        by_light, by_view = (
+            look_up_gain(table, level, omega[:, 2])
+            for table, omega in zip(self.gain, (omega_i, omega_o), strict=True)
+        )
+        return by_light * by_view
+
+    def load_weights(self, tensors: dict[str, Tensor]) -> None:
+        name = "gain"
+        gain = tensors.get(name)
+        if gain is not None:
+            # Of any number of knots.
+            wanted = (2, self.lattice.finest + 1, gain.shape[2] if gain.ndim == 4 else 0, 3)
+            if gain.shape != wanted or wanted[2] < 2:
+                raise InputError(f"the weights do not fit the model {self.name}: '{name}'")
+        self.gain = None if gain is None else gain.float().clone()
+        super().load_weights(tensors)
+
+    def formula(self) -> dict[str, str]:
+        out = super().formula()
+        if self.gain is None:
+            return out
+        knots = self.gain.shape[2]
+        out["gain"] = (
+            f"G_i * G_o, where G_i is gain[0] at the level l and the cosine omega_i.z, G_o gain[1] at l and "
+            f"omega_o.z, a factor per colour; gain is (2, levels, {knots} knots, 3), the knots stand at the "
+            f"cosines 0, 1/{knots - 1}, ..., 1; linear between knots, and between levels as textures are"
+        )
+        out["value"] = f"gain * {out['value']}"
+        return out
 
 
 class NeumipBaseline(Neumip):

@@ -56,6 +56,7 @@ class Model(ctypes.Structure):
         ("offset_scale", _F32),
         ("grazing", _F32),
         ("aspect", _F32),
+        ("coordinates", _I32),
     )
 
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ..config import EncodingSection
 from ..models import NeuralMaterial
+from ..models.encodings import direction_size
 from ..models.mlp import Mlp
 from ..models.neumip import Neumip, NeumipBaseline
 from ..models.textured import GRAZING, OFFSET_SCALE
@@ -34,7 +35,7 @@ _KNOWN: dict[str, tuple[Any, ...]] = {
     "output": ("exp-1",),
     "offset": ("depth", "none"),
     "blending": ("blend",),
-    "encoding": (EncodingSection().model_dump(),),
+    "encoding": tuple(EncodingSection(lifted=lifted).model_dump() for lifted in (False, True)),
 }
 _SIZES = {"channels", "width", "layers"}
 
@@ -103,6 +104,7 @@ class NativeModel:
         self.description = Model()
         self.description.offset_scale, self.description.grazing = OFFSET_SCALE, GRAZING
         self.description.aspect = model.lattice.aspect
+        self.description.coordinates = direction_size(model.network.encoding)
         self._packed: list[Tensor] = []
         for network, target in zip(networks(model), self._targets(), strict=False):
             widths = [network.weights[0].shape[1], *(len(w) for w in network.weights)]

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .encodings import encode_direction, encode_position, to_value
+from .gains import Gains
 from .network import MOST_UNROLLED, Arithmetic, Network, count_weights, default_arithmetic
 from .stored import F32, StoredMaterial
 from .textures import Textures
@@ -39,6 +40,7 @@ class Evaluator:
         self.unit = stored.unit
         weights = count_weights(stored.decoder) + count_weights(stored.offset_network or [])
         self.arithmetic: Arithmetic = default_arithmetic(weights) if arithmetic is None else arithmetic
+        self.gains = None if stored.gain is None else Gains(stored.gain)
         self.pyramid = Textures(stored.pyramid)
         self.holes = None if stored.holes is None else Textures(stored.holes)
         self.decoder = Network(stored.decoder, self.arithmetic, stored.network.activation)
@@ -59,7 +61,8 @@ class Evaluator:
         return dr.clip(-dr.log2(2.0 * sigma), 0.0, float(self.lattice.finest))
 
     def features(self, u: Any, level: Any, omega_o: Any) -> list[Any]:
-        """Stage 1, shared by all lights: features at uv positions (Point2f), seen from unit vectors."""
+        """Stage 1, shared by all lights: features at uv positions (Point2f), seen from unit vectors; after
+        them, where the material has factors, those of the view and the level."""
         moved = u
         if self.offset_texture is not None:
             r = self.offset_network([*self.offset_texture.first(u), omega_o.x, omega_o.y])
@@ -71,13 +74,18 @@ class Evaluator:
             )
         read = self.pyramid.blended if self.network.blending == "blend" else self.pyramid.side_by_side
         encoded = encode_position(u, level, self.lattice.aspect, self.network.encoding)
-        return [*read(moved, level), *encoded]
+        features = [*read(moved, level), *encoded]
+        return features if self.gains is None else [*features, *self.gains.by_view(level, omega_o.z), level]
 
     def value(self, features: list[Any], omega_i: Any, omega_o: Any) -> Any:
         """Stage 2: value (Color3f) in 1/sr, at least 0."""
         options = self.network.encoding
         directions = [*encode_direction(omega_i, options), *encode_direction(omega_o, options)]
-        return to_value(self.decoder([*features, *directions]), self.unit, self.network)
+        if self.gains is None:
+            return to_value(self.decoder([*features, *directions]), self.unit, self.network)
+        *features, red, green, blue, level = features
+        value = to_value(self.decoder([*features, *directions]), self.unit, self.network)
+        return value * mi.Color3f(red, green, blue) * self.gains.by_light(level, omega_i.z)
 
     def transmittance(self, u: Any, level: Any, omega_o: Any) -> Any:
         """Share of the footprint that is seen through holes, of unit vectors on either side of the plane: a

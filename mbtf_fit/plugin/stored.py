@@ -35,6 +35,7 @@ class StoredMaterial:
     decoder : layers of the network that gives the value
     offset_texture, offset_network : those of the neural offset; None without one
     unit : factor of the value, 1/sr
+    gain : (2, levels, knots, 3) factors by light's and view's elevation; None where there are none
     holes : (rows, columns, 6) coefficients of the transmittance of each level; None without holes
     conformance : queries ``u``, ``sigma``, ``omega_i``, ``omega_o`` and their values ``rgb`` (n, 3)
     """
@@ -47,6 +48,7 @@ class StoredMaterial:
     offset_texture: F32 | None
     offset_network: Layers | None
     unit: float
+    gain: F32 | None
     holes: list[F32] | None
     conformance: dict[str, F32]
 
@@ -88,6 +90,7 @@ def read_material(folder: str | Path) -> StoredMaterial:
         offset_texture,
         offset_network,
         float(reader.take("unit", ())),
+        reader.take("gain", (2, lattice.finest + 1, None, 3)) if "gain" in tensors else None,
         None if holes is None else holes.levels,
         conformance,
     )

@@ -288,7 +288,7 @@ def test_a_hierarchical_material_is_fitted_and_loads_again(tmp_path: Path) -> No
     assert material.deviation() < 1e-6
     # Evaluated on data of either layout, in any company.
     shuffled = write_data(tmp_path / "s", parallax, train=2000, test=500)
-    errors = evaluate(material, shuffled)["test"].overall
+    errors = evaluate(material, shuffled).values["test"].overall
     assert errors.n == 500
     assert errors.unexplained.value < 0.5
     queries = random_queries(np.random.default_rng(3), 1000, material.lattice)

@@ -15,12 +15,15 @@ from mbtf_fit import FitConfig, Material
 from mbtf_fit.exports import to_half, write_layers, write_textures
 from mbtf_fit.material import export
 from mbtf_fit.models import build_model
+from mbtf_fit.transmittance import Transmittance
 from mbtf_gen.errors import InputError
 from mbtf_gen.levels import Lattice
 
 F64 = NDArray[np.float64]
 CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "baseline": ("neumip-baseline", {}),
+    "calibrated": ("neumip", {}),
+    "with holes": ("neumip", {}),
     "neumip": ("neumip", {}),
     "direct, six outputs": ("neumip", {"offset": "direct", "outputs": 6, "activation": "leaky-relu"}),
     "side by side, sine": ("neumip", {"blending": "concatenate", "activation": "sine", "output": "softplus"}),
@@ -58,9 +61,18 @@ def make(case: str, folder: Path, scale: float = 1.0) -> Material:
             if parameter.ndim == 1:
                 parameter.add_(0.1 * torch.randn(parameter.shape, generator=generator))
     model.requires_grad_(False)
+    lattice, holes = model.lattice, None
+    if case == "calibrated":
+        gain = 0.7 + 0.6 * torch.rand((2, lattice.finest + 1, 6, 3), generator=generator)
+        model.load_weights(model.weights() | {"gain": gain})
+    if case == "with holes":
+        shapes = [(*lattice.shape(s), 6) for s in range(lattice.finest + 1)]
+        holes = Transmittance(
+            lattice, [0.3 + 0.2 * torch.randn(s, generator=generator).numpy() for s in shapes]
+        )
     folder.mkdir(parents=True, exist_ok=True)
     training = {"steps": 1, "batch": 1, "seconds": 0.0, "device": "cpu", "threads": 1, "errors": {}}
-    return export(model, config, folder, data={}, training=training)
+    return export(model, config, folder, data={}, training=training, holes=holes)
 
 
 class Reader:
@@ -171,7 +183,30 @@ class Reader:
         shared = np.concatenate(lights, -1)[:, None, None]
         x = np.concatenate([features, np.broadcast_to(shared, (*features.shape[:3], shared.shape[-1]))], -1)
         x = self.inception(x) if inception else self.network("decoder", x)
-        return self.output(x[:, 0, 0], options)
+        return self.output(x[:, 0, 0], options) * self.gain(level, omega_i, omega_o)
+
+    def gain(self, level: F64, omega_i: F64, omega_o: F64) -> F64:
+        total = np.ones((len(level), 3))
+        for table, omega in zip(self.document.get("gain", []), (omega_i, omega_o), strict=False):
+            knots = np.array(table)
+            cosines = np.arange(knots.shape[1]) / (knots.shape[1] - 1)
+            low = np.minimum(np.floor(level).astype(int), len(knots) - 2)
+            for c in range(3):
+                at = np.stack([np.interp(omega[:, 2], cosines, row[:, c]) for row in knots])
+                n, fine = np.arange(len(level)), level - low
+                total[:, c] *= (1 - fine) * at[low, n] + fine * at[low + 1, n]
+        return total
+
+    def transmittance(self) -> F64:
+        finest, known = self.document["levels"]["finest"], self.document["conformance"]
+        u, sigma, omega_o = (np.array(known[k]) for k in ("u", "sigma", "omega_o"))
+        level = np.clip(-np.log2(2 * sigma), 0, finest)
+        low = np.minimum(np.floor(level).astype(int), finest - 1)
+        n, fine = np.arange(len(u)), (level - low)[:, None]
+        levels = np.stack([self.texture(f"transmittance.{s}", u) for s in range(finest + 1)])
+        c = (1 - fine) * levels[low, n] + fine * levels[low + 1, n]
+        x, y = omega_o[:, 0], omega_o[:, 1]
+        return np.asarray(np.clip((c * np.stack([x**0, x, y, x * x, x * y, y * y], -1)).sum(-1), 0, 1))
 
     def inception(self, x: F64) -> F64:
         x = self.layer("decoder.first", x)
@@ -216,6 +251,16 @@ def test_textures_and_layers_suffice(case: str, half: bool, tmp_path: Path) -> N
     found = reader.value(material.config.network.model_dump())
     np.testing.assert_allclose(found, expected, rtol=2e-3, atol=1e-5)
     assert (expected.astype(np.float32) == material.conformance["rgb"]).all() != half
+    assert ("gain" in reader.document["formula"]) == (case == "calibrated")
+    assert ("transmittance" in reader.document) == (case == "with holes")
+    if case == "with holes":
+        assert reader.document["textures"]["parts"]["transmittance.4"]["channels"][0] == "c0"
+        through = np.array(reader.document["conformance"]["transmittance"])
+        assert through.std() > 0.1
+        np.testing.assert_allclose(reader.transmittance(), through, atol=2e-5)
+        queries = (material.conformance[k] for k in ("u", "sigma", "omega_o"))
+        assert material.holes is not None
+        assert (material.holes.evaluate(*queries) == through.astype(np.float32)).all() != half
 
 
 def test_half_precision_states_its_error(tmp_path: Path) -> None:

@@ -40,7 +40,7 @@ def kernel_of(variant: str) -> Kernel:
     return Kernel(KERNEL.library, variants(KERNEL.library)[variant], variant)
 
 
-def random_model(name: str, lattice: Lattice, **network: int) -> Neumip:
+def random_model(name: str, lattice: Lattice, **network: Any) -> Neumip:
     """A model with all parameters drawn, biases and offset texture too."""
     model = build_model(name, lattice, **network)
     assert isinstance(model, Neumip)
@@ -122,6 +122,7 @@ def assert_gradients_alike(model: Neumip, found: dict[Tensor, Tensor], exact: li
     n=st.integers(1, 300),
     kind=st.sampled_from(["relative", "squared"]),
     robust=st.sampled_from([None, 0.5]),
+    lifted=st.booleans(),
 )
 def test_values_and_gradients_are_those_of_the_reference(
     variant: str,
@@ -134,9 +135,11 @@ def test_values_and_gradients_are_those_of_the_reference(
     n: int,
     kind: str,
     robust: float | None,
+    lifted: bool,
 ) -> None:
     lattice = Lattice(finest, aspect)
-    model = random_model(name, lattice, channels=channels, width=width, layers=layers)
+    sizes = {"channels": channels, "width": width, "layers": layers}
+    model = random_model(name, lattice, **sizes, encoding={"lifted": lifted})
     batch = random_batch(n, lattice)
     with torch.no_grad():
         exact = model.double()(*inputs_of(in_double(batch)))
@@ -350,7 +353,7 @@ def test_every_option_of_the_architecture_is_known_or_leads_to_pytorch() -> None
         {"offset": "direct"},
         {"blending": "concatenate"},
         {"encoding": {"position": 2}},
-        {"encoding": {"lifted": True}},
+        {"encoding": {"direction": 1}},
         {"width": 129},
         {"layers": 16, "width": 500},
     ]
@@ -359,7 +362,12 @@ def test_every_option_of_the_architecture_is_known_or_leads_to_pytorch() -> None
         assert unsupported_reason(model) is not None, option
     assert unsupported_reason(build_model("hierarchical", LATTICE)) is not None
     assert unsupported_reason(build_model("neumip", LATTICE).double()) is not None
-    for option in ({"offset": "none"}, {"channels": 64, "width": 128, "layers": 16}):
+    known: list[dict[str, Any]] = [
+        {"offset": "none"},
+        {"channels": 64, "width": 128, "layers": 16},
+        {"encoding": {"lifted": True}},
+    ]
+    for option in known:
         assert unsupported_reason(build_model("neumip", LATTICE, **option)) is None
 
 

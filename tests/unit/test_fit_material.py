@@ -121,6 +121,12 @@ def test_stored_weights_and_formula_suffice(fitted: FitResult) -> None:
     features = (1 - fine) * levels[low, q] + fine * levels[np.minimum(low + 1, finest), q]
     x = network("decoder", np.concatenate([features, omega_i[:, :2], omega_o[:, :2]], 1))
     rgb = np.maximum(weights["unit"] * np.expm1(x), 0)
+    low = np.minimum(low, finest - 1)
+    for table, omega in zip(weights["gain"], (omega_i, omega_o), strict=True):
+        cosines = np.linspace(0, 1, table.shape[1])
+        for c in range(3):
+            at = np.stack([np.interp(omega[:, 2], cosines, row[:, c]) for row in table])
+            rgb[:, c] *= at[low, q] + (level - low) * (at[low + 1, q] - at[low, q])
     np.testing.assert_allclose(rgb, weights["conformance.rgb"], atol=2e-6)
     assert fitted.material.deviation() < 1e-6
 
@@ -221,7 +227,7 @@ def test_errors_of_a_perfect_prediction_are_zero(data: Path) -> None:
 
 
 def test_evaluation_repeats_the_errors_of_the_fit(fitted: FitResult, data: Path) -> None:
-    again = {name: e.as_dict() for name, e in evaluate(fitted.material, data).items()}
+    again = {name: e.as_dict() for name, e in evaluate(fitted.material, data).values.items()}
     assert set(again) == {"test", "held_out_queries", "held_out_directions", "training"}
     for name, errors in again.items():
         stored = fitted.errors[name]

@@ -67,7 +67,8 @@ def test_evaluation_leaves_training_queries_on_disk(
         return judged(predict, data, partition)
 
     monkeypatch.setattr(mbtf_fit.evaluation, "judge", watched)
-    errors = {name: e.as_dict() for name, e in mbtf_fit.evaluation.evaluate(result.material, folder).items()}
+    evaluated = mbtf_fit.evaluation.evaluate(result.material, folder).values
+    errors = {name: e.as_dict() for name, e in evaluated.items()}
     assert isinstance(found[0], StreamedQueries)
     assert set(errors) == set(result.errors)
     for name, expected in result.errors.items():

@@ -15,9 +15,11 @@ from test_plugin_values import deviation
 
 from mbtf_fit import Material
 from mbtf_fit.plugin import load_scene
+from mbtf_fit.transmittance import Transmittance
 from mbtf_gen.camera import Camera
 from mbtf_gen.directions import from_angles
 from mbtf_gen.errors import InputError, MbtfError, UsageError
+from mbtf_gen.levels import Lattice
 
 LIGHT = from_angles(40.0, 20.0)
 # A narrow view: differentials, which the footprint comes from, are differences over a pixel.
@@ -119,6 +121,40 @@ def test_more_samples_per_pixel_do_not_narrow_the_footprint(tmp_path: Path) -> N
     found = np.array(mi.render(scene, integrator=cones(), spp=16)).mean()
     assert abs(narrower / wanted - 1) > 0.05
     assert found == pytest.approx(wanted, rel=5e-3)
+
+
+@pytest.mark.parametrize("share", [0.05, 0.5, 0.95])
+def test_a_cone_goes_on_through_a_hole_as_if_it_were_not_there(tmp_path: Path, share: float) -> None:
+    """A sheet that is nothing but a hole, at a share of the camera's height: a plane whose brightness tells σ
+    looks the same behind it. Were the cone to begin again at the hole, or to widen, it would not."""
+    import torch
+
+    levels = {f"pyramid.{s}": torch.full((2**s, 2**s, 7), 0.5 * s) for s in range(5)}
+    fitted = write_material(tmp_path / "plane", model="neumip-baseline", finest=4, weights=levels)
+    texel = np.zeros((1, 1, 6), np.float32)
+    texel[..., 0] = 1.0
+    hole = Transmittance(Lattice(0), [texel])
+    write_material(tmp_path / "sheet", finest=0, constant=(0.0,) * 3, holes=hole)
+    camera = Camera(elevation=55.0, span=3.0, rows=6, columns=6)
+    at = mi.ScalarTransform4f().translate([0, 0, share * float(camera.position[2])]).scale(300.0)
+    scene = {
+        "type": "scene",
+        "m": plane(bsdf(tmp_path / "plane")),
+        "e": directional(LIGHT),
+        "sensor": sensor_of(camera),
+    }
+    sheet = {"type": "rectangle", "to_world": at, "b": bsdf(tmp_path / "sheet")}
+    tracer = mi.load_dict({"type": "mbtf_path", "max_depth": 3})
+    bare, behind = (
+        through_pixel_centres(mi.load_dict(scene | more), camera, tracer) for more in ({}, {"s": sheet})
+    )
+    bare, behind = bare[..., 0], behind[..., 0]
+    q = camera.queries(LIGHT).flat()
+    narrower, wider = (
+        fitted.evaluate(q.u, f * q.sigma, q.omega_i, q.omega_o)[:, 0].mean() for f in (0.9, 1.1)
+    )
+    assert min(abs(x / bare.mean() - 1) for x in (narrower, wider)) > 0.01
+    np.testing.assert_allclose(behind, bare, rtol=2e-3)
 
 
 def test_stock_integrators_read_the_given_footprint_and_warn_once_without(

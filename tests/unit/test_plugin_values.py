@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from support.damage import check_message
 from support.fit_data import random_queries
 from support.plugin_materials import write_material
@@ -23,12 +24,18 @@ from mbtf_fit.plugin import encodings, evaluator, network  # noqa: E402
 from mbtf_fit.plugin.evaluator import Evaluator  # noqa: E402
 from mbtf_fit.plugin.stored import read_material  # noqa: E402
 
+RANDOM = torch.Generator().manual_seed(1)
 VARIANTS: dict[str, dict[str, Any]] = {
     "neumip": {},
     "baseline": {"model": "neumip-baseline"},
     "tall tile": {"aspect": 2.3},
     "flat tile": {"aspect": 0.1},
     "one texel": {"finest": 0},
+    "calibrated": {"weights": {"gain": 0.7 + 0.6 * torch.rand((2, 4, 6, 3), generator=RANDOM)}},
+    "calibrated, one texel": {
+        "finest": 0,
+        "weights": {"gain": 0.7 + 0.6 * torch.rand((2, 1, 6, 3), generator=RANDOM)},
+    },
     "six outputs": {"network": {"outputs": 6}},
     "direct offset": {"network": {"offset": "direct", "activation": "leaky-relu", "output": "softplus"}},
     "concatenated": {"network": {"blending": "concatenate", "activation": "sine", "output": "exp"}},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -12,18 +13,19 @@ from support.damage import check_message
 from support.fit_data import constant, random_queries, write_data
 from support.plugin_materials import write_material
 
-from mbtf_fit.config import FitConfig
+from mbtf_fit.config import FitConfig, HeldOutSection
+from mbtf_fit.data import load_training
+from mbtf_fit.evaluation import evaluate
 from mbtf_fit.fitting import fit
 from mbtf_fit.material_format import read_description
-from mbtf_fit.transmittance import (
-    TRANSMITTANCE_NAME,
-    Transmittance,
-    fit_transmittance,
-    read_transmittance,
-)
+from mbtf_fit.streaming import Selection
+from mbtf_fit.transmittance import TRANSMITTANCE_NAME, Transmittance, read_transmittance
+from mbtf_fit.transmittance_fit import fit_transmittance, judge_transmittance
+from mbtf_fit.wording import describe_transmittance
 from mbtf_gen.dataset import Dataset
 from mbtf_gen.errors import InputError
 from mbtf_gen.levels import Lattice
+from mbtf_gen.shard_files import read_shard, write_shard
 
 
 def lace(u: np.ndarray, sigma: np.ndarray, omega_o: np.ndarray) -> np.ndarray:
@@ -34,11 +36,16 @@ def lace(u: np.ndarray, sigma: np.ndarray, omega_o: np.ndarray) -> np.ndarray:
     return np.asarray((0.45 + 0.2 * wave) * (1 - 0.7 * (x * x + y * y)) + 0.1 * x - 0.05 * y)
 
 
+def chosen(data: Dataset, held_out: HeldOutSection | None = None) -> Selection:
+    """What is trained on; everything by default."""
+    return load_training(data, held_out or HeldOutSection(queries=0, radius=0), 0).selection
+
+
 def test_a_known_transmittance_is_found(tmp_path: Path) -> None:
     data = Dataset.open(
         write_data(tmp_path, constant(0.2), train=120_000, finest=4, aspect=0.5, through=lace)
     )
-    model = fit_transmittance(data)
+    model = fit_transmittance(data, chosen(data))
     assert model is not None
     q = random_queries(np.random.default_rng(9), 4000, data.lattice)
     found = model.evaluate(q["u"] + np.float32(2.0), q["sigma"], q["omega_o"])
@@ -53,7 +60,7 @@ def test_a_known_transmittance_is_found(tmp_path: Path) -> None:
 def test_buffers_tell_the_same(tmp_path: Path, window: int | None) -> None:
     folder = write_buffers(tmp_path, constant(0.2), train=1500, through=lace, window=window)
     data = Dataset.open(folder)
-    model = fit_transmittance(data)
+    model = fit_transmittance(data, chosen(data))
     assert model is not None
     q = random_queries(np.random.default_rng(9), 4000, data.lattice)
     found = model.evaluate(q["u"], q["sigma"], q["omega_o"])
@@ -65,7 +72,7 @@ def test_few_queries_fall_back_on_coarser_levels(tmp_path: Path) -> None:
     data = Dataset.open(
         write_data(tmp_path, constant(0.2), train=200, finest=6, through=lambda u, s, o: 0.6 + 0 * s)
     )
-    model = fit_transmittance(data)
+    model = fit_transmittance(data, chosen(data))
     assert model is not None
     q = random_queries(np.random.default_rng(9), 500, data.lattice)
     assert np.abs(model.evaluate(q["u"], q["sigma"], q["omega_o"]) - 0.6).max() < 0.1
@@ -81,7 +88,8 @@ def test_a_fit_writes_it_beside_the_weights_and_only_for_holes(tmp_path: Path) -
     fit(config, tmp_path / "lace", tmp_path / "b")
     description, _ = read_description(tmp_path / "b")
     read = read_transmittance(tmp_path / "b", description)
-    fitted = fit_transmittance(Dataset.open(tmp_path / "lace"))
+    data = Dataset.open(tmp_path / "lace")
+    fitted = fit_transmittance(data, chosen(data, config.held_out))
     assert read is not None
     assert fitted is not None
     for mine, theirs in zip(read.levels, fitted.levels, strict=True):
@@ -93,6 +101,89 @@ def test_a_fit_writes_it_beside_the_weights_and_only_for_holes(tmp_path: Path) -
     with pytest.raises(InputError, match="not the file that") as caught:
         read_transmittance(tmp_path / "b", description)
     check_message(caught.value)
+
+
+def test_passes_over_the_data_change_nothing_but_memory(tmp_path: Path) -> None:
+    """Sums that take more than they may are made band by band, to the last bit alike."""
+    data = Dataset.open(
+        write_data(tmp_path, constant(0.2), train=20_000, finest=8, aspect=0.5, through=lace, noise=0.1)
+    )
+    found, peaks = [], []
+    for memory in (1e9, 1e6):
+        tracemalloc.start()
+        found.append(fit_transmittance(data, chosen(data), memory))
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    whole, banded = found
+    assert whole is not None
+    assert banded is not None
+    for mine, theirs in zip(whole.levels, banded.levels, strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+    assert data.lattice.texels() * 27 * 8 > 7e6
+    assert peaks[0] - peaks[1] > 4e6
+
+
+@pytest.mark.parametrize("layout", ["shuffled", "image"])
+def test_what_is_held_out_is_judged_and_not_fitted(layout: str, tmp_path: Path) -> None:
+    """Where held-out rows say something else, the fit does not know, and its error there says so."""
+    held_out = HeldOutSection(queries=0.2, radius=0.15)
+    if layout == "image":
+        write_buffers(tmp_path, constant(0.2), train=400, through=lace)
+    else:
+        write_data(tmp_path, constant(0.2), train=40_000, finest=3, through=lace)
+    data = Dataset.open(tmp_path)
+    selection = chosen(data, held_out)
+    before = fit_transmittance(data, selection)
+    assert before is not None
+    honest = judge_transmittance(before, data, selection)
+    for path, mask in selection.masks():
+        arrays = dict(read_shard(path, mapped=False))
+        assert 0.1 < (~mask).mean() < 0.6
+        through = arrays["transmittance"].copy()
+        through[~mask] += 0.5
+        write_shard(path, {**arrays, "transmittance": through})
+    after = fit_transmittance(data, selection)
+    assert after is not None
+    for mine, theirs in zip(before.levels, after.levels, strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+    judged = judge_transmittance(after, data, selection)
+    assert judged["held_out"].mse.value == pytest.approx(0.25, rel=0.1)
+    for name in ("training", "test"):
+        assert judged[name].mse == honest[name].mse
+        assert honest[name].mse.value < 2e-3
+    assert honest["held_out"].mse.value < 2e-3
+
+
+def test_errors_hold_the_noise_of_the_data_and_say_how_much(tmp_path: Path) -> None:
+    """Holes are hit or missed: of four independent paths each, a quarter of p(1-p) is noise."""
+    random = np.random.default_rng(3)
+    folder = write_data(
+        tmp_path,
+        constant(0.2),
+        train=30_000,
+        test=20_000,
+        finest=1,
+        through=lambda u, s, o: random.binomial(4, 0.3, len(s)) / 4,
+    )
+    for path in folder.glob("*.npz"):
+        arrays = dict(read_shard(path, mapped=False))
+        write_shard(path, {**arrays, "spp": np.full(len(arrays["spp"]), 4, np.float32)})
+    material = tmp_path / "material"
+    result = fit(FitConfig.model_validate({"training": {"steps": 2, "batch": 256}}), folder, material)
+    stated = result.as_dict()["training"]["transmittance"]
+    found = evaluate(result.material, folder).transmittance
+    assert found is not None
+    assert stated == {name: error.as_dict() for name, error in found.items()}
+    assert list(found) == ["test", "held_out", "training"]
+    for error in found.values():
+        assert error.noise.value == pytest.approx(0.3 * 0.7 / 4, rel=0.08)
+        # Some hundreds are held out.
+        few = 0.2 if error.n < 5000 else 0.05
+        assert error.mse.value == pytest.approx(error.noise.value, rel=few)
+        assert error.variance == pytest.approx(error.noise.value, rel=few)
+    text = describe_transmittance(stated)
+    assert len(text) == 3
+    assert "noise of the data at most 0.2" in text[0]
 
 
 def test_a_description_that_does_not_say_which_file_is_refused(tmp_path: Path) -> None:

@@ -34,11 +34,13 @@ typedef struct {
     const float *table;
 } mbtf_textures;
 
-/* neumip, or neumip-baseline where offset.layers is 0. */
+/* neumip, or neumip-baseline where offset.layers is 0. The decoder sees so many coordinates of light and of
+ * view: 2 (x, y) or 3. */
 typedef struct {
     mbtf_textures pyramid, offset_texture;
     mbtf_network decoder, offset;
     float unit, offset_scale, grazing, aspect;
+    int32_t coordinates;
 } mbtf_model;
 
 /* u (n, 2), sigma (n), omega_i and omega_o (n, 3). */
