@@ -9,6 +9,7 @@ from cyclopts import Parameter
 
 from mbtf_gen.console import CONSOLE, Console, clock, new_app
 from mbtf_gen.errors import InputError, PartialError, UsageError
+from mbtf_gen.near import near_miss
 from mbtf_gen.quality import Quality, as_assignments, quality_help
 
 from .plugin.preview.command import preview
@@ -133,10 +134,14 @@ def fit(
         )
         return
     from .fitting import fit
+    from .material_format import DESCRIPTION_NAME
 
-    console.note(
-        f"{shards} -> {output}: {resolved.model}, training for {budget} (change it with --time or --steps)"
-    )
+    finished = not overwrite and (output / DESCRIPTION_NAME).exists()
+    if not finished:
+        console.note(
+            f"{shards} -> {output}: {resolved.model}, training for {budget} "
+            "(change it with --time or --steps)"
+        )
     from .native import missing_reason
 
     if missing_reason():
@@ -149,6 +154,8 @@ def fit(
             overwrite=overwrite,
             progress=lambda share, note: bar.update(round(100 * share, 1), note),
         )
+    if finished:
+        console.note(f"{output}: this fit is finished, nothing was trained; --overwrite trains it again")
     data = result.as_dict()
     price = [result.price.describe()] if result.price is not None else []
     console.report(data, "\n".join([describe_fit(data), *price]))
@@ -335,7 +342,7 @@ def info(path: Path, /, *, console: Console = CONSOLE) -> None:
         Folder made by mbtf-fit or by mbtf-gen.
     """
     if not path.is_dir():
-        raise InputError("no such folder", where=path)
+        raise InputError("no such folder", where=path, cure=near_miss(path, Path.is_dir))
     from mbtf_gen.schema import MANIFEST_NAME
 
     data, text = _shards_info(path) if (path / MANIFEST_NAME).exists() else _material_info(path)

@@ -16,6 +16,7 @@ from pydantic import BaseModel, Field
 from mbtf_gen.atomic import digest, read_json
 from mbtf_gen.errors import InputError
 from mbtf_gen.levels import MAX_LEVEL
+from mbtf_gen.near import near_miss
 from mbtf_gen.settings import check_document
 
 FORMAT_NAME = "mbtf-material"
@@ -80,7 +81,7 @@ def read_description(folder: Path) -> tuple[dict[str, Any], Path]:
     InputError : missing, damaged, or of another schema
     """
     if not folder.is_dir():
-        raise InputError("no such folder", where=folder)
+        raise InputError("no such folder", where=folder, cure=near_miss(folder, Path.is_dir))
     path = folder / DESCRIPTION_NAME
     if not path.exists():
         raise InputError(

@@ -34,7 +34,22 @@ def describe_errors(errors: dict[str, Any]) -> list[str]:
                 [f"{label} {group}", *("-" if e is None else number(e["unexplained"]) for e in found)]
             )
     rows.append(["queries", *(str(errors[name]["n"]) for name in splits)])
-    return table(rows).splitlines()
+    return [*table(rows).splitlines(), *_remarks(errors)]
+
+
+def _remarks(errors: dict[str, Any]) -> list[str]:
+    """What surprises in a table of errors, and what helps; nothing where nothing does."""
+    found = []
+    groups = [g for e in errors.values() for g in (e, *e["levels"].values(), *e["elevations"].values())]
+    if any(group["unexplained"]["value"] is None for group in groups):
+        found.append("undefined: noise hides how much the values of these queries vary")
+    test = errors.get("test", {}).get("unexplained", {}).get("value")
+    if test is not None and test >= 1:
+        found.append(
+            "above 1 the mean value alone would do better: more queries (--queries of mbtf-gen), "
+            "more paths for each (--spp) or a wider light (--light-width) give a fit more to go by"
+        )
+    return found
 
 
 def describe_transmittance(errors: dict[str, Any] | None) -> list[str]:

@@ -154,7 +154,9 @@ class _LineProgress(Progress):
     def _print(self) -> None:
         self._shown = self.done
         parts = [f"{self.label}: {self.done:.10g}"]
-        if self.total:
+        if self.unit == "%":
+            parts[0] = f"{self.label}: {self.done:.0f}%"
+        elif self.total:
             parts[0] += f"/{self.total:.10g} {self.unit}".rstrip() + f" ({self.done / self.total:.0%})"
         elif self.unit:
             parts[0] += f" {self.unit}"

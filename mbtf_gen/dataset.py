@@ -14,6 +14,7 @@ from pydantic import BaseModel, Field
 from .atomic import read_json
 from .errors import InputError
 from .levels import MAX_LEVEL, Lattice
+from .near import near_miss
 from .schema import ARRAYS, FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, Layout
 from .settings import check_document
 from .shard_files import Arrays, read_shard
@@ -96,7 +97,7 @@ class Dataset:
         """
         folder = Path(folder)
         if not folder.is_dir():
-            raise InputError("no such folder", where=folder)
+            raise InputError("no such folder", where=folder, cure=near_miss(folder, Path.is_dir))
         path = folder / MANIFEST_NAME
         if not path.exists():
             raise InputError(

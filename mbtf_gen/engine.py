@@ -64,21 +64,27 @@ def load_mitsuba(variant: str = CPU_VARIANT) -> Any:
     except ImportError as error:
         raise _mitsuba_error(" ".join(str(error).split())) from None
     if variant == CPU_VARIANT:
-        _refuse_early_import()
+        refuse_old_llvm()
     _working.add(variant)
     return mitsuba
 
 
-def _refuse_early_import() -> None:
-    """Dr.Jit binds to an LLVM when it is first imported: an old one, where that came before this package's
-    import."""
+def refuse_old_llvm() -> None:
+    """Refuse the LLVM that Dr.Jit has bound to where it is too old: some kernel would abort the process.
+
+    That happens where Dr.Jit was imported before this package, which says where a newer one lies.
+
+    Raises
+    ------
+    EngineError : it is older than `OLDEST_LLVM`
+    """
     import drjit
 
     major = int(drjit.detail.llvm_version()[0])
     if major < OLDEST_LLVM:
         raise EngineError(
             f"Dr.Jit was imported before mbtf_gen and has bound to LLVM {major}, which is too old",
-            cure="import mbtf_gen before mitsuba and drjit",
+            cure="import mbtf_gen or mbtf_fit.plugin before mitsuba and drjit",
         )
 
 

@@ -18,6 +18,7 @@ from typing import Annotated, Any, TypeVar
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from .errors import InputError, MbtfError, UsageError, reason
+from .near import near_miss
 from .wording import explain, models_in
 
 
@@ -59,6 +60,10 @@ def _yaml() -> Any:
     return YAML(typ="rt")
 
 
+def _is_yaml(path: Path) -> bool:
+    return path.suffix.lower() in (".yaml", ".yml")
+
+
 def read_yaml(path: Path) -> Any:
     """Mapping stored in a YAML file, with line numbers kept.
 
@@ -71,7 +76,7 @@ def read_yaml(path: Path) -> Any:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
-        raise InputError("no such file", where=path) from None
+        raise InputError("no such file", where=path, cure=near_miss(path, _is_yaml)) from None
     except UnicodeDecodeError as error:
         raise InputError(f"is not UTF-8 text (byte {error.start})", where=path) from None
     except (OSError, ValueError) as error:
@@ -356,4 +361,6 @@ def _is_digest(value: Any) -> bool:
 
 
 def _brief(value: Any) -> str:
+    if value is None:
+        return "unset"
     return f"{value[:8]}…" if _is_digest(value) else str(value)

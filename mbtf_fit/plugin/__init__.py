@@ -1,13 +1,15 @@
 """Fitted materials as Mitsuba BSDFs (``mbtf``), and a path tracer that hands them footprints
 (``mbtf_path``).
 
+    import mbtf_fit.plugin
     import mitsuba as mi
     mi.set_variant("llvm_ad_rgb")
-    import mbtf_fit.plugin
+    mbtf_fit.plugin.register()
     bsdf = mi.load_dict({"type": "mbtf", "material": "material/"})
 
-Importing the package registers its plugins with the variant that is set; where none is set yet, call
-:func:`register` once it is. PyTorch is not needed, and never imported.
+Import the package before Mitsuba: Dr.Jit looks for its LLVM when it is first imported, and this package says
+where one lies that is new enough. Importing the package registers its plugins with a variant that is set
+already; :func:`load_scene` registers them by itself. PyTorch is not needed, and never imported.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ from .evaluator import Evaluator
 from .lobe_fit import fit_lobes
 from .lobes import LobeTextures, Mixture
 from .network import Arithmetic
-from .registration import BSDF_NAME
+from .registration import BSDF_NAME, refuse_unknown
 from .stored import StoredMaterial, read_material
 
 # Length of the directions' projection on the surface beyond which no material has data: lower directions are
@@ -30,6 +30,8 @@ from .stored import StoredMaterial, read_material
 LARGEST_SINE = 0.99**0.5
 # Largest deviation from the conformance values, as a share of max(value, their mean), that loading accepts.
 TOLERANCE = {"unrolled": 1e-4, "cooperative": 1e-4, "half": 1e-2}
+
+PARAMETERS = ("material", "uv_scale", "sigma", "networks", "sampling")
 
 _log = logging.getLogger(__name__)
 # Materials whose missing footprint was told.
@@ -103,6 +105,7 @@ class MbtfBSDF(mi.BSDF):
             raise UsageError(
                 "names no material", where=self._place(props), cure="give it: 'material': 'folder/'"
             )
+        refuse_unknown(props, PARAMETERS, self._place(props))
         folder = Path(str(mi.file_resolver().resolve(str(props["material"]))))
         stored = read_material(folder)
         self.lattice = stored.lattice

@@ -17,6 +17,7 @@ import mitsuba as mi
 from mbtf_gen.errors import UsageError
 
 from .bsdf import Cones
+from .registration import INTEGRATOR_NAME, refuse_unknown
 from .scene import check_scene
 
 # Spread of a scattered ray's cone, as a share of 1/√density, the side of the solid angle that a direction of
@@ -78,8 +79,9 @@ class ConePath(mi.SamplingIntegrator):
         self.max_depth = 0xFFFFFFFF if depth < 0 else depth
         self.rr_depth = int(props.get("rr_depth", 5))
         if depth < -1 or self.rr_depth < 1:
-            raise UsageError("max_depth must be at least -1, rr_depth at least 1", where="mbtf_path")
+            raise UsageError("max_depth must be at least -1, rr_depth at least 1", where=INTEGRATOR_NAME)
         self.hidden = bool(props.get("hide_emitters", False))
+        refuse_unknown(props, ("max_depth", "rr_depth", "hide_emitters"), INTEGRATOR_NAME)
 
     def render(self, scene: Any, *arguments: Any, **options: Any) -> Any:
         """Stock rendering, after a check of the scene.

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import difflib
 import sys
+from collections.abc import Sequence
 from typing import Any
 
+from mbtf_gen.engine import CPU_VARIANT, CUDA_VARIANT, refuse_old_llvm
 from mbtf_gen.errors import EngineError, MbtfError, UsageError
 
 BSDF_NAME = "mbtf"
 INTEGRATOR_NAME = "mbtf_path"
-VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
+VARIANTS = (CPU_VARIANT, CUDA_VARIANT)
 
 # The plugins' classes derive from classes of one variant.
 _registered: str | None = None
@@ -29,7 +32,8 @@ def register() -> None:
     Raises
     ------
     UsageError : no variant is set, or one that the plugins do not run in
-    EngineError : they are registered with another variant already
+    EngineError : they are registered with another variant already, or Dr.Jit has bound to an old
+        LLVM
     """
     global _registered
     if not variant_is_set():
@@ -49,12 +53,28 @@ def register() -> None:
             f"the plugin '{BSDF_NAME}' is registered with the variant {_registered}",
             cure="use one variant per process",
         )
+    if variant == CPU_VARIANT:
+        refuse_old_llvm()
     from .bsdf import MbtfBSDF
     from .integrator import ConePath
 
     mi.register_bsdf(BSDF_NAME, lambda props: _made(MbtfBSDF, props))
     mi.register_integrator(INTEGRATOR_NAME, lambda props: _made(ConePath, props))
     _registered = variant
+
+
+def refuse_unknown(props: Any, known: Sequence[str], where: str) -> None:
+    """Refuse a parameter that a plugin does not have; Mitsuba would say so in a report of several lines.
+
+    Raises
+    ------
+    UsageError : there is one
+    """
+    unknown = sorted(set(props.unqueried()) - set(known))
+    if unknown:
+        near = difflib.get_close_matches(unknown[0], known, n=1)
+        cure = f"did you mean '{near[0]}'?" if near else f"it has: {', '.join(known)}"
+        raise UsageError(f"has no parameter '{unknown[0]}'", where=where, cure=cure)
 
 
 def _made(plugin: Any, props: Any) -> Any:

@@ -91,6 +91,22 @@ def test_json_is_one_object(shards: Path, material: Path, tmp_path: Path, run_py
         json.loads(done.stdout)
 
 
+def test_a_finished_fit_says_that_nothing_was_trained(
+    shards: Path, material: Path, run_python: RunPython
+) -> None:
+    before = (material / "material.json").read_bytes()
+    done = run_python("-m", "mbtf_fit", str(shards), "-o", str(material), *QUICK)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.splitlines() == [
+        f"{material}: this fit is finished, nothing was trained; --overwrite trains it again"
+    ]
+    assert "unexplained variance  test" in done.stdout
+    assert (material / "material.json").read_bytes() == before
+    done = run_python("-m", "mbtf_fit", str(shards), "-o", str(material), *QUICK, "--overwrite")
+    assert "training for 5 steps" in done.stderr
+    assert "nothing was trained" not in done.stderr
+
+
 def test_another_material_s_data_are_warned_of(tmp_path: Path, run_python: RunPython) -> None:
     made = {}
     for name, digest in (("own", "1"), ("other", "2")):

@@ -226,6 +226,12 @@ def test_progress_comes_at_intervals(
     ]
 
 
+def test_per_cent_are_said_once(capsys: pytest.CaptureFixture[str]) -> None:
+    with CONSOLE.progress(100, "fitting", "%") as bar:
+        bar.update(29.6)
+    assert capsys.readouterr().err.startswith("fitting: 30%, ")
+
+
 def test_progress_survives_errors_and_unknown_totals(capsys: pytest.CaptureFixture[str]) -> None:
     def read() -> None:
         with CONSOLE.progress(None, "reading", "rows") as bar:

@@ -102,6 +102,11 @@ def test_missing_and_unfinished_shards(tmp_path: Path, suffix: str) -> None:
 def test_folders_that_hold_no_data_set(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such folder"):
         Dataset.open(tmp_path / "gone")
+    (tmp_path / "shards").mkdir()
+    (tmp_path / "shards.xy").touch()
+    with pytest.raises(InputError) as caught:
+        Dataset.open(tmp_path / "shards.x")
+    assert caught.value.cure == f"did you mean '{tmp_path / 'shards'}'?"
     with pytest.raises(InputError, match=r"no manifest\.json"):
         Dataset.open(tmp_path)
     path = tmp_path / "manifest.json"

@@ -29,6 +29,7 @@ VOCABULARY = {
     "mbtf_gen.durations",
     "mbtf_gen.errors",
     "mbtf_gen.levels",
+    "mbtf_gen.near",
     "mbtf_gen.quality",
     "mbtf_gen.schema",
     "mbtf_gen.seeds",

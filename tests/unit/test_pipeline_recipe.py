@@ -145,6 +145,7 @@ def test_published_maps_that_are_missing_are_named_with_their_source(
     ("arguments", "code", "what"),
     [
         (["run", "absent.yaml"], 3, "no such file"),
+        (["run", "recipe-under-tset.yaml"], 3, "did you mean 'recipe-under-test.yaml'?"),
         (["run", "."], 3, "is a folder"),
         (["run", "recipe-under-test.yaml", "--set", "compare.spp=x"], 2, "compare.spp"),
         (["run", "recipe-under-test.yaml", "--set", "compare"], 2, "key=value"),

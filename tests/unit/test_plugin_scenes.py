@@ -220,6 +220,8 @@ def scene_of(folder: Path | str, **options: Any) -> dict[str, Any]:
         ({"sigma": 0.0}, "sigma must be a positive number, not 0", UsageError),
         ({"networks": "exact"}, "networks must be one of unrolled, cooperative, half, not exact", UsageError),
         ({"sampling": "uniform"}, "sampling must be one of lobes, cosine, not uniform", UsageError),
+        ({"uvscale": 4.0}, "has no parameter 'uvscale'\n  did you mean 'uv_scale'?", UsageError),
+        ({"colour": 4.0}, "has no parameter 'colour'\n  it has: material, uv_scale", UsageError),
     ],
 )
 def test_faults_of_a_scene_are_one_clear_line(
@@ -241,6 +243,10 @@ def test_xml_is_loaded_and_refused_alike(material: tuple[Path, Material], tmp_pa
     file.write_text(text.format(tmp_path / "nothing"))
     with pytest.raises(InputError, match="nothing: no such folder"):
         load_scene(file)
+    with pytest.raises(
+        UsageError, match="mbtf_path: has no parameter 'maxdepth'\n  did you mean 'max_depth'"
+    ):
+        load_scene({"type": "scene", "integrator": {"type": "mbtf_path", "maxdepth": 3}})
     with pytest.raises(UsageError, match="names no material"):
         load_scene({"type": "scene", "ball": {"type": "sphere", "b": {"type": "mbtf"}}})
 

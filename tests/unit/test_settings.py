@@ -228,9 +228,9 @@ def test_differences_lead_with_settings_and_shorten_digests() -> None:
     changes = differences(before, after)
     assert changes == [
         "spp: 4 -> 8",
-        "width: None -> 2.0",
+        "width: unset -> 2.0",
         "inputs.height: a1a1a1a1… -> b2b2b2b2…",
-        "inputs.normal: None -> c3c3c3c3…",
+        "inputs.normal: unset -> c3c3c3c3…",
     ]
-    assert in_short(changes, 2) == "spp: 4 -> 8; width: None -> 2.0; and 2 more"
+    assert in_short(changes, 2) == "spp: 4 -> 8; width: unset -> 2.0; and 2 more"
     assert in_short(changes, 4) == "; ".join(changes)
