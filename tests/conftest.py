@@ -17,24 +17,6 @@ import mbtf_gen  # noqa: F401
 settings.register_profile("project", derandomize=True, deadline=None)
 settings.load_profile("project")
 
-_exit_status: int | None = None
-
-
-def pytest_sessionfinish(exitstatus: int) -> None:
-    global _exit_status
-    _exit_status = int(exitstatus)
-
-
-@pytest.hookimpl(trylast=True)
-def pytest_unconfigure() -> None:
-    """Leave with the status of the tests. A process that holds renderer, compiled kernels and PyTorch at once
-    may crash while the interpreter takes them down, after everything was judged."""
-    if _exit_status is not None:
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(_exit_status)
-
-
 RunPython = Callable[..., "subprocess.CompletedProcess[str]"]
 
 
