@@ -238,7 +238,7 @@ def test_chains_fit_into_their_budget(budget: float) -> None:
     assert totals == [2**n for n in range(len(totals))]
     assert sum(totals) <= WHOLE * budget / SHORTEST < sum(totals) + 2 * totals[-1]
     # Fits of other seeds are of a setting that was measured, on its data.
-    (like,) = (c for c in found if c.study == "fit" and c.name == f"{0.5 * FIT * budget / 13.5:.3g} s")
+    (like,) = (c for c in found if c.study == "fit" and c.name == f"{0.5 * FIT * budget / 15.5:.3g} s")
     others = [c for c in found if c.study == "seeds"]
     assert all(c.fit == {**like.fit, "seed": c.fit["seed"]} for c in others)
     assert all((c.queries, c.spp) == (like.queries, like.spp) for c in others)
