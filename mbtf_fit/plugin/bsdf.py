@@ -100,7 +100,8 @@ class MbtfBSDF(mi.BSDF):
     """
 
     def __init__(self, props: Any) -> None:
-        super().__init__(props)
+        # Whatever may fail comes before the renderer registers the instance: one that was registered and is
+        # kept by an exception's traceback would be called by every later render.
         if "material" not in props:
             raise UsageError(
                 "names no material", where=self._place(props), cure="give it: 'material': 'folder/'"
@@ -119,6 +120,7 @@ class MbtfBSDF(mi.BSDF):
         self.sigma_given = "sigma" in props
         self.sigma = self._positive(props, "sigma", stored.lattice.sigma_range[0])
         self.folder = folder
+        super().__init__(props)
         flags = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide | mi.BSDFFlags.SpatiallyVarying
         flags |= mi.BSDFFlags.Anisotropic
         self.m_components = [flags]

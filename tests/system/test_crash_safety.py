@@ -218,9 +218,14 @@ def test_an_interruption_keeps_what_was_rendered_and_says_how_to_go_on(
         return noisy_plane(self, queries, spp, stream)
 
     capsys.readouterr()
-    with monkeypatch.context() as patch:
-        patch.setattr(ClosedForm, "estimate", interrupted)
-        assert generate(line) == 130
+    # A shell without job control has its background processes ignore it, and these tests with them.
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with monkeypatch.context() as patch:
+            patch.setattr(ClosedForm, "estimate", interrupted)
+            assert generate(line) == 130
+    finally:
+        signal.signal(signal.SIGINT, handler)
     said = [x for x in capsys.readouterr().err.splitlines() if not x.startswith("warning: ")]
     assert len(said) == 2
     assert said[0].startswith("error: interrupted; ")

@@ -89,7 +89,8 @@ def test_every_table_has_its_numbers(made: Path) -> None:
     assert {(r["span"], r["method"]) for r in table(made, "zooms")} == {
         (span, r["method"]) for span in ("0.5", "2") for r in methods[:3]
     }
-    assert [r["verdict"] for r in table(made, "independence")] == ["agree"]
+    # Pictures of 16 pixels are.
+    assert [r["verdict"] for r in table(made, "independence")] == ["too small to tell"]
     for fit in ("neumip", "hierarchical"):
         begun = json.loads((run_folder / "fits" / fit / "fit.json").read_text())
         assert begun["config"]["training"]["steps"] == 4

@@ -268,6 +268,16 @@ def test_a_mesh_without_texture_coordinates_is_refused(
     assert "no texture coordinates" in str(caught.value.__cause__ or caught.value.__context__)
 
 
+def test_a_refused_material_leaves_later_pictures_alone(material: tuple[Path, Material]) -> None:
+    """A traceback, as notebooks keep it, holds the instance that failed."""
+    folder, fitted = material
+    with pytest.raises(Exception, match="uv_scale must be a positive number") as kept:
+        mi.load_dict(bsdf(folder, uv_scale=-1.0))
+    found = shown(plane(bsdf(folder), aspect=fitted.lattice.aspect))
+    assert kept.tb is not None
+    assert found.mean() > 0.0
+
+
 def test_values_that_are_not_the_materials_own_are_refused(tmp_path: Path) -> None:
     """A material whose conformance values say otherwise than its weights."""
     import json
