@@ -185,6 +185,13 @@ def _half_error(point: Point) -> Estimate:
 _STUDIES = {"chain": "whole chains", "data": "queries or paths", "fit": "models and sizes"}
 
 
+def chain_name(point: Point) -> str:
+    """Queries × paths, and what sets the fit apart: the words of its series behind the model's name."""
+    name = f"{point.details['queries'] / 1e6:.2g} M × {point.details['spp']:g}"
+    size = point.series.partition(", ")[2]
+    return f"{name}, {size}" if point.study == "fit" and size else name
+
+
 def front_figures(chains: Sequence[Point], folder: Path) -> list[dict[str, Any]]:
     """All chains and the front; only the front's points have names."""
     front = pareto_front(chains)
@@ -194,9 +201,7 @@ def front_figures(chains: Sequence[Point], folder: Path) -> list[dict[str, Any]]
             title,
             [p for p in chains if p.study == study],
             _error,
-            label=lambda p: (
-                f"{p.details['queries'] / 1e6:.2g} M × {p.details['spp']:g}" if id(p) in named else ""
-            ),
+            label=lambda p: chain_name(p) if id(p) in named else "",
             joined=False,
         )
         for study, title in _STUDIES.items()
@@ -208,7 +213,7 @@ def front_figures(chains: Sequence[Point], folder: Path) -> list[dict[str, Any]]
             ERROR_AXIS,
             "front",
             folder,
-            "Names on the front: training queries × paths per query.",
+            "Names on the front: training queries × paths per query, and sizes other than the paper's.",
             front=[(p.seconds.value, p.error.value) for p in front],
         )
     ]

@@ -21,6 +21,7 @@ from mbtf_gen.planning import plan_effects
 from mbtf_gen.queries import Queries
 from mbtf_gen.stats import Estimate
 from mbtf_pipeline.cost.chain_studies import DATA, FIT, GENERATOR, SHORTEST, WHOLE, chains
+from mbtf_pipeline.cost.figures import chain_name
 from mbtf_pipeline.cost.front import marginal_price, pareto_front
 from mbtf_pipeline.cost.generator import Bench
 from mbtf_pipeline.cost.generator_studies import COUNTS, TARGETS, generator_tasks
@@ -369,3 +370,14 @@ def test_other_work_on_the_machine_does_not_change_the_price() -> None:
     found = _typical([*quiet, 9.0])
     assert abs(found.value - 1.0) < 0.02
     assert 0.0 < found.error < 0.02
+
+
+def test_chains_on_the_front_are_told_apart() -> None:
+    five, error = Estimate(5.0, 0.0, 1), Estimate(0.2, 0.01, 9)
+
+    def name(study: str, series: str) -> str:
+        details = {"queries": 1.1e7, "spp": 4.0}
+        return chain_name(Point(study, series, "17.8 s", {}, "", five, error, details=details))
+
+    assert name("fit", "neumip") == name("data", "4 paths/query") == "11 M × 4"
+    assert name("fit", "neumip, 40 wide, 12 channels, z") == "11 M × 4, 40 wide, 12 channels, z"
