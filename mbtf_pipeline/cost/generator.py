@@ -29,6 +29,8 @@ from mbtf_gen.planning import plan_effects
 from mbtf_gen.queries import Queries
 from mbtf_gen.stats import Estimate, mean_estimate
 
+from .points import HALF_WIDTH
+
 # Queries of one piece of the reference, and paths that it and the setting get at each.
 BIAS_QUERIES = 16384
 BIAS_SPP = 64
@@ -36,9 +38,7 @@ _MOST_BIAS_PIECES = 16
 # Paths of one timed piece.
 _PIECE_PATHS = 1 << 19
 _FEWEST_PIECES = 8
-# Half-width of a 95 % interval, relative, at which measuring stops; and the bias below which none is looked
-# for.
-_HALF_WIDTH = 0.1
+# Bias below which none is looked for.
 _NEGLIGIBLE = 0.005
 # Shards, of this many queries, that stand for the study's streams of random numbers.
 _SHARD = 1 << 14
@@ -225,7 +225,7 @@ class Bench:
             a, b = found.value_a.astype(np.float64), found.value_b.astype(np.float64)
             squares.append(((a - reference.a) * (b - reference.b)).mean(axis=1) / mean**2)
             square = mean_estimate(np.concatenate(squares))
-            sure = 1.96 * square.error <= max(2 * _HALF_WIDTH * square.value, _NEGLIGIBLE**2)
+            sure = 1.96 * square.error <= max(2 * HALF_WIDTH * square.value, _NEGLIGIBLE**2)
             late = time.perf_counter() - began > seconds or len(squares) == _MOST_BIAS_PIECES
             if sure or late:
                 return square
@@ -265,7 +265,7 @@ def _typical(prices: list[float]) -> Estimate:
 
 def _sure(variance: Estimate) -> bool:
     """Whether the 95 % interval of a variance's root is as narrow as wanted."""
-    return 1.96 * variance.error <= 2 * _HALF_WIDTH * variance.value or variance.value == 0
+    return 1.96 * variance.error <= 2 * HALF_WIDTH * variance.value or variance.value == 0
 
 
 def _first(queries: Queries, count: int) -> Queries:

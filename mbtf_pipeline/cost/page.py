@@ -22,14 +22,12 @@ from .figures import (
     noise_figures,
 )
 from .front import marginal_price, pareto_front
-from .points import Point
+from .points import HALF_WIDTH, Point
 from .scatter import seed_scatter
 from .study import Study
 from .tables import chain_table, generator_table, to_csv
 
 CSV_NAME, PAGE_NAME = "cost.csv", "cost.html"
-# Half-width of a 95 % interval, relative, that a study aims at.
-HALF_WIDTH = 0.1
 
 Figures = Callable[[Sequence[Point], str, Path], list[dict[str, Any]]]
 Table = Callable[[Sequence[Point]], dict[str, Any]]
