@@ -2,9 +2,9 @@
 
     python benchmarks/budget.py [MATERIAL ...] [--time 5min] [--split 0.2 ...] [--levels 7]
 
-Every chain generates for its share of the time and trains ``neumip`` for the rest, start-up included, and is
-judged by the same test queries. ``--budget`` pays for its own pilots: what they take is missing from its
-chain. By default two of ``assets/``, five minutes (long enough for pilots) and splits of 10 to 70 %.
+Every chain generates for its share of the time and trains ``neumip``, as the qualities have it, for the rest,
+start-up included, and is judged by the same test queries. ``--budget`` pays for its own pilots: what they take
+is missing from its chain. By default two of ``assets/``, five minutes (long enough for pilots) and splits of 10 to 70 %.
 
 The last line is one JSON object: figures, and the bar they are held to: the error under ``--budget`` over the
 least of the grid is at most 1.2, or no more than its error bar allows. Exit code 1 where it is missed.
@@ -20,9 +20,11 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from mbtf_fit.quality import BEST
 from mbtf_gen.durations import parse_duration
 from mbtf_gen.engine import load_mitsuba
 from mbtf_gen.errors import MbtfError
+from mbtf_gen.settings import merge
 from mbtf_pipeline.budget import Split, split_budget, within_budget
 from mbtf_pipeline.cost.chains import Chain, Workshop
 from mbtf_pipeline.recipe import Recipe
@@ -43,6 +45,9 @@ def chain(recipe: Recipe, split: Split) -> Chain:
 
 def measure(material: Path, seconds: float, splits: list[float], levels: int, work: Path) -> dict[str, Any]:
     """Errors of the grid and of ``--budget``."""
+    fit: dict[str, Any] = {"model": "neumip"}
+    for name, value in BEST.items():
+        merge(fit, name.split("."), value)
     recipe = Recipe.model_validate(
         {
             "name": "budget",
@@ -50,7 +55,7 @@ def measure(material: Path, seconds: float, splits: list[float], levels: int, wo
                 "material": str(material),
                 "queries": {"levels": levels, "test": TEST, "test_spp": TEST_SPP},
             },
-            "fit": {"model": "neumip"},
+            "fit": fit,
         }
     )
     found = split_budget(recipe, seconds, work / "run", "", lambda note: print(note, file=sys.stderr))

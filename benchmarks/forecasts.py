@@ -1,11 +1,11 @@
 """Forecasts held against the runs that follow: seconds and error of the generator and of the fitter.
 
-    python benchmarks/forecasts.py [MATERIAL ...] [--queries 200/texel] [--levels 7] [--time 60s ...]
+    python benchmarks/forecasts.py [MATERIAL ...] [--quality draft] [--levels 7] [--time 60s ...]
 
 Of every material (by default the five of ``assets/`` and the six texture sets that lie beside the project,
-by name): what ``mbtf-gen plan`` and ``mbtf-fit --dry-run`` expect, then the run itself, a fit for each
-``--time`` (repeatable). Seconds are those of tracing and of training; errors are the noise of a training
-value and the unexplained variance of held-out queries. Printed too: the `PERSISTENCE` of
+by name): what ``mbtf-gen plan`` and ``mbtf-fit --dry-run`` expect at a quality, then the run itself, a fit
+for each ``--time`` (repeatable). Seconds are those of tracing and of training; errors are the noise of a
+training value and the unexplained variance of held-out queries. Printed too: the `PERSISTENCE` of
 ``mbtf_fit/forecast.py`` that all of these fits together ask for.
 
 The last line is one JSON object: figures, and the bars they are held to: seconds within 30 %, errors within a
@@ -21,35 +21,40 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from quality import HEIGHTS, source
 
+from mbtf_fit.config import FitConfig
 from mbtf_fit.forecast import PERSISTENCE, PILOT_SECONDS, extrapolated
+from mbtf_fit.quality import FITTER
 from mbtf_gen.config import GeneratorConfig
 from mbtf_gen.durations import parse_duration
 from mbtf_gen.engine import load_mitsuba
 from mbtf_gen.errors import MbtfError
+from mbtf_gen.quality import GENERATOR, Quality, as_assignments
+from mbtf_gen.settings import resolve
 
 ASSETS = ("cliff_rock", "insulation_foam", "straight_wool", "turtle_shell", "twisted_wool")
 # Largest factors between forecast and run, either way.
 BARS = {"seconds": 1.3, "error": 1.5}
 
 
-def generated(name: str, queries: str, levels: int, shards: Path) -> dict[str, Any]:
+def generated(name: str, quality: Quality, levels: int, shards: Path) -> dict[str, Any]:
     """Forecast and run of the generator."""
     from mbtf_gen.forecast import forecast
     from mbtf_gen.generation import Job, allocated, generate
     from mbtf_gen.planning import plan_effects
 
     material, height = source(name)
-    config = GeneratorConfig.model_validate(
-        {
-            "material": str(material),
-            "geometry": {"height": height},
-            "queries": {"train": queries, "levels": levels},
-        }
+    config = resolve(
+        GeneratorConfig,
+        assignments=[
+            f"material={json.dumps(str(material))}",
+            *as_assignments(GENERATOR[quality]),
+            *as_assignments({"geometry.height": height, "queries.levels": levels}),
+        ],
     )
     job = Job.prepare(config)
     expected = forecast(job, allocated(job, plan_effects(job)))
@@ -64,16 +69,16 @@ def generated(name: str, queries: str, levels: int, shards: Path) -> dict[str, A
     }
 
 
-def fitted(shards: Path, seconds: str, out: Path) -> dict[str, Any]:
+def fitted(shards: Path, quality: Quality, seconds: str, out: Path) -> dict[str, Any]:
     """Forecast and run of the fitter."""
     from mbtf_fit import fit
-    from mbtf_fit.config import FitConfig
     from mbtf_fit.forecast import forecast_fit
 
-    config = FitConfig.model_validate({"training": {"time": seconds}})
+    options = {**FITTER[quality], "training.time": seconds, "training.steps": None}
+    config = resolve(FitConfig, assignments=as_assignments(options))
     expected = forecast_fit(config, shards)
     # As many steps as are forecast, so that the forecast's rate is what is judged.
-    run = FitConfig.model_validate({"training": {"steps": expected.steps}})
+    run = resolve(FitConfig, assignments=as_assignments({**options, "training.steps": expected.steps}))
     result = fit(run, shards, out)
     reached = result.errors["held_out_queries"]["unexplained"]
     return {
@@ -110,7 +115,7 @@ def best_persistence(fits: list[dict[str, Any]]) -> tuple[float, float]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("materials", nargs="*", help="names of assets or texture sets")
-    parser.add_argument("--queries", default="200/texel")
+    parser.add_argument("--quality", default="draft", choices=get_args(Quality))
     parser.add_argument("--levels", type=int, default=7, help="finest level: 2^levels texels")
     parser.add_argument("--time", action="append", help="training (repeatable); default: 60s")
     arguments = parser.parse_args()
@@ -124,10 +129,10 @@ def main() -> int:
                 continue
             with tempfile.TemporaryDirectory() as work:
                 shards = Path(work) / "shards"
-                parts = {"generator": generated(name, arguments.queries, arguments.levels, shards)}
+                parts = {"generator": generated(name, arguments.quality, arguments.levels, shards)}
                 for seconds in arguments.time or ["60s"]:
                     label = f"fitter {parse_duration(seconds):g} s"
-                    parts[label] = fitted(shards, seconds, Path(work) / seconds)
+                    parts[label] = fitted(shards, arguments.quality, seconds, Path(work) / seconds)
                     if len(parts[label]["pilots"]) == 2 and min(*parts[label]["pilots"]) > 0:
                         fits.append(parts[label])
             for part, found in parts.items():

@@ -186,7 +186,7 @@ def paper(chains: list[Chain], levels: int) -> tuple[Chain | None, str]:
         f"q = {PERSISTENCE:g} of what the one before gained: "
         "E_paper = E_standard · (E_high / E_standard)^((1 − q^p) / (1 − q^h)), where training takes 2^h "
         "and 2^p times as long in `high` and `paper` as in `standard`. That `paper` has fewer, cleaner "
-        "queries and `high` a wider network is left out of account"
+        "queries is left out of account"
     )
     known = {(c.material, c.quality): c for c in chains}
     found = [c for c in chains if c.quality == "high" and (c.material, "standard") in known]

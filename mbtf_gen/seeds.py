@@ -28,6 +28,7 @@ class Purpose(IntEnum):
     QUERIES = 1
     FOOTPRINT = 2
     PATH = 3
+    CHOICE = 4
 
 
 def stream_number(split: str, shard: int, purpose: Purpose, pass_index: int = 0, half: int = 0) -> int:

@@ -14,6 +14,8 @@ from pathlib import Path
 
 from PIL import Image, ImageDraw, ImageFont
 
+from mbtf_pipeline.cost.chain_studies import QUALITIES
+
 HERE = Path(__file__).parent
 PAGE = HERE.parent / "cost.md"
 OUT = HERE / "cost"
@@ -92,7 +94,7 @@ def table(studies: list[Path]) -> str:
                 f"| {float(r['total_seconds']):.0f} s | {float(r['generation_seconds']):.1f} s "
                 f"| {float(r['training_seconds']):.1f} s "
                 f"| {float(r['queries']) / 1e6:.2g} M × {float(r['spp']):g} "
-                f"| {r['series'] if r['study'] == 'fit' else 'neumip'} "
+                f"| {r['series'] if r['study'] == 'fit' else QUALITIES} "
                 f"| {float(r['error']):.3f} ± {float(r['error_se']):.3f} |"
             )
         command = front[-1]["command"].replace(str(folder), f"out/cost/{folder.name}")

@@ -134,7 +134,9 @@ def signal_variance(a: ArrayLike, b: ArrayLike) -> Estimate:
     return Estimate(spread.value + correction, spread.error, spread.n)
 
 
-def unexplained_variance(prediction: ArrayLike, a: ArrayLike, b: ArrayLike) -> Estimate:
+def unexplained_variance(
+    prediction: ArrayLike, a: ArrayLike, b: ArrayLike, weights: ArrayLike | None = None
+) -> Estimate:
     """Share of the true values' variance that a prediction misses: noise-free MSE ÷ signal variance.
 
     0 is perfect, 1 no better than the mean value, more is possible. Numerator and denominator are unbiased;
@@ -142,33 +144,65 @@ def unexplained_variance(prediction: ArrayLike, a: ArrayLike, b: ArrayLike) -> E
     of ``x_q - R y_q`` over units, in which the correlation of both is accounted for. Where the signal
     variance is not even twice its own error the ratio has no meaning: the value is NaN and the error
     infinite.
+
+    Parameters
+    ----------
+    prediction, a, b : equal shapes
+    weights : (n,) of the units, above 0: one over the probability with which each was taken, where they were
+        not taken all alike. Sums over units then stand for those over all that might have been taken
+        (Horvitz & Thompson 1952); only their ratios matter
+
+    Raises
+    ------
+    InputError : a number is NaN or infinite
+    ValueError : shapes differ, or a weight is not above 0
     """
     p, first, second = _with_prediction(prediction, a, b)
-    products, correction = _centred_products(first, second)
-    return _ratio(per_unit((p - first) * (p - second)), products + correction)
+    w = _weights(weights, len(first))
+    products, correction = _centred_products(first, second, w)
+    return _ratio(per_unit((p - first) * (p - second)), products + correction, w)
 
 
-def _centred_products(a: NDArray[np.float64], b: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Per unit ``(a-ā)(b-b̄)`` (n,), and what must be added to its mean to make it unbiased."""
+def _weights(weights: ArrayLike | None, n: int) -> NDArray[np.float64]:
+    """Weights (n,) of mean 1."""
+    if weights is None:
+        return np.ones(n)
+    w = checked(weights, "weights")
+    if w.shape != (n,) or not np.all(w > 0):
+        raise ValueError(f"weights must be {n} numbers above 0, one for each unit")
+    return w / w.mean()
+
+
+def _centred_products(
+    a: NDArray[np.float64], b: NDArray[np.float64], w: NDArray[np.float64] | None = None
+) -> tuple[NDArray[np.float64], float]:
+    """Per unit ``(a-ā)(b-b̄)`` (n,), and what must be added to its mean to make it unbiased (for weights of 1,
+    the mean of `w`)."""
     n = len(a)
     channels = a.shape[-1] if a.ndim > 1 else 1
     x, y = a.reshape(n, -1, channels), b.reshape(n, -1, channels)
     # Constant data must come out as exactly zero, without the rounding of their mean.
     x, y = x - x[0, 0], y - y[0, 0]
-    x, y = x - x.mean(axis=(0, 1)), y - y.mean(axis=(0, 1))
-    between = float((x.mean(axis=1) * y.mean(axis=1)).sum(axis=0).mean())
+    x, y = (v - np.average(v.mean(axis=1), axis=0, weights=w) for v in (x, y))
+    squares = 1.0 if w is None else w[:, None] ** 2
+    between = float((squares * x.mean(axis=1) * y.mean(axis=1)).sum(axis=0).mean())
     return per_unit(x * y), between / (n * (n - 1)) if n > 1 else 0.0
 
 
-def _ratio(numerator: NDArray[np.float64], denominator: NDArray[np.float64]) -> Estimate:
-    """Ratio of the means of two correlated per-unit arrays (n,), with the delta method's error."""
+def _ratio(
+    numerator: NDArray[np.float64], denominator: NDArray[np.float64], w: NDArray[np.float64] | None = None
+) -> Estimate:
+    """Ratio of the weighted means of two correlated per-unit arrays (n,), with the delta method's error."""
     n = len(numerator)
-    below = mean_estimate(denominator)
-    if n < 2 or below.value <= 2.0 * below.error:
+    w = np.ones(n) if w is None else w
+    below = float((w * denominator).mean())
+    # Of a ratio of weighted sums: that of the residuals, whose weighted mean is zero.
+    scale = 1.0 / math.sqrt(n * (n - 1)) if n > 1 else math.inf
+    if n < 2 or below <= 2.0 * scale * float(np.linalg.norm(w * (denominator - below))):
         return Estimate(math.nan, math.inf, n)
-    ratio = float(numerator.mean()) / below.value
+    ratio = float((w * numerator).mean()) / below
     residual = numerator - ratio * denominator
-    return Estimate(ratio, float(residual.std(ddof=1)) / math.sqrt(n) / below.value, n)
+    return Estimate(ratio, scale * float(np.linalg.norm(w * residual)) / below, n)
 
 
 def _root(estimate: Estimate) -> Estimate:

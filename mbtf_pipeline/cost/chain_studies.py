@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
+from mbtf_fit.quality import BEST
+from mbtf_gen.settings import merge
+
 from .chains import Chain
 
-# Shares of the budget; the generator's own studies take GENERATOR, what is left over is for starting up.
-GENERATOR, DATA, FIT, WHOLE = 0.2, 0.18, 0.2296, 0.35
+# Shares of the budget; the generator's own studies take GENERATOR, what is left over is for starting up and
+# judging.
+GENERATOR, DATA, FIT, WHOLE = 0.2, 0.15, 0.2, 0.3
 # The shortest whole chain, seconds, the share of every chain that generates, and other shares that are tried.
 SHORTEST = 60.0
 SHARE = 0.35
@@ -17,8 +21,11 @@ SEEDS = (1, 2, 3)
 PATHS = (2, 4, 16, 64)
 # Path budgets at which they are compared, of the largest.
 PATH_SHARES = (0.4, 1.6)
+# What fits with the options of the qualities are called; chains are made of these.
+QUALITIES = "neumip of the qualities"
+# Models as their papers have them, and networks of other sizes; the last is that of the qualities without
+# their smoothing.
 MODELS = ("neumip", "neumip-baseline")
-# Networks of other sizes than the paper's; the last is that of quality `high`.
 SIZES: dict[str, dict[str, object]] = {
     "16 wide": {"width": 16},
     "40 wide": {"width": 40},
@@ -38,8 +45,17 @@ def _queries(seconds: float, spp: int, price: Price) -> int:
 
 
 def _fit(model: str, seconds: float, network: dict[str, object] | None = None) -> dict[str, object]:
+    """Options of a fit with a model as its paper has it, but for what `network` says."""
     options = {} if network is None else {"network": network}
     return {"model": model, "training": {"time": f"{seconds:.3g}s"}, **options}
+
+
+def _best(seconds: float) -> dict[str, object]:
+    """Options of a fit as the qualities have it."""
+    options: dict[str, object] = {"model": "neumip"}
+    for name, value in {**BEST, "training.time": f"{seconds:.3g}s"}.items():
+        merge(options, name.split("."), value)
+    return options
 
 
 def chains(budget: float, spp: int, price: Price) -> Iterator[Chain]:
@@ -58,7 +74,7 @@ def chains(budget: float, spp: int, price: Price) -> Iterator[Chain]:
         for share in PATH_SHARES:
             queries = max(_FEWEST_QUERIES, int(share * paths) // n)
             name = f"{queries * n / 1e6:.3g} M paths"
-            yield Chain("data", f"{n} paths/query", name, queries, n, _fit("neumip", 2 * each / 3))
+            yield Chain("data", f"{n} paths/query", name, queries, n, _best(2 * each / 3))
     yield from _fits(FIT * budget, spp, price)
 
 
@@ -77,7 +93,7 @@ def _whole(budget: float, spp: int, price: Price) -> Iterator[Chain]:
                 spent += total
     for total, share in wanted:
         queries = _queries(share * total, spp, price)
-        fit = _fit("neumip", (1 - share) * total)
+        fit = _best((1 - share) * total)
         yield Chain(
             "chain", f"{share:.0%} of the time generating", f"planned for {total:g} s", queries, spp, fit
         )
@@ -85,19 +101,20 @@ def _whole(budget: float, spp: int, price: Price) -> Iterator[Chain]:
 
 def _fits(budget: float, spp: int, price: Price) -> Iterator[Chain]:
     """Models and sizes over training time, on one data set."""
-    unit = budget / 15.5
+    unit = budget / 18.5
     queries = _queries(1.5 * unit, spp, price)
 
     def chain(study: str, series: str, name: str, fit: dict[str, object]) -> Chain:
         return Chain(study, series, name, queries, spp, fit)
 
     shortest = 0.5 * unit
-    yield chain("fit", MODELS[0], f"{shortest:.3g} s", _fit(MODELS[0], shortest))
+    yield chain("fit", QUALITIES, f"{shortest:.3g} s", _best(shortest))
     # Bars of all chains rest on these.
     for seed in SEEDS:
-        yield chain("seeds", MODELS[0], f"seed {seed}", {**_fit(MODELS[0], shortest), "seed": seed})
-    for model in MODELS:
-        for seconds in (unit, 2 * unit):
+        yield chain("seeds", QUALITIES, f"seed {seed}", {**_best(shortest), "seed": seed})
+    for seconds in (unit, 2 * unit):
+        yield chain("fit", QUALITIES, f"{seconds:.3g} s", _best(seconds))
+        for model in MODELS:
             yield chain("fit", model, f"{seconds:.3g} s", _fit(model, seconds))
     for size, network in SIZES.items():
         yield chain("fit", f"neumip, {size}", f"{2 * unit:.3g} s", _fit("neumip", 2 * unit, network))

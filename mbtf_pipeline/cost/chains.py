@@ -1,7 +1,7 @@
 """Whole chains: data of a size, a fit of a length, and the error that is left on test queries.
 
-Every chain is measured on the same test queries, which no training sees. Its parts are the generator and the
-fitter themselves, called as the programs call them; nothing is simulated or extrapolated.
+Every chain is measured on the same test queries (:mod:`.judges`), which no training sees. Its parts are the
+generator and the fitter themselves, called as the programs call them; nothing is simulated or extrapolated.
 """
 
 from __future__ import annotations
@@ -12,17 +12,22 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mbtf_gen.config import GeneratorConfig
+from mbtf_gen.config import GeneratorConfig, count_queries
 from mbtf_gen.durations import parse_duration
-from mbtf_gen.stats import Estimate, unexplained_variance
+from mbtf_gen.generation import Job, generate
+from mbtf_gen.material import load_material
+from mbtf_gen.stats import Estimate
 
 from ..stages import hash_of
+from .generator import Bench
 from .points import Point
+
+if TYPE_CHECKING:
+    from .judges import Judges
 
 # A picture of 1080p with one query per pixel.
 PIXELS = 1920 * 1080
@@ -89,26 +94,24 @@ class Workshop:
         self.command = command
         self.progress = progress
         self._made: dict[str, _Data] = {}
-        self._test: Any = None
+        self._judges: Judges | None = None
 
     def clear(self) -> None:
         """Remove data and fits; points hold what was measured on them."""
         shutil.rmtree(self.folder, ignore_errors=True)
 
-    def _generate(self, queries: str, spp: int, test: str, test_spp: int, name: str) -> _Data:
+    def _generate(self, queries: str, spp: int) -> _Data:
         """A data set, made anew: what an interrupted study left behind was not timed."""
-        from mbtf_gen.generation import generate
-
         data = self.config.model_dump(mode="json")
         data["queries"] |= {
             "train": queries,
             "spp": spp,
-            "test": test,
-            "test_spp": test_spp,
+            "test": _FEWEST,
+            "test_spp": 2,
             "layout": "shuffled",
         }
         config = GeneratorConfig.model_validate(data)
-        folder = self.folder / f"{name}-{hash_of(data)[:12]}"
+        folder = self.folder / f"data-{hash_of(data)[:12]}"
         shutil.rmtree(folder, ignore_errors=True)
         start = time.perf_counter()
         generate(config, folder)
@@ -119,7 +122,7 @@ class Workshop:
         key = f"{queries}-{spp}"
         if key not in self._made:
             self.progress(f"{queries / 1e6:.2f} M queries of {spp} paths")
-            self._made[key] = self._generate(str(queries), spp, _FEWEST, 2, "data")
+            self._made[key] = self._generate(str(queries), spp)
         return self._made[key]
 
     def has(self, chain: Chain) -> bool:
@@ -132,23 +135,24 @@ class Workshop:
         if made is not None:
             shutil.rmtree(made.folder, ignore_errors=True)
 
-    def test(self) -> Any:
-        """The test queries that all chains are judged by."""
-        if self._test is None:
-            from mbtf_fit.data import load_split
-            from mbtf_gen.dataset import Dataset
+    def judges(self) -> Judges:
+        """The test queries that all chains are judged by, as many paths as the configuration's test split."""
+        if self._judges is None:
+            from .judges import draw_judges
 
-            queries = self.config.queries
             self.progress("test queries")
-            made = self._generate(_FEWEST, 2, queries.test, queries.test_spp, "test")
-            self._test = load_split(Dataset.open(made.folder), "test")
-        return self._test
+            config = self.config
+            material = load_material(Path(config.material), config.geometry.tile)
+            texels = Job.of(config, material).lattice.texels()
+            paths = count_queries(config.queries.test, texels) * config.queries.test_spp
+            self._judges = draw_judges(Bench(config, material, config.seed), paths)
+        return self._judges
 
     def measure(self, chain: Chain) -> Point:
         """Make the data, fit, and judge."""
         from mbtf_fit import FitConfig, fit
 
-        test = self.test()
+        judges = self.judges()
         data = self.data(chain.queries, chain.spp)
         self.progress(f"{chain.study}: {chain.series}, {chain.name}")
         config = FitConfig.model_validate({"seed": self.config.seed, **chain.fit})
@@ -156,8 +160,8 @@ class Workshop:
         shutil.rmtree(out, ignore_errors=True)
         result = fit(config, data.folder, out)
         material = result.material
-        error = _missed(material.predict(test), test)
-        half = _missed(_half(material).predict(test), test)
+        error = judges.unexplained(material.predict(judges.queries))
+        half = judges.unexplained(_half(material).predict(judges.queries))
         size = sum(p.stat().st_size for p in out.glob("weights*"))
         numbers = sum(p.numel() for p in material.model.parameters())
         details = {
@@ -166,7 +170,7 @@ class Workshop:
             "generation_seconds": data.seconds,
             "training_seconds": result.seconds,
             "total_seconds": data.seconds + result.total_seconds,
-            "evaluation_ms_1080p": 1e3 * _evaluation_seconds(material, test),
+            "evaluation_ms_1080p": 1e3 * _evaluation_seconds(material, judges.queries),
             "bytes": float(size),
             "half_bytes": float(size - 2 * numbers),
             "half_error": half.value,
@@ -204,10 +208,6 @@ def _flat(options: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     for name, value in options.items():
         out |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
     return out
-
-
-def _missed(prediction: NDArray[np.float32], test: Any) -> Estimate:
-    return unexplained_variance(prediction, test.value_a, test.value_b)
 
 
 def _half(material: Any) -> Any:

@@ -11,6 +11,7 @@ from typing import Any
 from mbtf_gen.stats import Estimate
 
 from ..plots import Cloud, scatter
+from .chain_studies import QUALITIES
 from .front import pareto_front
 from .points import Point
 
@@ -186,10 +187,11 @@ _STUDIES = {"chain": "whole chains", "data": "queries or paths", "fit": "models 
 
 
 def chain_name(point: Point) -> str:
-    """Queries × paths, and what sets the fit apart: the words of its series behind the model's name."""
+    """Queries × paths, and what sets the fit apart from that of the qualities."""
     name = f"{point.details['queries'] / 1e6:.2g} M × {point.details['spp']:g}"
-    size = point.series.partition(", ")[2]
-    return f"{name}, {size}" if point.study == "fit" and size else name
+    if point.study != "fit" or point.series == QUALITIES:
+        return name
+    return f"{name}, {point.series.partition(', ')[2] or f'{point.series} of its paper'}"
 
 
 def front_figures(chains: Sequence[Point], folder: Path) -> list[dict[str, Any]]:
@@ -213,7 +215,7 @@ def front_figures(chains: Sequence[Point], folder: Path) -> list[dict[str, Any]]
             ERROR_AXIS,
             "front",
             folder,
-            "Names on the front: training queries × paths per query, and sizes other than the paper's.",
+            "Names on the front: training queries × paths per query, and fits unlike those of the qualities.",
             front=[(p.seconds.value, p.error.value) for p in front],
         )
     ]

@@ -41,7 +41,7 @@ _FEWEST_PIECES = 8
 # Bias below which none is looked for.
 _NEGLIGIBLE = 0.005
 # Shards, of this many queries, that stand for the study's streams of random numbers.
-_SHARD = 1 << 14
+SHARD = 1 << 14
 _FIRST_REFERENCE = 5_001
 _FIRST_PIECE = 10_001
 # Queries that tell how many paths adaptive counts take, and the fewest of a piece.
@@ -110,7 +110,7 @@ class Bench:
         fixed = {
             "queries.levels": levels,
             "queries.layout": "shuffled",
-            "output.shard_queries": _SHARD,
+            "output.shard_queries": SHARD,
         }
         for name, value in {**fixed, **changes}.items():
             section, _, key = name.rpartition(".")

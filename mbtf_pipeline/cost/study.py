@@ -9,10 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_gen.atomic import read_json, write_json, write_text
-from mbtf_gen.config import GeneratorConfig, count_queries
 from mbtf_gen.errors import InputError
-from mbtf_gen.generation import Job
-from mbtf_gen.material import Material, load_material
+from mbtf_gen.material import load_material
 from mbtf_gen.settings import dump_yaml
 
 from ..recipe import Recipe
@@ -33,9 +31,6 @@ WORK = ".work"
 _RESERVED = 0.7
 # Settings that the generator's share of the budget is divided among.
 _SETTINGS = 42
-# Paths of a test query of whole chains: the recipe's paths go to more queries. Halves need no more, for
-# errors are free of noise; what limits them is how they vary over queries.
-_TEST_PATHS, _MOST_TEST_QUERIES = 16, 1 << 18
 
 Tell = Callable[[float, str], None]
 
@@ -143,21 +138,9 @@ def run_study(
             _keep(study, point, task, task.command(generator))
         price = _price(study.points)
         if price is not None:
-            judged = _tested(config, material)
-            work = Workshop(judged, folder / WORK, generator, note)
+            work = Workshop(config, folder / WORK, generator, note)
             _measure_chains(study, store, work, budget, price, left)
     return replace(study, points=with_scatter(study.points))
-
-
-def _tested(config: GeneratorConfig, material: Material) -> GeneratorConfig:
-    """The configuration with the paths of its test split divided among more queries, up to a number that is
-    made in seconds."""
-    queries = config.queries
-    spp = min(queries.test_spp, _TEST_PATHS)
-    count = count_queries(queries.test, Job.of(config, material).lattice.texels()) * queries.test_spp // spp
-    test = str(min(count, _MOST_TEST_QUERIES))
-    changed = queries.model_copy(update={"test": test, "test_spp": spp})
-    return config.model_copy(update={"queries": changed})
 
 
 def _keep(study: Study, point: Point | None, task: GeneratorTask | Chain, command: str) -> None:

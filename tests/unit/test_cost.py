@@ -20,7 +20,7 @@ from mbtf_gen.material import Material
 from mbtf_gen.planning import plan_effects
 from mbtf_gen.queries import Queries
 from mbtf_gen.stats import Estimate
-from mbtf_pipeline.cost.chain_studies import DATA, FIT, GENERATOR, SHORTEST, WHOLE, chains
+from mbtf_pipeline.cost.chain_studies import DATA, FIT, GENERATOR, QUALITIES, SHORTEST, WHOLE, chains
 from mbtf_pipeline.cost.figures import chain_name
 from mbtf_pipeline.cost.front import marginal_price, pareto_front
 from mbtf_pipeline.cost.generator import Bench
@@ -119,6 +119,43 @@ def test_seeds_change_the_measurement_and_nothing_else_does(bench: Bench) -> Non
     assert noise[0] == noise[1]
     assert noise[0].value != noise[2].value
     assert abs(noise[0].value - noise[2].value) < 4 * math.hypot(noise[0].error, noise[2].error)
+
+
+def test_judges_stand_for_all_queries(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One query in a thousand is thirty times as bright: it is among the judges, and weighs one."""
+    from mbtf_pipeline.cost.judges import draw_judges
+
+    bright, glow = 0.001, 30.0
+
+    def lit(self: Fake, queries: Queries, spp: int, stream: Stream) -> Estimates:
+        rng = np.random.default_rng([stream.root, stream.shard, spp])
+        truth = np.where(queries.u[:, :1] < bright, glow, 1.0)
+        halves = [(truth * rng.gamma(spp, 1 / spp, (len(truth), 3))).astype(np.float32) for _ in range(2)]
+        return Estimates(*halves, None, spp * len(truth), 0, 0, 0)
+
+    monkeypatch.setattr(Fake, "estimate", lit)
+    monkeypatch.setattr("mbtf_pipeline.cost.judges.plan_effects", lambda job: None)
+    judges = draw_judges(bench, 200_000)
+    q, w = judges.queries, judges.weights
+    candidates, taken = 400_000, 200_000 // 16
+    assert 0.5 * taken < len(q) < taken
+    assert abs(w.sum() / candidates - 1) < 4 * math.sqrt(taken) / taken
+    hit = q.u[:, 0] < bright
+    # Half of what is taken by brightness is bright, and none of it stands for many.
+    assert abs(w[hit].sum() / (bright * candidates) - 1) < 0.25
+    assert hit.sum() > 0.6 * bright * candidates
+    # A fit that knows nothing of the bright ones misses all of the variance, one that knows them nothing.
+    none = np.ones((len(q), 3), np.float32)
+    variance = bright * (1 - bright) * (glow - 1) ** 2
+    missed = judges.unexplained(none)
+    truth = bright * (glow - 1) ** 2 / variance
+    assert abs(missed.value - truth) < 4 * missed.error
+    assert missed.error < 0.1
+    # Those that were not looked at brightly are judged as well.
+    dim = none + np.where(hit, glow - 1, 0.5)[:, None].astype(np.float32)
+    assert judges.unexplained(dim).value == pytest.approx(0.25 / variance, rel=0.15)
+    other = draw_judges(Bench(bench.config, bench.material, 1), 20_000)
+    assert not np.array_equal(other.queries.u[:100], q.u[:100])
 
 
 def test_every_setting_is_one_that_the_generator_takes(bench: Bench) -> None:
@@ -239,7 +276,7 @@ def test_chains_fit_into_their_budget(budget: float) -> None:
     assert totals == [2**n for n in range(len(totals))]
     assert sum(totals) <= WHOLE * budget / SHORTEST < sum(totals) + 2 * totals[-1]
     # Fits of other seeds are of a setting that was measured, on its data.
-    (like,) = (c for c in found if c.study == "fit" and c.name == f"{0.5 * FIT * budget / 15.5:.3g} s")
+    like = next(c for c in found if c.study == "fit")
     others = [c for c in found if c.study == "seeds"]
     assert all(c.fit == {**like.fit, "seed": c.fit["seed"]} for c in others)
     assert all((c.queries, c.spp) == (like.queries, like.spp) for c in others)
@@ -379,5 +416,6 @@ def test_chains_on_the_front_are_told_apart() -> None:
         details = {"queries": 1.1e7, "spp": 4.0}
         return chain_name(Point(study, series, "17.8 s", {}, "", five, error, details=details))
 
-    assert name("fit", "neumip") == name("data", "4 paths/query") == "11 M × 4"
+    assert name("fit", QUALITIES) == name("data", "4 paths/query") == "11 M × 4"
+    assert name("fit", "neumip") == "11 M × 4, neumip of its paper"
     assert name("fit", "neumip, 40 wide, 12 channels, z") == "11 M × 4, 40 wide, 12 channels, z"

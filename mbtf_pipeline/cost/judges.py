@@ -1,0 +1,100 @@
+"""The test queries that whole chains are judged by: more of them where values are bright.
+
+Squared errors, and the variance that they are divided by, are ruled by few queries: under a light of 1° a
+glossy relief answers one fine footprint in ten thousand with a hundred times the mean value. Half a million
+queries alike then leave bars of 10 % and more. So many more candidates are drawn as a test split has them,
+each is looked at with one path per half, and queries are taken from them with a probability that is half
+alike and half in proportion to the square of what was seen. Weights of one over that probability undo the
+choice without bias, whatever was seen; the paths that were looked at are not used again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbtf_fit.data import Queries as FitQueries
+from mbtf_gen.estimates import Stream
+from mbtf_gen.planning import plan_effects
+from mbtf_gen.queries import Queries
+from mbtf_gen.seeds import Purpose, numpy_generator
+from mbtf_gen.stats import Estimate, unexplained_variance
+
+from .generator import SHARD, Bench
+
+# Shards that stand for the streams of candidates; the paths of those taken come so many shards later.
+_FIRST_CANDIDATES, _PASS_ON = 20_001, 10_000
+# Candidates of one piece, and paths that each is looked at with, one in each half.
+_PIECE = 1 << 19
+_LOOK = 2
+# Paths of a query that is taken, and the most queries and candidates: what is made in seconds.
+_SPP = 16
+_MOST, _MOST_CANDIDATES = 1 << 17, 1 << 23
+# Probability that does not depend on what was seen, as a share of the mean one.
+_ALIKE = 0.5
+
+
+@dataclass(frozen=True)
+class Judges:
+    """Test queries, and for how many each stands.
+
+    Attributes
+    ----------
+    queries : n queries with both halves of their values
+    weights : (n,) one over the probability with which each was taken
+    """
+
+    queries: FitQueries
+    weights: NDArray[np.float64]
+
+    def unexplained(self, prediction: NDArray[np.float32]) -> Estimate:
+        """Unexplained variance of values (n, 3), over queries as a test split has them."""
+        return unexplained_variance(prediction, self.queries.value_a, self.queries.value_b, self.weights)
+
+
+def draw_judges(bench: Bench, paths: int) -> Judges:
+    """Judges of a bench's material and configuration.
+
+    Parameters
+    ----------
+    paths : of all that are taken, 16 each, at most; twice as many candidates are looked at. Halves need no
+        more, for errors are free of noise; what limits them is how they vary over queries
+    """
+    job = bench.job({})
+    spp = max(_LOOK, min(_SPP, paths // 2 * 2))
+    count = min(paths // spp, _MOST)
+    candidates = min(2 * paths, _MOST_CANDIDATES)
+    estimator = job.estimator(plan_effects(job))
+    sizes = [min(_PIECE, candidates - start) for start in range(0, candidates, _PIECE)]
+    # A piece spans several of the bench's shards.
+    shards = [_FIRST_CANDIDATES + -(-start // SHARD) for start in range(0, candidates, _PIECE)]
+    seen = []
+    for shard, size in zip(shards, sizes, strict=True):
+        found = estimator.estimate(bench.queries(job, shard, size), _LOOK, Stream(bench.seed, "test", shard))
+        values = 0.5 * (found.value_a.astype(np.float64) + found.value_b)
+        seen.append((values**2).mean(axis=1))
+    chances = np.split(_chances(np.concatenate(seen), count), np.cumsum(sizes)[:-1])
+    parts, weights = [], []
+    for shard, size, chance in zip(shards, sizes, chances, strict=True):
+        choice = numpy_generator(bench.seed, "test", shard, Purpose.CHOICE)
+        rows = np.flatnonzero(choice.random(size) < chance)
+        if len(rows) == 0:
+            continue
+        drawn = bench.queries(job, shard, size)
+        taken = Queries(drawn.u[rows], drawn.sigma[rows], drawn.omega_i[rows], drawn.omega_o[rows])
+        found = estimator.estimate(taken, spp, Stream(bench.seed, "test", _PASS_ON + shard))
+        halves = found.value_a, found.value_b
+        parts.append(FitQueries(taken.u, taken.sigma, taken.omega_i, taken.omega_o, *halves))
+        weights.append(1.0 / chance[rows])
+    return Judges(FitQueries.join(parts), np.concatenate(weights))
+
+
+def _chances(squares: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """Probability (n,) of each candidate to be taken, from the squares of what was seen of it."""
+    n = len(squares)
+    mean = float(squares.mean())
+    bright = squares / mean if mean > 0 else np.ones(n)
+    chances: NDArray[np.float64] = np.minimum(1.0, count / n * (_ALIKE + (1.0 - _ALIKE) * bright))
+    return chances
