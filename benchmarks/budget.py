@@ -3,8 +3,9 @@
     python benchmarks/budget.py [MATERIAL ...] [--time 5min] [--split 0.2 ...] [--levels 7]
 
 Every chain generates for its share of the time and trains ``neumip``, as the qualities have it, for the rest,
-start-up included, and is judged by the same test queries. ``--budget`` pays for its own pilots: what they take
-is missing from its chain. By default two of ``assets/``, five minutes (long enough for pilots) and splits of 10 to 70 %.
+start-up included, and is judged by the same test queries. ``--budget`` pays for its own pilots: what they
+take is missing from its chain. By default two of ``assets/``, five minutes (long enough for pilots) and
+splits of 10 to 70 %.
 
 The last line is one JSON object: figures, and the bar they are held to: the error under ``--budget`` over the
 least of the grid is at most 1.2, or no more than its error bar allows. Exit code 1 where it is missed.
