@@ -28,7 +28,7 @@ from quality import HEIGHTS, source
 
 from mbtf_fit.config import FitConfig
 from mbtf_fit.forecast import PERSISTENCE, PILOT_SECONDS, extrapolated
-from mbtf_fit.quality import FITTER
+from mbtf_fit.quality import BEST, FITTER
 from mbtf_gen.config import GeneratorConfig
 from mbtf_gen.durations import parse_duration
 from mbtf_gen.engine import load_mitsuba
@@ -74,7 +74,7 @@ def fitted(shards: Path, quality: Quality, seconds: str, out: Path) -> dict[str,
     from mbtf_fit import fit
     from mbtf_fit.forecast import forecast_fit
 
-    options = {**FITTER[quality], "training.time": seconds, "training.steps": None}
+    options = {**BEST, **FITTER[quality], "training.time": seconds, "training.steps": None}
     config = resolve(FitConfig, assignments=as_assignments(options))
     expected = forecast_fit(config, shards)
     # As many steps as are forecast, so that the forecast's rate is what is judged.

@@ -39,6 +39,7 @@ from mbtf_gen.quality import GENERATOR, Quality, as_assignments
 from mbtf_gen.quality_measured import FORMAT, STORED, Chain, markdown_table, read_expected
 from mbtf_gen.settings import resolve
 from mbtf_pipeline.fit_records import read_training
+from mbtf_pipeline.quality import settings_hash
 from mbtf_pipeline.run_folder import machine
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -84,7 +85,7 @@ def folder_bytes(folder: Path) -> int:
     return sum(p.stat().st_size for p in folder.rglob("*") if p.is_file())
 
 
-def run(name: str, quality: str, levels: int, work: Path) -> Chain:
+def run(name: str, quality: Quality, levels: int, work: Path) -> Chain:
     """One chain, timed from outside; what an interrupted one left in `work` was not, and is removed.
 
     Raises
@@ -124,6 +125,7 @@ def run(name: str, quality: str, levels: int, work: Path) -> Chain:
         folder_bytes(out / "shards"),
         sum(p.stat().st_size for p in fit.glob("weights*")),
         round(read_training(fit).samples_per_second),
+        settings_hash(quality),
     )
     shutil.rmtree(work)
     return found
@@ -160,7 +162,11 @@ def kept(folder: Path, levels: int) -> list[Chain]:
     """Chains that were measured at these levels, in the order of the table."""
     found = []
     for path in folder.glob(f"*-{levels}.json"):
-        found.append(Chain(**json.loads(path.read_text(encoding="utf-8"))))
+        chain = Chain(**json.loads(path.read_text(encoding="utf-8")))
+        if chain.settings == settings_hash(chain.quality):  # type: ignore[arg-type]
+            found.append(chain)
+        else:
+            print(f"{path}: left out, measured with other settings; remove it", file=sys.stderr)
     return sorted(found, key=lambda c: (QUALITIES.index(c.quality), c.material))
 
 
@@ -219,6 +225,7 @@ def paper(chains: list[Chain], levels: int) -> tuple[Chain | None, str]:
             round(high.data_bytes * queries["paper"] / queries["high"]),
             standard.material_bytes,
             standard.queries_per_second,
+            settings_hash("paper"),
         ),
         law,
     )

@@ -5,8 +5,8 @@
 
 For every material (by default three of ``assets/``), budget of paths and number of paths per query a data set
 is made, a ``neumip`` trained on it for the same number of steps, and judged by test queries that all share.
-No figure depends on the machine's speed. At 64² texels the default budgets are those of the qualities
-``draft`` and ``standard``. Prints the unexplained variance, and for each budget the number of paths per query
+No figure depends on the machine's speed. At 64² texels the larger of the default budgets is that of the
+quality ``draft``. Prints the unexplained variance, and for each budget the number of paths per query
 that left least. ``--keep`` writes every point to a file as soon as it is measured, and takes over those that
 stand there already, so that a run may be interrupted.
 
@@ -27,6 +27,7 @@ from typing import Any
 from mbtf_gen.config import GeneratorConfig
 from mbtf_gen.errors import MbtfError
 from mbtf_pipeline.cost.chains import Chain, Workshop
+from mbtf_pipeline.cost.points import POINT_SCHEMA
 from mbtf_pipeline.plots import Cloud, scatter
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -34,7 +35,7 @@ ASSETS = ("cliff_rock", "straight_wool", "turtle_shell")
 SPP = (2, 4, 8, 16, 64, 256)
 PATHS = (1.6e6, 6.4e6)
 # What makes a point another one.
-KEY = ("material", "height", "levels", "steps", "paths", "spp")
+KEY = ("material", "height", "levels", "steps", "paths", "spp", "schema")
 
 
 class Kept:
@@ -47,7 +48,7 @@ class Kept:
 
     @staticmethod
     def _key(row: dict[str, Any]) -> tuple[Any, ...]:
-        return tuple(row[name] for name in KEY)
+        return tuple(row.get(name) for name in KEY)
 
     def find(self, row: dict[str, Any]) -> dict[str, Any] | None:
         """The point of a key, if it was measured before."""
@@ -86,7 +87,8 @@ def measure(
         )
         for budget in budgets:
             for spp in spps:
-                key = dict(zip(KEY, (material.name, height, levels, steps, int(budget), spp), strict=True))
+                values = (material.name, height, levels, steps, int(budget), spp, POINT_SCHEMA)
+                key = dict(zip(KEY, values, strict=True))
                 row = kept.find(key)
                 if row is None:
                     queries = max(1, int(budget) // spp)

@@ -104,7 +104,7 @@ def fit(
     from mbtf_gen.settings import resolve
 
     from .config import FitConfig
-    from .quality import FITTER
+    from .quality import fitter_options, said_of
 
     flags = {
         "model": model,
@@ -116,7 +116,10 @@ def fit(
         "device": device,
     }
     # Time asked for on the command line takes the place of steps in a file.
-    assigned = as_assignments(FITTER[quality]) if quality else []
+    assigned: list[str] = []
+    if quality is not None:
+        said = {"model": model or "neumip", **said_of(config, assignments or [])}
+        assigned = as_assignments(fitter_options(quality, {"": said})[""])
     assigned += [*(assignments or []), *(["training.steps=null"] if time is not None else [])]
     resolved = resolve(FitConfig, file=config, assignments=assigned, flags=flags)
     training = resolved.training

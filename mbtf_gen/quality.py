@@ -38,8 +38,8 @@ GENERATOR: dict[Quality, dict[str, Any]] = {
     "paper": {
         "queries.train": "400/texel",
         "queries.spp": 64,
-        "queries.test": "65536",
-        "queries.test_spp": 1024,
+        "queries.test": "262144",
+        "queries.test_spp": 256,
     },
 }
 

@@ -30,6 +30,7 @@ class Chain:
     unexplained, unexplained_error : variance of test queries that the fit misses, and its standard error
     data_bytes, material_bytes : on disk
     queries_per_second : trained on
+    settings : hash of all that the quality set
     """
 
     material: str
@@ -43,6 +44,7 @@ class Chain:
     data_bytes: int
     material_bytes: int
     queries_per_second: float
+    settings: str
 
 
 @dataclass(frozen=True)

@@ -47,8 +47,8 @@ LEAST_SHARE, LARGEST_SHARE = 0.08, 0.75
 PILOT, SHORTEST_PILOT = 0.04, 10.0
 # The shortest budget worth splitting, seconds: below it starting up takes most.
 SHORTEST = 60.0
-# Test queries of the pilot chains and paths of each.
-_TEST, _TEST_SPP = "32768", 16
+# Test split of the pilot chains, whose paths are what their judges take.
+_TEST, _TEST_SPP = "8192", 16
 _FEWEST_QUERIES = 4096
 # Seconds that a query takes at the least: that of a closed form, written to disk.
 _CHEAPEST = 1e-8

@@ -74,7 +74,9 @@ def run(
     from .recipe import load_recipe
     from .run import run_recipe
 
-    loaded = load_recipe(recipe, [*quality_assignments(recipe, quality), *(assignments or [])])
+    loaded = load_recipe(
+        recipe, [*quality_assignments(recipe, quality, assignments or []), *(assignments or [])]
+    )
     command = ["mbtf-pipeline", "run", str(recipe)]
     command += ["--quality", quality] if quality is not None else []
     command += ["--budget", budget] if budget is not None else []

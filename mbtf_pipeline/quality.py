@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mbtf_fit.quality import FITTER
+from mbtf_fit.quality import BEST, FITTER, fitter_options, said_of
 from mbtf_gen.quality import GENERATOR, Quality, as_assignments
 
 from .recipe import fit_names
+from .stages import hash_of
 
 # Options of the comparison by quality.
 COMPARE: dict[Quality, dict[str, Any]] = {
@@ -19,8 +21,12 @@ COMPARE: dict[Quality, dict[str, Any]] = {
 }
 
 
-def quality_assignments(path: Path, quality: Quality | None) -> list[str]:
+def quality_assignments(path: Path, quality: Quality | None, assignments: Sequence[str] = ()) -> list[str]:
     """``a.b=c`` that bring the recipe of a file to a quality.
+
+    Parameters
+    ----------
+    assignments : those that will be laid over them
 
     Raises
     ------
@@ -29,6 +35,21 @@ def quality_assignments(path: Path, quality: Quality | None) -> list[str]:
     if quality is None:
         return []
     out = as_assignments(GENERATOR[quality], "generate.")
-    for prefix in fit_names(path):
-        out += as_assignments(FITTER[quality], f"{prefix}.")
+    prefixes = fit_names(path)
+    said = said_of(path, assignments)
+    for prefix, options in fitter_options(quality, {p: _said_of_fit(said, p) for p in prefixes}).items():
+        out += as_assignments(options, f"{prefix}.")
     return out + as_assignments(COMPARE[quality])
+
+
+def _said_of_fit(said: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+    """What is said of one fit, with its model: that of its name where none is said."""
+    _, _, name = prefix.partition(".")
+    fits = said.get("fit")
+    fit = fits.get(name) if name and isinstance(fits, Mapping) else fits
+    return {"model": name or "neumip", **(fit if isinstance(fit, Mapping) else {})}
+
+
+def settings_hash(quality: Quality) -> str:
+    """Hash of all that a quality sets: figures that were measured with others are out of date."""
+    return hash_of([GENERATOR[quality], BEST, FITTER[quality], COMPARE[quality]])[:12]

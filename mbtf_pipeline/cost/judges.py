@@ -29,8 +29,10 @@ _FIRST_CANDIDATES, _PASS_ON = 20_001, 10_000
 # Candidates of one piece, and paths that each is looked at with, one in each half.
 _PIECE = 1 << 19
 _LOOK = 2
-# Paths of a query that is taken, and the most queries and candidates: what is made in seconds.
+# Paths of a query that is taken; the fewest of all, and the most queries and candidates: what is made in
+# seconds.
 _SPP = 16
+_FEWEST_PATHS = 1 << 14
 _MOST, _MOST_CANDIDATES = 1 << 17, 1 << 23
 # Probability that does not depend on what was seen, as a share of the mean one.
 _ALIKE = 0.5
@@ -59,14 +61,15 @@ def draw_judges(bench: Bench, paths: int) -> Judges:
 
     Parameters
     ----------
-    paths : of all that are taken, 16 each, at most; twice as many candidates are looked at. Halves need no
-        more, for errors are free of noise; what limits them is how they vary over queries
+    paths : of all that are taken, 16 each; twice as many candidates are looked at. At least 16 384; at most
+        131 072 queries are taken, of 8 million candidates. Halves need no more, for errors are free of
+        noise; what limits them is how they vary over queries
     """
     job = bench.job({})
-    spp = max(_LOOK, min(_SPP, paths // 2 * 2))
-    count = min(paths // spp, _MOST)
+    paths = max(paths, _FEWEST_PATHS)
+    count = min(paths // _SPP, _MOST)
     candidates = min(2 * paths, _MOST_CANDIDATES)
-    estimator = job.estimator(plan_effects(job))
+    estimator = job.estimator(plan_effects(job, pilots=False))
     sizes = [min(_PIECE, candidates - start) for start in range(0, candidates, _PIECE)]
     # A piece spans several of the bench's shards.
     shards = [_FIRST_CANDIDATES + -(-start // SHARD) for start in range(0, candidates, _PIECE)]
@@ -84,7 +87,7 @@ def draw_judges(bench: Bench, paths: int) -> Judges:
             continue
         drawn = bench.queries(job, shard, size)
         taken = Queries(drawn.u[rows], drawn.sigma[rows], drawn.omega_i[rows], drawn.omega_o[rows])
-        found = estimator.estimate(taken, spp, Stream(bench.seed, "test", _PASS_ON + shard))
+        found = estimator.estimate(taken, _SPP, Stream(bench.seed, "test", _PASS_ON + shard))
         halves = found.value_a, found.value_b
         parts.append(FitQueries(taken.u, taken.sigma, taken.omega_i, taken.omega_o, *halves))
         weights.append(1.0 / chance[rows])
@@ -92,9 +95,21 @@ def draw_judges(bench: Bench, paths: int) -> Judges:
 
 
 def _chances(squares: NDArray[np.float64], count: int) -> NDArray[np.float64]:
-    """Probability (n,) of each candidate to be taken, from the squares of what was seen of it."""
+    """Probability (n,) of each candidate to be taken, `count` in all, from the squares of what was seen of
+    it. What the certain ones leave over goes to the others in proportion to theirs: one firefly must not use
+    up the share of all that are bright."""
     n = len(squares)
-    mean = float(squares.mean())
-    bright = squares / mean if mean > 0 else np.ones(n)
-    chances: NDArray[np.float64] = np.minimum(1.0, count / n * (_ALIKE + (1.0 - _ALIKE) * bright))
-    return chances
+    alike = min(1.0, _ALIKE * count / n)
+    certain = np.zeros(n, bool)
+    while True:
+        total = squares[~certain].sum()
+        left = count - certain.sum() - alike * (n - certain.sum())
+        scale = left / total if total > 0 else 0.0
+        chances = np.where(certain, 1.0, alike + scale * squares)
+        if total <= 0:
+            # All is black, or as good as: all alike.
+            chances = np.where(certain, 1.0, (count - certain.sum()) / max(1, n - certain.sum()))
+        more = chances > 1.0
+        if not more.any():
+            return chances
+        certain |= more

@@ -174,7 +174,7 @@ def _measure_chains(
     left: Callable[[], float],
 ) -> None:
     # Prices are those of stored points: a study that goes on has the same tasks.
-    tasks = list(chains(budget, work.config.queries.spp, price))
+    tasks = list(chains(budget, work.config.queries.spp, price, work.config.seed))
     needed = [(t.queries, t.spp) for t in tasks]
     try:
         for number, task in enumerate(tasks):

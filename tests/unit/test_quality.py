@@ -11,15 +11,15 @@ from typing import get_args
 import pytest
 
 from mbtf_fit.config import FitConfig
-from mbtf_fit.quality import FITTER
+from mbtf_fit.quality import BEST, FITTER, fitter_options, said_of
 from mbtf_gen.config import GeneratorConfig, count_queries
 from mbtf_gen.quality import GENERATOR, Quality, as_assignments
 from mbtf_gen.quality_measured import Chain, Expected, expected, markdown_table, read_expected
 from mbtf_gen.settings import resolve
-from mbtf_pipeline.quality import COMPARE, quality_assignments
+from mbtf_pipeline.quality import COMPARE, quality_assignments, settings_hash
 from mbtf_pipeline.recipe import load_recipe
 
-QUALITIES = get_args(Quality)
+QUALITIES: tuple[Quality, ...] = get_args(Quality)
 ROOT = Path(__file__).parents[2]
 
 
@@ -34,6 +34,9 @@ def test_each_quality_takes_more_paths_than_the_one_before() -> None:
         paths.append(count_queries(config.queries.train, 128**2) * config.queries.spp)
     assert paths == sorted(paths)
     assert len(set(paths)) == len(paths)
+    # The bars of test errors, which are free of noise, hang on the number of queries.
+    tests = [int(GENERATOR[q]["queries.test"]) for q in QUALITIES]
+    assert tests == sorted(tests)
 
 
 @pytest.mark.parametrize("quality", QUALITIES)
@@ -54,6 +57,40 @@ def test_recipes_take_a_quality(quality: Quality, name: str) -> None:
     assert recipe.compare.size == COMPARE[quality]["compare.size"]
 
 
+@pytest.mark.parametrize("name", ["models", "hierarchical"])
+@pytest.mark.parametrize("quality", QUALITIES)
+def test_recipes_that_compare_networks_keep_them(quality: Quality, name: str) -> None:
+    path = ROOT / "pipelines" / f"{name}.yaml"
+    plain, raised = load_recipe(path), load_recipe(path, quality_assignments(path, quality))
+    assert {n: f.network for n, f in raised.fit.items()} == {n: f.network for n, f in plain.fit.items()}
+    for one, fit in raised.fit.items():
+        if plain.fit[one].training.blur.start == 0 or fit.model == "hierarchical":
+            assert fit.training.blur == plain.fit[one].training.blur
+
+
+def test_other_recipes_get_the_network_of_the_qualities() -> None:
+    path = ROOT / "pipelines" / "rock_cliff.yaml"
+    fits = {"neumip": {"model": "neumip"}, "neumip-baseline": {"model": "neumip-baseline"}}
+    assert {n: {**BEST, **FITTER["draft"]} for n in fits} == fitter_options("draft", fits)
+    fits["hierarchical"] = {"model": "hierarchical"}
+    assert fitter_options("draft", fits)["hierarchical"] == FITTER["draft"]
+    text = quality_assignments(path, "draft")
+    assert {"fit.neumip.network.width=40", "fit.neumip-baseline.training.decay=1.0"} <= set(text)
+    # What the command line says of a network, or of smoothing, is not mixed with it.
+    text = quality_assignments(path, "draft", ["fit.neumip.network.width=25", "fit.neumip.training.decay=0"])
+    assert not any("network" in t or t.startswith("fit.neumip.training.decay") for t in text)
+    assert "fit.neumip.training.blur.floor=0.8" in text
+
+
+def test_a_file_of_the_fitter_stands(tmp_path: Path) -> None:
+    file = tmp_path / "fit.yaml"
+    file.write_text("network: {channels: 5}\ntraining: {blur: {start: 4}}\n")
+    said = {"model": "neumip", **said_of(file, ["seed=3"])}
+    assert fitter_options("draft", {"": said})[""] == {"training.decay": 1.0, **FITTER["draft"]}
+    said = {"model": "neumip", **said_of(None, ["model=hierarchical"])}
+    assert fitter_options("high", {"": said})[""] == FITTER["high"]
+
+
 def test_what_is_said_explicitly_wins(tmp_path: Path) -> None:
     path = ROOT / "pipelines" / "quickstart.yaml"
     said = [*quality_assignments(path, "draft"), "generate.queries.train=5/texel"]
@@ -66,11 +103,11 @@ def test_what_is_said_explicitly_wins(tmp_path: Path) -> None:
 
 
 CHAINS = (
-    Chain("rock", "draft", 0.1, 41.0, 5.0, 20.0, 0.314, 0.01, 10**8, 10**6, 3e6),
-    Chain("bark", "draft", None, 52.4, 6.0, 20.0, 0.62, 0.02, 10**8, 10**6, 3e6),
-    Chain("rock", "high", 0.1, 1800.0, 300.0, 1200.0, 0.05, 0.002, 10**9, 10**6, 3e6),
+    Chain("rock", "draft", 0.1, 41.0, 5.0, 20.0, 0.314, 0.01, 10**8, 10**6, 3e6, "h"),
+    Chain("bark", "draft", None, 52.4, 6.0, 20.0, 0.62, 0.02, 10**8, 10**6, 3e6, "h"),
+    Chain("rock", "high", 0.1, 1800.0, 300.0, 1200.0, 0.05, 0.002, 10**9, 10**6, 3e6, "h"),
 )
-GUESS = Chain("rock", "paper", 0.1, 40000.0, 20000.0, 20000.0, 0.03, 0.0, 10**9, 10**6, 3e6)
+GUESS = Chain("rock", "paper", 0.1, 40000.0, 20000.0, 20000.0, 0.03, 0.0, 10**9, 10**6, 3e6, "h")
 
 
 def written(folder: Path, chains: tuple[Chain, ...], guesses: tuple[Chain, ...]) -> Expected:
@@ -101,6 +138,13 @@ def test_the_documentation_shows_the_figures_that_are_stored() -> None:
     page = (ROOT / "docs" / "cost.md").read_text(encoding="utf-8")
     shown = page.split("<!-- qualities: begin -->")[1].split("<!-- qualities: end -->")[0].strip()
     assert shown == markdown_table(expected(), QUALITIES)
+
+
+def test_figures_are_of_the_qualities_as_they_are() -> None:
+    found = expected()
+    assert found.chains
+    for chain in (*found.chains, *found.extrapolated):
+        assert chain.settings == settings_hash(chain.quality), f"{chain.material} {chain.quality}"  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("program", ["mbtf-gen", "mbtf-fit", "mbtf-pipeline"])
