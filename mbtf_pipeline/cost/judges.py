@@ -3,9 +3,11 @@
 Squared errors, and the variance that they are divided by, are ruled by few queries: under a light of 1° a
 glossy relief answers one fine footprint in ten thousand with a hundred times the mean value. Half a million
 queries alike then leave bars of 10 % and more. So many more candidates are drawn as a test split has them,
-each is looked at with one path per half, and queries are taken from them with a probability that is half
-alike and half in proportion to the square of what was seen. Weights of one over that probability undo the
-choice without bias, whatever was seen; the paths that were looked at are not used again.
+each is looked at with a few paths, and queries are taken from them with a probability of which a quarter is
+alike, and the rest in proportion to the square of what was seen and to the mean square of candidates of like
+footprint and directions, half by half: a fit misses, too, where one is dark among bright ones. Weights of one
+over that probability undo the choice without bias, whatever was seen; the paths that were looked at are not
+used again.
 """
 
 from __future__ import annotations
@@ -26,16 +28,18 @@ from .generator import SHARD, Bench
 
 # Shards that stand for the streams of candidates; the paths of those taken come so many shards later.
 _FIRST_CANDIDATES, _PASS_ON = 20_001, 10_000
-# Candidates of one piece, and paths that each is looked at with, one in each half.
-_PIECE = 1 << 19
-_LOOK = 2
+# Candidates of one piece, and paths that each is looked at with.
+_PIECE = 1 << 18
+_LOOK = 4
+# Cells of alike queries: levels, and parts of the cosines of light and view and of the half vector's sine.
+_LEVELS, _ANGLES = 16, (6, 6, 8)
 # Paths of a query that is taken; the fewest of all, and the most queries and candidates: what is made in
 # seconds.
-_SPP = 16
+_SPP = 32
 _FEWEST_PATHS = 1 << 14
 _MOST, _MOST_CANDIDATES = 1 << 17, 1 << 23
 # Probability that does not depend on what was seen, as a share of the mean one.
-_ALIKE = 0.5
+_ALIKE = 0.25
 
 
 @dataclass(frozen=True)
@@ -61,7 +65,7 @@ def draw_judges(bench: Bench, paths: int) -> Judges:
 
     Parameters
     ----------
-    paths : of all that are taken, 16 each; twice as many candidates are looked at. At least 16 384; at most
+    paths : of all that are taken, 32 each; twice as many candidates are looked at. At least 16 384; at most
         131 072 queries are taken, of 8 million candidates. Halves need no more, for errors are free of
         noise; what limits them is how they vary over queries
     """
@@ -73,12 +77,15 @@ def draw_judges(bench: Bench, paths: int) -> Judges:
     sizes = [min(_PIECE, candidates - start) for start in range(0, candidates, _PIECE)]
     # A piece spans several of the bench's shards.
     shards = [_FIRST_CANDIDATES + -(-start // SHARD) for start in range(0, candidates, _PIECE)]
-    seen = []
+    seen, cells = [], []
     for shard, size in zip(shards, sizes, strict=True):
-        found = estimator.estimate(bench.queries(job, shard, size), _LOOK, Stream(bench.seed, "test", shard))
+        drawn = bench.queries(job, shard, size)
+        found = estimator.estimate(drawn, _LOOK, Stream(bench.seed, "test", shard))
         values = 0.5 * (found.value_a.astype(np.float64) + found.value_b)
         seen.append((values**2).mean(axis=1))
-    chances = np.split(_chances(np.concatenate(seen), count), np.cumsum(sizes)[:-1])
+        cells.append(_cells(drawn))
+    squares = _half_local(np.concatenate(seen), np.concatenate(cells))
+    chances = np.split(_chances(squares, count), np.cumsum(sizes)[:-1])
     parts, weights = [], []
     for shard, size, chance in zip(shards, sizes, chances, strict=True):
         choice = numpy_generator(bench.seed, "test", shard, Purpose.CHOICE)
@@ -92,6 +99,26 @@ def draw_judges(bench: Bench, paths: int) -> Judges:
         parts.append(FitQueries(taken.u, taken.sigma, taken.omega_i, taken.omega_o, *halves))
         weights.append(1.0 / chance[rows])
     return Judges(FitQueries.join(parts), np.concatenate(weights))
+
+
+def _cells(queries: Queries) -> NDArray[np.int64]:
+    """Number (n,) of the cell of footprint, light, view and half vector that each query lies in."""
+    half = queries.omega_i + queries.omega_o
+    tilt = half[:, 2] / np.linalg.norm(half, axis=1)
+    cosines = (queries.omega_i[:, 2], queries.omega_o[:, 2], np.sqrt(1.0 - np.minimum(tilt**2, 1.0)))
+    out = np.clip(-np.log2(2.0 * queries.sigma), 0, _LEVELS - 1).astype(np.int64)
+    for value, n in zip(cosines, _ANGLES, strict=True):
+        out = out * n + np.clip(value * n, 0, n - 1).astype(np.int64)
+    return out
+
+
+def _half_local(squares: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Squares (n,), half of each replaced by the mean of its cell: a fit misses, too, where a query is dark
+    by chance among bright ones."""
+    counts = np.bincount(cells)
+    means = np.bincount(cells, squares) / np.maximum(counts, 1)
+    out: NDArray[np.float64] = 0.5 * (squares + means[cells])
+    return out
 
 
 def _chances(squares: NDArray[np.float64], count: int) -> NDArray[np.float64]:

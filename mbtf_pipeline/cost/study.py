@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
@@ -12,6 +13,7 @@ from mbtf_gen.atomic import read_json, write_json, write_text
 from mbtf_gen.errors import InputError
 from mbtf_gen.material import load_material
 from mbtf_gen.settings import dump_yaml
+from mbtf_gen.stats import Estimate
 
 from ..recipe import Recipe
 from ..run_folder import locked, machine, take
@@ -29,6 +31,8 @@ CONFIG_NAME = "generate.yaml"
 WORK = ".work"
 # Share of the budget that is kept for whole chains while the generator is studied.
 _RESERVED = 0.7
+# Seconds of tracing in the data set that tells what a query costs on disk.
+_TRIAL = 3.0
 # Settings that the generator's share of the budget is divided among.
 _SETTINGS = 42
 
@@ -139,7 +143,8 @@ def run_study(
         price = _price(study.points)
         if price is not None:
             work = Workshop(config, folder / WORK, generator, note)
-            _measure_chains(study, store, work, budget, price, left)
+            kept = _kept(store, work, price)
+            _measure_chains(study, store, work, budget, lambda paths: price(paths) + kept, left)
     return replace(study, points=with_scatter(study.points))
 
 
@@ -163,6 +168,25 @@ def _price(points: Iterable[Point]) -> Callable[[int], float] | None:
         return known[nearest] * (paths / nearest if nearest != paths else 1.0)
 
     return price
+
+
+def _kept(store: PointFolder, work: Workshop, price: Callable[[int], float]) -> float:
+    """Seconds of a query beyond tracing: to draw, group and write it. From two data sets, the smaller of
+    which takes what starting takes; stored as a point, so that a study that goes on has the same chains."""
+    spp = work.config.queries.spp
+    count = max(1, int(_TRIAL / price(spp)))
+    key = {"queries": count, "spp": spp}
+    point = store.get("price", key)
+    if point is None:
+        seconds = []
+        for queries in (1, count):
+            seconds.append(work.data(queries, spp).seconds)
+            work.forget(queries, spp)
+        nothing = Estimate(math.nan, math.inf, 0)
+        taken = Estimate((seconds[1] - seconds[0]) / count * 1e6, 0.0, 1)
+        point = Point("price", "written", f"{count} queries", key, "", taken, nothing)
+        store.put(key, point)
+    return max(0.0, point.seconds.value * 1e-6 - price(spp))
 
 
 def _measure_chains(
