@@ -25,7 +25,7 @@ _MODELS = ("neumip", "neumip-baseline")
 FITTER: dict[Quality, dict[str, Any]] = {
     "draft": {"training.time": "20s", "training.steps": None},
     "standard": {"training.time": "3min", "training.steps": None},
-    "high": {"training.time": "20min", "training.steps": None},
+    "high": {"training.time": "10min", "training.steps": None},
     # Kuznetsov et al. 2021: 30 000 steps of 2^20 queries.
     "paper": {"training.steps": 30_000, "training.batch": 1 << 20},
 }
