@@ -250,9 +250,7 @@ def _scatter(clouds: Sequence[Cloud], x: str, y: str, front: Sequence[tuple[floa
     axes.set_xlim(left / reach**0.06, right * reach**0.2)
     for axis in (axes.xaxis, axes.yaxis):
         _plain_ticks(axis)
-    # Above the plot, where it hides no point.
-    marks, names = zip(*handles, strict=True)
-    figure.legend(marks, names, loc="outside upper left", frameon=False, fontsize=8.5, ncols=4)
+    _legend_above(figure, handles)
     place_names(figure, axes, named, shown, lines)
     return figure
 
@@ -303,6 +301,21 @@ def _points(
     return figure
 
 
+def _legend_above(figure: Any, handles: Sequence[tuple[Any, str]]) -> None:
+    """Legend above the plot, where it hides no point, in as many columns as the figure is wide."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    marks, names = zip(*handles, strict=True)
+    for columns in (4, 3, 2, 1):
+        legend = figure.legend(
+            marks, names, loc="outside upper left", frameon=False, fontsize=8.5, ncols=columns
+        )
+        if columns == 1 or legend.get_window_extent(renderer).width <= figure.bbox.width:
+            return
+        legend.remove()
+
+
 def _plain_ticks(axis: Any) -> None:
     """Ticks of a logarithmic axis at 1, 2 and 5 of each decade (fewer or more where it is long or short)."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
@@ -310,6 +323,8 @@ def _plain_ticks(axis: Any) -> None:
     low, high = axis.get_view_interval()
     decades = float(np.log10(high / low)) if 0 < low < high else 9.0
     subs: tuple[float, ...] = (1.0, 2.0, 5.0) if decades < 2.2 else (1.0,)
+    if decades < 0.6:
+        subs = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0)
     if decades < 0.35:
         subs = tuple(np.arange(1.0, 10.0, 0.5))
     axis.set_major_locator(LogLocator(base=10, subs=subs))

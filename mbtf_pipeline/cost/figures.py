@@ -146,7 +146,7 @@ def fit_figures(points: Sequence[Point], name: str, folder: Path) -> list[dict[s
     half = [replace(p, error=_half_error(p)) for p in longest]
 
     def series(p: Point) -> str:
-        return p.series
+        return "of the qualities" if p.series == QUALITIES else p.series.removeprefix("neumip, ")
 
     def precise(kind: str, some: Sequence[Point], size: str, hollow: bool) -> Cloud:
         def kilobytes(p: Point) -> Estimate:

@@ -382,6 +382,21 @@ def test_plots_name_their_axes_and_bars(tmp_path: Path) -> None:
         assert picture.convert("RGBA").getpixel((1, 1)) == (255, 255, 255, 255)
 
 
+def test_a_legend_of_long_names_is_no_wider_than_the_figure() -> None:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    from mbtf_pipeline.plots import _legend_above
+
+    figure = Figure(figsize=(7, 4), layout="constrained")
+    axes = figure.add_subplot()
+    _legend_above(figure, [(axes.plot([0])[0], f"a name of some length, number {n}") for n in range(6)])
+    (legend,) = figure.legends
+    extent = legend.get_window_extent(FigureCanvasAgg(figure).get_renderer())
+    assert extent.width <= figure.bbox.width
+    assert len(legend.get_texts()) == 6
+
+
 def test_names_lie_on_no_point_and_on_no_other_name() -> None:
     """Points of a cluster, close enough that names beside them would cover each other."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
