@@ -94,6 +94,7 @@ class Workshop:
         self.progress = progress
         self._made: dict[str, _Data] = {}
         self._judges: Judges | None = None
+        self._said = False
 
     def clear(self) -> None:
         """Remove data and fits; points hold what was measured on them."""
@@ -113,7 +114,9 @@ class Workshop:
         folder = self.folder / f"data-{hash_of(data)[:12]}"
         shutil.rmtree(folder, ignore_errors=True)
         start = time.perf_counter()
-        generate(config, folder)
+        # What is odd about the material is said once, not for every data set.
+        said, self._said = self._said, True
+        generate(config, folder, job=_quiet_job(config) if said else None)
         return _Data(folder, time.perf_counter() - start)
 
     def data(self, queries: int, spp: int) -> _Data:
@@ -140,11 +143,9 @@ class Workshop:
             from .judges import draw_judges
 
             self.progress("test queries")
-            config = self.config
-            material = load_material(Path(config.material), config.geometry.tile)
-            texels = Job.of(config, material).lattice.texels()
-            paths = count_queries(config.queries.test, texels) * config.queries.test_spp
-            self._judges = draw_judges(Bench(config, material, config.seed), paths)
+            config, job = self.config, _quiet_job(self.config)
+            paths = count_queries(config.queries.test, job.lattice.texels()) * config.queries.test_spp
+            self._judges = draw_judges(Bench(config, job.material, config.seed), paths)
         return self._judges
 
     def measure(self, chain: Chain) -> Point:
@@ -199,6 +200,11 @@ class Workshop:
             f"{self.command} --queries {chain.queries} --spp {chain.spp} -o shards/ && "
             f"mbtf-fit shards/{flags} -o material/"
         )
+
+
+def _quiet_job(config: GeneratorConfig) -> Job:
+    """The job of a configuration whose material was spoken of before."""
+    return Job.of(config, load_material(Path(config.material), config.geometry.tile))
 
 
 def _flat(options: dict[str, Any], prefix: str = "") -> dict[str, Any]:
