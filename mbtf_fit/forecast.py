@@ -19,10 +19,10 @@ from .models import MODELS
 # Seconds of the two pilot fits; each runs through the whole schedule in its time.
 PILOT_SECONDS = (4.0, 8.0)
 # Every doubling of the time gains this share of what the one before gained, in the logarithm of the error:
-# the model's size and the data end what training can reach. In docs/cost.md's studies of turtle_shell and
-# twisted_wool fits of 4.4, 8.9 and 18 s on the same data have 0.5 each; their chains of 39 and 78 s, on more
-# data, 0.57 to 0.71. benchmarks/forecasts.py finds it anew.
-PERSISTENCE = 0.6
+# the model's size and the data end what training can reach. benchmarks/forecasts.py finds it anew: 0.3 for
+# fits of 60 s with the options of the qualities on data of a draft; smaller networks, and more data, have 0.5
+# and more.
+PERSISTENCE = 0.45
 # Bytes of a number in the material's file.
 _NUMBER = 4
 
