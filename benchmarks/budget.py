@@ -25,7 +25,7 @@ from mbtf_fit.quality import BEST
 from mbtf_gen.durations import parse_duration
 from mbtf_gen.engine import load_mitsuba
 from mbtf_gen.errors import MbtfError
-from mbtf_gen.settings import merge
+from mbtf_gen.settings import nested
 from mbtf_pipeline.budget import Split, split_budget, within_budget
 from mbtf_pipeline.cost.chains import Chain, Workshop
 from mbtf_pipeline.recipe import Recipe
@@ -46,9 +46,6 @@ def chain(recipe: Recipe, split: Split) -> Chain:
 
 def measure(material: Path, seconds: float, splits: list[float], levels: int, work: Path) -> dict[str, Any]:
     """Errors of the grid and of ``--budget``."""
-    fit: dict[str, Any] = {"model": "neumip"}
-    for name, value in BEST.items():
-        merge(fit, name.split("."), value)
     recipe = Recipe.model_validate(
         {
             "name": "budget",
@@ -56,7 +53,7 @@ def measure(material: Path, seconds: float, splits: list[float], levels: int, wo
                 "material": str(material),
                 "queries": {"levels": levels, "test": TEST, "test_spp": TEST_SPP},
             },
-            "fit": fit,
+            "fit": nested({"model": "neumip", **BEST}),
         }
     )
     found = split_budget(recipe, seconds, work / "run", "", lambda note: print(note, file=sys.stderr))

@@ -278,6 +278,14 @@ def merge(base: Any, path: Sequence[str], value: Any) -> None:
     base[path[-1]] = value
 
 
+def nested(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Options by dotted name as nested mappings."""
+    out: dict[str, Any] = {}
+    for name, value in options.items():
+        merge(out, name.split("."), value)
+    return out
+
+
 def laid_over(base: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
     """A new mapping: `given` laid over `base`, section by section."""
     out = dict(base)

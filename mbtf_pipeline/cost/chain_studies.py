@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 from mbtf_fit.quality import BEST
-from mbtf_gen.settings import merge
+from mbtf_gen.settings import nested
 
 from .chains import Chain
 
@@ -52,10 +52,7 @@ def _fit(model: str, seconds: float, network: dict[str, object] | None = None) -
 
 def _best(seconds: float) -> dict[str, object]:
     """Options of a fit as the qualities have it."""
-    options: dict[str, object] = {"model": "neumip"}
-    for name, value in {**BEST, "training.time": f"{seconds:.3g}s"}.items():
-        merge(options, name.split("."), value)
-    return options
+    return nested({"model": "neumip", **BEST, "training.time": f"{seconds:.3g}s"})
 
 
 def chains(budget: float, spp: int, price: Price, seed: int = 0) -> Iterator[Chain]:

@@ -76,7 +76,7 @@ def draw_judges(bench: Bench, paths: int) -> Judges:
     estimator = job.estimator(plan_effects(job, pilots=False))
     sizes = [min(_PIECE, candidates - start) for start in range(0, candidates, _PIECE)]
     # A piece spans several of the bench's shards.
-    shards = [_FIRST_CANDIDATES + -(-start // SHARD) for start in range(0, candidates, _PIECE)]
+    shards = [_FIRST_CANDIDATES + start // SHARD for start in range(0, candidates, _PIECE)]
     seen, cells = [], []
     for shard, size in zip(shards, sizes, strict=True):
         drawn = bench.queries(job, shard, size)

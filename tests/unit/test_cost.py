@@ -331,6 +331,7 @@ def test_chains_fit_into_their_budget(budget: float) -> None:
     assert sum(totals) <= WHOLE * budget / SHORTEST < sum(totals) + 2 * totals[-1]
     # Fits of other seeds are of a setting that was measured, on its data.
     like = next(c for c in found if c.study == "fit")
+    assert like.name == f"{FIT * budget / 19.5:.3g} s"
     others = [c for c in found if c.study == "seeds"]
     assert all(c.fit == {**like.fit, "seed": c.fit["seed"]} for c in others)
     assert all((c.queries, c.spp) == (like.queries, like.spp) for c in others)

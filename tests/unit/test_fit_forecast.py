@@ -35,7 +35,7 @@ def test_fits_several_doublings_apart_follow_the_same_law() -> None:
     assert extrapolated(0.6, eight, 3, apart=2) == pytest.approx(end)
     assert extrapolated(0.8, eight, 3, apart=3) == pytest.approx(end)
     # Gains that last promise more.
-    assert extrapolated(0.8, 0.6, 5, persistence=0.9) < end < extrapolated(0.8, 0.6, 5, persistence=0.2)
+    assert extrapolated(0.8, 0.6, 5, persistence=0.9) < end < extrapolated(0.8, 0.6, 5, persistence=0.4)
 
 
 def test_what_pilots_do_not_show_is_not_promised() -> None:
