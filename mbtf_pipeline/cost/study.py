@@ -143,8 +143,8 @@ def run_study(
         price = _price(study.points)
         if price is not None:
             work = Workshop(config, folder / WORK, generator, note)
-            kept = _kept(store, work, price)
-            _measure_chains(study, store, work, budget, lambda paths: price(paths) + kept, left)
+            extra = _beyond_tracing(store, work, price)
+            _measure_chains(study, store, work, budget, lambda paths: price(paths) + extra, left)
     return replace(study, points=with_scatter(study.points))
 
 
@@ -170,7 +170,7 @@ def _price(points: Iterable[Point]) -> Callable[[int], float] | None:
     return price
 
 
-def _kept(store: PointFolder, work: Workshop, price: Callable[[int], float]) -> float:
+def _beyond_tracing(store: PointFolder, work: Workshop, price: Callable[[int], float]) -> float:
     """Seconds of a query beyond tracing: to draw, group and write it. From two data sets, the smaller of
     which takes what starting takes; stored as a point, so that a study that goes on has the same chains."""
     spp = work.config.queries.spp

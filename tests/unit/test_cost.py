@@ -340,7 +340,7 @@ def test_chains_fit_into_their_budget(budget: float) -> None:
 
 def test_queries_cost_what_they_cost_on_disk(tmp_path: Path) -> None:
     """Tracing takes 0.4 µs a query, drawing and writing 0.6 µs more, and starting two seconds."""
-    from mbtf_pipeline.cost.study import _kept
+    from mbtf_pipeline.cost.study import _beyond_tracing
 
     made: list[int] = []
 
@@ -359,11 +359,11 @@ def test_queries_cost_what_they_cost_on_disk(tmp_path: Path) -> None:
     def price(spp: int) -> float:
         return 1e-7 * spp
 
-    found = _kept(store, shop, price)  # type: ignore[arg-type]
+    found = _beyond_tracing(store, shop, price)  # type: ignore[arg-type]
     assert found == pytest.approx(6e-7)
     assert len(made) == 2
     # A study that goes on has the same price, and so the same chains.
-    assert _kept(store, shop, price) == found  # type: ignore[arg-type]
+    assert _beyond_tracing(store, shop, price) == found  # type: ignore[arg-type]
     assert len(made) == 2
 
 
