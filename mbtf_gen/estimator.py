@@ -213,7 +213,7 @@ class Estimator:
     def _batch(
         self, queries: Queries, rows: slice, counts: NDArray[np.int64], stream: Stream, source: RaySource
     ) -> Estimates:
-        part = Queries(queries.u[rows], queries.sigma[rows], queries.omega_i[rows], queries.omega_o[rows])
+        part = queries.take(rows)
         source.set_queries(part, rows.start)
         omega_i = mi.Vector3f(part.omega_i.T.copy())
         if self.light is None:

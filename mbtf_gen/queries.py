@@ -9,6 +9,7 @@ so queries are the same bits on every machine.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +50,10 @@ class Queries:
             self.omega_i.reshape(-1, 3),
             self.omega_o.reshape(-1, 3),
         )
+
+    def take(self, rows: Any) -> Queries:
+        """Some along the first axis: a slice, an index array or a mask."""
+        return Queries(self.u[rows], self.sigma[rows], self.omega_i[rows], self.omega_o[rows])
 
 
 @dataclass(frozen=True)

@@ -181,7 +181,7 @@ class Bench:
             return estimate_shard(estimator, queries, spp, target, stream, chosen)
 
         first = self.reference({}, 0)
-        look = trace(_first(first.queries, _LOOK), Stream(self.seed, "test", _FIRST_PIECE))
+        look = trace(first.queries.take(slice(_LOOK)), Stream(self.seed, "test", _FIRST_PIECE))
         paths = max(look.paths, 1) / len(look.value_a)
         noise, price = self._noise(job, trace, paths, seconds, first.mean)
         relative = self._relative(trace, paths, seconds, allocation)
@@ -196,7 +196,7 @@ class Bench:
         while True:
             piece = len(squares)
             reference = self.reference({}, piece)
-            queries = _first(reference.queries, count)
+            queries = reference.queries.take(slice(count))
             found = trace(queries, Stream(self.seed, "test", _FIRST_PIECE + piece))
             value = 0.5 * (reference.a + reference.b)[:count].mean(axis=1)
             scale = np.maximum(value, allocation.tile_mean(queries))
@@ -266,10 +266,6 @@ def _typical(prices: list[float]) -> Estimate:
 def _sure(variance: Estimate) -> bool:
     """Whether the 95 % interval of a variance's root is as narrow as wanted."""
     return 1.96 * variance.error <= 2 * HALF_WIDTH * variance.value or variance.value == 0
-
-
-def _first(queries: Queries, count: int) -> Queries:
-    return Queries(queries.u[:count], queries.sigma[:count], queries.omega_i[:count], queries.omega_o[:count])
 
 
 def _total(bias: Estimate, noise: Estimate) -> Estimate:

@@ -93,7 +93,7 @@ def draw_judges(bench: Bench, paths: int) -> Judges:
         if len(rows) == 0:
             continue
         drawn = bench.queries(job, shard, size)
-        taken = Queries(drawn.u[rows], drawn.sigma[rows], drawn.omega_i[rows], drawn.omega_o[rows])
+        taken = drawn.take(rows)
         found = estimator.estimate(taken, _SPP, Stream(bench.seed, "test", _PASS_ON + shard))
         halves = found.value_a, found.value_b
         parts.append(FitQueries(taken.u, taken.sigma, taken.omega_i, taken.omega_o, *halves))

@@ -1,0 +1,90 @@
+"""Cost studies of the generator: seconds, bias and noise are found where they are known."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from support.fake_bench import NOISE, SHIFT, fake_bench
+
+from mbtf_gen.planning import plan_effects
+from mbtf_pipeline.cost.generator import Bench
+from mbtf_pipeline.cost.generator_studies import COUNTS, TARGETS, generator_tasks
+
+
+@pytest.fixture
+def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
+    return fake_bench(monkeypatch)
+
+
+@pytest.mark.parametrize("spp", [4, 64])
+def test_bias_and_noise_are_told_apart(bench: Bench, spp: int) -> None:
+    found = bench.measure({"transport.max_depth": 1, "queries.spp": spp}, {}, 0.0)
+    # Relative to the mean value 0.25: the bias is the shift times the values, the noise that of spp paths.
+    bias = SHIFT * math.sqrt(np.mean((0.2 + 0.1 * np.linspace(0, 1, 10001)) ** 2)) / 0.25
+    noise = NOISE / math.sqrt(spp)
+    assert found.bias is not None
+    for estimate, truth in ((found.bias, bias), (found.noise, noise), (found.error, math.hypot(bias, noise))):
+        assert abs(estimate.value - truth) < 4 * estimate.error
+        assert estimate.error < 0.05 * truth
+    assert found.seconds.value > 0
+
+
+def test_an_unbiased_setting_shows_no_bias(bench: Bench) -> None:
+    found = bench.measure({"transport.max_depth": 3}, {}, 0.0)
+    assert found.bias is not None
+    assert found.bias.value == 0.0
+    assert bench.measure({"queries.spp": 8}, None, 0.0).bias is None
+
+
+def test_adaptive_counts_are_measured_by_both_kinds_of_error(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Values of known noise, the same for all: a target error takes the paths that bring it."""
+    monkeypatch.setattr(
+        "mbtf_pipeline.cost.generator.plan_effects", lambda job: plan_effects(job, pilots=False)
+    )
+    even = bench.measure_counts({"queries.spp": 16, "queries.allocation": "even"}, False, 0.0)
+    assert even.bias is None
+    assert even.paths == 16
+    assert abs(even.noise.value - NOISE / 4) < 4 * even.noise.error
+    assert even.relative is not None
+    # Deviation 0.2 of one path over values of 0.2 to 0.3, or over their mean 0.25 where that is more.
+    scale = np.maximum(0.2 + 0.1 * np.linspace(0, 1, 10001), 0.25)
+    truth = 0.25 * NOISE / 4 * math.sqrt(np.mean(scale**-2.0))
+    assert abs(even.relative.value - truth) < 4 * even.relative.error + 0.02 * truth
+    aimed = bench.measure_counts({"queries.target_error": "10%"}, True, 0.0)
+    assert aimed.relative is not None
+    assert aimed.paths is not None
+    assert 0.08 < aimed.relative.value < 0.1
+    assert aimed.paths > 4 * (NOISE / 0.4) ** 2 + 16
+
+
+def test_seeds_change_the_measurement_and_nothing_else_does(bench: Bench) -> None:
+    again = Bench(bench.config, bench.material, 0)
+    other = Bench(bench.config, bench.material, 1)
+    noise = [b.measure({"queries.spp": 8}, None, 0.0).noise for b in (bench, again, other)]
+    assert noise[0] == noise[1]
+    assert noise[0].value != noise[2].value
+    assert abs(noise[0].value - noise[2].value) < 4 * math.hypot(noise[0].error, noise[2].error)
+
+
+def test_every_setting_is_one_that_the_generator_takes(bench: Bench) -> None:
+    """Effects that cannot be left out are not asked away."""
+    tasks = list(generator_tasks(bench))
+    for task in tasks:
+        plan_effects(bench.job(task.changes), pilots=False)
+    names = {t.name for t in tasks if t.study == "effects"}
+    assert {"auto", "all", "without shadowing", "without interreflection"} <= names
+    assert "without neighbours" not in names
+    assert sum(t.study == "adaptive" for t in tasks) == 2 * len(COUNTS) + len(TARGETS)
+
+
+def test_other_work_on_the_machine_does_not_change_the_price() -> None:
+    from mbtf_pipeline.cost.generator import _typical
+
+    quiet = [1.0, 1.02, 0.98, 1.01, 0.99, 1.0, 1.03]
+    found = _typical([*quiet, 9.0])
+    assert abs(found.value - 1.0) < 0.02
+    assert 0.0 < found.error < 0.02
