@@ -21,13 +21,13 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from mbtf_fit.quality import BEST
+from mbtf_fit.quality import best_options
 from mbtf_gen.durations import parse_duration
 from mbtf_gen.engine import load_mitsuba
 from mbtf_gen.errors import MbtfError
 from mbtf_gen.settings import nested
 from mbtf_pipeline.budget import Split, split_budget, within_budget
-from mbtf_pipeline.cost.chains import Chain, Workshop
+from mbtf_pipeline.cost.chains import Chain, Wanted, Workshop
 from mbtf_pipeline.recipe import Recipe
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -35,6 +35,8 @@ ASSETS = ("turtle_shell", "cliff_rock")
 SPLITS = (0.1, 0.2, 0.35, 0.5, 0.7)
 TEST, TEST_SPP = "131072", 16
 BAR = 1.2
+# Share of the time that chains train for, about: what their network follows.
+TRAINING = 0.5
 
 
 def chain(recipe: Recipe, split: Split) -> Chain:
@@ -53,7 +55,7 @@ def measure(material: Path, seconds: float, splits: list[float], levels: int, wo
                 "material": str(material),
                 "queries": {"levels": levels, "test": TEST, "test_spp": TEST_SPP},
             },
-            "fit": nested({"model": "neumip", **BEST}),
+            "fit": nested({"model": "neumip", **best_options(TRAINING * seconds)}),
         }
     )
     found = split_budget(recipe, seconds, work / "run", "", lambda note: print(note, file=sys.stderr))
@@ -69,7 +71,7 @@ def measure(material: Path, seconds: float, splits: list[float], levels: int, wo
         if share is not None:
             split = Split(int(share * left / price), share * left, (1 - share) * left, share, (), 0.0)
         point = workshop.measure(chain(recipe, split))
-        workshop.forget(split.queries, recipe.generate.queries.spp)
+        workshop.forget(Wanted(split.queries, recipe.generate.queries.spp))
         took = point.details["total_seconds"] + (found.pilot_seconds if share is None else 0.0)
         rows.append(
             {

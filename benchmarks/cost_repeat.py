@@ -5,9 +5,9 @@
 
 The first measures every setting of the generator with each seed: other queries, other paths, another
 reference. The second compares two finished studies of the same recipe and budget (``mbtf-pipeline cost …
---seed 1``), whole chains included; prices differ a little between runs, so chains are matched in their order.
-Where the bars are right, the differences over their combined standard errors lie within 1.65 nine times out
-of ten.
+--seed 10``), whole chains included; prices differ a little between runs, so chains are matched in their
+order. Where the bars are right, the differences over their combined standard errors lie within 1.65 nine
+times out of ten.
 
 The first also measures, with independent random numbers in place of low-discrepancy points, how noise and
 bias of paths that end at their first interaction change with the number of paths: the noise's variance falls

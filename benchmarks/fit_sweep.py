@@ -11,7 +11,7 @@ measured first.
 
 Every configuration is judged by the test split of the yardstick: unexplained variance, noise-free. Data sets
 are made where they are missing (minutes; the maps lie beside the project); some configurations train on other
-ones, made of as many paths. Prints one line each, and writes ``sweep.png``, error of held-out queries over
+ones, made of as many paths. Prints one line each, and writes ``sweep.png``, error while training over
 seconds.
 
 The last line is one JSON object with the figures; the bar: no configuration of the default's model and
@@ -172,7 +172,7 @@ def train(name: str, data: Data, out: Path, seconds: float, per_step: float) -> 
     truth = Dataset.open(data.folder())
     test = split_errors(Material.load(folder).predict, load_split(truth, "test"), truth.lattice)
     assert test is not None
-    history = [(r["step"] * per_step, r["held_out"]) for r in read_history(folder) if r["held_out"]]
+    history = [(r["step"] * per_step, r["unexplained"]) for r in read_history(folder) if r["unexplained"]]
     return {
         "unexplained": test.overall.unexplained.as_dict(),
         "levels": {level: e.unexplained.value for level, e in test.levels.items()},
@@ -186,7 +186,7 @@ def train(name: str, data: Data, out: Path, seconds: float, per_step: float) -> 
 
 
 def plot(found: dict[str, dict[str, Any]], path: Path) -> None:
-    """Error of the held-out queries over seconds, a curve each."""
+    """Error while training over seconds, a curve each."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.ticker import NullLocator
@@ -207,7 +207,7 @@ def plot(found: dict[str, dict[str, Any]], path: Path) -> None:
     axes.yaxis.set_major_formatter("{x:g}")
     axes.yaxis.set_minor_locator(NullLocator())
     axes.set_xlabel("seconds of training")
-    axes.set_ylabel("unexplained variance, held-out queries")
+    axes.set_ylabel("unexplained variance while training")
     axes.grid(alpha=0.3, which="both")
     axes.legend(loc="upper right", fontsize=8, title="test split")
     figure.savefig(path, dpi=110)

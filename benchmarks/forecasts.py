@@ -5,7 +5,7 @@
 Of every material (by default the five of ``assets/`` and the six texture sets that lie beside the project,
 by name): what ``mbtf-gen plan`` and ``mbtf-fit --dry-run`` expect at a quality, then the run itself, a fit
 for each ``--time`` (repeatable). Seconds are those of tracing and of training; errors are the noise of a
-training value and the unexplained variance of held-out queries. Printed too: the `PERSISTENCE` of
+training value and the unexplained variance of test queries. Printed too: the `PERSISTENCE` of
 ``mbtf_fit/forecast.py`` that all of these fits together ask for.
 
 The last line is one JSON object: figures, and the bars they are held to: seconds within 30 %, errors within a
@@ -28,7 +28,7 @@ from quality import HEIGHTS, source
 
 from mbtf_fit.config import FitConfig
 from mbtf_fit.forecast import PERSISTENCE, PILOT_SECONDS, extrapolated
-from mbtf_fit.quality import BEST, FITTER
+from mbtf_fit.quality import best_options
 from mbtf_gen.config import GeneratorConfig
 from mbtf_gen.durations import parse_duration
 from mbtf_gen.engine import load_mitsuba
@@ -69,31 +69,31 @@ def generated(name: str, quality: Quality, levels: int, shards: Path) -> dict[st
     }
 
 
-def fitted(shards: Path, quality: Quality, seconds: str, out: Path) -> dict[str, Any]:
+def fitted(shards: Path, seconds: str, out: Path) -> dict[str, Any]:
     """Forecast and run of the fitter."""
     from mbtf_fit import fit
     from mbtf_fit.forecast import forecast_fit
 
-    options = {**BEST, **FITTER[quality], "training.time": seconds, "training.steps": None}
+    options = {**best_options(parse_duration(seconds)), "training.time": seconds, "training.steps": None}
     config = resolve(FitConfig, assignments=as_assignments(options))
     expected = forecast_fit(config, shards)
     # As many steps as are forecast, so that the forecast's rate is what is judged.
     run = resolve(FitConfig, assignments=as_assignments({**options, "training.steps": expected.steps}))
     result = fit(run, shards, out)
-    reached = result.errors["held_out_queries"]["unexplained"]
+    reached = result.errors["test"]["unexplained"]
     return {
         "seconds, forecast": expected.seconds,
         "seconds": result.seconds,
         "error, forecast": expected.unexplained if expected.unexplained is not None else math.nan,
-        "error": reached["value"],
+        "error": math.nan if reached["value"] is None else reached["value"],
         "error, bar": reached["error"],
         "pilots": expected.pilots,
     }
 
 
 def factor(a: float, b: float) -> float:
-    """How far apart two positive numbers are, at least 1."""
-    return max(a / b, b / a) if min(a, b) > 0 else math.inf
+    """How far apart two positive numbers are, at least 1; infinite where one is not positive, or unknown."""
+    return max(a / b, b / a) if a > 0 and b > 0 else math.inf
 
 
 def best_persistence(fits: list[dict[str, Any]]) -> tuple[float, float]:
@@ -132,7 +132,7 @@ def main() -> int:
                 parts = {"generator": generated(name, arguments.quality, arguments.levels, shards)}
                 for seconds in arguments.time or ["60s"]:
                     label = f"fitter {parse_duration(seconds):g} s"
-                    parts[label] = fitted(shards, arguments.quality, seconds, Path(work) / seconds)
+                    parts[label] = fitted(shards, seconds, Path(work) / seconds)
                     if len(parts[label]["pilots"]) == 2 and min(*parts[label]["pilots"]) > 0:
                         fits.append(parts[label])
             for part, found in parts.items():

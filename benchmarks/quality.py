@@ -4,14 +4,15 @@
 
 Runs ``mbtf-pipeline run`` in a process of its own for every material and quality of the table in
 docs/cost.md: ``draft`` and ``standard`` on the six texture sets that lie beside the project, ``high`` on one.
-``--only`` (repeatable) names single ones, also of ``assets/``, such as ``turtle_shell:draft``. Printed: its
-seconds, start-up, pictures and report included, the unexplained variance of test queries, and the bytes of
-data and material. Each is kept in FOLDER as soon as it is measured and not measured again, so the same
+The last one is measured with a quarter of its training, too: from both ``paper`` is extrapolated. ``--only``
+(repeatable) names single ones, also of ``assets/``, such as ``turtle_shell:draft``. Printed: its seconds,
+start-up, pictures and report included, the unexplained variance of test queries, and the bytes of data and
+material. Each is kept in FOLDER as soon as it is measured and not measured again, so the same
 command goes on where it stopped.
 
 ``--store`` writes what FOLDER holds to ``mbtf_gen/quality_measured.json``, from which help texts and
-``mbtf-gen plan`` speak, and the table of docs/cost.md; ``paper``, a GPU's work, is extrapolated there from
-``standard`` and ``high``. ``--check`` holds what FOLDER holds against the stored figures instead.
+``mbtf-gen plan`` speak, and the table of docs/cost.md. ``--check`` holds what FOLDER holds against the stored
+figures instead.
 
 The last line is one JSON object: figures, and the bars they are held to (a draft takes at most a minute, a
 standard run ten, on two cores, at 128 x 128 texels; under ``--check`` seconds within 30 % and errors within a
@@ -35,6 +36,7 @@ from mbtf_fit.config import FitConfig
 from mbtf_fit.forecast import PERSISTENCE, extrapolated
 from mbtf_fit.quality import FITTER
 from mbtf_gen.config import GeneratorConfig, count_queries
+from mbtf_gen.durations import parse_duration
 from mbtf_gen.quality import GENERATOR, Quality, as_assignments
 from mbtf_gen.quality_measured import FORMAT, STORED, Chain, markdown_table, read_expected
 from mbtf_gen.settings import resolve
@@ -53,14 +55,16 @@ HEIGHTS: dict[str, float] = {
     "stone_bricks": 0.06,
     "tree_bark": 0.1,
 }
-# The set that `high` is measured on, and `paper` extrapolated for.
+# The set that `high` is measured on, and `paper` extrapolated for, and the share of its training that another
+# fit of it gets.
 LONG = "rock_cliff"
+QUARTER = 0.25
 # Seconds of the whole chain.
 BARS = {"draft": 60.0, "standard": 600.0}
 BAR_LEVELS = 7
 # Largest factors between a stored figure and another run.
 CHECK = {"seconds": 1.3, "error": 1.5}
-QUALITIES: tuple[str, ...] = get_args(Quality)
+QUALITIES: tuple[Quality, ...] = get_args(Quality)
 PAGE = ROOT / "docs" / "cost.md"
 BEGIN, END = "<!-- qualities: begin -->", "<!-- qualities: end -->"
 RECIPE = """\
@@ -85,8 +89,9 @@ def folder_bytes(folder: Path) -> int:
     return sum(p.stat().st_size for p in folder.rglob("*") if p.is_file())
 
 
-def run(name: str, quality: Quality, levels: int, work: Path) -> Chain:
-    """One chain, timed from outside; what an interrupted one left in `work` was not, and is removed.
+def run(name: str, quality: Quality, levels: int, work: Path, share: float = 1.0) -> Chain:
+    """One chain that trains for a share of the quality's time, timed from outside; what an interrupted one
+    left in `work` was not, and is removed.
 
     Raises
     ------
@@ -101,6 +106,9 @@ def run(name: str, quality: Quality, levels: int, work: Path) -> Chain:
     )
     recipe.write_text(text, encoding="utf-8")
     command = [sys.executable, "-m", "mbtf_pipeline", "run", str(recipe), "--quality", quality]
+    if share != 1:
+        training = share * parse_duration(FITTER[quality]["training.time"])
+        command += ["--set", f"fit.training.time={training:g}s"]
     start = time.perf_counter()
     done = subprocess.run(
         [*command, "-o", str(out), "--json", "--quiet"], stdout=subprocess.PIPE, text=True, check=False
@@ -126,6 +134,7 @@ def run(name: str, quality: Quality, levels: int, work: Path) -> Chain:
         sum(p.stat().st_size for p in fit.glob("weights*")),
         round(read_training(fit).samples_per_second),
         settings_hash(quality),
+        share,
     )
     shutil.rmtree(work)
     return found
@@ -140,21 +149,28 @@ def line(c: Chain) -> str:
     )
 
 
-def wanted(only: list[str] | None) -> list[tuple[str, str]]:
-    """(material, quality) to measure.
+def wanted(only: list[str] | None) -> list[tuple[str, Quality, float]]:
+    """(material, quality, share of its training) to measure.
 
     Raises
     ------
     SystemExit : a name that is none
     """
     if not only:
-        return [(name, q) for q in ("draft", "standard") for name in HEIGHTS] + [(LONG, "high")]
+        short: tuple[Quality, ...] = ("draft", "standard")
+        return [
+            *((name, q, 1.0) for q in short for name in HEIGHTS),
+            (LONG, "high", QUARTER),
+            (LONG, "high", 1.0),
+        ]
     out = []
     for text in only:
         name, _, quality = text.partition(":")
         if quality not in QUALITIES or not source(name)[0].is_dir():
             raise SystemExit(f"--only {text}: must be MATERIAL:QUALITY, such as rock_cliff:draft")
-        out.append((name, quality))
+        if (name, quality) == (LONG, "high"):
+            out.append((name, quality, QUARTER))
+        out.append((name, quality, 1.0))
     return out
 
 
@@ -167,7 +183,7 @@ def kept(folder: Path, levels: int) -> list[Chain]:
             found.append(chain)
         else:
             print(f"{path}: left out, measured with other settings; remove it", file=sys.stderr)
-    return sorted(found, key=lambda c: (QUALITIES.index(c.quality), c.material))
+    return sorted(found, key=lambda c: (QUALITIES.index(c.quality), c.material, c.share))
 
 
 def paths_of(quality: str, levels: int) -> float:
@@ -188,23 +204,25 @@ def paper(chains: list[Chain], levels: int) -> tuple[Chain | None, str]:
     law = (
         "Of `paper`, generating takes the seconds of `high` times the ratio of their numbers of paths, data "
         "the bytes times that of their queries, and training 30 000 steps of 2²⁰ queries at the rate of "
-        "`standard`. In the error's logarithm every doubling of the training time gains "
+        "`high`. In the error's logarithm every doubling of the training time gains "
         f"q = {PERSISTENCE:g} of what the one before gained: "
-        "E_paper = E_standard · (E_high / E_standard)^((1 − q^p) / (1 − q^h)), where training takes 2^h "
-        "and 2^p times as long in `high` and `paper` as in `standard`. That `paper` has fewer, cleaner "
+        "E_paper = E_quarter · (E_high / E_quarter)^((1 − q^(p+2)) / (1 − q²)), where training takes 2^p "
+        "times as long as in `high`, and E_quarter is what `high` leaves with a quarter of its training"
+    )
+    known = {c.share: c for c in chains if (c.material, c.quality) == (LONG, "high")}
+    if known.keys() != {1.0, QUARTER}:
+        return None, law
+    high, quarter = known[1.0], known[QUARTER]
+    law += (
+        f": {quarter.unexplained:.3f} ± {quarter.unexplained_error:.3f}. That `paper` has fewer, cleaner "
         "queries is left out of account"
     )
-    known = {(c.material, c.quality): c for c in chains}
-    found = [c for c in chains if c.quality == "high" and (c.material, "standard") in known]
-    if not found:
-        return None, law
-    high, standard = found[0], known[found[0].material, "standard"]
     config = resolve(FitConfig, assignments=as_assignments(FITTER["paper"]))
     assert config.training.steps is not None
     samples = config.training.steps * config.training.batch
-    fit = samples / standard.queries_per_second
+    fit = samples / high.queries_per_second
     generate = high.generate * paths_of("paper", levels) / paths_of("high", levels)
-    apart, doublings = (math.log2(seconds / standard.fit) for seconds in (high.fit, fit))
+    doublings = math.log2(fit / high.fit)
     queries = {
         q: count_queries(GENERATOR[q]["queries.train"], 4**levels) + int(GENERATOR[q]["queries.test"])
         for q in ("high", "paper")
@@ -218,13 +236,12 @@ def paper(chains: list[Chain], levels: int) -> tuple[Chain | None, str]:
             round(generate),
             round(fit),
             round(
-                extrapolated(standard.unexplained, high.unexplained, doublings - apart, apart=apart),
-                3,
+                extrapolated(quarter.unexplained, high.unexplained, doublings, apart=-math.log2(QUARTER)), 3
             ),
             0.0,
             round(high.data_bytes * queries["paper"] / queries["high"]),
-            standard.material_bytes,
-            standard.queries_per_second,
+            high.material_bytes,
+            high.queries_per_second,
             settings_hash("paper"),
         ),
         law,
@@ -253,10 +270,10 @@ def store(chains: list[Chain], levels: int) -> None:
 
 def check(chains: list[Chain]) -> list[dict[str, Any]]:
     """Factors between the stored figures and these."""
-    stored = {(c.material, c.quality): c for c in read_expected(STORED).chains}
+    stored = {(c.material, c.quality, c.share): c for c in read_expected(STORED).chains}
     out = []
     for c in chains:
-        other = stored.get((c.material, c.quality))
+        other = stored.get((c.material, c.quality, c.share))
         if other is not None:
             pairs = {"seconds": (c.seconds, other.seconds), "error": (c.unexplained, other.unexplained)}
             factors = {name: max(a / b, b / a) for name, (a, b) in pairs.items()}
@@ -275,14 +292,15 @@ def main() -> int:
     parser.add_argument("--check", action="store_true", help="hold the figures against the stored ones")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
-    for name, quality in wanted(arguments.only):
-        path = arguments.out / f"{name}-{quality}-{arguments.levels}.json"
+    for name, quality, share in wanted(arguments.only):
+        part = "" if share == 1 else f"-{share:g}"
+        path = arguments.out / f"{name}-{quality}{part}-{arguments.levels}.json"
         if path.exists():
             continue
         if not source(name)[0].is_dir():
             print(f"{name}: left out, {source(name)[0]} is missing", file=sys.stderr)
             continue
-        found = run(name, quality, arguments.levels, arguments.out / ".work")
+        found = run(name, quality, arguments.levels, arguments.out / ".work", share)
         path.write_text(json.dumps(asdict(found)) + "\n", encoding="utf-8")
         print(line(found), flush=True)
     chains = kept(arguments.out, arguments.levels)

@@ -26,7 +26,7 @@ from typing import Any
 
 from mbtf_gen.config import GeneratorConfig
 from mbtf_gen.errors import MbtfError
-from mbtf_pipeline.cost.chains import Chain, Workshop
+from mbtf_pipeline.cost.chains import Chain, Wanted, Workshop
 from mbtf_pipeline.cost.points import POINT_SCHEMA
 from mbtf_pipeline.plots import Cloud, scatter
 
@@ -93,7 +93,7 @@ def measure(
                 if row is None:
                     queries = max(1, int(budget) // spp)
                     point = shop.measure(Chain("data", f"{budget:g} paths", f"{spp}", queries, spp, fit))
-                    shop.forget(queries, spp)
+                    shop.forget(Wanted(queries, spp))
                     row = {**key, "queries": queries, "unexplained": point.error.as_dict()}
                     kept.add(row)
                 rows.append(row)

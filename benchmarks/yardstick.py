@@ -48,7 +48,7 @@ def make_shards(folder: Path) -> Path:
 
 
 def train(model: str, shards: Path, out: Path, time: str, seed: int) -> FitResult:
-    """One fit, with a line per look at the held-out queries."""
+    """One fit, with a line per look at the error."""
     options = MODELS[model]
     training = options.get("training", {}) | {"time": time}
     config = FitConfig.model_validate({**options, "seed": seed, "training": training})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import signal
 import threading
 import time
@@ -12,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from mbtf_gen.atomic import read_json, write_json, write_text
@@ -21,7 +23,7 @@ from mbtf_gen.settings import differences, dump_yaml, in_short
 from mbtf_gen.stats import Estimate, pooled_variance, unexplained_variance
 
 from .config import FitConfig
-from .data import Partition, Queries, data_hash, load_training, mean_value, open_data
+from .data import Partition, Queries, data_hash, load_split, load_training, mean_value, open_data
 from .evaluation import judge
 from .exports import LAYERS_NAME, TEXTURES_NAME
 from .material import Material, export
@@ -53,11 +55,12 @@ _OWN_FILES = (
 )
 _FORMAT = "mbtf-fit"
 _SCHEMA = 1
-# Seconds of training between two looks at held-out queries, and between two checkpoints.
+# Seconds of training between two looks at the error, and between two checkpoints.
 _REPORT_SECONDS = 2.0
 _CHECKPOINT_SECONDS = 15.0
-# Held-out queries that are looked at while training.
-_GLANCE = 1 << 14
+# Queries that are looked at while training, and the fewest of a test split that tells more than queries of
+# few paths.
+_GLANCE, _FEWEST = 1 << 14, 1 << 12
 
 # Called with the share of the budget that is spent and a note on how it goes.
 ProgressCallback = Callable[[float, str], None]
@@ -71,7 +74,7 @@ class FitResult:
     ----------
     material : the fitted material, as its folder holds it
     folder : of the material
-    history : one record per look at the held-out queries: step, seconds, loss, held_out, …
+    history : one record per look at the error: step, seconds, loss, unexplained, …
     seconds : of training, over all runs; total_seconds : of this run, loading and evaluation included
     errors : split → errors; splits ``test``, ``held_out_queries``, ``held_out_directions``
     resumed : whether an earlier run was taken up
@@ -101,7 +104,8 @@ class FitResult:
     @property
     def price(self) -> Price | None:
         """What the last seconds bought; None where the history does not tell."""
-        return price_of(self.history, self.errors, self.material.description["training"].get("noise"))
+        training = self.material.description["training"]
+        return price_of(self.history, self.errors, training.get("noise"), training.get("looks_at", "test"))
 
 
 def choose_device(name: str) -> torch.device:
@@ -167,7 +171,8 @@ def fit(
         partition = load_training(data, config.held_out, config.seed, config.data.memory)
     trainer = prepare_trainer(config, data, partition, device)
     resumed = _resume(trainer, out)
-    _train(trainer, partition.held_out_queries, out, progress or (lambda share, note: None))
+    looks_at, glance = _glance(trainer, data, partition)
+    _train(trainer, glance, out, progress or (lambda share, note: None))
     trainer.calibrate()
     training = {
         "steps": trainer.progress.step,
@@ -175,6 +180,7 @@ def fit(
         "queries": len(partition.training),
         "seconds": round(trainer.progress.seconds, 3),
         "loss": trainer.progress.loss,
+        "looks_at": looks_at,
         "coverage": {str(level): share for level, share in trainer.coverage().items()},
         "device": str(device),
         "threads": torch.get_num_threads(),
@@ -286,8 +292,13 @@ def _resume(trainer: Trainer, out: Path) -> bool:
     return True
 
 
-def _train(trainer: Trainer, held_out: Queries, out: Path, progress: ProgressCallback) -> None:
-    glance = glance_of(trainer, held_out)
+def _glance(trainer: Trainer, data: Dataset, partition: Partition) -> tuple[str, Queries]:
+    """What is looked at while training, as a copy: the other judging queries need not stay in memory."""
+    looks_at, judging = judging_queries(data, partition)
+    return looks_at, glance_of(trainer, judging)
+
+
+def _train(trainer: Trainer, glance: Queries, out: Path, progress: ProgressCallback) -> None:
     saved = time.perf_counter()
     done = trainer.share >= 1.0
     with _finishing_steps(trainer):
@@ -324,10 +335,24 @@ def _finishing_steps(trainer: Trainer) -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def glance_of(trainer: Trainer, held_out: Queries) -> Queries:
-    """The held-out queries that are looked at while training. Looking costs time, of a model of
+def judging_queries(data: Dataset, partition: Partition) -> tuple[str, Queries]:
+    """The set that tells how good a fit is, before and while it is trained, and its name among the errors.
+
+    That of the test split, which has more paths: of gloss, four paths per query often cannot tell at all. Of
+    the held-out queries where there is no such split, or one of few queries. Nothing is chosen by it.
+    """
+    held_out = partition.held_out_queries
+    test = load_split(data, "test") if "test" in data.splits and data.shards("test") else None
+    if test is not None and len(test) >= min(len(held_out), _FEWEST):
+        return "test", test
+    return "held_out_queries", held_out
+
+
+def glance_of(trainer: Trainer, queries: Queries, most: int = _GLANCE) -> Queries:
+    """So many of the judging queries at most, from all parts of them. Looking costs time, of a model of
     neighbourhoods more than of the others."""
-    return held_out.take(slice(max(_GLANCE // trainer.model.positions, _GLANCE // 16)))
+    most = max(most // trainer.model.positions, most // 16)
+    return queries.take(np.arange(0, len(queries), max(1, math.ceil(len(queries) / most))))
 
 
 def missed(trainer: Trainer, queries: Queries) -> Estimate:
@@ -342,20 +367,20 @@ def _record(trainer: Trainer, glance: Queries) -> dict[str, Any]:
         "seconds": round(state.seconds, 3),
         "share": round(trainer.share, 5),
         "loss": state.loss,
-        "held_out": None,
-        "held_out_error": None,
+        "unexplained": None,
+        "unexplained_error": None,
         "queries_per_second": round(state.step * trainer.batch / max(state.seconds, 1e-9)),
     }
     if len(glance):
         found = missed(trainer, glance).as_dict()
-        record |= {"held_out": found["value"], "held_out_error": found["error"]}
+        record |= {"unexplained": found["value"], "unexplained_error": found["error"]}
     return record
 
 
 def _note(record: dict[str, Any]) -> str:
     note = f"loss {record['loss']:.3f}"
-    if record["held_out"] is not None:
-        note += f", held out {record['held_out']:.3f} ± {record['held_out_error']:.3f}"
+    if record["unexplained"] is not None:
+        note += f", unexplained {record['unexplained']:.3f} ± {record['unexplained_error']:.3f}"
     return f"{note}, {record['queries_per_second'] / 1e6:.2f} M queries/s"
 
 

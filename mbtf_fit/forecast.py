@@ -12,17 +12,19 @@ from mbtf_gen.console import clock
 
 from .config import FitConfig
 from .data import load_training, open_data
-from .fitting import choose_device, glance_of, missed, prepare_trainer
+from .fitting import choose_device, glance_of, judging_queries, missed, prepare_trainer
 from .memory import keep_freed_memory
 from .models import MODELS
+from .wording import SPLIT_NAMES
 
 # Seconds of the two pilot fits; each runs through the whole schedule in its time.
 PILOT_SECONDS = (4.0, 8.0)
 # Every doubling of the time gains this share of what the one before gained, in the logarithm of the error:
-# the model's size and the data end what training can reach. benchmarks/forecasts.py finds it anew: 0.3 for
-# fits of 60 s with the options of the qualities on data of a draft; smaller networks, and more data, have 0.5
-# and more.
+# the model's size and the data end what training can reach. What suits fits of 60 s with the options of the
+# qualities on data of a draft, of ten materials; benchmarks/forecasts.py finds it anew.
 PERSISTENCE = 0.45
+# Judging queries at most: few rule the errors, and the fit will be judged by all.
+_JUDGING = 1 << 17
 # Bytes of a number in the material's file.
 _NUMBER = 4
 
@@ -36,9 +38,10 @@ class FitForecast:
     seconds : of training; loading : of reading the data
     steps : that the time is enough for
     queries_per_second : trained on
-    unexplained : variance of held-out queries that it will miss; None where nothing is held out, or varies
+    looks_at : the set of queries that errors are of, in words: the test split, or what was held out
+    unexplained : variance of these that it will miss; None where there are none, or they do not vary
     at_most : the same after the longer pilot
-    pilots : the same after each of them; none where nothing is held out, or varies
+    pilots : the same after each of them; empty where there is none
     bytes : of the material's numbers
     pilot_seconds : what the forecast took, loading included
     """
@@ -47,6 +50,7 @@ class FitForecast:
     loading: float
     steps: int
     queries_per_second: float
+    looks_at: str
     unexplained: float | None
     at_most: float | None
     pilots: tuple[float, ...]
@@ -66,7 +70,7 @@ class FitForecast:
         ]
         if self.unexplained is not None:
             lines.append(
-                f"unexplained variance of held-out queries about {self.unexplained:.2f}; "
+                f"unexplained variance of {self.looks_at} about {self.unexplained:.2f}; "
                 f"{self.at_most:.2f} after {clock(PILOT_SECONDS[1])}"
             )
         return "\n".join(lines)
@@ -96,6 +100,7 @@ def forecast_fit(config: FitConfig, shards: str | Path) -> FitForecast:
     data = open_data(shards, MODELS[config.model].layout, config.model)
     keep_freed_memory()
     partition = load_training(data, config.held_out, config.seed, config.data.memory)
+    looks_at, judging = judging_queries(data, partition)
     loading = time.perf_counter() - began
     found: list[float] = []
     for seconds in PILOT_SECONDS:
@@ -104,8 +109,9 @@ def forecast_fit(config: FitConfig, shards: str | Path) -> FitForecast:
         trainer = prepare_trainer(pilot, data, partition, device)
         while not trainer.train(math.inf):
             pass
-        if len(glance := glance_of(trainer, partition.held_out_queries)):
-            found.append(missed(trainer, glance).value)
+        judged = glance_of(trainer, judging, _JUDGING)
+        if len(judged):
+            found.append(missed(trainer, judged).value)
     if not all(map(math.isfinite, found)):
         found.clear()
     rate = trainer.progress.step / trainer.progress.seconds
@@ -117,6 +123,7 @@ def forecast_fit(config: FitConfig, shards: str | Path) -> FitForecast:
         loading=loading,
         steps=round(total * rate) if steps is None else steps,
         queries_per_second=rate * trainer.batch,
+        looks_at=SPLIT_NAMES[looks_at],
         unexplained=extrapolated(found[0], found[1], math.log2(total / PILOT_SECONDS[1])) if found else None,
         at_most=found[-1] if found else None,
         pilots=tuple(found),

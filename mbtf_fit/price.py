@@ -8,6 +8,8 @@ from typing import Any
 
 from mbtf_gen.console import clock
 
+from .wording import SPLIT_NAMES
+
 # The record that stands for the middle of training lies between these shares of it.
 _MIDDLE = (0.35, 0.65)
 # A difference counts where it is so many standard errors.
@@ -18,19 +20,21 @@ _MOST_DOUBLINGS = 12.0
 
 @dataclass(frozen=True)
 class Price:
-    """How the error of held-out queries fell, and what of it is for want of data.
+    """How the error fell, and what of it is for want of data.
 
     Attributes
     ----------
+    looks_at : the set of queries that half and end are of, in words
     half, half_error : unexplained variance at half of the training time, and its standard error
     end, end_error : at its end
     halving : seconds of training more that would halve it if every doubling of the time went on to divide it
         as the last one did; None where that did not clearly help. Rates that fall towards the end of training
         flatter the last doubling, so this is a lower bound
-    noise_share : share of the error that is the noise of the training queries, which the fit has learned;
-        None where it is not clearly above zero
+    noise_share : share of the held-out queries' error that is the noise of the training queries, which the
+        fit has learned; None where it is not clearly above zero
     """
 
+    looks_at: str
     half: float
     half_error: float
     end: float
@@ -45,7 +49,7 @@ class Price:
     def describe(self) -> str:
         """One line, or two."""
         lines = [
-            f"held-out queries {self.half:.3f} ± {self.half_error:.3f} at half of the time, "
+            f"{self.looks_at} {self.half:.3f} ± {self.half_error:.3f} at half of the time, "
             f"{self.end:.3f} ± {self.end_error:.3f} at its end"
         ]
         if self.halving is None:
@@ -54,31 +58,35 @@ class Price:
             lines[0] += f"; halving that would take {clock(self.halving)} more at the least"
         if self.noise_share is not None:
             lines.append(
-                f"{self.noise_share:.0%} of the error is learned noise of the training queries: more "
-                "queries, or more paths per query, would take it away"
+                f"{self.noise_share:.0%} of the error of held-out queries is learned noise of the training "
+                "queries: more queries, or more paths per query, would take it away"
             )
         return "\n".join(lines)
 
 
 def price_of(
-    history: list[dict[str, Any]], errors: dict[str, Any], noise: float | None = None
+    history: list[dict[str, Any]],
+    errors: dict[str, Any],
+    noise: float | None = None,
+    looks_at: str = "test",
 ) -> Price | None:
     """Price of a finished fit; None where its history does not tell.
 
     Parameters
     ----------
-    history : records of the looks at held-out queries, with ``share``, ``seconds``, ``held_out`` and its
-        ``held_out_error``
+    history : records of the looks at the error, with ``share``, ``seconds``, ``unexplained`` and its
+        ``unexplained_error``
     errors : of the finished fit by split, as plain data
     noise : variance of the noise in the training values over that of the values; None where it is not known
+    looks_at : the set, among the errors, that was looked at
     """
-    known = [r for r in history if _number(r.get("held_out")) and _number(r.get("held_out_error"))]
+    known = [r for r in history if _number(r.get("unexplained")) and _number(r.get("unexplained_error"))]
     middle = [r for r in known if _MIDDLE[0] <= r.get("share", -1.0) <= _MIDDLE[1]]
     if not middle or known[-1].get("share", 0.0) < 1.0:
         return None
     last, half = known[-1], min(middle, key=lambda r: abs(r["share"] - 0.5))
-    before, after = half["held_out"], last["held_out"]
-    spread = math.hypot(half["held_out_error"], last["held_out_error"])
+    before, after = half["unexplained"], last["unexplained"]
+    spread = math.hypot(half["unexplained_error"], last["unexplained_error"])
     halving = None
     # Both looks are at the same queries, so this asks for more than it must.
     if after > 0 and before - after > _CLEAR * spread:
@@ -86,7 +94,10 @@ def price_of(
         if doublings < _MOST_DOUBLINGS:
             halving = last["seconds"] * (2.0**doublings - 1.0)
     share = _noise_share(errors, noise)
-    return Price(before, half["held_out_error"], after, last["held_out_error"], halving, share)
+    return Price(
+        SPLIT_NAMES[looks_at],
+        *(before, half["unexplained_error"], after, last["unexplained_error"], halving, share),
+    )
 
 
 def _number(x: Any) -> bool:

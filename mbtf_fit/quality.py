@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from mbtf_gen.durations import parse_duration
 from mbtf_gen.quality import Quality
 from mbtf_gen.settings import merge, read_yaml
 
-# What leaves the least error for the time at every size of budget (docs/cost.md): more features and channels,
-# directions with their z, and textures kept smooth where data say little.
-_NETWORK: dict[str, Any] = {
-    "network.width": 40,
-    "network.channels": 12,
-    "network.encoding.lifted": True,
-}
+# What leaves the least error for the time (docs/cost.md): more features and channels than the paper's, the
+# more the longer training is (seconds), directions with their z, and textures kept smooth where data say
+# little.
+_SIZES = (
+    (0.0, {"network.width": 40, "network.channels": 12}),
+    (300.0, {"network.width": 64, "network.channels": 16}),
+)
+_LIFTED: dict[str, Any] = {"network.encoding.lifted": True}
 _SMOOTH: dict[str, Any] = {"training.decay": 1.0, "training.blur.floor": 0.8}
-BEST: dict[str, Any] = {**_NETWORK, **_SMOOTH}
 # Models that it was measured for.
 _MODELS = ("neumip", "neumip-baseline")
 
@@ -31,9 +33,31 @@ FITTER: dict[Quality, dict[str, Any]] = {
 }
 
 
+def _network(seconds: float) -> dict[str, Any]:
+    size = [size for least, size in _SIZES if seconds >= least][-1]
+    return size | _LIFTED
+
+
+def best_options(seconds: float) -> dict[str, Any]:
+    """Network and smoothing of `neumip` and its baseline, dotted names, for so many seconds of training
+    on two processor cores."""
+    return _network(seconds) | _SMOOTH
+
+
+def best_at(quality: Quality) -> dict[str, Any]:
+    """:func:`best_options` of the time that a quality trains for."""
+    return best_options(_seconds(quality))
+
+
+def _seconds(quality: Quality) -> float:
+    """Of training; infinitely many where steps are counted."""
+    training = FITTER[quality].get("training.time")
+    return math.inf if training is None else parse_duration(training)
+
+
 def fitter_options(quality: Quality, fits: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
     """Options of fits at a quality, dotted names: how long they train, and for `neumip` and its baseline what
-    :data:`BEST` holds and nobody has said anything about.
+    of :func:`best_at` nobody has said anything about.
 
     What is said of one fit's network keeps all of them as their papers have them: such fits are compared for
     it.
@@ -49,7 +73,7 @@ def fitter_options(quality: Quality, fits: Mapping[str, Mapping[str, Any]]) -> d
         training = training if isinstance(training, Mapping) else {}
         options: dict[str, Any] = {}
         if said.get("model") in _MODELS:
-            options |= _NETWORK if free else {}
+            options |= _network(_seconds(quality)) if free else {}
             options |= {k: v for k, v in _SMOOTH.items() if k.split(".")[1] not in training}
         out[name] = options | FITTER[quality]
     return out

@@ -6,8 +6,8 @@ from typing import Any
 
 from mbtf_gen.console import clock
 
-_SPLITS = {
-    "test": "test",
+SPLIT_NAMES = {
+    "test": "test queries",
     "held_out_queries": "held-out queries",
     "held_out_directions": "held-out directions",
     "training": "training queries",
@@ -24,7 +24,7 @@ def table(rows: list[list[str]]) -> str:
 def describe_errors(errors: dict[str, Any]) -> list[str]:
     """A table: overall, by level of detail and by lowest cosine; a column per split, with error bars."""
     splits = list(errors)
-    rows = [["unexplained variance", *(_SPLITS[name] for name in splits)]]
+    rows = [["unexplained variance", *(SPLIT_NAMES[name] for name in splits)]]
     rows.append(["all", *(number(errors[name]["unexplained"]) for name in splits)])
     for grouping, label in (("levels", "level"), ("elevations", "cosine")):
         groups = {group: None for name in splits for group in errors[name][grouping]}
@@ -61,7 +61,7 @@ def describe_transmittance(errors: dict[str, Any] | None) -> list[str]:
             max(0.0, x) ** 0.5 for x in (e["mse"]["value"], e["noise"]["value"], e["variance"])
         )
         lines.append(
-            f"transmittance, {_SPLITS[name]}: rms error {rms:.3f}, of which noise of the data at most "
+            f"transmittance, {SPLIT_NAMES[name]}: rms error {rms:.3f}, of which noise of the data at most "
             f"{noise:.3f} (values spread by {spread:.3f}; {e['n']} queries)"
         )
     return lines

@@ -31,6 +31,7 @@ class Chain:
     data_bytes, material_bytes : on disk
     queries_per_second : trained on
     settings : hash of all that the quality set
+    share : of the quality's training time that it trained for
     """
 
     material: str
@@ -45,6 +46,7 @@ class Chain:
     material_bytes: int
     queries_per_second: float
     settings: str
+    share: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,7 @@ class Expected:
 
     def of(self, quality: str) -> list[Chain]:
         """Measured chains of a quality; extrapolated ones where there are none."""
-        return [c for c in self.chains if c.quality == quality] or [
+        return [c for c in self.chains if c.quality == quality and c.share == 1] or [
             c for c in self.extrapolated if c.quality == quality
         ]
 

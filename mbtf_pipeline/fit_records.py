@@ -16,7 +16,7 @@ class History:
     ----------
     steps, batch : number of steps and queries per step
     seconds : of training; device : it ran on; threads : of the processor
-    records : one per look at the held-out queries, as ``mbtf_fit.read_history`` gives them
+    records : one per look at the error, as ``mbtf_fit.read_history`` gives them
     """
 
     steps: int
@@ -42,12 +42,12 @@ class History:
         return [(r["seconds"], r["loss"]) for r in self.records if _finite(r["loss"])]
 
     @property
-    def held_out(self) -> list[tuple[float, float, float]]:
-        """(seconds, unexplained variance of held-out queries, its standard error)."""
+    def unexplained(self) -> list[tuple[float, float, float]]:
+        """(seconds, unexplained variance of the queries looked at, its standard error)."""
         return [
-            (r["seconds"], r["held_out"], r["held_out_error"])
+            (r["seconds"], r["unexplained"], r["unexplained_error"])
             for r in self.records
-            if _finite(r["held_out"]) and _finite(r["held_out_error"])
+            if _finite(r.get("unexplained")) and _finite(r.get("unexplained_error"))
         ]
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mbtf_fit.quality import BEST, FITTER, fitter_options, said_of
+from mbtf_fit.quality import FITTER, best_at, fitter_options, said_of
 from mbtf_gen.quality import GENERATOR, Quality, as_assignments
 
 from .recipe import fit_names
@@ -52,4 +52,4 @@ def _said_of_fit(said: Mapping[str, Any], prefix: str) -> dict[str, Any]:
 
 def settings_hash(quality: Quality) -> str:
     """Hash of all that a quality sets: figures that were measured with others are out of date."""
-    return hash_of([GENERATOR[quality], BEST, FITTER[quality], COMPARE[quality]])[:12]
+    return hash_of([GENERATOR[quality], best_at(quality), FITTER[quality], COMPARE[quality]])[:12]

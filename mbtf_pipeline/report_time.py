@@ -49,9 +49,9 @@ def time_context(
     ]
     generation = float(manifest["summary"]["shard_seconds"])
     bought = [
-        Curve(name, [generation + s for s, _, _ in h.held_out], *_errors(h))
+        Curve(name, [generation + s for s, _, _ in h.unexplained], *_errors(h))
         for name, h in histories.items()
-        if h.held_out
+        if h.unexplained
     ]
     if bought:
         plots.append(
@@ -60,7 +60,7 @@ def time_context(
                 "svg": curves(
                     bought,
                     "seconds of generation and training",
-                    "unexplained variance, held-out queries",
+                    "unexplained variance",
                     "error over all seconds",
                     logx=True,
                 ),
@@ -104,14 +104,14 @@ def _generation(manifest: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _errors(history: History) -> tuple[list[float], list[float]]:
-    return [e for _, e, _ in history.held_out], [error for _, _, error in history.held_out]
+    return [e for _, e, _ in history.unexplained], [error for _, _, error in history.unexplained]
 
 
 def _at(history: History, share: float) -> str:
-    """Held-out error at a share of the time, and when it was looked at."""
-    if not history.held_out:
+    """Error at a share of the time, and when it was looked at."""
+    if not history.unexplained:
         return "–"
-    seconds, value, error = min(history.held_out, key=lambda r: abs(r[0] - share * history.seconds))
+    seconds, value, error = min(history.unexplained, key=lambda r: abs(r[0] - share * history.seconds))
     return f"{error_text(_measured(value, error))} at {seconds:.0f} s"
 
 
@@ -125,7 +125,7 @@ def _bought(history: History) -> str:
 
     The error bar takes the two looks as independent. They are at the same queries, so it is rather too wide.
     """
-    later = [r for r in history.held_out if r[0] >= 0.5 * history.seconds]
+    later = [r for r in history.unexplained if r[0] >= 0.5 * history.seconds]
     if len(later) < 2 or later[-1][0] <= later[0][0]:
         return "–"
     (start, before, error_before), (end, after, error_after) = later[0], later[-1]
@@ -147,7 +147,7 @@ def _fits(histories: Mapping[str, History]) -> dict[str, Any]:
     ]
     head = [f"after {share:.0%}" for share in _SHARES]
     return {
-        "title": "Fit: unexplained variance of held-out queries after shares of its seconds",
+        "title": "Fit: unexplained variance after shares of its seconds",
         "head": ["fit", "seconds", "queries", "rate", *head, "bought per 10 s, second half"],
         "rows": rows,
     }

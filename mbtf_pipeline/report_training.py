@@ -12,14 +12,14 @@ from .plots import Curve, curves
 def training_context(histories: Mapping[str, History]) -> dict[str, Any]:
     """What the template shows about training; one history per fit."""
     loss = [Curve(name, *_columns(h.loss)) for name, h in histories.items() if h.loss]
-    held = [Curve(name, *_columns(h.held_out)) for name, h in histories.items() if h.held_out]
+    errors = [Curve(name, *_columns(h.unexplained)) for name, h in histories.items() if h.unexplained]
     plots = []
     if loss:
         svg = curves(loss, "seconds of training", "training loss", "training loss over seconds")
         plots.append({"title": "Training loss, noise included", "svg": svg})
-    if held:
-        svg = curves(held, "seconds of training", "unexplained variance", "held-out error over seconds")
-        plots.append({"title": "Error on held-out queries, noise-free", "svg": svg})
+    if errors:
+        svg = curves(errors, "seconds of training", "unexplained variance", "error over seconds")
+        plots.append({"title": "Error while training, noise-free", "svg": svg})
     lines = [
         f"{name}: {h.steps:,} steps of {h.batch:,} queries in {h.seconds:.0f} s on {h.device}, {h.threads} "
         f"threads ({h.samples_per_second / 1e6:.2f} M queries/s)"

@@ -3,33 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
-from mbtf_fit.quality import BEST
+from mbtf_fit.quality import best_options
 from mbtf_gen.settings import nested
 
 from .chains import Chain
 
 # Shares of the budget; the generator's own studies take GENERATOR, what is left over is for starting up and
-# judging.
-GENERATOR, DATA, FIT, WHOLE = 0.18, 0.15, 0.24, 0.3
+# judging. DATA pays for the chains of other seeds, too.
+GENERATOR, DATA, FIT, WHOLE = 0.18, 0.22, 0.2, 0.3
 # The shortest whole chain, seconds, the share of every chain that generates, and other shares that are tried.
 SHORTEST = 60.0
 SHARE = 0.35
 OTHER_SHARES = (0.6, 0.15)
-# Fits with other seeds, which show how far fits scatter.
+# Chains of other seeds at each of two sizes of data, which show how far chains scatter.
 SEEDS = 3
 PATHS = (2, 4, 16, 64)
 # Path budgets at which they are compared, of the largest.
 PATH_SHARES = (0.4, 1.6)
 # What fits with the options of the qualities are called; chains are made of these.
 QUALITIES = "neumip of the qualities"
-# Models as their papers have them, and networks of other sizes; the last is that of the qualities without
-# their smoothing.
+# Models as their papers have them, and networks of other sizes; the last two are those of the qualities
+# without their smoothing.
 MODELS = ("neumip", "neumip-baseline")
 SIZES: dict[str, dict[str, object]] = {
     "16 wide": {"width": 16},
     "40 wide": {"width": 40},
     "40 wide, 12 channels, z": {"width": 40, "channels": 12, "encoding": {"lifted": True}},
+    "64 wide, 16 channels, z": {"width": 64, "channels": 16, "encoding": {"lifted": True}},
 }
 _FEWEST_QUERIES = 20_000
 
@@ -52,28 +54,20 @@ def _fit(model: str, seconds: float, network: dict[str, object] | None = None) -
 
 def _best(seconds: float) -> dict[str, object]:
     """Options of a fit as the qualities have it."""
-    return nested({"model": "neumip", **BEST, "training.time": f"{seconds:.3g}s"})
+    return nested({"model": "neumip", **best_options(seconds), "training.time": f"{seconds:.3g}s"})
 
 
-def chains(budget: float, spp: int, price: Price, seed: int = 0) -> Iterator[Chain]:
+def chains(budget: float, spp: int, price: Price) -> Iterator[Chain]:
     """All chains that a budget in seconds allows.
 
     Parameters
     ----------
     spp : paths per query of the recipe
     price : seconds that a query takes to generate, by its number of paths
-    seed : of the study; fits that show how far fits scatter take the next ones
     """
     yield from _whole(WHOLE * budget, spp, price)
-    # On average a point of this study generates for a third of its time and trains for the rest.
-    each = DATA * budget / (len(PATHS) * len(PATH_SHARES))
-    paths = spp * _queries(each / 3, spp, price)
-    for n in PATHS:
-        for share in PATH_SHARES:
-            queries = max(_FEWEST_QUERIES, int(share * paths) // n)
-            name = f"{queries * n / 1e6:.3g} M paths"
-            yield Chain("data", f"{n} paths/query", name, queries, n, _best(2 * each / 3))
-    yield from _fits(FIT * budget, spp, price, seed)
+    yield from _data(DATA * budget, spp, price)
+    yield from _fits(FIT * budget, spp, price)
 
 
 def _whole(budget: float, spp: int, price: Price) -> Iterator[Chain]:
@@ -97,21 +91,35 @@ def _whole(budget: float, spp: int, price: Price) -> Iterator[Chain]:
         )
 
 
-def _fits(budget: float, spp: int, price: Price, seed: int) -> Iterator[Chain]:
+def _data(budget: float, spp: int, price: Price) -> Iterator[Chain]:
+    """Queries and paths at equal numbers of paths, and the same setting with other seeds."""
+    # On average a point generates for a third of its time and trains for the rest.
+    each = budget / (len(PATH_SHARES) * (len(PATHS) + SEEDS))
+    paths = spp * _queries(each / 3, spp, price)
+    # Bars of all chains rest on these; the recipe's number of paths per query is what most chains have.
+    usual = min(PATHS, key=lambda n: abs(n - spp))
+    for n in PATHS:
+        for share in PATH_SHARES:
+            queries = max(_FEWEST_QUERIES, int(share * paths) // n)
+            name = f"{queries * n / 1e6:.3g} M paths"
+            chain = Chain("data", f"{n} paths/query", name, queries, n, _best(2 * each / 3))
+            yield chain
+            if n == usual:
+                for other in range(1, SEEDS + 1):
+                    yield replace(chain, study="seeds", name=f"{name}, seed + {other}", seed=other)
+
+
+def _fits(budget: float, spp: int, price: Price) -> Iterator[Chain]:
     """Models and sizes over training time, on one data set."""
-    unit = budget / 19.5
+    unit = budget / 18.5
     queries = _queries(1.5 * unit, spp, price)
 
-    def chain(study: str, series: str, name: str, fit: dict[str, object]) -> Chain:
-        return Chain(study, series, name, queries, spp, fit)
+    def chain(series: str, seconds: float, fit: dict[str, object]) -> Chain:
+        return Chain("fit", series, f"{seconds:.3g} s", queries, spp, fit)
 
     for seconds in (unit, 2 * unit):
-        yield chain("fit", QUALITIES, f"{seconds:.3g} s", _best(seconds))
-        if seconds == unit:
-            # Bars of all chains rest on these.
-            for other in range(seed + 1, seed + 1 + SEEDS):
-                yield chain("seeds", QUALITIES, f"seed {other}", {**_best(unit), "seed": other})
+        yield chain(QUALITIES, seconds, _best(seconds))
         for model in MODELS:
-            yield chain("fit", model, f"{seconds:.3g} s", _fit(model, seconds))
+            yield chain(model, seconds, _fit(model, seconds))
     for size, network in SIZES.items():
-        yield chain("fit", f"neumip, {size}", f"{2 * unit:.3g} s", _fit("neumip", 2 * unit, network))
+        yield chain(f"neumip, {size}", 2 * unit, _fit("neumip", 2 * unit, network))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,6 +38,15 @@ _FEWEST = "64"
 
 
 @dataclass(frozen=True)
+class Wanted:
+    """Training data to make: number of queries, paths of each, and what is added to the study's seed."""
+
+    queries: int
+    spp: int
+    seed: int = 0
+
+
+@dataclass(frozen=True)
 class Chain:
     """One chain to measure.
 
@@ -46,6 +55,7 @@ class Chain:
     study, series, name : see :class:`~mbtf_pipeline.cost.points.Point`
     queries, spp : training queries, and paths of each
     fit : options of the fitter, as its configuration has them
+    seed : added to the study's, of data and fit
     """
 
     study: str
@@ -54,11 +64,17 @@ class Chain:
     queries: int
     spp: int
     fit: dict[str, Any] = field(default_factory=dict)
+    seed: int = 0
 
     @property
     def key(self) -> dict[str, Any]:
         """What the point depends on besides the study's basis."""
-        return {"queries": self.queries, "spp": self.spp, "fit": self.fit}
+        return {**asdict(self.data), "fit": self.fit}
+
+    @property
+    def data(self) -> Wanted:
+        """Its training data."""
+        return Wanted(self.queries, self.spp, self.seed)
 
     def seconds(self, price: Callable[[int], float], *, data: bool = True) -> float:
         """What it will take, where a query of so many paths takes ``price(paths)`` seconds to generate;
@@ -92,7 +108,7 @@ class Workshop:
         self.folder = folder
         self.command = command
         self.progress = progress
-        self._made: dict[str, _Data] = {}
+        self._made: dict[Wanted, _Data] = {}
         self._judges: Judges | None = None
         self._said = False
 
@@ -100,12 +116,13 @@ class Workshop:
         """Remove data and fits; points hold what was measured on them."""
         shutil.rmtree(self.folder, ignore_errors=True)
 
-    def _generate(self, queries: str, spp: int) -> _Data:
+    def _generate(self, wanted: Wanted) -> _Data:
         """A data set, made anew: what an interrupted study left behind was not timed."""
         data = self.config.model_dump(mode="json")
+        data["seed"] += wanted.seed
         data["queries"] |= {
-            "train": queries,
-            "spp": spp,
+            "train": str(wanted.queries),
+            "spp": wanted.spp,
             "test": _FEWEST,
             "test_spp": 2,
             "layout": "shuffled",
@@ -119,21 +136,20 @@ class Workshop:
         generate(config, folder, job=_quiet_job(config) if said else None)
         return _Data(folder, time.perf_counter() - start)
 
-    def data(self, queries: int, spp: int) -> _Data:
-        """Training data of a size."""
-        key = f"{queries}-{spp}"
-        if key not in self._made:
-            self.progress(f"{queries / 1e6:.2f} M queries of {spp} paths")
-            self._made[key] = self._generate(str(queries), spp)
-        return self._made[key]
+    def data(self, wanted: Wanted) -> _Data:
+        """Training data, made where they are missing."""
+        if wanted not in self._made:
+            self.progress(f"{wanted.queries / 1e6:.2f} M queries of {wanted.spp} paths")
+            self._made[wanted] = self._generate(wanted)
+        return self._made[wanted]
 
-    def has(self, chain: Chain) -> bool:
-        """Whether the data of a chain are there."""
-        return f"{chain.queries}-{chain.spp}" in self._made
+    def has(self, wanted: Wanted) -> bool:
+        """Whether training data are there."""
+        return wanted in self._made
 
-    def forget(self, queries: int, spp: int) -> None:
+    def forget(self, wanted: Wanted) -> None:
         """Remove training data that no other chain needs."""
-        made = self._made.pop(f"{queries}-{spp}", None)
+        made = self._made.pop(wanted, None)
         if made is not None:
             shutil.rmtree(made.folder, ignore_errors=True)
 
@@ -153,9 +169,9 @@ class Workshop:
         from mbtf_fit import FitConfig, fit
 
         judges = self.judges()
-        data = self.data(chain.queries, chain.spp)
+        data = self.data(chain.data)
         self.progress(f"{chain.study}: {chain.series}, {chain.name}")
-        config = FitConfig.model_validate({"seed": self.config.seed, **chain.fit})
+        config = FitConfig.model_validate({"seed": self.config.seed + chain.seed, **chain.fit})
         out = self.folder / f"fit-{hash_of(chain.key)[:12]}"
         shutil.rmtree(out, ignore_errors=True)
         result = fit(config, data.folder, out)
@@ -177,16 +193,19 @@ class Workshop:
             "half_error_se": half.error,
         }
         shutil.rmtree(out, ignore_errors=True)
-        price = {
-            "data": "generation_seconds",
-            "fit": "training_seconds",
-            "seeds": "training_seconds",
-        }.get(chain.study, "total_seconds")
+        price = {"data": "generation_seconds", "seeds": "generation_seconds", "fit": "training_seconds"}.get(
+            chain.study, "total_seconds"
+        )
         return Point(
             chain.study,
             chain.series,
             chain.name,
-            {"queries.train": str(chain.queries), "queries.spp": chain.spp, **_flat(chain.fit)},
+            {
+                "queries.train": str(chain.queries),
+                "queries.spp": chain.spp,
+                **_flat(chain.fit),
+                **({"seed": self.config.seed + chain.seed} if chain.seed else {}),
+            },
             "",
             Estimate(details[price], 0.0, 1),
             error,
@@ -195,9 +214,15 @@ class Workshop:
 
     def command_of(self, chain: Chain) -> str:
         """What makes a chain with the programs."""
-        flags = "".join(f" --set {name}={value}" for name, value in _flat(chain.fit).items())
+        fit = _flat(chain.fit)
+        own = ""
+        if seed := self.config.seed + chain.seed:
+            # Also what the generator's configuration holds already, where the chain is of the study's own.
+            fit["seed"] = seed
+            own = f" --set seed={seed}"
+        flags = "".join(f" --set {name}={value}" for name, value in fit.items())
         return (
-            f"{self.command} --queries {chain.queries} --spp {chain.spp} -o shards/ && "
+            f"{self.command} --queries {chain.queries} --spp {chain.spp}{own} -o shards/ && "
             f"mbtf-fit shards/{flags} -o material/"
         )
 

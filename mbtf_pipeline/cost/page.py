@@ -184,8 +184,8 @@ def write_page(study: Study) -> Path:
             scatter=(
                 ""
                 if scatter is None
-                else f"; those of fits hold {scatter.value:.1%} for the scatter between seeds, as "
-                f"{scatter.n} fits of the shortest kind show it"
+                else "; those of chains hold the scatter between seeds of data and fit, also where chains "
+                f"share their data: {scatter.describe()}"
             ),
             widths=f"{held} of {known} errors are known to within a tenth (95 %).",
         )

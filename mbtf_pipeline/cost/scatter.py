@@ -1,8 +1,13 @@
-"""How far fits of other seeds scatter: what the error bars of chains hold besides that of the test queries.
+"""How far chains scatter: what their error bars hold besides that of the test queries.
 
-Chains of a study share their test queries, so a few fits of one setting, on the same data and with other
-seeds, show how much of a difference between two chains is luck. Errors of fits scatter in proportion to
-themselves, so the standard deviation of their logarithms, measured on the shortest fit, stands for all.
+Another seed brings other data and other first weights. A few chains of one setting, judged by the same test
+queries, show how much of an error is luck. It is in proportion to the error, so the standard deviation of the
+errors' logarithms stands for all chains of as much data. Fits of few data scatter more than those of many,
+because a few bright paths rule them, so it is measured at two sizes: between them the deviation is taken to
+be linear in the size's logarithm, outside of them that of the nearer one.
+
+The size is the number of queries times their paths, of which no more than those of the measured chains count:
+where a query has more, queries are few, and luck is in where they lie; where it has fewer, in their noise.
 """
 
 from __future__ import annotations
@@ -10,7 +15,9 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from mbtf_gen.stats import Estimate
 
@@ -18,33 +25,78 @@ from .points import Point
 
 # Studies whose errors are those of fits.
 FITTED = ("chain", "data", "fit", "seeds")
+# Fewer values tell no deviation.
+_FEWEST = 3
 
 
-def seed_scatter(points: Sequence[Point]) -> Estimate | None:
-    """Relative standard deviation of the error over seeds; None where fewer than three were measured."""
+@dataclass(frozen=True)
+class Scatter:
+    """Relative standard deviation of the error over seeds.
+
+    Attributes
+    ----------
+    spp : paths per query of the chains that it was measured on
+    queries : their numbers of training queries, ascending; at least one
+    deviations : at each of them
+    """
+
+    spp: int
+    queries: tuple[float, ...]
+    deviations: tuple[Estimate, ...]
+
+    def of(self, point: Point) -> float:
+        """Deviation of a chain."""
+        size = _queries(point) * min(1.0, point.setting["queries.spp"] / self.spp)
+        known = [e.value for e in self.deviations]
+        return float(np.interp(math.log(size), np.log(self.queries), known))
+
+    def describe(self) -> str:
+        """``12 ± 5 % at 0.52 M queries × 4, 4 ± 2 % at 2.1 M × 4``."""
+        pairs = zip(self.deviations, self.queries, strict=True)
+        return ", ".join(
+            f"{100 * e.value:.2g} ± {100 * e.error:.1g} % at {n / 1e6:.3g} M queries × {self.spp}"
+            for e, n in pairs
+        )
+
+
+def _queries(point: Point) -> float:
+    return float(point.setting["queries.train"])
+
+
+def _deviation(values: Sequence[float]) -> Estimate:
+    """Standard deviation of normal scatter, unbiased, from n values."""
+    n = len(values)
+    # That of a sample is low by this factor on average.
+    low = math.sqrt(2 / (n - 1)) * math.gamma(n / 2) / math.gamma((n - 1) / 2)
+    value = statistics.stdev(values) / low
+    return Estimate(value, value / math.sqrt(2 * (n - 1)), n)
+
+
+def seed_scatter(points: Sequence[Point]) -> Scatter | None:
+    """Scatter over seeds; None where no setting was measured with three."""
     seeds = [p for p in points if p.study == "seeds"]
-    if not seeds:
+    settings = {_queries(p): {k: v for k, v in p.setting.items() if k != "seed"} for p in seeds}
+    found = {}
+    for queries, setting in sorted(settings.items()):
+        like = [p for p in seeds if _queries(p) == queries]
+        like += [p for p in points if p.study == "data" and p.setting == setting]
+        logs = [math.log(p.error.value) for p in like if math.isfinite(p.error.value) and p.error.value > 0]
+        if len(logs) >= _FEWEST:
+            found[queries] = _deviation(logs)
+    if not found:
         return None
-    like = {k: v for k, v in seeds[0].setting.items() if k != "seed"}
-    errors = [p.error.value for p in seeds]
-    errors += [p.error.value for p in points if p.study == "fit" and p.setting == like]
-    logs = [math.log(e) for e in errors if math.isfinite(e) and e > 0]
-    if len(logs) < 3:
-        return None
-    deviation = statistics.stdev(logs)
-    # Of a standard deviation, for normal scatter.
-    return Estimate(deviation, deviation / math.sqrt(2 * (len(logs) - 1)), len(logs))
+    return Scatter(seeds[0].setting["queries.spp"], tuple(found), tuple(found.values()))
 
 
 def with_scatter(points: Sequence[Point]) -> list[Point]:
-    """The points with the scatter of seeds in the error bars of fits, in quadrature."""
+    """The points with the scatter of seeds in the error bars of chains, in quadrature."""
     scatter = seed_scatter(points)
     if scatter is None:
         return list(points)
     out = []
     for p in points:
         if p.study in FITTED:
-            bar = math.hypot(p.error.error, scatter.value * p.error.value)
+            bar = math.hypot(p.error.error, scatter.of(p) * p.error.value)
             p = replace(p, error=replace(p.error, error=bar))
         out.append(p)
     return out

@@ -18,7 +18,7 @@ from mbtf_gen.stats import Estimate
 from ..recipe import Recipe
 from ..run_folder import locked, machine, take
 from .chain_studies import GENERATOR, chains
-from .chains import Chain, Workshop
+from .chains import Chain, Wanted, Workshop
 from .generator import Bench
 from .generator_studies import GeneratorTask, generator_tasks
 from .points import Point, PointFolder
@@ -180,8 +180,9 @@ def _beyond_tracing(store: PointFolder, work: Workshop, price: Callable[[int], f
     if point is None:
         seconds = []
         for queries in (1, count):
-            seconds.append(work.data(queries, spp).seconds)
-            work.forget(queries, spp)
+            data = Wanted(queries, spp)
+            seconds.append(work.data(data).seconds)
+            work.forget(data)
         nothing = Estimate(math.nan, math.inf, 0)
         taken = Estimate((seconds[1] - seconds[0]) / count * 1e6, 0.0, 1)
         point = Point("price", "written", f"{count} queries", key, "", taken, nothing)
@@ -198,16 +199,16 @@ def _measure_chains(
     left: Callable[[], float],
 ) -> None:
     # Prices are those of stored points: a study that goes on has the same tasks.
-    tasks = list(chains(budget, work.config.queries.spp, price, work.config.seed))
-    needed = [(t.queries, t.spp) for t in tasks]
+    tasks = list(chains(budget, work.config.queries.spp, price))
+    needed = [t.data for t in tasks]
     try:
         for number, task in enumerate(tasks):
             point = store.get(task.study, task.key)
-            if point is None and left() > task.seconds(price, data=not work.has(task)):
+            if point is None and left() > task.seconds(price, data=not work.has(task.data)):
                 point = work.measure(task)
                 store.put(task.key, point)
             _keep(study, point, task, work.command_of(task))
-            if (task.queries, task.spp) not in needed[number + 1 :]:
-                work.forget(task.queries, task.spp)
+            if task.data not in needed[number + 1 :]:
+                work.forget(task.data)
     finally:
         work.clear()

@@ -6,6 +6,7 @@ import csv
 import io
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,6 +18,7 @@ from PIL import Image
 from mbtf_gen.config import GeneratorConfig
 from mbtf_gen.stats import Estimate
 from mbtf_pipeline.cost.chain_studies import DATA, FIT, GENERATOR, QUALITIES, SHORTEST, WHOLE, chains
+from mbtf_pipeline.cost.chains import Wanted
 from mbtf_pipeline.cost.figures import chain_name
 from mbtf_pipeline.cost.front import marginal_price, pareto_front
 from mbtf_pipeline.cost.page import half_widths, paths_slope
@@ -112,14 +114,14 @@ def test_chains_fit_into_their_budget(budget: float) -> None:
     def price(spp: int) -> float:
         return spp * 5e-7
 
-    found = list(chains(budget, 4, price, seed=7))
+    found = list(chains(budget, 4, price))
     assert {c.study for c in found} == {"chain", "data", "fit", "seeds"}
-    made: set[tuple[int, int]] = set()
+    made: set[Wanted] = set()
     spent = dict.fromkeys(("data", "fit", "chain", "seeds"), 0.0)
     for chain in found:
-        spent[chain.study] += chain.seconds(price, data=(chain.queries, chain.spp) not in made)
-        made.add((chain.queries, chain.spp))
-    spent["fit"] += spent.pop("seeds")
+        spent[chain.study] += chain.seconds(price, data=chain.data not in made)
+        made.add(chain.data)
+    spent["data"] += spent.pop("seeds")
     assert 0.4 * budget < sum(spent.values()) < (1.0 - GENERATOR) * budget
     for study, share in (("data", DATA), ("fit", FIT), ("chain", WHOLE)):
         assert spent[study] <= 1.05 * share * budget
@@ -131,13 +133,46 @@ def test_chains_fit_into_their_budget(budget: float) -> None:
     totals = sorted({round(c.seconds(price) / SHORTEST) for c in whole})
     assert totals == [2**n for n in range(len(totals))]
     assert sum(totals) <= WHOLE * budget / SHORTEST < sum(totals) + 2 * totals[-1]
-    # Fits of other seeds are of a setting that was measured, on its data.
-    like = next(c for c in found if c.study == "fit")
-    assert like.name == f"{FIT * budget / 19.5:.3g} s"
+    # Chains of other seeds, of data and fit, are of two settings that were measured.
+    settings = [(c.queries, c.spp, c.fit) for c in found if c.study == "data" and c.spp == 4]
     others = [c for c in found if c.study == "seeds"]
-    assert all(c.fit == {**like.fit, "seed": c.fit["seed"]} for c in others)
-    assert all((c.queries, c.spp) == (like.queries, like.spp) for c in others)
-    assert {c.fit["seed"] for c in others} == {8, 9, 10}
+    for setting in settings:
+        assert {c.seed for c in others if (c.queries, c.spp, c.fit) == setting} == {1, 2, 3}
+    assert len(others) == 3 * len(settings) == 6
+    assert all(c.seed == 0 for c in found if c.study != "seeds")
+
+
+def test_chains_of_other_seeds_have_other_data_and_other_weights(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import mbtf_fit
+    import mbtf_pipeline.cost.chains as module
+
+    seeds: list[int] = []
+    shop = module.Workshop(GeneratorConfig(material="m", seed=5), tmp_path, "mbtf-gen m", lambda note: None)
+    monkeypatch.setattr(shop, "judges", lambda: None)
+    monkeypatch.setattr(module, "generate", lambda config, folder, job: seeds.append(config.seed))
+    monkeypatch.setattr(module, "_quiet_job", lambda config: None)
+
+    def fit(config: Any, shards: Path, out: Path) -> None:
+        seeds.append(config.seed)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(mbtf_fit, "fit", fit)
+    options = {"training": {"time": "5s"}}
+    for seed in (0, 2, 2):
+        with pytest.raises(KeyboardInterrupt):
+            shop.measure(module.Chain("seeds", "", "", 64, 4, options, seed=seed))
+    # Data of one seed are made once.
+    assert seeds == [5, 5, 7, 7, 7]
+    assert shop.has(Wanted(64, 4, 2))
+    assert not shop.has(Wanted(64, 4, 1))
+    chain = module.Chain("seeds", "", "", 64, 4, options, seed=2)
+    assert shop.command_of(chain).count(" --set seed=7") == 2
+    plain = module.Workshop(GeneratorConfig(material="m"), tmp_path, "mbtf-gen m", lambda note: None)
+    assert "seed" not in plain.command_of(replace(chain, seed=0))
+    assert plain.command_of(chain).count(" --set seed=2") == 2
+    assert chain.key != replace(chain, seed=0).key
 
 
 def test_queries_cost_what_they_cost_on_disk(tmp_path: Path) -> None:
@@ -149,12 +184,12 @@ def test_queries_cost_what_they_cost_on_disk(tmp_path: Path) -> None:
     class Shop:
         config = GeneratorConfig(material="heights.npy")
 
-        def data(self, queries: int, spp: int) -> Any:
-            made.append(queries)
-            return SimpleNamespace(seconds=2.0 + queries * 1e-6)
+        def data(self, wanted: Wanted) -> Any:
+            made.append(wanted.queries)
+            return SimpleNamespace(seconds=2.0 + wanted.queries * 1e-6)
 
-        def forget(self, queries: int, spp: int) -> None:
-            assert queries == made[-1]
+        def forget(self, wanted: Wanted) -> None:
+            assert wanted.queries == made[-1]
 
     store, shop = PointFolder(tmp_path, {"config": "abc"}), Shop()
 
@@ -169,29 +204,57 @@ def test_queries_cost_what_they_cost_on_disk(tmp_path: Path) -> None:
     assert len(made) == 2
 
 
-SETTING = {"queries.train": "100", "training.time": "5s"}
-
-
-def fitted(error: float, study: str = "fit", **more: Any) -> Point:
-    """A fit's point."""
+def chain(error: float, queries: int, study: str = "data", **more: Any) -> Point:
+    """A chain's point."""
     five = Estimate(5.0, 0.0, 1)
-    return Point(study, "neumip", "a fit", SETTING | more, "", five, Estimate(error, 0.01, 9))
+    setting = {"queries.train": str(queries), "queries.spp": 4, "training.time": "5s"}
+    return Point(study, "neumip", "a chain", setting | more, "", five, Estimate(error, 0.01, 9))
 
 
-def test_bars_of_fits_hold_the_scatter_of_seeds() -> None:
-    seeds = [fitted(e, "seeds", seed=n) for n, e in enumerate((0.22, 0.18, 0.21), start=1)]
-    points = [fitted(0.2), *seeds, point(60, 0.4), point(8, 0.3, "paths")]
-    scatter = seed_scatter(points)
+@pytest.mark.parametrize("n", [3, 4, 9])
+def test_deviations_of_few_values_are_right_on_average(n: int) -> None:
+    from mbtf_pipeline.cost.scatter import _deviation
+
+    samples = np.random.default_rng(0).normal(size=(4000, n))
+    found = [_deviation(list(row)) for row in samples]
+    values = np.array([e.value for e in found])
+    assert abs(values.mean() - 1) < 4 * values.std() / math.sqrt(len(values))
+    # The bar is that of large samples, about.
+    assert 0.8 < np.mean([e.error for e in found]) / values.std() < 1.3
+
+
+def test_bars_of_chains_hold_the_scatter_of_seeds() -> None:
+    few, many = (0.22, 0.18, 0.21), (0.101, 0.099, 0.1)
+    points = [chain(0.2, 100), chain(0.1, 1600), chain(0.4, 400, "chain"), point(8, 0.3, "paths")]
+    seeds = [
+        chain(e, queries, "seeds", seed=n)
+        for queries, errors in ((100, few), (1600, many))
+        for n, e in enumerate(errors, start=1)
+    ]
+    scatter = seed_scatter([*points, *seeds])
     assert scatter is not None
-    assert scatter.value == pytest.approx(np.std(np.log([0.2, 0.22, 0.18, 0.21]), ddof=1))
-    widened = with_scatter(points)
-    assert widened[-2].error.error == pytest.approx(math.hypot(0.01, 0.4 * scatter.value))
+    assert (scatter.spp, scatter.queries) == (4, (100, 1600))
+    # A sample's deviation is low by 8 % on average for four values.
+    deviations = [np.std(np.log(errors), ddof=1) / 0.9213 for errors in ((0.2, *few), (0.1, *many))]
+    assert [e.value for e in scatter.deviations] == pytest.approx(deviations, rel=1e-4)
+    # Half-way in the logarithm of the size, and no further than at its ends.
+    middle = np.mean(deviations)
+    assert scatter.of(points[2]) == pytest.approx(middle, rel=1e-4)
+    ends = [scatter.of(chain(0.3, n)) for n in (1, 10**8)]
+    assert ends == pytest.approx(deviations, rel=1e-4)
+    # Half of the paths per query are half of the data; twice as many for half as many queries are so too.
+    other = [chain(0.3, n, **{"queries.spp": spp}) for n, spp in ((800, 2), (400, 8))]
+    assert [scatter.of(p) for p in other] == pytest.approx([middle, middle], rel=1e-4)
+    assert scatter.describe().endswith("% at 0.0016 M queries × 4")
+    widened = with_scatter([*points, *seeds])
+    assert widened[2].error.error == pytest.approx(math.hypot(0.01, 0.4 * middle), rel=1e-4)
     # The generator's errors are not those of fits.
-    assert widened[-1] == points[-1]
+    assert widened[3] == points[3]
     # Another setting's error is no part of it, and two values are too few to tell.
-    assert seed_scatter([*points, fitted(9.0, **{"training.time": "9s"})]) == scatter
-    assert seed_scatter(points[:2]) is None
-    assert with_scatter(points[:2]) == points[:2]
+    other = [chain(9.0, 100, **{"training.time": "9s"}), chain(9.0, 100, "fit")]
+    assert seed_scatter([*points, *seeds, *other]) == scatter
+    assert seed_scatter([points[0], seeds[0]]) is None
+    assert with_scatter([points[0], seeds[0]]) == [points[0], seeds[0]]
 
 
 def test_a_study_of_a_folder_with_something_else_in_it_is_refused(tmp_path: Path) -> None:

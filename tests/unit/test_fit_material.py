@@ -246,7 +246,7 @@ def test_the_history_records_the_training(fitted: FitResult) -> None:
     assert history == fitted.history
     assert history[-1]["step"] == 30
     assert history[-1]["share"] == 1.0
-    assert {"seconds", "loss", "held_out", "held_out_error", "queries_per_second"} <= set(history[-1])
+    assert {"seconds", "loss", "unexplained", "unexplained_error", "queries_per_second"} <= set(history[-1])
 
 
 def test_data_that_were_read_before_give_the_same_fit(fitted: FitResult, data: Path, tmp_path: Path) -> None:

@@ -16,8 +16,8 @@ def history(power: float, error: float = 1e-4, total: float = 80.0) -> list[dict
         {
             "share": share,
             "seconds": share * total,
-            "held_out": 0.2 * share**-power,
-            "held_out_error": error,
+            "unexplained": 0.2 * share**-power,
+            "unexplained_error": error,
         }
         for share in (0.1, 0.2, 0.31, 0.49, 0.7, 1.0)
     ]
@@ -32,8 +32,9 @@ def errors(held_out: float, training: float, error: float = 0.002) -> dict[str, 
 
 @pytest.mark.parametrize("power", [0.25, 0.5, 1.0])
 def test_halving_takes_what_the_power_of_time_says(power: float) -> None:
-    found = price_of(history(power), {})
+    found = price_of(history(power), {}, looks_at="held_out_queries")
     assert found is not None
+    assert found.describe().startswith("held-out queries 0.")
     assert found.end == pytest.approx(0.2)
     assert found.half == pytest.approx(0.2 * 0.49**-power)
     assert found.halving == pytest.approx(80.0 * (2 ** (1 / power) - 1), rel=1e-6)
@@ -59,7 +60,7 @@ def test_half_of_the_distance_to_the_training_queries_is_learned_noise() -> None
     found = price_of(history(0.5), errors(0.2 + 0.05, 0.2 - 0.05), 0.3)
     assert found is not None
     assert found.noise_share == pytest.approx(0.05 / 0.25)
-    assert "20% of the error is learned noise" in found.describe()
+    assert "20% of the error of held-out queries is learned noise" in found.describe()
     for same in (errors(0.25, 0.248), errors(0.25, 0.3), {}, errors(math.nan, 0.1)):
         other = price_of(history(0.5), same, 0.3)
         assert other is not None
@@ -80,5 +81,5 @@ def test_histories_that_do_not_tell_give_no_price() -> None:
     assert price_of([], {}) is None
     assert price_of(history(0.5)[:-1], {}) is None
     assert price_of(history(0.5)[-1:], {}) is None
-    unknown = [{**r, "held_out": None, "held_out_error": None} for r in history(0.5)]
+    unknown = [{**r, "unexplained": None, "unexplained_error": None} for r in history(0.5)]
     assert price_of(unknown, {}) is None

@@ -55,8 +55,9 @@ def test_every_error_of_a_level_follows_one_rule() -> None:
 
 def test_errors_while_training_have_their_bars() -> None:
     rows = [(10.0, 0.5, 0.01), (50.0, 0.4, 0.03), (90.0, 0.039, 0.069)]
-    records = [{"seconds": s, "loss": 1.0, "held_out": v, "held_out_error": e} for s, v, e in rows]
-    history = History(1000, 4096, 100.0, "cpu", 2, records)
+    records = [{"seconds": s, "loss": 1.0, "unexplained": v, "unexplained_error": e} for s, v, e in rows]
+    # A look of which nothing was kept leaves no mark.
+    history = History(1000, 4096, 100.0, "cpu", 2, [*records, {"seconds": 95.0, "loss": 1.0}])
     cells = _fits({"a": history})["rows"][0]
     assert cells[-5] == "0.500 ± 0.010 at 10 s"
     assert cells[-2] == "below two error bars (0.04 ± 0.07) at 90 s"

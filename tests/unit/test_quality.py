@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 from dataclasses import asdict
 from pathlib import Path
 from typing import get_args
@@ -11,7 +12,7 @@ from typing import get_args
 import pytest
 
 from mbtf_fit.config import FitConfig
-from mbtf_fit.quality import BEST, FITTER, fitter_options, said_of
+from mbtf_fit.quality import FITTER, best_at, best_options, fitter_options, said_of
 from mbtf_gen.config import GeneratorConfig, count_queries
 from mbtf_gen.quality import GENERATOR, Quality, as_assignments
 from mbtf_gen.quality_measured import Chain, Expected, expected, markdown_table, read_expected
@@ -71,7 +72,7 @@ def test_recipes_that_compare_networks_keep_them(quality: Quality, name: str) ->
 def test_other_recipes_get_the_network_of_the_qualities() -> None:
     path = ROOT / "pipelines" / "rock_cliff.yaml"
     fits = {"neumip": {"model": "neumip"}, "neumip-baseline": {"model": "neumip-baseline"}}
-    assert {n: {**BEST, **FITTER["draft"]} for n in fits} == fitter_options("draft", fits)
+    assert {n: {**best_at("draft"), **FITTER["draft"]} for n in fits} == fitter_options("draft", fits)
     fits["hierarchical"] = {"model": "hierarchical"}
     assert fitter_options("draft", fits)["hierarchical"] == FITTER["draft"]
     text = quality_assignments(path, "draft")
@@ -80,6 +81,18 @@ def test_other_recipes_get_the_network_of_the_qualities() -> None:
     text = quality_assignments(path, "draft", ["fit.neumip.network.width=25", "fit.neumip.training.decay=0"])
     assert not any("network" in t or t.startswith("fit.neumip.training.decay") for t in text)
     assert "fit.neumip.training.blur.floor=0.8" in text
+
+
+def test_longer_training_gets_a_larger_network() -> None:
+    widths = [best_options(seconds)["network.width"] for seconds in (1.0, 20.0, 600.0, math.inf)]
+    assert widths == sorted(widths)
+    assert widths[0] < widths[-1]
+    # A quality's is that of its time; steps of a size that only a GPU takes are the longest.
+    assert best_at("draft") == best_options(20.0)
+    assert best_at("high") == best_options(600.0) == best_at("paper")
+    known = {"high": "network.width=64", "draft": "network.width=40"}
+    for quality, text in known.items():
+        assert f"fit.neumip.{text}" in quality_assignments(ROOT / "pipelines" / "rock_cliff.yaml", quality)
 
 
 def test_a_file_of_the_fitter_stands(tmp_path: Path) -> None:
@@ -107,6 +120,8 @@ CHAINS = (
     Chain("bark", "draft", None, 52.4, 6.0, 20.0, 0.62, 0.02, 10**8, 10**6, 3e6, "h"),
     Chain("rock", "high", 0.1, 1800.0, 300.0, 1200.0, 0.05, 0.002, 10**9, 10**6, 3e6, "h"),
 )
+# From which the last is extrapolated; not what the quality reaches.
+QUARTER = Chain("rock", "high", 0.1, 700.0, 300.0, 300.0, 0.08, 0.002, 10**9, 10**6, 3e6, "h", 0.25)
 GUESS = Chain("rock", "paper", 0.1, 40000.0, 20000.0, 20000.0, 0.03, 0.0, 10**9, 10**6, 3e6, "h")
 
 
@@ -120,7 +135,7 @@ def written(folder: Path, chains: tuple[Chain, ...], guesses: tuple[Chain, ...])
 
 
 def test_measured_qualities_are_told_from_guessed_ones(tmp_path: Path) -> None:
-    found = written(tmp_path, CHAINS, (GUESS,))
+    found = written(tmp_path, (*CHAINS, QUARTER), (GUESS,))
     assert found.line("draft") == "draft 0:41 to 0:52 in all, 0.31 to 0.62 unexplained"
     assert found.line("high") == "high 30:00 in all, 0.05 unexplained"
     assert found.line("paper") == "paper 11:06:40 in all, 0.03 unexplained (extrapolated)"
