@@ -24,6 +24,9 @@ _PLACES = (
 )
 # Half the side of the square that a marker takes, in pixels at the figure's resolution.
 _MARKER = 5.0
+# How far names stay from the sides: they may come out wider at another resolution, for small letters are
+# fitted to pixels.
+_ROOM = 16.0
 # Half the width that a line takes.
 _LINE = 1.5
 
@@ -68,7 +71,7 @@ def place_names(
         taken.append(
             Bbox([[min(x0, x1) - _LINE, min(y0, y1) - _LINE], [max(x0, x1) + _LINE, max(y0, y1) + _LINE]])
         )
-    frame = axes.get_window_extent(renderer)
+    frame = axes.get_window_extent(renderer).padded(-_ROOM, 0.0)
     for one in named:
         best, least = None, float("inf")
         for dx, dy, side, height in _PLACES:

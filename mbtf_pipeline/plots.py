@@ -17,9 +17,10 @@ from mbtf_gen.atomic import write_through
 
 from .labels import Named, place_names
 
-# Okabe and Ito (2008), without black and yellow: told apart under every common colour-vision deficiency.
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
-MARKERS = ("o", "s", "^", "D", "v", "P")
+# Okabe and Ito (2008), grey in place of black, without yellow: told apart under every common colour-vision
+# deficiency.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#7F7F7F")
+MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 # Stands for the page's own text colour until the SVG is inlined.
 _INK = "#010203"
 # A logarithmic axis ends at most this factor below its smallest value and above its largest.
