@@ -24,16 +24,15 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
-from quality import HEIGHTS, source
+from quality import HEIGHTS, generator_config, source
 
 from mbtf_fit.config import FitConfig
 from mbtf_fit.forecast import PERSISTENCE, PILOT_SECONDS, extrapolated
 from mbtf_fit.quality import best_options
-from mbtf_gen.config import GeneratorConfig
 from mbtf_gen.durations import parse_duration
 from mbtf_gen.engine import load_mitsuba
 from mbtf_gen.errors import MbtfError
-from mbtf_gen.quality import GENERATOR, Quality, as_assignments
+from mbtf_gen.quality import Quality, as_assignments
 from mbtf_gen.settings import resolve
 
 ASSETS = ("cliff_rock", "insulation_foam", "straight_wool", "turtle_shell", "twisted_wool")
@@ -47,15 +46,7 @@ def generated(name: str, quality: Quality, levels: int, shards: Path) -> dict[st
     from mbtf_gen.generation import Job, allocated, generate
     from mbtf_gen.planning import plan_effects
 
-    material, height = source(name)
-    config = resolve(
-        GeneratorConfig,
-        assignments=[
-            f"material={json.dumps(str(material))}",
-            *as_assignments(GENERATOR[quality]),
-            *as_assignments({"geometry.height": height, "queries.levels": levels}),
-        ],
-    )
+    config = generator_config(name, quality, levels)
     job = Job.prepare(config)
     expected = forecast(job, allocated(job, plan_effects(job)))
     start = time.perf_counter()

@@ -4,8 +4,8 @@
 
 Of a material (of ``assets/`` or of the texture sets that lie beside the project, by name): training data as
 the quality has them, then for each size, features of the hidden layers by channels of the textures, a fit of
-`neumip` as the qualities have it otherwise. Printed: unexplained variance of the same test queries, queries
-trained on per second, milliseconds for a picture of 1080p, and bytes of the material.
+`neumip` as the qualities have it otherwise. Printed: unexplained variance of the same test queries,
+milliseconds for a picture of 1080p, and bytes of the material.
 
 The last line is one JSON object: figures, and the bar: no size that evaluates faster than the one which the
 qualities take after so much training is clearly better than it. Exit code 1 where it is missed.
@@ -21,16 +21,16 @@ import tempfile
 from pathlib import Path
 from typing import Any, get_args
 
-from quality import source
+from quality import generator_config
 
 from mbtf_fit.quality import best_options
-from mbtf_gen.config import GeneratorConfig, count_queries
+from mbtf_gen.config import count_queries
 from mbtf_gen.durations import parse_duration
 from mbtf_gen.engine import load_mitsuba
 from mbtf_gen.errors import MbtfError
 from mbtf_gen.generation import Job
-from mbtf_gen.quality import GENERATOR, Quality, as_assignments
-from mbtf_gen.settings import nested, resolve
+from mbtf_gen.quality import Quality
+from mbtf_gen.settings import nested
 from mbtf_pipeline.cost.chains import Chain, Workshop
 from mbtf_pipeline.run_folder import machine
 
@@ -54,15 +54,7 @@ def measure(
     name: str, quality: Quality, seconds: float, sizes: list[tuple[int, int]], levels: int, work: Path
 ) -> list[dict[str, Any]]:
     """A row for each size."""
-    material, height = source(name)
-    config = resolve(
-        GeneratorConfig,
-        assignments=[
-            f"material={json.dumps(str(material))}",
-            *as_assignments(GENERATOR[quality]),
-            *as_assignments({"geometry.height": height, "queries.levels": levels}),
-        ],
-    )
+    config = generator_config(name, quality, levels)
     count = count_queries(config.queries.train, Job.prepare(config).lattice.texels())
     workshop = Workshop(config, work, "", lambda note: print(note, file=sys.stderr))
     rows = []

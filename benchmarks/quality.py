@@ -84,6 +84,19 @@ def source(name: str) -> tuple[Path, float | None]:
     return ROOT / "assets" / name, None
 
 
+def generator_config(name: str, quality: Quality, levels: int) -> GeneratorConfig:
+    """The generator's configuration of a material at a quality."""
+    material, height = source(name)
+    return resolve(
+        GeneratorConfig,
+        assignments=[
+            f"material={json.dumps(str(material))}",
+            *as_assignments(GENERATOR[quality]),
+            *as_assignments({"geometry.height": height, "queries.levels": levels}),
+        ],
+    )
+
+
 def folder_bytes(folder: Path) -> int:
     """Bytes of all files below a folder."""
     return sum(p.stat().st_size for p in folder.rglob("*") if p.is_file())

@@ -95,8 +95,13 @@ def price_of(
             halving = last["seconds"] * (2.0**doublings - 1.0)
     share = _noise_share(errors, noise)
     return Price(
-        SPLIT_NAMES[looks_at],
-        *(before, half["unexplained_error"], after, last["unexplained_error"], halving, share),
+        looks_at=SPLIT_NAMES[looks_at],
+        half=before,
+        half_error=half["unexplained_error"],
+        end=after,
+        end_error=last["unexplained_error"],
+        halving=halving,
+        noise_share=share,
     )
 
 
