@@ -111,7 +111,18 @@ class TrainingSection(Settings):
     texture_rate: float = Field(1e-2, gt=0, lt=1, description="largest learning rate of the textures")
     final_rate: float = Field(0.01, gt=0, le=1, description="share of the rates that is left at the end")
     decay: float = Field(
-        0.0, ge=0, le=10, description="pull of texels towards 0: by rate times this per step"
+        0.0,
+        ge=0,
+        le=10,
+        description="pull of texels towards 0: by rate times this per step; in proportion to it more where "
+        "noise is over half the variance of the values",
+    )
+    weight_decay: float = Field(
+        1e5,
+        ge=0,
+        le=1e9,
+        description="pull of the networks' weights towards 0: by rate times this per step, times noise over "
+        "variance of the values, over the number of queries; at most 1",
     )
     warmup: int = Field(100, ge=0, description="steps over which the rates rise")
     calibrate: bool = Field(

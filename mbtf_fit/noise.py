@@ -16,7 +16,7 @@ from torch import Tensor
 
 from mbtf_gen.directions import ELEVATION_BANDS
 from mbtf_gen.levels import Lattice
-from mbtf_gen.stats import elevation_groups, level_groups
+from mbtf_gen.stats import elevation_groups, level_groups, pooled_variance, signal_variance
 
 from .data import Queries
 
@@ -28,6 +28,8 @@ _LEAST_QUERIES = 8
 _LEAST_CELLS = 12
 # Share of the cells, those that stick out most, that the second fit leaves out.
 _TRIMMED = 0.05
+# Most that noise is taken to be of the values' variance: where these have none, no ratio tells.
+_MOST_NOISE = 5.0
 
 
 def typical_value(values: ArrayLike) -> float:
@@ -57,12 +59,14 @@ class NoiseModel:
     overall : (3,) c over all levels
     levels : (k+1, 3) c by nearest level
     bands : factors by band of the lower cosine (``ELEVATION_BANDS``)
+    ratio : noise variance over the variance of the true values, all queries together, at most 5
     """
 
     scale: float
     overall: NDArray[np.float64]
     levels: NDArray[np.float64]
     bands: NDArray[np.float64]
+    ratio: float = 0.0
 
     @classmethod
     def silent(cls, scale: float, lattice: Lattice) -> NoiseModel:
@@ -96,7 +100,7 @@ class NoiseModel:
             below = float((counts * explained)[mine].sum())
             if below > 0:
                 bands[b] = np.clip(float((counts * means[:, 0])[mine].sum()) / below, 0.1, 10.0)
-        return cls(scale, overall, levels, bands)
+        return cls(scale, overall, levels, bands, _ratio(queries))
 
     def variance(self, value: Tensor, sigma: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
         """Noise variance in 1/sr² where the true value is `value`: (n, 3), or (items, rows, columns, 3) where
@@ -116,6 +120,12 @@ class NoiseModel:
         c0, c1, c2 = (float(c) for c in self.overall)
         t = value.abs()
         return ((1 + c0) * self.scale**2 + t * (c1 * self.scale + c2 * t)).sqrt_()
+
+
+def _ratio(queries: Queries) -> float:
+    noise = pooled_variance(queries.value_a, queries.value_b).value
+    signal = signal_variance(queries.value_a, queries.value_b).value
+    return noise / max(signal, noise / _MOST_NOISE) if noise > 0 else 0.0
 
 
 def _per_query(array: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -37,6 +37,10 @@ BETAS = (0.8, 0.95)
 # Blur at its widest, in tile widths. Half a tile of blur left so little to find in textures of 16 x 16 texels
 # that offsets wandered off before they became sharp: three of eight fits ended no better than without.
 WIDEST_BLUR = 0.125
+# Texels are pulled the more the noisier the data, from where noise is half the variance of the values on.
+_PLAIN_NOISE = 0.5
+# Strongest pull of the networks' weights, by rate times this per step.
+_MOST_DECAY = 1.0
 
 
 def rate_factor(training: TrainingSection, step: int, share: float) -> float:
@@ -100,6 +104,8 @@ class Trainer:
         texels, weights = model.parameter_groups()
         self.optimiser = torch.optim.Adam([{"params": texels}, {"params": weights}], betas=BETAS, fused=True)
         self.loss = Objective(config.training, noise)
+        self._doubt = max(1.0, noise.ratio / _PLAIN_NOISE)
+        self._weight_decay = min(_MOST_DECAY, config.training.weight_decay * noise.ratio / len(queries))
         found = kernel()
         self._stepper = (
             NativeStepper(found, model, self.optimiser)
@@ -206,7 +212,7 @@ class Trainer:
             self.optimiser.param_groups, (training.texture_rate, training.rate), strict=True
         ):
             group["lr"] = rate * factor
-        self._decay(training.texture_rate * factor)
+        self._decay(factor)
         if self._stepper is not None and not isinstance(batch, Crops):
             return self._stepper.step(self.loss, batch, self._sigmas(), workers)
         texels, weights = self.model.parameter_groups()
@@ -224,13 +230,26 @@ class Trainer:
         self.optimiser.step()
         return loss
 
-    def _decay(self, rate: float) -> None:
-        """Pull texels towards 0, apart from their gradients (Loshchilov and Hutter, ICLR 2019)."""
-        decay = self.config.training.decay
-        if decay > 0:
-            with torch.no_grad():
-                for texels in self.model.parameter_groups()[0]:
-                    texels.mul_(1.0 - rate * decay)
+    def _decay(self, factor: float) -> None:
+        """Pull texels and the networks' weights towards 0, apart from their gradients (Loshchilov and Hutter,
+        ICLR 2019).
+
+        Both pulls follow the ratio of noise to signal as the penalty of ridge regression does (Hoerl and
+        Kennard, Technometrics 12, 1970). That of the weights, which all queries have in common, is divided by
+        their number too.
+        """
+        training = self.config.training
+        texels, weights = self.model.parameter_groups()
+        # Biases stay: what the last one holds is the mean value.
+        matrices = [p for p in weights if p.ndim > 1]
+        with torch.no_grad():
+            for parameters, pull in (
+                (texels, training.texture_rate * training.decay * self._doubt),
+                (matrices, training.rate * self._weight_decay),
+            ):
+                if pull > 0:
+                    for p in parameters:
+                        p.mul_(math.exp(-pull * factor))
 
     def predict(self, queries: Queries) -> NDArray[np.float32]:
         """Values (n, 3) of the model as it is now, read through the current blur."""

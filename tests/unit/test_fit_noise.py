@@ -61,9 +61,22 @@ def test_data_without_noise_have_none() -> None:
     queries, _, _ = noisy(2000)
     same = queries.value_a
     quiet = Queries(queries.u, queries.sigma, queries.omega_i, queries.omega_o, same, same)
-    assert not NoiseModel.of(quiet, LATTICE, 0.05).levels.any()
     nothing = quiet.take(slice(0))
-    assert not NoiseModel.of(nothing, LATTICE, 0.05).levels.any()
+    for data in (quiet, nothing):
+        found = NoiseModel.of(data, LATTICE, 0.05)
+        assert not found.levels.any()
+        assert found.ratio == 0.0
+
+
+def test_the_ratio_is_that_of_noise_to_true_values() -> None:
+    """To 5 %; wherever true values do not vary it is the most there is, since none can be told."""
+    queries, true, variance = noisy()
+    found = NoiseModel.of(queries, LATTICE, 0.05).ratio
+    assert found == pytest.approx(variance.mean() / true.var(0).mean(), rel=0.05)
+    random = np.random.default_rng(1)
+    a, b = (random.normal(1.0, 0.1, queries.value_a.shape).astype(np.float32) for _ in range(2))
+    even = Queries(queries.u, queries.sigma, queries.omega_i, queries.omega_o, a, b)
+    assert NoiseModel.of(even, LATTICE, 1.0).ratio == 5.0
 
 
 def test_buffers_are_pooled_like_queries() -> None:
