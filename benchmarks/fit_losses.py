@@ -66,7 +66,7 @@ def objective(kind: str, correction: str, relative: float) -> Loss:
     """A loss of the fitter, on the mean of the halves."""
     training = TrainingSection.model_validate({"losses": [{"kind": kind}], "correction": correction})
     c = np.array([0.0, 0.0, relative**2])
-    found = Objective(training, NoiseModel(1.0, c, c[None], np.ones(4)))
+    found = Objective(training, NoiseModel(1.0, c, c[None], np.ones(4), 0.0))
     up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(COUNT, 3)
 
     def loss(p: Tensor, a: Tensor, b: Tensor) -> Tensor:

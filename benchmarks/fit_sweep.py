@@ -57,7 +57,9 @@ SWEEP: dict[str, dict[str, Any]] = {
     "rates / 3": {"training": {"rate": 1e-2, "texture_rate": 3e-3}},
     "textures x 3": {"training": {"texture_rate": 3e-2}},
     "squared": {"training": {"losses": [{"kind": "squared"}]}},
-    "as published": {"training": {"losses": PUBLISHED, "correction": "none", "robust": None}},
+    "as published": {
+        "training": {"losses": PUBLISHED, "correction": "none", "robust": None, "weight_decay": 0.0}
+    },
     "no blur": {"training": {"blur": {"start": 0.0}}},
     "longer blur": {"training": {"blur": {"share": 0.9}}},
     "200/texel, 16 paths": {"queries": {"train": "200/texel", "spp": 16}},

@@ -118,11 +118,11 @@ class TrainingSection(Settings):
         "noise is over half the variance of the values",
     )
     weight_decay: float = Field(
-        1e5,
+        2e5,
         ge=0,
         le=1e9,
-        description="pull of the networks' weights towards 0: by rate times this per step, times noise over "
-        "variance of the values, over the number of queries; at most 1",
+        description="pull of the networks' weights towards 0: by rate times this per step, times "
+        "r min(1, 2r) over the number of queries; r: noise over variance of the values; at most 1",
     )
     warmup: int = Field(100, ge=0, description="steps over which the rates rise")
     calibrate: bool = Field(

@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -181,6 +181,7 @@ def fit(
         "seconds": round(trainer.progress.seconds, 3),
         "loss": trainer.progress.loss,
         "looks_at": looks_at,
+        "pull": asdict(trainer.pull),
         "coverage": {str(level): share for level, share in trainer.coverage().items()},
         "device": str(device),
         "threads": torch.get_num_threads(),

@@ -7,7 +7,7 @@ give a variance that depends on a query's value, footprint and directions alone.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -30,6 +30,8 @@ _LEAST_CELLS = 12
 _TRIMMED = 0.05
 # Most that noise is taken to be of the values' variance: where these have none, no ratio tells.
 _MOST_NOISE = 5.0
+# Halves further apart than twice so many times what a query may be off by are wild.
+_WILD = 10.0
 
 
 def typical_value(values: ArrayLike) -> float:
@@ -59,20 +61,21 @@ class NoiseModel:
     overall : (3,) c over all levels
     levels : (k+1, 3) c by nearest level
     bands : factors by band of the lower cosine (``ELEVATION_BANDS``)
-    ratio : noise variance over the variance of the true values, all queries together, at most 5
+    ratio : noise variance over the variance of the true values, all queries together, at most 5; what is
+        wild in one half counts only as far as training lets it
     """
 
     scale: float
     overall: NDArray[np.float64]
     levels: NDArray[np.float64]
     bands: NDArray[np.float64]
-    ratio: float = 0.0
+    ratio: float
 
     @classmethod
     def silent(cls, scale: float, lattice: Lattice) -> NoiseModel:
         """No noise at all."""
         bands = np.ones(len(ELEVATION_BANDS) - 1)
-        return cls(scale, np.zeros(3), np.zeros((lattice.finest + 1, 3)), bands)
+        return cls(scale, np.zeros(3), np.zeros((lattice.finest + 1, 3)), bands, 0.0)
 
     @classmethod
     def of(cls, queries: Queries, lattice: Lattice, scale: float) -> NoiseModel:
@@ -100,7 +103,19 @@ class NoiseModel:
             below = float((counts * explained)[mine].sum())
             if below > 0:
                 bands[b] = np.clip(float((counts * means[:, 0])[mine].sum()) / below, 0.1, 10.0)
-        return cls(scale, overall, levels, bands, _ratio(queries))
+        return cls(scale, overall, levels, bands, 0.0)._with_ratio(queries)
+
+    def _with_ratio(self, queries: Queries) -> NoiseModel:
+        """The same with the ratio of these queries, wild halves moved to where they no longer are."""
+        a, b = (torch.from_numpy(v).double() for v in (queries.value_a, queries.value_b))
+        a, b = (
+            torch.minimum(a, b + 2 * _WILD * self.spread(b)),
+            torch.minimum(b, a + 2 * _WILD * self.spread(a)),
+        )
+        noise, signal = (f(a.numpy(), b.numpy()).value for f in (pooled_variance, signal_variance))
+        # Not so of NaN either, the variance of a single query.
+        resolved = signal > noise / _MOST_NOISE
+        return replace(self, ratio=noise / signal if resolved else _MOST_NOISE if noise > 0 else 0.0)
 
     def variance(self, value: Tensor, sigma: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
         """Noise variance in 1/sr² where the true value is `value`: (n, 3), or (items, rows, columns, 3) where
@@ -120,12 +135,6 @@ class NoiseModel:
         c0, c1, c2 = (float(c) for c in self.overall)
         t = value.abs()
         return ((1 + c0) * self.scale**2 + t * (c1 * self.scale + c2 * t)).sqrt_()
-
-
-def _ratio(queries: Queries) -> float:
-    noise = pooled_variance(queries.value_a, queries.value_b).value
-    signal = signal_variance(queries.value_a, queries.value_b).value
-    return noise / max(signal, noise / _MOST_NOISE) if noise > 0 else 0.0
 
 
 def _per_query(array: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -22,6 +22,7 @@ from .buffers import Crops, TrainingBuffers
 from .calibration import fit_gains
 from .config import FitConfig, TrainingSection
 from .data import Queries, TrainingQueries
+from .decay import Pull
 from .inference import predict
 from .losses import Objective
 from .models import Neumip, NeuralMaterial
@@ -37,10 +38,6 @@ BETAS = (0.8, 0.95)
 # Blur at its widest, in tile widths. Half a tile of blur left so little to find in textures of 16 x 16 texels
 # that offsets wandered off before they became sharp: three of eight fits ended no better than without.
 WIDEST_BLUR = 0.125
-# Texels are pulled the more the noisier the data, from where noise is half the variance of the values on.
-_PLAIN_NOISE = 0.5
-# Strongest pull of the networks' weights, by rate times this per step.
-_MOST_DECAY = 1.0
 
 
 def rate_factor(training: TrainingSection, step: int, share: float) -> float:
@@ -80,6 +77,7 @@ class Trainer:
     Attributes
     ----------
     progress : how far it is
+    pull : towards 0, of texels and weights
     stop : set it to end :meth:`train` after the present step
     """
 
@@ -104,8 +102,7 @@ class Trainer:
         texels, weights = model.parameter_groups()
         self.optimiser = torch.optim.Adam([{"params": texels}, {"params": weights}], betas=BETAS, fused=True)
         self.loss = Objective(config.training, noise)
-        self._doubt = max(1.0, noise.ratio / _PLAIN_NOISE)
-        self._weight_decay = min(_MOST_DECAY, config.training.weight_decay * noise.ratio / len(queries))
+        self.pull = Pull.of(config.training, noise.ratio, len(queries))
         found = kernel()
         self._stepper = (
             NativeStepper(found, model, self.optimiser)
@@ -212,7 +209,7 @@ class Trainer:
             self.optimiser.param_groups, (training.texture_rate, training.rate), strict=True
         ):
             group["lr"] = rate * factor
-        self._decay(factor)
+        self.pull.act(self.model, training.texture_rate * factor, training.rate * factor)
         if self._stepper is not None and not isinstance(batch, Crops):
             return self._stepper.step(self.loss, batch, self._sigmas(), workers)
         texels, weights = self.model.parameter_groups()
@@ -229,27 +226,6 @@ class Trainer:
             p.grad = g
         self.optimiser.step()
         return loss
-
-    def _decay(self, factor: float) -> None:
-        """Pull texels and the networks' weights towards 0, apart from their gradients (Loshchilov and Hutter,
-        ICLR 2019).
-
-        Both pulls follow the ratio of noise to signal as the penalty of ridge regression does (Hoerl and
-        Kennard, Technometrics 12, 1970). That of the weights, which all queries have in common, is divided by
-        their number too.
-        """
-        training = self.config.training
-        texels, weights = self.model.parameter_groups()
-        # Biases stay: what the last one holds is the mean value.
-        matrices = [p for p in weights if p.ndim > 1]
-        with torch.no_grad():
-            for parameters, pull in (
-                (texels, training.texture_rate * training.decay * self._doubt),
-                (matrices, training.rate * self._weight_decay),
-            ):
-                if pull > 0:
-                    for p in parameters:
-                        p.mul_(math.exp(-pull * factor))
 
     def predict(self, queries: Queries) -> NDArray[np.float32]:
         """Values (n, 3) of the model as it is now, read through the current blur."""

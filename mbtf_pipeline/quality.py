@@ -6,8 +6,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from mbtf_fit.config import FitConfig
 from mbtf_fit.quality import FITTER, best_at, fitter_options, said_of
 from mbtf_gen.quality import GENERATOR, Quality, as_assignments
+from mbtf_gen.settings import resolve
 
 from .recipe import fit_names
 from .stages import hash_of
@@ -51,5 +53,8 @@ def _said_of_fit(said: Mapping[str, Any], prefix: str) -> dict[str, Any]:
 
 
 def settings_hash(quality: Quality) -> str:
-    """Hash of all that a quality sets: figures that were measured with others are out of date."""
-    return hash_of([GENERATOR[quality], best_at(quality), FITTER[quality], COMPARE[quality]])[:12]
+    """Hash of all that a quality sets, and of how the fitter trains otherwise: figures that were measured
+    with other settings are out of date."""
+    options = best_at(quality) | FITTER[quality]
+    training = resolve(FitConfig, assignments=as_assignments(options)).training.model_dump(mode="json")
+    return hash_of([GENERATOR[quality], options, training, COMPARE[quality]])[:12]

@@ -17,7 +17,7 @@ POINT_FORMAT = "mbtf-cost-point"
 # Half-width of a 95 % interval, relative, that a study aims at: measuring stops there.
 HALF_WIDTH = 0.1
 # Raised when a point is measured in another way: what an earlier version measured is measured again.
-POINT_SCHEMA = 3
+POINT_SCHEMA = 4
 POINTS = "points"
 
 

@@ -219,7 +219,7 @@ def test_any_other_loss_goes_through_pytorch_piece_by_piece(
 
 def test_the_quadratic_form_is_the_same_loss() -> None:
     terms = [{"kind": "relative", "weight": 0.7}, {"kind": "squared", "weight": 0.2}]
-    noise = NoiseModel(0.1, np.array([0.3, 0.2, 0.1]), np.zeros((4, 3)), np.ones(3))
+    noise = NoiseModel(0.1, np.array([0.3, 0.2, 0.1]), np.zeros((4, 3)), np.ones(3), 0.0)
     section = FitConfig.model_validate({"training": {"losses": terms, "robust": 1.5}}).training
     loss = Objective(section, noise)
     form = loss.quadratic()

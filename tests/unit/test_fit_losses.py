@@ -22,7 +22,7 @@ def objective(kind: str, variance: float = 0.0, **options: Any) -> Objective:
     """One term, for noise of a variance that is the same for all values."""
     training = TrainingSection.model_validate({"losses": [{"kind": kind}], **options})
     c = np.array([variance / SCALE**2, 0, 0])
-    return Objective(training, NoiseModel(SCALE, c, np.tile(c, (4, 1)), np.ones(4)))
+    return Objective(training, NoiseModel(SCALE, c, np.tile(c, (4, 1)), np.ones(4), 0.0))
 
 
 def queries(value: Tensor) -> TrainingQueries:
@@ -116,7 +116,7 @@ def test_terms_add_up_with_their_weights() -> None:
     both = TrainingSection.model_validate(
         {"losses": [{"kind": "squared", "weight": 2.0}, {"kind": "log", "weight": 0.5}]}
     )
-    noise = NoiseModel(SCALE, np.zeros(3), np.zeros((4, 3)), np.ones(4))
+    noise = NoiseModel(SCALE, np.zeros(3), np.zeros((4, 3)), np.ones(4), 0.0)
     total = 2.0 * objective("squared")(p, data) + 0.5 * objective("log")(p, data)
     torch.testing.assert_close(Objective(both, noise)(p, data), total)
 

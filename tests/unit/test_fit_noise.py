@@ -68,11 +68,14 @@ def test_data_without_noise_have_none() -> None:
         assert found.ratio == 0.0
 
 
-def test_the_ratio_is_that_of_noise_to_true_values() -> None:
-    """To 5 %; wherever true values do not vary it is the most there is, since none can be told."""
-    queries, true, variance = noisy()
+@pytest.mark.parametrize("wild", [0, 5])
+def test_the_ratio_is_that_of_noise_to_true_values(wild: int) -> None:
+    """To 5 %, wild values or not; where true values do not vary it is the most there is, since none can be
+    told, and of a single query likewise."""
+    queries, true, variance = noisy(wild=wild)
     found = NoiseModel.of(queries, LATTICE, 0.05).ratio
     assert found == pytest.approx(variance.mean() / true.var(0).mean(), rel=0.05)
+    assert NoiseModel.of(queries.take(slice(1)), LATTICE, 0.05).ratio == 5.0
     random = np.random.default_rng(1)
     a, b = (random.normal(1.0, 0.1, queries.value_a.shape).astype(np.float32) for _ in range(2))
     even = Queries(queries.u, queries.sigma, queries.omega_i, queries.omega_o, a, b)
@@ -86,6 +89,7 @@ def test_buffers_are_pooled_like_queries() -> None:
         shaped[name] = np.broadcast_to(shaped[name][:, :1, :1], shaped[name].shape)
     model = NoiseModel.of(Queries(**shaped), LATTICE, 0.05)
     assert model.overall.sum() > 0
+    assert model.ratio == pytest.approx(NoiseModel.of(queries, LATTICE, 0.05).ratio, rel=0.2)
     value = torch.from_numpy(true.reshape(500, 8, 8, 3))
     first = [torch.from_numpy(np.array(shaped[n][:, 0, 0])) for n in ("sigma", "omega_i", "omega_o")]
     assert model.variance(value, *first).shape == value.shape

@@ -14,7 +14,6 @@ from support.fit_data import make_trainer, parallax, random_queries, train_fully
 import mbtf_fit.parallel
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data import Queries, TrainingQueries
-from mbtf_fit.noise import NoiseModel
 from mbtf_fit.parallel import Workers
 from mbtf_fit.storage import read_tensors, write_tensors
 from mbtf_fit.streaming import Selection
@@ -170,44 +169,9 @@ def test_texels_without_a_gradient_decay_with_the_rate(compiled: bool) -> None:
     expected = first[finest:] * np.exp(-2.0 * sum(rates))
     torch.testing.assert_close(t.model.textures()[0].texels.detach()[finest:], expected)
     weights = [p.detach().clone() for p in t.model.parameter_groups()[1]]
-    t._decay(0.1)
+    t.pull.act(t.model, 0.1, 0.1)
     for before, after in zip(weights, t.model.parameter_groups()[1], strict=True):
         torch.testing.assert_close(after.detach(), before, rtol=0, atol=0)
-
-
-@pytest.mark.parametrize(
-    ("ratio", "weight_decay", "texels", "weights"),
-    [
-        (0.4, 1000.0, 2.0 * 0.05, 0.4 * 1000 / 5000 * 0.1),
-        (2.0, 1000.0, 4 * 2.0 * 0.05, 2.0 * 1000 / 5000 * 0.1),
-        # At most one, times the rate.
-        (2.0, 1e5, 4 * 2.0 * 0.05, 0.1),
-        (2.0, 0.0, 4 * 2.0 * 0.05, 0.0),
-    ],
-)
-def test_noise_makes_decay_stronger(ratio: float, weight_decay: float, texels: float, weights: float) -> None:
-    """Texels from a ratio of a half on, weights by their share of 5000 queries; biases stay."""
-    noise = NoiseModel(0.1, np.zeros(3), np.zeros((4, 3)), np.ones(4), ratio)
-    t = make_trainer(
-        queries(5000),
-        LATTICE,
-        noise=noise,
-        steps=5,
-        decay=2.0,
-        weight_decay=weight_decay,
-        texture_rate=0.05,
-        rate=0.1,
-    )
-    groups = t.model.parameter_groups()
-    with torch.no_grad():
-        for p in (p for group in groups for p in group):
-            p.fill_(1.0)
-    t._decay(0.5)
-    for p in groups[0]:
-        torch.testing.assert_close(p.detach(), torch.full_like(p, np.exp(-0.5 * texels)))
-    for p in groups[1]:
-        expected = np.exp(-0.5 * weights) if p.ndim > 1 else 1.0
-        torch.testing.assert_close(p.detach(), torch.full_like(p, expected))
 
 
 def test_a_budget_of_time_ends_training_and_its_annealing() -> None:

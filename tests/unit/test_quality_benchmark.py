@@ -1,0 +1,66 @@
+"""What `benchmarks/quality.py` says of the quality that nobody waits for."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mbtf_fit.forecast import PERSISTENCE
+from mbtf_gen.quality_measured import Chain
+
+SCRIPT = Path(__file__).parents[2] / "benchmarks/quality.py"
+# `high` at 128² texels; a quarter of its training is two doublings before.
+HIGH = Chain("rock_cliff", "high", 0.12, 800.0, 100.0, 600.0, 0.12, 0.003, 10**9, 10**6, 1e6, "settings")
+QUARTER = replace(HIGH, unexplained=0.15, fit=150.0, seconds=350.0, share=0.25)
+# 1600 queries per texel of 4 paths and 262 144 test queries of 128; 400 of 64, and as many of 256.
+PATHS = {"high": 1600 * 128**2 * 4 + 262_144 * 128, "paper": 400 * 128**2 * 64 + 262_144 * 256}
+QUERIES = {"high": 1600 * 128**2 + 262_144, "paper": 400 * 128**2 + 262_144}
+SAMPLES = 30_000 * 2**20
+
+
+@pytest.fixture(scope="module")
+def benchmark() -> Any:
+    """The benchmark's module."""
+    spec = importlib.util.spec_from_file_location("benchmark_of_qualities", SCRIPT)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("doublings", [0, 1, 3])
+def test_paper_goes_on_as_the_last_two_doublings_did(benchmark: Any, doublings: int) -> None:
+    """Doubling by doubling: the first two gained g and q g of the logarithm, the next ones q² g and on."""
+    high = replace(HIGH, queries_per_second=SAMPLES / (600 * 2**doublings))
+    found, law = benchmark.paper([QUARTER, high], 7)
+    error = QUARTER.unexplained
+    gain = (HIGH.unexplained / QUARTER.unexplained) ** (1 / (1 + PERSISTENCE))
+    for _ in range(2 + doublings):
+        error *= gain
+        gain **= PERSISTENCE
+    assert found.unexplained == pytest.approx(error, abs=5e-4)
+    assert found.fit == pytest.approx(600 * 2**doublings, abs=1)
+    assert f"{QUARTER.unexplained:.3f} ± " in law
+
+
+def test_paper_costs_what_its_paths_and_queries_do(benchmark: Any) -> None:
+    found, _ = benchmark.paper([QUARTER, HIGH], 7)
+    assert found.quality == "paper"
+    assert found.generate == pytest.approx(100 * PATHS["paper"] / PATHS["high"], abs=1)
+    assert found.data_bytes == pytest.approx(1e9 * QUERIES["paper"] / QUERIES["high"], rel=1e-6)
+    # Start-up and report are those of `high`.
+    assert found.seconds == pytest.approx(100 + found.generate + found.fit, abs=2)
+
+
+@pytest.mark.parametrize("chains", [[], [HIGH], [QUARTER], [replace(HIGH, quality="standard"), QUARTER]])
+def test_without_both_runs_nothing_is_said_of_paper(benchmark: Any, chains: list[Chain]) -> None:
+    found, law = benchmark.paper(chains, 7)
+    assert found is None
+    assert "±" not in law
