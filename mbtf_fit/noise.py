@@ -7,7 +7,8 @@ give a variance that depends on a query's value, footprint and directions alone.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import math
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -30,8 +31,8 @@ _LEAST_CELLS = 12
 _TRIMMED = 0.05
 # Most that noise is taken to be of the values' variance: where these have none, no ratio tells.
 _MOST_NOISE = 5.0
-# Halves further apart than twice so many times what a query may be off by are wild.
-_WILD = 10.0
+# Share of the queries, those whose halves are furthest apart, that say nothing about it: damaged ones.
+_WILD = 1e-4
 
 
 def typical_value(values: ArrayLike) -> float:
@@ -61,8 +62,8 @@ class NoiseModel:
     overall : (3,) c over all levels
     levels : (k+1, 3) c by nearest level
     bands : factors by band of the lower cosine (``ELEVATION_BANDS``)
-    ratio : noise variance over the variance of the true values, all queries together, at most 5; what is
-        wild in one half counts only as far as training lets it
+    ratio : noise variance over the variance of the true values, all queries together but for one in 10⁴
+        whose halves are furthest apart; at most 5
     """
 
     scale: float
@@ -103,19 +104,7 @@ class NoiseModel:
             below = float((counts * explained)[mine].sum())
             if below > 0:
                 bands[b] = np.clip(float((counts * means[:, 0])[mine].sum()) / below, 0.1, 10.0)
-        return cls(scale, overall, levels, bands, 0.0)._with_ratio(queries)
-
-    def _with_ratio(self, queries: Queries) -> NoiseModel:
-        """The same with the ratio of these queries, wild halves moved to where they no longer are."""
-        a, b = (torch.from_numpy(v).double() for v in (queries.value_a, queries.value_b))
-        a, b = (
-            torch.minimum(a, b + 2 * _WILD * self.spread(b)),
-            torch.minimum(b, a + 2 * _WILD * self.spread(a)),
-        )
-        noise, signal = (f(a.numpy(), b.numpy()).value for f in (pooled_variance, signal_variance))
-        # Not so of NaN either, the variance of a single query.
-        resolved = signal > noise / _MOST_NOISE
-        return replace(self, ratio=noise / signal if resolved else _MOST_NOISE if noise > 0 else 0.0)
+        return cls(scale, overall, levels, bands, _ratio(queries))
 
     def variance(self, value: Tensor, sigma: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
         """Noise variance in 1/sr² where the true value is `value`: (n, 3), or (items, rows, columns, 3) where
@@ -135,6 +124,18 @@ class NoiseModel:
         c0, c1, c2 = (float(c) for c in self.overall)
         t = value.abs()
         return ((1 + c0) * self.scale**2 + t * (c1 * self.scale + c2 * t)).sqrt_()
+
+
+def _ratio(queries: Queries) -> float:
+    n = len(queries)
+    apart = np.abs(queries.value_a - queries.value_b).reshape(n, -1).max(1)
+    kept = np.sort(np.argsort(apart)[: max(1, n - math.ceil(_WILD * n))])
+    halves = queries.value_a[kept], queries.value_b[kept]
+    noise, signal = pooled_variance(*halves).value, signal_variance(*halves).value
+    if not noise > 0:
+        return 0.0
+    # Not so of NaN either, the variance of a single query.
+    return noise / signal if signal > noise / _MOST_NOISE else _MOST_NOISE
 
 
 def _per_query(array: NDArray[np.float64]) -> NDArray[np.float64]:

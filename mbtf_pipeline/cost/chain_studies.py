@@ -49,7 +49,7 @@ def _queries(seconds: float, spp: int, price: Price) -> int:
 def _fit(model: str, seconds: float, network: dict[str, object] | None = None) -> dict[str, object]:
     """Options of a fit with a model as its paper has it, but for what `network` says."""
     options = {} if network is None else {"network": network}
-    return {"model": model, "training": {"time": f"{seconds:.3g}s"}, **options}
+    return {"model": model, "training": {"time": f"{seconds:.3g}s", "weight_decay": 0.0}, **options}
 
 
 def _best(seconds: float) -> dict[str, object]:

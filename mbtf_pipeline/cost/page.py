@@ -23,7 +23,7 @@ from .figures import (
 )
 from .front import marginal_price, pareto_front
 from .points import HALF_WIDTH, Point
-from .scatter import seed_scatter
+from .scatter import FITTED
 from .study import Study
 from .tables import chain_table, generator_table, to_csv
 
@@ -170,8 +170,9 @@ def write_page(study: Study) -> Path:
     """Write CSV, page and pictures into the study's folder; returns the page's path."""
     write_text(study.folder / CSV_NAME, to_csv(study.points))
     parts = [_front_part(study), *(_part(study, name) for name in _STUDIES)]
-    scatter = seed_scatter(study.points)
+    scatter = study.scatter
     held, known = half_widths(study.points)
+    seeds = max((p.details.get("seeds", 1.0) for p in study.points), default=1.0)
     html: str = (
         page_environment()
         .from_string(template("cost.html"))
@@ -179,6 +180,7 @@ def write_page(study: Study) -> Path:
             style=template("report.css"),
             study=study.description,
             budget=clock(study.description["budget"]),
+            seeds=round(seeds),
             parts=[p for p in parts if p is not None],
             skipped=study.skipped,
             scatter=(
@@ -188,6 +190,8 @@ def write_page(study: Study) -> Path:
                 f"share their data: {scatter.describe()}"
             ),
             widths=f"{held} of {known} errors are known to within a tenth (95 %).",
+            wide=any(1.96 * p.error.relative_error > HALF_WIDTH for p in study.points if p.study in FITTED),
+            failed=study.failed,
         )
     )
     path = study.folder / PAGE_NAME

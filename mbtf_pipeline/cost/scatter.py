@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -88,15 +88,55 @@ def seed_scatter(points: Sequence[Point]) -> Scatter | None:
     return Scatter(seeds[0].setting["queries.spp"], tuple(found), tuple(found.values()))
 
 
-def with_scatter(points: Sequence[Point]) -> list[Point]:
-    """The points with the scatter of seeds in the error bars of chains, in quadrature."""
-    scatter = seed_scatter(points)
+def mean_of(points: Sequence[Point]) -> Point:
+    """Chains of one setting and several seeds as one point, that of the first with the means of all.
+
+    They are judged by the same queries, so the bars that come from these do not become narrower.
+    """
+
+    def mean(estimates: Sequence[Estimate]) -> Estimate:
+        value, error = (statistics.fmean(getattr(e, k) for e in estimates) for k in ("value", "error"))
+        return replace(estimates[0], value=value, error=error)
+
+    details = {k: statistics.fmean(p.details[k] for p in points) for k in points[0].details}
+    return replace(
+        points[0],
+        seconds=mean([p.seconds for p in points]),
+        error=mean([p.error for p in points]),
+        details={**details, "seeds": float(len(points))},
+    )
+
+
+def bar_of(points: Sequence[Point], scatter: Scatter) -> float:
+    """Standard error of the mean of a chain's seeds.
+
+    It holds the error of the test queries, and over the square root of their number the deviation between
+    seeds: that of chains of as much data, or of these ones where it is larger.
+    """
+    mean = mean_of(points)
+    deviation = scatter.of(mean)
+    logs = [math.log(p.error.value) for p in points if p.error.value > 0]
+    if len(logs) >= _FEWEST:
+        deviation = max(deviation, _deviation(logs).value)
+    return math.hypot(mean.error.error, deviation * mean.error.value / math.sqrt(len(points)))
+
+
+def with_scatter(
+    points: Sequence[Point], scatter: Scatter | None, again: Mapping[int, Sequence[Point]] | None = None
+) -> list[Point]:
+    """The points with the scatter of seeds in the error bars of chains, in quadrature.
+
+    Parameters
+    ----------
+    again : of some, by their place, the same chain with other seeds: their means are given
+    """
     if scatter is None:
         return list(points)
     out = []
-    for p in points:
+    for place, p in enumerate(points):
         if p.study in FITTED:
-            bar = math.hypot(p.error.error, scatter.of(p) * p.error.value)
-            p = replace(p, error=replace(p.error, error=bar))
+            seeds = [p, *(again or {}).get(place, ())]
+            p = mean_of(seeds)
+            p = replace(p, error=replace(p.error, error=bar_of(seeds, scatter)))
         out.append(p)
     return out

@@ -22,7 +22,8 @@ from .chains import Chain, Wanted, Workshop
 from .generator import Bench
 from .generator_studies import GeneratorTask, generator_tasks
 from .points import Point, PointFolder
-from .scatter import with_scatter
+from .repeats import Repeats, repeat_chains
+from .scatter import Scatter, seed_scatter, with_scatter
 
 STUDY_NAME = "study.json"
 STUDY_FORMAT = "mbtf-cost"
@@ -49,12 +50,16 @@ class Study:
     description : name, command, budget, seed, machine, and when it was made
     points : in the order of measurement
     skipped : names of settings for which no time was left
+    scatter : of chains over seeds, which their bars hold; None where it is not known
+    failed : chains that could not be fitted with another seed, and why
     """
 
     folder: Path
     description: dict[str, Any]
     points: list[Point] = field(default_factory=list)
     skipped: list[str] = field(default_factory=list)
+    scatter: Scatter | None = None
+    failed: list[str] = field(default_factory=list)
 
 
 def claim(folder: Path) -> None:
@@ -80,6 +85,7 @@ def run_study(
     folder: Path,
     *,
     budget: float,
+    narrow: float = 0.0,
     seed: int | None = None,
     command: str = "",
     tell: Tell | None = None,
@@ -90,6 +96,7 @@ def run_study(
     ----------
     recipe : its material and generator are studied; fits and comparison are not used
     budget : seconds for everything, points that are done already counted as free
+    narrow : further seconds, for chains of other seeds where bars are wide
     seed : of queries, paths and first weights; the recipe's by default
     tell : called with (share of the budget spent, note)
 
@@ -107,7 +114,7 @@ def run_study(
 
     def note(text: str) -> None:
         if tell is not None:
-            tell(min(1.0, (time.perf_counter() - begin) / budget), text)
+            tell(min(1.0, (time.perf_counter() - begin) / (budget + narrow)), text)
 
     def left() -> float:
         return budget - (time.perf_counter() - begin)
@@ -144,8 +151,12 @@ def run_study(
         if price is not None:
             work = Workshop(config, folder / WORK, generator, note)
             extra = _beyond_tracing(store, work, price)
-            _measure_chains(study, store, work, budget, lambda paths: price(paths) + extra, left)
-    return replace(study, points=with_scatter(study.points))
+            repeats = _measure_chains(study, store, work, budget, narrow, lambda n: price(n) + extra, left)
+            study.scatter, study.failed = seed_scatter(study.points), repeats.failed
+            study.points = with_scatter(study.points, study.scatter, repeats.again)
+        if narrow > 0 and study.scatter is None:
+            study.skipped.append("other seeds: how far chains scatter is not known yet")
+    return study
 
 
 def _keep(study: Study, point: Point | None, task: GeneratorTask | Chain, command: str) -> None:
@@ -195,12 +206,15 @@ def _measure_chains(
     store: PointFolder,
     work: Workshop,
     budget: float,
+    narrow: float,
     price: Callable[[int], float],
     left: Callable[[], float],
-) -> None:
+) -> Repeats:
+    """Measure chains, then again those whose bars are too wide."""
     # Prices are those of stored points: a study that goes on has the same tasks.
     tasks = list(chains(budget, work.config.queries.spp, price))
     needed = [t.data for t in tasks]
+    measured: dict[int, Chain] = {}
     try:
         for number, task in enumerate(tasks):
             point = store.get(task.study, task.key)
@@ -208,7 +222,20 @@ def _measure_chains(
                 point = work.measure(task)
                 store.put(task.key, point)
             _keep(study, point, task, work.command_of(task))
+            if point is not None and task.study != "seeds":
+                measured[len(study.points) - 1] = task
             if task.data not in needed[number + 1 :]:
                 work.forget(task.data)
+        end = time.perf_counter() + narrow
+
+        def enough(chain: Chain, data: bool) -> bool:
+            return end - time.perf_counter() > chain.seconds(price, data=data)
+
+        scatter = seed_scatter(study.points)
+        return (
+            Repeats()
+            if scatter is None
+            else repeat_chains(study.points, measured, scatter, store, work, enough)
+        )
     finally:
         work.clear()

@@ -25,6 +25,7 @@ _DETAILS = (
     "relative",
     "relative_se",
     "paths",
+    "seeds",
 )
 COLUMNS = (
     "study",
@@ -106,6 +107,7 @@ def chain_table(points: Sequence[Point]) -> dict[str, Any]:
         "training, s",
         "in all, s",
         "unexplained variance",
+        "seeds",
         "the same in half precision",
         "1080p, ms",
         "MB",
@@ -123,6 +125,7 @@ def chain_table(points: Sequence[Point]) -> dict[str, Any]:
                 f"{d['training_seconds']:.1f}",
                 f"{d['total_seconds']:.1f}",
                 f"{p.error}",
+                f"{d.get('seeds', 1):g}",
                 f"{d['half_error']:.4g}",
                 f"{d['evaluation_ms_1080p']:.0f}",
                 f"{d['bytes'] / 1e6:.2f}",

@@ -223,3 +223,7 @@ def test_cost_study_measures_reports_and_goes_on(
     assert second["points"] == 3
     assert all(p.read_bytes() == content for p, content in points.items())
     assert not (out / ".work").exists()
+    # Without chains nothing can be repeated, and that is said.
+    assert run(app, [*command, "--narrow", "1min"]) == 0
+    assert any("other seeds" in text for text in json.loads(capsys.readouterr().out)["skipped"])
+    assert "--narrow 1min" in (out / "cost.html").read_text()

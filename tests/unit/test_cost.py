@@ -246,7 +246,7 @@ def test_bars_of_chains_hold_the_scatter_of_seeds() -> None:
     other = [chain(0.3, n, **{"queries.spp": spp}) for n, spp in ((800, 2), (400, 8))]
     assert [scatter.of(p) for p in other] == pytest.approx([middle, middle], rel=1e-4)
     assert scatter.describe().endswith("% at 0.0016 M queries × 4")
-    widened = with_scatter([*points, *seeds])
+    widened = with_scatter([*points, *seeds], scatter)
     assert widened[2].error.error == pytest.approx(math.hypot(0.01, 0.4 * middle), rel=1e-4)
     # The generator's errors are not those of fits.
     assert widened[3] == points[3]
@@ -254,7 +254,7 @@ def test_bars_of_chains_hold_the_scatter_of_seeds() -> None:
     other = [chain(9.0, 100, **{"training.time": "9s"}), chain(9.0, 100, "fit")]
     assert seed_scatter([*points, *seeds, *other]) == scatter
     assert seed_scatter([points[0], seeds[0]]) is None
-    assert with_scatter([points[0], seeds[0]]) == [points[0], seeds[0]]
+    assert with_scatter([points[0], seeds[0]], None) == [points[0], seeds[0]]
 
 
 def test_a_study_of_a_folder_with_something_else_in_it_is_refused(tmp_path: Path) -> None:

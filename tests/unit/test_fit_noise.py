@@ -27,7 +27,7 @@ def noisy(n: int = 60_000, wild: int = 0) -> tuple[Queries, np.ndarray, np.ndarr
     shape = true**2 / (2 * variance)
     a, b = (random.gamma(shape) / shape * true for _ in range(2))
     rows = random.choice(n, wild, replace=False)
-    a[rows] = 1e5
+    a[rows[::2]], b[rows[1::2]] = 1e5, 1e5
     return Queries(*arrays.values(), a.astype(np.float32), b.astype(np.float32)), true, variance
 
 
@@ -80,6 +80,17 @@ def test_the_ratio_is_that_of_noise_to_true_values(wild: int) -> None:
     a, b = (random.normal(1.0, 0.1, queries.value_a.shape).astype(np.float32) for _ in range(2))
     even = Queries(queries.u, queries.sigma, queries.omega_i, queries.omega_o, a, b)
     assert NoiseModel.of(even, LATTICE, 1.0).ratio == 5.0
+
+
+def test_light_that_few_paths_find_is_noise() -> None:
+    """One half in a hundred, a hundred times too bright, on few bright queries: noise far beyond the most."""
+    random = np.random.default_rng(2)
+    n = 60_000
+    at = random_queries(random, n, LATTICE)
+    true = parallax(*at.values()) + 5 * (random.random((n, 1)) < 0.02)
+    a, b = (100 * true * (random.random((n, 1)) < 0.01) for _ in range(2))
+    queries = Queries(*at.values(), a.astype(np.float32), b.astype(np.float32))
+    assert NoiseModel.of(queries, LATTICE, 0.05).ratio == 5.0
 
 
 def test_buffers_are_pooled_like_queries() -> None:
