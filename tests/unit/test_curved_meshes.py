@@ -2,29 +2,19 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from support.scripts import benchmark_module
 
 from mbtf_gen.heightfield import HeightGrid, tile_mesh
-
-SCRIPT = Path(__file__).parents[2] / "benchmarks/curved_meshes.py"
 
 
 @pytest.fixture(scope="module")
 def meshes() -> Any:
     """The benchmark's module."""
-    spec = importlib.util.spec_from_file_location("curved_meshes", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
+    return benchmark_module("curved_meshes")
 
 
 def crosses(place: np.ndarray, faces: np.ndarray) -> np.ndarray:

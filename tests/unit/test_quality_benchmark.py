@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
+from support.scripts import benchmark_module
 
 from mbtf_fit.forecast import PERSISTENCE
 from mbtf_gen.quality_measured import Chain
 
-SCRIPT = Path(__file__).parents[2] / "benchmarks/quality.py"
 # `high` at 128² texels; a quarter of its training is two doublings before.
 HIGH = Chain("rock_cliff", "high", 0.12, 800.0, 100.0, 600.0, 0.12, 0.003, 10**9, 10**6, 1e6, "settings")
 QUARTER = replace(HIGH, unexplained=0.15, fit=150.0, seconds=350.0, share=0.25)
@@ -26,13 +23,7 @@ SAMPLES = 30_000 * 2**20
 @pytest.fixture(scope="module")
 def benchmark() -> Any:
     """The benchmark's module."""
-    spec = importlib.util.spec_from_file_location("benchmark_of_qualities", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
+    return benchmark_module("quality")
 
 
 @pytest.mark.parametrize("doublings", [0, 1, 3])
