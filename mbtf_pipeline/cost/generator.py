@@ -29,7 +29,7 @@ from mbtf_gen.planning import plan_effects
 from mbtf_gen.queries import Queries
 from mbtf_gen.stats import Estimate, mean_estimate
 
-from .points import HALF_WIDTH
+from .points import HALF_WIDTH, NORMAL
 
 # Queries of one piece of the reference, and paths that it and the setting get at each.
 BIAS_QUERIES = 16384
@@ -225,7 +225,7 @@ class Bench:
             a, b = found.value_a.astype(np.float64), found.value_b.astype(np.float64)
             squares.append(((a - reference.a) * (b - reference.b)).mean(axis=1) / mean**2)
             square = mean_estimate(np.concatenate(squares))
-            sure = 1.96 * square.error <= max(2 * HALF_WIDTH * square.value, _NEGLIGIBLE**2)
+            sure = NORMAL * square.error <= max(2 * HALF_WIDTH * square.value, _NEGLIGIBLE**2)
             late = time.perf_counter() - began > seconds or len(squares) == _MOST_BIAS_PIECES
             if sure or late:
                 return square
@@ -265,7 +265,7 @@ def _typical(prices: list[float]) -> Estimate:
 
 def _sure(variance: Estimate) -> bool:
     """Whether the 95 % interval of a variance's root is as narrow as wanted."""
-    return 1.96 * variance.error <= 2 * HALF_WIDTH * variance.value or variance.value == 0
+    return NORMAL * variance.error <= 2 * HALF_WIDTH * variance.value or variance.value == 0
 
 
 def _total(bias: Estimate, noise: Estimate) -> Estimate:

@@ -22,7 +22,7 @@ from .figures import (
     noise_figures,
 )
 from .front import marginal_price, pareto_front
-from .points import HALF_WIDTH, Point
+from .points import HALF_WIDTH, NORMAL, Point
 from .scatter import FITTED
 from .study import Study
 from .tables import chain_table, generator_table, to_csv
@@ -120,7 +120,7 @@ def paths_slope(points: Sequence[Point]) -> Estimate | None:
 
 def half_widths(points: Sequence[Point]) -> tuple[int, int]:
     """(errors whose 95 % interval is within `HALF_WIDTH` of them, all)."""
-    widths = [1.96 * p.error.relative_error for p in points if p.study != "seeds" and p.error.value > 0]
+    widths = [NORMAL * p.error.relative_error for p in points if p.study != "seeds" and p.error.value > 0]
     return sum(w <= HALF_WIDTH for w in widths), len(widths)
 
 
@@ -172,6 +172,7 @@ def write_page(study: Study) -> Path:
     parts = [_front_part(study), *(_part(study, name) for name in _STUDIES)]
     scatter = study.scatter
     held, known = half_widths(study.points)
+    narrow, chains = half_widths([p for p in study.points if p.study in FITTED])
     seeds = max((p.details.get("seeds", 1.0) for p in study.points), default=1.0)
     html: str = (
         page_environment()
@@ -190,7 +191,7 @@ def write_page(study: Study) -> Path:
                 f"share their data: {scatter.describe()}"
             ),
             widths=f"{held} of {known} errors are known to within a tenth (95 %).",
-            wide=any(1.96 * p.error.relative_error > HALF_WIDTH for p in study.points if p.study in FITTED),
+            wide=narrow < chains,
             failed=study.failed,
         )
     )

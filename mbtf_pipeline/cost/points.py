@@ -16,6 +16,8 @@ from ..stages import hash_of
 POINT_FORMAT = "mbtf-cost-point"
 # Half-width of a 95 % interval, relative, that a study aims at: measuring stops there.
 HALF_WIDTH = 0.1
+# That half-width over the standard error.
+NORMAL = 1.96
 # Raised when a point is measured in another way: what an earlier version measured is measured again.
 POINT_SCHEMA = 4
 POINTS = "points"

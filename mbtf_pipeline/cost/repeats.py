@@ -8,13 +8,11 @@ from dataclasses import dataclass, field, replace
 from mbtf_gen.errors import InputError
 
 from .chains import Chain, Workshop
-from .points import HALF_WIDTH, Point, PointFolder
+from .points import HALF_WIDTH, NORMAL, Point, PointFolder
 from .scatter import Scatter, bar_of, mean_of
 
 # Seeds that a chain is measured with before its own bars say whether more would help, and at most.
 FEWEST_SEEDS, MOST_SEEDS = 3, 12
-# Half-width of a 95 % interval over the standard error.
-_NORMAL = 1.96
 
 
 @dataclass
@@ -34,7 +32,7 @@ class Repeats:
 def _worth_more(seeds: Sequence[Point], scatter: Scatter) -> bool:
     """Whether the mean of these is not known well enough, and more of them could make it so."""
     error = mean_of(seeds).error
-    wanted = HALF_WIDTH / _NORMAL * error.value
+    wanted = HALF_WIDTH / NORMAL * error.value
     if len(seeds) >= MOST_SEEDS or not bar_of(seeds, scatter) > wanted:
         return False
     # What the test queries leave open no seed narrows; but how much that is varies with the fit.

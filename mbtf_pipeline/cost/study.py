@@ -22,7 +22,7 @@ from .chains import Chain, Wanted, Workshop
 from .generator import Bench
 from .generator_studies import GeneratorTask, generator_tasks
 from .points import Point, PointFolder
-from .repeats import Repeats, repeat_chains
+from .repeats import repeat_chains
 from .scatter import Scatter, seed_scatter, with_scatter
 
 STUDY_NAME = "study.json"
@@ -151,9 +151,7 @@ def run_study(
         if price is not None:
             work = Workshop(config, folder / WORK, generator, note)
             extra = _beyond_tracing(store, work, price)
-            repeats = _measure_chains(study, store, work, budget, narrow, lambda n: price(n) + extra, left)
-            study.scatter, study.failed = seed_scatter(study.points), repeats.failed
-            study.points = with_scatter(study.points, study.scatter, repeats.again)
+            _measure_chains(study, store, work, budget, narrow, lambda n: price(n) + extra, left)
         if narrow > 0 and study.scatter is None:
             study.skipped.append("other seeds: how far chains scatter is not known yet")
     return study
@@ -209,8 +207,8 @@ def _measure_chains(
     narrow: float,
     price: Callable[[int], float],
     left: Callable[[], float],
-) -> Repeats:
-    """Measure chains, then again those whose bars are too wide."""
+) -> None:
+    """Measure chains, then again those whose bars are too wide; bars get the scatter of seeds."""
     # Prices are those of stored points: a study that goes on has the same tasks.
     tasks = list(chains(budget, work.config.queries.spp, price))
     needed = [t.data for t in tasks]
@@ -231,11 +229,10 @@ def _measure_chains(
         def enough(chain: Chain, data: bool) -> bool:
             return end - time.perf_counter() > chain.seconds(price, data=data)
 
-        scatter = seed_scatter(study.points)
-        return (
-            Repeats()
-            if scatter is None
-            else repeat_chains(study.points, measured, scatter, store, work, enough)
-        )
+        study.scatter = seed_scatter(study.points)
+        if study.scatter is not None:
+            repeats = repeat_chains(study.points, measured, study.scatter, store, work, enough)
+            study.failed = repeats.failed
+            study.points = with_scatter(study.points, study.scatter, repeats.again)
     finally:
         work.clear()
