@@ -26,7 +26,7 @@ from mbtf_gen.console import clock
 from mbtf_gen.durations import format_duration
 from mbtf_gen.errors import InputError, UsageError
 
-from .cost.chains import Chain, Workshop
+from .cost.chains import Chain, Wanted, Workshop
 from .recipe import Recipe
 from .run import layout_of
 from .run_folder import claim, describe, locked
@@ -246,7 +246,8 @@ def _pilots(
         for share in SHARES:
             queries = _two_digits(min(max(_FEWEST_QUERIES, share * length / price), most))
             options = _with_time(fit, (1 - share) * length).fields()
-            chain = Chain("chain", name, f"{share:.0%}", queries, recipe.generate.queries.spp, options)
+            wanted = Wanted(queries, recipe.generate.queries.spp)
+            chain = Chain("chain", name, f"{share:.0%}", wanted, options)
             out.append((share, workshop.measure(chain).error.value))
             tell(f"pilot: {share:.0%} of {length:.0f} s generating leaves {out[-1][1]:.3f}")
         return out

@@ -16,14 +16,6 @@ if TYPE_CHECKING:
     from mbtf_fit import Material
     from mbtf_fit.data import Queries
 
-# Splits in the report's words.
-_SPLITS = {
-    "test": "test",
-    "held_out_queries": "held-out queries",
-    "held_out_directions": "held-out directions",
-    "training": "training queries",
-}
-
 
 def errors_on_data(materials: Mapping[str, Material], data: Dataset) -> dict[str, Any]:
     """Errors of every fit on the test split of one data set, and on what its own training held out.
@@ -47,7 +39,7 @@ def errors_on_data(materials: Mapping[str, Material], data: Dataset) -> dict[str
         value = material.predict(test)
         found = split_errors(partial(_known, value), test, data.lattice)
         own = material.description["training"]["errors"]
-        splits = {_SPLITS[split]: errors for split, errors in own.items() if split != "test"}
+        splits = {split: errors for split, errors in own.items() if split != "test"}
         record = {
             "splits": {"test": None if found is None else found.as_dict(), **splits},
             **_size(material),

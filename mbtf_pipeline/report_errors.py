@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from mbtf_fit.wording import SPLIT_NAMES
+
 from .plots import points
 from .visible import measured, visible_text
 from .wording import data_errors, decibel, error_text, estimate, short_direction
@@ -71,7 +73,7 @@ def _table(comparison: Mapping[str, Any]) -> dict[str, Any]:
     splits = list(next(iter(comparison["test"].values()))["splits"])
     head = [
         "fit",
-        *(f"{UNEXPLAINED}, {s}" for s in splits),
+        *(f"{UNEXPLAINED}, {SPLIT_NAMES[s]}" for s in splits),
         "MSE, test [10⁻³/sr²]",
         "network weights",
         "texture values",

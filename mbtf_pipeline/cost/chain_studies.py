@@ -8,7 +8,7 @@ from dataclasses import replace
 from mbtf_fit.quality import best_options
 from mbtf_gen.settings import nested
 
-from .chains import Chain
+from .chains import Chain, Wanted
 
 # Shares of the budget; the generator's own studies take GENERATOR, what is left over is for starting up and
 # judging. DATA pays for the chains of other seeds, too.
@@ -85,10 +85,8 @@ def _whole(budget: float, spp: int, price: Price) -> Iterator[Chain]:
                 spent += total
     for total, share in wanted:
         queries = _queries(share * total, spp, price)
-        fit = _best((1 - share) * total)
-        yield Chain(
-            "chain", f"{share:.0%} of the time generating", f"planned for {total:g} s", queries, spp, fit
-        )
+        series, name = f"{share:.0%} of the time generating", f"planned for {total:g} s"
+        yield Chain("chain", series, name, Wanted(queries, spp), _best((1 - share) * total))
 
 
 def _data(budget: float, spp: int, price: Price) -> Iterator[Chain]:
@@ -102,20 +100,22 @@ def _data(budget: float, spp: int, price: Price) -> Iterator[Chain]:
         for share in PATH_SHARES:
             queries = max(_FEWEST_QUERIES, int(share * paths) // n)
             name = f"{queries * n / 1e6:.3g} M paths"
-            chain = Chain("data", f"{n} paths/query", name, queries, n, _best(2 * each / 3))
+            chain = Chain("data", f"{n} paths/query", name, Wanted(queries, n), _best(2 * each / 3))
             yield chain
             if n == usual:
                 for other in range(1, SEEDS + 1):
-                    yield replace(chain, study="seeds", name=f"{name}, seed + {other}", seed=other)
+                    yield replace(
+                        chain, study="seeds", name=f"{name}, seed + {other}", data=Wanted(queries, n, other)
+                    )
 
 
 def _fits(budget: float, spp: int, price: Price) -> Iterator[Chain]:
     """Models and sizes over training time, on one data set."""
     unit = budget / 18.5
-    queries = _queries(1.5 * unit, spp, price)
+    data = Wanted(_queries(1.5 * unit, spp, price), spp)
 
     def chain(series: str, seconds: float, fit: dict[str, object]) -> Chain:
-        return Chain("fit", series, f"{seconds:.3g} s", queries, spp, fit)
+        return Chain("fit", series, f"{seconds:.3g} s", data, fit)
 
     for seconds in (unit, 2 * unit):
         yield chain(QUALITIES, seconds, _best(seconds))

@@ -53,33 +53,25 @@ class Chain:
     Attributes
     ----------
     study, series, name : see :class:`~mbtf_pipeline.cost.points.Point`
-    queries, spp : training queries, and paths of each
+    data : its training data; what is added to the study's seed is that of the fit, too
     fit : options of the fitter, as its configuration has them
-    seed : added to the study's, of data and fit
     """
 
     study: str
     series: str
     name: str
-    queries: int
-    spp: int
+    data: Wanted
     fit: dict[str, Any] = field(default_factory=dict)
-    seed: int = 0
 
     @property
     def key(self) -> dict[str, Any]:
         """What the point depends on besides the study's basis."""
         return {**asdict(self.data), "fit": self.fit}
 
-    @property
-    def data(self) -> Wanted:
-        """Its training data."""
-        return Wanted(self.queries, self.spp, self.seed)
-
     def seconds(self, price: Callable[[int], float], *, data: bool = True) -> float:
         """What it will take, where a query of so many paths takes ``price(paths)`` seconds to generate;
         `data`: the data are still to be made."""
-        return data * self.queries * price(self.spp) + parse_duration(self.fit["training"]["time"])
+        return data * self.data.queries * price(self.data.spp) + parse_duration(self.fit["training"]["time"])
 
 
 @dataclass(frozen=True)
@@ -171,7 +163,7 @@ class Workshop:
         judges = self.judges()
         data = self.data(chain.data)
         self.progress(f"{chain.study}: {chain.series}, {chain.name}")
-        config = FitConfig.model_validate({"seed": self.config.seed + chain.seed, **chain.fit})
+        config = FitConfig.model_validate({"seed": self.config.seed + chain.data.seed, **chain.fit})
         out = self.folder / f"fit-{hash_of(chain.key)[:12]}"
         shutil.rmtree(out, ignore_errors=True)
         result = fit(config, data.folder, out)
@@ -181,8 +173,8 @@ class Workshop:
         size = sum(p.stat().st_size for p in out.glob("weights*"))
         numbers = sum(p.numel() for p in material.model.parameters())
         details = {
-            "queries": float(chain.queries),
-            "spp": float(chain.spp),
+            "queries": float(chain.data.queries),
+            "spp": float(chain.data.spp),
             "generation_seconds": data.seconds,
             "training_seconds": result.seconds,
             "total_seconds": data.seconds + result.total_seconds,
@@ -201,10 +193,10 @@ class Workshop:
             chain.series,
             chain.name,
             {
-                "queries.train": str(chain.queries),
-                "queries.spp": chain.spp,
+                "queries.train": str(chain.data.queries),
+                "queries.spp": chain.data.spp,
                 **_flat(chain.fit),
-                **({"seed": self.config.seed + chain.seed} if chain.seed else {}),
+                **({"seed": self.config.seed + chain.data.seed} if chain.data.seed else {}),
             },
             "",
             Estimate(details[price], 0.0, 1),
@@ -216,13 +208,13 @@ class Workshop:
         """What makes a chain with the programs."""
         fit = _flat(chain.fit)
         own = ""
-        if seed := self.config.seed + chain.seed:
+        if seed := self.config.seed + chain.data.seed:
             # Also what the generator's configuration holds already, where the chain is of the study's own.
             fit["seed"] = seed
             own = f" --set seed={seed}"
         flags = "".join(f" --set {name}={value}" for name, value in fit.items())
         return (
-            f"{self.command} --queries {chain.queries} --spp {chain.spp}{own} -o shards/ && "
+            f"{self.command} --queries {chain.data.queries} --spp {chain.data.spp}{own} -o shards/ && "
             f"mbtf-fit shards/{flags} -o material/"
         )
 

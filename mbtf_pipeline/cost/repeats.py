@@ -59,7 +59,7 @@ def repeat_chains(
     out = Repeats()
     left = dict(chains)
     for seed in range(1, MOST_SEEDS):
-        done = {place: replace(chain, seed=seed) for place, chain in left.items()}
+        done = {place: replace(chain, data=replace(chain.data, seed=seed)) for place, chain in left.items()}
         # The chains that the scatter was measured on are such repetitions.
         known = {k: store.get("seeds", c.key) or store.get(c.study, c.key) for k, c in done.items()}
         todo = [

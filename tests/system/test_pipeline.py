@@ -97,7 +97,7 @@ def test_pictures_and_numbers_belong_together(first: dict[str, Any], folder: Pat
             10 * np.log10(record["white"] ** 2 / mse["value"])
         )
     splits = record["test"]["neumip"]["splits"]
-    assert set(splits) == {"test", "held-out queries", "held-out directions", "training queries"}
+    assert set(splits) == {"test", "held_out_queries", "held_out_directions", "training"}
     assert sum(g["mse"]["n"] for g in splits["test"]["levels"].values()) == splits["test"]["n"] == 4096
 
 

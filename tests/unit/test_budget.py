@@ -47,8 +47,8 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, float]]:
         return SimpleNamespace(query_seconds=PRICE, seconds=seconds, start=START)
 
     def measure(self: Any, chain: Any) -> Any:
-        generating, training = chain.queries * PRICE, parse_duration(chain.fit["training"]["time"])
-        chains.append((chain.queries, training))
+        generating, training = chain.data.queries * PRICE, parse_duration(chain.fit["training"]["time"])
+        chains.append((chain.data.queries, training))
         error = 0.1 * math.exp(math.log(generating / training) ** 2)
         return SimpleNamespace(error=Estimate(error, 0.01, 10))
 

@@ -126,7 +126,7 @@ def test_chains_fit_into_their_budget(budget: float) -> None:
     for study, share in (("data", DATA), ("fit", FIT), ("chain", WHOLE)):
         assert spent[study] <= 1.05 * share * budget
     # Equal numbers of paths are compared, whatever their number per query.
-    budgets = {c.queries * c.spp for c in found if c.study == "data"}
+    budgets = {c.data.queries * c.data.spp for c in found if c.study == "data"}
     assert len(budgets) == 2
     # From a minute upwards, each twice as long as the one before, as far as the budget goes.
     whole = [c for c in found if c.study == "chain"]
@@ -134,12 +134,12 @@ def test_chains_fit_into_their_budget(budget: float) -> None:
     assert totals == [2**n for n in range(len(totals))]
     assert sum(totals) <= WHOLE * budget / SHORTEST < sum(totals) + 2 * totals[-1]
     # Chains of other seeds, of data and fit, are of two settings that were measured.
-    settings = [(c.queries, c.spp, c.fit) for c in found if c.study == "data" and c.spp == 4]
+    settings = [(c.data.queries, c.data.spp, c.fit) for c in found if c.study == "data" and c.data.spp == 4]
     others = [c for c in found if c.study == "seeds"]
     for setting in settings:
-        assert {c.seed for c in others if (c.queries, c.spp, c.fit) == setting} == {1, 2, 3}
+        assert {c.data.seed for c in others if (c.data.queries, c.data.spp, c.fit) == setting} == {1, 2, 3}
     assert len(others) == 3 * len(settings) == 6
-    assert all(c.seed == 0 for c in found if c.study != "seeds")
+    assert all(c.data.seed == 0 for c in found if c.study != "seeds")
 
 
 def test_chains_of_other_seeds_have_other_data_and_other_weights(
@@ -162,17 +162,17 @@ def test_chains_of_other_seeds_have_other_data_and_other_weights(
     options = {"training": {"time": "5s"}}
     for seed in (0, 2, 2):
         with pytest.raises(KeyboardInterrupt):
-            shop.measure(module.Chain("seeds", "", "", 64, 4, options, seed=seed))
+            shop.measure(module.Chain("seeds", "", "", Wanted(64, 4, seed), options))
     # Data of one seed are made once.
     assert seeds == [5, 5, 7, 7, 7]
     assert shop.has(Wanted(64, 4, 2))
     assert not shop.has(Wanted(64, 4, 1))
-    chain = module.Chain("seeds", "", "", 64, 4, options, seed=2)
+    chain = module.Chain("seeds", "", "", Wanted(64, 4, 2), options)
     assert shop.command_of(chain).count(" --set seed=7") == 2
     plain = module.Workshop(GeneratorConfig(material="m"), tmp_path, "mbtf-gen m", lambda note: None)
-    assert "seed" not in plain.command_of(replace(chain, seed=0))
+    assert "seed" not in plain.command_of(replace(chain, data=Wanted(64, 4)))
     assert plain.command_of(chain).count(" --set seed=2") == 2
-    assert chain.key != replace(chain, seed=0).key
+    assert chain.key != replace(chain, data=Wanted(64, 4)).key
 
 
 def test_queries_cost_what_they_cost_on_disk(tmp_path: Path) -> None:

@@ -43,18 +43,22 @@ class FakeWorkshop:
             self.held.add(chain.data)
         true = TRUE["data" if chain.study == "seeds" else chain.study]
         error = true * math.exp(self.scatter * next(self.luck))
-        setting = {"queries.train": str(chain.queries), "queries.spp": chain.spp, "model": chain.fit["model"]}
-        if chain.seed:
-            setting["seed"] = chain.seed
+        setting = {
+            "queries.train": str(chain.data.queries),
+            "queries.spp": chain.data.spp,
+            "model": chain.fit["model"],
+        }
+        if chain.data.seed:
+            setting["seed"] = chain.data.seed
         return Point(
             chain.study,
             chain.series,
             chain.name,
             setting,
             "command",
-            Estimate(5.0 + chain.seed, 0.0, 1),
+            Estimate(5.0 + chain.data.seed, 0.0, 1),
             Estimate(error, self.judged * error, 1000),
-            details={"total_seconds": 5.0 + chain.seed},
+            details={"total_seconds": 5.0 + chain.data.seed},
         )
 
     def has(self, data: Wanted) -> bool:
@@ -65,7 +69,7 @@ class FakeWorkshop:
 
 
 def chain(study: str, queries: int = 1000, seed: int = 0, name: str = "a chain") -> Chain:
-    return Chain(study, "neumip", name, queries, 4, FIT, seed)
+    return Chain(study, "neumip", name, Wanted(queries, 4, seed), FIT)
 
 
 def measured(work: FakeWorkshop, store: PointFolder, tasks: list[Chain]) -> list[Point]:
@@ -124,7 +128,7 @@ def test_chains_are_repeated_until_their_bars_are_narrow(tmp_path: Path) -> None
     assert all(needed <= n <= MOST_SEEDS for n in seeds.values())
     assert seeds.keys() == chains.keys()
     # Three of the first one's were there; data that two chains share are made once for each seed.
-    assert {c.seed for c in work.measured if c.study == "data"} == set(range(4, seeds[0]))
+    assert {c.data.seed for c in work.measured if c.study == "data"} == set(range(4, seeds[0]))
     assert len(work.generated) == len(set(work.generated))
     assert not work.held
     found = with_scatter(points, scatter, again)
@@ -187,7 +191,7 @@ def test_a_seed_far_from_the_others_widens_the_bar(tmp_path: Path) -> None:
 def test_a_chain_that_fails_with_a_seed_ends_nothing(tmp_path: Path) -> None:
     class Failing(FakeWorkshop):
         def measure(self, chain: Chain) -> Point:
-            if chain.seed == 2 and chain.study == "fit" and chain.name == "one":
+            if chain.data.seed == 2 and chain.study == "fit" and chain.name == "one":
                 raise InputError("training diverged at step 7")
             return super().measure(chain)
 

@@ -65,7 +65,7 @@ def test_all_fits_are_judged_by_the_same_test_queries(tmp_path: Path) -> None:
     for name, square in (("a", 0.01), ("b", 0.0025)):
         mse = found[name]["splits"]["test"]["mse"]
         assert abs(mse["value"] - square) < 4 * mse["error"]
-        assert found[name]["splits"]["held-out queries"] == {"mse": "own"}
+        assert found[name]["splits"]["held_out_queries"] == {"mse": "own"}
         assert sum(found[name]["networks"].values()) == found[name]["network_weights"]
     less = found["b"]["mse_less_first"]
     assert abs(less["value"] - (0.0025 - 0.01)) < 4 * less["error"]
