@@ -43,7 +43,8 @@ def chain(recipe: Recipe, split: Split) -> Chain:
     """The chain that a split makes of a recipe."""
     spent = within_budget(recipe, split)
     fit = spent.fit["neumip"].fields()
-    return Chain("chain", "neumip", f"{split.share:.0%}", split.queries, recipe.generate.queries.spp, fit)
+    data = Wanted(split.queries, recipe.generate.queries.spp)
+    return Chain("chain", "neumip", f"{split.share:.0%}", data, fit)
 
 
 def measure(material: Path, seconds: float, splits: list[float], levels: int, work: Path) -> dict[str, Any]:
@@ -65,7 +66,7 @@ def measure(material: Path, seconds: float, splits: list[float], levels: int, wo
     start = (found.generating - found.share * (seconds - found.pilot_seconds)) / (1 - found.share)
     price, left = (found.generating - start) / found.queries, seconds - start
     workshop = Workshop(recipe.generate, work / "chains", "", lambda note: None)
-    rows = []
+    rows, errors = [], []
     for share in [*splits, None]:
         split = found
         if share is not None:
@@ -73,6 +74,7 @@ def measure(material: Path, seconds: float, splits: list[float], levels: int, wo
         point = workshop.measure(chain(recipe, split))
         workshop.forget(Wanted(split.queries, recipe.generate.queries.spp))
         took = point.details["total_seconds"] + (found.pilot_seconds if share is None else 0.0)
+        errors.append(point.error)
         rows.append(
             {
                 "split": "--budget" if share is None else share,
@@ -85,9 +87,9 @@ def measure(material: Path, seconds: float, splits: list[float], levels: int, wo
         )
         print(f"{material.name:16s} {json.dumps(rows[-1])}", file=sys.stderr, flush=True)
     workshop.clear()
-    best = min(rows[:-1], key=lambda row: row["unexplained"])
-    ratio = rows[-1]["unexplained"] / best["unexplained"]
-    spread = ratio * math.hypot(*(row["error"] / row["unexplained"] for row in (best, rows[-1])))
+    best = min(errors[:-1], key=lambda e: e.value)
+    ratio = errors[-1].value / best.value
+    spread = ratio * math.hypot(best.relative_error, errors[-1].relative_error)
     return {"material": material.name, "rows": rows, "ratio": ratio, "ratio_error": spread}
 
 

@@ -190,7 +190,7 @@ def main() -> int:
         parser.add_argument(f"--{name}", type=int, default=default)
     options = parser.parse_args()
     dice = random.Random(options.seed)
-    ClosedForm.estimate = noisy_plane  # type: ignore[method-assign]
+    ClosedForm.estimate = noisy_plane  # type: ignore[method-assign, assignment]
     figures: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name).resolve()

@@ -29,6 +29,7 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -142,12 +143,12 @@ class Plain(nn.Module):
         """Values (n, 3), textures blurred by `sigma` texels of the finest level."""
         self.mark()
         columns = self.lattice.shape()[1]
-        pyramid = list(self.pyramid)
+        pyramid: list[Tensor] = list(self.pyramid)
         for s, texture in enumerate(pyramid):
             local = sigma * texture.shape[1] / columns
             if local >= NEGLIGIBLE:
                 pyramid[s] = blur_by_fft(texture, local)
-        offset_texture = self.offset_texture
+        offset_texture: Tensor = self.offset_texture
         if offset_sigma > 0:
             offset_texture = blur_by_fft(offset_texture, offset_sigma)
         self.mark("blur")
@@ -268,7 +269,7 @@ def main() -> int:
         plain.take(fresh())
         step = Plainly(plain, config, unit)
         step(batches[0], 0.5)
-        plains[read.__name__] = (seconds(lambda s=step: s(batches[1], 0.5)), step)
+        plains[read.__name__] = (seconds(partial(step, batches[1], 0.5)), step)
     reader = min(plains, key=lambda name: plains[name][0])
     plainly = plains[reader][1]
     plainly.model.take(fresh())
@@ -295,14 +296,18 @@ def main() -> int:
             for batch in batches:
                 plainly.model(batch, 0.0, 0.0).clamp_min(0)
 
+    def all_moments(step: Plainly | Ours) -> None:
+        for batch, moment in zip(batches, MOMENTS, strict=True):
+            step(batch, moment)
+
     for number in range(arguments.rounds + 1):
         if number == 1:
             plainly.model.seconds.clear()
-        times = {"plain": seconds(lambda: [plainly(b, m) for b, m in zip(batches, MOMENTS, strict=True)])}
+        times = {"plain": seconds(partial(all_moments, plainly))}
         shares = dict(plainly.model.seconds)
-        for way, step in ours.items():
-            with step:
-                times[way] = seconds(lambda s=step: [s(b, m) for b, m in zip(batches, MOMENTS, strict=True)])
+        for way, mine in ours.items():
+            with mine:
+                times[way] = seconds(partial(all_moments, mine))
         evaluations = {"plain": seconds(plain_inference)}
         plainly.model.seconds = defaultdict(float, shares)
         for way in ours:

@@ -257,8 +257,8 @@ def main() -> int:
         mine = found["default"]["unexplained"]
         for name in (n for n in found if n not in OTHER):
             other = found[name]["unexplained"]
-            error = (mine["error"] ** 2 + other["error"] ** 2) ** 0.5
-            if mine["value"] - other["value"] > max(SHARE, ERRORS * error):
+            bar = (mine["error"] ** 2 + other["error"] ** 2) ** 0.5
+            if mine["value"] - other["value"] > max(SHARE, ERRORS * bar):
                 better.append(name)
     figures = {name: {k: v for k, v in f.items() if k != "history"} for name, f in found.items()}
     print(json.dumps({"figures": figures, "better_than_default": better, "met": not better}))

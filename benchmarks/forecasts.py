@@ -94,7 +94,8 @@ def best_persistence(fits: list[dict[str, Any]]) -> tuple[float, float]:
         squares = []
         for found in fits:
             doublings = math.log2(found["seconds, forecast"] / PILOT_SECONDS[1])
-            said = extrapolated(*found["pilots"], doublings, persistence=persistence)
+            short, long = found["pilots"]
+            said = extrapolated(short, long, doublings, persistence=persistence)
             squares.append(math.log(said / found["error"]) ** 2)
         return math.sqrt(sum(squares) / len(squares))
 

@@ -31,7 +31,7 @@ from mbtf_gen.errors import MbtfError
 from mbtf_gen.generation import Job
 from mbtf_gen.quality import Quality
 from mbtf_gen.settings import nested
-from mbtf_pipeline.cost.chains import Chain, Workshop
+from mbtf_pipeline.cost.chains import Chain, Wanted, Workshop
 from mbtf_pipeline.run_folder import machine
 
 SIZES = ((25, 7), (40, 12), (64, 16), (96, 24))
@@ -56,6 +56,7 @@ def measure(
     """A row for each size."""
     config = generator_config(name, quality, levels)
     count = count_queries(config.queries.train, Job.prepare(config).lattice.texels())
+    data = Wanted(count, config.queries.spp)
     workshop = Workshop(config, work, "", lambda note: print(note, file=sys.stderr))
     rows = []
     for width, channels in sizes:
@@ -63,20 +64,22 @@ def measure(
         network = {"network.width": width, "network.channels": channels}
         options = {**best_options(seconds), **network, "training.time": f"{seconds:g}s"}
         fit = nested({"model": "neumip", **options})
-        point = workshop.measure(Chain("fit", "neumip", size, count, config.queries.spp, fit))
+        point = workshop.measure(Chain("fit", "neumip", size, data, fit))
+        size_bytes = point.details["bytes"]
+        evaluation = point.details["evaluation_ms_1080p"]
         rows.append(
             {
                 "size": size,
                 "unexplained": point.error.value,
                 "error": point.error.error,
                 "seconds": point.details["training_seconds"],
-                "evaluation_ms_1080p": point.details["evaluation_ms_1080p"],
-                "bytes": point.details["bytes"],
+                "evaluation_ms_1080p": evaluation,
+                "bytes": size_bytes,
             }
         )
         print(
             f"{name} {size:7s} unexplained {point.error}   "
-            f"{rows[-1]['evaluation_ms_1080p']:.0f} ms for 1080p   {rows[-1]['bytes'] / 1e6:.2f} MB",
+            f"{evaluation:.0f} ms for 1080p   {size_bytes / 1e6:.2f} MB",
             flush=True,
         )
     workshop.clear()

@@ -31,6 +31,7 @@ import sys
 import tempfile
 import time
 import zlib
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -103,14 +104,14 @@ def chi_squares(mi: Any, dr: Any, bsdf: Any) -> list[float]:
     sigma = 0.5 * np.exp2(-lattice.finest * random.random(PLACES))
     out = []
     for k in range(PLACES):
-        one = (u[k : k + 1], sigma[k : k + 1], views[k : k + 1])
-        si = hits(mi, dr, lattice.aspect, *one, SAMPLES)
+        here = partial(hits, mi, dr, lattice.aspect, u[k : k + 1], sigma[k : k + 1], views[k : k + 1])
+        si = here(SAMPLES)
         bs, _ = bsdf.sample(context, si, *uniform(mi, SAMPLES, 100 + k))
         # What fell below the surface was thrown away.
         drawn = np.where(np.array(bs.pdf) > 0, np.array(bs.wo), [[0.0], [0.0], [-1.0]]).T
 
-        def density(w: Any, one: Any = one) -> NDArray[np.float64]:
-            place = hits(mi, dr, lattice.aspect, *one, len(w))
+        def density(w: Any, here: Any = here) -> NDArray[np.float64]:
+            place = here(len(w))
             return np.array(bsdf.pdf(context, place, mi.Vector3f(w.T.astype(np.float32))), np.float64)
 
         out.append(chi_square_test(drawn, density, Cap(cos_min=0.0), bins=(16, 32)).p_value)

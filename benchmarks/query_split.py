@@ -91,10 +91,10 @@ def measure(
                 key = dict(zip(KEY, values, strict=True))
                 row = kept.find(key)
                 if row is None:
-                    queries = max(1, int(budget) // spp)
-                    point = shop.measure(Chain("data", f"{budget:g} paths", f"{spp}", queries, spp, fit))
-                    shop.forget(Wanted(queries, spp))
-                    row = {**key, "queries": queries, "unexplained": point.error.as_dict()}
+                    data = Wanted(max(1, int(budget) // spp), spp)
+                    point = shop.measure(Chain("data", f"{budget:g} paths", f"{spp}", data, fit))
+                    shop.forget(data)
+                    row = {**key, "queries": data.queries, "unexplained": point.error.as_dict()}
                     kept.add(row)
                 rows.append(row)
                 left = row["unexplained"]

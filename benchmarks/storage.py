@@ -76,19 +76,21 @@ def main() -> int:
                 run()
                 times[way].append(time.perf_counter() - start)
     rates = {f"{way} MB/s": round(size / median(seconds), 1) for way, seconds in times.items()}
+    verified = round(rates["verify MB/s"] / rates["sha256, one thread MB/s"], 3)
+    writing = round(summary.writing_seconds / summary.seconds / (os.cpu_count() or 1), 4)
+    waiting = round(summary.waiting_seconds / summary.seconds, 4)
     figures = {
         "MB": round(size, 1),
         "seconds": summary.seconds,
         "M paths/s": round(summary.paths_per_second / 1e6, 3),
-        "writing share": round(summary.writing_seconds / summary.seconds / (os.cpu_count() or 1), 4),
-        "waiting share": round(summary.waiting_seconds / summary.seconds, 4),
+        "writing share": writing,
+        "waiting share": waiting,
         **rates,
-        "verify over digest": round(rates["verify MB/s"] / rates["sha256, one thread MB/s"], 3),
+        "verify over digest": verified,
         "bars": BARS,
     }
     print(json.dumps(figures))
-    stored = figures["writing share"] + figures["waiting share"]
-    return int(stored > 0.05 or figures["verify over digest"] < 0.8)
+    return int(writing + waiting > 0.05 or verified < 0.8)
 
 
 if __name__ == "__main__":

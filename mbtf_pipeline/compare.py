@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 COMPARISON_NAME = "comparison.json"
 COMPARISON_FORMAT = "mbtf-comparison"
 # Raised when the record or what lies beside it changes; part of what the stage depends on.
-COMPARISON_SCHEMA = 4
+COMPARISON_SCHEMA = 5
 
 F32 = NDArray[np.float32]
 Progress = Callable[[str], None]

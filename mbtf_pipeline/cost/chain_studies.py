@@ -20,7 +20,7 @@ OTHER_SHARES = (0.6, 0.15)
 # Chains of other seeds at each of two sizes of data, which show how far chains scatter.
 SEEDS = 3
 PATHS = (2, 4, 16, 64)
-# Path budgets at which they are compared, of the largest.
+# Path budgets at which they are compared, of the mean one.
 PATH_SHARES = (0.4, 1.6)
 # What fits with the options of the qualities are called; chains are made of these.
 QUALITIES = "neumip of the qualities"

@@ -33,7 +33,7 @@ PIXELS = 1920 * 1080
 # Queries of one timed evaluation, and how often it is timed.
 _TIMED_QUERIES = 1 << 18
 _TIMED = 7
-# Training queries of the data set that is made for its test split alone.
+# Test queries of chains' data: chains are judged by others.
 _FEWEST = "64"
 
 
@@ -131,7 +131,8 @@ class Workshop:
     def data(self, wanted: Wanted) -> _Data:
         """Training data, made where they are missing."""
         if wanted not in self._made:
-            self.progress(f"{wanted.queries / 1e6:.2f} M queries of {wanted.spp} paths")
+            other = f", seed + {wanted.seed}" if wanted.seed else ""
+            self.progress(f"{wanted.queries / 1e6:.2f} M queries of {wanted.spp} paths{other}")
             self._made[wanted] = self._generate(wanted)
         return self._made[wanted]
 
@@ -162,7 +163,8 @@ class Workshop:
 
         judges = self.judges()
         data = self.data(chain.data)
-        self.progress(f"{chain.study}: {chain.series}, {chain.name}")
+        other = f", seed + {chain.data.seed}" if chain.data.seed and chain.study != "seeds" else ""
+        self.progress(f"{chain.study}: {chain.series}, {chain.name}{other}")
         config = FitConfig.model_validate({"seed": self.config.seed + chain.data.seed, **chain.fit})
         out = self.folder / f"fit-{hash_of(chain.key)[:12]}"
         shutil.rmtree(out, ignore_errors=True)

@@ -73,7 +73,9 @@ class GeneratorTask:
 
     def command(self, generator: str) -> str:
         """What measures it with the program: its command with the study's configuration, and the setting."""
-        sets = "".join(f" --set {name}={value}" for name, value in self.changes.items())
+        # But where ways to count paths are compared, all queries get as many.
+        even = {} if self.study == "adaptive" else {"queries.allocation": "even"}
+        sets = "".join(f" --set {name}={value}" for name, value in {**even, **self.changes}.items())
         return f"{generator}{sets} -o shards/"
 
 

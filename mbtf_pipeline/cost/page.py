@@ -193,6 +193,7 @@ def write_page(study: Study) -> Path:
             widths=f"{held} of {known} errors are known to within a tenth (95 %).",
             wide=narrow < chains,
             failed=study.failed,
+            tests=None if study.test_seconds is None else clock(study.test_seconds),
         )
     )
     path = study.folder / PAGE_NAME

@@ -32,7 +32,8 @@ class Point:
     study : the trade that it is part of; series : the line it lies on; name : what tells it from the others
     setting : options by dotted name, as ``--set`` takes them
     command : does with the programs what was measured here
-    seconds : what it costs; in the generator's studies per million queries, elsewhere of the whole chain
+    seconds : what it costs: in the generator's studies per million queries, of ``data`` and ``seeds`` to
+        generate, of ``fit`` to train, of ``chain`` in all
     error : what is wrong with the result, in the study's unit
     bias, noise : its two parts, where they are told apart; error² = bias² + noise²
     details : further numbers by name: generation and training seconds, bytes, milliseconds, …

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_gen.atomic import read_json, write_json, write_text
+from mbtf_gen.config import GeneratorConfig, count_queries
 from mbtf_gen.errors import InputError
 from mbtf_gen.material import load_material
 from mbtf_gen.settings import dump_yaml
@@ -52,6 +53,8 @@ class Study:
     skipped : names of settings for which no time was left
     scatter : of chains over seeds, which their bars hold; None where it is not known
     failed : chains that could not be fitted with another seed, and why
+    test_seconds : what the recipe's test split takes, which commands of chains make besides; None where no
+        price of paths is known
     """
 
     folder: Path
@@ -60,6 +63,7 @@ class Study:
     skipped: list[str] = field(default_factory=list)
     scatter: Scatter | None = None
     failed: list[str] = field(default_factory=list)
+    test_seconds: float | None = None
 
 
 def claim(folder: Path) -> None:
@@ -78,6 +82,33 @@ def _is_study(folder: Path) -> bool:
         return bool(read_json(folder / STUDY_NAME).get("format") == STUDY_FORMAT)
     except InputError:
         return False
+
+
+def _claim_for_this_machine(folder: Path) -> None:
+    """As :func:`claim`; a study of another machine is refused, for its seconds would stand beside this one's.
+
+    Raises
+    ------
+    InputError : the folder holds something else, or such a study
+    """
+    claim(folder)
+    path = folder / STUDY_NAME
+    if path.exists():
+        there, here = read_json(path).get("machine", {}).get("system"), machine()["system"]
+        if there != here:
+            raise InputError(
+                f"holds a cost study made on another machine ({there}; this is {here})",
+                where=folder,
+                cure="choose another folder with -o",
+            )
+
+
+def studied(config: GeneratorConfig, seed: int | None) -> GeneratorConfig:
+    """A recipe's generator as its study takes it: with numbers of paths, which a target error would override,
+    and queries one by one, which all models but one learn from."""
+    queries = config.queries.model_copy(update={"target_error": None, "layout": "shuffled"})
+    seeds = {} if seed is None else {"seed": seed}
+    return config.model_copy(update={"queries": queries, **seeds})
 
 
 def run_study(
@@ -106,11 +137,9 @@ def run_study(
     PartialError : another process is at work in the folder, or the disk is full; the same command goes on
     """
     begin = time.perf_counter()
-    config = recipe.generate
-    if seed is not None:
-        config = config.model_copy(update={"seed": seed})
+    config = studied(recipe.generate, seed)
     material = load_material(Path(config.material), config.geometry.tile)
-    claim(folder)
+    _claim_for_this_machine(folder)
 
     def note(text: str) -> None:
         if tell is not None:
@@ -149,6 +178,9 @@ def run_study(
             _keep(study, point, task, task.command(generator))
         price = _price(study.points)
         if price is not None:
+            texels = bench.job({}).lattice.texels()
+            tests = count_queries(config.queries.test, texels)
+            study.test_seconds = tests * price(config.queries.test_spp)
             work = Workshop(config, folder / WORK, generator, note)
             extra = _beyond_tracing(store, work, price)
             _measure_chains(study, store, work, budget, narrow, lambda n: price(n) + extra, left)

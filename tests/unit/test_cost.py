@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from mbtf_gen.atomic import write_json
 from mbtf_gen.config import GeneratorConfig
 from mbtf_gen.stats import Estimate
 from mbtf_pipeline.cost.chain_studies import DATA, FIT, GENERATOR, QUALITIES, SHORTEST, WHOLE, chains
@@ -264,6 +265,37 @@ def test_a_study_of_a_folder_with_something_else_in_it_is_refused(tmp_path: Path
     (tmp_path / "thesis.tex").write_text("")
     with pytest.raises(InputError, match="holds no cost study"):
         claim(tmp_path)
+
+
+def test_seconds_of_two_machines_are_not_mixed(tmp_path: Path) -> None:
+    from mbtf_gen.errors import InputError
+    from mbtf_pipeline.cost import study
+    from mbtf_pipeline.run_folder import machine
+
+    claim_here = study._claim_for_this_machine
+    claim_here(tmp_path / "new")
+    known = {"format": study.STUDY_FORMAT, "machine": machine()}
+    write_json(tmp_path / "new" / study.STUDY_NAME, known)
+    claim_here(tmp_path / "new")
+    known["machine"] = {"system": "Plan 9, 64 processors"}
+    write_json(tmp_path / "new" / study.STUDY_NAME, known)
+    with pytest.raises(InputError, match=r"another machine .Plan 9, 64 processors; this is "):
+        claim_here(tmp_path / "new")
+
+
+def test_studies_count_paths_whatever_the_recipe_aims_at() -> None:
+    """With a target error all numbers of paths would be one setting; and fits learn from single queries."""
+    from mbtf_pipeline.cost.study import studied
+
+    queries = {"target_error": "5%", "layout": "image", "window": 8, "spp": 6}
+    config = GeneratorConfig.model_validate({"material": "m", "seed": 3, "queries": queries})
+    found = studied(config, None)
+    assert found.queries.target_error is None
+    assert (found.queries.layout, found.queries.spp, found.seed) == ("shuffled", 6, 3)
+    assert studied(config, 7).seed == 7
+    # A recipe without either is studied as it stands, and so finds the points that were measured of it.
+    plain = GeneratorConfig(material="m")
+    assert studied(plain, None) == plain
 
 
 def test_plots_name_their_axes_and_bars(tmp_path: Path) -> None:

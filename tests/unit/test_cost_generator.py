@@ -79,6 +79,12 @@ def test_every_setting_is_one_that_the_generator_takes(bench: Bench) -> None:
     assert {"auto", "all", "without shadowing", "without interreflection"} <= names
     assert "without neighbours" not in names
     assert sum(t.study == "adaptive" for t in tasks) == 2 * len(COUNTS) + len(TARGETS)
+    # Commands give queries the paths that they were measured with: as many each, but where ways to count
+    # them are compared.
+    for task in tasks:
+        command = task.command("mbtf-gen m")
+        wanted = task.changes.get("queries.allocation", None if task.study == "adaptive" else "even")
+        assert f"allocation={wanted}" in command if wanted else "allocation" not in command
 
 
 def test_other_work_on_the_machine_does_not_change_the_price() -> None:
