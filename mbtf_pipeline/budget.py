@@ -197,7 +197,10 @@ def _plan(recipe: Recipe, budget: float, folder: Path, tell: Callable[[str], Non
     pilots: list[tuple[float, float]] = []
     length = PILOT * budget
     if length >= SHORTEST_PILOT:
-        pilots = _pilots(recipe, length, price, tell)
+        try:
+            pilots = _pilots(recipe, length, price, tell)
+        except InputError as error:
+            tell(f"pilot failed: {error}; {USUAL_SHARE:.0%} of the time generates, as of short budgets")
     # Data without variance, such as those of an even plane, leave nothing to be unexplained.
     pilots = pilots if all(math.isfinite(error) for _, error in pilots) else []
     share = best_share(pilots) if pilots else USUAL_SHARE
@@ -245,7 +248,10 @@ def _pilots(
         most = most_queries(recipe, Path(work))
         for share in SHARES:
             queries = _two_digits(min(max(_FEWEST_QUERIES, share * length / price), most))
-            options = _with_time(fit, (1 - share) * length).fields()
+            trained = _with_time(fit, (1 - share) * length)
+            # Where it trains is no option of the result, but of the time that it takes.
+            where = trained.model_dump(mode="json", include={"device", "data"})
+            options = {**trained.fields(), **where}
             wanted = Wanted(queries, recipe.generate.queries.spp)
             chain = Chain("chain", name, f"{share:.0%}", wanted, options)
             out.append((share, workshop.measure(chain).error.value))

@@ -247,7 +247,7 @@ def cost(
     /,
     *,
     output: Output = None,
-    time: str = "10min",
+    time: str | None = None,
     narrow: str | None = None,
     seed: int | None = None,
     assignments: Set | None = None,
@@ -255,8 +255,8 @@ def cost(
 ) -> None:
     """Measure what accuracy costs in time, on this material and machine: mbtf-pipeline cost RECIPE
 
-    Writes cost.html, cost.csv and PNGs. The same command again goes on where it stopped; a longer time adds
-    to what was measured.
+    Writes cost.html, cost.csv and PNGs. The same command again goes on where it stopped. A longer time keeps
+    the generator's settings that were measured, adds others, and makes longer chains.
 
     Parameters
     ----------
@@ -265,24 +265,24 @@ def cost(
     output
         Folder of the study. Default: out/NAME-cost
     time
-        Budget: 90s, 10min, 1h.
+        Budget: 90s, 10min, 1h. Default: that of the study in the folder, 10min for a new one
     narrow
-        Afterwards so much more: chains whose 95 % intervals are wider than a tenth again with other seeds.
-        A finished study is kept.
+        Afterwards so much more: chains whose errors are known to worse than ± 10 % (95 %) again with other
+        seeds.
     seed
         Of queries, paths and first weights. Default: the recipe's
     """
-    from mbtf_gen.durations import asked_duration
+    from mbtf_gen.durations import asked_duration, format_duration
 
     from .cost.page import whole_chains, write_page
-    from .cost.study import run_study
+    from .cost.study import budget_of, run_study
     from .recipe import load_recipe
 
-    budget = asked_duration(time, "--time")
     more = 0.0 if narrow is None else asked_duration(narrow, "--narrow")
     loaded = load_recipe(recipe, assignments or [])
     folder = output if output is not None else loaded.folder.with_name(f"{loaded.folder.name}-cost")
-    command = ["mbtf-pipeline", "cost", str(recipe), "--time", time]
+    budget = budget_of(folder) if time is None else asked_duration(time, "--time")
+    command = ["mbtf-pipeline", "cost", str(recipe), "--time", time or format_duration(budget)]
     command += ["--narrow", narrow] if narrow is not None else []
     command += ["-o", str(output)] if output is not None else []
     command += ["--seed", str(seed)] if seed is not None else []
@@ -302,11 +302,13 @@ def cost(
 
     front = pareto_front(whole_chains(study.points))
     lines = [f"{page}: {len(study.points)} settings measured, {len(study.skipped)} not for lack of time"]
+    lines += [f"could not be measured: {text}" for text in study.failed]
     lines += [f"  {p.seconds.value:.0f} s: unexplained variance {p.error}   {p.command}" for p in front]
     data = {
         "page": page,
         "points": len(study.points),
         "skipped": study.skipped,
+        "failed": study.failed,
         "front": [
             {"seconds": p.seconds.value, "unexplained": p.error.as_dict(), "command": p.command}
             for p in front

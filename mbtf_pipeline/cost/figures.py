@@ -29,6 +29,8 @@ def _figure(
     clouds: Sequence[Cloud], x: str, y: str, name: str, folder: Path, caption: str = "", **options: Any
 ) -> dict[str, Any]:
     shown = [c for c in clouds if len(c.x)]
+    if not shown:
+        return {"svg": "", "caption": f"No {y} could be told."}
     svg = scatter(shown, x, y, f"cost {name}", png=folder / f"{name}.png", **options)
     return {"svg": svg, "caption": caption}
 

@@ -5,7 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from mbtf_gen.stats import Estimate
+
 from .points import Point
+
+# The front's end: points of at least this share of the last one's seconds, and at least so many.
+_LATE, _FEWEST = 0.125, 3
+# Relative error below which no bar is believed.
+_BEST_KNOWN = 1e-3
 
 
 def pareto_front(points: Sequence[Point]) -> list[Point]:
@@ -22,22 +29,37 @@ def pareto_front(points: Sequence[Point]) -> list[Point]:
     return front
 
 
-def marginal_price(front: Sequence[Point], factor: float = 2.0) -> tuple[float, float] | None:
+def marginal_price(front: Sequence[Point], factor: float = 2.0) -> tuple[float, Estimate] | None:
     """(seconds, exponent): what dividing the error of the front's last point by `factor` would take on top,
-    and the power of time that the error falls with, from a line through the front's logarithms.
+    and the power of time that the error falls with at the front's end.
 
-    None where the front has fewer than three points, or does not fall.
+    From a line through the logarithms of those points that take an eighth of the last one's seconds or more,
+    at least three, weighted by their error bars. Errors fall ever more slowly, so the seconds are a lower
+    bound. None where there are fewer, or the power is not told from zero.
     """
-    if len(front) < 3:
+    usable = [p for p in front if p.error.value > 0 and math.isfinite(p.error.error)]
+    late = [p for p in usable if p.seconds.value >= _LATE * front[-1].seconds.value]
+    some = late if len(late) >= _FEWEST else usable[-_FEWEST:]
+    if len(some) < _FEWEST:
         return None
-    xs = [math.log(p.seconds.value) for p in front if p.error.value > 0]
-    ys = [math.log(p.error.value) for p in front if p.error.value > 0]
-    if len(xs) < 3:
+    line = weighted_line(
+        [math.log(p.seconds.value) for p in some],
+        [math.log(p.error.value) for p in some],
+        [max(p.error.relative_error, _BEST_KNOWN) for p in some],
+    )
+    if line is None or -line.value <= 2.0 * line.error:
         return None
-    mean_x, mean_y = sum(xs) / len(xs), sum(ys) / len(ys)
-    spread = sum((x - mean_x) ** 2 for x in xs)
-    slope = sum((x - mean_x) * (y - mean_y) for x, y in zip(xs, ys, strict=True)) / spread if spread else 0.0
-    if slope >= 0:
+    return front[-1].seconds.value * (factor ** (-1.0 / line.value) - 1.0), line.scaled(-1.0)
+
+
+def weighted_line(xs: Sequence[float], ys: Sequence[float], errors: Sequence[float]) -> Estimate | None:
+    """Slope of the line through points whose heights have these standard errors, all above zero, and its own;
+    None where all lie at one place."""
+    weights = [1 / e**2 for e in errors]
+    total = sum(weights)
+    mean_x, mean_y = (sum(w * v for w, v in zip(weights, vs, strict=True)) / total for vs in (xs, ys))
+    spread = sum(w * (x - mean_x) ** 2 for w, x in zip(weights, xs, strict=True))
+    if not spread > 0:
         return None
-    last = front[-1].seconds.value
-    return last * (factor ** (-1.0 / slope) - 1.0), -slope
+    slope = sum(w * (x - mean_x) * (y - mean_y) for w, x, y in zip(weights, xs, ys, strict=True)) / spread
+    return Estimate(slope, math.sqrt(1 / spread), len(xs))

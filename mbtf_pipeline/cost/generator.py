@@ -1,6 +1,6 @@
 """The generator's trades: error of M against seconds, split into bias and noise.
 
-A setting is compared with a converged reference at the same queries. With halves a, b of the setting and
+A setting is compared with a reference at the same queries. With halves a, b of the setting and
 r, s of the reference, (a, r) independent of (b, s), ``E[(a - r)(b - s)]`` is the squared bias, free of the
 noise of both. Within a half both use the same random numbers, so that most of the noise cancels in the
 differences and small biases are seen. ``E[(a - b)²/4]`` is the variance of the setting's own noise. Both are
@@ -38,6 +38,8 @@ _MOST_BIAS_PIECES = 16
 # Paths of one timed piece.
 _PIECE_PATHS = 1 << 19
 _FEWEST_PIECES = 8
+# Paths per query below which pieces get no larger: closed forms take none.
+_FEWEST_PATHS = 2.0
 # Bias below which none is looked for.
 _NEGLIGIBLE = 0.005
 # Shards, of this many queries, that stand for the study's streams of random numbers.
@@ -88,7 +90,8 @@ class _Reference:
 
 @dataclass
 class Bench:
-    """One material and configuration, and what settings of it are compared with.
+    """One material and configuration, and what settings of it are compared with: at the same queries, all
+    effects and no cap on interactions, but for what the reference of a study is about.
 
     Parameters
     ----------
@@ -122,7 +125,7 @@ class Bench:
         return job.plan().draw("test", shard, count)
 
     def reference(self, changes: dict[str, Any], piece: int) -> _Reference:
-        """One piece of the converged reference with these options."""
+        """One piece of the reference with these options."""
         setting = repr(sorted(changes.items()))
         if (setting, piece) not in self._references:
             if setting not in self._judges:
@@ -235,7 +238,7 @@ class Bench:
     ) -> tuple[Estimate, Estimate]:
         """Variance of one query's noise relative to the mean value squared, and seconds per million
         queries of about so many paths; the first piece, which may compile, is not timed."""
-        count = max(1, round(_PIECE_PATHS / paths))
+        count = max(1, round(_PIECE_PATHS / max(paths, _FEWEST_PATHS)))
         squares: list[NDArray[np.float64]] = []
         prices: list[float] = []
         began = time.perf_counter()

@@ -21,9 +21,9 @@ from .figures import (
     front_figures,
     noise_figures,
 )
-from .front import marginal_price, pareto_front
+from .front import marginal_price, pareto_front, weighted_line
 from .points import HALF_WIDTH, NORMAL, Point
-from .scatter import FITTED
+from .scatter import FITTED, Scatter
 from .study import Study
 from .tables import chain_table, generator_table, to_csv
 
@@ -110,12 +110,7 @@ def paths_slope(points: Sequence[Point]) -> Estimate | None:
     ]
     if len(known) < 3:
         return None
-    weights = [1 / e**2 for _, _, e in known]
-    total = sum(weights)
-    mean_x, mean_y = (sum(w * k[i] for w, k in zip(weights, known, strict=True)) / total for i in (0, 1))
-    spread = sum(w * (x - mean_x) ** 2 for w, (x, _, _) in zip(weights, known, strict=True))
-    slope = sum(w * (x - mean_x) * (y - mean_y) for w, (x, y, _) in zip(weights, known, strict=True)) / spread
-    return Estimate(slope, math.sqrt(1 / spread), len(known))
+    return weighted_line(*zip(*known, strict=True))
 
 
 def half_widths(points: Sequence[Point]) -> tuple[int, int]:
@@ -153,8 +148,8 @@ def _front_part(study: Study) -> dict[str, Any] | None:
     if price is not None:
         seconds, power = price
         text += (
-            f" Along the front the error falls with the power {power:.2f} of time: halving the last one’s "
-            f"would take about {clock(seconds)} more."
+            f" At the front’s end the error falls with the power {power} of time, and ever more slowly: "
+            f"halving the last one’s would take {clock(seconds)} more at the least."
         )
     return {
         "id": "front",
@@ -166,11 +161,25 @@ def _front_part(study: Study) -> dict[str, Any] | None:
     }
 
 
+def _scatter_text(scatter: Scatter | None, chains: bool) -> str:
+    """What the bars of chains hold besides that of the test queries."""
+    if scatter is not None:
+        return (
+            "; those of chains hold the scatter between seeds of data and fit, also where chains share their "
+            f"data: {scatter.describe()}"
+        )
+    if chains:
+        return (
+            "; those of chains hold the test queries alone: too few seeds were measured to tell how far "
+            "chains scatter, so their bars are too narrow"
+        )
+    return ""
+
+
 def write_page(study: Study) -> Path:
     """Write CSV, page and pictures into the study's folder; returns the page's path."""
     write_text(study.folder / CSV_NAME, to_csv(study.points))
     parts = [_front_part(study), *(_part(study, name) for name in _STUDIES)]
-    scatter = study.scatter
     held, known = half_widths(study.points)
     narrow, chains = half_widths([p for p in study.points if p.study in FITTED])
     seeds = max((p.details.get("seeds", 1.0) for p in study.points), default=1.0)
@@ -184,14 +193,9 @@ def write_page(study: Study) -> Path:
             seeds=round(seeds),
             parts=[p for p in parts if p is not None],
             skipped=study.skipped,
-            scatter=(
-                ""
-                if scatter is None
-                else "; those of chains hold the scatter between seeds of data and fit, also where chains "
-                f"share their data: {scatter.describe()}"
-            ),
+            scatter=_scatter_text(study.scatter, any(p.study in FITTED for p in study.points)),
             widths=f"{held} of {known} errors are known to within a tenth (95 %).",
-            wide=narrow < chains,
+            wide=study.scatter is not None and narrow < chains,
             failed=study.failed,
             tests=None if study.test_seconds is None else clock(study.test_seconds),
         )

@@ -88,8 +88,9 @@ class PointFolder:
             if data.pop("format") != POINT_FORMAT or data.pop("schema") != POINT_SCHEMA:
                 return None
             data |= {name: _estimate(data[name]) for name in _ESTIMATES}
+            data["details"] = {k: math.nan if v is None else v for k, v in data["details"].items()}
             return Point(**data)
-        except (InputError, KeyError, TypeError):
+        except (InputError, KeyError, TypeError, AttributeError):
             return None
 
     def put(self, key: dict[str, Any], point: Point) -> None:
@@ -103,4 +104,5 @@ class PointFolder:
         data = asdict(point) | {
             name: None if (e := getattr(point, name)) is None else e.as_dict() for name in _ESTIMATES
         }
+        data["details"] = {k: v if math.isfinite(v) else None for k, v in point.details.items()}
         write_json(self._path(point.study, key), {"format": POINT_FORMAT, "schema": POINT_SCHEMA, **data})

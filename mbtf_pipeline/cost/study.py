@@ -14,7 +14,7 @@ from mbtf_gen.config import GeneratorConfig, count_queries
 from mbtf_gen.errors import InputError
 from mbtf_gen.material import load_material
 from mbtf_gen.settings import dump_yaml
-from mbtf_gen.stats import Estimate
+from mbtf_gen.stats import Estimate, signal_variance
 
 from ..recipe import Recipe
 from ..run_folder import locked, machine, take
@@ -31,10 +31,14 @@ STUDY_FORMAT = "mbtf-cost"
 STUDY_SCHEMA = 1
 CONFIG_NAME = "generate.yaml"
 WORK = ".work"
+# Budget of a new study, seconds.
+NEW_BUDGET = 600.0
 # Share of the budget that is kept for whole chains while the generator is studied.
 _RESERVED = 0.7
 # Seconds of tracing in the data set that tells what a query costs on disk.
 _TRIAL = 3.0
+# Deviation of values, relative to their mean, below which a fit has nothing to learn.
+_LEAST_VARIATION = 0.005
 # Settings that the generator's share of the budget is divided among.
 _SETTINGS = 42
 
@@ -52,7 +56,7 @@ class Study:
     points : in the order of measurement
     skipped : names of settings for which no time was left
     scatter : of chains over seeds, which their bars hold; None where it is not known
-    failed : chains that could not be fitted with another seed, and why
+    failed : chains that could not be measured, and why
     test_seconds : what the recipe's test split takes, which commands of chains make besides; None where no
         price of paths is known
     """
@@ -84,6 +88,14 @@ def _is_study(folder: Path) -> bool:
         return False
 
 
+def budget_of(folder: Path) -> float:
+    """Seconds of the study in a folder; those of a new one where there is none."""
+    if not _is_study(folder):
+        return NEW_BUDGET
+    budget = read_json(folder / STUDY_NAME).get("budget")
+    return budget if isinstance(budget, float) and budget > 0 else NEW_BUDGET
+
+
 def _claim_for_this_machine(folder: Path) -> None:
     """As :func:`claim`; a study of another machine is refused, for its seconds would stand beside this one's.
 
@@ -101,6 +113,29 @@ def _claim_for_this_machine(folder: Path) -> None:
                 where=folder,
                 cure="choose another folder with -o",
             )
+
+
+def _check_variation(bench: Bench) -> None:
+    """Whether there is anything to learn of a material.
+
+    Raises
+    ------
+    InputError : it reflects nothing, or the same everywhere and in all directions
+    """
+    reference = bench.reference({}, 0)
+    if not reference.mean > 0:
+        raise InputError(
+            "reflects nothing: every value is 0",
+            where=bench.config.material,
+            cure="study a material with a base colour or gloss",
+        )
+    variance = signal_variance(reference.a, reference.b)
+    if variance.value + 2 * variance.error < (_LEAST_VARIATION * reference.mean) ** 2:
+        raise InputError(
+            "reflects the same everywhere and in all directions: there is nothing to fit",
+            where=bench.config.material,
+            cure="study a material with a relief or textures",
+        )
 
 
 def studied(config: GeneratorConfig, seed: int | None) -> GeneratorConfig:
@@ -167,6 +202,8 @@ def run_study(
         study = Study(folder, description)
         store = PointFolder(folder, {"config": config.hash(material.digests)})
         bench = Bench(config, material, config.seed)
+        note("reference")
+        _check_variation(bench)
         generator = f"mbtf-gen {config.material} --config {folder / CONFIG_NAME}"
         each = 0.5 * GENERATOR * budget / _SETTINGS
         for task in generator_tasks(bench):
@@ -248,12 +285,17 @@ def _measure_chains(
     try:
         for number, task in enumerate(tasks):
             point = store.get(task.study, task.key)
-            if point is None and left() > task.seconds(price, data=not work.has(task.data)):
-                point = work.measure(task)
-                store.put(task.key, point)
-            _keep(study, point, task, work.command_of(task))
-            if point is not None and task.study != "seeds":
-                measured[len(study.points) - 1] = task
+            try:
+                if point is None and left() > task.seconds(price, data=not work.has(task.data)):
+                    point = work.measure(task)
+                    store.put(task.key, point)
+            except InputError as error:
+                # What was measured, and what is still to come, is worth a page all the same.
+                study.failed.append(f"{task.study}: {task.series}, {task.name}: {error}")
+            else:
+                _keep(study, point, task, work.command_of(task))
+                if point is not None and task.study != "seeds":
+                    measured[len(study.points) - 1] = task
             if task.data not in needed[number + 1 :]:
                 work.forget(task.data)
         end = time.perf_counter() + narrow
@@ -264,7 +306,7 @@ def _measure_chains(
         study.scatter = seed_scatter(study.points)
         if study.scatter is not None:
             repeats = repeat_chains(study.points, measured, study.scatter, store, work, enough)
-            study.failed = repeats.failed
+            study.failed += repeats.failed
             study.points = with_scatter(study.points, study.scatter, repeats.again)
     finally:
         work.clear()

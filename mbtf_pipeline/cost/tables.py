@@ -78,6 +78,10 @@ def _seconds(e: Estimate) -> str:
     return f"{e}" if e.error > 0 else f"{e.value:.3g}"
 
 
+def _told(e: Estimate) -> str:
+    return f"{e}" if math.isfinite(e.value) else "–"
+
+
 def generator_table(points: Sequence[Point]) -> dict[str, Any]:
     """Settings of the generator: price, bias, noise, both; for ways to count paths how many there were and
     the noise relative to each value in place of bias and total."""
@@ -124,9 +128,9 @@ def chain_table(points: Sequence[Point]) -> dict[str, Any]:
                 f"{d['generation_seconds']:.1f}",
                 f"{d['training_seconds']:.1f}",
                 f"{d['total_seconds']:.1f}",
-                f"{p.error}",
+                _told(p.error),
                 f"{d.get('seeds', 1):g}",
-                f"{d['half_error']:.4g}",
+                f"{d['half_error']:.4g}" if math.isfinite(d["half_error"]) else "–",
                 f"{d['evaluation_ms_1080p']:.0f}",
                 f"{d['bytes'] / 1e6:.2f}",
                 f"{d['half_bytes'] / 1e6:.2f}",

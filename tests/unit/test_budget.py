@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mbtf_fit.config import FitConfig
 from mbtf_fit.data import QUERY_BYTES
 from mbtf_gen.durations import parse_duration
 from mbtf_gen.errors import InputError, UsageError
@@ -108,6 +109,46 @@ def test_long_budgets_are_split_by_pilots(measured: list[tuple[int, float]], tmp
     assert split.generating == pytest.approx(split.share * left + TEST + START, rel=1e-3)
     assert split.training == pytest.approx((1 - split.share) * left, rel=1e-3)
     assert 0.9 * split.share * left < split.queries * PRICE <= split.share * left + 1e-6
+
+
+def test_pilots_are_paid_by_the_budget(
+    measured: list[tuple[int, float]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module.time, "perf_counter", lambda: 15.0 * len(measured))
+    split = split_budget(recipe(), 1000.0, tmp_path / "run", "command", lambda note: None)
+    assert split.pilot_seconds == 45.0
+    assert split.generating + split.training + split.pilot_seconds == pytest.approx(1000.0, abs=0.5)
+
+
+def test_a_pilot_that_fails_leaves_the_usual_share(
+    measured: list[tuple[int, float]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(self: Any, chain: Any) -> Any:
+        raise InputError("training diverged at step 7")
+
+    monkeypatch.setattr("mbtf_pipeline.cost.chains.Workshop.measure", fail)
+    notes: list[str] = []
+    split = split_budget(recipe(), 1000.0, tmp_path / "run", "command", notes.append)
+    assert split.share == USUAL_SHARE
+    assert "training diverged at step 7" in notes[0]
+
+
+def test_pilots_train_where_the_fit_does(
+    measured: list[tuple[int, float]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options: list[dict[str, Any]] = []
+
+    def measure(self: Any, chain: Any) -> Any:
+        options.append(chain.fit)
+        return SimpleNamespace(error=Estimate(0.1, 0.01, 10))
+
+    monkeypatch.setattr("mbtf_pipeline.cost.chains.Workshop.measure", measure)
+    said = ["fit.neumip.device=cpu", "fit.neumip.data.memory=3 GB"]
+    asked = load_recipe(ROOT / "pipelines" / "quickstart.yaml", said)
+    split_budget(asked, 1000.0, tmp_path / "run", "command", lambda note: None)
+    for found in options:
+        config = FitConfig.model_validate(found)
+        assert (config.device, config.data.memory) == ("cpu", 3e9)
 
 
 def test_short_budgets_take_the_usual_share(measured: list[tuple[int, float]], tmp_path: Path) -> None:

@@ -82,8 +82,22 @@ def test_price_of_half_the_error_follows_a_power_law() -> None:
     assert price is not None
     # At a power of one half, half the error takes four times as long: three times as much more.
     assert price[0] == pytest.approx(3 * 80.0)
-    assert price[1] == pytest.approx(0.5)
+    assert price[1].value == pytest.approx(0.5)
     assert marginal_price(front[:2]) is None
+
+
+def test_the_price_of_more_is_that_of_the_front_s_end() -> None:
+    """A front that starts steeply, by the square, and ends with the power of a quarter."""
+    late = [(24.0, 0.115), (60.0, 0.115 * 2.5**-0.25), (120.0, 0.115 * 5**-0.25)]
+    front = [point(t, 0.115 * (t / 24) ** -2) for t in (8.0, 10.0, 14.0)] + [point(*p) for p in late]
+    price = marginal_price(front)
+    assert price is not None
+    assert price[1].value == pytest.approx(0.25)
+    assert price[0] == pytest.approx(15 * 120.0)
+    # What the bars do not tell from standing still is promised nothing.
+    assert marginal_price([point(t, e) for t, e in ((20.0, 0.2), (40.0, 0.199), (80.0, 0.198))]) is None
+    unknown = [replace(p, error=replace(p.error, error=math.inf)) for p in front]
+    assert marginal_price(unknown) is None
 
 
 def test_points_come_back_and_damaged_ones_are_measured_again(tmp_path: Path) -> None:
@@ -100,6 +114,28 @@ def test_points_come_back_and_damaged_ones_are_measured_again(tmp_path: Path) ->
     (path,) = store.folder.iterdir()
     path.write_text(path.read_text()[:-20])
     assert store.get("mesh", {"changes": 1}) is None
+
+
+def test_what_could_not_be_told_is_kept_and_shown_as_such(tmp_path: Path) -> None:
+    """Test values whose variance is not told from zero leave no error."""
+    from mbtf_pipeline.cost.page import write_page
+    from mbtf_pipeline.cost.study import Study
+
+    store = PointFolder(tmp_path, {})
+    unknown = made("fit", 10.0, math.nan)
+    store.put({"n": 1}, unknown)
+    found = store.get("fit", {"n": 1})
+    assert found is not None
+    assert math.isnan(found.error.value)
+    assert math.isnan(found.details["half_error"])
+    assert found.details["bytes"] == unknown.details["bytes"]
+    page = write_page(Study(tmp_path, DESCRIPTION, [found], test_seconds=90.0)).read_text()
+    assert not re.search(r"\b(nan|inf)\b", page)
+    assert "No unexplained variance of test queries could be told" in page
+    # Chains whose scatter is not known have bars that are too narrow.
+    assert "too few seeds" in page
+    assert "--narrow" not in page
+    assert "for about 1:30 of tracing" in page
 
 
 def test_csv_holds_every_number_with_its_error() -> None:
@@ -174,6 +210,96 @@ def test_chains_of_other_seeds_have_other_data_and_other_weights(
     assert "seed" not in plain.command_of(replace(chain, data=Wanted(64, 4)))
     assert plain.command_of(chain).count(" --set seed=2") == 2
     assert chain.key != replace(chain, data=Wanted(64, 4)).key
+
+
+class Clock:
+    """Time that passes where a test lets it."""
+
+    now = 0.0
+
+    def perf_counter(self) -> float:
+        return self.now
+
+
+def test_a_chain_counts_what_it_took_and_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seven seconds of generating, five of training and one of loading; half a second to evaluate 2¹⁸
+    queries; a constant, 0.1 and its nearest half-precision number, for values of 0 and 1."""
+    import torch
+
+    import mbtf_pipeline.cost.chains as module
+    from mbtf_fit.data import Queries
+    from mbtf_pipeline.cost.judges import Judges
+
+    clock = Clock()
+    n = 1000
+    value = np.repeat(np.arange(n) % 2.0, 3).reshape(n, 3).astype(np.float32)
+    zero = np.zeros((n, 3), np.float32)
+    queries = Queries(zero[:, :2], zero[:, 0], zero, zero, value, value)
+
+    class Answer(torch.nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.answer = torch.nn.Parameter(torch.tensor([0.1]))
+
+    class Material:
+        def __init__(self) -> None:
+            self.model = Answer()
+
+        def predict(self, queries: Any) -> Any:
+            return np.full((len(queries), 3), self.model.answer.detach().numpy(), np.float32)
+
+        def evaluate(self, u: Any, *_: Any) -> None:
+            assert len(u) == 1 << 18
+            clock.now += 0.5
+
+    def generate(config: GeneratorConfig, folder: Path, job: Any = None) -> None:
+        clock.now += 7.0
+
+    def fit(config: Any, shards: Path, out: Path) -> Any:
+        out.mkdir(parents=True)
+        (out / "weights.safetensors").write_bytes(bytes(100))
+        return SimpleNamespace(material=Material(), seconds=5.0, total_seconds=6.0)
+
+    monkeypatch.setattr(module, "generate", generate)
+    monkeypatch.setattr(module, "time", clock)
+    monkeypatch.setattr("mbtf_fit.fit", fit)
+    shop = module.Workshop(GeneratorConfig(material="m"), tmp_path, "mbtf-gen m", lambda note: None)
+    shop._judges = Judges(queries, np.ones(n))
+    options = {"training": {"time": "5s"}}
+    spent = {"chain": 13.0, "data": 7.0, "seeds": 7.0, "fit": 5.0}
+    for study, seconds in spent.items():
+        point = shop.measure(module.Chain(study, "", "", Wanted(640, 4), options))
+        assert point.seconds.value == seconds
+    found = point.details
+    assert (found["generation_seconds"], found["training_seconds"], found["total_seconds"]) == (7, 5, 13)
+    assert (found["queries"], found["spp"]) == (640, 4)
+    assert found["evaluation_ms_1080p"] == pytest.approx(500 * 1920 * 1080 / 2**18)
+    assert (found["bytes"], found["half_bytes"]) == (100, 98)
+    # Mean squares of 0.1 and 0.9 over the variance of a quarter.
+    for left, answer in ((point.error.value, 0.1), (found["half_error"], float(np.float16(0.1)))):
+        variance = 0.25 * n / (n - 1)
+        assert left == pytest.approx((answer**2 + (1 - answer) ** 2) / 2 / variance, rel=1e-5)
+
+
+def test_chains_are_judged_by_as_many_paths_as_the_test_split(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import mbtf_pipeline.cost.chains as module
+
+    asked: list[int] = []
+    job = SimpleNamespace(material=None, lattice=SimpleNamespace(texels=lambda: 256))
+    monkeypatch.setattr(module, "_quiet_job", lambda config: job)
+
+    def draw(bench: Any, paths: int) -> str:
+        asked.append(paths)
+        return "judges"
+
+    monkeypatch.setattr("mbtf_pipeline.cost.judges.draw_judges", draw)
+    queries = {"test": "2/texel", "test_spp": 6}
+    config = GeneratorConfig.model_validate({"material": "m", "queries": queries})
+    shop = module.Workshop(config, tmp_path, "mbtf-gen m", lambda note: None)
+    assert shop.judges() == shop.judges()
+    assert asked == [2 * 256 * 6]
 
 
 def test_queries_cost_what_they_cost_on_disk(tmp_path: Path) -> None:
@@ -358,6 +484,12 @@ def test_names_lie_on_no_point_and_on_no_other_name() -> None:
         assert not (across and box.y0 < ends[0][1] < box.y1)
 
 
+DESCRIPTION = {
+    "name": "a study", "machine": {"system": "a machine"}, "made": "today", "budget": 600.0,
+    "material": "rock", "command": "mbtf-pipeline cost rock",
+}  # fmt: skip
+
+
 def made(study: str, seconds: float, error: float, series: str = "neumip", **details: float) -> Point:
     """A chain's point as the workshop makes it."""
     numbers = {
@@ -384,11 +516,7 @@ def test_the_page_shows_the_front_with_commands_and_what_is_biased(tmp_path: Pat
         setting("1 interactions", Estimate(0.05, 0.004, 9)),
         setting("2 interactions", Estimate(0.002, 0.003, 9)), setting("no limit", Estimate(0.0, 0.0, 9)),
     ]  # fmt: skip
-    description = {
-        "name": "a study", "machine": {"system": "a machine"}, "made": "today", "budget": 600.0,
-        "material": "rock", "command": "mbtf-pipeline cost rock",
-    }  # fmt: skip
-    page = write_page(Study(tmp_path, description, points)).read_text()
+    page = write_page(Study(tmp_path, DESCRIPTION, points)).read_text()
     names = {p.stem for p in tmp_path.glob("*.png")}
     assert names == {"front", "fit", "fit_evaluation", "fit_bytes", "bounces"}
     front = page.split('id="front"')[1].split("</section>")[0]

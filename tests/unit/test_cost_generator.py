@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
-from support.fake_bench import NOISE, SHIFT, fake_bench
+from support.fake_bench import NOISE, SHIFT, FakeEstimator, fake_bench
 
+from mbtf_gen.errors import InputError
+from mbtf_gen.generation import Job
 from mbtf_gen.planning import plan_effects
 from mbtf_pipeline.cost.generator import Bench
 from mbtf_pipeline.cost.generator_studies import COUNTS, TARGETS, generator_tasks
@@ -94,3 +98,35 @@ def test_other_work_on_the_machine_does_not_change_the_price() -> None:
     found = _typical([*quiet, 9.0])
     assert abs(found.value - 1.0) < 0.02
     assert 0.0 < found.error < 0.02
+
+
+@pytest.mark.parametrize(
+    ("factor", "spread", "message"),
+    [(0.0, 0.0, "reflects nothing"), (1.0, 0.0, "reflects the same everywhere"), (1.0, 0.02, None)],
+)
+def test_materials_without_anything_to_learn_are_refused(
+    monkeypatch: pytest.MonkeyPatch, factor: float, spread: float, message: str | None
+) -> None:
+    """Noise does not count; values that vary by a fiftieth of their mean do."""
+    from mbtf_gen.estimates import Estimates, Stream
+    from mbtf_gen.queries import Queries
+    from mbtf_pipeline.cost.study import _check_variation
+
+    class Even(FakeEstimator):
+        def estimate(self, queries: Queries, spp: Any, stream: Stream, **_: Any) -> Estimates:
+            found = super().estimate(queries, spp, stream)
+            truth = 0.2 + 0.1 * queries.u[:, :1]
+            own = 0.25 * (1 + spread * np.sign(queries.u[:, :1] - 0.5))
+            halves = (
+                (factor * (0.1 * (v - truth) + own)).astype(np.float32)
+                for v in (found.value_a, found.value_b)
+            )
+            return replace(found, **dict(zip(("value_a", "value_b"), halves, strict=True)))
+
+    bench = fake_bench(monkeypatch)
+    monkeypatch.setattr(Job, "estimator", lambda self, plan: Even(self))
+    if message is None:
+        _check_variation(bench)
+        return
+    with pytest.raises(InputError, match=message):
+        _check_variation(bench)

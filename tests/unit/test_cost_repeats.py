@@ -18,6 +18,7 @@ from mbtf_pipeline.cost.chains import Chain, Wanted
 from mbtf_pipeline.cost.points import HALF_WIDTH, Point, PointFolder
 from mbtf_pipeline.cost.repeats import MOST_SEEDS, Repeats, repeat_chains
 from mbtf_pipeline.cost.scatter import bar_of, mean_of, seed_scatter, with_scatter
+from mbtf_pipeline.recipe import load_recipe
 
 ROOT = Path(__file__).parents[2]
 # Relative deviation of fits between seeds, and standard error of the test queries.
@@ -204,17 +205,22 @@ def test_a_chain_that_fails_with_a_seed_ends_nothing(tmp_path: Path) -> None:
     assert len(found.again[5]) > 1
 
 
-def test_a_study_repeats_chains_in_the_time_that_it_gets_for_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Without any, seeds that the scatter was measured on count all the same."""
+# The module of studies, and the workshops that its studies have made.
+Studied = tuple[Any, list[Any]]
+
+
+@pytest.fixture
+def studied(monkeypatch: pytest.MonkeyPatch) -> Studied:
+    """Studies of a point of the generator and six chains, of which the first takes longer than there is."""
     from mbtf_pipeline.cost import study as module
-    from mbtf_pipeline.recipe import load_recipe
+
+    shops: list[Any] = []
 
     class Shop(FakeWorkshop):
         def __init__(self, config: Any, *_: Any) -> None:
             super().__init__()
             self.config = config
+            shops.append(self)
 
         def command_of(self, chain: Chain) -> str:
             return "command"
@@ -222,7 +228,6 @@ def test_a_study_repeats_chains_in_the_time_that_it_gets_for_it(
         def clear(self) -> None:
             self.held.clear()
 
-    # A point of the generator comes first, and one chain takes longer than there is.
     second = Estimate(1.0, 0.1, 4)
     setting = Point("paths", "paths", "4", {}, "", second, second, None, second)
     long = replace(chain("chain", 3000), fit={**FIT, "training": {"time": "2h"}})
@@ -238,8 +243,15 @@ def test_a_study_repeats_chains_in_the_time_that_it_gets_for_it(
     monkeypatch.setattr(module, "Workshop", Shop)
     monkeypatch.setattr(module, "generator_tasks", lambda bench: [task])
     monkeypatch.setattr(module, "_price", lambda points: lambda paths: 1e-9)
+    monkeypatch.setattr(module, "_check_variation", lambda bench: None)
     monkeypatch.setattr(module, "_beyond_tracing", lambda *_: 0.0)
     monkeypatch.setattr(module, "chains", lambda *_: tasks)
+    return module, shops
+
+
+def test_a_study_repeats_chains_in_the_time_that_it_gets_for_it(studied: Studied, tmp_path: Path) -> None:
+    """Without any, seeds that the scatter was measured on count all the same."""
+    module, _ = studied
     recipe = load_recipe(ROOT / "pipelines/quickstart.yaml", [])
     first = module.run_study(recipe, tmp_path / "study", budget=3600.0)
     assert [p.details.get("seeds") for p in first.points] == [None, 4, 1, 1, 1, 1]
@@ -256,3 +268,38 @@ def test_a_study_repeats_chains_in_the_time_that_it_gets_for_it(
     # No second is left for a chain of five.
     third = module.run_study(recipe, tmp_path / "other", budget=3600.0, narrow=4.0)
     assert third.points[5].details["seeds"] == 1
+    assert module.budget_of(tmp_path / "other") == 3600.0
+    assert module.budget_of(tmp_path / "none") == module.NEW_BUDGET
+
+
+def test_points_of_other_seeds_and_materials_are_not_mixed(studied: Studied, tmp_path: Path) -> None:
+    module, shops = studied
+    recipe = load_recipe(ROOT / "pipelines/quickstart.yaml", [])
+    wool = load_recipe(ROOT / "pipelines/quickstart.yaml", ["generate.material=assets/twisted_wool"])
+    for asked, seed, measured in ((recipe, None, 5), (recipe, None, 0), (recipe, 7, 5), (wool, None, 5)):
+        module.run_study(asked, tmp_path / "study", budget=3600.0, seed=seed)
+        assert len(shops[-1].measured) == measured
+        assert shops[-1].config.seed == (seed or 0)
+    assert len(list((tmp_path / "study" / "points").iterdir())) == 3 * (5 + 1)
+
+
+def test_a_chain_that_fails_leaves_the_others(
+    studied: Studied, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module, _ = studied
+    usual = FakeWorkshop.measure
+
+    def measure(self: FakeWorkshop, chain: Chain) -> Point:
+        if chain.study == "fit" or chain.data.seed == 2:
+            raise InputError("training diverged at step 7")
+        return usual(self, chain)
+
+    monkeypatch.setattr(FakeWorkshop, "measure", measure)
+    recipe = load_recipe(ROOT / "pipelines/quickstart.yaml", [])
+    found = module.run_study(recipe, tmp_path / "study", budget=3600.0)
+    assert [p.study for p in found.points] == ["paths", "data", "seeds", "seeds"]
+    assert len(found.failed) == 2
+    assert all("training diverged at step 7" in text for text in found.failed)
+    assert found.skipped == ["chain: neumip, a chain"]
+    # Three seeds still tell the scatter.
+    assert found.scatter is not None

@@ -40,6 +40,11 @@ def test_many_queries_and_0_leave_weights_alone() -> None:
     assert pull(5.0, 10, weight_decay=0.0).weights == 0.0
 
 
+def test_no_pull_is_stronger_than_that_of_a_step_by_its_rate() -> None:
+    """Else so few queries would have weights pulled to 0, and the fit would be a constant."""
+    assert pull(5.0, 50, weight_decay=1000.0).weights == 1.0
+
+
 @pytest.mark.parametrize("model", ["neumip", "neumip-baseline", "hierarchical"])
 def test_texels_and_matrices_shrink_and_biases_stay(model: ModelName) -> None:
     found = build_model(model, LATTICE)

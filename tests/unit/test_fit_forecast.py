@@ -64,6 +64,9 @@ def test_a_forecast_is_of_the_fit_that_follows(
     assert found.unexplained is not None
     assert found.at_most is not None
     assert found.unexplained <= found.at_most == found.pilots[1]
+    # The longer pilot takes a tenth of a second: doublings count from there.
+    doublings = math.log2(found.seconds / 0.1)
+    assert found.unexplained == pytest.approx(extrapolated(*found.pilots, doublings), rel=1e-9)
     assert len(found.describe().splitlines()) == 2
     assert "unexplained variance of test queries about" in found.describe()
     if "steps" in options:
