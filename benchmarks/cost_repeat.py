@@ -5,9 +5,9 @@
 
 The first measures every setting of the generator with each seed: other queries, other paths, another
 reference. The second compares two finished studies of the same recipe and budget (``mbtf-pipeline cost …
---seed 10``), whole chains included; prices differ a little between runs, so chains are matched in their
-order. Where the bars are right, the differences over their combined standard errors lie within 1.65 nine
-times out of ten.
+--seed 100``; chains use up to 11 seeds more), whole chains included. Sizes of data follow from prices, which
+differ a little between runs, so chains of *Queries or paths?* are matched in their order. Where the bars are
+right, the differences over their combined standard errors lie within 1.65 nine times out of ten.
 
 The first also measures, with independent random numbers in place of low-discrepancy points, how noise and
 bias of paths that end at their first interaction change with the number of paths: the noise's variance falls
@@ -23,7 +23,7 @@ import csv
 import json
 import math
 import sys
-from collections import defaultdict
+from collections import Counter
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -35,10 +35,11 @@ from mbtf_gen.errors import MbtfError
 from mbtf_gen.material import load_material
 from mbtf_gen.planning import plan_effects
 from mbtf_gen.stats import Estimate
+from mbtf_pipeline.cost.chain_studies import PATH_SHARES
 from mbtf_pipeline.cost.generator import Bench
 from mbtf_pipeline.cost.generator_studies import generator_tasks
 from mbtf_pipeline.cost.page import paths_slope
-from mbtf_pipeline.cost.points import Point
+from mbtf_pipeline.cost.points import HALF_WIDTH, NORMAL, Point
 from mbtf_pipeline.recipe import load_recipe
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -80,20 +81,27 @@ def rows_of(points: list[Point]) -> list[Row]:
 
 
 def stored_rows(folder: Path) -> list[Row]:
-    """Points of a finished study, from its CSV; those of a series numbered in their order."""
+    """Points of a finished study, from its CSV; those whose names hold sizes of data are numbered in their
+    order, of series where none is missing."""
     with (folder / "cost.csv").open(encoding="utf-8", newline="") as stream:
         lines = [r for r in csv.DictReader(stream) if r["study"] != "seeds"]
-    numbers: dict[tuple[str, str], int] = defaultdict(int)
+    sized = Counter(line["series"] for line in lines if line["study"] == "data")
+    numbers: Counter[str] = Counter()
     out = []
     for line in lines:
-        series = line["study"], line["series"]
-        numbers[series] += 1
+        series, name = line["series"], line["name"]
+        if line["study"] == "data":
+            if sized[series] != len(PATH_SHARES):
+                print(f"{folder}: {series} left out, sizes of data are missing", file=sys.stderr)
+                continue
+            name = f"size {numbers[series]}"
+            numbers[series] += 1
         whole = bool(line["total_seconds"])
         found = {}
         for part in ("error",) if whole else ("noise", "bias"):
             if line[part] and line[f"{part}_se"]:
                 found["chain" if whole else part] = Estimate(float(line[part]), float(line[f"{part}_se"]), 1)
-        out.append((f"{series[0]} {series[1]} {numbers[series]}", found))
+        out.append((f"{line['study']} {series} {name}", found))
     return out
 
 
@@ -182,13 +190,13 @@ def main() -> int:
     tolerance = 3 * math.sqrt(EXPECTED * (1 - EXPECTED) / max(1, count))
     met &= abs(together - EXPECTED) <= tolerance
     widths = [
-        1.96 * e.error / e.value
+        NORMAL * e.relative_error
         for run in runs
         for _, parts in run
         for part, e in parts.items()
         if part != "bias" and e.value > 0
     ]
-    narrow = sum(w <= 0.1 for w in widths)
+    narrow = sum(w <= HALF_WIDTH for w in widths)
     print(f"within {WITHIN}: {shares}, together {together:.2f} of {count}")
     print(f"half-widths of noise and chains: {narrow} of {len(widths)} within 10 %")
     figures |= {

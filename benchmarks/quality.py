@@ -7,8 +7,8 @@ docs/cost.md: ``draft`` and ``standard`` on the six texture sets that lie beside
 The last one is measured with a quarter of its training, too: from both ``paper`` is extrapolated. ``--only``
 (repeatable) names single ones, also of ``assets/``, such as ``turtle_shell:draft``. Printed: its seconds,
 start-up, pictures and report included, the unexplained variance of test queries, and the bytes of data and
-material. Each is kept in FOLDER as soon as it is measured and not measured again, so the same
-command goes on where it stopped.
+material. Each is kept in FOLDER as soon as it is measured and not measured again, unless the
+quality has got other settings since, so the same command goes on where it stopped.
 
 ``--store`` writes what FOLDER holds to ``mbtf_gen/quality_measured.json``, from which help texts and
 ``mbtf-gen plan`` speak, and the table of docs/cost.md. ``--check`` holds what FOLDER holds against the stored
@@ -16,7 +16,7 @@ figures instead.
 
 The last line is one JSON object: figures, and the bars they are held to (a draft takes at most a minute, a
 standard run ten, on two cores, at 128 x 128 texels; under ``--check`` seconds within 30 % and errors within a
-factor 1.5 of the stored ones). Exit code 1 where a bar is missed.
+factor 1.5 of the stored ones, of which there is one at least). Exit code 1 where a bar is missed.
 """
 
 from __future__ import annotations
@@ -35,8 +35,10 @@ from typing import Any, get_args
 from mbtf_fit.config import FitConfig
 from mbtf_fit.forecast import PERSISTENCE, extrapolated
 from mbtf_fit.quality import FITTER
+from mbtf_gen.atomic import read_json, write_json
 from mbtf_gen.config import GeneratorConfig, count_queries
 from mbtf_gen.durations import parse_duration
+from mbtf_gen.errors import InputError
 from mbtf_gen.quality import GENERATOR, Quality, as_assignments
 from mbtf_gen.quality_measured import FORMAT, STORED, Chain, markdown_table, read_expected
 from mbtf_gen.settings import resolve
@@ -133,6 +135,8 @@ def run(name: str, quality: Quality, levels: int, work: Path, share: float = 1.0
     stages = {stage: record["seconds"] for stage, record in summary["stages"].items()}
     print(f"{name}: {json.dumps({k: round(v, 1) for k, v in stages.items()})}", file=sys.stderr)
     missed = summary["test"]["neumip"]["unexplained_variance"]
+    if missed["value"] is None:
+        raise SystemExit(f"{name} at {quality}: its test values do not tell an unexplained variance")
     fit = out / "fits" / "neumip"
     found = Chain(
         name,
@@ -187,15 +191,19 @@ def wanted(only: list[str] | None) -> list[tuple[str, Quality, float]]:
     return out
 
 
+def measured(path: Path) -> Chain | None:
+    """A chain that was measured, with the settings that its quality still has; None of another one, and of a
+    file that is missing or damaged."""
+    try:
+        chain = Chain(**read_json(path))
+    except (InputError, TypeError):
+        return None
+    return chain if chain.settings == settings_hash(chain.quality) else None  # type: ignore[arg-type]
+
+
 def kept(folder: Path, levels: int) -> list[Chain]:
     """Chains that were measured at these levels, in the order of the table."""
-    found = []
-    for path in folder.glob(f"*-{levels}.json"):
-        chain = Chain(**json.loads(path.read_text(encoding="utf-8")))
-        if chain.settings == settings_hash(chain.quality):  # type: ignore[arg-type]
-            found.append(chain)
-        else:
-            print(f"{path}: left out, measured with other settings; remove it", file=sys.stderr)
+    found = [c for path in folder.glob(f"*-{levels}.json") if (c := measured(path)) is not None]
     return sorted(found, key=lambda c: (QUALITIES.index(c.quality), c.material, c.share))
 
 
@@ -236,6 +244,12 @@ def paper(chains: list[Chain], levels: int) -> tuple[Chain | None, str]:
     fit = samples / high.queries_per_second
     generate = high.generate * paths_of("paper", levels) / paths_of("high", levels)
     doublings = math.log2(fit / high.fit)
+    apart = -math.log2(QUARTER)
+    error = extrapolated(quarter.unexplained, high.unexplained, doublings, apart=apart)
+    # The power of `high` in the law; that of its quarter is what is left of 1.
+    power = (1 - PERSISTENCE ** (doublings + apart)) / (1 - PERSISTENCE**apart)
+    bars = [c.unexplained_error / c.unexplained for c in (high, quarter)]
+    bar = error * math.hypot(power * bars[0], (1 - power) * bars[1])
     queries = {
         q: count_queries(GENERATOR[q]["queries.train"], 4**levels) + int(GENERATOR[q]["queries.test"])
         for q in ("high", "paper")
@@ -248,10 +262,8 @@ def paper(chains: list[Chain], levels: int) -> tuple[Chain | None, str]:
             round(high.seconds - high.generate - high.fit + generate + fit),
             round(generate),
             round(fit),
-            round(
-                extrapolated(quarter.unexplained, high.unexplained, doublings, apart=-math.log2(QUARTER)), 3
-            ),
-            0.0,
+            round(error, 3),
+            round(bar, 3),
             round(high.data_bytes * queries["paper"] / queries["high"]),
             high.material_bytes,
             high.queries_per_second,
@@ -308,13 +320,13 @@ def main() -> int:
     for name, quality, share in wanted(arguments.only):
         part = "" if share == 1 else f"-{share:g}"
         path = arguments.out / f"{name}-{quality}{part}-{arguments.levels}.json"
-        if path.exists():
+        if measured(path) is not None:
             continue
         if not source(name)[0].is_dir():
             print(f"{name}: left out, {source(name)[0]} is missing", file=sys.stderr)
             continue
         found = run(name, quality, arguments.levels, arguments.out / ".work", share)
-        path.write_text(json.dumps(asdict(found)) + "\n", encoding="utf-8")
+        write_json(path, asdict(found))
         print(line(found), flush=True)
     chains = kept(arguments.out, arguments.levels)
     held = [c for c in chains if c.quality in BARS and arguments.levels <= BAR_LEVELS]
@@ -322,6 +334,7 @@ def main() -> int:
     report: dict[str, Any] = {"figures": [asdict(c) for c in chains], "bars": {**BARS}}
     if arguments.check:
         report |= {"beside_stored": check(chains), "bars": {**BARS, **CHECK}}
+        met &= bool(report["beside_stored"])
         met &= all(f <= CHECK[name] for row in report["beside_stored"] for name, f in row["factors"].items())
     if arguments.store:
         store(chains, arguments.levels)

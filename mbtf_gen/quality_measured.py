@@ -116,8 +116,7 @@ def help_lines(qualities: Sequence[str]) -> str:
     lines = [line for quality in qualities if (line := found.line(quality)) is not None]
     if not lines:
         return ""
-    texels = 1 << found.levels
-    return f"Measured at {texels} x {texels} texels on {found.machine}: {'; '.join(lines)}."
+    return f"Measured with {1 << found.levels} texels across on {found.machine}: {'; '.join(lines)}."
 
 
 _HEAD = (
@@ -125,10 +124,10 @@ _HEAD = (
     "material",
     "in all",
     "generating",
-    "training",
+    "fitting",
     "unexplained variance",
     "data",
-    "material",
+    "weights",
 )
 
 

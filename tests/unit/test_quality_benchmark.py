@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from support.scripts import benchmark_module
 
@@ -39,6 +42,34 @@ def test_paper_goes_on_as_the_last_two_doublings_did(benchmark: Any, doublings: 
     assert found.unexplained == pytest.approx(error, abs=5e-4)
     assert found.fit == pytest.approx(600 * 2**doublings, abs=1)
     assert f"{QUARTER.unexplained:.3f} ± " in law
+
+
+def test_paper_is_no_better_known_than_what_it_follows_from(benchmark: Any) -> None:
+    """Its bar is that of the law with either error moved by its own."""
+    pair = [replace(c, unexplained_error=e) for c, e in ((QUARTER, 0.03), (HIGH, 0.02))]
+
+    def moved(number: int) -> float:
+        """Slope of the law in one of the errors, by steps small enough to be straight."""
+        other = list(pair)
+        step = 0.02
+        other[number] = replace(pair[number], unexplained=pair[number].unexplained + step)
+        at = [benchmark.paper(chains, 7)[0].unexplained for chains in (pair, other)]
+        return float((at[1] - at[0]) / step)
+
+    found, _ = benchmark.paper(pair, 7)
+    assert found.unexplained_error == pytest.approx(np.hypot(0.03 * moved(0), 0.02 * moved(1)), rel=0.1)
+
+
+def test_figures_of_other_settings_and_damaged_ones_are_measured_again(
+    benchmark: Any, tmp_path: Path
+) -> None:
+    now = replace(HIGH, settings=benchmark.settings_hash("high"))
+    texts = {"now": json.dumps(asdict(now)), "once": json.dumps(asdict(HIGH)), "cut": '{"material": "ro'}
+    for name, text in texts.items():
+        (tmp_path / f"{name}-7.json").write_text(text)
+    assert benchmark.measured(tmp_path / "now-7.json") == now
+    assert all(benchmark.measured(tmp_path / f"{name}-7.json") is None for name in ("once", "cut", "none"))
+    assert benchmark.kept(tmp_path, 7) == [now]
 
 
 def test_paper_costs_what_its_paths_and_queries_do(benchmark: Any) -> None:
