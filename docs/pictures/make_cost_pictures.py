@@ -77,10 +77,16 @@ def whole_chains(folder: Path) -> list[dict[str, str]]:
 
 
 def table(studies: list[Path]) -> str:
-    """The fronts of all studies as Markdown, with the commands that make their points."""
-    lines = []
-    for folder in studies:
-        study = json.loads((folder / "study.json").read_text(encoding="utf-8"))
+    """How well errors are known, and the fronts of all studies with commands, as Markdown."""
+    records = {f: json.loads((f / "study.json").read_text(encoding="utf-8")) for f in studies}
+    lines = ["| study | errors known to ± 10 % (95 %) | scatter between seeds |", "|---|---|---|"]
+    for folder, study in records.items():
+        found = study["summary"]
+        lines.append(
+            f"| `{folder.name}` | {found['known_to_a_tenth']} of {found['known']} | {found['scatter']} |"
+        )
+    lines.append("")
+    for folder, study in records.items():
         where = f"{study['machine']['system']}, {study['made']}"
         lines += [
             f"`{folder.name}`, {where}:",

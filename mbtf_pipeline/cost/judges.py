@@ -37,7 +37,7 @@ _LEVELS, _ANGLES = 16, (6, 6, 8)
 # seconds.
 _SPP = 32
 _FEWEST_PATHS = 1 << 14
-_MOST, _MOST_CANDIDATES = 1 << 17, 1 << 23
+_MOST, _MOST_CANDIDATES = 1 << 19, 1 << 23
 # Probability that does not depend on what was seen, as a share of the mean one.
 _ALIKE = 0.25
 
@@ -66,7 +66,7 @@ def draw_judges(bench: Bench, paths: int) -> Judges:
     Parameters
     ----------
     paths : of all that are taken, 32 each; twice as many candidates are looked at. At least 16 384; at most
-        131 072 queries are taken, of 8 million candidates. Halves need no more, for errors are free of
+        524 288 queries are taken, of 8 million candidates. Halves need no more, for errors are free of
         noise; what limits them is how they vary over queries
     """
     job = bench.job({})

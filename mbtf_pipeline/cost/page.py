@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from mbtf_gen.atomic import write_text
+from mbtf_gen.atomic import write_json, write_text
 from mbtf_gen.console import clock
 from mbtf_gen.stats import Estimate
 
@@ -24,7 +24,7 @@ from .figures import (
 from .front import marginal_price, pareto_front, weighted_line
 from .points import HALF_WIDTH, NORMAL, Point
 from .scatter import FITTED, Scatter
-from .study import Study
+from .study import STUDY_NAME, Study
 from .tables import chain_table, generator_table, to_csv
 
 CSV_NAME, PAGE_NAME = "cost.csv", "cost.html"
@@ -177,7 +177,8 @@ def _scatter_text(scatter: Scatter | None, chains: bool) -> str:
 
 
 def write_page(study: Study) -> Path:
-    """Write CSV, page and pictures into the study's folder; returns the page's path."""
+    """Write CSV, page and pictures into the study's folder, and what they say together into its record;
+    returns the page's path."""
     write_text(study.folder / CSV_NAME, to_csv(study.points))
     parts = [_front_part(study), *(_part(study, name) for name in _STUDIES)]
     held, known = half_widths(study.points)
@@ -202,4 +203,12 @@ def write_page(study: Study) -> Path:
     )
     path = study.folder / PAGE_NAME
     write_text(path, html)
+    summary = {
+        "known_to_a_tenth": held,
+        "known": known,
+        "scatter": None if study.scatter is None else study.scatter.describe(),
+        "skipped": study.skipped,
+        "failed": study.failed,
+    }
+    write_json(study.folder / STUDY_NAME, {**study.description, "summary": summary})
     return path

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 import math
 import re
 from dataclasses import replace
@@ -136,6 +137,8 @@ def test_what_could_not_be_told_is_kept_and_shown_as_such(tmp_path: Path) -> Non
     assert "too few seeds" in page
     assert "--narrow" not in page
     assert "for about 1:30 of tracing" in page
+    summary = json.loads((tmp_path / "study.json").read_text())["summary"]
+    assert (summary["known_to_a_tenth"], summary["known"], summary["scatter"]) == (0, 0, None)
 
 
 def test_csv_holds_every_number_with_its_error() -> None:
