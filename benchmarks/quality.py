@@ -196,14 +196,21 @@ def measured(path: Path) -> Chain | None:
     file that is missing or damaged."""
     try:
         chain = Chain(**read_json(path))
-    except (InputError, TypeError):
+        now = settings_hash(chain.quality)  # type: ignore[arg-type]
+    except (InputError, TypeError, KeyError):
         return None
-    return chain if chain.settings == settings_hash(chain.quality) else None  # type: ignore[arg-type]
+    return chain if chain.settings == now else None
 
 
 def kept(folder: Path, levels: int) -> list[Chain]:
     """Chains that were measured at these levels, in the order of the table."""
-    found = [c for path in folder.glob(f"*-{levels}.json") if (c := measured(path)) is not None]
+    found = []
+    for path in folder.glob(f"*-{levels}.json"):
+        chain = measured(path)
+        if chain is None:
+            print(f"{path}: left out, damaged or measured with other settings", file=sys.stderr)
+        else:
+            found.append(chain)
     return sorted(found, key=lambda c: (QUALITIES.index(c.quality), c.material, c.share))
 
 
@@ -236,7 +243,8 @@ def paper(chains: list[Chain], levels: int) -> tuple[Chain | None, str]:
     high, quarter = known[1.0], known[QUARTER]
     law += (
         f": {quarter.unexplained:.3f} ± {quarter.unexplained_error:.3f}. That `paper` has fewer, cleaner "
-        "queries is left out of account"
+        "queries is left out of account, and its bar is that of both errors alone: how far the law itself "
+        "may be off, forecasts tell"
     )
     config = resolve(FitConfig, assignments=as_assignments(FITTER["paper"]))
     assert config.training.steps is not None

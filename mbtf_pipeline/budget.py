@@ -200,7 +200,9 @@ def _plan(recipe: Recipe, budget: float, folder: Path, tell: Callable[[str], Non
         try:
             pilots = _pilots(recipe, length, price, tell)
         except InputError as error:
-            tell(f"pilot failed: {error}; {USUAL_SHARE:.0%} of the time generates, as of short budgets")
+            tell(
+                f"pilot failed: {error.what}; {USUAL_SHARE:.0%} of the time generates, as with short budgets"
+            )
     # Data without variance, such as those of an even plane, leave nothing to be unexplained.
     pilots = pilots if all(math.isfinite(error) for _, error in pilots) else []
     share = best_share(pilots) if pilots else USUAL_SHARE

@@ -81,10 +81,11 @@ def table(studies: list[Path]) -> str:
     records = {f: json.loads((f / "study.json").read_text(encoding="utf-8")) for f in studies}
     lines = ["| study | errors known to ± 10 % (95 %) | scatter between seeds |", "|---|---|---|"]
     for folder, study in records.items():
-        found = study["summary"]
-        lines.append(
-            f"| `{folder.name}` | {found['known_to_a_tenth']} of {found['known']} | {found['scatter']} |"
-        )
+        found = study.get("summary")
+        if found is None:
+            raise SystemExit(f"{folder}: not finished; run the command of the study again")
+        scatter = found["scatter"] or "–"
+        lines.append(f"| `{folder.name}` | {found['known_to_a_tenth']} of {found['known']} | {scatter} |")
     lines.append("")
     for folder, study in records.items():
         where = f"{study['machine']['system']}, {study['made']}"

@@ -112,10 +112,9 @@ def plan(
     data = {**found.to_manifest(), "forecast": expected.as_dict()}
     text = f"{table(found)}\n{expected.describe(job.target('train'))}"
     if quality is not None and (measured_line := expected_of().line(quality)) is not None:
-        texels = 1 << expected_of().levels
         text += (
-            f"\nwhole chains to material and report on {expected_of().machine}, {texels} x {texels} texels: "
-            f"{measured_line}"
+            f"\nwhole chains to material and report on {expected_of().machine}, {1 << expected_of().levels} "
+            f"texels across: {measured_line}"
         )
     console.report(data, text)
 

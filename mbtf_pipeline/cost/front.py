@@ -13,6 +13,8 @@ from .points import Point
 _LATE, _FEWEST = 0.125, 3
 # Relative error below which no bar is believed.
 _BEST_KNOWN = 1e-3
+# Times the last point's seconds beyond which nothing is said.
+_LONGEST = 1000.0
 
 
 def pareto_front(points: Sequence[Point]) -> list[Point]:
@@ -34,8 +36,8 @@ def marginal_price(front: Sequence[Point], factor: float = 2.0) -> tuple[float, 
     and the power of time that the error falls with at the front's end.
 
     From a line through the logarithms of those points that take an eighth of the last one's seconds or more,
-    at least three, weighted by their error bars. Errors fall ever more slowly, so the seconds are a lower
-    bound. None where there are fewer, or the power is not told from zero.
+    at least three, weighted by their error bars. Errors fall ever more slowly, so in truth it takes longer.
+    None where there are fewer, the power is not told from zero, or a thousand times as long would not do.
     """
     usable = [p for p in front if p.error.value > 0 and math.isfinite(p.error.error)]
     late = [p for p in usable if p.seconds.value >= _LATE * front[-1].seconds.value]
@@ -47,7 +49,7 @@ def marginal_price(front: Sequence[Point], factor: float = 2.0) -> tuple[float, 
         [math.log(p.error.value) for p in some],
         [max(p.error.relative_error, _BEST_KNOWN) for p in some],
     )
-    if line is None or -line.value <= 2.0 * line.error:
+    if line is None or -line.value <= max(2.0 * line.error, math.log(factor) / math.log(_LONGEST)):
         return None
     return front[-1].seconds.value * (factor ** (-1.0 / line.value) - 1.0), line.scaled(-1.0)
 

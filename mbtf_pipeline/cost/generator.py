@@ -4,7 +4,7 @@ A setting is compared with a reference at the same queries. With halves a, b of 
 r, s of the reference, (a, r) independent of (b, s), ``E[(a - r)(b - s)]`` is the squared bias, free of the
 noise of both. Within a half both use the same random numbers, so that most of the noise cancels in the
 differences and small biases are seen. ``E[(a - b)²/4]`` is the variance of the setting's own noise. Both are
-given as root mean squares relative to the mean value of the reference.
+given as root mean squares relative to the mean value of the reference, whose own error is part of their bars.
 """
 
 from __future__ import annotations
@@ -35,6 +35,8 @@ from .points import HALF_WIDTH, NORMAL
 BIAS_QUERIES = 16384
 BIAS_SPP = 64
 _MOST_BIAS_PIECES = 16
+# Pieces of queries, and paths of each, that the mean value is taken over.
+_MEAN_PIECES, _MEAN_QUERIES, _MEAN_SPP = 4, 1 << 17, 2
 # Paths of one timed piece.
 _PIECE_PATHS = 1 << 19
 _FEWEST_PIECES = 8
@@ -44,6 +46,7 @@ _FEWEST_PATHS = 2.0
 _NEGLIGIBLE = 0.005
 # Shards, of this many queries, that stand for the study's streams of random numbers.
 SHARD = 1 << 14
+_FIRST_MEAN = 1_001
 _FIRST_REFERENCE = 5_001
 _FIRST_PIECE = 10_001
 # Queries that tell how many paths adaptive counts take, and the fewest of a piece.
@@ -82,11 +85,6 @@ class _Reference:
     a: NDArray[np.float64]
     b: NDArray[np.float64]
 
-    @property
-    def mean(self) -> float:
-        """Mean value, which errors are relative to."""
-        return float((self.a + self.b).mean() / 2)
-
 
 @dataclass
 class Bench:
@@ -105,6 +103,7 @@ class Bench:
     # By the reference's options: its job and estimator, and by options and number its pieces.
     _judges: dict[str, tuple[Job, Any]] = field(default_factory=dict, repr=False)
     _references: dict[tuple[str, int], _Reference] = field(default_factory=dict, repr=False)
+    _means: dict[str, Estimate] = field(default_factory=dict, repr=False)
 
     def job(self, changes: dict[str, Any]) -> Job:
         """The job of the configuration with options changed, by dotted name."""
@@ -128,15 +127,35 @@ class Bench:
         """One piece of the reference with these options."""
         setting = repr(sorted(changes.items()))
         if (setting, piece) not in self._references:
-            if setting not in self._judges:
-                job = self.job({"effects.mode": "all", "transport.max_depth": 0, **changes})
-                self._judges[setting] = job, job.estimator(plan_effects(job))
-            job, estimator = self._judges[setting]
+            job, estimator = self._judge(changes)
             queries = self.queries(job, _FIRST_REFERENCE + piece, BIAS_QUERIES)
             found = estimator.estimate(queries, BIAS_SPP, self._stream(piece))
             a, b = found.value_a.astype(np.float64), found.value_b.astype(np.float64)
             self._references[setting, piece] = _Reference(queries, a, b)
         return self._references[setting, piece]
+
+    def mean(self, changes: dict[str, Any]) -> Estimate:
+        """Mean value of the reference with these options, 1/sr, which errors are relative to: of many more
+        queries than have the paths that a bias takes."""
+        setting = repr(sorted(changes.items()))
+        if setting not in self._means:
+            job, estimator = self._judge(changes)
+            parts = []
+            # A piece spans several shards.
+            for number in range(_MEAN_PIECES):
+                shard = _FIRST_MEAN + number * (_MEAN_QUERIES // SHARD)
+                queries = self.queries(job, shard, _MEAN_QUERIES)
+                found = estimator.estimate(queries, _MEAN_SPP, Stream(self.seed, "test", shard))
+                parts.append(0.5 * (found.value_a.astype(np.float64) + found.value_b).mean(axis=1))
+            self._means[setting] = mean_estimate(np.concatenate(parts))
+        return self._means[setting]
+
+    def _judge(self, changes: dict[str, Any]) -> tuple[Job, Any]:
+        setting = repr(sorted(changes.items()))
+        if setting not in self._judges:
+            job = self.job({"effects.mode": "all", "transport.max_depth": 0, **changes})
+            self._judges[setting] = job, job.estimator(plan_effects(job))
+        return self._judges[setting]
 
     def _stream(self, piece: int) -> Stream:
         return Stream(self.seed, "test", _FIRST_REFERENCE + piece)
@@ -152,18 +171,20 @@ class Bench:
         """
         job = self.job(changes)
         estimator = job.estimator(plan_effects(job))
-        mean = self.reference(against or {}, 0).mean
+        mean = self.mean(against or {})
         spp = job.spp("train")
 
         def trace(queries: Queries, stream: Stream) -> Estimates:
             found: Estimates = estimator.estimate(queries, spp, stream)
             return found
 
-        noise, price = self._noise(job, trace, spp, seconds, mean)
+        noise, price = self._noise(job, trace, spp, seconds, mean.value)
+        root = _beside(_root(noise), mean)
         if against is None:
-            return Measured(price, None, _root(noise), _root(noise))
+            return Measured(price, None, root, root)
         bias = self.bias(estimator, against, seconds)
-        return Measured(price, _root(bias), _root(noise), _root(_total(bias, noise)))
+        total = _beside(_root(_total(bias, noise)), mean)
+        return Measured(price, _beside(_root(bias), mean), root, total)
 
     def measure_counts(self, changes: dict[str, Any], adaptive: bool, seconds: float) -> Measured:
         """Price and noise where queries get the same number of paths, or each its own: `adaptive` with the
@@ -183,12 +204,13 @@ class Bench:
         def trace(queries: Queries, stream: Stream) -> Estimates:
             return estimate_shard(estimator, queries, spp, target, stream, chosen)
 
-        first = self.reference({}, 0)
+        first, mean = self.reference({}, 0), self.mean({})
         look = trace(first.queries.take(slice(_LOOK)), Stream(self.seed, "test", _FIRST_PIECE))
         paths = max(look.paths, 1) / len(look.value_a)
-        noise, price = self._noise(job, trace, paths, seconds, first.mean)
+        noise, price = self._noise(job, trace, paths, seconds, mean.value)
+        root = _beside(_root(noise), mean)
         relative = self._relative(trace, paths, seconds, allocation)
-        return Measured(price, None, _root(noise), _root(noise), _root(relative), paths)
+        return Measured(price, None, root, root, _root(relative), paths)
 
     def _relative(self, trace: Trace, paths: float, seconds: float, allocation: Allocation) -> Estimate:
         """Variance of one query's noise over the square of max(value, tile mean); values are those of the
@@ -218,7 +240,7 @@ class Bench:
         against : options of the reference
         spp : paths of the estimator at each query; the bias does not depend on them, its error bar does
         """
-        mean = self.reference(against, 0).mean
+        mean = self.mean(against).value
         began = time.perf_counter()
         squares: list[NDArray[np.float64]] = []
         while True:
@@ -274,6 +296,12 @@ def _sure(variance: Estimate) -> bool:
 def _total(bias: Estimate, noise: Estimate) -> Estimate:
     """Mean squared error from its parts; a squared bias that noise made negative counts as none."""
     return Estimate(max(bias.value, 0.0) + noise.value, math.hypot(bias.error, noise.error), noise.n)
+
+
+def _beside(relative: Estimate, mean: Estimate) -> Estimate:
+    """With the error of the mean value that it is relative to."""
+    error = math.hypot(relative.error, relative.value * mean.relative_error)
+    return Estimate(relative.value, error, relative.n)
 
 
 def _root(square: Estimate) -> Estimate:

@@ -148,8 +148,8 @@ def _front_part(study: Study) -> dict[str, Any] | None:
     if price is not None:
         seconds, power = price
         text += (
-            f" At the front’s end the error falls with the power {power} of time, and ever more slowly: "
-            f"halving the last one’s would take {clock(seconds)} more at the least."
+            f" At the front’s end the error falls with the power {power} of time: halving the last one’s "
+            f"would take about {clock(seconds)} more, and longer where gains shrink, as they do."
         )
     return {
         "id": "front",
@@ -170,8 +170,8 @@ def _scatter_text(scatter: Scatter | None, chains: bool) -> str:
         )
     if chains:
         return (
-            "; those of chains hold the test queries alone: too few seeds were measured to tell how far "
-            "chains scatter, so their bars are too narrow"
+            "; those of chains hold the test queries alone: too few seeds are known to tell how far chains "
+            "scatter, so their bars are too narrow"
         )
     return ""
 
@@ -198,7 +198,7 @@ def write_page(study: Study) -> Path:
             widths=f"{held} of {known} errors are known to within a tenth (95 %).",
             wide=study.scatter is not None and narrow < chains,
             failed=study.failed,
-            tests=None if study.test_seconds is None else clock(study.test_seconds),
+            tests=clock(tests) if (tests := study.test_seconds or 0.0) >= 1.0 else None,
         )
     )
     path = study.folder / PAGE_NAME

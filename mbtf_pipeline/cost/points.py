@@ -19,7 +19,7 @@ HALF_WIDTH = 0.1
 # That half-width over the standard error.
 NORMAL = 1.96
 # Raised when a point is measured in another way: what an earlier version measured is measured again.
-POINT_SCHEMA = 4
+POINT_SCHEMA = 5
 POINTS = "points"
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 from mbtf_gen.errors import InputError
 
@@ -46,6 +47,7 @@ def repeat_chains(
     store: PointFolder,
     work: Workshop,
     enough: Callable[[Chain, bool], bool],
+    failed: Collection[Mapping[str, Any]] = (),
 ) -> Repeats:
     """Seed after seed the chains whose bars are too wide, those of like data together.
 
@@ -54,6 +56,7 @@ def repeat_chains(
     points : of the study so far; chains : those of them that may be repeated, by their place
     store : keeps what was measured, so that nothing is measured twice; what is there already counts in any
         case
+    failed : keys of chains that could not be fitted before
     enough : whether time is left for a chain; its second argument: whether its data are still to be made
     """
     out = Repeats()
@@ -65,7 +68,9 @@ def repeat_chains(
         todo = [
             (place, chain)
             for place, chain in done.items()
-            if known[place] is None and _worth_more([points[place], *out.again.get(place, ())], scatter)
+            if known[place] is None
+            and chain.key not in failed
+            and _worth_more([points[place], *out.again.get(place, ())], scatter)
         ]
         needed = [chain.data for _, chain in todo]
         for number, (place, chain) in enumerate(todo):
@@ -74,7 +79,9 @@ def repeat_chains(
                     point = work.measure(chain)
                 except InputError as error:
                     # The same seed would fail the same way, and so end every run of this study.
-                    out.failed.append(f"{chain.study}: {chain.series}, {chain.name}, seed + {seed}: {error}")
+                    out.failed.append(
+                        f"{chain.study}: {chain.series}, {chain.name}, seed + {seed}: {error.what}"
+                    )
                     del left[place]
                 else:
                     store.put(chain.key, point)

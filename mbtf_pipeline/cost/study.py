@@ -93,11 +93,12 @@ def budget_of(folder: Path) -> float:
     if not _is_study(folder):
         return NEW_BUDGET
     budget = read_json(folder / STUDY_NAME).get("budget")
-    return budget if isinstance(budget, float) and budget > 0 else NEW_BUDGET
+    return float(budget) if isinstance(budget, int | float) and budget > 0 else NEW_BUDGET
 
 
 def _claim_for_this_machine(folder: Path) -> None:
-    """As :func:`claim`; a study of another machine is refused, for its seconds would stand beside this one's.
+    """As :func:`claim`; a study of another kind of machine is refused: its seconds would stand beside this
+    one's.
 
     Raises
     ------
@@ -109,7 +110,7 @@ def _claim_for_this_machine(folder: Path) -> None:
         there, here = read_json(path).get("machine", {}).get("system"), machine()["system"]
         if there != here:
             raise InputError(
-                f"holds a cost study made on another machine ({there}; this is {here})",
+                f"holds a cost study made on another kind of machine ({there}; this is {here})",
                 where=folder,
                 cure="choose another folder with -o",
             )
@@ -122,15 +123,15 @@ def _check_variation(bench: Bench) -> None:
     ------
     InputError : it reflects nothing, or the same everywhere and in all directions
     """
-    reference = bench.reference({}, 0)
-    if not reference.mean > 0:
+    reference, mean = bench.reference({}, 0), bench.mean({}).value
+    if not mean > 0:
         raise InputError(
             "reflects nothing: every value is 0",
             where=bench.config.material,
             cure="study a material with a base colour or gloss",
         )
     variance = signal_variance(reference.a, reference.b)
-    if variance.value + 2 * variance.error < (_LEAST_VARIATION * reference.mean) ** 2:
+    if variance.value + 2 * variance.error < (_LEAST_VARIATION * mean) ** 2:
         raise InputError(
             "reflects the same everywhere and in all directions: there is nothing to fit",
             where=bench.config.material,
@@ -196,14 +197,15 @@ def run_study(
             "made": time.strftime("%Y-%m-%d"),
             "machine": machine(),
         }
+        bench = Bench(config, material, config.seed)
+        note("reference")
+        # Before anything of the study that may be there is written over.
+        _check_variation(bench)
         write_json(folder / STUDY_NAME, description)
         data = config.model_dump(mode="json")
         write_text(folder / CONFIG_NAME, dump_yaml(data))
         study = Study(folder, description)
         store = PointFolder(folder, {"config": config.hash(material.digests)})
-        bench = Bench(config, material, config.seed)
-        note("reference")
-        _check_variation(bench)
         generator = f"mbtf-gen {config.material} --config {folder / CONFIG_NAME}"
         each = 0.5 * GENERATOR * budget / _SETTINGS
         for task in generator_tasks(bench):
@@ -282,6 +284,7 @@ def _measure_chains(
     tasks = list(chains(budget, work.config.queries.spp, price))
     needed = [t.data for t in tasks]
     measured: dict[int, Chain] = {}
+    failed: list[dict[str, Any]] = []
     try:
         for number, task in enumerate(tasks):
             point = store.get(task.study, task.key)
@@ -291,7 +294,8 @@ def _measure_chains(
                     store.put(task.key, point)
             except InputError as error:
                 # What was measured, and what is still to come, is worth a page all the same.
-                study.failed.append(f"{task.study}: {task.series}, {task.name}: {error}")
+                study.failed.append(f"{task.study}: {task.series}, {task.name}: {error.what}")
+                failed.append(task.key)
             else:
                 _keep(study, point, task, work.command_of(task))
                 if point is not None and task.study != "seeds":
@@ -305,7 +309,7 @@ def _measure_chains(
 
         study.scatter = seed_scatter(study.points)
         if study.scatter is not None:
-            repeats = repeat_chains(study.points, measured, study.scatter, store, work, enough)
+            repeats = repeat_chains(study.points, measured, study.scatter, store, work, enough, failed)
             study.failed += repeats.failed
             study.points = with_scatter(study.points, study.scatter, repeats.again)
     finally:

@@ -124,13 +124,13 @@ def test_a_pilot_that_fails_leaves_the_usual_share(
     measured: list[tuple[int, float]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(self: Any, chain: Any) -> Any:
-        raise InputError("training diverged at step 7")
+        raise InputError("training diverged at step 7", cure="lower the rate")
 
     monkeypatch.setattr("mbtf_pipeline.cost.chains.Workshop.measure", fail)
     notes: list[str] = []
     split = split_budget(recipe(), 1000.0, tmp_path / "run", "command", notes.append)
     assert split.share == USUAL_SHARE
-    assert "training diverged at step 7" in notes[0]
+    assert "training diverged at step 7; 35% of the time" in notes[0]
 
 
 def test_pilots_train_where_the_fit_does(

@@ -192,7 +192,7 @@ def test_seconds_of_two_machines_are_not_mixed(tmp_path: Path) -> None:
     claim_here(tmp_path / "new")
     known["machine"] = {"system": "Plan 9, 64 processors"}
     write_json(tmp_path / "new" / study.STUDY_NAME, known)
-    with pytest.raises(InputError, match=r"another machine .Plan 9, 64 processors; this is "):
+    with pytest.raises(InputError, match=r"another kind of machine .Plan 9, 64 processors; this is "):
         claim_here(tmp_path / "new")
 
 

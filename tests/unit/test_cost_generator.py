@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from support.fake_bench import NOISE, SHIFT, FakeEstimator, fake_bench
 from mbtf_gen.errors import InputError
 from mbtf_gen.generation import Job
 from mbtf_gen.planning import plan_effects
+from mbtf_gen.stats import Estimate
 from mbtf_pipeline.cost.generator import Bench
 from mbtf_pipeline.cost.generator_studies import COUNTS, TARGETS, generator_tasks
 
@@ -98,6 +100,38 @@ def test_other_work_on_the_machine_does_not_change_the_price() -> None:
     found = _typical([*quiet, 9.0])
     assert abs(found.value - 1.0) < 0.02
     assert 0.0 < found.error < 0.02
+
+
+def test_bars_hold_the_error_of_the_mean_that_they_are_relative_to(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The fake values are even, and so is their mean: known to 3e-4. Relative to one that is known to a tenth
+    noise and bias are no better known."""
+    mean = bench.mean({})
+    assert abs(mean.value - 0.25) < 4 * mean.error < 0.25 * 2e-3
+    changes = {"transport.max_depth": 1, "queries.spp": 8}
+    found = bench.measure(changes, {}, 0.0)
+    monkeypatch.setattr(bench, "mean", lambda against: Estimate(mean.value, 0.1 * mean.value, 9))
+    wide = bench.measure(changes, {}, 0.0)
+    assert found.bias is not None
+    assert wide.bias is not None
+    for a, b in ((found.noise, wide.noise), (found.bias, wide.bias), (found.error, wide.error)):
+        assert b.value == a.value
+        assert b.error == pytest.approx(math.hypot(a.error, 0.1 * a.value), rel=1e-3)
+
+
+def test_queries_without_paths_come_in_pieces_no_larger(bench: Bench) -> None:
+    """Closed forms take none: as many queries as a piece has paths would not fit into memory."""
+    sizes: list[int] = []
+
+    def trace(queries: Any, stream: Any) -> Any:
+        sizes.append(len(queries.sigma))
+        zero = np.zeros((sizes[-1], 3), np.float32)
+        return SimpleNamespace(value_a=zero, value_b=zero)
+
+    variance, _ = bench._noise(bench.job({}), trace, 1e-3, 0.0, 0.25)
+    assert variance.value == 0
+    assert set(sizes) == {1 << 18}
 
 
 @pytest.mark.parametrize(

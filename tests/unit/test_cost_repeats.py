@@ -205,6 +205,8 @@ def test_a_chain_that_fails_with_a_seed_ends_nothing(tmp_path: Path) -> None:
     assert len(found.again[5]) > 1
 
 
+# Materials that a study has looked at.
+checked: list[str] = []
 # The module of studies, and the workshops that its studies have made.
 Studied = tuple[Any, list[Any]]
 
@@ -215,6 +217,7 @@ def studied(monkeypatch: pytest.MonkeyPatch) -> Studied:
     from mbtf_pipeline.cost import study as module
 
     shops: list[Any] = []
+    checked.clear()
 
     class Shop(FakeWorkshop):
         def __init__(self, config: Any, *_: Any) -> None:
@@ -243,7 +246,7 @@ def studied(monkeypatch: pytest.MonkeyPatch) -> Studied:
     monkeypatch.setattr(module, "Workshop", Shop)
     monkeypatch.setattr(module, "generator_tasks", lambda bench: [task])
     monkeypatch.setattr(module, "_price", lambda points: lambda paths: 1e-9)
-    monkeypatch.setattr(module, "_check_variation", lambda bench: None)
+    monkeypatch.setattr(module, "_check_variation", lambda bench: checked.append(bench.config.material))
     monkeypatch.setattr(module, "_beyond_tracing", lambda *_: 0.0)
     monkeypatch.setattr(module, "chains", lambda *_: tasks)
     return module, shops
@@ -281,17 +284,57 @@ def test_points_of_other_seeds_and_materials_are_not_mixed(studied: Studied, tmp
         assert len(shops[-1].measured) == measured
         assert shops[-1].config.seed == (seed or 0)
     assert len(list((tmp_path / "study" / "points").iterdir())) == 3 * (5 + 1)
+    assert [Path(material).name for material in checked] == 3 * ["turtle_shell"] + ["twisted_wool"]
+
+
+def test_what_is_refused_leaves_the_study_that_is_there(
+    studied: Studied, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another kind of machine, or a material with nothing to learn."""
+    module, shops = studied
+    recipe = load_recipe(ROOT / "pipelines/quickstart.yaml", [])
+    folder = tmp_path / "study"
+    module.run_study(recipe, folder, budget=3600.0)
+    there = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+    def refuse(bench: Any) -> None:
+        raise InputError("reflects nothing")
+
+    monkeypatch.setattr(module, "_check_variation", refuse)
+    with pytest.raises(InputError, match="reflects nothing"):
+        module.run_study(recipe, folder, budget=60.0, seed=5)
+    monkeypatch.setattr(module, "machine", lambda: {"system": "Plan 9"})
+    with pytest.raises(InputError, match="another kind of machine"):
+        module.run_study(recipe, folder, budget=60.0)
+    found = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file() and "lock" not in p.name}
+    assert found == {p: content for p, content in there.items() if "lock" not in p.name}
+    assert len(shops) == 1
+
+
+def test_a_study_counts_paths_and_says_what_its_commands_take_besides(
+    studied: Studied, tmp_path: Path
+) -> None:
+    module, shops = studied
+    said = ["generate.queries.target_error=5%", "generate.queries.test=4096"]
+    recipe = load_recipe(ROOT / "pipelines/quickstart.yaml", said)
+    found = module.run_study(recipe, tmp_path / "study", budget=3600.0)
+    assert shops[-1].config.queries.target_error is None
+    # By the price that the fixture gives a query.
+    assert found.test_seconds == pytest.approx(4096e-9)
+    assert "target_error: null" in (tmp_path / "study" / module.CONFIG_NAME).read_text()
 
 
 def test_a_chain_that_fails_leaves_the_others(
     studied: Studied, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    module, _ = studied
+    module, shops = studied
     usual = FakeWorkshop.measure
+    tried: list[Wanted] = []
 
     def measure(self: FakeWorkshop, chain: Chain) -> Point:
         if chain.study == "fit" or chain.data.seed == 2:
-            raise InputError("training diverged at step 7")
+            tried.append(chain.data)
+            raise InputError("training diverged at step 7", where="here", cure="--rate 0.1")
         return usual(self, chain)
 
     monkeypatch.setattr(FakeWorkshop, "measure", measure)
@@ -299,7 +342,14 @@ def test_a_chain_that_fails_leaves_the_others(
     found = module.run_study(recipe, tmp_path / "study", budget=3600.0)
     assert [p.study for p in found.points] == ["paths", "data", "seeds", "seeds"]
     assert len(found.failed) == 2
-    assert all("training diverged at step 7" in text for text in found.failed)
+    # Other programs' flags would not help here.
+    assert all(text.endswith(": training diverged at step 7") for text in found.failed)
     assert found.skipped == ["chain: neumip, a chain"]
     # Three seeds still tell the scatter.
     assert found.scatter is not None
+    # Tried again when the study goes on, but not once more as a repetition.
+    assert len(tried) == 2
+    again = module.run_study(recipe, tmp_path / "study", budget=3600.0, narrow=3600.0)
+    assert len(tried) == 4
+    assert len(again.failed) == 2
+    assert {c.study for c in shops[-1].measured} <= {"data"}
