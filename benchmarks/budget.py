@@ -3,9 +3,9 @@
     python benchmarks/budget.py [MATERIAL ...] [--time 5min] [--split 0.2 ...] [--levels 7]
 
 Every chain generates for its share of the time and trains ``neumip``, as the qualities have it, for the rest,
-start-up included, and is judged by the same test queries. ``--budget`` pays for its own pilots: what they
-take is missing from its chain. By default two of ``assets/``, five minutes (long enough for pilots) and
-splits of 10 to 70 %.
+start-up, loading and judging included, and is judged by the same test queries. ``--budget`` pays for its own
+pilots: what they take is missing from its chain. By default two of ``assets/``, five minutes (long enough for
+pilots) and splits of 10 to 70 %.
 
 The last line is one JSON object: figures, and the bar they are held to: the error under ``--budget`` over the
 least of the grid is at most 1.2, or no more than its error bar allows. Exit code 1 where it is missed.
@@ -61,16 +61,14 @@ def measure(material: Path, seconds: float, splits: list[float], levels: int, wo
     )
     found = split_budget(recipe, seconds, work / "run", "", lambda note: print(note, file=sys.stderr))
     print(f"{material.name}: {found.describe()}", file=sys.stderr)
-    # What starting up, the test split and a query take by the same forecast; the grid's chains pay for no
-    # pilots.
-    start = (found.generating - found.share * (seconds - found.pilot_seconds)) / (1 - found.share)
-    price, left = (found.generating - start) / found.queries, seconds - start
     workshop = Workshop(recipe.generate, work / "chains", "", lambda note: None)
     rows, errors = [], []
     for share in [*splits, None]:
         split = found
         if share is not None:
-            split = Split(int(share * left / price), share * left, (1 - share) * left, share, (), 0.0)
+            # By the same prices, but for pilots.
+            queries, generating, training = found.prices.spend(seconds, share)
+            split = Split(int(queries), generating, training, share, (), 0.0, found.prices)
         point = workshop.measure(chain(recipe, split))
         workshop.forget(Wanted(split.queries, recipe.generate.queries.spp))
         took = point.details["total_seconds"] + (found.pilot_seconds if share is None else 0.0)

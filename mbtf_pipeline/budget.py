@@ -3,7 +3,8 @@ material and machine, then one allocation.
 
 Three short chains each generate for another share of their time and train for the rest; the share of the
 least error, by a parabola through the three, is taken for what is left of the budget. Error changes slowly
-about its least value, so a rough share is enough. Budgets too short for pilots take a fixed share. Where
+about its least value, so a rough share is enough. The pilots also tell what fits take besides training:
+loading, calibrating, judging. Budgets too short for pilots take a fixed share, and no account of that. Where
 queries cost next to nothing, disk and memory bound their number, and training gets the time.
 """
 
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
 
 BUDGET_NAME = "budget.json"
 BUDGET_FORMAT = "mbtf-budget"
-BUDGET_SCHEMA = 1
+BUDGET_SCHEMA = 2
 # Shares of a chain's time that its pilots generate for, and the one taken without pilots.
 SHARES = (0.15, 0.35, 0.6)
 USUAL_SHARE = 0.35
@@ -59,6 +60,36 @@ _LEAST_LEFT = 0.25
 
 
 @dataclass(frozen=True)
+class Prices:
+    """What a run takes, in seconds.
+
+    Attributes
+    ----------
+    query : to generate a training query
+    start : of generating besides, with the test split
+    fit, fit_query : of a fit besides training, and of that by training query
+    fits : number of fits
+    """
+
+    query: float
+    start: float
+    fit: float
+    fit_query: float
+    fits: int
+
+    def spend(self, seconds: float, share: float, most: float = math.inf) -> tuple[float, float, float]:
+        """(queries, seconds of making them, seconds of training) of so many seconds in all, where `share` of
+        both makes queries, at most `most`; what is left over then is trained for."""
+        left = seconds - self.start - self.fits * self.fit
+        # Fits load what is made.
+        both = left / (1 + self.fits * self.fit_query * share / self.query)
+        queries = share * both / self.query
+        if queries > most:
+            queries, both = most, left - self.fits * self.fit_query * most
+        return queries, queries * self.query, both - queries * self.query
+
+
+@dataclass(frozen=True)
 class Split:
     """How a budget is spent.
 
@@ -66,9 +97,10 @@ class Split:
     ----------
     queries : training queries to generate
     generating, training : seconds meant for either; training is over all fits
-    share : of generating in what the pilots left over
+    share : of generating in both
     pilots : (share, unexplained variance) of the pilot chains; none for short budgets
     pilot_seconds : what forecast and pilots took
+    prices : by which it was reckoned
     """
 
     queries: int
@@ -77,6 +109,12 @@ class Split:
     share: float
     pilots: tuple[tuple[float, float], ...]
     pilot_seconds: float
+    prices: Prices
+
+    @property
+    def beside(self) -> float:
+        """Seconds that fits take besides training."""
+        return self.prices.fits * (self.prices.fit + self.prices.fit_query * self.queries)
 
     def describe(self) -> str:
         """One line."""
@@ -84,7 +122,8 @@ class Split:
         how = f"pilots' unexplained variance by share of generating: {tried}" if tried else "a fixed share"
         return (
             f"budget: {clock(self.generating)} for {self.queries} queries, {clock(self.training)} of "
-            f"training, after {clock(self.pilot_seconds)} of looking ({self.share:.0%} generating; {how})"
+            f"training and {clock(self.beside)} beside it, after {clock(self.pilot_seconds)} of looking "
+            f"({self.share:.0%} generating; {how})"
         )
 
 
@@ -155,7 +194,8 @@ def _remembered(folder: Path, key: str) -> Split | None:
         data = read_json(path)
         if data.pop("format") != BUDGET_FORMAT or data.pop("key") != key:
             return None
-        return Split(**data | {"pilots": tuple((p[0], p[1]) for p in data["pilots"])})
+        pilots = tuple((p[0], p[1]) for p in data["pilots"])
+        return Split(**data | {"pilots": pilots, "prices": Prices(**data["prices"])})
     except (InputError, KeyError, TypeError, IndexError):
         return None
 
@@ -195,10 +235,11 @@ def _plan(recipe: Recipe, budget: float, folder: Path, tell: Callable[[str], Non
     expected = forecast(job, allocated(job, plan_effects(job, pilots=False)))
     price, test = _prices(expected, job.queries("train"))
     pilots: list[tuple[float, float]] = []
+    beside = 0.0, 0.0
     length = PILOT * budget
     if length >= SHORTEST_PILOT:
         try:
-            pilots = _pilots(recipe, length, price, tell)
+            pilots, beside = _pilots(recipe, length, price, tell)
         except InputError as error:
             tell(
                 f"pilot failed: {error.what}; {USUAL_SHARE:.0%} of the time generates, as with short budgets"
@@ -207,16 +248,17 @@ def _plan(recipe: Recipe, budget: float, folder: Path, tell: Callable[[str], Non
     pilots = pilots if all(math.isfinite(error) for _, error in pilots) else []
     share = best_share(pilots) if pilots else USUAL_SHARE
     looked = time.perf_counter() - began
-    left = max(budget - looked - test - expected.start, _LEAST_LEFT * budget)
-    wanted, most = max(_FEWEST_QUERIES, share * left / price), most_queries(recipe, folder)
-    generating = share * left if wanted <= most else most * price
+    prices = Prices(price, test + expected.start, *beside, len(recipe.fit))
+    left = max(budget - looked, _LEAST_LEFT * budget + prices.start + prices.fits * prices.fit)
+    queries, generating, training = prices.spend(left, share, most_queries(recipe, folder))
     return Split(
-        _two_digits(min(wanted, most)),
-        round(generating + test + expected.start, 1),
-        round(left - generating, 1),
+        _two_digits(max(_FEWEST_QUERIES, queries)),
+        round(generating + prices.start, 1),
+        round(training, 1),
         round(share, 3),
         tuple(pilots),
         round(looked, 1),
+        prices,
     )
 
 
@@ -240,13 +282,14 @@ def _two_digits(count: float) -> int:
 
 def _pilots(
     recipe: Recipe, length: float, price: float, tell: Callable[[str], None]
-) -> list[tuple[float, float]]:
+) -> tuple[list[tuple[float, float]], tuple[float, float]]:
+    """(share, error) of each, and what a fit takes besides training: seconds, and seconds per query."""
     name, fit = next(iter(recipe.fit.items()))
     with tempfile.TemporaryDirectory(prefix="mbtf-budget-") as work:
         data = recipe.generate.model_dump(mode="json")
         data["queries"] |= {"test": _TEST, "test_spp": _TEST_SPP}
         workshop = Workshop(GeneratorConfig.model_validate(data), Path(work), "", lambda note: None)
-        out = []
+        out, beside = [], []
         most = most_queries(recipe, Path(work))
         for share in SHARES:
             queries = _two_digits(min(max(_FEWEST_QUERIES, share * length / price), most))
@@ -256,9 +299,21 @@ def _pilots(
             options = {**trained.fields(), **where}
             wanted = Wanted(queries, recipe.generate.queries.spp)
             chain = Chain("chain", name, f"{share:.0%}", wanted, options)
-            out.append((share, workshop.measure(chain).error.value))
+            point = workshop.measure(chain)
+            out.append((share, point.error.value))
+            spent = point.details["generation_seconds"] + point.details["training_seconds"]
+            beside.append((float(queries), point.details["total_seconds"] - spent))
             tell(f"pilot: {share:.0%} of {length:.0f} s generating leaves {out[-1][1]:.3f}")
-        return out
+        return out, _line(beside)
+
+
+def _line(points: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    """(height at 0, slope) of a line through points by least squares, neither below 0."""
+    mean_x, mean_y = (sum(p[k] for p in points) / len(points) for k in (0, 1))
+    spread = sum((x - mean_x) ** 2 for x, _ in points)
+    slope = sum((x - mean_x) * (y - mean_y) for x, y in points) / spread if spread > 0 else 0.0
+    slope = min(max(0.0, slope), max(0.0, mean_y) / mean_x)
+    return max(0.0, mean_y - slope * mean_x), slope
 
 
 def _with_time(fit: FitConfig, seconds: float) -> FitConfig:

@@ -12,6 +12,7 @@ import pytest
 
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data import QUERY_BYTES
+from mbtf_gen.console import clock
 from mbtf_gen.durations import parse_duration
 from mbtf_gen.errors import InputError, UsageError
 from mbtf_gen.stats import Estimate
@@ -30,11 +31,20 @@ from mbtf_pipeline.recipe import Recipe, load_recipe
 ROOT = Path(__file__).parents[2]
 # Seconds of a training query, of the test split, and of starting.
 PRICE, TEST, START = 2e-6, 3.0, 1.5
+# Seconds of a fit besides training, and of that by training query.
+FIT, FIT_QUERY = 4.0, 5e-7
 
 
 def recipe(**fits: str) -> Recipe:
     said = [f"fit.{name}.model={model}" for name, model in fits.items()]
     return load_recipe(ROOT / "pipelines" / "quickstart.yaml", said)
+
+
+def point(error: float, queries: int = 4096, training: float = 0.0) -> Any:
+    """A pilot chain as the workshop makes it."""
+    details = {"generation_seconds": queries * PRICE, "training_seconds": training}
+    total = sum(details.values()) + FIT + queries * FIT_QUERY
+    return SimpleNamespace(error=Estimate(error, 0.01, 10), details={**details, "total_seconds": total})
 
 
 @pytest.fixture
@@ -51,7 +61,7 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, float]]:
         generating, training = chain.data.queries * PRICE, parse_duration(chain.fit["training"]["time"])
         chains.append((chain.data.queries, training))
         error = 0.1 * math.exp(math.log(generating / training) ** 2)
-        return SimpleNamespace(error=Estimate(error, 0.01, 10))
+        return point(error, chain.data.queries, training)
 
     monkeypatch.setattr("mbtf_gen.forecast.forecast", forecast)
     monkeypatch.setattr("mbtf_gen.generation.allocated", lambda job, plan: plan)
@@ -90,7 +100,7 @@ def test_pilots_that_have_nothing_to_explain_do_not_decide(
     measured: list[tuple[int, float]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The data of an even plane have no variance that an error could be a share of."""
-    nothing = SimpleNamespace(error=Estimate(math.nan, math.inf, 10))
+    nothing = point(math.nan)
     monkeypatch.setattr("mbtf_pipeline.cost.chains.Workshop.measure", lambda self, chain: nothing)
     split = split_budget(recipe(), 1000.0, tmp_path / "run", "command", lambda note: None)
     assert split.share == USUAL_SHARE
@@ -105,10 +115,15 @@ def test_long_budgets_are_split_by_pilots(measured: list[tuple[int, float]], tmp
     assert len(notes) == len(split.pilots) == 3
     # Half and half by the pilots; queries are rounded down to two digits.
     assert split.share == pytest.approx(0.5, abs=0.06)
-    left = 1000.0 - TEST - START
-    assert split.generating == pytest.approx(split.share * left + TEST + START, rel=1e-3)
-    assert split.training == pytest.approx((1 - split.share) * left, rel=1e-3)
-    assert 0.9 * split.share * left < split.queries * PRICE <= split.share * left + 1e-6
+    # Both fits load what is made.
+    assert split.prices.fit == pytest.approx(FIT)
+    assert split.prices.fit_query == pytest.approx(FIT_QUERY)
+    assert split.generating + split.training + split.beside == pytest.approx(1000.0, rel=0.01)
+    making = split.generating - TEST - START
+    assert making / (making + split.training) == pytest.approx(split.share, rel=1e-3)
+    assert 0.9 * making < split.queries * PRICE <= making + 0.1
+    assert split.beside == pytest.approx(2 * (FIT + FIT_QUERY * split.queries))
+    assert f"{clock(split.beside)} beside it" in split.describe()
 
 
 def test_pilots_are_paid_by_the_budget(
@@ -117,7 +132,8 @@ def test_pilots_are_paid_by_the_budget(
     monkeypatch.setattr(module.time, "perf_counter", lambda: 15.0 * len(measured))
     split = split_budget(recipe(), 1000.0, tmp_path / "run", "command", lambda note: None)
     assert split.pilot_seconds == 45.0
-    assert split.generating + split.training + split.pilot_seconds == pytest.approx(1000.0, abs=0.5)
+    spent = split.generating + split.training + split.beside + split.pilot_seconds
+    assert spent == pytest.approx(1000.0, rel=0.01)
 
 
 def test_a_pilot_that_fails_leaves_the_usual_share(
@@ -140,7 +156,7 @@ def test_pilots_train_where_the_fit_does(
 
     def measure(self: Any, chain: Any) -> Any:
         options.append(chain.fit)
-        return SimpleNamespace(error=Estimate(0.1, 0.01, 10))
+        return point(0.1)
 
     monkeypatch.setattr("mbtf_pipeline.cost.chains.Workshop.measure", measure)
     said = ["fit.neumip.device=cpu", "fit.neumip.data.memory=3 GB"]
@@ -174,8 +190,8 @@ def test_disk_and_memory_bound_the_queries(
     most = 20e6 / (68 if scarce == "disk" else QUERY_BYTES)
     assert 0.9 * most < split.queries <= most
     assert [n for n, _ in measured] == [split.queries] * 3
-    assert split.generating + split.training == pytest.approx(1000.0, abs=0.5)
-    assert split.training > 990.0
+    assert split.generating + split.training + split.beside == pytest.approx(1000.0, abs=0.5)
+    assert split.training > 985.0
 
 
 def test_fits_share_the_time_of_training(measured: list[tuple[int, float]], tmp_path: Path) -> None:
@@ -216,3 +232,21 @@ def test_what_cannot_be_split_is_refused(measured: list[tuple[int, float]], tmp_
     with pytest.raises(InputError, match="holds no run"):
         split_budget(recipe(), 100.0, tmp_path / "other", "command", lambda note: None)
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("seconds", "line"),
+    [((4.0, 5.0, 7.0), (3.0, 1.0)), ((5.0, 5.0, 5.0), (5.0, 0.0)), ((7.0, 5.0, 4.0), (16 / 3, 0.0))],
+)
+def test_what_fits_take_besides_training_never_falls(
+    seconds: tuple[float, ...], line: tuple[float, float]
+) -> None:
+    found = module._line(list(zip((1.0, 2.0, 4.0), seconds, strict=True)))
+    assert found == pytest.approx(line)
+
+
+def test_less_than_nothing_is_never_taken() -> None:
+    # Rising more steeply than from 0 up: noise.
+    fixed, slope = module._line([(1.0, 0.0), (2.0, 1.0), (4.0, 5.0)])
+    assert fixed == pytest.approx(0.0, abs=1e-12)
+    assert slope == pytest.approx(2.0 / (7 / 3))
