@@ -21,7 +21,7 @@ from .wording import SPLIT_NAMES
 PILOT_SECONDS = (4.0, 8.0)
 # Every doubling of the time gains this share of what the one before gained, in the logarithm of the error:
 # the model's size and the data end what training can reach. What suits fits of 60 s with the options of the
-# qualities on data of a draft, of ten materials; benchmarks/forecasts.py finds it anew.
+# qualities on data of a draft, of eleven materials; benchmarks/forecasts.py finds it anew.
 PERSISTENCE = 0.45
 # Judging queries at most: few rule the errors, and the fit will be judged by all.
 _JUDGING = 1 << 17

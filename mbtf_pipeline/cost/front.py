@@ -10,7 +10,7 @@ from mbtf_gen.stats import Estimate
 from .points import Point
 
 # The front's end: points of at least this share of the last one's seconds, and at least so many.
-_LATE, _FEWEST = 0.125, 3
+_LATE, _FEWEST = 0.25, 3
 # Relative error below which no bar is believed.
 _BEST_KNOWN = 1e-3
 # Times the last point's seconds beyond which nothing is said.
@@ -35,7 +35,7 @@ def marginal_price(front: Sequence[Point], factor: float = 2.0) -> tuple[float, 
     """(seconds, exponent): what dividing the error of the front's last point by `factor` would take on top,
     and the power of time that the error falls with at the front's end.
 
-    From a line through the logarithms of those points that take an eighth of the last one's seconds or more,
+    From a line through the logarithms of those points that take a quarter of the last one's seconds or more,
     at least three, weighted by their error bars. Errors fall ever more slowly, so in truth it takes longer.
     None where there are fewer, the power is not told from zero, or a thousand times as long would not do.
     """
