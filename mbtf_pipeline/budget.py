@@ -28,6 +28,7 @@ from mbtf_gen.durations import format_duration
 from mbtf_gen.errors import InputError, UsageError
 
 from .cost.chains import Chain, Wanted, Workshop
+from .cost.front import weighted_line
 from .recipe import Recipe
 from .run import layout_of
 from .run_folder import claim, describe, locked
@@ -309,10 +310,10 @@ def _pilots(
 
 def _line(points: Sequence[tuple[float, float]]) -> tuple[float, float]:
     """(height at 0, slope) of a line through points by least squares, neither below 0."""
-    mean_x, mean_y = (sum(p[k] for p in points) / len(points) for k in (0, 1))
-    spread = sum((x - mean_x) ** 2 for x, _ in points)
-    slope = sum((x - mean_x) * (y - mean_y) for x, y in points) / spread if spread > 0 else 0.0
-    slope = min(max(0.0, slope), max(0.0, mean_y) / mean_x)
+    xs, ys = zip(*points, strict=True)
+    mean_x, mean_y = sum(xs) / len(xs), sum(ys) / len(ys)
+    line = weighted_line(xs, ys, [1.0] * len(xs))
+    slope = min(max(0.0, line.value if line is not None else 0.0), max(0.0, mean_y) / mean_x)
     return max(0.0, mean_y - slope * mean_x), slope
 
 

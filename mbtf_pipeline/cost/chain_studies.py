@@ -104,9 +104,8 @@ def _data(budget: float, spp: int, price: Price) -> Iterator[Chain]:
             yield chain
             if n == usual:
                 for other in range(1, SEEDS + 1):
-                    yield replace(
-                        chain, study="seeds", name=f"{name}, seed + {other}", data=Wanted(queries, n, other)
-                    )
+                    data = Wanted(queries, n, other)
+                    yield replace(chain, study="seeds", name=f"{name}{data.other}", data=data)
 
 
 def _fits(budget: float, spp: int, price: Price) -> Iterator[Chain]:

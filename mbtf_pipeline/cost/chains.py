@@ -45,6 +45,11 @@ class Wanted:
     spp: int
     seed: int = 0
 
+    @property
+    def other(self) -> str:
+        """What names of other seeds end with; nothing for the study's own."""
+        return f", seed + {self.seed}" if self.seed else ""
+
 
 @dataclass(frozen=True)
 class Chain:
@@ -62,6 +67,13 @@ class Chain:
     name: str
     data: Wanted
     fit: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def label(self) -> str:
+        """What it is called beside all others."""
+        # Chains of the study of seeds are named so.
+        other = "" if self.study == "seeds" else self.data.other
+        return f"{self.study}: {self.series}, {self.name}{other}"
 
     @property
     def key(self) -> dict[str, Any]:
@@ -131,8 +143,7 @@ class Workshop:
     def data(self, wanted: Wanted) -> _Data:
         """Training data, made where they are missing."""
         if wanted not in self._made:
-            other = f", seed + {wanted.seed}" if wanted.seed else ""
-            self.progress(f"{wanted.queries / 1e6:.2f} M queries of {wanted.spp} paths{other}")
+            self.progress(f"{wanted.queries / 1e6:.2f} M queries of {wanted.spp} paths{wanted.other}")
             self._made[wanted] = self._generate(wanted)
         return self._made[wanted]
 
@@ -163,8 +174,7 @@ class Workshop:
 
         judges = self.judges()
         data = self.data(chain.data)
-        other = f", seed + {chain.data.seed}" if chain.data.seed and chain.study != "seeds" else ""
-        self.progress(f"{chain.study}: {chain.series}, {chain.name}{other}")
+        self.progress(chain.label)
         config = FitConfig.model_validate({"seed": self.config.seed + chain.data.seed, **chain.fit})
         out = self.folder / f"fit-{hash_of(chain.key)[:12]}"
         shutil.rmtree(out, ignore_errors=True)

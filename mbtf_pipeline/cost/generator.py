@@ -125,7 +125,7 @@ class Bench:
 
     def reference(self, changes: dict[str, Any], piece: int) -> _Reference:
         """One piece of the reference with these options."""
-        setting = repr(sorted(changes.items()))
+        setting = _setting(changes)
         if (setting, piece) not in self._references:
             job, estimator = self._judge(changes)
             queries = self.queries(job, _FIRST_REFERENCE + piece, BIAS_QUERIES)
@@ -137,7 +137,7 @@ class Bench:
     def mean(self, changes: dict[str, Any]) -> Estimate:
         """Mean value of the reference with these options, 1/sr, which errors are relative to: of many more
         queries than have the paths that a bias takes."""
-        setting = repr(sorted(changes.items()))
+        setting = _setting(changes)
         if setting not in self._means:
             job, estimator = self._judge(changes)
             parts = []
@@ -151,7 +151,7 @@ class Bench:
         return self._means[setting]
 
     def _judge(self, changes: dict[str, Any]) -> tuple[Job, Any]:
-        setting = repr(sorted(changes.items()))
+        setting = _setting(changes)
         if setting not in self._judges:
             job = self.job({"effects.mode": "all", "transport.max_depth": 0, **changes})
             self._judges[setting] = job, job.estimator(plan_effects(job))
@@ -278,6 +278,11 @@ class Bench:
             variance = mean_estimate(np.concatenate(squares))
             if piece >= _FEWEST_PIECES and (_sure(variance) or time.perf_counter() - began > seconds):
                 return variance, _typical(prices)
+
+
+def _setting(changes: dict[str, Any]) -> str:
+    """Options as a key, whatever their order."""
+    return repr(sorted(changes.items()))
 
 
 def _typical(prices: list[float]) -> Estimate:

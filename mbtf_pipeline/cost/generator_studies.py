@@ -40,6 +40,11 @@ class GeneratorTask:
     against: dict[str, Any] | None = field(default_factory=dict)
 
     @property
+    def label(self) -> str:
+        """What it is called beside all others."""
+        return f"{self.study}: {self.series}, {self.name}"
+
+    @property
     def key(self) -> dict[str, Any]:
         """What the point depends on besides the study's basis."""
         return {"changes": self.changes, "against": self.against}

@@ -182,7 +182,8 @@ def write_page(study: Study) -> Path:
     write_text(study.folder / CSV_NAME, to_csv(study.points))
     parts = [_front_part(study), *(_part(study, name) for name in _STUDIES)]
     held, known = half_widths(study.points)
-    narrow, chains = half_widths([p for p in study.points if p.study in FITTED])
+    fitted = [p for p in study.points if p.study in FITTED]
+    narrow, chains = half_widths(fitted)
     seeds = max((p.details.get("seeds", 1.0) for p in study.points), default=1.0)
     html: str = (
         page_environment()
@@ -194,7 +195,7 @@ def write_page(study: Study) -> Path:
             seeds=round(seeds),
             parts=[p for p in parts if p is not None],
             skipped=study.skipped,
-            scatter=_scatter_text(study.scatter, any(p.study in FITTED for p in study.points)),
+            scatter=_scatter_text(study.scatter, bool(fitted)),
             widths=f"{held} of {known} errors are known to within a tenth (95 %).",
             wide=study.scatter is not None and narrow < chains,
             failed=study.failed,

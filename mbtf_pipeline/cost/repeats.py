@@ -79,9 +79,7 @@ def repeat_chains(
                     point = work.measure(chain)
                 except InputError as error:
                     # The same seed would fail the same way, and so end every run of this study.
-                    out.failed.append(
-                        f"{chain.study}: {chain.series}, {chain.name}, seed + {seed}: {error.what}"
-                    )
+                    out.failed.append(f"{chain.label}: {error.what}")
                     del left[place]
                 else:
                     store.put(chain.key, point)

@@ -71,49 +71,39 @@ class Study:
 
 
 def claim(folder: Path) -> None:
-    """Make a study's folder, or take an empty one or one that holds a study.
+    """Make a study's folder, or take an empty one or one that holds a study of this kind of machine: seconds
+    of another one would stand beside its own.
 
     Raises
     ------
     InputError : it holds something else
     """
     cure = "choose another folder with -o"
-    take(folder, _is_study, InputError("is not empty and holds no cost study", where=folder, cure=cure))
-
-
-def _is_study(folder: Path) -> bool:
-    try:
-        return bool(read_json(folder / STUDY_NAME).get("format") == STUDY_FORMAT)
-    except InputError:
-        return False
-
-
-def budget_of(folder: Path) -> float:
-    """Seconds of the study in a folder; those of a new one where there is none."""
-    if not _is_study(folder):
-        return NEW_BUDGET
-    budget = read_json(folder / STUDY_NAME).get("budget")
-    return float(budget) if isinstance(budget, int | float) and budget > 0 else NEW_BUDGET
-
-
-def _claim_for_this_machine(folder: Path) -> None:
-    """As :func:`claim`; a study of another kind of machine is refused: its seconds would stand beside this
-    one's.
-
-    Raises
-    ------
-    InputError : the folder holds something else, or such a study
-    """
-    claim(folder)
-    path = folder / STUDY_NAME
-    if path.exists():
-        there, here = read_json(path).get("machine", {}).get("system"), machine()["system"]
+    other = InputError("is not empty and holds no cost study", where=folder, cure=cure)
+    take(folder, lambda path: bool(_record(path)), other)
+    if record := _record(folder):
+        there, here = record.get("machine", {}).get("system"), machine()["system"]
         if there != here:
             raise InputError(
                 f"holds a cost study made on another kind of machine ({there}; this is {here})",
                 where=folder,
-                cure="choose another folder with -o",
+                cure=cure,
             )
+
+
+def _record(folder: Path) -> dict[str, Any]:
+    """What a folder says of the study that it holds; empty where it holds none."""
+    try:
+        found = read_json(folder / STUDY_NAME)
+    except InputError:
+        return {}
+    return found if found.get("format") == STUDY_FORMAT else {}
+
+
+def budget_of(folder: Path) -> float:
+    """Seconds of the study in a folder; those of a new one where there is none."""
+    budget = _record(folder).get("budget")
+    return float(budget) if isinstance(budget, int | float) and budget > 0 else NEW_BUDGET
 
 
 def _check_variation(bench: Bench) -> None:
@@ -175,7 +165,7 @@ def run_study(
     begin = time.perf_counter()
     config = studied(recipe.generate, seed)
     material = load_material(Path(config.material), config.geometry.tile)
-    _claim_for_this_machine(folder)
+    claim(folder)
 
     def note(text: str) -> None:
         if tell is not None:
@@ -211,7 +201,7 @@ def run_study(
         for task in generator_tasks(bench):
             point = store.get(task.study, task.key)
             if point is None and left() > _RESERVED * budget:
-                note(f"{task.study}: {task.series}, {task.name}")
+                note(task.label)
                 point = task.run(bench, each)
                 store.put(task.key, point)
             _keep(study, point, task, task.command(generator))
@@ -231,7 +221,7 @@ def run_study(
 def _keep(study: Study, point: Point | None, task: GeneratorTask | Chain, command: str) -> None:
     """Take a point up; its command names the study's folder, which may have moved since it was measured."""
     if point is None:
-        study.skipped.append(f"{task.study}: {task.series}, {task.name}")
+        study.skipped.append(task.label)
     else:
         study.points.append(replace(point, series=task.series, name=task.name, command=command))
 
@@ -294,7 +284,7 @@ def _measure_chains(
                     store.put(task.key, point)
             except InputError as error:
                 # What was measured, and what is still to come, is worth a page all the same.
-                study.failed.append(f"{task.study}: {task.series}, {task.name}: {error.what}")
+                study.failed.append(f"{task.label}: {error.what}")
                 failed.append(task.key)
             else:
                 _keep(study, point, task, work.command_of(task))

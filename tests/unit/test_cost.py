@@ -185,7 +185,7 @@ def test_seconds_of_two_machines_are_not_mixed(tmp_path: Path) -> None:
     from mbtf_pipeline.cost import study
     from mbtf_pipeline.run_folder import machine
 
-    claim_here = study._claim_for_this_machine
+    claim_here = study.claim
     claim_here(tmp_path / "new")
     known = {"format": study.STUDY_FORMAT, "machine": machine()}
     write_json(tmp_path / "new" / study.STUDY_NAME, known)

@@ -241,7 +241,13 @@ def studied(monkeypatch: pytest.MonkeyPatch) -> Studied:
         chain("fit", 2000),
     ]
     task = SimpleNamespace(
-        study="paths", series="paths", name="4", key={}, run=lambda *_: setting, command=lambda *_: ""
+        study="paths",
+        series="paths",
+        name="4",
+        label="paths: paths, 4",
+        key={},
+        run=lambda *_: setting,
+        command=lambda *_: "",
     )
     monkeypatch.setattr(module, "Workshop", Shop)
     monkeypatch.setattr(module, "generator_tasks", lambda bench: [task])
