@@ -3,10 +3,10 @@
 
     python assets/make_assets.py [FOLDER [MATERIAL ...]]
 
-Each material is a folder with ``height.exr`` (float, heights in tile widths), ``basecolor.png`` (sRGB) and
+Each material is a folder with ``height.exr`` (float, heights in tile widths), ``base_color.png`` (sRGB) and
 ``roughness.png`` (linear), all 256 × 256 and periodic; where the refractive index is not 1.5, a
 ``material.yaml`` says so. Random numbers come from an integer hash and every result is rounded to a coarse
-grid (heights to 2^-14 tile widths, colours to 8 bits), so that neither the version of a library nor the last
+grid (heights to 2^-14 tile widths, colors to 8 bits), so that neither the version of a library nor the last
 bit of a sine shows in the files. Row 0 of every image is the side v → 1.
 """
 

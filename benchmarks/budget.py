@@ -21,13 +21,13 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from mbtf_fit.quality import best_options
-from mbtf_gen.durations import parse_duration
-from mbtf_gen.engine import load_mitsuba
-from mbtf_gen.errors import MbtfError
-from mbtf_gen.settings import nested
-from mbtf_pipeline.budget import Split, split_budget, within_budget
-from mbtf_pipeline.cost.chains import Chain, Wanted, Workshop
+from mbtf_core.config_file import nested
+from mbtf_core.errors import MbtfError
+from mbtf_core.units import parse_duration
+from mbtf_fit.presets import best_options
+from mbtf_gen.render.runtime import load_mitsuba
+from mbtf_pipeline.cost_study.runs import Chain, RunRequest, RunRunner
+from mbtf_pipeline.cost_study.time_split import Split, split_budget, within_budget
 from mbtf_pipeline.recipe import Recipe
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -43,7 +43,7 @@ def chain(recipe: Recipe, split: Split) -> Chain:
     """The chain that a split makes of a recipe."""
     spent = within_budget(recipe, split)
     fit = spent.fit["neumip"].fields()
-    data = Wanted(split.queries, recipe.generate.queries.spp)
+    data = RunRequest(split.queries, recipe.generate.queries.spp)
     return Chain("chain", "neumip", f"{split.share:.0%}", data, fit)
 
 
@@ -61,7 +61,7 @@ def measure(material: Path, seconds: float, splits: list[float], levels: int, wo
     )
     found = split_budget(recipe, seconds, work / "run", "", lambda note: print(note, file=sys.stderr))
     print(f"{material.name}: {found.describe()}", file=sys.stderr)
-    workshop = Workshop(recipe.generate, work / "chains", "", lambda note: None)
+    workshop = RunRunner(recipe.generate, work / "chains", "", lambda note: None)
     rows, errors = [], []
     for share in [*splits, None]:
         split = found
@@ -70,7 +70,7 @@ def measure(material: Path, seconds: float, splits: list[float], levels: int, wo
             queries, generating, training = found.prices.spend(seconds, share)
             split = Split(int(queries), generating, training, share, (), 0.0, found.prices)
         point = workshop.measure(chain(recipe, split))
-        workshop.forget(Wanted(split.queries, recipe.generate.queries.spp))
+        workshop.forget(RunRequest(split.queries, recipe.generate.queries.spp))
         took = point.details["total_seconds"] + (found.pilot_seconds if share is None else 0.0)
         errors.append(point.error)
         rows.append(

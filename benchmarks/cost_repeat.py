@@ -30,16 +30,16 @@ from typing import Any
 
 from error_per_second import independent_points
 
-from mbtf_gen.engine import load_mitsuba
-from mbtf_gen.errors import MbtfError
-from mbtf_gen.material import load_material
-from mbtf_gen.planning import plan_effects
-from mbtf_gen.stats import Estimate
-from mbtf_pipeline.cost.chain_studies import PATH_SHARES
-from mbtf_pipeline.cost.generator import Bench
-from mbtf_pipeline.cost.generator_studies import generator_tasks
-from mbtf_pipeline.cost.page import paths_slope
-from mbtf_pipeline.cost.points import HALF_WIDTH, NORMAL, Point
+from mbtf_core.errors import MbtfError
+from mbtf_core.stats import Estimate
+from mbtf_gen.material.material import load_material
+from mbtf_gen.planning.effects_plan import plan_effects
+from mbtf_gen.render.runtime import load_mitsuba
+from mbtf_pipeline.cost_study.fit_runs import PATH_SHARES
+from mbtf_pipeline.cost_study.generator_benchmark import GeneratorBenchmark
+from mbtf_pipeline.cost_study.generator_runs import generator_tasks
+from mbtf_pipeline.cost_study.measurements import HALF_WIDTH, NORMAL, Point
+from mbtf_pipeline.cost_study.page import paths_slope
 from mbtf_pipeline.recipe import load_recipe
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -54,11 +54,11 @@ BIASED = {"effects.mode": "all", "transport.max_depth": 1}
 Row = tuple[str, dict[str, Estimate]]
 
 
-def bench_of(recipe: Path, seed: int) -> Bench:
+def bench_of(recipe: Path, seed: int) -> GeneratorBenchmark:
     """The generator of a recipe with another seed."""
     config = load_recipe(recipe).generate
     material = load_material(Path(config.material), config.geometry.tile)
-    return Bench(config.model_copy(update={"seed": seed}), material, seed)
+    return GeneratorBenchmark(config.model_copy(update={"seed": seed}), material, seed)
 
 
 def measure(recipe: Path, seed: int, seconds: float) -> list[Point]:
@@ -105,7 +105,7 @@ def stored_rows(folder: Path) -> list[Row]:
     return out
 
 
-def normalised(a: Estimate, b: Estimate) -> float | None:
+def normalized(a: Estimate, b: Estimate) -> float | None:
     """Difference over its standard error; None where nothing was to be told."""
     scatter = math.hypot(a.error, b.error)
     return abs(a.value - b.value) / scatter if scatter > 0 and math.isfinite(scatter) else None
@@ -114,7 +114,7 @@ def normalised(a: Estimate, b: Estimate) -> float | None:
 def independent(recipe: Path, seconds: float) -> tuple[Estimate | None, dict[int, Estimate]]:
     """Slope of the noise's variance over the number of independent paths, and by number of paths the squared
     bias of a biased setting."""
-    import mbtf_gen.estimator as module
+    import mbtf_gen.render.estimator as module
 
     bench = bench_of(recipe, 0)
     usual = module.sequence
@@ -134,14 +134,14 @@ def independent(recipe: Path, seconds: float) -> tuple[Estimate | None, dict[int
 
 
 def compare(runs: list[list[Row]]) -> dict[str, list[float]]:
-    """Normalised differences between any two runs, by part."""
+    """Normalized differences between any two runs, by part."""
     differences: dict[str, list[float]] = {}
     for first, second in combinations(runs, 2):
         others = dict(second)
         for name, parts in first:
             for part, x in parts.items():
                 y = others.get(name, {}).get(part)
-                z = normalised(x, y) if y is not None else None
+                z = normalized(x, y) if y is not None else None
                 if z is not None:
                     differences.setdefault(part, []).append(z)
                     print(f"{name:50s} {part:5s} {x} against {y}: {z:.2f}")
@@ -174,7 +174,7 @@ def main() -> int:
                 met &= abs(slope.value + 1) <= SLOPE
             few, many = biases[PATHS[0]], biases[PATHS[-1]]
             figures["squared_bias_by_paths"] = {n: e.as_dict() for n, e in biases.items()}
-            z = normalised(few, many)
+            z = normalized(few, many)
             figures["bias_difference"] = z
             bars["bias_difference"] = 3.0
             met &= z is None or z <= 3.0

@@ -41,8 +41,8 @@ import numpy as np
 from curved_meshes import F64, Surface, displaced, load_object, refined
 from numpy.typing import NDArray
 
-from mbtf_gen.engine import load_mitsuba
-from mbtf_gen.reference import auto_exposure, to_display
+from mbtf_gen.pictures.reference import auto_exposure, to_display
+from mbtf_gen.render.runtime import load_mitsuba
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT.parent / "shared" / "data"
@@ -161,10 +161,10 @@ def fit_alone(
     """
     import drjit as dr
 
-    from mbtf_fit.plugin.bsdf import Frame, clamped
-    from mbtf_fit.plugin.integrator import camera_cone, write_footprint
-    from mbtf_gen.estimator import Stream
-    from mbtf_gen.queries import Queries
+    from mbtf_fit.mitsuba_plugin.bsdf import Frame, clamped
+    from mbtf_fit.mitsuba_plugin.integrator import camera_cone, write_footprint
+    from mbtf_gen.render.estimator import Stream
+    from mbtf_gen.sampling.query_sampler import Queries
 
     random, size = np.random.default_rng(5), len(inside)
     pixel = mi.UInt32(random.choice(np.flatnonzero(inside), QUERIES).astype(np.uint32))
@@ -197,7 +197,7 @@ def fit_alone(
 
 
 def hard_places(mi: Any, scene: Any, size: int) -> tuple[F64, F64]:
-    """Of what pixels' centres see on the smooth object: by how much its texture coordinates are stretched,
+    """Of what pixels' centers see on the smooth object: by how much its texture coordinates are stretched,
     longest side over shortest, and what share of the light that comes from above a cosine of -0.3 comes from
     below 0.3."""
     import drjit as dr
@@ -261,11 +261,11 @@ def rms(a: tuple[F64, F64], b: tuple[F64, F64], mask: NDArray[np.bool_], block: 
 
 def compare(mi: Any, scene: Scene, folder: Path, size: int, spp: int) -> tuple[dict[str, Any], list[F64]]:
     """Figures of a scene, and its two pictures."""
-    from mbtf_gen.bsdf import bsdf_of
-    from mbtf_gen.config import GeneratorConfig
+    from mbtf_gen.config.generator import GeneratorConfig
     from mbtf_gen.generation import build_estimator
-    from mbtf_gen.material import load_material
-    from mbtf_gen.scene import register_plugins
+    from mbtf_gen.material.material import load_material
+    from mbtf_gen.render.bsdf.plugin import bsdf_of
+    from mbtf_gen.render.scene import register_plugins
 
     register_plugins()
     material = load_material(ROOT / "assets" / scene.material)
@@ -312,7 +312,7 @@ def compare(mi: Any, scene: Scene, folder: Path, size: int, spp: int) -> tuple[d
         **{f"rms_{block}": rms(found, true, inside, block) for block in BLOCKS},
         "rim_mean_ratio": mean(found, rim) / mean(true, rim),
         "outline_pixels": float((smooth_area - area) / max(1, edge.sum())),
-        "relief_pixels": float(np.median(base.size) * grid.relief / pixel),
+        "relief_pixels": float(np.median(base.size) * grid.displacement_range / pixel),
         "mean_depth_pixels": float(-np.median(base.size) * grid.z.mean() / pixel),
     }
     return figures, [(true[0] + true[1]) / 2, (found[0] + found[1]) / 2]
@@ -323,7 +323,7 @@ def draw(rows: list[tuple[dict[str, Any], list[F64]]], path: Path) -> None:
     from PIL import Image, ImageDraw, ImageFont
 
     size, gap, caption = len(rows[0][1][0]), 6, 24
-    titles = ("really displaced", "fitted material", "difference (grey: none)")
+    titles = ("really displaced", "fitted material", "difference (gray: none)")
     sheet = Image.new(
         "RGB", (3 * (size + gap) - gap, caption + len(rows) * (size + gap) - gap), (255, 255, 255)
     )
@@ -364,9 +364,9 @@ def main() -> int:
     parser.add_argument("--picture", type=Path)
     options = parser.parse_args()
     mi = load_mitsuba()
-    import mbtf_fit.plugin
+    import mbtf_fit.mitsuba_plugin
 
-    mbtf_fit.plugin.register()
+    mbtf_fit.mitsuba_plugin.register()
     rows = []
     for scene in SCENES:
         if options.scene and scene.name not in options.scene:

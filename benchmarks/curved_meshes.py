@@ -94,7 +94,7 @@ def points(surface: Surface, face: NDArray[np.int64], weights: F64) -> Surface:
         at, to = surface.place[corners[:, k]], surface.normal[corners[:, k]]
         onto = place - ((place - at) * to).sum(1, keepdims=True) * to
         rounded += weights[:, k, None] * onto
-    # Same points of neighbouring triangles are rounded alike, so that no crack opens.
+    # Same points of neighboring triangles are rounded alike, so that no crack opens.
     place = np.round(0.25 * place + 0.75 * rounded, 7)
     return Surface(place, normal, mixed(surface.uv), mixed(surface.size), np.zeros((0, 3), np.int64))
 

@@ -4,7 +4,7 @@ with ``--costs``, whether what the plan states about costs is true.
     python benchmarks/effects.py [MATERIAL ...] [--only] [--queries N] [--spp N] [--rounds N]
     python benchmarks/effects.py [MATERIAL ...] [--only] --costs
 
-For made surfaces (flat Lambert, black, dark, mid-grey), the project's assets and every material given it
+For made surfaces (flat Lambert, black, dark, mid-gray), the project's assets and every material given it
 prints the time of both, their ratio, what auto leaves out with the cost that the plan
 states, and the cost measured: the RMS change of M, free of noise, relative to its mean.
 
@@ -31,18 +31,18 @@ from typing import Any
 
 import numpy as np
 
-from mbtf_gen.config import GeneratorConfig
-from mbtf_gen.effects import EffectsPlan
-from mbtf_gen.estimates import Estimates, Stream
+from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation import Job
-from mbtf_gen.material import Material, load_material
-from mbtf_gen.pilot import PILOT_ROULETTE, measured, relative_change
-from mbtf_gen.planning import SMALL_RUN, plan_effects, without
+from mbtf_gen.material.material import Material, load_material
+from mbtf_gen.planning.effects import EffectsPlan
+from mbtf_gen.planning.effects_plan import SMALL_RUN, plan_effects, without
+from mbtf_gen.planning.pilot import PILOT_ROULETTE, measured, relative_change
+from mbtf_gen.render.estimates import Estimates, Stream
 
 ASSETS = Path(__file__).parents[1] / "assets"
 # Ratio of the times, auto over all, that the surfaces are held to: at least 20 times faster, or never slower
 # beyond 3 %.
-BARS = {"flat Lambert": 0.05, "black": 0.05, "dark (albedo 0.05)": 1.0, "mid-grey": 1.03}
+BARS = {"flat Lambert": 0.05, "black": 0.05, "dark (albedo 0.05)": 1.0, "mid-gray": 1.03}
 
 
 def surfaces() -> dict[str, Material]:
@@ -51,14 +51,14 @@ def surfaces() -> dict[str, Material]:
 
     def lambert(albedo: float, scale: float = relief.height_scale) -> Material:
         return Material(
-            height=relief.height, height_scale=scale, height_bits=None, basecolor=np.full(3, albedo)
+            height=relief.height, height_scale=scale, height_bits=None, base_color=np.full(3, albedo)
         )
 
     return {
         "flat Lambert": lambert(0.5, 0.0),
         "black": lambert(0.0),
         "dark (albedo 0.05)": lambert(0.05),
-        "mid-grey": lambert(0.5),
+        "mid-gray": lambert(0.5),
     }
 
 

@@ -32,14 +32,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_gen.allocation import measure_allocation
-from mbtf_gen.config import GeneratorConfig
-from mbtf_gen.engine import load_mitsuba
-from mbtf_gen.errors import MbtfError
-from mbtf_gen.estimates import Estimates, Stream
+from mbtf_core.errors import MbtfError
+from mbtf_core.stats.groups import level_groups
+from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation import Job
-from mbtf_gen.planning import simulated
-from mbtf_gen.stats.groups import level_groups
+from mbtf_gen.planning.effects_plan import simulated
+from mbtf_gen.planning.sample_allocation import measure_allocation
+from mbtf_gen.render.estimates import Estimates, Stream
+from mbtf_gen.render.runtime import load_mitsuba
 
 ROOT = Path(__file__).resolve().parents[1]
 # Texture sets and the factor on their heights.
@@ -64,8 +64,8 @@ def independent_points(sequence: Callable[..., Any]) -> Callable[..., Any]:
 
 def sides(job: Job, count: int, spp: int) -> tuple[dict[str, Callable[[int], Estimates]], float, Any]:
     """(what to run by name, seconds of the pilot, the queries)."""
-    import mbtf_gen.estimator as module
-    from mbtf_gen import tracing
+    import mbtf_gen.render.estimator as module
+    from mbtf_gen.render import path_tracer as tracing
 
     plan = simulated(job)
     estimator = job.estimator(plan)

@@ -37,19 +37,19 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from mbtf_fit.blur import NEGLIGIBLE, annealed_sigma
+from mbtf_core.directions import from_projected_disk
+from mbtf_core.lattice import Lattice, sigma_of_level
 from mbtf_fit.config import FitConfig
-from mbtf_fit.data import TrainingQueries
-from mbtf_fit.inference import predict
-from mbtf_fit.memory import keep_freed_memory
+from mbtf_fit.data.loader import TrainingQueries
+from mbtf_fit.material.inference import predict
 from mbtf_fit.models import build_model
+from mbtf_fit.models.blur import NEGLIGIBLE, annealed_sigma
 from mbtf_fit.models.neumip import Neumip
 from mbtf_fit.native import library
-from mbtf_fit.noise import NoiseModel
-from mbtf_fit.parallel import MAX_KERNEL_THREADS, Workers
-from mbtf_fit.training import BETAS, Trainer
-from mbtf_gen.directions import from_projected_disk
-from mbtf_gen.levels import Lattice, sigma_of_level
+from mbtf_fit.objective.noise import NoiseModel
+from mbtf_fit.objective.parallel import MAX_KERNEL_THREADS, Workers
+from mbtf_fit.training.memory import keep_freed_memory
+from mbtf_fit.training.trainer import BETAS, Trainer
 
 # Times the plain way's samples per second, on two cores.
 BARS = {"training": 3.0, "inference": 2.0}
@@ -196,7 +196,7 @@ class Plainly:
         training = config.training
         texels = [*model.pyramid, model.offset_texture]
         weights = [*model.decoder.parameters(), *model.offset_network.parameters()]
-        self.optimiser = torch.optim.Adam(
+        self.optimizer = torch.optim.Adam(
             [{"params": texels, "lr": training.texture_rate}, {"params": weights, "lr": training.rate}],
             betas=BETAS,
         )
@@ -206,10 +206,10 @@ class Plainly:
         sigma = annealed_sigma(share / blur.share, blur.start, blur.end)
         p = self.model(batch, sigma, max(sigma, blur.offset))
         loss = ((p - batch.value) ** 2 / (p.detach() ** 2 + self.unit**2)).mean()
-        self.optimiser.zero_grad()
+        self.optimizer.zero_grad()
         loss.backward()
         self.model.mark("backward")
-        self.optimiser.step()
+        self.optimizer.step()
         self.model.mark("Adam")
 
 
@@ -260,7 +260,7 @@ def main() -> int:
     def fresh() -> Neumip:
         model = build_model("neumip", lattice)
         assert isinstance(model, Neumip)
-        model.initialise(torch.Generator().manual_seed(0), unit)
+        model.initialize(torch.Generator().manual_seed(0), unit)
         return model
 
     plains = {}

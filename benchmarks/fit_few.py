@@ -23,14 +23,14 @@ from typing import Any
 
 from quality import generator_config
 
+from mbtf_core.config_file import resolve
+from mbtf_core.errors import MbtfError
 from mbtf_fit import fit
 from mbtf_fit.config import FitConfig
-from mbtf_fit.quality import best_options
-from mbtf_gen.engine import load_mitsuba
-from mbtf_gen.errors import MbtfError
+from mbtf_fit.presets import best_options
+from mbtf_gen.config.presets import as_assignments
 from mbtf_gen.generation import generate
-from mbtf_gen.quality import as_assignments
-from mbtf_gen.settings import resolve
+from mbtf_gen.render.runtime import load_mitsuba
 
 STEPS = (200, 800, 3000)
 DEFAULT = FitConfig().training.weight_decay

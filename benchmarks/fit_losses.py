@@ -4,7 +4,7 @@
 
 One true value, many noisy ones around it: gamma noise, never negative and skewed as that of light paths, of
 a relative deviation of 0.3, 0.8 and 1.5 (a query of many, of some and of few paths). The prediction that
-minimises the mean loss is what training tends to; its distance from the true value is the bias. The variance
+minimizes the mean loss is what training tends to; its distance from the true value is the bias. The variance
 model knows the noise, the robust rule is at its default. The rows "weighed by ..." show what weights from a
 query's own noisy value would do.
 
@@ -27,9 +27,9 @@ import torch
 from torch import Tensor
 
 from mbtf_fit.config import TrainingSection
-from mbtf_fit.data import TrainingQueries
-from mbtf_fit.losses import Objective
-from mbtf_fit.noise import NoiseModel
+from mbtf_fit.data.loader import TrainingQueries
+from mbtf_fit.objective.losses import Objective
+from mbtf_fit.objective.noise import NoiseModel
 
 KINDS = ("relative", "squared", "linear", "log", "fourth-root")
 CORRECTIONS = ("none", "second-order", "linear")
@@ -90,9 +90,9 @@ def by_halves(p: Tensor, a: Tensor, b: Tensor) -> Tensor:
 def real_noise(material: Path, shards: Path) -> dict[str, float]:
     """Relative noise, share of values beyond the bound, relative bias of their mean: 65 536 queries."""
     from mbtf_fit import Material
-    from mbtf_fit.data import load_training, mean_value
-    from mbtf_fit.noise import typical_value
-    from mbtf_gen.dataset import Dataset
+    from mbtf_fit.data.loader import load_training, mean_value
+    from mbtf_fit.objective.noise import typical_value
+    from mbtf_gen.dataset.reader import Dataset
 
     loaded, data = Material.load(material), Dataset.open(shards)
     # Half a gigabyte at most: what is trained on stays on disk.

@@ -21,12 +21,12 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from mbtf_core.errors import MbtfError
 from mbtf_fit import FitConfig, Material, fit
-from mbtf_fit.data import load_split
+from mbtf_fit.data.loader import load_split
 from mbtf_fit.evaluation import split_errors
-from mbtf_gen.config import GeneratorConfig
-from mbtf_gen.dataset import Dataset
-from mbtf_gen.errors import MbtfError
+from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.dataset.reader import Dataset
 
 ROOT = Path(__file__).resolve().parents[1]
 TEXTURE_SETS = ROOT.parent / "shared" / "data" / "materials"

@@ -33,16 +33,16 @@ import numpy as np
 from fit import MOMENTS, random_batch
 from yardstick import RECIPE, make_shards
 
+from mbtf_core.errors import MbtfError
+from mbtf_core.lattice import Lattice
 from mbtf_fit import FitConfig, Material, fit, read_history
-from mbtf_fit.data import Partition, load_split, load_training, open_data
+from mbtf_fit.data.loader import Partition, load_split, load_training, open_data
 from mbtf_fit.evaluation import split_errors
 from mbtf_fit.models import build_model
-from mbtf_fit.noise import NoiseModel
-from mbtf_fit.parallel import MAX_KERNEL_THREADS, Workers
-from mbtf_fit.training import Trainer
-from mbtf_gen.dataset import Dataset
-from mbtf_gen.errors import MbtfError
-from mbtf_gen.levels import Lattice
+from mbtf_fit.objective.noise import NoiseModel
+from mbtf_fit.objective.parallel import MAX_KERNEL_THREADS, Workers
+from mbtf_fit.training.trainer import Trainer
+from mbtf_gen.dataset.reader import Dataset
 
 PUBLISHED = [{"kind": "log"}, {"kind": "linear", "weight": 0.1}]
 # Directions as (x, y, z).
@@ -95,7 +95,7 @@ def seconds_per_step(name: str, lattice: Lattice) -> float:
     model = build_model(config.model, lattice, **config.network.model_dump())
     import torch
 
-    model.initialise(torch.Generator().manual_seed(0), 0.2)
+    model.initialize(torch.Generator().manual_seed(0), 0.2)
     trainer = Trainer(config, model, queries, NoiseModel.silent(0.2, lattice))
     found = []
     limit = None if trainer.path == "pytorch" else MAX_KERNEL_THREADS

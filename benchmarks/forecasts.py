@@ -26,14 +26,14 @@ from typing import Any, get_args
 import numpy as np
 from quality import HEIGHTS, generator_config, source
 
+from mbtf_core.config_file import resolve
+from mbtf_core.errors import MbtfError
+from mbtf_core.units import parse_duration
 from mbtf_fit.config import FitConfig
-from mbtf_fit.forecast import PERSISTENCE, PILOT_SECONDS, extrapolated
-from mbtf_fit.quality import best_options
-from mbtf_gen.durations import parse_duration
-from mbtf_gen.engine import load_mitsuba
-from mbtf_gen.errors import MbtfError
-from mbtf_gen.quality import Quality, as_assignments
-from mbtf_gen.settings import resolve
+from mbtf_fit.presets import best_options
+from mbtf_fit.training.forecast import PERSISTENCE, PILOT_SECONDS, extrapolated
+from mbtf_gen.config.presets import Quality, as_assignments
+from mbtf_gen.render.runtime import load_mitsuba
 
 ASSETS = ("cliff_rock", "insulation_foam", "straight_wool", "turtle_shell", "twisted_wool")
 # Largest factors between forecast and run, either way.
@@ -44,7 +44,7 @@ def generated(name: str, quality: Quality, levels: int, shards: Path) -> dict[st
     """Forecast and run of the generator."""
     from mbtf_gen.forecast import forecast
     from mbtf_gen.generation import Job, allocated, generate
-    from mbtf_gen.planning import plan_effects
+    from mbtf_gen.planning.effects_plan import plan_effects
 
     config = generator_config(name, quality, levels)
     job = Job.prepare(config)
@@ -63,7 +63,7 @@ def generated(name: str, quality: Quality, levels: int, shards: Path) -> dict[st
 def fitted(shards: Path, seconds: str, out: Path) -> dict[str, Any]:
     """Forecast and run of the fitter."""
     from mbtf_fit import fit
-    from mbtf_fit.forecast import forecast_fit
+    from mbtf_fit.training.forecast import forecast_fit
 
     options = {**best_options(parse_duration(seconds)), "training.time": seconds, "training.steps": None}
     config = resolve(FitConfig, assignments=as_assignments(options))

@@ -3,7 +3,7 @@
     python benchmarks/memory.py [--resolution 1024] [--queries 131072 524288]
 
 Data sets of different numbers of queries are made by the command line in processes of their own, 16 paths
-per query, from a rough relief with colour and roughness at the same resolution. Read off are the process's
+per query, from a rough relief with color and roughness at the same resolution. Read off are the process's
 peak resident memory and the time from its start to its first finished shard, after a run that compiles the
 kernels (they are kept on disk). The last line is one JSON object with the figures and the bars they are held
 to; exit code 1 where one is missed.
@@ -42,7 +42,7 @@ def make_material(folder: Path, resolution: int) -> None:
     h = relief(resolution)
     np.save(folder / "height.npy", h.astype(np.float32))
     byte = (255 * h).astype(np.uint8)
-    Image.fromarray(np.stack([byte, byte, 255 - byte], axis=-1)).save(folder / "basecolor.png")
+    Image.fromarray(np.stack([byte, byte, 255 - byte], axis=-1)).save(folder / "base_color.png")
     Image.fromarray(64 + byte // 2).save(folder / "roughness.png")
 
 

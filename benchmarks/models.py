@@ -21,9 +21,9 @@ import numpy as np
 import torch
 from yardstick import MODELS as TRAINED
 
+from mbtf_core.directions import from_projected_disk
+from mbtf_core.lattice import Lattice
 from mbtf_fit.models import MODELS, build_model
-from mbtf_gen.directions import from_projected_disk
-from mbtf_gen.levels import Lattice
 
 # Places that are read at a time.
 PLACES = 1 << 15
@@ -49,7 +49,7 @@ def measure(name: str, finest: int, repeat: int) -> dict[str, Any]:
     """Microseconds of processor time per value, and weights."""
     model_name, network = CASES[name]
     model = build_model(model_name, Lattice(finest), **network)
-    model.initialise(torch.Generator().manual_seed(0), 0.1)
+    model.initialize(torch.Generator().manual_seed(0), 0.1)
     n = PLACES // model.positions
     u, sigma, light, view = queries(n, finest)
     first, second = [], []

@@ -23,15 +23,15 @@ from typing import Any, get_args
 
 from quality import generator_config
 
-from mbtf_fit.quality import best_options
-from mbtf_gen.config import count_queries
-from mbtf_gen.durations import parse_duration
-from mbtf_gen.engine import load_mitsuba
-from mbtf_gen.errors import MbtfError
+from mbtf_core.config_file import nested
+from mbtf_core.errors import MbtfError
+from mbtf_core.units import parse_duration
+from mbtf_fit.presets import best_options
+from mbtf_gen.config.generator import count_queries
+from mbtf_gen.config.presets import Quality
 from mbtf_gen.generation import Job
-from mbtf_gen.quality import Quality
-from mbtf_gen.settings import nested
-from mbtf_pipeline.cost.chains import Chain, Wanted, Workshop
+from mbtf_gen.render.runtime import load_mitsuba
+from mbtf_pipeline.cost_study.runs import Chain, RunRequest, RunRunner
 from mbtf_pipeline.run_folder import machine
 
 SIZES = ((25, 7), (40, 12), (64, 16), (96, 24))
@@ -58,8 +58,8 @@ def measure(
     """A row for each size."""
     config = generator_config(name, quality, levels)
     count = count_queries(config.queries.train, Job.prepare(config).lattice.texels())
-    data = Wanted(count, config.queries.spp)
-    workshop = Workshop(config, work, "", lambda note: print(note, file=sys.stderr))
+    data = RunRequest(count, config.queries.spp)
+    workshop = RunRunner(config, work, "", lambda note: print(note, file=sys.stderr))
     rows = []
     for width, channels in sizes:
         size = f"{width}x{channels}"

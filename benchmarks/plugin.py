@@ -33,9 +33,9 @@ os.environ["MBTF_KERNEL"] = "off"
 
 import numpy as np  # noqa: E402
 
-from mbtf_gen.camera import Camera  # noqa: E402
-from mbtf_gen.directions import from_angles  # noqa: E402
-from mbtf_gen.engine import load_mitsuba  # noqa: E402
+from mbtf_core.directions import from_angles  # noqa: E402
+from mbtf_gen.pictures.camera import Camera  # noqa: E402
+from mbtf_gen.render.runtime import load_mitsuba  # noqa: E402
 
 # Least ratio of PyTorch's time to the plugin's, most seconds of a first run, most deviation from conformance.
 FASTER, COMPILE, DEVIATION = 3.0, 10.0, 1e-4
@@ -51,13 +51,13 @@ def random_material(folder: Path, levels: int) -> None:
     """Export an untrained ``neumip`` of the paper's size."""
     import torch
 
+    from mbtf_core.lattice import Lattice
     from mbtf_fit.config import FitConfig
-    from mbtf_fit.material import export
+    from mbtf_fit.material.material import export
     from mbtf_fit.models import build_model
-    from mbtf_gen.levels import Lattice
 
     model = build_model("neumip", Lattice(levels))
-    model.initialise(torch.Generator().manual_seed(0), 0.2)
+    model.initialize(torch.Generator().manual_seed(0), 0.2)
     training = {"steps": 0, "batch": 1, "seconds": 0.0, "device": "cpu", "threads": 1, "errors": {}}
     export(model, FitConfig(), folder, data={}, training=training)
 
@@ -75,11 +75,11 @@ def main() -> int:
     import drjit as dr
     import torch
 
-    import mbtf_fit.plugin
+    import mbtf_fit.mitsuba_plugin
     from mbtf_fit import Material
-    from mbtf_fit.plugin import Evaluator, read_material
+    from mbtf_fit.mitsuba_plugin import Evaluator, read_material
 
-    mbtf_fit.plugin.register()
+    mbtf_fit.mitsuba_plugin.register()
     torch.set_num_threads(options.threads)
     dr.set_thread_count(options.threads)
     with tempfile.TemporaryDirectory(prefix="mbtf-material-") as made:

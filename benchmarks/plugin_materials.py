@@ -38,7 +38,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_gen.directions import from_angles, from_projected_disk
+from mbtf_core.directions import from_angles, from_projected_disk
 
 ROOT = Path(__file__).resolve().parents[1]
 ASSETS = ("turtle_shell", "cliff_rock", "twisted_wool", "straight_wool", "insulation_foam")
@@ -96,7 +96,7 @@ def uniform(mi: Any, n: int, seed: int) -> tuple[Any, Any]:
 
 def chi_squares(mi: Any, dr: Any, bsdf: Any) -> list[float]:
     """p-values of the samples at random places, footprints and views."""
-    from mbtf_gen.stats import Cap, chi_square_test
+    from mbtf_core.stats import Cap, chi_square_test
 
     random = np.random.default_rng(11)
     lattice, context = bsdf.lattice, mi.BSDFContext()
@@ -133,12 +133,12 @@ def variance_of(mi: Any, dr: Any, bsdf: Any, each: int = 2048, places: int = 512
 def energies(material: Path, shards: Path, evaluator: Any) -> list[dict[str, float]]:
     """Reflected share by elevation of the light: fit, reference, error of their difference. Of views, those
     that the data have, and of elevations too."""
-    from mbtf_gen.config import GeneratorConfig
-    from mbtf_gen.dataset import Dataset
-    from mbtf_gen.estimator import Stream
+    from mbtf_gen.config.generator import GeneratorConfig
+    from mbtf_gen.dataset.reader import Dataset
     from mbtf_gen.generation import build_estimator
-    from mbtf_gen.material import load_material
-    from mbtf_gen.queries import Queries
+    from mbtf_gen.material.material import load_material
+    from mbtf_gen.render.estimator import Stream
+    from mbtf_gen.sampling.query_sampler import Queries
 
     config = GeneratorConfig.model_validate(Dataset.open(shards).manifest["config"])
     estimator = build_estimator(config, load_material(material, config.geometry.tile))
@@ -176,14 +176,14 @@ def energies(material: Path, shards: Path, evaluator: Any) -> list[dict[str, flo
 def gloss(source: Path, config: dict[str, Any]) -> dict[str, float]:
     """Share of what the material's maps reflect that is specular, and their median roughness; 1 for
     Lambert."""
-    from mbtf_gen.material import load_material
+    from mbtf_gen.material.material import load_material
 
     maps = load_material(source, config["geometry"]["tile"])
     if maps.roughness is None:
         return {"specular_share": 0.0, "roughness": 1.0}
-    colour = float(np.mean(maps.basecolor @ np.array([0.2126, 0.7152, 0.0722])))
+    color = float(np.mean(maps.base_color @ np.array([0.2126, 0.7152, 0.0722])))
     metal = 0.0 if maps.metallic is None else float(np.mean(maps.metallic))
-    specular, diffuse = (1 - metal) * FRESNEL + metal * colour, (1 - metal) * (1 - FRESNEL) * colour
+    specular, diffuse = (1 - metal) * FRESNEL + metal * color, (1 - metal) * (1 - FRESNEL) * color
     return {"specular_share": specular / (specular + diffuse), "roughness": float(np.median(maps.roughness))}
 
 
@@ -224,16 +224,16 @@ def deviation(evaluator: Any, stored: Any) -> float:
 
 def measure(source: Path, shards: Path, folder: Path) -> dict[str, Any]:
     """All figures of one material; the kernel cache is empty."""
-    from mbtf_gen.engine import load_mitsuba
+    from mbtf_gen.render.runtime import load_mitsuba
 
     mi = load_mitsuba()
     import drjit as dr
 
-    import mbtf_fit.plugin
-    from mbtf_fit.plugin import Evaluator, read_material
-    from mbtf_gen.dataset import Dataset
+    import mbtf_fit.mitsuba_plugin
+    from mbtf_fit.mitsuba_plugin import Evaluator, read_material
+    from mbtf_gen.dataset.reader import Dataset
 
-    mbtf_fit.plugin.register()
+    mbtf_fit.mitsuba_plugin.register()
     start = time.perf_counter()
     plugin = {"type": "mbtf", "material": str(folder), "uv_scale": 40.0}
     scene = plane_scene(mi, plugin)

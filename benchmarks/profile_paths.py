@@ -20,10 +20,10 @@ from typing import Any
 
 from throughput import DEPTH, LIGHT_WIDTH, MESH, rocky
 
-from mbtf_gen.engine import load_mitsuba
-from mbtf_gen.errors import MbtfError
-from mbtf_gen.levels import Lattice
-from mbtf_gen.queries import Mixture, QueryPlan
+from mbtf_core.errors import MbtfError
+from mbtf_core.lattice import Lattice
+from mbtf_gen.render.runtime import load_mitsuba
+from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
 
 
 def main() -> int:
@@ -37,11 +37,11 @@ def main() -> int:
     except MbtfError as error:
         print(f"error: {error.message}", file=sys.stderr)
         return error.exit_code
-    from mbtf_gen.bsdf import bsdf_of
-    from mbtf_gen.estimator import Estimator, Stream
-    from mbtf_gen.light import LightKernel
-    from mbtf_gen.scene import build_tile
-    from mbtf_gen.tracing import Transport
+    from mbtf_gen.render.bsdf.plugin import bsdf_of
+    from mbtf_gen.render.estimator import Estimator, Stream
+    from mbtf_gen.render.path_tracer import Transport
+    from mbtf_gen.render.scene import build_tile
+    from mbtf_gen.sampling.light_kernel import LightKernel
 
     material = rocky()
     grid = material.grid(None, MESH)

@@ -32,18 +32,18 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, get_args
 
+from mbtf_core.atomic import read_json, write_json
+from mbtf_core.config_file import resolve
+from mbtf_core.errors import InputError
+from mbtf_core.units import parse_duration
 from mbtf_fit.config import FitConfig
-from mbtf_fit.forecast import PERSISTENCE, extrapolated
-from mbtf_fit.quality import FITTER
-from mbtf_gen.atomic import read_json, write_json
-from mbtf_gen.config import GeneratorConfig, count_queries
-from mbtf_gen.durations import parse_duration
-from mbtf_gen.errors import InputError
-from mbtf_gen.quality import GENERATOR, Quality, as_assignments
-from mbtf_gen.quality_measured import FORMAT, STORED, Chain, markdown_table, read_expected
-from mbtf_gen.settings import resolve
+from mbtf_fit.presets import FITTER
+from mbtf_fit.training.forecast import PERSISTENCE, extrapolated
+from mbtf_gen.config.generator import GeneratorConfig, count_queries
+from mbtf_gen.config.presets import GENERATOR, Quality, as_assignments
+from mbtf_gen.config.quality_measured import FORMAT, STORED, Chain, markdown_table, read_expected
 from mbtf_pipeline.fit_records import read_training
-from mbtf_pipeline.quality import settings_hash
+from mbtf_pipeline.presets import settings_hash
 from mbtf_pipeline.run_folder import machine
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -24,11 +24,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from mbtf_gen.config import GeneratorConfig
-from mbtf_gen.errors import MbtfError
-from mbtf_pipeline.cost.chains import Chain, Wanted, Workshop
-from mbtf_pipeline.cost.points import POINT_SCHEMA
-from mbtf_pipeline.plots import Cloud, scatter
+from mbtf_core.errors import MbtfError
+from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_pipeline.cost_study.measurements import POINT_SCHEMA
+from mbtf_pipeline.cost_study.runs import Chain, RunRequest, RunRunner
+from mbtf_pipeline.report.plots import Cloud, scatter
 
 ROOT = Path(__file__).resolve().parents[1]
 ASSETS = ("cliff_rock", "straight_wool", "turtle_shell")
@@ -82,7 +82,7 @@ def measure(
     rows = []
     fit = {"model": "neumip", "training": {"steps": steps}}
     with tempfile.TemporaryDirectory() as work:
-        shop = Workshop(
+        shop = RunRunner(
             config, Path(work), "", lambda note: print(f"{material.name}: {note}", file=sys.stderr)
         )
         for budget in budgets:
@@ -91,7 +91,7 @@ def measure(
                 key = dict(zip(KEY, values, strict=True))
                 row = kept.find(key)
                 if row is None:
-                    data = Wanted(max(1, int(budget) // spp), spp)
+                    data = RunRequest(max(1, int(budget) // spp), spp)
                     point = shop.measure(Chain("data", f"{budget:g} paths", f"{spp}", data, fit))
                     shop.forget(data)
                     row = {**key, "queries": data.queries, "unexplained": point.error.as_dict()}

@@ -20,10 +20,10 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from mbtf_gen.atomic import digest
-from mbtf_gen.config import GeneratorConfig
+from mbtf_core.atomic import digest
+from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.dataset.verify import verify
 from mbtf_gen.generation import generate
-from mbtf_gen.verification import verify
 
 ASSETS = Path(__file__).parents[1] / "assets"
 ROUNDS = 5

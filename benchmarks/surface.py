@@ -5,7 +5,7 @@
 **Energy**: what a white surface under white light returns, by roughness and cosine of the view, from 2^18
 samples of the BSDF's own sampler.
 **Cost**: processor seconds per million paths of the estimator, on a relief of 256² cells with bitmaps of
-colour, roughness and metallic, light of 1°, at most 6 interactions; the least of the runs, which alternate.
+color, roughness and metallic, light of 1°, at most 6 interactions; the least of the runs, which alternate.
 Processor time, not elapsed time, so that other work on the machine matters little.
 
 Tables go to standard error; the last line is one JSON object with the figures.
@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_gen.engine import load_mitsuba
+from mbtf_gen.render.runtime import load_mitsuba
 
 ROUGHNESSES = (0.02, 0.1, 0.3, 0.5, 1.0)
 COSINES = (1.0, 0.5, 0.2, 0.05)
@@ -79,11 +79,11 @@ def surfaces(mi: Any) -> dict[str, dict[str, Any]]:
     def bitmap(a: NDArray[np.float32]) -> dict[str, Any]:
         return {"type": "bitmap", "bitmap": mi.Bitmap(np.ascontiguousarray(a)), "raw": True}
 
-    colour, rough, metal = bitmap(pixels), bitmap(pixels[..., :1]), bitmap(pixels[..., 1:2])
-    own = {"type": "mbtf_surface", "base_color": colour}
-    stock = {"type": "principled", "base_color": colour, "roughness": rough, "specular": 0.5}
+    color, rough, metal = bitmap(pixels), bitmap(pixels[..., :1]), bitmap(pixels[..., 1:2])
+    own = {"type": "mbtf_surface", "base_color": color}
+    stock = {"type": "principled", "base_color": color, "roughness": rough, "specular": 0.5}
     return {
-        "diffuse": {"type": "diffuse", "reflectance": colour},
+        "diffuse": {"type": "diffuse", "reflectance": color},
         "mbtf_surface Lambert": own,
         "principled": {**stock, "metallic": 0.0},
         "mbtf_surface specular": {**own, "roughness": rough, "specular": 0.5},
@@ -103,12 +103,12 @@ def surfaces(mi: Any) -> dict[str, dict[str, Any]]:
 
 def costs(mi: Any, runs: int, count: int, spp: int) -> dict[str, float]:
     """Processor seconds per million paths."""
-    from mbtf_gen.estimator import Estimator, Stream
-    from mbtf_gen.heightfield import HeightGrid
-    from mbtf_gen.light import LightKernel
-    from mbtf_gen.queries import Queries
-    from mbtf_gen.scene import build_tile
-    from mbtf_gen.tracing import Transport
+    from mbtf_gen.geometry.heightfield import HeightGrid
+    from mbtf_gen.render.estimator import Estimator, Stream
+    from mbtf_gen.render.path_tracer import Transport
+    from mbtf_gen.render.scene import build_tile
+    from mbtf_gen.sampling.light_kernel import LightKernel
+    from mbtf_gen.sampling.query_sampler import Queries
 
     rng = np.random.default_rng(3)
 
@@ -149,7 +149,7 @@ def main() -> None:
     parser.add_argument("--spp", type=int, default=16)
     options = parser.parse_args()
     mi = load_mitsuba()
-    from mbtf_gen.scene import register_plugins
+    from mbtf_gen.render.scene import register_plugins
 
     register_plugins()
     figures = {"energy": energies(mi), "cost": costs(mi, options.runs, options.queries, options.spp)}

@@ -29,11 +29,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_gen.adaptive import Target, estimate_shard, round_up
-from mbtf_gen.config import GeneratorConfig
-from mbtf_gen.errors import MbtfError
-from mbtf_gen.estimates import Stream
+from mbtf_core.errors import MbtfError
+from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation import Job, plan_run
+from mbtf_gen.planning.adaptive import Target, estimate_shard, round_up
+from mbtf_gen.render.estimates import Stream
 
 ROOT = Path(__file__).resolve().parents[1]
 POLISHED = "height: {height}\nroughness: 0.2\nmetallic: 1.0\n"

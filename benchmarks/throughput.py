@@ -3,7 +3,7 @@
     python benchmarks/throughput.py [--material PATH] [--runs 5] [--queries 262144] [--spp 16]
 
 **ours**: random 7D queries (σ over all levels, both directions uniform on the projected disk) against a tile
-of 512² cells with bitmaps of colour and roughness, light of 1° RMS, at most 6 interactions.
+of 512² cells with bitmaps of color and roughness, light of 1° RMS, at most 6 interactions.
 **stock**: ``mi.render`` with the ``path`` integrator, one directional light, the same mesh as a single tile
 seen straight from above by an orthographic camera, as many paths, the same limits on depth: coherent rays,
 every one of which hits. It is what the renderer can do at best, not a goal for random queries.
@@ -31,14 +31,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_gen.engine import load_mitsuba
-from mbtf_gen.errors import MbtfError
-from mbtf_gen.levels import Lattice
-from mbtf_gen.material import Material, load_material
-from mbtf_gen.queries import Mixture, QueryPlan
+from mbtf_core.errors import MbtfError
+from mbtf_core.lattice import Lattice
+from mbtf_gen.material.material import Material, load_material
+from mbtf_gen.render.runtime import load_mitsuba
+from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
 
 if TYPE_CHECKING:
-    from mbtf_gen.heightfield import HeightGrid
+    from mbtf_gen.geometry.heightfield import HeightGrid
 
 MESH = 512
 DEPTH = 6
@@ -63,17 +63,17 @@ def noise(rng: np.random.Generator, cutoff: float) -> NDArray[np.float64]:
 
 
 def rocky() -> Material:
-    """Terraces with rough flanks, 0.12 tile widths deep; colour and roughness follow them."""
+    """Terraces with rough flanks, 0.12 tile widths deep; color and roughness follow them."""
     rng = np.random.default_rng(1)
     coarse, fine = noise(rng, 24.0), noise(rng, 200.0)
     h = 0.7 * np.floor(6.0 * coarse) / 6.0 + 0.2 * coarse + 0.1 * fine
     h = (h - h.min()) / np.ptp(h)
-    colour = np.stack([0.15 + 0.5 * h, 0.12 + 0.4 * fine, 0.1 + 0.3 * coarse], axis=-1).astype(np.float32)
+    color = np.stack([0.15 + 0.5 * h, 0.12 + 0.4 * fine, 0.1 + 0.3 * coarse], axis=-1).astype(np.float32)
     return Material(
         height=h,
         height_scale=0.12,
         height_bits=None,
-        basecolor=colour,
+        base_color=color,
         roughness=0.3 + 0.5 * fine,
         metallic=0.0,
         specular=0.5,
@@ -82,17 +82,17 @@ def rocky() -> Material:
 
 def our_run(material: Material, grid: HeightGrid, count: int, spp: int) -> Run:
     """A function of the run's number that traces `count` queries."""
-    from mbtf_gen.bsdf import bsdf_of
-    from mbtf_gen.estimator import Estimator, Stream
-    from mbtf_gen.light import LightKernel
-    from mbtf_gen.scene import build_tile
-    from mbtf_gen.tracing import Transport
+    from mbtf_gen.render.bsdf.plugin import bsdf_of
+    from mbtf_gen.render.estimator import Estimator, Stream
+    from mbtf_gen.render.path_tracer import Transport
+    from mbtf_gen.render.scene import build_tile
+    from mbtf_gen.sampling.light_kernel import LightKernel
 
     estimator = Estimator(
         build_tile(grid, bsdf_of(material)), LightKernel(LIGHT_WIDTH), Transport(DEPTH, ROULETTE)
     )
     lattice = Lattice.for_map(*grid.z.shape)
-    # Levels log-uniform, as a reader of "all levels" expects; the generator's default favours fine ones,
+    # Levels log-uniform, as a reader of "all levels" expects; the generator's default favors fine ones,
     # which are faster.
     plan = QueryPlan(lattice, Mixture(1.0, 0.0), 0.1, "shuffled", 0, count)
 
@@ -114,9 +114,9 @@ def stock_run(material: Material, grid: HeightGrid, count: int, spp: int) -> Run
     import drjit as dr
     import mitsuba as mi
 
-    from mbtf_gen.bsdf import bsdf_of
-    from mbtf_gen.scene import unit_of
-    from mbtf_gen.stock import mesh_of_grid
+    from mbtf_gen.geometry.mesh import mesh_of_grid
+    from mbtf_gen.render.bsdf.plugin import bsdf_of
+    from mbtf_gen.render.scene import unit_of
 
     unit = unit_of(grid.aspect)
     columns = max(1, round((count / grid.aspect) ** 0.5))

@@ -19,8 +19,8 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from mbtf_core.errors import MbtfError
 from mbtf_fit import FitConfig, FitResult, fit
-from mbtf_gen.errors import MbtfError
 
 ROOT = Path(__file__).resolve().parents[1]
 RECIPE = ROOT / "pipelines" / "rock_cliff.yaml"

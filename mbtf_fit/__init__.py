@@ -9,12 +9,12 @@ from importlib import import_module
 from typing import Any
 
 _PUBLIC = {
-    "FitConfig": "config",
-    "FitResult": "fitting",
-    "Material": "material",
-    "evaluate": "evaluation",
-    "fit": "fitting",
-    "read_history": "fitting",
+    "FitConfig": "mbtf_fit.config",
+    "FitResult": "mbtf_fit.training.fit",
+    "Material": "mbtf_fit.material.material",
+    "evaluate": "mbtf_fit.evaluation",
+    "fit": "mbtf_fit.training.fit",
+    "read_history": "mbtf_fit.training.fit",
 }
 
 __all__ = ["FitConfig", "FitResult", "Material", "evaluate", "fit", "read_history"]
@@ -22,5 +22,5 @@ __all__ = ["FitConfig", "FitResult", "Material", "evaluate", "fit", "read_histor
 
 def __getattr__(name: str) -> Any:
     if name in _PUBLIC:
-        return getattr(import_module(f".{_PUBLIC[name]}", __name__), name)
+        return getattr(import_module(_PUBLIC[name]), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -9,10 +9,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, PlainSerializer, model_validator
 
-from mbtf_gen.durations import format_duration, parse_duration
-from mbtf_gen.settings import Settings, laid_over
-
-from .sizes import format_size, parse_size
+from mbtf_core.config_file import Settings, deep_merge
+from mbtf_core.sizes import format_size, parse_size
+from mbtf_core.units import format_duration, parse_duration
 
 ModelName = Literal["neumip-baseline", "neumip", "hierarchical"]
 OutputMap = Literal["exp-1", "exp", "identity", "softplus", "fourth-root"]
@@ -54,7 +53,7 @@ class NetworkSection(Settings):
         "depth", description="a length along the view, two numbers, or no offset"
     )
     blending: Literal["blend", "concatenate"] = Field(
-        "blend", description="two neighbouring levels: their weighted sum, or both side by side"
+        "blend", description="two neighboring levels: their weighted sum, or both side by side"
     )
     encoding: EncodingSection = EncodingSection()
 
@@ -79,7 +78,7 @@ class BlurSection(Settings):
 
 
 class LossTerm(Settings):
-    """One term of what is minimised; ``docs/fitting.md`` has the formulas."""
+    """One term of what is minimized; ``docs/fitting.md`` has the formulas."""
 
     kind: LossKind
     weight: float = Field(1.0, gt=0, le=1e6)
@@ -101,7 +100,7 @@ class TrainingSection(Settings):
     losses: tuple[LossTerm, ...] = Field(
         (LossTerm(kind="relative", weight=1.0),),
         min_length=1,
-        description="what is minimised: {kind, weight}, added up",
+        description="what is minimized: {kind, weight}, added up",
     )
     correction: Correction = Field("linear", description="of the bias that noise leaves in curved losses")
     robust: float | None = Field(
@@ -145,7 +144,7 @@ class HeldOutSection(Settings):
 
     queries: float = Field(0.01, ge=0, lt=0.5, description="share of the queries, at random")
     direction: tuple[float, float] = Field(
-        (0.45, 0.3), description="centre (x, y) of the held-out region on the projected disk"
+        (0.45, 0.3), description="center (x, y) of the held-out region on the projected disk"
     )
     radius: float = Field(
         0.1, ge=0, lt=1, description="of that region; queries with light or view in it are kept out"
@@ -196,7 +195,7 @@ class FitConfig(Settings):
         if not isinstance(data, Mapping):
             return data
         name = data.get("model", cls.model_fields["model"].default)
-        return laid_over(PRESETS.get(name, {}) if isinstance(name, str) else {}, data)
+        return deep_merge(PRESETS.get(name, {}) if isinstance(name, str) else {}, data)
 
     @model_validator(mode="after")
     def _consistent(self) -> FitConfig:
@@ -205,7 +204,7 @@ class FitConfig(Settings):
             raise ValueError("neumip-baseline has no offset: choose the model neumip, or network.offset none")
         if self.model != "hierarchical" and network.decoder == "inception":
             raise ValueError(
-                "the inception decoder looks at neighbouring queries: choose the model hierarchical for it"
+                "the inception decoder looks at neighboring queries: choose the model hierarchical for it"
             )
         return self
 

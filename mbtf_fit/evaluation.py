@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_gen.dataset import Dataset
-from mbtf_gen.directions import ELEVATION_BANDS
-from mbtf_gen.errors import InputError
-from mbtf_gen.levels import Lattice
-from mbtf_gen.stats import (
+from mbtf_core.directions import ELEVATION_BANDS
+from mbtf_core.errors import InputError
+from mbtf_core.lattice import Lattice
+from mbtf_core.stats import (
     Estimate,
     by_group,
     elevation_groups,
@@ -23,13 +22,13 @@ from mbtf_gen.stats import (
     signal_variance,
     unexplained_variance,
 )
-
-from .buffers import HELD_OUT
-from .data import SAMPLE, Partition, Queries, load_split, load_training
-from .transmittance_fit import TransmittanceError, has_holes, judge_transmittance
+from mbtf_fit.data.images import HELD_OUT
+from mbtf_fit.data.loader import SAMPLE, Partition, Queries, load_split, load_training
+from mbtf_fit.material.transmittance_fit import TransmittanceError, has_holes, judge_transmittance
+from mbtf_gen.dataset.reader import Dataset
 
 if TYPE_CHECKING:
-    from .material import Material
+    from mbtf_fit.material.material import Material
 
 Predict = Callable[[Queries], NDArray[np.float32]]
 
@@ -131,7 +130,7 @@ def judge(predict: Predict, data: Dataset, partition: Partition) -> dict[str, Sp
         parts["test"] = load_split(data, "test")
     parts["held_out_queries"] = partition.held_out_queries
     parts["held_out_directions"] = partition.held_out_directions
-    # Evaluating a neighbourhood per query takes its time, and queries of a buffer have much in common.
+    # Evaluating a neighborhood per query takes its time, and queries of a buffer have much in common.
     parts["training"] = partition.sample.take(
         slice(None, None, SAMPLE // HELD_OUT if data.layout == "image" else 1)
     )
@@ -140,7 +139,7 @@ def judge(predict: Predict, data: Dataset, partition: Partition) -> dict[str, Sp
 
 
 def foreign_inputs(material: Material, shards: str | Path) -> list[str]:
-    """Roles of the inputs (height, basecolor, …) that differ between a data set and the one that the material
+    """Roles of the inputs (height, base_color, …) that differ between a data set and the one that the material
     was trained on; empty where either does not say what it was made from.
 
     Raises

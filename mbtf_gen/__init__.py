@@ -8,24 +8,24 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-from .llvm import use_shipped_llvm
+from mbtf_gen.render.llvm import use_shipped_llvm
 
 # Dr.Jit reads the library's path once, when it is first imported: before that, say where ours lies.
 use_shipped_llvm()
 
 _PUBLIC = {
-    "Camera": "camera",
-    "Dataset": "dataset",
-    "GeneratorConfig": "config",
-    "Lattice": "levels",
-    "LightKernel": "light",
-    "MbtfError": "errors",
-    "Queries": "queries",
-    "generate": "generation",
-    "load_material": "material",
-    "render_reference": "reference",
-    "repair": "repairs",
-    "verify": "verification",
+    "Camera": "mbtf_gen.pictures.camera",
+    "Dataset": "mbtf_gen.dataset.reader",
+    "GeneratorConfig": "mbtf_gen.config.generator",
+    "Lattice": "mbtf_core.lattice",
+    "LightKernel": "mbtf_gen.sampling.light_kernel",
+    "MbtfError": "mbtf_core.errors",
+    "Queries": "mbtf_gen.sampling.query_sampler",
+    "generate": "mbtf_gen.generation",
+    "load_material": "mbtf_gen.material.material",
+    "render_reference": "mbtf_gen.pictures.reference",
+    "repair": "mbtf_gen.repairs",
+    "verify": "mbtf_gen.dataset.verify",
 }
 
 __all__ = [
@@ -46,5 +46,5 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     if name in _PUBLIC:
-        return getattr(import_module(f".{_PUBLIC[name]}", __name__), name)
+        return getattr(import_module(_PUBLIC[name]), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -7,8 +7,8 @@ import sys
 
 def main() -> int:
     """Run the command line; returns the exit code."""
-    from .cli import app
-    from .console import run
+    from mbtf_core.console import run
+    from mbtf_gen.cli.app import app
 
     return run(app)
 

@@ -14,18 +14,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .adaptive import Target, estimate_shard
-from .console import clock
-from .effects import EffectsPlan
-from .estimates import Estimates, Stream
-from .pilot import pilot_queries
-from .queries import Queries
-from .schema import ARRAYS, SPLITS, Split
-from .shard_files import write_shard
-from .stats import pooled_error
+from mbtf_core.console import clock
+from mbtf_core.shard_schema import ARRAYS, SPLITS, Split
+from mbtf_core.stats import pooled_error
+from mbtf_gen.dataset.shard_io import write_shard
+from mbtf_gen.planning.adaptive import Target, estimate_shard
+from mbtf_gen.planning.effects import EffectsPlan
+from mbtf_gen.planning.pilot import pilot_queries
+from mbtf_gen.render.estimates import Estimates, Stream
+from mbtf_gen.sampling.query_sampler import Queries
 
 if TYPE_CHECKING:
-    from .generation import Job
+    from mbtf_gen.generation import Job
 
 # Paths of one piece of the pilot, and the fewest pieces that are timed.
 _PIECE_PATHS = 1 << 19

@@ -13,25 +13,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .adaptive import PILOT_SPP, Target
-from .allocation import measure_allocation
-from .config import GeneratorConfig, count_queries
-from .effects import EffectsPlan
-from .errors import PartialError, UsageError
-from .heightfield import HeightGrid
-from .levels import Lattice
-from .manifest import ShardEntry, build_manifest
-from .material import Material, load_material
-from .output_folder import holds, open_folder
-from .planning import SMALL_RUN, plan_effects, simulated
-from .queries import Mixture, QueryPlan
-from .schema import SPLITS, Split
-from .shard_files import shard_suffix
-from .shard_making import ProgressCallback, busy_message, make_shards
-from .simulation import estimator_of
-from .slopes import residual_slopes
-from .summary import Summary, finish, planned_effects
-from .verification import is_finished
+from mbtf_core.errors import PartialError, UsageError
+from mbtf_core.lattice import Lattice
+from mbtf_core.shard_schema import SPLITS, Split
+from mbtf_gen.config.generator import GeneratorConfig, count_queries
+from mbtf_gen.dataset.folder import holds, open_folder
+from mbtf_gen.dataset.manifest import ShardEntry, build_manifest
+from mbtf_gen.dataset.render_shards import ProgressCallback, busy_message, make_shards
+from mbtf_gen.dataset.shard_io import shard_suffix
+from mbtf_gen.dataset.summary import Summary, finish, planned_effects
+from mbtf_gen.dataset.verify import is_finished
+from mbtf_gen.geometry.heightfield import HeightGrid
+from mbtf_gen.geometry.slopes import residual_slopes
+from mbtf_gen.material.material import Material, load_material
+from mbtf_gen.planning.adaptive import PILOT_SPP, Target
+from mbtf_gen.planning.effects import EffectsPlan
+from mbtf_gen.planning.effects_plan import SMALL_RUN, plan_effects, simulated
+from mbtf_gen.planning.sample_allocation import measure_allocation
+from mbtf_gen.planning.simulation import estimator_of
+from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
 
 log = logging.getLogger(__name__)
 
@@ -62,7 +62,11 @@ class Job:
             log.info(note)
         for warning in job.material.warnings_at(config.geometry.height):
             log.warning(warning)
-        log.info("mesh: %d x %d cells, relief %.4g tile widths", *job.grid.z.shape[::-1], job.grid.relief)
+        log.info(
+            "mesh: %d x %d cells, relief %.4g tile widths",
+            *job.grid.z.shape[::-1],
+            job.grid.displacement_range,
+        )
         return job
 
     @classmethod
@@ -174,7 +178,7 @@ class Job:
             raise UsageError(
                 f"{wanted} {split} queries are more than {MAX_SHARD_FILES} shards of {size}",
                 where="queries",
-                cure="ask for fewer, or raise output.shard_queries",
+                hint="ask for fewer, or raise output.shard_queries",
             )
         suffix = shard_suffix(self.config.output.format)
         return [
@@ -265,7 +269,7 @@ def generate(
     made = make_shards(job, folder, job.slice(slice_index, slice_count), effects, progress=progress)
     if made.busy:
         raise PartialError(
-            busy_message(made.busy), where=folder, cure="wait for it, then run the same command again"
+            busy_message(made.busy), where=folder, hint="wait for it, then run the same command again"
         )
     summary = finish(
         folder,
@@ -278,6 +282,6 @@ def generate(
         raise PartialError(
             "shards that were finished are gone or cannot be read",
             where=folder,
-            cure="run the same command again",
+            hint="run the same command again",
         )
     return summary

@@ -16,25 +16,25 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from .atomic import read_json, read_sealed, write_sealed, write_text
-from .config import GeneratorConfig
-from .dataset import Dataset
-from .effects import EffectsPlan
-from .errors import InputError, MbtfError, PartialError
-from .generation import Job, plan_run
-from .locks import brief_lock
-from .manifest import ShardEntry, build_manifest, effects_digest
-from .schema import CONFIG_NAME, FORMAT_NAME, MANIFEST_NAME, SPLITS
-from .settings import differences, dump_yaml, in_short, read_yaml
-from .shard_making import ProgressCallback, busy_message, make_shards
-from .summary import finish, planned_effects
-from .verification import Fault, shard_faults, verify
+from mbtf_core.atomic import read_checksummed, read_json, write_checksummed, write_text
+from mbtf_core.config_file import differences, dump_yaml, in_short, read_yaml
+from mbtf_core.errors import InputError, MbtfError, PartialError
+from mbtf_core.locks import brief_lock
+from mbtf_core.shard_schema import CONFIG_NAME, FORMAT_NAME, MANIFEST_NAME, SPLITS
+from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.dataset.manifest import ShardEntry, build_manifest, effects_digest
+from mbtf_gen.dataset.reader import Dataset
+from mbtf_gen.dataset.render_shards import ProgressCallback, busy_message, make_shards
+from mbtf_gen.dataset.summary import finish, planned_effects
+from mbtf_gen.dataset.verify import Fault, shard_faults, verify
+from mbtf_gen.generation import Job, plan_run
+from mbtf_gen.planning.effects import EffectsPlan
 
 _AGAIN = "generate the data set again, into another folder"
 
 
 @dataclass(frozen=True)
-class Repaired:
+class RepairResult:
     """What a repair did.
 
     Attributes
@@ -54,7 +54,7 @@ class Repaired:
 
 
 @dataclass
-class Damage:
+class Corruption:
     """What is wrong with a data set and how it is mended; :meth:`mend` does it.
 
     Parameters
@@ -88,7 +88,7 @@ class Damage:
     def _manifest(self) -> dict[str, Any] | None:
         """The manifest, if it is as it was written."""
         try:
-            return read_sealed(self.folder / MANIFEST_NAME)
+            return read_checksummed(self.folder / MANIFEST_NAME)
         except InputError:
             return None
 
@@ -98,7 +98,7 @@ class Damage:
         seen: Counter[tuple[str, str]] = Counter()
         for path in self.folder.glob("*-*.json"):
             try:
-                record = read_sealed(path)
+                record = read_checksummed(path)
             except InputError:
                 continue
             if record.get("format") == FORMAT_NAME:
@@ -135,7 +135,7 @@ class Damage:
             raise InputError(
                 "cannot be restored: no other file of the folder says what it held",
                 where=self.folder / MANIFEST_NAME,
-                cure=_AGAIN,
+                hint=_AGAIN,
             )
         other: Job | None = None
         for config in self._configurations():
@@ -143,7 +143,7 @@ class Damage:
                 raise InputError(
                     f"the material is not at '{config.material}'",
                     where=self.folder,
-                    cure="name it with: mbtf-gen repair FOLDER --material PATH",
+                    hint="name it with: mbtf-gen repair FOLDER --material PATH",
                 )
             job = Job.prepare(config)
             if job.config_hash == wanted:
@@ -154,7 +154,7 @@ class Damage:
     def _refusal(self, job: Job | None) -> InputError:
         if job is None:
             return InputError(
-                f"neither {MANIFEST_NAME} nor {CONFIG_NAME} can be read", where=self.folder, cure=_AGAIN
+                f"neither {MANIFEST_NAME} nor {CONFIG_NAME} can be read", where=self.folder, hint=_AGAIN
             )
         then = (self._manifest or {}).get("inputs", {})
         changes = in_short(differences(then, dict(sorted(job.material.digests.items()))))
@@ -162,7 +162,7 @@ class Damage:
         return InputError(
             f"the material or the configuration is not the one that made the data set{what}",
             where=self.folder,
-            cure="bring it back, or generate the data set again",
+            hint="bring it back, or generate the data set again",
         )
 
     @cached_property
@@ -180,7 +180,7 @@ class Damage:
             raise InputError(
                 "cannot be restored: the effects plan comes out otherwise here",
                 where=self.folder / MANIFEST_NAME,
-                cure="repair it on the machine that made it, or generate the data set again",
+                hint="repair it on the machine that made it, or generate the data set again",
             )
         return plan
 
@@ -216,7 +216,7 @@ class Damage:
         """Paths that mending takes."""
         return sum(self.job.paths(entry) for entry in self.entries)
 
-    def mend(self, progress: ProgressCallback | None = None) -> Repaired:
+    def mend(self, progress: ProgressCallback | None = None) -> RepairResult:
         """Write the documents and make the shards again.
 
         Raises
@@ -239,10 +239,10 @@ class Damage:
             raise PartialError(
                 busy_message(made.busy),
                 where=self.folder,
-                cure="wait for it, then run the same command again",
+                hint="wait for it, then run the same command again",
             )
         summary = finish(self.folder)
-        return Repaired(
+        return RepairResult(
             str(self.folder),
             self.faults,
             made.shards,
@@ -258,18 +258,18 @@ class Damage:
         with brief_lock(path):
             if MANIFEST_NAME in documents:
                 every = [e for split in SPLITS for e in self.job.shards(split)]
-                write_sealed(path, build_manifest(self.job, every, self.effects))
-            manifest = read_sealed(path)
+                write_checksummed(path, build_manifest(self.job, every, self.effects))
+            manifest = read_checksummed(path)
             if unfinished and manifest["complete"]:
                 # Readers trust this word, and shards are about to go.
-                write_sealed(path, {**manifest, "complete": False, "summary": None})
+                write_checksummed(path, {**manifest, "complete": False, "summary": None})
             if CONFIG_NAME in documents:
                 write_text(self.folder / CONFIG_NAME, dump_yaml(manifest["config"]))
 
 
 def repair(
     folder: str | Path, *, material: str | None = None, progress: ProgressCallback | None = None
-) -> Repaired:
+) -> RepairResult:
     """Make again what ``verify`` condemns (``mbtf-gen repair``): the data set is then the undisturbed one.
 
     Parameters
@@ -282,4 +282,4 @@ def repair(
     InputError : no data set there, or its material is gone or has changed
     PartialError : others are writing, the disk is full; the same command goes on
     """
-    return Damage(Path(folder), material).mend(progress)
+    return Corruption(Path(folder), material).mend(progress)

@@ -7,9 +7,8 @@ import sys
 
 def main() -> int:
     """Run the command line; returns the exit code."""
-    from mbtf_gen.console import run
-
-    from .cli import app
+    from mbtf_core.console import run
+    from mbtf_pipeline.cli.app import app
 
     return run(app)
 

@@ -9,10 +9,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
+from mbtf_core.config_file import Settings, dump_yaml, line_of, read_yaml, resolve
+from mbtf_core.errors import InputError
 from mbtf_fit.config import FitConfig
-from mbtf_gen.config import GeneratorConfig, Paths
-from mbtf_gen.errors import InputError
-from mbtf_gen.settings import Settings, dump_yaml, line_of, read_yaml, resolve
+from mbtf_gen.config.generator import GeneratorConfig, Paths
 
 RECIPE_NAME = "recipe.yaml"
 # Names become files and folders, so they are plain.
@@ -167,7 +167,7 @@ def load_recipe(path: Path, assignments: Sequence[str] = ()) -> Recipe:
         raise InputError(
             f"material '{written}' does not exist",
             where="--set generate.material" if assigned else f"{path}:{line}" if line else path,
-            cure=_cure(path, material, assigned),
+            hint=_cure(path, material, assigned),
         )
     generate = recipe.generate.model_copy(update={"material": os.path.normpath(material)})
     return recipe.model_copy(update={"generate": generate})
@@ -205,13 +205,13 @@ def _cure(path: Path, material: Path, assigned: bool) -> str:
 
 def _find(path: Path) -> Path:
     if path.is_dir():
-        raise InputError("is a folder, not a recipe", where=path, cure="name a YAML file in it")
+        raise InputError("is a folder, not a recipe", where=path, hint="name a YAML file in it")
     return path
 
 
 def write_recipe(recipe: Recipe, folder: Path) -> None:
     """Write the resolved recipe into a run's folder, from where it can be run again."""
-    from mbtf_gen.atomic import write_text
+    from mbtf_core.atomic import write_text
 
     data = recipe.model_dump(mode="json")
     data["generate"]["material"] = os.path.relpath(recipe.generate.material, folder)
@@ -230,6 +230,6 @@ def read_resolved(folder: Path) -> Recipe:
         raise InputError(
             f"holds no run (no {RECIPE_NAME})",
             where=folder,
-            cure="make one: mbtf-pipeline run RECIPE -o FOLDER",
+            hint="make one: mbtf-pipeline run RECIPE -o FOLDER",
         )
     return resolve(Recipe, file=path)

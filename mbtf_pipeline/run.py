@@ -7,17 +7,26 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from mbtf_core.atomic import read_json
+from mbtf_core.console import Console, clock
+from mbtf_core.errors import InputError
 from mbtf_fit.config import FitConfig
-from mbtf_gen.atomic import read_json
-from mbtf_gen.config import GeneratorConfig
-from mbtf_gen.console import Console, clock
-from mbtf_gen.errors import InputError
-
-from .compare import COMPARISON_NAME, COMPARISON_SCHEMA
-from .recipe import Recipe, read_resolved
-from .report import LAYOUT
-from .run_folder import COMPARE, FITS, REPORT, SHARDS, claim, clear, describe, locked
-from .stages import NOT_RUN, Decision, Outcome, Stage, Stamp, decide, read_stamp, run_again, run_stages
+from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_pipeline.compare.compare import COMPARISON_NAME, COMPARISON_SCHEMA
+from mbtf_pipeline.recipe import Recipe, read_resolved
+from mbtf_pipeline.report.report import LAYOUT
+from mbtf_pipeline.run_folder import COMPARE, FITS, REPORT, SHARDS, claim, clear, describe, locked
+from mbtf_pipeline.stages import (
+    NOT_RUN,
+    Decision,
+    Outcome,
+    Stage,
+    Stamp,
+    decide,
+    read_stamp,
+    run_again,
+    run_stages,
+)
 
 GENERATE_STAGE, COMPARE_STAGE, REPORT_STAGE = "generate", "compare", "report"
 Inputs = Mapping[str, str]
@@ -138,10 +147,10 @@ class _Run:
 
     def _generate(self, data: DataSet) -> Callable[[Decision], dict[str, Any]]:
         def run(decision: Decision) -> dict[str, Any]:
+            from mbtf_core.shard_schema import MANIFEST_NAME
+            from mbtf_gen.dataset.summary import summary_dict
+            from mbtf_gen.dataset.verify import sidecar_of
             from mbtf_gen.generation import Job, generate, paths_left
-            from mbtf_gen.schema import MANIFEST_NAME
-            from mbtf_gen.summary import summary_dict
-            from mbtf_gen.verification import sidecar_of
 
             job = Job.prepare(data.config)
             shards = self.folder / data.sub
@@ -187,7 +196,7 @@ class _Run:
         return run
 
     def _compare(self, decision: Decision) -> dict[str, Any]:
-        from .compare import compare, steps
+        from mbtf_pipeline.compare.compare import compare, steps
 
         out = self.folder / COMPARE
         clear(out)
@@ -204,7 +213,7 @@ class _Run:
         return {"seconds": record["seconds"]}
 
     def _report(self, decision: Decision) -> dict[str, Any]:
-        from .report import write_report
+        from mbtf_pipeline.report.report import write_report
 
         size = write_report(self.folder, self.recipe, stage_names(self.recipe)[:-1])
         return {"bytes": size}
@@ -212,7 +221,7 @@ class _Run:
 
 def _unfinished(out: Path, config: FitConfig, shards: Path) -> bool:
     """Whether a folder holds the beginning of this very fit, from a run that was interrupted."""
-    from mbtf_gen.schema import MANIFEST_NAME
+    from mbtf_core.shard_schema import MANIFEST_NAME
 
     try:
         begun, manifest = read_json(out / "fit.json"), read_json(shards / MANIFEST_NAME)
@@ -223,7 +232,7 @@ def _unfinished(out: Path, config: FitConfig, shards: Path) -> bool:
 
 
 def _material_inputs(recipe: Recipe) -> dict[str, str]:
-    from mbtf_gen.material import load_material
+    from mbtf_gen.material.material import load_material
 
     return dict(load_material(recipe.generate.material).digests)
 

@@ -16,10 +16,9 @@ import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from mbtf_gen.atomic import read_json, write_json
-from mbtf_gen.errors import InputError, PartialError
-
-from .recipe import Recipe, write_recipe
+from mbtf_core.atomic import read_json, write_json
+from mbtf_core.errors import InputError, PartialError
+from mbtf_pipeline.recipe import Recipe, write_recipe
 
 RUN_NAME = "run.json"
 RUN_FORMAT = "mbtf-run"
@@ -58,8 +57,8 @@ def claim(folder: Path) -> None:
     ------
     InputError : it holds something else
     """
-    cure = "choose another folder with -o"
-    take(folder, is_run, InputError("is not empty and holds no run", where=folder, cure=cure))
+    hint = "choose another folder with -o"
+    take(folder, is_run, InputError("is not empty and holds no run", where=folder, hint=hint))
 
 
 def describe(folder: Path, recipe: Recipe, command: str) -> None:
@@ -109,13 +108,13 @@ def locked(folder: Path, record: str = RUN_NAME) -> Iterator[None]:
     ------
     PartialError : another process holds it
     """
-    from mbtf_gen.locks import shard_lock
+    from mbtf_core.locks import shard_lock
 
     with shard_lock(folder / record) as held:
         if not held:
             raise PartialError(
                 "another run is at work here",
                 where=folder,
-                cure="wait for it, or choose another folder with -o",
+                hint="wait for it, or choose another folder with -o",
             )
         yield

@@ -16,8 +16,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mbtf_gen.atomic import digest, read_json, write_json
-from mbtf_gen.errors import InputError
+from mbtf_core.atomic import digest, read_json, write_json
+from mbtf_core.errors import InputError
 
 STAMP_FORMAT = "mbtf-stage"
 # Part of every key: raise it when a stage makes something else from the same inputs.
@@ -139,7 +139,7 @@ def _key(stage: Stage, depends: Mapping[str, Any]) -> str:
 
 
 def _what_changed(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
-    from mbtf_gen.settings import differences
+    from mbtf_core.config_file import differences
 
     if changes := differences(old.get("config", {}), new["config"]):
         more = f" and {len(changes) - 3} more" if len(changes) > 3 else ""
@@ -230,7 +230,7 @@ def run_again(folder: Path, stage: Stage) -> Stamp:
         stamp = read_stamp(folder, name)
         if stamp is None:
             raise InputError(
-                f"stage '{name}' is not finished", where=folder, cure="run the recipe again: it resumes"
+                f"stage '{name}' is not finished", where=folder, hint="run the recipe again: it resumes"
             )
         upstream[name] = stamp.outputs_hash
     return _run(folder, stage, upstream, Decision(FORCED))

@@ -98,12 +98,12 @@ def cliff_rock() -> Material:
     hollow = height - ndimage.gaussian_filter(height, 5.0, mode="wrap")
     worn = smooth(0.004, 0.022, hollow)
     dirt = smooth(-0.004, -0.028, hollow)
-    colour = STONES[bed] * (0.92 + 0.22 * (own[1] - 0.5))[..., None]
+    color = STONES[bed] * (0.92 + 0.22 * (own[1] - 0.5))[..., None]
     stain = smooth(0.05, 0.5, noise(u, v, (9, 2), 98) + 0.35 * rough_u)
-    colour = mix(colour, (0.47, 0.31, 0.19), 0.45 * stain)
+    color = mix(color, (0.47, 0.31, 0.19), 0.45 * stain)
     mottle = 0.16 * (laminae - 0.5) + 0.18 * grain + 0.14 * layered(u, v, 6, 3, 99)
-    colour = colour * (1.0 + mottle)[..., None]
-    colour = mix(colour, (0.72, 0.67, 0.58), 0.45 * worn)
-    colour = mix(colour, (0.16, 0.13, 0.11), 0.75 * np.maximum(dirt, np.maximum(0.8 * joint, crack)))
+    color = color * (1.0 + mottle)[..., None]
+    color = mix(color, (0.72, 0.67, 0.58), 0.45 * worn)
+    color = mix(color, (0.16, 0.13, 0.11), 0.75 * np.maximum(dirt, np.maximum(0.8 * joint, crack)))
     roughness = 0.82 + 0.08 * dirt - 0.12 * worn + 0.05 * grain
-    return Material(height, colour, roughness, index=1.54)
+    return Material(height, color, roughness, index=1.54)

@@ -9,9 +9,9 @@ from .tile import Material
 
 
 def circles(candidates: int, largest: float, smallest: float, room: float, seed: int) -> Field:
-    """(n, 3) centres and radii of circles strewn over the periodic tile, the largest first.
+    """(n, 3) centers and radii of circles strewn over the periodic tile, the largest first.
 
-    A candidate stays where its centre keeps `room` times the sum of the radii from all others.
+    A candidate stays where its center keeps `room` times the sum of the radii from all others.
     """
     number = np.arange(candidates)
     x, y = uniform(seed, number, 0), uniform(seed, number, 1)
@@ -65,9 +65,9 @@ def insulation_foam() -> Material:
     height += 0.010 * layered(u, v, 10, 2, 117) + 0.0022 * pores
 
     old = smooth(-0.4, 0.4, layered(u, v, 3, 2, 118))
-    colour = mix((0.945, 0.885, 0.73), (0.94, 0.855, 0.65), old)
-    colour = mix(colour, (0.93, 0.82, 0.58), 0.6 * smooth(0.0, 0.05, depth) + 0.3 * crease)
-    colour = mix(colour, (0.945, 0.92, 0.82), 0.6 * rim)
-    colour = colour * (0.98 + 0.05 * pores + 0.04 * noise(u, v, (12, 12), 119))[..., None]
+    color = mix((0.945, 0.885, 0.73), (0.94, 0.855, 0.65), old)
+    color = mix(color, (0.93, 0.82, 0.58), 0.6 * smooth(0.0, 0.05, depth) + 0.3 * crease)
+    color = mix(color, (0.945, 0.92, 0.82), 0.6 * rim)
+    color = color * (0.98 + 0.05 * pores + 0.04 * noise(u, v, (12, 12), 119))[..., None]
     roughness = 0.58 - 0.08 * rim + 0.10 * pores + 0.16 * smooth(0.0, 0.05, depth)
-    return Material(height, np.minimum(colour, 0.945), roughness)
+    return Material(height, np.minimum(color, 0.945), roughness)

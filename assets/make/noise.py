@@ -33,7 +33,7 @@ def smooth(low: float, high: float, x: Field) -> Field:
 
 
 def mix(a: ArrayLike, b: ArrayLike, weight: Field) -> Field:
-    """a where the weight is 0, b where it is 1; colours have a trailing axis of 3."""
+    """a where the weight is 0, b where it is 1; colors have a trailing axis of 3."""
     a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
     w = weight[..., None] if (3,) in (a.shape[-1:], b.shape[-1:]) else weight
     return np.asarray(a + (b - a) * w)
@@ -62,6 +62,6 @@ def layered(u: Field, v: Field, cells: int, octaves: int, seed: int) -> Field:
 
 
 def lattice() -> tuple[Field, Field]:
-    """u and v (H, W) of the texel centres."""
+    """u and v (H, W) of the texel centers."""
     u, v = np.meshgrid((np.arange(SIZE) + 0.5) / SIZE, 1.0 - (np.arange(SIZE) + 0.5) / SIZE)
     return u, v

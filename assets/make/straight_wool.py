@@ -1,17 +1,17 @@
-"""Straight wool: parallel yarns of a single ply, softly spun, so that their fibres run almost along them."""
+"""Straight wool: parallel yarns of a single ply, softly spun, so that their fibers run almost along them."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from .fibres import Surface, strands, stray_fibres
+from .fibers import Surface, strands, stray_fibers
 from .noise import Field, lattice, layered, mix, noise, smooth, uniform
 from .tile import Material
 
-# Yarns from u = 0 on: width relative to the others, and colour in sRGB. The order has no mirror symmetry.
+# Yarns from u = 0 on: width relative to the others, and color in sRGB. The order has no mirror symmetry.
 WIDTHS = np.array([1.05, 0.92, 1.12, 0.90, 1.20, 0.85, 1.00, 0.95, 1.10])
 RED, WINE, OCHRE, CREAM = (0.68, 0.20, 0.16), (0.55, 0.15, 0.16), (0.82, 0.50, 0.20), (0.86, 0.79, 0.65)
-COLOURS = np.array([RED, WINE, OCHRE, RED, CREAM, WINE, RED, RED, OCHRE])
+COLORS = np.array([RED, WINE, OCHRE, RED, CREAM, WINE, RED, RED, OCHRE])
 FIBRES = 22  # around a yarn
 
 
@@ -32,29 +32,29 @@ def yarns(u: Field, v: Field) -> Surface:
 
 
 def straight_wool() -> Material:
-    """Heathered reds, ochre and natural wool; loose fibres on top."""
+    """Heathered reds, ochre and natural wool; loose fibers on top."""
     u, v = lattice()
     surface = yarns(u, v)
     bed = surface.tube < 0
     yarn = np.maximum(surface.tube, 0)
 
-    # One turn of the fibres per tile; how steeply they lean sways along the yarn.
+    # One turn of the fibers per tile; how steeply they lean sways along the yarn.
     line = (yarn + 0.5) / len(WIDTHS)
     sway = 0.10 * noise(line, v, (len(WIDTHS), 4), 39)
     around = surface.angle / (2.0 * np.pi) - v + sway + uniform(40, yarn)
     relief, tone = strands(around, v, FIBRES, 10, 41)
     upright = np.where(bed, 0.6, np.cos(surface.angle))
-    stray = stray_fibres(u, v, 160, 45)
+    stray = stray_fibers(u, v, 160, 45)
     lint = layered(u, v, 56, 2, 46)
     height = surface.z + 0.0075 * relief * np.sqrt(upright) + 0.0020 * lint + 0.0030 * stray
 
     # The dye took unevenly along the yarn.
-    colour = COLOURS[yarn] * (1.0 + 0.50 * noise(line, v, (len(WIDTHS), 3), 47))[..., None]
-    colour = mix(colour, 0.45 * colour + (0.44, 0.39, 0.32), 0.55 * smooth(0.62, 0.95, tone))
-    colour = mix(colour, 0.72 * colour, smooth(0.35, 0.05, tone))
-    colour = colour * (0.82 + 0.20 * relief + 0.10 * lint)[..., None]
-    colour = mix(colour, 0.6 * colour + (0.32, 0.28, 0.24), 0.45 * stray)
-    colour = np.where(bed[..., None], 0.6 * colour, colour)
+    color = COLORS[yarn] * (1.0 + 0.50 * noise(line, v, (len(WIDTHS), 3), 47))[..., None]
+    color = mix(color, 0.45 * color + (0.44, 0.39, 0.32), 0.55 * smooth(0.62, 0.95, tone))
+    color = mix(color, 0.72 * color, smooth(0.35, 0.05, tone))
+    color = color * (0.82 + 0.20 * relief + 0.10 * lint)[..., None]
+    color = mix(color, 0.6 * color + (0.32, 0.28, 0.24), 0.45 * stray)
+    color = np.where(bed[..., None], 0.6 * color, color)
 
     roughness = 0.84 - 0.12 * relief + 0.06 * lint + 0.05 * bed
-    return Material(height, np.minimum(colour, 0.92), roughness, index=1.55)
+    return Material(height, np.minimum(color, 0.92), roughness, index=1.55)

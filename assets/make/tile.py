@@ -20,13 +20,13 @@ class Material:
     Attributes
     ----------
     height : (H, W) in tile widths, from any zero
-    basecolor : (H, W, 3) in sRGB, [0, 1]
+    base_color : (H, W, 3) in sRGB, [0, 1]
     roughness : (H, W) in [0, 1]
     index : refractive index of the substance; None leaves it at the 1.5 of the customary constant
     """
 
     height: Field
-    basecolor: Field
+    base_color: Field
     roughness: Field
     index: float | None = None
 
@@ -47,13 +47,13 @@ def write(material: Material, folder: Path) -> None:
     height = np.round((material.height - material.height.max()) / QUANTUM) * QUANTUM + 0.0
     header = {"compression": OpenEXR.NO_COMPRESSION, "type": OpenEXR.scanlineimage}
     OpenEXR.File(header, {"Y": height.astype(np.float32)}).write(str(folder / "height.exr"))
-    for name, image in (("basecolor", material.basecolor), ("roughness", material.roughness)):
+    for name, image in (("base_color", material.base_color), ("roughness", material.roughness)):
         codes = np.round(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
         Image.fromarray(codes).save(folder / f"{name}.png", optimize=True)
     if material.index is not None:
         lines = [
             "height: height.exr",
-            "basecolor: basecolor.png",
+            "base_color: base_color.png",
             "roughness: roughness.png",
             f"specular: {specular(material.index):.2f} # refractive index {material.index:g}",
         ]

@@ -7,7 +7,7 @@ import numpy as np
 from .noise import Field, lattice, layered, mix, noise, smooth, uniform
 from .tile import Material
 
-# Centres of the scutes: rows shifted by half a step, then moved a little.
+# Centers of the scutes: rows shifted by half a step, then moved a little.
 SCUTES = np.array(
     [
         (0.135, 0.100), (0.535, 0.150), (0.845, 0.085),
@@ -81,12 +81,12 @@ def turtle_shell() -> Material:
     ray *= smooth(0.10, 0.30, t) * smooth(1.05, 0.80, t + 0.15 * layered(u, v, 16, 2, 9))
     horn = mix((0.30, 0.19, 0.10), (0.37, 0.32, 0.15), smooth(0.2, 0.8, own[4]))
     amber = mix((0.74, 0.55, 0.25), (0.66, 0.58, 0.27), smooth(-0.3, 0.3, noise(u, v, (3, 3), 10)))
-    colour = mix(horn, amber, 0.85 * ray)
-    colour = mix(colour, (0.70, 0.50, 0.24), 0.9 * smooth(0.24, 0.12, t))
+    color = mix(horn, amber, 0.85 * ray)
+    color = mix(color, (0.70, 0.50, 0.24), 0.9 * smooth(0.24, 0.12, t))
     shade = 0.80 + 0.28 * ridge * on_rings + 0.16 * grains + 0.20 * layered(u, v, 24, 3, 12)
-    colour = mix((0.13, 0.10, 0.065), colour * shade[..., None], smooth(1.0, 0.90, t))
+    color = mix((0.13, 0.10, 0.065), color * shade[..., None], smooth(1.0, 0.90, t))
 
     # Polished horn, duller in the valleys of the rings and on the areola; dust in the grooves.
     horn_roughness = 0.34 + 0.10 * (1.0 - ridge) * on_rings + 0.16 * (1.0 - on_rings)
     horn_roughness += 0.12 * layered(u, v, 16, 3, 13)
-    return Material(height, colour, mix(0.82, horn_roughness, smooth(1.0, 0.88, t)))
+    return Material(height, color, mix(0.82, horn_roughness, smooth(1.0, 0.88, t)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .fibres import Surface, strands, stray_fibres
+from .fibers import Surface, strands, stray_fibers
 from .noise import Field, lattice, layered, mix, noise, smooth, uniform
 from .tile import Material
 
@@ -48,19 +48,19 @@ def twisted_wool() -> Material:
     bed = surface.tube < 0
     tube = np.maximum(surface.tube, 0)
 
-    # Fibres are spun the other way than plies are wound, and so lie nearly along the cord.
+    # Fibers are spun the other way than plies are wound, and so lie nearly along the cord.
     around = surface.angle / (2.0 * np.pi) - 2.0 * u + 0.37 * tube
     relief, tone = strands(around, u, FIBRES, 6, 70)
     upright = np.where(bed, 0.6, np.cos(surface.angle))
-    stray = stray_fibres(u, v, 60, 71)
+    stray = stray_fibers(u, v, 60, 71)
     lint = layered(u, v, 56, 2, 72)
     height = surface.z + 0.0100 * relief * np.sqrt(upright) + 0.0022 * lint + 0.0030 * stray
 
-    colour = np.where((tube % PLIES == PLIES - 1)[..., None], DYES[tube // PLIES], CREAM)
-    colour = colour * (0.76 + 0.22 * relief + 0.34 * (tone - 0.5) + 0.10 * lint)[..., None]
-    colour = mix(colour, (0.80, 0.77, 0.70), 0.30 * smooth(0.80, 1.0, tone))
-    colour = mix(colour, 0.6 * colour + (0.32, 0.31, 0.28), 0.45 * stray)
-    colour = np.where(bed[..., None], 0.6 * colour, colour)
+    color = np.where((tube % PLIES == PLIES - 1)[..., None], DYES[tube // PLIES], CREAM)
+    color = color * (0.76 + 0.22 * relief + 0.34 * (tone - 0.5) + 0.10 * lint)[..., None]
+    color = mix(color, (0.80, 0.77, 0.70), 0.30 * smooth(0.80, 1.0, tone))
+    color = mix(color, 0.6 * color + (0.32, 0.31, 0.28), 0.45 * stray)
+    color = np.where(bed[..., None], 0.6 * color, color)
 
     roughness = 0.86 - 0.12 * relief + 0.06 * lint
-    return Material(height, np.minimum(colour, 0.92), roughness, index=1.55)
+    return Material(height, np.minimum(color, 0.92), roughness, index=1.55)

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from PIL import Image, ImageDraw, ImageFont
 
-from mbtf_pipeline.cost.chain_studies import QUALITIES
+from mbtf_pipeline.cost_study.fit_runs import QUALITIES
 
 HERE = Path(__file__).parent
 PAGE = HERE.parent / "cost.md"
@@ -33,7 +33,7 @@ PLOTS = (
     "mesh",
     "light",
 )
-WIDTH, TITLE, GAP, COLUMNS, COLOURS = 800, 30, 12, 2, 256
+WIDTH, TITLE, GAP, COLUMNS, COLORS = 800, 30, 12, 2, 256
 BEGIN, END = "<!-- fronts: begin -->", "<!-- fronts: end -->"
 
 
@@ -59,7 +59,7 @@ def sheet(plot: str, studies: list[Path]) -> Path | None:
         draw.text((x + 12, y + 4), folder.name, (30, 30, 30), ImageFont.load_default(20))
         out.paste(picture, (x, y + TITLE))
     path = OUT / f"{plot}.png"
-    out.quantize(COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(path, optimize=True)
+    out.quantize(COLORS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(path, optimize=True)
     return path
 
 

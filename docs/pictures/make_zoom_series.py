@@ -3,7 +3,7 @@
 From the repository's root, after ``make demo``: ``.venv/bin/python docs/pictures/make_zoom_series.py``.
 Rows: path-traced pixels of the micro-geometry (``mbtf-gen reference --kind pixel``, its command is printed);
 the material with footprints (``mbtf_path``); the material at its finest level everywhere, as stock
-integrators read it. One ray per pixel shows aliasing as it is. Printed, of grey
+integrators read it. One ray per pixel shows aliasing as it is. Printed, of gray
 values and as shares of the reference's mean: the picture's mean, its contrast (standard deviation) beside the
 reference's, and the RMS difference of the two; the reference's noise is taken out. More contrast than the
 reference's is aliasing, less is blur.
@@ -21,11 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from mbtf_gen.camera import Camera
-from mbtf_gen.directions import from_angles
-from mbtf_gen.engine import load_mitsuba
-from mbtf_gen.reference import auto_exposure, to_display
-from mbtf_gen.shard_files import read_exr
+from mbtf_core.directions import from_angles
+from mbtf_gen.dataset.shard_io import read_exr
+from mbtf_gen.pictures.camera import Camera
+from mbtf_gen.pictures.reference import auto_exposure, to_display
+from mbtf_gen.render.runtime import load_mitsuba
 
 ROOT = Path(__file__).parents[2]
 MATERIAL = ROOT / "out" / "quickstart" / "fits" / "neumip"
@@ -54,7 +54,7 @@ def reference(span: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def rendered(mi: Any, span: float, integrator: str) -> NDArray[np.float64]:
-    """The material on a plane under a delta light of unit irradiance, a ray through each pixel's centre."""
+    """The material on a plane under a delta light of unit irradiance, a ray through each pixel's center."""
     import drjit as dr
 
     camera = Camera(VIEW[0], VIEW[1], span=span, rows=SIZE, columns=SIZE)
@@ -87,8 +87,8 @@ def rendered(mi: Any, span: float, integrator: str) -> NDArray[np.float64]:
         }
     )
     index = dr.arange(mi.UInt32, SIZE * SIZE)
-    centre = mi.Point2f(mi.Float(index % SIZE) + 0.5, mi.Float(index // SIZE) + 0.5) / SIZE
-    ray, _ = scene.sensors()[0].sample_ray_differential(0.0, 0.5, centre, mi.Point2f(0.5))
+    center = mi.Point2f(mi.Float(index % SIZE) + 0.5, mi.Float(index // SIZE) + 0.5) / SIZE
+    ray, _ = scene.sensors()[0].sample_ray_differential(0.0, 0.5, center, mi.Point2f(0.5))
     sampler = mi.load_dict({"type": "independent", "sample_count": 1})
     sampler.seed(0, SIZE * SIZE)
     value, _, _ = mi.load_dict({"type": integrator, "max_depth": 2}).sample(scene, sampler, ray)
@@ -99,9 +99,9 @@ def rendered(mi: Any, span: float, integrator: str) -> NDArray[np.float64]:
 def main() -> None:
     """Write the sheet."""
     mi = load_mitsuba()
-    import mbtf_fit.plugin
+    import mbtf_fit.mitsuba_plugin
 
-    mbtf_fit.plugin.register()
+    mbtf_fit.mitsuba_plugin.register()
     sheet = Image.new("RGB", (len(SPANS) * (SIZE + GAP) - GAP, 3 * (SIZE + CAPTION)), (255, 255, 255))
     draw = ImageDraw.Draw(sheet)
     for column, span in enumerate(SPANS):
@@ -118,13 +118,13 @@ def main() -> None:
             draw.text((place[0] + 2, place[1] + 3), caption, (30, 30, 30), ImageFont.load_default(12))
             display = to_display(picture.astype(np.float32), exposure)
             sheet.paste(Image.fromarray(display), (place[0], place[1] + CAPTION))
-            grey = picture.mean(-1)
+            gray = picture.mean(-1)
             error, true = (
-                max(float(x), 0.0) ** 0.5 / level for x in (((grey - a) * (grey - b)).mean(), contrast)
+                max(float(x), 0.0) ** 0.5 / level for x in (((gray - a) * (gray - b)).mean(), contrast)
             )
             print(
-                f"{span:6g} tiles wide, {name:26} mean {grey.mean() / level:.3f}, contrast "
-                f"{grey.std() / level:.3f} for {true:.3f}, RMS {error:.3f}",
+                f"{span:6g} tiles wide, {name:26} mean {gray.mean() / level:.3f}, contrast "
+                f"{gray.std() / level:.3f} for {true:.3f}, RMS {error:.3f}",
                 flush=True,
             )
     sheet.save(Path(__file__).with_name("zoom_series.png"), optimize=True)

@@ -11,7 +11,7 @@ import math
 import torch
 from torch import Tensor
 
-from ..config import EncodingSection
+from mbtf_fit.config import EncodingSection
 
 
 def encode(p: Tensor, bands: int, pi: bool, options: EncodingSection, spread: Tensor | None = None) -> Tensor:

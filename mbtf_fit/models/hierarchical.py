@@ -2,16 +2,16 @@
 
 Xue, Zhao, Jensen, Montazeri: *A Hierarchical Architecture for Neural Materials*, Computer Graphics Forum
 2024: NeuMIP's pyramid and offset, positions and directions as sines and cosines, a decoder of Inception
-modules that sees neighbouring queries, and the fourth root of the value as its answer.
+modules that sees neighboring queries, and the fourth root of the value as its answer.
 
 What is done here in its own way:
 
-- **The neighbours are places of the material, not of a picture.** The decoder reads a grid of 9 × 9 places
+- **The neighbors are places of the material, not of a picture.** The decoder reads a grid of 9 × 9 places
   around the query, one texel apart, of the level nearest to its footprint. So the value is a function of the
   query alone, as every renderer needs it; in the paper it depends on which queries happen to stand beside it.
 - The grid wraps around the tile; the published code pads with zeros.
 - Training reads the same grids out of buffers, whose queries stand one per texel at random places within it;
-  where they stand at the texels' centres, training and evaluation give the same numbers.
+  where they stand at the texels' centers, training and evaluation give the same numbers.
 - Positions are encoded as ``p = 2u - 1`` with π, so that nothing jumps at the tile's seam, and before the
   offset moves them; raw coordinates are not kept.
 - Encodings are filtered by the footprint and damped, and directions go without π: as in the paper, they keep
@@ -27,17 +27,16 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from mbtf_gen.schema import Layout
-
-from .inception import InceptionDecoder
-from .mlp import Mlp
-from .textured import TexturedMaterial
+from mbtf_core.shard_schema import Layout
+from mbtf_fit.models.inception import InceptionDecoder
+from mbtf_fit.models.mlp import Mlp
+from mbtf_fit.models.textured import TexturedMaterial
 
 
 class Hierarchical(TexturedMaterial):
-    """Textures, offset, and a decoder that sees a neighbourhood in material space.
+    """Textures, offset, and a decoder that sees a neighborhood in material space.
 
-    With ``network.decoder: mlp`` the neighbourhood is the query alone.
+    With ``network.decoder: mlp`` the neighborhood is the query alone.
     """
 
     name = "hierarchical"
@@ -63,7 +62,7 @@ class Hierarchical(TexturedMaterial):
         nearest = (self.level(sigma) + 0.5).floor().long()
         return shapes.to(sigma.device)[nearest]
 
-    def neighbourhood(self, u: Tensor, sigma: Tensor) -> Tensor:
+    def neighborhood(self, u: Tensor, sigma: Tensor) -> Tensor:
         """Places (n, 2·margin+1, 2·margin+1, 2) around `u` (n, 2), a texel of the nearest level apart: image
         rows downwards, columns to the right."""
         rows, columns = self.nearest_shape(sigma).to(u.dtype).unbind(1)
@@ -100,7 +99,7 @@ class Hierarchical(TexturedMaterial):
         return self.answer(self.see(u, sigma, omega_o), omega_i, omega_o)
 
     def stage1(self, u: Tensor, sigma: Tensor, omega_o: Tensor) -> Tensor:
-        return self.see(self.neighbourhood(u, sigma), sigma, omega_o)
+        return self.see(self.neighborhood(u, sigma), sigma, omega_o)
 
     def stage2(self, features: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
         return self.answer(features, omega_i, omega_o)[:, 0, 0]

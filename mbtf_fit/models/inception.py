@@ -1,4 +1,4 @@
-"""A decoder that looks at the neighbourhood: 1×1 convolution, Inception modules, 1×1 convolution.
+"""A decoder that looks at the neighborhood: 1×1 convolution, Inception modules, 1×1 convolution.
 
 Xue, Zhao, Jensen, Montazeri: *A Hierarchical Architecture for Neural Materials*, Computer Graphics Forum
 2024. An Inception module (Szegedy et al., CVPR 2015) joins four branches: 1×1; 1×1 then 3×3; 1×1 then 5×5;
@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import conv2d, linear, max_pool2d
 
-from .mlp import ACTIVATIONS, Activation
+from mbtf_fit.models.mlp import ACTIVATIONS, Activation
 
 # Rows and columns that an Inception module takes from each border.
 REACH = 2
@@ -29,7 +29,7 @@ class Convolution(nn.Module):
         self.weight = nn.Parameter(torch.empty(outputs, inputs, size, size))
         self.bias = nn.Parameter(torch.empty(outputs))
 
-    def initialise(self, generator: torch.Generator, gain: float) -> None:
+    def initialize(self, generator: torch.Generator, gain: float) -> None:
         """Weights normal with variance gain²/inputs, biases 0."""
         with torch.no_grad():
             self.weight.normal_(0.0, gain / math.sqrt(self.weight[0].numel()), generator=generator)
@@ -99,11 +99,11 @@ class InceptionDecoder(nn.Module):
         self.modules_ = nn.ModuleList(Inception(width, activation) for _ in range(modules))
         self.last = Convolution(width, outputs)
 
-    def initialise(self, generator: torch.Generator) -> None:
+    def initialize(self, generator: torch.Generator) -> None:
         """Variance 2/inputs before an activation, 1/inputs in the last layer; biases 0."""
         for module in self.modules():
             if isinstance(module, Convolution):
-                module.initialise(generator, 1.0 if module is self.last else math.sqrt(2.0))
+                module.initialize(generator, 1.0 if module is self.last else math.sqrt(2.0))
 
     @property
     def margin(self) -> int:

@@ -8,14 +8,13 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from mbtf_gen.errors import InputError
-from mbtf_gen.levels import Lattice
-from mbtf_gen.schema import Layout
-
-from ..config import NetworkSection
-from .inception import InceptionDecoder
-from .mlp import Mlp
-from .textures import FeatureTextures
+from mbtf_core.errors import InputError
+from mbtf_core.lattice import Lattice
+from mbtf_core.shard_schema import Layout
+from mbtf_fit.config import NetworkSection
+from mbtf_fit.models.inception import InceptionDecoder
+from mbtf_fit.models.mlp import Mlp
+from mbtf_fit.models.textures import FeatureTextures
 
 # Modules that give and take their numbers by name.
 _PARTS = (FeatureTextures, Mlp, InceptionDecoder)
@@ -53,7 +52,7 @@ class NeuralMaterial(nn.Module, ABC):
         return (2 * self.margin + 1) ** 2
 
     @abstractmethod
-    def initialise(self, generator: torch.Generator, unit: float) -> None:
+    def initialize(self, generator: torch.Generator, unit: float) -> None:
         """Draw all parameters anew; `unit` is the typical value of the data in 1/sr, 0
         for black data: values are multiples of it, so that black is fitted exactly."""
 

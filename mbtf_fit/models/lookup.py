@@ -1,7 +1,7 @@
 """Bilinear lookups in a packed pyramid of periodic textures, blended between two levels.
 
 All levels lie one after the other in a single table (texels, channels); level s has ``rows[s] × columns[s]``
-texels from row ``start[s]`` on, image row by image row: row 0 is the side ``v → 1``, texel centres at
+texels from row ``start[s]`` on, image row by image row: row 0 is the side ``v → 1``, texel centers at
 ``((i+½)/W, 1-(j+½)/H)``, wrapped in both directions.
 
 :func:`lookup` is the fast path: gathers by ``embedding_bag``, analytic derivatives, texel gradients added up
@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
-from mbtf_gen.levels import Lattice
+from mbtf_core.lattice import Lattice
 
 
 @dataclass(frozen=True)

@@ -69,11 +69,11 @@ class Mlp(nn.Module):
         self.weights = nn.ParameterList(nn.Parameter(torch.empty(o, i)) for i, o in pairs)
         self.biases = nn.ParameterList(nn.Parameter(torch.empty(o)) for _, o in pairs)
 
-    def initialise(self, generator: torch.Generator, last_gain: float = 1.0) -> None:
+    def initialize(self, generator: torch.Generator, last_gain: float = 1.0) -> None:
         """Weights normal with variance 2/inputs before an activation (He et al. 2015; behind a sine, whose
         variance is ½, it is the same), `last_gain`²/inputs in the last layer; biases 0.
 
-        The papers state no initialisation. PyTorch's own (uniform, with random biases) left half of a 25-wide
+        The papers state no initialization. PyTorch's own (uniform, with random biases) left half of a 25-wide
         layer without a gradient for good at the learning rates used here.
         """
         with torch.no_grad():

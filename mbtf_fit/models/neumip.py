@@ -2,7 +2,7 @@
 
 Kuznetsov, Mullia, Xu, Hašan, Ramamoorthi: ACM Transactions on Graphics 40(4), article 175, 2021. A pyramid of
 learned textures is read at the query's footprint; a small network decodes the features, together with
-light and view direction, into colour. A second texture and network move the lookup along the view
+light and view direction, into color. A second texture and network move the lookup along the view
 direction, which gives parallax (the *neural offset*).
 
 Where this differs from the paper:
@@ -25,14 +25,13 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from mbtf_gen.errors import InputError
-from mbtf_gen.levels import Lattice
-from mbtf_gen.schema import Layout
-
-from ..config import NetworkSection
-from .gains import look_up_gain
-from .mlp import Mlp
-from .textured import TexturedMaterial
+from mbtf_core.errors import InputError
+from mbtf_core.lattice import Lattice
+from mbtf_core.shard_schema import Layout
+from mbtf_fit.config import NetworkSection
+from mbtf_fit.models.calibration_factors import look_up_gain
+from mbtf_fit.models.mlp import Mlp
+from mbtf_fit.models.textured import TexturedMaterial
 
 
 class Neumip(TexturedMaterial):
@@ -44,7 +43,7 @@ class Neumip(TexturedMaterial):
     Attributes
     ----------
     gain : (2, levels, knots, 3) factors by light's and by view's elevation, from
-        :mod:`mbtf_fit.calibration`; None for a model that was not calibrated
+        :mod:`mbtf_fit.training.calibration`; None for a model that was not calibrated
     """
 
     name = "neumip"
@@ -105,7 +104,7 @@ class Neumip(TexturedMaterial):
         knots = self.gain.shape[2]
         out["gain"] = (
             f"G_i * G_o, where G_i is gain[0] at the level l and the cosine omega_i.z, G_o gain[1] at l and "
-            f"omega_o.z, a factor per colour; gain is (2, levels, {knots} knots, 3), the knots stand at the "
+            f"omega_o.z, a factor per color; gain is (2, levels, {knots} knots, 3), the knots stand at the "
             f"cosines 0, 1/{knots - 1}, ..., 1; linear between knots, and between levels as textures are"
         )
         out["value"] = f"gain * {out['value']}"

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from ..config import OutputMap
+from mbtf_fit.config import OutputMap
 
 # The answer x that stands for the value `unit`, from which training starts; for exp-1 it starts at the value
 # 0.
@@ -37,7 +37,7 @@ _FORMULAS: dict[OutputMap, str] = {
     "fourth-root": "x |x|^3",
 }
 
-# Rec.601 YUV → RGB, one row per colour, as the published code has it.
+# Rec.601 YUV → RGB, one row per color, as the published code has it.
 _RGB_OF_YUV = ((1.0, 0.0, 1.13983), (1.0, -0.39465, -0.58060), (1.0, 2.03211, 0.0))
 # The gate's least value: it darkens, but never shuts off the gradient.
 _GATE = 0.1
@@ -47,7 +47,7 @@ def to_value(x: Tensor, unit: Tensor, output: OutputMap) -> Tensor:
     """Values (..., 3) of answers (..., 3) or (..., 6).
 
     Three answers are RGB: ``unit · map(x)``. Of six, the first three are YUV and the others a gate per
-    colour: ``unit · map(RGB(x_0..2)) · (0.1 + sigmoid(x_3..5))``, as in NeuMIP's published code.
+    color: ``unit · map(RGB(x_0..2)) · (0.1 + sigmoid(x_3..5))``, as in NeuMIP's published code.
     """
     if x.shape[-1] == 3:
         return unit * _MAPS[output](x)
@@ -57,8 +57,8 @@ def to_value(x: Tensor, unit: Tensor, output: OutputMap) -> Tensor:
 
 def start_of(output: OutputMap, outputs: int) -> list[float]:
     """Biases of the last layer to start from."""
-    grey = START[output]
-    return [grey] * 3 if outputs == 3 else [grey, 0.0, 0.0, 0.0, 0.0, 0.0]
+    gray = START[output]
+    return [gray] * 3 if outputs == 3 else [gray, 0.0, 0.0, 0.0, 0.0, 0.0]
 
 
 def output_formula(output: OutputMap, outputs: int) -> str:

@@ -7,16 +7,21 @@ from abc import abstractmethod
 import torch
 from torch import Tensor, nn
 
-from mbtf_gen.levels import Lattice
-
-from ..config import NetworkSection
-from .encodings import direction_size, encode_direction, encode_position, encoding_formula, position_size
-from .inception import InceptionDecoder
-from .interface import NeuralMaterial
-from .lookup import coarse_level
-from .mlp import Mlp
-from .outputs import output_formula, start_of, to_value
-from .textures import FeatureTextures
+from mbtf_core.lattice import Lattice
+from mbtf_fit.config import NetworkSection
+from mbtf_fit.models.encodings import (
+    direction_size,
+    encode_direction,
+    encode_position,
+    encoding_formula,
+    position_size,
+)
+from mbtf_fit.models.inception import InceptionDecoder
+from mbtf_fit.models.interface import NeuralMaterial
+from mbtf_fit.models.lookup import coarse_level
+from mbtf_fit.models.mlp import Mlp
+from mbtf_fit.models.outputs import output_formula, start_of, to_value
+from mbtf_fit.models.textures import FeatureTextures
 
 # Standard deviation of the features that training starts from.
 FEATURE_SCALE = 0.1
@@ -58,16 +63,16 @@ class TexturedMaterial(NeuralMaterial):
         """The decoder of so many features (encoded position included) and encoded coordinates of light and
         view."""
 
-    def initialise(self, generator: torch.Generator, unit: float) -> None:
+    def initialize(self, generator: torch.Generator, unit: float) -> None:
         nn.init.normal_(self.pyramid.texels, std=FEATURE_SCALE, generator=generator)
-        self.decoder.initialise(generator)
+        self.decoder.initialize(generator)
         with torch.no_grad():
             start = start_of(self.network.output, self.network.outputs)
             self.decoder.last_bias.copy_(torch.tensor(start))
         self.unit.fill_(unit)
         if self.network.offset != "none":
             nn.init.zeros_(self.offset_texture.texels)
-            self.offset_network.initialise(generator)
+            self.offset_network.initialize(generator)
 
     def offset(self, u: Tensor, omega_o: Tensor) -> Tensor:
         if self.network.offset == "none":

@@ -7,10 +7,9 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor, nn
 
-from mbtf_gen.levels import Lattice
-
-from ..blur import blur_texture
-from .lookup import Packing, lookup
+from mbtf_core.lattice import Lattice
+from mbtf_fit.models.blur import blur_texture
+from mbtf_fit.models.lookup import Packing, lookup
 
 
 class FeatureTextures(nn.Module):

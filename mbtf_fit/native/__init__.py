@@ -6,6 +6,6 @@ missing, everything runs in PyTorch; the tests hold the two equal.
 
 from __future__ import annotations
 
-from .library import Kernel, describe, kernel, missing_reason
+from mbtf_fit.native.library import Kernel, describe, kernel, missing_reason
 
 __all__ = ["Kernel", "describe", "kernel", "missing_reason"]

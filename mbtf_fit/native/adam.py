@@ -1,4 +1,4 @@
-"""Adam by the kernel, on the state of PyTorch's own optimiser: either goes on where the other stopped."""
+"""Adam by the kernel, on the state of PyTorch's own optimizer: either goes on where the other stopped."""
 
 from __future__ import annotations
 
@@ -10,33 +10,33 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from .library import AdamStep, Kernel
+from mbtf_fit.native.library import AdamStep, Kernel
 
 if TYPE_CHECKING:
-    from ..parallel import Workers
+    from mbtf_fit.objective.parallel import Workers
 
 # Parameters with fewer numbers are one thread's work.
 _SMALL = 1 << 14
 
 
 def adam(
-    kernel: Kernel, optimiser: torch.optim.Adam, gradients: Mapping[Tensor, Tensor], workers: Workers
+    kernel: Kernel, optimizer: torch.optim.Adam, gradients: Mapping[Tensor, Tensor], workers: Workers
 ) -> None:
     """One step for the parameters that have a gradient (contiguous float32, same shape), as
-    ``optimiser.step()`` takes it: without weight decay, with the groups' rates and decays.
+    ``optimizer.step()`` takes it: without weight decay, with the groups' rates and decays.
 
     Parameters
     ----------
     gradients : parameter → its gradient
     """
     tasks: list[tuple[AdamStep, Tensor, Tensor, Tensor, Tensor]] = []
-    for group in optimiser.param_groups:
+    for group in optimizer.param_groups:
         beta1, beta2 = group["betas"]
         for parameter in group["params"]:
             gradient = gradients.get(parameter)
             if gradient is None:
                 continue
-            state = optimiser.state[parameter]
+            state = optimizer.state[parameter]
             if not state:
                 state["step"] = torch.zeros(())
                 state["exp_avg"] = torch.zeros_like(parameter)

@@ -1,4 +1,4 @@
-"""Blur of packed textures by the kernel: :func:`mbtf_fit.blur.blur_texture`, level by level, in one pass."""
+"""Blur of packed textures by the kernel, equal to :func:`mbtf_fit.models.blur.blur_texture`."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..blur import NEGLIGIBLE, gaussian_taps
-from ..models.textures import FeatureTextures
-from .library import Kernel
+from mbtf_fit.models.blur import NEGLIGIBLE, gaussian_taps
+from mbtf_fit.models.textures import FeatureTextures
+from mbtf_fit.native.library import Kernel
 
 if TYPE_CHECKING:
-    from ..parallel import Workers
+    from mbtf_fit.objective.parallel import Workers
 
 # Textures of fewer texels are one thread's work.
 _SMALL = 1 << 12

@@ -13,11 +13,11 @@ import ctypes
 import torch
 from torch import Tensor
 
-from ..data import TrainingQueries
-from ..losses import Objective, Quadratic
-from ..parallel import Workers
-from .library import GradientSums, QuadraticLoss, QueryPointers
-from .model import NativeModel, aligned, networks, parameters_of, pointers
+from mbtf_fit.data.loader import TrainingQueries
+from mbtf_fit.native.library import GradientSums, QuadraticLoss, QueryPointers
+from mbtf_fit.native.model import NativeModel, aligned, networks, parameters_of, pointers
+from mbtf_fit.objective.losses import Objective, Quadratic
+from mbtf_fit.objective.parallel import Workers
 
 # Bytes of activations that a piece may have: about what a core has of the last cache.
 _PIECE_BYTES = 6 << 20

@@ -8,14 +8,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..config import EncodingSection
-from ..models import NeuralMaterial
-from ..models.encodings import direction_size
-from ..models.mlp import Mlp
-from ..models.neumip import Neumip, NeumipBaseline
-from ..models.textured import GRAZING, OFFSET_SCALE
-from ..models.textures import FeatureTextures
-from .library import (
+from mbtf_fit.config import EncodingSection
+from mbtf_fit.models import NeuralMaterial
+from mbtf_fit.models.encodings import direction_size
+from mbtf_fit.models.mlp import Mlp
+from mbtf_fit.models.neumip import Neumip, NeumipBaseline
+from mbtf_fit.models.textured import GRAZING, OFFSET_SCALE
+from mbtf_fit.models.textures import FeatureTextures
+from mbtf_fit.native.library import (
     MAX_CHANNELS,
     MAX_LAYERS,
     MAX_LEVELS,

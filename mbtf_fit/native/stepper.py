@@ -7,15 +7,15 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ..data import TrainingQueries
-from ..losses import Objective
-from ..models import NeuralMaterial
-from ..parallel import Workers
-from .adam import adam
-from .blur import Blur
-from .gradients import NativeGradients
-from .library import Kernel
-from .model import NativeModel, networks, parameters_of
+from mbtf_fit.data.loader import TrainingQueries
+from mbtf_fit.models import NeuralMaterial
+from mbtf_fit.native.adam import adam
+from mbtf_fit.native.blur import Blur
+from mbtf_fit.native.gradients import NativeGradients
+from mbtf_fit.native.library import Kernel
+from mbtf_fit.native.model import NativeModel, networks, parameters_of
+from mbtf_fit.objective.losses import Objective
+from mbtf_fit.objective.parallel import Workers
 
 
 class NativeStepper:
@@ -24,13 +24,13 @@ class NativeStepper:
     Parameters
     ----------
     model : that the kernel can evaluate
-    optimiser : keeps the state; what it says of rates and decays holds
+    optimizer : keeps the state; what it says of rates and decays holds
     """
 
-    def __init__(self, kernel: Kernel, model: NeuralMaterial, optimiser: torch.optim.Adam) -> None:
+    def __init__(self, kernel: Kernel, model: NeuralMaterial, optimizer: torch.optim.Adam) -> None:
         self.kernel = kernel
         self.model = model
-        self.optimiser = optimiser
+        self.optimizer = optimizer
         self._native = NativeModel(kernel, model)
         self._gradients = NativeGradients(self._native)
         texels = [texture.texels for texture in model.textures()]
@@ -61,5 +61,5 @@ class NativeStepper:
             found[texture.texels] = gradient
         for network, gradients in zip(networks(self.model), self._gradients.networks, strict=True):
             found.update(zip(parameters_of(network), gradients, strict=True))
-        adam(self.kernel, self.optimiser, found, workers)
+        adam(self.kernel, self.optimizer, found, workers)
         return loss

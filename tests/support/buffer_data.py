@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from mbtf_gen.levels import Lattice, sigma_of_level, texel_centres
-from mbtf_gen.queries import Mixture, QueryPlan
-from mbtf_gen.schema import FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION
-from mbtf_gen.shard_files import write_shard
+from mbtf_core.lattice import Lattice, sigma_of_level, texel_centers
+from mbtf_core.shard_schema import FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION
+from mbtf_gen.dataset.shard_io import write_shard
+from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
 
 from .fit_data import F32, Function, random_directions
 
@@ -20,11 +20,11 @@ from .fit_data import F32, Function, random_directions
 def random_buffers(
     random: np.random.Generator, items: int, lattice: Lattice, *, regular: bool = False
 ) -> dict[str, F32]:
-    """Buffers of all levels and directions: one query per finest texel, at its centre or anywhere in it."""
+    """Buffers of all levels and directions: one query per finest texel, at its center or anywhere in it."""
     rows, columns = lattice.shape()
     shape = (items, rows, columns)
     jitter = np.zeros((*shape, 2)) if regular else random.random((*shape, 2)) - 0.5
-    u = texel_centres(rows, columns) + jitter / [columns, rows]
+    u = texel_centers(rows, columns) + jitter / [columns, rows]
     sigma = sigma_of_level(lattice.finest * random.random(items))[:, None, None]
     omega = (random_directions(random, items)[:, None, None] for _ in range(2))
     spread = [np.broadcast_to(sigma, shape), *(np.broadcast_to(o, (*shape, 3)) for o in omega)]

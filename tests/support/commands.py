@@ -13,8 +13,8 @@ from pathlib import Path
 # Runs each command line as the program's entry point does, with its output kept apart.
 _CODE = """
 import contextlib, io, json, sys
-from mbtf_gen.cli import app
-from mbtf_gen.console import run
+from mbtf_gen.cli.app import app
+from mbtf_core.console import run
 answers = []
 for line in json.load(sys.stdin):
     out, err = io.StringIO(), io.StringIO()

@@ -9,6 +9,6 @@ from typing import Any
 
 
 def crash(*_: str) -> Iterator[dict[str, Any]]:
-    """Generator for :func:`mbtf_gen.child.run_child` that ends its process by a segmentation fault."""
+    """Generator for ``run_child`` that ends its process by a segmentation fault."""
     os.kill(os.getpid(), signal.SIGSEGV)
     yield {}

@@ -10,7 +10,7 @@ from typing import Any
 from hypothesis import settings
 from hypothesis import strategies as st
 
-from mbtf_gen.errors import MbtfError
+from mbtf_core.errors import MbtfError
 
 # Bytes that headers are sensitive to.
 _BYTES = st.one_of(st.sampled_from([0, 1, 2, 8, 16, 127, 128, 254, 255]), st.integers(0, 255))

@@ -10,18 +10,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_gen.atomic import sealed
-from mbtf_gen.config import GeneratorConfig
-from mbtf_gen.dataset import Dataset
-from mbtf_gen.estimates import Estimates
+from mbtf_core.atomic import checksummed
+from mbtf_core.shard_schema import SPLITS
+from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.dataset.folder import open_folder
+from mbtf_gen.dataset.manifest import build_manifest
+from mbtf_gen.dataset.reader import Dataset
+from mbtf_gen.dataset.render_shards import RenderedShard, store_shard
+from mbtf_gen.dataset.summary import finish
 from mbtf_gen.generation import Job
-from mbtf_gen.manifest import build_manifest
-from mbtf_gen.output_folder import open_folder
-from mbtf_gen.planning import simulated
-from mbtf_gen.queries import Queries
-from mbtf_gen.schema import SPLITS
-from mbtf_gen.shard_making import Rendered, store_shard
-from mbtf_gen.summary import finish
+from mbtf_gen.planning.effects_plan import simulated
+from mbtf_gen.render.estimates import Estimates
+from mbtf_gen.sampling.query_sampler import Queries
 
 F32 = NDArray[np.float32]
 NOISE = 0.05
@@ -40,7 +40,7 @@ def write_dataset(folder: Path, *, rows: int = 4, columns: int = 8, **options: A
 
     Parameters
     ----------
-    options : sections of the configuration, as :class:`~mbtf_gen.config.GeneratorConfig` takes them
+    options : sections of the configuration, as :class:`~mbtf_gen.config.generator.GeneratorConfig` takes them
     """
     heights = folder.parent / f"{folder.name}.npy"
     folder.parent.mkdir(parents=True, exist_ok=True)
@@ -57,7 +57,7 @@ def write_dataset(folder: Path, *, rows: int = 4, columns: int = 8, **options: A
         a, b = ((truth * (1 + NOISE * rng.normal(size=truth.shape))).astype(np.float32) for _ in range(2))
         paths = queries.sigma.size * job.spp(entry.split)
         made = Estimates(a.reshape(-1, 3), b.reshape(-1, 3), None, paths, 0, 0, 0)
-        store_shard(job, Rendered(entry, queries, made, 0.1), folder / entry.file, effects)
+        store_shard(job, RenderedShard(entry, queries, made, 0.1), folder / entry.file, effects)
     finish(folder)
     return Dataset.open(folder)
 
@@ -66,4 +66,4 @@ def edit(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
     """Change a manifest or a sidecar by hand, its checksum with it."""
     document = json.loads(path.read_text())
     change(document)
-    path.write_bytes(sealed(document))
+    path.write_bytes(checksummed(document))

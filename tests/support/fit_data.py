@@ -11,15 +11,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from mbtf_core.directions import from_projected_disk
+from mbtf_core.lattice import Lattice, sigma_of_level
+from mbtf_core.shard_schema import FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION
 from mbtf_fit.config import FitConfig
-from mbtf_fit.data import TrainingQueries
+from mbtf_fit.data.loader import TrainingQueries
 from mbtf_fit.models import build_model
-from mbtf_fit.noise import NoiseModel, typical_value
-from mbtf_fit.training import Trainer
-from mbtf_gen.directions import from_projected_disk
-from mbtf_gen.levels import Lattice, sigma_of_level
-from mbtf_gen.schema import FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION
-from mbtf_gen.shard_files import write_shard
+from mbtf_fit.objective.noise import NoiseModel, typical_value
+from mbtf_fit.training.trainer import Trainer
+from mbtf_gen.dataset.shard_io import write_shard
 
 F32 = NDArray[np.float32]
 # (u, sigma, omega_i, omega_o) → (n, 3)
@@ -44,7 +44,7 @@ def random_queries(random: np.random.Generator, n: int, lattice: Lattice) -> dic
 
 
 def constant(value: float) -> Function:
-    """The same grey everywhere."""
+    """The same gray everywhere."""
     return lambda u, sigma, omega_i, omega_o: np.full((len(u), 3), value)
 
 
@@ -133,7 +133,7 @@ def make_trainer(
     config = FitConfig.model_validate({"model": model, "training": training})
     scale = typical_value(queries.value.numpy())
     network = build_model(model, lattice)
-    network.initialise(torch.Generator().manual_seed(0), scale)
+    network.initialize(torch.Generator().manual_seed(0), scale)
     return Trainer(config, network, queries, noise or NoiseModel.silent(scale, lattice))
 
 

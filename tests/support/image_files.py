@@ -55,7 +55,7 @@ ADAM7 = [
 def png(
     path: Path,
     codes: NDArray[Any],
-    colour: int,
+    color: int,
     bits: int,
     filters: list[int] | None = None,
     *,
@@ -75,7 +75,7 @@ def png(
     )
     path.write_bytes(
         b"\x89PNG\r\n\x1a\n"
-        + chunk(b"IHDR", struct.pack(">IIBBBBB", columns, rows, bits, colour, 0, 0, int(interlace)))
+        + chunk(b"IHDR", struct.pack(">IIBBBBB", columns, rows, bits, color, 0, 0, int(interlace)))
         + b"".join(chunk(*c) for c in extra)
         + chunk(b"IDAT", zlib.compress(out))
         + chunk(b"IEND", b"")

@@ -25,14 +25,14 @@ def _saved(picture: Image.Image, kind: str, **options: object) -> bytes:
 
 def pictures() -> dict[str, Image.Image]:
     """Pictures by kind of pixel."""
-    colour, alpha, cmyk = (Image.fromarray(_random(3)), Image.fromarray(_random(4)), _random(4))
+    color, alpha, cmyk = (Image.fromarray(_random(3)), Image.fromarray(_random(4)), _random(4))
     return {
         "L": Image.fromarray(_random(1)[..., 0]),
         "LA": Image.fromarray(_random(4)).convert("LA"),
-        "RGB": colour,
+        "RGB": color,
         "RGBA": alpha,
-        "P": colour.quantize(16),
-        "1": colour.convert("1"),
+        "P": color.quantize(16),
+        "1": color.convert("1"),
         "I;16": Image.fromarray(_random(1, np.uint16)[..., 0]),
         "F": Image.fromarray(np.random.default_rng(0).random((ROWS, COLUMNS)).astype(np.float32)),
         "CMYK": Image.merge("CMYK", [Image.fromarray(cmyk[..., c]) for c in range(4)]),
@@ -44,10 +44,10 @@ def png_chunk(kind: bytes, content: bytes) -> bytes:
     return len(content).to_bytes(4, "big") + kind + content + zlib.crc32(kind + content).to_bytes(4, "big")
 
 
-def png(columns: int, rows: int, bits: int, colour: int, packed: bytes, interlace: int = 0) -> bytes:
+def png(columns: int, rows: int, bits: int, color: int, packed: bytes, interlace: int = 0) -> bytes:
     """A PNG file of any header around compressed lines."""
     size = columns.to_bytes(4, "big") + rows.to_bytes(4, "big")
-    head = png_chunk(b"IHDR", size + bytes([bits, colour, 0, 0, interlace]))
+    head = png_chunk(b"IHDR", size + bytes([bits, color, 0, 0, interlace]))
     return b"\x89PNG\r\n\x1a\n" + head + png_chunk(b"IDAT", packed) + png_chunk(b"IEND", b"")
 
 

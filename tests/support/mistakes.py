@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mbtf_gen.console import run
+from mbtf_core.console import run
 
 from .commands import Done
 from .datasets import write_dataset
@@ -80,13 +80,13 @@ LINES: dict[str, list[str]] = {
         for name in (
             *("text.exr", "cut.exr", "cut.png", "empty.png", "garbage.npy", "misnamed.exr", "notes.txt"),
             *("nan.npy", "inf.npy", "objects.npy", "whole.npy", "flat.npy", "huge.png", "short.png"),
-            *("layers.exr", "crop.exr", "colour.npy", "ink.jpg"),
+            *("layers.exr", "crop.exr", "color.npy", "ink.jpg"),
         )
     ],
     "materials": [
         f"mbtf-gen {name}"
         for name in (
-            *("empty", "twice", "unnamed", "aspects", "beyond", "greynormal", "unknown.yaml", "broken.yaml"),
+            *("empty", "twice", "unnamed", "aspects", "beyond", "graynormal", "unknown.yaml", "broken.yaml"),
             *("tab.yaml", "twice.yaml", "lost.yaml", "list.yaml", "latin.yaml", "number.yaml", "range.yaml"),
             *("nothing.yaml", "both.yaml", "bsdf.yaml", "bsdftype.yaml", "bsdffile.yaml", "bomb.yaml"),
             *("longnormal", "tag.yaml", "deep.yaml", "key.yaml", "channel.yaml", "escape.yaml"),
@@ -151,7 +151,7 @@ def _images(folder: Path, heights: np.ndarray) -> None:
     np.save(folder / "objects.npy", np.array([[None]]), allow_pickle=True)
     np.save(folder / "whole.npy", np.zeros((4, 4), np.int64))
     np.save(folder / "flat.npy", np.zeros(16))
-    np.save(folder / "colour.npy", np.random.default_rng(0).random((4, 4, 3)))
+    np.save(folder / "color.npy", np.random.default_rng(0).random((4, 4, 3)))
 
     def exr(name: str, channels: dict[str, np.ndarray], **more: object) -> None:
         header = {"compression": OpenEXR.NO_COMPRESSION, "type": OpenEXR.scanlineimage, **more}
@@ -166,14 +166,14 @@ def _images(folder: Path, heights: np.ndarray) -> None:
 
 
 def _folders(folder: Path, heights: np.ndarray) -> None:
-    for name in ("empty", "textures", "twice", "unnamed", "aspects", "beyond", "greynormal", "longnormal"):
+    for name in ("empty", "textures", "twice", "unnamed", "aspects", "beyond", "graynormal", "longnormal"):
         (folder / name).mkdir()
-    for name in ("textures", "twice", "aspects", "beyond", "greynormal", "longnormal"):
+    for name in ("textures", "twice", "aspects", "beyond", "graynormal", "longnormal"):
         np.save(folder / name / "height.npy", heights)
     np.save(folder / "twice/displacement.npy", heights)
     np.save(folder / "unnamed/picture.npy", heights)
-    np.save(folder / "aspects/basecolor.npy", np.zeros((8, 8, 3)))
-    np.save(folder / "greynormal/normal.npy", heights)
+    np.save(folder / "aspects/base_color.npy", np.zeros((8, 8, 3)))
+    np.save(folder / "graynormal/normal.npy", heights)
     np.save(folder / "longnormal/normal.npy", np.full((4, 8, 3), [0.5, 0.5, 255.0]))
     (folder / "zipped").mkdir()
     (folder / "zipped/rock.zip").write_bytes(b"PK")
@@ -201,7 +201,7 @@ _TEXTS = {
     "list": "- heights.npy\n",
     "number": "height: heights.npy\nroughness: rough\nmetallic: [1, 2]\n",
     "range": "height: heights.npy\nroughness: 1.5\n",
-    "nothing": "basecolor: 0.5\n",
+    "nothing": "base_color: 0.5\n",
     "both": "height: heights.npy\nroughness: {file: heights.npy, value: 0.5}\n",
     "bsdf": "height: heights.npy\nroughness: 0.5\nbsdf: {type: diffuse}\n",
     "bsdftype": "height: heights.npy\nbsdf: {reflectance: 0.5}\n",
@@ -288,12 +288,16 @@ def answer(line: str, folder: Path) -> str:
 
 def call(words: list[str]) -> Done:
     """Run a command line of one of the programs in this process, in the current folder."""
-    import mbtf_fit.cli
-    import mbtf_gen.cli
-    import mbtf_pipeline.cli
+    import mbtf_fit.cli.app
+    import mbtf_gen.cli.app
+    import mbtf_pipeline.cli.app
 
     program, *tokens = words
-    modules = {"mbtf-gen": mbtf_gen.cli, "mbtf-fit": mbtf_fit.cli, "mbtf-pipeline": mbtf_pipeline.cli}
+    modules = {
+        "mbtf-gen": mbtf_gen.cli.app,
+        "mbtf-fit": mbtf_fit.cli.app,
+        "mbtf-pipeline": mbtf_pipeline.cli.app,
+    }
     loggers = [logging.getLogger(name) for name in ("mbtf_gen", "mbtf_fit", "mbtf_pipeline")]
     before = [(logger, logger.handlers, logger.propagate, logger.level) for logger in loggers]
     out, err = io.StringIO(), io.StringIO()

@@ -5,13 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
+from mbtf_core.lattice import Lattice
 from mbtf_fit.config import FitConfig
-from mbtf_fit.material import Material, export
+from mbtf_fit.material.material import Material, export
+from mbtf_fit.material.transmittance import Transmittance
 from mbtf_fit.models import build_model
-from mbtf_fit.transmittance import Transmittance
-from mbtf_gen.levels import Lattice
 
 _TRAINING = {"steps": 0, "batch": 1, "seconds": 0.0, "device": "cpu", "threads": 1, "errors": {}}
 
@@ -43,7 +44,7 @@ def write_material(
     config = FitConfig.model_validate({"model": model, "network": network or {}})
     torch.manual_seed(seed)
     built = build_model(model, Lattice(finest, aspect), **(network or {}))
-    built.initialise(torch.Generator().manual_seed(seed), 0.2)
+    built.initialize(torch.Generator().manual_seed(seed), 0.2)
     tensors = built.weights()
     for name, tensor in tensors.items():
         if "texture" in name or "pyramid" in name:
@@ -59,3 +60,8 @@ def write_material(
     built.load_weights(tensors)
     folder.mkdir(parents=True, exist_ok=True)
     return export(built, config, folder, data={"hash": "0" * 64}, training=_TRAINING, holes=holes)
+
+
+def deviation(found: np.ndarray, wanted: np.ndarray) -> float:
+    """Largest difference as a share of max(value, mean)."""
+    return float((np.abs(found - wanted) / np.maximum(wanted, wanted.mean())).max())

@@ -8,12 +8,12 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-import mbtf_fit.plugin
-from mbtf_gen.camera import Camera
+import mbtf_fit.mitsuba_plugin
+from mbtf_gen.pictures.camera import Camera
 
 from .scenes import mi
 
-mbtf_fit.plugin.register()
+mbtf_fit.mitsuba_plugin.register()
 
 
 def plane(bsdf: dict[str, Any], to_uv: Any = None, aspect: float = 1.0, half: float = 200.0) -> Any:
@@ -63,8 +63,8 @@ def sensor_of(camera: Camera, spp: int = 1) -> dict[str, Any]:
     }
 
 
-def through_pixel_centres(scene: Any, camera: Camera, integrator: Any) -> NDArray[np.float64]:
-    """What an integrator answers for the rays through the pixels' centres, (rows, columns, 3)."""
+def through_pixel_centers(scene: Any, camera: Camera, integrator: Any) -> NDArray[np.float64]:
+    """What an integrator answers for the rays through the pixels' centers, (rows, columns, 3)."""
     n = camera.rows * camera.columns
     index = dr.arange(mi.UInt32, n)
     at = mi.Point2f(

@@ -40,7 +40,7 @@ def save_normals(path: Path, normals: NDArray[Any], *, dx: bool = False) -> Path
 
 
 def save_heights(path: Path, height: Floats, bits: int = 16) -> Path:
-    """Write heights in [0, 1] as grey PNG of 8 or 16 bits."""
+    """Write heights in [0, 1] as gray PNG of 8 or 16 bits."""
     from PIL import Image as Pillow
 
     codes = np.rint(height * (2**bits - 1))

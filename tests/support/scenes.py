@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
-from mbtf_gen.engine import load_mitsuba
+from mbtf_gen.render.runtime import load_mitsuba
+from support.paths import ROOT
 
 mi = load_mitsuba()
 
-from mbtf_gen.estimator import Estimates, Estimator, Stream  # noqa: E402
-from mbtf_gen.heightfield import HeightGrid  # noqa: E402
-from mbtf_gen.light import LightKernel  # noqa: E402
-from mbtf_gen.queries import Queries  # noqa: E402
-from mbtf_gen.scene import build_tile, register_plugins  # noqa: E402
-from mbtf_gen.tracing import Transport  # noqa: E402
+from mbtf_gen.geometry.heightfield import HeightGrid  # noqa: E402
+from mbtf_gen.render.estimator import Estimates, Estimator, Stream  # noqa: E402
+from mbtf_gen.render.path_tracer import Transport  # noqa: E402
+from mbtf_gen.render.scene import build_tile, register_plugins  # noqa: E402
+from mbtf_gen.sampling.light_kernel import LightKernel  # noqa: E402
+from mbtf_gen.sampling.query_sampler import Queries  # noqa: E402
 
 register_plugins()
 
@@ -55,9 +55,9 @@ def real_heights(name: str, resolution: int = 96) -> HeightGrid:
 
     The test is skipped, by name, where the set is not there.
     """
-    from mbtf_gen.material import load_material
+    from mbtf_gen.material.material import load_material
 
-    root = Path(__file__).parents[2]
+    root = ROOT
     folder = root / "assets" / name
     height = None
     if not folder.exists():
@@ -99,6 +99,6 @@ def estimate(
 
 def direction(elevation: float, azimuth: float) -> NDArray[np.float64]:
     """Unit vector from angles in degrees."""
-    from mbtf_gen.directions import from_angles
+    from mbtf_core.directions import from_angles
 
     return from_angles(elevation, azimuth)

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from mbtf_gen.cli import app
-from mbtf_gen.console import run
-from mbtf_gen.estimates import Estimates, Stream
-from mbtf_gen.queries import Queries
-from mbtf_gen.seeds import Purpose, numpy_generator
-from mbtf_gen.simulation import ClosedForm
+from mbtf_core.console import run
+from mbtf_gen.cli.app import app
+from mbtf_gen.planning.simulation import ClosedForm
+from mbtf_gen.render.estimates import Estimates, Stream
+from mbtf_gen.sampling.query_sampler import Queries
+from mbtf_gen.sampling.rng import Purpose, numpy_generator
 
 
 def noisy_plane(self: ClosedForm, queries: Queries, spp: int, stream: Stream) -> Estimates:

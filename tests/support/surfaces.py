@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mbtf_gen.surface import Surface, SurfaceParts, SurfacePoint
+from mbtf_gen.render.bsdf.surface import Surface, SurfaceParts, SurfacePoint
 from support.scenes import mi
 
 ALL = SurfaceParts(diffuse=True, specular=True, metallic=True, coat=True, sheen=True)
 
 
 class LaneTexture:
-    """A texture with one value per lane: a number, or a colour (3, n)."""
+    """A texture with one value per lane: a number, or a color (3, n)."""
 
     def __init__(self, value: ArrayLike) -> None:
         self.value = np.asarray(value, np.float32)
@@ -28,7 +28,7 @@ class LaneTexture:
         return mi.Color3f(*(mi.Float(v) for v in self.value))
 
     def eval(self, si: Any) -> Any:
-        """Colour of each lane."""
+        """Color of each lane."""
         return mi.Color3f(mi.Float(self.value)) if self.value.ndim < 2 else self.eval_3(si)
 
 
@@ -47,7 +47,7 @@ def towards(cosine: ArrayLike, azimuth: ArrayLike = 0.0) -> NDArray[np.float64]:
 def point(parts: SurfaceParts, wi: NDArray[np.float64], **maps: ArrayLike) -> SurfacePoint:
     """A surface on the plane z = 0 seen from directions `wi` (n, 3), one per lane.
 
-    Maps not given: base colour 1, specular 1/2, metallic 0, coat 1, white sheen of weight 1, all roughnesses
+    Maps not given: base color 1, specular 1/2, metallic 0, coat 1, white sheen of weight 1, all roughnesses
     0.3.
     """
     import drjit as dr

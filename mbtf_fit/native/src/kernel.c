@@ -161,7 +161,7 @@ EXPORT void mbtf_backward(int32_t variant, const mbtf_model *m, const mbtf_queri
     VARIANTS[variant]->backward(m, q, state, by_value, scratch, to);
 }
 
-/* Forward, loss and backward at once: the sum of the loss over queries and colours. `share` is what one of them
+/* Forward, loss and backward at once: the sum of the loss over queries and colors. `share` is what one of them
  * counts in the mean. `state` has room for one block, `out` for 6 BLOCK floats. */
 EXPORT double mbtf_learn(int32_t variant, const mbtf_model *m, const mbtf_queries *q, const float *targets,
                          const mbtf_loss *loss, float share, float *state, float *scratch, float *out,

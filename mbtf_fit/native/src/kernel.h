@@ -1,7 +1,7 @@
 /* The fitter's kernel: what Python hands over, and what is compiled once per instruction set.
  *
  * Everything is float32. Queries are processed in blocks of BLOCK; within a block an activation is a row of
- * BLOCK floats, so that each instruction works on neighbouring queries. Functions never allocate, keep no
+ * BLOCK floats, so that each instruction works on neighboring queries. Functions never allocate, keep no
  * state and start no threads: callers hand over memory and call them from as many threads as they like.
  */
 #ifndef MBTF_KERNEL_H
@@ -55,7 +55,7 @@ typedef struct {
     float *pyramid, *offset_texture, *decoder, *offset;
 } mbtf_gradients;
 
-/* Loss of a prediction p on a value t that the kernel takes by itself, the mean over queries and colours of
+/* Loss of a prediction p on a value t that the kernel takes by itself, the mean over queries and colors of
  *     (relative / (p² + scale²) + squared / scale²) · d²,   d = p - t,
  * p held still in the weight and in the bound on d:
  *     |d| <= √(bound[0] + bound[1] |p| + bound[2] p²)   where `bounded`. */
@@ -64,7 +64,7 @@ typedef struct {
     int32_t bounded;
 } mbtf_loss;
 
-/* Optimiser of one tensor: Adam (Kingma and Ba 2015) with the corrections of its means worked in. */
+/* Optimizer of one tensor: Adam (Kingma and Ba 2015) with the corrections of its means worked in. */
 typedef struct {
     float rate, beta1, beta2, epsilon, root_correction2;
 } mbtf_adam_step;

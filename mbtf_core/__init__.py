@@ -1,0 +1,1 @@
+"""What all packages share: errors, configuration, console, files and locks, directions, levels, statistics."""

@@ -1,0 +1,294 @@
+"""Files that are absent or complete: temporary file, fsync, rename, fsync of the folder."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import json
+import os
+import socket
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from mbtf_core.errors import InputError, PartialError, reason
+
+CHECKSUM = "checksum"
+# A checksummed document ends with its checksum, so that it can be found without a parser.
+_SEAL_TAIL = b'"\n}\n'
+_SEAL_HEAD = f'"{CHECKSUM}": "'.encode()
+_DIGITS = 64
+
+# What folders answer that cannot be opened or synced for what they are, not for what happens to the disk.
+_NO_FOLDER_SYNC = (errno.EACCES, errno.EPERM, errno.EISDIR, errno.EINVAL, errno.ENOTSUP, errno.ENOSYS)
+# What a file system without hard links answers.
+_NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)
+
+Buffer = bytes | bytearray | memoryview
+
+
+@dataclass(frozen=True)
+class Stored:
+    """What a file holds: its size in bytes and its SHA-256, hexadecimal."""
+
+    bytes: int
+    sha256: str
+
+
+def sync_folder(folder: Path) -> None:
+    """Make renames in `folder` durable (a no-op where folders cannot be opened or synced).
+
+    Raises
+    ------
+    OSError : the disk failed
+    """
+    try:
+        handle = os.open(folder, os.O_RDONLY)
+    except OSError as error:
+        if error.errno in _NO_FOLDER_SYNC:
+            return
+        raise
+    try:
+        os.fsync(handle)
+    except OSError as error:
+        if error.errno not in _NO_FOLDER_SYNC:
+            raise
+    finally:
+        os.close(handle)
+
+
+def temporary_of(path: Path) -> Path:
+    """Name of the unfinished file of `path` that this process writes: its machine and its number make it
+    unique among all writers of a folder."""
+    machine = zlib.crc32(socket.gethostname().encode())
+    return path.with_name(f".{path.name}.{machine:08x}-{os.getpid()}.tmp")
+
+
+# The names that `temporary_of` gives, after the dot and the file's own name.
+TEMPORARY = r"\.[0-9a-f]{8}-\d+\.tmp"
+
+
+@contextlib.contextmanager
+def _temporary(path: Path) -> Iterator[Path]:
+    """A fresh name to write to; what fails in between is partial work.
+
+    Raises
+    ------
+    PartialError : the disk is full or the folder cannot be written
+    """
+    temporary = temporary_of(path)
+    try:
+        # A killed process of the same number may have left it, linked under its final name even.
+        temporary.unlink(missing_ok=True)
+        yield temporary
+    except OSError as error:
+        raise unwritable(path, error) from None
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+
+
+def unwritable(path: Path, error: OSError) -> PartialError:
+    """What a user is told of a file or folder that the system would not write."""
+    return PartialError(
+        f"cannot be written ({error.strerror or error})",
+        where=path,
+        hint="what was finished is kept; free space or mend the folder, then run the same command again",
+    )
+
+
+def _replace(temporary: Path, path: Path) -> None:
+    os.replace(temporary, path)
+    sync_folder(path.parent)
+
+
+def write_file(path: Path, write: Callable[[BinaryIO], None]) -> None:
+    """Write `path` through `write(stream)` so that a crash at any instant leaves the old file or the new one.
+
+    Raises
+    ------
+    PartialError : the disk is full or the folder cannot be written
+    """
+    with _temporary(path) as temporary:
+        with temporary.open("wb") as stream:
+            write(stream)
+            stream.flush()
+            os.fsync(stream.fileno())
+        _replace(temporary, path)
+
+
+def write_chunks(path: Path, chunks: Iterable[Buffer]) -> Stored:
+    """Write `path` from consecutive pieces, atomically, and digest it on the way.
+
+    Raises
+    ------
+    PartialError : the disk is full or the folder cannot be written
+    """
+    sha, size = hashlib.sha256(), 0
+
+    def write(stream: BinaryIO) -> None:
+        nonlocal size
+        for chunk in chunks:
+            stream.write(chunk)
+            sha.update(chunk)
+            size += memoryview(chunk).nbytes
+
+    write_file(path, write)
+    return Stored(size, sha.hexdigest())
+
+
+def write_through(path: Path, write: Callable[[Path], None]) -> Stored:
+    """Like :func:`write_chunks` for libraries that want a file name: `write(temporary)` creates it."""
+    with _temporary(path) as temporary:
+        write(temporary)
+        with temporary.open("rb+") as stream:
+            os.fsync(stream.fileno())
+        stored = Stored(temporary.stat().st_size, digest(temporary))
+        _replace(temporary, path)
+    return stored
+
+
+def create_file(path: Path, content: bytes) -> bool:
+    """Write a file where there is none; False where there is one, which stays as it is.
+
+    Of several writers one wins, also of those on different machines: the file gets its name by a hard link.
+    File systems without hard links leave a moment in which the last one wins.
+
+    Raises
+    ------
+    PartialError : the disk is full or the folder cannot be written
+    """
+    with _temporary(path) as temporary:
+        with temporary.open("wb") as stream:
+            stream.write(content)
+            stream.flush()
+            os.fsync(stream.fileno())
+        try:
+            os.link(temporary, path)
+        except FileExistsError:
+            return False
+        except OSError as error:
+            if error.errno not in _NO_LINKS:
+                raise
+            if path.exists():
+                return False
+            os.replace(temporary, path)
+        sync_folder(path.parent)
+    return True
+
+
+def remove_file(path: Path) -> None:
+    """Remove a file for good, if it is there.
+
+    Raises
+    ------
+    PartialError : the folder cannot be written
+    """
+    try:
+        path.unlink()
+        sync_folder(path.parent)
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise unwritable(path, error) from None
+
+
+def _put(stream: BinaryIO, text: str) -> None:
+    stream.write(text.encode())
+
+
+def write_json(path: Path, data: Mapping[str, Any]) -> None:
+    """Write plain data as indented JSON, atomically. NaN and infinities are refused."""
+    text = json.dumps(data, indent=2, allow_nan=False) + "\n"
+    write_file(path, lambda stream: _put(stream, text))
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write text as UTF-8, atomically."""
+    write_file(path, lambda stream: _put(stream, text))
+
+
+def checksummed(data: Mapping[str, Any]) -> bytes:
+    """`data` as indented JSON whose last key, ``checksum``, is the SHA-256 of the text itself with the 64
+    digits of that key set to 0. NaN and infinities are refused."""
+    document = {**{k: v for k, v in data.items() if k != CHECKSUM}, CHECKSUM: "0" * _DIGITS}
+    text = (json.dumps(document, indent=2, allow_nan=False) + "\n").encode()
+    return _with_digits(text, hashlib.sha256(text).hexdigest().encode())
+
+
+def _with_digits(text: bytes, digits: bytes) -> bytes:
+    end = len(text) - len(_SEAL_TAIL)
+    return text[: end - _DIGITS] + digits + text[end:]
+
+
+def write_checksummed(path: Path, data: Mapping[str, Any]) -> None:
+    """Write :func:`checksummed` data, atomically."""
+    content = checksummed(data)
+    write_chunks(path, [content])
+
+
+def read_checksummed(path: Path, hint: str = "") -> dict[str, Any]:
+    """JSON object of a checksummed document, its checksum left out.
+
+    Parameters
+    ----------
+    hint : what to do about a document that is damaged
+
+    Raises
+    ------
+    InputError : missing, unreadable, not a JSON object, or not what was written
+    """
+    content = _content(path)
+    data = _parsed(content, path, hint)
+    head = content[: -len(_SEAL_TAIL) - _DIGITS]
+    zeros = hashlib.sha256(_with_digits(content, b"0" * _DIGITS)).hexdigest()
+    if (
+        not content.endswith(_SEAL_TAIL)
+        or not head.endswith(_SEAL_HEAD)
+        or content[len(head) : len(head) + _DIGITS] != zeros.encode()
+    ):
+        raise InputError("has changed since it was written (its checksum differs)", where=path, hint=hint)
+    del data[CHECKSUM]
+    return data
+
+
+def _content(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise InputError("no such file", where=path) from None
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
+
+
+def _parsed(content: bytes, path: Path, hint: str = "") -> dict[str, Any]:
+    try:
+        data = json.loads(content.decode(), parse_constant=_refuse_constant)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"not readable as JSON ({reason(error)})", where=path, hint=hint) from None
+    if not isinstance(data, dict):
+        raise InputError("must hold a JSON object", where=path, hint=hint)
+    return data
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """JSON object stored in a file.
+
+    Raises
+    ------
+    InputError : missing, unreadable, or not a JSON object
+    """
+    return _parsed(_content(path), path)
+
+
+def _refuse_constant(name: str) -> None:
+    raise ValueError(f"{name} is no number of JSON")
+
+
+def digest(path: Path) -> str:
+    """SHA-256 of a file, in hexadecimal (what ``sha256sum`` prints)."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()

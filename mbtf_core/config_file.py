@@ -1,0 +1,374 @@
+"""Typed configuration: YAML file, then ``--set a.b=c``, then flags, checked by pydantic.
+
+Used by all three programs. A key that the model does not know is refused with its file and line and the
+nearest valid key; a value that does not fit is refused with its key and what was expected.
+"""
+
+from __future__ import annotations
+
+import difflib
+import io
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence, Set
+from datetime import date
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+
+from mbtf_core.errors import InputError, MbtfError, UsageError, reason
+from mbtf_core.suggest import suggest_path
+from mbtf_core.validation_messages import explain, models_in
+
+
+class Settings(BaseModel):
+    """Base of every configuration section: unknown keys are errors, values are fixed once read."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
+
+
+S = TypeVar("S", bound=BaseModel)
+
+
+def _file_name(name: str) -> str:
+    try:
+        usable = "\0" not in name and all(len(os.fsencode(part)) <= 255 for part in name.split("/"))
+    except UnicodeError:
+        usable = False
+    if not usable or len(name) > 4000:
+        raise ValueError("is no name that a file can have")
+    return name
+
+
+# The name of a file, or a path to it.
+FileName = Annotated[str, Field(min_length=1), AfterValidator(_file_name)]
+
+_COMMAND_LINE = "command line"
+
+# A configuration that is longer, deeper or (through YAML's aliases) larger than this is no configuration.
+_MAX_CHARACTERS = 1 << 18
+_MAX_DEPTH = 100
+_MAX_VALUES = 100_000
+# Tags that stand for plain values.
+_TAGS = ("map", "seq", "str", "int", "float", "bool", "null", "timestamp", "binary", "set", "omap")
+
+
+def _yaml() -> Any:
+    from ruamel.yaml import YAML
+
+    return YAML(typ="rt")
+
+
+def _is_yaml(path: Path) -> bool:
+    return path.suffix.lower() in (".yaml", ".yml")
+
+
+def read_yaml(path: Path) -> Any:
+    """Mapping stored in a YAML file, with line numbers kept.
+
+    Raises
+    ------
+    InputError : the file is missing, unreadable, not YAML, or not a mapping
+    """
+    from ruamel.yaml.error import MarkedYAMLError, YAMLError
+
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise InputError("no such file", where=path, hint=suggest_path(path, _is_yaml)) from None
+    except UnicodeDecodeError as error:
+        raise InputError(f"is not UTF-8 text (byte {error.start})", where=path) from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot be read ({getattr(error, 'strerror', error)})", where=path) from None
+    if len(text) > _MAX_CHARACTERS:
+        raise InputError(f"is too long: more than {_MAX_CHARACTERS:,} characters", where=path)
+    if _bracket_depth(text) > _MAX_DEPTH:
+        raise InputError(_too_deep(), where=path)
+    try:
+        data = _yaml().load(text)
+    except MarkedYAMLError as error:
+        mark = error.problem_mark
+        line = f":{mark.line + 1}" if mark is not None else ""
+        raise InputError(f"not valid YAML ({reason(error.problem)})", where=f"{path}{line}") from None
+    except YAMLError as error:
+        raise InputError(f"not valid YAML ({reason(error)})", where=path) from None
+    except RecursionError:
+        raise InputError(_too_deep(), where=path) from None
+    except Exception as error:  # the reader turns scalars into numbers and dates, and may raise anything
+        raise InputError(f"not valid YAML ({reason(error)})", where=path) from None
+    if data is None:
+        return {}
+    if not isinstance(data, Mapping):
+        raise InputError("must hold a mapping of keys to values", where=path)
+    _check_tree(data, path)
+    return data
+
+
+def _too_deep() -> str:
+    return f"is nested more than {_MAX_DEPTH} levels deep"
+
+
+def _bracket_depth(text: str) -> int:
+    """How deep brackets are nested: the reader's time grows with the square of it."""
+    depth = deepest = 0
+    for bracket in re.finditer(r"[\[\]{}]", text):
+        depth += 1 if bracket[0] in "[{" else -1
+        deepest = max(deepest, depth)
+    return deepest
+
+
+def _check_tree(data: Any, where: object) -> None:
+    """Refuse what a few lines of YAML can hold but no configuration does.
+
+    Raises
+    ------
+    InputError : nested too deeply, repeated through aliases (or holding itself), keys that are no text, or
+        tags of some program's own
+    """
+    waiting: list[tuple[Any, int]] = [(data, 1)]
+    seen = 0
+    while waiting:
+        value, depth = waiting.pop()
+        seen += 1
+        if depth > _MAX_DEPTH or seen > _MAX_VALUES:
+            what = _too_deep() if depth > _MAX_DEPTH else f"holds more than {_MAX_VALUES:,} values"
+            raise InputError(what, where=where, hint="aliases (*name) count as what they stand for")
+        tag = getattr(getattr(value, "tag", None), "value", None)
+        if tag is not None and str(tag).removeprefix("tag:yaml.org,2002:") not in _TAGS:
+            raise InputError(f"holds the tag '{tag}'", where=where, hint="plain values are wanted")
+        if isinstance(value, Mapping):
+            for key, inner in value.items():
+                if not isinstance(key, str):
+                    raise InputError(f"key {_shown(key)} is not text", where=where, hint="put it in quotes")
+                waiting.append((inner, depth + 1))
+        elif isinstance(value, Sequence | Set) and not isinstance(value, str | bytes):
+            waiting += ((inner, depth + 1) for inner in value)
+
+
+def _shown(value: Any) -> str:
+    """A value as it was given, shortened to a part of a line."""
+    text = str(value) if isinstance(value, date) else repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def dump_yaml(data: Mapping[str, Any]) -> str:
+    """YAML text of plain data (dicts, lists, strings, numbers), keys in the given order."""
+    from ruamel.yaml import YAML
+
+    yaml = YAML(typ="safe", pure=True)
+    yaml.default_flow_style = False
+    yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
+    stream = io.StringIO()
+    yaml.dump(dict(data), stream)
+    return stream.getvalue()
+
+
+def _known_keys(model: type[BaseModel], location: Sequence[str | int]) -> list[str]:
+    """Valid keys of the section that `location` lies in (the last part is the offending key)."""
+    models = [model]
+    for part in location[:-1]:
+        if isinstance(part, int):
+            continue
+        fields = [m.model_fields[part] for m in models if part in m.model_fields]
+        deeper = [m for f in fields for m in models_in(f.annotation)]
+        models = deeper or models
+    return sorted({key for m in models for key in m.model_fields})
+
+
+def line_of(data: Any, location: Sequence[str | int]) -> int | None:
+    """Line (from 1) of a key in data that :func:`read_yaml` returned; None where it is not in the file."""
+    line = None
+    for part in location:
+        try:
+            if isinstance(part, str) and part not in data:
+                continue  # pydantic inserts tags of unions into its locations
+            position = data.lc.key(part) if isinstance(part, str) else data.lc.item(part)
+            line = position[0] + 1
+            data = data[part]
+        except (AttributeError, KeyError, IndexError, TypeError):
+            break
+    return line
+
+
+def _explain(
+    error: ValidationError, model: type[BaseModel], data: Any, source: str, spelled: Mapping[str, str]
+) -> tuple[str, str, str]:
+    """(where, what, hint) of one fault: an unknown key before others, since it may explain a missing one."""
+    faults = error.errors()
+    fault = next((f for f in faults if f["type"] == "extra_forbidden"), faults[0])
+    location = list(fault["loc"])
+    dotted = ".".join(str(p) for p in location) or "(top level)"
+    # Data that the command line has changed may still carry the file's line numbers.
+    line = None if source == _COMMAND_LINE else line_of(data, location)
+    flag = next((f for key, f in spelled.items() if f"{dotted}.".startswith(f"{key}.")), None)
+    where = flag or (f"{source}:{line}" if line is not None else source)
+    if fault["type"] == "extra_forbidden":
+        known = _known_keys(model, location)
+        near = difflib.get_close_matches(str(location[-1]), known, n=1, cutoff=0.5)
+        what = f"unknown key '{dotted}'"
+        hint = f"did you mean '{near[0]}'?" if near else f"valid keys: {', '.join(known)}"
+        return where, what, hint
+    if fault["type"] == "missing":
+        return where, f"key '{dotted}' is missing", "add it"
+    given = fault.get("input")
+    shown = "" if isinstance(given, Mapping | BaseModel) else f" (given {_shown(given)})"
+    named = f"'{dotted}': " if location else ""
+    return where, f"{named}{explain(fault, model)}{shown}", ""
+
+
+def build(
+    model: type[S],
+    data: Mapping[str, Any],
+    *,
+    source: str,
+    error: type[MbtfError] = InputError,
+    spelled: Mapping[str, str] | None = None,
+) -> S:
+    """Check `data` against `model`.
+
+    Parameters
+    ----------
+    source : where the data come from, for messages: a file, "command line"
+    error : class of the error to raise
+    spelled : dotted key → the flag that gave it, named in place of `source`
+
+    Raises
+    ------
+    error : with the key, its line where `data` came from :func:`read_yaml`, and the nearest valid key
+    """
+    try:
+        return model.model_validate(data)
+    except ValidationError as fault:
+        where, what, hint = _explain(fault, model, data, source, spelled or {})
+        raise error(what, where=where, hint=hint) from None
+
+
+def check_document(model: type[BaseModel], data: Mapping[str, Any], path: Path, hint: str) -> None:
+    """Refuse a JSON document of ours whose content is not what `model` says: somebody else changed it.
+
+    Raises
+    ------
+    InputError : with the first key that is missing or holds something else
+    """
+    try:
+        build(model, data, source=str(path))
+    except InputError as error:
+        raise InputError(f"is damaged ({error.what})", where=path, hint=hint) from None
+
+
+def _parse_value(text: str) -> Any:
+    """A ``--set`` value, read as YAML reads a scalar."""
+    from ruamel.yaml import YAML
+
+    try:
+        value = YAML(typ="safe", pure=True).load(text)
+    except Exception:  # what is no YAML stands for itself; the reader may raise anything
+        return text
+    _check_tree(value, "--set")
+    return value
+
+
+def merge(base: Any, path: Sequence[str], value: Any) -> None:
+    """Set ``base[path[0]][path[1]]… = value`` in nested mappings, making sections as needed."""
+    for part in path[:-1]:
+        if not isinstance(base.get(part), Mapping):
+            base[part] = {}
+        base = base[part]
+    base[path[-1]] = value
+
+
+def nested(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Options by dotted name as nested mappings."""
+    out: dict[str, Any] = {}
+    for name, value in options.items():
+        merge(out, name.split("."), value)
+    return out
+
+
+def deep_merge(base: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """A new mapping: `given` laid over `base`, section by section."""
+    out = dict(base)
+    for key, value in given.items():
+        under = out.get(key)
+        if isinstance(under, Mapping) and isinstance(value, Mapping):
+            value = deep_merge(under, value)
+        out[key] = value
+    return out
+
+
+def resolve(
+    model: type[S],
+    *,
+    file: Path | None = None,
+    assignments: Sequence[str] = (),
+    flags: Mapping[str, Any] | None = None,
+    spelled: Mapping[str, str] | None = None,
+) -> S:
+    """Resolved configuration: defaults, then the file, then ``a.b=c`` assignments, then flags.
+
+    Parameters
+    ----------
+    flags : dotted key → value; None values are flags that were not given
+    spelled : dotted key → its flag, for messages
+
+    Raises
+    ------
+    InputError : the file is at fault
+    UsageError : an assignment or a flag is at fault
+    """
+    data: Any = read_yaml(file) if file is not None else {}
+    given: list[tuple[str, Any]] = []
+    for assignment in assignments:
+        key, sign, text = assignment.partition("=")
+        if not sign or not key:
+            raise UsageError(f"{_shown(assignment)} is not of the form key=value", where="--set")
+        given.append((key.strip(), _parse_value(text)))
+    given += [(key, value) for key, value in (flags or {}).items() if value is not None]
+    if file is not None:
+        # The file's own faults are the file's, also where the command line supplies a key that it lacks.
+        for key, value in given:
+            if key in model.model_fields and model.model_fields[key].is_required() and key not in data:
+                data[key] = value
+        resolved = build(model, data, source=str(file))
+        if not given:
+            return resolved
+    for key, value in given:
+        merge(data, key.split("."), value)
+    names = {key: flag for key, flag in (spelled or {}).items() if (flags or {}).get(key) is not None}
+    return build(model, data, source=_COMMAND_LINE, error=UsageError, spelled=names)
+
+
+def differences(old: Mapping[str, Any], new: Mapping[str, Any], prefix: str = "") -> list[str]:
+    """Fields in which two nested mappings differ, as ``key: old -> new``; settings before digests of files.
+
+    Digests are shortened to their first eight digits.
+    """
+    changed = list(_changed(old, new, prefix))
+    changed.sort(key=lambda change: any(_is_digest(value) for value in change[1:]))
+    return [f"{key}: {_brief(before)} -> {_brief(after)}" for key, before, after in changed]
+
+
+def in_short(changes: Sequence[str], most: int = 6) -> str:
+    """The first of :func:`differences` on one line, with a count of the others."""
+    more = len(changes) - most
+    return "; ".join([*changes[:most], *([f"and {more} more"] if more > 0 else [])])
+
+
+def _changed(old: Mapping[str, Any], new: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any, Any]]:
+    for key in sorted({*old, *new}):
+        a, b = old.get(key), new.get(key)
+        if isinstance(a, Mapping) and isinstance(b, Mapping):
+            yield from _changed(a, b, f"{prefix}{key}.")
+        elif a != b:
+            yield f"{prefix}{key}", a, b
+
+
+def _is_digest(value: Any) -> bool:
+    return isinstance(value, str) and re.fullmatch(r"[0-9a-f]{64}", value) is not None
+
+
+def _brief(value: Any) -> str:
+    if value is None:
+        return "unset"
+    return f"{value[:8]}…" if _is_digest(value) else str(value)

@@ -1,0 +1,445 @@
+"""What the three programs share on the command line: errors, exit codes, JSON, progress.
+
+A program defines its commands with cyclopts and hands the application to :func:`run`::
+
+    # mbtf_fit/cli.py
+    app = new_app("mbtf-fit", "Fit neural materials to multi-resolution BTF data.")
+
+    @app.default
+    def fit(shards: Path, /, *, time: str = "2min", console: Console = CONSOLE) -> None:
+        "…docstring in numpydoc style: cyclopts shows its parameters…"
+        with console.progress(total=steps, label="fitting", unit="steps") as bar:
+            for step in range(steps):
+                bar.advance(1, note=f"loss {loss:.4f}")
+        console.report({"loss": loss}, f"loss {loss:.4f}")
+
+    @app.command
+    def info(material: Path, /, *, console: Console = CONSOLE) -> int: ...
+
+    # mbtf_fit/__main__.py
+    def main() -> int:
+        from .cli import app
+        return run(app)
+
+    if __name__ == "__main__":
+        sys.exit(main())
+
+The default command answers ``mbtf-fit shards/``, the named ones ``mbtf-fit info …``; flags may stand before
+or after the command's name. A command returns None or an exit code and raises
+:class:`~mbtf_core.errors.MbtfError` for everything a user can cause. Results go to standard output; progress,
+notes and warnings (``logging.getLogger(__name__).warning(…)`` anywhere in the packages) go to standard error.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import difflib
+import json as json_module
+import logging
+import math
+import os
+import re
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from cyclopts import App, CycloptsError, Parameter, UnusedCliTokensError
+
+from mbtf_core.errors import (
+    EXIT_BAD_INPUT,
+    EXIT_INTERRUPTED,
+    EXIT_OK,
+    EXIT_USAGE,
+    Interrupted,
+    MbtfError,
+    UsageError,
+    printable,
+    reason,
+)
+
+EXIT_INTERNAL = 1
+_EXIT_BROKEN_PIPE = 141
+_PACKAGES = ("mbtf_core", "mbtf_gen", "mbtf_fit", "mbtf_pipeline")
+# Seconds between two plain progress lines.
+_LINE_SECONDS = 10.0
+
+
+def clock(seconds: float) -> str:
+    """Duration as people read it: ``0:07``, ``12:03``, ``1:02:03``."""
+    whole = max(0, round(seconds))
+    hours, rest = divmod(whole, 3600)
+    minutes, rest = divmod(rest, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+def _plain(value: Any) -> Any:
+    """JSON's own types for paths, arrays, NumPy numbers and models; NaN and infinities become null."""
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, str | int):
+        return value
+    if hasattr(value, "model_dump"):
+        return _plain(value.model_dump())
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist())
+    return str(value)
+
+
+class Progress:
+    """Progress of one job, made by :meth:`Console.progress`; this class itself shows nothing.
+
+    Attributes
+    ----------
+    total : units the job has; None where that is not known
+    done : units done so far
+    """
+
+    def __init__(self, total: float | None, label: str, unit: str) -> None:
+        self.total = total
+        self.label = label
+        self.unit = unit
+        self.done = 0.0
+        self.note = ""
+        self._start = time.monotonic()
+
+    @property
+    def seconds(self) -> float:
+        """Seconds since the job began."""
+        return time.monotonic() - self._start
+
+    def advance(self, step: float = 1, note: str | None = None) -> None:
+        """Count `step` more as done."""
+        self.update(self.done + step, note)
+
+    def update(self, done: float, note: str | None = None) -> None:
+        """Say how much is done; `note` is shown beside it until the next one."""
+        self.done = done
+        if note is not None:
+            self.note = note
+        self._show()
+
+    def _show(self) -> None:
+        """Display the new state."""
+
+    def _close(self) -> None:
+        """Display the last state."""
+
+
+class _LineProgress(Progress):
+    """Plain lines at intervals, for logs and pipes."""
+
+    def __init__(self, total: float | None, label: str, unit: str) -> None:
+        super().__init__(total, label, unit)
+        self._next = self._start + _LINE_SECONDS
+        self._shown: float | None = None
+
+    def _show(self) -> None:
+        if time.monotonic() >= self._next:
+            self._next = time.monotonic() + _LINE_SECONDS
+            self._print()
+
+    def _close(self) -> None:
+        if self.done and self._shown != self.done:
+            self._print()
+
+    def _print(self) -> None:
+        self._shown = self.done
+        parts = [f"{self.label}: {self.done:.10g}"]
+        if self.unit == "%":
+            parts[0] = f"{self.label}: {self.done:.0f}%"
+        elif self.total:
+            parts[0] += f"/{self.total:.10g} {self.unit}".rstrip() + f" ({self.done / self.total:.0%})"
+        elif self.unit:
+            parts[0] += f" {self.unit}"
+        parts.append(f"{clock(self.seconds)} elapsed")
+        if self.total and 0 < self.done < self.total:
+            parts.append(f"{clock(self.seconds * (self.total - self.done) / self.done)} left")
+        if self.note:
+            parts.append(self.note)
+        print(", ".join(parts), file=sys.stderr, flush=True)
+
+
+class _BarProgress(Progress):
+    """A bar that redraws itself, for terminals."""
+
+    def __init__(self, total: float | None, label: str, unit: str) -> None:
+        super().__init__(total, label, unit)
+        from rich import progress
+        from rich.console import Console as RichConsole
+
+        self._rich = progress.Progress(
+            progress.TextColumn("{task.description}", markup=False),
+            progress.BarColumn(),
+            progress.TaskProgressColumn(),
+            progress.TimeElapsedColumn(),
+            progress.TimeRemainingColumn(),
+            progress.TextColumn("{task.fields[note]}", markup=False),
+            console=RichConsole(stderr=True),
+            # Standard output carries results; rich would move it to standard error.
+            redirect_stdout=False,
+        )
+        self._task = self._rich.add_task(label, total=total, note="")
+        self._rich.start()
+
+    def _show(self) -> None:
+        self._rich.update(self._task, completed=self.done, note=self.note)
+
+    def _close(self) -> None:
+        self._rich.stop()
+
+
+@Parameter(name="*", group="Output")
+@dataclass(frozen=True)
+class Console:
+    """Where a command's output goes; every command takes one as its keyword parameter `console`.
+
+    Attributes
+    ----------
+    json : print one JSON object on standard output instead of text
+    quiet : no progress and no notes; warnings and errors stay
+    """
+
+    json: Annotated[bool, Parameter(negative="", help="Print one JSON object on standard output.")] = False
+    quiet: Annotated[bool, Parameter(alias="-q", negative="", help="No progress, no notes.")] = False
+
+    def note(self, text: str) -> None:
+        """A line for people, on standard error."""
+        if not self.quiet:
+            print(text, file=sys.stderr, flush=True)
+
+    def report(self, data: Mapping[str, Any], text: str) -> None:
+        """The command's result, on standard output: `data` as one JSON object with ``--json``, else `text`.
+
+        Paths, arrays, NumPy numbers and pydantic models are converted; NaN and infinities become null.
+        """
+        if self.json:
+            text = json_module.dumps(_plain(data), indent=2, ensure_ascii=False, allow_nan=False)
+        print(text)
+
+    @contextlib.contextmanager
+    def progress(self, total: float | None, label: str, unit: str = "") -> Iterator[Progress]:
+        """Progress of a job of `total` units.
+
+        On a terminal a bar; elsewhere a line every ten seconds and one at the end.
+        """
+        kind: type[Progress] = Progress
+        if not self.quiet:
+            kind = _BarProgress if sys.stderr.isatty() else _LineProgress
+        bar = kind(total, label, unit)
+        try:
+            yield bar
+        finally:
+            bar._close()
+
+
+@contextlib.contextmanager
+def going_on(kept: str, hint: str = "the same command goes on from there") -> Iterator[None]:
+    """Work that an interruption does not lose; says so where one comes.
+
+    Parameters
+    ----------
+    kept : what is kept, for the message; hint : how to go on
+
+    Raises
+    ------
+    Interrupted : in place of KeyboardInterrupt
+    """
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise Interrupted(f"interrupted; {kept}", hint=hint) from None
+
+
+def _interrupt(number: int, frame: object) -> None:
+    raise KeyboardInterrupt
+
+
+@contextlib.contextmanager
+def _ended_like_interrupted() -> Iterator[None]:
+    """Have the system's request to end (SIGTERM, as batch systems send it) end the work as Ctrl-C does."""
+    usual = threading.current_thread() is threading.main_thread()
+    usual = usual and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    if usual:
+        signal.signal(signal.SIGTERM, _interrupt)
+        # A renderer that ran in this process may have left a handler behind Python's back, which points to
+        # what is gone by now.
+        signal.signal(signal.SIGINT, signal.getsignal(signal.SIGINT) or signal.default_int_handler)
+    try:
+        yield
+    finally:
+        if usual:
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+# Default of every command's `console` parameter: text, with progress.
+CONSOLE = Console()
+
+
+def new_app(name: str, description: str) -> App:
+    """A cyclopts application for :func:`run`, with ``--help`` and ``--version``; `name` is the program's."""
+
+    def version() -> str:
+        from importlib.metadata import version as installed
+
+        return f"{name} {installed('mbtf')}"
+
+    return App(
+        name=name,
+        help=description,
+        version=version,
+        help_format="plaintext",
+        help_epilogue="With --debug, an error shows its traceback.",
+        default_parameter=Parameter(negative_iterable=()),
+        exit_on_error=False,
+        print_error=False,
+        suppress_keyboard_interrupt=False,
+        result_action="return_value",
+    )
+
+
+class _LogHandler(logging.Handler):
+    """Log records of our packages as plain lines on what standard error is at that moment."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        prefix = f"{record.levelname.lower()}: " if record.levelno > logging.INFO else ""
+        print(prefix + printable(record.getMessage()), file=sys.stderr, flush=True)
+
+
+def _route_logs(tokens: Sequence[str], debug: bool) -> None:
+    level = logging.WARNING if {"-q", "--quiet"} & set(tokens) else logging.INFO
+    for package in _PACKAGES:
+        logger = logging.getLogger(package)
+        logger.handlers = [_LogHandler()]
+        logger.propagate = False
+        logger.setLevel(logging.DEBUG if debug else level)
+
+
+def _take_debug(tokens: Sequence[str]) -> tuple[bool, list[str]]:
+    """Whether ``--debug`` is among the tokens (what follows ``--`` is no flag), and the tokens without it."""
+    end = tokens.index("--") if "--" in tokens else len(tokens)
+    kept = [t for t in tokens[:end] if t != "--debug"]
+    return len(kept) < end, [*kept, *tokens[end:]]
+
+
+def _join_negative_pairs(tokens: Sequence[str]) -> list[str]:
+    """``--view -10,0`` as ``--view=-10,0``: a list of numbers that begins with a minus sign is no flag."""
+    out: list[str] = []
+    for token in tokens:
+        if re.fullmatch(r"-[\d.][^,\s]*,\S+", token) and out and re.fullmatch(r"--[\w-]+", out[-1]):
+            out[-1] += f"={token}"
+        else:
+            out.append(token)
+    return out
+
+
+def _commands(app: App) -> list[str]:
+    return [name for name in app if not name.startswith("-")]
+
+
+def _first_word(app: App, tokens: Sequence[str]) -> int | None:
+    """Index of the first token that is neither a flag nor a flag's value, by the flags of all commands."""
+    values: dict[str, int] = {}
+    for part in (app, *(app[name] for name in _commands(app))):
+        if part.default_command is None:
+            continue
+        for argument in part.assemble_argument_collection():
+            for name in argument.names:
+                values.setdefault(name, argument.token_count()[0])
+    index = 0
+    while index < len(tokens) and tokens[index].startswith("-") and tokens[index] not in ("-", "--"):
+        index += 1 if "=" in tokens[index] else 1 + values.get(tokens[index], 0)
+    return index if index < len(tokens) else None
+
+
+def _command_first(app: App, tokens: list[str]) -> list[str]:
+    """Tokens with the command's name in front, where flags stood before it.
+
+    Raises
+    ------
+    UsageError : the first word is no file and looks like a misspelt command
+    """
+    commands = _commands(app)
+    index = _first_word(app, tokens) if tokens and tokens[0].startswith("-") else 0
+    if not tokens or index is None:
+        return tokens
+    word = tokens[index]
+    if word in commands:
+        return [word, *tokens[:index], *tokens[index + 1 :]]
+    near = difflib.get_close_matches(word, commands, n=1, cutoff=0.75)
+    if near and not re.search(r"[./\\]", word) and not os.path.exists(word):
+        raise UsageError("no such file or command", where=word, hint=f"did you mean: {app.name[0]} {near[0]}")
+    return tokens
+
+
+def _usage_message(app: App, fault: CycloptsError, tokens: Sequence[str]) -> str:
+    """What cyclopts found wrong with the command line, with where to read on."""
+    if isinstance(fault, UnusedCliTokensError) and fault.unused_tokens:
+        text = f"unexpected argument '{reason(fault.unused_tokens[0])}'"
+    else:
+        text = reason(fault, 300)
+    command = f" {tokens[0]}" if tokens and tokens[0] in _commands(app) else ""
+    return f"{text}\n  see {app.name[0]}{command} --help"
+
+
+def _fail(text: str, code: int, debug: bool) -> int:
+    with contextlib.suppress(OSError):
+        if debug:
+            traceback.print_exc()
+        print(f"error: {text}", file=sys.stderr, flush=True)
+    return code
+
+
+def run(app: App, argv: Sequence[str] | None = None) -> int:
+    """Run a command line and return its exit code; no exception leaves except SystemExit.
+
+    Parameters
+    ----------
+    app : made by :func:`new_app`
+    argv : arguments after the program's name; the process's own by default
+
+    Exit codes: 0 done, 2 usage, 3 bad input or machine, 4 partial and resumable, 130 interrupted, 1 a defect
+    of ours. Errors are one or two lines on standard error; ``--debug`` anywhere adds the traceback.
+    """
+    debug, tokens = _take_debug(sys.argv[1:] if argv is None else list(argv))
+    _route_logs(tokens, debug)
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            # A terminal without our signs (Greek letters, ±) shows question marks instead of failing.
+            stream.reconfigure(errors="replace")
+    try:
+        tokens = _command_first(app, _join_negative_pairs(tokens))
+        with _ended_like_interrupted():
+            result = app(tokens)
+        sys.stdout.flush()
+        return result if type(result) is int else EXIT_OK
+    except MbtfError as error:
+        return _fail(error.message, error.exit_code, debug)
+    except CycloptsError as error:
+        return _fail(_usage_message(app, error, tokens), EXIT_USAGE, debug)
+    except KeyboardInterrupt:
+        return _fail("interrupted", EXIT_INTERRUPTED, debug)
+    except BrokenPipeError:
+        # The reader of our output has gone (`| head`); Python would complain again when it flushes at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return _EXIT_BROKEN_PIPE
+    except OSError as error:
+        if error.filename is None:
+            return _internal(error, debug)
+        return _fail(f"{reason(str(error.filename))}: {error.strerror}", EXIT_BAD_INPUT, debug)
+    except Exception as error:
+        return _internal(error, debug)
+
+
+def _internal(error: Exception, debug: bool) -> int:
+    text = reason(error, 1000)
+    hint = "" if debug else " (run again with --debug for the traceback)"
+    return _fail(f"internal error: {type(error).__name__}: {text}{hint}", EXIT_INTERNAL, debug)

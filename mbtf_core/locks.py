@@ -1,0 +1,222 @@
+"""Locks per shard: a file beside the shard that names its writer, so that several writers share one folder.
+
+The lock itself is the kernel's advisory lock on that file: it ends with its process, however that ends, and
+nobody has to guess whether a writer still lives. Machines that share a folder without sharing such locks go
+by what the file says: its writer's machine and its age, which the writer renews while it works.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import json
+import os
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+from mbtf_core.atomic import unwritable
+from mbtf_core.errors import PartialError
+
+# Seconds after which the lock of another machine counts as abandoned, and between two signs of life.
+STALE_SECONDS = 1800.0
+RENEW_SECONDS = 300.0
+# What a file system without advisory locks answers.
+_NO_LOCKS = (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK)
+# Waiting for a lock that is held for moments only.
+_POLL_SECONDS = 0.02
+_PATIENCE_SECONDS = 60.0
+
+
+@dataclass(frozen=True)
+class Owner:
+    """Who holds a lock: machine, process, and since when (seconds since 1970)."""
+
+    host: str
+    process: int
+    since: float
+
+    def __str__(self) -> str:
+        return f"process {self.process} on {self.host}, for {_age(time.time() - self.since)}"
+
+
+def _age(seconds: float) -> str:
+    for size, unit in ((86400, "d"), (3600, "h"), (60, "min")):
+        if seconds >= size:
+            return f"{seconds / size:.0f} {unit}"
+    return f"{max(0.0, seconds):.0f} s"
+
+
+class Lock:
+    """A lock that is held; :meth:`release` lets go, from any thread."""
+
+    _held: ClassVar[set[Lock]] = set()
+    _guard: ClassVar[threading.Lock] = threading.Lock()
+
+    def __init__(self, path: Path, handle: int) -> None:
+        self.path = path
+        self._handle = handle
+        with Lock._guard:
+            Lock._held.add(self)
+
+    def release(self) -> None:
+        """Remove the file and let go; once is enough, and more does no harm."""
+        with Lock._guard:
+            if self not in Lock._held:
+                return
+            Lock._held.discard(self)
+            try:
+                # A file that cannot be removed locks nothing once its holder has let go.
+                with contextlib.suppress(OSError):
+                    self.path.unlink()
+            finally:
+                os.close(self._handle)
+
+    @classmethod
+    def renew(cls) -> None:
+        """A sign of life for other machines, on every lock that this process holds."""
+        with cls._guard:
+            for lock in cls._held:
+                with contextlib.suppress(OSError):
+                    os.utime(lock._handle)
+
+
+def lock_file_of(path: Path) -> Path:
+    """The lock that belongs to a shard, or to another file of its folder."""
+    return path.with_name(f".{path.stem}.lock")
+
+
+def _locked(lock: Path) -> tuple[int, bool] | None:
+    """Descriptor of the locked file, and whether the system really locks; None where another process holds
+    it."""
+    while True:
+        handle = os.open(lock, os.O_CREAT | os.O_RDWR, 0o666)
+        real = True
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(handle)
+            return None
+        except OSError as error:
+            if error.errno not in _NO_LOCKS:
+                os.close(handle)
+                raise
+            real = False
+        try:
+            # Its former holder removes the file before letting go: what is locked may be gone by now.
+            if os.path.samestat(os.fstat(handle), os.stat(lock)):
+                return handle, real
+        except FileNotFoundError:
+            pass
+        except OSError:
+            os.close(handle)
+            raise
+        os.close(handle)
+
+
+def _parsed(content: bytes) -> Owner | None:
+    try:
+        data = json.loads(content)
+        return Owner(str(data["host"]), int(data["process"]), float(data["since"]))
+    except (ValueError, KeyError, TypeError):
+        return None
+
+
+def lock_owner(path: Path) -> Owner | None:
+    """Who holds (or held last) the lock of `path`, as its file says; None where that says nothing."""
+    try:
+        return _parsed(lock_file_of(path).read_bytes()[:4096])
+    except OSError:
+        return None
+
+
+def _alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+def _held_elsewhere(handle: int, real: bool, stale: float) -> bool:
+    """Whether the file's content speaks of a writer that the system's lock does not show: one on another
+    machine, not long ago, or, where there are no locks, another living process."""
+    owner = _parsed(os.pread(handle, 4096, 0))
+    if owner is None:
+        return False
+    if owner.host != socket.gethostname():
+        return time.time() - os.fstat(handle).st_mtime < stale
+    return not real and owner.process != os.getpid() and owner.process > 0 and _alive(owner.process)
+
+
+def take_lock(path: Path, stale: float = STALE_SECONDS) -> Lock | None:
+    """Take the lock of the shard `path`; None when another writer holds it.
+
+    Parameters
+    ----------
+    stale : seconds without a sign of life after which another machine's lock counts as abandoned
+
+    Raises
+    ------
+    PartialError : the folder cannot be written
+    """
+    file = lock_file_of(path)
+    try:
+        found = _locked(file)
+        if found is None:
+            return None
+        handle, real = found
+        try:
+            if _held_elsewhere(handle, real, stale):
+                os.close(handle)
+                return None
+            owner = {"host": socket.gethostname(), "process": os.getpid(), "since": time.time()}
+            os.ftruncate(handle, 0)
+            os.pwrite(handle, json.dumps(owner).encode(), 0)
+        except OSError:
+            os.close(handle)
+            raise
+    except OSError as error:
+        raise unwritable(file, error) from None
+    return Lock(file, handle)
+
+
+@contextlib.contextmanager
+def shard_lock(path: Path) -> Iterator[bool]:
+    """Hold the lock of the shard `path`; yields False when another writer holds it."""
+    lock = take_lock(path)
+    try:
+        yield lock is not None
+    finally:
+        if lock is not None:
+            lock.release()
+
+
+@contextlib.contextmanager
+def brief_lock(path: Path) -> Iterator[None]:
+    """Hold a lock that everybody holds for moments only, such as the manifest's; waits for it.
+
+    Raises
+    ------
+    PartialError : another process keeps it
+    """
+    give_up = time.monotonic() + _PATIENCE_SECONDS
+    while (lock := take_lock(path, _PATIENCE_SECONDS)) is None:
+        if time.monotonic() > give_up:
+            raise PartialError(
+                f"is being written by another process ({lock_owner(path)})",
+                where=path,
+                hint="wait for it, then run the same command again",
+            )
+        time.sleep(_POLL_SECONDS)
+    try:
+        yield
+    finally:
+        lock.release()

@@ -1,0 +1,82 @@
+"""The shard format's vocabulary: schema version, arrays, units, conventions in words.
+
+Every other module, the manifest and ``docs/format.md`` take their names and wording from here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+FORMAT_NAME = "mbtf-shards"
+SCHEMA_VERSION = 1
+MANIFEST_NAME = "manifest.json"
+CONFIG_NAME = "config.yaml"
+
+Layout = Literal["shuffled", "image"]
+ArrayFormat = Literal["npz", "exr"]
+# What is done to maps that do not tile.
+Tiling = Literal["none", "mirror", "blend"]
+Split = Literal["train", "test"]
+SPLITS: tuple[Split, ...] = ("train", "test")
+
+
+@dataclass(frozen=True)
+class ArraySpec:
+    """One stored array: its trailing shape after the query axes, its unit, its meaning, its EXR channels."""
+
+    name: str
+    trailing: tuple[int, ...]
+    unit: str
+    meaning: str
+    channels: tuple[str, ...]
+    optional: bool = False
+
+    @property
+    def dtype(self) -> np.dtype[np.float32]:
+        """Little-endian float32, all of them."""
+        return np.dtype("<f4")
+
+
+def _array(name: str, channels: str, unit: str, meaning: str, optional: bool = False) -> ArraySpec:
+    suffixes = channels.split()
+    names = tuple(f"{name}.{c}" for c in suffixes) if suffixes else (name,)
+    return ArraySpec(name, (len(suffixes),) if suffixes else (), unit, meaning, names, optional=optional)
+
+
+ARRAYS: tuple[ArraySpec, ...] = (
+    _array(
+        "u", "x y", "uv", "query position on the reference plane, uv in [0,1)^2, v = 0 at the images' bottom"
+    ),
+    _array("sigma", "", "tile widths", "standard deviation of the isotropic Gaussian footprint"),
+    _array("omega_i", "x y z", "unit vector", "direction from the surface towards the light, z > 0"),
+    _array("omega_o", "x y z", "unit vector", "direction from the surface towards the viewer, z > 0"),
+    _array("value_a", "R G B", "1/sr", "first independent estimate of M (linear Rec.709 RGB)"),
+    _array("value_b", "R G B", "1/sr", "second independent estimate of M (linear Rec.709 RGB)"),
+    _array("spp", "", "paths", "paths traced for this query, both halves together"),
+    _array("transmittance", "", "1", "share of the footprint that is seen through holes", optional=True),
+)
+ARRAY: dict[str, ArraySpec] = {a.name: a for a in ARRAYS}
+
+CONVENTIONS: dict[str, str] = {
+    "tile": "the material's period; uv in [0,1)^2; position on the reference plane x = (u, a*v), "
+    "z its normal; a = H/W is the aspect; lengths (sigma, heights) are in tile widths, isotropic in x",
+    "image_rows": "row 0 of every map is the side v -> 1; texel centers at ((i+1/2)/W, 1-(j+1/2)/H)",
+    "heights": "z = height * (h - max h): the highest point touches the reference plane z = 0",
+    "directions": "omega_i from the surface towards the light, omega_o from the surface towards the viewer, "
+    "unit vectors in the tile's frame, z > 0",
+    "light": "von Mises-Fisher lobe p around omega_i, cut at the horizon and normalized so that the "
+    "irradiance on the reference plane is exactly 1; its width is the RMS angle per axis in degrees, "
+    "0 a delta light",
+    "value": "M(u, sigma, omega_i, omega_o) in 1/sr: radiance leaving towards omega_o under that light, "
+    "averaged over a Gaussian footprint on the reference plane, wrapped on the torus; "
+    "no cosine, no clamp, no log; a Lambert plane gives albedo/pi",
+    "sigma": "standard deviation of the footprint in tile widths; level l = -log2(2 sigma)",
+    "levels": "level s has 2^s x max(1, round(a 2^s)) texels and sigma_s = 2^-s / 2; data lie in l in [0, k]",
+    "halves": "value_a and value_b are independent estimates from spp/2 paths each; the value is their mean "
+    "and (a-b)^2/4 an unbiased estimate of the variance of that mean",
+    "color": "linear, Rec.709 primaries, RGB order",
+    "holes": "a ray that passes through a hole sees black; value is premultiplied",
+}

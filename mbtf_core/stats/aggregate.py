@@ -1,0 +1,126 @@
+"""Two Monte Carlo data sets at the same queries: do they estimate the same values?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mbtf_core.stats.estimate import Estimate, checked, mean_estimate
+from mbtf_core.stats.groups import group_labels
+from mbtf_core.stats.paired import mean_of_halves
+from mbtf_core.stats.significance import Z_MINIMUM, holm, t_test
+
+Kind = Literal["mean", "scatter"]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One tested aggregate.
+
+    Attributes
+    ----------
+    group, channel : which rows and which channel
+    kind : ``mean``: mean difference; ``scatter``: mean squared true difference
+    estimate : the quantity, expected to be zero
+    p_value : of this test alone
+    corrected : corrected for all tests made together (Holm)
+    """
+
+    group: int
+    channel: int
+    kind: Kind
+    estimate: Estimate
+    p_value: float
+    corrected: float
+
+
+@dataclass(frozen=True)
+class Aggregate:
+    """All comparisons of :func:`aggregate_test`."""
+
+    comparisons: tuple[Comparison, ...]
+
+    @property
+    def p_value(self) -> float:
+        """Smallest corrected p-value: below α the data sets differ, with a false-alarm rate of at most α."""
+        return min(c.corrected for c in self.comparisons)
+
+    @property
+    def worst(self) -> Comparison:
+        """The comparison that speaks most strongly against agreement."""
+        return min(self.comparisons, key=lambda c: c.p_value)
+
+    def __str__(self) -> str:
+        w = self.worst
+        return (
+            f"{len(self.comparisons)} comparisons, smallest corrected p = {self.p_value:.3g} "
+            f"({w.kind} difference of group {w.group}, channel {w.channel}: {w.estimate})"
+        )
+
+
+def aggregate_test(
+    a1: ArrayLike,
+    b1: ArrayLike,
+    a2: ArrayLike,
+    b2: ArrayLike,
+    groups: ArrayLike | None = None,
+    *,
+    minimum: int = Z_MINIMUM,
+) -> Aggregate:
+    """Compare two data sets at the same queries, by group and channel, corrected for the number of tests.
+
+    Two aggregates are tested in each group and channel. The **mean** difference, with its error from the
+    halves, finds a bias. The **scatter**, the mean of ``(a1-a2)(b1-b2)``, has the expectation ``(t1-t2)²``
+    without noise and finds differences that average out, such as a shifted map; it is tested one-sided. Both
+    are tested by Student's t with their own degrees of freedom. To test one data set against known values,
+    give these as both `a2` and `b2`.
+
+    Parameters
+    ----------
+    a1, b1 : halves of the first data set, (n, channels) or (items, rows, columns, channels)
+    a2, b2 : halves of the second at the same queries in the same order, drawn independently of the first
+    groups : (n,) integer labels; one group by default; negative labels leave rows out
+    minimum : fewest units a group may have; a smaller one is refused because the tails of few heavy-tailed
+        values are not those of the t distribution
+
+    Raises
+    ------
+    ValueError : shapes differ, no group, or a group has fewer than `minimum` units
+    """
+    arrays = [_channels(array, name) for array, name in ((a1, "a1"), (b1, "b1"), (a2, "a2"), (b2, "b2"))]
+    if len({array.shape for array in arrays}) > 1:
+        raise ValueError(f"the halves have different shapes: {', '.join(str(x.shape) for x in arrays)}")
+    n, _, channels = arrays[0].shape
+    labels = np.zeros(n, np.int64) if groups is None else group_labels(groups, n)
+    found: list[tuple[int, int, Kind, Estimate, float]] = []
+    for label in np.unique(labels[labels >= 0]):
+        x1, y1, x2, y2 = (array[labels == label] for array in arrays)
+        if len(x1) < minimum:
+            raise ValueError(
+                f"group {label} has {len(x1)} units, fewer than {minimum}: merge groups or lower `minimum`"
+            )
+        for c in range(channels):
+            mean = _mean_difference(x1[..., c], y1[..., c], x2[..., c], y2[..., c])
+            scatter = mean_estimate((x1[..., c] - x2[..., c]) * (y1[..., c] - y2[..., c]))
+            found.append((int(label), c, "mean", mean, t_test(mean).p_value))
+            found.append((int(label), c, "scatter", scatter, t_test(scatter, 0.0, "greater").p_value))
+    if not found:
+        raise ValueError("no group to compare")
+    corrected = holm([p for *_, p in found])
+    return Aggregate(tuple(Comparison(*row, float(c)) for row, c in zip(found, corrected, strict=True)))
+
+
+def _channels(array: ArrayLike, name: str) -> NDArray[np.float64]:
+    """(n, texels, channels) of any accepted shape."""
+    x = checked(array, name)
+    return x.reshape(len(x), -1, x.shape[-1] if x.ndim > 1 else 1)
+
+
+def _mean_difference(
+    a1: NDArray[np.float64], b1: NDArray[np.float64], a2: NDArray[np.float64], b2: NDArray[np.float64]
+) -> Estimate:
+    """Mean difference over these queries; the two noises add, each with its own degrees of freedom."""
+    return t_test(mean_of_halves(a1, b1), mean_of_halves(a2, b2)).difference

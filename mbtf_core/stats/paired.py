@@ -1,0 +1,211 @@
+"""What two independent halves tell: noise, and error and variance free of it.
+
+Every query q is estimated twice, ``a_q = t_q + α_q`` and ``b_q = t_q + β_q``, with the truth ``t_q`` and
+noise α, β of mean zero, independent of each other and between queries. Products of an a with a b therefore
+have the expectation they would have without noise; squares of one half do not.
+
+Arrays are ``(n,)``, ``(n, channels)`` or ``(items, rows, columns, channels)``. The first axis counts the
+independent units. Everything else is averaged within a unit before an error bar is taken: channels of one
+query are correlated, and texels of one buffer share its directions.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mbtf_core.stats.estimate import Estimate, checked, mean_estimate, per_unit
+
+
+def _pair(a: ArrayLike, b: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    first, second = checked(a, "value_a"), checked(b, "value_b")
+    if first.shape != second.shape:
+        raise ValueError(f"halves need equal shapes, not {first.shape} and {second.shape}")
+    return first, second
+
+
+def _with_prediction(
+    prediction: ArrayLike, a: ArrayLike, b: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    first, second = _pair(a, b)
+    p = checked(prediction, "prediction")
+    if p.shape != first.shape:
+        raise ValueError(f"prediction has the shape {p.shape}, the halves {first.shape}")
+    return p, first, second
+
+
+def mean_of_halves(a: ArrayLike, b: ArrayLike) -> Estimate:
+    """Mean value over **these** queries, channels averaged; its error is Monte Carlo noise alone.
+
+    Unbiased because each half is. The variance ``Σ (a-b)²/4 / n²`` is unbiased too: ``E(a-b)²`` is ``Var a
+    + Var b`` and ``Var (a+b)/2`` a quarter of that. `dof` is the effective number of degrees of freedom of
+    this sum of single-pair variances v: Satterthwaite's (1946) ``(Σv)²/Σv²``, where a variance estimated
+    from one pair of normal halves has three times the square it should, so ``3 (Σv)²/Σv² - 2``. That is 1
+    for one query, about n for n alike ones, and few where few queries make the noise. Unlike
+    :func:`mean_estimate` it ignores that other queries might have been drawn.
+
+    Returns
+    -------
+    Estimate in the values' unit
+    """
+    first, second = _pair(a, b)
+    x, y = per_unit(first), per_unit(second)
+    variances = (x - y) ** 2 / 4.0
+    n, total = len(x), float(variances.sum())
+    dof = 3.0 * total**2 / float((variances**2).sum()) - 2.0 if total > 0 else float(n)
+    return Estimate(float((x + y).mean() / 2.0), math.sqrt(total) / n, n, max(1.0, dof))
+
+
+def pooled_variance(a: ArrayLike, b: ArrayLike) -> Estimate:
+    """Noise variance of one query's value ``(a+b)/2``, pooled over queries and channels.
+
+    The mean of ``(a-b)²/4``. Unbiased for any noise, also of different variance in the two halves:
+    ``E(a-b)² = Var a + Var b = 4 Var (a+b)/2``. Unit: the values' squared.
+    """
+    first, second = _pair(a, b)
+    return mean_estimate((first - second) ** 2 / 4.0)
+
+
+def pooled_error(a: ArrayLike, b: ArrayLike) -> Estimate:
+    """Root mean square noise of one query's value ``(a+b)/2``, in the values' unit.
+
+    The square root of :func:`pooled_variance`, whose error bar it takes by the delta method; the root of an
+    unbiased estimate is low by about ``error²/(2 value)``, negligible beyond some hundred queries.
+    """
+    return _root(pooled_variance(a, b))
+
+
+def pooled_relative_error(a: ArrayLike, b: ArrayLike, floor: float | None = None) -> Estimate:
+    """Noise of the values relative to the values, pooled; a pure number.
+
+    Parameters
+    ----------
+    floor : None divides the root mean square noise by the root mean square truth,
+        ``√(mean (a-b)²/4 / mean ab)``: both means are unbiased, the ratio is consistent. A number, such as
+        the tile mean, divides each query's noise by ``max(|a+b|/2, floor)`` first: the measure that a target
+        error is set in. Its denominators are noisy where the value is, so it is only as good as the floor is
+        large against the noise.
+    """
+    first, second = _pair(a, b)
+    noise = (first - second) ** 2 / 4.0
+    if floor is not None:
+        if not floor > 0:
+            raise ValueError(f"floor must be positive, not {floor}")
+        return _root(mean_estimate(noise / np.maximum(np.abs(first + second) / 2.0, floor) ** 2))
+    return _root(_ratio(per_unit(noise), per_unit(first * second)))
+
+
+def noise_free_mse(prediction: ArrayLike, a: ArrayLike, b: ArrayLike) -> Estimate:
+    """Mean squared error of a prediction against the truth, without the noise of the reference.
+
+    The mean of ``(p-a)(p-b)`` over queries and channels. Unbiased as long as p was not made from these
+    halves: ``E (p-t-α)(p-t-β) = (p-t)²`` because α and β are independent of mean zero. It may come out
+    negative when the true error lies below the noise. Unit: the values' squared.
+    """
+    p, first, second = _with_prediction(prediction, a, b)
+    return mean_estimate((p - first) * (p - second))
+
+
+def mse_difference(prediction: ArrayLike, other: ArrayLike, a: ArrayLike, b: ArrayLike) -> Estimate:
+    """Noise-free mean squared error of `prediction` minus that of `other`, compared query by query.
+
+    Negative where `prediction` is better. Reference noise that both share cancels, so the error bar is much
+    smaller than that of two separate errors. Unbiased like :func:`noise_free_mse`.
+    """
+    p, first, second = _with_prediction(prediction, a, b)
+    q, _, _ = _with_prediction(other, a, b)
+    return mean_estimate((p - first) * (p - second) - (q - first) * (q - second))
+
+
+def signal_variance(a: ArrayLike, b: ArrayLike) -> Estimate:
+    """Variance of the true values over queries, free of noise: per channel about its mean, then averaged.
+
+    For ``(n, channels)`` the sample covariance of a and b, ``Σ (a-ā)(b-b̄)/(n-1)``: given the queries, every
+    a is independent of every b, so its expectation is the covariance of t with itself. For buffers the term
+    subtracted with ``ā b̄`` is made good by the covariance of the buffers' means over n, which keeps it
+    unbiased when whole buffers are drawn. Unit: the values' squared.
+    """
+    products, correction = _centerd_products(*_pair(a, b))
+    spread = mean_estimate(products)
+    if spread.n < 2:
+        return Estimate(math.nan, math.inf, spread.n)
+    return Estimate(spread.value + correction, spread.error, spread.n)
+
+
+def unexplained_variance(
+    prediction: ArrayLike, a: ArrayLike, b: ArrayLike, weights: ArrayLike | None = None
+) -> Estimate:
+    """Share of the true values' variance that a prediction misses: noise-free MSE ÷ signal variance.
+
+    0 is perfect, 1 no better than the mean value, more is possible. Numerator and denominator are unbiased;
+    the ratio is consistent, with a bias of order 1/n. The error bar is the delta method's, from the scatter
+    of ``x_q - R y_q`` over units, in which the correlation of both is accounted for. Where the signal
+    variance is not even twice its own error the ratio has no meaning: the value is NaN and the error
+    infinite.
+
+    Parameters
+    ----------
+    prediction, a, b : equal shapes
+    weights : (n,) of the units, above 0: one over the probability with which each was taken, where they were
+        not taken all alike. Sums over units then stand for those over all that might have been taken
+        (Horvitz & Thompson 1952); only their ratios matter
+
+    Raises
+    ------
+    InputError : a number is NaN or infinite
+    ValueError : shapes differ, or a weight is not above 0
+    """
+    p, first, second = _with_prediction(prediction, a, b)
+    w = _weights(weights, len(first))
+    products, correction = _centerd_products(first, second, w)
+    return _ratio(per_unit((p - first) * (p - second)), products + correction, w)
+
+
+def _weights(weights: ArrayLike | None, n: int) -> NDArray[np.float64]:
+    """Weights (n,) of mean 1."""
+    if weights is None:
+        return np.ones(n)
+    w = checked(weights, "weights")
+    if w.shape != (n,) or not np.all(w > 0):
+        raise ValueError(f"weights must be {n} numbers above 0, one for each unit")
+    return w / w.mean()
+
+
+def _centerd_products(
+    a: NDArray[np.float64], b: NDArray[np.float64], w: NDArray[np.float64] | None = None
+) -> tuple[NDArray[np.float64], float]:
+    """Per unit ``(a-ā)(b-b̄)`` (n,), and what must be added to its mean to make it unbiased (for weights of 1,
+    the mean of `w`)."""
+    n = len(a)
+    channels = a.shape[-1] if a.ndim > 1 else 1
+    x, y = a.reshape(n, -1, channels), b.reshape(n, -1, channels)
+    # Constant data must come out as exactly zero, without the rounding of their mean.
+    x, y = x - x[0, 0], y - y[0, 0]
+    x, y = (v - np.average(v.mean(axis=1), axis=0, weights=w) for v in (x, y))
+    squares = 1.0 if w is None else w[:, None] ** 2
+    between = float((squares * x.mean(axis=1) * y.mean(axis=1)).sum(axis=0).mean())
+    return per_unit(x * y), between / (n * (n - 1)) if n > 1 else 0.0
+
+
+def _ratio(
+    numerator: NDArray[np.float64], denominator: NDArray[np.float64], w: NDArray[np.float64] | None = None
+) -> Estimate:
+    """Ratio of the weighted means of two correlated per-unit arrays (n,), with the delta method's error."""
+    n = len(numerator)
+    w = np.ones(n) if w is None else w
+    below = float((w * denominator).mean())
+    # Of a ratio of weighted sums: that of the residuals, whose weighted mean is zero.
+    scale = 1.0 / math.sqrt(n * (n - 1)) if n > 1 else math.inf
+    if n < 2 or below <= 2.0 * scale * float(np.linalg.norm(w * (denominator - below))):
+        return Estimate(math.nan, math.inf, n)
+    ratio = float((w * numerator).mean()) / below
+    residual = numerator - ratio * denominator
+    return Estimate(ratio, scale * float(np.linalg.norm(w * residual)) / below, n)
+
+
+def _root(estimate: Estimate) -> Estimate:
+    value = math.sqrt(estimate.value) if estimate.value >= 0 else math.nan
+    error = estimate.error / (2.0 * value) if value > 0 else estimate.error
+    return Estimate(value, error, estimate.n, estimate.dof)

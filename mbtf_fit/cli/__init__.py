@@ -1,0 +1,1 @@
+"""Commands of ``mbtf-fit``, one file each."""

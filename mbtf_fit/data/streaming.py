@@ -1,0 +1,132 @@
+"""Which rows of the shards are trained on, and batches of them read from memory-mapped shards.
+
+Data that do not fit into memory stay where they are. The rows of a batch are the same ones, in the same
+order, as if everything were in memory, so that where the data lie changes nothing but time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from mbtf_fit.data.loader import NEEDED, TrainingQueries, batch_starts, mean_value
+from mbtf_gen.dataset.shard_io import Arrays, read_shard
+
+# Rows of a shard between two counts of what is trained on: where to look for a row.
+_BLOCK = 4096
+# Parts of a batch that a message names.
+_NAMED = 3
+
+
+class Selection:
+    """Rows of shards that are trained on, numbered through: one bit per row of the data.
+
+    Attributes
+    ----------
+    paths : of the shards
+    starts : number of the first row of each shard, and of all rows
+    """
+
+    def __init__(self) -> None:
+        self.paths: list[Path] = []
+        self.starts: list[int] = [0]
+        self._bits: list[NDArray[np.uint8]] = []
+        self._counts: list[NDArray[np.int64]] = []
+        self._sizes: list[int] = []
+
+    def __len__(self) -> int:
+        return self.starts[-1]
+
+    def add(self, path: Path, chosen: NDArray[np.bool_]) -> None:
+        """Append a shard of which the `chosen` rows are trained on."""
+        blocks = np.add.reduceat(chosen, np.arange(0, len(chosen), _BLOCK), dtype=np.int64)
+        self.paths.append(path)
+        self._sizes.append(len(chosen))
+        self._bits.append(np.packbits(chosen))
+        self._counts.append(np.concatenate([[0], np.cumsum(blocks)]))
+        self.starts.append(self.starts[-1] + int(self._counts[-1][-1]))
+
+    def masks(self) -> Iterator[tuple[Path, NDArray[np.bool_]]]:
+        """(shard, which of its rows are trained on)."""
+        for path, bits, size in zip(self.paths, self._bits, self._sizes, strict=True):
+            yield path, np.unpackbits(bits, count=size).astype(bool)
+
+    def _rows(self, shard: int, start: int, stop: int) -> NDArray[np.int64]:
+        counts = self._counts[shard]
+        first = int(np.searchsorted(counts, start, "right")) - 1
+        last = int(np.searchsorted(counts, stop, "left"))
+        bits = self._bits[shard][first * _BLOCK // 8 : last * _BLOCK // 8]
+        rows = np.flatnonzero(np.unpackbits(bits)) + first * _BLOCK
+        return rows[start - counts[first] : stop - counts[first]]
+
+    def pieces(self, start: int, stop: int) -> Iterator[tuple[Path, NDArray[np.int64]]]:
+        """(shard, its rows) that the numbers from `start` to before `stop` stand for."""
+        for shard, (begin, end) in enumerate(pairwise(self.starts)):
+            low, high = max(start, begin), min(stop, end)
+            if low < high:
+                yield self.paths[shard], self._rows(shard, low - begin, high - begin)
+
+    def describe(self, numbers: Sequence[range]) -> str:
+        """Numbered rows in words, the first few of them: ``train-00003.npz rows 17-4112``."""
+        found = [piece for part in numbers for piece in self.pieces(part.start, part.stop)]
+        words = [
+            f"{path.name} row{'s' if len(rows) > 1 else ''} "
+            + "-".join(str(r) for r in rows[[0, -1][: len(rows)]])
+            for path, rows in found[:_NAMED]
+        ]
+        more = [f"{len(found) - _NAMED} more"] if len(found) > _NAMED else []
+        return " and ".join([*words, *more])
+
+
+class StreamedQueries:
+    """Training queries that stay on disk; every batch maps the shards that it comes from, and lets them go.
+
+    Parameters
+    ----------
+    selection : what is trained on; npz shards
+    device : where batches go
+    """
+
+    def __init__(self, selection: Selection, device: torch.device | None = None) -> None:
+        self.selection = selection
+        self.device = device or torch.device("cpu")
+
+    def __len__(self) -> int:
+        return len(self.selection)
+
+    def to(self, device: torch.device) -> StreamedQueries:
+        """The same with batches on another device."""
+        return StreamedQueries(self.selection, device)
+
+    def numbers(self, size: int, seed: int, step: int) -> list[range]:
+        """Numbers of the queries in the batch of a step."""
+        start = next(batch_starts(len(self), size, seed, step))
+        return [range(start, start + size)]
+
+    def slice(self, start: int, stop: int) -> TrainingQueries:
+        """Consecutive queries, read now."""
+        parts: list[Arrays] = []
+        for path, rows in self.selection.pieces(start, stop):
+            mapped = read_shard(path, NEEDED)
+            span, inside = slice(rows[0], rows[-1] + 1), rows - rows[0]
+            parts.append({name: array[span][inside] for name, array in mapped.items()})
+        joined = {name: np.concatenate([p[name] for p in parts]) for name in NEEDED}
+        joined["value"] = mean_value(joined.pop("value_a"), joined.pop("value_b"))
+        return TrainingQueries(**{k: torch.from_numpy(v) for k, v in joined.items()}).to(self.device)
+
+    def batches(self, size: int, seed: int, step: int, margin: int = 0) -> Iterator[TrainingQueries]:
+        """As :meth:`TrainingQueries.batches`; the next batch is read while the present one is trained on."""
+        starts = batch_starts(len(self), size, seed, step)
+        with ThreadPoolExecutor(1) as reader:
+            first = next(starts)
+            waiting = reader.submit(self.slice, first, first + size)
+            for start in starts:
+                batch = waiting.result()
+                waiting = reader.submit(self.slice, start, start + size)
+                yield batch

@@ -1,0 +1,1 @@
+"""The fitted material: its folder, its evaluation, its exports."""

@@ -1,0 +1,12 @@
+"""A material in other programs' forms: textures as EXR, networks as a list of layers, half precision.
+
+The folder that ``mbtf-fit`` writes is written by :mod:`mbtf_fit.material.material`.
+"""
+
+from __future__ import annotations
+
+from mbtf_fit.material.export.half import HalfError, to_half
+from mbtf_fit.material.export.layers import LAYERS_NAME, write_layers
+from mbtf_fit.material.export.textures import TEXTURES_NAME, write_textures
+
+__all__ = ["LAYERS_NAME", "TEXTURES_NAME", "HalfError", "to_half", "write_layers", "write_textures"]

@@ -1,0 +1,141 @@
+"""The material folder's vocabulary: names, schema, conventions in words, and what a reader checks first.
+
+Free of PyTorch, so that renderers can read a material without it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import BaseModel, Field
+
+from mbtf_core.atomic import digest, read_json
+from mbtf_core.config_file import check_document
+from mbtf_core.errors import InputError
+from mbtf_core.lattice import MAX_LEVEL
+from mbtf_core.suggest import suggest_path
+
+FORMAT_NAME = "mbtf-material"
+SCHEMA_VERSION = 1
+DESCRIPTION_NAME = "material.json"
+WEIGHTS_NAME = "weights.safetensors"
+# Queries with expected values that every exported material carries.
+CONFORMANCE_COUNT = 256
+CONFORMANCE = ("u", "sigma", "omega_i", "omega_o", "rgb")
+
+
+class _Weights(BaseModel):
+    sha256: str
+    network_weights: int
+    texels: int
+
+
+class _Holes(BaseModel):
+    sha256: str
+
+
+class _Levels(BaseModel):
+    finest: Annotated[int, Field(strict=True, ge=0, le=MAX_LEVEL)]
+
+
+class _Tile(BaseModel):
+    aspect: Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)]
+
+
+class _Conformance(BaseModel):
+    count: int
+
+
+class _Training(BaseModel):
+    steps: int
+    batch: int
+    seconds: float
+    device: str
+    threads: int
+    errors: dict[str, Any]
+
+
+class _Description(BaseModel):
+    """What readers of ``material.json`` rely on; it holds more."""
+
+    model: str
+    config: dict[str, Any]
+    weights: _Weights
+    levels: _Levels
+    tile: _Tile
+    conformance: _Conformance
+    training: _Training
+    data: dict[str, Any]
+    holes: _Holes | None = None
+
+
+def read_description(folder: Path) -> tuple[dict[str, Any], Path]:
+    """Content of a material folder's ``material.json``, checked, and the path of its weights, digest checked.
+
+    Raises
+    ------
+    InputError : missing, damaged, or of another schema
+    """
+    if not folder.is_dir():
+        raise InputError("no such folder", where=folder, hint=suggest_path(folder, Path.is_dir))
+    path = folder / DESCRIPTION_NAME
+    if not path.exists():
+        raise InputError(
+            f"no {DESCRIPTION_NAME} in it",
+            where=folder,
+            hint="make a material with: mbtf-fit SHARDS -o FOLDER",
+        )
+    description = read_json(path)
+    if description.get("format") != FORMAT_NAME:
+        raise InputError(f"does not describe a material ({FORMAT_NAME})", where=path)
+    if description.get("schema") != SCHEMA_VERSION:
+        raise InputError(
+            f"material of schema {description.get('schema')}; this version reads schema {SCHEMA_VERSION}",
+            where=path,
+            hint="fit it again with this version of mbtf-fit",
+        )
+    check_document(_Description, description, path, "fit it again, or fetch it again from where it came")
+    weights = folder / WEIGHTS_NAME
+    if not weights.is_file() or digest(weights) != description["weights"]["sha256"]:
+        raise InputError("is missing or not the file that material.json describes", where=weights)
+    return description, weights
+
+
+def check_conformance(
+    tensors: Mapping[str, ArrayLike], description: Mapping[str, Any], weights: Path
+) -> dict[str, NDArray[np.float32]]:
+    """The stored conformance queries and their values ``rgb``, by name.
+
+    Parameters
+    ----------
+    tensors : those of :data:`CONFORMANCE` that the file holds
+
+    Raises
+    ------
+    InputError : one is missing or of a wrong shape
+    """
+    missing = [name for name in CONFORMANCE if name not in tensors]
+    if missing:
+        raise InputError(f"lacks the tensor 'conformance.{missing[0]}'", where=weights)
+    wanted = {"u": (2,), "sigma": (), "omega_i": (3,), "omega_o": (3,), "rgb": (3,)}
+    out = {name: np.asarray(tensors[name], np.float32) for name in CONFORMANCE}
+    for name, array in out.items():
+        if array.shape != (description["conformance"]["count"], *wanted[name]):
+            raise InputError(f"its tensor 'conformance.{name}' has the shape {array.shape}", where=weights)
+    return out
+
+
+MATERIAL_CONVENTIONS = {
+    "textures": "weights of a texture are (rows, columns, channels); row 0 is the side v -> 1; texel centers "
+    "at ((i+1/2)/W, 1-(j+1/2)/H); bilinear between them, wrapped in both directions",
+    "blending": "level l = clamp(-log2(2 sigma), 0, k); features are (1-frac(l)) * level floor(l) + "
+    "frac(l) * level floor(l)+1",
+    "networks": "x -> weight x + bias, after every layer but the last the activation that config.network "
+    "names: relu, leaky-relu (slope 0.01 below 0) or sine; weight is (outputs, inputs), of a convolution "
+    "(outputs, inputs, rows, columns)",
+    "clamp": "values below 0 are set to 0",
+}

@@ -1,0 +1,83 @@
+"""Evaluation of a model on NumPy arrays of any length."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from mbtf_fit.models import NeuralMaterial
+from mbtf_fit.models.neumip import Neumip
+from mbtf_fit.native import Kernel, kernel
+from mbtf_fit.native.library import QueryPointers
+from mbtf_fit.native.model import NativeModel, unsupported_reason
+
+# Queries that are evaluated at a time: bounds memory and keeps activations in the cache.
+_CHUNK = 1 << 15
+# Queries that a thread of its own pays for.
+_SHARE = 1 << 12
+
+
+def evaluate_in_chunks(
+    function: Callable[..., Tensor],
+    device: torch.device,
+    outputs: int,
+    *arrays: ArrayLike,
+    chunk: int = _CHUNK,
+) -> NDArray[np.float32]:
+    """Apply a function of tensors (n, ...) to arrays (n, ...), `chunk` at a time: (n, outputs)."""
+    inputs = [np.asarray(a, np.float32) for a in arrays]
+    out = np.empty((len(inputs[0]), outputs), np.float32)
+    with torch.no_grad():
+        for start in range(0, len(out), chunk):
+            part = slice(start, start + chunk)
+            # A copy: memory-mapped shards are read-only, which tensors cannot be.
+            tensors = (torch.from_numpy(np.array(a[part], order="C")).to(device) for a in inputs)
+            out[part] = function(*tensors).cpu().numpy()
+    return out
+
+
+def predict(
+    model: NeuralMaterial, u: ArrayLike, sigma: ArrayLike, omega_i: ArrayLike, omega_o: ArrayLike
+) -> NDArray[np.float32]:
+    """Values (n, 3) in 1/sr of a model, clamped at 0 as materials are."""
+    found = kernel()
+    if found is not None and unsupported_reason(model) is None:
+        return _predict_natively(found, model, u, sigma, omega_i, omega_o)
+    device = next(model.parameters()).device
+    arrays = (u, sigma, omega_i, omega_o)
+    return evaluate_in_chunks(
+        lambda *a: model(*a).clamp_min(0), device, 3, *arrays, chunk=max(1, _CHUNK // model.positions)
+    )
+
+
+def _predict_natively(found: Kernel, model: NeuralMaterial, *arrays: ArrayLike) -> NDArray[np.float32]:
+    assert isinstance(model, Neumip)
+    inputs = [np.ascontiguousarray(a, np.float32) for a in arrays]
+    n = len(inputs[1])
+    shapes = [(n, 2), (n,), (n, 3), (n, 3)]
+    if [a.shape for a in inputs] != shapes:
+        raise ValueError(f"queries of the shapes {[a.shape for a in inputs]}, not {shapes}")
+    native = NativeModel(found, model)
+    out = np.empty((n, 3), np.float32)
+
+    def share(start: int, stop: int) -> None:
+        addresses = (a.ctypes.data + start * a.strides[0] for a in inputs)
+        queries = QueryPointers(stop - start, *addresses)
+        native.forward(queries, native.state(1), out.ctypes.data + start * out.strides[0], clamp=True)
+
+    count = max(1, min(torch.get_num_threads(), n // _SHARE))
+    edges = [n * k // count for k in range(count + 1)]
+    if count == 1:
+        share(0, n)
+    else:
+        with ThreadPoolExecutor(count) as pool:
+            list(pool.map(lambda edge: share(*edge), pairwise(edges)))
+    if model.gain is not None:
+        out *= evaluate_in_chunks(model.gains, torch.device("cpu"), 3, *inputs[1:])
+    return out

@@ -1,0 +1,238 @@
+"""The fitted material: a folder that a renderer can read, and its evaluation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from mbtf_core.atomic import digest, write_json
+from mbtf_core.config_file import build
+from mbtf_core.directions import from_projected_disk
+from mbtf_core.errors import InputError
+from mbtf_core.lattice import Lattice, sigma_of_level
+from mbtf_core.shard_schema import CONVENTIONS
+from mbtf_fit.config import FitConfig
+from mbtf_fit.data.loader import Queries
+from mbtf_fit.material.format import (
+    CONFORMANCE,
+    CONFORMANCE_COUNT,
+    DESCRIPTION_NAME,
+    FORMAT_NAME,
+    MATERIAL_CONVENTIONS,
+    SCHEMA_VERSION,
+    WEIGHTS_NAME,
+    check_conformance,
+    read_description,
+)
+from mbtf_fit.material.inference import evaluate_in_chunks, predict
+from mbtf_fit.material.storage import read_tensors, write_tensors
+from mbtf_fit.material.transmittance import (
+    TRANSMITTANCE_NAME,
+    Transmittance,
+    read_transmittance,
+    write_transmittance,
+)
+from mbtf_fit.models import NeuralMaterial, TexturedMaterial, build_model
+
+
+def conformance_queries(lattice: Lattice) -> dict[str, NDArray[np.float32]]:
+    """The queries of every material of a lattice, all over its arguments; seams and end levels included."""
+    random = np.random.Generator(np.random.Philox(key=[0x636F6E66, lattice.finest]))
+    u = random.random((CONFORMANCE_COUNT, 2))
+    seams = [
+        [0, 0],
+        [0, 0.5],
+        [0.5, 0],
+        [0.999, 0.999],
+        [0.001, 0.999],
+        [0.5, 0.5],
+        [0.25, 0.75],
+        [0.75, 0.25],
+    ]
+    u[:8] = np.array(seams)
+    level = random.random(CONFORMANCE_COUNT) * lattice.finest
+    level[8:12] = np.array([0, lattice.finest, -1, lattice.finest + 1], np.float64)
+    level[12:16] = np.floor(level[12:16])
+    disk = np.sqrt(0.99 * random.random((2, CONFORMANCE_COUNT)))
+    angle = 2 * np.pi * random.random((2, CONFORMANCE_COUNT))
+    disk[:, 16] = 0
+    omega = from_projected_disk(np.stack([disk * np.cos(angle), disk * np.sin(angle)], -1))
+    arrays = {"u": u, "sigma": sigma_of_level(level), "omega_i": omega[0], "omega_o": omega[1]}
+    return {name: np.ascontiguousarray(array, np.float32) for name, array in arrays.items()}
+
+
+@dataclass(frozen=True)
+class Material:
+    """A fitted material.
+
+    Attributes
+    ----------
+    model : with its weights, ready to evaluate
+    config : that it was fitted with
+    description : content of ``material.json``
+    conformance : the stored queries with their expected values ``rgb`` (n, 3)
+    holes : what it lets through; None for one without holes
+    """
+
+    model: TexturedMaterial
+    config: FitConfig
+    description: dict[str, Any]
+    conformance: dict[str, NDArray[np.float32]]
+    holes: Transmittance | None = None
+
+    @classmethod
+    def load(cls, folder: str | Path, device: str = "cpu") -> Material:
+        """Load an exported material.
+
+        Raises
+        ------
+        InputError : missing, damaged, or of another schema
+        """
+        description, weights = read_description(Path(folder))
+        config = build(FitConfig, description["config"], source=str(weights.with_name(DESCRIPTION_NAME)))
+        lattice = Lattice(description["levels"]["finest"], description["tile"]["aspect"])
+        # Before memory is taken for a model that the weights cannot fill.
+        number = 2 if description["weights"].get("dtype") == "float16" else 4
+        if number * lattice.texels() * config.network.channels > weights.stat().st_size:
+            raise InputError("is too small for the levels that material.json describes", where=weights)
+        model = build_model(config.model, lattice, **config.network.model_dump())
+        tensors, _ = read_tensors(weights, device)
+        conformance = check_conformance(
+            {
+                n: tensors.pop(f"conformance.{n}").float().cpu().numpy()
+                for n in CONFORMANCE
+                if f"conformance.{n}" in tensors
+            },
+            description,
+            weights,
+        )
+        model.to(device).requires_grad_(False)
+        model.load_weights(tensors)
+        return cls(model, config, description, conformance, read_transmittance(Path(folder), description))
+
+    @property
+    def lattice(self) -> Lattice:
+        """Texel grids of the tile."""
+        return self.model.lattice
+
+    def evaluate(
+        self, u: ArrayLike, sigma: ArrayLike, omega_i: ArrayLike, omega_o: ArrayLike
+    ) -> NDArray[np.float32]:
+        """Values M(u, σ, ω_i, ω_o) in 1/sr, linear RGB, at least 0.
+
+        Parameters
+        ----------
+        u : (n, 2) uv, any real numbers: the tile repeats
+        sigma : (n,) tile widths; outside the material's levels the nearest level answers
+        omega_i, omega_o : (n, 3) unit vectors towards light and viewer, z > 0
+
+        Returns
+        -------
+        (n, 3)
+        """
+        return predict(self.model, u, sigma, omega_i, omega_o)
+
+    def offset(self, u: ArrayLike, omega_o: ArrayLike) -> NDArray[np.float32]:
+        """By how much the material moves its lookup at `u` (n, 2) seen from `omega_o` (n, 3): (n, 2) in tile
+        widths along u and v; zero for a model without offsets."""
+        device = next(self.model.parameters()).device
+        return evaluate_in_chunks(self.model.offset, device, 2, u, omega_o)
+
+    def predict(self, queries: Queries) -> NDArray[np.float32]:
+        """:meth:`evaluate` at queries of a data set."""
+        return self.evaluate(queries.u, queries.sigma, queries.omega_i, queries.omega_o)
+
+    def deviation(self) -> float:
+        """Largest difference between the stored conformance values and what is evaluated here, in 1/sr."""
+        found = self.evaluate(*(self.conformance[name] for name in CONFORMANCE[:-1]))
+        return float(np.abs(found - self.conformance["rgb"]).max())
+
+
+def conformance_values(
+    model: NeuralMaterial, queries: Mapping[str, NDArray[np.float32]]
+) -> NDArray[np.float32]:
+    """Expected values (n, 3) of conformance queries."""
+    device = next(model.parameters()).device
+    with torch.no_grad():
+        rgb = model(*(torch.from_numpy(queries[name]).to(device) for name in CONFORMANCE[:-1]))
+    return np.asarray(rgb.clamp_min(0).cpu().numpy())
+
+
+def export(
+    model: NeuralMaterial,
+    config: FitConfig,
+    folder: Path,
+    *,
+    data: dict[str, Any],
+    training: dict[str, Any],
+    half: bool = False,
+    holes: Transmittance | None = None,
+) -> Material:
+    """Write a model as a material and return it as read back.
+
+    Parameters
+    ----------
+    data : what identifies the data set
+    training : summary of the training: steps, seconds, errors
+    half : store 16-bit floats; the model's numbers are such already
+    holes : what the material lets through; None for one without holes
+
+    Raises
+    ------
+    PartialError : the folder cannot be written
+    """
+    lattice = model.lattice
+    stated: dict[str, Any] = {}
+    if holes is not None:
+        write_transmittance(holes, folder / TRANSMITTANCE_NAME)
+        stated["holes"] = {"file": TRANSMITTANCE_NAME, "sha256": digest(folder / TRANSMITTANCE_NAME)}
+    queries = conformance_queries(lattice)
+    weights = model.weights()
+    if half:
+        weights = {name: tensor.half() if tensor.ndim else tensor for name, tensor in weights.items()}
+    queries["rgb"] = conformance_values(model, queries)
+    conformance = {f"conformance.{k}": torch.from_numpy(v) for k, v in queries.items()}
+    path = folder / WEIGHTS_NAME
+    # The description names the weights' digest, so it comes last: a folder with one is complete.
+    write_tensors(path, {**weights, **conformance}, {})
+    shape = {name: list(tensor.shape) for name, tensor in weights.items()}
+    write_json(
+        folder / DESCRIPTION_NAME,
+        {
+            "format": FORMAT_NAME,
+            "schema": SCHEMA_VERSION,
+            "model": model.name,
+            "formula": model.formula(),
+            "conventions": CONVENTIONS | MATERIAL_CONVENTIONS,
+            "tile": {"aspect": lattice.aspect},
+            "levels": {
+                "finest": lattice.finest,
+                "shapes": [list(lattice.shape(s)) for s in range(lattice.finest + 1)],
+            },
+            "weights": {
+                "file": WEIGHTS_NAME,
+                "sha256": digest(path),
+                "dtype": "float16" if half else "float32",
+                "shapes": shape,
+                "network_weights": sum(p.numel() for p in model.parameter_groups()[1]),
+                "texels": sum(p.numel() for p in model.parameter_groups()[0]),
+            },
+            "conformance": {
+                "count": CONFORMANCE_COUNT,
+                "tensors": [f"conformance.{name}" for name in CONFORMANCE],
+                "tolerance": 1e-4,
+                "note": "evaluating the first four must give the fifth within tolerance * max(1, value)",
+            },
+            **stated,
+            "config": config.model_dump(mode="json"),
+            "data": data,
+            "training": training,
+        },
+    )
+    return Material.load(folder)

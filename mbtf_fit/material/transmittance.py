@@ -1,0 +1,132 @@
+r"""What a material with holes lets through: a small model beside the networks.
+
+The data's ``transmittance`` is the share of a footprint that is seen through holes. It depends on position,
+footprint and view, not on the light. Here every texel of every level holds the coefficients of a quadratic
+polynomial of the view's projection on the plane,
+
+    T(u, σ, ω_o) = clamp(c_0 + c_1 x + c_2 y + c_3 x² + c_4 x y + c_5 y², 0, 1),  (x, y) = ω_o.xy
+
+read as features are: bilinear in a level, linear between two. :mod:`mbtf_fit.material.transmittance_fit` finds them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mbtf_core.atomic import digest, write_file
+from mbtf_core.errors import InputError
+from mbtf_core.lattice import Lattice, level_of_sigma
+
+TRANSMITTANCE_NAME = "transmittance.safetensors"
+COEFFICIENTS = 6
+# For a reader of an export.
+FORMULA = (
+    "share of the footprint that is seen through holes: clamp(c0 + c1 x + c2 y + c3 x^2 + c4 x y + c5 y^2, "
+    "0, 1), where x, y = omega_o.x, omega_o.y and c = the textures transmittance.0 ... transmittance.k at u "
+    "(not moved by any offset), blended by level as features are; a view from below sees the share of the "
+    "opposite one from above; values are premultiplied: they hold what comes back, and nothing of what passes"
+)
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+
+def basis(omega_o: ArrayLike) -> F64:
+    """(n, 6) polynomials of views (n, 3)."""
+    x, y = np.asarray(omega_o, np.float64)[:, :2].T
+    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], -1)
+
+
+def corners(u: ArrayLike, shape: tuple[int, int]) -> tuple[NDArray[np.int64], F64]:
+    """Texels (n, 4) of a level around uv positions (n, 2), and their bilinear weights (n, 4)."""
+    rows, columns = shape
+    at = np.asarray(u, np.float64)
+    x = (at[:, 0] - np.floor(at[:, 0])) * columns - 0.5
+    y = (1.0 - (at[:, 1] - np.floor(at[:, 1]))) * rows - 0.5
+    left, top = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
+    fx, fy = x - left, y - top
+    i, j = (left[:, None] + np.array([0, 1])) % columns, (top[:, None] + np.array([0, 1])) % rows
+    texel = (j[:, :, None] * columns + i[:, None, :]).reshape(-1, 4)
+    weight = np.stack([(1 - fy) * (1 - fx), (1 - fy) * fx, fy * (1 - fx), fy * fx], -1)
+    return texel, weight
+
+
+class Transmittance:
+    """The fitted model.
+
+    Parameters
+    ----------
+    lattice : texel grids of the tile
+    levels : (rows, columns, 6) each, coarsest first
+    """
+
+    def __init__(self, lattice: Lattice, levels: list[F32]) -> None:
+        self.lattice = lattice
+        self.levels = levels
+
+    def evaluate(self, u: ArrayLike, sigma: ArrayLike, omega_o: ArrayLike) -> F32:
+        """Transmittance (n,) in [0, 1] at uv positions (n, 2), footprints (n,) and views (n, 3)."""
+        finest = self.lattice.finest
+        level = np.clip(level_of_sigma(np.asarray(sigma, np.float64)), 0.0, finest)
+        coarse = np.minimum(level.astype(np.int64), max(0, finest - 1))
+        total = np.zeros(len(level))
+        terms = basis(omega_o)
+        for s, texels in enumerate(self.levels):
+            weight = np.clip(1.0 - np.abs(level - s), 0.0, 1.0) * ((s == coarse) | (s == coarse + 1))
+            some = np.flatnonzero(weight)
+            texel, share = corners(np.asarray(u)[some], self.lattice.shape(s))
+            c = (texels.reshape(-1, COEFFICIENTS)[texel] * share[..., None]).sum(1)
+            total[some] += weight[some] * (c * terms[some]).sum(1)
+        return np.clip(total, 0.0, 1.0).astype(np.float32)
+
+
+def write_transmittance(model: Transmittance, path: Path) -> None:
+    """Write the coefficients: a tensor ``level.s`` (rows, columns, 6) per level.
+
+    Raises
+    ------
+    PartialError : the disk is full or the folder cannot be written
+    """
+    from safetensors.numpy import save
+
+    content = save({f"level.{s}": np.ascontiguousarray(a) for s, a in enumerate(model.levels)})
+    write_file(path, lambda stream: _write(stream, content))
+
+
+def _write(stream: BinaryIO, content: bytes) -> None:
+    stream.write(content)
+
+
+def read_transmittance(folder: Path, description: Mapping[str, Any]) -> Transmittance | None:
+    """The model of a material folder; None where the material has no holes.
+
+    Parameters
+    ----------
+    description : content of its ``material.json``
+
+    Raises
+    ------
+    InputError : missing or damaged
+    """
+    stated = description.get("holes")
+    if stated is None:
+        return None
+    path = folder / TRANSMITTANCE_NAME
+    if not path.is_file() or digest(path) != stated["sha256"]:
+        raise InputError("is missing or not the file that material.json describes", where=path)
+    from safetensors.numpy import load_file
+
+    lattice = Lattice(description["levels"]["finest"], description["tile"]["aspect"])
+    tensors = load_file(path)
+    levels = []
+    for s in range(lattice.finest + 1):
+        array = tensors.get(f"level.{s}")
+        if array is None or array.shape != (*lattice.shape(s), COEFFICIENTS) or not np.isfinite(array).all():
+            raise InputError("does not hold the levels that material.json describes", where=path)
+        levels.append(np.asarray(array, np.float32))
+    return Transmittance(lattice, levels)

@@ -1,0 +1,45 @@
+"""Fitted materials as Mitsuba BSDFs (``mbtf``), and a path tracer that hands them footprints
+(``mbtf_path``).
+
+    import mbtf_fit.mitsuba_plugin
+    import mitsuba as mi
+    mi.set_variant("llvm_ad_rgb")
+    mbtf_fit.mitsuba_plugin.register()
+    bsdf = mi.load_dict({"type": "mbtf", "material": "material/"})
+
+Import the package before Mitsuba: Dr.Jit looks for its LLVM when it is first imported, and this package says
+where one lies that is new enough. Importing the package registers its plugins with a variant that is set
+already; :func:`load_scene` registers them by itself. PyTorch is not needed, and never imported.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+_PUBLIC = {
+    "Evaluator": "evaluator",
+    "StoredMaterial": "material_arrays",
+    "check_scene": "scene",
+    "load_scene": "scene",
+    "read_material": "material_arrays",
+    "register": "registration",
+}
+
+__all__ = ["Evaluator", "StoredMaterial", "check_scene", "load_scene", "read_material", "register"]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _PUBLIC:
+        return getattr(import_module(f".{_PUBLIC[name]}", __name__), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def _register_if_set() -> None:
+    from mbtf_fit.mitsuba_plugin.registration import register, variant_is_set
+
+    if variant_is_set():
+        register()
+
+
+_register_if_set()

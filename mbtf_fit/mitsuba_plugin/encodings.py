@@ -1,0 +1,82 @@
+"""What networks see of coordinates, and values from their answers, in Dr.Jit.
+
+The options of ``config.network``; the formulas stand in each material's ``material.json`` under ``formula``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mbtf_fit.config import EncodingSection, NetworkSection
+
+# Rec.601 YUV → RGB, a row per color, and the gate's least value, for decoders of six answers.
+RGB_OF_YUV = ((1.0, 0.0, 1.13983), (1.0, -0.39465, -0.58060), (1.0, 2.03211, 0.0))
+GATE = 0.1
+
+
+def encode(
+    p: Sequence[Any],
+    bands: int,
+    pi: bool,
+    options: EncodingSection,
+    spread: Sequence[Any] | None = None,
+) -> list[Any]:
+    """Coordinates → [themselves,] sines of doubling frequencies, cosines; without bands themselves alone.
+    With `spread`, their means over Gaussians of these standard deviations."""
+    if bands == 0:
+        return list(p)
+    unit = math.pi if pi else 1.0
+    frequencies = [unit * 2.0**k for k in range(bands)]
+    pairs = [dr.sincos(x * f) for x in p for f in frequencies]
+    if options.damped:
+        pairs = [(s * 0.5**k, c * 0.5**k) for (s, c), k in zip(pairs, [*range(bands)] * len(p), strict=True)]
+    if spread is not None:
+        left = [dr.exp(-0.5 * dr.square(s * f)) for s in spread for f in frequencies]
+        pairs = [(s * a, c * a) for (s, c), a in zip(pairs, left, strict=True)]
+    return [*(p if options.raw else ()), *(s for s, _ in pairs), *(c for _, c in pairs)]
+
+
+def encode_direction(omega: Any, options: EncodingSection) -> list[Any]:
+    """What networks see of a direction."""
+    coordinates = [omega.x, omega.y, omega.z] if options.lifted else [omega.x, omega.y]
+    return encode(coordinates, options.direction, options.direction_pi, options)
+
+
+def encode_position(u: Any, level: Any, aspect: float, options: EncodingSection) -> list[Any]:
+    """What the decoder sees of a uv position at a fractional level: nothing without bands."""
+    if options.position == 0:
+        return []
+    p = [2.0 * (x - dr.floor(x)) - 1.0 for x in (u.x, u.y)]
+    spread = None
+    if options.filtered:
+        across = dr.exp2(-level)
+        spread = [across, across / aspect]
+    return encode(p, options.position, options.pi, options, spread)
+
+
+def _mapped(x: Any, name: str) -> Any:
+    if name == "exp-1":
+        return dr.exp(x) - 1.0
+    if name == "exp":
+        return dr.exp(x)
+    if name == "softplus":
+        return dr.maximum(x, 0.0) + dr.log(1.0 + dr.exp(-dr.abs(x)))
+    if name == "fourth-root":
+        return x * dr.square(x) * dr.abs(x)
+    return x
+
+
+def to_value(x: Sequence[Any], unit: float, network: NetworkSection) -> Any:
+    """Value (Color3f) in 1/sr, at least 0, of a decoder's answers."""
+    if len(x) == 3:
+        colors = [unit * _mapped(v, network.output) for v in x]
+    else:
+        rgb = [sum(weight * v for weight, v in zip(row, x[:3], strict=True) if weight) for row in RGB_OF_YUV]
+        gates = [GATE + dr.rcp(1.0 + dr.exp(-v)) for v in x[3:]]
+        colors = [unit * _mapped(v, network.output) * gate for v, gate in zip(rgb, gates, strict=True)]
+    return mi.Color3f(*(dr.maximum(v, 0.0) for v in colors))

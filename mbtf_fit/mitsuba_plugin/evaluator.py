@@ -1,0 +1,112 @@
+"""M(u, σ, ω_i, ω_o) of a stored material, inside Dr.Jit kernels.
+
+The formulas are those that the material folder states (``formula`` and ``conventions`` in its
+``material.json``); what they mean stands in :mod:`mbtf_fit.models.neumip`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mbtf_fit.mitsuba_plugin.calibration_factors import Gains
+from mbtf_fit.mitsuba_plugin.encodings import encode_direction, encode_position, to_value
+from mbtf_fit.mitsuba_plugin.material_arrays import F32, StoredMaterial
+from mbtf_fit.mitsuba_plugin.network import (
+    MOST_UNROLLED,
+    Arithmetic,
+    Network,
+    count_weights,
+    default_arithmetic,
+)
+from mbtf_fit.mitsuba_plugin.textures import Textures
+
+# Of the model's definition: tile widths per unit that the offset network answers, and the cosine below which
+# the offset grows no further.
+OFFSET_SCALE = 0.1
+GRAZING = 0.6
+
+
+class Evaluator:
+    """A material, ready to be evaluated for lanes of queries.
+
+    Parameters
+    ----------
+    stored : its weights
+    arithmetic : how networks are evaluated; by default what suits variant and size
+    """
+
+    def __init__(self, stored: StoredMaterial, arithmetic: Arithmetic | None = None) -> None:
+        self.lattice = stored.lattice
+        self.network = stored.network
+        self.unit = stored.unit
+        weights = count_weights(stored.decoder) + count_weights(stored.offset_network or [])
+        self.arithmetic: Arithmetic = default_arithmetic(weights) if arithmetic is None else arithmetic
+        self.gains = None if stored.gain is None else Gains(stored.gain)
+        self.pyramid = Textures(stored.pyramid)
+        self.holes = None if stored.holes is None else Textures(stored.holes)
+        self.decoder = Network(stored.decoder, self.arithmetic, stored.network.activation)
+        self.offset_texture: Textures | None = None
+        if stored.offset_texture is not None and stored.offset_network is not None:
+            self.offset_texture = Textures([stored.offset_texture])
+            self.offset_network = Network(
+                stored.offset_network, self._offset_arithmetic(stored), stored.network.activation
+            )
+
+    def _offset_arithmetic(self, stored: StoredMaterial) -> Arithmetic:
+        """Single precision where it is affordable: small errors of the place are large ones of the value."""
+        small = count_weights(stored.offset_network or []) <= MOST_UNROLLED
+        return "unrolled" if self.arithmetic == "half" and small else self.arithmetic
+
+    def level(self, sigma: Any) -> Any:
+        """Fractional level of footprints in tile widths."""
+        return dr.clip(-dr.log2(2.0 * sigma), 0.0, float(self.lattice.finest))
+
+    def features(self, u: Any, level: Any, omega_o: Any) -> list[Any]:
+        """Stage 1, shared by all lights: features at uv positions (Point2f), seen from unit vectors; after
+        them, where the material has factors, those of the view and the level."""
+        moved = u
+        if self.offset_texture is not None:
+            r = self.offset_network([*self.offset_texture.first(u), omega_o.x, omega_o.y])
+            if len(r) == 1:
+                r = [r[0] * (omega / dr.maximum(omega_o.z, GRAZING)) for omega in (omega_o.x, omega_o.y)]
+            x, y = r
+            moved = mi.Point2f(
+                dr.fma(x, OFFSET_SCALE, u.x), dr.fma(y, OFFSET_SCALE / self.lattice.aspect, u.y)
+            )
+        read = self.pyramid.blended if self.network.blending == "blend" else self.pyramid.side_by_side
+        encoded = encode_position(u, level, self.lattice.aspect, self.network.encoding)
+        features = [*read(moved, level), *encoded]
+        return features if self.gains is None else [*features, *self.gains.by_view(level, omega_o.z), level]
+
+    def value(self, features: list[Any], omega_i: Any, omega_o: Any) -> Any:
+        """Stage 2: value (Color3f) in 1/sr, at least 0."""
+        options = self.network.encoding
+        directions = [*encode_direction(omega_i, options), *encode_direction(omega_o, options)]
+        if self.gains is None:
+            return to_value(self.decoder([*features, *directions]), self.unit, self.network)
+        *features, red, green, blue, level = features
+        value = to_value(self.decoder([*features, *directions]), self.unit, self.network)
+        return value * mi.Color3f(red, green, blue) * self.gains.by_light(level, omega_i.z)
+
+    def transmittance(self, u: Any, level: Any, omega_o: Any) -> Any:
+        """Share of the footprint that is seen through holes, of unit vectors on either side of the plane: a
+        line passes both ways. The formula is that of :mod:`mbtf_fit.material.transmittance`."""
+        if self.holes is None:
+            return mi.Float(0.0)
+        x, y = (dr.mulsign(w, omega_o.z) for w in (omega_o.x, omega_o.y))
+        c = self.holes.blended(u, level)
+        value = c[0] + c[1] * x + c[2] * y + c[3] * x * x + c[4] * x * y + c[5] * y * y
+        return dr.clip(value, 0.0, 1.0)
+
+    def evaluate(self, u: ArrayLike, sigma: ArrayLike, omega_i: ArrayLike, omega_o: ArrayLike) -> F32:
+        """Values (n, 3) in 1/sr at arrays of queries, as :meth:`mbtf_fit.Material.evaluate` gives them."""
+        place = mi.Point2f(np.asarray(u, np.float32).T)
+        lights, views = (mi.Vector3f(np.asarray(w, np.float32).T) for w in (omega_i, omega_o))
+        features = self.features(place, self.level(mi.Float(np.asarray(sigma, np.float32))), views)
+        out: F32 = np.array(self.value(features, lights, views), np.float32).T
+        return out

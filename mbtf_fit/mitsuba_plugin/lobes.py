@@ -1,0 +1,150 @@
+r"""Where a material reflects to: a mixture of two densities per texel, for importance sampling.
+
+One is the cosine-weighted hemisphere, the other reflects the view at the visible normals of an anisotropic,
+tilted GGX distribution. Its slopes are ``s = L t + s0`` with t distributed as ``1/(π (1+|t|²)²)``. The normal
+``(-s, 1)`` is then ``K (-t, 1)`` with ``K = [[L, -s0], [0, 1]]``, so that the normals visible from ω are the
+images of the normals of a unit GGX visible from ``ω' = Kᵀω`` (Heitz 2018; there without the tilt), and the
+density of the reflected direction is
+
+    p(ω_i) = D(h) / (2 (|ω'| + ω'_z)),   D(h) = 1 / (π |det L| (1+|t|²)² h_z⁴).
+
+What falls below the surface is lost: the density integrates to less than one there. The share of the lobe
+depends on the view's cosine, by bands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mbtf_fit.mitsuba_plugin.material_arrays import F32
+from mbtf_gen.render.bsdf.microfacet import visible_normal
+
+# Numbers per texel: L (11, 21, 22), s0 (x, y), the lobe's share in each band of the view's cosine.
+CHANNELS = 8
+# Inner edges of the bands.
+BANDS = (0.35, 0.7)
+
+
+def band_of(cosine: Any) -> Any:
+    """Number of the band of a view's cosine."""
+    return dr.select(
+        cosine < BANDS[0], mi.UInt32(0), dr.select(cosine < BANDS[1], mi.UInt32(1), mi.UInt32(2))
+    )
+
+
+@dataclass(frozen=True)
+class Lobe:
+    """A reflecting distribution of slopes, per lane: lower triangle of L, and s0."""
+
+    l11: Any
+    l21: Any
+    l22: Any
+    x: Any
+    y: Any
+
+    def deviation(self, half: Any) -> tuple[Any, Any, Any]:
+        """(slope x, slope y, |t|²) of half vectors of any length, z > 0."""
+        inverse = 1.0 / half.z
+        sx, sy = -half.x * inverse, -half.y * inverse
+        tx = (sx - self.x) / self.l11
+        ty = (sy - self.y - self.l21 * tx) / self.l22
+        return sx, sy, dr.fma(tx, tx, ty * ty)
+
+    def _stretched(self, viewer: Any) -> Any:
+        """Kᵀ ω."""
+        return mi.Vector3f(
+            dr.fma(self.l11, viewer.x, self.l21 * viewer.y),
+            self.l22 * viewer.y,
+            viewer.z - self.x * viewer.x - self.y * viewer.y,
+        )
+
+    def density(self, light: Any, viewer: Any) -> Any:
+        """Density in 1/sr of reflecting the viewer's direction into the light's, both with z > 0."""
+        half = light + viewer
+        _, _, square = self.deviation(half)
+        cosine2 = dr.square(half.z) / dr.squared_norm(half)
+        w = self._stretched(viewer)
+        # |ω'| + ω'_z cancels for views far below the tilted plane.
+        length = dr.norm(w)
+        flat = dr.fma(w.x, w.x, w.y * w.y)
+        sum_ = dr.select(w.z >= 0, length + w.z, flat / dr.maximum(length - w.z, 1e-20))
+        below = 2.0 * dr.pi * self.l11 * self.l22 * dr.square((1.0 + square) * cosine2) * sum_
+        return 1.0 / dr.maximum(below, 1e-20)
+
+    def reflect(self, viewer: Any, xi: Any) -> Any:
+        """Direction with that density; z may be negative."""
+        t = visible_normal(dr.normalize(self._stretched(viewer)), 1.0, xi)
+        half = dr.normalize(
+            mi.Vector3f(
+                dr.fma(self.l11, t.x, -self.x * t.z),
+                dr.fma(self.l21, t.x, self.l22 * t.y) - self.y * t.z,
+                t.z,
+            )
+        )
+        return 2.0 * dr.dot(viewer, half) * half - viewer
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """The density seen from one direction: the lobe with a share, else cosine-weighted."""
+
+    lobe: Lobe
+    share: Any
+    viewer: Any
+
+    @classmethod
+    def cosine(cls, viewer: Any) -> Mixture:
+        """Nothing but the cosine-weighted hemisphere."""
+        one, none = mi.Float(1.0), mi.Float(0.0)
+        return cls(Lobe(one, none, one, none, none), none, viewer)
+
+    def density(self, light: Any) -> Any:
+        """In 1/sr; 0 below the surface."""
+        value = dr.lerp(dr.inv_pi * light.z, self.lobe.density(light, self.viewer), self.share)
+        return dr.select((light.z > 0) & (self.viewer.z > 0), value, 0.0)
+
+    def sample(self, choice: Any, xi: Any) -> Any:
+        """Direction; below the surface it is to be thrown away."""
+        cosine = mi.warp.square_to_cosine_hemisphere(xi)
+        return dr.select(choice < self.share, self.lobe.reflect(self.viewer, xi), cosine)
+
+
+class LobeTextures:
+    """Lobes of a material by level and texel.
+
+    Parameters
+    ----------
+    levels : (rows, columns, 8) each, coarsest first
+    """
+
+    def __init__(self, levels: Sequence[F32]) -> None:
+        shapes = [level.shape[:2] for level in levels]
+        starts = np.cumsum([0, *(rows * columns for rows, columns in shapes)])
+        table = [[rows, columns, start, 0] for (rows, columns), start in zip(shapes, starts, strict=False)]
+        self._table = mi.UInt32(np.array(table, np.uint32).reshape(-1))
+        self._buffer = mi.Float(np.concatenate([level.reshape(-1) for level in levels]))
+        self._finest = len(levels) - 1
+        dr.eval(self._table, self._buffer)
+
+    def at(self, u: Any, level: Any, viewer: Any) -> Mixture:
+        """Mixture of the nearest texel of the nearest level at uv positions (Point2f)."""
+        nearest = mi.UInt32(dr.clip(dr.round(level), 0.0, float(self._finest)))
+        rows, columns, start, _ = dr.gather(mi.Vector4u, self._table, nearest)
+        i = dr.minimum(mi.UInt32((u.x - dr.floor(u.x)) * mi.Float(columns)), columns - 1)
+        j = dr.minimum(mi.UInt32((1.0 - (u.y - dr.floor(u.y))) * mi.Float(rows)), rows - 1)
+        return mixture_of(self._buffer, start + j * columns + i, viewer)
+
+
+def mixture_of(buffer: Any, texel: Any, viewer: Any) -> Mixture:
+    """Mixture of a texel of a buffer, by its number."""
+    l11, l21, l22, x = dr.gather(mi.Vector4f, buffer, 2 * texel)
+    y, *shares = dr.gather(mi.Vector4f, buffer, 2 * texel + 1)
+    band = band_of(viewer.z)
+    share = dr.select(band == 0, shares[0], dr.select(band == 1, shares[1], shares[2]))
+    return Mixture(Lobe(l11, l21, l22, x, y), share, viewer)

@@ -1,0 +1,93 @@
+"""Small fully connected networks in Dr.Jit kernels, evaluated in one of three ways.
+
+- ``unrolled``: multiply-adds with the weights as literals of the kernel. Fastest on a CPU: the features stay
+  in registers and no weight is loaded twice. The kernel is compiled for one material.
+- ``cooperative``: :mod:`drjit.nn` cooperative vectors in single precision; one kernel for all materials.
+- ``half``: the same in half precision, what tensor cores of GPUs need. The first layer is unrolled in single
+  precision: half of the error, and most of an offset's, would come from rounding what the network sees.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import drjit as dr
+import mitsuba as mi
+from drjit import nn
+
+from mbtf_fit.mitsuba_plugin.material_arrays import Layers
+
+Arithmetic = Literal["unrolled", "cooperative", "half"]
+# Weights beyond which unrolled code takes too long to compile.
+MOST_UNROLLED = 12_000
+# Slope of leaky-relu below zero.
+LEAK = 0.01
+
+
+def default_arithmetic(weights: int) -> Arithmetic:
+    """What suits the current variant and a number of weights."""
+    if mi.variant().startswith("cuda"):
+        return "half"
+    return "unrolled" if weights <= MOST_UNROLLED else "cooperative"
+
+
+def count_weights(layers: Layers) -> int:
+    """Number of weights, biases included."""
+    return sum(weight.size + bias.size for weight, bias in layers)
+
+
+class Network:
+    """A fully connected network with an activation after every layer but the last.
+
+    Parameters
+    ----------
+    layers : weights and biases
+    arithmetic : how it is evaluated
+    activation : ``relu``, ``leaky-relu`` or ``sine``
+    """
+
+    def __init__(self, layers: Layers, arithmetic: Arithmetic, activation: str = "relu") -> None:
+        self.layers = layers
+        self.activation = activation
+        self.arithmetic = arithmetic
+        # Layers that are unrolled; the others are cooperative.
+        self._single = {"unrolled": len(layers), "cooperative": 0, "half": 1}[arithmetic]
+        rest = layers[self._single :]
+        if rest:
+            tensor = mi.TensorXf16 if arithmetic == "half" else mi.TensorXf
+            parts = [tensor(array) for weight, bias in rest for array in (weight, bias[:, None])]
+            self._views = nn.pack(*parts, layout="inference")
+
+    def __call__(self, inputs: Sequence[Any]) -> list[Any]:
+        """Outputs of the last layer for lanes' inputs."""
+        x = self._unrolled(inputs)
+        return x if self._single == len(self.layers) else self._cooperative(x)
+
+    def _activated(self, x: Any) -> Any:
+        """Activation of a number per lane, or of a cooperative vector where it is ``relu``."""
+        if self.activation == "relu":
+            return dr.maximum(x, 0.0)
+        return dr.sin(x) if self.activation == "sine" else dr.maximum(x, LEAK * x)
+
+    def _unrolled(self, inputs: Sequence[Any]) -> list[Any]:
+        x = list(inputs)
+        for k, (weight, bias) in enumerate(self.layers[: self._single]):
+            y = []
+            for row, b in zip(weight.tolist(), bias.tolist(), strict=True):
+                total = mi.Float(b)
+                for value, w in zip(x, row, strict=True):
+                    total = dr.fma(value, w, total)
+                y.append(total if k == len(self.layers) - 1 else self._activated(total))
+            x = y
+        return x
+
+    def _cooperative(self, inputs: Sequence[Any]) -> list[Any]:
+        number = mi.Float16 if self.arithmetic == "half" else mi.Float
+        x = nn.CoopVec(*(number(value) for value in inputs))
+        count = len(self.layers) - self._single
+        for k in range(count):
+            x = nn.matvec(self._views[2 * k], x, self._views[2 * k + 1])
+            if k < count - 1:
+                x = self._activated(x) if self.activation == "relu" else nn.CoopVec(*map(self._activated, x))
+        return [mi.Float(value) for value in x]

@@ -1,0 +1,63 @@
+"""Options of ``mbtf-fit preview``."""
+
+from __future__ import annotations
+
+from typing import Annotated, Self
+
+from pydantic import Field, model_validator
+
+from mbtf_core.config_file import Settings
+from mbtf_gen.config.pictures import Direction
+
+# The whole sheet and the whole turntable are held in memory; this keeps both below a gigabyte.
+MOST_PIXELS = 1 << 25
+
+Width = Annotated[float, Field(gt=0, le=1e4)]
+
+
+class SheetSection(Settings):
+    """The contact sheet: a column per view and light, a row per width."""
+
+    views: Annotated[list[Direction], Field(min_length=1, max_length=8)] = Field(
+        [Direction(elevation=70, azimuth=-90), Direction(elevation=30, azimuth=-90)],
+        description="where the camera stands",
+    )
+    lights: Annotated[list[Direction], Field(min_length=1, max_length=8)] = Field(
+        [
+            Direction(elevation=65, azimuth=60),
+            Direction(elevation=35, azimuth=180),
+            Direction(elevation=20, azimuth=15),
+        ],
+        description="where the light comes from",
+    )
+    spans: Annotated[list[Width], Field(min_length=1, max_length=8)] = Field(
+        [1.0, 4.0, 16.0], description="widths of the field of view, in tile widths"
+    )
+    size: Annotated[int, Field(ge=64, le=2048)] = Field(
+        160, description="pixels along each side of a picture"
+    )
+
+
+class TurntableSection(Settings):
+    """A ball on a plate that turns once."""
+
+    size: Annotated[int, Field(ge=16, le=2048)] = Field(240, description="pixels along each side")
+    frames: Annotated[int, Field(ge=1, le=360)] = Field(24, description="pictures of one turn")
+    spp: Annotated[int, Field(ge=1, le=65536)] = Field(16, description="paths per pixel")
+    tiles: Annotated[int, Field(ge=1, le=1000)] = Field(8, description="tiles around the ball's equator")
+
+
+class PreviewConfig(Settings):
+    """Everything ``mbtf-fit preview`` needs."""
+
+    material: str = Field(description="folder made by mbtf-fit")
+    sheet: SheetSection = SheetSection()
+    turntable: TurntableSection = TurntableSection()
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        sheet, turn = self.sheet, self.turntable
+        panels = len(sheet.views) * len(sheet.lights) * len(sheet.spans)
+        if max(panels * sheet.size**2, turn.frames * turn.size**2) > MOST_PIXELS:
+            raise ValueError(f"asks for more than {MOST_PIXELS:,} pixels; take smaller or fewer pictures")
+        return self

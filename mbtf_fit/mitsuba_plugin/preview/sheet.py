@@ -1,0 +1,95 @@
+"""The contact sheet: a plane of the material from several views, under several lights, at several widths.
+
+A pixel is the material's value M at the pixel's position, footprint and directions, one query per pixel, as
+``mbtf-gen reference --kind query`` defines it; the light has unit irradiance on the plane.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from mbtf_core.directions import from_angles
+from mbtf_fit.mitsuba_plugin.evaluator import Evaluator
+from mbtf_fit.mitsuba_plugin.material_arrays import F32
+from mbtf_fit.mitsuba_plugin.preview.config import SheetSection
+from mbtf_gen.config.pictures import Direction
+from mbtf_gen.pictures.camera import Camera
+from mbtf_gen.pictures.reference import auto_exposure, to_display
+
+GAP, MARGIN, CAPTION = 4, 8, 34
+# Exposure as a share of what suits a picture alone: pictures of one sheet differ.
+HEADROOM = 0.8
+INK, PAPER = (30, 30, 30), (255, 255, 255)
+
+
+def panels(evaluator: Evaluator, section: SheetSection) -> F32:
+    """Values (views, lights, spans, size, size, 3) in 1/sr.
+
+    Raises
+    ------
+    UsageError : a view shows the horizon
+    """
+    aspect = evaluator.lattice.aspect
+    lights = [from_angles(light.elevation, light.azimuth) for light in section.lights]
+    pictures = []
+    for view in section.views:
+        for light in lights:
+            for span in section.spans:
+                camera = Camera(
+                    view.elevation,
+                    view.azimuth,
+                    span=span,
+                    target=(0.5, 0.5 * aspect),
+                    rows=section.size,
+                    columns=section.size,
+                )
+                q = camera.queries(light, aspect).flat()
+                pictures.append(evaluator.evaluate(q.u, q.sigma, q.omega_i, q.omega_o))
+    lead = (len(section.views), len(lights), len(section.spans))
+    return np.stack(pictures).reshape(*lead, section.size, section.size, 3)
+
+
+def contact_sheet(values: F32, section: SheetSection) -> NDArray[np.uint8]:
+    """The sheet (rows, columns, 3): a column per view and light, a row per width, one exposure for all."""
+    views, lights, spans, size = values.shape[:4]
+    exposure = HEADROOM * auto_exposure(values)
+    pitch = size + GAP
+    width = 2 * MARGIN + views * lights * pitch - GAP + (views - 1) * GAP
+    height = MARGIN + spans * pitch - GAP + CAPTION + MARGIN
+    sheet = Image.new("RGB", (width, height), PAPER)
+    draw = ImageDraw.Draw(sheet)
+    font = ImageFont.load_default(max(9, min(13, size // 12)))
+    for view in range(views):
+        for light in range(lights):
+            # Views stand a little apart.
+            left = MARGIN + (view * lights + light) * pitch + view * GAP
+            text = f"{_said('view', section.views[view])}\n{_said('light', section.lights[light])}"
+            draw.multiline_text((left + 1, MARGIN), text, INK, font, spacing=2)
+            for row in range(spans):
+                picture = Image.fromarray(to_display(values[view, light, row], exposure))
+                top = MARGIN + CAPTION + row * pitch
+                sheet.paste(picture, (left, top))
+                if view == light == 0:
+                    _label(draw, (left, top + size), _tiles(section.spans[row]), font)
+    return np.asarray(sheet)
+
+
+def _said(name: str, direction: Direction) -> str:
+    return f"{name} {direction.elevation:g}°, {direction.azimuth:g}°"
+
+
+def _tiles(span: float) -> str:
+    return f"{span:g} tile{'' if span == 1 else 's'} wide"
+
+
+def _label(draw: ImageDraw.ImageDraw, corner: tuple[int, int], text: str, font: Any) -> None:
+    """Text in the lower left corner of a picture, on paper so that it can be read."""
+    left, bottom = corner
+    box = draw.textbbox((0, 0), text, font=font)
+    top = bottom - (box[3] - box[1]) - 6
+    draw.rectangle((left, top, left + box[2] - box[0] + 6, bottom - 1), PAPER)
+    draw.text((left + 3, top + 3 - box[1]), text, INK, font)

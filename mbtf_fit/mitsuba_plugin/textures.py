@@ -1,0 +1,114 @@
+"""Bilinear lookups in a packed pyramid of periodic textures, in Dr.Jit kernels.
+
+All levels lie one after the other in one buffer, texels of a level row by row (row 0 is the side ``v → 1``),
+channels padded to whole groups of :data:`GROUP`, so that a texel is read by wide loads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mbtf_fit.mitsuba_plugin.material_arrays import F32
+
+# Channels that one gather reads.
+GROUP = 4
+
+
+def _in_image(u: Any) -> Any:
+    """Position in the image, from its left and its top, in [0, 1]."""
+    return mi.Point2f(u.x - dr.floor(u.x), 1.0 - (u.y - dr.floor(u.y)))
+
+
+class Textures:
+    """Textures of consecutive levels, coarsest first.
+
+    Parameters
+    ----------
+    levels : (rows, columns, channels) each
+    """
+
+    def __init__(self, levels: Sequence[F32]) -> None:
+        self.channels = levels[0].shape[2]
+        self.groups = -(-self.channels // GROUP)
+        padded = [
+            np.pad(level, ((0, 0), (0, 0), (0, self.groups * GROUP - self.channels))).reshape(-1)
+            for level in levels
+        ]
+        self.shapes = [level.shape[:2] for level in levels]
+        starts = np.cumsum([0, *(rows * columns for rows, columns in self.shapes)])
+        self.buffer = mi.Float(np.concatenate(padded))
+        table = [
+            [rows, columns, start, 0] for (rows, columns), start in zip(self.shapes, starts, strict=False)
+        ]
+        self._table = mi.UInt32(np.array(table, np.uint32).reshape(-1))
+        dr.eval(self.buffer, self._table)
+
+    def first(self, u: Any) -> list[Any]:
+        """Features of the first level at uv positions (Point2f), any real numbers: textures are periodic."""
+        rows, columns = self.shapes[0]
+        place = (mi.UInt32(rows), mi.UInt32(columns), mi.UInt32(0))
+        return self._bilinear(_in_image(u), *place, None, [0.0] * self.channels)
+
+    def blended(self, u: Any, level: Any) -> list[Any]:
+        """Features between two levels: (1 - frac(level)) of the coarser, frac(level) of the finer one."""
+        if len(self.shapes) == 1:
+            return self.first(u)
+        coarse, weight = self._coarse(level)
+        return self._level(u, coarse + 1, weight, self._level(u, coarse, 1.0 - weight, [0.0] * self.channels))
+
+    def side_by_side(self, u: Any, level: Any) -> list[Any]:
+        """The same two terms, not added: that of the even level, then that of the odd one."""
+        none = [0.0] * self.channels
+        if len(self.shapes) == 1:
+            return [*self.first(u), *(mi.Float(v) for v in none)]
+        coarse, weight = self._coarse(level)
+        low, high = self._level(u, coarse, 1.0 - weight, none), self._level(u, coarse + 1, weight, none)
+        odd = (coarse & 1) == 1
+        both = list(zip(low, high, strict=True))
+        return [dr.select(odd, h, v) for v, h in both] + [dr.select(odd, v, h) for v, h in both]
+
+    def _coarse(self, level: Any) -> tuple[Any, Any]:
+        """(coarser level, weight of the finer one)."""
+        level = dr.clip(level, 0.0, len(self.shapes) - 1.0)
+        coarse = dr.minimum(mi.UInt32(level), len(self.shapes) - 2)
+        return coarse, level - mi.Float(coarse)
+
+    def _level(self, u: Any, level: Any, scale: Any, out: list[Any]) -> list[Any]:
+        rows, columns, start, _ = dr.gather(mi.Vector4u, self._table, level)
+        return self._bilinear(_in_image(u), rows, columns, start, scale, out)
+
+    def _bilinear(self, x: Any, rows: Any, columns: Any, start: Any, scale: Any, out: list[Any]) -> list[Any]:
+        """`out` plus the texture of one level times a scale, at image positions x in [0, 1]."""
+        px, py = dr.fma(x.x, mi.Float(columns), -0.5), dr.fma(x.y, mi.Float(rows), -0.5)
+        left, top = dr.floor(px), dr.floor(py)
+        fx, fy = px - left, py - top
+        i, j = mi.Int32(left), mi.Int32(top)
+        # x lies within the image: only the first texel's left and the last one's right neighbor wrap.
+        i0 = mi.UInt32(dr.select(i < 0, mi.Int32(columns) - 1, i))
+        i1 = mi.UInt32(dr.select(i + 1 >= mi.Int32(columns), 0, i + 1))
+        j0 = start + columns * mi.UInt32(dr.select(j < 0, mi.Int32(rows) - 1, j))
+        j1 = start + columns * mi.UInt32(dr.select(j + 1 >= mi.Int32(rows), 0, j + 1))
+        right = fx if scale is None else fx * scale
+        left_weight = 1.0 - fx if scale is None else scale - right
+        low_right, low_left = right * fy, left_weight * fy
+        for index, weight in (
+            (j0 + i0, left_weight - low_left),
+            (j0 + i1, right - low_right),
+            (j1 + i0, low_left),
+            (j1 + i1, low_right),
+        ):
+            texel = self._texel(index)
+            out = [dr.fma(value, weight, total) for value, total in zip(texel, out, strict=True)]
+        return out
+
+    def _texel(self, index: Any) -> list[Any]:
+        values: list[Any] = []
+        for group in range(self.groups):
+            place = index * self.groups + group
+            values += list(dr.gather(mi.Vector4f, self.buffer, place))
+        return values[: self.channels]

@@ -1,0 +1,24 @@
+"""Factors of a value by its level and the elevations of light and view, read from small tables.
+
+A fit's tables come from :mod:`mbtf_fit.training.calibration`; what they are for stands there.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+# Along the cosine: 0, 1/16, ..., 1.
+KNOTS = 17
+
+
+def look_up_gain(table: Tensor, level: Tensor, cosine: Tensor) -> Tensor:
+    """Factors (n, 3) of a table (levels, knots, 3) at fractional levels (n,) and cosines (n,): linear between
+    knots, which stand at equal distances from 0 to 1, and between levels."""
+    last = max(1, table.shape[0] - 1)
+    # An image whose rows are levels, in the coordinates of grid_sample: corners at -1 and 1.
+    place = torch.stack([2.0 * cosine - 1.0, (2.0 / last) * level - 1.0], -1)
+    found = torch.nn.functional.grid_sample(
+        table.permute(2, 0, 1)[None], place[None, :, None], padding_mode="border", align_corners=True
+    )
+    return found[0, :, :, 0].T

@@ -1,0 +1,1 @@
+"""What training minimizes: losses, the noise of the data, regularization."""

@@ -1,0 +1,18 @@
+"""Command line of ``mbtf-gen``."""
+
+from __future__ import annotations
+
+from mbtf_core.console import new_app
+from mbtf_gen.cli.doctor import doctor
+from mbtf_gen.cli.folders import merge, repair, verify
+from mbtf_gen.cli.generate import generate
+from mbtf_gen.cli.inspect import inspect
+from mbtf_gen.cli.plan import plan
+from mbtf_gen.cli.preview import preview
+from mbtf_gen.cli.reference import reference
+from mbtf_gen.cli.selftest import selftest
+
+app = new_app("mbtf-gen", "Generate multi-resolution BTF (MBTF) data sets from displaced materials.")
+app.default(generate)
+for command in (inspect, plan, preview, merge, verify, repair, reference, selftest, doctor):
+    app.command(command)

@@ -1,0 +1,118 @@
+"""``mbtf-gen merge``, ``verify`` and ``repair``: folders of shards that exist."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from mbtf_core.console import CONSOLE, Console, clock, going_on
+from mbtf_core.errors import EXIT_BAD_INPUT, EXIT_OK
+from mbtf_gen.cli.generate import describe
+
+if TYPE_CHECKING:
+    from mbtf_gen.repairs import RepairResult
+
+
+def merge(folder: Path, /, *, console: Console = CONSOLE) -> int:
+    """Complete the manifest of a folder that slices (--shards i/n) were written into.
+
+    Parameters
+    ----------
+    folder
+        Folder of shards.
+    """
+    from mbtf_core.errors import EXIT_PARTIAL
+    from mbtf_gen.dataset.reader import Dataset
+    from mbtf_gen.dataset.summary import finish, summary_dict
+
+    Dataset.open(folder)
+    summary = finish(folder)
+    console.report(summary_dict(summary), describe(summary, ran=False))
+    return EXIT_OK if summary.complete else EXIT_PARTIAL
+
+
+def verify(folder: Path, /, *, console: Console = CONSOLE) -> int:
+    """Check every byte of a data set against its digests and the manifest.
+
+    Parameters
+    ----------
+    folder
+        Folder of shards.
+    """
+    from mbtf_gen.dataset.reader import Dataset
+    from mbtf_gen.dataset.verify import verify
+
+    start = time.perf_counter()
+    faults = verify(folder)
+    seconds = time.perf_counter() - start
+    dataset = Dataset.open(folder)
+    files = [folder / e["file"] for s in dataset.manifest["splits"].values() for e in s["shards"]]
+    read = sum(path.stat().st_size for path in files if path.exists())
+    lines = [f"{folder / f.file}: {f.what}; {f.hint}" for f in faults if not f.absent]
+    if absent := [f for f in faults if f.absent]:
+        missing = f"{len(absent)} of {len(files)} shards are missing, first {absent[0].file}"
+        lines.insert(0, f"{folder}: {missing}; {absent[0].hint}")
+    data = {
+        "folder": folder,
+        "shards": len(files),
+        "bytes": read,
+        "seconds": round(seconds, 3),
+        "faults": [asdict(f) for f in faults],
+    }
+    console.report(data, "\n".join(lines) or f"{folder}: {len(files)} shards, all intact")
+    console.note(f"{read / 1e6:.1f} MB read in {clock(seconds)} ({read / 1e6 / max(seconds, 1e-9):.0f} MB/s)")
+    return EXIT_BAD_INPUT if faults else EXIT_OK
+
+
+def repair(
+    folder: Path,
+    /,
+    *,
+    material: str | None = None,
+    dry_run: Annotated[bool, Parameter(negative="")] = False,
+    console: Console = CONSOLE,
+) -> int:
+    """Make again what verify condemns: the data set is then the undisturbed one.
+
+    Parameters
+    ----------
+    folder
+        Folder of shards.
+    material
+        Where the material lies now. Default: where it lay when the data set was made
+    dry_run
+        Only say what would be done.
+    """
+    from mbtf_gen.repairs import Corruption, RepairResult
+
+    damage = Corruption(folder, material)
+    if dry_run:
+        shards = [entry.file for entry in damage.entries]
+        done = RepairResult(str(folder), damage.faults, shards, damage.documents, damage.left, False, 0, 0.0)
+    else:
+        with (
+            going_on(f"{folder}: what was made again is kept"),
+            console.progress(damage.paths, "repairing", "paths") as bar,
+        ):
+            done = damage.mend(bar.update)
+    data = {"dry_run": dry_run, **asdict(done)}
+    console.report(data, _describe_repair(done, dry_run))
+    return EXIT_BAD_INPUT if done.left else EXIT_OK
+
+
+def _describe_repair(done: RepairResult, dry_run: bool) -> str:
+    verb, wrote = ("would be made", "would be written") if dry_run else ("made", "written")
+    lines = [f"{done.folder}/{f.file}: {f.what}" for f in done.faults if not f.absent and f not in done.left]
+    if done.shards:
+        first = ", ".join(done.shards[:5]) + (", …" if len(done.shards) > 5 else "")
+        lines.append(f"{done.folder}: {len(done.shards)} shards {verb} again ({first})")
+    if done.documents:
+        lines.append(f"{done.folder}: {' and '.join(done.documents)} {wrote} again")
+    if not done.shards and not done.documents:
+        lines.append(f"{done.folder}: nothing to mend")
+    lines += [f"{done.folder}/{f.file}: {f.what}, left alone; {f.hint}" for f in done.left]
+    return "\n".join(lines)

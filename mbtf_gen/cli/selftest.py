@@ -1,0 +1,47 @@
+"""``mbtf-gen selftest``: physics with known answers on this machine."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mbtf_core.console import CONSOLE, Console
+from mbtf_core.errors import InputError, UsageError
+
+
+def selftest(*, report: Path | None = None, time: str = "2min", console: Console = CONSOLE) -> int:
+    """Check physics with known answers on this machine, and say how far off the worst case is.
+
+    Exit code 0 when every check passed, 3 otherwise.
+
+    Parameters
+    ----------
+    report
+        Write every case to this file, .md or .html.
+    time
+        About how long to measure: 90s, 2min, 1h. Each check runs at least once; longer means smaller
+        statistical errors.
+    """
+    from mbtf_core.units import asked_duration
+
+    seconds = asked_duration(time, "--time")
+    if report is not None and report.suffix not in (".md", ".html"):
+        raise UsageError(f"'{report.name}' must end in .md or .html", where="--report")
+    from mbtf_gen.diagnostics.checks import all_checks
+    from mbtf_gen.diagnostics.report import as_html, as_json, as_markdown, as_text
+    from mbtf_gen.diagnostics.selftest import exit_code, run_checks
+    from mbtf_gen.render.runtime import load_mitsuba
+
+    load_mitsuba()
+    with console.progress(total=seconds, label="checking", unit="s") as bar:
+        findings = run_checks(
+            all_checks(), seconds, lambda done, name: bar.update(round(min(done, seconds)), name)
+        )
+    if report is not None:
+        from mbtf_core.atomic import write_text
+
+        try:
+            write_text(report, (as_html if report.suffix == ".html" else as_markdown)(findings))
+        except OSError as error:
+            raise InputError(f"cannot be written ({error.strerror})", where=report) from None
+    console.report(as_json(findings), as_text(findings))
+    return exit_code(findings)

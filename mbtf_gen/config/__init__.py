@@ -1,0 +1,1 @@
+"""Typed configurations of the generator and of the commands that make pictures."""

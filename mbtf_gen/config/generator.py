@@ -1,0 +1,201 @@
+"""Configuration of the generator: every option, typed, with its unit and its default.
+
+The hash of a configuration covers what changes the data (the contents of input files, not their names) and
+leaves out what does not (launch size, progress).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BeforeValidator, Field
+
+from mbtf_core.config_file import FileName, Settings
+from mbtf_core.errors import UsageError
+from mbtf_core.shard_schema import SCHEMA_VERSION, ArrayFormat, Layout, Tiling
+from mbtf_gen.geometry.slopes import NormalMode
+from mbtf_gen.planning.effects import EffectsRequest
+from mbtf_gen.sampling.light_kernel import MAX_WIDTH_DEG, MIN_WIDTH_DEG
+
+_PERCENT = re.compile(r"^\s*(\d+(?:\.\d*)?|\.\d+)\s*%\s*$")
+_COUNT = re.compile(r"^\s*(\d+(?:\.\d+)?(?:[eE][+]?\d+)?)\s*(/\s*texel)?\s*$")
+
+
+def parse_count(text: str | int | float) -> tuple[float, bool]:
+    """Read ``N`` or ``N/texel``: (N, whether it is per texel).
+
+    Raises
+    ------
+    ValueError : neither of the two, or not positive
+    """
+    match = _COUNT.match(str(text))
+    if match is None:
+        raise ValueError("must be N or N/texel, such as 100000 or 400/texel")
+    number = float(match[1])
+    if not 0 < number < 1e13:
+        raise ValueError("must be positive and below 1e13")
+    if match[2] is None and number != int(number):
+        raise ValueError("must be a whole number, or N/texel")
+    return number, match[2] is not None
+
+
+def count_queries(text: str | int | float, texels: int) -> int:
+    """Number of queries that ``N`` or ``N/texel`` stands for; at least 1."""
+    number, per_texel = parse_count(text)
+    return max(1, round(number * texels) if per_texel else int(number))
+
+
+def _count(text: Any) -> str:
+    """One spelling per count, so that ``400 / texel`` and ``400/texel`` are one configuration."""
+    number, per_texel = parse_count(text)
+    digits = str(int(number)) if number == int(number) else repr(number)
+    return f"{digits}/texel" if per_texel else digits
+
+
+def _share(text: Any) -> Any:
+    """A share as a number, also from ``2%``."""
+    if isinstance(text, str) and (match := _PERCENT.match(text)):
+        return float(match[1]) / 100.0
+    return text
+
+
+def _even(spp: int) -> int:
+    if spp % 2:
+        raise ValueError("must be even: the paths of a query are split into two independent halves")
+    return spp
+
+
+def _light_width(width: float) -> float:
+    if 0 < width < MIN_WIDTH_DEG:
+        raise ValueError(f"must be 0 (a delta light) or at least {MIN_WIDTH_DEG} degrees")
+    return width
+
+
+Count = Annotated[str, BeforeValidator(_count)]
+Paths = Annotated[int, Field(ge=2, le=1 << 20), AfterValidator(_even)]
+
+
+class GeometrySection(Settings):
+    """The displaced tile."""
+
+    height: float | None = Field(
+        None, ge=-100, le=100, description="factor on the stored heights; default: the material's own"
+    )
+    mesh: int | None = Field(
+        None, ge=1, le=8192, description="mesh cells across the tile; default: the map's width, at most 512"
+    )
+    tile: Tiling = Field(
+        "none", description="hint for maps that do not tile: mirrored copies, or edges cross-faded"
+    )
+
+
+class MixtureSection(Settings):
+    """Mixture over the fractional level l, weights that are normalized to sum 1."""
+
+    log_uniform: float = Field(0.6, ge=0, description="l uniform in [0, k]")
+    finest: float = Field(0.4, ge=0, description="l uniform in [k-1, k]")
+
+
+class QueriesSection(Settings):
+    """Which queries are drawn and how many paths each gets."""
+
+    train: Count = Field("100/texel", description="N or N/texel (texels of the finest level)")
+    test: Count = Field("8192", description="N or N/texel")
+    spp: Paths = Field(4, description="mean number of paths per training query, both halves together")
+    test_spp: Paths = Field(256, description="mean number of paths per test query, both halves together")
+    allocation: Literal["noise", "even"] = Field(
+        "noise", description="which queries get more paths: those where a pilot expects more noise, or none"
+    )
+    target_error: Annotated[float | None, BeforeValidator(_share)] = Field(
+        None,
+        gt=0,
+        lt=1,
+        description="error of every training value relative to max(value, tile mean), such as 2%; in place "
+        "of a mean number of paths",
+    )
+    cap: Paths = Field(1024, description="most paths per query under a target error")
+    levels: int | None = Field(None, ge=0, le=14, description="finest level k; default: from the map's width")
+    mixture: MixtureSection = MixtureSection()
+    min_cos: float = Field(0.1, gt=0, lt=1, description="smallest cosine of both directions to the normal")
+    layout: Layout = "shuffled"
+    window: int | None = Field(
+        None,
+        ge=1,
+        le=256,
+        description="image layout: so many places along each side of a buffer, a texel of the level nearest "
+        "to its footprint apart; default: one place in every texel of the finest level",
+    )
+
+
+class LightSection(Settings):
+    """The smoothed directional light."""
+
+    width: Annotated[float, AfterValidator(_light_width)] = Field(
+        1.0, ge=0, le=MAX_WIDTH_DEG, description="RMS angle per axis in degrees; 0 is a delta light"
+    )
+
+
+class TransportSection(Settings):
+    """How light paths are followed."""
+
+    max_depth: int = Field(0, ge=0, le=1000, description="surface interactions per path; 0: no limit")
+    roulette_depth: int = Field(1, ge=1, le=1000, description="interactions before Russian roulette begins")
+    max_crossings: int = Field(4096, ge=1, description="tile borders that one ray may cross")
+
+
+def _effects(text: str) -> str:
+    try:
+        EffectsRequest.parse(text)
+    except UsageError as error:
+        raise ValueError(str(error)) from None
+    return text
+
+
+class EffectsSection(Settings):
+    """Which effects of light are simulated."""
+
+    mode: Annotated[str, AfterValidator(_effects)] = Field(
+        "auto", description="auto, all or none, then +x or -x for single effects, comma-separated"
+    )
+    tolerance: float = Field(
+        0.005, ge=0, lt=1, description="cost of all effects left out together, relative to the mean value"
+    )
+    normal: NormalMode = Field(
+        "residual",
+        description="slopes of a normal map: those the mesh lacks, all in place of its own, or none",
+    )
+
+
+class OutputSection(Settings):
+    """How the data are stored."""
+
+    format: ArrayFormat = "npz"
+    shard_queries: int = Field(1 << 18, ge=1, le=1 << 24, description="queries per shard")
+
+
+class GeneratorConfig(Settings):
+    """Everything ``mbtf-gen`` needs to make a data set."""
+
+    version: Literal[1] = 1
+    material: FileName = Field(description="height map, folder of maps, or material.yaml")
+    geometry: GeometrySection = GeometrySection()
+    queries: QueriesSection = QueriesSection()
+    light: LightSection = LightSection()
+    transport: TransportSection = TransportSection()
+    effects: EffectsSection = EffectsSection()
+    output: OutputSection = OutputSection()
+    seed: int = Field(0, ge=0, lt=1 << 63, description="root seed")
+
+    def data_fields(self, inputs: dict[str, str]) -> dict[str, Any]:
+        """What the data depend on: the options, and the digests of the input files in place of their
+        names."""
+        fields = self.model_dump(exclude={"material"})
+        return {"schema": SCHEMA_VERSION, "inputs": dict(sorted(inputs.items())), **fields}
+
+    def hash(self, inputs: dict[str, str]) -> str:
+        """SHA-256 over :meth:`data_fields`, hexadecimal; `inputs` maps roles to digests of files."""
+        text = json.dumps(self.data_fields(inputs), sort_keys=True, separators=(",", ":"))
+        return hashlib.sha256(text.encode()).hexdigest()

@@ -1,0 +1,1 @@
+"""Data sets on disk: shards, manifest, locks, verification."""

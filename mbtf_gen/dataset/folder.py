@@ -1,0 +1,197 @@
+"""The folder that a data set is written into: claimed, resumed, refused, or cleared."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mbtf_core.atomic import (
+    TEMPORARY,
+    checksummed,
+    create_file,
+    read_checksummed,
+    read_json,
+    remove_file,
+    unwritable,
+    write_text,
+)
+from mbtf_core.config_file import differences, dump_yaml, in_short
+from mbtf_core.errors import InputError, PartialError
+from mbtf_core.locks import brief_lock, lock_owner, take_lock
+from mbtf_core.shard_schema import CONFIG_NAME, FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, SPLITS
+
+if TYPE_CHECKING:
+    from mbtf_gen.generation import Job
+
+# What a run writes into its folder, and what a killed one leaves there.
+_SHARD = rf"(?:{'|'.join(SPLITS)})-\d+"
+_OWN = re.compile(rf"{re.escape(MANIFEST_NAME)}|{re.escape(CONFIG_NAME)}|{_SHARD}\.(?:npz|exr|json)")
+_UNFINISHED = re.compile(rf"\.({_OWN.pattern}){TEMPORARY}")
+_LOCK = re.compile(rf"\.({_SHARD}|{re.escape(Path(MANIFEST_NAME).stem)})\.lock")
+
+
+def _is_leftover(name: str) -> bool:
+    return bool(_UNFINISHED.fullmatch(name) or _LOCK.fullmatch(name))
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """The manifest of a folder, to go on from: just as it was written.
+
+    Raises
+    ------
+    InputError : missing, unreadable, or changed
+    """
+    return read_checksummed(folder / MANIFEST_NAME, "mend it with: mbtf-gen repair FOLDER")
+
+
+def holds(folder: Path, config_hash: str) -> bool:
+    """Whether a folder holds a data set of this configuration, finished or not."""
+    path = folder / MANIFEST_NAME
+    return path.exists() and read_json(path).get("config_hash") == config_hash
+
+
+def open_folder(
+    job: Job, folder: Path, like: dict[str, Any], begin: Callable[[], dict[str, Any]], overwrite: bool
+) -> None:
+    """Claim the output folder: new, empty, resumed, or replaced.
+
+    Of several writers that begin a data set at once, one writes the manifest and the others adopt it.
+
+    Parameters
+    ----------
+    like : manifest of the data set to make, for comparison
+    begin : makes the manifest that is written where there is none yet, its effects planned
+
+    Raises
+    ------
+    InputError : it holds something else, or a damaged manifest
+    PartialError : it cannot be written, or others write what is to be replaced
+    """
+    if folder.exists() and not folder.is_dir():
+        raise InputError("is a file, not a folder", where=folder)
+    existing = folder / MANIFEST_NAME
+    replace = overwrite and existing.exists()
+    if replace:
+        _check_format(existing)
+    elif existing.exists():
+        _check_same(job, folder, like)
+        if (folder / CONFIG_NAME).exists():
+            return
+    elif folder.exists() and not all(_is_leftover(p.name) for p in folder.iterdir()):
+        if existing.exists():
+            # Another writer of the same data set made it between the two looks.
+            return open_folder(job, folder, like, begin, overwrite)
+        raise InputError(
+            "is not empty and holds no data set", where=folder, hint="choose another folder with -o"
+        )
+    # Planned before anything is touched, and not while others wait.
+    content = checksummed(begin()) if replace or not existing.exists() else b""
+    if replace:
+        _clear(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot be made ({error.strerror})", where=folder) from None
+    with brief_lock(existing):
+        _remove_unfinished(folder, (MANIFEST_NAME, CONFIG_NAME))
+        # The manifest first: it makes the folder ours, whatever instant the run is killed at.
+        if content and not create_file(existing, content):
+            _check_same(job, folder, like)
+        if not (folder / CONFIG_NAME).exists():
+            write_text(folder / CONFIG_NAME, dump_yaml(read_manifest(folder)["config"]))
+
+
+def _check_format(path: Path) -> dict[str, Any]:
+    manifest = read_json(path)
+    if manifest.get("format") != FORMAT_NAME:
+        raise InputError(
+            f"is not a manifest of {FORMAT_NAME}", where=path, hint="choose another folder with -o"
+        )
+    return manifest
+
+
+def _check_same(job: Job, folder: Path, like: dict[str, Any]) -> None:
+    """Refuse a folder whose manifest, which is there, is not of this job, or damaged."""
+    old = _check_format(folder / MANIFEST_NAME)
+    if old.get("config_hash") == job.config_hash:
+        read_manifest(folder)
+        return
+    config = old.get("config")
+    before = {**(config if isinstance(config, dict) else {}), "inputs": old.get("inputs", {})}
+    before["schema"] = old.get("schema")
+    after = {**like["config"], "inputs": like["inputs"], "schema": SCHEMA_VERSION}
+    changes = in_short(differences(before, after))
+    if not changes:
+        read_manifest(folder)
+        changes = "inputs differ"
+    raise InputError(
+        f"holds a data set of another configuration: {changes}",
+        where=folder,
+        hint="choose another folder with -o, or replace it with --overwrite",
+    )
+
+
+def _locks(folder: Path) -> Iterator[Path]:
+    """Files whose locks lie in a folder, by names that lead to them."""
+    for path in sorted(folder.iterdir()):
+        if match := _LOCK.fullmatch(path.name):
+            yield folder / f"{match[1]}.npz"
+
+
+def _remove_unfinished(folder: Path, names: tuple[str, ...]) -> None:
+    """Remove what killed runs left of files; hold their lock."""
+    for path in folder.iterdir():
+        if any(re.fullmatch(rf"\.{re.escape(name)}{TEMPORARY}", path.name) for name in names):
+            remove_file(path)
+
+
+def sweep(folder: Path) -> None:
+    """Remove the locks and unfinished files that killed runs left, where nobody holds them.
+
+    Raises
+    ------
+    PartialError : the folder cannot be written
+    """
+    general = Path(MANIFEST_NAME).stem
+    stems = {path.stem for path in _locks(folder)}
+    for path in folder.iterdir():
+        if match := _UNFINISHED.fullmatch(path.name):
+            stem = Path(match[1]).stem
+            stems.add(general if match[1] == CONFIG_NAME else stem)
+    for stem in sorted(stems):
+        lock = take_lock(folder / f"{stem}.npz")
+        if lock is None:
+            continue
+        try:
+            files = [f"{stem}{suffix}" for suffix in (".npz", ".exr", ".json")]
+            _remove_unfinished(folder, (*files, *([CONFIG_NAME] if stem == general else [])))
+        finally:
+            lock.release()
+
+
+def _clear(folder: Path) -> None:
+    """Remove a data set and nothing else; the manifest last, so that the rest never stands without it.
+
+    Raises
+    ------
+    PartialError : somebody is writing it, or the folder cannot be written
+    """
+    with ExitStack() as held:
+        for path in _locks(folder):
+            lock = take_lock(path)
+            if lock is None:
+                raise PartialError(
+                    f"is being written by another process ({lock_owner(path)})",
+                    where=folder,
+                    hint="wait for it or end it, then run the same command again",
+                )
+            held.callback(lock.release)
+        names = [p.name for p in folder.iterdir() if _OWN.fullmatch(p.name) or _is_leftover(p.name)]
+        try:
+            for name in sorted(names, key=lambda name: name == MANIFEST_NAME):
+                (folder / name).unlink(missing_ok=True)
+        except OSError as error:
+            raise unwritable(folder, error) from None

@@ -1,0 +1,229 @@
+"""One shard on disk: npz (uncompressed, memory-mappable) or EXR (named float32 channels).
+
+A shard is a mapping of array name to array; all arrays share their leading axes: ``(n,)`` queries in the
+``shuffled`` layout, ``(items, rows, columns)`` in the ``image`` layout. See ``docs/format.md``.
+"""
+
+from __future__ import annotations
+
+import errno
+import math
+import zipfile
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.lib import format as npy_format
+from numpy.typing import NDArray
+
+from mbtf_core.atomic import Stored, write_chunks, write_through
+from mbtf_core.errors import InputError, reason
+from mbtf_core.shard_schema import ARRAY, ARRAYS, ArrayFormat
+from mbtf_gen.dataset.npz import npz_chunks
+
+Arrays = dict[str, NDArray[np.float32]]
+
+# Width of the EXR images that shuffled queries are folded into.
+_FOLD_WIDTH = 1024
+# An EXR header that claims more is damaged.
+_MAX_PIXELS = 2**31
+
+
+def check_arrays(arrays: Mapping[str, NDArray[np.float32]], where: object) -> tuple[int, ...]:
+    """Leading axes shared by all arrays of a shard.
+
+    Raises
+    ------
+    InputError : a required array is missing, unknown, or of the wrong shape
+    """
+    missing = [a.name for a in ARRAYS if not a.optional and a.name not in arrays]
+    if missing:
+        raise InputError(f"shard lacks the array(s) {', '.join(missing)}", where=where)
+    return _common_lead(arrays, where)
+
+
+def _common_lead(arrays: Mapping[str, NDArray[np.float32]], where: object) -> tuple[int, ...]:
+    """Leading axes shared by arrays of a shard, not necessarily all of them.
+
+    Raises
+    ------
+    InputError : an array is unknown or of the wrong shape
+    """
+    lead: tuple[int, ...] | None = None
+    for name, array in arrays.items():
+        if name not in ARRAY:
+            raise InputError(f"shard holds an unknown array '{name}'", where=where)
+        trailing = ARRAY[name].trailing
+        shape = array.shape[: array.ndim - len(trailing)]
+        fits = array.shape[len(shape) :] == trailing and len(shape) in (1, 3)
+        if not fits or lead not in (None, shape):
+            raise InputError(f"array '{name}' has the shape {array.shape}", where=where)
+        lead = shape
+    if lead is None:
+        raise InputError("shard holds no arrays", where=where)
+    return lead
+
+
+def write_npz(path: Path, arrays: Mapping[str, NDArray[np.float32]]) -> Stored:
+    """Write a shard as npz, atomically; the bytes depend on the arrays alone."""
+    check_arrays(arrays, path)
+    present = ((s.name, np.ascontiguousarray(arrays[s.name], s.dtype)) for s in ARRAYS if s.name in arrays)
+    return write_chunks(path, npz_chunks(present))
+
+
+def read_npz(path: Path, names: Iterable[str] | None = None, *, mapped: bool = True) -> Arrays:
+    """Arrays of an npz shard, memory-mapped read-only by default.
+
+    Parameters
+    ----------
+    names : arrays wanted; all by default
+
+    Raises
+    ------
+    InputError : missing file, not a shard, truncated, or compressed by another writer
+    """
+    out: Arrays = {}
+    try:
+        with zipfile.ZipFile(path) as archive, path.open("rb") as stream:
+            members = {i.filename.removesuffix(".npy"): i for i in archive.infolist()}
+            wanted = list(members) if names is None else list(names)
+            size = path.stat().st_size
+            for name in wanted:
+                if name not in members:
+                    raise InputError(f"shard lacks the array '{name}'", where=path)
+                info = members[name]
+                if info.compress_type != zipfile.ZIP_STORED:
+                    raise InputError("shard is compressed; shards are stored uncompressed", where=path)
+                stream.seek(info.header_offset + 26)
+                lengths = stream.read(4)
+                skip = int.from_bytes(lengths[:2], "little") + int.from_bytes(lengths[2:], "little")
+                stream.seek(info.header_offset + 30 + skip)
+                start = stream.tell()
+                shape, fortran, dtype = _npy_header(stream)
+                if fortran or dtype != np.dtype("<f4"):
+                    raise InputError(f"array '{name}' is not C-ordered float32", where=path)
+                count = math.prod(shape)
+                end = stream.tell() + count * dtype.itemsize
+                if count < 0 or end - start != info.file_size or end > size:
+                    raise InputError(f"array '{name}' is not as long as its header says", where=path)
+                array: NDArray[np.float32]
+                if mapped and 0 not in shape:
+                    array = np.memmap(path, dtype, mode="r", offset=stream.tell(), shape=shape)
+                else:
+                    array = np.fromfile(stream, dtype, count).reshape(shape)
+                out[name] = array
+    except FileNotFoundError:
+        raise InputError("no such shard", where=path) from None
+    except InputError:
+        raise
+    except Exception as error:  # a damaged archive or header may make its parser raise anything
+        raise InputError(f"shard cannot be read ({reason(error)})", where=path) from None
+    return out
+
+
+def _npy_header(stream: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    try:
+        version = npy_format.read_magic(stream)
+        readers = {(1, 0): npy_format.read_array_header_1_0, (2, 0): npy_format.read_array_header_2_0}
+        return readers[version](stream)
+    except Exception:  # a damaged header may make its parser raise anything, the header's bytes included
+        raise ValueError("the header of an array is damaged") from None
+
+
+def _fold(array: NDArray[np.float32], lead: tuple[int, ...]) -> NDArray[np.float32]:
+    """Bring leading axes to (rows, columns) of one image: queries row by row, buffers stacked downwards."""
+    trailing = array.shape[len(lead) :]
+    if len(lead) == 1:
+        rows = -(-lead[0] // _FOLD_WIDTH)
+        folded = np.zeros((rows * _FOLD_WIDTH, *trailing), np.float32)
+        folded[: lead[0]] = array
+        return folded.reshape(rows, _FOLD_WIDTH, *trailing)
+    return array.reshape(lead[0] * lead[1], lead[2], *trailing)
+
+
+def write_exr(path: Path, arrays: Mapping[str, NDArray[np.float32]]) -> Stored:
+    """Write a shard as one EXR image with a named float32 channel per component, atomically.
+
+    The header's string ``mbtf.lead`` holds the leading axes ("n" or "items,rows,columns").
+    """
+    import OpenEXR
+
+    lead = check_arrays(arrays, path)
+    channels: dict[str, Any] = {}
+    for spec in ARRAYS:
+        if spec.name not in arrays:
+            continue
+        image = _fold(np.asarray(arrays[spec.name], np.float32), lead)
+        for index, channel in enumerate(spec.channels):
+            channels[channel] = np.ascontiguousarray(image[..., index] if spec.trailing else image)
+    header = {
+        "compression": OpenEXR.NO_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+        "mbtf.lead": ",".join(str(n) for n in lead),
+    }
+
+    def write(temporary: Path) -> None:
+        try:
+            OpenEXR.File(header, channels).write(str(temporary))
+        except RuntimeError as error:
+            # What the system said stands behind the library's words, which end with the file's name.
+            raise OSError(errno.EIO, reason(str(error).rpartition('". ')[2].rstrip("."))) from None
+
+    return write_through(path, write)
+
+
+def read_exr(path: Path, names: Iterable[str] | None = None) -> Arrays:
+    """Arrays of an EXR shard.
+
+    Raises
+    ------
+    InputError : missing file, not an EXR file, or not a shard
+    """
+    from mbtf_gen.images.exr import read_file
+
+    if not path.exists():
+        raise InputError("no such shard", where=path)
+    # Shards are stored uncompressed: one that claims more pixels than it has bytes is damaged.
+    header, stored = read_file(path, min(_MAX_PIXELS, path.stat().st_size))
+    if "mbtf.lead" not in header:
+        raise InputError("EXR image is not a shard (no 'mbtf.lead' in its header)", where=path)
+    out: Arrays = {}
+    try:
+        lead = tuple(int(n) for n in header["mbtf.lead"].split(","))
+        for spec in ARRAYS:
+            if spec.name not in (names if names is not None else [spec.name]):
+                continue
+            if any(c not in stored for c in spec.channels):
+                if spec.optional and names is None:
+                    continue
+                raise InputError(f"shard lacks the array '{spec.name}'", where=path)
+            count = math.prod(lead)
+            flat = np.stack([stored[c].reshape(-1)[:count] for c in spec.channels], axis=-1)
+            out[spec.name] = np.ascontiguousarray(flat.reshape(*lead, *spec.trailing), np.float32)
+    except (ValueError, AttributeError):
+        raise InputError("shard cannot be read (its 'mbtf.lead' does not fit its size)", where=path) from None
+    return out
+
+
+def shard_suffix(array_format: ArrayFormat) -> str:
+    """File name suffix of a shard of the given format."""
+    return f".{array_format}"
+
+
+def write_shard(path: Path, arrays: Mapping[str, NDArray[np.float32]]) -> Stored:
+    """Write a shard in the format that its suffix names, atomically; its size and digest."""
+    return (write_exr if path.suffix == ".exr" else write_npz)(path, arrays)
+
+
+def read_shard(path: Path, names: Iterable[str] | None = None, *, mapped: bool = True) -> Arrays:
+    """Read a shard of either format; npz shards are memory-mapped by default.
+
+    Raises
+    ------
+    InputError : missing, damaged, or arrays of shapes that do not fit together
+    """
+    arrays = read_exr(path, names) if path.suffix == ".exr" else read_npz(path, names, mapped=mapped)
+    if arrays:
+        _common_lead(arrays, path)
+    return arrays

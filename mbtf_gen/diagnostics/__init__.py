@@ -1,0 +1,1 @@
+"""Checks of a machine: ``mbtf-gen doctor`` and ``mbtf-gen selftest``."""

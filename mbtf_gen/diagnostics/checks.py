@@ -1,0 +1,370 @@
+"""The checks of ``mbtf-gen selftest``: scenes whose answer is known, through the estimator of every run."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mbtf_core.directions import from_angles
+from mbtf_core.stats import Estimate, mean_estimate, mean_of_halves
+from mbtf_gen.diagnostics.closed_forms import Groove, Wall, mirror
+from mbtf_gen.diagnostics.selftest import Case, Check
+from mbtf_gen.geometry.heightfield import HeightGrid
+from mbtf_gen.sampling.light_kernel import LightKernel
+from mbtf_gen.sampling.query_sampler import Queries
+
+F64 = NDArray[np.float64]
+Cases = Mapping[str, Case]
+
+_UP = from_angles(90.0, 0.0)
+_PAIRS = [((70, 0), (80, 0)), ((35, 10), (50, 200)), ((20, 180), (60, 30)), ((15, 60), (25, 75))]
+_GRAZING = (1.0, 0.1, 1e-2, 1e-4)
+
+
+def all_checks() -> list[Check]:
+    """Every check, in the order in which they are reported."""
+    return [
+        Check(
+            "Lambert plane",
+            "M = albedo/π for footprints of 0 … 100 tiles, light and view down to cosine 1e-4",
+            "relative",
+            1e-4,
+            _lambert,
+        ),
+        Check(
+            "irradiance",
+            "the light brings exactly 1 to the reference plane, also where the horizon cuts it",
+            "relative",
+            1e-4,
+            _irradiance,
+        ),
+        Check("mirror", "a mirror shows the light's lobe, path by path", "relative", 2e-3, _mirror, False),
+        Check(
+            "V-groove",
+            "tile means of a groove are those of its closed form",
+            "relative",
+            1e-3,
+            _groove,
+        ),
+        Check("wall", "shadow and flank of a wall of slope 100", "relative", 1e-3, _wall),
+        Check("furnace", "a white relief under constant radiance returns 1", "relative", 2e-4, _furnace),
+        Check(
+            "reciprocity",
+            "light and view may be exchanged, interreflection included",
+            "relative",
+            2e-3,
+            _reciprocity,
+        ),
+        Check("surface energy", "white gloss and metal return 1", "relative", 2e-3, _surface),
+        Check("periodicity", "no ray slips through the tile's borders and corners", "count", 0.0, _lost),
+        Check("chunks", "values do not depend on how many are traced at once", "count", 0.0, _chunks, False),
+        Check("directions", "they survive npz and EXR, horizon included", "rad", 1e-6, _stored, False),
+        Check(
+            "CUDA",
+            "the groove's closed form on the graphics processor",
+            "relative",
+            1e-3,
+            _cuda,
+            repeated=False,
+            required=False,
+        ),
+    ]
+
+
+def made_relief(cells: int = 64) -> HeightGrid:
+    """A periodic relief with terraces, steep flanks and no symmetry."""
+    t = 2.0 * np.pi * np.arange(cells) / cells
+    x, y = np.meshgrid(t, t)
+    h = np.sin(x + 1.3 * np.sin(y)) + 0.6 * np.cos(2 * y - x + 0.4) + 0.3 * np.sin(3 * x + 2 * y)
+    h = (h - h.min()) / np.ptp(h)
+    return HeightGrid.from_map(0.7 * np.floor(5.0 * h) / 5.0 + 0.3 * h, 0.2)
+
+
+def _diffuse(albedo: float) -> dict[str, Any]:
+    return {"type": "mbtf_surface", "base_color": {"type": "rgb", "value": [albedo] * 3}}
+
+
+def _queries(u: ArrayLike, sigma: ArrayLike, omega_i: ArrayLike, omega_o: ArrayLike, n: int) -> Queries:
+    def rows(x: ArrayLike, trailing: tuple[int, ...]) -> NDArray[np.float32]:
+        return np.broadcast_to(np.asarray(x, np.float32), (n, *trailing)).copy()
+
+    return Queries(rows(u, (2,)), rows(sigma, ()), rows(omega_i, (3,)), rows(omega_o, (3,)))
+
+
+def _positions(n: int, round_number: int) -> F64:
+    return np.random.default_rng([7, round_number]).random((n, 2))
+
+
+def _estimates(
+    grid: HeightGrid,
+    bsdf: dict[str, Any],
+    light: LightKernel | None,
+    queries: Queries,
+    spp: int,
+    round_number: int,
+    *,
+    direct: bool = False,
+    launch: int = 1 << 20,
+    variant: str | None = None,
+) -> Any:
+    """Estimates of M; each round has random numbers of its own."""
+    from mbtf_gen.render.runtime import CPU_VARIANT, load_mitsuba
+
+    load_mitsuba(variant or CPU_VARIANT)
+    from mbtf_gen.render.estimates import Stream
+    from mbtf_gen.render.estimator import Estimator
+    from mbtf_gen.render.path_tracer import Transport
+    from mbtf_gen.render.scene import build_tile
+
+    estimator = Estimator(build_tile(grid, bsdf), light, Transport(max_depth=1 if direct else 0), launch)
+    return estimator.estimate(queries, spp, Stream(17, "test", round_number))
+
+
+def _tile_mean(
+    grid: HeightGrid,
+    bsdf: dict[str, Any],
+    light: LightKernel | None,
+    omega_i: ArrayLike,
+    omega_o: ArrayLike,
+    round_number: int,
+    n: int = 16_000,
+    **options: Any,
+) -> Estimate:
+    """Tile mean: footprints of four tile widths, each of which covers the tile evenly."""
+    q = _queries(_positions(n, round_number), 4.0, omega_i, omega_o, n)
+    e = _estimates(grid, bsdf, light, q, 16, round_number, **options)
+    return mean_estimate(0.5 * (e.value_a.astype(np.float64) + e.value_b)[:, 0])
+
+
+def _off(measured: Estimate, expected: float) -> Case:
+    return Case(measured.value / expected - 1.0, measured.error / abs(expected))
+
+
+def _towards(cosine: float, azimuth: float) -> F64:
+    return from_angles(math.degrees(math.asin(cosine)), azimuth)
+
+
+def _lambert(round_number: int) -> Cases:
+    out = {}
+    plane, n = HeightGrid(np.zeros((4, 4)), 1.0), 2000
+    for width in (0.0, 1.0):
+        for light in _GRAZING:
+            for view in _GRAZING:
+                sigma = np.resize([0.0, 1e-3, 0.5, 100.0], n)
+                u = _positions(n, round_number)
+                q = _queries(u, sigma, _towards(light, 20), _towards(view, 200), n)
+                e = _estimates(plane, _diffuse(0.5), LightKernel(width), q, 32, round_number)
+                name = f"light {width:g}°, cosines {light:g} and {view:g}"
+                out[name] = _off(mean_of_halves(e.value_a[:, 0], e.value_b[:, 0]), 0.5 / math.pi)
+    return out
+
+
+def _irradiance(round_number: int) -> Cases:
+    """By the sampler of the light: E[L ω_z / density]."""
+    from mbtf_gen.render.runtime import load_mitsuba
+
+    mi = load_mitsuba()
+    import drjit as dr
+
+    from mbtf_gen.render.directional_light import DirectionalLight
+
+    n, out = 100_000, {}
+    rng = np.random.default_rng([3, round_number])
+    for width in (0.05, 1.0, 30.0):
+        kernel = LightKernel(width)
+        for cosine in _GRAZING:
+            omega_i = _towards(cosine, 77).astype(np.float32)
+            lanes = DirectionalLight(
+                "lobe",
+                mi.Vector3f(*(dr.full(mi.Float, float(c), n) for c in omega_i)),
+                dr.full(mi.Float, 1.0 / float(kernel.irradiance(omega_i)), n),
+                dr.opaque(mi.Float, kernel.kappa),
+            )
+            omega = lanes.sample(mi.Point2f(rng.random((2, n), np.float32)))
+            value = np.array(lanes.radiance(omega) * omega.z / lanes.sampling_density(omega), np.float64)
+            out[f"light {width:g}°, cosine {cosine:g}"] = _off(mean_estimate(value), 1.0)
+    return out
+
+
+def _mirror(round_number: int) -> Cases:
+    plane, out = HeightGrid(np.zeros((4, 4)), 1.0), {}
+    rng = np.random.default_rng(5)
+    metal: dict[str, Any] = {"type": "mbtf_surface", "base_color": {"type": "rgb", "value": [0.9] * 3}}
+    metal |= {"metallic": 1.0, "roughness": 0.0}
+    for width in (0.05, 1.0, 10.0):
+        light, n = LightKernel(width), 200
+        rise = np.degrees(np.arcsin(10 ** rng.uniform(-3, 0, n)))
+        view = from_angles(rise, 360 * rng.random(n))
+        omega_i = view * (-1.0, -1.0, 1.0) + np.radians(width) * rng.normal(size=view.shape)
+        omega_i[:, 2] = np.maximum(np.abs(omega_i[:, 2]), 1e-3)
+        omega_i = (omega_i / np.linalg.norm(omega_i, axis=1, keepdims=True)).astype(np.float32)
+        view = view.astype(np.float32)
+        e = _estimates(plane, metal, light, _queries([0.5, 0.5], 0.1, omega_i, view, n), 2, round_number)
+        expected = mirror(0.9, light, omega_i, view)
+        # Far out in the lobe there is next to nothing to be right about.
+        off = (e.value_a[:, 0] - expected) / np.maximum(expected, 1e-3)
+        out[f"light {width:g}°"] = Case(float(off[np.argmax(np.abs(off))]))
+    return out
+
+
+def _groove(round_number: int, variant: str | None = None) -> Cases:
+    groove, out = Groove(0.4, 0.7), {}
+    for light, view in _PAIRS:
+        omega_i, omega_o = from_angles(*light), from_angles(*view)
+        mean = _tile_mean(
+            groove.grid,
+            _diffuse(groove.albedo),
+            LightKernel(0.0),
+            omega_i,
+            omega_o,
+            round_number,
+            direct=True,
+            variant=variant,
+        )
+        out[f"light {light}, view {view}"] = _off(mean, groove.tile_mean(omega_i, omega_o))
+    return out
+
+
+def _wall(round_number: int) -> Cases:
+    wall, out = Wall(64, 100.0, 0.7), {}
+    for elevation in (65.0, 80.0):
+        for azimuth in (0.0, 180.0):
+            light = from_angles(elevation, azimuth)
+            mean = _tile_mean(
+                wall.grid, _diffuse(0.7), LightKernel(0.0), light, _UP, round_number, direct=True
+            )
+            name = f"light {elevation:g}°, azimuth {azimuth:g}°"
+            out[name] = _off(mean, wall.tile_mean_from_above(light))
+    return out
+
+
+def _furnace(round_number: int) -> Cases:
+    relief, white = made_relief(), _diffuse(1.0)
+    return {
+        f"view {elevation:g}°": _off(
+            _tile_mean(relief, white, None, _UP, from_angles(elevation, 40), round_number, 4000), 1.0
+        )
+        for elevation in (90.0, 30.0, 3.0, 0.5)
+    }
+
+
+def _reciprocity(round_number: int) -> Cases:
+    relief, out = made_relief(), {}
+    for light, view in _PAIRS[1:]:
+        one, other = from_angles(*light), from_angles(*view)
+        forth, back = (
+            _tile_mean(relief, _diffuse(0.9), LightKernel(0.0), i, o, 2 * round_number + k)
+            for k, (i, o) in enumerate(((one, other), (other, one)))
+        )
+        mean = 0.5 * (forth.value + back.value)
+        error = math.hypot(forth.error, back.error) / mean
+        out[f"{light} and {view}"] = Case((forth.value - back.value) / mean, error)
+    return out
+
+
+def _surface(round_number: int) -> Cases:
+    plane, n, out = HeightGrid(np.zeros((4, 4)), 1.0), 1000, {}
+    for metallic in (0.0, 1.0):
+        for roughness in (0.0, 0.1, 0.5, 1.0):
+            bsdf = {**_diffuse(1.0), "specular": 0.5, "metallic": metallic, "roughness": roughness}
+            for cosine in (1.0, 0.3, 1e-2, 1e-4):
+                q = _queries([0.5, 0.5], 0.1, _UP, _towards(cosine, 30), n)
+                e = _estimates(plane, bsdf, None, q, 32, round_number)
+                name = f"metallic {metallic:g}, roughness {roughness:g}, cosine {cosine:g}"
+                out[name] = _off(mean_of_halves(e.value_a[:, 0], e.value_b[:, 0]), 1.0)
+    return out
+
+
+def _lost(round_number: int) -> Cases:
+    """Counts of rays from above that found no surface; 300 000 a round and shape."""
+    out = {}
+    rng = np.random.default_rng([11, round_number])
+    for aspect in (1.0, 0.5):
+        grid, n = HeightGrid(made_relief().z, aspect), 150_000
+        u = rng.random((n, 2))
+        border = np.array([0.0, 0.5 / 64, 1.0 - 0.5 / 64, 1.0 - 1e-7])
+        third = n // 3
+        u[:third, 0] = rng.choice(border, third)
+        u[third : 2 * third] = rng.choice(border, (third, 2))
+        z = np.exp(rng.uniform(math.log(0.02), 0.0, n))
+        phi = 2.0 * np.pi * rng.random(n)
+        # Along the axes of the grid rays run inside edges.
+        phi[::2] = np.round(phi[::2] / (0.5 * np.pi)) * 0.5 * np.pi
+        r = np.sqrt(1.0 - z * z)
+        view = np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=-1)
+        e = _estimates(
+            grid,
+            _diffuse(0.0),
+            LightKernel(0.0),
+            _queries(u, 0.0, _UP, view, n),
+            2,
+            round_number,
+            direct=True,
+        )
+        out[f"aspect {aspect:g}"] = Case(float(e.lost + e.capped))
+    return out
+
+
+def _chunks(round_number: int) -> Cases:
+    """Counts of values that differ between launches of different size."""
+    n = 1000
+    q = _queries(_positions(n, 0), 0.1, from_angles(40, 60), from_angles(55, 200), n)
+    light = LightKernel(5.0)
+    whole, pieces = (
+        _estimates(made_relief(), _diffuse(0.8), light, q, 8, round_number, launch=launch)
+        for launch in (1 << 20, 1 << 11)
+    )
+    different = np.count_nonzero((whole.value_a != pieces.value_a) | (whole.value_b != pieces.value_b))
+    return {"launches of 2048 and 8000 paths": Case(float(different))}
+
+
+def _stored(round_number: int) -> Cases:
+    from mbtf_gen.dataset.shard_io import read_shard, write_shard
+
+    n, out = 20_000, {}
+    rng = np.random.default_rng(13)
+    cosine, phi = 10 ** rng.uniform(-9, 0, n), 2 * np.pi * rng.random(n)
+    sine = np.sqrt((1 - cosine) * (1 + cosine))
+    omega = np.stack([sine * np.cos(phi), sine * np.sin(phi), cosine], axis=-1)
+    q = _queries([0.5, 0.5], 0.1, omega, omega, n)
+    value = np.ones((n, 3), np.float32)
+    arrays = {"u": q.u, "sigma": q.sigma, "omega_i": q.omega_i, "omega_o": q.omega_o}
+    arrays |= {"value_a": value, "value_b": value, "spp": q.sigma}
+    with tempfile.TemporaryDirectory(prefix="mbtf-selftest-") as folder:
+        for suffix in ("npz", "exr"):
+            path = Path(folder, f"train-00000.{suffix}")
+            write_shard(path, arrays)
+            back = np.array(read_shard(path, mapped=False)["omega_i"], np.float64)
+            off = 2.0 * np.arcsin(0.5 * np.linalg.norm(back - omega, axis=1))
+            # The height above the horizon matters relatively.
+            rise = np.abs(back[:, 2] / omega[:, 2] - 1.0)
+            out[f"{suffix}, angle"] = Case(float(off.max()))
+            out[f"{suffix}, cosine (relative)"] = Case(float(rise.max()))
+    return out
+
+
+def _cuda(round_number: int) -> Cases | None:
+    """In a child process: a driver may end it. None where there is no device."""
+    from mbtf_core.child_process import run_child
+    from mbtf_core.errors import EngineError
+    from mbtf_gen.render.runtime import CUDA_VARIANT, prove
+
+    if prove(CUDA_VARIANT).fault:
+        return None
+    outcome = run_child(__name__, "groove_on_cuda", timeout=180.0)
+    if outcome.fault:
+        raise EngineError(outcome.fault)
+    return {name: Case(*numbers) for name, numbers in outcome.answers.items()}
+
+
+def groove_on_cuda() -> Iterator[dict[str, Any]]:
+    """Child process of the CUDA check."""
+    from mbtf_gen.render.runtime import CUDA_VARIANT
+
+    yield {name: (c.off, c.error) for name, c in _groove(0, CUDA_VARIANT).items()}

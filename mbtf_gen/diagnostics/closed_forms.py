@@ -1,0 +1,138 @@
+"""Scenes whose M is known in closed form, for checks of a machine (``mbtf-gen selftest``) and tests.
+
+All of them are Lambert reliefs under a delta light, direct light alone, of unit irradiance on the reference
+plane: a lit facet of normal n sends ``albedo/π · (n·ω_i)/ω_i,z`` towards every viewer. Which part of a
+facet is lit or seen follows from straight lines past ridges in the cross-section.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mbtf_gen.geometry.heightfield import HeightGrid
+from mbtf_gen.sampling.light_kernel import LightKernel
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Groove:
+    """A symmetric V-groove along y: ridges at x = 1/4 + n, valleys at x = 3/4 + n.
+
+    Attributes
+    ----------
+    depth : of the valleys, tile widths
+    albedo : of both facets
+    """
+
+    depth: float
+    albedo: float
+
+    @property
+    def grid(self) -> HeightGrid:
+        """Its heights: two columns."""
+        return HeightGrid(np.tile([0.0, -self.depth], (2, 1)), 1.0)
+
+    @property
+    def slope(self) -> float:
+        """Steepness of the facets."""
+        return 2.0 * self.depth
+
+    def _reach(self, omega: F64, side: int) -> float:
+        """Depth down to which the facet that descends towards `side`·x sees direction ω (3,)."""
+        if side * self.slope * omega[0] + omega[2] <= 0:
+            return 0.0
+        # At depth d the facet is d/slope from its ridge; the opposite ridge, one tile on, is passed when
+        # d/slope + d·ω_x/ω_z ≤ 1.
+        run = 1.0 / self.slope + side * omega[0] / omega[2]
+        return self.depth if run <= 0 else min(self.depth, 1.0 / run)
+
+    def _radiance(self, omega_i: F64, side: int) -> float:
+        cosine = (side * self.slope * omega_i[0] + omega_i[2]) / np.hypot(1.0, self.slope)
+        return float(self.albedo / np.pi * max(0.0, cosine) / omega_i[2])
+
+    def tile_mean(self, omega_i: ArrayLike, omega_o: ArrayLike) -> float:
+        """Tile mean in 1/sr for directions (3,)."""
+        light, view = np.asarray(omega_i, np.float64), np.asarray(omega_o, np.float64)
+        total = 0.0
+        for side in (1, -1):
+            both = min(self._reach(light, side), self._reach(view, side))
+            # The shadow of a facet's depth d on the reference plane, along the view.
+            length = both * (1.0 / self.slope + side * view[0] / view[2])
+            total += self._radiance(light, side) * length
+        return total
+
+    def value(self, x: ArrayLike, omega_i: ArrayLike, omega_o: ArrayLike) -> F64:
+        """B in 1/sr at positions x (any shape) on the reference plane, for directions (3,)."""
+        light, view = np.asarray(omega_i, np.float64), np.asarray(omega_o, np.float64)
+        position = np.asarray(x, np.float64)
+        out = np.zeros_like(position)
+        for side in (1, -1):
+            seen, lit = self._reach(view, side), self._reach(light, side)
+            if seen == 0:
+                continue
+            length = side / self.slope + view[0] / view[2]
+            # Distance from the facet's ridge on the plane, in the direction in which the facet lies, 0 … 1.
+            away = (position - 0.25) * np.sign(length) % 1.0
+            depth = away / abs(length)
+            out = np.where(depth <= min(seen, lit), self._radiance(light, side), out)
+        return out
+
+
+@dataclass(frozen=True)
+class Wall:
+    """A thin wall along y on a floor: one column of a map of `columns` is high, its flanks are a cell wide.
+
+    Attributes
+    ----------
+    columns : of the map
+    slope : steepness of the flanks
+    albedo : of everything
+    """
+
+    columns: int
+    slope: float
+    albedo: float
+
+    @property
+    def height(self) -> float:
+        """Of the wall, tile widths."""
+        return self.slope / self.columns
+
+    @property
+    def grid(self) -> HeightGrid:
+        """Its heights."""
+        row = np.full(self.columns, -self.height)
+        row[self.columns // 3] = 0.0
+        return HeightGrid(np.tile(row, (2, 1)), 1.0)
+
+    def tile_mean_from_above(self, omega_i: ArrayLike) -> float:
+        """Tile mean in 1/sr seen along the normal, for a light (3,) whose shadow falls short of the next
+        wall.
+
+        Raises
+        ------
+        ValueError : the shadow reaches the next wall, or the light sees both flanks
+        """
+        light = np.asarray(omega_i, np.float64)
+        shadow, cell = self.height * abs(light[0]) / light[2], 1.0 / self.columns
+        if not cell <= shadow <= 1.0 - cell:
+            raise ValueError("the light is too low or too high for the closed form")
+        floor = 1.0 - 2.0 * cell - (shadow - cell)
+        flank = (self.slope * abs(light[0]) + light[2]) / (np.hypot(1.0, self.slope) * light[2])
+        return float(self.albedo / np.pi * (floor + cell * flank))
+
+
+def mirror(f0: float, light: LightKernel, omega_i: ArrayLike, omega_o: ArrayLike) -> F64:
+    """M (...) in 1/sr of a flat metallic mirror: Schlick's ``F(μ_o)`` times the light from the mirrored view.
+
+    Parameters
+    ----------
+    f0 : reflectance at normal incidence; omega_i, omega_o : (..., 3)
+    """
+    view = np.asarray(omega_o, np.float64)
+    fresnel = f0 + (1.0 - f0) * (1.0 - view[..., 2]) ** 5
+    return np.asarray(fresnel * light.radiance(view * (-1.0, -1.0, 1.0), omega_i))

@@ -1,0 +1,122 @@
+"""Findings of the self-test as text for a terminal, as Markdown and as HTML."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+from typing import Any
+
+from mbtf_gen.diagnostics.selftest import STANDARD_ERRORS, Case, Finding
+
+_HEAD = ("check", "worst error", "± statistical", "tolerance", "cases", "")
+_UNITS = {"relative": "", "count": "", "rad": " rad"}
+_STYLE = (
+    "body{font:16px/1.5 system-ui,sans-serif;max-width:60rem;margin:2rem auto;padding:0 1rem}"
+    "table{border-collapse:collapse}td,th{padding:.3rem .8rem;text-align:left;border-bottom:1px solid #ccc}"
+    ".failed{color:#b00020;font-weight:bold}.absent{color:#666}"
+)
+
+
+def machine() -> dict[str, Any]:
+    """What the numbers were measured on: software versions, kind and number of processors."""
+    import os
+
+    from mbtf_gen.dataset.manifest import software_versions
+
+    return {**software_versions(), "processors": os.cpu_count() or 1}
+
+
+def _number(x: float, unit: str) -> str:
+    return f"{x:.3g}" if unit == "count" else f"{x:.1e}{_UNITS[unit]}"
+
+
+def _row(finding: Finding) -> tuple[str, ...]:
+    check, worst = finding.check, finding.worst
+    tolerance = _number(check.tolerance, check.unit)
+    if worst is None:
+        return (check.name, "-", "-", tolerance, "-", finding.state)
+    off, error = worst[1].off, worst[1].error
+    size = _number(abs(off), check.unit)
+    random = _number(error, check.unit) if error else "exact"
+    return (check.name, size, random, tolerance, str(len(finding.cases)), finding.state)
+
+
+def verdict(findings: Sequence[Finding]) -> str:
+    """The result in a sentence."""
+    failed = [f.check.name for f in findings if f.state == "failed"]
+    if not failed:
+        return "every check passed"
+    return f"failed: {', '.join(failed)}"
+
+
+def as_text(findings: Sequence[Finding]) -> str:
+    """A table for a terminal, the worst case of what failed, and the verdict."""
+    rows = [_HEAD, *(_row(f) for f in findings)]
+    widths = [max(len(row[i]) for row in rows) for i in range(len(_HEAD))]
+    lines = ["  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip() for row in rows]
+    for f in (f for f in findings if f.state == "failed"):
+        lines.append(f"{f.check.name}: {f.fault or _case(f, *f.worst) if f.worst else f.fault}")
+    return "\n".join([*lines, verdict(findings)])
+
+
+def _case(finding: Finding, name: str, case: Case) -> str:
+    unit = finding.check.unit
+    random = f" ± {_number(case.error, unit)}" if case.error else ""
+    return f"{name}: off by {case.off:.3g}{_UNITS[unit]}{random}"
+
+
+def _introduction(findings: Sequence[Finding]) -> list[str]:
+    about = machine()
+    versions = ", ".join(f"{k} {v}" for k, v in about.items() if k not in ("machine", "processors"))
+    seconds = sum(f.seconds for f in findings)
+    return [
+        f"{verdict(findings).capitalize()}, in {seconds:.0f} s on {about['machine']} with "
+        f"{about['processors']} processors ({versions}).",
+        f"A case may be off by its tolerance and {STANDARD_ERRORS:g} standard errors. Shown is the worst "
+        "one of each check.",
+    ]
+
+
+def as_markdown(findings: Sequence[Finding]) -> str:
+    """A report with every case."""
+    lines = ["# Self-test", "", *(line for text in _introduction(findings) for line in (text, ""))]
+    lines += [f"| {' | '.join(_HEAD)} |", "|" + "---|" * len(_HEAD)]
+    lines += [f"| {' | '.join(_row(f))} |" for f in findings]
+    for f in findings:
+        lines += ["", f"## {f.check.name}", "", f"{f.check.statement}.", ""]
+        lines += [f"- {_case(f, name, case)}" for name, case in f.cases.items()]
+        lines += [f"- {f.fault}"] if f.fault else []
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def as_html(findings: Sequence[Finding]) -> str:
+    """The same as one self-contained page."""
+    head = "".join(f"<th>{escape(c)}</th>" for c in _HEAD)
+    rows = "".join(
+        f'<tr class="{f.state}">' + "".join(f"<td>{escape(c)}</td>" for c in _row(f)) + "</tr>\n"
+        for f in findings
+    )
+    parts = [f"<p>{escape(text)}</p>" for text in _introduction(findings)]
+    parts.append(f"<table>\n<tr>{head}</tr>\n{rows}</table>")
+    for f in findings:
+        items = [*(_case(f, name, case) for name, case in f.cases.items()), *([f.fault] if f.fault else [])]
+        parts.append(
+            f"<h2>{escape(f.check.name)}</h2>\n<p>{escape(f.check.statement)}.</p>\n<ul>"
+            + "".join(f"<li>{escape(item)}</li>" for item in items)
+            + "</ul>"
+        )
+    body = "\n".join(parts)
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>Self-test</title>'
+        f"<style>{_STYLE}</style></head>\n<body><h1>Self-test</h1>\n{body}\n</body></html>\n"
+    )
+
+
+def as_json(findings: Sequence[Finding]) -> dict[str, Any]:
+    """As one object for ``--json``."""
+    return {
+        "ok": all(f.state != "failed" for f in findings if f.check.required),
+        "seconds": round(sum(f.seconds for f in findings), 2),
+        "checks": [f.as_dict() for f in findings],
+        "machine": machine(),
+    }

@@ -1,0 +1,80 @@
+"""Displaced periodic tile: heights on a grid → triangles.
+
+Mesh vertices sit on texel centers of the grid, ``uv = ((i+½)/W, 1-(j+½)/H)``, heights are
+``z = height · (h - max h)``, and the cell between the last and the first column (row) closes the period.
+Meshes for other renderers may have an apron of repeated cells around the period, so that a ray near its
+border meets surface on both sides of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class HeightGrid:
+    """Heights of one tile in tile widths.
+
+    Attributes
+    ----------
+    z : (H, W) heights ≤ 0, maximum 0; row 0 is the side ``v → 1``
+    aspect : H/W of the tile
+    """
+
+    z: NDArray[np.float64]
+    aspect: float
+
+    @classmethod
+    def from_map(cls, heights: NDArray[np.float64], scale: float, aspect: float | None = None) -> HeightGrid:
+        """Grid of a height map (H, W) of stored numbers: ``z = scale · (h - max h)``; aspect H/W by default.
+
+        The maximum is taken after scaling, so that a negative scale turns the relief upside down.
+        """
+        z = scale * np.asarray(heights, np.float64)
+        rows, columns = z.shape
+        return cls(z - z.max(), rows / columns if aspect is None else aspect)
+
+    @property
+    def displacement_range(self) -> float:
+        """Largest height difference in tile widths."""
+        return float(self.z.max() - self.z.min())
+
+
+def grid_vertices(grid: HeightGrid, apron: tuple[int, int] = (0, 0)) -> NDArray[np.float64]:
+    """Vertices (rows, columns, 3) as (x, y, z) in tile widths, x = u, y = a·v, from the period's first
+    vertex to the first vertex of the next period, plus `apron` = (rows, columns) cells on each side."""
+    rows, columns = grid.z.shape
+    j = np.arange(-apron[0], rows + 1 + apron[0])
+    i = np.arange(-apron[1], columns + 1 + apron[1])
+    x = (i + 0.5) / columns
+    y = grid.aspect * (1.0 - (j + 0.5) / rows)
+    z = grid.z[np.ix_(j % rows, i % columns)]
+    return np.stack(np.broadcast_arrays(x[None, :], y[:, None], z), axis=-1)
+
+
+def grid_faces(rows: int, columns: int) -> NDArray[np.uint32]:
+    """Triangles (2·(rows-1)·(columns-1), 3) of a grid of vertices, counter-clockwise seen from above."""
+    index = np.arange(rows * columns, dtype=np.uint32).reshape(rows, columns)
+    top_left, top_right = index[:-1, :-1], index[:-1, 1:]
+    low_left, low_right = index[1:, :-1], index[1:, 1:]
+    first = np.stack([top_left, low_left, low_right], axis=-1)
+    second = np.stack([top_left, low_right, top_right], axis=-1)
+    return np.stack([first, second], axis=2).reshape(-1, 3)
+
+
+def tile_mesh(grid: HeightGrid) -> Any:
+    """One period of the tile as a :class:`trimesh.Trimesh` with texture coordinates; lengths in tile
+    widths."""
+    import trimesh
+
+    vertices = grid_vertices(grid)
+    rows, columns = vertices.shape[:2]
+    flat = vertices.reshape(-1, 3)
+    uv = flat[:, :2] / (1.0, grid.aspect)
+    mesh = trimesh.Trimesh(flat, grid_faces(rows, columns), process=False)
+    mesh.visual = trimesh.visual.TextureVisuals(uv=uv)
+    return mesh

@@ -1,0 +1,141 @@
+"""Channels of an EXR file, with the size checked before any pixel is read."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbtf_core.errors import InputError
+
+# Of all channels of all parts together, so many full images are read.
+_MOST_CHANNELS = 4
+# Tiles may be larger than the image, up to this.
+_TILE_PIXELS = 1 << 20
+
+
+@contextlib.contextmanager
+def silenced() -> Iterator[None]:
+    """Keep a native library's remarks on a broken file out of standard output and standard error."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    saved = os.dup(1), os.dup(2)
+    sink = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(sink, 1)
+        os.dup2(sink, 2)
+        with (
+            open(os.devnull, "w") as nothing,
+            contextlib.redirect_stdout(nothing),
+            contextlib.redirect_stderr(nothing),
+        ):
+            yield
+    finally:
+        os.dup2(saved[0], 1)
+        os.dup2(saved[1], 2)
+        for handle in (*saved, sink):
+            os.close(handle)
+
+
+def _window(header: dict[str, Any], name: str) -> tuple[int, int, int, int]:
+    low, high = header[name]
+    return int(low[0]), int(low[1]), int(high[0]), int(high[1])
+
+
+def read_file(path: Path, max_pixels: int) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """Header of the first part of an EXR file, and its channels (H, W) by name, float16 or float32.
+
+    Raises
+    ------
+    InputError : broken, more than `max_pixels`, cropped (data window unlike the display window), deep,
+        subsampled, or channels of whole numbers
+    """
+    head, channels = _read(path, max_pixels)[0]
+    for name, channel in channels.items():
+        if channel.dtype.kind != "f":
+            raise InputError(
+                f"channel '{name}' holds whole numbers", where=path, hint="save it as half or float"
+            )
+    return head, channels
+
+
+def read_channels(path: Path, max_pixels: int) -> dict[str, NDArray[Any]]:
+    """Channels (H, W) by name of all parts, float16, float32 or uint32.
+
+    With several parts, the channels of a part carry its name in front, as layers do.
+
+    Raises
+    ------
+    InputError : as :func:`read_file`, or two channels of one name
+    """
+    parts = _read(path, max_pixels)
+    if len(parts) == 1:
+        return parts[0][1]
+    out: dict[str, NDArray[Any]] = {}
+    for number, (head, channels) in enumerate(parts):
+        part = str(head.get("name", f"part{number}"))
+        for name, pixels in channels.items():
+            full = name if name.startswith(f"{part}.") else f"{part}.{name}"
+            if full in out:
+                raise InputError(f"two channels are named '{full}'", where=path)
+            out[full] = pixels
+    return out
+
+
+def _read(path: Path, max_pixels: int) -> list[tuple[dict[str, Any], dict[str, NDArray[Any]]]]:
+    """(header, channels) of every part; all sizes are checked before any pixel is read."""
+    import OpenEXR
+
+    broken = InputError("cannot be read as an EXR image: it is damaged or cut short", where=path)
+    try:
+        with silenced():
+            file = OpenEXR.File(str(path), separate_channels=True, header_only=True)
+            heads = [part.header for part in file.parts]
+    except Exception:  # a damaged file may make the library raise anything
+        raise broken from None
+    sizes = [_checked_size(head, path, max_pixels) for head in heads]
+    numbers = sum(h * w * len(head["channels"]) for (h, w), head in zip(sizes, heads, strict=True))
+    if numbers > _MOST_CHANNELS * max_pixels:
+        raise InputError(
+            f"claims {numbers:,} numbers; at most {_MOST_CHANNELS * max_pixels:,} are read", where=path
+        )
+    try:
+        with silenced(), OpenEXR.File(str(path), separate_channels=True) as file:
+            parts = [{n: np.array(c.pixels) for n, c in part.channels.items()} for part in file.parts]
+    except Exception:
+        raise broken from None
+    if not heads or len(parts) != len(heads):
+        raise broken
+    for size, channels in zip(sizes, parts, strict=True):
+        if not channels or any(c.shape != size for c in channels.values()):
+            raise broken
+    return list(zip(heads, parts, strict=True))
+
+
+def _checked_size(head: dict[str, Any], path: Path, max_pixels: int) -> tuple[int, int]:
+    """(rows, columns) of a part, unless it is of a kind that is refused."""
+    import OpenEXR
+
+    if head["type"] not in (OpenEXR.scanlineimage, OpenEXR.tiledimage):
+        raise InputError("deep EXR images are not supported", where=path, hint="flatten the image")
+    window = _window(head, "dataWindow")
+    columns, rows = window[2] - window[0] + 1, window[3] - window[1] + 1
+    if rows * columns > max_pixels:
+        raise InputError(f"claims {columns} x {rows} pixels; at most {max_pixels:,} are read", where=path)
+    if window != _window(head, "displayWindow"):
+        raise InputError(
+            "data window and display window differ: a cropped tile", where=path, hint="crop the image"
+        )
+    tiles = head["tiles"] if head["type"] == OpenEXR.tiledimage else None
+    if tiles is not None and tiles.xSize * tiles.ySize > max(rows * columns, _TILE_PIXELS):
+        # The library takes memory for whole tiles, whatever the size of the image.
+        raise InputError(f"claims tiles of {tiles.xSize} x {tiles.ySize} pixels", where=path)
+    if any(c.xSampling != 1 or c.ySampling != 1 for c in head["channels"]):
+        raise InputError("subsampled EXR channels are not supported", where=path, hint="save it as plain RGB")
+    return rows, columns

@@ -1,0 +1,361 @@
+"""Images as arrays: EXR, PNG, JPG, TIFF and npy, decoded to numbers without loss.
+
+Integer images become ``code / largest code``; float images keep their numbers. No color space is applied
+here: which map is sRGB and which is data is the material's business.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import warnings as python_warnings
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mbtf_core.errors import InputError, reason
+from mbtf_core.suggest import suggest_path
+from mbtf_gen.images.exr import read_channels, silenced
+from mbtf_gen.images.exr_layers import choose_channels
+from mbtf_gen.images.metadata import NO_TAGS, Tags, tags_of
+from mbtf_gen.images.png16 import header as png_header
+from mbtf_gen.images.png16 import read_png16
+from mbtf_gen.images.tiff import read_tiff
+
+# A header may claim any size; beyond this nothing is allocated (11 585² pixels).
+MAX_PIXELS = 2**27
+
+# No compression of these formats does better (that of PNG reaches 1032 : 1, with 8 pixels in a byte).
+_PIXELS_PER_BYTE = 1 << 14
+
+# Gray images stored as color JPG come back with channels that differ by rounding.
+_GRAY_CODES = 2.0 / 255.0
+
+# Rec.709 luminance of linear RGB.
+LUMINANCE = (0.2126, 0.7152, 0.0722)
+
+_KINDS = {
+    ".exr": "EXR",
+    ".png": "PNG",
+    ".jpg": "JPEG",
+    ".jpeg": "JPEG",
+    ".tif": "TIFF",
+    ".tiff": "TIFF",
+    ".npy": "NPY",
+}
+_MAGIC = {
+    b"\x76\x2f\x31\x01": "EXR",
+    b"\x89PNG": "PNG",
+    b"\xff\xd8\xff": "JPEG",
+    b"II*\x00": "TIFF",
+    b"MM\x00*": "TIFF",
+    b"II+\x00": "TIFF",
+    b"MM\x00+": "TIFF",
+    b"\x93NUMPY": "NPY",
+}
+SUFFIXES = tuple(_KINDS)
+
+
+@dataclass(frozen=True)
+class Image:
+    """A decoded image.
+
+    Attributes
+    ----------
+    pixels : (H, W, C), row 0 the top, C = 1 gray, 2 gray and alpha, 3 RGB, 4 RGBA; float64 for one channel,
+        float32 for several; all finite
+    bits : 8 or 16 where the file holds integers (then pixels are code / largest code), None for floats
+    path : the file
+    tags : what the file says about its colors and orientation; nothing of it is applied here
+    channels : names of the channels that were chosen, where there was a choice
+    """
+
+    pixels: NDArray[np.floating[Any]]
+    bits: int | None
+    path: Path
+    tags: Tags = NO_TAGS
+    channels: tuple[str, ...] = ()
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, columns)."""
+        return self.pixels.shape[0], self.pixels.shape[1]
+
+
+def is_image(path: Path) -> bool:
+    """Does the file name end like an image that can be read?"""
+    return path.suffix.lower() in _KINDS
+
+
+def read_image(
+    path: str | Path, channel: str | None = None, prefer: Callable[[str], bool] | None = None
+) -> Image:
+    """Decode an image file.
+
+    Parameters
+    ----------
+    channel : what to take of it: a channel or a layer of an EXR file, R, G, B, A or Y of the others; by
+        default all that belongs together
+    prefer : of several layers of an EXR file, the one whose name this accepts (see
+        :func:`~mbtf_gen.images.exr_layers.choose_channels`)
+
+    Raises
+    ------
+    InputError : missing, empty, damaged, cut short, of another kind than its name says, of a kind that is not
+        supported, more than ``MAX_PIXELS`` pixels, without the channel, or with pixels that are NaN or
+        infinite (with their number and the first one's column and row)
+    """
+    path = Path(path)
+    kind = _kind(path)
+    if kind == "EXR":
+        image = _from_exr(path, channel, prefer)
+    else:
+        image = _from_npy(path) if kind == "NPY" else _from_pillow(path, kind)
+        image = image if channel is None else _pick(image, channel)
+    bad = ~np.isfinite(image.pixels).all(axis=-1)
+    if bad.any():
+        raise InputError(f"{count_and_first(bad)} NaN or infinite", where=path)
+    return image
+
+
+def count_and_first(bad: NDArray[np.bool_]) -> str:
+    """``3 pixels, the first at column 5, row 2, are`` for a mask (H, W) that is set somewhere."""
+    number = int(bad.sum())
+    row, column = (int(i) for i in np.argwhere(bad)[0])
+    if number == 1:
+        return f"1 pixel, at column {column}, row {row}, is"
+    return f"{number} pixels, the first at column {column}, row {row}, are"
+
+
+def _kind(path: Path) -> str:
+    """What the file is by its first bytes, which must agree with its name."""
+    named = _KINDS.get(path.suffix.lower())
+    if path.is_dir():
+        raise InputError("is a folder, not an image", where=path)
+    try:
+        with path.open("rb") as stream:
+            start = stream.read(8)
+    except FileNotFoundError:
+        raise InputError("no such file", where=path, hint=suggest_path(path, is_image)) from None
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
+    if named is None:
+        raise InputError(
+            f"'{path.suffix}' is not an image format that is read",
+            where=path,
+            hint=f"use one of {', '.join(SUFFIXES)}",
+        )
+    if not start:
+        raise InputError("is empty", where=path)
+    found = next((kind for magic, kind in _MAGIC.items() if start.startswith(magic)), None)
+    if found is None:
+        raise InputError(f"is no {named} image", where=path)
+    if found != named:
+        suffix = next(s for s, kind in _KINDS.items() if kind == found)
+        raise InputError(f"holds {found} data", where=path, hint=f"rename it to {path.stem}{suffix}")
+    return found
+
+
+def _check_size(rows: int, columns: int, path: Path) -> None:
+    if rows * columns > MAX_PIXELS:
+        raise InputError(f"claims {columns} x {rows} pixels; at most {MAX_PIXELS:,} are read", where=path)
+    if rows * columns <= 0:
+        raise InputError("holds no pixels", where=path)
+    size = path.stat().st_size
+    if rows * columns > _PIXELS_PER_BYTE * size:
+        raise InputError(f"is cut short: {size} bytes cannot hold {columns} x {rows} pixels", where=path)
+
+
+def _from_codes(codes: NDArray[Any], bits: int, path: Path) -> Image:
+    stacked = codes if codes.ndim == 3 else codes[..., None]
+    dtype = np.float64 if stacked.shape[2] == 1 else np.float32
+    return Image(np.divide(stacked, 2**bits - 1, dtype=dtype), bits, path)
+
+
+def _from_floats(numbers: NDArray[Any], path: Path) -> Image:
+    stacked = numbers if numbers.ndim == 3 else numbers[..., None]
+    dtype = np.float64 if stacked.shape[2] == 1 else np.float32
+    with np.errstate(
+        over="ignore", invalid="ignore"
+    ):  # too large for float32 becomes infinite and is reported as that
+        return Image(stacked.astype(dtype), None, path)
+
+
+def _from_exr(path: Path, channel: str | None, prefer: Callable[[str], bool] | None) -> Image:
+    channels = read_channels(path, MAX_PIXELS)
+    names = choose_channels(list(channels), path, channel, prefer)
+    for name in names:
+        if channels[name].dtype.kind != "f":
+            raise InputError(
+                f"channel '{name}' holds whole numbers", where=path, hint="save it as half or float"
+            )
+    image = _from_floats(np.stack([channels[n] for n in names], axis=-1), path)
+    return replace(image, channels=tuple(names) if len(channels) > len(names) else ())
+
+
+def _pick(image: Image, channel: str) -> Image:
+    """One channel of an image by its letter."""
+    names = {1: "Y", 2: "YA", 3: "RGB", 4: "RGBA"}[image.pixels.shape[2]]
+    if channel.upper() not in tuple(names):
+        raise InputError(f"has no channel '{channel}'", where=image.path, hint=f"it holds {', '.join(names)}")
+    index = names.index(channel.upper())
+    numbers = _exact(image.pixels[..., index], image.bits)
+    return replace(image, pixels=numbers[..., None], channels=(names[index],))
+
+
+def _exact(numbers: NDArray[np.floating[Any]], bits: int | None) -> NDArray[np.float64]:
+    """Back from single precision to the exact fraction that a code stands for."""
+    if bits is None:
+        return numbers.astype(np.float64)
+    largest = 2**bits - 1
+    return np.rint(numbers.astype(np.float64) * largest) / largest
+
+
+def _npy_fault(error: Exception) -> str:
+    """What the array reader means: its own words quote the header's bytes or speak of its way of reading."""
+    known = {
+        "header": "its header is damaged",
+        "Python objects": "it holds Python objects",
+        "mmap length": "it is cut short",
+    }
+    return next((said for word, said in known.items() if word in str(error)), reason(error))
+
+
+def _from_npy(path: Path) -> Image:
+    try:
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+    except Exception as error:  # a damaged header may make the parser raise anything, its bytes included
+        raise InputError(f"cannot be read as an npy array ({_npy_fault(error)})", where=path) from None
+    if array.ndim not in (2, 3) or (array.ndim == 3 and not 1 <= array.shape[2] <= 4):
+        raise InputError(
+            f"holds an array of shape {array.shape}; (H, W) or (H, W, 1..4) is wanted", where=path
+        )
+    _check_size(array.shape[0], array.shape[1], path)
+    if array.dtype.kind == "f":
+        return _from_floats(array, path)
+    if array.dtype in (np.uint8, np.uint16):
+        return _from_codes(array, 8 * array.dtype.itemsize, path)
+    raise InputError(f"holds {array.dtype} numbers; uint8, uint16 or floats are wanted", where=path)
+
+
+def _from_pillow(path: Path, kind: str) -> Image:
+    import PIL
+    from PIL import Image as Pillow
+
+    head = None
+    if kind == "PNG":
+        with path.open("rb") as stream:
+            head = png_header(stream.read(33))
+    if head is not None:
+        _check_size(head[1], head[0], path)
+        if head[2] == 16 and head[3] > 1:
+            return replace(_from_codes(read_png16(path), 16, path), tags=_tags(path, kind))
+    if kind == "TIFF":
+        array = read_tiff(path, _check_size)
+        if array is not None:
+            floats = array.dtype.kind == "f"
+            image = _from_floats(array, path) if floats else _from_codes(array, 8 * array.itemsize, path)
+            return replace(image, tags=_tags(path, kind))
+    try:
+        with python_warnings.catch_warnings(), silenced() if kind == "TIFF" else contextlib.nullcontext():
+            python_warnings.simplefilter("ignore")
+            with Pillow.open(path, formats=[kind]) as picture:
+                _check_size(picture.height, picture.width, path)
+                _refuse_deep_tiff(picture, path)
+                picture.load()
+                return replace(_from_picture(picture, path), tags=tags_of(picture.info, picture.getexif()))
+    except Pillow.DecompressionBombError:
+        raise InputError(f"claims more than {MAX_PIXELS:,} pixels", where=path) from None
+    except InputError:
+        raise
+    except PIL.UnidentifiedImageError:
+        raise InputError(f"cannot be read as a {kind} image (its header is damaged)", where=path) from None
+    except Exception as error:  # a damaged file may make the decoder raise anything
+        raise InputError(f"cannot be read as a {kind} image ({reason(error)})", where=path) from None
+
+
+def _tags(path: Path, kind: str) -> Tags:
+    """Tags of a file whose pixels another reader has decoded; none where they cannot be read."""
+    from PIL import Image as Pillow
+
+    try:
+        with python_warnings.catch_warnings(), silenced():
+            python_warnings.simplefilter("ignore")
+            with Pillow.open(path, formats=[kind]) as picture:
+                return tags_of(picture.info, picture.getexif())
+    except Exception:  # what the library does not know may make it raise anything
+        return NO_TAGS
+
+
+def _refuse_deep_tiff(picture: Any, path: Path) -> None:
+    """The library reads color TIFF of 16 bits as 8: better refused than cut."""
+    bits = getattr(picture, "tag_v2", {}).get(258, (8,))
+    bits = bits if isinstance(bits, tuple) else (bits,)
+    if len(bits) > 1 and max(bits) > 8:
+        raise InputError(
+            f"color TIFF of {max(bits)} bits is not read", where=path, hint="save it as PNG or EXR"
+        )
+
+
+def _from_picture(picture: Any, path: Path) -> Image:
+    mode = picture.mode
+    if mode in ("P", "PA"):
+        transparent = mode == "PA" or "transparency" in picture.info
+        picture = picture.convert("RGBA" if transparent else "RGB")
+    elif mode == "1":
+        picture = picture.convert("L")
+    elif mode == "YCbCr":
+        picture = picture.convert("RGB")
+    if picture.mode in ("L", "LA", "RGB", "RGBA"):
+        return _from_codes(np.asarray(picture), 8, path)
+    if picture.mode.startswith("I;16"):
+        return _from_codes(np.asarray(picture).astype(np.uint16), 16, path)
+    if picture.mode == "F":
+        return _from_floats(np.asarray(picture), path)
+    if picture.mode == "I" and picture.format == "PNG":
+        return _from_codes(np.asarray(picture), 16, path)
+    raise InputError(f"holds pixels of the kind '{mode}'", where=path, hint="save it as gray or RGB")
+
+
+def gray(image: Image) -> tuple[NDArray[np.float64], list[str]]:
+    """One number per pixel, (H, W), and warnings about what was dropped.
+
+    A gray image is taken as it is. RGB whose channels agree (within two codes of 8 bits, which is JPG's
+    rounding) is gray too; other colors are reduced to their Rec.709 luminance with a warning. Alpha is
+    dropped, with a warning where it is not 1 everywhere.
+    """
+    pixels, warnings = image.pixels, []
+    if pixels.shape[2] in (2, 4) and np.any(pixels[..., -1] != 1.0):
+        warnings.append(f"{image.path}: its alpha channel is not used")
+    rgb = pixels[..., : 3 if pixels.shape[2] > 2 else 1]
+    spread = float(np.max(rgb.max(axis=-1) - rgb.min(axis=-1)))
+    if spread == 0.0:
+        return _exact(rgb[..., 0], image.bits), warnings
+    tolerance = _GRAY_CODES if image.bits == 8 else 1e-4 * float(np.abs(rgb).max())
+    if spread > tolerance:
+        warnings.append(
+            f"{image.path}: is colored where one number per pixel is wanted; its luminance is used"
+        )
+    return rgb.astype(np.float64) @ np.asarray(LUMINANCE), warnings
+
+
+def srgb_to_linear(encoded: ArrayLike) -> NDArray[np.floating[Any]]:
+    """Linear light of sRGB-encoded numbers in [0, 1], any shape (IEC 61966-2-1)."""
+    c = _floating(encoded)
+    bent = ((np.maximum(c, 0.0) + c.dtype.type(0.055)) / c.dtype.type(1.055)) ** c.dtype.type(2.4)
+    return np.where(c <= 0.04045, c / c.dtype.type(12.92), bent)
+
+
+def linear_to_srgb(linear: ArrayLike) -> NDArray[np.floating[Any]]:
+    """sRGB encoding of linear light in [0, 1], any shape (IEC 61966-2-1); not clamped."""
+    c = _floating(linear)
+    root = np.maximum(c, 0.0) ** c.dtype.type(1.0 / 2.4)
+    return np.where(c <= 0.0031308, c * c.dtype.type(12.92), c.dtype.type(1.055) * root - c.dtype.type(0.055))
+
+
+def _floating(numbers: ArrayLike) -> NDArray[np.floating[Any]]:
+    c = np.asarray(numbers)
+    return c if c.dtype.kind == "f" else c.astype(np.float64)

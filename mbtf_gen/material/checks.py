@@ -1,0 +1,171 @@
+"""What the maps of a material say about each other, put into words: heights, tiling, normals."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbtf_core.errors import InputError
+from mbtf_gen.images.read import Image
+from mbtf_gen.material.normal_map import Convention, NormalFit
+from mbtf_gen.material.quantization import Codes
+from mbtf_gen.material.tiling import Seam, broken
+
+CONVENTION_NAMES: dict[Convention, str] = {"gl": "OpenGL", "dx": "DirectX"}
+# Mean spread of the channels, relative to the largest number, beyond which an image is a color picture.
+_COLORED = 0.02
+# Levels, and codes between them, that 8-bit heights in a 16-bit file have.
+_FEW_LEVELS, _FAR_APART = 1024, 16.0
+# Beyond so many tile widths of relief a default factor is probably not what was meant.
+_STEEP = 0.5
+# So many times more or less than the normal map suggests is far off.
+_FAR_OFF = 3.0
+
+
+def refuse_color(image: Image) -> None:
+    """A color picture is no height map.
+
+    Raises
+    ------
+    InputError : the channels differ by more than 2 % on average
+    """
+    if image.pixels.shape[2] < 3:
+        return
+    rgb = image.pixels[..., :3].astype(np.float64)
+    largest = float(np.abs(rgb).max())
+    if largest == 0 or float(np.mean(np.ptp(rgb, axis=-1))) <= _COLORED * largest:
+        return
+    red, green, blue = rgb.mean(axis=(0, 1))
+    normals = abs(red - 0.5) < 0.1 and abs(green - 0.5) < 0.1 and blue > 0.7
+    raise InputError(
+        f"is colored{' like a normal map' if normals else ''}; a height map is gray",
+        where=image.path,
+        hint="if one of its channels holds the heights, name it in a material.yaml: "
+        f"height: {{file: {image.path.name}, channel: R}}",
+    )
+
+
+def coarse_step(codes: Codes, bits: int) -> float | None:
+    """Step, in codes, that heights were rounded to, where it is coarse enough to show as terraces."""
+    if bits == 8:
+        return codes.rounding
+    hidden = codes.levels <= _FEW_LEVELS and codes.spacing >= _FAR_APART
+    return codes.rounding if hidden else None
+
+
+def level_remark(path: Path, codes: Codes, bits: int, step: float, smoothed: bool) -> str:
+    """The remark that heights come in few levels."""
+    apart = f" {codes.spacing:.4g} codes apart" if codes.spacing > 1 else ""
+    hint = f"smoothed within {'half a code' if step == 1 else f'{step / 2:.3g} codes'}"
+    return f"{path}: heights of {bits} bits, {codes.levels} levels{apart}; " + (
+        hint if smoothed else "their steps stay, as asked for"
+    )
+
+
+def seam_warning(path: Path, seams: Sequence[Seam], factor: float) -> str | None:
+    """The warning that heights do not tile; `factor` takes stored heights to tile widths."""
+    bad = [s for s in seams if broken(s)]
+    if not bad:
+        return None
+    worst = max(bad, key=lambda s: s.ratio)
+    return (
+        f"{path}: does not tile along {' and '.join(s.axis for s in bad)}: the seam is a step of "
+        f"{abs(factor) * worst.step:.2g} tile widths, {worst.ratio:.3g} times the interior's 99th "
+        "percentile; --tile mirror or --tile blend closes it"
+    )
+
+
+def orientation_warning(fit: NormalFit, normal: Path, height: Path) -> str | None:
+    """The warning that a normal map and the heights do not belong together as they are."""
+    if not fit.misfit:
+        return None
+    found = f"correlation of their slopes {fit.best:.2f} so, {fit.as_is:.2f} as it is"
+    if not fit.turn:
+        return (
+            f"{normal}: fits the heights only upside down ({found}); "
+            "if dark is high, give a negative --height"
+        )
+    which, other = (height, normal) if fit.image == "height" else (normal, height)
+    return f"{which}: fits {other.name} only when {fit.turn} ({found}); turn it, or one of the two is wrong"
+
+
+def choose_convention(
+    fit: NormalFit | None, named: Convention | None, asked: Convention | None, path: Path
+) -> tuple[Convention, str, str | None]:
+    """(convention to read by, how it is known, warning or None): what is asked for comes before what the data
+    show, that before the name, and OpenGL is assumed at last."""
+    shown = None if fit is None else fit.convention
+    chosen: Convention = asked or shown or named or "gl"
+    if shown is None or fit is None:
+        how = "as asked for" if asked else "as named" if named else "assumed: the heights do not tell"
+        return chosen, how, None
+    claim = asked or named
+    if claim is None or claim == shown:
+        return chosen, "as the heights' slopes show", None
+    said = "convention in the material file" if asked else "name"
+    warning = (
+        f"{path}: the {said} says {CONVENTION_NAMES[claim]}, the heights' slopes say "
+        f"{CONVENTION_NAMES[shown]} (correlation {fit.as_is:.2f} against {min(fit.gl, fit.dx):.2f}); "
+        f"read as {CONVENTION_NAMES[chosen]}"
+    )
+    return chosen, "as asked for" if asked else "as the heights' slopes show", warning
+
+
+def signed(correlation: float) -> str:
+    """A correlation as text; NaN, where one of the two has no slopes, as such."""
+    return "undefined" if math.isnan(correlation) else f"{correlation:+.2f}"
+
+
+def flat_warning(path: Path, heights: NDArray[np.float64]) -> str | None:
+    """The warning that there is no relief."""
+    return f"{path}: its heights are constant: the tile is flat" if np.ptp(heights) == 0 else None
+
+
+def relief_warning(path: Path, relief: float) -> str | None:
+    """The warning that a default factor makes too much, in tile widths, of the heights."""
+    if relief <= _STEEP:
+        return None
+    return f"{path}: the relief is {relief:.4g} tile widths; is another --height meant?"
+
+
+def suggestion_warning(path: Path, fit: NormalFit | None, factor: float) -> str | None:
+    """The warning that a default factor is far from the one that a normal map was made with."""
+    if not misses(fit, factor) or fit is None:
+        return None
+    ratio = factor / fit.scale
+    return (
+        f"{path}: its slopes suggest another height than the default of {factor:.3g}, "
+        f"which is {ratio:{'.0f' if ratio >= 10 else '.2g'}} times as much; --height {fit.scale:.3g} takes it"
+    )
+
+
+def misses(fit: NormalFit | None, factor: float) -> bool:
+    """Is a factor more than three times, or less than a third of, what a normal map clearly suggests?"""
+    if fit is None or not fit.fits or fit.scale == 0:
+        return False
+    return not 1 / _FAR_OFF <= factor / fit.scale <= _FAR_OFF
+
+
+def normal_note(
+    path: Path, fit: NormalFit | None, convention: Convention, how: str, factor: float, default: bool
+) -> str:
+    """What a normal map is read as, how it fits, and the height that it suggests."""
+    text = f"normal map: {path.name}, {CONVENTION_NAMES[convention]}, {how}"
+    if fit is None:
+        return text
+    sign = 1.0 if convention == "gl" else -1.0
+    u, v = signed(fit.correlation_u), signed(sign * fit.correlation_v)
+    text += f"; correlation with them u {u}, v {v}"
+    if fit.fits:
+        own = "the default" if default else "the material file's"
+        text += f"; it suggests --height {fit.scale:.3g} ({own} is {factor:.3g})"
+    return text
+
+
+def holes(opacity: NDArray[np.float64] | float | None) -> float:
+    """Share of the tile that is more transparent than opaque."""
+    return 0.0 if opacity is None else float(np.mean(np.asarray(opacity) < 0.5))

@@ -1,0 +1,229 @@
+"""Which file of a folder is which map, by the names that texture libraries customarily use."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from itertools import takewhile
+from pathlib import Path
+from typing import Literal
+
+from mbtf_core.errors import InputError
+from mbtf_gen.images.read import SUFFIXES, is_image
+
+Role = Literal["height", "base_color", "roughness", "metallic", "normal", "opacity"]
+Convention = Literal["gl", "dx"]
+
+# Words of file names that mean a map.
+WORDS: dict[Role, tuple[str, ...]] = {
+    "height": ("height", "heightmap", "displacement", "disp", "bump"),
+    "base_color": ("basecolor", "basecolour", "albedo", "color", "colour", "col", "diffuse", "diff"),
+    "roughness": ("roughness", "rough", "rgh"),
+    "metallic": ("metallic", "metalness", "metal"),
+    "normal": ("normal", "normals", "nor", "nrm", "normalgl", "normaldx"),
+    "opacity": ("opacity", "alpha", "mask"),
+}
+_ROLES: dict[str, Role] = {word: role for role, words in WORDS.items() for word in words}
+# Words of maps that are known but not used by themselves, and why.
+UNUSED: dict[str, str] = {
+    **dict.fromkeys(("ao", "occlusion"), "ambient occlusion comes out of the simulation"),
+    **dict.fromkeys(
+        ("arm", "orm", "rma", "metallicroughness", "roughnessmetallic"),
+        "name its channels in a material.yaml, as in roughness: {file: …, channel: G}",
+    ),
+    **dict.fromkeys(("specular", "spec"), "name it in a material.yaml to use it"),
+    **dict.fromkeys(("gloss", "glossiness"), "in a material.yaml it is roughness: {file: …, invert: true}"),
+    **dict.fromkeys(("emissive", "emission", "preview", "thumb"), "it has no use here"),
+}
+# Words of packed maps → their channels of roughness and metallic.
+PACKED: dict[str, dict[Role, str]] = {
+    **{
+        word: {"roughness": "G", "metallic": "B"}
+        for word in ("arm", "orm", "metallicroughness", "roughnessmetallic")
+    },
+    "rma": {"roughness": "R", "metallic": "G"},
+}
+_GLOSS = ("gloss", "glossiness")
+# Neighbouring words that are one.
+_JOINED = {
+    (first, second): "metallicroughness" if second == "roughness" else "roughnessmetallic"
+    for metal in ("metallic", "metalness")
+    for first, second in ((metal, "roughness"), ("roughness", metal))
+}
+_NAMELESS = "its name says no map"
+_ARCHIVES = (".zip", ".7z", ".rar", ".tar", ".tgz", ".gz")
+# Names listed in a message.
+_LISTED = 6
+_PIECE = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
+
+
+@dataclass(frozen=True)
+class FoundMaps:
+    """Maps found in a folder.
+
+    Attributes
+    ----------
+    maps : role → file
+    unused : name of an image that is not used → why
+    notes, warnings : remarks for the user
+    """
+
+    maps: dict[Role, Path] = field(default_factory=dict)
+    unused: dict[str, str] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+
+def tokens(name: str) -> list[str]:
+    """Words of a file name without suffix, lower case: split at ``_ - .``, blanks, digits and camelCase."""
+    return [piece.lower() for piece in _PIECE.findall(Path(name).stem)]
+
+
+def role_of(name: str, shared: int = 0) -> Role | None:
+    """What a file's name says it holds: the **last** word that means a map decides.
+
+    So ``metal_plate_disp.png`` holds heights and ``rock_height_mask.png`` opacity. None where no word does,
+    or the last one means a map that is not used.
+
+    Parameters
+    ----------
+    shared : number of leading words that do not count, because all files of the folder share them
+    """
+    word = _last_word(name, shared)
+    return _ROLES.get(word) if word else None
+
+
+def _last_word(name: str, shared: int = 0) -> str | None:
+    words = tokens(name)[shared:]
+    for i in reversed(range(len(words))):
+        if i and (words[i - 1], words[i]) in _JOINED:
+            return _JOINED[words[i - 1], words[i]]
+        if words[i] in _ROLES or words[i] in UNUSED:
+            return words[i]
+    return None
+
+
+def _shared_words(names: list[str]) -> int:
+    """Number of leading words that all of several names share: they name the material, not a map."""
+    columns = zip(*map(tokens, names), strict=False)
+    return sum(1 for _ in takewhile(lambda words: len(set(words)) == 1, columns)) if len(names) > 1 else 0
+
+
+def normal_convention(name: str) -> Convention | None:
+    """``gl`` or ``dx`` where a normal map's name says so."""
+    words = tokens(name)
+    if any(w in ("gl", "opengl", "normalgl") for w in words):
+        return "gl"
+    return "dx" if any(w in ("dx", "directx", "normaldx") for w in words) else None
+
+
+def find_maps(folder: Path) -> FoundMaps:
+    """Maps in a folder, not below it.
+
+    Words that all names begin with do not count, unless there is no height map without them: of
+    ``Metal004.png`` and ``Metal004_Color.png`` the former is a picture of the material. Of two normal maps of
+    which one is named for OpenGL that one is taken.
+
+    Raises
+    ------
+    InputError : the folder cannot be read, holds no image, no height map, or two candidates for one map
+    """
+    files = _images(folder)
+    if not files:
+        raise InputError(
+            "the folder holds no image",
+            where=folder,
+            hint=_elsewhere(folder) or f"a height map is wanted ({', '.join(SUFFIXES)})",
+        )
+    shared = _shared_words([p.name for p in files])
+    if not any(role_of(p.name, shared) == "height" for p in files):
+        if not any(role_of(p.name) == "height" for p in files):
+            raise _no_heights(folder, files, shared)
+        shared = 0
+    candidates: dict[Role, list[Path]] = {}
+    unused: dict[str, str] = {}
+    for path in files:
+        role, word = role_of(path.name, shared), _last_word(path.name, shared)
+        if role is not None:
+            candidates.setdefault(role, []).append(path)
+        else:
+            unused[path.name] = UNUSED[word] if word is not None else _NAMELESS
+    normals = candidates.get("normal", [])
+    gl = [p for p in normals if normal_convention(p.name) == "gl"]
+    if len(normals) > 1 and len(gl) == 1:
+        candidates["normal"] = gl
+        unused |= {p.name: f"{gl[0].name} is the normal map" for p in normals if p != gl[0]}
+    for role, paths in candidates.items():
+        if len(paths) > 1:
+            raise InputError(
+                f"two maps of {role}: {paths[0].name} and {paths[1].name}",
+                where=folder,
+                hint="remove one, or say which is meant in a material.yaml",
+            )
+    maps = {role: paths[0] for role, paths in candidates.items()}
+    lost = (_lost_warning(p, _last_word(p.name, shared), maps) for p in files if p.name in unused)
+    notes = [f"{name} is not used: {why}" for name, why in unused.items()]
+    return FoundMaps(maps, unused, notes, [text for text in lost if text is not None])
+
+
+def unpack(path: Path) -> str:
+    """The hint for an archive that was given; empty for any other file."""
+    return f"unpack {path.name} and give its folder" if path.suffix.lower() in _ARCHIVES else ""
+
+
+def _images(folder: Path) -> list[Path]:
+    return [p for p in _content(folder) if p.is_file() and is_image(p)]
+
+
+def _content(folder: Path) -> list[Path]:
+    try:
+        return sorted(p for p in folder.iterdir() if not p.name.startswith("."))
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", where=folder) from None
+
+
+def _elsewhere(folder: Path) -> str:
+    """Where the maps may be instead, as a hint: an archive, or a folder below with a height map."""
+    content = _content(folder)
+    for below in (p for p in content if p.is_dir()):
+        try:
+            held = _images(below)
+        except InputError:
+            continue
+        if any(role_of(p.name) == "height" for p in held):
+            return f"did you mean '{below}'?"
+    return next((unpack(p) for p in content if p.is_file() and unpack(p)), "")
+
+
+def _no_heights(folder: Path, files: list[Path], shared: int) -> InputError:
+    def listed(names: list[str]) -> str:
+        return ", ".join(names[:_LISTED]) + (", …" if len(names) > _LISTED else "")
+
+    nameless = [p.name for p in files if _last_word(p.name, shared) is None]
+    hint = f"its name must hold one of: {', '.join(WORDS['height'])}; or name it in a material.yaml"
+    if nameless:
+        hint += f" (what they hold is unknown: {listed(nameless)})"
+    return InputError(
+        f"no height map among {listed([p.name for p in files])}",
+        where=folder,
+        hint=_elsewhere(folder) or hint,
+    )
+
+
+def _lost_warning(path: Path, word: str | None, maps: dict[Role, Path]) -> str | None:
+    """The warning that an unused image holds a map that is missing."""
+    if word in _GLOSS:
+        entries = {} if "roughness" in maps else {"roughness": f"{{file: {path.name}, invert: true}}"}
+    else:
+        channels = PACKED.get(word or "", {})
+        entries = {
+            str(r): f"{{file: {path.name}, channel: {c}}}" for r, c in channels.items() if r not in maps
+        }
+    if not entries:
+        return None
+    lambert = "roughness" not in maps and "metallic" not in maps
+    return (
+        f"{path}: is not used, {'so that the surface is Lambert' if lambert else 'and its map is missing'}; "
+        "a material.yaml that names all maps can use it: "
+        + ", ".join(f"{r}: {e}" for r, e in entries.items())
+    )

@@ -1,0 +1,361 @@
+"""A material: heights and what covers them, from a height map, a folder of maps, or a ``material.yaml``."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbtf_core.atomic import digest
+from mbtf_core.errors import InputError
+from mbtf_core.suggest import suggest_path
+from mbtf_gen.geometry.heightfield import HeightGrid
+from mbtf_gen.images.read import SUFFIXES, gray, is_image, srgb_to_linear
+from mbtf_gen.images.resample import dequantize, resample
+from mbtf_gen.material.checks import (
+    choose_convention,
+    coarse_step,
+    flat_warning,
+    holes,
+    level_remark,
+    normal_note,
+    orientation_warning,
+    refuse_color,
+    relief_warning,
+    seam_warning,
+    suggestion_warning,
+)
+from mbtf_gen.material.discovery import Convention, FoundMaps, find_maps, normal_convention, unpack
+from mbtf_gen.material.loader import DEFAULT_COLOR, Color, MapFacts, MapLoader, Share
+from mbtf_gen.material.normal_map import NormalFit, fit_normals
+from mbtf_gen.material.quantization import Codes, code_use
+from mbtf_gen.material.spec import MaterialFile, NormalEntry, plain, read_material_file
+from mbtf_gen.material.tiling import Seam, Tiling, retile, seams
+
+# Heights of integer images are shares of an unknown range: this many tile widths. Floats are tile widths.
+INTEGER_SCALE = 0.05
+FLOAT_SCALE = 1.0
+# What stands in for the maps that are not given.
+DEFAULT_ROUGHNESS = 0.5
+DEFAULT_METALLIC = 0.0
+DEFAULT_SPECULAR = 0.5
+DEFAULT_COAT_ROUGHNESS = 0.1
+DEFAULT_SHEEN_ROUGHNESS = 0.3
+# Mesh cells across the tile, at most, unless asked for.
+DEFAULT_MESH = 512
+_YAML = ("material.yaml", "material.yml")
+
+
+@dataclass(frozen=True)
+class Material:
+    """Everything that a tile is made of. All maps have row 0 at ``v → 1``; resolutions may differ.
+
+    Attributes
+    ----------
+    height : (H, W) stored numbers: code / largest code of integer images, the number itself of float images;
+        heights of few levels are smoothed within half a level; halved in a mirrored tile, whose width is two
+        images
+    height_scale : factor from stored numbers to tile widths unless the configuration says another
+    height_given : does the material file state that factor? It is a default otherwise
+    height_bits : 8, 16, or None for floats
+    base_color : (h, w, 3) or (3,), linear Rec.709 in [0, 1]
+    roughness, metallic, specular : (h, w) or one number in [0, 1]; all three None for Lambert
+    coat, coat_roughness : clear coat's share and roughness, (h, w) or one number in [0, 1]; None without one
+    sheen, sheen_roughness : weight of a sheen on top of it all and its roughness, (h, w) or one number in
+        [0, 1]; None without one
+    sheen_color : (h, w, 3) or (3,), linear Rec.709 in [0, 1]; None for white, or without sheen
+    normal : (h, w, 3) unit vectors, x along u and y along v (OpenGL); None without a map
+    opacity : (h, w) or one number in [0, 1]; None where nothing is transparent
+    bsdf : Mitsuba dictionary that stands in place of the maps, or None
+    files : role → file
+    digests : role → SHA-256 of the file's content; ``settings`` covers everything else that changes the data
+    warnings, notes : what the user should see, whatever height is asked for; what the user may want to know
+    unused : name of an image of the folder that is not used → why
+    facts : role → what the map's file holds
+    codes : use that integer heights make of their codes; None for floats
+    seams : seams of the heights as they are in the file
+    normal_fit : how the normal map relates to the heights; None without a map, or where neither has slopes
+    normal_convention : how the normal map was read; None without a map
+    tile : what was done to make the maps tile
+    """
+
+    height: NDArray[np.float64]
+    height_scale: float
+    height_bits: int | None
+    base_color: Color
+    roughness: Share = None
+    metallic: Share = None
+    specular: Share = None
+    coat: Share = None
+    coat_roughness: Share = None
+    sheen: Share = None
+    sheen_color: Color | None = None
+    sheen_roughness: Share = None
+    normal: NDArray[np.float32] | None = None
+    opacity: Share = None
+    bsdf: dict[str, Any] | None = None
+    height_given: bool = False
+    files: dict[str, Path] = field(default_factory=dict)
+    digests: dict[str, str] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    unused: dict[str, str] = field(default_factory=dict)
+    facts: dict[str, MapFacts] = field(default_factory=dict)
+    codes: Codes | None = None
+    seams: tuple[Seam, ...] = ()
+    normal_fit: NormalFit | None = None
+    normal_convention: Convention | None = None
+    tile: Tiling = "none"
+
+    @property
+    def aspect(self) -> float:
+        """Height of the tile over its width, H/W of the maps."""
+        return self.height.shape[0] / self.height.shape[1]
+
+    @property
+    def is_lambert(self) -> bool:
+        """Is the surface Lambert because no roughness, metallic or specular is given?"""
+        return (
+            self.bsdf is None and self.roughness is None and self.metallic is None and self.specular is None
+        )
+
+    def warnings_at(self, height: float | None = None) -> tuple[str, ...]:
+        """All warnings where `height` is the factor asked for: a default one is questioned."""
+        flat = flat_warning(self.files["height"], self.height)
+        if flat is not None or height is not None or self.height_given:
+            return (*self.warnings, *([flat] if flat else []))
+        text = None
+        if "normal" in self.files:
+            text = suggestion_warning(self.files["normal"], self.normal_fit, self.height_scale)
+        relief = abs(self.height_scale) * float(np.ptp(self.height))
+        text = text or relief_warning(self.files["height"], relief)
+        return (*self.warnings, *([text] if text else []))
+
+    def grid(self, height: float | None = None, mesh: int | None = None) -> HeightGrid:
+        """Heights in tile widths on the mesh's grid.
+
+        Parameters
+        ----------
+        height : factor on the stored numbers; the material's own by default
+        mesh : cells across the tile; the map's width, at most 512, by default. Coarser grids average the map
+            (box), finer ones interpolate it (cubic).
+        """
+        columns = min(self.height.shape[1], DEFAULT_MESH) if mesh is None else mesh
+        rows = max(1, round(self.aspect * columns))
+        heights = resample(self.height, rows, columns, "cubic")
+        return HeightGrid.from_map(
+            heights.astype(np.float64), self.height_scale if height is None else height, self.aspect
+        )
+
+
+def load_material(path: str | Path, tile: Tiling = "none") -> Material:
+    """Load a material.
+
+    Parameters
+    ----------
+    path : a height map; a folder of maps with customary names, or with a ``material.yaml`` in it; or a YAML
+        file of that kind. A bare height map stands alone, whatever lies beside it.
+    tile : what to do so that the maps tile: nothing; ``mirror``, two by two mirrored copies, a tile of twice
+        the width; ``blend``, a cross-fade over an eighth of the tile at each edge
+
+    Raises
+    ------
+    InputError : something is missing, unreadable, ambiguous, out of its range, or maps of different aspect
+    """
+    spec, folder, found = _described(Path(path))
+    material = _assemble(spec, folder, found, tile)
+    return material if tile == "none" else retile(material, tile)
+
+
+def _described(path: Path) -> tuple[MaterialFile, Path, FoundMaps]:
+    """Maps and constants of a material, the folder that file names are relative to, and what lies there."""
+    if path.is_dir():
+        described = next((path / name for name in _YAML if (path / name).is_file()), None)
+        if described is not None:
+            return read_material_file(described), path, FoundMaps()
+        found = find_maps(path)
+        spec = MaterialFile.model_validate({role: str(file.name) for role, file in found.maps.items()})
+        return spec, path, found
+    if not path.exists():
+        raise InputError("no such file or folder", where=path, hint=suggest_path(path))
+    if path.suffix.lower() in (".yaml", ".yml"):
+        return read_material_file(path), path.parent, FoundMaps()
+    if not is_image(path):
+        raise InputError(
+            f"'{path.suffix}' is no height map",
+            where=path,
+            hint=unpack(path) or f"give a folder, a .yaml file, or {', '.join(SUFFIXES)}",
+        )
+    spec = MaterialFile.model_validate({"height": path.name})
+    return spec, path.parent, FoundMaps(notes=list(_siblings(path)))
+
+
+def _siblings(path: Path) -> Iterator[str]:
+    """The hint that a bare height map's folder holds more maps."""
+    try:
+        others = {role: file for role, file in find_maps(path.parent).maps.items() if file != path}
+    except InputError:
+        return
+    if others and "height" not in others:
+        names = ", ".join(file.name for file in others.values())
+        yield f"only the heights of {path.name} are used; for {names} too, give the folder {path.parent}"
+
+
+def _assemble(spec: MaterialFile, folder: Path, found: FoundMaps, tile: Tiling) -> Material:
+    load = MapLoader(folder, found.notes)
+    load.warnings += found.warnings
+    height, codes, scale = _heights(spec, load)
+    rounding = 0.0 if codes is None else codes.rounding / (2 ** (load.facts["height"].bits or 8) - 1)
+    edges = seams(height, rounding)
+    warning = seam_warning(load.files["height"], edges, scale)
+    if warning is not None and tile == "none":
+        load.warnings.append(warning)
+    roughness, metallic, specular = (
+        load.share(role, getattr(spec, role)) for role in ("roughness", "metallic", "specular")
+    )
+    if spec.bsdf is not None:
+        load.notes.append(f"surface: the BSDF '{spec.bsdf['type']}' of the material file")
+    elif roughness is None and metallic is None and specular is None:
+        layers = [
+            n for n, on in (("a clear coat", spec.clearcoat), ("a sheen", spec.sheen)) if on is not None
+        ]
+        under = f" under {' and '.join(layers)}" if layers else ""
+        load.notes.append(f"surface: Lambert{under}, because no roughness, metallic or specular is given")
+    else:
+        constants = {
+            "roughness": DEFAULT_ROUGHNESS,
+            "metallic": DEFAULT_METALLIC,
+            "specular": DEFAULT_SPECULAR,
+        }
+        given = {"roughness": roughness, "metallic": metallic, "specular": specular}
+        filled = [f"{name} {constants[name]}" for name, value in given.items() if value is None]
+        roughness, metallic, specular = (constants[n] if v is None else v for n, v in given.items())
+        load.notes.append(f"surface: glossy{', constants ' + ', '.join(filled) if filled else ''}")
+    base_color = load.base_color(spec.base_color) if spec.bsdf is None else np.full(3, DEFAULT_COLOR)
+    normal, convention, fit = None, None, None
+    if spec.normal is not None:
+        normal, convention, fit = _normals(spec, spec.normal, load, height, scale)
+    opacity = load.share("opacity", spec.opacity)
+    if opacity is not None:
+        load.notes.append(f"opacity: {holes(opacity):.0%} of the tile are holes")
+    coat, coat_roughness = (load.share(n, getattr(spec, n)) for n in ("clearcoat", "clearcoat_roughness"))
+    if coat is not None and coat_roughness is None:
+        coat_roughness = DEFAULT_COAT_ROUGHNESS
+    sheen, sheen_roughness = (load.share(n, getattr(spec, n)) for n in ("sheen", "sheen_roughness"))
+    sheen_color = None if spec.sheen_color is None else load.color("sheen_color", spec.sheen_color)
+    if sheen is not None and sheen_roughness is None:
+        sheen_roughness = DEFAULT_SHEEN_ROUGHNESS
+    bsdf = None
+    if spec.bsdf is not None:
+        bsdf, load.settings["bsdf"] = _bsdf(plain(spec.bsdf), load)
+    if tile != "none":
+        load.settings["tile"] = tile
+    text = json.dumps(load.settings, sort_keys=True)
+    digests = {**load.digests(), "settings": hashlib.sha256(text.encode()).hexdigest()}
+    return Material(
+        height=height,
+        height_scale=scale,
+        height_bits=load.facts["height"].bits,
+        base_color=base_color,
+        roughness=roughness,
+        metallic=metallic,
+        specular=specular,
+        coat=coat,
+        coat_roughness=coat_roughness,
+        sheen=sheen,
+        sheen_color=sheen_color,
+        sheen_roughness=sheen_roughness,
+        normal=normal,
+        opacity=opacity,
+        bsdf=bsdf,
+        height_given=spec.height.scale is not None,
+        files=load.files,
+        digests=digests,
+        warnings=tuple(load.warnings),
+        notes=tuple(load.notes),
+        unused=found.unused,
+        facts=load.facts,
+        codes=codes,
+        seams=edges,
+        normal_fit=fit,
+        normal_convention=convention,
+    )
+
+
+def _normals(
+    spec: MaterialFile, entry: NormalEntry, load: MapLoader, height: NDArray[np.float64], scale: float
+) -> tuple[NDArray[np.float32], Convention, NormalFit | None]:
+    """Unit vectors (h, w, 3), the convention they were read by, and how they fit the heights."""
+    vectors = load.normals(entry)
+    path = load.files["normal"]
+    fit = fit_normals(height, vectors)
+    convention, how, warning = choose_convention(fit, normal_convention(path.name), entry.convention, path)
+    found = (warning, None if fit is None else orientation_warning(fit, path, load.files["height"]))
+    load.warnings += [text for text in found if text is not None]
+    load.notes.append(normal_note(path, fit, convention, how, scale, spec.height.scale is None))
+    return load.turned_green(vectors, convention), convention, fit
+
+
+def _heights(spec: MaterialFile, load: MapLoader) -> tuple[NDArray[np.float64], Codes | None, float]:
+    """Stored heights, the use they make of their codes, and the factor to tile widths."""
+    entry = spec.height
+    image = load.image("height", entry, entry.colorspace)
+    refuse_color(image)
+    height, warnings = gray(image)
+    load.warnings += warnings
+    scale = entry.scale
+    if scale is None:
+        scale = FLOAT_SCALE if image.bits is None else INTEGER_SCALE
+    codes, step = None, None
+    if image.bits is not None:
+        largest = 2**image.bits - 1
+        codes = code_use(np.rint(height * largest))
+        step = coarse_step(codes, image.bits)
+        if step is not None and codes.levels > 1:
+            load.warnings.append(level_remark(image.path, codes, image.bits, step, entry.dequantize))
+            if entry.dequantize:
+                height = dequantize(height, step / largest)
+    load.settings["height"] = [scale, step if entry.dequantize else None]
+    if entry.colorspace == "srgb":
+        height = np.asarray(srgb_to_linear(height), np.float64)
+        load.settings["height.encoding"] = entry.colorspace
+    relief = abs(scale) * float(np.ptp(height))
+    kind = "floats" if image.bits is None else f"{image.bits}-bit integers"
+    load.notes.append(
+        f"heights: {image.path.name}, {image.shape[1]} x {image.shape[0]} {kind}, "
+        f"relief {relief:.4g} tile widths at its factor {scale:g}"
+    )
+    return height, codes, scale
+
+
+def _bsdf(tree: dict[str, Any], load: MapLoader) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The BSDF with its file names made absolute, and the same with digests in place of file names."""
+    out: dict[str, Any] = {}
+    nameless: dict[str, Any] = {}
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            out[key], nameless[key] = _bsdf(value, load)
+        elif key == "filename" and isinstance(value, str):
+            try:
+                path = (load.folder / value).resolve()
+                found = path.is_file()
+            except (OSError, ValueError):
+                raise InputError("the bsdf names a file that cannot be", where=load.folder) from None
+            if not found:
+                raise InputError("no such file (named in the bsdf)", where=path, hint=suggest_path(path))
+            load.files[f"bsdf.{sum(r.startswith('bsdf.') for r in load.files)}"] = path
+            out[key], nameless[key] = str(path), digest(path)
+        elif value is None or isinstance(value, str | bool | int | float | list):
+            out[key] = nameless[key] = value
+        else:
+            kind = type(value).__name__
+            raise InputError(
+                f"the bsdf's '{key}' is a {kind}; text and numbers are wanted", where=load.folder
+            )
+    return out, nameless

@@ -1,0 +1,191 @@
+"""How a normal map relates to the heights it comes with: convention, orientation, scale.
+
+A normal map usually repeats the slopes of its height map. So both can be held against each other: the slopes
+that the normals claim, ``t = (-n_x/n_z, -n_y/n_z)``, and those of the heights, ``s = (∂h/∂u, ∂h/∂y)``,
+y = a·v. Their correlation over all texels and both components, ``Σ s·t / √(Σ s² Σ t²)``, is near 1 where they
+agree. It is taken for every way in which the two may have been confused: one of the images turned or mirrored
+(the eight symmetries of a square), the green channel upside down (DirectX), heights upside down.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbtf_gen.geometry.slopes import normal_slopes
+from mbtf_gen.images.resample import resample
+
+Convention = Literal["gl", "dx"]
+Array = NDArray[np.floating[Any]]
+
+# What has to be done to an image, as one sees it.
+SYMMETRIES: dict[str, Callable[[Array], Array]] = {
+    "": lambda a: a,
+    "turned by 90 degrees counter-clockwise": lambda a: np.rot90(a, 1),
+    "turned by 180 degrees": lambda a: np.rot90(a, 2),
+    "turned by 90 degrees clockwise": lambda a: np.rot90(a, 3),
+    "mirrored left to right": lambda a: np.flip(a, 1),
+    "mirrored top to bottom": lambda a: np.flip(a, 0),
+    "transposed": lambda a: np.swapaxes(a, 0, 1),
+    "transposed along the other diagonal": lambda a: np.swapaxes(np.rot90(a, 2), 0, 1),
+}
+# Texels across, at most, that orientations are compared at, and that the scale is fitted at.
+_COMPARED, _FITTED = 512, 2048
+# The data decide where a correlation exceeds the first number and its rival by the second; of n texels, no
+# less than chance allows (multiples of 1/√n).
+_CLEAR, _AHEAD = (0.3, 8.0), (0.1, 4.0)
+# Correlations so close are one.
+_TIE = 1e-6
+_FLATTEST = 0.1
+_SMALLEST = 4
+
+
+@dataclass(frozen=True)
+class NormalFit:
+    """What the data say about a normal map.
+
+    Attributes
+    ----------
+    correlation_u, correlation_v : of the slopes along u and along v, as the images are, the vectors read as
+        OpenGL; NaN where either has no slopes
+    gl, dx : correlation over both components of the images as they are, read as OpenGL and as DirectX
+    convention : the one of the two that the data show; None where they do not decide
+    fits : do the data clearly say that the two belong together as they are?
+    misfit : do they clearly say that one is turned or mirrored, or the heights upside down?
+    image, turn, inverted : the best explanation: which image has to be turned or mirrored to fit ("height",
+        "normal", None), how (one of :data:`SYMMETRIES`, empty for not at all), are heights upside down
+    best, runner_up : correlation of the best explanation, and of the next best one that differs from it
+    scale : factor on the stored heights whose slopes fit the normals best (least squares) as the images are,
+        in the better convention; tile widths, signed
+    """
+
+    correlation_u: float
+    correlation_v: float
+    gl: float
+    dx: float
+    convention: Convention | None
+    fits: bool
+    misfit: bool
+    image: Literal["height", "normal"] | None
+    turn: str
+    inverted: bool
+    best: float
+    runner_up: float
+    scale: float
+
+    @property
+    def as_is(self) -> float:
+        """Correlation of the images as they are, in the better of the two conventions."""
+        return max(self.gl, self.dx)
+
+
+@dataclass(frozen=True)
+class _Guess:
+    score: float
+    image: Literal["height", "normal"] | None
+    turn: str
+    convention: Convention
+    inverted: bool
+
+
+def slopes_of_heights(height: Array) -> Array:
+    """Slopes (2, H-2, W-2) of heights (H, W) along u and y = a·v, by central differences, in stored heights
+    per tile width. The outermost texels are left out: heights need not tile."""
+    along_u = height[1:-1, 2:] - height[1:-1, :-2]
+    along_v = height[:-2, 1:-1] - height[2:, 1:-1]
+    return np.stack([along_u, along_v]) * (0.5 * height.shape[1])
+
+
+def slopes_of_normals(normal: Array) -> Array:
+    """Slopes (2, H-2, W-2) along u and y that normals (H, W, 3) claim, their mean removed, without the
+    outermost texels."""
+    slopes = np.moveaxis(normal_slopes(normal[1:-1, 1:-1], _FLATTEST), -1, 0)
+    return slopes - slopes.mean(axis=(1, 2), keepdims=True)
+
+
+def fit_normals(height: Array, normal: Array) -> NormalFit | None:
+    """Hold normals (h, w, 3), y along v (OpenGL), against heights (H, W) of the same tile.
+
+    Both are averaged (box) to the coarser of the two resolutions. None where heights or normals are flat, or
+    too small to tell.
+    """
+    fitted = _common(height, normal, _FITTED)
+    if min(fitted[0].shape) < _SMALLEST:
+        return None
+    s, t = slopes_of_heights(fitted[0]), slopes_of_normals(fitted[1])
+    if not _energy(s) > 0 or not _energy(t) > 1e-9 * t.size:
+        return None
+    along = [_correlation(s[i : i + 1], t[i : i + 1]) for i in (0, 1)]
+    h, n = _common(height, normal, _COMPARED)
+    guesses = _guesses(h, n)
+    highest = max(g.score for g in guesses)
+    # Symmetric tiles fit in several ways: the likeliest one that is as good as any.
+    best = next(g for g in guesses if g.score >= highest - _TIE)
+    as_is = {g.convention: g.score for g in guesses if not g.turn and not g.inverted}
+    here = max(as_is.values())
+    clear, ahead = (max(low, factor / math.sqrt(h.size)) for low, factor in (_CLEAR, _AHEAD))
+    misfit = highest >= clear and highest - here >= ahead
+    fits = here >= clear and not misfit
+    known = fits and abs(as_is["gl"] - as_is["dx"]) >= ahead
+    better: Convention = "gl" if as_is["gl"] >= as_is["dx"] else "dx"
+    sign = np.array([1.0, 1.0 if better == "gl" else -1.0])[:, None, None]
+    return NormalFit(
+        correlation_u=along[0],
+        correlation_v=along[1],
+        gl=as_is["gl"],
+        dx=as_is["dx"],
+        convention=better if known else None,
+        fits=fits,
+        misfit=misfit,
+        image=best.image,
+        turn=best.turn,
+        inverted=best.inverted,
+        best=best.score,
+        runner_up=max((g.score for g in guesses if g.score < highest - _TIE), default=-1.0),
+        scale=float((s * t * sign).sum() / _energy(s)),
+    )
+
+
+def _common(height: Array, normal: Array, limit: int) -> tuple[Array, Array]:
+    rows = min(height.shape[0], normal.shape[0])
+    columns = min(height.shape[1], normal.shape[1])
+    shrink = max(1.0, max(rows, columns) / limit)
+    size = max(1, round(rows / shrink)), max(1, round(columns / shrink))
+    return resample(height, *size), resample(normal, *size)
+
+
+def _energy(slopes: Array) -> float:
+    return float((slopes * slopes).sum())
+
+
+def _correlation(s: Array, t: Array) -> float:
+    norm = math.sqrt(_energy(s) * _energy(t))
+    return float((s * t).sum()) / norm if norm > 0 else float("nan")
+
+
+def _guesses(height: Array, normal: Array) -> list[_Guess]:
+    """Every explanation with its correlation, likelier ones before others that fit as well."""
+    s, t = slopes_of_heights(height), slopes_of_normals(normal)
+    norm = math.sqrt(_energy(s) * _energy(t))
+    out = []
+    for turn, move in SYMMETRIES.items():
+        if move(height).shape != height.shape:
+            continue
+        moved: list[tuple[Literal["height", "normal"] | None, Array, Array]]
+        if turn:
+            # Pixels are turned, their vectors are not; slopes of turned heights follow.
+            turned = np.stack([move(t[0]), move(t[1])])
+            moved = [("height", slopes_of_heights(move(height)), t), ("normal", s, turned)]
+        else:
+            moved = [(None, s, t)]
+        for image, a, b in moved:
+            along_u, along_v = float((a[0] * b[0]).sum()), float((a[1] * b[1]).sum())
+            for sign in (1.0, -1.0) if not turn else (1.0,):
+                gl, dx = sign * (along_u + along_v) / norm, sign * (along_u - along_v) / norm
+                out += [_Guess(gl, image, turn, "gl", sign < 0), _Guess(dx, image, turn, "dx", sign < 0)]
+    return out

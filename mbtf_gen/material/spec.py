@@ -1,0 +1,173 @@
+"""``material.yaml``: which maps and constants make up a material."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field, model_validator
+
+from mbtf_core.config_file import FileName, Settings, build, read_yaml
+from mbtf_gen.images.metadata import ColorSpace
+
+Share = Annotated[float, Field(ge=0, le=1)]
+Channel = Annotated[str, Field(min_length=1)]
+_CHANNEL = "channel or layer of an EXR file; R, G, B, A or Y of others; default: all that belongs together"
+
+
+def _gray(value: Any) -> Any:
+    return (value, value, value) if isinstance(value, int | float) and not isinstance(value, bool) else value
+
+
+def _short(data: Any) -> Any:
+    """``roughness: 0.4`` and ``roughness: rough.png`` stand for their long forms."""
+    if isinstance(data, str):
+        return {"file": data}
+    if isinstance(data, int | float | Sequence) and not isinstance(data, bool):
+        return {"value": data}
+    return data
+
+
+class HeightEntry(Settings):
+    """The height map."""
+
+    file: FileName = Field(description="the height map")
+    channel: Channel | None = Field(None, description=_CHANNEL)
+    scale: float | None = Field(
+        None,
+        ge=-100,
+        le=100,
+        description="factor on the stored heights, tile widths; default 1 for floats, 0.05 for integers",
+    )
+    dequantize: bool = Field(True, description="smooth heights of few levels within half a level")
+    colorspace: ColorSpace = Field("linear", description="srgb decodes the stored numbers first")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _long(cls, data: Any) -> Any:
+        return _short(data)
+
+
+class _FileOrValue(Settings):
+    file: FileName | None = Field(None, description="the map; either this or value")
+    channel: Channel | None = Field(None, description=_CHANNEL)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _long(cls, data: Any) -> Any:
+        return _short(data)
+
+    @model_validator(mode="after")
+    def _one(self) -> _FileOrValue:
+        if (self.file is None) == (getattr(self, "value", None) is None):
+            raise ValueError("needs either 'file' or 'value'")
+        if self.file is None and self.channel is not None:
+            raise ValueError("'channel' goes with 'file'")
+        return self
+
+
+class ColorEntry(_FileOrValue):
+    """A color map or one color."""
+
+    value: Annotated[tuple[Share, Share, Share], BeforeValidator(_gray)] | None = Field(
+        None, description="one color, three numbers or one"
+    )
+    colorspace: ColorSpace | None = Field(
+        None, description="default: srgb for integer images, linear for float images and values"
+    )
+
+
+class ShareEntry(_FileOrValue):
+    """A map of numbers in [0, 1] or one number."""
+
+    value: Share | None = Field(None, description="one number")
+    colorspace: ColorSpace = Field("linear", description="srgb decodes the stored numbers of a map first")
+    invert: bool = Field(False, description="take 1 - x of a map, such as gloss for roughness")
+
+    @model_validator(mode="after")
+    def _of_a_map(self) -> ShareEntry:
+        if self.file is None and (self.invert or self.colorspace != "linear"):
+            raise ValueError("'invert' and 'colorspace' go with 'file'")
+        return self
+
+
+class NormalEntry(Settings):
+    """A tangent-space normal map."""
+
+    file: FileName = Field(description="the normal map")
+    channel: Channel | None = Field(None, description="layer of an EXR file")
+    convention: Literal["gl", "dx"] | None = Field(
+        None, description="green up (gl) or down (dx); default: as the heights' slopes show, else by the name"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _long(cls, data: Any) -> Any:
+        return _short(data)
+
+
+# What a BSDF of the user's own stands in place of.
+_REFLECTANCE = (
+    *("base_color", "roughness", "metallic", "specular", "clearcoat", "clearcoat_roughness"),
+    *("sheen", "sheen_color", "sheen_roughness"),
+)
+# Keys that say more about another key.
+_GOES_WITH = {"clearcoat_roughness": "clearcoat", "sheen_color": "sheen", "sheen_roughness": "sheen"}
+
+
+class MaterialFile(Settings):
+    """Content of a ``material.yaml``; file names are relative to its folder."""
+
+    height: HeightEntry = Field(description="heights; the only key that must be there")
+    base_color: ColorEntry | None = Field(None, description="color; default: linear gray 0.5")
+    roughness: ShareEntry | None = Field(None, description="0 mirror to 1; default 0.5 once one is given")
+    metallic: ShareEntry | None = Field(None, description="0 dielectric to 1 metal; default 0")
+    specular: ShareEntry | None = Field(None, description="strength of the dielectric lobe; default 0.5")
+    clearcoat: ShareEntry | None = Field(None, description="share of a clear coat over it all; default 0")
+    clearcoat_roughness: ShareEntry | None = Field(None, description="of the coat; default 0.1")
+    sheen: ShareEntry | None = Field(None, description="weight of a sheen on top of it all; default 0")
+    sheen_color: ColorEntry | None = Field(None, description="of the sheen; default white")
+    sheen_roughness: ShareEntry | None = Field(None, description="of the sheen; default 0.3")
+    normal: NormalEntry | None = Field(None, description="tangent-space normal map")
+    opacity: ShareEntry | None = Field(None, description="1 opaque to 0 hole; default: opaque")
+    bsdf: dict[str, Any] | None = Field(
+        None, description="Mitsuba BSDF in place of the maps, passed on as it is"
+    )
+
+    @model_validator(mode="after")
+    def _bsdf_alone(self) -> MaterialFile:
+        given = [n for n in _REFLECTANCE if getattr(self, n) is not None]
+        if self.bsdf is not None and given:
+            raise ValueError(f"'bsdf' stands in place of {', '.join(given)}; give one or the other")
+        for name, other in _GOES_WITH.items():
+            if getattr(self, name) is not None and getattr(self, other) is None:
+                raise ValueError(f"'{name}' goes with '{other}'")
+        if self.bsdf is not None and not isinstance(self.bsdf.get("type"), str):
+            raise ValueError("'bsdf' needs a 'type', such as diffuse")
+        return self
+
+
+def read_material_file(path: Path) -> MaterialFile:
+    """Read a ``material.yaml``.
+
+    Raises
+    ------
+    InputError : missing, not YAML, an unknown key (with its line and the nearest valid one), a value out of
+        its range
+    """
+    return build(MaterialFile, read_yaml(path), source=str(path))
+
+
+def plain(data: Any) -> Any:
+    """The same nested data in Python's own types, without what a YAML reader attaches."""
+    if isinstance(data, Mapping):
+        return {str(key): plain(value) for key, value in data.items()}
+    if isinstance(data, str):
+        return str(data)
+    if isinstance(data, Sequence):
+        return [plain(value) for value in data]
+    for kind in (bool, int, float):
+        if isinstance(data, kind):
+            return kind(data)
+    return data

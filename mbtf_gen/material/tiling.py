@@ -1,0 +1,194 @@
+"""Does a map continue across its edges, and what to do where it does not.
+
+A tile is repeated without end, so a map whose last column does not lead on to its first one shows a cliff at
+every period.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbtf_core.errors import InputError
+from mbtf_core.shard_schema import Tiling
+from mbtf_gen.images.read import MAX_PIXELS
+
+if TYPE_CHECKING:
+    from mbtf_gen.material.material import Material
+
+Array = NDArray[np.floating[Any]]
+
+# Share of the tile, at each edge, over which `blend` cross-fades.
+BAND = 0.125
+# A seam this many times the interior's 99th percentile is reported.
+_LIMIT = 1.5
+# Lines along an axis below which no percentile of the interior exists.
+_FEWEST = 16
+# Slopes are taken from normals no closer to the plane than this.
+_FLATTEST = 0.01
+
+
+@dataclass(frozen=True)
+class Seam:
+    """Seam of a height map (H, W) along one axis, in stored heights.
+
+    The step between two neighboring lines (columns for the axis u, rows for v) is the root mean square of
+    their difference.
+
+    Attributes
+    ----------
+    axis : "u" or "v"
+    step : step across the seam, between the last and the first line
+    interior : 99th percentile of the steps between neighboring lines inside the map
+    """
+
+    axis: Literal["u", "v"]
+    step: float
+    interior: float
+
+    @property
+    def ratio(self) -> float:
+        """Seam step over interior step; 1 and below: the seam looks like any other place."""
+        return self.step / self.interior if self.interior > 0 else (0.0 if self.step == 0 else float("inf"))
+
+
+def seams(height: Array, rounding: float = 0.0) -> tuple[Seam, ...]:
+    """Seams of heights (H, W) along u and v; axes of fewer than 16 lines are left out.
+
+    Parameters
+    ----------
+    rounding : step that heights were rounded to; no interior step counts as less
+    """
+    out = []
+    for axis, name in ((1, "u"), (0, "v")):
+        if height.shape[axis] < _FEWEST:
+            continue
+        # The step behind the last line is the seam's.
+        steps = np.sqrt(np.mean((np.roll(height, -1, axis) - height) ** 2, axis=1 - axis))
+        interior = max(float(np.percentile(steps[:-1], 99)), rounding)
+        out.append(Seam("u" if name == "u" else "v", float(steps[-1]), interior))
+    return tuple(out)
+
+
+def broken(seam: Seam) -> bool:
+    """Does the seam stand out: more than 1.5 times the interior's 99th percentile?"""
+    return seam.ratio > _LIMIT
+
+
+def mirror(image: Array, flip_u: int | None = None, flip_v: int | None = None) -> Array:
+    """Two by two copies, (2H, 2W, ...), every other one mirrored, so that all edges meet.
+
+    Parameters
+    ----------
+    flip_u, flip_v : component of a vector that changes its sign in copies mirrored along u, along v
+    """
+    right = np.flip(image, 1)
+    if flip_u is not None:
+        right = _negated(right, flip_u)
+    top = np.concatenate([image, right], axis=1)
+    low = np.flip(top, 0)
+    if flip_v is not None:
+        low = _negated(low, flip_v)
+    return np.concatenate([top, low], axis=0)
+
+
+def _negated(image: Array, component: int) -> Array:
+    out = image.copy()
+    out[..., component] *= -1.0
+    return out
+
+
+def blend(image: Array) -> Array:
+    """Cross-fade at all edges, same shape (H, W, ...).
+
+    Along each axis the map is mixed with itself shifted by half a tile, which runs on smoothly where the map
+    has its seam: ``w(x)·f(x) + (1-w(x))·f(x+½)``, w rising from 0 at the edges to 1 over an eighth of the
+    tile (smoothstep). Maps of any resolution are treated alike; odd sizes interpolate the half texel.
+    """
+    out = np.asarray(image, np.float64)
+    for axis in (0, 1):
+        size = out.shape[axis]
+        edge = np.minimum(np.arange(size) + 0.5, size - np.arange(size) - 0.5) / size
+        x = np.clip(edge / BAND, 0.0, 1.0)
+        shape = [1] * out.ndim
+        shape[axis] = size
+        w = (x * x * (3.0 - 2.0 * x)).reshape(shape)
+        half = size // 2
+        other = 0.5 * (np.roll(out, half, axis) + np.roll(out, size - half, axis))
+        out = w * out + (1.0 - w) * other
+    return out.astype(image.dtype)
+
+
+def mirror_normals(normal: NDArray[np.float32]) -> NDArray[np.float32]:
+    """:func:`mirror` of unit vectors (H, W, 3), x along u and y along v: the mirrored axis changes sign."""
+    return mirror(normal, flip_u=0, flip_v=1).astype(np.float32)
+
+
+def blend_normals(normal: NDArray[np.float32]) -> NDArray[np.float32]:
+    """:func:`blend` of unit vectors (H, W, 3): their slopes are mixed, as the heights' own are.
+
+    The slope that the cross-fade itself gives the heights is not in it: that is the mesh's.
+    """
+    n = normal.astype(np.float64)
+    slopes = blend(n[..., :2] / np.maximum(n[..., 2:], _FLATTEST))
+    up = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
+    return (up / np.linalg.norm(up, axis=-1, keepdims=True)).astype(np.float32)
+
+
+def retile(material: Material, tile: Tiling) -> Material:
+    """The material with all its maps mirrored or blended.
+
+    Lengths are in tile widths. A mirrored tile is two images wide, so that its heights count half: the shape
+    of the relief stays.
+
+    Raises
+    ------
+    InputError : the maps are too large to be mirrored, or a BSDF reads textures by itself
+    """
+    if tile == "none":
+        return material
+    if any(role.startswith("bsdf.") for role in material.files):
+        raise InputError(
+            "the textures of its bsdf cannot be mirrored or blended",
+            where=material.files["height"].parent,
+            hint="use --tile none, or give maps in place of the bsdf",
+        )
+    if tile == "mirror" and any(4 * f.rows * f.columns > MAX_PIXELS for f in material.facts.values()):
+        raise InputError(
+            f"mirrored maps would have more than {MAX_PIXELS:,} pixels",
+            where=material.files["height"].parent,
+            hint="use smaller maps, or --tile blend",
+        )
+    change: Callable[[Array], Array] = mirror if tile == "mirror" else blend
+    normals = mirror_normals if tile == "mirror" else blend_normals
+
+    def changed(value: Any) -> Any:
+        return change(value) if np.ndim(value) >= 2 else value
+
+    said = (
+        "tile: two by two mirrored copies; the tile is two images wide, so heights in tile widths are half"
+        if tile == "mirror"
+        else f"tile: edges cross-faded over {BAND:g} of the tile"
+    )
+    height = changed(material.height)
+    return replace(
+        material,
+        height=0.5 * height if tile == "mirror" else height,
+        base_color=changed(material.base_color),
+        roughness=changed(material.roughness),
+        metallic=changed(material.metallic),
+        specular=changed(material.specular),
+        coat=changed(material.coat),
+        coat_roughness=changed(material.coat_roughness),
+        sheen=changed(material.sheen),
+        sheen_color=changed(material.sheen_color),
+        sheen_roughness=changed(material.sheen_roughness),
+        normal=None if material.normal is None else normals(material.normal),
+        opacity=changed(material.opacity),
+        notes=(*material.notes, said),
+        tile=tile,
+    )

@@ -1,0 +1,181 @@
+"""A folder of pictures that a command makes, goes on with, and replaces.
+
+Beside the pictures lie ``config.yaml``, the resolved options, and ``pictures.json``, the record: it lists the
+files that the command writes, and the finished ones with their sizes. Files that the record does not list
+belong to somebody else and are never touched.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from mbtf_core.atomic import TEMPORARY, read_json, write_json, write_text
+from mbtf_core.config_file import check_document, differences, dump_yaml, in_short
+from mbtf_core.errors import InputError
+from mbtf_core.shard_schema import CONFIG_NAME
+
+RECORD_NAME = "pictures.json"
+FORMAT_NAME = "mbtf-pictures"
+_VERSION = 1
+_OURS = (CONFIG_NAME, RECORD_NAME)
+
+
+def _is_leftover(name: str, files: Iterable[str]) -> bool:
+    """Whether a file is what a kill leaves of writing one of `files`."""
+    match = re.fullmatch(rf"\.(.+?){TEMPORARY}", name)
+    return match is not None and match[1] in files
+
+
+def hash_of(depends: Mapping[str, Any]) -> str:
+    """SHA-256 over plain data, hexadecimal."""
+    return hashlib.sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()
+
+
+class _Picture(BaseModel):
+    files: dict[str, int]
+    facts: dict[str, Any]
+
+
+class _Record(BaseModel):
+    """Content of ``pictures.json``."""
+
+    hash: str
+    depends: dict[str, Any]
+    files: list[str]
+    pictures: dict[str, _Picture]
+
+
+@dataclass
+class PictureFolder:
+    """A folder that :meth:`claim` has made ours.
+
+    Attributes
+    ----------
+    path : the folder
+    record : content of its ``pictures.json``
+    """
+
+    path: Path
+    record: dict[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def claim(
+        cls,
+        path: Path,
+        kind: str,
+        *,
+        files: Iterable[str],
+        config: Mapping[str, Any],
+        inputs: Mapping[str, str],
+        overwrite: bool = False,
+        command: str = "",
+    ) -> PictureFolder:
+        """Claim a folder that is new, empty, of the same configuration, or to be replaced.
+
+        Parameters
+        ----------
+        kind : what pictures these are, as the record says it
+        files : names of all files that it may write there
+        config : resolved options, written beside the pictures; all but ``material`` decide what they show
+        inputs : what else decides it: digests of the input files, by role
+        overwrite : remove what the folder's record lists, and start anew
+        command : that makes these pictures, for messages; by default ``mbtf-gen`` and the kind
+
+        Raises
+        ------
+        InputError : the folder holds something else
+        """
+        command = command or f"mbtf-gen {kind}"
+        depends = {**{k: v for k, v in config.items() if k != "material"}, "inputs": dict(inputs)}
+        if path.exists() and not path.is_dir():
+            raise InputError("is a file, not a folder", where=path)
+        existing = path / RECORD_NAME
+        if existing.exists():
+            old = read_json(existing)
+            if old.get("format") != FORMAT_NAME or old.get("kind") != kind:
+                raise InputError(
+                    f"holds pictures of something else than {command}",
+                    where=path,
+                    hint="choose another folder with -o",
+                )
+            check_document(_Record, old, existing, "choose another folder with -o")
+            if not overwrite and old.get("hash") == hash_of(depends):
+                folder = cls(path, old)
+                folder._sweep()
+                if not (path / CONFIG_NAME).exists():
+                    write_text(path / CONFIG_NAME, dump_yaml(config))
+                return folder
+            if not overwrite:
+                changes = in_short(differences(old.get("depends", {}), depends))
+                raise InputError(
+                    f"holds pictures of another configuration: {changes}",
+                    where=path,
+                    hint="choose another folder with -o, or replace them with --overwrite",
+                )
+            cls(path, old)._clear()
+        elif path.exists() and any(not _is_leftover(p.name, _OURS) for p in path.iterdir()):
+            raise InputError(
+                f"is not empty and holds no pictures of {command}",
+                where=path,
+                hint="choose another folder with -o",
+            )
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"cannot be made ({error.strerror})", where=path) from None
+        record = {
+            "format": FORMAT_NAME,
+            "version": _VERSION,
+            "kind": kind,
+            "hash": hash_of(depends),
+            "depends": depends,
+            "files": sorted(files),
+            "pictures": {},
+        }
+        folder = cls(path, record)
+        # The record first: it makes the folder ours, whatever instant the run is killed at.
+        folder._save()
+        write_text(path / CONFIG_NAME, dump_yaml(config))
+        return folder
+
+    def _save(self) -> None:
+        write_json(self.path / RECORD_NAME, self.record)
+
+    def _sweep(self) -> None:
+        """Remove what a killed run left of its files."""
+        names = (*_OURS, *self.record.get("files", ()))
+        for path in list(self.path.iterdir()):
+            if _is_leftover(path.name, names):
+                path.unlink(missing_ok=True)
+
+    def _clear(self) -> None:
+        """Remove what the record lists and nothing else; the record last, so that the folder stays ours."""
+        self._sweep()
+        for name in (*self.record.get("files", ()), CONFIG_NAME, RECORD_NAME):
+            (self.path / Path(name).name).unlink(missing_ok=True)
+
+    def finished(self, name: str) -> dict[str, Any] | None:
+        """What :meth:`keep` was told about a picture, where all its files are there in their full size."""
+        entry: dict[str, Any] | None = self.record["pictures"].get(name)
+        if entry is None:
+            return None
+        for file, size in entry["files"].items():
+            path = self.path / file
+            if not path.is_file() or path.stat().st_size != size:
+                return None
+        facts: dict[str, Any] = entry["facts"]
+        return facts
+
+    def keep(self, name: str, files: Iterable[Path], facts: Mapping[str, Any]) -> None:
+        """Record a picture as finished: its files, which lie in the folder, and plain data about it."""
+        sizes = {path.name: path.stat().st_size for path in files}
+        self.record["pictures"][name] = {"files": sizes, "facts": dict(facts)}
+        self._save()

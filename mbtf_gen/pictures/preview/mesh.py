@@ -1,0 +1,234 @@
+"""The displaced mesh with its base color, drawn by VTK in a child process: drivers fail by ending it."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbtf_core.child_process import run_child
+from mbtf_core.errors import EngineError
+from mbtf_gen.geometry.heightfield import HeightGrid, grid_faces, grid_vertices
+from mbtf_gen.images.resample import resample
+from mbtf_gen.material.material import Material
+from mbtf_gen.pictures.camera import Camera
+from mbtf_gen.pictures.reference import auto_exposure, to_display
+
+# Cells along each side of the whole block, and texels across the texture, at most.
+MOST_CELLS = 1024
+MOST_TEXELS = 2048
+# Seconds; software rendering of the largest block takes ten.
+_TIMEOUT = 180.0
+# A window stays open as long as its user likes.
+_DAY = 86400.0
+# The picture is drawn so many times larger and averaged: smooth edges whatever the driver can do.
+_OVERSAMPLING = 2
+# A flat place is shown in its base color; the light is at most so strong, lest low ones paint all white.
+_AMBIENT, _STRONGEST = 0.3, 3.0
+_BACKGROUND, _WALL = (0.95, 0.95, 0.95), (0.45, 0.45, 0.45)
+# VTK's windows that no screen shows; it falls back to them silently.
+_UNSEEN = ("EGL", "OSOpenGL", "OSMesa")
+
+
+@dataclass(frozen=True)
+class Block:
+    """A block of repeated tiles as a mesh.
+
+    Attributes
+    ----------
+    points : (rows, columns, 3) tile widths; uv : (rows, columns, 2), beyond 1 where the tile repeats
+    hole : (rows-1, columns-1) cells that are left out, because less than half of the light is stopped there
+    texture : (h, w, 3) sRGB, row 0 at ``v → 1``, as bright as the path-traced picture is made
+    cells : (rows, columns) of one tile's mesh
+    """
+
+    points: NDArray[np.float32]
+    uv: NDArray[np.float32]
+    hole: NDArray[np.bool_]
+    texture: NDArray[np.uint8]
+    cells: tuple[int, int]
+
+
+def block_of(material: Material, tiles: int, height: float | None = None, mesh: int | None = None) -> Block:
+    """Block of `tiles` × `tiles` tiles of a material, with the mesh that is traced, or a coarser one.
+
+    Parameters
+    ----------
+    height, mesh : as :meth:`~mbtf_gen.material.material.Material.grid` takes them
+    """
+    grid = material.grid(height, mesh)
+    most = MOST_CELLS // tiles
+    if max(grid.z.shape) > most:
+        grid = material.grid(height, max(1, min(most, int(most / material.aspect))))
+    repeated = HeightGrid(np.tile(grid.z, (tiles, tiles)), grid.aspect)
+    points = grid_vertices(repeated) * (tiles, tiles, 1)
+    hole = np.zeros(repeated.z.shape, np.bool_)
+    if material.opacity is not None:
+        opacity = resample(np.atleast_2d(np.asarray(material.opacity, np.float64)), *grid.z.shape)
+        # A cell lies between its vertex and the next ones, around the period.
+        below = np.roll(opacity, -1, axis=0)
+        cells = 0.25 * (opacity + below + np.roll(opacity, -1, axis=1) + np.roll(below, -1, axis=1))
+        hole = np.tile(cells < 0.5, (tiles, tiles))
+    color = np.asarray(material.base_color, np.float32)
+    color = np.broadcast_to(color, (1, 1, 3)) if color.ndim == 1 else color
+    share = min(1.0, MOST_TEXELS / max(color.shape[:2]))
+    texels = (max(1, round(share * color.shape[0])), max(1, round(share * color.shape[1])))
+    return Block(
+        points.astype(np.float32),
+        (points[..., :2] / (1.0, grid.aspect)).astype(np.float32),
+        hole,
+        to_display(resample(color, *texels).astype(np.float32), auto_exposure(color)),
+        (grid.z.shape[0], grid.z.shape[1]),
+    )
+
+
+def draw(block: Block, camera: Camera, omega_i: NDArray[np.float64], path: Path) -> str:
+    """Write a PNG of a block as `camera` sees it under light from `omega_i`; returns why it failed, or ""."""
+    return _run("draw_in_child", block, camera, omega_i, path, timeout=_TIMEOUT)
+
+
+def show(block: Block, camera: Camera, omega_i: NDArray[np.float64]) -> None:
+    """Show a block in a window until its user closes it.
+
+    Raises
+    ------
+    EngineError : there is no display, or VTK cannot draw on it
+    """
+    check_display()
+    fault = _run("show_in_child", block, camera, omega_i, None, timeout=_DAY)
+    if fault:
+        raise EngineError(
+            f"the window could not be shown ({fault})", where="--window", hint="mbtf-gen doctor says more"
+        )
+
+
+def check_display() -> None:
+    """Raise the error of :func:`show` where the environment names no display."""
+    if sys.platform.startswith("linux") and not (
+        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    ):
+        raise EngineError(
+            "there is no display", where="--window", hint="leave it out: the pictures are written as files"
+        )
+
+
+def _run(
+    function: str,
+    block: Block,
+    camera: Camera,
+    omega_i: NDArray[np.float64],
+    path: Path | None,
+    *,
+    timeout: float,
+) -> str:
+    forward, _, up = camera.frame()
+    target = camera.position + camera.distance * forward
+    view = {
+        "position": camera.position.tolist(),
+        "target": target.tolist(),
+        "up": up.tolist(),
+        "angle": camera.field_of_view,
+        "size": [camera.columns, camera.rows],
+        "light": (target + camera.distance * np.asarray(omega_i)).tolist(),
+        "intensity": min(_STRONGEST, (1.0 - _AMBIENT) / float(omega_i[2])),
+    }
+    with tempfile.TemporaryDirectory(prefix="mbtf-preview-") as folder:
+        scene = Path(folder, "scene.npz")
+        np.savez(scene, points=block.points, uv=block.uv, hole=block.hole, texture=block.texture)
+        arguments = [str(scene), json.dumps(view), *([str(path)] if path is not None else [])]
+        return run_child(__name__, function, *arguments, timeout=timeout).fault
+
+
+def _plotter(scene: str, view: dict[str, Any], **options: Any) -> Any:
+    """A plotter with the block, its walls, the light and the camera."""
+    import pyvista
+
+    with np.load(scene) as stored:
+        points, uv, hole, texture = (stored[name] for name in ("points", "uv", "hole", "texture"))
+    rows, columns = points.shape[:2]
+    faces = grid_faces(rows, columns)[np.repeat(~hole.ravel(), 2)]
+    mesh = pyvista.PolyData(points.reshape(-1, 3), _polygons(faces))
+    mesh.active_texture_coordinates = uv.reshape(-1, 2)
+    image = pyvista.Texture(np.ascontiguousarray(texture))
+    image.repeat = True
+    image.interpolate = True
+    image.mipmap = True
+    plotter = pyvista.Plotter(lighting="none", **options)
+    plotter.set_background(_BACKGROUND)
+    look = {"ambient": _AMBIENT, "diffuse": 1.0, "specular": 0.0}
+    plotter.add_mesh(mesh, texture=image, **look)
+    wall = _walls(points)
+    if wall is not None:
+        plotter.add_mesh(pyvista.PolyData(wall, _polygons(_strip(len(wall)))), color=_WALL, **look)
+    light = pyvista.Light(
+        position=view["light"],
+        focal_point=view["target"],
+        light_type="scene light",
+        intensity=view["intensity"],
+    )
+    light.positional = False
+    plotter.add_light(light)
+    plotter.camera.position, plotter.camera.focal_point = view["position"], view["target"]
+    plotter.camera.up = view["up"]
+    plotter.camera.SetUseHorizontalViewAngle(True)
+    plotter.camera.view_angle = view["angle"]
+    plotter.reset_camera_clipping_range()
+    return plotter
+
+
+def _polygons(faces: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
+    """Triangles (n, 3) as VTK takes them: each with its number of corners in front."""
+    return np.column_stack([np.full(len(faces), 3), faces]).astype(np.int64)
+
+
+def _walls(points: NDArray[np.float32]) -> NDArray[np.float32] | None:
+    """The block's sides, down to its lowest point: pairs (edge, foot) around the border, (2n, 3)."""
+    edge = np.concatenate([points[0, :-1], points[:-1, -1], points[-1, :0:-1], points[:0:-1, 0]])
+    edge = np.concatenate([edge, edge[:1]])
+    if not np.ptp(points[..., 2]) > 0:
+        return None
+    foot = edge.copy()
+    foot[:, 2] = points[..., 2].min()
+    return np.stack([edge, foot], axis=1).reshape(-1, 3)
+
+
+def _strip(count: int) -> NDArray[np.int64]:
+    """Triangles of a strip of `count` points, taken in pairs."""
+    first = np.arange(0, count - 2, 2)
+    return np.concatenate(
+        [np.column_stack([first, first + 1, first + 3]), np.column_stack([first, first + 3, first + 2])]
+    )
+
+
+def draw_in_child(scene: str, view_json: str, path: str) -> Iterator[dict[str, Any]]:
+    """Child process of :func:`draw`."""
+    from PIL import Image
+
+    view = json.loads(view_json)
+    size = [_OVERSAMPLING * n for n in view["size"]]
+    plotter = _plotter(scene, view, off_screen=True, window_size=size)
+    picture = plotter.screenshot(return_img=True)
+    plotter.close()
+    if picture is None or not int(picture.max()) > int(picture.min()):
+        raise EngineError("the picture came out empty")
+    Image.fromarray(picture).reduce(_OVERSAMPLING).save(path, format="PNG")
+    yield {"drawn": True}
+
+
+def show_in_child(scene: str, view_json: str) -> Iterator[dict[str, Any]]:
+    """Child process of :func:`show`."""
+    view = json.loads(view_json)
+    plotter = _plotter(scene, view, window_size=view["size"])
+    window = type(plotter.render_window).__name__
+    if any(word in window for word in _UNSEEN):
+        raise EngineError(f"the display {os.environ.get('DISPLAY', '')} cannot be opened")
+    plotter.show(title="mbtf-gen preview")
+    yield {"shown": True}

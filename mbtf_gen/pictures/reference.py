@@ -1,0 +1,175 @@
+"""Reference pictures: path-traced from the real micro-geometry, with both halves kept.
+
+A picture is stored as an EXR image with the channels of the shard schema (``u.x``, ``omega_o.z``,
+``value_a.R``, …), so that a fitted material can be evaluated at exactly its queries, and as a PNG for the
+eye.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbtf_core.atomic import write_file
+from mbtf_gen.dataset.shard_io import write_exr
+from mbtf_gen.pictures.camera import PIXEL_SIGMA, Camera, PixelKind
+from mbtf_gen.sampling.query_sampler import Queries
+
+if TYPE_CHECKING:
+    from mbtf_gen.render.estimator import Estimator
+
+
+@dataclass(frozen=True)
+class ReferenceImage:
+    """A rendered picture.
+
+    Attributes
+    ----------
+    kind : ``query`` or ``pixel``
+    queries : one per pixel, leading axes (rows, columns)
+    value_a, value_b : (rows, columns, 3) independent halves, 1/sr
+    spp : paths per pixel, both halves together
+    transmittance : (rows, columns) share seen through holes; None where there are none
+    """
+
+    kind: PixelKind
+    camera: Camera
+    queries: Queries
+    value_a: NDArray[np.float32]
+    value_b: NDArray[np.float32]
+    spp: int
+    transmittance: NDArray[np.float32] | None = None
+
+    @property
+    def value(self) -> NDArray[np.float32]:
+        """Mean of the halves, (rows, columns, 3)."""
+        return 0.5 * (self.value_a + self.value_b)
+
+    def write(self, path: Path, exposure: float | None = None) -> tuple[Path, Path]:
+        """Write ``path`` + ``.exr`` (all channels) and + ``.png`` (sRGB), each atomically; returns both."""
+        lead = (1, *self.queries.lead)
+        arrays = {
+            "u": self.queries.u.reshape(*lead, 2),
+            "sigma": self.queries.sigma.reshape(lead),
+            "omega_i": self.queries.omega_i.reshape(*lead, 3),
+            "omega_o": self.queries.omega_o.reshape(*lead, 3),
+            "value_a": self.value_a.reshape(*lead, 3),
+            "value_b": self.value_b.reshape(*lead, 3),
+            "spp": np.full(lead, self.spp, np.float32),
+        }
+        if self.transmittance is not None:
+            arrays["transmittance"] = self.transmittance.reshape(lead)
+        exr, png = (path.with_name(f"{path.name}{suffix}") for suffix in (".exr", ".png"))
+        write_exr(exr, arrays)
+        write_png(png, to_display(self.value, exposure))
+        return exr, png
+
+
+def write_png(path: Path, pixels: NDArray[np.uint8]) -> None:
+    """Write an 8-bit picture (rows, columns, 3), atomically."""
+    from PIL import Image
+
+    write_file(path, lambda stream: Image.fromarray(pixels).save(stream, format="PNG"))
+
+
+def auto_exposure(value: NDArray[np.float32]) -> float:
+    """Factor that brings the 95th percentile of the mean channel to 0.8; 1 for a black picture."""
+    bright = float(np.percentile(np.asarray(value).mean(axis=-1), 95))
+    return 0.8 / bright if bright > 0 else 1.0
+
+
+def to_display(value: NDArray[np.float32], exposure: float | None = None) -> NDArray[np.uint8]:
+    """8-bit sRGB of linear values (..., 3) times an exposure factor (by default :func:`auto_exposure`)."""
+    linear = np.clip(
+        np.asarray(value, np.float64) * (auto_exposure(value) if exposure is None else exposure), 0, 1
+    )
+    coded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    return np.round(255.0 * coded).astype(np.uint8)
+
+
+def _camera_rays(camera: Camera, estimator: Estimator) -> Any:
+    """Ray source whose n-th query is the camera's n-th pixel under its Gaussian filter."""
+    import drjit as dr
+    import mitsuba as mi
+
+    from mbtf_gen.render.scene import CLEARANCE
+    from mbtf_gen.render.sensor import ray_through
+
+    tile = estimator.tile
+
+    def numbers(*values: float) -> list[Any]:
+        """Opaque, so that every camera uses the same compiled kernel."""
+        return [dr.opaque(mi.Float, float(v)) for v in values]
+
+    forward, right, up = (mi.Vector3f(*numbers(*axis)) for axis in camera.frame())
+    position = mi.Point3f(*numbers(*camera.position))
+    unit, aspect, start, pitch = numbers(tile.unit, tile.aspect, CLEARANCE, camera.pixel_pitch)
+    center_x, center_y = numbers(camera.columns / 2 - 0.5, camera.rows / 2 - 0.5)
+    columns = dr.opaque(mi.UInt32, camera.columns)
+
+    class CameraRays:
+        def set_queries(self, queries: Queries, first: int = 0) -> None:
+            self.first = dr.opaque(mi.UInt32, first)
+
+        def footprint(self, query: Any, xi: Any) -> Any:
+            pixel = query + self.first
+            jitter = mi.warp.square_to_std_normal(xi) * PIXEL_SIGMA
+            row = pixel // columns
+            x = (mi.Float(pixel - row * columns) - center_x + jitter.x) * pitch
+            y = (center_y - mi.Float(row) + jitter.y) * pitch
+            d = forward + right * x + up * y
+            # A jitter of many pixels could reach the horizon; such rays have no weight worth speaking of.
+            t = position.z / dr.maximum(-d.z, 1e-4)
+            return mi.Point2f(position.x + t * d.x, (position.y + t * d.y) / aspect)
+
+        def ray(self, query: Any, point: Any) -> Any:
+            towards = mi.Vector3f(position.x - point.x, position.y - point.y * aspect, position.z)
+            return ray_through(point, dr.normalize(towards), unit, aspect, start)
+
+    return CameraRays()
+
+
+def render_reference(
+    estimator: Estimator,
+    camera: Camera,
+    omega_i: NDArray[np.float64],
+    *,
+    kind: PixelKind = "query",
+    spp: int = 256,
+    seed: int = 0,
+    index: int = 0,
+) -> ReferenceImage:
+    """Render one picture.
+
+    Parameters
+    ----------
+    estimator : of the tile, its light kernel and transport
+    omega_i : (3,) direction towards the light
+    kind : what a pixel means
+    spp : paths per pixel, both halves together
+    seed, index : random numbers: root seed and number of the picture
+
+    Raises
+    ------
+    UsageError : the picture shows the horizon
+    """
+    from mbtf_gen.render.estimator import Stream
+
+    queries = camera.queries(omega_i, estimator.tile.aspect)
+    source = _camera_rays(camera, estimator) if kind == "pixel" else None
+    stream = Stream(seed, "reference", 2 * index + (kind == "pixel"))
+    estimates = estimator.estimate(queries.flat(), spp, stream, source)
+    shape, through = (*queries.lead, 3), estimates.transmittance
+    return ReferenceImage(
+        kind,
+        camera,
+        queries,
+        estimates.value_a.reshape(shape),
+        estimates.value_b.reshape(shape),
+        spp,
+        None if through is None else through.reshape(queries.lead),
+    )

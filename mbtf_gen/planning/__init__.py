@@ -1,0 +1,1 @@
+"""What a run simulates and how many paths each query gets."""

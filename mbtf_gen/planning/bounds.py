@@ -1,0 +1,170 @@
+"""What a relief does to light, estimated on its height grid alone, before anything is rendered.
+
+Rays are marched over the periodic heights, and a Lambert surface is shaded with and without an effect. The
+change at single points (σ → 0) is never smaller, in the root mean square, than that of footprint averages
+(Jensen), so it bounds the cost for any mixture of levels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbtf_gen.geometry.heightfield import HeightGrid
+from mbtf_gen.geometry.slope_statistics import triangle_slopes
+from mbtf_gen.geometry.slopes import height_slopes
+from mbtf_gen.sampling.light_kernel import LightKernel
+
+F64 = NDArray[np.float64]
+
+# Rays per estimate.
+POINTS = 4096
+# Standard errors of the mean square that are added to an estimate.
+CAUTION = 2.0
+# Steps after which a marched ray is taken to be free.
+MAX_STEPS = 4096
+
+
+@dataclass(frozen=True)
+class ReliefBounds:
+    """Costs of leaving effects of the relief out, relative to the mean value, for a Lambert surface, with
+    :data:`CAUTION`.
+
+    Attributes
+    ----------
+    masking : the plane with the mesh's slopes in place of the displaced tile, shadows left out too
+    shadowing : the displaced tile without shadows
+    normal : shading without the given residual slopes
+    opacity : surface and occluders opaque throughout
+    """
+
+    masking: float
+    shadowing: float
+    normal: float
+    opacity: float
+
+
+def largest_slope(grid: HeightGrid) -> float:
+    """Largest slope of any triangle of the mesh (tangent of its angle to the plane)."""
+    return float(triangle_slopes(grid).max())
+
+
+class _Field:
+    """Bilinear periodic samples of a grid."""
+
+    def __init__(self, values: F64, aspect: float) -> None:
+        self.values, self.aspect = values, aspect
+
+    def __call__(self, x: F64, y: F64) -> F64:
+        rows, columns = self.values.shape[:2]
+        i = x * columns - 0.5
+        j = (1.0 - y / self.aspect) * rows - 0.5
+        i0, j0 = np.floor(i).astype(np.int64), np.floor(j).astype(np.int64)
+        s, t = i - i0, j - j0
+        if self.values.ndim == 3:
+            s, t = s[:, None], t[:, None]
+        i0, i1, j0, j1 = i0 % columns, (i0 + 1) % columns, j0 % rows, (j0 + 1) % rows
+        v = self.values
+        top = v[j0, i0] * (1 - s) + v[j0, i1] * s
+        low = v[j1, i0] * (1 - s) + v[j1, i1] * s
+        out: F64 = top * (1 - t) + low * t
+        return out
+
+
+def _march(
+    field: _Field, origin: F64, direction: F64, step: float, relief: float
+) -> tuple[F64, NDArray[np.bool_]]:
+    """First points (n, 3) where rays dip below the heights, and which rays do before they leave the
+    relief."""
+    if relief == 0.0:
+        return origin, np.zeros(len(origin), bool)
+    horizontal = np.hypot(direction[:, 0], direction[:, 1])
+    # A step moves at most one cell sideways and a fiftieth of the relief up or down.
+    pace = 1.0 / np.maximum(horizontal / step, np.abs(direction[:, 2]) / (0.02 * relief))
+    point = origin.copy()
+    hit = np.zeros(len(origin), bool)
+    going = np.arange(len(origin))
+    for _ in range(MAX_STEPS):
+        if not len(going):
+            break
+        point[going] += direction[going] * pace[going, None]
+        p = point[going]
+        below = p[:, 2] < field(p[:, 0], p[:, 1])
+        hit[going[below]] = True
+        going = going[~below & (p[:, 2] <= 0.0) & (p[:, 2] >= -1.01 * relief)]
+    return point, hit
+
+
+def _lambert(slope: F64, light: F64, irradiance: F64) -> F64:
+    """Reflected share of unit irradiance on the reference plane, for facets (n, 2) of given slopes."""
+    up = 1.0 / np.sqrt(1.0 + np.sum(slope**2, axis=-1))
+    cosine = up * (light[:, 2] - np.sum(slope * light[:, :2], axis=-1))
+    lit = np.where(light[:, 2] > 0, np.maximum(cosine, 0.0) / irradiance, 0.0)
+    return np.asarray(lit[:, None])
+
+
+def relief_bounds(
+    grid: HeightGrid,
+    omega_i: F64,
+    omega_o: F64,
+    kernel: LightKernel,
+    albedo: F64,
+    residual: F64 | None = None,
+    through: F64 | None = None,
+) -> ReliefBounds:
+    """Estimate costs from pairs of directions.
+
+    Parameters
+    ----------
+    grid : heights
+    omega_i, omega_o : (n, 3) directions as the run draws them
+    kernel : light around omega_i
+    albedo : (h, w, channels) reflectance, any resolution
+    residual : (h, w, 2) slopes that a normal map adds
+    through : (h, w) share of the rays that pass through the surface
+    """
+    heights = _Field(grid.z, grid.aspect)
+    slopes = _Field(height_slopes(grid), grid.aspect)
+    color = _Field(albedo, grid.aspect)
+    step = 1.0 / grid.z.shape[1]
+    n = len(omega_i)
+    rng = np.random.default_rng(0)
+    foot = np.column_stack([rng.random(n), rng.random(n) * grid.aspect, np.zeros(n)])
+
+    met, _ = _march(heights, foot, -omega_o, step, grid.displacement_range)
+    start = met.copy()
+    start[:, 2] = heights(met[:, 0], met[:, 1]) + 0.02 * grid.displacement_range
+    light, irradiance = kernel.sample(omega_i, rng), kernel.irradiance(omega_i)
+    up = np.column_stack([light[:, :2], np.maximum(light[:, 2], 1e-6)])
+    occluder, blocked = _march(heights, start, up, step, grid.displacement_range)
+    shadowed = blocked[:, None]
+
+    there = slopes(met[:, 0], met[:, 1])
+    shade = color(met[:, 0], met[:, 1]) * _lambert(there, light, irradiance)
+    value = np.where(shadowed, 0.0, shade)
+    here = color(foot[:, 0], foot[:, 1]) * _lambert(slopes(foot[:, 0], foot[:, 1]), light, irradiance)
+    mean = max(float(value.mean()), 1e-12)
+
+    def cost(change: F64) -> float:
+        square = np.mean(change**2, axis=1)
+        return float(np.sqrt(square.mean() + CAUTION * square.std() / np.sqrt(n))) / mean
+
+    normal = 0.0
+    if residual is not None:
+        tilted = there + _Field(residual, grid.aspect)(met[:, 0], met[:, 1])
+        normal = cost(
+            np.where(shadowed, 0.0, color(met[:, 0], met[:, 1]) * _lambert(tilted, light, irradiance) - shade)
+        )
+    opacity = 0.0
+    if through is not None:
+        passing = _Field(through, grid.aspect)
+        seen, lit = (passing(p[:, 0], p[:, 1])[:, None] for p in (met, occluder))
+        # What lies behind a hole is another place of the same relief, lit about as much: their squares add.
+        behind = np.roll(value, 1, axis=0)
+        with_holes = (1.0 - seen) * np.where(shadowed, lit, 1.0) * shade
+        change = np.sqrt((with_holes - value) ** 2 + (seen * behind) ** 2)
+        # Relative to what holes leave.
+        opacity = cost(change) * mean / max(float(with_holes.mean()), 1e-12)
+    return ReliefBounds(cost(here - value), cost(shade - value), normal, opacity)

@@ -1,0 +1,1 @@
+"""Path tracing of the displaced tile in Mitsuba."""

@@ -1,0 +1,208 @@
+"""Surfaces as Mitsuba BSDFs: the project's own, ``mbtf_surface``, and Mitsuba's in the project's loop.
+
+The generator's loop asks a :class:`~mbtf_gen.render.bsdf.surface.Surface` directly; the registered plugin makes the same
+surface usable in any Mitsuba scene. Maps are bilinear, periodic, and linear; row 0 of an image is the side
+``v → 1`` (the mesh's texture coordinates see to it).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from mbtf_gen.render.bsdf.surface import Surface, SurfaceParts
+
+if TYPE_CHECKING:
+    from mbtf_gen.material.material import Material
+    from mbtf_gen.planning.effects import EffectsPlan
+
+# Parameters of ``mbtf_surface``: textures or numbers.
+NAMES = (
+    "base_color",
+    "roughness",
+    "metallic",
+    "specular",
+    "coat",
+    "coat_roughness",
+    "sheen",
+    "sheen_color",
+    "sheen_roughness",
+    "slopes",
+    "opacity",
+)
+
+
+class SurfaceBSDF(mi.BSDF):
+    """``mbtf_surface``: the project's surface as a BSDF of Mitsuba.
+
+    Plugin parameters: the names of :data:`NAMES`, each a texture or a number. The terms simulated are those
+    whose parameters are given: ``specular`` (with ``roughness``), ``metallic``, ``coat``, ``sheen``,
+    ``slopes``. Opacity needs the generator's own loop and is not a part of the plugin.
+    """
+
+    def __init__(self, props: Any) -> None:
+        super().__init__(props)
+        textures = {name: props.get_texture(name) for name in NAMES if name in props}
+        numbers = {
+            "base_color": 0.5,
+            "roughness": 0.5,
+            "coat_roughness": 0.1,
+            "sheen_color": 1.0,
+            "sheen_roughness": 0.3,
+        }
+        for name, number in numbers.items():
+            if name not in textures:
+                textures[name] = props.get_texture(name, number)
+        parts = SurfaceParts(
+            diffuse=bool(props.get("diffuse", True)),
+            specular="specular" in textures,
+            metallic="metallic" in textures,
+            coat="coat" in textures,
+            sheen="sheen" in textures,
+            slopes="slopes" in textures,
+            opacity="opacity" in textures,
+        )
+        self.surface = Surface(parts, textures)
+        flags = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide
+        if parts.specular or parts.metallic or parts.coat:
+            flags |= mi.BSDFFlags.GlossyReflection
+        self.m_components = [flags]
+        self.m_flags = flags
+
+    def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
+        """Direction and weight f·cos/density."""
+        omega, weight, pdf = self.surface.at(si, si.to_world(si.wi)).sample(sample1, sample2)
+        bs = dr.zeros(mi.BSDFSample3f, dr.width(omega))
+        mirrored = dr.isinf(pdf)
+        bs.wo = si.to_local(omega)
+        bs.pdf = dr.select(mirrored, 1.0, pdf)
+        bs.eta = 1.0
+        glossy = mi.UInt32(int(mi.BSDFFlags.GlossyReflection))
+        bs.sampled_type = dr.select(mirrored, mi.UInt32(int(mi.BSDFFlags.DeltaReflection)), glossy)
+        bs.sampled_component = 0
+        good = active & (pdf > 0)
+        bs.pdf = dr.select(good, bs.pdf, 0.0)
+        return bs, dr.select(good, weight, 0.0)
+
+    def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
+        """(f·cos, density) of a local direction."""
+        value, pdf = self.surface.at(si, si.to_world(si.wi)).eval_pdf(si.to_world(wo))
+        return dr.select(active, value, 0.0), dr.select(active, pdf, 0.0)
+
+    def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+        """f·cos of a local direction."""
+        return self.eval_pdf(ctx, si, wo, active)[0]
+
+    def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+        """Density of a local direction."""
+        return self.eval_pdf(ctx, si, wo, active)[1]
+
+    def to_string(self) -> str:
+        """Description that Mitsuba prints."""
+        return f"SurfaceBSDF[{self.surface.parts}]"
+
+
+class MitsubaSurface:
+    """A BSDF of Mitsuba, as the generator's loop asks for it."""
+
+    def __init__(self, bsdf: Any) -> None:
+        self.bsdf = bsdf
+        self.transmits = bool(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Transmission))
+        self.parts = SurfaceParts()
+
+    def at(self, si: Any, towards_viewer: Any) -> MitsubaPoint:
+        """The surface at hits."""
+        return MitsubaPoint(self.bsdf, si)
+
+
+class MitsubaPoint:
+    """A BSDF of Mitsuba at lanes' hits."""
+
+    def __init__(self, bsdf: Any, si: Any) -> None:
+        self.bsdf, self.si, self.context = bsdf, si, mi.BSDFContext()
+
+    def eval_pdf(self, omega: Any) -> tuple[Any, Any]:
+        """(f·cos, density) of a direction in the scene."""
+        value, pdf = self.bsdf.eval_pdf(self.context, self.si, self.si.to_local(omega))
+        return value, pdf
+
+    def sample(self, xi_lobe: Any, xi: Any) -> tuple[Any, Any, Any]:
+        """(direction in the scene, weight, density; infinite for a delta lobe)."""
+        bs, weight = self.bsdf.sample(self.context, self.si, xi_lobe, xi)
+        delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        return self.si.to_world(bs.wo), weight, dr.select(delta, dr.inf, bs.pdf)
+
+
+def surface_of(bsdf: Any) -> Any:
+    """What the generator's loop asks about reflection, for a loaded BSDF."""
+    return bsdf.surface if isinstance(bsdf, SurfaceBSDF) else MitsubaSurface(bsdf)
+
+
+def _texture(value: Any) -> dict[str, Any]:
+    """Bilinear periodic bitmap of an (H, W) or (H, W, 3) array of linear numbers."""
+    pixels: NDArray[np.float32] = np.ascontiguousarray(value, np.float32)
+    if pixels.ndim == 2:
+        pixels = pixels[..., None]
+    return {
+        "type": "bitmap",
+        "bitmap": mi.Bitmap(pixels),
+        "raw": True,
+        "filter_type": "bilinear",
+        "wrap_mode": "repeat",
+    }
+
+
+def _color(value: Any) -> dict[str, Any]:
+    array = np.asarray(value, np.float64)
+    if array.ndim >= 2:
+        return _texture(array)
+    return {"type": "rgb", "value": [float(c) for c in np.broadcast_to(array, 3)]}
+
+
+def _scalar(value: Any) -> Any:
+    array = np.asarray(value, np.float64)
+    return _texture(array) if array.ndim >= 2 else float(array)
+
+
+def bsdf_of(
+    material: Material, plan: EffectsPlan | None = None, slopes: NDArray[np.float64] | None = None
+) -> dict[str, Any]:
+    """Mitsuba dictionary of a material's BSDF.
+
+    Parameters
+    ----------
+    plan : leaves out what it does not simulate; without one everything but opacity is in
+    slopes : (h, w, 2) slopes added to the mesh's
+    """
+    if material.bsdf is not None:
+        return dict(material.bsdf)
+
+    def on(name: str) -> bool:
+        return plan is None or plan.on(name)
+
+    out = {"type": "mbtf_surface", "base_color": _color(material.base_color)}
+    metallic = (
+        material.metallic is not None and bool(np.any(np.asarray(material.metallic) > 0)) and on("metallic")
+    )
+    if material.roughness is not None:
+        out["roughness"] = _scalar(material.roughness)
+    if material.specular is not None and on("specular"):
+        out["specular"] = _scalar(material.specular)
+    if metallic:
+        out["metallic"] = _scalar(material.metallic)
+    if material.coat is not None and on("coat"):
+        out["coat"] = _scalar(material.coat)
+        out["coat_roughness"] = _scalar(material.coat_roughness)
+    if material.sheen is not None and on("sheen"):
+        out["sheen"] = _scalar(material.sheen)
+        out["sheen_color"] = _color(1.0 if material.sheen_color is None else material.sheen_color)
+        out["sheen_roughness"] = _scalar(material.sheen_roughness)
+    if slopes is not None:
+        out["slopes"] = _texture(np.concatenate([slopes, np.zeros_like(slopes[..., :1])], axis=-1))
+    if plan is not None and plan.on("opacity"):
+        out["opacity"] = _scalar(material.opacity)
+    return out

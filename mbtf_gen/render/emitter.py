@@ -1,0 +1,103 @@
+"""The smoothed directional light as a Mitsuba emitter, for stock integrators.
+
+It takes either one direction (parameter ``direction``, towards the light) or the ``omega_i`` of a batch of
+queries, which it finds by the query number that :class:`~mbtf_gen.render.sensor.QuerySensor` writes into the rays'
+time. The formulas are those of :class:`~mbtf_gen.render.directional_light.DirectionalLight`, which the generator's own loop uses.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mbtf_gen.render.directional_light import DirectionalLight
+from mbtf_gen.sampling.light_kernel import LightKernel
+
+# Scene units that stock integrators search for occluders. Mitsuba tells an emitter written in Python nothing
+# of the scene's size, so it is a constant: thousands of tiles, and still exact to 1e-7 in direction.
+SHADOW_DISTANCE = 1.0e5
+
+
+class SmoothedDirectional(mi.Emitter):
+    """``mbtf_directional``: von Mises–Fisher lobe cut at the horizon z = 0, unit irradiance on the plane z =
+    0.
+
+    Plugin parameters: ``width`` (RMS angle per axis in degrees, 0 for a delta light), ``direction`` (towards
+    the light).
+    """
+
+    def __init__(self, props: Any) -> None:
+        super().__init__(props)
+        self.kernel = LightKernel(float(props.get("width", 1.0)))
+        flags = mi.EmitterFlags.Infinite
+        self.m_flags = flags | mi.EmitterFlags.DeltaDirection if self.kernel.is_delta else flags
+        self.kappa = dr.opaque(mi.Float, 0.0 if self.kernel.is_delta else self.kernel.kappa)
+        direction = props.get("direction", mi.ScalarVector3f(0, 0, 1))
+        self.set_directions(np.asarray(direction, np.float32).reshape(1, 3))
+
+    def set_directions(self, omega_i: ArrayLike) -> None:
+        """Take the light directions (n, 3) of a batch of queries; one row serves all rays."""
+        w = np.asarray(omega_i, np.float32)
+        self.omega_i = mi.Vector3f(w.T.copy())
+        self.inverse = mi.Float((1.0 / self.kernel.irradiance(w)).astype(np.float32))
+        dr.eval(self.omega_i, self.inverse)
+
+    def _light(self, time: Any) -> DirectionalLight:
+        index = dr.minimum(mi.UInt32(time), dr.width(self.inverse) - 1)
+        return DirectionalLight(
+            "delta" if self.kernel.is_delta else "lobe",
+            dr.gather(mi.Vector3f, self.omega_i, index),
+            dr.gather(mi.Float, self.inverse, index),
+            self.kappa,
+        )
+
+    def eval(self, si: Any, active: Any = True) -> Any:
+        """Radiance that arrives against ``si.wi`` from above the horizon."""
+        omega = -si.wi
+        return dr.select(active & (omega.z > 0), mi.Spectrum(self._light(si.time).radiance(omega)), 0.0)
+
+    def sample_direction(self, it: Any, sample: Any, active: Any = True) -> tuple[Any, Any]:
+        """A direction towards the light, with radiance over density."""
+        light = self._light(it.time)
+        ds = dr.zeros(mi.DirectionSample3f, dr.width(it))
+        if self.kernel.is_delta:
+            omega, pdf, weight = light.omega_i, mi.Float(1.0), light.inverse_irradiance
+        else:
+            omega = light.sample(sample)
+            pdf = light.sampling_density(omega)
+            weight = light.radiance(omega) / pdf
+        ds.d = omega
+        ds.dist = mi.Float(SHADOW_DISTANCE)
+        ds.p = dr.fma(omega, ds.dist, it.p)
+        ds.n = -omega
+        ds.time = it.time
+        ds.pdf = pdf
+        ds.delta = mi.Bool(self.kernel.is_delta)
+        ds.emitter = mi.EmitterPtr(self)
+        return ds, dr.select(active, mi.Spectrum(weight), 0.0)
+
+    def pdf_direction(self, it: Any, ds: Any, active: Any = True) -> Any:
+        """Density in 1/sr with which :meth:`sample_direction` draws ``ds.d``; 0 for a delta light."""
+        if self.kernel.is_delta:
+            return mi.Float(0.0)
+        return dr.select(active & (ds.d.z > 0), self._light(it.time).sampling_density(ds.d), 0.0)
+
+    def eval_direction(self, it: Any, ds: Any, active: Any = True) -> Any:
+        """Radiance that arrives from ``ds.d``."""
+        return dr.select(active & (ds.d.z > 0), mi.Spectrum(self._light(it.time).radiance(ds.d)), 0.0)
+
+    def is_environment(self) -> bool:
+        """Rays that leave the scene see it."""
+        return True
+
+    def bbox(self) -> Any:
+        """It has no extent."""
+        return mi.ScalarBoundingBox3f()
+
+    def to_string(self) -> str:
+        """Description that Mitsuba prints."""
+        return f"SmoothedDirectional[width = {self.kernel.width_deg} degrees]"

@@ -1,0 +1,254 @@
+"""The one place that imports Mitsuba: checks that its compiler works on this machine, then sets the variant.
+
+A broken or too old LLVM ends the whole process at some kernel, so it is proved in a child first, once per
+library, and the proof is remembered.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from mbtf_core.atomic import read_json, write_json
+from mbtf_core.child_process import Outcome, run_child
+from mbtf_core.errors import EngineError, MbtfError, UsageError
+from mbtf_gen.render.llvm import (
+    CACHE_VARIABLE,
+    OLDEST_LLVM,
+    VARIABLE,
+    Version,
+    cache_folder,
+    chosen_llvm,
+    shipped_llvm,
+    use_shipped_llvm,
+    version_in_name,
+    version_of,
+)
+
+CPU_VARIANT = "llvm_ad_rgb"
+CUDA_VARIANT = "cuda_ad_rgb"
+# Seconds; a first start from a slow network disk takes tens of them.
+_PROOF_TIMEOUT = 180.0
+
+_working: set[str] = set()
+
+
+def load_mitsuba(variant: str = CPU_VARIANT) -> Any:
+    """Mitsuba's module with a variant set.
+
+    Parameters
+    ----------
+    variant : ``llvm_ad_rgb``, ``cuda_ad_rgb``, or ``auto``: CUDA where it works, else LLVM
+
+    Raises
+    ------
+    UsageError : no such variant
+    EngineError : Mitsuba, its LLVM or the CUDA device cannot be used here; says why and what to do
+    """
+    if variant == "auto":
+        variant = CUDA_VARIANT if not prove(CUDA_VARIANT).fault else CPU_VARIANT
+    if variant not in (CPU_VARIANT, CUDA_VARIANT):
+        raise UsageError(f"no variant '{variant}'", hint=f"choose {CPU_VARIANT}, {CUDA_VARIANT} or auto")
+    if variant not in _working:
+        _ensure_working(variant)
+    try:
+        import mitsuba
+
+        if mitsuba.variant() != variant:
+            mitsuba.set_variant(variant)
+    except ImportError as error:
+        raise _mitsuba_error(" ".join(str(error).split())) from None
+    if variant == CPU_VARIANT:
+        refuse_old_llvm()
+    _working.add(variant)
+    return mitsuba
+
+
+def refuse_old_llvm() -> None:
+    """Refuse the LLVM that Dr.Jit has bound to where it is too old: some kernel would abort the process.
+
+    That happens where Dr.Jit was imported before this package, which says where a newer one lies.
+
+    Raises
+    ------
+    EngineError : it is older than `OLDEST_LLVM`
+    """
+    import drjit
+
+    major = int(drjit.detail.llvm_version()[0])
+    if major < OLDEST_LLVM:
+        raise EngineError(
+            f"Dr.Jit was imported before mbtf_gen and has bound to LLVM {major}, which is too old",
+            hint="import mbtf_gen or mbtf_fit.mitsuba_plugin before mitsuba and drjit",
+        )
+
+
+def prove(variant: str) -> Outcome:
+    """Compile and run kernels of `variant` in a child process, without the disk cache.
+
+    The answers hold ``llvm`` (version) for the CPU variant and ``device`` once a kernel has run.
+    """
+    use_shipped_llvm()
+    with tempfile.TemporaryDirectory(prefix="mbtf-proof-") as folder:
+        return run_child(
+            __name__, "_proof", variant, timeout=_PROOF_TIMEOUT, environment={CACHE_VARIABLE: folder}
+        )
+
+
+def check_llvm() -> Version:
+    """Version of the LLVM that Dr.Jit will use, proved to work on this machine (now or by an earlier run).
+
+    Raises
+    ------
+    EngineError : missing, broken or too old
+    """
+    use_shipped_llvm()
+    library = chosen_llvm()
+    if library is not None and os.sep in library and not Path(library).is_file():
+        raise _llvm_error(library, "is not a file" if Path(library).exists() else "no such file")
+    stated = version_in_name(library) if library is not None else None
+    if stated is not None and stated[0] < OLDEST_LLVM:
+        raise _llvm_error(library, _too_old(stated[0]))
+    remembered = _proof_file(library)
+    if remembered is not None and remembered.exists():
+        try:
+            major, minor, patch = read_json(remembered)["llvm"]
+            return int(major), int(minor), int(patch)
+        except (MbtfError, KeyError, TypeError, ValueError):
+            remembered.unlink(missing_ok=True)
+    outcome = prove(CPU_VARIANT)
+    if outcome.fault:
+        if "llvm" not in outcome.answers and "No module named" in outcome.fault:
+            raise _mitsuba_error(outcome.fault)
+        raise _llvm_error(library, outcome.fault)
+    major, minor, patch = outcome.answers["llvm"]
+    if remembered is not None:
+        try:
+            remembered.parent.mkdir(parents=True, exist_ok=True)
+            write_json(remembered, {"library": library, "llvm": [major, minor, patch]})
+        except (OSError, MbtfError):
+            pass  # without a writable cache the next process proves it again
+    return major, minor, patch
+
+
+def _ensure_working(variant: str) -> None:
+    if variant == CPU_VARIANT:
+        check_llvm()
+        return
+    fault = prove(CUDA_VARIANT).fault
+    if fault:
+        raise EngineError(
+            f"no usable CUDA device ({fault})", hint=f"use the processor: variant {CPU_VARIANT}"
+        )
+
+
+def _proof_file(library: str | None) -> Path | None:
+    """File that remembers a proof: of this library file, this Dr.Jit, this machine's name."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    if library is None or not Path(library).is_file():
+        return None
+    try:
+        drjit = version("drjit")
+    except PackageNotFoundError:
+        return None
+    real = Path(library).resolve()
+    state = real.stat()
+    key = f"{real}|{state.st_size}|{state.st_mtime_ns}|{drjit}|{platform.node()}"
+    return cache_folder() / f"llvm-proof-{hashlib.sha256(key.encode()).hexdigest()[:16]}.json"
+
+
+def _too_old(major: int | None) -> str:
+    name = f"LLVM {major}" if major is not None else f"older than LLVM {OLDEST_LLVM}, or not LLVM at all"
+    return f"is {name}; LLVM {OLDEST_LLVM} or newer is needed"
+
+
+def _llvm_error(library: str | None, fault: str) -> EngineError:
+    if library is None:
+        return EngineError(
+            f"no usable LLVM library was found ({fault})",
+            hint="reinstall into a virtual environment (pip install --target loses it), "
+            f"or set {VARIABLE} to a libLLVM of version {OLDEST_LLVM} or newer",
+        )
+    shipped = shipped_llvm()
+    if shipped is not None and library == str(shipped):
+        return EngineError(
+            f"the LLVM that came with the installation cannot be used: {fault}",
+            where=library,
+            hint="install it again: pip install --force-reinstall karellen-llvm-core",
+        )
+    hint = (
+        "unset it to use the LLVM of the installation"
+        if shipped is not None
+        else "pip install karellen-llvm-core"
+    )
+    return EngineError(fault, where=f"{VARIABLE}={library}", hint=f"{hint}, or name a newer libLLVM")
+
+
+def _mitsuba_error(fault: str) -> EngineError:
+    return EngineError(
+        f"Mitsuba cannot be loaded ({fault})",
+        hint="install it again: pip install --force-reinstall mitsuba==3.9.1",
+    )
+
+
+def _proof(variant: str) -> Iterator[dict[str, Any]]:
+    """Child process of :func:`prove`."""
+    use_shipped_llvm()
+    library = chosen_llvm()
+    if variant == CPU_VARIANT and library is not None:
+        try:
+            stated = version_of(library)
+        except OSError as error:
+            raise EngineError(f"cannot be loaded ({str(error).removeprefix(f'{library}: ')})") from None
+        if stated is None:
+            raise EngineError(_too_old(None))
+        yield {"llvm": stated}
+        if stated[0] < OLDEST_LLVM:
+            raise EngineError(_too_old(stated[0]))
+    import drjit as dr
+    import mitsuba as mi
+
+    try:
+        mi.set_variant(variant)
+    except ImportError:
+        if variant == CUDA_VARIANT:
+            raise EngineError("no driver or no device was found") from None
+        raise
+    if variant == CPU_VARIANT:
+        found = dr.detail.llvm_version()
+        yield {"llvm": found}
+        if found[0] < OLDEST_LLVM:
+            raise EngineError(_too_old(found[0]))
+    _exercise(mi, dr)
+    yield {"device": "cuda" if variant == CUDA_VARIANT else "cpu"}
+
+
+def _exercise(mi: Any, dr: Any) -> None:
+    """Kernels of the kinds that rendering uses: arithmetic, a symbolic loop, random numbers, a ray."""
+    n = 4096
+    index = dr.arange(mi.UInt32, n)
+    x = mi.Float(index) / n
+    if dr.sum(dr.minimum(mi.Float(index), 3) + dr.maximum(-x, 0))[0] != 3 * n - 6:
+        raise EngineError("a test kernel computed a wrong minimum")
+    generator = mi.PCG32(initstate=1, initseq=index)
+
+    def add(i: Any, total: Any, state: Any) -> Any:
+        return i + 1, total + state.next_float32(), state
+
+    _, total, _ = dr.while_loop(
+        (mi.UInt32(0), mi.Float(0), generator), lambda i, total, state: i < 8 + index % 8, add
+    )
+    mean = dr.sum(total)[0] / dr.sum(mi.Float(8 + index % 8))[0]
+    # 47104 uniform numbers: six standard deviations of their mean are 0.008.
+    if not abs(mean - 0.5) < 0.008:
+        raise EngineError("a test kernel drew wrong random numbers")
+    scene = mi.load_dict({"type": "scene", "shape": {"type": "rectangle"}})
+    hit = scene.ray_intersect(mi.Ray3f(mi.Point3f(x, 0.25, 1 + x), mi.Vector3f(0, 0, -1)))
+    if not dr.all(dr.abs(hit.t - (1 + x)) < 1e-5)[0]:
+        raise EngineError("a test ray missed its target")

@@ -1,0 +1,1 @@
+"""Random numbers, low-discrepancy points, 7D queries and the light kernel."""

@@ -1,0 +1,183 @@
+r"""The light kernel: a von Mises–Fisher lobe around ω_i, cut at the horizon, of unit irradiance.
+
+    p(ω) = κ / (2π (1 - e^{-2κ})) · exp(-κ (1 - ω·ω_i))
+    L(ω) = p(ω) [ω_z > 0] / E(ω_i),    E(ω_i) = ∫ p(ω) max(ω_z, 0) dω
+
+so that the irradiance on the reference plane is 1 at every elevation. The width of the lobe is its RMS angle
+per axis in degrees, ``δ² = E[θ²]/2`` with θ the angle to the axis; κ ≈ 1/δ² for narrow lobes. Width 0 is a
+delta light, ``E = ω_i,z``.
+
+``1 - ω·ω_i`` is always computed as ``|ω - ω_i|²/2``: in single precision the cosine of a 0.05° lobe has only
+a few hundred distinct values left.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cache, lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+# The uniform sphere has an RMS angle of 69° per axis; beyond this a lobe is no longer a light from one side.
+MAX_WIDTH_DEG = 45.0
+# A lobe narrower than this cannot be told from a delta light in single precision.
+MIN_WIDTH_DEG = 0.01
+
+
+# The horizon cuts nothing that counts from lobes that stand this many widths above it.
+NEAR_WIDTHS = 10.0
+
+# Worked out once: nodes of high order take a tenth of a second.
+_gauss = cache(np.polynomial.legendre.leggauss)
+
+
+def _theta_nodes(kappa: float, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Gauss–Legendre nodes and weights over the polar angle, up to where the lobe holds e^-40 of its peak."""
+    end = float(np.arccos(max(-1.0, 1.0 - 40.0 / kappa)))
+    x, w = _gauss(count)
+    return 0.5 * end * (x + 1.0), 0.5 * end * w
+
+
+def _density(kappa: float, versine: ArrayLike) -> NDArray[np.float64]:
+    """Lobe density in 1/sr as a function of 1 - cos θ."""
+    norm = kappa / (2.0 * np.pi * -np.expm1(-2.0 * kappa))
+    return norm * np.exp(-kappa * np.asarray(versine, np.float64))
+
+
+def rms_angle_deg(kappa: float) -> float:
+    """RMS angle per axis, in degrees, of a von Mises–Fisher lobe of concentration κ."""
+    theta, weight = _theta_nodes(kappa, 400)
+    density = _density(kappa, 2.0 * np.sin(0.5 * theta) ** 2) * 2.0 * np.pi * np.sin(theta)
+    return float(np.degrees(np.sqrt(0.5 * np.sum(weight * density * theta**2) / np.sum(weight * density))))
+
+
+@lru_cache(maxsize=64)
+def concentration(width_deg: float) -> float:
+    """Concentration κ of the lobe whose RMS angle per axis is `width_deg` degrees."""
+    from scipy.optimize import brentq
+
+    start = 1.0 / np.radians(width_deg) ** 2
+    log_kappa = brentq(
+        lambda x: rms_angle_deg(float(np.exp(x))) - width_deg,
+        np.log(start) - 1.0,
+        np.log(start) + 1.0,
+        xtol=1e-13,
+    )
+    return float(np.exp(log_kappa))
+
+
+def _mean_positive_part(mean: NDArray[np.float64], amplitude: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Mean over φ of ``max(0, mean + amplitude·cos φ)`` for amplitude ≥ 0."""
+    ratio = np.clip(-mean / np.maximum(amplitude, 1e-300), -1.0, 1.0)
+    edge = np.arccos(ratio)
+    partial = (mean * edge + amplitude * np.sin(edge)) / np.pi
+    return np.where(mean >= amplitude, mean, np.where(mean <= -amplitude, 0.0, partial))
+
+
+def lobe_irradiance(kappa: float, elevation: ArrayLike) -> NDArray[np.float64]:
+    """E = ∫ p(ω) max(ω_z, 0) dω by quadrature, for elevations of ω_i in radians (any shape)."""
+    alpha = np.atleast_1d(np.asarray(elevation, np.float64))
+    end = float(np.arccos(max(-1.0, 1.0 - 40.0 / kappa)))
+    x, w = _gauss(128)
+    total = np.zeros_like(alpha)
+    # The inner mean has a kink where the cone of half-angle θ touches the horizon, at θ = elevation.
+    kink = np.clip(alpha, 0.0, end)
+    for low, high in ((np.zeros_like(kink), kink), (kink, np.full_like(kink, end))):
+        half = 0.5 * (high - low)
+        # Squaring the abscissa towards the kink removes the root singularity that the mean has there.
+        s = 0.5 * (x + 1.0)
+        t = (
+            low[..., None] + 2.0 * half[..., None] * s**2
+            if low is kink
+            else high[..., None] - 2.0 * half[..., None] * s**2
+        )
+        jacobian = 4.0 * half[..., None] * s * 0.5
+        density = _density(kappa, 2.0 * np.sin(0.5 * t) ** 2) * 2.0 * np.pi * np.sin(t)
+        inner = _mean_positive_part(
+            np.cos(t) * np.sin(alpha[..., None]), np.sin(t) * np.cos(alpha[..., None])
+        )
+        total += np.sum(w * jacobian * density * inner, axis=-1)
+    return total.reshape(np.shape(elevation))
+
+
+@lru_cache(maxsize=16)
+def _lobe(width_deg: float) -> tuple[float, Any]:
+    """Concentration of a lobe, and its irradiance as a spline over low elevations; a fifth of a second."""
+    from scipy.interpolate import CubicSpline
+
+    kappa = concentration(width_deg)
+    # Dense, for E departs from sin(elevation) here.
+    elevation = np.linspace(0.0, min(NEAR_WIDTHS * np.radians(width_deg), np.pi / 2), 2049)
+    return kappa, CubicSpline(elevation, lobe_irradiance(kappa, elevation))
+
+
+@dataclass(frozen=True)
+class LightKernel:
+    """Smoothed directional light of a given width.
+
+    Attributes
+    ----------
+    width_deg : RMS angle per axis in degrees; 0 is a delta light
+    """
+
+    width_deg: float
+    kappa: float = field(init=False)
+    _table: Any = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        if self.width_deg == 0:
+            object.__setattr__(self, "kappa", np.inf)
+            object.__setattr__(self, "_table", None)
+            return
+        if not MIN_WIDTH_DEG <= self.width_deg <= MAX_WIDTH_DEG:
+            raise ValueError(
+                f"light width must be 0 or {MIN_WIDTH_DEG}..{MAX_WIDTH_DEG} degrees, not {self.width_deg}"
+            )
+        kappa, table = _lobe(float(self.width_deg))
+        object.__setattr__(self, "kappa", kappa)
+        object.__setattr__(self, "_table", table)
+
+    @property
+    def is_delta(self) -> bool:
+        """True for width 0."""
+        return self.width_deg == 0
+
+    def irradiance(self, omega_i: ArrayLike) -> NDArray[np.float64]:
+        """Irradiance E of the unnormalized lobe for directions (..., 3) with z ≥ 0; the divisor of L."""
+        w = np.asarray(omega_i, np.float64)
+        if self.is_delta:
+            return w[..., 2].copy()
+        # Where nothing of the lobe is cut off: its mean cosine.
+        out = np.array(w[..., 2] * (1.0 / np.tanh(self.kappa) - 1.0 / self.kappa))
+        widest = NEAR_WIDTHS * np.radians(self.width_deg)
+        near = w[..., 2] < (np.sin(widest) if widest < np.pi / 2 else np.inf)
+        low = w[near]
+        out[near] = self._table(np.arctan2(low[..., 2], np.hypot(low[..., 0], low[..., 1])))
+        return out
+
+    def density(self, omega: ArrayLike, omega_i: ArrayLike) -> NDArray[np.float64]:
+        """Lobe p(ω) in 1/sr for directions (..., 3), not cut at the horizon. Not defined for a delta
+        light."""
+        difference = np.asarray(omega, np.float64) - np.asarray(omega_i, np.float64)
+        return _density(self.kappa, 0.5 * np.sum(difference**2, axis=-1))
+
+    def sample(self, omega_i: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
+        """Directions (n, 3) drawn from the lobe around each of omega_i (n, 3), not cut at the horizon."""
+        if self.is_delta:
+            return omega_i
+        xi, turn = rng.random(len(omega_i)), 2.0 * np.pi * rng.random(len(omega_i))
+        versine = -np.log1p(xi * np.expm1(-2.0 * self.kappa)) / self.kappa
+        sine = np.sqrt(np.maximum(versine * (2.0 - versine), 0.0))
+        across = np.where(np.abs(omega_i[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+        first = np.cross(omega_i, across)
+        first /= np.linalg.norm(first, axis=1, keepdims=True)
+        second = np.cross(omega_i, first)
+        aside = np.cos(turn)[:, None] * first + np.sin(turn)[:, None] * second
+        return np.asarray((1.0 - versine)[:, None] * omega_i + sine[:, None] * aside)
+
+    def radiance(self, omega: ArrayLike, omega_i: ArrayLike) -> NDArray[np.float64]:
+        """Arriving radiance L(ω) in 1/sr per unit irradiance: the lobe, cut and normalized."""
+        above = np.asarray(omega)[..., 2] > 0
+        return np.where(above, self.density(omega, omega_i), 0.0) / self.irradiance(omega_i)

@@ -1,0 +1,188 @@
+"""Random 7D queries: position, footprint, light and view.
+
+Positions are stratified: pass after pass over the finest level's texels in a new random order, one query at
+a random point of each. Levels are stratified within a shard over the cumulative mixture. Directions are
+uniform on the projected disk, ``r ≤ √(1 - cos²_min)``. All arithmetic is exactly rounded (see ``exact.py``),
+so queries are the same bits on every machine.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbtf_core.lattice import Lattice
+from mbtf_core.shard_schema import Layout
+from mbtf_core.stats import level_groups
+from mbtf_gen.sampling.exact_math import exp2, sincos_turns
+from mbtf_gen.sampling.rng import Purpose, numpy_generator
+
+F32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Queries:
+    """A batch of queries; the leading axes are ``(n,)`` or ``(items, rows, columns)``.
+
+    Attributes
+    ----------
+    u : (..., 2) uv; sigma : (...) tile widths; omega_i, omega_o : (..., 3) unit vectors. float32.
+    """
+
+    u: F32
+    sigma: F32
+    omega_i: F32
+    omega_o: F32
+
+    @property
+    def lead(self) -> tuple[int, ...]:
+        """The leading axes."""
+        return self.sigma.shape
+
+    def flat(self) -> Queries:
+        """The same queries with one leading axis."""
+        return Queries(
+            self.u.reshape(-1, 2),
+            self.sigma.reshape(-1),
+            self.omega_i.reshape(-1, 3),
+            self.omega_o.reshape(-1, 3),
+        )
+
+    def take(self, rows: Any) -> Queries:
+        """Some along the first axis: a slice, an index array or a mask."""
+        return Queries(self.u[rows], self.sigma[rows], self.omega_i[rows], self.omega_o[rows])
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """Distribution of the fractional level: with weights that sum to 1, l ~ U[0,k] and l ~ U[k-1,k]."""
+
+    log_uniform: float
+    finest: float
+
+    def __post_init__(self) -> None:
+        total = self.log_uniform + self.finest
+        if not total > 0:
+            raise ValueError("weights of the level mixture must not all be zero")
+        object.__setattr__(self, "log_uniform", self.log_uniform / total)
+        object.__setattr__(self, "finest", self.finest / total)
+
+    def level(self, xi: NDArray[np.float64], finest: int) -> NDArray[np.float64]:
+        """Fractional level in [0, k] from numbers in [0, 1), any shape."""
+        first = xi < self.log_uniform
+        low = max(finest - 1, 0)
+        share = xi / self.log_uniform if self.log_uniform > 0 else xi
+        rest = (xi - self.log_uniform) / self.finest if self.finest > 0 else xi
+        return np.where(first, share * finest, low + rest * (finest - low))
+
+    def density(self, level: NDArray[np.float64], finest: int) -> NDArray[np.float64]:
+        """Density per level at fractional levels (any shape) for k = `finest` ≥ 1; 0 outside [0, k]."""
+        low = max(finest - 1, 0)
+        inside = (level >= 0) & (level <= finest)
+        near = inside & (level >= low)
+        return np.where(inside, self.log_uniform / finest, 0.0) + np.where(
+            near, self.finest / (finest - low), 0.0
+        )
+
+
+def _rounded(u: NDArray[np.float64], v: NDArray[np.float64]) -> F32:
+    """Positions (..., 2) in [0, 1)."""
+    uv = np.stack([u, v], axis=-1).astype(np.float32)
+    # Rounding to float32 can reach 1, which is 0 on the torus.
+    return np.where(uv >= 1.0, np.float32(0.0), uv)
+
+
+@dataclass(frozen=True)
+class QueryPlan:
+    """Draws the queries of any shard on its own.
+
+    Attributes
+    ----------
+    lattice : texel grids; mixture : over levels; min_cos : smallest cosine of both directions
+    layout : ``shuffled`` or ``image``; root : root seed; shard_rows : queries (or buffers) per full shard
+    window : places along each side of a buffer, one texel of the level nearest to its footprint apart; None:
+        one place in each texel of the finest level
+    """
+
+    lattice: Lattice
+    mixture: Mixture
+    min_cos: float
+    layout: Layout
+    root: int
+    shard_rows: int
+    window: int | None = None
+
+    def draw(self, split: str, shard: int, rows: int) -> Queries:
+        """Queries of one shard: `rows` queries, or `rows` buffers, each of the finest lattice or of a window
+        of the lattice nearest to its footprint."""
+        generator = numpy_generator(self.root, split, shard, Purpose.QUERIES)
+        sigma = self._sigma(generator, rows)
+        omega_i = self._directions(generator, rows)
+        omega_o = self._directions(generator, rows)
+        if self.layout == "shuffled":
+            texel = self._texels(split, shard * self.shard_rows, rows)
+            return Queries(self._positions(generator, texel), sigma, omega_i, omega_o)
+        if self.window is None:
+            shape = (rows, *self.lattice.shape())
+            texel = np.broadcast_to(np.arange(self.lattice.texels()).reshape(shape[1:]), shape)
+            positions = self._positions(generator, texel)
+        else:
+            shape = (rows, self.window, self.window)
+            positions = self._window(generator, sigma, self.window)
+        return Queries(
+            positions,
+            np.ascontiguousarray(np.broadcast_to(sigma[:, None, None], shape)),
+            np.ascontiguousarray(np.broadcast_to(omega_i[:, None, None], (*shape, 3))),
+            np.ascontiguousarray(np.broadcast_to(omega_o[:, None, None], (*shape, 3))),
+        )
+
+    def _texels(self, split: str, start: int, count: int) -> NDArray[np.int64]:
+        """Texel of query number start … start+count-1 of a split: a new random order for every pass."""
+        texels = self.lattice.texels()
+        parts = []
+        position, left = start, count
+        while left > 0:
+            sweep, offset = divmod(position, texels)
+            generator = numpy_generator(self.root, split, sweep, Purpose.TEXEL_ORDER)
+            order = generator.permutation(texels)
+            take = min(left, texels - offset)
+            parts.append(order[offset : offset + take])
+            position, left = position + take, left - take
+        return np.concatenate(parts)
+
+    def _window(self, generator: np.random.Generator, sigma: F32, size: int) -> F32:
+        """Places (n, size, size, 2): grids, one texel of the level nearest to footprints (n,) between
+        neighbors, that begin anywhere and go around the tile."""
+        shapes = np.array([self.lattice.shape(s) for s in range(self.lattice.finest + 1)])
+        extent = shapes[level_groups(sigma, self.lattice.finest)]
+        start = generator.random((len(sigma), 2, 1))
+        down, across = (start[:, k] + np.arange(size) / extent[:, k, None] for k in (0, 1))
+        shape = (len(sigma), size, size)
+        u, v = (
+            np.broadcast_to(across[:, None] % 1.0, shape),
+            np.broadcast_to(1 - down[:, :, None] % 1.0, shape),
+        )
+        return _rounded(u, v)
+
+    def _positions(self, generator: np.random.Generator, texel: NDArray[np.int64]) -> F32:
+        rows, columns = self.lattice.shape()
+        j, i = np.divmod(texel, columns)
+        jitter = generator.random((*texel.shape, 2))
+        u = (i + jitter[..., 0]) / columns
+        v = 1.0 - (j + jitter[..., 1]) / rows
+        return _rounded(u, v)
+
+    def _sigma(self, generator: np.random.Generator, rows: int) -> F32:
+        strata = (generator.permutation(rows) + generator.random(rows)) / rows
+        level = self.mixture.level(strata, self.lattice.finest)
+        low, high = (np.float32(s) for s in self.lattice.sigma_range)
+        return np.clip((0.5 * exp2(-level)).astype(np.float32), low, high)
+
+    def _directions(self, generator: np.random.Generator, rows: int) -> F32:
+        radius2 = generator.random(rows) * ((1.0 - self.min_cos) * (1.0 + self.min_cos))
+        sine, cosine = sincos_turns(generator.random(rows))
+        radius = np.sqrt(radius2)
+        return np.stack([radius * cosine, radius * sine, np.sqrt(1.0 - radius2)], axis=-1).astype(np.float32)

@@ -1,0 +1,85 @@
+"""Random streams, an injective function of (root seed, split, shard, purpose, pass, half).
+
+Queries are drawn with NumPy's Philox, a counter-based generator whose key holds all of these numbers
+unhashed. Paths draw from low-discrepancy sequences inside kernels (:mod:`mbtf_gen.sampling.sobol`), one for each
+half of each query: the fields are hashed into a key of 64 bits, from which queries of one stream derive keys
+that differ from each other, so that no value depends on how paths are grouped into launches.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from mbtf_gen.sampling.sobol import SobolSampler
+
+MAX_SHARDS = 1 << 28
+# Data splits, reference pictures and pilots draw from streams of their own.
+_SPLIT_NUMBER: dict[str, int] = {"train": 0, "test": 1, "reference": 2, "pilot": 3}
+
+
+class Purpose(IntEnum):
+    """What a stream is for."""
+
+    TEXEL_ORDER = 0
+    QUERIES = 1
+    FOOTPRINT = 2
+    PATH = 3
+    CHOICE = 4
+
+
+def stream_number(split: str, shard: int, purpose: Purpose, pass_index: int = 0, half: int = 0) -> int:
+    """Pack the fields into 47 bits: split (2), half (1), purpose (4), pass (12), shard (28)."""
+    if not 0 <= shard < MAX_SHARDS:
+        raise ValueError(f"shard number must lie in 0..{MAX_SHARDS - 1}, not {shard}")
+    if not 0 <= pass_index < 1 << 12 or half not in (0, 1):
+        raise ValueError(f"pass {pass_index}, half {half} out of range")
+    number = _SPLIT_NUMBER[split]
+    for value, bits in ((half, 1), (int(purpose), 4), (pass_index, 12), (shard, 28)):
+        number = (number << bits) | value
+    return number
+
+
+def numpy_generator(
+    root: int, split: str, shard: int, purpose: Purpose, pass_index: int = 0
+) -> np.random.Generator:
+    """NumPy generator of a stream; its bits are the same on every machine."""
+    key = np.array([root, stream_number(split, shard, purpose, pass_index)], np.uint64)
+    return np.random.Generator(np.random.Philox(key=key))
+
+
+_WORD = (1 << 64) - 1
+
+
+def _mix(x: int) -> int:
+    """The finaliser of MurmurHash3 (Appleby), a bijection of 64-bit numbers."""
+    x = (x ^ (x >> 33)) * 0xFF51AFD7ED558CCD & _WORD
+    x = (x ^ (x >> 33)) * 0xC4CEB9FE1A85EC53 & _WORD
+    return x ^ (x >> 33)
+
+
+def stream_key(root: int, number: int) -> int:
+    """64-bit key of the paths of a stream; `number` from :func:`stream_number`."""
+    # Each is hashed before the next is added: neighboring root seeds share nothing then.
+    return _mix(_mix(number + 1) + root & _WORD)
+
+
+def sequence(key: Any, salt: Any, query: Any, index: Any) -> SobolSampler:
+    """Points inside a kernel, one sequence per query of a stream.
+
+    Parameters
+    ----------
+    key, salt : ``mi.UInt32``, lower and upper half of :func:`stream_key`, one or one per lane
+    query : ``mi.UInt32``, number of the query in its shard; index : of the path within its half of the query
+    """
+    import mitsuba as mi
+
+    from mbtf_gen.sampling.sobol import SobolSampler, mix
+
+    # Both are bijections of the query's number, and unrelated ones.
+    return SobolSampler(
+        mix(query ^ key), mix(query * mi.UInt32(0x2C1B3C6D) + salt), mi.UInt32(index), mi.UInt32(query) * 0
+    )

@@ -1,0 +1,104 @@
+r"""Low-discrepancy points inside kernels: Owen-scrambled Sobol' points, padded pair by pair.
+
+The paths of one half of a query are the points 0, 1, 2, … of one randomized sequence; half, query, shard and
+root seed choose the randomization, so halves are independent and no number depends on how paths are grouped
+into launches. Every draw of a path is one *dimension* of the sequence, of one or two coordinates:
+
+- the coordinates are the first one or two of Sobol' (1967), for two a (0, m, 2)-net: any 2^m consecutive
+  points that begin at a multiple of 2^m put exactly one point into each of the 2^m boxes of every shape
+  2^-j × 2^-(m-j);
+- each coordinate is scrambled after Owen (1995), which keeps that and makes every single point uniform, so
+  that estimates are unbiased for any number of points;
+- the order of the points is scrambled too, anew for each dimension, so that dimensions are independent of
+  each other (Burley 2020, "Practical Hash-based Owen Scrambling").
+
+Scrambling by hashing follows Laine and Karras (2011) with the constants of Vegdahl (2021). All of it is
+32-bit integer arithmetic, and a path's state is four numbers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+# The lower half of the counter counts dimensions, the upper half plain random numbers.
+_CHANCE_STEP = 1 << 16
+_DIMENSIONS = _CHANCE_STEP - 1
+
+
+def mix(x: Any) -> Any:
+    """A bijection of ``mi.UInt32`` in which every bit of x changes each bit of the result half of the time
+    (``lowbias32``, Wellons 2018)."""
+    x = (x ^ (x >> 16)) * mi.UInt32(0x7FEB352D)
+    x = (x ^ (x >> 15)) * mi.UInt32(0x846CA68B)
+    return x ^ (x >> 16)
+
+
+def _scramble(x: Any, seed: Any) -> Any:
+    """Owen's scrambling of a bit-reversed number: what becomes of a bit depends on the lower ones alone."""
+    x = x ^ (x * mi.UInt32(0x3D20ADEA))
+    x = (x + seed) * ((seed >> 16) | 1)
+    x = x ^ (x * mi.UInt32(0x05526C56))
+    return x ^ (x * mi.UInt32(0x53A22864))
+
+
+def _second_coordinate(i: Any) -> Any:
+    """Sobol's second coordinate of point i, bit-reversed: i times Pascal's triangle modulo 2."""
+    i = i ^ (i >> 16)
+    i = i ^ ((i & 0xFF00FF00) >> 8)
+    i = i ^ ((i & 0xF0F0F0F0) >> 4)
+    i = i ^ ((i & 0xCCCCCCCC) >> 2)
+    return i ^ ((i & 0xAAAAAAAA) >> 1)
+
+
+def _unit(x: Any) -> Any:
+    """Number in [0, 1) from the upper 24 bits."""
+    return mi.Float(x >> 8) * (1.0 / (1 << 24))
+
+
+@dataclass
+class SobolSampler:
+    """State of lanes' sequences; all ``mi.UInt32``, one per lane.
+
+    Attributes
+    ----------
+    key, salt : which randomization: 64 bits, see :func:`mbtf_gen.sampling.rng.sequence`
+    index : number of the point
+    counter : dimensions drawn so far, and in the upper half plain numbers
+    """
+
+    key: Any
+    salt: Any
+    index: Any
+    counter: Any
+
+    def _seed(self, dimension: Any) -> Any:
+        return mix(mix(self.key + dimension * mi.UInt32(0x9E3779B9)) ^ self.salt)
+
+    def _next(self) -> tuple[Any, Any]:
+        """(the next dimension's seed, its scrambled number of the point)."""
+        seed = self._seed(self.counter & _DIMENSIONS)
+        self.counter = self.counter + 1
+        return seed, dr.brev(_scramble(dr.brev(self.index), mix(seed + 1)))
+
+    def next_1d(self) -> Any:
+        """The next dimension, of one coordinate in [0, 1)."""
+        seed, index = self._next()
+        return _unit(dr.brev(_scramble(index, mix(seed + 2))))
+
+    def next_2d(self) -> Any:
+        """The next dimension, of two coordinates in [0, 1)."""
+        seed, index = self._next()
+        x = dr.brev(_scramble(index, mix(seed + 2)))
+        y = dr.brev(_scramble(_second_coordinate(index), mix(seed + 3)))
+        return mi.Point2f(_unit(x), _unit(y))
+
+    def chance(self) -> Any:
+        """A plain random number in [0, 1), which is no dimension of the sequence: for decisions that some
+        paths take more often than others."""
+        number = self.counter >> 16
+        self.counter = self.counter + _CHANCE_STEP
+        return _unit(mix(self._seed(~number) ^ mix(self.index + 0x68E31DA4)))

@@ -1,0 +1,1 @@
+"""Commands of ``mbtf-pipeline``, one file each."""

@@ -1,0 +1,1 @@
+"""Comparison of fits with references: pictures, errors on data, offsets, timing."""

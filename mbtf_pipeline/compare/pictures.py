@@ -1,0 +1,171 @@
+"""Which pictures a comparison holds, and their files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbtf_gen.pictures.camera import Camera, PixelKind
+from mbtf_pipeline.recipe import FIELD_OF_VIEW, CompareSection, Direction, View
+
+F32 = NDArray[np.float32]
+PICTURES = "pictures"
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One view under one light at one span.
+
+    Attributes
+    ----------
+    index : number of the scene in the comparison
+    name : ``v1-l2-s3``: numbers of view, light and span, from 1
+    span : width of the field of view at the target, in tile widths
+    """
+
+    index: int
+    name: str
+    view: View
+    light: Direction
+    span: float
+
+    def camera(self, size: int) -> Camera:
+        """The scene's camera, `size` pixels along each side."""
+        return Camera(
+            self.view.elevation,
+            self.view.azimuth,
+            self.span,
+            rows=size,
+            columns=size,
+            field_of_view=FIELD_OF_VIEW,
+        )
+
+    def describe(self) -> dict[str, Any]:
+        """Plain data for the comparison's record."""
+        return {
+            "name": self.name,
+            "view": self.view.model_dump(),
+            "light": self.light.model_dump(),
+            "span": self.span,
+        }
+
+    def file(self, what: str) -> str:
+        """Name of one of the scene's pictures without its suffix, relative to the comparison's folder."""
+        return f"{PICTURES}/{self.name}-{what}"
+
+
+def scenes(compare: CompareSection) -> Iterator[Scene]:
+    """All scenes of a comparison: views outermost, spans innermost."""
+    index = 0
+    for v, view in enumerate(compare.views, 1):
+        for n, light in enumerate(compare.lights, 1):
+            for s, span in enumerate(compare.spans, 1):
+                yield Scene(index, f"v{v}-l{n}-s{s}", view, light, span)
+                index += 1
+
+
+def reference_name(kind: PixelKind) -> str:
+    """What a reference's files are called."""
+    return f"reference-{kind}"
+
+
+def fit_name(fit: str) -> str:
+    """What a fit's files are called."""
+    return f"fit-{fit}"
+
+
+def with_ending(path: Path, ending: str) -> Path:
+    """The path with something appended to its name, which may hold dots."""
+    return path.with_name(f"{path.name}{ending}")
+
+
+def write_picture(path: Path, value: F32) -> None:
+    """Write linear RGB (rows, columns, 3) in 1/sr as ``path`` + ``.exr`` (float32), atomically."""
+    import OpenEXR
+
+    from mbtf_core.atomic import write_through
+
+    channels = {name: np.ascontiguousarray(value[..., i], np.float32) for i, name in enumerate("RGB")}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    write_through(with_ending(path, ".exr"), lambda p: OpenEXR.File(header, channels).write(str(p)))
+
+
+def write_preview(path: Path, value: F32, white: float) -> None:
+    """Write ``path`` + ``.png``, sRGB with the linear value `white` at full scale, atomically."""
+    from PIL import Image
+
+    from mbtf_core.atomic import write_file
+    from mbtf_gen.pictures.reference import to_display
+
+    image = Image.fromarray(to_display(value, 1.0 / white))
+    write_file(with_ending(path, ".png"), lambda stream: image.save(stream, "PNG", optimize=True))
+
+
+# What a fit's map of HDR-FLIP is called, beside its picture.
+_FLIP = "-flip.png"
+
+
+def write_map(path: Path, flip: F32) -> None:
+    """Write a map (rows, columns) from 0 to 1 as ``path`` + ``-flip.png``, 8-bit gray, atomically."""
+    from PIL import Image
+
+    from mbtf_core.atomic import write_file
+
+    image = Image.fromarray(np.round(255.0 * np.clip(flip, 0.0, 1.0)).astype(np.uint8))
+    write_file(with_ending(path, _FLIP), lambda stream: image.save(stream, "PNG", optimize=True))
+
+
+def read_map(path: Path) -> F32:
+    """The map (rows, columns) from 0 to 1 that :func:`write_map` wrote.
+
+    Raises
+    ------
+    InputError : missing or damaged
+    """
+    from PIL import Image
+
+    from mbtf_core.errors import InputError
+
+    file = with_ending(path, _FLIP)
+    try:
+        with Image.open(file) as image:
+            return (np.asarray(image.convert("L"), np.float32) / 255.0).astype(np.float32)
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"cannot be read ({error})", where=file, hint="run the recipe again: it is made anew"
+        ) from None
+
+
+def read_halves(path: Path) -> tuple[F32, F32]:
+    """Both halves of a reference, linear RGB (rows, columns, 3).
+
+    Raises
+    ------
+    InputError : missing or damaged
+    """
+    from mbtf_gen.images.exr import read_channels
+
+    channels = read_channels(with_ending(path, ".exr"), 1 << 26)
+    a, b = (np.stack([channels[f"value_{h}.{c}"] for c in "RGB"], axis=-1) for h in "ab")
+    return a.astype(np.float32), b.astype(np.float32)
+
+
+def read_picture(path: Path) -> F32:
+    """Linear RGB (rows, columns, 3) of a picture: of a reference the mean of its halves.
+
+    Raises
+    ------
+    InputError : missing or damaged
+    """
+    from mbtf_gen.images.exr import read_channels
+
+    channels = read_channels(with_ending(path, ".exr"), 1 << 26)
+    if "value_a.R" in channels:
+        halves = [np.stack([channels[f"value_{h}.{c}"] for c in "RGB"], axis=-1) for h in "ab"]
+        return (0.5 * (halves[0] + halves[1])).astype(np.float32)
+    return np.stack([channels[c] for c in "RGB"], axis=-1).astype(np.float32)

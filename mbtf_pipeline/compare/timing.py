@@ -1,0 +1,165 @@
+"""Where the time of one evaluation goes: offset texture, offset network, pyramid, decoder.
+
+A model answers in two stages: stage 1 (offset and lookup) depends on the view alone, stage 2 on the light as
+well, so several lights share stage 1. Both are timed as PyTorch runs them, part by part, at random queries;
+the whole is also timed as :meth:`~mbtf_fit.Material.evaluate` runs it.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from mbtf_fit import Material
+
+# Lights that one view is evaluated under.
+LIGHTS = (1, 4, 16)
+# Queries that are evaluated at a time, and timings whose median counts, after one that does not.
+_CHUNK = 1 << 15
+_TIMINGS = 3
+_SEED = 7
+# One of so many pixels is evaluated, and times are scaled: they grow with the number of queries alone.
+_THIN = 8
+
+T = TypeVar("T")
+
+
+def timed(work: Callable[[], T]) -> tuple[T, float]:
+    """What `work` returns, and the median of several timings in seconds, after one that is not counted."""
+    result = work()
+    seconds = []
+    for _ in range(_TIMINGS):
+        start = time.perf_counter()
+        work()
+        seconds.append(time.perf_counter() - start)
+    return result, statistics.median(seconds)
+
+
+@dataclass(frozen=True)
+class Workload:
+    """Random queries as tensors, in chunks: positions, levels' footprints, light and view."""
+
+    u: Tensor
+    sigma: Tensor
+    omega_i: Tensor
+    omega_o: Tensor
+
+    @classmethod
+    def random(cls, count: int, finest: int, device: str) -> Workload:
+        """So many queries of all levels, directions within 60° of the normal."""
+        import torch
+
+        from mbtf_core.directions import from_projected_disk
+        from mbtf_core.lattice import sigma_of_level
+
+        rng = np.random.default_rng(_SEED)
+        angle = 2 * np.pi * rng.random((2, count))
+        radius = np.sqrt(0.75 * rng.random((2, count)))
+        light, view = from_projected_disk(np.stack([radius * np.cos(angle), radius * np.sin(angle)], -1))
+        arrays = (rng.random((count, 2)), sigma_of_level(finest * rng.random(count)), light, view)
+        return cls(*(torch.from_numpy(np.asarray(a, np.float32)).to(device) for a in arrays))
+
+    def chunks(self, size: int) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
+        """All queries, `size` at a time."""
+        arrays = (self.u, self.sigma, self.omega_i, self.omega_o)
+        for start in range(0, len(self.u), size):
+            u, sigma, light, view = (a[start : start + size] for a in arrays)
+            yield u, sigma, light, view
+
+
+def _once(work: Callable[[], Any]) -> Callable[[], None]:
+    """The work without gradients, waited for."""
+    import torch
+
+    def run() -> None:
+        with torch.no_grad():
+            work()
+        if torch.cuda.is_available():
+            torch.cuda.synchronize()
+
+    return run
+
+
+def measure_timing(material: Material, pixels: int, device: str = "cpu") -> dict[str, Any]:
+    """Milliseconds of one evaluation per pixel and their parts, plain data.
+
+    An eighth of the pixels is evaluated, and where a model reads many places for one query as many fewer; the
+    times are scaled, ``queries`` says how many were evaluated.
+
+    Parameters
+    ----------
+    material : on `device`
+    pixels : queries that the times are for
+    """
+    model = material.model
+    count = max(1, pixels // (_THIN * model.positions))
+    work = Workload.random(count, model.lattice.finest, device)
+    size = max(1, _CHUNK // model.positions)
+    scale = 1e3 * pixels / count
+
+    def milliseconds(part: Callable[..., Any]) -> float:
+        whole = _once(lambda: [part(*chunk) for chunk in work.chunks(size)])
+        return scale * timed(whole)[1]
+
+    numpy = [a.cpu().numpy() for a in (work.u, work.sigma, work.omega_i, work.omega_o)]
+    whole = scale * timed(_once(lambda: material.evaluate(*numpy)))[1]
+    first = milliseconds(lambda u, s, i, o: model.stage1(u, s, o))
+    # Stage 2 is timed with the features of the first chunk, over and over: what they are changes nothing.
+    features = _first_features(material, work, size)
+    second = milliseconds(lambda u, s, i, o: model.stage2(features[: len(u)], i, o))
+    parts = {name: milliseconds(part) for name, part in _parts(material).items()}
+    return {
+        "device": device,
+        "pixels": pixels,
+        "queries": count,
+        "evaluate_ms": round(whole, 3),
+        "stage1_ms": round(first, 3),
+        "stage2_ms": round(second, 3),
+        "lights_ms": {str(n): round(first + n * second, 3) for n in LIGHTS},
+        "parts_ms": {name: round(ms, 3) for name, ms in parts.items()},
+    }
+
+
+def _first_features(material: Material, work: Workload, size: int) -> Any:
+    import torch
+
+    u, sigma, _, view = next(work.chunks(size))
+    with torch.no_grad():
+        return material.model.stage1(u, sigma, view)
+
+
+def _parts(material: Material) -> dict[str, Callable[..., Any]]:
+    """What stage 1 does, part by part, at one place per position that the model reads."""
+    from mbtf_fit.models.encodings import encode_position
+
+    model = material.model
+    around = model.positions
+
+    def spread(a: Tensor) -> Tensor:
+        return a.repeat_interleave(around, 0) if around > 1 else a
+
+    out: dict[str, Callable[..., Any]] = {}
+    if model.network.offset != "none":
+        channels = model.network.channels
+        out["offset texture"] = lambda u, s, i, o: model.offset_texture(spread(u))
+
+        def offset_network(u: Tensor, s: Tensor, i: Tensor, o: Tensor) -> Any:
+            seen = u.new_zeros(len(u) * around, channels + 2)
+            return model.offset_network(seen)
+
+        out["offset network"] = offset_network
+    out["pyramid"] = lambda u, s, i, o: model.read(spread(u), model.level(spread(s)))
+    encoding = model.network.encoding
+    if encoding.position:
+        out["encoding"] = lambda u, s, i, o: encode_position(
+            spread(u), model.level(spread(s)), model.lattice.aspect, encoding
+        )
+    return out

@@ -1,0 +1,105 @@
+"""The page of a paper recipe, and one CSV file per table."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from mbtf_core.atomic import write_text
+from mbtf_core.errors import InputError
+from mbtf_pipeline.compare.metrics import DEFINITIONS
+from mbtf_pipeline.compare.st_lpips import weights_file
+from mbtf_pipeline.paper_tables.ablations import ablations
+from mbtf_pipeline.paper_tables.cells import Table
+from mbtf_pipeline.paper_tables.independence import independence
+from mbtf_pipeline.paper_tables.levels import levels
+from mbtf_pipeline.paper_tables.methods import methods
+from mbtf_pipeline.paper_tables.offsets import offsets
+from mbtf_pipeline.paper_tables.runs import Run
+from mbtf_pipeline.paper_tables.sizes import timing, weights
+from mbtf_pipeline.paper_tables.suite import RUNS
+from mbtf_pipeline.paper_tables.zooms import zooms
+from mbtf_pipeline.report.plots import BARS_NOTE
+from mbtf_pipeline.report.report import page_environment, template
+
+PAGE = "paper.html"
+TABLES = "tables"
+_MAKERS: dict[str, Callable[[Sequence[Run]], list[Table]]] = {
+    "methods": methods,
+    "levels": levels,
+    "weights": weights,
+    "ablations": ablations,
+    "timing": timing,
+    "offsets": offsets,
+    "zooms": zooms,
+    "independence": independence,
+}
+
+
+def read_runs(folder: Path, record: Mapping[str, Any]) -> list[Run]:
+    """Finished runs of a paper recipe.
+
+    Raises
+    ------
+    InputError : there is none, or one is damaged
+    """
+    if not record["runs"]:
+        raise InputError("has no finished run", where=folder, hint="run the recipe again: it resumes")
+    return [Run.read(r["material"], r["variant"], folder / RUNS / r["name"]) for r in record["runs"]]
+
+
+def make_tables(names: Sequence[str], runs: Sequence[Run]) -> list[Table]:
+    """All tables of these names."""
+    return [table for name in names for table in _MAKERS[name](runs)]
+
+
+def write_page(folder: Path, record: Mapping[str, Any]) -> tuple[Path, list[Path]]:
+    """Write ``paper.html`` and ``tables/*.csv``; returns their paths.
+
+    Raises
+    ------
+    InputError : a run is missing or damaged
+    """
+    runs = read_runs(folder, record)
+    tables = make_tables(record["tables"], runs)
+    (folder / TABLES).mkdir(exist_ok=True)
+    files = []
+    for table in tables:
+        files.append(folder / TABLES / f"{table.key}.csv")
+        write_text(files[-1], table.csv())
+    html = (
+        page_environment()
+        .from_string(template("paper.html"))
+        .render(
+            record=record,
+            tables=tables,
+            reports=[
+                (r["name"].replace("_", " "), f"{RUNS}/{r['name']}/report.html") for r in record["runs"]
+            ],
+            sizes=_sizes(runs),
+            definitions=DEFINITIONS,
+            bars_note=BARS_NOTE,
+            learned=weights_file() is not None,
+            style=template("report.css"),
+        )
+    )
+    write_text(folder / PAGE, html)
+    return folder / PAGE, files
+
+
+def _sizes(runs: Sequence[Run]) -> dict[str, Any]:
+    """What was computed, for the head of the page."""
+    run = runs[0]
+    splits = run.manifest["splits"]
+    return {
+        "finest": 2 ** run.comparison["finest"],
+        "train": splits["train"]["queries"],
+        "spp": splits["train"]["spp"],
+        "test": splits["test"]["queries"],
+        "test_spp": splits["test"]["spp"],
+        "pictures": len(run.pictures),
+        "size": run.comparison["size"],
+        "picture_spp": run.comparison["spp"],
+        "training": max(float(r.size(fit)["training_seconds"]) for r in runs for fit in r.fits),
+    }

@@ -1,0 +1,90 @@
+"""Error maps and their colors: what they show, on which scale, with a labeled color bar."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import cache
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+U8 = NDArray[np.uint8]
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+Palette = Literal["size", "flip", "signed"]
+# Color maps of sizes from 0 to 1. Both are perceptually uniform and told apart by lightness alone, so also
+# with any color-vision deficiency.
+_SIZES = {"size": "viridis", "flip": "magma"}
+# Colors of a signed difference from -1 to 1, sRGB: blue is too dark, orange too bright, near black is right.
+# Blue and orange stay apart under every common color-vision deficiency; lightness alone gives the size.
+_STOPS = (-1.0, -0.5, 0.0, 0.5, 1.0)
+_COLORS = ((199, 233, 255), (34, 136, 209), (13, 15, 20), (214, 98, 16), (255, 232, 189))
+# Standard deviation in pixels of the window that errors are averaged over.
+WINDOW = 2.0
+
+
+@cache
+def palette(name: Palette) -> tuple[tuple[int, int, int], ...]:
+    """256 sRGB colors: of sizes from 0 to 1, or of signed numbers from -1 to 1."""
+    if name == "signed":
+        t = np.linspace(-1.0, 1.0, 256)
+        channels = [np.interp(t, _STOPS, [c[i] for c in _COLORS]) for i in range(3)]
+        table = np.stack(channels, axis=-1)
+    else:
+        from matplotlib import colormaps
+
+        table = 255.0 * np.asarray(colormaps[_SIZES[name]](np.linspace(0.0, 1.0, 256)))[:, :3]
+    rows = np.round(table).astype(int).tolist()
+    return tuple((r, g, b) for r, g, b in rows)
+
+
+def gradient(name: Palette) -> str:
+    """CSS gradient with a palette's colors, the lower end on the left."""
+    colors = [palette(name)[i] for i in np.linspace(0, 255, 17).round().astype(int)]
+    return f"linear-gradient(90deg, {', '.join(f'rgb({r} {g} {b})' for r, g, b in colors)})"
+
+
+def indices(field: ArrayLike, name: Palette) -> U8:
+    """Palette entries of numbers, clipped to the palette's range; what is not a number counts as 0."""
+    x = np.nan_to_num(np.asarray(field, np.float64))
+    if name == "signed":
+        x = 0.5 * (x + 1.0)
+    return np.round(255.0 * np.clip(x, 0.0, 1.0)).astype(np.uint8)
+
+
+def local_error(picture: F32, value_a: F32, value_b: F32) -> F64:
+    """Local root mean square error (rows, columns) in 1/sr, without the reference's noise.
+
+    The root of the Gaussian average (standard deviation 2 pixels) of the channels' mean of ``(p-a)(p-b)``.
+    One pixel's product is as often negative as not where the error is small against the noise; averaging
+    brings out the error. Where also the average is negative, the error lies below the noise: 0 is shown.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    p, a, b = (np.asarray(x, np.float64) for x in (picture, value_a, value_b))
+    squared = gaussian_filter(((p - a) * (p - b)).mean(axis=-1), WINDOW, mode="nearest")
+    out: F64 = np.sqrt(np.maximum(squared, 0.0))
+    return out
+
+
+def round_scale(x: float) -> float:
+    """The next of 1, 2, 5 times a power of ten that is not below x; 1 where x is not positive."""
+    if not x > 0 or not math.isfinite(x):
+        return 1.0
+    power = 10.0 ** math.floor(math.log10(x))
+    return next(m * power for m in (1.0, 2.0, 5.0, 10.0) if m * power >= x * (1 - 1e-9))
+
+
+def common_scale(fields: Sequence[ArrayLike]) -> float:
+    """One rounded end of the scale for several maps: the 99th percentile of all sizes."""
+    if not fields:
+        return 1.0
+    return round_scale(float(np.percentile(np.concatenate([np.abs(np.ravel(f)) for f in fields]), 99)))
+
+
+def ticks(low: float, high: float, factor: float = 1.0) -> list[str]:
+    """Five evenly spaced numbers for a color bar, times a factor, with a true minus sign."""
+    return [f"{factor * x:.3g}".replace("-", "−") for x in np.linspace(low, high, 5)]

@@ -1,0 +1,141 @@
+"""The report: one HTML file that holds everything it shows."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from mbtf_core.atomic import read_json, write_text
+from mbtf_core.errors import InputError
+from mbtf_pipeline.compare.compare import COMPARISON_NAME, COMPARISON_SCHEMA
+from mbtf_pipeline.fit_records import read_training
+from mbtf_pipeline.formatting import BELOW
+from mbtf_pipeline.recipe import RECIPE_NAME, Recipe
+from mbtf_pipeline.report.embed import ENCODINGS, Embedded, Gallery, embed, encode
+from mbtf_pipeline.report.error_maps import palette
+from mbtf_pipeline.report.errors import error_context
+from mbtf_pipeline.report.linear_images import EXPOSURE_STOPS
+from mbtf_pipeline.report.offsets import show_offsets
+from mbtf_pipeline.report.pictures import Shown, show_pictures
+from mbtf_pipeline.report.plots import BARS_NOTE
+from mbtf_pipeline.report.times import provenance, time_context
+from mbtf_pipeline.report.training import training_context
+from mbtf_pipeline.run_folder import COMPARE, FITS, REPORT, RUN_NAME, SHARDS
+
+# Raised when the page changes; part of what the report's stage depends on.
+LAYOUT = 4
+
+_TABLE = """
+<table><thead><tr>{% for h in t.head %}<th>{{ h }}</th>{% endfor %}</tr></thead><tbody>
+{% for row in t.rows %}<tr>
+{%- for cell in row %}
+{%- if cell is command %}<td class=command><code>{{ cell }}</code></td>
+{%- else %}<td{{ ' class=long' if cell is in_words }}>{{ cell }}</td>{% endif %}
+{%- endfor %}</tr>
+{% endfor %}</tbody></table>
+"""
+
+
+def page_environment() -> Any:
+    """Jinja environment of pages, with ``table`` as a function."""
+    from jinja2 import Environment, StrictUndefined
+    from markupsafe import Markup
+
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
+    environment.tests["in_words"] = lambda cell: BELOW in cell
+    environment.tests["command"] = lambda cell: cell.startswith("mbtf-")
+    table = environment.from_string(_TABLE)
+    environment.globals["table"] = lambda t: Markup(table.render(t=t))
+    return environment
+
+
+def write_report(folder: Path, recipe: Recipe, stages: Sequence[str]) -> int:
+    """Write ``report.html`` of the finished run in `folder`; returns its size in bytes.
+
+    Raises
+    ------
+    InputError : a file of the run is missing or damaged
+    """
+    comparison = read_json(folder / COMPARE / COMPARISON_NAME)
+    if comparison.get("schema") != COMPARISON_SCHEMA:
+        raise InputError(
+            "was written by another version",
+            where=folder / COMPARE / COMPARISON_NAME,
+            hint="run the recipe again: the pictures are compared anew, data and fits are kept",
+        )
+    manifest = read_json(folder / SHARDS / "manifest.json")
+    run = read_json(folder / RUN_NAME)
+    white = comparison["white"] if recipe.report.exposure is None else 1.0 / recipe.report.exposure
+    gallery = Gallery(white)
+    shown = show_pictures(folder / COMPARE, comparison, gallery)
+    offsets = show_offsets(folder / COMPARE, comparison["offsets"], gallery)
+    fit_folders = {name: folder / FITS / name for name in comparison["fits"]}
+    histories = {name: read_training(path) for name, path in fit_folders.items()}
+    context: dict[str, Any] = {
+        "title": recipe.title,
+        "comparison": comparison,
+        "description": recipe.description,
+        "groups": shown.groups,
+        "scenes": shown.scenes,
+        "bars": {bar.key: bar for bar in shown.bars},
+        "bars_note": BARS_NOTE,
+        "train_spp": manifest["splits"]["train"]["spp"],
+        "offsets": offsets,
+        "offset_columns": len(offsets[0]["cells"]) if offsets else 1,
+        "effects": manifest["effects"]["effects"],
+        "command": run["command"],
+        "recipe_yaml": (folder / RECIPE_NAME).read_text(encoding="utf-8"),
+        "provenance": provenance(folder, manifest, fit_folders, run["machine"]),
+        **error_context(comparison, float(manifest["config"]["queries"]["min_cos"])),
+        **training_context(histories),
+        **time_context(folder, stages, manifest, comparison, histories),
+    }
+    budget = recipe.report.max_megabytes * 1e6
+    # What is not pictures is measured with the smallest ones, and the rest is theirs.
+    smallest = encode(gallery, ENCODINGS[-1])
+    rest = len(_render(context, comparison, shown, smallest, white).encode()) - smallest.size
+    html = _render(context, comparison, shown, embed(gallery, budget - rest), white)
+    write_text(folder / REPORT, html)
+    return len(html.encode())
+
+
+def _render(
+    context: Mapping[str, Any],
+    comparison: Mapping[str, Any],
+    shown: Shown,
+    embedded: Embedded,
+    white: float,
+) -> str:
+    """The page."""
+    pictures = {
+        "images": embedded.images,
+        "white": white,
+        "encoding": embedded.encoding.describe(embedded.coding),
+        "stops": EXPOSURE_STOPS,
+        "viewer": _viewer(comparison, shown, embedded, white),
+        "style": template("report.css"),
+        "script": template("report.js"),
+    }
+    html: str = page_environment().from_string(template("report.html")).render(context, **pictures)
+    return html
+
+
+def template(name: str) -> str:
+    """Text of a file of ``templates/``."""
+    return (files("mbtf_pipeline.report") / "templates" / name).read_text(encoding="utf-8")
+
+
+def _viewer(comparison: Mapping[str, Any], shown: Shown, embedded: Embedded, white: float) -> str:
+    """What the page's script reads, as JSON that may stand within a ``<script>`` element."""
+    data = {
+        "white": white,
+        "coding": embedded.coding.describe(),
+        "fits": comparison["fits"],
+        "scenes": shown.scenes,
+        "pictures": embedded.packed,
+        "difference": {"scale": shown.difference * white, "colors": palette("signed")},
+    }
+    return json.dumps(data, ensure_ascii=False, separators=(",", ":")).replace("<", "\\u003c")

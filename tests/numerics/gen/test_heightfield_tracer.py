@@ -1,0 +1,235 @@
+"""Rays over the height field meet what Embree meets on a mesh of many tiles."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from support.scenes import HeightGrid, build_tile, lambert, mi, rocks
+
+from mbtf_gen.geometry.mesh import mesh_of_grid
+from mbtf_gen.render.heightfield_tracer import HeightField, closest_hit, hit_and_shadow, occluded
+from mbtf_gen.sampling.rng import sequence
+
+N = 200_000
+
+
+def needles() -> HeightGrid:
+    z = np.where(np.random.default_rng(5).random((24, 24)) < 0.1, 0.0, -0.4)
+    return HeightGrid(z, 1.0)
+
+
+def odd() -> HeightGrid:
+    return HeightGrid.from_map(rocks(64).z[:23, :37], 1.0)
+
+
+def narrow(rows: int, columns: int, aspect: float) -> HeightGrid:
+    """Cells that are not square, with slopes along both axes."""
+    heights = np.random.default_rng(5).random((rows, columns))
+    return HeightGrid(0.2 * (heights - heights.max()), aspect)
+
+
+GRIDS = [
+    rocks(64),
+    odd(),
+    needles(),
+    HeightGrid(np.array([[0.0, -0.3]]), 0.5),
+    narrow(7, 3, 0.31),
+    narrow(9, 1, 0.6),
+    narrow(4, 16, 0.25),
+]
+NAMES = ["rocks", "23 x 37", "needles", "1 x 2", "7 x 3", "9 x 1", "4 x 16"]
+
+
+def rays(rng: np.random.Generator, grid: HeightGrid, unit: float) -> tuple[NDArray, NDArray]:
+    """Origins (n, 3) within the tile, above the relief; directions (n, 3) downwards, no lower than 6°."""
+    o = np.column_stack([(rng.random((N, 2)) - 0.5) * (unit, unit * grid.aspect), np.full(N, 0.1)])
+    z = rng.uniform(0.1, 1.0, N)
+    phi = 2 * np.pi * rng.random(N)
+    r = np.sqrt(1 - z * z)
+    return o, np.stack([r * np.cos(phi), r * np.sin(phi), -z], axis=-1)
+
+
+def ray_of(o: NDArray, d: NDArray) -> mi.Ray3f:
+    arrays = (np.ascontiguousarray(a.T, np.float32) for a in (o, d))
+    return mi.Ray3f(*(t(a) for t, a in zip((mi.Point3f, mi.Vector3f), arrays, strict=True)))
+
+
+@pytest.mark.parametrize("grid", GRIDS, ids=NAMES)
+def test_hits_and_shadows_are_those_of_the_mesh(grid: HeightGrid) -> None:
+    rng = np.random.default_rng(0)
+    tile = build_tile(grid, lambert(0.5))
+    rows, columns = grid.z.shape
+    around = round(5 / grid.aspect)
+    mesh = mesh_of_grid(grid, tile.unit, (around * rows, around * columns), mi.load_dict(lambert(0.5)))
+    scene = mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, "mesh": mesh})
+    ray = ray_of(*rays(rng, grid, tile.unit))
+    expected = scene.ray_intersect(ray)
+    found, _, capped, _ = closest_hit(tile.world.field, ray, mi.Bool(True), 100)
+    assert np.all(np.array(expected.is_valid()))
+    assert np.all(np.array(found.is_valid()))
+    assert not np.any(np.array(capped))
+    period = np.array([[tile.unit], [tile.unit * grid.aspect]])
+    gap = np.array(expected.p) - np.array(found.p)
+    gap[:2] -= np.round(gap[:2] / period) * period
+    far = np.abs(gap).max(axis=0) > 2e-4 * tile.unit
+    turned = np.abs(np.array(expected.n) - np.array(found.n)).max(axis=0) > 1e-4
+    # Rays through edges and over the rims of ridges, where rounding decides.
+    assert np.mean(far) < 1e-4
+    assert np.mean(turned) < 1e-3
+    u = np.array(found.uv) - np.array(expected.uv)
+    assert np.mean(np.abs(u - np.round(u)).max(axis=0) > 2e-4) < 1e-4
+
+    light = np.array([0.75, -0.55, 0.37]) * (rng.choice([-1, 1], (N, 1)) * [1, 1, 0] + [0, 0, 1])
+    shadow = tile.world.field.leave(found, ray_of(light, light).d)
+    blocked, _, capped, _ = occluded(tile.world.field, shadow, mi.Bool(True), 100)
+    assert not np.any(np.array(capped))
+    truth = np.array(scene.ray_test(shadow))
+    assert 0.02 < truth.mean() < 0.98
+    assert np.mean(np.array(blocked) != truth) < 1e-3
+
+
+@pytest.mark.parametrize("grid", [rocks(64), odd()], ids=["rocks", "23 x 37"])
+def test_rays_from_below_meet_the_surface_from_below(grid: HeightGrid) -> None:
+    """Turned over, what lies below is what lies above: the same hits at mirrored places."""
+    rng = np.random.default_rng(1)
+    upside_down = HeightGrid.from_map(grid.z, -1.0, grid.aspect)
+    field, mirrored = (HeightField.of(g, 32.0, True) for g in (grid, upside_down))
+    o, d = rays(rng, grid, 32.0)
+    o[:, 2] = 0.1
+    expected = closest_hit(mirrored, ray_of(o, d), mi.Bool(True), 100)[0]
+    flip = np.array([1.0, 1.0, -1.0])
+    o[:, 2] += 32.0 * grid.displacement_range
+    found = closest_hit(field, ray_of(o * flip, d * flip), mi.Bool(True), 100, mi.Bool(True))[0]
+    assert np.all(np.array(found.is_valid()))
+    back = np.array(found.p).T * flip - [0, 0, 32.0 * grid.displacement_range]
+    # The table's triangles meet along the same diagonals, whichever side is up.
+    assert np.mean(np.abs(back - np.array(expected.p).T).max(axis=1) > 1e-3) < 1e-4
+
+
+def test_two_rays_at_once_are_as_each_alone() -> None:
+    """One ray may end, at the cap too, while the other goes on: what it has found stays as it is."""
+    grid, rng = rocks(64), np.random.default_rng(2)
+    field = HeightField.of(grid, 32.0, False)
+    n = N // 4
+    o, d = (a[:n] for a in rays(rng, grid, 32.0))
+    o[:, 2] = -0.5 * 32.0 * grid.displacement_range * rng.random(n)
+    # Nearly level, down and up, so that many reach the cap.
+    d[:, 2] *= 0.2 * rng.choice([-1, 1], n)
+    one, two = ray_of(o, d), ray_of(o, d[::-1])
+    active = [mi.Bool(rng.random(n) < 0.8) for _ in range(2)]
+    si, capped, blocked, shadow_capped = hit_and_shadow(field, one, active[0], two, active[1], 1)
+    alone, _, alone_capped, _ = closest_hit(field, one, active[0], 1)
+    other, _, other_capped, _ = occluded(field, two, active[1], 1)
+    for pair in ((si.is_valid(), alone.is_valid()), (capped, alone_capped), (shadow_capped, other_capped)):
+        first, second = (np.array(x) for x in pair)
+        assert 0.005 < second.mean() < 0.9
+        assert np.mean(first != second) < 1e-4
+    assert np.mean(np.array(blocked) != np.array(other)) < 1e-4
+    both = np.array(si.is_valid()) & np.array(alone.is_valid())
+    gap = (np.array(si.p) - np.array(alone.p))[:, both]
+    assert np.mean(np.abs(gap).max(axis=0) > 1e-3) < 1e-4
+
+
+def test_grazing_rays_and_rays_that_bounced_meet_what_the_mesh_has() -> None:
+    """First hits of rays down to a cosine of 1e-3, and what rays meet that leave those places at random: the
+    second bounce. Embree counts positions from far away at grazing angles, so a few may differ."""
+    grid, around = HeightGrid(rocks(16).z * 0.15, 1.0), 26
+    tile = build_tile(grid, lambert(0.5))
+    n = N // 2
+    mesh = mesh_of_grid(grid, tile.unit, (around * 16, around * 16), mi.load_dict(lambert(0.5)))
+    scene = mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, "mesh": mesh})
+    rng = np.random.default_rng(4)
+    o, d = (a[:n] for a in rays(rng, grid, tile.unit))
+    o[:, 2] = 1e-3
+    z = np.exp(rng.uniform(np.log(1e-3), np.log(0.1), n))
+    d = np.column_stack([d[:, :2] * (np.sqrt(1 - z * z) / np.hypot(*d[:, :2].T))[:, None], -z])
+
+    def compared(ray: mi.Ray3f, most: float) -> tuple[Any, NDArray]:
+        expected = scene.ray_intersect(ray)
+        found, _, capped, _ = closest_hit(tile.world.field, ray, mi.Bool(True), 4096)
+        assert not np.any(np.array(capped))
+        met = np.array(found.is_valid())
+        # Rays that leave upwards leave the mesh as well.
+        assert np.mean(met != np.array(expected.is_valid())) < most
+        gap = np.array(expected.p) - np.array(found.p)
+        gap[:2] -= np.round(gap[:2] / tile.unit) * tile.unit
+        wrong = (np.abs(gap).max(axis=0) > 1e-3 * tile.unit) & met & np.array(expected.is_valid())
+        assert np.mean(wrong) < most
+        return found, met
+
+    first, met = compared(ray_of(o, d), 2e-3)
+    assert met.all()
+    # Into the upper half space about the normal, half of them nearly level.
+    d = rng.normal(size=(n, 3)) * np.where(rng.random((n, 1)) < 0.5, [[1, 1, 0.02]], [[1, 1, 1]])
+    normal = np.array(first.n).T
+    d *= np.sign(np.sum(d * normal, axis=1))[:, None]
+    d /= np.linalg.norm(d, axis=1)[:, None]
+    _, met = compared(tile.world.field.leave(first, ray_of(d, d).d), 2e-3)
+    assert 0.2 < met.mean() < 0.9
+
+
+class Sieve:
+    """Stops a share of the rays."""
+
+    def __init__(self, share: float) -> None:
+        self.share = share
+
+    def opacity(self, si: Any) -> Any:
+        return mi.Float(self.share)
+
+
+def numbers(n: int) -> Any:
+    return sequence(mi.UInt32(1), mi.UInt32(2), dr.arange(mi.UInt32, n), mi.UInt32(0))
+
+
+def test_borders_are_counted_through_holes() -> None:
+    """A ray that passes through holes has crossed as many borders as a straight line to where it ends, and
+    the cap cuts just those that cross more."""
+    grid, n = rocks(32), 20_000
+    field = HeightField.of(grid, 32.0, True)
+    rng = np.random.default_rng(3)
+    o, d = (a[:n] for a in rays(rng, grid, 32.0))
+    o[:, 2] = -0.4 * 32.0 * grid.displacement_range
+    d[:, 2] *= -0.03 * rng.choice([-1, 1], n)
+    d /= np.linalg.norm(d, axis=1)[:, None]
+    ray, below = ray_of(o, d), mi.Bool(False)
+
+    def run(most: int) -> tuple[Any, NDArray, NDArray]:
+        si, crossings, capped, _ = closest_hit(
+            field, ray, mi.Bool(True), most, below, Sieve(0.15), numbers(n)
+        )
+        return si, np.array(crossings), np.array(capped)
+
+    si, crossings, capped = run(1000)
+    met = np.array(si.is_valid())
+    assert not capped.any()
+    assert 0.3 < met.mean() < 0.9
+    t = (np.array(si.p)[2] - o[:, 2]) / d[:, 2]
+    end = o[:, :2] + t[:, None] * d[:, :2]
+    # The border runs through vertices, which are texel centers.
+    low = -16.0 + 0.5
+    borders = np.abs(np.floor((end - low) / 32.0) - np.floor((o[:, :2] - low) / 32.0)).sum(axis=1)
+    # Nearly level rays are moved along by what lifts them off the surface.
+    assert np.mean(crossings[met] != borders[met]) < 1e-2
+    assert crossings[met].max() > 5
+    for most in (0, 2):
+        _, fewer, cut = run(most)
+        assert 0.05 < cut.mean() < 0.95
+        assert (cut == (crossings > most)).all()
+        assert (fewer == np.minimum(crossings, most)).all()
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_rays_that_are_not_finite_end(bad: float) -> None:
+    """Nothing is read from outside the table, and no kernel runs for ever."""
+    field = HeightField.of(rocks(16), 32.0, False)
+    for place in range(6):
+        o, d = np.array([[0.0, 0.0, 0.1]]), np.array([[0.3, 0.4, -0.5]])
+        (o if place < 3 else d)[0, place % 3] = bad
+        si, crossings, capped, _ = closest_hit(field, ray_of(o, d), mi.Bool(True), 50)
+        dr.eval(si, crossings, capped)
+        assert int(crossings[0]) <= 50

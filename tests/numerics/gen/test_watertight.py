@@ -1,0 +1,65 @@
+"""No ray slips through the tile: borders, corners, vertices, edges, creases, any elevation."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from support.scenes import build_tile, lambert, mi, rocks
+
+from mbtf_gen.geometry.heightfield import HeightGrid
+from mbtf_gen.render.heightfield_tracer import closest_hit
+from mbtf_gen.render.scene import CLEARANCE
+
+RAYS = 10_000_000
+RESOLUTION = 64
+
+
+def misses(grid: HeightGrid, uv: NDArray[np.float64], direction: NDArray[np.float64]) -> int:
+    """Rays through uv (n, 2) of the reference plane along `direction` (n, 3) that hit nothing."""
+    tile = build_tile(grid, lambert(0.5))
+    plane = np.column_stack([(uv - 0.5) * (1.0, grid.aspect) * tile.unit, np.zeros(len(uv))])
+    origin = plane - direction * (CLEARANCE / -direction[:, 2:])
+    total = 0
+    for part in range(0, len(uv), 1 << 20):
+        o, d = (np.ascontiguousarray(x[part : part + (1 << 20)].T, np.float32) for x in (origin, direction))
+        si, _, capped, _ = closest_hit(
+            tile.world.field, mi.Ray3f(mi.Point3f(o), mi.Vector3f(d)), mi.Bool(True), 4096
+        )
+        total += int(np.sum(~np.array(si.is_valid()))) + int(np.sum(np.array(capped)))
+    return total
+
+
+def downward(rng: np.random.Generator, n: int, smallest_cosine: float) -> NDArray[np.float64]:
+    """Directions that go down, a fifth of them straight, the rest log-uniform in the cosine."""
+    z = np.exp(rng.uniform(np.log(smallest_cosine), 0, n))
+    z[: n // 5] = 1.0
+    phi = 2 * np.pi * rng.random(n)
+    # Many along the axes of the grid, where rays run inside edges.
+    phi[n // 5 : n // 2] = np.round(phi[n // 5 : n // 2] / (np.pi / 2)) * (np.pi / 2)
+    r = np.sqrt(1 - z * z)
+    return np.stack([r * np.cos(phi), r * np.sin(phi), -z], axis=-1)
+
+
+@pytest.mark.parametrize("aspect", [1.0, 0.5], ids=["square", "wide"])
+def test_ten_million_rays_onto_borders_and_corners(aspect: float) -> None:
+    rng = np.random.default_rng(0)
+    n = RAYS // 2
+    grid = HeightGrid(rocks(RESOLUTION, 0.2).z, aspect)
+    # Borders of the tile and of the mesh's period, its corners, vertices and edges of the grid.
+    lines = np.array([0.0, 0.5 / RESOLUTION, 1.0 - 0.5 / RESOLUTION, 1.0 - 1e-7])
+    uv = rng.random((n, 2))
+    fifth = n // 5
+    uv[:fifth, 0] = rng.choice(lines, fifth)
+    uv[fifth : 2 * fifth, 1] = rng.choice(lines, fifth)
+    uv[2 * fifth : 3 * fifth] = rng.choice(lines, (fifth, 2))
+    uv[3 * fifth : 4 * fifth] = (rng.integers(0, RESOLUTION, (fifth, 2)) + 0.5) / RESOLUTION
+    uv[4 * fifth :, 0] = (rng.integers(0, RESOLUTION, n - 4 * fifth) + 0.5) / RESOLUTION
+    assert misses(grid, uv, downward(rng, n, 0.02)[rng.permutation(n)]) == 0
+
+
+def test_grazing_rays_on_a_plane_all_arrive() -> None:
+    rng = np.random.default_rng(1)
+    n = 200_000
+    flat = HeightGrid(np.zeros((8, 8)), 1.0)
+    assert misses(flat, rng.random((n, 2)), downward(rng, n, 1e-4)) == 0

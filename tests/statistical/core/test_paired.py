@@ -1,0 +1,223 @@
+"""The kit's estimates are unbiased and their error bars honest: repeated experiments with known truth.
+
+Each experiment draws queries and noise anew from a fixed seed; over many experiments the estimates must
+scatter about the truth as their own error bars say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mbtf_core.stats import (
+    Estimate,
+    mean_of_halves,
+    mse_difference,
+    noise_free_mse,
+    pooled_error,
+    pooled_variance,
+    signal_variance,
+    unexplained_variance,
+)
+
+Floats = NDArray[np.float64]
+EXPERIMENTS = 600
+QUERIES = 1000
+# Noise of the two halves differs, is skewed, and grows with the value: nothing in the kit may rely on less.
+NOISE_A, NOISE_B = 0.5, 0.8
+
+
+def draw(rng: np.random.Generator, shape: tuple[int, ...] = (QUERIES, 3)) -> tuple[Floats, Floats, Floats]:
+    """Truth and two halves, (n, 3): channels share a factor, so they are correlated within a query."""
+    shared = rng.normal(size=(shape[0],) + (1,) * (len(shape) - 1))
+    truth = np.array([1.0, 2.0, 3.0]) + shared * np.array([0.5, 1.0, 1.5])
+    truth = np.broadcast_to(truth, shape)
+    a = truth + NOISE_A * (rng.exponential(size=shape) - 1.0)
+    b = truth + NOISE_B * (rng.exponential(size=shape) - 1.0)
+    return truth, a, b
+
+
+def pulls(experiment: Callable[[np.random.Generator], Estimate], truth: float) -> tuple[Floats, Floats]:
+    """Values over experiments, and their deviations from the truth in their own standard errors."""
+    rng = np.random.default_rng(20260101)
+    found = [experiment(rng) for _ in range(EXPERIMENTS)]
+    values = np.array([e.value for e in found])
+    return values, (values - truth) / np.array([e.error for e in found])
+
+
+def values_of(experiment: Callable[[np.random.Generator], Estimate]) -> Floats:
+    """Values over experiments that are too small for error bars."""
+    rng = np.random.default_rng(20260101)
+    return np.array([experiment(rng).value for _ in range(EXPERIMENTS)])
+
+
+def assert_honest(experiment: Callable[[np.random.Generator], Estimate], truth: float) -> None:
+    """Mean of the values on the truth (4.5σ), spread of the pulls 1 (4.5σ and 3 % for skewness)."""
+    values, pull = pulls(experiment, truth)
+    assert abs(values.mean() - truth) < 4.5 * values.std(ddof=1) / np.sqrt(EXPERIMENTS)
+    assert abs(pull.std(ddof=1) - 1.0) < 4.5 / np.sqrt(2.0 * EXPERIMENTS) + 0.03
+
+
+VARIANCE = (NOISE_A**2 + NOISE_B**2) / 4.0
+SIGNAL = (0.5**2 + 1.0**2 + 1.5**2) / 3.0
+
+
+def test_pooled_variance() -> None:
+    assert_honest(lambda rng: pooled_variance(*draw(rng)[1:]), VARIANCE)
+
+
+def test_a_wrong_divisor_is_caught() -> None:
+    """``(a-b)²/2``, the variance of one half, is not that of the mean: the same check must refuse it."""
+
+    def wrong(rng: np.random.Generator) -> Estimate:
+        _, a, b = draw(rng)
+        return pooled_variance(np.sqrt(2.0) * a, np.sqrt(2.0) * b)
+
+    with pytest.raises(AssertionError):
+        assert_honest(wrong, VARIANCE)
+
+
+def test_pooled_error() -> None:
+    assert_honest(lambda rng: pooled_error(*draw(rng)[1:]), float(np.sqrt(VARIANCE)))
+
+
+def test_noise_free_mse() -> None:
+    def experiment(rng: np.random.Generator) -> Estimate:
+        truth, a, b = draw(rng)
+        return noise_free_mse(0.9 * truth + 0.1, a, b)
+
+    mean = np.array([1.0, 2.0, 3.0])
+    assert_honest(experiment, float(np.mean((0.1 - 0.1 * mean) ** 2)) + 0.01 * SIGNAL)
+
+
+def test_the_noisy_mse_is_caught() -> None:
+    """Squaring the distance to the mean of the halves adds the noise: the same check must refuse it."""
+
+    def wrong(rng: np.random.Generator) -> Estimate:
+        truth, a, b = draw(rng)
+        return noise_free_mse(truth, (a + b) / 2.0, (a + b) / 2.0)
+
+    with pytest.raises(AssertionError):
+        assert_honest(wrong, 0.0)
+
+
+def test_channels_of_a_query_are_no_extra_samples() -> None:
+    """Counting correlated channels as independent queries makes the error bar too small, which is caught."""
+
+    def wrong(rng: np.random.Generator) -> Estimate:
+        _, a, b = draw(rng)
+        return signal_variance(a[:, [0, 0, 0]].ravel(), b[:, [0, 0, 0]].ravel())
+
+    with pytest.raises(AssertionError):
+        assert_honest(wrong, 0.25)
+    assert_honest(lambda rng: signal_variance(*(h[:, [0, 0, 0]] for h in draw(rng)[1:])), 0.25)
+
+
+def test_signal_variance() -> None:
+    assert_honest(lambda rng: signal_variance(*draw(rng)[1:]), SIGNAL)
+
+
+@pytest.mark.parametrize("queries", [2, 5])
+def test_signal_variance_is_unbiased_for_few_queries(queries: int) -> None:
+    values = values_of(lambda rng: signal_variance(*draw(rng, (queries, 3))[1:]))
+    assert abs(values.mean() - SIGNAL) < 4.5 * values.std(ddof=1) / np.sqrt(EXPERIMENTS)
+
+
+def test_signal_variance_of_buffers() -> None:
+    """Texels of a buffer share directions; with few buffers the correction for their means matters."""
+
+    def experiment(rng: np.random.Generator) -> Estimate:
+        return signal_variance(*draw(rng, (4, 3, 5, 3))[1:])
+
+    values = values_of(experiment)
+    assert abs(values.mean() - SIGNAL) < 4.5 * values.std(ddof=1) / np.sqrt(EXPERIMENTS)
+    uncorrected = SIGNAL * 3.0 / 4.0
+    assert abs(values.mean() - uncorrected) > 4.5 * values.std(ddof=1) / np.sqrt(EXPERIMENTS)
+
+
+def test_unexplained_variance() -> None:
+    """A prediction that regresses to the mean by 40 % leaves 16 % of the variance."""
+
+    def experiment(rng: np.random.Generator) -> Estimate:
+        truth, a, b = draw(rng)
+        mean = np.array([1.0, 2.0, 3.0])
+        return unexplained_variance(mean + 0.6 * (truth - mean), a, b)
+
+    assert_honest(experiment, 0.16)
+
+
+def test_unexplained_variance_of_buffers_has_an_error_bar_by_buffer() -> None:
+    def experiment(rng: np.random.Generator) -> Estimate:
+        truth, a, b = draw(rng, (200, 2, 2, 3))
+        return unexplained_variance(
+            np.array([1.0, 2.0, 3.0]) + 0.0 * truth + rng.normal(size=(200, 1, 1, 1)), a, b
+        )
+
+    _, pull = pulls(experiment, 1.0 + 1.0 / SIGNAL)
+    assert abs(pull.std(ddof=1) - 1.0) < 0.2
+
+
+def test_unexplained_variance_of_queries_taken_by_their_brightness() -> None:
+    """Log-normal values t, more of the bright ones; the prediction t / 2 + 0.2 misses most where they are."""
+    spread, added = 0.7, 0.2
+    mean, square = np.exp(spread**2 / 2), np.exp(2 * spread**2)
+    truth = (0.25 * square - added * mean + added**2) / (square - mean**2)
+    errors = []
+
+    def experiment(rng: np.random.Generator) -> Estimate:
+        t = np.exp(spread * rng.normal(size=(20_000, 1)))
+        looked = (t[:, 0] + 0.5 * rng.normal(size=len(t))) ** 2
+        chance = np.minimum(1.0, QUERIES / len(t) * (0.5 + 0.5 * looked / looked.mean()))
+        rows = rng.random(len(t)) < chance
+        a, b = (t[rows] + scale * rng.normal(size=(rows.sum(), 1)) for scale in (NOISE_A, NOISE_B))
+        first = t[:QUERIES]
+        c, d = (first + scale * rng.normal(size=first.shape) for scale in (NOISE_A, NOISE_B))
+        plain = unexplained_variance(0.5 * first + added, c, d)
+        found = unexplained_variance(0.5 * t[rows] + added, a, b, 7.0 / chance[rows])
+        errors.append(found.error / plain.error)
+        return found
+
+    assert_honest(experiment, truth)
+    # What few bright values would decide many do.
+    assert np.median(errors) < 1.0
+
+
+def test_weights_are_checked() -> None:
+    _, a, b = draw(np.random.default_rng(1), (50, 3))
+    same = unexplained_variance(a, a, b, np.full(50, 3.0))
+    assert same.value == pytest.approx(unexplained_variance(a, a, b).value)
+    assert same.error == pytest.approx(unexplained_variance(a, a, b).error)
+    for bad in (np.ones(49), np.zeros(50)):
+        with pytest.raises(ValueError, match="weights"):
+            unexplained_variance(a, a, b, bad)
+
+
+def test_mse_difference_is_sharper_than_two_errors() -> None:
+    """A small improvement that two separate error bars hide shows in the paired difference."""
+
+    def experiment(rng: np.random.Generator) -> Estimate:
+        truth, a, b = draw(rng)
+        return mse_difference(truth + 0.10, truth + 0.12, a, b)
+
+    assert_honest(experiment, 0.10**2 - 0.12**2)
+    truth, a, b = draw(np.random.default_rng(5))
+    p, q = truth + 0.10, truth + 0.12
+    assert mse_difference(p, q, a, b).error < 0.3 * np.hypot(
+        noise_free_mse(p, a, b).error, noise_free_mse(q, a, b).error
+    )
+
+
+def test_mean_of_halves_counts_noise_alone() -> None:
+    """At fixed queries the mean scatters by the Monte Carlo noise only, whatever the queries' own spread."""
+    truth, _, _ = draw(np.random.default_rng(1))
+
+    def experiment(rng: np.random.Generator) -> Estimate:
+        return mean_of_halves(
+            truth + NOISE_A * (rng.exponential(size=truth.shape) - 1.0),
+            truth + NOISE_B * (rng.exponential(size=truth.shape) - 1.0),
+        )
+
+    assert_honest(experiment, float(truth.mean()))

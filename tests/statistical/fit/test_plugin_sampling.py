@@ -1,0 +1,231 @@
+"""Directions of the fitted materials' plugin have the density it states, and its light adds up."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import pytest
+from support.fit_data import random_directions
+from support.plugin_materials import write_material
+from support.plugin_scenes import plane
+from support.scenes import mi
+
+from mbtf_core.lattice import Lattice
+from mbtf_core.stats import Cap, Estimate, chi_square_test, t_test
+from mbtf_fit.mitsuba_plugin.lobe_fit import lobes_of
+from mbtf_fit.mitsuba_plugin.lobes import Lobe, LobeTextures, Mixture
+
+COUNT = 32
+
+
+def random_mixture(random: np.random.Generator, viewer: np.ndarray, width: int) -> Mixture:
+    """Any lobe that a fit may give: narrow, wide, tilted, sheared; any share."""
+    l11, l22 = np.exp(random.uniform(np.log(0.05), np.log(1.0), 2))
+    l21, x, y = random.normal(0, 0.3, 3)
+    lanes = [mi.Float(np.full(width, v, np.float32)) for v in (l11, l21, l22, x, y)]
+    view = mi.Vector3f(*(mi.Float(np.full(width, v, np.float32)) for v in viewer))
+    return Mixture(Lobe(*lanes), mi.Float(float(random.uniform(0, 0.9))), view)
+
+
+def uniform(n: int, seed: int) -> tuple[Any, Any]:
+    """(choice, point) of the unit cube."""
+    xi = np.random.default_rng(seed).random((3, n)).astype(np.float32)
+    return mi.Float(xi[0]), mi.Point2f(xi[1:])
+
+
+def p_value(seed: int, distort: float = 1.0) -> float:
+    """χ² of a random mixture's samples; `distort` scales the slopes of what is drawn."""
+    n = 40_000
+    viewer = random_directions(np.random.default_rng(100 + seed), 1)[0]
+
+    def mixture(width: int) -> Mixture:
+        return random_mixture(np.random.default_rng(seed), viewer, width)
+
+    drawn = mixture(n)
+    lobe = drawn.lobe
+    wrong = Lobe(lobe.l11 * distort, lobe.l21, lobe.l22, lobe.x, lobe.y)
+    wo = np.array(Mixture(wrong, drawn.share, drawn.viewer).sample(*uniform(n, seed))).T
+
+    def density(w: np.ndarray) -> np.ndarray:
+        return np.array(mixture(len(w)).density(mi.Vector3f(w.T.astype(np.float32))), np.float64)
+
+    return chi_square_test(wo, density, Cap(cos_min=0.0), bins=(20, 40)).p_value
+
+
+def test_samples_have_the_stated_density() -> None:
+    p = np.sort([p_value(seed) for seed in range(COUNT)])
+    assert p[0] > 0.01 / COUNT, p
+    assert np.median(p) > 0.1, p
+
+
+def test_the_judge_sees_lobes_a_tenth_too_wide() -> None:
+    assert min(p_value(seed, 1.1) for seed in range(COUNT)) < 1e-6
+
+
+class Glossy:
+    """An evaluator of a known BRDF: a GGX facet distribution, tilted and anisotropic, on a Lambert base."""
+
+    lattice = Lattice(1)
+    alphas, tilt, base = (0.1, 0.25), (0.2, -0.1), 0.05
+
+    def lobe(self) -> Lobe:
+        return Lobe(*(mi.Float(v) for v in (self.alphas[0], 0.0, self.alphas[1], *self.tilt)))
+
+    def features(self, u: Any, level: Any, viewer: Any) -> list[Any]:
+        return []
+
+    def value(self, features: list[Any], light: Any, viewer: Any) -> Any:
+        # Half of the lobe's own density over the cosine: energy one half.
+        return mi.Color3f(self.base / dr.pi + 0.5 * self.lobe().density(light, viewer) / light.z)
+
+
+def second_moment(value: Any, mixture: Mixture, n: int) -> tuple[float, float]:
+    """(mean, variance) of the estimate of ∫ f cos by a mixture's samples."""
+    light = mixture.sample(*uniform(n, 5))
+    above = light.z > 0
+    light = dr.select(above, light, mi.Vector3f(0, 0, 1))
+    ratio = dr.select(above, value(light) * light.z / mixture.density(light), 0.0)
+    x = np.array(ratio, np.float64)
+    return float(x.mean()), float(x.var())
+
+
+def test_the_lobes_of_a_known_material_are_found() -> None:
+    """Its parameters, and a variance far below the cosine's."""
+    glossy: Any = Glossy()
+    levels = lobes_of(glossy)
+    assert [level.shape for level in levels] == [(1, 1, 8), (2, 2, 8)]
+    found = np.mean([texel for level in levels for texel in level.reshape(-1, 8)], 0)
+    np.testing.assert_allclose(found[[0, 2]], Glossy.alphas, rtol=0.25)
+    np.testing.assert_allclose(found[3:5], Glossy.tilt, atol=0.05)
+    assert abs(found[1]) < 0.05
+    assert found[5:].min() > 0.5
+    n = 1 << 16
+    textures = LobeTextures(levels)
+    for direction in random_directions(np.random.default_rng(4), 4):
+        viewer = mi.Vector3f(*(mi.Float(np.full(n, c, np.float32)) for c in direction))
+
+        def value(light: Any, viewer: Any = viewer) -> Any:
+            return glossy.value([], light, viewer).x
+
+        at = textures.at(mi.Point2f(0.3, 0.6), mi.Float(0.0), viewer)
+        mean, variance = second_moment(value, at, n)
+        flat_mean, flat = second_moment(value, Mixture.cosine(viewer), n)
+        assert abs(mean - flat_mean) < 4 * ((flat + variance) / n) ** 0.5
+        assert variance < flat / 4
+
+
+def test_a_lambert_material_keeps_the_cosine() -> None:
+    evaluator: Any = SimpleNamespace(
+        lattice=Lattice(2),
+        features=lambda u, level, viewer: [],
+        value=lambda features, light, viewer: mi.Color3f(0.2),
+    )
+    assert np.concatenate([level[..., 5:].ravel() for level in lobes_of(evaluator)]).max() == 0
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("material")
+    write_material(out, finest=3, aspect=0.7, contrast=0.3, brightness=0.5)
+    return out
+
+
+def test_weights_are_value_over_density_of_the_same_directions(folder: Path) -> None:
+    """sample, eval, pdf and eval_pdf of the plugin agree, and its samples pass χ² through a turned frame."""
+    bsdf = mi.load_dict({"type": "mbtf", "material": str(folder), "networks": "cooperative"})
+    n = 100_000
+    si = dr.zeros(mi.SurfaceInteraction3f, n)
+    si.n = mi.Normal3f(0, 0, 1)
+    si.sh_frame = mi.Frame3f(si.n)
+    si.uv = mi.Point2f(0.3, 1.7)
+    si.dp_du, si.dp_dv = mi.Vector3f(0.6, 0.8, 0), mi.Vector3f(0.8, -0.3, 0)
+    si.duv_dx, si.duv_dy = mi.Vector2f(0.1, 0.02), mi.Vector2f(0.01, 0.3)
+    si.wi = dr.normalize(mi.Vector3f(0.5, 0.4, 0.5))
+    context = mi.BSDFContext()
+    bs, weight = bsdf.sample(context, si, *uniform(n, 3))
+    kept = np.array(bs.pdf) > 0
+    assert kept.mean() > 0.9
+    value, pdf = bsdf.eval_pdf(context, si, bs.wo)
+    np.testing.assert_allclose(np.array(pdf)[kept], np.array(bs.pdf)[kept], rtol=2e-3)
+    np.testing.assert_allclose(np.array(bsdf.pdf(context, si, bs.wo)), np.array(pdf), rtol=1e-5)
+    np.testing.assert_allclose(np.array(bsdf.eval(context, si, bs.wo)), np.array(value), rtol=1e-5)
+    np.testing.assert_allclose(
+        np.array(weight)[:, kept], (np.array(value) / np.array(pdf))[:, kept], rtol=5e-3, atol=1e-6
+    )
+
+    def density(w: np.ndarray) -> np.ndarray:
+        hit = dr.gather(mi.SurfaceInteraction3f, si, dr.zeros(mi.UInt32, len(w)))
+        return np.array(bsdf.pdf(context, hit, mi.Vector3f(w.T.astype(np.float32))), np.float64)
+
+    wo = np.where(kept, np.array(bs.wo), np.array([[0.0], [0.0], [-1.0]])).T
+    assert chi_square_test(wo, density, Cap(cos_min=0.0), bins=(12, 24)).p_value > 1e-3
+
+
+def furnace(bsdf: dict[str, Any], integrator: str, seed: int, spp: int = 64) -> np.ndarray:
+    """Pixels of a sphere under constant white light, where it is seen."""
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "ball": {"type": "sphere", "bsdf": bsdf},
+            "light": {"type": "constant"},
+            "sensor": {
+                "type": "orthographic",
+                "to_world": mi.ScalarTransform4f().look_at([3, 2, 4], [0, 0, 0], [0, 1, 0])
+                @ mi.ScalarTransform4f().scale(0.6),
+                "film": {"type": "hdrfilm", "width": 12, "height": 12, "pixel_format": "rgb"},
+            },
+        }
+    )
+    tracer = mi.load_dict({"type": integrator, "max_depth": 2})
+    return np.array(mi.render(scene, integrator=tracer, spp=spp, seed=seed), np.float64)
+
+
+@pytest.mark.parametrize("integrator", ["path", "mbtf_path"])
+def test_a_white_sphere_vanishes_in_a_furnace(integrator: str, tmp_path: Path) -> None:
+    """For a material of value 1/π everywhere; its sampling makes no difference."""
+    write_material(tmp_path, constant=(1 / np.pi,) * 3)
+    seen = furnace({"type": "mbtf", "material": str(tmp_path), "networks": "cooperative"}, integrator, 0)
+    np.testing.assert_allclose(seen.mean((0, 1)), 1.0, atol=0.005)
+    # Near the silhouette and in the middle alike.
+    np.testing.assert_allclose(seen.mean(2)[5:7, 5:7].mean(), 1.0, atol=0.03)
+
+
+@pytest.mark.parametrize("integrator", ["path", "mbtf_path"])
+def test_a_constant_material_equals_mitsubas_diffuse(integrator: str, tmp_path: Path) -> None:
+    """Several bounces between a sphere and a plane, under two kinds of light, by t-test over runs; Mitsuba's
+    BSDF in Mitsuba's path tracer."""
+    color = (0.2, 0.5, 0.8)
+    write_material(tmp_path, constant=tuple(c / np.pi for c in color))
+    ours = {"type": "mbtf", "material": str(tmp_path), "networks": "cooperative"}
+    theirs = {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(color)}}
+    means = {}
+    for name, bsdf, kind, first in (("ours", ours, integrator, 0), ("theirs", theirs, "path", 100)):
+        tracer = mi.load_dict({"type": kind, "max_depth": 5})
+        scene = mi.load_dict(
+            {
+                "type": "scene",
+                "ground": plane(bsdf, half=3.0),
+                "ball": {"type": "sphere", "center": [0, 0, 0.8], "radius": 0.8, "bsdf": bsdf},
+                "lamp": {"type": "point", "position": [2, 1, 3], "intensity": 20.0},
+                "sky": {"type": "constant", "radiance": 0.3},
+                "sensor": {
+                    "type": "perspective",
+                    "fov": 35,
+                    "to_world": mi.ScalarTransform4f().look_at([1, -5, 3], [0, 0, 0.4], [0, 0, 1]),
+                    "film": {"type": "hdrfilm", "width": 24, "height": 24, "pixel_format": "rgb"},
+                },
+            }
+        )
+        runs = [np.array(mi.render(scene, integrator=tracer, spp=16, seed=first + k)) for k in range(8)]
+        means[name] = np.array([run.mean((0, 1)) for run in runs], np.float64)
+    for channel in range(3):
+        estimates = [
+            Estimate(float(x.mean()), float(x.std(ddof=1) / np.sqrt(len(x))), len(x), len(x) - 1.0)
+            for x in (means["ours"][:, channel], means["theirs"][:, channel])
+        ]
+        assert t_test(*estimates).p_value > 1e-3, means
+        assert estimates[0].error < 0.005 * estimates[0].value

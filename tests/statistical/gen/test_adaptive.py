@@ -1,0 +1,261 @@
+"""Runs to a target error: values stay unbiased, halves independent, and the error is what was asked for."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from support.small_runs import contents
+
+from mbtf_core.lattice import Lattice
+from mbtf_core.stats import mean_estimate, noise_free_mse, z_test
+from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.dataset.reader import Dataset
+from mbtf_gen.dataset.summary import finish
+from mbtf_gen.generation import Job, generate, plan_run
+from mbtf_gen.planning.adaptive import Target, estimate_shard
+from mbtf_gen.planning.effects import EffectsPlan
+from mbtf_gen.planning.effects_plan import plan_effects
+from mbtf_gen.planning.sample_allocation import fit_allocation
+from mbtf_gen.render.estimates import Estimates, Stream
+from mbtf_gen.render.runtime import load_mitsuba
+from mbtf_gen.sampling.query_sampler import Mixture, Queries, QueryPlan
+
+load_mitsuba()
+
+N = 20_000
+RARE, BRIGHT, DIM = 0.04, 4.0, 0.05
+TRUTH = RARE * BRIGHT + (1 - RARE) * DIM
+
+
+class FewBrightPaths:
+    """Stands in for an estimator: every path brings a little light, one in twenty-five a lot."""
+
+    def paths(self, n: int, spp: int, stream: Stream) -> NDArray[np.float64]:
+        seed = [stream.root, stream.shard, stream.first_pass, spp]
+        return np.where(np.random.default_rng(seed).random((n, spp)) < RARE, BRIGHT, DIM)
+
+    def estimate(self, queries: Queries, spp: Any, stream: Stream, **options: Any) -> Estimates:
+        n = len(queries.sigma)
+        counts = np.broadcast_to(np.asarray(spp), (n,))
+        value, variance = np.zeros((2, n, 3), np.float32), np.zeros(n, np.float32)
+        for count in np.unique(counts):
+            rows = np.flatnonzero(counts == count)
+            y = self.paths(len(rows), int(count), stream)
+            value[:, rows] = np.stack([h.mean(axis=1) for h in np.split(y, 2, axis=1)])[..., None]
+            variance[rows] = y.var(axis=1, ddof=1)
+        every = None if isinstance(spp, int) else counts
+        return Estimates(
+            value[0], value[1], None, int(counts.sum()), 0, 0, 0, spp=every, path_variance=variance
+        )
+
+
+@pytest.fixture(scope="module")
+def skewed() -> tuple[Queries, EffectsPlan]:
+    q = QueryPlan(Lattice(4), Mixture(0.6, 0.4), 0.1, "shuffled", 0, N).draw("train", 0, N)
+    pilot = FewBrightPaths().estimate(q, 16, Stream(0, "pilot", 1))
+    return q, EffectsPlan((), allocation=fit_allocation(q, pilot, 16, 4))
+
+
+def test_values_of_a_skewed_scene_are_unbiased(skewed: tuple[Queries, EffectsPlan]) -> None:
+    q, plan = skewed
+    e = estimate_shard(FewBrightPaths(), q, 4, Target(0.2, 512), Stream(1, "train", 0), plan)
+    assert e.spp is not None
+    assert len(np.unique(e.spp)) > 3
+    a, b = e.value_a[:, 0].astype(np.float64), e.value_b[:, 0].astype(np.float64)
+    assert z_test(mean_estimate(0.5 * (a + b)), TRUTH).p_value > 1e-3
+    # Within every count as well, and the halves' errors do not go together.
+    for count in np.unique(e.spp):
+        some = e.spp == count
+        if some.sum() >= 1000:
+            assert z_test(mean_estimate(0.5 * (a + b)[some]), TRUTH).p_value > 1e-4
+    assert z_test(mean_estimate((a - TRUTH) * (b - TRUTH))).p_value > 1e-3
+
+
+def test_a_skewed_scene_comes_near_its_target_and_what_is_reported_is_so(
+    skewed: tuple[Queries, EffectsPlan],
+) -> None:
+    q, plan = skewed
+    e = estimate_shard(FewBrightPaths(), q, 4, Target(0.2, 8192), Stream(1, "train", 0), plan)
+    value = 0.5 * (e.value_a[:, 0].astype(np.float64) + e.value_b[:, 0])
+    error = float(np.sqrt(np.mean((value - TRUTH) ** 2))) / TRUTH
+    assert 0.2 < error < 1.2 * 0.2
+    assert e.target is not None
+    assert np.sqrt(e.target.square) == pytest.approx(error, rel=0.2)
+    # What the pilot expects of a path is its root mean square deviation.
+    assert plan.allocation is not None
+    s = plan.allocation.deviation(q)
+    assert np.sqrt(np.mean(s**2)) == pytest.approx(np.sqrt(RARE * (1 - RARE)) * (BRIGHT - DIM), rel=0.05)
+
+
+def test_what_is_reported_does_not_hide_errors_that_the_cap_leaves(
+    skewed: tuple[Queries, EffectsPlan],
+) -> None:
+    """Bright paths among few make large values: an error divided by them would never be above one or so."""
+    q, plan = skewed
+    e = estimate_shard(FewBrightPaths(), q, 4, Target(0.2, 8), Stream(1, "train", 0), plan)
+    value = 0.5 * (e.value_a[:, 0].astype(np.float64) + e.value_b[:, 0])
+    error = float(np.sqrt(np.mean((value - TRUTH) ** 2))) / TRUTH
+    assert error > 1.0
+    assert e.target is not None
+    assert np.sqrt(e.target.square) == pytest.approx(error, rel=0.15)
+
+
+def test_stopping_when_the_paths_so_far_look_good_is_biased() -> None:
+    """What the pilot is thrown away for: the same rule on the stored paths themselves."""
+    y = FewBrightPaths().paths(N, 512, Stream(1, "train", 0))
+    value, open_ = np.zeros(N), np.ones(N, bool)
+    for n in (16, 32, 64, 128, 256, 512):
+        mean, error = y[:, :n].mean(axis=1), y[:, :n].std(axis=1, ddof=1) / np.sqrt(n)
+        stop = open_ & ((error < 0.2 * np.maximum(mean, TRUTH)) | (n == 512))
+        value[stop] = mean[stop]
+        open_ &= ~stop
+    found = mean_estimate(value)
+    assert z_test(found, TRUTH).p_value < 1e-9
+    assert found.value < 0.9 * TRUTH
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory: pytest.TempPathFactory) -> GeneratorConfig:
+    folder = tmp_path_factory.mktemp("maps")
+    rng = np.random.default_rng(4)
+    np.save(folder / "height.npy", np.kron(rng.random((8, 8)), np.ones((2, 2))))
+    return GeneratorConfig.model_validate(
+        {
+            "material": str(folder / "height.npy"),
+            "geometry": {"height": 0.05},
+            "queries": {"train": "1500", "test": "8", "test_spp": 4, "target_error": "6%", "cap": 256},
+            "output": {"shard_queries": 500},
+        }
+    )
+
+
+def test_the_error_reached_is_what_was_asked_for(config: GeneratorConfig, tmp_path: Path) -> None:
+    found = generate(config, tmp_path / "out")
+    data = Dataset.open(tmp_path / "out").load("train")
+    a, b, spp = data["value_a"], data["value_b"], data["spp"]
+    assert found.target is not None
+    # Counts are rounded up and low-discrepancy points do better than the pilot's single paths say.
+    assert 0.03 < found.target["reached"] < 0.06
+    assert spp.max() <= 256
+    assert len(np.unique(spp)) > 4
+    assert found.target["missed"] <= (spp == 256).sum()
+    # Against a run of many paths: the squared error that the halves do not know of.
+    fixed = config.model_dump() | {
+        "queries": {**config.model_dump()["queries"], "target_error": None, "spp": 512}
+    }
+    generate(GeneratorConfig.model_validate(fixed), tmp_path / "many")
+    many = Dataset.open(tmp_path / "many").load("train")
+    np.testing.assert_array_equal(many["u"], data["u"])
+    mean = float(a.mean())
+    scale = np.maximum(0.5 * (many["value_a"] + many["value_b"]).mean(axis=1, keepdims=True), mean)
+    squared = noise_free_mse(0.5 * (a + b) / scale, many["value_a"] / scale, many["value_b"] / scale)
+    assert np.sqrt(squared.value) == pytest.approx(found.target["reached"], rel=0.15)
+    manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
+    assert manifest["summary"]["target"] == found.target
+    assert manifest["effects"]["allocation"]["typical"] > 0
+
+
+def of_kind(config: GeneratorConfig, kind: str) -> GeneratorConfig:
+    """Eight shards, with a target error or a mean number of paths."""
+    data = config.model_dump()
+    data["output"]["shard_queries"] = 220
+    if kind == "noise":
+        data["queries"] |= {"target_error": None, "spp": 8}
+    return GeneratorConfig.model_validate(data)
+
+
+@pytest.fixture
+def small_pilots(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every run is worth a pilot, and pilots are short."""
+    monkeypatch.setattr("mbtf_gen.generation.SMALL_RUN", 0)
+    monkeypatch.setattr("mbtf_gen.planning.sample_allocation.PILOT_QUERIES", 1024)
+    monkeypatch.setattr("mbtf_gen.generation.plan_effects", lambda job, pilots: plan_effects(job))
+
+
+@pytest.mark.parametrize("kind", ["target", "noise"])
+def test_any_slices_merged_are_the_whole(
+    kind: str, config: GeneratorConfig, small_pilots: None, tmp_path: Path
+) -> None:
+    """Seven of them, in any order: the same numbers of paths for every query, and the same values."""
+    config = of_kind(config, kind)
+    for index in (4, 2, 7, 1, 6, 3, 5):
+        generate(config, tmp_path / "parts", slice_index=index, slice_count=7)
+    assert finish(tmp_path / "parts").complete
+    generate(config, tmp_path / "whole")
+    parts, whole = (contents(tmp_path / name) for name in ("parts", "whole"))
+    assert parts == whole
+    assert whole["manifest.json"]["effects"]["allocation"] is not None
+    assert len([name for name in whole if name.endswith(".npz")]) == 8
+    assert len(np.unique(Dataset.open(tmp_path / "whole").load("train")["spp"])) > 3
+
+
+@pytest.mark.parametrize("kind", ["target", "noise"])
+def test_counts_do_not_depend_on_launches_or_threads(
+    kind: str, config: GeneratorConfig, small_pilots: None
+) -> None:
+    job = Job.prepare(of_kind(config, kind))
+    plan = plan_run(job)
+    n = 600
+    q = job.plan().draw("train", 1, n)
+    estimator = job.estimator(plan)
+    before, found = dr.thread_count(), []
+    try:
+        for launch, threads in ((1 << 20, 3), (1 << 9, 1), (777, 3)):
+            dr.set_thread_count(threads)
+            estimator.launch = launch
+            stream = Stream(job.config.seed, "train", 1)
+            found.append(estimate_shard(estimator, q, job.spp("train"), job.target("train"), stream, plan))
+    finally:
+        dr.set_thread_count(before)
+    one = found[0]
+    assert one.spp is not None
+    assert len(np.unique(one.spp)) > 3
+    for other in found[1:]:
+        assert (other.spp == one.spp).all()
+        assert (other.value_a == one.value_a).all()
+        assert (other.value_b == one.value_b).all()
+        assert other.target == one.target
+
+
+def test_a_closed_form_needs_no_paths(tmp_path: Path) -> None:
+    np.save(tmp_path / "height.npy", np.zeros((4, 4)))
+    flat = GeneratorConfig.model_validate(
+        {
+            "material": str(tmp_path / "height.npy"),
+            "queries": {"train": "50", "test": "8", "target_error": 0.01},
+        }
+    )
+    found = generate(flat, tmp_path / "out")
+    assert found.paths == 0
+    assert found.relative_error == 0.0
+    assert found.target is None
+
+
+def test_image_buffers_and_holes_keep_their_shape(tmp_path: Path) -> None:
+    rng = np.random.default_rng(4)
+    np.save(tmp_path / "height.npy", rng.random((8, 8)))
+    np.save(tmp_path / "opacity.npy", (rng.random((8, 8)) > 0.3).astype(np.float32))
+    config = GeneratorConfig.model_validate(
+        {
+            "material": str(tmp_path),
+            "geometry": {"height": 0.02},
+            "queries": {
+                "train": "256",
+                "test": "64",
+                "test_spp": 4,
+                "layout": "image",
+                "target_error": "10%",
+            },
+        }
+    )
+    generate(config, tmp_path / "out")
+    data = Dataset.open(tmp_path / "out").load("train")
+    assert data["spp"].shape == data["transmittance"].shape == data["value_a"].shape[:-1] == (4, 8, 8)
+    assert 0.1 < data["transmittance"].mean() < 0.5
+    assert data["spp"].min() >= 2

@@ -1,0 +1,184 @@
+"""The effects plan is right: what it leaves out does not matter, what it keeps does."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from support.scenes import rocks
+
+from mbtf_core.stats import Estimate, mean_of_halves
+from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.generation import Job
+from mbtf_gen.material.material import Material
+from mbtf_gen.planning.effects import OF_RELIEF, EffectsPlan
+from mbtf_gen.planning.effects_plan import plan_effects, without
+from mbtf_gen.planning.pilot import pilot_queries, relative_change
+from mbtf_gen.render.estimates import Estimates, Stream
+
+QUERIES, SPP = 16384, 8
+
+
+def pattern() -> NDArray[np.float32]:
+    rng = np.random.default_rng(4)
+    return (0.2 + 0.6 * rng.random((16, 16, 3))).astype(np.float32)
+
+
+def bumps(strength: float) -> NDArray[np.float32]:
+    """Normals of ripples along u."""
+    x = (np.arange(64) + 0.5) / 64
+    slope = np.broadcast_to(strength * np.cos(2 * np.pi * 4 * x), (64, 64))
+    n = np.stack([-slope, np.zeros_like(slope), np.ones_like(slope)], axis=-1)
+    return (n / np.linalg.norm(n, axis=-1, keepdims=True)).astype(np.float32)
+
+
+ROCKS = rocks(64, 1.0).z
+
+
+def material(relief: float, albedo: Any = 0.5, **more: Any) -> Material:
+    color = np.full(3, albedo) if np.ndim(albedo) == 0 else albedo
+    return Material(height=ROCKS, height_scale=relief, height_bits=None, base_color=color, **more)
+
+
+def job_of(
+    stuff: Material, mode: str = "auto", min_cos: float = 0.1, width: float = 1.0, depth: int = 0
+) -> Job:
+    return Job.of(
+        GeneratorConfig.model_validate(
+            {
+                "material": "m",
+                "effects": {"mode": mode},
+                "queries": {"min_cos": min_cos, "levels": 6},
+                "light": {"width": width},
+                "transport": {"max_depth": depth},
+            }
+        ),
+        stuff,
+    )
+
+
+def estimates(job: Job, plan: EffectsPlan, seed: int = 1) -> Estimates:
+    found: Estimates = job.estimator(plan).estimate(pilot_queries(job, QUERIES), SPP, Stream(seed, "test", 0))
+    return found
+
+
+def difference(x: Estimates, y: Estimates) -> Estimate:
+    """Of the mean values, query by query, channels averaged."""
+    a, b = (x.value_a - y.value_a).mean(axis=1), (x.value_b - y.value_b).mean(axis=1)
+    return mean_of_halves(a, b)
+
+
+GLOSS: dict[str, Any] = {"roughness": 0.4, "specular": 0.5, "metallic": 0.0}
+SCENES: dict[str, tuple[Material, dict[str, Any]]] = {
+    "dark relief": (material(0.15, 0.05), {}),
+    "gray relief": (material(0.15, 0.5), {}),
+    "white relief": (material(0.15, 0.95), {}),
+    "faint relief": (material(2e-5, pattern()), {"min_cos": 0.3}),
+    "gentle relief": (material(0.002, pattern()), {"min_cos": 0.6}),
+    "pattern on a plane": (material(0.0, pattern()), {}),
+    "gloss on a plane": (material(0.0, pattern(), **GLOSS), {}),
+    "normal map on a plane": (material(0.0, 0.5, normal=bumps(0.3)), {}),
+    "glossy relief": (material(0.1, 0.4, **GLOSS), {}),
+    "metal relief": (material(0.1, 0.9, **{**GLOSS, "metallic": 1.0}), {}),
+    "wide light": (material(0.1, 0.5), {"width": 10.0}),
+    "delta light": (material(0.1, 0.5), {"width": 0.0}),
+    "mirror relief": (material(0.02, 0.9, roughness=0.0, specular=0.5, metallic=1.0), {"width": 10.0}),
+    "coated relief": (material(0.1, 0.3, coat=1.0, coat_roughness=0.4), {}),
+    "velvet relief": (material(0.1, 0.3, sheen=1.0, sheen_roughness=0.3), {}),
+    "holed relief": (material(0.1, 0.5, opacity=np.where(np.median(ROCKS) > ROCKS, 0.2, 1.0)), {}),
+    # Layers so faint that they are not simulated.
+    "faint gloss": (material(0.1, 0.5, roughness=0.5, specular=2e-4, metallic=0.0), {"min_cos": 0.3}),
+    "faint coat": (material(0.1, 0.5, coat=1e-4, coat_roughness=0.3), {"min_cos": 0.3}),
+    "faint sheen": (material(0.1, 0.5, sheen=2e-4, sheen_roughness=0.5), {"min_cos": 0.3}),
+    "faint normal map": (material(0.0, pattern(), normal=bumps(2e-4)), {"min_cos": 0.3}),
+    "faint holes": (material(0.1, 0.5, opacity=np.full((4, 4), 0.9995)), {"min_cos": 0.3}),
+}
+
+
+@cache
+def planned(scene: str) -> tuple[Job, EffectsPlan]:
+    stuff, options = SCENES[scene]
+    job = job_of(stuff, **options)
+    return job, plan_effects(job)
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_what_is_left_out_does_not_matter(scene: str) -> None:
+    """Against everything on: mean values by a z-test with the planned cost as tolerance."""
+    job, plan = planned(scene)
+    stuff, options = SCENES[scene]
+    everything = job_of(stuff, "all", **options)
+    full = estimates(everything, plan_effects(everything))
+    cut = estimates(job, plan, seed=2)
+    assert plan.cost <= plan.tolerance
+    found = difference(full, cut)
+    mean = float(full.value_a.mean())
+    assert abs(found.value) < 4 * found.error + plan.cost * mean
+    assert found.error < 0.02 * mean
+
+
+CASES = [
+    ("masking", "gray relief", "pattern on a plane"),
+    ("masking", "gray relief", "faint relief"),
+    ("shadowing", "gray relief", "gentle relief"),
+    ("interreflection", "white relief", "gentle relief"),
+    ("specular", "glossy relief", "gray relief"),
+    ("metallic", "metal relief", "glossy relief"),
+    ("normal", "normal map on a plane", "gray relief"),
+    ("normal", "normal map on a plane", "faint normal map"),
+    ("mis", "mirror relief", "glossy relief"),
+    ("specular", "glossy relief", "faint gloss"),
+    ("coat", "coated relief", "faint coat"),
+    ("sheen", "velvet relief", "faint sheen"),
+    ("opacity", "holed relief", "faint holes"),
+]
+
+
+@pytest.mark.parametrize(("name", "needed", "idle"), CASES)
+def test_an_effect_is_on_where_it_matters_and_off_where_not(name: str, needed: str, idle: str) -> None:
+    job, plan = planned(needed)
+    assert plan.on(name)
+    assert not planned(idle)[1].on(name)
+    full, cut = estimates(job, plan), estimates(job, without(plan, name))
+    cost, cautious = relative_change(full, cut)
+    assert cost > 2 * plan.tolerance
+    assert cautious - cost < 0.5 * cost
+
+
+def test_a_faint_relief_becomes_its_slopes() -> None:
+    """Without displacement the relief still shades the plane."""
+    plan = planned("faint relief")[1]
+    assert not any(plan.on(name) for name in OF_RELIEF)
+    assert 0 < plan["masking"].cost <= plan.tolerance
+    bare = replace(SCENES["faint relief"][0], height_scale=0.0)
+    plane = job_of(bare, min_cos=0.3)
+    strong = job_of(replace(bare, height_scale=0.02), "-masking", min_cos=0.3)
+    shaded = estimates(strong, plan_effects(strong))
+    assert relative_change(shaded, estimates(plane, plan_effects(plane)))[0] > 0.02
+
+
+def test_a_cap_on_interactions_costs_no_more_than_it_says() -> None:
+    job, plan = planned("dark relief")
+    assert plan.on("interreflection")
+    assert 2 <= plan.max_depth <= 4
+    unlimited = estimates(job, replace(plan, max_depth=0))
+    assert relative_change(unlimited, estimates(job, plan))[0] < plan.tolerance
+
+
+def test_light_is_sampled_both_ways_only_where_it_helps() -> None:
+    """Leaving BSDF sampling out changes no mean, and no variance worth speaking of where the plan does so."""
+    job, plan = planned("glossy relief")
+    assert not plan.on("mis")
+    both = replace(plan, effects=tuple(replace(e, on=True) if e.name == "mis" else e for e in plan.effects))
+    one, two = estimates(job, plan), estimates(job, both, seed=2)
+    found = difference(one, two)
+    assert abs(found.value) < 4 * found.error
+    # Medians: a few queries that see highlights of highlights hold most of the variance, either way.
+    scatter = [float(np.median(np.abs(e.value_a - e.value_b))) for e in (one, two)]
+    assert scatter[0] < 1.1 * scatter[1]
+    mirror = replace(SCENES["glossy relief"][0], roughness=0.05)
+    assert plan_effects(job_of(mirror)).on("mis")

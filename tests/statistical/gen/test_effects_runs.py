@@ -1,0 +1,183 @@
+"""What a plan decides reaches the traced paths and the shards: aprons, launches, colors, transmittance,
+resumed plans."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mbtf_core.atomic import write_checksummed
+from mbtf_gen import generation
+from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.dataset.reader import Dataset
+from mbtf_gen.generation import Job, generate
+from mbtf_gen.material.material import Material
+from mbtf_gen.planning.effects import EffectsPlan
+from mbtf_gen.planning.effects_plan import plan_effects, without
+from mbtf_gen.planning.pilot import pilot_queries
+from mbtf_gen.render.estimates import Estimates, Stream
+from mbtf_gen.render.runtime import load_mitsuba
+from mbtf_gen.sampling.query_sampler import Queries
+
+load_mitsuba()
+
+from mbtf_gen.render.estimator import Estimator  # noqa: E402
+
+STREAM = Stream(1, "test", 0)
+
+
+def noise(rows: int, columns: int) -> NDArray[np.float64]:
+    h = np.random.default_rng(6).random((rows, columns))
+    return (h - h.min()) / np.ptp(h)
+
+
+def lambert(height: NDArray[np.float64], scale: float, color: Any = (0.5, 0.5, 0.5), **more: Any) -> Material:
+    base = np.asarray(color, np.float64)
+    return Material(height=height, height_scale=scale, height_bits=None, base_color=base, **more)
+
+
+def job_of(stuff: Material, mode: str = "auto", **options: Any) -> Job:
+    data = {"material": "m", "effects": {"mode": mode}, **options}
+    return Job.of(GeneratorConfig.model_validate(data), stuff)
+
+
+OPACITY = np.where(np.random.default_rng(2).random((8, 8)) < 0.4, 0.2, 1.0)
+
+
+@pytest.mark.parametrize(
+    "mode", ["all", "all,-interreflection,-mis", "none,+opacity", "all,-opacity,-shadowing"]
+)
+def test_values_do_not_depend_on_launches_whatever_is_simulated(mode: str) -> None:
+    job = job_of(lambert(noise(16, 16), 0.05, opacity=OPACITY), mode)
+    estimator = job.estimator(plan_effects(job))
+    q = pilot_queries(job, 500)
+    whole = estimator.estimate(q, 8, STREAM)
+    small = Estimator(estimator.tile, estimator.light, estimator.transport, launch=8 * 77)
+    for queries in (q, Queries(q.u[:100], q.sigma[:100], q.omega_i[:100], q.omega_o[:100])):
+        part = small.estimate(queries, 8, STREAM)
+        n = len(queries.sigma)
+        np.testing.assert_array_equal(part.value_a, whole.value_a[:n])
+        np.testing.assert_array_equal(part.value_b, whole.value_b[:n])
+        assert (part.transmittance is None) == ("-opacity" in mode)
+        if part.transmittance is not None and whole.transmittance is not None:
+            np.testing.assert_array_equal(part.transmittance, whole.transmittance[:n])
+            assert len(np.unique(part.transmittance)) > 2
+
+
+def test_the_closed_form_is_the_color_over_pi() -> None:
+    color = np.array([0.8, 0.3, 0.1])
+    job = job_of(lambert(np.zeros((4, 4)), 1.0, color), light={"width": 0.0})
+    plan = plan_effects(job)
+    assert plan.closed_form
+    q = pilot_queries(job, 50)
+    found = job.estimator(plan).estimate(q, 4, STREAM)
+    for half in (found.value_a, found.value_b):
+        np.testing.assert_allclose(half, np.tile(color / np.pi, (len(q.sigma), 1)), rtol=1e-6)
+    # The same as traced.
+    traced = job.estimator(replace(plan, closed_form=False)).estimate(q, 4, STREAM)
+    np.testing.assert_allclose(traced.value_a, found.value_a, rtol=1e-5)
+
+
+def test_a_manifest_keeps_every_number_of_a_plan() -> None:
+    plan = plan_effects(job_of(lambert(noise(4, 4), 0.01), "none"))
+    changed = replace(
+        plan, max_depth=3, cap_cost=0.25, roulette_depth=7, mode="x", tolerance=0.5, closed_form=True
+    )
+    assert EffectsPlan.from_manifest(json.loads(json.dumps(changed.to_manifest()))) == changed
+
+
+class Recorder:
+    """Stands in for the estimator and remembers which plans it was built for."""
+
+    def __init__(self) -> None:
+        self.plans: list[EffectsPlan] = []
+
+    def build(self, job: Job, plan: EffectsPlan, tiles: Any) -> Recorder:
+        self.plans.append(plan)
+        return self
+
+    def estimate(self, queries: Queries, spp: int, stream: Stream) -> Estimates:
+        value = np.zeros((len(queries.sigma), 3), np.float32)
+        through = queries.u[:, 0].astype(np.float32)
+        return Estimates(value, value, through, len(value) * spp, 0, 0, 0)
+
+
+@pytest.fixture
+def recorder(monkeypatch: pytest.MonkeyPatch) -> Recorder:
+    found = Recorder()
+    monkeypatch.setattr(generation, "estimator_of", found.build)
+    return found
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> GeneratorConfig:
+    np.save(tmp_path / "height.npy", noise(4, 8))
+    return GeneratorConfig.model_validate(
+        {
+            "material": str(tmp_path / "height.npy"),
+            "queries": {"train": "100", "test": "30", "spp": 2, "test_spp": 4},
+            "output": {"shard_queries": 40},
+            "effects": {"mode": "all"},
+        }
+    )
+
+
+def test_resumed_and_sliced_runs_follow_the_plan_of_the_manifest(
+    config: GeneratorConfig, recorder: Recorder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another machine may decide otherwise; the plan of the manifest holds, nothing is planned anew."""
+    out = tmp_path / "out"
+    generate(config, out, slice_index=1, slice_count=2)
+    first = recorder.plans[-1]
+    manifest = json.loads((out / "manifest.json").read_text())
+    stored = replace(first, max_depth=7, roulette_depth=5)
+    manifest["effects"] = stored.to_manifest()
+    write_checksummed(out / "manifest.json", manifest)
+
+    def never(job: Job) -> EffectsPlan:
+        raise AssertionError("planned again although the manifest has a plan")
+
+    monkeypatch.setattr(generation, "plan_effects", never)
+    generate(config, out, slice_index=2, slice_count=2)
+    assert recorder.plans[-1] == stored
+    assert json.loads((out / "manifest.json").read_text())["effects"] == stored.to_manifest()
+
+
+def test_shards_hold_what_passed_through_the_holes(
+    config: GeneratorConfig, recorder: Recorder, tmp_path: Path
+) -> None:
+    generate(config, tmp_path / "out")
+    data = Dataset.open(tmp_path / "out").load("train")
+    np.testing.assert_array_equal(data["transmittance"], data["u"][:, 0])
+
+
+def test_what_passed_is_the_view_rays_alone() -> None:
+    """Scattered rays that leave through holes are no transmittance: it is what it is without them."""
+    job = job_of(lambert(noise(16, 16), 0.15, (0.9, 0.9, 0.9), opacity=OPACITY), "all,-mis")
+    plan = plan_effects(job)
+    q = pilot_queries(job, 2000)
+    full, direct = (
+        job.estimator(p).estimate(q, 16, STREAM).transmittance
+        for p in (plan, without(plan, "interreflection"))
+    )
+    np.testing.assert_array_equal(full, direct)
+
+
+@pytest.mark.parametrize("depth", [2, 3])
+def test_a_cap_is_the_same_with_and_without_sampling_of_the_surface(depth: int) -> None:
+    """Under a delta light sampling the surface finds nothing, so the cap alone decides."""
+    stuff = lambert(noise(16, 16), 0.3, (0.9, 0.9, 0.9))
+    options: dict[str, Any] = {"light": {"width": 0.0}, "queries": {"min_cos": 0.4}}
+    means = []
+    for mode, limit in (("all", depth), ("all,-mis", depth), ("all,-mis", depth - 1)):
+        job = job_of(stuff, mode, transport={"max_depth": limit, "roulette_depth": 100}, **options)
+        found = job.estimator(plan_effects(job)).estimate(pilot_queries(job, 8192), 16, STREAM)
+        means.append(float(found.value_a.mean() + found.value_b.mean()))
+    assert means[1] == pytest.approx(means[0], rel=0.01)
+    assert means[2] < 0.95 * means[0]

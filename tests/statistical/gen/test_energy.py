@@ -1,0 +1,143 @@
+"""Energy and reciprocity of displaced tiles, interreflection included."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from support.scenes import (
+    DIRECT,
+    Transport,
+    direction,
+    estimate,
+    lambert,
+    mi,
+    real_heights,
+    rocks,
+    tile_mean_queries,
+)
+
+from mbtf_core.stats import Estimate, mean_of_halves, z_test
+from mbtf_gen.geometry.heightfield import HeightGrid
+from mbtf_gen.sampling.light_kernel import LightKernel
+
+ROUGH = {"type": "roughconductor", "alpha": 0.4, "distribution": "ggx", "material": "none"}
+PAIRS = [((40, 0), (70, 120)), ((15, 30), (60, 250)), ((25, 200), (12, 90))]
+
+
+@pytest.mark.parametrize("view", [(90, 0), (30, 40), (3, 100)])
+def test_closed_white_furnace_returns_one(view: tuple[float, float]) -> None:
+    omega_o = direction(*view)
+    e = estimate(rocks(), lambert(1.0), None, tile_mean_queries([0, 0, 1], omega_o, 8000), 16)
+    mean = mean_of_halves(e.value_a[:, 0], e.value_b[:, 0])
+    # Nothing is absorbed, so roulette leaves almost every path alone and the answer is nearly exact; what a
+    # ray offset swallows in creases must stay below 1e-4.
+    assert mean.error < 1e-4
+    assert abs(mean.value - 1.0) < 1e-4 + 4 * mean.error
+    assert e.lost <= 2
+    assert e.capped == 0
+
+
+@pytest.mark.parametrize("light", [LightKernel(2.0), None], ids=["lobe", "furnace"])
+def test_roulette_changes_nothing_but_the_noise(light: LightKernel | None) -> None:
+    q = tile_mean_queries(direction(40, 60), direction(55, 200), 20_000)
+    with_it, without = (
+        estimate(rocks(), lambert(0.7), light, q, 16, transport=Transport(roulette_depth=r), seed=r)
+        for r in (1, 1000)
+    )
+    first, second = (mean_of_halves(e.value_a[:, 0], e.value_b[:, 0]) for e in (with_it, without))
+    assert first.relative_error < 5e-3
+    assert first.error > second.error
+    assert z_test(first, second).p_value > 1e-3
+
+
+@pytest.mark.parametrize("albedo", [0.02, 0.7])
+@pytest.mark.parametrize("width", [1.0, 20.0])
+def test_roulette_leaves_direct_light_alone(albedo: float, width: float) -> None:
+    """Light that surface sampling finds must not hang on the few paths that roulette spares."""
+    q = tile_mean_queries(direction(40, 60), direction(55, 200), 8_000)
+    early, late = (
+        estimate(rocks(), lambert(albedo), LightKernel(width), q, 8, transport=Transport(roulette_depth=r))
+        for r in (1, 1000)
+    )
+    noise = [float(np.mean((e.value_a.astype(np.float64) - e.value_b) ** 2)) for e in (early, late)]
+    assert noise[0] < 2.0 * noise[1]
+
+
+def tile_mean(
+    grid: HeightGrid, bsdf: Any, omega_i: NDArray[np.float64], omega_o: NDArray[np.float64], seed: int
+) -> Estimate:
+    """Tile mean over independent positions: its error holds the positions' scatter and the paths' noise."""
+    q = tile_mean_queries(omega_i, omega_o, 30_000, seed)
+    e = estimate(grid, bsdf, LightKernel(0.0), q, 16, seed=seed)
+    v = 0.5 * (e.value_a + e.value_b)[:, 0].astype(np.float64)
+    return Estimate(float(v.mean()), float(v.std(ddof=1) / np.sqrt(len(v))), len(v))
+
+
+@pytest.mark.parametrize("heights", ["turtle_shell", "rock_cliff"])
+@pytest.mark.parametrize("bsdf", [lambert(0.9), ROUGH], ids=["lambert", "roughconductor"])
+@pytest.mark.parametrize(("light", "view"), PAIRS)
+def test_tile_mean_is_reciprocal(
+    heights: str, bsdf: dict[str, Any], light: tuple[float, float], view: tuple[float, float]
+) -> None:
+    grid = real_heights(heights)
+    one, other = direction(*light), direction(*view)
+    forward, backward = tile_mean(grid, bsdf, one, other, 1), tile_mean(grid, bsdf, other, one, 2)
+    assert max(forward.relative_error, backward.relative_error) < 0.01
+    assert z_test(forward, backward).p_value > 1e-3
+
+
+class NoCosine(mi.BSDF):  # type: ignore[misc]
+    """A Lambert reflector whose author forgot the light's cosine: the fault that reciprocity must catch."""
+
+    def __init__(self, props: Any) -> None:
+        mi.BSDF.__init__(self, props)
+        self.inner = mi.load_dict(lambert(0.9))
+        self.m_flags = self.inner.flags()
+        self.m_components = [self.inner.flags()]
+
+    def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+        return self.inner.eval(ctx, si, wo, active) / dr.maximum(wo.z, 1e-3)
+
+    def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+        return self.inner.pdf(ctx, si, wo, active)
+
+    def sample(self, ctx: Any, si: Any, s1: Any, s2: Any, active: Any = True) -> Any:
+        return self.inner.sample(ctx, si, s1, s2, active)
+
+
+def test_reciprocity_fails_without_a_cosine() -> None:
+    one, other = direction(*PAIRS[1][0]), direction(*PAIRS[1][1])
+    forward, backward = (
+        tile_mean(rocks(), lambert(0.9), one, other, 1),
+        tile_mean(rocks(), lambert(0.9), other, one, 2),
+    )
+    # Values divided by the light's cosine, as some published data are: no longer reciprocal.
+    assert z_test(forward.scaled(1 / one[2]), backward.scaled(1 / other[2])).p_value < 1e-6
+    # The cosine dropped inside the BSDF.
+    faulty = NoCosine(mi.Properties())
+    forward, backward = tile_mean(rocks(), faulty, one, other, 1), tile_mean(rocks(), faulty, other, one, 2)
+    assert z_test(forward, backward).p_value < 1e-6
+
+
+@pytest.mark.parametrize("light", [(80, 0), (20, 130)])
+def test_tile_mean_returns_at_most_what_arrives(light: tuple[float, float]) -> None:
+    """∫ M cos θ_o dω_o of the tile mean is the tile's albedo: positive, and below that of its facets."""
+    omega_i = direction(*light)
+    n = 40_000
+    rng = np.random.default_rng(9)
+    r, phi = np.sqrt(rng.random(n) * (1 - 1e-6)), 2 * np.pi * rng.random(n)
+    omega_o = np.stack([r * np.cos(phi), r * np.sin(phi), np.sqrt(1 - r * r)], axis=-1)
+    q = tile_mean_queries(omega_i, omega_o, n)
+    values = {}
+    for name, transport in (("all", None), ("direct", DIRECT)):
+        e = estimate(rocks(), lambert(1.0), LightKernel(0.0), q, 16, transport=transport)
+        # Uniform on the projected disk: the cosine-weighted integral is π times the mean.
+        v = np.pi * 0.5 * (e.value_a + e.value_b)[:, 0].astype(np.float64)
+        values[name] = Estimate(float(v.mean()), float(v.std(ddof=1) / np.sqrt(n)), n)
+    # Albedo 1 loses nothing: all of the light comes back, none of it more than once.
+    assert z_test(values["all"], 1.0).p_value > 1e-3
+    assert values["direct"].value < 1.0 - 5 * values["direct"].error

@@ -1,0 +1,132 @@
+"""The estimator gives every path random numbers of its own, and values that depend on nothing else."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import pytest
+from support.scenes import (
+    Estimator,
+    HeightGrid,
+    LightKernel,
+    Stream,
+    Transport,
+    build_tile,
+    direction,
+    flat,
+    lambert,
+    mi,
+    queries,
+    rocks,
+)
+
+from mbtf_gen.render.estimates import MOST_LOCATED
+
+
+def estimator(launch: int = 1 << 20, **options: Any) -> Estimator:
+    return Estimator(build_tile(rocks(32), lambert(0.8)), LightKernel(5.0), Transport(**options), launch)
+
+
+def same_query(n: int) -> Any:
+    return queries([0.3, 0.7], 0.1, direction(40, 60), direction(55, 200), n)
+
+
+def test_equal_queries_get_paths_of_their_own() -> None:
+    n = 20_000
+    e = estimator().estimate(same_query(n), 2, Stream(0, "train", 0))
+    a, b = e.value_a[:, 0].astype(np.float64), e.value_b[:, 0].astype(np.float64)
+    bound = 4 / np.sqrt(n)
+    assert abs(np.corrcoef(a, b)[0, 1]) < bound
+    for x in (a, b):
+        assert abs(np.corrcoef(x[1:], x[:-1])[0, 1]) < bound
+
+
+def test_values_differ_between_streams_and_are_uncorrelated() -> None:
+    n = 4000
+    streams = [Stream(0, "train", 0), Stream(0, "train", 1), Stream(0, "test", 0), Stream(1, "train", 0)]
+    e = estimator()
+    values = [e.estimate(same_query(n), 8, s) for s in streams]
+    means = [0.5 * (v.value_a + v.value_b)[:, 0].astype(np.float64) for v in values]
+    for x, y in combinations(means, 2):
+        assert abs(np.corrcoef(x, y)[0, 1]) < 4.5 / np.sqrt(n)
+
+
+def test_launches_of_any_size_share_their_kernels() -> None:
+    """Compiling takes seconds, a launch tenths of one: nothing of a launch may be part of its kernels."""
+    surface = {"type": "mbtf_surface", "roughness": 0.3, "specular": 0.5, "metallic": 0.4, "coat": 0.3}
+    e = Estimator(build_tile(rocks(32), surface), LightKernel(5.0), Transport())
+    e.estimate(same_query(300), 8, Stream(0, "train", 0))
+    # Another number of queries, of another relief, with other limits on the paths.
+    # (Reliefs whose sides are no powers of two have kernels of their own.)
+    other = Estimator(build_tile(rocks(64, 0.1), surface), LightKernel(2.0), Transport(7, 2))
+    before = dr.flag(dr.JitFlag.KernelHistory)
+    dr.set_flag(dr.JitFlag.KernelHistory, True)
+    try:
+        dr.kernel_history()
+        other.estimate(same_query(411), 8, Stream(3, "test", 5))
+        kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+    finally:
+        dr.set_flag(dr.JitFlag.KernelHistory, before)
+    # Small ones prepare and collect; the two large ones trace.
+    large = [k for k in kernels if k["operation_count"] > 1000]
+    assert len(large) == 2
+    assert all(k["cache_hit"] for k in large)
+
+
+def test_values_do_not_depend_on_the_size_of_launches() -> None:
+    q = same_query(1000)
+    whole, pieces = (estimator(launch).estimate(q, 8, Stream(0, "train", 0)) for launch in (1 << 20, 1 << 11))
+    assert np.array_equal(whole.value_a, pieces.value_a)
+    assert np.array_equal(whole.value_b, pieces.value_b)
+
+
+class Faulty(mi.BSDF):  # type: ignore[misc]
+    """A Lambert reflector of albedo 1/2 with NaN or infinite values on a twentieth of the tile, in
+    `stripes`."""
+
+    def __init__(self, props: Any, bad: float, stripes: float = 1000.0) -> None:
+        mi.BSDF.__init__(self, props)
+        self.bad, self.stripes = bad, stripes
+        self.inner = mi.load_dict(lambert(0.5))
+        self.m_flags = self.inner.flags()
+        self.m_components = [self.inner.flags()]
+
+    def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+        x = self.stripes * si.uv.x
+        return dr.select(x - dr.floor(x) < 0.05, mi.Color3f(self.bad), self.inner.eval(ctx, si, wo, active))
+
+    def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+        return self.inner.pdf(ctx, si, wo, active)
+
+    def sample(self, ctx: Any, si: Any, s1: Any, s2: Any, active: Any = True) -> Any:
+        return self.inner.sample(ctx, si, s1, s2, active)
+
+
+@pytest.mark.parametrize("bad", [np.inf, np.nan])
+def test_nonfinite_samples_are_drawn_again_and_counted(bad: float) -> None:
+    n, spp = 500, 8
+    tile = build_tile(flat(), Faulty(mi.Properties(), bad))
+    e = Estimator(tile, LightKernel(0.0), Transport(max_depth=1))
+    values = e.estimate(same_query(n), spp, Stream(0, "train", 0))
+    # One in twenty, and of those one in twenty again; none is left in the values.
+    assert values.nonfinite == pytest.approx(n * spp / 19, rel=0.3)
+    np.testing.assert_allclose([values.value_a, values.value_b], 0.5 / np.pi, rtol=1e-5)
+
+
+def test_nonfinite_samples_are_located() -> None:
+    """A groove whose facet towards u = 0 has a bad stripe: queries on it fail at once, those on the other
+    facet by what the stripe reflects to them."""
+    groove = HeightGrid(np.tile([0.0, -0.4], (2, 1)), 1.0)
+    e = Estimator(build_tile(groove, Faulty(mi.Properties(), np.nan, 1.0)), LightKernel(0.0), Transport())
+    n = 500
+    u = np.array([[0.5, 0.5]] * n + [[0.08, 0.5]] * n)
+    for effect, first in (("interreflection", 0), ("direct light", n)):
+        q = queries(np.roll(u, -first, axis=0), 0.02, direction(80, 90), direction(90, 0), 2 * n)
+        values = e.estimate(q, 8, Stream(0, "train", 0))
+        assert values.nonfinite > MOST_LOCATED == len(values.bad_samples)
+        # Some paths come back to the stripe from the other facet.
+        assert sum(bad.effect == effect for bad in values.bad_samples) > MOST_LOCATED // 2
+        assert all(0 <= bad.query < n for bad in values.bad_samples)

@@ -1,0 +1,118 @@
+"""The Gaussian footprint: isotropic in tile widths on tiles of any aspect, and apart from the paths."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from support.scenes import (
+    Estimator,
+    LightKernel,
+    Stream,
+    Transport,
+    build_tile,
+    direction,
+    flat,
+    mi,
+    queries,
+)
+
+from mbtf_core.stats import mean_of_halves, z_test
+from mbtf_gen.pictures.camera import Camera
+from mbtf_gen.pictures.reference import _camera_rays
+from mbtf_gen.render.scene import CLEARANCE, LONG_SIDE
+
+# Cells of a lattice of random numbers in [0, 1)²: moments come out to a few thousandths.
+CELLS = 512
+ASPECTS = [1.0, 0.5, 3.0]
+
+
+def lattice() -> Any:
+    """Random numbers (CELLS²) at the centers of a lattice."""
+    y, x = np.divmod(np.arange(CELLS * CELLS), CELLS)
+    return mi.Point2f((np.stack([x, y]).astype(np.float32) + 0.5) / CELLS)
+
+
+def covariance(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(np.cov(points.T), np.float64)
+
+
+@pytest.mark.parametrize("aspect", ASPECTS)
+@pytest.mark.parametrize("sigma", [0.003, 0.5])
+def test_query_footprint_is_isotropic_in_tile_widths(aspect: float, sigma: float) -> None:
+    sensor = mi.load_dict({"type": "mbtf_queries", "unit": 10.0, "aspect": aspect})
+    u = np.array([0.3, 0.8])
+    sensor.set_queries(queries(u, sigma, [0, 0, 1], [0, 0, 1], 1))
+    point = sensor.footprint(dr.zeros(mi.UInt32, CELLS * CELLS), lattice())
+    offset = (np.array(point, np.float64).T - u) * (1.0, aspect) / sigma
+    np.testing.assert_allclose(offset.mean(axis=0), 0.0, atol=5e-3)
+    np.testing.assert_allclose(covariance(offset), np.eye(2), atol=1e-2)
+    # Gaussian, not another kernel of the same width: share within one and two σ.
+    radius = np.linalg.norm(offset, axis=-1)
+    for r in (1.0, 2.0):
+        assert np.mean(radius < r) == pytest.approx(1 - np.exp(-r * r / 2), abs=5e-3)
+
+
+@pytest.mark.parametrize("aspect", ASPECTS)
+def test_query_rays_pass_the_reference_plane_at_their_point(aspect: float) -> None:
+    unit = LONG_SIDE / max(1.0, aspect)
+    sensor = mi.load_dict({"type": "mbtf_queries", "unit": unit, "aspect": aspect, "start": CLEARANCE})
+    omega_o = np.array([direction(80, 10), direction(20, 100), direction(3, 250)])
+    sensor.set_queries(queries(0.0, 0.0, [0, 0, 1], omega_o, 3))
+    u = np.array([[0.1, 0.9], [2.7, -1.4], [0.5, 0.01]])
+    ray = sensor.ray(dr.arange(mi.UInt32, 3), mi.Point2f(u.T.astype(np.float32).copy()))
+    o, d = np.array(ray.o, np.float64).T, np.array(ray.d, np.float64).T
+    np.testing.assert_allclose(d, -omega_o, atol=1e-6)
+    plane = o[:, :2] - d[:, :2] * o[:, 2:] / d[:, 2:]
+    # The tile is centerd on the origin.
+    expected = (u % 1.0 - 0.5) * (unit, unit * aspect)
+    np.testing.assert_allclose(plane, expected, atol=1e-4)
+
+
+@pytest.mark.parametrize("aspect", ASPECTS)
+def test_camera_rays_fill_the_pixel_that_its_query_states(aspect: float) -> None:
+    camera = Camera(elevation=35, azimuth=20, span=0.4, rows=9, columns=11, field_of_view=2.0)
+    q = camera.queries(np.array([0, 0, 1.0]), aspect)
+    tile = build_tile(flat(aspect), {"type": "diffuse"})
+    source = _camera_rays(camera, Estimator(tile, LightKernel(0.0), Transport()))
+    source.set_queries(q.flat(), 40)
+    pixel = 50
+    # The tenth query of a batch that begins with number 40.
+    point = source.footprint(dr.full(mi.UInt32, pixel - 40, CELLS * CELLS), lattice())
+    u = np.array(point, np.float64).T
+    middle = u.mean(axis=0) - q.u.reshape(-1, 2)[pixel]
+    np.testing.assert_allclose(middle, np.round(middle), atol=2e-4)
+    # σ of the query is the geometric mean of the two radii.
+    spread = covariance(u * (1.0, aspect))
+    assert np.linalg.det(spread) ** 0.25 == pytest.approx(q.sigma.ravel()[pixel], rel=2e-2)
+    ray = source.ray(None, point)
+    o, d = np.array(ray.o, np.float64).T, np.array(ray.d, np.float64).T
+    np.testing.assert_allclose(d.mean(axis=0), -q.omega_o.reshape(-1, 3)[pixel], atol=2e-3)
+    back = camera.position - np.column_stack([u * (1.0, aspect), np.zeros(len(u))])
+    np.testing.assert_allclose(-d, back / np.linalg.norm(back, axis=1)[:, None], atol=1e-5)
+    plane = o[:, :2] - d[:, :2] * o[:, 2:] / d[:, 2:]
+    expected = (u % 1.0 - 0.5) * (tile.unit, tile.unit * aspect)
+    np.testing.assert_allclose(plane, expected, atol=1e-3)
+
+
+@pytest.mark.parametrize("azimuth", [0, 90, 200])
+def test_positions_in_the_footprint_do_not_follow_light_directions(azimuth: float) -> None:
+    """Under a wide light every direction brings its own irradiance; were it drawn along with the position, a
+    ramp of color would not average to its middle."""
+    ramp = np.linspace(0.0, 1.0, 64, dtype=np.float32)
+    pixels = np.zeros((64, 64, 3), np.float32)
+    pixels[..., 0], pixels[..., 1] = ramp[None, :], ramp[::-1, None]
+    bsdf = {
+        "type": "diffuse",
+        "reflectance": {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True},
+    }
+    estimator = Estimator(build_tile(flat(), bsdf), LightKernel(30.0), Transport())
+    q = queries([0.5, 0.5], 0.1, direction(40, azimuth), direction(60, 10), 4000)
+    e = estimator.estimate(q, 32, Stream(2, "test", 0))
+    for channel in (0, 1):
+        mean = mean_of_halves(e.value_a[:, channel], e.value_b[:, channel])
+        assert mean.relative_error < 5e-3
+        assert z_test(mean, 0.5 / np.pi).p_value > 1e-3

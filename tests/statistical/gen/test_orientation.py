@@ -1,0 +1,166 @@
+"""u and v are neither flipped nor swapped between heights, maps, queries and pictures, nor off by half a
+texel."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from support.scenes import (
+    DIRECT,
+    HeightGrid,
+    LightKernel,
+    Transport,
+    build_tile,
+    direction,
+    estimate,
+    flat,
+    lambert,
+    mi,
+    queries,
+)
+
+from mbtf_core.lattice import Lattice, texel_centers
+from mbtf_gen.geometry.heightfield import tile_mesh
+from mbtf_gen.pictures.camera import Camera
+from mbtf_gen.render.heightfield_tracer import closest_hit
+from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
+
+ROWS, COLUMNS = 4, 8
+ASPECT = ROWS / COLUMNS
+UP = [0.0, 0.0, 1.0]
+
+
+def color_map() -> NDArray[np.float32]:
+    return np.random.default_rng(2).uniform(0.1, 0.9, (ROWS, COLUMNS, 3)).astype(np.float32)
+
+
+def textured(pixels: NDArray[np.float32]) -> dict[str, Any]:
+    from mbtf_gen.material.material import Material
+    from mbtf_gen.render.bsdf.plugin import bsdf_of
+
+    return bsdf_of(
+        Material(height=np.zeros(pixels.shape[:2]), height_scale=1.0, height_bits=None, base_color=pixels)
+    )
+
+
+def test_color_at_texel_centers_is_the_texel() -> None:
+    pixels = color_map()
+    u = texel_centers(ROWS, COLUMNS).reshape(-1, 2)
+    q = queries(u, 1e-6, UP, UP, len(u))
+    e = estimate(flat(ASPECT), textured(pixels), LightKernel(0.0), q, 2)
+    np.testing.assert_allclose(e.value_a * np.pi, pixels.reshape(-1, 3), atol=2e-4)
+
+
+def test_color_between_texels_wraps_around() -> None:
+    pixels = color_map()
+    # On the tile's corner four texels meet: those of the map's four corners.
+    e = estimate(flat(ASPECT), textured(pixels), LightKernel(0.0), queries([0.0, 0.0], 1e-6, UP, UP, 1), 2)
+    corner = pixels[[0, 0, -1, -1], [0, -1, 0, -1]].mean(axis=0)
+    np.testing.assert_allclose(e.value_a[0] * np.pi, corner, atol=2e-4)
+
+
+def test_vertices_sit_on_texel_centers() -> None:
+    heights = np.random.default_rng(4).random((ROWS, COLUMNS))
+    grid = HeightGrid.from_map(heights, 0.3)
+    assert grid.z.max() == 0
+    assert grid.displacement_range == pytest.approx(0.3 * np.ptp(heights))
+    tile = build_tile(grid, lambert(0.5))
+    u = texel_centers(ROWS, COLUMNS).reshape(-1, 2)
+    origin = np.column_stack(
+        [(u[:, 0] - 0.5) * tile.unit, (u[:, 1] - 0.5) * ASPECT * tile.unit, np.full(len(u), 1.0)]
+    )
+    ray = mi.Ray3f(mi.Point3f(origin.T.astype(np.float32).copy()), mi.Vector3f(0, 0, -1))
+    si, *_ = closest_hit(tile.world.field, ray, mi.Bool(True), 16)
+    np.testing.assert_allclose(np.array(si.p.z) / tile.unit, grid.z.ravel(), atol=1e-5)
+    # Mitsuba's texture coordinates of the hits: (u, 1-v).
+    np.testing.assert_allclose(np.array(si.uv).T % 1.0, u * [1, -1] + [0, 1], atol=1e-5)
+    # The exported mesh says the same.
+    mesh = tile_mesh(grid)
+    found = {(round(float(x), 6), round(float(y), 6)): z for x, y, z in mesh.vertices}
+    for (s, t), z in zip(u, grid.z.ravel(), strict=True):
+        assert found[(round(s, 6), round(t * ASPECT, 6))] == pytest.approx(z)
+
+
+@pytest.mark.parametrize(("azimuth", "axis", "sign"), [(0, 0, -1), (180, 0, 1), (90, 1, -1), (270, 1, 1)])
+def test_sunk_texture_is_seen_displaced(azimuth: float, axis: int, sign: int) -> None:
+    """A plane sunk by d under a single high texel: seen from ω_o the texture is looked up at u -
+    d·ω_xy/ω_z."""
+    rows = columns = 32
+    depth = 0.25
+    heights = np.full((rows, columns), -depth)
+    # One peak keeps the reference plane up; queries stay far from it and from its shadow.
+    heights[0, 0] = 0.0
+    ramp = np.linspace(0.1, 0.9, 32, dtype=np.float32)
+    pixels = np.broadcast_to((ramp if axis == 0 else ramp[::-1, None])[..., None], (rows, columns, 3)).copy()
+    omega_o = direction(60, azimuth)
+    u = np.array([0.5, 0.5]) - 0.5 * depth * omega_o[:2] / omega_o[2] * -1.0
+    grid = HeightGrid.from_map(heights, 1.0)
+    e = estimate(
+        grid, textured(pixels), LightKernel(0.0), queries(u, 1e-6, UP, omega_o, 1), 2, transport=DIRECT
+    )
+    seen = u[axis] - depth * omega_o[axis] / omega_o[2]
+    expected = np.interp(seen, (np.arange(32) + 0.5) / 32, ramp)
+    assert e.value_a[0, 0] * np.pi == pytest.approx(expected, abs=2e-3)
+    assert np.sign(seen - u[axis]) == sign
+
+
+def test_image_layout_walks_texels_in_row_order() -> None:
+    plan = QueryPlan(Lattice(3, 0.5), Mixture(1, 0), 0.1, "image", 5, 4)
+    q = plan.draw("train", 0, 3)
+    assert q.lead == (3, 4, 8)
+    centers = texel_centers(4, 8)
+    assert np.all(np.abs(q.u - centers) <= np.array([0.5 / 8, 0.5 / 4]) + 1e-6)
+    assert np.ptp(q.omega_i[1].reshape(-1, 3), axis=0).max() == 0
+    assert np.ptp(q.sigma[2]) == 0
+
+
+def test_picture_shows_the_map_the_right_way_up() -> None:
+    """Seen from straight above, a picture of one tile is the map itself: row 0 on top, column 0 on the
+    left."""
+    camera = Camera(
+        90.0, -90.0, 1.0, (0.5, 0.5 * ASPECT), rows=ROWS * 8, columns=COLUMNS * 8, field_of_view=2.0
+    )
+    q = camera.queries(np.array(UP), ASPECT)
+    expected = texel_centers(ROWS * 8, COLUMNS * 8)
+    assert np.abs(q.u - expected).max() < 1e-3
+    # A pixel's footprint: half the pitch of pixels.
+    np.testing.assert_allclose(q.sigma, 0.5 / (COLUMNS * 8), rtol=1e-2)
+
+
+def test_tilted_picture_is_not_mirrored() -> None:
+    camera = Camera(50.0, -90.0, 0.5, rows=33, columns=33)
+    q = camera.queries(np.array(UP))
+    # The camera stands towards -v: right is +u, the far side (+v) is on top, the view points back to it.
+    assert q.u[16, 32, 0] > q.u[16, 0, 0]
+    assert q.u[0, 16, 1] > q.u[32, 16, 1]
+    assert np.all(q.omega_o[..., 1] < 0)
+    np.testing.assert_allclose(np.linalg.norm(q.omega_o, axis=-1), 1.0, atol=1e-6)
+
+
+def test_pixel_kind_and_query_kind_agree_from_above() -> None:
+    """Near normal incidence the truly filtered picture is the picture of queries, on an asymmetric textured
+    relief."""
+    from support.scenes import rocks
+
+    from mbtf_core.stats import aggregate_test
+    from mbtf_gen.pictures.reference import render_reference
+    from mbtf_gen.render.estimator import Estimator
+
+    estimator = Estimator(build_tile(rocks(32), textured(color_map())), LightKernel(1.0), Transport())
+    camera = Camera(90.0, -90.0, 1.5, rows=40, columns=40, field_of_view=1.0)
+    pair = [
+        render_reference(estimator, camera, direction(50, 20), kind=k, spp=64) for k in ("query", "pixel")
+    ]
+    flat_halves = [h.reshape(-1, 3) for image in pair for h in (image.value_a, image.value_b)]
+    result = aggregate_test(*flat_halves)
+    assert result.p_value > 1e-3, str(result)
+    # The same pictures with one turned upside down are told apart.
+    upside = [
+        flat_halves[0],
+        flat_halves[1],
+        *(h.reshape(40, 40, 3)[::-1].reshape(-1, 3) for h in flat_halves[2:]),
+    ]
+    assert aggregate_test(*upside).p_value < 1e-6

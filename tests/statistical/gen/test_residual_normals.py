@@ -1,0 +1,71 @@
+"""Normal maps add what the mesh lacks, and count nothing twice: a coarse mesh against the fine one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.paths import ROOT
+
+from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.generation import Job
+from mbtf_gen.geometry.slopes import height_slopes
+from mbtf_gen.material.material import Material, load_material
+from mbtf_gen.planning.effects_plan import simulated
+from mbtf_gen.planning.pilot import pilot_queries, relative_change
+from mbtf_gen.render.estimates import Estimates, Stream
+
+SPP = 16
+
+
+def lambert(material: Material) -> Material:
+    return replace(material, roughness=None, metallic=None, specular=None, normal=None)
+
+
+def normals_of(material: Material) -> np.ndarray[tuple[int, int, int], np.dtype[np.float32]]:
+    """The normal map that the heights would have, at their own resolution."""
+    slopes = height_slopes(material.grid(mesh=material.height.shape[1]))
+    n = np.concatenate([-slopes, np.ones_like(slopes[..., :1])], axis=-1)
+    return (n / np.linalg.norm(n, axis=-1, keepdims=True)).astype(np.float32)
+
+
+def estimates(material: Material, mesh: int, normal: str) -> Estimates:
+    config = GeneratorConfig.model_validate(
+        {
+            "material": "m",
+            "geometry": {"mesh": mesh},
+            # High directions: what is compared is shading, not the masking that a coarse mesh lacks.
+            "queries": {"levels": 5, "min_cos": 0.7},
+            "effects": {"normal": normal},
+            "transport": {"max_depth": 1},
+        }
+    )
+    job = Job.of(config, material)
+    plan = simulated(job)
+    assert plan.on("normal") == (normal != "off")
+    found: Estimates = job.estimator(plan).estimate(pilot_queries(job, 16384), SPP, Stream(2, "test", 0))
+    return found
+
+
+@pytest.mark.parametrize("name", ["turtle_shell", "rock_cliff"])
+def test_a_coarse_mesh_with_the_residual_comes_closer_to_the_fine_one(name: str) -> None:
+    folder = ROOT / "assets" / name
+    if not folder.exists():
+        folder = ROOT.parent / "shared" / "data" / "materials" / name
+    if not folder.exists():
+        pytest.skip(f"{name} is not beside the project")
+    plain = lambert(load_material(folder))
+    # Reliefs gentle enough for slopes to stand for displacement.
+    plain = replace(plain, height_scale=0.3 * plain.height_scale)
+    fine = plain.height.shape[1]
+    mapped = replace(plain, normal=normals_of(plain))
+    full = estimates(mapped, fine, "off")
+    without = relative_change(full, estimates(mapped, fine // 16, "off"))[0]
+    residual, upper = relative_change(full, estimates(mapped, fine // 16, "residual"))
+    assert residual < 0.8 * without
+    assert upper - residual < 0.2 * without
+    # On the fine mesh the map repeats everything: nothing changes, while the slopes twice would.
+    same, bound = relative_change(full, estimates(mapped, fine, "residual"))
+    assert bound < 0.3 * without
+    assert same < residual

@@ -1,0 +1,53 @@
+"""A bench of a cost study whose estimator's bias and noise are known."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.generation import Job
+from mbtf_gen.material.material import Material
+from mbtf_gen.render.estimates import Estimates, Stream
+from mbtf_gen.sampling.query_sampler import Queries
+from mbtf_pipeline.cost_study.generator_benchmark import GeneratorBenchmark
+
+NOISE = 0.8  # standard deviation of one path, relative to the value
+SHIFT = 0.25  # bias of a run with one interaction, relative to the value
+
+
+class FakeEstimator:
+    """Values of known bias and noise; random numbers by the stream alone, as the real ones."""
+
+    def __init__(self, job: Job) -> None:
+        self.shift = SHIFT if job.config.transport.max_depth == 1 else 0.0
+
+    def estimate(
+        self, queries: Queries, spp: Any, stream: Stream, *, path_variance: bool = False
+    ) -> Estimates:
+        # Other paths have other noise, as where another setting takes other turns.
+        key = [stream.root, stream.shard, stream.first_pass, len(queries.sigma), self.shift > 0]
+        rng = np.random.default_rng(key)
+        each = np.broadcast_to(spp, len(queries.sigma))
+        truth = 0.2 + 0.1 * queries.u[:, :1]
+        # The bias has either sign: what counts is its square, query by query.
+        sign = np.where(queries.u[:, 1:] < 0.5, -1.0, 1.0)
+        halves = [
+            truth * (1 + self.shift * sign)
+            + 0.25 * NOISE * rng.normal(size=(len(truth), 3)) / np.sqrt(each[:, None] / 2)
+            for _ in range(2)
+        ]
+        a, b = (h.astype(np.float32) for h in halves)
+        known = np.full(len(truth), (0.25 * NOISE) ** 2, np.float32) if path_variance else None
+        return Estimates(a, b, None, int(each.sum()), 0, 0, 0, path_variance=known)
+
+
+def fake_benchmark(monkeypatch: pytest.MonkeyPatch) -> GeneratorBenchmark:
+    """Of a small relief, traced by :class:`FakeEstimator` until the test ends."""
+    monkeypatch.setattr(Job, "estimator", lambda self, plan: FakeEstimator(self))
+    monkeypatch.setattr("mbtf_pipeline.cost_study.generator_benchmark.plan_effects", lambda job: None)
+    heights = np.random.default_rng(0).random((8, 8))
+    material = Material(heights, height_scale=0.1, height_bits=None, base_color=np.array([0.5, 0.5, 0.5]))
+    return GeneratorBenchmark(GeneratorConfig(material="heights.npy"), material, 0)

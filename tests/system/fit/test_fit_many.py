@@ -1,0 +1,70 @@
+"""``mbtf-fit --many``: several data sets, none stopped by another's failure."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from conftest import RunPython
+from support.fit_data import parallax, write_data
+
+from mbtf_core.errors import InputError, UsageError
+from mbtf_fit.training.fit_many import find_data, name_materials
+from mbtf_gen.dataset.shard_io import read_shard, write_shard
+
+QUICK = ("--steps", "3", "--batch", "300", "--device", "cpu")
+
+
+def test_one_that_fails_does_not_stop_the_others(tmp_path: Path, run_python: RunPython) -> None:
+    for name in ("a", "b", "c"):
+        write_data(tmp_path / "data" / name, parallax, train=1000, test=100)
+    shard = tmp_path / "data" / "b" / "train-00000.npz"
+    arrays = read_shard(shard, mapped=False)
+    whole = arrays["value_a"].copy()
+    arrays["value_a"][3] = float("nan")
+    write_shard(shard, arrays)
+    command = ("-m", "mbtf_fit", "--many", str(tmp_path / "data"), "-o", str(tmp_path / "out"), *QUICK)
+    done = run_python(*command, "--processes", "2", "--json")
+    assert done.returncode == 4, done.stderr
+    assert "1 of 3 fits failed" in done.stderr
+    fits = json.loads(done.stdout)["fits"]
+    assert [Path(f["material"]).name for f in fits] == ["a", "b", "c"]
+    assert [f["error"] is None for f in fits] == [True, False, True]
+    assert "train-00000.npz" in fits[1]["error"]
+    assert fits[0]["result"]["training"]["steps"] == 3
+    assert (tmp_path / "out" / "c" / "material.json").exists()
+    # Mended, the same command finishes the one and leaves the others as they are.
+    arrays["value_a"] = whole
+    write_shard(shard, arrays)
+    done = run_python(*command)
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert lines[0].split() == ["material", "unexplained", "variance,", "test", "steps", "training"]
+    assert [line.split()[0] for line in lines[1:4]] == ["a", "b", "c"]
+
+
+def test_data_sets_come_from_folders_folders_of_folders_and_lists(tmp_path: Path) -> None:
+    for name in ("x/one", "x/two", "three"):
+        (tmp_path / name).mkdir(parents=True)
+        (tmp_path / name / "manifest.json").write_text("{}")
+    (tmp_path / "list.txt").write_text("# mine\nthree\n\nx/one\n")
+    names = [p.relative_to(tmp_path).as_posix() for p in find_data([tmp_path / "x", tmp_path / "list.txt"])]
+    assert names == ["x/one", "x/two", "three", "x/one"]
+    with pytest.raises(InputError, match="holds no data sets"):
+        find_data([_empty(tmp_path)])
+
+
+def _empty(tmp_path: Path) -> Path:
+    folder = tmp_path / "empty"
+    folder.mkdir()
+    return folder
+
+
+def test_materials_are_called_like_their_data(tmp_path: Path) -> None:
+    out = Path("out")
+    assert name_materials([tmp_path / "a", tmp_path / "b"], out) == [out / "a", out / "b"]
+    found = name_materials([tmp_path / "rock" / "shards", tmp_path / "wool" / "shards"], out)
+    assert found == [out / "rock-shards", out / "wool-shards"]
+    with pytest.raises(UsageError, match="2 data sets are called"):
+        name_materials([tmp_path / "a" / "s", tmp_path / "b" / ".." / "a" / "s"], out)

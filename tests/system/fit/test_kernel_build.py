@@ -1,0 +1,51 @@
+"""The kernel is compiled when the package is installed, and its absence breaks nothing."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from support.paths import ROOT
+
+from mbtf_fit.native import library
+
+pytest.importorskip("setuptools", minversion="77")
+
+
+def build(out: Path, **variables: str) -> list[Path]:
+    """Run the build step of an installation; returns the libraries that it made."""
+    command = [
+        sys.executable,
+        "setup.py",
+        "build_ext",
+        "--build-lib",
+        str(out),
+        "--build-temp",
+        str(out / "temp"),
+    ]
+    done = subprocess.run(
+        command,
+        cwd=ROOT,
+        env={**os.environ, **variables},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return sorted((out / "mbtf_fit").rglob(f"{library.LIBRARY}*"))
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler is installed here")
+def test_it_is_built_where_there_is_a_compiler(tmp_path: Path) -> None:
+    (path,) = build(tmp_path)
+    loaded = library.open_library(path)
+    assert "portable" in library.variants(loaded)
+
+
+def test_an_installation_without_a_compiler_succeeds(tmp_path: Path) -> None:
+    assert build(tmp_path, CC="/no/such/compiler") == []

@@ -1,0 +1,121 @@
+"""The plugin works in a process that cannot import PyTorch."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from conftest import RunPython
+from support.paths import ROOT
+from support.plugin_materials import write_material
+
+from mbtf_gen.render.llvm import OLDEST_LLVM
+
+PROJECT = ROOT
+MOVE = "import os, sys; os.chdir(sys.argv[1])\n"
+
+CODE = """
+import sys
+for name in ("torch", "scipy", "trimesh", "matplotlib"):
+    sys.modules[name] = None  # importing it fails
+import mbtf_fit.mitsuba_plugin
+import mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+scene = mbtf_fit.mitsuba_plugin.load_scene({
+    "type": "scene", "integrator": {"type": "mbtf_path", "max_depth": 3}, "light": {"type": "constant"},
+    "ball": {"type": "sphere", "b": {"type": "mbtf", "material": sys.argv[1], "uv_scale": 3.0}},
+    "sensor": {"type": "perspective",
+               "to_world": mi.ScalarTransform4f().look_at([0, 3, 3], [0, 0, 0], [0, 0, 1]),
+               "film": {"type": "hdrfilm", "width": 8, "height": 8}},
+})
+import numpy as np
+mean = np.array(mi.render(scene, spp=4)).mean()
+assert 0.05 < mean < 5, mean
+mbtf_fit.mitsuba_plugin.register()
+print("rendered")
+"""
+
+
+def test_rendering_without_pytorch(tmp_path: Path, run_python: RunPython) -> None:
+    write_material(tmp_path)
+    # No path to the compiler is handed down: importing the plugin must find it.
+    done = run_python("-c", CODE, str(tmp_path), DRJIT_LIBLLVM_PATH=None)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["rendered"]
+
+
+def test_the_example_of_the_documentation_runs(tmp_path: Path, run_python: RunPython) -> None:
+    write_material(tmp_path / "material")
+    page = (PROJECT / "docs" / "rendering.md").read_text(encoding="utf-8")
+    example = page.split("```python\n")[1].split("```")[0]
+    quick = example.replace("spp=64", "spp=1").replace("[0, 0, 1])", "[0, 0, 1]), **SMALL")
+    assert quick.count("SMALL") == 1
+    assert quick.count("spp=1") == 1
+    small = 'SMALL = {"film": {"type": "hdrfilm", "width": 8, "height": 8}}\n'
+    done = run_python("-c", MOVE + small + quick, str(tmp_path), DRJIT_LIBLLVM_PATH=None)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "ball.png").stat().st_size > 0
+
+
+def test_a_scene_in_xml_of_the_documentation_runs(tmp_path: Path, run_python: RunPython) -> None:
+    write_material(tmp_path / "material")
+    page = (PROJECT / "docs" / "rendering.md").read_text(encoding="utf-8")
+    (tmp_path / "scene.xml").write_text(page.split("```xml\n")[1].split("```")[0], encoding="utf-8")
+    code = (
+        "import mbtf_fit.mitsuba_plugin, mitsuba as mi\nmi.set_variant('llvm_ad_rgb')\n"
+        "scene = mbtf_fit.mitsuba_plugin.load_scene('scene.xml')\n"
+        "print(type(scene.integrator()).__name__, scene.shapes()[0].bsdf().uv_scale)"
+    )
+    done = run_python("-c", MOVE + code, str(tmp_path), DRJIT_LIBLLVM_PATH=None)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["ConePath", "[4]"]
+
+
+def test_a_plugin_that_came_too_late_says_so(run_python: RunPython) -> None:
+    code = """
+import drjit.llvm, mitsuba as mi
+try:
+    mi.set_variant("llvm_ad_rgb")
+    import drjit as dr
+    dr.eval(mi.Float(1))
+except Exception:
+    print("no LLVM without ours")
+else:
+    try:
+        import mbtf_fit.mitsuba_plugin
+        print("registered", drjit.detail.llvm_version()[0])
+    except Exception as error:
+        print(error)
+"""
+    done = run_python("-c", code, DRJIT_LIBLLVM_PATH=None)
+    assert done.returncode == 0, done.stderr
+    said = done.stdout.strip()
+    if said.startswith("registered"):
+        assert int(said.split()[1]) >= OLDEST_LLVM
+    else:
+        assert said == "no LLVM without ours" or said.startswith("Dr.Jit was imported before mbtf_gen")
+
+
+def test_registration_says_what_it_misses(run_python: RunPython) -> None:
+    code = """
+import mbtf_fit.mitsuba_plugin
+try:
+    mbtf_fit.mitsuba_plugin.register()
+except Exception as error:
+    print(error)
+import mitsuba as mi
+mi.set_variant("scalar_rgb")
+try:
+    mbtf_fit.mitsuba_plugin.register()
+except Exception as error:
+    print(error)
+mi.set_variant("llvm_ad_rgb")
+mbtf_fit.mitsuba_plugin.register()
+mbtf_fit.mitsuba_plugin.register()
+print("done")
+"""
+    done = run_python("-c", code)
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert lines[0] == "no variant of Mitsuba is set"
+    assert lines[2] == "the plugin 'mbtf' does not run in the variant scalar_rgb"
+    assert lines[-1] == "done"

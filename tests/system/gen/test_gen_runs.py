@@ -1,0 +1,302 @@
+"""Whole runs of ``mbtf-gen``: forms of the command, resuming, kills, slices, layouts, formats, pictures."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+from support.commands import Done, finished, run_all, start
+from support.datasets import edit
+
+from mbtf_gen.dataset.reader import Dataset
+from mbtf_gen.dataset.shard_io import read_exr
+from mbtf_gen.dataset.verify import verify
+
+Arrays = dict[str, NDArray[np.float32]]
+
+# 16 texels across, 8 down; shards of 64 queries, so that there is much to interrupt.
+MAP = (8, 16)
+SMALL = "--queries 16/texel --test-queries 200 --test-spp 8 --set output.shard_queries=64"
+COMMAND = f"maps {SMALL}".split()
+SHARDS = 16 * 8 * 16 // 64 + 4
+
+
+def write_material(folder: Path) -> None:
+    """Heights and colors without any symmetry, in folder/maps; a description of them in folder."""
+    maps = folder / "maps"
+    maps.mkdir()
+    rng = np.random.default_rng(4)
+    np.save(maps / "height.npy", (0.1 * rng.random(MAP)).astype(np.float32))
+    color = rng.integers(0, 255, (*MAP, 3)).astype(np.uint8)
+    Image.fromarray(color).save(maps / "base_color.png")
+    (folder / "material.yaml").write_text("height: maps/height.npy\nbasecolor: maps/base_color.png\n")
+
+
+def load(folder: Path) -> dict[str, Arrays]:
+    dataset = Dataset.open(folder)
+    return {split: dataset.load(split) for split in dataset.splits}
+
+
+def equal(a: Path, b: Path) -> bool:
+    """Do two data sets hold the same bits?"""
+    x, y = load(a), load(b)
+    return x.keys() == y.keys() and all(
+        x[s].keys() == y[s].keys() and all(np.array_equal(x[s][n], y[s][n]) for n in x[s]) for s in x
+    )
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs")
+    write_material(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def whole(work: Path) -> Path:
+    """An undisturbed run, made by the program itself."""
+    done = finished(start([*COMMAND, "-o", "whole", "--json"], work))
+    assert done.code == 0, done.err
+    # Standard output is one JSON object and nothing else.
+    summary = json.loads(done.out)
+    assert summary["complete"] is True
+    assert summary["queries"] == 16 * 8 * 16 + 200
+    assert summary["paths"] == 16 * 8 * 16 * 4 + 200 * 8
+    assert summary["paths_per_second"] > 0
+    assert 0 < summary["relative_error"] < 2
+    assert (summary["lost"], summary["capped"], summary["nonfinite"]) == (0, 0, 0)
+    assert "shadowing" in summary["effects"]
+    assert "error" not in done.err
+    return work / "whole"
+
+
+def test_the_data_set_is_intact_and_sane(whole: Path) -> None:
+    assert verify(whole) == []
+    data = load(whole)
+    assert {split: len(arrays["sigma"]) for split, arrays in data.items()} == {"train": 2048, "test": 200}
+    for arrays in data.values():
+        value = 0.5 * (arrays["value_a"] + arrays["value_b"])
+        assert (value >= 0).all()
+        assert value.mean() > 0.01
+        # Halves are two estimates, not one.
+        assert np.mean(arrays["value_a"] != arrays["value_b"]) > 0.3
+    assert (whole / "config.yaml").read_text().startswith("version: 1\nmaterial: maps\n")
+
+
+def finished_shards(folder: Path) -> int:
+    return sum(path.with_suffix(".npz").exists() for path in folder.glob("t*-*.json"))
+
+
+def test_kills_at_any_instant_and_the_same_command_give_the_same_data(work: Path, whole: Path) -> None:
+    out = work / "killed"
+    line = [*COMMAND, "-o", "killed"]
+    counts = [0]
+    for more in (1, 6):
+        process = start(line, work)
+        give_up = time.monotonic() + 120
+        while finished_shards(out) < counts[-1] + more:
+            assert process.poll() is None, process.communicate()[1]
+            assert time.monotonic() < give_up
+            time.sleep(0.001)
+        process.send_signal(signal.SIGKILL)
+        assert finished(process).code == -signal.SIGKILL
+        counts.append(finished_shards(out))
+    assert counts[1] < counts[2] < SHARDS, "killed too late to show anything"
+    assert json.loads((out / "manifest.json").read_text())["complete"] is False
+    done = finished(start([*line, "--json"], work))
+    assert done.code == 0, done.err
+    # Finished shards were kept.
+    made = json.loads(done.out)["paths"]
+    assert 0 < made < 2048 * 4 + 200 * 8
+    assert verify(out) == []
+    assert equal(out, whole)
+    assert not list(out.glob(".*.tmp"))
+
+
+def test_slices_written_at_once_and_merged_are_the_whole(work: Path, whole: Path) -> None:
+    processes = [start([*COMMAND, "-o", "sliced", "--shards", f"{i}/3"], work) for i in (1, 2, 3)]
+    done = [finished(p) for p in processes]
+    assert [d.code for d in done] == [0, 0, 0], done
+    (merged,) = run_all([["merge", "sliced", "--json"]], work)
+    assert merged.code == 0, merged.err
+    assert json.loads(merged.out)["complete"] is True
+    assert verify(work / "sliced") == []
+    assert equal(work / "sliced", whole)
+
+
+@pytest.fixture(scope="module")
+def batch(work: Path, whole: Path) -> dict[str, Done]:
+    """Many commands in one process."""
+    shutil.copytree(whole, work / "again")
+    shutil.copytree(whole, work / "replaced")
+    shutil.copytree(whole, work / "unmerged")
+    (work / "unmerged/test-00001.npz").unlink()
+    edit(work / "unmerged/manifest.json", lambda manifest: manifest.update(complete=False))
+    few = "--queries 2/texel --test-queries 100 --spp 2 --test-spp 2 --seed 3 --json"
+    image = f"{few} --layout image --set output.shard_queries=256"
+    lines = {
+        "again": f"{' '.join(COMMAND)} -o again --json",
+        "again in words": f"{' '.join(COMMAND)} -o again",
+        "unmerged": "merge unmerged",
+        "verify": "verify again --json",
+        "changed seed": f"{' '.join(COMMAND)} -o replaced --seed 3",
+        "overwrite": f"{' '.join(COMMAND)} -o replaced --seed 3 --overwrite --json",
+        "file": f"maps/height.npy {few} -o file",
+        "flags first": f"{few} -o first maps",
+        "yaml": f"material.yaml {few} -o yaml",
+        "set": "maps -o set --json --set queries.train=2/texel --set queries.test=100 --set queries.spp=2 "
+        "--set queries.test_spp=2 --set seed=3",
+        "plain exr": f"maps {few} --format exr -o plain-exr",
+        "images": f"maps {image} -o images",
+        "image exr": f"maps {image} --format exr -o image-exr",
+        "reference": "reference maps -o pictures --json --view 50,20 --light 60,80 --spans 0.5,2 "
+        "--size 24 --spp 4",
+        "pictures again": "reference maps -o pictures --json --view 50,20 --light 60,80 --spans 0.5,2 "
+        "--size 24 --spp 4",
+        "pictures changed": "reference maps -o pictures --view 50,20 --light 60,80 --spans 0.5,2 --size 24",
+        "from its own file": "reference maps -o pictures --json --config pictures/config.yaml",
+        "one reference": "reference maps/height.npy -o one --spans 1 --size 8 --spp 2 --kind query",
+        "one replaced": "reference maps/height.npy -o one --spans 2 --size 8 --spp 2 --kind pixel "
+        "--overwrite",
+    }
+    done = run_all([line.split() for line in lines.values()], work)
+    return dict(zip(lines, done, strict=True))
+
+
+def summary(done: Done) -> dict[str, Any]:
+    assert done.code == 0, done.err
+    parsed = json.loads(done.out)
+    assert isinstance(parsed, dict)
+    return parsed
+
+
+def test_the_same_command_twice_renders_nothing(batch: dict[str, Done], work: Path, whole: Path) -> None:
+    again = summary(batch["again"])
+    assert (again["paths"], again["complete"], again["queries"]) == (0, True, 2248)
+    for path in whole.iterdir():
+        assert (work / "again" / path.name).read_bytes() == path.read_bytes()
+    assert summary(batch["verify"])["faults"] == []
+
+
+def test_merging_what_is_not_there_is_partial(batch: dict[str, Done]) -> None:
+    assert batch["unmerged"].code == 4
+    assert "unfinished" in batch["unmerged"].out
+
+
+def test_another_seed_is_refused_and_overwrite_replaces(
+    batch: dict[str, Done], work: Path, whole: Path
+) -> None:
+    assert batch["changed seed"].code == 3
+    assert "seed: 0 -> 3" in batch["changed seed"].err
+    assert summary(batch["overwrite"])["paths"] == 2048 * 4 + 200 * 8
+    assert verify(work / "replaced") == []
+    new, old = load(work / "replaced"), load(whole)
+    for name in ("u", "sigma", "omega_i", "value_a"):
+        assert np.mean(new["train"][name] == old["train"][name]) < 0.1
+
+
+def test_every_form_of_the_command_makes_the_same_data(batch: dict[str, Done], work: Path) -> None:
+    for name in ("flags first", "yaml", "set", "file"):
+        assert summary(batch[name])["complete"] is True
+    assert equal(work / "first", work / "yaml")
+    assert equal(work / "first", work / "set")
+    # A bare height map stands alone, gray: same queries, other values.
+    gray, colored = load(work / "file")["train"], load(work / "first")["train"]
+    assert np.array_equal(gray["u"], colored["u"])
+    assert np.ptp(gray["value_a"], axis=-1).max() < 1e-6
+    assert np.ptp(colored["value_a"], axis=-1).max() > 0.01
+
+
+def test_formats_hold_the_same_numbers(batch: dict[str, Done], work: Path) -> None:
+    for npz, exr in (("first", "plain-exr"), ("images", "image-exr")):
+        assert equal(work / npz, work / exr)
+        assert verify(work / exr) == []
+        assert not list((work / exr).glob("*.npz"))
+    assert summary(batch["plain exr"])["mean_value"] == summary(batch["flags first"])["mean_value"]
+
+
+def test_image_layout_holds_buffers_of_one_light_and_view(batch: dict[str, Done], work: Path) -> None:
+    assert summary(batch["images"])["queries"] == (2 + 1) * 8 * 16
+    dataset = Dataset.open(work / "images")
+    assert dataset.layout == "image"
+    data = dataset.load("train")
+    assert data["value_a"].shape == (2, *MAP, 3)
+    for name in ("sigma", "omega_i", "omega_o"):
+        first = data[name][:, :1, :1]
+        assert (data[name] == first).all()
+    assert not np.array_equal(data["omega_i"][0, 0, 0], data["omega_i"][1, 0, 0])
+    # Texel order: row 0 is the side v → 1.
+    rows, columns = MAP
+    assert (np.floor(data["u"][..., 0] * columns) == np.arange(columns)).all()
+    assert (np.floor((1 - data["u"][..., 1]) * rows) == np.arange(rows)[:, None]).all()
+
+
+def test_reference_writes_pictures_for_people_and_programs(batch: dict[str, Done], work: Path) -> None:
+    report = summary(batch["reference"])
+    stems = {f"{kind}-span{span}" for kind in ("query", "pixel") for span in ("0.5", "2")}
+    assert {p.name for p in (work / "pictures").iterdir()} == {
+        "config.yaml",
+        "pictures.json",
+        *(f"{s}.{x}" for s in stems for x in ("exr", "png")),
+    }
+    pictures = report["pictures"]
+    assert isinstance(pictures, list)
+    assert {Path(p["file"]).stem for p in pictures} == stems
+    for p in pictures:
+        arrays = read_exr(work / p["file"])
+        assert arrays["value_a"].shape == (1, 24, 24, 3)
+        value = 0.5 * (arrays["value_a"] + arrays["value_b"])
+        assert value.mean() > 0.01
+        assert set(arrays["spp"].ravel()) == {4.0}
+        assert 0 < p["relative_noise"] < 1
+        shown = np.asarray(Image.open((work / p["file"]).with_suffix(".png")))
+        assert shown.shape == (24, 24, 3)
+        # The picture shows the values: brighter where they are brighter.
+        assert np.corrcoef(shown.mean(axis=-1).ravel(), value.mean(axis=-1).ravel())[0, 1] > 0.8
+    assert batch["one reference"].code == 0
+    assert "noise" in batch["one reference"].out
+
+
+def test_pictures_that_are_there_are_kept_and_others_refused(batch: dict[str, Done], work: Path) -> None:
+    first = summary(batch["reference"])
+    assert [p["kept"] for p in first["pictures"]] == [False] * 4
+    for name in ("pictures again", "from its own file"):
+        again = summary(batch[name])
+        assert [p["kept"] for p in again["pictures"]] == [True] * 4, name
+        assert again["exposure"] == first["exposure"]
+        assert [p["relative_noise"] for p in again["pictures"]] == [
+            p["relative_noise"] for p in first["pictures"]
+        ]
+    refused = batch["pictures changed"]
+    assert refused.code == 3
+    assert "pictures: holds pictures of another configuration: reference.spp: 4 -> 256" in refused.err
+    assert "size: 24" in (work / "pictures/config.yaml").read_text()
+
+
+def test_overwriting_pictures_leaves_none_of_before(batch: dict[str, Done], work: Path) -> None:
+    assert batch["one replaced"].code == 0, batch["one replaced"].err
+    assert {p.name for p in (work / "one").iterdir()} == {
+        "config.yaml",
+        "pictures.json",
+        "pixel-span2.exr",
+        "pixel-span2.png",
+    }
+
+
+def test_the_report_counts_training_and_test_queries(batch: dict[str, Done], work: Path) -> None:
+    again = batch["again in words"]
+    assert "2048 training + 200 test queries, finest level 4" in again.err
+    assert again.out.splitlines()[:2] == [
+        "again: 2048 training + 200 test queries, complete",
+        "  this run: nothing left to do",
+    ]
+    # Merging traces nothing by its nature, and says nothing of it.
+    assert "this run" not in batch["unmerged"].out

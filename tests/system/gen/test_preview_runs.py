@@ -1,0 +1,257 @@
+"""``mbtf-gen preview``: pictures that are there, the right way round, kept, refused, and in agreement."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+from support.commands import Done, finished, run_all, start
+from support.datasets import write_dataset
+
+from mbtf_core.directions import from_angles
+from mbtf_core.lattice import level_of_sigma
+from mbtf_gen.dataset.reader import Dataset
+from mbtf_gen.material.material import load_material
+from mbtf_gen.pictures.preview.mesh import block_of, draw
+from mbtf_gen.pictures.preview.view import block_camera
+
+# Quadrants of the map: top left, top right, bottom left, bottom right.
+QUADRANTS = {"red": (1, 0, 0), "green": (0, 1, 0), "blue": (0, 0, 1), "white": (1, 1, 1)}
+FAST = "--size 96 --spp 4 --set queries.train=3000"
+
+
+def write_inputs(folder: Path) -> None:
+    """A material whose quadrants have different colors and heights; 2:1, so that nothing may be swapped."""
+    (folder / "maps").mkdir()
+    color = np.zeros((16, 32, 3), np.uint8)
+    height = np.zeros((16, 32), np.float32)
+    for (j, i), rgb, z in zip(np.ndindex(2, 2), QUADRANTS.values(), (0.04, 0.0, 0.02, 0.01), strict=True):
+        part = (slice(8 * j, 8 * j + 8), slice(16 * i, 16 * i + 16))
+        color[part] = 40 + 180 * np.array(rgb)
+        height[part] = z
+    Image.fromarray(color).save(folder / "maps/base_color.png")
+    np.save(folder / "maps/height.npy", height)
+    np.save(folder / "flat.npy", np.zeros((8, 8)))
+    write_dataset(folder / "data", queries={"train": "5000", "test": "8"}, output={"shard_queries": 2000})
+    write_dataset(folder / "lonely", queries={"train": "90", "test": "8"})
+    (folder / "lonely.npy").unlink()
+    (folder / "others").mkdir()
+    (folder / "others/mesh.png").write_text("of somebody else")
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("preview")
+    write_inputs(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def drawing(work: Path) -> None:
+    """Skips tests of what VTK draws where it cannot."""
+    block = block_of(load_material(work / "maps"), 1)
+    camera = block_camera(40, -90, tiles=1, aspect=0.5, relief=0.04, columns=64)
+    fault = draw(block, camera, from_angles(35, 150), work / "trial.png")
+    if fault:
+        pytest.skip(f"VTK cannot draw off screen here: {fault}")
+
+
+@pytest.fixture(scope="module")
+def batch(work: Path) -> dict[str, Done]:
+    lines = {
+        "tilted": f"preview maps -o tilted --block 1 {FAST} --json",
+        "side": f"preview maps -o side --block 1 --view 50,30 --light 70,0 {FAST} --json",
+        "two": f"preview maps -o two {FAST}",
+        "flat": f"preview flat.npy -o flat {FAST}",
+        "again": f"preview maps -o tilted --block 1 {FAST} --json",
+        "changed": f"preview maps -o tilted --block 2 {FAST}",
+        "replaced": f"preview flat.npy -o flat --block 1 --overwrite {FAST} --json",
+        "others": f"preview maps -o others {FAST} --overwrite",
+        "data": "preview data -o data-pictures --size 64 --spp 2 --json",
+        "buffers": "preview flat.npy -o buffers --size 64 --spp 2 --set queries.layout=image "
+        "--set queries.train=200",
+        "lonely": "preview lonely -o lonely-pictures --json",
+        "settled": "preview data -o nowhere --min-cos 0.2",
+        "settled too": "preview data -o nowhere --set queries.min_cos=0.2",
+        "block": "preview maps -o nowhere --block 9",
+        "horizon": "preview maps -o nowhere --view 3,0",
+        "below": "preview maps -o nowhere --light -3,0",
+    }
+    done = run_all([line.split() for line in lines.values()], work)
+    return dict(zip(lines, done, strict=True))
+
+
+def report(done: Done) -> dict[str, Any]:
+    assert done.code == 0, done.err
+    parsed = json.loads(done.out)
+    assert isinstance(parsed, dict)
+    return parsed
+
+
+def pixels(path: Path) -> NDArray[np.float64]:
+    return np.asarray(Image.open(path).convert("RGB"), np.float64) / 255
+
+
+def quadrant(picture: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Which of the four colors each pixel has; -1 where that is not clear."""
+    colors = np.array(list(QUADRANTS.values()), np.float64)
+    hue = picture / np.maximum(picture.max(axis=-1, keepdims=True), 0.05)
+    distance = np.linalg.norm(hue[..., None, :] - colors, axis=-1)
+    return np.where(distance.min(axis=-1) < 0.6, distance.argmin(axis=-1), -1)
+
+
+@pytest.mark.usefixtures("drawing")
+@pytest.mark.parametrize("name", ["tilted", "side"])
+def test_mesh_and_path_traced_picture_show_the_same_thing(
+    name: str, batch: dict[str, Done], work: Path
+) -> None:
+    report(batch[name])
+    mesh, beauty = (pixels(work / name / f"{n}.png") for n in ("mesh", "beauty"))
+    assert mesh.shape == beauty.shape == (72, 96, 3)
+    block = np.abs(mesh - mesh[0, 0]).max(axis=-1) > 0.1
+    assert 0.15 < block.mean() < 0.9
+    a, b = quadrant(mesh), quadrant(beauty)
+    clear = block & (a >= 0) & (b >= 0)
+    assert clear.sum() > 0.5 * block.sum()
+    assert (a == b)[clear].mean() > 0.9
+    # Not so if one of them were mirrored or turned.
+    for turned in (b[:, ::-1], b[::-1], b[::-1, ::-1]):
+        assert (a == turned)[clear].mean() < 0.6
+
+
+@pytest.mark.usefixtures("drawing")
+def test_colors_lie_in_the_quadrants_of_the_map(batch: dict[str, Done], work: Path) -> None:
+    """The camera stands towards -v: the map's first row is far, its first column left."""
+    for file in ("mesh.png", "beauty.png"):
+        picture = quadrant(pixels(work / "tilted" / file))
+        # Positions close to the picture's middle, where the tile's middle is.
+        for number, (down, right) in enumerate([(-5, -12), (-5, 12), (6, -12), (6, 12)]):
+            part = picture[36 + down - 2 : 36 + down + 3, 48 + right - 4 : 48 + right + 5]
+            assert (part == number).mean() > 0.8, (file, number)
+
+
+@pytest.mark.usefixtures("drawing")
+def test_no_picture_is_blank(batch: dict[str, Done], work: Path) -> None:
+    for name in ("tilted", "two"):
+        assert {p.name for p in (work / name).iterdir()} == {
+            "config.yaml",
+            "pictures.json",
+            "mesh.png",
+            "beauty.png",
+            "queries.png",
+        }
+        for file in ("mesh", "beauty", "queries"):
+            assert np.ptp(pixels(work / name / f"{file}.png")) > 0.5, (name, file)
+    # A flat gray tile is a gray quadrangle before the background, and a gray plane.
+    mesh, beauty = (pixels(work / "flat" / f"{n}.png") for n in ("mesh", "beauty"))
+    assert mesh[36, 48].max() < mesh[0, 0].min() - 0.03
+    assert 0.3 < beauty.mean() < 0.99
+
+
+@pytest.mark.usefixtures("drawing")
+def test_each_picture_has_a_line_that_says_what_it_shows(batch: dict[str, Done]) -> None:
+    lines = batch["two"].out.splitlines()
+    assert [line.partition(": ")[0] for line in lines] == [
+        f"two/{n}.png" for n in ("mesh", "beauty", "queries")
+    ]
+    assert "32 x 16 cells per tile) of 2 x 2 tiles" in lines[0]
+    assert "4 paths per pixel" in lines[1]
+    assert "3000 of 3000 training queries to be drawn for maps" in lines[2]
+    assert "256 of 256 training queries to be drawn for flat.npy, in 4 buffers of one" in batch["buffers"].out
+
+
+@pytest.mark.usefixtures("drawing")
+def test_the_same_command_keeps_and_another_is_refused(batch: dict[str, Done], work: Path) -> None:
+    assert [p["kept"] for p in report(batch["tilted"])["pictures"]] == [False] * 3
+    assert [p["kept"] for p in report(batch["again"])["pictures"]] == [True] * 3
+    assert batch["changed"].code == 3
+    assert "preview.block: 1 -> 2" in batch["changed"].err
+    assert "block: 1" in (work / "tilted/config.yaml").read_text()
+    assert [p["kept"] for p in report(batch["replaced"])["pictures"]] == [False] * 3
+    assert "block: 1" in (work / "flat/config.yaml").read_text()
+
+
+def test_files_of_others_stay(batch: dict[str, Done], work: Path) -> None:
+    assert batch["others"].code == 3
+    assert "holds no pictures" in batch["others"].err
+    assert [p.read_text() for p in (work / "others").iterdir()] == ["of somebody else"]
+
+
+@pytest.mark.usefixtures("drawing")
+def test_plots_of_a_data_set_are_of_its_stored_queries(batch: dict[str, Done], work: Path) -> None:
+    pictures = {Path(p["file"]).stem: p for p in report(batch["data"])["pictures"]}
+    assert list(pictures) == ["mesh", "beauty", "queries"]
+    assert "stored in data" in pictures["queries"]["shows"]
+    found = pictures["queries"]["queries"]
+    assert (found["shown"], found["total"]) == (5000, 5000)
+    level = level_of_sigma(Dataset.open(work / "data").load("train")["sigma"])
+    counts, _ = np.histogram(np.clip(level, 0, 3), found["level_edges"])
+    np.testing.assert_allclose(
+        np.array(found["level_density"]) * 5000 * np.diff(found["level_edges"]), counts, atol=1e-6
+    )
+    np.testing.assert_allclose(found["level_density"], found["level_density_stated"], atol=0.02)
+
+
+def test_queries_can_be_seen_without_their_material(batch: dict[str, Done], work: Path) -> None:
+    pictures = report(batch["lonely"])["pictures"]
+    assert [Path(p["file"]).name for p in pictures] == ["queries.png"]
+    assert "queries alone are shown" in batch["lonely"].err
+    assert not (work / "lonely-pictures/mesh.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("settled", "--min-cos: data holds a data set"),
+        ("settled too", "--set: data holds a data set"),
+        ("block", "--block: 'preview.block': must be at least 1 and at most 4 (given 9)"),
+        ("horizon", "shows the horizon"),
+        ("below", "--light: elevation -3 must lie above 0"),
+    ],
+)
+def test_mistakes_are_named_before_anything_is_written(
+    name: str, says: str, batch: dict[str, Done], work: Path
+) -> None:
+    done = batch[name]
+    assert (done.code, done.out) == (2, "")
+    assert says in done.err
+    assert not (work / "nowhere").exists()
+
+
+@pytest.mark.usefixtures("drawing")
+def test_a_preview_without_drawing_is_partial_and_resumes(
+    work: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from mbtf_core.console import run
+    from mbtf_gen.cli.app import app
+    from mbtf_gen.pictures.preview import mesh
+
+    line = ["preview", str(work / "flat.npy"), "-o", str(work / "partial"), *FAST.split()]
+    with monkeypatch.context() as patch:
+        patch.setattr(mesh, "draw", lambda *_: "the process was ended by SIGSEGV")
+        assert run(app, line) == 4
+    out, err = capsys.readouterr()
+    assert [Path(text.partition(": ")[0]).name for text in out.splitlines()] == ["beauty.png", "queries.png"]
+    assert "mesh.png: could not be drawn (the process was ended by SIGSEGV)" in err
+    assert "doctor" in err
+    assert run(app, line) == 0
+    out, _ = capsys.readouterr()
+    assert [text.endswith("(was there)") for text in out.splitlines()] == [False, True, True]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems always have a display")
+def test_a_window_without_a_display_is_one_line(work: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    done = finished(start(["preview", "maps", "-o", "nowhere", "--window"], work))
+    assert done.code == 3
+    assert done.err == (
+        "error: --window: there is no display\n  leave it out: the pictures are written as files\n"
+    )
+    assert not (work / "nowhere").exists()

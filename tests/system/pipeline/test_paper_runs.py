@@ -1,0 +1,150 @@
+"""A paper recipe from maps to page and CSV: both layouts, a missing material, and what runs again."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.pages import loads
+
+from mbtf_core.console import run
+from mbtf_pipeline.cli.app import app
+
+RECIPE = """\
+name: tiny
+title: A tiny comparison
+tables: [methods, levels, weights, ablations, timing, offsets, zooms, independence]
+materials:
+  bumps: bumps.npy
+  elsewhere: nowhere/maps
+base:
+  generate:
+    geometry: {height: 0.1, mesh: 16}
+    queries: {train: 100/texel, spp: 2, test: "512", test_spp: 16, levels: 2, min_cos: 0.3}
+    light: {width: 10}
+  each_fit:
+    training: {steps: 400, batch: 512}
+  fit: {neumip-baseline: , neumip: , hierarchical: {network: {encoding: {position: 0, direction: 0}}}}
+  compare:
+    views: [{elevation: 80, azimuth: -90}]
+    lights: [{elevation: 50, azimuth: 40}]
+    spans: [0.5, 2]
+    size: 16
+    spp: 8
+    kinds: [query, pixel]
+    offset_views: [{elevation: 40, azimuth: 0}]
+    st_lpips: false
+    stock: true
+    timing: true
+quick:
+  each_fit: {training: {steps: 4}}
+"""
+
+
+def command(folder: Path, *options: str) -> list[str]:
+    return ["run", str(folder / "tiny.yaml"), "--quick", "-o", str(folder / "out"), "--json", "-q", *options]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a finished quick run; timings are of few pixels."""
+    folder = tmp_path_factory.mktemp("paper")
+    np.save(folder / "bumps.npy", np.random.default_rng(1).random((8, 8)).astype(np.float32))
+    (folder / "tiny.yaml").write_text(RECIPE)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("mbtf_pipeline.compare.compare._TIMED_PIXELS", 8 * 81)
+        assert run(app, command(folder)) == 0
+    return folder
+
+
+def table(folder: Path, name: str) -> list[dict[str, str]]:
+    with (folder / "out" / "tables" / f"{name}.csv").open(encoding="utf-8") as stream:
+        return list(csv.DictReader(stream))
+
+
+def test_every_table_has_its_numbers(made: Path) -> None:
+    record: dict[str, Any] = json.loads((made / "out" / "paper.json").read_text())
+    assert record["size"] == "quick"
+    assert list(record["skipped"]) == ["elsewhere"]
+    methods = table(made, "methods")
+    assert [r["method"] for r in methods[:3]] == ["neumip-baseline", "neumip", "hierarchical"]
+    assert [r["unexplained"] for r in methods[3:]] == ["not built yet"] * 2
+    run_folder = made / "out" / "runs" / "bumps"
+    comparison = json.loads((run_folder / "compare" / "comparison.json").read_text())
+    for row in methods[:3]:
+        mse = comparison["test"][row["method"]]["splits"]["test"]["mse"]
+        assert float(row["mse"]) == pytest.approx(mse["value"], rel=1e-5)
+        assert mse["n"] == 512
+    assert len(table(made, "levels")) == 3
+    assert len(table(made, "timing")) == 5
+    assert [r["fit"] if "fit" in r else r["method"] for r in table(made, "offsets")] == [
+        "neumip",
+        "hierarchical",
+    ]
+    assert {(r["span"], r["method"]) for r in table(made, "zooms")} == {
+        (span, r["method"]) for span in ("0.5", "2") for r in methods[:3]
+    }
+    # Pictures of 16 pixels are.
+    assert [r["verdict"] for r in table(made, "independence")] == ["too small to tell"]
+    for fit in ("neumip", "hierarchical"):
+        begun = json.loads((run_folder / "fits" / fit / "fit.json").read_text())
+        assert begun["config"]["training"]["steps"] == 4
+
+
+def test_the_page_stands_alone_and_says_which_size_ran(made: Path) -> None:
+    html = (made / "out" / "paper.html").read_text()
+    found = loads(html)
+    assert not found.external
+    assert len(found.pictures) == 4 + 3 + 10 + 3
+    assert all(p.startswith("data:image/") for p in found.pictures)
+    assert "This is the quick size" in html
+    assert "Skipped, because their files are not there: elsewhere" in html
+    assert "--quick" in html
+
+
+def test_the_same_command_runs_nothing_again(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    stamps = {p: p.stat().st_mtime_ns for p in (made / "out" / "runs").rglob("stages/*.json")}
+    assert len(stamps) == 7
+    (made / "out" / "paper.html").unlink()
+    capsys.readouterr()
+    assert run(app, command(made)) == 0
+    assert json.loads(capsys.readouterr().out)["skipped"].keys() == {"elsewhere"}
+    assert {p: p.stat().st_mtime_ns for p in stamps} == stamps
+    assert (made / "out" / "paper.html").exists()
+
+
+def test_the_page_can_be_written_again(made: Path) -> None:
+    page, rows = made / "out" / "paper.html", made / "out" / "tables" / "methods.csv"
+    before = page.read_bytes(), rows.read_bytes()
+    page.unlink()
+    rows.unlink()
+    assert run(app, ["report", str(made / "out")]) == 0
+    assert (page.read_bytes(), rows.read_bytes()) == before
+
+
+def test_an_interrupted_recipe_has_a_page_that_says_so(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(made / "out", tmp_path / "out")
+    record = tmp_path / "out" / "paper.json"
+    data = json.loads(record.read_text()) | {"planned": 3}
+    record.write_text(json.dumps(data))
+    assert run(app, ["report", str(tmp_path / "out")]) == 0
+    assert "1 of 3 runs are finished" in (tmp_path / "out" / "paper.html").read_text()
+    record.write_text(json.dumps(data | {"runs": []}))
+    assert run(app, ["report", str(tmp_path / "out")]) == 3
+    assert "has no finished run" in capsys.readouterr().err
+
+
+def test_a_folder_of_something_else_is_left_alone(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    other = made / "other"
+    other.mkdir()
+    (other / "notes.txt").write_text("mine")
+    assert run(app, ["run", str(made / "tiny.yaml"), "--quick", "-o", str(other)]) == 3
+    assert "is not empty and holds no paper recipe" in capsys.readouterr().err
+    assert [p.name for p in other.iterdir()] == ["notes.txt"]

@@ -1,0 +1,231 @@
+"""The whole chain on a small recipe: what it makes, what it makes again, and a report that stands alone."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import subprocess
+import sys
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.pages import loads
+from support.paths import ROOT
+
+from mbtf_core.console import run
+from mbtf_pipeline.compare.pictures import read_picture
+
+RECIPE = ROOT / "pipelines" / "ci.yaml"
+STAGES = ["generate", "fit neumip", "compare", "report"]
+
+
+@pytest.mark.parametrize(
+    "planted",
+    [
+        '<img src="compare/v1.png">',
+        '<link rel="stylesheet" href="https://example.org/a.css">',
+        "<style>@import 'a.css';</style>",
+        "<style>body { background: url(paper.png) }</style>",
+        '<p style="background: url(http://example.org/x)">',
+        "<script>fetch('numbers.json')</script>",
+        '<svg><image xlink:href="plot.png"/></svg>',
+    ],
+)
+def test_the_check_finds_planted_loads(planted: str) -> None:
+    assert loads(f"<html>{planted}</html>").external
+    assert not loads('<a href="#x"></a><svg xmlns="http://www.w3.org/2000/svg"></svg>').external
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("pipeline") / "ci"
+
+
+@pytest.fixture(scope="module")
+def first(folder: Path) -> dict[str, Any]:
+    """What the first run prints, as a user starts it."""
+    command = [sys.executable, "-m", "mbtf_pipeline", "run", str(RECIPE), "-o", str(folder), "--json", "-q"]
+    done = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, timeout=300, stdin=subprocess.DEVNULL, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    out: dict[str, Any] = json.loads(done.stdout)
+    return out
+
+
+@pytest.fixture
+def again(first: dict[str, Any], folder: Path, capsys: pytest.CaptureFixture[str]) -> Any:
+    """Runs the recipe again in the same folder; returns which stages ran, by reason."""
+    from mbtf_pipeline.cli.app import app
+
+    def execute(*options: str) -> dict[str, str]:
+        capsys.readouterr()
+        assert run(app, ["run", str(RECIPE), "-o", str(folder), "--json", "-q", *options]) == 0
+        stages = json.loads(capsys.readouterr().out)["stages"]
+        assert list(stages) == STAGES
+        return {name: s["reason"] for name, s in stages.items() if s["ran"]}
+
+    return execute
+
+
+def test_every_stage_runs_and_the_material_is_learned(first: dict[str, Any], folder: Path) -> None:
+    assert {name: s["ran"] for name, s in first["stages"].items()} == dict.fromkeys(STAGES, True)
+    assert Path(first["report"]) == folder / "report.html"
+    share = first["test"]["neumip"]["unexplained_variance"]
+    # The best constant leaves 1; the bar is far above what the fit reaches and far below that.
+    assert share["value"] + 3 * share["error"] < 0.5
+
+
+def test_pictures_and_numbers_belong_together(first: dict[str, Any], folder: Path) -> None:
+    record = json.loads((folder / "compare" / "comparison.json").read_text())
+    assert [p["name"] for p in record["pictures"]] == ["v1-l1-s1", "v2-l1-s1"]
+    for picture in record["pictures"]:
+        reference = read_picture(folder / "compare" / picture["references"]["query"]["file"])
+        made = picture["fits"]["neumip"]
+        fit = read_picture(folder / "compare" / made["file"])
+        assert reference.shape == fit.shape == (48, 48, 3)
+        assert np.isfinite(reference).all()
+        mse = made["errors"]["query"]["mse"]
+        # The plain error holds the reference's noise as well.
+        plain = float(np.mean((fit.astype(np.float64) - reference) ** 2))
+        assert mse["value"] - 4 * mse["error"] < plain
+        assert made["errors"]["query"]["psnr"]["value"] == pytest.approx(
+            10 * np.log10(record["white"] ** 2 / mse["value"])
+        )
+    splits = record["test"]["neumip"]["splits"]
+    assert set(splits) == {"test", "held_out_queries", "held_out_directions", "training"}
+    assert sum(g["mse"]["n"] for g in splits["test"]["levels"].values()) == splits["test"]["n"] == 4096
+
+
+def test_the_report_stands_alone(first: dict[str, Any], folder: Path) -> None:
+    html = (folder / "report.html").read_text(encoding="utf-8")
+    page = loads(html)
+    assert page.external == []
+    assert len(html) < 10e6
+    # Two scenes of two references, a fit and its two maps; offsets traced and learned; the viewer's map and
+    # the enlarged view have no picture of their own.
+    embedded = [p for p in page.pictures if p]
+    assert len(embedded) == 2 * 5 + 2
+    for uri in embedded:
+        head, _, data = uri.partition(",")
+        assert head in ("data:image/png;base64", "data:image/jpeg;base64")
+        assert len(base64.b64decode(data, validate=True)) > 100
+    for text in (
+        "unexplained variance",
+        "1/sr is white",
+        "HDR-FLIP",
+        "% of white",
+        "flip-evaluator",
+        "seconds of training",
+        "mbtf-pipeline run",
+        "mitsuba",
+    ):
+        assert text in html
+    assert html.count("<svg") >= 6
+    ids = re.findall(r'\bid="([^"]+)"', html)
+    assert len(ids) == len(set(ids))
+
+
+def test_nothing_runs_twice(again: Any) -> None:
+    assert again() == {}
+
+
+def test_other_pictures_leave_data_and_fit_alone(again: Any) -> None:
+    ran = again("--set", "compare.spp=16")
+    assert list(ran) == ["compare", "report"]
+    assert "spp: 32 -> 16" in ran["compare"]
+    assert again("--set", "compare.spp=16") == {}
+    assert list(again()) == ["compare", "report"]
+
+
+def test_a_report_that_would_be_too_large_gives_up_precision_and_says_so(again: Any, folder: Path) -> None:
+    larger = ("--set", "compare.size=256", "--set", "compare.spp=4", "--set", "compare.spans=[2, 4]")
+    assert list(again(*larger)) == ["compare", "report"]
+    report = folder / "report.html"
+    assert report.stat().st_size > 1.2e6
+    assert "to keep the file small" not in report.read_text()
+    assert list(again(*larger, "--set", "report.max_megabytes=1")) == ["report"]
+    assert report.stat().st_size <= 1e6
+    assert "to keep the file small" in report.read_text()
+    assert list(again()) == ["compare", "report"]
+
+
+def test_another_title_makes_only_the_report(again: Any, folder: Path) -> None:
+    assert list(again("--set", "report.title=A <b> & c")) == ["report"]
+    assert "<h1>A &lt;b&gt; &amp; c</h1>" in (folder / "report.html").read_text()
+    assert list(again()) == ["report"]
+
+
+def test_a_fit_that_was_done_but_not_stamped_is_not_trained_again(again: Any, folder: Path) -> None:
+    weights = folder / "fits" / "neumip" / "weights.safetensors"
+    before = weights.stat().st_mtime_ns
+    (folder / "stages" / "fit-neumip.json").unlink()
+    assert list(again()) == ["fit neumip", "compare", "report"]
+    assert weights.stat().st_mtime_ns == before
+
+
+def test_a_flipped_byte_is_found_and_mended(again: Any, folder: Path) -> None:
+    shard = folder / "shards" / "test-00000.npz"
+    whole = shard.read_bytes()
+    middle = len(whole) // 2
+    shard.write_bytes(whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :])
+    ran = again()
+    assert list(ran) == STAGES
+    assert ran["generate"] == "shards/test-00000.npz has changed"
+    assert shard.read_bytes() == whole
+
+
+def test_the_report_can_be_written_again(
+    again: Any, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from mbtf_pipeline.cli.app import app
+
+    (folder / "report.html").unlink()
+    assert run(app, ["report", str(folder)]) == 0
+    assert (folder / "report.html").exists()
+    assert again() == {}
+
+
+def test_cost_study_measures_reports_and_goes_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from mbtf_pipeline.cli.app import app
+    from mbtf_pipeline.cost_study import study
+    from mbtf_pipeline.cost_study.generator_runs import generator_tasks
+
+    some = 2
+    monkeypatch.setattr(study, "generator_tasks", lambda bench: islice(generator_tasks(bench), some))
+    monkeypatch.setattr(study, "chains", lambda *arguments: [])
+    monkeypatch.setattr(study, "_SETTINGS", 1000)
+    out = tmp_path / "study"
+    # The budget is large enough never to decide what is measured.
+    command = ["cost", str(RECIPE), "--time", "1h", "-o", str(out), "--json", "--quiet"]
+    assert run(app, command) == 0
+    first = json.loads(capsys.readouterr().out)
+    assert first["points"] == 2
+    points = {p: p.read_bytes() for p in (out / "points").iterdir()}
+    # One is no setting: what a query costs on disk.
+    assert len([p for p in points if not p.name.startswith("price-")]) == first["points"]
+    html = (out / "cost.html").read_text()
+    assert not loads(html).external
+    assert "Paths per query" in html
+    rows = (out / "cost.csv").read_text().splitlines()
+    assert len(rows) == 1 + first["points"]
+    assert (out / "paths.png").stat().st_size > 1000
+    # The same again, with more to do: what was measured is kept, and more is added.
+    some = 3
+    assert run(app, command) == 0
+    second = json.loads(capsys.readouterr().out)
+    assert second["points"] == 3
+    assert all(p.read_bytes() == content for p, content in points.items())
+    assert not (out / ".work").exists()
+    # Without chains nothing can be repeated, and that is said.
+    # Without a time the study's own is meant.
+    flag = command.index("--time")
+    assert run(app, [*command[:flag], *command[flag + 2 :], "--narrow", "1min"]) == 0
+    assert any("other seeds" in text for text in json.loads(capsys.readouterr().out)["skipped"])
+    assert "--time 1h --narrow 1min" in (out / "cost.html").read_text()

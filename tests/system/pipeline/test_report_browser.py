@@ -1,0 +1,373 @@
+"""The report as people use it: opened in a headless browser, its slider moved, its exposure changed."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from support.paths import ROOT
+
+from mbtf_gen.pictures.reference import to_display
+from mbtf_pipeline.compare.pictures import read_picture
+
+# Seconds for anything the browser does, on a machine that is busy with something else.
+PATIENCE = 120
+# Size of the pictures, and of the stage in the window, a multiple of it.
+PIXELS, STAGE = 48, 480
+FLAGS = (
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-background-networking",
+    "--disable-dev-shm-usage",
+    "--no-first-run",
+    "--hide-scrollbars",
+    "--force-device-scale-factor=1",
+    "--window-size=1300,1000",
+    # Nothing has a name, so nothing outside this machine can be asked.
+    "--host-resolver-rules=MAP * ~NOTFOUND",
+)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with two fits, two spans and both kinds of reference."""
+    out = tmp_path_factory.mktemp("report") / "run"
+    command = [
+        sys.executable,
+        "-m",
+        "mbtf_pipeline",
+        "run",
+        str(ROOT / "pipelines" / "ci.yaml"),
+        "-o",
+        str(out),
+        "-q",
+    ]
+    for assignment in (
+        "fit.neumip.training={steps: 60, batch: 2048}",
+        "fit.plain={model: neumip-baseline, training: {steps: 20, batch: 2048}}",
+        "compare.spans=[2, 4]",
+        f"compare.size={PIXELS}",
+        "compare.spp=16",
+    ):
+        command += ["--set", assignment]
+    done = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, timeout=300, stdin=subprocess.DEVNULL, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return out
+
+
+def _start(profile: Path) -> Any:
+    """A browser of this machine with its driver; skips where there is none or it does not start."""
+    selenium = pytest.importorskip(
+        "selenium.webdriver", reason="no selenium: the report was not opened in a browser"
+    )
+    from selenium.common.exceptions import WebDriverException
+    from selenium.webdriver.chrome.service import Service
+    from urllib3.exceptions import HTTPError
+
+    names = ("chromium", "chromium-browser", "google-chrome")
+    browser = next((path for name in names if (path := shutil.which(name))), None)
+    driver = shutil.which("chromedriver")
+    if browser is None or driver is None:
+        pytest.skip("no chromium with chromedriver here: the report was not opened in a browser")
+    options = selenium.ChromeOptions()
+    options.binary_location = browser
+    for flag in (*FLAGS, f"--user-data-dir={profile}"):
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
+    try:
+        started = selenium.Chrome(options=options, service=Service(executable_path=driver))
+        started.get("about:blank")
+        return started
+    except (WebDriverException, HTTPError, OSError) as error:
+        first = (str(error).strip() or type(error).__name__).splitlines()[0]
+        pytest.skip(f"the browser does not start here ({first}): the report was not opened in it")
+
+
+class Page:
+    """The report in a browser."""
+
+    def __init__(self, driver: Any, folder: Path) -> None:
+        self.driver = driver
+        self.folder = folder
+        self.record = json.loads((folder / "compare" / "comparison.json").read_text())
+        self.errors: list[str] = []
+        self.requests: list[str] = []
+        driver.set_page_load_timeout(PATIENCE)
+        driver.set_script_timeout(PATIENCE)
+        driver.get((folder / "report.html").as_uri())
+
+    def find(self, css: str) -> Any:
+        return self.driver.find_element("css selector", css)
+
+    def js(self, code: str, *arguments: Any) -> Any:
+        return self.driver.execute_script(code, *arguments)
+
+    def until(self, condition: Callable[[], Any], what: str) -> None:
+        from selenium.webdriver.support.ui import WebDriverWait
+
+        WebDriverWait(self.driver, PATIENCE, 0.05).until(lambda _: condition(), what)
+
+    def drawn(self, scene: int, kind: int, fit: int, stops: str = "0") -> None:
+        """Wait until the stage shows this."""
+        wanted = f"{scene} {kind} {fit} {stops}"
+        self.until(lambda: self.js("return document.getElementById('stage').dataset.drawn") == wanted, wanted)
+
+    def canvas(self, css: str) -> np.ndarray:
+        """Pixels (rows, columns, 3) of a canvas."""
+        code = """
+            const canvas = document.querySelector(arguments[0]);
+            const { width, height } = canvas;
+            return [height, width, [...canvas.getContext('2d').getImageData(0, 0, width, height).data]];
+        """
+        rows, columns, values = self.js(code, css)
+        return np.array(values, np.int64).reshape(rows, columns, 4)[..., :3]
+
+    def screen(self) -> np.ndarray:
+        """The stage as it is seen: colors at the centers of its pictures' pixels (rows, columns, 3)."""
+        png = self.find("#stage").screenshot_as_png
+        image = np.asarray(Image.open(io.BytesIO(png)).convert("RGB"), np.int64)
+        assert image.shape == (STAGE, STAGE, 3)
+        step = STAGE // PIXELS
+        return image[step // 2 :: step, step // 2 :: step]
+
+    def expected(self, scene: int, what: str, stops: float = 0.0) -> np.ndarray:
+        """A picture as it must be shown: ``query``, ``pixel``, or a fit's name."""
+        picture = self.record["pictures"][scene]
+        file = (picture["references"] if what in ("query", "pixel") else picture["fits"])[what]["file"]
+        value = read_picture(self.folder / "compare" / file)
+        return to_display(value, 2.0**stops / self.record["white"]).astype(np.int64)
+
+    def collect(self) -> None:
+        """Take in the browser's logs."""
+        self.errors += [e["message"] for e in self.driver.get_log("browser") if e["level"] == "SEVERE"]
+        for entry in self.driver.get_log("performance"):
+            message = json.loads(entry["message"])["message"]
+            # The browser's own first page asks for its parts, too.
+            ours = message["params"].get("documentURL", "").endswith("/report.html")
+            if message["method"] == "Network.requestWillBeSent" and ours:
+                self.requests.append(message["params"]["request"]["url"])
+
+
+@pytest.fixture(scope="module")
+def page(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("no_proxy", "NO_PROXY"):
+            patch.setenv(name, "localhost,127.0.0.1")
+        patch.setenv("SE_OFFLINE", "true")
+        driver = _start(tmp_path_factory.mktemp("profile"))
+        try:
+            opened = Page(driver, folder)
+            opened.until(lambda: opened.js("return document.body.dataset.sheet") == "drawn", "the sheet")
+            # Whole screen pixels per picture pixel, so that what is seen can be told pixel by pixel.
+            opened.js(
+                "const s = document.createElement('style'); document.head.append(s);"
+                f"s.textContent = '.stage {{ width: {STAGE}px; border-radius: 0 }}"
+                ".stage canvas { image-rendering: pixelated }"
+                ".side, .border { visibility: hidden }"
+                "#stage:focus { outline: none }';"
+            )
+            opened.drawn(0, 0, 0)
+            yield opened
+        finally:
+            driver.quit()
+
+
+@pytest.fixture
+def stage(page: Page) -> Iterator[Any]:
+    """The stage in its first state; the logs are looked at afterwards."""
+    page.js(
+        "for (const name of ['fit', 'kind', 'group'])"
+        " document.querySelector(`input[name=${name}][value='0']`).click();"
+        "document.querySelector('#spans input').click(); document.getElementById('zero').click();"
+        "document.querySelector('input[name=map]').click()"
+    )
+    page.drawn(0, 0, 0)
+    yield page.find("#stage")
+    page.collect()
+    assert page.errors == []
+
+
+def matches(found: np.ndarray, expected: np.ndarray) -> bool:
+    """Same up to the coding of the linear values: 10 bits, and one step of rounding."""
+    return found.shape == expected.shape and int(np.abs(found - expected).max()) <= 3
+
+
+def test_pictures_are_those_that_were_compared(page: Page, stage: Any) -> None:
+    assert matches(page.canvas("#reference"), page.expected(0, "query"))
+    assert matches(page.canvas("#fit"), page.expected(0, "neumip"))
+    # They differ by far more than the coding, or the tests below would show nothing.
+    assert not matches(page.expected(0, "query"), page.expected(0, "neumip"))
+
+
+def test_keys_move_the_border(page: Page, stage: Any) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    reference, fit = page.expected(0, "query"), page.expected(0, "neumip")
+    stage.send_keys(Keys.END)
+    assert stage.get_attribute("aria-valuenow") == "100"
+    assert matches(page.screen(), reference)
+    stage.send_keys(Keys.HOME)
+    assert stage.get_attribute("aria-valuenow") == "0"
+    assert matches(page.screen(), fit)
+    stage.send_keys(*[Keys.PAGE_UP] * 2, *[Keys.ARROW_RIGHT] * 5)
+    assert stage.get_attribute("aria-valuenow") == "25"
+    assert "neumip" in stage.get_attribute("aria-valuetext")
+    shown, border = page.screen(), PIXELS // 4
+    assert matches(shown[:, :border], reference[:, :border])
+    assert matches(shown[:, border:], fit[:, border:])
+
+
+@pytest.mark.parametrize("kind", ["mouse", "touch"])
+def test_dragging_moves_the_border(page: Page, stage: Any, kind: str) -> None:
+    from selenium.webdriver.common.action_chains import ActionChains
+    from selenium.webdriver.common.actions.pointer_input import PointerInput
+
+    reference, fit = page.expected(0, "query"), page.expected(0, "neumip")
+    page.js("arguments[0].scrollIntoView({block: 'center', behavior: 'instant'})", stage)
+    for share in (-0.25, 0.25):
+        chain = ActionChains(page.driver, devices=[PointerInput(kind, f"{kind}{share}")])
+        chain.move_to_element(stage).click_and_hold()
+        chain.move_by_offset(int(share * STAGE / 2), 0).move_by_offset(int(share * STAGE / 2), 0)
+        chain.release().perform()
+        border = int((0.5 + share) * PIXELS)
+        assert stage.get_attribute("aria-valuenow") == str(round(100 * (0.5 + share)))
+        shown = page.screen()
+        assert matches(shown[:, :border], reference[:, :border])
+        assert matches(shown[:, border:], fit[:, border:])
+
+
+@pytest.mark.parametrize(("key", "stops"), [("ARROW_RIGHT", 2.0), ("ARROW_LEFT", -2.0)])
+def test_exposure_acts_on_linear_values_of_both_sides(page: Page, stage: Any, key: str, stops: float) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    page.find("#stops").send_keys(*[getattr(Keys, key)] * 20)
+    text = f"{stops:g}"
+    page.drawn(0, 0, 0, text)
+    assert matches(page.canvas("#reference"), page.expected(0, "query", stops))
+    assert matches(page.canvas("#fit"), page.expected(0, "neumip", stops))
+    stage.send_keys(Keys.HOME)
+    assert matches(page.screen(), page.expected(0, "neumip", stops))
+    white = page.record["white"] / 2.0**stops
+    said = page.find("#said").text
+    assert f"{stops:+.1f} EV".replace("-", "−") in said
+    assert f"{float(f'{white:.3g}'):g} 1/sr is white" in said
+    # The sheet below follows.
+    page.until(lambda: page.js("return document.body.dataset.exposure") == text, "the sheet's exposure")
+    cells = "button.zoom[data-scene='1'] canvas"
+    assert matches(page.canvas(cells), page.expected(1, "query", stops))
+
+
+def test_choices_change_what_is_shown(page: Page, stage: Any) -> None:
+    def choose(name: str, value: str) -> None:
+        page.js(
+            "document.querySelector(`input[name=${arguments[0]}][value='${arguments[1]}']`).click()",
+            name,
+            value,
+        )
+
+    choose("fit", "1")
+    page.drawn(0, 0, 1)
+    assert matches(page.canvas("#fit"), page.expected(0, "plain"))
+    choose("kind", "1")
+    page.drawn(0, 1, 1)
+    assert matches(page.canvas("#reference"), page.expected(0, "pixel"))
+    choose("scene", "1")
+    page.drawn(1, 1, 1)
+    assert matches(page.canvas("#fit"), page.expected(1, "plain"))
+    choose("group", "1")
+    # The span stays the chosen one.
+    page.drawn(3, 1, 1)
+    assert matches(page.canvas("#fit"), page.expected(3, "plain"))
+    assert "4 tiles across" in page.find("#said").text
+
+
+def test_maps_belong_to_the_choice(page: Page, stage: Any) -> None:
+    def shown() -> list[str]:
+        return [
+            bar.text for bar in page.driver.find_elements("css selector", "#maps .bar") if bar.is_displayed()
+        ]
+
+    first = page.find("#map-image").get_attribute("src")
+    assert first == page.js(
+        "return document.getElementById(arguments[0]).src", "pictures/v1-l1-s1-fit-neumip-local"
+    )
+    assert [bar.startswith("Local RMS error, % of white") for bar in shown()] == [True]
+    page.js("document.querySelector('input[name=map][value=flip]').click()")
+    page.until(lambda: page.find("#map-image").get_attribute("src") != first, "the other map")
+    assert [bar.startswith("HDR-FLIP") for bar in shown()] == [True]
+    page.js("document.querySelector('input[name=map][value=signed]').click()")
+    page.until(lambda: page.find("#map-canvas").is_displayed(), "the difference")
+    colors = page.canvas("#map-canvas")
+    difference = (page.expected(0, "neumip") - page.expected(0, "query")).mean(axis=-1)
+    # Blue is too dark, orange too bright.
+    assert colors[difference > 40, 0].mean() > colors[difference > 40, 2].mean()
+    assert colors[difference < -40, 2].mean() > colors[difference < -40, 0].mean()
+
+
+def test_a_picture_of_the_sheet_opens_above(page: Page, stage: Any) -> None:
+    page.js("document.querySelector(\"button.zoom[data-scene='2'][data-fit='1'][data-map=flip]\").click()")
+    page.drawn(2, 0, 1)
+    assert page.js("return document.activeElement.id") == "stage"
+    assert page.js("return document.querySelector('input[name=map][value=flip]').checked")
+
+
+def test_nothing_is_asked_for_outside(page: Page, stage: Any) -> None:
+    page.collect()
+    assert any(url.endswith("report.html") for url in page.requests)
+    here = (page.folder / "report.html").as_uri()
+    assert [url for url in page.requests if url != here and not url.startswith(("data:", "blob:"))] == []
+
+
+def test_everything_has_a_name(page: Page, stage: Any) -> None:
+    code = """
+        const named = e => e.getAttribute('aria-label') || e.alt
+            || (!e.hasAttribute('role') && e.textContent.trim())
+            || [...(e.labels || [])].map(l => l.textContent.trim()).join('')
+            || e.querySelector('[alt],[aria-label]');
+        return [...document.querySelectorAll('img, button, input, [role=img], [role=slider]')]
+            .filter(e => e.checkVisibility() && !named(e)).map(e => e.outerHTML.slice(0, 120));
+    """
+    assert page.js(code) == []
+
+
+def test_the_log_would_show_a_script_s_error(page: Page) -> None:
+    page.collect()
+    before = len(page.errors)
+    page.js("setTimeout(() => { throw new Error('planted'); }, 0)")
+
+    def found() -> bool:
+        page.collect()
+        return any("planted" in e for e in page.errors[before:])
+
+    page.until(found, "the planted error")
+    del page.errors[before:]
+
+
+def test_with_scripts_off_the_pictures_are_there(page: Page, folder: Path) -> None:
+    driver = page.driver
+    driver.switch_to.new_window("window")
+    # Without scripts nothing scrolls to a picture: the first ones must be in sight.
+    driver.set_window_size(1300, 2400)
+    driver.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": True})
+    driver.get((folder / "report.html").as_uri())
+    png = page.find("img[data-linear]").screenshot_as_png
+    shown = np.asarray(
+        Image.open(io.BytesIO(png)).convert("RGB").resize((PIXELS, PIXELS), Image.Resampling.BOX)
+    )
+    expected = page.expected(0, "query")
+    assert np.corrcoef(shown.ravel(), expected.ravel())[0, 1] > 0.9
+    assert not page.find("#viewer").is_displayed()
+    driver.close()
+    driver.switch_to.window(driver.window_handles[0])

@@ -1,0 +1,50 @@
+"""The examples of ``docs/statistics.md`` run as printed and say what the text says."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support.datasets import write_dataset
+from support.paths import ROOT
+
+from mbtf_core import stats
+
+DOCUMENT = (ROOT / "docs/statistics.md").read_text(encoding="utf-8")
+
+
+def run(number: int) -> dict[str, Any]:
+    """Execute the document's example of that number; its variables."""
+    namespace: dict[str, Any] = {}
+    exec(re.findall(r"```python\n(.*?)```", DOCUMENT, re.S)[number], namespace)
+    return namespace
+
+
+def test_the_worked_example(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_dataset(tmp_path / "shards", queries={"train": "2000", "test": "4000"})
+    monkeypatch.chdir(tmp_path)
+    found = run(0)
+    printed = capsys.readouterr().out
+    assert len(re.findall(r" ± ", printed)) >= 8
+    constant = stats.unexplained_variance(found["constant"], found["a"], found["b"])
+    shaded = stats.unexplained_variance(found["shaded"], found["a"], found["b"])
+    assert abs(constant.value - 1.0) < 0.1
+    assert shaded.value < 0.9
+    assert found["better"].p_value < 1e-6
+    assert found["verdict"].p_value < 1e-6
+    # Two digits: the noise that the data were made with.
+    assert "noise of one query: 0.03" in printed
+
+
+def test_the_sampler_example(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(1)["result"].p_value > 1e-3
+    assert "degrees of freedom" in capsys.readouterr().out
+
+
+def test_every_public_name_is_mentioned() -> None:
+    functions = [n for n in stats.__all__ if n[0].islower() and n != "mean_estimate"]
+    assert [n for n in functions if f"`{n}`" not in DOCUMENT] == []

@@ -1,0 +1,163 @@
+"""Estimates, their printing, groups and refusals."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from mbtf_core.errors import InputError
+from mbtf_core.lattice import sigma_of_level
+from mbtf_core.stats import (
+    Estimate,
+    by_group,
+    elevation_groups,
+    level_groups,
+    mean_estimate,
+    mean_of_halves,
+    noise_free_mse,
+    paired_difference,
+    pooled_relative_error,
+    pooled_variance,
+    signal_variance,
+    t_test,
+    unexplained_variance,
+)
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "text"),
+    [
+        (0.31798, 0.0041, "0.318 ± 0.004"),
+        (0.31798, 0.0012, "0.3180 ± 0.0012"),
+        (0.31798, 0.00197, "0.318 ± 0.002"),
+        (-12.3456, 0.3, "-12.3 ± 0.3"),
+        (3.18e-5, 4e-7, "(3.18 ± 0.04)e-05"),
+        (1.5e7, 2e4, "(1.500 ± 0.002)e+07"),
+        (0.0, 0.02, "0.00 ± 0.02"),
+        (0.5, 0.0, "0.5 ± 0"),
+        (0.5, math.inf, "0.5 ± inf"),
+        (math.nan, math.inf, "nan ± inf"),
+    ],
+)
+def test_estimates_print_with_as_many_digits_as_they_know(value: float, error: float, text: str) -> None:
+    assert str(Estimate(value, error, 10)) == text
+
+
+def test_estimates_go_into_json() -> None:
+    assert json.loads(json.dumps(Estimate(math.nan, math.inf, 1).as_dict(), allow_nan=False)) == {
+        "value": None,
+        "error": None,
+        "n": 1,
+    }
+    assert Estimate(2.0, 0.1, 5).as_dict() == {"value": 2.0, "error": 0.1, "n": 5}
+
+
+def test_scaled_and_relative() -> None:
+    estimate = Estimate(2.0, 0.1, 50, 7.0).scaled(-3.0)
+    assert estimate == Estimate(-6.0, pytest.approx(0.3), 50, 7.0)
+    assert estimate.relative_error == pytest.approx(0.05)
+    assert Estimate(0.0, 0.1, 5).relative_error == math.inf
+
+
+def test_mean_estimate_by_hand() -> None:
+    estimate = mean_estimate([[1.0, 3.0], [3.0, 5.0], [5.0, 7.0]])
+    assert estimate.value == 4.0
+    assert estimate.error == pytest.approx(2.0 / math.sqrt(3.0))
+    assert estimate.n == 3
+    assert mean_estimate([1.0]).error == math.inf
+
+
+def test_halves_by_hand() -> None:
+    a, b = np.array([[1.0], [3.0]]), np.array([[3.0], [3.0]])
+    assert pooled_variance(a, b).value == 0.5
+    assert mean_of_halves(a, b) == Estimate(2.5, 0.5, 2, 1.0)
+    assert noise_free_mse(np.array([[2.0], [5.0]]), a, b).value == pytest.approx((-1.0 + 4.0) / 2.0)
+    assert pooled_relative_error(a, b, floor=10.0).value == pytest.approx(math.sqrt(0.5) / 10.0)
+    a, b = np.tile(a, (10, 1)), np.tile(b, (10, 1))
+    assert pooled_relative_error(a, b).value == pytest.approx(math.sqrt(0.5 / 6.0))
+
+
+def test_effective_degrees_of_freedom() -> None:
+    """One query: 1. Many alike: about n. One noisy query among silent ones: 1 again."""
+    rng = np.random.default_rng(1)
+    a, b = rng.normal(size=(2, 10_000))
+    assert mean_of_halves(a[:1], b[:1]).degrees == 1.0
+    assert mean_of_halves(a, b).degrees == pytest.approx(10_000, rel=0.1)
+    a[1:] = b[1:]
+    assert mean_of_halves(a, b).degrees == 1.0
+
+
+def test_one_query_has_no_signal_variance() -> None:
+    one = np.ones((1, 3))
+    assert math.isnan(signal_variance(one, one).value)
+    assert math.isnan(unexplained_variance(one, one, one).value)
+
+
+def test_constant_data_have_no_unexplained_share() -> None:
+    values = np.full((100, 3), 0.2)
+    result = unexplained_variance(values + 0.1, values, values)
+    assert math.isnan(result.value)
+    assert result.error == math.inf
+    with pytest.raises(ValueError, match="cannot be tested"):
+        t_test(result, 0.0)
+
+
+def test_paired_difference() -> None:
+    x = np.array([1.0, 20.0, 300.0])
+    estimate = paired_difference(x + 0.5, x)
+    assert estimate == Estimate(pytest.approx(0.5), pytest.approx(0.0, abs=1e-12), 3)
+    with pytest.raises(ValueError, match="equal shapes"):
+        paired_difference(x, x[:2])
+
+
+def test_numbers_that_are_not_finite_are_refused_with_their_place() -> None:
+    a = np.ones((4, 3))
+    a[2, 1] = np.nan
+    with pytest.raises(
+        InputError, match=r"value_b: 1 numbers are NaN or infinite, the first at index \(2, 1\)"
+    ):
+        pooled_variance(np.ones((4, 3)), a)
+
+
+def test_shapes_that_do_not_fit_are_refused() -> None:
+    a = np.ones((4, 3))
+    with pytest.raises(ValueError, match=r"\(4, 3\) and \(3, 3\)"):
+        pooled_variance(a, a[:3])
+    with pytest.raises(ValueError, match="prediction has the shape"):
+        noise_free_mse(a[:, 0], a, a)
+    with pytest.raises(ValueError, match="no rows"):
+        pooled_variance(a[:0], a[:0])
+    with pytest.raises(ValueError, match="floor must be positive"):
+        pooled_relative_error(a, a, floor=0.0)
+
+
+def test_groups() -> None:
+    values = np.arange(6.0)
+    found = by_group(mean_estimate, np.array([2, 0, 2, 0, -1, 2]), values)
+    assert {label: e.value for label, e in found.items()} == {0: 2.0, 2: pytest.approx(7.0 / 3.0)}
+    assert list(found) == [0, 2]
+    with pytest.raises(ValueError, match="6 integers"):
+        by_group(mean_estimate, np.ones(6), values)
+
+
+def test_level_and_elevation_groups() -> None:
+    sigma = sigma_of_level([0.0, 0.4, 0.6, 3.0, 7.4, -0.2])
+    assert level_groups(sigma).tolist() == [0, 0, 1, 3, 7, 0]
+    assert level_groups(sigma, finest=5).tolist() == [0, 0, 1, 3, 5, 0]
+    omega = np.zeros((5, 3))
+    omega[:, 2] = [0.0, 0.19, 0.2, 0.7, 1.0]
+    assert elevation_groups(omega).tolist() == [0, 0, 1, 3, 3]
+    up = np.tile([0.0, 0.0, 1.0], (5, 1))
+    assert elevation_groups(up, omega).tolist() == [0, 0, 1, 3, 3]
+
+
+def test_the_kit_imports_without_scipy() -> None:
+    """scipy costs a tenth of a second of start-up; only the tests themselves need it."""
+    import subprocess
+    import sys
+
+    code = "import mbtf_core.stats, sys; sys.exit('scipy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

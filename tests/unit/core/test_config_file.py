@@ -1,0 +1,236 @@
+"""Configuration: file, then assignments, then flags; faults are named with key, line and hint."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import pytest
+from pydantic import Field
+
+from mbtf_core.config_file import Settings, build, differences, dump_yaml, in_short, read_yaml, resolve
+from mbtf_core.errors import InputError, UsageError
+
+
+class Light(Settings):
+    width_deg: float = Field(1.0, ge=0, le=30)
+    kind: Literal["lobe", "delta"] = "lobe"
+
+
+class Stage(Settings):
+    name: str
+    spp: int = Field(16, gt=0)
+
+
+class Whole(Settings):
+    height: float = 1.0
+    light: Light = Light()
+    levels: int | None = None
+    stages: tuple[Stage, ...] = ()
+
+
+class Needy(Settings):
+    source: str
+    spp: int = 1
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Any:
+    def write(text: str) -> Path:
+        path = tmp_path / "config.yaml"
+        path.write_text(text)
+        return path
+
+    return write
+
+
+def test_defaults_stand_alone() -> None:
+    assert resolve(Whole) == Whole()
+
+
+def test_an_empty_file_is_all_defaults(write: Any) -> None:
+    assert resolve(Whole, file=write("# nothing yet\n")) == Whole()
+
+
+def test_flags_win_over_assignments_over_the_file(write: Any) -> None:
+    path = write("height: 0.1\nlevels: 3\nlight:\n  width_deg: 2\n")
+    assert resolve(Whole, file=path).height == 0.1
+    whole = resolve(
+        Whole,
+        file=path,
+        assignments=["height=0.2", "levels=4", "light.width_deg=5"],
+        flags={"height": 0.3, "levels": None},
+    )
+    assert (whole.height, whole.levels, whole.light.width_deg) == (0.3, 4, 5.0)
+
+
+def test_later_assignments_win_and_reach_sections_not_in_the_file() -> None:
+    whole = resolve(Whole, assignments=["light.width_deg=5", "light.width_deg=6", "light.kind=delta"])
+    assert whole.light == Light(width_deg=6, kind="delta")
+
+
+def test_assignments_are_read_as_yaml() -> None:
+    whole = resolve(Whole, assignments=["stages=[{name: a, spp: 4}]", "levels=null", "height=1e-6"])
+    assert whole.stages == (Stage(name="a", spp=4),)
+    assert whole.levels is None
+    assert whole.height == 1e-6
+
+
+@pytest.mark.parametrize(
+    ("text", "where", "what", "hint"),
+    [
+        ("hight: 1\n", 1, "unknown key 'hight'", "did you mean 'height'?"),
+        (
+            "height: 1\nlight:\n  widht_deg: 2\n",
+            3,
+            "unknown key 'light.widht_deg'",
+            "did you mean 'width_deg'?",
+        ),
+        ("height: 1\nxyzzy: 1\n", 2, "unknown key 'xyzzy'", "valid keys: height, levels, light, stages"),
+        ("stages:\n- name: a\n- name: b\n  ssp: 2\n", 4, "unknown key 'stages.1.ssp'", "did you mean 'spp'?"),
+        ("\n\nheight: tall\n", 3, "'height': must be a number", ""),
+        ("light:\n  width_deg: 31\n", 2, "'light.width_deg': must be at least 0 and at most 30", ""),
+        ("light:\n  kind: lamp\n", 2, "'light.kind': must be 'lobe' or 'delta'", ""),
+        ("stages:\n- spp: 2\n", 2, "key 'stages.0.name' is missing", "add it"),
+    ],
+)
+def test_faults_name_line_and_cure(write: Any, text: str, where: int, what: str, hint: str) -> None:
+    path = write(text)
+    with pytest.raises(InputError) as caught:
+        resolve(Whole, file=path)
+    assert caught.value.where == f"{path}:{where}"
+    assert caught.value.what.startswith(what)
+    assert caught.value.hint == hint
+
+
+@pytest.mark.parametrize(
+    ("assignment", "what"),
+    [
+        ("hight=2", "unknown key 'hight'"),
+        ("height=tall", "'height': must be a number"),
+        ("light.width_deg=31", "'light.width_deg': must be at least 0 and at most 30"),
+        ("height", "'height' is not of the form key=value"),
+        ("=3", "'=3' is not of the form key=value"),
+    ],
+)
+def test_bad_assignments_are_usage_errors(assignment: str, what: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        resolve(Whole, assignments=[assignment])
+    assert caught.value.what.startswith(what)
+    assert caught.value.exit_code == 2
+
+
+def test_a_file_at_fault_is_blamed_before_the_flags(write: Any) -> None:
+    path = write("source: a\nssp: 2\n")
+    with pytest.raises(InputError) as caught:
+        resolve(Needy, file=path, flags={"spp": 3})
+    assert caught.value.where == f"{path}:2"
+
+
+def test_required_keys_may_come_from_flags(write: Any) -> None:
+    assert resolve(Needy, file=write("spp: 2\n"), flags={"source": "map.exr"}) == Needy(
+        source="map.exr", spp=2
+    )
+    with pytest.raises(UsageError, match="'source' is missing"):
+        resolve(Needy)
+
+
+@pytest.mark.parametrize(
+    ("text", "what", "line"),
+    [
+        ("a: [1\nb: 2\n", "not valid YAML", 2),
+        ("a: 1\na: 2\n", "not valid YAML", 2),
+        ("- 1\n- 2\n", "must hold a mapping", None),
+        ("just text\n", "must hold a mapping", None),
+    ],
+)
+def test_files_that_are_no_mapping_are_refused(write: Any, text: str, what: str, line: int | None) -> None:
+    path = write(text)
+    with pytest.raises(InputError, match=what) as caught:
+        read_yaml(path)
+    assert caught.value.where == (str(path) if line is None else f"{path}:{line}")
+
+
+def test_missing_and_unreadable_files_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such file"):
+        read_yaml(tmp_path / "none.yaml")
+    with pytest.raises(InputError, match="cannot be read"):
+        read_yaml(tmp_path)
+    (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00a: 1")
+    with pytest.raises(InputError, match="is not UTF-8 text"):
+        read_yaml(tmp_path / "binary.yaml")
+
+
+def test_settings_do_not_change_once_read() -> None:
+    whole = Whole()
+    with pytest.raises(ValueError, match="frozen"):
+        whole.height = 2.0  # type: ignore[misc]
+
+
+def test_what_is_dumped_reads_back(tmp_path: Path) -> None:
+    whole = Whole(height=1e-6, light=Light(kind="delta"), stages=(Stage(name="ä: #"),))
+    path = tmp_path / "resolved.yaml"
+    path.write_text(dump_yaml(whole.model_dump(mode="json")), encoding="utf-8")
+    assert resolve(Whole, file=path) == whole
+    assert path.read_text(encoding="utf-8").startswith("height:")
+
+
+def test_unions_of_sections_know_their_keys() -> None:
+    class Either(Settings):
+        part: Annotated[Light | Stage | None, Field()] = None
+
+    with pytest.raises(InputError) as caught:
+        build(Either, {"part": {"widht_deg": 2.0}}, source="x")
+    assert caught.value.hint == "did you mean 'width_deg'?"
+
+
+def test_a_value_that_a_flag_gave_is_blamed_on_the_flag(write: Any) -> None:
+    spelled = {"light.width_deg": "--width"}
+    with pytest.raises(UsageError) as caught:
+        resolve(Whole, flags={"light.width_deg": 31}, spelled=spelled)
+    assert caught.value.message == "--width: 'light.width_deg': must be at least 0 and at most 30 (given 31)"
+    # Another source of the same key is not the flag.
+    with pytest.raises(UsageError) as caught:
+        resolve(Whole, assignments=["light.width_deg=31"], spelled=spelled)
+    assert caught.value.where == "command line"
+    with pytest.raises(InputError) as read:
+        resolve(Whole, file=write("light: {width_deg: 31}\n"), spelled=spelled)
+    assert str(read.value.where).endswith("config.yaml:1")
+
+
+class Items(Settings):
+    widths: list[Annotated[float, Field(gt=0, le=10)]] = Field([1.0], min_length=1)
+    count: int = 1
+    on: bool = False
+    pair: tuple[int, int] | None = None
+
+
+@pytest.mark.parametrize(
+    ("data", "says"),
+    [
+        ({"widths": [1, 0]}, "'widths.1': must be above 0 and at most 10 (given 0)"),
+        ({"widths": []}, "'widths': must hold at least 1 (given [])"),
+        ({"widths": 3}, "'widths': must be a list (given 3)"),
+        ({"count": 1.5}, "'count': must be a whole number (given 1.5)"),
+        ({"count": "few"}, "'count': must be a whole number (given 'few')"),
+        ({"on": "perhaps"}, "'on': must be true or false (given 'perhaps')"),
+    ],
+)
+def test_faults_are_worded_for_people(data: dict[str, Any], says: str) -> None:
+    with pytest.raises(InputError) as caught:
+        build(Items, data, source="x")
+    assert caught.value.what == says
+
+
+def test_differences_lead_with_settings_and_shorten_digests() -> None:
+    before = {"inputs": {"height": "a1" * 32}, "spp": 4, "width": None, "same": 1}
+    after = {"inputs": {"height": "b2" * 32, "normal": "c3" * 32}, "spp": 8, "width": 2.0, "same": 1}
+    changes = differences(before, after)
+    assert changes == [
+        "spp: 4 -> 8",
+        "width: unset -> 2.0",
+        "inputs.height: a1a1a1a1… -> b2b2b2b2…",
+        "inputs.normal: unset -> c3c3c3c3…",
+    ]
+    assert in_short(changes, 2) == "spp: 4 -> 8; width: unset -> 2.0; and 2 more"
+    assert in_short(changes, 4) == "; ".join(changes)

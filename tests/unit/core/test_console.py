@@ -1,0 +1,298 @@
+"""Exit codes, messages, JSON and progress of the command lines."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cyclopts import App
+
+from mbtf_core.console import CONSOLE, Console, clock, new_app, run
+from mbtf_core.errors import EngineError, InputError, MbtfError, PartialError, UsageError
+
+
+@pytest.fixture
+def app() -> App:
+    """A program with a default command and two named ones, which print what they were given."""
+    app = new_app("prog", "A program.")
+
+    @app.default
+    def make(
+        source: Path, /, *, queries: str = "4", size: tuple[int, int] = (1, 1), console: Console = CONSOLE
+    ) -> None:
+        print("make", source, queries, size, console.json)
+
+    @app.command
+    def plan(source: Path, /, *, depth: int = 6, deep: bool = False, console: Console = CONSOLE) -> None:
+        print("plan", source, depth, deep, console.json)
+
+    @app.command
+    def doctor(*, code: int = 0, console: Console = CONSOLE) -> int:
+        console.report({"code": code}, f"code {code}")
+        return code
+
+    return app
+
+
+def failing(error: BaseException) -> App:
+    app = new_app("prog", "A program.")
+
+    @app.default
+    def fail() -> None:
+        raise error
+
+    return app
+
+
+@pytest.mark.parametrize(
+    ("arguments", "printed"),
+    [
+        ("map.exr", "make map.exr 4 (1, 1) False"),
+        ("map.exr --queries 400/texel", "make map.exr 400/texel (1, 1) False"),
+        ("--queries 400/texel map.exr", "make map.exr 400/texel (1, 1) False"),
+        ("map.exr --queries -10,0", "make map.exr -10,0 (1, 1) False"),
+        ("--queries -.5,-1e3 map.exr", "make map.exr -.5,-1e3 (1, 1) False"),
+        ("--queries=9 --size 2 3 map.exr --json", "make map.exr 9 (2, 3) True"),
+        ("--json --size 2 3 --queries 9 map.exr", "make map.exr 9 (2, 3) True"),
+        ("plan map.exr --depth 2", "plan map.exr 2 False False"),
+        ("--depth 2 plan map.exr", "plan map.exr 2 False False"),
+        ("--json plan --depth 2 map.exr", "plan map.exr 2 False True"),
+        ("--deep --depth=2 --json plan map.exr", "plan map.exr 2 True True"),
+        ("--queries plan map.exr", "make map.exr plan (1, 1) False"),
+        ("map.exr --queries plan", "make map.exr plan (1, 1) False"),
+        ("./plan", "make plan 4 (1, 1) False"),
+    ],
+)
+def test_flags_stand_anywhere(
+    app: App, arguments: str, printed: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(app, arguments.split()) == 0
+    assert capsys.readouterr().out.strip() == printed
+
+
+def test_json_is_one_object(app: App, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(app, ["--json", "doctor", "--code", "3"]) == 3
+    assert json.loads(capsys.readouterr().out) == {"code": 3}
+    assert run(app, ["doctor"]) == 0
+    assert capsys.readouterr().out == "code 0\n"
+
+
+def test_json_takes_arrays_paths_and_missing_numbers(capsys: pytest.CaptureFixture[str]) -> None:
+    data = {
+        "array": np.array([[1.5, math.nan]], np.float32),
+        "number": np.float32(0.25),
+        "count": np.int64(3),
+        "infinite": math.inf,
+        "path": Path("a/b"),
+        "rows": (1, 2),
+        "flag": True,
+    }
+    Console(json=True).report(data, "text")
+    assert json.loads(capsys.readouterr().out) == {
+        "array": [[1.5, None]],
+        "number": 0.25,
+        "count": 3,
+        "infinite": None,
+        "path": "a/b",
+        "rows": [1, 2],
+        "flag": True,
+    }
+
+
+@pytest.mark.parametrize(
+    ("error", "code"), [(UsageError, 2), (InputError, 3), (EngineError, 3), (PartialError, 4), (MbtfError, 1)]
+)
+def test_our_errors_are_two_lines(
+    error: type[MbtfError], code: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(failing(error("is torn", where="a.exr", hint="mend it")), []) == code
+    captured = capsys.readouterr()
+    assert captured.err == "error: a.exr: is torn\n  mend it\n"
+    assert captured.out == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ("map.exr --querie 3", "--queries"),
+        ("map.exr --size 1 x", "--size"),
+        ("doctor --code many", "prog doctor --help"),
+        ("map.exr second.exr", "second.exr"),
+        ("", "SOURCE"),
+        ("map.exr --queries", "--queries"),
+        ("map.exr --queries 1 --queries 2", "--queries"),
+        ("doctr", "prog doctor"),
+        ("--json plna", "prog plan"),
+    ],
+)
+def test_usage_errors_are_short_and_exit_2(
+    app: App, arguments: str, expected: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(app, arguments.split()) == 2
+    captured = capsys.readouterr()
+    lines = captured.err.splitlines()
+    assert len(lines) <= 2
+    assert lines[0].startswith("error: ")
+    assert expected in captured.err
+    assert captured.out == ""
+
+
+def test_a_file_named_like_a_misspelt_command_is_a_file(
+    app: App, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("doctr").touch()
+    assert run(app, ["doctr"]) == 0
+    assert capsys.readouterr().out.startswith("make doctr")
+
+
+def test_interrupt_exits_130(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(failing(KeyboardInterrupt()), []) == 130
+    assert capsys.readouterr().err == "error: interrupted\n"
+
+
+def test_defects_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(failing(ZeroDivisionError("first\nsecond")), []) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("error: internal error: ZeroDivisionError: first second")
+    assert "--debug" in error
+    assert len(error.splitlines()) == 1
+
+
+@pytest.mark.parametrize("error", [InputError("torn"), ZeroDivisionError("x"), KeyboardInterrupt()])
+def test_debug_shows_the_traceback(error: BaseException, capsys: pytest.CaptureFixture[str]) -> None:
+    run(failing(error), [])
+    assert "Traceback" not in capsys.readouterr().err
+    run(failing(error), ["--debug"])
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_system_errors_name_the_file(capsys: pytest.CaptureFixture[str]) -> None:
+    app = new_app("prog", "A program.")
+
+    @app.default
+    def read() -> None:
+        Path("/nonexistent/map").read_bytes()
+
+    assert run(app, []) == 3
+    assert capsys.readouterr().err == "error: /nonexistent/map: No such file or directory\n"
+
+
+def test_warnings_of_the_packages_reach_standard_error(capsys: pytest.CaptureFixture[str]) -> None:
+    app = new_app("prog", "A program.")
+
+    @app.default
+    def warn(console: Console = CONSOLE) -> None:
+        logging.getLogger("mbtf_gen.anything").info("mesh: 64 cells")
+        logging.getLogger("mbtf_gen.anything").warning("8-bit heights were smoothed")
+        logging.getLogger("mbtf_gen.anything").debug("detail")
+
+    assert run(app, []) == 0
+    assert capsys.readouterr().err == "mesh: 64 cells\nwarning: 8-bit heights were smoothed\n"
+    assert run(app, ["--quiet"]) == 0
+    assert capsys.readouterr().err == "warning: 8-bit heights were smoothed\n"
+
+
+def test_plain_progress_ends_with_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+    with CONSOLE.progress(4, "rendering", "shards") as bar:
+        for index in range(4):
+            bar.advance(note=f"shard {index}")
+    captured = capsys.readouterr()
+    assert re.fullmatch(
+        r"rendering: 4/4 shards \(100%\), \d+:\d\d elapsed, shard 3", captured.err.splitlines()[-1]
+    )
+    assert captured.out == ""
+
+
+def test_progress_comes_at_intervals(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = 0.0
+    monkeypatch.setattr("mbtf_core.console.time.monotonic", lambda: now)
+    with CONSOLE.progress(100, "fitting", "steps") as bar:
+        for _ in range(50):
+            now += 0.5
+            bar.advance()
+    assert capsys.readouterr().err.splitlines() == [
+        "fitting: 20/100 steps (20%), 0:10 elapsed, 0:40 left",
+        "fitting: 40/100 steps (40%), 0:20 elapsed, 0:30 left",
+        "fitting: 50/100 steps (50%), 0:25 elapsed, 0:25 left",
+    ]
+
+
+def test_per_cent_are_said_once(capsys: pytest.CaptureFixture[str]) -> None:
+    with CONSOLE.progress(100, "fitting", "%") as bar:
+        bar.update(29.6)
+    assert capsys.readouterr().err.startswith("fitting: 30%, ")
+
+
+def test_progress_survives_errors_and_unknown_totals(capsys: pytest.CaptureFixture[str]) -> None:
+    def read() -> None:
+        with CONSOLE.progress(None, "reading", "rows") as bar:
+            bar.update(7)
+            raise InputError("torn")
+
+    with pytest.raises(InputError):
+        read()
+    assert capsys.readouterr().err.startswith("reading: 7 rows, ")
+
+
+def test_progress_that_never_began_is_silent(capsys: pytest.CaptureFixture[str]) -> None:
+    with CONSOLE.progress(4, "rendering", "shards"):
+        pass
+    assert capsys.readouterr().err == ""
+
+
+def test_quiet_shows_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    console = Console(quiet=True)
+    console.note("started")
+    with console.progress(2, "rendering") as bar:
+        bar.advance(2)
+    assert bar.done == 2
+    assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no pseudo-terminals")
+def test_progress_on_a_terminal_is_a_bar() -> None:
+    import os
+    import pty
+    import subprocess
+
+    code = (
+        "from mbtf_core.console import CONSOLE\n"
+        "with CONSOLE.progress(3, 'rendering') as bar:\n"
+        "    bar.advance(3, 'last')\n"
+        "CONSOLE.report({}, 'result')\n"
+    )
+    reader, writer = pty.openpty()
+    environment = {**os.environ, "TERM": "xterm", "COLUMNS": "100"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=writer, env=environment, check=True
+    )
+    os.close(writer)
+    shown = os.read(reader, 65536).decode()
+    os.close(reader)
+    assert "━" in shown
+    assert "100%" in shown
+    assert done.stdout == b"result\n"
+
+
+def test_help_and_version_answer(app: App, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(app, ["--help"]) == 0
+    text = capsys.readouterr().out
+    assert all(word in text for word in ("plan", "doctor", "--queries", "--json", "--debug"))
+    assert run(app, ["--version"]) == 0
+    assert re.fullmatch(r"prog \d+\.\d+\.\d+\S*\n", capsys.readouterr().out)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(0.2, "0:00"), (59.6, "1:00"), (723, "12:03"), (3723, "1:02:03")]
+)
+def test_clock(seconds: float, text: str) -> None:
+    assert clock(seconds) == text

@@ -1,0 +1,210 @@
+"""Locks of shards: one writer at a time, abandoned ones are taken over."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from mbtf_core.errors import PartialError
+from mbtf_core.locks import STALE_SECONDS, Lock, brief_lock, lock_owner, shard_lock, take_lock
+
+
+def lock_of(shard: Path) -> Path:
+    return shard.with_name(f".{shard.stem}.lock")
+
+
+def plant(shard: Path, text: str, age: float = 0.0) -> Path:
+    """A lock that somebody else left."""
+    lock = lock_of(shard)
+    lock.write_text(text)
+    then = time.time() - age
+    os.utime(lock, (then, then))
+    return lock
+
+
+def owner(host: str, process: int) -> str:
+    return json.dumps({"host": host, "process": process, "since": 0})
+
+
+@pytest.fixture
+def shard(tmp_path: Path) -> Path:
+    return tmp_path / "train-00003.npz"
+
+
+def test_a_lock_is_exclusive_names_its_writer_and_is_removed(shard: Path) -> None:
+    with shard_lock(shard) as held:
+        assert held
+        stored = json.loads(lock_of(shard).read_text())
+        assert (stored["host"], stored["process"]) == (socket.gethostname(), os.getpid())
+        assert stored["since"] == pytest.approx(time.time(), abs=60)
+        with shard_lock(shard) as second:
+            assert not second
+        assert lock_of(shard).exists()
+        with shard_lock(shard.with_name("train-00004.npz")) as other:
+            assert other
+    assert not lock_of(shard).exists()
+
+
+def test_an_error_inside_releases_the_lock(shard: Path) -> None:
+    with pytest.raises(RuntimeError, match="boom"), shard_lock(shard):
+        raise RuntimeError("boom")
+    assert not lock_of(shard).exists()
+    with shard_lock(shard) as held:
+        assert held
+
+
+def hold(shard: Path) -> subprocess.Popen[bytes]:
+    """Another process that holds the lock until its standard input ends."""
+    code = f"""
+import sys
+from pathlib import Path
+from mbtf_core.locks import shard_lock
+with shard_lock(Path({str(shard)!r})) as held:
+    print(held, flush=True)
+    sys.stdin.read()
+"""
+    child = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    assert child.stdout is not None
+    assert child.stdout.readline() == b"True\n"
+    return child
+
+
+def test_the_lock_of_a_living_process_is_respected_however_old(shard: Path) -> None:
+    child = hold(shard)
+    try:
+        assert json.loads(lock_of(shard).read_text())["process"] == child.pid
+        os.utime(lock_of(shard), (0, 0))
+        with shard_lock(shard) as held:
+            assert not held
+    finally:
+        child.communicate()
+    assert not lock_of(shard).exists()
+
+
+def test_the_lock_of_a_killed_process_is_taken_over_at_once(shard: Path) -> None:
+    child = hold(shard)
+    child.kill()
+    child.communicate()
+    assert lock_of(shard).exists()
+    with shard_lock(shard) as held:
+        assert held
+        assert json.loads(lock_of(shard).read_text())["process"] == os.getpid()
+    assert not lock_of(shard).exists()
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"host": "x"}'[:9], '{"process": 3}'])
+def test_what_a_kill_left_half_written_is_taken_over_at_once(text: str, shard: Path) -> None:
+    plant(shard, text)
+    with shard_lock(shard) as held:
+        assert held
+
+
+def test_of_many_that_take_over_at_once_one_gets_it(shard: Path) -> None:
+    plant(shard, owner(socket.gethostname(), 1))
+    inside, most, gate = 0, 0, threading.Barrier(8)
+    count = threading.Lock()
+
+    def contend() -> None:
+        nonlocal inside, most
+        gate.wait()
+        for _ in range(200):
+            with shard_lock(shard) as held:
+                if held:
+                    with count:
+                        inside += 1
+                        most = max(most, inside)
+                    time.sleep(0)
+                    with count:
+                        inside -= 1
+
+    threads = [threading.Thread(target=contend) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert most == 1
+    assert not lock_of(shard).exists()
+
+
+def test_without_advisory_locks_the_file_still_keeps_other_machines_out(
+    shard: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def unsupported(handle: int, operation: int) -> None:
+        raise OSError(errno.ENOSYS, "not implemented")
+
+    monkeypatch.setattr("fcntl.flock", unsupported)
+    plant(shard, owner(f"{socket.gethostname()}-other", 1))
+    with shard_lock(shard) as held:
+        assert not held
+    plant(shard, "")
+    with shard_lock(shard) as held:
+        assert held
+
+
+def test_locks_of_other_machines_count_by_age(shard: Path) -> None:
+    text = owner(f"{socket.gethostname()}-other", 1)
+    plant(shard, text, age=STALE_SECONDS - 60)
+    with shard_lock(shard) as held:
+        assert not held
+    plant(shard, text, age=STALE_SECONDS + 60)
+    with shard_lock(shard) as held:
+        assert held
+
+
+def test_without_advisory_locks_a_living_process_keeps_its_lock(
+    shard: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def unsupported(handle: int, operation: int) -> None:
+        raise OSError(errno.ENOSYS, "not implemented")
+
+    monkeypatch.setattr("fcntl.flock", unsupported)
+    plant(shard, owner(socket.gethostname(), os.getppid()))
+    with shard_lock(shard) as held:
+        assert not held
+    plant(shard, owner(socket.gethostname(), 2**31 - 1))
+    with shard_lock(shard) as held:
+        assert held
+
+
+def test_a_lock_says_who_holds_it_and_for_how_long(shard: Path) -> None:
+    assert lock_owner(shard) is None
+    since = time.time() - 7300
+    plant(shard, json.dumps({"host": "oak", "process": 12, "since": since}))
+    assert str(lock_owner(shard)) == "process 12 on oak, for 2 h"
+    for text in ("", "{", '{"host": "oak"}', '{"host": "oak", "process": "x", "since": 0}'):
+        plant(shard, text)
+        assert lock_owner(shard) is None
+
+
+def test_a_sign_of_life_keeps_other_machines_out(shard: Path) -> None:
+    lock = take_lock(shard)
+    assert lock is not None
+    os.utime(lock_of(shard), (0, 0))
+    Lock.renew()
+    assert time.time() - lock_of(shard).stat().st_mtime < 60
+    lock.release()
+    lock.release()
+    assert not lock_of(shard).exists()
+
+
+def test_a_brief_lock_is_waited_for_but_not_for_ever(shard: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    held = take_lock(shard)
+    assert held is not None
+    threading.Timer(0.1, held.release).start()
+    with brief_lock(shard):
+        pass
+    held = take_lock(shard)
+    assert held is not None
+    monkeypatch.setattr("mbtf_core.locks._PATIENCE_SECONDS", 0.05)
+    with pytest.raises(PartialError, match=f"process {os.getpid()} on"), brief_lock(shard):
+        pass
+    held.release()

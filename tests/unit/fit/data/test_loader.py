@@ -1,0 +1,159 @@
+"""Reading shards for training: what is held out, what is refused."""
+
+from __future__ import annotations
+
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.fit_data import constant, parallax, write_data
+
+from mbtf_core.errors import InputError
+from mbtf_fit.config import HeldOutSection
+from mbtf_fit.data.loader import (
+    Partition,
+    Queries,
+    batch_starts,
+    in_region,
+    load_split,
+    load_training,
+    open_data,
+)
+from mbtf_gen.dataset.reader import Dataset
+
+HELD_OUT = HeldOutSection(queries=0.1, radius=0.3)
+
+
+def partition(folder: Path, seed: int = 0, held_out: HeldOutSection = HELD_OUT) -> Partition:
+    return load_training(Dataset.open(folder), held_out, seed)
+
+
+def rows(*arrays: np.ndarray) -> set[bytes]:
+    """Each query as bytes, to compare sets of them."""
+    flat = np.concatenate([a.reshape(len(a), -1) for a in arrays], 1)
+    return {row.tobytes() for row in flat}
+
+
+def keys(part: Queries) -> set[bytes]:
+    return rows(part.u, part.sigma, part.omega_i)
+
+
+def test_every_query_is_either_trained_on_or_held_out(tmp_path: Path) -> None:
+    folder = write_data(tmp_path / "d", parallax, train=3000)
+    part = partition(folder)
+    t = part.training
+    trained = rows(t.u.numpy(), t.sigma.numpy(), t.omega_i.numpy())
+    sets = [trained, keys(part.held_out_queries), keys(part.held_out_directions)]
+    assert sum(map(len, sets)) == 3000
+    assert set.union(*sets) == keys(load_split(Dataset.open(folder), "train"))
+    assert 200 < len(sets[1]) < 400
+
+
+def test_the_sample_is_of_what_is_trained_on(tmp_path: Path) -> None:
+    """It says how good a fit is on data that it knows, and how noisy they are: no held-out query is in it."""
+    part = partition(write_data(tmp_path / "d", parallax, train=3000))
+    t = part.training
+    trained = rows(t.u.numpy(), t.sigma.numpy(), t.omega_i.numpy())
+    assert keys(part.sample) == trained
+
+
+@pytest.mark.parametrize(("total", "size"), [(10, 4), (9, 5), (8, 8), (7, 1)])
+def test_no_query_is_left_out_for_good(total: int, size: int) -> None:
+    """Where batches do not come out even, each epoch leaves out others."""
+    starts = list(islice(batch_starts(total, size, 0, 0), 60 * (total // size)))
+    assert {k for start in starts for k in range(start, start + size)} == set(range(total))
+
+
+def test_the_order_of_batches_follows_the_seed() -> None:
+    first, again, other = (list(islice(batch_starts(1000, 10, seed, 0), 50)) for seed in (0, 0, 1))
+    assert first == again != other
+
+
+def test_shards_are_divided_each_in_its_own_way(tmp_path: Path) -> None:
+    """Rows of equal number share no fate."""
+    folder = write_data(tmp_path / "d", parallax, train=2000)
+    t = partition(folder, held_out=HeldOutSection(queries=0.3, radius=0)).selection
+    kept = [{int(row) for _, some in t.pieces(*t.starts[k : k + 2]) for row in some} for k in (0, 1)]
+    # Of rows that the one keeps the other keeps 70 % too.
+    assert 0.6 < len(kept[0] & kept[1]) / len(kept[0]) < 0.8
+
+
+def test_held_out_directions_are_never_trained_on(tmp_path: Path) -> None:
+    part = partition(write_data(tmp_path / "d", parallax, train=20_000))
+    for omega in (part.training.omega_i.numpy(), part.training.omega_o.numpy()):
+        assert not in_region(HELD_OUT, omega).any()
+    out = part.held_out_directions
+    assert (in_region(HELD_OUT, out.omega_i) | in_region(HELD_OUT, out.omega_o)).all()
+    # A disk of radius 0.3 holds 9/99 of the directions, for light and for view.
+    assert len(out) / 20_000 == pytest.approx(1 - (1 - 0.09 / 0.99) ** 2, abs=0.015)
+    for omega in (part.held_out_queries.omega_i, part.held_out_queries.omega_o):
+        assert not in_region(HELD_OUT, omega).any()
+
+
+def test_the_division_is_reproducible_and_follows_the_seed(tmp_path: Path) -> None:
+    folder = write_data(tmp_path / "d", parallax, train=2000)
+    first, again, other = (partition(folder, seed) for seed in (0, 0, 1))
+    assert keys(first.held_out_queries) == keys(again.held_out_queries) != keys(other.held_out_queries)
+    assert keys(first.held_out_directions) == keys(other.held_out_directions)
+
+
+def test_values_are_the_mean_of_both_halves(tmp_path: Path) -> None:
+    folder = write_data(tmp_path / "d", constant(0.3), train=500, noise=0.1)
+    everything = HeldOutSection(queries=0, radius=0)
+    found = partition(folder, held_out=everything)
+    data = load_split(Dataset.open(folder), "train")
+    np.testing.assert_allclose(found.training.value.numpy(), (data.value_a + data.value_b) / 2, rtol=1e-6)
+    np.testing.assert_array_equal(found.training.u.numpy(), data.u)
+    assert len(found.held_out_queries) == len(found.held_out_directions) == 0
+
+
+def test_exr_shards_hold_the_same(tmp_path: Path) -> None:
+    npz = partition(write_data(tmp_path / "npz", parallax, train=1000))
+    exr = partition(write_data(tmp_path / "exr", parallax, train=1000, suffix=".exr"))
+    for name in ("u", "sigma", "omega_i", "omega_o", "value"):
+        assert (getattr(npz.training, name) == getattr(exr.training, name)).all(), name
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+@pytest.mark.parametrize("name", ["value_b", "sigma"])
+def test_a_shard_with_nan_or_infinity_is_refused_by_name(tmp_path: Path, bad: float, name: str) -> None:
+    folder = write_data(tmp_path / "d", parallax, train=1000)
+    from mbtf_gen.dataset.shard_io import read_shard, write_shard
+
+    path = folder / "train-00001.npz"
+    arrays = read_shard(path, mapped=False)
+    arrays[name][7] = bad
+    write_shard(path, arrays)
+    with pytest.raises(InputError, match=rf"train-00001\.npz: '{name}' holds NaN or infinite .* row 7"):
+        partition(folder)
+
+
+def test_large_finite_values_are_no_fault(tmp_path: Path) -> None:
+    part = partition(write_data(tmp_path / "d", constant(3e38), train=1000))
+    assert np.isfinite(part.held_out_queries.value_a).all()
+
+
+def test_nothing_to_train_on_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="holds no queries"):
+        partition(write_data(tmp_path / "none", parallax, train=0, shards=0))
+    with pytest.raises(InputError, match="holds no queries"):
+        partition(write_data(tmp_path / "empty", parallax, train=0, shards=1))
+    folder = write_data(tmp_path / "all", parallax, train=100)
+    with pytest.raises(InputError, match="held out"):
+        partition(folder, held_out=HeldOutSection(direction=(0, 0), radius=0.999, queries=0.4))
+    with pytest.raises(InputError, match="test split holds no queries"):
+        load_split(Dataset.open(write_data(tmp_path / "t", parallax, train=9, test=0)), "test")
+
+
+def test_another_layout_is_refused_with_the_fix(tmp_path: Path) -> None:
+    folder = write_data(tmp_path / "d", parallax, train=100, layout="image")
+    with pytest.raises(InputError, match=r"image layout, but neumip .*\n.*--layout shuffled"):
+        open_data(folder, "shuffled", "neumip")
+
+
+def test_rows_that_contradict_the_sidecar_are_refused(tmp_path: Path) -> None:
+    folder = write_data(tmp_path / "d", parallax, train=100, shards=1)
+    (folder / "train-00000.json").write_text('{"rows": 90}')
+    with pytest.raises(InputError, match=r"train-00000.*100 rows, its sidecar says 90"):
+        partition(folder)

@@ -1,0 +1,130 @@
+"""Training queries that stay on disk: the same batches, and memory that does not grow with the data."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import RunPython
+from support.fit_data import parallax, write_data
+
+import mbtf_fit.evaluation
+from mbtf_core.errors import InputError
+from mbtf_core.sizes import format_size, parse_size
+from mbtf_fit.config import FitConfig, HeldOutSection
+from mbtf_fit.data.loader import Partition, load_training
+from mbtf_fit.data.streaming import Selection, StreamedQueries
+from mbtf_fit.evaluation import Predict, SplitErrors
+from mbtf_fit.training.fit import fit
+from mbtf_gen.dataset.reader import Dataset
+
+HELD_OUT = HeldOutSection(queries=0.1, radius=0.3)
+
+
+def test_batches_are_those_of_data_in_memory(tmp_path: Path) -> None:
+    data = Dataset.open(write_data(tmp_path / "d", parallax, train=9000, shards=3))
+    memory = load_training(data, HELD_OUT, 0)
+    disk = load_training(data, HELD_OUT, 0, memory=1.0)
+    assert isinstance(disk.training, StreamedQueries)
+    assert len(disk.training) == len(memory.training)
+    for k, (a, b) in enumerate(
+        zip(memory.training.batches(1000, 0, 5), disk.training.batches(1000, 0, 5), strict=False)
+    ):
+        for name in ("u", "sigma", "omega_i", "omega_o", "value"):
+            assert (getattr(a, name) == getattr(b, name)).all(), name
+        if k == 15:
+            break
+
+
+def test_a_fit_from_disk_is_the_same_fit(tmp_path: Path) -> None:
+    shards = write_data(tmp_path / "d", parallax, train=3000, test=500)
+    found = []
+    for memory in ("1GB", "1kB"):
+        config = FitConfig.model_validate(
+            {"training": {"steps": 6, "batch": 500}, "data": {"memory": memory}}
+        )
+        material = fit(config, shards, tmp_path / memory).material
+        found.append(material.model.weights())
+    assert all((found[0][name] == found[1][name]).all() for name in found[0])
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".exr"])
+def test_evaluation_leaves_training_queries_on_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str
+) -> None:
+    """Data that a fit streams can be evaluated too, and are judged by the queries that the fit held out."""
+    folder = write_data(tmp_path / "d", parallax, train=3000, test=500, suffix=suffix)
+    held_out = {"queries": 0.2, "radius": 0.3}
+    config = FitConfig.model_validate(
+        {"training": {"steps": 2, "batch": 500}, "held_out": held_out, "seed": 3}
+    )
+    result = fit(config, folder, tmp_path / "m")
+    judged, found = mbtf_fit.evaluation.judge, []
+
+    def watched(predict: Predict, data: Dataset, partition: Partition) -> dict[str, SplitErrors]:
+        found.append(partition.training)
+        return judged(predict, data, partition)
+
+    monkeypatch.setattr(mbtf_fit.evaluation, "judge", watched)
+    evaluated = mbtf_fit.evaluation.evaluate(result.material, folder).values
+    errors = {name: e.as_dict() for name, e in evaluated.items()}
+    assert isinstance(found[0], StreamedQueries)
+    assert set(errors) == set(result.errors)
+    for name, expected in result.errors.items():
+        assert errors[name]["n"] == expected["n"]
+        assert errors[name]["mse"]["value"] == pytest.approx(expected["mse"]["value"], rel=1e-3)
+
+
+def test_rows_are_found_among_any_that_are_left_out() -> None:
+    random = np.random.default_rng(0)
+    selection, wanted = Selection(), []
+    for k, rows in enumerate((10_000, 1, 4096, 20_001)):
+        chosen = random.random(rows) < (0.9, 0.0, 1.0, 0.01)[k]
+        chosen[:5000] &= k != 3
+        selection.add(Path(str(k)), chosen)
+        wanted += [(str(k), int(row)) for row in np.flatnonzero(chosen)]
+    assert len(selection) == len(wanted)
+    for start, stop in ((0, 1), (0, len(wanted)), (8990, 9100), (13_000, len(wanted)), (4096, 8192)):
+        found = [(p.name, int(r)) for p, rows in selection.pieces(start, stop) for r in rows]
+        assert found == wanted[start:stop]
+
+
+def test_exr_shards_too_large_for_memory_are_refused(tmp_path: Path) -> None:
+    data = Dataset.open(write_data(tmp_path / "d", parallax, train=1000, suffix=".exr"))
+    with pytest.raises(InputError, match=r"more than data\.memory allows.*\n.*--format npz"):
+        load_training(data, HELD_OUT, 0, memory=1e4)
+
+
+@pytest.mark.parametrize(("text", "size"), [("500MB", 5e8), ("4GB", 4e9), ("1.5 kB", 1500.0), (2e6, 2e6)])
+def test_amounts_of_memory_are_read_and_written(text: str | float, size: float) -> None:
+    assert parse_size(text) == size
+    assert parse_size(format_size(size)) == size
+
+
+@pytest.mark.parametrize("text", ["", "-1GB", "0", "much", "nan"])
+def test_nonsense_amounts_are_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="memory"):
+        parse_size(text)
+
+
+def test_memory_does_not_grow_with_the_data(tmp_path: Path, run_python: RunPython) -> None:
+    """48 MB of shards more take less than 14 MB more at the peak, all of them read and trained on; in memory
+    they would take 38."""
+    peaks = []
+    for shards in (2, 10):
+        folder = write_data(tmp_path / str(shards), parallax, train=100_000 * shards, test=10, shards=shards)
+        code = (
+            "import resource, sys\n"
+            "from mbtf_fit.config import HeldOutSection\n"
+            "from mbtf_fit.data.loader import load_training\n"
+            "from mbtf_gen.dataset.reader import Dataset\n"
+            f"part = load_training(Dataset.open({str(folder)!r}), HeldOutSection(), 0, memory=1e6)\n"
+            "for k, batch in enumerate(part.training.batches(10_000, 0, 0)):\n"
+            f"    if k == {10 * shards}: break\n"
+            "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)\n"
+        )
+        done = run_python("-c", code)
+        assert done.returncode == 0, done.stderr
+        peaks.append(int(done.stdout) / 1024)
+    assert peaks[1] - peaks[0] < 14, peaks

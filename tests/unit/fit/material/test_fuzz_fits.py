@@ -1,0 +1,159 @@
+"""Damaged fitted materials and checkpoints: they load, or are refused in a line or two."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from safetensors.torch import load, save
+from support.damage import altered, damaged, examples, loads_or_refuses
+from support.fit_data import constant, write_data
+
+from mbtf_core.atomic import digest
+from mbtf_core.errors import InputError
+from mbtf_fit import FitConfig, Material, fit, read_history
+from mbtf_fit.material.storage import read_tensors
+
+CONFIG = FitConfig.model_validate(
+    {"training": {"steps": 2, "batch": 50, "warmup": 1}, "network": {"channels": 2, "width": 4, "layers": 2}}
+)
+DESCRIPTION, WEIGHTS = "material.json", "weights.safetensors"
+
+
+@pytest.fixture(scope="module")
+def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_data(tmp_path_factory.mktemp("data"), constant(0.2), train=200, test=50, shards=1, finest=2)
+
+
+@pytest.fixture(scope="module")
+def whole(shards: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished material."""
+    return fit(CONFIG, shards, tmp_path_factory.mktemp("fit") / "material").folder
+
+
+@pytest.fixture(scope="module")
+def folder(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy to be damaged."""
+    return Path(shutil.copytree(whole, tmp_path_factory.mktemp("copy") / "material"))
+
+
+def use(folder: Path) -> None:
+    """Load a material and evaluate it."""
+    Material.load(folder).deviation()
+    read_history(folder)
+
+
+def write(folder: Path, whole: Path, description: str | None, weights: bytes | None) -> None:
+    """Put files into the copy; the description names the digest of the weights that are there."""
+    before = (whole / WEIGHTS).read_bytes()
+    (folder / WEIGHTS).write_bytes(before if weights is None else weights)
+    text = description if description is not None else (whole / DESCRIPTION).read_text()
+    (folder / DESCRIPTION).write_text(text.replace(digest(whole / WEIGHTS), digest(folder / WEIGHTS)))
+
+
+@given(data=st.data())
+@examples(40)
+def test_an_altered_description(data: st.DataObject, whole: Path, folder: Path) -> None:
+    write(folder, whole, data.draw(altered(described(whole))), None)
+    loads_or_refuses(lambda: use(folder))
+
+
+def described(whole: Path) -> str:
+    """The description without what differs from run to run."""
+    found = json.loads((whole / DESCRIPTION).read_text())
+    del found["conventions"], found["formula"]
+    return json.dumps(found)
+
+
+@given(data=st.data())
+@examples(40)
+def test_damaged_weights(data: st.DataObject, whole: Path, folder: Path) -> None:
+    _, content = data.draw(damaged({WEIGHTS: (whole / WEIGHTS).read_bytes()}))
+    write(folder, whole, None, content)
+    loads_or_refuses(lambda: use(folder))
+
+
+@given(content=st.binary(max_size=60))
+@examples(40)
+def test_a_damaged_history(content: bytes, whole: Path, folder: Path) -> None:
+    (folder / "metrics.jsonl").write_bytes((whole / "metrics.jsonl").read_bytes() + content)
+    assert len(read_history(folder)) >= len(read_history(whole))
+
+
+def odd_tensors(whole: Path) -> dict[str, tuple[dict[str, torch.Tensor], str]]:
+    """What the weights could hold instead, and what is said of it."""
+    good = load((whole / WEIGHTS).read_bytes())
+    name = next(n for n in good if n.endswith("weight"))
+    return {
+        "none": ({}, "lacks the tensor 'conformance.u'"),
+        "no weights": (
+            {n: t for n, t in good.items() if n.startswith("conformance")},
+            "do not fit the model",
+        ),
+        "one too many": ({**good, "extra": torch.zeros(1)}, "do not fit the model"),
+        "another shape": ({**good, name: torch.zeros(1)}, "do not fit the model"),
+        "few queries": ({**good, "conformance.u": torch.zeros(3, 2)}, "has the shape (3, 2)"),
+        "flat queries": ({**good, "conformance.rgb": torch.zeros(256)}, "has the shape (256,)"),
+    }
+
+
+@pytest.mark.parametrize(
+    "case", ["none", "no weights", "one too many", "another shape", "few queries", "flat queries"]
+)
+def test_odd_tensors(case: str, whole: Path, folder: Path) -> None:
+    tensors, says = odd_tensors(whole)[case]
+    padding = {} if tensors else {"padding": torch.zeros(1000)}
+    write(folder, whole, None, save({**tensors, **padding}))
+    with pytest.raises(InputError) as caught:
+        Material.load(folder)
+    assert says in caught.value.what
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("levels.finest", 14), ("tile.aspect", 1e6), ("config.network.channels", 64)]
+)
+def test_a_description_cannot_claim_more_than_the_weights_hold(
+    key: str, value: Any, whole: Path, folder: Path
+) -> None:
+    description = json.loads((whole / DESCRIPTION).read_text())
+    *sections, last = key.split(".")
+    place = description
+    for section in sections:
+        place = place[section]
+    place[last] = value
+    if last == "channels":
+        description["levels"]["finest"] = 8
+    write(folder, whole, json.dumps(description), None)
+    with pytest.raises(InputError, match="too small for the levels"):
+        Material.load(folder)
+
+
+@pytest.mark.parametrize("content", [b"", b"\xff" * 64, b"{}", (2**60).to_bytes(8, "little") + b"{}"])
+def test_files_that_hold_no_tensors(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "t.safetensors"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="cannot be read as tensors"):
+        read_tensors(path)
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"garbage", save({"a": torch.zeros(1)}), save({"a": torch.zeros(1)}, {"mbtf": "[1]"})]
+)
+def test_a_checkpoint_of_something_else(content: bytes, shards: Path, tmp_path: Path, whole: Path) -> None:
+    out = tmp_path / "fit"
+    fit(CONFIG, shards, out)
+    for name in (DESCRIPTION, WEIGHTS):
+        (out / name).unlink()
+    (out / "checkpoint.safetensors").write_bytes(content)
+    with pytest.raises(InputError, match="is no checkpoint of this fit") as caught:
+        fit(CONFIG, shards, out)
+    # The hint cures.
+    (out / "checkpoint.safetensors").unlink()
+    assert "remove it" in caught.value.hint
+    assert fit(CONFIG, shards, out).folder == out

@@ -1,0 +1,319 @@
+"""Fits from start to end, and the materials they leave."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.numpy import load_file
+from support.fit_data import constant, parallax, random_queries, write_data
+
+import mbtf_fit.material.material
+from mbtf_core.errors import EngineError, InputError
+from mbtf_core.lattice import Lattice
+from mbtf_fit import FitConfig, FitResult, Material, evaluate, fit, read_history
+from mbtf_fit.data.loader import load_training
+from mbtf_fit.evaluation import split_errors
+from mbtf_fit.material.material import conformance_queries, export
+from mbtf_fit.training.fit import prepare_trainer
+from mbtf_gen.dataset.reader import Dataset
+
+
+def config(steps: int = 30, **options: Any) -> FitConfig:
+    training = {"steps": steps, "batch": 1000, "warmup": 5, **options.pop("training", {})}
+    return FitConfig.model_validate({"training": training, **options})
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_data(tmp_path_factory.mktemp("data"), parallax, train=8000, noise=0.01, aspect=0.5)
+
+
+@pytest.fixture(scope="module")
+def fitted(data: Path, tmp_path_factory: pytest.TempPathFactory) -> FitResult:
+    return fit(config(), data, tmp_path_factory.mktemp("fit") / "material")
+
+
+@pytest.mark.parametrize("model", ["neumip", "neumip-baseline"])
+def test_a_homogeneous_constant_is_fitted(model: str, tmp_path: Path) -> None:
+    folder = write_data(tmp_path / "d", constant(0.25), noise=0.05)
+    result = fit(config(200, model=model), folder, tmp_path / "m")
+    found = result.material.evaluate(*random_queries(np.random.default_rng(5), 500, Lattice(3)).values())
+    assert found.mean() == pytest.approx(0.25, abs=0.003)
+    assert np.sqrt(((found - 0.25) ** 2).mean()) < 0.01
+
+
+def test_the_first_parameters_follow_the_seed(data: Path) -> None:
+    opened = Dataset.open(data)
+    partition = load_training(opened, config().held_out, 0)
+    first, again, other = (
+        prepare_trainer(config(seed=seed), opened, partition, torch.device("cpu")).model.weights()
+        for seed in (0, 0, 1)
+    )
+    assert all(torch.equal(first[name], again[name]) for name in first)
+    for name in ("pyramid.3", "decoder.0.weight", "offset_network.0.weight"):
+        assert not torch.equal(first[name], other[name]), name
+
+
+def test_black_data_are_fitted(tmp_path: Path) -> None:
+    folder = write_data(tmp_path / "d", constant(0.0), train=3000)
+    result = fit(config(100), folder, tmp_path / "m")
+    queries = random_queries(np.random.default_rng(5), 500, Lattice(3))
+    assert result.material.evaluate(*queries.values()).mean() < 0.01
+    assert result.errors["test"]["unexplained"]["value"] is None
+
+
+def test_the_folder_states_what_it_holds(fitted: FitResult) -> None:
+    description = json.loads((fitted.folder / "material.json").read_text())
+    weights = load_file(fitted.folder / "weights.safetensors")
+    assert description["tile"] == {"aspect": 0.5}
+    assert description["levels"]["shapes"] == [[1, 1], [1, 2], [2, 4], [4, 8]]
+    assert {k: list(weights[k].shape) for k in description["weights"]["shapes"]} == description["weights"][
+        "shapes"
+    ]
+    assert weights["pyramid.3"].shape == weights["offset_texture.0"].shape == (4, 8, 7)
+    assert weights["conformance.rgb"].shape == (256, 3)
+    assert description["training"]["steps"] == 30
+    held_out = [fitted.errors[name]["n"] for name in ("held_out_queries", "held_out_directions")]
+    assert description["training"]["queries"] == 8000 - sum(held_out)
+    assert not (fitted.folder / "checkpoint.safetensors").exists()
+    assert fitted.errors["test"]["n"] == 2000
+
+
+def test_stored_weights_and_formula_suffice(fitted: FitResult) -> None:
+    """An evaluation written from the description alone, in NumPy, meets the conformance values."""
+    weights = load_file(fitted.folder / "weights.safetensors")
+    aspect, finest = 0.5, 3
+    u, sigma, omega_i, omega_o = (
+        weights[f"conformance.{k}"].astype(np.float64) for k in ("u", "sigma", "omega_i", "omega_o")
+    )
+
+    def texture(name: str, at: np.ndarray) -> np.ndarray:
+        t = weights[name]
+        rows, columns = t.shape[:2]
+        x, y = at[:, 0] * columns - 0.5, (1 - at[:, 1]) * rows - 0.5
+        i, j = np.floor(x).astype(int), np.floor(y).astype(int)
+        fx, fy = (x - i)[:, None], (y - j)[:, None]
+        rows_of = [t[(j + k) % rows] for k in (0, 1)]
+        q = np.arange(len(at))
+        across = [r[q, i % columns] * (1 - fx) + r[q, (i + 1) % columns] * fx for r in rows_of]
+        return across[0] * (1 - fy) + across[1] * fy
+
+    def network(name: str, x: np.ndarray) -> np.ndarray:
+        for k in range(4):
+            x = x @ weights[f"{name}.{k}.weight"].T + weights[f"{name}.{k}.bias"]
+            x = np.maximum(x, 0) if k < 3 else x
+        return x
+
+    r = 0.1 * network("offset_network", np.concatenate([texture("offset_texture.0", u), omega_o[:, :2]], 1))
+    offset = r / np.maximum(omega_o[:, 2:], 0.6) * omega_o[:, :2]
+    np.testing.assert_allclose(fitted.material.offset(u, omega_o), offset, atol=1e-6)
+    moved = u + offset / [1, aspect]
+    level = np.clip(-np.log2(2 * sigma), 0, finest)
+    low = np.floor(level).astype(int)
+    levels = np.stack([texture(f"pyramid.{s}", moved) for s in range(finest + 1)])
+    q, fine = np.arange(len(u)), (level - low)[:, None]
+    features = (1 - fine) * levels[low, q] + fine * levels[np.minimum(low + 1, finest), q]
+    x = network("decoder", np.concatenate([features, omega_i[:, :2], omega_o[:, :2]], 1))
+    rgb = np.maximum(weights["unit"] * np.expm1(x), 0)
+    low = np.minimum(low, finest - 1)
+    for table, omega in zip(weights["gain"], (omega_i, omega_o), strict=True):
+        cosines = np.linspace(0, 1, table.shape[1])
+        for c in range(3):
+            at = np.stack([np.interp(omega[:, 2], cosines, row[:, c]) for row in table])
+            rgb[:, c] *= at[low, q] + (level - low) * (at[low + 1, q] - at[low, q])
+    np.testing.assert_allclose(rgb, weights["conformance.rgb"], atol=2e-6)
+    assert fitted.material.deviation() < 1e-6
+
+
+@pytest.mark.parametrize("finest", [0, 4])
+def test_conformance_queries_go_to_the_limits(finest: int) -> None:
+    """Seams of the tile, footprints at both ends and beyond, light and view from straight above."""
+    lattice = Lattice(finest)
+    queries = conformance_queries(lattice)
+    assert ((queries["u"] >= 0) & (queries["u"] <= 1)).all()
+    for axis in (0, 1):
+        assert (queries["u"][:, axis] == 0).any()
+        assert (queries["u"][:, axis] > 0.998).any()
+    level = -np.log2(2 * queries["sigma"])
+    assert level.min() == -1
+    assert level.max() == finest + 1
+    assert {0, finest} <= set(level.tolist())
+    for name in ("omega_i", "omega_o"):
+        assert (queries[name][:, 2] == 1).any()
+        assert queries[name][:, 2].min() < 0.3
+        np.testing.assert_allclose(np.linalg.norm(queries[name], axis=1), 1, atol=1e-6)
+
+
+def test_expected_values_are_not_made_by_what_they_check(
+    fitted: FitResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A fault in fast evaluation shows as a deviation from what is stored."""
+    true = mbtf_fit.material.material.predict
+
+    def faulty(*arguments: Any) -> np.ndarray:
+        return true(*arguments) + np.float32(0.25)
+
+    monkeypatch.setattr(mbtf_fit.material.material, "predict", faulty)
+    material, description = fitted.material, fitted.material.description
+    facts = {name: description[name] for name in ("data", "training")}
+    again = export(material.model, material.config, tmp_path, **facts)
+    np.testing.assert_array_equal(again.conformance["rgb"], material.conformance["rgb"])
+    assert again.deviation() == pytest.approx(0.25, rel=1e-3)
+
+
+def test_evaluation_takes_any_number_of_queries(fitted: FitResult) -> None:
+    material = fitted.material
+    queries = random_queries(np.random.default_rng(3), 70_000, material.lattice)
+    found = material.evaluate(*queries.values())
+    assert found.shape == (70_000, 3)
+    assert found.min() >= 0
+    part = material.evaluate(*(a[40_000:40_010] for a in queries.values()))
+    np.testing.assert_allclose(found[40_000:40_010], part, atol=1e-6)
+    assert material.evaluate(*(a[:0] for a in queries.values())).shape == (0, 3)
+    shifted = material.evaluate(queries["u"] + np.array([2.0, -1.0]), *list(queries.values())[1:])
+    np.testing.assert_allclose(shifted, found, atol=1e-4)
+
+
+def test_a_moved_material_loads(fitted: FitResult, tmp_path: Path) -> None:
+    moved = fitted.folder.rename(fitted.folder.with_name("moved"))
+    try:
+        assert Material.load(moved).deviation() == fitted.material.deviation()
+    finally:
+        moved.rename(fitted.folder)
+
+
+def test_damaged_materials_are_refused(fitted: FitResult, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such folder"):
+        Material.load(tmp_path / "none")
+    with pytest.raises(InputError, match=r"no material\.json"):
+        Material.load(tmp_path)
+    for name in ("material.json", "weights.safetensors"):
+        (tmp_path / name).write_bytes((fitted.folder / name).read_bytes())
+    weights = tmp_path / "weights.safetensors"
+    content = bytearray(weights.read_bytes())
+    content[-1] ^= 1
+    weights.write_bytes(content)
+    with pytest.raises(InputError, match="not the file"):
+        Material.load(tmp_path)
+    description = json.loads((tmp_path / "material.json").read_text())
+    (tmp_path / "material.json").write_text(json.dumps({**description, "schema": 99}))
+    with pytest.raises(InputError, match="schema 99"):
+        Material.load(tmp_path)
+
+
+def test_errors_of_a_perfect_prediction_are_zero(data: Path) -> None:
+    from mbtf_fit.data.loader import load_split
+    from mbtf_gen.dataset.reader import Dataset
+
+    opened = Dataset.open(data)
+    queries = load_split(opened, "test")
+    truth = parallax(queries.u, queries.sigma, queries.omega_i, queries.omega_o).astype(np.float32)
+    perfect = split_errors(lambda q: truth, queries, opened.lattice)
+    flat = split_errors(lambda q: np.full_like(truth, truth.mean(0)), queries, opened.lattice)
+    assert perfect is not None
+    assert flat is not None
+    assert abs(perfect.overall.mse.value) < 4 * perfect.overall.mse.error
+    assert flat.overall.unexplained.value == pytest.approx(1.0, abs=0.02)
+    assert (
+        sum(e.n for e in flat.levels.values()) == sum(e.n for e in flat.elevations.values()) == len(queries)
+    )
+    assert set(flat.elevations) == {(0.0, 0.2), (0.2, 0.4), (0.4, 0.7), (0.7, 1.0)}
+
+
+def test_evaluation_repeats_the_errors_of_the_fit(fitted: FitResult, data: Path) -> None:
+    again = {name: e.as_dict() for name, e in evaluate(fitted.material, data).values.items()}
+    assert set(again) == {"test", "held_out_queries", "held_out_directions", "training"}
+    for name, errors in again.items():
+        stored = fitted.errors[name]
+        assert errors["n"] == stored["n"]
+        assert errors["mse"]["value"] == pytest.approx(stored["mse"]["value"], rel=1e-3)
+
+
+def test_evaluation_refuses_a_tile_of_another_shape(fitted: FitResult, tmp_path: Path) -> None:
+    other = write_data(tmp_path / "d", parallax, train=100, aspect=1.0)
+    with pytest.raises(InputError, match=r"aspect 1, the material's 0\.5"):
+        evaluate(fitted.material, other)
+
+
+def test_the_history_records_the_training(fitted: FitResult) -> None:
+    history = read_history(fitted.folder)
+    assert history == fitted.history
+    assert history[-1]["step"] == 30
+    assert history[-1]["share"] == 1.0
+    assert {"seconds", "loss", "unexplained", "unexplained_error", "queries_per_second"} <= set(history[-1])
+
+
+def test_data_that_were_read_before_give_the_same_fit(fitted: FitResult, data: Path, tmp_path: Path) -> None:
+    default = config()
+    partition = load_training(Dataset.open(data), default.held_out, default.seed)
+    again = fit(default, data, tmp_path / "m", partition=partition)
+    assert again.errors == fitted.errors
+    # They are what is trained on and judged by, whatever the folder holds.
+    few = dataclasses.replace(partition, held_out_queries=partition.held_out_queries.take(slice(7)))
+    other = fit(default, data, tmp_path / "o", partition=few)
+    assert other.errors["held_out_queries"]["unexplained"]["n"] == 7
+
+
+def test_the_same_fit_again_is_left_as_it_is(data: Path, tmp_path: Path) -> None:
+    out = tmp_path / "m"
+    fit(config(3), data, out)
+    before = (out / "weights.safetensors").stat().st_mtime_ns
+    again = fit(config(3), data, out)
+    assert again.resumed
+    assert (out / "weights.safetensors").stat().st_mtime_ns == before
+
+
+def test_another_configuration_is_refused_field_by_field(data: Path, tmp_path: Path) -> None:
+    out = tmp_path / "m"
+    fit(config(3), data, out)
+    with pytest.raises(
+        InputError, match=r"training\.batch: 1000 -> 500; training\.steps: 3 -> 4.*\n.*--overwrite"
+    ):
+        fit(config(4, training={"batch": 500}), data, out)
+    other = write_data(tmp_path / "d", parallax, train=8000, aspect=0.5, seed=1)
+    with pytest.raises(InputError, match=r"data\.hash: .* -> "):
+        fit(config(3), other, out)
+    assert fit(config(4), data, out, overwrite=True).history[-1]["step"] == 4
+
+
+def test_a_folder_of_other_files_is_never_touched(data: Path, tmp_path: Path) -> None:
+    (tmp_path / "precious").write_text("mine")
+    for overwrite in (False, True):
+        with pytest.raises(InputError, match="holds no fit"):
+            fit(config(3), data, tmp_path, overwrite=overwrite)
+    assert [p.name for p in tmp_path.iterdir()] == ["precious"]
+
+
+def test_an_interrupted_fit_resumes_to_the_same_weights(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mbtf_fit.training.fit._REPORT_SECONDS", 0.0)
+    monkeypatch.setattr("mbtf_fit.training.fit._CHECKPOINT_SECONDS", 0.0)
+    whole = fit(config(12), data, tmp_path / "whole")
+
+    def interrupt(share: float, note: str) -> None:
+        if share > 0.5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fit(config(12), data, tmp_path / "parts", progress=interrupt)
+    assert not (tmp_path / "parts" / "material.json").exists()
+    resumed = fit(config(12), data, tmp_path / "parts")
+    assert resumed.resumed
+    weights = (load_file(folder / "weights.safetensors") for folder in (whole.folder, resumed.folder))
+    for mine, other in zip(*(w.values() for w in weights), strict=True):
+        np.testing.assert_array_equal(mine, other)
+    assert [line["step"] for line in resumed.history] == list(range(1, 13))
+
+
+def test_cuda_where_there_is_none_is_refused(data: Path, tmp_path: Path) -> None:
+    if torch.cuda.is_available():
+        pytest.skip("this machine has a CUDA device")
+    with pytest.raises(EngineError, match="no CUDA device"):
+        fit(config(3, device="cuda"), data, tmp_path / "m")

@@ -1,0 +1,208 @@
+"""What a material lets through: found from data, written, read back, refused when damaged."""
+
+from __future__ import annotations
+
+import json
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.buffer_data import write_buffers
+from support.damage import check_message
+from support.fit_data import constant, random_queries, write_data
+from support.plugin_materials import write_material
+
+from mbtf_core.errors import InputError
+from mbtf_core.lattice import Lattice
+from mbtf_fit.config import FitConfig, HeldOutSection
+from mbtf_fit.data.loader import load_training
+from mbtf_fit.data.streaming import Selection
+from mbtf_fit.evaluation import evaluate
+from mbtf_fit.formatting import describe_transmittance
+from mbtf_fit.material.format import read_description
+from mbtf_fit.material.transmittance import TRANSMITTANCE_NAME, Transmittance, read_transmittance
+from mbtf_fit.material.transmittance_fit import fit_transmittance, judge_transmittance
+from mbtf_fit.training.fit import fit
+from mbtf_gen.dataset.reader import Dataset
+from mbtf_gen.dataset.shard_io import read_shard, write_shard
+
+
+def lace(u: np.ndarray, sigma: np.ndarray, omega_o: np.ndarray) -> np.ndarray:
+    """Holes towards one side of the tile that close at grazing views, on one side more than on the other."""
+    fade = np.exp(-2 * (np.pi * sigma) ** 2)
+    wave = fade * np.sin(2 * np.pi * u[:, 0]) + 0.5 * fade * np.cos(2 * np.pi * u[:, 1])
+    x, y = omega_o[:, 0], omega_o[:, 1]
+    return np.asarray((0.45 + 0.2 * wave) * (1 - 0.7 * (x * x + y * y)) + 0.1 * x - 0.05 * y)
+
+
+def chosen(data: Dataset, held_out: HeldOutSection | None = None) -> Selection:
+    """What is trained on; everything by default."""
+    return load_training(data, held_out or HeldOutSection(queries=0, radius=0), 0).selection
+
+
+def test_a_known_transmittance_is_found(tmp_path: Path) -> None:
+    data = Dataset.open(
+        write_data(tmp_path, constant(0.2), train=120_000, finest=4, aspect=0.5, through=lace)
+    )
+    model = fit_transmittance(data, chosen(data))
+    assert model is not None
+    q = random_queries(np.random.default_rng(9), 4000, data.lattice)
+    found = model.evaluate(q["u"] + np.float32(2.0), q["sigma"], q["omega_o"])
+    wanted = lace(q["u"], q["sigma"], q["omega_o"])
+    assert wanted.std() > 0.1
+    assert np.sqrt(np.mean((found - wanted) ** 2)) < 0.035
+    fine = q["sigma"] < 0.045
+    assert np.sqrt(np.mean((found - wanted)[fine] ** 2)) < 0.02
+
+
+@pytest.mark.parametrize("window", [None, 4])
+def test_buffers_tell_the_same(tmp_path: Path, window: int | None) -> None:
+    folder = write_buffers(tmp_path, constant(0.2), train=1500, through=lace, window=window)
+    data = Dataset.open(folder)
+    model = fit_transmittance(data, chosen(data))
+    assert model is not None
+    q = random_queries(np.random.default_rng(9), 4000, data.lattice)
+    found = model.evaluate(q["u"], q["sigma"], q["omega_o"])
+    assert np.sqrt(np.mean((found - lace(q["u"], q["sigma"], q["omega_o"])) ** 2)) < 0.05
+
+
+def test_few_queries_fall_back_on_coarser_levels(tmp_path: Path) -> None:
+    """No texel of an empty neighborhood is left without a value."""
+    data = Dataset.open(
+        write_data(tmp_path, constant(0.2), train=200, finest=6, through=lambda u, s, o: 0.6 + 0 * s)
+    )
+    model = fit_transmittance(data, chosen(data))
+    assert model is not None
+    q = random_queries(np.random.default_rng(9), 500, data.lattice)
+    assert np.abs(model.evaluate(q["u"], q["sigma"], q["omega_o"]) - 0.6).max() < 0.1
+
+
+def test_a_fit_writes_it_beside_the_weights_and_only_for_holes(tmp_path: Path) -> None:
+    config = FitConfig.model_validate({"training": {"steps": 2, "batch": 256}})
+    write_data(tmp_path / "solid", constant(0.2), train=600, test=64)
+    write_data(tmp_path / "lace", constant(0.2), train=600, test=64, through=lace)
+    fit(config, tmp_path / "solid", tmp_path / "a")
+    assert not (tmp_path / "a" / TRANSMITTANCE_NAME).exists()
+    assert read_transmittance(tmp_path / "a", read_description(tmp_path / "a")[0]) is None
+    fit(config, tmp_path / "lace", tmp_path / "b")
+    description, _ = read_description(tmp_path / "b")
+    read = read_transmittance(tmp_path / "b", description)
+    data = Dataset.open(tmp_path / "lace")
+    fitted = fit_transmittance(data, chosen(data, config.held_out))
+    assert read is not None
+    assert fitted is not None
+    for mine, theirs in zip(read.levels, fitted.levels, strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+    path = tmp_path / "b" / TRANSMITTANCE_NAME
+    content = bytearray(path.read_bytes())
+    content[-1] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="not the file that") as caught:
+        read_transmittance(tmp_path / "b", description)
+    check_message(caught.value)
+
+
+def test_passes_over_the_data_change_nothing_but_memory(tmp_path: Path) -> None:
+    """Sums that take more than they may are made band by band, to the last bit alike."""
+    data = Dataset.open(
+        write_data(tmp_path, constant(0.2), train=20_000, finest=8, aspect=0.5, through=lace, noise=0.1)
+    )
+    found, peaks = [], []
+    for memory in (1e9, 1e6):
+        tracemalloc.start()
+        found.append(fit_transmittance(data, chosen(data), memory))
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    whole, banded = found
+    assert whole is not None
+    assert banded is not None
+    for mine, theirs in zip(whole.levels, banded.levels, strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+    assert data.lattice.texels() * 27 * 8 > 7e6
+    assert peaks[0] - peaks[1] > 4e6
+
+
+@pytest.mark.parametrize("layout", ["shuffled", "image"])
+def test_what_is_held_out_is_judged_and_not_fitted(layout: str, tmp_path: Path) -> None:
+    """Where held-out rows say something else, the fit does not know, and its error there says so."""
+    held_out = HeldOutSection(queries=0.2, radius=0.15)
+    if layout == "image":
+        write_buffers(tmp_path, constant(0.2), train=400, through=lace)
+    else:
+        write_data(tmp_path, constant(0.2), train=40_000, finest=3, through=lace)
+    data = Dataset.open(tmp_path)
+    selection = chosen(data, held_out)
+    before = fit_transmittance(data, selection)
+    assert before is not None
+    honest = judge_transmittance(before, data, selection)
+    for path, mask in selection.masks():
+        arrays = dict(read_shard(path, mapped=False))
+        assert 0.1 < (~mask).mean() < 0.6
+        through = arrays["transmittance"].copy()
+        through[~mask] += 0.5
+        write_shard(path, {**arrays, "transmittance": through})
+    after = fit_transmittance(data, selection)
+    assert after is not None
+    for mine, theirs in zip(before.levels, after.levels, strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+    judged = judge_transmittance(after, data, selection)
+    assert judged["held_out"].mse.value == pytest.approx(0.25, rel=0.1)
+    for name in ("training", "test"):
+        assert judged[name].mse == honest[name].mse
+        assert honest[name].mse.value < 2e-3
+    assert honest["held_out"].mse.value < 2e-3
+
+
+def test_errors_hold_the_noise_of_the_data_and_say_how_much(tmp_path: Path) -> None:
+    """Holes are hit or missed: of four independent paths each, a quarter of p(1-p) is noise."""
+    random = np.random.default_rng(3)
+    folder = write_data(
+        tmp_path,
+        constant(0.2),
+        train=30_000,
+        test=20_000,
+        finest=1,
+        through=lambda u, s, o: random.binomial(4, 0.3, len(s)) / 4,
+    )
+    for path in folder.glob("*.npz"):
+        arrays = dict(read_shard(path, mapped=False))
+        write_shard(path, {**arrays, "spp": np.full(len(arrays["spp"]), 4, np.float32)})
+    material = tmp_path / "material"
+    result = fit(FitConfig.model_validate({"training": {"steps": 2, "batch": 256}}), folder, material)
+    stated = result.as_dict()["training"]["transmittance"]
+    found = evaluate(result.material, folder).transmittance
+    assert found is not None
+    assert stated == {name: error.as_dict() for name, error in found.items()}
+    assert list(found) == ["test", "held_out", "training"]
+    for error in found.values():
+        assert error.noise.value == pytest.approx(0.3 * 0.7 / 4, rel=0.08)
+        # Some hundreds are held out.
+        few = 0.2 if error.n < 5000 else 0.05
+        assert error.mse.value == pytest.approx(error.noise.value, rel=few)
+        assert error.variance == pytest.approx(error.noise.value, rel=few)
+    text = describe_transmittance(stated)
+    assert len(text) == 3
+    assert "noise of the data at most 0.2" in text[0]
+
+
+def test_a_description_that_does_not_say_which_file_is_refused(tmp_path: Path) -> None:
+    write_material(tmp_path, finest=0, holes=Transmittance(Lattice(0), [np.zeros((1, 1, 6), np.float32)]))
+    whole = json.loads((tmp_path / "material.json").read_text())
+    for holes in ({}, [], "x", {"sha256": 5}):
+        (tmp_path / "material.json").write_text(json.dumps(whole | {"holes": holes}))
+        with pytest.raises(InputError, match="is damaged") as caught:
+            read_transmittance(tmp_path, read_description(tmp_path)[0])
+        check_message(caught.value)
+
+
+def test_a_view_is_a_line_through_the_plane() -> None:
+    """Nothing but the polynomial of the view's projection, at a texel's center, clamped."""
+    lattice = Lattice(0)
+    texel = np.array([0.5, 0.2, -0.1, -0.3, 0.4, 0.1], np.float32).reshape(1, 1, 6)
+    model = Transmittance(lattice, [texel])
+    omega = np.array([[0.6, -0.3, 0.74], [0.0, 0.0, 1.0]])
+    x, y = omega[0, :2]
+    wanted = 0.5 + 0.2 * x - 0.1 * y - 0.3 * x * x + 0.4 * x * y + 0.1 * y * y
+    np.testing.assert_allclose(model.evaluate([[0.1, 0.9]] * 2, [0.3] * 2, omega), [wanted, 0.5], rtol=1e-6)
+    assert Transmittance(lattice, [8 * texel]).evaluate([[0.1, 0.9]], [0.3], omega[1:])[0] == 1.0

@@ -1,0 +1,169 @@
+"""``mbtf-fit preview``: which picture stands where, what turns, and that the scene is as it is said to be."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import pytest
+from PIL import Image
+from support.damage import check_message
+from support.paths import ROOT
+from support.plugin_materials import write_material
+from support.scenes import mi
+
+import mbtf_fit.mitsuba_plugin
+from mbtf_core.config_file import resolve
+from mbtf_core.directions import from_angles
+from mbtf_core.errors import InputError, UsageError
+from mbtf_fit.mitsuba_plugin.preview.config import PreviewConfig, SheetSection, TurntableSection
+from mbtf_gen.config.pictures import Direction
+from mbtf_gen.pictures.camera import Camera
+
+mbtf_fit.mitsuba_plugin.register()
+
+from mbtf_fit.mitsuba_plugin.bsdf import Frame  # noqa: E402
+from mbtf_fit.mitsuba_plugin.evaluator import Evaluator  # noqa: E402
+from mbtf_fit.mitsuba_plugin.material_arrays import read_material  # noqa: E402
+from mbtf_fit.mitsuba_plugin.preview import sheet, turntable  # noqa: E402
+
+SECTION = SheetSection(
+    views=[Direction(elevation=70, azimuth=-90), Direction(elevation=35, azimuth=20)],
+    lights=[Direction(elevation=60, azimuth=0), Direction(elevation=30, azimuth=120)],
+    spans=[0.5, 2.0, 9.0],
+    size=64,
+)
+
+
+def test_every_picture_stands_at_its_view_light_and_width(tmp_path: Path) -> None:
+    """Against PyTorch at the same pixels."""
+    material = write_material(tmp_path, aspect=2.0, contrast=1.0)
+    values = sheet.panels(Evaluator(read_material(tmp_path), "cooperative"), SECTION)
+    assert values.shape == (2, 2, 3, 64, 64, 3)
+    pixels = sheet.contact_sheet(values, SECTION)
+    exposure = sheet.HEADROOM * sheet.auto_exposure(values)
+    pitch = 64 + sheet.GAP
+    for view, light, row in np.ndindex(2, 2, 3):
+        v, i = SECTION.views[view], SECTION.lights[light]
+        camera = Camera(v.elevation, v.azimuth, SECTION.spans[row], (0.5, 1.0), 64, 64)
+        queries = camera.queries(from_angles(i.elevation, i.azimuth), 2.0).flat()
+        wanted = material.predict(queries).reshape(64, 64, 3)  # type: ignore[arg-type]
+        np.testing.assert_allclose(values[view, light, row], wanted, rtol=1e-3, atol=1e-4)
+        left = sheet.MARGIN + (2 * view + light) * pitch + view * sheet.GAP
+        top = sheet.MARGIN + sheet.CAPTION + row * pitch
+        shown = pixels[top : top + 64, left : left + 64].astype(int)
+        difference = np.abs(shown - sheet.to_display(wanted, exposure))
+        # The first column carries labels below.
+        assert difference[: 32 if (view, light) == (0, 0) else 64].max() <= 1
+    flat = values.reshape(12, -1)
+    assert min(np.abs(a - b).max() for k, a in enumerate(flat) for b in flat[:k]) > 1e-3
+
+
+def white(tmp_path: Path) -> Any:
+    write_material(tmp_path, constant=(0.25, 0.25, 0.25))
+    return mi.load_dict(
+        {"type": "mbtf", "material": str(tmp_path), "networks": "cooperative", "sampling": "cosine"}
+    )
+
+
+def test_tiles_on_the_ball_are_square_and_upright(tmp_path: Path) -> None:
+    """Eight around the equator; x to the east and y to the north, at every latitude."""
+    scene = mi.load_dict({"type": "scene", "ball": turntable.ball(white(tmp_path), 8)})
+    latitude = np.radians([-75.0, -40.0, 1.0, 30.0, 60.0, 70.0])
+    azimuth = np.radians([5.0, 100.0, 200.0, 300.0, 355.0, 60.0])
+    out = np.stack([np.cos(latitude) * np.cos(azimuth), np.cos(latitude) * np.sin(azimuth), np.sin(latitude)])
+    ray = mi.Ray3f(mi.Point3f(3.0 * out), mi.Vector3f(-out))
+    si = scene.ray_intersect(ray, mi.RayFlags.All, True)
+    du, dv = np.array(si.dp_du), np.array(si.dp_dv)
+    lengths = np.linalg.norm(du, axis=0), np.linalg.norm(dv, axis=0)
+    np.testing.assert_allclose(lengths[0], 2 * np.pi / 8 * np.cos(latitude), rtol=0.07)
+    np.testing.assert_allclose(lengths[1], lengths[0], rtol=0.07)
+    assert np.abs((du * dv).sum(0) / lengths[0] / lengths[1]).max() < 0.07
+    frame = Frame.at(si)
+    east = si.to_world(frame.to_local(mi.Vector3f(1, 0, 0)))
+    north = si.to_world(frame.to_local(mi.Vector3f(0, 1, 0)))
+    to_east = np.stack([-np.sin(azimuth), np.cos(azimuth), np.zeros(6)])
+    assert (np.array(east) * to_east).sum(0).min() > 0.99
+    to_north = np.cross(out, to_east, axis=0)
+    assert (np.array(north) * to_north).sum(0).min() > 0.99
+
+
+def test_tiles_on_the_plate_are_as_large_as_on_the_equator(tmp_path: Path) -> None:
+    scene = mi.load_dict({"type": "scene", "plate": turntable.plate(white(tmp_path), 8)})
+    si = scene.ray_intersect(mi.Ray3f(mi.Point3f([0.3, -1.2], [0.4, 0.5], 3.0), mi.Vector3f(0, 0, -1)))
+    np.testing.assert_allclose(np.array(si.dp_du).T, [[np.pi / 4, 0, 0]] * 2, atol=1e-5)
+    np.testing.assert_allclose(np.array(si.dp_dv).T, [[0, -np.pi / 4, 0]] * 2, atol=1e-5)
+    assert dr.all(si.n.z > 0.999)
+
+
+def test_a_turn_of_a_uniform_material_changes_nothing_and_of_a_patterned_one_does(tmp_path: Path) -> None:
+    """Camera and lights go round together; the material stays."""
+    section = TurntableSection(size=24, frames=3, spp=64)
+    same = list(turntable.frames(white(tmp_path / "white"), section))
+    assert len(same) == 3
+    for picture in same[1:]:
+        assert np.abs(picture - same[0]).mean() < 0.08 * same[0].mean()
+    lit = same[0].mean(-1)
+    # The key light comes from the left, so the ball's shadow falls to the right.
+    assert lit[15, 4:7].mean() > 1.3 * lit[15, 17:20].mean(), lit[15]
+    write_material(tmp_path / "patterned", model="neumip-baseline", contrast=1.5)
+    patterned = mi.load_dict(
+        {"type": "mbtf", "material": str(tmp_path / "patterned"), "networks": "cooperative"}
+    )
+    turned = list(turntable.frames(patterned, section.model_copy(update={"tiles": 2})))
+    assert np.abs(turned[1] - turned[0]).mean() > 0.12 * turned[0].mean()
+
+
+def test_the_file_of_a_turn_repeats_and_keeps_its_frames(tmp_path: Path) -> None:
+    pictures = [np.full((8, 8, 3), (40 * k, 90, 250 - 40 * k), np.uint8) for k in range(5)]
+    turntable.write_gif(tmp_path / "turn.gif", pictures)
+    with Image.open(tmp_path / "turn.gif") as file:
+        assert file.info["loop"] == 0
+        for k, picture in enumerate(pictures):
+            file.seek(k)
+            assert np.abs(np.asarray(file.convert("RGB")).astype(int) - picture).max() <= 8
+            assert file.info["duration"] == turntable.TURN // 5
+        assert file.n_frames == 5
+
+
+def test_options_that_make_no_sense_are_refused() -> None:
+    for key, value, fault in (
+        ("sheet.size", 2000, "pixels; take smaller or fewer"),
+        ("turntable.frames", 0, "turntable.frames"),
+        ("sheet.spans", [], "sheet.spans"),
+        ("sheet.view", 3, "did you mean 'views'"),
+    ):
+        flags = {"material": "m", key: value}
+        if key == "sheet.size":
+            flags["sheet.spans"] = [1.0, 2.0, 3.0]
+        with pytest.raises(UsageError, match=fault) as caught:
+            resolve(PreviewConfig, flags=flags)
+        check_message(caught.value)
+
+
+def test_the_document_states_options_and_defaults() -> None:
+    text = (ROOT / "docs/preview.md").read_text()
+    config = PreviewConfig(material="material/")
+    for name, section in (("sheet", config.sheet), ("turntable", config.turntable)):
+        for key, value in section:
+            shown = str(value)
+            if isinstance(value, list):
+                pairs = [
+                    f"{v.elevation:g},{v.azimuth:g}" if isinstance(v, Direction) else f"{v:g}" for v in value
+                ]
+                shown = (" and " if isinstance(value[0], Direction) else ",").join(pairs)
+            assert f"`{name}.{key}` | {shown} |" in text
+
+
+def test_a_folder_that_is_no_material_is_refused_before_anything_is_made(tmp_path: Path) -> None:
+    from mbtf_fit.mitsuba_plugin.preview.command import preview
+
+    with pytest.raises(InputError, match=r"no material\.json"):
+        preview(tmp_path, output=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(UsageError, match="must be numbers separated by commas"):
+        preview(tmp_path, spans="1;2")
+    with pytest.raises(UsageError, match="no material given"):
+        preview()

@@ -1,0 +1,297 @@
+"""A plane with a fitted material in a Mitsuba scene shows what the material answers at the same queries."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.plugin_materials import deviation, write_material
+from support.plugin_scenes import directional, plane, sensor_of, through_pixel_centers
+from support.scenes import mi
+
+from mbtf_core.directions import from_angles
+from mbtf_core.errors import InputError, MbtfError, UsageError
+from mbtf_core.lattice import Lattice
+from mbtf_fit import Material
+from mbtf_fit.material.transmittance import Transmittance
+from mbtf_fit.mitsuba_plugin import load_scene
+from mbtf_gen.pictures.camera import Camera
+
+LIGHT = from_angles(40.0, 20.0)
+# A narrow view: differentials, which the footprint comes from, are differences over a pixel.
+CAMERA = Camera(50.0, -70.0, span=1.3, target=(0.3, 0.6), rows=24, columns=32, field_of_view=8.0)
+
+
+@pytest.fixture(scope="module")
+def material(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Material]:
+    folder = tmp_path_factory.mktemp("material")
+    return folder, write_material(folder, aspect=1.5, finest=4, contrast=0.2, brightness=0.5)
+
+
+def bsdf(folder: Path, **options: Any) -> dict[str, Any]:
+    """The plugin with the cheapest of settings to compile."""
+    return {
+        "type": "mbtf",
+        "material": str(folder),
+        "sampling": "cosine",
+        "networks": "cooperative",
+        **options,
+    }
+
+
+def cones() -> Any:
+    return mi.load_dict({"type": "mbtf_path", "max_depth": 2})
+
+
+def shown(mesh: Any, camera: Camera = CAMERA, light: Any = LIGHT) -> np.ndarray:
+    """What ``mbtf_path`` sees of a plane through the pixels' centers, under unit irradiance."""
+    scene = mi.load_dict({"type": "scene", "m": mesh, "e": directional(light), "sensor": sensor_of(camera)})
+    return through_pixel_centers(scene, camera, cones())
+
+
+@pytest.mark.parametrize("zoom", [0.5, 1.0, 8.0, 64.0])
+def test_a_plane_equals_the_material_at_the_pixels_queries(
+    material: tuple[Path, Material], zoom: float
+) -> None:
+    """Positions, footprints, directions, orientation of the tile: all of them, at all distances."""
+    folder, fitted = material
+    camera = Camera(**{**CAMERA.__dict__, "span": CAMERA.span * zoom})
+    wanted = fitted.predict(camera.queries(LIGHT, fitted.lattice.aspect).flat())  # type: ignore[arg-type]
+    found = shown(plane(bsdf(folder), aspect=fitted.lattice.aspect), camera)
+    assert wanted.std() > 0.03 * wanted.mean()
+    assert deviation(found.reshape(-1, 3), wanted) < 4e-3
+
+
+ROTATION = np.array([[np.cos(0.5), -np.sin(0.5)], [np.sin(0.5), np.cos(0.5)]])
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("scale", [1.0, 2.5])
+def test_the_tile_follows_the_texture_coordinates(
+    material: tuple[Path, Material], mirrored: bool, scale: float
+) -> None:
+    """Turned, mirrored and scaled coordinates: the plane equals the material at turned, mirrored queries."""
+    folder, fitted = material
+    turn = ROTATION @ np.diag([1.0, -1.0 if mirrored else 1.0])
+    to_uv = np.concatenate([np.diag([1.0, -1.0]) @ turn, [[0.0], [1.0]]], 1)
+    queries = CAMERA.queries(LIGHT)
+    # Mitsuba's v is 1 - y here, and is scaled about 0.
+    x, y = np.moveaxis(seen_places(CAMERA) @ turn.T, -1, 0)
+    u = np.stack([scale * x, 1.0 - scale * (1.0 - y) / fitted.lattice.aspect], -1)
+    turned = [
+        np.concatenate([w[..., :2] @ turn.T, w[..., 2:]], -1) for w in (queries.omega_i, queries.omega_o)
+    ]
+    arrays = (u, scale * queries.sigma, *turned)
+    wanted = fitted.evaluate(*(a.reshape(-1, *a.shape[2:]) for a in arrays))
+    found = shown(plane(bsdf(folder, uv_scale=scale), to_uv)).reshape(-1, 3)
+    assert deviation(found, wanted) < 2e-2
+
+
+def seen_places(camera: Camera) -> np.ndarray:
+    """(x, y) on the plane that the pixels' centers see, not wrapped."""
+    forward, right, up = camera.frame()
+    x = (np.arange(camera.columns) + 0.5 - camera.columns / 2) * camera.pixel_pitch
+    y = (camera.rows / 2 - np.arange(camera.rows) - 0.5) * camera.pixel_pitch
+    ray = forward + x[None, :, None] * right + y[:, None, None] * up
+    return (camera.position + ray * (camera.position[2] / -ray[..., 2:]))[..., :2]
+
+
+def test_more_samples_per_pixel_do_not_narrow_the_footprint(tmp_path: Path) -> None:
+    """Levels of different constant features: brightness tells σ."""
+    import torch
+
+    levels = {f"pyramid.{s}": torch.full((2**s, 2**s, 7), 0.5 * s) for s in range(5)}
+    fitted = write_material(tmp_path, model="neumip-baseline", finest=4, weights=levels)
+    camera = Camera(elevation=70.0, span=3.0, rows=8, columns=8)
+    wanted = fitted.predict(camera.queries(LIGHT).flat()).mean()  # type: ignore[arg-type]
+    at_double = camera.queries(LIGHT).flat()
+    narrower = fitted.evaluate(at_double.u, at_double.sigma / 4, at_double.omega_i, at_double.omega_o).mean()
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "m": plane(bsdf(tmp_path)),
+            "e": directional(LIGHT),
+            "sensor": sensor_of(camera, 16),
+        }
+    )
+    found = np.array(mi.render(scene, integrator=cones(), spp=16)).mean()
+    assert abs(narrower / wanted - 1) > 0.05
+    assert found == pytest.approx(wanted, rel=5e-3)
+
+
+@pytest.mark.parametrize("share", [0.05, 0.5, 0.95])
+def test_a_cone_goes_on_through_a_hole_as_if_it_were_not_there(tmp_path: Path, share: float) -> None:
+    """A sheet that is nothing but a hole, at a share of the camera's height: a plane whose brightness tells σ
+    looks the same behind it. Were the cone to begin again at the hole, or to widen, it would not."""
+    import torch
+
+    levels = {f"pyramid.{s}": torch.full((2**s, 2**s, 7), 0.5 * s) for s in range(5)}
+    fitted = write_material(tmp_path / "plane", model="neumip-baseline", finest=4, weights=levels)
+    texel = np.zeros((1, 1, 6), np.float32)
+    texel[..., 0] = 1.0
+    hole = Transmittance(Lattice(0), [texel])
+    write_material(tmp_path / "sheet", finest=0, constant=(0.0,) * 3, holes=hole)
+    camera = Camera(elevation=55.0, span=3.0, rows=6, columns=6)
+    at = mi.ScalarTransform4f().translate([0, 0, share * float(camera.position[2])]).scale(300.0)
+    scene = {
+        "type": "scene",
+        "m": plane(bsdf(tmp_path / "plane")),
+        "e": directional(LIGHT),
+        "sensor": sensor_of(camera),
+    }
+    sheet = {"type": "rectangle", "to_world": at, "b": bsdf(tmp_path / "sheet")}
+    tracer = mi.load_dict({"type": "mbtf_path", "max_depth": 3})
+    bare, behind = (
+        through_pixel_centers(mi.load_dict(scene | more), camera, tracer) for more in ({}, {"s": sheet})
+    )
+    bare, behind = bare[..., 0], behind[..., 0]
+    q = camera.queries(LIGHT).flat()
+    narrower, wider = (
+        fitted.evaluate(q.u, f * q.sigma, q.omega_i, q.omega_o)[:, 0].mean() for f in (0.9, 1.1)
+    )
+    assert min(abs(x / bare.mean() - 1) for x in (narrower, wider)) > 0.01
+    np.testing.assert_allclose(behind, bare, rtol=2e-3)
+
+
+def test_stock_integrators_read_the_given_footprint_and_warn_once_without(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    fitted = write_material(tmp_path, finest=4, contrast=0.2, brightness=0.5)
+    queries = CAMERA.queries(LIGHT).flat()
+    stock = mi.load_dict({"type": "path", "max_depth": 2})
+    for given, sigma in (({"sigma": 0.1}, 0.1), ({}, fitted.lattice.sigma_range[0])):
+        wanted = fitted.evaluate(
+            queries.u, np.full_like(queries.sigma, sigma), queries.omega_i, queries.omega_o
+        )
+        caplog.clear()
+        for _ in range(2):
+            scene = mi.load_dict(
+                {
+                    "type": "scene",
+                    "m": plane(bsdf(tmp_path, **given)),
+                    "e": directional(LIGHT),
+                    "sensor": sensor_of(CAMERA),
+                }
+            )
+            with caplog.at_level(logging.WARNING, logger="mbtf_fit"):
+                found = through_pixel_centers(scene, CAMERA, stock).reshape(-1, 3)
+        assert deviation(found, wanted) < 4e-3
+        assert len([r for r in caplog.records if "mbtf_path" in r.message]) == (0 if given else 1)
+
+
+def test_nothing_is_seen_from_below_or_lit_from_below(material: tuple[Path, Material]) -> None:
+    below = from_angles(-40.0, 20.0)
+    mesh = plane(bsdf(material[0]))
+    assert shown(mesh).mean() > 0.02
+    assert shown(mesh, light=below).max() == 0
+    under = Camera(**{**CAMERA.__dict__, "elevation": -50.0})
+    assert shown(mesh, under, below).max() == shown(mesh, under, LIGHT).max() == 0
+    both = plane({"type": "twosided", "bsdf": bsdf(material[0])})
+    assert shown(both, under, below).mean() > 0.02
+
+
+def test_parameters_can_be_changed(material: tuple[Path, Material]) -> None:
+    mesh = plane(bsdf(material[0]))
+    before = shown(mesh)
+    parameters = mi.traverse(mesh)
+    assert {"bsdf.uv_scale", "bsdf.sigma", "bsdf.pyramid", "bsdf.offset_texture"} <= set(parameters.keys())
+    parameters["bsdf.pyramid"] = parameters["bsdf.pyramid"] * 0.0
+    parameters.update()
+    after = shown(mesh)
+    assert np.abs(after - before).mean() > 0.01
+
+
+def scene_of(folder: Path | str, **options: Any) -> dict[str, Any]:
+    return {
+        "type": "scene",
+        "ball": {"type": "sphere", "b": {"type": "mbtf", "material": str(folder), **options}},
+    }
+
+
+@pytest.mark.parametrize(
+    ("options", "fault", "kind"),
+    [
+        ({"material": "nowhere"}, "nowhere: no such folder", InputError),
+        ({"uv_scale": -1.0}, "uv_scale must be a positive number, not -1", UsageError),
+        ({"sigma": 0.0}, "sigma must be a positive number, not 0", UsageError),
+        ({"networks": "exact"}, "networks must be one of unrolled, cooperative, half, not exact", UsageError),
+        ({"sampling": "uniform"}, "sampling must be one of lobes, cosine, not uniform", UsageError),
+        ({"uvscale": 4.0}, "has no parameter 'uvscale'\n  did you mean 'uv_scale'?", UsageError),
+        ({"color": 4.0}, "has no parameter 'color'\n  it has: material, uv_scale", UsageError),
+    ],
+)
+def test_faults_of_a_scene_are_one_clear_line(
+    options: dict[str, Any], fault: str, kind: type[MbtfError], material: tuple[Path, Material]
+) -> None:
+    with pytest.raises(kind) as caught:
+        load_scene(scene_of(material[0]) | {"ball": {"type": "sphere", "b": bsdf(material[0]) | options}})
+    assert fault in caught.value.message
+    assert len(caught.value.message.splitlines()) <= 2
+
+
+def test_xml_is_loaded_and_refused_alike(material: tuple[Path, Material], tmp_path: Path) -> None:
+    text = """<scene version="3.0.0"><shape type="sphere"><bsdf type="mbtf">
+        <string name="material" value="{}"/>
+        <string name="sampling" value="cosine"/>
+        <float name="uv_scale" value="2"/></bsdf></shape></scene>"""
+    assert len(load_scene(text.format(material[0])).shapes()) == 1
+    file = tmp_path / "scene.xml"
+    file.write_text(text.format(tmp_path / "nothing"))
+    with pytest.raises(InputError, match="nothing: no such folder"):
+        load_scene(file)
+    with pytest.raises(
+        UsageError, match="mbtf_path: has no parameter 'maxdepth'\n  did you mean 'max_depth'"
+    ):
+        load_scene({"type": "scene", "integrator": {"type": "mbtf_path", "maxdepth": 3}})
+    with pytest.raises(UsageError, match="names no material"):
+        load_scene({"type": "scene", "ball": {"type": "sphere", "b": {"type": "mbtf"}}})
+
+
+def test_a_mesh_without_texture_coordinates_is_refused(
+    material: tuple[Path, Material], tmp_path: Path
+) -> None:
+    path = tmp_path / "bare.ply"
+    path.write_text(
+        "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+        "element face 1\nproperty list uchar int vertex_index\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
+    )
+    bare = {"type": "scene", "bare": {"type": "ply", "filename": str(path), "b": bsdf(material[0])}}
+    with pytest.raises(InputError, match="shape 'bare': the mesh has an mbtf material but no texture"):
+        load_scene(bare)
+    # Mitsuba says no more than that the rendering failed; the cause says why.
+    with pytest.raises(RuntimeError) as caught:
+        mi.render(mi.load_dict({**bare, "sensor": sensor_of(CAMERA)}), integrator=cones())
+    assert "no texture coordinates" in str(caught.value.__cause__ or caught.value.__context__)
+
+
+def test_a_refused_material_leaves_later_pictures_alone(material: tuple[Path, Material]) -> None:
+    """A traceback, as notebooks keep it, holds the instance that failed."""
+    folder, fitted = material
+    with pytest.raises(Exception, match="uv_scale must be a positive number") as kept:
+        mi.load_dict(bsdf(folder, uv_scale=-1.0))
+    found = shown(plane(bsdf(folder), aspect=fitted.lattice.aspect))
+    assert kept.tb is not None
+    assert found.mean() > 0.0
+
+
+def test_values_that_are_not_the_materials_own_are_refused(tmp_path: Path) -> None:
+    """A material whose conformance values say otherwise than its weights."""
+    import json
+
+    from safetensors.numpy import load_file, save_file
+
+    from mbtf_core.atomic import digest
+
+    write_material(tmp_path)
+    path = tmp_path / "weights.safetensors"
+    tensors = load_file(path)
+    tensors["conformance.rgb"][7] *= 1.01
+    save_file(tensors, path)
+    description = json.loads((tmp_path / "material.json").read_text())
+    description["weights"]["sha256"] = digest(path)
+    (tmp_path / "material.json").write_text(json.dumps(description))
+    with pytest.raises(InputError, match="does not give its conformance values"):
+        load_scene(scene_of(tmp_path, sampling="cosine", networks="cooperative"))

@@ -1,0 +1,158 @@
+"""The plugin's evaluator gives the values of the PyTorch model, for every option, level, seam and shape."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from support.damage import check_message
+from support.fit_data import random_queries
+from support.plugin_materials import deviation, write_material
+from support.scenes import mi
+
+from mbtf_core.errors import InputError
+from mbtf_core.lattice import Lattice
+from mbtf_fit.models import mlp, outputs, textured
+
+assert mi.variant()
+
+from mbtf_fit.mitsuba_plugin import encodings, evaluator, network  # noqa: E402
+from mbtf_fit.mitsuba_plugin.evaluator import Evaluator  # noqa: E402
+from mbtf_fit.mitsuba_plugin.material_arrays import read_material  # noqa: E402
+
+RANDOM = torch.Generator().manual_seed(1)
+VARIANTS: dict[str, dict[str, Any]] = {
+    "neumip": {},
+    "baseline": {"model": "neumip-baseline"},
+    "tall tile": {"aspect": 2.3},
+    "flat tile": {"aspect": 0.1},
+    "one texel": {"finest": 0},
+    "calibrated": {"weights": {"gain": 0.7 + 0.6 * torch.rand((2, 4, 6, 3), generator=RANDOM)}},
+    "calibrated, one texel": {
+        "finest": 0,
+        "weights": {"gain": 0.7 + 0.6 * torch.rand((2, 1, 6, 3), generator=RANDOM)},
+    },
+    "six outputs": {"network": {"outputs": 6}},
+    "direct offset": {"network": {"offset": "direct", "activation": "leaky-relu", "output": "softplus"}},
+    "concatenated": {"network": {"blending": "concatenate", "activation": "sine", "output": "exp"}},
+    "concatenated, one texel": {"finest": 0, "network": {"blending": "concatenate"}},
+    "encoded": {
+        "network": {"encoding": {"position": 2, "direction": 2, "raw": True, "lifted": True, "pi": False}}
+    },
+    "encoded with pi": {"network": {"encoding": {"position": 3, "direction": 1}, "output": "identity"}},
+    "filtered": {"aspect": 0.5, "network": {"encoding": {"position": 4, "filtered": True}}},
+    "damped": {
+        "network": {"encoding": {"position": 3, "direction": 3, "direction_pi": False, "damped": True}}
+    },
+    "fourth root": {"network": {"output": "fourth-root", "channels": 9, "width": 8, "layers": 2}},
+}
+UNROLLED = ("fourth root", "encoded")
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_conformance_and_random_queries(name: str, tmp_path: Path) -> None:
+    options = VARIANTS[name]
+    material = write_material(tmp_path, **options)
+    # Unrolled kernels take a second to compile.
+    plugin = Evaluator(read_material(tmp_path), "unrolled" if name in UNROLLED else "cooperative")
+    stored = material.conformance
+    queries = [stored[k] for k in ("u", "sigma", "omega_i", "omega_o")]
+    assert stored["rgb"].std() > 0.01
+    assert deviation(plugin.evaluate(*queries), stored["rgb"]) < 1e-4
+    drawn = random_queries(np.random.default_rng(3), 4000, Lattice(material.lattice.finest))
+    drawn["u"] = 5 * drawn["u"] - 2
+    drawn["sigma"] *= np.float32(1.5)
+    found, wanted = plugin.evaluate(*drawn.values()), material.evaluate(*drawn.values())
+    assert deviation(found, wanted) < 1e-4
+
+
+def test_the_networks_of_the_paper_unrolled(tmp_path: Path) -> None:
+    material = write_material(tmp_path)
+    stored = material.conformance
+    queries = [stored[k] for k in ("u", "sigma", "omega_i", "omega_o")]
+    assert deviation(Evaluator(read_material(tmp_path), "unrolled").evaluate(*queries), stored["rgb"]) < 1e-4
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"finest": 6, "contrast": 0.5}, {"model": "neumip-baseline", "finest": 6, "contrast": 1.0}],
+)
+def test_half_precision_keeps_to_a_hundredth(options: dict[str, Any], tmp_path: Path) -> None:
+    """Also where neighboring texels differ much, so that an offset's rounding would show."""
+    material = write_material(tmp_path, **options)
+    half = Evaluator(read_material(tmp_path), "half")
+    drawn = random_queries(np.random.default_rng(4), 20_000, material.lattice)
+    assert 1e-5 < deviation(half.evaluate(*drawn.values()), material.evaluate(*drawn.values())) < 1e-2
+
+
+def test_half_precision_does_not_round_what_the_network_sees() -> None:
+    """A difference of 2⁻¹², which half precision cannot hold beside 1, is seen by the first layer."""
+    one = np.ones((1, 1), np.float32)
+    layers = [(one, np.full(1, -1.0, np.float32)), (4096 * one, np.zeros(1, np.float32))]
+    (found,) = network.Network(layers, "half")([mi.Float(1.0 + 2.0**-12)])
+    assert found[0] == 1.0
+
+
+def test_constants_are_those_of_the_models() -> None:
+    assert evaluator.OFFSET_SCALE == textured.OFFSET_SCALE
+    assert evaluator.GRAZING == textured.GRAZING
+    assert network.LEAK == mlp.LEAK
+    assert encodings.RGB_OF_YUV == outputs._RGB_OF_YUV
+    assert encodings.GATE == outputs._GATE
+
+
+def test_what_looks_at_neighbors_is_refused(tmp_path: Path) -> None:
+    write_material(tmp_path)
+    path = tmp_path / "material.json"
+    description = json.loads(path.read_text())
+    description["model"] = "hierarchical"
+    description["config"] |= {"model": "hierarchical", "network": {}}
+    path.write_text(json.dumps(description))
+    with pytest.raises(InputError, match="cannot evaluate 'hierarchical'") as caught:
+        read_material(tmp_path)
+    check_message(caught.value)
+
+
+def test_folders_that_are_no_material_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such folder"):
+        read_material(tmp_path / "none")
+    with pytest.raises(InputError, match=r"no material\.json"):
+        read_material(tmp_path)
+    write_material(tmp_path)
+    path = tmp_path / "material.json"
+    text = path.read_text()
+    path.write_text(text.replace('"schema": 1', '"schema": 7'))
+    with pytest.raises(InputError, match="schema 7; this version reads schema 1"):
+        read_material(tmp_path)
+    path.write_text(text)
+    weights = tmp_path / "weights.safetensors"
+    content = bytearray(weights.read_bytes())
+    content[-1] ^= 1
+    weights.write_bytes(content)
+    with pytest.raises(InputError, match="not the file that"):
+        read_material(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("network", "fault"),
+    [
+        ({"channels": 7, "outputs": 6}, "has 3 outputs, not 6"),
+        ({"encoding": {"direction": 2}}, "has the shape"),
+        ({"activation": "gelu"}, "activation"),
+    ],
+)
+def test_weights_of_another_architecture_are_refused(
+    network: dict[str, Any], fault: str, tmp_path: Path
+) -> None:
+    write_material(tmp_path)
+    path = tmp_path / "material.json"
+    description = json.loads(path.read_text())
+    description["config"]["network"] |= network
+    path.write_text(json.dumps(description))
+    with pytest.raises(InputError, match=fault) as caught:
+        read_material(tmp_path)
+    check_message(caught.value)

@@ -1,0 +1,93 @@
+"""Pictures of a fitted material from near to far: as bright and as rich in contrast as filtered pixels are.
+
+The material is a texture whose levels are filtered; nothing is left but the footprint, and the blend of two
+levels that stands for what lies between. Contrast in excess of the filtered texture's is aliasing, what is
+missing is blur.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from support.plugin_materials import write_material
+from support.plugin_scenes import directional, plane, sensor_of, through_pixel_centers
+from support.scenes import mi
+
+from mbtf_core.directions import from_angles
+from mbtf_gen.pictures.camera import Camera
+
+FINEST = 6
+LIGHT = from_angles(60.0, 20.0)
+
+
+def filtered(values: NDArray[np.float64], sigma: float, rows: int) -> NDArray[np.float64]:
+    """A periodic texture (n, n) behind a Gaussian of `sigma` tile widths, at rows x rows texel centers."""
+    n = len(values)
+    frequency = np.fft.fftfreq(n, 1.0 / n)
+    passed = np.exp(-2.0 * (np.pi * sigma) ** 2 * (frequency[:, None] ** 2 + frequency**2))
+    # The center of a coarse texel lies between fine ones.
+    shift = np.exp(1j * np.pi * frequency * (1.0 / rows - 1.0 / n))
+    spectrum = np.fft.fft2(values) * passed * shift[:, None] * shift
+    return np.asarray(np.fft.ifft2(spectrum).real[:: n // rows, :: n // rows], np.float64)
+
+
+@pytest.fixture(scope="module")
+def texture() -> NDArray[np.float64]:
+    """Small positive values of every wavelength down to a texel of the finest level."""
+    random = np.random.default_rng(2)
+    values = sum(
+        np.kron(random.random((2**s, 2**s)), np.ones((2 ** (FINEST - s),) * 2)) for s in range(1, FINEST + 1)
+    )
+    return 0.05 * np.kron(np.asarray(values), np.ones((4, 4))) / FINEST
+
+
+@pytest.fixture(scope="module")
+def material(texture: NDArray[np.float64], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Its first feature goes through the decoder, whose exp(x) - 1 is x + x²/2."""
+    weights: dict[str, torch.Tensor] = {"unit": torch.ones(())}
+    for s in range(FINEST + 1):
+        level = np.zeros((2**s, 2**s, 7), np.float32)
+        # The tent between texels, whose variance is a sixth of their square, is two thirds of the footprint.
+        level[..., 0] = filtered(texture, 0.5 * 2.0**-s / 3**0.5, 2**s)
+        weights[f"pyramid.{s}"] = torch.from_numpy(level)
+    for layer, (outputs, inputs) in enumerate(((25, 11), (25, 25), (25, 25), (3, 25))):
+        weight = torch.zeros(outputs, inputs)
+        weight[: 3 if layer == 3 else 1, 0] = 1.0
+        weights |= {f"decoder.{layer}.weight": weight, f"decoder.{layer}.bias": torch.zeros(outputs)}
+    folder = tmp_path_factory.mktemp("material")
+    write_material(folder, model="neumip-baseline", finest=FINEST, weights=weights)
+    return folder
+
+
+@pytest.mark.parametrize("span", [0.25, 1.0, 3.0, 10.0, 30.0, 300.0])
+def test_mean_and_contrast_are_those_of_filtered_pixels(
+    material: Path, texture: NDArray[np.float64], span: float
+) -> None:
+    camera = Camera(80.0, -70.0, span=span, target=(0.3, 0.6), rows=64, columns=64, field_of_view=6.0)
+    bsdf: Any = {"type": "mbtf", "material": str(material), "sampling": "cosine", "networks": "cooperative"}
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "m": plane(bsdf, half=2.0 * span + 2.0),
+            "e": directional(LIGHT),
+            "sensor": sensor_of(camera),
+        }
+    )
+    integrator = mi.load_dict({"type": "mbtf_path", "max_depth": 2})
+    found = through_pixel_centers(scene, camera, integrator)[..., 0]
+    queries = camera.queries(LIGHT)
+    sigma = float(np.median(queries.sigma))
+    fine = filtered(texture, max(sigma, 0.5 * 2.0**-FINEST), len(texture))
+    row, column = (
+        np.minimum((x * len(fine)).astype(int), len(fine) - 1)
+        for x in (1.0 - queries.u[..., 1], queries.u[..., 0])
+    )
+    wanted = np.expm1(fine[row, column])
+    assert found.mean() == pytest.approx(wanted.mean(), rel=0.01)
+    # Between two coarse levels a blend is no Gaussian, which little contrast shows.
+    assert found.std() == pytest.approx(wanted.std(), rel=0.12, abs=0.025 * wanted.mean())

@@ -1,0 +1,89 @@
+"""Lookups in the feature pyramid: orientation, wrap, blending, derivatives; fast path and reference agree."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from mbtf_core.lattice import Lattice, texel_centers
+from mbtf_fit.models.lookup import Packing, lookup, lookup_reference
+
+F64 = torch.float64
+
+
+def asymmetric(rows: int, columns: int) -> torch.Tensor:
+    """A texture (rows·columns, 2) that tells u from v, and either from its mirror image."""
+    i = torch.arange(columns, dtype=F64)[None, :].expand(rows, columns)
+    j = torch.arange(rows, dtype=F64)[:, None].expand(rows, columns)
+    return torch.stack([i + 0.3 * (i == 0), 10.0 * j + (j == 1)], -1).reshape(-1, 2)
+
+
+@pytest.mark.parametrize("aspect", [1.0, 0.5, 0.6, 2.0])
+def test_a_lookup_at_texel_centers_returns_the_texels(aspect: float) -> None:
+    lattice = Lattice(3, aspect)
+    rows, columns = lattice.shape()
+    centers = torch.from_numpy(texel_centers(rows, columns).reshape(-1, 2))
+    table = asymmetric(rows, columns)
+    found = lookup(table, Packing.of(lattice, [3]), centers)
+    torch.testing.assert_close(found, table, rtol=0, atol=1e-12)
+
+
+def test_row_zero_is_the_side_where_v_is_largest() -> None:
+    packing = Packing(((2, 2),))
+    table = torch.tensor([[1.0], [2.0], [3.0], [4.0]], dtype=F64)
+    at = torch.tensor([[0.25, 0.75], [0.75, 0.75], [0.25, 0.25], [0.75, 0.25]], dtype=F64)
+    assert lookup(table, packing, at).flatten().tolist() == [1.0, 2.0, 3.0, 4.0]
+
+
+def test_textures_wrap_in_both_directions() -> None:
+    lattice = Lattice(3, 0.5)
+    table = torch.rand(lattice.texels(), 3, dtype=F64)
+    packing = Packing.of(lattice, [3])
+    u = torch.rand(200, 2, dtype=F64)
+    shift = torch.from_numpy(np.random.default_rng(1).integers(-3, 4, (200, 2)).astype(np.float64))
+    torch.testing.assert_close(lookup(table, packing, u + shift), lookup(table, packing, u))
+    # Half a texel beyond the last center lies the mean of the last and the first texel.
+    texture = table.view(4, 8, 3)
+    seam = lookup(table, packing, torch.tensor([[0.0, 1 - 0.5 / 4]], dtype=F64))
+    torch.testing.assert_close(seam[0], (texture[0, 0] + texture[0, 7]) / 2)
+    seam = lookup(table, packing, torch.tensor([[0.5 / 8, 0.0]], dtype=F64))
+    torch.testing.assert_close(seam[0], (texture[0, 0] + texture[3, 0]) / 2)
+
+
+def test_levels_blend_with_the_fraction() -> None:
+    packing = Packing.of(Lattice(3), range(4))
+    table = torch.cat([torch.full((4**s, 1), 2.0**s, dtype=F64) for s in range(4)])
+    level = torch.tensor([0.0, 1.0, 2.0, 3.0, 0.25, 1.5, 2.75, -1.0, 4.5], dtype=F64)
+    found = lookup(table, packing, torch.rand(len(level), 2, dtype=F64), level).flatten()
+    expected = [1, 2, 4, 8, 0.75 * 1 + 0.25 * 2, 3, 0.25 * 4 + 0.75 * 8, 1, 8]
+    torch.testing.assert_close(found, torch.tensor(expected, dtype=F64))
+
+
+@pytest.mark.parametrize("aspect", [1.0, 0.4, 1.7])
+@pytest.mark.parametrize("levels", [[3], [0, 1, 2, 3], [0]])
+def test_fast_path_equals_the_reference(aspect: float, levels: list[int]) -> None:
+    torch.manual_seed(0)
+    packing = Packing.of(Lattice(3, aspect), levels)
+    table = torch.randn(packing.texels, 5, dtype=F64, requires_grad=True)
+    u = (6 * torch.rand(300, 2, dtype=F64) - 3).requires_grad_()
+    level = 4 * torch.rand(300, dtype=F64) - 0.5 if len(levels) > 1 else None
+    weight = torch.randn(300, 5, dtype=F64)
+    results = []
+    for function in (lookup, lookup_reference):
+        out = function(table, packing, u, level)
+        results.append((out, *torch.autograd.grad((out * weight).sum(), (table, u))))
+    for fast, reference in zip(*results, strict=True):
+        torch.testing.assert_close(fast, reference, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("levels", [[2], [0, 1, 2]])
+def test_gradients_agree_with_finite_differences(levels: list[int]) -> None:
+    torch.manual_seed(0)
+    packing = Packing.of(Lattice(2, 1.5), levels)
+    table = torch.randn(packing.texels, 2, dtype=F64, requires_grad=True)
+    # Away from the texel centers, where the slope of a bilinear texture jumps.
+    i = torch.randint(0, 8, (12, 2))
+    u = ((i + 0.2 + 0.6 * torch.rand(12, 2, dtype=F64)) / torch.tensor([8.0, 12.0])).requires_grad_()
+    level = 0.1 + 1.8 * torch.rand(12, dtype=F64) if len(levels) > 1 else None
+    assert torch.autograd.gradcheck(lambda t, x: lookup(t, packing, x, level), (table, u), eps=1e-6)

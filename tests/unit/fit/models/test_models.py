@@ -1,0 +1,365 @@
+"""The models: weight counts, stages, offset, gradients, options, what they export."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+from mbtf_core.config_file import resolve
+from mbtf_core.errors import InputError, UsageError
+from mbtf_core.lattice import Lattice
+from mbtf_fit.config import EncodingSection, FitConfig
+from mbtf_fit.models import MODELS, Hierarchical, Neumip, TexturedMaterial, build_model
+from mbtf_fit.models.encodings import direction_size, encode_direction, encode_position, position_size
+from mbtf_fit.models.mlp import Mlp
+from mbtf_fit.models.outputs import START, to_value
+
+F64 = torch.float64
+# Every option away from its default at least once, on the model that it is for.
+VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
+    "baseline": ("neumip-baseline", {}),
+    "neumip": ("neumip", {}),
+    "six outputs": ("neumip", {"outputs": 6}),
+    "direct offset": ("neumip", {"offset": "direct", "activation": "leaky-relu", "output": "softplus"}),
+    "concatenated": ("neumip", {"blending": "concatenate", "activation": "sine", "output": "exp"}),
+    "encoded": (
+        "neumip",
+        {"encoding": {"position": 2, "direction": 2, "raw": True, "lifted": True, "pi": False}},
+    ),
+    "filtered": ("neumip", {"encoding": {"position": 3, "direction": 1, "filtered": True, "damped": True}}),
+    "identity": ("neumip-baseline", {"output": "identity", "channels": 3, "width": 8, "layers": 2}),
+    "hierarchical": ("hierarchical", {}),
+    "hierarchical, one module": ("hierarchical", {"layers": 3, "offset": "none", "outputs": 6, "width": 12}),
+    "hierarchical, mlp": ("hierarchical", {"decoder": "mlp"}),
+}
+variants = pytest.mark.parametrize("variant", VARIANTS)
+
+
+def directions(n: int, lowest: float = 0.1) -> torch.Tensor:
+    radius = ((1 - lowest**2) * torch.rand(n, dtype=F64)).sqrt()
+    angle = 6.2831853 * torch.rand(n, dtype=F64)
+    return torch.stack([radius * angle.cos(), radius * angle.sin(), (1 - radius**2).sqrt()], 1)
+
+
+def random_model(variant: str, aspect: float = 1.0, finest: int = 3) -> TexturedMaterial:
+    torch.manual_seed(0)
+    name, options = VARIANTS[variant]
+    model = build_model(name, Lattice(finest, aspect), **options).double()
+    model.initialize(torch.Generator().manual_seed(0), 0.1)
+    # Away from the kink of units that sum nothing but zeros.
+    for name, parameter in model.named_parameters():
+        if "bias" in name:
+            torch.nn.init.normal_(parameter, 0.5, 0.2)
+    if model.network.offset != "none":
+        torch.nn.init.normal_(model.offset_texture.texels)
+    return model
+
+
+def arguments(n: int) -> tuple[torch.Tensor, ...]:
+    sigma = 0.5 * torch.exp2(-3 * torch.rand(n, dtype=F64))
+    return torch.rand(n, 2, dtype=F64), sigma, directions(n), directions(n)
+
+
+def test_weight_counts_are_the_papers() -> None:
+    counts = {}
+    for outputs in (3, 6):
+        model = build_model("neumip", Lattice(7), outputs=outputs)
+        counts[outputs] = sum(p.numel() for p in model.parameter_groups()[1])
+    # The paper's text describes three outputs, its figure counts six.
+    assert counts == {3: 3254, 6: 3332}
+    assert sum(p.numel() for p in model.parameter_groups()[0]) == 7 * (sum(4**s for s in range(8)) + 4**7)
+    # 47 features (7 and 10 bands of u), 16 numbers per direction (4 bands of two coordinates).
+    model = build_model("hierarchical", Lattice(7))
+    modules = 2 * (26 * 7 + 26 * 3 + 28 * 12 + 26 * 5 + 3 * 126 + 26 * 3)
+    assert model.decoder.count == (47 + 32 + 1) * 25 + modules + 26 * 3
+
+
+def test_unset_options_are_the_models_own() -> None:
+    assert FitConfig().network.offset == "depth"
+    assert FitConfig(model="neumip-baseline").network.offset == "none"
+    network = resolve(FitConfig, assignments=["model=hierarchical", "network.encoding.position=6"]).network
+    assert (network.decoder, network.output, network.encoding.direction) == ("inception", "fourth-root", 4)
+    assert network.encoding.position == 6
+    dumped = FitConfig.model_validate({"model": "hierarchical", "network": {"decoder": "mlp"}})
+    assert FitConfig.model_validate(dumped.model_dump(mode="json")) == dumped
+
+
+@pytest.mark.parametrize(
+    ("assignments", "words"),
+    [
+        (["model=neumip-baseline", "network.offset=depth"], "has no offset"),
+        (["network.decoder=inception"], "choose the model hierarchical"),
+    ],
+)
+def test_options_that_contradict_the_model_are_refused(assignments: list[str], words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        resolve(FitConfig, assignments=assignments)
+
+
+@pytest.mark.parametrize("activation", ["relu", "leaky-relu", "sine"])
+def test_mlp_equals_its_reference(activation: Any) -> None:
+    torch.manual_seed(0)
+    network = Mlp([6, 25, 25, 3], activation).double()
+    network.initialize(torch.Generator().manual_seed(1))
+    x = torch.randn(100, 6, dtype=F64, requires_grad=True)
+    weight = torch.randn(100, 3, dtype=F64)
+    inputs = [x, *network.parameters()]
+    fast, reference = network(x), network.reference(x)
+    torch.testing.assert_close(fast, reference)
+    gradients = [torch.autograd.grad((out * weight).sum(), inputs) for out in (fast, reference)]
+    for mine, plain in zip(*gradients, strict=True):
+        torch.testing.assert_close(mine, plain)
+
+
+@variants
+def test_gradients_agree_with_finite_differences(variant: str) -> None:
+    model = random_model(variant, aspect=0.5, finest=2)
+    at = arguments(2)
+    names, parameters = zip(*model.named_parameters(), strict=True)
+
+    def value(*tensors: torch.Tensor) -> torch.Tensor:
+        out: torch.Tensor = torch.func.functional_call(model, dict(zip(names, tensors, strict=True)), at)
+        return out
+
+    assert torch.autograd.gradcheck(
+        value, parameters, eps=1e-7, atol=1e-5, rtol=1e-3, fast_mode=True, check_undefined_grad=False
+    )
+
+
+def test_the_offset_follows_the_papers_formula() -> None:
+    model = random_model("neumip")
+    u, omega_o = torch.rand(50, 2, dtype=F64), directions(50)
+    seen = torch.cat([model.offset_texture(u), omega_o[:, :2]], 1)
+    r = 0.1 * model.offset_network.reference(seen)
+    expected = r / omega_o[:, 2:].clamp_min(0.6) * omega_o[:, :2]
+    torch.testing.assert_close(model.offset(u, omega_o), expected)
+    straight = torch.tensor([[0.0, 0.0, 1.0]], dtype=F64).expand(50, 3)
+    assert model.offset(u, straight).abs().max() == 0
+
+
+@pytest.mark.parametrize("variant", ["neumip", "direct offset"])
+@pytest.mark.parametrize("aspect", [1.0, 0.5])
+def test_the_offset_is_a_length_in_tile_widths(variant: str, aspect: float) -> None:
+    model = random_model(variant, aspect)
+    u, sigma, _, omega_o = arguments(50)
+    moved = u + model.offset(u, omega_o) / torch.tensor([1.0, aspect], dtype=F64)
+    torch.testing.assert_close(model.stage1(u, sigma, omega_o), model.read(moved, model.level(sigma)))
+
+
+def test_without_an_offset_texture_the_view_alone_decides() -> None:
+    model = build_model("neumip-baseline", Lattice(3))
+    assert model.offset(torch.rand(5, 2), torch.rand(5, 3)).abs().max() == 0
+
+
+@variants
+def test_stage_one_does_not_see_the_light(variant: str) -> None:
+    model = random_model(variant)
+    u, sigma, view, _ = arguments(9)
+    features = model.stage1(u, sigma, view)
+    for _ in range(2):
+        light = directions(9)
+        torch.testing.assert_close(model.stage2(features, light, view), model(u, sigma, light, view))
+
+
+@variants
+def test_the_tile_repeats(variant: str) -> None:
+    model = random_model(variant)
+    if not model.network.encoding.pi:
+        pytest.skip("sin(2^k p) does not repeat with the tile")
+    u, *rest = arguments(20)
+    shift = torch.randint(-3, 4, u.shape).double()
+    torch.testing.assert_close(model(u + shift, *rest), model(u, *rest))
+    # ... and without a seam: both sides of it have the same value.
+    left, right = u.clone(), u.clone()
+    left[:, 0], right[:, 0] = 1 - 1e-9, 1e-9
+    torch.testing.assert_close(model(left, *rest), model(right, *rest), rtol=1e-4, atol=1e-6)
+
+
+@variants
+def test_exported_weights_make_the_same_model(variant: str) -> None:
+    model = random_model(variant)
+    for texture in model.textures():
+        texture.read(texture.blurred(1.5))
+    other = random_model(variant)
+    with torch.no_grad():
+        for p in other.parameters():
+            p.zero_()
+    other.load_weights(model.weights())
+    at = arguments(20)
+    torch.testing.assert_close(other(*at), model(*at), rtol=0, atol=0)
+    weights = model.weights()
+    lost = next(name for name in weights if name.startswith("decoder."))
+    weights.pop(lost)
+    with pytest.raises(InputError, match=lost.replace(".", r"\.")):
+        other.load_weights(weights)
+
+
+@pytest.mark.parametrize("sigma", [0.0, 1e-9, 0.5, 3.0])
+def test_footprints_beyond_the_levels_take_the_nearest(sigma: float) -> None:
+    model = random_model("baseline")
+    level = model.level(torch.tensor([sigma]))
+    assert level.item() == (3.0 if sigma < 0.1 else 0.0)
+
+
+@pytest.mark.parametrize("variant", ["neumip", "concatenated"])
+def test_the_value_is_continuous_across_levels(variant: str) -> None:
+    model = random_model(variant)
+    u, _, light, view = arguments(30)
+    for level in (1.0, 2.0):
+        near = [torch.full((30,), 0.5 * 2.0 ** -(level + e), dtype=F64) for e in (-1e-9, 1e-9)]
+        torch.testing.assert_close(*(model(u, sigma, light, view) for sigma in near), rtol=1e-6, atol=1e-8)
+
+
+def test_concatenated_levels_are_two_weighted_lookups() -> None:
+    model = random_model("concatenated")
+    u, level = torch.rand(2, 2, dtype=F64), torch.tensor([1.25, 2.25], dtype=F64)
+    one, two, three = (model.pyramid(u, torch.full((2,), s, dtype=F64)) for s in (1.0, 2.0, 3.0))
+    expected = [
+        torch.cat([0.25 * two[0], 0.75 * one[0]]),
+        torch.cat([0.75 * two[1], 0.25 * three[1]]),
+    ]
+    torch.testing.assert_close(model.read(u, level), torch.stack(expected))
+
+
+@pytest.mark.parametrize("output", START)
+def test_training_starts_from_the_datas_brightness(output: Any) -> None:
+    at = torch.full((4, 3), START[output], dtype=F64)
+    value = to_value(at, torch.tensor(0.3, dtype=F64), output)
+    torch.testing.assert_close(value, torch.full_like(value, 0.0 if output == "exp-1" else 0.3))
+
+
+def test_six_outputs_are_luma_chroma_and_a_gate() -> None:
+    unit = torch.tensor(2.0, dtype=F64)
+    gray = torch.tensor([[0.7, 0.0, 0.0, 0.0, 20.0, -20.0]], dtype=F64)
+    brightness = 2.0 * torch.expm1(torch.tensor(0.7, dtype=F64))
+    expected = brightness * torch.tensor([[0.6, 1.1, 0.1]], dtype=F64)
+    torch.testing.assert_close(to_value(gray, unit, "exp-1"), expected)
+    red = torch.tensor([[0.0, 0.0, 1.0, 9.0, 9.0, 9.0]], dtype=F64)
+    r, g, b = to_value(red, unit, "identity")[0]
+    assert r > 0 > g
+    assert b == 0
+
+
+def test_encodings_are_sines_and_cosines_of_doubling_frequencies() -> None:
+    options = EncodingSection(position=2, direction=1)
+    pi = torch.pi
+    u = torch.tensor([[0.75, -0.75]], dtype=F64)  # p = 0.5, -0.5
+    expected = [(k * p, f) for f in (torch.sin, torch.cos) for p in (0.5, -0.5) for k in (pi, 2 * pi)]
+    level = torch.zeros(1, dtype=F64)
+    found = encode_position(u, level, 1.0, options)[0]
+    torch.testing.assert_close(found, torch.stack([f(torch.tensor(x, dtype=F64)) for x, f in expected]))
+    omega = torch.tensor([[0.6, 0.0, 0.8]], dtype=F64)
+    kept = EncodingSection(direction=1, direction_pi=False, raw=True, lifted=True)
+    s, c = omega.sin(), omega.cos()
+    torch.testing.assert_close(encode_direction(omega, kept), torch.cat([omega, s, c], 1))
+    for e in (options, kept, EncodingSection(), EncodingSection(position=3, raw=True)):
+        assert encode_position(u, level, 1.0, e).shape[1] == position_size(e)
+        assert encode_direction(omega, e).shape[1] == direction_size(e)
+
+
+def test_damped_encodings_are_equally_steep() -> None:
+    options = EncodingSection(position=6, direction=4, direction_pi=False, damped=True)
+    h = 1e-6
+    up, tilt = torch.tensor([[0.0, 0.0, 1.0]], dtype=F64), torch.tensor([[h, h, 0.0]], dtype=F64)
+    rise = encode_direction(up + tilt, options) - encode_direction(up, options)
+    torch.testing.assert_close(rise[:, :8] / h, torch.ones(1, 8, dtype=F64))
+    u, level = torch.full((2, 2), 0.5, dtype=F64), torch.zeros(2, dtype=F64)
+    u[1] += h
+    below, above = encode_position(u, level, 1.0, options)
+    torch.testing.assert_close((above - below)[:12] / h, torch.full((12,), 2 * torch.pi, dtype=F64))
+
+
+def test_filtered_encodings_are_means_over_the_footprint() -> None:
+    """Footprints are Gaussians of a standard deviation of ``2^-level / 2`` tile widths; raw coordinates keep
+    their own mean."""
+    options = EncodingSection(position=4, raw=True)
+    aspect, u = 0.5, torch.tensor([[0.3, 0.6]], dtype=F64)
+    z = torch.linspace(-8, 8, 8001, dtype=F64)
+    weights = torch.exp(-0.5 * z**2)
+    for level in (0.0, 1.5, 4.0):
+        at = torch.full((1,), level, dtype=F64)
+        sigma = 0.5 * 2.0**-level / torch.tensor([1.0, aspect], dtype=F64)
+        around = encode_position(u + z[:, None] * sigma, at, aspect, options)
+        expected = (weights[:, None] * around).sum(0) / weights.sum()
+        found = encode_position(u, at, aspect, options.model_copy(update={"filtered": True}))[0]
+        torch.testing.assert_close(found[2:], expected[2:], atol=1e-9, rtol=0)
+        torch.testing.assert_close(found[:2], 2 * u[0] - 1)
+
+
+@variants
+def test_training_starts_as_the_documentation_says(variant: str) -> None:
+    """Features of 0.1·N(0,1), no offset texture; variance-preserving weights, biases 0 but the answer's."""
+    name, options = VARIANTS[variant]
+    model = build_model(name, Lattice(5), **{**options, "width": 128}).requires_grad_(False)
+    model.initialize(torch.Generator().manual_seed(0), 0.2)
+    assert float(model.unit) == pytest.approx(0.2)
+    assert float(model.pyramid.texels.std()) == pytest.approx(0.1, rel=0.05)
+    if model.network.offset != "none":
+        assert not model.offset_texture.texels.any()
+    weights = model.weights()
+    for network in ("decoder", "offset_network"):
+        mine = [key for key in weights if key.startswith(network)]
+        for key in mine:
+            tensor, last = weights[key], key in mine[-2:]
+            if key.endswith(".bias"):
+                start = START[model.network.output] if last and network == "decoder" else 0.0
+                assert float(tensor[0]) == pytest.approx(start)
+                assert not tensor[3 if last else 0 :].any()
+            else:
+                variance = float(tensor.double().square().mean()) * tensor[0].numel()
+                # Of so many numbers, to four standard errors.
+                assert variance == pytest.approx(1 if last else 2, rel=4 * (2 / tensor.numel()) ** 0.5), key
+
+
+@variants
+def test_the_formula_names_what_the_export_holds(variant: str) -> None:
+    model = random_model(variant)
+    text = " ".join(model.formula().values())
+    for name in {key.split(".")[0] for key in model.weights()}:
+        assert name in text
+
+
+def test_hierarchical_sees_nine_by_nine_texels_of_the_nearest_level() -> None:
+    model = build_model("hierarchical", Lattice(4, 0.5)).double()
+    assert isinstance(model, Hierarchical)
+    assert model.positions == 81
+    u = torch.tensor([[0.3, 0.7]], dtype=F64)
+    for level, (rows, columns) in ((2.4, (2, 4)), (2.6, (4, 8)), (9.0, (8, 16))):
+        sigma = torch.tensor([0.5 * 2.0**-level], dtype=F64)
+        places = model.neighborhood(u, sigma)[0]
+        torch.testing.assert_close(places[4, 4], u[0])
+        torch.testing.assert_close(places[4, 5] - places[4, 4], torch.tensor([1 / columns, 0.0], dtype=F64))
+        torch.testing.assert_close(places[5, 4] - places[4, 4], torch.tensor([0.0, -1 / rows], dtype=F64))
+
+
+def test_hierarchical_depends_on_every_place_of_its_neighborhood_and_no_other() -> None:
+    model = random_model("hierarchical")
+    assert isinstance(model, Hierarchical)
+    features = model.stage1(*(a[:1] for a in (*arguments(1)[:2], directions(1)))).detach().requires_grad_()
+    light, view = directions(1), directions(1)
+    model.stage2(features, light, view).sum().backward()
+    assert features.grad is not None
+    assert features.shape[1:3] == (9, 9)
+    touched = features.grad.abs().sum((0, 3)) > 0
+    assert touched[[0, 0, 4, 8, 8], [0, 8, 4, 0, 8]].float().mean() > 0.5
+    assert touched.float().mean() > 0.8
+
+
+def test_a_query_has_the_same_value_in_any_company() -> None:
+    model = random_model("hierarchical")
+    at = arguments(40)
+    together = model(*at)
+    order = torch.randperm(40)
+    torch.testing.assert_close(model(*(a[order] for a in at)), together[order])
+    torch.testing.assert_close(model(*(a[7:8] for a in at)), together[7:8])
+
+
+def test_neumip_is_named_by_its_class() -> None:
+    assert isinstance(build_model("neumip", Lattice(2)), Neumip)
+    assert {name: model.layout for name, model in MODELS.items()} == {
+        "neumip-baseline": "shuffled",
+        "neumip": "shuffled",
+        "hierarchical": "image",
+    }

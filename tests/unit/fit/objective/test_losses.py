@@ -1,0 +1,168 @@
+"""Losses: what each weighs, what noise does to its minimum, how far a single value reaches."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from mbtf_fit.config import TrainingSection
+from mbtf_fit.data.loader import TrainingQueries
+from mbtf_fit.objective.losses import Curve, FourthRoot, Log, Objective
+from mbtf_fit.objective.noise import NoiseModel
+
+KINDS = ("relative", "squared", "linear", "log", "fourth-root")
+SCALE = 0.5
+
+
+def objective(kind: str, variance: float = 0.0, **options: Any) -> Objective:
+    """One term, for noise of a variance that is the same for all values."""
+    training = TrainingSection.model_validate({"losses": [{"kind": kind}], **options})
+    c = np.array([variance / SCALE**2, 0, 0])
+    return Objective(training, NoiseModel(SCALE, c, np.tile(c, (4, 1)), np.ones(4), 0.0))
+
+
+def queries(value: Tensor) -> TrainingQueries:
+    n = len(value)
+    up = torch.tensor([0.0, 0.0, 1.0]).expand(n, 3)
+    return TrainingQueries(torch.zeros(n, 2), torch.full((n,), 0.1), up, up, value)
+
+
+def minimum(loss: Objective, value: Tensor) -> float:
+    """Prediction at which the mean gradient over values (n, 1) vanishes, by bisection."""
+    low, high = 0.2, 2.0
+    for _ in range(24):
+        middle = (low + high) / 2
+        p = torch.full_like(value, middle, requires_grad=True)
+        (gradient,) = torch.autograd.grad(loss(p, queries(value)), p)
+        low, high = (low, middle) if float(gradient.sum()) > 0 else (middle, high)
+    return low
+
+
+def skewed(relative: float) -> Tensor:
+    """Values of mean 1 with gamma noise of a relative deviation, as paths make it: never negative, skewed."""
+    random = np.random.default_rng(1)
+    shape = 1 / relative**2
+    value = random.gamma(shape, 1 / shape, (20_000, 1))
+    return torch.from_numpy(value / value.mean())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_by_default_the_minimum_is_the_expectation_whatever_the_noise(kind: str) -> None:
+    value = skewed(0.8)
+    assert minimum(objective(kind, 0.64, robust=None), value) == pytest.approx(1.0, abs=2e-3)
+
+
+@pytest.mark.parametrize(("kind", "least"), [("linear", 0.15), ("log", 0.08), ("fourth-root", 0.15)])
+def test_without_correction_curved_losses_are_biased(kind: str, least: float) -> None:
+    """They are dark, by a median or by ½ f''·variance/f': the correction has something to correct."""
+    assert minimum(objective(kind, correction="none", robust=None), skewed(0.8)) < 1 - least
+
+
+def test_second_order_takes_most_of_the_bias_of_little_noise() -> None:
+    value = skewed(0.3)
+    plain = 1 - minimum(objective("log", correction="none", robust=None), value)
+    corrected = 1 - minimum(objective("log", 0.09, correction="second-order", robust=None), value)
+    assert plain > 0.02
+    assert abs(corrected) < 0.1 * plain
+
+
+def test_the_default_s_robust_rule_costs_little_bias() -> None:
+    """Ten times noise and scale: of skewed noise as large as the value, three in a million are beyond."""
+    assert minimum(objective("relative", 1.0), skewed(1.0)) == pytest.approx(1.0, abs=1e-3)
+
+
+def test_a_wild_value_pulls_like_one_at_the_bound() -> None:
+    loss = objective("squared", 0.04)
+    pulls = []
+    bound = 10 * (SCALE**2 + 0.04) ** 0.5
+    for off in (0.5 * bound, bound, 2 * bound, 1e5):
+        p = torch.full((1, 3), 1.0, dtype=torch.float64, requires_grad=True)
+        value = torch.full((1, 3), 1.0 + off, dtype=torch.float64)
+        (gradient,) = torch.autograd.grad(loss(p, queries(value)), p)
+        pulls.append(float(gradient[0, 0]))
+    assert pulls[0] == pytest.approx(pulls[1] / 2)
+    assert pulls[1] == pytest.approx(pulls[2]) == pytest.approx(pulls[3])
+
+
+@pytest.mark.parametrize("curve", [Log(), FourthRoot()], ids=["log", "fourth-root"])
+def test_slopes_and_curvatures_are_derivatives(curve: Curve) -> None:
+    x = torch.tensor([-3.0, -0.6, -0.2, 0.0003, 0.1, 1.0, 30.0], dtype=torch.float64, requires_grad=True)
+    value = curve.value(x)
+    (slope,) = torch.autograd.grad(value.sum(), x)
+    torch.testing.assert_close(slope, curve.slope(x.detach()))
+    h = 1e-7
+    bend = (curve.slope(x.detach() + h) - curve.slope(x.detach() - h)) / (2 * h)
+    torch.testing.assert_close(bend, curve.curvature(x.detach()), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["squared", "log", "relative"])
+def test_without_noise_and_near_the_value_corrections_change_nothing(kind: str) -> None:
+    value = torch.tensor([[0.3, 1.0, 4.0]], dtype=torch.float64)
+    found = []
+    for correction in ("none", "second-order", "linear"):
+        p = (value * 1.0001).requires_grad_()
+        loss = objective(kind, correction=correction)
+        found.append(torch.autograd.grad(loss(p, queries(value)), p)[0])
+    torch.testing.assert_close(found[1], found[0])
+    torch.testing.assert_close(found[2], found[0], rtol=1e-3, atol=0.0)
+
+
+def test_terms_add_up_with_their_weights() -> None:
+    p, data = torch.full((4, 3), 0.2), queries(torch.full((4, 3), 0.7))
+    both = TrainingSection.model_validate(
+        {"losses": [{"kind": "squared", "weight": 2.0}, {"kind": "log", "weight": 0.5}]}
+    )
+    noise = NoiseModel(SCALE, np.zeros(3), np.zeros((4, 3)), np.ones(4), 0.0)
+    total = 2.0 * objective("squared")(p, data) + 0.5 * objective("log")(p, data)
+    torch.testing.assert_close(Objective(both, noise)(p, data), total)
+
+
+def test_corrected_absolute_terms_are_parabolas_of_the_noise() -> None:
+    """e²/2√(v + 0.01), e and v in units of the scale; of neighbors' differences v is that of both."""
+    e, v = 0.3 / SCALE, 0.04 / SCALE**2
+    loss = objective("linear", 0.04, robust=None)
+    found = loss(torch.full((5, 3), 1.0), queries(torch.full((5, 3), 1.3)))
+    assert float(found) == pytest.approx(e**2 / 2 / (v + 0.01) ** 0.5, rel=1e-5)
+    loss = objective("gradient", 0.04, robust=None)
+    value = torch.ones(1, 4, 4, 3, dtype=torch.float64)
+    value[:, ::2] += 1e-3
+    data = queries(value[:, 0, 0])
+    data = TrainingQueries(data.u, data.sigma, data.omega_i, data.omega_o, value)
+    slope = float(FourthRoot().slope(torch.tensor(1.0 / SCALE, dtype=torch.float64)))
+    edge, noise = slope * 1e-3 / SCALE, 2 * slope**2 * v
+    # All differences down the columns, none along the rows.
+    expected = edge**2 / 2 / (noise + 0.01) ** 0.5 / 2
+    assert float(loss(torch.ones_like(value), data)) == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize("shape", [(2, 1, 6, 3), (2, 6, 1, 3), (2, 1, 1, 3)])
+def test_a_single_row_of_places_has_gradients_along_it_alone(shape: tuple[int, ...]) -> None:
+    value = torch.rand(shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    data = queries(value[:, 0, 0])
+    data = TrainingQueries(data.u, data.sigma, data.omega_i, data.omega_o, value)
+    for correction in ("none", "linear"):
+        p = torch.zeros_like(value, requires_grad=True)
+        loss = objective("gradient", 0.01, correction=correction)(p, data)
+        (gradient,) = torch.autograd.grad(loss, p)
+        assert bool(loss.isfinite())
+        assert bool(gradient.isfinite().all())
+        assert bool(loss > 0) == (max(shape[1:3]) > 1)
+
+
+def test_the_gradient_term_sees_differences_of_neighbors_alone() -> None:
+    """A constant error costs nothing; an edge costs what it is high."""
+    value = torch.zeros(1, 4, 6, 3, dtype=torch.float64)
+    data = TrainingQueries(*(torch.ones(1, 3).double() for _ in range(4)), value)
+    data = TrainingQueries(data.u, torch.full((1,), 0.1), data.omega_i, data.omega_o, value)
+    loss = objective("gradient", correction="none")
+    assert float(loss(value + 0.1, data)) == pytest.approx(0.0, abs=1e-12)
+    edge = value.clone()
+    edge[:, :, 3:] = 0.1
+    height = float(FourthRoot().value(torch.tensor(0.2)) - FourthRoot().value(torch.tensor(0.0)))
+    # Five differences along each row, one of them the edge; half the weight is that of columns.
+    assert float(loss(edge, data)) == pytest.approx(height / 5 / 2)
+    assert float(objective("gradient", 0.01)(edge, data)) > 0

@@ -1,0 +1,119 @@
+"""The variance model: pooled over queries it finds what the noise was made with."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from support.fit_data import parallax, random_queries
+
+from mbtf_core.lattice import Lattice
+from mbtf_fit.data.loader import Queries
+from mbtf_fit.objective.noise import NoiseModel, typical_value
+
+LATTICE = Lattice(3)
+
+
+def noisy(n: int = 60_000, wild: int = 0) -> tuple[Queries, np.ndarray, np.ndarray]:
+    """(queries, true values, variance of the mean of their halves): variance 0.2 t² at coarse levels, 0.05 t²
+    at fine ones, twice that where light or view is low."""
+    random = np.random.default_rng(0)
+    arrays = random_queries(random, n, LATTICE)
+    true = parallax(*arrays.values())
+    low = np.minimum(arrays["omega_i"][:, 2], arrays["omega_o"][:, 2]) < 0.2
+    factor = np.where(arrays["sigma"] > 0.15, 0.2, 0.05) * np.where(low, 2.0, 1.0)
+    variance = factor[:, None] * true**2
+    # Gamma noise, each half with twice the variance of the mean.
+    shape = true**2 / (2 * variance)
+    a, b = (random.gamma(shape) / shape * true for _ in range(2))
+    rows = random.choice(n, wild, replace=False)
+    a[rows[::2]], b[rows[1::2]] = 1e5, 1e5
+    return Queries(*arrays.values(), a.astype(np.float32), b.astype(np.float32)), true, variance
+
+
+@pytest.mark.parametrize("wild", [0, 5])
+def test_variance_by_level_and_elevation_is_found(wild: int) -> None:
+    """To 25 % in every group (the factors are pooled where the levels' footprints are); wild values decide
+    nothing."""
+    queries, true, variance = noisy(wild=wild)
+    model = NoiseModel.of(queries, LATTICE, 0.05)
+    tensors = (torch.from_numpy(a) for a in (queries.sigma, queries.omega_i, queries.omega_o))
+    found = model.variance(torch.from_numpy(true), *tensors).numpy()
+    low = np.minimum(queries.omega_i[:, 2], queries.omega_o[:, 2]) < 0.2
+    for coarse in (queries.sigma > 0.3, queries.sigma < 0.1):
+        for elevation in (low, ~low):
+            group = coarse & elevation
+            assert found[group].mean() / variance[group].mean() == pytest.approx(1.0, abs=0.25)
+
+
+def test_the_lower_of_light_and_view_decides() -> None:
+    """Whichever it is: twice the variance that both being high have."""
+    queries, _, _ = noisy()
+    model = NoiseModel.of(queries, LATTICE, 0.05)
+    steep, low = (torch.tensor([[x, 0.0, (1 - x * x) ** 0.5]]) for x in (0.3, 0.99))
+    at = torch.full((1, 3), 0.05), torch.tensor([0.1])
+    high = float(model.variance(*at, steep, steep)[0, 0])
+    for light, view in ((low, steep), (steep, low), (low, low)):
+        assert float(model.variance(*at, light, view)[0, 0]) / high == pytest.approx(2.0, rel=0.25)
+
+
+def test_data_without_noise_have_none() -> None:
+    queries, _, _ = noisy(2000)
+    same = queries.value_a
+    quiet = Queries(queries.u, queries.sigma, queries.omega_i, queries.omega_o, same, same)
+    nothing = quiet.take(slice(0))
+    for data in (quiet, nothing):
+        found = NoiseModel.of(data, LATTICE, 0.05)
+        assert not found.levels.any()
+        assert found.ratio == 0.0
+
+
+@pytest.mark.parametrize("wild", [0, 5])
+def test_the_ratio_is_that_of_noise_to_true_values(wild: int) -> None:
+    """To 5 %, wild values or not; where true values do not vary it is the most there is, since none can be
+    told, and of a single query likewise."""
+    queries, true, variance = noisy(wild=wild)
+    found = NoiseModel.of(queries, LATTICE, 0.05).ratio
+    assert found == pytest.approx(variance.mean() / true.var(0).mean(), rel=0.05)
+    assert NoiseModel.of(queries.take(slice(1)), LATTICE, 0.05).ratio == 5.0
+    random = np.random.default_rng(1)
+    a, b = (random.normal(1.0, 0.1, queries.value_a.shape).astype(np.float32) for _ in range(2))
+    even = Queries(queries.u, queries.sigma, queries.omega_i, queries.omega_o, a, b)
+    assert NoiseModel.of(even, LATTICE, 1.0).ratio == 5.0
+
+
+def test_light_that_few_paths_find_is_noise() -> None:
+    """One half in a hundred, a hundred times too bright, on few bright queries: noise far beyond the most."""
+    random = np.random.default_rng(2)
+    n = 60_000
+    at = random_queries(random, n, LATTICE)
+    true = parallax(*at.values()) + 5 * (random.random((n, 1)) < 0.02)
+    a, b = (100 * true * (random.random((n, 1)) < 0.01) for _ in range(2))
+    queries = Queries(*at.values(), a.astype(np.float32), b.astype(np.float32))
+    assert NoiseModel.of(queries, LATTICE, 0.05).ratio == 5.0
+
+
+def test_buffers_are_pooled_like_queries() -> None:
+    queries, true, _ = noisy(64 * 500)
+    shaped = {k: v.reshape(500, 8, 8, *v.shape[1:]) for k, v in vars(queries).items()}
+    for name in ("sigma", "omega_i", "omega_o"):
+        shaped[name] = np.broadcast_to(shaped[name][:, :1, :1], shaped[name].shape)
+    model = NoiseModel.of(Queries(**shaped), LATTICE, 0.05)
+    assert model.overall.sum() > 0
+    assert model.ratio == pytest.approx(NoiseModel.of(queries, LATTICE, 0.05).ratio, rel=0.2)
+    value = torch.from_numpy(true.reshape(500, 8, 8, 3))
+    first = [torch.from_numpy(np.array(shaped[n][:, 0, 0])) for n in ("sigma", "omega_i", "omega_o")]
+    assert model.variance(value, *first).shape == value.shape
+
+
+def test_the_typical_value_ignores_a_few_wild_ones() -> None:
+    value = np.random.default_rng(0).gamma(0.5, 2.0, (20_000, 3))
+    assert typical_value(value) == pytest.approx(1.0, abs=0.05)
+    value[:5] = 1e5
+    assert typical_value(value) == pytest.approx(1.0, abs=0.05)
+    assert typical_value(np.zeros((10, 3))) == 0.0
+    assert typical_value(np.full((1, 3), 0.25)) == 0.25
+    # Mostly black, with rare highlights: the median group has none.
+    rare = np.zeros((5000, 3))
+    rare[7] = 100.0
+    assert typical_value(rare) == pytest.approx(0.02)

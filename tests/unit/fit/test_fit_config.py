@@ -1,0 +1,59 @@
+"""Configuration of the fitter."""
+
+from __future__ import annotations
+
+import pytest
+
+from mbtf_core.config_file import resolve
+from mbtf_core.errors import UsageError
+from mbtf_core.units import format_duration, parse_duration
+from mbtf_fit.config import FitConfig
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"),
+    [
+        ("90s", 90.0),
+        ("2min", 120.0),
+        ("2 m", 120.0),
+        ("1h", 3600.0),
+        ("1.5h", 5400.0),
+        (45, 45.0),
+        ("0.5s", 0.5),
+    ],
+)
+def test_durations_are_read(text: str | float, seconds: float) -> None:
+    assert parse_duration(text) == seconds
+
+
+@pytest.mark.parametrize("text", ["", "fast", "-3s", "0s", "2 weeks", "1e9h", "nan"])
+def test_nonsense_durations_are_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="duration"):
+        parse_duration(text)
+
+
+@pytest.mark.parametrize("seconds", [0.25, 45.0, 90.0, 120.0, 3600.0, 5400.0, 7261.0])
+def test_durations_survive_writing(seconds: float) -> None:
+    assert parse_duration(format_duration(seconds)) == seconds
+
+
+def test_configuration_survives_writing() -> None:
+    config = FitConfig.model_validate(
+        {"training": {"time": "90s", "batch": 1000}, "held_out": {"radius": 0.2}}
+    )
+    assert FitConfig.model_validate(config.model_dump(mode="json")) == config
+
+
+def test_hash_covers_data_and_options_but_not_the_device() -> None:
+    config = FitConfig()
+    assert config.hash("data") == FitConfig(device="cpu").hash("data")
+    assert config.hash("data") != config.hash("other data")
+    assert config.hash("data") != FitConfig(seed=1).hash("data")
+    assert config.hash("data") == FitConfig.model_validate({"training": {"time": "120s"}}).hash("data")
+
+
+def test_unknown_keys_name_the_nearest_valid_one() -> None:
+    with pytest.raises(UsageError, match=r"training\.bach.*\n.*batch"):
+        resolve(FitConfig, assignments=["training.bach=3"])
+    with pytest.raises(UsageError, match="neumip"):
+        resolve(FitConfig, flags={"model": "neumop"})

@@ -1,0 +1,40 @@
+"""What the fitter says beside its table of errors."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from mbtf_fit.formatting import describe_errors
+
+
+def errors(value: float | None, by_level: float | None) -> dict[str, Any]:
+    def group(unexplained: float | None) -> dict[str, Any]:
+        return {
+            "n": 100,
+            "unexplained": {"value": unexplained, "error": None if unexplained is None else 0.1},
+        }
+
+    return {"test": group(value) | {"levels": {"0": group(by_level)}, "elevations": {}}}
+
+
+@pytest.mark.parametrize(
+    ("value", "by_level", "remarks"),
+    [
+        (0.3, 0.2, []),
+        (0.3, None, ["undefined: noise hides"]),
+        (1.0, 0.2, ["above 1 the mean value alone would do better"]),
+        (0.99, 7.0, []),
+        (None, None, ["undefined: noise hides"]),
+        (127.0, None, ["undefined: noise hides", "above 1 the mean value"]),
+    ],
+)
+def test_numbers_that_surprise_are_explained(
+    value: float | None, by_level: float | None, remarks: list[str]
+) -> None:
+    lines = describe_errors(errors(value, by_level))
+    assert lines[3].split() == ["queries", "100"]
+    assert len(lines) == 4 + len(remarks)
+    for line, remark in zip(lines[4:], remarks, strict=True):
+        assert line.startswith(remark)

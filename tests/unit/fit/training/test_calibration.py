@@ -1,0 +1,176 @@
+"""Factors that set the mean reflectance at each elevation to that of the data."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from support.fit_data import random_queries, training_queries, write_data
+from support.plugin_materials import write_material
+
+from mbtf_core.errors import InputError
+from mbtf_core.lattice import Lattice, level_of_sigma
+from mbtf_fit import FitConfig, fit
+from mbtf_fit.config import HeldOutSection
+from mbtf_fit.data.loader import TrainingQueries, in_region
+from mbtf_fit.material.inference import evaluate_in_chunks, predict
+from mbtf_fit.models import Neumip, build_model
+from mbtf_fit.models.calibration_factors import KNOTS, look_up_gain
+from mbtf_fit.training.calibration import fit_gains
+
+F32 = np.ndarray
+LATTICE = Lattice(3)
+TINT = np.array([0.3, 0.2, 0.1])
+# Wide, so that it shows in means.
+HELD_OUT = HeldOutSection(radius=0.4)
+
+
+def truth(u: F32, sigma: F32, omega_i: F32, omega_o: F32) -> F32:
+    """A pattern under light and view of their own, with equal means at all levels."""
+    fade = np.exp(-2 * (np.pi * np.asarray(sigma, np.float64)) ** 2)
+    shade = (1 + 0.8 * fade * np.sin(2 * np.pi * u[:, 0])) * (1 + omega_i[:, 2] * omega_o[:, 0] ** 2)
+    return np.asarray(shade[:, None] * TINT, np.float32)
+
+
+def wrong(u: F32, sigma: F32, omega_i: F32, omega_o: F32) -> F32:
+    """The same with errors of level and elevations."""
+    level = np.clip(level_of_sigma(np.asarray(sigma, np.float64)), 0, 3)
+    off = 1 + 0.1 * np.sin(6 * omega_i[:, 2]) * (1 - 0.2 * level) + 0.08 * omega_o[:, 2] ** 2
+    return np.asarray(truth(u, sigma, omega_i, omega_o) * off[:, None] * [1.0, 1.05, 0.9], np.float32)
+
+
+def data(n: int, noise: float, seed: int = 0) -> TrainingQueries:
+    """Queries with skewed noise, that of paths; none in the held-out region."""
+    random = np.random.default_rng(seed)
+    queries = random_queries(random, n, LATTICE)
+    seen = ~(in_region(HELD_OUT, queries["omega_i"]) | in_region(HELD_OUT, queries["omega_o"]))
+    queries = {name: array[seen] for name, array in queries.items()}
+    value = truth(*queries.values())
+    return training_queries(queries, value * (1 + noise * (random.exponential(1.0, value.shape) - 1)))
+
+
+def excess(gain: F32 | None, sigma: float, axis: int) -> F32:
+    """(wrong · gain) over truth, minus 1, by six bands of light's (0) or view's (1) elevation."""
+    random = np.random.default_rng(7)
+    q = random_queries(random, 60_000, LATTICE)
+    q["sigma"] = np.full_like(q["sigma"], sigma)
+    value = wrong(*q.values()).astype(np.float64)
+    if gain is not None:
+        level = torch.from_numpy(np.clip(level_of_sigma(q["sigma"]), 0, 3).astype(np.float32))
+        for table, omega in zip(torch.from_numpy(gain), (q["omega_i"], q["omega_o"]), strict=True):
+            value *= look_up_gain(table, level, torch.from_numpy(omega[:, 2])).numpy()
+    cosine = q["omega_i" if axis == 0 else "omega_o"][:, 2]
+    band = np.minimum(((cosine - 0.1) / 0.15).astype(int), 5)
+    means = [np.stack([v[band == k].mean(0) for k in range(6)]) for v in (value, truth(*q.values()))]
+    return np.asarray(means[0] / means[1] - 1)
+
+
+def nothing(prediction: torch.Tensor) -> None:
+    """No error is too large."""
+
+
+def test_means_at_each_elevation_become_those_of_the_data() -> None:
+    """Of light and view, at every level, per color, under skewed noise; held-out directions included."""
+    gain = fit_gains(wrong, LATTICE, data(150_000, 0.5), HELD_OUT, nothing)
+    assert gain.shape == (2, 4, KNOTS, 3)
+    for sigma in (0.5, 0.09):
+        for axis in (0, 1):
+            assert np.abs(excess(None, sigma, axis)).max() > 0.1
+            assert np.abs(excess(gain, sigma, axis)).max() < 0.02
+            assert np.abs(excess(gain, sigma, axis)).mean() < 0.006
+
+
+def test_data_that_say_little_change_little() -> None:
+    gain = fit_gains(truth, LATTICE, data(3000, 3.0), HELD_OUT, nothing)
+    assert np.abs(gain - 1).max() < 0.06
+    # Where no data lie, and in black ones.
+    black = fit_gains(
+        lambda u, *_: np.zeros((len(u), 3), np.float32), LATTICE, data(3000, 0.0), HELD_OUT, nothing
+    )
+    np.testing.assert_allclose(black, 1.0)
+
+
+def test_wild_values_do_not_decide() -> None:
+    queries = data(50_000, 0.5)
+    kept = fit_gains(wrong, LATTICE, queries, HELD_OUT, lambda p: 2.0 + 0 * p)
+    queries.value[::2500] = 1e6
+    found = fit_gains(wrong, LATTICE, queries, HELD_OUT, lambda p: 2.0 + 0 * p)
+    np.testing.assert_allclose(found, kept, atol=0.02)
+
+
+def random_gain(levels: int, knots: int = 5) -> torch.Tensor:
+    return 0.7 + 0.6 * torch.rand((2, levels, knots, 3), generator=torch.Generator().manual_seed(2))
+
+
+def by_hand(table: F32, level: F32, cosine: F32) -> F32:
+    """Linear between knots and levels."""
+    levels, knots = table.shape[:2]
+    x = cosine * (knots - 1)
+    i, s = np.minimum(x.astype(int), knots - 2), np.minimum(level.astype(int), max(levels - 2, 0))
+    t, f = (x - i)[:, None], (level - s)[:, None]
+    low, high = (table[r, i] * (1 - t) + table[r, i + 1] * t for r in (s, np.minimum(s + 1, levels - 1)))
+    return np.asarray(low * (1 - f) + high * f)
+
+
+@pytest.mark.parametrize("finest", [0, 3])
+@pytest.mark.parametrize("model", ["neumip", "neumip-baseline"])
+def test_a_calibrated_model_is_the_model_times_its_factors(model: str, finest: int, tmp_path: Path) -> None:
+    """In one piece, in two stages, by the compiled kernel where there is one, and as read from a folder."""
+    lattice, gain = Lattice(finest), random_gain(finest + 1)
+    plain = write_material(tmp_path / "a", model=model, finest=finest)
+    material = write_material(tmp_path / "b", model=model, finest=finest, weights={"gain": gain})
+    q = random_queries(np.random.default_rng(5), 500, lattice)
+    level = np.clip(level_of_sigma(q["sigma"].astype(np.float64)), 0, finest)
+    factor = by_hand(gain[0].numpy(), level, q["omega_i"][:, 2]) * by_hand(
+        gain[1].numpy(), level, q["omega_o"][:, 2]
+    )
+    wanted = plain.evaluate(*q.values()) * factor
+    assert factor.std() > 0.1
+    calibrated = material.model
+    for found in (
+        material.evaluate(*q.values()),
+        evaluate_in_chunks(lambda *a: calibrated(*a).clamp_min(0), torch.device("cpu"), 3, *q.values()),
+    ):
+        np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-6)
+    formula = calibrated.formula()
+    assert formula["value"] == f"gain * {plain.model.formula()['value']}"
+    assert "5 knots" in formula["gain"]
+
+
+@pytest.mark.parametrize("shape", [(2, 3, 5, 3), (2, 4, 1, 3), (2, 4, 3)])
+def test_factors_of_another_shape_are_refused(shape: tuple[int, ...]) -> None:
+    model = build_model("neumip", Lattice(3))
+    weights = model.weights()
+    with pytest.raises(InputError, match="do not fit the model neumip: 'gain'"):
+        model.load_weights({**weights, "gain": torch.ones(shape)})
+    model.load_weights({**weights, "gain": torch.ones((2, 4, 5, 3))})
+    # And they go with the weights that they came with.
+    model.load_weights(weights)
+    assert model.weights().keys() == weights.keys()
+
+
+def test_a_fit_is_calibrated_unless_told_otherwise(tmp_path: Path) -> None:
+    """A fit that is cut short reflects too little at some elevations; its factors say so."""
+
+    def bright(u: F32, sigma: F32, omega_i: F32, omega_o: F32) -> F32:
+        return np.asarray(np.stack([0.2 + 0.6 * omega_i[:, 2] ** 4] * 3, -1))
+
+    folder = write_data(tmp_path / "shards", bright, train=20_000, test=500, noise=0.1)
+    q = random_queries(np.random.default_rng(4), 10_000, Lattice(3))
+    q["omega_i"][:, 2] = 0.8
+    q["omega_i"][:, :2] *= 0.6 / np.linalg.norm(q["omega_i"][:, :2], axis=1, keepdims=True)
+    wanted = 0.2 + 0.6 * 0.8**4
+    off = {}
+    for calibrate in (True, False):
+        training = {"steps": 40, "batch": 2000, "calibrate": calibrate}
+        result = fit(FitConfig.model_validate({"training": training}), folder, tmp_path / str(calibrate))
+        model = result.material.model
+        assert isinstance(model, Neumip)
+        assert (model.gain is not None) == calibrate
+        assert ("gain" in result.material.description["formula"]) == calibrate
+        off[calibrate] = abs(float(predict(model, *q.values()).mean()) / wanted - 1)
+        assert result.material.deviation() < 1e-5
+    assert off[False] > 0.08
+    assert off[True] < 0.03

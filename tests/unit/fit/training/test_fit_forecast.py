@@ -1,0 +1,127 @@
+"""Forecasts of fits: the arithmetic, and short fits that write nothing."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from support.fit_data import constant, parallax, write_data
+
+import mbtf_fit.training.fit as fitting
+import mbtf_fit.training.forecast as module
+from mbtf_fit import fit
+from mbtf_fit.config import FitConfig, HeldOutSection
+from mbtf_fit.data.loader import Queries, load_training, open_data
+from mbtf_fit.training.fit import glance_of, judging_queries
+from mbtf_fit.training.forecast import PERSISTENCE, extrapolated, forecast_fit
+
+
+@pytest.fixture(scope="module")
+def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_data(tmp_path_factory.mktemp("data") / "shards", parallax, train=6000, noise=0.01)
+
+
+def test_every_doubling_gains_a_share_of_the_one_before() -> None:
+    gain = math.log(0.8 / 0.6)
+    one, two = (extrapolated(0.8, 0.6, doublings) for doublings in (1, 2))
+    assert math.log(0.6 / one) == pytest.approx(PERSISTENCE * gain)
+    assert math.log(one / two) == pytest.approx(PERSISTENCE**2 * gain)
+    # In the end all of them together gain a finite part.
+    assert extrapolated(0.8, 0.6, 60) == pytest.approx(0.6 * (0.6 / 0.8) ** (PERSISTENCE / (1 - PERSISTENCE)))
+
+
+def test_fits_several_doublings_apart_follow_the_same_law() -> None:
+    """Errors of the law itself at 1, 2, 8 and 64 times: any two tell the third."""
+    eight = extrapolated(0.8, 0.6, 2)
+    end = extrapolated(0.8, 0.6, 5)
+    assert extrapolated(0.6, eight, 3, apart=2) == pytest.approx(end)
+    assert extrapolated(0.8, eight, 3, apart=3) == pytest.approx(end)
+    # Gains that last promise more.
+    assert extrapolated(0.8, 0.6, 5, persistence=0.9) < end < extrapolated(0.8, 0.6, 5, persistence=0.4)
+
+
+def test_what_pilots_do_not_show_is_not_promised() -> None:
+    assert extrapolated(0.5, 0.6, 3) == 0.6
+    assert extrapolated(0.8, 0.6, -2) == 0.6
+    assert extrapolated(0.1, -0.01, 3) == -0.01
+
+
+@pytest.mark.parametrize("options", [{"time": "3s"}, {"steps": 12}])
+def test_a_forecast_is_of_the_fit_that_follows(
+    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: dict[str, object]
+) -> None:
+    monkeypatch.setattr(module, "PILOT_SECONDS", (0.05, 0.1))
+    config = FitConfig.model_validate({"training": {"batch": 500, "warmup": 3, **options}})
+    before = sorted(tmp_path.rglob("*")), sorted(shards.rglob("*"))
+    found = forecast_fit(config, shards)
+    assert (sorted(tmp_path.rglob("*")), sorted(shards.rglob("*"))) == before
+    assert found.steps == pytest.approx(found.seconds * found.queries_per_second / 500, abs=0.5)
+    assert found.seconds == 3.0 if "time" in options else found.steps == 12
+    assert found.unexplained is not None
+    assert found.at_most is not None
+    assert found.unexplained <= found.at_most == found.pilots[1]
+    # The longer pilot takes a tenth of a second: doublings count from there.
+    doublings = math.log2(found.seconds / 0.1)
+    assert found.unexplained == pytest.approx(extrapolated(*found.pilots, doublings), rel=1e-9)
+    assert len(found.describe().splitlines()) == 2
+    assert "unexplained variance of test queries about" in found.describe()
+    if "steps" in options:
+        fit(config, shards, tmp_path / "material")
+        # Names and shapes stand before the numbers, conformance queries beside them.
+        size = (tmp_path / "material" / "weights.safetensors").stat().st_size
+        assert found.bytes < size < found.bytes + 20480
+
+
+def test_errors_are_those_of_the_test_split_where_it_can_tell(
+    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its queries have more paths, but few of them say less than what was held out."""
+
+    def looked_at(shards: Path) -> tuple[str, Queries]:
+        data = open_data(shards, "shuffled", "neumip")
+        return judging_queries(data, load_training(data, HeldOutSection(), 0))
+
+    name, queries = looked_at(shards)
+    assert (name, len(queries)) == ("test", 2000)
+    name, queries = looked_at(write_data(tmp_path / "few", parallax, train=6000, test=10))
+    assert name == "held_out_queries"
+    assert 10 < len(queries) < 200
+    # Some thousand will do, however many were held out.
+    monkeypatch.setattr(fitting, "_FEWEST", 30)
+    assert looked_at(write_data(tmp_path / "enough", parallax, train=6000, test=30))[0] == "test"
+
+
+def test_a_fit_tells_the_error_of_the_queries_that_it_says(shards: Path, tmp_path: Path) -> None:
+    """All test queries are looked at here, so the last look is the fit's error itself."""
+    config = FitConfig.model_validate({"training": {"batch": 500, "steps": 12, "calibrate": False}})
+    found = fit(config, shards, tmp_path / "material")
+    assert found.material.description["training"]["looks_at"] == "test"
+    reached = found.errors["test"]["unexplained"]["value"]
+    assert found.history[-1]["unexplained"] == pytest.approx(reached, rel=1e-5)
+    assert found.errors["held_out_queries"]["unexplained"]["value"] != pytest.approx(reached, rel=1e-3)
+
+
+@pytest.mark.parametrize(("most", "step"), [(5000, 1), (2000, 1), (1999, 2), (150, 14)])
+def test_a_glance_is_of_all_parts(most: int, step: int) -> None:
+    u = np.arange(2000.0, dtype=np.float32)[:, None].repeat(2, 1)
+    three = u[:, :1].repeat(3, 1)
+    model: Any = SimpleNamespace(model=SimpleNamespace(positions=1))
+    glance = glance_of(model, Queries(u, u[:, 0], three, three, three, three), most)
+    assert np.array_equal(glance.u[:, 0], np.arange(0, 2000, step))
+    # One that looks at nine positions for each looks at fewer.
+    model.model.positions = 9
+    assert len(glance_of(model, Queries(u, u[:, 0], three, three, three, three), most)) <= max(1, most // 9)
+
+
+def test_data_without_variance_have_none_to_forecast(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "PILOT_SECONDS", (0.05, 0.1))
+    config = FitConfig.model_validate({"training": {"batch": 500, "time": "3s"}})
+    found = forecast_fit(config, write_data(tmp_path, constant(0.2), train=2000))
+    assert found.unexplained is None
+    assert found.at_most is None
+    assert found.pilots == ()
+    assert "nan" not in found.describe()

@@ -1,0 +1,105 @@
+"""A fit that is killed at any step and started again ends as if nothing had been."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from support.fit_data import parallax, write_data
+
+import mbtf_fit.training.fit
+from mbtf_fit.config import FitConfig
+from mbtf_fit.training.fit import fit, read_history
+from mbtf_fit.training.trainer import Trainer
+
+STEPS = 14
+
+
+class Killed(BaseException):
+    """Nothing that runs after it may tidy up: stands for SIGKILL."""
+
+
+@pytest.fixture(scope="module")
+def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_data(tmp_path_factory.mktemp("data") / "shards", parallax, train=3000, test=300, noise=0.01)
+
+
+def config(memory: str = "1GB") -> FitConfig:
+    training = {"steps": STEPS, "batch": 300, "warmup": 3}
+    return FitConfig.model_validate({"training": training, "data": {"memory": memory}})
+
+
+@pytest.fixture
+def often(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Look and save after every step."""
+    monkeypatch.setattr(mbtf_fit.training.fit, "_REPORT_SECONDS", 0.0)
+    monkeypatch.setattr(mbtf_fit.training.fit, "_CHECKPOINT_SECONDS", 0.0)
+
+
+@pytest.mark.parametrize("memory", ["1GB", "1kB"])
+def test_killed_at_random_steps_it_ends_with_the_same_bits(
+    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, often: None, memory: str
+) -> None:
+    whole = fit(config(), shards, tmp_path / "whole")
+    random = np.random.default_rng(0)
+    out, step, kills = tmp_path / "killed", Trainer._step, 0
+    saved = mbtf_fit.training.fit.write_tensors
+    while not (out / "material.json").exists():
+        left = int(random.integers(1, 7))
+
+        def dying(self: Trainer, *arguments: Any) -> torch.Tensor:
+            nonlocal left
+            left -= 1
+            if left == 0:
+                raise Killed
+            return step(self, *arguments)
+
+        def forgetful(*arguments: Any) -> None:
+            # Not every step is saved: some are done again.
+            if random.random() < 0.4:
+                saved(*arguments)
+
+        monkeypatch.setattr(Trainer, "_step", dying)
+        monkeypatch.setattr(mbtf_fit.training.fit, "write_tensors", forgetful)
+        try:
+            found = fit(config(memory), shards, out)
+        except Killed:
+            kills += 1
+            assert kills < 200
+    assert kills >= 2
+    mine, other = found.material.model.weights(), whole.material.model.weights()
+    assert all(torch.equal(mine[name], other[name]) for name in other)
+    assert found.errors == whole.errors
+    steps = [record["step"] for record in read_history(out)]
+    assert steps == sorted(set(steps))
+    assert steps[-1] == STEPS
+
+
+def test_ctrl_c_loses_no_step(shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also between checkpoints, and also with a budget of time."""
+    import signal
+
+    training = {"time": "1h", "batch": 300}
+    budget = FitConfig.model_validate({"training": training})
+    step, count = Trainer._step, 0
+
+    def interrupted(self: Trainer, *arguments: Any) -> torch.Tensor:
+        nonlocal count
+        count += 1
+        if count == 7:
+            signal.raise_signal(signal.SIGINT)
+        return step(self, *arguments)
+
+    monkeypatch.setattr(Trainer, "_step", interrupted)
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        fit(budget, shards, tmp_path / "m")
+    assert signal.getsignal(signal.SIGINT) == before
+    from mbtf_fit.material.storage import read_tensors
+
+    _, data = read_tensors(tmp_path / "m" / "checkpoint.safetensors")
+    assert data["step"] == 7
+    assert data["seconds"] > 0

@@ -1,0 +1,253 @@
+"""Training: batches, schedules, gradients of several threads, resuming."""
+
+from __future__ import annotations
+
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from support.fit_data import make_trainer, parallax, random_queries, train_fully, training_queries
+
+import mbtf_fit.objective.parallel
+from mbtf_core.errors import InputError
+from mbtf_core.lattice import Lattice
+from mbtf_fit.config import FitConfig
+from mbtf_fit.data.loader import Queries, TrainingQueries
+from mbtf_fit.data.streaming import Selection
+from mbtf_fit.material.storage import read_tensors, write_tensors
+from mbtf_fit.objective.parallel import Workers
+from mbtf_fit.training.trainer import Trainer, rate_factor
+
+LATTICE = Lattice(3)
+
+
+def queries(n: int = 5000) -> TrainingQueries:
+    arrays = random_queries(np.random.default_rng(0), n, LATTICE)
+    return training_queries(arrays, parallax(*arrays.values()))
+
+
+def trainer(data: TrainingQueries, model: str = "neumip", **training: Any) -> Trainer:
+    return make_trainer(data, LATTICE, model, **{"steps": 40, "batch": 1000, "warmup": 5, **training})
+
+
+@pytest.mark.parametrize(
+    ("shape", "asked", "start"),
+    [
+        ((16, 16), 8.0, 2.0),
+        ((64, 64), 8.0, 8.0),
+        ((64, 16), 8.0, 2.0),
+        ((64, 64), 3.0, 3.0),
+        ((16, 16), 0.0, 0.0),
+    ],
+)
+def test_blur_begins_at_an_eighth_of_the_tile_at_most(
+    shape: tuple[int, int], asked: float, start: float
+) -> None:
+    """Wider blur leaves nothing to find: offsets wander off and textures become sharp where they are."""
+    lattice = Lattice.for_map(*shape)
+    arrays = random_queries(np.random.default_rng(0), 500, lattice)
+    data = training_queries(arrays, parallax(*arrays.values()))
+    blur = {"start": asked, "end": 0.25, "offset": 0.5}
+    t = make_trainer(data, lattice, "neumip", steps=40, batch=100, blur=blur)
+    sigmas = t._sigmas()
+    assert sigmas == [start if not x.moves_lookups else max(start, 0.5) for x in t.model.textures()]
+
+
+@pytest.mark.parametrize("model", ["neumip", "neumip-baseline"])
+def test_training_lowers_the_loss(model: str) -> None:
+    data = queries()
+    t = trainer(data, model, steps=150)
+    with torch.no_grad():
+        first = t._loss(data).item()
+    train_fully(t)
+    assert t.progress.step == 150
+    assert t.progress.loss < 0.3 * first
+
+
+def test_every_epoch_takes_each_query_at_most_once() -> None:
+    data = queries(1050)
+    t = trainer(data, batch=100)
+    seen = []
+    for k, batch in enumerate(islice(t._batches(), 20)):
+        assert len(batch) == 100
+        seen.append(batch.sigma)
+        t.progress.step = k + 1
+    for epoch in (torch.cat(seen[:10]), torch.cat(seen[10:])):
+        assert len(epoch.unique()) == 1000
+    assert not torch.equal(torch.cat(seen[:10]), torch.cat(seen[10:]))
+
+
+def test_fewer_queries_than_a_batch_make_one_batch() -> None:
+    assert train_fully(trainer(queries(30), steps=3)).progress.step == 3
+
+
+def test_a_resumed_training_ends_with_the_same_numbers(tmp_path: Any) -> None:
+    data = queries()
+    whole = train_fully(trainer(data))
+    half = trainer(data)
+    while half.progress.step < 13:
+        half.train(0.0)
+    path = tmp_path / "checkpoint.safetensors"
+    write_tensors(path, *half.state())
+    resumed = trainer(data)
+    resumed.restore(*read_tensors(path))
+    assert resumed.progress == half.progress
+    train_fully(resumed)
+    for mine, other in zip(resumed.model.parameters(), whole.model.parameters(), strict=True):
+        assert torch.equal(mine, other)
+    with torch.no_grad():
+        assert resumed._loss(data) == whole._loss(data)
+
+
+def test_threads_share_a_batch_without_changing_its_gradient(monkeypatch: pytest.MonkeyPatch) -> None:
+    data = queries(999)
+    t = trainer(data)
+    monkeypatch.setattr(mbtf_fit.objective.parallel, "MAX_THREADS", 3)
+    inputs = list(t.model.parameters())
+    found = []
+    for threads in (1, 3):
+        with Workers(torch.device("cpu"), threads) as workers:
+            assert workers.count == threads
+            found.append(workers.gradients(t._loss, data, inputs))
+    torch.testing.assert_close(found[0][0], found[1][0])
+    for one, three in zip(found[0][1], found[1][1], strict=True):
+        torch.testing.assert_close(one, three, rtol=1e-4, atol=1e-6)
+
+
+def test_workers_leave_torchs_settings_as_they_were() -> None:
+    before = torch.get_num_threads(), torch.get_float32_matmul_precision()
+    with Workers(torch.device("cpu"), 2):
+        pass
+    assert (torch.get_num_threads(), torch.get_float32_matmul_precision()) == before
+
+
+def test_rates_rise_and_fall() -> None:
+    training = FitConfig().training.model_copy(update={"warmup": 10, "final_rate": 0.05})
+    assert rate_factor(training, 0, 0.0) == pytest.approx(1 / 11)
+    assert rate_factor(training, 10, 0.0) == 1.0
+    assert rate_factor(training, 1000, 0.5) == pytest.approx(0.525)
+    assert rate_factor(training, 1000, 1.0) == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_textures_and_networks_learn_at_their_own_rates(compiled: bool) -> None:
+    """The first step of Adam is as long as the rate, whatever the gradient."""
+    rates = {"texture_rate": 1e-3, "rate": 1e-4, "warmup": 0}
+    t = trainer(queries(), steps=1, blur={"start": 0.0, "offset": 0.0}, **rates)
+    t._stepper = t._stepper if compiled else None
+    groups = t.model.parameter_groups()
+    before = [[p.detach().clone() for p in group] for group in groups]
+    train_fully(t)
+    for group, old, rate in zip(groups, before, (1e-3, 1e-4), strict=True):
+        longest = max(float((p.detach() - q).abs().max()) for p, q in zip(group, old, strict=True))
+        assert longest == pytest.approx(rate, rel=0.01)
+
+
+def test_the_blur_is_over_with_its_share_of_the_budget() -> None:
+    t = trainer(queries(10), blur={"start": 1.0, "end": 0.25, "share": 0.25, "offset": 0.0})
+    found = []
+    for step in (0, 5, 9, 10, 40):
+        t.progress.step = step
+        found.append(t._sigmas()[0])
+    assert found == pytest.approx([1.0, 0.5, 0.25**0.9, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_texels_without_a_gradient_decay_with_the_rate(compiled: bool) -> None:
+    arrays = random_queries(np.random.default_rng(0), 64, LATTICE)
+    arrays["sigma"][:] = 0.5
+    data = training_queries(arrays, parallax(*arrays.values()))
+    t = trainer(data, steps=5, decay=2.0, texture_rate=0.05, warmup=0, final_rate=0.1, blur={"start": 0.0})
+    t._stepper = t._stepper if compiled else None
+    first = t.model.textures()[0].texels.detach().clone()
+    rates = [0.05 * rate_factor(t.config.training, k, k / 5) for k in range(5)]
+    train_fully(t)
+    finest = t.model.textures()[0].packing.starts[-2]
+    expected = first[finest:] * np.exp(-2.0 * sum(rates))
+    torch.testing.assert_close(t.model.textures()[0].texels.detach()[finest:], expected)
+    weights = [p.detach().clone() for p in t.model.parameter_groups()[1]]
+    t.pull.act(t.model, 0.1, 0.1)
+    for before, after in zip(weights, t.model.parameter_groups()[1], strict=True):
+        torch.testing.assert_close(after.detach(), before, rtol=0, atol=0)
+
+
+def test_a_budget_of_time_ends_training_and_its_annealing() -> None:
+    t = train_fully(trainer(queries(), steps=None, time=0.3))
+    assert t.share == 1.0
+    assert t.progress.seconds >= 0.3
+    pyramid, offset = t.model.textures()
+    tables = t._tables()
+    assert tables[0] is pyramid.texels
+    torch.testing.assert_close(tables[1], offset.blurred(2.0))
+
+
+def test_the_blur_of_the_pyramid_ends_at_its_floor_and_the_offset_keeps_its_own() -> None:
+    t = train_fully(trainer(queries(), blur={"floor": 0.7, "offset": 0.3}))
+    pyramid, offset = t.model.textures()
+    for found, expected in zip(t._tables(), (pyramid.blurred(0.7), offset.blurred(0.3)), strict=True):
+        torch.testing.assert_close(found, expected)
+    # Materials hold what is read, blur included.
+    value = queries(10).value.numpy()
+    arrays = random_queries(np.random.default_rng(0), 10, LATTICE)
+    t.predict(Queries(**arrays, value_a=value, value_b=value))
+    torch.testing.assert_close(pyramid.export()["3"].reshape(64, -1), pyramid.blurred(0.7)[-64:].detach())
+
+
+@pytest.mark.parametrize("poison", ["pyramid.texels", "offset_texture.texels", "offset_network.biases.3"])
+def test_divergence_is_one_clear_error(poison: str) -> None:
+    t = trainer(queries())
+    with torch.no_grad():
+        t.model.get_parameter(poison).fill_(torch.nan)
+    with pytest.raises(InputError, match=r"diverged at step 1: its batch .*\n.*--rate 0\.01 "):
+        train_fully(t)
+
+
+def test_weights_that_the_last_step_spoils_are_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its loss was that of the weights before, and finite."""
+    step = Trainer._step
+
+    def spoiling(self: Trainer, *arguments: Any) -> torch.Tensor:
+        loss = step(self, *arguments)
+        if self.progress.step == 2:
+            with torch.no_grad():
+                self.model.parameter_groups()[1][0].fill_(torch.inf)
+        assert bool(loss.isfinite())
+        return loss
+
+    monkeypatch.setattr(Trainer, "_step", spoiling)
+    with pytest.raises(InputError, match="diverged at step 3"):
+        train_fully(trainer(queries(), steps=3))
+
+
+def test_divergence_names_the_first_bad_batch() -> None:
+    """The step, the shard and the rows, counted without what is held out."""
+    data = queries()
+    selection = Selection()
+    chosen = np.ones(3000, bool)
+    chosen[:7] = False
+    selection.add(Path("train-00000.npz"), chosen)
+    selection.add(Path("train-00001.npz"), np.ones(2007, bool))
+    data.value[4200] = torch.inf
+    t = make_trainer(data, LATTICE, steps=40, batch=100, robust=None)
+    t.selection = selection
+    step, numbers = next((k, n) for k in range(50) for n in data.numbers(100, 0, k) if 4200 in n)
+    # Number 4200 is row 1207 of the second shard.
+    first, last = numbers.start - 2993, numbers.stop - 1 - 2993
+    with pytest.raises(InputError, match=rf"at step {step + 1}: .*train-00001\.npz rows {first}-{last},"):
+        train_fully(t)
+
+
+def test_coverage_counts_texels_that_gradients_have_reached() -> None:
+    t = trainer(queries(), "neumip-baseline", blur={"start": 0.0})
+    assert set(t.coverage().values()) == {0.0}
+    # Only the lower left quarter, at the finest level.
+    t.queries.u[:] = 0.5 * t.queries.u
+    t.queries.sigma[:] = 0.5 * 2.0**-3
+    train_fully(t)
+    found = t.coverage()
+    assert found[0] == found[1] == 0.0
+    # 5 of 8 texels each way are read, and the one before the first.
+    assert found[3] == pytest.approx((6 / 8) ** 2, abs=0.1)

@@ -1,0 +1,230 @@
+"""Configuration of the generator: counts, limits, hash, and whose fault a fault is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mbtf_core.config_file import resolve
+from mbtf_core.errors import InputError, UsageError
+from mbtf_gen.config.generator import GeneratorConfig, count_queries, parse_count
+from mbtf_gen.material.material import load_material
+from mbtf_gen.sampling.light_kernel import MIN_WIDTH_DEG, LightKernel
+
+
+@pytest.mark.parametrize(
+    ("text", "count"),
+    [
+        ("1", 1),
+        ("100000", 100_000),
+        ("1e6", 1_000_000),
+        ("1.5e3", 1500),
+        ("400/texel", 400 * 96),
+        (" 2 / texel ", 192),
+        ("0.5/texel", 48),
+        ("0.001/texel", 1),
+        (7, 7),
+    ],
+)
+def test_counts(text: str | int, count: int) -> None:
+    assert count_queries(text, 96) == count
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "many",
+        "0",
+        "0/texel",
+        "-5",
+        "1.5",
+        "1e20",
+        "nan",
+        "inf",
+        "4/pixel",
+        "4/texel/texel",
+        "4 4",
+        "1e-3",
+    ],
+)
+def test_nonsense_counts_are_usage_errors(text: str) -> None:
+    with pytest.raises(ValueError, match=r"must be|whole"):
+        parse_count(text)
+    with pytest.raises(UsageError) as caught:
+        resolve(
+            GeneratorConfig,
+            flags={"material": "m", "queries.train": text},
+            spelled={"queries.train": "--queries"},
+        )
+    assert caught.value.where == "--queries"
+    assert f"'{text}'" in caught.value.what
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "says"),
+    [
+        ("queries.spp", 3, "even"),
+        ("queries.test_spp", 0, "at least 2 and at most 1048576"),
+        ("queries.min_cos", 0, "above 0 and below 1"),
+        ("queries.levels", 15, "at least 0 and at most 14"),
+        ("queries.layout", "rows", "'shuffled' or 'image'"),
+        ("light.width", 46, "45"),
+        ("light.width", 1e-3, "delta light"),
+        ("light.width", float("nan"), "at most 45"),
+        ("seed", 1 << 63, "below"),
+        ("seed", -1, "at least 0"),
+        ("geometry.height", float("inf"), "at most 100"),
+    ],
+)
+def test_values_out_of_range_are_refused_with_key_and_reason(key: str, value: Any, says: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        resolve(GeneratorConfig, flags={"material": "m", key: value})
+    assert key in caught.value.what
+    assert says in caught.value.what
+
+
+@pytest.mark.parametrize("width", [0.0, MIN_WIDTH_DEG, 1.0, 45.0])
+def test_every_light_width_that_is_accepted_can_be_used(width: float) -> None:
+    config = GeneratorConfig.model_validate({"material": "m", "light": {"width": width}})
+    assert LightKernel(config.light.width).width_deg == width
+
+
+CONFIG_LINES = "queries:\n  train: 5\n  ssp: 8\n"
+
+
+@pytest.mark.parametrize("flags", [{}, {"material": "m"}, {"material": "m", "seed": 3}])
+def test_an_unknown_key_is_the_files_fault_whatever_the_flags(flags: dict[str, Any], tmp_path: Path) -> None:
+    path = tmp_path / "config.yaml"
+    path.write_text(CONFIG_LINES)
+    with pytest.raises(InputError) as caught:
+        resolve(GeneratorConfig, file=path, flags=flags)
+    assert caught.value.where == f"{path}:3"
+    assert "unknown key 'queries.ssp'" in caught.value.what
+    assert "'spp'" in caught.value.hint
+
+
+def test_a_bad_flag_over_a_good_file_is_a_usage_error_without_a_line(tmp_path: Path) -> None:
+    path = tmp_path / "config.yaml"
+    path.write_text("material: m\nqueries:\n  spp: 8\n")
+    with pytest.raises(UsageError) as caught:
+        resolve(GeneratorConfig, file=path, flags={"queries.spp": 7})
+    assert caught.value.where == "command line"
+    assert "even" in caught.value.what
+
+
+def test_later_sources_win(tmp_path: Path) -> None:
+    path = tmp_path / "config.yaml"
+    path.write_text("queries: {spp: 8, test_spp: 10, train: 7}\n")
+    config = resolve(
+        GeneratorConfig,
+        file=path,
+        assignments=["queries.test_spp=12", "queries.train=3/texel", "seed=9"],
+        flags={"material": "m", "queries.train": "5", "seed": None},
+    )
+    assert (config.queries.spp, config.queries.test_spp, config.queries.train, config.seed) == (8, 12, "5", 9)
+
+
+@pytest.mark.parametrize(
+    ("spellings", "stored"),
+    [(["400/texel", " 400 / texel", "4e2/texel"], "400/texel"), ([7, "7", 7.0, "7.0"], "7")],
+)
+def test_counts_have_one_spelling(spellings: list[Any], stored: str) -> None:
+    for text in spellings:
+        config = GeneratorConfig.model_validate({"material": "m", "queries": {"train": text}})
+        assert config.queries.train == stored
+
+
+def write_maps(folder: Path, *, height: float = 0.0, color: int = 100, suffix: str = "") -> Path:
+    folder.mkdir()
+    np.save(folder / f"height{suffix}.npy", np.full((2, 4), height))
+    np.save(folder / f"base_color{suffix}.npy", np.full((2, 4, 3), color, np.uint8))
+    return folder
+
+
+def config_hash(folder: Path, **options: Any) -> str:
+    config = GeneratorConfig.model_validate({"material": str(folder), **options})
+    return config.hash(load_material(folder).digests)
+
+
+def test_hash_ignores_names_and_places_but_not_contents(tmp_path: Path) -> None:
+    base = config_hash(write_maps(tmp_path / "a"))
+    assert config_hash(write_maps(tmp_path / "b", suffix="_2k")) == base
+    assert config_hash(write_maps(tmp_path / "c", height=0.5)) != base
+    assert config_hash(write_maps(tmp_path / "d", color=101)) != base
+    swapped = write_maps(tmp_path / "e")
+    (swapped / "base_color.npy").rename(swapped / "opacity.npy")
+    assert config_hash(swapped) != base
+
+
+def test_hash_covers_every_option_but_the_materials_name(tmp_path: Path) -> None:
+    folder = write_maps(tmp_path / "a")
+    changes: list[dict[str, Any]] = [
+        {"seed": 1},
+        {"geometry": {"height": 0.5}},
+        {"geometry": {"mesh": 8}},
+        {"geometry": {"tile": "mirror"}},
+        {"light": {"width": 2}},
+        {"effects": {"mode": "all"}},
+        {"effects": {"tolerance": 0.01}},
+        {"effects": {"normal": "off"}},
+        {"transport": {"max_depth": 3}},
+        {"transport": {"roulette_depth": 5}},
+        {"transport": {"max_crossings": 9}},
+        {"output": {"format": "exr"}},
+        {"output": {"shard_queries": 99}},
+        *(
+            {"queries": {key: value}}
+            for key, value in {
+                "train": "3",
+                "test": "3",
+                "spp": 8,
+                "test_spp": 8,
+                "allocation": "even",
+                "target_error": "5%",
+                "cap": 64,
+                "levels": 1,
+                "mixture": {"finest": 0.3},
+                "min_cos": 0.2,
+                "layout": "image",
+                "window": 8,
+            }.items()
+        ),
+    ]
+    hashes = {config_hash(folder), *(config_hash(folder, **change) for change in changes)}
+    assert len(hashes) == 1 + len(changes)
+    # Every option is in the list above.
+    listed = {(s, k) for c in changes for s, v in c.items() if isinstance(v, dict) for k in v}
+    fields = GeneratorConfig.model_fields
+    known = {
+        (s, k)
+        for s in fields
+        if hasattr(fields[s].annotation, "model_fields")
+        for k in fields[s].annotation.model_fields  # type: ignore[union-attr]
+    }
+    assert listed == known
+    assert set(fields) - {s for s, _ in known} == {"version", "material", "seed"}
+
+
+def test_a_material_constant_changes_the_hash(tmp_path: Path) -> None:
+    folder = write_maps(tmp_path / "a")
+    hashes = set()
+    for text in ("roughness: 0.5", "roughness: 0.6", "roughness: 0.5\nspecular: 0.1", "metallic: 0.5"):
+        (folder / "material.yaml").write_text(f"height: height.npy\nbasecolor: base_color.npy\n{text}\n")
+        hashes.add(config_hash(folder))
+    assert len(hashes) == 4
+
+
+@pytest.mark.parametrize(("text", "share"), [("2%", 0.02), (" 2.5 % ", 0.025), (0.02, 0.02), ("0.02", 0.02)])
+def test_a_target_error_is_a_share_or_per_cent(text: str | float, share: float) -> None:
+    config = GeneratorConfig.model_validate({"material": "m", "queries": {"target_error": text}})
+    assert config.queries.target_error == pytest.approx(share)
+
+
+@pytest.mark.parametrize("text", ["0", "100%", "-1%", "much", "2%%", "nan"])
+def test_other_target_errors_are_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="target_error"):
+        GeneratorConfig.model_validate({"material": "m", "queries": {"target_error": text}})

@@ -1,0 +1,120 @@
+"""``docs/format.md`` says what is written: its reader runs, and every stored name stands in it."""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.datasets import write_dataset
+from support.paths import ROOT
+
+from mbtf_core.shard_schema import ARRAYS, CONVENTIONS, SCHEMA_VERSION
+
+DOCUMENT = (ROOT / "docs/format.md").read_text(encoding="utf-8")
+QUERIES = {"train": "160", "test": "64"}
+SMALL = {"shard_queries": 64}
+
+
+def section(title: str) -> str:
+    """Text of one section of the document."""
+    found = re.search(rf"^## {title}\n(.*?)(?=^## |\Z)", DOCUMENT, re.M | re.S)
+    assert found is not None, title
+    return found[1]
+
+
+def reader() -> tuple[str, Any]:
+    """Source of the document's reader, and its function."""
+    source = re.findall(r"```python\n(.*?)```", section("Reader"), re.S)[0]
+    namespace: dict[str, Any] = {}
+    exec(source, namespace)
+    return source, namespace["read_split"]
+
+
+@pytest.mark.parametrize("layout", ["shuffled", "image"])
+def test_the_reader_reads_what_is_written(tmp_path: Path, layout: str) -> None:
+    data = write_dataset(tmp_path / "shards", queries={**QUERIES, "layout": layout}, output=SMALL)
+    _, read_split = reader()
+    for split in ("train", "test"):
+        expected, found = data.load(split), read_split(str(data.folder), split)
+        assert set(found) == set(expected)
+        assert all(np.array_equal(found[name], expected[name]) for name in expected)
+
+
+def test_the_reader_is_a_dozen_lines_of_numpy() -> None:
+    source, _ = reader()
+    tree = ast.parse(source)
+    imported = {n.module if isinstance(n, ast.ImportFrom) else n.names[0].name for n in tree.body[:3]}  # type: ignore[attr-defined]
+    assert imported == {"json", "pathlib", "numpy"}
+    assert not any(
+        isinstance(n, ast.Import | ast.ImportFrom) for n in ast.walk(ast.Module(tree.body[3:], []))
+    )
+    assert sum(bool(line.strip()) for line in source.splitlines()) <= 12
+
+
+def test_the_reader_refuses_other_schemas_and_unfinished_data(tmp_path: Path) -> None:
+    data = write_dataset(tmp_path / "shards", queries=QUERIES)
+    _, read_split = reader()
+    for change in ({"schema": 2}, {"complete": False}, {"format": "other"}):
+        (data.folder / "manifest.json").write_text(json.dumps({**data.manifest, **change}))
+        with pytest.raises(ValueError, match="no complete data set"):
+            read_split(data.folder, "train")
+
+
+def test_every_array_has_its_row() -> None:
+    rows = [line.split("|")[1:-1] for line in section("Arrays").splitlines() if line.startswith("| `")]
+    table = {cells[0].strip(" `"): [c.strip() for c in cells[1:]] for cells in rows}
+    assert list(table) == [a.name for a in ARRAYS]
+    for spec in ARRAYS:
+        trailing, unit, channels, _ = table[spec.name]
+        assert trailing == (str(spec.trailing[0]) if spec.trailing else "–")
+        assert unit == spec.unit
+        assert re.findall(r"`([^`]+)`", channels) == list(spec.channels)
+
+
+def test_every_key_of_manifest_and_sidecar_is_explained(tmp_path: Path) -> None:
+    data = write_dataset(tmp_path / "shards", queries=QUERIES, output=SMALL)
+    manifest, sidecar = data.manifest, data.shards("train")[0].sidecar
+    split = manifest["splits"]["train"]
+    in_manifest = [manifest, manifest["tile"], manifest["levels"], manifest["levels"]["mixture"], split]
+    in_manifest += [manifest["effects"], manifest["effects"]["effects"][0]]
+    in_manifest += [split["shards"][0], next(iter(manifest["arrays"].values()))]
+    in_sidecar = [sidecar, sidecar["seed"], sidecar["quarantined"], sidecar["statistics"]]
+    counts = set(sidecar["quarantined"])
+    for title, objects in (
+        ("Manifest", [*in_manifest, set(manifest["summary"]) - counts]),
+        ("Sidecar", in_sidecar),
+    ):
+        missing = [key for found in objects for key in found if f"`{key}`" not in section(title)]
+        assert not missing, f"{title} does not explain {missing}"
+    for title, top in (("Manifest", manifest), ("Sidecar", sidecar)):
+        first_cells = "".join(re.findall(r"^\| (`[^|]*) \|", section(title), re.M))
+        assert set(re.findall(r"`([^`]+)`", first_cells)) == set(top)
+
+
+def test_the_conventions_are_those_of_the_manifest() -> None:
+    keys = re.findall(r"^\| `(\w+)` \|", section("What a query is"), re.M)
+    assert keys == list(CONVENTIONS)
+    assert f"Schema {SCHEMA_VERSION}." in DOCUMENT
+
+
+def test_members_lie_where_the_document_says(tmp_path: Path) -> None:
+    """The recipe for mapping a member by hand, followed literally."""
+    import zipfile
+
+    data = write_dataset(tmp_path / "shards", queries=QUERIES)
+    path = data.shards("train")[0].path
+    whole = path.read_bytes()
+    with zipfile.ZipFile(path) as archive:
+        for info in archive.infolist():
+            name, extra = (int.from_bytes(whole[info.header_offset + i :][:2], "little") for i in (26, 28))
+            start = info.header_offset + 30 + name + extra
+            assert whole[start : start + 6] == b"\x93NUMPY"
+            numbers = start + 10 + int.from_bytes(whole[start + 8 : start + 10], "little")
+            assert numbers % 64 == 0
+            first = np.frombuffer(whole, "<f4", 1, numbers)[0]
+            assert first == np.load(path)[info.filename.removesuffix(".npy")].flat[0]

@@ -1,0 +1,199 @@
+"""Damaged data sets: they load, or are refused in a line or two; no other exception, whatever is damaged."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.damage import altered, damaged, examples, loads_or_refuses
+from support.datasets import write_dataset
+
+from mbtf_core.errors import InputError
+from mbtf_core.shard_schema import MANIFEST_NAME
+from mbtf_fit.config import HeldOutSection
+from mbtf_fit.data.loader import load_split, load_training, open_data
+from mbtf_gen.dataset.reader import Dataset
+from mbtf_gen.dataset.shard_io import read_shard, write_exr, write_npz
+from mbtf_gen.dataset.summary import finish
+from mbtf_gen.dataset.verify import verify
+
+ARRAYS = {
+    "u": np.zeros((3, 2), np.float32),
+    "sigma": np.ones(3, np.float32),
+    "omega_i": np.ones((3, 3), np.float32),
+    "omega_o": np.ones((3, 3), np.float32),
+    "value_a": np.ones((3, 3), np.float32),
+    "value_b": np.ones((3, 3), np.float32),
+    "spp": np.full(3, 4, np.float32),
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Room for one damaged file at a time."""
+    return tmp_path_factory.mktemp("shards")
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data set of three shards."""
+    made = tmp_path_factory.mktemp("set") / "set"
+    write_dataset(made, queries={"train": "20", "test": "4"}, output={"shard_queries": 10})
+    manifest = made / MANIFEST_NAME
+    # The same bytes in every run, wherever the folder lies.
+    manifest.write_text(manifest.read_text().replace(str(made.parent), "of"))
+    return made
+
+
+def shards(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    made = tmp_path_factory.mktemp("samples")
+    write_npz(made / "a.npz", ARRAYS)
+    write_exr(made / "a.exr", ARRAYS)
+    # Another writer's archive: sizes without zip64, no padding.
+    np.savez(made / "b.npz", **ARRAYS)
+    return {path.name: path.read_bytes() for path in made.iterdir()}
+
+
+@pytest.fixture(scope="module")
+def samples(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    return shards(tmp_path_factory)
+
+
+@given(data=st.data())
+@examples(250)
+def test_a_damaged_shard(data: st.DataObject, samples: dict[str, bytes], folder: Path) -> None:
+    name, content = data.draw(damaged(samples))
+    path = folder / name
+    path.write_bytes(content)
+    for mapped in (True, False):
+        arrays = loads_or_refuses(lambda mapped=mapped: read_shard(path, mapped=mapped))
+        if arrays:
+            # What is loaded can be read to its end: nothing is mapped beyond the file.
+            assert all(np.isfinite(a).size == a.size for a in arrays.values())
+            assert sum(a.nbytes for a in arrays.values()) <= len(content)
+
+
+def read_all(folder: Path) -> None:
+    """What the programs do with a data set."""
+    for read in (
+        lambda: verify(folder),
+        lambda: Dataset.open(folder).lattice,
+        lambda: Dataset.open(folder).load("train"),
+        lambda: load_training(open_data(folder, "shuffled", "neumip"), HeldOutSection(), 0),
+        lambda: load_split(open_data(folder, "shuffled", "neumip"), "test"),
+        lambda: finish(folder),
+    ):
+        loads_or_refuses(read)
+
+
+@given(data=st.data())
+@examples(150)
+def test_an_altered_manifest_or_sidecar(data: st.DataObject, whole: Path) -> None:
+    manifest = (whole / MANIFEST_NAME).read_text()
+    path = whole / data.draw(st.sampled_from([MANIFEST_NAME, MANIFEST_NAME, "train-00001.json"]))
+    before = path.read_text()
+    try:
+        path.write_text(data.draw(altered(before)))
+        read_all(whole)
+    finally:
+        path.write_text(before)
+        # Reading may have completed it.
+        (whole / MANIFEST_NAME).write_text(manifest)
+
+
+@given(data=st.data())
+@examples(100)
+def test_damaged_bytes_of_a_data_set(data: st.DataObject, whole: Path) -> None:
+    files = {n: (whole / n).read_bytes() for n in (MANIFEST_NAME, "train-00000.json", "train-00000.npz")}
+    name, content = data.draw(damaged(files))
+    try:
+        (whole / name).write_bytes(content)
+        read_all(whole)
+    finally:
+        for each, content in files.items():
+            (whole / each).write_bytes(content)
+
+
+def archive(members: dict[str, bytes], compression: int = zipfile.ZIP_STORED) -> bytes:
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", compression) as out:
+        for name, content in members.items():
+            out.writestr(f"{name}.npy", content)
+    return stream.getvalue()
+
+
+def npy(header: str, content: bytes = b"") -> bytes:
+    """An npy file of a header in words."""
+    text = header.encode().ljust(118) + b"\n"
+    return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text + content
+
+
+def header(dtype: str, shape: str) -> str:
+    return f"{{'descr': '{dtype}', 'fortran_order': False, 'shape': {shape}}}"
+
+
+CLAIMS = {
+    "a terabyte": (archive({"sigma": npy(header("<f4", "(274877906944,)"))}), "not as long as"),
+    "more than there is": (archive({"sigma": npy(header("<f4", "(9,)"), b"\0" * 32)}), "not as long as"),
+    "less than nothing": (archive({"sigma": npy(header("<f4", "(-4,)"))}), "not as long as"),
+    "an overflow": (archive({"u": npy(header("<f4", f"({2**63}, 2)"))}), "not as long as"),
+    "objects": (archive({"sigma": npy(header("|O", "(4,)"), b"\0" * 32)}), "not C-ordered float32"),
+    "giant elements": (archive({"sigma": npy(header("|V999999999", "(4,)"))}), "not C-ordered float32"),
+    "one number": (archive({"sigma": npy(header("<f4", "()"), b"\0" * 4)}), "has the shape ()"),
+    "two axes": (archive({"sigma": npy(header("<f4", "(2, 2)"), b"\0" * 16)}), "has the shape (2, 2)"),
+    "another array": (archive({"weights": npy(header("<f4", "(1,)"), b"\0" * 4)}), "unknown array"),
+    "a bomb": (
+        archive({"sigma": npy(header("<f4", "(2500000,)"), bytes(10_000_000))}, zipfile.ZIP_DEFLATED),
+        "shard is compressed",
+    ),
+}
+
+
+@pytest.mark.parametrize("claim", CLAIMS)
+def test_claims_of_an_archive(claim: str, tmp_path: Path) -> None:
+    content, says = CLAIMS[claim]
+    path = tmp_path / "s.npz"
+    path.write_bytes(content)
+    for mapped in (True, False):
+        with pytest.raises(InputError) as caught:
+            read_shard(path, mapped=mapped)
+        assert says in caught.value.what
+
+
+def test_a_manifest_cannot_name_files_elsewhere(whole: Path) -> None:
+    path = whole / MANIFEST_NAME
+    before = path.read_text()
+    try:
+        path.write_text(before.replace("train-00001.npz", "../outside.npz"))
+        with pytest.raises(InputError, match=r"splits\.train\.shards\.1\.file"):
+            Dataset.open(whole)
+    finally:
+        path.write_text(before)
+
+
+@pytest.mark.parametrize("rows", ['"ten"', "null", "-1", "1.5", "true", "[10]", "{}", "1e3"])
+def test_a_sidecar_says_a_number_of_rows(rows: str, whole: Path) -> None:
+    path = whole / "train-00001.json"
+    before = path.read_text()
+    try:
+        path.write_text(before.replace('"rows": 10', f'"rows": {rows}'))
+        with pytest.raises(InputError, match="is damaged"):
+            Dataset.open(whole).shards("train")
+    finally:
+        path.write_text(before)
+
+
+def test_a_sidecar_cannot_claim_rows_without_bytes(whole: Path) -> None:
+    path = whole / "train-00001.json"
+    before = path.read_text()
+    try:
+        path.write_text(before.replace('"rows": 10', '"rows": 1000000000'))
+        with pytest.raises(InputError, match="too short for the 1000000000 rows"):
+            load_training(open_data(whole, "shuffled", "neumip"), HeldOutSection(), 0)
+    finally:
+        path.write_text(before)

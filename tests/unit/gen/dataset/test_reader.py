@@ -1,0 +1,130 @@
+"""Data sets as folders: opening, splits, both layouts, both formats, and folders that are none."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.datasets import NOISE, formula, write_dataset
+
+from mbtf_core.errors import InputError
+from mbtf_core.stats import pooled_error
+from mbtf_gen.dataset.reader import Dataset
+from mbtf_gen.dataset.shard_io import Arrays
+from mbtf_gen.sampling.query_sampler import Queries
+
+OUTPUT = {"shard_queries": 64}
+
+
+def queries_of(arrays: Arrays) -> Queries:
+    return Queries(arrays["u"], arrays["sigma"], arrays["omega_i"], arrays["omega_o"])
+
+
+@pytest.mark.parametrize("array_format", ["npz", "exr"])
+def test_shuffled_layout(tmp_path: Path, array_format: str) -> None:
+    written = {"train": "150", "test": "1000"}
+    data = write_dataset(tmp_path / "shards", queries=written, output={**OUTPUT, "format": array_format})
+    assert data.layout == "shuffled"
+    assert data.splits == ["train", "test"]
+    assert [s.rows for s in data.shards("train")] == [64, 64, 22]
+    assert [s.path.name for s in data.shards("train")] == [f"train-{i:05d}.{array_format}" for i in range(3)]
+    arrays = data.load("train")
+    assert {a.shape[0] for a in arrays.values()} == {150}
+    test = data.load("test")
+    error = (test["value_a"] + test["value_b"]) / 2 - formula(queries_of(test))
+    expected = pooled_error(test["value_a"], test["value_b"]).value
+    assert np.sqrt(np.mean(error**2)) == pytest.approx(expected, rel=0.1)
+    assert np.abs(error).max() < 6 * NOISE
+
+
+@pytest.mark.parametrize("array_format", ["npz", "exr"])
+def test_buffers_share_direction_and_footprint_in_texel_order(tmp_path: Path, array_format: str) -> None:
+    data = write_dataset(
+        tmp_path / "shards",
+        queries={"train": "160", "test": "32", "layout": "image"},
+        output={**OUTPUT, "format": array_format},
+    )
+    assert data.layout == "image"
+    assert data.lattice.shape() == (4, 8)
+    assert [shard.rows for shard in data.shards("train")] == [2, 2, 1]
+    arrays = data.load("train")
+    assert arrays["u"].shape == (5, 4, 8, 2)
+    for name in ("sigma", "omega_i", "omega_o"):
+        assert np.array_equal(arrays[name], np.broadcast_to(arrays[name][:, :1, :1], arrays[name].shape))
+    column = np.floor(arrays["u"][..., 0] * 8)
+    row = np.floor((1.0 - arrays["u"][..., 1]) * 4)
+    assert np.array_equal(column, np.broadcast_to(np.arange(8), (5, 4, 8)))
+    assert np.array_equal(row, np.broadcast_to(np.arange(4)[:, None], (5, 4, 8)))
+
+
+def test_both_formats_hold_the_same_numbers(tmp_path: Path) -> None:
+    first = write_dataset(tmp_path / "npz", queries={"train": "100", "test": "10"}).load("train")
+    second = write_dataset(
+        tmp_path / "exr", queries={"train": "100", "test": "10"}, output={"format": "exr"}
+    ).load("train")
+    assert all(np.array_equal(first[name], second[name]) for name in first)
+
+
+def test_chosen_arrays_are_mapped(tmp_path: Path) -> None:
+    data = write_dataset(tmp_path / "shards", queries={"train": "100", "test": "10"}, output=OUTPUT)
+    parts = list(data.iterate("train", ["u", "sigma"]))
+    assert [len(p["sigma"]) for p in parts] == [64, 36]
+    assert set(parts[0]) == {"u", "sigma"}
+    assert isinstance(parts[0]["u"], np.memmap)
+
+
+def test_a_folder_can_move(tmp_path: Path) -> None:
+    data = write_dataset(tmp_path / "here", queries={"train": "100", "test": "10"}, output=OUTPUT)
+    before = data.load("train")
+    moved = (tmp_path / "here").rename(tmp_path / "there")
+    (tmp_path / "here.npy").unlink()
+    assert np.array_equal(Dataset.open(moved).load("train")["u"], before["u"])
+
+
+def test_an_unknown_split_names_the_known_ones(tmp_path: Path) -> None:
+    data = write_dataset(tmp_path / "shards", queries={"train": "10", "test": "10"})
+    with pytest.raises(InputError, match=r"no split 'valid' \(it has: train, test\)"):
+        data.shards("valid")
+
+
+@pytest.mark.parametrize("suffix", ["npz", "json"])
+def test_missing_and_unfinished_shards(tmp_path: Path, suffix: str) -> None:
+    data = write_dataset(tmp_path / "shards", queries={"train": "100", "test": "10"}, output=OUTPUT)
+    (data.folder / f"train-00001.{suffix}").unlink()
+    with pytest.raises(InputError, match=r"train-00001\.npz is missing or unfinished") as caught:
+        data.load("train")
+    assert "resumes" in caught.value.hint
+    assert len(data.load("test")["u"]) == 10
+
+
+def test_folders_that_hold_no_data_set(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such folder"):
+        Dataset.open(tmp_path / "gone")
+    (tmp_path / "shards").mkdir()
+    (tmp_path / "shards.xy").touch()
+    with pytest.raises(InputError) as caught:
+        Dataset.open(tmp_path / "shards.x")
+    assert caught.value.hint == f"did you mean '{tmp_path / 'shards'}'?"
+    with pytest.raises(InputError, match=r"no manifest\.json"):
+        Dataset.open(tmp_path)
+    path = tmp_path / "manifest.json"
+    for text, message in (
+        ("{", "not readable as JSON"),
+        ("[1]", "must hold a JSON object"),
+        ('{"format": "other"}', "is not a manifest"),
+        ('{"format": "mbtf-shards", "schema": 99}', "shards of schema 99; this version reads schema 1"),
+        ('{"format": "mbtf-shards"}', "shards of schema None"),
+    ):
+        path.write_text(text)
+        with pytest.raises(InputError, match=message) as caught:
+            Dataset.open(tmp_path)
+        assert caught.value.exit_code == 3
+
+
+def test_the_manifest_is_plain_json_that_names_no_array_it_lacks(tmp_path: Path) -> None:
+    data = write_dataset(tmp_path / "shards", queries={"train": "10", "test": "10"})
+    manifest = json.loads((data.folder / "manifest.json").read_text())
+    assert manifest["complete"] is True
+    assert set(manifest["arrays"]) == set(data.load("train"))

@@ -1,0 +1,192 @@
+"""``verify`` finds what is wrong with a folder of shards, and nothing where nothing is."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.datasets import edit, write_dataset
+
+from mbtf_core.atomic import digest
+from mbtf_core.errors import InputError
+from mbtf_gen.dataset.shard_io import read_shard, write_shard
+from mbtf_gen.dataset.verify import is_finished, shard_fault, sidecar_of, verify
+
+FORMATS = ["npz", "exr"]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """One intact data set per format: three training shards, one test shard."""
+    folder = tmp_path_factory.mktemp("sets")
+    for suffix in FORMATS:
+        write_dataset(
+            folder / suffix,
+            queries={"train": "100", "test": "40"},
+            output={"shard_queries": 40, "format": suffix},
+        )
+    return {suffix: folder / suffix for suffix in FORMATS}
+
+
+@pytest.fixture(params=FORMATS)
+def copy(request: pytest.FixtureRequest, made: dict[str, Path], tmp_path: Path) -> Path:
+    """A copy of a data set, to damage; its name is its format."""
+    shutil.copytree(made[request.param], tmp_path / request.param)
+    return tmp_path / request.param
+
+
+def shard(folder: Path, number: int = 1) -> Path:
+    return folder / f"train-{number:05d}.{folder.name}"
+
+
+def faults(folder: Path) -> dict[str, str]:
+    return {f.file: f.what for f in verify(folder)}
+
+
+def test_an_intact_set_has_no_fault(copy: Path) -> None:
+    assert verify(copy) == []
+
+
+def test_every_flipped_byte_is_found(copy: Path) -> None:
+    path = shard(copy)
+    intact = path.read_bytes()
+    # Ends, headers, numbers: a spread over the file.
+    for position in [*range(0, len(intact), len(intact) // 40), len(intact) - 1]:
+        damaged = bytearray(intact)
+        damaged[position] ^= 0x10
+        path.write_bytes(damaged)
+        assert list(faults(copy)) == [path.name], position
+    path.write_bytes(intact)
+    assert verify(copy) == []
+
+
+@pytest.mark.parametrize("kept", [0, 1, 100, -1])
+def test_a_truncated_shard_is_found(copy: Path, kept: int) -> None:
+    path = shard(copy)
+    path.write_bytes(path.read_bytes()[:kept])
+    assert "bytes" in faults(copy)[path.name]
+    # Size alone decides whether it counts as finished on resuming.
+    manifest = json.loads((copy / "manifest.json").read_text())
+    assert not is_finished(path, 40, manifest["config_hash"])
+    assert is_finished(shard(copy, 0), 40, manifest["config_hash"])
+
+
+def test_missing_parts_are_found(copy: Path) -> None:
+    shard(copy, 0).unlink()
+    sidecar_of(shard(copy, 1)).unlink()
+    assert faults(copy) == {
+        shard(copy, 0).name: "is missing",
+        shard(copy, 1).name: "is unfinished (no sidecar)",
+    }
+
+
+def test_a_doubled_shard_is_found(copy: Path) -> None:
+    # Under a new name, with or without its sidecar.
+    extra = shard(copy, 7)
+    shutil.copy(shard(copy, 1), extra)
+    assert faults(copy) == {extra.name: "is not listed in the manifest"}
+    shutil.copy(sidecar_of(shard(copy, 1)), sidecar_of(extra))
+    assert extra.name in faults(copy)
+    extra.unlink()
+    sidecar_of(extra).unlink()
+    # In place of its neighbor.
+    shutil.copy(shard(copy, 1), shard(copy, 0))
+    assert "SHA-256" in faults(copy)[shard(copy, 0).name]
+    shutil.copy(sidecar_of(shard(copy, 1)), sidecar_of(shard(copy, 0)))
+    assert faults(copy)[shard(copy, 0).name] == f"has the sidecar of {shard(copy, 1).name}"
+    edit(sidecar_of(shard(copy, 0)), lambda record: record.update(file=shard(copy, 0).name))
+    # Which of the two is the copy, nobody knows.
+    assert faults(copy) == {
+        shard(copy, i).name: f"has the same content as {shard(copy, 1 - i).name}" for i in (0, 1)
+    }
+
+
+def test_a_shard_listed_twice_is_found(copy: Path) -> None:
+    def double(manifest: dict[str, Any]) -> None:
+        shards = manifest["splits"]["train"]["shards"]
+        shards.append(shards[0])
+
+    edit(copy / "manifest.json", double)
+    assert faults(copy) == {shard(copy, 0).name: "is listed twice"}
+
+
+def test_foreign_files_are_found(copy: Path, made: dict[str, Path], tmp_path: Path) -> None:
+    (copy / "render.exr").write_bytes(b"of somebody else")
+    (copy / "notes.txt").write_text("harmless")
+    assert faults(copy) == {"render.exr": "is not listed in the manifest"}
+    (copy / "render.exr").unlink()
+    other = write_dataset(
+        tmp_path / "other",
+        queries={"train": "100", "test": "40"},
+        output={"shard_queries": 40, "format": copy.name},
+        seed=1,
+    )
+    for path in (shard(copy), sidecar_of(shard(copy))):
+        shutil.copy(other.folder / path.name, path)
+    assert faults(copy) == {shard(copy).name: "belongs to another data set"}
+
+
+def test_wrong_rows_and_bad_numbers_are_found_behind_a_true_digest(copy: Path) -> None:
+    path = shard(copy)
+    intact = {name: np.array(array) for name, array in read_shard(path).items()}
+
+    def replace(arrays: dict[str, Any]) -> str:
+        write_shard(path, arrays)
+        edit(sidecar_of(path), lambda r: r.update(bytes=path.stat().st_size, sha256=digest(path)))
+        return faults(copy).get(path.name, "nothing")
+
+    assert replace(intact) == "nothing"
+    assert "39 rows" in replace({name: array[:39] for name, array in intact.items()})
+    for bad in (np.nan, np.inf):
+        spoilt = intact["value_b"].copy()
+        spoilt[7, 1] = bad
+        assert replace({**intact, "value_b": spoilt}) == "holds NaN or infinite numbers in 'value_b'"
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "{}", '{"format": "mbtf-shards"}'])
+def test_a_broken_sidecar_is_a_fault_not_an_abort(copy: Path, text: str) -> None:
+    sidecar_of(shard(copy)).write_text(text)
+    assert list(faults(copy)) == [shard(copy).name]
+    assert not is_finished(shard(copy), 40, "any")
+
+
+def test_a_shard_that_shows_other_effects_is_found(copy: Path) -> None:
+    edit(copy / "train-00001.json", lambda record: record.update(effects="0" * 64))
+    found = [(f.file.partition(".")[0], f.what) for f in verify(copy)]
+    assert found == [("train-00001", "was made under another effects plan")]
+
+
+def test_an_unfinished_manifest_is_found(copy: Path) -> None:
+    edit(copy / "manifest.json", lambda manifest: manifest.update(complete=False))
+    assert "not complete" in faults(copy)["manifest.json"]
+
+
+def test_folders_without_a_data_set_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"manifest\.json"):
+        verify(tmp_path)
+    with pytest.raises(InputError, match="no such folder"):
+        verify(tmp_path / "nowhere")
+    for text, says in (
+        ("{", "JSON"),
+        ('{"format": "other"}', "not a manifest"),
+        ('{"format": "mbtf-shards", "schema": 99}', "schema 99"),
+    ):
+        (tmp_path / "manifest.json").write_text(text)
+        with pytest.raises(InputError, match=says):
+            verify(tmp_path)
+
+
+def test_sizes_alone_are_checked_where_digests_are_not_wanted(copy: Path) -> None:
+    path = shard(copy)
+    damaged = bytearray(path.read_bytes())
+    damaged[len(damaged) // 2] ^= 1
+    path.write_bytes(damaged)
+    wanted = json.loads((copy / "manifest.json").read_text())["config_hash"]
+    assert shard_fault(path, 40, wanted, digests=False) is None
+    assert "SHA-256" in str(shard_fault(path, 40, wanted))
+    assert "rows" in str(shard_fault(path, 39, wanted))
+    assert shard_fault(path, 40, "0" * 64) == "belongs to another data set"

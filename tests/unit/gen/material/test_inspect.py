@@ -1,0 +1,265 @@
+"""``mbtf-gen inspect``: numbers that can be checked by hand, and one screenful of text."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.reliefs import Floats, fractal, normals_of, save_heights, save_normals
+
+from mbtf_core.console import run
+from mbtf_gen.cli.app import app
+from mbtf_gen.geometry.heightfield import HeightGrid
+from mbtf_gen.geometry.slope_statistics import (
+    autocorrelation,
+    detail_size,
+    repeats,
+    rms_slope,
+    slope_angles,
+    triangle_slopes,
+)
+from mbtf_gen.material.inspect import inspect_material
+from mbtf_gen.material.inspect_text import LINES, USES, WIDTH, inspection_text
+from mbtf_gen.material.material import load_material
+from mbtf_gen.material.spec import MaterialFile
+
+
+class TestRelief:
+    @pytest.mark.parametrize("aspect", [1.0, 0.5])
+    def test_slopes_are_those_of_the_mesh(self, aspect: float) -> None:
+        """Against the triangles that are rendered."""
+        from mbtf_gen.geometry.heightfield import tile_mesh
+
+        grid = HeightGrid.from_map(fractal(int(12 * aspect), 12), 0.2, aspect)
+        normals = tile_mesh(grid).face_normals
+        expected = np.hypot(normals[:, 0], normals[:, 1]) / normals[:, 2]
+        assert np.sort(triangle_slopes(grid)) == pytest.approx(np.sort(expected))
+        assert rms_slope(grid) == pytest.approx(np.sqrt(np.mean(expected**2)))
+
+    def test_a_roof(self) -> None:
+        """Both flanks of a ridge along v rise by as much as they are wide."""
+        roof = np.tile(np.abs(np.arange(16) - 8.0) / 16, (4, 1))
+        median, high, steepest = slope_angles(HeightGrid.from_map(roof, 1.0, 0.25))
+        assert (median, high, steepest) == pytest.approx((45.0, 45.0, 45.0))
+
+    def test_percentiles(self) -> None:
+        """A gentle flank over seven eighths of the tile, a steep one over the last."""
+        gentle = np.arange(57) / 56 * 0.1
+        steep = 0.1 - np.arange(1, 8) / 8 * 0.1
+        saw = np.tile(np.concatenate([gentle, steep]), (4, 1))
+        median, high, steepest = slope_angles(HeightGrid.from_map(saw, 1.0, 1 / 16))
+        expected = np.degrees(np.arctan([0.1 * 64 / 56, 0.1 * 8, 0.1 * 8]))
+        assert (median, high, steepest) == pytest.approx(tuple(expected))
+
+    def test_repeats(self) -> None:
+        cell = fractal(16, 16)
+        assert [repeats(np.tile(cell, (3, 5)), axis) for axis in (1, 0)] == [5, 3]
+        assert [repeats(fractal(64, 64), axis) for axis in (1, 0)] == [1, 1]
+        assert repeats(np.zeros((8, 8)), 0) == 1
+        # A ripple on a swell repeats as often as the swell.
+        x = np.arange(96) / 96 * 2 * np.pi
+        assert repeats(np.tile(np.cos(x) + 0.5 * np.cos(16 * x), (4, 1)), 1) == 1
+        assert repeats(np.tile(np.cos(2 * x), (4, 1)), 1) == 2
+
+    def test_detail(self) -> None:
+        noise = np.random.default_rng(0).normal(size=(128, 128))
+        assert detail_size(noise) < 1.0
+        assert detail_size(noise.repeat(4, 0).repeat(4, 1)) == pytest.approx(2.0, abs=0.3)
+        x = np.cos(np.arange(96) / 96 * 2 * np.pi)
+        assert detail_size(np.tile(x, (96, 1))) == pytest.approx(96 / 6, abs=0.1)
+        assert autocorrelation(np.tile(x, (4, 1)), 1)[48] == pytest.approx(-1.0)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    out = tmp_path / "rock"
+    out.mkdir()
+    height = fractal(48, 96)
+    save_heights(out / "height.png", height)
+    save_normals(out / "normal.png", normals_of(height, 0.1))
+    color = np.full((48, 96, 3), 0.5)
+    color[:12] = 0.97
+    color[12:18] = 0.01
+    np.save(out / "albedo.npy", color)
+    opacity = np.ones((48, 96))
+    opacity[:, :24] = 0.0
+    np.save(out / "opacity.npy", opacity)
+    metallic = np.zeros((48, 96))
+    metallic[:, 50:] = 1.0
+    np.save(out / "metallic.npy", metallic)
+    return out
+
+
+class TestNumbers:
+    def test_by_hand(self, folder: Path) -> None:
+        found = inspect_material(load_material(folder), height=0.2, mesh=48)
+        assert found["aspect"] == 0.5
+        assert found["surface"] == "glossy"
+        assert found["geometry"]["mesh"] == [24, 48]
+        assert found["geometry"]["height"] == 0.2
+        assert found["geometry"]["relief"] <= 0.2
+        assert 0.3 < found["geometry"]["slope_kept"] < 0.95
+        assert found["albedo"]["share_above"] == 0.25
+        assert found["albedo"]["share_below"] == 0.125
+        assert found["albedo"]["median"] == pytest.approx(0.5)
+        assert (found["albedo"]["min"], found["albedo"]["max"]) == pytest.approx((0.01, 0.97))
+        assert found["opacity"] == {"holes": 0.25, "partly": 0.0}
+        assert found["normal"]["suggested_height"] == pytest.approx(0.1, rel=0.01)
+        assert found["constants"] == {"roughness": 0.5, "specular": 0.5}
+        assert [t["tiles"] for t in found["tiling"]] == [True, True]
+
+    def test_oddities(self, folder: Path) -> None:
+        texts = "\n".join(inspect_material(load_material(folder), height=0.2, mesh=48)["oddities"])
+        for part in (
+            "not square: 96 x 48",
+            "the mesh keeps",
+            "--mesh 96 keeps all",
+            "25.00% of the albedo lies above 0.95",
+            "metallic varies from 0 to 1",
+            "holes: 25.0%",
+            "2 times the 0.1 that the normal map suggests",
+        ):
+            assert part in texts
+        assert "no base color" not in texts
+
+    def test_floats_that_were_integers(self, tmp_path: Path) -> None:
+        for name, height in (("a", fractal(96, 96)), ("b", np.rint(fractal(96, 96) * 200) / 200)):
+            np.save(tmp_path / f"{name}.npy", 0.1 * height)
+            oddities = inspect_material(load_material(tmp_path / f"{name}.npy"))["oddities"]
+            assert any("different values" in o for o in oddities) == (name == "b")
+
+    @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (5, 1), (2, 3)])
+    def test_tiny_maps(self, tmp_path: Path, shape: tuple[int, int]) -> None:
+        save_heights(tmp_path / "height.png", np.random.default_rng(0).random(shape), 8)
+        save_normals(tmp_path / "normal.png", np.full((*shape, 3), (0.0, 0.0, 1.0)))
+        found = inspect_material(load_material(tmp_path))
+        assert found["maps"]["height"]["columns"] == shape[1]
+        assert found["normal"] is not None
+        assert len(inspection_text(found, "tiny").splitlines()) <= LINES
+
+    def test_a_flat_plain_map_is_nothing_special(self, tmp_path: Path) -> None:
+        np.save(tmp_path / "h.npy", np.zeros((4, 4)))
+        found = inspect_material(load_material(tmp_path / "h.npy"))
+        assert "relief 0 tile widths" in inspection_text(found, "flat")
+        assert found["geometry"]["slope_max_deg"] == 0.0
+        assert found["geometry"]["slope_kept"] == 1.0
+        assert found["oddities"] == ["no base color map: linear RGB 0.5, 0.5, 0.5 everywhere"]
+        assert found["tiling"] == []
+        assert any("heights are constant" in w for w in found["warnings"])
+
+
+class TestText:
+    def lines(self, found: dict, name: str = "rock") -> list[str]:
+        lines = inspection_text(found, name).splitlines()
+        assert len(lines) <= LINES
+        assert max(map(len, lines)) <= WIDTH
+        return lines
+
+    def test_one_screen(self, folder: Path) -> None:
+        lines = self.lines(inspect_material(load_material(folder)))
+        assert lines[0] == "rock: tile 1 x 0.5, surface glossy, tile=none"
+        text = "\n".join(lines)
+        for part in (
+            "displaces the mesh",
+            "slopes     median",
+            "OpenGL",
+            "suggests height 0.1",
+            "holes 25.0%",
+        ):
+            assert part in text
+
+    def test_misfits_and_seams_are_shouted(self, folder: Path) -> None:
+        height: Floats = fractal(48, 96)[:, ::-1]
+        save_heights(folder / "height.png", height * np.linspace(0.1, 1, 96))
+        text = "\n".join(self.lines(inspect_material(load_material(folder))))
+        assert "DOES NOT FIT; fits with the height map mirrored left to right" in text
+        assert "along u DOES NOT TILE" in text
+
+    def test_every_entry_of_a_material_file(self, folder: Path) -> None:
+        """Each as a map and as a constant, but the heights, normals and BSDF, which are no numbers."""
+        assert set(USES) == set(MaterialFile.model_fields) - {"bsdf"}
+        shares = sorted(set(USES) - {"height", "normal"})
+        for value in ("0.5", "metallic.npy"):
+            text = "height: height.png\n" + "".join(f"{name}: {value}\n" for name in shares)
+            (folder / "material.yaml").write_text(text)
+            text = "\n".join(self.lines(inspect_material(load_material(folder))))
+            for name in shares:
+                assert USES[name] in text
+        assert "surface glossy under a clear coat" in text
+
+    def test_a_coat_alone_lies_on_lambert(self, folder: Path) -> None:
+        (folder / "material.yaml").write_text("height: height.png\nclearcoat: 1\n")
+        material = load_material(folder)
+        assert any(n.startswith("surface: Lambert under a clear coat, because") for n in material.notes)
+        lines = self.lines(inspect_material(material))
+        assert "surface diffuse under a clear coat" in lines[0]
+        assert any(line.startswith("clearcoat_roughness constant 0.1") for line in lines)
+
+    def test_maps_that_are_not_used_are_shown(self, folder: Path) -> None:
+        for name in ("orm.png", "gloss.png", "ao.png", "view.png"):
+            save_heights(folder / name, fractal(48, 96))
+        lines = self.lines(inspect_material(load_material(folder)))
+        text = "\n".join(line for line in lines if line.startswith("not used"))
+        for name in (
+            "orm.png: name its channels",
+            "gloss.png: in a",
+            "ao.png: ambient",
+            "view.png: its name",
+        ):
+            assert name in text
+        assert any("orm.png: is not used, and its map is missing" in line for line in lines)
+        found = inspect_material(load_material(folder))
+        found["unused"] = {f"{i} {'long ' * 20}.png": f"reason {i}" for i in range(30)}
+        assert any("… more with --json" in line for line in self.lines(found))
+
+    def test_a_default_height_far_from_the_suggested_one(self, folder: Path) -> None:
+        save_normals(folder / "normal.png", normals_of(fractal(48, 96), 0.01))
+
+        def said(height: float | None = None) -> tuple[bool, bool]:
+            found = inspect_material(load_material(folder), height)
+            warned = any(
+                "default of 0.05, which is 5 times as much; --height 0.0099" in w for w in found["warnings"]
+            )
+            return warned, any("that the normal map suggests" in o for o in found["oddities"])
+
+        assert said() == (True, False)
+        assert any("(the default is 0.05)" in note for note in load_material(folder).notes)
+        assert said(0.05) == (False, True)
+        save_heights(folder / "height.png", fractal(48, 96) / 50)
+        (warning,) = (w for w in load_material(folder).warnings_at() if "suggest" in w)
+        assert "which is 0.1 times as much" in warning
+        save_heights(folder / "height.png", fractal(48, 96))
+        (folder / "material.yaml").write_text("height: {file: height.png, scale: 0.05}\nnormal: normal.png\n")
+        assert said() == (False, True)
+        assert any("(the material file's is 0.05)" in note for note in load_material(folder).notes)
+        (folder / "material.yaml").unlink()
+        save_normals(folder / "normal.png", normals_of(fractal(48, 96), 0.02))
+        assert not any("suggest another" in w for w in load_material(folder).warnings_at())
+
+    def test_long_lists_and_names_are_cut(self, folder: Path) -> None:
+        found = inspect_material(load_material(folder))
+        found["warnings"] = [f"/very/long/folder/x.png: {'words and more ' * 20}"] * 30
+        lines = self.lines(found)
+        assert lines[-1].strip() == "… more with --json"
+        assert "/very/long" not in "\n".join(lines)
+
+
+class TestCommand:
+    def test_json(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        assert run(app, ["inspect", str(folder), "--json", "--height", "0.3", "--mesh", "10"]) == 0
+        found = json.loads(capsys.readouterr().out)
+        assert found["material"] == str(folder)
+        assert found["geometry"]["height"] == 0.3
+        assert found["geometry"]["mesh"] == [5, 10]
+        assert found["maps"]["height"]["bits"] == 16
+
+    def test_text_and_tile(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        assert run(app, ["inspect", str(folder), "--tile", "mirror"]) == 0
+        assert "tile=mirror" in capsys.readouterr().out
+
+    def test_what_is_missing(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        assert run(app, ["inspect", str(folder.parent / "rok")]) == 3
+        assert f"did you mean '{folder}'" in capsys.readouterr().err
+        assert run(app, ["inspect"]) == 2

@@ -1,0 +1,247 @@
+"""Previews without rendering: camera, block of tiles, samples of queries, plots, faults of drawing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.datasets import write_dataset
+from support.paths import ROOT
+
+from mbtf_core.child_process import run_child
+from mbtf_core.directions import from_angles
+from mbtf_core.errors import EngineError, InputError
+from mbtf_core.lattice import level_of_sigma, texel_centers
+from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.generation import Job
+from mbtf_gen.material.material import Material
+from mbtf_gen.pictures.camera import Camera
+from mbtf_gen.pictures.preview import mesh
+from mbtf_gen.pictures.preview.mesh import MOST_CELLS, block_of, check_display, draw
+from mbtf_gen.pictures.preview.plots import level_histogram, query_figure, write_plots
+from mbtf_gen.pictures.preview.sample import QuerySample, drawn, finished_shards, stored
+from mbtf_gen.pictures.preview.view import block_camera
+from mbtf_gen.sampling.query_sampler import Mixture
+
+LIGHT = from_angles(35, 150)
+
+
+def material(rows: int = 4, columns: int = 8, **options: Any) -> Material:
+    rng = np.random.default_rng(1)
+    color = rng.uniform(0.1, 0.9, (rows, columns, 3)).astype(np.float32)
+    given = {"height": 0.1 * rng.random((rows, columns)), "base_color": color, **options}
+    return Material(height_scale=1.0, height_bits=None, **given)
+
+
+@pytest.mark.parametrize("aspect", [0.5, 1.0, 3.0])
+@pytest.mark.parametrize(("elevation", "azimuth"), [(90, -90), (40, -90), (25, 30)])
+@pytest.mark.parametrize("relief", [0.0, 0.3, 5.0])
+def test_the_camera_just_holds_the_block(
+    aspect: float, elevation: float, azimuth: float, relief: float
+) -> None:
+    camera = block_camera(elevation, azimuth, tiles=2, aspect=aspect, relief=relief, columns=120)
+    assert (camera.rows, camera.columns) == (90, 120)
+    assert camera.target == (1.0, aspect)
+    forward, right, up = camera.frame()
+    reach = []
+    for corner in np.ndindex(2, 2, 2):
+        offset = np.array(corner) * (2.0, 2.0 * aspect, -relief) - camera.position
+        depth = offset @ forward
+        assert depth > 0
+        half = camera.pixel_pitch / 2 * depth
+        reach += [abs(offset @ right) / (half * 120), abs(offset @ up) / (half * 90)]
+    assert max(reach) == pytest.approx(0.94, abs=1e-3)
+
+
+@pytest.mark.parametrize("tiles", [1, 2, 3])
+def test_the_block_is_the_repeated_tile(tiles: int) -> None:
+    m = material()
+    block = block_of(m, tiles)
+    assert block.cells == (4, 8)
+    assert block.points.shape == (4 * tiles + 1, 8 * tiles + 1, 3)
+    z = m.height - m.height.max()
+    centers = texel_centers(4, 8)
+    # The last tile row is the map itself, at its texel centers; the first column continues it upwards.
+    np.testing.assert_allclose(block.points[-5:-1, :8, 2], z, atol=1e-6)
+    np.testing.assert_allclose(block.uv[-5:-1, :8], centers, atol=1e-6)
+    np.testing.assert_allclose(block.points[..., 0], block.uv[..., 0], atol=1e-6)
+    np.testing.assert_allclose(block.points[..., 1], 0.5 * block.uv[..., 1], atol=1e-6)
+    np.testing.assert_allclose(block.points[:4, -9:-1, 2], z, atol=1e-6)
+    assert block.uv.max() == pytest.approx(tiles + 0.0625, abs=0.07)
+    assert not block.hole.any()
+    # Brighter texels are shown brighter; row 0 stays on top.
+    shown = block.texture.astype(float).mean(axis=-1).ravel()
+    assert np.corrcoef(shown, np.asarray(m.base_color).mean(axis=-1).ravel())[0, 1] > 0.95
+
+
+def test_holes_are_cut_where_little_is_left() -> None:
+    opacity = np.ones((4, 8), np.float32)
+    opacity[1:3, 2:6] = 0.0
+    block = block_of(material(opacity=opacity), 2)
+    assert block.hole.shape == (8, 16)
+    # Cells lie between texel centers: those whose four corners average below one half.
+    expected = np.zeros((4, 8), bool)
+    expected[1:2, 2:5] = True
+    np.testing.assert_array_equal(block.hole, np.tile(expected, (2, 2)))
+    assert block_of(material(opacity=0.2), 1).hole.all()
+
+
+def test_a_large_mesh_is_drawn_coarser() -> None:
+    m = material()
+    for tiles, wide in ((1, MOST_CELLS), (4, MOST_CELLS // 4)):
+        block = block_of(m, tiles, mesh=4000)
+        assert block.cells == (wide // 2, wide)
+    tall = block_of(material(8, 4), 2, mesh=2000)
+    assert tall.cells == (MOST_CELLS // 2, MOST_CELLS // 4)
+
+
+def sample_of(count: int, seed: int = 0, **options: Any) -> QuerySample:
+    config = GeneratorConfig.model_validate({"material": "m", "queries": {"train": str(count), **options}})
+    job = Job(config, material(), lattice=_lattice(config), config_hash="")
+    return drawn(job)
+
+
+def _lattice(config: GeneratorConfig) -> Any:
+    from mbtf_core.lattice import Lattice
+
+    return Lattice.for_map(4, 8, config.queries.levels)
+
+
+@pytest.mark.parametrize("weights", [(0.6, 0.4), (1.0, 0.0), (0.0, 1.0)])
+@pytest.mark.parametrize("finest", [1, 2, 5])
+def test_the_stated_density_is_that_of_the_levels_drawn(weights: tuple[float, float], finest: int) -> None:
+    mixture = Mixture(*weights)
+    at = np.linspace(-1, finest + 1, 20_001)
+    density = mixture.density(at, finest)
+    assert np.trapezoid(density, at) == pytest.approx(1.0, abs=2e-3)
+    assert density[(at < 0) | (at > finest)].max() == 0
+    # Quantiles of the generator against the integral of the density.
+    level = mixture.level((np.arange(4000) + 0.5) / 4000, finest)
+    for limit in np.linspace(0.1, finest, 7):
+        below = float(np.trapezoid(np.where(at <= limit, density, 0), at))
+        assert (level <= limit).mean() == pytest.approx(below, abs=2e-3)
+
+
+def test_the_histogram_of_levels_follows_the_mixture() -> None:
+    edges, found, stated = level_histogram(sample_of(20_000))
+    assert edges[0] == 0
+    assert edges[-1] == 3
+    assert np.sum(found * np.diff(edges)) == pytest.approx(1.0)
+    # Levels are stratified: the counts are those stated to within one per bin, or two at a weight's edge.
+    np.testing.assert_allclose(found, stated, atol=2 / (20_000 * 0.125))
+    other = replace(sample_of(20_000), mixture=Mixture(1.0, 0.0))
+    assert np.abs(level_histogram(other)[1] - level_histogram(other)[2]).max() > 0.1
+    # Few queries fill whole levels only.
+    edges, found, stated = level_histogram(sample_of(300))
+    assert edges.tolist() == [0, 1, 2, 3]
+    np.testing.assert_allclose(stated, [0.2, 0.2, 0.6])
+    np.testing.assert_allclose(found, stated, atol=2 / 300)
+    edges, found, stated = level_histogram(sample_of(50, levels=0))
+    assert (found.tolist(), stated.tolist()) == ([1.0], [1.0])
+
+
+@pytest.mark.parametrize("layout", ["shuffled", "image"])
+def test_stored_queries_are_those_that_the_configuration_draws(layout: str, tmp_path: Path) -> None:
+    dataset = write_dataset(
+        tmp_path / "set",
+        queries={"train": "100", "test": "8", "layout": layout},
+        output={"shard_queries": 40},
+    )
+    config = GeneratorConfig.model_validate(dataset.manifest["config"])
+    a, b = stored(dataset), drawn(Job.prepare(config))
+    data = dataset.load("train")
+    for sample in (a, b):
+        np.testing.assert_array_equal(sample.u, data["u"].reshape(-1, 2))
+        one = ... if layout == "shuffled" else (slice(None), 0, 0)
+        np.testing.assert_array_equal(sample.omega_i, data["omega_i"][one])
+        np.testing.assert_array_equal(sample.omega_o, data["omega_o"][one])
+        np.testing.assert_array_equal(sample.level, level_of_sigma(data["sigma"][one]))
+        assert sample.total == len(sample.u)
+        assert (sample.mixture, sample.finest) == (Mixture(0.6, 0.4), 3)
+        assert (sample.min_cos, sample.aspect) == (0.1, 0.5)
+
+
+def test_unfinished_shards_are_left_out(tmp_path: Path) -> None:
+    dataset = write_dataset(
+        tmp_path / "set", queries={"train": "100", "test": "8"}, output={"shard_queries": 40}
+    )
+    (tmp_path / "set/train-00001.json").unlink()
+    assert [p.name for p in finished_shards(dataset, "train")] == ["train-00000.npz", "train-00002.npz"]
+    sample = stored(dataset)
+    assert (len(sample.u), sample.shards, sample.total) == (60, 2, 100)
+    for name in ("train-00000.npz", "train-00002.npz"):
+        (tmp_path / "set" / name).unlink()
+    with pytest.raises(InputError, match="no finished train shard"):
+        stored(dataset)
+
+
+@pytest.mark.parametrize("count", [1, 300, 9000])
+def test_plots_show_the_queries(count: int, tmp_path: Path) -> None:
+    sample = sample_of(count, min_cos=0.5)
+    position, level, light, view, *bars = query_figure(sample, "title").axes
+    assert len(bars) == (3 if count == 9000 else 0)
+    assert position.get_aspect() == 0.5
+    assert f"k = {sample.finest} " in level.get_xlabel()
+    for axes, points in ((position, sample.u), (light, sample.omega_i[:, :2]), (view, sample.omega_o[:, :2])):
+        collection = axes.collections[0]
+        if count < 4000:
+            np.testing.assert_array_equal(np.asarray(collection.get_offsets(), np.float32), points)
+        else:
+            ratio = np.ma.filled(collection.get_array(), np.nan)
+            assert np.nanmean(ratio) == pytest.approx(1.0, abs=0.05)
+            assert np.nanmax(ratio) < 2
+    for axes in (light, view):
+        radii = [np.hypot(*line.get_data()) for line in axes.lines]
+        np.testing.assert_allclose(radii[0], 1.0)
+        np.testing.assert_allclose(radii[1], np.sqrt(0.75))
+    edges, found, stated = level_histogram(sample)
+    for patch, values in zip(level.patches, (found, stated), strict=True):
+        data = patch.get_data()
+        np.testing.assert_array_equal(data.values, values)
+        np.testing.assert_array_equal(data.edges, edges)
+    write_plots(tmp_path / "plots.png", sample, "title")
+    assert (tmp_path / "plots.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_queries_outside_the_disk_stand_out() -> None:
+    sample = sample_of(9000, min_cos=0.5)
+    wrong = replace(sample, min_cos=0.8)
+    ratio = np.ma.filled(query_figure(wrong, "").axes[2].collections[0].get_array(), np.nan)
+    assert np.nansum(ratio == 2.0) > 20
+
+
+def test_a_crash_while_drawing_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def crashing(module: str, function: str, *arguments: str, timeout: float) -> Any:
+        return run_child("support.crashing", "crash", *arguments, timeout=timeout)
+
+    monkeypatch.setattr(mesh, "run_child", crashing)
+    block, camera = block_of(material(), 1), Camera(rows=8, columns=8)
+    fault = draw(block, camera, LIGHT, tmp_path / "mesh.png")
+    assert fault == "the process was ended by SIGSEGV"
+    assert list(tmp_path.iterdir()) == []
+    monkeypatch.setenv("DISPLAY", ":0")
+    with pytest.raises(EngineError, match=r"SIGSEGV.*\n.*doctor"):
+        mesh.show(block, camera, LIGHT)
+
+
+def test_a_window_needs_a_display(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.platform", "linux")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(EngineError, match="no display"):
+        check_display()
+    monkeypatch.setenv("WAYLAND_DISPLAY", "wayland-0")
+    check_display()
+
+
+def test_the_document_states_options_and_defaults() -> None:
+    from mbtf_gen.config.pictures import Direction, PreviewSection
+
+    text = (ROOT / "docs/preview.md").read_text()
+    for key, value in PreviewSection():
+        shown = f"{value.elevation:g},{value.azimuth:g}" if isinstance(value, Direction) else str(value)
+        assert f"| `--{key}` | `preview.{key}` | {shown} |" in text
+    assert str(MOST_CELLS) in text

@@ -1,0 +1,261 @@
+"""Which queries get how many paths: fitted expectations, counts, and what a target error calls for."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from conftest import RunPython
+from numpy.typing import NDArray
+
+from mbtf_core.lattice import Lattice
+from mbtf_gen.planning.adaptive import DOUBT, MOST_CORRECTION, PRIOR_PATHS, correction, round_up, wanted_paths
+from mbtf_gen.planning.sample_allocation import (
+    FLOOR,
+    Allocation,
+    _evaluate,
+    _terms,
+    fit_allocation,
+    fit_log_linear,
+)
+from mbtf_gen.render.estimates import Estimates
+from mbtf_gen.sampling.query_sampler import Mixture, Queries, QueryPlan
+
+SPP = 16
+
+
+def some_queries(n: int = 20_000, shard: int = 0) -> Queries:
+    return QueryPlan(Lattice(6), Mixture(0.6, 0.4), 0.1, "shuffled", 0, n).draw("train", shard, n)
+
+
+def deviation(q: Queries) -> NDArray[np.float64]:
+    """Noisy at fine levels and low lights."""
+    level = -np.log2(2.0 * q.sigma.astype(np.float64))
+    return np.asarray(0.05 * np.exp(0.3 * level) / q.omega_i[:, 2].astype(np.float64))
+
+
+def pilot(q: Queries, paths: int = SPP, seed: int = 0) -> Estimates:
+    """Values whose noise has the deviation above, around a tile mean of 0.2 · ω_o,z."""
+    rng = np.random.default_rng(seed)
+    noise = deviation(q)[:, None] * np.sqrt(2.0 / paths)
+    a, b = (
+        (0.2 * q.omega_o[:, 2:] + noise * rng.normal(size=(len(q.sigma), 3))).astype(np.float32)
+        for _ in range(2)
+    )
+    return Estimates(a, b, None, 0, 0, 0, 0)
+
+
+@pytest.fixture(scope="module")
+def fitted() -> Allocation:
+    q = some_queries()
+    return fit_allocation(q, pilot(q), SPP, SPP)
+
+
+def test_a_log_linear_mean_is_recovered() -> None:
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=20_000)
+    weights = fit_log_linear([np.ones_like(x), x], np.exp(0.5 * x - 3.0) * rng.exponential(size=len(x)))
+    assert weights == pytest.approx([-3.0, 0.5], abs=0.05)
+    nothing = fit_log_linear([np.ones_like(x), x], np.zeros_like(x))
+    assert nothing is not None
+    assert not nothing.any()
+
+
+def glossy_pilot(q: Queries, seed: int) -> Estimates:
+    """Noise of a sharp lobe, large where the half vector is the normal and seen by few paths."""
+    half = q.omega_i.astype(np.float64) + q.omega_o
+    square = (half[:, 0] ** 2 + half[:, 1] ** 2) / half[:, 2] ** 2
+    size = 0.01 * (1.0 + 1e5 / (1.0 + 100.0 * square) ** 2)
+    rng = np.random.default_rng(seed)
+    size *= rng.exponential(size=len(size)) * np.where(rng.random(len(size)) < 0.004, 250.0, 0.05)
+    a = (1.0 + size).astype(np.float32)[:, None].repeat(3, axis=1)
+    return Estimates(a, np.ones_like(a), None, 0, 0, 0, 0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_sharp_lobe_is_fitted_to_the_end(seed: int) -> None:
+    q = some_queries(8000)
+    found = glossy_pilot(q, seed)
+    noise = np.sqrt(np.mean((found.value_a.astype(np.float64) - found.value_b) ** 2, axis=-1))
+    weights = fit_log_linear(_terms(q), noise)
+    assert weights is not None
+    fit = np.exp(np.stack(_terms(q), axis=1) @ weights)
+    # The constant has no ridge, so this holds at the optimum and nowhere else along it.
+    assert fit.mean() == pytest.approx(noise.mean(), rel=1e-3)
+    allocation = fit_allocation(q, found, SPP, SPP)
+    assert allocation.counts(q, SPP).mean() == pytest.approx(SPP, rel=0.02)
+    # s is the root mean square, which a pilot of few bright paths has well above the mean size.
+    s = _evaluate(allocation.weights, _terms(q))
+    assert s.mean() == pytest.approx(allocation.typical)
+    assert np.mean(s**2) == pytest.approx(0.25 * SPP * np.mean(noise**2), rel=1e-3)
+
+
+def test_a_fit_that_does_not_converge_gives_even_counts(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    q = some_queries(2000)
+    found = glossy_pilot(q, 1)
+    monkeypatch.setattr("mbtf_gen.planning.sample_allocation._STEPS", 2)
+    allocation = fit_allocation(q, found, SPP, 12)
+    assert caplog.messages == [
+        "the fit of the tile mean over directions did not converge; taken to be constant",
+        "the fit of the noise over queries did not converge; expected to be the same for all",
+    ]
+    assert (allocation.counts(q, 12) == 12).all()
+    difference = found.value_a.astype(np.float64) - found.value_b
+    assert allocation.deviation(q) ** 2 == pytest.approx(np.full(2000, 0.25 * SPP * np.mean(difference**2)))
+    mean = 0.5 * np.mean(found.value_a.astype(np.float64) + found.value_b)
+    assert allocation.tile_mean(q) == pytest.approx(np.full(2000, mean))
+
+
+def test_expected_deviations_and_means_follow_the_pilot(fitted: Allocation) -> None:
+    q = some_queries(4000, shard=1)
+    ratio = fitted.deviation(q) / deviation(q)
+    assert np.quantile(ratio, [0.02, 0.98]) == pytest.approx([1.0, 1.0], rel=0.2)
+    assert np.mean(ratio**2) == pytest.approx(1.0, rel=0.05)
+    assert fitted.tile_mean(q) / (0.2 * q.omega_o[:, 2]) == pytest.approx(np.ones(4000), rel=0.35)
+
+
+def test_counts_are_powers_of_two_about_the_wanted_mean(fitted: Allocation) -> None:
+    q = some_queries(shard=2)
+    for spp in (SPP, 256):
+        counts = fitted.counts(q, spp)
+        assert counts.mean() == pytest.approx(spp, rel=0.06)
+        assert (np.log2(counts) % 1 == 0).all()
+        assert counts.min() >= 2
+    # In proportion to the deviation, to the nearest power of two.
+    share = fitted.counts(q, 256) / fitted.deviation(q)
+    assert share.max() / share.min() < 2.0001
+
+
+def test_they_make_errors_smaller_and_the_gain_says_by_how_much(fitted: Allocation) -> None:
+    q = some_queries(shard=3)
+    variance = deviation(q) ** 2
+    gain = np.mean(variance / SPP) / np.mean(variance / fitted.counts(q, SPP))
+    assert gain > 1.3
+    assert fitted.gain == pytest.approx(gain, rel=0.1)
+
+
+def test_counts_of_a_query_do_not_depend_on_the_others(fitted: Allocation) -> None:
+    q = some_queries(1000)
+    some = Queries(q.u[7:9], q.sigma[7:9], q.omega_i[7:9], q.omega_o[7:9])
+    assert (fitted.deviation(some) == fitted.deviation(q)[7:9]).all()
+    assert (fitted.counts(some, SPP) == fitted.counts(q, SPP)[7:9]).all()
+
+
+# Counts by a manifest's weights, and by a pilot of its own for a target error; prints NumPy's features in use
+# and the digest of all bits, those of the expectations too, where the last bit shows.
+CODE = """
+import hashlib, json, sys
+import numpy as np
+from mbtf_gen.planning.adaptive import round_up, wanted_paths
+from mbtf_gen.planning.sample_allocation import Allocation
+from mbtf_gen.render.estimates import Estimates
+from mbtf_core.lattice import Lattice
+from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
+n = 20000
+allocation = Allocation.from_manifest(json.loads(sys.argv[1]))
+q = QueryPlan(Lattice(6), Mixture(0.6, 0.4), 0.1, "shuffled", 0, n).draw("train", 3, n)
+rng = np.random.Generator(np.random.Philox(5))
+a, b, v = (0.3 * rng.random((n, k), dtype=np.float32) for k in (3, 3, 1))
+pilot = Estimates(a, b, None, 0, 0, 0, 0, path_variance=v[:, 0])
+expected = allocation.deviation(q), allocation.tile_mean(q)
+wanted, scale = wanted_paths(pilot, 16, *expected, 0.05)
+h = hashlib.sha256()
+for array in (*expected, wanted, scale, allocation.counts(q, 16), round_up(wanted, 1000)):
+    h.update(array.tobytes())
+found = np.show_config(mode="dicts")["SIMD Extensions"].get("found", [])
+print(json.dumps({"found": found, "digest": h.hexdigest()}))
+"""
+
+
+def test_counts_do_not_depend_on_the_processors_features(fitted: Allocation, run_python: RunPython) -> None:
+    def counted(features: list[str] | None) -> tuple[list[str], str]:
+        disabled = None if features is None else " ".join(features)
+        done = run_python("-c", CODE, json.dumps(fitted.to_manifest()), NPY_DISABLE_CPU_FEATURES=disabled)
+        assert done.returncode == 0, done.stderr
+        answer = json.loads(done.stdout)
+        return answer["found"], answer["digest"]
+
+    found, digest = counted(None)
+    if not found:
+        pytest.skip("NumPy uses no optional features of this processor")
+    left, again = counted(found)
+    assert len(left) < len(found)
+    assert again == digest
+
+
+def test_an_allocation_survives_the_manifest(fitted: Allocation) -> None:
+    assert Allocation.from_manifest(json.loads(json.dumps(fitted.to_manifest()))) == fitted
+
+
+def test_no_noise_and_little_noise() -> None:
+    q = some_queries(500)
+    value = np.full((500, 3), 0.1, np.float32)
+    silent = fit_allocation(q, Estimates(value, value, None, 0, 0, 0, 0), SPP, SPP)
+    assert (silent.counts(q, SPP) == SPP).all()
+    assert silent.gain == 1.0
+    lonely = value.copy()
+    lonely[3] = 1.0
+    found = fit_allocation(q, Estimates(lonely, value, None, 0, 0, 0, 0), SPP, SPP)
+    assert found.deviation(q).min() >= FLOOR * found.typical > 0
+
+
+def test_counts_under_a_target_are_rounded_up() -> None:
+    wanted = np.array([0.0, 2.0, 2.1, 4.1, 6.0, 6.1, 9.0, 12.1, 500.0, 1e9])
+    assert round_up(wanted, 1000).tolist() == [2, 2, 4, 6, 6, 8, 12, 16, 512, 1000]
+
+
+def test_paths_for_a_target_error() -> None:
+    n = 4
+    value = np.array([0.1, 2.0, 0.0, 0.1], np.float32)[:, None].repeat(3, axis=1)
+    variance = np.array([0.01, 0.01, 0.0, 0.01], np.float32)
+    found = Estimates(value, value, None, 0, 0, 0, 0, path_variance=variance)
+    wanted, scale = wanted_paths(found, 16, np.full(n, 0.1), np.array([0.2, 0.2, 0.2, 0.0]), 0.05)
+    # The tile mean, or a value that is well above it.
+    assert scale == pytest.approx([0.2, 2.0, 0.2, 0.1], rel=0.15)
+    # Where pilot and expectation agree, the variance over the square of what is allowed.
+    shrunken = 2.0 - DOUBT * 0.01 / 16 / 1.8
+    assert wanted[:2] == pytest.approx([0.01 / (0.05 * 0.2) ** 2, 0.01 / (0.05 * shrunken) ** 2])
+    # A pilot that saw nothing does not overrule the expectation.
+    assert wanted[2] == pytest.approx(0.01 * PRIOR_PATHS / (15 + PRIOR_PATHS) / (0.05 * 0.2) ** 2)
+    assert wanted[3] == pytest.approx(0.01 / (0.05 * (0.1 - DOUBT * 0.01 / 16 / 0.1)) ** 2)
+
+
+def test_an_expectation_that_falls_short_of_the_pilots_is_raised() -> None:
+    """In proportion to the tile mean's square, and by no more than a factor; one path decides nothing."""
+    rng = np.random.default_rng(0)
+    n = 4000
+    mean = np.exp(rng.normal(size=n))
+    deviation = 0.3 * mean
+    for factor, expected in ((0.5, 1.0), (1.5, 1.5), (9.0, MOST_CORRECTION)):
+        variance = (factor * deviation) ** 2 * rng.exponential(size=n)
+        assert correction(variance, deviation, mean) == pytest.approx(expected, rel=0.05)
+        variance[7] = 1e6
+        assert correction(variance, deviation, mean) == pytest.approx(expected, rel=0.08)
+    # Where the dark ones are the noisy ones, they count.
+    dark = mean < np.median(mean)
+    assert correction(np.where(dark, 2.0, 0.7) * deviation**2, deviation, mean) == pytest.approx(
+        1.16, rel=0.02
+    )
+    # Too few say nothing; nor does black.
+    assert correction(9.0 * deviation[:100] ** 2, deviation[:100], mean[:100]) == 1.0
+    assert correction(np.zeros(n), np.zeros(n), np.zeros(n)) == 1.0
+    found = Estimates(
+        *np.zeros((2, n, 3), np.float32), None, 0, 0, 0, 0, path_variance=np.zeros(n, np.float32)
+    )
+    assert found.path_variance is not None
+    found.path_variance[:] = (1.5 * deviation) ** 2
+    wanted, _ = wanted_paths(found, 16, deviation, mean, 0.05)
+    assert wanted == pytest.approx(np.full(n, (1.5 * 0.3 / 0.05) ** 2), rel=1e-5)
+
+
+def test_one_bright_path_of_a_pilot_allows_no_larger_error() -> None:
+    paths = np.r_[50.0, np.zeros(15)]
+    value = np.full((1, 3), paths.mean(), np.float32)
+    variance = np.array([paths.var(ddof=1)], np.float32)
+    found = Estimates(value, value, None, 0, 0, 0, 0, path_variance=variance)
+    for expected in (0.0, 0.5):
+        _, scale = wanted_paths(found, 16, np.array([expected]), np.array([0.2]), 0.05)
+        assert scale == pytest.approx([0.2], rel=1e-3)

@@ -1,0 +1,290 @@
+"""The LLVM library: found without the user, and never the cause of an abort."""
+
+from __future__ import annotations
+
+import ctypes.util
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+from conftest import RunPython
+
+from mbtf_core.child_process import run_child
+from mbtf_core.errors import EngineError, UsageError
+from mbtf_gen.render import llvm
+from mbtf_gen.render import runtime as engine
+
+LOAD = """
+from mbtf_gen.render.runtime import load_mitsuba
+from mbtf_core.errors import MbtfError
+try:
+    print(load_mitsuba().variant())
+except MbtfError as error:
+    print(type(error).__name__ + "|" + error.message.replace(chr(10), "|"))
+"""
+
+
+def old_llvm(major: int) -> str:
+    """Path of a system library of that version, or skip."""
+    places = [
+        f"/usr/lib/x86_64-linux-gnu/libLLVM-{major}.so.1",
+        f"/usr/lib/aarch64-linux-gnu/libLLVM-{major}.so.1",
+        f"/usr/lib/llvm-{major}/lib/libLLVM-{major}.so.1",
+        f"/usr/lib64/libLLVM-{major}.so",
+    ]
+    for place in places:
+        if Path(place).exists():
+            return place
+    pytest.skip(f"no LLVM {major} on this machine")
+
+
+def test_the_installation_has_a_new_enough_llvm() -> None:
+    library = llvm.shipped_llvm()
+    assert library is not None
+    assert library.is_file()
+    version = llvm.version_in_name(library)
+    assert version is not None
+    assert version[0] >= llvm.OLDEST_LLVM
+
+
+def test_it_is_found_and_works_with_nothing_set(run_python: RunPython, tmp_path: Path) -> None:
+    done = run_python(
+        "-c",
+        LOAD + "import os; print(os.environ['DRJIT_LIBLLVM_PATH'])",
+        DRJIT_LIBLLVM_PATH=None,
+        DRJIT_CACHE_DIR=None,
+        XDG_CACHE_HOME=str(tmp_path),
+    )
+    assert done.stdout.splitlines() == ["llvm_ad_rgb", str(llvm.shipped_llvm())]
+    assert done.stderr == ""
+    assert any(p.name.startswith("llvm-proof-") for p in (tmp_path / "mbtf").iterdir())
+
+
+def test_a_path_the_user_set_wins(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(llvm.VARIABLE, "/somewhere/libLLVM.so.99")
+    monkeypatch.delenv(llvm.CACHE_VARIABLE, raising=False)
+    llvm.use_shipped_llvm()
+    assert os.environ[llvm.VARIABLE] == "/somewhere/libLLVM.so.99"
+    assert os.environ[llvm.CACHE_VARIABLE].endswith("kernels-libLLVM.so.99")
+
+
+def test_an_empty_path_counts_as_unset(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(llvm.VARIABLE, "")
+    monkeypatch.setenv(llvm.CACHE_VARIABLE, "/kept")
+    llvm.use_shipped_llvm()
+    assert os.environ[llvm.VARIABLE] == str(llvm.shipped_llvm())
+    assert os.environ[llvm.CACHE_VARIABLE] == "/kept"
+
+
+def test_a_text_file_is_refused_in_one_line(run_python: RunPython, tmp_path: Path) -> None:
+    fake = tmp_path / "libLLVM.so"
+    fake.write_text("no library\n")
+    done = run_python("-c", LOAD, DRJIT_LIBLLVM_PATH=str(fake))
+    assert done.returncode == 0
+    assert done.stdout.startswith(f"EngineError|DRJIT_LIBLLVM_PATH={fake}: cannot be loaded (")
+    assert "|  unset it" in done.stdout
+    assert done.stderr == ""
+
+
+def test_a_missing_file_and_a_folder_are_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv(llvm.VARIABLE, str(tmp_path / "libLLVM.so"))
+    with pytest.raises(EngineError, match="no such file"):
+        engine.check_llvm()
+    monkeypatch.setenv(llvm.VARIABLE, str(tmp_path))
+    with pytest.raises(EngineError, match="is not a file"):
+        engine.check_llvm()
+
+
+@pytest.mark.parametrize("major", [14, 15])
+def test_an_old_llvm_is_refused_by_its_name(major: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(llvm.VARIABLE, old_llvm(major))
+    with pytest.raises(EngineError, match=f"is LLVM {major}; LLVM {llvm.OLDEST_LLVM} or newer is needed"):
+        engine.check_llvm()
+
+
+@pytest.mark.parametrize("major", [14, 15])
+def test_an_old_llvm_under_another_name_is_refused(major: int, run_python: RunPython, tmp_path: Path) -> None:
+    disguised = tmp_path / "compiler.so"
+    shutil.copy(old_llvm(major), disguised)
+    done = run_python("-c", LOAD, DRJIT_LIBLLVM_PATH=str(disguised))
+    assert done.returncode == 0
+    assert "is older than LLVM 16" in done.stdout
+    assert done.stderr == ""
+
+
+def test_a_library_that_is_no_llvm_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    name = ctypes.util.find_library("z")
+    if name is None:
+        pytest.skip("no zlib on this machine")
+    monkeypatch.setenv(llvm.VARIABLE, name)
+    with pytest.raises(EngineError, match="not LLVM at all"):
+        engine.check_llvm()
+
+
+@pytest.mark.parametrize(
+    ("name", "version"),
+    [
+        ("libLLVM.so.23.1", (23, 1, 0)),
+        ("libLLVM-15.so.1", (15, 0, 0)),
+        ("libLLVM-14.0.6.so.1", (14, 0, 6)),
+        ("libLLVM.so", None),
+        ("other.so.3", None),
+    ],
+)
+def test_versions_in_names(name: str, version: llvm.Version | None, tmp_path: Path) -> None:
+    assert llvm.version_in_name(tmp_path / name) == version
+
+
+def test_versions_are_read_through_links(tmp_path: Path) -> None:
+    (tmp_path / "libLLVM.so.19.1").touch()
+    (tmp_path / "libLLVM.so").symlink_to("libLLVM.so.19.1")
+    assert llvm.version_in_name(tmp_path / "libLLVM.so") == (19, 1, 0)
+
+
+def test_an_installation_nobody_started_as_its_owner_works(run_python: RunPython, tmp_path: Path) -> None:
+    # Links of the C++ runtime appear at the first start that may write; here they never did.
+    shipped = llvm.shipped_llvm()
+    assert shipped is not None
+    runtime = sorted({p.resolve() for p in shipped.parent.glob("*-linux-gnu/lib*.so.*")})
+    if not runtime:
+        pytest.skip("the library brings no C++ runtime on this platform")
+    folder = tmp_path / "lib"
+    (folder / runtime[0].parent.name).mkdir(parents=True)
+    shutil.copy(shipped, folder)
+    for library in runtime:
+        shutil.copy(library, folder / library.parent.name)
+    record = tmp_path / "site" / "karellen_llvm_core-99.dist-info"
+    record.mkdir(parents=True)
+    (record / "RECORD").write_text(f"../lib/{shipped.name},sha256=x,1\n")
+    code = f"import sys; sys.path.insert(0, {str(record.parent)!r})\n{LOAD}"
+    done = run_python(
+        "-c", code, DRJIT_LIBLLVM_PATH=None, DRJIT_CACHE_DIR=None, XDG_CACHE_HOME=str(tmp_path / "cache")
+    )
+    assert done.stdout == "llvm_ad_rgb\n"
+
+
+def test_a_proof_is_remembered_and_forgotten_with_the_library(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    library = tmp_path / "libLLVM.so.20.1"
+    library.write_bytes(b"x")
+    monkeypatch.setenv(llvm.VARIABLE, str(library))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    proofs = []
+
+    def prove(variant: str) -> object:
+        proofs.append(variant)
+        return engine.Outcome({"llvm": [20, 1, 2]}, "", 0.0)
+
+    monkeypatch.setattr(engine, "prove", prove)
+    assert engine.check_llvm() == (20, 1, 2)
+    assert engine.check_llvm() == (20, 1, 2)
+    assert len(proofs) == 1
+    library.write_bytes(b"changed")
+    engine.check_llvm()
+    assert len(proofs) == 2
+
+
+def test_a_failed_proof_is_not_remembered(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    library = tmp_path / "libLLVM.so.20.1"
+    library.write_bytes(b"x")
+    monkeypatch.setenv(llvm.VARIABLE, str(library))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    fault = "the process was ended by SIGABRT (LLVM ERROR: Cannot select)"
+    monkeypatch.setattr(engine, "prove", lambda variant: engine.Outcome({"llvm": [20, 1, 2]}, fault, 0.0))
+    for _ in range(2):
+        with pytest.raises(EngineError, match="ended by SIGABRT"):
+            engine.check_llvm()
+
+
+def test_an_unwritable_cache_does_no_harm(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    monkeypatch.delenv(llvm.VARIABLE, raising=False)
+    monkeypatch.setattr(engine, "prove", lambda variant: engine.Outcome({"llvm": [23, 1, 4]}, "", 0.0))
+    assert engine.check_llvm() == (23, 1, 4)
+
+
+def test_unknown_variants_are_usage_errors() -> None:
+    with pytest.raises(UsageError, match="no variant 'scalar_rgb'"):
+        engine.load_mitsuba("scalar_rgb")
+
+
+# Functions that children of the tests below run.
+
+
+def abort():  # type: ignore[no-untyped-def]
+    yield {"step": 1}
+    os.write(2, b"LLVM ERROR: Cannot select\n")
+    os.abort()
+
+
+def hang():  # type: ignore[no-untyped-def]
+    import time
+
+    yield {"step": 1}
+    time.sleep(600)
+
+
+def answer(text):  # type: ignore[no-untyped-def]
+    print("noise of a library", end="")
+    yield {"step": 1}
+    yield {"step": 2, "text": text}
+
+
+def fail():  # type: ignore[no-untyped-def]
+    yield {"step": 1}
+    raise EngineError("is\nbroken", where="here", hint="mend it")
+
+
+def leave():  # type: ignore[no-untyped-def]
+    yield {"step": 1}
+    raise SystemExit(7)
+
+
+def prove_whatever_the_version():  # type: ignore[no-untyped-def]
+    engine.OLDEST_LLVM = 0
+    engine.version_of = lambda library: (15, 0, 0)
+    yield from engine._proof(engine.CPU_VARIANT)
+
+
+def test_the_proof_catches_the_abort_of_llvm_15(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Without the version check, the test kernels end the child in the way they would end a render."""
+    monkeypatch.setenv(llvm.VARIABLE, old_llvm(15))
+    environment = {llvm.CACHE_VARIABLE: str(tmp_path)}
+    outcome = run_child(__name__, "prove_whatever_the_version", timeout=60, environment=environment)
+    assert "ended by SIGABRT" in outcome.fault
+    assert "device" not in outcome.answers
+
+
+@pytest.mark.parametrize(
+    ("function", "arguments", "answers", "fault"),
+    [
+        ("answer", ["a b"], {"step": 2, "text": "a b"}, ""),
+        ("abort", [], {"step": 1}, "the process was ended by SIGABRT (LLVM ERROR: Cannot select)"),
+        ("fail", [], {"step": 1}, "is broken"),
+        ("leave", [], {"step": 1}, "the process was ended with exit code 7"),
+        ("hang", [], {"step": 1}, "no answer within 1 s"),
+    ],
+)
+def test_how_a_child_ended_is_said(
+    function: str, arguments: list[str], answers: dict[str, object], fault: str
+) -> None:
+    outcome = run_child(__name__, function, *arguments, timeout=1 if function == "hang" else 60)
+    assert (outcome.answers, outcome.fault) == (answers, fault)
+
+
+def test_an_interrupted_parent_leaves_no_child(monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[subprocess.Popen[str]] = []
+
+    class Interrupted(subprocess.Popen):  # type: ignore[type-arg]
+        def communicate(self, *arguments, **keywords):  # type: ignore[no-untyped-def]
+            started.append(self)
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr("mbtf_core.child_process.subprocess.Popen", Interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run_child(__name__, "hang", timeout=60)
+    assert started[0].poll() is not None

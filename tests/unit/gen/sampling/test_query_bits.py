@@ -1,0 +1,176 @@
+"""Queries are the same bits wherever and however they are drawn, and every pass covers every texel once."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from conftest import RunPython
+from numpy.typing import NDArray
+
+from mbtf_core.lattice import Lattice
+from mbtf_gen.sampling.query_sampler import Mixture, Queries, QueryPlan
+
+# Draws of every kind, and the elementary functions in double precision, where the last bit shows; prints
+# NumPy's features in use and the digest of all bits.
+CODE = """
+import hashlib, json
+import numpy as np
+from mbtf_gen.sampling.exact_math import exp2, sincos_turns
+from mbtf_core.lattice import Lattice
+from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
+h = hashlib.sha256()
+for layout, lattice, rows in (("shuffled", Lattice(5, 0.75), 5000), ("image", Lattice(4, 1.0), 7)):
+    plan = QueryPlan(lattice, Mixture(0.6, 0.4), 0.1, layout, 11, rows)
+    for split, shard in (("train", 0), ("train", 3), ("test", 1)):
+        q = plan.draw(split, shard, rows)
+        for array in (q.u, q.sigma, q.omega_i, q.omega_o):
+            assert array.dtype == np.float32
+            h.update(np.ascontiguousarray(array).tobytes())
+x = np.random.Generator(np.random.Philox(1)).random(20000)
+for array in (exp2(-14 * x), *sincos_turns(x)):
+    h.update(array.tobytes())
+found = np.show_config(mode="dicts")["SIMD Extensions"].get("found", [])
+print(json.dumps({"found": found, "digest": h.hexdigest()}))
+"""
+DIGEST = "29bf97bc8100b9038a075a49ff564f26538593acf0f925c65b3ebb6c16f59908"
+
+
+def drawn_in_child(run_python: RunPython, **variables: str | None) -> tuple[list[str], str]:
+    done = run_python("-c", CODE, **variables)
+    assert done.returncode == 0, done.stderr
+    answer = json.loads(done.stdout)
+    return answer["found"], answer["digest"]
+
+
+def test_bits_do_not_depend_on_the_processors_features(run_python: RunPython) -> None:
+    found, digest = drawn_in_child(run_python, NPY_DISABLE_CPU_FEATURES=None)
+    # The same bits as on every machine so far: data sets are made by several of them.
+    assert digest == DIGEST
+    if not found:
+        pytest.skip("NumPy uses no optional features of this processor")
+    for disabled in (found, found[-1:]):
+        left, again = drawn_in_child(run_python, NPY_DISABLE_CPU_FEATURES=" ".join(disabled))
+        assert len(left) < len(found)
+        assert again == digest
+
+
+LATTICES = [
+    Lattice(3, 1.0),
+    Lattice(3, 0.75),
+    Lattice(4, 5 / 16),
+    Lattice(2, 2.5),
+    Lattice(0, 1.0),
+    Lattice(0, 3.0),
+]
+
+
+def texels(lattice: Lattice, u: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Texel number of positions (n, 2), row 0 the side v → 1."""
+    rows, columns = lattice.shape()
+    i = np.floor(u[:, 0].astype(np.float64) * columns).astype(int) % columns
+    j = np.floor((1.0 - u[:, 1].astype(np.float64)) * rows).astype(int) % rows
+    return j * columns + i
+
+
+def plan(lattice: Lattice, shard_rows: int, layout: str = "shuffled", root: int = 5) -> QueryPlan:
+    return QueryPlan(lattice, Mixture(0.6, 0.4), 0.2, layout, root, shard_rows)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("lattice", LATTICES, ids=lambda k: "x".join(map(str, k.shape())))
+@pytest.mark.parametrize("shard_rows", [7, 64])
+def test_each_pass_covers_each_texel_once_across_shards(lattice: Lattice, shard_rows: int) -> None:
+    count = lattice.texels()
+    passes = 4
+    total = passes * count + count // 2
+    shards = [
+        plan(lattice, shard_rows).draw("train", s, min(shard_rows, total - s * shard_rows))
+        for s in range(-(-total // shard_rows))
+    ]
+    visited = texels(lattice, np.concatenate([q.u for q in shards]))
+    assert len(visited) == total
+    for sweep in range(passes):
+        assert sorted(visited[sweep * count : (sweep + 1) * count]) == list(range(count))
+    # The unfinished pass repeats nothing, and passes have orders of their own.
+    assert len(set(visited[passes * count :])) == total - passes * count
+    if count > 8:
+        assert len({tuple(visited[s * count : (s + 1) * count]) for s in range(passes)}) == passes
+
+
+@pytest.mark.parametrize("lattice", LATTICES, ids=lambda k: "x".join(map(str, k.shape())))
+def test_image_buffers_hold_every_texel_in_order_under_one_light_and_view(lattice: Lattice) -> None:
+    q = plan(lattice, 3, "image").draw("train", 2, 3)
+    assert q.lead == (3, *lattice.shape())
+    for item in range(3):
+        assert texels(lattice, q.u[item].reshape(-1, 2)).tolist() == list(range(lattice.texels()))
+        for array in (q.sigma, q.omega_i, q.omega_o):
+            first = array[item, 0, 0]
+            assert (array[item] == first).all()
+    # Buffers differ from one another, jitter included.
+    assert len(np.unique(q.omega_i[:, 0, 0], axis=0)) == 3
+    assert len(np.unique(q.u[:, 0, 0], axis=0)) == 3
+
+
+@pytest.mark.parametrize("lattice", LATTICES, ids=lambda k: "x".join(map(str, k.shape())))
+def test_windows_are_grids_of_the_level_nearest_to_their_footprint(lattice: Lattice) -> None:
+    q = QueryPlan(lattice, Mixture(1, 0), 0.2, "image", 5, 40, window=5).draw("train", 1, 40)
+    assert q.lead == (40, 5, 5)
+    assert ((q.u >= 0) & (q.u < 1)).all()
+    for item in range(40):
+        for array in (q.sigma, q.omega_i, q.omega_o):
+            assert (array[item] == array[item, 0, 0]).all()
+        level = min(max(round(-np.log2(2 * float(q.sigma[item, 0, 0]))), 0), lattice.finest)
+        rows, columns = lattice.shape(level)
+        # Rows go down the tile, against v, and columns to the right; around the tile.
+        for axis, step in ((1, (1 / columns, 0)), (0, (0, -1 / rows))):
+            apart = np.diff(q.u[item].astype(np.float64), axis=axis) - step
+            np.testing.assert_allclose(apart, np.round(apart), atol=1e-6)
+    # They begin anywhere.
+    assert len(np.unique(q.u[:, 0, 0])) == 80
+    assert np.ptp(q.u[:, 0, 0], axis=0).min() > 0.7
+    other = QueryPlan(lattice, Mixture(1, 0), 0.2, "image", 5, 40, window=5).draw("train", 2, 40)
+    assert not equal(q, other)
+
+
+def equal(a: Queries, b: Queries) -> bool:
+    return all(np.array_equal(getattr(a, n), getattr(b, n)) for n in ("u", "sigma", "omega_i", "omega_o"))
+
+
+def test_a_shard_is_drawn_alone_as_in_company() -> None:
+    company = plan(LATTICES[1], 50)
+    many = [company.draw("train", s, 50) for s in range(6)]
+    for s in (5, 0, 3):
+        assert equal(plan(LATTICES[1], 50).draw("train", s, 50), many[s])
+    assert not equal(many[0], many[1])
+
+
+@pytest.mark.parametrize("layout", ["shuffled", "image"])
+def test_every_number_is_within_its_range(layout: str) -> None:
+    lattice = Lattice(6, 0.75)
+    low, high = lattice.sigma_range
+    for shard in range(3):
+        q = (
+            plan(lattice, 20_000 if layout == "shuffled" else 6, layout)
+            .draw("test", shard, 20_000 if layout == "shuffled" else 6)
+            .flat()
+        )
+        assert (q.u >= 0).all()
+        assert (q.u < 1).all()
+        assert (q.sigma >= np.float32(low)).all()
+        assert (q.sigma <= np.float32(high)).all()
+        for omega in (q.omega_i, q.omega_o):
+            length = np.linalg.norm(omega.astype(np.float64), axis=-1)
+            np.testing.assert_allclose(length, 1.0, rtol=0, atol=1e-6)
+            assert (omega[:, 2] >= np.float32(0.2)).all()
+
+
+def test_level_zero_alone_has_one_footprint() -> None:
+    q = plan(Lattice(0, 1.0), 100).draw("train", 0, 100)
+    assert set(q.sigma.tolist()) == {0.5}
+
+
+def test_mixture_weights_are_normalized_and_not_all_zero() -> None:
+    assert (Mixture(3.0, 1.0).log_uniform, Mixture(3.0, 1.0).finest) == (0.75, 0.25)
+    with pytest.raises(ValueError, match="zero"):
+        Mixture(0.0, 0.0)

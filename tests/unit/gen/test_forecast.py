@@ -1,0 +1,149 @@
+"""Forecasts: bytes as written, noise as it is, seconds in proportion to the paths."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.datasets import write_dataset
+
+from mbtf_gen import forecast as module
+from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.dataset.reader import Dataset
+from mbtf_gen.forecast import forecast, row_bytes, size_text
+from mbtf_gen.generation import Job, allocated
+from mbtf_gen.material.material import Material
+from mbtf_gen.planning.effects_plan import plan_effects
+from mbtf_gen.planning.pilot import pilot_queries
+from mbtf_gen.render.estimates import Estimates, Stream
+from mbtf_gen.sampling.query_sampler import Queries
+
+RATE = 1e6
+
+
+class Clock:
+    """Time that passes only where paths are traced."""
+
+    now = 0.0
+
+    def perf_counter(self) -> float:
+        return self.now
+
+
+class Fake:
+    """Estimates of known noise, one standard deviation of 0.8 per path at a mean value of 0.25."""
+
+    def __init__(self, clock: Clock) -> None:
+        self.clock = clock
+
+    def estimate(self, queries: Queries, spp: Any, stream: Stream, path_variance: bool = False) -> Estimates:
+        assert stream.split == "pilot"
+        rng = np.random.default_rng([stream.shard, stream.first_pass])
+        n = len(queries.sigma)
+        counts = np.broadcast_to(np.asarray(spp, np.int64), (n,))
+        paths = int(counts.sum())
+        self.clock.now += paths / RATE
+        noise = 0.8 * np.sqrt(2.0 / counts)[:, None]
+        a, b = ((0.25 + noise * rng.normal(size=(n, 3))).astype(np.float32) for _ in range(2))
+        every = None if isinstance(spp, int) else counts
+        variance = np.full(n, 0.8**2, np.float32) if path_variance else None
+        return Estimates(a, b, None, paths, 0, 0, 0, spp=every, path_variance=variance)
+
+
+def job_of(**queries: Any) -> Job:
+    heights = np.random.default_rng(0).random((16, 16))
+    material = Material(heights, height_scale=0.1, height_bits=None, base_color=np.array([0.5, 0.5, 0.5]))
+    return Job.of(GeneratorConfig.model_validate({"material": "m", "queries": queries}), material)
+
+
+@pytest.mark.parametrize("options", [{}, {"layout": "image"}, {"layout": "image", "window": 12}])
+def test_pilots_ask_in_many_directions_whatever_the_layout(options: dict[str, Any]) -> None:
+    """A buffer of the image layout has one pair of directions and one footprint, however many places."""
+    queries = pilot_queries(job_of(**options), 200, 1)
+    assert queries.u.shape == (200, 2)
+    for array in (queries.sigma[:, None], queries.omega_i, queries.omega_o):
+        assert len(np.unique(array, axis=0)) > 190
+
+
+@pytest.fixture
+def faked(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = Clock()
+    monkeypatch.setattr(module, "time", clock)
+    monkeypatch.setattr(Job, "estimator", lambda self, plan: Fake(clock))
+
+
+@pytest.mark.parametrize(("each", "share"), [(2e-6, 0.25), (1e-4, 1.0)])
+def test_writing_takes_its_share_of_the_processors(
+    monkeypatch: pytest.MonkeyPatch, each: float, share: float
+) -> None:
+    """Of four processors it takes a quarter of its time, unless it is what everything waits for."""
+    clock = Clock()
+
+    def write(queries: Queries, found: Estimates) -> None:
+        clock.now += each * len(queries.sigma)
+
+    monkeypatch.setattr(module, "time", clock)
+    monkeypatch.setattr(Job, "estimator", lambda self, plan: Fake(clock))
+    monkeypatch.setattr(module, "_write", write)
+    monkeypatch.setattr(module.os, "cpu_count", lambda: 4)
+    job = job_of(train="1000000", spp=8, test="20000", test_spp=64)
+    found = forecast(job, plan_effects(job, pilots=False), seconds=0.0)
+    tracing = 8 / RATE if share < 1.0 else 0.0
+    assert found.query_seconds == pytest.approx(tracing + share * each)
+    assert found.paths_per_second == pytest.approx(RATE)
+
+
+@pytest.mark.parametrize("layout", ["shuffled", "image"])
+def test_seconds_and_noise(faked: None, layout: str) -> None:
+    job = job_of(train="1000000", spp=8, test="20000", test_spp=64, layout=layout)
+    found = forecast(job, plan_effects(job, pilots=False), seconds=0.0)
+    assert found.paths_per_second == pytest.approx(RATE)
+    assert found.paths == pytest.approx(1e6 * 8 + 2e4 * 64, rel=2e-2)
+    assert found.seconds == pytest.approx(found.paths / RATE, rel=1e-6)
+    noise = 0.8 / math.sqrt(8) / 0.25
+    assert abs(found.relative_error - noise) < 5 * found.relative_error_se
+    assert found.relative_error_se < 0.02 * noise
+
+
+def test_a_target_error_decides_paths_and_seconds(faked: None) -> None:
+    """All queries need the paths that bring 0.8 to 8 % of 0.25 or so, unless the cap is lower."""
+    for cap, missed in ((8192, 0.0), (512, 1.0)):
+        job = job_of(train="1000000", test="20000", test_spp=64, target_error="8%", cap=cap)
+        plan = allocated(job, plan_effects(job, pilots=False))
+        found = forecast(job, plan, seconds=0.0)
+        # 1600, rounded up to a power of two or three times one; less where a pilot's value is large.
+        assert found.missed == pytest.approx(missed, abs=0.02)
+        stored = found.paths_per_query
+        assert stored == pytest.approx(min(2048, cap), rel=0.03)
+        # No piece is many times as large as those of other runs.
+        assert found.pilot_seconds < 10 * (1 << 19) / RATE
+        # The pilots of the queries are paths, too.
+        assert found.paths == pytest.approx(1e6 * (stored + 16) + 2e4 * 64, rel=1e-3)
+        assert found.seconds == pytest.approx(found.paths / RATE, rel=1e-3)
+        assert found.relative_error == pytest.approx(0.8 / np.sqrt(stored) / 0.25, rel=0.1)
+        said = found.describe(job.target("train")).splitlines()
+        assert f"{stored:.0f} paths per training query for an error of 8.00% of" in said[1]
+        assert said[1].endswith("of the queries stop at the cap of 512") == bool(missed)
+
+
+def test_bytes_are_those_of_the_arrays(tmp_path: Path) -> None:
+    data = write_dataset(tmp_path / "shards", queries={"train": "64", "test": "16", "spp": 4})
+    arrays = Dataset.open(data.folder).load("train")
+    assert row_bytes(False) * 64 == sum(a.nbytes for a in arrays.values())
+    assert row_bytes(True) == row_bytes(False) + 4
+
+
+def test_a_run_without_noise_is_forecast_too(faked: None) -> None:
+    job = job_of(train="1000", test="10")
+    quiet = forecast(job, plan_effects(job, pilots=False), seconds=0.0)
+    assert quiet.bytes == 1010 * row_bytes(False)
+    assert str(size_text(quiet.bytes)) == "65 kB"
+    assert "of the mean value" in quiet.describe()
+
+
+@pytest.mark.parametrize(("size", "text"), [(812e3, "812 kB"), (6.4e7, "64 MB"), (1.68e9, "1.7 GB")])
+def test_sizes_read_well(size: float, text: str) -> None:
+    assert size_text(size) == text

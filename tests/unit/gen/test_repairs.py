@@ -1,0 +1,211 @@
+"""``repair`` makes again what ``verify`` condemns, and nothing else."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.datasets import edit
+from support.small_runs import command, contents, generate, noisy_plane
+
+from mbtf_core.errors import InputError, PartialError
+from mbtf_core.locks import shard_lock
+from mbtf_gen import repairs
+from mbtf_gen.dataset.verify import verify
+from mbtf_gen.planning.effects_plan import simulated
+from mbtf_gen.planning.simulation import ClosedForm
+from mbtf_gen.repairs import Corruption, repair
+
+
+@pytest.fixture(autouse=True)
+def fast_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ClosedForm, "estimate", noisy_plane)
+    monkeypatch.setattr(os, "fsync", lambda handle: None)
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    """A data set of three training shards and a test shard, and beside it another copy, `whole`."""
+    assert generate(command(tmp_path, tmp_path / "out")) == 0
+    shutil.copytree(tmp_path / "out", tmp_path / "whole")
+    return tmp_path / "out"
+
+
+def flip(path: Path, at: int) -> None:
+    content = bytearray(path.read_bytes())
+    content[at] ^= 4
+    path.write_bytes(content)
+
+
+def moments(folder: Path) -> dict[str, int]:
+    return {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
+
+
+def replace_by_another(out: Path) -> None:
+    """Shard 1 is a copy of shard 0, and says otherwise."""
+    for suffix in (".npz", ".json"):
+        shutil.copy(out / f"train-00000{suffix}", out / f"train-00001{suffix}")
+    edit(out / "train-00001.json", lambda record: record.update(file="train-00001.npz", index=1))
+
+
+DAMAGE: dict[str, tuple[Callable[[Path], object], set[str], set[str]]] = {
+    "nothing": (lambda out: None, set(), set()),
+    "byte": (lambda out: flip(out / "train-00002.npz", 2000), {"train-00002.npz"}, set()),
+    "cut": (lambda out: os.truncate(out / "test-00000.npz", 900), {"test-00000.npz"}, set()),
+    "shard gone": (lambda out: (out / "train-00000.npz").unlink(), {"train-00000.npz"}, set()),
+    "sidecar gone": (lambda out: (out / "train-00001.json").unlink(), {"train-00001.npz"}, set()),
+    "sidecar": (lambda out: flip(out / "train-00001.json", 500), {"train-00001.npz"}, set()),
+    "copy": (replace_by_another, {"train-00000.npz", "train-00001.npz"}, set()),
+    "configuration": (lambda out: flip(out / "config.yaml", 30), set(), {"config.yaml"}),
+    "configuration gone": (lambda out: (out / "config.yaml").unlink(), set(), {"config.yaml"}),
+    "blank of the manifest": (lambda out: flip(out / "manifest.json", 3), set(), {"manifest.json"}),
+    "manifest gone": (lambda out: (out / "manifest.json").unlink(), set(), {"manifest.json"}),
+    "no JSON": (lambda out: (out / "manifest.json").write_text("{"), set(), {"manifest.json"}),
+    "listed twice": (
+        lambda out: edit(
+            out / "manifest.json",
+            lambda m: m["splits"]["train"]["shards"].append(m["splits"]["train"]["shards"][0]),
+        ),
+        set(),
+        {"manifest.json"},
+    ),
+    "manifest and shard": (
+        lambda out: (flip(out / "manifest.json", 90), flip(out / "train-00000.npz", 700)),
+        {"train-00000.npz"},
+        {"manifest.json"},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGE)
+def test_what_is_condemned_is_made_again_and_nothing_else(name: str, out: Path) -> None:
+    damage, shards, documents = DAMAGE[name]
+    damage(out)
+    before = moments(out)
+    planned = Corruption(out)
+    assert {e.file for e in planned.entries} == shards
+    assert set(planned.documents) == documents
+    assert moments(out) == before
+    done = repair(out)
+    assert (set(done.shards), set(done.documents), done.complete) == (shards, documents, True)
+    assert contents(out) == contents(out.parent / "whole")
+    assert verify(out) == []
+    touched = shards | {Path(s).with_suffix(".json").name for s in shards} | documents | {"manifest.json"}
+    kept = set(before) - touched
+    assert {f: t for f, t in moments(out).items() if f in kept} == {f: before[f] for f in kept}
+    # Nothing is left to mend, and nothing is written.
+    before = moments(out)
+    assert repair(out).faults == []
+    assert moments(out) == before
+
+
+def test_files_of_others_are_named_and_left_alone(out: Path) -> None:
+    shutil.copy(out / "train-00000.npz", out / "train-00007.npz")
+    flip(out / "train-00000.npz", 700)
+    done = repair(out)
+    assert [f.file for f in done.left] == ["train-00007.npz"]
+    assert done.shards == ["train-00000.npz"]
+    assert [f.file for f in verify(out)] == ["train-00007.npz"]
+    assert generate(["repair", str(out), "-q"]) == 3
+
+
+def test_another_material_is_refused_untouched(out: Path) -> None:
+    flip(out / "train-00000.npz", 700)
+    np.save(out.parent / "plane.npy", np.full((4, 8), 0.25))
+    before = contents(out)
+    with pytest.raises(InputError, match=r"not the one that made the data set \(height: [0-9a-f]{8}… -> "):
+        repair(out)
+    assert contents(out) == before
+
+
+def test_a_material_that_has_moved_is_named(out: Path) -> None:
+    flip(out / "train-00000.npz", 700)
+    moved = out.parent / "moved.npy"
+    (out.parent / "plane.npy").rename(moved)
+    with pytest.raises(InputError, match="the material is not at") as caught:
+        repair(out)
+    assert "--material" in caught.value.hint
+    assert repair(out, material=str(moved)).complete
+    assert contents(out) == contents(out.parent / "whole")
+
+
+def test_a_manifest_is_not_restored_without_witnesses(out: Path) -> None:
+    flip(out / "manifest.json", 90)
+    for sidecar in out.glob("t*.json"):
+        flip(sidecar, 200)
+    before = contents(out.parent / "whole")
+    with pytest.raises(InputError, match="no other file of the folder says what it held"):
+        repair(out)
+    assert before == contents(out.parent / "whole")
+
+
+def test_a_manifest_is_not_restored_with_other_effects(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    flip(out / "manifest.json", 90)
+
+    def otherwise(job: repairs.Job) -> object:
+        config = job.config.model_copy(
+            update={"effects": job.config.effects.model_copy(update={"mode": "all"})}
+        )
+        return simulated(repairs.Job.of(config, job.material))
+
+    monkeypatch.setattr(repairs, "plan_run", otherwise)
+    with pytest.raises(InputError, match="comes out otherwise"):
+        repair(out)
+
+
+def test_while_shards_are_gone_the_manifest_does_not_say_complete(
+    out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flip(out / "train-00000.npz", 700)
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ClosedForm, "estimate", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            repair(out)
+    assert json.loads((out / "manifest.json").read_text())["complete"] is False
+    assert repair(out).complete
+    assert contents(out) == contents(out.parent / "whole")
+
+
+def test_a_shard_that_another_process_makes_is_left_to_it(out: Path) -> None:
+    flip(out / "train-00000.npz", 700)
+    with shard_lock(out / "train-00000.npz") as held:
+        assert held
+        with pytest.raises(PartialError, match=rf"train-00000\.npz \(process {os.getpid()} on .*, for 0 s\)"):
+            repair(out)
+    assert repair(out).complete
+
+
+def test_a_dry_run_says_what_would_be_done(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    flip(out / "train-00000.npz", 700)
+    (out / "config.yaml").unlink()
+    before = moments(out)
+    capsys.readouterr()
+    assert generate(["repair", str(out), "--dry-run", "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["dry_run"] is True
+    assert (said["shards"], said["documents"]) == (["train-00000.npz"], ["config.yaml"])
+    assert {f["file"] for f in said["faults"]} == {"train-00000.npz", "config.yaml"}
+    assert moments(out) == before
+    assert generate(["repair", str(out)]) == 0
+    text = capsys.readouterr().out
+    assert f"{out}: 1 shards made again (train-00000.npz)" in text
+    assert f"{out}: config.yaml written again" in text
+
+
+def test_folders_without_a_data_set_are_refused(tmp_path: Path) -> None:
+    for folder, says in ((tmp_path / "nowhere", "no such folder"), (tmp_path, r"no manifest\.json")):
+        with pytest.raises(InputError, match=says):
+            repair(folder)
+    (tmp_path / "manifest.json").write_text('{"name": "a web page"}')
+    with pytest.raises(InputError):
+        repair(tmp_path)
+    assert (tmp_path / "manifest.json").read_text() == '{"name": "a web page"}'

@@ -1,0 +1,107 @@
+"""Fits of both layouts in one recipe, judged by one test split, and the time of their parts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from support.fit_data import parallax, write_data
+
+from mbtf_core.lattice import Lattice
+from mbtf_fit.models import build_model
+from mbtf_gen.dataset.reader import Dataset
+from mbtf_pipeline.compare import timing
+from mbtf_pipeline.compare.dataset_errors import errors_on_data
+from mbtf_pipeline.compare.timing import LIGHTS, measure_timing
+from mbtf_pipeline.recipe import Recipe
+from mbtf_pipeline.run import data_sets, stage_names
+
+
+def recipe(layout: str, *models: str) -> Recipe:
+    generate = {"material": "m", "queries": {"layout": layout, "train": "9/texel", "test": "4096"}}
+    return Recipe.model_validate({"name": "r", "generate": generate, "fit": dict.fromkeys(models)})
+
+
+@pytest.mark.parametrize("layout", ["shuffled", "image"])
+def test_a_model_of_the_other_layout_has_data_of_its_own(layout: str) -> None:
+    other = {"shuffled": "image", "image": "shuffled"}[layout]
+    made = recipe(layout, "neumip", "hierarchical")
+    first, second = data_sets(made)
+    assert first.config == made.generate
+    assert (second.stage, second.sub) == (f"generate {other}", f"shards-{other}")
+    assert second.config.queries.layout == other
+    assert second.config.queries.train == made.generate.queries.train
+    assert stage_names(made)[:3] == ["generate", f"generate {other}", "fit neumip"]
+
+
+def test_one_layout_is_one_data_set() -> None:
+    assert [d.sub for d in data_sets(recipe("shuffled", "neumip", "neumip-baseline"))] == ["shards"]
+    assert [d.sub for d in data_sets(recipe("image", "hierarchical"))] == ["shards"]
+
+
+class Shifted:
+    """A material that is off by a constant."""
+
+    def __init__(self, model: str, shift: float) -> None:
+        self.shift = shift
+        self.model = build_model(model, Lattice(3))
+        self.config = SimpleNamespace(model=model)
+        sizes = {"network_weights": sum(p.numel() for p in self.model.parameter_groups()[1]), "texels": 5}
+        errors = {"test": {"mse": "of other data"}, "held_out_queries": {"mse": "own"}}
+        self.description = {"weights": sizes, "training": {"errors": errors, "seconds": 3.0}}
+
+    def predict(self, q: Any) -> np.ndarray:
+        return (parallax(q.u, q.sigma, q.omega_i, q.omega_o) + self.shift).astype(np.float32)
+
+
+def test_all_fits_are_judged_by_the_same_test_queries(tmp_path: Path) -> None:
+    data = Dataset.open(write_data(tmp_path / "shards", parallax, train=64, noise=0.02))
+    fits: Any = {"a": Shifted("neumip", 0.1), "b": Shifted("hierarchical", 0.05)}
+    found = errors_on_data(fits, data)
+    for name, square in (("a", 0.01), ("b", 0.0025)):
+        mse = found[name]["splits"]["test"]["mse"]
+        assert abs(mse["value"] - square) < 4 * mse["error"]
+        assert found[name]["splits"]["held_out_queries"] == {"mse": "own"}
+        assert sum(found[name]["networks"].values()) == found[name]["network_weights"]
+    less = found["b"]["mse_less_first"]
+    assert abs(less["value"] - (0.0025 - 0.01)) < 4 * less["error"]
+    # Noise that both share cancels: the bar is that of the difference.
+    assert less["error"] < found["a"]["splits"]["test"]["mse"]["error"]
+    assert set(less["levels"]) == {"0", "1", "2", "3"}
+    assert all(e["value"] + 4 * e["error"] < 0 for e in less["levels"].values())
+    assert "mse_less_first" not in found["a"]
+
+
+@pytest.mark.parametrize(
+    ("model", "parts"),
+    [
+        ("neumip-baseline", ["pyramid"]),
+        ("neumip", ["offset texture", "offset network", "pyramid"]),
+        ("hierarchical", ["offset texture", "offset network", "pyramid", "encoding"]),
+    ],
+)
+def test_times_are_scaled_to_all_pixels(
+    model: str, parts: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With a clock that takes a second for everything, only the scale is left."""
+
+    def one_second(work: Any) -> tuple[Any, float]:
+        return work(), 1.0
+
+    monkeypatch.setattr(timing, "timed", one_second)
+    network = build_model(model, Lattice(2))
+    network.initialize(torch.Generator().manual_seed(0), 1.0)
+    material: Any = SimpleNamespace(model=network, evaluate=lambda *arrays: arrays)
+    pixels = 8 * 81 * 20
+    found = measure_timing(material, pixels)
+    count = 20 if model == "hierarchical" else 81 * 20
+    assert found["queries"] == count
+    assert list(found["parts_ms"]) == parts
+    assert found["stage1_ms"] == pytest.approx(1e3 * pixels / count)
+    for n in LIGHTS:
+        expected = found["stage1_ms"] + n * found["stage2_ms"]
+        assert found["lights_ms"][str(n)] == pytest.approx(expected)

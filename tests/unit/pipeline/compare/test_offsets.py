@@ -1,0 +1,66 @@
+"""Offsets traced from heights are those of plane geometry, and survive their file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mbtf_core.directions import from_angles
+from mbtf_gen.geometry.heightfield import HeightGrid
+from mbtf_gen.render.runtime import load_mitsuba
+from mbtf_pipeline.compare.offsets import _correlation, _write, read_offset, towards_view, traced_offset
+from mbtf_pipeline.recipe import View
+
+DEPTH = 0.05
+
+
+@pytest.fixture(scope="module")
+def plane_below() -> object:
+    """A plane at depth 0.05 with one peak that touches the reference plane, twice as high as wide."""
+    load_mitsuba()
+    from mbtf_gen.render.estimator import Estimator
+    from mbtf_gen.render.path_tracer import Transport
+    from mbtf_gen.render.scene import build_tile
+
+    heights = np.full((64, 32), -DEPTH)
+    heights[60, 2] = 0.0
+    grid = HeightGrid.from_map(heights, 1.0, 2.0)
+    tile = build_tile(grid, {"type": "diffuse"})
+    return Estimator(tile, None, Transport())
+
+
+@pytest.mark.parametrize(("elevation", "azimuth"), [(30, 0), (30, 135), (60, -90), (90, 0), (20, 250)])
+def test_a_plane_below_is_displaced_by_its_depth_over_the_tangent(
+    plane_below: object, elevation: float, azimuth: float
+) -> None:
+    u = np.array([[0.5, 0.5], [0.7, 0.4], [0.3, 0.6]], np.float32)
+    found = traced_offset(plane_below, u, from_angles(elevation, azimuth))  # type: ignore[arg-type]
+    distance = DEPTH / np.tan(np.radians(elevation))
+    expected = -distance * np.array([np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth))])
+    np.testing.assert_allclose(found, np.broadcast_to(expected, (3, 2)), atol=2e-6)
+    along = towards_view(found, View(elevation=elevation, azimuth=azimuth))
+    np.testing.assert_allclose(along, -distance, atol=2e-6)
+
+
+def test_a_peak_at_the_plane_is_not_displaced(plane_below: object) -> None:
+    # Texel centers lie at ((i+½)/W, 1-(j+½)/H).
+    u = np.array([[2.5 / 32, 1 - 60.5 / 64]], np.float32)
+    found = traced_offset(plane_below, u, from_angles(90, 0))  # type: ignore[arg-type]
+    np.testing.assert_allclose(found, 0, atol=1e-6)
+    slanted = traced_offset(plane_below, u, from_angles(30, 0))  # type: ignore[arg-type]
+    assert np.abs(slanted).max() < 1e-4
+
+
+def test_offsets_survive_their_file(tmp_path: Path) -> None:
+    offset = np.random.default_rng(1).normal(size=(5, 7, 2)).astype(np.float32)
+    _write(tmp_path / "v1-fit-some.name.exr", offset)
+    np.testing.assert_array_equal(read_offset(tmp_path / "v1-fit-some.name.exr"), offset)
+
+
+def test_correlation() -> None:
+    x = np.linspace(0, 1, 50, dtype=np.float32)
+    assert _correlation(x, 3 * x - 2) == pytest.approx(1.0)
+    assert _correlation(x, -x) == pytest.approx(-1.0)
+    assert _correlation(x, np.zeros_like(x)) is None

@@ -1,0 +1,80 @@
+"""Error maps: free of the reference's noise, on colors that can be told apart, with numbers at the scale."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mbtf_pipeline.report.error_maps import (
+    common_scale,
+    gradient,
+    indices,
+    local_error,
+    palette,
+    round_scale,
+    ticks,
+)
+
+
+def luma(colors: np.ndarray) -> np.ndarray:
+    return np.asarray(colors, float) @ [0.2126, 0.7152, 0.0722]
+
+
+def test_local_error_is_the_error_without_the_noise() -> None:
+    random = np.random.default_rng(1)
+    truth = np.full((96, 96, 3), 0.5)
+    a, b = (truth + 0.2 * random.standard_normal(truth.shape) for _ in range(2))
+    picture = truth.copy()
+    picture[:, 48:] += 0.3
+    found = local_error(picture, a, b)
+    assert found[:, 56:].mean() == pytest.approx(0.3, rel=0.05)
+    # Where the fit is right most of the map lies far below the noise, and half of it is shown as 0.
+    assert np.median(found[:, :40]) < 0.05
+    assert 0.3 < np.mean(found[:, :40] == 0) < 0.7
+    assert (found >= 0).all()
+
+
+@pytest.mark.parametrize("name", ["size", "flip"])
+def test_sizes_are_told_by_lightness_alone(name: str) -> None:
+    steps = np.diff(luma(palette(name)))  # type: ignore[arg-type]
+    assert steps.min() > -0.6
+    assert luma(palette(name))[-1] - luma(palette(name))[0] > 150  # type: ignore[arg-type]
+
+
+def test_sign_and_size_of_a_difference_can_be_told() -> None:
+    table = np.array(palette("signed"))
+    colors = table[indices([-1.0, -0.5, 0.0, 0.5, 1.0, 7.0, np.nan], "signed")].astype(int)
+    shades = luma(colors)
+    assert shades[2] < 20
+    assert shades[1] < shades[0]
+    assert shades[3] < shades[4]
+    assert colors[0, 2] > colors[0, 0]
+    assert colors[4, 0] > colors[4, 2]
+    assert (colors[5] == colors[4]).all()
+    assert (colors[6] == colors[2]).all()
+
+
+def test_entries_follow_sizes() -> None:
+    assert indices([-1.0, 0.0, 0.5, 1.0, 9.0], "size").tolist() == [0, 0, 128, 255, 255]
+
+
+@pytest.mark.parametrize(
+    ("x", "expected"), [(0.011, 0.02), (0.02, 0.02), (0.3, 0.5), (7.0, 10.0), (0.0, 1.0), (np.nan, 1.0)]
+)
+def test_scales_are_round(x: float, expected: float) -> None:
+    assert round_scale(x) == pytest.approx(expected)
+
+
+def test_one_scale_for_all_maps() -> None:
+    zero = np.zeros((10, 10))
+    assert common_scale([zero - 0.03, zero]) == pytest.approx(0.05)
+    assert common_scale([]) == 1.0
+
+
+def test_the_bar_has_the_map_s_colors_and_numbers() -> None:
+    assert ticks(0, 0.2, 100) == ["0", "5", "10", "15", "20"]
+    assert ticks(-0.5, 0.5) == ["−0.5", "−0.25", "0", "0.25", "0.5"]
+    first, last = palette("size")[0], palette("size")[-1]
+    text = gradient("size")
+    assert text.startswith("linear-gradient(90deg, rgb({} {} {}),".format(*first))
+    assert text.endswith("rgb({} {} {}))".format(*last))

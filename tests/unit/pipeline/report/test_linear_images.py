@@ -1,0 +1,65 @@
+"""Linear pictures on the page: one relative error for every value, and packing that loses nothing."""
+
+from __future__ import annotations
+
+import zlib
+
+import numpy as np
+import pytest
+
+from mbtf_pipeline.report.linear_images import EXPOSURE_STOPS, STOPS_BELOW, Coding, pack
+
+
+def unpacked(data: bytes, rows: int, columns: int) -> np.ndarray:
+    """Codes (rows, columns, 3), one pixel after the other."""
+    planes = np.frombuffer(zlib.decompress(data), np.uint8).reshape(3, 2, rows, columns).astype(int)
+    folded = planes[:, 0] + 256 * planes[:, 1]
+    rest = np.where(folded % 2, -(folded + 1) // 2, folded // 2)
+    channels = np.zeros_like(rest)
+    for y in range(rows):
+        for x in range(columns):
+            left = channels[:, y, x - 1] if x else 0
+            up = channels[:, y - 1, x] if y else 0
+            channels[:, y, x] = rest[:, y, x] + (left + up) // 2
+    g, r, b = channels
+    return np.stack([r + g, g, b + g], axis=-1)
+
+
+@pytest.mark.parametrize("bits", [8, 10])
+def test_packing_loses_nothing(bits: int) -> None:
+    codes = np.random.default_rng(bits).integers(0, 1 << bits, (7, 5, 3)).astype(np.int32)
+    codes[0, 0], codes[3, 2] = 0, (1 << bits) - 1
+    assert (unpacked(pack(codes), 7, 5) == codes).all()
+
+
+def test_smooth_pictures_pack_smaller_than_noise() -> None:
+    ramp = np.linspace(100, 900, 64, dtype=np.int32)[None, :, None] * np.ones((64, 1, 3), np.int32)
+    noise = np.random.default_rng(0).integers(0, 1024, ramp.shape).astype(np.int32)
+    assert len(pack(ramp)) < len(pack(noise)) / 10
+
+
+@pytest.mark.parametrize("bits", [8, 9, 10])
+def test_every_value_carries_the_same_relative_error(bits: int) -> None:
+    picture = np.geomspace(1e-4, 30.0, 3000).astype(np.float32).reshape(50, 20, 3)
+    coding = Coding.spanning([picture], 0.5, bits)
+    found = coding.decode(coding.encode(picture))
+    relative = np.abs(found / picture - 1)
+    assert relative.max() <= coding.relative_error * 1.001
+    assert relative.max() > 0.8 * coding.relative_error
+    assert coding.encode(picture).max() == coding.largest
+
+
+def test_black_stays_black_and_faults_do_no_harm() -> None:
+    picture = np.array([[[0.0, -1.0, np.nan], [np.inf, 1e30, 1.0]]], np.float32)
+    coding = Coding.spanning([np.ones((1, 1, 3), np.float32)], 1.0, 10)
+    codes = coding.encode(picture)
+    assert codes.tolist() == [[[0, 0, 0], [coding.largest] * 3]]
+    assert coding.decode(codes)[0, 0].tolist() == [0, 0, 0]
+
+
+def test_what_is_cut_off_below_is_black_at_every_exposure() -> None:
+    dim = np.full((2, 2, 3), 1e-12, np.float32)
+    coding = Coding.spanning([dim, np.ones_like(dim)], 1.0, 10)
+    assert coding.low == 2.0**-STOPS_BELOW
+    # The largest value that is cut off, at the largest exposure, in steps of an 8-bit sRGB display.
+    assert 255 * 12.92 * coding.low * 2.0**EXPOSURE_STOPS < 3.5

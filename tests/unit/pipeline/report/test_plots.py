@@ -1,0 +1,82 @@
+"""Plots are SVG elements that fit into a page: no loads, no fixed ink, ids of their own."""
+
+from __future__ import annotations
+
+import re
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from mbtf_pipeline.report.plots import Curve, bars, color, curves, points
+
+SECONDS = list(np.linspace(2, 60, 30))
+ERROR = [0.3 + 1 / s for s in SECONDS]
+
+
+def training(label: str = "training") -> str:
+    lines = [Curve("first", SECONDS, ERROR, [0.01] * 30), Curve("second", SECONDS, [2 * e for e in ERROR])]
+    return curves(lines, "seconds of training", "unexplained variance", label)
+
+
+def levels() -> str:
+    series = {"first": [(0.1, 0.01), (0.2, 0.5), None], "second": [(0.3, 0.02), (-0.1, 0.2), (0.5, 0.1)]}
+    return points(["0", "1", "2"], series, "level", "unexplained variance", "levels")
+
+
+def stages() -> str:
+    return bars([("generate", 12.0), ("fit", 90.5)], "seconds", "stages")
+
+
+def texts(svg: str) -> set[str]:
+    return {e.text for e in ElementTree.fromstring(svg).iter("{http://www.w3.org/2000/svg}text") if e.text}
+
+
+@pytest.mark.parametrize(
+    ("svg", "expected"),
+    [
+        (training(), {"seconds of training", "unexplained variance", "first", "second"}),
+        (levels(), {"level", "unexplained variance", "first", "second", "0", "1", "2"}),
+        (stages(), {"seconds", "generate", "fit", "12", "90.5"}),
+    ],
+)
+def test_axes_and_series_are_named(svg: str, expected: set[str]) -> None:
+    assert expected <= texts(svg)
+
+
+@pytest.mark.parametrize("svg", [training(), levels(), stages()])
+def test_nothing_is_loaded_and_the_ink_is_the_page_s(svg: str) -> None:
+    without_names = re.sub(r'\sxmlns(:xlink)?="[^"]*"', "", svg)
+    assert "http" not in without_names
+    assert "<metadata" not in svg
+    assert "<?xml" not in svg
+    assert "currentColor" in svg
+    assert "#010203" not in svg
+    references = re.findall(r'(?:href="|url\()#([^")]+)', svg)
+    assert set(references) <= set(re.findall(r'\bid="([^"]+)"', svg))
+
+
+def test_ids_of_two_plots_differ_and_a_plot_is_always_the_same() -> None:
+    first, again, other = training("a plot"), training("a plot"), training("another")
+    assert first == again
+    ids = [set(re.findall(r'\bid="([^"]+)"', svg)) for svg in (first, other)]
+    assert ids[0]
+    assert not ids[0] & ids[1]
+
+
+def test_every_series_has_its_color() -> None:
+    svg = training().lower()
+    assert color(0).lower() in svg
+    assert color(1).lower() in svg
+    assert color(0) != color(1)
+
+
+def test_a_bar_larger_than_its_value_does_not_stretch_the_axis() -> None:
+    wide = points(["0"], {"a": [(0.2, 0.19999)], "b": [(0.3, 0.01)]}, "x", "y", "wide")
+    assert "0.001" not in texts(wide)
+
+
+def test_a_band_that_reaches_zero_is_cut_off_where_the_values_end() -> None:
+    lines = [Curve("a", [10.0, 20.0, 30.0], [0.3, 0.2, -0.01], [0.31, 5.0, 0.1])]
+    numbers = {float(t) for t in texts(curves(lines, "x", "y", "band")) if re.fullmatch(r"[\d.e-]+", t)}
+    assert {n for n in numbers if n < 10} == {0.1, 0.2, 0.5}

@@ -1,0 +1,229 @@
+"""Recipes: what is read, what is refused, and in which words."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mbtf_core.console import run
+from mbtf_core.errors import InputError, UsageError
+from mbtf_core.locks import shard_lock
+from mbtf_pipeline.recipe import load_recipe, read_resolved, write_recipe
+
+HEAD = """\
+name: small
+generate:
+  material: maps/height.npy
+  queries: {train: 4/texel}
+"""
+SINGLE = HEAD + "fit: {model: neumip}\n"
+NAMED = (
+    HEAD
+    + """\
+fit:
+  neumip:
+  quick:
+    model: neumip-baseline
+    training:
+      time: 5s
+"""
+)
+
+
+def written(folder: Path, text: str) -> Path:
+    (folder / "maps").mkdir(exist_ok=True)
+    np.save(folder / "maps" / "height.npy", np.zeros((4, 4), np.float32))
+    path = folder / "recipe-under-test.yaml"
+    path.write_text(text)
+    return path
+
+
+def test_material_lies_beside_the_recipe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = written(tmp_path, SINGLE)
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    monkeypatch.chdir(elsewhere)
+    recipe = load_recipe(Path("..") / path.name)
+    assert Path(recipe.generate.material).samefile(tmp_path / "maps" / "height.npy")
+    assert recipe.folder == Path("out") / "small"
+
+
+def test_an_assigned_material_lies_in_the_current_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = written(tmp_path, SINGLE)
+    other = tmp_path / "other"
+    other.mkdir()
+    np.save(other / "h.npy", np.zeros((2, 2), np.float32))
+    monkeypatch.chdir(other)
+    recipe = load_recipe(path, ["generate.material=h.npy", "compare.spp=32"])
+    assert Path(recipe.generate.material).samefile(other / "h.npy")
+    assert recipe.compare.spp == 32
+
+
+def test_one_fit_is_named_after_its_model(tmp_path: Path) -> None:
+    recipe = load_recipe(written(tmp_path, SINGLE))
+    assert list(recipe.fit) == ["neumip"]
+    without = load_recipe(written(tmp_path, HEAD + "fit: {training: {time: 9s}}\n"))
+    assert {name: fit.model for name, fit in without.fit.items()} == {"neumip": "neumip"}
+    assert without.fit["neumip"].training.time == 9.0
+
+
+def test_a_fit_without_a_model_has_the_model_of_its_name(tmp_path: Path) -> None:
+    recipe = load_recipe(written(tmp_path, NAMED))
+    assert {name: fit.model for name, fit in recipe.fit.items()} == {
+        "neumip": "neumip",
+        "quick": "neumip-baseline",
+    }
+    assert recipe.fit["quick"].training.time == 5.0
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "what"),
+    [
+        (SINGLE + "compar: {}\n", 6, "did you mean 'compare'"),
+        (SINGLE + "compare:\n  size: 64\n  vews: []\n", 8, "did you mean 'views'"),
+        (SINGLE + "compare:\n  views:\n  - {elevation: 45, azimut: 3}\n", 8, "did you mean 'azimuth'"),
+        (SINGLE.replace("train:", "trian:"), 4, "did you mean 'train'"),
+        (HEAD + "fit:\n  modle: neumip\n", 6, "did you mean 'model'"),
+        (NAMED.replace("time: 5s", "tmie: 5s"), 10, "did you mean 'time'"),
+        (NAMED.replace("model: neumip-baseline", "model: neural"), 8, "neumip-baseline"),
+        (HEAD + "fit:\n  other:\n", 6, "'neumip' or 'hierarchical'"),
+        (HEAD + "fit: {}\n", 5, "names no fit"),
+        (SINGLE.replace("small", "a/b"), 1, "'name'"),
+        (SINGLE + "compare:\n  views:\n  - {elevation: 3}\n", 8, "at least"),
+        (SINGLE + "compare: {spp: 3}\n", 6, "must be even"),
+        (SINGLE + "compare: {spans: [2, 2.0]}\n", 6, "same entry twice"),
+        (SINGLE + "compare: {kinds: []}\n", 6, "at least 1"),
+        (SINGLE + "report: {exposure: x}\n", 6, "must be a number"),
+    ],
+)
+def test_faults_are_named_with_their_line(tmp_path: Path, text: str, line: int, what: str) -> None:
+    path = written(tmp_path, text)
+    with pytest.raises(InputError) as caught:
+        load_recipe(path)
+    assert caught.value.where == f"{path}:{line}"
+    assert what in caught.value.message
+
+
+def test_a_missing_key_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="'generate' is missing"):
+        load_recipe(written(tmp_path, "name: x\nfit: {model: neumip}\n"))
+
+
+def test_a_missing_material_is_one_clear_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = written(tmp_path, SINGLE.replace("maps/height.npy", "../nowhere/height.exr"))
+    from mbtf_pipeline.cli.app import app
+
+    assert run(app, ["run", str(path), "-o", str(tmp_path / "out")]) == 3
+    out, err = capsys.readouterr()
+    first, second = err.splitlines()
+    assert first == f"error: {path}:3: material '../nowhere/height.exr' does not exist"
+    looked = os.path.abspath(tmp_path / "../nowhere/height.exr")
+    assert second.strip() == f"looked for {looked}; edit 'generate.material' in {path}"
+    assert out == ""
+    assert not (tmp_path / "out").exists()
+
+
+def test_published_maps_that_are_missing_are_named_with_their_source(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = written(tmp_path, SINGLE.replace("maps/height.npy", "../data/rock_cliff"))
+    with pytest.raises(InputError) as caught:
+        load_recipe(path)
+    for text in ("ambientCG Rock023", "CC0", "'generate.material'", "--set generate.material=FOLDER"):
+        assert text in caught.value.hint
+    with pytest.raises(InputError) as caught:
+        load_recipe(path, ["generate.material=elsewhere/rock_cliff"])
+    assert "edit" not in caught.value.hint
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "what"),
+    [
+        (["run", "absent.yaml"], 3, "no such file"),
+        (["run", "recipe-under-tset.yaml"], 3, "did you mean 'recipe-under-test.yaml'?"),
+        (["run", "."], 3, "is a folder"),
+        (["run", "recipe-under-test.yaml", "--set", "compare.spp=x"], 2, "compare.spp"),
+        (["run", "recipe-under-test.yaml", "--set", "compare"], 2, "key=value"),
+        (["run", "recipe-under-test.yaml", "--set", "compare.sp=2"], 2, "did you mean 'spp'"),
+        (["run", "recipe-under-test.yaml", "-o", "maps"], 3, "not empty"),
+        (["run", "recipe-under-test.yaml", "-o", "maps/height.npy"], 3, "not a folder"),
+        (["report", "maps"], 3, "holds no run"),
+        (["list", "absent"], 3, "no such folder"),
+        (["rnu", "recipe-under-test.yaml"], 2, "rnu"),
+    ],
+)
+def test_exit_codes(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    code: int,
+    what: str,
+) -> None:
+    written(tmp_path, SINGLE)
+    monkeypatch.chdir(tmp_path)
+    from mbtf_pipeline.cli.app import app
+
+    assert run(app, arguments) == code
+    err = capsys.readouterr().err
+    assert what in err
+    assert len(err.splitlines()) <= 2
+
+
+def test_a_folder_at_work_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = written(tmp_path, SINGLE)
+    folder = tmp_path / "out"
+    folder.mkdir()
+    from mbtf_pipeline.cli.app import app
+
+    with shard_lock(folder / "run.json") as held:
+        assert held
+        assert run(app, ["run", str(path), "-o", str(folder), "-q"]) == 4
+    assert "another run is at work" in capsys.readouterr().err
+    assert list(folder.iterdir()) == []
+
+
+def test_a_wrong_assignment_is_an_error_of_usage(tmp_path: Path) -> None:
+    path = written(tmp_path, SINGLE)
+    with pytest.raises(UsageError, match="size"):
+        load_recipe(path, ["compare.size=0"])
+    with pytest.raises(InputError, match="absent") as caught:
+        load_recipe(path, ["generate.material=absent"])
+    assert "--set" in str(caught.value.where)
+
+
+def test_the_resolved_recipe_can_be_run_again(tmp_path: Path) -> None:
+    recipe = load_recipe(written(tmp_path, NAMED + "compare: {views: [{elevation: 45, azimuth: 10}]}\n"))
+    folder = tmp_path / "deep" / "run"
+    folder.mkdir(parents=True)
+    write_recipe(recipe, folder)
+    again = load_recipe(folder / "recipe.yaml")
+    assert Path(again.generate.material).samefile(recipe.generate.material)
+    assert again.model_dump(exclude={"generate": {"material"}}) == recipe.model_dump(
+        exclude={"generate": {"material"}}
+    )
+    (tmp_path / "maps" / "height.npy").unlink()
+    assert read_resolved(folder).fit == recipe.fit
+
+
+def test_listing_names_recipes_and_faults(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    written(tmp_path, SINGLE + "description: four by four\n")
+    (tmp_path / "broken.yaml").write_text("name: broken\nfti: {}\n")
+    monkeypatch.chdir(tmp_path)
+    from mbtf_pipeline.cli.app import app
+
+    assert run(app, ["list", "."]) == 0
+    broken, small = capsys.readouterr().out.splitlines()
+    # The path stands once.
+    assert broken.startswith("broken.yaml: line 2: unknown key 'fti'")
+    assert small == "recipe-under-test.yaml: four by four"
+    assert run(app, ["list", ".", "-v"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[2:] == [f"    {s}: has not run" for s in ("generate", "fit neumip", "compare", "report")]

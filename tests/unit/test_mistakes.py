@@ -1,0 +1,51 @@
+"""Mistakes that people make with the three programs are refused in one or two lines, with an exit code."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from support.mistakes import LINES, call, write_files
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = tmp_path_factory.mktemp("mistakes").resolve()
+    write_files(made)
+    return made
+
+
+@pytest.mark.parametrize("group", LINES)
+def test_every_mistake_is_refused_in_two_lines(
+    group: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    for line in LINES[group]:
+        done = call(line.split())
+        assert done.code in (2, 3), (line, done)
+        errors = done.err[done.err.find("error: ") :].splitlines() if "error: " in done.err else []
+        # `verify` reports what it found on standard output.
+        assert len(errors) <= 2, (line, done)
+        assert errors or done.out, (line, done)
+        assert "Traceback" not in done.err
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        ["heights.npy", "--mesh", "\x1b[31m"],
+        ["heights.npy", "--mesh", "9" * 5000],
+        ["heights.npy", "--tile", "\0"],
+        ["heights.npy", "--set", "\x1b[2J=1"],
+        ["heights.npy", "two\x1b[31mwords"],
+        ["\x1b]0;title\x07.npy"],
+        ["x" * 5000],
+    ],
+)
+def test_odd_words_are_quoted_safely(line: list[str], folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    done = call(["mbtf-gen", *line])
+    assert done.code in (2, 3)
+    lines = done.err[done.err.index("error: ") :].splitlines()
+    assert len(lines) <= 2
+    assert all(text.isprintable() and len(text) < 600 for text in lines), done.err
