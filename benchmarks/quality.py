@@ -3,7 +3,7 @@
     python benchmarks/quality.py --out FOLDER [--only MATERIAL:QUALITY ...] [--levels 7] [--store] [--check]
 
 Runs ``mbtf-pipeline run`` in a process of its own for every material and quality of the table in
-docs/cost.md: ``draft`` and ``standard`` on the six texture sets that lie beside the project, ``high`` on one.
+docs/results/2026-11-cost-studies.md: ``draft`` and ``standard`` on six texture sets, ``high`` on one.
 The last one is measured with a quarter of its training, too: from both ``paper`` is extrapolated. ``--only``
 (repeatable) names single ones, also of ``assets/``, such as ``turtle_shell:draft``. Printed: its seconds,
 start-up, pictures and report included, the unexplained variance of test queries, and the bytes of data and
@@ -11,8 +11,8 @@ material. Each is kept in FOLDER as soon as it is measured and not measured agai
 quality has got other settings since, so the same command goes on where it stopped.
 
 ``--store`` writes what FOLDER holds to ``mbtf_gen/quality_measured.json``, from which help texts and
-``mbtf-gen plan`` speak, and the table of docs/cost.md. ``--check`` holds what FOLDER holds against the stored
-figures instead.
+``mbtf-gen plan`` speak, and the table of docs/results/2026-11-cost-studies.md. ``--check`` compares FOLDER
+with the stored figures instead.
 
 The last line is one JSON object: figures, and the bars they are held to (a draft takes at most a minute, a
 standard run ten, on two cores, at 128 x 128 texels; under ``--check`` seconds within 30 % and errors within a
@@ -67,7 +67,7 @@ BAR_LEVELS = 7
 # Largest factors between a stored figure and another run.
 CHECK = {"seconds": 1.3, "error": 1.5}
 QUALITIES: tuple[Quality, ...] = get_args(Quality)
-PAGE = ROOT / "docs" / "cost.md"
+PAGE = ROOT / "docs" / "results" / "2026-11-cost-studies.md"
 BEGIN, END = "<!-- qualities: begin -->", "<!-- qualities: end -->"
 RECIPE = """\
 name: quality

@@ -1,6 +1,6 @@
-"""Makes the figures of docs/cost.md and docs/accuracy.md from folders of cost studies, and tables of fronts.
+"""Makes the figures and tables of docs/results/2026-11-cost-studies.md from folders of cost studies.
 
-From the repository's root, after the studies (the commands stand in docs/cost.md):
+From the repository's root, after the studies (that page has their commands):
 ``.venv/bin/python docs/pictures/make_cost_pictures.py out/cost/turtle_shell out/cost/twisted_wool …``.
 Every sheet shows one plot of all studies side by side; studies that did not get to it are left out of it.
 """
@@ -17,7 +17,7 @@ from PIL import Image, ImageDraw, ImageFont
 from mbtf_pipeline.cost_study.fit_runs import QUALITIES
 
 HERE = Path(__file__).parent
-PAGE = HERE.parent / "cost.md"
+PAGE = HERE.parent / "results" / "2026-11-cost-studies.md"
 OUT = HERE / "cost"
 PLOTS = (
     "front",
@@ -79,7 +79,7 @@ def whole_chains(folder: Path) -> list[dict[str, str]]:
 def table(studies: list[Path]) -> str:
     """How well errors are known, and the fronts of all studies with commands, as Markdown."""
     records = {f: json.loads((f / "study.json").read_text(encoding="utf-8")) for f in studies}
-    lines = ["| study | errors known to ± 10 % (95 %) | scatter between seeds |", "|---|---|---|"]
+    lines = ["| study | errors known to ± 10 % (95 %) | standard deviation between seeds |", "|---|---|---|"]
     for folder, study in records.items():
         found = study.get("summary")
         if found is None:
@@ -92,7 +92,7 @@ def table(studies: list[Path]) -> str:
         lines += [
             f"`{folder.name}`, {where}:",
             "",
-            "| in all | generating | training | queries × paths | model | unexplained variance |",
+            "| total | generation | training | queries × paths | model | unexplained variance |",
             "|---|---|---|---|---|---|",
         ]
         front = whole_chains(folder)
@@ -105,7 +105,7 @@ def table(studies: list[Path]) -> str:
                 f"| {float(r['error']):.3f} ± {float(r['error_se']):.3f} |"
             )
         command = front[-1]["command"].replace(str(folder), f"out/cost/{folder.name}")
-        lines += ["", "The last one by itself:", "", f"    {command.replace(' && ', chr(10) + '    ')}", ""]
+        lines += ["", "Commands of the last row:", "", f"    {command.replace(' && ', chr(10) + '    ')}", ""]
     return "\n".join(lines)
 
 

@@ -1,13 +1,13 @@
-"""The yardstick ``rock_cliff-128``: the share of the variance of real values that 100 s of training miss.
+"""The benchmark ``rock_cliff-128``: unexplained variance of a real material after 100 s of training.
 
-    python benchmarks/yardstick.py [--shards FOLDER] [--out FOLDER] [--time 100s] [--seed 0]
+    python benchmarks/rock_cliff_128.py [--shards FOLDER] [--out FOLDER] [--time 100s] [--seed 0]
 
 Without ``--shards`` the data set of ``pipelines/rock_cliff.yaml`` is made first (minutes); its maps lie
 beside the project. Trains ``neumip``, ``neumip-baseline`` and a ``neumip`` of up to twice the cost of
 evaluation for the same time and prints their unexplained variance on the test split (noise-free mean squared
 error over the variance of the test values), overall and by level.
 
-The last line is one JSON object: figures, and the bars they are held to. Exit code 1 where a bar is missed.
+The last line is one JSON object with the figures and their thresholds. Exit code 1 if a threshold is missed.
 """
 
 from __future__ import annotations
