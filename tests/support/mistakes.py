@@ -195,9 +195,9 @@ _RECIPE = "name: r\ngenerate: {material: heights.npy, queries: {train: 10, test:
 _TEXTS = {
     "unknown": "height: heights.npy\nruoghness: 0.5\n",
     "broken": "height: heights.npy\n  roughness: 0.5\n",
-    "tab": "height: heights.npy\nbasecolor:\n\tvalue: 0.5\n",
+    "tab": "height: heights.npy\nbase_color:\n\tvalue: 0.5\n",
     "twice": "height: heights.npy\nheight: other.npy\n",
-    "lost": "height: heights.npy\nbasecolor: nowhere.png\n",
+    "lost": "height: heights.npy\nbase_color: nowhere.png\n",
     "list": "- heights.npy\n",
     "number": "height: heights.npy\nroughness: rough\nmetallic: [1, 2]\n",
     "range": "height: heights.npy\nroughness: 1.5\n",

@@ -156,7 +156,7 @@ def write_inputs(folder: Path) -> None:
     np.save(folder / "twice/displacement.npy", heights)
     (folder / "unknown.yaml").write_text("height: heights.npy\nruoghness: 0.5\n")
     (folder / "broken.yaml").write_text("height: heights.npy\n  roughness: 0.5\n")
-    (folder / "lost.yaml").write_text("height: heights.npy\nbasecolor: nowhere.png\n")
+    (folder / "lost.yaml").write_text("height: heights.npy\nbase_color: nowhere.png\n")
     (folder / "config.yaml").write_text("queries:\n  spp: 4\n  mincos: 0.2\n")
     write_dataset(folder / "schema", queries={"train": "8", "test": "8"})
     manifest = folder / "schema/manifest.json"

@@ -37,7 +37,7 @@ def write_material(folder: Path) -> None:
     np.save(maps / "height.npy", (0.1 * rng.random(MAP)).astype(np.float32))
     color = rng.integers(0, 255, (*MAP, 3)).astype(np.uint8)
     Image.fromarray(color).save(maps / "base_color.png")
-    (folder / "material.yaml").write_text("height: maps/height.npy\nbasecolor: maps/base_color.png\n")
+    (folder / "material.yaml").write_text("height: maps/height.npy\nbase_color: maps/base_color.png\n")
 
 
 def load(folder: Path) -> dict[str, Arrays]:

@@ -213,7 +213,7 @@ def test_a_material_constant_changes_the_hash(tmp_path: Path) -> None:
     folder = write_maps(tmp_path / "a")
     hashes = set()
     for text in ("roughness: 0.5", "roughness: 0.6", "roughness: 0.5\nspecular: 0.1", "metallic: 0.5"):
-        (folder / "material.yaml").write_text(f"height: height.npy\nbasecolor: base_color.npy\n{text}\n")
+        (folder / "material.yaml").write_text(f"height: height.npy\nbase_color: base_color.npy\n{text}\n")
         hashes.add(config_hash(folder))
     assert len(hashes) == 4
 

@@ -118,7 +118,7 @@ class TestMaterial:
         save_heights(tmp_path / "rough.png", cut(fractal(48, 64)), 8)
         np.save(tmp_path / "color.npy", np.random.default_rng(0).random((72, 96, 3)))
         (tmp_path / "material.yaml").write_text(
-            "height: height.png\nnormal: normal_dx.png\nroughness: rough.png\nbasecolor: color.npy\n"
+            "height: height.png\nnormal: normal_dx.png\nroughness: rough.png\nbase_color: color.npy\n"
             "opacity: {file: color.npy, channel: G}\nsheen_color: color.npy\n"
             + "".join(f"{name}: rough.png\n" for name in ("clearcoat", "clearcoat_roughness", "sheen"))
         )
