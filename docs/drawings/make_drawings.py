@@ -1,7 +1,6 @@
-"""Draws the figures of docs/concepts.md: ``.venv/bin/python docs/drawings/make_drawings.py``.
+"""Draw the figures of docs/explanation/concepts.md: ``.venv/bin/python docs/drawings/make_drawings.py``.
 
-Curves are computed by the project's own code (light kernel, level weights), so that a drawing cannot say
-something else than the programs do.
+The curves come from the project's own code (light kernel, level weights), so drawings and programs agree.
 """
 
 from __future__ import annotations
@@ -16,12 +15,12 @@ from mbtf_gen.levels import Lattice
 from mbtf_gen.light import LightKernel
 
 FOLDER = Path(__file__).parent
-# Distinguishable by colour-blind readers (Okabe and Ito).
-BLUE, ORANGE, GREEN, RED, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#666666"
+# Distinguishable by color-blind readers (Okabe and Ito).
+BLUE, ORANGE, GREEN, RED, GRAY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#666666"
 
 
-def relief(x: Any) -> Any:
-    """A relief of period 1, its highest point at 0."""
+def heights(x: Any) -> Any:
+    """Heights of period 1, the highest point at 0."""
 
     def shape(at: Any) -> Any:
         phase = 2 * np.pi * (np.asarray(at) - 0.14)
@@ -37,35 +36,35 @@ def bare(axes: Any) -> None:
 
 
 def arrow(
-    axes: Any, start: tuple[float, float], end: tuple[float, float], colour: str, **options: Any
+    axes: Any, start: tuple[float, float], end: tuple[float, float], color: str, **options: Any
 ) -> None:
     """An arrow in data coordinates."""
-    style = {"arrowstyle": "-|>", "color": colour, "lw": 1.6, "shrinkA": 0, "shrinkB": 0, **options}
+    style = {"arrowstyle": "-|>", "color": color, "lw": 1.6, "shrinkA": 0, "shrinkB": 0, **options}
     axes.annotate("", xy=end, xytext=start, arrowprops=style)
 
 
 def first_hit(x: float, direction: tuple[float, float]) -> tuple[float, float]:
-    """Where the ray that leaves (x, 0) downwards along `direction` meets the relief."""
+    """Where the ray from (x, 0) down along `direction` meets the surface."""
     t = np.linspace(0, 1, 200001)
-    along = relief(x + t * direction[0])
+    along = heights(x + t * direction[0])
     k = int(np.argmax(t * direction[1] <= along))
     return x + t[k] * direction[0], float(along[k])
 
 
 def tile(plot: Any) -> Any:
-    """Section through a tile: what B(x, ω_i, ω_o) is."""
+    """Section through a tile: the geometry of B(x, ω_i, ω_o)."""
     figure, axes = plot.subplots(figsize=(8, 2.9))
     x = np.linspace(-0.35, 1.35, 700)
-    axes.fill_between(x, relief(x), -0.42, color="#e8e4dc")
-    axes.plot(x, relief(x), color="black", lw=1.4)
-    axes.plot([-0.35, 1.36], [0, 0], color=GREY, ls="--", lw=1)
-    axes.text(-0.34, 0.015, "reference plane z = 0", ha="left", va="bottom", color=GREY, fontsize=9)
+    axes.fill_between(x, heights(x), -0.42, color="#e8e4dc")
+    axes.plot(x, heights(x), color="black", lw=1.4)
+    axes.plot([-0.35, 1.36], [0, 0], color=GRAY, ls="--", lw=1)
+    axes.text(-0.34, 0.015, "reference plane z = 0", ha="left", va="bottom", color=GRAY, fontsize=9)
     for border in (0.0, 1.0):
-        axes.plot([border, border], [-0.42, 0.05], color=GREY, lw=0.8, ls=":")
+        axes.plot([border, border], [-0.42, 0.05], color=GRAY, lw=0.8, ls=":")
     axes.annotate(
-        "", xy=(1, -0.38), xytext=(0, -0.38), arrowprops={"arrowstyle": "<->", "color": GREY, "lw": 1}
+        "", xy=(1, -0.38), xytext=(0, -0.38), arrowprops={"arrowstyle": "<->", "color": GRAY, "lw": 1}
     )
-    axes.text(0.5, -0.375, "one tile", va="bottom", ha="center", color=GREY, fontsize=9)
+    axes.text(0.5, -0.375, "one tile", va="bottom", ha="center", color=GRAY, fontsize=9)
     at, view = 1.02, np.array([0.86, 0.5])
     hit = first_hit(at, (-view[0], -view[1]))
     end = (at + 0.42 * view[0], 0.42 * view[1])
@@ -79,7 +78,7 @@ def tile(plot: Any) -> Any:
     axes.plot(at, 0, "o", color=BLUE, ms=5)
     axes.text(at + 0.015, -0.02, r"$\mathbf{x}$", color=BLUE, va="top", fontsize=12)
     axes.plot(*hit, "o", color=RED, ms=5)
-    axes.text(hit[0] - 0.01, hit[1] - 0.04, "the point seen", color=RED, va="top", ha="center", fontsize=9)
+    axes.text(hit[0] - 0.01, hit[1] - 0.04, "visible point", color=RED, va="top", ha="center", fontsize=9)
     axes.set_xlim(-0.36, 1.75)
     axes.set_ylim(-0.43, 0.45)
     bare(axes)
@@ -87,7 +86,7 @@ def tile(plot: Any) -> Any:
 
 
 def orientation(plot: Any) -> Any:
-    """Image rows, texel centres, and (u, v)."""
+    """Image rows, texel centers, and (u, v)."""
     figure, axes = plot.subplots(figsize=(4.2, 3.3))
     columns, rows = 4, 3
     shade = np.linspace(0.95, 0.7, columns * rows).reshape(rows, columns)
@@ -97,16 +96,16 @@ def orientation(plot: Any) -> Any:
             axes.add_patch(
                 plot.Rectangle(corner, 1 / columns, 1 / rows, fc=str(shade[j, i]), ec="white", lw=1.5)
             )
-            centre = ((i + 0.5) / columns, 1 - (j + 0.5) / rows)
-            axes.plot(*centre, "o", color=BLUE, ms=4)
-            axes.text(centre[0], centre[1] - 0.05, f"[{j}, {i}]", ha="center", va="top", fontsize=8)
+            center = ((i + 0.5) / columns, 1 - (j + 0.5) / rows)
+            axes.plot(*center, "o", color=BLUE, ms=4)
+            axes.text(center[0], center[1] - 0.05, f"[{j}, {i}]", ha="center", va="top", fontsize=8)
     arrow(axes, (0, -0.04), (1.12, -0.04), "black")
     arrow(axes, (-0.03, 0), (-0.03, 1.14), "black")
     axes.text(1.14, -0.04, "u", va="center", style="italic")
     axes.text(-0.03, 1.17, "v", ha="center", style="italic")
     axes.text(-0.06, 0, "0", ha="right", va="center", fontsize=9)
     axes.text(-0.06, 1, "1", ha="right", va="center", fontsize=9)
-    axes.text(0.5, 1.03, "image row 0", ha="center", va="bottom", color=GREY, fontsize=9)
+    axes.text(0.5, 1.03, "image row 0", ha="center", va="bottom", color=GRAY, fontsize=9)
     axes.set_xlim(-0.15, 1.2)
     axes.set_ylim(-0.12, 1.25)
     bare(axes)
@@ -114,7 +113,7 @@ def orientation(plot: Any) -> Any:
 
 
 def footprint(plot: Any) -> Any:
-    """Footprints of three levels on the finest texels, and how levels blend."""
+    """Footprints of three levels on the finest texels, and the weights of the levels."""
     figure, (left, right) = plot.subplots(1, 2, figsize=(9, 3.2), width_ratios=(1, 1.6))
     lattice = Lattice(4, 1.0)
     n = 2**lattice.finest
@@ -122,10 +121,10 @@ def footprint(plot: Any) -> Any:
         left.plot([0, 1], [k / n, k / n], color="#d5d5d5", lw=0.6)
         left.plot([k / n, k / n], [0, 1], color="#d5d5d5", lw=0.6)
     angle = np.linspace(0, 2 * np.pi, 200)
-    for level, colour in ((1, BLUE), (2, GREEN), (4, RED)):
+    for level, color in ((1, BLUE), (2, GREEN), (4, RED)):
         sigma = 0.5 * 2.0**-level
-        left.plot(0.5 + sigma * np.cos(angle), 0.5 + sigma * np.sin(angle), color=colour, lw=1.8)
-        left.text(0.5, 0.5 + sigma + 0.015, rf"$\sigma_{level}$", color=colour, ha="center", va="bottom")
+        left.plot(0.5 + sigma * np.cos(angle), 0.5 + sigma * np.sin(angle), color=color, lw=1.8)
+        left.text(0.5, 0.5 + sigma + 0.015, rf"$\sigma_{level}$", color=color, ha="center", va="bottom")
     left.set_title("1 σ of levels 1, 2 and 4 on level 4's texels", fontsize=9)
     bare(left)
     sigma = np.exp2(-np.linspace(0, 4, 801)) / 2
@@ -148,14 +147,14 @@ def light(plot: Any) -> Any:
     figure, axes = plot.subplots(figsize=(7, 3))
     kernel = LightKernel(1.0)
     elevation = np.radians(np.linspace(-4, 16, 2001))
-    for degrees, colour in ((0.5, RED), (2, ORANGE), (10, BLUE)):
+    for degrees, color in ((0.5, RED), (2, ORANGE), (10, BLUE)):
         omega_i = np.array([np.cos(np.radians(degrees)), 0, np.sin(np.radians(degrees))])
         directions = np.stack([np.cos(elevation), np.zeros_like(elevation), np.sin(elevation)], axis=-1)
         radiance = kernel.radiance(directions, np.broadcast_to(omega_i, directions.shape))
         axes.plot(
             np.degrees(elevation),
             radiance,
-            color=colour,
+            color=color,
             lw=1.8,
             label=f"light {degrees:g}° above the horizon",
         )
@@ -163,11 +162,11 @@ def light(plot: Any) -> Any:
     axes.text(
         -2,
         axes.get_ylim()[1] * 0.5,
-        "below the\nhorizon:\nnothing",
+        "below the\nhorizon:\nno light",
         ha="center",
         va="center",
         fontsize=9,
-        color=GREY,
+        color=GRAY,
     )
     axes.set_xlabel("elevation of the direction, degrees")
     axes.set_ylabel("arriving radiance L")
@@ -179,13 +178,13 @@ def light(plot: Any) -> Any:
 
 
 def periodic(plot: Any) -> Any:
-    """A grazing ray that leaves the tile re-enters it on the other side."""
+    """A grazing ray that leaves the tile re-enters on the other side."""
     figure, axes = plot.subplots(figsize=(8, 2.2))
     x = np.linspace(-0.12, 1.12, 700)
-    axes.fill_between(x, relief(x), -0.42, color="#f1efe9")
+    axes.fill_between(x, heights(x), -0.42, color="#f1efe9")
     inside = (x >= 0) & (x <= 1)
-    axes.fill_between(x[inside], relief(x[inside]), -0.42, color="#dfd9cc")
-    axes.plot(x, relief(x), color="black", lw=1.3)
+    axes.fill_between(x[inside], heights(x[inside]), -0.42, color="#dfd9cc")
+    axes.plot(x, heights(x), color="black", lw=1.3)
     slope = -0.06
     height = -0.005
     start = 0.56
@@ -193,7 +192,7 @@ def periodic(plot: Any) -> Any:
     while pieces < 4:
         t = np.linspace(0, 1.0 - start, 20001)
         z = height + slope * t
-        blocked = np.nonzero(z < relief(start + t))[0]
+        blocked = np.nonzero(z < heights(start + t))[0]
         last = int(blocked[0]) if len(blocked) else len(t) - 1
         axes.plot(start + t[[0, last]], z[[0, last]], color=BLUE, lw=1.8)
         if len(blocked):
@@ -204,10 +203,10 @@ def periodic(plot: Any) -> Any:
         )
         height, start, pieces = float(z[last]), start + float(t[last]) - 1.0, pieces + 1
         axes.plot(start, height, "o", mfc="white", mec=BLUE, ms=6)
-        axes.text(start + 0.015, height + 0.02, "goes on", color=BLUE, fontsize=9, va="bottom")
+        axes.text(start + 0.015, height + 0.02, "re-enters", color=BLUE, fontsize=9, va="bottom")
     for border, name in ((0.0, "left border"), (1.0, "right border")):
-        axes.plot([border, border], [-0.42, 0.03], color=GREY, ls=":", lw=1)
-        axes.text(border, 0.035, name, ha="center", va="bottom", color=GREY, fontsize=9)
+        axes.plot([border, border], [-0.42, 0.03], color=GRAY, ls=":", lw=1)
+        axes.text(border, 0.035, name, ha="center", va="bottom", color=GRAY, fontsize=9)
     axes.set_xlim(-0.13, 1.13)
     bare(axes)
     return figure
