@@ -1,12 +1,11 @@
-"""Makes docs/pictures/zoom_series.png: a fitted material in Mitsuba beside truly filtered pictures.
+"""Make docs/pictures/zoom_series.png: a fitted material in Mitsuba beside truly filtered pictures.
 
 From the repository's root, after ``make demo``: ``.venv/bin/python docs/pictures/make_zoom_series.py``.
 Rows: path-traced pixels of the micro-geometry (``mbtf-gen reference --kind pixel``, its command is printed);
-the material with footprints (``mbtf_path``); the material at its finest level everywhere, as stock
-integrators read it. One ray per pixel shows aliasing as it is. Printed, of gray
-values and as shares of the reference's mean: the picture's mean, its contrast (standard deviation) beside the
-reference's, and the RMS difference of the two; the reference's noise is taken out. More contrast than the
-reference's is aliasing, less is blur.
+the material with footprints (``mbtf_path``); the material at its finest level everywhere, as unmodified
+integrators read it. One ray per pixel shows aliasing. The script prints, for gray values relative to the
+reference's mean: the picture's mean, its contrast (standard deviation) beside the reference's, and the RMS
+difference without the reference's noise. More contrast than the reference's is aliasing, less is blur.
 """
 
 from __future__ import annotations
@@ -29,18 +28,18 @@ from mbtf_gen.render.runtime import load_mitsuba
 
 ROOT = Path(__file__).parents[2]
 MATERIAL = ROOT / "out" / "quickstart" / "fits" / "neumip"
-SPANS = (0.5, 2.0, 8.0, 32.0, 128.0)
+TILES_ACROSS = (0.5, 2.0, 8.0, 32.0, 128.0)
 VIEW, LIGHT, SIZE, SPP = (60.0, -90.0), (45.0, 45.0), 160, 64
 # As the recipe generates its data.
 OPTIONS = ("--mesh", "256", "--light-width", "5")
-ROWS = ("reference, 0.5 tiles wide", "material, mbtf_path", "material, finest level")
+ROWS = ("reference, 0.5 tiles across", "material, mbtf_path", "material, finest level")
 GAP, CAPTION = 6, 24
 
 
 def reference(span: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Truly filtered pixels, two independent halves (SIZE, SIZE, 3)."""
+    """Truly filtered pixels: two independent halves (SIZE, SIZE, 3)."""
     words = ["reference", "assets/turtle_shell", "--view", "{:g},{:g}".format(*VIEW)]
-    words += ["--light", "{:g},{:g}".format(*LIGHT), "--spans", f"{span:g}", "--size", str(SIZE)]
+    words += ["--light", "{:g},{:g}".format(*LIGHT), "--tiles-across", f"{span:g}", "--size", str(SIZE)]
     words += ["--spp", str(SPP), "--kind", "pixel", *OPTIONS]
     print("mbtf-gen", *words, flush=True)
     with tempfile.TemporaryDirectory() as folder:
@@ -102,9 +101,9 @@ def main() -> None:
     import mbtf_fit.mitsuba_plugin
 
     mbtf_fit.mitsuba_plugin.register()
-    sheet = Image.new("RGB", (len(SPANS) * (SIZE + GAP) - GAP, 3 * (SIZE + CAPTION)), (255, 255, 255))
+    sheet = Image.new("RGB", (len(TILES_ACROSS) * (SIZE + GAP) - GAP, 3 * (SIZE + CAPTION)), (255, 255, 255))
     draw = ImageDraw.Draw(sheet)
-    for column, span in enumerate(SPANS):
+    for column, span in enumerate(TILES_ACROSS):
         halves = reference(span)
         truth = 0.5 * (halves[0] + halves[1])
         a, b = (half.mean(-1) for half in halves)
@@ -114,7 +113,7 @@ def main() -> None:
         exposure = auto_exposure(truth.astype(np.float32))
         for row, (name, picture) in enumerate(zip(ROWS, pictures, strict=True)):
             place = (column * (SIZE + GAP), row * (SIZE + CAPTION))
-            caption = name if column == 0 else f"{span:g} tiles wide" if row == 0 else ""
+            caption = name if column == 0 else f"{span:g} tiles across" if row == 0 else ""
             draw.text((place[0] + 2, place[1] + 3), caption, (30, 30, 30), ImageFont.load_default(12))
             display = to_display(picture.astype(np.float32), exposure)
             sheet.paste(Image.fromarray(display), (place[0], place[1] + CAPTION))
@@ -123,7 +122,7 @@ def main() -> None:
                 max(float(x), 0.0) ** 0.5 / level for x in (((gray - a) * (gray - b)).mean(), contrast)
             )
             print(
-                f"{span:6g} tiles wide, {name:26} mean {gray.mean() / level:.3f}, contrast "
+                f"{span:6g} tiles across, {name:27} mean {gray.mean() / level:.3f}, contrast "
                 f"{gray.std() / level:.3f} for {true:.3f}, RMS {error:.3f}",
                 flush=True,
             )
