@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from PIL import Image
 from support.damage import check_message
-from support.paths import ROOT
 from support.plugin_materials import write_material
 from support.scenes import mi
 
@@ -141,20 +140,6 @@ def test_options_that_make_no_sense_are_refused() -> None:
         with pytest.raises(UsageError, match=fault) as caught:
             resolve(PreviewConfig, flags=flags)
         check_message(caught.value)
-
-
-def test_the_document_states_options_and_defaults() -> None:
-    text = (ROOT / "docs/preview.md").read_text()
-    config = PreviewConfig(material="material/")
-    for name, section in (("sheet", config.sheet), ("turntable", config.turntable)):
-        for key, value in section:
-            shown = str(value)
-            if isinstance(value, list):
-                pairs = [
-                    f"{v.elevation:g},{v.azimuth:g}" if isinstance(v, Direction) else f"{v:g}" for v in value
-                ]
-                shown = (" and " if isinstance(value[0], Direction) else ",").join(pairs)
-            assert f"`{name}.{key}` | {shown} |" in text
 
 
 def test_a_folder_that_is_no_material_is_refused_before_anything_is_made(tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 from support.datasets import write_dataset
-from support.paths import ROOT
 
 from mbtf_core.child_process import run_child
 from mbtf_core.directions import from_angles
@@ -235,13 +234,3 @@ def test_a_window_needs_a_display(monkeypatch: pytest.MonkeyPatch) -> None:
         check_display()
     monkeypatch.setenv("WAYLAND_DISPLAY", "wayland-0")
     check_display()
-
-
-def test_the_document_states_options_and_defaults() -> None:
-    from mbtf_gen.config.pictures import Direction, PreviewSection
-
-    text = (ROOT / "docs/preview.md").read_text()
-    for key, value in PreviewSection():
-        shown = f"{value.elevation:g},{value.azimuth:g}" if isinstance(value, Direction) else str(value)
-        assert f"| `--{key}` | `preview.{key}` | {shown} |" in text
-    assert str(MOST_CELLS) in text
