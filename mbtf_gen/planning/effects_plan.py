@@ -122,7 +122,7 @@ def _look(job: Job, pilots: bool) -> _Look:
     return _Look(
         job,
         albedo,
-        material.is_lambert and material.coat is None and material.sheen is None,
+        material.is_lambert and material.clearcoat is None and material.sheen is None,
         own,
         pilots,
     )
@@ -194,7 +194,7 @@ def _strengths(material: Material) -> dict[str, float]:
     return {
         "specular": largest(material.specular),
         "metallic": largest(material.metallic),
-        "coat": largest(material.coat),
+        "coat": largest(material.clearcoat),
         "sheen": sheen,
     }
 
@@ -326,8 +326,8 @@ def _mis(look: _Look) -> Effect:
         return Effect("mis", True, "a wide light")
     material = job.material
     lobes = [2.0] if material.is_lambert else [2.0 * float(np.min(np.asarray(material.roughness))) ** 2]
-    if material.coat is not None:
-        lobes.append(2.0 * float(np.min(np.asarray(material.coat_roughness))) ** 2)
+    if material.clearcoat is not None:
+        lobes.append(2.0 * float(np.min(np.asarray(material.clearcoat_roughness))) ** 2)
     if material.sheen is not None:
         # Fibers stand within √α of upright.
         lobes.append(float(np.min(np.asarray(material.sheen_roughness))))

@@ -37,7 +37,7 @@ def pilot_queries(job: Job, count: int = PILOT_QUERIES, shard: int = 0) -> Queri
 
     Whatever the layout, each has a footprint and directions of its own: a few buffers would be a few.
     """
-    return replace(job.plan(), layout="shuffled", window=None).draw("pilot", shard, count)
+    return replace(job.plan(), layout="shuffled", patch_size=None).draw("pilot", shard, count)
 
 
 @dataclass(frozen=True)
