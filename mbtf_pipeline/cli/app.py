@@ -10,7 +10,7 @@ from cyclopts import Parameter
 
 from mbtf_core.console import CONSOLE, Console, clock, new_app
 from mbtf_core.errors import InputError, MbtfError, UsageError
-from mbtf_gen.config.presets import Quality, quality_help
+from mbtf_gen.config.presets import Quality
 
 if TYPE_CHECKING:
     from mbtf_pipeline.recipe import Recipe
@@ -21,7 +21,7 @@ app = new_app("mbtf-pipeline", "Run recipes: generate, fit, compare, report.")
 Set = Annotated[list[str], Parameter(name="--set", help="Set any option of the recipe, a.b=c. Repeatable.")]
 Output = Annotated[Path | None, Parameter(name=["--output", "-o"])]
 QualityOption = Annotated[
-    Quality, Parameter(help=quality_help("Sizes and times of all stages, in place of the recipe's."))
+    Quality, Parameter(help="Preset of the sizes and times of all stages; overrides the recipe.")
 ]
 _FOLDER = Path("pipelines")
 
@@ -33,7 +33,7 @@ def run(
     *,
     output: Output = None,
     quality: QualityOption | None = None,
-    budget: str | None = None,
+    time: str | None = None,
     quick: Annotated[bool, Parameter(negative="")] = False,
     force: Annotated[bool, Parameter(negative="")] = False,
     assignments: Set | None = None,
@@ -49,9 +49,9 @@ def run(
         YAML file.
     output
         Folder of the run. Default: out/NAME
-    budget
-        Time for generating and training together: 90s, 10min, 1h. Pilots on this machine split it; it takes
-        the place of the recipe's queries and training times. Comparison and report come on top.
+    time
+        Time for generating and training together: 90s, 10min, 1h. Pilots on this machine split it. Overrides
+        the recipe's queries and training times; comparison and report take additional time.
     quick
         The quick size of a paper recipe: minutes in place of hours.
     force
@@ -63,9 +63,9 @@ def run(
         if quality is not None:
             hint = "leave it out; --quick is the small size"
             raise UsageError("a paper recipe has sizes of its own", where="--quality", hint=hint)
-        if budget is not None:
+        if time is not None:
             hint = "leave it out; --quick is the small size"
-            raise UsageError("a paper recipe has times of its own", where="--budget", hint=hint)
+            raise UsageError("a paper recipe has times of its own", where="--time", hint=hint)
         _run_paper(recipe, output, quick, force, assignments or [], console)
         return
     if quick:
@@ -79,23 +79,23 @@ def run(
     )
     command = ["mbtf-pipeline", "run", str(recipe)]
     command += ["--quality", quality] if quality is not None else []
-    command += ["--budget", budget] if budget is not None else []
+    command += ["--time", time] if time is not None else []
     command += ["-o", str(output)] if output is not None else []
     command += [part for a in assignments or [] for part in ("--set", a)]
-    if budget is not None:
-        loaded = _budgeted(loaded, budget, output, shlex.join(command), console)
+    if time is not None:
+        loaded = _split(loaded, time, output, shlex.join(command), console)
     result = run_recipe(loaded, output, force=force, command=shlex.join(command), console=console)
     console.report(_summary(result), _describe(result))
 
 
-def _budgeted(loaded: Recipe, budget: str, output: Path | None, command: str, console: Console) -> Recipe:
+def _split(loaded: Recipe, time: str, output: Path | None, command: str, console: Console) -> Recipe:
     from mbtf_core.units import asked_duration
-    from mbtf_pipeline.cost_study.time_split import split_budget, within_budget
+    from mbtf_pipeline.cost_study.time_split import split_time, with_split
 
-    seconds = asked_duration(budget, "--budget")
-    split = split_budget(loaded, seconds, output or loaded.folder, command, console.note)
+    seconds = asked_duration(time, "--time")
+    split = split_time(loaded, seconds, output or loaded.folder, command, console.note)
     console.note(split.describe())
-    return within_budget(loaded, split)
+    return with_split(loaded, split)
 
 
 def _run_paper(
@@ -247,15 +247,15 @@ def cost(
     *,
     output: Output = None,
     time: str | None = None,
-    narrow: str | None = None,
+    refine: str | None = None,
     seed: int | None = None,
     assignments: Set | None = None,
     console: Console = CONSOLE,
 ) -> None:
     """Measure what accuracy costs in time, on this material and machine: mbtf-pipeline cost RECIPE
 
-    Writes cost.html, cost.csv and PNGs. The same command again goes on where it stopped. A longer time keeps
-    the generator's settings that were measured, adds others, and makes longer chains.
+    Writes cost.html, cost.csv and PNGs. The same command resumes. A longer time keeps the measurements of the
+    generator and of whole runs, and adds longer runs.
 
     Parameters
     ----------
@@ -264,24 +264,23 @@ def cost(
     output
         Folder of the study. Default: out/NAME-cost
     time
-        Budget: 90s, 10min, 1h. Default: that of the study in the folder, 10min for a new one
-    narrow
-        Afterwards so much more: chains whose errors are known to worse than ± 10 % (95 %) again with other
-        seeds.
+        Time of the study: 90s, 10min, 1h. Default: that of the study in the folder, 10min for a new one
+    refine
+        Additional time: repeats runs with further seeds until their 95 % intervals are within ±10 %.
     seed
-        Of queries, paths and first weights. Default: the recipe's
+        Of queries, paths and initial weights. Default: the recipe's
     """
     from mbtf_core.units import asked_duration, format_duration
-    from mbtf_pipeline.cost_study.page import whole_chains, write_page
-    from mbtf_pipeline.cost_study.study import budget_of, run_study
+    from mbtf_pipeline.cost_study.page import whole_runs, write_page
+    from mbtf_pipeline.cost_study.study import run_study, time_of
     from mbtf_pipeline.recipe import load_recipe
 
-    more = 0.0 if narrow is None else asked_duration(narrow, "--narrow")
+    more = 0.0 if refine is None else asked_duration(refine, "--refine")
     loaded = load_recipe(recipe, assignments or [])
     folder = output if output is not None else loaded.folder.with_name(f"{loaded.folder.name}-cost")
-    budget = budget_of(folder) if time is None else asked_duration(time, "--time")
-    command = ["mbtf-pipeline", "cost", str(recipe), "--time", time or format_duration(budget)]
-    command += ["--narrow", narrow] if narrow is not None else []
+    seconds = time_of(folder) if time is None else asked_duration(time, "--time")
+    command = ["mbtf-pipeline", "cost", str(recipe), "--time", time or format_duration(seconds)]
+    command += ["--refine", refine] if refine is not None else []
     command += ["-o", str(output)] if output is not None else []
     command += ["--seed", str(seed)] if seed is not None else []
     command += [part for a in assignments or [] for part in ("--set", a)]
@@ -289,27 +288,28 @@ def cost(
         study = run_study(
             loaded,
             folder,
-            budget=budget,
-            narrow=more,
+            seconds=seconds,
+            refine=more,
             seed=seed,
             command=shlex.join(command),
-            tell=lambda share, note: bar.update(round(100 * share, 1), note),
+            progress=lambda share, note: bar.update(round(100 * share, 1), note),
         )
     page = write_page(study)
     from mbtf_pipeline.cost_study.pareto import pareto_front
 
-    front = pareto_front(whole_chains(study.points))
-    lines = [f"{page}: {len(study.points)} settings measured, {len(study.skipped)} not for lack of time"]
-    lines += [f"could not be measured: {text}" for text in study.failed]
-    lines += [f"  {p.seconds.value:.0f} s: unexplained variance {p.error}   {p.command}" for p in front]
+    front = pareto_front(whole_runs(study.measurements))
+    measured, skipped = len(study.measurements), len(study.skipped)
+    lines = [f"{page}: {measured} configurations measured, {skipped} skipped for lack of time"]
+    lines += [f"failed: {text}" for text in study.failed]
+    lines += [f"  {m.seconds.value:.0f} s: unexplained variance {m.error}   {m.command}" for m in front]
     data = {
         "page": page,
-        "points": len(study.points),
+        "measurements": len(study.measurements),
         "skipped": study.skipped,
         "failed": study.failed,
         "front": [
-            {"seconds": p.seconds.value, "unexplained": p.error.as_dict(), "command": p.command}
-            for p in front
+            {"seconds": m.seconds.value, "unexplained": m.error.as_dict(), "command": m.command}
+            for m in front
         ],
     }
     console.report(data, "\n".join(lines))
