@@ -72,9 +72,9 @@ def make_data(name: str, folder: Path, layout: str) -> Path:
 
 
 # Options of a model, under the name that its figures have.
-LIFTED = "neumip-lifted"
+XYZ = "neumip-xyz"
 OPTIONS: dict[str, dict[str, Any]] = {
-    LIFTED: {"model": "neumip", "network": {"encoding": {"lifted": True}}},
+    XYZ: {"model": "neumip", "network": {"encoding": {"direction_xyz": True}}},
 }
 
 
@@ -109,7 +109,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, required=True, help="folder to work in")
     parser.add_argument("--steps", type=int, default=1500)
     parser.add_argument("--hierarchical", type=int, help="steps of hierarchical; not trained by default")
-    parser.add_argument("--direction-xyz", action="store_true", help=f"train {LIFTED}, too")
+    parser.add_argument("--direction-xyz", action="store_true", help=f"train {XYZ}, too")
     parser.add_argument("--only", nargs="*", choices=list(MATERIALS), help="of these; all by default")
     arguments = parser.parse_args()
     record = arguments.out / "materials.json"
@@ -117,7 +117,7 @@ def main() -> int:
     found: dict[str, Any] = json.loads(record.read_text()) if record.exists() else {}
     runs = [("neumip-baseline", arguments.steps), ("neumip", arguments.steps)]
     if arguments.direction_xyz:
-        runs.append((LIFTED, arguments.steps))
+        runs.append((XYZ, arguments.steps))
     if arguments.hierarchical:
         runs += [("neumip", arguments.hierarchical), ("hierarchical", arguments.hierarchical)]
     for name in arguments.only or MATERIALS:

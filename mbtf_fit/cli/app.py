@@ -10,7 +10,13 @@ from cyclopts import Parameter
 from mbtf_core.console import CONSOLE, Console, clock, new_app
 from mbtf_core.errors import InputError, PartialError, UsageError
 from mbtf_core.suggest import suggest_path
-from mbtf_fit.formatting import describe_errors, describe_fit, describe_transmittance, number, table
+from mbtf_fit.formatting import (
+    describe_errors,
+    describe_fit,
+    describe_transmittance,
+    format_estimate,
+    format_table,
+)
 from mbtf_fit.mitsuba_plugin.preview.command import preview
 from mbtf_gen.config.presets import Quality, as_assignments
 
@@ -42,7 +48,7 @@ def fit(
     time: str | None = None,
     steps: int | None = None,
     batch: int | None = None,
-    rate: float | None = None,
+    learning_rate: float | None = None,
     seed: int | None = None,
     device: Literal["auto", "cpu", "cuda"] | None = None,
     config: Path | None = None,
@@ -74,8 +80,8 @@ def fit(
         Train this many steps instead, however long they take.
     batch
         Queries per step.
-    rate
-        Largest learning rate of the networks.
+    learning_rate
+        Peak learning rate of the networks.
     seed
         Seed of the first parameters and of the order of batches.
     device
@@ -107,7 +113,7 @@ def fit(
         "training.time": time,
         "training.steps": steps,
         "training.batch": batch,
-        "training.rate": rate,
+        "training.learning_rate": learning_rate,
         "seed": seed,
         "device": device,
     }
@@ -151,13 +157,13 @@ def fit(
             shards,
             output,
             overwrite=overwrite,
-            progress=lambda share, note: bar.update(round(100 * share, 1), note),
+            progress=lambda fraction, note: bar.update(round(100 * fraction, 1), note),
         )
     if finished:
         console.note(f"{output}: this fit is finished, nothing was trained; --overwrite trains it again")
     data = result.as_dict()
-    price = [result.price.describe()] if result.price is not None else []
-    console.report(data, "\n".join([describe_fit(data), *price]))
+    cost = [result.marginal_cost.describe()] if result.marginal_cost is not None else []
+    console.report(data, "\n".join([describe_fit(data), *cost]))
 
 
 def _fit_many(
@@ -168,7 +174,7 @@ def _fit_many(
     overwrite: bool,
     console: Console,
 ) -> None:
-    from mbtf_fit.training.fit_many import Outcome, find_data, fit_many, name_materials
+    from mbtf_fit.training.fit_many import FitOutcome, find_data, fit_many, name_materials
 
     shards = find_data(many)
     folders = name_materials(shards, output)
@@ -179,7 +185,7 @@ def _fit_many(
     console.note(f"{len(shards)} data sets -> {output}: {config.model}, {processes} at a time")
     with console.progress(total=len(shards), label="fitting", unit="data sets") as bar:
 
-        def finished(outcome: Outcome) -> None:
+        def finished(outcome: FitOutcome) -> None:
             bar.advance(1, f"{outcome.folder.name}: {'failed' if outcome.error else 'done'}")
 
         outcomes = fit_many(
@@ -195,12 +201,12 @@ def _fit_many(
         rows.append(
             [
                 outcome.folder.name,
-                number(test["unexplained"]),
+                format_estimate(test["unexplained"]),
                 str(training["steps"]),
                 clock(training["seconds"]),
             ]
         )
-    console.report({"fits": [o.as_dict() for o in outcomes]}, table(rows))
+    console.report({"fits": [o.as_dict() for o in outcomes]}, format_table(rows))
     failed = [o for o in outcomes if o.error is not None]
     for outcome in failed:
         console.note(f"{outcome.shards}: {outcome.error}")
@@ -317,9 +323,9 @@ def export_material(
             data=description["data"],
             training=description["training"],
             half=half,
-            holes=written.holes,
+            transmittance=written.transmittance,
         )
-        files += [WEIGHTS_NAME, DESCRIPTION_NAME, *([TRANSMITTANCE_NAME] if loaded.holes else [])]
+        files += [WEIGHTS_NAME, DESCRIPTION_NAME, *([TRANSMITTANCE_NAME] if loaded.transmittance else [])]
     sizes = {name: (folder / name).stat().st_size for name in files}
     lines = [f"{folder / name}: {size / 1e6:.3f} MB" for name, size in sizes.items()]
     console.report(
@@ -357,7 +363,7 @@ def _shards_info(path: Path) -> tuple[dict[str, Any], str]:
     splits = {
         s: {"shards": len(data.shards(s)), "rows": sum(x.rows for x in data.shards(s))} for s in data.splits
     }
-    kind = "queries" if data.layout == "shuffled" else "buffers"
+    kind = "queries" if data.layout == "shuffled" else "images"
     lines = [
         f"{path}: shards, {data.layout} layout",
         f"levels 0 to {lattice.finest}, finest {columns} x {rows} texels, aspect {lattice.aspect:g}",

@@ -25,8 +25,8 @@ PRESET = "neumip of the presets"
 MODELS_OF_PAPERS = ("neumip", "neumip-baseline")
 SIZES: dict[str, dict[str, object]] = {
     "40 wide": {"width": 40},
-    "40 wide, 12 channels, z": {"width": 40, "channels": 12, "encoding": {"lifted": True}},
-    "64 wide, 16 channels, z": {"width": 64, "channels": 16, "encoding": {"lifted": True}},
+    "40 wide, 12 channels, z": {"width": 40, "channels": 12, "encoding": {"direction_xyz": True}},
+    "64 wide, 16 channels, z": {"width": 64, "channels": 16, "encoding": {"direction_xyz": True}},
 }
 _FEWEST_QUERIES = 20_000
 
@@ -68,7 +68,7 @@ def _preset(seconds: float) -> dict[str, object]:
 def _plain(model: str, seconds: float, network: dict[str, object] | None = None) -> dict[str, object]:
     """A fit as in the paper of its model, except for `network`."""
     options = {} if network is None else {"network": network}
-    return {"model": model, "training": {"time": f"{seconds:.3g}s", "weight_decay": 0.0}, **options}
+    return {"model": model, "training": {"time": f"{seconds:.3g}s", "noise_regularization": 0.0}, **options}
 
 
 def _whole(seconds: float, spp: int, query_seconds: QuerySeconds) -> Iterator[Run]:

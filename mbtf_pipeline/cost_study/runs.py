@@ -26,7 +26,7 @@ from mbtf_pipeline.cost_study.measurements import Measurement
 from mbtf_pipeline.stages import hash_of
 
 if TYPE_CHECKING:
-    from mbtf_fit.data.loader import Queries
+    from mbtf_fit.data.queries import ShardQueries
 
 # Test queries, and paths of each.
 TEST = (1 << 20, 8)
@@ -111,7 +111,7 @@ class RunRunner:
         self._overhead = _OVERHEAD
         # Folder and seconds by request.
         self._data: dict[DataRequest, tuple[Path, float]] = {}
-        self._test_set: Queries | None = None
+        self._test_set: ShardQueries | None = None
 
     def clear(self) -> None:
         """Remove data and fits."""
@@ -159,7 +159,7 @@ class RunRunner:
         generating = 0.0 if self.has(run.data) else run.data.queries * self.query_seconds(run.data.spp)
         return generating + parse_duration(run.fit["training"].get("time", 0.0))
 
-    def test_set(self) -> Queries:
+    def test_set(self) -> ShardQueries:
         """The test queries of all runs."""
         if self._test_set is None:
             from mbtf_fit.data.loader import load_split
@@ -228,7 +228,7 @@ def _flat(options: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return out
 
 
-def _evaluation_seconds(material: Any, test: Queries) -> float:
+def _evaluation_seconds(material: Any, test: ShardQueries) -> float:
     """Seconds for one query per pixel of 1080p, at random queries."""
     rows = np.resize(np.arange(len(test)), _TIMED_QUERIES)
     arrays = [getattr(test, name)[rows] for name in ("u", "sigma", "omega_i", "omega_o")]

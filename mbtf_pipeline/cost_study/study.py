@@ -166,7 +166,7 @@ def run_study(
     """
     clock = _Clock(seconds, refine)
     config = study_config(recipe.generate, seed)
-    material = load_material(Path(config.material), config.geometry.tile)
+    material = load_material(Path(config.material), config.geometry.make_tileable)
     claim(folder)
     with locked(folder, STUDY_NAME):
         description = {

@@ -207,7 +207,7 @@ def _generating(config: GeneratorConfig) -> tuple[float, float]:
     from mbtf_gen.material.material import load_material
     from mbtf_gen.planning.effects_plan import plan_effects
 
-    job = Job.of(config, load_material(Path(config.material), config.geometry.tile))
+    job = Job.of(config, load_material(Path(config.material), config.geometry.make_tileable))
     expected = forecast(job, allocated(job, plan_effects(job, pilots=False)))
     query = max(expected.query_seconds, _CHEAPEST)
     return query, expected.start + max(0.0, expected.seconds - job.queries("train") * query)
@@ -250,7 +250,7 @@ def _line(points: Sequence[tuple[float, float]]) -> tuple[float, float]:
 def most_queries(recipe: Recipe, folder: Path) -> int:
     """Training queries that disk and memory hold: a quarter of the free space of `folder`, and the larger of
     ``data.memory`` of the fits and half of the machine's memory."""
-    from mbtf_fit.data.loader import QUERY_BYTES
+    from mbtf_fit.data.queries import QUERY_BYTES
     from mbtf_gen.forecast import row_bytes
 
     size = row_bytes(holes=True)
