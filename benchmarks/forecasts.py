@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
-from quality import HEIGHTS, generator_config, source
+from quality import HEIGHT_SCALES, generator_config, source
 
 from mbtf_core.config_file import resolve
 from mbtf_core.errors import MbtfError
@@ -115,7 +115,7 @@ def main() -> int:
     fits: list[dict[str, Any]] = []
     try:
         load_mitsuba()
-        for name in arguments.materials or [*ASSETS, *HEIGHTS]:
+        for name in arguments.materials or [*ASSETS, *HEIGHT_SCALES]:
             if not source(name)[0].is_dir():
                 print(f"{name}: left out, {source(name)[0]} is missing", file=sys.stderr)
                 continue

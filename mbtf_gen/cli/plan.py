@@ -11,7 +11,6 @@ from mbtf_core.console import CONSOLE, Console
 from mbtf_core.shard_schema import Tiling
 from mbtf_gen.cli.common import QualityOption, Set, general, resolve_config
 from mbtf_gen.config.presets import GENERATOR, as_assignments
-from mbtf_gen.config.quality_measured import expected as expected_of
 
 if TYPE_CHECKING:
     from mbtf_gen.planning.effects import Effect, EffectsPlan
@@ -111,11 +110,6 @@ def plan(
     found = measured(job, found)
     data = {**found.to_manifest(), "forecast": expected.as_dict()}
     text = f"{table(found)}\n{expected.describe(job.target('train'))}"
-    if quality is not None and (measured_line := expected_of().line(quality)) is not None:
-        text += (
-            f"\nwhole chains to material and report on {expected_of().machine}, {1 << expected_of().levels} "
-            f"texels across: {measured_line}"
-        )
     console.report(data, text)
 
 
