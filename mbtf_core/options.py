@@ -41,7 +41,8 @@ _METAVARS = {int: "INT", float: "FLOAT"}
 Switch = Annotated[bool, Parameter(negative="", show_default=False)]
 Output = Annotated[Path, Parameter(name=["--output", "-o"], help="Output folder.")]
 Overwrite = Annotated[Switch, Parameter(help="Start anew: replace what the output folder holds.")]
-Time = Annotated[str | None, Parameter(metavar="DURATION", help="Time the command may take: 90s, 2min, 1h.")]
+Time = Annotated[str | None, Parameter(metavar="DURATION", help="Time budget: 90s, 2min, 1h.")]
+DryRun = Annotated[Switch, Parameter(help="Write nothing; only report what would be done.")]
 Config = Annotated[Path | None, Parameter(help="YAML file with the options.")]
 Set = Annotated[
     list[str] | None,
@@ -116,7 +117,7 @@ def _walk(model: type[BaseModel], prefix: str) -> typing.Iterator[ConfigOption]:
 
 def _option(flag: Flag, key: str, field: FieldInfo) -> ConfigOption:
     text, _, default = (field.description or "").partition(_DEFAULT)
-    kind = _without_none(field.annotation)
+    kind = _bare(field.annotation)
     choices = typing.get_origin(kind) is Literal
     return ConfigOption(
         flag.name,
@@ -128,10 +129,13 @@ def _option(flag: Flag, key: str, field: FieldInfo) -> ConfigOption:
     )
 
 
-def _without_none(annotation: Any) -> Any:
+def _bare(annotation: Any) -> Any:
+    """A type without None and metadata."""
+    if typing.get_origin(annotation) is Annotated:
+        return _bare(typing.get_args(annotation)[0])
     if typing.get_origin(annotation) in (Union, types.UnionType):
         kept = [part for part in typing.get_args(annotation) if part is not type(None)]
-        return _without_none(kept[0]) if len(kept) == 1 else annotation
+        return _bare(kept[0]) if len(kept) == 1 else annotation
     return annotation
 
 
@@ -171,14 +175,14 @@ class Options(Generic[S]):
     config: Path | None = None
     assignments: Sequence[str] = ()
 
-    def resolve(self, presets: Sequence[str] = (), **arguments: str | None) -> S:
+    def resolve(self, presets: Sequence[str] = (), **arguments: Any) -> S:
         """The configuration: defaults, file, presets, assignments, flags.
 
         Parameters
         ----------
         presets : ``a.b=c`` that assignments and flags override
-        arguments : paths by key that were given without a flag; one that only the file gives is relative to
-            the file, so that the file works from anywhere
+        arguments : values by key that have no flag; a path that is None here and that the file gives is
+            relative to the file, so that the file works from anywhere
 
         Raises
         ------
@@ -227,18 +231,22 @@ def takes_options(model: type[BaseModel], *keys: str) -> Callable[[C], C]:
             own = parameter.replace(annotation=hints[parameter.name])
             parameters += generated if parameter.name == "options" else [own]
 
-        @functools.wraps(command)
-        def run(*args: Any, **kwargs: Any) -> Any:
-            values = {o.key: kwargs.pop(o.parameter, None) for o in options}
-            given = Options(
+        def read(arguments: dict[str, Any]) -> Options[Any]:
+            values = {o.key: arguments.pop(o.parameter, None) for o in options}
+            return Options(
                 model,
                 {o.key: o.flag for o in options},
                 {key: value for key, value in values.items() if value is not None},
-                kwargs.pop("config", None),
-                kwargs.pop("assignments", None) or (),
+                arguments.pop("config", None),
+                arguments.pop("assignments", None) or (),
             )
-            return command(*args, options=given, **kwargs)
 
+        @functools.wraps(command)
+        def run(*args: Any, **kwargs: Any) -> Any:
+            return command(*args, options=read(kwargs), **kwargs)
+
+        # For tests of documented commands.
+        run.config_options, run.read_options = options, read  # type: ignore[attr-defined]
         run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         run.__annotations__ = {p.name: p.annotation for p in parameters} | {"return": hints["return"]}
         return typing.cast(C, run)
