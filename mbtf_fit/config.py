@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, PlainSerializer, model_validator
 
 from mbtf_core.config_file import Settings, deep_merge
+from mbtf_core.options import Flag
 from mbtf_core.sizes import format_size, parse_size
 from mbtf_core.units import format_duration, parse_duration
 
@@ -87,9 +88,13 @@ class LossTerm(Settings):
 class TrainingSection(Settings):
     """How long and how a model is trained."""
 
-    time: Duration = Field(120.0, description="budget: 90s, 2min, 1h")
-    steps: int | None = Field(None, ge=1, description="train this many steps, however long they take")
-    batch: int = Field(1 << 15, ge=1, le=1 << 24, description="queries per step")
+    time: Annotated[Duration, Flag("--time", "DURATION")] = Field(
+        120.0, description="time budget: 90s, 2min, 1h"
+    )
+    steps: Annotated[int | None, Flag("--steps")] = Field(
+        None, ge=1, description="number of training steps, in place of a time"
+    )
+    batch: Annotated[int, Flag("--batch")] = Field(1 << 15, ge=1, le=1 << 24, description="queries per step")
     crop: int = Field(
         32,
         ge=1,
@@ -106,7 +111,9 @@ class TrainingSection(Settings):
     robust: float | None = Field(
         10.0, gt=0, description="errors beyond so many times noise and value count linearly; null: never"
     )
-    rate: float = Field(3e-2, gt=0, lt=1, description="largest learning rate of the networks (Adam)")
+    rate: Annotated[float, Flag("--learning-rate")] = Field(
+        3e-2, gt=0, lt=1, description="peak learning rate of the networks (Adam)"
+    )
     texture_rate: float = Field(1e-2, gt=0, lt=1, description="largest learning rate of the textures")
     final_rate: float = Field(0.01, gt=0, le=1, description="share of the rates that is left at the end")
     decay: float = Field(
@@ -133,9 +140,8 @@ class TrainingSection(Settings):
 class DataSection(Settings):
     """How the data are read; what is fitted does not depend on it."""
 
-    memory: Size = Field(
-        4e9,
-        description="training queries that take more are left on disk and read as needed: 500MB, 4GB",
+    memory: Annotated[Size, Flag("--memory", "SIZE")] = Field(
+        4e9, description="memory for training queries: 500MB, 4GB; larger data are streamed from disk"
     )
 
 
@@ -177,16 +183,20 @@ class FitConfig(Settings):
     """Everything ``mbtf-fit`` needs besides the shards."""
 
     version: Literal[1] = 1
-    model: ModelName = Field("neumip", description="model by name")
-    start: str | None = Field(
-        None, description="folder of a material whose textures and offset training starts from"
+    model: Annotated[ModelName, Flag("--model")] = Field("neumip", description="model to fit")
+    start: Annotated[str | None, Flag("--init-from", "FOLDER")] = Field(
+        None, description="folder of a material that initializes textures and offset"
     )
     network: NetworkSection = NetworkSection()
     training: TrainingSection = TrainingSection()
     held_out: HeldOutSection = HeldOutSection()
     data: DataSection = DataSection()
-    seed: int = Field(0, ge=0, lt=1 << 63, description="of the first parameters and the order of batches")
-    device: Literal["auto", "cpu", "cuda"] = Field("auto", description="auto: cuda where there is one")
+    seed: Annotated[int, Flag("--seed")] = Field(
+        0, ge=0, lt=1 << 63, description="root seed of all random numbers"
+    )
+    device: Annotated[Literal["auto", "cpu", "cuda"], Flag("--device")] = Field(
+        "auto", description="processor that trains; auto: cuda if available"
+    )
 
     @model_validator(mode="before")
     @classmethod

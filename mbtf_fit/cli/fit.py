@@ -33,7 +33,8 @@ def fit(
     """Fit a material to a data set: mbtf-fit shards/ -o material/
 
     The same command again resumes an unfinished fit. --time is that of training. --dry-run forecasts time,
-    error and size by two short fits on this machine. With --many, the output folder holds one folder per material.
+    error and size by two short fits on this machine. With --many, the output folder holds one folder per
+    material.
 
     Parameters
     ----------

@@ -232,7 +232,7 @@ class RunRunner:
 
 def _quiet_job(config: GeneratorConfig) -> Job:
     """The job of a configuration whose material was spoken of before."""
-    return Job.of(config, load_material(Path(config.material), config.geometry.tile))
+    return Job.of(config, load_material(Path(config.material), config.geometry.make_tileable))
 
 
 def _flat(options: dict[str, Any], prefix: str = "") -> dict[str, Any]:

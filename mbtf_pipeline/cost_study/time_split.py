@@ -265,7 +265,7 @@ def _plan(recipe: Recipe, budget: float, folder: Path, tell: Callable[[str], Non
 def _material(config: GeneratorConfig) -> Any:
     from mbtf_gen.material.material import load_material
 
-    return load_material(Path(config.material), config.geometry.tile)
+    return load_material(Path(config.material), config.geometry.make_tileable)
 
 
 def _prices(expected: Forecast, queries: int) -> tuple[float, float]:

@@ -39,7 +39,7 @@ def draw(config: PreviewConfig, path: Path, *, overwrite: bool, console: Console
     columns = len(sheet.views) * len(sheet.lights)
     shows = {
         SHEET_NAME: f"{len(sheet.views)} views x {len(sheet.lights)} lights (columns) x "
-        f"{len(sheet.spans)} zooms (rows), {columns * len(sheet.spans)} pictures at one exposure",
+        f"{len(sheet.tiles_across)} zooms (rows), {columns * len(sheet.tiles_across)} pictures, one exposure",
         TURNTABLE_NAME: f"a ball of {turn.tiles} tiles around on a plate, {turn.frames} pictures of "
         f"{turn.spp} paths per pixel",
     }
