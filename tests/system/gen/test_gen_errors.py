@@ -48,7 +48,7 @@ CASES: dict[str, tuple[str, int, list[str]]] = {
         ["config.yaml:3", "'queries.mincos'"],
     ),
     "config without a file": ("heights.npy --config no.yaml", INPUT, ["no.yaml", "no such file"]),
-    "other schema": ("verify schema", INPUT, ["schema 99", "schema 1"]),
+    "other schema": ("verify schema", INPUT, ["schema 99", "schema 2"]),
     "merge of another schema": ("merge schema", INPUT, ["schema 99"]),
     "verify an empty folder": ("verify empty", INPUT, ["empty", "manifest.json"]),
     "merge an empty folder": ("merge empty", INPUT, ["empty", "manifest.json"]),
