@@ -116,7 +116,8 @@ def test_planted_faults_are_found(line: str) -> None:
 
 def test_commands_are_found_where_they_stand() -> None:
     page = (
-        "Run `mbtf-gen doctor` first.\n\n```sh\n$ A=1 .venv/bin/mbtf-gen a.exr \\\n    -o out/   # a note\n```\n\n"
+        "Run `mbtf-gen doctor` first.\n\n"
+        "```sh\n$ A=1 .venv/bin/mbtf-gen a.exr \\\n    -o out/   # a note\n```\n\n"
         "    mbtf-fit out/ && mbtf-pipeline list | head\n"
     )
     assert {shown.text for shown in in_markdown(page, "")} == {

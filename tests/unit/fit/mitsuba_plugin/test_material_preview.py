@@ -152,7 +152,7 @@ def test_a_folder_that_is_no_material_is_refused_before_anything_is_made(
         (3, "no material.json", str(tmp_path), "-o", str(tmp_path / "out")),
         (
             2,
-            "--tiles-across: 'sheet.tiles_across': must be numbers separated by commas",
+            "--tiles-across: 'sheet.tiles_across': must be numbers",
             "m",
             "--tiles-across",
             "1;2",
