@@ -5,7 +5,7 @@
 For each material two data sets of as many queries and paths are made at 64 × 64 texels, one per layout, and
 ``neumip`` and ``neumip-baseline`` are trained for ``--steps`` steps of 32 768 queries. Both are judged by the
 same shuffled test queries. ``--hierarchical`` also trains ``hierarchical`` on windows of the image layout,
-and ``neumip`` for as many steps; ``--lifted`` also trains ``neumip`` with directions as (x, y, z).
+and ``neumip`` for as many steps; ``--direction-xyz`` also trains ``neumip`` with directions as (x, y, z).
 
 What is reached depends on steps alone: the call may share its processor, may be interrupted, and goes on
 where it was. Texture sets that are not there are skipped by name.
@@ -72,9 +72,9 @@ def make_data(name: str, folder: Path, layout: str) -> Path:
 
 
 # Options of a model, under the name that its figures have.
-LIFTED = "neumip-lifted"
+XYZ = "neumip-xyz"
 OPTIONS: dict[str, dict[str, Any]] = {
-    LIFTED: {"model": "neumip", "network": {"encoding": {"lifted": True}}},
+    XYZ: {"model": "neumip", "network": {"encoding": {"direction_xyz": True}}},
 }
 
 
@@ -109,15 +109,15 @@ def main() -> int:
     parser.add_argument("--out", type=Path, required=True, help="folder to work in")
     parser.add_argument("--steps", type=int, default=1500)
     parser.add_argument("--hierarchical", type=int, help="steps of hierarchical; not trained by default")
-    parser.add_argument("--lifted", action="store_true", help=f"train {LIFTED}, too")
+    parser.add_argument("--direction-xyz", action="store_true", help=f"train {XYZ}, too")
     parser.add_argument("--only", nargs="*", choices=list(MATERIALS), help="of these; all by default")
     arguments = parser.parse_args()
     record = arguments.out / "materials.json"
     arguments.out.mkdir(parents=True, exist_ok=True)
     found: dict[str, Any] = json.loads(record.read_text()) if record.exists() else {}
     runs = [("neumip-baseline", arguments.steps), ("neumip", arguments.steps)]
-    if arguments.lifted:
-        runs.append((LIFTED, arguments.steps))
+    if arguments.direction_xyz:
+        runs.append((XYZ, arguments.steps))
     if arguments.hierarchical:
         runs += [("neumip", arguments.hierarchical), ("hierarchical", arguments.hierarchical)]
     for name in arguments.only or MATERIALS:

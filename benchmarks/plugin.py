@@ -54,7 +54,7 @@ def random_material(folder: Path, levels: int) -> None:
     from mbtf_core.lattice import Lattice
     from mbtf_fit.config import FitConfig
     from mbtf_fit.material.material import export
-    from mbtf_fit.models import build_model
+    from mbtf_fit.models.registry import build_model
 
     model = build_model("neumip", Lattice(levels))
     model.initialize(torch.Generator().manual_seed(0), 0.2)

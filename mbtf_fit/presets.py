@@ -17,8 +17,8 @@ _SIZES = (
     (0.0, {"network.width": 40, "network.channels": 12}),
     (300.0, {"network.width": 64, "network.channels": 16}),
 )
-_DIRECTIONS: dict[str, Any] = {"network.encoding.lifted": True}
-_SMOOTHING: dict[str, Any] = {"training.decay": 1.0, "training.blur.floor": 0.8}
+_DIRECTIONS: dict[str, Any] = {"network.encoding.direction_xyz": True}
+_SMOOTHING: dict[str, Any] = {"training.texture_weight_decay": 1.0, "training.blur.min_sigma": 0.8}
 # Models that these options were measured for.
 _MODELS = ("neumip", "neumip-baseline")
 

@@ -71,9 +71,9 @@ def export_material(
             data=description["data"],
             training=description["training"],
             half=half,
-            holes=written.holes,
+            transmittance=written.transmittance,
         )
-        files += [WEIGHTS_NAME, DESCRIPTION_NAME, *([TRANSMITTANCE_NAME] if loaded.holes else [])]
+        files += [WEIGHTS_NAME, DESCRIPTION_NAME, *([TRANSMITTANCE_NAME] if loaded.transmittance else [])]
     sizes = {name: (folder / name).stat().st_size for name in files}
     lines = [f"{folder / name}: {size / 1e6:.3f} MB" for name, size in sizes.items()]
     console.report(

@@ -12,7 +12,7 @@ from mbtf_core.console import CONSOLE, Console, clock
 from mbtf_core.errors import PartialError, UsageError
 from mbtf_core.options import DryRun, Options, Output, Overwrite, takes_options
 from mbtf_fit.config import FitConfig
-from mbtf_fit.formatting import describe_fit, number, table
+from mbtf_fit.formatting import describe_fit, format_estimate, format_table
 from mbtf_gen.config.presets import QualityOption, as_assignments
 
 
@@ -102,13 +102,13 @@ def fit(
             shards,
             output,
             overwrite=overwrite,
-            progress=lambda share, note: bar.update(round(100 * share, 1), note),
+            progress=lambda fraction, note: bar.update(round(100 * fraction, 1), note),
         )
     if finished:
         console.note(f"{output}: this fit is finished, nothing was trained; --overwrite trains it again")
     data = result.as_dict()
-    price = [result.price.describe()] if result.price is not None else []
-    console.report(data, "\n".join([describe_fit(data), *price]))
+    cost = [result.marginal_cost.describe()] if result.marginal_cost is not None else []
+    console.report(data, "\n".join([describe_fit(data), *cost]))
 
 
 def _fit_many(
@@ -119,7 +119,7 @@ def _fit_many(
     overwrite: bool,
     console: Console,
 ) -> None:
-    from mbtf_fit.training.fit_many import Outcome, find_data, fit_many, name_materials
+    from mbtf_fit.training.fit_many import FitOutcome, find_data, fit_many, name_materials
 
     shards = find_data(many)
     folders = name_materials(shards, output)
@@ -130,7 +130,7 @@ def _fit_many(
     console.note(f"{len(shards)} data sets -> {output}: {config.model}, {processes} at a time")
     with console.progress(total=len(shards), label="fitting", unit="data sets") as bar:
 
-        def finished(outcome: Outcome) -> None:
+        def finished(outcome: FitOutcome) -> None:
             bar.advance(1, f"{outcome.folder.name}: {'failed' if outcome.error else 'done'}")
 
         outcomes = fit_many(
@@ -146,12 +146,12 @@ def _fit_many(
         rows.append(
             [
                 outcome.folder.name,
-                number(test["unexplained"]),
+                format_estimate(test["unexplained"]),
                 str(training["steps"]),
                 clock(training["seconds"]),
             ]
         )
-    console.report({"fits": [o.as_dict() for o in outcomes]}, table(rows))
+    console.report({"fits": [o.as_dict() for o in outcomes]}, format_table(rows))
     failed = [o for o in outcomes if o.error is not None]
     for outcome in failed:
         console.note(f"{outcome.shards}: {outcome.error}")

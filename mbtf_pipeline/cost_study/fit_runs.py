@@ -29,8 +29,8 @@ MODELS = ("neumip", "neumip-baseline")
 SIZES: dict[str, dict[str, object]] = {
     "16 wide": {"width": 16},
     "40 wide": {"width": 40},
-    "40 wide, 12 channels, z": {"width": 40, "channels": 12, "encoding": {"lifted": True}},
-    "64 wide, 16 channels, z": {"width": 64, "channels": 16, "encoding": {"lifted": True}},
+    "40 wide, 12 channels, z": {"width": 40, "channels": 12, "encoding": {"direction_xyz": True}},
+    "64 wide, 16 channels, z": {"width": 64, "channels": 16, "encoding": {"direction_xyz": True}},
 }
 _FEWEST_QUERIES = 20_000
 
@@ -48,7 +48,7 @@ def _queries(seconds: float, spp: int, price: Price) -> int:
 def _fit(model: str, seconds: float, network: dict[str, object] | None = None) -> dict[str, object]:
     """Options of a fit with a model as its paper has it, but for what `network` says."""
     options = {} if network is None else {"network": network}
-    return {"model": model, "training": {"time": f"{seconds:.3g}s", "weight_decay": 0.0}, **options}
+    return {"model": model, "training": {"time": f"{seconds:.3g}s", "noise_regularization": 0.0}, **options}
 
 
 def _best(seconds: float) -> dict[str, object]:

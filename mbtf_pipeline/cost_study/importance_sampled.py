@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.stats import Estimate, unexplained_variance
-from mbtf_fit.data.loader import Queries as FitQueries
+from mbtf_fit.data.queries import ShardQueries
 from mbtf_gen.planning.effects_plan import plan_effects
 from mbtf_gen.render.estimates import Stream
 from mbtf_gen.sampling.query_sampler import Queries
@@ -51,7 +51,7 @@ class Judges:
     weights : (n,) one over the probability with which each was taken
     """
 
-    queries: FitQueries
+    queries: ShardQueries
     weights: NDArray[np.float64]
 
     def unexplained(self, prediction: NDArray[np.float32]) -> Estimate:
@@ -95,9 +95,9 @@ def draw_judges(bench: GeneratorBenchmark, paths: int) -> Judges:
         taken = drawn.take(rows)
         found = estimator.estimate(taken, _SPP, Stream(bench.seed, "test", _PASS_ON + shard))
         halves = found.value_a, found.value_b
-        parts.append(FitQueries(taken.u, taken.sigma, taken.omega_i, taken.omega_o, *halves))
+        parts.append(ShardQueries(taken.u, taken.sigma, taken.omega_i, taken.omega_o, *halves))
         weights.append(1.0 / chance[rows])
-    return Judges(FitQueries.join(parts), np.concatenate(weights))
+    return Judges(ShardQueries.join(parts), np.concatenate(weights))
 
 
 def _cells(queries: Queries) -> NDArray[np.int64]:

@@ -207,7 +207,7 @@ def most_queries(recipe: Recipe, folder: Path) -> int:
     ----------
     folder : that they are written to; it exists
     """
-    from mbtf_fit.data.loader import QUERY_BYTES
+    from mbtf_fit.data.queries import QUERY_BYTES
     from mbtf_gen.forecast import row_bytes
 
     on_disk = _DISK * shutil.disk_usage(folder).free / row_bytes(holes=True)

@@ -45,7 +45,7 @@ seed: 7
 """
 FIT = """\
 model: neumip
-training: {time: 2min, batch: 1024, blur: {start: 4}}
+training: {time: 2min, batch: 1024, blur: {initial_sigma: 4}}
 held_out: {queries: 0.1, direction: [0.1, 0.2]}
 """
 RECIPE = """\

@@ -133,7 +133,7 @@ def test_a_cone_goes_on_through_a_hole_as_if_it_were_not_there(tmp_path: Path, s
     texel = np.zeros((1, 1, 6), np.float32)
     texel[..., 0] = 1.0
     hole = Transmittance(Lattice(0), [texel])
-    write_material(tmp_path / "sheet", finest=0, constant=(0.0,) * 3, holes=hole)
+    write_material(tmp_path / "sheet", finest=0, constant=(0.0,) * 3, transmittance=hole)
     camera = Camera(elevation=55.0, tiles_across=3.0, rows=6, columns=6)
     at = mi.ScalarTransform4f().translate([0, 0, share * float(camera.position[2])]).scale(300.0)
     scene = {
