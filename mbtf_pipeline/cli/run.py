@@ -66,12 +66,12 @@ def run(
     loaded = load_recipe(recipe, [*quality_assignments(recipe, quality, own), *own])
     if time is not None:
         from mbtf_core.units import asked_duration
-        from mbtf_pipeline.cost_study.time_split import split_budget, within_budget
+        from mbtf_pipeline.cost_study.time_split import split_time, with_split
 
         seconds = asked_duration(time, "--time")
-        split = split_budget(loaded, seconds, output or loaded.folder, command, console.note)
+        split = split_time(loaded, seconds, output or loaded.folder, command, console.note)
         console.note(split.describe())
-        loaded = within_budget(loaded, split)
+        loaded = with_split(loaded, split)
     result = run_recipe(loaded, output, force=force, command=command, console=console)
     console.report(_summary(result), _describe(result))
 
