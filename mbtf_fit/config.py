@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, PlainSerializer, model_validator
 
 from mbtf_core.config_file import Settings, deep_merge
+from mbtf_core.options import Flag
 from mbtf_core.sizes import format_size, parse_size
 from mbtf_core.units import format_duration, parse_duration
 
@@ -94,9 +95,13 @@ class LossTerm(Settings):
 class TrainingSection(Settings):
     """Budget, loss and optimizer."""
 
-    time: Duration = Field(120.0, description="training time: 90s, 2min, 1h")
-    steps: int | None = Field(None, ge=1, description="number of steps, in place of a training time")
-    batch: int = Field(1 << 15, ge=1, le=1 << 24, description="queries per step")
+    time: Annotated[Duration, Flag("--time", "DURATION")] = Field(
+        120.0, description="time budget: 90s, 2min, 1h"
+    )
+    steps: Annotated[int | None, Flag("--steps")] = Field(
+        None, ge=1, description="number of training steps, in place of a time"
+    )
+    batch: Annotated[int, Flag("--batch")] = Field(1 << 15, ge=1, le=1 << 24, description="queries per step")
     patch_size: int = Field(
         32,
         ge=1,
@@ -118,7 +123,9 @@ class TrainingSection(Settings):
         description="Huber threshold: errors beyond this multiple of value and noise count linearly; "
         "null: no threshold",
     )
-    learning_rate: float = Field(3e-2, gt=0, lt=1, description="peak learning rate of the networks (Adam)")
+    learning_rate: Annotated[float, Flag("--learning-rate")] = Field(
+        3e-2, gt=0, lt=1, description="peak learning rate of the networks (Adam)"
+    )
     texture_learning_rate: float = Field(1e-2, gt=0, lt=1, description="peak learning rate of the textures")
     final_learning_rate_factor: float = Field(
         0.01, gt=0, le=1, description="last learning rate over the peak learning rate"
@@ -147,9 +154,8 @@ class TrainingSection(Settings):
 class DataSection(Settings):
     """Reading of the data; the fit does not depend on it."""
 
-    memory: Size = Field(
-        4e9,
-        description="memory for training queries: 500MB, 4GB; larger data are streamed from disk",
+    memory: Annotated[Size, Flag("--memory", "SIZE")] = Field(
+        4e9, description="memory for training queries: 500MB, 4GB; larger data are streamed from disk"
     )
 
 
@@ -215,18 +221,20 @@ class FitConfig(Settings):
     """
 
     version: Literal[2] = 2
-    model: ModelName = Field("neumip", description="model to fit")
-    init_from: str | None = Field(
+    model: Annotated[ModelName, Flag("--model")] = Field("neumip", description="model to fit")
+    init_from: Annotated[str | None, Flag("--init-from", "FOLDER")] = Field(
         None, description="folder of a material that initializes textures and offset"
     )
     network: NetworkSection = NetworkSection()
     training: TrainingSection = TrainingSection()
     held_out: HeldOutSection = HeldOutSection()
     data: DataSection = DataSection()
-    seed: int = Field(
-        0, ge=0, lt=1 << 63, description="seed of the initial parameters and of the batch order"
+    seed: Annotated[int, Flag("--seed")] = Field(
+        0, ge=0, lt=1 << 63, description="root seed of all random numbers"
     )
-    device: Literal["auto", "cpu", "cuda"] = Field("auto", description="auto: cuda if available")
+    device: Annotated[Literal["auto", "cpu", "cuda"], Flag("--device")] = Field(
+        "auto", description="processor that trains; auto: cuda if available"
+    )
 
     @model_validator(mode="before")
     @classmethod

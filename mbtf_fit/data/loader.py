@@ -161,8 +161,8 @@ def _load_images(data: Dataset, shards: list[Shard], held_out: HeldOutSection, s
     count = int((labels == TRAINING).sum())
     if count == 0:
         raise _all_held_out(data, f"{len(labels)} images")
-    window = data.window
-    shape = (count, *(data.lattice.shape() if window is None else (window, window)))
+    patch_size = data.patch_size
+    shape = (count, *(data.lattice.shape() if patch_size is None else (patch_size, patch_size)))
     u, value = np.empty((*shape, 2), np.float32), np.empty((*shape, 3), np.float32)
     sigma, omega = np.empty(count, np.float32), np.empty((2, count, 3), np.float32)
     kept_out: tuple[list[ShardQueries], list[ShardQueries]] = ([], [])
@@ -185,8 +185,8 @@ def _load_images(data: Dataset, shards: list[Shard], held_out: HeldOutSection, s
         filled += len(kept)
     training = TrainingImages(
         *(torch.from_numpy(a) for a in (u, sigma, *omega, value)),
-        strides(data.lattice, sigma) if window is None else np.ones((count, 2), np.int64),
-        None if window is None else nearest_shapes(data.lattice, sigma),
+        strides(data.lattice, sigma) if patch_size is None else np.ones((count, 2), np.int64),
+        None if patch_size is None else nearest_shapes(data.lattice, sigma),
     )
     groups = [sample_images(ShardQueries.join(g), MAX_HELD_OUT_OF_IMAGES, random) for g in kept_out]
     return Partition(training, groups[0], groups[1], ShardQueries.join(sample), selection)

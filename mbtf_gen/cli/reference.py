@@ -3,95 +3,34 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
-
-from cyclopts import Parameter
+from typing import Any
 
 from mbtf_core.console import CONSOLE, Console
-from mbtf_core.shard_schema import Tiling
-from mbtf_gen.cli.common import Output, Set, angles, general, numbers, resolve_config
+from mbtf_core.options import Options, Output, Overwrite, takes_options
+from mbtf_gen.cli.common import resolve_config
+from mbtf_gen.config.pictures import RENDERING, ReferenceConfig, without_queries
 
 
+@takes_options(ReferenceConfig, "reference", *RENDERING)
 def reference(
     material: str | None = None,
     /,
     *,
-    output: Output = None,
-    view: str | None = None,
-    light: str | None = None,
-    tiles_across: str | None = None,
-    size: int | None = None,
-    spp: int | None = None,
-    kind: Literal["query", "pixel", "both"] | None = None,
-    height_scale: float | None = None,
-    mesh: int | None = None,
-    make_tileable: Tiling | None = None,
-    light_width: float | None = None,
-    max_depth: int | None = None,
-    seed: int | None = None,
-    config: Path | None = None,
-    assignments: Set | None = None,
-    overwrite: Annotated[bool, Parameter(negative="")] = False,
+    output: Output = Path("reference"),
+    options: Options[ReferenceConfig],
+    overwrite: Overwrite = False,
     console: Console = CONSOLE,
 ) -> None:
     """Render reference pictures of the micro-geometry on the plane: EXR with both halves, and PNG.
 
-    The same command again makes the pictures that are missing.
+    The same command again renders the missing pictures.
 
     Parameters
     ----------
     material
         Height map, folder of maps, or material.yaml.
-    output
-        Folder of pictures. Default: reference/
-    view
-        ELEVATION,AZIMUTH of the camera in degrees. Default: 60,-90
-    light
-        ELEVATION,AZIMUTH of the light in degrees. Default: 45,45
-    tiles_across
-        Widths of the field of view in tile widths, comma-separated. Default: 1,2,4
-    size
-        Pixels along each side. Default: 256
-    spp
-        Paths per pixel, both halves together (even). Default: 256
-    kind
-        query: M at each pixel's footprint; pixel: the truly filtered image. Default: both
-    height_scale
-        Factor on the stored heights, in tile widths. Default: the material's own
-    mesh
-        Mesh cells across the tile. Default: the map's width, at most 512
-    make_tileable
-        For maps that do not tile: 2 x 2 mirrored copies, or cross-faded edges. Default: none
-    light_width
-        RMS angle of the light per axis in degrees; 0 is a delta light. Default: 1
-    max_depth
-        Surface interactions per path; 0: no limit. Default: 0
-    seed
-        Root seed. Default: 0
-    config
-        YAML file with the options.
-    overwrite
-        Replace pictures of another configuration.
     """
-    flags = {
-        "--view": ("reference.view", angles(view, "--view")),
-        "--light": ("reference.light", angles(light, "--light")),
-        "--tiles-across": ("reference.tiles_across", numbers(tiles_across, "--tiles-across")),
-        "--size": ("reference.size", size),
-        "--spp": ("reference.spp", spp),
-        "--kind": ("reference.kind", kind),
-        **general(
-            height_scale=height_scale,
-            mesh=mesh,
-            make_tileable=make_tileable,
-            light_width=light_width,
-            max_depth=max_depth,
-            seed=seed,
-        ),
-    }
-    from mbtf_gen.config.pictures import ReferenceConfig, without_queries
-
-    resolved = resolve_config(ReferenceConfig, material, config, assignments or [], flags)
+    resolved = resolve_config(options, material)
     from mbtf_core.directions import from_angles
     from mbtf_core.stats import pooled_relative_error
     from mbtf_gen.generation import Job, build_estimator
@@ -113,7 +52,7 @@ def reference(
     kinds: tuple[PixelKind, ...] = ("query", "pixel") if wanted.kind == "both" else (wanted.kind,)
     names = {(camera, one): f"{one}-tiles{camera.tiles_across:g}" for camera in cameras for one in kinds}
     folder = PictureFolder.claim(
-        output or Path("reference"),
+        output,
         "reference",
         files=[f"{name}.{suffix}" for name in names.values() for suffix in ("exr", "png")],
         config=without_queries(resolved),

@@ -6,14 +6,20 @@ measures the time that each preset takes and the error that it reaches.
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+from cyclopts import Parameter
 
 Quality = Literal["draft", "standard", "high", "paper"]
+QualityOption = Annotated[
+    Quality | None,
+    Parameter(help="Preset of sizes and times; overrides the configuration, other options override it."),
+]
 
 # Options of the generator by preset, dotted names.
 GENERATOR: dict[Quality, dict[str, Any]] = {
-    # With half as many queries, fits of glossy materials overfit single bright paths. The test errors are free
-    # of noise and limited by their variance over queries, so many test queries get few paths each.
+    # With half as many queries, fits of glossy materials overfit single bright paths. The test errors are
+    # free of noise and limited by their variance over queries, so many test queries get few paths each.
     "draft": {
         "queries.train": "400/texel",
         "queries.spp": 4,

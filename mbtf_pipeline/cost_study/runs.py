@@ -129,7 +129,7 @@ class RunRunner:
         shutil.rmtree(folder, ignore_errors=True)
         start = time.perf_counter()
         # `Job.prepare` would log the material's warnings for every data set.
-        job = Job.of(config, load_material(Path(config.material), config.geometry.tile))
+        job = Job.of(config, load_material(Path(config.material), config.geometry.make_tileable))
         generate(config, folder, job=job)
         return folder, time.perf_counter() - start
 

@@ -50,7 +50,7 @@ def write_images(
 
     Parameters
     ----------
-    patch_size : places along each side of a image; None: whole images
+    patch_size : texels along each side of an image; None: whole images
     through : transmittance at u, σ and view, of a material with holes
     """
     folder.mkdir(parents=True, exist_ok=True)

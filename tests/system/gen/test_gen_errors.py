@@ -76,7 +76,7 @@ CASES: dict[str, tuple[str, int, list[str]]] = {
     "level too fine": (
         "heights.npy --resolution 99",
         USAGE,
-        ["--resolution: 'queries.resolution': must be a power of two from 1 to 16384 (given 99)"],
+        ["--resolution: 'queries.resolution': must be a power of two from 1 to 16384 (given '99')"],
     ),
     "light too wide": ("heights.npy --light-width 60", USAGE, ["light.width", "45"]),
     "light too narrow": ("heights.npy --light-width 0.001", USAGE, ["light.width", "delta"]),
@@ -99,7 +99,7 @@ CASES: dict[str, tuple[str, int, list[str]]] = {
     "view from below": (
         "reference heights.npy --view -10,0",
         USAGE,
-        ["--view: elevation -10 must lie above 0 and at most at 90 degrees"],
+        ["--view: 'reference.view.elevation': must be above 0 and at most 90 (given -10.0)"],
     ),
     "view from below, with a sign of equality": (
         "reference heights.npy --view=-10,0",

@@ -226,6 +226,6 @@ def test_cost_study_measures_reports_and_goes_on(
     # Without chains nothing can be repeated, and that is said.
     # Without a time the study's own is meant.
     flag = command.index("--time")
-    assert run(app, [*command[:flag], *command[flag + 2 :], "--narrow", "1min"]) == 0
+    assert run(app, [*command[:flag], *command[flag + 2 :], "--refine", "1min"]) == 0
     assert any("other seeds" in text for text in json.loads(capsys.readouterr().out)["skipped"])
-    assert "--time 1h --narrow 1min" in (out / "cost.html").read_text()
+    assert "--time 1h --refine 1min" in (out / "cost.html").read_text()

@@ -16,7 +16,7 @@ from support.scenes import mi
 import mbtf_fit.mitsuba_plugin
 from mbtf_core.config_file import resolve
 from mbtf_core.directions import from_angles
-from mbtf_core.errors import InputError, UsageError
+from mbtf_core.errors import UsageError
 from mbtf_fit.mitsuba_plugin.preview.config import PreviewConfig, SheetSection, TurntableSection
 from mbtf_gen.config.pictures import Direction
 from mbtf_gen.pictures.camera import Camera
@@ -142,13 +142,23 @@ def test_options_that_make_no_sense_are_refused() -> None:
         check_message(caught.value)
 
 
-def test_a_folder_that_is_no_material_is_refused_before_anything_is_made(tmp_path: Path) -> None:
-    from mbtf_fit.mitsuba_plugin.preview.command import preview
+def test_a_folder_that_is_no_material_is_refused_before_anything_is_made(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from mbtf_core.console import run
+    from mbtf_fit.cli.app import app
 
-    with pytest.raises(InputError, match=r"no material\.json"):
-        preview(tmp_path, output=tmp_path / "out")
+    for code, what, *words in (
+        (3, "no material.json", str(tmp_path), "-o", str(tmp_path / "out")),
+        (
+            2,
+            "--tiles-across: 'sheet.tiles_across': must be numbers",
+            "m",
+            "--tiles-across",
+            "1;2",
+        ),
+        (2, "no material given"),
+    ):
+        assert run(app, ["preview", *words]) == code
+        assert what in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
-    with pytest.raises(UsageError, match="must be numbers separated by commas"):
-        preview(tmp_path, tiles_across="1;2")
-    with pytest.raises(UsageError, match="no material given"):
-        preview()

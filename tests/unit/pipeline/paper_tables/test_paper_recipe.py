@@ -116,7 +116,7 @@ def test_ordinary_and_paper_recipes_are_told_apart(
     assert run(app, ["run", str(PIPELINES / "ci.yaml"), "--quick"]) == 2
     assert "only paper recipes have a quick size" in capsys.readouterr().err
     assert run(app, ["run", str(SHIPPED[0]), "--quality", "draft"]) == 2
-    assert "a paper recipe has sizes of its own" in capsys.readouterr().err
+    assert "a paper recipe has sizes and times of its own" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=[p.stem for p in SHIPPED])
