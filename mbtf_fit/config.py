@@ -9,8 +9,7 @@ from pydantic import BeforeValidator, Field, PlainSerializer, model_validator
 
 from mbtf_core.config_file import Settings, deep_merge
 from mbtf_core.digest import data_sha256
-from mbtf_core.sizes import format_size, parse_size
-from mbtf_core.units import format_duration, parse_duration
+from mbtf_core.units import format_duration, format_size, parse_duration, parse_size
 
 ModelName = Literal["neumip-baseline", "neumip", "hierarchical"]
 OutputMap = Literal["exp-1", "exp", "identity", "softplus", "fourth-root"]
