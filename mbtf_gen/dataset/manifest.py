@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
 from mbtf_core.config_file import dump_yaml
+from mbtf_core.digest import data_sha256
 from mbtf_core.lattice import sigma_of_level
 from mbtf_core.shard_schema import ARRAYS, CONVENTIONS, FORMAT_NAME, SCHEMA_VERSION, SPLITS, Split
 from mbtf_gen.planning.effects import EffectsPlan
@@ -49,8 +49,7 @@ def _versions() -> tuple[tuple[str, str], ...]:
 
 def effects_digest(effects: Mapping[str, Any]) -> str:
     """SHA-256 of an effects plan as the manifest holds it, hexadecimal: sidecars name the plan by it."""
-    text = json.dumps(effects, sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(text.encode()).hexdigest()
+    return data_sha256(effects)
 
 
 def build_manifest(job: Job, entries: list[ShardEntry], effects: EffectsPlan | None) -> dict[str, Any]:

@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from mbtf_core.atomic import digest, read_checksummed
+from mbtf_core.atomic import read_checksummed
+from mbtf_core.digest import file_sha256
 from mbtf_core.errors import InputError, reason
 from mbtf_core.shard_schema import CONFIG_NAME, FORMAT_NAME, MANIFEST_NAME, SPLITS
 from mbtf_gen.dataset.manifest import ShardEntry, effects_digest
@@ -117,7 +118,7 @@ def _record_of(path: Path, rows: int, config_hash: str) -> dict[str, Any] | str:
 
 def _content_fault(path: Path, rows: int, record: dict[str, Any]) -> str | None:
     """What is wrong with the bytes and the numbers of a shard."""
-    if digest(path) != record["sha256"]:
+    if file_sha256(path) != record["sha256"]:
         return "has changed since it was written (SHA-256 differs)"
     with _ONE_AT_A_TIME if path.suffix == ".exr" else contextlib.nullcontext():
         arrays = read_shard(path)
@@ -139,7 +140,7 @@ def _manifest_faults(dataset: Dataset) -> Iterator[Fault]:
     config = folder / CONFIG_NAME
     if not config.exists():
         yield Fault(CONFIG_NAME, "is not there", _REMAKE)
-    elif digest(config) != dataset.manifest.get("config_yaml"):
+    elif file_sha256(config) != dataset.manifest.get("config_yaml"):
         yield Fault(CONFIG_NAME, "has changed since it was written (SHA-256 differs)", _REMAKE)
 
 
