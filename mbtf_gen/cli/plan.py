@@ -135,7 +135,7 @@ def table(plan: EffectsPlan) -> str:
 
 
 def _row(effect: Effect) -> list[str]:
-    from mbtf_gen.planning.effects import EFFECTS
+    from mbtf_gen.config.effects_request import EFFECTS
 
     before = _NAME + 5 + _COST
     reason = textwrap.wrap(effect.reason, _WIDTH - before) or [""]

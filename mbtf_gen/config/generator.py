@@ -16,8 +16,8 @@ from pydantic import AfterValidator, BeforeValidator, Field
 from mbtf_core.config_file import FileName, Settings
 from mbtf_core.errors import UsageError
 from mbtf_core.shard_schema import SCHEMA_VERSION, ArrayFormat, Layout, Tiling
+from mbtf_gen.config.effects_request import EffectsRequest
 from mbtf_gen.geometry.slopes import NormalMode
-from mbtf_gen.planning.effects import EffectsRequest
 from mbtf_gen.sampling.light_kernel import MAX_WIDTH_DEG, MIN_WIDTH_DEG
 
 _PERCENT = re.compile(r"^\s*(\d+(?:\.\d*)?|\.\d+)\s*%\s*$")

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mbtf_gen.config.effects_request import EFFECTS
 from mbtf_gen.planning.bounds import CAUTION
-from mbtf_gen.planning.effects import EFFECTS, Effect, EffectsPlan
+from mbtf_gen.planning.effects import Effect, EffectsPlan
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.sampling.query_sampler import Queries
 

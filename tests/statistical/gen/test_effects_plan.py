@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from support.scenes import rocks
 
 from mbtf_core.stats import Estimate, mean_of_halves
+from mbtf_gen.config.effects_request import OF_RELIEF
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation import Job
 from mbtf_gen.material.material import Material
-from mbtf_gen.planning.effects import OF_RELIEF, EffectsPlan
+from mbtf_gen.planning.effects import EffectsPlan
 from mbtf_gen.planning.effects_plan import plan_effects, without
 from mbtf_gen.planning.pilot import pilot_queries, relative_change
 from mbtf_gen.render.estimates import Estimates, Stream

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from mbtf_core.errors import UsageError
+from mbtf_gen.config.effects_request import EFFECTS, OF_RELIEF, EffectsRequest
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation import Job
 from mbtf_gen.material.material import Material
-from mbtf_gen.planning.effects import EFFECTS, OF_RELIEF, Effect, EffectsPlan, EffectsRequest
+from mbtf_gen.planning.effects import Effect, EffectsPlan
 from mbtf_gen.planning.effects_plan import plan_effects, simulated
 
 HEIGHTS = np.array([[0.0, 0.1], [0.05, 0.02]])
