@@ -122,13 +122,14 @@ def generate(
     resolved = resolve_config(GeneratorConfig, material, config, assigned, flags)
     part = _slice(shards)
     from mbtf_gen.dataset.summary import summary_dict
-    from mbtf_gen.generation import Job, generate, paths_left
+    from mbtf_gen.generation import generate, paths_left
+    from mbtf_gen.job import Job, split_queries
 
     folder = output or Path("shards")
     job = Job.prepare(resolved)
     console.note(
-        f"{resolved.material} -> {folder}: {job.queries('train')} training + {job.queries('test')} test "
-        f"queries, finest level {job.lattice.finest}"
+        f"{resolved.material} -> {folder}: {split_queries(job, 'train')} training + "
+        f"{split_queries(job, 'test')} test queries, finest level {job.lattice.finest}"
     )
     total = paths_left(job, folder, *part)
     with (
@@ -136,13 +137,12 @@ def generate(
         console.progress(total=total, label="generating", unit="paths") as bar,
     ):
         summary = generate(
-            resolved,
+            job,
             folder,
             overwrite=overwrite,
             slice_index=part[0],
             slice_count=part[1],
-            progress=lambda done, note: bar.update(done, note),
-            job=job,
+            progress=bar.update,
         )
     console.report(summary_dict(summary), describe(summary))
 

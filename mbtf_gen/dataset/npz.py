@@ -1,7 +1,7 @@
-"""An npz archive as consecutive pieces, so that it is digested while it is written and never read again.
+"""An npz archive as consecutive chunks, so that a digest can be computed while it is written.
 
-The records are those of the zip format (PKWARE, APPNOTE.TXT 6.3.3, sections 4.3.7, 4.3.12, 4.3.14-16):
-members are stored, not compressed, and their sizes stand in front of them.
+The records are those of the zip format (PKWARE, APPNOTE.TXT 6.3.3, sections 4.3.7, 4.3.12, 4.3.14-16).
+Members are stored uncompressed, with their sizes in the local headers.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 
-# Offsets of arrays are multiples of this, so that they can be mapped and used in place.
+# Offsets of arrays are multiples of this, so that mapped arrays are aligned.
 ALIGNMENT = 64
 
 _LOCAL = struct.Struct("<4s5H3I2H")
@@ -28,13 +28,13 @@ _END = struct.Struct("<4s4H2LH")
 _VERSION, _UNIX, _DATE = 45, 3, 0x21
 _MODE = 0o600 << 16
 _IN_64_BITS = 0xFFFFFFFF
-# Readers of old take sizes for signed numbers.
+# Old readers interpret sizes as signed numbers.
 _LARGEST = 0x7FFFFFFF
 
 
 @dataclass(frozen=True)
 class _Member:
-    """What the central directory says of a member."""
+    """A member's entry in the central directory."""
 
     name: bytes
     filler: bytes
@@ -73,7 +73,7 @@ class _Member:
 
 
 def _end(count: int, start: int, size: int) -> bytes:
-    """Records at the end of an archive whose central directory has `size` bytes at `start`."""
+    """Records at the end of an archive with a central directory of `size` bytes at `start`."""
     if start <= _LARGEST:
         return _END.pack(b"PK\5\6", 0, 0, count, count, size, start, 0)
     return (
@@ -95,7 +95,7 @@ def npz_chunks(arrays: Iterable[tuple[str, NDArray[np.float32]]]) -> Iterator[by
     for name, array in arrays:
         numbers: memoryview = array.reshape(-1).view(np.uint8).data
         head, file = _npy_header(array), f"{name}.npy".encode()
-        # Local header and its 20 bytes of sizes; an extra field of ours fills up.
+        # Local header with 20 bytes of sizes, then an extra field that pads to the alignment.
         padding = -(position + _LOCAL.size + len(file) + 20 + 4) % ALIGNMENT
         filler = b"MT" + padding.to_bytes(2, "little") + bytes(padding)
         checksum = zlib.crc32(numbers, zlib.crc32(head))

@@ -13,7 +13,7 @@ import math
 import statistics
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -21,11 +21,12 @@ from numpy.typing import NDArray
 
 from mbtf_core.stats import Estimate, mean_estimate
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.generation import Job
+from mbtf_gen.job import Job, split_spp, split_target
 from mbtf_gen.material.material import Material
 from mbtf_gen.planning.adaptive import estimate_shard
 from mbtf_gen.planning.effects_plan import plan_effects
 from mbtf_gen.planning.sample_allocation import Allocation, measure_allocation
+from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.sampling.query_sampler import Queries
 from mbtf_pipeline.cost_study.measurements import HALF_WIDTH, NORMAL
@@ -107,7 +108,7 @@ class GeneratorBenchmark:
     def job(self, changes: dict[str, Any]) -> Job:
         """The job of the configuration with options changed, by dotted name."""
         data = self.config.model_dump(mode="json")
-        levels = Job.of(self.config, self.material).lattice.finest
+        levels = Job(self.config, self.material).lattice.finest
         fixed = {
             "queries.levels": levels,
             "queries.layout": "shuffled",
@@ -116,11 +117,11 @@ class GeneratorBenchmark:
         for name, value in {**fixed, **changes}.items():
             section, _, key = name.rpartition(".")
             (data[section] if section else data)[key] = value
-        return Job.of(GeneratorConfig.model_validate({**data, "seed": self.seed}), self.material)
+        return Job(GeneratorConfig.model_validate({**data, "seed": self.seed}), self.material)
 
     def queries(self, job: Job, shard: int, count: int) -> Queries:
         """Queries as a test split has them, one leading axis."""
-        return job.plan().draw("test", shard, count)
+        return job.query_plan.draw("test", shard, count)
 
     def reference(self, changes: dict[str, Any], piece: int) -> _Reference:
         """One piece of the reference with these options."""
@@ -153,7 +154,7 @@ class GeneratorBenchmark:
         setting = _setting(changes)
         if setting not in self._judges:
             job = self.job({"effects.mode": "all", "transport.max_depth": 0, **changes})
-            self._judges[setting] = job, job.estimator(plan_effects(job))
+            self._judges[setting] = job, build_estimator(job, plan_effects(job))
         return self._judges[setting]
 
     def _stream(self, piece: int) -> Stream:
@@ -169,9 +170,9 @@ class GeneratorBenchmark:
         seconds : spent on each of timing and bias at most; less where the error bars are small before
         """
         job = self.job(changes)
-        estimator = job.estimator(plan_effects(job))
+        estimator = build_estimator(job, plan_effects(job))
         mean = self.mean(against or {})
-        spp = job.spp("train")
+        spp = split_spp(job.config, "train")
 
         def trace(queries: Queries, stream: Stream) -> Estimates:
             found: Estimates = estimator.estimate(queries, spp, stream)
@@ -195,10 +196,10 @@ class GeneratorBenchmark:
         """
         job = self.job(changes)
         plan = plan_effects(job)
-        estimator = job.estimator(plan)
+        estimator = build_estimator(job, plan)
         allocation = measure_allocation(job, plan)
-        chosen = replace(plan, allocation=allocation if adaptive else None)
-        target, spp = job.target("train"), job.spp("train")
+        chosen = allocation if adaptive and not plan.closed_form else None
+        target, spp = split_target(job.config, "train"), split_spp(job.config, "train")
 
         def trace(queries: Queries, stream: Stream) -> Estimates:
             return estimate_shard(estimator, queries, spp, target, stream, chosen)

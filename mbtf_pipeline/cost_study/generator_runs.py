@@ -115,7 +115,7 @@ def _effects(bench: GeneratorBenchmark) -> Iterator[GeneratorTask]:
     yield GeneratorTask("effects", "effects", "auto", {"effects.mode": "auto"})
     yield GeneratorTask("effects", "effects", "all", {"effects.mode": "all"})
     for effect in everything.effects:
-        # Some are not there to be switched: the tile repeats by construction.
+        # A material may require an effect.
         if effect.on and effect.present:
             mode = f"all,-{effect.name}"
             yield GeneratorTask("effects", "effects", f"without {effect.name}", {"effects.mode": mode})

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from mbtf_core.stats import Estimate, unexplained_variance
 from mbtf_fit.data.loader import Queries as FitQueries
 from mbtf_gen.planning.effects_plan import plan_effects
+from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Stream
 from mbtf_gen.sampling.query_sampler import Queries
 from mbtf_gen.sampling.rng import Purpose, numpy_generator
@@ -72,7 +73,7 @@ def draw_judges(bench: GeneratorBenchmark, paths: int) -> Judges:
     paths = max(paths, _FEWEST_PATHS)
     count = min(paths // _SPP, _MOST)
     candidates = min(2 * paths, _MOST_CANDIDATES)
-    estimator = job.estimator(plan_effects(job, pilots=False))
+    estimator = build_estimator(job, plan_effects(job, pilots=False))
     sizes = [min(_PIECE, candidates - start) for start in range(0, candidates, _PIECE)]
     # A piece spans several of the bench's shards.
     shards = [_FIRST_CANDIDATES + start // SHARD for start in range(0, candidates, _PIECE)]

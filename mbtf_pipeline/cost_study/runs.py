@@ -18,7 +18,8 @@ import numpy as np
 from mbtf_core.stats import Estimate
 from mbtf_core.units import parse_duration
 from mbtf_gen.config.generator import GeneratorConfig, count_queries
-from mbtf_gen.generation import Job, generate
+from mbtf_gen.generation import generate
+from mbtf_gen.job import Job
 from mbtf_gen.material.material import load_material
 from mbtf_pipeline.cost_study.generator_benchmark import GeneratorBenchmark
 from mbtf_pipeline.cost_study.measurements import Point
@@ -136,7 +137,7 @@ class RunRunner:
         start = time.perf_counter()
         # What is odd about the material is said once, not for every data set.
         said, self._said = self._said, True
-        generate(config, folder, job=_quiet_job(config) if said else None)
+        generate(_quiet_job(config) if said else config, folder)
         return _Data(folder, time.perf_counter() - start)
 
     def data(self, wanted: RunRequest) -> _Data:
@@ -232,7 +233,7 @@ class RunRunner:
 
 def _quiet_job(config: GeneratorConfig) -> Job:
     """The job of a configuration whose material was spoken of before."""
-    return Job.of(config, load_material(Path(config.material), config.geometry.tile))
+    return Job(config, load_material(Path(config.material), config.geometry.tile))
 
 
 def _flat(options: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -227,13 +227,14 @@ def physical_memory() -> float:
 
 def _plan(recipe: Recipe, budget: float, folder: Path, tell: Callable[[str], None]) -> Split:
     from mbtf_gen.forecast import forecast
-    from mbtf_gen.generation import Job, allocated
+    from mbtf_gen.job import Job, split_queries
     from mbtf_gen.planning.effects_plan import plan_effects
+    from mbtf_gen.planning.run_plan import allocate
 
     began = time.perf_counter()
-    job = Job.of(recipe.generate, _material(recipe.generate))
-    expected = forecast(job, allocated(job, plan_effects(job, pilots=False)))
-    price, test = _prices(expected, job.queries("train"))
+    job = Job(recipe.generate, _material(recipe.generate))
+    expected = forecast(job, allocate(job, plan_effects(job, pilots=False)))
+    price, test = _prices(expected, split_queries(job, "train"))
     pilots: list[tuple[float, float]] = []
     beside = 0.0, 0.0
     length = PILOT * budget
