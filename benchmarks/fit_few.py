@@ -1,6 +1,6 @@
 """Few noisy queries, gone round many times: what the pull on the networks' weights is for.
 
-    python benchmarks/fit_few.py [MATERIAL] [--levels 4] [--steps 200 ...] [--seed 0]
+    python benchmarks/fit_few.py [MATERIAL] [--resolution 16] [--steps 200 ...] [--seed 0]
 
 Draft data of a glossy material (of ``assets/``, or of the texture sets that lie beside the project, by name)
 at few texels, and fits of `neumip` as the qualities have it otherwise, without ``training.weight_decay`` and
@@ -78,7 +78,7 @@ def main() -> int:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description="Few noisy queries, gone round many times.")
     parser.add_argument("material", nargs="?", default="turtle_shell")
-    parser.add_argument("--levels", type=int, default=4, help="2^levels texels along the longer side")
+    parser.add_argument("--resolution", type=int, default=16, help="texels across, a power of two")
     parser.add_argument("--steps", type=int, action="append", help=f"repeatable; default: {STEPS}")
     parser.add_argument("--seed", type=int, default=0, help="of the fits")
     options = parser.parse_args()
@@ -86,7 +86,7 @@ def main() -> int:
         load_mitsuba()
         with tempfile.TemporaryDirectory() as folder:
             shards = Path(folder) / "shards"
-            generate(generator_config(options.material, "draft", options.levels), shards)
+            generate(generator_config(options.material, "draft", options.resolution.bit_length() - 1), shards)
             rows = []
             for steps in options.steps or STEPS:
                 for weight_decay in (0.0, DEFAULT):

@@ -49,14 +49,20 @@ def make_data(name: str, folder: Path, layout: str) -> Path:
     from mbtf_gen.generation import generate
 
     material, height = MATERIALS[name]
-    queries: dict[str, Any] = {"train": "600/texel", "spp": 4, "levels": 6, "min_cos": 0.2, "test_spp": 256}
+    queries: dict[str, Any] = {
+        "train": "600/texel",
+        "spp": 4,
+        "resolution": 64,
+        "min_cos": 0.2,
+        "test_spp": 256,
+    }
     queries |= {"test": "16384"} if layout == "shuffled" else {"test": "256", "layout": "image"}
     if layout == "image":
-        queries["window"] = WINDOW
+        queries["patch_size"] = WINDOW
     config = GeneratorConfig.model_validate(
         {
             "material": str(material),
-            "geometry": {"height": height, "mesh": 256},
+            "geometry": {"height_scale": height, "mesh": 256},
             "queries": queries,
             "light": {"width": 3},
         }

@@ -1,6 +1,7 @@
 """What the qualities cost and reach: the whole chain of each material at a quality.
 
-    python benchmarks/quality.py --out FOLDER [--only MATERIAL:QUALITY ...] [--levels 7] [--store] [--check]
+    python benchmarks/quality.py --out FOLDER [--only MATERIAL:QUALITY ...] [--resolution 128]
+                                 [--store] [--check]
 
 Runs ``mbtf-pipeline run`` in a process of its own for every material and quality of the table in
 docs/cost.md: ``draft`` and ``standard`` on the six texture sets that lie beside the project, ``high`` on one.
@@ -73,8 +74,8 @@ RECIPE = """\
 name: quality
 generate:
   material: {material}
-  geometry: {{height: {height}}}
-  queries: {{levels: {levels}}}
+  geometry: {{height_scale: {height}}}
+  queries: {{resolution: {resolution}}}
 fit: {{model: neumip}}
 """
 
@@ -94,7 +95,7 @@ def generator_config(name: str, quality: Quality, levels: int) -> GeneratorConfi
         assignments=[
             f"material={json.dumps(str(material))}",
             *as_assignments(GENERATOR[quality]),
-            *as_assignments({"geometry.height": height, "queries.levels": levels}),
+            *as_assignments({"geometry.height_scale": height, "queries.resolution": 1 << levels}),
         ],
     )
 
@@ -117,7 +118,9 @@ def run(name: str, quality: Quality, levels: int, work: Path, share: float = 1.0
     work.mkdir(parents=True)
     recipe, out = work / "recipe.yaml", work / "run"
     text = RECIPE.format(
-        material=json.dumps(str(material)), levels=levels, height="null" if height is None else height
+        material=json.dumps(str(material)),
+        resolution=1 << levels,
+        height="null" if height is None else height,
     )
     recipe.write_text(text, encoding="utf-8")
     command = [sys.executable, "-m", "mbtf_pipeline", "run", str(recipe), "--quality", quality]
@@ -318,26 +321,29 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--out", type=Path, required=True, help="folder that keeps what was measured")
     parser.add_argument("--only", action="append", help="MATERIAL:QUALITY (repeatable)")
-    parser.add_argument("--levels", type=int, default=BAR_LEVELS, help="finest level: 2^levels texels")
+    parser.add_argument(
+        "--resolution", type=int, default=1 << BAR_LEVELS, help="texels across, a power of two"
+    )
     parser.add_argument(
         "--store", action="store_true", help="write the package's figures and the docs' table"
     )
     parser.add_argument("--check", action="store_true", help="hold the figures against the stored ones")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
+    levels = arguments.resolution.bit_length() - 1
     for name, quality, share in wanted(arguments.only):
         part = "" if share == 1 else f"-{share:g}"
-        path = arguments.out / f"{name}-{quality}{part}-{arguments.levels}.json"
+        path = arguments.out / f"{name}-{quality}{part}-{levels}.json"
         if measured(path) is not None:
             continue
         if not source(name)[0].is_dir():
             print(f"{name}: left out, {source(name)[0]} is missing", file=sys.stderr)
             continue
-        found = run(name, quality, arguments.levels, arguments.out / ".work", share)
+        found = run(name, quality, levels, arguments.out / ".work", share)
         write_json(path, asdict(found))
         print(line(found), flush=True)
-    chains = kept(arguments.out, arguments.levels)
-    held = [c for c in chains if c.quality in BARS and arguments.levels <= BAR_LEVELS]
+    chains = kept(arguments.out, levels)
+    held = [c for c in chains if c.quality in BARS and levels <= BAR_LEVELS]
     met = all(c.seconds <= BARS[c.quality] for c in held)
     report: dict[str, Any] = {"figures": [asdict(c) for c in chains], "bars": {**BARS}}
     if arguments.check:
@@ -345,7 +351,7 @@ def main() -> int:
         met &= bool(report["beside_stored"])
         met &= all(f <= CHECK[name] for row in report["beside_stored"] for name, f in row["factors"].items())
     if arguments.store:
-        store(chains, arguments.levels)
+        store(chains, levels)
     print(json.dumps({**report, "met": met, "machine": machine()}))
     return 0 if met else 1
 

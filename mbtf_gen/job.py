@@ -70,10 +70,10 @@ class Job:
         InputError
             The material cannot be used.
         """
-        job = cls(config, load_material(Path(config.material), config.geometry.tile))
+        job = cls(config, load_material(Path(config.material), config.geometry.make_tileable))
         for note in job.material.notes:
             log.info(note)
-        for warning in job.material.warnings_at(config.geometry.height):
+        for warning in job.material.warnings_at(config.geometry.height_scale):
             log.warning(warning)
         rows, columns = job.grid.z.shape
         log.info(
@@ -87,7 +87,8 @@ class Job:
     @cached_property
     def lattice(self) -> Lattice:
         """Texel grids of the levels."""
-        return Lattice.for_map(*self.material.height.shape, self.config.queries.levels)
+        rows, columns = self.material.height.shape
+        return Lattice.for_map(rows, columns, self.config.queries.finest)
 
     @cached_property
     def config_hash(self) -> str:
@@ -97,7 +98,7 @@ class Job:
     @cached_property
     def grid(self) -> HeightGrid:
         """Heights of the mesh."""
-        return self.material.grid(self.config.geometry.height, self.config.geometry.mesh)
+        return self.material.grid(self.config.geometry.height_scale, self.config.geometry.mesh)
 
     @cached_property
     def query_plan(self) -> QueryPlan:
@@ -119,7 +120,7 @@ class Job:
             queries.layout,
             self.config.seed,
             _shard_rows(self),
-            queries.window,
+            queries.patch_size,
         )
 
     @cached_property
@@ -138,7 +139,7 @@ def row_queries(job: Job) -> int:
     queries = job.config.queries
     if queries.layout == "shuffled":
         return 1
-    return job.lattice.texels() if queries.window is None else queries.window**2
+    return job.lattice.texels() if queries.patch_size is None else queries.patch_size**2
 
 
 def _shard_rows(job: Job) -> int:
@@ -172,7 +173,7 @@ def split_spp(config: GeneratorConfig, split: Split) -> int:
 def split_target(config: GeneratorConfig, split: Split) -> Target | None:
     """Target error of a split; None where it has a number of paths."""
     error = config.queries.target_error
-    return None if split != "train" or error is None else Target(error, config.queries.cap)
+    return None if split != "train" or error is None else Target(error, config.queries.max_spp)
 
 
 def split_queries(job: Job, split: Split) -> int:

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.config_file import resolve
+from mbtf_core.digest import data_sha256
 from mbtf_fit.config import FitConfig
 from mbtf_fit.presets import FITTER, best_at, fitter_options, overrides_of
 from mbtf_gen.config.presets import GENERATOR, Quality, as_assignments
 from mbtf_pipeline.recipe import fit_names
-from mbtf_pipeline.stages import hash_of
 
 # Options of the comparison by quality.
 COMPARE: dict[Quality, dict[str, Any]] = {
@@ -56,4 +56,4 @@ def settings_hash(quality: Quality) -> str:
     with other settings are out of date."""
     options = best_at(quality) | FITTER[quality]
     training = resolve(FitConfig, assignments=as_assignments(options)).training.model_dump(mode="json")
-    return hash_of([GENERATOR[quality], options, training, COMPARE[quality]])[:12]
+    return data_sha256([GENERATOR[quality], options, training, COMPARE[quality]])[:12]

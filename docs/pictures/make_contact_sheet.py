@@ -17,8 +17,8 @@ from PIL import Image, ImageDraw, ImageFont
 MATERIALS = ("twisted_wool", "straight_wool", "turtle_shell", "cliff_rock", "insulation_foam")
 # What is said of a row, and the options that make its pictures.
 ROWS = (
-    ("one tile wide, view at 55°, light at 40°", "--view 55,-90 --light 40,140 --spans 1"),
-    ("two tiles wide, view at 40°, grazing light at 15°", "--view 40,-90 --light 15,150 --spans 2"),
+    ("one tile wide, view at 55°, light at 40°", "--view 55,-90 --light 40,140 --tiles-across 1"),
+    ("two tiles wide, view at 40°, grazing light at 15°", "--view 40,-90 --light 15,150 --tiles-across 2"),
 )
 SIZE, SPP = 248, 256
 GAP, TITLE, CAPTION = 6, 26, 22

@@ -224,7 +224,7 @@ def load_buffers(data: Dataset, held_out: HeldOutSection, seed: int) -> Partitio
             where=data.folder,
             hint="lower held_out.queries and held_out.radius",
         )
-    window = data.window
+    window = data.patch_size
     shape = (count, *(data.lattice.shape() if window is None else (window, window)))
     u, value = np.empty((*shape, 2), np.float32), np.empty((*shape, 3), np.float32)
     sigma, omega = np.empty(count, np.float32), np.empty((2, count, 3), np.float32)

@@ -18,6 +18,7 @@ import torch
 
 from mbtf_core.atomic import read_json, write_json, write_text
 from mbtf_core.config_file import differences, dump_yaml, in_short
+from mbtf_core.digest import data_sha256
 from mbtf_core.errors import EngineError, InputError
 from mbtf_core.stats import Estimate, pooled_variance, unexplained_variance
 from mbtf_fit.config import FitConfig
@@ -219,7 +220,7 @@ def _identity(config: FitConfig, data: Dataset) -> dict[str, Any]:
     return {
         "format": _FORMAT,
         "schema": _SCHEMA,
-        "config_hash": config.hash(json.dumps({**described, "files": files}, sort_keys=True)),
+        "config_hash": config.hash(data_sha256({**described, "files": files})),
         "config": config.fields(),
         "data": {**described, "shards": lengths, "inputs": data.manifest.get("inputs", {})},
     }

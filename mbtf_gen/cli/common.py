@@ -35,18 +35,18 @@ Flags = Mapping[str, tuple[str, Any]]
 
 def general(
     *,
-    height: float | None,
+    height_scale: float | None,
     mesh: int | None,
     light_width: float | None,
     max_depth: int | None,
     seed: int | None,
-    tile: Tiling | None = None,
+    make_tileable: Tiling | None = None,
 ) -> Flags:
     """The flags that several commands have: flag → (dotted key it sets, its value or None)."""
     return {
-        "--height": ("geometry.height", height),
+        "--height-scale": ("geometry.height_scale", height_scale),
         "--mesh": ("geometry.mesh", mesh),
-        "--tile": ("geometry.tile", tile),
+        "--make-tileable": ("geometry.make_tileable", make_tileable),
         "--light-width": ("light.width", light_width),
         "--max-depth": ("transport.max_depth", max_depth),
         "--seed": ("seed", seed),

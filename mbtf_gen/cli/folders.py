@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def merge(folder: Path, /, *, console: Console = CONSOLE) -> int:
-    """Complete the manifest of a folder that slices (--shards i/n) were written into.
+    """Complete the manifest of a folder that slices (--slice i/n) were written into.
 
     Parameters
     ----------

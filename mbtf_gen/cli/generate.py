@@ -20,7 +20,7 @@ _SPLIT_WORDS = {"train": "training"}
 def _slice(text: str) -> tuple[int, int]:
     match = re.fullmatch(r"(\d+)/(\d+)", text.strip())
     if match is None or not 1 <= int(match[1]) <= int(match[2]):
-        raise UsageError(f"'{text}' must be i/n with 1 <= i <= n, such as 3/8", where="--shards")
+        raise UsageError(f"'{text}' must be i/n with 1 <= i <= n, such as 3/8", where="--slice")
     return int(match[1]), int(match[2])
 
 
@@ -35,10 +35,10 @@ def generate(
     spp: int | None = None,
     target_error: str | None = None,
     test_spp: int | None = None,
-    height: float | None = None,
+    height_scale: float | None = None,
     mesh: int | None = None,
-    tile: Tiling | None = None,
-    levels: int | None = None,
+    make_tileable: Tiling | None = None,
+    resolution: int | None = None,
     light_width: float | None = None,
     min_cos: float | None = None,
     max_depth: int | None = None,
@@ -46,7 +46,7 @@ def generate(
     layout: Literal["shuffled", "image"] | None = None,
     format: Literal["npz", "exr"] | None = None,
     seed: int | None = None,
-    shards: str = "1/1",
+    slice: str = "1/1",
     config: Path | None = None,
     assignments: Set | None = None,
     overwrite: Annotated[bool, Parameter(negative="")] = False,
@@ -72,14 +72,14 @@ def generate(
         Error of every training value relative to max(value, tile mean), such as 2%, in place of --spp.
     test_spp
         Mean number of paths per test query, both halves together (even). Default: 256
-    height
+    height_scale
         Factor on the stored heights, in tile widths. Default: the material's own
     mesh
         Mesh cells across the tile. Default: the map's width, at most 512
-    tile
-        Cure for maps that do not tile: 2 x 2 mirrored copies, or edges cross-faded. Default: none
-    levels
-        Finest level k: 2^k texels across. Default: from the map's width
+    make_tileable
+        For maps that do not tile: 2 x 2 mirrored copies, or cross-faded edges. Default: none
+    resolution
+        Texels across at the finest level, a power of two. Default: from the map's width
     light_width
         RMS angle of the light per axis in degrees; 0 is a delta light. Default: 1
     min_cos
@@ -94,8 +94,8 @@ def generate(
         npz or exr shards.
     seed
         Root seed. Default: 0
-    shards
-        Slice i/n: make only every n-th shard; finish with mbtf-gen merge.
+    slice
+        i/n: make only every n-th shard; finish with mbtf-gen merge.
     config
         YAML file with the options.
     overwrite
@@ -109,18 +109,23 @@ def generate(
         "--spp": ("queries.spp", spp),
         "--target-error": ("queries.target_error", target_error),
         "--test-spp": ("queries.test_spp", test_spp),
-        "--levels": ("queries.levels", levels),
+        "--resolution": ("queries.resolution", resolution),
         "--min-cos": ("queries.min_cos", min_cos),
         "--effects": ("effects.mode", effects),
         "--layout": ("queries.layout", layout),
         "--format": ("output.format", format),
         **general(
-            height=height, mesh=mesh, tile=tile, light_width=light_width, max_depth=max_depth, seed=seed
+            height_scale=height_scale,
+            mesh=mesh,
+            make_tileable=make_tileable,
+            light_width=light_width,
+            max_depth=max_depth,
+            seed=seed,
         ),
     }
     assigned = [*as_assignments(GENERATOR[quality] if quality else {}), *(assignments or [])]
     resolved = resolve_config(GeneratorConfig, material, config, assigned, flags)
-    part = _slice(shards)
+    part = _slice(slice)
     from mbtf_gen.dataset.summary import summary_dict
     from mbtf_gen.generation import generate, paths_left
     from mbtf_gen.job import Job, split_queries

@@ -13,9 +13,9 @@ def inspect(
     material: str | None = None,
     /,
     *,
-    height: float | None = None,
+    height_scale: float | None = None,
     mesh: int | None = None,
-    tile: Tiling | None = None,
+    make_tileable: Tiling | None = None,
     config: Path | None = None,
     assignments: Set | None = None,
     console: Console = CONSOLE,
@@ -26,12 +26,12 @@ def inspect(
     ----------
     material
         Height map, folder of maps, or material.yaml.
-    height
+    height_scale
         Factor on the stored heights, in tile widths. Default: the material's own
     mesh
         Mesh cells across the tile. Default: the map's width, at most 512
-    tile
-        Cure for maps that do not tile: 2 x 2 mirrored copies, or edges cross-faded. Default: none
+    make_tileable
+        For maps that do not tile: 2 x 2 mirrored copies, or cross-faded edges. Default: none
     config
         YAML file with the options.
     """
@@ -40,9 +40,16 @@ def inspect(
     from mbtf_gen.material.inspect_text import inspection_text
     from mbtf_gen.material.material import load_material
 
-    flags = general(height=height, mesh=mesh, tile=tile, light_width=None, max_depth=None, seed=None)
+    flags = general(
+        height_scale=height_scale,
+        mesh=mesh,
+        make_tileable=make_tileable,
+        light_width=None,
+        max_depth=None,
+        seed=None,
+    )
     resolved = resolve_config(GeneratorConfig, material, config, assignments or [], flags)
     geometry = resolved.geometry
-    loaded = load_material(resolved.material, geometry.tile)
-    found = {"material": resolved.material, **inspect_material(loaded, geometry.height, geometry.mesh)}
+    loaded = load_material(resolved.material, geometry.make_tileable)
+    found = {"material": resolved.material, **inspect_material(loaded, geometry.height_scale, geometry.mesh)}
     console.report(found, inspection_text(found, resolved.material))

@@ -30,9 +30,9 @@ def plan(
     target_error: str | None = None,
     effects: str | None = None,
     tolerance: float | None = None,
-    height: float | None = None,
+    height_scale: float | None = None,
     mesh: int | None = None,
-    tile: Tiling | None = None,
+    make_tileable: Tiling | None = None,
     light_width: float | None = None,
     min_cos: float | None = None,
     max_depth: int | None = None,
@@ -61,12 +61,12 @@ def plan(
         auto, all, none, then +x or -x: effects of light to simulate. Default: auto
     tolerance
         Bias bound of all effects left out together, relative to the mean value. Default: 0.005
-    height
+    height_scale
         Factor on the stored heights, in tile widths. Default: the material's own
     mesh
         Mesh cells across the tile. Default: the map's width, at most 512
-    tile
-        Cure for maps that do not tile: 2 x 2 mirrored copies, or edges cross-faded. Default: none
+    make_tileable
+        For maps that do not tile: 2 x 2 mirrored copies, or cross-faded edges. Default: none
     light_width
         RMS angle of the light per axis in degrees; 0 is a delta light. Default: 1
     min_cos
@@ -90,7 +90,12 @@ def plan(
         "--tolerance": ("effects.tolerance", tolerance),
         "--min-cos": ("queries.min_cos", min_cos),
         **general(
-            height=height, mesh=mesh, tile=tile, light_width=light_width, max_depth=max_depth, seed=seed
+            height_scale=height_scale,
+            mesh=mesh,
+            make_tileable=make_tileable,
+            light_width=light_width,
+            max_depth=max_depth,
+            seed=seed,
         ),
     }
     assigned = [*as_assignments(GENERATOR[quality] if quality else {}), *(assignments or [])]

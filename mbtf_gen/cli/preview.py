@@ -25,20 +25,20 @@ def preview(
     output: Output = None,
     view: str | None = None,
     light: str | None = None,
-    block: int | None = None,
+    tiles: int | None = None,
     size: int | None = None,
     spp: int | None = None,
-    height: float | None = None,
+    height_scale: float | None = None,
     mesh: int | None = None,
-    tile: Tiling | None = None,
-    levels: int | None = None,
+    make_tileable: Tiling | None = None,
+    resolution: int | None = None,
     light_width: float | None = None,
     min_cos: float | None = None,
     max_depth: int | None = None,
     seed: int | None = None,
     config: Path | None = None,
     assignments: Set | None = None,
-    window: Annotated[bool, Parameter(negative="")] = False,
+    interactive: Annotated[bool, Parameter(negative="")] = False,
     overwrite: Annotated[bool, Parameter(negative="")] = False,
     console: Console = CONSOLE,
 ) -> None:
@@ -54,20 +54,20 @@ def preview(
         ELEVATION,AZIMUTH of the camera in degrees. Default: 40,-90
     light
         ELEVATION,AZIMUTH of the light in degrees. Default: 35,150
-    block
-        Tiles along each side of the block that is drawn, 1 to 4. Default: 2
+    tiles
+        Tiles along each side of the drawn plane, 1 to 4. Default: 2
     size
         Pixels across. Default: 640
     spp
         Paths per pixel of the path-traced picture (even). Default: 16
-    height
+    height_scale
         Factor on the stored heights, in tile widths. Default: the material's own
     mesh
         Mesh cells across the tile. Default: the map's width, at most 512
-    tile
-        Cure for maps that do not tile: 2 x 2 mirrored copies, or edges cross-faded. Default: none
-    levels
-        Finest level k of the queries. Default: from the map's width
+    make_tileable
+        For maps that do not tile: 2 x 2 mirrored copies, or cross-faded edges. Default: none
+    resolution
+        Texels across at the finest level, a power of two. Default: from the map's width
     light_width
         RMS angle of the light per axis in degrees; 0 is a delta light. Default: 1
     min_cos
@@ -78,7 +78,7 @@ def preview(
         Root seed. Default: 0
     config
         YAML file with the options.
-    window
+    interactive
         Also show the mesh in a window, to be turned with the mouse.
     overwrite
         Draw again, and replace pictures of another configuration.
@@ -86,21 +86,26 @@ def preview(
     look = {
         "--view": ("preview.view", angles(view, "--view")),
         "--light": ("preview.light", angles(light, "--light")),
-        "--block": ("preview.block", block),
+        "--tiles": ("preview.tiles", tiles),
         "--size": ("preview.size", size),
         "--spp": ("preview.spp", spp),
     }
     rest = {
         **general(
-            height=height, mesh=mesh, tile=tile, light_width=light_width, max_depth=max_depth, seed=seed
+            height_scale=height_scale,
+            mesh=mesh,
+            make_tileable=make_tileable,
+            light_width=light_width,
+            max_depth=max_depth,
+            seed=seed,
         ),
-        "--levels": ("queries.levels", levels),
+        "--resolution": ("queries.resolution", resolution),
         "--min-cos": ("queries.min_cos", min_cos),
     }
     from mbtf_core.shard_schema import MANIFEST_NAME
     from mbtf_gen.config.pictures import PreviewConfig
 
-    if window:
+    if interactive:
         from mbtf_gen.pictures.preview.mesh import check_display
 
         check_display()
@@ -120,7 +125,7 @@ def preview(
         resolved = _of_dataset(dataset, look)
     else:
         resolved = resolve_config(PreviewConfig, material, config, assignments or [], {**look, **rest})
-    _Preview(resolved, dataset, console).make(output or Path("preview"), overwrite, window)
+    _Preview(resolved, dataset, console).make(output or Path("preview"), overwrite, interactive)
 
 
 def _of_dataset(dataset: Dataset, look: Flags) -> PreviewConfig:
@@ -164,11 +169,11 @@ class _Preview:
         from mbtf_gen.pictures.preview.view import block_camera
 
         wanted = self.config.preview
-        grid = job.material.grid(self.config.geometry.height, self.config.geometry.mesh)
+        grid = job.material.grid(self.config.geometry.height_scale, self.config.geometry.mesh)
         self.camera = block_camera(
             wanted.view.elevation,
             wanted.view.azimuth,
-            tiles=wanted.block,
+            tiles=wanted.tiles,
             aspect=grid.aspect,
             relief=grid.displacement_range,
             columns=wanted.size,
@@ -179,7 +184,7 @@ class _Preview:
             f"light from {wanted.light.elevation:g}, {wanted.light.azimuth:g} degrees"
         )
 
-    def make(self, path: Path, overwrite: bool, window: bool) -> None:
+    def make(self, path: Path, overwrite: bool, interactive: bool) -> None:
         """Make the pictures that are missing, report them, and open the window.
 
         Raises
@@ -229,7 +234,7 @@ class _Preview:
                 hint="the other pictures are there; mbtf-gen doctor says what drawing needs, "
                 "then the same command draws it",
             )
-        if window and self.job is not None:
+        if interactive and self.job is not None:
             from mbtf_gen.pictures.preview.mesh import show
 
             self.console.note("the mesh is shown in a window: close it to go on")
@@ -248,7 +253,7 @@ class _Preview:
 
         assert self.job is not None
         geometry = self.config.geometry
-        return block_of(self.job.material, self.config.preview.block, geometry.height, geometry.mesh)
+        return block_of(self.job.material, self.config.preview.tiles, geometry.height_scale, geometry.mesh)
 
     def _mesh(self, file: Path) -> dict[str, Any]:
         from mbtf_gen.pictures.preview.mesh import draw
@@ -257,7 +262,7 @@ class _Preview:
         fault = draw(block, self.camera, self.omega_i, file)
         if fault:
             return {"fault": fault}
-        tiles, (rows, columns) = self.config.preview.block, block.cells
+        tiles, (rows, columns) = self.config.preview.tiles, block.cells
         return {
             "shows": f"the displaced mesh ({columns} x {rows} cells per tile) of {tiles} x {tiles} tiles "
             f"with its base color, {self.seen}"

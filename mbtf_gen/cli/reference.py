@@ -19,13 +19,13 @@ def reference(
     output: Output = None,
     view: str | None = None,
     light: str | None = None,
-    spans: str | None = None,
+    tiles_across: str | None = None,
     size: int | None = None,
     spp: int | None = None,
     kind: Literal["query", "pixel", "both"] | None = None,
-    height: float | None = None,
+    height_scale: float | None = None,
     mesh: int | None = None,
-    tile: Tiling | None = None,
+    make_tileable: Tiling | None = None,
     light_width: float | None = None,
     max_depth: int | None = None,
     seed: int | None = None,
@@ -48,7 +48,7 @@ def reference(
         ELEVATION,AZIMUTH of the camera in degrees. Default: 60,-90
     light
         ELEVATION,AZIMUTH of the light in degrees. Default: 45,45
-    spans
+    tiles_across
         Widths of the field of view in tile widths, comma-separated. Default: 1,2,4
     size
         Pixels along each side. Default: 256
@@ -56,12 +56,12 @@ def reference(
         Paths per pixel, both halves together (even). Default: 256
     kind
         query: M at each pixel's footprint; pixel: the truly filtered image. Default: both
-    height
+    height_scale
         Factor on the stored heights, in tile widths. Default: the material's own
     mesh
         Mesh cells across the tile. Default: the map's width, at most 512
-    tile
-        Cure for maps that do not tile: 2 x 2 mirrored copies, or edges cross-faded. Default: none
+    make_tileable
+        For maps that do not tile: 2 x 2 mirrored copies, or cross-faded edges. Default: none
     light_width
         RMS angle of the light per axis in degrees; 0 is a delta light. Default: 1
     max_depth
@@ -76,12 +76,17 @@ def reference(
     flags = {
         "--view": ("reference.view", angles(view, "--view")),
         "--light": ("reference.light", angles(light, "--light")),
-        "--spans": ("reference.spans", numbers(spans, "--spans")),
+        "--tiles-across": ("reference.tiles_across", numbers(tiles_across, "--tiles-across")),
         "--size": ("reference.size", size),
         "--spp": ("reference.spp", spp),
         "--kind": ("reference.kind", kind),
         **general(
-            height=height, mesh=mesh, tile=tile, light_width=light_width, max_depth=max_depth, seed=seed
+            height_scale=height_scale,
+            mesh=mesh,
+            make_tileable=make_tileable,
+            light_width=light_width,
+            max_depth=max_depth,
+            seed=seed,
         ),
     }
     from mbtf_gen.config.pictures import ReferenceConfig, without_queries
@@ -99,14 +104,16 @@ def reference(
     wanted = resolved.reference
     job = Job.prepare(resolved)
     cameras = [
-        Camera(wanted.view.elevation, wanted.view.azimuth, span, rows=wanted.size, columns=wanted.size)
-        for span in wanted.spans
+        Camera(
+            wanted.view.elevation, wanted.view.azimuth, tiles_across, rows=wanted.size, columns=wanted.size
+        )
+        for tiles_across in wanted.tiles_across
     ]
     omega_i = from_angles(wanted.light.elevation, wanted.light.azimuth)
     for camera in cameras:
         camera.queries(omega_i)  # refuses a view of the horizon before anything is written
     kinds: tuple[PixelKind, ...] = ("query", "pixel") if wanted.kind == "both" else (wanted.kind,)
-    names = {(camera, one): f"{one}-span{camera.span:g}" for camera in cameras for one in kinds}
+    names = {(camera, one): f"{one}-tiles{camera.tiles_across:g}" for camera in cameras for one in kinds}
     folder = PictureFolder.claim(
         output or Path("reference"),
         "reference",
@@ -139,7 +146,7 @@ def reference(
                     {
                         "file": folder.path / f"{name}.exr",
                         "kind": one,
-                        "span": camera.span,
+                        "tiles_across": camera.tiles_across,
                         "relative_noise": facts["relative_noise"],
                         "kept": kept,
                     }

@@ -6,20 +6,21 @@ leaves out what does not (launch size, progress).
 
 from __future__ import annotations
 
-import hashlib
-import json
 import re
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from mbtf_core.config_file import FileName, Settings
+from mbtf_core.digest import data_sha256
 from mbtf_core.errors import UsageError
+from mbtf_core.lattice import MAX_LEVEL
 from mbtf_core.shard_schema import SCHEMA_VERSION, ArrayFormat, Layout, Tiling
 from mbtf_gen.config.effects_request import EffectsRequest
 from mbtf_gen.geometry.slopes import NormalMode
 from mbtf_gen.sampling.light_kernel import MAX_WIDTH_DEG, MIN_WIDTH_DEG
 
+_RESOLUTIONS = [1 << level for level in range(MAX_LEVEL + 1)]
 _PERCENT = re.compile(r"^\s*(\d+(?:\.\d*)?|\.\d+)\s*%\s*$")
 _COUNT = re.compile(r"^\s*(\d+(?:\.\d+)?(?:[eE][+]?\d+)?)\s*(/\s*texel)?\s*$")
 
@@ -75,20 +76,32 @@ def _light_width(width: float) -> float:
 
 
 Count = Annotated[str, BeforeValidator(_count)]
+
+
+def _power_of_two(resolution: int) -> int:
+    if resolution not in _RESOLUTIONS:
+        raise ValueError(f"must be a power of two from 1 to {_RESOLUTIONS[-1]}")
+    return resolution
+
+
+Resolution = Annotated[int, AfterValidator(_power_of_two)]
 Paths = Annotated[int, Field(ge=2, le=1 << 20), AfterValidator(_even)]
 
 
 class GeometrySection(Settings):
     """The displaced tile."""
 
-    height: float | None = Field(
-        None, ge=-100, le=100, description="factor on the stored heights; default: the material's own"
+    height_scale: float | None = Field(
+        None,
+        ge=-100,
+        le=100,
+        description="factor on the stored heights, in tile widths; default: the material's own",
     )
     mesh: int | None = Field(
         None, ge=1, le=8192, description="mesh cells across the tile; default: the map's width, at most 512"
     )
-    tile: Tiling = Field(
-        "none", description="hint for maps that do not tile: mirrored copies, or edges cross-faded"
+    make_tileable: Tiling = Field(
+        "none", description="for maps that do not tile: 2 x 2 mirrored copies, or cross-faded edges"
     )
 
 
@@ -106,8 +119,8 @@ class QueriesSection(Settings):
     test: Count = Field("8192", description="N or N/texel")
     spp: Paths = Field(4, description="mean number of paths per training query, both halves together")
     test_spp: Paths = Field(256, description="mean number of paths per test query, both halves together")
-    allocation: Literal["noise", "even"] = Field(
-        "noise", description="which queries get more paths: those where a pilot expects more noise, or none"
+    allocation: Literal["noise", "uniform"] = Field(
+        "noise", description="paths per query: more where a pilot expects more noise, or the same for all"
     )
     target_error: Annotated[float | None, BeforeValidator(_share)] = Field(
         None,
@@ -116,18 +129,26 @@ class QueriesSection(Settings):
         description="error of every training value relative to max(value, tile mean), such as 2%; in place "
         "of a mean number of paths",
     )
-    cap: Paths = Field(1024, description="most paths per query under a target error")
-    levels: int | None = Field(None, ge=0, le=14, description="finest level k; default: from the map's width")
+    max_spp: Paths = Field(1024, description="most paths per query under a target error")
+    resolution: Resolution | None = Field(
+        None,
+        description="texels across at the finest level, a power of two; default: from the map's width",
+    )
     mixture: MixtureSection = MixtureSection()
     min_cos: float = Field(0.1, gt=0, lt=1, description="smallest cosine of both directions to the normal")
     layout: Layout = "shuffled"
-    window: int | None = Field(
+    patch_size: int | None = Field(
         None,
         ge=1,
         le=256,
-        description="image layout: so many places along each side of a buffer, a texel of the level nearest "
-        "to its footprint apart; default: one place in every texel of the finest level",
+        description="image layout: texels along each side of an image, of the level nearest to its "
+        "footprint; default: one query in every texel of the finest level",
     )
+
+    @property
+    def finest(self) -> int | None:
+        """The finest level k, ``log2(resolution)``; None: from the map's width."""
+        return None if self.resolution is None else self.resolution.bit_length() - 1
 
 
 class LightSection(Settings):
@@ -179,7 +200,7 @@ class OutputSection(Settings):
 class GeneratorConfig(Settings):
     """Everything ``mbtf-gen`` needs to make a data set."""
 
-    version: Literal[1] = 1
+    version: Literal[2] = 2
     material: FileName = Field(description="height map, folder of maps, or material.yaml")
     geometry: GeometrySection = GeometrySection()
     queries: QueriesSection = QueriesSection()
@@ -197,5 +218,4 @@ class GeneratorConfig(Settings):
 
     def hash(self, inputs: dict[str, str]) -> str:
         """SHA-256 over :meth:`data_fields`, hexadecimal; `inputs` maps roles to digests of files."""
-        text = json.dumps(self.data_fields(inputs), sort_keys=True, separators=(",", ":"))
-        return hashlib.sha256(text.encode()).hexdigest()
+        return data_sha256(self.data_fields(inputs))

@@ -31,7 +31,7 @@ class ReferenceSection(Settings):
 
     view: Direction = Field(Direction(elevation=60, azimuth=-90), description="where the camera stands")
     light: Direction = Field(Direction(elevation=45, azimuth=45), description="where the light comes from")
-    spans: Annotated[
+    tiles_across: Annotated[
         list[Annotated[float, Field(gt=0, le=1e4)]], Field(min_length=1), AfterValidator(_distinct)
     ] = Field([1.0, 2.0, 4.0], description="widths of the field of view at the target, in tile widths")
     size: Size = Field(256, description="pixels along each side")
@@ -46,7 +46,9 @@ class PreviewSection(Settings):
 
     view: Direction = Field(Direction(elevation=40, azimuth=-90), description="where the camera stands")
     light: Direction = Field(Direction(elevation=35, azimuth=150), description="where the light comes from")
-    block: Annotated[int, Field(ge=1, le=4)] = Field(2, description="tiles along each side of what is drawn")
+    tiles: Annotated[int, Field(ge=1, le=4)] = Field(
+        2, description="tiles along each side of the drawn plane"
+    )
     size: Annotated[int, Field(ge=64, le=8192)] = Field(640, description="pixels across")
     spp: Paths = Field(16, description="paths per pixel of the path-traced picture")
 

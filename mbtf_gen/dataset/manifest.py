@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
 from mbtf_core.config_file import dump_yaml
+from mbtf_core.digest import data_sha256
 from mbtf_core.lattice import sigma_of_level
 from mbtf_core.shard_schema import ARRAYS, CONVENTIONS, FORMAT_NAME, SCHEMA_VERSION, SPLITS
 from mbtf_gen.job import Job, split_queries, split_spp
@@ -36,9 +36,7 @@ def _versions() -> tuple[tuple[str, str], ...]:
 
 def plan_digest(manifest: Mapping[str, Any]) -> str:
     """SHA-256 of the run plan in a manifest, hexadecimal. The sidecars of all shards repeat it."""
-    plan = {name: manifest.get(name) for name in ("effects", "allocation")}
-    text = json.dumps(plan, sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(text.encode()).hexdigest()
+    return data_sha256({name: manifest.get(name) for name in ("effects", "allocation")})
 
 
 def build_manifest(job: Job, plan: RunPlan) -> dict[str, Any]:
@@ -61,7 +59,9 @@ def build_manifest(job: Job, plan: RunPlan) -> dict[str, Any]:
             "aspect": lattice.aspect,
             "maps_shape": list(material.height.shape),
             "mesh_shape": list(grid.z.shape),
-            "height": material.height_scale if config.geometry.height is None else config.geometry.height,
+            "height_scale": material.height_scale
+            if config.geometry.height_scale is None
+            else config.geometry.height_scale,
             "displacement_range": grid.displacement_range,
         },
         "levels": {
@@ -71,7 +71,7 @@ def build_manifest(job: Job, plan: RunPlan) -> dict[str, Any]:
             "mixture": {"log_uniform": queries.mixture.log_uniform, "finest": queries.mixture.finest},
         },
         "layout": queries.layout,
-        "window": queries.window,
+        "patch_size": queries.patch_size,
         "array_format": config.output.format,
         "arrays": {
             a.name: {"shape": [*lead, *a.trailing], "unit": a.unit, "meaning": a.meaning}

@@ -50,7 +50,7 @@ class _Manifest(BaseModel):
     levels: _Levels
     tile: _Tile
     splits: dict[str, _Split]
-    window: _Count | None = None
+    patch_size: _Count | None = None
 
 
 class _Sidecar(BaseModel):
@@ -134,10 +134,10 @@ class Dataset:
         return layout
 
     @property
-    def window(self) -> int | None:
-        """Texels along each side of an image; None: images cover the finest level."""
-        window: int | None = self.manifest.get("window")
-        return window
+    def patch_size(self) -> int | None:
+        """Texels along each side of an image; None: images cover the whole finest level."""
+        size: int | None = self.manifest.get("patch_size")
+        return size
 
     @property
     def lattice(self) -> Lattice:

@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from mbtf_core.atomic import digest, read_checksummed
+from mbtf_core.atomic import read_checksummed
+from mbtf_core.digest import file_sha256
 from mbtf_core.errors import InputError, reason
 from mbtf_core.shard_schema import CONFIG_NAME, FORMAT_NAME, MANIFEST_NAME, SPLITS, ShardEntry
 from mbtf_gen.dataset.manifest import plan_digest
@@ -127,7 +128,7 @@ def _record_of(path: Path, rows: int, config_hash: str) -> dict[str, Any] | str:
 
 def _content_fault(path: Path, rows: int, record: dict[str, Any]) -> str | None:
     """The fault of a shard's bytes or values, or None."""
-    if digest(path) != record["sha256"]:
+    if file_sha256(path) != record["sha256"]:
         return "has changed since it was written (SHA-256 differs)"
     with _ONE_AT_A_TIME if path.suffix == ".exr" else contextlib.nullcontext():
         arrays = read_shard(path)
@@ -149,7 +150,7 @@ def _manifest_faults(dataset: Dataset) -> Iterator[Fault]:
     config = folder / CONFIG_NAME
     if not config.exists():
         yield Fault(CONFIG_NAME, "is missing", _REPAIR)
-    elif digest(config) != dataset.manifest.get("config_yaml"):
+    elif file_sha256(config) != dataset.manifest.get("config_yaml"):
         yield Fault(CONFIG_NAME, "has changed since it was written (SHA-256 differs)", _REPAIR)
 
 

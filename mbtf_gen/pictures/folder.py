@@ -7,8 +7,6 @@ belong to somebody else and are never touched.
 
 from __future__ import annotations
 
-import hashlib
-import json
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -19,6 +17,7 @@ from pydantic import BaseModel
 
 from mbtf_core.atomic import TEMPORARY, read_json, write_json, write_text
 from mbtf_core.config_file import check_document, differences, dump_yaml, in_short
+from mbtf_core.digest import data_sha256
 from mbtf_core.errors import InputError
 from mbtf_core.shard_schema import CONFIG_NAME
 
@@ -32,11 +31,6 @@ def _is_leftover(name: str, files: Iterable[str]) -> bool:
     """Whether a file is what a kill leaves of writing one of `files`."""
     match = re.fullmatch(rf"\.(.+?){TEMPORARY}", name)
     return match is not None and match[1] in files
-
-
-def hash_of(depends: Mapping[str, Any]) -> str:
-    """SHA-256 over plain data, hexadecimal."""
-    return hashlib.sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()
 
 
 class _Picture(BaseModel):
@@ -107,7 +101,7 @@ class PictureFolder:
                     hint="choose another folder with -o",
                 )
             check_document(_Record, old, existing, "choose another folder with -o")
-            if not overwrite and old.get("hash") == hash_of(depends):
+            if not overwrite and old.get("hash") == data_sha256(depends):
                 folder = cls(path, old)
                 folder._sweep()
                 if not (path / CONFIG_NAME).exists():
@@ -135,7 +129,7 @@ class PictureFolder:
             "format": FORMAT_NAME,
             "version": _VERSION,
             "kind": kind,
-            "hash": hash_of(depends),
+            "hash": data_sha256(depends),
             "depends": depends,
             "files": sorted(files),
             "pictures": {},

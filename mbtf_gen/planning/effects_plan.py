@@ -137,7 +137,7 @@ def _analysis(job: Job, pilots: bool) -> _Analysis:
     return _Analysis(
         job,
         albedo,
-        material.is_lambert and material.coat is None and material.sheen is None,
+        material.is_lambert and material.clearcoat is None and material.sheen is None,
         own,
         pilots,
     )
@@ -212,7 +212,7 @@ def _strengths(material: Material) -> dict[str, float]:
     return {
         "specular": largest(material.specular),
         "metallic": largest(material.metallic),
-        "clearcoat": largest(material.coat),
+        "clearcoat": largest(material.clearcoat),
         "sheen": sheen,
     }
 
@@ -223,8 +223,7 @@ def _faint_bound(scene: _Analysis, name: str, strength: float) -> float | None:
     if not scene.pilots:
         return None
     material = scene.job.material
-    field = "coat" if name == "clearcoat" else name
-    scaled: dict[str, Any] = {field: np.asarray(getattr(material, field)) / strength}
+    scaled: dict[str, Any] = {name: np.asarray(getattr(material, name)) / strength}
     job = Job(scene.job.config, replace(material, **scaled))
     plan = reference_plan(job)
     return FAINT_CAUTION * strength * Pilot(job, plan).changed(without(plan, name)).bound()
@@ -343,8 +342,8 @@ def _bsdf_sampling(scene: _Analysis) -> Effect:
         return Effect(name, True, "a wide light")
     material = job.material
     lobes = [2.0] if material.is_lambert else [2.0 * float(np.min(np.asarray(material.roughness))) ** 2]
-    if material.coat is not None:
-        lobes.append(2.0 * float(np.min(np.asarray(material.coat_roughness))) ** 2)
+    if material.clearcoat is not None:
+        lobes.append(2.0 * float(np.min(np.asarray(material.clearcoat_roughness))) ** 2)
     if material.sheen is not None:
         # The fibers of sheen lean by less than about √α.
         lobes.append(float(np.min(np.asarray(material.sheen_roughness))))

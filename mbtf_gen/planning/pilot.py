@@ -35,7 +35,7 @@ def pilot_queries(job: Job, count: int = PILOT_QUERIES, shard: int = 0) -> Queri
 
     In both layouts every query has its own footprint and directions: a few images would have few of them.
     """
-    return replace(job.query_plan, layout="shuffled", window=None).draw("pilot", shard, count)
+    return replace(job.query_plan, layout="shuffled", patch_size=None).draw("pilot", shard, count)
 
 
 @dataclass(frozen=True)

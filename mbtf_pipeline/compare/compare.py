@@ -92,7 +92,7 @@ def compare(
     (out / PICTURES).mkdir(parents=True, exist_ok=True)
     materials = {name: Material.load(folder) for name, folder in fits.items()}
     start = time.perf_counter()
-    material = load_material(Path(generate.material), generate.geometry.tile)
+    material = load_material(Path(generate.material), generate.geometry.make_tileable)
     job = Job(generate, material)
     estimator = build_estimator(job, reference_plan(job))
     rendered = _render(section, estimator, progress)

@@ -110,7 +110,7 @@ class GeneratorBenchmark:
         data = self.config.model_dump(mode="json")
         levels = Job(self.config, self.material).lattice.finest
         fixed = {
-            "queries.levels": levels,
+            "queries.resolution": 1 << levels,
             "queries.layout": "shuffled",
             "output.shard_queries": SHARD,
         }

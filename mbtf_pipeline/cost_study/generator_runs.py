@@ -51,8 +51,8 @@ class GeneratorTask:
     def run(self, bench: GeneratorBenchmark, seconds: float) -> Point:
         """Measure it, timing for at most so many seconds."""
         if self.study == "adaptive":
-            even = self.changes.get("queries.allocation") == "even"
-            found = bench.measure_counts(self.changes, not even, seconds)
+            uniform = self.changes.get("queries.allocation") == "uniform"
+            found = bench.measure_counts(self.changes, not uniform, seconds)
         else:
             found = bench.measure(self.changes, self.against, seconds)
         details = {}
@@ -78,8 +78,8 @@ class GeneratorTask:
     def command(self, generator: str) -> str:
         """What measures it with the program: its command with the study's configuration, and the setting."""
         # But where ways to count paths are compared, all queries get as many.
-        even = {} if self.study == "adaptive" else {"queries.allocation": "even"}
-        sets = "".join(f" --set {name}={value}" for name, value in {**even, **self.changes}.items())
+        uniform = {} if self.study == "adaptive" else {"queries.allocation": "uniform"}
+        sets = "".join(f" --set {name}={value}" for name, value in {**uniform, **self.changes}.items())
         return f"{generator}{sets} -o shards/"
 
 
@@ -100,7 +100,7 @@ def generator_tasks(bench: GeneratorBenchmark) -> Iterator[GeneratorTask]:
 
 
 def _counts() -> Iterator[GeneratorTask]:
-    kinds = (("even", "the same for every query"), ("noise", "more where more noise is expected"))
+    kinds = (("uniform", "the same for every query"), ("noise", "more where more noise is expected"))
     for allocation, series in kinds:
         for n in COUNTS:
             changes = {"queries.spp": n, "queries.allocation": allocation}

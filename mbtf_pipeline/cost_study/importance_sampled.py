@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_core.lattice import level_of_sigma
 from mbtf_core.stats import Estimate, unexplained_variance
 from mbtf_fit.data.loader import Queries as FitQueries
 from mbtf_gen.planning.effects_plan import plan_effects
@@ -106,7 +107,7 @@ def _cells(queries: Queries) -> NDArray[np.int64]:
     half = queries.omega_i + queries.omega_o
     tilt = half[:, 2] / np.linalg.norm(half, axis=1)
     cosines = (queries.omega_i[:, 2], queries.omega_o[:, 2], np.sqrt(1.0 - np.minimum(tilt**2, 1.0)))
-    out = np.clip(-np.log2(2.0 * queries.sigma), 0, _LEVELS - 1).astype(np.int64)
+    out = np.clip(level_of_sigma(queries.sigma), 0, _LEVELS - 1).astype(np.int64)
     for value, n in zip(cosines, _ANGLES, strict=True):
         out = out * n + np.clip(value * n, 0, n - 1).astype(np.int64)
     return out

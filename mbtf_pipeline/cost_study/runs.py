@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mbtf_core.digest import data_sha256
 from mbtf_core.stats import Estimate
 from mbtf_core.units import parse_duration
 from mbtf_gen.config.generator import GeneratorConfig, count_queries
@@ -23,7 +24,6 @@ from mbtf_gen.job import Job
 from mbtf_gen.material.material import load_material
 from mbtf_pipeline.cost_study.generator_benchmark import GeneratorBenchmark
 from mbtf_pipeline.cost_study.measurements import Point
-from mbtf_pipeline.stages import hash_of
 
 if TYPE_CHECKING:
     from mbtf_pipeline.cost_study.importance_sampled import Judges
@@ -132,7 +132,7 @@ class RunRunner:
             "layout": "shuffled",
         }
         config = GeneratorConfig.model_validate(data)
-        folder = self.folder / f"data-{hash_of(data)[:12]}"
+        folder = self.folder / f"data-{data_sha256(data)[:12]}"
         shutil.rmtree(folder, ignore_errors=True)
         start = time.perf_counter()
         # What is odd about the material is said once, not for every data set.
@@ -176,7 +176,7 @@ class RunRunner:
         data = self.data(chain.data)
         self.progress(chain.label)
         config = FitConfig.model_validate({"seed": self.config.seed + chain.data.seed, **chain.fit})
-        out = self.folder / f"fit-{hash_of(chain.key)[:12]}"
+        out = self.folder / f"fit-{data_sha256(chain.key)[:12]}"
         shutil.rmtree(out, ignore_errors=True)
         result = fit(config, data.folder, out)
         material = result.material
@@ -233,7 +233,7 @@ class RunRunner:
 
 def _quiet_job(config: GeneratorConfig) -> Job:
     """The job of a configuration whose material was spoken of before."""
-    return Job(config, load_material(Path(config.material), config.geometry.tile))
+    return Job(config, load_material(Path(config.material), config.geometry.make_tileable))
 
 
 def _flat(options: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -163,7 +163,7 @@ def run_study(
     """
     begin = time.perf_counter()
     config = studied(recipe.generate, seed)
-    material = load_material(Path(config.material), config.geometry.tile)
+    material = load_material(Path(config.material), config.geometry.make_tileable)
     claim(folder)
 
     def note(text: str) -> None:

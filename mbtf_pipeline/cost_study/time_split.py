@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 from mbtf_core.atomic import read_json, write_json
 from mbtf_core.console import clock
+from mbtf_core.digest import data_sha256
 from mbtf_core.errors import InputError, UsageError
 from mbtf_core.units import format_duration
 from mbtf_fit.config import FitConfig
@@ -31,7 +32,6 @@ from mbtf_pipeline.cost_study.runs import Chain, RunRequest, RunRunner
 from mbtf_pipeline.recipe import Recipe
 from mbtf_pipeline.run import layout_of
 from mbtf_pipeline.run_folder import claim, describe, locked
-from mbtf_pipeline.stages import hash_of
 
 if TYPE_CHECKING:
     from mbtf_gen.forecast import Forecast
@@ -175,7 +175,7 @@ def split_budget(
             hint="leave out the fits of 'hierarchical'",
         )
     asked = recipe.model_dump(mode="json", include={"generate", "fit"})
-    key = hash_of({"schema": BUDGET_SCHEMA, "budget": budget, "recipe": asked})
+    key = data_sha256({"schema": BUDGET_SCHEMA, "budget": budget, "recipe": asked})
     claim(folder)
     with locked(folder):
         split = _remembered(folder, key)
@@ -266,7 +266,7 @@ def _plan(recipe: Recipe, budget: float, folder: Path, tell: Callable[[str], Non
 def _material(config: GeneratorConfig) -> Any:
     from mbtf_gen.material.material import load_material
 
-    return load_material(Path(config.material), config.geometry.tile)
+    return load_material(Path(config.material), config.geometry.make_tileable)
 
 
 def _prices(expected: Forecast, queries: int) -> tuple[float, float]:

@@ -43,14 +43,14 @@ def write_buffers(
     aspect: float = 1.0,
     noise: float = 0.0,
     seed: int = 0,
-    window: int | None = None,
+    patch_size: int | None = None,
     through: Callable[[F32, F32, F32], Any] | None = None,
 ) -> Path:
     """Write so many buffers of a known function, in two shards, with independent noise in both halves.
 
     Parameters
     ----------
-    window : places along each side of a buffer; None: whole buffers
+    patch_size : texels along each side of an image; None: whole buffers
     through : transmittance at u, σ and view, of a material with holes
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -60,8 +60,8 @@ def write_buffers(
         entries = []
         for index, items in enumerate(counts):
             queries = random_buffers(random, items, lattice)
-            if window is not None:
-                plan = QueryPlan(lattice, Mixture(1, 0), 0.1, "image", seed, items, window)
+            if patch_size is not None:
+                plan = QueryPlan(lattice, Mixture(1, 0), 0.1, "image", seed, items, patch_size)
                 queries = {name: getattr(plan.draw(split, index, items), name) for name in queries}
             shape = queries["sigma"].shape
             flat = {name: a.reshape(-1, *a.shape[3:]) for name, a in queries.items()}
@@ -86,7 +86,7 @@ def write_buffers(
         "levels": {"finest": finest},
         "tile": {"aspect": aspect},
         "splits": splits,
-        "window": window,
+        "patch_size": patch_size,
     }
     if through is not None:
         manifest["arrays"] = {"transmittance": {}}

@@ -18,7 +18,7 @@ def preview(
     /,
     *,
     output: Annotated[Path, Parameter(name=["--output", "-o"])] = Path("preview"),
-    spans: str | None = None,
+    tiles_across: str | None = None,
     size: int | None = None,
     turn_size: int | None = None,
     frames: int | None = None,
@@ -42,7 +42,7 @@ def preview(
         Folder made by mbtf-fit.
     output
         Folder of pictures.
-    spans
+    tiles_across
         Widths of the sheet's pictures in tiles. Default: 1,4,16
     size
         Pixels along each side of a picture of the sheet. Default: 160
@@ -66,7 +66,7 @@ def preview(
     if material is None and config is None:
         raise UsageError("no material given", hint="mbtf-fit preview material/ -o preview/")
     flags = {
-        "--spans": ("sheet.spans", numbers(spans, "--spans")),
+        "--tiles-across": ("sheet.tiles_across", numbers(tiles_across, "--tiles-across")),
         "--size": ("sheet.size", size),
         "--turn-size": ("turntable.size", turn_size),
         "--frames": ("turntable.frames", frames),
@@ -112,7 +112,7 @@ def draw(config: Any, path: Path, *, overwrite: bool, console: Console) -> None:
     columns = len(sheet.views) * len(sheet.lights)
     shows = {
         SHEET_NAME: f"{len(sheet.views)} views x {len(sheet.lights)} lights (columns) x "
-        f"{len(sheet.spans)} zooms (rows), {columns * len(sheet.spans)} pictures at one exposure",
+        f"{len(sheet.tiles_across)} zooms (rows), {columns * len(sheet.tiles_across)} pictures, one exposure",
         TURNTABLE_NAME: f"a ball of {turn.tiles} tiles around on a plate, {turn.frames} pictures of "
         f"{turn.spp} paths per pixel",
     }

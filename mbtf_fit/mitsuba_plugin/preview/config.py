@@ -30,7 +30,7 @@ class SheetSection(Settings):
         ],
         description="where the light comes from",
     )
-    spans: Annotated[list[Width], Field(min_length=1, max_length=8)] = Field(
+    tiles_across: Annotated[list[Width], Field(min_length=1, max_length=8)] = Field(
         [1.0, 4.0, 16.0], description="widths of the field of view, in tile widths"
     )
     size: Annotated[int, Field(ge=64, le=2048)] = Field(
@@ -57,7 +57,7 @@ class PreviewConfig(Settings):
     @model_validator(mode="after")
     def _fits(self) -> Self:
         sheet, turn = self.sheet, self.turntable
-        panels = len(sheet.views) * len(sheet.lights) * len(sheet.spans)
+        panels = len(sheet.views) * len(sheet.lights) * len(sheet.tiles_across)
         if max(panels * sheet.size**2, turn.frames * turn.size**2) > MOST_PIXELS:
             raise ValueError(f"asks for more than {MOST_PIXELS:,} pixels; take smaller or fewer pictures")
         return self

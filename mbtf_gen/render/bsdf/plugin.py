@@ -25,8 +25,8 @@ NAMES = (
     "roughness",
     "metallic",
     "specular",
-    "coat",
-    "coat_roughness",
+    "clearcoat",
+    "clearcoat_roughness",
     "sheen",
     "sheen_color",
     "sheen_roughness",
@@ -41,7 +41,7 @@ class SurfaceBSDF(mi.BSDF):
     """``mbtf_surface``: the project's surface as a BSDF of Mitsuba.
 
     Plugin parameters: the names of :data:`NAMES`, each a texture or a number. The terms simulated are those
-    whose parameters are given: ``specular`` (with ``roughness``), ``metallic``, ``coat``, ``sheen``,
+    whose parameters are given: ``specular`` (with ``roughness``), ``metallic``, ``clearcoat``, ``sheen``,
     ``slopes``. Opacity needs the generator's own loop and is not a part of the plugin.
     """
 
@@ -51,7 +51,7 @@ class SurfaceBSDF(mi.BSDF):
         numbers = {
             "base_color": 0.5,
             "roughness": 0.5,
-            "coat_roughness": 0.1,
+            "clearcoat_roughness": 0.1,
             "sheen_color": 1.0,
             "sheen_roughness": 0.3,
         }
@@ -62,14 +62,14 @@ class SurfaceBSDF(mi.BSDF):
             diffuse=bool(props.get("diffuse", True)),
             specular="specular" in textures,
             metallic="metallic" in textures,
-            coat="coat" in textures,
+            clearcoat="clearcoat" in textures,
             sheen="sheen" in textures,
             slopes="slopes" in textures,
             opacity="opacity" in textures,
         )
         self.surface = Surface(parts, textures)
         flags = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide
-        if parts.specular or parts.metallic or parts.coat:
+        if parts.specular or parts.metallic or parts.clearcoat:
             flags |= mi.BSDFFlags.GlossyReflection
         self.m_components = [flags]
         self.m_flags = flags
@@ -188,9 +188,9 @@ def bsdf_of(
         out["specular"] = _scalar(material.specular)
     if "metallic" in on and material.metallic is not None and np.any(np.asarray(material.metallic) > 0):
         out["metallic"] = _scalar(material.metallic)
-    if material.coat is not None and "clearcoat" in on:
-        out["coat"] = _scalar(material.coat)
-        out["coat_roughness"] = _scalar(material.coat_roughness)
+    if material.clearcoat is not None and "clearcoat" in on:
+        out["clearcoat"] = _scalar(material.clearcoat)
+        out["clearcoat_roughness"] = _scalar(material.clearcoat_roughness)
     if material.sheen is not None and "sheen" in on:
         out["sheen"] = _scalar(material.sheen)
         out["sheen_color"] = _color(1.0 if material.sheen_color is None else material.sheen_color)

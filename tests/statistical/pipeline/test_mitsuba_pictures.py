@@ -18,7 +18,7 @@ SECTION = CompareSection.model_validate(
     {
         "views": [{"elevation": 82, "azimuth": -60}],
         "lights": [{"elevation": 45, "azimuth": 35}],
-        "spans": [0.6],
+        "tiles_across": [0.6],
         "size": 40,
         "spp": 32,
     }
@@ -36,7 +36,7 @@ def glossy(tmp_path_factory: pytest.TempPathFactory) -> Material:
     colors = np.kron(random.integers(40, 255, (8, 16, 3)), np.ones((2, 2, 1))).astype(np.uint8)
     PIL.Image.fromarray(colors).save(folder / "base_color.png")
     (folder / "material.yaml").write_text(
-        "height: {file: height.npy, scale: 0.06}\nbasecolor: base_color.png\nroughness: 0.4\n"
+        "height: {file: height.npy, scale: 0.06}\nbase_color: base_color.png\nroughness: 0.4\n"
     )
     return load_material(folder / "material.yaml")
 

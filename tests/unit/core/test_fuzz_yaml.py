@@ -34,7 +34,7 @@ bsdf:
 """
 CONFIG = """\
 material: heights.npy
-geometry: {height: 0.1, mesh: 64}
+geometry: {height_scale: 0.1, mesh: 64}
 queries:
   train: 400/texel
   test: 1000
@@ -59,7 +59,7 @@ fit:
   b: {model: neumip-baseline}
 compare:
   views: [{elevation: 60, azimuth: 0}, {elevation: 90}]
-  spans: [1, 4]
+  tiles_across: [1, 4]
   kinds: [query]
 report: {title: "Small: a test"}
 """

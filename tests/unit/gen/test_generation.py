@@ -167,9 +167,7 @@ def test_an_interrupted_run_resumes(
     assert contents(tmp_path / "out") == contents(tmp_path / "whole")
 
 
-def test_leftovers_of_a_kill_are_removed(
-    config: GeneratorConfig, engine: Formula, tmp_path: Path
-) -> None:
+def test_leftovers_of_a_kill_are_removed(config: GeneratorConfig, engine: Formula, tmp_path: Path) -> None:
     out = tmp_path / "out"
     # Killed while the manifest was written: the folder holds a temporary file alone.
     out.mkdir()

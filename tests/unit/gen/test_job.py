@@ -37,7 +37,7 @@ def test_shards_cover_the_rows(heights: Path) -> None:
     # Image layout: whole images of 32 texels; 100 queries are four of them, one per shard.
     assert [n for _, n in rows(job_of(heights, layout="image"))] == [1] * 4
     # Patches of 9 texels: 100 queries are twelve of them, four per shard of 40 queries.
-    patches = job_of(heights, layout="image", window=3)
+    patches = job_of(heights, layout="image", patch_size=3)
     assert [n for _, n in rows(patches)] == [4, 4, 4]
     assert split_queries(patches, "train") == 108
     assert sum(n for _, n in rows(job_of(heights, train="3/texel"))) == 96
@@ -51,4 +51,4 @@ def test_too_many_shards_are_refused(heights: Path) -> None:
 def test_most_paths_include_pilots_and_cap(heights: Path) -> None:
     job = job_of(heights)
     assert most_paths(job) == planned_paths(job, job.shards) == 320
-    assert most_paths(job_of(heights, target_error=0.02, cap=128)) == 100 * (128 + 16) + 30 * 4
+    assert most_paths(job_of(heights, target_error=0.02, max_spp=128)) == 100 * (128 + 16) + 30 * 4

@@ -165,7 +165,7 @@ def test_batches_take_every_buffer_and_resume_anywhere() -> None:
 
 def windows(lattice: Lattice, size: int, count: int) -> TrainingBuffers:
     """Windows as the generator draws them; the value's first channel numbers the queries."""
-    q = QueryPlan(lattice, Mixture(1, 0), 0.2, "image", 3, count, window=size).draw("train", 0, count)
+    q = QueryPlan(lattice, Mixture(1, 0), 0.2, "image", 3, count, patch_size=size).draw("train", 0, count)
     sigma = q.sigma[:, 0, 0]
     number = np.arange(q.sigma.size, dtype=np.float32).reshape(q.sigma.shape)
     value = np.stack([number, 0 * number, 0 * number], -1)
@@ -193,7 +193,7 @@ def test_crops_of_windows_go_on_beyond_their_border() -> None:
 
 
 def test_windows_are_read_with_the_grids_that_they_lie_on(tmp_path: Path) -> None:
-    folder = write_buffers(tmp_path / "d", parallax, train=20, finest=4, aspect=0.5, window=5)
+    folder = write_buffers(tmp_path / "d", parallax, train=20, finest=4, aspect=0.5, patch_size=5)
     data = buffers_of(partition(folder, HeldOutSection(queries=0, radius=0)))
     assert data.u.shape == (20, 5, 5, 2)
     crops = data.crop(np.arange(20), np.ones((20, 2), np.int64), 3, 2)
@@ -218,9 +218,9 @@ def test_batches_cut_windows_within_them() -> None:
     assert seen == {6 * j + i for j in range(3) for i in range(3)}
 
 
-@pytest.mark.parametrize("window", [None, 6])
-def test_smaller_crops_make_batches_of_more_lights_and_views(tmp_path: Path, window: int | None) -> None:
-    folder = write_buffers(tmp_path / "d", constant(0.1), train=40, window=window)
+@pytest.mark.parametrize("patch_size", [None, 6])
+def test_smaller_crops_make_batches_of_more_lights_and_views(tmp_path: Path, patch_size: int | None) -> None:
+    folder = write_buffers(tmp_path / "d", constant(0.1), train=40, patch_size=patch_size)
     for crop, shape in ((2, (16, 2, 2, 3)), (4, (4, 4, 4, 3))):
         training = {"steps": 1, "batch": 64, "crop": crop}
         config = FitConfig.model_validate({"model": "hierarchical", "training": training})

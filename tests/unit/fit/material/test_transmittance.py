@@ -56,9 +56,9 @@ def test_a_known_transmittance_is_found(tmp_path: Path) -> None:
     assert np.sqrt(np.mean((found - wanted)[fine] ** 2)) < 0.02
 
 
-@pytest.mark.parametrize("window", [None, 4])
-def test_buffers_tell_the_same(tmp_path: Path, window: int | None) -> None:
-    folder = write_buffers(tmp_path, constant(0.2), train=1500, through=lace, window=window)
+@pytest.mark.parametrize("patch_size", [None, 4])
+def test_buffers_tell_the_same(tmp_path: Path, patch_size: int | None) -> None:
+    folder = write_buffers(tmp_path, constant(0.2), train=1500, through=lace, patch_size=patch_size)
     data = Dataset.open(folder)
     model = fit_transmittance(data, chosen(data))
     assert model is not None

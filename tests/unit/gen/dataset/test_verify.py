@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from support.datasets import edit, write_dataset
 
-from mbtf_core.atomic import digest
+from mbtf_core.digest import file_sha256
 from mbtf_core.errors import InputError
 from mbtf_gen.dataset.shard_io import read_shard, write_shard
 from mbtf_gen.dataset.verify import is_finished, shard_fault, sidecar_of, verify
@@ -136,7 +136,7 @@ def test_wrong_rows_and_bad_numbers_are_found_behind_a_true_digest(copy: Path) -
 
     def replace(arrays: dict[str, Any]) -> str:
         write_shard(path, arrays)
-        edit(sidecar_of(path), lambda r: r.update(bytes=path.stat().st_size, sha256=digest(path)))
+        edit(sidecar_of(path), lambda r: r.update(bytes=path.stat().st_size, sha256=file_sha256(path)))
         return faults(copy).get(path.name, "nothing")
 
     assert replace(intact) == "nothing"

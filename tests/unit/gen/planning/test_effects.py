@@ -136,7 +136,7 @@ def test_a_small_run_has_no_pilot() -> None:
     assert plan_effects(job_of(FLAT), pilots=False).closed_form
 
 
-COAT: dict[str, Any] = {"coat": 1.0, "coat_roughness": 0.1}
+COAT: dict[str, Any] = {"clearcoat": 1.0, "clearcoat_roughness": 0.1}
 
 
 def test_black_under_a_clearcoat_is_not_black() -> None:
@@ -168,7 +168,9 @@ def test_the_smallest_roughness_decides_on_bsdf_sampling() -> None:
     patch[3, 3] = 0.02
     assert not plan_effects(job_of(replace(FLAT, **dull))).on("bsdf_sampling")
     assert plan_effects(job_of(replace(FLAT, **{**dull, "roughness": patch}))).on("bsdf_sampling")
-    assert plan_effects(job_of(replace(FLAT, **dull, coat=1.0, coat_roughness=0.05))).on("bsdf_sampling")
+    assert plan_effects(job_of(replace(FLAT, **dull, clearcoat=1.0, clearcoat_roughness=0.05))).on(
+        "bsdf_sampling"
+    )
     assert not plan_effects(job_of(FLAT, "+parallax")).on("bsdf_sampling")
     sheen = {"sheen": 0.5, "sheen_roughness": 0.5}
     assert not plan_effects(job_of(replace(FLAT, **sheen))).on("bsdf_sampling")

@@ -200,7 +200,7 @@ def test_studies_count_paths_whatever_the_recipe_aims_at() -> None:
     """With a target error all numbers of paths would be one setting; and fits learn from single queries."""
     from mbtf_pipeline.cost_study.study import studied
 
-    queries = {"target_error": "5%", "layout": "image", "window": 8, "spp": 6}
+    queries = {"target_error": "5%", "layout": "image", "patch_size": 8, "spp": 6}
     config = GeneratorConfig.model_validate({"material": "m", "seed": 3, "queries": queries})
     found = studied(config, None)
     assert found.queries.target_error is None
