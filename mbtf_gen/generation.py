@@ -7,7 +7,7 @@ from pathlib import Path
 
 from mbtf_core.errors import PartialError
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.dataset.folder import holds, open_folder
+from mbtf_gen.dataset.folder import has_dataset, open_folder
 from mbtf_gen.dataset.render_shards import ProgressCallback, busy_message, render_shards
 from mbtf_gen.dataset.summary import Summary, finish, read_run_plan
 from mbtf_gen.dataset.verify import is_finished
@@ -67,7 +67,7 @@ def generate(
     folder = Path(folder)
     start = time.perf_counter()
     job = source if isinstance(source, Job) else Job.prepare(source)
-    overwrite = overwrite and not (slice_count > 1 and holds(folder, job.config_hash))
+    overwrite = overwrite and not (slice_count > 1 and has_dataset(folder, job.config_hash))
     open_folder(job, folder, plan_run, overwrite)
     entries = job.shards[slice_index - 1 :: slice_count]
     result = render_shards(job, folder, entries, read_run_plan(folder), progress=progress)

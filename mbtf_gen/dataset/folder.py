@@ -47,8 +47,8 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     return read_checksummed(folder / MANIFEST_NAME, "repair it with: mbtf-gen repair FOLDER")
 
 
-def holds(folder: Path, config_hash: str) -> bool:
-    """Whether a folder holds a data set of this configuration, finished or not."""
+def has_dataset(folder: Path, config_hash: str) -> bool:
+    """Whether a folder contains a data set of this configuration, finished or not."""
     path = folder / MANIFEST_NAME
     return path.exists() and read_json(path).get("config_hash") == config_hash
 
@@ -64,7 +64,7 @@ def open_folder(job: Job, folder: Path, plan: Callable[[Job], RunPlan], overwrit
 
     Raises
     ------
-    InputError : the folder holds something else, or a corrupt manifest
+    InputError : the folder contains something else, or a corrupt manifest
     PartialError : it cannot be written, or other processes write the data set that is to be replaced
     """
     if folder.exists() and not folder.is_dir():

@@ -176,7 +176,7 @@ class Dataset:
                 raise InputError(
                     f"shard {entry['file']} is missing or unfinished",
                     where=self.folder,
-                    hint="run the mbtf-gen command that made the folder again: it resumes",
+                    hint="run the mbtf-gen command that generated it again: it resumes",
                 )
             record = read_json(sidecar)
             check_document(_Sidecar, record, sidecar, _MAKE_AGAIN)
