@@ -21,7 +21,8 @@ from mbtf_core.digest import data_sha256
 from mbtf_core.stats import Estimate, unexplained_variance
 from mbtf_core.units import parse_duration
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.generation import Job, generate
+from mbtf_gen.generation import generate
+from mbtf_gen.job import Job
 from mbtf_gen.material.material import load_material
 from mbtf_pipeline.cost_study.measurements import Measurement
 
@@ -129,8 +130,8 @@ class RunRunner:
         shutil.rmtree(folder, ignore_errors=True)
         start = time.perf_counter()
         # `Job.prepare` would log the material's warnings for every data set.
-        job = Job.of(config, load_material(Path(config.material), config.geometry.make_tileable))
-        generate(config, folder, job=job)
+        job = Job(config, load_material(Path(config.material), config.geometry.make_tileable))
+        generate(job, folder)
         return folder, time.perf_counter() - start
 
     def data(self, request: DataRequest) -> tuple[Path, float]:

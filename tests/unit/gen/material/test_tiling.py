@@ -191,7 +191,7 @@ class TestMaterial:
 
 def test_jobs_use_it(tmp_path: Path) -> None:
     from mbtf_gen.config.generator import GeneratorConfig
-    from mbtf_gen.generation import Job
+    from mbtf_gen.job import Job
 
     path = save_heights(tmp_path / "h.png", cut(fractal(64, 64)))
     config = {"material": str(path), "geometry": {"make_tileable": "mirror"}}
