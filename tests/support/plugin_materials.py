@@ -59,7 +59,9 @@ def write_material(
     tensors |= weights or {}
     built.load_weights(tensors)
     folder.mkdir(parents=True, exist_ok=True)
-    return export(built, config, folder, data={"hash": "0" * 64}, training=_TRAINING, transmittance=transmittance)
+    return export(
+        built, config, folder, data={"hash": "0" * 64}, training=_TRAINING, transmittance=transmittance
+    )
 
 
 def deviation(found: np.ndarray, wanted: np.ndarray) -> float:

@@ -18,7 +18,7 @@ def preview(
     /,
     *,
     output: Annotated[Path, Parameter(name=["--output", "-o"])] = Path("preview"),
-    spans: str | None = None,
+    tiles_across: str | None = None,
     size: int | None = None,
     turn_size: int | None = None,
     frames: int | None = None,
@@ -32,7 +32,7 @@ def preview(
     overwrite: Annotated[bool, Parameter(negative="")] = False,
     console: Console = CONSOLE,
 ) -> None:
-    """Draw a material: a contact sheet of views, lights and zooms, and a turntable.
+    """Draw a material: a contact sheet of views, lights and widths, and a turntable.
 
     Needs neither a scene nor PyTorch. Writes sheet.png and turntable.gif.
 
@@ -42,14 +42,14 @@ def preview(
         Folder made by mbtf-fit.
     output
         Folder of pictures.
-    spans
+    tiles_across
         Widths of the sheet's pictures in tiles. Default: 1,4,16
     size
         Pixels along each side of a picture of the sheet. Default: 160
     turn_size
         Pixels along each side of the turntable. Default: 240
     frames
-        Pictures of one turn. Default: 24
+        Frames of one rotation. Default: 24
     spp
         Paths per pixel of the turntable. Default: 16
     tiles
@@ -66,7 +66,7 @@ def preview(
     if material is None and config is None:
         raise UsageError("no material given", hint="mbtf-fit preview material/ -o preview/")
     flags = {
-        "--spans": ("sheet.spans", numbers(spans, "--spans")),
+        "--tiles-across": ("sheet.tiles_across", numbers(tiles_across, "--tiles-across")),
         "--size": ("sheet.size", size),
         "--turn-size": ("turntable.size", turn_size),
         "--frames": ("turntable.frames", frames),
@@ -87,7 +87,7 @@ def preview(
 
 
 def draw(config: Any, path: Path, *, overwrite: bool, console: Console) -> None:
-    """Draw the pictures that are missing and report them.
+    """Draw the missing pictures and report all.
 
     Raises
     ------
@@ -109,10 +109,9 @@ def draw(config: Any, path: Path, *, overwrite: bool, console: Console) -> None:
         overwrite=overwrite,
     )
     sheet, turn = config.sheet, config.turntable
-    columns = len(sheet.views) * len(sheet.lights)
     shows = {
         SHEET_NAME: f"{len(sheet.views)} views x {len(sheet.lights)} lights (columns) x "
-        f"{len(sheet.spans)} zooms (rows), {columns * len(sheet.spans)} pictures at one exposure",
+        f"{len(sheet.tiles_across)} widths (rows) at one exposure",
         TURNTABLE_NAME: f"a ball of {turn.tiles} tiles around on a plate, {turn.frames} pictures of "
         f"{turn.spp} paths per pixel",
     }
@@ -131,5 +130,5 @@ def draw(config: Any, path: Path, *, overwrite: bool, console: Console) -> None:
                 pictures.turntable(folder.path / TURNTABLE_NAME, lambda: bar.advance(1))
                 folder.keep(TURNTABLE_NAME, [folder.path / TURNTABLE_NAME], {})
     made = [{"file": folder.path / name, "shows": text, "kept": kept[name]} for name, text in shows.items()]
-    lines = [f"{p['file']}: {p['shows']}{' (was there)' if p['kept'] else ''}" for p in made]
+    lines = [f"{p['file']}: {p['shows']}{' (kept)' if p['kept'] else ''}" for p in made]
     console.report({"folder": path, "pictures": made}, "\n".join(lines))

@@ -9,18 +9,18 @@ from pydantic import Field, model_validator
 from mbtf_core.config_file import Settings
 from mbtf_gen.config.pictures import Direction
 
-# The whole sheet and the whole turntable are held in memory; this keeps both below a gigabyte.
+# Limits the memory of sheet and turntable to a gigabyte.
 MOST_PIXELS = 1 << 25
 
 Width = Annotated[float, Field(gt=0, le=1e4)]
 
 
 class SheetSection(Settings):
-    """The contact sheet: a column per view and light, a row per width."""
+    """The contact sheet: a column per view and light, a row per width of the field of view."""
 
     views: Annotated[list[Direction], Field(min_length=1, max_length=8)] = Field(
         [Direction(elevation=70, azimuth=-90), Direction(elevation=30, azimuth=-90)],
-        description="where the camera stands",
+        description="directions towards the camera",
     )
     lights: Annotated[list[Direction], Field(min_length=1, max_length=8)] = Field(
         [
@@ -28,10 +28,10 @@ class SheetSection(Settings):
             Direction(elevation=35, azimuth=180),
             Direction(elevation=20, azimuth=15),
         ],
-        description="where the light comes from",
+        description="directions towards the light",
     )
-    spans: Annotated[list[Width], Field(min_length=1, max_length=8)] = Field(
-        [1.0, 4.0, 16.0], description="widths of the field of view, in tile widths"
+    tiles_across: Annotated[list[Width], Field(min_length=1, max_length=8)] = Field(
+        [1.0, 4.0, 16.0], description="widths of the field of view in tiles"
     )
     size: Annotated[int, Field(ge=64, le=2048)] = Field(
         160, description="pixels along each side of a picture"
@@ -39,16 +39,16 @@ class SheetSection(Settings):
 
 
 class TurntableSection(Settings):
-    """A ball on a plate that turns once."""
+    """A rotating ball on a plate."""
 
     size: Annotated[int, Field(ge=16, le=2048)] = Field(240, description="pixels along each side")
-    frames: Annotated[int, Field(ge=1, le=360)] = Field(24, description="pictures of one turn")
+    frames: Annotated[int, Field(ge=1, le=360)] = Field(24, description="frames of one rotation")
     spp: Annotated[int, Field(ge=1, le=65536)] = Field(16, description="paths per pixel")
     tiles: Annotated[int, Field(ge=1, le=1000)] = Field(8, description="tiles around the ball's equator")
 
 
 class PreviewConfig(Settings):
-    """Everything ``mbtf-fit preview`` needs."""
+    """Every option of ``mbtf-fit preview``."""
 
     material: str = Field(description="folder made by mbtf-fit")
     sheet: SheetSection = SheetSection()
@@ -57,7 +57,7 @@ class PreviewConfig(Settings):
     @model_validator(mode="after")
     def _fits(self) -> Self:
         sheet, turn = self.sheet, self.turntable
-        panels = len(sheet.views) * len(sheet.lights) * len(sheet.spans)
+        panels = len(sheet.views) * len(sheet.lights) * len(sheet.tiles_across)
         if max(panels * sheet.size**2, turn.frames * turn.size**2) > MOST_PIXELS:
-            raise ValueError(f"asks for more than {MOST_PIXELS:,} pixels; take smaller or fewer pictures")
+            raise ValueError(f"asks for more than {MOST_PIXELS:,} pixels; use smaller or fewer pictures")
         return self

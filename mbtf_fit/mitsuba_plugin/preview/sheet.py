@@ -1,7 +1,7 @@
-"""The contact sheet: a plane of the material from several views, under several lights, at several widths.
+"""The contact sheet: a plane of the material for several views, lights and widths of the field of view.
 
-A pixel is the material's value M at the pixel's position, footprint and directions, one query per pixel, as
-``mbtf-gen reference --kind query`` defines it; the light has unit irradiance on the plane.
+A pixel is the material's value M for a single query, as in ``mbtf-gen reference --kind query``; the light has
+unit irradiance on the plane.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from mbtf_gen.pictures.camera import Camera
 from mbtf_gen.pictures.reference import auto_exposure, to_display
 
 GAP, MARGIN, CAPTION = 4, 8, 34
-# Exposure as a share of what suits a picture alone: pictures of one sheet differ.
+# Factor of the automatic exposure: pictures of one sheet differ in brightness.
 HEADROOM = 0.8
 INK, PAPER = (30, 30, 30), (255, 255, 255)
 
 
 def panels(evaluator: Evaluator, section: SheetSection) -> F32:
-    """Values (views, lights, spans, size, size, 3) in 1/sr.
+    """Values (views, lights, widths, size, size, 3) in 1/sr.
 
     Raises
     ------
@@ -38,7 +38,7 @@ def panels(evaluator: Evaluator, section: SheetSection) -> F32:
     pictures = []
     for view in section.views:
         for light in lights:
-            for span in section.spans:
+            for span in section.tiles_across:
                 camera = Camera(
                     view.elevation,
                     view.azimuth,
@@ -49,36 +49,36 @@ def panels(evaluator: Evaluator, section: SheetSection) -> F32:
                 )
                 q = camera.queries(light, aspect).flat()
                 pictures.append(evaluator.evaluate(q.u, q.sigma, q.omega_i, q.omega_o))
-    lead = (len(section.views), len(lights), len(section.spans))
+    lead = (len(section.views), len(lights), len(section.tiles_across))
     return np.stack(pictures).reshape(*lead, section.size, section.size, 3)
 
 
 def contact_sheet(values: F32, section: SheetSection) -> NDArray[np.uint8]:
     """The sheet (rows, columns, 3): a column per view and light, a row per width, one exposure for all."""
-    views, lights, spans, size = values.shape[:4]
+    views, lights, widths, size = values.shape[:4]
     exposure = HEADROOM * auto_exposure(values)
     pitch = size + GAP
     width = 2 * MARGIN + views * lights * pitch - GAP + (views - 1) * GAP
-    height = MARGIN + spans * pitch - GAP + CAPTION + MARGIN
+    height = MARGIN + widths * pitch - GAP + CAPTION + MARGIN
     sheet = Image.new("RGB", (width, height), PAPER)
     draw = ImageDraw.Draw(sheet)
     font = ImageFont.load_default(max(9, min(13, size // 12)))
     for view in range(views):
         for light in range(lights):
-            # Views stand a little apart.
+            # A wider gap separates views.
             left = MARGIN + (view * lights + light) * pitch + view * GAP
-            text = f"{_said('view', section.views[view])}\n{_said('light', section.lights[light])}"
+            text = f"{_caption('view', section.views[view])}\n{_caption('light', section.lights[light])}"
             draw.multiline_text((left + 1, MARGIN), text, INK, font, spacing=2)
-            for row in range(spans):
+            for row in range(widths):
                 picture = Image.fromarray(to_display(values[view, light, row], exposure))
                 top = MARGIN + CAPTION + row * pitch
                 sheet.paste(picture, (left, top))
                 if view == light == 0:
-                    _label(draw, (left, top + size), _tiles(section.spans[row]), font)
+                    _label(draw, (left, top + size), _tiles(section.tiles_across[row]), font)
     return np.asarray(sheet)
 
 
-def _said(name: str, direction: Direction) -> str:
+def _caption(name: str, direction: Direction) -> str:
     return f"{name} {direction.elevation:g}°, {direction.azimuth:g}°"
 
 
@@ -87,7 +87,7 @@ def _tiles(span: float) -> str:
 
 
 def _label(draw: ImageDraw.ImageDraw, corner: tuple[int, int], text: str, font: Any) -> None:
-    """Text in the lower left corner of a picture, on paper so that it can be read."""
+    """Text in the lower left corner of a picture, on a white background."""
     left, bottom = corner
     box = draw.textbbox((0, 0), text, font=font)
     top = bottom - (box[3] - box[1]) - 6

@@ -179,7 +179,9 @@ class Reader:
         if encoding["position"]:
             p = 2 * (places - np.floor(places)) - 1
             spread = 2.0 ** -level[:, None, None, None] / [1, document["tile"]["aspect"]]
-            encoded = self.encoded(p, "position", encoding, spread if encoding["footprint_filtered"] else None)
+            encoded = self.encoded(
+                p, "position", encoding, spread if encoding["footprint_filtered"] else None
+            )
             features = np.concatenate([features, encoded], -1)
         size = 3 if encoding["direction_xyz"] else 2
         lights = [self.encoded(o[:, :size], "direction", encoding) for o in (omega_i, omega_o)]

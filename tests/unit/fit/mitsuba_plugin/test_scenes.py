@@ -293,5 +293,5 @@ def test_values_that_are_not_the_materials_own_are_refused(tmp_path: Path) -> No
     description = json.loads((tmp_path / "material.json").read_text())
     description["weights"]["sha256"] = digest(path)
     (tmp_path / "material.json").write_text(json.dumps(description))
-    with pytest.raises(InputError, match="does not give its conformance values"):
+    with pytest.raises(InputError, match="does not reproduce its conformance values"):
         load_scene(scene_of(tmp_path, sampling="cosine", networks="cooperative"))

@@ -126,9 +126,7 @@ def test_workers_leave_torchs_settings_as_they_were() -> None:
 
 
 def test_rates_rise_and_fall() -> None:
-    training = FitConfig().training.model_copy(
-        update={"warmup": 10, "final_learning_rate_factor": 0.05}
-    )
+    training = FitConfig().training.model_copy(update={"warmup": 10, "final_learning_rate_factor": 0.05})
     assert learning_rate_factor(training, 0, 0.0) == pytest.approx(1 / 11)
     assert learning_rate_factor(training, 10, 0.0) == 1.0
     assert learning_rate_factor(training, 1000, 0.5) == pytest.approx(0.525)
