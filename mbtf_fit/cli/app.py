@@ -31,9 +31,7 @@ Set = Annotated[
 Output = Annotated[Path, Parameter(name=["--output", "-o"])]
 QualityOption = Annotated[
     Quality,
-    Parameter(
-        help=quality_help("Training time and size that belong together; other options change single ones.")
-    ),
+    Parameter(help=quality_help("Preset of training time and network size; explicit options override it.")),
 ]
 
 
@@ -85,9 +83,9 @@ def fit(
     learning_rate
         Peak learning rate of the networks.
     seed
-        Seed of the first parameters and of the order of batches.
+        Seed of the initial parameters and of the batch order.
     device
-        Where to train; auto takes CUDA where there is one. Default: auto
+        Device to train on; auto is CUDA if available. Default: auto
     config
         YAML file with the options.
     overwrite
@@ -96,7 +94,7 @@ def fit(
         Forecast time, error and size by two short fits on this machine, and write nothing.
     """
     if dry_run and many is not None:
-        raise UsageError("--dry-run looks at one data set", hint="mbtf-fit shards/ --dry-run")
+        raise UsageError("--dry-run forecasts one data set", hint="mbtf-fit shards/ --dry-run")
     if many is not None and shards is not None:
         raise UsageError("--many takes all data sets", hint=f"mbtf-fit --many {shards} ... -o materials/")
     if processes is not None and (many is None or processes < 1):
@@ -122,8 +120,8 @@ def fit(
     # Time asked for on the command line takes the place of steps in a file.
     assigned: list[str] = []
     if quality is not None:
-        said = {"model": model or "neumip", **overrides_of(config, assignments or [])}
-        assigned = as_assignments(fitter_options(quality, {"": said})[""])
+        given = {"model": model or "neumip", **overrides_of(config, assignments or [])}
+        assigned = as_assignments(fitter_options(quality, {"": given})[""])
     assigned += [*(assignments or []), *(["training.steps=null"] if time is not None else [])]
     resolved = resolve(FitConfig, file=config, assignments=assigned, flags=flags)
     training = resolved.training
@@ -216,16 +214,15 @@ def _fit_many(
         raise PartialError(
             f"{len(failed)} of {len(outcomes)} fits failed",
             where=output,
-            hint="the same command again takes up what is not finished",
+            hint="the same command resumes the unfinished fits",
         )
 
 
 @app.command
 def evaluate(material: Path, shards: Path, /, *, console: Console = CONSOLE) -> None:
-    """Errors of a material on a data set, free of the data's noise.
+    """Errors of a material on a data set, corrected for the data's noise.
 
-    On the test split, and on the queries and directions that were held out of training: overall, by level of
-    detail, and by elevation.
+    On the test split and on held-out queries and directions: overall, by level, and by elevation.
 
     Parameters
     ----------
@@ -242,12 +239,12 @@ def evaluate(material: Path, shards: Path, /, *, console: Console = CONSOLE) -> 
     if foreign:
         console.note(
             f"warning: {shards} was made from another material than {material} was trained on "
-            f"({', '.join(foreign)} differ{'s' if len(foreign) == 1 else ''}); these errors say how far the "
-            "two are apart, not how good the fit is"
+            f"({', '.join(foreign)} differ{'s' if len(foreign) == 1 else ''}); these errors compare two "
+            "materials"
         )
     found = evaluate(loaded, shards)
     errors = {name: e.as_dict() for name, e in found.values.items()}
-    through = (
+    transmittance = (
         None if found.transmittance is None else {n: e.as_dict() for n, e in found.transmittance.items()}
     )
     lines = [f"{material}: {loaded.config.model} on {shards}", *describe_errors(errors)]
@@ -257,9 +254,9 @@ def evaluate(material: Path, shards: Path, /, *, console: Console = CONSOLE) -> 
             "shards": shards,
             "foreign_inputs": foreign,
             "errors": errors,
-            **({} if through is None else {"transmittance": through}),
+            **({} if transmittance is None else {"transmittance": transmittance}),
         },
-        "\n".join(lines + describe_transmittance(through)),
+        "\n".join(lines + describe_transmittance(transmittance)),
     )
 
 
@@ -275,11 +272,11 @@ def export_material(
     half: Annotated[bool, Parameter(negative="")] = False,
     console: Console = CONSOLE,
 ) -> None:
-    """Write a material in forms that other programs read: mbtf-fit export material/ --to exr
+    """Export a material for other programs: mbtf-fit export material/ --to exr
 
-    exr: the latent textures, a part per level and a channel per feature, and those of the transmittance of a
-    material with holes. json: the networks as a list of layers, with formulas, conventions and queries with
-    expected values. material: another material folder.
+    exr: the latent textures and the transmittance, a part per level and a channel per feature. json: the
+    networks as a list of layers, with formulas, conventions and conformance values. material: another
+    material folder.
 
     Parameters
     ----------
@@ -290,7 +287,7 @@ def export_material(
     output
         Folder to write to. Default: the material's own
     half
-        Round all weights and texels to 16 bits, and print the error of that.
+        Round all weights and texels to 16 bits, and print the rounding error.
     """
     from mbtf_fit.material.export import LAYERS_NAME, TEXTURES_NAME, to_half, write_layers, write_textures
     from mbtf_fit.material.format import DESCRIPTION_NAME, WEIGHTS_NAME
@@ -302,9 +299,7 @@ def export_material(
     folder = material if output is None else output
     loaded = Material.load(material)
     if "material" in wanted and folder.is_dir() and any(folder.iterdir()):
-        raise InputError(
-            "holds something already", where=folder, hint="name a new folder with -o for --to material"
-        )
+        raise InputError("is not empty", where=folder, hint="name a new folder with -o for --to material")
     written, error = loaded, None
     if half:
         written, error = to_half(loaded)
@@ -341,7 +336,7 @@ app.command(preview)
 
 @app.command
 def info(path: Path, /, *, console: Console = CONSOLE) -> None:
-    """What a material or a data set holds.
+    """Describe a material or a data set.
 
     Parameters
     ----------
@@ -398,7 +393,7 @@ def _material_info(path: Path) -> tuple[dict[str, Any], str]:
         f"{weights['network_weights']} network weights, {weights['texels']} numbers in textures, "
         f"{size / 1e6:.2f} MB",
         f"trained {training['steps']} steps of {training['batch']} in {clock(training['seconds'])}",
-        f"this machine's CPU evaluates by: {describe()}",
+        f"CPU backend of this machine: {describe()}",
         *describe_errors(training["errors"]),
         *describe_transmittance(training.get("transmittance")),
         f"conformance: {description['conformance']['count']} queries, largest deviation {deviation:.2g}",

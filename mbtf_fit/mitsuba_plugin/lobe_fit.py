@@ -117,12 +117,8 @@ def _iterate(weight: Float, viewer: Vector3f, light: Vector3f, texel: UInt32, co
         mixture = mixture_of(buffer, texel, viewer)
         lobe, lobe_weight = mixture.lobe, mixture.weight
         density = lobe.density(light, viewer)
-        by_lobe = (
-            weight
-            * lobe_weight
-            * density
-            / dr.maximum(dr.lerp(dr.inv_pi * light.z, density, lobe_weight), 1e-20)
-        )
+        mixed = dr.lerp(dr.inv_pi * light.z, density, lobe_weight)
+        by_lobe = weight * lobe_weight * density / dr.maximum(mixed, 1e-20)
         sx, sy, square = lobe.deviation(half)
         # Student weights (ν + 2)/(ν + δ) with ν = 2 and δ = 2|t|².
         robust = 2.0 * by_lobe / (1.0 + square)

@@ -70,7 +70,7 @@ def test_a_scene_in_xml_of_the_documentation_runs(tmp_path: Path, run_python: Ru
     assert done.stdout.split() == ["ConePath", "[4]"]
 
 
-def test_a_plugin_that_came_too_late_says_so(run_python: RunPython) -> None:
+def test_a_late_import_is_refused(run_python: RunPython) -> None:
     code = """
 import drjit.llvm, mitsuba as mi
 try:
@@ -95,7 +95,7 @@ else:
         assert said == "no LLVM without ours" or said.startswith("Dr.Jit was imported before mbtf_gen")
 
 
-def test_registration_says_what_it_misses(run_python: RunPython) -> None:
+def test_registration_reports_missing_variants(run_python: RunPython) -> None:
     code = """
 import mbtf_fit.mitsuba_plugin
 from mbtf_gen.render.llvm import use_shipped_llvm

@@ -91,7 +91,7 @@ def test_the_networks_of_the_paper_unrolled(tmp_path: Path) -> None:
     "options",
     [{}, {"finest": 6, "contrast": 0.5}, {"model": "neumip-baseline", "finest": 6, "contrast": 1.0}],
 )
-def test_half_precision_keeps_to_a_hundredth(options: dict[str, Any], tmp_path: Path) -> None:
+def test_half_precision_errs_by_less_than_one_percent(options: dict[str, Any], tmp_path: Path) -> None:
     """Also where neighboring texels differ much, so that an offset's rounding would show."""
     material = write_material(tmp_path, **options)
     half = Evaluator(read_material(tmp_path), "half")
@@ -99,7 +99,7 @@ def test_half_precision_keeps_to_a_hundredth(options: dict[str, Any], tmp_path: 
     assert 1e-5 < deviation(half.evaluate(*drawn.values()), material.evaluate(*drawn.values())) < 1e-2
 
 
-def test_half_precision_does_not_round_what_the_network_sees() -> None:
+def test_half_precision_does_not_round_inputs() -> None:
     """A difference of 2⁻¹², which half precision cannot hold beside 1, is seen by the first layer."""
     one = np.ones((1, 1), np.float32)
     layers = [(one, np.full(1, -1.0, np.float32)), (4096 * one, np.zeros(1, np.float32))]
@@ -107,16 +107,14 @@ def test_half_precision_does_not_round_what_the_network_sees() -> None:
     assert found[0] == 1.0
 
 
-def test_what_looks_at_neighbors_is_refused(tmp_path: Path) -> None:
+def test_the_inception_decoder_is_refused(tmp_path: Path) -> None:
     write_material(tmp_path)
     path = tmp_path / "material.json"
     description = json.loads(path.read_text())
     description["model"] = "hierarchical"
     description["config"] |= {"model": "hierarchical", "network": {}}
     path.write_text(json.dumps(description))
-    with pytest.raises(
-        InputError, match="does not support the inception decoder"
-    ) as caught:
+    with pytest.raises(InputError, match="does not support the inception decoder") as caught:
         read_material(tmp_path)
     check_message(caught.value)
 
