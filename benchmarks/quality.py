@@ -1,6 +1,7 @@
 """Time, error and size of the quality presets: whole runs, from height map to report.
 
-    python benchmarks/quality.py --out FOLDER [--only MATERIAL:QUALITY ...] [--resolution 128] [--store] [--check]
+    python benchmarks/quality.py --out FOLDER [--only MATERIAL:QUALITY ...] [--store] [--check]
+    python benchmarks/quality.py --table
 
 Runs ``mbtf-pipeline run --quality`` in a process of its own: ``draft`` and ``standard`` on six texture sets
 that lie beside the project, ``high`` on one of them. ``paper`` needs a GPU and is not run. ``--only``

@@ -1,8 +1,8 @@
-"""Makes the figures of docs/cost.md and docs/accuracy.md from folders of cost studies, and tables of fronts.
+"""Makes the figures of the documentation from folders of cost studies, and prints tables of Pareto fronts.
 
-From the repository's root, after the studies (the commands stand in docs/cost.md):
+From the repository's root, after the studies:
 ``.venv/bin/python docs/pictures/make_cost_pictures.py out/cost/turtle_shell out/cost/twisted_wool …``.
-Every sheet shows one plot of all studies side by side; studies that did not get to it are left out of it.
+Every sheet shows one plot of all studies side by side; studies without that plot are left out.
 """
 
 from __future__ import annotations
@@ -14,27 +14,21 @@ from pathlib import Path
 
 from PIL import Image, ImageDraw, ImageFont
 
-from mbtf_pipeline.cost_study.fit_runs import QUALITIES
+from mbtf_pipeline.cost_study.fit_runs import PRESET
 
 HERE = Path(__file__).parent
-PAGE = HERE.parent / "cost.md"
 OUT = HERE / "cost"
 PLOTS = (
     "front",
     "data",
-    "fit",
-    "fit_evaluation",
-    "fit_bytes",
+    "models",
+    "models_evaluation",
     "paths",
-    "adaptive",
-    "adaptive_relative",
     "effects",
-    "bounces",
     "mesh",
-    "light",
+    "interactions",
 )
 WIDTH, TITLE, GAP, COLUMNS, COLORS = 800, 30, 12, 2, 256
-BEGIN, END = "<!-- fronts: begin -->", "<!-- fronts: end -->"
 
 
 def sheet(plot: str, studies: list[Path]) -> Path | None:
@@ -63,12 +57,10 @@ def sheet(plot: str, studies: list[Path]) -> Path | None:
     return path
 
 
-def whole_chains(folder: Path) -> list[dict[str, str]]:
-    """Rows of the study that lie on the front: nothing beats them in both time and error."""
+def front_rows(folder: Path) -> list[dict[str, str]]:
+    """Rows of the study on the Pareto front: no other one beats them in both time and error."""
     with (folder / "cost.csv").open(encoding="utf-8", newline="") as stream:
-        rows = [
-            r for r in csv.DictReader(stream) if r["total_seconds"] and r["study"] != "seeds" and r["error"]
-        ]
+        rows = [r for r in csv.DictReader(stream) if r["total_seconds"] and r["error"]]
     front: list[dict[str, str]] = []
     for row in sorted(rows, key=lambda r: (float(r["total_seconds"]), float(r["error"]))):
         if not front or float(row["error"]) < float(front[-1]["error"]):
@@ -77,40 +69,43 @@ def whole_chains(folder: Path) -> list[dict[str, str]]:
 
 
 def table(studies: list[Path]) -> str:
-    """How well errors are known, and the fronts of all studies with commands, as Markdown."""
+    """How well errors are known, and the Pareto fronts of all studies with commands, as Markdown."""
     records = {f: json.loads((f / "study.json").read_text(encoding="utf-8")) for f in studies}
-    lines = ["| study | errors known to ± 10 % (95 %) | scatter between seeds |", "|---|---|---|"]
+    lines = ["| study | errors within ± 10 % (95 %) | standard deviation over seeds |", "|---|---|---|"]
     for folder, study in records.items():
         found = study.get("summary")
         if found is None:
             raise SystemExit(f"{folder}: not finished; run the command of the study again")
-        scatter = found["scatter"] or "–"
-        lines.append(f"| `{folder.name}` | {found['known_to_a_tenth']} of {found['known']} | {scatter} |")
+        deviation = found["seed_deviation"]
+        text = (
+            "–" if deviation is None else f"{100 * deviation['value']:.1f} ± {100 * deviation['error']:.1f} %"
+        )
+        lines.append(f"| `{folder.name}` | {found['narrow']} of {found['known']} | {text} |")
     lines.append("")
     for folder, study in records.items():
-        where = f"{study['machine']['system']}, {study['made']}"
+        where = f"{study['machine']['system']}, {study['date']}"
         lines += [
             f"`{folder.name}`, {where}:",
             "",
-            "| in all | generating | training | queries × paths | model | unexplained variance |",
+            "| total | generating | training | queries × paths | model | unexplained variance |",
             "|---|---|---|---|---|---|",
         ]
-        front = whole_chains(folder)
+        front = front_rows(folder)
         for r in front:
             lines.append(
                 f"| {float(r['total_seconds']):.0f} s | {float(r['generation_seconds']):.1f} s "
                 f"| {float(r['training_seconds']):.1f} s "
                 f"| {float(r['queries']) / 1e6:.2g} M × {float(r['spp']):g} "
-                f"| {r['series'] if r['study'] == 'fit' else QUALITIES} "
+                f"| {r['series'] if r['study'] == 'models' else PRESET} "
                 f"| {float(r['error']):.3f} ± {float(r['error_se']):.3f} |"
             )
         command = front[-1]["command"].replace(str(folder), f"out/cost/{folder.name}")
-        lines += ["", "The last one by itself:", "", f"    {command.replace(' && ', chr(10) + '    ')}", ""]
+        lines += ["", "The last one:", "", f"    {command.replace(' && ', chr(10) + '    ')}", ""]
     return "\n".join(lines)
 
 
 def main() -> int:
-    """Write the sheets and the table."""
+    """Write the sheets and print the tables."""
     studies = [Path(name) for name in sys.argv[1:]]
     if not studies:
         print(__doc__, file=sys.stderr)
@@ -119,9 +114,8 @@ def main() -> int:
     for plot in PLOTS:
         path = sheet(plot, studies)
         if path is not None:
-            print(f"{path}: {path.stat().st_size / 1e3:.0f} kB")
-    before, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
-    PAGE.write_text(f"{before}{BEGIN}\n\n{table(studies)}\n{END}{rest.split(END)[1]}", encoding="utf-8")
+            print(f"{path}: {path.stat().st_size / 1e3:.0f} kB", file=sys.stderr)
+    print(table(studies))
     return 0
 
 
