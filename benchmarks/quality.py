@@ -1,7 +1,7 @@
 """Time, error and size of the quality presets: whole runs, from height map to report.
 
-    python benchmarks/quality.py --out FOLDER [--only MATERIAL:QUALITY ...] [--resolution 128]
-                                 [--store] [--check]
+    python benchmarks/quality.py --out FOLDER [--only MATERIAL:QUALITY ...] [--store] [--check]
+    python benchmarks/quality.py --table
 
 Runs ``mbtf-pipeline run --quality`` in a process of its own: ``draft`` and ``standard`` on six texture sets
 that lie beside the project, ``high`` on one of them. ``paper`` needs a GPU and is not run. ``--only``
@@ -66,8 +66,8 @@ RECIPE = """\
 name: quality
 generate:
   material: {material}
-  geometry: {{height_scale: {height}}}
-  queries: {{resolution: {resolution}}}
+  geometry: {{height: {height}}}
+  queries: {{levels: {levels}}}
 fit: {{model: neumip}}
 """
 
@@ -112,6 +112,13 @@ def source(name: str) -> tuple[Path, float | None]:
     return ROOT / "assets" / name, None
 
 
+def levels_of(resolution: int) -> int:
+    """Finest level of a resolution, a power of two."""
+    if resolution < 1 or resolution & (resolution - 1):
+        raise SystemExit(f"--resolution {resolution}: must be a power of two")
+    return resolution.bit_length() - 1
+
+
 def settings_hash(quality: Quality) -> str:
     """Hash of all options of a preset and of the fitter's other training options."""
     options = best_at(quality) | FITTER[quality]
@@ -127,7 +134,7 @@ def generator_config(name: str, quality: Quality, resolution: int) -> GeneratorC
         assignments=[
             f"material={json.dumps(str(material))}",
             *as_assignments(GENERATOR[quality]),
-            *as_assignments({"geometry.height_scale": height, "queries.resolution": resolution}),
+            *as_assignments({"geometry.height": height, "queries.levels": levels_of(resolution)}),
         ],
     )
 
@@ -143,7 +150,9 @@ def run(name: str, quality: Quality, resolution: int, work: Path) -> MeasuredRun
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True)
     recipe, out = work / "recipe.yaml", work / "run"
-    text = RECIPE.format(material=json.dumps(str(material)), resolution=resolution, height=json.dumps(height))
+    text = RECIPE.format(
+        material=json.dumps(str(material)), levels=levels_of(resolution), height=json.dumps(height)
+    )
     recipe.write_text(text, encoding="utf-8")
     command = [sys.executable, "-m", "mbtf_pipeline", "run", str(recipe), "--quality", quality]
     command += ["-o", str(out), "--json", "--quiet"]

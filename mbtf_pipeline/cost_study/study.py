@@ -16,11 +16,11 @@ from mbtf_core.folders import ELSEWHERE, check_folder, make_folder
 from mbtf_core.stats import Estimate, signal_variance
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.material.material import load_material
-from mbtf_pipeline.cost_study.fit_runs import GENERATOR, SEEDS, QuerySeconds, planned_runs
+from mbtf_pipeline.cost_study.fit_runs import GENERATOR, QuerySeconds, planned_runs
 from mbtf_pipeline.cost_study.generator_benchmark import GeneratorBenchmark
 from mbtf_pipeline.cost_study.generator_runs import generator_tasks
 from mbtf_pipeline.cost_study.measurements import Measurement, MeasurementFolder
-from mbtf_pipeline.cost_study.repeats import MOST_SEEDS, combined, measure_runs, seed_deviation
+from mbtf_pipeline.cost_study.repeats import FEWEST_SEEDS, MOST_SEEDS, combined, measure_runs, seed_deviation
 from mbtf_pipeline.cost_study.runs import Run, RunRunner
 from mbtf_pipeline.recipe import Recipe
 from mbtf_pipeline.run_folder import locked, machine
@@ -212,7 +212,7 @@ def _measure_generator(
     for task in generator_tasks(benchmark):
         found = store.get(task.study, task.key)
         # Configurations take longer than their share where kernels are compiled.
-        if found is None and clock.left() > (1.0 - 1.5 * GENERATOR) * clock.seconds:
+        if found is None and clock.left() > (1.0 - 1.2 * GENERATOR) * clock.seconds:
             progress(clock.share(), task.label)
             found = task.run(benchmark, each)
             store.put(task.key, found)
@@ -258,7 +258,7 @@ def _measure_runs(
         # The additional time is for repeats alone.
         return clock.left(refining=run.data.seed > 0) > runner.expected_seconds(run)
 
-    found = measure_runs(runs, store, runner, fits, MOST_SEEDS if clock.refine else SEEDS)
+    found = measure_runs(runs, store, runner, fits, MOST_SEEDS if clock.refine else FEWEST_SEEDS)
     study.deviation = seed_deviation(found.groups)
     study.failed = found.failed
     for run, group in zip(runs, found.groups, strict=True):
