@@ -39,7 +39,7 @@ from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.config.presets import GENERATOR, Quality, as_assignments
 from mbtf_pipeline.presets import COMPARE
 from mbtf_pipeline.run_folder import machine
-from mbtf_pipeline.stages import hash_of
+from mbtf_core.digest import data_sha256
 
 ROOT = Path(__file__).resolve().parents[1]
 TEXTURE_SETS = ROOT.parent / "shared" / "data" / "materials"
@@ -66,8 +66,8 @@ RECIPE = """\
 name: quality
 generate:
   material: {material}
-  geometry: {{height: {height}}}
-  queries: {{levels: {levels}}}
+  geometry: {{height_scale: {height}}}
+  queries: {{resolution: {resolution}}}
 fit: {{model: neumip}}
 """
 
@@ -112,18 +112,11 @@ def source(name: str) -> tuple[Path, float | None]:
     return ROOT / "assets" / name, None
 
 
-def levels_of(resolution: int) -> int:
-    """Finest level of a resolution, a power of two."""
-    if resolution < 1 or resolution & (resolution - 1):
-        raise SystemExit(f"--resolution {resolution}: must be a power of two")
-    return resolution.bit_length() - 1
-
-
 def settings_hash(quality: Quality) -> str:
     """Hash of all options of a preset and of the fitter's other training options."""
     options = best_at(quality) | FITTER[quality]
     training = resolve(FitConfig, assignments=as_assignments(options)).training.model_dump(mode="json")
-    return hash_of([GENERATOR[quality], options, training, COMPARE[quality]])[:12]
+    return data_sha256([GENERATOR[quality], options, training, COMPARE[quality]])[:12]
 
 
 def generator_config(name: str, quality: Quality, resolution: int) -> GeneratorConfig:
@@ -134,7 +127,7 @@ def generator_config(name: str, quality: Quality, resolution: int) -> GeneratorC
         assignments=[
             f"material={json.dumps(str(material))}",
             *as_assignments(GENERATOR[quality]),
-            *as_assignments({"geometry.height": height, "queries.levels": levels_of(resolution)}),
+            *as_assignments({"geometry.height_scale": height, "queries.resolution": resolution}),
         ],
     )
 
@@ -151,7 +144,7 @@ def run(name: str, quality: Quality, resolution: int, work: Path) -> MeasuredRun
     work.mkdir(parents=True)
     recipe, out = work / "recipe.yaml", work / "run"
     text = RECIPE.format(
-        material=json.dumps(str(material)), levels=levels_of(resolution), height=json.dumps(height)
+        material=json.dumps(str(material)), resolution=resolution, height=json.dumps(height)
     )
     recipe.write_text(text, encoding="utf-8")
     command = [sys.executable, "-m", "mbtf_pipeline", "run", str(recipe), "--quality", quality]

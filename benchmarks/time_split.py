@@ -39,9 +39,9 @@ THRESHOLD = 1.2
 TRAINING = 0.5
 
 
-def measure(material: Path, seconds: float, shares: list[float], levels: int, work: Path) -> dict[str, Any]:
+def measure(material: Path, seconds: float, shares: list[float], resolution: int, work: Path) -> dict[str, Any]:
     """Errors of the fixed shares and of ``run --time``."""
-    generate = {"material": str(material), "queries": {"levels": levels, "test_spp": 16}}
+    generate = {"material": str(material), "queries": {"resolution": resolution, "test_spp": 16}}
     fit = nested({"model": "neumip", **best_options(TRAINING * seconds)})
     recipe = Recipe.model_validate({"name": "time", "generate": generate, "fit": fit})
 

@@ -72,7 +72,7 @@ def fitter_options(quality: Quality, fits: Mapping[str, Mapping[str, Any]]) -> d
         options: dict[str, Any] = {}
         if given.get("model") in _MODELS:
             options |= _network(_seconds(quality)) if free else {}
-            options |= {k: v for k, v in _SMOOTHING.items() if k.split(".")[1] not in training}
+            options |= {k: v for k, v in _SMOOTH.items() if k.split(".")[1] not in training}
         out[name] = options | FITTER[quality]
     return out
 

@@ -231,12 +231,13 @@ def query_seconds(benchmark: GeneratorBenchmark, store: MeasurementFolder) -> Qu
     if found is None:
         from mbtf_gen.forecast import forecast
         from mbtf_gen.planning.effects_plan import plan_effects
+        from mbtf_gen.planning.run_plan import RunPlan
 
         at = []
         for paths in _TIMED_PATHS:
             options = {"queries.spp": paths, "queries.train": _TIMED_QUERIES, "queries.test": "1"}
             job = benchmark.job(options)
-            at.append(forecast(job, plan_effects(job), _TIMED_SECONDS).query_seconds)
+            at.append(forecast(job, RunPlan(plan_effects(job)), _TIMED_SECONDS).query_seconds)
         slope = max(0.0, (at[1] - at[0]) / (_TIMED_PATHS[1] - _TIMED_PATHS[0]))
         details = {"query": max(0.0, at[0] - slope * _TIMED_PATHS[0]), "path": slope}
         nothing = Estimate(math.nan, math.inf, 0)

@@ -205,14 +205,15 @@ def measure_costs(
 def _generating(config: GeneratorConfig) -> tuple[float, float]:
     """Seconds of a training query, and of starting the generator with its test split, by a forecast."""
     from mbtf_gen.forecast import forecast
-    from mbtf_gen.generation import Job, allocated
+    from mbtf_gen.job import Job, split_queries
     from mbtf_gen.material.material import load_material
     from mbtf_gen.planning.effects_plan import plan_effects
+    from mbtf_gen.planning.run_plan import allocate
 
-    job = Job.of(config, load_material(Path(config.material), config.geometry.make_tileable))
-    expected = forecast(job, allocated(job, plan_effects(job, pilots=False)))
+    job = Job(config, load_material(Path(config.material), config.geometry.make_tileable))
+    expected = forecast(job, allocate(job, plan_effects(job, pilots=False)))
     query = max(expected.query_seconds, _CHEAPEST)
-    return query, expected.start + max(0.0, expected.seconds - job.queries("train") * query)
+    return query, expected.start + max(0.0, expected.seconds - split_queries(job, "train") * query)
 
 
 def _pilots(
