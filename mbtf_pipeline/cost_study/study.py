@@ -23,7 +23,7 @@ from mbtf_pipeline.cost_study.repeats import repeat_chains
 from mbtf_pipeline.cost_study.runs import Chain, RunRequest, RunRunner
 from mbtf_pipeline.cost_study.seed_variance import Scatter, seed_scatter, with_scatter
 from mbtf_pipeline.recipe import Recipe
-from mbtf_pipeline.run_folder import locked, machine, take
+from mbtf_pipeline.run_folder import claim_folder, locked, machine
 
 STUDY_NAME = "study.json"
 STUDY_FORMAT = "mbtf-cost"
@@ -79,7 +79,7 @@ def claim(folder: Path) -> None:
     """
     hint = "choose another folder with -o"
     other = InputError("is not empty and holds no cost study", where=folder, hint=hint)
-    take(folder, lambda path: bool(_record(path)), other)
+    claim_folder(folder, lambda path: bool(_record(path)), other)
     if record := _record(folder):
         there, here = record.get("machine", {}).get("system"), machine()["system"]
         if there != here:

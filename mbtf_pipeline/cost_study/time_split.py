@@ -30,7 +30,7 @@ from mbtf_pipeline.cost_study.pareto import weighted_line
 from mbtf_pipeline.cost_study.runs import Chain, RunRequest, RunRunner
 from mbtf_pipeline.recipe import Recipe
 from mbtf_pipeline.run import layout_of
-from mbtf_pipeline.run_folder import claim, describe, locked
+from mbtf_pipeline.run_folder import claim_run_folder, locked, write_run_record
 from mbtf_pipeline.stages import hash_of
 
 if TYPE_CHECKING:
@@ -176,11 +176,11 @@ def split_budget(
         )
     asked = recipe.model_dump(mode="json", include={"generate", "fit"})
     key = hash_of({"schema": BUDGET_SCHEMA, "budget": budget, "recipe": asked})
-    claim(folder)
+    claim_run_folder(folder)
     with locked(folder):
         split = _remembered(folder, key)
         if split is None:
-            describe(folder, recipe, command)
+            write_run_record(folder, recipe, command)
             split = _plan(recipe, budget, folder, tell)
             write_json(folder / BUDGET_NAME, {"format": BUDGET_FORMAT, "key": key, **asdict(split)})
     return split

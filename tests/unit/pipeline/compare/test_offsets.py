@@ -1,4 +1,4 @@
-"""Offsets traced from heights are those of plane geometry, and survive their file."""
+"""Traced offsets match plane geometry, and files preserve them."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_a_peak_at_the_plane_is_not_displaced(plane_below: object) -> None:
     assert np.abs(slanted).max() < 1e-4
 
 
-def test_offsets_survive_their_file(tmp_path: Path) -> None:
+def test_files_preserve_offsets(tmp_path: Path) -> None:
     offset = np.random.default_rng(1).normal(size=(5, 7, 2)).astype(np.float32)
     _write(tmp_path / "v1-fit-some.name.exr", offset)
     np.testing.assert_array_equal(read_offset(tmp_path / "v1-fit-some.name.exr"), offset)
