@@ -5,7 +5,7 @@
 For each material two data sets of as many queries and paths are made at 64 × 64 texels, one per layout, and
 ``neumip`` and ``neumip-baseline`` are trained for ``--steps`` steps of 32 768 queries. Both are judged by the
 same shuffled test queries. ``--hierarchical`` also trains ``hierarchical`` on windows of the image layout,
-and ``neumip`` for as many steps; ``--lifted`` also trains ``neumip`` with directions as (x, y, z).
+and ``neumip`` for as many steps; ``--direction-xyz`` also trains ``neumip`` with directions as (x, y, z).
 
 What is reached depends on steps alone: the call may share its processor, may be interrupted, and goes on
 where it was. Texture sets that are not there are skipped by name.
@@ -49,14 +49,20 @@ def make_data(name: str, folder: Path, layout: str) -> Path:
     from mbtf_gen.generation import generate
 
     material, height = MATERIALS[name]
-    queries: dict[str, Any] = {"train": "600/texel", "spp": 4, "levels": 6, "min_cos": 0.2, "test_spp": 256}
+    queries: dict[str, Any] = {
+        "train": "600/texel",
+        "spp": 4,
+        "resolution": 64,
+        "min_cos": 0.2,
+        "test_spp": 256,
+    }
     queries |= {"test": "16384"} if layout == "shuffled" else {"test": "256", "layout": "image"}
     if layout == "image":
-        queries["window"] = WINDOW
+        queries["patch_size"] = WINDOW
     config = GeneratorConfig.model_validate(
         {
             "material": str(material),
-            "geometry": {"height": height, "mesh": 256},
+            "geometry": {"height_scale": height, "mesh": 256},
             "queries": queries,
             "light": {"width": 3},
         }
@@ -66,9 +72,9 @@ def make_data(name: str, folder: Path, layout: str) -> Path:
 
 
 # Options of a model, under the name that its figures have.
-LIFTED = "neumip-lifted"
+XYZ = "neumip-xyz"
 OPTIONS: dict[str, dict[str, Any]] = {
-    LIFTED: {"model": "neumip", "network": {"encoding": {"lifted": True}}},
+    XYZ: {"model": "neumip", "network": {"encoding": {"direction_xyz": True}}},
 }
 
 
@@ -103,15 +109,15 @@ def main() -> int:
     parser.add_argument("--out", type=Path, required=True, help="folder to work in")
     parser.add_argument("--steps", type=int, default=1500)
     parser.add_argument("--hierarchical", type=int, help="steps of hierarchical; not trained by default")
-    parser.add_argument("--lifted", action="store_true", help=f"train {LIFTED}, too")
+    parser.add_argument("--direction-xyz", action="store_true", help=f"train {XYZ}, too")
     parser.add_argument("--only", nargs="*", choices=list(MATERIALS), help="of these; all by default")
     arguments = parser.parse_args()
     record = arguments.out / "materials.json"
     arguments.out.mkdir(parents=True, exist_ok=True)
     found: dict[str, Any] = json.loads(record.read_text()) if record.exists() else {}
     runs = [("neumip-baseline", arguments.steps), ("neumip", arguments.steps)]
-    if arguments.lifted:
-        runs.append((LIFTED, arguments.steps))
+    if arguments.direction_xyz:
+        runs.append((XYZ, arguments.steps))
     if arguments.hierarchical:
         runs += [("neumip", arguments.hierarchical), ("hierarchical", arguments.hierarchical)]
     for name in arguments.only or MATERIALS:

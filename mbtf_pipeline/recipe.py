@@ -45,7 +45,7 @@ def _distinct(values: Sequence[Any]) -> Sequence[Any]:
 
 
 Views = Annotated[list[View], Field(min_length=1), AfterValidator(_distinct)]
-Span = Annotated[float, Field(gt=0, le=1e4)]
+TilesAcross = Annotated[float, Field(gt=0, le=1e4)]
 
 
 class CompareSection(Settings):
@@ -59,7 +59,7 @@ class CompareSection(Settings):
         [Direction(elevation=45, azimuth=45), Direction(elevation=20, azimuth=160)],
         description="directions of the light",
     )
-    spans: Annotated[list[Span], Field(min_length=1), AfterValidator(_distinct)] = Field(
+    tiles_across: Annotated[list[TilesAcross], Field(min_length=1), AfterValidator(_distinct)] = Field(
         [1.0, 4.0], description="widths of the field of view at the target, in tile widths"
     )
     size: int = Field(256, ge=8, le=4096, description="pixels along each side of an image")

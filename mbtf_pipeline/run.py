@@ -71,7 +71,7 @@ class DataSet:
 
 def layout_of(config: FitConfig) -> str:
     """Data layout that a fit's model requires."""
-    from mbtf_fit.models import MODELS
+    from mbtf_fit.models.registry import MODELS
 
     return MODELS[config.model].layout
 

@@ -29,18 +29,25 @@ from mbtf_gen.render.runtime import load_mitsuba
 
 ROOT = Path(__file__).parents[2]
 MATERIAL = ROOT / "out" / "quickstart" / "fits" / "neumip"
-SPANS = (0.5, 2.0, 8.0, 32.0, 128.0)
+TILES_ACROSS = (0.5, 2.0, 8.0, 32.0, 128.0)
 VIEW, LIGHT, SIZE, SPP = (60.0, -90.0), (45.0, 45.0), 160, 64
 # As the recipe generates its data.
 OPTIONS = ("--mesh", "256", "--light-width", "5")
-ROWS = ("reference, 0.5 tiles wide", "material, mbtf_path", "material, finest level")
+ROWS = ("reference, 0.5 tiles across", "material, mbtf_path", "material, finest level")
 GAP, CAPTION = 6, 24
 
 
-def reference(span: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def reference(tiles_across: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Truly filtered pixels, two independent halves (SIZE, SIZE, 3)."""
     words = ["reference", "assets/turtle_shell", "--view", "{:g},{:g}".format(*VIEW)]
-    words += ["--light", "{:g},{:g}".format(*LIGHT), "--spans", f"{span:g}", "--size", str(SIZE)]
+    words += [
+        "--light",
+        "{:g},{:g}".format(*LIGHT),
+        "--tiles-across",
+        f"{tiles_across:g}",
+        "--size",
+        str(SIZE),
+    ]
     words += ["--spp", str(SPP), "--kind", "pixel", *OPTIONS]
     print("mbtf-gen", *words, flush=True)
     with tempfile.TemporaryDirectory() as folder:
@@ -53,13 +60,13 @@ def reference(span: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return a, b
 
 
-def rendered(mi: Any, span: float, integrator: str) -> NDArray[np.float64]:
+def rendered(mi: Any, tiles_across: float, integrator: str) -> NDArray[np.float64]:
     """The material on a plane under a delta light of unit irradiance, a ray through each pixel's center."""
     import drjit as dr
 
-    camera = Camera(VIEW[0], VIEW[1], span=span, rows=SIZE, columns=SIZE)
+    camera = Camera(VIEW[0], VIEW[1], tiles_across=tiles_across, rows=SIZE, columns=SIZE)
     omega_i = from_angles(*LIGHT)
-    half = 4.0 * span + 1.0
+    half = 4.0 * tiles_across + 1.0
     to_world = mi.ScalarTransform4f().scale([half, half, 1.0])
     # The rectangle's texture coordinates run from 0 to 1; row 0 of images lies at v = 0.
     bsdf = {"type": "mbtf", "material": str(MATERIAL), "uv_scale": 2.0 * half}
@@ -102,19 +109,19 @@ def main() -> None:
     import mbtf_fit.mitsuba_plugin
 
     mbtf_fit.mitsuba_plugin.register()
-    sheet = Image.new("RGB", (len(SPANS) * (SIZE + GAP) - GAP, 3 * (SIZE + CAPTION)), (255, 255, 255))
+    sheet = Image.new("RGB", (len(TILES_ACROSS) * (SIZE + GAP) - GAP, 3 * (SIZE + CAPTION)), (255, 255, 255))
     draw = ImageDraw.Draw(sheet)
-    for column, span in enumerate(SPANS):
-        halves = reference(span)
+    for column, tiles_across in enumerate(TILES_ACROSS):
+        halves = reference(tiles_across)
         truth = 0.5 * (halves[0] + halves[1])
         a, b = (half.mean(-1) for half in halves)
         level = 0.5 * (a.mean() + b.mean())
         contrast = ((a - a.mean()) * (b - b.mean())).mean()
-        pictures = (truth, rendered(mi, span, "mbtf_path"), rendered(mi, span, "path"))
+        pictures = (truth, rendered(mi, tiles_across, "mbtf_path"), rendered(mi, tiles_across, "path"))
         exposure = auto_exposure(truth.astype(np.float32))
         for row, (name, picture) in enumerate(zip(ROWS, pictures, strict=True)):
             place = (column * (SIZE + GAP), row * (SIZE + CAPTION))
-            caption = name if column == 0 else f"{span:g} tiles wide" if row == 0 else ""
+            caption = name if column == 0 else f"{tiles_across:g} tiles across" if row == 0 else ""
             draw.text((place[0] + 2, place[1] + 3), caption, (30, 30, 30), ImageFont.load_default(12))
             display = to_display(picture.astype(np.float32), exposure)
             sheet.paste(Image.fromarray(display), (place[0], place[1] + CAPTION))
@@ -123,7 +130,7 @@ def main() -> None:
                 max(float(x), 0.0) ** 0.5 / level for x in (((gray - a) * (gray - b)).mean(), contrast)
             )
             print(
-                f"{span:6g} tiles wide, {name:26} mean {gray.mean() / level:.3f}, contrast "
+                f"{tiles_across:6g} tiles across, {name:26} mean {gray.mean() / level:.3f}, contrast "
                 f"{gray.std() / level:.3f} for {true:.3f}, RMS {error:.3f}",
                 flush=True,
             )

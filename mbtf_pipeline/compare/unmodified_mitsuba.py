@@ -52,8 +52,8 @@ _NOT_LAMBERTIAN = (
     "roughness",
     "metallic",
     "specular",
-    "coat",
-    "coat_roughness",
+    "clearcoat",
+    "clearcoat_roughness",
     "sheen",
     "sheen_color",
     "sheen_roughness",
@@ -150,7 +150,7 @@ def pick_scene(section: CompareSection) -> tuple[View, Direction, float]:
             where="compare.unmodified_mitsuba",
             hint="add them to compare.views and compare.lights, or remove the option",
         )
-    return views[0], lights[0], min(section.spans)
+    return views[0], lights[0], min(section.tiles_across)
 
 
 def write_agreement(
@@ -162,7 +162,7 @@ def write_agreement(
     ------
     UsageError : the comparison has no suitable scene
     """
-    view, light, span = pick_scene(section)
+    view, light, tiles_across = pick_scene(section)
     surfaces = []
     for found in compare_with_mitsuba(section, generate, material):
         files = {}
@@ -174,7 +174,7 @@ def write_agreement(
     return {
         "view": view.model_dump(),
         "light": light.model_dump(),
-        "span": span,
+        "tiles_across": tiles_across,
         "tolerances": {"mean": MEAN_TOLERANCE, "rms": RMS_TOLERANCE},
         "surfaces": surfaces,
     }
@@ -193,9 +193,9 @@ def compare_with_mitsuba(
     from mbtf_gen.generation import Job, build_estimator
     from mbtf_gen.pictures.reference import render_reference
 
-    view, light, span = pick_scene(section)
+    view, light, tiles_across = pick_scene(section)
     config = generate.model_copy(update={"light": LightSection(width=0.0)})
-    camera = Camera(view.elevation, view.azimuth, span, rows=section.size, columns=section.size)
+    camera = Camera(view.elevation, view.azimuth, tiles_across, rows=section.size, columns=section.size)
     omega_i = from_angles(light.elevation, light.azimuth)
     out = []
     for surface, variant in _surfaces(material).items():
@@ -253,9 +253,9 @@ def _mitsuba_scene(job: Job, camera: Camera, omega_i: F64, folder: Path) -> dict
         "flip_tex_coords": True,
         "bsdf": _mitsuba_bsdf(job),
     }
-    # Distance from which surfaces can affect a pixel at the edge, by visibility, shadowing or
-    # interreflection.
-    reach = 0.75 * camera.span + 2.0 * grid.displacement_range / math.tan(math.radians(LOWEST_LIGHT)) + 1.0
+    # Surfaces within this distance affect a pixel at the edge by visibility, shadowing or interreflection.
+    slope = math.tan(math.radians(LOWEST_LIGHT))
+    reach = 0.75 * camera.tiles_across + 2.0 * grid.displacement_range / slope + 1.0
     columns, rows = (math.ceil(reach / side) for side in (1.0, grid.aspect))
     shift = mi.ScalarTransform4f().translate
     # The camera looks at the central tile.

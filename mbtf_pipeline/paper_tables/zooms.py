@@ -22,7 +22,12 @@ def zooms(runs: Sequence[FinishedRun]) -> list[Table]:
     """Errors for every field of view and kind of reference, averaged over views and lights."""
     columns = [
         MATERIAL,
-        Column("tiles across", "span", lambda run, fit, chosen: float(chosen[0]["span"]), digits="g"),
+        Column(
+            "tiles across",
+            "tiles_across",
+            lambda run, fit, chosen: float(chosen[0]["tiles_across"]),
+            digits="g",
+        ),
         Column(
             "level",
             "level",
@@ -34,9 +39,9 @@ def zooms(runs: Sequence[FinishedRun]) -> list[Table]:
         columns += _errors(kind)
     columns += METRIC_COLUMNS
     items = [
-        (run, fit, [p for p in run.pictures if p["span"] == span])
+        (run, fit, [p for p in run.pictures if p["tiles_across"] == width])
         for run in runs
-        for span in _spans(run)
+        for width in _widths(run)
         for fit in run.fits
     ]
     rows = rows_of(columns, items)
@@ -58,19 +63,19 @@ def _errors(kind: str) -> list[Column]:
     ]
 
 
-def _spans(run: FinishedRun) -> list[float]:
-    return list(dict.fromkeys(p["span"] for p in run.pictures))
+def _widths(run: FinishedRun) -> list[float]:
+    return list(dict.fromkeys(p["tiles_across"] for p in run.pictures))
 
 
 def _images(runs: Sequence[FinishedRun]) -> list[tuple[str, list[Thumbnail]]]:
     out: list[tuple[str, list[Thumbnail]]] = []
     for run in runs:
-        shown = [next(p for p in run.pictures if p["span"] == span) for span in _spans(run)]
+        shown = [next(p for p in run.pictures if p["tiles_across"] == width) for width in _widths(run)]
         sources = [(f"reference, {_KINDS[kind]}", "references", kind) for kind in run.comparison["kinds"]]
         sources += [(fit, "fits", fit) for fit in run.fits]
         for title, group, name in sources:
             row = [
-                Thumbnail(preview(run.file(p[group][name]["file"])), f"{p['span']:g} tiles across")
+                Thumbnail(preview(run.file(p[group][name]["file"])), f"{p['tiles_across']:g} tiles across")
                 for p in shown
             ]
             out.append((f"{run.title}: {title}", row))

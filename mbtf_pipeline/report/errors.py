@@ -146,7 +146,7 @@ def _pictures_table(comparison: Mapping[str, Any]) -> dict[str, Any]:
         for fit in comparison["fits"]:
             record = picture["fits"][fit]
             row = [short_direction(picture[d]) for d in ("view", "light")]
-            row += [f"{picture['span']:g}", fit]
+            row += [f"{picture['tiles_across']:g}", fit]
             for kind in kinds:
                 errors = {name: estimate(e) for name, e in record["errors"][kind].items()}
                 row += [

@@ -180,12 +180,12 @@ class _Sheet:
         return file
 
     def _title(self, picture: Mapping[str, Any]) -> str:
-        return f"{width(picture['span'])}, {levels(picture['levels'], self._finest)}"
+        return f"{width(picture['tiles_across'])}, {levels(picture['levels'], self._finest)}"
 
     def block(self, number: int, picture: Mapping[str, Any]) -> dict[str, Any]:
         """Figures of one scene: rows of four, references in the first column."""
         where = f"view {direction(picture['view'])}, light {direction(picture['light'])}, "
-        where += width(picture["span"])
+        where += width(picture["tiles_across"])
         rows: list[list[dict[str, Any] | None]] = []
         for index in range(max(len(self.kinds), len(self._fits))):
             row: list[dict[str, Any] | None] = [None]
@@ -228,7 +228,7 @@ class _Sheet:
         return {
             "where": f"View {direction(picture['view'])}; light {direction(picture['light'])}; "
             f"{self._title(picture)}",
-            "span": width(picture["span"]),
+            "tiles_across": width(picture["tiles_across"]),
             "references": [
                 {
                     "label": _KIND[kind],

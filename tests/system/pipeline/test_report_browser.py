@@ -40,14 +40,14 @@ FLAGS = (
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run with two fits, two spans and both kinds of reference."""
+    """A run with two fits, two widths and both kinds of reference."""
     out = tmp_path_factory.mktemp("report") / "run"
     recipe = str(ROOT / "pipelines" / "ci.yaml")
     command = [sys.executable, "-m", "mbtf_pipeline", "run", recipe, "-o", str(out), "-q"]
     for assignment in (
         "fit.neumip.training={steps: 60, batch: 2048}",
         "fit.plain={model: neumip-baseline, training: {steps: 20, batch: 2048}}",
-        "compare.spans=[2, 4]",
+        "compare.tiles_across=[2, 4]",
         f"compare.size={PIXELS}",
         "compare.spp=16",
     ):
@@ -182,7 +182,7 @@ def stage(page: Page) -> Iterator[Any]:
     page.js(
         "for (const name of ['fit', 'kind', 'group'])"
         " document.querySelector(`input[name=${name}][value='0']`).click();"
-        "document.querySelector('#spans input').click(); document.getElementById('zero').click();"
+        "document.querySelector('#tiles-across input').click(); document.getElementById('zero').click();"
         "document.querySelector('input[name=map]').click()"
     )
     page.drawn(0, 0, 0)

@@ -1,4 +1,4 @@
-"""``docs/format.md`` says what is written: its reader runs, and every stored name stands in it."""
+"""``docs/reference/data-format.md``: its reader runs, and it explains every stored name."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from support.paths import ROOT
 
 from mbtf_core.shard_schema import ARRAYS, CONVENTIONS, SCHEMA_VERSION
 
-DOCUMENT = (ROOT / "docs/format.md").read_text(encoding="utf-8")
+DOCUMENT = (ROOT / "docs/reference/data-format.md").read_text(encoding="utf-8")
 QUERIES = {"train": "160", "test": "64"}
 SMALL = {"shard_queries": 64}
 
@@ -59,7 +59,7 @@ def test_the_reader_is_a_dozen_lines_of_numpy() -> None:
 def test_the_reader_refuses_other_schemas_and_unfinished_data(tmp_path: Path) -> None:
     data = write_dataset(tmp_path / "shards", queries=QUERIES)
     _, read_split = reader()
-    for change in ({"schema": 2}, {"complete": False}, {"format": "other"}):
+    for change in ({"schema": SCHEMA_VERSION + 1}, {"complete": False}, {"format": "other"}):
         (data.folder / "manifest.json").write_text(json.dumps({**data.manifest, **change}))
         with pytest.raises(ValueError, match="no complete data set"):
             read_split(data.folder, "train")

@@ -150,7 +150,7 @@ class TestBareFile:
     def test_a_great_relief_at_the_default_factor_is_questioned(self, tmp_path: Path) -> None:
         material = load_material(npy(tmp_path / "h.npy", np.array([[0.0, 0.6]])))
         (warning,) = material.warnings_at()
-        assert "the relief is 0.6 tile widths; is another --height meant?" in warning
+        assert "the relief is 0.6 tile widths; is another --height-scale meant?" in warning
         assert material.warnings_at(1.0) == ()
         assert load_material(npy(tmp_path / "h.npy", np.array([[0.0, 0.5]]))).warnings_at() == ()
         yaml = tmp_path / "m.yaml"
@@ -305,7 +305,7 @@ class TestYaml:
             assert (material.metallic, material.specular, material.opacity) == (1.0, 0.25, 0.75)
 
     def test_gray_shorthand(self, folder: Path) -> None:
-        material = load_material(self.write(folder, "height: rock_height.npy\nbasecolor: 0.8\n"))
+        material = load_material(self.write(folder, "height: rock_height.npy\nbase_color: 0.8\n"))
         assert np.array_equal(material.base_color, np.full(3, 0.8))
         assert material.is_lambert
 
@@ -342,8 +342,8 @@ class TestYaml:
                 "height: rock_height.npy\nroughness: 1.5\n",
                 r"material\.yaml:2: .*roughness.*at most 1",
             ),
-            ("height: rock_height.npy\nbasecolor: [0.1, 0.2]\n", r"material\.yaml:2: .*base_color"),
-            ("height: rock_height.npy\nbasecolor: [0.1, 0.2, 1.2]\n", r"at most 1"),
+            ("height: rock_height.npy\nbase_color: [0.1, 0.2]\n", r"material\.yaml:2: .*base_color"),
+            ("height: rock_height.npy\nbase_color: [0.1, 0.2, 1.2]\n", r"at most 1"),
             ("height: rock_height.npy\nmetallic: {}\n", "either 'file' or 'value'"),
             ("height: rock_height.npy\nmetallic: {file: a.png, value: 1}\n", "either 'file' or 'value'"),
             ("height: rock_height.npy\nroughness: gone.png\n", r"gone\.png: no such file"),

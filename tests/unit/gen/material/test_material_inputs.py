@@ -76,13 +76,13 @@ class TestLayers:
 
     def test_the_option_decides(self, tmp_path: Path) -> None:
         stored = self.layered(tmp_path)
-        path = write(tmp_path, "height: {file: all.exr, channel: extra.Y}\nbasecolor: all.exr\n")
+        path = write(tmp_path, "height: {file: all.exr, channel: extra.Y}\nbase_color: all.exr\n")
         material = load_material(path)
         assert np.array_equal(material.height, stored["e"])
         assert np.array_equal(material.base_color, np.stack([stored[c] for c in "RGB"], axis=-1))
         assert not any("height: channels" in note for note in material.notes)
         other = load_material(
-            write(tmp_path, "height: {file: all.exr, channel: displacement}\nbasecolor: all.exr\n")
+            write(tmp_path, "height: {file: all.exr, channel: displacement}\nbase_color: all.exr\n")
         )
         assert other.digests["settings"] != material.digests["settings"]
         with pytest.raises(InputError, match="no channel or layer 'extr'") as caught:
@@ -130,7 +130,7 @@ class TestColor:
     def color(self, folder: Path, option: str, *chunks: tuple[bytes, bytes]) -> Material:
         self.codes = rng().integers(0, 256, (8, 16, 3))
         png(folder / "c.png", self.codes, 2, 8, extra=chunks)
-        return load_material(write(folder, f"height: height.npy\nbasecolor: {{file: c.png{option}}}\n"))
+        return load_material(write(folder, f"height: height.npy\nbase_color: {{file: c.png{option}}}\n"))
 
     def test_integers_are_srgb_unless_said_otherwise(self, heights: Path) -> None:
         linear_chunk = (b"gAMA", (100000).to_bytes(4, "big"))

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 from support.datasets import write_dataset
-from support.paths import ROOT
 
 from mbtf_core.child_process import run_child
 from mbtf_core.directions import from_angles
@@ -107,7 +106,7 @@ def sample_of(count: int, seed: int = 0, **options: Any) -> QuerySample:
 def _lattice(config: GeneratorConfig) -> Any:
     from mbtf_core.lattice import Lattice
 
-    return Lattice.for_map(4, 8, config.queries.levels)
+    return Lattice.for_map(4, 8, config.queries.finest)
 
 
 @pytest.mark.parametrize("weights", [(0.6, 0.4), (1.0, 0.0), (0.0, 1.0)])
@@ -139,7 +138,7 @@ def test_the_histogram_of_levels_follows_the_mixture() -> None:
     assert edges.tolist() == [0, 1, 2, 3]
     np.testing.assert_allclose(stated, [0.2, 0.2, 0.6])
     np.testing.assert_allclose(found, stated, atol=2 / 300)
-    edges, found, stated = level_histogram(sample_of(50, levels=0))
+    edges, found, stated = level_histogram(sample_of(50, resolution=1))
     assert (found.tolist(), stated.tolist()) == ([1.0], [1.0])
 
 
@@ -235,13 +234,3 @@ def test_a_window_needs_a_display(monkeypatch: pytest.MonkeyPatch) -> None:
         check_display()
     monkeypatch.setenv("WAYLAND_DISPLAY", "wayland-0")
     check_display()
-
-
-def test_the_document_states_options_and_defaults() -> None:
-    from mbtf_gen.config.pictures import Direction, PreviewSection
-
-    text = (ROOT / "docs/preview.md").read_text()
-    for key, value in PreviewSection():
-        shown = f"{value.elevation:g},{value.azimuth:g}" if isinstance(value, Direction) else str(value)
-        assert f"| `--{key}` | `preview.{key}` | {shown} |" in text
-    assert str(MOST_CELLS) in text

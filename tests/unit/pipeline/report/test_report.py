@@ -33,7 +33,7 @@ def test_both_errors_of_a_group_are_significant_or_neither() -> None:
     picture = {
         "view": direction,
         "light": direction,
-        "span": 1,
+        "tiles_across": 1,
         "references": {"query": {"flip": flip}},
         "fits": {"a": {"errors": {"query": error}, "flip": flip}},
     }

@@ -1,0 +1,94 @@
+"""Small data sets of the image layout of known functions, written as shards."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mbtf_core.lattice import Lattice, sigma_of_level, texel_centers
+from mbtf_core.shard_schema import FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION
+from mbtf_gen.dataset.shard_io import write_shard
+from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
+
+from .fit_data import F32, Function, random_directions
+
+
+def random_images(
+    random: np.random.Generator, items: int, lattice: Lattice, *, regular: bool = False
+) -> dict[str, F32]:
+    """Images of all levels and directions: one query per finest texel, at its center or anywhere in it."""
+    rows, columns = lattice.shape()
+    shape = (items, rows, columns)
+    jitter = np.zeros((*shape, 2)) if regular else random.random((*shape, 2)) - 0.5
+    u = texel_centers(rows, columns) + jitter / [columns, rows]
+    sigma = sigma_of_level(lattice.finest * random.random(items))[:, None, None]
+    omega = (random_directions(random, items)[:, None, None] for _ in range(2))
+    spread = [np.broadcast_to(sigma, shape), *(np.broadcast_to(o, (*shape, 3)) for o in omega)]
+    names = ("u", "sigma", "omega_i", "omega_o")
+    arrays = (u, *spread)
+    return {n: np.ascontiguousarray(a, np.float32) for n, a in zip(names, arrays, strict=True)}
+
+
+def write_images(
+    folder: Path,
+    function: Function,
+    *,
+    train: int = 60,
+    test: int = 3,
+    finest: int = 3,
+    aspect: float = 1.0,
+    noise: float = 0.0,
+    seed: int = 0,
+    patch_size: int | None = None,
+    through: Callable[[F32, F32, F32], Any] | None = None,
+) -> Path:
+    """Write so many images of a known function, in two shards, with independent noise in both halves.
+
+    Parameters
+    ----------
+    patch_size : texels along each side of an image; None: whole images
+    through : transmittance at u, σ and view, of a material with holes
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    lattice, random = Lattice(finest, aspect), np.random.default_rng(seed)
+    splits: dict[str, dict[str, object]] = {}
+    for split, counts in (("train", (train // 2, train - train // 2)), ("test", (test,))):
+        entries = []
+        for index, items in enumerate(counts):
+            queries = random_images(random, items, lattice)
+            if patch_size is not None:
+                plan = QueryPlan(lattice, Mixture(1, 0), 0.1, "image", seed, items, patch_size)
+                queries = {name: getattr(plan.draw(split, index, items), name) for name in queries}
+            shape = queries["sigma"].shape
+            flat = {name: a.reshape(-1, *a.shape[3:]) for name, a in queries.items()}
+            value = function(*flat.values()).reshape(*shape, 3)
+            halves = {
+                f"value_{half}": (value + noise * random.standard_normal(value.shape)).astype(np.float32)
+                for half in "ab"
+            }
+            if through is not None:
+                seen = through(flat["u"], flat["sigma"], flat["omega_o"])
+                halves["transmittance"] = seen.reshape(shape).astype(np.float32)
+            name = f"{split}-{index:05d}.npz"
+            write_shard(folder / name, {**queries, **halves, "spp": np.full(shape, 2, np.float32)})
+            (folder / name).with_suffix(".json").write_text(json.dumps({"rows": items}))
+            entries.append({"file": name, "rows": items})
+        splits[split] = {"queries": sum(counts), "shards": entries}
+    manifest: dict[str, Any] = {
+        "format": FORMAT_NAME,
+        "schema": SCHEMA_VERSION,
+        "config_hash": f"images-{function.__name__}-{seed}-{noise}",
+        "layout": "image",
+        "levels": {"finest": finest},
+        "tile": {"aspect": aspect},
+        "splits": splits,
+        "patch_size": patch_size,
+    }
+    if through is not None:
+        manifest["arrays"] = {"transmittance": {}}
+    (folder / MANIFEST_NAME).write_text(json.dumps(manifest))
+    return folder
