@@ -1,4 +1,4 @@
-"""A recipe: one YAML file that says what is generated, fitted, compared and reported."""
+"""A recipe: one YAML file that defines data, fits, comparison and report of a run."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ FIELD_OF_VIEW = 20.0
 Name = Annotated[str, Field(pattern=_NAME, max_length=100)]
 
 
-class Direction(Settings):
+class SceneDirection(Settings):
     """A direction as seen from the tile."""
 
     elevation: float = Field(gt=0, le=90, description="above the reference plane, in degrees")
     azimuth: float = Field(0.0, ge=-360, le=360, description="from +u towards +v, in degrees")
 
 
-class View(Direction):
-    """Direction of the camera; high enough that no horizon is visible."""
+class SceneView(SceneDirection):
+    """SceneDirection of the camera; high enough that no horizon is visible."""
 
     elevation: float = Field(
         ge=FIELD_OF_VIEW * 0.7 + 2, le=90, description="above the reference plane, in degrees"
@@ -44,7 +44,7 @@ def _distinct(values: Sequence[Any]) -> Sequence[Any]:
     return values
 
 
-Views = Annotated[list[View], Field(min_length=1), AfterValidator(_distinct)]
+Views = Annotated[list[SceneView], Field(min_length=1), AfterValidator(_distinct)]
 TilesAcross = Annotated[float, Field(gt=0, le=1e4)]
 
 
@@ -52,11 +52,11 @@ class CompareSection(Settings):
     """Images of the plane for every view, light and width of the field of view: references and fits."""
 
     views: Views = Field(
-        [View(elevation=90, azimuth=-90), View(elevation=35, azimuth=-90)],
+        [SceneView(elevation=90, azimuth=-90), SceneView(elevation=35, azimuth=-90)],
         description="directions of the cameras",
     )
-    lights: Annotated[list[Direction], Field(min_length=1), AfterValidator(_distinct)] = Field(
-        [Direction(elevation=45, azimuth=45), Direction(elevation=20, azimuth=160)],
+    lights: Annotated[list[SceneDirection], Field(min_length=1), AfterValidator(_distinct)] = Field(
+        [SceneDirection(elevation=45, azimuth=45), SceneDirection(elevation=20, azimuth=160)],
         description="directions of the light",
     )
     tiles_across: Annotated[list[TilesAcross], Field(min_length=1), AfterValidator(_distinct)] = Field(
@@ -68,7 +68,7 @@ class CompareSection(Settings):
         ["query"], description="query: M at each pixel's footprint; pixel: the filtered image"
     )
     offset_views: Views = Field(
-        [View(elevation=30, azimuth=a) for a in (-90, 0, 90, 180)],
+        [SceneView(elevation=30, azimuth=a) for a in (-90, 0, 90, 180)],
         description="views for which learned offsets are shown",
     )
     st_lpips: bool = Field(

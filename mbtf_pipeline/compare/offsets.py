@@ -19,7 +19,7 @@ from mbtf_core.atomic import write_through
 from mbtf_core.directions import from_angles
 from mbtf_core.lattice import Lattice, texel_centers
 from mbtf_pipeline.compare.pictures import fit_name
-from mbtf_pipeline.recipe import View
+from mbtf_pipeline.recipe import SceneView
 
 if TYPE_CHECKING:
     from mbtf_fit import Material
@@ -76,7 +76,7 @@ def read_offset(path: Path) -> F32:
     return np.stack([channels["X"], channels["Y"]], axis=-1).astype(np.float32)
 
 
-def towards_view(offset: F32, view: View) -> F32:
+def towards_view(offset: F32, view: SceneView) -> F32:
     """Component of displacements (..., 2) towards the viewer's azimuth, in tile widths."""
     along = from_angles(0.0, view.azimuth)[:2]
     out: F32 = (offset @ along).astype(np.float32)
@@ -100,7 +100,7 @@ def _slope(x: F32, y: F32) -> float | None:
 def write_offsets(
     estimator: Estimator,
     materials: Mapping[str, Material],
-    views: Sequence[View],
+    views: Sequence[SceneView],
     lattice: Lattice,
     out: Path,
 ) -> list[dict[str, Any]]:

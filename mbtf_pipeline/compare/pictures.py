@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_gen.pictures.camera import Camera, PixelKind
-from mbtf_pipeline.recipe import FIELD_OF_VIEW, CompareSection, Direction, View
+from mbtf_pipeline.recipe import FIELD_OF_VIEW, CompareSection, SceneDirection, SceneView
 
 F32 = NDArray[np.float32]
 PICTURES = "pictures"
@@ -30,8 +30,8 @@ class Scene:
 
     index: int
     name: str
-    view: View
-    light: Direction
+    view: SceneView
+    light: SceneDirection
     tiles_across: float
 
     def camera(self, size: int) -> Camera:

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from mbtf_gen.config.generator import GeneratorConfig
     from mbtf_gen.generation import Job
     from mbtf_gen.material.material import Material
-    from mbtf_pipeline.recipe import CompareSection, Direction, View
+    from mbtf_pipeline.recipe import CompareSection, SceneDirection, SceneView
 
 F64 = NDArray[np.float64]
 # Lowest elevations of view and light for which the finite block suffices.
@@ -135,7 +135,7 @@ def _blocks(picture: F64) -> F64:
     return cut.transpose(0, 2, 1, 3, 4).reshape(rows * columns, side * side, 3)
 
 
-def pick_scene(section: CompareSection) -> tuple[View, Direction, float]:
+def pick_scene(section: CompareSection) -> tuple[SceneView, SceneDirection, float]:
     """The first view and the first light that are high enough, and the smallest field of view.
 
     Raises

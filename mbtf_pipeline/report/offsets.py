@@ -10,7 +10,7 @@ import numpy as np
 
 from mbtf_pipeline.compare.offsets import read_offset, towards_view
 from mbtf_pipeline.formatting import direction, signed
-from mbtf_pipeline.recipe import View
+from mbtf_pipeline.recipe import SceneView
 from mbtf_pipeline.report.embed import Gallery, Pixels
 from mbtf_pipeline.report.error_maps import common_scale, gradient, ticks
 from mbtf_pipeline.report.pictures import ColorBar
@@ -27,7 +27,7 @@ def displacements(
     """
     files = [r["traced"] if fit is None else r["fits"][fit]["file"] for r in records]
     maps: list[Pixels] = [
-        towards_view(read_offset(folder / file), View(**record["view"]))
+        towards_view(read_offset(folder / file), SceneView(**record["view"]))
         for file, record in zip(files, records, strict=True)
     ]
     medians = [float(np.median(m)) for m in maps]

@@ -60,7 +60,7 @@ class Cloud:
 
 
 @dataclass(frozen=True)
-class Curve:
+class Line:
     """A named line: x and y (n,), and optionally the standard error of y (n,)."""
 
     name: str
@@ -137,7 +137,7 @@ def _limits(values: Sequence[float]) -> tuple[float, float]:
 
 
 def curves(
-    lines: Sequence[Curve], x: str, y: str, label: str, *, logx: bool = False, logy: bool = True
+    lines: Sequence[Line], x: str, y: str, label: str, *, logx: bool = False, logy: bool = True
 ) -> str:
     """Lines with bands of one standard error; `x` and `y` name the axes with units."""
     with _style(label):

@@ -11,7 +11,7 @@ import numpy as np
 from mbtf_core.stats import Estimate
 from mbtf_pipeline.fit_records import TrainingHistory
 from mbtf_pipeline.formatting import estimate, estimate_text
-from mbtf_pipeline.report.plots import Curve, bars, curves
+from mbtf_pipeline.report.plots import Line, bars, curves
 from mbtf_pipeline.run_folder import FITS
 from mbtf_pipeline.stages import read_stamp
 
@@ -44,7 +44,7 @@ def time_context(
     ]
     generation = float(manifest["summary"]["shard_seconds"])
     lines = [
-        Curve(name, [generation + r[0] for r in rows], [r[1] for r in rows], [r[2] for r in rows])
+        Line(name, [generation + r[0] for r in rows], [r[1] for r in rows], [r[2] for r in rows])
         for name, rows in ((name, h.unexplained) for name, h in histories.items())
         if rows
     ]

@@ -6,13 +6,13 @@ from collections.abc import Mapping
 from typing import Any
 
 from mbtf_pipeline.fit_records import TrainingHistory
-from mbtf_pipeline.report.plots import Curve, curves
+from mbtf_pipeline.report.plots import Line, curves
 
 
 def training_context(histories: Mapping[str, TrainingHistory]) -> dict[str, Any]:
     """Template data about training; one history per fit."""
-    loss = [Curve(name, *_columns(h.loss)) for name, h in histories.items() if h.loss]
-    errors = [Curve(name, *_columns(h.unexplained)) for name, h in histories.items() if h.unexplained]
+    loss = [Line(name, *_columns(h.loss)) for name, h in histories.items() if h.loss]
+    errors = [Line(name, *_columns(h.unexplained)) for name, h in histories.items() if h.unexplained]
     plots = []
     if loss:
         svg = curves(loss, "seconds of training", "training loss", "training loss over seconds")

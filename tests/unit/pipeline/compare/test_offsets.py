@@ -11,7 +11,7 @@ from mbtf_core.directions import from_angles
 from mbtf_gen.geometry.heightfield import HeightGrid
 from mbtf_gen.render.runtime import load_mitsuba
 from mbtf_pipeline.compare.offsets import _correlation, _write, read_offset, towards_view, traced_offset
-from mbtf_pipeline.recipe import View
+from mbtf_pipeline.recipe import SceneView
 
 DEPTH = 0.05
 
@@ -40,7 +40,7 @@ def test_a_plane_below_is_displaced_by_its_depth_over_the_tangent(
     distance = DEPTH / np.tan(np.radians(elevation))
     expected = -distance * np.array([np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth))])
     np.testing.assert_allclose(found, np.broadcast_to(expected, (3, 2)), atol=2e-6)
-    along = towards_view(found, View(elevation=elevation, azimuth=azimuth))
+    along = towards_view(found, SceneView(elevation=elevation, azimuth=azimuth))
     np.testing.assert_allclose(along, -distance, atol=2e-6)
 
 

@@ -11,14 +11,14 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from mbtf_pipeline.report.labels import place_labels
-from mbtf_pipeline.report.plots import Curve, bars, curves, points
+from mbtf_pipeline.report.plots import Line, bars, curves, points
 
 SECONDS = list(np.linspace(2, 60, 30))
 ERROR = [0.3 + 1 / s for s in SECONDS]
 
 
 def training(label: str = "training") -> str:
-    lines = [Curve("first", SECONDS, ERROR, [0.01] * 30), Curve("second", SECONDS, [2 * e for e in ERROR])]
+    lines = [Line("first", SECONDS, ERROR, [0.01] * 30), Line("second", SECONDS, [2 * e for e in ERROR])]
     return curves(lines, "seconds of training", "unexplained variance", label)
 
 
@@ -93,6 +93,6 @@ def test_an_error_bar_larger_than_its_value_does_not_stretch_the_axis() -> None:
 
 
 def test_a_band_that_reaches_zero_is_clipped() -> None:
-    lines = [Curve("a", [10.0, 20.0, 30.0], [0.3, 0.2, -0.01], [0.31, 5.0, 0.1])]
+    lines = [Line("a", [10.0, 20.0, 30.0], [0.3, 0.2, -0.01], [0.31, 5.0, 0.1])]
     numbers = {float(t) for t in texts(curves(lines, "x", "y", "band")) if re.fullmatch(r"[\d.e-]+", t)}
     assert {n for n in numbers if n < 10} == {0.1, 0.2, 0.5}
