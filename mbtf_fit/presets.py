@@ -65,7 +65,7 @@ def fitter_options(quality: Quality, fits: Mapping[str, Mapping[str, Any]]) -> d
     ----------
     fits : by name, the options that files and command line set for each fit, nested, with its model
     """
-    free = not any("network" in given or given.get("start") for given in fits.values())
+    free = not any("network" in given or given.get("init_from") for given in fits.values())
     out = {}
     for name, given in fits.items():
         training = given.get("training")
