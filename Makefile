@@ -58,7 +58,7 @@ docs: $(INSTALLED)
 	@echo "documentation: docs/_build/html/index.html"
 
 test: lint
-	$(BIN)/python -m pytest -q -m "not slow"
+	$(BIN)/python -m pytest -q -m "not slow" -n auto --maxprocesses 8 --dist worksteal
 	$(BIN)/mbtf-pipeline run pipelines/ci.yaml --force --quiet
 	$(MAKE) docs
 

@@ -1,4 +1,4 @@
-"""Error against time of many configurations of the fitter, on the yardstick's data.
+"""Error against time of many configurations of the fitter, on the data of the benchmark rock_cliff-128.
 
     python benchmarks/fit_sweep.py --out FOLDER --rates                  # a quiet machine for half a minute
     python benchmarks/fit_sweep.py --out FOLDER [--seconds 20] [--only NAME ...]
@@ -9,7 +9,7 @@ fit reaches depends on its steps alone, so the second call may share its process
 interrupted, and goes on where it was: ``sweep.json`` keeps what is done. Without ``rates.json`` they are
 measured first.
 
-Every configuration is judged by the test split of the yardstick: unexplained variance, noise-free. Data sets
+Every configuration is evaluated on the test split of the benchmark: unexplained variance. Data sets
 are made where they are missing (minutes; the maps lie beside the project); some configurations train on other
 ones, made of as many paths. Prints one line each, and writes ``sweep.png``, error while training over
 seconds.
@@ -31,7 +31,7 @@ from typing import Any
 
 import numpy as np
 from fit import MOMENTS, random_batch
-from yardstick import RECIPE, make_shards
+from rock_cliff_128 import RECIPE, make_shards
 
 from mbtf_core.errors import MbtfError
 from mbtf_core.lattice import Lattice
@@ -223,7 +223,7 @@ def plot(found: dict[str, dict[str, Any]], path: Path) -> None:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--shards", type=Path, help="the yardstick's data set; made by default")
+    parser.add_argument("--shards", type=Path, help="data set of the benchmark; made by default")
     parser.add_argument("--out", type=Path, help="folder to work in; a temporary one by default")
     parser.add_argument("--seconds", type=float, default=20.0, help="training time of each")
     parser.add_argument("--rates", action="store_true", help="measure the time of steps, no more")

@@ -4,7 +4,7 @@
 
 Processor time of both stages per value, of models with random weights on a square tile: the least of some
 repetitions, on one thread. ``hierarchical`` reads 81 places for every value; ``neumip-wide`` is the
-``neumip`` that ``yardstick.py`` trains with more features and channels.
+``neumip`` that ``rock_cliff_128.py`` trains with more features and channels.
 
 The last line is one JSON object: figures, and the bars they are held to. Exit code 1 where a bar is missed.
 """
@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from yardstick import MODELS as TRAINED
+from rock_cliff_128 import MODELS as TRAINED
 
 from mbtf_core.directions import from_projected_disk
 from mbtf_core.lattice import Lattice

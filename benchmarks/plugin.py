@@ -28,7 +28,7 @@ from typing import Any
 # Before drjit is imported: kernels are compiled anew.
 _CACHE = tempfile.TemporaryDirectory(prefix="mbtf-kernels-")
 os.environ["DRJIT_CACHE_DIR"] = _CACHE.name
-# PyTorch itself is the yardstick, not the fitter's own compiled kernel.
+# PyTorch itself is the baseline, not the fitter's own compiled kernel.
 os.environ["MBTF_KERNEL"] = "off"
 
 import numpy as np  # noqa: E402

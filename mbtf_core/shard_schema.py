@@ -1,6 +1,6 @@
 """The shard format's vocabulary: schema version, arrays, units, conventions in words.
 
-Every other module, the manifest and ``docs/format.md`` take their names and wording from here.
+Every other module, the manifest and ``docs/reference/data-format.md`` take their names and wording from here.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
-"""Draws the figures of docs/concepts.md: ``.venv/bin/python docs/drawings/make_drawings.py``.
+"""Draw the figures of docs/explanation/concepts.md: ``.venv/bin/python docs/drawings/make_drawings.py``.
 
-Curves are computed by the project's own code (light kernel, level weights), so that a drawing cannot say
-something else than the programs do.
+The curves come from the project's own code (light kernel, level weights), so drawings and programs agree.
 """
 
 from __future__ import annotations
@@ -20,8 +19,8 @@ FOLDER = Path(__file__).parent
 BLUE, ORANGE, GREEN, RED, GRAY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#666666"
 
 
-def relief(x: Any) -> Any:
-    """A relief of period 1, its highest point at 0."""
+def heights(x: Any) -> Any:
+    """Heights of period 1, the highest point at 0."""
 
     def shape(at: Any) -> Any:
         phase = 2 * np.pi * (np.asarray(at) - 0.14)
@@ -45,19 +44,19 @@ def arrow(
 
 
 def first_hit(x: float, direction: tuple[float, float]) -> tuple[float, float]:
-    """Where the ray that leaves (x, 0) downwards along `direction` meets the relief."""
+    """Where the ray from (x, 0) down along `direction` meets the surface."""
     t = np.linspace(0, 1, 200001)
-    along = relief(x + t * direction[0])
+    along = heights(x + t * direction[0])
     k = int(np.argmax(t * direction[1] <= along))
     return x + t[k] * direction[0], float(along[k])
 
 
 def tile(plot: Any) -> Any:
-    """Section through a tile: what B(x, ω_i, ω_o) is."""
+    """Section through a tile: the geometry of B(x, ω_i, ω_o)."""
     figure, axes = plot.subplots(figsize=(8, 2.9))
     x = np.linspace(-0.35, 1.35, 700)
-    axes.fill_between(x, relief(x), -0.42, color="#e8e4dc")
-    axes.plot(x, relief(x), color="black", lw=1.4)
+    axes.fill_between(x, heights(x), -0.42, color="#e8e4dc")
+    axes.plot(x, heights(x), color="black", lw=1.4)
     axes.plot([-0.35, 1.36], [0, 0], color=GRAY, ls="--", lw=1)
     axes.text(-0.34, 0.015, "reference plane z = 0", ha="left", va="bottom", color=GRAY, fontsize=9)
     for border in (0.0, 1.0):
@@ -79,7 +78,7 @@ def tile(plot: Any) -> Any:
     axes.plot(at, 0, "o", color=BLUE, ms=5)
     axes.text(at + 0.015, -0.02, r"$\mathbf{x}$", color=BLUE, va="top", fontsize=12)
     axes.plot(*hit, "o", color=RED, ms=5)
-    axes.text(hit[0] - 0.01, hit[1] - 0.04, "the point seen", color=RED, va="top", ha="center", fontsize=9)
+    axes.text(hit[0] - 0.01, hit[1] - 0.04, "visible point", color=RED, va="top", ha="center", fontsize=9)
     axes.set_xlim(-0.36, 1.75)
     axes.set_ylim(-0.43, 0.45)
     bare(axes)
@@ -114,7 +113,7 @@ def orientation(plot: Any) -> Any:
 
 
 def footprint(plot: Any) -> Any:
-    """Footprints of three levels on the finest texels, and how levels blend."""
+    """Footprints of three levels on the finest texels, and the weights of the levels."""
     figure, (left, right) = plot.subplots(1, 2, figsize=(9, 3.2), width_ratios=(1, 1.6))
     lattice = Lattice(4, 1.0)
     n = 2**lattice.finest
@@ -163,7 +162,7 @@ def light(plot: Any) -> Any:
     axes.text(
         -2,
         axes.get_ylim()[1] * 0.5,
-        "below the\nhorizon:\nnothing",
+        "below the\nhorizon:\nno light",
         ha="center",
         va="center",
         fontsize=9,
@@ -179,13 +178,13 @@ def light(plot: Any) -> Any:
 
 
 def periodic(plot: Any) -> Any:
-    """A grazing ray that leaves the tile re-enters it on the other side."""
+    """A grazing ray that leaves the tile re-enters on the other side."""
     figure, axes = plot.subplots(figsize=(8, 2.2))
     x = np.linspace(-0.12, 1.12, 700)
-    axes.fill_between(x, relief(x), -0.42, color="#f1efe9")
+    axes.fill_between(x, heights(x), -0.42, color="#f1efe9")
     inside = (x >= 0) & (x <= 1)
-    axes.fill_between(x[inside], relief(x[inside]), -0.42, color="#dfd9cc")
-    axes.plot(x, relief(x), color="black", lw=1.3)
+    axes.fill_between(x[inside], heights(x[inside]), -0.42, color="#dfd9cc")
+    axes.plot(x, heights(x), color="black", lw=1.3)
     slope = -0.06
     height = -0.005
     start = 0.56
@@ -193,7 +192,7 @@ def periodic(plot: Any) -> Any:
     while pieces < 4:
         t = np.linspace(0, 1.0 - start, 20001)
         z = height + slope * t
-        blocked = np.nonzero(z < relief(start + t))[0]
+        blocked = np.nonzero(z < heights(start + t))[0]
         last = int(blocked[0]) if len(blocked) else len(t) - 1
         axes.plot(start + t[[0, last]], z[[0, last]], color=BLUE, lw=1.8)
         if len(blocked):
@@ -204,7 +203,7 @@ def periodic(plot: Any) -> Any:
         )
         height, start, pieces = float(z[last]), start + float(t[last]) - 1.0, pieces + 1
         axes.plot(start, height, "o", mfc="white", mec=BLUE, ms=6)
-        axes.text(start + 0.015, height + 0.02, "goes on", color=BLUE, fontsize=9, va="bottom")
+        axes.text(start + 0.015, height + 0.02, "re-enters", color=BLUE, fontsize=9, va="bottom")
     for border, name in ((0.0, "left border"), (1.0, "right border")):
         axes.plot([border, border], [-0.42, 0.03], color=GRAY, ls=":", lw=1)
         axes.text(border, 0.035, name, ha="center", va="bottom", color=GRAY, fontsize=9)

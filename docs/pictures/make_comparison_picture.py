@@ -1,5 +1,6 @@
-"""Makes docs/pictures/comparison.png from a finished quickstart run: reference left of each seam, fitted
-material right of it.
+"""Make docs/pictures/comparison.png from a finished quickstart run.
+
+The reference is on the left of each seam, the fitted material on the right.
 
 Run after ``make demo``, from the repository's root: ``.venv/bin/python
 docs/pictures/make_comparison_picture.py``.

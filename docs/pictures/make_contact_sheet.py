@@ -1,6 +1,6 @@
-"""Makes docs/pictures/contact_sheet.png: every material of assets/ as a close view and from afar.
+"""Make docs/pictures/contact_sheet.png: every material of assets/ as a close view and from afar.
 
-Each picture is made by one run of ``mbtf-gen reference``, which is printed; only the labels are added here.
+One run of ``mbtf-gen reference`` renders each picture; its command is printed. Labels are added here.
 From the repository's root, in a minute or two: ``.venv/bin/python docs/pictures/make_contact_sheet.py``.
 """
 
@@ -15,10 +15,10 @@ from pathlib import Path
 from PIL import Image, ImageDraw, ImageFont
 
 MATERIALS = ("twisted_wool", "straight_wool", "turtle_shell", "cliff_rock", "insulation_foam")
-# What is said of a row, and the options that make its pictures.
+# Caption of each row, and the options of its pictures.
 ROWS = (
-    ("one tile wide, view at 55°, light at 40°", "--view 55,-90 --light 40,140 --tiles-across 1"),
-    ("two tiles wide, view at 40°, grazing light at 15°", "--view 40,-90 --light 15,150 --tiles-across 2"),
+    ("one tile across, view at 55°, light at 40°", "--view 55,-90 --light 40,140 --tiles-across 1"),
+    ("two tiles across, view at 40°, grazing light at 15°", "--view 40,-90 --light 15,150 --tiles-across 2"),
 )
 SIZE, SPP = 248, 256
 GAP, TITLE, CAPTION = 6, 26, 22
@@ -30,7 +30,8 @@ def render(material: str, options: str) -> Image.Image:
 
     Raises
     ------
-    subprocess.CalledProcessError : the program failed; it has said why
+    subprocess.CalledProcessError
+        If the program fails.
     """
     words = ["reference", f"assets/{material}", *shlex.split(options)]
     words += ["--size", str(SIZE), "--spp", str(SPP), "--kind", "pixel"]

@@ -1,8 +1,9 @@
-"""Makes the figures of docs/cost.md and docs/accuracy.md from folders of cost studies, and tables of fronts.
+"""Make the figures in docs/pictures/cost from folders of cost studies, and print their Pareto fronts.
 
-From the repository's root, after the studies (the commands stand in docs/cost.md):
+From the repository's root, after the studies:
 ``.venv/bin/python docs/pictures/make_cost_pictures.py out/cost/turtle_shell out/cost/twisted_wool …``.
-Every sheet shows one plot of all studies side by side; studies that did not get to it are left out of it.
+Each figure shows one plot of all studies side by side. The tables of the Pareto fronts go to standard output,
+as Markdown for a results page.
 """
 
 from __future__ import annotations
@@ -17,7 +18,6 @@ from PIL import Image, ImageDraw, ImageFont
 from mbtf_pipeline.cost_study.fit_runs import QUALITIES
 
 HERE = Path(__file__).parent
-PAGE = HERE.parent / "cost.md"
 OUT = HERE / "cost"
 PLOTS = (
     "front",
@@ -34,11 +34,10 @@ PLOTS = (
     "light",
 )
 WIDTH, TITLE, GAP, COLUMNS, COLORS = 800, 30, 12, 2, 256
-BEGIN, END = "<!-- fronts: begin -->", "<!-- fronts: end -->"
 
 
 def sheet(plot: str, studies: list[Path]) -> Path | None:
-    """One plot of all studies, each under its name."""
+    """One figure: a plot of all studies, each under its name."""
     found = [folder for folder in studies if (folder / f"{plot}.png").exists()]
     if not found:
         return None
@@ -63,8 +62,8 @@ def sheet(plot: str, studies: list[Path]) -> Path | None:
     return path
 
 
-def whole_chains(folder: Path) -> list[dict[str, str]]:
-    """Rows of the study that lie on the front: nothing beats them in both time and error."""
+def pareto_front(folder: Path) -> list[dict[str, str]]:
+    """Rows of the study's Pareto front: no other row has less error in as little time."""
     with (folder / "cost.csv").open(encoding="utf-8", newline="") as stream:
         rows = [
             r for r in csv.DictReader(stream) if r["total_seconds"] and r["study"] != "seeds" and r["error"]
@@ -77,9 +76,9 @@ def whole_chains(folder: Path) -> list[dict[str, str]]:
 
 
 def table(studies: list[Path]) -> str:
-    """How well errors are known, and the fronts of all studies with commands, as Markdown."""
+    """Markdown tables of all studies: precision of the errors, and Pareto fronts with a command."""
     records = {f: json.loads((f / "study.json").read_text(encoding="utf-8")) for f in studies}
-    lines = ["| study | errors known to ± 10 % (95 %) | scatter between seeds |", "|---|---|---|"]
+    lines = ["| study | errors within ± 10 % (95 %) | seed variance |", "|---|---|---|"]
     for folder, study in records.items():
         found = study.get("summary")
         if found is None:
@@ -92,10 +91,10 @@ def table(studies: list[Path]) -> str:
         lines += [
             f"`{folder.name}`, {where}:",
             "",
-            "| in all | generating | training | queries × paths | model | unexplained variance |",
+            "| total time | generation | training | queries × paths | model | unexplained variance |",
             "|---|---|---|---|---|---|",
         ]
-        front = whole_chains(folder)
+        front = pareto_front(folder)
         for r in front:
             lines.append(
                 f"| {float(r['total_seconds']):.0f} s | {float(r['generation_seconds']):.1f} s "
@@ -105,12 +104,12 @@ def table(studies: list[Path]) -> str:
                 f"| {float(r['error']):.3f} ± {float(r['error_se']):.3f} |"
             )
         command = front[-1]["command"].replace(str(folder), f"out/cost/{folder.name}")
-        lines += ["", "The last one by itself:", "", f"    {command.replace(' && ', chr(10) + '    ')}", ""]
+        lines += ["", "Command of the last row:", "", f"    {command.replace(' && ', chr(10) + '    ')}", ""]
     return "\n".join(lines)
 
 
 def main() -> int:
-    """Write the sheets and the table."""
+    """Write the figures, print the tables."""
     studies = [Path(name) for name in sys.argv[1:]]
     if not studies:
         print(__doc__, file=sys.stderr)
@@ -119,9 +118,8 @@ def main() -> int:
     for plot in PLOTS:
         path = sheet(plot, studies)
         if path is not None:
-            print(f"{path}: {path.stat().st_size / 1e3:.0f} kB")
-    before, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
-    PAGE.write_text(f"{before}{BEGIN}\n\n{table(studies)}\n{END}{rest.split(END)[1]}", encoding="utf-8")
+            print(f"{path}: {path.stat().st_size / 1e3:.0f} kB", file=sys.stderr)
+    print(table(studies))
     return 0
 
 

@@ -1,4 +1,4 @@
-"""Makes smoothing.png: a tile at its finest level by several fits, one row each.
+"""Make smoothing.png: a tile at its finest level by several fits, one row each.
 
     python docs/pictures/make_smoothing_picture.py MATERIAL ...
 

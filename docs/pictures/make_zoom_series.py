@@ -33,7 +33,7 @@ TILES_ACROSS = (0.5, 2.0, 8.0, 32.0, 128.0)
 VIEW, LIGHT, SIZE, SPP = (60.0, -90.0), (45.0, 45.0), 160, 64
 # As the recipe generates its data.
 OPTIONS = ("--mesh", "256", "--light-width", "5")
-ROWS = ("reference, 0.5 tiles wide", "material, mbtf_path", "material, finest level")
+ROWS = ("reference, 0.5 tiles across", "material, mbtf_path", "material, finest level")
 GAP, CAPTION = 6, 24
 
 
@@ -121,7 +121,7 @@ def main() -> None:
         exposure = auto_exposure(truth.astype(np.float32))
         for row, (name, picture) in enumerate(zip(ROWS, pictures, strict=True)):
             place = (column * (SIZE + GAP), row * (SIZE + CAPTION))
-            caption = name if column == 0 else f"{tiles_across:g} tiles wide" if row == 0 else ""
+            caption = name if column == 0 else f"{tiles_across:g} tiles across" if row == 0 else ""
             draw.text((place[0] + 2, place[1] + 3), caption, (30, 30, 30), ImageFont.load_default(12))
             display = to_display(picture.astype(np.float32), exposure)
             sheet.paste(Image.fromarray(display), (place[0], place[1] + CAPTION))
@@ -130,7 +130,7 @@ def main() -> None:
                 max(float(x), 0.0) ** 0.5 / level for x in (((gray - a) * (gray - b)).mean(), contrast)
             )
             print(
-                f"{tiles_across:6g} tiles wide, {name:26} mean {gray.mean() / level:.3f}, contrast "
+                f"{tiles_across:6g} tiles across, {name:26} mean {gray.mean() / level:.3f}, contrast "
                 f"{gray.std() / level:.3f} for {true:.3f}, RMS {error:.3f}",
                 flush=True,
             )

@@ -7,6 +7,7 @@ f, averaged over the footprint and over the light kernel of the data. ``eval`` t
 from __future__ import annotations
 
 import logging
+from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
@@ -35,12 +36,8 @@ PARAMETERS = ("material", "uv_scale", "sigma", "networks", "sampling")
 _log = logging.getLogger(__name__)
 # Materials whose missing footprint was told.
 _warned: set[Path] = set()
-
-
-class Cones:
-    """Whether the integrator that is tracing now hands footprints to the BSDFs."""
-
-    carried = False
+# Whether the integrator that is tracing now passes footprints to the BSDFs.
+FOOTPRINTS_PASSED: ContextVar[bool] = ContextVar("footprints_passed", default=False)
 
 
 @dataclass(frozen=True)
@@ -150,7 +147,7 @@ class MbtfBSDF(mi.BSDF):
         return value
 
     def _warn_once(self) -> None:
-        if Cones.carried or self.sigma_given or self.folder in _warned:
+        if FOOTPRINTS_PASSED.get() or self.sigma_given or self.folder in _warned:
             return
         _warned.add(self.folder)
         _log.warning(

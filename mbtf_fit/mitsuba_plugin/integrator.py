@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mbtf_core.errors import UsageError
-from mbtf_fit.mitsuba_plugin.bsdf import Cones
+from mbtf_fit.mitsuba_plugin.bsdf import FOOTPRINTS_PASSED
 from mbtf_fit.mitsuba_plugin.registration import INTEGRATOR_NAME, refuse_unknown
 from mbtf_fit.mitsuba_plugin.scene import check_scene
 
@@ -97,14 +97,14 @@ class ConePath(mi.SamplingIntegrator):
     ) -> tuple[Any, Any, list[Any]]:
         """Radiance along a camera ray, whether it met a surface, no further channels."""
         width, spread = camera_cone(ray, sampler.sample_count())
-        Cones.carried = True
+        token = FOOTPRINTS_PASSED.set(True)
         try:
             first = mi.Ray3f(ray)
             value, valid = self._trace(
                 scene, sampler, first, width, spread, mi.Bool(active), lets_through(scene)
             )
         finally:
-            Cones.carried = False
+            FOOTPRINTS_PASSED.reset(token)
         return value, valid, []
 
     @dr.syntax

@@ -1,7 +1,7 @@
 """One shard on disk: npz (uncompressed, memory-mappable) or EXR (named float32 channels).
 
 A shard is a mapping of array name to array; all arrays share their leading axes: ``(n,)`` queries in the
-``shuffled`` layout, ``(items, rows, columns)`` in the ``image`` layout. See ``docs/format.md``.
+``shuffled`` layout, ``(items, rows, columns)`` in the ``image`` layout. See ``docs/reference/data-format.md``.
 """
 
 from __future__ import annotations

@@ -1,13 +1,13 @@
 """Monte Carlo estimates of M at queries: two independent halves per query.
 
-Paths of one launch are traced in an order in which neighbors meet the reference plane near each other and
-look and are lit as steeply, so that their rays take about as many steps. The random numbers of a path depend
-on its number in the shard alone, so values do not depend on how queries are grouped into launches.
+The paths of a launch are sorted by position on the reference plane and by the elevations of view and light,
+so that neighboring lanes take about as many traversal steps. The random numbers of a path depend only on its
+number in the shard, so values do not depend on how queries are grouped into launches.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import drjit as dr
@@ -18,53 +18,55 @@ from numpy.typing import NDArray
 from mbtf_core.errors import PartialError
 from mbtf_gen.render.directional_light import DirectionalLight
 from mbtf_gen.render.estimates import MOST_LOCATED, BadSample, Estimates, Stream
-from mbtf_gen.render.path_tracer import Transport, trace
+from mbtf_gen.render.path_tracer import TraceOptions, Transport, trace
 from mbtf_gen.render.scene import CLEARANCE, Tile
+from mbtf_gen.render.types import Color3f, Float, Float64, Point2f, Ray3f, UInt32, Vector3f
 from mbtf_gen.sampling.light_kernel import LightKernel
 from mbtf_gen.sampling.query_sampler import Queries
 from mbtf_gen.sampling.rng import Purpose, sequence, stream_key, stream_number
+from mbtf_gen.sampling.sobol import SobolSampler
 
-# Paths per launch: enough to fill any machine, few enough to stay small in memory.
+# Paths per launch: enough to fill any machine, few enough to fit into memory.
 LAUNCH_PATHS = 1 << 20
-# Passes in which a path that came out non-finite is traced again before the run is stopped.
+# Passes in which non-finite samples are drawn again before the run stops.
 MAX_RESAMPLES = 4
 
 
 class RaySource(Protocol):
-    """What rays of queries start from: the query sensor, or a camera's pixels."""
+    """Source of first rays: the query sensor, or a camera's pixels."""
 
     def set_queries(self, queries: Queries, first: int = 0) -> None:
-        """Take a batch of queries; `first` is the number of its first query."""
+        """Set a batch of queries; `first` is the number of its first query."""
 
-    def footprint(self, query: Any, xi: Any) -> Any:
-        """uv of a point of the footprint of queries of the batch, not wrapped."""
+    def footprint(self, query: UInt32, xi: Point2f) -> Point2f:
+        """uv of a point of the queries' footprints, not wrapped."""
 
-    def ray(self, query: Any, point: Any) -> Any:
+    def ray(self, query: UInt32, point: Point2f) -> Ray3f:
         """Ray through such a point, in scene units."""
 
 
-def _place(point: Any) -> Any:
-    """Upper half of a path's place in the order: 8 bits of a Morton curve over the tile."""
+def _position_key(point: Point2f) -> UInt32:
+    """Upper half of a path's sorting key: 8 bits of a Morton curve over the tile."""
     cell = mi.Vector2u((point - dr.floor(point)) * 16.0)
 
-    def spread(x: Any) -> Any:
+    def spread(x: UInt32) -> UInt32:
         x = (x | (x << 2)) & 0x33
         return (x | (x << 1)) & 0x55
 
     return (spread(cell.x) | (spread(cell.y) << 1)) << 8
 
 
-def _slopes(queries: Queries) -> Any:
-    """Lower half: 4 bits of the cosine of either direction, the view's first."""
+def _direction_key(queries: Queries) -> UInt32:
+    """Lower half of the sorting key: 4 bits each of the cosines of ω_o and ω_i."""
     view, light = (
         np.clip(16.0 * omega[:, 2], 0, 15).astype(np.uint32) for omega in (queries.omega_o, queries.omega_i)
     )
     return _aligned(view << 4 | light)
 
 
-def _aligned(numbers: NDArray[Any]) -> Any:
-    """Lane numbers as a copy: memory borrowed from NumPy is aligned by chance, and kernels that read it are
-    compiled for either case."""
+def _aligned(numbers: NDArray[Any]) -> UInt32:
+    """Lane numbers as a copy: NumPy's memory is aligned or not by chance, and kernels would be compiled for
+    either case."""
     copied = mi.UInt32(numbers.astype(np.uint32)) + dr.opaque(mi.UInt32, 0)
     dr.eval(copied)
     return copied
@@ -89,34 +91,33 @@ class Lanes:
     ----------
     first : number of the first query in the shard
     counts : (n,) paths of each query; starts : (n,) its first lane
-    query : ``mi.UInt32``, query of each lane
-    start, half : ``mi.UInt32``, of each query its first lane and the paths of one half
-    slopes : ``mi.UInt32``, of each query what its directions add to its paths' place in the order
+    query : query of each lane
+    start, half : first lane of each query, and the paths of one half
+    direction_key : lower half of the sorting key of each query
     """
 
     first: int
     counts: NDArray[np.int64]
     starts: NDArray[np.int64]
-    query: Any
-    start: Any
-    half: Any
-    slopes: Any
+    query: UInt32
+    start: UInt32
+    half: UInt32
+    direction_key: UInt32
 
     @classmethod
     def of(cls, first: int, counts: NDArray[np.int64], queries: Queries) -> Lanes:
-        """Lanes of queries that follow each other."""
+        """Lanes of consecutive queries."""
         starts = np.cumsum(counts) - counts
         query = np.repeat(np.arange(len(counts), dtype=np.uint32), counts)
-        columns = [*(_aligned(x) for x in (query, starts, counts // 2)), _slopes(queries)]
+        columns = [*(_aligned(x) for x in (query, starts, counts // 2)), _direction_key(queries)]
         return cls(first, counts, starts, *columns)
 
     def number(self, lane: int) -> int:
-        """Number in the shard of a lane's query."""
+        """Number of a lane's query in the shard."""
         return self.first + int(np.searchsorted(self.starts, lane, side="right")) - 1
 
-    def halves(self, x: Any) -> NDArray[np.float64]:
-        """Means over both halves of each query of numbers per lane, a ``mi.Float`` or one per channel:
-        (n, 2, channels)."""
+    def halves(self, x: Float | Color3f) -> NDArray[np.float64]:
+        """Mean of each half of each query, (n, 2, channels), of one number or color per lane."""
         which = dr.arange(mi.UInt32, 2 * len(self.counts))
         query, second = which >> 1, which & 1
         half = dr.gather(mi.UInt32, self.half, query)
@@ -128,8 +129,8 @@ class Lanes:
 
 
 @dr.syntax
-def _sum_of(x: Any, lane: Any, end: Any) -> Any:
-    """Sums of numbers from one lane to another, in their order: none depends on threads or launches."""
+def _sum_of(x: Float, lane: UInt32, end: UInt32) -> Float64:
+    """Sums over ranges of lanes, in order, so that they do not depend on threads or launches."""
     total, lane = mi.Float64(0.0), mi.UInt32(lane)
     while dr.hint(lane < end, exclude=[x, end]):
         total += mi.Float64(dr.gather(mi.Float, x, lane))
@@ -138,14 +139,23 @@ def _sum_of(x: Any, lane: Any, end: Any) -> Any:
 
 
 class Estimator:
-    """Traces queries against one tile.
+    """Monte Carlo estimator of M on one tile.
 
     Parameters
     ----------
-    tile : the displaced tile
-    light : smoothed directional light, or None for constant radiance 1 from above (furnace)
-    transport : how paths are followed
-    launch : paths per launch
+    tile : Tile
+        The displaced tile, see :func:`~mbtf_gen.render.scene.build_tile`.
+    light : LightKernel or None
+        Smoothed directional light; None for constant radiance 1 from the upper hemisphere (white furnace).
+    transport : Transport
+        Effects that are simulated.
+    launch : int
+        Paths per kernel launch; does not change the values.
+
+    Attributes
+    ----------
+    holes : bool
+        Whether the surface has an opacity mask, so that the transmittance is estimated.
     """
 
     def __init__(
@@ -155,7 +165,6 @@ class Estimator:
         self.light = light
         self.transport = transport
         self.launch = launch
-        # Whether rays may pass through, so that what passed is counted.
         self.holes = bool(tile.world.surface.parts.opacity)
         self._sensor = mi.load_dict(
             {"type": "mbtf_queries", "unit": tile.unit, "aspect": tile.aspect, "start": CLEARANCE}
@@ -172,29 +181,48 @@ class Estimator:
         roulette: int | None = None,
         path_variance: bool = False,
     ) -> Estimates:
-        """Both halves of each query (one leading axis).
+        """Estimate M at queries.
 
         Parameters
         ----------
-        spp : paths of every query, or of each (n,), both halves together
-        source : where rays come from; the query sensor by default
-        limit, roulette : other numbers of surface interactions at which paths end, and at which roulette
-            begins, for the same kernel
-        path_variance : find the sample variance of single paths too
+        queries : Queries
+            n queries, with one leading axis.
+        spp : int or (n,) int64 array
+            Paths per query, both halves together; even.
+        stream : Stream
+            Random numbers to use.
+        source : RaySource, optional
+            Source of the first rays; the query sensor by default.
+        limit : int, optional
+            Largest number of surface interactions of a path; that of the transport by default.
+        roulette : int, optional
+            Interactions before Russian roulette starts; that of the transport by default.
+        path_variance : bool
+            Also estimate the sample variance of single paths.
+
+        Returns
+        -------
+        Estimates
+            Values of both halves in 1/sr, with counts of lost and non-finite samples.
 
         Raises
         ------
-        PartialError : samples stay non-finite after several draws; says where
+        ValueError
+            A number of paths is odd or zero.
+        PartialError
+            Samples stay non-finite after several draws; says which query and which effect.
         """
         n = len(queries.sigma)
         counts = np.full(n, spp, np.int64) if isinstance(spp, int) else spp
         if n and (counts.min() < 2 or (counts % 2).any()):
             raise ValueError(f"spp must be even, for two equal halves, not {spp}")
-        self._limit = dr.opaque(mi.UInt32, self.transport.limit if limit is None else limit)
-        self._roulette = dr.opaque(mi.UInt32, self.transport.roulette_depth if roulette is None else roulette)
-        self._path_variance = path_variance
+        options = TraceOptions(
+            dr.opaque(mi.UInt32, self.transport.limit if limit is None else limit),
+            dr.opaque(mi.UInt32, self.transport.roulette_depth if roulette is None else roulette),
+            path_variance,
+        )
         parts = [
-            self._batch(queries, rows, counts[rows], stream, source or self._sensor)
+            self._batch(queries, rows, counts[rows], stream, source or self._sensor, options)
             for rows in _launches(counts, self.launch)
         ]
         return Estimates(
@@ -211,7 +239,13 @@ class Estimator:
         )
 
     def _batch(
-        self, queries: Queries, rows: slice, counts: NDArray[np.int64], stream: Stream, source: RaySource
+        self,
+        queries: Queries,
+        rows: slice,
+        counts: NDArray[np.int64],
+        stream: Stream,
+        source: RaySource,
+        options: TraceOptions,
     ) -> Estimates:
         part = queries.take(rows)
         source.set_queries(part, rows.start)
@@ -220,20 +254,19 @@ class Estimator:
             inverse = mi.Float(0.0)
         else:
             inverse = mi.Float((1.0 / self.light.irradiance(part.omega_i)).astype(np.float32))
-        # Before any kernel reads them: their places in NumPy's array, and so the number of queries, would be
-        # a part of it.
+        # Evaluated before any kernel reads them: otherwise the number of queries would be part of the kernel.
         dr.eval(omega_i, inverse)
         lanes = Lanes.of(rows.start, counts, part)
 
-        def trace_lanes(which: Any, attempt: int) -> tuple[Any, Any, int, int]:
-            return self._trace(source, lanes, which, stream, omega_i, inverse, attempt)
+        def trace_lanes(which: UInt32 | None, attempt: int) -> tuple[Color3f, Float, int, int]:
+            return self._trace(source, lanes, which, stream, omega_i, inverse, attempt, options)
 
         radiance, passed, lost, capped = trace_lanes(None, 0)
         values = lanes.halves(radiance)
-        # Few launches have bad samples: their paths are looked through only then.
+        # Few launches have non-finite samples: their lanes are searched only then.
         bad = np.zeros(0, np.uint32) if np.isfinite(values).all() else self._nonfinite(radiance)
         nonfinite = len(bad)
-        located = self._located(source, lanes, bad[:MOST_LOCATED], stream, omega_i, inverse)
+        located = self._located(source, lanes, bad[:MOST_LOCATED], stream, omega_i, inverse, options)
         for attempt in range(1, MAX_RESAMPLES + 1):
             if not len(bad):
                 break
@@ -264,7 +297,7 @@ class Estimator:
             capped,
             nonfinite,
             located,
-            path_variance=self._variances(lanes, radiance, values) if self._path_variance else None,
+            path_variance=self._variances(lanes, radiance, values) if options.path_variance else None,
         )
 
     def _located(
@@ -273,29 +306,29 @@ class Estimator:
         lanes: Lanes,
         bad: NDArray[np.uint32],
         stream: Stream,
-        omega_i: Any,
-        inverse: Any,
+        omega_i: Vector3f,
+        inverse: Float,
+        options: TraceOptions,
     ) -> tuple[BadSample, ...]:
-        """Queries of bad lanes, and the effect at fault: their paths cut after one interaction show whether
-        direct light is."""
+        """Queries of non-finite lanes, and the effect at fault: direct light, if their paths are non-finite
+        after one interaction."""
         if not len(bad):
             return ()
-        full, self._limit = self._limit, dr.opaque(mi.UInt32, 1)
-        short = self._trace(source, lanes, mi.UInt32(bad), stream, omega_i, inverse, 0)[0]
-        self._limit = full
-        direct = np.isin(np.arange(len(bad)), self._nonfinite(short))
+        short = replace(options, limit=dr.opaque(mi.UInt32, 1))
+        radiance = self._trace(source, lanes, mi.UInt32(bad), stream, omega_i, inverse, 0, short)[0]
+        direct = np.isin(np.arange(len(bad)), self._nonfinite(radiance))
         return tuple(
             BadSample(lanes.number(int(lane)), "direct light" if at_once else "interreflection")
             for lane, at_once in zip(bad, direct, strict=True)
         )
 
-    def _variances(self, lanes: Lanes, radiance: Any, values: NDArray[np.float64]) -> NDArray[np.float32]:
+    def _variances(self, lanes: Lanes, radiance: Color3f, values: NDArray[np.float64]) -> NDArray[np.float32]:
         """Sample variance of each query's paths, mean over channels."""
         square = lanes.halves(dr.squared_norm(radiance)).mean(axis=(1, 2)) / 3.0
         spread = square - np.mean(values.mean(axis=1) ** 2, axis=-1)
         return np.maximum(spread * lanes.counts / (lanes.counts - 1), 0.0).astype(np.float32)
 
-    def _nonfinite(self, radiance: Any) -> NDArray[np.uint32]:
+    def _nonfinite(self, radiance: Color3f) -> NDArray[np.uint32]:
         finite = dr.isfinite(radiance.x) & dr.isfinite(radiance.y) & dr.isfinite(radiance.z)
         if dr.all(finite)[0]:
             return np.zeros(0, np.uint32)
@@ -305,20 +338,21 @@ class Estimator:
         self,
         source: RaySource,
         lanes: Lanes,
-        which: Any,
+        which: UInt32 | None,
         stream: Stream,
-        omega_i: Any,
-        inverse: Any,
+        omega_i: Vector3f,
+        inverse: Float,
         attempt: int,
-    ) -> tuple[Any, Any, int, int]:
-        """Radiance of some of the lanes (all, if None) and, where there are holes, whether they passed
-        through the tile, in their order; counts of lost and capped rays."""
+        options: TraceOptions,
+    ) -> tuple[Color3f, Float, int, int]:
+        """Radiance of some of the lanes (all, if None); with an opacity mask, 1 where the first ray was
+        transmitted; counts of lost and capped rays."""
 
-        def generator(lane: Any, query: Any, purpose: Purpose) -> Any:
+        def generator(lane: UInt32, query: UInt32, purpose: Purpose) -> SobolSampler:
             path = lane - dr.gather(mi.UInt32, lanes.start, query)
             half = dr.gather(mi.UInt32, lanes.half, query)
             second = path >= half
-            # Both halves take the same points of sequences of other streams.
+            # Both halves take the same points, of differently scrambled sequences.
             a, b = (
                 stream_key(
                     stream.root,
@@ -343,7 +377,7 @@ class Estimator:
         else:
             query = dr.gather(mi.UInt32, lanes.query, which)
         point = source.footprint(query, generator(which, query, Purpose.FOOTPRINT).next_2d())
-        key = _place(point) | dr.gather(mi.UInt32, lanes.slopes, query)
+        key = _position_key(point) | dr.gather(mi.UInt32, lanes.direction_key, query)
         dr.eval(point, key)
         order = _aligned(np.argsort(np.array(key).astype(np.uint16), kind="stable"))
 
@@ -364,8 +398,7 @@ class Estimator:
             ray,
             light,
             self.transport,
-            self._limit,
-            self._roulette,
+            options,
             generator(lane, query, Purpose.PATH),
             mi.Bool(True),
         )

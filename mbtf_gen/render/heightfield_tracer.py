@@ -1,17 +1,17 @@
-"""Rays on the displaced tile, repeated without end: where they first meet it.
+"""Intersection of rays with the periodic height field of the displaced tile.
 
-The tile is a height field over a grid of cells, each of two triangles. A ray walks over the cells' blocks,
-coarse where it runs above the planes that bound them (:mod:`~mbtf_gen.render.heightfield_nodes`), fine where it does not:
-at a block that it may meet it goes down one level, past a block it goes on, one level up where it leaves the
-block's parent as well (Tevs, Ihrke and Seidel 2008, with planes in place of maxima). Cells are counted modulo
-the period, so the tile repeats at no cost.
+The surface is a grid of cells, each of two triangles. A ray traverses a quadtree of blocks of cells. Each
+block stores a plane that bounds its surface from above (:mod:`~mbtf_gen.render.heightfield_nodes`). If the
+ray may intersect a block, traversal descends one level. Otherwise it skips the block, and ascends one level
+where the ray leaves the parent as well (Tevs, Ihrke and Seidel 2008, "Maximum mipmaps for fast, accurate,
+and scalable dynamic height field rendering", with planes in place of maxima). Cell indices wrap at the
+period, so the tile repeats at no cost.
 
-No ray slips through: it stands above the surface at its start, and in each cell that it passes only the
-heights above the surface where it crosses the diagonal and where it leaves are looked at. The first that is
-not positive is a hit; whatever rounding moved it by, it is found there or in the next cell.
+The test of a cell is watertight. A ray starts above the surface. In each cell its height above the surface
+is evaluated at two points: where it crosses the diagonal and where it leaves the cell. The first height that
+is not positive is a hit. Rounding can only move a hit into the next cell.
 
-Positions are cells plus fractions of a cell, so that a place on a tile of any resolution is as exact as
-single precision can hold it.
+A position is the index of a cell plus a fraction, so that its precision does not depend on the resolution.
 """
 
 from __future__ import annotations
@@ -21,187 +21,108 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
-from mbtf_gen.geometry.heightfield import HeightGrid
-from mbtf_gen.render.heightfield_nodes import node_table
+from mbtf_gen.render.heightfield import HeightField
 from mbtf_gen.render.surface_interaction import interaction
+from mbtf_gen.render.types import (
+    Float,
+    Int32,
+    Mask,
+    Ray3f,
+    SurfaceInteraction3f,
+    UInt32,
+    Vector3f,
+    Vector4f,
+)
+from mbtf_gen.sampling.sobol import SobolSampler
 
-# Directions are kept from being exactly parallel to an axis by this much per unit, lest 0/0 arise.
+# Smallest magnitude of a direction's component, which avoids 0/0 for rays parallel to an axis.
 _TINY = 1e-18
-# Levels at which rays begin: those from above the relief, and those that leave a surface.
+# Levels at which traversal starts: of rays from above the surface, and of rays that leave the surface.
 _START_ABOVE, _START_WITHIN = 4, 0
-# Ray offset over the largest coordinate: a few units in the last place of single precision. Four times as
-# much made points on a tile 64 times as long as wide a thousandth too bright.
-_RELATIVE_OFFSET = 5.0e-7
-
-
-@dataclass(frozen=True)
-class HeightField:
-    """A periodic height field, ready for rays; lengths in scene units, centerd on the tile. Numbers are of
-    width 1 and kept out of the kernels' code, so that other tiles use the same compiled kernels.
-
-    Attributes
-    ----------
-    nodes : rows of :class:`~mbtf_gen.render.heightfield_nodes.NodeTable`; where rays may be below the surface, followed by
-        the table of planes below it
-    columns, rows, cells, columns_log2, both_log2, finest, below : where rows of the table stand; `below` is
-        the number of the second table's first row, 0 where there is none
-    low : (x, y) of the first vertex; cell, size : (x, y) lengths of a cell and of the
-        tile
-    bottom, top : z of the lowest and of the highest vertex
-    offset : distance from the surface at which a ray that leaves it starts
-    two_sided : rays may be below the surface
-    powers : columns and rows are powers of two, which makes a step a seventh shorter
-    """
-
-    nodes: Any
-    columns: Any
-    rows: Any
-    cells: Any
-    columns_log2: Any
-    both_log2: Any
-    finest: Any
-    below: Any
-    low: tuple[Any, Any]
-    cell: tuple[Any, Any]
-    size: tuple[Any, Any]
-    bottom: Any
-    top: Any
-    offset: Any
-    two_sided: bool
-    powers: bool
-
-    @classmethod
-    def of(cls, grid: HeightGrid, unit: float, two_sided: bool) -> HeightField:
-        """Field of a height grid, `unit` scene units per tile width."""
-        # Row 0 of a map is the side y → max.
-        z = grid.z[::-1] * unit
-        rows, columns = z.shape
-        table = node_table(z)
-        numbers = [table.rows, node_table(z, below=True).rows] if two_sided else [table.rows]
-
-        def number(x: float) -> Any:
-            return dr.opaque(mi.Float, x)
-
-        def count(n: int) -> Any:
-            return dr.opaque(mi.Int32, n)
-
-        # A copy: memory borrowed from NumPy is not aligned as reads of whole rows need it.
-        nodes = mi.Float(np.concatenate(numbers).ravel()) + number(0.0)
-        dr.eval(nodes)
-        cell = (unit / columns, unit * grid.aspect / rows)
-        low = (0.5 * (cell[0] - unit), 0.5 * (cell[1] - unit * grid.aspect))
-        extent = max(0.5 * unit, 0.5 * unit * grid.aspect, grid.displacement_range * unit)
-        return cls(
-            nodes,
-            count(columns),
-            count(rows),
-            count(rows * columns),
-            count(table.columns_log2),
-            count(table.columns_log2 + table.rows_log2),
-            count(table.finest),
-            count(len(table.rows)),
-            (number(low[0]), number(low[1])),
-            (number(cell[0]), number(cell[1])),
-            (number(unit), number(unit * grid.aspect)),
-            number(float(z.min())),
-            number(float(z.max())),
-            number(_RELATIVE_OFFSET * extent),
-            two_sided,
-            1 << table.columns_log2 == columns and 1 << table.rows_log2 == rows,
-        )
-
-    def leave(self, si: Any, d: Any) -> Any:
-        """Ray that leaves a surface point in direction d.
-
-        The tile is centerd on the origin, so hit points are exact to a few units in the last place and a far
-        smaller offset than the renderer's own is enough: it would lift rays by 5e-5 tile widths, through thin
-        ridges and out of creases.
-        """
-        side = dr.select(dr.dot(si.n, d) < 0, -self.offset, self.offset)
-        return mi.Ray3f(dr.fma(si.n, side, si.p), d)
 
 
 @dataclass
 class TraversalState:
-    """Where lanes' rays are.
+    """State of the traversal, one ray per lane.
 
     Attributes
     ----------
-    column, row, x, y : cell, and place in it from 0 to 1
+    column, row, x, y : index of the cell, and position in it from 0 to 1
     z : height, in scene units
-    level : of the block that is looked at next
-    searching : lanes that go on
-    hit : lanes that meet the surface within their cell
-    crossings : borders of the tile crossed so far
+    level : level of the block that is tested next
+    searching : lanes whose traversal continues
+    hit : lanes whose ray intersects the surface within the cell
+    crossings : tile borders crossed so far
     capped : lanes that reached the cap on crossings
     """
 
-    column: Any
-    row: Any
-    x: Any
-    y: Any
-    z: Any
-    level: Any
-    searching: Any
-    hit: Any
-    crossings: Any
-    capped: Any
+    column: Int32
+    row: Int32
+    x: Float
+    y: Float
+    z: Float
+    level: Int32
+    searching: Mask
+    hit: Mask
+    crossings: UInt32
+    capped: Mask
 
 
 @dataclass(frozen=True)
 class RayConstants:
-    """What stays the same along lanes' rays: direction in cells per scene unit, its signs and inverses.
+    """Constants of a ray: its direction in cells per scene unit, with signs and inverses.
 
     Attributes
     ----------
-    x, y, z : direction; both : x + y, across the cells' diagonals
-    over_x, over_y, over_both : inverses; the last negated
+    x, y, z : direction; both : x + y, the rate across the cells' diagonals
+    over_x, over_y, over_both : inverses; the last one negated
     right, up, rising : signs
-    side : -1 where the ray is below the surface, else 1; a Python number where none may be
+    side : -1 where the ray is below the surface, else 1; a Python number for one-sided height fields
     """
 
-    x: Any
-    y: Any
-    z: Any
-    both: Any
-    over_x: Any
-    over_y: Any
-    over_both: Any
-    right: Any
-    up: Any
-    rising: Any
-    side: Any
+    x: Float
+    y: Float
+    z: Float
+    both: Float
+    over_x: Float
+    over_y: Float
+    over_both: Float
+    right: Mask
+    up: Mask
+    rising: Mask
+    side: Float
 
 
-def _inverse(x: Any) -> Any:
+def _inverse(x: Float) -> Float:
     return dr.rcp(dr.select(x >= 0, dr.maximum(x, _TINY), dr.minimum(x, -_TINY)))
 
 
-def _start(field: HeightField, ray: Any, active: Any, below: Any) -> tuple[TraversalState, RayConstants]:
-    dx, dy, dz = ray.d.x / field.cell[0], ray.d.y / field.cell[1], ray.d.z
-    column, x = _cell(ray.o.x, field.low[0], field.cell[0], field.columns)
-    row, y = _cell(ray.o.y, field.low[1], field.cell[1], field.rows)
+def _start(
+    heightfield: HeightField, ray: Ray3f, active: Mask, below: Mask
+) -> tuple[TraversalState, RayConstants]:
+    dx, dy, dz = ray.d.x / heightfield.cell[0], ray.d.y / heightfield.cell[1], ray.d.z
+    column, x = _cell(ray.o.x, heightfield.low[0], heightfield.cell[0], heightfield.columns)
+    row, y = _cell(ray.o.y, heightfield.low[1], heightfield.cell[1], heightfield.rows)
     both = dx + dy
-    slant = RayConstants(
+    constants = RayConstants(
         dx, dy, dz, both,
         _inverse(dx), _inverse(dy), -_inverse(both),
         dx >= 0, dy >= 0, dz >= 0,
-        dr.select(below, mi.Float(-1.0), 1.0) if field.two_sided else 1.0,
+        dr.select(below, mi.Float(-1.0), 1.0) if heightfield.two_sided else 1.0,
     )  # fmt: skip
-    level = dr.select(ray.o.z >= field.top, mi.Int32(_START_ABOVE), _START_WITHIN)
-    level = dr.minimum(level, field.finest)
-    walk = TraversalState(
+    level = dr.select(ray.o.z >= heightfield.top, mi.Int32(_START_ABOVE), _START_WITHIN)
+    level = dr.minimum(level, heightfield.finest)
+    state = TraversalState(
         column, row, x, y, mi.Float(ray.o.z), level,
         mi.Bool(active), mi.Bool(False), mi.UInt32(0), mi.Bool(False),
     )  # fmt: skip
-    return walk, slant
+    return state, constants
 
 
-def _cell(position: Any, low: Any, length: Any, cells: Any) -> tuple[Any, Any]:
-    """(cell, place in it) of a coordinate, modulo the period. Numbers that are not finite end in some cell,
-    too: nothing is read from outside the table."""
+def _cell(position: Float, low: Float, length: Float, cells: Int32) -> tuple[Int32, Float]:
+    """(cell, position in it) of a coordinate, modulo the period. Non-finite coordinates are clamped to a
+    cell as well, so that no lane reads outside the table."""
     p = (position - low) / length
     count = mi.Float(cells)
     p -= dr.floor(p / count) * count
@@ -209,224 +130,264 @@ def _cell(position: Any, low: Any, length: Any, cells: Any) -> tuple[Any, Any]:
     return cell, p - mi.Float(cell)
 
 
-def _above(z: Any, x: Any, y: Any, slant: RayConstants, node: Any) -> tuple[Any, Any]:
-    """(height above a node's plane, or below it on the lower side; what is won per scene unit of the way)."""
+def _above(z: Float, x: Float, y: Float, constants: RayConstants, node: Vector4f) -> tuple[Float, Float]:
+    """(signed height of a ray above a node's plane; its derivative along the ray). The sign is flipped for
+    rays below the surface."""
     here = z - dr.fma(x, node.y, dr.fma(y, node.z, node.x))
-    slope = dr.fma(-slant.x, node.y, dr.fma(-slant.y, node.z, slant.z))
-    return slant.side * here, slant.side * slope
+    slope = dr.fma(-constants.x, node.y, dr.fma(-constants.y, node.z, constants.z))
+    return constants.side * here, constants.side * slope
 
 
 def _step(
-    field: HeightField, walk: TraversalState, slant: RayConstants, max_crossings: Any
+    heightfield: HeightField, state: TraversalState, constants: RayConstants, max_crossings: UInt32
 ) -> TraversalState:
-    """Look at one block: go past it, or down to the next level, or end.
+    """Test one block: skip it, descend one level, or end.
 
-    Rays that have met the surface stay where they are; those that have ended otherwise may go on, but nothing
-    comes of it.
+    Rays that hit the surface stay in their cell. Rays that ended otherwise may be stepped further, without
+    effect on the result.
     """
-    # The block, and the ray's place in it.
-    size = mi.Int32(1) << walk.level
-    i, j = walk.column & (size - 1), walk.row & (size - 1)
-    left, low = walk.column - i, walk.row - j
-    x, y = mi.Float(i) + walk.x, mi.Float(j) + walk.y
-    leaf = walk.level == 0
-    first = (mi.Int32(1) << (field.both_log2 - 2 * walk.level)) + field.cells
-    index = (walk.row >> walk.level << (field.columns_log2 - walk.level)) + (walk.column >> walk.level)
-    if field.powers:
+    # The block, and the ray's position in it.
+    size = mi.Int32(1) << state.level
+    i, j = state.column & (size - 1), state.row & (size - 1)
+    left, low = state.column - i, state.row - j
+    x, y = mi.Float(i) + state.x, mi.Float(j) + state.y
+    leaf = state.level == 0
+    first = (mi.Int32(1) << (heightfield.both_log2 - 2 * state.level)) + heightfield.cells
+    index = state.row >> state.level << (heightfield.columns_log2 - state.level)
+    index += state.column >> state.level
+    if heightfield.powers:
         width = height = size
         index += dr.select(leaf, 0, first)
     else:
-        width, height = dr.minimum(size, field.columns - left), dr.minimum(size, field.rows - low)
-        index = dr.select(leaf, walk.row * field.columns + walk.column, index + first)
-    if field.two_sided:
-        index += dr.select(slant.side < 0, field.below, 0)
-    node = dr.gather(mi.Vector4f, field.nodes, index)
+        width, height = dr.minimum(size, heightfield.columns - left), dr.minimum(size, heightfield.rows - low)
+        index = dr.select(leaf, state.row * heightfield.columns + state.column, index + first)
+    if heightfield.two_sided:
+        index += dr.select(constants.side < 0, heightfield.below, 0)
+    node = dr.gather(mi.Vector4f, heightfield.nodes, index)
 
-    # Where the ray leaves it, and how far above the surface it is here, there, and at a cell's diagonal.
-    to_x = (dr.select(slant.right, mi.Float(width), 0.0) - x) * slant.over_x
-    to_y = (dr.select(slant.up, mi.Float(height), 0.0) - y) * slant.over_y
+    # Distance to the block's border, and the height above the surface here, there and at a cell's diagonal.
+    to_x = (dr.select(constants.right, mi.Float(width), 0.0) - x) * constants.over_x
+    to_y = (dr.select(constants.up, mi.Float(height), 0.0) - y) * constants.over_y
     end = dr.maximum(dr.minimum(to_x, to_y), 0.0)
-    here, slope = _above(walk.z, x, y, slant, node)
+    here, slope = _above(state.z, x, y, constants, node)
     across = x + y - 1.0
-    fold = slant.side * (dr.maximum(dr.fma(end, slant.both, across), 0.0) * node.w)
-    diagonal = across * slant.over_both
+    fold = constants.side * (dr.maximum(dr.fma(end, constants.both, across), 0.0) * node.w)
+    diagonal = across * constants.over_both
     under = (diagonal > 0) & (diagonal < end) & (dr.fma(diagonal, slope, here) <= 0)
-    # Written so that NaN counts as a hit: it must reach the value, where it is found and drawn again.
+    # NaN counts as a hit: it must reach the value, where the sample is detected and drawn again.
     free = (dr.fma(end, slope, here) - fold > 0) & (leaf | (here > 0)) & ~under
-    walk.hit |= walk.searching & leaf & ~free
+    state.hit |= state.searching & leaf & ~free
 
-    # Past the block, into the next cell.
+    # Skip the block, into the next cell.
     end = dr.select(free, end, 0.0)
-    x, y = dr.fma(end, slant.x, x), dr.fma(end, slant.y, y)
-    walk.z = dr.fma(end, slant.z, walk.z)
+    x, y = dr.fma(end, constants.x, x), dr.fma(end, constants.y, y)
+    state.z = dr.fma(end, constants.z, state.z)
     along_x = free & (to_x <= to_y)
     along_y = free & ~along_x
-    i = dr.select(along_x, dr.select(slant.right, width, -1), dr.clip(mi.Int32(x), 0, width - 1))
-    j = dr.select(along_y, dr.select(slant.up, height, -1), dr.clip(mi.Int32(y), 0, height - 1))
-    walk.x = dr.select(along_x, dr.select(slant.right, 0.0, 1.0), x - mi.Float(i))
-    walk.y = dr.select(along_y, dr.select(slant.up, 0.0, 1.0), y - mi.Float(j))
+    i = dr.select(along_x, dr.select(constants.right, width, -1), dr.clip(mi.Int32(x), 0, width - 1))
+    j = dr.select(along_y, dr.select(constants.up, height, -1), dr.clip(mi.Int32(y), 0, height - 1))
+    state.x = dr.select(along_x, dr.select(constants.right, 0.0, 1.0), x - mi.Float(i))
+    state.y = dr.select(along_y, dr.select(constants.up, 0.0, 1.0), y - mi.Float(j))
     i, j = left + i, low + j
-    leaves_parent = ((i ^ walk.column) | (j ^ walk.row)) >> (walk.level + 1) != 0
-    above = dr.select(leaves_parent, dr.minimum(walk.level + 1, field.finest), walk.level)
-    walk.level = dr.select(free, above, dr.maximum(walk.level - 1, 0))
+    leaves_parent = ((i ^ state.column) | (j ^ state.row)) >> (state.level + 1) != 0
+    above = dr.select(leaves_parent, dr.minimum(state.level + 1, heightfield.finest), state.level)
+    state.level = dr.select(free, above, dr.maximum(state.level - 1, 0))
 
     # Modulo the period.
-    if field.powers:
-        walk.column, walk.row = i & (field.columns - 1), j & (field.rows - 1)
+    if heightfield.powers:
+        state.column, state.row = i & (heightfield.columns - 1), j & (heightfield.rows - 1)
     else:
-        walk.column = dr.select(i < 0, field.columns - 1, dr.select(i >= field.columns, 0, i))
-        walk.row = dr.select(j < 0, field.rows - 1, dr.select(j >= field.rows, 0, j))
-    gone = slant.rising & (walk.z >= field.top)
-    if field.two_sided:
-        gone = (gone & (slant.side > 0)) | (~slant.rising & (walk.z <= field.bottom) & (slant.side < 0))
-    walk.searching &= ~walk.hit & ~gone
-    crossed = walk.searching & ((walk.column != i) | (walk.row != j))
-    walk.capped |= crossed & (walk.crossings >= max_crossings)
-    walk.crossings += dr.select(crossed & ~walk.capped, mi.UInt32(1), 0)
-    walk.searching &= ~walk.capped
-    return walk
+        state.column = dr.select(i < 0, heightfield.columns - 1, dr.select(i >= heightfield.columns, 0, i))
+        state.row = dr.select(j < 0, heightfield.rows - 1, dr.select(j >= heightfield.rows, 0, j))
+    gone = constants.rising & (state.z >= heightfield.top)
+    if heightfield.two_sided:
+        below = ~constants.rising & (state.z <= heightfield.bottom)
+        gone = (gone & (constants.side > 0)) | (below & (constants.side < 0))
+    state.searching &= ~state.hit & ~gone
+    crossed = state.searching & ((state.column != i) | (state.row != j))
+    state.capped |= crossed & (state.crossings >= max_crossings)
+    state.crossings += dr.select(crossed & ~state.capped, mi.UInt32(1), 0)
+    state.searching &= ~state.capped
+    return state
 
 
-def _surface(field: HeightField, walk: TraversalState, slant: RayConstants, d: Any) -> Any:
-    """Surface interactions of lanes that meet the surface within their cell."""
-    index = walk.row * field.columns + walk.column
-    node = dr.gather(mi.Vector4f, field.nodes, index)
-    here, slope = _above(walk.z, walk.x, walk.y, slant, node)
-    to_x = (dr.select(slant.right, 1.0, 0.0) - walk.x) * slant.over_x
-    to_y = (dr.select(slant.up, 1.0, 0.0) - walk.y) * slant.over_y
+def _surface(
+    heightfield: HeightField, state: TraversalState, constants: RayConstants, d: Vector3f
+) -> SurfaceInteraction3f:
+    """Surface interactions of lanes whose ray hits the surface within the cell."""
+    index = state.row * heightfield.columns + state.column
+    node = dr.gather(mi.Vector4f, heightfield.nodes, index)
+    here, slope = _above(state.z, state.x, state.y, constants, node)
+    to_x = (dr.select(constants.right, 1.0, 0.0) - state.x) * constants.over_x
+    to_y = (dr.select(constants.up, 1.0, 0.0) - state.y) * constants.over_y
     end = dr.maximum(dr.minimum(to_x, to_y), 0.0)
-    across = walk.x + walk.y - 1.0
-    diagonal = across * slant.over_both
-    # The triangle in which the ray enters the cell, or the other one.
-    second = (across > 0) | ((across == 0) & (slant.both > 0))
+    across = state.x + state.y - 1.0
+    diagonal = across * constants.over_both
+    # The triangle that contains the hit: the one in which the ray enters the cell, or the other one.
+    second = (across > 0) | ((across == 0) & (constants.both > 0))
     passes = (diagonal > 0) & (diagonal < end) & (dr.fma(diagonal, slope, here) > 0)
     second ^= passes
     fold = dr.select(second, node.w, 0.0)
-    bend = slant.side * fold
-    t = dr.clip((here - across * bend) / (slant.both * bend - slope), 0.0, end)
-    x, y = mi.Float(walk.column) + dr.fma(t, slant.x, walk.x), mi.Float(walk.row) + dr.fma(t, slant.y, walk.y)
+    bend = constants.side * fold
+    t = dr.clip((here - across * bend) / (constants.both * bend - slope), 0.0, end)
+    x = mi.Float(state.column) + dr.fma(t, constants.x, state.x)
+    y = mi.Float(state.row) + dr.fma(t, constants.y, state.y)
     p = mi.Point3f(
-        dr.fma(x, field.cell[0], field.low[0]),
-        dr.fma(y, field.cell[1], field.low[1]),
-        dr.fma(t, slant.z, walk.z),
+        dr.fma(x, heightfield.cell[0], heightfield.low[0]),
+        dr.fma(y, heightfield.cell[1], heightfield.low[1]),
+        dr.fma(t, constants.z, state.z),
     )
-    n = dr.normalize(mi.Normal3f(-(node.y + fold) / field.cell[0], -(node.z + fold) / field.cell[1], 1.0))
-    return interaction(p, n, d, field.size, walk.hit)
+    dz_dx, dz_dy = (node.y + fold) / heightfield.cell[0], (node.z + fold) / heightfield.cell[1]
+    n = dr.normalize(mi.Normal3f(-dz_dx, -dz_dy, 1.0))
+    return interaction(p, n, d, heightfield.size, state.hit)
 
 
 @dr.syntax
 def _follow(
-    field: HeightField, walk: TraversalState, slant: RayConstants, max_crossings: int
+    heightfield: HeightField, state: TraversalState, constants: RayConstants, max_crossings: int
 ) -> TraversalState:
-    """Follow rays until they meet the surface, leave it behind, or reach the cap."""
-    while dr.hint(walk.searching, exclude=[field, slant]):
-        walk = _step(field, walk, slant, max_crossings)
-    return walk
+    """Traverse until rays hit the surface, leave its slab, or reach the cap."""
+    while dr.hint(state.searching, exclude=[heightfield, constants]):
+        state = _step(heightfield, state, constants, max_crossings)
+    return state
 
 
 @dr.syntax
 def _follow_two(
-    field: HeightField,
+    heightfield: HeightField,
     one: TraversalState,
-    slant_one: RayConstants,
+    constants_one: RayConstants,
     two: TraversalState,
-    slant_two: RayConstants,
+    constants_two: RayConstants,
     max_crossings: int,
 ) -> tuple[TraversalState, TraversalState]:
-    """:func:`_follow` for two rays of each lane at a time. A step of one ray is a chain of instructions that
-    wait for each other; those of two rays fill each other's gaps."""
-    while dr.hint(one.searching | two.searching, exclude=[field, slant_one, slant_two]):
-        one = _step(field, one, slant_one, max_crossings)
-        two = _step(field, two, slant_two, max_crossings)
+    """:func:`_follow` for two rays of each lane at a time. The instructions of one step depend on each other;
+    interleaving two rays hides their latency."""
+    while dr.hint(one.searching | two.searching, exclude=[heightfield, constants_one, constants_two]):
+        one = _step(heightfield, one, constants_one, max_crossings)
+        two = _step(heightfield, two, constants_two, max_crossings)
     return one, two
 
 
 @dr.syntax
 def _search(
-    field: HeightField, ray: Any, active: Any, max_crossings: int, below: Any, holes: Any, rng: Any
-) -> tuple[TraversalState, RayConstants, Any]:
-    """Follow rays until something stops them for good."""
-    walk, slant = _start(field, ray, active, below)
+    heightfield: HeightField,
+    ray: Ray3f,
+    active: Mask,
+    max_crossings: int,
+    below: Mask,
+    holes: Any,
+    rng: SobolSampler | None,
+) -> tuple[TraversalState, RayConstants, SobolSampler | None]:
+    """Traverse until rays hit an opaque point; at each hit the opacity decides by chance whether it is."""
+    state, constants = _start(heightfield, ray, active, below)
     if dr.hint(holes is None, mode="scalar"):
-        walk = _follow(field, walk, slant, max_crossings)
+        state = _follow(heightfield, state, constants, max_crossings)
     else:
         ray, below, searching = mi.Ray3f(ray), mi.Bool(below), mi.Bool(active)
-        while dr.hint(searching, exclude=[field, holes, slant]):
-            piece, way = _start(field, ray, searching, below)
-            piece.crossings = walk.crossings
-            walk = _follow(field, piece, way, max_crossings)
-            si = _surface(field, walk, way, ray.d)
-            searching = walk.hit & (rng.chance() >= holes.opacity(si))
-            walk.hit &= ~searching
-            ray.o = dr.select(searching, field.leave(si, ray.d).o, ray.o)
+        while dr.hint(searching, exclude=[heightfield, holes, constants]):
+            segment, segment_constants = _start(heightfield, ray, searching, below)
+            segment.crossings = state.crossings
+            state = _follow(heightfield, segment, segment_constants, max_crossings)
+            si = _surface(heightfield, state, segment_constants, ray.d)
+            searching = state.hit & (rng.chance() >= holes.opacity(si))
+            state.hit &= ~searching
+            ray.o = dr.select(searching, heightfield.leave(si, ray.d).o, ray.o)
             below ^= searching
-        slant = _start(field, ray, active, below)[1]
-    return walk, slant, rng
+        constants = _start(heightfield, ray, active, below)[1]
+    return state, constants, rng
 
 
 def closest_hit(
-    field: HeightField,
-    ray: Any,
-    active: Any,
+    heightfield: HeightField,
+    ray: Ray3f,
+    active: Mask,
     max_crossings: int,
-    below: Any = False,
+    below: Mask = False,
     holes: Any = None,
-    rng: Any = None,
-) -> tuple[Any, Any, Any, Any]:
-    """First hit along a ray over the repeated tile.
+    rng: SobolSampler | None = None,
+) -> tuple[SurfaceInteraction3f, UInt32, Mask, SobolSampler | None]:
+    """First intersection of rays with the periodic height field.
 
     Parameters
     ----------
-    max_crossings : borders of the tile that a ray may cross
-    below : rays that start below the surface, which a field that is not two-sided knows none of
-    holes : ``holes.opacity(si)``, the chance that a hit stops the ray; None where nothing lets rays through
-    rng : random numbers that decide it
+    heightfield : HeightField
+        The surface.
+    ray : Ray3f
+        Rays in scene units; the tile is centered on the origin.
+    active : Mask
+        Lanes to trace.
+    max_crossings : int
+        Tile borders that a ray may cross.
+    below : Mask
+        Lanes whose ray starts below the surface; only for two-sided height fields.
+    holes : object with a method ``opacity(si)``, optional
+        Gives the probability in [0, 1] that a hit stops the ray. None for opaque surfaces.
+    rng : SobolSampler, optional
+        Random numbers for `holes`.
 
     Returns
     -------
-    (surface interaction, in the tile; crossings spent; lanes that hit the cap; the generator)
+    si : SurfaceInteraction3f
+        Hits within the tile.
+    crossings : UInt32
+        Tile borders crossed.
+    capped : Mask
+        Lanes that reached `max_crossings`.
+    rng : SobolSampler
+        State of the random numbers after tracing.
     """
-    walk, slant, rng = _search(field, ray, active, max_crossings, below, holes, rng)
-    return _surface(field, walk, slant, ray.d), walk.crossings, walk.capped, rng
+    state, constants, rng = _search(heightfield, ray, active, max_crossings, below, holes, rng)
+    return _surface(heightfield, state, constants, ray.d), state.crossings, state.capped, rng
 
 
 def occluded(
-    field: HeightField,
-    ray: Any,
-    active: Any,
+    heightfield: HeightField,
+    ray: Ray3f,
+    active: Mask,
     max_crossings: int,
-    below: Any = False,
+    below: Mask = False,
     holes: Any = None,
-    rng: Any = None,
-) -> tuple[Any, Any, Any, Any]:
-    """Whether a ray meets anything over the repeated tile; parameters as of :func:`closest_hit`.
+    rng: SobolSampler | None = None,
+) -> tuple[Mask, UInt32, Mask, SobolSampler | None]:
+    """Occlusion of rays by the periodic height field; parameters as of :func:`closest_hit`.
 
     Returns
     -------
-    (occluded; crossings spent; lanes that hit the cap, which count as occluded; the generator)
+    blocked : Mask
+        Lanes whose ray is occluded; rays that reached the cap count as occluded.
+    crossings, capped, rng
+        As of :func:`closest_hit`.
     """
-    walk, _, rng = _search(field, ray, active, max_crossings, below, holes, rng)
-    return walk.hit | walk.capped, walk.crossings, walk.capped, rng
+    state, _, rng = _search(heightfield, ray, active, max_crossings, below, holes, rng)
+    return state.hit | state.capped, state.crossings, state.capped, rng
 
 
 def hit_and_shadow(
-    field: HeightField,
-    ray: Any,
-    active: Any,
-    shadow_ray: Any,
-    shadow_active: Any,
+    heightfield: HeightField,
+    ray: Ray3f,
+    active: Mask,
+    shadow_ray: Ray3f,
+    shadow_active: Mask,
     max_crossings: int,
-    below: Any = False,
-    shadow_below: Any = False,
-) -> tuple[Any, Any, Any, Any]:
-    """:func:`closest_hit` of a ray and :func:`occluded` of another at once, where there are no holes.
+    below: Mask = False,
+    shadow_below: Mask = False,
+) -> tuple[SurfaceInteraction3f, Mask, Mask, Mask]:
+    """:func:`closest_hit` of a ray and :func:`occluded` of a shadow ray in one loop, for opaque surfaces.
 
     Returns
     -------
-    (surface interaction; lanes whose ray hit the cap; occluded; lanes whose other ray hit the cap)
+    si : SurfaceInteraction3f
+        Hits of the first ray.
+    capped : Mask
+        Lanes whose first ray reached the cap.
+    blocked : Mask
+        Lanes whose shadow ray is occluded.
+    shadow_capped : Mask
+        Lanes whose shadow ray reached the cap.
     """
-    walk, slant = _start(field, ray, active, below)
-    shadow, shadow_slant = _start(field, shadow_ray, shadow_active, shadow_below)
-    walk, shadow = _follow_two(field, walk, slant, shadow, shadow_slant, max_crossings)
-    hit = _surface(field, walk, slant, ray.d)
-    return hit, walk.capped, shadow.hit | shadow.capped, shadow.capped
+    state, constants = _start(heightfield, ray, active, below)
+    shadow, shadow_constants = _start(heightfield, shadow_ray, shadow_active, shadow_below)
+    state, shadow = _follow_two(heightfield, state, constants, shadow, shadow_constants, max_crossings)
+    hit = _surface(heightfield, state, constants, ray.d)
+    return hit, state.capped, shadow.hit | shadow.capped, shadow.capped

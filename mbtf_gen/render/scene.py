@@ -17,7 +17,7 @@ from mbtf_core.errors import InputError, reason
 from mbtf_gen.geometry.heightfield import HeightGrid
 from mbtf_gen.render.bsdf.plugin import SurfaceBSDF, surface_of
 from mbtf_gen.render.emitter import SmoothedDirectional
-from mbtf_gen.render.heightfield_tracer import HeightField
+from mbtf_gen.render.heightfield import HeightField
 from mbtf_gen.render.path_tracer import World
 from mbtf_gen.render.sensor import QuerySensor
 

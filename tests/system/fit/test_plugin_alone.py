@@ -45,7 +45,7 @@ def test_rendering_without_pytorch(tmp_path: Path, run_python: RunPython) -> Non
 
 def test_the_example_of_the_documentation_runs(tmp_path: Path, run_python: RunPython) -> None:
     write_material(tmp_path / "material")
-    page = (PROJECT / "docs" / "rendering.md").read_text(encoding="utf-8")
+    page = (PROJECT / "docs" / "how-to" / "render-in-mitsuba.md").read_text(encoding="utf-8")
     example = page.split("```python\n")[1].split("```")[0]
     quick = example.replace("spp=64", "spp=1").replace("[0, 0, 1])", "[0, 0, 1]), **SMALL")
     assert quick.count("SMALL") == 1
@@ -58,7 +58,7 @@ def test_the_example_of_the_documentation_runs(tmp_path: Path, run_python: RunPy
 
 def test_a_scene_in_xml_of_the_documentation_runs(tmp_path: Path, run_python: RunPython) -> None:
     write_material(tmp_path / "material")
-    page = (PROJECT / "docs" / "rendering.md").read_text(encoding="utf-8")
+    page = (PROJECT / "docs" / "how-to" / "render-in-mitsuba.md").read_text(encoding="utf-8")
     (tmp_path / "scene.xml").write_text(page.split("```xml\n")[1].split("```")[0], encoding="utf-8")
     code = (
         "import mbtf_fit.mitsuba_plugin, mitsuba as mi\nmi.set_variant('llvm_ad_rgb')\n"

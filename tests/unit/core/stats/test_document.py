@@ -1,4 +1,4 @@
-"""The examples of ``docs/statistics.md`` run as printed and say what the text says."""
+"""The examples of ``docs/explanation/statistics.md`` run as printed and say what the text says."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from support.paths import ROOT
 
 from mbtf_core import stats
 
-DOCUMENT = (ROOT / "docs/statistics.md").read_text(encoding="utf-8")
+DOCUMENT = (ROOT / "docs/explanation/statistics.md").read_text(encoding="utf-8")
 
 
 def run(number: int) -> dict[str, Any]:

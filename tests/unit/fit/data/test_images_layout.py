@@ -166,7 +166,7 @@ def test_batches_take_every_image_and_resume_anywhere() -> None:
     assert len(many.sigma.unique()) == 5
 
 
-def windows(lattice: Lattice, size: int, count: int) -> TrainingImages:
+def patches_of_size(lattice: Lattice, size: int, count: int) -> TrainingImages:
     """Windows as the generator draws them; the value's first channel numbers the queries."""
     q = QueryPlan(lattice, Mixture(1, 0), 0.2, "image", 3, count, patch_size=size).draw("train", 0, count)
     sigma = q.sigma[:, 0, 0]
@@ -178,9 +178,9 @@ def windows(lattice: Lattice, size: int, count: int) -> TrainingImages:
     return TrainingImages(*tensors[:5], ones, nearest_shapes(lattice, sigma))  # type: ignore[arg-type,call-arg]
 
 
-def test_patches_of_windows_go_on_beyond_their_border() -> None:
+def test_patches_go_on_beyond_their_border() -> None:
     lattice = Lattice(4, 0.5)
-    data = windows(lattice, 6, 30)
+    data = patches_of_size(lattice, 6, 30)
     origin = np.array([[k % 3, k // 3 % 3] for k in range(30)])
     patches = data.patches(np.arange(30), origin, 4, 3)
     assert patches.u.shape == (30, 10, 10, 2)
@@ -195,7 +195,7 @@ def test_patches_of_windows_go_on_beyond_their_border() -> None:
         torch.testing.assert_close(step, step.round().to(step.dtype), atol=1e-6, rtol=0)
 
 
-def test_windows_are_read_with_the_grids_that_they_lie_on(tmp_path: Path) -> None:
+def test_patches_are_read_with_the_grids_that_they_lie_on(tmp_path: Path) -> None:
     folder = write_images(tmp_path / "d", parallax, train=20, finest=4, aspect=0.5, patch_size=5)
     data = images_of(partition(folder, HeldOutSection(queries=0, radius=0)))
     assert data.u.shape == (20, 5, 5, 2)
@@ -208,8 +208,8 @@ def test_windows_are_read_with_the_grids_that_they_lie_on(tmp_path: Path) -> Non
         torch.testing.assert_close(step, step.round().to(step.dtype), atol=1e-6, rtol=0)
 
 
-def test_batches_cut_windows_within_them() -> None:
-    data = windows(Lattice(4), 6, 8)
+def test_batches_cut_patches_within_images() -> None:
+    data = patches_of_size(Lattice(4), 6, 8)
     for batch in islice(data.batches(2 * 16, 0, 0, 2), 20):
         assert batch.value.shape == (1, 6, 6, 3)
     seen = set()
@@ -237,7 +237,7 @@ def test_smaller_patches_make_batches_of_more_lights_and_views(
         assert len(batch.omega_i.unique(dim=0)) == shape[0]
 
 
-@pytest.mark.parametrize("cut", ["whole", "windows"])
+@pytest.mark.parametrize("cut", ["whole", "patch_sizes"])
 @pytest.mark.parametrize("aspect", [1.0, 0.5])
 @pytest.mark.parametrize("decoder", ["inception", "mlp"])
 def test_training_and_evaluation_agree_on_regular_images(aspect: float, decoder: str, cut: str) -> None:
@@ -249,7 +249,9 @@ def test_training_and_evaluation_agree_on_regular_images(aspect: float, decoder:
     torch.nn.init.normal_(model.pyramid.texels, generator=torch.Generator().manual_seed(1))
     torch.nn.init.normal_(model.offset_texture.texels, generator=torch.Generator().manual_seed(2))
     whole = cut == "whole"
-    data = images(lattice, [4.0, 3.0, 2.3, 1.0, 0.0], regular=True) if whole else windows(lattice, 6, 5)
+    data = (
+        images(lattice, [4.0, 3.0, 2.3, 1.0, 0.0], regular=True) if whole else patches_of_size(lattice, 6, 5)
+    )
     m = model.margin
     origin = np.array([[0, 0], [3, 9], [1, 1], [7, 15], [5, 2]]) if whole else np.zeros((5, 2), np.int64)
     patches = data.patches(np.arange(5), origin, 6, m)

@@ -1,4 +1,4 @@
-"""``docs/format.md`` says what is written: its reader runs, and every stored name stands in it."""
+"""``docs/reference/data-format.md``: its reader runs, and it explains every stored name."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from support.paths import ROOT
 
 from mbtf_core.shard_schema import ARRAYS, CONVENTIONS, SCHEMA_VERSION
 
-DOCUMENT = (ROOT / "docs/format.md").read_text(encoding="utf-8")
+DOCUMENT = (ROOT / "docs/reference/data-format.md").read_text(encoding="utf-8")
 QUERIES = {"train": "160", "test": "64"}
 SMALL = {"shard_queries": 64}
 

@@ -95,10 +95,10 @@ def test_a_chain_counts_what_it_took_and_left(tmp_path: Path, monkeypatch: pytes
     """Seven seconds of generating, five of training and one of loading; half a second to evaluate 2¹⁸
     queries; a constant, 0.1 and its nearest half-precision number, for values of 0 and 1."""
     import torch
+    from mbtf_pipeline.cost_study.importance_sampled import Judges
 
     import mbtf_pipeline.cost_study.runs as module
     from mbtf_fit.data.queries import ShardQueries
-    from mbtf_pipeline.cost_study.importance_sampled import Judges
 
     clock = Clock()
     n = 1000
