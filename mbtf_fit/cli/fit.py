@@ -47,7 +47,7 @@ def fit(
         With --many, number of simultaneous fits.
     """
     if dry_run and many is not None:
-        raise UsageError("--dry-run looks at one data set", hint="mbtf-fit shards/ --dry-run")
+        raise UsageError("--dry-run takes one data set", hint="mbtf-fit shards/ --dry-run")
     if many is not None and shards is not None:
         raise UsageError("--many takes all data sets", hint=f"mbtf-fit --many {shards} ... -o materials/")
     if processes is not None and (many is None or processes < 1):
@@ -171,5 +171,5 @@ def _fit_many(
         raise PartialError(
             f"{len(failed)} of {len(outcomes)} fits failed",
             where=output,
-            hint="the same command again takes up what is not finished",
+            hint="the same command resumes the others",
         )
