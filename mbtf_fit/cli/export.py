@@ -23,7 +23,7 @@ def export_material(
     half: Switch = False,
     console: Console = CONSOLE,
 ) -> None:
-    """Write a material in forms that other programs read: mbtf-fit export material/ --to exr
+    """Export a material for other programs: mbtf-fit export material/ --to exr
 
     exr: the latent textures, a part per level and a channel per feature, and those of the transmittance of a
     material with holes. json: the networks as a list of layers, with formulas, conventions and queries with
