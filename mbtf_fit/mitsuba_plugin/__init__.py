@@ -7,15 +7,22 @@
     mbtf_fit.mitsuba_plugin.register()
     bsdf = mi.load_dict({"type": "mbtf", "material": "material/"})
 
-Import the package before Mitsuba: Dr.Jit looks for its LLVM when it is first imported, and this package says
-where one lies that is new enough. Importing the package registers its plugins with a variant that is set
-already; :func:`load_scene` registers them by itself. PyTorch is not needed, and never imported.
+Import this package before Mitsuba. Dr.Jit looks for its LLVM when it is first imported. Therefore the import
+of this package, alone among the packages, sets ``DRJIT_LIBLLVM_PATH`` and ``DRJIT_CACHE_DIR`` where they are
+unset. If Mitsuba was imported first with an LLVM that is too old, :func:`register` raises an ``EngineError``.
+
+Importing the package registers its plugins with a variant that is set already; :func:`load_scene` registers
+them itself. PyTorch is not needed, and never imported.
 """
 
 from __future__ import annotations
 
 from importlib import import_module
 from typing import Any
+
+from mbtf_gen.render.llvm import use_shipped_llvm
+
+use_shipped_llvm()
 
 _PUBLIC = {
     "Evaluator": "evaluator",
