@@ -53,7 +53,7 @@ def shipped_llvm() -> Path | None:
 
 
 def chosen_llvm() -> str | None:
-    """Value of ``DRJIT_LIBLLVM_PATH``; None where it is unset or empty, so that Dr.Jit searches the system."""
+    """Value of ``DRJIT_LIBLLVM_PATH``; None where it is unset or empty: Dr.Jit then searches the system."""
     return os.environ.get(VARIABLE) or None
 
 

@@ -1,8 +1,8 @@
 """Loading of Mitsuba: checks that its compiler works on this machine, imports it, sets the variant.
 
 A broken or old LLVM aborts the process at some kernel. Therefore test kernels run in a child process first,
-once per library, and the result is cached. Modules that import ``drjit`` or ``mitsuba`` at the top are imported
-after :func:`load_mitsuba`.
+once per library, and the result is cached. Modules that import ``drjit`` or ``mitsuba`` at the top must be
+imported after :func:`load_mitsuba`.
 """
 
 from __future__ import annotations
