@@ -1,6 +1,6 @@
 """Splits of a total time between generating and training: fixed ones, and the one that ``--budget`` finds.
 
-    python benchmarks/budget.py [MATERIAL ...] [--time 5min] [--split 0.2 ...] [--levels 7]
+    python benchmarks/budget.py [MATERIAL ...] [--time 5min] [--split 0.2 ...] [--resolution 128]
 
 Every chain generates for its share of the time and trains ``neumip``, as the qualities have it, for the rest,
 start-up, loading and judging included, and is judged by the same test queries. ``--budget`` pays for its own
@@ -54,7 +54,7 @@ def measure(material: Path, seconds: float, splits: list[float], levels: int, wo
             "name": "budget",
             "generate": {
                 "material": str(material),
-                "queries": {"levels": levels, "test": TEST, "test_spp": TEST_SPP},
+                "queries": {"resolution": 1 << levels, "test": TEST, "test_spp": TEST_SPP},
             },
             "fit": nested({"model": "neumip", **best_options(TRAINING * seconds)}),
         }
@@ -96,7 +96,7 @@ def main() -> int:
     parser.add_argument("materials", nargs="*", type=Path)
     parser.add_argument("--time", default="5min", help="total time of a chain")
     parser.add_argument("--split", action="append", type=float, help="share that generates (repeatable)")
-    parser.add_argument("--levels", type=int, default=7, help="finest level: 2^levels texels")
+    parser.add_argument("--resolution", type=int, default=128, help="texels across, a power of two")
     arguments = parser.parse_args()
     materials = arguments.materials or [ROOT / "assets" / name for name in ASSETS]
     found = []
@@ -106,7 +106,13 @@ def main() -> int:
         for material in materials:
             with tempfile.TemporaryDirectory() as work:
                 found.append(
-                    measure(material, seconds, arguments.split or list(SPLITS), arguments.levels, Path(work))
+                    measure(
+                        material,
+                        seconds,
+                        arguments.split or list(SPLITS),
+                        arguments.resolution.bit_length() - 1,
+                        Path(work),
+                    )
                 )
     except (MbtfError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)

@@ -57,7 +57,7 @@ Row = tuple[str, dict[str, Estimate]]
 def bench_of(recipe: Path, seed: int) -> GeneratorBenchmark:
     """The generator of a recipe with another seed."""
     config = load_recipe(recipe).generate
-    material = load_material(Path(config.material), config.geometry.tile)
+    material = load_material(Path(config.material), config.geometry.make_tileable)
     return GeneratorBenchmark(config.model_copy(update={"seed": seed}), material, seed)
 
 

@@ -108,8 +108,8 @@ def measure(name: str, folder: Path, height: float, arguments: argparse.Namespac
     config = GeneratorConfig.model_validate(
         {
             "material": str(folder / name),
-            "geometry": {"height": height, "mesh": MESH},
-            "queries": {"levels": LEVELS},
+            "geometry": {"height_scale": height, "mesh": MESH},
+            "queries": {"resolution": 1 << LEVELS},
         }
     )
     runs, pilot, queries = sides(Job.prepare(config), arguments.queries, arguments.spp)

@@ -40,15 +40,15 @@ from torch import Tensor, nn
 from mbtf_core.directions import from_projected_disk
 from mbtf_core.lattice import Lattice, sigma_of_level
 from mbtf_fit.config import FitConfig
-from mbtf_fit.data.loader import TrainingQueries
+from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.material.inference import predict
-from mbtf_fit.models import build_model
 from mbtf_fit.models.blur import NEGLIGIBLE, annealed_sigma
 from mbtf_fit.models.neumip import Neumip
+from mbtf_fit.models.registry import build_model
 from mbtf_fit.native import library
 from mbtf_fit.objective.noise import NoiseModel
 from mbtf_fit.objective.parallel import MAX_KERNEL_THREADS, Workers
-from mbtf_fit.training.memory import keep_freed_memory
+from mbtf_fit.training.fit import keep_freed_memory
 from mbtf_fit.training.trainer import BETAS, Trainer
 
 # Times the plain way's samples per second, on two cores.
@@ -197,14 +197,17 @@ class Plainly:
         texels = [*model.pyramid, model.offset_texture]
         weights = [*model.decoder.parameters(), *model.offset_network.parameters()]
         self.optimizer = torch.optim.Adam(
-            [{"params": texels, "lr": training.texture_rate}, {"params": weights, "lr": training.rate}],
+            [
+                {"params": texels, "lr": training.texture_learning_rate},
+                {"params": weights, "lr": training.learning_rate},
+            ],
             betas=BETAS,
         )
 
     def __call__(self, batch: TrainingQueries, share: float) -> None:
         blur = self.config.training.blur
-        sigma = annealed_sigma(share / blur.share, blur.start, blur.end)
-        p = self.model(batch, sigma, max(sigma, blur.offset))
+        sigma = annealed_sigma(share / blur.fraction, blur.initial_sigma, blur.final_sigma)
+        p = self.model(batch, sigma, max(sigma, blur.offset_sigma))
         loss = ((p - batch.value) ** 2 / (p.detach() ** 2 + self.unit**2)).mean()
         self.optimizer.zero_grad()
         loss.backward()
@@ -220,7 +223,7 @@ class Ours:
         use_kernel(kernel)
         unit = float(queries.value.mean())
         self.trainer = Trainer(config, model, queries, NoiseModel.silent(unit, model.lattice))
-        self.path = self.trainer.path
+        self.backend = self.trainer.backend
         self.limit = MAX_KERNEL_THREADS if kernel else None
 
     def __call__(self, batch: TrainingQueries, share: float) -> None:
@@ -277,7 +280,7 @@ def main() -> int:
 
     pytorch = Ours(fresh(), config, queries, kernel=False)
     kernel = Ours(fresh(), config, queries, kernel=True)
-    ours = {"pytorch": pytorch} | ({"kernel": kernel} if kernel.path != "pytorch" else {})
+    ours = {"pytorch": pytorch} | ({"kernel": kernel} if kernel.backend != "pytorch" else {})
     checked, model = batches[0].slice(0, 4096), fresh()
     arrays = [a.numpy() for a in (checked.u, checked.sigma, checked.omega_i, checked.omega_o)]
     with torch.no_grad():
@@ -327,7 +330,7 @@ def main() -> int:
     }
     best = "kernel" if "kernel" in ours else "pytorch"
     ratios = {kind: found[best] / found["plain"] for kind, found in rates.items()}
-    print(f"{lattice.shape()[1]}² pyramid, batch {n}, {torch.get_num_threads()} threads, {kernel.path}")
+    print(f"{lattice.shape()[1]}² pyramid, batch {n}, {torch.get_num_threads()} threads, {kernel.backend}")
     for kind, found in rates.items():
         line = "  ".join(
             f"{way} {rate / 1e6:.2f} M samples/s ({rate / found['plain']:.1f}x)"
@@ -339,7 +342,7 @@ def main() -> int:
     figures = {
         "samples_per_second": rates,
         "ratios": ratios,
-        "path": kernel.path,
+        "path": kernel.backend,
         "plain_shares": {name: time / total for name, time in parts.items()},
         "plain_lookup": reader,
         "rounds": {"training": dict(training), "inference": dict(inference)},

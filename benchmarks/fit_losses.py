@@ -27,7 +27,7 @@ import torch
 from torch import Tensor
 
 from mbtf_fit.config import TrainingSection
-from mbtf_fit.data.loader import TrainingQueries
+from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.objective.losses import Objective
 from mbtf_fit.objective.noise import NoiseModel
 
@@ -90,7 +90,8 @@ def by_halves(p: Tensor, a: Tensor, b: Tensor) -> Tensor:
 def real_noise(material: Path, shards: Path) -> dict[str, float]:
     """Relative noise, share of values beyond the bound, relative bias of their mean: 65 536 queries."""
     from mbtf_fit import Material
-    from mbtf_fit.data.loader import load_training, mean_value
+    from mbtf_fit.data.loader import load_training
+    from mbtf_fit.data.queries import mean_value
     from mbtf_fit.objective.noise import typical_value
     from mbtf_gen.dataset.reader import Dataset
 
@@ -99,7 +100,7 @@ def real_noise(material: Path, shards: Path) -> dict[str, float]:
     sample = load_training(data, loaded.config.held_out, loaded.config.seed, memory=5e8).sample
     value, p = mean_value(sample.value_a, sample.value_b), loaded.predict(sample)
     noise = NoiseModel.of(sample, data.lattice, typical_value(value))
-    bound = (loaded.config.training.robust or np.inf) * noise.spread(torch.from_numpy(p)).numpy()
+    bound = (loaded.config.training.huber_delta or np.inf) * noise.spread(torch.from_numpy(p)).numpy()
     error = value - p
     return {
         "relative_noise": float(np.sqrt(((sample.value_a - sample.value_b) ** 2 / 4).mean()) / value.mean()),

@@ -49,14 +49,20 @@ def make_data(name: str, folder: Path, layout: str) -> Path:
     from mbtf_gen.generation import generate
 
     material, height = MATERIALS[name]
-    queries: dict[str, Any] = {"train": "600/texel", "spp": 4, "levels": 6, "min_cos": 0.2, "test_spp": 256}
+    queries: dict[str, Any] = {
+        "train": "600/texel",
+        "spp": 4,
+        "resolution": 64,
+        "min_cos": 0.2,
+        "test_spp": 256,
+    }
     queries |= {"test": "16384"} if layout == "shuffled" else {"test": "256", "layout": "image"}
     if layout == "image":
-        queries["window"] = WINDOW
+        queries["patch_size"] = WINDOW
     config = GeneratorConfig.model_validate(
         {
             "material": str(material),
-            "geometry": {"height": height, "mesh": 256},
+            "geometry": {"height_scale": height, "mesh": 256},
             "queries": queries,
             "light": {"width": 3},
         }
@@ -66,9 +72,9 @@ def make_data(name: str, folder: Path, layout: str) -> Path:
 
 
 # Options of a model, under the name that its figures have.
-LIFTED = "neumip-lifted"
+XYZ = "neumip-xyz"
 OPTIONS: dict[str, dict[str, Any]] = {
-    LIFTED: {"model": "neumip", "network": {"encoding": {"lifted": True}}},
+    XYZ: {"model": "neumip", "network": {"encoding": {"direction_xyz": True}}},
 }
 
 
@@ -103,7 +109,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, required=True, help="folder to work in")
     parser.add_argument("--steps", type=int, default=1500)
     parser.add_argument("--hierarchical", type=int, help="steps of hierarchical; not trained by default")
-    parser.add_argument("--direction-xyz", action="store_true", help=f"train {LIFTED}, too")
+    parser.add_argument("--direction-xyz", action="store_true", help=f"train {XYZ}, too")
     parser.add_argument("--only", nargs="*", choices=list(MATERIALS), help="of these; all by default")
     arguments = parser.parse_args()
     record = arguments.out / "materials.json"
@@ -111,7 +117,7 @@ def main() -> int:
     found: dict[str, Any] = json.loads(record.read_text()) if record.exists() else {}
     runs = [("neumip-baseline", arguments.steps), ("neumip", arguments.steps)]
     if arguments.direction_xyz:
-        runs.append((LIFTED, arguments.steps))
+        runs.append((XYZ, arguments.steps))
     if arguments.hierarchical:
         runs += [("neumip", arguments.hierarchical), ("hierarchical", arguments.hierarchical)]
     for name in arguments.only or MATERIALS:

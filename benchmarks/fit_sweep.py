@@ -36,9 +36,10 @@ from rock_cliff_128 import RECIPE, make_shards
 from mbtf_core.errors import MbtfError
 from mbtf_core.lattice import Lattice
 from mbtf_fit import FitConfig, Material, fit, read_history
-from mbtf_fit.data.loader import Partition, load_split, load_training, open_data
+from mbtf_fit.data.loader import load_split, load_training, open_data
+from mbtf_fit.data.split import Partition
 from mbtf_fit.evaluation import split_errors
-from mbtf_fit.models import build_model
+from mbtf_fit.models.registry import build_model
 from mbtf_fit.objective.noise import NoiseModel
 from mbtf_fit.objective.parallel import MAX_KERNEL_THREADS, Workers
 from mbtf_fit.training.trainer import Trainer
@@ -46,30 +47,35 @@ from mbtf_gen.dataset.reader import Dataset
 
 PUBLISHED = [{"kind": "log"}, {"kind": "linear", "weight": 0.1}]
 # Directions as (x, y, z).
-LIFTED = {"lifted": True}
-SMOOTHED: dict[str, Any] = {"decay": 1.0, "blur": {"floor": 0.8}}
+XYZ = {"direction_xyz": True}
+SMOOTHED: dict[str, Any] = {"texture_weight_decay": 1.0, "blur": {"min_sigma": 0.8}}
 # What differs from the default; "queries" differs in the data.
 SWEEP: dict[str, dict[str, Any]] = {
     "default": {},
     "baseline": {"model": "neumip-baseline"},
     "batch 2^13": {"training": {"batch": 1 << 13}},
     "batch 2^17": {"training": {"batch": 1 << 17}},
-    "rates / 3": {"training": {"rate": 1e-2, "texture_rate": 3e-3}},
-    "textures x 3": {"training": {"texture_rate": 3e-2}},
+    "rates / 3": {"training": {"learning_rate": 1e-2, "texture_learning_rate": 3e-3}},
+    "textures x 3": {"training": {"texture_learning_rate": 3e-2}},
     "squared": {"training": {"losses": [{"kind": "squared"}]}},
     "as published": {
-        "training": {"losses": PUBLISHED, "correction": "none", "robust": None, "weight_decay": 0.0}
+        "training": {
+            "losses": PUBLISHED,
+            "correction": "none",
+            "huber_delta": None,
+            "noise_regularization": 0.0,
+        }
     },
-    "no blur": {"training": {"blur": {"start": 0.0}}},
-    "longer blur": {"training": {"blur": {"share": 0.9}}},
+    "no blur": {"training": {"blur": {"initial_sigma": 0.0}}},
+    "longer blur": {"training": {"blur": {"fraction": 0.9}}},
     "200/texel, 16 paths": {"queries": {"train": "200/texel", "spp": 16}},
     "40 % at the finest": {"queries": {"mixture": {"log_uniform": 0.6, "finest": 0.4}}},
     "width 40, channels 12": {"network": {"width": 40, "channels": 12}},
-    "lifted": {"network": {"encoding": LIFTED}},
-    "lifted, smoothed": {"network": {"encoding": LIFTED}, "training": SMOOTHED},
-    "lifted, 40, 12": {"network": {"width": 40, "channels": 12, "encoding": LIFTED}},
+    "direction_xyz": {"network": {"encoding": XYZ}},
+    "lifted, smoothed": {"network": {"encoding": XYZ}, "training": SMOOTHED},
+    "lifted, 40, 12": {"network": {"width": 40, "channels": 12, "encoding": XYZ}},
     "lifted, 40, 12, smoothed": {
-        "network": {"width": 40, "channels": 12, "encoding": LIFTED},
+        "network": {"width": 40, "channels": 12, "encoding": XYZ},
         "training": SMOOTHED,
     },
 }
@@ -98,7 +104,7 @@ def seconds_per_step(name: str, lattice: Lattice) -> float:
     model.initialize(torch.Generator().manual_seed(0), 0.2)
     trainer = Trainer(config, model, queries, NoiseModel.silent(0.2, lattice))
     found = []
-    limit = None if trainer.path == "pytorch" else MAX_KERNEL_THREADS
+    limit = None if trainer.backend == "pytorch" else MAX_KERNEL_THREADS
     with Workers(torch.device("cpu"), limit=limit) as workers:
         for _ in range(ROUNDS + 1):
             start = time.perf_counter()
@@ -113,7 +119,7 @@ def seconds_per_step(name: str, lattice: Lattice) -> float:
 def arithmetic(name: str) -> str:
     """What a step of a configuration computes: the same text, the same time."""
     fields = configuration(name).fields()
-    for key in ("rate", "texture_rate", "time", "steps", "warmup"):
+    for key in ("learning_rate", "texture_learning_rate", "time", "steps", "warmup"):
         del fields["training"][key]
     kinds = {term["kind"] for term in fields["training"]["losses"]}
     fields["training"]["losses"] = sorted("relative" if kind == "squared" else kind for kind in kinds)

@@ -1,6 +1,6 @@
 """Forecasts held against the runs that follow: seconds and error of the generator and of the fitter.
 
-    python benchmarks/forecasts.py [MATERIAL ...] [--quality draft] [--levels 7] [--time 60s ...]
+    python benchmarks/forecasts.py [MATERIAL ...] [--quality draft] [--resolution 128] [--time 60s ...]
 
 Of every material (by default the five of ``assets/`` and the six texture sets that lie beside the project,
 by name): what ``mbtf-gen plan`` and ``mbtf-fit --dry-run`` expect at a quality, then the run itself, a fit
@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
-from quality import HEIGHTS, generator_config, source
+from quality import HEIGHT_SCALES, generator_config, source
 
 from mbtf_core.config_file import resolve
 from mbtf_core.errors import MbtfError
@@ -108,20 +108,24 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("materials", nargs="*", help="names of assets or texture sets")
     parser.add_argument("--quality", default="draft", choices=get_args(Quality))
-    parser.add_argument("--levels", type=int, default=7, help="finest level: 2^levels texels")
+    parser.add_argument("--resolution", type=int, default=128, help="texels across, a power of two")
     parser.add_argument("--time", action="append", help="training (repeatable); default: 60s")
     arguments = parser.parse_args()
     figures: dict[str, Any] = {}
     fits: list[dict[str, Any]] = []
     try:
         load_mitsuba()
-        for name in arguments.materials or [*ASSETS, *HEIGHTS]:
+        for name in arguments.materials or [*ASSETS, *HEIGHT_SCALES]:
             if not source(name)[0].is_dir():
                 print(f"{name}: left out, {source(name)[0]} is missing", file=sys.stderr)
                 continue
             with tempfile.TemporaryDirectory() as work:
                 shards = Path(work) / "shards"
-                parts = {"generator": generated(name, arguments.quality, arguments.levels, shards)}
+                parts = {
+                    "generator": generated(
+                        name, arguments.quality, arguments.resolution.bit_length() - 1, shards
+                    )
+                }
                 for seconds in arguments.time or ["60s"]:
                     label = f"fitter {parse_duration(seconds):g} s"
                     parts[label] = fitted(shards, seconds, Path(work) / seconds)

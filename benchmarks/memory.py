@@ -51,7 +51,7 @@ def measure(material: Path, resolution: int, queries: int, out: Path) -> tuple[f
     start = time.perf_counter()
     command = [sys.executable, "-m", "mbtf_gen", str(material), "--queries", str(queries), "-o", str(out)]
     # Light is always scattered, so that no plan leaves the second kernel out.
-    command += ["--height", "0.1", "--mesh", str(resolution), "--effects", "all", "--spp", "16"]
+    command += ["--height-scale", "0.1", "--mesh", str(resolution), "--effects", "all", "--spp", "16"]
     command += ["--set", "queries.test=1024", "--set", f"output.shard_queries={SHARD_QUERIES}"]
     quiet = os.open(os.devnull, os.O_WRONLY)
     child = os.posix_spawn(command[0], command, os.environ, file_actions=[(os.POSIX_SPAWN_DUP2, quiet, 1)])

@@ -1,6 +1,6 @@
 """What the models cost to evaluate, and how many weights they have.
 
-    python benchmarks/models.py [--levels 6] [--repeat 12]
+    python benchmarks/models.py [--resolution 64] [--repeat 12]
 
 Processor time of both stages per value, of models with random weights on a square tile: the least of some
 repetitions, on one thread. ``hierarchical`` reads 81 places for every value; ``neumip-wide`` is the
@@ -23,7 +23,7 @@ from rock_cliff_128 import MODELS as TRAINED
 
 from mbtf_core.directions import from_projected_disk
 from mbtf_core.lattice import Lattice
-from mbtf_fit.models import MODELS, build_model
+from mbtf_fit.models.registry import MODELS, build_model
 
 # Places that are read at a time.
 PLACES = 1 << 15
@@ -71,11 +71,11 @@ def measure(name: str, finest: int, repeat: int) -> dict[str, Any]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--levels", type=int, default=6)
+    parser.add_argument("--resolution", type=int, default=64, help="texels across, a power of two")
     parser.add_argument("--repeat", type=int, default=12)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    found = {name: measure(name, arguments.levels, arguments.repeat) for name in CASES}
+    found = {name: measure(name, arguments.resolution.bit_length() - 1, arguments.repeat) for name in CASES}
     for name, f in found.items():
         print(
             f"{name:16s} {f['weights']:5d} weights   {f['places']:2d} places   "

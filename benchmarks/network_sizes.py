@@ -111,7 +111,7 @@ def main() -> int:
     parser.add_argument("--quality", default="high", choices=get_args(Quality), help="of the data")
     parser.add_argument("--time", default="4min", help="training of each fit")
     parser.add_argument("--size", action="append", type=size_of, help="WIDTHxCHANNELS (repeatable)")
-    parser.add_argument("--levels", type=int, default=7, help="finest level: 2^levels texels")
+    parser.add_argument("--resolution", type=int, default=128, help="texels across, a power of two")
     arguments = parser.parse_args()
     try:
         load_mitsuba()
@@ -122,7 +122,12 @@ def main() -> int:
         sizes = list(dict.fromkeys([*(arguments.size or SIZES), chosen]))
         with tempfile.TemporaryDirectory() as work:
             rows = measure(
-                arguments.material, arguments.quality, seconds, sizes, arguments.levels, Path(work)
+                arguments.material,
+                arguments.quality,
+                seconds,
+                sizes,
+                arguments.resolution.bit_length() - 1,
+                Path(work),
             )
     except (MbtfError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)

@@ -1,6 +1,6 @@
 """One 1080p picture's queries, evaluated by the Mitsuba plugin and by PyTorch.
 
-    python benchmarks/plugin.py [--material FOLDER] [--runs 7] [--levels 9] [--threads N]
+    python benchmarks/plugin.py [--material FOLDER] [--runs 7] [--resolution 512] [--threads N]
 
 The queries are those of a perspective picture of the plane: 1920 × 1080 positions, footprints and views, one
 light. **unrolled** and **cooperative** are the plugin's ways to evaluate networks, ``unrolled`` its default
@@ -54,7 +54,7 @@ def random_material(folder: Path, levels: int) -> None:
     from mbtf_core.lattice import Lattice
     from mbtf_fit.config import FitConfig
     from mbtf_fit.material.material import export
-    from mbtf_fit.models import build_model
+    from mbtf_fit.models.registry import build_model
 
     model = build_model("neumip", Lattice(levels))
     model.initialize(torch.Generator().manual_seed(0), 0.2)
@@ -68,7 +68,7 @@ def main() -> int:
     )
     parser.add_argument("--material", type=Path)
     parser.add_argument("--runs", type=int, default=7)
-    parser.add_argument("--levels", type=int, default=9)
+    parser.add_argument("--resolution", type=int, default=512, help="texels across, a power of two")
     parser.add_argument("--threads", type=int, default=len(os.sched_getaffinity(0)))
     options = parser.parse_args()
     mi = load_mitsuba()
@@ -85,9 +85,11 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix="mbtf-material-") as made:
         folder = options.material or Path(made)
         if options.material is None:
-            random_material(folder, options.levels)
+            random_material(folder, options.resolution.bit_length() - 1)
         material, stored = Material.load(folder), read_material(folder)
-    queries = Camera(elevation=45, span=4.0, rows=1080, columns=1920).queries(from_angles(40, 30)).flat()
+    queries = (
+        Camera(elevation=45, tiles_across=4.0, rows=1080, columns=1920).queries(from_angles(40, 30)).flat()
+    )
     arrays = (queries.u, queries.sigma, queries.omega_i, queries.omega_o)
     u = mi.Point2f(queries.u.T)
     sigma = mi.Float(queries.sigma)

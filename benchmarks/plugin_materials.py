@@ -141,7 +141,7 @@ def energies(material: Path, shards: Path, evaluator: Any) -> list[dict[str, flo
     from mbtf_gen.sampling.query_sampler import Queries
 
     config = GeneratorConfig.model_validate(Dataset.open(shards).manifest["config"])
-    estimator = build_estimator(config, load_material(material, config.geometry.tile))
+    estimator = build_estimator(config, load_material(material, config.geometry.make_tileable))
     random = np.random.default_rng([14, zlib.crc32(material.name.encode())])
     n, rows, lowest = ENERGY_QUERIES, [], config.queries.min_cos
     for k, elevation in enumerate(ELEVATIONS):
@@ -178,7 +178,7 @@ def gloss(source: Path, config: dict[str, Any]) -> dict[str, float]:
     Lambert."""
     from mbtf_gen.material.material import load_material
 
-    maps = load_material(source, config["geometry"]["tile"])
+    maps = load_material(source, config["geometry"]["make_tileable"])
     if maps.roughness is None:
         return {"specular_share": 0.0, "roughness": 1.0}
     color = float(np.mean(maps.base_color @ np.array([0.2126, 0.7152, 0.0722])))
@@ -275,7 +275,7 @@ def prepare(source: Path, work: Path, budget: str, only: bool) -> tuple[Path, Pa
     if not (folder / "material.json").exists():
         if only:
             return None
-        options = ["--levels", "7", "--mesh", "256", "--queries", "200/texel", "--spp", "4", "--quiet"]
+        options = ["--resolution", "128", "--mesh", "256", "--queries", "200/texel", "--spp", "4", "--quiet"]
         options += ["--set", "queries.test=16384", "--set", "queries.test_spp=128"]
         for words in (
             ["mbtf_gen", str(source), "-o", str(shards), *options],

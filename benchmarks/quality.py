@@ -1,55 +1,52 @@
-"""What the qualities cost and reach: the whole chain of each material at a quality.
+"""Time, error and size of the quality presets: whole runs, from height map to report.
 
-    python benchmarks/quality.py --out FOLDER [--only MATERIAL:QUALITY ...] [--levels 7] [--store] [--check]
+    python benchmarks/quality.py --out FOLDER [--only MATERIAL:QUALITY ...] [--resolution 128]
+                                 [--store] [--check]
 
-Runs ``mbtf-pipeline run`` in a process of its own for every material and quality of the table in
-docs/results/2026-11-cost-studies.md: ``draft`` and ``standard`` on six texture sets, ``high`` on one.
-The last one is measured with a quarter of its training, too: from both ``paper`` is extrapolated. ``--only``
-(repeatable) names single ones, also of ``assets/``, such as ``turtle_shell:draft``. Printed: its seconds,
-start-up, pictures and report included, the unexplained variance of test queries, and the bytes of data and
-material. Each is kept in FOLDER as soon as it is measured and not measured again, unless the
-quality has got other settings since, so the same command goes on where it stopped.
+Runs ``mbtf-pipeline run --quality`` in a process of its own: ``draft`` and ``standard`` on six texture sets
+that lie beside the project, ``high`` on one of them. ``paper`` needs a GPU and is not run. ``--only``
+(repeatable) selects single runs, also of ``assets/``, such as ``turtle_shell:draft``. FOLDER keeps every
+finished run, so the same command resumes; a run is repeated only if its preset has changed since.
 
-``--store`` writes what FOLDER holds to ``mbtf_gen/quality_measured.json``, from which help texts and
-``mbtf-gen plan`` speak, and the table of docs/results/2026-11-cost-studies.md. ``--check`` compares FOLDER
-with the stored figures instead.
+``--store`` writes the runs of FOLDER to ``quality_measured.json`` beside this script. ``--table`` prints that
+file as the Markdown table of the documentation. ``--check`` compares FOLDER with that file.
 
-The last line is one JSON object: figures, and the bars they are held to (a draft takes at most a minute, a
-standard run ten, on two cores, at 128 x 128 texels; under ``--check`` seconds within 30 % and errors within a
-factor 1.5 of the stored ones, of which there is one at least). Exit code 1 where a bar is missed.
+The last line is one JSON object with the figures and their thresholds. On two cores, at 128 texels across, a
+draft takes at most a minute and a standard run ten minutes. Under ``--check`` seconds differ by at most 30 %
+and errors by at most a factor 1.5. Exit code 1 where a threshold is exceeded.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import math
 import shutil
 import subprocess
 import sys
 import time
-from dataclasses import asdict
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, get_args
 
 from mbtf_core.atomic import read_json, write_json
 from mbtf_core.config_file import resolve
+from mbtf_core.console import clock
 from mbtf_core.errors import InputError
-from mbtf_core.units import parse_duration
 from mbtf_fit.config import FitConfig
-from mbtf_fit.presets import FITTER
-from mbtf_fit.training.forecast import PERSISTENCE, extrapolated
-from mbtf_gen.config.generator import GeneratorConfig, count_queries
+from mbtf_fit.presets import FITTER, best_at
+from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.config.presets import GENERATOR, Quality, as_assignments
-from mbtf_gen.config.quality_measured import FORMAT, STORED, Chain, markdown_table, read_expected
-from mbtf_pipeline.fit_records import read_training
-from mbtf_pipeline.presets import settings_hash
+from mbtf_pipeline.presets import COMPARE
 from mbtf_pipeline.run_folder import machine
+from mbtf_pipeline.stages import hash_of
 
 ROOT = Path(__file__).resolve().parents[1]
 TEXTURE_SETS = ROOT.parent / "shared" / "data" / "materials"
-# Factor on the heights of each set: fine structure is exaggerated so that it shows.
-HEIGHTS: dict[str, float] = {
+STORED = Path(__file__).with_name("quality_measured.json")
+FORMAT, SCHEMA = "mbtf-quality", 2
+# Height scale of each texture set, exaggerated where the structure is fine.
+HEIGHT_SCALES: dict[str, float] = {
     "knit_fabric": 0.05,
     "leather_fine": 0.02,
     "metal_plate": 0.05,
@@ -57,296 +54,255 @@ HEIGHTS: dict[str, float] = {
     "stone_bricks": 0.06,
     "tree_bark": 0.1,
 }
-# The set that `high` is measured on, and `paper` extrapolated for, and the share of its training that another
-# fit of it gets.
+# The texture set of the `high` run.
 LONG = "rock_cliff"
-QUARTER = 0.25
-# Seconds of the whole chain.
-BARS = {"draft": 60.0, "standard": 600.0}
-BAR_LEVELS = 7
-# Largest factors between a stored figure and another run.
+# Seconds of a whole run.
+THRESHOLDS = {"draft": 60.0, "standard": 600.0}
+RESOLUTION = 128
+# Largest factors between a stored figure and a new one.
 CHECK = {"seconds": 1.3, "error": 1.5}
 QUALITIES: tuple[Quality, ...] = get_args(Quality)
-PAGE = ROOT / "docs" / "results" / "2026-11-cost-studies.md"
-BEGIN, END = "<!-- qualities: begin -->", "<!-- qualities: end -->"
 RECIPE = """\
 name: quality
 generate:
   material: {material}
-  geometry: {{height: {height}}}
-  queries: {{levels: {levels}}}
+  geometry: {{height_scale: {height}}}
+  queries: {{resolution: {resolution}}}
 fit: {{model: neumip}}
 """
 
 
+@dataclass(frozen=True)
+class MeasuredRun:
+    """One material at a preset, from height map to report.
+
+    Attributes
+    ----------
+    height_scale : in tile widths, None for the material's own
+    seconds : of the whole run, start-up included; generate, fit : of these two stages
+    unexplained, unexplained_error : unexplained variance of the test queries and its standard error
+    data_bytes, material_bytes : on disk
+    settings : hash of the preset's options
+    """
+
+    material: str
+    quality: Quality
+    height_scale: float | None
+    seconds: float
+    generate: float
+    fit: float
+    unexplained: float
+    unexplained_error: float
+    data_bytes: int
+    material_bytes: int
+    settings: str
+
+    def __str__(self) -> str:
+        return (
+            f"{self.material:16s} {self.quality:9s} {self.seconds:7.1f} s (generate {self.generate:.1f}, "
+            f"fit {self.fit:.1f})  unexplained {self.unexplained:.3f} ± {self.unexplained_error:.3f}  "
+            f"data {self.data_bytes / 1e6:.0f} MB  material {self.material_bytes / 1e6:.2f} MB"
+        )
+
+
 def source(name: str) -> tuple[Path, float | None]:
-    """Folder of a material and the factor on its heights."""
-    if name in HEIGHTS:
-        return TEXTURE_SETS / name, HEIGHTS[name]
+    """Folder of a material and its height scale."""
+    if name in HEIGHT_SCALES:
+        return TEXTURE_SETS / name, HEIGHT_SCALES[name]
     return ROOT / "assets" / name, None
 
 
-def generator_config(name: str, quality: Quality, levels: int) -> GeneratorConfig:
-    """The generator's configuration of a material at a quality."""
+def settings_hash(quality: Quality) -> str:
+    """Hash of all options of a preset and of the fitter's other training options."""
+    options = best_at(quality) | FITTER[quality]
+    training = resolve(FitConfig, assignments=as_assignments(options)).training.model_dump(mode="json")
+    return hash_of([GENERATOR[quality], options, training, COMPARE[quality]])[:12]
+
+
+def generator_config(name: str, quality: Quality, resolution: int) -> GeneratorConfig:
+    """Configuration of the generator for a material at a preset."""
     material, height = source(name)
     return resolve(
         GeneratorConfig,
         assignments=[
             f"material={json.dumps(str(material))}",
             *as_assignments(GENERATOR[quality]),
-            *as_assignments({"geometry.height": height, "queries.levels": levels}),
+            *as_assignments({"geometry.height_scale": height, "queries.resolution": resolution}),
         ],
     )
 
 
-def folder_bytes(folder: Path) -> int:
-    """Bytes of all files below a folder."""
-    return sum(p.stat().st_size for p in folder.rglob("*") if p.is_file())
-
-
-def run(name: str, quality: Quality, levels: int, work: Path, share: float = 1.0) -> Chain:
-    """One chain that trains for a share of the quality's time, timed from outside; what an interrupted one
-    left in `work` was not, and is removed.
+def run(name: str, quality: Quality, resolution: int, work: Path) -> MeasuredRun:
+    """Run the pipeline on a material, timed from outside, in an empty folder `work`.
 
     Raises
     ------
-    SystemExit : the chain failed; its message is shown
+    SystemExit : the run failed
     """
     material, height = source(name)
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True)
     recipe, out = work / "recipe.yaml", work / "run"
-    text = RECIPE.format(
-        material=json.dumps(str(material)), levels=levels, height="null" if height is None else height
-    )
+    text = RECIPE.format(material=json.dumps(str(material)), resolution=resolution, height=json.dumps(height))
     recipe.write_text(text, encoding="utf-8")
     command = [sys.executable, "-m", "mbtf_pipeline", "run", str(recipe), "--quality", quality]
-    if share != 1:
-        training = share * parse_duration(FITTER[quality]["training.time"])
-        command += ["--set", f"fit.training.time={training:g}s"]
+    command += ["-o", str(out), "--json", "--quiet"]
     start = time.perf_counter()
-    done = subprocess.run(
-        [*command, "-o", str(out), "--json", "--quiet"], stdout=subprocess.PIPE, text=True, check=False
-    )
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
     seconds = time.perf_counter() - start
     if done.returncode:
         raise SystemExit(f"{name} at {quality} ended with exit code {done.returncode}")
     summary = json.loads(done.stdout)
     stages = {stage: record["seconds"] for stage, record in summary["stages"].items()}
-    print(f"{name}: {json.dumps({k: round(v, 1) for k, v in stages.items()})}", file=sys.stderr)
-    missed = summary["test"]["neumip"]["unexplained_variance"]
-    if missed["value"] is None:
-        raise SystemExit(f"{name} at {quality}: its test values do not tell an unexplained variance")
-    fit = out / "fits" / "neumip"
-    found = Chain(
+    unexplained = summary["test"]["neumip"]["unexplained_variance"]
+    if unexplained["value"] is None:
+        raise SystemExit(f"{name} at {quality}: the unexplained variance of its test values is undefined")
+    found = MeasuredRun(
         name,
         quality,
         height,
         round(seconds, 1),
         round(stages["generate"], 1),
         round(sum(s for stage, s in stages.items() if stage.startswith("fit")), 1),
-        round(missed["value"], 4),
-        round(missed["error"], 4),
-        folder_bytes(out / "shards"),
-        sum(p.stat().st_size for p in fit.glob("weights*")),
-        round(read_training(fit).samples_per_second),
+        round(unexplained["value"], 4),
+        round(unexplained["error"], 4),
+        sum(p.stat().st_size for p in (out / "shards").rglob("*") if p.is_file()),
+        sum(p.stat().st_size for p in (out / "fits" / "neumip").glob("weights*")),
         settings_hash(quality),
-        share,
     )
     shutil.rmtree(work)
     return found
 
 
-def line(c: Chain) -> str:
-    """A chain as text."""
-    return (
-        f"{c.material:16s} {c.quality:9s} {c.seconds:7.1f} s (generate {c.generate:.1f}, fit {c.fit:.1f})  "
-        f"unexplained {c.unexplained:.3f} ± {c.unexplained_error:.3f}  data {c.data_bytes / 1e6:.0f} MB  "
-        f"material {c.material_bytes / 1e6:.2f} MB"
-    )
-
-
-def wanted(only: list[str] | None) -> list[tuple[str, Quality, float]]:
-    """(material, quality, share of its training) to measure.
+def requested(only: Sequence[str] | None) -> list[tuple[str, Quality]]:
+    """(material, preset) to run.
 
     Raises
     ------
-    SystemExit : a name that is none
+    SystemExit : an unknown material or preset
     """
     if not only:
         short: tuple[Quality, ...] = ("draft", "standard")
-        return [
-            *((name, q, 1.0) for q in short for name in HEIGHTS),
-            (LONG, "high", QUARTER),
-            (LONG, "high", 1.0),
-        ]
-    out = []
+        return [*((name, q) for q in short for name in HEIGHT_SCALES), (LONG, "high")]
+    out: list[tuple[str, Quality]] = []
     for text in only:
         name, _, quality = text.partition(":")
         if quality not in QUALITIES or not source(name)[0].is_dir():
             raise SystemExit(f"--only {text}: must be MATERIAL:QUALITY, such as rock_cliff:draft")
-        if (name, quality) == (LONG, "high"):
-            out.append((name, quality, QUARTER))
-        out.append((name, quality, 1.0))
+        out.append((name, quality))
     return out
 
 
-def measured(path: Path) -> Chain | None:
-    """A chain that was measured, with the settings that its quality still has; None of another one, and of a
-    file that is missing or damaged."""
+def finished(path: Path) -> MeasuredRun | None:
+    """A stored run; None where the file is missing or damaged, or its preset has changed since."""
     try:
-        chain = Chain(**read_json(path))
-        now = settings_hash(chain.quality)  # type: ignore[arg-type]
+        found = MeasuredRun(**read_json(path))
+        return found if found.settings == settings_hash(found.quality) else None
     except (InputError, TypeError, KeyError):
         return None
-    return chain if chain.settings == now else None
 
 
-def kept(folder: Path, levels: int) -> list[Chain]:
-    """Chains that were measured at these levels, in the order of the table."""
+def finished_runs(folder: Path, resolution: int) -> list[MeasuredRun]:
+    """All stored runs of a resolution, in the order of the table."""
     found = []
-    for path in folder.glob(f"*-{levels}.json"):
-        chain = measured(path)
-        if chain is None:
-            print(f"{path}: left out, damaged or measured with other settings", file=sys.stderr)
+    for path in folder.glob(f"*-{resolution}.json"):
+        one = finished(path)
+        if one is None:
+            print(f"{path}: ignored, damaged or measured with other options", file=sys.stderr)
         else:
-            found.append(chain)
-    return sorted(found, key=lambda c: (QUALITIES.index(c.quality), c.material, c.share))
+            found.append(one)
+    return sorted(found, key=lambda r: (QUALITIES.index(r.quality), r.material))
 
 
-def paths_of(quality: str, levels: int) -> float:
-    """Paths of a quality's data set of a square material, and those of its test split."""
-    config = resolve(
-        GeneratorConfig,
-        assignments=["material=m", *as_assignments(GENERATOR[quality])],  # type: ignore[index]
-    ).queries
-    texels = 4**levels
-    return (
-        count_queries(config.train, texels) * config.spp
-        + count_queries(config.test, texels) * config.test_spp
-    )
-
-
-def paper(chains: list[Chain], levels: int) -> tuple[Chain | None, str]:
-    """`paper` for the material that `high` was measured on, and how its figures follow."""
-    law = (
-        "Of `paper`, generating takes the seconds of `high` times the ratio of their numbers of paths, data "
-        "the bytes times that of their queries, and training 30 000 steps of 2²⁰ queries at the rate of "
-        "`high`. In the error's logarithm every doubling of the training time gains "
-        f"q = {PERSISTENCE:g} of what the one before gained: "
-        "E_paper = E_quarter · (E_high / E_quarter)^((1 − q^(p+2)) / (1 − q²)), where training takes 2^p "
-        "times as long as in `high`, and E_quarter is what `high` leaves with a quarter of its training"
-    )
-    known = {c.share: c for c in chains if (c.material, c.quality) == (LONG, "high")}
-    if known.keys() != {1.0, QUARTER}:
-        return None, law
-    high, quarter = known[1.0], known[QUARTER]
-    law += (
-        f": {quarter.unexplained:.3f} ± {quarter.unexplained_error:.3f}. That `paper` has fewer, cleaner "
-        "queries is left out of account, and its bar is that of both errors alone: how far the law itself "
-        "may be off, forecasts tell"
-    )
-    config = resolve(FitConfig, assignments=as_assignments(FITTER["paper"]))
-    assert config.training.steps is not None
-    samples = config.training.steps * config.training.batch
-    fit = samples / high.queries_per_second
-    generate = high.generate * paths_of("paper", levels) / paths_of("high", levels)
-    doublings = math.log2(fit / high.fit)
-    apart = -math.log2(QUARTER)
-    error = extrapolated(quarter.unexplained, high.unexplained, doublings, apart=apart)
-    # The power of `high` in the law; that of its quarter is what is left of 1.
-    power = (1 - PERSISTENCE ** (doublings + apart)) / (1 - PERSISTENCE**apart)
-    bars = [c.unexplained_error / c.unexplained for c in (high, quarter)]
-    bar = error * math.hypot(power * bars[0], (1 - power) * bars[1])
-    queries = {
-        q: count_queries(GENERATOR[q]["queries.train"], 4**levels) + int(GENERATOR[q]["queries.test"])
-        for q in ("high", "paper")
-    }
-    return (
-        Chain(
-            high.material,
-            "paper",
-            high.height,
-            round(high.seconds - high.generate - high.fit + generate + fit),
-            round(generate),
-            round(fit),
-            round(error, 3),
-            round(bar, 3),
-            round(high.data_bytes * queries["paper"] / queries["high"]),
-            high.material_bytes,
-            high.queries_per_second,
-            settings_hash("paper"),
-        ),
-        law,
-    )
-
-
-def store(chains: list[Chain], levels: int) -> None:
-    """Write the figures beside the package's code, and their table into the documentation."""
-    guess, law = paper(chains, levels)
+def store(runs: Sequence[MeasuredRun], resolution: int) -> None:
+    """Write the figures beside this script."""
     data = {
         "format": FORMAT,
+        "schema": SCHEMA,
         "command": "python benchmarks/quality.py --out out/quality --store",
         "date": time.strftime("%Y-%m-%d"),
         "machine": machine()["system"],
-        "levels": levels,
-        "chains": [asdict(c) for c in chains],
-        "extrapolated": [] if guess is None else [asdict(guess)],
-        "law": law,
+        "resolution": resolution,
+        "runs": [asdict(r) for r in runs],
     }
     STORED.write_text(json.dumps(data, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-    text = PAGE.read_text(encoding="utf-8")
-    before, rest = text.split(BEGIN)
-    table = markdown_table(read_expected(STORED), QUALITIES)
-    PAGE.write_text(f"{before}{BEGIN}\n\n{table}\n\n{END}{rest.split(END)[1]}", encoding="utf-8")
 
 
-def check(chains: list[Chain]) -> list[dict[str, Any]]:
+def stored_runs() -> list[MeasuredRun]:
+    """The figures beside this script."""
+    return [MeasuredRun(**row) for row in read_json(STORED)["runs"]]
+
+
+def markdown_table(runs: Sequence[MeasuredRun]) -> str:
+    """The table of the documentation."""
+    head = ("quality", "material", "total", "generate", "fit", "unexplained variance", "data", "weights")
+    rows = [head, ("---",) * len(head)]
+    for r in runs:
+        rows.append(
+            (
+                f"`{r.quality}`",
+                r.material if r.height_scale is None else f"{r.material}, height scale {r.height_scale:g}",
+                clock(r.seconds),
+                clock(r.generate),
+                clock(r.fit),
+                f"{r.unexplained:.3f} ± {r.unexplained_error:.3f}",
+                f"{r.data_bytes / 1e6:.0f} MB",
+                f"{r.material_bytes / 1e6:.2f} MB",
+            )
+        )
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
+def compare(runs: Sequence[MeasuredRun]) -> list[dict[str, Any]]:
     """Factors between the stored figures and these."""
-    stored = {(c.material, c.quality, c.share): c for c in read_expected(STORED).chains}
+    stored = {(r.material, r.quality): r for r in stored_runs()}
     out = []
-    for c in chains:
-        other = stored.get((c.material, c.quality, c.share))
+    for r in runs:
+        other = stored.get((r.material, r.quality))
         if other is not None:
-            pairs = {"seconds": (c.seconds, other.seconds), "error": (c.unexplained, other.unexplained)}
+            pairs = {"seconds": (r.seconds, other.seconds), "error": (r.unexplained, other.unexplained)}
             factors = {name: max(a / b, b / a) for name, (a, b) in pairs.items()}
-            out.append({"material": c.material, "quality": c.quality, "factors": factors})
+            out.append({"material": r.material, "quality": r.quality, "factors": factors})
     return out
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--out", type=Path, required=True, help="folder that keeps what was measured")
+    parser.add_argument("--out", type=Path, help="folder of the finished runs")
     parser.add_argument("--only", action="append", help="MATERIAL:QUALITY (repeatable)")
-    parser.add_argument("--levels", type=int, default=BAR_LEVELS, help="finest level: 2^levels texels")
-    parser.add_argument(
-        "--store", action="store_true", help="write the package's figures and the docs' table"
-    )
-    parser.add_argument("--check", action="store_true", help="hold the figures against the stored ones")
+    parser.add_argument("--resolution", type=int, default=RESOLUTION, help="texels across, a power of two")
+    parser.add_argument("--store", action="store_true", help="write quality_measured.json")
+    parser.add_argument("--table", action="store_true", help="print quality_measured.json as Markdown")
+    parser.add_argument("--check", action="store_true", help="compare with quality_measured.json")
     arguments = parser.parse_args()
+    if arguments.table:
+        print(markdown_table(stored_runs()))
+        return 0
+    if arguments.out is None:
+        parser.error("--out is required")
     arguments.out.mkdir(parents=True, exist_ok=True)
-    for name, quality, share in wanted(arguments.only):
-        part = "" if share == 1 else f"-{share:g}"
-        path = arguments.out / f"{name}-{quality}{part}-{arguments.levels}.json"
-        if measured(path) is not None:
+    for name, quality in requested(arguments.only):
+        path = arguments.out / f"{name}-{quality}-{arguments.resolution}.json"
+        if finished(path) is not None:
             continue
         if not source(name)[0].is_dir():
-            print(f"{name}: left out, {source(name)[0]} is missing", file=sys.stderr)
+            print(f"{name}: skipped, {source(name)[0]} is missing", file=sys.stderr)
             continue
-        found = run(name, quality, arguments.levels, arguments.out / ".work", share)
+        found = run(name, quality, arguments.resolution, arguments.out / ".work")
         write_json(path, asdict(found))
-        print(line(found), flush=True)
-    chains = kept(arguments.out, arguments.levels)
-    held = [c for c in chains if c.quality in BARS and arguments.levels <= BAR_LEVELS]
-    met = all(c.seconds <= BARS[c.quality] for c in held)
-    report: dict[str, Any] = {"figures": [asdict(c) for c in chains], "bars": {**BARS}}
+        print(found, flush=True)
+    runs = finished_runs(arguments.out, arguments.resolution)
+    timed = [r for r in runs if r.quality in THRESHOLDS and arguments.resolution <= RESOLUTION]
+    met = all(r.seconds <= THRESHOLDS[r.quality] for r in timed)
+    report: dict[str, Any] = {"figures": [asdict(r) for r in runs], "thresholds": {**THRESHOLDS}}
     if arguments.check:
-        report |= {"beside_stored": check(chains), "bars": {**BARS, **CHECK}}
-        met &= bool(report["beside_stored"])
-        met &= all(f <= CHECK[name] for row in report["beside_stored"] for name, f in row["factors"].items())
+        rows = compare(runs)
+        report |= {"compared": rows, "thresholds": {**THRESHOLDS, **CHECK}}
+        met &= bool(rows)
+        met &= all(f <= CHECK[name] for row in rows for name, f in row["factors"].items())
     if arguments.store:
-        store(chains, arguments.levels)
-    print(json.dumps({**report, "met": met, "machine": machine()}))
+        store(runs, arguments.resolution)
+    print(json.dumps({**report, "met": met}))
     return 0 if met else 1
 
 

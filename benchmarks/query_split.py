@@ -1,7 +1,7 @@
 """Many noisy queries or few clean ones? Held-out error of a fit at equal numbers of paths.
 
     python benchmarks/query_split.py [MATERIAL ...] [--paths 1.6e6 --paths 6.4e6] [--spp 2 ...] [--steps N]
-                                     [--levels 6] [--height H] [--keep FILE] [--plot FILE]
+                                     [--resolution 64] [--height-scale H] [--keep FILE] [--plot FILE]
 
 For every material (by default three of ``assets/``), budget of paths and number of paths per query a data set
 is made, a ``neumip`` trained on it for the same number of steps, and judged by test queries that all share.
@@ -75,8 +75,8 @@ def measure(
     config = GeneratorConfig.model_validate(
         {
             "material": str(material),
-            "geometry": {"height": height},
-            "queries": {"levels": levels, "test": "32768", "test_spp": 256},
+            "geometry": {"height_scale": height},
+            "queries": {"resolution": 1 << levels, "test": "32768", "test_spp": 256},
         }
     )
     rows = []
@@ -141,8 +141,8 @@ def main() -> int:
     parser.add_argument("--paths", type=float, action="append", help="budget of paths; repeatable")
     parser.add_argument("--spp", type=int, action="append", help="paths per query; repeatable")
     parser.add_argument("--steps", type=int, default=400, help="training steps of each fit")
-    parser.add_argument("--levels", type=int, default=6)
-    parser.add_argument("--height", type=float, help="factor on the stored heights")
+    parser.add_argument("--resolution", type=int, default=64, help="texels across, a power of two")
+    parser.add_argument("--height-scale", type=float, help="factor on the stored heights")
     parser.add_argument("--keep", type=Path, help="file of the points that were measured, to go on from")
     parser.add_argument("--plot", type=Path, help="PNG of the table")
     arguments = parser.parse_args()
@@ -152,8 +152,8 @@ def main() -> int:
         for material in arguments.materials or [ROOT / "assets" / name for name in ASSETS]:
             rows += measure(
                 material,
-                arguments.height,
-                arguments.levels,
+                arguments.height_scale,
+                arguments.resolution.bit_length() - 1,
                 arguments.paths or PATHS,
                 arguments.spp or SPP,
                 arguments.steps,

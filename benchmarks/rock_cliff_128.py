@@ -29,8 +29,8 @@ MODELS: dict[str, dict[str, Any]] = {
     "neumip": {},
     "neumip-baseline": {"model": "neumip-baseline"},
     "neumip-wide": {
-        "network": {"width": 40, "channels": 12, "encoding": {"lifted": True}},
-        "training": {"decay": 1.0, "blur": {"floor": 0.8}},
+        "network": {"width": 40, "channels": 12, "encoding": {"direction_xyz": True}},
+        "training": {"texture_weight_decay": 1.0, "blur": {"min_sigma": 0.8}},
     },
 }
 # Both explain all but this share; the baseline misses at least so many times what neumip misses.

@@ -95,8 +95,8 @@ def surfaces(mi: Any) -> dict[str, dict[str, Any]]:
             "roughness": rough,
             "specular": 0.5,
             "metallic": metal,
-            "coat": 1.0,
-            "coat_roughness": 0.1,
+            "clearcoat": 1.0,
+            "clearcoat_roughness": 0.1,
         },
     }
 

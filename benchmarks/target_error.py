@@ -1,6 +1,7 @@
 """How near runs to a target error come, against the true noise of every query.
 
-    python benchmarks/target_error.py [MATERIAL ...] [--target 0.05] [--queries N] [--cap N] [--height H]
+    python benchmarks/target_error.py [MATERIAL ...] [--target 0.05] [--queries N] [--max-spp N]
+                                      [--height-scale H]
 
 By default ``cliff_rock`` and ``turtle_shell`` of ``assets/``, and the relief of ``cliff_rock`` in polished
 metal (roughness 0.2), where few bright paths make most of the value, to five times the target. For every
@@ -48,9 +49,16 @@ def measure(
     material: Path, name: str, height: float | None, error: float, cap: int, n: int
 ) -> dict[str, Any]:
     """One row."""
-    queries = {"levels": 7, "train": str(n), "test": "2", "test_spp": 2, "target_error": error, "cap": cap}
+    queries = {
+        "resolution": 128,
+        "train": str(n),
+        "test": "2",
+        "test_spp": 2,
+        "target_error": error,
+        "max_spp": cap,
+    }
     config = GeneratorConfig.model_validate(
-        {"material": str(material), "geometry": {"height": height}, "queries": queries}
+        {"material": str(material), "geometry": {"height_scale": height}, "queries": queries}
     )
     job = Job.prepare(config)
     plan = plan_run(job)
@@ -95,8 +103,8 @@ def main() -> int:
     parser.add_argument("materials", nargs="*", type=Path)
     parser.add_argument("--target", type=float, default=0.05)
     parser.add_argument("--queries", type=int, default=1500)
-    parser.add_argument("--cap", type=int, default=1 << 14)
-    parser.add_argument("--height", type=float, help="factor on the stored heights")
+    parser.add_argument("--max-spp", type=int, default=1 << 14)
+    parser.add_argument("--height-scale", type=float, help="factor on the stored heights")
     options = parser.parse_args()
     rows = []
     try:
@@ -105,14 +113,14 @@ def main() -> int:
             polished = Path(work) / "material.yaml"
             height = json.dumps(str(assets / "cliff_rock" / "height.exr"))
             polished.write_text(POLISHED.format(height=height), encoding="utf-8")
-            cases = [(m, m.name, options.height, 1.0) for m in options.materials] or [
+            cases = [(m, m.name, options.height_scale, 1.0) for m in options.materials] or [
                 (assets / "cliff_rock", "cliff_rock", None, 1.0),
                 (assets / "turtle_shell", "turtle_shell", None, 1.0),
                 (polished, "polished", 0.2, 5.0),
             ]
             for material, name, height_scale, factor in cases:
                 row = measure(
-                    material, name, height_scale, factor * options.target, options.cap, options.queries
+                    material, name, height_scale, factor * options.target, options.max_spp, options.queries
                 )
                 rows.append(row)
                 print(

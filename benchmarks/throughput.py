@@ -189,7 +189,7 @@ def main() -> int:
     parser.add_argument(
         "--material", type=Path, help="height map, folder or material.yaml; own one by default"
     )
-    parser.add_argument("--height", type=float, help="factor on its stored heights")
+    parser.add_argument("--height-scale", type=float, help="factor on its stored heights")
     parser.add_argument("--runs", type=int, default=5, help="timed runs of each")
     parser.add_argument("--queries", type=int, default=1 << 18, help="queries per run")
     parser.add_argument("--spp", type=int, default=16, help="paths per query (even)")
@@ -202,7 +202,7 @@ def main() -> int:
         return error.exit_code
     import drjit as dr
 
-    grid = material.grid(arguments.height, MESH)
+    grid = material.grid(arguments.height_scale, MESH)
     makers: dict[str, Any] = {"ours": our_run, "stock": stock_run}
     runs = {name: make(material, grid, arguments.queries, arguments.spp) for name, make in makers.items()}
     seconds: dict[str, list[float]] = {name: [] for name in runs}

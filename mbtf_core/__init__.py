@@ -1,1 +1,1 @@
-"""What all packages share: errors, configuration, console, files and locks, directions, levels, statistics."""
+"""What all packages share: errors, configuration, console, files, directions, levels, statistics."""

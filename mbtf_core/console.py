@@ -61,6 +61,7 @@ from mbtf_core.errors import (
     printable,
     reason,
 )
+from mbtf_core.options import Switch
 
 EXIT_INTERNAL = 1
 _EXIT_BROKEN_PIPE = 141
@@ -208,8 +209,8 @@ class Console:
     quiet : no progress and no notes; warnings and errors stay
     """
 
-    json: Annotated[bool, Parameter(negative="", help="Print one JSON object on standard output.")] = False
-    quiet: Annotated[bool, Parameter(alias="-q", negative="", help="No progress, no notes.")] = False
+    json: Annotated[Switch, Parameter(help="Print one JSON object on standard output.")] = False
+    quiet: Annotated[Switch, Parameter(alias="-q", help="No progress, no notes.")] = False
 
     def note(self, text: str) -> None:
         """A line for people, on standard error."""

@@ -1,8 +1,9 @@
-"""Durations as people write them: ``90s``, ``2min``, ``1h``."""
+"""Values as people write them: durations such as ``90s``, ``2min``, ``1h``, and lists such as ``1,2,4``."""
 
 from __future__ import annotations
 
 import re
+from typing import Any
 
 from mbtf_core.errors import UsageError
 
@@ -45,3 +46,18 @@ def format_duration(seconds: float) -> str:
         if seconds >= size and seconds % size == 0:
             return f"{seconds / size:g}{unit}"
     return f"{seconds:g}s"
+
+
+def parse_numbers(value: Any) -> Any:
+    """Numbers of a text such as ``"1,2,4"``; any other value as it is.
+
+    Raises
+    ------
+    ValueError : a text that is none
+    """
+    if not isinstance(value, str):
+        return value
+    try:
+        return [float(part) for part in value.split(",")]
+    except ValueError:
+        raise ValueError("must be numbers separated by commas, such as 1,2,4") from None

@@ -14,7 +14,7 @@ _PUBLIC = {
     "Material": "mbtf_fit.material.material",
     "evaluate": "mbtf_fit.evaluation",
     "fit": "mbtf_fit.training.fit",
-    "read_history": "mbtf_fit.training.fit",
+    "read_history": "mbtf_fit.training.validation",
 }
 
 __all__ = ["FitConfig", "FitResult", "Material", "evaluate", "fit", "read_history"]

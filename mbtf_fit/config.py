@@ -10,11 +10,12 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, PlainSerializer, model_validator
 
 from mbtf_core.config_file import Settings, deep_merge
+from mbtf_core.options import Flag
 from mbtf_core.sizes import format_size, parse_size
 from mbtf_core.units import format_duration, parse_duration
 
 ModelName = Literal["neumip-baseline", "neumip", "hierarchical"]
-OutputMap = Literal["exp-1", "exp", "identity", "softplus", "fourth-root"]
+OutputTransform = Literal["expm1", "exp", "identity", "softplus", "fourth-root"]
 LossKind = Literal["relative", "squared", "linear", "log", "fourth-root", "gradient"]
 Correction = Literal["none", "second-order", "linear"]
 
@@ -25,173 +26,220 @@ Size = Annotated[float, BeforeValidator(parse_size), PlainSerializer(format_size
 
 
 class EncodingSection(Settings):
-    """What networks see of positions and directions: sines and cosines of doubling frequencies."""
+    """Positional encoding of the networks' inputs: sines and cosines of doubling frequencies."""
 
-    position: int = Field(0, ge=0, le=16, description="bands of the position; 0: it is not encoded")
-    direction: int = Field(0, ge=0, le=16, description="bands of a direction; 0: its coordinates")
-    pi: bool = Field(True, description="position: sin(2^k π p), which repeats with the tile; else sin(2^k p)")
-    direction_pi: bool = Field(
-        True, description="direction: likewise; π makes opposite grazing directions look alike"
+    position: int = Field(0, ge=0, le=16, description="frequency bands of the position; 0: not an input")
+    direction: int = Field(
+        0, ge=0, le=16, description="frequency bands of each direction; 0: raw coordinates"
     )
-    raw: bool = Field(False, description="whether encoded coordinates are also given as they are")
-    lifted: bool = Field(False, description="directions as (x, y, z) rather than (x, y)")
-    damped: bool = Field(False, description="band k divided by 2^k, so that all are equally steep")
-    filtered: bool = Field(False, description="position: bands averaged over the query's footprint")
+    pi: bool = Field(
+        True, description="position: sin(2^k π p), which is periodic over the tile; false: sin(2^k p)"
+    )
+    direction_pi: bool = Field(
+        True, description="direction: sin(2^k π p), equal for opposite grazing directions; false: sin(2^k p)"
+    )
+    raw: bool = Field(False, description="append encoded coordinates to the raw ones")
+    direction_xyz: bool = Field(False, description="directions as (x, y, z); false: (x, y)")
+    band_attenuation: bool = Field(False, description="divide band k by 2^k, so that all slopes are equal")
+    footprint_filtered: bool = Field(
+        False, description="position: average each band over the query's footprint"
+    )
 
 
 class NetworkSection(Settings):
-    """Architecture of the model; unset keys are as the model's paper has them."""
+    """Architecture of the model; defaults follow the model's paper."""
 
     channels: int = Field(7, ge=1, le=64, description="features per texel")
-    width: int = Field(25, ge=1, le=512, description="features of the hidden layers")
+    width: int = Field(25, ge=1, le=512, description="features of each hidden layer")
     layers: int = Field(4, ge=2, le=16, description="layers of each fully connected network")
-    decoder: Literal["mlp", "inception"] = Field("mlp", description="network that answers the value")
-    activation: Literal["relu", "leaky-relu", "sine"] = Field("relu", description="between layers")
-    outputs: Literal[3, 6] = Field(3, description="3: RGB; 6: YUV and a gate, as the published code has it")
-    output: OutputMap = Field("exp-1", description="from the network's answer to the value")
+    decoder: Literal["mlp", "inception"] = Field("mlp", description="network that predicts the value")
+    activation: Literal["relu", "leaky-relu", "sine"] = Field(
+        "relu", description="activation function of the hidden layers"
+    )
+    output_channels: Literal[3, 6] = Field(
+        3, description="3: RGB; 6: YUV and a gate, as in NeuMIP's published code"
+    )
+    output_transform: OutputTransform = Field(
+        "expm1", description="function from the network's output to the value"
+    )
     offset: Literal["depth", "direct", "none"] = Field(
-        "depth", description="a length along the view, two numbers, or no offset"
+        "depth", description="neural offset: a depth along the view, a 2-D vector, or none"
     )
     blending: Literal["blend", "concatenate"] = Field(
-        "blend", description="two neighboring levels: their weighted sum, or both side by side"
+        "blend", description="features of two adjacent levels: weighted sum, or concatenation"
     )
     encoding: EncodingSection = EncodingSection()
 
 
 class BlurSection(Settings):
-    """Blur annealing of the textures: σ falls from `start` to `end` within `share` of the budget."""
+    """Annealed Gaussian blur of the textures; sigmas are in texels of the finest level."""
 
-    start: float = Field(
-        8.0, ge=0, le=256, description="texels of the finest level, at most an eighth of the tile; 0: no blur"
+    initial_sigma: float = Field(
+        8.0, ge=0, le=256, description="sigma at the start, at most an eighth of the tile; 0: no blur"
     )
-    end: float = Field(0.25, gt=0, le=256, description="texels of the finest level")
-    share: float = Field(0.5, gt=0, le=1, description="of the budget")
-    floor: float = Field(
-        0.0, ge=0, le=256, description="blur of the pyramid that always stays, texels of the finest level"
-    )
-    offset: float = Field(
-        2.0,
-        ge=0,
-        le=256,
-        description="blur of the offset texture that always stays, texels of the finest level",
+    final_sigma: float = Field(0.25, gt=0, le=256, description="sigma at the end of the annealing")
+    fraction: float = Field(0.5, gt=0, le=1, description="fraction of the budget that the annealing takes")
+    min_sigma: float = Field(0.0, ge=0, le=256, description="least sigma of the pyramid, kept for good")
+    offset_sigma: float = Field(
+        2.0, ge=0, le=256, description="least sigma of the offset texture, kept for good"
     )
 
 
 class LossTerm(Settings):
-    """One term of what is minimized; ``docs/fitting.md`` has the formulas."""
+    """One term of the loss."""
 
     kind: LossKind
     weight: float = Field(1.0, gt=0, le=1e6)
 
 
 class TrainingSection(Settings):
-    """How long and how a model is trained."""
+    """Budget, loss and optimizer."""
 
-    time: Duration = Field(120.0, description="budget: 90s, 2min, 1h")
-    steps: int | None = Field(None, ge=1, description="train this many steps, however long they take")
-    batch: int = Field(1 << 15, ge=1, le=1 << 24, description="queries per step")
-    crop: int = Field(
+    time: Annotated[Duration, Flag("--time", "DURATION")] = Field(
+        120.0, description="time budget: 90s, 2min, 1h"
+    )
+    steps: Annotated[int | None, Flag("--steps")] = Field(
+        None, ge=1, description="number of training steps, in place of a time"
+    )
+    batch: Annotated[int, Flag("--batch")] = Field(1 << 15, ge=1, le=1 << 24, description="queries per step")
+    patch_size: int = Field(
         32,
         ge=1,
         le=256,
-        description="image layout: places on each side of the parts of buffers that a batch is made of, at "
-        "most; smaller ones make a batch of more lights and views, and read more for each place",
+        description="image layout: largest width and height of the patches in a batch, in texels; smaller "
+        "patches put more lights and views into a batch, and read a larger margin per texel",
     )
     losses: tuple[LossTerm, ...] = Field(
         (LossTerm(kind="relative", weight=1.0),),
         min_length=1,
-        description="what is minimized: {kind, weight}, added up",
+        description="terms of the loss, which are added: {kind, weight}",
     )
-    correction: Correction = Field("linear", description="of the bias that noise leaves in curved losses")
-    robust: float | None = Field(
-        10.0, gt=0, description="errors beyond so many times noise and value count linearly; null: never"
+    correction: Correction = Field(
+        "linear", description="correction of the bias of nonlinear losses by noise"
     )
-    rate: float = Field(3e-2, gt=0, lt=1, description="largest learning rate of the networks (Adam)")
-    texture_rate: float = Field(1e-2, gt=0, lt=1, description="largest learning rate of the textures")
-    final_rate: float = Field(0.01, gt=0, le=1, description="share of the rates that is left at the end")
-    decay: float = Field(
+    huber_delta: float | None = Field(
+        10.0,
+        gt=0,
+        description="Huber threshold: errors beyond this multiple of value and noise count linearly; "
+        "null: no threshold",
+    )
+    learning_rate: Annotated[float, Flag("--learning-rate")] = Field(
+        3e-2, gt=0, lt=1, description="peak learning rate of the networks (Adam)"
+    )
+    texture_learning_rate: float = Field(1e-2, gt=0, lt=1, description="peak learning rate of the textures")
+    final_learning_rate_factor: float = Field(
+        0.01, gt=0, le=1, description="last learning rate over the peak learning rate"
+    )
+    texture_weight_decay: float = Field(
         0.0,
         ge=0,
         le=10,
-        description="pull of texels towards 0: by rate times this per step; in proportion to it more where "
-        "noise is over half the variance of the values",
+        description="weight decay (L2) of the texels per step, times the learning rate; multiplied by 2r "
+        "where the noise-to-signal ratio r of the data exceeds 1/2",
     )
-    weight_decay: float = Field(
+    noise_regularization: float = Field(
         2e5,
         ge=0,
         le=1e9,
-        description="pull of the networks' weights towards 0: by rate times this per step, times "
-        "r min(1, 2r) over the number of queries; r: noise over variance of the values; at most 1",
+        description="weight decay (L2) of the network weights per step, times the learning rate and "
+        "r min(1, 2r) over the number of queries; r: noise-to-signal ratio of the data; at most 1",
     )
-    warmup: int = Field(100, ge=0, description="steps over which the rates rise")
-    calibrate: bool = Field(
-        True, description="at the end, set the mean reflectance at each elevation to that of the data"
+    warmup: int = Field(100, ge=0, description="steps in which the learning rates rise to their peaks")
+    energy_calibration: bool = Field(
+        True, description="after training, scale the mean reflectance at each elevation to that of the data"
     )
     blur: BlurSection = BlurSection()
 
 
 class DataSection(Settings):
-    """How the data are read; what is fitted does not depend on it."""
+    """Reading of the data; the fit does not depend on it."""
 
-    memory: Size = Field(
-        4e9,
-        description="training queries that take more are left on disk and read as needed: 500MB, 4GB",
+    memory: Annotated[Size, Flag("--memory", "SIZE")] = Field(
+        4e9, description="memory for training queries: 500MB, 4GB; larger data are streamed from disk"
     )
 
 
 class HeldOutSection(Settings):
-    """Queries of the train split that are kept for judging, never trained on."""
+    """Queries of the train split that are held out for validation."""
 
-    queries: float = Field(0.01, ge=0, lt=0.5, description="share of the queries, at random")
+    queries: float = Field(0.01, ge=0, lt=0.5, description="fraction of the queries, selected at random")
     direction: tuple[float, float] = Field(
         (0.45, 0.3), description="center (x, y) of the held-out region on the projected disk"
     )
     radius: float = Field(
-        0.1, ge=0, lt=1, description="of that region; queries with light or view in it are kept out"
+        0.1, ge=0, lt=1, description="radius of that region; queries with light or view in it are held out"
     )
 
 
-# What a model's paper asks for, where that is not the sections' own default; what is not the paper's was
-# measured (``docs/models.md``).
+# Defaults that depend on the model: those of its paper, or measured ones.
 PRESETS: dict[str, dict[str, Any]] = {
     "neumip-baseline": {"network": {"offset": "none"}},
     "hierarchical": {
         "network": {
             "decoder": "inception",
-            "output": "fourth-root",
+            "output_transform": "fourth-root",
             "encoding": {
                 "position": 10,
                 "direction": 4,
                 "direction_pi": False,
-                "damped": True,
-                "filtered": True,
+                "band_attenuation": True,
+                "footprint_filtered": True,
             },
         },
-        # Whole buffers are held out, and each has one light, view and footprint.
+        # Whole images are held out; each has a single light, view and footprint.
         "held_out": {"queries": 0.05},
     },
 }
 
 
 class FitConfig(Settings):
-    """Everything ``mbtf-fit`` needs besides the shards."""
+    """Every option of ``mbtf-fit`` besides the shards.
 
-    version: Literal[1] = 1
-    model: ModelName = Field("neumip", description="model by name")
-    start: str | None = Field(
-        None, description="folder of a material whose textures and offset training starts from"
+    Parameters
+    ----------
+    model : str
+        ``neumip``, ``neumip-baseline`` or ``hierarchical``.
+    init_from : str, optional
+        Folder of a material that initializes textures and offset.
+    network : NetworkSection
+        Architecture.
+    training : TrainingSection
+        Budget, loss and optimizer.
+    held_out : HeldOutSection
+        Queries that are held out for validation.
+    data : DataSection
+        Reading of the data.
+    seed : int
+        Seed of the initial parameters and of the batch order.
+    device : str
+        ``auto``, ``cpu`` or ``cuda``.
+
+    Raises
+    ------
+    pydantic.ValidationError
+        A key is unknown, or a value is out of range.
+    """
+
+    version: Literal[2] = 2
+    model: Annotated[ModelName, Flag("--model")] = Field("neumip", description="model to fit")
+    init_from: Annotated[str | None, Flag("--init-from", "FOLDER")] = Field(
+        None, description="folder of a material that initializes textures and offset"
     )
     network: NetworkSection = NetworkSection()
     training: TrainingSection = TrainingSection()
     held_out: HeldOutSection = HeldOutSection()
     data: DataSection = DataSection()
-    seed: int = Field(0, ge=0, lt=1 << 63, description="of the first parameters and the order of batches")
-    device: Literal["auto", "cpu", "cuda"] = Field("auto", description="auto: cuda where there is one")
+    seed: Annotated[int, Flag("--seed")] = Field(
+        0, ge=0, lt=1 << 63, description="root seed of all random numbers"
+    )
+    device: Annotated[Literal["auto", "cpu", "cuda"], Flag("--device")] = Field(
+        "auto", description="processor that trains; auto: cuda if available"
+    )
 
     @model_validator(mode="before")
     @classmethod
     def _preset(cls, data: Any) -> Any:
-        """Fill what is not given as the model has it."""
+        """Fill unset keys with the model's defaults."""
         if not isinstance(data, Mapping):
             return data
         name = data.get("model", cls.model_fields["model"].default)
@@ -204,12 +252,12 @@ class FitConfig(Settings):
             raise ValueError("neumip-baseline has no offset: choose the model neumip, or network.offset none")
         if self.model != "hierarchical" and network.decoder == "inception":
             raise ValueError(
-                "the inception decoder looks at neighboring queries: choose the model hierarchical for it"
+                "the inception decoder reads neighboring queries: it needs the model hierarchical"
             )
         return self
 
     def fields(self) -> dict[str, Any]:
-        """What the fit depends on, as plain data: everything but device and memory."""
+        """Options that determine the fit, as plain data: all but device and memory."""
         return self.model_dump(mode="json", exclude={"device", "data"})
 
     def hash(self, data_hash: str) -> str:

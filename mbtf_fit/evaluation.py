@@ -1,4 +1,4 @@
-"""Errors of predictions on a data set, free of the data's noise."""
+"""Errors of predictions on a data set, without the bias of the data's noise."""
 
 from __future__ import annotations
 
@@ -22,15 +22,16 @@ from mbtf_core.stats import (
     signal_variance,
     unexplained_variance,
 )
-from mbtf_fit.data.images import HELD_OUT
-from mbtf_fit.data.loader import SAMPLE, Partition, Queries, load_split, load_training
-from mbtf_fit.material.transmittance_fit import TransmittanceError, has_holes, judge_transmittance
+from mbtf_fit.data.loader import load_split, load_training
+from mbtf_fit.data.queries import ShardQueries
+from mbtf_fit.data.split import MAX_HELD_OUT_OF_IMAGES, SAMPLE, Partition
+from mbtf_fit.material.transmittance_fit import TransmittanceError, evaluate_transmittance, has_transmittance
 from mbtf_gen.dataset.reader import Dataset
 
 if TYPE_CHECKING:
     from mbtf_fit.material.material import Material
 
-Predict = Callable[[Queries], NDArray[np.float32]]
+Predict = Callable[[ShardQueries], NDArray[np.float32]]
 
 
 @dataclass(frozen=True)
@@ -39,10 +40,14 @@ class Errors:
 
     Attributes
     ----------
-    n : queries
-    mse : mean squared error E[(p-a)(p-b)], without the noise of the data, in 1/sr²
-    variance : of the data's values, without their noise, in 1/sr²
-    unexplained : the former over the latter: 0 is perfect, 1 no better than the mean value
+    n : int
+        Number of queries.
+    mse : Estimate
+        Mean squared error E[(p-a)(p-b)] without the noise of the data, in 1/sr².
+    variance : Estimate
+        Variance of the data's values without their noise, in 1/sr².
+    unexplained : Estimate
+        Unexplained variance mse / variance (1 - R²): 0 is exact, 1 as good as the mean value.
     """
 
     n: int
@@ -72,12 +77,16 @@ class Errors:
 
 @dataclass(frozen=True)
 class SplitErrors:
-    """Errors on one split: overall, by level of detail, by elevation.
+    """Errors on one split: overall, by level, by elevation.
 
     Attributes
     ----------
-    levels : nearest level → errors
-    elevations : (lower, upper) edge of the cosine, of light or view, whichever is lower → errors
+    overall : Errors
+        Of all queries.
+    levels : dict
+        Nearest level → errors.
+    elevations : dict
+        (lower, upper) edge of the smaller cosine of light and view → errors.
     """
 
     overall: Errors
@@ -100,7 +109,7 @@ def _grouped(labels: NDArray[np.int64], *arrays: NDArray[np.float32]) -> dict[in
     return {k: Errors(mse[k].n, mse[k], variance[k], unexplained[k]) for k in mse}
 
 
-def split_errors(predict: Predict, queries: Queries, lattice: Lattice) -> SplitErrors | None:
+def split_errors(predict: Predict, queries: ShardQueries, lattice: Lattice) -> SplitErrors | None:
     """Errors of a prediction on queries; None where there are none."""
     if len(queries) == 0:
         return None
@@ -113,38 +122,37 @@ def split_errors(predict: Predict, queries: Queries, lattice: Lattice) -> SplitE
     )
 
 
-def judge(predict: Predict, data: Dataset, partition: Partition) -> dict[str, SplitErrors]:
-    """Errors of a prediction on ``test``, ``held_out_queries``, ``held_out_directions``, and on ``training``
+def evaluate_splits(predict: Predict, data: Dataset, partition: Partition) -> dict[str, SplitErrors]:
+    """Errors of a prediction on ``test``, ``held_out_queries``, ``held_out_directions`` and ``training``
     queries; a set without queries is left out.
 
-    The last is what the fit made of data that it knows. It is free of their noise like the others, but a fit
-    that follows the noise of its own data comes out better there than it is, by twice the covariance of
-    prediction and noise: the distance to the held-out queries is what it overfits by.
+    The error on training queries is underestimated by twice the covariance of prediction and noise: its
+    distance from the error on held-out queries measures overfitting.
 
     Raises
     ------
-    InputError : a test shard is missing or damaged
+    InputError : a test shard is missing or corrupt
     """
-    parts: dict[str, Queries] = {}
+    parts: dict[str, ShardQueries] = {}
     if "test" in data.splits and data.shards("test"):
         parts["test"] = load_split(data, "test")
     parts["held_out_queries"] = partition.held_out_queries
     parts["held_out_directions"] = partition.held_out_directions
-    # Evaluating a neighborhood per query takes its time, and queries of a buffer have much in common.
+    # The inception decoder is slow, and queries of one image are correlated.
     parts["training"] = partition.sample.take(
-        slice(None, None, SAMPLE // HELD_OUT if data.layout == "image" else 1)
+        slice(None, None, SAMPLE // MAX_HELD_OUT_OF_IMAGES if data.layout == "image" else 1)
     )
     found = {name: split_errors(predict, queries, data.lattice) for name, queries in parts.items()}
     return {name: errors for name, errors in found.items() if errors is not None}
 
 
 def foreign_inputs(material: Material, shards: str | Path) -> list[str]:
-    """Roles of the inputs (height, base_color, …) that differ between a data set and the one that the material
-    was trained on; empty where either does not say what it was made from.
+    """Inputs (height, base_color, …) that differ between a data set and the training data of a material;
+    empty where either records none.
 
     Raises
     ------
-    InputError : shards missing or damaged
+    InputError : shards are missing or corrupt
     """
     trained, given = material.description["data"].get("inputs"), Dataset.open(shards).manifest.get("inputs")
     if not trained or not given:
@@ -158,8 +166,10 @@ class Evaluation:
 
     Attributes
     ----------
-    values : set of queries → errors
-    transmittance : the same of what passes through holes; None unless material and data have some
+    values : dict
+        Split → :class:`SplitErrors` of the values.
+    transmittance : dict or None
+        Split → error of the transmittance; None unless both material and data have one.
     """
 
     values: dict[str, SplitErrors]
@@ -167,15 +177,28 @@ class Evaluation:
 
 
 def evaluate(material: Material, shards: str | Path) -> Evaluation:
-    """Errors of a fitted material on the splits of a data set: ``test``, and what was held out of ``train``.
+    """Evaluate a fitted material on a data set of either layout.
 
-    The held-out queries are those that the material's own configuration keeps out; on another data set than
-    the material was made from they are just queries. Either layout will do: a value depends on its query
-    alone.
+    Held-out queries are selected by the material's own configuration; they are held out only in the data set
+    that the material was fitted to.
+
+    Parameters
+    ----------
+    material : Material
+        The fitted material.
+    shards : str or Path
+        Folder made by ``mbtf-gen``.
+
+    Returns
+    -------
+    Evaluation
+        Errors of values and transmittance on the splits ``test``, ``held_out_queries``,
+        ``held_out_directions`` and ``training``.
 
     Raises
     ------
-    InputError : shards missing, damaged, or of another aspect
+    InputError
+        Shards are missing, corrupt, or of another aspect ratio.
     """
     data = Dataset.open(shards)
     if data.lattice.aspect != material.lattice.aspect:
@@ -184,7 +207,7 @@ def evaluate(material: Material, shards: str | Path) -> Evaluation:
             where=data.folder,
         )
     partition = load_training(data, material.config.held_out, material.config.seed, memory=None)
-    through = None
-    if material.holes is not None and has_holes(data):
-        through = judge_transmittance(material.holes, data, partition.selection)
-    return Evaluation(judge(material.predict, data, partition), through)
+    transmittance = None
+    if material.transmittance is not None and has_transmittance(data):
+        transmittance = evaluate_transmittance(material.transmittance, data, partition.selection)
+    return Evaluation(evaluate_splits(material.predict, data, partition), transmittance)

@@ -1,4 +1,4 @@
-"""What the fitter says about its results, in words and tables."""
+"""Results of the fitter as text and tables."""
 
 from __future__ import annotations
 
@@ -15,46 +15,48 @@ SPLIT_NAMES = {
 }
 
 
-def table(rows: list[list[str]]) -> str:
+def format_table(rows: list[list[str]]) -> str:
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ("  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)) for row in rows)
     return "\n".join(line.rstrip() for line in lines)
 
 
 def describe_errors(errors: dict[str, Any]) -> list[str]:
-    """A table: overall, by level of detail and by lowest cosine; a column per split, with error bars."""
+    """A table of unexplained variance: overall, by level and by lowest cosine; a column per split."""
     splits = list(errors)
     rows = [["unexplained variance", *(SPLIT_NAMES[name] for name in splits)]]
-    rows.append(["all", *(number(errors[name]["unexplained"]) for name in splits)])
+    rows.append(["all", *(format_estimate(errors[name]["unexplained"]) for name in splits)])
     for grouping, label in (("levels", "level"), ("elevations", "cosine")):
         groups = {group: None for name in splits for group in errors[name][grouping]}
         for group in sorted(groups, key=lambda g: float(g.split("-")[0])):
             found = [errors[name][grouping].get(group) for name in splits]
             rows.append(
-                [f"{label} {group}", *("-" if e is None else number(e["unexplained"]) for e in found)]
+                [
+                    f"{label} {group}",
+                    *("-" if e is None else format_estimate(e["unexplained"]) for e in found),
+                ]
             )
     rows.append(["queries", *(str(errors[name]["n"]) for name in splits)])
-    return [*table(rows).splitlines(), *_remarks(errors)]
+    return [*format_table(rows).splitlines(), *_remarks(errors)]
 
 
 def _remarks(errors: dict[str, Any]) -> list[str]:
-    """What surprises in a table of errors, and what helps; nothing where nothing does."""
+    """Notes on undefined and large errors."""
     found = []
     groups = [g for e in errors.values() for g in (e, *e["levels"].values(), *e["elevations"].values())]
     if any(group["unexplained"]["value"] is None for group in groups):
-        found.append("undefined: noise hides how much the values of these queries vary")
+        found.append("undefined: the noise exceeds the variance of these values")
     test = errors.get("test", {}).get("unexplained", {}).get("value")
     if test is not None and test >= 1:
         found.append(
-            "above 1 the mean value alone would do better: more queries (--queries of mbtf-gen), "
-            "more paths for each (--spp) or a wider light (--light-width) give a fit more to go by"
+            "above 1: worse than the mean value; generate more queries (mbtf-gen --queries), more paths per "
+            "query (--spp), or a wider light (--light-width)"
         )
     return found
 
 
 def describe_transmittance(errors: dict[str, Any] | None) -> list[str]:
-    """A line per set: root mean square error, and how much of it noise of the data may be; nothing for
-    materials without holes."""
+    """A line per split: root mean square error, and the bound on its part that is noise of the data."""
     lines = []
     for name, e in (errors or {}).items():
         rms, noise, spread = (
@@ -62,12 +64,12 @@ def describe_transmittance(errors: dict[str, Any] | None) -> list[str]:
         )
         lines.append(
             f"transmittance, {SPLIT_NAMES[name]}: rms error {rms:.3f}, of which noise of the data at most "
-            f"{noise:.3f} (values spread by {spread:.3f}; {e['n']} queries)"
+            f"{noise:.3f} (standard deviation of the values {spread:.3f}; {e['n']} queries)"
         )
     return lines
 
 
-def number(estimate: dict[str, Any]) -> str:
+def format_estimate(estimate: dict[str, Any]) -> str:
     if estimate["value"] is None:
         return "undefined"
     error = "?" if estimate["error"] is None else f"{estimate['error']:.3f}"
@@ -75,7 +77,7 @@ def number(estimate: dict[str, Any]) -> str:
 
 
 def describe_coverage(coverage: dict[str, float]) -> str:
-    """Which levels gradients have reached."""
+    """One line: levels whose texels have received gradients."""
     partly = [f"{share:.1%} of level {level}" for level, share in coverage.items() if share < 1]
     return f"gradients reached every texel{', but only ' + ', '.join(partly) if partly else ''}"
 
@@ -85,7 +87,7 @@ def describe_fit(data: dict[str, Any]) -> str:
     rate = training["steps"] * training["batch"] / max(training["seconds"], 1e-9)
     lines = [
         f"{data['material']}: {data['model']}, {training['steps']} steps of {training['batch']} queries in "
-        f"{clock(training['seconds'])} on {training['device']} by {training.get('path', 'pytorch')} "
+        f"{clock(training['seconds'])} on {training['device']} by {training['backend']} "
         f"({rate / 1e6:.2f} M queries/s)",
         describe_coverage(training["coverage"]),
         *describe_errors(data["errors"]),

@@ -57,10 +57,10 @@ class Job:
         ------
         InputError : the material cannot be used
         """
-        job = cls.of(config, load_material(Path(config.material), config.geometry.tile))
+        job = cls.of(config, load_material(Path(config.material), config.geometry.make_tileable))
         for note in job.material.notes:
             log.info(note)
-        for warning in job.material.warnings_at(config.geometry.height):
+        for warning in job.material.warnings_at(config.geometry.height_scale):
             log.warning(warning)
         log.info(
             "mesh: %d x %d cells, relief %.4g tile widths",
@@ -73,7 +73,7 @@ class Job:
     def of(cls, config: GeneratorConfig, material: Material) -> Job:
         """The job of a material that is loaded."""
         rows, columns = material.height.shape
-        lattice = Lattice.for_map(rows, columns, config.queries.levels)
+        lattice = Lattice.for_map(rows, columns, config.queries.finest)
         return cls(config, material, lattice, config.hash(material.digests))
 
     def plan(self) -> QueryPlan:
@@ -90,7 +90,7 @@ class Job:
             queries.layout,
             self.config.seed,
             self._shard_rows(),
-            queries.window,
+            queries.patch_size,
         )
 
     @property
@@ -99,7 +99,7 @@ class Job:
         queries = self.config.queries
         if queries.layout == "shuffled":
             return 1
-        return self.lattice.texels() if queries.window is None else queries.window**2
+        return self.lattice.texels() if queries.patch_size is None else queries.patch_size**2
 
     def _shard_rows(self) -> int:
         return max(1, self.config.output.shard_queries // self.places)
@@ -107,7 +107,7 @@ class Job:
     @cached_property
     def grid(self) -> HeightGrid:
         """Heights of the mesh."""
-        return self.material.grid(self.config.geometry.height, self.config.geometry.mesh)
+        return self.material.grid(self.config.geometry.height_scale, self.config.geometry.mesh)
 
     @cached_property
     def residual(self) -> tuple[NDArray[np.float64], float] | None:
@@ -131,7 +131,7 @@ class Job:
         error = self.config.queries.target_error
         if split != "train" or error is None:
             return None
-        return Target(error, self.config.queries.cap)
+        return Target(error, self.config.queries.max_spp)
 
     def paths(self, entry: ShardEntry) -> int:
         """Paths that a shard takes."""

@@ -71,9 +71,9 @@ def short_direction(d: Mapping[str, float]) -> str:
     return f"{d['elevation']:g}° / {d['azimuth']:g}°".replace("-", "−")
 
 
-def width(span: float) -> str:
+def width(tiles_across: float) -> str:
     """Width of the field of view."""
-    return f"{span:g} tile{'' if span == 1 else 's'} across"
+    return f"{tiles_across:g} tile{'' if tiles_across == 1 else 's'} across"
 
 
 def levels(found: list[float], finest: int) -> str:

@@ -1,4 +1,4 @@
-"""A recipe at a quality: the generator's and every fit's options, and pictures to match."""
+"""Quality presets of a recipe: options of the generator, of every fit, and of the comparison."""
 
 from __future__ import annotations
 
@@ -6,14 +6,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mbtf_core.config_file import resolve
-from mbtf_fit.config import FitConfig
-from mbtf_fit.presets import FITTER, best_at, fitter_options, overrides_of
+from mbtf_fit.presets import fitter_options, overrides_of
 from mbtf_gen.config.presets import GENERATOR, Quality, as_assignments
 from mbtf_pipeline.recipe import fit_names
-from mbtf_pipeline.stages import hash_of
 
-# Options of the comparison by quality.
+# Options of the comparison by preset.
 COMPARE: dict[Quality, dict[str, Any]] = {
     "draft": {"compare.size": 128, "compare.spp": 32},
     "standard": {"compare.size": 256, "compare.spp": 128},
@@ -23,11 +20,11 @@ COMPARE: dict[Quality, dict[str, Any]] = {
 
 
 def quality_assignments(path: Path, quality: Quality | None, assignments: Sequence[str] = ()) -> list[str]:
-    """``a.b=c`` that bring the recipe of a file to a quality.
+    """Assignments ``a.b=c`` that apply a preset to the recipe of a file.
 
     Parameters
     ----------
-    assignments : those that will be laid over them
+    assignments : those that will override them
 
     Raises
     ------
@@ -37,23 +34,15 @@ def quality_assignments(path: Path, quality: Quality | None, assignments: Sequen
         return []
     out = as_assignments(GENERATOR[quality], "generate.")
     prefixes = fit_names(path)
-    said = overrides_of(path, assignments)
-    for prefix, options in fitter_options(quality, {p: _said_of_fit(said, p) for p in prefixes}).items():
+    given = overrides_of(path, assignments)
+    for prefix, options in fitter_options(quality, {p: _options_of_fit(given, p) for p in prefixes}).items():
         out += as_assignments(options, f"{prefix}.")
     return out + as_assignments(COMPARE[quality])
 
 
-def _said_of_fit(said: Mapping[str, Any], prefix: str) -> dict[str, Any]:
-    """What is said of one fit, with its model: that of its name where none is said."""
+def _options_of_fit(given: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+    """The options set for one fit, with its model: by default that of its name."""
     _, _, name = prefix.partition(".")
-    fits = said.get("fit")
+    fits = given.get("fit")
     fit = fits.get(name) if name and isinstance(fits, Mapping) else fits
     return {"model": name or "neumip", **(fit if isinstance(fit, Mapping) else {})}
-
-
-def settings_hash(quality: Quality) -> str:
-    """Hash of all that a quality sets, and of how the fitter trains otherwise: figures that were measured
-    with other settings are out of date."""
-    options = best_at(quality) | FITTER[quality]
-    training = resolve(FitConfig, assignments=as_assignments(options)).training.model_dump(mode="json")
-    return hash_of([GENERATOR[quality], options, training, COMPARE[quality]])[:12]

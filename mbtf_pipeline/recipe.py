@@ -45,11 +45,11 @@ def _distinct(values: Sequence[Any]) -> Sequence[Any]:
 
 
 Views = Annotated[list[View], Field(min_length=1), AfterValidator(_distinct)]
-Span = Annotated[float, Field(gt=0, le=1e4)]
+TilesAcross = Annotated[float, Field(gt=0, le=1e4)]
 
 
 class CompareSection(Settings):
-    """Pictures of the plane: every view under every light at every span, as reference and as each fit."""
+    """Pictures of the plane: every view under every light at every width, as reference and as each fit."""
 
     views: Views = Field(
         [View(elevation=90, azimuth=-90), View(elevation=35, azimuth=-90)], description="where cameras stand"
@@ -58,7 +58,7 @@ class CompareSection(Settings):
         [Direction(elevation=45, azimuth=45), Direction(elevation=20, azimuth=160)],
         description="where the light comes from",
     )
-    spans: Annotated[list[Span], Field(min_length=1), AfterValidator(_distinct)] = Field(
+    tiles_across: Annotated[list[TilesAcross], Field(min_length=1), AfterValidator(_distinct)] = Field(
         [1.0, 4.0], description="widths of the field of view at the target, in tile widths"
     )
     size: int = Field(256, ge=8, le=4096, description="pixels along each side of a picture")

@@ -60,7 +60,7 @@ class DataSet:
 
 def layout_of(config: FitConfig) -> str:
     """Layout that a fit's model learns from."""
-    from mbtf_fit.models import MODELS
+    from mbtf_fit.models.registry import MODELS
 
     return MODELS[config.model].layout
 

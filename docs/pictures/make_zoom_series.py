@@ -1,11 +1,12 @@
-"""Make docs/pictures/zoom_series.png: a fitted material in Mitsuba beside truly filtered pictures.
+"""Makes docs/pictures/zoom_series.png: a fitted material in Mitsuba beside truly filtered pictures.
 
 From the repository's root, after ``make demo``: ``.venv/bin/python docs/pictures/make_zoom_series.py``.
 Rows: path-traced pixels of the micro-geometry (``mbtf-gen reference --kind pixel``, its command is printed);
-the material with footprints (``mbtf_path``); the material at its finest level everywhere, as unmodified
-integrators read it. One ray per pixel shows aliasing. The script prints, for gray values relative to the
-reference's mean: the picture's mean, its contrast (standard deviation) beside the reference's, and the RMS
-difference without the reference's noise. More contrast than the reference's is aliasing, less is blur.
+the material with footprints (``mbtf_path``); the material at its finest level everywhere, as stock
+integrators read it. One ray per pixel shows aliasing as it is. Printed, of gray
+values and as shares of the reference's mean: the picture's mean, its contrast (standard deviation) beside the
+reference's, and the RMS difference of the two; the reference's noise is taken out. More contrast than the
+reference's is aliasing, less is blur.
 """
 
 from __future__ import annotations
@@ -36,10 +37,17 @@ ROWS = ("reference, 0.5 tiles across", "material, mbtf_path", "material, finest 
 GAP, CAPTION = 6, 24
 
 
-def reference(span: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Truly filtered pixels: two independent halves (SIZE, SIZE, 3)."""
+def reference(tiles_across: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Truly filtered pixels, two independent halves (SIZE, SIZE, 3)."""
     words = ["reference", "assets/turtle_shell", "--view", "{:g},{:g}".format(*VIEW)]
-    words += ["--light", "{:g},{:g}".format(*LIGHT), "--tiles-across", f"{span:g}", "--size", str(SIZE)]
+    words += [
+        "--light",
+        "{:g},{:g}".format(*LIGHT),
+        "--tiles-across",
+        f"{tiles_across:g}",
+        "--size",
+        str(SIZE),
+    ]
     words += ["--spp", str(SPP), "--kind", "pixel", *OPTIONS]
     print("mbtf-gen", *words, flush=True)
     with tempfile.TemporaryDirectory() as folder:
@@ -52,13 +60,13 @@ def reference(span: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return a, b
 
 
-def rendered(mi: Any, span: float, integrator: str) -> NDArray[np.float64]:
+def rendered(mi: Any, tiles_across: float, integrator: str) -> NDArray[np.float64]:
     """The material on a plane under a delta light of unit irradiance, a ray through each pixel's center."""
     import drjit as dr
 
-    camera = Camera(VIEW[0], VIEW[1], span=span, rows=SIZE, columns=SIZE)
+    camera = Camera(VIEW[0], VIEW[1], tiles_across=tiles_across, rows=SIZE, columns=SIZE)
     omega_i = from_angles(*LIGHT)
-    half = 4.0 * span + 1.0
+    half = 4.0 * tiles_across + 1.0
     to_world = mi.ScalarTransform4f().scale([half, half, 1.0])
     # The rectangle's texture coordinates run from 0 to 1; row 0 of images lies at v = 0.
     bsdf = {"type": "mbtf", "material": str(MATERIAL), "uv_scale": 2.0 * half}
@@ -103,17 +111,17 @@ def main() -> None:
     mbtf_fit.mitsuba_plugin.register()
     sheet = Image.new("RGB", (len(TILES_ACROSS) * (SIZE + GAP) - GAP, 3 * (SIZE + CAPTION)), (255, 255, 255))
     draw = ImageDraw.Draw(sheet)
-    for column, span in enumerate(TILES_ACROSS):
-        halves = reference(span)
+    for column, tiles_across in enumerate(TILES_ACROSS):
+        halves = reference(tiles_across)
         truth = 0.5 * (halves[0] + halves[1])
         a, b = (half.mean(-1) for half in halves)
         level = 0.5 * (a.mean() + b.mean())
         contrast = ((a - a.mean()) * (b - b.mean())).mean()
-        pictures = (truth, rendered(mi, span, "mbtf_path"), rendered(mi, span, "path"))
+        pictures = (truth, rendered(mi, tiles_across, "mbtf_path"), rendered(mi, tiles_across, "path"))
         exposure = auto_exposure(truth.astype(np.float32))
         for row, (name, picture) in enumerate(zip(ROWS, pictures, strict=True)):
             place = (column * (SIZE + GAP), row * (SIZE + CAPTION))
-            caption = name if column == 0 else f"{span:g} tiles across" if row == 0 else ""
+            caption = name if column == 0 else f"{tiles_across:g} tiles across" if row == 0 else ""
             draw.text((place[0] + 2, place[1] + 3), caption, (30, 30, 30), ImageFont.load_default(12))
             display = to_display(picture.astype(np.float32), exposure)
             sheet.paste(Image.fromarray(display), (place[0], place[1] + CAPTION))
@@ -122,7 +130,7 @@ def main() -> None:
                 max(float(x), 0.0) ** 0.5 / level for x in (((gray - a) * (gray - b)).mean(), contrast)
             )
             print(
-                f"{span:6g} tiles across, {name:27} mean {gray.mean() / level:.3f}, contrast "
+                f"{tiles_across:6g} tiles across, {name:26} mean {gray.mean() / level:.3f}, contrast "
                 f"{gray.std() / level:.3f} for {true:.3f}, RMS {error:.3f}",
                 flush=True,
             )

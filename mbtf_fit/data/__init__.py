@@ -1,1 +1,1 @@
-"""Training data in memory and on disk, and what is held out of training."""
+"""Data sets as the fitter reads them: queries, images, streamed shards, and the validation split."""

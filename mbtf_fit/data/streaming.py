@@ -1,7 +1,7 @@
-"""Which rows of the shards are trained on, and batches of them read from memory-mapped shards.
+"""Rows of the shards that are trained on, and batches of them read from memory-mapped shards.
 
-Data that do not fit into memory stay where they are. The rows of a batch are the same ones, in the same
-order, as if everything were in memory, so that where the data lie changes nothing but time.
+Data that exceed the memory limit stay on disk. A batch has the same rows in the same order as in memory, so
+that the fit does not depend on where the data lie.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mbtf_fit.data.loader import NEEDED, TrainingQueries, batch_starts, mean_value
+from mbtf_fit.data.queries import NEEDED, TrainingQueries, batch_ranges, batch_starts, mean_value
 from mbtf_gen.dataset.shard_io import Arrays, read_shard
 
-# Rows of a shard between two counts of what is trained on: where to look for a row.
+# Rows of a shard between two cumulative counts of selected rows.
 _BLOCK = 4096
-# Parts of a batch that a message names.
+# Most row ranges that a message names.
 _NAMED = 3
 
 
 class Selection:
-    """Rows of shards that are trained on, numbered through: one bit per row of the data.
+    """Selected rows of shards, numbered consecutively; one bit per row.
 
     Attributes
     ----------
     paths : of the shards
-    starts : number of the first row of each shard, and of all rows
+    starts : index of the first selected row of each shard, and the number of all selected rows
     """
 
     def __init__(self) -> None:
@@ -44,7 +44,7 @@ class Selection:
         return self.starts[-1]
 
     def add(self, path: Path, chosen: NDArray[np.bool_]) -> None:
-        """Append a shard of which the `chosen` rows are trained on."""
+        """Append a shard with a mask of its selected rows."""
         blocks = np.add.reduceat(chosen, np.arange(0, len(chosen), _BLOCK), dtype=np.int64)
         self.paths.append(path)
         self._sizes.append(len(chosen))
@@ -53,7 +53,7 @@ class Selection:
         self.starts.append(self.starts[-1] + int(self._counts[-1][-1]))
 
     def masks(self) -> Iterator[tuple[Path, NDArray[np.bool_]]]:
-        """(shard, which of its rows are trained on)."""
+        """(shard, mask of its selected rows)."""
         for path, bits, size in zip(self.paths, self._bits, self._sizes, strict=True):
             yield path, np.unpackbits(bits, count=size).astype(bool)
 
@@ -66,15 +66,15 @@ class Selection:
         return rows[start - counts[first] : stop - counts[first]]
 
     def pieces(self, start: int, stop: int) -> Iterator[tuple[Path, NDArray[np.int64]]]:
-        """(shard, its rows) that the numbers from `start` to before `stop` stand for."""
+        """(shard, rows) of the selected rows with indices in [start, stop)."""
         for shard, (begin, end) in enumerate(pairwise(self.starts)):
             low, high = max(start, begin), min(stop, end)
             if low < high:
                 yield self.paths[shard], self._rows(shard, low - begin, high - begin)
 
-    def describe(self, numbers: Sequence[range]) -> str:
-        """Numbered rows in words, the first few of them: ``train-00003.npz rows 17-4112``."""
-        found = [piece for part in numbers for piece in self.pieces(part.start, part.stop)]
+    def describe(self, ranges: Sequence[range]) -> str:
+        """Text that names the first few rows: ``train-00003.npz rows 17-4112``."""
+        found = [piece for part in ranges for piece in self.pieces(part.start, part.stop)]
         words = [
             f"{path.name} row{'s' if len(rows) > 1 else ''} "
             + "-".join(str(r) for r in rows[[0, -1][: len(rows)]])
@@ -85,12 +85,12 @@ class Selection:
 
 
 class StreamedQueries:
-    """Training queries that stay on disk; every batch maps the shards that it comes from, and lets them go.
+    """Training queries on disk; each batch maps the shards that it reads, and then releases them.
 
     Parameters
     ----------
-    selection : what is trained on; npz shards
-    device : where batches go
+    selection : rows to train on; npz shards
+    device : of the batches
     """
 
     def __init__(self, selection: Selection, device: torch.device | None = None) -> None:
@@ -101,16 +101,15 @@ class StreamedQueries:
         return len(self.selection)
 
     def to(self, device: torch.device) -> StreamedQueries:
-        """The same with batches on another device."""
+        """The same queries with batches on another device."""
         return StreamedQueries(self.selection, device)
 
-    def numbers(self, size: int, seed: int, step: int) -> list[range]:
-        """Numbers of the queries in the batch of a step."""
-        start = next(batch_starts(len(self), size, seed, step))
-        return [range(start, start + size)]
+    def batch_ranges(self, size: int, seed: int, step: int) -> list[range]:
+        """Indices of the queries in the batch of a step."""
+        return batch_ranges(len(self), size, seed, step)
 
     def slice(self, start: int, stop: int) -> TrainingQueries:
-        """Consecutive queries, read now."""
+        """Consecutive queries, read from disk."""
         parts: list[Arrays] = []
         for path, rows in self.selection.pieces(start, stop):
             mapped = read_shard(path, NEEDED)
@@ -121,7 +120,7 @@ class StreamedQueries:
         return TrainingQueries(**{k: torch.from_numpy(v) for k, v in joined.items()}).to(self.device)
 
     def batches(self, size: int, seed: int, step: int, margin: int = 0) -> Iterator[TrainingQueries]:
-        """As :meth:`TrainingQueries.batches`; the next batch is read while the present one is trained on."""
+        """As :meth:`TrainingQueries.batches`; a thread reads the next batch in the meantime."""
         starts = batch_starts(len(self), size, seed, step)
         with ThreadPoolExecutor(1) as reader:
             first = next(starts)

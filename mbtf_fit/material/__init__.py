@@ -1,1 +1,1 @@
-"""The fitted material: its folder, its evaluation, its exports."""
+"""Fitted materials: folder, evaluation, transmittance, exports."""

@@ -1,6 +1,6 @@
-"""The material folder's vocabulary: names, schema, conventions in words, and what a reader checks first.
+"""Format of material folders: names, schema, conventions, and checks of a reader.
 
-Free of PyTorch, so that renderers can read a material without it.
+Does not import PyTorch, so that renderers can read a material without it.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from mbtf_core.lattice import MAX_LEVEL
 from mbtf_core.suggest import suggest_path
 
 FORMAT_NAME = "mbtf-material"
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 DESCRIPTION_NAME = "material.json"
 WEIGHTS_NAME = "weights.safetensors"
-# Queries with expected values that every exported material carries.
+# Conformance queries, with expected values, of every exported material.
 CONFORMANCE_COUNT = 256
 CONFORMANCE = ("u", "sigma", "omega_i", "omega_o", "rgb")
 
@@ -34,7 +34,7 @@ class _Weights(BaseModel):
     texels: int
 
 
-class _Holes(BaseModel):
+class _Transmittance(BaseModel):
     sha256: str
 
 
@@ -60,7 +60,7 @@ class _Training(BaseModel):
 
 
 class _Description(BaseModel):
-    """What readers of ``material.json`` rely on; it holds more."""
+    """Keys of ``material.json`` that readers require; it has more."""
 
     model: str
     config: dict[str, Any]
@@ -70,15 +70,15 @@ class _Description(BaseModel):
     conformance: _Conformance
     training: _Training
     data: dict[str, Any]
-    holes: _Holes | None = None
+    transmittance: _Transmittance | None = None
 
 
 def read_description(folder: Path) -> tuple[dict[str, Any], Path]:
-    """Content of a material folder's ``material.json``, checked, and the path of its weights, digest checked.
+    """Content of ``material.json``, validated, and the path of the weights, with their digest verified.
 
     Raises
     ------
-    InputError : missing, damaged, or of another schema
+    InputError : missing, corrupt, or of another schema
     """
     if not folder.is_dir():
         raise InputError("no such folder", where=folder, hint=suggest_path(folder, Path.is_dir))
@@ -98,10 +98,10 @@ def read_description(folder: Path) -> tuple[dict[str, Any], Path]:
             where=path,
             hint="fit it again with this version of mbtf-fit",
         )
-    check_document(_Description, description, path, "fit it again, or fetch it again from where it came")
+    check_document(_Description, description, path, "fit it again, or copy it again")
     weights = folder / WEIGHTS_NAME
     if not weights.is_file() or digest(weights) != description["weights"]["sha256"]:
-        raise InputError("is missing or not the file that material.json describes", where=weights)
+        raise InputError("is missing, or its SHA-256 differs from the one in material.json", where=weights)
     return description, weights
 
 

@@ -11,16 +11,16 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from mbtf_fit.models import NeuralMaterial
+from mbtf_fit.models.interface import NeuralMaterial
 from mbtf_fit.models.neumip import Neumip
 from mbtf_fit.native import Kernel, kernel
 from mbtf_fit.native.library import QueryPointers
 from mbtf_fit.native.model import NativeModel, unsupported_reason
 
-# Queries that are evaluated at a time: bounds memory and keeps activations in the cache.
+# Queries per chunk: bounds memory and keeps activations in the cache.
 _CHUNK = 1 << 15
-# Queries that a thread of its own pays for.
-_SHARE = 1 << 12
+# Fewest queries per thread.
+_PER_THREAD = 1 << 12
 
 
 def evaluate_in_chunks(
@@ -45,7 +45,7 @@ def evaluate_in_chunks(
 def predict(
     model: NeuralMaterial, u: ArrayLike, sigma: ArrayLike, omega_i: ArrayLike, omega_o: ArrayLike
 ) -> NDArray[np.float32]:
-    """Values (n, 3) in 1/sr of a model, clamped at 0 as materials are."""
+    """Values (n, 3) of a model in 1/sr, clamped at 0."""
     found = kernel()
     if found is not None and unsupported_reason(model) is None:
         return _predict_natively(found, model, u, sigma, omega_i, omega_o)
@@ -66,18 +66,18 @@ def _predict_natively(found: Kernel, model: NeuralMaterial, *arrays: ArrayLike) 
     native = NativeModel(found, model)
     out = np.empty((n, 3), np.float32)
 
-    def share(start: int, stop: int) -> None:
+    def evaluate(start: int, stop: int) -> None:
         addresses = (a.ctypes.data + start * a.strides[0] for a in inputs)
         queries = QueryPointers(stop - start, *addresses)
         native.forward(queries, native.state(1), out.ctypes.data + start * out.strides[0], clamp=True)
 
-    count = max(1, min(torch.get_num_threads(), n // _SHARE))
+    count = max(1, min(torch.get_num_threads(), n // _PER_THREAD))
     edges = [n * k // count for k in range(count + 1)]
     if count == 1:
-        share(0, n)
+        evaluate(0, n)
     else:
         with ThreadPoolExecutor(count) as pool:
-            list(pool.map(lambda edge: share(*edge), pairwise(edges)))
-    if model.gain is not None:
-        out *= evaluate_in_chunks(model.gains, torch.device("cpu"), 3, *inputs[1:])
+            list(pool.map(lambda edge: evaluate(*edge), pairwise(edges)))
+    if model.calibration is not None:
+        out *= evaluate_in_chunks(model.calibration_factors, torch.device("cpu"), 3, *inputs[1:])
     return out

@@ -1,4 +1,4 @@
-"""The fitted material: a folder that a renderer can read, and its evaluation."""
+"""The fitted material: its folder, which renderers read, and its evaluation."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mbtf_core.errors import InputError
 from mbtf_core.lattice import Lattice, sigma_of_level
 from mbtf_core.shard_schema import CONVENTIONS
 from mbtf_fit.config import FitConfig
-from mbtf_fit.data.loader import Queries
+from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.material.format import (
     CONFORMANCE,
     CONFORMANCE_COUNT,
@@ -38,11 +38,13 @@ from mbtf_fit.material.transmittance import (
     read_transmittance,
     write_transmittance,
 )
-from mbtf_fit.models import NeuralMaterial, TexturedMaterial, build_model
+from mbtf_fit.models.interface import NeuralMaterial
+from mbtf_fit.models.registry import build_model
+from mbtf_fit.models.textured import TexturedMaterial
 
 
 def conformance_queries(lattice: Lattice) -> dict[str, NDArray[np.float32]]:
-    """The queries of every material of a lattice, all over its arguments; seams and end levels included."""
+    """Conformance queries of a lattice; they include seams and the first and last level."""
     random = np.random.Generator(np.random.Philox(key=[0x636F6E66, lattice.finest]))
     u = random.random((CONFORMANCE_COUNT, 2))
     seams = [
@@ -73,31 +75,49 @@ class Material:
 
     Attributes
     ----------
-    model : with its weights, ready to evaluate
-    config : that it was fitted with
-    description : content of ``material.json``
-    conformance : the stored queries with their expected values ``rgb`` (n, 3)
-    holes : what it lets through; None for one without holes
+    model : TexturedMaterial
+        The model with its weights.
+    config : FitConfig
+        Options of the fit.
+    description : dict
+        Content of ``material.json``.
+    conformance : dict of str to float32 array
+        Conformance queries ``u`` (n, 2), ``sigma`` (n,), ``omega_i`` and ``omega_o`` (n, 3), and their
+        expected values ``rgb`` (n, 3).
+    transmittance : Transmittance or None
+        Transparent fraction of footprints; None for an opaque material.
     """
 
     model: TexturedMaterial
     config: FitConfig
     description: dict[str, Any]
     conformance: dict[str, NDArray[np.float32]]
-    holes: Transmittance | None = None
+    transmittance: Transmittance | None = None
 
     @classmethod
     def load(cls, folder: str | Path, device: str = "cpu") -> Material:
-        """Load an exported material.
+        """Load a material.
+
+        Parameters
+        ----------
+        folder : str or Path
+            Folder made by ``mbtf-fit``.
+        device : str
+            PyTorch device of the weights.
+
+        Returns
+        -------
+        Material
 
         Raises
         ------
-        InputError : missing, damaged, or of another schema
+        InputError
+            The folder is missing, corrupt, or of another schema.
         """
         description, weights = read_description(Path(folder))
         config = build(FitConfig, description["config"], source=str(weights.with_name(DESCRIPTION_NAME)))
         lattice = Lattice(description["levels"]["finest"], description["tile"]["aspect"])
-        # Before memory is taken for a model that the weights cannot fill.
+        # A small file cannot ask for the memory of a large model.
         number = 2 if description["weights"].get("dtype") == "float16" else 4
         if number * lattice.texels() * config.network.channels > weights.stat().st_size:
             raise InputError("is too small for the levels that material.json describes", where=weights)
@@ -128,28 +148,43 @@ class Material:
 
         Parameters
         ----------
-        u : (n, 2) uv, any real numbers: the tile repeats
-        sigma : (n,) tile widths; outside the material's levels the nearest level answers
-        omega_i, omega_o : (n, 3) unit vectors towards light and viewer, z > 0
+        u : (n, 2) float array
+            Positions on the reference plane, uv; the tile repeats.
+        sigma : (n,) float array
+            Standard deviations of the footprints in tile widths, clamped to the material's levels.
+        omega_i, omega_o : (n, 3) float array
+            Unit vectors towards light and viewer, z > 0.
 
         Returns
         -------
-        (n, 3)
+        (n, 3) float32 array
         """
         return predict(self.model, u, sigma, omega_i, omega_o)
 
     def offset(self, u: ArrayLike, omega_o: ArrayLike) -> NDArray[np.float32]:
-        """By how much the material moves its lookup at `u` (n, 2) seen from `omega_o` (n, 3): (n, 2) in tile
-        widths along u and v; zero for a model without offsets."""
+        """Evaluate the neural offset of the texture lookup.
+
+        Parameters
+        ----------
+        u : (n, 2) float array
+            Positions on the reference plane, uv.
+        omega_o : (n, 3) float array
+            Unit vectors towards the viewer, z > 0.
+
+        Returns
+        -------
+        (n, 2) float32 array
+            Offsets along u and v in tile widths; zero for a model without offset.
+        """
         device = next(self.model.parameters()).device
         return evaluate_in_chunks(self.model.offset, device, 2, u, omega_o)
 
-    def predict(self, queries: Queries) -> NDArray[np.float32]:
+    def predict(self, queries: ShardQueries) -> NDArray[np.float32]:
         """:meth:`evaluate` at queries of a data set."""
         return self.evaluate(queries.u, queries.sigma, queries.omega_i, queries.omega_o)
 
     def deviation(self) -> float:
-        """Largest difference between the stored conformance values and what is evaluated here, in 1/sr."""
+        """Largest deviation of this machine from the conformance values, in 1/sr."""
         found = self.evaluate(*(self.conformance[name] for name in CONFORMANCE[:-1]))
         return float(np.abs(found - self.conformance["rgb"]).max())
 
@@ -172,26 +207,26 @@ def export(
     data: dict[str, Any],
     training: dict[str, Any],
     half: bool = False,
-    holes: Transmittance | None = None,
+    transmittance: Transmittance | None = None,
 ) -> Material:
     """Write a model as a material and return it as read back.
 
     Parameters
     ----------
-    data : what identifies the data set
+    data : identity of the data set
     training : summary of the training: steps, seconds, errors
-    half : store 16-bit floats; the model's numbers are such already
-    holes : what the material lets through; None for one without holes
+    half : store 16-bit floats; the weights are rounded already
+    transmittance : None for an opaque material
 
     Raises
     ------
     PartialError : the folder cannot be written
     """
     lattice = model.lattice
-    stated: dict[str, Any] = {}
-    if holes is not None:
-        write_transmittance(holes, folder / TRANSMITTANCE_NAME)
-        stated["holes"] = {"file": TRANSMITTANCE_NAME, "sha256": digest(folder / TRANSMITTANCE_NAME)}
+    extra: dict[str, Any] = {}
+    if transmittance is not None:
+        write_transmittance(transmittance, folder / TRANSMITTANCE_NAME)
+        extra["transmittance"] = {"file": TRANSMITTANCE_NAME, "sha256": digest(folder / TRANSMITTANCE_NAME)}
     queries = conformance_queries(lattice)
     weights = model.weights()
     if half:
@@ -229,7 +264,7 @@ def export(
                 "tolerance": 1e-4,
                 "note": "evaluating the first four must give the fifth within tolerance * max(1, value)",
             },
-            **stated,
+            **extra,
             "config": config.model_dump(mode="json"),
             "data": data,
             "training": training,

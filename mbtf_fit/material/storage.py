@@ -16,16 +16,16 @@ _KEY = "mbtf"
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder and those above it, where they are not there yet.
+    """Create a folder and its parents.
 
     Raises
     ------
-    InputError : it cannot be made
+    InputError : it cannot be created
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"cannot be made ({error.strerror})", where=folder) from None
+        raise InputError(f"cannot be created ({error.strerror})", where=folder) from None
 
 
 def write_tensors(path: Path, tensors: dict[str, Tensor], data: dict[str, Any]) -> None:
@@ -47,11 +47,11 @@ def write_tensors(path: Path, tensors: dict[str, Tensor], data: dict[str, Any]) 
 
 
 def read_tensors(path: Path, device: torch.device | str = "cpu") -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """What :func:`write_tensors` wrote.
+    """Read a file of :func:`write_tensors`: (tensors, data).
 
     Raises
     ------
-    InputError : missing or damaged
+    InputError : missing or corrupt
     """
     from safetensors import SafetensorError, safe_open
 

@@ -1,12 +1,13 @@
-r"""What a material with holes lets through: a small model beside the networks.
+r"""Transmittance of a material with an opacity mask: a polynomial model beside the networks.
 
-The data's ``transmittance`` is the share of a footprint that is seen through holes. It depends on position,
-footprint and view, not on the light. Here every texel of every level holds the coefficients of a quadratic
-polynomial of the view's projection on the plane,
+The data's ``transmittance`` is the fraction of a footprint that is transparent. It depends on position,
+footprint and view, not on the light. Every texel of every level stores the coefficients of a quadratic
+polynomial in the view's projection onto the plane,
 
     T(u, σ, ω_o) = clamp(c_0 + c_1 x + c_2 y + c_3 x² + c_4 x y + c_5 y², 0, 1),  (x, y) = ω_o.xy
 
-read as features are: bilinear in a level, linear between two. :mod:`mbtf_fit.material.transmittance_fit` finds them.
+with bilinear interpolation in a level and linear interpolation between levels, like the features.
+:mod:`mbtf_fit.material.transmittance_fit` fits them.
 """
 
 from __future__ import annotations
@@ -26,10 +27,10 @@ TRANSMITTANCE_NAME = "transmittance.safetensors"
 COEFFICIENTS = 6
 # For a reader of an export.
 FORMULA = (
-    "share of the footprint that is seen through holes: clamp(c0 + c1 x + c2 y + c3 x^2 + c4 x y + c5 y^2, "
-    "0, 1), where x, y = omega_o.x, omega_o.y and c = the textures transmittance.0 ... transmittance.k at u "
-    "(not moved by any offset), blended by level as features are; a view from below sees the share of the "
-    "opposite one from above; values are premultiplied: they hold what comes back, and nothing of what passes"
+    "transparent fraction of the footprint: clamp(c0 + c1 x + c2 y + c3 x^2 + c4 x y + c5 y^2, 0, 1), where "
+    "x, y = omega_o.x, omega_o.y and c = the textures transmittance.0 ... transmittance.k at u (without the "
+    "neural offset), blended by level like the features; a view from below has the transmittance of the "
+    "opposite view from above; values are premultiplied: reflected light only, without transmitted light"
 )
 
 F32 = NDArray[np.float32]
@@ -37,7 +38,7 @@ F64 = NDArray[np.float64]
 
 
 def basis(omega_o: ArrayLike) -> F64:
-    """(n, 6) polynomials of views (n, 3)."""
+    """Monomials (n, 6) of views (n, 3)."""
     x, y = np.asarray(omega_o, np.float64)[:, :2].T
     return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], -1)
 
@@ -57,7 +58,7 @@ def corners(u: ArrayLike, shape: tuple[int, int]) -> tuple[NDArray[np.int64], F6
 
 
 class Transmittance:
-    """The fitted model.
+    """The fitted polynomial model.
 
     Parameters
     ----------
@@ -103,7 +104,7 @@ def _write(stream: BinaryIO, content: bytes) -> None:
 
 
 def read_transmittance(folder: Path, description: Mapping[str, Any]) -> Transmittance | None:
-    """The model of a material folder; None where the material has no holes.
+    """The transmittance of a material folder; None for an opaque material.
 
     Parameters
     ----------
@@ -111,14 +112,14 @@ def read_transmittance(folder: Path, description: Mapping[str, Any]) -> Transmit
 
     Raises
     ------
-    InputError : missing or damaged
+    InputError : missing or corrupt
     """
-    stated = description.get("holes")
+    stated = description.get("transmittance")
     if stated is None:
         return None
     path = folder / TRANSMITTANCE_NAME
     if not path.is_file() or digest(path) != stated["sha256"]:
-        raise InputError("is missing or not the file that material.json describes", where=path)
+        raise InputError("is missing, or its SHA-256 differs from the one in material.json", where=path)
     from safetensors.numpy import load_file
 
     lattice = Lattice(description["levels"]["finest"], description["tile"]["aspect"])

@@ -1,7 +1,7 @@
-"""Fit of the :mod:`~mbtf_fit.material.transmittance` of a data set in closed form, and its error.
+"""Closed-form fit of the :mod:`~mbtf_fit.material.transmittance` of a data set, and its error.
 
-A level's coefficients are the least-squares fit to the queries around each texel, drawn towards those of the
-next coarser level where queries are few (ridge regression).
+The coefficients of a level are the least-squares fit to the queries around each texel. Ridge regression
+regularizes them towards the next coarser level where queries are few.
 """
 
 from __future__ import annotations
@@ -23,29 +23,29 @@ from mbtf_gen.dataset.shard_io import Arrays, read_shard
 if TYPE_CHECKING:
     from mbtf_fit.data.streaming import Selection
 
-# Queries that the coarser level counts for, and at the coarsest one the coefficient 0.
+# Weight of the coarser level in queries; at the coarsest level, that of the coefficient 0.
 _PRIOR, _FIRST_PRIOR = 4.0, 1e-3
 # Trailing axes of the arrays that are read.
 _TRAILING = {"u": (2,), "sigma": (), "omega_o": (3,), "transmittance": (), "spp": ()}
-# Queries, and texels, that are worked on at a time; queries of a set that are judged at most.
-_BLOCK, _TEXELS, _JUDGED = 1 << 16, 1 << 16, 1 << 18
+# Queries and texels per block; most queries of a split that are evaluated.
+_BLOCK, _TEXELS, _EVALUATED = 1 << 16, 1 << 16, 1 << 18
 # Upper triangle of a texel's matrix.
 _PAIRS = [(a, b) for a in range(COEFFICIENTS) for b in range(a, COEFFICIENTS)]
 _TEXEL_BYTES = 8 * (len(_PAIRS) + COEFFICIENTS)
-# Bytes that sums may take; what needs more is summed in several passes over the shards.
+# Bytes for the sums; more need several passes over the shards.
 MEMORY = 1e9
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 
-def has_holes(data: Dataset) -> bool:
-    """Whether a data set tells what passes through holes."""
+def has_transmittance(data: Dataset) -> bool:
+    """Whether a data set has a transmittance."""
     return "transmittance" in data.manifest.get("arrays", {})
 
 
 def _blocks(path: Path, chosen: NDArray[np.bool_] | None = None) -> Iterator[Arrays]:
-    """The arrays of chosen rows of a shard (all by default), some queries at a time: axes (n, ...)."""
+    """Blocks of arrays (n, ...) of the chosen rows of a shard, or of all."""
     arrays = read_shard(path, _TRAILING)
     count = len(arrays["sigma"])
     rows = np.arange(count) if chosen is None else np.flatnonzero(chosen)
@@ -64,14 +64,14 @@ class _Sums:
         self.products = np.zeros((COEFFICIENTS, count))
 
     def add(self, block: Arrays) -> None:
-        """Take in queries."""
+        """Add a block of queries."""
         level = np.clip(level_of_sigma(block["sigma"].astype(np.float64)), 0.0, self.lattice.finest)
         near = np.flatnonzero(np.abs(level - self.level) < 1.0)
         texel, share = corners(block["u"][near], self.lattice.shape(self.level))
         share *= (1.0 - np.abs(level[near] - self.level))[:, None]
         inside = (texel >= self.first) & (texel < self.first + self.count)
         query = np.broadcast_to(np.arange(len(near))[:, None], texel.shape)[inside]
-        # Most texels of a fine level see none of a block's queries.
+        # Most texels of a fine level have no query in the block.
         found, index = np.unique(texel[inside] - self.first, return_inverse=True)
         weight, terms = share[inside], basis(block["omega_o"][near])
         through = block["transmittance"][near].astype(np.float64)
@@ -83,7 +83,7 @@ class _Sums:
             self.products[a, found] += np.bincount(index, x, len(found))
 
     def solve(self, levels: list[F32]) -> None:
-        """Write the texels of the level into `levels`, of which the coarser one is complete."""
+        """Solve for the texels of the level and write them to `levels`, whose coarser level is complete."""
         out = levels[self.level].reshape(-1, COEFFICIENTS)
         ridge = _PRIOR if self.level else _FIRST_PRIOR
         for start in range(0, self.count, _TEXELS):
@@ -128,14 +128,14 @@ def _passes(lattice: Lattice, memory: float) -> list[list[tuple[int, int, int]]]
 
 
 def fit_transmittance(data: Dataset, selection: Selection, memory: float = MEMORY) -> Transmittance | None:
-    """Fit the model to what is trained on; None for a material without holes.
+    """Fit the transmittance to the training queries; None for an opaque material.
 
     Parameters
     ----------
-    selection : rows of the shards that are trained on, as in :class:`~mbtf_fit.data.loader.Partition`
-    memory : bytes that sums may take
+    selection : rows of the shards that are trained on, as in :class:`~mbtf_fit.data.split.Partition`
+    memory : bytes for the sums
     """
-    if not has_holes(data):
+    if not has_transmittance(data):
         return None
     lattice = data.lattice
     levels = [np.zeros((*lattice.shape(s), COEFFICIENTS), np.float32) for s in range(lattice.finest + 1)]
@@ -152,14 +152,14 @@ def fit_transmittance(data: Dataset, selection: Selection, memory: float = MEMOR
 
 @dataclass(frozen=True)
 class TransmittanceError:
-    """How far a model is from the transmittance of queries.
+    """Error of a transmittance model on queries.
 
     Attributes
     ----------
     n : queries
-    mse : mean squared difference from the data, their noise included: a query has one estimate alone
-    noise : what of it the data's noise may be, at most: ``t (1 - t) / (paths - 1)``, that of independent
-        paths, which evenly placed ones stay below
+    mse : mean squared difference from the data, including their noise: each query has a single estimate
+    noise : upper bound of the noise in it, ``t (1 - t) / (paths - 1)``, the variance of independent paths;
+        stratified paths have less
     variance : of the data's transmittance, noise included
     """
 
@@ -178,11 +178,11 @@ class TransmittanceError:
         }
 
 
-def judge_transmittance(
+def evaluate_transmittance(
     model: Transmittance, data: Dataset, selection: Selection
 ) -> dict[str, TransmittanceError]:
-    """Errors on ``test``, on ``held_out`` (queries and directions that were kept out of training), and on
-    ``training`` queries; the first 262 144 of each, a set without queries is left out."""
+    """Errors on ``test``, ``held_out`` and ``training`` queries: the first 262 144 of each; a split without
+    queries is left out."""
     sets: dict[str, Iterator[Arrays]] = {}
     if "test" in data.splits:
         sets["test"] = (block for shard in data.shards("test") for block in _blocks(shard.path))
@@ -194,7 +194,7 @@ def judge_transmittance(
 
 def _error(model: Transmittance, blocks: Iterator[Arrays]) -> TransmittanceError | None:
     squares, noises, values = [], [], []
-    left = _JUDGED
+    left = _EVALUATED
     for block in blocks:
         part = {name: array[:left] for name, array in block.items()}
         t = part["transmittance"].astype(np.float64)

@@ -121,7 +121,7 @@ class MbtfBSDF(mi.BSDF):
         flags |= mi.BSDFFlags.Anisotropic
         self.m_components = [flags]
         self.m_flags = flags
-        self.has_holes = stored.holes is not None
+        self.has_holes = stored.transmittance is not None
         if self.has_holes:
             through = mi.BSDFFlags.Null | mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide
             through |= mi.BSDFFlags.SpatiallyVarying

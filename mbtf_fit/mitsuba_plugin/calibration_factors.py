@@ -14,7 +14,7 @@ import numpy as np
 from mbtf_fit.mitsuba_plugin.material_arrays import F32
 
 
-class Gains:
+class CalibrationFactors:
     """The tables of a material.
 
     Parameters

@@ -33,7 +33,7 @@ def encode(
     unit = math.pi if pi else 1.0
     frequencies = [unit * 2.0**k for k in range(bands)]
     pairs = [dr.sincos(x * f) for x in p for f in frequencies]
-    if options.damped:
+    if options.band_attenuation:
         pairs = [(s * 0.5**k, c * 0.5**k) for (s, c), k in zip(pairs, [*range(bands)] * len(p), strict=True)]
     if spread is not None:
         left = [dr.exp(-0.5 * dr.square(s * f)) for s in spread for f in frequencies]
@@ -43,7 +43,7 @@ def encode(
 
 def encode_direction(omega: Any, options: EncodingSection) -> list[Any]:
     """What networks see of a direction."""
-    coordinates = [omega.x, omega.y, omega.z] if options.lifted else [omega.x, omega.y]
+    coordinates = [omega.x, omega.y, omega.z] if options.direction_xyz else [omega.x, omega.y]
     return encode(coordinates, options.direction, options.direction_pi, options)
 
 
@@ -53,14 +53,14 @@ def encode_position(u: Any, level: Any, aspect: float, options: EncodingSection)
         return []
     p = [2.0 * (x - dr.floor(x)) - 1.0 for x in (u.x, u.y)]
     spread = None
-    if options.filtered:
+    if options.footprint_filtered:
         across = dr.exp2(-level)
         spread = [across, across / aspect]
     return encode(p, options.position, options.pi, options, spread)
 
 
 def _mapped(x: Any, name: str) -> Any:
-    if name == "exp-1":
+    if name == "expm1":
         return dr.exp(x) - 1.0
     if name == "exp":
         return dr.exp(x)
@@ -74,9 +74,11 @@ def _mapped(x: Any, name: str) -> Any:
 def to_value(x: Sequence[Any], unit: float, network: NetworkSection) -> Any:
     """Value (Color3f) in 1/sr, at least 0, of a decoder's answers."""
     if len(x) == 3:
-        colors = [unit * _mapped(v, network.output) for v in x]
+        colors = [unit * _mapped(v, network.output_transform) for v in x]
     else:
         rgb = [sum(weight * v for weight, v in zip(row, x[:3], strict=True) if weight) for row in RGB_OF_YUV]
         gates = [GATE + dr.rcp(1.0 + dr.exp(-v)) for v in x[3:]]
-        colors = [unit * _mapped(v, network.output) * gate for v, gate in zip(rgb, gates, strict=True)]
+        colors = [
+            unit * _mapped(v, network.output_transform) * gate for v, gate in zip(rgb, gates, strict=True)
+        ]
     return mi.Color3f(*(dr.maximum(v, 0.0) for v in colors))

@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbtf_fit.mitsuba_plugin.calibration_factors import Gains
+from mbtf_fit.mitsuba_plugin.calibration_factors import CalibrationFactors
 from mbtf_fit.mitsuba_plugin.encodings import encode_direction, encode_position, to_value
 from mbtf_fit.mitsuba_plugin.material_arrays import F32, StoredMaterial
 from mbtf_fit.mitsuba_plugin.network import (
@@ -46,9 +46,9 @@ class Evaluator:
         self.unit = stored.unit
         weights = count_weights(stored.decoder) + count_weights(stored.offset_network or [])
         self.arithmetic: Arithmetic = default_arithmetic(weights) if arithmetic is None else arithmetic
-        self.gains = None if stored.gain is None else Gains(stored.gain)
+        self.factors = None if stored.calibration is None else CalibrationFactors(stored.calibration)
         self.pyramid = Textures(stored.pyramid)
-        self.holes = None if stored.holes is None else Textures(stored.holes)
+        self.coefficients = None if stored.transmittance is None else Textures(stored.transmittance)
         self.decoder = Network(stored.decoder, self.arithmetic, stored.network.activation)
         self.offset_texture: Textures | None = None
         if stored.offset_texture is not None and stored.offset_network is not None:
@@ -81,25 +81,27 @@ class Evaluator:
         read = self.pyramid.blended if self.network.blending == "blend" else self.pyramid.side_by_side
         encoded = encode_position(u, level, self.lattice.aspect, self.network.encoding)
         features = [*read(moved, level), *encoded]
-        return features if self.gains is None else [*features, *self.gains.by_view(level, omega_o.z), level]
+        return (
+            features if self.factors is None else [*features, *self.factors.by_view(level, omega_o.z), level]
+        )
 
     def value(self, features: list[Any], omega_i: Any, omega_o: Any) -> Any:
         """Stage 2: value (Color3f) in 1/sr, at least 0."""
         options = self.network.encoding
         directions = [*encode_direction(omega_i, options), *encode_direction(omega_o, options)]
-        if self.gains is None:
+        if self.factors is None:
             return to_value(self.decoder([*features, *directions]), self.unit, self.network)
         *features, red, green, blue, level = features
         value = to_value(self.decoder([*features, *directions]), self.unit, self.network)
-        return value * mi.Color3f(red, green, blue) * self.gains.by_light(level, omega_i.z)
+        return value * mi.Color3f(red, green, blue) * self.factors.by_light(level, omega_i.z)
 
     def transmittance(self, u: Any, level: Any, omega_o: Any) -> Any:
         """Share of the footprint that is seen through holes, of unit vectors on either side of the plane: a
         line passes both ways. The formula is that of :mod:`mbtf_fit.material.transmittance`."""
-        if self.holes is None:
+        if self.coefficients is None:
             return mi.Float(0.0)
         x, y = (dr.mulsign(w, omega_o.z) for w in (omega_o.x, omega_o.y))
-        c = self.holes.blended(u, level)
+        c = self.coefficients.blended(u, level)
         value = c[0] + c[1] * x + c[2] * y + c[3] * x * x + c[4] * x * y + c[5] * y * y
         return dr.clip(value, 0.0, 1.0)
 

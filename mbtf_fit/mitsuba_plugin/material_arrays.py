@@ -34,8 +34,8 @@ class StoredMaterial:
     decoder : layers of the network that gives the value
     offset_texture, offset_network : those of the neural offset; None without one
     unit : factor of the value, 1/sr
-    gain : (2, levels, knots, 3) factors by light's and view's elevation; None where there are none
-    holes : (rows, columns, 6) coefficients of the transmittance of each level; None without holes
+    calibration : (2, levels, knots, 3) factors by light's and view's elevation; None where there are none
+    transmittance : (rows, columns, 6) coefficients of each level; None for an opaque material
     conformance : queries ``u``, ``sigma``, ``omega_i``, ``omega_o`` and their values ``rgb`` (n, 3)
     """
 
@@ -47,8 +47,8 @@ class StoredMaterial:
     offset_texture: F32 | None
     offset_network: Layers | None
     unit: float
-    gain: F32 | None
-    holes: list[F32] | None
+    calibration: F32 | None
+    transmittance: list[F32] | None
     conformance: dict[str, F32]
 
 
@@ -69,7 +69,7 @@ def read_material(folder: str | Path) -> StoredMaterial:
     }
     conformance = check_conformance(stored, description, weights)
     reader = _Reader(tensors, weights)
-    holes = read_transmittance(folder, description)
+    transmittance = read_transmittance(folder, description)
     pyramid = [reader.texture(f"pyramid.{s}", lattice.shape(s)) for s in range(lattice.finest + 1)]
     channels = pyramid[0].shape[2]
     offset_texture, offset_network = None, None
@@ -78,19 +78,19 @@ def read_material(folder: str | Path) -> StoredMaterial:
         answers = 1 if network.offset == "depth" else 2
         offset_network = reader.layers("offset_network", offset_texture.shape[2] + 2, answers)
     features = channels * (2 if network.blending == "concatenate" else 1)
-    directions = 2 * _size(3 if network.encoding.lifted else 2, network.encoding.direction, network)
+    directions = 2 * _size(3 if network.encoding.direction_xyz else 2, network.encoding.direction, network)
     position = _size(2, network.encoding.position, network) if network.encoding.position else 0
     return StoredMaterial(
         folder,
         lattice,
         network,
         pyramid,
-        reader.layers("decoder", features + position + directions, network.outputs),
+        reader.layers("decoder", features + position + directions, network.output_channels),
         offset_texture,
         offset_network,
         float(reader.take("unit", ())),
-        reader.take("gain", (2, lattice.finest + 1, None, 3)) if "gain" in tensors else None,
-        None if holes is None else holes.levels,
+        reader.take("calibration", (2, lattice.finest + 1, None, 3)) if "calibration" in tensors else None,
+        None if transmittance is None else transmittance.levels,
         conformance,
     )
 

@@ -1,8 +1,8 @@
-"""Gaussian blur of periodic textures, and how it shrinks while a model is trained.
+"""Gaussian blur of periodic textures, and its annealing during training.
 
-Textures that are trained through a blur learn their coarse content first; detail follows as the blur shrinks.
-Without it neighboring texels and the offset network settle on parallaxes that do not fit together, and
-levels that few queries read keep the noise they started with (NeuMIP, section 4.3).
+Blurred textures learn coarse content first, and details as the blur shrinks. Without blur, neighboring texels
+and the offset network converge to inconsistent parallaxes, and levels with few queries keep their random
+initialization (NeuMIP, section 4.3).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def gaussian_taps(sigma: float, size: int) -> Tensor:
     if 2 * reach + 1 > size:
         index = torch.arange(-reach, reach + 1) % size
         taps = torch.zeros(size, dtype=torch.float64).index_add_(0, index, taps)
-        # Centerd again: texel 0 of the period in the middle of an odd number of taps.
+        # Centered again: texel 0 of the period in the middle of an odd number of taps.
         half = (size - 1) // 2
         even = taps[size // 2 : size // 2 + 1] / 2 if size % 2 == 0 else taps[:0]
         taps = torch.cat([even, taps[-half:] if half else taps[:0], taps[: half + 1], even])
@@ -82,12 +82,12 @@ def blur_texture(texture: Tensor, sigma: float) -> Tensor:
     return out
 
 
-def annealed_sigma(share: float, start: float, end: float) -> float:
-    """Blur in texels of the finest level when `share` of the annealing is over: ``start·(end/start)^share``.
+def annealed_sigma(fraction: float, start: float, end: float) -> float:
+    """Blur in texels of the finest level after a fraction of the annealing: ``start·(end/start)^fraction``.
 
-    The paper's ``8·2^(-t/3333)`` steps is the same curve; here its end is a share of the budget instead of
-    an iteration, so that it is reached however long one trains. 0 (no blur) from then on.
+    The paper's ``8·2^(-t/3333)`` in steps t is the same curve. Here it ends at a fraction of the budget, and
+    is 0 from then on.
     """
-    if start <= 0 or share >= 1:
+    if start <= 0 or fraction >= 1:
         return 0.0
-    return start * (end / start) ** max(share, 0.0)
+    return start * (end / start) ** max(fraction, 0.0)

@@ -1,6 +1,6 @@
-"""Factors of a value by its level and the elevations of light and view, read from small tables.
+"""Calibration factors of a value by level and elevation of light and view, interpolated in small tables.
 
-A fit's tables come from :mod:`mbtf_fit.training.calibration`; what they are for stands there.
+:mod:`mbtf_fit.training.calibration` derives and fits the tables.
 """
 
 from __future__ import annotations
@@ -8,13 +8,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-# Along the cosine: 0, 1/16, ..., 1.
+# Knots of the cosine: 0, 1/16, ..., 1.
 KNOTS = 17
 
 
-def look_up_gain(table: Tensor, level: Tensor, cosine: Tensor) -> Tensor:
-    """Factors (n, 3) of a table (levels, knots, 3) at fractional levels (n,) and cosines (n,): linear between
-    knots, which stand at equal distances from 0 to 1, and between levels."""
+def interpolate_factors(table: Tensor, level: Tensor, cosine: Tensor) -> Tensor:
+    """Factors (n, 3) of a table (levels, knots, 3) at fractional levels (n,) and cosines (n,): bilinear
+    between levels and knots, which are equidistant in [0, 1]."""
     last = max(1, table.shape[0] - 1)
     # An image whose rows are levels, in the coordinates of grid_sample: corners at -1 and 1.
     place = torch.stack([2.0 * cosine - 1.0, (2.0 / last) * level - 1.0], -1)

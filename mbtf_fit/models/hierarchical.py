@@ -1,23 +1,22 @@
 """The hierarchical neural material.
 
 Xue, Zhao, Jensen, Montazeri: *A Hierarchical Architecture for Neural Materials*, Computer Graphics Forum
-2024: NeuMIP's pyramid and offset, positions and directions as sines and cosines, a decoder of Inception
-modules that sees neighboring queries, and the fourth root of the value as its answer.
+2024: NeuMIP's pyramid and offset, encoded positions and directions, a decoder of Inception modules that reads
+neighboring queries, and the fourth root of the value as its output.
 
-What is done here in its own way:
+Deviations from the paper:
 
-- **The neighbors are places of the material, not of a picture.** The decoder reads a grid of 9 × 9 places
-  around the query, one texel apart, of the level nearest to its footprint. So the value is a function of the
-  query alone, as every renderer needs it; in the paper it depends on which queries happen to stand beside it.
+- **The neighbors are positions of the material, not pixels of an image.** The decoder reads a grid of 9 × 9
+  samples around the query, one texel of the level nearest to its footprint apart. The value is therefore a
+  function of the query alone, as renderers require; in the paper it depends on the neighboring pixels.
 - The grid wraps around the tile; the published code pads with zeros.
-- Training reads the same grids out of buffers, whose queries stand one per texel at random places within it;
-  where they stand at the texels' centers, training and evaluation give the same numbers.
-- Positions are encoded as ``p = 2u - 1`` with π, so that nothing jumps at the tile's seam, and before the
-  offset moves them; raw coordinates are not kept.
-- Encodings are filtered by the footprint and damped, and directions go without π: as in the paper, they keep
-  short fits from learning (``docs/models.md``). ``network.encoding`` has the paper's and the published code's
-  choices.
-- The answer x stands for the value ``unit · x|x|³``, an odd function.
+- Training reads the same grids from images, which have one query at a random position in each texel. For
+  queries at the texels' centers, training and evaluation are identical.
+- Positions are encoded as ``p = 2u - 1`` with π, so that the encoding is continuous at the tile's seam, and
+  before the offset; raw coordinates are omitted.
+- Encodings are filtered by the footprint and attenuated, and directions are encoded without π: with the
+  paper's choices short fits do not converge (they remain available in ``network.encoding``).
+- The output x is the value ``unit · x|x|³``, an odd function.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ from mbtf_fit.models.textured import TexturedMaterial
 
 
 class Hierarchical(TexturedMaterial):
-    """Textures, offset, and a decoder that sees a neighborhood in material space.
+    """Textures, offset, and a decoder that reads a neighborhood on the material.
 
     With ``network.decoder: mlp`` the neighborhood is the query alone.
     """
@@ -46,14 +45,19 @@ class Hierarchical(TexturedMaterial):
         network = self.network
         if network.decoder == "mlp":
             hidden = [network.width] * (network.layers - 1)
-            return Mlp([features + directions, *hidden, network.outputs], network.activation)
+            return Mlp([features + directions, *hidden, network.output_channels], network.activation)
         return InceptionDecoder(
-            features, directions, network.width, network.layers - 2, network.outputs, network.activation
+            features,
+            directions,
+            network.width,
+            network.layers - 2,
+            network.output_channels,
+            network.activation,
         )
 
     @property
     def margin(self) -> int:
-        """Places on each side of the query that the decoder sees."""
+        """Radius of the decoder's receptive field, in texels of the nearest level."""
         return self.decoder.margin if isinstance(self.decoder, InceptionDecoder) else 0
 
     def nearest_shape(self, sigma: Tensor) -> Tensor:
@@ -63,8 +67,8 @@ class Hierarchical(TexturedMaterial):
         return shapes.to(sigma.device)[nearest]
 
     def neighborhood(self, u: Tensor, sigma: Tensor) -> Tensor:
-        """Places (n, 2·margin+1, 2·margin+1, 2) around `u` (n, 2), a texel of the nearest level apart: image
-        rows downwards, columns to the right."""
+        """Positions (n, 2·margin+1, 2·margin+1, 2) around `u` (n, 2), a texel of the nearest level apart:
+        image rows downwards, columns to the right."""
         rows, columns = self.nearest_shape(sigma).to(u.dtype).unbind(1)
         steps = torch.arange(-self.margin, self.margin + 1, dtype=u.dtype, device=u.device)
         along_u = u[:, :1] + steps / columns[:, None]
@@ -74,17 +78,17 @@ class Hierarchical(TexturedMaterial):
             [along_u[:, None].expand(-1, size, -1), along_v[:, :, None].expand(-1, -1, size)], -1
         )
 
-    def see(self, u: Tensor, sigma: Tensor, omega_o: Tensor) -> Tensor:
-        """Features (items, rows, columns, f) at places (items, rows, columns, 2) that share footprint
+    def read_features(self, u: Tensor, sigma: Tensor, omega_o: Tensor) -> Tensor:
+        """Features (items, rows, columns, f) at positions (items, rows, columns, 2) that share footprint
         (items,) and view (items, 3)."""
         items, rows, columns, _ = u.shape
-        places = rows * columns
+        count = rows * columns
         features = self.features(
-            u.reshape(-1, 2), sigma.repeat_interleave(places), omega_o.repeat_interleave(places, 0)
+            u.reshape(-1, 2), sigma.repeat_interleave(count), omega_o.repeat_interleave(count, 0)
         )
         return features.view(items, rows, columns, -1)
 
-    def answer(self, features: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
+    def decode(self, features: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
         """Values (items, rows-2·margin, columns-2·margin, 3) of features (items, rows, columns, f) that share
         light and view (items, 3)."""
         directions = self.directions(omega_i, omega_o)
@@ -95,14 +99,14 @@ class Hierarchical(TexturedMaterial):
         x: Tensor = self.decoder(torch.cat([features, repeated], -1).flatten(0, 2))
         return self.to_value(x).view(items, rows, columns, 3)
 
-    def crops(self, u: Tensor, sigma: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
-        return self.answer(self.see(u, sigma, omega_o), omega_i, omega_o)
+    def evaluate_patches(self, u: Tensor, sigma: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
+        return self.decode(self.read_features(u, sigma, omega_o), omega_i, omega_o)
 
     def stage1(self, u: Tensor, sigma: Tensor, omega_o: Tensor) -> Tensor:
-        return self.see(self.neighborhood(u, sigma), sigma, omega_o)
+        return self.read_features(self.neighborhood(u, sigma), sigma, omega_o)
 
     def stage2(self, features: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
-        return self.answer(features, omega_i, omega_o)[:, 0, 0]
+        return self.decode(features, omega_i, omega_o)[:, 0, 0]
 
     def formula(self) -> dict[str, str]:
         if self.margin == 0:
@@ -110,10 +114,10 @@ class Hierarchical(TexturedMaterial):
         size = 2 * self.margin + 1
         level = "level s = floor(clamp(-log2(2 sigma), 0, k) + 1/2), of rows(s) x columns(s) texels"
         return {
-            "places": f"a grid of {size} x {size} places (u + i / columns(s), v - j / rows(s)), i and j = "
+            "samples": f"{size} x {size} positions (u + i / columns(s), v - j / rows(s)), i and j = "
             f"-{self.margin}..{self.margin}, at {level}; each is u in what follows, up to features",
             **super().formula(),
-            "x": "decoder(features at all places, light, view) at the middle: 1x1 convolution 'first' over "
+            "x": "decoder(features at all samples, light, view) at the middle: 1x1 convolution 'first' over "
             "(features, light, view); Inception modules 0, 1, ...; 1x1 convolution 'last'; no padding. A "
             "module joins one(x), three(before3(x)), five(before5(x)) and pooled(3x3 maximum of x); an "
             "activation follows every convolution but the last",

@@ -1,9 +1,9 @@
-"""A decoder that looks at the neighborhood: 1×1 convolution, Inception modules, 1×1 convolution.
+"""The inception decoder, which reads a neighborhood: 1×1 convolution, Inception modules, 1×1 convolution.
 
 Xue, Zhao, Jensen, Montazeri: *A Hierarchical Architecture for Neural Materials*, Computer Graphics Forum
 2024. An Inception module (Szegedy et al., CVPR 2015) joins four branches: 1×1; 1×1 then 3×3; 1×1 then 5×5;
-3×3 maximum then 1×1. Arrays are (items, rows, columns, channels); every module takes two rows and columns
-from each border, so nothing is padded here.
+3×3 maximum then 1×1. Arrays are (items, rows, columns, channels); every module crops two rows and columns
+at each border; there is no padding.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from torch.nn.functional import conv2d, linear, max_pool2d
 
 from mbtf_fit.models.mlp import ACTIVATIONS, Activation
 
-# Rows and columns that an Inception module takes from each border.
+# Rows and columns that an Inception module crops at each border.
 REACH = 2
 
 
 class Convolution(nn.Module):
-    """A convolution's numbers: `weight` (outputs, inputs, size, size) and `bias` (outputs,)."""
+    """Parameters of a convolution: `weight` (outputs, inputs, size, size) and `bias` (outputs,)."""
 
     def __init__(self, inputs: int, outputs: int, size: int = 1) -> None:
         super().__init__()
@@ -83,10 +83,10 @@ class InceptionDecoder(nn.Module):
 
     Parameters
     ----------
-    features, directions : inputs per place, and inputs that all places of an item share
+    features, directions : inputs per sample, and inputs that all samples of an item share
     width : channels between
-    modules : how many; each reaches 2 places further
-    outputs : numbers per place
+    modules : how many; each extends the receptive field by 2 samples
+    outputs : channels per sample
     """
 
     def __init__(
@@ -107,7 +107,7 @@ class InceptionDecoder(nn.Module):
 
     @property
     def margin(self) -> int:
-        """Places on each side that the answer depends on."""
+        """Radius of the receptive field, in samples."""
         return REACH * len(self.modules_)
 
     @property
@@ -121,8 +121,8 @@ class InceptionDecoder(nn.Module):
         return sum(p.numel() for p in self.parameters())
 
     def forward(self, x: Tensor, directions: Tensor) -> Tensor:
-        """Features (items, rows, columns, f) and what an item's places share (items, d) → (items,
-        rows-2·margin, columns-2·margin, outputs)."""
+        """Features (items, rows, columns, f) and inputs shared by an item (items, d) → (items, rows-2·margin,
+        columns-2·margin, outputs)."""
         matrix = self.first.matrix
         shared = linear(directions, matrix[:, self.features :], self.first.bias)
         activate = ACTIVATIONS[self.activation]
@@ -145,7 +145,7 @@ class InceptionDecoder(nn.Module):
         }
 
     def load(self, tensors: Mapping[str, Tensor]) -> None:
-        """Take over what :meth:`export` gave; other entries are ignored."""
+        """Load tensors of :meth:`export`; other entries are ignored."""
         with torch.no_grad():
             for name, layer in self._layers().items():
                 layer.weight.copy_(tensors[f"{name}.weight"])

@@ -1,4 +1,4 @@
-"""What the trainer, the exporter and the renderers know of a model."""
+"""Interface of all models to trainer, exporter and renderers."""
 
 from __future__ import annotations
 
@@ -16,21 +16,28 @@ from mbtf_fit.models.inception import InceptionDecoder
 from mbtf_fit.models.mlp import Mlp
 from mbtf_fit.models.textures import FeatureTextures
 
-# Modules that give and take their numbers by name.
+# Modules that export and load their tensors by name.
 _PARTS = (FeatureTextures, Mlp, InceptionDecoder)
 
 
 class NeuralMaterial(nn.Module, ABC):
     """A model of ``M(u, σ, ω_i, ω_o)`` in two stages, a function of each query alone.
 
-    Stage 1 depends on the view alone and is shared by all lights; stage 2 is evaluated once per light.
+    Stage 1 does not depend on the light; stage 2 is evaluated once per light.
+
+    Parameters
+    ----------
+    lattice : Lattice
+        Texel grids of the tile.
+    network : NetworkSection
+        Architecture.
 
     Attributes
     ----------
-    name : by which configurations and materials call the model
-    layout : layout of the shards that it is trained on
-    lattice : texel grids of the tile
-    network : its architecture
+    name : str
+        Name in configurations and materials.
+    layout : str
+        Layout of the shards that it is trained on.
     """
 
     name: ClassVar[str]
@@ -43,47 +50,55 @@ class NeuralMaterial(nn.Module, ABC):
 
     @property
     def margin(self) -> int:
-        """Places on each side of a query that the value depends on, one texel of the nearest level apart."""
+        """Radius of the neighborhood that the value depends on, in texels of the nearest level."""
         return 0
 
     @property
     def positions(self) -> int:
-        """Places at which stage 1 reads the textures for one query."""
+        """Positions at which stage 1 reads the textures for one query."""
         return (2 * self.margin + 1) ** 2
 
     @abstractmethod
     def initialize(self, generator: torch.Generator, unit: float) -> None:
-        """Draw all parameters anew; `unit` is the typical value of the data in 1/sr, 0
-        for black data: values are multiples of it, so that black is fitted exactly."""
+        """Initialize all parameters at random.
+
+        Parameters
+        ----------
+        generator : torch.Generator
+            Random numbers.
+        unit : float
+            Typical value of the data in 1/sr. Values are multiples of it, so that black data (0) are fitted
+            exactly.
+        """
 
     @abstractmethod
     def stage1(self, u: Tensor, sigma: Tensor, omega_o: Tensor) -> Tensor:
-        """Features (n, ...) at uv positions `u` (n, 2), footprints `sigma` (n,) in tile widths, seen from
+        """Features (n, ...) at uv positions `u` (n, 2), footprints `sigma` (n,) in tile widths and views
         `omega_o` (n, 3)."""
 
     @abstractmethod
     def stage2(self, features: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
-        """Value (n, 3) in 1/sr under light from `omega_i` (n, 3). Not clamped: it may fall below zero."""
+        """Value (n, 3) in 1/sr for light from `omega_i` (n, 3). Not clamped: it may be negative."""
 
     def forward(self, u: Tensor, sigma: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
-        """Both stages."""
+        """Both stages: value (n, 3) in 1/sr."""
         return self.stage2(self.stage1(u, sigma, omega_o), omega_i, omega_o)
 
-    def crops(self, u: Tensor, sigma: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
-        """Values (items, rows, columns, 3) of crops of buffers, as in training.
+    def evaluate_patches(self, u: Tensor, sigma: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
+        """Values (items, rows, columns, 3) of patches, as in training.
 
         Parameters
         ----------
-        u : (items, rows+2·margin, columns+2·margin, 2) places
-        sigma : (items,); omega_i, omega_o : (items, 3), shared by an item's places
+        u : (items, rows+2·margin, columns+2·margin, 2) positions
+        sigma : (items,); omega_i, omega_o : (items, 3), shared by the positions of an item
         """
-        places = u.shape[1] * u.shape[2]
-        each = (a.repeat_interleave(places, 0) for a in (sigma, omega_i, omega_o))
+        count = u.shape[1] * u.shape[2]
+        each = (a.repeat_interleave(count, 0) for a in (sigma, omega_i, omega_o))
         value: Tensor = self(u.reshape(-1, 2), *each)
         return value.view(*u.shape[:3], 3)
 
     def offset(self, u: Tensor, omega_o: Tensor) -> Tensor:
-        """By how much the model moves its lookup, (n, 2) in tile widths; zero where it does not."""
+        """Neural offset of the lookup, (n, 2) in tile widths; zero for a model without offset."""
         return torch.zeros_like(u)
 
     def textures(self) -> list[FeatureTextures]:
@@ -98,11 +113,11 @@ class NeuralMaterial(nn.Module, ABC):
 
     @abstractmethod
     def formula(self) -> dict[str, str]:
-        """How the value is computed from :meth:`weights`, for a reader of the export."""
+        """Formulas of the value in terms of :meth:`weights`, as text for an export."""
 
     def weights(self) -> dict[str, Tensor]:
-        """All numbers of the model by name, as it evaluates now: textures blurred, one tensor (rows, columns,
-        channels) per level; network layers as ``NAME.0.weight`` (outputs, inputs) and ``NAME.0.bias``,
+        """All tensors of the model by name, with the current blur: one tensor (rows, columns, channels) per
+        level of a texture; network layers as ``NAME.0.weight`` (outputs, inputs) and ``NAME.0.bias``,
         convolutions as ``NAME.weight`` (outputs, inputs, rows, columns)."""
         out = {name: buffer.detach().clone() for name, buffer in self.named_buffers()}
         for name, module in self.named_modules():
@@ -111,7 +126,7 @@ class NeuralMaterial(nn.Module, ABC):
         return out
 
     def load_weights(self, tensors: dict[str, Tensor]) -> None:
-        """Take over what :meth:`weights` gave.
+        """Load tensors of :meth:`weights`.
 
         Raises
         ------

@@ -4,9 +4,9 @@ All levels lie one after the other in a single table (texels, channels); level s
 texels from row ``start[s]`` on, image row by image row: row 0 is the side ``v → 1``, texel centers at
 ``((i+½)/W, 1-(j+½)/H)``, wrapped in both directions.
 
-:func:`lookup` is the fast path: gathers by ``embedding_bag``, analytic derivatives, texel gradients added up
-by one sparse product. :func:`lookup_reference` says the same in a few lines of plain PyTorch; the tests hold
-the two equal.
+:func:`lookup` is the fast path: it gathers by ``embedding_bag``, with analytic derivatives and one sparse
+product for the gradients of the texels. :func:`lookup_reference` is the same in plain PyTorch; the tests
+compare both.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from mbtf_core.lattice import Lattice
 
 @dataclass(frozen=True)
 class Packing:
-    """Where each level of a pyramid lies in its table.
+    """Layout of a pyramid's levels in their table.
 
     Attributes
     ----------
@@ -138,12 +138,12 @@ def _interleave(*corners: Tensor) -> Tensor:
 
 
 def _wrap(index: Tensor, size: Any) -> Tensor:
-    """Whole numbers stored as floats, brought to [0, size)."""
+    """Whole numbers stored as floats, modulo size."""
     return index - size * torch.floor(index / size)
 
 
 def find_corners(packing: Packing, u: Tensor, level: Tensor | None) -> Corners:
-    """Which texels queries at `u` (n, 2) and `level` (n,) read."""
+    """Texels that queries at `u` (n, 2) and `level` (n,) read."""
     columns: Any
     rows: Any
     start: Any

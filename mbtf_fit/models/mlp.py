@@ -10,9 +10,9 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
+from mbtf_fit.models.constants import LEAK
+
 Activation = Literal["relu", "leaky-relu", "sine"]
-# Slope of leaky-relu below zero.
-LEAK = 0.01
 ACTIVATIONS: dict[Activation, Callable[[Tensor], Tensor]] = {
     "relu": torch.relu,
     "leaky-relu": lambda x: nn.functional.leaky_relu(x, LEAK),
@@ -21,8 +21,7 @@ ACTIVATIONS: dict[Activation, Callable[[Tensor], Tensor]] = {
 
 
 class _FusedMlp(torch.autograd.Function):
-    """ReLU network with its backward pass written out: activations are overwritten in place, nothing is kept
-    but the layers' outputs."""
+    """ReLU network with a hand-written backward pass, which stores the layers' outputs only."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, *parameters: Tensor) -> Tensor:
@@ -102,7 +101,7 @@ class Mlp(nn.Module):
         }
 
     def load(self, tensors: Mapping[str, Tensor]) -> None:
-        """Take over what :meth:`export` gave; other entries are ignored."""
+        """Load tensors of :meth:`export`; other entries are ignored."""
         with torch.no_grad():
             for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
                 weight.copy_(tensors[f"{k}.weight"])
@@ -117,7 +116,7 @@ class Mlp(nn.Module):
         return out
 
     def reference(self, x: Tensor) -> Tensor:
-        """The same network as plain PyTorch says it."""
+        """The same network in plain PyTorch."""
         last = len(self.weights) - 1
         for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             x = nn.functional.linear(x, weight, bias)

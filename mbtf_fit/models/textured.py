@@ -1,4 +1,4 @@
-"""What all models have in common: a pyramid of learned textures, read at a place that the view moves."""
+"""Common part of all models: a pyramid of learned textures with a neural offset of the lookup."""
 
 from __future__ import annotations
 
@@ -9,13 +9,8 @@ from torch import Tensor, nn
 
 from mbtf_core.lattice import Lattice
 from mbtf_fit.config import NetworkSection
-from mbtf_fit.models.encodings import (
-    direction_size,
-    encode_direction,
-    encode_position,
-    encoding_formula,
-    position_size,
-)
+from mbtf_fit.models.constants import GRAZING, OFFSET_SCALE, direction_size, position_size
+from mbtf_fit.models.encodings import encode_direction, encode_position, encoding_formula
 from mbtf_fit.models.inception import InceptionDecoder
 from mbtf_fit.models.interface import NeuralMaterial
 from mbtf_fit.models.lookup import coarse_level
@@ -23,16 +18,12 @@ from mbtf_fit.models.mlp import Mlp
 from mbtf_fit.models.outputs import output_formula, start_of, to_value
 from mbtf_fit.models.textures import FeatureTextures
 
-# Standard deviation of the features that training starts from.
+# Standard deviation of the initial features.
 FEATURE_SCALE = 0.1
-# Tile widths per unit that the offset network answers.
-OFFSET_SCALE = 0.1
-# Cosine below which the offset grows no further towards grazing views.
-GRAZING = 0.6
 
 
 class TexturedMaterial(NeuralMaterial):
-    """Pyramid, offset and output map; sub-classes say how features are decoded.
+    """Pyramid, offset and output transform; sub-classes decode the features.
 
     Parameters
     ----------
@@ -54,20 +45,19 @@ class TexturedMaterial(NeuralMaterial):
             self.offset_texture = FeatureTextures(
                 lattice, [lattice.finest], network.channels, moves_lookups=True
             )
-            answers = 1 if network.offset == "depth" else 2
+            outputs = 1 if network.offset == "depth" else 2
             hidden = [network.width] * (network.layers - 1)
-            self.offset_network = Mlp([network.channels + 2, *hidden, answers], network.activation)
+            self.offset_network = Mlp([network.channels + 2, *hidden, outputs], network.activation)
 
     @abstractmethod
     def _make_decoder(self, features: int, directions: int) -> Mlp | InceptionDecoder:
-        """The decoder of so many features (encoded position included) and encoded coordinates of light and
-        view."""
+        """The decoder: inputs are features (encoded position included) and encoded light and view."""
 
     def initialize(self, generator: torch.Generator, unit: float) -> None:
         nn.init.normal_(self.pyramid.texels, std=FEATURE_SCALE, generator=generator)
         self.decoder.initialize(generator)
         with torch.no_grad():
-            start = start_of(self.network.output, self.network.outputs)
+            start = start_of(self.network.output_transform, self.network.output_channels)
             self.decoder.last_bias.copy_(torch.tensor(start))
         self.unit.fill_(unit)
         if self.network.offset != "none":
@@ -77,8 +67,8 @@ class TexturedMaterial(NeuralMaterial):
     def offset(self, u: Tensor, omega_o: Tensor) -> Tensor:
         if self.network.offset == "none":
             return torch.zeros_like(u)
-        seen = torch.cat([self.offset_texture(u), omega_o[:, :2]], 1)
-        r: Tensor = OFFSET_SCALE * self.offset_network(seen)
+        inputs = torch.cat([self.offset_texture(u), omega_o[:, :2]], 1)
+        r: Tensor = OFFSET_SCALE * self.offset_network(inputs)
         if self.network.offset == "direct":
             return r
         return r * (omega_o[:, :2] / omega_o[:, 2:].clamp_min(GRAZING))
@@ -92,12 +82,12 @@ class TexturedMaterial(NeuralMaterial):
         coarse, weight = coarse_level(level, self.lattice.finest + 1)
         low = (1 - weight)[:, None] * self.pyramid(u, coarse)
         high = weight[:, None] * self.pyramid(u, coarse + 1)
-        # Every level keeps its side, so that nothing jumps where the coarser level becomes the finer one.
+        # Even and odd levels keep their order, so that the result is continuous at whole levels.
         odd = (coarse.remainder(2) == 1)[:, None]
         return torch.cat([torch.where(odd, high, low), torch.where(odd, low, high)], 1)
 
     def features(self, u: Tensor, sigma: Tensor, omega_o: Tensor) -> Tensor:
-        """What the decoder sees of single places `u` (n, 2), footprints (n,) and views (n, 3): (n, f)."""
+        """Inputs (n, f) of the decoder at single positions `u` (n, 2), footprints (n,) and views (n, 3)."""
         moved = u
         if self.network.offset != "none":
             moved = u + self.offset(u, omega_o) / u.new_tensor([1.0, self.lattice.aspect])
@@ -109,17 +99,17 @@ class TexturedMaterial(NeuralMaterial):
         return torch.cat([features, encoded], 1)
 
     def directions(self, omega_i: Tensor, omega_o: Tensor) -> Tensor:
-        """What the decoder sees of light and view (n, 3): (n, d)."""
+        """Inputs (n, d) of the decoder for light and view (n, 3)."""
         options = self.network.encoding
         return torch.cat([encode_direction(omega_i, options), encode_direction(omega_o, options)], 1)
 
     def to_value(self, x: Tensor) -> Tensor:
-        """Values (..., 3) in 1/sr of the decoder's answers."""
-        return to_value(x, self.unit, self.network.output)
+        """Values (..., 3) in 1/sr of the decoder's outputs."""
+        return to_value(x, self.unit, self.network.output_transform)
 
     def formula(self) -> dict[str, str]:
         network, encoding = self.network, self.network.encoding
-        omega = "(x, y, z)" if encoding.lifted else "(x, y)"
+        omega = "(x, y, z)" if encoding.direction_xyz else "(x, y)"
         r = "offset_network(texture offset_texture.0 at u, omega_o.x, omega_o.y)"
         out: dict[str, str] = {}
         if network.offset == "depth":
@@ -136,16 +126,16 @@ class TexturedMaterial(NeuralMaterial):
             out["features"] = f"{textures}, blended by level"
         else:
             out["features"] = (
-                f"{textures}, of the two levels that are blended: each times its weight, first the even "
-                "level, then the odd one"
+                f"{textures}, of the two adjacent levels, each times its weight: first the even level, "
+                "then the odd level"
             )
         if encoding.position:
-            spread = "; s = 2^-level / (1, aspect)" if encoding.filtered else ""
+            spread = "; s = 2^-level / (1, aspect)" if encoding.footprint_filtered else ""
             p = encoding_formula("p = 2 (u mod 1) - 1", encoding.position, encoding.pi, encoding, spread)
             out["features"] += f"; then the position u encoded: {p}"
         out["light, view"] = encoding_formula(
             f"{omega} of omega_i, of omega_o", encoding.direction, encoding.direction_pi, encoding
         )
         out["x"] = "decoder(features, light, view)"
-        out["value"] = output_formula(network.output, network.outputs)
+        out["value"] = output_formula(network.output_transform, network.output_channels)
         return out

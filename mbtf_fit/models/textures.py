@@ -20,12 +20,12 @@ class FeatureTextures(nn.Module):
     lattice : texel grids of the tile
     levels : the lattice's levels to hold, coarsest first; `level` of :meth:`forward` counts from the first
     channels : features per texel
-    moves_lookups : whether the features decide where others are read
+    moves_lookups : whether the features are inputs of the offset network
 
     Attributes
     ----------
     texels : (texels, channels) parameter, all levels one after the other
-    table : what lookups read: the texels, or what :meth:`read` was last given
+    table : table that lookups read: the texels, or the last argument of :meth:`read`
     """
 
     def __init__(
@@ -42,13 +42,13 @@ class FeatureTextures(nn.Module):
         return self.texels if self._table is None else self._table
 
     def read(self, table: Tensor | None) -> None:
-        """Let lookups read a table in place of the texels; None takes it away."""
+        """Let lookups read a table instead of the texels; None restores the texels."""
         # Unblurred, the table is the texels themselves, which must not become a second parameter of the
         # module.
         self._table = None if table is self.texels else table
 
     def blurred(self, sigma: float) -> Tensor:
-        """The texels as a table, through a Gaussian of `sigma` texels of the finest level.
+        """The texels, blurred by a Gaussian of `sigma` texels of the finest level.
 
         Coarser levels get the same blur in tile widths: half as many texels each (as in the published
         code).
@@ -65,7 +65,7 @@ class FeatureTextures(nn.Module):
         return torch.cat(parts)
 
     def export(self) -> dict[str, Tensor]:
-        """``0`` for the coarsest level, ``1``, …: what lookups read now, each (rows, columns, channels)."""
+        """Current table by level, ``0`` the coarsest: (rows, columns, channels) each."""
         starts, table = self.packing.starts, self.table.detach()
         return {
             str(s): table[starts[s] : starts[s + 1]].view(rows, columns, -1).clone()
@@ -73,7 +73,7 @@ class FeatureTextures(nn.Module):
         }
 
     def load(self, tensors: Mapping[str, Tensor]) -> None:
-        """Take over what :meth:`export` gave, to be read without blur; other entries are ignored."""
+        """Load tensors of :meth:`export`, to be read without blur; other entries are ignored."""
         self._table = None
         with torch.no_grad():
             parts = [tensors[str(s)].flatten(0, 1) for s in range(len(self.packing.shapes))]

@@ -1,7 +1,7 @@
 """The compiled kernel: forward and backward of the NeuMIP models, blur and Adam on CPUs.
 
-Written in C, compiled when the package is installed (``setup.py``), called through ctypes. Where it is
-missing, everything runs in PyTorch; the tests hold the two equal.
+Written in C, compiled when the package is installed (``setup.py``), called through ctypes. Without it
+everything runs in PyTorch; the tests compare both.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Adam by the kernel, on the state of PyTorch's own optimizer: either goes on where the other stopped."""
+"""Adam by the kernel, on the state of PyTorch's own optimizer, so that both are interchangeable."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mbtf_fit.native.library import AdamStep, Kernel
 if TYPE_CHECKING:
     from mbtf_fit.objective.parallel import Workers
 
-# Parameters with fewer numbers are one thread's work.
+# Parameters with fewer numbers are updated by one thread.
 _SMALL = 1 << 14
 
 
@@ -48,7 +48,7 @@ def adam(
             )
             tasks.append((step, gradient, parameter, state["exp_avg"], state["exp_avg_sq"]))
 
-    def share(part: int) -> None:
+    def step_part(part: int) -> None:
         for step, *tensors in tasks:
             n = tensors[0].numel()
             first, last = n * part // workers.count, n * (part + 1) // workers.count
@@ -62,4 +62,4 @@ def adam(
                     *(tensor.data_ptr() + 4 * first for tensor in tensors),
                 )
 
-    workers.each(share)
+    workers.each(step_part)

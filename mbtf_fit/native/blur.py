@@ -16,7 +16,7 @@ from mbtf_fit.native.library import Kernel
 if TYPE_CHECKING:
     from mbtf_fit.objective.parallel import Workers
 
-# Textures of fewer texels are one thread's work.
+# Textures of fewer texels are blurred by one thread.
 _SMALL = 1 << 12
 
 
@@ -94,7 +94,8 @@ def _taps(sigma: float, size: int) -> NDArray[np.float32]:
 
 
 def blur_table(kernel: Kernel, texture: FeatureTextures, sigma: float, workers: Workers) -> Tensor:
-    """The texels of a texture through a Gaussian of `sigma` texels of the finest level, as a new table."""
+    """The texels of a texture, blurred by a Gaussian of `sigma` texels of the finest level, as a new
+    table."""
     blur = Blur(kernel, texture, sigma)
     texels = texture.texels.detach()
     if blur.idle:

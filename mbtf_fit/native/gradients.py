@@ -1,9 +1,9 @@
-"""Gradients of a batch by the kernel: every thread works through its share of the queries.
+"""Gradients of a batch by the kernel: every thread computes a part of the queries.
 
-The quadratic losses are the kernel's own: it goes forward and backward block by block. With any other loss a
-share is cut into pieces: each goes forward, through the loss in PyTorch, and backward while its activations
-are still in the cache. Each thread adds to sums of its own; they are added up in a fixed order, so that the
-result depends on the number of threads and on nothing else about them.
+The kernel implements the quadratic losses itself: forward and backward pass, block by block. With any other
+loss a part is cut into pieces: forward pass, loss in PyTorch, and backward pass while the activations are
+still in the cache. Each thread has its own sums, which are added in a fixed order, so that the result depends
+on the number of threads only.
 """
 
 from __future__ import annotations
@@ -13,24 +13,24 @@ import ctypes
 import torch
 from torch import Tensor
 
-from mbtf_fit.data.loader import TrainingQueries
+from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.native.library import GradientSums, QuadraticLoss, QueryPointers
 from mbtf_fit.native.model import NativeModel, aligned, networks, parameters_of, pointers
 from mbtf_fit.objective.losses import Objective, Quadratic
 from mbtf_fit.objective.parallel import Workers
 
-# Bytes of activations that a piece may have: about what a core has of the last cache.
+# Bytes of activations per piece: about a core's part of the last-level cache.
 _PIECE_BYTES = 6 << 20
 
 
 def query_pointers(batch: TrainingQueries, start: int, stop: int) -> QueryPointers:
-    """Where queries [start, stop) of a batch lie; its tensors are contiguous float32."""
+    """Addresses of queries [start, stop) of a batch; its tensors are contiguous float32."""
     arrays = (batch.u, batch.sigma, batch.omega_i, batch.omega_o)
     return QueryPointers(stop - start, *(a.data_ptr() + 4 * start * a.stride(0) for a in arrays))
 
 
 class _Sums:
-    """What one thread adds to, and its working memory."""
+    """Sums and working memory of one thread."""
 
     def __init__(self, native: NativeModel, piece: int) -> None:
         lanes = native.kernel.lanes
@@ -78,7 +78,7 @@ class NativeGradients:
 
         quadratic = objective.quadratic()
 
-        def share(k: int) -> Tensor:
+        def work(k: int) -> Tensor:
             if quadratic is not None:
                 return self._learn(self._sums[k], quadratic, batch, edges[k], edges[k + 1])
             total = torch.zeros(())
@@ -87,11 +87,11 @@ class NativeGradients:
                 total += self._piece(self._sums[k], objective, batch, start, stop)
             return total
 
-        losses = workers.each(share)
+        losses = workers.each(work)
         for k, gradients in enumerate(self.networks):
             self._collect_network(k, gradients)
         workers.each(self._collect_textures)
-        # Always added in the same order: the sum does not depend on who was first.
+        # Added in a fixed order: the sum does not depend on which thread finishes first.
         total = losses[0]
         for loss in losses[1:]:
             total = total + loss
@@ -103,20 +103,20 @@ class NativeGradients:
         bound = (ctypes.c_float * 3)(*(loss.bound or (0.0, 0.0, 0.0)))
         form = QuadraticLoss(loss.relative, loss.squared, loss.scale, bound, bounded)
         queries = query_pointers(batch, start, stop)
-        share = 1.0 / (3 * len(batch))
+        weight = 1.0 / (3 * len(batch))
         total = native.kernel.library.mbtf_learn(
             native.kernel.variant,
             ctypes.byref(native.description),
             ctypes.byref(queries),
             batch.value.data_ptr() + 12 * start,
             ctypes.byref(form),
-            share,
+            weight,
             sums.state.data_ptr(),
             sums.scratch.data_ptr(),
             sums.out.data_ptr(),
             ctypes.byref(sums.pointers),
         )
-        return torch.tensor(share * total)
+        return torch.tensor(weight * total)
 
     def _piece(
         self, sums: _Sums, objective: Objective, batch: TrainingQueries, start: int, stop: int

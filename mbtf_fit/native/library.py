@@ -10,7 +10,7 @@ from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 from typing import Any
 
-# Which kernel runs: "off", or the name of a variant; the fastest that this processor has by default.
+# Environment variable that selects the kernel: "off", or a variant; by default the fastest one.
 ENVIRONMENT = "MBTF_KERNEL"
 # Name of the library in this folder, without suffix.
 LIBRARY = "_kernel"
@@ -144,7 +144,7 @@ class Kernel:
     Attributes
     ----------
     library : functions ``mbtf_*``; calls release the interpreter's lock
-    variant : number of the instruction set, first argument of what is vectorised; name : its name
+    variant : number of the instruction set, first argument of what is vectorized; name : its name
     """
 
     library: Any
@@ -153,7 +153,7 @@ class Kernel:
 
     @property
     def block(self) -> int:
-        """Queries that are worked on at a time."""
+        """Queries per block."""
         return int(self.library.mbtf_block())
 
     @property
@@ -213,21 +213,21 @@ def _load() -> tuple[Kernel | None, str]:
 
 
 def kernel() -> Kernel | None:
-    """The kernel of this installation; None where there is none, see :func:`missing_reason`."""
+    """The kernel of this installation, or None (see :func:`missing_reason`)."""
     return _load()[0]
 
 
 def missing_reason() -> str:
-    """Why :func:`kernel` is None, in some words; empty where it is not."""
+    """Why :func:`kernel` is None; empty if it is not."""
     return _load()[1]
 
 
 def describe() -> str:
-    """What computes on this machine's CPU, in some words."""
+    """Name of this machine's CPU backend."""
     found, reason = _load()
     return f"compiled kernel ({found.name})" if found is not None else f"PyTorch; compiled kernel: {reason}"
 
 
 def reload() -> None:
-    """Look again, after a change of the environment."""
+    """Load again, after a change of the environment."""
     _load.cache_clear()

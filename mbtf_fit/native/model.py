@@ -1,4 +1,4 @@
-"""A PyTorch model as the kernel sees it."""
+"""Description of a PyTorch model for the kernel."""
 
 from __future__ import annotations
 
@@ -9,11 +9,10 @@ import torch
 from torch import Tensor
 
 from mbtf_fit.config import EncodingSection
-from mbtf_fit.models import NeuralMaterial
-from mbtf_fit.models.encodings import direction_size
+from mbtf_fit.models.constants import GRAZING, OFFSET_SCALE, direction_size
+from mbtf_fit.models.interface import NeuralMaterial
 from mbtf_fit.models.mlp import Mlp
 from mbtf_fit.models.neumip import Neumip, NeumipBaseline
-from mbtf_fit.models.textured import GRAZING, OFFSET_SCALE
 from mbtf_fit.models.textures import FeatureTextures
 from mbtf_fit.native.library import (
     MAX_CHANNELS,
@@ -27,29 +26,29 @@ from mbtf_fit.native.library import (
     Textures,
 )
 
-# Options of the architecture that the kernel knows, and their values; any size within its limits will do.
-_KNOWN: dict[str, tuple[Any, ...]] = {
+# Values of the architecture's options that the kernel supports; sizes are limited by the kernel's constants.
+_SUPPORTED: dict[str, tuple[Any, ...]] = {
     "decoder": ("mlp",),
     "activation": ("relu",),
-    "outputs": (3,),
-    "output": ("exp-1",),
+    "output_channels": (3,),
+    "output_transform": ("expm1",),
     "offset": ("depth", "none"),
     "blending": ("blend",),
-    "encoding": tuple(EncodingSection(lifted=lifted).model_dump() for lifted in (False, True)),
+    "encoding": tuple(EncodingSection(direction_xyz=xyz).model_dump() for xyz in (False, True)),
 }
 _SIZES = {"channels", "width", "layers"}
 
 
 def unsupported_reason(model: NeuralMaterial) -> str | None:
-    """Why the kernel cannot evaluate a model, in some words; None where it can."""
+    """Why the kernel cannot evaluate a model; None where it can."""
     if type(model) not in (Neumip, NeumipBaseline):
-        return f"it does not know the model {model.name}"
+        return f"it does not support the model {model.name}"
     options = model.network.model_dump()
-    for name, known in _KNOWN.items():
-        if options.pop(name) not in known:
-            return f"it does not know network.{name}={getattr(model.network, name)}"
+    for name, supported in _SUPPORTED.items():
+        if options.pop(name) not in supported:
+            return f"it does not support network.{name}={getattr(model.network, name)}"
     if options.keys() - _SIZES:
-        return f"it does not know network.{min(options.keys() - _SIZES)}"
+        return f"it does not support network.{min(options.keys() - _SIZES)}"
     tensors = [*model.parameters(), *(t.table for t in model.textures())]
     if any(t.device.type != "cpu" or t.dtype != torch.float32 for t in tensors):
         return "it runs on CPUs, in float32"
@@ -65,7 +64,7 @@ def unsupported_reason(model: NeuralMaterial) -> str | None:
 
 
 def networks(model: NeuralMaterial) -> list[Mlp]:
-    """The networks that the kernel evaluates: the decoder, then the offset's where there is one."""
+    """Networks that the kernel evaluates: the decoder, and the offset network if there is one."""
     assert isinstance(model, Neumip)
     assert isinstance(model.decoder, Mlp)
     return [model.decoder, *([] if model.network.offset == "none" else [model.offset_network])]
@@ -89,9 +88,9 @@ def aligned(floats: int) -> Tensor:
 
 
 class NativeModel:
-    """A model that :func:`unsupported_reason` lets pass, evaluated by the kernel.
+    """A supported model, evaluated by the kernel.
 
-    Holds no numbers of its own: :meth:`refresh` takes over what the model reads and weighs now.
+    :meth:`refresh` copies the model's current weights.
 
     Attributes
     ----------
@@ -128,7 +127,7 @@ class NativeModel:
         return [self.description.pyramid, self.description.offset_texture]
 
     def refresh(self) -> None:
-        """Take over the weights, and the tables that lookups read."""
+        """Copy the current weights, and the tables that lookups read."""
         library, variant = self.kernel.library, self.kernel.variant
         assert isinstance(self.model, Neumip)
         self.description.unit = float(self.model.unit)
@@ -147,7 +146,7 @@ class NativeModel:
         return self.model.textures()
 
     def state(self, queries: int) -> Tensor:
-        """Memory for the activations of so many queries."""
+        """Memory for the activations of a number of queries."""
         blocks = -(-queries // self.kernel.block)
         return aligned(blocks * int(self.kernel.library.mbtf_state_floats(ctypes.byref(self.description))))
 

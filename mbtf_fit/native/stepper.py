@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from mbtf_fit.data.loader import TrainingQueries
-from mbtf_fit.models import NeuralMaterial
+from mbtf_fit.data.queries import TrainingQueries
+from mbtf_fit.models.interface import NeuralMaterial
 from mbtf_fit.native.adam import adam
 from mbtf_fit.native.blur import Blur
 from mbtf_fit.native.gradients import NativeGradients
@@ -19,12 +19,12 @@ from mbtf_fit.objective.parallel import Workers
 
 
 class NativeStepper:
-    """Takes steps of training on one model.
+    """Training steps of one model.
 
     Parameters
     ----------
-    model : that the kernel can evaluate
-    optimizer : keeps the state; what it says of rates and decays holds
+    model : supported by the kernel
+    optimizer : state and learning rates
     """
 
     def __init__(self, kernel: Kernel, model: NeuralMaterial, optimizer: torch.optim.Adam) -> None:

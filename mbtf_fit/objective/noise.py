@@ -1,8 +1,8 @@
-"""How noisy the data are: scales and a variance model, pooled over queries.
+"""Noise of the data: typical value, and a variance model that is pooled over queries.
 
-One pair of halves says next to nothing about the noise of its own query, and a weight made from it depends
-on the noise that it is meant to weigh, which biases whatever it weighs. Pooled over queries the same pairs
-give a variance that depends on a query's value, footprint and directions alone.
+The two halves of a single query hardly determine its noise, and a weight derived from them is correlated with
+that noise, which causes a bias. Pooled over queries, the halves give a variance that depends on value,
+footprint and directions alone.
 """
 
 from __future__ import annotations
@@ -18,32 +18,32 @@ from torch import Tensor
 from mbtf_core.directions import ELEVATION_BANDS
 from mbtf_core.lattice import Lattice
 from mbtf_core.stats import elevation_groups, level_groups, pooled_variance, signal_variance
-from mbtf_fit.data.loader import Queries
+from mbtf_fit.data.queries import ShardQueries
 
-# Queries in a group whose mean is taken before the median over groups.
+# Queries per group of the median of means.
 _GROUP = 1024
 _FEW_GROUPS = 101
-# Cells with fewer queries, and levels with fewer cells, say too little by themselves.
+# Fewest queries of a cell, and fewest cells of a level with coefficients of its own.
 _LEAST_QUERIES = 8
 _LEAST_CELLS = 12
-# Share of the cells, those that stick out most, that the second fit leaves out.
+# Fraction of the cells, those with the largest residuals, that the second fit omits.
 _TRIMMED = 0.05
-# Most that noise is taken to be of the values' variance: where these have none, no ratio tells.
+# Largest noise-to-signal ratio, also of constant values.
 _MOST_NOISE = 5.0
-# Share of the queries, those whose halves are furthest apart, that say nothing about it: damaged ones.
-_WILD = 1e-4
+# Fraction of the queries, those with the largest difference of halves, that the ratio omits as outliers.
+_OUTLIERS = 1e-4
 
 
 def typical_value(values: ArrayLike) -> float:
-    """Mean of values (n, ...), in their unit, that a few wild ones do not move: the median over groups of the
-    groups' means (n in random order). The plain mean where that is 0; 0 where all values are.
+    """Robust mean of values (n, ...) in random order: the median of the means of groups. The plain mean where
+    that is 0.
     """
     flat = np.asarray(values)
     flat = flat.reshape(len(flat), -1)
     n = len(flat)
     groups = max(min(_FEW_GROUPS, n // 8), n // _GROUP, 1)
     size = n // groups
-    # A group that overflows float32 is a wild one, so its infinity does no harm.
+    # A group that overflows float32 is an outlier of the median.
     with np.errstate(over="ignore"):
         means = flat[: size * groups].reshape(groups, -1).mean(1, dtype=np.float64)
     middle = float(np.median(means))
@@ -61,8 +61,8 @@ class NoiseModel:
     overall : (3,) c over all levels
     levels : (k+1, 3) c by nearest level
     bands : factors by band of the lower cosine (``ELEVATION_BANDS``)
-    ratio : noise variance over the variance of the true values, all queries together but for one in 10⁴
-        whose halves are furthest apart; at most 5
+    ratio : noise-to-signal ratio, noise variance over variance of the true values, of all queries but the
+        outliers; at most 5
     """
 
     scale: float
@@ -73,18 +73,18 @@ class NoiseModel:
 
     @classmethod
     def silent(cls, scale: float, lattice: Lattice) -> NoiseModel:
-        """No noise at all."""
+        """No noise."""
         bands = np.ones(len(ELEVATION_BANDS) - 1)
         return cls(scale, np.zeros(3), np.zeros((lattice.finest + 1, 3)), bands, 0.0)
 
     @classmethod
-    def of(cls, queries: Queries, lattice: Lattice, scale: float) -> NoiseModel:
+    def of(cls, queries: ShardQueries, lattice: Lattice, scale: float) -> NoiseModel:
         """Fit to queries (n, ...) with their halves.
 
         Queries are pooled in cells of like level, directions and position; over a cell's queries the means
-        of ``(a-b)²/4``, ``(a+b)/2`` and ``ab`` are unbiased for the noise, t and t². The coefficients, none
-        negative, are fitted to the cells by least squares of relative errors, twice: the second time without
-        the cells that stick out most, so that a few wild values do not decide.
+        of ``(a-b)²/4``, ``(a+b)/2`` and ``ab`` are unbiased for the noise, t and t². Non-negative
+        least squares of relative errors fit the coefficients to the cells, twice: the second time without the
+        cells of largest residuals, so that the fit is robust to outliers.
         """
         if len(queries) == 0 or scale <= 0:
             return cls.silent(scale, lattice)
@@ -119,21 +119,21 @@ class NoiseModel:
         return c0 * self.scale**2 + t * (c1 * self.scale + c2 * t)
 
     def spread(self, value: Tensor) -> Tensor:
-        """``√(s² + noise variance)`` of values t, over all levels: what one query may well be off by."""
+        """``√(s² + noise variance)`` of values t, over all levels: the scale of a query's error."""
         c0, c1, c2 = (float(c) for c in self.overall)
         t = value.abs()
         return ((1 + c0) * self.scale**2 + t * (c1 * self.scale + c2 * t)).sqrt_()
 
 
-def _ratio(queries: Queries) -> float:
+def _ratio(queries: ShardQueries) -> float:
     n = len(queries)
     apart = np.abs(queries.value_a - queries.value_b).reshape(n, -1).max(1)
-    kept = np.sort(np.argsort(apart)[: max(1, n - math.ceil(_WILD * n))])
+    kept = np.sort(np.argsort(apart)[: max(1, n - math.ceil(_OUTLIERS * n))])
     halves = queries.value_a[kept], queries.value_b[kept]
     noise, signal = pooled_variance(*halves).value, signal_variance(*halves).value
     if not noise > 0:
         return 0.0
-    # Not so of NaN either, the variance of a single query.
+    # False for NaN too, the variance of a single query.
     return noise / signal if signal > noise / _MOST_NOISE else _MOST_NOISE
 
 
@@ -142,7 +142,7 @@ def _per_query(array: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _cells(
-    queries: Queries, lattice: Lattice, scale: float
+    queries: ShardQueries, lattice: Lattice, scale: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
     """(level, band, means, counts) of the cells; means (cells, 4) of noise, 1, t and t², in units of s."""
     n = len(queries)
@@ -150,7 +150,7 @@ def _cells(
     columns = np.stack(
         [_per_query((a - b) ** 2 / 4), np.ones(n), _per_query((a + b) / 2), _per_query(a * b)], 1
     )
-    # Buffers share their footprint and directions; the first texel speaks for all.
+    # The queries of an image share footprint and directions.
     sigma = queries.sigma.reshape(n, -1)[:, 0]
     omega_i, omega_o = (w.reshape(n, -1)[:, :3] for w in (queries.omega_i, queries.omega_o))
     level = level_groups(sigma, lattice.finest)

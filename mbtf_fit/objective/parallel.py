@@ -1,8 +1,8 @@
-"""Gradients of one batch, computed by several threads, each on its own share of the queries.
+"""Gradients of one batch by several threads, each on a part of the queries.
 
-A step consists of some hundred small operations. Splitting every one of them over the cores costs a
-rendezvous each, and where another process holds a core for a moment, all wait for it each time. Splitting the
-batch instead costs one rendezvous per step, and the parts that libraries run on one core run side by side.
+A step consists of some hundred small operations. Parallelizing each of them costs a synchronization each, and
+waits for every core that another process uses. Dividing the batch costs one synchronization per step, and
+runs single-threaded operations in parallel.
 """
 
 from __future__ import annotations
@@ -16,28 +16,28 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from mbtf_fit.data.images import Crops
-from mbtf_fit.data.loader import TrainingQueries
+from mbtf_fit.data.images import Patches
+from mbtf_fit.data.queries import TrainingQueries
 
-# Python itself is busy for a part of each step, and one thread at a time: more than these do not pay.
+# Python code runs in one thread at a time: more threads are not faster.
 MAX_THREADS = 4
-# The kernel leaves the interpreter alone; its threads have sums of gradients each.
+# The kernel releases the interpreter's lock; each of its threads has sums of gradients.
 MAX_KERNEL_THREADS = 32
 
 T = TypeVar("T")
 
-Batch = TrainingQueries | Crops
+Batch = TrainingQueries | Patches
 Loss = Callable[[Any], Tensor]
 
 
 class Workers:
-    """Threads that share batches; use as a context manager.
+    """Threads that divide batches; a context manager.
 
     Parameters
     ----------
-    device : on CUDA one thread does it all
-    threads : at most so many; by default as many as cores
-    limit : no more than these in any case
+    device : CUDA uses one thread
+    threads : number of threads; by default that of cores
+    limit : most threads
     """
 
     def __init__(self, device: torch.device, threads: int | None = None, *, limit: int | None = None) -> None:
@@ -48,8 +48,8 @@ class Workers:
         self._pool = ThreadPoolExecutor(self.count) if self.count > 1 else None
 
     def __enter__(self) -> Workers:
-        # Lets the library choose among its matrix products: for matrices this narrow the one it then takes is
-        # twice as fast. Processors with bfloat16 tiles may round factors to 8 bits, which training tolerates.
+        # Allows faster matrix products, twice as fast for narrow matrices. Processors with bfloat16 tiles may
+        # round factors to 8 bits, which training tolerates.
         torch.set_float32_matmul_precision("medium")
         torch.set_num_threads(max(1, self._cores // self.count))
         return self
@@ -63,7 +63,7 @@ class Workers:
         torch.set_float32_matmul_precision(self._precision)
 
     def each(self, work: Callable[[int], T]) -> list[T]:
-        """``work(k)`` for every thread k, run side by side; answers in this order."""
+        """Results of ``work(k)`` for every thread k, in this order."""
         parts = range(self.count)
         return list(map(work, parts) if self._pool is None else self._pool.map(work, parts))
 
@@ -72,7 +72,7 @@ class Workers:
 
         Parameters
         ----------
-        loss : mean over the queries that it is given; called from several threads at a time
+        loss : mean over the queries of its argument; called from several threads
         """
         n = len(batch)
         edges = [n * k // self.count for k in range(self.count + 1)]
@@ -83,7 +83,7 @@ class Workers:
             return value.detach(), torch.autograd.grad(value, inputs)
 
         found = list(map(work, parts) if self._pool is None else self._pool.map(work, parts))
-        # Always added in the same order: the sum does not depend on who was first.
+        # Added in a fixed order: the sum does not depend on which thread finishes first.
         total, gradients = found[0][0], list(found[0][1])
         for value, more in found[1:]:
             total = total + value

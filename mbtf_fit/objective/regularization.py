@@ -1,31 +1,31 @@
-"""Pulls towards 0 beside the gradients: how strong they are, and how they act.
+"""Weight decay of textures and network weights, decoupled from the gradients.
 
-Gone round often enough, few noisy queries are learned by heart. As the penalty of ridge regression does
-(Hoerl and Kennard, Technometrics 12, 1970), both pulls grow with the ratio of noise to signal; that of the
-networks' weights, which all queries have in common, falls with their number. They act apart from gradients
-(Loshchilov and Hutter, ICLR 2019).
+After many epochs a network overfits the noise of few queries. As the penalty of ridge regression does (Hoerl
+and Kennard, Technometrics 12, 1970), both decays grow with the noise-to-signal ratio. The decay of the
+network weights, which all queries share, falls with the number of queries. Both are applied to the parameters
+themselves, not to the gradients (Loshchilov and Hutter, ICLR 2019).
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import torch
 
 from mbtf_fit.config import TrainingSection
-from mbtf_fit.models import NeuralMaterial
+from mbtf_fit.models.interface import NeuralMaterial
 
-# Ratio of noise to signal from which on texels are pulled more than they are asked to be; below it weights
-# are pulled less, so that few but clean queries are learned from freely.
-_PLAIN_NOISE = 0.5
-# Strongest pull of the weights.
+# Noise-to-signal ratio above which the decay of texels grows. Below it the decay of weights falls
+# quadratically, so that few but clean queries are fitted without bias.
+_REFERENCE_NOISE = 0.5
+# Largest decay of the network weights.
 _MOST = 1.0
 
 
 @dataclass(frozen=True)
-class Pull:
-    """By the rate times this per step.
+class WeightDecay:
+    """Decay per step, relative to the learning rate.
 
     Attributes
     ----------
@@ -36,16 +36,20 @@ class Pull:
     weights: float
 
     @classmethod
-    def of(cls, training: TrainingSection, ratio: float, queries: int) -> Pull:
-        """For so many training queries, whose noise variance is `ratio` times that of their true values."""
-        doubt = ratio / _PLAIN_NOISE
-        weights = training.weight_decay * ratio * min(1.0, doubt) / queries
-        return cls(training.decay * max(1.0, doubt), min(_MOST, weights))
+    def of(cls, training: TrainingSection, noise_ratio: float, queries: int) -> WeightDecay:
+        """Decay for a number of training queries with a noise-to-signal ratio (of variances)."""
+        relative = noise_ratio / _REFERENCE_NOISE
+        weights = training.noise_regularization * noise_ratio * min(1.0, relative) / queries
+        return cls(training.texture_weight_decay * max(1.0, relative), min(_MOST, weights))
 
-    def act(self, model: NeuralMaterial, texture_rate: float, rate: float) -> None:
-        """Shrink a model's parameters by one step at these rates."""
+    def as_dict(self) -> dict[str, float]:
+        """Plain data for JSON."""
+        return asdict(self)
+
+    def apply(self, model: NeuralMaterial, texture_rate: float, rate: float) -> None:
+        """Decay a model's parameters by one step at these learning rates."""
         texels, weights = model.parameter_groups()
-        # Biases hold the value that is left when all else has shrunk.
+        # Biases do not decay: they keep the mean value.
         matrices = [p for p in weights if p.ndim > 1]
         with torch.no_grad():
             for parameters, amount in ((texels, texture_rate * self.texels), (matrices, rate * self.weights)):

@@ -1,1 +1,1 @@
-"""Training: one fit from start to end, its schedule, its forecast, several fits at once."""
+"""Training of one fit or of several: schedule, checkpoints, calibration, convergence, forecast."""

@@ -1,20 +1,20 @@
-r"""Mean reflectance of a fit at every elevation, set to that of its data.
+r"""Energy calibration: the mean reflectance at every elevation is scaled to that of the data.
 
-A network of this size errs by directions, and so do the tile's means: by one to six per cent of themselves at
-single elevations, some thirty times what the data leave uncertain. Two factors per color take that out,
+Networks of this size have errors by direction, and so have the tile's means: 1 to 6 % at single elevations,
+30 times the uncertainty of the data. Two factors per color correct them,
 
     M' = M · G_i(l, ω_i,z) · G_o(l, ω_o,z),
 
 each linear between knots of the cosine and between levels. The mean over the tile, and over everything but
-one elevation, is the same at every level: that of the data. With hat functions φ_j about the knots, of the
-light's elevation for G_i and of the view's for G_o, each table therefore solves, level by level,
+one elevation, is equal at all levels: that of the data. With hat functions φ_j about the knots, of the
+light's elevation for G_i and of the view's for G_o, each table is the solution, level by level, of
 
     E[φ_j M'_s] = E[φ_j t] = E[φ_j (t - M_0)] + E[φ_j M_0].
 
-t is a query's noisy value, in which all of this is linear: noise averages out. The first term is a mean over
-training queries, the others are means over low-discrepancy points, over which level 0 is smooth.
-What remains uncertain is known too, so that the equations are solved together with the expectation that
-factors are smooth and near 1: data that say little change little.
+t is a query's noisy value; the equations are linear in it, so that the noise averages out. The first term is
+a mean over training queries, the others are means over low-discrepancy points, over which level 0 is smooth.
+The variance of both is known, and the equations are solved with a prior of smooth factors near 1, so that
+data with large variance change the factors little.
 """
 
 from __future__ import annotations
@@ -29,39 +29,40 @@ from torch import Tensor
 from mbtf_core.directions import from_projected_disk
 from mbtf_core.lattice import Lattice, sigma_of_level
 from mbtf_fit.config import HeldOutSection
-from mbtf_fit.data.loader import TrainingQueries, in_region
+from mbtf_fit.data.queries import TrainingQueries
+from mbtf_fit.data.split import in_region
 from mbtf_fit.data.streaming import StreamedQueries
 from mbtf_fit.models.calibration_factors import KNOTS
 
-# Training queries that are looked at, at most, and at a time.
-MOST = 1 << 22
+# Most training queries that are used, and queries per block.
+MAX_QUERIES = 1 << 22
 _CHUNK = 1 << 18
 # Footprint of level 0.
 _COARSEST = np.float32(0.5)
 # Points per level, at most; fewer where queries are few.
 POINTS = 1 << 20
 _LEAST_POINTS = 1 << 12
-# What may be expected of factors beforehand: second differences between knots, and distances from 1.
+# Prior standard deviations of the factors: of second differences between knots, and of distances from 1.
 CURVATURES, DISTANCES = (0.0003, 0.001, 0.003, 0.01), (0.003, 0.01, 0.03)
 _SECOND = np.diff(np.eye(KNOTS), 2, axis=0)
-# The covariances of factors that go with them: (pairs, knots, knots).
+# Prior covariances of the factors: (pairs, knots, knots).
 _PRIORS = np.stack(
     [
         np.linalg.inv(_SECOND.T @ _SECOND / curvature**2 + np.eye(KNOTS) / distance**2)
         for curvature, distance in product(CURVATURES, DISTANCES)
     ]
 )
-# Relative error of means of level 0 over points, which are even and its values smooth.
+# Relative error of means of level 0 over low-discrepancy points.
 POINT_ERROR = 3e-4
-# Cosines are told apart so finely.
+# Bins of the cosine.
 _BINS = 16 * (KNOTS - 1)
 # Hat functions about the knots at the bins' middles: (bins, knots).
 _HATS = np.stack(
     [np.interp((np.arange(_BINS) + 0.5) / _BINS, np.linspace(0, 1, KNOTS), e) for e in np.eye(KNOTS)], -1
 )
-# Factors stay within this and its inverse.
+# Largest factor; its inverse is the smallest one.
 LARGEST = 2.0
-# G_i and G_o depend on each other: how often they are solved in turn.
+# Alternations between the solutions for G_i and G_o, which depend on each other.
 ROUNDS = 2
 
 F32 = NDArray[np.float32]
@@ -75,9 +76,9 @@ def _bin(omega: F32) -> NDArray[np.int64]:
     return np.minimum((omega[:, 2].astype(np.float64) * _BINS).astype(np.int64), _BINS - 1)
 
 
-def _binned(place: NDArray[np.int64], x: F32 | F64, count: int = _BINS) -> F64:
-    """Sums (count, 3) of numbers (n, 3) by their places."""
-    return np.stack([np.bincount(place, x[:, c], count) for c in range(3)], -1)
+def _binned(index: NDArray[np.int64], x: F32 | F64, count: int = _BINS) -> F64:
+    """Sums (count, 3) of numbers (n, 3) by bin."""
+    return np.stack([np.bincount(index, x[:, c], count) for c in range(3)], -1)
 
 
 def points(start: int, stop: int, largest: float) -> tuple[F32, F32, F32]:
@@ -93,17 +94,17 @@ def points(start: int, stop: int, largest: float) -> tuple[F32, F32, F32]:
 
 
 def solve(products: F64, target: F64, covariance: F64) -> F64:
-    """The likeliest factors (knots,) with ``products · factors ≈ target``, whose errors have this covariance.
+    """Maximum a posteriori factors (knots,) of ``products · factors ≈ target``, with errors of a covariance.
 
-    Of the expectations in :data:`CURVATURES` and :data:`DISTANCES` the pair is taken under which the data are
-    likeliest (empirical Bayes): what noise explains as well is left at 1.
+    The prior is the pair of :data:`CURVATURES` and :data:`DISTANCES` of largest marginal likelihood
+    (empirical Bayes): deviations that noise explains as well leave the factors at 1.
     """
     scale = float(np.abs(products).sum())
     if scale == 0:
         return np.ones(KNOTS)
     products, target, covariance = products / scale, target / scale, covariance / scale**2
     missing = target - products.sum(1)
-    # Knots that nothing is near to have neither products nor errors.
+    # Knots without queries have neither products nor errors.
     covariance = covariance + 1e-12 * np.eye(KNOTS)
     along = _PRIORS @ products.T
     total = products @ along + covariance
@@ -113,7 +114,7 @@ def solve(products: F64, target: F64, covariance: F64) -> F64:
     return np.clip(factors, 1.0 / LARGEST, LARGEST)
 
 
-def fit_gains(
+def fit_calibration(
     evaluate: Evaluate,
     lattice: Lattice,
     queries: TrainingQueries | StreamedQueries,
@@ -125,59 +126,59 @@ def fit_gains(
     Parameters
     ----------
     evaluate : the fit, without factors
-    queries : that it was trained on
-    held_out : which of their directions are missing
-    bound : largest errors of predictions (n, 3) that count; None where all do
+    queries : training queries
+    held_out : region without training queries
+    bound : Huber bound of the errors of predictions (n, 3); None without one
     """
-    used = min(len(queries), MOST)
+    used = min(len(queries), MAX_QUERIES)
     sums, squares = np.zeros((2, _BINS, 3)), np.zeros((2, _BINS, 3))
     largest = 0.0
     for start in range(0, used, _CHUNK):
         part = queries.slice(start, min(start + _CHUNK, used))
         u, sigma, *directions = (a.cpu().numpy() for a in (part.u, part.sigma, part.omega_i, part.omega_o))
         own = evaluate(u, sigma, *directions)
-        missed = part.value.cpu().numpy() - own
+        residual = part.value.cpu().numpy() - own
         most = bound(part.value.new_tensor(own))
         if most is not None:
-            missed = missed.clip(-most.cpu().numpy(), most.cpu().numpy())
-        missed = missed + (own - evaluate(u, np.full_like(sigma, _COARSEST), *directions))
+            residual = residual.clip(-most.cpu().numpy(), most.cpu().numpy())
+        residual = residual + (own - evaluate(u, np.full_like(sigma, _COARSEST), *directions))
         for k, omega in enumerate(directions):
-            sums[k] += _binned(_bin(omega), missed)
-            squares[k] += _binned(_bin(omega), missed.astype(np.float64) ** 2)
+            sums[k] += _binned(_bin(omega), residual)
+            squares[k] += _binned(_bin(omega), residual.astype(np.float64) ** 2)
             largest = max(largest, float(np.hypot(omega[:, 0], omega[:, 1]).max()))
     means, spread, count = _means(evaluate, lattice, held_out, min(largest, 1.0), 2 * used)
     tables = np.ones((2, lattice.finest + 1, KNOTS, 3))
     for s in range(lattice.finest + 1):
         for c, k in product(range(3), (0, 1) * ROUNDS):
-            # Bins of the one elevation, for factors of the other that are known so far.
+            # Sums over the other elevation, with its current factors.
             other = _HATS @ tables[1 - k, s, :, c]
             mine = means[s, ..., c] @ other if k == 0 else other @ means[s, ..., c]
-            wanted = sums[k, :, c] / used + means[0, ..., c].sum(1 - k)
-            unsure = squares[k, :, c] / used**2 + spread[s, ..., c].sum(1 - k) / count
-            target = _HATS.T @ wanted
-            covariance = _HATS.T @ (unsure[:, None] * _HATS) + np.diag((POINT_ERROR * target) ** 2)
+            total = sums[k, :, c] / used + means[0, ..., c].sum(1 - k)
+            variance = squares[k, :, c] / used**2 + spread[s, ..., c].sum(1 - k) / count
+            target = _HATS.T @ total
+            covariance = _HATS.T @ (variance[:, None] * _HATS) + np.diag((POINT_ERROR * target) ** 2)
             tables[k, s, :, c] = solve(_HATS.T @ (mine[:, None] * _HATS), target, covariance)
     return tables.astype(np.float32)
 
 
 def _means(
-    evaluate: Evaluate, lattice: Lattice, held_out: HeldOutSection, largest: float, wanted: int
+    evaluate: Evaluate, lattice: Lattice, held_out: HeldOutSection, largest: float, count: int
 ) -> tuple[F64, F64, int]:
-    """Means over points of a fit's values at each level, and of their squared differences from those of level
-    0, by bins of light and view: (levels, bins, bins, 3) each, shares of a sum of 1; the number of points."""
+    """Means over points of a fit's values at each level, and of their squared differences from level 0, by
+    bins of light and view: (levels, bins, bins, 3) each; and the number of points."""
     out = np.zeros((2, lattice.finest + 1, _BINS * _BINS, 3))
-    seen = 0
-    total = min(POINTS, max(_LEAST_POINTS, wanted))
+    used = 0
+    total = min(POINTS, max(_LEAST_POINTS, count))
     for start in range(0, total, _CHUNK):
         u, light, view = points(start, min(start + _CHUNK, total), largest)
         kept = ~(in_region(held_out, light) | in_region(held_out, view))
         u, light, view = u[kept], light[kept], view[kept]
-        seen += len(u)
-        place, first = _bin(light) * _BINS + _bin(view), np.zeros((0, 3), np.float32)
+        used += len(u)
+        index, first = _bin(light) * _BINS + _bin(view), np.zeros((0, 3), np.float32)
         for s in range(lattice.finest + 1):
             value = evaluate(u, np.full(len(u), sigma_of_level(s), np.float32), light, view)
             first = value if s == 0 else first
-            out[0, s] += _binned(place, value, _BINS * _BINS)
-            out[1, s] += _binned(place, (value - first).astype(np.float64) ** 2, _BINS * _BINS)
-    means, spread = (out / max(seen, 1)).reshape(2, -1, _BINS, _BINS, 3)
-    return means, spread, max(seen, 1)
+            out[0, s] += _binned(index, value, _BINS * _BINS)
+            out[1, s] += _binned(index, (value - first).astype(np.float64) ** 2, _BINS * _BINS)
+    means, spread = (out / max(used, 1)).reshape(2, -1, _BINS, _BINS, 3)
+    return means, spread, max(used, 1)

@@ -1,4 +1,4 @@
-"""What a fit's last seconds bought, and where the next ones are best spent."""
+"""Marginal cost of a fit's error: the training time that would halve it, and the part that is overfitting."""
 
 from __future__ import annotations
 
@@ -9,31 +9,31 @@ from typing import Any
 from mbtf_core.console import clock
 from mbtf_fit.formatting import SPLIT_NAMES
 
-# The record that stands for the middle of training lies between these shares of it.
+# Fractions of the budget between which a record counts as the middle of training.
 _MIDDLE = (0.35, 0.65)
-# A difference counts where it is so many standard errors.
-_CLEAR = 2.0
-# More doublings of the time than these are as good as never.
+# Standard errors that make a difference significant.
+_SIGNIFICANT = 2.0
+# More doublings of the time than these count as never.
 _MOST_DOUBLINGS = 12.0
 
 
 @dataclass(frozen=True)
-class Price:
-    """How the error fell, and what of it is for want of data.
+class MarginalCost:
+    """Convergence of the error at the end of training, and how much of it is overfitting.
 
     Attributes
     ----------
-    looks_at : the set of queries that half and end are of, in words
-    half, half_error : unexplained variance at half of the training time, and its standard error
-    end, end_error : at its end
-    halving : seconds of training more that would halve it if every doubling of the time went on to divide it
-        as the last one did; None where that did not clearly help. Rates that fall towards the end of training
-        flatter the last doubling, so this is a lower bound
-    noise_share : share of the held-out queries' error that is the noise of the training queries, which the
-        fit has learned; None where it is not clearly above zero
+    validation_set : the set of queries that the errors are of, in words
+    half, half_error : unexplained variance after half of the training time, and its standard error
+    end, end_error : the same at the end
+    halving : seconds of training that would halve the error if every doubling of the time divided it as the
+        last one did; None where that one was not significant. The learning rate falls towards the end, which
+        favors the last doubling, so this is a lower bound
+    noise_share : share of the held-out queries' error that is overfitting to the noise of the training
+        queries; None where it is not significant
     """
 
-    looks_at: str
+    validation_set: str
     half: float
     half_error: float
     end: float
@@ -48,59 +48,57 @@ class Price:
     def describe(self) -> str:
         """One line, or two."""
         lines = [
-            f"{self.looks_at} {self.half:.3f} ± {self.half_error:.3f} at half of the time, "
-            f"{self.end:.3f} ± {self.end_error:.3f} at its end"
+            f"unexplained variance of {self.validation_set}: {self.half:.3f} ± {self.half_error:.3f} at half "
+            f"of the training time, {self.end:.3f} ± {self.end_error:.3f} at the end"
         ]
         if self.halving is None:
-            lines[0] += ": more training alone would not help much"
+            lines[0] += "; longer training alone would hardly reduce it"
         else:
-            lines[0] += f"; halving that would take {clock(self.halving)} more at the least"
+            lines[0] += f"; halving the error takes about {clock(self.halving)} more, or longer"
         if self.noise_share is not None:
             lines.append(
-                f"{self.noise_share:.0%} of the error of held-out queries is learned noise of the training "
-                "queries: more queries, or more paths per query, would take it away"
+                f"overfitting to noise is {self.noise_share:.0%} of the error of held-out queries: use more "
+                "queries, or more paths per query"
             )
         return "\n".join(lines)
 
 
-def price_of(
+def marginal_cost_of(
     history: list[dict[str, Any]],
     errors: dict[str, Any],
     noise: float | None = None,
-    looks_at: str = "test",
-) -> Price | None:
-    """Price of a finished fit; None where its history does not tell.
+    validation_set: str = "test",
+) -> MarginalCost | None:
+    """Marginal cost of a finished fit; None where its history does not resolve it.
 
     Parameters
     ----------
-    history : records of the looks at the error, with ``share``, ``seconds``, ``unexplained`` and its
-        ``unexplained_error``
+    history : records with ``fraction``, ``seconds``, ``unexplained`` and ``unexplained_error``
     errors : of the finished fit by split, as plain data
-    noise : variance of the noise in the training values over that of the values; None where it is not known
-    looks_at : the set, among the errors, that was looked at
+    noise : variance of the noise of training values over that of the values; None where unknown
+    validation_set : the split that the history is of
     """
     known = [r for r in history if _number(r.get("unexplained")) and _number(r.get("unexplained_error"))]
-    middle = [r for r in known if _MIDDLE[0] <= r.get("share", -1.0) <= _MIDDLE[1]]
-    if not middle or known[-1].get("share", 0.0) < 1.0:
+    middle = [r for r in known if _MIDDLE[0] <= r.get("fraction", -1.0) <= _MIDDLE[1]]
+    if not middle or known[-1].get("fraction", 0.0) < 1.0:
         return None
-    last, half = known[-1], min(middle, key=lambda r: abs(r["share"] - 0.5))
+    last, half = known[-1], min(middle, key=lambda r: abs(r["fraction"] - 0.5))
     before, after = half["unexplained"], last["unexplained"]
     spread = math.hypot(half["unexplained_error"], last["unexplained_error"])
     halving = None
-    # Both looks are at the same queries, so this asks for more than it must.
-    if after > 0 and before - after > _CLEAR * spread:
+    # Both records are of the same queries, so this test is conservative.
+    if after > 0 and before - after > _SIGNIFICANT * spread:
         doublings = math.log(2.0) / math.log(before / after) * math.log2(last["seconds"] / half["seconds"])
         if doublings < _MOST_DOUBLINGS:
             halving = last["seconds"] * (2.0**doublings - 1.0)
-    share = _noise_share(errors, noise)
-    return Price(
-        looks_at=SPLIT_NAMES[looks_at],
+    return MarginalCost(
+        validation_set=SPLIT_NAMES[validation_set],
         half=before,
         half_error=half["unexplained_error"],
         end=after,
         end_error=last["unexplained_error"],
         halving=halving,
-        noise_share=share,
+        noise_share=_noise_share(errors, noise),
     )
 
 
@@ -109,15 +107,18 @@ def _number(x: Any) -> bool:
 
 
 def _noise_share(errors: dict[str, Any], noise: float | None) -> float | None:
-    """A fit that has learned the noise of its training queries misses held-out ones by the variance of what
-    it has learned, and seems to miss the training queries by as much less: the difference is twice that.
-    Few queries without noise part the two as well, so no more is called learned than there is."""
+    """Overfitting over the error of held-out queries.
+
+    A fit that overfits the noise of its training queries gains an error on held-out queries that equals the
+    variance of what it has overfitted, and its error on the training queries falls by as much. The difference
+    is twice that. Few queries cause such a difference without noise too, so the noise itself is the bound.
+    """
     found = [errors.get(name, {}).get("unexplained", {}) for name in ("held_out_queries", "training")]
     if noise is None or not all(_number(e.get(k)) for e in found for k in ("value", "error")):
         return None
     held_out, training = found
-    learned = min(0.5 * (held_out["value"] - training["value"]), noise)
+    overfit = min(0.5 * (held_out["value"] - training["value"]), noise)
     spread = 0.5 * math.hypot(held_out["error"], training["error"])
-    if held_out["value"] <= 0 or learned <= _CLEAR * spread:
+    if held_out["value"] <= 0 or overfit <= _SIGNIFICANT * spread:
         return None
-    return min(1.0, float(learned / held_out["value"]))
+    return min(1.0, float(overfit / held_out["value"]))

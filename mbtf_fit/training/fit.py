@@ -1,90 +1,79 @@
-"""From shards to a material: one fit from start (or from where it stopped) to end."""
+"""From shards to a material: one fit, started or resumed."""
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import json
-import math
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
-from mbtf_core.atomic import read_json, write_json, write_text
-from mbtf_core.config_file import differences, dump_yaml, in_short
+from mbtf_core.atomic import write_text
 from mbtf_core.errors import EngineError, InputError
-from mbtf_core.stats import Estimate, pooled_variance, unexplained_variance
+from mbtf_core.stats import pooled_variance
 from mbtf_fit.config import FitConfig
-from mbtf_fit.data.loader import (
-    Partition,
-    Queries,
-    data_hash,
-    load_split,
-    load_training,
-    mean_value,
-    open_data,
-)
-from mbtf_fit.evaluation import judge
-from mbtf_fit.material.export import LAYERS_NAME, TEXTURES_NAME
-from mbtf_fit.material.format import DESCRIPTION_NAME, WEIGHTS_NAME
+from mbtf_fit.data.loader import load_training, open_data
+from mbtf_fit.data.queries import ShardQueries, mean_value
+from mbtf_fit.data.split import Partition
+from mbtf_fit.evaluation import evaluate_splits
+from mbtf_fit.material.format import DESCRIPTION_NAME
 from mbtf_fit.material.material import Material, export
-from mbtf_fit.material.storage import make_folder, read_tensors, write_tensors
-from mbtf_fit.material.transmittance import TRANSMITTANCE_NAME
-from mbtf_fit.material.transmittance_fit import fit_transmittance, judge_transmittance
-from mbtf_fit.models import MODELS, build_model
+from mbtf_fit.material.transmittance_fit import evaluate_transmittance, fit_transmittance
+from mbtf_fit.models.registry import MODELS, build_model
 from mbtf_fit.objective.noise import NoiseModel, typical_value
-from mbtf_fit.training.convergence import Price, price_of
-from mbtf_fit.training.memory import keep_freed_memory
+from mbtf_fit.training.checkpoint import CHECKPOINT_NAME, read_checkpoint, write_checkpoint
+from mbtf_fit.training.convergence import MarginalCost, marginal_cost_of
+from mbtf_fit.training.fit_folder import claim, identity_of
 from mbtf_fit.training.trainer import Trainer
-from mbtf_fit.training.warm_start import digest_of, take_over
+from mbtf_fit.training.validation import (
+    HISTORY_NAME,
+    describe_record,
+    history_record,
+    read_history,
+    validation_set,
+    validation_subset,
+)
+from mbtf_fit.training.warm_start import initialize_from
 from mbtf_gen.dataset.reader import Dataset
 
-FIT_NAME = "fit.json"
-CONFIG_NAME = "config.yaml"
-METRICS_NAME = "metrics.jsonl"
-CHECKPOINT_NAME = "checkpoint.safetensors"
-_OWN_FILES = (
-    FIT_NAME,
-    CONFIG_NAME,
-    METRICS_NAME,
-    CHECKPOINT_NAME,
-    DESCRIPTION_NAME,
-    WEIGHTS_NAME,
-    TRANSMITTANCE_NAME,
-    LAYERS_NAME,
-    TEXTURES_NAME,
-)
-_FORMAT = "mbtf-fit"
-_SCHEMA = 1
-# Seconds of training between two looks at the error, and between two checkpoints.
+# Seconds of training between two validations, and between two checkpoints.
 _REPORT_SECONDS = 2.0
 _CHECKPOINT_SECONDS = 15.0
-# Queries that are looked at while training, and the fewest of a test split that tells more than queries of
-# few paths.
-_GLANCE, _FEWEST = 1 << 14, 1 << 12
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 
-# Called with the share of the budget that is spent and a note on how it goes.
+# Called with the fraction of the budget that is spent, and one line of text.
 ProgressCallback = Callable[[float, str], None]
 
 
 @dataclass(frozen=True)
 class FitResult:
-    """What :func:`fit` gives.
+    """Result of :func:`fit`.
 
     Attributes
     ----------
-    material : the fitted material, as its folder holds it
-    folder : of the material
-    history : one record per look at the error: step, seconds, loss, unexplained, …
-    seconds : of training, over all runs; total_seconds : of this run, loading and evaluation included
-    errors : split → errors; splits ``test``, ``held_out_queries``, ``held_out_directions``
-    resumed : whether an earlier run was taken up
+    material : Material
+        The fitted material, as read from its folder.
+    folder : Path
+        Folder of the material.
+    history : list of dict
+        Records of the validations, see :func:`read_history`.
+    seconds : float
+        Training time over all runs, in seconds.
+    total_seconds : float
+        Time of this run in seconds, loading and evaluation included.
+    errors : dict
+        Errors by split: ``test``, ``held_out_queries``, ``held_out_directions``, ``training``.
+    resumed : bool
+        Whether an earlier run was resumed.
     """
 
     material: Material
@@ -97,6 +86,7 @@ class FitResult:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data for JSON, without the history."""
+        cost = self.marginal_cost
         return {
             "material": str(self.folder),
             "model": self.material.config.model,
@@ -105,22 +95,24 @@ class FitResult:
             "resumed": self.resumed,
             "training": self.material.description["training"],
             "errors": self.errors,
-            "price": None if self.price is None else self.price.as_dict(),
+            "marginal_cost": None if cost is None else cost.as_dict(),
         }
 
     @property
-    def price(self) -> Price | None:
-        """What the last seconds bought; None where the history does not tell."""
+    def marginal_cost(self) -> MarginalCost | None:
+        """Estimated training time that halves the error; None where the history does not resolve it."""
         training = self.material.description["training"]
-        return price_of(self.history, self.errors, training.get("noise"), training.get("looks_at", "test"))
+        return marginal_cost_of(
+            self.history, self.errors, training.get("noise_ratio"), training.get("validation_set", "test")
+        )
 
 
 def choose_device(name: str) -> torch.device:
-    """The device to train on; ``auto`` is CUDA where there is one.
+    """The device to train on; ``auto`` is CUDA if available.
 
     Raises
     ------
-    EngineError : CUDA asked for where there is none
+    EngineError : no CUDA device is available
     """
     available = torch.cuda.is_available()
     if name == "cuda" and not available:
@@ -128,6 +120,20 @@ def choose_device(name: str) -> torch.device:
             "no CUDA device is available", where="--device cuda", hint="use --device cpu or auto"
         )
     return torch.device("cuda" if available and name != "cpu" else "cpu")
+
+
+def keep_freed_memory() -> None:
+    """Let glibc keep freed blocks of up to 32 MiB instead of returning them to the kernel.
+
+    A training step frees and allocates the same few megabytes; page faults would cost as much as the
+    arithmetic.
+    """
+    if sys.platform != "linux":
+        return
+    with contextlib.suppress(OSError, AttributeError):
+        library = ctypes.CDLL(None)
+        library.mallopt(_M_MMAP_THRESHOLD, 1 << 25)
+        library.mallopt(_M_TRIM_THRESHOLD, 1 << 30)
 
 
 def fit(
@@ -141,20 +147,37 @@ def fit(
 ) -> FitResult:
     """Fit a model to a data set and export it as a material.
 
+    An unfinished fit of the same configuration and data is resumed; a finished one is kept.
+
     Parameters
     ----------
-    shards : folder made by ``mbtf-gen``
-    out : folder of the material; an unfinished fit of the same configuration and data there is resumed, a
-        finished one is left as it is
-    overwrite : replace a fit of another configuration
-    partition : the train split as :func:`~mbtf_fit.data.loader.load_training` gave it for these data, held-out
-        settings and seed, for several fits of one data set; read here by default
+    config : FitConfig
+        Options of the fit.
+    shards : str or Path
+        Folder made by ``mbtf-gen``.
+    out : str or Path
+        Folder of the material.
+    overwrite : bool
+        Replace a fit of another configuration.
+    progress : callable, optional
+        Called with the fraction of the budget that is spent, in [0, 1], and one line of text.
+    partition : Partition, optional
+        Result of :func:`~mbtf_fit.data.loader.load_training` for these data, held-out settings and seed, to
+        share among several fits; read from `shards` by default.
+
+    Returns
+    -------
+    FitResult
+        The material, its errors and its history.
 
     Raises
     ------
-    InputError : shards or folder cannot be used; training diverged
-    EngineError : the device is not there
-    PartialError : the disk is full; the same command resumes
+    InputError
+        Shards or folder cannot be used, or training diverged.
+    EngineError
+        The device is not available.
+    PartialError
+        The disk is full; the same command resumes.
     """
     begin = time.perf_counter()
     device = choose_device(config.device)
@@ -162,15 +185,13 @@ def fit(
     layout = MODELS[config.model].layout
     if layout != "image" and any(term.kind == "gradient" for term in config.training.losses):
         raise InputError(
-            f"the gradient loss compares neighbors, which {config.model} never sees together",
+            f"the gradient loss compares neighboring texels, which {config.model} never sees together",
             where="training.losses",
-            hint="take another loss, or a model that learns from the image layout",
+            hint="use another loss, or a model that learns from the image layout",
         )
     data = open_data(shards, layout, config.model)
-    identity = _identity(config, data)
-    if config.start is not None:
-        identity["config_hash"] = f"{identity['config_hash']}-{digest_of(config.start)}"
-    _claim(out, identity, config, overwrite)
+    identity = identity_of(config, data)
+    claim(out, identity, config, overwrite)
     if (out / DESCRIPTION_NAME).exists():
         return _finished(out, time.perf_counter() - begin)
     keep_freed_memory()
@@ -178,86 +199,40 @@ def fit(
         partition = load_training(data, config.held_out, config.seed, config.data.memory)
     trainer = prepare_trainer(config, data, partition, device)
     resumed = _resume(trainer, out)
-    looks_at, glance = _glance(trainer, data, partition)
-    _train(trainer, glance, out, progress or (lambda share, note: None))
+    name, queries = validation_set(data, partition)
+    subset = validation_subset(trainer.model.positions, queries)
+    del queries
+    _train(trainer, subset, out, progress or (lambda fraction, note: None))
     trainer.calibrate()
+    errors = evaluate_splits(trainer.predict, data, partition)
     training = {
         "steps": trainer.progress.step,
         "batch": trainer.batch,
         "queries": len(partition.training),
         "seconds": round(trainer.progress.seconds, 3),
         "loss": trainer.progress.loss,
-        "looks_at": looks_at,
-        "pull": asdict(trainer.pull),
-        "coverage": {str(level): share for level, share in trainer.coverage().items()},
+        "validation_set": name,
+        "weight_decay": trainer.weight_decay.as_dict(),
+        "coverage": {str(level): fraction for level, fraction in trainer.coverage().items()},
         "device": str(device),
         "threads": torch.get_num_threads(),
-        "path": trainer.path,
+        "backend": trainer.backend,
         "torch": torch.__version__,
+        "errors": {split: e.as_dict() for split, e in errors.items()},
+        "noise_ratio": _noise_ratio(partition.sample, errors["training"].overall.variance.value),
     }
-    errors = judge(trainer.predict, data, partition)
-    training["errors"] = {name: e.as_dict() for name, e in errors.items()}
-    training["noise"] = _noise(partition.sample, errors["training"].overall.variance.value)
-    holes = fit_transmittance(data, partition.selection)
-    if holes is not None:
-        through = judge_transmittance(holes, data, partition.selection)
-        training["transmittance"] = {name: e.as_dict() for name, e in through.items()}
-    export(trainer.model, config, out, data=identity["data"], training=training, holes=holes)
+    transmittance = fit_transmittance(data, partition.selection)
+    if transmittance is not None:
+        found = evaluate_transmittance(transmittance, data, partition.selection)
+        training["transmittance"] = {split: e.as_dict() for split, e in found.items()}
+    export(trainer.model, config, out, data=identity["data"], training=training, transmittance=transmittance)
     (out / CHECKPOINT_NAME).unlink(missing_ok=True)
     return _finished(out, time.perf_counter() - begin, resumed=resumed)
 
 
-def _noise(sample: Queries, variance: float) -> float | None:
-    """Variance of the noise in values over that of the values; None where these have none."""
+def _noise_ratio(sample: ShardQueries, variance: float) -> float | None:
+    """Variance of the noise of values over that of the values; None for constant values."""
     return pooled_variance(sample.value_a, sample.value_b).value / variance if variance > 0 else None
-
-
-def _identity(config: FitConfig, data: Dataset) -> dict[str, Any]:
-    files = {split: [e["file"] for e in data.manifest["splits"][split]["shards"]] for split in data.splits}
-    described = {"hash": data_hash(data), "levels": data.lattice.finest, "aspect": data.lattice.aspect}
-    lengths = {split: len(names) for split, names in files.items()}
-    return {
-        "format": _FORMAT,
-        "schema": _SCHEMA,
-        "config_hash": config.hash(json.dumps({**described, "files": files}, sort_keys=True)),
-        "config": config.fields(),
-        "data": {**described, "shards": lengths, "inputs": data.manifest.get("inputs", {})},
-    }
-
-
-def _claim(out: Path, identity: dict[str, Any], config: FitConfig, overwrite: bool) -> None:
-    """Make the folder this fit's own, or check that it already is.
-
-    Raises
-    ------
-    InputError : it holds something else
-    """
-    if out.exists() and not out.is_dir():
-        raise InputError("is a file, not a folder", where=out)
-    existing = out / FIT_NAME
-    if out.is_dir() and any(out.iterdir()):
-        if not existing.exists():
-            raise InputError("is not empty and holds no fit", where=out, hint="choose another folder with -o")
-        old = read_json(existing)
-        if old.get("config_hash") == identity["config_hash"] and not overwrite:
-            return
-        if not overwrite:
-            before, after = (
-                {**record.get("config", {}), **{k: record.get(k) for k in ("schema", "data")}}
-                for record in (old, identity)
-            )
-            changes = in_short(differences(before, after)) or "other shards"
-            raise InputError(
-                f"holds a fit of another configuration: {changes}",
-                where=out,
-                hint="choose another folder with -o, or replace it with --overwrite",
-            )
-        # The description goes first: without it nothing else passes for a finished material.
-        for name in (DESCRIPTION_NAME, *_OWN_FILES):
-            (out / name).unlink(missing_ok=True)
-    make_folder(out)
-    write_text(out / CONFIG_NAME, dump_yaml(config.model_dump(mode="json")))
-    write_json(out / FIT_NAME, identity)
 
 
 def prepare_trainer(config: FitConfig, data: Dataset, partition: Partition, device: torch.device) -> Trainer:
@@ -265,146 +240,70 @@ def prepare_trainer(config: FitConfig, data: Dataset, partition: Partition, devi
 
     Raises
     ------
-    InputError : the material to start from is not there, or has other textures
+    InputError : the material that initializes the fit is missing, or has other textures
     """
     model = build_model(config.model, data.lattice, **config.network.model_dump())
     unit = typical_value(mean_value(partition.sample.value_a, partition.sample.value_b))
     model.initialize(torch.Generator().manual_seed(config.seed), unit)
-    if config.start is not None:
-        take_over(model, config.start)
+    if config.init_from is not None:
+        initialize_from(model, config.init_from)
     noise = NoiseModel.of(partition.sample, data.lattice, unit)
     return Trainer(config, model.to(device), partition.training.to(device), noise, partition.selection)
 
 
 def _resume(trainer: Trainer, out: Path) -> bool:
-    """Take up the checkpoint where there is one.
+    """Resume from the checkpoint, if there is one.
 
     Raises
     ------
-    InputError : it is damaged, or of another model
+    InputError : it is corrupt, or of another model
     """
     path = out / CHECKPOINT_NAME
     if not path.exists():
-        (out / METRICS_NAME).unlink(missing_ok=True)
+        (out / HISTORY_NAME).unlink(missing_ok=True)
         return False
-    try:
-        trainer.restore(*read_tensors(path))
-    except (InputError, KeyError, TypeError, ValueError, RuntimeError):
-        raise InputError(
-            "is no checkpoint of this fit: damaged, or put there by something else",
-            where=path,
-            hint="remove it: the same command then starts from the beginning",
-        ) from None
+    read_checkpoint(trainer, path)
     kept = [line for line in read_history(out) if line.get("step", 0) <= trainer.progress.step]
-    write_text(out / METRICS_NAME, "".join(json.dumps(line) + "\n" for line in kept))
+    write_text(out / HISTORY_NAME, "".join(json.dumps(line) + "\n" for line in kept))
     return True
 
 
-def _glance(trainer: Trainer, data: Dataset, partition: Partition) -> tuple[str, Queries]:
-    """What is looked at while training, as a copy: the other judging queries need not stay in memory."""
-    looks_at, judging = judging_queries(data, partition)
-    return looks_at, glance_of(trainer, judging)
-
-
-def _train(trainer: Trainer, glance: Queries, out: Path, progress: ProgressCallback) -> None:
+def _train(trainer: Trainer, subset: ShardQueries, out: Path, progress: ProgressCallback) -> None:
     saved = time.perf_counter()
-    done = trainer.share >= 1.0
-    with _finishing_steps(trainer):
-        while not (done or trainer.stop):
-            done = trainer.train(_REPORT_SECONDS)
-            record = _record(trainer, glance)
-            with (out / METRICS_NAME).open("a", encoding="utf-8") as stream:
+    done = trainer.fraction >= 1.0
+    with _stop_on_interrupt() as stop:
+        while not (done or stop.is_set()):
+            done = trainer.train(_REPORT_SECONDS, stop)
+            record = history_record(trainer, subset)
+            with (out / HISTORY_NAME).open("a", encoding="utf-8") as stream:
                 stream.write(json.dumps(record) + "\n")
-            progress(trainer.share, _note(record))
-            if time.perf_counter() - saved > _CHECKPOINT_SECONDS or done or trainer.stop:
-                write_tensors(out / CHECKPOINT_NAME, *trainer.state())
+            progress(trainer.fraction, describe_record(record))
+            if time.perf_counter() - saved > _CHECKPOINT_SECONDS or done or stop.is_set():
+                write_checkpoint(trainer, out / CHECKPOINT_NAME)
                 saved = time.perf_counter()
-    if trainer.stop:
-        raise KeyboardInterrupt
+        if stop.is_set():
+            raise KeyboardInterrupt
 
 
 @contextmanager
-def _finishing_steps(trainer: Trainer) -> Iterator[None]:
-    """Let the first Ctrl-C end training after the present step, so that a checkpoint loses nothing; the
-    second one acts at once."""
+def _stop_on_interrupt() -> Iterator[threading.Event]:
+    """An event that the first Ctrl-C sets, so that training ends after its current step and the checkpoint
+    keeps it; the second Ctrl-C interrupts at once."""
+    stop = threading.Event()
     if threading.current_thread() is not threading.main_thread():
-        yield
+        yield stop
         return
 
-    def stop(number: int, frame: object) -> None:
-        if trainer.stop:
+    def handle(number: int, frame: object) -> None:
+        if stop.is_set():
             raise KeyboardInterrupt
-        trainer.stop = True
+        stop.set()
 
-    before = signal.signal(signal.SIGINT, stop)
+    before = signal.signal(signal.SIGINT, handle)
     try:
-        yield
+        yield stop
     finally:
         signal.signal(signal.SIGINT, before)
-
-
-def judging_queries(data: Dataset, partition: Partition) -> tuple[str, Queries]:
-    """The set that tells how good a fit is, before and while it is trained, and its name among the errors.
-
-    That of the test split, which has more paths: of gloss, four paths per query often cannot tell at all. Of
-    the held-out queries where there is no such split, or one of few queries. Nothing is chosen by it.
-    """
-    held_out = partition.held_out_queries
-    test = load_split(data, "test") if "test" in data.splits and data.shards("test") else None
-    if test is not None and len(test) >= min(len(held_out), _FEWEST):
-        return "test", test
-    return "held_out_queries", held_out
-
-
-def glance_of(trainer: Trainer, queries: Queries, most: int = _GLANCE) -> Queries:
-    """So many of the judging queries at most, from all parts of them. Looking costs time, of a model of
-    neighborhoods more than of the others."""
-    most = max(most // trainer.model.positions, most // 16)
-    return queries.take(np.arange(0, len(queries), max(1, math.ceil(len(queries) / most))))
-
-
-def missed(trainer: Trainer, queries: Queries) -> Estimate:
-    """Unexplained variance of queries by the model as it is now."""
-    return unexplained_variance(trainer.predict(queries), queries.value_a, queries.value_b)
-
-
-def _record(trainer: Trainer, glance: Queries) -> dict[str, Any]:
-    state = trainer.progress
-    record: dict[str, Any] = {
-        "step": state.step,
-        "seconds": round(state.seconds, 3),
-        "share": round(trainer.share, 5),
-        "loss": state.loss,
-        "unexplained": None,
-        "unexplained_error": None,
-        "queries_per_second": round(state.step * trainer.batch / max(state.seconds, 1e-9)),
-    }
-    if len(glance):
-        found = missed(trainer, glance).as_dict()
-        record |= {"unexplained": found["value"], "unexplained_error": found["error"]}
-    return record
-
-
-def _note(record: dict[str, Any]) -> str:
-    note = f"loss {record['loss']:.3f}"
-    if record["unexplained"] is not None:
-        note += f", unexplained {record['unexplained']:.3f} ± {record['unexplained_error']:.3f}"
-    return f"{note}, {record['queries_per_second'] / 1e6:.2f} M queries/s"
-
-
-def read_history(folder: str | Path) -> list[dict[str, Any]]:
-    """The records of ``metrics.jsonl``; what follows a damaged line is left out."""
-    path = Path(folder) / METRICS_NAME
-    out = []
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []:
-        try:
-            record = json.loads(line)
-        except (ValueError, RecursionError):
-            break
-        if not isinstance(record, dict):
-            break
-        out.append(record)
-    return out
 
 
 def _finished(out: Path, total: float, *, resumed: bool = True) -> FitResult:

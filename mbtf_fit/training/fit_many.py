@@ -1,4 +1,4 @@
-"""Several data sets fitted by one command: a process each, none stopped by another's failure."""
+"""Several data sets fitted by one command, in independent processes."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from mbtf_fit.config import FitConfig
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """What became of one data set.
+class FitOutcome:
+    """Result or error of one data set.
 
     Attributes
     ----------
     shards, folder : of the data and of the material
-    result : as :meth:`FitResult.as_dict` has it; None where the fit failed
-    error : why it failed
+    result : see :meth:`FitResult.as_dict`; None where the fit failed
+    error : message of the failure
     """
 
     shards: Path
@@ -43,12 +43,12 @@ class Outcome:
 
 
 def find_data(arguments: Sequence[Path]) -> list[Path]:
-    """Data sets that arguments stand for: a data set's folder, a folder of such folders, or a text file with
-    one folder per line, relative to the file's own; lines that start with # are left out.
+    """Data sets of the arguments: a data set's folder, a folder of such folders, or a text file with one
+    folder per line, relative to the file; lines that start with # are comments.
 
     Raises
     ------
-    InputError : one of them stands for none
+    InputError : an argument has no data set
     """
     found: list[Path] = []
     for argument in arguments:
@@ -69,11 +69,11 @@ def find_data(arguments: Sequence[Path]) -> list[Path]:
 
 
 def name_materials(shards: Sequence[Path], out: Path) -> list[Path]:
-    """A folder in `out` for each data set, called like it; with its parent's name before where two are alike.
+    """A folder in `out` for each data set, with its name; equal names are prefixed by the parent's name.
 
     Raises
     ------
-    UsageError : two are still alike
+    UsageError : two names are still equal
     """
     names = [path.resolve().name for path in shards]
     often = Counter(names)
@@ -88,14 +88,14 @@ def name_materials(shards: Sequence[Path], out: Path) -> list[Path]:
 
 
 def _work(
-    config: FitConfig, shards: Path, out: Path, overwrite: bool, place: int, processes: int, pipe: Connection
+    config: FitConfig, shards: Path, out: Path, overwrite: bool, worker: int, processes: int, pipe: Connection
 ) -> None:
-    """One fit, in a process of its own; sends its result, or what went wrong."""
-    # Decides which GPU the process sees, so it comes before anything of CUDA is loaded.
+    """One fit, in its own process; sends its result or its error."""
+    # Selects the GPU of the process, so it precedes the import of CUDA.
     if config.device != "cpu":
         visible = os.environ.get("CUDA_VISIBLE_DEVICES")
         devices = visible.split(",") if visible else []
-        os.environ["CUDA_VISIBLE_DEVICES"] = devices[place % len(devices)] if devices else str(place)
+        os.environ["CUDA_VISIBLE_DEVICES"] = devices[worker % len(devices)] if devices else str(worker)
     try:
         import torch
 
@@ -119,34 +119,34 @@ def fit_many(
     *,
     processes: int,
     overwrite: bool = False,
-    finished: Callable[[Outcome], None] | None = None,
-) -> list[Outcome]:
+    finished: Callable[[FitOutcome], None] | None = None,
+) -> list[FitOutcome]:
     """Fit every data set, at most `processes` at a time; outcomes in the order of the data sets.
 
-    Each fit is a process of its own, started afresh: what fails, or is killed, takes nothing else along. With
-    CUDA each place takes the GPU of its number; on processors the cores are divided.
+    Each fit has its own process, so that a failure does not stop the others. With CUDA each worker uses the
+    GPU of its number; on CPUs the workers divide the cores.
 
     Parameters
     ----------
-    finished : called with each outcome as it comes
+    finished : called with each outcome
     """
     context = multiprocessing.get_context("spawn")
     waiting = list(range(len(shards)))
     running: dict[int, tuple[int, Any, Connection]] = {}
-    outcomes: dict[int, Outcome] = {}
+    outcomes: dict[int, FitOutcome] = {}
     try:
         while waiting or running:
-            for place in sorted({*range(processes)} - {*running}):
+            for worker in sorted({*range(processes)} - {*running}):
                 if waiting:
                     k = waiting.pop(0)
                     mine, theirs = context.Pipe(duplex=False)
-                    arguments = (config, shards[k], folders[k], overwrite, place, processes, theirs)
+                    arguments = (config, shards[k], folders[k], overwrite, worker, processes, theirs)
                     process = context.Process(target=_work, args=arguments)
                     process.start()
                     theirs.close()
-                    running[place] = k, process, mine
+                    running[worker] = k, process, mine
             wait([pipe for _, _, pipe in running.values()])
-            for place, (k, process, pipe) in list(running.items()):
+            for worker, (k, process, pipe) in list(running.items()):
                 if not pipe.poll():
                     continue
                 try:
@@ -155,12 +155,12 @@ def fit_many(
                 except EOFError:
                     process.join()
                     result, error = None, f"its process ended with code {process.exitcode}"
-                del running[place]
-                outcomes[k] = Outcome(shards[k], folders[k], result, error)
+                del running[worker]
+                outcomes[k] = FitOutcome(shards[k], folders[k], result, error)
                 if finished is not None:
                     finished(outcomes[k])
     except KeyboardInterrupt:
-        # A terminal sends Ctrl-C to the children too: they write their checkpoints and end.
+        # A terminal sends Ctrl-C to the children too, which write their checkpoints and exit.
         for _, process, _ in running.values():
             process.join()
         raise

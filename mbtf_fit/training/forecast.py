@@ -1,4 +1,4 @@
-"""What a fit will take and reach, from short fits of the same data on this very machine, before it starts."""
+"""Forecast of a fit: time, error and size, extrapolated from two short fits of the same data."""
 
 from __future__ import annotations
 
@@ -12,44 +12,44 @@ from mbtf_core.console import clock
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import load_training, open_data
 from mbtf_fit.formatting import SPLIT_NAMES
-from mbtf_fit.models import MODELS
-from mbtf_fit.training.fit import choose_device, glance_of, judging_queries, missed, prepare_trainer
-from mbtf_fit.training.memory import keep_freed_memory
+from mbtf_fit.models.registry import MODELS
+from mbtf_fit.training.fit import choose_device, keep_freed_memory, prepare_trainer
+from mbtf_fit.training.validation import validation_error, validation_set, validation_subset
 
-# Seconds of the two pilot fits; each runs through the whole schedule in its time.
+# Training times of the two pilot fits in seconds; each runs the whole schedule.
 PILOT_SECONDS = (4.0, 8.0)
-# Every doubling of the time gains this share of what the one before gained, in the logarithm of the error:
-# the model's size and the data end what training can reach. What suits fits of 60 s with the options of the
-# qualities on data of a draft, of eleven materials; benchmarks/forecasts.py finds it anew.
+# Each doubling of the time improves the logarithm of the error by this share of the improvement before. Least
+# squares over fits of 60 s with quality options on draft data of eleven materials
+# (benchmarks/forecasts.py).
 PERSISTENCE = 0.45
-# Judging queries at most: few rule the errors, and the fit will be judged by all.
-_JUDGING = 1 << 17
+# Most queries of the validation subset.
+_SUBSET = 1 << 17
 # Bytes of a number in the material's file.
 _NUMBER = 4
 
 
 @dataclass(frozen=True)
 class FitForecast:
-    """What is expected of a fit.
+    """Expected cost and error of a fit.
 
     Attributes
     ----------
     seconds : of training; loading : of reading the data
-    steps : that the time is enough for
-    queries_per_second : trained on
-    looks_at : the set of queries that errors are of, in words: the test split, or what was held out
-    unexplained : variance of these that it will miss; None where there are none, or they do not vary
-    at_most : the same after the longer pilot
-    pilots : the same after each of them; empty where there is none
+    steps : in that time
+    queries_per_second : training throughput
+    validation_set : the set of queries that the errors are of, in words
+    unexplained : expected unexplained variance; None where there are no queries, or constant values
+    at_most : that after the longer pilot
+    pilots : that after each pilot; empty where there is none
     bytes : of the material's numbers
-    pilot_seconds : what the forecast took, loading included
+    pilot_seconds : time of the forecast, loading included
     """
 
     seconds: float
     loading: float
     steps: int
     queries_per_second: float
-    looks_at: str
+    validation_set: str
     unexplained: float | None
     at_most: float | None
     pilots: tuple[float, ...]
@@ -69,7 +69,7 @@ class FitForecast:
         ]
         if self.unexplained is not None:
             lines.append(
-                f"unexplained variance of {self.looks_at} about {self.unexplained:.2f}; "
+                f"unexplained variance of {self.validation_set} about {self.unexplained:.2f}; "
                 f"{self.at_most:.2f} after {clock(PILOT_SECONDS[1])}"
             )
         return "\n".join(lines)
@@ -78,54 +78,54 @@ class FitForecast:
 def extrapolated(
     short: float, long: float, doublings: float, *, apart: float = 1.0, persistence: float = PERSISTENCE
 ) -> float:
-    """Error after so many doublings of the longer fit's time, from those of two fits, `apart` doublings from
-    each other, of which each gains `persistence` of what the one before gained, in the logarithm; never above
-    the longer fit's, however short the budget."""
-    gain = max(0.0, math.log(short / long)) if min(short, long) > 0 else 0.0
+    """Error after so many doublings of the longer fit's time, from the errors of two fits that are `apart`
+    doublings apart. Each doubling improves the logarithm of the error by `persistence` of the improvement
+    before. Never above the longer fit's error."""
+    improvement = max(0.0, math.log(short / long)) if min(short, long) > 0 else 0.0
     ratio = persistence**apart / (1.0 - persistence**apart)
-    return long * math.exp(-gain * ratio * (1.0 - persistence ** max(doublings, 0.0)))
+    return long * math.exp(-improvement * ratio * (1.0 - persistence ** max(doublings, 0.0)))
 
 
 def forecast_fit(config: FitConfig, shards: str | Path) -> FitForecast:
-    """Fit twice, briefly, and say what the fit of a configuration will take; nothing is written.
+    """Forecast the fit of a configuration by two pilot fits; nothing is written.
 
     Raises
     ------
     InputError : shards cannot be used
-    EngineError : the device is not there
+    EngineError : the device is not available
     """
     began = time.perf_counter()
     device = choose_device(config.device)
     data = open_data(shards, MODELS[config.model].layout, config.model)
     keep_freed_memory()
     partition = load_training(data, config.held_out, config.seed, config.data.memory)
-    looks_at, judging = judging_queries(data, partition)
+    name, queries = validation_set(data, partition)
     loading = time.perf_counter() - began
-    found: list[float] = []
+    errors: list[float] = []
     for seconds in PILOT_SECONDS:
         training = config.training.model_copy(update={"time": seconds, "steps": None})
         pilot = config.model_copy(update={"training": training})
         trainer = prepare_trainer(pilot, data, partition, device)
         while not trainer.train(math.inf):
             pass
-        judged = glance_of(trainer, judging, _JUDGING)
-        if len(judged):
-            found.append(missed(trainer, judged).value)
-    if not all(map(math.isfinite, found)):
-        found.clear()
+        subset = validation_subset(trainer.model.positions, queries, _SUBSET)
+        if len(subset):
+            errors.append(validation_error(trainer, subset).value)
+    if not all(map(math.isfinite, errors)):
+        errors.clear()
     rate = trainer.progress.step / trainer.progress.seconds
     steps = config.training.steps
     total = config.training.time if steps is None else steps / rate
-    numbers = sum(p.numel() for p in trainer.model.parameters())
+    doublings = math.log2(total / PILOT_SECONDS[1])
     return FitForecast(
         seconds=total,
         loading=loading,
         steps=round(total * rate) if steps is None else steps,
         queries_per_second=rate * trainer.batch,
-        looks_at=SPLIT_NAMES[looks_at],
-        unexplained=extrapolated(found[0], found[1], math.log2(total / PILOT_SECONDS[1])) if found else None,
-        at_most=found[-1] if found else None,
-        pilots=tuple(found),
-        bytes=_NUMBER * numbers,
+        validation_set=SPLIT_NAMES[name],
+        unexplained=extrapolated(errors[0], errors[1], doublings) if errors else None,
+        at_most=errors[-1] if errors else None,
+        pilots=tuple(errors),
+        bytes=_NUMBER * sum(p.numel() for p in trainer.model.parameters()),
         pilot_seconds=time.perf_counter() - began,
     )

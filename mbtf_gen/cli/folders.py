@@ -5,12 +5,11 @@ from __future__ import annotations
 import time
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-from cyclopts import Parameter
+from typing import TYPE_CHECKING
 
 from mbtf_core.console import CONSOLE, Console, clock, going_on
 from mbtf_core.errors import EXIT_BAD_INPUT, EXIT_OK
+from mbtf_core.options import DryRun
 from mbtf_gen.cli.generate import describe
 
 if TYPE_CHECKING:
@@ -18,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def merge(folder: Path, /, *, console: Console = CONSOLE) -> int:
-    """Complete the manifest of a folder that slices (--shards i/n) were written into.
+    """Complete the manifest of a folder that slices (--slice i/n) were written into.
 
     Parameters
     ----------
@@ -73,7 +72,7 @@ def repair(
     /,
     *,
     material: str | None = None,
-    dry_run: Annotated[bool, Parameter(negative="")] = False,
+    dry_run: DryRun = False,
     console: Console = CONSOLE,
 ) -> int:
     """Make again what verify condemns: the data set is then the undisturbed one.
@@ -83,9 +82,7 @@ def repair(
     folder
         Folder of shards.
     material
-        Where the material lies now. Default: where it lay when the data set was made
-    dry_run
-        Only say what would be done.
+        Where the material is now, if it was moved.
     """
     from mbtf_gen.repairs import Corruption, RepairResult
 

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from cyclopts import Parameter
 
 from mbtf_core.console import CONSOLE, Console, clock, going_on
 from mbtf_core.errors import UsageError
-from mbtf_core.shard_schema import Tiling
-from mbtf_gen.cli.common import Output, QualityOption, Set, general, resolve_config
-from mbtf_gen.config.presets import GENERATOR, as_assignments
+from mbtf_core.options import Options, Output, Overwrite, takes_options
+from mbtf_gen.cli.common import resolve_config
+from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.config.presets import GENERATOR, QualityOption, as_assignments
 
 _SPLIT_WORDS = {"train": "training"}
 
@@ -20,36 +21,20 @@ _SPLIT_WORDS = {"train": "training"}
 def _slice(text: str) -> tuple[int, int]:
     match = re.fullmatch(r"(\d+)/(\d+)", text.strip())
     if match is None or not 1 <= int(match[1]) <= int(match[2]):
-        raise UsageError(f"'{text}' must be i/n with 1 <= i <= n, such as 3/8", where="--shards")
+        raise UsageError(f"'{text}' must be i/n with 1 <= i <= n, such as 3/8", where="--slice")
     return int(match[1]), int(match[2])
 
 
+@takes_options(GeneratorConfig)
 def generate(
     material: str | None = None,
     /,
     *,
-    output: Output = None,
-    quality: QualityOption | None = None,
-    queries: str | None = None,
-    test_queries: str | None = None,
-    spp: int | None = None,
-    target_error: str | None = None,
-    test_spp: int | None = None,
-    height: float | None = None,
-    mesh: int | None = None,
-    tile: Tiling | None = None,
-    levels: int | None = None,
-    light_width: float | None = None,
-    min_cos: float | None = None,
-    max_depth: int | None = None,
-    effects: str | None = None,
-    layout: Literal["shuffled", "image"] | None = None,
-    format: Literal["npz", "exr"] | None = None,
-    seed: int | None = None,
-    shards: str = "1/1",
-    config: Path | None = None,
-    assignments: Set | None = None,
-    overwrite: Annotated[bool, Parameter(negative="")] = False,
+    output: Output = Path("shards"),
+    quality: QualityOption = None,
+    options: Options[GeneratorConfig],
+    slice: Annotated[str, Parameter(metavar="I/N")] = "1/1",
+    overwrite: Overwrite = False,
     console: Console = CONSOLE,
 ) -> None:
     """Generate a data set: mbtf-gen heightfield.exr --queries 400/texel -o shards/
@@ -60,84 +45,27 @@ def generate(
     ----------
     material
         Height map, folder of maps, or material.yaml.
-    output
-        Folder of shards. Default: shards/
-    queries
-        Training queries: N, or N/texel of the finest level. Default: 100/texel
-    test_queries
-        Test queries, made besides the training queries: N or N/texel. Default: 8192
-    spp
-        Mean number of paths per training query, both halves together (even). Default: 4
-    target_error
-        Error of every training value relative to max(value, tile mean), such as 2%, in place of --spp.
-    test_spp
-        Mean number of paths per test query, both halves together (even). Default: 256
-    height
-        Factor on the stored heights, in tile widths. Default: the material's own
-    mesh
-        Mesh cells across the tile. Default: the map's width, at most 512
-    tile
-        Cure for maps that do not tile: 2 x 2 mirrored copies, or edges cross-faded. Default: none
-    levels
-        Finest level k: 2^k texels across. Default: from the map's width
-    light_width
-        RMS angle of the light per axis in degrees; 0 is a delta light. Default: 1
-    min_cos
-        Smallest cosine of light and view directions to the normal. Default: 0.1
-    max_depth
-        Surface interactions per path; 0: no limit (Russian roulette). Default: 0
-    effects
-        auto, all, none, then +x or -x: effects of light to simulate. Default: auto
-    layout
-        shuffled queries, or one image buffer per (light, view, footprint).
-    format
-        npz or exr shards.
-    seed
-        Root seed. Default: 0
-    shards
-        Slice i/n: make only every n-th shard; finish with mbtf-gen merge.
-    config
-        YAML file with the options.
-    overwrite
-        Replace a data set of another configuration.
+    slice
+        Render only every n-th shard, from the i-th; finish with mbtf-gen merge.
     """
-    from mbtf_gen.config.generator import GeneratorConfig
-
-    flags = {
-        "--queries": ("queries.train", queries),
-        "--test-queries": ("queries.test", test_queries),
-        "--spp": ("queries.spp", spp),
-        "--target-error": ("queries.target_error", target_error),
-        "--test-spp": ("queries.test_spp", test_spp),
-        "--levels": ("queries.levels", levels),
-        "--min-cos": ("queries.min_cos", min_cos),
-        "--effects": ("effects.mode", effects),
-        "--layout": ("queries.layout", layout),
-        "--format": ("output.format", format),
-        **general(
-            height=height, mesh=mesh, tile=tile, light_width=light_width, max_depth=max_depth, seed=seed
-        ),
-    }
-    assigned = [*as_assignments(GENERATOR[quality] if quality else {}), *(assignments or [])]
-    resolved = resolve_config(GeneratorConfig, material, config, assigned, flags)
-    part = _slice(shards)
+    resolved = resolve_config(options, material, as_assignments(GENERATOR[quality] if quality else {}))
+    part = _slice(slice)
     from mbtf_gen.dataset.summary import summary_dict
     from mbtf_gen.generation import Job, generate, paths_left
 
-    folder = output or Path("shards")
     job = Job.prepare(resolved)
     console.note(
-        f"{resolved.material} -> {folder}: {job.queries('train')} training + {job.queries('test')} test "
+        f"{resolved.material} -> {output}: {job.queries('train')} training + {job.queries('test')} test "
         f"queries, finest level {job.lattice.finest}"
     )
-    total = paths_left(job, folder, *part)
+    total = paths_left(job, output, *part)
     with (
-        going_on(f"the shards that are finished are kept in {folder}"),
+        going_on(f"the shards that are finished are kept in {output}"),
         console.progress(total=total, label="generating", unit="paths") as bar,
     ):
         summary = generate(
             resolved,
-            folder,
+            output,
             overwrite=overwrite,
             slice_index=part[0],
             slice_count=part[1],

@@ -2,47 +2,33 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from mbtf_core.console import CONSOLE, Console
-from mbtf_core.shard_schema import Tiling
-from mbtf_gen.cli.common import Set, general, resolve_config
+from mbtf_core.options import Options, takes_options
+from mbtf_gen.cli.common import resolve_config
+from mbtf_gen.config.generator import GeneratorConfig
 
 
+@takes_options(GeneratorConfig, "geometry")
 def inspect(
     material: str | None = None,
     /,
     *,
-    height: float | None = None,
-    mesh: int | None = None,
-    tile: Tiling | None = None,
-    config: Path | None = None,
-    assignments: Set | None = None,
+    options: Options[GeneratorConfig],
     console: Console = CONSOLE,
 ) -> None:
-    """Say what a material holds and what each map will do: sizes, relief, slopes, tiling, albedo, oddities.
+    """Describe a material and each of its maps: sizes, heights, slopes, tiling, albedo, warnings.
 
     Parameters
     ----------
     material
         Height map, folder of maps, or material.yaml.
-    height
-        Factor on the stored heights, in tile widths. Default: the material's own
-    mesh
-        Mesh cells across the tile. Default: the map's width, at most 512
-    tile
-        Cure for maps that do not tile: 2 x 2 mirrored copies, or edges cross-faded. Default: none
-    config
-        YAML file with the options.
     """
-    from mbtf_gen.config.generator import GeneratorConfig
     from mbtf_gen.material.inspect import inspect_material
     from mbtf_gen.material.inspect_text import inspection_text
     from mbtf_gen.material.material import load_material
 
-    flags = general(height=height, mesh=mesh, tile=tile, light_width=None, max_depth=None, seed=None)
-    resolved = resolve_config(GeneratorConfig, material, config, assignments or [], flags)
+    resolved = resolve_config(options, material)
     geometry = resolved.geometry
-    loaded = load_material(resolved.material, geometry.tile)
-    found = {"material": resolved.material, **inspect_material(loaded, geometry.height, geometry.mesh)}
+    loaded = load_material(resolved.material, geometry.make_tileable)
+    found = {"material": resolved.material, **inspect_material(loaded, geometry.height_scale, geometry.mesh)}
     console.report(found, inspection_text(found, resolved.material))

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 import textwrap
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+from cyclopts import Parameter
 
 from mbtf_core.console import CONSOLE, Console
-from mbtf_core.shard_schema import Tiling
-from mbtf_gen.cli.common import QualityOption, Set, general, resolve_config
-from mbtf_gen.config.presets import GENERATOR, as_assignments
-from mbtf_gen.config.quality_measured import expected as expected_of
+from mbtf_core.options import Options, takes_options
+from mbtf_gen.cli.common import resolve_config
+from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.config.presets import GENERATOR, QualityOption, as_assignments
 
 if TYPE_CHECKING:
     from mbtf_gen.planning.effects import Effect, EffectsPlan
@@ -20,81 +21,29 @@ if TYPE_CHECKING:
 _NAME, _COST, _WIDTH = 24, 18, 100
 
 
+@takes_options(GeneratorConfig)
 def plan(
     material: str | None = None,
     /,
     *,
-    quality: QualityOption | None = None,
-    queries: str | None = None,
-    spp: int | None = None,
-    target_error: str | None = None,
-    effects: str | None = None,
-    tolerance: float | None = None,
-    height: float | None = None,
-    mesh: int | None = None,
-    tile: Tiling | None = None,
-    light_width: float | None = None,
-    min_cos: float | None = None,
-    max_depth: int | None = None,
-    seed: int | None = None,
-    measure: bool = True,
-    config: Path | None = None,
-    assignments: Set | None = None,
+    quality: QualityOption = None,
+    options: Options[GeneratorConfig],
+    measure: Annotated[bool, Parameter(show_default=False)] = True,
     console: Console = CONSOLE,
 ) -> None:
-    """Say which effects of light a run would simulate, why, and what leaving each one out costs.
+    """Report which effects of light a run would simulate and why, and forecast its time, size and noise.
 
-    A cost is the root mean square change of M over the run's queries, in percent of its mean value. Then what
-    the run will take in time and disk space, and how noisy its values will be, from a pilot on this machine.
+    The bias bound of an effect is the root mean square change of M over the run's queries if the effect is
+    left out, in percent of its mean value. A pilot on this machine gives the forecast.
 
     Parameters
     ----------
     material
         Height map, folder of maps, or material.yaml.
-    queries
-        Training queries of the run that is forecast: N, or N/texel of the finest level. Default: 100/texel
-    spp
-        Paths per training query, both halves together (even). Default: 4
-    target_error
-        Error of every training value to reach, relative to max(value, tile mean), such as 2%.
-    effects
-        auto, all, none, then +x or -x: effects of light to simulate. Default: auto
-    tolerance
-        Cost of all effects left out together, a share of the mean value. Default: 0.005
-    height
-        Factor on the stored heights, in tile widths. Default: the material's own
-    mesh
-        Mesh cells across the tile. Default: the map's width, at most 512
-    tile
-        Cure for maps that do not tile: 2 x 2 mirrored copies, or edges cross-faded. Default: none
-    light_width
-        RMS angle of the light per axis in degrees; 0 is a delta light. Default: 1
-    min_cos
-        Smallest cosine of light and view directions to the normal. Default: 0.1
-    max_depth
-        Surface interactions per path; 0: no limit (Russian roulette). Default: 0
-    seed
-        Root seed. Default: 0
     measure
-        Measure the cost of every effect that is on by a small run without it, and forecast the run.
-    config
-        YAML file with the options.
+        Measure the bias of leaving out each simulated effect by a small run, and forecast the run.
     """
-    from mbtf_gen.config.generator import GeneratorConfig
-
-    flags = {
-        "--queries": ("queries.train", queries),
-        "--spp": ("queries.spp", spp),
-        "--target-error": ("queries.target_error", target_error),
-        "--effects": ("effects.mode", effects),
-        "--tolerance": ("effects.tolerance", tolerance),
-        "--min-cos": ("queries.min_cos", min_cos),
-        **general(
-            height=height, mesh=mesh, tile=tile, light_width=light_width, max_depth=max_depth, seed=seed
-        ),
-    }
-    assigned = [*as_assignments(GENERATOR[quality] if quality else {}), *(assignments or [])]
-    resolved = resolve_config(GeneratorConfig, material, config, assigned, flags)
+    resolved = resolve_config(options, material, as_assignments(GENERATOR[quality] if quality else {}))
     from mbtf_gen.generation import Job
     from mbtf_gen.planning.effects_plan import plan_effects
     from mbtf_gen.planning.pilot import measured
@@ -111,11 +60,6 @@ def plan(
     found = measured(job, found)
     data = {**found.to_manifest(), "forecast": expected.as_dict()}
     text = f"{table(found)}\n{expected.describe(job.target('train'))}"
-    if quality is not None and (measured_line := expected_of().line(quality)) is not None:
-        text += (
-            f"\nwhole chains to material and report on {expected_of().machine}, {1 << expected_of().levels} "
-            f"texels across: {measured_line}"
-        )
     console.report(data, text)
 
 
@@ -126,7 +70,7 @@ def table(plan: EffectsPlan) -> str:
         lines += _row(effect)
     left = plan.cost
     share = "nothing" if left == 0 else f"at most {_percent(left)}"
-    lines.append(f"left out together: {share}, of {_percent(plan.tolerance)} allowed (--tolerance)")
+    lines.append(f"left out together: {share}, of {_percent(plan.tolerance)} allowed (effects.tolerance)")
     if plan.closed_form:
         lines.append("M is known in closed form: nothing is traced")
     elif plan.max_depth:
@@ -135,7 +79,7 @@ def table(plan: EffectsPlan) -> str:
 
 
 def _row(effect: Effect) -> list[str]:
-    from mbtf_gen.planning.effects import EFFECTS
+    from mbtf_gen.config.effects_request import EFFECTS
 
     before = _NAME + 5 + _COST
     reason = textwrap.wrap(effect.reason, _WIDTH - before) or [""]

@@ -1,45 +1,32 @@
-"""``mbtf-gen preview``: a first look at a material and its queries."""
+"""``mbtf-gen preview``: pictures of a material and of its queries."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-from cyclopts import Parameter
+from typing import TYPE_CHECKING, Any
 
 from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import InputError, PartialError, UsageError
-from mbtf_core.shard_schema import Tiling
-from mbtf_gen.cli.common import Flags, Output, Set, angles, general, resolve_config
+from mbtf_core.options import Options, Output, Overwrite, Switch, takes_options
+from mbtf_gen.cli.common import resolve_config
+from mbtf_gen.config.pictures import RENDERING, PreviewConfig
 
 if TYPE_CHECKING:
-    from mbtf_gen.config.pictures import PreviewConfig
     from mbtf_gen.dataset.reader import Dataset
 
+_QUERIES = ("train", "resolution", "min_cos", "layout", "patch_size")
 
+
+@takes_options(PreviewConfig, "preview", *(f"queries.{key}" for key in _QUERIES), *RENDERING)
 def preview(
     material: str | None = None,
     /,
     *,
-    output: Output = None,
-    view: str | None = None,
-    light: str | None = None,
-    block: int | None = None,
-    size: int | None = None,
-    spp: int | None = None,
-    height: float | None = None,
-    mesh: int | None = None,
-    tile: Tiling | None = None,
-    levels: int | None = None,
-    light_width: float | None = None,
-    min_cos: float | None = None,
-    max_depth: int | None = None,
-    seed: int | None = None,
-    config: Path | None = None,
-    assignments: Set | None = None,
-    window: Annotated[bool, Parameter(negative="")] = False,
-    overwrite: Annotated[bool, Parameter(negative="")] = False,
+    output: Output = Path("preview"),
+    options: Options[PreviewConfig],
+    interactive: Switch = False,
+    overwrite: Overwrite = False,
     console: Console = CONSOLE,
 ) -> None:
     """Draw the mesh, a path-traced picture, and the queries of a material or of a folder of shards.
@@ -48,59 +35,12 @@ def preview(
     ----------
     material
         Height map, folder of maps, material.yaml, or a folder of shards.
-    output
-        Folder of pictures. Default: preview/
-    view
-        ELEVATION,AZIMUTH of the camera in degrees. Default: 40,-90
-    light
-        ELEVATION,AZIMUTH of the light in degrees. Default: 35,150
-    block
-        Tiles along each side of the block that is drawn, 1 to 4. Default: 2
-    size
-        Pixels across. Default: 640
-    spp
-        Paths per pixel of the path-traced picture (even). Default: 16
-    height
-        Factor on the stored heights, in tile widths. Default: the material's own
-    mesh
-        Mesh cells across the tile. Default: the map's width, at most 512
-    tile
-        Cure for maps that do not tile: 2 x 2 mirrored copies, or edges cross-faded. Default: none
-    levels
-        Finest level k of the queries. Default: from the map's width
-    light_width
-        RMS angle of the light per axis in degrees; 0 is a delta light. Default: 1
-    min_cos
-        Smallest cosine of the queries' directions to the normal. Default: 0.1
-    max_depth
-        Surface interactions per path; 0: no limit. Default: 0
-    seed
-        Root seed. Default: 0
-    config
-        YAML file with the options.
-    window
-        Also show the mesh in a window, to be turned with the mouse.
-    overwrite
-        Draw again, and replace pictures of another configuration.
+    interactive
+        Also show the mesh in a window, where the mouse turns it.
     """
-    look = {
-        "--view": ("preview.view", angles(view, "--view")),
-        "--light": ("preview.light", angles(light, "--light")),
-        "--block": ("preview.block", block),
-        "--size": ("preview.size", size),
-        "--spp": ("preview.spp", spp),
-    }
-    rest = {
-        **general(
-            height=height, mesh=mesh, tile=tile, light_width=light_width, max_depth=max_depth, seed=seed
-        ),
-        "--levels": ("queries.levels", levels),
-        "--min-cos": ("queries.min_cos", min_cos),
-    }
     from mbtf_core.shard_schema import MANIFEST_NAME
-    from mbtf_gen.config.pictures import PreviewConfig
 
-    if window:
+    if interactive:
         from mbtf_gen.pictures.preview.mesh import check_display
 
         check_display()
@@ -109,29 +49,18 @@ def preview(
         from mbtf_gen.dataset.reader import Dataset
 
         dataset = Dataset.open(material)
-        given = [flag for flag, (_, value) in rest.items() if value is not None]
-        given += ["--config"] * (config is not None) + ["--set"] * bool(assignments)
+        given = [options.flags[key] for key in options.given if not key.startswith("preview.")]
+        given += ["--config"] * (options.config is not None) + ["--set"] * bool(options.assignments)
         if given:
             raise UsageError(
                 f"{material} holds a data set, whose configuration is settled",
                 where=given[0],
                 hint="leave it out, or name the material instead of its shards",
             )
-        resolved = _of_dataset(dataset, look)
+        resolved = options.resolve(**dataset.manifest["config"])
     else:
-        resolved = resolve_config(PreviewConfig, material, config, assignments or [], {**look, **rest})
-    _Preview(resolved, dataset, console).make(output or Path("preview"), overwrite, window)
-
-
-def _of_dataset(dataset: Dataset, look: Flags) -> PreviewConfig:
-    from mbtf_core.config_file import resolve
-    from mbtf_gen.config.pictures import PreviewConfig
-
-    return resolve(
-        PreviewConfig,
-        flags={**dataset.manifest["config"], **dict(look.values())},
-        spelled={key: flag for flag, (key, _) in look.items()},
-    )
+        resolved = resolve_config(options, material)
+    _Preview(resolved, dataset, console).make(output, overwrite, interactive)
 
 
 class _Preview:
@@ -164,11 +93,11 @@ class _Preview:
         from mbtf_gen.pictures.preview.view import block_camera
 
         wanted = self.config.preview
-        grid = job.material.grid(self.config.geometry.height, self.config.geometry.mesh)
+        grid = job.material.grid(self.config.geometry.height_scale, self.config.geometry.mesh)
         self.camera = block_camera(
             wanted.view.elevation,
             wanted.view.azimuth,
-            tiles=wanted.block,
+            tiles=wanted.tiles,
             aspect=grid.aspect,
             relief=grid.displacement_range,
             columns=wanted.size,
@@ -179,7 +108,7 @@ class _Preview:
             f"light from {wanted.light.elevation:g}, {wanted.light.azimuth:g} degrees"
         )
 
-    def make(self, path: Path, overwrite: bool, window: bool) -> None:
+    def make(self, path: Path, overwrite: bool, interactive: bool) -> None:
         """Make the pictures that are missing, report them, and open the window.
 
         Raises
@@ -229,7 +158,7 @@ class _Preview:
                 hint="the other pictures are there; mbtf-gen doctor says what drawing needs, "
                 "then the same command draws it",
             )
-        if window and self.job is not None:
+        if interactive and self.job is not None:
             from mbtf_gen.pictures.preview.mesh import show
 
             self.console.note("the mesh is shown in a window: close it to go on")
@@ -248,7 +177,7 @@ class _Preview:
 
         assert self.job is not None
         geometry = self.config.geometry
-        return block_of(self.job.material, self.config.preview.block, geometry.height, geometry.mesh)
+        return block_of(self.job.material, self.config.preview.tiles, geometry.height_scale, geometry.mesh)
 
     def _mesh(self, file: Path) -> dict[str, Any]:
         from mbtf_gen.pictures.preview.mesh import draw
@@ -257,7 +186,7 @@ class _Preview:
         fault = draw(block, self.camera, self.omega_i, file)
         if fault:
             return {"fault": fault}
-        tiles, (rows, columns) = self.config.preview.block, block.cells
+        tiles, (rows, columns) = self.config.preview.tiles, block.cells
         return {
             "shows": f"the displaced mesh ({columns} x {rows} cells per tile) of {tiles} x {tiles} tiles "
             f"with its base color, {self.seen}"

@@ -3,90 +3,34 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
-
-from cyclopts import Parameter
+from typing import Any
 
 from mbtf_core.console import CONSOLE, Console
-from mbtf_core.shard_schema import Tiling
-from mbtf_gen.cli.common import Output, Set, angles, general, numbers, resolve_config
+from mbtf_core.options import Options, Output, Overwrite, takes_options
+from mbtf_gen.cli.common import resolve_config
+from mbtf_gen.config.pictures import RENDERING, ReferenceConfig, without_queries
 
 
+@takes_options(ReferenceConfig, "reference", *RENDERING)
 def reference(
     material: str | None = None,
     /,
     *,
-    output: Output = None,
-    view: str | None = None,
-    light: str | None = None,
-    spans: str | None = None,
-    size: int | None = None,
-    spp: int | None = None,
-    kind: Literal["query", "pixel", "both"] | None = None,
-    height: float | None = None,
-    mesh: int | None = None,
-    tile: Tiling | None = None,
-    light_width: float | None = None,
-    max_depth: int | None = None,
-    seed: int | None = None,
-    config: Path | None = None,
-    assignments: Set | None = None,
-    overwrite: Annotated[bool, Parameter(negative="")] = False,
+    output: Output = Path("reference"),
+    options: Options[ReferenceConfig],
+    overwrite: Overwrite = False,
     console: Console = CONSOLE,
 ) -> None:
     """Render reference pictures of the micro-geometry on the plane: EXR with both halves, and PNG.
 
-    The same command again makes the pictures that are missing.
+    The same command again renders the missing pictures.
 
     Parameters
     ----------
     material
         Height map, folder of maps, or material.yaml.
-    output
-        Folder of pictures. Default: reference/
-    view
-        ELEVATION,AZIMUTH of the camera in degrees. Default: 60,-90
-    light
-        ELEVATION,AZIMUTH of the light in degrees. Default: 45,45
-    spans
-        Widths of the field of view in tile widths, comma-separated. Default: 1,2,4
-    size
-        Pixels along each side. Default: 256
-    spp
-        Paths per pixel, both halves together (even). Default: 256
-    kind
-        query: M at each pixel's footprint; pixel: the truly filtered image. Default: both
-    height
-        Factor on the stored heights, in tile widths. Default: the material's own
-    mesh
-        Mesh cells across the tile. Default: the map's width, at most 512
-    tile
-        Cure for maps that do not tile: 2 x 2 mirrored copies, or edges cross-faded. Default: none
-    light_width
-        RMS angle of the light per axis in degrees; 0 is a delta light. Default: 1
-    max_depth
-        Surface interactions per path; 0: no limit. Default: 0
-    seed
-        Root seed. Default: 0
-    config
-        YAML file with the options.
-    overwrite
-        Replace pictures of another configuration.
     """
-    flags = {
-        "--view": ("reference.view", angles(view, "--view")),
-        "--light": ("reference.light", angles(light, "--light")),
-        "--spans": ("reference.spans", numbers(spans, "--spans")),
-        "--size": ("reference.size", size),
-        "--spp": ("reference.spp", spp),
-        "--kind": ("reference.kind", kind),
-        **general(
-            height=height, mesh=mesh, tile=tile, light_width=light_width, max_depth=max_depth, seed=seed
-        ),
-    }
-    from mbtf_gen.config.pictures import ReferenceConfig, without_queries
-
-    resolved = resolve_config(ReferenceConfig, material, config, assignments or [], flags)
+    resolved = resolve_config(options, material)
     from mbtf_core.directions import from_angles
     from mbtf_core.stats import pooled_relative_error
     from mbtf_gen.generation import Job, build_estimator
@@ -97,16 +41,18 @@ def reference(
     wanted = resolved.reference
     job = Job.prepare(resolved)
     cameras = [
-        Camera(wanted.view.elevation, wanted.view.azimuth, span, rows=wanted.size, columns=wanted.size)
-        for span in wanted.spans
+        Camera(
+            wanted.view.elevation, wanted.view.azimuth, tiles_across, rows=wanted.size, columns=wanted.size
+        )
+        for tiles_across in wanted.tiles_across
     ]
     omega_i = from_angles(wanted.light.elevation, wanted.light.azimuth)
     for camera in cameras:
         camera.queries(omega_i)  # refuses a view of the horizon before anything is written
     kinds: tuple[PixelKind, ...] = ("query", "pixel") if wanted.kind == "both" else (wanted.kind,)
-    names = {(camera, one): f"{one}-span{camera.span:g}" for camera in cameras for one in kinds}
+    names = {(camera, one): f"{one}-tiles{camera.tiles_across:g}" for camera in cameras for one in kinds}
     folder = PictureFolder.claim(
-        output or Path("reference"),
+        output,
         "reference",
         files=[f"{name}.{suffix}" for name in names.values() for suffix in ("exr", "png")],
         config=without_queries(resolved),
@@ -137,7 +83,7 @@ def reference(
                     {
                         "file": folder.path / f"{name}.exr",
                         "kind": one,
-                        "span": camera.span,
+                        "tiles_across": camera.tiles_across,
                         "relative_noise": facts["relative_noise"],
                         "kept": kept,
                     }

@@ -6,24 +6,23 @@ from pathlib import Path
 
 from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import InputError, UsageError
+from mbtf_core.options import Time
 
 
-def selftest(*, report: Path | None = None, time: str = "2min", console: Console = CONSOLE) -> int:
-    """Check physics with known answers on this machine, and say how far off the worst case is.
+def selftest(*, report: Path | None = None, time: Time = "2min", console: Console = CONSOLE) -> int:
+    """Check physics with known answers on this machine, and report the largest deviation.
 
-    Exit code 0 when every check passed, 3 otherwise.
+    Each check runs at least once; a longer time means smaller statistical errors. Exit code 0 when every
+    check passed, 3 otherwise.
 
     Parameters
     ----------
     report
         Write every case to this file, .md or .html.
-    time
-        About how long to measure: 90s, 2min, 1h. Each check runs at least once; longer means smaller
-        statistical errors.
     """
     from mbtf_core.units import asked_duration
 
-    seconds = asked_duration(time, "--time")
+    seconds = asked_duration(time or "2min", "--time")
     if report is not None and report.suffix not in (".md", ".html"):
         raise UsageError(f"'{report.name}' must end in .md or .html", where="--report")
     from mbtf_gen.diagnostics.checks import all_checks

@@ -15,11 +15,14 @@ from pydantic import AfterValidator, BeforeValidator, Field
 
 from mbtf_core.config_file import FileName, Settings
 from mbtf_core.errors import UsageError
+from mbtf_core.lattice import MAX_LEVEL
+from mbtf_core.options import Flag
 from mbtf_core.shard_schema import SCHEMA_VERSION, ArrayFormat, Layout, Tiling
+from mbtf_gen.config.effects_request import EffectsRequest
 from mbtf_gen.geometry.slopes import NormalMode
-from mbtf_gen.planning.effects import EffectsRequest
 from mbtf_gen.sampling.light_kernel import MAX_WIDTH_DEG, MIN_WIDTH_DEG
 
+_RESOLUTIONS = [1 << level for level in range(MAX_LEVEL + 1)]
 _PERCENT = re.compile(r"^\s*(\d+(?:\.\d*)?|\.\d+)\s*%\s*$")
 _COUNT = re.compile(r"^\s*(\d+(?:\.\d+)?(?:[eE][+]?\d+)?)\s*(/\s*texel)?\s*$")
 
@@ -75,20 +78,32 @@ def _light_width(width: float) -> float:
 
 
 Count = Annotated[str, BeforeValidator(_count)]
+
+
+def _power_of_two(resolution: int) -> int:
+    if resolution not in _RESOLUTIONS:
+        raise ValueError(f"must be a power of two from 1 to {_RESOLUTIONS[-1]}")
+    return resolution
+
+
+Resolution = Annotated[int, AfterValidator(_power_of_two)]
 Paths = Annotated[int, Field(ge=2, le=1 << 20), AfterValidator(_even)]
 
 
 class GeometrySection(Settings):
     """The displaced tile."""
 
-    height: float | None = Field(
-        None, ge=-100, le=100, description="factor on the stored heights; default: the material's own"
+    height_scale: Annotated[float | None, Flag("--height-scale")] = Field(
+        None,
+        ge=-100,
+        le=100,
+        description="factor on the stored heights, in tile widths; default: the material's own",
     )
-    mesh: int | None = Field(
+    mesh: Annotated[int | None, Flag("--mesh")] = Field(
         None, ge=1, le=8192, description="mesh cells across the tile; default: the map's width, at most 512"
     )
-    tile: Tiling = Field(
-        "none", description="hint for maps that do not tile: mirrored copies, or edges cross-faded"
+    make_tileable: Annotated[Tiling, Flag("--make-tileable")] = Field(
+        "none", description="method for maps that do not tile: 2 x 2 mirrored copies, or cross-faded edges"
     )
 
 
@@ -102,46 +117,68 @@ class MixtureSection(Settings):
 class QueriesSection(Settings):
     """Which queries are drawn and how many paths each gets."""
 
-    train: Count = Field("100/texel", description="N or N/texel (texels of the finest level)")
-    test: Count = Field("8192", description="N or N/texel")
-    spp: Paths = Field(4, description="mean number of paths per training query, both halves together")
-    test_spp: Paths = Field(256, description="mean number of paths per test query, both halves together")
-    allocation: Literal["noise", "even"] = Field(
-        "noise", description="which queries get more paths: those where a pilot expects more noise, or none"
+    train: Annotated[Count, Flag("--queries", "N|N/texel")] = Field(
+        "100/texel", description="training queries, in all or per texel of the finest level"
     )
-    target_error: Annotated[float | None, BeforeValidator(_share)] = Field(
+    test: Annotated[Count, Flag("--test-queries", "N|N/texel")] = Field(
+        "8192", description="test queries, in all or per texel of the finest level"
+    )
+    spp: Annotated[Paths, Flag("--spp")] = Field(
+        4, description="mean number of paths per training query, both halves together (even)"
+    )
+    test_spp: Annotated[Paths, Flag("--test-spp")] = Field(
+        256, description="mean number of paths per test query, both halves together (even)"
+    )
+    allocation: Literal["noise", "uniform"] = Field(
+        "noise", description="paths per query: more where a pilot expects more noise, or the same for all"
+    )
+    target_error: Annotated[float | None, BeforeValidator(_share), Flag("--target-error", "2%")] = Field(
         None,
         gt=0,
         lt=1,
-        description="error of every training value relative to max(value, tile mean), such as 2%; in place "
-        "of a mean number of paths",
+        description="error of every training value relative to max(value, tile mean), in place of a mean "
+        "number of paths",
     )
-    cap: Paths = Field(1024, description="most paths per query under a target error")
-    levels: int | None = Field(None, ge=0, le=14, description="finest level k; default: from the map's width")
+    max_spp: Paths = Field(1024, description="most paths per query under a target error")
+    resolution: Annotated[Resolution | None, Flag("--resolution")] = Field(
+        None,
+        description="texels across at the finest level, a power of two; default: from the map's width",
+    )
     mixture: MixtureSection = MixtureSection()
-    min_cos: float = Field(0.1, gt=0, lt=1, description="smallest cosine of both directions to the normal")
-    layout: Layout = "shuffled"
-    window: int | None = Field(
+    min_cos: Annotated[float, Flag("--min-cos")] = Field(
+        0.1, gt=0, lt=1, description="smallest cosine of light and view directions to the normal"
+    )
+    layout: Annotated[Layout, Flag("--layout")] = Field(
+        "shuffled", description="shuffled queries, or images that share one light, view and footprint each"
+    )
+    patch_size: Annotated[int | None, Flag("--patch-size")] = Field(
         None,
         ge=1,
         le=256,
-        description="image layout: so many places along each side of a buffer, a texel of the level nearest "
-        "to its footprint apart; default: one place in every texel of the finest level",
+        description="image layout: texels along each side of an image, of the level nearest to its "
+        "footprint; default: one query in every texel of the finest level",
     )
+
+    @property
+    def finest(self) -> int | None:
+        """The finest level k, ``log2(resolution)``; None: from the map's width."""
+        return None if self.resolution is None else self.resolution.bit_length() - 1
 
 
 class LightSection(Settings):
     """The smoothed directional light."""
 
-    width: Annotated[float, AfterValidator(_light_width)] = Field(
-        1.0, ge=0, le=MAX_WIDTH_DEG, description="RMS angle per axis in degrees; 0 is a delta light"
+    width: Annotated[float, AfterValidator(_light_width), Flag("--light-width")] = Field(
+        1.0, ge=0, le=MAX_WIDTH_DEG, description="RMS angle of the light per axis in degrees; 0: delta light"
     )
 
 
 class TransportSection(Settings):
     """How light paths are followed."""
 
-    max_depth: int = Field(0, ge=0, le=1000, description="surface interactions per path; 0: no limit")
+    max_depth: Annotated[int, Flag("--max-depth")] = Field(
+        0, ge=0, le=1000, description="surface interactions per path; 0: no limit (Russian roulette)"
+    )
     roulette_depth: int = Field(1, ge=1, le=1000, description="interactions before Russian roulette begins")
     max_crossings: int = Field(4096, ge=1, description="tile borders that one ray may cross")
 
@@ -157,8 +194,10 @@ def _effects(text: str) -> str:
 class EffectsSection(Settings):
     """Which effects of light are simulated."""
 
-    mode: Annotated[str, AfterValidator(_effects)] = Field(
-        "auto", description="auto, all or none, then +x or -x for single effects, comma-separated"
+    mode: Annotated[str, AfterValidator(_effects), Flag("--effects")] = Field(
+        "auto",
+        description="simulated effects of light: auto, all or none, then +x or -x for single effects, "
+        "comma-separated",
     )
     tolerance: float = Field(
         0.005, ge=0, lt=1, description="cost of all effects left out together, relative to the mean value"
@@ -172,14 +211,14 @@ class EffectsSection(Settings):
 class OutputSection(Settings):
     """How the data are stored."""
 
-    format: ArrayFormat = "npz"
+    format: Annotated[ArrayFormat, Flag("--format")] = Field("npz", description="file format of the shards")
     shard_queries: int = Field(1 << 18, ge=1, le=1 << 24, description="queries per shard")
 
 
 class GeneratorConfig(Settings):
     """Everything ``mbtf-gen`` needs to make a data set."""
 
-    version: Literal[1] = 1
+    version: Literal[2] = 2
     material: FileName = Field(description="height map, folder of maps, or material.yaml")
     geometry: GeometrySection = GeometrySection()
     queries: QueriesSection = QueriesSection()
@@ -187,7 +226,9 @@ class GeneratorConfig(Settings):
     transport: TransportSection = TransportSection()
     effects: EffectsSection = EffectsSection()
     output: OutputSection = OutputSection()
-    seed: int = Field(0, ge=0, lt=1 << 63, description="root seed")
+    seed: Annotated[int, Flag("--seed")] = Field(
+        0, ge=0, lt=1 << 63, description="root seed of all random numbers"
+    )
 
     def data_fields(self, inputs: dict[str, str]) -> dict[str, Any]:
         """What the data depend on: the options, and the digests of the input files in place of their

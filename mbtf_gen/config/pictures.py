@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from mbtf_core.config_file import Settings
+from mbtf_core.options import Flag
+from mbtf_core.units import parse_numbers
 from mbtf_gen.config.generator import GeneratorConfig, Paths
 
 
@@ -22,33 +24,66 @@ class Direction(Settings):
     elevation: float = Field(gt=0, le=90, description="degrees above the plane")
     azimuth: float = Field(ge=-360, le=360, description="degrees from +u towards +v")
 
+    @model_validator(mode="before")
+    @classmethod
+    def _read(cls, value: Any) -> Any:
+        """A direction written as ``ELEVATION,AZIMUTH``."""
+        if not isinstance(value, str):
+            return value
+        try:
+            elevation, azimuth = (float(part) for part in value.split(","))
+        except ValueError:
+            raise ValueError("must be ELEVATION,AZIMUTH in degrees, such as 60,-90") from None
+        return {"elevation": elevation, "azimuth": azimuth}
+
 
 Size = Annotated[int, Field(ge=8, le=16384)]
+TilesAcross = Annotated[
+    list[Annotated[float, Field(gt=0, le=1e4)]],
+    BeforeValidator(parse_numbers),
+    Field(min_length=1),
+    AfterValidator(_distinct),
+]
+PATHS_PER_PIXEL = "paths per pixel"
+# Sections of the generator's configuration that decide what a picture shows.
+RENDERING = ("geometry", "light", "transport", "effects", "seed")
 
 
 class ReferenceSection(Settings):
     """Reference pictures."""
 
-    view: Direction = Field(Direction(elevation=60, azimuth=-90), description="where the camera stands")
-    light: Direction = Field(Direction(elevation=45, azimuth=45), description="where the light comes from")
-    spans: Annotated[
-        list[Annotated[float, Field(gt=0, le=1e4)]], Field(min_length=1), AfterValidator(_distinct)
-    ] = Field([1.0, 2.0, 4.0], description="widths of the field of view at the target, in tile widths")
-    size: Size = Field(256, description="pixels along each side")
-    spp: Paths = Field(256, description="paths per pixel, both halves together")
-    kind: Literal["query", "pixel", "both"] = Field(
-        "both", description="query: M at each pixel's footprint; pixel: the truly filtered image"
+    view: Annotated[Direction, Flag("--view", "ELEVATION,AZIMUTH")] = Field(
+        Direction(elevation=60, azimuth=-90), description="direction of the camera in degrees"
+    )
+    light: Annotated[Direction, Flag("--light", "ELEVATION,AZIMUTH")] = Field(
+        Direction(elevation=45, azimuth=45), description="direction of the light in degrees"
+    )
+    tiles_across: Annotated[TilesAcross, Flag("--tiles-across", "1,2,4")] = Field(
+        [1.0, 2.0, 4.0], description="widths of the field of view at the target, in tile widths"
+    )
+    size: Annotated[Size, Flag("--size")] = Field(256, description="pixels along each side of a picture")
+    spp: Annotated[Paths, Flag("--spp")] = Field(256, description=PATHS_PER_PIXEL)
+    kind: Annotated[Literal["query", "pixel", "both"], Flag("--kind")] = Field(
+        "both", description="values: M at each pixel's footprint (query), or the filtered image (pixel)"
     )
 
 
 class PreviewSection(Settings):
     """Pictures for a first look."""
 
-    view: Direction = Field(Direction(elevation=40, azimuth=-90), description="where the camera stands")
-    light: Direction = Field(Direction(elevation=35, azimuth=150), description="where the light comes from")
-    block: Annotated[int, Field(ge=1, le=4)] = Field(2, description="tiles along each side of what is drawn")
-    size: Annotated[int, Field(ge=64, le=8192)] = Field(640, description="pixels across")
-    spp: Paths = Field(16, description="paths per pixel of the path-traced picture")
+    view: Annotated[Direction, Flag("--view", "ELEVATION,AZIMUTH")] = Field(
+        Direction(elevation=40, azimuth=-90), description="direction of the camera in degrees"
+    )
+    light: Annotated[Direction, Flag("--light", "ELEVATION,AZIMUTH")] = Field(
+        Direction(elevation=35, azimuth=150), description="direction of the light in degrees"
+    )
+    tiles: Annotated[int, Field(ge=1, le=4), Flag("--tiles")] = Field(
+        2, description="tiles along each side of the drawn plane"
+    )
+    size: Annotated[int, Field(ge=64, le=8192), Flag("--size")] = Field(
+        640, description="pixels along each side of a picture"
+    )
+    spp: Annotated[Paths, Flag("--spp")] = Field(16, description=PATHS_PER_PIXEL)
 
 
 class ReferenceConfig(GeneratorConfig):

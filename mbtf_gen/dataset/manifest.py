@@ -75,7 +75,9 @@ def build_manifest(job: Job, entries: list[ShardEntry], effects: EffectsPlan | N
             "aspect": lattice.aspect,
             "maps_shape": list(material.height.shape),
             "mesh_shape": list(grid.z.shape),
-            "height": material.height_scale if config.geometry.height is None else config.geometry.height,
+            "height_scale": material.height_scale
+            if config.geometry.height_scale is None
+            else config.geometry.height_scale,
             "displacement_range": grid.displacement_range,
         },
         "levels": {
@@ -85,7 +87,7 @@ def build_manifest(job: Job, entries: list[ShardEntry], effects: EffectsPlan | N
             "mixture": {"log_uniform": plan.mixture.log_uniform, "finest": plan.mixture.finest},
         },
         "layout": plan.layout,
-        "window": plan.window,
+        "patch_size": plan.patch_size,
         "array_format": config.output.format,
         "arrays": {
             a.name: {"shape": [*lead, *a.trailing], "unit": a.unit, "meaning": a.meaning}

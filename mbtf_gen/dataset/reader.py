@@ -51,7 +51,7 @@ class _Manifest(BaseModel):
     levels: _Levels
     tile: _Tile
     splits: dict[str, _Split]
-    window: _Count | None = None
+    patch_size: _Count | None = None
 
 
 class _Sidecar(BaseModel):
@@ -122,10 +122,10 @@ class Dataset:
         return layout
 
     @property
-    def window(self) -> int | None:
-        """Places along each side of a buffer; None: buffers are whole finest lattices."""
-        window: int | None = self.manifest.get("window")
-        return window
+    def patch_size(self) -> int | None:
+        """Texels along each side of an image; None: images cover the whole finest level."""
+        size: int | None = self.manifest.get("patch_size")
+        return size
 
     @property
     def lattice(self) -> Lattice:

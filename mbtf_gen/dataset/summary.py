@@ -12,12 +12,13 @@ from mbtf_core.atomic import write_checksummed
 from mbtf_core.config_file import check_document
 from mbtf_core.locks import brief_lock
 from mbtf_core.shard_schema import MANIFEST_NAME
+from mbtf_gen.config.effects_request import EFFECTS
 from mbtf_gen.dataset.folder import read_manifest, sweep
 from mbtf_gen.dataset.manifest import software_versions
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.dataset.shard_statistics import COUNTS, ShardStatistics, refuse_nonfinite
 from mbtf_gen.dataset.verify import finished_record, sidecar_of
-from mbtf_gen.planning.effects import EFFECTS, EffectsPlan
+from mbtf_gen.planning.effects import EffectsPlan
 
 
 @dataclass(frozen=True)

@@ -75,7 +75,7 @@ def seam_warning(path: Path, seams: Sequence[Seam], factor: float) -> str | None
     return (
         f"{path}: does not tile along {' and '.join(s.axis for s in bad)}: the seam is a step of "
         f"{abs(factor) * worst.step:.2g} tile widths, {worst.ratio:.3g} times the interior's 99th "
-        "percentile; --tile mirror or --tile blend closes it"
+        "percentile; --make-tileable mirror or --make-tileable blend closes it"
     )
 
 
@@ -87,7 +87,7 @@ def orientation_warning(fit: NormalFit, normal: Path, height: Path) -> str | Non
     if not fit.turn:
         return (
             f"{normal}: fits the heights only upside down ({found}); "
-            "if dark is high, give a negative --height"
+            "if dark is high, give a negative --height-scale"
         )
     which, other = (height, normal) if fit.image == "height" else (normal, height)
     return f"{which}: fits {other.name} only when {fit.turn} ({found}); turn it, or one of the two is wrong"
@@ -129,7 +129,7 @@ def relief_warning(path: Path, relief: float) -> str | None:
     """The warning that a default factor makes too much, in tile widths, of the heights."""
     if relief <= _STEEP:
         return None
-    return f"{path}: the relief is {relief:.4g} tile widths; is another --height meant?"
+    return f"{path}: the relief is {relief:.4g} tile widths; is another --height-scale meant?"
 
 
 def suggestion_warning(path: Path, fit: NormalFit | None, factor: float) -> str | None:
@@ -138,8 +138,8 @@ def suggestion_warning(path: Path, fit: NormalFit | None, factor: float) -> str 
         return None
     ratio = factor / fit.scale
     return (
-        f"{path}: its slopes suggest another height than the default of {factor:.3g}, "
-        f"which is {ratio:{'.0f' if ratio >= 10 else '.2g'}} times as much; --height {fit.scale:.3g} takes it"
+        f"{path}: its slopes suggest --height-scale {fit.scale:.3g}; the default of {factor:.3g} is "
+        f"{ratio:{'.0f' if ratio >= 10 else '.2g'}} times as much"
     )
 
 
@@ -162,7 +162,7 @@ def normal_note(
     text += f"; correlation with them u {u}, v {v}"
     if fit.fits:
         own = "the default" if default else "the material file's"
-        text += f"; it suggests --height {fit.scale:.3g} ({own} is {factor:.3g})"
+        text += f"; it suggests --height-scale {fit.scale:.3g} ({own} is {factor:.3g})"
     return text
 
 

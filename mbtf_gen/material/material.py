@@ -45,7 +45,7 @@ FLOAT_SCALE = 1.0
 DEFAULT_ROUGHNESS = 0.5
 DEFAULT_METALLIC = 0.0
 DEFAULT_SPECULAR = 0.5
-DEFAULT_COAT_ROUGHNESS = 0.1
+DEFAULT_CLEARCOAT_ROUGHNESS = 0.1
 DEFAULT_SHEEN_ROUGHNESS = 0.3
 # Mesh cells across the tile, at most, unless asked for.
 DEFAULT_MESH = 512
@@ -66,7 +66,7 @@ class Material:
     height_bits : 8, 16, or None for floats
     base_color : (h, w, 3) or (3,), linear Rec.709 in [0, 1]
     roughness, metallic, specular : (h, w) or one number in [0, 1]; all three None for Lambert
-    coat, coat_roughness : clear coat's share and roughness, (h, w) or one number in [0, 1]; None without one
+    clearcoat, clearcoat_roughness : share and roughness, (h, w) or one number in [0, 1]; None without
     sheen, sheen_roughness : weight of a sheen on top of it all and its roughness, (h, w) or one number in
         [0, 1]; None without one
     sheen_color : (h, w, 3) or (3,), linear Rec.709 in [0, 1]; None for white, or without sheen
@@ -92,8 +92,8 @@ class Material:
     roughness: Share = None
     metallic: Share = None
     specular: Share = None
-    coat: Share = None
-    coat_roughness: Share = None
+    clearcoat: Share = None
+    clearcoat_roughness: Share = None
     sheen: Share = None
     sheen_color: Color | None = None
     sheen_roughness: Share = None
@@ -244,9 +244,11 @@ def _assemble(spec: MaterialFile, folder: Path, found: FoundMaps, tile: Tiling) 
     opacity = load.share("opacity", spec.opacity)
     if opacity is not None:
         load.notes.append(f"opacity: {holes(opacity):.0%} of the tile are holes")
-    coat, coat_roughness = (load.share(n, getattr(spec, n)) for n in ("clearcoat", "clearcoat_roughness"))
-    if coat is not None and coat_roughness is None:
-        coat_roughness = DEFAULT_COAT_ROUGHNESS
+    clearcoat, clearcoat_roughness = (
+        load.share(n, getattr(spec, n)) for n in ("clearcoat", "clearcoat_roughness")
+    )
+    if clearcoat is not None and clearcoat_roughness is None:
+        clearcoat_roughness = DEFAULT_CLEARCOAT_ROUGHNESS
     sheen, sheen_roughness = (load.share(n, getattr(spec, n)) for n in ("sheen", "sheen_roughness"))
     sheen_color = None if spec.sheen_color is None else load.color("sheen_color", spec.sheen_color)
     if sheen is not None and sheen_roughness is None:
@@ -266,8 +268,8 @@ def _assemble(spec: MaterialFile, folder: Path, found: FoundMaps, tile: Tiling) 
         roughness=roughness,
         metallic=metallic,
         specular=specular,
-        coat=coat,
-        coat_roughness=coat_roughness,
+        clearcoat=clearcoat,
+        clearcoat_roughness=clearcoat_roughness,
         sheen=sheen,
         sheen_color=sheen_color,
         sheen_roughness=sheen_roughness,

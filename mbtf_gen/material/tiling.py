@@ -155,13 +155,13 @@ def retile(material: Material, tile: Tiling) -> Material:
         raise InputError(
             "the textures of its bsdf cannot be mirrored or blended",
             where=material.files["height"].parent,
-            hint="use --tile none, or give maps in place of the bsdf",
+            hint="use --make-tileable none, or give maps in place of the bsdf",
         )
     if tile == "mirror" and any(4 * f.rows * f.columns > MAX_PIXELS for f in material.facts.values()):
         raise InputError(
             f"mirrored maps would have more than {MAX_PIXELS:,} pixels",
             where=material.files["height"].parent,
-            hint="use smaller maps, or --tile blend",
+            hint="use smaller maps, or --make-tileable blend",
         )
     change: Callable[[Array], Array] = mirror if tile == "mirror" else blend
     normals = mirror_normals if tile == "mirror" else blend_normals
@@ -182,8 +182,8 @@ def retile(material: Material, tile: Tiling) -> Material:
         roughness=changed(material.roughness),
         metallic=changed(material.metallic),
         specular=changed(material.specular),
-        coat=changed(material.coat),
-        coat_roughness=changed(material.coat_roughness),
+        clearcoat=changed(material.clearcoat),
+        clearcoat_roughness=changed(material.clearcoat_roughness),
         sheen=changed(material.sheen),
         sheen_color=changed(material.sheen_color),
         sheen_roughness=changed(material.sheen_roughness),

@@ -41,7 +41,7 @@ class Camera:
     Attributes
     ----------
     elevation, azimuth : of the direction from the target to the camera, in degrees
-    span : width of the field of view at the target, in tile widths
+    tiles_across : width of the field of view at the target, in tile widths
     target : (x, y) looked at, in tile widths
     rows, columns : of the image
     field_of_view : horizontal, in degrees
@@ -49,7 +49,7 @@ class Camera:
 
     elevation: float = 60.0
     azimuth: float = -90.0
-    span: float = 2.0
+    tiles_across: float = 2.0
     target: tuple[float, float] = (0.5, 0.5)
     rows: int = 256
     columns: int = 256
@@ -58,7 +58,7 @@ class Camera:
     @property
     def distance(self) -> float:
         """Distance from the target in tile widths."""
-        return self.span / (2.0 * np.tan(np.radians(self.field_of_view) / 2.0))
+        return self.tiles_across / (2.0 * np.tan(np.radians(self.field_of_view) / 2.0))
 
     @property
     def position(self) -> NDArray[np.float64]:

@@ -11,25 +11,8 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 from mbtf_core.errors import UsageError
+from mbtf_gen.config.effects_request import EFFECTS, EffectsRequest
 from mbtf_gen.planning.sample_allocation import Allocation
-
-# Effects by name, in the order in which light meets them, and what they are called.
-EFFECTS: dict[str, str] = {
-    "masking": "parallax and masking",
-    "shadowing": "shadowing",
-    "interreflection": "interreflection",
-    "neighbors": "periodic neighbors",
-    "specular": "specular lobe",
-    "metallic": "metallic",
-    "coat": "clear coat",
-    "sheen": "sheen",
-    "normal": "normal map",
-    "opacity": "opacity",
-    "fibers": "fiber scattering",
-    "mis": "BSDF sampling of light",
-}
-# Those that only a displaced tile has.
-OF_RELIEF = ("masking", "shadowing", "interreflection", "neighbors")
 
 # How a cost is known: it follows exactly; it is bounded from above by theory; it was measured by a pilot; or
 # the effect was asked for, or asked away, and nobody looked.
@@ -121,52 +104,22 @@ class EffectsPlan:
         return cls(effects, **{name: data[name] for name in names}, allocation=allocation)
 
 
-@dataclass(frozen=True)
-class EffectsRequest:
-    """What was asked for: ``auto``, ``all`` or ``none``, and effects forced on or off."""
+def decide(request: EffectsRequest, effect: Effect) -> Effect:
+    """The effect as it was asked for, where it was.
 
-    base: Literal["auto", "all", "none"]
-    forced: dict[str, bool]
-
-    @classmethod
-    def parse(cls, text: str) -> EffectsRequest:
-        """Read ``auto``, ``all``, ``none``, ``+x``, ``-x``, or a comma-separated list of them.
-
-        Raises
-        ------
-        UsageError : an unknown word
-        """
-        base: Any = "auto"
-        forced: dict[str, bool] = {}
-        for position, word in enumerate(w.strip() for w in text.split(",")):
-            if position == 0 and word in ("auto", "all", "none"):
-                base = word
-            elif word[:1] in ("+", "-") and word[1:] in EFFECTS:
-                forced[word[1:]] = word[0] == "+"
-            else:
-                raise UsageError(
-                    f"'{word}' is no effect",
-                    where="--effects",
-                    hint=f"auto, all or none, then +x or -x with x of {', '.join(EFFECTS)}",
-                )
-        return cls(base, forced)
-
-    def decide(self, effect: Effect) -> Effect:
-        """The effect as it was asked for, where it was.
-
-        Raises
-        ------
-        UsageError : asked for by name, but the material does not have it; or asked away, but it stays
-        """
-        name = effect.name
-        if not effect.present:
-            asked = self.forced.get(name, effect.on)
-            if asked and not effect.on:
-                raise UsageError(f"the material has none: {effect.reason}", where=f"--effects +{name}")
-            if effect.on and not asked:
-                raise UsageError(f"cannot be left out: {effect.reason}", where=f"--effects -{name}")
-            return effect
-        on = self.forced.get(name, effect.on if self.base == "auto" else self.base == "all")
-        if on == effect.on:
-            return effect
-        return replace(effect, on=on, reason=f"asked {'for' if on else 'away'}; {effect.reason}")
+    Raises
+    ------
+    UsageError : asked for by name, but the material does not have it; or asked away, but it stays
+    """
+    name = effect.name
+    if not effect.present:
+        asked = request.forced.get(name, effect.on)
+        if asked and not effect.on:
+            raise UsageError(f"the material has none: {effect.reason}", where=f"--effects +{name}")
+        if effect.on and not asked:
+            raise UsageError(f"cannot be left out: {effect.reason}", where=f"--effects -{name}")
+        return effect
+    on = request.forced.get(name, effect.on if request.base == "auto" else request.base == "all")
+    if on == effect.on:
+        return effect
+    return replace(effect, on=on, reason=f"asked {'for' if on else 'away'}; {effect.reason}")

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.errors import UsageError
+from mbtf_gen.config.effects_request import EFFECTS, OF_RELIEF, EffectsRequest
 from mbtf_gen.images.resample import resample
 from mbtf_gen.planning.bounds import POINTS, ReliefBounds, largest_slope, relief_bounds
-from mbtf_gen.planning.effects import EFFECTS, OF_RELIEF, Effect, EffectsPlan, EffectsRequest
+from mbtf_gen.planning.effects import Effect, EffectsPlan, decide
 from mbtf_gen.planning.pilot import Pilot, pilot_queries
 from mbtf_gen.sampling.light_kernel import LightKernel
 
@@ -86,13 +87,13 @@ def plan_effects(job: Job, *, pilots: bool = True) -> EffectsPlan:
     look = _look(job, pilots)
     tolerance = job.config.effects.tolerance
     reflecting = _surface(look, [n for n in LAYERS if wish.base == "auto" and n not in wish.forced])
-    decided = {e.name: wish.decide(e) for e in _affordable(reflecting, tolerance)}
+    decided = {e.name: decide(wish, e) for e in _affordable(reflecting, tolerance)}
     left = tolerance - sum(e.cost or 0.0 for e in decided.values() if not e.on)
     if not any(e.on for e in decided.values()):
         look = replace(look, lambert=True)
     costs = _relief(look)
     others = _affordable([_normal(look, costs), _opacity(look, costs), _fibers()], left)
-    decided |= {e.name: wish.decide(e) for e in others}
+    decided |= {e.name: decide(wish, e) for e in others}
     left = tolerance - sum(e.cost or 0.0 for e in decided.values() if not e.on)
     plan = _of_relief(look, wish, decided, costs, left)
     if wish.base != "all" and _known_exactly(look, plan):
@@ -108,7 +109,7 @@ def simulated(job: Job) -> EffectsPlan:
     effects = [*_surface(look), _normal(look, None), _opacity(look, None), _fibers()]
     effects += [Effect(name, not flat, "flat" if flat else "a relief") for name in OF_RELIEF]
     effects.append(Effect("mis", True, "reference"))
-    decided = _consistent({e.name: wish.decide(e) for e in effects}, wish)
+    decided = _consistent({e.name: decide(wish, e) for e in effects}, wish)
     plan = _assemble(job, decided, job.config.transport.max_depth)
     return replace(plan, mode=job.config.effects.mode)
 
@@ -121,7 +122,7 @@ def _look(job: Job, pilots: bool) -> _Look:
     return _Look(
         job,
         albedo,
-        material.is_lambert and material.coat is None and material.sheen is None,
+        material.is_lambert and material.clearcoat is None and material.sheen is None,
         own,
         pilots,
     )
@@ -193,7 +194,7 @@ def _strengths(material: Material) -> dict[str, float]:
     return {
         "specular": largest(material.specular),
         "metallic": largest(material.metallic),
-        "coat": largest(material.coat),
+        "coat": largest(material.clearcoat),
         "sheen": sheen,
     }
 
@@ -266,12 +267,12 @@ def _of_relief(
     """Effects of the relief and the sampling of light, given the surface's."""
     job = look.job
     cap = job.config.transport.max_depth
-    decided["mis"] = wish.decide(_mis(look))
+    decided["mis"] = decide(wish, _mis(look))
     black = not look.albedo.any() and look.lambert and not decided["opacity"].on
     if job.grid.displacement_range == 0.0 or black:
         reason = "flat" if job.grid.displacement_range == 0.0 else "black: nothing is reflected"
         for name in OF_RELIEF:
-            decided[name] = wish.decide(Effect(name, False, reason, 0.0, "exact"))
+            decided[name] = decide(wish, Effect(name, False, reason, 0.0, "exact"))
         return _assemble(job, _consistent(decided, wish), cap)
     shadowing = _shadowing(look, costs)
     masking = Effect(
@@ -286,15 +287,15 @@ def _of_relief(
         # Without the displaced tile its other effects go too; their costs are in the sum.
         masking = replace(masking, on=False, cost=costs.masking + bounces)
         for name in OF_RELIEF[1:]:
-            decided[name] = wish.decide(Effect(name, False, "no displaced tile", 0.0, "pilot"))
-        decided["masking"] = wish.decide(masking)
+            decided[name] = decide(wish, Effect(name, False, "no displaced tile", 0.0, "pilot"))
+        decided["masking"] = decide(wish, masking)
         return _assemble(job, _consistent(decided, wish), cap)
-    decided["masking"] = wish.decide(masking)
+    decided["masking"] = decide(wish, masking)
     if shadowing.cost is not None and shadowing.cost <= left / 2:
         left -= shadowing.cost
         shadowing = replace(shadowing, on=False)
-    decided["shadowing"] = wish.decide(shadowing)
-    decided["neighbors"] = wish.decide(_neighbors(look))
+    decided["shadowing"] = decide(wish, shadowing)
+    decided["neighbors"] = decide(wish, _neighbors(look))
     decided["interreflection"] = Effect("interreflection", True, "not looked at")
     decided["interreflection"], cap, cost = _interreflection(look, wish, decided, left)
     return _assemble(job, _consistent(decided, wish), cap, cost)
@@ -325,8 +326,8 @@ def _mis(look: _Look) -> Effect:
         return Effect("mis", True, "a wide light")
     material = job.material
     lobes = [2.0] if material.is_lambert else [2.0 * float(np.min(np.asarray(material.roughness))) ** 2]
-    if material.coat is not None:
-        lobes.append(2.0 * float(np.min(np.asarray(material.coat_roughness))) ** 2)
+    if material.clearcoat is not None:
+        lobes.append(2.0 * float(np.min(np.asarray(material.clearcoat_roughness))) ** 2)
     if material.sheen is not None:
         # Fibers stand within √α of upright.
         lobes.append(float(np.min(np.asarray(material.sheen_roughness))))
@@ -364,9 +365,9 @@ def _interreflection(
     asked = look.job.config.transport.max_depth
     effect = decided["interreflection"]
     if asked == 1:
-        return wish.decide(Effect("interreflection", False, "max_depth 1", None)), 1, 0.0
+        return decide(wish, Effect("interreflection", False, "max_depth 1", None)), 1, 0.0
     if "interreflection" in wish.forced or wish.base != "auto" or not decided["masking"].on:
-        effect = wish.decide(replace(effect, reason="a relief"))
+        effect = decide(wish, replace(effect, reason="a relief"))
         return effect, asked, 0.0
     most = _bounce_bound(look) if look.lambert else np.inf
     reason = "light from facet to facet"
@@ -429,7 +430,7 @@ def _consistent(decided: dict[str, Effect], wish: EffectsRequest) -> dict[str, E
 def without(plan: EffectsPlan, name: str) -> EffectsPlan:
     """The plan without an effect and without what needs it."""
     wish = EffectsRequest("auto", {name: False})
-    decided = _consistent({e.name: wish.decide(e) for e in plan.effects}, wish)
+    decided = _consistent({e.name: decide(wish, e) for e in plan.effects}, wish)
     return replace(plan, effects=tuple(decided.values()))
 
 

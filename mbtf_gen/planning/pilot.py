@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mbtf_gen.config.effects_request import EFFECTS
 from mbtf_gen.planning.bounds import CAUTION
-from mbtf_gen.planning.effects import EFFECTS, Effect, EffectsPlan
+from mbtf_gen.planning.effects import Effect, EffectsPlan
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.sampling.query_sampler import Queries
 
@@ -36,7 +37,7 @@ def pilot_queries(job: Job, count: int = PILOT_QUERIES, shard: int = 0) -> Queri
 
     Whatever the layout, each has a footprint and directions of its own: a few buffers would be a few.
     """
-    return replace(job.plan(), layout="shuffled", window=None).draw("pilot", shard, count)
+    return replace(job.plan(), layout="shuffled", patch_size=None).draw("pilot", shard, count)
 
 
 @dataclass(frozen=True)

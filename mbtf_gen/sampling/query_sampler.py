@@ -113,7 +113,7 @@ class QueryPlan:
     layout: Layout
     root: int
     shard_rows: int
-    window: int | None = None
+    patch_size: int | None = None
 
     def draw(self, split: str, shard: int, rows: int) -> Queries:
         """Queries of one shard: `rows` queries, or `rows` buffers, each of the finest lattice or of a window
@@ -125,13 +125,13 @@ class QueryPlan:
         if self.layout == "shuffled":
             texel = self._texels(split, shard * self.shard_rows, rows)
             return Queries(self._positions(generator, texel), sigma, omega_i, omega_o)
-        if self.window is None:
+        if self.patch_size is None:
             shape = (rows, *self.lattice.shape())
             texel = np.broadcast_to(np.arange(self.lattice.texels()).reshape(shape[1:]), shape)
             positions = self._positions(generator, texel)
         else:
-            shape = (rows, self.window, self.window)
-            positions = self._window(generator, sigma, self.window)
+            shape = (rows, self.patch_size, self.patch_size)
+            positions = self._patch(generator, sigma, self.patch_size)
         return Queries(
             positions,
             np.ascontiguousarray(np.broadcast_to(sigma[:, None, None], shape)),
@@ -153,7 +153,7 @@ class QueryPlan:
             position, left = position + take, left - take
         return np.concatenate(parts)
 
-    def _window(self, generator: np.random.Generator, sigma: F32, size: int) -> F32:
+    def _patch(self, generator: np.random.Generator, sigma: F32, size: int) -> F32:
         """Places (n, size, size, 2): grids, one texel of the level nearest to footprints (n,) between
         neighbors, that begin anywhere and go around the tile."""
         shapes = np.array([self.lattice.shape(s) for s in range(self.lattice.finest + 1)])

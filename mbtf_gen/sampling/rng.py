@@ -1,9 +1,9 @@
 """Random streams, an injective function of (root seed, split, shard, purpose, pass, half).
 
 Queries are drawn with NumPy's Philox, a counter-based generator whose key holds all of these numbers
-unhashed. Paths draw from low-discrepancy sequences inside kernels (:mod:`mbtf_gen.sampling.sobol`), one for each
-half of each query: the fields are hashed into a key of 64 bits, from which queries of one stream derive keys
-that differ from each other, so that no value depends on how paths are grouped into launches.
+unhashed. Paths draw from low-discrepancy sequences inside kernels (:mod:`mbtf_gen.sampling.sobol`), one for
+each half of each query. The fields are hashed into a key of 64 bits, from which the queries of one stream
+derive distinct keys, so that no value depends on how paths are grouped into launches.
 """
 
 from __future__ import annotations

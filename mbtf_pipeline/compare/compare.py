@@ -90,7 +90,7 @@ def compare(
     (out / PICTURES).mkdir(parents=True, exist_ok=True)
     materials = {name: Material.load(folder) for name, folder in fits.items()}
     start = time.perf_counter()
-    material = load_material(Path(generate.material), generate.geometry.tile)
+    material = load_material(Path(generate.material), generate.geometry.make_tileable)
     estimator = build_estimator(generate, material)
     rendered = _render(section, estimator, progress)
     seconds = {"references": time.perf_counter() - start}

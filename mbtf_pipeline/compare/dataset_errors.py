@@ -14,7 +14,7 @@ from mbtf_gen.dataset.reader import Dataset
 
 if TYPE_CHECKING:
     from mbtf_fit import Material
-    from mbtf_fit.data.loader import Queries
+    from mbtf_fit.data.queries import ShardQueries
 
 
 def errors_on_data(materials: Mapping[str, Material], data: Dataset) -> dict[str, Any]:
@@ -56,7 +56,7 @@ def errors_on_data(materials: Mapping[str, Material], data: Dataset) -> dict[str
     return out
 
 
-def _known(value: NDArray[np.float32], queries: Queries) -> NDArray[np.float32]:
+def _known(value: NDArray[np.float32], queries: ShardQueries) -> NDArray[np.float32]:
     """A prediction that has been made."""
     return value
 

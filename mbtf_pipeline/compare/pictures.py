@@ -19,27 +19,27 @@ PICTURES = "pictures"
 
 @dataclass(frozen=True)
 class Scene:
-    """One view under one light at one span.
+    """One view under one light at one width.
 
     Attributes
     ----------
     index : number of the scene in the comparison
-    name : ``v1-l2-s3``: numbers of view, light and span, from 1
-    span : width of the field of view at the target, in tile widths
+    name : ``v1-l2-s3``: numbers of view, light and width, from 1
+    tiles_across : width of the field of view at the target, in tile widths
     """
 
     index: int
     name: str
     view: View
     light: Direction
-    span: float
+    tiles_across: float
 
     def camera(self, size: int) -> Camera:
         """The scene's camera, `size` pixels along each side."""
         return Camera(
             self.view.elevation,
             self.view.azimuth,
-            self.span,
+            self.tiles_across,
             rows=size,
             columns=size,
             field_of_view=FIELD_OF_VIEW,
@@ -51,7 +51,7 @@ class Scene:
             "name": self.name,
             "view": self.view.model_dump(),
             "light": self.light.model_dump(),
-            "span": self.span,
+            "tiles_across": self.tiles_across,
         }
 
     def file(self, what: str) -> str:
@@ -60,12 +60,12 @@ class Scene:
 
 
 def scenes(compare: CompareSection) -> Iterator[Scene]:
-    """All scenes of a comparison: views outermost, spans innermost."""
+    """All scenes of a comparison: views outermost, widths innermost."""
     index = 0
     for v, view in enumerate(compare.views, 1):
         for n, light in enumerate(compare.lights, 1):
-            for s, span in enumerate(compare.spans, 1):
-                yield Scene(index, f"v{v}-l{n}-s{s}", view, light, span)
+            for s, tiles_across in enumerate(compare.tiles_across, 1):
+                yield Scene(index, f"v{v}-l{n}-s{s}", view, light, tiles_across)
                 index += 1
 
 

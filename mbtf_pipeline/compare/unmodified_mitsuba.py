@@ -51,8 +51,8 @@ _BARE = (
     "roughness",
     "metallic",
     "specular",
-    "coat",
-    "coat_roughness",
+    "clearcoat",
+    "clearcoat_roughness",
     "sheen",
     "sheen_color",
     "sheen_roughness",
@@ -132,7 +132,7 @@ def _blocks(picture: F64) -> F64:
 
 
 def pick_scene(section: CompareSection) -> tuple[View, Direction, float]:
-    """The first view and the first light that are high enough, and the smallest span.
+    """The first view and the first light that are high enough, and the smallest width.
 
     Raises
     ------
@@ -146,7 +146,7 @@ def pick_scene(section: CompareSection) -> tuple[View, Direction, float]:
             where="compare.stock",
             hint="add them to compare.views and compare.lights, or leave the option out",
         )
-    return views[0], lights[0], min(section.spans)
+    return views[0], lights[0], min(section.tiles_across)
 
 
 def write_stock(
@@ -158,7 +158,7 @@ def write_stock(
     ------
     UsageError : the comparison has no scene for it
     """
-    view, light, span = pick_scene(section)
+    view, light, tiles_across = pick_scene(section)
     surfaces = []
     for found in compare_with_stock(section, generate, material):
         files = {}
@@ -170,7 +170,7 @@ def write_stock(
     return {
         "view": view.model_dump(),
         "light": light.model_dump(),
-        "span": span,
+        "tiles_across": tiles_across,
         "tolerances": {"mean": MEAN_TOLERANCE, "rms": RMS_TOLERANCE},
         "surfaces": surfaces,
     }
@@ -189,9 +189,9 @@ def compare_with_stock(
     from mbtf_gen.generation import Job, build_estimator
     from mbtf_gen.pictures.reference import render_reference
 
-    view, light, span = pick_scene(section)
+    view, light, tiles_across = pick_scene(section)
     config = generate.model_copy(update={"light": LightSection(width=0.0)})
-    camera = Camera(view.elevation, view.azimuth, span, rows=section.size, columns=section.size)
+    camera = Camera(view.elevation, view.azimuth, tiles_across, rows=section.size, columns=section.size)
     omega_i = from_angles(light.elevation, light.azimuth)
     out = []
     for surface, made in _surfaces(material).items():
@@ -250,7 +250,11 @@ def _stock_scene(job: Job, camera: Camera, omega_i: F64, folder: Path) -> dict[s
         "bsdf": _stock_surface(job),
     }
     # What a pixel at the edge sees, and from where light and interreflection reach it.
-    reach = 0.75 * camera.span + 2.0 * grid.displacement_range / math.tan(math.radians(LOWEST_LIGHT)) + 1.0
+    reach = (
+        0.75 * camera.tiles_across
+        + 2.0 * grid.displacement_range / math.tan(math.radians(LOWEST_LIGHT))
+        + 1.0
+    )
     columns, rows = (math.ceil(reach / side) for side in (1.0, grid.aspect))
     shift = mi.ScalarTransform4f().translate
     # The tile that the camera looks at lies in the middle.

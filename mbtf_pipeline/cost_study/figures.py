@@ -4,24 +4,38 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from mbtf_core.stats import Estimate
-from mbtf_pipeline.cost_study.fit_runs import QUALITIES
-from mbtf_pipeline.cost_study.measurements import Point
+from mbtf_pipeline.cost_study.fit_runs import PRESET
+from mbtf_pipeline.cost_study.measurements import Measurement
 from mbtf_pipeline.cost_study.pareto import pareto_front
 from mbtf_pipeline.report.plots import Cloud, scatter
 
 NOISE_AXIS = "RMS error relative to the mean value"
 ERROR_AXIS = "unexplained variance of test queries"
-PRICE_AXIS = "seconds per million queries"
+TIME_AXIS = "seconds per million queries"
+_RUNS = {"whole": "whole runs", "models": "models and sizes", "data": "queries or paths"}
+
+Value = Callable[[Measurement], Estimate]
 
 
-def told(point: Point) -> bool:
-    """Whether a bias is told from zero."""
-    return point.bias is not None and point.bias.value > 2 * point.bias.error
+def is_significant(bias: Estimate | None) -> bool:
+    """Whether a bias differs from zero by more than two standard errors."""
+    return bias is not None and bias.value > 2 * bias.error
+
+
+def _seconds(m: Measurement) -> Estimate:
+    return m.seconds
+
+
+def _error(m: Measurement) -> Estimate:
+    return m.error
+
+
+def _name(m: Measurement) -> str:
+    return m.name
 
 
 def _figure(
@@ -29,194 +43,117 @@ def _figure(
 ) -> dict[str, Any]:
     shown = [c for c in clouds if len(c.x)]
     if not shown:
-        return {"svg": "", "caption": f"No {y} could be told."}
+        return {"svg": "", "caption": f"No {y} could be measured."}
     svg = scatter(shown, x, y, f"cost {name}", png=folder / f"{name}.png", **options)
     return {"svg": svg, "caption": caption}
 
 
 def _cloud(
     name: str,
-    points: Sequence[Point],
-    y: Callable[[Point], Estimate],
-    x: Callable[[Point], Estimate] = lambda p: p.seconds,
+    found: Sequence[Measurement],
+    y: Value = _error,
+    x: Value = _seconds,
     *,
-    label: Callable[[Point], str] = lambda p: p.name,
+    label: Callable[[Measurement], str] = _name,
     joined: bool = True,
     hollow: bool = False,
 ) -> Cloud:
-    usable = [p for p in points if math.isfinite(y(p).value) and math.isfinite(x(p).value)]
-    ordered = sorted(usable, key=lambda p: x(p).value)
+    usable = [m for m in found if math.isfinite(y(m).value) and math.isfinite(x(m).value)]
+    ordered = sorted(usable, key=lambda m: x(m).value)
 
-    def bars(of: Callable[[Point], Estimate]) -> list[float]:
-        return [of(p).error if math.isfinite(of(p).error) else 0.0 for p in ordered]
+    def errors(of: Value) -> list[float]:
+        return [of(m).error if math.isfinite(of(m).error) else 0.0 for m in ordered]
 
     return Cloud(
         name,
-        [x(p).value for p in ordered],
-        [y(p).value for p in ordered],
-        bars(x),
-        bars(y),
-        [label(p) for p in ordered],
+        [x(m).value for m in ordered],
+        [y(m).value for m in ordered],
+        errors(x),
+        errors(y),
+        [label(m) for m in ordered],
         joined=joined,
         hollow=hollow,
     )
 
 
-def _by_series(
-    points: Sequence[Point],
-    y: Callable[[Point], Estimate],
-    x: Callable[[Point], Estimate] = lambda p: p.seconds,
-    *,
-    label: Callable[[Point], str] = lambda p: p.name,
-    joined: bool = True,
-) -> list[Cloud]:
-    names = list(dict.fromkeys(p.series for p in points))
-    return [_cloud(n, [p for p in points if p.series == n], y, x, label=label, joined=joined) for n in names]
+def _by_series(found: Sequence[Measurement], **options: Any) -> list[Cloud]:
+    names = list(dict.fromkeys(m.series for m in found))
+    return [_cloud(n, [m for m in found if m.series == n], **options) for n in names]
 
 
-def _error(point: Point) -> Estimate:
-    return point.error
-
-
-def detail(name: str) -> Callable[[Point], Estimate]:
-    """A further number of a point, with its standard error where there is one; NaN where there is none."""
-
-    def of(point: Point) -> Estimate:
-        return Estimate(point.details.get(name, math.nan), point.details.get(f"{name}_se", 0.0), 1)
-
-    return of
-
-
-def noise_figures(points: Sequence[Point], name: str, folder: Path) -> list[dict[str, Any]]:
+def noise_figures(found: Sequence[Measurement], name: str, folder: Path) -> list[dict[str, Any]]:
     """Noise over seconds, one line per series."""
-    return [_figure(_by_series(points, _error), PRICE_AXIS, NOISE_AXIS, name, folder)]
+    return [_figure(_by_series(found), TIME_AXIS, NOISE_AXIS, name, folder)]
 
 
-def count_figures(points: Sequence[Point], name: str, folder: Path) -> list[dict[str, Any]]:
-    """Noise over seconds for ways to count paths, by both measures of it."""
-    relative = _by_series(points, detail("relative"))
-    return [
-        _figure(
-            _by_series(points, _error), PRICE_AXIS, NOISE_AXIS, name, folder, "Relative to the mean value."
-        ),
-        _figure(
-            relative,
-            PRICE_AXIS,
-            "RMS of error ÷ max(value, tile mean)",
-            f"{name}_relative",
-            folder,
-            "Relative to each value, or to the tile mean where that is more: what a target error is about.",
-        ),
-    ]
-
-
-def bias_figures(points: Sequence[Point], name: str, folder: Path) -> list[dict[str, Any]]:
-    """Bias and noise over seconds, apart."""
-    hidden = [p for p in points if not told(p)]
+def bias_figures(found: Sequence[Measurement], name: str, folder: Path) -> list[dict[str, Any]]:
+    """Bias and noise over seconds."""
+    biased = [m for m in found if is_significant(m.bias)]
     clouds = [
-        _cloud("bias", [p for p in points if told(p)], lambda p: p.bias or p.error, joined=False),
+        _cloud("bias", biased, lambda m: m.bias or m.error, joined=False),
         _cloud(
             "noise",
-            points,
-            lambda p: p.noise or p.error,
-            label=lambda p: "" if told(p) else p.name,
+            found,
+            lambda m: m.noise or m.error,
+            label=lambda m: "" if is_significant(m.bias) else m.name,
             joined=False,
             hollow=True,
         ),
     ]
+    limits = [2 * max(m.bias.error, m.bias.value) for m in found if m.bias and not is_significant(m.bias)]
     caption = ""
-    if hidden:
-        limits = [2 * max(p.bias.error, p.bias.value) for p in hidden if p.bias is not None]
-        caption = "Settings named at their noise have a bias that is not told from zero" + (
-            f", at most {100 * max(limits):.2g} % of the mean value." if limits else "."
+    if limits:
+        limit = 100 * max(limits)
+        caption = (
+            f"Labels at the noise: the bias is not significant, at most {limit:.2g} % of the mean value."
         )
-    return [_figure(clouds, PRICE_AXIS, NOISE_AXIS, name, folder, caption)]
+    return [_figure(clouds, TIME_AXIS, NOISE_AXIS, name, folder, caption)]
 
 
-def data_figures(points: Sequence[Point], name: str, folder: Path) -> list[dict[str, Any]]:
+def data_figures(found: Sequence[Measurement], name: str, folder: Path) -> list[dict[str, Any]]:
     """Error over seconds of generating."""
-    return [_figure(_by_series(points, _error), "seconds of generating", ERROR_AXIS, name, folder)]
+    return [_figure(_by_series(found), "seconds of generating", ERROR_AXIS, name, folder)]
 
 
-def fit_figures(points: Sequence[Point], name: str, folder: Path) -> list[dict[str, Any]]:
-    """Error over seconds of training, milliseconds of evaluation and bytes, the last in both precisions."""
-    longest = [
-        max((p for p in points if p.series == s), key=lambda p: p.seconds.value)
-        for s in dict.fromkeys(p.series for p in points)
-    ]
-    half = [replace(p, error=_half_error(p)) for p in longest]
-
-    def series(p: Point) -> str:
-        return "of the qualities" if p.series == QUALITIES else p.series.removeprefix("neumip, ")
-
-    def precise(kind: str, some: Sequence[Point], size: str, hollow: bool) -> Cloud:
-        def kilobytes(p: Point) -> Estimate:
-            return detail(size)(p).scaled(1e-3)
-
-        return _cloud(kind, some, _error, kilobytes, label=series, joined=False, hollow=hollow)
-
+def model_figures(found: Sequence[Measurement], name: str, folder: Path) -> list[dict[str, Any]]:
+    """Error over seconds of training, and over milliseconds of evaluation."""
+    series = dict.fromkeys(m.series for m in found)
+    longest = [max((m for m in found if m.series == s), key=lambda m: m.seconds.value) for s in series]
+    evaluated = _by_series(
+        longest,
+        x=lambda m: Estimate(m.details.get("evaluation_ms_1080p", math.nan), 0.0, 1),
+        label=lambda m: m.series.removeprefix("neumip, "),
+        joined=False,
+    )
+    axis = "milliseconds for a 1080p image, one query per pixel"
+    caption = "The longest training of each."
     return [
-        _figure(_by_series(points, _error), "seconds of training", ERROR_AXIS, name, folder),
-        _figure(
-            _by_series(longest, _error, detail("evaluation_ms_1080p"), label=series, joined=False),
-            "milliseconds for a 1080p picture, one query per pixel",
-            ERROR_AXIS,
-            f"{name}_evaluation",
-            folder,
-            "The longest training of each.",
-        ),
-        _figure(
-            [
-                precise("32-bit floats", longest, "bytes", False),
-                precise("the same in 16-bit floats", half, "half_bytes", True),
-            ],
-            "kilobytes of the material",
-            ERROR_AXIS,
-            f"{name}_bytes",
-            folder,
-            "The longest training of each, as it is and rounded to half precision.",
-        ),
+        _figure(_by_series(found), "seconds of training", ERROR_AXIS, name, folder),
+        _figure(evaluated, axis, ERROR_AXIS, f"{name}_evaluation", folder, caption),
     ]
 
 
-def _half_error(point: Point) -> Estimate:
-    """Error in half precision; its bar is that of single precision, whose test queries and seed it shares."""
-    return Estimate(point.details.get("half_error", math.nan), point.error.error, point.error.n)
-
-
-_STUDIES = {"chain": "whole chains", "data": "queries or paths", "fit": "models and sizes"}
-
-
-def chain_name(point: Point) -> str:
-    """Queries × paths, and what sets the fit apart from that of the qualities."""
-    name = f"{point.details['queries'] / 1e6:.2g} M × {point.details['spp']:g}"
-    if point.study != "fit" or point.series == QUALITIES:
+def run_name(m: Measurement) -> str:
+    """Queries × paths, and the model where it is not that of the presets."""
+    name = f"{m.details['queries'] / 1e6:.2g} M × {m.details['spp']:g}"
+    if m.study != "models" or m.series == PRESET:
         return name
-    return f"{name}, {point.series.partition(', ')[2] or f'{point.series} of its paper'}"
+    return f"{name}, {m.series.partition(', ')[2] or f'{m.series} of its paper'}"
 
 
-def front_figures(chains: Sequence[Point], folder: Path) -> list[dict[str, Any]]:
-    """All chains and the front; only the front's points have names."""
-    front = pareto_front(chains)
-    named = {id(p) for p in front}
+def front_figures(runs: Sequence[Measurement], folder: Path) -> list[dict[str, Any]]:
+    """All runs and their Pareto front, whose points have names."""
+    front = pareto_front(runs)
     clouds = [
         _cloud(
             title,
-            [p for p in chains if p.study == study],
-            _error,
-            label=lambda p: chain_name(p) if id(p) in named else "",
+            [m for m in runs if m.study == study],
+            label=lambda m: run_name(m) if m in front else "",
             joined=False,
         )
-        for study, title in _STUDIES.items()
+        for study, title in _RUNS.items()
     ]
-    return [
-        _figure(
-            clouds,
-            "seconds in all, from height map to material",
-            ERROR_AXIS,
-            "front",
-            folder,
-            "Names on the front: training queries × paths per query, and fits unlike those of the qualities.",
-            front=[(p.seconds.value, p.error.value) for p in front],
-        )
-    ]
+    axis = "seconds in total, from height map to material"
+    caption = "Names on the front: training queries × paths per query, and models other than the preset's."
+    points = [(m.seconds.value, m.error.value) for m in front]
+    return [_figure(clouds, axis, ERROR_AXIS, "front", folder, caption, front=points)]

@@ -1,10 +1,11 @@
-"""The generator's trades: error of M against seconds, split into bias and noise.
+"""Time and error of the generator's configurations; the error of M is split into bias and noise.
 
-A setting is compared with a reference at the same queries. With halves a, b of the setting and
+A configuration is compared with a reference at the same queries. With halves a, b of the configuration and
 r, s of the reference, (a, r) independent of (b, s), ``E[(a - r)(b - s)]`` is the squared bias, free of the
-noise of both. Within a half both use the same random numbers, so that most of the noise cancels in the
-differences and small biases are seen. ``E[(a - b)²/4]`` is the variance of the setting's own noise. Both are
-given as root mean squares relative to the mean value of the reference, whose own error is part of their bars.
+noise of both. Within a half both use the same random numbers, so most of the noise cancels in the differences
+and biases far below the noise are significant. ``E[(a - b)²/4]`` is the variance of the configuration's
+noise. Both are given as root mean squares relative to the mean value of the reference; the error of that mean
+is part of their error bars.
 """
 
 from __future__ import annotations
@@ -12,8 +13,7 @@ from __future__ import annotations
 import math
 import statistics
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -21,59 +21,47 @@ from numpy.typing import NDArray
 
 from mbtf_core.stats import Estimate, mean_estimate
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.generation import Job
+from mbtf_gen.generation import Job, allocated
 from mbtf_gen.material.material import Material
 from mbtf_gen.planning.adaptive import estimate_shard
 from mbtf_gen.planning.effects_plan import plan_effects
-from mbtf_gen.planning.sample_allocation import Allocation, measure_allocation
-from mbtf_gen.render.estimates import Estimates, Stream
+from mbtf_gen.render.estimates import Stream
 from mbtf_gen.sampling.query_sampler import Queries
 from mbtf_pipeline.cost_study.measurements import HALF_WIDTH, NORMAL
 
-# Queries of one piece of the reference, and paths that it and the setting get at each.
-BIAS_QUERIES = 16384
-BIAS_SPP = 64
-_MOST_BIAS_PIECES = 16
-# Pieces of queries, and paths of each, that the mean value is taken over.
-_MEAN_PIECES, _MEAN_QUERIES, _MEAN_SPP = 4, 1 << 17, 2
-# Paths of one timed piece.
-_PIECE_PATHS = 1 << 19
-_FEWEST_PIECES = 8
-# Paths per query below which pieces get no larger: closed forms take none.
+# Queries of one batch of the reference, and paths of each there and in the configuration.
+BIAS_QUERIES, BIAS_SPP = 1 << 14, 64
+_MOST_BIAS_BATCHES = 16
+# Batches of queries for the mean value, and paths of each query.
+_MEAN_BATCHES, _MEAN_QUERIES, _MEAN_SPP = 4, 1 << 17, 2
+# Paths of one timed batch, and the fewest batches. Closed forms take fewer paths per query than counted here.
+_BATCH_PATHS = 1 << 19
+_FEWEST_BATCHES = 8
 _FEWEST_PATHS = 2.0
-# Bias below which none is looked for.
+# Squared biases below the square of this are negligible.
 _NEGLIGIBLE = 0.005
-# Shards, of this many queries, that stand for the study's streams of random numbers.
+# Random streams of the study stand for shards of so many queries, from these numbers on.
 SHARD = 1 << 14
-_FIRST_MEAN = 1_001
-_FIRST_REFERENCE = 5_001
-_FIRST_PIECE = 10_001
-# Queries that tell how many paths adaptive counts take, and the fewest of a piece.
-_LOOK, _FEWEST_IN_PIECE = 2048, 1024
-
-# Estimates queries with a stream's random numbers.
-Trace = Callable[[Queries, Stream], Estimates]
+_FIRST_MEAN, _FIRST_REFERENCE, _FIRST_BATCH = 1_001, 5_001, 10_001
+# Queries that measure how many paths a target error takes.
+_PROBE = 2048
 
 
 @dataclass(frozen=True)
-class Measurement:
-    """A setting's price and error.
+class BenchmarkResult:
+    """Time and error of a configuration.
 
     Attributes
     ----------
     seconds : per million queries
-    bias, noise, error : root mean squares relative to the reference's mean value; no bias where setting and
-        reference trace the same
-    relative : root mean square of the noise of each query over max(value, tile mean), and paths : mean per
-        query, where they were asked for
+    bias, noise, error : root mean squares relative to the mean value of the reference; no bias where only the
+        number of paths differs from the reference
     """
 
     seconds: Estimate
     bias: Estimate | None
     noise: Estimate
     error: Estimate
-    relative: Estimate | None = None
-    paths: float | None = None
 
 
 @dataclass(frozen=True)
@@ -87,29 +75,27 @@ class _Reference:
 
 @dataclass
 class GeneratorBenchmark:
-    """One material and configuration, and what settings of it are compared with: at the same queries, all
-    effects and no cap on interactions, but for what the reference of a study is about.
+    """Measures configurations of one material against references with all effects and unlimited paths.
 
     Parameters
     ----------
-    config : the recipe's generator; its level is fixed, so that every setting answers the same queries
+    config : the recipe's generator; its finest level is fixed, so that all configurations have equal queries
     seed : of queries and paths
     """
 
     config: GeneratorConfig
     material: Material
     seed: int
-    # By the reference's options: its job and estimator, and by options and number its pieces.
-    _judges: dict[str, tuple[Job, Any]] = field(default_factory=dict, repr=False)
+    # By the options of the reference: estimator and mean value; by options and number: its batches.
+    _estimators: dict[str, tuple[Job, Any]] = field(default_factory=dict, repr=False)
     _references: dict[tuple[str, int], _Reference] = field(default_factory=dict, repr=False)
     _means: dict[str, Estimate] = field(default_factory=dict, repr=False)
 
     def job(self, changes: dict[str, Any]) -> Job:
-        """The job of the configuration with options changed, by dotted name."""
+        """The job with options changed, by dotted name."""
         data = self.config.model_dump(mode="json")
-        levels = Job.of(self.config, self.material).lattice.finest
         fixed = {
-            "queries.levels": levels,
+            "queries.resolution": 1 << Job.of(self.config, self.material).lattice.finest,
             "queries.layout": "shuffled",
             "output.shard_queries": SHARD,
         }
@@ -118,199 +104,152 @@ class GeneratorBenchmark:
             (data[section] if section else data)[key] = value
         return Job.of(GeneratorConfig.model_validate({**data, "seed": self.seed}), self.material)
 
-    def queries(self, job: Job, shard: int, count: int) -> Queries:
-        """Queries as a test split has them, one leading axis."""
+    def _queries(self, job: Job, shard: int, count: int) -> Queries:
+        """Queries of a test split, one leading axis."""
         return job.plan().draw("test", shard, count)
 
-    def reference(self, changes: dict[str, Any], piece: int) -> _Reference:
-        """One piece of the reference with these options."""
-        setting = _setting(changes)
-        if (setting, piece) not in self._references:
-            job, estimator = self._judge(changes)
-            queries = self.queries(job, _FIRST_REFERENCE + piece, BIAS_QUERIES)
-            found = estimator.estimate(queries, BIAS_SPP, self._stream(piece))
-            a, b = found.value_a.astype(np.float64), found.value_b.astype(np.float64)
-            self._references[setting, piece] = _Reference(queries, a, b)
-        return self._references[setting, piece]
+    def reference(self, changes: dict[str, Any], batch: int) -> _Reference:
+        """One batch of the reference with these options."""
+        key = _key(changes), batch
+        if key not in self._references:
+            job, estimator = self._estimator(changes)
+            queries = self._queries(job, _FIRST_REFERENCE + batch, BIAS_QUERIES)
+            self._references[key] = _Reference(
+                queries, *self._bias_halves(estimator, queries, batch, BIAS_SPP)
+            )
+        return self._references[key]
 
     def mean(self, changes: dict[str, Any]) -> Estimate:
-        """Mean value of the reference with these options, 1/sr, which errors are relative to: of many more
-        queries than have the paths that a bias takes."""
-        setting = _setting(changes)
-        if setting not in self._means:
-            job, estimator = self._judge(changes)
+        """Mean value of the reference with these options, 1/sr."""
+        key = _key(changes)
+        if key not in self._means:
+            job, estimator = self._estimator(changes)
             parts = []
-            # A piece spans several shards.
-            for number in range(_MEAN_PIECES):
+            for number in range(_MEAN_BATCHES):
                 shard = _FIRST_MEAN + number * (_MEAN_QUERIES // SHARD)
-                queries = self.queries(job, shard, _MEAN_QUERIES)
+                queries = self._queries(job, shard, _MEAN_QUERIES)
                 found = estimator.estimate(queries, _MEAN_SPP, Stream(self.seed, "test", shard))
                 parts.append(0.5 * (found.value_a.astype(np.float64) + found.value_b).mean(axis=1))
-            self._means[setting] = mean_estimate(np.concatenate(parts))
-        return self._means[setting]
+            self._means[key] = mean_estimate(np.concatenate(parts))
+        return self._means[key]
 
-    def _judge(self, changes: dict[str, Any]) -> tuple[Job, Any]:
-        setting = _setting(changes)
-        if setting not in self._judges:
+    def _estimator(self, changes: dict[str, Any]) -> tuple[Job, Any]:
+        key = _key(changes)
+        if key not in self._estimators:
             job = self.job({"effects.mode": "all", "transport.max_depth": 0, **changes})
-            self._judges[setting] = job, job.estimator(plan_effects(job))
-        return self._judges[setting]
+            self._estimators[key] = job, job.estimator(plan_effects(job))
+        return self._estimators[key]
 
-    def _stream(self, piece: int) -> Stream:
-        return Stream(self.seed, "test", _FIRST_REFERENCE + piece)
+    def _bias_halves(
+        self, estimator: Any, queries: Queries, batch: int, spp: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Both halves (n, 3) of values with the random numbers of a batch of the reference."""
+        found = estimator.estimate(queries, spp, Stream(self.seed, "test", _FIRST_REFERENCE + batch))
+        return found.value_a.astype(np.float64), found.value_b.astype(np.float64)
 
-    def measure(self, changes: dict[str, Any], against: dict[str, Any] | None, seconds: float) -> Measurement:
-        """Price and error of a setting.
+    def measure(
+        self, changes: dict[str, Any], against: dict[str, Any] | None, seconds: float
+    ) -> BenchmarkResult:
+        """Time and error of a configuration.
 
         Parameters
         ----------
-        changes : options of the setting; against : options of the reference, or None where the setting only
-            takes another number of paths, which leaves no bias
-        seconds : spent on each of timing and bias at most; less where the error bars are small before
+        changes : options of the configuration
+        against : options of its reference; None where only paths per query differ, which adds no bias
+        seconds : largest time of each of noise and bias; less once the error bars are small
+        """
+        mean = self.mean(against or {})
+        noise, time_per_million = self.noise(self.job(changes), seconds, mean.value)
+        root = _relative_to(_root(noise), mean)
+        if against is None:
+            return BenchmarkResult(time_per_million, None, root, root)
+        bias = self.bias(changes, against, seconds)
+        # A squared bias that noise made negative counts as none.
+        square = Estimate(max(bias.value, 0.0) + noise.value, math.hypot(bias.error, noise.error), noise.n)
+        return BenchmarkResult(
+            time_per_million, _relative_to(_root(bias), mean), root, _relative_to(_root(square), mean)
+        )
+
+    def bias(
+        self, changes: dict[str, Any], against: dict[str, Any], seconds: float, spp: int = BIAS_SPP
+    ) -> Estimate:
+        """Squared bias relative to the squared mean value.
+
+        Parameters
+        ----------
+        spp : paths of each query; the expected value does not depend on them
         """
         job = self.job(changes)
         estimator = job.estimator(plan_effects(job))
-        mean = self.mean(against or {})
-        spp = job.spp("train")
-
-        def trace(queries: Queries, stream: Stream) -> Estimates:
-            found: Estimates = estimator.estimate(queries, spp, stream)
-            return found
-
-        noise, price = self._noise(job, trace, spp, seconds, mean.value)
-        root = _beside(_root(noise), mean)
-        if against is None:
-            return Measurement(price, None, root, root)
-        bias = self.bias(estimator, against, seconds)
-        total = _beside(_root(_total(bias, noise)), mean)
-        return Measurement(price, _beside(_root(bias), mean), root, total)
-
-    def measure_counts(self, changes: dict[str, Any], adaptive: bool, seconds: float) -> Measurement:
-        """Price and noise where queries get the same number of paths, or each its own: `adaptive` with the
-        run's allocation, whose pilot is not timed, as it is once for a whole data set.
-
-        Parameters
-        ----------
-        seconds : spent on each of both measures of the noise at most
-        """
-        job = self.job(changes)
-        plan = plan_effects(job)
-        estimator = job.estimator(plan)
-        allocation = measure_allocation(job, plan)
-        chosen = replace(plan, allocation=allocation if adaptive else None)
-        target, spp = job.target("train"), job.spp("train")
-
-        def trace(queries: Queries, stream: Stream) -> Estimates:
-            return estimate_shard(estimator, queries, spp, target, stream, chosen)
-
-        first, mean = self.reference({}, 0), self.mean({})
-        look = trace(first.queries.take(slice(_LOOK)), Stream(self.seed, "test", _FIRST_PIECE))
-        paths = max(look.paths, 1) / len(look.value_a)
-        noise, price = self._noise(job, trace, paths, seconds, mean.value)
-        root = _beside(_root(noise), mean)
-        relative = self._relative(trace, paths, seconds, allocation)
-        return Measurement(price, None, root, root, _root(relative), paths)
-
-    def _relative(self, trace: Trace, paths: float, seconds: float, allocation: Allocation) -> Estimate:
-        """Variance of one query's noise over the square of max(value, tile mean); values are those of the
-        reference, which no path of the setting enters."""
-        count = int(min(max(_PIECE_PATHS / paths, _FEWEST_IN_PIECE), BIAS_QUERIES))
-        squares: list[NDArray[np.float64]] = []
-        began = time.perf_counter()
-        while True:
-            piece = len(squares)
-            reference = self.reference({}, piece)
-            queries = reference.queries.take(slice(count))
-            found = trace(queries, Stream(self.seed, "test", _FIRST_PIECE + piece))
-            value = 0.5 * (reference.a + reference.b)[:count].mean(axis=1)
-            scale = np.maximum(value, allocation.tile_mean(queries))
-            square = ((found.value_a.astype(np.float64) - found.value_b) ** 2 / 4.0).mean(axis=1)
-            squares.append(np.divide(square, scale**2, out=np.zeros(len(square)), where=scale > 0))
-            variance = mean_estimate(np.concatenate(squares))
-            late = time.perf_counter() - began > seconds or len(squares) == _MOST_BIAS_PIECES
-            if _sure(variance) or late:
-                return variance
-
-    def bias(self, estimator: Any, against: dict[str, Any], seconds: float, spp: int = BIAS_SPP) -> Estimate:
-        """Squared bias relative to the mean value squared.
-
-        Parameters
-        ----------
-        against : options of the reference
-        spp : paths of the estimator at each query; the bias does not depend on them, its error bar does
-        """
         mean = self.mean(against).value
-        began = time.perf_counter()
+        start = time.perf_counter()
         squares: list[NDArray[np.float64]] = []
         while True:
-            piece = len(squares)
-            reference = self.reference(against, piece)
-            found = estimator.estimate(reference.queries, spp, self._stream(piece))
-            a, b = found.value_a.astype(np.float64), found.value_b.astype(np.float64)
+            reference = self.reference(against, len(squares))
+            a, b = self._bias_halves(estimator, reference.queries, len(squares), spp)
             squares.append(((a - reference.a) * (b - reference.b)).mean(axis=1) / mean**2)
             square = mean_estimate(np.concatenate(squares))
-            sure = NORMAL * square.error <= max(2 * HALF_WIDTH * square.value, _NEGLIGIBLE**2)
-            late = time.perf_counter() - began > seconds or len(squares) == _MOST_BIAS_PIECES
-            if sure or late:
+            enough = NORMAL * square.error <= max(2 * HALF_WIDTH * square.value, _NEGLIGIBLE**2)
+            late = time.perf_counter() - start > seconds or len(squares) == _MOST_BIAS_BATCHES
+            if enough or late:
                 return square
 
-    def _noise(
-        self, job: Job, trace: Trace, paths: float, seconds: float, mean: float
-    ) -> tuple[Estimate, Estimate]:
-        """Variance of one query's noise relative to the mean value squared, and seconds per million
-        queries of about so many paths; the first piece, which may compile, is not timed."""
-        count = max(1, round(_PIECE_PATHS / max(paths, _FEWEST_PATHS)))
+    def noise(self, job: Job, seconds: float, mean: float) -> tuple[Estimate, Estimate]:
+        """Noise variance of one query relative to the squared mean value, and seconds per million queries.
+
+        Queries get paths as in a data set: equally many, more where more noise is expected, or as many as a
+        target error takes. The pilot of that allocation is not timed: it runs once per data set.
+        """
+        plan = allocated(job, plan_effects(job))
+        estimator, target, spp = job.estimator(plan), job.target("train"), job.spp("train")
+        paths: float = spp
+        if target is not None:
+            probe = self._queries(job, _FIRST_BATCH - 1, _PROBE)
+            stream = Stream(self.seed, "test", _FIRST_BATCH - 1)
+            paths = estimate_shard(estimator, probe, spp, target, stream, plan).paths / _PROBE
+        count = max(1, round(_BATCH_PATHS / max(paths, _FEWEST_PATHS)))
         squares: list[NDArray[np.float64]] = []
-        prices: list[float] = []
+        times: list[float] = []
         began = time.perf_counter()
-        piece = 0
         while True:
-            queries = self.queries(job, _FIRST_PIECE + piece, count)
+            shard = _FIRST_BATCH + len(squares)
+            queries = self._queries(job, shard, count)
             start = time.perf_counter()
-            found = trace(queries, Stream(self.seed, "test", _FIRST_PIECE + piece))
-            took = time.perf_counter() - start
-            difference = found.value_a.astype(np.float64) - found.value_b
-            squares.append((difference**2 / 4.0).mean(axis=1) / mean**2)
-            if piece:
-                prices.append(took / len(difference) * 1e6)
-            piece += 1
-            variance = mean_estimate(np.concatenate(squares))
-            if piece >= _FEWEST_PIECES and (_sure(variance) or time.perf_counter() - began > seconds):
-                return variance, _typical(prices)
+            found = estimate_shard(estimator, queries, spp, target, Stream(self.seed, "test", shard), plan)
+            times.append((time.perf_counter() - start) / count * 1e6)
+            squares.append(((found.value_a.astype(np.float64) - found.value_b) ** 2 / 4.0).mean(axis=1))
+            variance = mean_estimate(np.concatenate(squares)).scaled(1.0 / mean**2)
+            # The 95 % interval of its root.
+            narrow = NORMAL * variance.error <= 2 * HALF_WIDTH * variance.value or variance.value == 0
+            late = time.perf_counter() - began > seconds
+            if len(squares) >= _FEWEST_BATCHES and (narrow or late):
+                # The first batch may compile kernels.
+                return variance, _median(times[1:])
 
 
-def _setting(changes: dict[str, Any]) -> str:
+def _key(changes: dict[str, Any]) -> str:
     """Options as a key, whatever their order."""
     return repr(sorted(changes.items()))
 
 
-def _typical(prices: list[float]) -> Estimate:
-    """Median, which other work on the machine moves little, and its standard error from the median absolute
-    deviation, both as for normal scatter."""
-    middle = statistics.median(prices)
-    deviation = 1.4826 * statistics.median(abs(p - middle) for p in prices)
-    return Estimate(middle, 1.2533 * deviation / math.sqrt(len(prices)), len(prices))
+def _median(times: list[float]) -> Estimate:
+    """Median, which other work on the machine changes little, and its standard error from the median absolute
+    deviation, both as for a normal distribution."""
+    middle = statistics.median(times)
+    deviation = 1.4826 * statistics.median(abs(t - middle) for t in times)
+    return Estimate(middle, 1.2533 * deviation / math.sqrt(len(times)), len(times))
 
 
-def _sure(variance: Estimate) -> bool:
-    """Whether the 95 % interval of a variance's root is as narrow as wanted."""
-    return NORMAL * variance.error <= 2 * HALF_WIDTH * variance.value or variance.value == 0
-
-
-def _total(bias: Estimate, noise: Estimate) -> Estimate:
-    """Mean squared error from its parts; a squared bias that noise made negative counts as none."""
-    return Estimate(max(bias.value, 0.0) + noise.value, math.hypot(bias.error, noise.error), noise.n)
-
-
-def _beside(relative: Estimate, mean: Estimate) -> Estimate:
-    """With the error of the mean value that it is relative to."""
-    error = math.hypot(relative.error, relative.value * mean.relative_error)
-    return Estimate(relative.value, error, relative.n)
+def _relative_to(relative: Estimate, mean: Estimate) -> Estimate:
+    """A number relative to a mean value, with the error of that mean."""
+    return Estimate(
+        relative.value, math.hypot(relative.error, relative.value * mean.relative_error), relative.n
+    )
 
 
 def _root(square: Estimate) -> Estimate:
-    """Root of a measured square. Where the square is not told from zero its root has no error bar of first
-    order: the bar is then the root of the square's own bar."""
+    """Root of a measured square. Where the square is not significant, the error bar of first order does not
+    exist; the root of the square's error bar takes its place."""
     value = math.sqrt(max(square.value, 0.0))
     if square.value <= 2.0 * square.error:
         return Estimate(value, math.sqrt(square.error), square.n)

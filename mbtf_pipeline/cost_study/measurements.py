@@ -1,4 +1,4 @@
-"""A measured point of a cost study: what a setting costs, and the error that it leaves."""
+"""One measurement of a cost study: what a configuration costs in time, and the error that it leaves."""
 
 from __future__ import annotations
 
@@ -12,36 +12,37 @@ from mbtf_core.errors import InputError
 from mbtf_core.stats import Estimate
 from mbtf_pipeline.stages import hash_of
 
-POINT_FORMAT = "mbtf-cost-point"
-# Half-width of a 95 % interval, relative, that a study aims at: measuring stops there.
+FORMAT = "mbtf-cost-measurement"
+# Raised when the method of measuring changes: older measurements are then repeated.
+SCHEMA = 6
+FOLDER = "measurements"
+# Relative half-width of a 95 % interval that a study aims at, and that half-width over the standard error.
 HALF_WIDTH = 0.1
-# That half-width over the standard error.
 NORMAL = 1.96
-# Raised when a point is measured in another way: what an earlier version measured is measured again.
-POINT_SCHEMA = 5
-POINTS = "points"
 
 
 @dataclass(frozen=True)
-class Point:
-    """One setting, measured.
+class Measurement:
+    """A measured configuration.
 
     Attributes
     ----------
-    study : the trade that it is part of; series : the line it lies on; name : what tells it from the others
-    setting : options by dotted name, as ``--set`` takes them
-    command : does with the programs what was measured here
-    seconds : what it costs: in the generator's studies per million queries, of ``data`` and ``seeds`` to
-        generate, of ``fit`` to train, of ``chain`` in all
-    error : what is wrong with the result, in the study's unit
-    bias, noise : its two parts, where they are told apart; error² = bias² + noise²
-    details : further numbers by name: generation and training seconds, bytes, milliseconds, …
+    study : the comparison that it belongs to
+    series : its line in the plot of that comparison
+    name : its name within the series
+    options : of the configuration, by dotted name, as ``--set`` takes them
+    command : reproduces it with the programs
+    seconds : its time: per million queries for the generator; of generating in ``data``, of training in
+        ``models``, of both with everything around them in ``whole``
+    error : relative RMS error of the generator's values, or unexplained variance of a fit
+    bias, noise : the two parts of the generator's error; error² = bias² + noise²
+    details : further numbers by name: generation and training seconds, bytes, milliseconds
     """
 
     study: str
     series: str
     name: str
-    setting: dict[str, Any]
+    options: dict[str, Any]
     command: str
     seconds: Estimate
     error: Estimate
@@ -60,48 +61,48 @@ def _estimate(record: dict[str, Any] | None) -> Estimate | None:
     return Estimate(value, math.inf if math.isnan(error) else error, record["n"])
 
 
-class PointFolder:
-    """Points that are done, one file each, so that a study goes on where it stopped.
+class MeasurementFolder:
+    """Finished measurements, one file each, so that a study resumes where it stopped.
 
     Parameters
     ----------
     folder : of the study
-    basis : what all its points depend on: the material's and the configuration's hash, the seed
+    basis : what all measurements depend on: the hash of the material and the configuration, with its seed
     """
 
     def __init__(self, folder: Path, basis: dict[str, Any]) -> None:
-        self.folder = folder / POINTS
+        self.folder = folder / FOLDER
         self.basis = basis
 
     def _path(self, study: str, key: dict[str, Any]) -> Path:
-        digest = hash_of({"schema": POINT_SCHEMA, "basis": self.basis, "study": study, "key": key})
+        digest = hash_of({"schema": SCHEMA, "basis": self.basis, "study": study, "key": key})
         return self.folder / f"{study}-{digest[:16]}.json"
 
-    def get(self, study: str, key: dict[str, Any]) -> Point | None:
-        """The point of a setting, where it has been measured; damaged files count as not measured."""
+    def get(self, study: str, key: dict[str, Any]) -> Measurement | None:
+        """The stored measurement of a configuration; None where it is missing or its file is damaged."""
         path = self._path(study, key)
         if not path.exists():
             return None
         try:
             data = read_json(path)
-            if data.pop("format") != POINT_FORMAT or data.pop("schema") != POINT_SCHEMA:
+            if data.pop("format") != FORMAT or data.pop("schema") != SCHEMA:
                 return None
             data |= {name: _estimate(data[name]) for name in _ESTIMATES}
             data["details"] = {k: math.nan if v is None else v for k, v in data["details"].items()}
-            return Point(**data)
+            return Measurement(**data)
         except (InputError, KeyError, TypeError, AttributeError):
             return None
 
-    def put(self, key: dict[str, Any], point: Point) -> None:
-        """Keep a point.
+    def put(self, key: dict[str, Any], found: Measurement) -> None:
+        """Store a measurement.
 
         Raises
         ------
         PartialError : the disk is full or the folder cannot be written
         """
         self.folder.mkdir(parents=True, exist_ok=True)
-        data = asdict(point) | {
-            name: None if (e := getattr(point, name)) is None else e.as_dict() for name in _ESTIMATES
+        data = asdict(found) | {
+            name: None if (e := getattr(found, name)) is None else e.as_dict() for name in _ESTIMATES
         }
-        data["details"] = {k: v if math.isfinite(v) else None for k, v in point.details.items()}
-        write_json(self._path(point.study, key), {"format": POINT_FORMAT, "schema": POINT_SCHEMA, **data})
+        data["details"] = {k: v if math.isfinite(v) else None for k, v in found.details.items()}
+        write_json(self._path(found.study, key), {"format": FORMAT, "schema": SCHEMA, **data})

@@ -1,212 +1,181 @@
-"""What a study shows: ``cost.csv``, ``cost.html``, and its plots as PNG."""
+"""The page of a study ``cost.html``, its plots as PNG, and ``cost.csv``."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from mbtf_core.atomic import write_json, write_text
 from mbtf_core.console import clock
 from mbtf_core.stats import Estimate
 from mbtf_pipeline.cost_study.figures import (
     bias_figures,
-    count_figures,
     data_figures,
-    fit_figures,
     front_figures,
+    model_figures,
     noise_figures,
 )
-from mbtf_pipeline.cost_study.measurements import HALF_WIDTH, NORMAL, Point
-from mbtf_pipeline.cost_study.pareto import marginal_price, pareto_front, weighted_line
-from mbtf_pipeline.cost_study.seed_variance import FITTED, Scatter
+from mbtf_pipeline.cost_study.measurements import HALF_WIDTH, NORMAL, Measurement
+from mbtf_pipeline.cost_study.pareto import extrapolation, pareto_front, power_law
 from mbtf_pipeline.cost_study.study import STUDY_NAME, Study
-from mbtf_pipeline.cost_study.tables import chain_table, generator_table, to_csv
+from mbtf_pipeline.cost_study.tables import generator_table, run_table, to_csv
 from mbtf_pipeline.report.report import page_environment, template
 
 CSV_NAME, PAGE_NAME = "cost.csv", "cost.html"
 
-Figures = Callable[[Sequence[Point], str, Path], list[dict[str, Any]]]
-Table = Callable[[Sequence[Point]], dict[str, Any]]
-# Studies: title, what to read from the plot, its plots, its table.
-_STUDIES: dict[str, tuple[str, str, Figures, Table]] = {
-    "data": (
+
+class _Section(NamedTuple):
+    title: str
+    text: str
+    figures: Callable[[Sequence[Measurement], str, Path], list[dict[str, Any]]]
+    table: Callable[[Sequence[Measurement]], dict[str, Any]] = generator_table
+
+
+_SECTIONS = {
+    "data": _Section(
         "Queries or paths?",
-        "Data of equal numbers of paths, divided among many noisy or few clean queries; one fit of equal "
-        "length each.",
+        "Training data of equal total paths, divided among many noisy or few clean queries. Every fit trains "
+        "equally long.",
         data_figures,
-        chain_table,
+        run_table,
     ),
-    "fit": (
+    "models": _Section(
         "Models and sizes",
-        "On one data set: what training time buys for each model and size, what they cost when they are "
-        "evaluated, and how large they are.",
-        fit_figures,
-        chain_table,
+        "Models and network sizes trained on one data set: error over training time and over the time of an "
+        "evaluation.",
+        model_figures,
+        run_table,
     ),
-    "paths": (
+    "paths": _Section(
         "Paths per query",
-        "More paths buy less noise; there is no bias to buy off. Independent samples would fall along a "
-        "slope of −½ (error against seconds); better points fall faster.",
+        "More paths reduce the noise and leave no bias. Queries get equally many paths, more where a pilot "
+        "expects more noise, or as many as a target error takes.",
         noise_figures,
-        generator_table,
     ),
-    "adaptive": (
-        "The same paths for all, or as many as each needs",
-        "Equal numbers of paths, numbers in proportion to the noise that a pilot expects (what runs do by "
-        "themselves), and as many as a target error takes, the queries’ own pilots included.",
-        count_figures,
-        generator_table,
-    ),
-    "effects": (
+    "effects": _Section(
         "Effects",
-        "What each effect costs in time, and what leaving it out costs in accuracy: its bias does not go "
-        "away with more paths.",
+        "The time that each effect takes, and the bias of leaving it out, which more paths do not reduce.",
         bias_figures,
-        generator_table,
     ),
-    "bounces": (
+    "mesh": _Section(
+        "Mesh resolution",
+        "Bias against the finest mesh of this plot. A coarser mesh is a different, smoother surface.",
+        bias_figures,
+    ),
+    "interactions": _Section(
         "Surface interactions",
-        "A cap saves time and leaves a bias; no limit leaves none.",
+        "A limit on the interactions of a path saves time and adds a bias; no limit adds none.",
         bias_figures,
-        generator_table,
-    ),
-    "mesh": (
-        "Mesh",
-        "Bias against the finest mesh that was tried. It is part of what the material is: a coarser mesh is "
-        "another, smoother surface.",
-        bias_figures,
-        generator_table,
-    ),
-    "light": (
-        "Width of the light",
-        "Another width is another quantity: a wider lobe blurs highlights and shadows (bias against the "
-        "recipe’s width), and has less noise.",
-        bias_figures,
-        generator_table,
     ),
 }
 
 
-def whole_chains(points: Sequence[Point]) -> list[Point]:
-    """All chains that were measured, whatever their study, by what they cost in all."""
+def whole_runs(found: Sequence[Measurement]) -> list[Measurement]:
+    """The runs of all comparisons, by their total time."""
     return [
-        replace(p, seconds=Estimate(p.details["total_seconds"], 0.0, 1))
-        for p in points
-        if "total_seconds" in p.details and p.study != "seeds"
+        replace(m, seconds=Estimate(m.details["total_seconds"], 0.0, 1))
+        for m in found
+        if "total_seconds" in m.details
     ]
 
 
-def paths_slope(points: Sequence[Point]) -> Estimate | None:
-    """Power of the number of paths with which the noise's variance falls, from a line through logarithms
-    weighted by their error bars; None where there are fewer than three."""
+def noise_exponent(found: Sequence[Measurement]) -> Estimate | None:
+    """Power of the number of paths with which the noise variance changes; None for fewer than three numbers
+    of paths."""
     known = [
-        (math.log(p.setting["queries.spp"]), 2 * math.log(p.noise.value), 2 * p.noise.relative_error)
-        for p in points
-        if p.study == "paths" and p.noise is not None and p.noise.value > 0 and p.noise.error > 0
+        (float(m.options["queries.spp"]), Estimate(m.noise.value**2, 2 * m.noise.value * m.noise.error, 1))
+        for m in found
+        if m.study == "paths" and m.series == "uniform" and m.noise and m.noise.value > 0 < m.noise.error
     ]
-    if len(known) < 3:
-        return None
-    return weighted_line(*zip(*known, strict=True))
+    return power_law(*zip(*known, strict=True)) if len(known) >= 3 else None
 
 
-def half_widths(points: Sequence[Point]) -> tuple[int, int]:
-    """(errors whose 95 % interval is within `HALF_WIDTH` of them, all)."""
-    widths = [NORMAL * p.error.relative_error for p in points if p.study != "seeds" and p.error.value > 0]
+def narrow_errors(found: Sequence[Measurement]) -> tuple[int, int]:
+    """(errors whose 95 % interval is within `HALF_WIDTH` of them, all errors)."""
+    widths = [NORMAL * m.error.relative_error for m in found if m.error.value > 0]
     return sum(w <= HALF_WIDTH for w in widths), len(widths)
 
 
-def _part(study: Study, name: str) -> dict[str, Any] | None:
-    points = [p for p in study.points if p.study == name]
-    if not points:
+def _section(study: Study, name: str) -> dict[str, Any] | None:
+    found = [m for m in study.measurements if m.study == name]
+    if not found:
         return None
-    title, text, figures, table = _STUDIES[name]
-    if name == "paths" and (slope := paths_slope(points)) is not None:
+    section = _SECTIONS[name]
+    text = section.text
+    if name == "paths" and (exponent := noise_exponent(found)) is not None:
         text += (
-            f" Here the noise’s variance falls with the power {slope.scaled(-1.0)} of the number of paths."
+            f" With equally many paths the noise variance changes as paths to the power {exponent}; with "
+            "independent samples the power would be -1."
         )
     return {
         "id": name,
-        "title": title,
+        "title": section.title,
         "text": text,
-        "figures": figures(points, name, study.folder),
-        "table": table(points),
+        "figures": section.figures(found, name, study.folder),
+        "table": section.table(found),
         "open": False,
     }
 
 
-def _front_part(study: Study) -> dict[str, Any] | None:
-    chains = whole_chains(study.points)
-    if not chains:
+def _front_section(study: Study) -> dict[str, Any] | None:
+    runs = whole_runs(study.measurements)
+    if not runs:
         return None
-    front = pareto_front(chains)
-    price = marginal_price(front)
-    text = "Every chain that was measured, and those that nothing beats in both time and error."
-    if price is not None:
-        seconds, power = price
+    front = pareto_front(runs)
+    text = "All runs, and the Pareto front: the runs that no other one beats in both time and error."
+    further = extrapolation(front)
+    if further is not None:
+        seconds, exponent = further
         text += (
-            f" At the front’s end the error falls with the power {power} of time: halving the last one’s "
-            f"would take about {clock(seconds)} more, and longer where gains shrink, as they do."
+            " Extrapolation: we fit a power law to the last three points of the front. The error falls as "
+            f"time to the power -{exponent}, so halving the last error takes about {clock(seconds)} more. "
+            "Expect longer, because gains shrink with time."
         )
     return {
         "id": "front",
-        "title": "The whole chain",
+        "title": "Whole runs",
         "text": text,
-        "figures": front_figures(chains, study.folder),
-        "table": chain_table(front),
+        "figures": front_figures(runs, study.folder),
+        "table": run_table(front),
         "open": True,
     }
 
 
-def _scatter_text(scatter: Scatter | None, chains: bool) -> str:
-    """What the bars of chains hold besides that of the test queries."""
-    if scatter is not None:
-        return (
-            "; those of chains hold the scatter between seeds of data and fit, also where chains share their "
-            f"data: {scatter.describe()}"
-        )
-    if chains:
-        return (
-            "; those of chains hold the test queries alone: too few seeds are known to tell how far chains "
-            "scatter, so their bars are too narrow"
-        )
-    return ""
-
-
 def write_page(study: Study) -> Path:
-    """Write CSV, page and pictures into the study's folder, and what they say together into its record;
-    returns the page's path."""
-    write_text(study.folder / CSV_NAME, to_csv(study.points))
-    parts = [_front_part(study), *(_part(study, name) for name in _STUDIES)]
-    held, known = half_widths(study.points)
-    fitted = [p for p in study.points if p.study in FITTED]
-    narrow, chains = half_widths(fitted)
-    seeds = max((p.details.get("seeds", 1.0) for p in study.points), default=1.0)
+    """Write CSV, page and plots into the study's folder, and a summary into its record; returns the path of
+    the page."""
+    write_text(study.folder / CSV_NAME, to_csv(study.measurements))
+    sections = [_front_section(study), *(_section(study, name) for name in _SECTIONS)]
+    runs = whole_runs(study.measurements)
+    narrow, known = narrow_errors(study.measurements)
+    narrow_runs, known_runs = narrow_errors(runs)
+    deviation = None if study.deviation is None else f"{study.deviation.scaled(100.0)} %"
     html: str = (
         page_environment()
         .from_string(template("cost.html"))
         .render(
             style=template("report.css"),
             study=study.description,
-            budget=clock(study.description["budget"]),
-            seeds=round(seeds),
-            parts=[p for p in parts if p is not None],
+            time=clock(study.description["time"]),
+            sections=[s for s in sections if s is not None],
             skipped=study.skipped,
-            scatter=_scatter_text(study.scatter, bool(fitted)),
-            widths=f"{held} of {known} errors are known to within a tenth (95 %).",
-            wide=study.scatter is not None and narrow < chains,
             failed=study.failed,
-            tests=clock(tests) if (tests := study.test_seconds or 0.0) >= 1.0 else None,
+            runs=bool(runs),
+            deviation=deviation,
+            seeds=round(max((m.details.get("seeds", 1.0) for m in runs), default=1.0)),
+            narrow=narrow,
+            known=known,
+            refine=narrow_runs < known_runs,
         )
     )
     path = study.folder / PAGE_NAME
     write_text(path, html)
     summary = {
-        "known_to_a_tenth": held,
+        "narrow": narrow,
         "known": known,
-        "scatter": None if study.scatter is None else study.scatter.describe(),
+        "seed_deviation": None if study.deviation is None else study.deviation.as_dict(),
         "skipped": study.skipped,
         "failed": study.failed,
     }

@@ -1,66 +1,59 @@
-"""The Pareto front: settings that nothing beats in both time and error."""
+"""The Pareto front: measurements that no other one beats in both time and error."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 
+import numpy as np
+
 from mbtf_core.stats import Estimate
-from mbtf_pipeline.cost_study.measurements import Point
+from mbtf_pipeline.cost_study.measurements import Measurement
 
-# The front's end: points of at least this share of the last one's seconds, and at least so many.
-_LATE, _FEWEST = 0.25, 3
-# Relative error below which no bar is believed.
+# The extrapolation uses at least so many points of the front, and never goes further than so many times the
+# seconds of the last one.
+_FEWEST = 3
+_FURTHEST = 1000.0
+# Relative errors are taken to be known no better than this.
 _BEST_KNOWN = 1e-3
-# Times the last point's seconds beyond which nothing is said.
-_LONGEST = 1000.0
 
 
-def pareto_front(points: Sequence[Point]) -> list[Point]:
-    """Points that no other is both cheaper than and more accurate than, by rising seconds.
+def pareto_front(found: Sequence[Measurement]) -> list[Measurement]:
+    """Measurements that no other one beats in both time and error, by increasing time.
 
-    Judged by the measured values; of points whose error bars overlap the cheaper one may be on the front by
-    chance, which the bars show.
+    Compares the measured values. Of measurements whose error bars overlap, the cheaper one may be on the
+    front by chance.
     """
-    usable = [p for p in points if math.isfinite(p.seconds.value) and math.isfinite(p.error.value)]
-    front: list[Point] = []
-    for point in sorted(usable, key=lambda p: (p.seconds.value, p.error.value)):
-        if not front or point.error.value < front[-1].error.value:
-            front.append(point)
+    usable = [m for m in found if math.isfinite(m.seconds.value) and math.isfinite(m.error.value)]
+    front: list[Measurement] = []
+    for m in sorted(usable, key=lambda m: (m.seconds.value, m.error.value)):
+        if not front or m.error.value < front[-1].error.value:
+            front.append(m)
     return front
 
 
-def marginal_price(front: Sequence[Point], factor: float = 2.0) -> tuple[float, Estimate] | None:
-    """(seconds, exponent): what dividing the error of the front's last point by `factor` would take on top,
-    and the power of time that the error falls with at the front's end.
+def extrapolation(front: Sequence[Measurement]) -> tuple[float, Estimate] | None:
+    """(seconds, exponent): the additional time that would halve the error of the front's last point, and the
+    power of time with which the error falls, from a power law through the last three points.
 
-    From a line through the logarithms of those points that take a quarter of the last one's seconds or more,
-    at least three, weighted by their error bars. Errors fall ever more slowly, so in truth it takes longer.
-    None where there are fewer, the power is not told from zero, or a thousand times as long would not do.
+    None where there are fewer, where the exponent is not significant, or where the result is too far away.
     """
-    usable = [p for p in front if p.error.value > 0 and math.isfinite(p.error.error)]
-    late = [p for p in usable if p.seconds.value >= _LATE * front[-1].seconds.value]
-    some = late if len(late) >= _FEWEST else usable[-_FEWEST:]
-    if len(some) < _FEWEST:
+    last = [m for m in front if m.error.value > 0 and math.isfinite(m.error.error)][-_FEWEST:]
+    if len(last) < _FEWEST:
         return None
-    line = weighted_line(
-        [math.log(p.seconds.value) for p in some],
-        [math.log(p.error.value) for p in some],
-        [max(p.error.relative_error, _BEST_KNOWN) for p in some],
+    slope = power_law(
+        [m.seconds.value for m in last],
+        [Estimate(m.error.value, max(m.error.error, _BEST_KNOWN * m.error.value), 1) for m in last],
     )
-    if line is None or -line.value <= max(2.0 * line.error, math.log(factor) / math.log(_LONGEST)):
+    if -slope.value <= max(2.0 * slope.error, math.log(2.0) / math.log(_FURTHEST)):
         return None
-    return front[-1].seconds.value * (factor ** (-1.0 / line.value) - 1.0), line.scaled(-1.0)
+    return front[-1].seconds.value * (2.0 ** (-1.0 / slope.value) - 1.0), slope.scaled(-1.0)
 
 
-def weighted_line(xs: Sequence[float], ys: Sequence[float], errors: Sequence[float]) -> Estimate | None:
-    """Slope of the line through points whose heights have these standard errors, all above zero, and its own;
-    None where all lie at one place."""
-    weights = [1 / e**2 for e in errors]
-    total = sum(weights)
-    mean_x, mean_y = (sum(w * v for w, v in zip(weights, vs, strict=True)) / total for vs in (xs, ys))
-    spread = sum(w * (x - mean_x) ** 2 for w, x in zip(weights, xs, strict=True))
-    if not spread > 0:
-        return None
-    slope = sum(w * (x - mean_x) * (y - mean_y) for w, x, y in zip(weights, xs, ys, strict=True)) / spread
-    return Estimate(slope, math.sqrt(1 / spread), len(xs))
+def power_law(xs: Sequence[float], ys: Sequence[Estimate]) -> Estimate:
+    """Exponent of a power law through points, by weighted least squares in logarithms."""
+    weights = np.array([1.0 / y.relative_error for y in ys])
+    x, y = np.log(xs), np.log([e.value for e in ys])
+    x -= np.average(x, weights=weights**2)
+    spread = float(((weights * x) ** 2).sum())
+    return Estimate(float((weights**2 * x * y).sum()) / spread, 1.0 / math.sqrt(spread), len(xs))

@@ -1,93 +1,142 @@
-"""Chains measured again with other seeds, until their error bars are narrow enough."""
+"""Runs repeated with other seeds, and the error bars that follow.
+
+Another seed generates other data and starts from other weights. A configuration that was run n times is
+reported with the mean of its errors. Its error bar adds two independent parts in quadrature:
+
+- the error of the test set, which all runs of the study share, so that repeats do not reduce it;
+- the seed variance over n. It is estimated from all repeated configurations together: the pooled relative
+  standard deviation s of their errors, with the sum of (n - 1) as its degrees of freedom. A configuration of
+  three runs or more uses its own standard deviation where that is larger.
+
+Pooling is what makes two runs of each configuration enough: with some twenty of them s is known to 15 %.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+import math
+import statistics
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 from mbtf_core.errors import InputError
-from mbtf_pipeline.cost_study.measurements import HALF_WIDTH, NORMAL, Point, PointFolder
-from mbtf_pipeline.cost_study.runs import Chain, RunRunner
-from mbtf_pipeline.cost_study.seed_variance import Scatter, bar_of, mean_of
+from mbtf_core.stats import Estimate
+from mbtf_pipeline.cost_study.measurements import HALF_WIDTH, NORMAL, Measurement, MeasurementFolder
+from mbtf_pipeline.cost_study.runs import Run, RunRunner
 
-# Seeds that a chain is measured with before its own bars say whether more would help, and at most.
-FEWEST_SEEDS, MOST_SEEDS = 3, 12
+# Seeds of one configuration at most, and the fewest whose own deviation counts.
+MOST_SEEDS = 12
+FEWEST_OWN = 3
+
+
+def seed_deviation(groups: Sequence[Sequence[Measurement]]) -> Estimate | None:
+    """Relative standard deviation of the error over seeds, pooled over configurations; each group holds the
+    runs of one configuration. None without any repeat."""
+    squares, dof = 0.0, 0
+    for group in groups:
+        errors = _errors(group)
+        if len(errors) > 1:
+            squares += (len(errors) - 1) * _relative_variance(errors)
+            dof += len(errors) - 1
+    if dof == 0:
+        return None
+    value = math.sqrt(squares / dof)
+    return Estimate(value, value / math.sqrt(2 * dof), dof)
+
+
+def _errors(group: Sequence[Measurement]) -> list[float]:
+    return [m.error.value for m in group if math.isfinite(m.error.value) and m.error.value > 0]
+
+
+def _relative_variance(errors: Sequence[float]) -> float:
+    return statistics.variance(errors) / statistics.fmean(errors) ** 2
+
+
+def combined(group: Sequence[Measurement], deviation: Estimate | None) -> Measurement:
+    """The runs of one configuration as one measurement: name and command of the first one, means of all."""
+    n = len(group)
+    error = statistics.fmean(m.error.value for m in group)
+    test = statistics.fmean(m.error.error for m in group)
+    seeds = 0.0 if deviation is None else deviation.value
+    errors = _errors(group)
+    if len(errors) >= FEWEST_OWN:
+        seeds = max(seeds, math.sqrt(_relative_variance(errors)))
+    times = [m.seconds.value for m in group]
+    spread = statistics.stdev(times) / math.sqrt(n) if n > 1 else 0.0
+    details = {k: statistics.fmean(m.details[k] for m in group) for k in group[0].details}
+    return replace(
+        group[0],
+        seconds=Estimate(statistics.fmean(times), spread, n),
+        error=Estimate(error, math.hypot(test, seeds * error / math.sqrt(n)), group[0].error.n),
+        details={**details, "seeds": float(n)},
+    )
+
+
+def _is_wide(group: Sequence[Measurement], deviation: Estimate | None) -> bool:
+    """Whether the 95 % interval is too wide and more seeds can narrow it."""
+    error = combined(group, deviation).error
+    threshold = HALF_WIDTH / NORMAL * error.value
+    test = statistics.fmean(m.error.error for m in group)
+    return error.error > threshold > test
 
 
 @dataclass
-class Repeats:
-    """What came of it.
+class Repeated:
+    """Measurements by configuration in the order of the plan, one per seed, and the runs that failed."""
 
-    Attributes
-    ----------
-    again : by place of a point of the study, the same chain with other seeds
-    failed : chains that could not be fitted with another seed, and why
-    """
-
-    again: dict[int, list[Point]] = field(default_factory=dict)
-    failed: list[str] = field(default_factory=list)
+    groups: list[list[Measurement]]
+    failed: list[str]
 
 
-def _worth_more(seeds: Sequence[Point], scatter: Scatter) -> bool:
-    """Whether the mean of these is not known well enough, and more of them could make it so."""
-    error = mean_of(seeds).error
-    wanted = HALF_WIDTH / NORMAL * error.value
-    if len(seeds) >= MOST_SEEDS or not bar_of(seeds, scatter) > wanted:
-        return False
-    # What the test queries leave open no seed narrows; but how much that is varies with the fit.
-    return len(seeds) < FEWEST_SEEDS or error.error < wanted
-
-
-def repeat_chains(
-    points: Sequence[Point],
-    chains: Mapping[int, Chain],
-    scatter: Scatter,
-    store: PointFolder,
-    work: RunRunner,
-    enough: Callable[[Chain, bool], bool],
-    failed: Collection[Mapping[str, Any]] = (),
-) -> Repeats:
-    """Seed after seed the chains whose bars are too wide, those of like data together.
+def measure_runs(
+    runs: Sequence[Run],
+    store: MeasurementFolder,
+    runner: RunRunner,
+    fits: Callable[[Run], bool],
+    seeds: int,
+) -> Repeated:
+    """Measure each comparison with the study's seed and with another one, then runs whose 95 % interval is too
+    wide with further seeds; store every measurement. Repeats begin with the shortest run.
 
     Parameters
     ----------
-    points : of the study so far; chains : those of them that may be repeated, by their place
-    store : keeps what was measured, so that nothing is measured twice; what is there already counts in any
-        case
-    failed : keys of chains that could not be fitted before
-    enough : whether time is left for a chain; its second argument: whether its data are still to be made
+    runs : the runs of one comparison follow each other
+    fits : whether a run fits into the remaining time
+    seeds : number of seeds that may be measured; stored measurements count in any case
     """
-    out = Repeats()
-    left = dict(chains)
-    for seed in range(1, MOST_SEEDS):
-        done = {place: replace(chain, data=replace(chain.data, seed=seed)) for place, chain in left.items()}
-        # The chains that the scatter was measured on are such repetitions.
-        known = {k: store.get("seeds", c.key) or store.get(c.study, c.key) for k, c in done.items()}
-        todo = [
-            (place, chain)
-            for place, chain in done.items()
-            if known[place] is None
-            and chain.key not in failed
-            and _worth_more([points[place], *out.again.get(place, ())], scatter)
-        ]
-        needed = [chain.data for _, chain in todo]
-        for number, (place, chain) in enumerate(todo):
-            if enough(chain, not work.has(chain.data)):
+    out = Repeated([[] for _ in runs], [])
+    broken: set[int] = set()
+
+    def length(k: int) -> float:
+        return out.groups[k][0].details["total_seconds"]
+
+    def measure_seed(seed: int, places: Sequence[int]) -> None:
+        tasks = {k: replace(runs[k], data=replace(runs[k].data, seed=seed)) for k in places}
+        todo = {k: task for k, task in tasks.items() if store.get(task.study, task.key) is None}
+        for k, task in list(todo.items()):
+            del todo[k]
+            if k not in broken and seed < seeds and fits(task):
                 try:
-                    point = work.measure(chain)
+                    store.put(task.key, runner.measure(task))
                 except InputError as error:
-                    # The same seed would fail the same way, and so end every run of this study.
-                    out.failed.append(f"{chain.label}: {error.what}")
-                    del left[place]
-                else:
-                    store.put(chain.key, point)
-                    known[place] = point
-            if chain.data not in needed[number + 1 :]:
-                work.forget(chain.data)
-        for place, found in known.items():
-            if found is not None:
-                out.again.setdefault(place, []).append(found)
-        if not any(known.values()):
-            break
+                    # The other runs are worth a page all the same.
+                    out.failed.append(f"{task.label}: {error.what}")
+                    broken.add(k)
+            if all(other.data != task.data for other in todo.values()):
+                runner.forget(task.data)
+        for k, task in tasks.items():
+            if (found := store.get(task.study, task.key)) is not None:
+                command = runner.command_of(runs[k])
+                out.groups[k].append(replace(found, series=task.series, name=task.name, command=command))
+
+    def measured(places: Sequence[int], seed: int) -> list[int]:
+        return sorted((k for k in places if len(out.groups[k]) == seed), key=length)
+
+    for study in dict.fromkeys(run.study for run in runs):
+        places = [k for k, run in enumerate(runs) if run.study == study]
+        measure_seed(0, places)
+        measure_seed(1, measured(places, 1))
+    for seed in range(2, MOST_SEEDS):
+        deviation = seed_deviation(out.groups)
+        places = measured(range(len(runs)), seed)
+        measure_seed(seed, [k for k in places if _is_wide(out.groups[k], deviation) or seed >= seeds])
     return out

@@ -1,7 +1,9 @@
-"""Whole chains: data of a size, a fit of a length, and the error that is left on test queries.
+"""One run of the whole chain: training data of a size, a fit of a length, and its error on a test set.
 
-Every chain is measured on the same test queries (:mod:`~mbtf_pipeline.cost_study.importance_sampled`), which no training sees. Its parts are the
-generator and the fitter themselves, called as the programs call them; nothing is simulated or extrapolated.
+All runs of a study are evaluated on the same test set, which no fit is trained on: many queries of few
+paths. With halves a, b of its values and a prediction p, ``E[(p - a)(p - b)]`` is the squared error of p,
+free of the noise of the test values. Its error bar depends on the number of queries more than on that of
+paths. Data and fits come from the generator and the fitter, called as the programs call them.
 """
 
 from __future__ import annotations
@@ -15,224 +17,207 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mbtf_core.stats import Estimate
+from mbtf_core.stats import Estimate, unexplained_variance
 from mbtf_core.units import parse_duration
-from mbtf_gen.config.generator import GeneratorConfig, count_queries
+from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation import Job, generate
 from mbtf_gen.material.material import load_material
-from mbtf_pipeline.cost_study.generator_benchmark import GeneratorBenchmark
-from mbtf_pipeline.cost_study.measurements import Point
+from mbtf_pipeline.cost_study.measurements import Measurement
 from mbtf_pipeline.stages import hash_of
 
 if TYPE_CHECKING:
-    from mbtf_pipeline.cost_study.importance_sampled import Judges
+    from mbtf_fit.data.queries import ShardQueries
 
-# A picture of 1080p with one query per pixel.
+# Test queries, and paths of each.
+TEST = (1 << 20, 8)
+# The smallest split that the generator takes.
+_NO_QUERIES = (1, 2)
+# Pixels of a 1080p image with one query each; queries of one timed evaluation, and how often it is timed.
 PIXELS = 1920 * 1080
-# Queries of one timed evaluation, and how often it is timed.
 _TIMED_QUERIES = 1 << 18
-_TIMED = 7
-# Test queries of chains' data: chains are judged by others.
-_FEWEST = "64"
+_TIMED = 5
+_OVERHEAD = 2.0
+# The time that each study reports, by name of the detail.
+_SECONDS = {"data": "generation_seconds", "models": "training_seconds", "whole": "total_seconds"}
 
 
 @dataclass(frozen=True)
-class RunRequest:
-    """Training data to make: number of queries, paths of each, and what is added to the study's seed."""
+class DataRequest:
+    """Training data: number of queries, paths of each, and an offset that is added to the study's seed."""
 
     queries: int
     spp: int
     seed: int = 0
 
-    @property
-    def other(self) -> str:
-        """What names of other seeds end with; nothing for the study's own."""
-        return f", seed + {self.seed}" if self.seed else ""
-
 
 @dataclass(frozen=True)
-class Chain:
-    """One chain to measure.
+class Run:
+    """A run to measure.
 
     Attributes
     ----------
-    study, series, name : see :class:`~mbtf_pipeline.cost_study.measurements.Point`
-    data : its training data; what is added to the study's seed is that of the fit, too
-    fit : options of the fitter, as its configuration has them
+    study, series, name : see :class:`~mbtf_pipeline.cost_study.measurements.Measurement`
+    data : its training data; the seed offset is that of the fit, too
+    fit : options of the fitter, nested as in its configuration
     """
 
     study: str
     series: str
     name: str
-    data: RunRequest
+    data: DataRequest
     fit: dict[str, Any] = field(default_factory=dict)
 
     @property
     def label(self) -> str:
-        """What it is called beside all others."""
-        # Chains of the study of seeds are named so.
-        other = "" if self.study == "seeds" else self.data.other
-        return f"{self.study}: {self.series}, {self.name}{other}"
+        """Its name among all runs."""
+        seed = f", seed + {self.data.seed}" if self.data.seed else ""
+        return f"{self.study}: {self.series}, {self.name}{seed}"
 
     @property
     def key(self) -> dict[str, Any]:
-        """What the point depends on besides the study's basis."""
+        """What its measurement depends on besides the study's basis."""
         return {**asdict(self.data), "fit": self.fit}
-
-    def seconds(self, price: Callable[[int], float], *, data: bool = True) -> float:
-        """What it will take, where a query of so many paths takes ``price(paths)`` seconds to generate;
-        `data`: the data are still to be made."""
-        return data * self.data.queries * price(self.data.spp) + parse_duration(self.fit["training"]["time"])
-
-
-@dataclass(frozen=True)
-class _Data:
-    """A data set that was made, and the seconds it took, planning and start included."""
-
-    folder: Path
-    seconds: float
 
 
 class RunRunner:
-    """Makes data and fits in a folder of the study, and keeps data that several chains share.
+    """Generates data and fits models in a working folder, and keeps data that several runs share.
 
     Parameters
     ----------
     config : the recipe's generator
-    folder : to work in; what lies there is removed by :meth:`clear`
-    command : of the generator with the study's configuration, to which a chain adds its own options
+    folder : to work in; removed by :meth:`clear`
+    command : of the generator with the study's configuration
     progress : called with a note
+    test : number of test queries, and paths of each
+    query_seconds : time to generate a query, by its number of paths
     """
 
     def __init__(
-        self, config: GeneratorConfig, folder: Path, command: str, progress: Callable[[str], None]
+        self,
+        config: GeneratorConfig,
+        folder: Path,
+        command: str,
+        progress: Callable[[str], None],
+        test: tuple[int, int] = TEST,
+        query_seconds: Callable[[int], float] = lambda paths: 0.0,
     ) -> None:
         self.config = config
         self.folder = folder
         self.command = command
         self.progress = progress
-        self._made: dict[RunRequest, _Data] = {}
-        self._judges: Judges | None = None
-        self._said = False
+        self.test = test
+        self.query_seconds = query_seconds
+        # Seconds by which a run exceeds generating and training: the most of all so far, or a guess.
+        self._overhead = _OVERHEAD
+        # Folder and seconds by request.
+        self._data: dict[DataRequest, tuple[Path, float]] = {}
+        self._test_set: ShardQueries | None = None
 
     def clear(self) -> None:
-        """Remove data and fits; points hold what was measured on them."""
+        """Remove data and fits."""
         shutil.rmtree(self.folder, ignore_errors=True)
 
-    def _generate(self, wanted: RunRequest) -> _Data:
-        """A data set, made anew: what an interrupted study left behind was not timed."""
+    def _generate(self, seed: int, train: tuple[int, int], test: tuple[int, int]) -> tuple[Path, float]:
+        """Folder of a new data set with (queries, paths of each) of both splits, and the seconds it took."""
         data = self.config.model_dump(mode="json")
-        data["seed"] += wanted.seed
-        data["queries"] |= {
-            "train": str(wanted.queries),
-            "spp": wanted.spp,
-            "test": _FEWEST,
-            "test_spp": 2,
-            "layout": "shuffled",
-        }
+        data["seed"] += seed
+        data["queries"] |= {"train": str(train[0]), "spp": train[1], "layout": "shuffled"}
+        data["queries"] |= {"test": str(test[0]), "test_spp": test[1]}
         config = GeneratorConfig.model_validate(data)
         folder = self.folder / f"data-{hash_of(data)[:12]}"
+        # Data that an interrupted study left behind were not timed.
         shutil.rmtree(folder, ignore_errors=True)
         start = time.perf_counter()
-        # What is odd about the material is said once, not for every data set.
-        said, self._said = self._said, True
-        generate(config, folder, job=_quiet_job(config) if said else None)
-        return _Data(folder, time.perf_counter() - start)
+        # `Job.prepare` would log the material's warnings for every data set.
+        job = Job.of(config, load_material(Path(config.material), config.geometry.make_tileable))
+        generate(config, folder, job=job)
+        return folder, time.perf_counter() - start
 
-    def data(self, wanted: RunRequest) -> _Data:
-        """Training data, made where they are missing."""
-        if wanted not in self._made:
-            self.progress(f"{wanted.queries / 1e6:.2f} M queries of {wanted.spp} paths{wanted.other}")
-            self._made[wanted] = self._generate(wanted)
-        return self._made[wanted]
+    def data(self, request: DataRequest) -> tuple[Path, float]:
+        """Folder of training data, generated where they are missing, and the seconds that this took."""
+        if request not in self._data:
+            self.progress(f"{request.queries / 1e6:.2f} M queries of {request.spp} paths")
+            train = (request.queries, request.spp)
+            self._data[request] = self._generate(request.seed, train, _NO_QUERIES)
+        return self._data[request]
 
-    def has(self, wanted: RunRequest) -> bool:
-        """Whether training data are there."""
-        return wanted in self._made
+    def has(self, request: DataRequest) -> bool:
+        """Whether training data exist."""
+        return request in self._data
 
-    def forget(self, wanted: RunRequest) -> None:
-        """Remove training data that no other chain needs."""
-        made = self._made.pop(wanted, None)
-        if made is not None:
-            shutil.rmtree(made.folder, ignore_errors=True)
+    def forget(self, request: DataRequest) -> None:
+        """Remove training data that no other run needs."""
+        folder, _ = self._data.pop(request, (None, 0.0))
+        if folder is not None:
+            shutil.rmtree(folder, ignore_errors=True)
 
-    def judges(self) -> Judges:
-        """The test queries that all chains are judged by, as many paths as the configuration's test split."""
-        if self._judges is None:
-            from mbtf_pipeline.cost_study.importance_sampled import draw_judges
+    def expected_seconds(self, run: Run) -> float:
+        """Expected time of measuring a run; existing data take none."""
+        return self._planned_seconds(run) + self._overhead
 
-            self.progress("test queries")
-            config, job = self.config, _quiet_job(self.config)
-            paths = count_queries(config.queries.test, job.lattice.texels()) * config.queries.test_spp
-            self._judges = draw_judges(GeneratorBenchmark(config, job.material, config.seed), paths)
-        return self._judges
+    def _planned_seconds(self, run: Run) -> float:
+        generating = 0.0 if self.has(run.data) else run.data.queries * self.query_seconds(run.data.spp)
+        return generating + parse_duration(run.fit["training"].get("time", 0.0))
 
-    def measure(self, chain: Chain) -> Point:
-        """Make the data, fit, and judge."""
+    def test_set(self) -> ShardQueries:
+        """The test queries of all runs."""
+        if self._test_set is None:
+            from mbtf_fit.data.loader import load_split
+            from mbtf_gen.dataset.reader import Dataset
+
+            self.progress("test set")
+            folder, _ = self._generate(0, _NO_QUERIES, self.test)
+            self._test_set = load_split(Dataset.open(folder), "test")
+            shutil.rmtree(folder, ignore_errors=True)
+        return self._test_set
+
+    def measure(self, run: Run) -> Measurement:
+        """Generate the data, fit, and evaluate.
+
+        Raises
+        ------
+        InputError : the fit failed
+        """
         from mbtf_fit import FitConfig, fit
 
-        judges = self.judges()
-        data = self.data(chain.data)
-        self.progress(chain.label)
-        config = FitConfig.model_validate({"seed": self.config.seed + chain.data.seed, **chain.fit})
-        out = self.folder / f"fit-{hash_of(chain.key)[:12]}"
+        test = self.test_set()
+        start, planned = time.perf_counter(), self._planned_seconds(run)
+        folder, generation_seconds = self.data(run.data)
+        self.progress(run.label)
+        config = FitConfig.model_validate({"seed": self.config.seed + run.data.seed, **run.fit})
+        out = self.folder / f"fit-{hash_of(run.key)[:12]}"
         shutil.rmtree(out, ignore_errors=True)
-        result = fit(config, data.folder, out)
-        material = result.material
-        error = judges.unexplained(material.predict(judges.queries))
-        half = judges.unexplained(_half(material).predict(judges.queries))
-        size = sum(p.stat().st_size for p in out.glob("weights*"))
-        numbers = sum(p.numel() for p in material.model.parameters())
+        result = fit(config, folder, out)
+        error = unexplained_variance(result.material.predict(test), test.value_a, test.value_b)
         details = {
-            "queries": float(chain.data.queries),
-            "spp": float(chain.data.spp),
-            "generation_seconds": data.seconds,
+            "queries": float(run.data.queries),
+            "spp": float(run.data.spp),
+            "generation_seconds": generation_seconds,
             "training_seconds": result.seconds,
-            "total_seconds": data.seconds + result.total_seconds,
-            "evaluation_ms_1080p": 1e3 * _evaluation_seconds(material, judges.queries),
-            "bytes": float(size),
-            "half_bytes": float(size - 2 * numbers),
-            "half_error": half.value,
-            "half_error_se": half.error,
+            "total_seconds": generation_seconds + result.total_seconds,
+            "evaluation_ms_1080p": 1e3 * _evaluation_seconds(result.material, test),
+            "bytes": float(sum(p.stat().st_size for p in out.glob("weights*"))),
         }
         shutil.rmtree(out, ignore_errors=True)
-        price = {"data": "generation_seconds", "seeds": "generation_seconds", "fit": "training_seconds"}.get(
-            chain.study, "total_seconds"
-        )
-        return Point(
-            chain.study,
-            chain.series,
-            chain.name,
-            {
-                "queries.train": str(chain.data.queries),
-                "queries.spp": chain.data.spp,
-                **_flat(chain.fit),
-                **({"seed": self.config.seed + chain.data.seed} if chain.data.seed else {}),
-            },
-            "",
-            Estimate(details[price], 0.0, 1),
-            error,
-            details=details,
+        self._overhead = max(self._overhead, time.perf_counter() - start - planned)
+        options = {"queries.train": str(run.data.queries), "queries.spp": run.data.spp, **_flat(run.fit)}
+        seconds = Estimate(details[_SECONDS[run.study]], 0.0, 1)
+        return Measurement(
+            run.study, run.series, run.name, options, self.command_of(run), seconds, error, details=details
         )
 
-    def command_of(self, chain: Chain) -> str:
-        """What makes a chain with the programs."""
-        fit = _flat(chain.fit)
-        own = ""
-        if seed := self.config.seed + chain.data.seed:
-            # Also what the generator's configuration holds already, where the chain is of the study's own.
+    def command_of(self, run: Run) -> str:
+        """The command that reproduces a run; the test split is that of the recipe."""
+        fit = _flat(run.fit)
+        seed = self.config.seed + run.data.seed
+        own = f" --seed {seed}" if run.data.seed else ""
+        if seed:
             fit["seed"] = seed
-            own = f" --set seed={seed}"
         flags = "".join(f" --set {name}={value}" for name, value in fit.items())
         return (
-            f"{self.command} --queries {chain.data.queries} --spp {chain.data.spp}{own} -o shards/ && "
+            f"{self.command} --queries {run.data.queries} --spp {run.data.spp}{own} -o shards/ && "
             f"mbtf-fit shards/{flags} -o material/"
         )
-
-
-def _quiet_job(config: GeneratorConfig) -> Job:
-    """The job of a configuration whose material was spoken of before."""
-    return Job.of(config, load_material(Path(config.material), config.geometry.tile))
 
 
 def _flat(options: dict[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -243,27 +228,14 @@ def _flat(options: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return out
 
 
-def _half(material: Any) -> Any:
-    """The material with its numbers rounded to half precision, evaluated in single."""
-    import copy
-
-    import torch
-
-    rounded = copy.deepcopy(material)
-    with torch.no_grad():
-        for parameter in rounded.model.parameters():
-            parameter.copy_(parameter.half().float())
-    return rounded
-
-
-def _evaluation_seconds(material: Any, test: Any) -> float:
+def _evaluation_seconds(material: Any, test: ShardQueries) -> float:
     """Seconds for one query per pixel of 1080p, at random queries."""
     rows = np.resize(np.arange(len(test)), _TIMED_QUERIES)
     arrays = [getattr(test, name)[rows] for name in ("u", "sigma", "omega_i", "omega_o")]
-    took = []
+    times = []
     for _ in range(_TIMED):
         start = time.perf_counter()
         material.evaluate(*arrays)
-        took.append(time.perf_counter() - start)
-    # Disks still write what was generated: the least is what evaluating takes.
-    return min(took) * PIXELS / _TIMED_QUERIES
+        times.append(time.perf_counter() - start)
+    # The smallest: the disk may still be writing generated data.
+    return min(times) * PIXELS / _TIMED_QUERIES

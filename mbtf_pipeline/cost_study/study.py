@@ -1,10 +1,10 @@
-"""A cost study: measures what accuracy costs, within a time budget, and goes on where it stopped."""
+"""A cost study: measures what accuracy costs within a time budget, and resumes where it stopped."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,35 +13,30 @@ from mbtf_core.atomic import read_json, write_json, write_text
 from mbtf_core.config_file import dump_yaml
 from mbtf_core.errors import InputError
 from mbtf_core.stats import Estimate, signal_variance
-from mbtf_gen.config.generator import GeneratorConfig, count_queries
+from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.material.material import load_material
-from mbtf_pipeline.cost_study.fit_runs import GENERATOR, chains
+from mbtf_pipeline.cost_study.fit_runs import GENERATOR, SEEDS, QuerySeconds, planned_runs
 from mbtf_pipeline.cost_study.generator_benchmark import GeneratorBenchmark
-from mbtf_pipeline.cost_study.generator_runs import GeneratorTask, generator_tasks
-from mbtf_pipeline.cost_study.measurements import Point, PointFolder
-from mbtf_pipeline.cost_study.repeats import repeat_chains
-from mbtf_pipeline.cost_study.runs import Chain, RunRequest, RunRunner
-from mbtf_pipeline.cost_study.seed_variance import Scatter, seed_scatter, with_scatter
+from mbtf_pipeline.cost_study.generator_runs import generator_tasks
+from mbtf_pipeline.cost_study.measurements import Measurement, MeasurementFolder
+from mbtf_pipeline.cost_study.repeats import MOST_SEEDS, combined, measure_runs, seed_deviation
+from mbtf_pipeline.cost_study.runs import Run, RunRunner
 from mbtf_pipeline.recipe import Recipe
 from mbtf_pipeline.run_folder import locked, machine, take
 
 STUDY_NAME = "study.json"
 STUDY_FORMAT = "mbtf-cost"
-STUDY_SCHEMA = 1
+STUDY_SCHEMA = 2
 CONFIG_NAME = "generate.yaml"
 WORK = ".work"
-# Budget of a new study, seconds.
-NEW_BUDGET = 600.0
-# Share of the budget that is kept for whole chains while the generator is studied.
-_RESERVED = 0.7
-# Seconds of tracing in the data set that tells what a query costs on disk.
-_TRIAL = 3.0
-# Deviation of values, relative to their mean, below which a fit has nothing to learn.
+# Time of a new study, seconds.
+NEW_TIME = 600.0
+# Relative standard deviation of the values below which a fit has nothing to learn.
 _LEAST_VARIATION = 0.005
-# Settings that the generator's share of the budget is divided among.
-_SETTINGS = 42
-
-Tell = Callable[[float, str], None]
+# About as many configurations of the generator share its time.
+_CONFIGURATIONS = 35
+# Paths per query at which the time of generating is measured, seconds of each measurement, and queries.
+_TIMED_PATHS, _TIMED_SECONDS, _TIMED_QUERIES = (2, 32), 0.5, "1e6"
 
 
 @dataclass
@@ -51,47 +46,46 @@ class Study:
     Attributes
     ----------
     folder : of the study
-    description : name, command, budget, seed, machine, and when it was made
-    points : in the order of measurement
-    skipped : names of settings for which no time was left
-    scatter : of chains over seeds, which their bars hold; None where it is not known
-    failed : chains that could not be measured, and why
-    test_seconds : what the recipe's test split takes, which commands of chains make besides; None where no
-        price of paths is known
+    description : name, command, time, seed, machine, date
+    measurements : one per configuration
+    deviation : relative standard deviation of runs over seeds, part of their error bars; None where no run
+        was repeated
+    skipped : configurations for which no time was left
+    failed : runs that failed, and why
     """
 
     folder: Path
     description: dict[str, Any]
-    points: list[Point] = field(default_factory=list)
+    measurements: list[Measurement] = field(default_factory=list)
+    deviation: Estimate | None = None
     skipped: list[str] = field(default_factory=list)
-    scatter: Scatter | None = None
     failed: list[str] = field(default_factory=list)
-    test_seconds: float | None = None
 
 
 def claim(folder: Path) -> None:
-    """Make a study's folder, or take an empty one or one that holds a study of this kind of machine: seconds
-    of another one would stand beside its own.
+    """Create a study's folder, or take an empty one or one that holds a study of this kind of machine.
 
     Raises
     ------
-    InputError : it holds something else
+    InputError : it holds something else, or a study of another version or machine
     """
     hint = "choose another folder with -o"
     other = InputError("is not empty and holds no cost study", where=folder, hint=hint)
     take(folder, lambda path: bool(_record(path)), other)
-    if record := _record(folder):
-        there, here = record.get("machine", {}).get("system"), machine()["system"]
-        if there != here:
-            raise InputError(
-                f"holds a cost study made on another kind of machine ({there}; this is {here})",
-                where=folder,
-                hint=hint,
-            )
+    record = _record(folder)
+    if not record:
+        return
+    if record.get("schema") != STUDY_SCHEMA:
+        problem = f"holds a cost study of schema version {record.get('schema')}; this is {STUDY_SCHEMA}"
+        raise InputError(problem, where=folder, hint=hint)
+    there, here = record.get("machine", {}).get("system"), machine()["system"]
+    if there != here:
+        problem = f"holds a cost study of another kind of machine ({there}; this is {here})"
+        raise InputError(problem, where=folder, hint=hint)
 
 
 def _record(folder: Path) -> dict[str, Any]:
-    """What a folder says of the study that it holds; empty where it holds none."""
+    """The record of the study in a folder; empty where there is none."""
     try:
         found = read_json(folder / STUDY_NAME)
     except InputError:
@@ -99,207 +93,175 @@ def _record(folder: Path) -> dict[str, Any]:
     return found if found.get("format") == STUDY_FORMAT else {}
 
 
-def budget_of(folder: Path) -> float:
-    """Seconds of the study in a folder; those of a new one where there is none."""
-    budget = _record(folder).get("budget")
-    return float(budget) if isinstance(budget, int | float) and budget > 0 else NEW_BUDGET
+def time_of(folder: Path) -> float:
+    """Time in seconds of the study in a folder; that of a new one where there is none."""
+    seconds = _record(folder).get("time")
+    return float(seconds) if isinstance(seconds, int | float) and seconds > 0 else NEW_TIME
 
 
-def _check_variation(bench: GeneratorBenchmark) -> None:
-    """Whether there is anything to learn of a material.
+def _check_variation(benchmark: GeneratorBenchmark) -> None:
+    """Refuse a material that gives a fit nothing to learn.
 
     Raises
     ------
     InputError : it reflects nothing, or the same everywhere and in all directions
     """
-    reference, mean = bench.reference({}, 0), bench.mean({}).value
+    reference, mean = benchmark.reference({}, 0), benchmark.mean({}).value
+    where = benchmark.config.material
     if not mean > 0:
-        raise InputError(
-            "reflects nothing: every value is 0",
-            where=bench.config.material,
-            hint="study a material with a base color or gloss",
-        )
+        hint = "study a material with a base color or gloss"
+        raise InputError("reflects nothing: every value is 0", where=where, hint=hint)
     variance = signal_variance(reference.a, reference.b)
     if variance.value + 2 * variance.error < (_LEAST_VARIATION * mean) ** 2:
-        raise InputError(
-            "reflects the same everywhere and in all directions: there is nothing to fit",
-            where=bench.config.material,
-            hint="study a material with a relief or textures",
-        )
+        problem = "reflects the same everywhere and in all directions: there is nothing to fit"
+        raise InputError(problem, where=where, hint="study a material with displacement or textures")
 
 
-def studied(config: GeneratorConfig, seed: int | None) -> GeneratorConfig:
-    """A recipe's generator as its study takes it: with numbers of paths, which a target error would override,
-    and queries one by one, which all models but one learn from."""
+def study_config(config: GeneratorConfig, seed: int | None) -> GeneratorConfig:
+    """A recipe's generator as its study uses it: without a target error, which would override the numbers of
+    paths, and with shuffled queries."""
     queries = config.queries.model_copy(update={"target_error": None, "layout": "shuffled"})
     seeds = {} if seed is None else {"seed": seed}
     return config.model_copy(update={"queries": queries, **seeds})
+
+
+class _Clock:
+    """The remaining time of a study, and the share of it that is spent."""
+
+    def __init__(self, seconds: float, refine: float) -> None:
+        self.begin = time.perf_counter()
+        self.seconds, self.refine = seconds, refine
+
+    def left(self, *, refining: bool = False) -> float:
+        return self.seconds + refining * self.refine - (time.perf_counter() - self.begin)
+
+    def share(self) -> float:
+        return min(1.0, (time.perf_counter() - self.begin) / (self.seconds + self.refine))
 
 
 def run_study(
     recipe: Recipe,
     folder: Path,
     *,
-    budget: float,
-    narrow: float = 0.0,
+    seconds: float,
+    refine: float = 0.0,
     seed: int | None = None,
     command: str = "",
-    tell: Tell | None = None,
+    progress: Callable[[float, str], None] = lambda share, note: None,
 ) -> Study:
-    """Measure what the budget allows; points that were measured before are kept.
+    """Measure what the time allows; stored measurements are kept.
 
     Parameters
     ----------
-    recipe : its material and generator are studied; fits and comparison are not used
-    budget : seconds for everything, points that are done already counted as free
-    narrow : further seconds, for chains of other seeds where bars are wide
-    seed : of queries, paths and first weights; the recipe's by default
-    tell : called with (share of the budget spent, note)
+    recipe : its material and generator are studied; its fits and comparison are not used
+    seconds : time of everything; stored measurements cost none of it
+    refine : additional seconds for repeating runs with wide error bars
+    seed : of queries, paths and initial weights; the recipe's by default
+    progress : called with (share of the time spent, note)
 
     Raises
     ------
     InputError : the material or the folder cannot be used
-    PartialError : another process is at work in the folder, or the disk is full; the same command goes on
+    PartialError : another process works in the folder, or the disk is full; the same command resumes
     """
-    begin = time.perf_counter()
-    config = studied(recipe.generate, seed)
-    material = load_material(Path(config.material), config.geometry.tile)
+    clock = _Clock(seconds, refine)
+    config = study_config(recipe.generate, seed)
+    material = load_material(Path(config.material), config.geometry.make_tileable)
     claim(folder)
-
-    def note(text: str) -> None:
-        if tell is not None:
-            tell(min(1.0, (time.perf_counter() - begin) / (budget + narrow)), text)
-
-    def left() -> float:
-        return budget - (time.perf_counter() - begin)
-
     with locked(folder, STUDY_NAME):
         description = {
             "format": STUDY_FORMAT,
             "schema": STUDY_SCHEMA,
             "name": recipe.name,
             "command": command,
-            "budget": budget,
+            "time": seconds,
             "seed": config.seed,
             "material": config.material,
-            "queries": config.queries.model_dump(mode="json"),
-            "made": time.strftime("%Y-%m-%d"),
+            "date": time.strftime("%Y-%m-%d"),
             "machine": machine(),
         }
-        bench = GeneratorBenchmark(config, material, config.seed)
-        note("reference")
-        # Before anything of the study that may be there is written over.
-        _check_variation(bench)
+        benchmark = GeneratorBenchmark(config, material, config.seed)
+        progress(0.0, "reference")
+        # Before anything is written: a refused study leaves the folder as it was.
+        _check_variation(benchmark)
         write_json(folder / STUDY_NAME, description)
-        data = config.model_dump(mode="json")
-        write_text(folder / CONFIG_NAME, dump_yaml(data))
+        write_text(folder / CONFIG_NAME, dump_yaml(config.model_dump(mode="json")))
         study = Study(folder, description)
-        store = PointFolder(folder, {"config": config.hash(material.digests)})
+        store = MeasurementFolder(folder, {"config": config.hash(material.digests)})
         generator = f"mbtf-gen {config.material} --config {folder / CONFIG_NAME}"
-        each = 0.5 * GENERATOR * budget / _SETTINGS
-        for task in generator_tasks(bench):
-            point = store.get(task.study, task.key)
-            if point is None and left() > _RESERVED * budget:
-                note(task.label)
-                point = task.run(bench, each)
-                store.put(task.key, point)
-            _keep(study, point, task, task.command(generator))
-        price = _price(study.points)
-        if price is not None:
-            texels = bench.job({}).lattice.texels()
-            tests = count_queries(config.queries.test, texels)
-            study.test_seconds = tests * price(config.queries.test_spp)
-            work = RunRunner(config, folder / WORK, generator, note)
-            extra = _beyond_tracing(store, work, price)
-            _measure_chains(study, store, work, budget, narrow, lambda n: price(n) + extra, left)
-        if narrow > 0 and study.scatter is None:
-            study.skipped.append("other seeds: how far chains scatter is not known yet")
+        _measure_generator(study, store, benchmark, generator, clock, progress)
+        runner = RunRunner(config, folder / WORK, generator, lambda note: progress(clock.share(), note))
+        try:
+            _measure_runs(study, store, runner, benchmark, clock)
+        finally:
+            runner.clear()
     return study
 
 
-def _keep(study: Study, point: Point | None, task: GeneratorTask | Chain, command: str) -> None:
-    """Take a point up; its command names the study's folder, which may have moved since it was measured."""
-    if point is None:
-        study.skipped.append(task.label)
-    else:
-        study.points.append(replace(point, series=task.series, name=task.name, command=command))
-
-
-def _price(points: Iterable[Point]) -> Callable[[int], float] | None:
-    """Seconds per query by its paths, from those that were measured: the nearest number of paths, in
-    proportion."""
-    known = {int(p.setting["queries.spp"]): p.seconds.value * 1e-6 for p in points if p.study == "paths"}
-    if not known:
-        return None
-
-    def price(paths: int) -> float:
-        nearest = min(known, key=lambda n: abs(n - paths))
-        return known[nearest] * (paths / nearest if nearest != paths else 1.0)
-
-    return price
-
-
-def _beyond_tracing(store: PointFolder, work: RunRunner, price: Callable[[int], float]) -> float:
-    """Seconds of a query beyond tracing: to draw, group and write it. From two data sets, the smaller of
-    which takes what starting takes; stored as a point, so that a study that goes on has the same chains."""
-    spp = work.config.queries.spp
-    count = max(1, int(_TRIAL / price(spp)))
-    key = {"queries": count, "spp": spp}
-    point = store.get("price", key)
-    if point is None:
-        seconds = []
-        for queries in (1, count):
-            data = RunRequest(queries, spp)
-            seconds.append(work.data(data).seconds)
-            work.forget(data)
-        nothing = Estimate(math.nan, math.inf, 0)
-        taken = Estimate((seconds[1] - seconds[0]) / count * 1e6, 0.0, 1)
-        point = Point("price", "written", f"{count} queries", key, "", taken, nothing)
-        store.put(key, point)
-    return max(0.0, point.seconds.value * 1e-6 - price(spp))
-
-
-def _measure_chains(
+def _measure_generator(
     study: Study,
-    store: PointFolder,
-    work: RunRunner,
-    budget: float,
-    narrow: float,
-    price: Callable[[int], float],
-    left: Callable[[], float],
+    store: MeasurementFolder,
+    benchmark: GeneratorBenchmark,
+    generator: str,
+    clock: _Clock,
+    progress: Callable[[float, str], None],
 ) -> None:
-    """Measure chains, then again those whose bars are too wide; bars get the scatter of seeds."""
-    # Prices are those of stored points: a study that goes on has the same tasks.
-    tasks = list(chains(budget, work.config.queries.spp, price))
-    needed = [t.data for t in tasks]
-    measured: dict[int, Chain] = {}
-    failed: list[dict[str, Any]] = []
-    try:
-        for number, task in enumerate(tasks):
-            point = store.get(task.study, task.key)
-            try:
-                if point is None and left() > task.seconds(price, data=not work.has(task.data)):
-                    point = work.measure(task)
-                    store.put(task.key, point)
-            except InputError as error:
-                # What was measured, and what is still to come, is worth a page all the same.
-                study.failed.append(f"{task.label}: {error.what}")
-                failed.append(task.key)
-            else:
-                _keep(study, point, task, work.command_of(task))
-                if point is not None and task.study != "seeds":
-                    measured[len(study.points) - 1] = task
-            if task.data not in needed[number + 1 :]:
-                work.forget(task.data)
-        end = time.perf_counter() + narrow
+    """Measure the generator's configurations in its share of the time."""
+    each = 0.5 * GENERATOR * clock.seconds / _CONFIGURATIONS
+    for task in generator_tasks(benchmark):
+        found = store.get(task.study, task.key)
+        # Configurations take longer than their share where kernels are compiled.
+        if found is None and clock.left() > (1.0 - 1.5 * GENERATOR) * clock.seconds:
+            progress(clock.share(), task.label)
+            found = task.run(benchmark, each)
+            store.put(task.key, found)
+        if found is None:
+            study.skipped.append(task.label)
+        else:
+            command = task.command(generator)
+            found = replace(found, series=task.series, name=task.name, command=command)
+            study.measurements.append(found)
 
-        def enough(chain: Chain, data: bool) -> bool:
-            return end - time.perf_counter() > chain.seconds(price, data=data)
 
-        study.scatter = seed_scatter(study.points)
-        if study.scatter is not None:
-            repeats = repeat_chains(study.points, measured, study.scatter, store, work, enough, failed)
-            study.failed += repeats.failed
-            study.points = with_scatter(study.points, study.scatter, repeats.again)
-    finally:
-        work.clear()
+def query_seconds(benchmark: GeneratorBenchmark, store: MeasurementFolder) -> QuerySeconds:
+    """Seconds to generate a query by its number of paths, linear in it: from forecasts at two numbers. They
+    are stored, so that a resumed study plans the same runs."""
+    found = store.get("seconds", {})
+    if found is None:
+        from mbtf_gen.forecast import forecast
+        from mbtf_gen.planning.effects_plan import plan_effects
+
+        at = []
+        for paths in _TIMED_PATHS:
+            options = {"queries.spp": paths, "queries.train": _TIMED_QUERIES, "queries.test": "1"}
+            job = benchmark.job(options)
+            at.append(forecast(job, plan_effects(job), _TIMED_SECONDS).query_seconds)
+        slope = max(0.0, (at[1] - at[0]) / (_TIMED_PATHS[1] - _TIMED_PATHS[0]))
+        details = {"query": max(0.0, at[0] - slope * _TIMED_PATHS[0]), "path": slope}
+        nothing = Estimate(math.nan, math.inf, 0)
+        found = Measurement("seconds", "", "", {}, "", nothing, nothing, details=details)
+        store.put({}, found)
+    details = found.details
+    # A closed form takes hardly any time.
+    return lambda paths: max(1e-8, details["query"] + details["path"] * paths)
+
+
+def _measure_runs(
+    study: Study, store: MeasurementFolder, runner: RunRunner, benchmark: GeneratorBenchmark, clock: _Clock
+) -> None:
+    """Measure runs and their repeats in the remaining time."""
+    runner.query_seconds = query_seconds(benchmark, store)
+    runs = planned_runs(clock.seconds, runner.config.queries.spp, runner.query_seconds)
+
+    def fits(run: Run) -> bool:
+        # The additional time is for repeats alone.
+        return clock.left(refining=run.data.seed > 0) > runner.expected_seconds(run)
+
+    found = measure_runs(runs, store, runner, fits, MOST_SEEDS if clock.refine else SEEDS)
+    study.deviation = seed_deviation(found.groups)
+    study.failed = found.failed
+    for run, group in zip(runs, found.groups, strict=True):
+        if group:
+            study.measurements.append(combined(group, study.deviation))
+        elif not any(text.startswith(run.label) for text in found.failed):
+            study.skipped.append(run.label)

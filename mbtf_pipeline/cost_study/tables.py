@@ -1,4 +1,4 @@
-"""The points of a study as CSV, and as rows of the page's tables."""
+"""The measurements of a study as CSV and as tables of its page."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from mbtf_core.stats import Estimate
-from mbtf_pipeline.cost_study.measurements import Point
+from mbtf_pipeline.cost_study.figures import is_significant
+from mbtf_pipeline.cost_study.measurements import Measurement
 
 _DETAILS = (
     "queries",
@@ -19,47 +20,32 @@ _DETAILS = (
     "total_seconds",
     "evaluation_ms_1080p",
     "bytes",
-    "half_bytes",
-    "half_error",
-    "relative",
-    "relative_se",
-    "paths",
     "seeds",
 )
+_ESTIMATES = ("seconds", "error", "bias", "noise")
 COLUMNS = (
     "study",
     "series",
     "name",
-    "seconds",
-    "seconds_se",
-    "error",
-    "error_se",
-    "bias",
-    "bias_se",
-    "noise",
-    "noise_se",
+    *(f"{name}{suffix}" for name in _ESTIMATES for suffix in ("", "_se")),
     *_DETAILS,
     "command",
 )
 
 
-def _number(x: float | None) -> str:
-    return "" if x is None or not math.isfinite(x) else f"{x:.6g}"
-
-
-def _pair(e: Estimate | None) -> tuple[str, str]:
-    return ("", "") if e is None else (_number(e.value), _number(e.error))
-
-
-def to_csv(points: Sequence[Point]) -> str:
-    """One row per point; ``_se`` are standard errors, empty cells what was not measured."""
+def to_csv(found: Sequence[Measurement]) -> str:
+    """One row per configuration; ``_se`` are standard errors, empty cells were not measured."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(COLUMNS)
-    for p in points:
-        estimates = [cell for e in (p.seconds, p.error, p.bias, p.noise) for cell in _pair(e)]
-        details = [_number(p.details.get(name)) for name in _DETAILS]
-        writer.writerow([p.study, p.series, p.name, *estimates, *details, p.command])
+    for m in found:
+        numbers: list[float | None] = []
+        for name in _ESTIMATES:
+            e: Estimate | None = getattr(m, name)
+            numbers += [None, None] if e is None else [e.value, e.error]
+        numbers += [m.details.get(name) for name in _DETAILS]
+        cells = ["" if x is None or not math.isfinite(x) else f"{x:.6g}" for x in numbers]
+        writer.writerow([m.study, m.series, m.name, *cells, m.command])
     return stream.getvalue()
 
 
@@ -68,72 +54,56 @@ def _percent(e: Estimate | None) -> str:
         return "–"
     if e.value == e.error == 0:
         return "0 %"
-    if e.value <= 2 * e.error:
-        return f"< {100 * 2 * max(e.error, e.value):.2g} %"
-    return f"{e.scaled(100.0)} %"
+    return f"{e.scaled(100.0)} %" if is_significant(e) else f"< {100 * 2 * max(e.error, e.value):.2g} %"
 
 
-def _seconds(e: Estimate) -> str:
-    return f"{e}" if e.error > 0 else f"{e.value:.3g}"
+def generator_table(found: Sequence[Measurement]) -> dict[str, Any]:
+    """Configurations of the generator: time, bias, noise, and both together."""
+    several = len({m.series for m in found}) > 1
+    rows = [
+        [
+            f"{m.series}, {m.name}" if several else m.name,
+            f"{m.seconds}",
+            _percent(m.bias),
+            _percent(m.noise),
+            _percent(m.error),
+            m.command,
+        ]
+        for m in found
+    ]
+    head = ["configuration", "seconds per million queries", "bias", "noise", "error", "command"]
+    return {"title": "", "head": head, "rows": rows}
 
 
-def _told(e: Estimate) -> str:
-    return f"{e}" if math.isfinite(e.value) else "–"
-
-
-def generator_table(points: Sequence[Point]) -> dict[str, Any]:
-    """Settings of the generator: price, bias, noise, both; for ways to count paths how many there were and
-    the noise relative to each value in place of bias and total."""
-    counts = any("relative" in p.details for p in points)
-    head = ["setting", "seconds per million queries"]
-    counted = ["paths per query", "noise", "noise ÷ max(value, tile mean)"]
-    head += counted if counts else ["bias", "noise", "error"]
-    rows = []
-    for p in points:
-        row = [f"{p.series}, {p.name}" if counts else p.name, _seconds(p.seconds)]
-        if counts:
-            d = p.details
-            relative = Estimate(d["relative"], d["relative_se"], 1)
-            row += [f"{d['paths']:.0f}", _percent(p.noise), _percent(relative)]
-        else:
-            row += [_percent(p.bias), _percent(p.noise), _percent(p.error)]
-        rows.append([*row, p.command])
-    return {"title": "", "head": [*head, "command"], "rows": rows}
-
-
-def chain_table(points: Sequence[Point]) -> dict[str, Any]:
-    """Whole chains: what was spent where, and what is left unexplained."""
+def run_table(found: Sequence[Measurement]) -> dict[str, Any]:
+    """Runs: where the time went, and the error."""
     head = [
-        "chain",
+        "run",
         "queries × paths",
         "generating, s",
         "training, s",
-        "in all, s",
+        "total, s",
         "unexplained variance",
         "seeds",
-        "the same in half precision",
         "1080p, ms",
         "MB",
-        "MB in half",
         "command",
     ]
     rows = []
-    for p in points:
-        d = p.details
+    for m in found:
+        d = m.details
         rows.append(
             [
-                f"{p.series}, {p.name}",
+                f"{m.series}, {m.name}",
                 f"{d['queries'] / 1e6:.2f} M × {d['spp']:g}",
                 f"{d['generation_seconds']:.1f}",
                 f"{d['training_seconds']:.1f}",
                 f"{d['total_seconds']:.1f}",
-                _told(p.error),
-                f"{d.get('seeds', 1):g}",
-                f"{d['half_error']:.4g}" if math.isfinite(d["half_error"]) else "–",
+                f"{m.error}" if math.isfinite(m.error.value) else "–",
+                f"{d['seeds']:g}",
                 f"{d['evaluation_ms_1080p']:.0f}",
                 f"{d['bytes'] / 1e6:.2f}",
-                f"{d['half_bytes'] / 1e6:.2f}",
-                p.command,
+                m.command,
             ]
         )
     return {"title": "", "head": head, "rows": rows}

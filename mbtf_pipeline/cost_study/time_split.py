@@ -1,11 +1,16 @@
-"""A total time for generating and training, split so that little error is left: pilot chains on this very
-material and machine, then one allocation.
+"""Splits a total time between generating and training.
 
-Three short chains each generate for another share of their time and train for the rest; the share of the
-least error, by a parabola through the three, is taken for what is left of the budget. Error changes slowly
-about its least value, so a rough share is enough. The pilots also tell what fits take besides training:
-loading, calibrating, judging. Budgets too short for pilots take a fixed share, and no account of that. Where
-queries cost next to nothing, disk and memory bound their number, and training gets the time.
+Three short pilot runs on the same material and machine generate for 15, 35 and 60 % of their time and train
+for the rest. The share with the lowest error is used for the remaining time: the error changes slowly near
+its minimum, so a finer search gains nothing. A short total time uses 35 % without pilots.
+
+The time T left after the pilots pays for everything: with n queries, f fits, and the measured seconds g per
+generated query, c of start and test split, and a + b n of each fit besides training (loading, calibration,
+evaluation),
+
+    T = c + n g + f (a + b n) + training,    n g = share (n g + training),
+
+where a line through the pilots gives a and b. Disk space and memory limit n; training gets what is left.
 """
 
 from __future__ import annotations
@@ -18,7 +23,8 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from mbtf_core.atomic import read_json, write_json
 from mbtf_core.console import clock
@@ -26,50 +32,70 @@ from mbtf_core.errors import InputError, UsageError
 from mbtf_core.units import format_duration
 from mbtf_fit.config import FitConfig
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_pipeline.cost_study.pareto import weighted_line
-from mbtf_pipeline.cost_study.runs import Chain, RunRequest, RunRunner
+from mbtf_pipeline.cost_study.fit_runs import round_down
+from mbtf_pipeline.cost_study.runs import DataRequest, Run, RunRunner
 from mbtf_pipeline.recipe import Recipe
 from mbtf_pipeline.run import layout_of
 from mbtf_pipeline.run_folder import claim, describe, locked
 from mbtf_pipeline.stages import hash_of
 
-if TYPE_CHECKING:
-    from mbtf_gen.forecast import Forecast
-
-BUDGET_NAME = "budget.json"
-BUDGET_FORMAT = "mbtf-budget"
-BUDGET_SCHEMA = 2
-# Shares of a chain's time that its pilots generate for, and the one taken without pilots.
+SPLIT_NAME = "time_split.json"
+SPLIT_FORMAT = "mbtf-time-split"
+SPLIT_SCHEMA = 3
+# Shares that the pilots generate for, and the one without pilots.
 SHARES = (0.15, 0.35, 0.6)
-USUAL_SHARE = 0.35
-# Shares that may come out.
-LEAST_SHARE, LARGEST_SHARE = 0.08, 0.75
-# Share of the budget that one pilot chain takes, and its shortest length in seconds.
+DEFAULT_SHARE = 0.35
+# Share of the total time that one pilot takes, and its shortest length in seconds.
 PILOT, SHORTEST_PILOT = 0.04, 10.0
-# The shortest budget worth splitting, seconds: below it starting up takes most.
+# The shortest total time, seconds: start-up takes most of a shorter one.
 SHORTEST = 60.0
-# Test split of the pilot chains, whose paths are what their judges take.
-_TEST, _TEST_SPP = "8192", 16
+# Test set of the pilots: queries, and paths of each.
+_TEST = (1 << 17, 8)
 _FEWEST_QUERIES = 4096
-# Seconds that a query takes at the least: that of a closed form, written to disk.
+# Seconds of a query at least: that of a closed form, written to disk.
 _CHEAPEST = 1e-8
 # Shares of the free disk space and of the machine's memory that training queries may take.
 _DISK, _MEMORY = 0.25, 0.5
-# However long looking took, this share of the budget is spent.
+# Share of the total time that remains at least, however long the pilots took.
 _LEAST_LEFT = 0.25
 
 
 @dataclass(frozen=True)
-class Prices:
-    """What a run takes, in seconds.
+class Split:
+    """How a total time is spent.
 
     Attributes
     ----------
-    query : to generate a training query
-    start : of generating besides, with the test split
-    fit, fit_query : of a fit besides training, and of that by training query
-    fits : number of fits
+    queries : training queries to generate
+    generating, training, other : seconds of generating, of training all fits, and of fits besides training
+    share : of generating in generating and training
+    pilots : (share, unexplained variance) of each pilot; empty for short times
+    pilot_seconds : time of forecast and pilots
     """
+
+    queries: int
+    generating: float
+    training: float
+    other: float
+    share: float
+    pilots: tuple[tuple[float, float], ...]
+    pilot_seconds: float
+
+    def describe(self) -> str:
+        """One line."""
+        errors = ", ".join(f"{share:.0%} {error:.3f}" for share, error in self.pilots)
+        how = f"pilots' unexplained variance by share: {errors}" if errors else "fixed share"
+        return (
+            f"time: {clock(self.generating)} for {self.queries} queries, {clock(self.training)} of training, "
+            f"{clock(self.other)} of loading and evaluation, after {clock(self.pilot_seconds)} of pilots "
+            f"({self.share:.0%} generating; {how})"
+        )
+
+
+@dataclass(frozen=True)
+class Costs:
+    """Measured times in seconds: per generated query, of starting the generator with its test split, of a fit
+    besides training, and of that per query; and the number of fits."""
 
     query: float
     start: float
@@ -77,243 +103,170 @@ class Prices:
     fit_query: float
     fits: int
 
-    def spend(self, seconds: float, share: float, most: float = math.inf) -> tuple[float, float, float]:
-        """(queries, seconds of making them, seconds of training) of so many seconds in all, where `share` of
-        both makes queries, at most `most`; what is left over then is trained for."""
+    def split(self, seconds: float, share: float, most: float = math.inf) -> tuple[int, float, float, float]:
+        """(queries, seconds of generating, of training, of fits besides training) for a total time; at most
+        so many queries."""
         left = seconds - self.start - self.fits * self.fit
-        # Fits load what is made.
-        both = left / (1 + self.fits * self.fit_query * share / self.query)
-        queries = share * both / self.query
-        if queries > most:
-            queries, both = most, left - self.fits * self.fit_query * most
-        return queries, queries * self.query, both - queries * self.query
+        # Of n queries, n (query / share + fits fit_query) is the time left.
+        count = min(most, left / (self.query / share + self.fits * self.fit_query))
+        queries = round_down(max(_FEWEST_QUERIES, count))
+        generating = queries * self.query
+        other = self.fits * (self.fit + queries * self.fit_query)
+        training = max(1.0 * self.fits, seconds - self.start - generating - other)
+        return queries, generating + self.start, training, other
 
 
-@dataclass(frozen=True)
-class Split:
-    """How a budget is spent.
-
-    Attributes
-    ----------
-    queries : training queries to generate
-    generating, training : seconds meant for either; training is over all fits
-    share : of generating in both
-    pilots : (share, unexplained variance) of the pilot chains; none for short budgets
-    pilot_seconds : what forecast and pilots took
-    prices : by which it was reckoned
-    """
-
-    queries: int
-    generating: float
-    training: float
-    share: float
-    pilots: tuple[tuple[float, float], ...]
-    pilot_seconds: float
-    prices: Prices
-
-    @property
-    def beside(self) -> float:
-        """Seconds that fits take besides training."""
-        return self.prices.fits * (self.prices.fit + self.prices.fit_query * self.queries)
-
-    def describe(self) -> str:
-        """One line."""
-        tried = ", ".join(f"{share:.0%} {error:.3f}" for share, error in self.pilots)
-        how = f"pilots' unexplained variance by share of generating: {tried}" if tried else "a fixed share"
-        return (
-            f"budget: {clock(self.generating)} for {self.queries} queries, {clock(self.training)} of "
-            f"training and {clock(self.beside)} beside it, after {clock(self.pilot_seconds)} of looking "
-            f"({self.share:.0%} generating; {how})"
-        )
-
-
-def best_share(pilots: Sequence[tuple[float, float]]) -> float:
-    """Share of the least error by a parabola through three (share, error), both in logarithms; the best of
-    them where it has no least value, and always within the shares that may come out."""
-    (x0, y0), (x1, y1), (x2, y2) = ((math.log(x), math.log(max(y, 1e-12))) for x, y in pilots)
-    left, right = (y1 - y0) / (x1 - x0), (y2 - y1) / (x2 - x1)
-    bend = (right - left) / (x2 - x0)
-    if bend > 0:
-        vertex = 0.5 * (x0 + x1 - left / bend)
-    else:
-        vertex = math.log(min(pilots, key=lambda p: p[1])[0])
-    # What lies outside of the pilots is a guess: no more than half a step beyond them.
-    vertex = min(max(vertex, x0 - 0.5 * (x1 - x0)), x2 + 0.5 * (x2 - x1))
-    return min(max(math.exp(vertex), LEAST_SHARE), LARGEST_SHARE)
-
-
-def split_budget(
-    recipe: Recipe, budget: float, folder: Path, command: str, tell: Callable[[str], None]
+def split_time(
+    recipe: Recipe, seconds: float, folder: Path, command: str, progress: Callable[[str], None]
 ) -> Split:
-    """How to spend a budget in seconds on a recipe; remembered in the run's folder, so that the same command
-    goes on with the same split.
+    """How to spend a total time on a recipe; stored in the run's folder, so that the same command resumes
+    with the same split.
 
     Parameters
     ----------
-    command : what the run is described by
-    tell : called with a note after every pilot chain
-
-    Training queries take at most a quarter of the free disk space, and no more memory than ``data.memory`` of
-    the fits or half of the machine's, whichever is more: beyond both, training would wait for the disk.
+    command : of the run, for its record
+    progress : called with a note after every pilot
 
     Raises
     ------
-    UsageError : the budget is too short, or a model of the recipe learns from another layout
+    UsageError : the time is too short, or a model of the recipe needs another layout
     InputError : the folder holds something else
-    PartialError : something else works in it
+    PartialError : another process works in it
     """
-    if budget < SHORTEST:
+    if seconds < SHORTEST:
         raise UsageError(
-            f"{format_duration(budget)} is too short to split: starting up takes most of it",
-            where="--budget",
+            f"{format_duration(seconds)} is too short: starting up takes most of it",
+            where="--time",
             hint=f"give {format_duration(SHORTEST)} or more",
         )
     if any(layout_of(fit) != "shuffled" for fit in recipe.fit.values()):
         raise UsageError(
-            "only models of the shuffled layout can share a budget",
-            where="--budget",
+            "only models of the shuffled layout can share a time",
+            where="--time",
             hint="leave out the fits of 'hierarchical'",
         )
-    asked = recipe.model_dump(mode="json", include={"generate", "fit"})
-    key = hash_of({"schema": BUDGET_SCHEMA, "budget": budget, "recipe": asked})
+    options = recipe.model_dump(mode="json", include={"generate", "fit"})
+    key = hash_of({"schema": SPLIT_SCHEMA, "time": seconds, "recipe": options})
     claim(folder)
     with locked(folder):
-        split = _remembered(folder, key)
+        split = _stored(folder, key)
         if split is None:
             describe(folder, recipe, command)
-            split = _plan(recipe, budget, folder, tell)
-            write_json(folder / BUDGET_NAME, {"format": BUDGET_FORMAT, "key": key, **asdict(split)})
+            split = _measure(recipe, seconds, folder, progress)
+            write_json(folder / SPLIT_NAME, {"format": SPLIT_FORMAT, "key": key, **asdict(split)})
     return split
 
 
-def _remembered(folder: Path, key: str) -> Split | None:
-    path = folder / BUDGET_NAME
+def _stored(folder: Path, key: str) -> Split | None:
+    path = folder / SPLIT_NAME
     if not path.exists():
         return None
     try:
         data = read_json(path)
-        if data.pop("format") != BUDGET_FORMAT or data.pop("key") != key:
+        if data.pop("format") != SPLIT_FORMAT or data.pop("key") != key:
             return None
-        pilots = tuple((p[0], p[1]) for p in data["pilots"])
-        return Split(**data | {"pilots": pilots, "prices": Prices(**data["prices"])})
+        return Split(**data | {"pilots": tuple((p[0], p[1]) for p in data["pilots"])})
     except (InputError, KeyError, TypeError, IndexError):
         return None
 
 
-def most_queries(recipe: Recipe, folder: Path) -> int:
-    """Training queries that disk and memory hold.
+def _measure(recipe: Recipe, seconds: float, folder: Path, progress: Callable[[str], None]) -> Split:
+    start = time.perf_counter()
+    pilots, costs = measure_costs(recipe, PILOT * seconds, folder, progress)
+    share = min(pilots, key=lambda p: p[1])[0] if pilots else DEFAULT_SHARE
+    took = time.perf_counter() - start
+    left = max(seconds - took, _LEAST_LEFT * seconds + costs.start + costs.fits * costs.fit)
+    queries, *parts = costs.split(left, share, most_queries(recipe, folder))
+    generating, training, other = (round(part, 1) for part in parts)
+    return Split(queries, generating, training, other, share, tuple(pilots), round(took, 1))
 
-    Parameters
-    ----------
-    folder : that they are written to; it exists
-    """
-    from mbtf_fit.data.loader import QUERY_BYTES
+
+def measure_costs(
+    recipe: Recipe, length: float, folder: Path, progress: Callable[[str], None]
+) -> tuple[list[tuple[float, float]], Costs]:
+    """(share, unexplained variance) of pilots of so many seconds each, and the costs of a run. Lengths below
+    `SHORTEST_PILOT` and failed pilots leave no pilots, and the costs of a fit unknown."""
+    query, start = _generating(recipe.generate)
+    most = most_queries(recipe, folder)
+    errors: list[tuple[float, float]] = []
+    fits = [(1.0, 0.0)]
+    if length >= SHORTEST_PILOT:
+        try:
+            errors, fits = _pilots(recipe, length, query, most, progress)
+        except InputError as error:
+            progress(f"pilot failed: {error.what}; {DEFAULT_SHARE:.0%} of the time generates")
+    # The values of a flat plane do not vary: their unexplained variance is not defined.
+    errors = errors if all(math.isfinite(error) for _, error in errors) else []
+    return errors, Costs(query, start, *_line(fits), len(recipe.fit))
+
+
+def _generating(config: GeneratorConfig) -> tuple[float, float]:
+    """Seconds of a training query, and of starting the generator with its test split, by a forecast."""
+    from mbtf_gen.forecast import forecast
+    from mbtf_gen.generation import Job, allocated
+    from mbtf_gen.material.material import load_material
+    from mbtf_gen.planning.effects_plan import plan_effects
+
+    job = Job.of(config, load_material(Path(config.material), config.geometry.make_tileable))
+    expected = forecast(job, allocated(job, plan_effects(job, pilots=False)))
+    query = max(expected.query_seconds, _CHEAPEST)
+    return query, expected.start + max(0.0, expected.seconds - job.queries("train") * query)
+
+
+def _pilots(
+    recipe: Recipe, length: float, query: float, most: int, progress: Callable[[str], None]
+) -> tuple[list[tuple[float, float]], list[tuple[float, float]]]:
+    """(share, error) of each pilot, and (queries, seconds of its fit besides training)."""
+    name, fit = next(iter(recipe.fit.items()))
+    errors, fits = [], []
+    with tempfile.TemporaryDirectory(prefix="mbtf-time-split-") as work:
+        runner = RunRunner(recipe.generate, Path(work), "", lambda note: None, _TEST)
+        for share in SHARES:
+            queries = round_down(min(max(_FEWEST_QUERIES, share * length / query), most))
+            trained = _with_time(fit, (1 - share) * length)
+            # Device and memory are no part of `fields`, as they do not change the result.
+            options = {**trained.fields(), **trained.model_dump(mode="json", include={"device", "data"})}
+            data = DataRequest(queries, recipe.generate.queries.spp)
+            found = runner.measure(Run("whole", name, f"{share:.0%}", data, options))
+            runner.forget(data)
+            d = found.details
+            errors.append((share, found.error.value))
+            fits.append(
+                (float(queries), d["total_seconds"] - d["generation_seconds"] - d["training_seconds"])
+            )
+            progress(f"pilot: {share:.0%} of {length:.0f} s generating, error {found.error.value:.3f}")
+    return errors, fits
+
+
+def _line(points: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    """(height at 0, slope) of the least-squares line through points, neither negative."""
+    xs, ys = np.array(points).T
+    spread = float(((xs - xs.mean()) ** 2).sum())
+    slope = float(((xs - xs.mean()) * ys).sum()) / spread if spread > 0 else 0.0
+    slope = min(max(0.0, slope), max(0.0, float(ys.mean())) / float(xs.mean()))
+    return max(0.0, float(ys.mean()) - slope * float(xs.mean())), slope
+
+
+def most_queries(recipe: Recipe, folder: Path) -> int:
+    """Training queries that disk and memory hold: a quarter of the free space of `folder`, and the larger of
+    ``data.memory`` of the fits and half of the machine's memory."""
+    from mbtf_fit.data.queries import QUERY_BYTES
     from mbtf_gen.forecast import row_bytes
 
-    on_disk = _DISK * shutil.disk_usage(folder).free / row_bytes(holes=True)
+    size = row_bytes(holes=True)
+    on_disk = _DISK * shutil.disk_usage(folder).free / size
     loaded = min(fit.data.memory for fit in recipe.fit.values()) / QUERY_BYTES
-    # What is read from disk goes through the file system's memory.
-    mapped = _MEMORY * physical_memory() / row_bytes(holes=True)
+    # What is read from disk passes through the file system's memory.
+    mapped = _MEMORY * physical_memory() / size
     return max(_FEWEST_QUERIES, int(min(on_disk, max(loaded, mapped))))
 
 
 def physical_memory() -> float:
-    """Bytes of the machine's memory; infinite where it does not say."""
+    """Bytes of the machine's memory; infinite where it is unknown."""
     try:
         return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     except (AttributeError, ValueError, OSError):
         return math.inf
-
-
-def _plan(recipe: Recipe, budget: float, folder: Path, tell: Callable[[str], None]) -> Split:
-    from mbtf_gen.forecast import forecast
-    from mbtf_gen.generation import Job, allocated
-    from mbtf_gen.planning.effects_plan import plan_effects
-
-    began = time.perf_counter()
-    job = Job.of(recipe.generate, _material(recipe.generate))
-    expected = forecast(job, allocated(job, plan_effects(job, pilots=False)))
-    price, test = _prices(expected, job.queries("train"))
-    pilots: list[tuple[float, float]] = []
-    beside = 0.0, 0.0
-    length = PILOT * budget
-    if length >= SHORTEST_PILOT:
-        try:
-            pilots, beside = _pilots(recipe, length, price, tell)
-        except InputError as error:
-            tell(
-                f"pilot failed: {error.what}; {USUAL_SHARE:.0%} of the time generates, as with short budgets"
-            )
-    # Data without variance, such as those of an even plane, leave nothing to be unexplained.
-    pilots = pilots if all(math.isfinite(error) for _, error in pilots) else []
-    share = best_share(pilots) if pilots else USUAL_SHARE
-    looked = time.perf_counter() - began
-    prices = Prices(price, test + expected.start, *beside, len(recipe.fit))
-    left = max(budget - looked, _LEAST_LEFT * budget + prices.start + prices.fits * prices.fit)
-    queries, generating, training = prices.spend(left, share, most_queries(recipe, folder))
-    return Split(
-        _two_digits(max(_FEWEST_QUERIES, queries)),
-        round(generating + prices.start, 1),
-        round(training, 1),
-        round(share, 3),
-        tuple(pilots),
-        round(looked, 1),
-        prices,
-    )
-
-
-def _material(config: GeneratorConfig) -> Any:
-    from mbtf_gen.material.material import load_material
-
-    return load_material(Path(config.material), config.geometry.tile)
-
-
-def _prices(expected: Forecast, queries: int) -> tuple[float, float]:
-    """(seconds of a training query, seconds of the test split)."""
-    # What has a closed form takes no time that could be told from none.
-    price = max(expected.query_seconds, _CHEAPEST)
-    return price, max(0.0, expected.seconds - queries * price)
-
-
-def _two_digits(count: float) -> int:
-    digits = 10 ** max(0, len(str(int(count))) - 2)
-    return max(digits, int(count / digits) * digits)
-
-
-def _pilots(
-    recipe: Recipe, length: float, price: float, tell: Callable[[str], None]
-) -> tuple[list[tuple[float, float]], tuple[float, float]]:
-    """(share, error) of each, and what a fit takes besides training: seconds, and seconds per query."""
-    name, fit = next(iter(recipe.fit.items()))
-    with tempfile.TemporaryDirectory(prefix="mbtf-budget-") as work:
-        data = recipe.generate.model_dump(mode="json")
-        data["queries"] |= {"test": _TEST, "test_spp": _TEST_SPP}
-        workshop = RunRunner(GeneratorConfig.model_validate(data), Path(work), "", lambda note: None)
-        out, beside = [], []
-        most = most_queries(recipe, Path(work))
-        for share in SHARES:
-            queries = _two_digits(min(max(_FEWEST_QUERIES, share * length / price), most))
-            trained = _with_time(fit, (1 - share) * length)
-            # Where it trains is no option of the result, but of the time that it takes.
-            where = trained.model_dump(mode="json", include={"device", "data"})
-            options = {**trained.fields(), **where}
-            wanted = RunRequest(queries, recipe.generate.queries.spp)
-            chain = Chain("chain", name, f"{share:.0%}", wanted, options)
-            point = workshop.measure(chain)
-            out.append((share, point.error.value))
-            spent = point.details["generation_seconds"] + point.details["training_seconds"]
-            beside.append((float(queries), point.details["total_seconds"] - spent))
-            tell(f"pilot: {share:.0%} of {length:.0f} s generating leaves {out[-1][1]:.3f}")
-        return out, _line(beside)
-
-
-def _line(points: Sequence[tuple[float, float]]) -> tuple[float, float]:
-    """(height at 0, slope) of a line through points by least squares, neither below 0."""
-    xs, ys = zip(*points, strict=True)
-    mean_x, mean_y = sum(xs) / len(xs), sum(ys) / len(ys)
-    line = weighted_line(xs, ys, [1.0] * len(xs))
-    slope = min(max(0.0, line.value if line is not None else 0.0), max(0.0, mean_y) / mean_x)
-    return max(0.0, mean_y - slope * mean_x), slope
 
 
 def _with_time(fit: FitConfig, seconds: float) -> FitConfig:
@@ -322,7 +275,7 @@ def _with_time(fit: FitConfig, seconds: float) -> FitConfig:
     )
 
 
-def within_budget(recipe: Recipe, split: Split) -> Recipe:
+def with_split(recipe: Recipe, split: Split) -> Recipe:
     """The recipe with the queries and training times of a split."""
     queries = recipe.generate.queries.model_copy(update={"train": str(split.queries)})
     each = max(1.0, round(split.training / len(recipe.fit), 1))

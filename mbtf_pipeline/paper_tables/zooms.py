@@ -16,11 +16,11 @@ _KINDS = {"query": "M at each pixel’s footprint", "pixel": "filtered pixels"}
 
 
 def zooms(runs: Sequence[Run]) -> list[Table]:
-    """Errors at every span, against every kind of reference, means over views and lights."""
+    """Errors at every width, against every kind of reference, means over views and lights."""
     kinds = list(dict.fromkeys(kind for run in runs for kind in run.comparison["kinds"]))
     columns = [
         Column("material", "material"),
-        Column("tiles across", "span", digits="g"),
+        Column("tiles across", "tiles_across", digits="g"),
         Column("level", "level"),
         Column("method", "method"),
     ]
@@ -32,11 +32,11 @@ def zooms(runs: Sequence[Run]) -> list[Table]:
     columns += visible_columns()
     rows: list[list[Cell]] = []
     for run in runs:
-        for span in _spans(run):
-            chosen = [p for p in run.pictures if p["span"] == span]
+        for tiles_across in _widths(run):
+            chosen = [p for p in run.pictures if p["tiles_across"] == tiles_across]
             level = levels(chosen[0]["levels"], run.comparison["finest"])
             for fit in run.fits:
-                row: list[Cell] = [name_of(run.material), float(span), level, fit]
+                row: list[Cell] = [name_of(run.material), float(tiles_across), level, fit]
                 for kind in kinds:
                     row += _against(run, chosen, fit, kind)
                 rows.append([*row, *(mean_seen(run, fit, m, chosen) for m in MEASURES)])
@@ -48,8 +48,8 @@ def zooms(runs: Sequence[Run]) -> list[Table]:
     return [Table("zooms", "Materials at several zooms", text, columns, rows, figures=_figures(runs))]
 
 
-def _spans(run: Run) -> list[float]:
-    return list(dict.fromkeys(p["span"] for p in run.pictures))
+def _widths(run: Run) -> list[float]:
+    return list(dict.fromkeys(p["tiles_across"] for p in run.pictures))
 
 
 def _against(run: Run, chosen: Sequence[dict[str, Any]], fit: str, kind: str) -> list[Cell]:
@@ -62,8 +62,11 @@ def _against(run: Run, chosen: Sequence[dict[str, Any]], fit: str, kind: str) ->
 def _figures(runs: Sequence[Run]) -> list[tuple[str, list[Figure]]]:
     out: list[tuple[str, list[Figure]]] = []
     for run in runs:
-        shown = [next(p for p in run.pictures if p["span"] == span) for span in _spans(run)]
-        lines = [f"{p['span']:g} tiles across" for p in shown]
+        shown = [
+            next(p for p in run.pictures if p["tiles_across"] == tiles_across)
+            for tiles_across in _widths(run)
+        ]
+        lines = [f"{p['tiles_across']:g} tiles across" for p in shown]
         for kind in run.comparison["kinds"]:
             files = [p["references"][kind]["file"] for p in shown]
             out.append((f"{name_of(run.material)}: reference, {_KINDS[kind]}", _row(run, files, lines)))

@@ -163,7 +163,7 @@ def _pictures_table(comparison: Mapping[str, Any]) -> dict[str, Any]:
     for picture in comparison["pictures"]:
         for fit in comparison["fits"]:
             row = [short_direction(picture[d]) for d in ("view", "light")]
-            row += [f"{picture['span']:g}", fit]
+            row += [f"{picture['tiles_across']:g}", fit]
             made = picture["fits"][fit]
             for kind in kinds:
                 errors = made["errors"][kind]

@@ -69,7 +69,7 @@ class Shown:
 
     Attributes
     ----------
-    groups : per view and light: title, diagram, blocks of figures, one block per span
+    groups : per view and light: title, diagram, blocks of figures, one block per width
     scenes : what the viewer can show, plain data
     bars : of the maps: local error, HDR-FLIP, signed difference
     difference : end of the signed scale, as a share of white
@@ -185,7 +185,7 @@ class _Sheet:
     def block(self, number: int, picture: Mapping[str, Any]) -> dict[str, Any]:
         """Figures of one scene: rows of four, references in the first column."""
         angles = f"view {direction(picture['view'])}, light {direction(picture['light'])}"
-        where = f"{angles}, {width(picture['span'])}"
+        where = f"{angles}, {width(picture['tiles_across'])}"
         cells: list[list[dict[str, Any] | None]] = []
         references = [self._reference(picture, kind, where) for kind in self._kinds]
         for index in range(max(len(references), len(self._comparison["fits"]))):
@@ -194,7 +194,7 @@ class _Sheet:
                 row += self._fit(picture, self._comparison["fits"][index], where)
             cells.append(row)
         level = levels(picture["levels"], self._comparison["finest"])
-        return {"title": f"{width(picture['span'])}, {level}", "rows": cells, "scene": number}
+        return {"title": f"{width(picture['tiles_across'])}, {level}", "rows": cells, "scene": number}
 
     def _reference(self, picture: Mapping[str, Any], kind: str, where: str) -> dict[str, Any]:
         reference = picture["references"][kind]
@@ -245,8 +245,8 @@ class _Sheet:
         level = levels(picture["levels"], self._comparison["finest"])
         return {
             "where": f"View {direction(picture['view'])}; light {direction(picture['light'])}; "
-            f"{width(picture['span'])}, {level}",
-            "span": width(picture["span"]),
+            f"{width(picture['tiles_across'])}, {level}",
+            "tiles_across": width(picture["tiles_across"]),
             "references": [
                 {
                     "label": _KIND[kind],

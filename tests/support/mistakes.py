@@ -34,7 +34,7 @@ LINES: dict[str, list[str]] = {
         "mbtf-gen heights.npy --queries 1.5",
         "mbtf-gen heights.npy --queries 1e12/texel",
         "mbtf-gen heights.npy --spp 5",
-        "mbtf-gen heights.npy --levels 99",
+        "mbtf-gen heights.npy --resolution 99",
         "mbtf-gen heights.npy --light-width 60",
         "mbtf-gen heights.npy --light-width 0.001",
         "mbtf-gen heights.npy --min-cos 0",
@@ -43,18 +43,18 @@ LINES: dict[str, list[str]] = {
         "mbtf-gen heights.npy --set seed=-1",
         "mbtf-gen heights.npy --set seed=2001-01-01",
         "mbtf-gen heights.npy --set queries.mixture.finest=0 --set queries.mixture.log_uniform=0",
-        "mbtf-gen heights.npy --shards 4/3",
+        "mbtf-gen heights.npy --slice 4/3",
         "mbtf-gen heights.npy -o notes.txt",
         "mbtf-gen heights.npy -o notes.txt/below",
         "mbtf-gen heights.npy -o textures",
         "mbtf-gen steep.npy -o textures",
-        "mbtf-gen steep.npy --height 0.1 -o textures",
+        "mbtf-gen steep.npy --height-scale 0.1 -o textures",
         "mbtf-gen heights.npy -o set --queries 10",
         "mbtf-gen reference heights.npy --view 5,0",
         "mbtf-gen reference heights.npy --view 60",
         "mbtf-gen reference heights.npy --view -10,0",
-        "mbtf-gen reference heights.npy --spans 1,zwei",
-        "mbtf-gen reference heights.npy --spans 1,1.0",
+        "mbtf-gen reference heights.npy --tiles-across 1,zwei",
+        "mbtf-gen reference heights.npy --tiles-across 1,1.0",
         "mbtf-gen reference heights.npy --size 0",
         "mbtf-gen reference heights.npy -o textures",
         "mbtf-gen reference heights.npy -o pictures",
@@ -239,7 +239,7 @@ def _shards(folder: Path) -> None:
         assert old in text, name
         path.write_text(text.replace(old, new))
 
-    change("schema", '"schema": 1', '"schema": 99')
+    change("schema", '"schema": 2', '"schema": 99')
     change("foreign", "mbtf-shards", "other-shards")
     change("nojson", "{", "[")
     change("altered", '"rows": 20', '"rows": "twenty"')

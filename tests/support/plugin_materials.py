@@ -12,7 +12,7 @@ from mbtf_core.lattice import Lattice
 from mbtf_fit.config import FitConfig
 from mbtf_fit.material.material import Material, export
 from mbtf_fit.material.transmittance import Transmittance
-from mbtf_fit.models import build_model
+from mbtf_fit.models.registry import build_model
 
 _TRAINING = {"steps": 0, "batch": 1, "seconds": 0.0, "device": "cpu", "threads": 1, "errors": {}}
 
@@ -29,7 +29,7 @@ def write_material(
     contrast: float = 0.5,
     brightness: float = 0.3,
     seed: int = 0,
-    holes: Transmittance | None = None,
+    transmittance: Transmittance | None = None,
 ) -> Material:
     """Write a material of random weights that all matter, and return it as read back.
 
@@ -39,7 +39,7 @@ def write_material(
     weights : tensors by name that replace those of the model
     contrast : standard deviation of the features
     brightness : mean of all biases
-    holes : what the material lets through
+    transmittance : None for an opaque material
     """
     config = FitConfig.model_validate({"model": model, "network": network or {}})
     torch.manual_seed(seed)
@@ -59,7 +59,9 @@ def write_material(
     tensors |= weights or {}
     built.load_weights(tensors)
     folder.mkdir(parents=True, exist_ok=True)
-    return export(built, config, folder, data={"hash": "0" * 64}, training=_TRAINING, holes=holes)
+    return export(
+        built, config, folder, data={"hash": "0" * 64}, training=_TRAINING, transmittance=transmittance
+    )
 
 
 def deviation(found: np.ndarray, wanted: np.ndarray) -> float:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from mbtf_gen.render.bsdf.surface import Surface, SurfaceParts, SurfacePoint
 from support.scenes import mi
 
-ALL = SurfaceParts(diffuse=True, specular=True, metallic=True, coat=True, sheen=True)
+ALL = SurfaceParts(diffuse=True, specular=True, metallic=True, clearcoat=True, sheen=True)
 
 
 class LaneTexture:
@@ -56,9 +56,9 @@ def point(parts: SurfaceParts, wi: NDArray[np.float64], **maps: ArrayLike) -> Su
         "base_color": 1.0,
         "specular": 0.5,
         "metallic": 0.0,
-        "coat": 1.0,
+        "clearcoat": 1.0,
         "roughness": 0.3,
-        "coat_roughness": 0.3,
+        "clearcoat_roughness": 0.3,
         "sheen": 1.0,
         "sheen_color": 1.0,
         "sheen_roughness": 0.3,

@@ -35,7 +35,7 @@ def test_every_mistake_is_refused_in_two_lines(
     [
         ["heights.npy", "--mesh", "\x1b[31m"],
         ["heights.npy", "--mesh", "9" * 5000],
-        ["heights.npy", "--tile", "\0"],
+        ["heights.npy", "--make-tileable", "\0"],
         ["heights.npy", "--set", "\x1b[2J=1"],
         ["heights.npy", "two\x1b[31mwords"],
         ["\x1b]0;title\x07.npy"],

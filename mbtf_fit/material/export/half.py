@@ -12,7 +12,7 @@ from torch import Tensor
 from mbtf_core.errors import InputError
 from mbtf_fit.material.material import Material, conformance_values
 from mbtf_fit.material.transmittance import Transmittance
-from mbtf_fit.models import build_model
+from mbtf_fit.models.registry import build_model
 
 
 @dataclass(frozen=True)
@@ -81,16 +81,19 @@ def to_half(material: Material) -> tuple[Material, HalfError]:
     rms, power = float(np.sqrt((difference**2).mean())), float(np.sqrt((before**2).mean()))
     error = HalfError(len(before), float(np.abs(difference).max()), rms, rms / power if power else None)
     return replace(
-        material, model=model, conformance={**queries, "rgb": after}, holes=_holes_to_half(material.holes)
+        material,
+        model=model,
+        conformance={**queries, "rgb": after},
+        transmittance=_transmittance_to_half(material.transmittance),
     ), error
 
 
-def _holes_to_half(holes: Transmittance | None) -> Transmittance | None:
+def _transmittance_to_half(transmittance: Transmittance | None) -> Transmittance | None:
     """The same with coefficients rounded to 16 bits."""
-    if holes is None:
+    if transmittance is None:
         return None
-    levels = enumerate(holes.levels)
+    levels = enumerate(transmittance.levels)
     return Transmittance(
-        holes.lattice,
+        transmittance.lattice,
         [round_to_half(f"transmittance.{s}", torch.from_numpy(a)).float().numpy() for s, a in levels],
     )

@@ -18,7 +18,7 @@ from mbtf_fit.material.transmittance import FORMULA
 
 LAYERS_NAME = "layers.json"
 FORMAT_NAME = "mbtf-layers"
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 
 
 def _numbers(array: Any, half: bool) -> Any:
@@ -60,10 +60,10 @@ def layers(material: Material, *, half: bool = False) -> dict[str, list[dict[str
 
 def _expected_transmittance(material: Material) -> dict[str, Any]:
     """What passes through holes at the conformance queries, where there are some."""
-    if material.holes is None:
+    if material.transmittance is None:
         return {}
     queries = (material.conformance[name] for name in ("u", "sigma", "omega_o"))
-    return {"transmittance": _numbers(material.holes.evaluate(*queries), False)}
+    return {"transmittance": _numbers(material.transmittance.evaluate(*queries), False)}
 
 
 def write_layers(material: Material, path: Path, *, half: bool = False) -> None:
@@ -83,7 +83,7 @@ def write_layers(material: Material, path: Path, *, half: bool = False) -> None:
         for name, t in texture_parts(material).items()
     }
     lattice = material.lattice
-    gain = material.model.weights().get("gain")
+    calibration = material.model.weights().get("calibration")
     document = {
         "format": FORMAT_NAME,
         "schema": SCHEMA_VERSION,
@@ -99,8 +99,8 @@ def write_layers(material: Material, path: Path, *, half: bool = False) -> None:
         "unit": _numbers(material.model.unit.cpu(), False),
         "textures": {"file": TEXTURES_NAME, "parts": parts},
         "networks": layers(material, half=half),
-        **({} if gain is None else {"gain": _numbers(gain.cpu(), half)}),
-        **({} if material.holes is None else {"transmittance": FORMULA}),
+        **({} if calibration is None else {"calibration": _numbers(calibration.cpu(), half)}),
+        **({} if material.transmittance is None else {"transmittance": FORMULA}),
         "conformance": {
             **{name: _numbers(array, False) for name, array in material.conformance.items()},
             **_expected_transmittance(material),

@@ -1,6 +1,6 @@
 """Latent textures as one EXR file: a part per level, a channel per feature.
 
-A material with holes has those of its transmittance besides, a channel per coefficient.
+The coefficients of the transmittance follow, a part per level and a channel per coefficient.
 """
 
 from __future__ import annotations
@@ -14,25 +14,25 @@ from mbtf_core.atomic import write_through
 from mbtf_fit.material.material import Material
 
 TEXTURES_NAME = "textures.exr"
-# What parts of the transmittance are called: this and a level.
-HOLES_PART = "transmittance."
+# Name of the parts of the transmittance, before the level.
+TRANSMITTANCE_PART = "transmittance."
 
 
 def channel_names(part: str, count: int) -> list[str]:
     """``f0``, ``f1``, …, with as many digits as the last one has, so that their order is that of the
     features; ``c0``, … of the transmittance's coefficients."""
     digits = len(str(count - 1))
-    letter = "c" if part.startswith(HOLES_PART) else "f"
+    letter = "c" if part.startswith(TRANSMITTANCE_PART) else "f"
     return [f"{letter}{k:0{digits}d}" for k in range(count)]
 
 
 def texture_parts(material: Material) -> dict[str, Any]:
     """Part → texture (rows, columns, channels), coarsest level first: ``pyramid.0``, …,
     ``offset_texture.0``, ``transmittance.0``, …"""
-    weights, holes = material.model.weights(), material.holes
+    weights, transmittance = material.model.weights(), material.transmittance
     parts = {name: tensor.cpu().numpy() for name, tensor in weights.items() if tensor.ndim == 3}
-    levels = [] if holes is None else holes.levels
-    return parts | {f"{HOLES_PART}{s}": texels for s, texels in enumerate(levels)}
+    levels = [] if transmittance is None else transmittance.levels
+    return parts | {f"{TRANSMITTANCE_PART}{s}": texels for s, texels in enumerate(levels)}
 
 
 def write_textures(material: Material, path: Path, *, half: bool = False) -> None:

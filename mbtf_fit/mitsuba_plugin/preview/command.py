@@ -1,92 +1,19 @@
-"""The command ``mbtf-fit preview``."""
+"""The files of ``mbtf-fit preview``."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING
 
-from cyclopts import Parameter
+from mbtf_core.console import Console
 
-from mbtf_core.console import CONSOLE, Console
-from mbtf_core.errors import UsageError
+if TYPE_CHECKING:
+    from mbtf_fit.mitsuba_plugin.preview.config import PreviewConfig
 
 SHEET_NAME, TURNTABLE_NAME = "sheet.png", "turntable.gif"
 
 
-def preview(
-    material: Path | None = None,
-    /,
-    *,
-    output: Annotated[Path, Parameter(name=["--output", "-o"])] = Path("preview"),
-    spans: str | None = None,
-    size: int | None = None,
-    turn_size: int | None = None,
-    frames: int | None = None,
-    spp: int | None = None,
-    tiles: int | None = None,
-    config: Path | None = None,
-    assignments: Annotated[
-        list[str] | None,
-        Parameter(name="--set", help="Set any option of the configuration, a.b=c. Repeatable."),
-    ] = None,
-    overwrite: Annotated[bool, Parameter(negative="")] = False,
-    console: Console = CONSOLE,
-) -> None:
-    """Draw a material: a contact sheet of views, lights and zooms, and a turntable.
-
-    Needs neither a scene nor PyTorch. Writes sheet.png and turntable.gif.
-
-    Parameters
-    ----------
-    material
-        Folder made by mbtf-fit.
-    output
-        Folder of pictures.
-    spans
-        Widths of the sheet's pictures in tiles. Default: 1,4,16
-    size
-        Pixels along each side of a picture of the sheet. Default: 160
-    turn_size
-        Pixels along each side of the turntable. Default: 240
-    frames
-        Pictures of one turn. Default: 24
-    spp
-        Paths per pixel of the turntable. Default: 16
-    tiles
-        Tiles around the turntable's ball. Default: 8
-    config
-        YAML file with the options.
-    overwrite
-        Draw again, and replace pictures of another configuration.
-    """
-    from mbtf_core.config_file import resolve
-    from mbtf_fit.mitsuba_plugin.preview.config import PreviewConfig
-    from mbtf_gen.cli.common import numbers
-
-    if material is None and config is None:
-        raise UsageError("no material given", hint="mbtf-fit preview material/ -o preview/")
-    flags = {
-        "--spans": ("sheet.spans", numbers(spans, "--spans")),
-        "--size": ("sheet.size", size),
-        "--turn-size": ("turntable.size", turn_size),
-        "--frames": ("turntable.frames", frames),
-        "--spp": ("turntable.spp", spp),
-        "--tiles": ("turntable.tiles", tiles),
-    }
-    resolved = resolve(
-        PreviewConfig,
-        file=config,
-        assignments=assignments or [],
-        flags={"material": None if material is None else str(material), **dict(flags.values())},
-        spelled={key: flag for flag, (key, _) in flags.items()},
-    )
-    if material is None and config is not None:
-        # A path in a file is relative to that file, so that the file works from anywhere.
-        resolved = resolved.model_copy(update={"material": str(config.parent / resolved.material)})
-    draw(resolved, output, overwrite=overwrite, console=console)
-
-
-def draw(config: Any, path: Path, *, overwrite: bool, console: Console) -> None:
+def draw(config: PreviewConfig, path: Path, *, overwrite: bool, console: Console) -> None:
     """Draw the pictures that are missing and report them.
 
     Raises
@@ -112,7 +39,7 @@ def draw(config: Any, path: Path, *, overwrite: bool, console: Console) -> None:
     columns = len(sheet.views) * len(sheet.lights)
     shows = {
         SHEET_NAME: f"{len(sheet.views)} views x {len(sheet.lights)} lights (columns) x "
-        f"{len(sheet.spans)} zooms (rows), {columns * len(sheet.spans)} pictures at one exposure",
+        f"{len(sheet.tiles_across)} zooms (rows), {columns * len(sheet.tiles_across)} pictures, one exposure",
         TURNTABLE_NAME: f"a ball of {turn.tiles} tiles around on a plate, {turn.frames} pictures of "
         f"{turn.spp} paths per pixel",
     }

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated, Self
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from mbtf_core.config_file import Settings
+from mbtf_core.options import Flag
+from mbtf_core.units import parse_numbers
 from mbtf_gen.config.pictures import Direction
 
 # The whole sheet and the whole turntable are held in memory; this keeps both below a gigabyte.
@@ -30,21 +32,30 @@ class SheetSection(Settings):
         ],
         description="where the light comes from",
     )
-    spans: Annotated[list[Width], Field(min_length=1, max_length=8)] = Field(
-        [1.0, 4.0, 16.0], description="widths of the field of view, in tile widths"
+    tiles_across: Annotated[list[Width], BeforeValidator(parse_numbers), Flag("--tiles-across", "1,2,4")] = (
+        Field(
+            [1.0, 4.0, 16.0],
+            min_length=1,
+            max_length=8,
+            description="widths of the field of view at the target, in tile widths",
+        )
     )
-    size: Annotated[int, Field(ge=64, le=2048)] = Field(
-        160, description="pixels along each side of a picture"
+    size: Annotated[int, Flag("--size")] = Field(
+        160, ge=64, le=2048, description="pixels along each side of a picture"
     )
 
 
 class TurntableSection(Settings):
     """A ball on a plate that turns once."""
 
-    size: Annotated[int, Field(ge=16, le=2048)] = Field(240, description="pixels along each side")
-    frames: Annotated[int, Field(ge=1, le=360)] = Field(24, description="pictures of one turn")
-    spp: Annotated[int, Field(ge=1, le=65536)] = Field(16, description="paths per pixel")
-    tiles: Annotated[int, Field(ge=1, le=1000)] = Field(8, description="tiles around the ball's equator")
+    size: Annotated[int, Flag("--turn-size")] = Field(
+        240, ge=16, le=2048, description="pixels along each side of the turntable"
+    )
+    frames: Annotated[int, Flag("--frames")] = Field(24, ge=1, le=360, description="pictures of one turn")
+    spp: Annotated[int, Flag("--spp")] = Field(16, ge=1, le=65536, description="paths per pixel")
+    tiles: Annotated[int, Flag("--tiles-around")] = Field(
+        8, ge=1, le=1000, description="tiles around the ball's equator"
+    )
 
 
 class PreviewConfig(Settings):
@@ -57,7 +68,7 @@ class PreviewConfig(Settings):
     @model_validator(mode="after")
     def _fits(self) -> Self:
         sheet, turn = self.sheet, self.turntable
-        panels = len(sheet.views) * len(sheet.lights) * len(sheet.spans)
+        panels = len(sheet.views) * len(sheet.lights) * len(sheet.tiles_across)
         if max(panels * sheet.size**2, turn.frames * turn.size**2) > MOST_PIXELS:
             raise ValueError(f"asks for more than {MOST_PIXELS:,} pixels; take smaller or fewer pictures")
         return self

@@ -27,7 +27,7 @@ INK, PAPER = (30, 30, 30), (255, 255, 255)
 
 
 def panels(evaluator: Evaluator, section: SheetSection) -> F32:
-    """Values (views, lights, spans, size, size, 3) in 1/sr.
+    """Values (views, lights, widths, size, size, 3) in 1/sr.
 
     Raises
     ------
@@ -38,28 +38,28 @@ def panels(evaluator: Evaluator, section: SheetSection) -> F32:
     pictures = []
     for view in section.views:
         for light in lights:
-            for span in section.spans:
+            for tiles_across in section.tiles_across:
                 camera = Camera(
                     view.elevation,
                     view.azimuth,
-                    span=span,
+                    tiles_across=tiles_across,
                     target=(0.5, 0.5 * aspect),
                     rows=section.size,
                     columns=section.size,
                 )
                 q = camera.queries(light, aspect).flat()
                 pictures.append(evaluator.evaluate(q.u, q.sigma, q.omega_i, q.omega_o))
-    lead = (len(section.views), len(lights), len(section.spans))
+    lead = (len(section.views), len(lights), len(section.tiles_across))
     return np.stack(pictures).reshape(*lead, section.size, section.size, 3)
 
 
 def contact_sheet(values: F32, section: SheetSection) -> NDArray[np.uint8]:
     """The sheet (rows, columns, 3): a column per view and light, a row per width, one exposure for all."""
-    views, lights, spans, size = values.shape[:4]
+    views, lights, widths, size = values.shape[:4]
     exposure = HEADROOM * auto_exposure(values)
     pitch = size + GAP
     width = 2 * MARGIN + views * lights * pitch - GAP + (views - 1) * GAP
-    height = MARGIN + spans * pitch - GAP + CAPTION + MARGIN
+    height = MARGIN + widths * pitch - GAP + CAPTION + MARGIN
     sheet = Image.new("RGB", (width, height), PAPER)
     draw = ImageDraw.Draw(sheet)
     font = ImageFont.load_default(max(9, min(13, size // 12)))
@@ -69,12 +69,12 @@ def contact_sheet(values: F32, section: SheetSection) -> NDArray[np.uint8]:
             left = MARGIN + (view * lights + light) * pitch + view * GAP
             text = f"{_said('view', section.views[view])}\n{_said('light', section.lights[light])}"
             draw.multiline_text((left + 1, MARGIN), text, INK, font, spacing=2)
-            for row in range(spans):
+            for row in range(widths):
                 picture = Image.fromarray(to_display(values[view, light, row], exposure))
                 top = MARGIN + CAPTION + row * pitch
                 sheet.paste(picture, (left, top))
                 if view == light == 0:
-                    _label(draw, (left, top + size), _tiles(section.spans[row]), font)
+                    _label(draw, (left, top + size), _tiles(section.tiles_across[row]), font)
     return np.asarray(sheet)
 
 
@@ -82,8 +82,8 @@ def _said(name: str, direction: Direction) -> str:
     return f"{name} {direction.elevation:g}°, {direction.azimuth:g}°"
 
 
-def _tiles(span: float) -> str:
-    return f"{span:g} tile{'' if span == 1 else 's'} wide"
+def _tiles(tiles_across: float) -> str:
+    return f"{tiles_across:g} tile{'' if tiles_across == 1 else 's'} wide"
 
 
 def _label(draw: ImageDraw.ImageDraw, corner: tuple[int, int], text: str, font: Any) -> None:

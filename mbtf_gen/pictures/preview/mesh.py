@@ -106,7 +106,9 @@ def show(block: Block, camera: Camera, omega_i: NDArray[np.float64]) -> None:
     fault = _run("show_in_child", block, camera, omega_i, None, timeout=_DAY)
     if fault:
         raise EngineError(
-            f"the window could not be shown ({fault})", where="--window", hint="mbtf-gen doctor says more"
+            f"the window could not be shown ({fault})",
+            where="--interactive",
+            hint="mbtf-gen doctor says more",
         )
 
 
@@ -116,7 +118,9 @@ def check_display() -> None:
         os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     ):
         raise EngineError(
-            "there is no display", where="--window", hint="leave it out: the pictures are written as files"
+            "there is no display",
+            where="--interactive",
+            hint="leave it out: the pictures are written as files",
         )
 
 

@@ -29,11 +29,11 @@ def block_camera(
     x, y, z = zip(*product((0.0, tiles), (0.0, tiles * aspect), (0.0, -relief)), strict=True)
     corners = np.column_stack([x, y, z])
 
-    def camera(span: float) -> Camera:
-        return Camera(elevation, azimuth, span, target, rows, columns)
+    def camera(tiles_across: float) -> Camera:
+        return Camera(elevation, azimuth, tiles_across, target, rows, columns)
 
-    def holds(span: float) -> bool:
-        trial = camera(span)
+    def holds(tiles_across: float) -> bool:
+        trial = camera(tiles_across)
         forward, right, up = trial.frame()
         offset = corners - trial.position
         depth = offset @ forward

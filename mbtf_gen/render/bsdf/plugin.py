@@ -26,8 +26,8 @@ NAMES = (
     "roughness",
     "metallic",
     "specular",
-    "coat",
-    "coat_roughness",
+    "clearcoat",
+    "clearcoat_roughness",
     "sheen",
     "sheen_color",
     "sheen_roughness",
@@ -40,7 +40,7 @@ class SurfaceBSDF(mi.BSDF):
     """``mbtf_surface``: the project's surface as a BSDF of Mitsuba.
 
     Plugin parameters: the names of :data:`NAMES`, each a texture or a number. The terms simulated are those
-    whose parameters are given: ``specular`` (with ``roughness``), ``metallic``, ``coat``, ``sheen``,
+    whose parameters are given: ``specular`` (with ``roughness``), ``metallic``, ``clearcoat``, ``sheen``,
     ``slopes``. Opacity needs the generator's own loop and is not a part of the plugin.
     """
 
@@ -50,7 +50,7 @@ class SurfaceBSDF(mi.BSDF):
         numbers = {
             "base_color": 0.5,
             "roughness": 0.5,
-            "coat_roughness": 0.1,
+            "clearcoat_roughness": 0.1,
             "sheen_color": 1.0,
             "sheen_roughness": 0.3,
         }
@@ -61,14 +61,14 @@ class SurfaceBSDF(mi.BSDF):
             diffuse=bool(props.get("diffuse", True)),
             specular="specular" in textures,
             metallic="metallic" in textures,
-            coat="coat" in textures,
+            clearcoat="clearcoat" in textures,
             sheen="sheen" in textures,
             slopes="slopes" in textures,
             opacity="opacity" in textures,
         )
         self.surface = Surface(parts, textures)
         flags = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide
-        if parts.specular or parts.metallic or parts.coat:
+        if parts.specular or parts.metallic or parts.clearcoat:
             flags |= mi.BSDFFlags.GlossyReflection
         self.m_components = [flags]
         self.m_flags = flags
@@ -194,9 +194,9 @@ def bsdf_of(
         out["specular"] = _scalar(material.specular)
     if metallic:
         out["metallic"] = _scalar(material.metallic)
-    if material.coat is not None and on("coat"):
-        out["coat"] = _scalar(material.coat)
-        out["coat_roughness"] = _scalar(material.coat_roughness)
+    if material.clearcoat is not None and on("coat"):
+        out["clearcoat"] = _scalar(material.clearcoat)
+        out["clearcoat_roughness"] = _scalar(material.clearcoat_roughness)
     if material.sheen is not None and on("sheen"):
         out["sheen"] = _scalar(material.sheen)
         out["sheen_color"] = _color(1.0 if material.sheen_color is None else material.sheen_color)

@@ -42,7 +42,7 @@ from mbtf_gen.render.bsdf.microfacet import (
 )
 from mbtf_gen.render.bsdf.sheen import SheenTables, sheen_value
 
-COAT_REFLECTANCE = 0.04
+CLEARCOAT_REFLECTANCE = 0.04
 # A shading normal that would face away from the viewer is bent until its cosine is this.
 SMALLEST_COSINE = 0.01
 # Least and greatest chance, without a coat, with which sampling chooses the lobe.
@@ -117,7 +117,7 @@ class SurfaceParts:
     diffuse: bool = True
     specular: bool = False
     metallic: bool = False
-    coat: bool = False
+    clearcoat: bool = False
     sheen: bool = False
     slopes: bool = False
     opacity: bool = False
@@ -129,8 +129,8 @@ class Surface:
     Parameters
     ----------
     parts : terms that are simulated
-    textures : ``base_color``, ``roughness``, ``metallic``, ``specular``, ``coat``, ``coat_roughness``,
-        ``sheen``, ``sheen_color``, ``sheen_roughness``, ``slopes``, ``opacity`` → Mitsuba textures; those
+    textures : ``base_color``, ``roughness``, ``metallic``, ``specular``, ``clearcoat``,
+        ``clearcoat_roughness``, ``sheen``, ``sheen_color``, ``sheen_roughness``, ``slopes``, ``opacity`` → Mitsuba textures; those
         that no term needs may be missing. `slopes` (residual slopes along u and y, in tile widths per tile
         width) are added to the mesh's own.
     """
@@ -140,7 +140,7 @@ class Surface:
         self.textures = textures
         # Whether rays may end up below the surface.
         self.transmits = parts.opacity
-        glossy = parts.specular or parts.metallic or parts.coat
+        glossy = parts.specular or parts.metallic or parts.clearcoat
         self.tables = energy_tables(mi.variant()) if glossy else None
         self.sheen_tables = sheen_tables(mi.variant()) if parts.sheen else None
 
@@ -174,8 +174,8 @@ class SurfacePoint:
         self.metallic = maps["metallic"].eval_1(si) if parts.metallic else mi.Float(0.0)
         if parts.specular or parts.metallic:
             self._lobe(maps, si)
-        if parts.coat:
-            self._coat(maps, si)
+        if parts.clearcoat:
+            self._clearcoat(maps, si)
         if parts.sheen:
             assert surface.sheen_tables is not None
             self.sheen_tables = surface.sheen_tables
@@ -203,13 +203,13 @@ class SurfacePoint:
             self.several = self.returned / mean[0]
             self.lost = pair[0]
 
-    def _coat(self, maps: dict[str, Any], si: Any) -> None:
-        roughness = dr.clip(maps["coat_roughness"].eval_1(si), 0.0, 1.0)
+    def _clearcoat(self, maps: dict[str, Any], si: Any) -> None:
+        roughness = dr.clip(maps["clearcoat_roughness"].eval_1(si), 0.0, 1.0)
         tables = self.tables
         assert tables is not None
         pair = tables.at(self.wi.z, roughness)
-        self.coat_weight = maps["coat"].eval_1(si)
-        self.coat = Lobe(roughness, mi.Color3f(COAT_REFLECTANCE), mi.Color3f(1.0), tables, pair)
+        self.clearcoat_weight = maps["clearcoat"].eval_1(si)
+        self.clearcoat = Lobe(roughness, mi.Color3f(CLEARCOAT_REFLECTANCE), mi.Color3f(1.0), tables, pair)
 
     def _sheen(self, maps: dict[str, Any], si: Any) -> None:
         self.sheen_roughness = dr.clip(maps["sheen_roughness"].eval_1(si), 0.0, 1.0)
@@ -246,10 +246,10 @@ class SurfacePoint:
             lobe = dr.select(broad + again > 0, lobe, 1.0)
             if self.parts.metallic:
                 several = (1.0 - lobe) * again / dr.maximum(broad + again, 1e-12)
-        if self.parts.coat:
-            share = self.coat_weight * _mean(self.coat.share(self.coat.towards_viewer))
+        if self.parts.clearcoat:
+            share = self.clearcoat_weight * _mean(self.clearcoat.share(self.clearcoat.towards_viewer))
             coat = dr.clip(share / dr.maximum(share + (1.0 - share) * _mean(self.base), 1e-6), 0.05, 0.9)
-            coat = dr.select(self.coat_weight > 0, coat, 0.0)
+            coat = dr.select(self.clearcoat_weight > 0, coat, 0.0)
             below = dr.maximum(below, share)
             lobe *= 1.0 - coat
             several *= 1.0 - coat
@@ -262,11 +262,11 @@ class SurfacePoint:
             coat, lobe, several = (c * (1.0 - sheen) for c in (coat, lobe, several))
         return sheen, coat, lobe, several
 
-    def _below_coat(self, cosine: Any) -> Any:
+    def _below_clearcoat(self, cosine: Any) -> Any:
         """What the coat lets through of both directions."""
-        viewer = 1.0 - self.coat_weight * _mean(self.coat.share(self.coat.towards_viewer))
-        light = 1.0 - self.coat_weight * _mean(
-            self.coat.share(self.coat.tables.at(cosine, self.coat.roughness))
+        viewer = 1.0 - self.clearcoat_weight * _mean(self.clearcoat.share(self.clearcoat.towards_viewer))
+        light = 1.0 - self.clearcoat_weight * _mean(
+            self.clearcoat.share(self.clearcoat.tables.at(cosine, self.clearcoat.roughness))
         )
         return viewer * light
 
@@ -286,9 +286,9 @@ class SurfacePoint:
             lobe, lobe_pdf = self.lobe.value_pdf(self.wi, wo)
             value += lobe
             pdf += chance * lobe_pdf
-        if self.parts.coat:
-            coat, coat_pdf = self.coat.value_pdf(self.wi, wo)
-            value = value * self._below_coat(wo.z) + self.coat_weight * coat
+        if self.parts.clearcoat:
+            coat, coat_pdf = self.clearcoat.value_pdf(self.wi, wo)
+            value = value * self._below_clearcoat(wo.z) + self.clearcoat_weight * coat
             pdf += chance_coat * coat_pdf
         if self.parts.sheen:
             area, albedo = self.sheen_tables.at(wo.z, self.sheen_roughness)
@@ -324,14 +324,14 @@ class SurfacePoint:
             wo = dr.select(chosen, wo_lobe, wo)
             mirrored |= chosen & self.lobe.mirror
             single = weight / dr.maximum(chance, 1e-6)
-            if self.parts.coat:
-                single *= self._below_coat(dr.maximum(wo.z, 1e-6))
-        if self.parts.coat:
+            if self.parts.clearcoat:
+                single *= self._below_clearcoat(dr.maximum(wo.z, 1e-6))
+        if self.parts.clearcoat:
             chosen = (xi_lobe > 1.0 - chance_coat - chance_sheen) & (xi_lobe <= 1.0 - chance_sheen)
-            wo_coat, weight = self.coat.sample(self.wi, xi)
+            wo_coat, weight = self.clearcoat.sample(self.wi, xi)
             wo = dr.select(chosen, wo_coat, wo)
-            flat = chosen & self.coat.mirror
-            single = dr.select(flat, self.coat_weight * weight / dr.maximum(chance_coat, 1e-6), single)
+            flat = chosen & self.clearcoat.mirror
+            single = dr.select(flat, self.clearcoat_weight * weight / dr.maximum(chance_coat, 1e-6), single)
             mirrored = (mirrored & ~chosen) | flat
         if self.parts.sheen:
             chosen = xi_lobe > 1.0 - chance_sheen
@@ -341,7 +341,7 @@ class SurfacePoint:
         omega = self.frame.to_world(wo)
         good = self._leaves(wo, omega)
         wo.z = dr.maximum(wo.z, 1e-6)
-        if self.parts.specular or self.parts.metallic or self.parts.coat or self.parts.sheen:
+        if self.parts.specular or self.parts.metallic or self.parts.clearcoat or self.parts.sheen:
             value, pdf = self._local(wo)
             weight = dr.select(mirrored, single, value / dr.maximum(pdf, 1e-30))
             pdf = dr.select(mirrored, dr.inf, pdf)

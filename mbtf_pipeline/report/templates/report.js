@@ -172,15 +172,15 @@
   };
 
   // Spans are those of the chosen view and light.
-  const spans = () => {
+  const widths = () => {
     const of = data.scenes.map((scene, i) => [scene, i]).filter(([scene]) => scene.group === state.group);
-    const wanted = current().span;
-    const chosen = of.find(([scene]) => scene.span === wanted) || of[0];
+    const wanted = current().tiles_across;
+    const chosen = of.find(([scene]) => scene.tiles_across === wanted) || of[0];
     state.scene = chosen[1];
-    $('spans').replaceChildren(...of.map(([scene, i]) => {
+    $('tiles-across').replaceChildren(...of.map(([scene, i]) => {
       const label = document.createElement('label');
       const input = Object.assign(document.createElement('input'), { type: 'radio', name: 'scene', value: i, checked: i === state.scene });
-      const text = Object.assign(document.createElement('span'), { textContent: scene.span });
+      const text = Object.assign(document.createElement('span'), { textContent: scene.tiles_across });
       label.append(input, text);
       return label;
     }));
@@ -189,13 +189,13 @@
     state.scene = scene;
     state.group = current().group;
     document.querySelectorAll('input[name=group]').forEach(e => { e.checked = Number(e.value) === state.group; });
-    spans();
+    widths();
     show();
   };
 
   $('viewer').addEventListener('change', ({ target }) => {
     if (target.name === 'scene') choose(Number(target.value));
-    else if (target.name === 'group') { state.group = Number(target.value); spans(); show(); }
+    else if (target.name === 'group') { state.group = Number(target.value); widths(); show(); }
     else if (target.name === 'map') { state.map = target.value; show(); }
     else if (target.name === 'fit' || target.name === 'kind') { state[target.name] = Number(target.value); show(); }
   });
@@ -250,7 +250,7 @@
 
   const start = async () => {
     $('viewer').hidden = false;
-    spans();
+    widths();
     expose(0);
     await show();
     await enliven();

@@ -14,8 +14,9 @@ from support.surfaces import towards
 from mbtf_core.lattice import Lattice
 from mbtf_fit.config import FitConfig
 from mbtf_fit.material.material import Material, export
-from mbtf_fit.models import Neumip, build_model
-from mbtf_fit.models.textured import GRAZING
+from mbtf_fit.models.constants import GRAZING
+from mbtf_fit.models.neumip import Neumip
+from mbtf_fit.models.registry import build_model
 
 LATTICE = Lattice(3)
 # Lowest cosine of the directions that are trained on.
@@ -32,7 +33,7 @@ def material(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
     """Fitted to a wave that dims towards grazing light, far enough that its weights are no longer random."""
     arrays = random_queries(np.random.default_rng(0), 4000, LATTICE)
     data = training_queries(arrays, parallax(*arrays.values()))
-    options = {"steps": 120, "batch": 500, "warmup": 20, "blur": {"start": 2.0, "offset": 1.0}}
+    options = {"steps": 120, "batch": 500, "warmup": 20, "blur": {"initial_sigma": 2.0, "offset_sigma": 1.0}}
     trainer = train_fully(make_trainer(data, LATTICE, request.param, **options))
     trainer.predict(as_held_out(queries()))
     folder = tmp_path_factory.mktemp("material")
@@ -42,10 +43,10 @@ def material(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
 
 
 def as_held_out(arrays: dict[str, np.ndarray]):  # type: ignore[no-untyped-def]
-    from mbtf_fit.data.loader import Queries
+    from mbtf_fit.data.queries import ShardQueries
 
     nothing = np.zeros((len(arrays["sigma"]), 3), np.float32)
-    return Queries(*arrays.values(), nothing, nothing)
+    return ShardQueries(*arrays.values(), nothing, nothing)
 
 
 def evaluate(material: Material, **changed: object) -> np.ndarray:

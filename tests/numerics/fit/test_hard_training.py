@@ -20,12 +20,12 @@ from support.fit_data import (
 from mbtf_core.directions import from_projected_disk
 from mbtf_core.lattice import Lattice
 from mbtf_fit.config import FitConfig
-from mbtf_fit.data.loader import Queries
+from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.objective.noise import NoiseModel, typical_value
 from mbtf_fit.training.trainer import Trainer
 
 LATTICE = Lattice(2)
-SMALL = {"batch": 500, "warmup": 20, "blur": {"start": 2.0, "share": 0.5, "offset": 1.0}}
+SMALL = {"batch": 500, "warmup": 20, "blur": {"initial_sigma": 2.0, "fraction": 0.5, "offset_sigma": 1.0}}
 
 
 @pytest.fixture(autouse=True)
@@ -50,7 +50,7 @@ def fitted(value: NDArray[np.floating], **training: object) -> Trainer:
 def predictions(trainer: Trainer) -> F32:
     """At queries that were not trained on, whose true values :func:`unseen` has."""
     nothing = np.zeros((2000, 3), np.float32)
-    return trainer.predict(Queries(*arrays(2000, seed=1).values(), nothing, nothing))
+    return trainer.predict(ShardQueries(*arrays(2000, seed=1).values(), nothing, nothing))
 
 
 def unseen(function: object = parallax) -> NDArray[np.float64]:
@@ -77,7 +77,7 @@ def test_long_after_convergence_the_error_does_not_climb_again() -> None:
     """Data without noise cannot be overfitted, so that errors may only fall once the blur is gone, but for
     the unrest of the steps, which the falling rates calm: at the end at most 1.1 of the least on the way."""
     value = parallax(*arrays().values())
-    options = {**SMALL, "batch": 250, "blur": {**SMALL["blur"], "share": 0.1}}
+    options = {**SMALL, "batch": 250, "blur": {**SMALL["blur"], "fraction": 0.1}}
     trainer = make_trainer(training_queries(arrays(), value), LATTICE, steps=1200, **options)
     errors = []
     while not trainer.train(0.0):
@@ -104,13 +104,13 @@ def test_few_noisy_queries_gone_round_many_times_stay_bounded() -> None:
     random = np.random.default_rng(0)
     at, true = arrays(), glossy(*arrays().values())
     a, b = (10 * true * (random.random((len(true), 1)) < 0.1) for _ in range(2))
-    noisy = Queries(*at.values(), a.astype(np.float32), b.astype(np.float32))
+    noisy = ShardQueries(*at.values(), a.astype(np.float32), b.astype(np.float32))
     queries = training_queries(at, (a + b) / 2)
     noise = NoiseModel.of(noisy, LATTICE, typical_value(queries.value.numpy()))
     found = {}
-    default = FitConfig().training.weight_decay
+    default = FitConfig().training.noise_regularization
     for decay in (0.0, default):
-        options = {**SMALL, "batch": 1000, "steps": 600, "weight_decay": decay}
+        options = {**SMALL, "batch": 1000, "steps": 600, "noise_regularization": decay}
         trainer = train_fully(make_trainer(queries, LATTICE, noise=noise, **options))
         assert_finite(trainer)
         found[decay] = missed(predictions(trainer), unseen(glossy))

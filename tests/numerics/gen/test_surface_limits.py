@@ -93,7 +93,7 @@ def test_polished_dielectric_mirrors_and_scatters_the_rest() -> None:
     )
 
 
-@pytest.mark.parametrize("kind", ["metallic", "specular", "coat"])
+@pytest.mark.parametrize("kind", ["metallic", "specular", "clearcoat"])
 @pytest.mark.parametrize("width", [0.05, 0.2, 1.0])
 def test_value_is_continuous_from_a_mirror_on(kind: str, width: float) -> None:
     """The mirror below roughness 0.00316 and the lobe above it cannot be told apart, even at the mirrored
@@ -103,7 +103,11 @@ def test_value_is_continuous_from_a_mirror_on(kind: str, width: float) -> None:
     omega_i = mirrored(omega_o)
     seen = []
     for r in (0.0, 0.00315, 0.00318):
-        given = {"coat": 1.0, "coat_roughness": r} if kind == "coat" else {kind: 1.0, "roughness": r}
+        given = (
+            {"clearcoat": 1.0, "clearcoat_roughness": r}
+            if kind == "clearcoat"
+            else {kind: 1.0, "roughness": r}
+        )
         seen.append(values(surface(0.5, **given), light, omega_i, omega_o, 1 << 16)[:, 0])
     for a, b in itertools.pairwise(seen):
         np.testing.assert_allclose(a, b, rtol=0.006)
@@ -155,16 +159,16 @@ def test_grazing_light_and_view_give_finite_values() -> None:
     omega_i, omega_o = np.repeat(omega, 4, axis=0), mirrored(np.tile(omega, (4, 1)))
     for width in (0.0, 1.0):
         for r in (0.0, 0.02, 0.5):
-            bsdf = surface(0.8, roughness=r, metallic=0.5, specular=0.5, coat=0.5)
+            bsdf = surface(0.8, roughness=r, metallic=0.5, specular=0.5, clearcoat=0.5)
             e = estimate(flat(), bsdf, LightKernel(width), queries([0.5, 0.5], 0.1, omega_i, omega_o, 16), 64)
             assert np.all(np.isfinite(e.value_a))
             assert np.all(e.value_a >= 0)
             assert e.nonfinite == 0
 
 
-@pytest.mark.parametrize("name", ["roughness", "coat_roughness"])
+@pytest.mark.parametrize("name", ["roughness", "clearcoat_roughness"])
 def test_roughness_outside_its_range_is_clipped(name: str) -> None:
-    given = {"metallic": 1.0} if name == "roughness" else {"coat": 1.0}
+    given = {"metallic": 1.0} if name == "roughness" else {"clearcoat": 1.0}
     for out, limit in ((-1e-3, 0.0), (1.001, 1.0)):
         a, b = (
             values(
@@ -192,8 +196,8 @@ MAPS = {
     "roughness": np.full((2, 2), 0.3),
     "metallic": np.full((2, 2), 0.5),
     "specular": np.full((2, 2), 0.5),
-    "coat": np.full((2, 2), 0.5),
-    "coat_roughness": np.full((2, 2), 0.2),
+    "clearcoat": np.full((2, 2), 0.5),
+    "clearcoat_roughness": np.full((2, 2), 0.2),
     "sheen": np.full((2, 2), 0.5),
     "sheen_color": np.full((2, 2, 3), 0.5),
     "sheen_roughness": np.full((2, 2), 0.3),

@@ -35,7 +35,7 @@ def even(finest: int = 2) -> Transmittance:
 def lace(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """A gray material that lets some of the light through."""
     folder = tmp_path_factory.mktemp("lace")
-    write_material(folder, constant=(GRAY,) * 3, finest=2, holes=even())
+    write_material(folder, constant=(GRAY,) * 3, finest=2, transmittance=even())
     return {"type": "mbtf", "material": str(folder), "networks": "cooperative", "sampling": "cosine"}
 
 
@@ -62,7 +62,7 @@ def test_the_plugin_reads_the_share_that_was_fitted(tmp_path: Path) -> None:
     lattice = Lattice(3, 2.0)
     levels = [random.normal(0.3, 0.2, (*lattice.shape(s), 6)).astype(np.float32) for s in range(4)]
     model = Transmittance(lattice, levels)
-    write_material(tmp_path, finest=3, aspect=2.0, holes=model)
+    write_material(tmp_path, finest=3, aspect=2.0, transmittance=model)
     evaluator = Evaluator(read_material(tmp_path), "cooperative")
     q = random_queries(random, 3000, lattice)
     u, view = mi.Point2f(q["u"].T * 3 - 1), mi.Vector3f(q["omega_o"].T)

@@ -13,8 +13,9 @@ from support.fit_data import F32, random_queries, write_data
 
 from mbtf_core.lattice import Lattice
 from mbtf_fit import FitConfig, fit
-from mbtf_fit.data.loader import TrainingQueries
-from mbtf_fit.models import TexturedMaterial, build_model
+from mbtf_fit.data.queries import TrainingQueries
+from mbtf_fit.models.registry import build_model
+from mbtf_fit.models.textured import TexturedMaterial
 from mbtf_fit.objective.noise import NoiseModel
 from mbtf_fit.training.trainer import Trainer
 
@@ -43,9 +44,9 @@ def answers(model: TexturedMaterial, n: int, seed: int) -> TrainingQueries:
 def trainer(model: TexturedMaterial, data: TrainingQueries, **training: Any) -> Trainer:
     options = {
         "losses": [{"kind": "squared"}],
-        "robust": None,
+        "huber_delta": None,
         "warmup": 20,
-        "blur": {"start": 0, "offset": 0},
+        "blur": {"initial_sigma": 0, "offset_sigma": 0},
         **training,
     }
     config = FitConfig.model_validate({"training": options})
@@ -89,7 +90,17 @@ def test_a_perturbed_teacher_returns(queries: int, steps: int, bound: float) -> 
         for p in model.parameters():
             p.add_(0.03 * p.std(correction=0) * torch.randn(p.shape, generator=generator))
     before = relative_error(model, unseen)
-    finish(trainer(model, data, steps=steps, batch=2000, rate=2e-3, texture_rate=2e-3, final_rate=1e-4))
+    finish(
+        trainer(
+            model,
+            data,
+            steps=steps,
+            batch=2000,
+            rate=2e-3,
+            texture_learning_rate=2e-3,
+            final_learning_rate_factor=1e-4,
+        )
+    )
     assert before > 5 * bound
     assert relative_error(model, unseen) < bound
 
@@ -112,7 +123,11 @@ def test_a_random_start_approaches_the_teacher(
     data, unseen = answers(teacher(), queries, 0), answers(teacher(), 5000, 9)
     model = build_model("neumip", LATTICE, **network)
     model.initialize(torch.Generator().manual_seed(7), float(data.value.mean()))
-    options = {"batch": 2000, "texture_rate": 1e-2, "final_rate": 1e-3 if rate > 1e-2 else 1e-4}
+    options = {
+        "batch": 2000,
+        "texture_learning_rate": 1e-2,
+        "final_learning_rate_factor": 1e-3 if rate > 1e-2 else 1e-4,
+    }
     finish(trainer(model, data, steps=steps, rate=rate, **options))
     variance = (unseen.value - unseen.value.mean()).square().mean()
     share = relative_error(model, unseen) ** 2 * float(unseen.value.square().mean() / variance)
@@ -131,11 +146,11 @@ def test_the_third_coordinate_tells_low_lights_apart() -> None:
     arrays["value"] = np.broadcast_to(0.1 / (1 + np.exp(-(z - 0.15) / 0.01)) / (z + 0.1), (40_000, 3))
     data = TrainingQueries(*(torch.from_numpy(a.astype(np.float32)) for a in arrays.values()))
     left = {}
-    for lifted in (False, True):
-        model = build_model("neumip-baseline", LATTICE, encoding={"lifted": lifted})
+    for direction_xyz in (False, True):
+        model = build_model("neumip-baseline", LATTICE, encoding={"direction_xyz": direction_xyz})
         model.initialize(torch.Generator().manual_seed(0), 0.2)
         finish(trainer(model, data, steps=300, batch=4000))
-        left[lifted] = relative_error(model, data)
+        left[direction_xyz] = relative_error(model, data)
     assert left[True] < 0.5 * left[False]
 
 

@@ -128,8 +128,8 @@ def config(tmp_path_factory: pytest.TempPathFactory) -> GeneratorConfig:
     return GeneratorConfig.model_validate(
         {
             "material": str(folder / "height.npy"),
-            "geometry": {"height": 0.05},
-            "queries": {"train": "1500", "test": "8", "test_spp": 4, "target_error": "6%", "cap": 256},
+            "geometry": {"height_scale": 0.05},
+            "queries": {"train": "1500", "test": "8", "test_spp": 4, "target_error": "6%", "max_spp": 256},
             "output": {"shard_queries": 500},
         }
     )
@@ -244,7 +244,7 @@ def test_image_buffers_and_holes_keep_their_shape(tmp_path: Path) -> None:
     config = GeneratorConfig.model_validate(
         {
             "material": str(tmp_path),
-            "geometry": {"height": 0.02},
+            "geometry": {"height_scale": 0.02},
             "queries": {
                 "train": "256",
                 "test": "64",

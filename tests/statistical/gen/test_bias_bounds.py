@@ -62,7 +62,7 @@ def tilted(rows: int, columns: int) -> NDArray[np.float32]:
 def test_a_plane_with_slopes_is_the_relief_but_for_its_parallax(shape: tuple[int, int], mapped: bool) -> None:
     """Of a faint relief nearly everything is shading: a slope of the wrong sign or row would double it."""
     stuff = lambert(waves(*shape), 0.004, normal=tilted(*shape) if mapped else None)
-    high: dict[str, Any] = {"queries": {"min_cos": 0.7, "levels": 5}}
+    high: dict[str, Any] = {"queries": {"min_cos": 0.7, "resolution": 32}}
     full_job, cut_job = job_of(stuff, "all", **high), job_of(stuff, "all,-masking", **high)
     bare_job = job_of(replace(stuff, height_scale=0.0), "all,-masking", **high)
     full = estimates(full_job, plan_effects(full_job))
@@ -74,7 +74,7 @@ def test_a_plane_with_slopes_is_the_relief_but_for_its_parallax(shape: tuple[int
 
 def finest_job(stuff: Material, mode: str) -> Job:
     """Footprints far smaller than a cell: what costs are estimated for."""
-    queries = {"min_cos": 0.3, "levels": 9, "mixture": {"log_uniform": 0.0, "finest": 1.0}}
+    queries = {"min_cos": 0.3, "resolution": 512, "mixture": {"log_uniform": 0.0, "finest": 1.0}}
     return job_of(stuff, mode, queries=queries, light={"width": 0.0})
 
 

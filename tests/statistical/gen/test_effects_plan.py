@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from support.scenes import rocks
 
 from mbtf_core.stats import Estimate, mean_of_halves
+from mbtf_gen.config.effects_request import OF_RELIEF
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation import Job
 from mbtf_gen.material.material import Material
-from mbtf_gen.planning.effects import OF_RELIEF, EffectsPlan
+from mbtf_gen.planning.effects import EffectsPlan
 from mbtf_gen.planning.effects_plan import plan_effects, without
 from mbtf_gen.planning.pilot import pilot_queries, relative_change
 from mbtf_gen.render.estimates import Estimates, Stream
@@ -52,7 +53,7 @@ def job_of(
             {
                 "material": "m",
                 "effects": {"mode": mode},
-                "queries": {"min_cos": min_cos, "levels": 6},
+                "queries": {"min_cos": min_cos, "resolution": 64},
                 "light": {"width": width},
                 "transport": {"max_depth": depth},
             }
@@ -87,12 +88,12 @@ SCENES: dict[str, tuple[Material, dict[str, Any]]] = {
     "wide light": (material(0.1, 0.5), {"width": 10.0}),
     "delta light": (material(0.1, 0.5), {"width": 0.0}),
     "mirror relief": (material(0.02, 0.9, roughness=0.0, specular=0.5, metallic=1.0), {"width": 10.0}),
-    "coated relief": (material(0.1, 0.3, coat=1.0, coat_roughness=0.4), {}),
+    "coated relief": (material(0.1, 0.3, clearcoat=1.0, clearcoat_roughness=0.4), {}),
     "velvet relief": (material(0.1, 0.3, sheen=1.0, sheen_roughness=0.3), {}),
     "holed relief": (material(0.1, 0.5, opacity=np.where(np.median(ROCKS) > ROCKS, 0.2, 1.0)), {}),
     # Layers so faint that they are not simulated.
     "faint gloss": (material(0.1, 0.5, roughness=0.5, specular=2e-4, metallic=0.0), {"min_cos": 0.3}),
-    "faint coat": (material(0.1, 0.5, coat=1e-4, coat_roughness=0.3), {"min_cos": 0.3}),
+    "faint coat": (material(0.1, 0.5, clearcoat=1e-4, clearcoat_roughness=0.3), {"min_cos": 0.3}),
     "faint sheen": (material(0.1, 0.5, sheen=2e-4, sheen_roughness=0.5), {"min_cos": 0.3}),
     "faint normal map": (material(0.0, pattern(), normal=bumps(2e-4)), {"min_cos": 0.3}),
     "faint holes": (material(0.1, 0.5, opacity=np.full((4, 4), 0.9995)), {"min_cos": 0.3}),

@@ -56,7 +56,7 @@ def test_values_differ_between_streams_and_are_uncorrelated() -> None:
 
 def test_launches_of_any_size_share_their_kernels() -> None:
     """Compiling takes seconds, a launch tenths of one: nothing of a launch may be part of its kernels."""
-    surface = {"type": "mbtf_surface", "roughness": 0.3, "specular": 0.5, "metallic": 0.4, "coat": 0.3}
+    surface = {"type": "mbtf_surface", "roughness": 0.3, "specular": 0.5, "metallic": 0.4, "clearcoat": 0.3}
     e = Estimator(build_tile(rocks(32), surface), LightKernel(5.0), Transport())
     e.estimate(same_query(300), 8, Stream(0, "train", 0))
     # Another number of queries, of another relief, with other limits on the paths.

@@ -74,7 +74,7 @@ def test_query_rays_pass_the_reference_plane_at_their_point(aspect: float) -> No
 
 @pytest.mark.parametrize("aspect", ASPECTS)
 def test_camera_rays_fill_the_pixel_that_its_query_states(aspect: float) -> None:
-    camera = Camera(elevation=35, azimuth=20, span=0.4, rows=9, columns=11, field_of_view=2.0)
+    camera = Camera(elevation=35, azimuth=20, tiles_across=0.4, rows=9, columns=11, field_of_view=2.0)
     q = camera.queries(np.array([0, 0, 1.0]), aspect)
     tile = build_tile(flat(aspect), {"type": "diffuse"})
     source = _camera_rays(camera, Estimator(tile, LightKernel(0.0), Transport()))

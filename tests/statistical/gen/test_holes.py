@@ -173,7 +173,7 @@ def test_pictures_keep_what_passes(tmp_path: Path) -> None:
     from mbtf_gen.pictures.camera import Camera
     from mbtf_gen.pictures.reference import render_reference
 
-    camera = Camera(90.0, -90.0, span=1.0, rows=16, columns=16)
+    camera = Camera(90.0, -90.0, tiles_across=1.0, rows=16, columns=16)
     estimator = Estimator(sheet(flat(), half_open()), LightKernel(2.0), PLANE)
     image = render_reference(estimator, camera, direction(50, 20), kind="pixel", spp=8)
     assert image.transmittance is not None

@@ -71,16 +71,20 @@ def bright_veil() -> Material:
 
 SCENES: dict[str, tuple[Material, dict[str, Any], int]] = {
     # Costs of Lambert do not hold under a coat: 0.4 where they were trusted.
-    "coat": (stuff(fractal(64, 3.0), 2e-5, normal=ripples(0.003), coat=1.0, coat_roughness=0.1), {}, 16),
+    "coat": (
+        stuff(fractal(64, 3.0), 2e-5, normal=ripples(0.003), clearcoat=1.0, clearcoat_roughness=0.1),
+        {},
+        16,
+    ),
     # Wrong by 0.09, 0.02, 0.01 and 0.007 where what is named was overlooked.
     "scratches": (scratches(), {}, 8),
-    "colors of one brightness": (checks(), {"queries": {"levels": 8}}, 8),
+    "colors of one brightness": (checks(), {"queries": {"resolution": 256}}, 8),
     "wide light from above": (
         stuff(fractal(64, 1.6), 0.2, 0.05),
-        {"queries": {"min_cos": 0.98, "levels": 6}, "light": {"width": 20.0}},
+        {"queries": {"min_cos": 0.98, "resolution": 64}, "light": {"width": 20.0}},
         64,
     ),
-    "bright veil": (bright_veil(), {"queries": {"levels": 6}, "light": {"width": 0.0}}, 128),
+    "bright veil": (bright_veil(), {"queries": {"resolution": 64}, "light": {"width": 0.0}}, 128),
 }
 
 

@@ -36,7 +36,7 @@ def estimates(material: Material, mesh: int, normal: str) -> Estimates:
             "material": "m",
             "geometry": {"mesh": mesh},
             # High directions: what is compared is shading, not the masking that a coarse mesh lacks.
-            "queries": {"levels": 5, "min_cos": 0.7},
+            "queries": {"resolution": 32, "min_cos": 0.7},
             "effects": {"normal": normal},
             "transport": {"max_depth": 1},
         }

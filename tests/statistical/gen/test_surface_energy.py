@@ -18,7 +18,7 @@ from mbtf_gen.render.bsdf.surface import SurfaceParts
 Array = NDArray[np.float64]
 METAL = SurfaceParts(metallic=True)
 GLOSSY = SurfaceParts(specular=True, metallic=True)
-COATED = SurfaceParts(specular=True, metallic=True, coat=True)
+COATED = SurfaceParts(specular=True, metallic=True, clearcoat=True)
 
 ROUGHNESS = (0.0, 0.0033, 0.005, 0.013, 0.02, 0.1, 0.3, 0.5, 1.0)
 COSINES = (1.0, 0.5, 0.1, 1e-2, 1e-3, 1e-4)
@@ -36,7 +36,15 @@ def albedos(rows: Array, parts: SurfaceParts, points: int = 1 << 12) -> tuple[Ar
     xi = sobol(points, 3, seed=11)
     energy, greatest = [], []
     for part in np.array_split(rows, max(1, len(rows) * points // (1 << 22))):
-        names = ("roughness", "metallic", "specular", "coat", "coat_roughness", "base_color", "cosine")
+        names = (
+            "roughness",
+            "metallic",
+            "specular",
+            "clearcoat",
+            "clearcoat_roughness",
+            "base_color",
+            "cosine",
+        )
         names += ("sheen", "sheen_roughness")
         lanes = {n: np.repeat(c, points) for n, c in zip(names, part.T, strict=False)}
         wi = towards(lanes.pop("cosine"))
@@ -197,11 +205,11 @@ def brdf(parts: SurfaceParts, wi: Array, wo: Array, **maps: Any) -> Array:
         (SurfaceParts(diffuse=False, specular=True), {}),
         (METAL, {"metallic": 1.0}),
         (GLOSSY, {"metallic": 0.4}),
-        (SurfaceParts(coat=True), {"coat": 0.8}),
+        (SurfaceParts(clearcoat=True), {"clearcoat": 0.8}),
         (SurfaceParts(sheen=True), {"sheen": 0.8, "sheen_color": np.array([[1.0], [0.5], [0.2]])}),
-        (ALL, {"metallic": 0.4, "coat": 0.5, "sheen": 0.7}),
+        (ALL, {"metallic": 0.4, "clearcoat": 0.5, "sheen": 0.7}),
     ],
-    ids=["diffuse", "dielectric", "lobe", "metal", "mixture", "coat", "sheen", "all"],
+    ids=["diffuse", "dielectric", "lobe", "metal", "mixture", "clearcoat", "sheen", "all"],
 )
 def test_value_is_reciprocal(parts: SurfaceParts, maps: dict[str, Any], roughness: float) -> None:
     one, other = random_directions(4000, 1), random_directions(4000, 2)
@@ -210,7 +218,7 @@ def test_value_is_reciprocal(parts: SurfaceParts, maps: dict[str, Any], roughnes
     other[:, 2] = np.maximum(np.abs(other[:, 2]), 1e-2)
     other /= np.linalg.norm(other, axis=1, keepdims=True)
     color = np.array([[0.9], [0.5], [0.1]])
-    given = {"base_color": color, "roughness": roughness, "coat_roughness": 0.7 * roughness, **maps}
+    given = {"base_color": color, "roughness": roughness, "clearcoat_roughness": 0.7 * roughness, **maps}
     given["sheen_roughness"] = roughness
     there, back = brdf(parts, one, other, **given), brdf(parts, other, one, **given)
     np.testing.assert_allclose(there, back, rtol=1e-3, atol=1e-6)

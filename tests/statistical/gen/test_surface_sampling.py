@@ -22,7 +22,7 @@ from mbtf_gen.render.bsdf.surface import SurfaceParts
 DIFFUSE = SurfaceParts()
 SPECULAR = SurfaceParts(specular=True)
 METAL = SurfaceParts(specular=True, metallic=True)
-COAT = SurfaceParts(coat=True)
+COAT = SurfaceParts(clearcoat=True)
 SHEEN = SurfaceParts(sheen=True)
 
 
@@ -80,8 +80,8 @@ def chi_square(
 ) -> ChiSquareTest:
     """The test, run, of sampling a surface towards `wi`; `fault` changes maps for the samples alone."""
     widths = [maps.get("roughness", 0.3) ** 2] if parts.specular or parts.metallic else [1.0]
-    if parts.coat:
-        widths.append(maps.get("coat_roughness", 0.3) ** 2)
+    if parts.clearcoat:
+        widths.append(maps.get("clearcoat_roughness", 0.3) ** 2)
     normal = (
         np.array([-maps["slopes"][0][0], -maps["slopes"][1][0], 1.0])
         if parts.slopes
@@ -116,10 +116,10 @@ CASES: list[tuple[str, SurfaceParts, dict[str, Any]]] = [
     *((f"metal {r}", METAL, {"roughness": r, "metallic": 1.0}) for r in (0.1, 0.3, 1.0)),
     ("dark metal", METAL, {"roughness": 0.6, "metallic": 1.0, "base_color": 0.2}),
     ("half metal tilted", sloping(METAL), {"roughness": 0.4, "metallic": 0.5, **tilt(0.3, 0.3)}),
-    ("coat", COAT, {"coat_roughness": 0.2}),
+    ("clearcoat", COAT, {"clearcoat_roughness": 0.2}),
     *((f"sheen {r}", SHEEN, {"sheen_roughness": r, "base_color": 0.6}) for r in (0.07, 0.3, 1.0)),
     ("sheen tilted", sloping(SHEEN), {"sheen": 0.5, **tilt(0.4, 0.2)}),
-    ("everything", ALL, {"roughness": 0.5, "coat_roughness": 0.1, "metallic": 0.4, "base_color": 0.7}),
+    ("everything", ALL, {"roughness": 0.5, "clearcoat_roughness": 0.1, "metallic": 0.4, "base_color": 0.7}),
 ]
 
 
@@ -135,7 +135,7 @@ FAULTS = {
     "diffuse tilted": tilt(0.6, -0.3),
     "specular 0.2": {"roughness": 0.22},
     "metal 1.0": {"metallic": 0.9},
-    "coat": {"coat_roughness": 0.24},
+    "clearcoat": {"clearcoat_roughness": 0.24},
     "sheen 1.0": {"sheen": 0.8},
 }
 
@@ -179,7 +179,9 @@ def plugin(**values: Any) -> dict[str, Any]:
 
 def test_plugin_answers_as_the_surface_does() -> None:
     bsdf = mi.load_dict(
-        plugin(base_color=(0.7, 0.7, 0.7), roughness=0.4, metallic=0.3, specular=0.6, coat=0.5, sheen=0.4)
+        plugin(
+            base_color=(0.7, 0.7, 0.7), roughness=0.4, metallic=0.3, specular=0.6, clearcoat=0.5, sheen=0.4
+        )
     )
     xi = sobol(1 << 10, 3)
     wi = towards(0.5, 30)
@@ -190,8 +192,8 @@ def test_plugin_answers_as_the_surface_does() -> None:
         roughness=0.4,
         metallic=0.3,
         specular=0.6,
-        coat=0.5,
-        coat_roughness=0.1,
+        clearcoat=0.5,
+        clearcoat_roughness=0.1,
         sheen=0.4,
         sheen_roughness=0.3,
     )

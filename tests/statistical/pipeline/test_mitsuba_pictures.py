@@ -18,7 +18,7 @@ SECTION = CompareSection.model_validate(
     {
         "views": [{"elevation": 82, "azimuth": -60}],
         "lights": [{"elevation": 45, "azimuth": 35}],
-        "spans": [0.6],
+        "tiles_across": [0.6],
         "size": 40,
         "spp": 32,
     }

@@ -256,7 +256,7 @@ def test_any_slices_merged_are_the_whole(tmp_path: Path) -> None:
     assert generate(command(tmp_path, tmp_path / "whole", train=600)) == 0
     line = command(tmp_path, tmp_path / "out", train=600)
     for index in (3, 1, 7, 2, 6, 5, 4):
-        assert generate([*line, "--shards", f"{index}/7", "--overwrite"]) == 0
+        assert generate([*line, "--slice", f"{index}/7", "--overwrite"]) == 0
     assert generate(["merge", str(tmp_path / "out")]) == 0
     assert contents(tmp_path / "out") == contents(tmp_path / "whole")
 

@@ -48,7 +48,7 @@ CASES: dict[str, tuple[str, int, list[str]]] = {
         ["config.yaml:3", "'queries.mincos'"],
     ),
     "config without a file": ("heights.npy --config no.yaml", INPUT, ["no.yaml", "no such file"]),
-    "other schema": ("verify schema", INPUT, ["schema 99", "schema 1"]),
+    "other schema": ("verify schema", INPUT, ["schema 99", "schema 2"]),
     "merge of another schema": ("merge schema", INPUT, ["schema 99"]),
     "verify an empty folder": ("verify empty", INPUT, ["empty", "manifest.json"]),
     "merge an empty folder": ("merge empty", INPUT, ["empty", "manifest.json"]),
@@ -74,9 +74,9 @@ CASES: dict[str, tuple[str, int, list[str]]] = {
     "odd paths of a reference": ("reference heights.npy --spp 3", USAGE, ["--spp", "reference.spp", "even"]),
     "words as paths": ("heights.npy --spp few", USAGE, ["--spp", "few"]),
     "level too fine": (
-        "heights.npy --levels 99",
+        "heights.npy --resolution 99",
         USAGE,
-        ["--levels: 'queries.levels': must be at least 0 and at most 14 (given 99)"],
+        ["--resolution: 'queries.resolution': must be a power of two from 1 to 16384 (given '99')"],
     ),
     "light too wide": ("heights.npy --light-width 60", USAGE, ["light.width", "45"]),
     "light too narrow": ("heights.npy --light-width 0.001", USAGE, ["light.width", "delta"]),
@@ -88,8 +88,8 @@ CASES: dict[str, tuple[str, int, list[str]]] = {
     ),
     "unknown key to set": ("heights.npy --set queries.ssp=4", USAGE, ["'queries.ssp'", "'spp'"]),
     "nothing to set": ("heights.npy --set queries", USAGE, ["--set", "key=value"]),
-    "no such slice": ("heights.npy --shards 4/3", USAGE, ["--shards", "4/3"]),
-    "slice zero": ("heights.npy --shards 0/3", USAGE, ["--shards", "0/3"]),
+    "no such slice": ("heights.npy --slice 4/3", USAGE, ["--slice", "4/3"]),
+    "slice zero": ("heights.npy --slice 0/3", USAGE, ["--slice", "0/3"]),
     "unknown layout": ("heights.npy --layout rows", USAGE, ["--layout"]),
     "unknown flag": ("heights.npy --qeries 5", USAGE, ["qeries", "Did you mean --queries", "--help"]),
     "misspelt command": ("verfy empty", USAGE, ["verfy", "mbtf-gen verify"]),
@@ -99,7 +99,7 @@ CASES: dict[str, tuple[str, int, list[str]]] = {
     "view from below": (
         "reference heights.npy --view -10,0",
         USAGE,
-        ["--view: elevation -10 must lie above 0 and at most at 90 degrees"],
+        ["--view: 'reference.view.elevation': must be above 0 and at most 90 (given -10.0)"],
     ),
     "view from below, with a sign of equality": (
         "reference heights.npy --view=-10,0",
@@ -109,9 +109,9 @@ CASES: dict[str, tuple[str, int, list[str]]] = {
     "flag in place of a view": ("reference heights.npy --view --spp 4", USAGE, ["--view"]),
     "half a view": ("reference heights.npy --view 60", USAGE, ["--view", "'60'"]),
     "light in words": ("reference heights.npy --light high", USAGE, ["--light", "'high'"]),
-    "no width": ("reference heights.npy --spans 1,zwei", USAGE, ["--spans", "zwei"]),
-    "no width at all": ("reference heights.npy --spans 0", USAGE, ["--spans", "above 0"]),
-    "one width twice": ("reference heights.npy --spans 1,1.0", USAGE, ["--spans", "twice"]),
+    "no width": ("reference heights.npy --tiles-across 1,zwei", USAGE, ["--tiles-across", "zwei"]),
+    "no width at all": ("reference heights.npy --tiles-across 0", USAGE, ["--tiles-across", "above 0"]),
+    "one width twice": ("reference heights.npy --tiles-across 1,1.0", USAGE, ["--tiles-across", "twice"]),
     "picture of nothing": ("reference heights.npy --size 0", USAGE, ["--size"]),
 }
 
@@ -160,7 +160,7 @@ def write_inputs(folder: Path) -> None:
     (folder / "config.yaml").write_text("queries:\n  spp: 4\n  mincos: 0.2\n")
     write_dataset(folder / "schema", queries={"train": "8", "test": "8"})
     manifest = folder / "schema/manifest.json"
-    manifest.write_text(manifest.read_text().replace('"schema": 1', '"schema": 99'))
+    manifest.write_text(manifest.read_text().replace('"schema": 2', '"schema": 99'))
 
 
 def listing(folder: Path) -> dict[str, bytes]:

@@ -20,13 +20,13 @@ def test_a_set_of_unequal_maps_that_do_not_tile(tmp_path: Path) -> None:
     save_normals(folder / "Brick_07_Normal.png", normals[:36, :72], dx=True)
     png(folder / "Brick_07_Color.png", rng().integers(40, 200, (18, 36, 3)), 2, 8)
     png(folder / "Brick_07_Roughness.png", rng().integers(9000, 60000, (54, 108, 1)), 0, 16, interlace=True)
-    options = ["--queries", 200, "--test-queries", 50, "--test-spp", 4, "--levels", 3]
+    options = ["--queries", 200, "--test-queries", 50, "--test-spp", 4, "--resolution", 8]
     looked, plain, mirrored, planned = run_all(
         [
             ["inspect", folder, "--json", "--quiet"],
             [folder, "-o", "plain", *options],
-            [folder, "-o", "mirrored", "--tile", "mirror", *options],
-            ["plan", folder, "--tile", "mirror", "--no-measure", "--set", "queries.train=200"],
+            [folder, "-o", "mirrored", "--make-tileable", "mirror", *options],
+            ["plan", folder, "--make-tileable", "mirror", "--no-measure", "--set", "queries.train=200"],
         ],
         tmp_path,
     )

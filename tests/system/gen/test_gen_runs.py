@@ -88,7 +88,7 @@ def test_the_data_set_is_intact_and_sane(whole: Path) -> None:
         assert value.mean() > 0.01
         # Halves are two estimates, not one.
         assert np.mean(arrays["value_a"] != arrays["value_b"]) > 0.3
-    assert (whole / "config.yaml").read_text().startswith("version: 1\nmaterial: maps\n")
+    assert (whole / "config.yaml").read_text().startswith("version: 2\nmaterial: maps\n")
 
 
 def finished_shards(folder: Path) -> int:
@@ -122,7 +122,7 @@ def test_kills_at_any_instant_and_the_same_command_give_the_same_data(work: Path
 
 
 def test_slices_written_at_once_and_merged_are_the_whole(work: Path, whole: Path) -> None:
-    processes = [start([*COMMAND, "-o", "sliced", "--shards", f"{i}/3"], work) for i in (1, 2, 3)]
+    processes = [start([*COMMAND, "-o", "sliced", "--slice", f"{i}/3"], work) for i in (1, 2, 3)]
     done = [finished(p) for p in processes]
     assert [d.code for d in done] == [0, 0, 0], done
     (merged,) = run_all([["merge", "sliced", "--json"]], work)
@@ -157,14 +157,15 @@ def batch(work: Path, whole: Path) -> dict[str, Done]:
         "plain exr": f"maps {few} --format exr -o plain-exr",
         "images": f"maps {image} -o images",
         "image exr": f"maps {image} --format exr -o image-exr",
-        "reference": "reference maps -o pictures --json --view 50,20 --light 60,80 --spans 0.5,2 "
+        "reference": "reference maps -o pictures --json --view 50,20 --light 60,80 --tiles-across 0.5,2 "
         "--size 24 --spp 4",
-        "pictures again": "reference maps -o pictures --json --view 50,20 --light 60,80 --spans 0.5,2 "
+        "pictures again": "reference maps -o pictures --json --view 50,20 --light 60,80 --tiles-across 0.5,2 "
         "--size 24 --spp 4",
-        "pictures changed": "reference maps -o pictures --view 50,20 --light 60,80 --spans 0.5,2 --size 24",
+        "pictures changed": "reference maps -o pictures --view 50,20 --light 60,80 --tiles-across 0.5,2 "
+        "--size 24",
         "from its own file": "reference maps -o pictures --json --config pictures/config.yaml",
-        "one reference": "reference maps/height.npy -o one --spans 1 --size 8 --spp 2 --kind query",
-        "one replaced": "reference maps/height.npy -o one --spans 2 --size 8 --spp 2 --kind pixel "
+        "one reference": "reference maps/height.npy -o one --tiles-across 1 --size 8 --spp 2 --kind query",
+        "one replaced": "reference maps/height.npy -o one --tiles-across 2 --size 8 --spp 2 --kind pixel "
         "--overwrite",
     }
     done = run_all([line.split() for line in lines.values()], work)
@@ -241,7 +242,7 @@ def test_image_layout_holds_buffers_of_one_light_and_view(batch: dict[str, Done]
 
 def test_reference_writes_pictures_for_people_and_programs(batch: dict[str, Done], work: Path) -> None:
     report = summary(batch["reference"])
-    stems = {f"{kind}-span{span}" for kind in ("query", "pixel") for span in ("0.5", "2")}
+    stems = {f"{kind}-tiles{tiles_across}" for kind in ("query", "pixel") for tiles_across in ("0.5", "2")}
     assert {p.name for p in (work / "pictures").iterdir()} == {
         "config.yaml",
         "pictures.json",
@@ -286,8 +287,8 @@ def test_overwriting_pictures_leaves_none_of_before(batch: dict[str, Done], work
     assert {p.name for p in (work / "one").iterdir()} == {
         "config.yaml",
         "pictures.json",
-        "pixel-span2.exr",
-        "pixel-span2.png",
+        "pixel-tiles2.exr",
+        "pixel-tiles2.png",
     }
 
 

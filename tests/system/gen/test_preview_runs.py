@@ -65,13 +65,13 @@ def drawing(work: Path) -> None:
 @pytest.fixture(scope="module")
 def batch(work: Path) -> dict[str, Done]:
     lines = {
-        "tilted": f"preview maps -o tilted --block 1 {FAST} --json",
-        "side": f"preview maps -o side --block 1 --view 50,30 --light 70,0 {FAST} --json",
+        "tilted": f"preview maps -o tilted --tiles 1 {FAST} --json",
+        "side": f"preview maps -o side --tiles 1 --view 50,30 --light 70,0 {FAST} --json",
         "two": f"preview maps -o two {FAST}",
         "flat": f"preview flat.npy -o flat {FAST}",
-        "again": f"preview maps -o tilted --block 1 {FAST} --json",
-        "changed": f"preview maps -o tilted --block 2 {FAST}",
-        "replaced": f"preview flat.npy -o flat --block 1 --overwrite {FAST} --json",
+        "again": f"preview maps -o tilted --tiles 1 {FAST} --json",
+        "changed": f"preview maps -o tilted --tiles 2 {FAST}",
+        "replaced": f"preview flat.npy -o flat --tiles 1 --overwrite {FAST} --json",
         "others": f"preview maps -o others {FAST} --overwrite",
         "data": "preview data -o data-pictures --size 64 --spp 2 --json",
         "buffers": "preview flat.npy -o buffers --size 64 --spp 2 --set queries.layout=image "
@@ -79,7 +79,7 @@ def batch(work: Path) -> dict[str, Done]:
         "lonely": "preview lonely -o lonely-pictures --json",
         "settled": "preview data -o nowhere --min-cos 0.2",
         "settled too": "preview data -o nowhere --set queries.min_cos=0.2",
-        "block": "preview maps -o nowhere --block 9",
+        "block": "preview maps -o nowhere --tiles 9",
         "horizon": "preview maps -o nowhere --view 3,0",
         "below": "preview maps -o nowhere --light -3,0",
     }
@@ -171,10 +171,10 @@ def test_the_same_command_keeps_and_another_is_refused(batch: dict[str, Done], w
     assert [p["kept"] for p in report(batch["tilted"])["pictures"]] == [False] * 3
     assert [p["kept"] for p in report(batch["again"])["pictures"]] == [True] * 3
     assert batch["changed"].code == 3
-    assert "preview.block: 1 -> 2" in batch["changed"].err
-    assert "block: 1" in (work / "tilted/config.yaml").read_text()
+    assert "preview.tiles: 1 -> 2" in batch["changed"].err
+    assert "tiles: 1" in (work / "tilted/config.yaml").read_text()
     assert [p["kept"] for p in report(batch["replaced"])["pictures"]] == [False] * 3
-    assert "block: 1" in (work / "flat/config.yaml").read_text()
+    assert "tiles: 1" in (work / "flat/config.yaml").read_text()
 
 
 def test_files_of_others_stay(batch: dict[str, Done], work: Path) -> None:
@@ -210,9 +210,9 @@ def test_queries_can_be_seen_without_their_material(batch: dict[str, Done], work
     [
         ("settled", "--min-cos: data holds a data set"),
         ("settled too", "--set: data holds a data set"),
-        ("block", "--block: 'preview.block': must be at least 1 and at most 4 (given 9)"),
+        ("block", "--tiles: 'preview.tiles': must be at least 1 and at most 4 (given '9')"),
         ("horizon", "shows the horizon"),
-        ("below", "--light: elevation -3 must lie above 0"),
+        ("below", "--light: 'preview.light.elevation': must be above 0"),
     ],
 )
 def test_mistakes_are_named_before_anything_is_written(
@@ -249,9 +249,9 @@ def test_a_preview_without_drawing_is_partial_and_resumes(
 def test_a_window_without_a_display_is_one_line(work: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
-    done = finished(start(["preview", "maps", "-o", "nowhere", "--window"], work))
+    done = finished(start(["preview", "maps", "-o", "nowhere", "--interactive"], work))
     assert done.code == 3
     assert done.err == (
-        "error: --window: there is no display\n  leave it out: the pictures are written as files\n"
+        "error: --interactive: there is no display\n  leave it out: the pictures are written as files\n"
     )
     assert not (work / "nowhere").exists()

@@ -24,8 +24,8 @@ materials:
   elsewhere: nowhere/maps
 base:
   generate:
-    geometry: {height: 0.1, mesh: 16}
-    queries: {train: 100/texel, spp: 2, test: "512", test_spp: 16, levels: 2, min_cos: 0.3}
+    geometry: {height_scale: 0.1, mesh: 16}
+    queries: {train: 100/texel, spp: 2, test: "512", test_spp: 16, resolution: 4, min_cos: 0.3}
     light: {width: 10}
   each_fit:
     training: {steps: 400, batch: 512}
@@ -33,7 +33,7 @@ base:
   compare:
     views: [{elevation: 80, azimuth: -90}]
     lights: [{elevation: 50, azimuth: 40}]
-    spans: [0.5, 2]
+    tiles_across: [0.5, 2]
     size: 16
     spp: 8
     kinds: [query, pixel]
@@ -86,8 +86,8 @@ def test_every_table_has_its_numbers(made: Path) -> None:
         "neumip",
         "hierarchical",
     ]
-    assert {(r["span"], r["method"]) for r in table(made, "zooms")} == {
-        (span, r["method"]) for span in ("0.5", "2") for r in methods[:3]
+    assert {(r["tiles_across"], r["method"]) for r in table(made, "zooms")} == {
+        (tiles_across, r["method"]) for tiles_across in ("0.5", "2") for r in methods[:3]
     }
     # Pictures of 16 pixels are.
     assert [r["verdict"] for r in table(made, "independence")] == ["too small to tell"]

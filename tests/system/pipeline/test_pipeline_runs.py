@@ -143,7 +143,7 @@ def test_other_pictures_leave_data_and_fit_alone(again: Any) -> None:
 
 
 def test_a_report_that_would_be_too_large_gives_up_precision_and_says_so(again: Any, folder: Path) -> None:
-    larger = ("--set", "compare.size=256", "--set", "compare.spp=4", "--set", "compare.spans=[2, 4]")
+    larger = ("--set", "compare.size=256", "--set", "compare.spp=4", "--set", "compare.tiles_across=[2, 4]")
     assert list(again(*larger)) == ["compare", "report"]
     report = folder / "report.html"
     assert report.stat().st_size > 1.2e6
@@ -226,6 +226,6 @@ def test_cost_study_measures_reports_and_goes_on(
     # Without chains nothing can be repeated, and that is said.
     # Without a time the study's own is meant.
     flag = command.index("--time")
-    assert run(app, [*command[:flag], *command[flag + 2 :], "--narrow", "1min"]) == 0
+    assert run(app, [*command[:flag], *command[flag + 2 :], "--refine", "1min"]) == 0
     assert any("other seeds" in text for text in json.loads(capsys.readouterr().out)["skipped"])
-    assert "--time 1h --narrow 1min" in (out / "cost.html").read_text()
+    assert "--time 1h --refine 1min" in (out / "cost.html").read_text()

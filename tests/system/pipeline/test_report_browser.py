@@ -40,7 +40,7 @@ FLAGS = (
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run with two fits, two spans and both kinds of reference."""
+    """A run with two fits, two widths and both kinds of reference."""
     out = tmp_path_factory.mktemp("report") / "run"
     command = [
         sys.executable,
@@ -55,7 +55,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for assignment in (
         "fit.neumip.training={steps: 60, batch: 2048}",
         "fit.plain={model: neumip-baseline, training: {steps: 20, batch: 2048}}",
-        "compare.spans=[2, 4]",
+        "compare.tiles_across=[2, 4]",
         f"compare.size={PIXELS}",
         "compare.spp=16",
     ):
@@ -190,7 +190,7 @@ def stage(page: Page) -> Iterator[Any]:
     page.js(
         "for (const name of ['fit', 'kind', 'group'])"
         " document.querySelector(`input[name=${name}][value='0']`).click();"
-        "document.querySelector('#spans input').click(); document.getElementById('zero').click();"
+        "document.querySelector('#tiles-across input').click(); document.getElementById('zero').click();"
         "document.querySelector('input[name=map]').click()"
     )
     page.drawn(0, 0, 0)
@@ -287,7 +287,7 @@ def test_choices_change_what_is_shown(page: Page, stage: Any) -> None:
     page.drawn(1, 1, 1)
     assert matches(page.canvas("#fit"), page.expected(1, "plain"))
     choose("group", "1")
-    # The span stays the chosen one.
+    # The chosen width stays.
     page.drawn(3, 1, 1)
     assert matches(page.canvas("#fit"), page.expected(3, "plain"))
     assert "4 tiles across" in page.find("#said").text

@@ -34,7 +34,7 @@ bsdf:
 """
 CONFIG = """\
 material: heights.npy
-geometry: {height: 0.1, mesh: 64}
+geometry: {height_scale: 0.1, mesh: 64}
 queries:
   train: 400/texel
   test: 1000
@@ -45,7 +45,7 @@ seed: 7
 """
 FIT = """\
 model: neumip
-training: {time: 2min, batch: 1024, blur: {start: 4}}
+training: {time: 2min, batch: 1024, blur: {initial_sigma: 4}}
 held_out: {queries: 0.1, direction: [0.1, 0.2]}
 """
 RECIPE = """\
@@ -59,7 +59,7 @@ fit:
   b: {model: neumip-baseline}
 compare:
   views: [{elevation: 60, azimuth: 0}, {elevation: 90}]
-  spans: [1, 4]
+  tiles_across: [1, 4]
   kinds: [query]
 report: {title: "Small: a test"}
 """

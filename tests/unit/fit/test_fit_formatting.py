@@ -23,11 +23,11 @@ def errors(value: float | None, by_level: float | None) -> dict[str, Any]:
     ("value", "by_level", "remarks"),
     [
         (0.3, 0.2, []),
-        (0.3, None, ["undefined: noise hides"]),
-        (1.0, 0.2, ["above 1 the mean value alone would do better"]),
+        (0.3, None, ["undefined: the noise exceeds"]),
+        (1.0, 0.2, ["above 1: worse than the mean value"]),
         (0.99, 7.0, []),
-        (None, None, ["undefined: noise hides"]),
-        (127.0, None, ["undefined: noise hides", "above 1 the mean value"]),
+        (None, None, ["undefined: the noise exceeds"]),
+        (127.0, None, ["undefined: the noise exceeds", "above 1: worse than the mean value"]),
     ],
 )
 def test_numbers_that_surprise_are_explained(

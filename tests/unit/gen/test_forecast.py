@@ -59,7 +59,7 @@ def job_of(**queries: Any) -> Job:
     return Job.of(GeneratorConfig.model_validate({"material": "m", "queries": queries}), material)
 
 
-@pytest.mark.parametrize("options", [{}, {"layout": "image"}, {"layout": "image", "window": 12}])
+@pytest.mark.parametrize("options", [{}, {"layout": "image"}, {"layout": "image", "patch_size": 12}])
 def test_pilots_ask_in_many_directions_whatever_the_layout(options: dict[str, Any]) -> None:
     """A buffer of the image layout has one pair of directions and one footprint, however many places."""
     queries = pilot_queries(job_of(**options), 200, 1)
@@ -111,7 +111,7 @@ def test_seconds_and_noise(faked: None, layout: str) -> None:
 def test_a_target_error_decides_paths_and_seconds(faked: None) -> None:
     """All queries need the paths that bring 0.8 to 8 % of 0.25 or so, unless the cap is lower."""
     for cap, missed in ((8192, 0.0), (512, 1.0)):
-        job = job_of(train="1000000", test="20000", test_spp=64, target_error="8%", cap=cap)
+        job = job_of(train="1000000", test="20000", test_spp=64, target_error="8%", max_spp=cap)
         plan = allocated(job, plan_effects(job, pilots=False))
         found = forecast(job, plan, seconds=0.0)
         # 1600, rounded up to a power of two or three times one; less where a pilot's value is large.

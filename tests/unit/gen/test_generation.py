@@ -86,7 +86,7 @@ def test_shards_cover_the_wanted_rows(config: GeneratorConfig) -> None:
     image = Job.prepare(changed(config, queries={"layout": "image"}))
     assert [(e.file, e.rows) for e in image.shards("train")] == [(f"train-{i:05d}.npz", 1) for i in range(4)]
     # Windows of 9 places: 100 queries are twelve of them, four per shard of 40 queries.
-    windows = Job.prepare(changed(config, queries={"layout": "image", "window": 3}))
+    windows = Job.prepare(changed(config, queries={"layout": "image", "patch_size": 3}))
     assert [e.rows for e in windows.shards("train")] == [4, 4, 4]
     assert windows.queries("train") == 108
     per_texel = Job.prepare(changed(config, queries={"train": "3/texel"}))
@@ -152,7 +152,7 @@ def test_too_many_nonfinite_samples_fail_the_run_and_name_their_place(
 def test_samples_are_held_against_all_paths_that_a_target_error_may_take(config: GeneratorConfig) -> None:
     """A run is not stopped for samples that are few among its paths."""
     assert Job.prepare(config).most_paths() == Job.prepare(config).all_paths() == 320
-    aimed = Job.prepare(changed(config, queries={"target_error": 0.02, "cap": 128}))
+    aimed = Job.prepare(changed(config, queries={"target_error": 0.02, "max_spp": 128}))
     assert aimed.most_paths() == 100 * (128 + 16) + 30 * 4
 
 

@@ -96,7 +96,7 @@ def test_a_fit_without_a_model_has_the_model_of_its_name(tmp_path: Path) -> None
         (SINGLE.replace("small", "a/b"), 1, "'name'"),
         (SINGLE + "compare:\n  views:\n  - {elevation: 3}\n", 8, "at least"),
         (SINGLE + "compare: {spp: 3}\n", 6, "must be even"),
-        (SINGLE + "compare: {spans: [2, 2.0]}\n", 6, "same entry twice"),
+        (SINGLE + "compare: {tiles_across: [2, 2.0]}\n", 6, "same entry twice"),
         (SINGLE + "compare: {kinds: []}\n", 6, "at least 1"),
         (SINGLE + "report: {exposure: x}\n", 6, "must be a number"),
     ],

@@ -1,4 +1,4 @@
-"""The image layout: buffers, what is held out of them, crops, and models that see neighborhoods."""
+"""The image layout: images, what is held out of them, patches, and models that see neighborhoods."""
 
 from __future__ import annotations
 
@@ -8,17 +8,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from support.buffer_data import random_buffers, write_buffers
 from support.fit_data import constant, parallax, random_queries, write_data
+from support.image_data import random_images, write_images
 
 from mbtf_core.errors import InputError
 from mbtf_core.lattice import Lattice, sigma_of_level
 from mbtf_fit import FitConfig, Material, evaluate, fit
 from mbtf_fit.config import HeldOutSection
-from mbtf_fit.data.images import Crops, TrainingBuffers, load_buffers, nearest_shapes, strides
-from mbtf_fit.data.loader import Partition, Queries, in_region, load_split
-from mbtf_fit.evaluation import judge
-from mbtf_fit.models import Hierarchical, build_model
+from mbtf_fit.data.images import Patches, TrainingImages, nearest_shapes, strides
+from mbtf_fit.data.loader import load_split, load_training
+from mbtf_fit.data.queries import ShardQueries
+from mbtf_fit.data.split import Partition, in_region
+from mbtf_fit.evaluation import evaluate_splits
+from mbtf_fit.models.hierarchical import Hierarchical
+from mbtf_fit.models.registry import build_model
 from mbtf_fit.training.fit import prepare_trainer
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
@@ -27,30 +30,30 @@ HELD_OUT = HeldOutSection(queries=0.1, radius=0.3)
 
 
 def partition(folder: Path, held_out: HeldOutSection = HELD_OUT, seed: int = 0) -> Partition:
-    return load_buffers(Dataset.open(folder), held_out, seed)
+    return load_training(Dataset.open(folder), held_out, seed)
 
 
-def buffers_of(part: Partition) -> TrainingBuffers:
-    assert isinstance(part.training, TrainingBuffers)
+def images_of(part: Partition) -> TrainingImages:
+    assert isinstance(part.training, TrainingImages)
     return part.training
 
 
-def buffers(lattice: Lattice, levels: list[float], *, regular: bool) -> TrainingBuffers:
-    """One buffer per level; the value's first channel numbers the queries."""
-    q = random_buffers(np.random.default_rng(0), len(levels), lattice, regular=regular)
+def images(lattice: Lattice, levels: list[float], *, regular: bool) -> TrainingImages:
+    """One image per level; the value's first channel numbers the queries."""
+    q = random_images(np.random.default_rng(0), len(levels), lattice, regular=regular)
     sigma = sigma_of_level(levels).astype(np.float32)
     number = np.arange(q["sigma"].size, dtype=np.float32).reshape(q["sigma"].shape)
     value = np.stack([number, 0 * number, 0 * number], -1)
     u, light, view = q["u"], q["omega_i"][:, 0, 0], q["omega_o"][:, 0, 0]
     tensors = [torch.from_numpy(np.ascontiguousarray(a)) for a in (u, sigma, light, view, value)]
-    return TrainingBuffers(*tensors[:5], strides(lattice, sigma))  # type: ignore[arg-type,call-arg]
+    return TrainingImages(*tensors[:5], strides(lattice, sigma))  # type: ignore[arg-type,call-arg]
 
 
-def test_whole_buffers_are_held_out(tmp_path: Path) -> None:
-    folder = write_buffers(tmp_path / "d", parallax, train=60)
+def test_whole_images_are_held_out(tmp_path: Path) -> None:
+    folder = write_images(tmp_path / "d", parallax, train=60)
     many = HeldOutSection(queries=0.4, radius=0.3)
     part = partition(folder, many)
-    training = buffers_of(part)
+    training = images_of(part)
     for q in (training, part.held_out_queries):
         for omega in (q.omega_i, q.omega_o):
             assert not in_region(many, np.asarray(omega)).any()
@@ -68,28 +71,28 @@ def test_whole_buffers_are_held_out(tmp_path: Path) -> None:
     assert other != held[0]
 
 
-def test_the_sample_is_of_buffers_that_are_trained_on(tmp_path: Path) -> None:
+def test_the_sample_is_of_images_that_are_trained_on(tmp_path: Path) -> None:
     """Equally many queries of each."""
     part = partition(
-        write_buffers(tmp_path / "d", parallax, train=60), HeldOutSection(queries=0.4, radius=0.3)
+        write_images(tmp_path / "d", parallax, train=60), HeldOutSection(queries=0.4, radius=0.3)
     )
-    kept = {row.tobytes() for row in buffers_of(part).omega_i.numpy()}
+    kept = {row.tobytes() for row in images_of(part).omega_i.numpy()}
     sampled = [row.tobytes() for row in part.sample.omega_i]
     assert set(sampled) == kept
     assert len({sampled.count(k) for k in kept}) == 1
 
 
-def test_training_buffers_are_judged_by_a_quarter_of_their_sample(tmp_path: Path) -> None:
-    """Of all buffers alike: neighborhoods take their time."""
-    data = Dataset.open(write_buffers(tmp_path / "d", parallax, train=20, test=1))
-    part = load_buffers(data, HeldOutSection(queries=0.1, radius=0), 0)
-    asked: list[Queries] = []
+def test_training_images_are_judged_by_a_quarter_of_their_sample(tmp_path: Path) -> None:
+    """Of all images alike: neighborhoods take their time."""
+    data = Dataset.open(write_images(tmp_path / "d", parallax, train=20, test=1))
+    part = load_training(data, HeldOutSection(queries=0.1, radius=0), 0)
+    asked: list[ShardQueries] = []
 
-    def answer(queries: Queries) -> np.ndarray:
+    def answer(queries: ShardQueries) -> np.ndarray:
         asked.append(queries)
         return 0.5 * (queries.value_a + queries.value_b)
 
-    found = judge(answer, data, part)
+    found = evaluate_splits(answer, data, part)
     assert list(found) == ["test", "held_out_queries", "training"]
     assert found["test"].overall.n == 64
     assert found["held_out_queries"].overall.n == len(part.held_out_queries)
@@ -98,43 +101,43 @@ def test_training_buffers_are_judged_by_a_quarter_of_their_sample(tmp_path: Path
     assert len(lights) == len(np.unique(part.sample.omega_i, axis=0)) == 18
 
 
-def test_some_buffer_is_held_out_where_any_shall_be(tmp_path: Path) -> None:
-    folder = write_buffers(tmp_path / "d", parallax, train=6)
+def test_some_image_is_held_out_where_any_shall_be(tmp_path: Path) -> None:
+    folder = write_images(tmp_path / "d", parallax, train=6)
     few = HeldOutSection(queries=0.01, radius=0)
     assert len(partition(folder, few).held_out_queries) == 64
     none = partition(folder, HeldOutSection(queries=0, radius=0))
     assert len(none.held_out_queries) == len(none.held_out_directions) == 0
-    assert len(buffers_of(none)) == 6 * 64
-    with pytest.raises(InputError, match=r"all 6 buffers .* held out"):
+    assert len(images_of(none)) == 6 * 64
+    with pytest.raises(InputError, match=r"all 6 images .* held out"):
         partition(folder, HeldOutSection(radius=0.99, direction=(0.0, 0.0)))
 
 
 def test_values_are_the_mean_of_both_halves(tmp_path: Path) -> None:
-    folder = write_buffers(tmp_path / "d", parallax, train=4, noise=0.1)
-    training = buffers_of(partition(folder, HeldOutSection(queries=0, radius=0)))
+    folder = write_images(tmp_path / "d", parallax, train=4, noise=0.1)
+    training = images_of(partition(folder, HeldOutSection(queries=0, radius=0)))
     stored = Dataset.open(folder).load("train")
     np.testing.assert_allclose(training.value, 0.5 * (stored["value_a"] + stored["value_b"]), atol=1e-7)
     np.testing.assert_array_equal(training.u, stored["u"])
 
 
-def test_splits_of_buffers_are_read_as_queries(tmp_path: Path) -> None:
-    queries = load_split(Dataset.open(write_buffers(tmp_path / "d", parallax, test=3)), "test")
+def test_splits_of_images_are_read_as_queries(tmp_path: Path) -> None:
+    queries = load_split(Dataset.open(write_images(tmp_path / "d", parallax, test=3)), "test")
     assert queries.u.shape == (3 * 64, 2)
     expected = parallax(queries.u, queries.sigma, queries.omega_i, queries.omega_o)
     np.testing.assert_allclose(queries.value_a, expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("aspect", [1.0, 0.5, 0.3])
-def test_neighbors_in_a_crop_are_a_texel_of_their_level_apart(aspect: float) -> None:
+def test_neighbors_in_a_patch_are_a_texel_of_their_level_apart(aspect: float) -> None:
     lattice = Lattice(4, aspect)
     rows, _ = lattice.shape()
-    data = buffers(lattice, [0.0, 1.4, 2.6, 4.0], regular=True)
-    crops = data.crop(np.arange(4), np.array([[0, 0], [1, 3], [rows - 1, 2], [2, 15]]), 5, 2)
-    assert crops.u.shape == (4, 9, 9, 2)
-    assert crops.value.shape == (4, 5, 5, 3)
+    data = images(lattice, [0.0, 1.4, 2.6, 4.0], regular=True)
+    patches = data.patches(np.arange(4), np.array([[0, 0], [1, 3], [rows - 1, 2], [2, 15]]), 5, 2)
+    assert patches.u.shape == (4, 9, 9, 2)
+    assert patches.value.shape == (4, 5, 5, 3)
     for item, level in enumerate((0, 1, 3, 4)):
         down, across = lattice.shape(level)
-        step = crops.u[item, 1:, 1:] - crops.u[item, :-1, :-1]
+        step = patches.u[item, 1:, 1:] - patches.u[item, :-1, :-1]
         step = (step + 0.5) % 1 - 0.5  # around the tile
         expected = torch.tensor([1 / across, -round(rows / down) / rows])
         torch.testing.assert_close((step - expected + 0.5) % 1 - 0.5, torch.zeros(8, 8, 2), atol=1e-6, rtol=0)
@@ -142,16 +145,16 @@ def test_neighbors_in_a_crop_are_a_texel_of_their_level_apart(aspect: float) -> 
 
 def test_values_belong_to_the_places_within_the_margin() -> None:
     lattice = Lattice(3)
-    data = buffers(lattice, [3.0, 2.0], regular=False)
-    crops = data.crop(np.array([1, 0]), np.array([[5, 7], [2, 2]]), 4, 3)
-    number = crops.value[..., 0].long()
-    torch.testing.assert_close(crops.u[:, 3:-3, 3:-3], data.u.view(-1, 2)[number])
+    data = images(lattice, [3.0, 2.0], regular=False)
+    patches = data.patches(np.array([1, 0]), np.array([[5, 7], [2, 2]]), 4, 3)
+    number = patches.value[..., 0].long()
+    torch.testing.assert_close(patches.u[:, 3:-3, 3:-3], data.u.view(-1, 2)[number])
     assert number[0, 0, 0] == 64 + 5 * 8 + 7
     assert number[0, 1, 1] == 64 + 7 * 8 + (7 + 2) % 8
 
 
-def test_batches_take_every_buffer_and_resume_anywhere() -> None:
-    data = buffers(Lattice(3), [1.0, 2.0, 3.0, 2.5, 0.5], regular=False)
+def test_batches_take_every_image_and_resume_anywhere() -> None:
+    data = images(Lattice(3), [1.0, 2.0, 3.0, 2.5, 0.5], regular=False)
     batches = list(islice(data.batches(32, 7, 0, 4), 10))
     assert all(len(b) == 1 and b.value.shape == (1, 6, 6, 3) for b in batches)
     seen = [float(b.sigma[0]) for b in batches]
@@ -163,50 +166,50 @@ def test_batches_take_every_buffer_and_resume_anywhere() -> None:
     assert len(many.sigma.unique()) == 5
 
 
-def windows(lattice: Lattice, size: int, count: int) -> TrainingBuffers:
+def patches_of_size(lattice: Lattice, size: int, count: int) -> TrainingImages:
     """Windows as the generator draws them; the value's first channel numbers the queries."""
-    q = QueryPlan(lattice, Mixture(1, 0), 0.2, "image", 3, count, window=size).draw("train", 0, count)
+    q = QueryPlan(lattice, Mixture(1, 0), 0.2, "image", 3, count, patch_size=size).draw("train", 0, count)
     sigma = q.sigma[:, 0, 0]
     number = np.arange(q.sigma.size, dtype=np.float32).reshape(q.sigma.shape)
     value = np.stack([number, 0 * number, 0 * number], -1)
     arrays = (q.u, sigma, q.omega_i[:, 0, 0], q.omega_o[:, 0, 0], value)
     tensors = [torch.from_numpy(np.ascontiguousarray(a)) for a in arrays]
     ones = np.ones((count, 2), np.int64)
-    return TrainingBuffers(*tensors[:5], ones, nearest_shapes(lattice, sigma))  # type: ignore[arg-type,call-arg]
+    return TrainingImages(*tensors[:5], ones, nearest_shapes(lattice, sigma))  # type: ignore[arg-type,call-arg]
 
 
-def test_crops_of_windows_go_on_beyond_their_border() -> None:
+def test_patches_go_on_beyond_their_border() -> None:
     lattice = Lattice(4, 0.5)
-    data = windows(lattice, 6, 30)
+    data = patches_of_size(lattice, 6, 30)
     origin = np.array([[k % 3, k // 3 % 3] for k in range(30)])
-    crops = data.crop(np.arange(30), origin, 4, 3)
-    assert crops.u.shape == (30, 10, 10, 2)
-    number = crops.value[..., 0].long()
+    patches = data.patches(np.arange(30), origin, 4, 3)
+    assert patches.u.shape == (30, 10, 10, 2)
+    number = patches.value[..., 0].long()
     assert number[5, 0, 0] == 5 * 36 + 2 * 6 + 1
     assert number[5, 1, 3] == 5 * 36 + 3 * 6 + 4
-    apart = crops.u[:, 3:7, 3:7] - data.u.view(-1, 2)[number]
+    apart = patches.u[:, 3:7, 3:7] - data.u.view(-1, 2)[number]
     torch.testing.assert_close(apart, apart.round(), atol=1e-6, rtol=0)
     for item in range(30):
-        rows, columns = nearest_shapes(lattice, crops.sigma[item : item + 1].numpy())[0]
-        step = crops.u[item, 1:, 1:] - crops.u[item, :-1, :-1] - torch.tensor([1 / columns, -1 / rows])
+        rows, columns = nearest_shapes(lattice, patches.sigma[item : item + 1].numpy())[0]
+        step = patches.u[item, 1:, 1:] - patches.u[item, :-1, :-1] - torch.tensor([1 / columns, -1 / rows])
         torch.testing.assert_close(step, step.round().to(step.dtype), atol=1e-6, rtol=0)
 
 
-def test_windows_are_read_with_the_grids_that_they_lie_on(tmp_path: Path) -> None:
-    folder = write_buffers(tmp_path / "d", parallax, train=20, finest=4, aspect=0.5, window=5)
-    data = buffers_of(partition(folder, HeldOutSection(queries=0, radius=0)))
+def test_patches_are_read_with_the_grids_that_they_lie_on(tmp_path: Path) -> None:
+    folder = write_images(tmp_path / "d", parallax, train=20, finest=4, aspect=0.5, patch_size=5)
+    data = images_of(partition(folder, HeldOutSection(queries=0, radius=0)))
     assert data.u.shape == (20, 5, 5, 2)
-    crops = data.crop(np.arange(20), np.ones((20, 2), np.int64), 3, 2)
-    torch.testing.assert_close(crops.value, data.value[:, 1:4, 1:4])
+    patches = data.patches(np.arange(20), np.ones((20, 2), np.int64), 3, 2)
+    torch.testing.assert_close(patches.value, data.value[:, 1:4, 1:4])
     shapes = nearest_shapes(Lattice(4, 0.5), data.sigma.numpy())
     assert len(np.unique(shapes, axis=0)) > 3
-    for u, (rows, columns) in zip(crops.u, shapes, strict=True):
+    for u, (rows, columns) in zip(patches.u, shapes, strict=True):
         step = u[1:, 1:] - u[:-1, :-1] - torch.tensor([1 / columns, -1 / rows])
         torch.testing.assert_close(step, step.round().to(step.dtype), atol=1e-6, rtol=0)
 
 
-def test_batches_cut_windows_within_them() -> None:
-    data = windows(Lattice(4), 6, 8)
+def test_batches_cut_patches_within_images() -> None:
+    data = patches_of_size(Lattice(4), 6, 8)
     for batch in islice(data.batches(2 * 16, 0, 0, 2), 20):
         assert batch.value.shape == (1, 6, 6, 3)
     seen = set()
@@ -218,25 +221,27 @@ def test_batches_cut_windows_within_them() -> None:
     assert seen == {6 * j + i for j in range(3) for i in range(3)}
 
 
-@pytest.mark.parametrize("window", [None, 6])
-def test_smaller_crops_make_batches_of_more_lights_and_views(tmp_path: Path, window: int | None) -> None:
-    folder = write_buffers(tmp_path / "d", constant(0.1), train=40, window=window)
-    for crop, shape in ((2, (16, 2, 2, 3)), (4, (4, 4, 4, 3))):
-        training = {"steps": 1, "batch": 64, "crop": crop}
+@pytest.mark.parametrize("patch_size", [None, 6])
+def test_smaller_patches_make_batches_of_more_lights_and_views(
+    tmp_path: Path, patch_size: int | None
+) -> None:
+    folder = write_images(tmp_path / "d", constant(0.1), train=40, patch_size=patch_size)
+    for patch, shape in ((2, (16, 2, 2, 3)), (4, (4, 4, 4, 3))):
+        training = {"steps": 1, "batch": 64, "patch_size": patch}
         config = FitConfig.model_validate({"model": "hierarchical", "training": training})
         data = Dataset.open(folder)
-        part = load_buffers(data, config.held_out, 0)
+        part = load_training(data, config.held_out, 0)
         batch = next(prepare_trainer(config, data, part, torch.device("cpu"))._batches())
-        assert isinstance(batch, Crops)
+        assert isinstance(batch, Patches)
         assert batch.value.shape == shape
         assert len(batch.omega_i.unique(dim=0)) == shape[0]
 
 
-@pytest.mark.parametrize("cut", ["whole", "windows"])
+@pytest.mark.parametrize("cut", ["whole", "patch_sizes"])
 @pytest.mark.parametrize("aspect", [1.0, 0.5])
 @pytest.mark.parametrize("decoder", ["inception", "mlp"])
-def test_training_and_evaluation_agree_on_regular_buffers(aspect: float, decoder: str, cut: str) -> None:
-    """The answer of a crop is that of its queries one by one, in any order."""
+def test_training_and_evaluation_agree_on_regular_images(aspect: float, decoder: str, cut: str) -> None:
+    """The answer of a patch is that of its queries one by one, in any order."""
     lattice = Lattice(4, aspect)
     model = build_model("hierarchical", lattice, decoder=decoder)
     assert isinstance(model, Hierarchical)
@@ -244,29 +249,31 @@ def test_training_and_evaluation_agree_on_regular_buffers(aspect: float, decoder
     torch.nn.init.normal_(model.pyramid.texels, generator=torch.Generator().manual_seed(1))
     torch.nn.init.normal_(model.offset_texture.texels, generator=torch.Generator().manual_seed(2))
     whole = cut == "whole"
-    data = buffers(lattice, [4.0, 3.0, 2.3, 1.0, 0.0], regular=True) if whole else windows(lattice, 6, 5)
+    data = (
+        images(lattice, [4.0, 3.0, 2.3, 1.0, 0.0], regular=True) if whole else patches_of_size(lattice, 6, 5)
+    )
     m = model.margin
     origin = np.array([[0, 0], [3, 9], [1, 1], [7, 15], [5, 2]]) if whole else np.zeros((5, 2), np.int64)
-    crops = data.crop(np.arange(5), origin, 6, m)
+    patches = data.patches(np.arange(5), origin, 6, m)
     with torch.no_grad():
-        together = model.crops(crops.u, crops.sigma, crops.omega_i, crops.omega_o)
+        together = model.evaluate_patches(patches.u, patches.sigma, patches.omega_i, patches.omega_o)
         order = torch.randperm(5 * 36)
         item = order // 36
-        u = crops.u[:, m : m + 6, m : m + 6].reshape(-1, 2)[order]
-        alone = model(u, crops.sigma[item], crops.omega_i[item], crops.omega_o[item])
+        u = patches.u[:, m : m + 6, m : m + 6].reshape(-1, 2)[order]
+        alone = model(u, patches.sigma[item], patches.omega_i[item], patches.omega_o[item])
     assert together.shape == (5, 6, 6, 3)
     assert together.std() > 0.01
     torch.testing.assert_close(alone, together.reshape(-1, 3)[order], rtol=2e-3, atol=1e-5)
 
 
-def test_models_without_neighborhoods_answer_crops_place_by_place() -> None:
+def test_models_without_neighborhoods_answer_patches_place_by_place() -> None:
     lattice = Lattice(3)
     model = build_model("neumip", lattice)
     model.initialize(torch.Generator().manual_seed(0), 0.1)
-    crops = buffers(lattice, [3.0, 2.0], regular=False).crop(np.arange(2), np.zeros((2, 2), int), 4, 0)
+    patches = images(lattice, [3.0, 2.0], regular=False).patches(np.arange(2), np.zeros((2, 2), int), 4, 0)
     with torch.no_grad():
-        found = model.crops(crops.u, crops.sigma, crops.omega_i, crops.omega_o)
-        one = model(crops.u[1, 2, 3:4], crops.sigma[1:], crops.omega_i[1:], crops.omega_o[1:])
+        found = model.evaluate_patches(patches.u, patches.sigma, patches.omega_i, patches.omega_o)
+        one = model(patches.u[1, 2, 3:4], patches.sigma[1:], patches.omega_i[1:], patches.omega_o[1:])
     torch.testing.assert_close(found[1, 2, 3], one[0])
 
 
@@ -281,7 +288,7 @@ def quick(steps: int, **network: object) -> FitConfig:
 
 
 def test_a_hierarchical_material_is_fitted_and_loads_again(tmp_path: Path) -> None:
-    folder = write_buffers(tmp_path / "d", parallax, train=300, test=20, noise=0.005)
+    folder = write_images(tmp_path / "d", parallax, train=300, test=20, noise=0.005)
     result = fit(quick(200), folder, tmp_path / "m")
     assert result.errors["test"]["unexplained"]["value"] < 0.4
     material = Material.load(tmp_path / "m")
@@ -301,6 +308,6 @@ def test_the_other_layout_is_refused_with_the_cure(tmp_path: Path) -> None:
     shuffled = write_data(tmp_path / "s", constant(0.1), train=100)
     with pytest.raises(InputError, match=r"shuffled layout, but hierarchical .*\n.*--layout image"):
         fit(quick(1), shuffled, tmp_path / "m")
-    image = write_buffers(tmp_path / "d", constant(0.1), train=4)
+    image = write_images(tmp_path / "d", constant(0.1), train=4)
     with pytest.raises(InputError, match=r"image layout, but neumip .*\n.*--layout shuffled"):
         fit(FitConfig(), image, tmp_path / "m")

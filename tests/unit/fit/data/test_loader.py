@@ -11,15 +11,9 @@ from support.fit_data import constant, parallax, write_data
 
 from mbtf_core.errors import InputError
 from mbtf_fit.config import HeldOutSection
-from mbtf_fit.data.loader import (
-    Partition,
-    Queries,
-    batch_starts,
-    in_region,
-    load_split,
-    load_training,
-    open_data,
-)
+from mbtf_fit.data.loader import load_split, load_training, open_data
+from mbtf_fit.data.queries import ShardQueries, batch_starts
+from mbtf_fit.data.split import Partition, in_region
 from mbtf_gen.dataset.reader import Dataset
 
 HELD_OUT = HeldOutSection(queries=0.1, radius=0.3)
@@ -35,7 +29,7 @@ def rows(*arrays: np.ndarray) -> set[bytes]:
     return {row.tobytes() for row in flat}
 
 
-def keys(part: Queries) -> set[bytes]:
+def keys(part: ShardQueries) -> set[bytes]:
     return rows(part.u, part.sigma, part.omega_i)
 
 

@@ -13,7 +13,8 @@ import mbtf_fit.evaluation
 from mbtf_core.errors import InputError
 from mbtf_core.sizes import format_size, parse_size
 from mbtf_fit.config import FitConfig, HeldOutSection
-from mbtf_fit.data.loader import Partition, load_training
+from mbtf_fit.data.loader import load_training
+from mbtf_fit.data.split import Partition
 from mbtf_fit.data.streaming import Selection, StreamedQueries
 from mbtf_fit.evaluation import Predict, SplitErrors
 from mbtf_fit.training.fit import fit
@@ -60,13 +61,13 @@ def test_evaluation_leaves_training_queries_on_disk(
         {"training": {"steps": 2, "batch": 500}, "held_out": held_out, "seed": 3}
     )
     result = fit(config, folder, tmp_path / "m")
-    judged, found = mbtf_fit.evaluation.judge, []
+    judged, found = mbtf_fit.evaluation.evaluate_splits, []
 
     def watched(predict: Predict, data: Dataset, partition: Partition) -> dict[str, SplitErrors]:
         found.append(partition.training)
         return judged(predict, data, partition)
 
-    monkeypatch.setattr(mbtf_fit.evaluation, "judge", watched)
+    monkeypatch.setattr(mbtf_fit.evaluation, "evaluate_splits", watched)
     evaluated = mbtf_fit.evaluation.evaluate(result.material, folder).values
     errors = {name: e.as_dict() for name, e in evaluated.items()}
     assert isinstance(found[0], StreamedQueries)

@@ -17,7 +17,7 @@ from mbtf_fit import FitConfig, Material
 from mbtf_fit.material.export import to_half, write_layers, write_textures
 from mbtf_fit.material.material import export
 from mbtf_fit.material.transmittance import Transmittance
-from mbtf_fit.models import build_model
+from mbtf_fit.models.registry import build_model
 
 F64 = NDArray[np.float64]
 CASES: dict[str, tuple[str, dict[str, Any]]] = {
@@ -25,12 +25,15 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "calibrated": ("neumip", {}),
     "with holes": ("neumip", {}),
     "neumip": ("neumip", {}),
-    "direct, six outputs": ("neumip", {"offset": "direct", "outputs": 6, "activation": "leaky-relu"}),
-    "side by side, sine": ("neumip", {"blending": "concatenate", "activation": "sine", "output": "softplus"}),
+    "direct, six outputs": ("neumip", {"offset": "direct", "output_channels": 6, "activation": "leaky-relu"}),
+    "side by side, sine": (
+        "neumip",
+        {"blending": "concatenate", "activation": "sine", "output_transform": "softplus"},
+    ),
     "hierarchical": ("hierarchical", {}),
     "eleven channels": (
         "hierarchical",
-        {"decoder": "mlp", "channels": 11, "encoding": {"raw": True, "lifted": True}},
+        {"decoder": "mlp", "channels": 11, "encoding": {"raw": True, "direction_xyz": True}},
     ),
     "encoded": (
         "neumip",
@@ -40,8 +43,8 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
                 "direction": 2,
                 "direction_pi": False,
                 "raw": True,
-                "damped": True,
-                "filtered": True,
+                "band_attenuation": True,
+                "footprint_filtered": True,
             }
         },
     ),
@@ -63,8 +66,8 @@ def make(case: str, folder: Path, scale: float = 1.0) -> Material:
     model.requires_grad_(False)
     lattice, holes = model.lattice, None
     if case == "calibrated":
-        gain = 0.7 + 0.6 * torch.rand((2, lattice.finest + 1, 6, 3), generator=generator)
-        model.load_weights(model.weights() | {"gain": gain})
+        calibration = 0.7 + 0.6 * torch.rand((2, lattice.finest + 1, 6, 3), generator=generator)
+        model.load_weights(model.weights() | {"calibration": calibration})
     if case == "with holes":
         shapes = [(*lattice.shape(s), 6) for s in range(lattice.finest + 1)]
         holes = Transmittance(
@@ -72,7 +75,7 @@ def make(case: str, folder: Path, scale: float = 1.0) -> Material:
         )
     folder.mkdir(parents=True, exist_ok=True)
     training = {"steps": 1, "batch": 1, "seconds": 0.0, "device": "cpu", "threads": 1, "errors": {}}
-    return export(model, config, folder, data={}, training=training, holes=holes)
+    return export(model, config, folder, data={}, training=training, transmittance=holes)
 
 
 class Reader:
@@ -136,7 +139,7 @@ class Reader:
         doubling = 2.0 ** np.arange(options[kind])
         frequency = doubling * (np.pi if options["pi" if kind == "position" else "direction_pi"] else 1)
         angle = (p[..., None] * frequency).reshape(*p.shape[:-1], -1)
-        left: Any = np.tile(1 / doubling, p.shape[-1]) if options["damped"] else 1.0
+        left: Any = np.tile(1 / doubling, p.shape[-1]) if options["band_attenuation"] else 1.0
         if spread is not None:
             left = left * np.exp(-((spread[..., None] * frequency) ** 2) / 2).reshape(*spread.shape[:-1], -1)
         parts = [left * np.sin(angle), left * np.cos(angle)]
@@ -176,18 +179,20 @@ class Reader:
         if encoding["position"]:
             p = 2 * (places - np.floor(places)) - 1
             spread = 2.0 ** -level[:, None, None, None] / [1, document["tile"]["aspect"]]
-            encoded = self.encoded(p, "position", encoding, spread if encoding["filtered"] else None)
+            encoded = self.encoded(
+                p, "position", encoding, spread if encoding["footprint_filtered"] else None
+            )
             features = np.concatenate([features, encoded], -1)
-        size = 3 if encoding["lifted"] else 2
+        size = 3 if encoding["direction_xyz"] else 2
         lights = [self.encoded(o[:, :size], "direction", encoding) for o in (omega_i, omega_o)]
         shared = np.concatenate(lights, -1)[:, None, None]
         x = np.concatenate([features, np.broadcast_to(shared, (*features.shape[:3], shared.shape[-1]))], -1)
         x = self.inception(x) if inception else self.network("decoder", x)
-        return self.output(x[:, 0, 0], options) * self.gain(level, omega_i, omega_o)
+        return self.output(x[:, 0, 0], options) * self.calibration(level, omega_i, omega_o)
 
-    def gain(self, level: F64, omega_i: F64, omega_o: F64) -> F64:
+    def calibration(self, level: F64, omega_i: F64, omega_o: F64) -> F64:
         total = np.ones((len(level), 3))
-        for table, omega in zip(self.document.get("gain", []), (omega_i, omega_o), strict=False):
+        for table, omega in zip(self.document.get("calibration", []), (omega_i, omega_o), strict=False):
             knots = np.array(table)
             cosines = np.arange(knots.shape[1]) / (knots.shape[1] - 1)
             low = np.minimum(np.floor(level).astype(int), len(knots) - 2)
@@ -224,15 +229,15 @@ class Reader:
 
     def output(self, x: F64, options: dict[str, Any]) -> F64:
         gate: Any = 1.0
-        if options["outputs"] == 6:
+        if options["output_channels"] == 6:
             gate = 0.1 + 1 / (1 + np.exp(-x[:, 3:]))
             y, b, r = x[:, 0], x[:, 1], x[:, 2]
             x = np.stack([y + 1.13983 * r, y - 0.39465 * b - 0.5806 * r, y + 2.03211 * b], -1)
         value = {
-            "exp-1": np.expm1,
+            "expm1": np.expm1,
             "fourth-root": lambda v: v * np.abs(v) ** 3,
             "softplus": lambda v: np.log1p(np.exp(v)),
-        }[options["output"]](x)
+        }[options["output_transform"]](x)
         return np.asarray(np.maximum(self.document["unit"] * value * gate, 0))
 
 
@@ -251,7 +256,7 @@ def test_textures_and_layers_suffice(case: str, half: bool, tmp_path: Path) -> N
     found = reader.value(material.config.network.model_dump())
     np.testing.assert_allclose(found, expected, rtol=2e-3, atol=1e-5)
     assert (expected.astype(np.float32) == material.conformance["rgb"]).all() != half
-    assert ("gain" in reader.document["formula"]) == (case == "calibrated")
+    assert ("calibration" in reader.document["formula"]) == (case == "calibrated")
     assert ("transmittance" in reader.document) == (case == "with holes")
     if case == "with holes":
         assert reader.document["textures"]["parts"]["transmittance.4"]["channels"][0] == "c0"
@@ -259,8 +264,8 @@ def test_textures_and_layers_suffice(case: str, half: bool, tmp_path: Path) -> N
         assert through.std() > 0.1
         np.testing.assert_allclose(reader.transmittance(), through, atol=2e-5)
         queries = (material.conformance[k] for k in ("u", "sigma", "omega_o"))
-        assert material.holes is not None
-        assert (material.holes.evaluate(*queries) == through.astype(np.float32)).all() != half
+        assert material.transmittance is not None
+        assert (material.transmittance.evaluate(*queries) == through.astype(np.float32)).all() != half
 
 
 def test_half_precision_states_its_error(tmp_path: Path) -> None:

@@ -122,7 +122,7 @@ def test_stored_weights_and_formula_suffice(fitted: FitResult) -> None:
     x = network("decoder", np.concatenate([features, omega_i[:, :2], omega_o[:, :2]], 1))
     rgb = np.maximum(weights["unit"] * np.expm1(x), 0)
     low = np.minimum(low, finest - 1)
-    for table, omega in zip(weights["gain"], (omega_i, omega_o), strict=True):
+    for table, omega in zip(weights["calibration"], (omega_i, omega_o), strict=True):
         cosines = np.linspace(0, 1, table.shape[1])
         for c in range(3):
             at = np.stack([np.interp(omega[:, 2], cosines, row[:, c]) for row in table])
@@ -199,7 +199,7 @@ def test_damaged_materials_are_refused(fitted: FitResult, tmp_path: Path) -> Non
     content = bytearray(weights.read_bytes())
     content[-1] ^= 1
     weights.write_bytes(content)
-    with pytest.raises(InputError, match="not the file"):
+    with pytest.raises(InputError, match="SHA-256 differs"):
         Material.load(tmp_path)
     description = json.loads((tmp_path / "material.json").read_text())
     (tmp_path / "material.json").write_text(json.dumps({**description, "schema": 99}))
@@ -245,7 +245,7 @@ def test_the_history_records_the_training(fitted: FitResult) -> None:
     history = read_history(fitted.folder)
     assert history == fitted.history
     assert history[-1]["step"] == 30
-    assert history[-1]["share"] == 1.0
+    assert history[-1]["fraction"] == 1.0
     assert {"seconds", "loss", "unexplained", "unexplained_error", "queries_per_second"} <= set(history[-1])
 
 

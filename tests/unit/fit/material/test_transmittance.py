@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.buffer_data import write_buffers
 from support.damage import check_message
 from support.fit_data import constant, random_queries, write_data
+from support.image_data import write_images
 from support.plugin_materials import write_material
 
 from mbtf_core.errors import InputError
@@ -22,7 +22,7 @@ from mbtf_fit.evaluation import evaluate
 from mbtf_fit.formatting import describe_transmittance
 from mbtf_fit.material.format import read_description
 from mbtf_fit.material.transmittance import TRANSMITTANCE_NAME, Transmittance, read_transmittance
-from mbtf_fit.material.transmittance_fit import fit_transmittance, judge_transmittance
+from mbtf_fit.material.transmittance_fit import evaluate_transmittance, fit_transmittance
 from mbtf_fit.training.fit import fit
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.dataset.shard_io import read_shard, write_shard
@@ -56,9 +56,9 @@ def test_a_known_transmittance_is_found(tmp_path: Path) -> None:
     assert np.sqrt(np.mean((found - wanted)[fine] ** 2)) < 0.02
 
 
-@pytest.mark.parametrize("window", [None, 4])
-def test_buffers_tell_the_same(tmp_path: Path, window: int | None) -> None:
-    folder = write_buffers(tmp_path, constant(0.2), train=1500, through=lace, window=window)
+@pytest.mark.parametrize("patch_size", [None, 4])
+def test_images_tell_the_same(tmp_path: Path, patch_size: int | None) -> None:
+    folder = write_images(tmp_path, constant(0.2), train=1500, through=lace, patch_size=patch_size)
     data = Dataset.open(folder)
     model = fit_transmittance(data, chosen(data))
     assert model is not None
@@ -98,7 +98,7 @@ def test_a_fit_writes_it_beside_the_weights_and_only_for_holes(tmp_path: Path) -
     content = bytearray(path.read_bytes())
     content[-1] ^= 1
     path.write_bytes(content)
-    with pytest.raises(InputError, match="not the file that") as caught:
+    with pytest.raises(InputError, match="is missing, or its SHA-256") as caught:
         read_transmittance(tmp_path / "b", description)
     check_message(caught.value)
 
@@ -125,17 +125,17 @@ def test_passes_over_the_data_change_nothing_but_memory(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("layout", ["shuffled", "image"])
 def test_what_is_held_out_is_judged_and_not_fitted(layout: str, tmp_path: Path) -> None:
-    """Where held-out rows say something else, the fit does not know, and its error there says so."""
+    """Where held-out rows say something else, the fit does not support, and its error there says so."""
     held_out = HeldOutSection(queries=0.2, radius=0.15)
     if layout == "image":
-        write_buffers(tmp_path, constant(0.2), train=400, through=lace)
+        write_images(tmp_path, constant(0.2), train=400, through=lace)
     else:
         write_data(tmp_path, constant(0.2), train=40_000, finest=3, through=lace)
     data = Dataset.open(tmp_path)
     selection = chosen(data, held_out)
     before = fit_transmittance(data, selection)
     assert before is not None
-    honest = judge_transmittance(before, data, selection)
+    honest = evaluate_transmittance(before, data, selection)
     for path, mask in selection.masks():
         arrays = dict(read_shard(path, mapped=False))
         assert 0.1 < (~mask).mean() < 0.6
@@ -146,7 +146,7 @@ def test_what_is_held_out_is_judged_and_not_fitted(layout: str, tmp_path: Path) 
     assert after is not None
     for mine, theirs in zip(before.levels, after.levels, strict=True):
         np.testing.assert_array_equal(mine, theirs)
-    judged = judge_transmittance(after, data, selection)
+    judged = evaluate_transmittance(after, data, selection)
     assert judged["held_out"].mse.value == pytest.approx(0.25, rel=0.1)
     for name in ("training", "test"):
         assert judged[name].mse == honest[name].mse
@@ -187,10 +187,12 @@ def test_errors_hold_the_noise_of_the_data_and_say_how_much(tmp_path: Path) -> N
 
 
 def test_a_description_that_does_not_say_which_file_is_refused(tmp_path: Path) -> None:
-    write_material(tmp_path, finest=0, holes=Transmittance(Lattice(0), [np.zeros((1, 1, 6), np.float32)]))
+    write_material(
+        tmp_path, finest=0, transmittance=Transmittance(Lattice(0), [np.zeros((1, 1, 6), np.float32)])
+    )
     whole = json.loads((tmp_path / "material.json").read_text())
     for holes in ({}, [], "x", {"sha256": 5}):
-        (tmp_path / "material.json").write_text(json.dumps(whole | {"holes": holes}))
+        (tmp_path / "material.json").write_text(json.dumps(whole | {"transmittance": holes}))
         with pytest.raises(InputError, match="is damaged") as caught:
             read_transmittance(tmp_path, read_description(tmp_path)[0])
         check_message(caught.value)

@@ -16,7 +16,7 @@ from support.scenes import mi
 import mbtf_fit.mitsuba_plugin
 from mbtf_core.config_file import resolve
 from mbtf_core.directions import from_angles
-from mbtf_core.errors import InputError, UsageError
+from mbtf_core.errors import UsageError
 from mbtf_fit.mitsuba_plugin.preview.config import PreviewConfig, SheetSection, TurntableSection
 from mbtf_gen.config.pictures import Direction
 from mbtf_gen.pictures.camera import Camera
@@ -31,7 +31,7 @@ from mbtf_fit.mitsuba_plugin.preview import sheet, turntable  # noqa: E402
 SECTION = SheetSection(
     views=[Direction(elevation=70, azimuth=-90), Direction(elevation=35, azimuth=20)],
     lights=[Direction(elevation=60, azimuth=0), Direction(elevation=30, azimuth=120)],
-    spans=[0.5, 2.0, 9.0],
+    tiles_across=[0.5, 2.0, 9.0],
     size=64,
 )
 
@@ -46,7 +46,7 @@ def test_every_picture_stands_at_its_view_light_and_width(tmp_path: Path) -> Non
     pitch = 64 + sheet.GAP
     for view, light, row in np.ndindex(2, 2, 3):
         v, i = SECTION.views[view], SECTION.lights[light]
-        camera = Camera(v.elevation, v.azimuth, SECTION.spans[row], (0.5, 1.0), 64, 64)
+        camera = Camera(v.elevation, v.azimuth, SECTION.tiles_across[row], (0.5, 1.0), 64, 64)
         queries = camera.queries(from_angles(i.elevation, i.azimuth), 2.0).flat()
         wanted = material.predict(queries).reshape(64, 64, 3)  # type: ignore[arg-type]
         np.testing.assert_allclose(values[view, light, row], wanted, rtol=1e-3, atol=1e-4)
@@ -131,24 +131,34 @@ def test_options_that_make_no_sense_are_refused() -> None:
     for key, value, fault in (
         ("sheet.size", 2000, "pixels; take smaller or fewer"),
         ("turntable.frames", 0, "turntable.frames"),
-        ("sheet.spans", [], "sheet.spans"),
+        ("sheet.tiles_across", [], "sheet.tiles_across"),
         ("sheet.view", 3, "did you mean 'views'"),
     ):
         flags = {"material": "m", key: value}
         if key == "sheet.size":
-            flags["sheet.spans"] = [1.0, 2.0, 3.0]
+            flags["sheet.tiles_across"] = [1.0, 2.0, 3.0]
         with pytest.raises(UsageError, match=fault) as caught:
             resolve(PreviewConfig, flags=flags)
         check_message(caught.value)
 
 
-def test_a_folder_that_is_no_material_is_refused_before_anything_is_made(tmp_path: Path) -> None:
-    from mbtf_fit.mitsuba_plugin.preview.command import preview
+def test_a_folder_that_is_no_material_is_refused_before_anything_is_made(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from mbtf_core.console import run
+    from mbtf_fit.cli.app import app
 
-    with pytest.raises(InputError, match=r"no material\.json"):
-        preview(tmp_path, output=tmp_path / "out")
+    for code, what, *words in (
+        (3, "no material.json", str(tmp_path), "-o", str(tmp_path / "out")),
+        (
+            2,
+            "--tiles-across: 'sheet.tiles_across': must be numbers",
+            "m",
+            "--tiles-across",
+            "1;2",
+        ),
+        (2, "no material given"),
+    ):
+        assert run(app, ["preview", *words]) == code
+        assert what in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
-    with pytest.raises(UsageError, match="must be numbers separated by commas"):
-        preview(tmp_path, spans="1;2")
-    with pytest.raises(UsageError, match="no material given"):
-        preview()

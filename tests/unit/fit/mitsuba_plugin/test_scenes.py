@@ -22,7 +22,7 @@ from mbtf_gen.pictures.camera import Camera
 
 LIGHT = from_angles(40.0, 20.0)
 # A narrow view: differentials, which the footprint comes from, are differences over a pixel.
-CAMERA = Camera(50.0, -70.0, span=1.3, target=(0.3, 0.6), rows=24, columns=32, field_of_view=8.0)
+CAMERA = Camera(50.0, -70.0, tiles_across=1.3, target=(0.3, 0.6), rows=24, columns=32, field_of_view=8.0)
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def test_a_plane_equals_the_material_at_the_pixels_queries(
 ) -> None:
     """Positions, footprints, directions, orientation of the tile: all of them, at all distances."""
     folder, fitted = material
-    camera = Camera(**{**CAMERA.__dict__, "span": CAMERA.span * zoom})
+    camera = Camera(**{**CAMERA.__dict__, "tiles_across": CAMERA.tiles_across * zoom})
     wanted = fitted.predict(camera.queries(LIGHT, fitted.lattice.aspect).flat())  # type: ignore[arg-type]
     found = shown(plane(bsdf(folder), aspect=fitted.lattice.aspect), camera)
     assert wanted.std() > 0.03 * wanted.mean()
@@ -105,7 +105,7 @@ def test_more_samples_per_pixel_do_not_narrow_the_footprint(tmp_path: Path) -> N
 
     levels = {f"pyramid.{s}": torch.full((2**s, 2**s, 7), 0.5 * s) for s in range(5)}
     fitted = write_material(tmp_path, model="neumip-baseline", finest=4, weights=levels)
-    camera = Camera(elevation=70.0, span=3.0, rows=8, columns=8)
+    camera = Camera(elevation=70.0, tiles_across=3.0, rows=8, columns=8)
     wanted = fitted.predict(camera.queries(LIGHT).flat()).mean()  # type: ignore[arg-type]
     at_double = camera.queries(LIGHT).flat()
     narrower = fitted.evaluate(at_double.u, at_double.sigma / 4, at_double.omega_i, at_double.omega_o).mean()
@@ -133,8 +133,8 @@ def test_a_cone_goes_on_through_a_hole_as_if_it_were_not_there(tmp_path: Path, s
     texel = np.zeros((1, 1, 6), np.float32)
     texel[..., 0] = 1.0
     hole = Transmittance(Lattice(0), [texel])
-    write_material(tmp_path / "sheet", finest=0, constant=(0.0,) * 3, holes=hole)
-    camera = Camera(elevation=55.0, span=3.0, rows=6, columns=6)
+    write_material(tmp_path / "sheet", finest=0, constant=(0.0,) * 3, transmittance=hole)
+    camera = Camera(elevation=55.0, tiles_across=3.0, rows=6, columns=6)
     at = mi.ScalarTransform4f().translate([0, 0, share * float(camera.position[2])]).scale(300.0)
     scene = {
         "type": "scene",

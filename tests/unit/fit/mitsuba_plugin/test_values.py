@@ -31,24 +31,35 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "tall tile": {"aspect": 2.3},
     "flat tile": {"aspect": 0.1},
     "one texel": {"finest": 0},
-    "calibrated": {"weights": {"gain": 0.7 + 0.6 * torch.rand((2, 4, 6, 3), generator=RANDOM)}},
+    "calibrated": {"weights": {"calibration": 0.7 + 0.6 * torch.rand((2, 4, 6, 3), generator=RANDOM)}},
     "calibrated, one texel": {
         "finest": 0,
-        "weights": {"gain": 0.7 + 0.6 * torch.rand((2, 1, 6, 3), generator=RANDOM)},
+        "weights": {"calibration": 0.7 + 0.6 * torch.rand((2, 1, 6, 3), generator=RANDOM)},
     },
-    "six outputs": {"network": {"outputs": 6}},
-    "direct offset": {"network": {"offset": "direct", "activation": "leaky-relu", "output": "softplus"}},
-    "concatenated": {"network": {"blending": "concatenate", "activation": "sine", "output": "exp"}},
+    "six outputs": {"network": {"output_channels": 6}},
+    "direct offset": {
+        "network": {"offset": "direct", "activation": "leaky-relu", "output_transform": "softplus"}
+    },
+    "concatenated": {"network": {"blending": "concatenate", "activation": "sine", "output_transform": "exp"}},
     "concatenated, one texel": {"finest": 0, "network": {"blending": "concatenate"}},
     "encoded": {
-        "network": {"encoding": {"position": 2, "direction": 2, "raw": True, "lifted": True, "pi": False}}
+        "network": {
+            "encoding": {"position": 2, "direction": 2, "raw": True, "direction_xyz": True, "pi": False}
+        }
     },
-    "encoded with pi": {"network": {"encoding": {"position": 3, "direction": 1}, "output": "identity"}},
-    "filtered": {"aspect": 0.5, "network": {"encoding": {"position": 4, "filtered": True}}},
-    "damped": {
-        "network": {"encoding": {"position": 3, "direction": 3, "direction_pi": False, "damped": True}}
+    "encoded with pi": {
+        "network": {"encoding": {"position": 3, "direction": 1}, "output_transform": "identity"}
     },
-    "fourth root": {"network": {"output": "fourth-root", "channels": 9, "width": 8, "layers": 2}},
+    "footprint_filtered": {
+        "aspect": 0.5,
+        "network": {"encoding": {"position": 4, "footprint_filtered": True}},
+    },
+    "band_attenuation": {
+        "network": {
+            "encoding": {"position": 3, "direction": 3, "direction_pi": False, "band_attenuation": True}
+        }
+    },
+    "fourth root": {"network": {"output_transform": "fourth-root", "channels": 9, "width": 8, "layers": 2}},
 }
 UNROLLED = ("fourth root", "encoded")
 
@@ -101,8 +112,8 @@ def test_constants_are_those_of_the_models() -> None:
     assert evaluator.OFFSET_SCALE == textured.OFFSET_SCALE
     assert evaluator.GRAZING == textured.GRAZING
     assert network.LEAK == mlp.LEAK
-    assert encodings.RGB_OF_YUV == outputs._RGB_OF_YUV
-    assert encodings.GATE == outputs._GATE
+    assert encodings.RGB_OF_YUV == outputs.RGB_OF_YUV
+    assert encodings.GATE == outputs.GATE
 
 
 def test_what_looks_at_neighbors_is_refused(tmp_path: Path) -> None:
@@ -140,7 +151,7 @@ def test_folders_that_are_no_material_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("network", "fault"),
     [
-        ({"channels": 7, "outputs": 6}, "has 3 outputs, not 6"),
+        ({"channels": 7, "output_channels": 6}, "has 3 outputs, not 6"),
         ({"encoding": {"direction": 2}}, "has the shape"),
         ({"activation": "gelu"}, "activation"),
     ],

@@ -64,16 +64,18 @@ def material(texture: NDArray[np.float64], tmp_path_factory: pytest.TempPathFact
     return folder
 
 
-@pytest.mark.parametrize("span", [0.25, 1.0, 3.0, 10.0, 30.0, 300.0])
+@pytest.mark.parametrize("tiles_across", [0.25, 1.0, 3.0, 10.0, 30.0, 300.0])
 def test_mean_and_contrast_are_those_of_filtered_pixels(
-    material: Path, texture: NDArray[np.float64], span: float
+    material: Path, texture: NDArray[np.float64], tiles_across: float
 ) -> None:
-    camera = Camera(80.0, -70.0, span=span, target=(0.3, 0.6), rows=64, columns=64, field_of_view=6.0)
+    camera = Camera(
+        80.0, -70.0, tiles_across=tiles_across, target=(0.3, 0.6), rows=64, columns=64, field_of_view=6.0
+    )
     bsdf: Any = {"type": "mbtf", "material": str(material), "sampling": "cosine", "networks": "cooperative"}
     scene = mi.load_dict(
         {
             "type": "scene",
-            "m": plane(bsdf, half=2.0 * span + 2.0),
+            "m": plane(bsdf, half=2.0 * tiles_across + 2.0),
             "e": directional(LIGHT),
             "sensor": sensor_of(camera),
         }

@@ -11,27 +11,40 @@ from mbtf_core.config_file import resolve
 from mbtf_core.errors import InputError, UsageError
 from mbtf_core.lattice import Lattice
 from mbtf_fit.config import EncodingSection, FitConfig
-from mbtf_fit.models import MODELS, Hierarchical, Neumip, TexturedMaterial, build_model
-from mbtf_fit.models.encodings import direction_size, encode_direction, encode_position, position_size
+from mbtf_fit.models.constants import direction_size, position_size
+from mbtf_fit.models.encodings import encode_direction, encode_position
+from mbtf_fit.models.hierarchical import Hierarchical
 from mbtf_fit.models.mlp import Mlp
+from mbtf_fit.models.neumip import Neumip
 from mbtf_fit.models.outputs import START, to_value
+from mbtf_fit.models.registry import MODELS, build_model
+from mbtf_fit.models.textured import TexturedMaterial
 
 F64 = torch.float64
 # Every option away from its default at least once, on the model that it is for.
 VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
     "baseline": ("neumip-baseline", {}),
     "neumip": ("neumip", {}),
-    "six outputs": ("neumip", {"outputs": 6}),
-    "direct offset": ("neumip", {"offset": "direct", "activation": "leaky-relu", "output": "softplus"}),
-    "concatenated": ("neumip", {"blending": "concatenate", "activation": "sine", "output": "exp"}),
+    "six outputs": ("neumip", {"output_channels": 6}),
+    "direct offset": (
+        "neumip",
+        {"offset": "direct", "activation": "leaky-relu", "output_transform": "softplus"},
+    ),
+    "concatenated": ("neumip", {"blending": "concatenate", "activation": "sine", "output_transform": "exp"}),
     "encoded": (
         "neumip",
-        {"encoding": {"position": 2, "direction": 2, "raw": True, "lifted": True, "pi": False}},
+        {"encoding": {"position": 2, "direction": 2, "raw": True, "direction_xyz": True, "pi": False}},
     ),
-    "filtered": ("neumip", {"encoding": {"position": 3, "direction": 1, "filtered": True, "damped": True}}),
-    "identity": ("neumip-baseline", {"output": "identity", "channels": 3, "width": 8, "layers": 2}),
+    "footprint_filtered": (
+        "neumip",
+        {"encoding": {"position": 3, "direction": 1, "footprint_filtered": True, "band_attenuation": True}},
+    ),
+    "identity": ("neumip-baseline", {"output_transform": "identity", "channels": 3, "width": 8, "layers": 2}),
     "hierarchical": ("hierarchical", {}),
-    "hierarchical, one module": ("hierarchical", {"layers": 3, "offset": "none", "outputs": 6, "width": 12}),
+    "hierarchical, one module": (
+        "hierarchical",
+        {"layers": 3, "offset": "none", "output_channels": 6, "width": 12},
+    ),
     "hierarchical, mlp": ("hierarchical", {"decoder": "mlp"}),
 }
 variants = pytest.mark.parametrize("variant", VARIANTS)
@@ -65,7 +78,7 @@ def arguments(n: int) -> tuple[torch.Tensor, ...]:
 def test_weight_counts_are_the_papers() -> None:
     counts = {}
     for outputs in (3, 6):
-        model = build_model("neumip", Lattice(7), outputs=outputs)
+        model = build_model("neumip", Lattice(7), output_channels=outputs)
         counts[outputs] = sum(p.numel() for p in model.parameter_groups()[1])
     # The paper's text describes three outputs, its figure counts six.
     assert counts == {3: 3254, 6: 3332}
@@ -80,7 +93,11 @@ def test_unset_options_are_the_models_own() -> None:
     assert FitConfig().network.offset == "depth"
     assert FitConfig(model="neumip-baseline").network.offset == "none"
     network = resolve(FitConfig, assignments=["model=hierarchical", "network.encoding.position=6"]).network
-    assert (network.decoder, network.output, network.encoding.direction) == ("inception", "fourth-root", 4)
+    assert (network.decoder, network.output_transform, network.encoding.direction) == (
+        "inception",
+        "fourth-root",
+        4,
+    )
     assert network.encoding.position == 6
     dumped = FitConfig.model_validate({"model": "hierarchical", "network": {"decoder": "mlp"}})
     assert FitConfig.model_validate(dumped.model_dump(mode="json")) == dumped
@@ -90,7 +107,7 @@ def test_unset_options_are_the_models_own() -> None:
     ("assignments", "words"),
     [
         (["model=neumip-baseline", "network.offset=depth"], "has no offset"),
-        (["network.decoder=inception"], "choose the model hierarchical"),
+        (["network.decoder=inception"], "it needs the model hierarchical"),
     ],
 )
 def test_options_that_contradict_the_model_are_refused(assignments: list[str], words: str) -> None:
@@ -227,7 +244,7 @@ def test_concatenated_levels_are_two_weighted_lookups() -> None:
 def test_training_starts_from_the_datas_brightness(output: Any) -> None:
     at = torch.full((4, 3), START[output], dtype=F64)
     value = to_value(at, torch.tensor(0.3, dtype=F64), output)
-    torch.testing.assert_close(value, torch.full_like(value, 0.0 if output == "exp-1" else 0.3))
+    torch.testing.assert_close(value, torch.full_like(value, 0.0 if output == "expm1" else 0.3))
 
 
 def test_six_outputs_are_luma_chroma_and_a_gate() -> None:
@@ -235,7 +252,7 @@ def test_six_outputs_are_luma_chroma_and_a_gate() -> None:
     gray = torch.tensor([[0.7, 0.0, 0.0, 0.0, 20.0, -20.0]], dtype=F64)
     brightness = 2.0 * torch.expm1(torch.tensor(0.7, dtype=F64))
     expected = brightness * torch.tensor([[0.6, 1.1, 0.1]], dtype=F64)
-    torch.testing.assert_close(to_value(gray, unit, "exp-1"), expected)
+    torch.testing.assert_close(to_value(gray, unit, "expm1"), expected)
     red = torch.tensor([[0.0, 0.0, 1.0, 9.0, 9.0, 9.0]], dtype=F64)
     r, g, b = to_value(red, unit, "identity")[0]
     assert r > 0 > g
@@ -251,7 +268,7 @@ def test_encodings_are_sines_and_cosines_of_doubling_frequencies() -> None:
     found = encode_position(u, level, 1.0, options)[0]
     torch.testing.assert_close(found, torch.stack([f(torch.tensor(x, dtype=F64)) for x, f in expected]))
     omega = torch.tensor([[0.6, 0.0, 0.8]], dtype=F64)
-    kept = EncodingSection(direction=1, direction_pi=False, raw=True, lifted=True)
+    kept = EncodingSection(direction=1, direction_pi=False, raw=True, direction_xyz=True)
     s, c = omega.sin(), omega.cos()
     torch.testing.assert_close(encode_direction(omega, kept), torch.cat([omega, s, c], 1))
     for e in (options, kept, EncodingSection(), EncodingSection(position=3, raw=True)):
@@ -260,7 +277,7 @@ def test_encodings_are_sines_and_cosines_of_doubling_frequencies() -> None:
 
 
 def test_damped_encodings_are_equally_steep() -> None:
-    options = EncodingSection(position=6, direction=4, direction_pi=False, damped=True)
+    options = EncodingSection(position=6, direction=4, direction_pi=False, band_attenuation=True)
     h = 1e-6
     up, tilt = torch.tensor([[0.0, 0.0, 1.0]], dtype=F64), torch.tensor([[h, h, 0.0]], dtype=F64)
     rise = encode_direction(up + tilt, options) - encode_direction(up, options)
@@ -283,7 +300,7 @@ def test_filtered_encodings_are_means_over_the_footprint() -> None:
         sigma = 0.5 * 2.0**-level / torch.tensor([1.0, aspect], dtype=F64)
         around = encode_position(u + z[:, None] * sigma, at, aspect, options)
         expected = (weights[:, None] * around).sum(0) / weights.sum()
-        found = encode_position(u, at, aspect, options.model_copy(update={"filtered": True}))[0]
+        found = encode_position(u, at, aspect, options.model_copy(update={"footprint_filtered": True}))[0]
         torch.testing.assert_close(found[2:], expected[2:], atol=1e-9, rtol=0)
         torch.testing.assert_close(found[:2], 2 * u[0] - 1)
 
@@ -304,7 +321,7 @@ def test_training_starts_as_the_documentation_says(variant: str) -> None:
         for key in mine:
             tensor, last = weights[key], key in mine[-2:]
             if key.endswith(".bias"):
-                start = START[model.network.output] if last and network == "decoder" else 0.0
+                start = START[model.network.output_transform] if last and network == "decoder" else 0.0
                 assert float(tensor[0]) == pytest.approx(start)
                 assert not tensor[3 if last else 0 :].any()
             else:

@@ -14,16 +14,16 @@ from torch import Tensor
 
 from mbtf_core.lattice import Lattice
 from mbtf_fit.config import FitConfig, NetworkSection
-from mbtf_fit.data.loader import TrainingQueries
+from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.material.inference import evaluate_in_chunks, predict
-from mbtf_fit.models import build_model
 from mbtf_fit.models.neumip import Neumip
+from mbtf_fit.models.registry import build_model
 from mbtf_fit.native import library
 from mbtf_fit.native.adam import adam
 from mbtf_fit.native.blur import blur_table
 from mbtf_fit.native.gradients import NativeGradients, query_pointers
 from mbtf_fit.native.library import Kernel, variants
-from mbtf_fit.native.model import _KNOWN, _SIZES, NativeModel, networks, parameters_of, unsupported_reason
+from mbtf_fit.native.model import _SIZES, _SUPPORTED, NativeModel, networks, parameters_of, unsupported_reason
 from mbtf_fit.objective.losses import Objective
 from mbtf_fit.objective.noise import NoiseModel
 from mbtf_fit.objective.parallel import Workers
@@ -121,8 +121,8 @@ def assert_gradients_alike(model: Neumip, found: dict[Tensor, Tensor], exact: li
     layers=st.integers(2, 5),
     n=st.integers(1, 300),
     kind=st.sampled_from(["relative", "squared"]),
-    robust=st.sampled_from([None, 0.5]),
-    lifted=st.booleans(),
+    huber_delta=st.sampled_from([None, 0.5]),
+    direction_xyz=st.booleans(),
 )
 def test_values_and_gradients_are_those_of_the_reference(
     variant: str,
@@ -134,12 +134,12 @@ def test_values_and_gradients_are_those_of_the_reference(
     layers: int,
     n: int,
     kind: str,
-    robust: float | None,
-    lifted: bool,
+    huber_delta: float | None,
+    direction_xyz: bool,
 ) -> None:
     lattice = Lattice(finest, aspect)
     sizes = {"channels": channels, "width": width, "layers": layers}
-    model = random_model(name, lattice, **sizes, encoding={"lifted": lifted})
+    model = random_model(name, lattice, **sizes, encoding={"direction_xyz": direction_xyz})
     batch = random_batch(n, lattice)
     with torch.no_grad():
         exact = model.double()(*inputs_of(in_double(batch)))
@@ -148,7 +148,7 @@ def test_values_and_gradients_are_those_of_the_reference(
         patch.setattr("mbtf_fit.material.inference.kernel", lambda: kernel_of(variant))
         found = predict(model, *(t.numpy() for t in inputs_of(batch)))
     assert_alike(torch.from_numpy(found), exact.clamp_min(0), 1e-5)
-    loss = objective(lattice, losses=[{"kind": kind, "weight": 0.7}], robust=robust)
+    loss = objective(lattice, losses=[{"kind": kind, "weight": 0.7}], huber_delta=huber_delta)
     exact_loss, expected = exact_gradients(model, loss, batch)
     value, gradients = kernel_gradients(variant, model, loss, batch)
     torch.testing.assert_close(value.double(), exact_loss, rtol=1e-5, atol=1e-8)
@@ -174,14 +174,14 @@ def test_the_largest_networks_are_those_of_the_reference(variant: str) -> None:
 
 @needs_kernel
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_answers_of_any_size_become_values(variant: str) -> None:
+def test_outputs_of_any_size_become_values(variant: str) -> None:
     """exp(x) - 1 to single precision, from where only the -1 is left to where it is infinite, and near 0
     where the two cancel; its slope likewise."""
     model = build_model("neumip-baseline", LATTICE, layers=2)
     small = 10.0 ** np.arange(-9, 1)
     answers = np.concatenate([[-200, -87.1, 88.2, 88.8, 200], np.linspace(-86.9, 88.2, 66), small, -small])
     native, batch = NativeModel(kernel_of(variant), model), random_batch(1)
-    loss = objective(losses=[{"kind": "squared"}], robust=None)
+    loss = objective(losses=[{"kind": "squared"}], huber_delta=None)
     with torch.no_grad():
         for p in model.parameters():
             p.zero_()
@@ -220,7 +220,7 @@ def test_any_other_loss_goes_through_pytorch_piece_by_piece(
 def test_the_quadratic_form_is_the_same_loss() -> None:
     terms = [{"kind": "relative", "weight": 0.7}, {"kind": "squared", "weight": 0.2}]
     noise = NoiseModel(0.1, np.array([0.3, 0.2, 0.1]), np.zeros((4, 3)), np.ones(3), 0.0)
-    section = FitConfig.model_validate({"training": {"losses": terms, "robust": 1.5}}).training
+    section = FitConfig.model_validate({"training": {"losses": terms, "huber_delta": 1.5}}).training
     loss = Objective(section, noise)
     form = loss.quadratic()
     assert form is not None
@@ -300,7 +300,7 @@ def test_a_training_goes_the_way_that_pytorch_goes(monkeypatch: pytest.MonkeyPat
     trainers = [make_trainer(data, LATTICE, "neumip", steps=4, batch=1000, warmup=0)]
     monkeypatch.setattr("mbtf_fit.training.trainer.kernel", lambda: None)
     trainers.append(make_trainer(data, LATTICE, "neumip", steps=4, batch=1000, warmup=0))
-    assert [t.path.split()[0] for t in trainers] == ["kernel", "pytorch"]
+    assert [t.backend.split()[0] for t in trainers] == ["kernel", "pytorch"]
     start = [p.detach().clone() for p in trainers[0].model.parameters()]
     mine, theirs = (train_fully(t) for t in trainers)
     assert mine.progress.loss == pytest.approx(theirs.progress.loss, rel=1e-4)
@@ -345,11 +345,11 @@ def test_queries_of_another_shape_are_refused() -> None:
 
 
 def test_every_option_of_the_architecture_is_known_or_leads_to_pytorch() -> None:
-    assert _KNOWN.keys() | _SIZES == NetworkSection.model_fields.keys()
+    assert _SUPPORTED.keys() | _SIZES == NetworkSection.model_fields.keys()
     options: list[dict[str, Any]] = [
         {"activation": "leaky-relu"},
-        {"outputs": 6},
-        {"output": "exp"},
+        {"output_channels": 6},
+        {"output_transform": "exp"},
         {"offset": "direct"},
         {"blending": "concatenate"},
         {"encoding": {"position": 2}},
@@ -365,7 +365,7 @@ def test_every_option_of_the_architecture_is_known_or_leads_to_pytorch() -> None
     known: list[dict[str, Any]] = [
         {"offset": "none"},
         {"channels": 64, "width": 128, "layers": 16},
-        {"encoding": {"lifted": True}},
+        {"encoding": {"direction_xyz": True}},
     ]
     for option in known:
         assert unsupported_reason(build_model("neumip", LATTICE, **option)) is None

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from mbtf_fit.config import TrainingSection
-from mbtf_fit.data.loader import TrainingQueries
+from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.objective.losses import Curve, FourthRoot, Log, Objective
 from mbtf_fit.objective.noise import NoiseModel
 
@@ -53,19 +53,19 @@ def skewed(relative: float) -> Tensor:
 @pytest.mark.parametrize("kind", KINDS)
 def test_by_default_the_minimum_is_the_expectation_whatever_the_noise(kind: str) -> None:
     value = skewed(0.8)
-    assert minimum(objective(kind, 0.64, robust=None), value) == pytest.approx(1.0, abs=2e-3)
+    assert minimum(objective(kind, 0.64, huber_delta=None), value) == pytest.approx(1.0, abs=2e-3)
 
 
 @pytest.mark.parametrize(("kind", "least"), [("linear", 0.15), ("log", 0.08), ("fourth-root", 0.15)])
 def test_without_correction_curved_losses_are_biased(kind: str, least: float) -> None:
     """They are dark, by a median or by ½ f''·variance/f': the correction has something to correct."""
-    assert minimum(objective(kind, correction="none", robust=None), skewed(0.8)) < 1 - least
+    assert minimum(objective(kind, correction="none", huber_delta=None), skewed(0.8)) < 1 - least
 
 
 def test_second_order_takes_most_of_the_bias_of_little_noise() -> None:
     value = skewed(0.3)
-    plain = 1 - minimum(objective("log", correction="none", robust=None), value)
-    corrected = 1 - minimum(objective("log", 0.09, correction="second-order", robust=None), value)
+    plain = 1 - minimum(objective("log", correction="none", huber_delta=None), value)
+    corrected = 1 - minimum(objective("log", 0.09, correction="second-order", huber_delta=None), value)
     assert plain > 0.02
     assert abs(corrected) < 0.1 * plain
 
@@ -124,10 +124,10 @@ def test_terms_add_up_with_their_weights() -> None:
 def test_corrected_absolute_terms_are_parabolas_of_the_noise() -> None:
     """e²/2√(v + 0.01), e and v in units of the scale; of neighbors' differences v is that of both."""
     e, v = 0.3 / SCALE, 0.04 / SCALE**2
-    loss = objective("linear", 0.04, robust=None)
+    loss = objective("linear", 0.04, huber_delta=None)
     found = loss(torch.full((5, 3), 1.0), queries(torch.full((5, 3), 1.3)))
     assert float(found) == pytest.approx(e**2 / 2 / (v + 0.01) ** 0.5, rel=1e-5)
-    loss = objective("gradient", 0.04, robust=None)
+    loss = objective("gradient", 0.04, huber_delta=None)
     value = torch.ones(1, 4, 4, 3, dtype=torch.float64)
     value[:, ::2] += 1e-3
     data = queries(value[:, 0, 0])

@@ -8,13 +8,13 @@ import torch
 from support.fit_data import parallax, random_queries
 
 from mbtf_core.lattice import Lattice
-from mbtf_fit.data.loader import Queries
+from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.objective.noise import NoiseModel, typical_value
 
 LATTICE = Lattice(3)
 
 
-def noisy(n: int = 60_000, wild: int = 0) -> tuple[Queries, np.ndarray, np.ndarray]:
+def noisy(n: int = 60_000, wild: int = 0) -> tuple[ShardQueries, np.ndarray, np.ndarray]:
     """(queries, true values, variance of the mean of their halves): variance 0.2 t² at coarse levels, 0.05 t²
     at fine ones, twice that where light or view is low."""
     random = np.random.default_rng(0)
@@ -28,7 +28,7 @@ def noisy(n: int = 60_000, wild: int = 0) -> tuple[Queries, np.ndarray, np.ndarr
     a, b = (random.gamma(shape) / shape * true for _ in range(2))
     rows = random.choice(n, wild, replace=False)
     a[rows[::2]], b[rows[1::2]] = 1e5, 1e5
-    return Queries(*arrays.values(), a.astype(np.float32), b.astype(np.float32)), true, variance
+    return ShardQueries(*arrays.values(), a.astype(np.float32), b.astype(np.float32)), true, variance
 
 
 @pytest.mark.parametrize("wild", [0, 5])
@@ -60,7 +60,7 @@ def test_the_lower_of_light_and_view_decides() -> None:
 def test_data_without_noise_have_none() -> None:
     queries, _, _ = noisy(2000)
     same = queries.value_a
-    quiet = Queries(queries.u, queries.sigma, queries.omega_i, queries.omega_o, same, same)
+    quiet = ShardQueries(queries.u, queries.sigma, queries.omega_i, queries.omega_o, same, same)
     nothing = quiet.take(slice(0))
     for data in (quiet, nothing):
         found = NoiseModel.of(data, LATTICE, 0.05)
@@ -78,7 +78,7 @@ def test_the_ratio_is_that_of_noise_to_true_values(wild: int) -> None:
     assert NoiseModel.of(queries.take(slice(1)), LATTICE, 0.05).ratio == 5.0
     random = np.random.default_rng(1)
     a, b = (random.normal(1.0, 0.1, queries.value_a.shape).astype(np.float32) for _ in range(2))
-    even = Queries(queries.u, queries.sigma, queries.omega_i, queries.omega_o, a, b)
+    even = ShardQueries(queries.u, queries.sigma, queries.omega_i, queries.omega_o, a, b)
     assert NoiseModel.of(even, LATTICE, 1.0).ratio == 5.0
 
 
@@ -89,16 +89,16 @@ def test_light_that_few_paths_find_is_noise() -> None:
     at = random_queries(random, n, LATTICE)
     true = parallax(*at.values()) + 5 * (random.random((n, 1)) < 0.02)
     a, b = (100 * true * (random.random((n, 1)) < 0.01) for _ in range(2))
-    queries = Queries(*at.values(), a.astype(np.float32), b.astype(np.float32))
+    queries = ShardQueries(*at.values(), a.astype(np.float32), b.astype(np.float32))
     assert NoiseModel.of(queries, LATTICE, 0.05).ratio == 5.0
 
 
-def test_buffers_are_pooled_like_queries() -> None:
+def test_images_are_pooled_like_queries() -> None:
     queries, true, _ = noisy(64 * 500)
     shaped = {k: v.reshape(500, 8, 8, *v.shape[1:]) for k, v in vars(queries).items()}
     for name in ("sigma", "omega_i", "omega_o"):
         shaped[name] = np.broadcast_to(shaped[name][:, :1, :1], shaped[name].shape)
-    model = NoiseModel.of(Queries(**shaped), LATTICE, 0.05)
+    model = NoiseModel.of(ShardQueries(**shaped), LATTICE, 0.05)
     assert model.overall.sum() > 0
     assert model.ratio == pytest.approx(NoiseModel.of(queries, LATTICE, 0.05).ratio, rel=0.2)
     value = torch.from_numpy(true.reshape(500, 8, 8, 3))

@@ -13,16 +13,16 @@ from support.fit_data import make_trainer, parallax, random_queries, training_qu
 from mbtf_core.lattice import Lattice
 from mbtf_fit.config import FitConfig, ModelName
 from mbtf_fit.data.loader import load_training, open_data
-from mbtf_fit.models import build_model
+from mbtf_fit.models.registry import build_model
 from mbtf_fit.objective.noise import NoiseModel
-from mbtf_fit.objective.regularization import Pull
+from mbtf_fit.objective.regularization import WeightDecay
 from mbtf_fit.training.fit import prepare_trainer
 
 LATTICE = Lattice(3)
 
 
-def pull(ratio: float, queries: int = 5000, **training: Any) -> Pull:
-    return Pull.of(FitConfig.model_validate({"training": training}).training, ratio, queries)
+def pull(ratio: float, queries: int = 5000, **training: Any) -> WeightDecay:
+    return WeightDecay.of(FitConfig.model_validate({"training": training}).training, ratio, queries)
 
 
 @pytest.mark.parametrize(
@@ -31,18 +31,18 @@ def pull(ratio: float, queries: int = 5000, **training: Any) -> Pull:
 )
 def test_noise_makes_pulls_stronger(ratio: float, texels: float, weights: float) -> None:
     """Of texels from a ratio of a half on; of weights with its square up to there, then with it, up to 1."""
-    found = pull(ratio, decay=2.0, weight_decay=1000.0)
+    found = pull(ratio, texture_weight_decay=2.0, noise_regularization=1000.0)
     assert (found.texels, found.weights) == (pytest.approx(texels), pytest.approx(weights))
 
 
 def test_many_queries_and_0_leave_weights_alone() -> None:
-    assert pull(1.0, 10**8, weight_decay=1e5).weights == pytest.approx(1e-3)
-    assert pull(5.0, 10, weight_decay=0.0).weights == 0.0
+    assert pull(1.0, 10**8, noise_regularization=1e5).weights == pytest.approx(1e-3)
+    assert pull(5.0, 10, noise_regularization=0.0).weights == 0.0
 
 
 def test_no_pull_is_stronger_than_that_of_a_step_by_its_rate() -> None:
     """Else so few queries would have weights pulled to 0, and the fit would be a constant."""
-    assert pull(5.0, 50, weight_decay=1000.0).weights == 1.0
+    assert pull(5.0, 50, noise_regularization=1000.0).weights == 1.0
 
 
 @pytest.mark.parametrize("model", ["neumip", "neumip-baseline", "hierarchical"])
@@ -51,7 +51,7 @@ def test_texels_and_matrices_shrink_and_biases_stay(model: ModelName) -> None:
     with torch.no_grad():
         for p in found.parameters():
             p.fill_(1.0)
-    Pull(texels=3.0, weights=2.0).act(found, 0.1, 0.01)
+    WeightDecay(texels=3.0, weights=2.0).apply(found, 0.1, 0.01)
     texels, _ = found.parameter_groups()
     for name, p in found.named_parameters():
         texel = any(p is t for t in texels)
@@ -66,14 +66,19 @@ def test_a_trainer_pulls_as_all_its_queries_say() -> None:
     arrays = random_queries(np.random.default_rng(0), 5000, LATTICE)
     noise = NoiseModel(0.1, np.zeros(3), np.zeros((4, 3)), np.ones(4), 0.7)
     data = training_queries(arrays, parallax(*arrays.values()))
-    trainer = make_trainer(data, LATTICE, noise=noise, batch=1000, steps=1, weight_decay=1000.0)
-    assert (trainer.pull.texels, trainer.pull.weights) == (0.0, pytest.approx(0.7 * 1000 / 5000))
+    trainer = make_trainer(data, LATTICE, noise=noise, batch=1000, steps=1, noise_regularization=1000.0)
+    assert (trainer.weight_decay.texels, trainer.weight_decay.weights) == (
+        0.0,
+        pytest.approx(0.7 * 1000 / 5000),
+    )
 
 
 def test_a_fit_finds_the_ratio_in_its_data(tmp_path: Path) -> None:
     """Noise of 0.02 in each half is 2e-4 of variance in their mean."""
     folder = write_data(tmp_path / "data", parallax, train=20_000, noise=0.02)
-    config = FitConfig.model_validate({"training": {"weight_decay": 1000.0, "decay": 1.0}})
+    config = FitConfig.model_validate(
+        {"training": {"noise_regularization": 1000.0, "texture_weight_decay": 1.0}}
+    )
     data = open_data(folder, "shuffled", "neumip")
     partition = load_training(data, config.held_out, config.seed, config.data.memory)
     trainer = prepare_trainer(config, data, partition, torch.device("cpu"))
@@ -81,5 +86,5 @@ def test_a_fit_finds_the_ratio_in_its_data(tmp_path: Path) -> None:
     ratio = 2e-4 / parallax(*arrays.values()).var(0).mean()
     assert ratio > 0.5
     n = len(partition.training)
-    assert trainer.pull.weights == pytest.approx(1000 * ratio / n, rel=0.1)
-    assert trainer.pull.texels == pytest.approx(2 * ratio, rel=0.1)
+    assert trainer.weight_decay.weights == pytest.approx(1000 * ratio / n, rel=0.1)
+    assert trainer.weight_decay.texels == pytest.approx(2 * ratio, rel=0.1)

@@ -14,11 +14,13 @@ from mbtf_core.errors import InputError
 from mbtf_core.lattice import Lattice, level_of_sigma
 from mbtf_fit import FitConfig, fit
 from mbtf_fit.config import HeldOutSection
-from mbtf_fit.data.loader import TrainingQueries, in_region
+from mbtf_fit.data.queries import TrainingQueries
+from mbtf_fit.data.split import in_region
 from mbtf_fit.material.inference import evaluate_in_chunks, predict
-from mbtf_fit.models import Neumip, build_model
-from mbtf_fit.models.calibration_factors import KNOTS, look_up_gain
-from mbtf_fit.training.calibration import fit_gains
+from mbtf_fit.models.calibration_factors import KNOTS, interpolate_factors
+from mbtf_fit.models.neumip import Neumip
+from mbtf_fit.models.registry import build_model
+from mbtf_fit.training.calibration import fit_calibration
 
 F32 = np.ndarray
 LATTICE = Lattice(3)
@@ -51,16 +53,16 @@ def data(n: int, noise: float, seed: int = 0) -> TrainingQueries:
     return training_queries(queries, value * (1 + noise * (random.exponential(1.0, value.shape) - 1)))
 
 
-def excess(gain: F32 | None, sigma: float, axis: int) -> F32:
-    """(wrong · gain) over truth, minus 1, by six bands of light's (0) or view's (1) elevation."""
+def excess(calibration: F32 | None, sigma: float, axis: int) -> F32:
+    """(wrong · calibration) over truth, minus 1, by six bands of light's (0) or view's (1) elevation."""
     random = np.random.default_rng(7)
     q = random_queries(random, 60_000, LATTICE)
     q["sigma"] = np.full_like(q["sigma"], sigma)
     value = wrong(*q.values()).astype(np.float64)
-    if gain is not None:
+    if calibration is not None:
         level = torch.from_numpy(np.clip(level_of_sigma(q["sigma"]), 0, 3).astype(np.float32))
-        for table, omega in zip(torch.from_numpy(gain), (q["omega_i"], q["omega_o"]), strict=True):
-            value *= look_up_gain(table, level, torch.from_numpy(omega[:, 2])).numpy()
+        for table, omega in zip(torch.from_numpy(calibration), (q["omega_i"], q["omega_o"]), strict=True):
+            value *= interpolate_factors(table, level, torch.from_numpy(omega[:, 2])).numpy()
     cosine = q["omega_i" if axis == 0 else "omega_o"][:, 2]
     band = np.minimum(((cosine - 0.1) / 0.15).astype(int), 5)
     means = [np.stack([v[band == k].mean(0) for k in range(6)]) for v in (value, truth(*q.values()))]
@@ -73,20 +75,20 @@ def nothing(prediction: torch.Tensor) -> None:
 
 def test_means_at_each_elevation_become_those_of_the_data() -> None:
     """Of light and view, at every level, per color, under skewed noise; held-out directions included."""
-    gain = fit_gains(wrong, LATTICE, data(150_000, 0.5), HELD_OUT, nothing)
-    assert gain.shape == (2, 4, KNOTS, 3)
+    calibration = fit_calibration(wrong, LATTICE, data(150_000, 0.5), HELD_OUT, nothing)
+    assert calibration.shape == (2, 4, KNOTS, 3)
     for sigma in (0.5, 0.09):
         for axis in (0, 1):
             assert np.abs(excess(None, sigma, axis)).max() > 0.1
-            assert np.abs(excess(gain, sigma, axis)).max() < 0.02
-            assert np.abs(excess(gain, sigma, axis)).mean() < 0.006
+            assert np.abs(excess(calibration, sigma, axis)).max() < 0.02
+            assert np.abs(excess(calibration, sigma, axis)).mean() < 0.006
 
 
 def test_data_that_say_little_change_little() -> None:
-    gain = fit_gains(truth, LATTICE, data(3000, 3.0), HELD_OUT, nothing)
-    assert np.abs(gain - 1).max() < 0.06
+    calibration = fit_calibration(truth, LATTICE, data(3000, 3.0), HELD_OUT, nothing)
+    assert np.abs(calibration - 1).max() < 0.06
     # Where no data lie, and in black ones.
-    black = fit_gains(
+    black = fit_calibration(
         lambda u, *_: np.zeros((len(u), 3), np.float32), LATTICE, data(3000, 0.0), HELD_OUT, nothing
     )
     np.testing.assert_allclose(black, 1.0)
@@ -94,13 +96,13 @@ def test_data_that_say_little_change_little() -> None:
 
 def test_wild_values_do_not_decide() -> None:
     queries = data(50_000, 0.5)
-    kept = fit_gains(wrong, LATTICE, queries, HELD_OUT, lambda p: 2.0 + 0 * p)
+    kept = fit_calibration(wrong, LATTICE, queries, HELD_OUT, lambda p: 2.0 + 0 * p)
     queries.value[::2500] = 1e6
-    found = fit_gains(wrong, LATTICE, queries, HELD_OUT, lambda p: 2.0 + 0 * p)
+    found = fit_calibration(wrong, LATTICE, queries, HELD_OUT, lambda p: 2.0 + 0 * p)
     np.testing.assert_allclose(found, kept, atol=0.02)
 
 
-def random_gain(levels: int, knots: int = 5) -> torch.Tensor:
+def random_calibration(levels: int, knots: int = 5) -> torch.Tensor:
     return 0.7 + 0.6 * torch.rand((2, levels, knots, 3), generator=torch.Generator().manual_seed(2))
 
 
@@ -118,13 +120,15 @@ def by_hand(table: F32, level: F32, cosine: F32) -> F32:
 @pytest.mark.parametrize("model", ["neumip", "neumip-baseline"])
 def test_a_calibrated_model_is_the_model_times_its_factors(model: str, finest: int, tmp_path: Path) -> None:
     """In one piece, in two stages, by the compiled kernel where there is one, and as read from a folder."""
-    lattice, gain = Lattice(finest), random_gain(finest + 1)
+    lattice, calibration = Lattice(finest), random_calibration(finest + 1)
     plain = write_material(tmp_path / "a", model=model, finest=finest)
-    material = write_material(tmp_path / "b", model=model, finest=finest, weights={"gain": gain})
+    material = write_material(
+        tmp_path / "b", model=model, finest=finest, weights={"calibration": calibration}
+    )
     q = random_queries(np.random.default_rng(5), 500, lattice)
     level = np.clip(level_of_sigma(q["sigma"].astype(np.float64)), 0, finest)
-    factor = by_hand(gain[0].numpy(), level, q["omega_i"][:, 2]) * by_hand(
-        gain[1].numpy(), level, q["omega_o"][:, 2]
+    factor = by_hand(calibration[0].numpy(), level, q["omega_i"][:, 2]) * by_hand(
+        calibration[1].numpy(), level, q["omega_o"][:, 2]
     )
     wanted = plain.evaluate(*q.values()) * factor
     assert factor.std() > 0.1
@@ -135,17 +139,17 @@ def test_a_calibrated_model_is_the_model_times_its_factors(model: str, finest: i
     ):
         np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-6)
     formula = calibrated.formula()
-    assert formula["value"] == f"gain * {plain.model.formula()['value']}"
-    assert "5 knots" in formula["gain"]
+    assert formula["value"] == f"calibration * {plain.model.formula()['value']}"
+    assert "5 knots" in formula["calibration"]
 
 
 @pytest.mark.parametrize("shape", [(2, 3, 5, 3), (2, 4, 1, 3), (2, 4, 3)])
 def test_factors_of_another_shape_are_refused(shape: tuple[int, ...]) -> None:
     model = build_model("neumip", Lattice(3))
     weights = model.weights()
-    with pytest.raises(InputError, match="do not fit the model neumip: 'gain'"):
-        model.load_weights({**weights, "gain": torch.ones(shape)})
-    model.load_weights({**weights, "gain": torch.ones((2, 4, 5, 3))})
+    with pytest.raises(InputError, match="do not fit the model neumip: 'calibration'"):
+        model.load_weights({**weights, "calibration": torch.ones(shape)})
+    model.load_weights({**weights, "calibration": torch.ones((2, 4, 5, 3))})
     # And they go with the weights that they came with.
     model.load_weights(weights)
     assert model.weights().keys() == weights.keys()
@@ -164,12 +168,12 @@ def test_a_fit_is_calibrated_unless_told_otherwise(tmp_path: Path) -> None:
     wanted = 0.2 + 0.6 * 0.8**4
     off = {}
     for calibrate in (True, False):
-        training = {"steps": 40, "batch": 2000, "calibrate": calibrate}
+        training = {"steps": 40, "batch": 2000, "energy_calibration": calibrate}
         result = fit(FitConfig.model_validate({"training": training}), folder, tmp_path / str(calibrate))
         model = result.material.model
         assert isinstance(model, Neumip)
-        assert (model.gain is not None) == calibrate
-        assert ("gain" in result.material.description["formula"]) == calibrate
+        assert (model.calibration is not None) == calibrate
+        assert ("calibration" in result.material.description["formula"]) == calibrate
         off[calibrate] = abs(float(predict(model, *q.values()).mean()) / wanted - 1)
         assert result.material.deviation() < 1e-5
     assert off[False] > 0.08

@@ -7,19 +7,19 @@ from typing import Any
 
 import pytest
 
-from mbtf_fit.training.convergence import price_of
+from mbtf_fit.training.convergence import marginal_cost_of
 
 
 def history(power: float, error: float = 1e-4, total: float = 80.0) -> list[dict[str, Any]]:
     """Looks at an error that falls with a power of time."""
     return [
         {
-            "share": share,
-            "seconds": share * total,
-            "unexplained": 0.2 * share**-power,
+            "fraction": fraction,
+            "seconds": fraction * total,
+            "unexplained": 0.2 * fraction**-power,
             "unexplained_error": error,
         }
-        for share in (0.1, 0.2, 0.31, 0.49, 0.7, 1.0)
+        for fraction in (0.1, 0.2, 0.31, 0.49, 0.7, 1.0)
     ]
 
 
@@ -32,24 +32,24 @@ def errors(held_out: float, training: float, error: float = 0.002) -> dict[str, 
 
 @pytest.mark.parametrize("power", [0.25, 0.5, 1.0])
 def test_halving_takes_what_the_power_of_time_says(power: float) -> None:
-    found = price_of(history(power), {}, looks_at="held_out_queries")
+    found = marginal_cost_of(history(power), {}, validation_set="held_out_queries")
     assert found is not None
-    assert found.describe().startswith("held-out queries 0.")
+    assert found.describe().startswith("unexplained variance of held-out queries: 0.")
     assert found.end == pytest.approx(0.2)
     assert found.half == pytest.approx(0.2 * 0.49**-power)
     assert found.halving == pytest.approx(80.0 * (2 ** (1 / power) - 1), rel=1e-6)
 
 
 def test_a_gain_below_its_error_bar_promises_nothing() -> None:
-    found = price_of(history(0.25, error=0.03), {})
+    found = marginal_cost_of(history(0.25, error=0.03), {})
     assert found is not None
     assert found.halving is None
-    assert "would not help much" in found.describe()
-    worse = price_of(history(-0.2), {})
+    assert "would hardly reduce it" in found.describe()
+    worse = marginal_cost_of(history(-0.2), {})
     assert worse is not None
     assert worse.halving is None
     # Hardly falling at all: more years than anyone has, or than a number holds.
-    flat = price_of(history(1e-4, error=1e-9), {})
+    flat = marginal_cost_of(history(1e-4, error=1e-9), {})
     assert flat is not None
     assert flat.halving is None
 
@@ -57,12 +57,12 @@ def test_a_gain_below_its_error_bar_promises_nothing() -> None:
 def test_half_of_the_distance_to_the_training_queries_is_learned_noise() -> None:
     # Least squares with k free numbers and noise s² in n queries misses others by s²k/n, and seems to miss
     # its own by -s²k/n.
-    found = price_of(history(0.5), errors(0.2 + 0.05, 0.2 - 0.05), 0.3)
+    found = marginal_cost_of(history(0.5), errors(0.2 + 0.05, 0.2 - 0.05), 0.3)
     assert found is not None
     assert found.noise_share == pytest.approx(0.05 / 0.25)
-    assert "20% of the error of held-out queries is learned noise" in found.describe()
+    assert "overfitting to noise is 20% of the error" in found.describe()
     for same in (errors(0.25, 0.248), errors(0.25, 0.3), {}, errors(math.nan, 0.1)):
-        other = price_of(history(0.5), same, 0.3)
+        other = marginal_cost_of(history(0.5), same, 0.3)
         assert other is not None
         assert other.noise_share is None
 
@@ -72,14 +72,14 @@ def test_half_of_the_distance_to_the_training_queries_is_learned_noise() -> None
 )
 def test_no_more_noise_is_learned_than_there_is(noise: float | None, share: float | None) -> None:
     """Few queries without noise leave the same distance: what lies between them was not learned."""
-    found = price_of(history(0.5), errors(0.25, 0.15), noise)
+    found = marginal_cost_of(history(0.5), errors(0.25, 0.15), noise)
     assert found is not None
     assert found.noise_share == (share if share is None else pytest.approx(share))
 
 
 def test_histories_that_do_not_tell_give_no_price() -> None:
-    assert price_of([], {}) is None
-    assert price_of(history(0.5)[:-1], {}) is None
-    assert price_of(history(0.5)[-1:], {}) is None
+    assert marginal_cost_of([], {}) is None
+    assert marginal_cost_of(history(0.5)[:-1], {}) is None
+    assert marginal_cost_of(history(0.5)[-1:], {}) is None
     unknown = [{**r, "unexplained": None, "unexplained_error": None} for r in history(0.5)]
-    assert price_of(unknown, {}) is None
+    assert marginal_cost_of(unknown, {}) is None

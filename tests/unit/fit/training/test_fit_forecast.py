@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 from support.fit_data import constant, parallax, write_data
 
-import mbtf_fit.training.fit as fitting
 import mbtf_fit.training.forecast as module
+import mbtf_fit.training.validation as validation
 from mbtf_fit import fit
 from mbtf_fit.config import FitConfig, HeldOutSection
-from mbtf_fit.data.loader import Queries, load_training, open_data
-from mbtf_fit.training.fit import glance_of, judging_queries
+from mbtf_fit.data.loader import load_training, open_data
+from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.training.forecast import PERSISTENCE, extrapolated, forecast_fit
+from mbtf_fit.training.validation import validation_set, validation_subset
 
 
 @pytest.fixture(scope="module")
@@ -81,9 +80,9 @@ def test_errors_are_those_of_the_test_split_where_it_can_tell(
 ) -> None:
     """Its queries have more paths, but few of them say less than what was held out."""
 
-    def looked_at(shards: Path) -> tuple[str, Queries]:
+    def looked_at(shards: Path) -> tuple[str, ShardQueries]:
         data = open_data(shards, "shuffled", "neumip")
-        return judging_queries(data, load_training(data, HeldOutSection(), 0))
+        return validation_set(data, load_training(data, HeldOutSection(), 0))
 
     name, queries = looked_at(shards)
     assert (name, len(queries)) == ("test", 2000)
@@ -91,15 +90,15 @@ def test_errors_are_those_of_the_test_split_where_it_can_tell(
     assert name == "held_out_queries"
     assert 10 < len(queries) < 200
     # Some thousand will do, however many were held out.
-    monkeypatch.setattr(fitting, "_FEWEST", 30)
+    monkeypatch.setattr(validation, "_FEWEST", 30)
     assert looked_at(write_data(tmp_path / "enough", parallax, train=6000, test=30))[0] == "test"
 
 
 def test_a_fit_tells_the_error_of_the_queries_that_it_says(shards: Path, tmp_path: Path) -> None:
     """All test queries are looked at here, so the last look is the fit's error itself."""
-    config = FitConfig.model_validate({"training": {"batch": 500, "steps": 12, "calibrate": False}})
+    config = FitConfig.model_validate({"training": {"batch": 500, "steps": 12, "energy_calibration": False}})
     found = fit(config, shards, tmp_path / "material")
-    assert found.material.description["training"]["looks_at"] == "test"
+    assert found.material.description["training"]["validation_set"] == "test"
     reached = found.errors["test"]["unexplained"]["value"]
     assert found.history[-1]["unexplained"] == pytest.approx(reached, rel=1e-5)
     assert found.errors["held_out_queries"]["unexplained"]["value"] != pytest.approx(reached, rel=1e-3)
@@ -109,12 +108,10 @@ def test_a_fit_tells_the_error_of_the_queries_that_it_says(shards: Path, tmp_pat
 def test_a_glance_is_of_all_parts(most: int, step: int) -> None:
     u = np.arange(2000.0, dtype=np.float32)[:, None].repeat(2, 1)
     three = u[:, :1].repeat(3, 1)
-    model: Any = SimpleNamespace(model=SimpleNamespace(positions=1))
-    glance = glance_of(model, Queries(u, u[:, 0], three, three, three, three), most)
-    assert np.array_equal(glance.u[:, 0], np.arange(0, 2000, step))
-    # One that looks at nine positions for each looks at fewer.
-    model.model.positions = 9
-    assert len(glance_of(model, Queries(u, u[:, 0], three, three, three, three), most)) <= max(1, most // 9)
+    queries = ShardQueries(u, u[:, 0], three, three, three, three)
+    assert np.array_equal(validation_subset(1, queries, most).u[:, 0], np.arange(0, 2000, step))
+    # Fewer for a model that reads its textures at nine positions per query.
+    assert len(validation_subset(9, queries, most)) <= max(1, most // 9)
 
 
 def test_data_without_variance_have_none_to_forecast(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,8 +12,9 @@ from support.fit_data import parallax, write_data
 
 import mbtf_fit.training.fit
 from mbtf_fit.config import FitConfig
-from mbtf_fit.training.fit import fit, read_history
+from mbtf_fit.training.fit import fit
 from mbtf_fit.training.trainer import Trainer
+from mbtf_fit.training.validation import read_history
 
 STEPS = 14
 
@@ -46,7 +47,7 @@ def test_killed_at_random_steps_it_ends_with_the_same_bits(
     whole = fit(config(), shards, tmp_path / "whole")
     random = np.random.default_rng(0)
     out, step, kills = tmp_path / "killed", Trainer._step, 0
-    saved = mbtf_fit.training.fit.write_tensors
+    saved = mbtf_fit.training.fit.write_checkpoint
     while not (out / "material.json").exists():
         left = int(random.integers(1, 7))
 
@@ -63,7 +64,7 @@ def test_killed_at_random_steps_it_ends_with_the_same_bits(
                 saved(*arguments)
 
         monkeypatch.setattr(Trainer, "_step", dying)
-        monkeypatch.setattr(mbtf_fit.training.fit, "write_tensors", forgetful)
+        monkeypatch.setattr(mbtf_fit.training.fit, "write_checkpoint", forgetful)
         try:
             found = fit(config(memory), shards, out)
         except Killed:

@@ -15,11 +15,12 @@ import mbtf_fit.objective.parallel
 from mbtf_core.errors import InputError
 from mbtf_core.lattice import Lattice
 from mbtf_fit.config import FitConfig
-from mbtf_fit.data.loader import Queries, TrainingQueries
+from mbtf_fit.data.queries import ShardQueries, TrainingQueries
 from mbtf_fit.data.streaming import Selection
-from mbtf_fit.material.storage import read_tensors, write_tensors
 from mbtf_fit.objective.parallel import Workers
-from mbtf_fit.training.trainer import Trainer, rate_factor
+from mbtf_fit.training.checkpoint import read_checkpoint, write_checkpoint
+from mbtf_fit.training.schedule import learning_rate_factor
+from mbtf_fit.training.trainer import Trainer
 
 LATTICE = Lattice(3)
 
@@ -50,7 +51,7 @@ def test_blur_begins_at_an_eighth_of_the_tile_at_most(
     lattice = Lattice.for_map(*shape)
     arrays = random_queries(np.random.default_rng(0), 500, lattice)
     data = training_queries(arrays, parallax(*arrays.values()))
-    blur = {"start": asked, "end": 0.25, "offset": 0.5}
+    blur = {"initial_sigma": asked, "final_sigma": 0.25, "offset_sigma": 0.5}
     t = make_trainer(data, lattice, "neumip", steps=40, batch=100, blur=blur)
     sigmas = t._sigmas()
     assert sigmas == [start if not x.moves_lookups else max(start, 0.5) for x in t.model.textures()]
@@ -91,9 +92,9 @@ def test_a_resumed_training_ends_with_the_same_numbers(tmp_path: Any) -> None:
     while half.progress.step < 13:
         half.train(0.0)
     path = tmp_path / "checkpoint.safetensors"
-    write_tensors(path, *half.state())
+    write_checkpoint(half, path)
     resumed = trainer(data)
-    resumed.restore(*read_tensors(path))
+    read_checkpoint(resumed, path)
     assert resumed.progress == half.progress
     train_fully(resumed)
     for mine, other in zip(resumed.model.parameters(), whole.model.parameters(), strict=True):
@@ -125,18 +126,18 @@ def test_workers_leave_torchs_settings_as_they_were() -> None:
 
 
 def test_rates_rise_and_fall() -> None:
-    training = FitConfig().training.model_copy(update={"warmup": 10, "final_rate": 0.05})
-    assert rate_factor(training, 0, 0.0) == pytest.approx(1 / 11)
-    assert rate_factor(training, 10, 0.0) == 1.0
-    assert rate_factor(training, 1000, 0.5) == pytest.approx(0.525)
-    assert rate_factor(training, 1000, 1.0) == pytest.approx(0.05)
+    training = FitConfig().training.model_copy(update={"warmup": 10, "final_learning_rate_factor": 0.05})
+    assert learning_rate_factor(training, 0, 0.0) == pytest.approx(1 / 11)
+    assert learning_rate_factor(training, 10, 0.0) == 1.0
+    assert learning_rate_factor(training, 1000, 0.5) == pytest.approx(0.525)
+    assert learning_rate_factor(training, 1000, 1.0) == pytest.approx(0.05)
 
 
 @pytest.mark.parametrize("compiled", [True, False])
 def test_textures_and_networks_learn_at_their_own_rates(compiled: bool) -> None:
     """The first step of Adam is as long as the rate, whatever the gradient."""
-    rates = {"texture_rate": 1e-3, "rate": 1e-4, "warmup": 0}
-    t = trainer(queries(), steps=1, blur={"start": 0.0, "offset": 0.0}, **rates)
+    rates = {"texture_learning_rate": 1e-3, "learning_rate": 1e-4, "warmup": 0}
+    t = trainer(queries(), steps=1, blur={"initial_sigma": 0.0, "offset_sigma": 0.0}, **rates)
     t._stepper = t._stepper if compiled else None
     groups = t.model.parameter_groups()
     before = [[p.detach().clone() for p in group] for group in groups]
@@ -147,7 +148,9 @@ def test_textures_and_networks_learn_at_their_own_rates(compiled: bool) -> None:
 
 
 def test_the_blur_is_over_with_its_share_of_the_budget() -> None:
-    t = trainer(queries(10), blur={"start": 1.0, "end": 0.25, "share": 0.25, "offset": 0.0})
+    t = trainer(
+        queries(10), blur={"initial_sigma": 1.0, "final_sigma": 0.25, "fraction": 0.25, "offset_sigma": 0.0}
+    )
     found = []
     for step in (0, 5, 9, 10, 40):
         t.progress.step = step
@@ -160,23 +163,31 @@ def test_texels_without_a_gradient_decay_with_the_rate(compiled: bool) -> None:
     arrays = random_queries(np.random.default_rng(0), 64, LATTICE)
     arrays["sigma"][:] = 0.5
     data = training_queries(arrays, parallax(*arrays.values()))
-    t = trainer(data, steps=5, decay=2.0, texture_rate=0.05, warmup=0, final_rate=0.1, blur={"start": 0.0})
+    t = trainer(
+        data,
+        steps=5,
+        texture_weight_decay=2.0,
+        texture_learning_rate=0.05,
+        warmup=0,
+        final_learning_rate_factor=0.1,
+        blur={"initial_sigma": 0.0},
+    )
     t._stepper = t._stepper if compiled else None
     first = t.model.textures()[0].texels.detach().clone()
-    rates = [0.05 * rate_factor(t.config.training, k, k / 5) for k in range(5)]
+    rates = [0.05 * learning_rate_factor(t.config.training, k, k / 5) for k in range(5)]
     train_fully(t)
     finest = t.model.textures()[0].packing.starts[-2]
     expected = first[finest:] * np.exp(-2.0 * sum(rates))
     torch.testing.assert_close(t.model.textures()[0].texels.detach()[finest:], expected)
     weights = [p.detach().clone() for p in t.model.parameter_groups()[1]]
-    t.pull.act(t.model, 0.1, 0.1)
+    t.weight_decay.apply(t.model, 0.1, 0.1)
     for before, after in zip(weights, t.model.parameter_groups()[1], strict=True):
         torch.testing.assert_close(after.detach(), before, rtol=0, atol=0)
 
 
 def test_a_budget_of_time_ends_training_and_its_annealing() -> None:
     t = train_fully(trainer(queries(), steps=None, time=0.3))
-    assert t.share == 1.0
+    assert t.fraction == 1.0
     assert t.progress.seconds >= 0.3
     pyramid, offset = t.model.textures()
     tables = t._tables()
@@ -185,14 +196,14 @@ def test_a_budget_of_time_ends_training_and_its_annealing() -> None:
 
 
 def test_the_blur_of_the_pyramid_ends_at_its_floor_and_the_offset_keeps_its_own() -> None:
-    t = train_fully(trainer(queries(), blur={"floor": 0.7, "offset": 0.3}))
+    t = train_fully(trainer(queries(), blur={"min_sigma": 0.7, "offset_sigma": 0.3}))
     pyramid, offset = t.model.textures()
     for found, expected in zip(t._tables(), (pyramid.blurred(0.7), offset.blurred(0.3)), strict=True):
         torch.testing.assert_close(found, expected)
     # Materials hold what is read, blur included.
     value = queries(10).value.numpy()
     arrays = random_queries(np.random.default_rng(0), 10, LATTICE)
-    t.predict(Queries(**arrays, value_a=value, value_b=value))
+    t.predict(ShardQueries(**arrays, value_a=value, value_b=value))
     torch.testing.assert_close(pyramid.export()["3"].reshape(64, -1), pyramid.blurred(0.7)[-64:].detach())
 
 
@@ -201,7 +212,7 @@ def test_divergence_is_one_clear_error(poison: str) -> None:
     t = trainer(queries())
     with torch.no_grad():
         t.model.get_parameter(poison).fill_(torch.nan)
-    with pytest.raises(InputError, match=r"diverged at step 1: its batch .*\n.*--rate 0\.01 "):
+    with pytest.raises(InputError, match=r"diverged at step 1: its batch .*\n.*--learning-rate 0\.01 "):
         train_fully(t)
 
 
@@ -231,9 +242,9 @@ def test_divergence_names_the_first_bad_batch() -> None:
     selection.add(Path("train-00000.npz"), chosen)
     selection.add(Path("train-00001.npz"), np.ones(2007, bool))
     data.value[4200] = torch.inf
-    t = make_trainer(data, LATTICE, steps=40, batch=100, robust=None)
+    t = make_trainer(data, LATTICE, steps=40, batch=100, huber_delta=None)
     t.selection = selection
-    step, numbers = next((k, n) for k in range(50) for n in data.numbers(100, 0, k) if 4200 in n)
+    step, numbers = next((k, n) for k in range(50) for n in data.batch_ranges(100, 0, k) if 4200 in n)
     # Number 4200 is row 1207 of the second shard.
     first, last = numbers.start - 2993, numbers.stop - 1 - 2993
     with pytest.raises(InputError, match=rf"at step {step + 1}: .*train-00001\.npz rows {first}-{last},"):
@@ -241,7 +252,7 @@ def test_divergence_names_the_first_bad_batch() -> None:
 
 
 def test_coverage_counts_texels_that_gradients_have_reached() -> None:
-    t = trainer(queries(), "neumip-baseline", blur={"start": 0.0})
+    t = trainer(queries(), "neumip-baseline", blur={"initial_sigma": 0.0})
     assert set(t.coverage().values()) == {0.0}
     # Only the lower left quarter, at the finest level.
     t.queries.u[:] = 0.5 * t.queries.u

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 import torch
-from support.buffer_data import write_buffers
 from support.fit_data import parallax, write_data
+from support.image_data import write_images
 
 from mbtf_core.errors import InputError
 from mbtf_fit import FitConfig, Material, fit
@@ -18,32 +18,38 @@ def config(model: str, start: Path | None, steps: int = 3, **network: Any) -> Fi
     return FitConfig.model_validate(
         {
             "model": model,
-            "start": None if start is None else str(start),
+            "init_from": None if start is None else str(start),
             "network": network,
-            "training": {"steps": steps, "batch": 256, "blur": {"start": 0, "offset": 0}},
+            "training": {"steps": steps, "batch": 256, "blur": {"initial_sigma": 0, "offset_sigma": 0}},
         }
     )
 
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """(buffers, material of a neumip that was fitted to queries of the same function)"""
+    """(images, material of a neumip that was fitted to queries of the same function)"""
     folder = tmp_path_factory.mktemp("start")
     shuffled = write_data(folder / "s", parallax, train=4000)
     fit(config("neumip", None, 200), shuffled, folder / "m")
-    return write_buffers(folder / "d", parallax, train=40), folder / "m"
+    return write_images(folder / "d", parallax, train=40), folder / "m"
 
 
 def test_textures_and_offset_are_taken_over_and_the_decoder_is_not(
     folders: tuple[Path, Path], tmp_path: Path
 ) -> None:
-    buffers, start = folders
+    images, start = folders
     # At rates this low what training started from is what it ends with.
-    slow = {"steps": 1, "batch": 64, "rate": 1e-9, "texture_rate": 1e-9, "blur": {"start": 0, "offset": 0}}
+    slow = {
+        "steps": 1,
+        "batch": 64,
+        "learning_rate": 1e-9,
+        "texture_learning_rate": 1e-9,
+        "blur": {"initial_sigma": 0, "offset_sigma": 0},
+    }
     options = {"model": "hierarchical", "training": slow}
     weights = {}
-    for name, more in (("own", {}), ("taken", {"start": str(start)})):
-        fit(FitConfig.model_validate({**options, **more}), buffers, tmp_path / name)
+    for name, more in (("own", {}), ("taken", {"init_from": str(start)})):
+        fit(FitConfig.model_validate({**options, **more}), images, tmp_path / name)
         weights[name] = Material.load(tmp_path / name).model.weights()
     given = Material.load(start).model.weights()
     for key, tensor in weights["taken"].items():
@@ -55,15 +61,15 @@ def test_textures_and_offset_are_taken_over_and_the_decoder_is_not(
 
 
 def test_another_material_to_start_from_is_another_fit(folders: tuple[Path, Path], tmp_path: Path) -> None:
-    buffers, _ = folders
+    images, _ = folders
     shuffled = write_data(tmp_path / "s", parallax, train=1000)
     fit(config("neumip", None), shuffled, tmp_path / "first")
     wanted = config("hierarchical", tmp_path / "first")
-    fit(wanted, buffers, tmp_path / "m")
-    assert fit(wanted, buffers, tmp_path / "m").resumed
+    fit(wanted, images, tmp_path / "m")
+    assert fit(wanted, images, tmp_path / "m").resumed
     fit(config("neumip", None, 5), shuffled, tmp_path / "first", overwrite=True)
     with pytest.raises(InputError, match="holds a fit of another configuration"):
-        fit(wanted, buffers, tmp_path / "m")
+        fit(wanted, images, tmp_path / "m")
 
 
 @pytest.mark.parametrize(
@@ -72,6 +78,6 @@ def test_another_material_to_start_from_is_another_fit(folders: tuple[Path, Path
 def test_other_textures_are_refused_with_the_cure(
     folders: tuple[Path, Path], tmp_path: Path, network: dict[str, Any], lost: str
 ) -> None:
-    buffers, start = folders
-    with pytest.raises(InputError, match=rf"'{lost}.*not what the fit needs to start from.*\n.*same levels"):
-        fit(config("hierarchical", start, **network), buffers, tmp_path / "m")
+    images, start = folders
+    with pytest.raises(InputError, match=rf"'{lost}.*does not have the shape.*\n.*same levels"):
+        fit(config("hierarchical", start, **network), images, tmp_path / "m")

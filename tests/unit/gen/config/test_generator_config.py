@@ -70,14 +70,14 @@ def test_nonsense_counts_are_usage_errors(text: str) -> None:
         ("queries.spp", 3, "even"),
         ("queries.test_spp", 0, "at least 2 and at most 1048576"),
         ("queries.min_cos", 0, "above 0 and below 1"),
-        ("queries.levels", 15, "at least 0 and at most 14"),
+        ("queries.resolution", 100, "must be a power of two from 1 to 16384"),
         ("queries.layout", "rows", "'shuffled' or 'image'"),
         ("light.width", 46, "45"),
         ("light.width", 1e-3, "delta light"),
         ("light.width", float("nan"), "at most 45"),
         ("seed", 1 << 63, "below"),
         ("seed", -1, "at least 0"),
-        ("geometry.height", float("inf"), "at most 100"),
+        ("geometry.height_scale", float("inf"), "at most 100"),
     ],
 )
 def test_values_out_of_range_are_refused_with_key_and_reason(key: str, value: Any, says: str) -> None:
@@ -164,9 +164,9 @@ def test_hash_covers_every_option_but_the_materials_name(tmp_path: Path) -> None
     folder = write_maps(tmp_path / "a")
     changes: list[dict[str, Any]] = [
         {"seed": 1},
-        {"geometry": {"height": 0.5}},
+        {"geometry": {"height_scale": 0.5}},
         {"geometry": {"mesh": 8}},
-        {"geometry": {"tile": "mirror"}},
+        {"geometry": {"make_tileable": "mirror"}},
         {"light": {"width": 2}},
         {"effects": {"mode": "all"}},
         {"effects": {"tolerance": 0.01}},
@@ -183,14 +183,14 @@ def test_hash_covers_every_option_but_the_materials_name(tmp_path: Path) -> None
                 "test": "3",
                 "spp": 8,
                 "test_spp": 8,
-                "allocation": "even",
+                "allocation": "uniform",
                 "target_error": "5%",
-                "cap": 64,
-                "levels": 1,
+                "max_spp": 64,
+                "resolution": 2,
                 "mixture": {"finest": 0.3},
                 "min_cos": 0.2,
                 "layout": "image",
-                "window": 8,
+                "patch_size": 8,
             }.items()
         ),
     ]

@@ -59,7 +59,7 @@ def test_the_reader_is_a_dozen_lines_of_numpy() -> None:
 def test_the_reader_refuses_other_schemas_and_unfinished_data(tmp_path: Path) -> None:
     data = write_dataset(tmp_path / "shards", queries=QUERIES)
     _, read_split = reader()
-    for change in ({"schema": 2}, {"complete": False}, {"format": "other"}):
+    for change in ({"schema": SCHEMA_VERSION + 1}, {"complete": False}, {"format": "other"}):
         (data.folder / "manifest.json").write_text(json.dumps({**data.manifest, **change}))
         with pytest.raises(ValueError, match="no complete data set"):
             read_split(data.folder, "train")

@@ -27,7 +27,7 @@ def found(folder: Path, *names: str) -> dict[str, str]:
 class TestSharedWords:
     def test_a_preview_named_like_the_asset_is_no_map(self, tmp_path: Path) -> None:
         plain = ["PaintedMetal004_1K_Color.png", "PaintedMetal004_1K_Displacement.png"]
-        expected = {"basecolor": plain[0], "height": plain[1]}
+        expected = {"base_color": plain[0], "height": plain[1]}
         names = [*plain, "PaintedMetal004.png"]
         assert found(tmp_path / "a", *names) == expected
         assert find_maps(tmp_path / "a").unused == {"PaintedMetal004.png": "its name says no map"}

@@ -149,7 +149,7 @@ class TestMaterial:
         note = next(n for n in material.notes if n.startswith("normal map: normal.png"))
         assert ("DirectX" if dx else "OpenGL") in note
         assert "u +1.00, v +1.00" in note
-        assert "suggests --height 0.05 " in note
+        assert "suggests --height-scale 0.05 " in note
         assert material.normal is not None
         assert np.abs(material.normal - normals_of(fractal(96, 96), 0.05)).max() < 0.02
 
@@ -190,4 +190,4 @@ class TestMaterial:
         folder = self.folder(tmp_path, 1 - fractal(96, 96), "normal.png", dx=False)
         (warning,) = load_material(folder).warnings
         assert "upside down" in warning
-        assert "negative --height" in warning
+        assert "negative --height-scale" in warning

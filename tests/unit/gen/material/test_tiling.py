@@ -127,13 +127,13 @@ class TestMaterial:
     def test_it_is_said_once_with_the_cure(self, folder: Path) -> None:
         (warning,) = load_material(folder).warnings
         assert "height.png: does not tile along u and v: the seam is a step of 0.0" in warning
-        assert "--tile mirror" in warning
+        assert "--make-tileable mirror" in warning
         assert load_material(folder, "mirror").warnings == ()
 
     def test_mirror_treats_all_maps_alike(self, folder: Path) -> None:
         plain, mirrored = load_material(folder), load_material(folder, "mirror")
         assert mirrored.height.shape == (144, 192)
-        for numbers in (mirrored.roughness, mirrored.coat, mirrored.coat_roughness, mirrored.sheen):
+        for numbers in (mirrored.roughness, mirrored.clearcoat, mirrored.clearcoat_roughness, mirrored.sheen):
             assert np.shape(numbers) == (72, 96)
         assert np.shape(mirrored.sheen_color) == (144, 192, 3)
         assert mirrored.base_color.shape == (144, 192, 3)
@@ -160,7 +160,7 @@ class TestMaterial:
             "base_color",
             "opacity",
             "normal",
-            "coat",
+            "clearcoat",
             "sheen",
             "sheen_color",
         ):
@@ -194,8 +194,8 @@ def test_jobs_use_it(tmp_path: Path) -> None:
     from mbtf_gen.generation import Job
 
     path = save_heights(tmp_path / "h.png", cut(fractal(64, 64)))
-    config = {"material": str(path), "geometry": {"tile": "mirror"}}
-    assert GeneratorConfig.model_validate({"material": "m"}).geometry.tile == "none"
+    config = {"material": str(path), "geometry": {"make_tileable": "mirror"}}
+    assert GeneratorConfig.model_validate({"material": "m"}).geometry.make_tileable == "none"
     job = Job.prepare(GeneratorConfig.model_validate(config))
     assert job.material.height.shape == (96, 96)
     assert job.material.tile == "mirror"

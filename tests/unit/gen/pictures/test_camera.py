@@ -11,7 +11,7 @@ from mbtf_gen.pictures.camera import Camera
 
 UP = np.array([0.0, 0.0, 1.0])
 CAMERA = Camera(
-    elevation=30.0, azimuth=40.0, span=0.3, target=(0.5, 0.45), rows=61, columns=81, field_of_view=25
+    elevation=30.0, azimuth=40.0, tiles_across=0.3, target=(0.5, 0.45), rows=61, columns=81, field_of_view=25
 )
 
 
@@ -39,10 +39,10 @@ def test_views_point_from_the_plane_to_the_camera(aspect: float) -> None:
     x = CAMERA.position[:2] - CAMERA.position[2] * omega[..., :2] / omega[..., 2:]
     difference = x / (1.0, aspect) - q.u
     np.testing.assert_allclose(difference, np.round(difference), atol=1e-5)
-    # The middle pixel looks at the target, from the stated direction, and the picture is `span` wide there.
+    # The middle pixel looks at the target, from the stated direction; there the picture is that wide.
     np.testing.assert_allclose(omega[30, 40], from_angles(30.0, 40.0), atol=1e-6)
     np.testing.assert_allclose(x[30, 40], CAMERA.target, atol=1e-5)
-    assert np.linalg.norm(x[30, 80] - x[30, 0]) * 81 / 80 == pytest.approx(CAMERA.span, rel=1e-2)
+    assert np.linalg.norm(x[30, 80] - x[30, 0]) * 81 / 80 == pytest.approx(CAMERA.tiles_across, rel=1e-2)
 
 
 def test_a_view_of_the_horizon_is_refused() -> None:

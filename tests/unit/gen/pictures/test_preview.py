@@ -106,7 +106,7 @@ def sample_of(count: int, seed: int = 0, **options: Any) -> QuerySample:
 def _lattice(config: GeneratorConfig) -> Any:
     from mbtf_core.lattice import Lattice
 
-    return Lattice.for_map(4, 8, config.queries.levels)
+    return Lattice.for_map(4, 8, config.queries.finest)
 
 
 @pytest.mark.parametrize("weights", [(0.6, 0.4), (1.0, 0.0), (0.0, 1.0)])
@@ -138,7 +138,7 @@ def test_the_histogram_of_levels_follows_the_mixture() -> None:
     assert edges.tolist() == [0, 1, 2, 3]
     np.testing.assert_allclose(stated, [0.2, 0.2, 0.6])
     np.testing.assert_allclose(found, stated, atol=2 / 300)
-    edges, found, stated = level_histogram(sample_of(50, levels=0))
+    edges, found, stated = level_histogram(sample_of(50, resolution=1))
     assert (found.tolist(), stated.tolist()) == ([1.0], [1.0])
 
 

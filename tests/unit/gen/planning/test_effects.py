@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from mbtf_core.errors import UsageError
+from mbtf_gen.config.effects_request import EFFECTS, OF_RELIEF, EffectsRequest
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation import Job
 from mbtf_gen.material.material import Material
-from mbtf_gen.planning.effects import EFFECTS, OF_RELIEF, Effect, EffectsPlan, EffectsRequest
+from mbtf_gen.planning.effects import Effect, EffectsPlan
 from mbtf_gen.planning.effects_plan import plan_effects, simulated
 
 HEIGHTS = np.array([[0.0, 0.1], [0.05, 0.02]])
@@ -143,7 +144,7 @@ def test_a_small_run_is_not_looked_at_twice() -> None:
     assert plan_effects(job_of(FLAT), pilots=False).closed_form
 
 
-COAT: dict[str, Any] = {"coat": 1.0, "coat_roughness": 0.1}
+COAT: dict[str, Any] = {"clearcoat": 1.0, "clearcoat_roughness": 0.1}
 
 
 def test_black_under_a_coat_is_not_black() -> None:
@@ -175,7 +176,7 @@ def test_the_smoothest_place_decides_how_light_is_found() -> None:
     patch[3, 3] = 0.02
     assert not plan_effects(job_of(replace(FLAT, **dull))).on("mis")
     assert plan_effects(job_of(replace(FLAT, **{**dull, "roughness": patch}))).on("mis")
-    assert plan_effects(job_of(replace(FLAT, **dull, coat=1.0, coat_roughness=0.05))).on("mis")
+    assert plan_effects(job_of(replace(FLAT, **dull, clearcoat=1.0, clearcoat_roughness=0.05))).on("mis")
     assert not plan_effects(job_of(FLAT, "+masking")).on("mis")
     sheen = {"sheen": 0.5, "sheen_roughness": 0.5}
     assert not plan_effects(job_of(replace(FLAT, **sheen))).on("mis")

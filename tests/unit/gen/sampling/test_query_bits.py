@@ -114,7 +114,7 @@ def test_image_buffers_hold_every_texel_in_order_under_one_light_and_view(lattic
 
 @pytest.mark.parametrize("lattice", LATTICES, ids=lambda k: "x".join(map(str, k.shape())))
 def test_windows_are_grids_of_the_level_nearest_to_their_footprint(lattice: Lattice) -> None:
-    q = QueryPlan(lattice, Mixture(1, 0), 0.2, "image", 5, 40, window=5).draw("train", 1, 40)
+    q = QueryPlan(lattice, Mixture(1, 0), 0.2, "image", 5, 40, patch_size=5).draw("train", 1, 40)
     assert q.lead == (40, 5, 5)
     assert ((q.u >= 0) & (q.u < 1)).all()
     for item in range(40):
@@ -129,7 +129,7 @@ def test_windows_are_grids_of_the_level_nearest_to_their_footprint(lattice: Latt
     # They begin anywhere.
     assert len(np.unique(q.u[:, 0, 0])) == 80
     assert np.ptp(q.u[:, 0, 0], axis=0).min() > 0.7
-    other = QueryPlan(lattice, Mixture(1, 0), 0.2, "image", 5, 40, window=5).draw("train", 2, 40)
+    other = QueryPlan(lattice, Mixture(1, 0), 0.2, "image", 5, 40, patch_size=5).draw("train", 2, 40)
     assert not equal(q, other)
 
 

@@ -12,7 +12,7 @@ import torch
 from support.fit_data import parallax, write_data
 
 from mbtf_core.lattice import Lattice
-from mbtf_fit.models import build_model
+from mbtf_fit.models.registry import build_model
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_pipeline.compare import timing
 from mbtf_pipeline.compare.dataset_errors import errors_on_data

@@ -52,7 +52,7 @@ def test_adaptive_counts_are_measured_by_both_kinds_of_error(
         "mbtf_pipeline.cost_study.generator_benchmark.plan_effects",
         lambda job: plan_effects(job, pilots=False),
     )
-    even = bench.measure_counts({"queries.spp": 16, "queries.allocation": "even"}, False, 0.0)
+    even = bench.measure_counts({"queries.spp": 16, "queries.allocation": "uniform"}, False, 0.0)
     assert even.bias is None
     assert even.paths == 16
     assert abs(even.noise.value - NOISE / 4) < 4 * even.noise.error
@@ -90,7 +90,7 @@ def test_every_setting_is_one_that_the_generator_takes(bench: GeneratorBenchmark
     # them are compared.
     for task in tasks:
         command = task.command("mbtf-gen m")
-        wanted = task.changes.get("queries.allocation", None if task.study == "adaptive" else "even")
+        wanted = task.changes.get("queries.allocation", None if task.study == "adaptive" else "uniform")
         assert f"allocation={wanted}" in command if wanted else "allocation" not in command
 
 

@@ -95,16 +95,16 @@ def test_a_chain_counts_what_it_took_and_left(tmp_path: Path, monkeypatch: pytes
     """Seven seconds of generating, five of training and one of loading; half a second to evaluate 2¹⁸
     queries; a constant, 0.1 and its nearest half-precision number, for values of 0 and 1."""
     import torch
+    from mbtf_pipeline.cost_study.importance_sampled import Judges
 
     import mbtf_pipeline.cost_study.runs as module
-    from mbtf_fit.data.loader import Queries
-    from mbtf_pipeline.cost_study.importance_sampled import Judges
+    from mbtf_fit.data.queries import ShardQueries
 
     clock = Clock()
     n = 1000
     value = np.repeat(np.arange(n) % 2.0, 3).reshape(n, 3).astype(np.float32)
     zero = np.zeros((n, 3), np.float32)
-    queries = Queries(zero[:, :2], zero[:, 0], zero, zero, value, value)
+    queries = ShardQueries(zero[:, :2], zero[:, 0], zero, zero, value, value)
 
     class Answer(torch.nn.Module):
         def __init__(self) -> None:

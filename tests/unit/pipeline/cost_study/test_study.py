@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mbtf_pipeline.cost_study.seed_variance import seed_scatter, with_scatter
 
 from mbtf_core.atomic import write_json
 from mbtf_core.stats import Estimate
@@ -18,7 +19,6 @@ from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_pipeline.cost_study.measurements import Point, PointFolder
 from mbtf_pipeline.cost_study.page import half_widths, paths_slope
 from mbtf_pipeline.cost_study.pareto import marginal_price, pareto_front
-from mbtf_pipeline.cost_study.seed_variance import seed_scatter, with_scatter
 from mbtf_pipeline.cost_study.tables import COLUMNS, to_csv
 
 
@@ -200,7 +200,7 @@ def test_studies_count_paths_whatever_the_recipe_aims_at() -> None:
     """With a target error all numbers of paths would be one setting; and fits learn from single queries."""
     from mbtf_pipeline.cost_study.study import studied
 
-    queries = {"target_error": "5%", "layout": "image", "window": 8, "spp": 6}
+    queries = {"target_error": "5%", "layout": "image", "patch_size": 8, "spp": 6}
     config = GeneratorConfig.model_validate({"material": "m", "seed": 3, "queries": queries})
     found = studied(config, None)
     assert found.queries.target_error is None

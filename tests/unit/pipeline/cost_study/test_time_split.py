@@ -16,7 +16,7 @@ from mbtf_core.errors import InputError, UsageError
 from mbtf_core.stats import Estimate
 from mbtf_core.units import parse_duration
 from mbtf_fit.config import FitConfig
-from mbtf_fit.data.loader import QUERY_BYTES
+from mbtf_fit.data.queries import QUERY_BYTES
 from mbtf_pipeline.cost_study import time_split as module
 from mbtf_pipeline.cost_study.time_split import (
     LARGEST_SHARE,

@@ -20,15 +20,15 @@ tables: [methods]
 materials:
   here: maps/height.npy
   elsewhere: maps/nowhere.npy
-  steep: {generate: {material: maps/height.npy, geometry: {height: 0.5}}}
+  steep: {generate: {material: maps/height.npy, geometry: {height_scale: 0.5}}}
 base:
-  generate: {geometry: {height: 0.1, mesh: 8}, queries: {train: 400/texel, levels: 2}}
+  generate: {geometry: {height_scale: 0.1, mesh: 8}, queries: {train: 400/texel, resolution: 4}}
   each_fit: {training: {steps: 500, batch: 64}}
   fit:
     neumip-baseline:
     wide: {model: neumip, network: {width: 40}, training: {batch: 32}}
 quick:
-  generate: {geometry: {height: 0.2}, queries: {train: 4/texel}}
+  generate: {geometry: {height_scale: 0.2}, queries: {train: 4/texel}}
   each_fit: {training: {steps: 3}}
 """
 
@@ -52,11 +52,11 @@ def test_layers_in_their_order(tmp_path: Path) -> None:
     full, _ = planned(path)
     quick, _ = planned(path, True)
     # The quick size goes over the base, a material's own options over both.
-    heights = [runs["here"].recipe.generate.geometry.height for runs in (full, quick)]
+    heights = [runs["here"].recipe.generate.geometry.height_scale for runs in (full, quick)]
     assert heights == [0.1, 0.2]
-    assert {runs["steep"].recipe.generate.geometry.height for runs in (full, quick)} == {0.5}
+    assert {runs["steep"].recipe.generate.geometry.height_scale for runs in (full, quick)} == {0.5}
     assert quick["here"].recipe.generate.geometry.mesh == 8
-    assert quick["here"].recipe.generate.queries.levels == 2
+    assert quick["here"].recipe.generate.queries.resolution == 4
     # What holds for every fit lies below its own options.
     fits = quick["here"].recipe.fit
     assert {name: f.model for name, f in fits.items()} == {
@@ -116,7 +116,7 @@ def test_ordinary_and_paper_recipes_are_told_apart(
     assert run(app, ["run", str(PIPELINES / "ci.yaml"), "--quick"]) == 2
     assert "only paper recipes have a quick size" in capsys.readouterr().err
     assert run(app, ["run", str(SHIPPED[0]), "--quality", "draft"]) == 2
-    assert "a paper recipe has sizes of its own" in capsys.readouterr().err
+    assert "a paper recipe has sizes and times of its own" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=[p.stem for p in SHIPPED])
@@ -130,5 +130,5 @@ def test_shipped_recipes_are_sound_and_quick_is_smaller(path: Path) -> None:
         assert small.compare.size <= large.recipe.compare.size
         assert small.compare.spp <= large.recipe.compare.spp
         assert int(small.generate.queries.test) <= int(large.recipe.generate.queries.test)
-        assert (small.generate.queries.levels or 99) < (large.recipe.generate.queries.levels or 0)
+        assert (small.generate.queries.resolution or 99) < (large.recipe.generate.queries.resolution or 0)
         assert small.fit.keys() == large.recipe.fit.keys()

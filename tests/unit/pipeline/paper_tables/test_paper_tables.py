@@ -34,7 +34,7 @@ def errors(mse: float, error: float = 1e-6) -> dict[str, Any]:
     return {"unexplained": number(1e3 * mse, 1e3 * error), "mse": number(mse, error)}
 
 
-def record(folder: Path, span: float = 1.0) -> dict[str, Any]:
+def record(folder: Path, tiles_across: float = 1.0) -> dict[str, Any]:
     """A comparison of two fits with one picture, whose files are there."""
     for name in ("reference", *MSE):
         (folder / "compare").mkdir(parents=True, exist_ok=True)
@@ -52,7 +52,12 @@ def record(folder: Path, span: float = 1.0) -> dict[str, Any]:
         for fit, mse in MSE.items()
     }
     noise = {"file": "reference", "flip": {"ldr": 0.1, "hdr": 0.35}, "ssim": 0.95, "st_lpips": None}
-    picture = {"span": span, "levels": [2.0, 2.0], "references": {"query": noise}, "fits": fits}
+    picture = {
+        "tiles_across": tiles_across,
+        "levels": [2.0, 2.0],
+        "references": {"query": noise},
+        "fits": fits,
+    }
     sizes = {"networks": {"decoder": 1678, "offset_network": 1576}, "texels": 700, "network_weights": 3254}
     test = {
         fit: {
@@ -182,7 +187,9 @@ def test_zooms_hold_one_row_per_span_and_fit(tmp_path: Path) -> None:
     far = record(tmp_path, 8.0)["pictures"]
     run.comparison["pictures"] = run.pictures + far
     table = zooms([run])[0]
-    assert [(r["span"], r["method"]) for r in csv_of(table)] == [(s, f) for s in ("1", "8") for f in MSE]
+    assert [(r["tiles_across"], r["method"]) for r in csv_of(table)] == [
+        (s, f) for s in ("1", "8") for f in MSE
+    ]
     assert [len(row) for _, row in table.figures] == [2, 2, 2]
 
 

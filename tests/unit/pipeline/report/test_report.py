@@ -33,7 +33,7 @@ def test_every_error_of_a_level_follows_one_rule() -> None:
     picture = {
         "view": direction,
         "light": direction,
-        "span": 1,
+        "tiles_across": 1,
         "references": {"query": {"flip": flips}},
         "fits": {"a": {"errors": {"query": error}, "flip": flips}},
     }

@@ -17,10 +17,10 @@ from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
 from .fit_data import F32, Function, random_directions
 
 
-def random_buffers(
+def random_images(
     random: np.random.Generator, items: int, lattice: Lattice, *, regular: bool = False
 ) -> dict[str, F32]:
-    """Buffers of all levels and directions: one query per finest texel, at its center or anywhere in it."""
+    """Images of all levels and directions: one query per finest texel, at its center or anywhere in it."""
     rows, columns = lattice.shape()
     shape = (items, rows, columns)
     jitter = np.zeros((*shape, 2)) if regular else random.random((*shape, 2)) - 0.5
@@ -33,7 +33,7 @@ def random_buffers(
     return {n: np.ascontiguousarray(a, np.float32) for n, a in zip(names, arrays, strict=True)}
 
 
-def write_buffers(
+def write_images(
     folder: Path,
     function: Function,
     *,
@@ -43,14 +43,14 @@ def write_buffers(
     aspect: float = 1.0,
     noise: float = 0.0,
     seed: int = 0,
-    window: int | None = None,
+    patch_size: int | None = None,
     through: Callable[[F32, F32, F32], Any] | None = None,
 ) -> Path:
-    """Write so many buffers of a known function, in two shards, with independent noise in both halves.
+    """Write so many images of a known function, in two shards, with independent noise in both halves.
 
     Parameters
     ----------
-    window : places along each side of a buffer; None: whole buffers
+    patch_size : texels along each side of an image; None: whole images
     through : transmittance at u, σ and view, of a material with holes
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -59,9 +59,9 @@ def write_buffers(
     for split, counts in (("train", (train // 2, train - train // 2)), ("test", (test,))):
         entries = []
         for index, items in enumerate(counts):
-            queries = random_buffers(random, items, lattice)
-            if window is not None:
-                plan = QueryPlan(lattice, Mixture(1, 0), 0.1, "image", seed, items, window)
+            queries = random_images(random, items, lattice)
+            if patch_size is not None:
+                plan = QueryPlan(lattice, Mixture(1, 0), 0.1, "image", seed, items, patch_size)
                 queries = {name: getattr(plan.draw(split, index, items), name) for name in queries}
             shape = queries["sigma"].shape
             flat = {name: a.reshape(-1, *a.shape[3:]) for name, a in queries.items()}
@@ -81,12 +81,12 @@ def write_buffers(
     manifest: dict[str, Any] = {
         "format": FORMAT_NAME,
         "schema": SCHEMA_VERSION,
-        "config_hash": f"buffers-{function.__name__}-{seed}-{noise}",
+        "config_hash": f"images-{function.__name__}-{seed}-{noise}",
         "layout": "image",
         "levels": {"finest": finest},
         "tile": {"aspect": aspect},
         "splits": splits,
-        "window": window,
+        "patch_size": patch_size,
     }
     if through is not None:
         manifest["arrays"] = {"transmittance": {}}

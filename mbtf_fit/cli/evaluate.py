@@ -1,0 +1,50 @@
+"""``mbtf-fit evaluate``: errors of a material on a data set."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mbtf_core.console import CONSOLE, Console
+from mbtf_fit.formatting import describe_errors, describe_transmittance
+
+
+def evaluate(material: Path, shards: Path, /, *, console: Console = CONSOLE) -> None:
+    """Errors of a material on a data set, free of the data's noise.
+
+    On the test split, and on the queries and directions that were held out of training: overall, by level of
+    detail, and by elevation.
+
+    Parameters
+    ----------
+    material
+        Folder made by mbtf-fit.
+    shards
+        Folder made by mbtf-gen.
+    """
+    from mbtf_fit.evaluation import evaluate, foreign_inputs
+    from mbtf_fit.material.material import Material
+
+    loaded = Material.load(material)
+    foreign = foreign_inputs(loaded, shards)
+    if foreign:
+        console.note(
+            f"warning: {shards} was made from another material than {material} was trained on "
+            f"({', '.join(foreign)} differ{'s' if len(foreign) == 1 else ''}); these errors say how far the "
+            "two are apart, not how good the fit is"
+        )
+    found = evaluate(loaded, shards)
+    errors = {name: e.as_dict() for name, e in found.values.items()}
+    through = (
+        None if found.transmittance is None else {n: e.as_dict() for n, e in found.transmittance.items()}
+    )
+    lines = [f"{material}: {loaded.config.model} on {shards}", *describe_errors(errors)]
+    console.report(
+        {
+            "material": material,
+            "shards": shards,
+            "foreign_inputs": foreign,
+            "errors": errors,
+            **({} if through is None else {"transmittance": through}),
+        },
+        "\n".join(lines + describe_transmittance(through)),
+    )

@@ -1,0 +1,82 @@
+"""``mbtf-fit export``: a material in forms that other programs read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from mbtf_core.console import CONSOLE, Console
+from mbtf_core.errors import InputError
+from mbtf_core.options import Output, Switch
+
+
+def export_material(
+    material: Path,
+    /,
+    *,
+    to: Annotated[
+        list[Literal["exr", "json", "material"]] | None, Parameter(show_default="exr, json")
+    ] = None,
+    output: Annotated[Output | None, Parameter(show_default="the material's own")] = None,
+    half: Switch = False,
+    console: Console = CONSOLE,
+) -> None:
+    """Write a material in forms that other programs read: mbtf-fit export material/ --to exr
+
+    exr: the latent textures, a part per level and a channel per feature, and those of the transmittance of a
+    material with holes. json: the networks as a list of layers, with formulas, conventions and queries with
+    expected values. material: another material folder.
+
+    Parameters
+    ----------
+    material
+        Folder made by mbtf-fit.
+    to
+        Form to write. Repeatable.
+    half
+        Round all weights and texels to 16 bits, and print the error of that.
+    """
+    from mbtf_fit.material.export import LAYERS_NAME, TEXTURES_NAME, to_half, write_layers, write_textures
+    from mbtf_fit.material.format import DESCRIPTION_NAME, WEIGHTS_NAME
+    from mbtf_fit.material.material import Material, export
+    from mbtf_fit.material.storage import make_folder
+    from mbtf_fit.material.transmittance import TRANSMITTANCE_NAME
+
+    wanted = list(dict.fromkeys(to or ["exr", "json"]))
+    folder = material if output is None else output
+    loaded = Material.load(material)
+    if "material" in wanted and folder.is_dir() and any(folder.iterdir()):
+        raise InputError(
+            "holds something already", where=folder, hint="name a new folder with -o for --to material"
+        )
+    written, error = loaded, None
+    if half:
+        written, error = to_half(loaded)
+    make_folder(folder)
+    files = []
+    if "exr" in wanted:
+        write_textures(written, folder / TEXTURES_NAME, half=half)
+        files.append(TEXTURES_NAME)
+    if "json" in wanted:
+        write_layers(written, folder / LAYERS_NAME, half=half)
+        files.append(LAYERS_NAME)
+    if "material" in wanted:
+        description = loaded.description
+        export(
+            written.model,
+            written.config,
+            folder,
+            data=description["data"],
+            training=description["training"],
+            half=half,
+            transmittance=written.transmittance,
+        )
+        files += [WEIGHTS_NAME, DESCRIPTION_NAME, *([TRANSMITTANCE_NAME] if loaded.transmittance else [])]
+    sizes = {name: (folder / name).stat().st_size for name in files}
+    lines = [f"{folder / name}: {size / 1e6:.3f} MB" for name, size in sizes.items()]
+    console.report(
+        {"folder": folder, "files": sizes, "half": None if error is None else error.as_dict()},
+        "\n".join([*lines, *([] if error is None else [str(error)])]),
+    )

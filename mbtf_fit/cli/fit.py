@@ -1,0 +1,163 @@
+"""``mbtf-fit SHARDS``: fit a material."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from mbtf_core.console import CONSOLE, Console, clock
+from mbtf_core.errors import PartialError, UsageError
+from mbtf_core.options import DryRun, Options, Output, Overwrite, takes_options
+from mbtf_fit.config import FitConfig
+from mbtf_fit.formatting import describe_fit, format_estimate, format_table
+from mbtf_gen.config.presets import QualityOption, as_assignments
+
+
+@takes_options(FitConfig)
+def fit(
+    shards: Path | None = None,
+    /,
+    *,
+    output: Output = Path("material"),
+    quality: QualityOption = None,
+    options: Options[FitConfig],
+    many: Annotated[list[Path] | None, Parameter(consume_multiple=True)] = None,
+    processes: Annotated[int | None, Parameter(show_default="one per GPU, or 1")] = None,
+    dry_run: DryRun = False,
+    overwrite: Overwrite = False,
+    console: Console = CONSOLE,
+) -> None:
+    """Fit a material to a data set: mbtf-fit shards/ -o material/
+
+    The same command again resumes an unfinished fit. --time is that of training. --dry-run forecasts time,
+    error and size by two short fits on this machine. With --many, the output folder holds one folder per
+    material.
+
+    Parameters
+    ----------
+    shards
+        Folder made by mbtf-gen.
+    many
+        Fit several data sets, one material each: folders made by mbtf-gen, folders of such folders, or text
+        files with one folder per line. A failure stops none of the others.
+    processes
+        With --many, number of simultaneous fits.
+    """
+    if dry_run and many is not None:
+        raise UsageError("--dry-run looks at one data set", hint="mbtf-fit shards/ --dry-run")
+    if many is not None and shards is not None:
+        raise UsageError("--many takes all data sets", hint=f"mbtf-fit --many {shards} ... -o materials/")
+    if processes is not None and (many is None or processes < 1):
+        raise UsageError("--processes is a positive number that goes with --many")
+    if shards is None and many is None:
+        raise UsageError("no shards given", hint="mbtf-fit shards/ -o material/")
+    given = options.given
+    if {"training.time", "training.steps"} <= set(given):
+        raise UsageError("--time and --steps exclude each other", hint="give one of them")
+    from mbtf_core.units import format_duration
+    from mbtf_fit.presets import fitter_options, overrides_of
+
+    presets: list[str] = []
+    if quality is not None:
+        flags = [f"{key}={value}" for key, value in given.items()]
+        overrides = {"model": "neumip", **overrides_of(options.config, [*options.assignments, *flags])}
+        presets = as_assignments(fitter_options(quality, {"": overrides})[""])
+    if "training.time" in given:
+        # A time given with its flag overrides steps from anywhere else.
+        options = replace(options, assignments=[*options.assignments, "training.steps=null"])
+    resolved = options.resolve(presets)
+    training = resolved.training
+    budget = format_duration(training.time) if training.steps is None else f"{training.steps} steps"
+    if many is not None:
+        _fit_many(resolved, many, output, processes, overwrite, console)
+        return
+    assert shards is not None
+    if dry_run:
+        from mbtf_fit.training.forecast import forecast_fit
+
+        expected = forecast_fit(resolved, shards)
+        console.report(
+            {"shards": shards, "model": resolved.model, "forecast": expected.as_dict()}, expected.describe()
+        )
+        return
+    from mbtf_fit.material.format import DESCRIPTION_NAME
+    from mbtf_fit.training.fit import fit
+
+    finished = not overwrite and (output / DESCRIPTION_NAME).exists()
+    if not finished:
+        console.note(
+            f"{shards} -> {output}: {resolved.model}, training for {budget} "
+            "(change it with --time or --steps)"
+        )
+    from mbtf_fit.native import missing_reason
+
+    if missing_reason():
+        console.note(f"note: training runs in PyTorch, not in the compiled kernel ({missing_reason()})")
+    with console.progress(total=100, label="fitting", unit="%") as bar:
+        result = fit(
+            resolved,
+            shards,
+            output,
+            overwrite=overwrite,
+            progress=lambda fraction, note: bar.update(round(100 * fraction, 1), note),
+        )
+    if finished:
+        console.note(f"{output}: this fit is finished, nothing was trained; --overwrite trains it again")
+    data = result.as_dict()
+    cost = [result.marginal_cost.describe()] if result.marginal_cost is not None else []
+    console.report(data, "\n".join([describe_fit(data), *cost]))
+
+
+def _fit_many(
+    config: FitConfig,
+    many: list[Path],
+    output: Path,
+    processes: int | None,
+    overwrite: bool,
+    console: Console,
+) -> None:
+    from mbtf_fit.training.fit_many import FitOutcome, find_data, fit_many, name_materials
+
+    shards = find_data(many)
+    folders = name_materials(shards, output)
+    if processes is None:
+        import torch
+
+        processes = max(1, torch.cuda.device_count()) if config.device != "cpu" else 1
+    console.note(f"{len(shards)} data sets -> {output}: {config.model}, {processes} at a time")
+    with console.progress(total=len(shards), label="fitting", unit="data sets") as bar:
+
+        def finished(outcome: FitOutcome) -> None:
+            bar.advance(1, f"{outcome.folder.name}: {'failed' if outcome.error else 'done'}")
+
+        outcomes = fit_many(
+            config, shards, folders, processes=processes, overwrite=overwrite, finished=finished
+        )
+    rows = [["material", "unexplained variance, test", "steps", "training"]]
+    for outcome in outcomes:
+        if outcome.result is None:
+            rows.append([outcome.folder.name, "failed", "-", "-"])
+            continue
+        training, errors = outcome.result["training"], outcome.result["errors"]
+        test = errors.get("test") or next(iter(errors.values()))
+        rows.append(
+            [
+                outcome.folder.name,
+                format_estimate(test["unexplained"]),
+                str(training["steps"]),
+                clock(training["seconds"]),
+            ]
+        )
+    console.report({"fits": [o.as_dict() for o in outcomes]}, format_table(rows))
+    failed = [o for o in outcomes if o.error is not None]
+    for outcome in failed:
+        console.note(f"{outcome.shards}: {outcome.error}")
+    if failed:
+        raise PartialError(
+            f"{len(failed)} of {len(outcomes)} fits failed",
+            where=output,
+            hint="the same command again takes up what is not finished",
+        )

@@ -1,0 +1,82 @@
+"""``mbtf-fit info``: what a material or a data set holds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from mbtf_core.console import CONSOLE, Console, clock
+from mbtf_core.errors import InputError
+from mbtf_core.suggest import suggest_path
+from mbtf_fit.formatting import describe_errors, describe_transmittance
+
+
+def info(path: Path, /, *, console: Console = CONSOLE) -> None:
+    """What a material or a data set holds.
+
+    Parameters
+    ----------
+    path
+        Folder made by mbtf-fit or by mbtf-gen.
+    """
+    if not path.is_dir():
+        raise InputError("no such folder", where=path, hint=suggest_path(path, Path.is_dir))
+    from mbtf_core.shard_schema import MANIFEST_NAME
+
+    data, text = _shards_info(path) if (path / MANIFEST_NAME).exists() else _material_info(path)
+    console.report(data, text)
+
+
+def _shards_info(path: Path) -> tuple[dict[str, Any], str]:
+    from mbtf_gen.dataset.reader import Dataset
+
+    data = Dataset.open(path)
+    lattice = data.lattice
+    rows, columns = lattice.shape()
+    splits = {
+        s: {"shards": len(data.shards(s)), "rows": sum(x.rows for x in data.shards(s))} for s in data.splits
+    }
+    kind = "queries" if data.layout == "shuffled" else "images"
+    lines = [
+        f"{path}: shards, {data.layout} layout",
+        f"levels 0 to {lattice.finest}, finest {columns} x {rows} texels, aspect {lattice.aspect:g}",
+        *(f"{s}: {n['rows']} {kind} in {n['shards']} shards" for s, n in splits.items()),
+    ]
+    return {
+        "shards": path,
+        "layout": data.layout,
+        "levels": {"finest": lattice.finest, "shape": [rows, columns]},
+        "aspect": lattice.aspect,
+        "splits": splits,
+    }, "\n".join(lines)
+
+
+def _material_info(path: Path) -> tuple[dict[str, Any], str]:
+    from mbtf_fit.material.format import WEIGHTS_NAME
+    from mbtf_fit.material.material import Material
+    from mbtf_fit.native import describe
+
+    material = Material.load(path)
+    description = material.description
+    weights, training = description["weights"], description["training"]
+    size = (path / WEIGHTS_NAME).stat().st_size
+    deviation = material.deviation()
+    rows, columns = material.lattice.shape()
+    lines = [
+        f"{path}: {description['model']}",
+        f"levels 0 to {material.lattice.finest}, finest {columns} x {rows} texels, "
+        f"aspect {material.lattice.aspect:g}",
+        f"{weights['network_weights']} network weights, {weights['texels']} numbers in textures, "
+        f"{size / 1e6:.2f} MB",
+        f"trained {training['steps']} steps of {training['batch']} in {clock(training['seconds'])}",
+        f"this machine's CPU evaluates by: {describe()}",
+        *describe_errors(training["errors"]),
+        *describe_transmittance(training.get("transmittance")),
+        f"conformance: {description['conformance']['count']} queries, largest deviation {deviation:.2g}",
+    ]
+    return {
+        "material": path,
+        "bytes": size,
+        "conformance_deviation": deviation,
+        **{k: description[k] for k in ("model", "levels", "tile", "weights", "config", "data", "training")},
+    }, "\n".join(lines)

@@ -1,0 +1,117 @@
+"""Queries of a data set as NumPy arrays and as tensors, and the order of the batches."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+# Arrays of a shard that the fitter reads.
+NEEDED = ("u", "sigma", "omega_i", "omega_o", "value_a", "value_b")
+# Bytes of a training query in memory.
+QUERY_BYTES = 48
+
+
+@dataclass(frozen=True)
+class ShardQueries:
+    """Queries with both estimates of their value, float32 NumPy arrays.
+
+    Images of the image layout have (items, rows, columns) in place of n, until :meth:`flat`.
+
+    Attributes
+    ----------
+    u : (n, 2) uv; sigma : (n,) tile widths; omega_i, omega_o : (n, 3); value_a, value_b : (n, 3) in 1/sr
+    """
+
+    u: NDArray[np.float32]
+    sigma: NDArray[np.float32]
+    omega_i: NDArray[np.float32]
+    omega_o: NDArray[np.float32]
+    value_a: NDArray[np.float32]
+    value_b: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.sigma)
+
+    @classmethod
+    def join(cls, parts: Iterable[ShardQueries]) -> ShardQueries:
+        """Concatenation of all parts."""
+        found = list(parts)
+        return cls(**{f.name: np.concatenate([getattr(p, f.name) for p in found]) for f in fields(cls)})
+
+    def flat(self) -> ShardQueries:
+        """The same queries with one leading axis."""
+        lead = self.sigma.ndim
+        arrays = {f.name: getattr(self, f.name) for f in fields(self)}
+        return ShardQueries(**{name: a.reshape(-1, *a.shape[lead:]) for name, a in arrays.items()})
+
+    def take(self, rows: Any) -> ShardQueries:
+        """Some of the queries: a slice, an index array or a mask."""
+        return ShardQueries(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+
+
+def batch_starts(total: int, size: int, seed: int, step: int) -> Iterator[int]:
+    """Endless indices of the first query of each batch of `size` of `total` queries, from a step on.
+
+    Every epoch visits all batches in a new order, and starts its batches at another query.
+    """
+    count = total // size
+    while True:
+        epoch, done = divmod(step, count)
+        random = np.random.Generator(np.random.Philox(key=[seed, epoch]))
+        start = int(random.integers(total - count * size + 1))
+        for i in random.permutation(count)[done:]:
+            yield start + int(i) * size
+        step += count - done
+
+
+def batch_ranges(total: int, size: int, seed: int, step: int) -> list[range]:
+    """Indices of the queries in the batch of a step."""
+    start = next(batch_starts(total, size, seed, step))
+    return [range(start, start + size)]
+
+
+def mean_value(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Mean of both halves, without overflow."""
+    half = np.float32(0.5)
+    out: NDArray[np.float32] = half * a + half * b
+    return out
+
+
+@dataclass(frozen=True)
+class TrainingQueries:
+    """Queries for training: contiguous tensors on the device; the value is the mean of both halves."""
+
+    u: Tensor
+    sigma: Tensor
+    omega_i: Tensor
+    omega_o: Tensor
+    value: Tensor
+
+    def __len__(self) -> int:
+        return len(self.sigma)
+
+    def batches(self, size: int, seed: int, step: int, margin: int = 0) -> Iterator[TrainingQueries]:
+        """Endless batches of `size` queries from a step on; `margin` is unused.
+
+        The shards store queries in random order, so consecutive queries form a batch.
+        """
+        for start in batch_starts(len(self), size, seed, step):
+            yield self.slice(start, start + size)
+
+    def batch_ranges(self, size: int, seed: int, step: int) -> list[range]:
+        """Indices of the queries in the batch of a step."""
+        return batch_ranges(len(self), size, seed, step)
+
+    def slice(self, start: int, stop: int) -> TrainingQueries:
+        """Consecutive queries, without a copy."""
+        return TrainingQueries(*(getattr(self, f.name)[start:stop] for f in fields(self)))
+
+    def to(self, device: torch.device) -> TrainingQueries:
+        """The same queries on another device."""
+        return TrainingQueries(*(getattr(self, f.name).to(device) for f in fields(self)))

@@ -1,0 +1,60 @@
+"""Checkpoints: the state of a trainer in one file, and training resumed from it."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mbtf_core.errors import InputError
+from mbtf_fit.material.storage import read_tensors, write_tensors
+from mbtf_fit.training.trainer import Progress, Trainer
+
+CHECKPOINT_NAME = "checkpoint.safetensors"
+_MOMENTS = ("step", "exp_avg", "exp_avg_sq")
+
+
+def write_checkpoint(trainer: Trainer, path: Path) -> None:
+    """Write parameters, optimizer state and progress.
+
+    Raises
+    ------
+    PartialError : the disk is full or the folder cannot be written
+    """
+    tensors = {f"model.{name}": p.detach() for name, p in trainer.model.named_parameters()}
+    for name, p in trainer.model.named_parameters():
+        for key, value in trainer.optimizer.state.get(p, {}).items():
+            tensors[f"adam.{key}.{name}"] = value
+    write_tensors(path, tensors, asdict(trainer.progress))
+
+
+def read_checkpoint(trainer: Trainer, path: Path) -> None:
+    """Resume from a checkpoint of the same configuration and data, with identical results.
+
+    Raises
+    ------
+    InputError : the checkpoint is corrupt, or of another model
+    """
+    try:
+        _restore(trainer, *read_tensors(path))
+    except (InputError, KeyError, TypeError, ValueError, RuntimeError):
+        raise InputError(
+            "is no checkpoint of this fit: corrupt, or of an older version",
+            where=path,
+            hint="remove it: the same command then starts from the beginning",
+        ) from None
+
+
+def _restore(trainer: Trainer, tensors: dict[str, Tensor], data: dict[str, Any]) -> None:
+    with torch.no_grad():
+        for name, p in trainer.model.named_parameters():
+            p.copy_(tensors[f"model.{name}"])
+            trainer.optimizer.state[p] = {
+                key: tensors[f"adam.{key}.{name}"].to(p.device)
+                for key in _MOMENTS
+                if f"adam.{key}.{name}" in tensors
+            }
+    trainer.progress = Progress(int(data["step"]), float(data["seconds"]), float(data["loss"]))

@@ -1,0 +1,92 @@
+"""The folder of a fit: its files, and the claim of one configuration and data set on it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from mbtf_core.atomic import read_json, write_json, write_text
+from mbtf_core.config_file import differences, dump_yaml, in_short
+from mbtf_core.errors import InputError
+from mbtf_fit.config import FitConfig
+from mbtf_fit.data.loader import data_hash
+from mbtf_fit.material.export import LAYERS_NAME, TEXTURES_NAME
+from mbtf_fit.material.format import DESCRIPTION_NAME, WEIGHTS_NAME
+from mbtf_fit.material.storage import make_folder
+from mbtf_fit.material.transmittance import TRANSMITTANCE_NAME
+from mbtf_fit.training.checkpoint import CHECKPOINT_NAME
+from mbtf_fit.training.validation import HISTORY_NAME
+from mbtf_fit.training.warm_start import weights_digest
+from mbtf_gen.dataset.reader import Dataset
+
+FIT_NAME = "fit.json"
+CONFIG_NAME = "config.yaml"
+_FORMAT = "mbtf-fit"
+_SCHEMA = 2
+
+
+def identity_of(config: FitConfig, data: Dataset) -> dict[str, Any]:
+    """Content of ``fit.json``: configuration and data of a fit, and the hash of both.
+
+    Raises
+    ------
+    InputError : the material that initializes the fit is missing
+    """
+    files = {split: [e["file"] for e in data.manifest["splits"][split]["shards"]] for split in data.splits}
+    described = {"hash": data_hash(data), "levels": data.lattice.finest, "aspect": data.lattice.aspect}
+    lengths = {split: len(names) for split, names in files.items()}
+    config_hash = config.hash(json.dumps({**described, "files": files}, sort_keys=True))
+    if config.init_from is not None:
+        config_hash += f"-{weights_digest(config.init_from)}"
+    return {
+        "format": _FORMAT,
+        "schema": _SCHEMA,
+        "config_hash": config_hash,
+        "config": config.fields(),
+        "data": {**described, "shards": lengths, "inputs": data.manifest.get("inputs", {})},
+    }
+
+
+def claim(out: Path, identity: dict[str, Any], config: FitConfig, overwrite: bool) -> None:
+    """Claim the folder for a fit, or check that it already belongs to it.
+
+    Raises
+    ------
+    InputError : it holds something else
+    """
+    if out.exists() and not out.is_dir():
+        raise InputError("is a file, not a folder", where=out)
+    existing = out / FIT_NAME
+    if out.is_dir() and any(out.iterdir()):
+        if not existing.exists():
+            raise InputError("is not empty and holds no fit", where=out, hint="choose another folder with -o")
+        old = read_json(existing)
+        if old.get("config_hash") == identity["config_hash"] and not overwrite:
+            return
+        if not overwrite:
+            raise _another_fit(out, old, identity)
+        # The description goes first: without it nothing counts as a finished material.
+        for name in (
+            *(DESCRIPTION_NAME, FIT_NAME, CONFIG_NAME, HISTORY_NAME, CHECKPOINT_NAME),
+            *(WEIGHTS_NAME, TRANSMITTANCE_NAME, LAYERS_NAME, TEXTURES_NAME),
+        ):
+            (out / name).unlink(missing_ok=True)
+    make_folder(out)
+    write_text(out / CONFIG_NAME, dump_yaml(config.model_dump(mode="json")))
+    write_json(out / FIT_NAME, identity)
+
+
+def _another_fit(out: Path, old: dict[str, Any], new: dict[str, Any]) -> InputError:
+    if old.get("schema") != _SCHEMA:
+        return InputError(
+            f"holds a fit of schema {old.get('schema')}; this version writes schema {_SCHEMA}",
+            where=out,
+            hint="choose another folder with -o, or replace it with --overwrite",
+        )
+    before, after = ({**record.get("config", {}), "data": record.get("data")} for record in (old, new))
+    return InputError(
+        f"holds a fit of another configuration: {in_short(differences(before, after)) or 'other shards'}",
+        where=out,
+        hint="choose another folder with -o, or replace it with --overwrite",
+    )

@@ -1,0 +1,57 @@
+"""The effects of light by name, and the request that a user makes of them with ``--effects``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from mbtf_core.errors import UsageError
+
+# Effects by name, in the order in which light meets them, and what they are called.
+EFFECTS: dict[str, str] = {
+    "masking": "parallax and masking",
+    "shadowing": "shadowing",
+    "interreflection": "interreflection",
+    "neighbors": "periodic neighbors",
+    "specular": "specular lobe",
+    "metallic": "metallic",
+    "coat": "clear coat",
+    "sheen": "sheen",
+    "normal": "normal map",
+    "opacity": "opacity",
+    "fibers": "fiber scattering",
+    "mis": "BSDF sampling of light",
+}
+# Those that only a displaced tile has.
+OF_RELIEF = ("masking", "shadowing", "interreflection", "neighbors")
+
+
+@dataclass(frozen=True)
+class EffectsRequest:
+    """What was asked for: ``auto``, ``all`` or ``none``, and effects forced on or off."""
+
+    base: Literal["auto", "all", "none"]
+    forced: dict[str, bool]
+
+    @classmethod
+    def parse(cls, text: str) -> EffectsRequest:
+        """Read ``auto``, ``all``, ``none``, ``+x``, ``-x``, or a comma-separated list of them.
+
+        Raises
+        ------
+        UsageError : an unknown word
+        """
+        base: Any = "auto"
+        forced: dict[str, bool] = {}
+        for position, word in enumerate(w.strip() for w in text.split(",")):
+            if position == 0 and word in ("auto", "all", "none"):
+                base = word
+            elif word[:1] in ("+", "-") and word[1:] in EFFECTS:
+                forced[word[1:]] = word[0] == "+"
+            else:
+                raise UsageError(
+                    f"'{word}' is no effect",
+                    where="--effects",
+                    hint=f"auto, all or none, then +x or -x with x of {', '.join(EFFECTS)}",
+                )
+        return cls(base, forced)

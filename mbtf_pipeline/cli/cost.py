@@ -1,0 +1,82 @@
+"""``mbtf-pipeline cost``: accuracy against time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from mbtf_core.console import CONSOLE, Console
+from mbtf_core.options import Output, Set, Time, command_line
+
+
+def cost(
+    recipe: Path,
+    /,
+    *,
+    output: Annotated[Output | None, Parameter(show_default="out/NAME-cost")] = None,
+    time: Annotated[Time, Parameter(show_default="that of the study in the folder, or 10min")] = None,
+    refine: Annotated[str | None, Parameter(metavar="DURATION")] = None,
+    seed: Annotated[int | None, Parameter(show_default="the recipe's")] = None,
+    assignments: Set = None,
+    console: Console = CONSOLE,
+) -> None:
+    """Measure error against time for this material and machine: mbtf-pipeline cost RECIPE
+
+    Writes cost.html, cost.csv and PNGs. The same command resumes. A longer time keeps the measurements of the
+    generator and of whole runs, and adds longer runs.
+
+    Parameters
+    ----------
+    recipe
+        YAML file; its material and generator are studied.
+    refine
+        Additional time: repeats runs with further seeds until their 95 % intervals are within ±10 %.
+    seed
+        Root seed of all random numbers.
+    """
+    from mbtf_core.units import asked_duration, format_duration
+    from mbtf_pipeline.cost_study.page import whole_runs, write_page
+    from mbtf_pipeline.cost_study.pareto import pareto_front
+    from mbtf_pipeline.cost_study.study import run_study, time_of
+    from mbtf_pipeline.recipe import load_recipe
+
+    more = 0.0 if refine is None else asked_duration(refine, "--refine")
+    loaded = load_recipe(recipe, assignments or [])
+    folder = output if output is not None else loaded.folder.with_name(f"{loaded.folder.name}-cost")
+    seconds = time_of(folder) if time is None else asked_duration(time, "--time")
+    with console.progress(total=100, label="cost", unit="%") as bar:
+        study = run_study(
+            loaded,
+            folder,
+            seconds=seconds,
+            refine=more,
+            seed=seed,
+            command=command_line(
+                *("mbtf-pipeline", "cost", recipe),
+                time=time or format_duration(seconds),
+                refine=refine,
+                output=output,
+                seed=seed,
+                set=assignments,
+            ),
+            progress=lambda share, note: bar.update(round(100 * share, 1), note),
+        )
+    page = write_page(study)
+    front = pareto_front(whole_runs(study.measurements))
+    measured, skipped = len(study.measurements), len(study.skipped)
+    lines = [f"{page}: {measured} configurations measured, {skipped} skipped for lack of time"]
+    lines += [f"failed: {text}" for text in study.failed]
+    lines += [f"  {m.seconds.value:.0f} s: unexplained variance {m.error}   {m.command}" for m in front]
+    data = {
+        "page": page,
+        "measurements": len(study.measurements),
+        "skipped": study.skipped,
+        "failed": study.failed,
+        "front": [
+            {"seconds": m.seconds.value, "unexplained": m.error.as_dict(), "command": m.command}
+            for m in front
+        ],
+    }
+    console.report(data, "\n".join(lines))

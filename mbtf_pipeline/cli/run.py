@@ -1,0 +1,136 @@
+"""``mbtf-pipeline run``: a recipe."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from cyclopts import Parameter
+
+from mbtf_core.console import CONSOLE, Console, clock
+from mbtf_core.errors import UsageError
+from mbtf_core.options import Output, Set, Switch, Time, command_line
+from mbtf_gen.config.presets import QualityOption
+
+if TYPE_CHECKING:
+    from mbtf_pipeline.run import RunResult
+
+
+def run(
+    recipe: Path,
+    /,
+    *,
+    output: Annotated[Output | None, Parameter(show_default="out/NAME")] = None,
+    quality: QualityOption = None,
+    time: Time = None,
+    quick: Switch = False,
+    force: Switch = False,
+    assignments: Set = None,
+    console: Console = CONSOLE,
+) -> None:
+    """Run a recipe: mbtf-pipeline run pipelines/quickstart.yaml
+
+    A stage whose inputs have not changed is skipped; the same command again resumes an interrupted run.
+    --time replaces the recipe's numbers of queries and training times: pilots on this machine divide it
+    between generation and training. Comparison and report take their time on top.
+
+    Parameters
+    ----------
+    recipe
+        YAML file.
+    quick
+        The quick size of a paper recipe: minutes in place of hours.
+    force
+        Run every stage, also those that are up to date.
+    """
+    from mbtf_pipeline.paper_tables.recipe import is_paper_recipe
+
+    given = {"quality": quality, "time": time, "quick": quick, "output": output, "set": assignments}
+    command = command_line("mbtf-pipeline", "run", recipe, **given)
+    if is_paper_recipe(recipe):
+        for name in ("quality", "time"):
+            if given[name] is not None:
+                hint = "leave it out; --quick is the small size"
+                raise UsageError(
+                    "a paper recipe has sizes and times of its own", where=f"--{name}", hint=hint
+                )
+        _run_paper(recipe, output, quick, force, assignments or [], command, console)
+        return
+    if quick:
+        raise UsageError("only paper recipes have a quick size", where="--quick", hint="use --quality draft")
+    from mbtf_pipeline.presets import quality_assignments
+    from mbtf_pipeline.recipe import load_recipe
+    from mbtf_pipeline.run import run_recipe
+
+    own = assignments or []
+    loaded = load_recipe(recipe, [*quality_assignments(recipe, quality, own), *own])
+    if time is not None:
+        from mbtf_core.units import asked_duration
+        from mbtf_pipeline.cost_study.time_split import split_time, with_split
+
+        seconds = asked_duration(time, "--time")
+        split = split_time(loaded, seconds, output or loaded.folder, command, console.note)
+        console.note(split.describe())
+        loaded = with_split(loaded, split)
+    result = run_recipe(loaded, output, force=force, command=command, console=console)
+    console.report(_summary(result), _describe(result))
+
+
+def _run_paper(
+    file: Path,
+    output: Path | None,
+    quick: bool,
+    force: bool,
+    assignments: list[str],
+    command: str,
+    console: Console,
+) -> None:
+    from mbtf_pipeline.paper_tables.recipe import load_paper_recipe, plan
+    from mbtf_pipeline.paper_tables.suite import run_paper
+
+    paper = load_paper_recipe(file, assignments)
+    planned, missing = plan(paper, file, quick)
+    folder = output if output is not None else paper.folder(quick)
+    done = run_paper(
+        paper, planned, missing, folder, quick=quick, command=command, force=force, console=console
+    )
+    skipped = f", {len(missing)} skipped: {', '.join(missing)}" if missing else ""
+    size = done.record["size"]
+    data = {
+        "folder": done.folder,
+        "page": done.page,
+        "size": size,
+        "tables": done.tables,
+        "runs": [one.name for one in planned],
+        "skipped": missing,
+    }
+    console.report(data, f"{done.page}: {size} size, {len(planned)} runs{skipped}")
+
+
+def _summary(result: RunResult) -> dict[str, Any]:
+    return {
+        "folder": result.folder,
+        "report": result.report,
+        "seconds": round(sum(o.stamp.seconds for o in result.outcomes.values() if o.ran), 3),
+        "stages": {
+            name: {"ran": o.ran, "reason": o.reason or "up to date", "seconds": o.stamp.seconds}
+            for name, o in result.outcomes.items()
+        },
+        "test": {
+            fit: {
+                "unexplained_variance": r["splits"]["test"]["unexplained"],
+                "mse": r["splits"]["test"]["mse"],
+            }
+            for fit, r in result.comparison["test"].items()
+        },
+    }
+
+
+def _describe(result: RunResult) -> str:
+    from mbtf_pipeline.formatting import estimate
+
+    ran = [f"{n} {clock(o.stamp.seconds)}" for n, o in result.outcomes.items() if o.ran]
+    lines = [f"{result.report}: {', '.join(ran) or 'everything up to date'}"]
+    for fit, record in result.comparison["test"].items():
+        lines.append(f"  {fit}: unexplained variance {estimate(record['splits']['test']['unexplained'])}")
+    return "\n".join(lines)

@@ -1,0 +1,129 @@
+"""Command-line options come from the fields of a configuration."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import pytest
+from pydantic import Field
+
+from mbtf_core.config_file import Settings
+from mbtf_core.console import new_app, run
+from mbtf_core.options import Flag, Options, command_line, config_options, takes_options
+
+
+class Query(Settings):
+    train: Annotated[str, Flag("--queries", "N")] = Field("100/texel", description="number of queries")
+    spp: Annotated[int, Flag("--spp")] = Field(4, ge=2, description="paths per query")
+    mixture: float = 0.5
+    mesh: Annotated[int | None, Flag("--mesh")] = Field(None, description="cells; default: the map's width")
+
+
+class Config(Settings):
+    material: str
+    queries: Query = Query()
+    layout: Annotated[Literal["shuffled", "image"], Flag("--layout")] = Field("shuffled", description="order")
+    widths: Annotated[list[float], Flag("--widths")] = Field([1.0, 2.5], description="widths")
+
+
+class Twice(Config):
+    spp: Annotated[int, Flag("--spp")] = Field(4, description="paths per pixel")
+
+
+@takes_options(Config)
+def everything(
+    material: str | None = None, /, *, options: Options[Config], last: bool = False
+) -> Options[Config]:
+    """All.
+
+    Parameters
+    ----------
+    material
+        A map.
+    """
+    return options
+
+
+def test_options_are_listed_in_the_configuration_s_order() -> None:
+    found = {o.flag: o for o in config_options(Config)}
+    assert list(found) == ["--queries", "--spp", "--mesh", "--layout", "--widths"]
+    assert [(o.key, o.default, o.help) for o in found.values()] == [
+        ("queries.train", "100/texel", "Number of queries."),
+        ("queries.spp", "4", "Paths per query."),
+        ("queries.mesh", "the map's width", "Cells."),
+        ("layout", "shuffled", "Order."),
+        ("widths", "1,2.5", "Widths."),
+    ]
+    assert [o.metavar for o in found.values()] == ["N", "INT", "INT", None, "TEXT"]
+    assert [o.flag for o in config_options(Config, "queries.spp", "layout")] == ["--spp", "--layout"]
+
+
+def test_a_command_takes_them_as_its_own(capsys: pytest.CaptureFixture[str]) -> None:
+    app = new_app("mbtf-test", "A test.")
+    app.default(everything)
+    given = app(["--spp", "8", "map.exr", "--set", "queries.mixture=1", "--layout", "image", "--set", "a=b"])
+    assert given.given == {"queries.spp": "8", "layout": "image"}
+    assert given.assignments == ["queries.mixture=1", "a=b"]
+    assert run(app, ["map.exr", "--layout", "other"]) == 2
+    assert run(app, ["--help"]) == 0
+    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    for text in (
+        "--queries N Number of queries. [default: 100/texel]",
+        "--mesh INT Cells. [default: the map's width]",
+        "[choices: shuffled, image]",
+        "--config PATH",
+        "--set KEY=VALUE",
+    ):
+        assert text in shown
+    assert shown.index("--widths") < shown.index("--config") < shown.index("--last")
+
+
+def test_values_go_over_presets_and_files(tmp_path: Path) -> None:
+    file = tmp_path / "c.yaml"
+    file.write_text("material: map.exr\nqueries: {spp: 2, mixture: 0.1}\nlayout: image\n")
+    options = Options(
+        Config,
+        {"queries.spp": "--spp"},
+        {"queries.spp": "8"},
+        file,
+        ["queries.mixture=0.3", "queries.train=9x"],
+    )
+    resolved = options.resolve(["queries.mixture=0.2", "layout=shuffled", "queries.spp=6"], material=None)
+    assert resolved.queries == Query(train="9x", spp=8, mixture=0.3)
+    assert resolved.layout == "shuffled"
+    assert resolved.material == str(tmp_path / "map.exr")
+    assert options.resolve(material="here.exr").material == "here.exr"
+
+
+def test_a_wrong_value_names_its_flag(capsys: pytest.CaptureFixture[str]) -> None:
+    app = new_app("mbtf-test", "A test.")
+
+    @app.default
+    @takes_options(Config, "queries")
+    def command(*, options: Options[Config]) -> None:
+        options.resolve(material="map.exr")
+
+    assert run(app, ["--spp", "1"]) == 2
+    assert "--spp: 'queries.spp': must be at least 2 (given '1')" in capsys.readouterr().err
+    assert run(app, ["--layout", "image"]) == 2
+
+
+def test_two_options_of_one_flag_are_refused() -> None:
+    with pytest.raises(ValueError, match="same flag"):
+        takes_options(Twice)
+    takes_options(Twice, "spp", "layout")
+
+
+def test_a_command_line_can_be_given_to_a_shell() -> None:
+    line = command_line(
+        "mbtf-pipeline",
+        "run",
+        Path("a b.yaml"),
+        quick=True,
+        force=False,
+        time=None,
+        output=Path("o"),
+        set=["a=1"],
+    )
+    assert line == "mbtf-pipeline run 'a b.yaml' --quick -o o --set a=1"

@@ -1,0 +1,151 @@
+"""Every command line that the project shows can be given as it stands; one option means one thing."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from cyclopts import App, CycloptsError, MissingArgumentError
+from support.documented import Shown, in_markdown, in_strings, shown_commands
+from support.paths import ROOT
+
+from mbtf_core.config_file import resolve
+from mbtf_core.errors import MbtfError
+from mbtf_core.options import ConfigOption
+from mbtf_fit.cli.app import app as fit
+from mbtf_gen.cli.app import app as generate
+from mbtf_pipeline.cli.app import app as pipeline
+from mbtf_pipeline.paper_tables.recipe import is_paper_recipe, load_paper_recipe
+from mbtf_pipeline.recipe import Recipe
+
+APPS = {"mbtf-gen": generate, "mbtf-fit": fit, "mbtf-pipeline": pipeline}
+# What stands for something else: optional parts, alternatives, and so on.
+SYNOPSIS = re.compile(r"[\[\]|…<>]|\.\.\.")
+
+
+def commands(app: App) -> dict[str, App]:
+    """Commands of a program by name; the one without a name is ''."""
+    named = {name: app[name] for name in app if not name.startswith("-")}
+    return {**({"": app} if app.default_command is not None else {}), **named}
+
+
+def fault(shown: Shown) -> str:
+    """What is wrong with a command line; empty if nothing is."""
+    try:
+        program, *words = shlex.split(shown.text)
+    except ValueError as error:
+        return str(error)
+    app = APPS[program]
+    name = words[0] if words and words[0] in commands(app) else ""
+    if name not in commands(app):
+        return "no such command" if words and shown.whole else ""
+    if not shown.whole or SYNOPSIS.search(shown.text):
+        arguments = commands(app)[name].assemble_argument_collection()
+        known = {n for argument in arguments for n in argument.names} | {"--help", "--version", "--debug"}
+        flags = re.findall(r"(?<![\w-])--?[a-z][\w-]*", shown.text)
+        return ", ".join(f"no option {flag}" for flag in flags if flag not in known)
+    if {"--help", "--version", "--debug"} & set(words):
+        return ""
+    try:
+        command, bound, _ = app.parse_args(words, exit_on_error=False, print_error=False)
+    except MissingArgumentError:
+        # A command that is only named.
+        return "" if words in ([], [name]) else "an argument is missing"
+    except CycloptsError as error:
+        return str(error)
+    try:
+        check_values(command, dict(bound.arguments))
+    except MbtfError as error:
+        return error.message
+    return ""
+
+
+def check_values(command: Any, arguments: dict[str, Any]) -> None:
+    """Check what a command line says of a configuration.
+
+    Raises
+    ------
+    MbtfError : a key or a value that there is not
+    """
+    if hasattr(command, "read_options"):
+        options = command.read_options(arguments)
+        if options.config is not None and not (ROOT / options.config).exists():
+            options = replace(options, config=None)
+        options.resolve(**({"material": "X"} if "material" in options.model.model_fields else {}))
+    if arguments.get("assignments"):
+        recipe = ROOT / arguments["recipe"]
+        if not recipe.exists():
+            recipe = ROOT / "pipelines/quickstart.yaml"
+        if is_paper_recipe(recipe):
+            load_paper_recipe(recipe, arguments["assignments"])
+        else:
+            resolve(Recipe, file=recipe, assignments=arguments["assignments"])
+
+
+def test_every_command_that_is_shown_can_be_given() -> None:
+    found = shown_commands()
+    assert len(found) > 100
+    assert {shown.text.split()[0] for shown in found} == set(APPS)
+    faults = [f"{shown.where}: {shown.text}: {text}" for shown in found if (text := fault(shown))]
+    assert faults == []
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "mbtf-gen verfy set/",
+        "mbtf-gen plan a.exr --levels 7",
+        "mbtf-gen [MATERIAL] --levels 7",
+        "mbtf-gen a.exr --queries many",
+        "mbtf-gen a.exr --set queries.levels=7",
+        "mbtf-gen a.exr b.exr",
+        "mbtf-fit evaluate material/",
+        "mbtf-fit shards/ --model other",
+        "mbtf-fit shards/ --time soon",
+        "mbtf-pipeline run",
+        "mbtf-pipeline run pipelines/quickstart.yaml --set fit.other=1",
+        "mbtf-pipeline run pipelines/paper_methods.yaml --set other=1",
+    ],
+)
+def test_planted_faults_are_found(line: str) -> None:
+    assert fault(Shown("here", line)) or line == "mbtf-pipeline run"
+
+
+def test_commands_are_found_where_they_stand() -> None:
+    page = (
+        "Run `mbtf-gen doctor` first.\n\n"
+        "```sh\n$ A=1 .venv/bin/mbtf-gen a.exr \\\n    -o out/   # a note\n```\n\n"
+        "    mbtf-fit out/ && mbtf-pipeline list | head\n"
+    )
+    assert {shown.text for shown in in_markdown(page, "")} == {
+        "mbtf-gen doctor",
+        "mbtf-gen a.exr      -o out/",
+        "mbtf-fit out/",
+        "mbtf-pipeline list",
+    }
+    source = 'x = f"mbtf-fit {folder} --many; then"\ny = "no; mbtf-gen merge FOLDER, then go"\n'
+    assert list(in_strings(source, "")) == [
+        Shown("", "mbtf-fit X --many"),
+        Shown("", "mbtf-gen merge FOLDER", whole=False),
+    ]
+
+
+def test_an_option_has_one_help_and_one_meaning() -> None:
+    helps: dict[str, set[str | None]] = {}
+    keys: dict[str, set[str]] = {}
+    for app in APPS.values():
+        for command in commands(app).values():
+            for argument in command.assemble_argument_collection(parse_docstring=True):
+                for name in argument.names:
+                    if name.startswith("--"):
+                        helps.setdefault(name, set()).add(argument.parameter.help)
+            options: list[ConfigOption] = getattr(command.default_command, "config_options", [])
+            for option in options:
+                keys.setdefault(option.flag, set()).add(option.key.rpartition(".")[2])
+    # Paths per query or per pixel.
+    assert len(helps.pop("--spp")) == 2
+    assert {name: found for name, found in helps.items() if len(found) > 1 or not all(found)} == {}
+    assert {flag: found for flag, found in keys.items() if len(found) > 1} == {}
