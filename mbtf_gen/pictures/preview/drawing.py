@@ -67,7 +67,7 @@ class PreviewPictures:
             wanted.view.azimuth,
             tiles=wanted.tiles,
             aspect=grid.aspect,
-            relief=grid.displacement_range,
+            displacement_range=grid.displacement_range,
             columns=wanted.size,
         )
         self.camera.queries(self.omega_i, grid.aspect)  # refuses a view of the horizon
