@@ -38,7 +38,7 @@ def material(shards: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_export_writes_what_it_says(material: Path, tmp_path: Path, run_python: RunPython) -> None:
+def test_export_writes_the_reported_files(material: Path, tmp_path: Path, run_python: RunPython) -> None:
     out = tmp_path / "export"
     done = run_python("-m", "mbtf_fit", "export", str(material), "--half", "-o", str(out), "--json")
     assert done.returncode == 0, done.stderr
@@ -80,9 +80,7 @@ def test_json_is_one_object(shards: Path, tmp_path: Path, run_python: RunPython)
     assert set(found["errors"]) == {"test", "held_out_queries", "held_out_directions", "training"}
 
 
-def test_a_finished_fit_says_that_nothing_was_trained(
-    shards: Path, material: Path, run_python: RunPython
-) -> None:
+def test_a_finished_fit_is_not_trained_again(shards: Path, material: Path, run_python: RunPython) -> None:
     before = (material / "material.json").read_bytes()
     done = run_python("-m", "mbtf_fit", str(shards), "-o", str(material), *QUICK)
     assert done.returncode == 0, done.stderr
@@ -96,7 +94,7 @@ def test_a_finished_fit_says_that_nothing_was_trained(
     assert "nothing was trained" not in done.stderr
 
 
-def test_another_material_s_data_are_warned_of(tmp_path: Path, run_python: RunPython) -> None:
+def test_data_of_another_material_cause_a_warning(tmp_path: Path, run_python: RunPython) -> None:
     made = {}
     for name, digest in (("own", "1"), ("other", "2")):
         made[name] = write_data(tmp_path / name, parallax, train=2000, test=500)
@@ -130,7 +128,7 @@ def test_evaluate_and_info_report_text_and_json(shards: Path, material: Path) ->
         json.loads(done.out)
 
 
-def test_bad_input_ends_with_3_and_says_what_to_do(shards: Path, material: Path, tmp_path: Path) -> None:
+def test_bad_input_exits_with_3_and_a_hint(shards: Path, material: Path, tmp_path: Path) -> None:
     out = ["-o", str(tmp_path / "m")]
     assert "no such folder" in fails(3, str(tmp_path / "none"), *out)
     empty = tmp_path / "empty"
@@ -157,7 +155,7 @@ def test_a_damaged_shard_is_named(tmp_path: Path) -> None:
     assert "NaN" in said
 
 
-def test_nonsense_on_the_command_line_ends_with_2(shards: Path) -> None:
+def test_invalid_command_lines_exit_with_2(shards: Path) -> None:
     assert "mbtf-fit shards/" in fails(2)
     assert "2min" in fails(2, str(shards), "--time", "soon")
     assert "exclude each other" in fails(2, str(shards), "--time", "1s", "--steps", "3")
