@@ -295,23 +295,23 @@ def export_material(
     from mbtf_fit.material.storage import make_folder
     from mbtf_fit.material.transmittance import TRANSMITTANCE_NAME
 
-    wanted = list(dict.fromkeys(to or ["exr", "json"]))
+    requested = list(dict.fromkeys(to or ["exr", "json"]))
     folder = material if output is None else output
     loaded = Material.load(material)
-    if "material" in wanted and folder.is_dir() and any(folder.iterdir()):
+    if "material" in requested and folder.is_dir() and any(folder.iterdir()):
         raise InputError("is not empty", where=folder, hint="name a new folder with -o for --to material")
     written, error = loaded, None
     if half:
         written, error = to_half(loaded)
     make_folder(folder)
     files = []
-    if "exr" in wanted:
+    if "exr" in requested:
         write_textures(written, folder / TEXTURES_NAME, half=half)
         files.append(TEXTURES_NAME)
-    if "json" in wanted:
+    if "json" in requested:
         write_layers(written, folder / LAYERS_NAME, half=half)
         files.append(LAYERS_NAME)
-    if "material" in wanted:
+    if "material" in requested:
         description = loaded.description
         export(
             written.model,
