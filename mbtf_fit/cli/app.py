@@ -12,7 +12,7 @@ from mbtf_core.errors import InputError, PartialError, UsageError
 from mbtf_core.suggest import suggest_path
 from mbtf_fit.formatting import describe_errors, describe_fit, describe_transmittance, number, table
 from mbtf_fit.mitsuba_plugin.preview.command import preview
-from mbtf_gen.config.presets import Quality, as_assignments, quality_help
+from mbtf_gen.config.presets import Quality, as_assignments
 
 if TYPE_CHECKING:
     from mbtf_fit.config import FitConfig
@@ -25,9 +25,7 @@ Set = Annotated[
 Output = Annotated[Path, Parameter(name=["--output", "-o"])]
 QualityOption = Annotated[
     Quality,
-    Parameter(
-        help=quality_help("Training time and size that belong together; other options change single ones.")
-    ),
+    Parameter(help="Training time and size that belong together; other options change single ones."),
 ]
 
 

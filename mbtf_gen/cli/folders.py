@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from mbtf_core.console import CONSOLE, Console, clock, going_on
+from mbtf_core.console import CONSOLE, Console, clock, resumable
 from mbtf_core.errors import EXIT_BAD_INPUT, EXIT_OK
 from mbtf_gen.cli.generate import describe
 
@@ -95,7 +95,7 @@ def repair(
         done = RepairResult(str(folder), damage.faults, shards, damage.documents, damage.left, False, 0, 0.0)
     else:
         with (
-            going_on(f"{folder}: what was made again is kept"),
+            resumable(f"{folder}: what was made again is kept"),
             console.progress(damage.paths, "repairing", "paths") as bar,
         ):
             done = damage.mend(bar.update)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ShardEntry:
-    """A shard to make: split, number within the split, file name, rows (queries or buffers)."""
+    """A shard to make: split, number within the split, file name, rows (queries or images)."""
 
     split: Split
     index: int

@@ -69,7 +69,7 @@ class Shard:
 
     @property
     def rows(self) -> int:
-        """Queries in the shuffled layout, buffers in the image layout."""
+        """Queries in the shuffled layout, images in the image layout."""
         return int(self.sidecar["rows"])
 
 
@@ -174,7 +174,7 @@ class Dataset:
             yield read_shard(shard.path, wanted)
 
     def load(self, split: str, names: Iterable[str] | None = None) -> Arrays:
-        """All queries of a split in memory, leading axis the query (or buffer)."""
+        """All queries of a split in memory, leading axis the query (or image)."""
         parts = list(self.iterate(split, names))
         if not parts:
             raise InputError(f"split '{split}' has no shards", where=self.folder)

@@ -132,7 +132,7 @@ def _npy_header(stream: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any]]
 
 
 def _fold(array: NDArray[np.float32], lead: tuple[int, ...]) -> NDArray[np.float32]:
-    """Bring leading axes to (rows, columns) of one image: queries row by row, buffers stacked downwards."""
+    """Bring leading axes to (rows, columns) of one image: queries row by row, images stacked downwards."""
     trailing = array.shape[len(lead) :]
     if len(lead) == 1:
         rows = -(-lead[0] // _FOLD_WIDTH)

@@ -72,7 +72,7 @@ def shard_fault(path: Path, rows: int, config_hash: str, *, digests: bool = True
 
     Parameters
     ----------
-    rows : queries (or buffers) it must hold
+    rows : queries (or images) it must hold
     digests : also read the whole file and compare its SHA-256; else only its sidecar and its size
     """
     return examine(path, rows, config_hash, digests=digests)[1]
