@@ -1,6 +1,6 @@
 """Statistics of Monte Carlo data: noise from halves, errors free of noise, tests, χ² of samplers.
 
-Needs numpy and scipy alone. ``docs/statistics.md`` explains when to use which.
+Needs numpy and scipy alone. The documentation's page on statistics explains when to use which.
 """
 
 from mbtf_core.stats.aggregate import Aggregate, Comparison, aggregate_test

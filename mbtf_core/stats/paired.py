@@ -1,4 +1,4 @@
-"""What two independent halves tell: noise, and error and variance free of it.
+"""Paired (split-half) estimates: noise, and noise-free error and variance.
 
 Every query q is estimated twice, ``a_q = t_q + α_q`` and ``b_q = t_q + β_q``, with the truth ``t_q`` and
 noise α, β of mean zero, independent of each other and between queries. Products of an a with a b therefore
@@ -123,8 +123,8 @@ def signal_variance(a: ArrayLike, b: ArrayLike) -> Estimate:
     """Variance of the true values over queries, free of noise: per channel about its mean, then averaged.
 
     For ``(n, channels)`` the sample covariance of a and b, ``Σ (a-ā)(b-b̄)/(n-1)``: given the queries, every
-    a is independent of every b, so its expectation is the covariance of t with itself. For images the term
-    subtracted with ``ā b̄`` is made good by the covariance of the images' means over n, which keeps it
+    a is independent of every b, so its expectation is the covariance of t with itself. For images the
+    covariance of the images' means over n compensates the term that ``ā b̄`` subtracts, so the estimate is
     unbiased when whole images are drawn. Unit: the values' squared.
     """
     products, correction = _centered_products(*_pair(a, b))

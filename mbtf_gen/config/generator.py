@@ -50,14 +50,14 @@ def count_queries(text: str | int | float, texels: int) -> int:
 
 
 def _count(text: Any) -> str:
-    """One spelling per count, so that ``400 / texel`` and ``400/texel`` are one configuration."""
+    """One spelling per count: ``400 / texel`` and ``400/texel`` are one configuration."""
     number, per_texel = parse_count(text)
     digits = str(int(number)) if number == int(number) else repr(number)
     return f"{digits}/texel" if per_texel else digits
 
 
 def _share(text: Any) -> Any:
-    """A share as a number, also from ``2%``."""
+    """A fraction as a number, also from ``2%``."""
     if isinstance(text, str) and (match := _PERCENT.match(text)):
         return float(match[1]) / 100.0
     return text
@@ -113,7 +113,7 @@ class MixtureSection(Settings):
 
 
 class QueriesSection(Settings):
-    """Which queries are drawn and how many paths each gets."""
+    """Distribution and number of the queries, and paths per query."""
 
     train: Count = Field("100/texel", description="N or N/texel (texels of the finest level)")
     test: Count = Field("8192", description="N or N/texel")
@@ -126,8 +126,8 @@ class QueriesSection(Settings):
         None,
         gt=0,
         lt=1,
-        description="error of every training value relative to max(value, tile mean), such as 2%; in place "
-        "of a mean number of paths",
+        description="error of every training value relative to max(value, tile mean), such as 2%, "
+        "instead of spp",
     )
     max_spp: Paths = Field(1024, description="most paths per query under a target error")
     resolution: Resolution | None = Field(
@@ -160,7 +160,7 @@ class LightSection(Settings):
 
 
 class TransportSection(Settings):
-    """How light paths are followed."""
+    """Depth limits of light paths."""
 
     max_depth: int = Field(0, ge=0, le=1000, description="surface interactions per path; 0: no limit")
     roulette_depth: int = Field(1, ge=1, le=1000, description="interactions before Russian roulette begins")
@@ -176,7 +176,7 @@ def _effects(text: str) -> str:
 
 
 class EffectsSection(Settings):
-    """Which effects of light are simulated."""
+    """Which light transport effects are simulated."""
 
     mode: Annotated[str, AfterValidator(_effects)] = Field(
         "auto", description="auto, all or none, then +x or -x for single effects, comma-separated"
@@ -186,19 +186,19 @@ class EffectsSection(Settings):
     )
     normal: NormalMode = Field(
         "residual",
-        description="slopes of a normal map: those the mesh lacks, all in place of its own, or none",
+        description="normal map: add the slopes that the mesh lacks, replace the mesh's slopes, or ignore",
     )
 
 
 class OutputSection(Settings):
-    """How the data are stored."""
+    """File format and size of the shards."""
 
     format: ArrayFormat = "npz"
     shard_queries: int = Field(1 << 18, ge=1, le=1 << 24, description="queries per shard")
 
 
 class GeneratorConfig(Settings):
-    """Everything ``mbtf-gen`` needs to make a data set."""
+    """Everything that ``mbtf-gen`` needs to generate a data set."""
 
     version: Literal[2] = 2
     material: FileName = Field(description="height map, folder of maps, or material.yaml")
@@ -211,8 +211,7 @@ class GeneratorConfig(Settings):
     seed: int = Field(0, ge=0, lt=1 << 63, description="root seed")
 
     def data_fields(self, inputs: dict[str, str]) -> dict[str, Any]:
-        """What the data depend on: the options, and the digests of the input files in place of their
-        names."""
+        """What the data depend on: the options, and digests of the input files instead of their names."""
         fields = self.model_dump(exclude={"material"})
         return {"schema": SCHEMA_VERSION, "inputs": dict(sorted(inputs.items())), **fields}
 

@@ -1,4 +1,4 @@
-"""Options of the commands that make pictures: those of the generator, and what the pictures show."""
+"""Options of the commands that render pictures: the generator's, and view, light and size."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mbtf_gen.config.generator import GeneratorConfig, Paths
 
 def _distinct(values: list[float]) -> list[float]:
     if len(set(values)) < len(values):
-        raise ValueError("holds the same width twice")
+        raise ValueError("lists the same width twice")
     return values
 
 
@@ -29,23 +29,23 @@ Size = Annotated[int, Field(ge=8, le=16384)]
 class ReferenceSection(Settings):
     """Reference pictures."""
 
-    view: Direction = Field(Direction(elevation=60, azimuth=-90), description="where the camera stands")
-    light: Direction = Field(Direction(elevation=45, azimuth=45), description="where the light comes from")
+    view: Direction = Field(Direction(elevation=60, azimuth=-90), description="direction towards the camera")
+    light: Direction = Field(Direction(elevation=45, azimuth=45), description="direction towards the light")
     tiles_across: Annotated[
         list[Annotated[float, Field(gt=0, le=1e4)]], Field(min_length=1), AfterValidator(_distinct)
-    ] = Field([1.0, 2.0, 4.0], description="widths of the field of view at the target, in tile widths")
+    ] = Field([1.0, 2.0, 4.0], description="tiles across the picture, at the target")
     size: Size = Field(256, description="pixels along each side")
     spp: Paths = Field(256, description="paths per pixel, both halves together")
     kind: Literal["query", "pixel", "both"] = Field(
-        "both", description="query: M at each pixel's footprint; pixel: the truly filtered image"
+        "both", description="query: M at each pixel's footprint; pixel: the filtered image"
     )
 
 
 class PreviewSection(Settings):
-    """Pictures for a first look."""
+    """Pictures of ``mbtf-gen preview``."""
 
-    view: Direction = Field(Direction(elevation=40, azimuth=-90), description="where the camera stands")
-    light: Direction = Field(Direction(elevation=35, azimuth=150), description="where the light comes from")
+    view: Direction = Field(Direction(elevation=40, azimuth=-90), description="direction towards the camera")
+    light: Direction = Field(Direction(elevation=35, azimuth=150), description="direction towards the light")
     tiles: Annotated[int, Field(ge=1, le=4)] = Field(
         2, description="tiles along each side of the drawn plane"
     )
@@ -66,5 +66,5 @@ class PreviewConfig(GeneratorConfig):
 
 
 def without_queries(config: GeneratorConfig) -> dict[str, Any]:
-    """The options, as plain data, of pictures that no query is drawn for."""
+    """The options, as plain data, without those of queries and output."""
     return config.model_dump(mode="json", exclude={"queries", "output"})

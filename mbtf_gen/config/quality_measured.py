@@ -1,7 +1,7 @@
 """What the quality presets cost and reach, as ``benchmarks/quality.py --store`` measured it.
 
-The figures lie beside this module as JSON, with the date and the kind of machine. ``mbtf-gen plan`` and a table
-of the documentation show them.
+The figures lie beside this module as JSON, with the date and the kind of machine. ``mbtf-gen plan`` and a
+table of the documentation show them.
 """
 
 from __future__ import annotations

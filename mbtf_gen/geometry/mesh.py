@@ -1,4 +1,4 @@
-"""The tile as a stock Mitsuba mesh, for comparisons with stock scenes; the generator does not use it."""
+"""The tile as a Mitsuba mesh, for comparisons with unmodified Mitsuba; the generator does not use it."""
 
 from __future__ import annotations
 
