@@ -26,8 +26,8 @@ A program defines its commands with cyclopts and hands the application to :func:
 
 ``mbtf-fit shards/`` runs the default command, ``mbtf-fit info …`` a named one; flags may come before or after
 the command's name. A command returns None or an exit code, and raises
-:class:`~mbtf_core.errors.MbtfError` for every error that a user can cause. Results go to standard output. Progress, notes and warnings (of any logger
-of the packages) go to standard error.
+:class:`~mbtf_core.errors.MbtfError` for every error that a user can cause. Results go to standard output.
+Progress, notes and warnings (of any logger of the packages) go to standard error.
 """
 
 from __future__ import annotations
