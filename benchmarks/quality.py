@@ -42,7 +42,7 @@ from mbtf_fit.presets import FITTER
 from mbtf_fit.training.forecast import PERSISTENCE, extrapolated
 from mbtf_gen.config.generator import GeneratorConfig, count_queries
 from mbtf_gen.config.presets import GENERATOR, Quality, as_assignments
-from mbtf_gen.config.quality_measured import FORMAT, STORED, Chain, markdown_table, read_expected
+from mbtf_gen.config.quality_measured import FORMAT, STORED, PresetRun, markdown_table, read_expected
 from mbtf_pipeline.fit_records import read_training
 from mbtf_pipeline.presets import settings_hash
 from mbtf_pipeline.run_folder import machine
@@ -64,7 +64,7 @@ LONG = "rock_cliff"
 QUARTER = 0.25
 # Seconds of the whole chain.
 BARS = {"draft": 60.0, "standard": 600.0}
-BAR_LEVELS = 7
+BAR_RESOLUTION = 128
 # Largest factors between a stored figure and another run.
 CHECK = {"seconds": 1.3, "error": 1.5}
 QUALITIES: tuple[Quality, ...] = get_args(Quality)
@@ -87,7 +87,7 @@ def source(name: str) -> tuple[Path, float | None]:
     return ROOT / "assets" / name, None
 
 
-def generator_config(name: str, quality: Quality, levels: int) -> GeneratorConfig:
+def generator_config(name: str, quality: Quality, resolution: int) -> GeneratorConfig:
     """The generator's configuration of a material at a quality."""
     material, height = source(name)
     return resolve(
@@ -95,7 +95,7 @@ def generator_config(name: str, quality: Quality, levels: int) -> GeneratorConfi
         assignments=[
             f"material={json.dumps(str(material))}",
             *as_assignments(GENERATOR[quality]),
-            *as_assignments({"geometry.height_scale": height, "queries.resolution": 1 << levels}),
+            *as_assignments({"geometry.height_scale": height, "queries.resolution": resolution}),
         ],
     )
 
@@ -105,7 +105,7 @@ def folder_bytes(folder: Path) -> int:
     return sum(p.stat().st_size for p in folder.rglob("*") if p.is_file())
 
 
-def run(name: str, quality: Quality, levels: int, work: Path, share: float = 1.0) -> Chain:
+def run(name: str, quality: Quality, resolution: int, work: Path, share: float = 1.0) -> PresetRun:
     """One chain that trains for a share of the quality's time, timed from outside; what an interrupted one
     left in `work` was not, and is removed.
 
@@ -119,7 +119,7 @@ def run(name: str, quality: Quality, levels: int, work: Path, share: float = 1.0
     recipe, out = work / "recipe.yaml", work / "run"
     text = RECIPE.format(
         material=json.dumps(str(material)),
-        resolution=1 << levels,
+        resolution=resolution,
         height="null" if height is None else height,
     )
     recipe.write_text(text, encoding="utf-8")
@@ -141,7 +141,7 @@ def run(name: str, quality: Quality, levels: int, work: Path, share: float = 1.0
     if missed["value"] is None:
         raise SystemExit(f"{name} at {quality}: its test values do not tell an unexplained variance")
     fit = out / "fits" / "neumip"
-    found = Chain(
+    found = PresetRun(
         name,
         quality,
         height,
@@ -160,7 +160,7 @@ def run(name: str, quality: Quality, levels: int, work: Path, share: float = 1.0
     return found
 
 
-def line(c: Chain) -> str:
+def line(c: PresetRun) -> str:
     """A chain as text."""
     return (
         f"{c.material:16s} {c.quality:9s} {c.seconds:7.1f} s (generate {c.generate:.1f}, fit {c.fit:.1f})  "
@@ -194,21 +194,21 @@ def wanted(only: list[str] | None) -> list[tuple[str, Quality, float]]:
     return out
 
 
-def measured(path: Path) -> Chain | None:
+def measured(path: Path) -> PresetRun | None:
     """A chain that was measured, with the settings that its quality still has; None of another one, and of a
     file that is missing or damaged."""
     try:
-        chain = Chain(**read_json(path))
+        chain = PresetRun(**read_json(path))
         now = settings_hash(chain.quality)  # type: ignore[arg-type]
     except (InputError, TypeError, KeyError):
         return None
     return chain if chain.settings == now else None
 
 
-def kept(folder: Path, levels: int) -> list[Chain]:
-    """Chains that were measured at these levels, in the order of the table."""
+def kept(folder: Path, resolution: int) -> list[PresetRun]:
+    """Runs that were measured at this resolution, in the order of the table."""
     found = []
-    for path in folder.glob(f"*-{levels}.json"):
+    for path in folder.glob(f"*-{resolution}.json"):
         chain = measured(path)
         if chain is None:
             print(f"{path}: left out, damaged or measured with other settings", file=sys.stderr)
@@ -217,20 +217,20 @@ def kept(folder: Path, levels: int) -> list[Chain]:
     return sorted(found, key=lambda c: (QUALITIES.index(c.quality), c.material, c.share))
 
 
-def paths_of(quality: str, levels: int) -> float:
+def paths_of(quality: str, resolution: int) -> float:
     """Paths of a quality's data set of a square material, and those of its test split."""
     config = resolve(
         GeneratorConfig,
         assignments=["material=m", *as_assignments(GENERATOR[quality])],  # type: ignore[index]
     ).queries
-    texels = 4**levels
+    texels = resolution**2
     return (
         count_queries(config.train, texels) * config.spp
         + count_queries(config.test, texels) * config.test_spp
     )
 
 
-def paper(chains: list[Chain], levels: int) -> tuple[Chain | None, str]:
+def paper(chains: list[PresetRun], resolution: int) -> tuple[PresetRun | None, str]:
     """`paper` for the material that `high` was measured on, and how its figures follow."""
     law = (
         "Of `paper`, generating takes the seconds of `high` times the ratio of their numbers of paths, data "
@@ -253,7 +253,7 @@ def paper(chains: list[Chain], levels: int) -> tuple[Chain | None, str]:
     assert config.training.steps is not None
     samples = config.training.steps * config.training.batch
     fit = samples / high.queries_per_second
-    generate = high.generate * paths_of("paper", levels) / paths_of("high", levels)
+    generate = high.generate * paths_of("paper", resolution) / paths_of("high", resolution)
     doublings = math.log2(fit / high.fit)
     apart = -math.log2(QUARTER)
     error = extrapolated(quarter.unexplained, high.unexplained, doublings, apart=apart)
@@ -262,14 +262,14 @@ def paper(chains: list[Chain], levels: int) -> tuple[Chain | None, str]:
     bars = [c.unexplained_error / c.unexplained for c in (high, quarter)]
     bar = error * math.hypot(power * bars[0], (1 - power) * bars[1])
     queries = {
-        q: count_queries(GENERATOR[q]["queries.train"], 4**levels) + int(GENERATOR[q]["queries.test"])
+        q: count_queries(GENERATOR[q]["queries.train"], resolution**2) + int(GENERATOR[q]["queries.test"])
         for q in ("high", "paper")
     }
     return (
-        Chain(
+        PresetRun(
             high.material,
             "paper",
-            high.height,
+            high.height_scale,
             round(high.seconds - high.generate - high.fit + generate + fit),
             round(generate),
             round(fit),
@@ -284,16 +284,16 @@ def paper(chains: list[Chain], levels: int) -> tuple[Chain | None, str]:
     )
 
 
-def store(chains: list[Chain], levels: int) -> None:
+def store(chains: list[PresetRun], resolution: int) -> None:
     """Write the figures beside the package's code, and their table into the documentation."""
-    guess, law = paper(chains, levels)
+    guess, law = paper(chains, resolution)
     data = {
         "format": FORMAT,
         "command": "python benchmarks/quality.py --out out/quality --store",
         "date": time.strftime("%Y-%m-%d"),
         "machine": machine()["system"],
-        "levels": levels,
-        "chains": [asdict(c) for c in chains],
+        "resolution": resolution,
+        "runs": [asdict(c) for c in chains],
         "extrapolated": [] if guess is None else [asdict(guess)],
         "law": law,
     }
@@ -304,9 +304,9 @@ def store(chains: list[Chain], levels: int) -> None:
     PAGE.write_text(f"{before}{BEGIN}\n\n{table}\n\n{END}{rest.split(END)[1]}", encoding="utf-8")
 
 
-def check(chains: list[Chain]) -> list[dict[str, Any]]:
+def check(chains: list[PresetRun]) -> list[dict[str, Any]]:
     """Factors between the stored figures and these."""
-    stored = {(c.material, c.quality, c.share): c for c in read_expected(STORED).chains}
+    stored = {(c.material, c.quality, c.share): c for c in read_expected(STORED).runs}
     out = []
     for c in chains:
         other = stored.get((c.material, c.quality, c.share))
@@ -322,7 +322,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, required=True, help="folder that keeps what was measured")
     parser.add_argument("--only", action="append", help="MATERIAL:QUALITY (repeatable)")
     parser.add_argument(
-        "--resolution", type=int, default=1 << BAR_LEVELS, help="texels across, a power of two"
+        "--resolution", type=int, default=BAR_RESOLUTION, help="texels across, a power of two"
     )
     parser.add_argument(
         "--store", action="store_true", help="write the package's figures and the docs' table"
@@ -330,20 +330,20 @@ def main() -> int:
     parser.add_argument("--check", action="store_true", help="hold the figures against the stored ones")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
-    levels = arguments.resolution.bit_length() - 1
+    resolution = arguments.resolution
     for name, quality, share in wanted(arguments.only):
         part = "" if share == 1 else f"-{share:g}"
-        path = arguments.out / f"{name}-{quality}{part}-{levels}.json"
+        path = arguments.out / f"{name}-{quality}{part}-{resolution}.json"
         if measured(path) is not None:
             continue
         if not source(name)[0].is_dir():
             print(f"{name}: left out, {source(name)[0]} is missing", file=sys.stderr)
             continue
-        found = run(name, quality, levels, arguments.out / ".work", share)
+        found = run(name, quality, resolution, arguments.out / ".work", share)
         write_json(path, asdict(found))
         print(line(found), flush=True)
-    chains = kept(arguments.out, levels)
-    held = [c for c in chains if c.quality in BARS and levels <= BAR_LEVELS]
+    chains = kept(arguments.out, resolution)
+    held = [c for c in chains if c.quality in BARS and resolution <= BAR_RESOLUTION]
     met = all(c.seconds <= BARS[c.quality] for c in held)
     report: dict[str, Any] = {"figures": [asdict(c) for c in chains], "bars": {**BARS}}
     if arguments.check:
@@ -351,7 +351,7 @@ def main() -> int:
         met &= bool(report["beside_stored"])
         met &= all(f <= CHECK[name] for row in report["beside_stored"] for name, f in row["factors"].items())
     if arguments.store:
-        store(chains, levels)
+        store(chains, resolution)
     print(json.dumps({**report, "met": met, "machine": machine()}))
     return 0 if met else 1
 

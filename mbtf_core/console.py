@@ -242,7 +242,7 @@ class Console:
 
 
 @contextlib.contextmanager
-def going_on(kept: str, hint: str = "the same command goes on from there") -> Iterator[None]:
+def resumable(kept: str, hint: str = "the same command resumes") -> Iterator[None]:
     """Work that an interruption does not lose; says so where one comes.
 
     Parameters

@@ -12,7 +12,7 @@ from mbtf_core.errors import InputError, PartialError, UsageError
 from mbtf_core.suggest import suggest_path
 from mbtf_fit.formatting import describe_errors, describe_fit, describe_transmittance, number, table
 from mbtf_fit.mitsuba_plugin.preview.command import preview
-from mbtf_gen.config.presets import Quality, as_assignments, quality_help
+from mbtf_gen.config.presets import Quality, as_assignments
 
 if TYPE_CHECKING:
     from mbtf_fit.config import FitConfig
@@ -25,9 +25,7 @@ Set = Annotated[
 Output = Annotated[Path, Parameter(name=["--output", "-o"])]
 QualityOption = Annotated[
     Quality,
-    Parameter(
-        help=quality_help("Training time and size that belong together; other options change single ones.")
-    ),
+    Parameter(help="Training time and size that belong together; other options change single ones."),
 ]
 
 
@@ -286,10 +284,10 @@ def export_material(
     half
         Round all weights and texels to 16 bits, and print the error of that.
     """
+    from mbtf_core.folders import make_folder
     from mbtf_fit.material.export import LAYERS_NAME, TEXTURES_NAME, to_half, write_layers, write_textures
     from mbtf_fit.material.format import DESCRIPTION_NAME, WEIGHTS_NAME
     from mbtf_fit.material.material import Material, export
-    from mbtf_fit.material.storage import make_folder
     from mbtf_fit.material.transmittance import TRANSMITTANCE_NAME
 
     wanted = list(dict.fromkeys(to or ["exr", "json"]))

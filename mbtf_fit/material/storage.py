@@ -15,19 +15,6 @@ from mbtf_core.errors import InputError, reason
 _KEY = "mbtf"
 
 
-def make_folder(folder: Path) -> None:
-    """Make a folder and those above it, where they are not there yet.
-
-    Raises
-    ------
-    InputError : it cannot be made
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot be made ({error.strerror})", where=folder) from None
-
-
 def write_tensors(path: Path, tensors: dict[str, Tensor], data: dict[str, Any]) -> None:
     """Write tensors, and JSON data in the file's header.
 

@@ -17,9 +17,10 @@ import numpy as np
 import torch
 
 from mbtf_core.atomic import read_json, write_json, write_text
-from mbtf_core.config_file import differences, dump_yaml, in_short
+from mbtf_core.config_file import dump_yaml
 from mbtf_core.digest import data_sha256
 from mbtf_core.errors import EngineError, InputError
+from mbtf_core.folders import check_folder, make_folder, other_configuration
 from mbtf_core.stats import Estimate, pooled_variance, unexplained_variance
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import (
@@ -35,7 +36,7 @@ from mbtf_fit.evaluation import judge
 from mbtf_fit.material.export import LAYERS_NAME, TEXTURES_NAME
 from mbtf_fit.material.format import DESCRIPTION_NAME, WEIGHTS_NAME
 from mbtf_fit.material.material import Material, export
-from mbtf_fit.material.storage import make_folder, read_tensors, write_tensors
+from mbtf_fit.material.storage import read_tensors, write_tensors
 from mbtf_fit.material.transmittance import TRANSMITTANCE_NAME
 from mbtf_fit.material.transmittance_fit import fit_transmittance, judge_transmittance
 from mbtf_fit.models import MODELS, build_model
@@ -233,13 +234,8 @@ def _claim(out: Path, identity: dict[str, Any], config: FitConfig, overwrite: bo
     ------
     InputError : it holds something else
     """
-    if out.exists() and not out.is_dir():
-        raise InputError("is a file, not a folder", where=out)
-    existing = out / FIT_NAME
-    if out.is_dir() and any(out.iterdir()):
-        if not existing.exists():
-            raise InputError("is not empty and holds no fit", where=out, hint="choose another folder with -o")
-        old = read_json(existing)
+    if check_folder(out, lambda path: (path / FIT_NAME).exists(), "fit"):
+        old = read_json(out / FIT_NAME)
         if old.get("config_hash") == identity["config_hash"] and not overwrite:
             return
         if not overwrite:
@@ -247,12 +243,7 @@ def _claim(out: Path, identity: dict[str, Any], config: FitConfig, overwrite: bo
                 {**record.get("config", {}), **{k: record.get(k) for k in ("schema", "data")}}
                 for record in (old, identity)
             )
-            changes = in_short(differences(before, after)) or "other shards"
-            raise InputError(
-                f"holds a fit of another configuration: {changes}",
-                where=out,
-                hint="choose another folder with -o, or replace it with --overwrite",
-            )
+            raise other_configuration(out, "a fit", before, after, "other shards")
         # The description goes first: without it nothing else passes for a finished material.
         for name in (DESCRIPTION_NAME, *_OWN_FILES):
             (out / name).unlink(missing_ok=True)

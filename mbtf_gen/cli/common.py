@@ -10,7 +10,7 @@ from cyclopts import Parameter
 
 from mbtf_core.errors import UsageError
 from mbtf_core.shard_schema import Tiling
-from mbtf_gen.config.presets import Quality, quality_help
+from mbtf_gen.config.presets import Quality
 
 if TYPE_CHECKING:
     from mbtf_gen.config.generator import GeneratorConfig
@@ -23,11 +23,7 @@ Set = Annotated[
 Output = Annotated[Path | None, Parameter(name=["--output", "-o"])]
 QualityOption = Annotated[
     Quality,
-    Parameter(
-        help=quality_help(
-            "Numbers of queries and paths that belong together; other options change single ones."
-        )
-    ),
+    Parameter(help="Numbers of queries and paths that belong together; other options change single ones."),
 ]
 
 Flags = Mapping[str, tuple[str, Any]]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from mbtf_core.console import CONSOLE, Console, clock, going_on
+from mbtf_core.console import CONSOLE, Console, clock, resumable
 from mbtf_core.errors import EXIT_BAD_INPUT, EXIT_OK
 from mbtf_gen.cli.generate import describe
 
@@ -95,7 +95,7 @@ def repair(
         done = RepairResult(str(folder), found.faults, shards, found.documents, found.left, False, 0, 0.0)
     else:
         with (
-            going_on(f"{folder}: the shards rendered so far are kept"),
+            resumable(f"{folder}: the shards rendered so far are kept"),
             console.progress(found.paths, "repairing", "paths") as bar,
         ):
             done = found.repair(bar.update)

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from mbtf_core.console import CONSOLE, Console, clock, going_on
+from mbtf_core.console import CONSOLE, Console, clock, resumable
 from mbtf_core.errors import UsageError
 from mbtf_core.shard_schema import Tiling
 from mbtf_gen.cli.common import Output, QualityOption, Set, general, resolve_config
@@ -89,7 +89,7 @@ def generate(
     effects
         auto, all, none, then +x or -x: effects of light to simulate. Default: auto
     layout
-        shuffled queries, or one image buffer per (light, view, footprint).
+        shuffled queries, or one image per (light, view, footprint).
     format
         npz or exr shards.
     seed
@@ -138,7 +138,7 @@ def generate(
     )
     total = paths_left(job, folder, *part)
     with (
-        going_on(f"the shards that are finished are kept in {folder}"),
+        resumable(f"the shards that are finished are kept in {folder}"),
         console.progress(total=total, label="generating", unit="paths") as bar,
     ):
         summary = generate(

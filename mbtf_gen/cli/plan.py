@@ -118,7 +118,7 @@ def plan(
     text = f"{table(found)}\n{expected.describe(split_target(job.config, 'train'))}"
     if quality is not None and (measured_line := expected_of().line(quality)) is not None:
         text += (
-            f"\nwhole chains to material and report on {expected_of().machine}, {1 << expected_of().levels} "
+            f"\nwhole runs to material and report on {expected_of().machine}, {expected_of().resolution} "
             f"texels across: {measured_line}"
         )
     console.report(data, text)

@@ -295,7 +295,7 @@ class _Preview:
             source = f"to be drawn for {self.config.material}"
         shown = f"{len(sample.u)} of {sample.total} training queries {source}"
         if len(sample.level) < len(sample.u):
-            shown += f", in {len(sample.level)} buffers of one footprint, light and view each"
+            shown += f", in {len(sample.level)} images of one footprint, light and view each"
         write_plots(file, sample, shown)
         edges, found, expected = level_histogram(sample)
         return {

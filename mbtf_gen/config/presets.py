@@ -1,21 +1,19 @@
-"""Qualities: settings that belong together, from a first look to the papers' sizes.
+"""Quality presets: options that belong together, from a first try to the sizes of the papers.
 
-A quality is laid over the configuration file and under ``--set`` and flags. What each costs and reaches was
-measured by ``benchmarks/quality.py``; see :mod:`mbtf_gen.config.quality_measured`.
+A preset overrides the configuration file; ``--set`` and flags override the preset. ``benchmarks/quality.py``
+measures what each costs and reaches; see :mod:`mbtf_gen.config.quality_measured`.
 """
 
 from __future__ import annotations
 
-from typing import Any, Literal, get_args
-
-from mbtf_gen.config.quality_measured import help_lines
+from typing import Any, Literal
 
 Quality = Literal["draft", "standard", "high", "paper"]
 
-# The generator's options by quality, dotted names.
+# Options of the generator by preset, dotted names.
 GENERATOR: dict[Quality, dict[str, Any]] = {
-    # Half as many queries let fits of glossy relief follow single bright paths. Test errors are free of
-    # noise: what limits them is how they vary over queries, so paths go to many of them.
+    # With half as many queries, fits of glossy materials overfit single bright paths. Test errors are free of
+    # noise; their variance over queries dominates, so many test queries get few paths each.
     "draft": {
         "queries.train": "400/texel",
         "queries.spp": 4,
@@ -42,11 +40,6 @@ GENERATOR: dict[Quality, dict[str, Any]] = {
         "queries.test_spp": 256,
     },
 }
-
-
-def quality_help(what: str) -> str:
-    """Help text of ``--quality``: what it sets, and what each quality was measured to cost and to reach."""
-    return f"{what} {help_lines(get_args(Quality))}"
 
 
 def as_assignments(options: dict[str, Any], prefix: str = "") -> list[str]:

@@ -1,7 +1,7 @@
-"""What the qualities cost and reach, as ``benchmarks/quality.py --store`` measured it.
+"""What the quality presets cost and reach, as ``benchmarks/quality.py --store`` measured it.
 
-The figures lie beside this module as JSON with the date and the kind of machine; help texts, what
-``mbtf-gen plan`` says and the table of docs/cost.md are made from them.
+The figures lie beside this module as JSON, with the date and the kind of machine. ``mbtf-gen plan`` and a table
+of the documentation show them.
 """
 
 from __future__ import annotations
@@ -20,23 +20,25 @@ FORMAT = "mbtf-quality"
 
 
 @dataclass(frozen=True)
-class Chain:
-    """One material at a quality, from height map to report.
+class PresetRun:
+    """One material at a preset, from height map to report.
 
     Attributes
     ----------
-    material, quality : names; height : of the relief in tile widths, None for the material's own
-    seconds : of the whole chain, start-up included; generate, fit : of these two stages
-    unexplained, unexplained_error : variance of test queries that the fit misses, and its standard error
+    material, quality : names
+    height_scale : factor on the stored heights; None for the material's own
+    seconds : of the whole run, start-up included
+    generate, fit : seconds of these two stages
+    unexplained, unexplained_error : unexplained variance on test queries, and its standard error
     data_bytes, material_bytes : on disk
-    queries_per_second : trained on
-    settings : hash of all that the quality set
-    share : of the quality's training time that it trained for
+    queries_per_second : in training
+    settings : hash of all options that the preset sets
+    share : share of the preset's training time that the fit used
     """
 
     material: str
     quality: str
-    height: float | None
+    height_scale: float | None
     seconds: float
     generate: float
     fit: float
@@ -51,27 +53,28 @@ class Chain:
 
 @dataclass(frozen=True)
 class Expected:
-    """All that is known of the qualities.
+    """Measured and extrapolated figures of the presets.
 
     Attributes
     ----------
-    date, machine, command : of the run; levels : finest level of its materials
-    chains : measured ones
-    extrapolated : qualities that nobody waited for, as chains whose figures follow from measured ones
+    date, machine, command : of the benchmark
+    resolution : texels across
+    runs : measured runs
+    extrapolated : runs of presets that take too long to measure; their figures follow from measured runs
     law : how they follow, in words
     """
 
     date: str
     machine: str
     command: str
-    levels: int
-    chains: tuple[Chain, ...]
-    extrapolated: tuple[Chain, ...]
+    resolution: int
+    runs: tuple[PresetRun, ...]
+    extrapolated: tuple[PresetRun, ...]
     law: str
 
-    def of(self, quality: str) -> list[Chain]:
-        """Measured chains of a quality; extrapolated ones where there are none."""
-        return [c for c in self.chains if c.quality == quality and c.share == 1] or [
+    def of(self, quality: str) -> list[PresetRun]:
+        """Measured runs of a preset; extrapolated ones where there are none."""
+        return [c for c in self.runs if c.quality == quality and c.share == 1] or [
             c for c in self.extrapolated if c.quality == quality
         ]
 
@@ -80,7 +83,7 @@ class Expected:
         known = self.of(quality)
         if not known:
             return None
-        guess = " (extrapolated)" if all(c not in self.chains for c in known) else ""
+        guess = " (extrapolated)" if all(c not in self.runs for c in known) else ""
         times = _range([clock(c.seconds) for c in sorted(known, key=lambda c: c.seconds)])
         errors = _range([f"{c.unexplained:.2f}" for c in sorted(known, key=lambda c: c.unexplained)])
         return f"{quality} {times} in all, {errors} unexplained{guess}"
@@ -98,9 +101,9 @@ def read_expected(path: Path) -> Expected:
     InputError : the file is missing or damaged
     """
     data: dict[str, Any] = read_json(path)
-    chains, guessed = (tuple(Chain(**row) for row in data[name]) for name in ("chains", "extrapolated"))
+    runs, guessed = (tuple(PresetRun(**row) for row in data[name]) for name in ("runs", "extrapolated"))
     return Expected(
-        data["date"], data["machine"], data["command"], data["levels"], chains, guessed, data["law"]
+        data["date"], data["machine"], data["command"], data["resolution"], runs, guessed, data["law"]
     )
 
 
@@ -108,15 +111,6 @@ def read_expected(path: Path) -> Expected:
 def expected() -> Expected:
     """The figures that come with the package."""
     return read_expected(STORED)
-
-
-def help_lines(qualities: Sequence[str]) -> str:
-    """What ``--help`` says of the qualities."""
-    found = expected()
-    lines = [line for quality in qualities if (line := found.line(quality)) is not None]
-    if not lines:
-        return ""
-    return f"Measured with {1 << found.levels} texels across on {found.machine}: {'; '.join(lines)}."
 
 
 _HEAD = (
@@ -132,18 +126,18 @@ _HEAD = (
 
 
 def markdown_table(found: Expected, qualities: Sequence[str]) -> str:
-    """The table of docs/cost.md, and how what is extrapolated follows."""
-    if not found.chains:
+    """Markdown table of the presets' figures, and how the extrapolated ones follow."""
+    if not found.runs:
         return "No figures are stored."
     rows = ["| " + " | ".join(_HEAD) + " |", "|" + "---|" * len(_HEAD)]
     for quality in qualities:
         for c in found.of(quality):
-            guess = "" if c in found.chains else ", extrapolated"
+            guess = "" if c in found.runs else ", extrapolated"
             error = f" ± {c.unexplained_error:.3f}" if c.unexplained_error > 0 else ""
-            relief = "" if c.height is None else f", relief {c.height:g}"
+            scale = "" if c.height_scale is None else f", height scale {c.height_scale:g}"
             cells = (
                 f"`{quality}`{guess}",
-                f"{c.material}{relief}",
+                f"{c.material}{scale}",
                 clock(c.seconds),
                 clock(c.generate),
                 clock(c.fit),

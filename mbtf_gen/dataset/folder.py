@@ -14,12 +14,12 @@ from mbtf_core.atomic import (
     create_file,
     read_checksummed,
     read_json,
-    remove_file,
     unwritable,
     write_text,
 )
-from mbtf_core.config_file import differences, dump_yaml, in_short
+from mbtf_core.config_file import differences, dump_yaml
 from mbtf_core.errors import InputError, PartialError
+from mbtf_core.folders import ELSEWHERE, check_folder, make_folder, other_configuration, remove_unfinished
 from mbtf_core.locks import brief_lock, lock_owner, take_lock
 from mbtf_core.shard_schema import CONFIG_NAME, FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, SPLITS
 from mbtf_gen.dataset.manifest import build_manifest
@@ -67,33 +67,22 @@ def open_folder(job: Job, folder: Path, plan: Callable[[Job], RunPlan], overwrit
     InputError : the folder contains something else, or a corrupt manifest
     PartialError : it cannot be written, or other processes write the data set that is to be replaced
     """
-    if folder.exists() and not folder.is_dir():
-        raise InputError("is a file, not a folder", where=folder)
     existing = folder / MANIFEST_NAME
-    replace = overwrite and existing.exists()
+    present = check_folder(folder, lambda path: (path / MANIFEST_NAME).exists(), "data set")
+    replace = overwrite and present
     if replace:
         _check_format(existing)
-    elif existing.exists():
+    elif present:
         _check_same(job, folder)
         if (folder / CONFIG_NAME).exists():
             return
-    elif folder.exists() and not all(_is_leftover(p.name) for p in folder.iterdir()):
-        if existing.exists():
-            # Another writer of the same data set has just created it.
-            return open_folder(job, folder, plan, overwrite)
-        raise InputError(
-            "is not empty and contains no data set", where=folder, hint="choose another folder with -o"
-        )
     # Planning takes long: it comes before any change, and outside the lock.
     content = checksummed(build_manifest(job, plan(job))) if replace or not existing.exists() else b""
     if replace:
         _clear(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot be created ({error.strerror})", where=folder) from None
+    make_folder(folder)
     with brief_lock(existing):
-        _remove_unfinished(folder, (MANIFEST_NAME, CONFIG_NAME))
+        remove_unfinished(folder, (MANIFEST_NAME, CONFIG_NAME))
         # The manifest comes first: it marks the folder as a data set, at whatever instant the run is killed.
         if content and not create_file(existing, content):
             _check_same(job, folder)
@@ -104,9 +93,7 @@ def open_folder(job: Job, folder: Path, plan: Callable[[Job], RunPlan], overwrit
 def _check_format(path: Path) -> dict[str, Any]:
     manifest = read_json(path)
     if manifest.get("format") != FORMAT_NAME:
-        raise InputError(
-            f"is not a manifest of {FORMAT_NAME}", where=path, hint="choose another folder with -o"
-        )
+        raise InputError(f"is not a manifest of {FORMAT_NAME}", where=path, hint=ELSEWHERE)
     return manifest
 
 
@@ -119,20 +106,11 @@ def _check_same(job: Job, folder: Path) -> None:
     config = old.get("config")
     before = {**(config if isinstance(config, dict) else {}), "inputs": old.get("inputs", {})}
     before["schema"] = old.get("schema")
-    after = {
-        **job.config.model_dump(mode="json"),
-        "inputs": dict(job.material.digests),
-        "schema": SCHEMA_VERSION,
-    }
-    changes = in_short(differences(before, after))
-    if not changes:
+    after = {**job.config.model_dump(mode="json"), "inputs": dict(job.material.digests)}
+    after["schema"] = SCHEMA_VERSION
+    if not differences(before, after):
         read_manifest(folder)
-        changes = "inputs differ"
-    raise InputError(
-        f"contains a data set of another configuration: {changes}",
-        where=folder,
-        hint="choose another folder with -o, or replace it with --overwrite",
-    )
+    raise other_configuration(folder, "a data set", before, after)
 
 
 def _locks(folder: Path) -> Iterator[Path]:
@@ -140,13 +118,6 @@ def _locks(folder: Path) -> Iterator[Path]:
     for path in sorted(folder.iterdir()):
         if match := _LOCK.fullmatch(path.name):
             yield folder / f"{match[1]}.npz"
-
-
-def _remove_unfinished(folder: Path, names: tuple[str, ...]) -> None:
-    """Remove unfinished versions of files; the caller holds their lock."""
-    for path in folder.iterdir():
-        if any(re.fullmatch(rf"\.{re.escape(name)}{TEMPORARY}", path.name) for name in names):
-            remove_file(path)
 
 
 def remove_leftovers(folder: Path) -> None:
@@ -168,7 +139,7 @@ def remove_leftovers(folder: Path) -> None:
             continue
         try:
             files = [f"{stem}{suffix}" for suffix in (".npz", ".exr", ".json")]
-            _remove_unfinished(folder, (*files, *([CONFIG_NAME] if stem == general else [])))
+            remove_unfinished(folder, (*files, *([CONFIG_NAME] if stem == general else [])))
         finally:
             lock.release()
 

@@ -38,7 +38,7 @@ _RELATIVE_OFFSET = 5.0e-7
 
 @dataclass(frozen=True)
 class HeightField:
-    """A periodic height field, ready for rays; lengths in scene units, centerd on the tile. Numbers are of
+    """A periodic height field, ready for rays; lengths in scene units, centered on the tile. Numbers are of
     width 1 and kept out of the kernels' code, so that other tiles use the same compiled kernels.
 
     Attributes
@@ -115,7 +115,7 @@ class HeightField:
     def leave(self, si: Any, d: Any) -> Any:
         """Ray that leaves a surface point in direction d.
 
-        The tile is centerd on the origin, so hit points are exact to a few units in the last place and a far
+        The tile is centered on the origin, so hit points are exact to a few units in the last place and a far
         smaller offset than the renderer's own is enough: it would lift rays by 5e-5 tile widths, through thin
         ridges and out of creases.
         """

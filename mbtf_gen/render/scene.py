@@ -1,4 +1,4 @@
-"""The displaced tile, ready to be traced: its shape and its surface, centerd on the origin.
+"""The displaced tile, ready to be traced: its shape and its surface, centered on the origin.
 
 Scene units: the longer side of the tile is 32 units, where single precision resolves 2e-6 and hit points are
 exact enough for a ray offset of 8e-6 units.

@@ -37,8 +37,8 @@ def standard_normal(xi: Any) -> Any:
     function of each axis, so that well-spread numbers give well-spread points (polar coordinates tear
     neighbors apart)."""
     # Centers of cells of 2^-24: symmetric, and never at the infinite ends.
-    centerd = xi * 2.0 - (1.0 - 2.0**-24)
-    return dr.sqrt(2.0) * dr.erfinv(centerd)
+    centered = xi * 2.0 - (1.0 - 2.0**-24)
+    return dr.sqrt(2.0) * dr.erfinv(centered)
 
 
 class QuerySensor(mi.Sensor):

@@ -102,8 +102,8 @@ class QueryPlan:
     Attributes
     ----------
     lattice : texel grids; mixture : over levels; min_cos : smallest cosine of both directions
-    layout : ``shuffled`` or ``image``; root : root seed; shard_rows : queries (or buffers) per full shard
-    window : places along each side of a buffer, one texel of the level nearest to its footprint apart; None:
+    layout : ``shuffled`` or ``image``; root : root seed; shard_rows : queries (or images) per full shard
+    window : places along each side of an image, one texel of the level nearest to its footprint apart; None:
         one place in each texel of the finest level
     """
 
@@ -116,7 +116,7 @@ class QueryPlan:
     patch_size: int | None = None
 
     def draw(self, split: str, shard: int, rows: int) -> Queries:
-        """Queries of one shard: `rows` queries, or `rows` buffers, each of the finest lattice or of a window
+        """Queries of one shard: `rows` queries, or `rows` images, each of the finest lattice or of a window
         of the lattice nearest to its footprint."""
         generator = numpy_generator(self.root, split, shard, Purpose.QUERIES)
         sigma = self._sigma(generator, rows)

@@ -10,7 +10,7 @@ from cyclopts import Parameter
 
 from mbtf_core.console import CONSOLE, Console, clock, new_app
 from mbtf_core.errors import InputError, MbtfError, UsageError
-from mbtf_gen.config.presets import Quality, quality_help
+from mbtf_gen.config.presets import Quality
 
 if TYPE_CHECKING:
     from mbtf_pipeline.recipe import Recipe
@@ -20,9 +20,7 @@ app = new_app("mbtf-pipeline", "Run recipes: generate, fit, compare, report.")
 
 Set = Annotated[list[str], Parameter(name="--set", help="Set any option of the recipe, a.b=c. Repeatable.")]
 Output = Annotated[Path | None, Parameter(name=["--output", "-o"])]
-QualityOption = Annotated[
-    Quality, Parameter(help=quality_help("Sizes and times of all stages, in place of the recipe's."))
-]
+QualityOption = Annotated[Quality, Parameter(help="Sizes and times of all stages, in place of the recipe's.")]
 _FOLDER = Path("pipelines")
 
 

@@ -12,6 +12,7 @@ from typing import Any
 from mbtf_core.atomic import read_json, write_json, write_text
 from mbtf_core.config_file import dump_yaml
 from mbtf_core.errors import InputError
+from mbtf_core.folders import ELSEWHERE, check_folder, make_folder
 from mbtf_core.stats import Estimate, signal_variance
 from mbtf_gen.config.generator import GeneratorConfig, count_queries
 from mbtf_gen.material.material import load_material
@@ -23,7 +24,7 @@ from mbtf_pipeline.cost_study.repeats import repeat_chains
 from mbtf_pipeline.cost_study.runs import Chain, RunRequest, RunRunner
 from mbtf_pipeline.cost_study.seed_variance import Scatter, seed_scatter, with_scatter
 from mbtf_pipeline.recipe import Recipe
-from mbtf_pipeline.run_folder import locked, machine, take
+from mbtf_pipeline.run_folder import locked, machine
 
 STUDY_NAME = "study.json"
 STUDY_FORMAT = "mbtf-cost"
@@ -77,16 +78,15 @@ def claim(folder: Path) -> None:
     ------
     InputError : it holds something else
     """
-    hint = "choose another folder with -o"
-    other = InputError("is not empty and holds no cost study", where=folder, hint=hint)
-    take(folder, lambda path: bool(_record(path)), other)
+    check_folder(folder, lambda path: bool(_record(path)), "cost study")
+    make_folder(folder)
     if record := _record(folder):
         there, here = record.get("machine", {}).get("system"), machine()["system"]
         if there != here:
             raise InputError(
                 f"holds a cost study made on another kind of machine ({there}; this is {here})",
                 where=folder,
-                hint=hint,
+                hint=ELSEWHERE,
             )
 
 

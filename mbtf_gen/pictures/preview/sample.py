@@ -30,7 +30,7 @@ class QuerySample:
     Attributes
     ----------
     u : (n, 2) uv
-    level : (m,) fractional levels; omega_i, omega_o : (m, 3). One per query, or one per buffer in the image
+    level : (m,) fractional levels; omega_i, omega_o : (m, 3). One per query, or one per image in the image
         layout, whose queries share them.
     split : of the data set; shards : taken; total : queries of the whole split
     mixture, finest : of the levels; min_cos : of both directions; aspect : H/W of the tile
@@ -116,7 +116,7 @@ def _columns(
     parts: list[Queries],
 ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float32], NDArray[np.float32]]:
     first = parts[0]
-    # The image layout repeats footprint and directions over a buffer: its first query stands for it.
+    # The image layout repeats footprint and directions over an image: its first query stands for it.
     one: Any = (slice(None), *(0,) * (len(first.lead) - 1))
     return (
         np.concatenate([p.u.reshape(-1, 2) for p in parts]),

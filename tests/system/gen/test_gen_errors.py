@@ -61,7 +61,7 @@ CASES: dict[str, tuple[str, int, list[str]]] = {
     "preview without paths": ("preview heights.npy --spp 0", USAGE, ["--spp", "at least 2"]),
     "preview among files of others": ("preview heights.npy -o aspects", INPUT, ["aspects", "no pictures"]),
     "preview of a data set of another schema": ("preview schema", INPUT, ["schema 99"]),
-    "output of others": ("heights.npy -o aspects", INPUT, ["aspects", "contains no data set"]),
+    "output of others": ("heights.npy -o aspects", INPUT, ["aspects", "holds no data set"]),
     "output below a file": ("heights.npy -o notes.txt/below", INPUT, ["notes.txt"]),
     "words as a count": ("heights.npy --queries many", USAGE, ["--queries", "'many'", "400/texel"]),
     "a negative count": ("heights.npy --queries -5", USAGE, ["--queries", "'-5'"]),
@@ -207,7 +207,7 @@ def test_another_configuration_is_refused_field_by_field(tmp_path: Path) -> None
     assert done.code == INPUT
     assert done.out == ""
     error = done.err[done.err.index("error: ") :]
-    assert "set: contains a data set of another configuration" in error
+    assert "set: holds a data set of another configuration" in error
     for part in ("light.width: 2.0 -> 3.0", "queries.min_cos: 0.1 -> 0.3", "--overwrite"):
         assert part in error
     assert "seed" not in error

@@ -163,7 +163,7 @@ def test_each_picture_has_a_line_that_says_what_it_shows(batch: dict[str, Done])
     assert "32 x 16 cells per tile) of 2 x 2 tiles" in lines[0]
     assert "4 paths per pixel" in lines[1]
     assert "3000 of 3000 training queries to be drawn for maps" in lines[2]
-    assert "256 of 256 training queries to be drawn for flat.npy, in 4 buffers of one" in batch["buffers"].out
+    assert "256 of 256 training queries to be drawn for flat.npy, in 4 images of one" in batch["buffers"].out
 
 
 @pytest.mark.usefixtures("drawing")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
 from dataclasses import asdict
@@ -17,7 +16,7 @@ from mbtf_fit.config import FitConfig
 from mbtf_fit.presets import FITTER, best_at, best_options, fitter_options, overrides_of
 from mbtf_gen.config.generator import GeneratorConfig, count_queries
 from mbtf_gen.config.presets import GENERATOR, Quality, as_assignments
-from mbtf_gen.config.quality_measured import Chain, Expected, expected, markdown_table, read_expected
+from mbtf_gen.config.quality_measured import Expected, PresetRun, expected, markdown_table, read_expected
 from mbtf_pipeline.presets import COMPARE, quality_assignments, settings_hash
 from mbtf_pipeline.recipe import load_recipe
 
@@ -116,20 +115,26 @@ def test_what_is_said_explicitly_wins(tmp_path: Path) -> None:
 
 
 CHAINS = (
-    Chain("rock", "draft", 0.1, 41.0, 5.0, 20.0, 0.314, 0.01, 10**8, 10**6, 3e6, "h"),
-    Chain("bark", "draft", None, 52.4, 6.0, 20.0, 0.62, 0.02, 10**8, 10**6, 3e6, "h"),
-    Chain("rock", "high", 0.1, 1800.0, 300.0, 1200.0, 0.05, 0.002, 10**9, 10**6, 3e6, "h"),
+    PresetRun("rock", "draft", 0.1, 41.0, 5.0, 20.0, 0.314, 0.01, 10**8, 10**6, 3e6, "h"),
+    PresetRun("bark", "draft", None, 52.4, 6.0, 20.0, 0.62, 0.02, 10**8, 10**6, 3e6, "h"),
+    PresetRun("rock", "high", 0.1, 1800.0, 300.0, 1200.0, 0.05, 0.002, 10**9, 10**6, 3e6, "h"),
 )
 # From which the last is extrapolated; not what the quality reaches.
-QUARTER = Chain("rock", "high", 0.1, 700.0, 300.0, 300.0, 0.08, 0.002, 10**9, 10**6, 3e6, "h", 0.25)
-GUESS = Chain("rock", "paper", 0.1, 40000.0, 20000.0, 20000.0, 0.03, 0.0, 10**9, 10**6, 3e6, "h")
+QUARTER = PresetRun("rock", "high", 0.1, 700.0, 300.0, 300.0, 0.08, 0.002, 10**9, 10**6, 3e6, "h", 0.25)
+GUESS = PresetRun("rock", "paper", 0.1, 40000.0, 20000.0, 20000.0, 0.03, 0.0, 10**9, 10**6, 3e6, "h")
 
 
-def written(folder: Path, chains: tuple[Chain, ...], guesses: tuple[Chain, ...]) -> Expected:
+def written(folder: Path, chains: tuple[PresetRun, ...], guesses: tuple[PresetRun, ...]) -> Expected:
     """Figures as the benchmark writes them, read back."""
     path = folder / "figures.json"
-    head = {"date": "2001-02-03", "machine": "a machine", "command": "c", "levels": 7, "law": "as it comes"}
-    rows = {"chains": [asdict(c) for c in chains], "extrapolated": [asdict(c) for c in guesses]}
+    head = {
+        "date": "2001-02-03",
+        "machine": "a machine",
+        "command": "c",
+        "resolution": 128,
+        "law": "as it comes",
+    }
+    rows = {"runs": [asdict(c) for c in chains], "extrapolated": [asdict(c) for c in guesses]}
     path.write_text(json.dumps({**head, **rows}))
     return read_expected(path)
 
@@ -145,40 +150,15 @@ def test_measured_qualities_are_told_from_guessed_ones(tmp_path: Path) -> None:
     assert [row.split(" | ")[0] for row in rows[2:-2]] == [
         "| `draft`", "| `draft`", "| `high`", "| `paper`, extrapolated",
     ]  # fmt: skip
-    assert "rock, relief 0.1 | 0:41 | 0:05 | 0:20 | 0.314 ± 0.010 | 100 MB | 1.00 MB |" in rows[2]
+    assert "rock, height scale 0.1 | 0:41 | 0:05 | 0:20 | 0.314 ± 0.010 | 100 MB | 1.00 MB |" in rows[2]
     assert "| bark |" in rows[3]
-
-
-def test_the_documentation_shows_the_figures_that_are_stored() -> None:
-    page = (ROOT / "docs" / "cost.md").read_text(encoding="utf-8")
-    shown = page.split("<!-- qualities: begin -->")[1].split("<!-- qualities: end -->")[0].strip()
-    assert shown == markdown_table(expected(), QUALITIES)
 
 
 def test_figures_are_of_the_qualities_as_they_are() -> None:
     found = expected()
-    assert found.chains
-    for chain in (*found.chains, *found.extrapolated):
+    assert found.runs
+    for chain in (*found.runs, *found.extrapolated):
         assert chain.settings == settings_hash(chain.quality), f"{chain.material} {chain.quality}"  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("program", ["mbtf-gen", "mbtf-fit", "mbtf-pipeline"])
-def test_help_says_what_qualities_cost(program: str, capsys: pytest.CaptureFixture[str]) -> None:
-    from mbtf_fit.cli.app import app as fit
-    from mbtf_gen.cli.app import app as generate
-    from mbtf_pipeline.cli.app import app as pipeline
-
-    app, words = {
-        "mbtf-gen": (generate, ["--help"]),
-        "mbtf-fit": (fit, ["--help"]),
-        "mbtf-pipeline": (pipeline, ["run", "--help"]),
-    }[program]
-    with contextlib.suppress(SystemExit):
-        app(words)
-    text = "".join(capsys.readouterr().out.replace("│", " ").split())
-    for quality in QUALITIES:
-        line = expected().line(quality)
-        assert line is None or "".join(line.split()) in text
 
 
 def test_no_quality_changes_nothing() -> None:
