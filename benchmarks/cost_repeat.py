@@ -34,6 +34,7 @@ from mbtf_core.errors import MbtfError
 from mbtf_core.stats import Estimate
 from mbtf_gen.material.material import load_material
 from mbtf_gen.planning.effects_plan import plan_effects
+from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.runtime import load_mitsuba
 from mbtf_pipeline.cost_study.fit_runs import PATH_SHARES
 from mbtf_pipeline.cost_study.generator_benchmark import GeneratorBenchmark
@@ -126,7 +127,7 @@ def independent(recipe: Path, seconds: float) -> tuple[Estimate | None, dict[int
             setting = {"queries.spp": n}
             points.append(Point("paths", "", "", setting, "", found.seconds, found.error, None, found.noise))
             job = bench.job(BIASED)
-            biases[n] = bench.bias(job.estimator(plan_effects(job)), {}, 2 * seconds, n)
+            biases[n] = bench.bias(build_estimator(job, plan_effects(job)), {}, 2 * seconds, n)
             print(f"independent, {n} paths: noise {found.noise}, squared bias {biases[n]}")
     finally:
         module.sequence = usual

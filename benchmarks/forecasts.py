@@ -43,14 +43,16 @@ BARS = {"seconds": 1.3, "error": 1.5}
 def generated(name: str, quality: Quality, levels: int, shards: Path) -> dict[str, Any]:
     """Forecast and run of the generator."""
     from mbtf_gen.forecast import forecast
-    from mbtf_gen.generation import Job, allocated, generate
+    from mbtf_gen.generation import generate
+    from mbtf_gen.job import Job
     from mbtf_gen.planning.effects_plan import plan_effects
+    from mbtf_gen.planning.run_plan import allocate
 
     config = generator_config(name, quality, levels)
     job = Job.prepare(config)
-    expected = forecast(job, allocated(job, plan_effects(job)))
+    expected = forecast(job, allocate(job, plan_effects(job)))
     start = time.perf_counter()
-    summary = generate(config, shards, job=job)
+    summary = generate(job, shards)
     took = time.perf_counter() - start
     return {
         "seconds, forecast": expected.seconds + expected.start,

@@ -32,6 +32,7 @@ from typing import Any, get_args
 from mbtf_core.atomic import read_json, write_json
 from mbtf_core.config_file import resolve
 from mbtf_core.console import clock
+from mbtf_core.digest import data_sha256
 from mbtf_core.errors import InputError
 from mbtf_fit.config import FitConfig
 from mbtf_fit.presets import FITTER, best_at
@@ -39,7 +40,6 @@ from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.config.presets import GENERATOR, Quality, as_assignments
 from mbtf_pipeline.presets import COMPARE
 from mbtf_pipeline.run_folder import machine
-from mbtf_pipeline.stages import hash_of
 
 ROOT = Path(__file__).resolve().parents[1]
 TEXTURE_SETS = ROOT.parent / "shared" / "data" / "materials"
@@ -116,7 +116,7 @@ def settings_hash(quality: Quality) -> str:
     """Hash of all options of a preset and of the fitter's other training options."""
     options = best_at(quality) | FITTER[quality]
     training = resolve(FitConfig, assignments=as_assignments(options)).training.model_dump(mode="json")
-    return hash_of([GENERATOR[quality], options, training, COMPARE[quality]])[:12]
+    return data_sha256([GENERATOR[quality], options, training, COMPARE[quality]])[:12]
 
 
 def generator_config(name: str, quality: Quality, resolution: int) -> GeneratorConfig:

@@ -13,11 +13,12 @@ from __future__ import annotations
 
 import contextlib
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 from mbtf_core.atomic import read_json, write_json
 from mbtf_core.errors import InputError, PartialError
+from mbtf_core.folders import check_folder, make_folder
 from mbtf_pipeline.recipe import Recipe, write_recipe
 
 RUN_NAME = "run.json"
@@ -32,24 +33,6 @@ def clear(folder: Path) -> None:
         shutil.rmtree(folder)
 
 
-def claim_folder(folder: Path, is_ours: Callable[[Path], bool], refusal: InputError) -> None:
-    """Create an output folder, or accept one that is empty or ours.
-
-    Raises
-    ------
-    InputError : `refusal` if it contains something else; or it cannot be created
-    """
-    if folder.exists() and not folder.is_dir():
-        raise InputError("is a file, not a folder", where=folder)
-    occupied = folder.exists() and any(not path.name.startswith(".") for path in folder.iterdir())
-    if occupied and not is_ours(folder):
-        raise refusal
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot be created ({error.strerror})", where=folder) from None
-
-
 def claim_run_folder(folder: Path) -> None:
     """Create a run's folder, or accept an empty one or one that contains a run.
 
@@ -57,8 +40,8 @@ def claim_run_folder(folder: Path) -> None:
     ------
     InputError : it contains something else
     """
-    hint = "choose another folder with -o"
-    claim_folder(folder, is_run, InputError("is not empty and contains no run", where=folder, hint=hint))
+    check_folder(folder, is_run, "run")
+    make_folder(folder)
 
 
 def write_run_record(folder: Path, recipe: Recipe, command: str) -> None:

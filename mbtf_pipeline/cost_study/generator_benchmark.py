@@ -21,10 +21,11 @@ from numpy.typing import NDArray
 
 from mbtf_core.stats import Estimate, mean_estimate
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.generation import Job, allocated
+from mbtf_gen.job import Job
 from mbtf_gen.material.material import Material
 from mbtf_gen.planning.adaptive import estimate_shard
 from mbtf_gen.planning.effects_plan import plan_effects
+from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Stream
 from mbtf_gen.sampling.query_sampler import Queries
 from mbtf_pipeline.cost_study.measurements import HALF_WIDTH, NORMAL
@@ -102,11 +103,11 @@ class GeneratorBenchmark:
         for name, value in {**fixed, **changes}.items():
             section, _, key = name.rpartition(".")
             (data[section] if section else data)[key] = value
-        return Job.of(GeneratorConfig.model_validate({**data, "seed": self.seed}), self.material)
+        return Job(GeneratorConfig.model_validate({**data, "seed": self.seed}), self.material)
 
     def _queries(self, job: Job, shard: int, count: int) -> Queries:
         """Queries of a test split, one leading axis."""
-        return job.plan().draw("test", shard, count)
+        return job.query_plan.draw("test", shard, count)
 
     def reference(self, changes: dict[str, Any], batch: int) -> _Reference:
         """One batch of the reference with these options."""
@@ -137,7 +138,7 @@ class GeneratorBenchmark:
         key = _key(changes)
         if key not in self._estimators:
             job = self.job({"effects.mode": "all", "transport.max_depth": 0, **changes})
-            self._estimators[key] = job, job.estimator(plan_effects(job))
+            self._estimators[key] = job, build_estimator(job, plan_effects(job))
         return self._estimators[key]
 
     def _bias_halves(
@@ -180,7 +181,7 @@ class GeneratorBenchmark:
         spp : paths of each query; the expected value does not depend on them
         """
         job = self.job(changes)
-        estimator = job.estimator(plan_effects(job))
+        estimator = build_estimator(job, plan_effects(job))
         mean = self.mean(against).value
         start = time.perf_counter()
         squares: list[NDArray[np.float64]] = []

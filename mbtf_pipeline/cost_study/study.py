@@ -12,6 +12,7 @@ from typing import Any
 from mbtf_core.atomic import read_json, write_json, write_text
 from mbtf_core.config_file import dump_yaml
 from mbtf_core.errors import InputError
+from mbtf_core.folders import ELSEWHERE, check_folder, make_folder
 from mbtf_core.stats import Estimate, signal_variance
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.material.material import load_material
@@ -22,7 +23,7 @@ from mbtf_pipeline.cost_study.measurements import Measurement, MeasurementFolder
 from mbtf_pipeline.cost_study.repeats import MOST_SEEDS, combined, measure_runs, seed_deviation
 from mbtf_pipeline.cost_study.runs import Run, RunRunner
 from mbtf_pipeline.recipe import Recipe
-from mbtf_pipeline.run_folder import claim_folder, locked, machine
+from mbtf_pipeline.run_folder import locked, machine
 
 STUDY_NAME = "study.json"
 STUDY_FORMAT = "mbtf-cost"
@@ -69,19 +70,19 @@ def claim(folder: Path) -> None:
     ------
     InputError : it holds something else, or a study of another version or machine
     """
-    hint = "choose another folder with -o"
-    other = InputError("is not empty and holds no cost study", where=folder, hint=hint)
-    claim_folder(folder, lambda path: bool(_record(path)), other)
-    record = _record(folder)
-    if not record:
-        return
-    if record.get("schema") != STUDY_SCHEMA:
-        problem = f"holds a cost study of schema version {record.get('schema')}; this is {STUDY_SCHEMA}"
-        raise InputError(problem, where=folder, hint=hint)
-    there, here = record.get("machine", {}).get("system"), machine()["system"]
-    if there != here:
-        problem = f"holds a cost study of another kind of machine ({there}; this is {here})"
-        raise InputError(problem, where=folder, hint=hint)
+    check_folder(folder, lambda path: bool(_record(path)), "cost study")
+    make_folder(folder)
+    if record := _record(folder):
+        if record.get("schema") != STUDY_SCHEMA:
+            problem = f"holds a cost study of schema version {record.get('schema')}; this is {STUDY_SCHEMA}"
+            raise InputError(problem, where=folder, hint=ELSEWHERE)
+        there, here = record.get("machine", {}).get("system"), machine()["system"]
+        if there != here:
+            raise InputError(
+                f"holds a cost study made on another kind of machine ({there}; this is {here})",
+                where=folder,
+                hint=ELSEWHERE,
+            )
 
 
 def _record(folder: Path) -> dict[str, Any]:

@@ -28,6 +28,7 @@ import numpy as np
 
 from mbtf_core.atomic import read_json, write_json
 from mbtf_core.console import clock
+from mbtf_core.digest import data_sha256
 from mbtf_core.errors import InputError, UsageError
 from mbtf_core.units import format_duration
 from mbtf_fit.config import FitConfig
@@ -37,7 +38,6 @@ from mbtf_pipeline.cost_study.runs import DataRequest, Run, RunRunner
 from mbtf_pipeline.recipe import Recipe
 from mbtf_pipeline.run import layout_of
 from mbtf_pipeline.run_folder import claim_run_folder, locked, write_run_record
-from mbtf_pipeline.stages import hash_of
 
 SPLIT_NAME = "time_split.json"
 SPLIT_FORMAT = "mbtf-time-split"
@@ -146,7 +146,7 @@ def split_time(
             hint="leave out the fits of 'hierarchical'",
         )
     options = recipe.model_dump(mode="json", include={"generate", "fit"})
-    key = hash_of({"schema": SPLIT_SCHEMA, "time": seconds, "recipe": options})
+    key = data_sha256({"schema": SPLIT_SCHEMA, "time": seconds, "recipe": options})
     claim_run_folder(folder)
     with locked(folder):
         split = _stored(folder, key)

@@ -9,11 +9,11 @@ from typing import Any
 
 from mbtf_core.atomic import read_json, write_json
 from mbtf_core.console import Console
-from mbtf_core.errors import InputError
+from mbtf_core.folders import check_folder, make_folder
 from mbtf_pipeline.paper_tables.page import write_page
 from mbtf_pipeline.paper_tables.recipe import RUNS, PaperRecipe, Planned
 from mbtf_pipeline.run import run_recipe
-from mbtf_pipeline.run_folder import claim_folder, has_record, locked, machine
+from mbtf_pipeline.run_folder import has_record, locked, machine
 
 PAPER_NAME = "paper.json"
 PAPER_FORMAT = "mbtf-paper"
@@ -95,10 +95,8 @@ def run_paper(
         Another process uses the folder, or the disk is full; the same command resumes.
     """
     console = console or Console(quiet=True)
-    hint = "choose another folder with -o"
-    claim_folder(
-        folder, is_paper, InputError("is not empty and contains no paper recipe", where=folder, hint=hint)
-    )
+    check_folder(folder, is_paper, "paper recipe")
+    make_folder(folder)
     record: dict[str, Any] = {
         "format": PAPER_FORMAT,
         "schema": PAPER_SCHEMA,

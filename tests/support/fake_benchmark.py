@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.generation import Job
+from mbtf_gen.job import Job
 from mbtf_gen.material.material import Material
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.sampling.query_sampler import Queries
@@ -46,8 +46,10 @@ class FakeEstimator:
 
 def fake_benchmark(monkeypatch: pytest.MonkeyPatch) -> GeneratorBenchmark:
     """Of a small relief, traced by :class:`FakeEstimator` until the test ends."""
-    monkeypatch.setattr(Job, "estimator", lambda self, plan: FakeEstimator(self))
-    monkeypatch.setattr("mbtf_pipeline.cost_study.generator_benchmark.plan_effects", lambda job: None)
+    module = "mbtf_pipeline.cost_study.generator_benchmark"
+    for name in (module, "mbtf_gen.planning.sample_allocation"):
+        monkeypatch.setattr(f"{name}.build_estimator", lambda job, plan: FakeEstimator(job))
+    monkeypatch.setattr(f"{module}.plan_effects", lambda job: None)
     heights = np.random.default_rng(0).random((8, 8))
     material = Material(heights, height_scale=0.1, height_bits=None, base_color=np.array([0.5, 0.5, 0.5]))
     return GeneratorBenchmark(GeneratorConfig(material="heights.npy"), material, 0)

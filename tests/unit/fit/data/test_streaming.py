@@ -11,7 +11,7 @@ from support.fit_data import parallax, write_data
 
 import mbtf_fit.evaluation
 from mbtf_core.errors import InputError
-from mbtf_core.sizes import format_size, parse_size
+from mbtf_core.units import format_size, parse_size
 from mbtf_fit.config import FitConfig, HeldOutSection
 from mbtf_fit.data.loader import load_training
 from mbtf_fit.data.split import Partition

@@ -283,7 +283,7 @@ def test_values_that_are_not_the_materials_own_are_refused(tmp_path: Path) -> No
 
     from safetensors.numpy import load_file, save_file
 
-    from mbtf_core.atomic import digest
+    from mbtf_core.digest import file_sha256
 
     write_material(tmp_path)
     path = tmp_path / "weights.safetensors"
@@ -291,7 +291,7 @@ def test_values_that_are_not_the_materials_own_are_refused(tmp_path: Path) -> No
     tensors["conformance.rgb"][7] *= 1.01
     save_file(tensors, path)
     description = json.loads((tmp_path / "material.json").read_text())
-    description["weights"]["sha256"] = digest(path)
+    description["weights"]["sha256"] = file_sha256(path)
     (tmp_path / "material.json").write_text(json.dumps(description))
     with pytest.raises(InputError, match="does not give its conformance values"):
         load_scene(scene_of(tmp_path, sampling="cosine", networks="cooperative"))

@@ -17,6 +17,8 @@ from mbtf_core.stats import Estimate
 from mbtf_core.units import parse_duration
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import QUERY_BYTES
+from mbtf_gen.job import split_queries
+from mbtf_gen.planning.run_plan import RunPlan
 from mbtf_pipeline.cost_study import time_split as module
 from mbtf_pipeline.cost_study.time_split import (
     LARGEST_SHARE,
@@ -54,7 +56,7 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, float]]:
     chains: list[tuple[int, float]] = []
 
     def forecast(job: Any, plan: Any) -> Any:
-        seconds = job.queries("train") * PRICE + TEST
+        seconds = split_queries(job, "train") * PRICE + TEST
         return SimpleNamespace(query_seconds=PRICE, seconds=seconds, start=START)
 
     def measure(self: Any, chain: Any) -> Any:
@@ -64,8 +66,8 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, float]]:
         return point(error, chain.data.queries, training)
 
     monkeypatch.setattr("mbtf_gen.forecast.forecast", forecast)
-    monkeypatch.setattr("mbtf_gen.generation.allocated", lambda job, plan: plan)
-    monkeypatch.setattr("mbtf_pipeline.cost_study.runs.Workshop.measure", measure)
+    monkeypatch.setattr("mbtf_gen.planning.run_plan.allocate", lambda job, effects: RunPlan(effects))
+    monkeypatch.setattr("mbtf_pipeline.cost_study.runs.RunRunner.measure", measure)
     monkeypatch.setattr(module.time, "perf_counter", lambda: 0.0)
     monkeypatch.setattr(module.shutil, "disk_usage", lambda path: SimpleNamespace(free=1e15))
     monkeypatch.setattr(module, "physical_memory", lambda: 1e15)
@@ -101,7 +103,7 @@ def test_pilots_that_have_nothing_to_explain_do_not_decide(
 ) -> None:
     """The data of an even plane have no variance that an error could be a share of."""
     nothing = point(math.nan)
-    monkeypatch.setattr("mbtf_pipeline.cost_study.runs.Workshop.measure", lambda self, chain: nothing)
+    monkeypatch.setattr("mbtf_pipeline.cost_study.runs.RunRunner.measure", lambda self, chain: nothing)
     split = split_budget(recipe(), 1000.0, tmp_path / "run", "command", lambda note: None)
     assert split.share == USUAL_SHARE
     assert split.pilots == ()
@@ -142,7 +144,7 @@ def test_a_pilot_that_fails_leaves_the_usual_share(
     def fail(self: Any, chain: Any) -> Any:
         raise InputError("training diverged at step 7", hint="lower the rate")
 
-    monkeypatch.setattr("mbtf_pipeline.cost_study.runs.Workshop.measure", fail)
+    monkeypatch.setattr("mbtf_pipeline.cost_study.runs.RunRunner.measure", fail)
     notes: list[str] = []
     split = split_budget(recipe(), 1000.0, tmp_path / "run", "command", notes.append)
     assert split.share == USUAL_SHARE
@@ -158,7 +160,7 @@ def test_pilots_train_where_the_fit_does(
         options.append(chain.fit)
         return point(0.1)
 
-    monkeypatch.setattr("mbtf_pipeline.cost_study.runs.Workshop.measure", measure)
+    monkeypatch.setattr("mbtf_pipeline.cost_study.runs.RunRunner.measure", measure)
     said = ["fit.neumip.device=cpu", "fit.neumip.data.memory=3 GB"]
     asked = load_recipe(ROOT / "pipelines" / "quickstart.yaml", said)
     split_budget(asked, 1000.0, tmp_path / "run", "command", lambda note: None)
