@@ -1,7 +1,7 @@
 """Time, error and size of the quality presets: whole runs, from height map to report.
 
-    python benchmarks/quality.py --out FOLDER [--only MATERIAL:QUALITY ...] [--resolution 128]
-                                 [--store] [--check]
+    python benchmarks/quality.py --out FOLDER [--only MATERIAL:QUALITY ...] [--store] [--check]
+    python benchmarks/quality.py --table
 
 Runs ``mbtf-pipeline run --quality`` in a process of its own: ``draft`` and ``standard`` on six texture sets
 that lie beside the project, ``high`` on one of them. ``paper`` needs a GPU and is not run. ``--only``
@@ -143,7 +143,9 @@ def run(name: str, quality: Quality, resolution: int, work: Path) -> MeasuredRun
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True)
     recipe, out = work / "recipe.yaml", work / "run"
-    text = RECIPE.format(material=json.dumps(str(material)), resolution=resolution, height=json.dumps(height))
+    text = RECIPE.format(
+        material=json.dumps(str(material)), resolution=resolution, height=json.dumps(height)
+    )
     recipe.write_text(text, encoding="utf-8")
     command = [sys.executable, "-m", "mbtf_pipeline", "run", str(recipe), "--quality", quality]
     command += ["-o", str(out), "--json", "--quiet"]

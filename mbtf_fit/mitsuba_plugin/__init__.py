@@ -1,15 +1,14 @@
-"""Fitted materials as Mitsuba BSDFs (``mbtf``), and a path tracer that hands them footprints
+"""Fitted materials as Mitsuba BSDFs (``mbtf``), and a path tracer that provides their footprints
 (``mbtf_path``).
 
     import mbtf_fit.mitsuba_plugin
+    mbtf_fit.mitsuba_plugin.register("llvm_ad_rgb")
     import mitsuba as mi
-    mi.set_variant("llvm_ad_rgb")
-    mbtf_fit.mitsuba_plugin.register()
     bsdf = mi.load_dict({"type": "mbtf", "material": "material/"})
 
-Import the package before Mitsuba: Dr.Jit looks for its LLVM when it is first imported, and this package says
-where one lies that is new enough. Importing the package registers its plugins with a variant that is set
-already; :func:`load_scene` registers them by itself. PyTorch is not needed, and never imported.
+Call ``register`` with a variant before the first import of Mitsuba, so that Dr.Jit uses the LLVM of this
+installation. Importing this package registers the plugins with a variant that is already set. PyTorch is not
+needed, and never imported.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from typing import Any
 _PUBLIC = {
     "Evaluator": "evaluator",
     "StoredMaterial": "material_arrays",
-    "check_scene": "scene",
+    "check_scene": "bsdf",
     "load_scene": "scene",
     "read_material": "material_arrays",
     "register": "registration",

@@ -1,4 +1,4 @@
-"""A bench of a cost study whose estimator's bias and noise are known."""
+"""A generator benchmark whose estimator has known bias and noise."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from mbtf_gen.sampling.query_sampler import Queries
 from mbtf_pipeline.cost_study.generator_benchmark import GeneratorBenchmark
 
 NOISE = 0.8  # standard deviation of one path, relative to the value
-SHIFT = 0.25  # bias of a run with one interaction, relative to the value
+SHIFT = 0.25  # bias of one interaction, relative to the value
 
 
 class FakeEstimator:
-    """Values of known bias and noise; random numbers by the stream alone, as the real ones."""
+    """Values of known bias and noise; random numbers depend on the stream alone, as the real ones."""
 
     def __init__(self, job: Job) -> None:
         self.shift = SHIFT if job.config.transport.max_depth == 1 else 0.0
@@ -27,12 +27,12 @@ class FakeEstimator:
     def estimate(
         self, queries: Queries, spp: Any, stream: Stream, *, path_variance: bool = False
     ) -> Estimates:
-        # Other paths have other noise, as where another setting takes other turns.
+        # A biased configuration traces other paths.
         key = [stream.root, stream.shard, stream.first_pass, len(queries.sigma), self.shift > 0]
         rng = np.random.default_rng(key)
         each = np.broadcast_to(spp, len(queries.sigma))
         truth = 0.2 + 0.1 * queries.u[:, :1]
-        # The bias has either sign: what counts is its square, query by query.
+        # The bias has both signs: its square is measured, query by query.
         sign = np.where(queries.u[:, 1:] < 0.5, -1.0, 1.0)
         halves = [
             truth * (1 + self.shift * sign)

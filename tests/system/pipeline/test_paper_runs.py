@@ -145,5 +145,5 @@ def test_a_foreign_folder_is_refused(made: Path, capsys: pytest.CaptureFixture[s
     other.mkdir()
     (other / "notes.txt").write_text("mine")
     assert run(app, ["run", str(made / "tiny.yaml"), "--quick", "-o", str(other)]) == 3
-    assert "is not empty and contains no paper recipe" in capsys.readouterr().err
+    assert "is not empty and holds no paper recipe" in capsys.readouterr().err
     assert [p.name for p in other.iterdir()] == ["notes.txt"]
