@@ -143,9 +143,7 @@ def run(name: str, quality: Quality, resolution: int, work: Path) -> MeasuredRun
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True)
     recipe, out = work / "recipe.yaml", work / "run"
-    text = RECIPE.format(
-        material=json.dumps(str(material)), resolution=resolution, height=json.dumps(height)
-    )
+    text = RECIPE.format(material=json.dumps(str(material)), resolution=resolution, height=json.dumps(height))
     recipe.write_text(text, encoding="utf-8")
     command = [sys.executable, "-m", "mbtf_pipeline", "run", str(recipe), "--quality", quality]
     command += ["-o", str(out), "--json", "--quiet"]

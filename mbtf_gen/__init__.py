@@ -8,11 +8,6 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-from mbtf_gen.render.llvm import use_shipped_llvm
-
-# Dr.Jit reads the library's path once, when it is first imported: before that, say where ours lies.
-use_shipped_llvm()
-
 _PUBLIC = {
     "Camera": "mbtf_gen.pictures.camera",
     "Dataset": "mbtf_gen.dataset.reader",

@@ -10,8 +10,10 @@ from collections.abc import Callable
 import pytest
 from hypothesis import settings
 
-# Before any test imports drjit: says where the LLVM of the installation lies.
-import mbtf_gen  # noqa: F401
+from mbtf_gen.render.llvm import use_shipped_llvm
+
+# Tests import drjit at the top: before that, as load_mitsuba does, choose the LLVM of the installation.
+use_shipped_llvm()
 
 # The same examples in every run, and no limit on the time of one: neither machine nor luck decides a test.
 settings.register_profile("project", derandomize=True, deadline=None)

@@ -18,15 +18,15 @@ def selftest(*, report: Path | None = None, time: Time = "2min", console: Consol
     Parameters
     ----------
     report
-        Write every case to this file, .md or .html.
+        Write every case to this HTML file.
     """
     from mbtf_core.units import asked_duration
 
     seconds = asked_duration(time or "2min", "--time")
-    if report is not None and report.suffix not in (".md", ".html"):
-        raise UsageError(f"'{report.name}' must end in .md or .html", where="--report")
+    if report is not None and report.suffix != ".html":
+        raise UsageError(f"'{report.name}' must end in .html", where="--report")
     from mbtf_gen.diagnostics.checks import all_checks
-    from mbtf_gen.diagnostics.report import as_html, as_json, as_markdown, as_text
+    from mbtf_gen.diagnostics.report import as_html, as_json, as_text
     from mbtf_gen.diagnostics.selftest import exit_code, run_checks
     from mbtf_gen.render.runtime import load_mitsuba
 
@@ -39,7 +39,7 @@ def selftest(*, report: Path | None = None, time: Time = "2min", console: Consol
         from mbtf_core.atomic import write_text
 
         try:
-            write_text(report, (as_html if report.suffix == ".html" else as_markdown)(findings))
+            write_text(report, as_html(findings))
         except OSError as error:
             raise InputError(f"cannot be written ({error.strerror})", where=report) from None
     console.report(as_json(findings), as_text(findings))

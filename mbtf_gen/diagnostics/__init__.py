@@ -1,1 +1,1 @@
-"""Checks of a machine: ``mbtf-gen doctor`` and ``mbtf-gen selftest``."""
+"""Diagnosis of the machine, and the self-test of the physics."""

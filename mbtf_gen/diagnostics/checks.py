@@ -1,4 +1,4 @@
-"""The checks of ``mbtf-gen selftest``: scenes whose answer is known, through the estimator of every run."""
+"""The checks of ``mbtf-gen selftest``: scenes with known answers, measured by the generator's estimator."""
 
 from __future__ import annotations
 
@@ -39,35 +39,50 @@ def all_checks() -> list[Check]:
         ),
         Check(
             "irradiance",
-            "the light brings exactly 1 to the reference plane, also where the horizon cuts it",
+            "the irradiance on the reference plane is 1, also where the horizon cuts the light",
             "relative",
             1e-4,
             _irradiance,
         ),
-        Check("mirror", "a mirror shows the light's lobe, path by path", "relative", 2e-3, _mirror, False),
+        Check("mirror", "a mirror reflects the light's lobe, path by path", "relative", 2e-3, _mirror, False),
         Check(
             "V-groove",
-            "tile means of a groove are those of its closed form",
+            "tile means of a groove agree with the closed form",
             "relative",
             1e-3,
             _groove,
         ),
-        Check("wall", "shadow and flank of a wall of slope 100", "relative", 1e-3, _wall),
-        Check("furnace", "a white relief under constant radiance returns 1", "relative", 2e-4, _furnace),
+        Check(
+            "wall",
+            "shadow and flank of a wall of slope 100 agree with the closed form",
+            "relative",
+            1e-3,
+            _wall,
+        ),
+        Check(
+            "furnace", "a white surface under constant radiance 1 has radiance 1", "relative", 2e-4, _furnace
+        ),
         Check(
             "reciprocity",
-            "light and view may be exchanged, interreflection included",
+            "exchanging light and view leaves the tile mean unchanged, interreflection included",
             "relative",
             2e-3,
             _reciprocity,
         ),
-        Check("surface energy", "white gloss and metal return 1", "relative", 2e-3, _surface),
-        Check("periodicity", "no ray slips through the tile's borders and corners", "count", 0.0, _lost),
-        Check("chunks", "values do not depend on how many are traced at once", "count", 0.0, _chunks, False),
-        Check("directions", "they survive npz and EXR, horizon included", "rad", 1e-6, _stored, False),
+        Check("surface energy", "white glossy and metallic planes have albedo 1", "relative", 2e-3, _surface),
+        Check("periodicity", "no ray passes through the tile's borders and corners", "count", 0.0, _lost),
+        Check(
+            "launches",
+            "values do not depend on the number of paths per launch",
+            "count",
+            0.0,
+            _launches,
+            False,
+        ),
+        Check("directions", "npz and EXR keep directions, horizon included", "rad", 1e-6, _stored, False),
         Check(
             "CUDA",
-            "the groove's closed form on the graphics processor",
+            "tile means of the groove on the GPU agree with the closed form",
             "relative",
             1e-3,
             _cuda,
@@ -77,8 +92,8 @@ def all_checks() -> list[Check]:
     ]
 
 
-def made_relief(cells: int = 64) -> HeightGrid:
-    """A periodic relief with terraces, steep flanks and no symmetry."""
+def terraces(cells: int = 64) -> HeightGrid:
+    """A periodic height field with terraces, steep flanks and no symmetry."""
     t = 2.0 * np.pi * np.arange(cells) / cells
     x, y = np.meshgrid(t, t)
     h = np.sin(x + 1.3 * np.sin(y)) + 0.6 * np.cos(2 * y - x + 0.4) + 0.3 * np.sin(3 * x + 2 * y)
@@ -113,7 +128,7 @@ def _estimates(
     launch: int = 1 << 20,
     variant: str | None = None,
 ) -> Any:
-    """Estimates of M; each round has random numbers of its own."""
+    """Estimates of M; each round has its own random numbers."""
     from mbtf_gen.render.runtime import CPU_VARIANT, load_mitsuba
 
     load_mitsuba(variant or CPU_VARIANT)
@@ -136,7 +151,7 @@ def _tile_mean(
     n: int = 16_000,
     **options: Any,
 ) -> Estimate:
-    """Tile mean: footprints of four tile widths, each of which covers the tile evenly."""
+    """Tile mean: footprints with σ of four tile widths, each of which covers the tile evenly."""
     q = _queries(_positions(n, round_number), 4.0, omega_i, omega_o, n)
     e = _estimates(grid, bsdf, light, q, 16, round_number, **options)
     return mean_estimate(0.5 * (e.value_a.astype(np.float64) + e.value_b)[:, 0])
@@ -166,7 +181,7 @@ def _lambert(round_number: int) -> Cases:
 
 
 def _irradiance(round_number: int) -> Cases:
-    """By the sampler of the light: E[L ω_z / density]."""
+    """Irradiance by sampling the light: E[L ω_z / density]."""
     from mbtf_gen.render.runtime import load_mitsuba
 
     mi = load_mitsuba()
@@ -207,7 +222,7 @@ def _mirror(round_number: int) -> Cases:
         view = view.astype(np.float32)
         e = _estimates(plane, metal, light, _queries([0.5, 0.5], 0.1, omega_i, view, n), 2, round_number)
         expected = mirror(0.9, light, omega_i, view)
-        # Far out in the lobe there is next to nothing to be right about.
+        # Relative to at least 1e-3, because values far out in the lobe vanish.
         off = (e.value_a[:, 0] - expected) / np.maximum(expected, 1e-3)
         out[f"light {width:g}°"] = Case(float(off[np.argmax(np.abs(off))]))
     return out
@@ -245,21 +260,21 @@ def _wall(round_number: int) -> Cases:
 
 
 def _furnace(round_number: int) -> Cases:
-    relief, white = made_relief(), _diffuse(1.0)
+    heights, white = terraces(), _diffuse(1.0)
     return {
         f"view {elevation:g}°": _off(
-            _tile_mean(relief, white, None, _UP, from_angles(elevation, 40), round_number, 4000), 1.0
+            _tile_mean(heights, white, None, _UP, from_angles(elevation, 40), round_number, 4000), 1.0
         )
         for elevation in (90.0, 30.0, 3.0, 0.5)
     }
 
 
 def _reciprocity(round_number: int) -> Cases:
-    relief, out = made_relief(), {}
+    heights, out = terraces(), {}
     for light, view in _PAIRS[1:]:
         one, other = from_angles(*light), from_angles(*view)
         forth, back = (
-            _tile_mean(relief, _diffuse(0.9), LightKernel(0.0), i, o, 2 * round_number + k)
+            _tile_mean(heights, _diffuse(0.9), LightKernel(0.0), i, o, 2 * round_number + k)
             for k, (i, o) in enumerate(((one, other), (other, one)))
         )
         mean = 0.5 * (forth.value + back.value)
@@ -282,11 +297,11 @@ def _surface(round_number: int) -> Cases:
 
 
 def _lost(round_number: int) -> Cases:
-    """Counts of rays from above that found no surface; 300 000 a round and shape."""
+    """Number of rays from above that hit no surface, of 300 000 per round and shape."""
     out = {}
     rng = np.random.default_rng([11, round_number])
     for aspect in (1.0, 0.5):
-        grid, n = HeightGrid(made_relief().z, aspect), 150_000
+        grid, n = HeightGrid(terraces().z, aspect), 150_000
         u = rng.random((n, 2))
         border = np.array([0.0, 0.5 / 64, 1.0 - 0.5 / 64, 1.0 - 1e-7])
         third = n // 3
@@ -294,7 +309,7 @@ def _lost(round_number: int) -> Cases:
         u[third : 2 * third] = rng.choice(border, (third, 2))
         z = np.exp(rng.uniform(math.log(0.02), 0.0, n))
         phi = 2.0 * np.pi * rng.random(n)
-        # Along the axes of the grid rays run inside edges.
+        # Rays along the axes of the grid run inside edges.
         phi[::2] = np.round(phi[::2] / (0.5 * np.pi)) * 0.5 * np.pi
         r = np.sqrt(1.0 - z * z)
         view = np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=-1)
@@ -311,13 +326,13 @@ def _lost(round_number: int) -> Cases:
     return out
 
 
-def _chunks(round_number: int) -> Cases:
-    """Counts of values that differ between launches of different size."""
+def _launches(round_number: int) -> Cases:
+    """Number of values that differ between launches of different size."""
     n = 1000
     q = _queries(_positions(n, 0), 0.1, from_angles(40, 60), from_angles(55, 200), n)
     light = LightKernel(5.0)
     whole, pieces = (
-        _estimates(made_relief(), _diffuse(0.8), light, q, 8, round_number, launch=launch)
+        _estimates(terraces(), _diffuse(0.8), light, q, 8, round_number, launch=launch)
         for launch in (1 << 20, 1 << 11)
     )
     different = np.count_nonzero((whole.value_a != pieces.value_a) | (whole.value_b != pieces.value_b))
@@ -342,7 +357,7 @@ def _stored(round_number: int) -> Cases:
             write_shard(path, arrays)
             back = np.array(read_shard(path, mapped=False)["omega_i"], np.float64)
             off = 2.0 * np.arcsin(0.5 * np.linalg.norm(back - omega, axis=1))
-            # The height above the horizon matters relatively.
+            # Near the horizon the relative error of the cosine matters.
             rise = np.abs(back[:, 2] / omega[:, 2] - 1.0)
             out[f"{suffix}, angle"] = Case(float(off.max()))
             out[f"{suffix}, cosine (relative)"] = Case(float(rise.max()))
@@ -350,7 +365,7 @@ def _stored(round_number: int) -> Cases:
 
 
 def _cuda(round_number: int) -> Cases | None:
-    """In a child process: a driver may end it. None where there is no device."""
+    """In a child process, because a driver may abort it. None without a device."""
     from mbtf_core.child_process import run_child
     from mbtf_core.errors import EngineError
     from mbtf_gen.render.runtime import CUDA_VARIANT, prove

@@ -1,8 +1,8 @@
-"""Scenes whose M is known in closed form, for checks of a machine (``mbtf-gen selftest``) and tests.
+"""Scenes whose M is known in closed form, for ``mbtf-gen selftest`` and for tests.
 
-All of them are Lambert reliefs under a delta light, direct light alone, of unit irradiance on the reference
-plane: a lit facet of normal n sends ``albedo/π · (n·ω_i)/ω_i,z`` towards every viewer. Which part of a
-facet is lit or seen follows from straight lines past ridges in the cross-section.
+The height fields are Lambertian under a delta light of unit irradiance on the reference plane, with direct
+light alone. The radiance of a lit facet of normal n is ``albedo/π · (n·ω_i)/ω_i,z`` in every direction. The
+lit and the visible part of a facet follow from straight lines past ridges in the cross-section.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class Groove:
 
     Attributes
     ----------
-    depth : of the valleys, tile widths
+    depth : depth of the valleys, in tile widths
     albedo : of both facets
     """
 
@@ -33,16 +33,16 @@ class Groove:
 
     @property
     def grid(self) -> HeightGrid:
-        """Its heights: two columns."""
+        """The heights: two columns."""
         return HeightGrid(np.tile([0.0, -self.depth], (2, 1)), 1.0)
 
     @property
     def slope(self) -> float:
-        """Steepness of the facets."""
+        """Slope of the facets."""
         return 2.0 * self.depth
 
     def _reach(self, omega: F64, side: int) -> float:
-        """Depth down to which the facet that descends towards `side`·x sees direction ω (3,)."""
+        """Depth down to which the facet that descends towards `side`·x is visible from direction ω (3,)."""
         if side * self.slope * omega[0] + omega[2] <= 0:
             return 0.0
         # At depth d the facet is d/slope from its ridge; the opposite ridge, one tile on, is passed when
@@ -84,13 +84,13 @@ class Groove:
 
 @dataclass(frozen=True)
 class Wall:
-    """A thin wall along y on a floor: one column of a map of `columns` is high, its flanks are a cell wide.
+    """A thin wall along y on a floor: one of `columns` columns is high; its flanks are one cell wide.
 
     Attributes
     ----------
-    columns : of the map
-    slope : steepness of the flanks
-    albedo : of everything
+    columns : columns of the map
+    slope : slope of the flanks
+    albedo : of all facets
     """
 
     columns: int
@@ -99,23 +99,22 @@ class Wall:
 
     @property
     def height(self) -> float:
-        """Of the wall, tile widths."""
+        """Height of the wall in tile widths."""
         return self.slope / self.columns
 
     @property
     def grid(self) -> HeightGrid:
-        """Its heights."""
+        """The heights."""
         row = np.full(self.columns, -self.height)
         row[self.columns // 3] = 0.0
         return HeightGrid(np.tile(row, (2, 1)), 1.0)
 
     def tile_mean_from_above(self, omega_i: ArrayLike) -> float:
-        """Tile mean in 1/sr seen along the normal, for a light (3,) whose shadow falls short of the next
-        wall.
+        """Tile mean in 1/sr seen along the normal, for a light (3,) whose shadow ends before the next wall.
 
         Raises
         ------
-        ValueError : the shadow reaches the next wall, or the light sees both flanks
+        ValueError : the shadow reaches the next wall, or both flanks are lit
         """
         light = np.asarray(omega_i, np.float64)
         shadow, cell = self.height * abs(light[0]) / light[2], 1.0 / self.columns

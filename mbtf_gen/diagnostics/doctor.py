@@ -1,6 +1,7 @@
-"""What this machine can do: each part is used in a child process, each failure names its hint.
+"""Diagnosis of the machine: each part is used in a child process, and each failure comes with a hint.
 
-A part fails by aborting or hanging as often as by an exception, hence the children (:mod:`mbtf_core.child_process`).
+A part fails by aborting or hanging as often as by an exception, therefore in a child process
+(:mod:`mbtf_core.child_process`).
 """
 
 from __future__ import annotations
@@ -12,15 +13,16 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-from mbtf_core.child_process import Outcome, run_child
+from mbtf_core.child_process import run_child
 from mbtf_core.errors import EXIT_BAD_INPUT, EXIT_OK, EngineError
 from mbtf_gen.render.llvm import CACHE_VARIABLE, chosen_llvm, shipped_llvm, use_shipped_llvm
 from mbtf_gen.render.runtime import CPU_VARIANT, CUDA_VARIANT, check_llvm, load_mitsuba, prove
 
-State = Literal["ok", "failed", "absent"]
+Answers = dict[str, Any]
 
 # Seconds; first starts from a slow network disk take tens of them.
 _TIMEOUT = 180.0
@@ -28,98 +30,95 @@ _REINSTALL = "install again: pip install --force-reinstall"
 
 
 @dataclass(frozen=True)
-class Check:
-    """One part of the machine.
+class Part:
+    """The state of one part of the machine.
 
     Attributes
     ----------
-    name : the part
-    state : ``ok``; ``failed``; ``absent``: not there, and not needed
-    required : whether the programs need it
-    found : what was found, or what went wrong
-    hint : what to do about it; empty where nothing is to be done
+    name : str
+        The part.
+    state : {"ok", "failed", "absent"}
+        ``absent`` parts are not there and not needed.
+    required : bool
+        Whether the programs need it.
+    found : str
+        What was found, or what went wrong.
+    hint : str
+        What to do about it; empty where nothing is to be done.
     """
 
     name: str
-    state: State
+    state: Literal["ok", "failed", "absent"]
     required: bool
     found: str
     hint: str = ""
 
 
-def diagnose() -> list[Check]:
-    """Try every part, several at a time; takes seconds, never raises."""
+@dataclass(frozen=True)
+class Probe:
+    """How a part is tested: `use` runs in a child process, `found` describes its answers in words."""
+
+    use: str
+    found: Callable[[Answers], str]
+    hint: str
+    required: bool = True
+
+    def run(self, name: str) -> Part:
+        """Test the part."""
+        outcome = run_child(__name__, self.use, timeout=_TIMEOUT)
+        if outcome.fault:
+            return Part(name, "failed", self.required, outcome.fault, self.hint)
+        return Part(name, "ok", self.required, self.found(outcome.answers))
+
+
+def diagnose() -> list[Part]:
+    """Test every part, several at a time. It takes seconds and never raises."""
     use_shipped_llvm()
-    checks: tuple[Callable[[], Check], ...] = (
-        _python,
-        _llvm,
-        _mitsuba,
-        _threads,
-        _cuda,
-        _torch,
-        _openexr,
-        _drawing,
-        _kernel_cache,
-    )
+    tests = [_python, _llvm, _cuda, *(partial(probe, name) for name in PROBES)]
     with ThreadPoolExecutor(max_workers=min(4, os.cpu_count() or 1)) as pool:
-        return list(pool.map(lambda check: check(), checks))
+        return list(pool.map(lambda test: test(), tests))
 
 
-def exit_code(checks: Sequence[Check]) -> int:
+def exit_code(parts: Sequence[Part]) -> int:
     """0, or 3 when something required failed."""
-    return EXIT_BAD_INPUT if any(c.required and c.state != "ok" for c in checks) else EXIT_OK
+    return EXIT_BAD_INPUT if any(p.required and p.state != "ok" for p in parts) else EXIT_OK
 
 
-def as_json(checks: Sequence[Check]) -> dict[str, Any]:
+def as_json(parts: Sequence[Part]) -> dict[str, Any]:
     """Plain data of the diagnosis: ``healthy`` and the list ``checks``."""
-    return {"healthy": exit_code(checks) == EXIT_OK, "checks": [asdict(c) for c in checks]}
+    return {"healthy": exit_code(parts) == EXIT_OK, "checks": [asdict(p) for p in parts]}
 
 
-def as_text(checks: Sequence[Check]) -> str:
-    """The diagnosis as a table, cures below what they hint, a closing line."""
-    width = max(len(c.name) for c in checks)
+def as_text(parts: Sequence[Part]) -> str:
+    """The diagnosis as a table with hints, and a closing line."""
+    width = max(len(p.name) for p in parts)
     lines = []
-    for check in checks:
-        lines.append(f"{check.state:<7} {check.name:<{width}}  {check.found}")
-        if check.hint:
-            lines.append(f"{'':<7} {'':<{width}}  → {check.hint}")
-    if exit_code(checks) != EXIT_OK:
-        closing = "something that is needed does not work: see the cures (→) above"
-    elif any(c.state == "failed" for c in checks):
-        closing = "everything needed works; some conveniences do not (→)"
+    for part in parts:
+        lines.append(f"{part.state:<7} {part.name:<{width}}  {part.found}")
+        if part.hint:
+            lines.append(f"{'':<7} {'':<{width}}  → {part.hint}")
+    if exit_code(parts) != EXIT_OK:
+        closing = "a required part does not work: see the hints (→) above"
+    elif any(p.state == "failed" for p in parts):
+        closing = "every required part works; some optional ones do not (→)"
     else:
         closing = "everything works"
     return "\n".join([*lines, "", closing])
 
 
-def _probe(function: str, *arguments: str) -> Outcome:
-    return run_child(__name__, function, *arguments, timeout=_TIMEOUT)
+def probe(name: str) -> Part:
+    """Test one of the parts in :data:`PROBES`."""
+    return PROBES[name].run(name)
 
 
-def _result(
-    name: str, outcome: Outcome, found: Callable[[dict[str, Any]], str], hint: str, required: bool = True
-) -> Check:
-    if outcome.fault:
-        return Check(name, "failed", required, outcome.fault, hint)
-    return Check(name, "ok", required, found(outcome.answers))
+def _python() -> Part:
+    found = f"{platform.python_version()} on {platform.platform(terse=True)}, {sys.executable}"
+    return Part("Python", "ok", True, found)
 
 
-def _python() -> Check:
-    return _result(
-        "Python",
-        _probe("_use_python"),
-        lambda a: f"{a['version']} on {a['platform']}, {sys.executable}",
-        "make a new virtual environment with Python 3.11 or newer",
-    )
-
-
-def _use_python() -> Iterator[dict[str, Any]]:
-    yield {"version": platform.python_version(), "platform": platform.platform(terse=True)}
-
-
-def _llvm() -> Check:
+def _llvm() -> Part:
     library = chosen_llvm()
-    # Proved anew: a remembered proof says nothing about today.
+    # Tested again: a cached result does not show the state of today.
     outcome = prove(CPU_VARIANT)
     if not outcome.fault:
         shipped = shipped_llvm()
@@ -127,34 +126,35 @@ def _llvm() -> Check:
         if library is None:
             origin = "of the system"
         version = ".".join(str(n) for n in outcome.answers["llvm"])
-        return Check(
-            "LLVM", "ok", True, f"{version} {origin}, ran test kernels, {library or 'found by Dr.Jit'}"
-        )
+        found = f"{version} {origin}, ran test kernels, {library or 'found by Dr.Jit'}"
+        return Part("LLVM", "ok", True, found)
     try:
         check_llvm()
     except EngineError as error:
-        return Check(
-            "LLVM", "failed", True, f"{error.where}: {error.what}" if error.where else error.what, error.hint
-        )
-    return Check("LLVM", "failed", True, outcome.fault, f"{_REINSTALL} karellen-llvm-core")
+        fault = f"{error.where}: {error.what}" if error.where else error.what
+        return Part("LLVM", "failed", True, fault, error.hint)
+    return Part("LLVM", "failed", True, outcome.fault, f"{_REINSTALL} karellen-llvm-core")
 
 
-def _mitsuba() -> Check:
-    return _result(
-        "Mitsuba",
-        _probe("_use_mitsuba"),
-        lambda a: f"{a['mitsuba']} with Dr.Jit {a['drjit']}, rendered a test image",
-        f"see LLVM; if that is well, {_REINSTALL} mitsuba==3.9.1",
-    )
+def _cuda() -> Part:
+    outcome = prove(CUDA_VARIANT)
+    if outcome.fault:
+        return Part("CUDA", "absent", False, f"{outcome.fault}; the processor is used")
+    return Part("CUDA", "ok", False, "ran test kernels")
 
 
-def _use_mitsuba() -> Iterator[dict[str, Any]]:
+# The functions below run in child processes.
+
+
+def use_mitsuba() -> Iterator[Answers]:
+    """Mitsuba renders a sphere."""
     from importlib.metadata import version
 
     mi = load_mitsuba(CPU_VARIANT)
     import drjit as dr
 
     yield {"mitsuba": version("mitsuba"), "drjit": version("drjit")}
+    look_at = mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0])
     scene = mi.load_dict(
         {
             "type": "scene",
@@ -163,9 +163,7 @@ def _use_mitsuba() -> Iterator[dict[str, Any]]:
             "shape": {"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": 0.5}},
             "sensor": {
                 "type": "orthographic",
-                "to_world": mi.ScalarTransform4f()
-                .look_at([0, 0, 3], [0, 0, 0], [0, 1, 0])
-                .scale([0.5, 0.5, 1]),
+                "to_world": look_at.scale([0.5, 0.5, 1]),
                 "film": {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}},
             },
         }
@@ -176,19 +174,8 @@ def _use_mitsuba() -> Iterator[dict[str, Any]]:
         raise EngineError(f"a test image has the mean {mean:.3f} instead of 0.5")
 
 
-def _threads() -> Check:
-    return _result(
-        "Threads",
-        _probe("_use_threads"),
-        lambda a: (
-            f"{a['threads']} render threads on {a['processors']} processors"
-            + (f", limited to the time of {a['quota']:g}" if a["quota"] else "")
-        ),
-        "see LLVM",
-    )
-
-
-def _use_threads() -> Iterator[dict[str, Any]]:
+def use_threads() -> Iterator[Answers]:
+    """A sum over many lanes is right."""
     mi = load_mitsuba(CPU_VARIANT)
     import drjit as dr
 
@@ -201,7 +188,7 @@ def _use_threads() -> Iterator[dict[str, Any]]:
 
 
 def _processor_quota() -> float | None:
-    """Processors whose time a container may use; None where there is no such limit."""
+    """Processor time that a container may use, in processors; None without such a limit."""
     try:
         quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
         return int(quota) / int(period)
@@ -209,24 +196,9 @@ def _processor_quota() -> float | None:
         return None
 
 
-def _cuda() -> Check:
-    outcome = prove(CUDA_VARIANT)
-    if outcome.fault:
-        return Check("CUDA", "absent", False, f"{outcome.fault}; the processor is used")
-    return Check("CUDA", "ok", False, "ran test kernels")
-
-
-def _torch() -> Check:
-    return _result(
-        "PyTorch",
-        _probe("_use_torch"),
-        lambda a: f"{a['torch']} on {a['device']}, took a training step",
-        f"{_REINSTALL} torch==2.13.0",
-    )
-
-
-def _use_torch() -> Iterator[dict[str, Any]]:
-    # By name: this package does not depend on PyTorch, the fitter in the same installation does.
+def use_torch() -> Iterator[Answers]:
+    """PyTorch takes a training step."""
+    # By name: this package does not depend on PyTorch, but the fitter in the same installation does.
     from importlib import import_module
 
     torch: Any = import_module("torch")
@@ -241,16 +213,8 @@ def _use_torch() -> Iterator[dict[str, Any]]:
         raise EngineError(f"a training step gave {weight.item()} instead of 0.5")
 
 
-def _openexr() -> Check:
-    return _result(
-        "OpenEXR",
-        _probe("_use_openexr"),
-        lambda a: f"{a['openexr']}, wrote an image and read it back",
-        f"{_REINSTALL} OpenEXR; make sure that the temporary folder ({tempfile.gettempdir()}) can be written",
-    )
-
-
-def _use_openexr() -> Iterator[dict[str, Any]]:
+def use_openexr() -> Iterator[Answers]:
+    """OpenEXR writes and reads an image."""
     from importlib.metadata import version
 
     import numpy as np
@@ -267,18 +231,8 @@ def _use_openexr() -> Iterator[dict[str, Any]]:
                 raise EngineError("an image came back changed")
 
 
-def _drawing() -> Check:
-    return _result(
-        "Drawing",
-        _probe("_use_drawing"),
-        lambda a: f"pyvista {a['pyvista']} drew a sphere off screen",
-        "only 3D pictures need it; install OpenGL (software will do), on Debian: "
-        "apt install libgl1 libegl1 libosmesa6",
-        required=False,
-    )
-
-
-def _use_drawing() -> Iterator[dict[str, Any]]:
+def use_drawing() -> Iterator[Answers]:
+    """PyVista draws a sphere off screen."""
     import pyvista
 
     yield {"pyvista": pyvista.__version__}
@@ -291,21 +245,52 @@ def _use_drawing() -> Iterator[dict[str, Any]]:
         raise EngineError("the picture is empty")
 
 
-def _kernel_cache() -> Check:
+def use_kernel_cache() -> Iterator[Answers]:
+    """The folder of compiled kernels is writable."""
     folder = os.environ.get(CACHE_VARIABLE) or str(Path("~/.drjit").expanduser())
-    return _result(
-        "Kernel cache",
-        _probe("_use_kernel_cache", folder),
-        lambda a: f"{folder}, {a['files']} files, {a['bytes'] / 2**10:.0f} KiB",
-        f"without it every run compiles its kernels again: make {folder} writable or set {CACHE_VARIABLE}",
-        required=False,
-    )
-
-
-def _use_kernel_cache(folder: str) -> Iterator[dict[str, Any]]:
     Path(folder).mkdir(parents=True, exist_ok=True)
     with tempfile.NamedTemporaryFile(dir=folder, prefix=".doctor-") as stream:
         stream.write(b"mbtf")
         stream.flush()
     sizes = [entry.stat().st_size for entry in os.scandir(folder)]
-    yield {"files": len(sizes), "bytes": sum(sizes)}
+    yield {"folder": folder, "files": len(sizes), "bytes": sum(sizes)}
+
+
+PROBES = {
+    "Mitsuba": Probe(
+        "use_mitsuba",
+        lambda a: f"{a['mitsuba']} with Dr.Jit {a['drjit']}, rendered a test image",
+        f"see LLVM; if that works, {_REINSTALL} mitsuba==3.9.1",
+    ),
+    "Threads": Probe(
+        "use_threads",
+        lambda a: (
+            f"{a['threads']} render threads on {a['processors']} processors"
+            + (f", limited to the time of {a['quota']:g}" if a["quota"] else "")
+        ),
+        "see LLVM",
+    ),
+    "PyTorch": Probe(
+        "use_torch",
+        lambda a: f"{a['torch']} on {a['device']}, took a training step",
+        f"{_REINSTALL} torch==2.13.0",
+    ),
+    "OpenEXR": Probe(
+        "use_openexr",
+        lambda a: f"{a['openexr']}, wrote an image and read it back",
+        f"{_REINSTALL} OpenEXR; make sure that the temporary folder ({tempfile.gettempdir()}) can be written",
+    ),
+    "Drawing": Probe(
+        "use_drawing",
+        lambda a: f"pyvista {a['pyvista']} drew a sphere off screen",
+        "only 3D pictures need it; install OpenGL (software will do), on Debian: "
+        "apt install libgl1 libegl1 libosmesa6",
+        required=False,
+    ),
+    "Kernel cache": Probe(
+        "use_kernel_cache",
+        lambda a: f"{a['folder']}, {a['files']} files, {a['bytes'] / 2**10:.0f} KiB",
+        f"without it every run compiles its kernels again; make its folder writable or set {CACHE_VARIABLE}",
+        required=False,
+    ),
+}

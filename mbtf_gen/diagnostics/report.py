@@ -1,4 +1,4 @@
-"""Findings of the self-test as text for a terminal, as Markdown and as HTML."""
+"""Findings of the self-test as text for a terminal, as a page of HTML, and as plain data."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _STYLE = (
 
 
 def machine() -> dict[str, Any]:
-    """What the numbers were measured on: software versions, kind and number of processors."""
+    """Software versions, and the kind and number of processors."""
     import os
 
     from mbtf_gen.dataset.manifest import software_versions
@@ -35,10 +35,10 @@ def _row(finding: Finding) -> tuple[str, ...]:
     tolerance = _number(check.tolerance, check.unit)
     if worst is None:
         return (check.name, "-", "-", tolerance, "-", finding.state)
-    off, error = worst[1].off, worst[1].error
-    size = _number(abs(off), check.unit)
-    random = _number(error, check.unit) if error else "exact"
-    return (check.name, size, random, tolerance, str(len(finding.cases)), finding.state)
+    case = worst[1]
+    error = _number(abs(case.off), check.unit)
+    random = _number(case.error, check.unit) if case.error else "exact"
+    return (check.name, error, random, tolerance, str(len(finding.cases)), finding.state)
 
 
 def verdict(findings: Sequence[Finding]) -> str:
@@ -50,7 +50,7 @@ def verdict(findings: Sequence[Finding]) -> str:
 
 
 def as_text(findings: Sequence[Finding]) -> str:
-    """A table for a terminal, the worst case of what failed, and the verdict."""
+    """A table for a terminal, the worst case of each failed check, and the result."""
     rows = [_HEAD, *(_row(f) for f in findings)]
     widths = [max(len(row[i]) for row in rows) for i in range(len(_HEAD))]
     lines = ["  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip() for row in rows]
@@ -72,25 +72,13 @@ def _introduction(findings: Sequence[Finding]) -> list[str]:
     return [
         f"{verdict(findings).capitalize()}, in {seconds:.0f} s on {about['machine']} with "
         f"{about['processors']} processors ({versions}).",
-        f"A case may be off by its tolerance and {STANDARD_ERRORS:g} standard errors. Shown is the worst "
-        "one of each check.",
+        f"A case passes if its error is at most its tolerance plus {STANDARD_ERRORS:g} standard errors. "
+        "The table shows the worst case of each check.",
     ]
 
 
-def as_markdown(findings: Sequence[Finding]) -> str:
-    """A report with every case."""
-    lines = ["# Self-test", "", *(line for text in _introduction(findings) for line in (text, ""))]
-    lines += [f"| {' | '.join(_HEAD)} |", "|" + "---|" * len(_HEAD)]
-    lines += [f"| {' | '.join(_row(f))} |" for f in findings]
-    for f in findings:
-        lines += ["", f"## {f.check.name}", "", f"{f.check.statement}.", ""]
-        lines += [f"- {_case(f, name, case)}" for name, case in f.cases.items()]
-        lines += [f"- {f.fault}"] if f.fault else []
-    return "\n".join(lines).rstrip() + "\n"
-
-
 def as_html(findings: Sequence[Finding]) -> str:
-    """The same as one self-contained page."""
+    """A report with every case as one self-contained page."""
     head = "".join(f"<th>{escape(c)}</th>" for c in _HEAD)
     rows = "".join(
         f'<tr class="{f.state}">' + "".join(f"<td>{escape(c)}</td>" for c in _row(f)) + "</tr>\n"
@@ -113,7 +101,7 @@ def as_html(findings: Sequence[Finding]) -> str:
 
 
 def as_json(findings: Sequence[Finding]) -> dict[str, Any]:
-    """As one object for ``--json``."""
+    """Plain data for ``--json``."""
     return {
         "ok": all(f.state != "failed" for f in findings if f.check.required),
         "seconds": round(sum(f.seconds for f in findings), 2),

@@ -1,8 +1,8 @@
-"""Physics with known answers on the user's own machine: ``mbtf-gen selftest``.
+"""Self-test of the physics on the user's machine: ``mbtf-gen selftest``.
 
-Every check measures a number whose true value is known and reports the worst case: how far off it is, with
-its own statistical error. A check passes when each case is off by no more than its tolerance and 4.5 standard
-errors. Checks are repeated with new random numbers until the time is up, so that more time means smaller
+Every check measures quantities whose true values are known and reports the worst case: its error, and the
+standard error of the measurement. A check passes if the error of each case is at most its tolerance plus
+4.5 standard errors. Checks repeat with new random numbers until the time is up; that reduces the standard
 errors.
 """
 
@@ -14,9 +14,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from mbtf_core.errors import EXIT_BAD_INPUT, EXIT_OK
+from mbtf_core.errors import EXIT_BAD_INPUT, EXIT_OK, MbtfError, reason
 
-# Of normal errors one in 300 000 lies beyond: with a hundred cases one false alarm in three thousand runs.
+# Exceeded by one normal error in 150 000: with a hundred cases, one false alarm in 1500 runs.
 STANDARD_ERRORS = 4.5
 
 Unit = Literal["relative", "count", "rad"]
@@ -28,8 +28,8 @@ class Case:
 
     Attributes
     ----------
-    off : measured less true value, in the unit of the check
-    error : standard error of that; 0 where nothing is random
+    off : measured minus true value, in the unit of the check
+    error : its standard error; 0 for deterministic cases
     """
 
     off: float
@@ -38,16 +38,17 @@ class Case:
 
 @dataclass(frozen=True)
 class Check:
-    """Something that must hold.
+    """A property with a known answer.
 
     Attributes
     ----------
     name, statement : in a few words, and in a sentence
-    unit : of what is measured: ``relative``, ``count``, ``rad``
-    tolerance : how far off a case may be, beside its statistical error
-    measure : cases by name, of one round; rounds (numbers from 0) draw other random numbers
-    repeated : more rounds make its error smaller
-    required : a failure fails the self-test; None from `measure` means absent
+    unit : of the measured quantity: ``relative``, ``count``, ``rad``
+    tolerance : error that a case may have, beside its statistical error
+    measure : cases by name of one round; each round, numbered from 0, has its own random numbers. None means
+        that the part under test is absent
+    repeated : more rounds reduce the statistical error
+    required : a failure fails the self-test
     """
 
     name: str
@@ -61,12 +62,12 @@ class Check:
 
 @dataclass
 class Finding:
-    """What a check found.
+    """The result of a check.
 
     Attributes
     ----------
-    cases : name → mean over the rounds; rounds : how many; seconds : they took
-    fault : why the check could not run; empty where it could
+    cases : mean over the rounds, by name; rounds : their number; seconds : their time
+    fault : why the check could not run; empty if it did
     """
 
     check: Check
@@ -77,7 +78,7 @@ class Finding:
 
     @property
     def worst(self) -> tuple[str, Case] | None:
-        """Name and measurement of the case that comes closest to its limit."""
+        """Name and measurement of the case closest to its limit."""
         if not self.cases:
             return None
         return max(self.cases.items(), key=lambda item: abs(item[1].off) / self._limit(item[1]))
@@ -87,7 +88,7 @@ class Finding:
 
     @property
     def state(self) -> Literal["ok", "failed", "absent"]:
-        """``absent``: what it is about is not on this machine."""
+        """``absent``: this machine lacks the part under test."""
         if self.fault:
             return "failed"
         if not self.cases:
@@ -96,7 +97,7 @@ class Finding:
         return "ok" if good else "failed"
 
     def add(self, cases: Mapping[str, Case]) -> None:
-        """Take another round into the means."""
+        """Include another round in the means."""
         n = self.rounds
         for name, new in cases.items():
             old = self.cases.get(name, Case(0.0))
@@ -105,7 +106,7 @@ class Finding:
         self.rounds += 1
 
     def as_dict(self) -> dict[str, Any]:
-        """As plain data for ``--json``."""
+        """Plain data for ``--json``."""
         worst = self.worst
         return {
             "name": self.check.name,
@@ -127,14 +128,14 @@ class Finding:
 def run_checks(
     checks: Sequence[Check], seconds: float, progress: Callable[[float, str], None] | None = None
 ) -> list[Finding]:
-    """Run every check once, then those that gain by it again and again until `seconds` have passed.
+    """Run every check once, then repeat those that gain from it until `seconds` have passed.
 
     Parameters
     ----------
-    progress : called with (seconds passed, name of the check that is about to run)
+    checks : checks to run
+    seconds : time to use; every check runs at least once
+    progress : called before each round with (seconds passed, name of the check)
     """
-    from mbtf_core.errors import MbtfError, reason
-
     start = time.monotonic()
     findings = [Finding(check) for check in checks]
 
@@ -146,7 +147,7 @@ def run_checks(
             cases = finding.check.measure(finding.rounds)
         except MbtfError as error:
             finding.fault = error.what
-        except Exception as error:  # whatever goes wrong is what the check is there to find
+        except Exception as error:  # whatever goes wrong is a finding
             finding.fault = reason(error)
         else:
             if cases is not None:
@@ -157,7 +158,7 @@ def run_checks(
         one_round(finding)
     repeated = [f for f in findings if f.check.repeated and f.state != "absent" and not f.fault]
     while repeated and time.monotonic() - start < seconds:
-        # The one that had least time yet: all get the same.
+        # The check with the least time so far, so that all get the same.
         finding = min(repeated, key=lambda f: f.seconds)
         one_round(finding)
         if finding.fault:

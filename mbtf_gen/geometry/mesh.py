@@ -1,4 +1,4 @@
-"""The tile as a stock Mitsuba mesh, for comparisons with stock scenes; the generator does not use it."""
+"""The tile as a Mitsuba mesh, for comparisons with unmodified Mitsuba; the generator does not use it."""
 
 from __future__ import annotations
 
@@ -11,14 +11,26 @@ from mbtf_gen.geometry.heightfield import HeightGrid, grid_faces, grid_vertices
 
 
 def mesh_of_grid(grid: HeightGrid, unit: float, apron: tuple[int, int], bsdf: Any) -> Any:
-    """Mitsuba mesh of one period plus `apron` = (rows, columns) cells on each side, in scene units."""
+    """Mitsuba mesh of one period of the tile with an apron, in scene units.
+
+    Parameters
+    ----------
+    grid : HeightGrid
+        Heights in tile widths.
+    unit : float
+        Scene units per tile width.
+    apron : tuple of int
+        (rows, columns) of cells that are repeated on each side.
+    bsdf : mitsuba.BSDF
+        Reflection of the mesh.
+    """
     vertices = grid_vertices(grid, apron)
     rows, columns = vertices.shape[:2]
     flat = vertices.reshape(-1, 3)
     faces = grid_faces(rows, columns)
     props = mi.Properties()
     props["bsdf"] = bsdf
-    # Face normals: interpolated ones lose energy on coarse grids.
+    # Face normals: interpolated normals lose energy on coarse grids.
     props["face_normals"] = True
     mesh = mi.Mesh("tile", len(flat), len(faces), props=props, has_vertex_texcoords=True)
     center = np.array([0.5, 0.5 * grid.aspect, 0.0])

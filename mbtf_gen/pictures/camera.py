@@ -1,9 +1,9 @@
-"""Perspective pictures of the infinitely repeated tile: pixels as queries, and as truly filtered pixels.
+"""Perspective pictures of the infinitely repeated tile: pixels as queries, and exactly filtered pixels.
 
-A pixel's filter is a Gaussian with a standard deviation of half a pixel. ``query`` kind: M at the pixel's
-position, view direction and isotropic footprint σ, the geometric mean of the two radii of the projected
-filter. ``pixel`` kind: the filtered image itself, every path with its own position and view direction. They
-agree near normal incidence.
+The pixel filter is a Gaussian with a standard deviation of half a pixel. A picture of kind ``query`` evaluates
+M at each pixel's position, view direction and isotropic footprint σ, which is the geometric mean of the two
+radii of the projected filter. Kind ``pixel`` is the filtered image itself: every path has its own position and
+view direction. The two agree near normal incidence.
 """
 
 from __future__ import annotations
@@ -22,14 +22,22 @@ PixelKind = Literal["query", "pixel"]
 
 # Standard deviation of the pixel filter, in pixels.
 PIXEL_SIGMA = 0.5
-# Pixels that see the plane under a smaller cosine than this are refused: their footprints have no end.
+# Smallest cosine between the plane's normal and a pixel's ray; at the horizon footprints are unbounded.
 SMALLEST_COSINE = 0.01
 
 
 def pixel_sigma(area: Any) -> Any:
-    """σ of a pixel that sees the given area: the geometric mean of the two radii of its projected Gaussian.
+    """Footprint σ of a pixel: the geometric mean of the two radii of its projected Gaussian.
 
-    Works on numbers and on arrays of NumPy and Dr.Jit; areas in squared tile widths give tile widths.
+    Parameters
+    ----------
+    area : float, array or Float
+        Area of the pixel on the surface, in squared tile widths.
+
+    Returns
+    -------
+    float, array or Float
+        σ in tile widths.
     """
     return PIXEL_SIGMA * area**0.5
 
@@ -38,13 +46,18 @@ def pixel_sigma(area: Any) -> Any:
 class Camera:
     """A pinhole camera that looks at a point of the reference plane; the image's up is towards +v.
 
-    Attributes
+    Parameters
     ----------
-    elevation, azimuth : of the direction from the target to the camera, in degrees
-    tiles_across : width of the field of view at the target, in tile widths
-    target : (x, y) looked at, in tile widths
-    rows, columns : of the image
-    field_of_view : horizontal, in degrees
+    elevation, azimuth : float
+        Direction from the target to the camera, in degrees.
+    tiles_across : float
+        Width of the field of view at the target, in tile widths.
+    target : (float, float)
+        Point of the reference plane at the image's center, in tile widths.
+    rows, columns : int
+        Size of the image in pixels.
+    field_of_view : float
+        Horizontal angle, in degrees.
     """
 
     elevation: float = 60.0
@@ -73,7 +86,7 @@ class Camera:
     def frame(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """(forward, right, up) unit vectors; right and up are those of the image."""
         forward = -self._towards
-        # Seen from straight above the image's up is +v; otherwise it is what is up in the world.
+        # Seen from above, the image's up is +v; otherwise it is the projected normal.
         vertical = np.array([0.0, 1.0, 0.0]) if self.elevation > 89.9 else np.array([0.0, 0.0, 1.0])
         right = np.cross(forward, vertical)
         right /= np.linalg.norm(right)
@@ -89,12 +102,20 @@ class Camera:
 
         Parameters
         ----------
-        omega_i : (3,) direction towards the light
-        aspect : H/W of the tile
+        omega_i : (3,) float array
+            Direction towards the light.
+        aspect : float
+            H/W of the tile.
+
+        Returns
+        -------
+        Queries
+            One query per pixel.
 
         Raises
         ------
-        UsageError : pixels look past the plane or along it
+        UsageError
+            The image shows the horizon.
         """
         forward, right, up = self.frame()
         x = (np.arange(self.columns) + 0.5 - self.columns / 2) * self.pixel_pitch
@@ -110,8 +131,7 @@ class Camera:
             )
         distance = self.position[2] / cosine
         point = self.position + distance[..., None] * direction
-        # Solid angle of a pixel: pitch² · cos³ of the angle to the image axis; the plane is seen under
-        # `cosine`.
+        # A pixel's solid angle is pitch² · cos³ of the angle to the image axis; the plane's cosine is `cosine`.
         area = distance**2 * self.pixel_pitch**2 / length**3 / cosine
         shape = (self.rows, self.columns)
         return Queries(

@@ -1,8 +1,7 @@
-"""Reference pictures: path-traced from the real micro-geometry, with both halves kept.
+"""Reference pictures: path-traced from the micro-geometry, with both halves.
 
 A picture is stored as an EXR image with the channels of the shard schema (``u.x``, ``omega_o.z``,
-``value_a.R``, …), so that a fitted material can be evaluated at exactly its queries, and as a PNG for the
-eye.
+``value_a.R``, …), so that a fitted material can be evaluated at its queries, and as a PNG for display.
 """
 
 from __future__ import annotations
@@ -30,11 +29,18 @@ class ReferenceImage:
 
     Attributes
     ----------
-    kind : ``query`` or ``pixel``
-    queries : one per pixel, leading axes (rows, columns)
-    value_a, value_b : (rows, columns, 3) independent halves, 1/sr
-    spp : paths per pixel, both halves together
-    transmittance : (rows, columns) share seen through holes; None where there are none
+    kind : {"query", "pixel"}
+        Meaning of a pixel, see :mod:`mbtf_gen.pictures.camera`.
+    camera : Camera
+        The camera.
+    queries : Queries
+        One per pixel, with leading axes (rows, columns).
+    value_a, value_b : (rows, columns, 3) float32 array
+        Independent halves, in 1/sr.
+    spp : int
+        Paths per pixel, both halves together.
+    transmittance : (rows, columns) float32 array or None
+        Fraction of the view rays that the opacity mask transmits; None without a mask.
     """
 
     kind: PixelKind
@@ -51,7 +57,20 @@ class ReferenceImage:
         return 0.5 * (self.value_a + self.value_b)
 
     def write(self, path: Path, exposure: float | None = None) -> tuple[Path, Path]:
-        """Write ``path`` + ``.exr`` (all channels) and + ``.png`` (sRGB), each atomically; returns both."""
+        """Write the picture as EXR and PNG, each atomically.
+
+        Parameters
+        ----------
+        path : Path
+            Path without suffix.
+        exposure : float, optional
+            Factor of the PNG; :func:`auto_exposure` by default.
+
+        Returns
+        -------
+        (Path, Path)
+            The EXR image with all channels, and the sRGB PNG.
+        """
         lead = (1, *self.queries.lead)
         arrays = {
             "u": self.queries.u.reshape(*lead, 2),
@@ -78,7 +97,7 @@ def write_png(path: Path, pixels: NDArray[np.uint8]) -> None:
 
 
 def auto_exposure(value: NDArray[np.float32]) -> float:
-    """Factor that brings the 95th percentile of the mean channel to 0.8; 1 for a black picture."""
+    """Exposure that maps the 95th percentile of the mean channel to 0.8; 1 for a black picture."""
     bright = float(np.percentile(np.asarray(value).mean(axis=-1), 95))
     return 0.8 / bright if bright > 0 else 1.0
 
@@ -92,7 +111,7 @@ def to_display(value: NDArray[np.float32], exposure: float | None = None) -> NDA
 
 
 def _camera_rays(camera: Camera, estimator: Estimator) -> Any:
-    """Ray source whose n-th query is the camera's n-th pixel under its Gaussian filter."""
+    """Source of first rays whose n-th query is the camera's n-th pixel under its Gaussian filter."""
     import drjit as dr
     import mitsuba as mi
 
@@ -102,7 +121,7 @@ def _camera_rays(camera: Camera, estimator: Estimator) -> Any:
     tile = estimator.tile
 
     def numbers(*values: float) -> list[Any]:
-        """Opaque, so that every camera uses the same compiled kernel."""
+        """Opaque, so that all cameras share the compiled kernel."""
         return [dr.opaque(mi.Float, float(v)) for v in values]
 
     forward, right, up = (mi.Vector3f(*numbers(*axis)) for axis in camera.frame())
@@ -122,7 +141,7 @@ def _camera_rays(camera: Camera, estimator: Estimator) -> Any:
             x = (mi.Float(pixel - row * columns) - center_x + jitter.x) * pitch
             y = (center_y - mi.Float(row) + jitter.y) * pitch
             d = forward + right * x + up * y
-            # A jitter of many pixels could reach the horizon; such rays have no weight worth speaking of.
+            # The filter's tail may reach the horizon, with negligible weight.
             t = position.z / dr.maximum(-d.z, 1e-4)
             return mi.Point2f(position.x + t * d.x, (position.y + t * d.y) / aspect)
 
@@ -143,19 +162,32 @@ def render_reference(
     seed: int = 0,
     index: int = 0,
 ) -> ReferenceImage:
-    """Render one picture.
+    """Render one picture of the tile.
 
     Parameters
     ----------
-    estimator : of the tile, its light kernel and transport
-    omega_i : (3,) direction towards the light
-    kind : what a pixel means
-    spp : paths per pixel, both halves together
-    seed, index : random numbers: root seed and number of the picture
+    estimator : Estimator
+        Estimator of the tile.
+    camera : Camera
+        The camera.
+    omega_i : (3,) float array
+        Direction towards the light.
+    kind : {"query", "pixel"}
+        Meaning of a pixel, see :mod:`mbtf_gen.pictures.camera`.
+    spp : int
+        Paths per pixel, both halves together; even.
+    seed, index : int
+        Root seed of the random numbers, and number of the picture.
+
+    Returns
+    -------
+    ReferenceImage
+        The picture and its queries.
 
     Raises
     ------
-    UsageError : the picture shows the horizon
+    UsageError
+        The picture shows the horizon.
     """
     from mbtf_gen.render.estimator import Stream
 

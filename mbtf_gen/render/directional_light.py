@@ -1,61 +1,69 @@
-"""The smoothed directional light inside kernels, another one for every lane.
+"""The smoothed directional light in kernels, one light per lane.
 
-Light directions are drawn from the lobe and, where they fall below the horizon, reflected up at it: their
-density ``q(ω) = p(ω) + p(ω mirrored)`` is exact, positive where ``L`` is, and no sample is lost below the
-horizon.
+The radiance is ``L(ω) = p(ω) [ω_z > 0] / E``: a von Mises–Fisher lobe p around ω_i (Fisher 1953, "Dispersion
+on a Sphere"), normalized to irradiance 1 on the reference plane by
+:meth:`mbtf_gen.sampling.light_kernel.LightKernel.irradiance`. Directions are sampled from the lobe (Jakob
+2012, "Numerically stable sampling of the von Mises Fisher distribution on S²") and mirrored at the horizon
+where they fall below it. Their density is ``q(ω) = p(ω) + p(ω mirrored)``, which is positive where L is.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import drjit as dr
 import mitsuba as mi
 
+from mbtf_gen.render.types import Float, Point2f, Vector3f
+
 
 @dataclass(frozen=True)
 class DirectionalLight:
-    """Light of every lane.
+    """Light of each lane.
 
     Attributes
     ----------
-    kind : ``lobe``, ``delta``, or ``constant`` (radiance 1 from everywhere above the horizon)
-    omega_i : direction towards the light, one per lane
-    inverse_irradiance : 1/E(ω_i), one per lane
-    kappa : concentration of the lobe
+    kind : {"lobe", "delta", "constant"}
+        ``constant`` is radiance 1 from the whole upper hemisphere.
+    omega_i : Vector3f
+        Direction towards the light.
+    inverse_irradiance : Float
+        1/E(ω_i), with E the irradiance of the lobe on the reference plane.
+    kappa : Float
+        Concentration of the lobe.
     """
 
     kind: Literal["lobe", "delta", "constant"]
-    omega_i: Any = None
-    inverse_irradiance: Any = None
-    kappa: Any = None
+    omega_i: Vector3f = None
+    inverse_irradiance: Float = None
+    kappa: Float = None
 
-    def density(self, omega: Any, about: Any) -> Any:
-        """Lobe density in 1/sr, from |ω - ω_i|²/2."""
+    def density(self, omega: Vector3f, mean: Vector3f) -> Float:
+        """Density of the lobe around `mean` in 1/sr; |ω - mean|²/2 is 1 - ω·mean without cancellation."""
         norm = self.kappa / (dr.two_pi * (1.0 - dr.exp(-2.0 * self.kappa)))
-        return norm * dr.exp(-0.5 * self.kappa * dr.squared_norm(omega - about))
+        return norm * dr.exp(-0.5 * self.kappa * dr.squared_norm(omega - mean))
 
-    def mirrored(self) -> Any:
-        """ω_i reflected at the horizon."""
+    def mirrored(self) -> Vector3f:
+        """ω_i mirrored at the horizon."""
         return mi.Vector3f(self.omega_i.x, self.omega_i.y, -self.omega_i.z)
 
-    def radiance(self, omega: Any) -> Any:
-        """Radiance that arrives from ω above the horizon; 0 for a delta light."""
+    def radiance(self, omega: Vector3f) -> Float:
+        """Radiance arriving from ω above the horizon; 0 for a delta light."""
         if self.kind == "constant":
             return mi.Float(1.0)
         if self.kind == "delta":
             return mi.Float(0.0)
         return self.density(omega, self.omega_i) * self.inverse_irradiance
 
-    def sampling_density(self, omega: Any) -> Any:
+    def sampling_density(self, omega: Vector3f) -> Float:
         """Density in 1/sr of :meth:`sample`."""
         if self.kind != "lobe":
             return mi.Float(0.0)
         return self.density(omega, self.omega_i) + self.density(omega, self.mirrored())
 
-    def sample(self, xi: Any) -> Any:
-        """A direction above the horizon: from the lobe, reflected up where it falls below."""
+    def sample(self, xi: Point2f) -> Vector3f:
+        """Sample a direction above the horizon: from the lobe, mirrored where it falls below."""
         versine = -dr.log(1.0 - xi.x * (1.0 - dr.exp(-2.0 * self.kappa))) / self.kappa
         sine = dr.safe_sqrt(versine * (2.0 - versine))
         s, c = dr.sincos(dr.two_pi * xi.y)

@@ -1,8 +1,9 @@
-"""The smoothed directional light as a Mitsuba emitter, for stock integrators.
+"""The smoothed directional light as a Mitsuba emitter, for Mitsuba's integrators.
 
-It takes either one direction (parameter ``direction``, towards the light) or the ``omega_i`` of a batch of
-queries, which it finds by the query number that :class:`~mbtf_gen.render.sensor.QuerySensor` writes into the rays'
-time. The formulas are those of :class:`~mbtf_gen.render.directional_light.DirectionalLight`, which the generator's own loop uses.
+It has either one direction (parameter ``direction``, towards the light) or the ``omega_i`` of a batch of
+queries. It finds the query by the number that :class:`~mbtf_gen.render.sensor.QuerySensor` stores in the
+ray's time. The formulas are those of :class:`~mbtf_gen.render.directional_light.DirectionalLight`, which the
+generator's own loop uses.
 """
 
 from __future__ import annotations
@@ -15,22 +16,30 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbtf_gen.render.directional_light import DirectionalLight
+from mbtf_gen.render.types import (
+    DirectionSample3f,
+    Float,
+    Mask,
+    Point2f,
+    Properties,
+    Spectrum,
+    SurfaceInteraction3f,
+)
 from mbtf_gen.sampling.light_kernel import LightKernel
 
-# Scene units that stock integrators search for occluders. Mitsuba tells an emitter written in Python nothing
-# of the scene's size, so it is a constant: thousands of tiles, and still exact to 1e-7 in direction.
+# Length of shadow rays in Mitsuba's integrators, in scene units. Mitsuba does not pass the scene's size to
+# emitters in Python, so it is a constant: thousands of tiles, with directions exact to 1e-7.
 SHADOW_DISTANCE = 1.0e5
 
 
 class SmoothedDirectional(mi.Emitter):
-    """``mbtf_directional``: von Mises–Fisher lobe cut at the horizon z = 0, unit irradiance on the plane z =
-    0.
+    """``mbtf_directional``: a von Mises–Fisher lobe cut at the horizon, with irradiance 1 on the plane z = 0.
 
     Plugin parameters: ``width`` (RMS angle per axis in degrees, 0 for a delta light), ``direction`` (towards
     the light).
     """
 
-    def __init__(self, props: Any) -> None:
+    def __init__(self, props: Properties) -> None:
         super().__init__(props)
         self.kernel = LightKernel(float(props.get("width", 1.0)))
         flags = mi.EmitterFlags.Infinite
@@ -40,13 +49,13 @@ class SmoothedDirectional(mi.Emitter):
         self.set_directions(np.asarray(direction, np.float32).reshape(1, 3))
 
     def set_directions(self, omega_i: ArrayLike) -> None:
-        """Take the light directions (n, 3) of a batch of queries; one row serves all rays."""
+        """Set the light directions (n, 3) of a batch of queries; a single row is used for all rays."""
         w = np.asarray(omega_i, np.float32)
         self.omega_i = mi.Vector3f(w.T.copy())
         self.inverse = mi.Float((1.0 / self.kernel.irradiance(w)).astype(np.float32))
         dr.eval(self.omega_i, self.inverse)
 
-    def _light(self, time: Any) -> DirectionalLight:
+    def _light(self, time: Float) -> DirectionalLight:
         index = dr.minimum(mi.UInt32(time), dr.width(self.inverse) - 1)
         return DirectionalLight(
             "delta" if self.kernel.is_delta else "lobe",
@@ -55,13 +64,15 @@ class SmoothedDirectional(mi.Emitter):
             self.kappa,
         )
 
-    def eval(self, si: Any, active: Any = True) -> Any:
-        """Radiance that arrives against ``si.wi`` from above the horizon."""
+    def eval(self, si: SurfaceInteraction3f, active: Mask = True) -> Spectrum:
+        """Radiance arriving against ``si.wi`` from above the horizon."""
         omega = -si.wi
         return dr.select(active & (omega.z > 0), mi.Spectrum(self._light(si.time).radiance(omega)), 0.0)
 
-    def sample_direction(self, it: Any, sample: Any, active: Any = True) -> tuple[Any, Any]:
-        """A direction towards the light, with radiance over density."""
+    def sample_direction(
+        self, it: SurfaceInteraction3f, sample: Point2f, active: Mask = True
+    ) -> tuple[DirectionSample3f, Spectrum]:
+        """Sample a direction towards the light; returns it with radiance over density."""
         light = self._light(it.time)
         ds = dr.zeros(mi.DirectionSample3f, dr.width(it))
         if self.kernel.is_delta:
@@ -80,22 +91,24 @@ class SmoothedDirectional(mi.Emitter):
         ds.emitter = mi.EmitterPtr(self)
         return ds, dr.select(active, mi.Spectrum(weight), 0.0)
 
-    def pdf_direction(self, it: Any, ds: Any, active: Any = True) -> Any:
-        """Density in 1/sr with which :meth:`sample_direction` draws ``ds.d``; 0 for a delta light."""
+    def pdf_direction(self, it: SurfaceInteraction3f, ds: DirectionSample3f, active: Mask = True) -> Float:
+        """Density of :meth:`sample_direction` at ``ds.d`` in 1/sr; 0 for a delta light."""
         if self.kernel.is_delta:
             return mi.Float(0.0)
         return dr.select(active & (ds.d.z > 0), self._light(it.time).sampling_density(ds.d), 0.0)
 
-    def eval_direction(self, it: Any, ds: Any, active: Any = True) -> Any:
-        """Radiance that arrives from ``ds.d``."""
+    def eval_direction(
+        self, it: SurfaceInteraction3f, ds: DirectionSample3f, active: Mask = True
+    ) -> Spectrum:
+        """Radiance arriving from ``ds.d``."""
         return dr.select(active & (ds.d.z > 0), mi.Spectrum(self._light(it.time).radiance(ds.d)), 0.0)
 
     def is_environment(self) -> bool:
-        """Rays that leave the scene see it."""
+        """Rays that leave the scene see the light."""
         return True
 
     def bbox(self) -> Any:
-        """It has no extent."""
+        """Empty: the light is at infinity."""
         return mi.ScalarBoundingBox3f()
 
     def to_string(self) -> str:

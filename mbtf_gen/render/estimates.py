@@ -1,4 +1,4 @@
-"""What an estimator returns, and which random numbers it uses."""
+"""Estimates of M at queries, and the streams of random numbers that they use."""
 
 from __future__ import annotations
 
@@ -29,12 +29,14 @@ class Target:
 
 @dataclass(frozen=True)
 class BadSample:
-    """Where a sample came out non-finite.
+    """A non-finite sample.
 
     Attributes
     ----------
-    query : its number in the batch, or in the shard
-    effect : what brought it there: ``direct light``, or ``interreflection``
+    query : int
+        Number of its query in the batch, or in the shard.
+    effect : str
+        Effect that caused it: ``direct light`` or ``interreflection``.
     """
 
     query: int
@@ -43,13 +45,18 @@ class BadSample:
 
 @dataclass(frozen=True)
 class TargetReached:
-    """How close a batch of queries came to a target error, relative to max(value, tile mean).
+    """Error of a batch of queries under a target error; errors are relative to max(value, tile mean).
 
     Attributes
     ----------
-    queries : in all; missed : those that would have needed more paths than the cap
-    worst : largest error that the pilot expects of one of those that missed; 0 where none did
-    square : mean square of the relative error reached, from the stored halves
+    queries : int
+        Number of queries.
+    missed : int
+        Queries that needed more paths than the cap.
+    worst : float
+        Largest error of a missed query that the pilot predicts; 0 without missed queries.
+    square : float
+        Mean square of the relative error, from the stored halves.
     """
 
     queries: int
@@ -64,16 +71,26 @@ class Estimates:
 
     Attributes
     ----------
-    value_a, value_b : (n, 3) float32, independent halves of spp/2 paths each
-    transmittance : (n,) float32, share of the view rays that went through holes; None where there are none
-    paths : paths traced; lost : rays that slipped through the surface; capped : rays cut at the cap on
-        crossings
-    nonfinite : samples that came out non-finite and were drawn again
-    bad_samples : the first of them, at most ``MOST_LOCATED``
-    spp : (n,) int64, paths of each query, both halves together; None where they are all the same
-    path_variance : (n,) float32, sample variance of the query's single paths, mean over channels; None where
-        it was not asked for
-    target : what a run to a target error reached
+    value_a, value_b : (n, 3) float32 array
+        Independent halves of spp/2 paths each, in 1/sr.
+    transmittance : (n,) float32 array or None
+        Fraction of the view rays that the opacity mask transmits; None without a mask.
+    paths : int
+        Paths traced.
+    lost : int
+        Rays that passed through the surface without a hit.
+    capped : int
+        Rays that reached the cap on crossings.
+    nonfinite : int
+        Non-finite samples, which were drawn again.
+    bad_samples : tuple of BadSample
+        The first of them, at most ``MOST_LOCATED``.
+    spp : (n,) int64 array or None
+        Paths of each query, both halves together; None where all have the same number.
+    path_variance : (n,) float32 array or None
+        Sample variance of each query's single paths, mean over channels, if requested.
+    target : TargetReached or None
+        Error reached under a target error.
     """
 
     value_a: NDArray[np.float32]
@@ -91,9 +108,18 @@ class Estimates:
 
 @dataclass(frozen=True)
 class Stream:
-    """Which random numbers to use: split and number of the shard under a root seed, and the first pass.
+    """Random numbers to use: those of a shard under a root seed.
 
-    A pass draws all paths anew; those after the first are for paths that came out non-finite.
+    Attributes
+    ----------
+    root : int
+        Root seed.
+    split : str
+        Split of the shard.
+    shard : int
+        Number of the shard in the split.
+    first_pass : int
+        Number of the first pass. Every pass draws all paths anew; later passes replace non-finite samples.
     """
 
     root: int

@@ -277,8 +277,8 @@ def _search(
     max_crossings: int,
     below: Mask,
     holes: Any,
-    rng: SobolSampler | None,
-) -> tuple[TraversalState, RayConstants, SobolSampler | None]:
+    rng: Any,
+) -> tuple[TraversalState, RayConstants, Any]:
     """Traverse until rays hit an opaque point; at each hit the opacity decides by chance whether it is."""
     state, constants = _start(heightfield, ray, active, below)
     if dr.hint(holes is None, mode="scalar"):
@@ -306,7 +306,7 @@ def closest_hit(
     below: Mask = False,
     holes: Any = None,
     rng: SobolSampler | None = None,
-) -> tuple[SurfaceInteraction3f, UInt32, Mask, SobolSampler | None]:
+) -> tuple[SurfaceInteraction3f, UInt32, Mask, Any]:
     """First intersection of rays with the periodic height field.
 
     Parameters
@@ -349,7 +349,7 @@ def occluded(
     below: Mask = False,
     holes: Any = None,
     rng: SobolSampler | None = None,
-) -> tuple[Mask, UInt32, Mask, SobolSampler | None]:
+) -> tuple[Mask, UInt32, Mask, Any]:
     """Occlusion of rays by the periodic height field; parameters as of :func:`closest_hit`.
 
     Returns

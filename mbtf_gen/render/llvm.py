@@ -1,8 +1,9 @@
-"""The LLVM library that Dr.Jit compiles its CPU kernels with: where it lies, which version it is.
+"""The LLVM library with which Dr.Jit compiles its CPU kernels: its path and its version.
 
-The distribution ``karellen-llvm-core`` brings ``libLLVM.so.N.M``. Dr.Jit reads ``DRJIT_LIBLLVM_PATH`` once,
-when it is first imported, so :func:`use_shipped_llvm` runs on import of :mod:`mbtf_gen`. A path that the user
-set wins.
+The distribution ``karellen-llvm-core`` contains ``libLLVM.so.N.M``. Dr.Jit reads ``DRJIT_LIBLLVM_PATH`` once,
+when it is first imported. Therefore :func:`~mbtf_gen.render.runtime.load_mitsuba`, and the import of
+:mod:`mbtf_fit.mitsuba_plugin`, call :func:`use_shipped_llvm` first; importing the packages changes no
+environment variable. A path that the user set has priority.
 """
 
 from __future__ import annotations
@@ -23,17 +24,17 @@ Version = tuple[int, int, int]
 _DISTRIBUTION = re.compile(r"karellen_llvm_core-[^/]*\.dist-info")
 _RECORDED = re.compile(r"^([^,\n]*libLLVM\.(?:so\.[0-9.]+|dylib)),", re.MULTILINE)
 _NUMBERS = re.compile(r"libLLVM[-.](?:so\.)?(\d+)(?:\.(\d+))?(?:\.(\d+))?")
-# libLLVM needs these. They lie in a folder beside it under these names; those it asks for are links to them.
+# Dependencies of libLLVM, in a folder beside it. It loads them by links to these names.
 _RUNTIME = ("libunwind.so.1.0", "libc++abi.so.1.0", "libc++.so.1.0")
 
 
 def shipped_llvm() -> Path | None:
-    """Path of the libLLVM that came with the installation; None where there is none.
+    """Path of the libLLVM of the installation; None where there is none.
 
-    Found through the list of files of the installed distribution, so a virtual environment, a user or a
-    prefix installation all work.
+    It is found through the list of files of the installed distribution, in virtual environments, user and
+    prefix installations alike.
     """
-    # importlib.metadata would say the same but takes ten times as long to import.
+    # importlib.metadata would find the same but takes ten times as long to import.
     for entry in sys.path:
         try:
             names = [name for name in os.listdir(entry or ".") if _DISTRIBUTION.fullmatch(name)]
@@ -52,21 +53,21 @@ def shipped_llvm() -> Path | None:
 
 
 def chosen_llvm() -> str | None:
-    """What ``DRJIT_LIBLLVM_PATH`` says; None where it is unset or empty and Dr.Jit searches the system."""
+    """Value of ``DRJIT_LIBLLVM_PATH``; None where it is unset or empty: Dr.Jit then searches the system."""
     return os.environ.get(VARIABLE) or None
 
 
 def cache_folder() -> Path:
-    """Folder for what can be computed again: ``$XDG_CACHE_HOME/mbtf``, by default ``~/.cache/mbtf``."""
+    """Cache folder: ``$XDG_CACHE_HOME/mbtf``, by default ``~/.cache/mbtf``."""
     base = os.environ.get("XDG_CACHE_HOME")
     return Path(base) / "mbtf" if base else Path(os.path.expanduser("~"), ".cache", "mbtf")
 
 
 def _load_runtime(library: Path) -> None:
-    """Load the C++ runtime that the shipped library needs where its links were never made.
+    """Load the C++ runtime of the shipped library where the links to it do not exist.
 
-    The links appear at the first start of an interpreter that may write beside the library, which never comes
-    when an administrator installs and another user runs.
+    The first interpreter that may write beside the library creates the links. There is none if an
+    administrator installs and another user runs.
     """
     for path in (p for name in _RUNTIME for p in library.parent.glob(f"*-linux-gnu/{name}")):
         if not path.with_suffix("").exists():
@@ -74,9 +75,10 @@ def _load_runtime(library: Path) -> None:
 
 
 def use_shipped_llvm() -> None:
-    """Point Dr.Jit to the shipped LLVM and to a kernel cache of its own, unless the user said otherwise.
+    """Make Dr.Jit use the shipped LLVM and a kernel cache of its own, unless the user chose others.
 
-    Must run before ``drjit`` is imported; has no effect on it afterwards. Costs about a millisecond.
+    Sets ``DRJIT_LIBLLVM_PATH`` and ``DRJIT_CACHE_DIR`` where they are unset. It must run before ``drjit`` is
+    imported and has no effect afterwards. It takes about a millisecond.
     """
     library = chosen_llvm()
     shipped = shipped_llvm()
@@ -86,7 +88,7 @@ def use_shipped_llvm() -> None:
         library = os.environ[VARIABLE] = str(shipped)
     if shipped is not None and library == str(shipped):
         _load_runtime(shipped)
-    # Kernels compiled by one LLVM must not be taken for those of another.
+    # Kernels compiled by different LLVMs must not share a cache.
     os.environ.setdefault(CACHE_VARIABLE, str(cache_folder() / f"kernels-{Path(library).resolve().name}"))
 
 
@@ -100,13 +102,13 @@ def version_in_name(library: str | Path) -> Version | None:
 
 
 def version_of(library: str) -> Version | None:
-    """Version that a library itself states; None where it does not (LLVM up to 15, or no LLVM).
+    """Version that a library reports; None where it reports none (LLVM up to 15, or another library).
 
-    Loads the library: call it in a child process.
+    It loads the library: call it in a child process.
 
     Raises
     ------
-    OSError : it cannot be loaded
+    OSError : the library cannot be loaded
     """
     loaded = ctypes.CDLL(library)
     if not hasattr(loaded, "LLVMGetVersion"):

@@ -1,7 +1,8 @@
-"""The one place that imports Mitsuba: checks that its compiler works on this machine, then sets the variant.
+"""Loading of Mitsuba: checks that its compiler works on this machine, imports it, sets the variant.
 
-A broken or too old LLVM ends the whole process at some kernel, so it is proved in a child first, once per
-library, and the proof is remembered.
+A broken or old LLVM aborts the process at some kernel. Therefore test kernels run in a child process first,
+once per library, and the result is cached. Modules that import ``drjit`` or ``mitsuba`` at the top must be
+imported after :func:`load_mitsuba`.
 """
 
 from __future__ import annotations
@@ -39,16 +40,26 @@ _working: set[str] = set()
 
 
 def load_mitsuba(variant: str = CPU_VARIANT) -> Any:
-    """Mitsuba's module with a variant set.
+    """Import Mitsuba and set a variant.
+
+    Sets ``DRJIT_LIBLLVM_PATH`` and ``DRJIT_CACHE_DIR`` where they are unset.
 
     Parameters
     ----------
-    variant : ``llvm_ad_rgb``, ``cuda_ad_rgb``, or ``auto``: CUDA where it works, else LLVM
+    variant : str
+        ``llvm_ad_rgb``, ``cuda_ad_rgb``, or ``auto``: CUDA where it works, else LLVM.
+
+    Returns
+    -------
+    module
+        ``mitsuba``.
 
     Raises
     ------
-    UsageError : no such variant
-    EngineError : Mitsuba, its LLVM or the CUDA device cannot be used here; says why and what to do
+    UsageError
+        The variant does not exist.
+    EngineError
+        Mitsuba, its LLVM or the CUDA device cannot be used here; says why and what to do.
     """
     if variant == "auto":
         variant = CUDA_VARIANT if not prove(CUDA_VARIANT).fault else CPU_VARIANT
@@ -70,28 +81,31 @@ def load_mitsuba(variant: str = CPU_VARIANT) -> Any:
 
 
 def refuse_old_llvm() -> None:
-    """Refuse the LLVM that Dr.Jit has bound to where it is too old: some kernel would abort the process.
+    """Refuse to run with an LLVM that is too old: some kernel would abort the process.
 
-    That happens where Dr.Jit was imported before this package, which says where a newer one lies.
+    Dr.Jit has bound to such an LLVM where a program imports ``mitsuba`` or ``drjit`` before
+    :func:`load_mitsuba` or :mod:`mbtf_fit.mitsuba_plugin` and the system's LLVM is old.
 
     Raises
     ------
-    EngineError : it is older than `OLDEST_LLVM`
+    EngineError
+        Dr.Jit uses an LLVM older than `OLDEST_LLVM`.
     """
     import drjit
 
     major = int(drjit.detail.llvm_version()[0])
     if major < OLDEST_LLVM:
         raise EngineError(
-            f"Dr.Jit was imported before mbtf_gen and has bound to LLVM {major}, which is too old",
-            hint="import mbtf_gen or mbtf_fit.mitsuba_plugin before mitsuba and drjit",
+            f"Dr.Jit was imported first and uses LLVM {major}, which is too old",
+            hint="import mbtf_fit.mitsuba_plugin, or call mbtf_gen.render.runtime.load_mitsuba(), before "
+            "importing mitsuba or drjit",
         )
 
 
 def prove(variant: str) -> Outcome:
-    """Compile and run kernels of `variant` in a child process, without the disk cache.
+    """Compile and run test kernels of `variant` in a child process, without the disk cache.
 
-    The answers hold ``llvm`` (version) for the CPU variant and ``device`` once a kernel has run.
+    The answers contain ``llvm`` (version) for the CPU variant, and ``device`` once a kernel has run.
     """
     use_shipped_llvm()
     with tempfile.TemporaryDirectory(prefix="mbtf-proof-") as folder:
@@ -101,11 +115,12 @@ def prove(variant: str) -> Outcome:
 
 
 def check_llvm() -> Version:
-    """Version of the LLVM that Dr.Jit will use, proved to work on this machine (now or by an earlier run).
+    """Version of the LLVM that Dr.Jit will use, tested on this machine now or by an earlier run.
 
     Raises
     ------
-    EngineError : missing, broken or too old
+    EngineError
+        The library is missing, broken or too old.
     """
     use_shipped_llvm()
     library = chosen_llvm()
@@ -132,7 +147,7 @@ def check_llvm() -> Version:
             remembered.parent.mkdir(parents=True, exist_ok=True)
             write_json(remembered, {"library": library, "llvm": [major, minor, patch]})
         except (OSError, MbtfError):
-            pass  # without a writable cache the next process proves it again
+            pass  # without a writable cache the next process tests it again
     return major, minor, patch
 
 
@@ -148,7 +163,7 @@ def _ensure_working(variant: str) -> None:
 
 
 def _proof_file(library: str | None) -> Path | None:
-    """File that remembers a proof: of this library file, this Dr.Jit, this machine's name."""
+    """Cached result of the test: of this library file, this Dr.Jit, this machine's name."""
     from importlib.metadata import PackageNotFoundError, version
 
     if library is None or not Path(library).is_file():
@@ -230,7 +245,7 @@ def _proof(variant: str) -> Iterator[dict[str, Any]]:
 
 
 def _exercise(mi: Any, dr: Any) -> None:
-    """Kernels of the kinds that rendering uses: arithmetic, a symbolic loop, random numbers, a ray."""
+    """Run kernels of the kinds that rendering uses: arithmetic, a symbolic loop, random numbers, a ray."""
     n = 4096
     index = dr.arange(mi.UInt32, n)
     x = mi.Float(index) / n

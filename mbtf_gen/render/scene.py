@@ -1,7 +1,7 @@
-"""The displaced tile, ready to be traced: its shape and its surface, centerd on the origin.
+"""The displaced tile as a scene: its geometry and its BSDF, centered on the origin.
 
-Scene units: the longer side of the tile is 32 units, where single precision resolves 2e-6 and hit points are
-exact enough for a ray offset of 8e-6 units.
+Scene units: the longer side of the tile is 32 units. There single precision resolves 2e-6 units, which
+suffices for a ray offset of 8e-6 units.
 """
 
 from __future__ import annotations
@@ -20,15 +20,16 @@ from mbtf_gen.render.emitter import SmoothedDirectional
 from mbtf_gen.render.heightfield import HeightField
 from mbtf_gen.render.path_tracer import World
 from mbtf_gen.render.sensor import QuerySensor
+from mbtf_gen.render.types import BSDF
 
 LONG_SIDE = 32.0
-# Rays begin this far above the reference plane, in units; it must exceed the rounding of the highest vertex.
+# Rays start this far above the reference plane, in units: more than the rounding of the highest vertex.
 CLEARANCE = 0.01
 
 
 def register_plugins() -> None:
-    """Make the project's plugins known to Mitsuba's loaders under the current variant: ``mbtf_queries``
-    (sensor), ``mbtf_directional`` (emitter), ``mbtf_surface`` (BSDF)."""
+    """Register the plugins with Mitsuba's current variant: ``mbtf_queries`` (sensor), ``mbtf_directional``
+    (emitter), ``mbtf_surface`` (BSDF)."""
     mi.register_sensor("mbtf_queries", lambda props: QuerySensor(props))
     mi.register_bsdf("mbtf_surface", lambda props: SurfaceBSDF(props))
     mi.register_emitter("mbtf_directional", lambda props: SmoothedDirectional(props))
@@ -36,13 +37,16 @@ def register_plugins() -> None:
 
 @dataclass(frozen=True)
 class Tile:
-    """A displaced periodic tile, ready to be traced.
+    """A displaced periodic tile as a scene.
 
     Attributes
     ----------
-    grid : its heights in tile widths
-    unit : scene units per tile width
-    world : what rays meet
+    grid : HeightGrid
+        Heights in tile widths.
+    unit : float
+        Scene units per tile width.
+    world : World
+        Geometry and reflection in scene units.
     """
 
     grid: HeightGrid
@@ -55,12 +59,12 @@ class Tile:
         return self.grid.aspect
 
 
-def _load_bsdf(bsdf: Mapping[str, Any]) -> Any:
+def _load_bsdf(bsdf: Mapping[str, Any]) -> BSDF:
     try:
         return mi.load_dict(dict(bsdf))
     except Exception as error:  # whatever the plugins raise about their parameters
         text = re.sub(r"\[\w+\.cpp:\d+\]\s*", "", reason(error, 250))
-        raise InputError(f"Mitsuba does not take the BSDF '{bsdf.get('type')}' ({text})") from None
+        raise InputError(f"Mitsuba rejects the BSDF '{bsdf.get('type')}' ({text})") from None
 
 
 def unit_of(aspect: float) -> float:
@@ -68,12 +72,20 @@ def unit_of(aspect: float) -> float:
     return LONG_SIDE / max(1.0, aspect)
 
 
-def build_tile(grid: HeightGrid, bsdf: Mapping[str, Any] | Any) -> Tile:
-    """Tile of a height grid and a BSDF (a Mitsuba dictionary or object).
+def build_tile(grid: HeightGrid, bsdf: Mapping[str, Any] | BSDF) -> Tile:
+    """Build the scene of a tile.
+
+    Parameters
+    ----------
+    grid : HeightGrid
+        Heights in tile widths.
+    bsdf : mapping or mitsuba.BSDF
+        A Mitsuba dictionary, or a loaded BSDF.
 
     Raises
     ------
-    InputError : Mitsuba does not take the BSDF
+    InputError
+        Mitsuba rejects the BSDF.
     """
     register_plugins()
     unit = unit_of(grid.aspect)

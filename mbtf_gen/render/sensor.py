@@ -1,10 +1,9 @@
 """The query sensor: a Mitsuba sensor whose "pixels" are 7D queries.
 
 Every sample is one ray through a point of the query's Gaussian footprint on the reference plane, against its
-view direction. The generator's own loop asks it for rays by query number; stock ``mi.render`` drives it
-through ``sample_ray``: the n-th pixel of its film (in row order) is the n-th query, with the sampler's count
-of rays each. The ray's time carries the query's number, so that the light of a query can follow its rays
-through stock integrators.
+view direction. The generator's own loop requests rays by query number. ``mi.render`` calls ``sample_ray``:
+the n-th pixel of the film, in row order, is the n-th query. The ray's time stores the query's number, from
+which :class:`~mbtf_gen.render.emitter.SmoothedDirectional` finds the query's light in Mitsuba's integrators.
 """
 
 from __future__ import annotations
@@ -14,31 +13,43 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mbtf_gen.render.types import Float, Mask, Point2f, Properties, Ray3f, Spectrum, UInt32, Vector3f
 from mbtf_gen.sampling.query_sampler import Queries
 
-# Query numbers travel as float32 times, exact up to here.
-MAX_STOCK_QUERIES = 1 << 24
+# Query numbers are stored as float32 times, which is exact up to here.
+MAX_MITSUBA_QUERIES = 1 << 24
 
 
-def ray_through(point: Any, omega_o: Any, unit: Any, aspect: Any, start: Any) -> Any:
-    """Ray against ω_o that passes the reference plane exactly at uv `point`, wrapped into the tile.
+def ray_through(point: Point2f, omega_o: Vector3f, unit: Float, aspect: Float, start: Float) -> Ray3f:
+    """Ray against ω_o that intersects the reference plane at uv `point`, wrapped into the tile.
 
     Parameters
     ----------
-    unit : scene units per tile width; aspect : H/W; start : height in scene units at which the ray begins
+    point : Point2f
+        Position on the reference plane, uv.
+    omega_o : Vector3f
+        Direction towards the viewer.
+    unit : Float
+        Scene units per tile width.
+    aspect : Float
+        H/W of the tile.
+    start : Float
+        Height above the reference plane at which the ray starts, in scene units.
     """
     wrapped = point - dr.floor(point)
     plane = mi.Point3f((wrapped.x - 0.5) * unit, (wrapped.y - 0.5) * (unit * aspect), 0.0)
     return mi.Ray3f(dr.fma(omega_o, start / omega_o.z, plane), -omega_o)
 
 
-def standard_normal(xi: Any) -> Any:
-    """Point of the standard normal distribution in the plane, from `xi` in [0,1)²: the inverse distribution
-    function of each axis, so that well-spread numbers give well-spread points (polar coordinates tear
-    neighbors apart)."""
-    # Centers of cells of 2^-24: symmetric, and never at the infinite ends.
-    centerd = xi * 2.0 - (1.0 - 2.0**-24)
-    return dr.sqrt(2.0) * dr.erfinv(centerd)
+def standard_normal(xi: Point2f) -> Point2f:
+    """Sample of the standard normal distribution in the plane, from `xi` in [0,1)².
+
+    It inverts the distribution function of each axis. Unlike polar coordinates (Box-Muller) this is
+    continuous, so that low-discrepancy points stay well distributed.
+    """
+    # Centers of cells of 2^-24: symmetric, and finite after inversion.
+    centered = xi * 2.0 - (1.0 - 2.0**-24)
+    return dr.sqrt(2.0) * dr.erfinv(centered)
 
 
 class QuerySensor(mi.Sensor):
@@ -48,9 +59,9 @@ class QuerySensor(mi.Sensor):
     above the reference plane, in scene units, at which rays begin), a film and a sampler.
     """
 
-    def __init__(self, props: Any) -> None:
+    def __init__(self, props: Properties) -> None:
         super().__init__(props)
-        # Opaque: other tiles use the same compiled kernels.
+        # Opaque, so that all tiles share the compiled kernels.
         self.unit = dr.opaque(mi.Float, float(props.get("unit", 32.0)))
         self.aspect = dr.opaque(mi.Float, float(props.get("aspect", 1.0)))
         self.start = dr.opaque(mi.Float, float(props.get("start", 0.01)))
@@ -59,29 +70,28 @@ class QuerySensor(mi.Sensor):
         self.omega_o = mi.Vector3f(0, 0, 1)
 
     def set_queries(self, queries: Queries, first: int = 0) -> None:
-        """Take a batch of queries (one leading axis); `first` is the number of its first query, unused
-        here."""
+        """Set a batch of queries (one leading axis); `first` is unused here."""
         self.u = mi.Point2f(queries.u.T.copy())
         self.sigma = mi.Float(queries.sigma)
         self.omega_o = mi.Vector3f(queries.omega_o.T.copy())
         dr.eval(self.u, self.sigma, self.omega_o)
 
-    def footprint(self, query: Any, xi: Any) -> Any:
-        """uv of a point of the footprint of the given queries, not wrapped; `xi` in [0,1)²."""
+    def footprint(self, query: UInt32, xi: Point2f) -> Point2f:
+        """uv of a point of the queries' footprints, not wrapped; `xi` in [0,1)²."""
         u = dr.gather(mi.Point2f, self.u, query)
-        spread = dr.gather(mi.Float, self.sigma, query)
-        offset = standard_normal(xi) * spread
+        sigma = dr.gather(mi.Float, self.sigma, query)
+        offset = standard_normal(xi) * sigma
         return mi.Point2f(u + mi.Vector2f(offset.x, offset.y / self.aspect))
 
-    def ray(self, query: Any, point: Any) -> Any:
-        """Ray through uv `point` of the reference plane against the view direction of the given queries."""
+    def ray(self, query: UInt32, point: Point2f) -> Ray3f:
+        """Ray through uv `point` of the reference plane against the queries' view directions."""
         omega_o = dr.gather(mi.Vector3f, self.omega_o, query)
         return ray_through(point, omega_o, self.unit, self.aspect, self.start)
 
     def sample_ray(
-        self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
-    ) -> tuple[Any, Any]:
-        """One ray per sample; the query follows from the lane, not from the rounded film position."""
+        self, time: Float, sample1: Float, sample2: Point2f, sample3: Point2f, active: Mask = True
+    ) -> tuple[Ray3f, Spectrum]:
+        """One ray per sample. The lane gives the query's number; film positions are rounded."""
         paths = self.sampler().sample_count()
         query = dr.minimum(dr.arange(mi.UInt32, dr.width(sample2)) // paths, dr.width(self.sigma) - 1)
         ray = self.ray(query, self.footprint(query, sample3))
@@ -89,9 +99,9 @@ class QuerySensor(mi.Sensor):
         return ray, mi.Color3f(1.0)
 
     def sample_ray_differential(
-        self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
-    ) -> tuple[Any, Any]:
-        """As :meth:`sample_ray`; a query has no differentials."""
+        self, time: Float, sample1: Float, sample2: Point2f, sample3: Point2f, active: Mask = True
+    ) -> tuple[Any, Spectrum]:
+        """As :meth:`sample_ray`, without differentials."""
         ray, weight = self.sample_ray(time, sample1, sample2, sample3, active)
         return mi.RayDifferential3f(ray), weight
 

@@ -1,22 +1,28 @@
-"""What rays met, as Mitsuba's BSDFs and textures ask about it."""
+"""Surface interactions on the height field, as Mitsuba's BSDFs and textures expect them."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from mbtf_gen.render.types import Float, Mask, Normal3f, Point3f, SurfaceInteraction3f, Vector3f
 
-def interaction(p: Any, n: Any, d: Any, size: tuple[Any, Any], valid: Any) -> Any:
-    """Surface interaction of places on a height field.
+
+def interaction(
+    p: Point3f, n: Normal3f, d: Vector3f, size: tuple[Float, Float], valid: Mask
+) -> SurfaceInteraction3f:
+    """Surface interaction at points of a height field.
 
     Parameters
     ----------
-    p, n : position in scene units from the tile's center, unit normal with z > 0
-    d : direction of the rays
-    size : (x, y) lengths of the tile in scene units
-    valid : lanes that met something; of `t` no more is told than that
+    p, n : Point3f, Normal3f
+        Position in scene units from the tile's center, and unit normal with z > 0.
+    d : Vector3f
+        Direction of the ray.
+    size : tuple of two Float
+        (x, y) lengths of the tile in scene units.
+    valid : Mask
+        Lanes with a hit. They get t = 0, the others t = ∞; distances are not needed.
     """
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(p))
     si.t = dr.select(valid, mi.Float(0.0), dr.inf)

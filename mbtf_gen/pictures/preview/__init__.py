@@ -1,1 +1,1 @@
-"""Pictures for a first look at a material and at its queries, to be drawn or already stored."""
+"""Previews of a material: its mesh, a path-traced picture, and its queries."""

@@ -1,1 +1,1 @@
-"""How the displaced surface reflects: microfacets, sheen, and the BSDF as a Mitsuba plugin."""
+"""Reflection of the displaced surface: microfacets, sheen, and the BSDF as a Mitsuba plugin."""

@@ -15,6 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_gen.render.bsdf.surface import Surface, SurfaceParts
+from mbtf_gen.render.types import (
+    BSDF,
+    BSDFSample3f,
+    Float,
+    Mask,
+    Point2f,
+    Properties,
+    Spectrum,
+    SurfaceInteraction3f,
+    Vector3f,
+)
 
 if TYPE_CHECKING:
     from mbtf_gen.material.material import Material
@@ -38,14 +49,14 @@ REFLECTION = frozenset({"specular", "metallic", "clearcoat", "sheen"})
 
 
 class SurfaceBSDF(mi.BSDF):
-    """``mbtf_surface``: the project's surface as a BSDF of Mitsuba.
+    """``mbtf_surface``: the project's BSDF as a Mitsuba plugin.
 
-    Plugin parameters: the names of :data:`NAMES`, each a texture or a number. The terms simulated are those
-    whose parameters are given: ``specular`` (with ``roughness``), ``metallic``, ``clearcoat``, ``sheen``,
-    ``slopes``. Opacity needs the generator's own loop and is not a part of the plugin.
+    Plugin parameters are the names of :data:`NAMES`, each a texture or a number. The simulated terms are
+    those whose parameters are given: ``specular`` (with ``roughness``), ``metallic``, ``clearcoat``,
+    ``sheen``, ``slopes``. Opacity is only supported by the generator's own loop.
     """
 
-    def __init__(self, props: Any) -> None:
+    def __init__(self, props: Properties) -> None:
         super().__init__(props)
         textures = {name: props.get_texture(name) for name in NAMES if name in props}
         numbers = {
@@ -74,8 +85,10 @@ class SurfaceBSDF(mi.BSDF):
         self.m_components = [flags]
         self.m_flags = flags
 
-    def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
-        """Direction and weight f·cos/density."""
+    def sample(
+        self, ctx: Any, si: SurfaceInteraction3f, sample1: Float, sample2: Point2f, active: Mask = True
+    ) -> tuple[BSDFSample3f, Spectrum]:
+        """Sample a direction; returns it with the weight f·cos/density."""
         omega, weight, pdf = self.surface.at(si, si.to_world(si.wi)).sample(sample1, sample2)
         bs = dr.zeros(mi.BSDFSample3f, dr.width(omega))
         mirrored = dr.isinf(pdf)
@@ -89,16 +102,18 @@ class SurfaceBSDF(mi.BSDF):
         bs.pdf = dr.select(good, bs.pdf, 0.0)
         return bs, dr.select(good, weight, 0.0)
 
-    def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
+    def eval_pdf(
+        self, ctx: Any, si: SurfaceInteraction3f, wo: Vector3f, active: Mask = True
+    ) -> tuple[Spectrum, Float]:
         """(f·cos, density) of a local direction."""
         value, pdf = self.surface.at(si, si.to_world(si.wi)).eval_pdf(si.to_world(wo))
         return dr.select(active, value, 0.0), dr.select(active, pdf, 0.0)
 
-    def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+    def eval(self, ctx: Any, si: SurfaceInteraction3f, wo: Vector3f, active: Mask = True) -> Spectrum:
         """f·cos of a local direction."""
         return self.eval_pdf(ctx, si, wo, active)[0]
 
-    def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+    def pdf(self, ctx: Any, si: SurfaceInteraction3f, wo: Vector3f, active: Mask = True) -> Float:
         """Density of a local direction."""
         return self.eval_pdf(ctx, si, wo, active)[1]
 
@@ -108,43 +123,43 @@ class SurfaceBSDF(mi.BSDF):
 
 
 class MitsubaSurface:
-    """A BSDF of Mitsuba, as the generator's loop asks for it."""
+    """A BSDF of Mitsuba with the interface of :class:`~mbtf_gen.render.bsdf.surface.Surface`."""
 
-    def __init__(self, bsdf: Any) -> None:
+    def __init__(self, bsdf: BSDF) -> None:
         self.bsdf = bsdf
         self.transmits = bool(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Transmission))
         self.parts = SurfaceParts()
 
-    def at(self, si: Any, towards_viewer: Any) -> MitsubaPoint:
-        """The surface at hits."""
-        return MitsubaPoint(self.bsdf, si)
+    def at(self, si: SurfaceInteraction3f, towards_viewer: Vector3f) -> MitsubaSurfacePoint:
+        """The BSDF at surface interactions."""
+        return MitsubaSurfacePoint(self.bsdf, si)
 
 
-class MitsubaPoint:
-    """A BSDF of Mitsuba at lanes' hits."""
+class MitsubaSurfacePoint:
+    """A BSDF of Mitsuba at one surface interaction per lane."""
 
-    def __init__(self, bsdf: Any, si: Any) -> None:
+    def __init__(self, bsdf: BSDF, si: SurfaceInteraction3f) -> None:
         self.bsdf, self.si, self.context = bsdf, si, mi.BSDFContext()
 
-    def eval_pdf(self, omega: Any) -> tuple[Any, Any]:
+    def eval_pdf(self, omega: Vector3f) -> tuple[Spectrum, Float]:
         """(f·cos, density) of a direction in the scene."""
         value, pdf = self.bsdf.eval_pdf(self.context, self.si, self.si.to_local(omega))
         return value, pdf
 
-    def sample(self, xi_lobe: Any, xi: Any) -> tuple[Any, Any, Any]:
+    def sample(self, xi_lobe: Float, xi: Point2f) -> tuple[Vector3f, Spectrum, Float]:
         """(direction in the scene, weight, density; infinite for a delta lobe)."""
         bs, weight = self.bsdf.sample(self.context, self.si, xi_lobe, xi)
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         return self.si.to_world(bs.wo), weight, dr.select(delta, dr.inf, bs.pdf)
 
 
-def surface_of(bsdf: Any) -> Any:
-    """What the generator's loop asks about reflection, for a loaded BSDF."""
+def surface_of(bsdf: BSDF) -> Surface | MitsubaSurface:
+    """Interface of the generator's loop to a loaded BSDF."""
     return bsdf.surface if isinstance(bsdf, SurfaceBSDF) else MitsubaSurface(bsdf)
 
 
 def _texture(value: Any) -> dict[str, Any]:
-    """Bilinear periodic bitmap of an (H, W) or (H, W, 3) array of linear numbers."""
+    """Bilinear periodic bitmap of an (H, W) or (H, W, 3) array of linear values."""
     pixels: NDArray[np.float32] = np.ascontiguousarray(value, np.float32)
     if pixels.ndim == 2:
         pixels = pixels[..., None]

@@ -1,44 +1,45 @@
-r"""Sheen: a layer of upright fibers that shines at grazing views, such as velvet, dust or peach skin.
+r"""Sheen: a layer of upright fibers that is bright at grazing views, such as velvet, dust or peach skin.
 
-Microfacets that stand up: their normals h have the density of Estevez and Kulla 2017 ("Production friendly
-microfacet sheen"), ``D(h) = (2+n)/(2π) sinⁿθ`` with n = 1/α and α = roughness². They hide one another as
-Smith's theory has it for any distribution, of which only the projected area that a direction sees is needed,
+It is a microfacet model. The normals h have the density of Estevez and Kulla 2017 ("Production Friendly
+Microfacet Sheen BRDF"), ``D(h) = (2+n)/(2π) sinⁿθ`` with n = 1/α and α = roughness². Masking and shadowing
+follow Smith's theory, which for any distribution needs only the projected area that a direction sees,
 
     q(ω) = ∫ D(h) (ω·h)⁺ dh,    f = F·D(h) / (4 (q(ωi) μo + q(ωo) μi - μi μo)),
 
-Heitz 2014's height-correlated G2 written with q = μ (1+Λ). So the layer returns no more than it receives,
-without fits or corrections. q and the directional albedo E (what the layer reflects of a direction at F = 1)
-are integrated once per process, in double precision.
+which is the height-correlated G2 of Heitz 2014 written with q = μ (1+Λ). So the layer conserves energy
+without fitted corrections. q and the directional albedo E at F = 1 are integrated once per process, in double
+precision.
 """
 
 from __future__ import annotations
 
 from functools import cache
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_gen.render.types import Float, Vector3f
+
 F64 = NDArray[np.float64]
 
-# Fibers of a smaller roughness would stand so upright that light of the view's own plane alone meets them.
+# Smaller roughnesses are clamped: fibers would be so upright that they reflect within one plane alone.
 SMALLEST_ROUGHNESS = 0.07
 # Nodes of the tables over the cosine and over the logarithm of roughness.
 TABLE_COSINES, TABLE_ROUGHNESSES = 64, 32
 # Points of the quadratures: over fibers, over polar angles, and over half of the azimuth.
-_FIBRES, _POLAR, _AZIMUTH = 200, 64, 48
+_FIBERS, _POLAR, _AZIMUTH = 200, 64, 48
 _LOG_RANGE = float(-np.log(SMALLEST_ROUGHNESS))
 
 
-def fiber_density(sine2: Any, roughness: Any) -> Any:
+def fiber_density(sine2: Float, roughness: Float) -> Float:
     """D(h) in 1/sr for the squared sine of h's polar angle."""
     n = dr.rcp(dr.square(dr.maximum(roughness, SMALLEST_ROUGHNESS)))
     return (2.0 + n) * (0.5 * dr.inv_pi) * dr.power(dr.maximum(sine2, 1e-12), 0.5 * n)
 
 
-def sheen_value(wi: Any, wo: Any, roughness: Any, q_i: Any, q_o: Any) -> Any:
+def sheen_value(wi: Vector3f, wo: Vector3f, roughness: Float, q_i: Float, q_o: Float) -> Float:
     """f·μo at F = 1."""
     h = wi + wo
     sine2 = (dr.square(h.x) + dr.square(h.y)) / dr.squared_norm(h)
@@ -49,7 +50,7 @@ def sheen_value(wi: Any, wo: Any, roughness: Any, q_i: Any, q_o: Any) -> Any:
 class SheenTables:
     """q and E by cosine μ and roughness, bilinear in asin ∜μ, which resolves both ends, and log roughness.
 
-    Held as (q·roughness, E), which hardly vary with roughness.
+    The table stores (q·roughness, E), which hardly vary with roughness.
     """
 
     def __init__(self) -> None:
@@ -62,7 +63,7 @@ class SheenTables:
             nodes[row, :, 1] = directional_albedo(cosine, roughness)
         self._table = mi.Float(nodes.ravel())
 
-    def at(self, cosine: Any, roughness: Any) -> tuple[Any, Any]:
+    def at(self, cosine: Float, roughness: Float) -> tuple[Float, Float]:
         """(q, E) at cosines in [0, 1] and roughnesses in [0, 1]."""
         rough = dr.maximum(roughness, SMALLEST_ROUGHNESS)
         x = dr.asin(dr.sqrt(dr.sqrt(dr.clip(cosine, 0.0, 1.0)))) * ((TABLE_COSINES - 1) * 2.0 * dr.inv_pi)
@@ -91,8 +92,8 @@ def _gauss(points: int) -> tuple[F64, F64]:
 
 
 def projected_area(cosine: F64, roughness: float) -> F64:
-    """q of directions, the azimuth of h integrated in closed form."""
-    x, w = _gauss(_FIBRES)
+    """q of directions; the azimuth of h is integrated in closed form."""
+    x, w = _gauss(_FIBERS)
     theta, weight = 0.5 * np.pi * x, 0.5 * np.pi * w
     n = 1.0 / roughness**2
     density = (2.0 + n) / (2.0 * np.pi) * np.sin(theta) ** (n + 1.0)
@@ -106,7 +107,7 @@ def projected_area(cosine: F64, roughness: float) -> F64:
 
 def directional_albedo(cosine: F64, roughness: float) -> F64:
     """E of directions: ∫ f μo dωo at F = 1."""
-    # Grazing directions reflect most: μo = t².
+    # Substitution μo = t² resolves grazing directions, which reflect most.
     t, w = _gauss(_POLAR)
     mu, measure = t**2, 2.0 * t**3 * w
     x, v = _gauss(_AZIMUTH)
@@ -116,7 +117,7 @@ def directional_albedo(cosine: F64, roughness: float) -> F64:
     mu_i, mu_o = cosine[:, None, None], mu[:, None]
     s = np.sqrt((1.0 - mu_i**2) * (1.0 - mu_o**2)) * np.cos(phi)
     up = mu_i + mu_o
-    # |wi + wo|² = 2 + 2 wi·wo; what is not z of it is the half vector's sine.
+    # |wi + wo|² = 2 + 2 wi·wo; the half vector's sine follows from it and from z.
     length2 = 2.0 + 2.0 * (mu_i * mu_o + s)
     sine2 = np.clip(1.0 - up**2 / np.maximum(length2, 1e-300), 0.0, 1.0)
     density = (2.0 + n) / (2.0 * np.pi) * sine2 ** (0.5 * n)

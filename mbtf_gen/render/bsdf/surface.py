@@ -1,28 +1,28 @@
-r"""How the displaced surface reflects: the project's own BSDF, which returns no more than it receives.
+r"""The project's BSDF, which conserves energy.
 
-For a view direction i and a light direction o (local cosines μi, μo) the value is
+For a view direction i and a light direction o (local cosines μi, μo) its value is
 
     f = (1 - m) · [ F-lobe(F0 = 0.08·specular) + base/π · (1-E(μi))(1-E(μo)) / (1-Ē) ]
       +    m    · [ F-lobe(F0 = base) + Fms/π · (1-A(μi))(1-A(μo)) / (1-Ā) ]
 
-where m is `metallic`, an F-lobe is ``F·D·G2/(4 μi μo)`` with GGX facets of α = roughness², E is the share
-that the dielectric's lobe reflects and A that of a lobe with F = 1 (bars are cosine-weighted averages over
-the hemisphere). The diffuse term takes what the lobe leaves over (Kelemen and Szirmay-Kalos 2001); the last
-one gives back what scatters several times between metal facets (Kulla and Conty 2017), with
-``Fms = F̄²Ā/(1-F̄(1-Ā))``. Both are reciprocal, and a white surface reflects exactly everything. A clear
-coat of F0 = 4 % takes its share c·E_c of both directions from what lies below: ``f = c·f_c +
-(1-cE_c(μi))(1-cE_c(μo))·f``. Sheen, of weight w and color k, lies on top of it all and takes its share once,
-at the direction where it is larger: ``f = w·k·f_s + min(t(μi), t(μo))·f`` with ``t = 1 - w·max(k)·E_s``.
+where m is `metallic`. An F-lobe is ``F·D·G2/(4 μi μo)`` with GGX facets of α = roughness² (Walter et al.
+2007). E is the directional albedo of the dielectric's lobe, A that of a lobe with F = 1; bars are
+cosine-weighted averages over the hemisphere. The diffuse term scatters the energy that the lobe does not
+reflect (Kelemen and Szirmay-Kalos 2001, "A Microfacet Based Coupled Specular-Matte BRDF Model"). The last
+term adds multiple scattering between metal facets (Kulla and Conty 2017, "Revisiting Physically Based Shading
+at Imageworks"), with ``Fms = F̄²Ā/(1-F̄(1-Ā))``. Both are reciprocal, and a white surface has albedo 1.
 
-What a material does not have costs nothing: terms without maps or constants are left out when the kernel is
-built.
+A clear coat of weight c and F0 = 4 % attenuates both directions by its directional albedo E_c:
+``f = c·f_c + (1-cE_c(μi))(1-cE_c(μo))·f``. Sheen of weight w and color k is the topmost layer. It attenuates
+once, by the larger of its two albedos: ``f = w·k·f_s + min(t(μi), t(μo))·f`` with ``t = 1 - w·max(k)·E_s``.
+
+Terms without maps or constants are not compiled into the kernel.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -34,19 +34,29 @@ from mbtf_gen.render.bsdf.microfacet import (
     grazing_reflectance,
     half_tangent2,
     is_mirror,
-    lost_light,
-    lost_light_pdf,
+    missing_energy_pdf,
+    sample_missing_energy,
     schlick,
     smith,
     visible_normal,
 )
 from mbtf_gen.render.bsdf.sheen import SheenTables, sheen_value
+from mbtf_gen.render.types import (
+    Color3f,
+    Float,
+    Mask,
+    Normal3f,
+    Point2f,
+    SurfaceInteraction3f,
+    Texture,
+    Vector3f,
+)
 
 CLEARCOAT_REFLECTANCE = 0.04
-# A shading normal that would face away from the viewer is bent until its cosine is this.
+# Smallest cosine between shading normal and viewer; shading normals below it are bent towards the viewer.
 SMALLEST_COSINE = 0.01
-# Least and greatest chance, without a coat, with which sampling chooses the lobe.
-LOBE_CHANCES = (0.1, 0.98)
+# Smallest and largest probability of sampling the lobe, without a clear coat.
+LOBE_PROBABILITIES = (0.1, 0.98)
 
 
 @cache
@@ -63,35 +73,34 @@ def sheen_tables(variant: str) -> SheenTables:
 
 @dataclass(frozen=True)
 class Lobe:
-    """A GGX lobe at lanes' hits: α, roughness √α, reflectances F0 and F90, and the facets' energies
-    (L, B) towards the viewer."""
+    """A GGX lobe: roughness √α, reflectances F0 and F90, energy tables, and their (L, B) for the viewer."""
 
-    roughness: Any
-    normal: Any
-    grazing: Any
+    roughness: Float
+    normal: Color3f
+    grazing: Color3f
     tables: EnergyTables
-    towards_viewer: tuple[Any, Any]
+    energy: tuple[Float, Float]
 
     @property
-    def alpha(self) -> Any:
+    def alpha(self) -> Float:
         """α, at least :data:`MIRROR_ALPHA`."""
         return dr.maximum(dr.square(self.roughness), MIRROR_ALPHA)
 
     @property
-    def mirror(self) -> Any:
+    def mirror(self) -> Mask:
         """Lanes whose lobe is a mirror."""
         return is_mirror(self.roughness)
 
-    def fresnel(self, cosine: Any) -> Any:
-        """Reflectance of a facet seen under a cosine."""
+    def fresnel(self, cosine: Float) -> Color3f:
+        """Fresnel reflectance of a facet, by the cosine of incidence (Schlick 1994)."""
         s = schlick(cosine)
         return self.normal * (1.0 - s) + self.grazing * s
 
-    def share(self, pair: tuple[Any, Any]) -> Any:
-        """Reflectance of the lobe from the facets' (L, B)."""
+    def albedo(self, pair: tuple[Float, Float]) -> Color3f:
+        """Directional albedo of the lobe, from (L, B) of the tables."""
         return self.normal * (1.0 - pair[0] - pair[1]) + self.grazing * pair[1]
 
-    def value_pdf(self, wi: Any, wo: Any) -> tuple[Any, Any]:
+    def value_pdf(self, wi: Vector3f, wo: Vector3f) -> tuple[Color3f, Float]:
         """(f·μo, density of sampling wo); 0 for mirrors."""
         alpha = self.alpha
         d = dr.select(self.mirror, 0.0, distribution(half_tangent2(wi, wo), alpha))
@@ -100,19 +109,19 @@ class Lobe:
         cosine = dr.dot(wi, dr.normalize(wi + wo))
         return self.fresnel(cosine) * (rest / (1.0 + si + so)), rest / (1.0 + si)
 
-    def sample(self, wi: Any, xi: Any) -> tuple[Any, Any]:
-        """(wo, weight f·μo/density of this lobe alone); exact for mirrors."""
+    def sample(self, wi: Vector3f, xi: Point2f) -> tuple[Vector3f, Color3f]:
+        """(wo, weight f·μo/density) of this lobe alone; exact for mirrors."""
         alpha = self.alpha
         h = dr.select(self.mirror, mi.Vector3f(0, 0, 1), visible_normal(wi, alpha, xi))
         wo = dr.fma(2.0 * dr.dot(wi, h), h, -wi)
         si, so = smith(wi.z, alpha), smith(dr.maximum(wo.z, 1e-7), alpha)
-        share = dr.select(self.mirror, 1.0, (1.0 + si) / (1.0 + si + so))
-        return wo, self.fresnel(dr.dot(wi, h)) * dr.select(wo.z > 0, share, 0.0)
+        shadowing = dr.select(self.mirror, 1.0, (1.0 + si) / (1.0 + si + so))
+        return wo, self.fresnel(dr.dot(wi, h)) * dr.select(wo.z > 0, shadowing, 0.0)
 
 
 @dataclass(frozen=True)
 class SurfaceParts:
-    """Which terms of the value a surface has; decided before a kernel is built."""
+    """Terms of a surface's BSDF, fixed before a kernel is compiled."""
 
     diffuse: bool = True
     specular: bool = False
@@ -124,50 +133,56 @@ class SurfaceParts:
 
 
 class Surface:
-    """A surface's maps and the terms that they call for.
+    """Reflection of a tile: its textures and the terms of the BSDF.
 
     Parameters
     ----------
-    parts : terms that are simulated
-    textures : ``base_color``, ``roughness``, ``metallic``, ``specular``, ``clearcoat``,
-        ``clearcoat_roughness``, ``sheen``, ``sheen_color``, ``sheen_roughness``, ``slopes``, ``opacity`` → Mitsuba textures; those
-        that no term needs may be missing. `slopes` (residual slopes along u and y, in tile widths per tile
-        width) are added to the mesh's own.
+    parts : SurfaceParts
+        Terms that are simulated.
+    textures : dict of str to Texture
+        Mitsuba textures named ``base_color``, ``roughness``, ``metallic``, ``specular``, ``clearcoat``,
+        ``clearcoat_roughness``, ``sheen``, ``sheen_color``, ``sheen_roughness``, ``slopes``, ``opacity``.
+        Those that no term needs may be missing. ``slopes`` are residual slopes along x and y, which are added
+        to those of the geometry.
+
+    Attributes
+    ----------
+    transmits : bool
+        Whether rays may be below the surface.
     """
 
-    def __init__(self, parts: SurfaceParts, textures: dict[str, Any]) -> None:
+    def __init__(self, parts: SurfaceParts, textures: dict[str, Texture]) -> None:
         self.parts = parts
         self.textures = textures
-        # Whether rays may end up below the surface.
         self.transmits = parts.opacity
         glossy = parts.specular or parts.metallic or parts.clearcoat
         self.tables = energy_tables(mi.variant()) if glossy else None
         self.sheen_tables = sheen_tables(mi.variant()) if parts.sheen else None
 
-    def at(self, si: Any, towards_viewer: Any) -> SurfacePoint:
-        """The surface at hits; `si` needs p, n, uv and its validity."""
+    def at(self, si: SurfaceInteraction3f, towards_viewer: Vector3f) -> SurfacePoint:
+        """The BSDF at surface interactions, of which p, n, uv and validity are used."""
         return SurfacePoint(self, si, towards_viewer)
 
-    def opacity(self, si: Any) -> Any:
-        """Share of rays that the surface stops at hits."""
+    def opacity(self, si: SurfaceInteraction3f) -> Float:
+        """Probability that a surface interaction stops a ray, from the opacity mask."""
         return self.textures["opacity"].eval_1(si)
 
 
 class SurfacePoint:
-    """A surface at lanes' hits, seen from given directions. Directions given and returned are in the
-    scene."""
+    """The BSDF at one surface interaction per lane, for given view directions. Directions in arguments and
+    results are in the scene's frame; shading normals may differ from the geometric normal."""
 
-    def __init__(self, surface: Surface, si: Any, towards_viewer: Any) -> None:
+    def __init__(self, surface: Surface, si: SurfaceInteraction3f, towards_viewer: Vector3f) -> None:
         parts, maps, tables = surface.parts, surface.textures, surface.tables
         self.parts, self.tables = parts, tables
-        self.face = si.n
+        self.geometric_normal = si.n
         self.visible = dr.dot(si.n, towards_viewer) > 0
         normal = si.n
         if parts.slopes:
-            normal = _tilted(si, maps["slopes"], towards_viewer)
+            normal = _shading_normal(si, maps["slopes"], towards_viewer)
         self.frame = mi.Frame3f(normal)
         self.wi = self.frame.to_local(towards_viewer)
-        # Written so that NaN counts as seen: it must reach the value, where it is found and drawn again.
+        # NaN counts as visible: it must reach the value, where the sample is detected and drawn again.
         self.visible &= ~(self.wi.z <= 0)
         self.wi.z = dr.maximum(self.wi.z, 1e-6)
         self.base = maps["base_color"].eval(si) if parts.diffuse or parts.metallic else mi.Color3f(0.0)
@@ -181,7 +196,7 @@ class SurfacePoint:
             self.sheen_tables = surface.sheen_tables
             self._sheen(maps, si)
 
-    def _lobe(self, maps: dict[str, Any], si: Any) -> None:
+    def _lobe(self, maps: dict[str, Texture], si: SurfaceInteraction3f) -> None:
         roughness = dr.clip(maps["roughness"].eval_1(si), 0.0, 1.0)
         tables = self.tables
         assert tables is not None
@@ -192,18 +207,19 @@ class SurfacePoint:
         normal = dr.lerp(mi.Color3f(dielectric), self.base, m)
         grazing = dr.lerp(mi.Color3f(edge), grazing_reflectance(self.base), m)
         self.lobe = Lobe(roughness, normal, grazing, tables, pair)
-        # What the dielectric's lobe leaves to the diffuse term, by direction and on average.
+        # Energy that the dielectric's lobe does not reflect: 1 - E(μi) and 1 - Ē.
         self.dielectric, self.edge = dielectric, edge
-        self.left = 1.0 - (dielectric * (1.0 - pair[0] - pair[1]) + edge * pair[1])
-        self.left_mean = 1.0 - (dielectric * (1.0 - mean[0] - mean[1]) + edge * mean[1])
+        self.transmitted = 1.0 - (dielectric * (1.0 - pair[0] - pair[1]) + edge * pair[1])
+        self.transmitted_mean = 1.0 - (dielectric * (1.0 - mean[0] - mean[1]) + edge * mean[1])
         if self.parts.metallic:
             f = self.base + (grazing_reflectance(self.base) - self.base) * (1.0 / 21.0)
-            # Share of what one scattering loses that several give back; as a value, by direction.
-            self.returned = m * dr.square(f) * (1.0 - mean[0]) / (1.0 - f * mean[0])
-            self.several = self.returned / mean[0]
-            self.lost = pair[0]
+            # Fms: the fraction of the energy missing from single scattering that multiple scattering adds.
+            # F̄ of Schlick's approximation is F0 + (F90 - F0)/21.
+            self.multiple_albedo = m * dr.square(f) * (1.0 - mean[0]) / (1.0 - f * mean[0])
+            self.multiple_scale = self.multiple_albedo / mean[0]
+            self.missing = pair[0]
 
-    def _clearcoat(self, maps: dict[str, Any], si: Any) -> None:
+    def _clearcoat(self, maps: dict[str, Texture], si: SurfaceInteraction3f) -> None:
         roughness = dr.clip(maps["clearcoat_roughness"].eval_1(si), 0.0, 1.0)
         tables = self.tables
         assert tables is not None
@@ -211,161 +227,162 @@ class SurfacePoint:
         self.clearcoat_weight = maps["clearcoat"].eval_1(si)
         self.clearcoat = Lobe(roughness, mi.Color3f(CLEARCOAT_REFLECTANCE), mi.Color3f(1.0), tables, pair)
 
-    def _sheen(self, maps: dict[str, Any], si: Any) -> None:
+    def _sheen(self, maps: dict[str, Texture], si: SurfaceInteraction3f) -> None:
         self.sheen_roughness = dr.clip(maps["sheen_roughness"].eval_1(si), 0.0, 1.0)
         self.sheen = maps["sheen"].eval_1(si) * maps["sheen_color"].eval(si)
-        self.sheen_area, albedo = self.sheen_tables.at(self.wi.z, self.sheen_roughness)
-        self.sheen_share = dr.max(self.sheen) * albedo
+        self.sheen_q, albedo = self.sheen_tables.at(self.wi.z, self.sheen_roughness)
+        self.sheen_albedo = dr.max(self.sheen) * albedo
 
-    def _broad(self, cosine: Any) -> Any:
-        """π·f of everything but coat, lobes and sheen, for the cosine of wo."""
+    def _diffuse(self, cosine: Float) -> Color3f:
+        """π·f of the diffuse term and of multiple scattering, by the cosine of wo."""
         diffuse = self.base * (1.0 - self.metallic)
         if not (self.parts.specular or self.parts.metallic):
             return diffuse
         assert self.tables is not None
-        lost, b = self.tables.at(cosine, self.lobe.roughness)
-        left = 1.0 - (self.dielectric * (1.0 - lost - b) + self.edge * b)
-        value = diffuse * (self.left * left / self.left_mean) if self.parts.diffuse else mi.Color3f(0.0)
+        missing, b = self.tables.at(cosine, self.lobe.roughness)
+        transmitted = 1.0 - (self.dielectric * (1.0 - missing - b) + self.edge * b)
+        value = mi.Color3f(0.0)
+        if self.parts.diffuse:
+            value = diffuse * (self.transmitted * transmitted / self.transmitted_mean)
         if self.parts.metallic:
-            value += self.several * (self.lost * lost)
+            value += self.multiple_scale * (self.missing * missing)
         return value
 
-    def _chances(self) -> tuple[Any, Any, Any, Any]:
-        """Chances with which sampling chooses (sheen, the coat, the lobe, what metal scatters several
-        times); the rest is cosine-distributed."""
-        sheen, coat, lobe, several = (mi.Float(0.0) for _ in range(4))
-        # Energy that goes towards the viewer, about.
+    def _probabilities(self) -> tuple[Float, Float, Float, Float]:
+        """Probabilities of sampling (sheen, clear coat, lobe, multiple scattering of metal); otherwise the
+        cosine-weighted hemisphere is sampled."""
+        sheen, coat, lobe, multiple = (mi.Float(0.0) for _ in range(4))
+        # Approximate directional albedos of the terms.
         below = _mean(self.base)
         if self.parts.specular or self.parts.metallic:
-            # Energies towards the viewer.
-            strong = _mean(self.lobe.share(self.lobe.towards_viewer))
-            broad = _mean(self.base * (1.0 - self.metallic)) * self.left
-            again = _mean(self.returned) * self.lost if self.parts.metallic else mi.Float(0.0)
+            strong = _mean(self.lobe.albedo(self.lobe.energy))
+            broad = _mean(self.base * (1.0 - self.metallic)) * self.transmitted
+            again = _mean(self.multiple_albedo) * self.missing if self.parts.metallic else mi.Float(0.0)
             below = dr.maximum(below, strong)
-            lobe = dr.clip(strong / dr.maximum(strong + broad + again, 1e-6), *LOBE_CHANCES)
+            lobe = dr.clip(strong / dr.maximum(strong + broad + again, 1e-6), *LOBE_PROBABILITIES)
             lobe = dr.select(broad + again > 0, lobe, 1.0)
             if self.parts.metallic:
-                several = (1.0 - lobe) * again / dr.maximum(broad + again, 1e-12)
+                multiple = (1.0 - lobe) * again / dr.maximum(broad + again, 1e-12)
         if self.parts.clearcoat:
-            share = self.clearcoat_weight * _mean(self.clearcoat.share(self.clearcoat.towards_viewer))
+            share = self.clearcoat_weight * _mean(self.clearcoat.albedo(self.clearcoat.energy))
             coat = dr.clip(share / dr.maximum(share + (1.0 - share) * _mean(self.base), 1e-6), 0.05, 0.9)
             coat = dr.select(self.clearcoat_weight > 0, coat, 0.0)
             below = dr.maximum(below, share)
             lobe *= 1.0 - coat
-            several *= 1.0 - coat
+            multiple *= 1.0 - coat
         if self.parts.sheen:
-            # Twice its energy, for even samples fit it less well than those of the other terms.
-            share = 2.0 * self.sheen_share
-            rest = (1.0 - self.sheen_share) * below
+            # Twice its albedo, because uniform sampling fits sheen less well than the other terms' sampling.
+            share = 2.0 * self.sheen_albedo
+            rest = (1.0 - self.sheen_albedo) * below
             sheen = dr.clip(share / dr.maximum(share + rest, 1e-6), 0.05, 0.9)
             sheen = dr.select(dr.max(self.sheen) > 0, sheen, 0.0)
-            coat, lobe, several = (c * (1.0 - sheen) for c in (coat, lobe, several))
-        return sheen, coat, lobe, several
+            coat, lobe, multiple = (c * (1.0 - sheen) for c in (coat, lobe, multiple))
+        return sheen, coat, lobe, multiple
 
-    def _below_clearcoat(self, cosine: Any) -> Any:
-        """What the coat lets through of both directions."""
-        viewer = 1.0 - self.clearcoat_weight * _mean(self.clearcoat.share(self.clearcoat.towards_viewer))
+    def _clearcoat_transmittance(self, cosine: Float) -> Float:
+        """Transmittance of the clear coat for both directions, by the cosine of wo."""
+        viewer = 1.0 - self.clearcoat_weight * _mean(self.clearcoat.albedo(self.clearcoat.energy))
         light = 1.0 - self.clearcoat_weight * _mean(
-            self.clearcoat.share(self.clearcoat.tables.at(cosine, self.clearcoat.roughness))
+            self.clearcoat.albedo(self.clearcoat.tables.at(cosine, self.clearcoat.roughness))
         )
         return viewer * light
 
-    def _below_sheen(self, albedo: Any) -> Any:
-        """What sheen leaves of both directions, its albedo towards the light given: its larger share of the
-        two is taken once, so that the rest is reciprocal and together no more than what comes in."""
-        return 1.0 - dr.maximum(self.sheen_share, dr.max(self.sheen) * albedo)
+    def _sheen_transmittance(self, albedo: Float) -> Float:
+        """Transmittance of the sheen layer, from its albedo towards the light. The larger of the two albedos
+        counts once, so that the sum is reciprocal and conserves energy."""
+        return 1.0 - dr.maximum(self.sheen_albedo, dr.max(self.sheen) * albedo)
 
-    def _local(self, wo: Any) -> tuple[Any, Any]:
-        """(f·μo, density) for local wo with z > 0, without mirrors."""
-        chance_sheen, chance_coat, chance, chance_several = self._chances()
-        value = self._broad(wo.z) * (dr.inv_pi * wo.z)
-        pdf = (1.0 - chance_sheen - chance_coat - chance - chance_several) * (dr.inv_pi * wo.z)
+    def _local(self, wo: Vector3f) -> tuple[Color3f, Float]:
+        """(f·μo, density) of a local direction with z > 0, without mirrors."""
+        p_sheen, p_clearcoat, p_lobe, p_multiple = self._probabilities()
+        value = self._diffuse(wo.z) * (dr.inv_pi * wo.z)
+        pdf = (1.0 - p_sheen - p_clearcoat - p_lobe - p_multiple) * (dr.inv_pi * wo.z)
         if self.parts.metallic:
-            pdf += chance_several * lost_light_pdf(wo.z, self.lobe.alpha)
+            pdf += p_multiple * missing_energy_pdf(wo.z, self.lobe.alpha)
         if self.parts.specular or self.parts.metallic:
             lobe, lobe_pdf = self.lobe.value_pdf(self.wi, wo)
             value += lobe
-            pdf += chance * lobe_pdf
+            pdf += p_lobe * lobe_pdf
         if self.parts.clearcoat:
             coat, coat_pdf = self.clearcoat.value_pdf(self.wi, wo)
-            value = value * self._below_clearcoat(wo.z) + self.clearcoat_weight * coat
-            pdf += chance_coat * coat_pdf
+            value = value * self._clearcoat_transmittance(wo.z) + self.clearcoat_weight * coat
+            pdf += p_clearcoat * coat_pdf
         if self.parts.sheen:
-            area, albedo = self.sheen_tables.at(wo.z, self.sheen_roughness)
-            sheen = sheen_value(self.wi, wo, self.sheen_roughness, self.sheen_area, area)
-            value = value * self._below_sheen(albedo) + self.sheen * sheen
-            pdf += chance_sheen * (0.5 * dr.inv_pi)
+            q, albedo = self.sheen_tables.at(wo.z, self.sheen_roughness)
+            sheen = sheen_value(self.wi, wo, self.sheen_roughness, self.sheen_q, q)
+            value = value * self._sheen_transmittance(albedo) + self.sheen * sheen
+            pdf += p_sheen * (0.5 * dr.inv_pi)
         return value, pdf
 
-    def _leaves(self, wo: Any, omega: Any) -> Any:
-        """Lanes whose direction leaves above the shading plane and above the face."""
-        return self.visible & ~(wo.z <= 0) & ~(dr.dot(self.face, omega) <= 0)
+    def _above_horizon(self, wo: Vector3f, omega: Vector3f) -> Mask:
+        """Lanes whose direction is above the planes of both the shading and the geometric normal."""
+        return self.visible & ~(wo.z <= 0) & ~(dr.dot(self.geometric_normal, omega) <= 0)
 
-    def eval_pdf(self, omega: Any) -> tuple[Any, Any]:
-        """(f·cos, density with which :meth:`sample` chooses it) of a direction, mirrors left out."""
+    def eval_pdf(self, omega: Vector3f) -> tuple[Color3f, Float]:
+        """(f·cos, density of :meth:`sample` in 1/sr) of a direction, without mirrors."""
         wo = self.frame.to_local(omega)
-        good = self._leaves(wo, omega)
+        good = self._above_horizon(wo, omega)
         wo.z = dr.maximum(wo.z, 1e-6)
         value, pdf = self._local(wo)
         return dr.select(good, value, 0.0), dr.select(good, pdf, 0.0)
 
-    def sample(self, xi_lobe: Any, xi: Any) -> tuple[Any, Any, Any]:
-        """(direction, weight f·cos/density, density; infinite for a mirrored direction)."""
-        chance_sheen, chance_coat, chance, chance_several = self._chances()
+    def sample(self, xi_lobe: Float, xi: Point2f) -> tuple[Vector3f, Color3f, Float]:
+        """(direction, weight f·cos/density, density in 1/sr); the density is infinite for mirrors."""
+        p_sheen, p_clearcoat, p_lobe, p_multiple = self._probabilities()
         wo = mi.warp.square_to_cosine_hemisphere(xi)
         mirrored = mi.Bool(False)
         single = mi.Color3f(0.0)
         if self.parts.metallic:
-            chosen = xi_lobe < chance + chance_several
-            wo = dr.select(chosen, lost_light(self.lobe.alpha, xi), wo)
+            chosen = xi_lobe < p_lobe + p_multiple
+            wo = dr.select(chosen, sample_missing_energy(self.lobe.alpha, xi), wo)
         if self.parts.specular or self.parts.metallic:
-            chosen = xi_lobe < chance
+            chosen = xi_lobe < p_lobe
             wo_lobe, weight = self.lobe.sample(self.wi, xi)
             wo = dr.select(chosen, wo_lobe, wo)
             mirrored |= chosen & self.lobe.mirror
-            single = weight / dr.maximum(chance, 1e-6)
+            single = weight / dr.maximum(p_lobe, 1e-6)
             if self.parts.clearcoat:
-                single *= self._below_clearcoat(dr.maximum(wo.z, 1e-6))
+                single *= self._clearcoat_transmittance(dr.maximum(wo.z, 1e-6))
         if self.parts.clearcoat:
-            chosen = (xi_lobe > 1.0 - chance_coat - chance_sheen) & (xi_lobe <= 1.0 - chance_sheen)
+            chosen = (xi_lobe > 1.0 - p_clearcoat - p_sheen) & (xi_lobe <= 1.0 - p_sheen)
             wo_coat, weight = self.clearcoat.sample(self.wi, xi)
             wo = dr.select(chosen, wo_coat, wo)
             flat = chosen & self.clearcoat.mirror
-            single = dr.select(flat, self.clearcoat_weight * weight / dr.maximum(chance_coat, 1e-6), single)
+            single = dr.select(flat, self.clearcoat_weight * weight / dr.maximum(p_clearcoat, 1e-6), single)
             mirrored = (mirrored & ~chosen) | flat
         if self.parts.sheen:
-            chosen = xi_lobe > 1.0 - chance_sheen
+            chosen = xi_lobe > 1.0 - p_sheen
             wo = dr.select(chosen, mi.warp.square_to_uniform_hemisphere(xi), wo)
             albedo = self.sheen_tables.at(dr.maximum(wo.z, 1e-6), self.sheen_roughness)[1]
-            single *= self._below_sheen(albedo)
+            single *= self._sheen_transmittance(albedo)
         omega = self.frame.to_world(wo)
-        good = self._leaves(wo, omega)
+        good = self._above_horizon(wo, omega)
         wo.z = dr.maximum(wo.z, 1e-6)
         if self.parts.specular or self.parts.metallic or self.parts.clearcoat or self.parts.sheen:
             value, pdf = self._local(wo)
             weight = dr.select(mirrored, single, value / dr.maximum(pdf, 1e-30))
             pdf = dr.select(mirrored, dr.inf, pdf)
         else:
-            weight, pdf = self._broad(wo.z), dr.inv_pi * wo.z
+            weight, pdf = self._diffuse(wo.z), dr.inv_pi * wo.z
             if self.parts.slopes:
-                # A direction of NaN would meet nothing and bring no light.
+                # A NaN direction would hit nothing, so that the sample would count as black.
                 weight = dr.select(dr.isnan(self.wi.z), dr.nan, weight)
         return omega, dr.select(good, weight, 0.0), dr.select(good, pdf, 0.0)
 
 
-def _mean(color: Any) -> Any:
-    """Mean of a color's channels; `dr.mean` makes the number of lanes a part of the kernel, so that every
-    launch of another size would be compiled anew."""
+def _mean(color: Color3f) -> Float:
+    """Mean of a color's channels. With `dr.mean` the number of lanes would be part of the kernel, so that
+    each launch size would be compiled anew."""
     return (color.x + color.y + color.z) * (1.0 / 3.0)
 
 
-def _tilted(si: Any, slopes: Any, towards_viewer: Any) -> Any:
-    """Normal of the face with residual slopes added, bent towards the viewer where it would face away."""
+def _shading_normal(si: SurfaceInteraction3f, slopes: Texture, towards_viewer: Vector3f) -> Normal3f:
+    """Geometric normal with residual slopes added, bent towards the viewer where it would face away."""
     extra = slopes.eval_3(si)
     n = si.n
     tilted = dr.normalize(mi.Normal3f(dr.fma(-extra.x, n.z, n.x), dr.fma(-extra.y, n.z, n.y), n.z))
-    # Only where the face itself looks up: slopes add to slopes of a height field, which a face seen from
-    # below does not have.
+    # Only for upward normals: residual slopes add to the slopes of a height field, which surfaces seen from
+    # below do not have.
     tilted = dr.select(n.z > 0, tilted, n)
     short = dr.maximum(SMALLEST_COSINE - dr.dot(tilted, towards_viewer), 0.0)
     return dr.select(short > 0, dr.normalize(tilted + short * towards_viewer), tilted)

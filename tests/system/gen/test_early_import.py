@@ -1,10 +1,11 @@
-"""A program that imports drjit before mbtf_gen gets a working LLVM or one clear error, never an abort."""
+"""Environment and order of imports: packages change no variable; an early drjit is used or refused."""
 
 from __future__ import annotations
 
+import pytest
 from conftest import RunPython
 
-PROGRAM = """
+EARLY = """
 import drjit.llvm
 from mbtf_gen.render.runtime import load_mitsuba
 from mbtf_core.errors import EngineError
@@ -19,6 +20,14 @@ else:
 
 
 def test_import_order(run_python: RunPython) -> None:
-    result = run_python("-c", PROGRAM, DRJIT_LIBLLVM_PATH=None)
+    """A program that imports drjit first gets a working LLVM or one clear error, never an abort."""
+    result = run_python("-c", EARLY, DRJIT_LIBLLVM_PATH=None)
     assert result.returncode == 0, result.stderr
-    assert result.stdout.startswith(("refused: Dr.Jit was imported before mbtf_gen", "works: [0, 1, 2, 2]"))
+    assert result.stdout.startswith(("refused: Dr.Jit was imported first", "works: [0, 1, 2, 2]"))
+
+
+@pytest.mark.parametrize("package", ["mbtf_core", "mbtf_gen", "mbtf_fit", "mbtf_pipeline"])
+def test_importing_a_package_changes_no_variable(package: str, run_python: RunPython) -> None:
+    code = f"import os; before = dict(os.environ); import {package}; print(os.environ == before)"
+    done = run_python("-c", code, DRJIT_LIBLLVM_PATH=None, DRJIT_CACHE_DIR=None)
+    assert (done.stdout, done.stderr) == ("True\n", "")

@@ -56,7 +56,7 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def drawing(work: Path) -> None:
     """Skips tests of what VTK draws where it cannot."""
     block = block_of(load_material(work / "maps"), 1)
-    camera = block_camera(40, -90, tiles=1, aspect=0.5, relief=0.04, columns=64)
+    camera = block_camera(40, -90, tiles=1, aspect=0.5, displacement_range=0.04, columns=64)
     fault = draw(block, camera, from_angles(35, 150), work / "trial.png")
     if fault:
         pytest.skip(f"VTK cannot draw off screen here: {fault}")

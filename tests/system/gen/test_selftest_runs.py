@@ -21,7 +21,7 @@ def test_selftest_prints_a_table_and_writes_a_report(run_python: RunPython, tmp_
     assert "Every check passed" in report.read_text()
     for words, fault in (
         (["--time", "soon"], "must be a duration"),
-        (["--report", "report.txt"], "must end in .md or .html"),
+        (["--report", "report.txt"], "must end in .html"),
     ):
         done = run_python("-m", "mbtf_gen", "selftest", *words)
         assert done.returncode == 2

@@ -1,4 +1,4 @@
-"""The diagnosis: uses what it names, and says what is wrong with the hint."""
+"""The diagnosis: uses each part, and gives a hint for each failure."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ import pytest
 
 from mbtf_core.child_process import Outcome
 from mbtf_gen.diagnostics import doctor
-from mbtf_gen.diagnostics.doctor import Check
+from mbtf_gen.diagnostics.doctor import Part
 from mbtf_gen.render import llvm
 
 
-def test_failures_show_their_cures() -> None:
+def test_failures_show_their_hints() -> None:
     checks = [
-        Check("Python", "ok", True, "3.11"),
-        Check("LLVM", "failed", True, "is LLVM 15", "unset it"),
-        Check("CUDA", "absent", False, "none was found"),
+        Part("Python", "ok", True, "3.11"),
+        Part("LLVM", "failed", True, "is LLVM 15", "unset it"),
+        Part("CUDA", "absent", False, "none was found"),
     ]
     assert doctor.as_text(checks).splitlines() == [
         "ok      Python  3.11",
@@ -24,26 +24,26 @@ def test_failures_show_their_cures() -> None:
         "                → unset it",
         "absent  CUDA    none was found",
         "",
-        "something that is needed does not work: see the cures (→) above",
+        "a required part does not work: see the hints (→) above",
     ]
     assert doctor.exit_code(checks) == 3
     assert doctor.as_json(checks)["healthy"] is False
 
 
-def test_conveniences_may_fail() -> None:
+def test_optional_parts_may_fail() -> None:
     checks = [
-        Check("Python", "ok", True, "3.11"),
-        Check("Drawing", "failed", False, "no OpenGL", "install it"),
+        Part("Python", "ok", True, "3.11"),
+        Part("Drawing", "failed", False, "no OpenGL", "install it"),
     ]
     assert doctor.exit_code(checks) == 0
-    assert doctor.as_text(checks).endswith("everything needed works; some conveniences do not (→)")
+    assert doctor.as_text(checks).endswith("every required part works; some optional ones do not (→)")
 
 
 def test_a_broken_llvm_is_a_finding_not_a_crash(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     fake = tmp_path / "libLLVM.so"
     fake.write_text("no library\n")
     monkeypatch.setenv(llvm.VARIABLE, str(fake))
-    found = {c.name: c for c in (doctor._llvm(), doctor._mitsuba(), doctor._threads())}
+    found = {c.name: c for c in (doctor._llvm(), doctor.probe("Mitsuba"), doctor.probe("Threads"))}
     assert {c.state for c in found.values()} == {"failed"}
     assert str(fake) in found["LLVM"].found
     assert "unset" in found["LLVM"].hint
@@ -53,7 +53,7 @@ def test_a_broken_llvm_is_a_finding_not_a_crash(monkeypatch: pytest.MonkeyPatch,
 def test_an_abort_of_the_drawing_library_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
     fault = "the process was ended by SIGSEGV"
     monkeypatch.setattr(doctor, "run_child", lambda *a, **k: Outcome({}, fault, 0.1))
-    check = doctor._drawing()
+    check = doctor.probe("Drawing")
     assert (check.state, check.required, check.found) == ("failed", False, fault)
     assert "OpenGL" in check.hint
 
@@ -61,7 +61,7 @@ def test_an_abort_of_the_drawing_library_is_a_finding(monkeypatch: pytest.Monkey
 def test_an_unwritable_kernel_cache_is_found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     monkeypatch.setenv(llvm.CACHE_VARIABLE, str(tmp_path / "file"))
-    check = doctor._kernel_cache()
+    check = doctor.probe("Kernel cache")
     assert check.state == "failed"
     assert not check.required
     assert llvm.CACHE_VARIABLE in check.hint

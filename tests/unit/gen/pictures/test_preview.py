@@ -41,7 +41,7 @@ def material(rows: int = 4, columns: int = 8, **options: Any) -> Material:
 def test_the_camera_just_holds_the_block(
     aspect: float, elevation: float, azimuth: float, relief: float
 ) -> None:
-    camera = block_camera(elevation, azimuth, tiles=2, aspect=aspect, relief=relief, columns=120)
+    camera = block_camera(elevation, azimuth, tiles=2, aspect=aspect, displacement_range=relief, columns=120)
     assert (camera.rows, camera.columns) == (90, 120)
     assert camera.target == (1.0, aspect)
     forward, right, up = camera.frame()

@@ -14,8 +14,8 @@ from mbtf_gen.render.bsdf.microfacet import (
     distribution,
     grazing_reflectance,
     half_tangent2,
-    lost_light,
-    lost_light_pdf,
+    missing_energy_pdf,
+    sample_missing_energy,
     smith,
 )
 
@@ -120,14 +120,14 @@ def test_half_vectors_keep_the_digits_of_narrow_lobes(cosine: float) -> None:
     assert error.max() < 2.5e-7 + 1e-7 / cosine
 
 
-def test_lost_light_has_its_density() -> None:
+def test_samples_of_missing_energy_have_its_density() -> None:
     """Quantiles of drawn cosines are those of the integrated density; azimuths are even."""
     for alpha in (1e-5, 1e-2, 0.3, 1.0):
-        w = np.array(lost_light(mi.Float(alpha), mi.Point2f(sobol(1 << 12, 2).T)), np.float64)
+        w = np.array(sample_missing_energy(mi.Float(alpha), mi.Point2f(sobol(1 << 12, 2).T)), np.float64)
         np.testing.assert_allclose(np.linalg.norm(w, axis=0), 1.0, atol=1e-6)
         assert np.all(np.abs(w[:2].mean(axis=1)) < 2e-3)
         log = np.linspace(np.log(1e-7), 0, 200_001)
-        pdf = np.array(lost_light_pdf(mi.Float(np.exp(log)), mi.Float(alpha)), np.float64)
+        pdf = np.array(missing_energy_pdf(mi.Float(np.exp(log)), mi.Float(alpha)), np.float64)
         cumulative = np.cumsum(2 * np.pi * pdf * np.exp(log)) * (log[1] - log[0])
         assert cumulative[-1] == pytest.approx(1.0, abs=1e-3)
         for q in (0.1, 0.5, 0.9):
