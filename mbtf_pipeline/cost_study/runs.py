@@ -98,14 +98,14 @@ class RunRunner:
         folder: Path,
         command: str,
         progress: Callable[[str], None],
-        test: tuple[int, int] = TEST,
+        test: tuple[int, int] | None = None,
         query_seconds: Callable[[int], float] = lambda paths: 0.0,
     ) -> None:
         self.config = config
         self.folder = folder
         self.command = command
         self.progress = progress
-        self.test = test
+        self.test = test or TEST
         self.query_seconds = query_seconds
         # Seconds by which a run exceeds generating and training: the most of all so far, or a guess.
         self._overhead = _OVERHEAD

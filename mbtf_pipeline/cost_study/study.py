@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -188,7 +189,7 @@ def run_study(
         write_text(folder / CONFIG_NAME, dump_yaml(config.model_dump(mode="json")))
         study = Study(folder, description)
         store = MeasurementFolder(folder, {"config": config.hash(material.digests)})
-        generator = f"mbtf-gen {config.material} --config {folder / CONFIG_NAME}"
+        generator = shlex.join(["mbtf-gen", config.material, "--config", str(folder / CONFIG_NAME)])
         _measure_generator(study, store, benchmark, generator, clock, progress)
         runner = RunRunner(config, folder / WORK, generator, lambda note: progress(clock.share(), note))
         try:

@@ -190,42 +190,42 @@ def test_the_report_can_be_written_again(
     assert again() == {}
 
 
-def test_cost_study_measures_reports_and_goes_on(
+def test_a_cost_study_measures_reports_and_resumes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Two configurations of the generator, then a third one and a run of two seeds."""
     from mbtf_pipeline.cli.app import app
     from mbtf_pipeline.cost_study import study
+    from mbtf_pipeline.cost_study.fit_runs import planned_runs
     from mbtf_pipeline.cost_study.generator_runs import generator_tasks
 
-    some = 2
-    monkeypatch.setattr(study, "generator_tasks", lambda bench: islice(generator_tasks(bench), some))
-    monkeypatch.setattr(study, "chains", lambda *arguments: [])
-    monkeypatch.setattr(study, "_SETTINGS", 1000)
+    some, runs = 2, 0
+    monkeypatch.setattr(study, "generator_tasks", lambda benchmark: islice(generator_tasks(benchmark), some))
+    monkeypatch.setattr(study, "planned_runs", lambda *arguments: planned_runs(30.0, *arguments[1:])[:runs])
+    monkeypatch.setattr(study, "_CONFIGURATIONS", 1000)
+    monkeypatch.setattr("mbtf_pipeline.cost_study.fit_runs.SHORTEST", 2.0)
+    monkeypatch.setattr("mbtf_pipeline.cost_study.runs.TEST", (4096, 8))
     out = tmp_path / "study"
-    # The budget is large enough never to decide what is measured.
+    # Long enough never to decide what is measured.
     command = ["cost", str(RECIPE), "--time", "1h", "-o", str(out), "--json", "--quiet"]
     assert run(app, command) == 0
     first = json.loads(capsys.readouterr().out)
-    assert first["points"] == 2
-    points = {p: p.read_bytes() for p in (out / "points").iterdir()}
-    # One is no setting: what a query costs on disk.
-    assert len([p for p in points if not p.name.startswith("price-")]) == first["points"]
+    assert first["measurements"] == 2
+    stored = {p: p.read_bytes() for p in (out / "measurements").iterdir()}
+    assert (out / "paths.png").stat().st_size > 1000
+    # The same command with more to do keeps what was measured; without a time, that of the study counts.
+    some, runs = 3, 1
+    flag = command.index("--time")
+    assert run(app, [*command[:flag], *command[flag + 2 :]]) == 0
+    second = json.loads(capsys.readouterr().out)
+    assert second["measurements"] == 4
+    assert all(p.read_bytes() == content for p, content in stored.items())
+    assert not (out / ".work").exists()
+    (point,) = second["front"]
+    assert 0 < point["unexplained"]["error"] < point["unexplained"]["value"] < 1
+    assert "mbtf-fit shards/" in point["command"]
     html = (out / "cost.html").read_text()
     assert not loads(html).external
-    assert "Paths per query" in html
-    rows = (out / "cost.csv").read_text().splitlines()
-    assert len(rows) == 1 + first["points"]
-    assert (out / "paths.png").stat().st_size > 1000
-    # The same again, with more to do: what was measured is kept, and more is added.
-    some = 3
-    assert run(app, command) == 0
-    second = json.loads(capsys.readouterr().out)
-    assert second["points"] == 3
-    assert all(p.read_bytes() == content for p, content in points.items())
-    assert not (out / ".work").exists()
-    # Without chains nothing can be repeated, and that is said.
-    # Without a time the study's own is meant.
-    flag = command.index("--time")
-    assert run(app, [*command[:flag], *command[flag + 2 :], "--narrow", "1min"]) == 0
-    assert any("other seeds" in text for text in json.loads(capsys.readouterr().out)["skipped"])
-    assert "--time 1h --narrow 1min" in (out / "cost.html").read_text()
+    for text in ("Paths per query", "up to 2 seeds", "--time 1h"):
+        assert text in html
+    assert len((out / "cost.csv").read_text().splitlines()) == 1 + 4

@@ -19,7 +19,7 @@ from mbtf_core.stats import Estimate
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_pipeline.cost_study import study as module
 from mbtf_pipeline.cost_study.measurements import Measurement, MeasurementFolder
-from mbtf_pipeline.cost_study.page import narrow_errors, noise_exponent
+from mbtf_pipeline.cost_study.page import narrow_errors
 from mbtf_pipeline.cost_study.pareto import extrapolation, pareto_front
 from mbtf_pipeline.cost_study.runs import Run
 from mbtf_pipeline.cost_study.tables import COLUMNS, to_csv
@@ -54,21 +54,6 @@ def test_the_extrapolation_follows_the_end_of_the_front() -> None:
     assert extrapolation(front[:2]) is None
     # Nothing is promised where the error bars allow no progress.
     assert extrapolation([point(t, e) for t, e in ((20.0, 0.2), (40.0, 0.199), (80.0, 0.198))]) is None
-
-
-def test_the_noise_exponent_is_that_of_the_variance() -> None:
-    def paths(n: int, noise: float) -> Measurement:
-        estimate = Estimate(noise, 0.01 * noise, 9)
-        options = {"queries.spp": n}
-        return Measurement("paths", "uniform", "", options, "", ONE, estimate, noise=estimate)
-
-    found = [paths(n, 2.0 * n**-0.6) for n in (2, 8, 32)]
-    exponent = noise_exponent(found)
-    assert exponent is not None
-    assert exponent.value == pytest.approx(-1.2)
-    # The slope of a line through equal errors of 2 % of the variance.
-    assert exponent.error == pytest.approx(0.02 / math.sqrt(2 * math.log(4) ** 2))
-    assert noise_exponent(found[:2]) is None
 
 
 def test_narrow_errors_are_those_of_95_percent() -> None:
