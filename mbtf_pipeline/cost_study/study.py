@@ -16,7 +16,7 @@ from mbtf_core.errors import InputError
 from mbtf_core.stats import Estimate, signal_variance
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.material.material import load_material
-from mbtf_pipeline.cost_study.fit_runs import GENERATOR, QuerySeconds, planned_runs
+from mbtf_pipeline.cost_study.fit_runs import GENERATOR, RUN_SHARES, QuerySeconds, planned_runs
 from mbtf_pipeline.cost_study.generator_benchmark import GeneratorBenchmark
 from mbtf_pipeline.cost_study.generator_runs import generator_tasks
 from mbtf_pipeline.cost_study.measurements import Measurement, MeasurementFolder
@@ -254,9 +254,15 @@ def _measure_runs(
     runner.query_seconds = query_seconds(benchmark, store)
     runs = planned_runs(clock.seconds, runner.config.queries.spp, runner.query_seconds)
 
+    # On a machine slower than planned, every comparison keeps its share of the time.
+    start, shares = clock.left(), list(RUN_SHARES.values())
+    later = {study: sum(shares[n + 1 :]) / sum(shares) for n, study in enumerate(RUN_SHARES)}
+
     def fits(run: Run) -> bool:
+        seed = run.data.seed
+        reserved = start * later[run.study] if seed < FEWEST_SEEDS else 0.0
         # The additional time is for repeats alone.
-        return clock.left(refining=run.data.seed > 0) > runner.expected_seconds(run)
+        return clock.left(refining=seed > 0) - reserved > runner.expected_seconds(run)
 
     found = measure_runs(runs, store, runner, fits, MOST_SEEDS if clock.refine else FEWEST_SEEDS)
     study.deviation = seed_deviation(found.groups)

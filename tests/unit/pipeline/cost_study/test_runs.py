@@ -18,15 +18,7 @@ from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import Queries
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_pipeline.cost_study import runs as module
-from mbtf_pipeline.cost_study.fit_runs import (
-    DATA,
-    GENERATOR,
-    MODELS,
-    SHORTEST,
-    WHOLE,
-    planned_runs,
-    round_down,
-)
+from mbtf_pipeline.cost_study.fit_runs import GENERATOR, RUN_SHARES, SHORTEST, planned_runs, round_down
 from mbtf_pipeline.cost_study.runs import DataRequest, Run, RunRunner
 
 FIT = {"model": "neumip", "training": {"time": "5s"}}
@@ -48,9 +40,9 @@ def test_planned_runs_fit_into_the_time_twice(seconds: float, tmp_path: Path) ->
         generating = run.data.queries * price(run.data.spp) * (run.data not in made)
         made.add(run.data)
         spent[run.study] += generating + float(run.fit["training"]["time"].rstrip("s"))
-    for study, share in (("whole", WHOLE), ("models", MODELS), ("data", DATA)):
+    for study, share in RUN_SHARES.items():
         assert 0.5 * share * seconds / 2 < spent[study] <= 1.1 * share * seconds / 2
-    assert GENERATOR + WHOLE + MODELS + DATA < 0.9
+    assert GENERATOR + sum(RUN_SHARES.values()) < 0.9
     assert all(run.data.seed == 0 for run in found)
     assert len({str((run.study, run.key)) for run in found}) == len(found)
     # Equal total paths are compared, whatever their number per query.

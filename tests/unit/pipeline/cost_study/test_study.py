@@ -169,22 +169,23 @@ def runners(monkeypatch: pytest.MonkeyPatch) -> list[FakeRunner]:
 
 def test_a_study_keeps_its_time_and_resumes(runners: list[FakeRunner], tmp_path: Path) -> None:
     recipe, folder = load_recipe(RECIPE, []), tmp_path / "study"
-    # 60 + 60 s of whole runs, and one of models, 30 s.
-    first = module.run_study(recipe, folder, seconds=155.0)
-    assert [m.details.get("seeds") for m in first.measurements] == [None, 2, 1]
-    assert sum(r.fit["training"]["time"] for r in runners[0].measured) <= 155.0
+    # One whole run of 60 s; a second one would take the share of the models, 30 s twice.
+    first = module.run_study(recipe, folder, seconds=150.0)
+    assert [m.details.get("seeds") for m in first.measurements] == [None, 1, 2]
+    assert sum(r.fit["training"]["time"] for r in runners[0].measured) <= 150.0
     assert first.skipped == ["whole: neumip, long"]
     assert first.deviation is not None
-    # The second seed of the models is missing; nothing else is measured again.
-    second = module.run_study(recipe, folder, seconds=155.0)
-    assert [(r.name, r.data.seed) for r in runners[1].measured] == [("m", 1)]
-    # Refining takes its own time: 60 s for a third seed of the shorter runs.
-    module.run_study(recipe, folder, seconds=155.0, refine=3600.0)
+    # Only what is missing is measured: the second seed of the whole run.
+    second = module.run_study(recipe, folder, seconds=150.0)
+    assert [(r.name, r.data.seed) for r in runners[1].measured] == [("short", 1)]
+    # Refining takes its own time, for further seeds.
+    module.run_study(recipe, folder, seconds=150.0, refine=3600.0)
     assert {r.data.seed for r in runners[2].measured} >= {2}
     assert all(r.name != "long" for r in runners[2].measured)
-    assert module.time_of(folder) == 155.0
+    assert sum(r.fit["training"]["time"] for r in runners[2].measured) <= 3750.0
+    assert module.time_of(folder) == 150.0
     assert module.time_of(tmp_path / "none") == module.NEW_TIME
-    assert second.measurements[1].error.value == first.measurements[1].error.value
+    assert second.measurements[2].error.value == first.measurements[2].error.value
 
 
 def test_measurements_of_other_seeds_and_materials_are_not_mixed(
