@@ -115,7 +115,7 @@ def independent(recipe: Path, seconds: float) -> tuple[Estimate, dict[int, Estim
     try:
         noises, biases = [], {}
         for n in PATHS:
-            noises.append(benchmark.measure({**BIASED, "queries.spp": n}, None, seconds).noise)
+            noises.append(benchmark.measure({**BIASED, "queries.spp": n}, None, seconds)[3])
             biases[n] = benchmark.bias(BIASED, {}, 2 * seconds, n)
             print(f"independent, {n} paths: noise {noises[-1]}, squared bias {biases[n]}")
     finally:

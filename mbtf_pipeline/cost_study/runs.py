@@ -157,7 +157,8 @@ class RunRunner:
 
     def _planned_seconds(self, run: Run) -> float:
         generating = 0.0 if self.has(run.data) else run.data.queries * self.query_seconds(run.data.spp)
-        return generating + parse_duration(run.fit["training"].get("time", 0.0))
+        training = run.fit["training"].get("time")
+        return generating + (0.0 if training is None else parse_duration(training))
 
     def test_set(self) -> Queries:
         """The test queries of all runs."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -131,6 +132,8 @@ def test_the_expected_time_learns_from_earlier_runs(clock: Clock, tmp_path: Path
     assert one.expected_seconds(run) == pytest.approx(5 + (7 + 6 + 2.5 - 9))
     one.forget(run.data)
     assert one.expected_seconds(run) == pytest.approx(7 + 6 + 2.5)
+    # Fits that count steps have no planned time.
+    assert one.expected_seconds(replace(run, fit={"training": {"steps": 3, "time": None}})) < 7 + 6 + 2.5
 
 
 def test_other_seeds_have_other_data_and_other_weights(
