@@ -163,7 +163,7 @@ def test_commands_reproduce_their_run(
     monkeypatch.setattr(mbtf_fit, "fit", lambda config, *rest: used.append(config) or usual(config, *rest))
     one = runner(tmp_path, study_seed)
     write_text(tmp_path / "generate.yaml", dump_yaml(one.config.model_dump(mode="json")))
-    runs = [run for run in planned_runs(600.0, 4, lambda paths: 1e-6) if run.study == "models"]
+    runs = [run for run in planned_runs(600.0, 6, lambda paths: 1e-6) if run.study == "models"]
     for run in (runs[0], runs[-1]):
         used.clear()
         one.forget(run.data)

@@ -74,7 +74,7 @@ def split(
 
 @pytest.mark.parametrize("best", SHARES)
 def test_the_best_pilot_decides(fake: Machine, tmp_path: Path, best: float) -> None:
-    fake.best = best
+    fake.best, fake.pilot_takes = best, 80.0
     notes: list[str] = []
     found = split(tmp_path, notes=notes)
     times = [parse_duration(run.fit["training"]["time"]) for run in fake.pilots]
