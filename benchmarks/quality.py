@@ -82,7 +82,7 @@ class MeasuredRun:
     seconds : of the whole run, start-up included; generate, fit : of these two stages
     unexplained, unexplained_error : unexplained variance of the test queries and its standard error
     data_bytes, material_bytes : on disk
-    settings : hash of the preset's options
+    options_hash : of the preset's options
     """
 
     material: str
@@ -95,7 +95,7 @@ class MeasuredRun:
     unexplained_error: float
     data_bytes: int
     material_bytes: int
-    settings: str
+    options_hash: str
 
     def __str__(self) -> str:
         return (
@@ -119,7 +119,7 @@ def levels_of(resolution: int) -> int:
     return resolution.bit_length() - 1
 
 
-def settings_hash(quality: Quality) -> str:
+def options_hash(quality: Quality) -> str:
     """Hash of all options of a preset and of the fitter's other training options."""
     options = best_at(quality) | FITTER[quality]
     training = resolve(FitConfig, assignments=as_assignments(options)).training.model_dump(mode="json")
@@ -177,7 +177,7 @@ def run(name: str, quality: Quality, resolution: int, work: Path) -> MeasuredRun
         round(unexplained["error"], 4),
         sum(p.stat().st_size for p in (out / "shards").rglob("*") if p.is_file()),
         sum(p.stat().st_size for p in (out / "fits" / "neumip").glob("weights*")),
-        settings_hash(quality),
+        options_hash(quality),
     )
     shutil.rmtree(work)
     return found
@@ -206,7 +206,7 @@ def finished(path: Path) -> MeasuredRun | None:
     """A stored run; None where the file is missing or damaged, or its preset has changed since."""
     try:
         found = MeasuredRun(**read_json(path))
-        return found if found.settings == settings_hash(found.quality) else None
+        return found if found.options_hash == options_hash(found.quality) else None
     except (InputError, TypeError, KeyError):
         return None
 

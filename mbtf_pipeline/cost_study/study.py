@@ -1,4 +1,4 @@
-"""A cost study: measures what accuracy costs within a time budget, and resumes where it stopped."""
+"""A cost study: measures what accuracy costs within a given time, and resumes where it stopped."""
 
 from __future__ import annotations
 
