@@ -255,14 +255,15 @@ def _measure_runs(
     runs = planned_runs(clock.seconds, runner.config.queries.spp, runner.query_seconds)
 
     # On a machine slower than planned, every comparison keeps its share of the time.
-    start, shares = clock.left(), list(RUN_SHARES.values())
-    later = {study: sum(shares[n + 1 :]) / sum(shares) for n, study in enumerate(RUN_SHARES)}
+    start, studies, shares = clock.left(), list(RUN_SHARES), list(RUN_SHARES.values())
+    reached = 0
 
     def fits(run: Run) -> bool:
-        seed = run.data.seed
-        reserved = start * later[run.study] if seed < FEWEST_SEEDS else 0.0
+        nonlocal reached
+        reached = max(reached, studies.index(run.study))
+        reserved = start * sum(shares[reached + 1 :]) / sum(shares)
         # The additional time is for repeats alone.
-        return clock.left(refining=seed > 0) - reserved > runner.expected_seconds(run)
+        return clock.left(refining=run.data.seed > 0) - reserved > runner.expected_seconds(run)
 
     found = measure_runs(runs, store, runner, fits, MOST_SEEDS if clock.refine else FEWEST_SEEDS)
     study.deviation = seed_deviation(found.groups)
