@@ -262,8 +262,10 @@ def rms(a: tuple[F64, F64], b: tuple[F64, F64], mask: NDArray[np.bool_], block: 
 def compare(mi: Any, scene: Scene, folder: Path, size: int, spp: int) -> tuple[dict[str, Any], list[F64]]:
     """Figures of a scene, and its two pictures."""
     from mbtf_gen.config.generator import GeneratorConfig
-    from mbtf_gen.generation import build_estimator
+    from mbtf_gen.job import Job
     from mbtf_gen.material.material import load_material
+    from mbtf_gen.planning.effects_plan import reference_plan
+    from mbtf_gen.planning.simulation import build_estimator
     from mbtf_gen.render.bsdf.plugin import bsdf_of
     from mbtf_gen.render.scene import register_plugins
 
@@ -280,11 +282,12 @@ def compare(mi: Any, scene: Scene, folder: Path, size: int, spp: int) -> tuple[d
     found = halves(mi, fitted, "mbtf_path", spp)
     facing = shrunk(covered & (cosine >= LOWEST), MARGIN)
     config = GeneratorConfig.model_validate({"material": scene.material, "geometry": {"mesh": MESH}})
-    alone, error = fit_alone(mi, fitted, bsdf, build_estimator(config, material), facing)
+    job = Job(config, material)
+    alone, error = fit_alone(mi, fitted, bsdf, build_estimator(job, reference_plan(job)), facing)
     stretch, low = hard_places(mi, fitted, size)
     del fitted
     fine = displaced(rough, grid)
-    surface = mi.load_dict(bsdf_of(material, None, None))
+    surface = mi.load_dict(bsdf_of(material))
     real = scene_of(mi, scene, mesh_of(mi, fine, surface, smooth=False, aspect=grid.aspect), size, "gaussian")
     met, _ = seen(mi, real, size, 1)
     area = seen(mi, real, size, 4)[0].sum() / 16

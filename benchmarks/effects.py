@@ -32,11 +32,13 @@ from typing import Any
 import numpy as np
 
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.generation import Job
+from mbtf_gen.job import Job
 from mbtf_gen.material.material import Material, load_material
-from mbtf_gen.planning.effects import EffectsPlan
-from mbtf_gen.planning.effects_plan import SMALL_RUN, plan_effects, without
+from mbtf_gen.planning.effects import EffectsPlan, without
+from mbtf_gen.planning.effects_plan import plan_effects
 from mbtf_gen.planning.pilot import PILOT_ROULETTE, measured, relative_change
+from mbtf_gen.planning.run_plan import SMALL_RUN
+from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Estimates, Stream
 
 ASSETS = Path(__file__).parents[1] / "assets"
@@ -67,12 +69,12 @@ def run(
 ) -> tuple[float, EffectsPlan, Estimates]:
     """Seconds of planning and tracing, the plan, and the values."""
     config = GeneratorConfig.model_validate({"material": "benchmark", "effects": {"mode": mode}})
-    job = Job.of(config, material)
-    asked = job.plan().draw("train", 0, queries)
+    job = Job(config, material)
+    asked = job.query_plan.draw("train", 0, queries)
     start = time.perf_counter()
     # Pilots where a run of this size takes them.
     plan = plan_effects(job, pilots=queries * spp >= SMALL_RUN)
-    found: Estimates = job.estimator(plan).estimate(asked, spp, Stream(seed, "train", 0))
+    found: Estimates = build_estimator(job, plan).estimate(asked, spp, Stream(seed, "train", 0))
     return time.perf_counter() - start, plan, found
 
 
@@ -102,7 +104,7 @@ def compare(name: str, material: Material, queries: int, spp: int, rounds: int) 
         "off": [e.name for e in plan.effects if e.present and not e.on],
         "max_depth": plan.max_depth,
         "closed_form": plan.closed_form,
-        "planned_cost": plan.cost,
+        "planned_cost": plan.bias_bound,
         "measured_cost": change,
         "measured_cost_at_most": cautious,
         "mean_shift": float(shift.mean() / mean) if mean > 0 else 0.0,
@@ -112,7 +114,7 @@ def compare(name: str, material: Material, queries: int, spp: int, rounds: int) 
     cap = f", at most {plan.max_depth} interactions" if plan.max_depth else ""
     print(
         f"{name:<20} {row['seconds_auto']:8.2f} s {row['seconds_all']:8.2f} s  x{1 / row['ratio']:<7.3g}"
-        f" cost {plan.cost:.1e}, measured {change:.1e} (<= {cautious:.1e}),"
+        f" cost {plan.bias_bound:.1e}, measured {change:.1e} (<= {cautious:.1e}),"
         f" mean {row['mean_shift']:+.1e} (z {z:+.1f});"
         f" off: {', '.join(row['off']) or 'nothing'}{cap}",
         flush=True,
@@ -142,12 +144,12 @@ def verdict(stated: float, low: float, high: float) -> str:
 
 def costs_of(name: str, material: Material, queries: int, spp: int) -> list[dict[str, Any]]:
     """Stated and true costs of one material, printed as they come."""
-    job = Job.of(GeneratorConfig.model_validate({"material": "benchmark"}), material)
+    job = Job(GeneratorConfig.model_validate({"material": "benchmark"}), material)
     plan = plan_effects(job)
 
     def values(plan: EffectsPlan, limit: int | None = None, fewer: int = 1) -> Estimates:
-        asked = job.plan().draw("test", 0, queries // fewer).flat()
-        found: Estimates = job.estimator(plan).estimate(
+        asked = job.query_plan.draw("test", 0, queries // fewer).flat()
+        found: Estimates = build_estimator(job, plan).estimate(
             asked, spp * fewer**2, Stream(7, "test", 0), limit=limit, roulette=PILOT_ROULETTE
         )
         return found
@@ -177,29 +179,29 @@ def costs_of(name: str, material: Material, queries: int, spp: int) -> list[dict
         )
 
     base = values(plan)
-    if plan.cap_cost:
+    if plan.cap_bias_bound:
         unlimited = replace(plan, max_depth=0)
         row(
             "interreflection",
             f"cap {plan.max_depth}",
-            plan.cap_cost,
+            plan.cap_bias_bound,
             0.0,
             truth(values(unlimited), values(unlimited, plan.max_depth)),
         )
     for effect in plan.effects:
-        if not effect.on and effect.present and (plan.on("masking") or effect.name == "masking"):
+        if not effect.on and effect.present and (plan.on("parallax") or effect.name == "parallax"):
             whole = replace(
                 plan, effects=tuple(replace(e, on=True) if e.name == effect.name else e for e in plan.effects)
             )
-            fewer = 8 if effect.known == "exact" else 1
+            fewer = 8 if effect.reason == "exact" else 1
             pair = values(whole, fewer=fewer), values(plan, fewer=fewer)
-            row(effect.name, "off", effect.cost or 0.0, 0.0, truth(*pair))
+            row(effect.name, "off", effect.bias_bound or 0.0, 0.0, truth(*pair))
     for effect in measured(job, plan).effects:
-        if effect.on and effect.cost is not None:
+        if effect.on and effect.bias_bound is not None:
             row(
                 effect.name,
                 "on",
-                effect.cost or 0.0,
+                effect.bias_bound or 0.0,
                 effect.error,
                 truth(base, values(without(plan, effect.name))),
             )

@@ -35,9 +35,10 @@ from numpy.typing import NDArray
 from mbtf_core.errors import MbtfError
 from mbtf_core.stats.groups import level_groups
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.generation import Job
-from mbtf_gen.planning.effects_plan import simulated
+from mbtf_gen.job import Job
+from mbtf_gen.planning.effects_plan import reference_plan
 from mbtf_gen.planning.sample_allocation import measure_allocation
+from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.render.runtime import load_mitsuba
 
@@ -65,11 +66,11 @@ def independent_points(sequence: Callable[..., Any]) -> Callable[..., Any]:
 def sides(job: Job, count: int, spp: int) -> tuple[dict[str, Callable[[int], Estimates]], float, Any]:
     """(what to run by name, seconds of the pilot, the queries)."""
     import mbtf_gen.render.estimator as module
-    from mbtf_gen.render import path_tracer as tracing
+    from mbtf_gen.render import russian_roulette as tracing
 
-    plan = simulated(job)
-    estimator = job.estimator(plan)
-    queries = job.plan().draw("train", 0, count)
+    plan = reference_plan(job)
+    estimator = build_estimator(job, plan)
+    queries = job.query_plan.draw("train", 0, count)
     start = time.process_time()
     allocation = measure_allocation(job, plan)
     pilot = time.process_time() - start

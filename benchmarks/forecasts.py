@@ -1,15 +1,15 @@
-"""Forecasts held against the runs that follow: seconds and error of the generator and of the fitter.
+"""Forecasts compared with the runs that follow: seconds and error of the generator and of the fitter.
 
     python benchmarks/forecasts.py [MATERIAL ...] [--quality draft] [--resolution 128] [--time 60s ...]
 
-Of every material (by default the five of ``assets/`` and the six texture sets that lie beside the project,
-by name): what ``mbtf-gen plan`` and ``mbtf-fit --dry-run`` expect at a quality, then the run itself, a fit
-for each ``--time`` (repeatable). Seconds are those of tracing and of training; errors are the noise of a
-training value and the unexplained variance of test queries. Printed too: the `PERSISTENCE` of
-``mbtf_fit/forecast.py`` that all of these fits together ask for.
+For every material (by default the five of ``assets/`` and the six texture sets that lie beside the project):
+the forecasts of ``mbtf-gen plan`` and ``mbtf-fit --dry-run`` at a preset, then the run itself, with a fit for
+each ``--time`` (repeatable). Seconds are those of tracing and of training. Errors are the noise of a training
+value and the unexplained variance of test queries. Also prints the `PERSISTENCE` of
+``mbtf_fit/training/forecast.py`` that suits all of these fits best.
 
-The last line is one JSON object: figures, and the bars they are held to: seconds within 30 %, errors within a
-factor 1.5. Exit code 1 where one is missed.
+The last line is one JSON object with the figures and their thresholds: seconds within 30 %, errors within a
+factor 1.5. Exit code 1 where one is exceeded.
 """
 
 from __future__ import annotations
@@ -37,20 +37,22 @@ from mbtf_gen.render.runtime import load_mitsuba
 
 ASSETS = ("cliff_rock", "insulation_foam", "straight_wool", "turtle_shell", "twisted_wool")
 # Largest factors between forecast and run, either way.
-BARS = {"seconds": 1.3, "error": 1.5}
+THRESHOLDS = {"seconds": 1.3, "error": 1.5}
 
 
 def generated(name: str, quality: Quality, levels: int, shards: Path) -> dict[str, Any]:
     """Forecast and run of the generator."""
     from mbtf_gen.forecast import forecast
-    from mbtf_gen.generation import Job, allocated, generate
+    from mbtf_gen.generation import generate
+    from mbtf_gen.job import Job
     from mbtf_gen.planning.effects_plan import plan_effects
+    from mbtf_gen.planning.run_plan import allocate
 
     config = generator_config(name, quality, levels)
     job = Job.prepare(config)
-    expected = forecast(job, allocated(job, plan_effects(job)))
+    expected = forecast(job, allocate(job, plan_effects(job)))
     start = time.perf_counter()
-    summary = generate(config, shards, job=job)
+    summary = generate(job, shards)
     took = time.perf_counter() - start
     return {
         "seconds, forecast": expected.seconds + expected.start,
@@ -68,7 +70,7 @@ def fitted(shards: Path, seconds: str, out: Path) -> dict[str, Any]:
     options = {**best_options(parse_duration(seconds)), "training.time": seconds, "training.steps": None}
     config = resolve(FitConfig, assignments=as_assignments(options))
     expected = forecast_fit(config, shards)
-    # As many steps as are forecast, so that the forecast's rate is what is judged.
+    # As many steps as forecast, so that the seconds compare the forecast rate.
     run = resolve(FitConfig, assignments=as_assignments({**options, "training.steps": expected.steps}))
     result = fit(run, shards, out)
     reached = result.errors["test"]["unexplained"]
@@ -77,13 +79,13 @@ def fitted(shards: Path, seconds: str, out: Path) -> dict[str, Any]:
         "seconds": result.seconds,
         "error, forecast": expected.unexplained if expected.unexplained is not None else math.nan,
         "error": math.nan if reached["value"] is None else reached["value"],
-        "error, bar": reached["error"],
+        "error, se": reached["error"],
         "pilots": expected.pilots,
     }
 
 
 def factor(a: float, b: float) -> float:
-    """How far apart two positive numbers are, at least 1; infinite where one is not positive, or unknown."""
+    """Ratio of two positive numbers, at least 1; infinite where one is not positive or unknown."""
     return max(a / b, b / a) if a > 0 and b > 0 else math.inf
 
 
@@ -95,8 +97,8 @@ def best_persistence(fits: list[dict[str, Any]]) -> tuple[float, float]:
         for found in fits:
             doublings = math.log2(found["seconds, forecast"] / PILOT_SECONDS[1])
             short, long = found["pilots"]
-            said = extrapolated(short, long, doublings, persistence=persistence)
-            squares.append(math.log(said / found["error"]) ** 2)
+            forecast = extrapolated(short, long, doublings, persistence=persistence)
+            squares.append(math.log(forecast / found["error"]) ** 2)
         return math.sqrt(sum(squares) / len(squares))
 
     tried = [float(p) for p in np.arange(0.3, 0.99, 0.01)]
@@ -117,7 +119,7 @@ def main() -> int:
         load_mitsuba()
         for name in arguments.materials or [*ASSETS, *HEIGHT_SCALES]:
             if not source(name)[0].is_dir():
-                print(f"{name}: left out, {source(name)[0]} is missing", file=sys.stderr)
+                print(f"{name}: skipped, {source(name)[0]} is missing", file=sys.stderr)
                 continue
             with tempfile.TemporaryDirectory() as work:
                 shards = Path(work) / "shards"
@@ -147,14 +149,16 @@ def main() -> int:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code if isinstance(error, MbtfError) else 2
     rows = [found for parts in figures.values() for found in parts.values()]
-    met = all(found[f"{what}, factor"] <= bar for found in rows for what, bar in BARS.items())
+    met = all(
+        found[f"{what}, factor"] <= threshold for found in rows for what, threshold in THRESHOLDS.items()
+    )
     persistence = best_persistence([f for f in fits if f["error"] > 0]) if fits else None
     if persistence is not None:
         print(
             f"persistence: {persistence[0]} fits these best, a factor {math.exp(persistence[1]):.2f} (RMS); "
             f"the code has {PERSISTENCE}"
         )
-    print(json.dumps({"figures": figures, "persistence": persistence, "bars": BARS, "met": met}))
+    print(json.dumps({"figures": figures, "persistence": persistence, "thresholds": THRESHOLDS, "met": met}))
     return 0 if met else 1
 
 

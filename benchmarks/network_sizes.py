@@ -2,13 +2,13 @@
 
     python benchmarks/network_sizes.py [MATERIAL] [--quality high] [--time 4min] [--size 40x12 ...]
 
-Of a material (of ``assets/`` or of the texture sets that lie beside the project, by name): training data as
-the quality has them, then for each size, features of the hidden layers by channels of the textures, a fit of
-`neumip` as the qualities have it otherwise. Printed: unexplained variance of the same test queries,
-milliseconds for a picture of 1080p, and bytes of the material.
+MATERIAL names one of ``assets/`` or a texture set that lies beside the project. The data set is that of a
+quality preset. Each size, features of the hidden layers by channels of the textures, is fitted with the other
+options of the presets. Prints the unexplained variance of the same test queries, milliseconds for a 1080p
+image, and bytes of the material.
 
-The last line is one JSON object: figures, and the bar: no size that evaluates faster than the one which the
-qualities take after so much training is clearly better than it. Exit code 1 where it is missed.
+The last line is one JSON object with the figures and the threshold: no size that evaluates faster than the
+preset's is significantly better than it. Exit code 1 where one is.
 """
 
 from __future__ import annotations
@@ -29,15 +29,16 @@ from mbtf_core.units import parse_duration
 from mbtf_fit.presets import best_options
 from mbtf_gen.config.generator import count_queries
 from mbtf_gen.config.presets import Quality
-from mbtf_gen.generation import Job
+from mbtf_gen.job import Job
 from mbtf_gen.render.runtime import load_mitsuba
-from mbtf_pipeline.cost_study.runs import Chain, RunRequest, RunRunner
+from mbtf_pipeline.cost_study.runs import DataRequest, Run, RunRunner
 from mbtf_pipeline.run_folder import machine
 
 SIZES = ((25, 7), (40, 12), (64, 16), (96, 24))
-# Standard errors of a difference that make it clear.
-CLEAR = 2.0
-# Relative deviation of such fits between seeds, as `mbtf-pipeline cost` finds it with millions of queries.
+# Standard errors of a significant difference.
+SIGNIFICANT = 2.0
+# Relative standard deviation of such fits over seeds, as `mbtf-pipeline cost` measures it with millions of
+# queries.
 SEEDS = 0.03
 
 
@@ -58,42 +59,41 @@ def measure(
     """A row for each size."""
     config = generator_config(name, quality, levels)
     count = count_queries(config.queries.train, Job.prepare(config).lattice.texels())
-    data = RunRequest(count, config.queries.spp)
-    workshop = RunRunner(config, work, "", lambda note: print(note, file=sys.stderr))
+    data = DataRequest(count, config.queries.spp)
+    runner = RunRunner(config, work, "", lambda note: print(note, file=sys.stderr))
     rows = []
     for width, channels in sizes:
         size = f"{width}x{channels}"
         network = {"network.width": width, "network.channels": channels}
         options = {**best_options(seconds), **network, "training.time": f"{seconds:g}s"}
         fit = nested({"model": "neumip", **options})
-        point = workshop.measure(Chain("fit", "neumip", size, data, fit))
-        size_bytes = point.details["bytes"]
-        evaluation = point.details["evaluation_ms_1080p"]
+        found = runner.measure(Run("models", "neumip", size, data, fit))
+        size_bytes = found.details["bytes"]
+        evaluation = found.details["evaluation_ms_1080p"]
         rows.append(
             {
                 "size": size,
-                "unexplained": point.error.value,
-                "error": point.error.error,
-                "seconds": point.details["training_seconds"],
+                "unexplained": found.error.value,
+                "error": found.error.error,
+                "seconds": found.details["training_seconds"],
                 "evaluation_ms_1080p": evaluation,
                 "bytes": size_bytes,
             }
         )
         print(
-            f"{name} {size:7s} unexplained {point.error}   "
+            f"{name} {size:7s} unexplained {found.error}   "
             f"{evaluation:.0f} ms for 1080p   {size_bytes / 1e6:.2f} MB",
             flush=True,
         )
-    workshop.clear()
+    runner.clear()
     return rows
 
 
-def clearly_better(rows: list[dict[str, Any]], chosen: str) -> list[str]:
-    """Sizes that evaluate faster than the chosen one and leave clearly less, or whose error could not be told
-    from it."""
+def significantly_better(rows: list[dict[str, Any]], chosen: str) -> list[str]:
+    """Sizes that evaluate faster than the chosen one and have a significantly lower or an undefined error."""
     mine = next(row for row in rows if row["size"] == chosen)
 
-    def bar(row: dict[str, Any]) -> float:
+    def total_error(row: dict[str, Any]) -> float:
         return math.hypot(row["error"], SEEDS * row["unexplained"])
 
     return [
@@ -101,7 +101,8 @@ def clearly_better(rows: list[dict[str, Any]], chosen: str) -> list[str]:
         for row in rows
         if row["evaluation_ms_1080p"] < mine["evaluation_ms_1080p"]
         # Not so of NaN either.
-        and not mine["unexplained"] - row["unexplained"] <= CLEAR * math.hypot(bar(mine), bar(row))
+        and not mine["unexplained"] - row["unexplained"]
+        <= SIGNIFICANT * math.hypot(total_error(mine), total_error(row))
     ]
 
 
@@ -118,7 +119,7 @@ def main() -> int:
         seconds = parse_duration(arguments.time)
         best = best_options(seconds)
         chosen = (best["network.width"], best["network.channels"])
-        # The one that the others are held against is always among them.
+        # The others are compared with the chosen one, so it is always measured.
         sizes = list(dict.fromkeys([*(arguments.size or SIZES), chosen]))
         with tempfile.TemporaryDirectory() as work:
             rows = measure(
@@ -132,13 +133,13 @@ def main() -> int:
     except (MbtfError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code if isinstance(error, MbtfError) else 2
-    better = clearly_better(rows, "{}x{}".format(*chosen))
+    better = significantly_better(rows, "{}x{}".format(*chosen))
     print(
         json.dumps(
             {
                 "figures": rows,
                 "chosen": chosen,
-                "bars": {"clearly_better_and_faster": []},
+                "thresholds": {"significantly_better_and_faster": []},
                 "met": not better,
                 "machine": machine(),
             }

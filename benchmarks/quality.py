@@ -1,7 +1,7 @@
 """Time, error and size of the quality presets: whole runs, from height map to report.
 
-    python benchmarks/quality.py --out FOLDER [--only MATERIAL:QUALITY ...] [--resolution 128]
-                                 [--store] [--check]
+    python benchmarks/quality.py --out FOLDER [--only MATERIAL:QUALITY ...] [--store] [--check]
+    python benchmarks/quality.py --table
 
 Runs ``mbtf-pipeline run --quality`` in a process of its own: ``draft`` and ``standard`` on six texture sets
 that lie beside the project, ``high`` on one of them. ``paper`` needs a GPU and is not run. ``--only``
@@ -39,7 +39,7 @@ from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.config.presets import GENERATOR, Quality, as_assignments
 from mbtf_pipeline.presets import COMPARE
 from mbtf_pipeline.run_folder import machine
-from mbtf_pipeline.stages import hash_of
+from mbtf_core.digest import data_sha256
 
 ROOT = Path(__file__).resolve().parents[1]
 TEXTURE_SETS = ROOT.parent / "shared" / "data" / "materials"
@@ -116,7 +116,7 @@ def settings_hash(quality: Quality) -> str:
     """Hash of all options of a preset and of the fitter's other training options."""
     options = best_at(quality) | FITTER[quality]
     training = resolve(FitConfig, assignments=as_assignments(options)).training.model_dump(mode="json")
-    return hash_of([GENERATOR[quality], options, training, COMPARE[quality]])[:12]
+    return data_sha256([GENERATOR[quality], options, training, COMPARE[quality]])[:12]
 
 
 def generator_config(name: str, quality: Quality, resolution: int) -> GeneratorConfig:
@@ -143,7 +143,9 @@ def run(name: str, quality: Quality, resolution: int, work: Path) -> MeasuredRun
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True)
     recipe, out = work / "recipe.yaml", work / "run"
-    text = RECIPE.format(material=json.dumps(str(material)), resolution=resolution, height=json.dumps(height))
+    text = RECIPE.format(
+        material=json.dumps(str(material)), resolution=resolution, height=json.dumps(height)
+    )
     recipe.write_text(text, encoding="utf-8")
     command = [sys.executable, "-m", "mbtf_pipeline", "run", str(recipe), "--quality", quality]
     command += ["-o", str(out), "--json", "--quiet"]

@@ -1,14 +1,13 @@
-"""Many noisy queries or few clean ones? Held-out error of a fit at equal numbers of paths.
+"""Many noisy queries or few clean ones? Test error of a fit at equal total paths.
 
     python benchmarks/query_split.py [MATERIAL ...] [--paths 1.6e6 --paths 6.4e6] [--spp 2 ...] [--steps N]
                                      [--resolution 64] [--height-scale H] [--keep FILE] [--plot FILE]
 
-For every material (by default three of ``assets/``), budget of paths and number of paths per query a data set
-is made, a ``neumip`` trained on it for the same number of steps, and judged by test queries that all share.
-No figure depends on the machine's speed. At 64² texels the larger of the default budgets is that of the
-quality ``draft``. Prints the unexplained variance, and for each budget the number of paths per query
-that left least. ``--keep`` writes every point to a file as soon as it is measured, and takes over those that
-stand there already, so that a run may be interrupted.
+For every material (by default three of ``assets/``), total of paths and number of paths per query, a data set
+is generated and ``neumip`` is trained on it for the same number of steps. All fits are evaluated on the same
+test queries. No figure depends on the machine's speed. At 64² texels the larger of the default totals is that
+of the preset ``draft``. Prints the unexplained variance, and for each total the number of paths per query
+with the lowest one. ``--keep FILE`` stores every measurement, so that the same command resumes.
 
 The last line is one JSON object.
 """
@@ -26,20 +25,20 @@ from typing import Any
 
 from mbtf_core.errors import MbtfError
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_pipeline.cost_study.measurements import POINT_SCHEMA
-from mbtf_pipeline.cost_study.runs import Chain, RunRequest, RunRunner
+from mbtf_pipeline.cost_study.measurements import SCHEMA
+from mbtf_pipeline.cost_study.runs import DataRequest, Run, RunRunner
 from mbtf_pipeline.report.plots import Cloud, scatter
 
 ROOT = Path(__file__).resolve().parents[1]
 ASSETS = ("cliff_rock", "straight_wool", "turtle_shell")
 SPP = (2, 4, 8, 16, 64, 256)
 PATHS = (1.6e6, 6.4e6)
-# What makes a point another one.
+# What identifies a measurement.
 KEY = ("material", "height", "levels", "steps", "paths", "spp", "schema")
 
 
 class Kept:
-    """Points that were measured, one JSON object per line of a file; nothing is kept without one."""
+    """Measurements, one JSON object per line of a file; not stored without one."""
 
     def __init__(self, path: Path | None) -> None:
         self._path = path
@@ -51,11 +50,11 @@ class Kept:
         return tuple(row.get(name) for name in KEY)
 
     def find(self, row: dict[str, Any]) -> dict[str, Any] | None:
-        """The point of a key, if it was measured before."""
+        """The stored measurement of a key."""
         return self._rows.get(self._key(row))
 
     def add(self, row: dict[str, Any]) -> None:
-        """Keep a point."""
+        """Store a measurement."""
         self._rows[self._key(row)] = row
         if self._path is not None:
             with self._path.open("a", encoding="utf-8") as stream:
@@ -66,12 +65,12 @@ def measure(
     material: Path,
     height: float | None,
     levels: int,
-    budgets: Sequence[float],
+    totals: Sequence[float],
     spps: Sequence[int],
     steps: int,
     kept: Kept,
 ) -> list[dict[str, Any]]:
-    """One row per budget and number of paths per query."""
+    """One row per total and number of paths per query."""
     config = GeneratorConfig.model_validate(
         {
             "material": str(material),
@@ -82,24 +81,24 @@ def measure(
     rows = []
     fit = {"model": "neumip", "training": {"steps": steps}}
     with tempfile.TemporaryDirectory() as work:
-        shop = RunRunner(
+        runner = RunRunner(
             config, Path(work), "", lambda note: print(f"{material.name}: {note}", file=sys.stderr)
         )
-        for budget in budgets:
+        for total in totals:
             for spp in spps:
-                values = (material.name, height, levels, steps, int(budget), spp, POINT_SCHEMA)
+                values = (material.name, height, levels, steps, int(total), spp, SCHEMA)
                 key = dict(zip(KEY, values, strict=True))
                 row = kept.find(key)
                 if row is None:
-                    data = RunRequest(max(1, int(budget) // spp), spp)
-                    point = shop.measure(Chain("data", f"{budget:g} paths", f"{spp}", data, fit))
-                    shop.forget(data)
-                    row = {**key, "queries": data.queries, "unexplained": point.error.as_dict()}
+                    data = DataRequest(max(1, int(total) // spp), spp)
+                    found = runner.measure(Run("data", f"{total:g} paths", f"{spp}", data, fit))
+                    runner.forget(data)
+                    row = {**key, "queries": data.queries, "unexplained": found.error.as_dict()}
                     kept.add(row)
                 rows.append(row)
                 left = row["unexplained"]
                 print(
-                    f"{material.name:16s} {budget / 1e6:6.1f} M paths  {spp:4d} per query  "
+                    f"{material.name:16s} {total / 1e6:6.1f} M paths  {spp:4d} per query  "
                     f"{left['value']:.4f} ± {left['error']:.4f}",
                     flush=True,
                 )
@@ -107,7 +106,7 @@ def measure(
 
 
 def best(rows: Sequence[dict[str, Any]]) -> dict[str, int]:
-    """Number of paths per query that left least, by material and budget."""
+    """Number of paths per query with the lowest error, by material and total paths."""
     found: dict[str, dict[str, Any]] = {}
     for row in rows:
         key = f"{row['material']} {row['paths'] / 1e6:g}M"
@@ -118,7 +117,7 @@ def best(rows: Sequence[dict[str, Any]]) -> dict[str, int]:
 
 
 def plot(rows: Sequence[dict[str, Any]], path: Path) -> None:
-    """Unexplained variance over paths per query, a line per material and budget."""
+    """Unexplained variance over paths per query, a line per material and total paths."""
     clouds = []
     for key in dict.fromkeys((r["material"], r["paths"]) for r in rows):
         part = [r for r in rows if (r["material"], r["paths"]) == key]
@@ -138,12 +137,12 @@ def plot(rows: Sequence[dict[str, Any]], path: Path) -> None:
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("materials", nargs="*", type=Path)
-    parser.add_argument("--paths", type=float, action="append", help="budget of paths; repeatable")
+    parser.add_argument("--paths", type=float, action="append", help="total of paths; repeatable")
     parser.add_argument("--spp", type=int, action="append", help="paths per query; repeatable")
     parser.add_argument("--steps", type=int, default=400, help="training steps of each fit")
     parser.add_argument("--resolution", type=int, default=64, help="texels across, a power of two")
     parser.add_argument("--height-scale", type=float, help="factor on the stored heights")
-    parser.add_argument("--keep", type=Path, help="file of the points that were measured, to go on from")
+    parser.add_argument("--keep", type=Path, help="file of the points that were measured, to resume")
     parser.add_argument("--plot", type=Path, help="PNG of the table")
     arguments = parser.parse_args()
     rows: list[dict[str, Any]] = []
@@ -164,7 +163,7 @@ def main() -> int:
         return error.exit_code if isinstance(error, MbtfError) else 2
     if arguments.plot is not None:
         plot(rows, arguments.plot)
-    print(json.dumps({"figures": rows, "least_error_at": best(rows), "bars": {}, "met": None}))
+    print(json.dumps({"figures": rows, "least_error_at": best(rows), "thresholds": {}, "met": None}))
     return 0
 
 

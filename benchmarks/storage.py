@@ -20,7 +20,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from mbtf_core.atomic import digest
+from mbtf_core.digest import file_sha256
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.dataset.verify import verify
 from mbtf_gen.generation import generate
@@ -40,7 +40,7 @@ def plainly(paths: list[Path]) -> None:
 
 def digested(paths: list[Path]) -> None:
     for path in paths:
-        digest(path)
+        file_sha256(path)
 
 
 def intact(folder: Path) -> None:

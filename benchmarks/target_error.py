@@ -32,9 +32,11 @@ from numpy.typing import NDArray
 
 from mbtf_core.errors import MbtfError
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.generation import Job, plan_run
-from mbtf_gen.planning.adaptive import Target, estimate_shard, round_up
-from mbtf_gen.render.estimates import Stream
+from mbtf_gen.job import Job
+from mbtf_gen.planning.adaptive import estimate_shard, round_up
+from mbtf_gen.planning.run_plan import plan_run
+from mbtf_gen.planning.simulation import build_estimator
+from mbtf_gen.render.estimates import Stream, Target
 
 ROOT = Path(__file__).resolve().parents[1]
 POLISHED = "height: {height}\nroughness: 0.2\nmetallic: 1.0\n"
@@ -62,10 +64,10 @@ def measure(
     )
     job = Job.prepare(config)
     plan = plan_run(job)
-    estimator, q = job.estimator(plan), job.plan().draw("train", 0, n)
+    estimator, q = build_estimator(job, plan.effects), job.query_plan.draw("train", 0, n)
     assert plan.allocation is not None
     tile_mean = plan.allocation.tile_mean(q)
-    found = estimate_shard(estimator, q, 4, Target(error, cap), Stream(0, "train", 0), plan)
+    found = estimate_shard(estimator, q, 4, Target(error, cap), Stream(0, "train", 0), plan.allocation)
     assert found.spp is not None
     assert found.target is not None
     means, variances = [], []

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from mbtf_core.digest import file_sha256
 from mbtf_core.errors import InputError, PartialError, reason
 
 CHECKSUM = "checksum"
@@ -146,7 +147,7 @@ def write_through(path: Path, write: Callable[[Path], None]) -> Stored:
         write(temporary)
         with temporary.open("rb+") as stream:
             os.fsync(stream.fileno())
-        stored = Stored(temporary.stat().st_size, digest(temporary))
+        stored = Stored(temporary.stat().st_size, file_sha256(temporary))
         _replace(temporary, path)
     return stored
 
@@ -286,9 +287,3 @@ def read_json(path: Path) -> dict[str, Any]:
 
 def _refuse_constant(name: str) -> None:
     raise ValueError(f"{name} is no number of JSON")
-
-
-def digest(path: Path) -> str:
-    """SHA-256 of a file, in hexadecimal (what ``sha256sum`` prints)."""
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -24,6 +24,27 @@ SPLITS: tuple[Split, ...] = ("train", "test")
 
 
 @dataclass(frozen=True)
+class ShardEntry:
+    """A shard of a data set, rendered or not.
+
+    Attributes
+    ----------
+    split : {"train", "test"}
+    index : int
+        Its number within the split, from 0.
+    file : str
+        Its file name.
+    rows : int
+        Its queries, or its images in the image layout.
+    """
+
+    split: Split
+    index: int
+    file: str
+    rows: int
+
+
+@dataclass(frozen=True)
 class ArraySpec:
     """One stored array: its trailing shape after the query axes, its unit, its meaning, its EXR channels."""
 

@@ -1,14 +1,28 @@
-"""Values as people write them: durations such as ``90s``, ``2min``, ``1h``, and lists such as ``1,2,4``."""
+"""Values as people write them: durations (``90s``, ``2min``), sizes (``500MB``), lists (``1,2,4``)."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from typing import Any
 
 from mbtf_core.errors import UsageError
 
-_DURATION = re.compile(r"^\s*(\d+(?:\.\d+)?)\s*(s|sec|min|m|h)?\s*$")
-_SECONDS = {"s": 1.0, "sec": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0, None: 1.0}
+# Larger units first; a number without a unit counts seconds or bytes.
+_SECONDS = {"h": 3600.0, "min": 60.0, "m": 60.0, "sec": 1.0, "s": 1.0}
+_BYTES = {"TB": 1e12, "GB": 1e9, "MB": 1e6, "kB": 1e3, "KB": 1e3, "B": 1.0}
+
+
+def _parse(text: str | float, units: Mapping[str, float], expected: str) -> float:
+    match = re.fullmatch(rf"\s*(\d+(?:\.\d+)?(?:e\d+)?)\s*({'|'.join(units)})?\s*", str(text))
+    if match is None:
+        raise ValueError(f"must be {expected}")
+    return float(match[1]) * units.get(match[2], 1.0)
+
+
+def _format(number: float, units: Mapping[str, float], default: str) -> str:
+    unit = next((u for u, size in units.items() if number >= size > 1 and number % size == 0), None)
+    return f"{number:g}{default}" if unit is None else f"{number / units[unit]:g}{unit}"
 
 
 def parse_duration(text: str | float) -> float:
@@ -18,10 +32,7 @@ def parse_duration(text: str | float) -> float:
     ------
     ValueError : none of these, or not positive
     """
-    match = _DURATION.match(str(text))
-    if match is None:
-        raise ValueError("must be a duration such as 90s, 2min or 1h")
-    seconds = float(match[1]) * _SECONDS[match[2]]
+    seconds = _parse(text, _SECONDS, "a duration such as 90s, 2min or 1h")
     if not 0 < seconds <= 1e7:
         raise ValueError("must be a positive duration of at most 1e7 seconds")
     return seconds
@@ -42,10 +53,25 @@ def asked_duration(text: str, flag: str) -> float:
 
 def format_duration(seconds: float) -> str:
     """``90s``, ``2min``, ``1h``: the largest unit that needs no fraction."""
-    for unit, size in (("h", 3600.0), ("min", 60.0)):
-        if seconds >= size and seconds % size == 0:
-            return f"{seconds / size:g}{unit}"
-    return f"{seconds:g}s"
+    return _format(seconds, _SECONDS, "s")
+
+
+def parse_size(text: str | float) -> float:
+    """Bytes of ``"500MB"``, ``"4GB"``, or of a plain number of bytes; decimal units.
+
+    Raises
+    ------
+    ValueError : none of these, or not positive
+    """
+    size = _parse(text, _BYTES, "an amount of memory such as 500MB or 4GB")
+    if not 0 < size <= 1e18:
+        raise ValueError("must be a positive amount of memory")
+    return size
+
+
+def format_size(size: float) -> str:
+    """``500MB``, ``4GB``: the largest unit that needs no fraction."""
+    return _format(size, _BYTES, "")
 
 
 def parse_numbers(value: Any) -> Any:

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, PlainSerializer, model_validator
 
 from mbtf_core.config_file import Settings, deep_merge
+from mbtf_core.digest import data_sha256
 from mbtf_core.options import Flag
-from mbtf_core.sizes import format_size, parse_size
-from mbtf_core.units import format_duration, parse_duration
+from mbtf_core.units import format_duration, format_size, parse_duration, parse_size
 
 ModelName = Literal["neumip-baseline", "neumip", "hierarchical"]
 OutputTransform = Literal["expm1", "exp", "identity", "softplus", "fourth-root"]
@@ -262,5 +260,4 @@ class FitConfig(Settings):
 
     def hash(self, data_hash: str) -> str:
         """SHA-256 over :meth:`fields` and the data set's own hash, hexadecimal."""
-        text = json.dumps({**self.fields(), "data": data_hash}, sort_keys=True, separators=(",", ":"))
-        return hashlib.sha256(text.encode()).hexdigest()
+        return data_sha256({**self.fields(), "data": data_hash})

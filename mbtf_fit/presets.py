@@ -1,4 +1,4 @@
-"""Options of the fitter by quality preset; see :mod:`mbtf_gen.config.presets`."""
+"""The fitter's options of each quality preset; see :mod:`mbtf_gen.config.presets`."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from mbtf_core.config_file import merge, read_yaml
 from mbtf_core.units import parse_duration
 from mbtf_gen.config.presets import Quality
 
-# Network sizes by training time in seconds. With directions of three coordinates and smooth textures they
-# reached the lowest error for their time in cost studies of four materials.
+# Options of least error per time in the cost studies: larger networks and textures than the paper's, growing
+# with the training time (seconds), directions with z, and smooth textures where data are few.
 _SIZES = (
     (0.0, {"network.width": 40, "network.channels": 12}),
     (300.0, {"network.width": 64, "network.channels": 16}),
 )
-_DIRECTIONS: dict[str, Any] = {"network.encoding.direction_xyz": True}
-_SMOOTHING: dict[str, Any] = {"training.texture_weight_decay": 1.0, "training.blur.min_sigma": 0.8}
-# Models that these options were measured for.
+_XYZ: dict[str, Any] = {"network.encoding.direction_xyz": True}
+_SMOOTH: dict[str, Any] = {"training.texture_weight_decay": 1.0, "training.blur.min_sigma": 0.8}
+# Models of those studies.
 _MODELS = ("neumip", "neumip-baseline")
 
-# Training times.
+# Budget of each preset.
 FITTER: dict[Quality, dict[str, Any]] = {
     "draft": {"training.time": "20s", "training.steps": None},
     "standard": {"training.time": "3min", "training.steps": None},
@@ -34,38 +34,37 @@ FITTER: dict[Quality, dict[str, Any]] = {
 
 def _network(seconds: float) -> dict[str, Any]:
     size = [size for least, size in _SIZES if seconds >= least][-1]
-    return size | _DIRECTIONS
+    return size | _XYZ
 
 
 def best_options(seconds: float) -> dict[str, Any]:
-    """Network and smoothing of `neumip` and its baseline, dotted names, for a training time in seconds on two
-    processor cores."""
-    return _network(seconds) | _SMOOTHING
+    """Network and smoothing options of `neumip` and its baseline, dotted names, for a training time (seconds)
+    on two processor cores."""
+    return _network(seconds) | _SMOOTH
 
 
 def best_at(quality: Quality) -> dict[str, Any]:
-    """:func:`best_options` for the training time of a preset."""
+    """:func:`best_options` for the training time of a quality preset."""
     return best_options(_seconds(quality))
 
 
 def _seconds(quality: Quality) -> float:
-    """Training time of a preset; infinite where it counts steps."""
+    """Training time in seconds; infinite where the budget is a number of steps."""
     training = FITTER[quality].get("training.time")
     return math.inf if training is None else parse_duration(training)
 
 
 def fitter_options(quality: Quality, fits: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Options of fits at a preset, dotted names: the training time, and for `neumip` and its baseline those
-    options of :func:`best_at` that the user does not set.
+    """Options of fits at a quality preset, dotted names: their budget, and for `neumip` and its baseline
+    :func:`best_at`. Explicit values override the preset.
 
-    If the user sets any option of one fit's network, all fits keep their own networks: such recipes compare
-    networks.
+    If any fit sets a network option, all keep the networks of their papers, so that they can be compared.
 
     Parameters
     ----------
-    fits : by name, the options that files and command line set for each fit, nested, with its model
+    fits : name → explicit options of files and command line, nested, with the model
     """
-    free = not any("network" in given or given.get("start") for given in fits.values())
+    free = not any("network" in given or given.get("init_from") for given in fits.values())
     out = {}
     for name, given in fits.items():
         training = given.get("training")
@@ -73,13 +72,13 @@ def fitter_options(quality: Quality, fits: Mapping[str, Mapping[str, Any]]) -> d
         options: dict[str, Any] = {}
         if given.get("model") in _MODELS:
             options |= _network(_seconds(quality)) if free else {}
-            options |= {k: v for k, v in _SMOOTHING.items() if k.split(".")[1] not in training}
+            options |= {k: v for k, v in _SMOOTH.items() if k.split(".")[1] not in training}
         out[name] = options | FITTER[quality]
     return out
 
 
 def overrides_of(file: Path | None, assignments: Sequence[str]) -> dict[str, Any]:
-    """Options that a configuration file and ``a.b=c`` set, nested; values of the latter as text.
+    """Options of a configuration file and of ``a.b=c``, nested; values of the latter as text.
 
     Raises
     ------

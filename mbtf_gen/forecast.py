@@ -1,4 +1,4 @@
-"""What a run will take and give, from a pilot on this very machine, before it starts."""
+"""Predicts time, disk space and noise of a run, by a pilot on this machine."""
 
 from __future__ import annotations
 
@@ -9,23 +9,22 @@ import tempfile
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.console import clock
-from mbtf_core.shard_schema import ARRAYS, SPLITS, Split
+from mbtf_core.shard_schema import ARRAYS, Split
 from mbtf_core.stats import pooled_error
 from mbtf_gen.dataset.shard_io import write_shard
-from mbtf_gen.planning.adaptive import Target, estimate_shard
-from mbtf_gen.planning.effects import EffectsPlan
+from mbtf_gen.job import Job, split_queries, split_spp, split_target
+from mbtf_gen.planning.adaptive import estimate_shard
 from mbtf_gen.planning.pilot import pilot_queries
-from mbtf_gen.render.estimates import Estimates, Stream
+from mbtf_gen.planning.run_plan import RunPlan
+from mbtf_gen.planning.simulation import build_estimator
+from mbtf_gen.render.estimates import Estimates, Stream, Target
 from mbtf_gen.sampling.query_sampler import Queries
-
-if TYPE_CHECKING:
-    from mbtf_gen.generation import Job
 
 # Paths of one piece of the pilot, and the fewest pieces that are timed.
 _PIECE_PATHS = 1 << 19
@@ -34,21 +33,32 @@ _FEWEST = 3
 
 @dataclass(frozen=True)
 class Forecast:
-    """What is expected of a run.
+    """Prediction for a run.
 
     Attributes
     ----------
-    seconds : of tracing, once kernels are compiled, and what drawing queries and writing take beside it
-    start : of loading, compiling and the pilot's first piece
-    query_seconds : of a training query, all told
-    paths : of all splits, under a target error with those of the queries' own pilots
-    paths_per_second : of the training split, in the pilot
-    paths_per_query : mean over the training split, pilots not counted
-    missed : share of training queries that the cap on paths keeps from the target error; 0 without one
-    bytes : of all shards
-    relative_error : RMS noise of one training value relative to the mean value, as a run's summary has it
-    relative_error_se : its standard error
-    pilot_seconds : what the forecast took
+    seconds : float
+        Of tracing with compiled kernels, and of sampling queries and writing shards.
+    start : float
+        Seconds of loading, compiling and the pilot's first piece.
+    query_seconds : float
+        Total seconds per training query.
+    paths : int
+        Of all splits, including the queries' own pilots under a target error.
+    paths_per_second : float
+        Of the training split, in the pilot.
+    paths_per_query : float
+        Mean over the training split, without pilots.
+    missed : float
+        Share of training queries that miss the target error because of the cap on paths; 0 without a target.
+    bytes : int
+        Of all shards.
+    relative_error : float
+        RMS noise of one training value relative to the mean value, as in a run's summary.
+    relative_error_se : float
+        Its standard error.
+    pilot_seconds : float
+        Duration of the forecast.
     """
 
     seconds: float
@@ -72,7 +82,9 @@ class Forecast:
         )
         if target is None:
             return line
-        missed = f"; {self.missed:.1%} of the queries stop at the cap of {target.cap}" if self.missed else ""
+        missed = (
+            f"; {self.missed:.1%} of the queries stop at the cap of {target.max_spp}" if self.missed else ""
+        )
         need = f"{self.paths_per_query:.0f} paths per training query for an error of {target.error:.2%}"
         return f"{line}\n  {need} of max(value, tile mean){missed}"
 
@@ -93,14 +105,13 @@ def size_text(size: float) -> str:
 
 def row_bytes(holes: bool) -> int:
     """Bytes of one query in a shard."""
-    wanted = [a for a in ARRAYS if holes or not a.optional]
-    return sum(4 * max(1, math.prod(a.trailing)) for a in wanted)
+    return sum(4 * max(1, math.prod(a.trailing)) for a in ARRAYS if holes or not a.optional)
 
 
 @dataclass(frozen=True)
 class _Piece:
-    """What one piece of a pilot took and gave: queries, paths in all and those that would be stored, queries
-    that missed a target, seconds of tracing, of drawing queries and writing, both halves."""
+    """One piece of a pilot: queries, paths in total and those of stored values, queries that missed a target,
+    seconds of tracing, seconds of sampling queries and writing, both halves."""
 
     queries: int
     paths: int
@@ -112,59 +123,66 @@ class _Piece:
     value_b: NDArray[np.float32]
 
 
-def forecast(job: Job, plan: EffectsPlan, seconds: float = 2.0) -> Forecast:
-    """Trace a little of each split and say what all of it will take.
+def forecast(job: Job, plan: RunPlan, seconds: float = 2.0) -> Forecast:
+    """Trace a small part of each split and extrapolate.
 
     Parameters
     ----------
-    plan : effects of the run, with its allocation where the run has a target error
-    seconds : spent on the training split at most, beyond the first pieces
+    job : Job
+        The run.
+    plan : RunPlan
+        Its plan.
+    seconds : float
+        Time spent on the training split at most, after the first pieces.
+
+    Returns
+    -------
+    Forecast
     """
     began = time.perf_counter()
-    estimator = job.estimator(plan)
-    target = job.target("train")
-    first = _piece(
-        job, plan, estimator, "train", 0, _PIECE_PATHS // (job.spp("train") if target is None else target.cap)
-    )
+    estimator = build_estimator(job, plan.effects)
+    target = split_target(job.config, "train")
+    first_spp = split_spp(job.config, "train") if target is None else target.max_spp
+    first = _piece(job, plan, estimator, "train", 0, _PIECE_PATHS // first_spp)
     start = time.perf_counter() - began
-    # A target error takes other numbers of paths.
+    # Under a target error the first piece has traced fewer paths.
     size = max(1, _PIECE_PATHS * first.queries // max(first.paths, 1))
     train = _pilot(job, plan, estimator, "train", seconds, size)
     a, b = (np.concatenate([getattr(p, name) for p in train]) for name in ("value_a", "value_b"))
     mean = 0.5 * float(np.mean(a, dtype=np.float64) + np.mean(b, dtype=np.float64))
     error = pooled_error(a, b).scaled(1.0 / mean if mean > 0 else 0.0)
-    tried = sum(p.queries for p in train)
-    paths = round(job.queries("train") * sum(p.paths for p in train) / tried)
+    traced, count = sum(p.queries for p in train), split_queries(job, "train")
+    paths = round(count * sum(p.paths for p in train) / traced)
     rate = statistics.median(p.paths / p.seconds for p in train)
     each = _query_seconds(train)
-    took = each * job.queries("train")
-    if test := job.queries("test") * job.spp("test"):
-        part = _pilot(job, plan, estimator, "test", 0.25 * seconds, _PIECE_PATHS // job.spp("test"))
-        took += _query_seconds(part) * job.queries("test")
-    queries = sum(job.queries(split) for split in SPLITS)
+    total = each * count
+    test_spp, test_count = split_spp(job.config, "test"), split_queries(job, "test")
+    if test_count:
+        part = _pilot(job, plan, estimator, "test", 0.25 * seconds, _PIECE_PATHS // test_spp)
+        total += _query_seconds(part) * test_count
     return Forecast(
-        seconds=took,
+        seconds=total,
         start=start,
         query_seconds=each,
-        paths=paths + test,
+        paths=paths + test_count * test_spp,
         paths_per_second=rate,
-        paths_per_query=sum(p.stored for p in train) / tried,
-        missed=sum(p.missed for p in train) / tried,
-        bytes=queries * row_bytes(plan.on("opacity")),
+        paths_per_query=sum(p.stored for p in train) / traced,
+        missed=sum(p.missed for p in train) / traced,
+        bytes=(count + test_count) * row_bytes(plan.effects.on("opacity")),
         relative_error=error.value,
         relative_error_se=error.error,
         pilot_seconds=time.perf_counter() - began,
     )
 
 
-def _piece(job: Job, plan: EffectsPlan, estimator: Any, split: Split, number: int, count: int) -> _Piece:
-    """About `count` queries of a split, estimated as the run does, from streams of the pilot's own."""
-    spp, target = job.spp(split), job.target(split)
+def _piece(job: Job, plan: RunPlan, estimator: Any, split: Split, number: int, count: int) -> _Piece:
+    """About `count` queries of a split, estimated as in the run, from the pilot's random streams."""
+    spp, target = split_spp(job.config, split), split_target(job.config, split)
     start = time.perf_counter()
-    queries = pilot_queries(job, max(1, min(count, job.queries(split))), number)
+    queries = pilot_queries(job, max(1, min(count, split_queries(job, split))), number)
     stream = Stream(job.config.seed, "pilot", number)
     drawn = time.perf_counter()
-    found = estimate_shard(estimator, queries, spp, target, stream, plan)
+    found = estimate_shard(estimator, queries, spp, target, stream, plan.allocation)
     traced = time.perf_counter()
     _write(queries, found)
     beside = drawn - start + time.perf_counter() - traced
@@ -176,8 +194,7 @@ def _piece(job: Job, plan: EffectsPlan, estimator: Any, split: Split, number: in
 
 
 def _query_seconds(pieces: list[_Piece]) -> float:
-    """Seconds of a query: tracing keeps all processors busy, so what is drawn and written beside it takes its
-    time from them, shared among them."""
+    """Seconds of a query. Tracing uses all processors, so one of them samples and writes at its expense."""
     cores = os.cpu_count() or 1
     tracing = statistics.median(p.seconds / p.queries for p in pieces)
     beside = statistics.median(p.beside / p.queries for p in pieces)
@@ -185,7 +202,7 @@ def _query_seconds(pieces: list[_Piece]) -> float:
 
 
 def _write(queries: Queries, found: Estimates) -> None:
-    """Write a piece as a shard is written, and forget it."""
+    """Write a piece like a shard, and delete it."""
     arrays = {
         "u": queries.u,
         "sigma": queries.sigma,
@@ -199,13 +216,11 @@ def _write(queries: Queries, found: Estimates) -> None:
         write_shard(Path(folder) / "piece.npz", arrays)
 
 
-def _pilot(
-    job: Job, plan: EffectsPlan, estimator: Any, split: Split, seconds: float, size: int
-) -> list[_Piece]:
+def _pilot(job: Job, plan: RunPlan, estimator: Any, split: Split, seconds: float, size: int) -> list[_Piece]:
     """Pieces of a split of about `size` queries each."""
     began = time.perf_counter()
     pieces: list[_Piece] = []
     while len(pieces) < _FEWEST or time.perf_counter() - began < seconds:
-        # Piece 0 has warmed up.
+        # Piece 0 was the warm-up.
         pieces.append(_piece(job, plan, estimator, split, len(pieces) + 1, size))
     return pieces

@@ -1,8 +1,8 @@
-"""Makes again what ``verify`` condemns, and nothing else.
+"""Restores what ``verify`` finds missing or corrupt, and nothing else.
 
-What the data set is, its manifest says. Where that is damaged too, sidecars bear witness: each carries the
-hash of the configuration and the digest of the effects plan, so that a manifest made anew from
-``config.yaml`` and the material is known to be the lost one, or refused.
+The manifest describes the data set. If it is corrupt, the sidecars replace it as evidence. Each contains the
+hash of the configuration and the digest of the run plan. A manifest rebuilt from ``config.yaml`` and the
+material is accepted only if both match.
 """
 
 from __future__ import annotations
@@ -20,27 +20,41 @@ from mbtf_core.atomic import read_checksummed, read_json, write_checksummed, wri
 from mbtf_core.config_file import differences, dump_yaml, in_short, read_yaml
 from mbtf_core.errors import InputError, MbtfError, PartialError
 from mbtf_core.locks import brief_lock
-from mbtf_core.shard_schema import CONFIG_NAME, FORMAT_NAME, MANIFEST_NAME, SPLITS
+from mbtf_core.shard_schema import CONFIG_NAME, FORMAT_NAME, MANIFEST_NAME, ShardEntry
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.dataset.manifest import ShardEntry, build_manifest, effects_digest
+from mbtf_gen.dataset.manifest import build_manifest, plan_digest
 from mbtf_gen.dataset.reader import Dataset
-from mbtf_gen.dataset.render_shards import ProgressCallback, busy_message, make_shards
-from mbtf_gen.dataset.summary import finish, planned_effects
+from mbtf_gen.dataset.render_shards import ProgressCallback, busy_message, render_shards
+from mbtf_gen.dataset.summary import finish, read_run_plan
 from mbtf_gen.dataset.verify import Fault, shard_faults, verify
-from mbtf_gen.generation import Job, plan_run
-from mbtf_gen.planning.effects import EffectsPlan
+from mbtf_gen.job import Job, planned_paths
+from mbtf_gen.planning.run_plan import RunPlan, plan_run
 
 _AGAIN = "generate the data set again, into another folder"
 
 
 @dataclass(frozen=True)
 class RepairResult:
-    """What a repair did.
+    """Result of a repair.
 
     Attributes
     ----------
-    shards : files made again; documents : manifest and configuration, where they were written again
-    left : faults that are not ours to mend: files that the manifest does not list
+    folder : str
+        The data set.
+    faults : list of Fault
+        Faults before the repair.
+    shards : list of str
+        Files of the shards that were rendered again.
+    documents : list of str
+        Manifest and configuration, if they were written again.
+    left : list of Fault
+        Faults that remain: files that the manifest does not list.
+    complete : bool
+        Whether all shards are finished now.
+    paths : int
+        Paths traced.
+    seconds : float
+        Duration of the rendering.
     """
 
     folder: str
@@ -55,16 +69,16 @@ class RepairResult:
 
 @dataclass
 class Corruption:
-    """What is wrong with a data set and how it is mended; :meth:`mend` does it.
+    """The faults of a data set and how to repair them; :meth:`repair` does.
 
     Parameters
     ----------
-    folder : the data set's
-    material : where its material lies now; by default where it lay when the data set was made
+    folder : of the data set
+    material : current path of its material; by default the path in its configuration
 
     Raises
     ------
-    InputError : no data set there
+    InputError : no data set
     """
 
     folder: Path
@@ -73,12 +87,12 @@ class Corruption:
     def __post_init__(self) -> None:
         if not self.folder.is_dir():
             raise InputError("no such folder", where=self.folder)
-        if not (self.folder / MANIFEST_NAME).exists() and self._witness[0] is None:
+        if not (self.folder / MANIFEST_NAME).exists() and self._evidence[0] is None:
             Dataset.open(self.folder)
 
     @cached_property
     def faults(self) -> list[Fault]:
-        """What :func:`verify` finds; of a data set whose manifest cannot be read, that."""
+        """The faults that :func:`verify` finds, or that the manifest cannot be read."""
         try:
             return verify(self.folder)
         except InputError as error:
@@ -86,15 +100,15 @@ class Corruption:
 
     @cached_property
     def _manifest(self) -> dict[str, Any] | None:
-        """The manifest, if it is as it was written."""
+        """The manifest, if it is intact."""
         try:
             return read_checksummed(self.folder / MANIFEST_NAME)
         except InputError:
             return None
 
     @cached_property
-    def _witness(self) -> tuple[str | None, str | None]:
-        """Hash of the configuration and digest of the effects plan, as most of the intact sidecars say."""
+    def _evidence(self) -> tuple[str | None, str | None]:
+        """Hash of the configuration and digest of the run plan, by majority of the intact sidecars."""
         seen: Counter[tuple[str, str]] = Counter()
         for path in self.folder.glob("*-*.json"):
             try:
@@ -102,11 +116,11 @@ class Corruption:
             except InputError:
                 continue
             if record.get("format") == FORMAT_NAME:
-                seen[str(record.get("config_hash")), str(record.get("effects"))] += 1
+                seen[str(record.get("config_hash")), str(record.get("plan"))] += 1
         return seen.most_common(1)[0][0] if seen else (None, None)
 
     def _configurations(self) -> Iterator[GeneratorConfig]:
-        """Configurations that are still legible, the manifest's first."""
+        """Configurations that can be read, the manifest's first."""
         stored: list[Any] = []
         for path in (self.folder / MANIFEST_NAME, self.folder / CONFIG_NAME):
             try:
@@ -124,16 +138,16 @@ class Corruption:
 
     @cached_property
     def job(self) -> Job:
-        """The configuration that made the data set, with its material.
+        """The job of the data set.
 
         Raises
         ------
-        InputError : there is no telling, or the material is gone or another one by now
+        InputError : no evidence of it is left, or its material is missing or has changed
         """
-        wanted = self._witness[0] if self._manifest is None else self._manifest["config_hash"]
-        if wanted is None:
+        expected = self._evidence[0] if self._manifest is None else self._manifest["config_hash"]
+        if expected is None:
             raise InputError(
-                "cannot be restored: no other file of the folder says what it held",
+                "cannot be restored: no sidecar of the folder is intact",
                 where=self.folder / MANIFEST_NAME,
                 hint=_AGAIN,
             )
@@ -143,10 +157,10 @@ class Corruption:
                 raise InputError(
                     f"the material is not at '{config.material}'",
                     where=self.folder,
-                    hint="name it with: mbtf-gen repair FOLDER --material PATH",
+                    hint="give its path: mbtf-gen repair FOLDER --material PATH",
                 )
             job = Job.prepare(config)
-            if job.config_hash == wanted:
+            if job.config_hash == expected:
                 return job
             other = other or job
         raise self._refusal(other)
@@ -156,37 +170,37 @@ class Corruption:
             return InputError(
                 f"neither {MANIFEST_NAME} nor {CONFIG_NAME} can be read", where=self.folder, hint=_AGAIN
             )
-        then = (self._manifest or {}).get("inputs", {})
-        changes = in_short(differences(then, dict(sorted(job.material.digests.items()))))
-        what = f" ({changes})" if then and changes else ""
+        before = (self._manifest or {}).get("inputs", {})
+        changes = in_short(differences(before, dict(sorted(job.material.digests.items()))))
+        what = f" ({changes})" if before and changes else ""
         return InputError(
-            f"the material or the configuration is not the one that made the data set{what}",
+            f"the material or the configuration has changed since the data set was generated{what}",
             where=self.folder,
-            hint="bring it back, or generate the data set again",
+            hint="restore it, or generate the data set again",
         )
 
     @cached_property
-    def effects(self) -> EffectsPlan:
-        """The effects plan that the data set was made with.
+    def plan(self) -> RunPlan:
+        """The run plan of the data set.
 
         Raises
         ------
         InputError : it is lost
         """
         if self._manifest is not None:
-            return planned_effects(self.folder)
+            return read_run_plan(self.folder)
         plan = plan_run(self.job)
-        if effects_digest(plan.to_manifest()) != self._witness[1]:
+        if plan_digest(plan.to_manifest()) != self._evidence[1]:
             raise InputError(
-                "cannot be restored: the effects plan comes out otherwise here",
+                "cannot be restored: this machine plans the run differently",
                 where=self.folder / MANIFEST_NAME,
-                hint="repair it on the machine that made it, or generate the data set again",
+                hint="repair it on the machine that generated it, or generate the data set again",
             )
         return plan
 
     @cached_property
     def documents(self) -> list[str]:
-        """Manifest and configuration, where they have to be written again."""
+        """Manifest and configuration, if they have to be written again."""
         names = {f.file for f in self.faults if f.file in (MANIFEST_NAME, CONFIG_NAME) and not f.unfinished}
         if self._manifest is None or any(f.listing for f in self.faults):
             names.add(MANIFEST_NAME)
@@ -194,50 +208,44 @@ class Corruption:
 
     @cached_property
     def entries(self) -> list[ShardEntry]:
-        """Shards that have to be made again, or are not there yet."""
-        every = [e for split in SPLITS for e in self.job.shards(split)]
-        condemned = {f.file for f in self._shard_faults()}
-        return [e for e in every if e.file in condemned]
+        """Shards that are missing or corrupt."""
+        faulty = {f.file for f in self._shard_faults()}
+        return [e for e in self.job.shards if e.file in faulty]
 
     @cached_property
     def left(self) -> list[Fault]:
-        """Faults that are not ours to mend."""
+        """Faults that a repair leaves."""
         return [f for f in self.faults if f.unlisted]
 
     def _shard_faults(self) -> list[Fault]:
-        """Faults of shards; where the manifest was no help in finding them, those of the restored one."""
+        """Faults of shards; with a corrupt manifest, of those that the restored one lists."""
         if self._manifest is not None:
             return [f for f in self.faults if not (f.unlisted or f.listing)]
-        every = [e for split in SPLITS for e in self.job.shards(split)]
-        return list(shard_faults(self.folder, every, self.job.config_hash, str(self._witness[1])))
+        job = self.job
+        return list(shard_faults(self.folder, job.shards, job.config_hash, str(self._evidence[1])))
 
     @property
     def paths(self) -> int:
-        """Paths that mending takes."""
-        return sum(self.job.paths(entry) for entry in self.entries)
+        """Paths to trace."""
+        return planned_paths(self.job, self.entries)
 
-    def mend(self, progress: ProgressCallback | None = None) -> RepairResult:
-        """Write the documents and make the shards again.
+    def repair(self, progress: ProgressCallback | None = None) -> RepairResult:
+        """Write the documents and render the shards again.
 
         Raises
         ------
-        InputError : see :attr:`job` and :attr:`effects`
-        PartialError : others are writing, the disk is full; the same command goes on
+        InputError : see :attr:`job` and :attr:`plan`
+        PartialError : other processes write the data set, or the disk is full; the same command resumes
         """
-        documents, entries, effects = self.documents, self.entries, self.effects
+        documents, entries, plan = self.documents, self.entries, self.plan
         if documents or entries:
             self._write_documents(documents, bool(entries))
-        made = make_shards(
-            self.job,
-            self.folder,
-            entries,
-            effects,
-            condemned={e.file for e in entries},
-            progress=progress,
+        result = render_shards(
+            self.job, self.folder, entries, plan, corrupt={e.file for e in entries}, progress=progress
         )
-        if made.busy:
+        if result.busy:
             raise PartialError(
-                busy_message(made.busy),
+                busy_message(result.busy),
                 where=self.folder,
                 hint="wait for it, then run the same command again",
             )
@@ -245,23 +253,22 @@ class Corruption:
         return RepairResult(
             str(self.folder),
             self.faults,
-            made.shards,
+            result.shards,
             documents,
             self.left,
             summary.complete,
-            made.paths,
-            round(made.seconds, 3),
+            result.paths,
+            round(result.seconds, 3),
         )
 
     def _write_documents(self, documents: list[str], unfinished: bool) -> None:
         path = self.folder / MANIFEST_NAME
         with brief_lock(path):
             if MANIFEST_NAME in documents:
-                every = [e for split in SPLITS for e in self.job.shards(split)]
-                write_checksummed(path, build_manifest(self.job, every, self.effects))
+                write_checksummed(path, build_manifest(self.job, self.plan))
             manifest = read_checksummed(path)
             if unfinished and manifest["complete"]:
-                # Readers trust this word, and shards are about to go.
+                # Readers rely on this key, and rendering removes the corrupt shards.
                 write_checksummed(path, {**manifest, "complete": False, "summary": None})
             if CONFIG_NAME in documents:
                 write_text(self.folder / CONFIG_NAME, dump_yaml(manifest["config"]))
@@ -270,16 +277,26 @@ class Corruption:
 def repair(
     folder: str | Path, *, material: str | None = None, progress: ProgressCallback | None = None
 ) -> RepairResult:
-    """Make again what ``verify`` condemns (``mbtf-gen repair``): the data set is then the undisturbed one.
+    """Restore what ``verify`` finds missing or corrupt; the data set is then identical to the original.
 
     Parameters
     ----------
-    material : where the material lies now; by default where it lay when the data set was made
-    progress : called with (paths traced so far, note)
+    folder : str or Path
+        The data set.
+    material : str, optional
+        Current path of the material; by default the path in the data set's configuration.
+    progress : callable, optional
+        Called after every shard with the number of planned paths that are done and a note.
+
+    Returns
+    -------
+    RepairResult
 
     Raises
     ------
-    InputError : no data set there, or its material is gone or has changed
-    PartialError : others are writing, the disk is full; the same command goes on
+    InputError
+        No data set, or its material is missing or has changed.
+    PartialError
+        Other processes write the data set, or the disk is full. The same command resumes.
     """
-    return Corruption(Path(folder), material).mend(progress)
+    return Corruption(Path(folder), material).repair(progress)

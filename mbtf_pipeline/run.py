@@ -150,7 +150,8 @@ class _Run:
             from mbtf_core.shard_schema import MANIFEST_NAME
             from mbtf_gen.dataset.summary import summary_dict
             from mbtf_gen.dataset.verify import sidecar_of
-            from mbtf_gen.generation import Job, generate, paths_left
+            from mbtf_gen.generation import generate, paths_left
+            from mbtf_gen.job import Job
 
             job = Job.prepare(data.config)
             shards = self.folder / data.sub
@@ -165,9 +166,7 @@ class _Run:
             ):
                 clear(shards)
             with self.console.progress(paths_left(job, shards), data.stage, "paths") as bar:
-                summary = generate(
-                    data.config, shards, progress=lambda done, note: bar.update(done, note), job=job
-                )
+                summary = generate(job, shards, progress=lambda done, note: bar.update(done, note))
             return summary_dict(summary)
 
         return run

@@ -13,11 +13,12 @@ from __future__ import annotations
 
 import contextlib
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 from mbtf_core.atomic import read_json, write_json
 from mbtf_core.errors import InputError, PartialError
+from mbtf_core.folders import check_folder, make_folder
 from mbtf_pipeline.recipe import Recipe, write_recipe
 
 RUN_NAME = "run.json"
@@ -32,24 +33,6 @@ def clear(folder: Path) -> None:
         shutil.rmtree(folder)
 
 
-def take(folder: Path, ours: Callable[[Path], bool], refusal: InputError) -> None:
-    """Make a folder, or take one that is empty or ours.
-
-    Raises
-    ------
-    InputError : `refusal`, where it holds something else; or it cannot be made
-    """
-    if folder.exists() and not folder.is_dir():
-        raise InputError("is a file, not a folder", where=folder)
-    seen = folder.exists() and any(not path.name.startswith(".") for path in folder.iterdir())
-    if seen and not ours(folder):
-        raise refusal
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot be made ({error.strerror})", where=folder) from None
-
-
 def claim(folder: Path) -> None:
     """Make a run's folder, or take an empty one or one that holds a run.
 
@@ -57,8 +40,8 @@ def claim(folder: Path) -> None:
     ------
     InputError : it holds something else
     """
-    hint = "choose another folder with -o"
-    take(folder, is_run, InputError("is not empty and holds no run", where=folder, hint=hint))
+    check_folder(folder, is_run, "run")
+    make_folder(folder)
 
 
 def describe(folder: Path, recipe: Recipe, command: str) -> None:

@@ -8,7 +8,6 @@ while its key is the stamp's and its files are as the stamp says; dates and name
 
 from __future__ import annotations
 
-import hashlib
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -16,7 +15,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mbtf_core.atomic import digest, read_json, write_json
+from mbtf_core.atomic import read_json, write_json
+from mbtf_core.digest import data_sha256, file_sha256
 from mbtf_core.errors import InputError
 
 STAMP_FORMAT = "mbtf-stage"
@@ -25,11 +25,6 @@ STAGE_SCHEMA = 1
 STAMPS = "stages"
 FORCED = "forced"
 NOT_RUN = "has not run"
-
-
-def hash_of(data: Any) -> str:
-    """SHA-256 of plain data, hexadecimal; the order of mappings' keys does not count."""
-    return hashlib.sha256(json.dumps(data, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
 @dataclass(frozen=True)
@@ -76,7 +71,7 @@ class Stamp:
     @property
     def outputs_hash(self) -> str:
         """One digest of everything the stage wrote."""
-        return hash_of(self.outputs)
+        return data_sha256(self.outputs)
 
 
 @dataclass(frozen=True)
@@ -135,7 +130,7 @@ def _depends(stage: Stage, upstream: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _key(stage: Stage, depends: Mapping[str, Any]) -> str:
-    return hash_of({"schema": STAGE_SCHEMA, "stage": stage.name, **depends})
+    return data_sha256({"schema": STAGE_SCHEMA, "stage": stage.name, **depends})
 
 
 def _what_changed(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
@@ -169,7 +164,7 @@ def decide(folder: Path, stage: Stage, upstream: Mapping[str, str], fresh: Seque
     damaged = tuple(
         folder / name
         for name, expected in stamp.outputs.items()
-        if not (folder / name).is_file() or digest(folder / name) != expected
+        if not (folder / name).is_file() or file_sha256(folder / name) != expected
     )
     if damaged:
         what = "is missing" if not damaged[0].exists() else "has changed"
@@ -243,7 +238,7 @@ def _run(folder: Path, stage: Stage, upstream: Mapping[str, str], decision: Deci
     notes = stage.run(decision)
     seconds = time.perf_counter() - start
     depends = _depends(stage, upstream)
-    outputs = {path.relative_to(folder).as_posix(): digest(path) for path in sorted(stage.outputs())}
+    outputs = {path.relative_to(folder).as_posix(): file_sha256(path) for path in sorted(stage.outputs())}
     stamp = Stamp(stage.name, _key(stage, depends), depends, outputs, round(seconds, 3), dict(notes))
     _write_stamp(folder, stamp)
     return stamp

@@ -1,9 +1,8 @@
-"""Make the figures in docs/pictures/cost from folders of cost studies, and print their Pareto fronts.
+"""Makes the figures of the documentation from folders of cost studies, and prints tables of Pareto fronts.
 
 From the repository's root, after the studies:
 ``.venv/bin/python docs/pictures/make_cost_pictures.py out/cost/turtle_shell out/cost/twisted_wool …``.
-Each figure shows one plot of all studies side by side. The tables of the Pareto fronts go to standard output,
-as Markdown for a results page.
+Every sheet shows one plot of all studies side by side; studies without that plot are left out.
 """
 
 from __future__ import annotations
@@ -15,29 +14,25 @@ from pathlib import Path
 
 from PIL import Image, ImageDraw, ImageFont
 
-from mbtf_pipeline.cost_study.fit_runs import QUALITIES
+from mbtf_pipeline.cost_study.fit_runs import PRESET
 
 HERE = Path(__file__).parent
 OUT = HERE / "cost"
 PLOTS = (
     "front",
     "data",
-    "fit",
-    "fit_evaluation",
-    "fit_bytes",
+    "models",
+    "models_evaluation",
     "paths",
-    "adaptive",
-    "adaptive_relative",
     "effects",
-    "bounces",
     "mesh",
-    "light",
+    "interactions",
 )
 WIDTH, TITLE, GAP, COLUMNS, COLORS = 800, 30, 12, 2, 256
 
 
 def sheet(plot: str, studies: list[Path]) -> Path | None:
-    """One figure: a plot of all studies, each under its name."""
+    """One plot of all studies, each under its name."""
     found = [folder for folder in studies if (folder / f"{plot}.png").exists()]
     if not found:
         return None
@@ -62,12 +57,10 @@ def sheet(plot: str, studies: list[Path]) -> Path | None:
     return path
 
 
-def pareto_front(folder: Path) -> list[dict[str, str]]:
-    """Rows of the study's Pareto front: no other row has less error in as little time."""
+def front_rows(folder: Path) -> list[dict[str, str]]:
+    """Rows of the study on the Pareto front: no other one beats them in both time and error."""
     with (folder / "cost.csv").open(encoding="utf-8", newline="") as stream:
-        rows = [
-            r for r in csv.DictReader(stream) if r["total_seconds"] and r["study"] != "seeds" and r["error"]
-        ]
+        rows = [r for r in csv.DictReader(stream) if r["total_seconds"] and r["error"]]
     front: list[dict[str, str]] = []
     for row in sorted(rows, key=lambda r: (float(r["total_seconds"]), float(r["error"]))):
         if not front or float(row["error"]) < float(front[-1]["error"]):
@@ -76,40 +69,43 @@ def pareto_front(folder: Path) -> list[dict[str, str]]:
 
 
 def table(studies: list[Path]) -> str:
-    """Markdown tables of all studies: precision of the errors, and Pareto fronts with a command."""
+    """How well errors are known, and the Pareto fronts of all studies with commands, as Markdown."""
     records = {f: json.loads((f / "study.json").read_text(encoding="utf-8")) for f in studies}
-    lines = ["| study | errors within ± 10 % (95 %) | seed variance |", "|---|---|---|"]
+    lines = ["| study | errors within ± 10 % (95 %) | standard deviation over seeds |", "|---|---|---|"]
     for folder, study in records.items():
         found = study.get("summary")
         if found is None:
             raise SystemExit(f"{folder}: not finished; run the command of the study again")
-        scatter = found["scatter"] or "–"
-        lines.append(f"| `{folder.name}` | {found['known_to_a_tenth']} of {found['known']} | {scatter} |")
+        deviation = found["seed_deviation"]
+        text = (
+            "–" if deviation is None else f"{100 * deviation['value']:.1f} ± {100 * deviation['error']:.1f} %"
+        )
+        lines.append(f"| `{folder.name}` | {found['narrow']} of {found['known']} | {text} |")
     lines.append("")
     for folder, study in records.items():
-        where = f"{study['machine']['system']}, {study['made']}"
+        where = f"{study['machine']['system']}, {study['date']}"
         lines += [
             f"`{folder.name}`, {where}:",
             "",
-            "| total time | generation | training | queries × paths | model | unexplained variance |",
+            "| total | generating | training | queries × paths | model | unexplained variance |",
             "|---|---|---|---|---|---|",
         ]
-        front = pareto_front(folder)
+        front = front_rows(folder)
         for r in front:
             lines.append(
                 f"| {float(r['total_seconds']):.0f} s | {float(r['generation_seconds']):.1f} s "
                 f"| {float(r['training_seconds']):.1f} s "
                 f"| {float(r['queries']) / 1e6:.2g} M × {float(r['spp']):g} "
-                f"| {r['series'] if r['study'] == 'fit' else QUALITIES} "
+                f"| {r['series'] if r['study'] == 'models' else PRESET} "
                 f"| {float(r['error']):.3f} ± {float(r['error_se']):.3f} |"
             )
         command = front[-1]["command"].replace(str(folder), f"out/cost/{folder.name}")
-        lines += ["", "Command of the last row:", "", f"    {command.replace(' && ', chr(10) + '    ')}", ""]
+        lines += ["", "The last one:", "", f"    {command.replace(' && ', chr(10) + '    ')}", ""]
     return "\n".join(lines)
 
 
 def main() -> int:
-    """Write the figures, print the tables."""
+    """Write the sheets and print the tables."""
     studies = [Path(name) for name in sys.argv[1:]]
     if not studies:
         print(__doc__, file=sys.stderr)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from mbtf_core.color import linear_to_srgb
 from mbtf_fit import Material
 
 SIZE, EXTENT, EXPOSURE = 256, 0.6, 3.0
@@ -36,8 +37,7 @@ def picture(material: Material) -> NDArray[np.uint8]:
     for view, light in VIEWS:
         omega_i, omega_o = (np.tile(direction(*d), (len(u), 1)) for d in (light, view))
         value = EXPOSURE * material.evaluate(u, sigma, omega_i, omega_o).reshape(SIZE, SIZE, 3)
-        curve = np.where(value <= 0.0031308, 12.92 * value, 1.055 * np.maximum(value, 0) ** (1 / 2.4) - 0.055)
-        parts.append((np.clip(curve, 0, 1) * 255).astype(np.uint8))
+        parts.append((np.clip(linear_to_srgb(value), 0, 1) * 255).astype(np.uint8))
     return np.concatenate(parts, 1)
 
 

@@ -41,7 +41,7 @@ def export_material(
     from mbtf_fit.material.export import LAYERS_NAME, TEXTURES_NAME, to_half, write_layers, write_textures
     from mbtf_fit.material.format import DESCRIPTION_NAME, WEIGHTS_NAME
     from mbtf_fit.material.material import Material, export
-    from mbtf_fit.material.storage import make_folder
+    from mbtf_core.folders import make_folder
     from mbtf_fit.material.transmittance import TRANSMITTANCE_NAME
 
     wanted = list(dict.fromkeys(to or ["exr", "json"]))

@@ -143,7 +143,8 @@ def load_training(
         training = StreamedQueries(selection)
     else:
         training = TrainingQueries(**{n: torch.from_numpy(a[: len(selection)]) for n, a in store.items()})
-    return Partition(training, *(ShardQueries.join(group) for group in (*kept_out, sample)), selection)
+    joined = [ShardQueries.join(group) for group in (*kept_out, sample)]
+    return Partition(training, joined[0], joined[1], joined[2], selection)
 
 
 def _all_held_out(data: Dataset, what: str) -> InputError:
@@ -184,7 +185,11 @@ def _load_images(data: Dataset, shards: list[Shard], held_out: HeldOutSection, s
         value[part] = mean_value(images.value_a[kept], images.value_b[kept])
         filled += len(kept)
     training = TrainingImages(
-        *(torch.from_numpy(a) for a in (u, sigma, *omega, value)),
+        torch.from_numpy(u),
+        torch.from_numpy(sigma),
+        torch.from_numpy(omega[0]),
+        torch.from_numpy(omega[1]),
+        torch.from_numpy(value),
         strides(data.lattice, sigma) if patch_size is None else np.ones((count, 2), np.int64),
         None if patch_size is None else nearest_shapes(data.lattice, sigma),
     )

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, Field
 
-from mbtf_core.atomic import digest, read_json
+from mbtf_core.atomic import read_json
 from mbtf_core.config_file import check_document
+from mbtf_core.digest import file_sha256
 from mbtf_core.errors import InputError
 from mbtf_core.lattice import MAX_LEVEL
 from mbtf_core.suggest import suggest_path
@@ -100,7 +101,7 @@ def read_description(folder: Path) -> tuple[dict[str, Any], Path]:
         )
     check_document(_Description, description, path, "fit it again, or copy it again")
     weights = folder / WEIGHTS_NAME
-    if not weights.is_file() or digest(weights) != description["weights"]["sha256"]:
+    if not weights.is_file() or file_sha256(weights) != description["weights"]["sha256"]:
         raise InputError("is missing, or its SHA-256 differs from the one in material.json", where=weights)
     return description, weights
 

@@ -11,8 +11,9 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from mbtf_core.atomic import digest, write_json
+from mbtf_core.atomic import write_json
 from mbtf_core.config_file import build
+from mbtf_core.digest import file_sha256
 from mbtf_core.directions import from_projected_disk
 from mbtf_core.errors import InputError
 from mbtf_core.lattice import Lattice, sigma_of_level
@@ -226,7 +227,10 @@ def export(
     extra: dict[str, Any] = {}
     if transmittance is not None:
         write_transmittance(transmittance, folder / TRANSMITTANCE_NAME)
-        extra["transmittance"] = {"file": TRANSMITTANCE_NAME, "sha256": digest(folder / TRANSMITTANCE_NAME)}
+        extra["transmittance"] = {
+            "file": TRANSMITTANCE_NAME,
+            "sha256": file_sha256(folder / TRANSMITTANCE_NAME),
+        }
     queries = conformance_queries(lattice)
     weights = model.weights()
     if half:
@@ -252,7 +256,7 @@ def export(
             },
             "weights": {
                 "file": WEIGHTS_NAME,
-                "sha256": digest(path),
+                "sha256": file_sha256(path),
                 "dtype": "float16" if half else "float32",
                 "shapes": shape,
                 "network_weights": sum(p.numel() for p in model.parameter_groups()[1]),

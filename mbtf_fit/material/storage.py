@@ -15,19 +15,6 @@ from mbtf_core.errors import InputError, reason
 _KEY = "mbtf"
 
 
-def make_folder(folder: Path) -> None:
-    """Create a folder and its parents.
-
-    Raises
-    ------
-    InputError : it cannot be created
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot be created ({error.strerror})", where=folder) from None
-
-
 def write_tensors(path: Path, tensors: dict[str, Tensor], data: dict[str, Any]) -> None:
     """Write tensors, and JSON data in the file's header.
 

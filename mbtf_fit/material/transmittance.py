@@ -19,7 +19,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mbtf_core.atomic import digest, write_file
+from mbtf_core.atomic import write_file
+from mbtf_core.digest import file_sha256
 from mbtf_core.errors import InputError
 from mbtf_core.lattice import Lattice, level_of_sigma
 
@@ -118,7 +119,7 @@ def read_transmittance(folder: Path, description: Mapping[str, Any]) -> Transmit
     if stated is None:
         return None
     path = folder / TRANSMITTANCE_NAME
-    if not path.is_file() or digest(path) != stated["sha256"]:
+    if not path.is_file() or file_sha256(path) != stated["sha256"]:
         raise InputError("is missing, or its SHA-256 differs from the one in material.json", where=path)
     from safetensors.numpy import load_file
 

@@ -1,18 +1,18 @@
-"""Fitted materials as Mitsuba BSDFs (``mbtf``), and a path tracer that hands them footprints
+"""Fitted materials as Mitsuba BSDFs (``mbtf``), and a path tracer that provides their footprints
 (``mbtf_path``).
 
     import mbtf_fit.mitsuba_plugin
+    mbtf_fit.mitsuba_plugin.register("llvm_ad_rgb")
     import mitsuba as mi
-    mi.set_variant("llvm_ad_rgb")
-    mbtf_fit.mitsuba_plugin.register()
     bsdf = mi.load_dict({"type": "mbtf", "material": "material/"})
 
-Import this package before Mitsuba. Dr.Jit looks for its LLVM when it is first imported. Therefore the import
-of this package, alone among the packages, sets ``DRJIT_LIBLLVM_PATH`` and ``DRJIT_CACHE_DIR`` where they are
-unset. If Mitsuba was imported first with an LLVM that is too old, :func:`register` raises an ``EngineError``.
+Import this package before Mitsuba, or call ``register`` with a variant: Dr.Jit looks for its LLVM when it is
+first imported. Therefore the import of this package, alone among the packages, sets ``DRJIT_LIBLLVM_PATH`` and
+``DRJIT_CACHE_DIR`` where they are unset. If Mitsuba was imported first with an LLVM that is too old,
+:func:`register` raises an ``EngineError``.
 
-Importing the package registers its plugins with a variant that is set already; :func:`load_scene` registers
-them itself. PyTorch is not needed, and never imported.
+Importing this package registers the plugins with a variant that is already set. PyTorch is not needed, and
+never imported.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ use_shipped_llvm()
 _PUBLIC = {
     "Evaluator": "evaluator",
     "StoredMaterial": "material_arrays",
-    "check_scene": "scene",
+    "check_scene": "bsdf",
     "load_scene": "scene",
     "read_material": "material_arrays",
     "register": "registration",

@@ -1,21 +1,20 @@
-"""Factors of a value by its level and the elevations of light and view, in Dr.Jit kernels.
+"""Calibration factors of a value by level and elevation of light and view, in Dr.Jit kernels.
 
 The formula is that of :mod:`mbtf_fit.models.calibration_factors`.
 """
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mbtf_fit.mitsuba_plugin.material_arrays import F32
+from mbtf_gen.render.types import Color3f, Float, UInt32
 
 
 class CalibrationFactors:
-    """The tables of a material.
+    """Calibration tables of a material.
 
     Parameters
     ----------
@@ -27,15 +26,15 @@ class CalibrationFactors:
         self._buffer = mi.Float(np.pad(tables, ((0, 0), (0, 0), (0, 0), (0, 1))).reshape(-1))
         dr.eval(self._buffer)
 
-    def by_light(self, level: Any, cosine: Any) -> Any:
+    def by_light(self, level: Float, cosine: Float) -> Color3f:
         """Factors (Color3f) of the light's cosine at fractional levels."""
         return self._at(0, level, cosine)
 
-    def by_view(self, level: Any, cosine: Any) -> Any:
+    def by_view(self, level: Float, cosine: Float) -> Color3f:
         """Factors (Color3f) of the view's cosine."""
         return self._at(1, level, cosine)
 
-    def _at(self, table: int, level: Any, cosine: Any) -> Any:
+    def _at(self, table: int, level: Float, cosine: Float) -> Color3f:
         x = dr.clip(cosine, 0.0, 1.0) * (self._knots - 1)
         left = dr.minimum(mi.UInt32(x), self._knots - 2)
         inside = x - mi.Float(left)
@@ -47,7 +46,7 @@ class CalibrationFactors:
         pair = (self._along(first, inside), self._along(first + self._knots, inside))
         return dr.lerp(*pair, level - mi.Float(coarse))
 
-    def _along(self, first: Any, inside: Any) -> Any:
+    def _along(self, first: UInt32, inside: Float) -> Color3f:
         pair = (dr.gather(mi.Vector4f, self._buffer, first + k) for k in (0, 1))
         found = dr.lerp(*pair, inside)
         return mi.Color3f(found.x, found.y, found.z)

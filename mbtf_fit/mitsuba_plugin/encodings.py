@@ -1,31 +1,28 @@
-"""What networks see of coordinates, and values from their answers, in Dr.Jit.
+"""Inputs and output transforms of networks in Dr.Jit, by the options of ``config.network``.
 
-The options of ``config.network``; the formulas stand in each material's ``material.json`` under ``formula``.
+The key ``formula`` of each ``material.json`` states the formulas.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from mbtf_fit.config import EncodingSection, NetworkSection
-
-# Rec.601 YUV → RGB, a row per color, and the gate's least value, for decoders of six answers.
-RGB_OF_YUV = ((1.0, 0.0, 1.13983), (1.0, -0.39465, -0.58060), (1.0, 2.03211, 0.0))
-GATE = 0.1
+from mbtf_fit.models.constants import GATE, RGB_OF_YUV
+from mbtf_gen.render.types import Color3f, Float, Point2f, Vector3f
 
 
 def encode(
-    p: Sequence[Any],
+    p: Sequence[Float],
     bands: int,
     pi: bool,
     options: EncodingSection,
-    spread: Sequence[Any] | None = None,
-) -> list[Any]:
+    spread: Sequence[Float] | None = None,
+) -> list[Float]:
     """Coordinates → [themselves,] sines of doubling frequencies, cosines; without bands themselves alone.
     With `spread`, their means over Gaussians of these standard deviations."""
     if bands == 0:
@@ -41,14 +38,14 @@ def encode(
     return [*(p if options.raw else ()), *(s for s, _ in pairs), *(c for _, c in pairs)]
 
 
-def encode_direction(omega: Any, options: EncodingSection) -> list[Any]:
-    """What networks see of a direction."""
+def encode_direction(omega: Vector3f, options: EncodingSection) -> list[Float]:
+    """Encoded direction."""
     coordinates = [omega.x, omega.y, omega.z] if options.direction_xyz else [omega.x, omega.y]
     return encode(coordinates, options.direction, options.direction_pi, options)
 
 
-def encode_position(u: Any, level: Any, aspect: float, options: EncodingSection) -> list[Any]:
-    """What the decoder sees of a uv position at a fractional level: nothing without bands."""
+def encode_position(u: Point2f, level: Float, aspect: float, options: EncodingSection) -> list[Float]:
+    """Encoded uv position at a fractional level: empty without bands."""
     if options.position == 0:
         return []
     p = [2.0 * (x - dr.floor(x)) - 1.0 for x in (u.x, u.y)]
@@ -59,7 +56,7 @@ def encode_position(u: Any, level: Any, aspect: float, options: EncodingSection)
     return encode(p, options.position, options.pi, options, spread)
 
 
-def _mapped(x: Any, name: str) -> Any:
+def _mapped(x: Float, name: str) -> Float:
     if name == "expm1":
         return dr.exp(x) - 1.0
     if name == "exp":
@@ -71,8 +68,8 @@ def _mapped(x: Any, name: str) -> Any:
     return x
 
 
-def to_value(x: Sequence[Any], unit: float, network: NetworkSection) -> Any:
-    """Value (Color3f) in 1/sr, at least 0, of a decoder's answers."""
+def to_value(x: Sequence[Float], unit: float, network: NetworkSection) -> Color3f:
+    """Value in 1/sr, at least 0, of a decoder's outputs."""
     if len(x) == 3:
         colors = [unit * _mapped(v, network.output_transform) for v in x]
     else:

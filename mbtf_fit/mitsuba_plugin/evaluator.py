@@ -1,12 +1,10 @@
 """M(u, σ, ω_i, ω_o) of a stored material, inside Dr.Jit kernels.
 
-The formulas are those that the material folder states (``formula`` and ``conventions`` in its
-``material.json``); what they mean stands in :mod:`mbtf_fit.models.neumip`.
+The keys ``formula`` and ``conventions`` of ``material.json`` state the formulas;
+:mod:`mbtf_fit.models.neumip` explains them.
 """
 
 from __future__ import annotations
-
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -24,20 +22,20 @@ from mbtf_fit.mitsuba_plugin.network import (
     default_arithmetic,
 )
 from mbtf_fit.mitsuba_plugin.textures import Textures
-
-# Of the model's definition: tile widths per unit that the offset network answers, and the cosine below which
-# the offset grows no further.
-OFFSET_SCALE = 0.1
-GRAZING = 0.6
+from mbtf_fit.models.constants import GRAZING, OFFSET_SCALE
+from mbtf_gen.render.types import Color3f, Float, Point2f, Vector3f
 
 
 class Evaluator:
-    """A material, ready to be evaluated for lanes of queries.
+    """Evaluation of a material for arrays of queries.
 
     Parameters
     ----------
-    stored : its weights
-    arithmetic : how networks are evaluated; by default what suits variant and size
+    stored : StoredMaterial
+        Weights of the material.
+    arithmetic : str, optional
+        Evaluation of the networks: ``unrolled``, ``cooperative`` or ``half``. The default depends on variant
+        and size.
     """
 
     def __init__(self, stored: StoredMaterial, arithmetic: Arithmetic | None = None) -> None:
@@ -58,17 +56,17 @@ class Evaluator:
             )
 
     def _offset_arithmetic(self, stored: StoredMaterial) -> Arithmetic:
-        """Single precision where it is affordable: small errors of the place are large ones of the value."""
+        """Single precision for small networks: the value is sensitive to errors of the offset."""
         small = count_weights(stored.offset_network or []) <= MOST_UNROLLED
         return "unrolled" if self.arithmetic == "half" and small else self.arithmetic
 
-    def level(self, sigma: Any) -> Any:
+    def level(self, sigma: Float) -> Float:
         """Fractional level of footprints in tile widths."""
         return dr.clip(-dr.log2(2.0 * sigma), 0.0, float(self.lattice.finest))
 
-    def features(self, u: Any, level: Any, omega_o: Any) -> list[Any]:
-        """Stage 1, shared by all lights: features at uv positions (Point2f), seen from unit vectors; after
-        them, where the material has factors, those of the view and the level."""
+    def features(self, u: Point2f, level: Float, omega_o: Vector3f) -> list[Float]:
+        """Stage 1, independent of the light: features at uv positions for unit view vectors, followed by the
+        calibration factors of the view and the level, where the material has some."""
         moved = u
         if self.offset_texture is not None:
             r = self.offset_network([*self.offset_texture.first(u), omega_o.x, omega_o.y])
@@ -85,8 +83,8 @@ class Evaluator:
             features if self.factors is None else [*features, *self.factors.by_view(level, omega_o.z), level]
         )
 
-    def value(self, features: list[Any], omega_i: Any, omega_o: Any) -> Any:
-        """Stage 2: value (Color3f) in 1/sr, at least 0."""
+    def value(self, features: list[Float], omega_i: Vector3f, omega_o: Vector3f) -> Color3f:
+        """Stage 2: value in 1/sr, at least 0."""
         options = self.network.encoding
         directions = [*encode_direction(omega_i, options), *encode_direction(omega_o, options)]
         if self.factors is None:
@@ -95,9 +93,9 @@ class Evaluator:
         value = to_value(self.decoder([*features, *directions]), self.unit, self.network)
         return value * mi.Color3f(red, green, blue) * self.factors.by_light(level, omega_i.z)
 
-    def transmittance(self, u: Any, level: Any, omega_o: Any) -> Any:
-        """Share of the footprint that is seen through holes, of unit vectors on either side of the plane: a
-        line passes both ways. The formula is that of :mod:`mbtf_fit.material.transmittance`."""
+    def transmittance(self, u: Point2f, level: Float, omega_o: Vector3f) -> Float:
+        """Transparent fraction of the footprint for unit vectors on either side of the plane, equal for
+        opposite ones. The formula is that of :mod:`mbtf_fit.material.transmittance`."""
         if self.coefficients is None:
             return mi.Float(0.0)
         x, y = (dr.mulsign(w, omega_o.z) for w in (omega_o.x, omega_o.y))
@@ -106,9 +104,24 @@ class Evaluator:
         return dr.clip(value, 0.0, 1.0)
 
     def evaluate(self, u: ArrayLike, sigma: ArrayLike, omega_i: ArrayLike, omega_o: ArrayLike) -> F32:
-        """Values (n, 3) in 1/sr at arrays of queries, as :meth:`mbtf_fit.Material.evaluate` gives them."""
-        place = mi.Point2f(np.asarray(u, np.float32).T)
+        """Evaluate arrays of queries like :meth:`mbtf_fit.Material.evaluate`.
+
+        Parameters
+        ----------
+        u : (n, 2) float array
+            Positions on the reference plane, uv; the tile repeats.
+        sigma : (n,) float array
+            Standard deviations of the footprints in tile widths.
+        omega_i, omega_o : (n, 3) float array
+            Unit vectors towards light and viewer, z > 0.
+
+        Returns
+        -------
+        (n, 3) float32 array
+            Values in 1/sr, linear RGB, at least 0.
+        """
+        position = mi.Point2f(np.asarray(u, np.float32).T)
         lights, views = (mi.Vector3f(np.asarray(w, np.float32).T) for w in (omega_i, omega_o))
-        features = self.features(place, self.level(mi.Float(np.asarray(sigma, np.float32))), views)
+        features = self.features(position, self.level(mi.Float(np.asarray(sigma, np.float32))), views)
         out: F32 = np.array(self.value(features, lights, views), np.float32).T
         return out

@@ -1,10 +1,10 @@
-"""``mbtf_path``: a path tracer that carries ray cones, so that ``mbtf`` knows its footprint at every hit.
+"""``mbtf_path``: a path tracer with ray cones, which give ``mbtf`` its footprint at every hit.
 
 A cone has a width, the side of the square that a pixel covers across the ray, and a spread, by which the
-width grows per unit of length (Amanatides 1984; Akenine-Möller et al. 2019). Both start from the sensor's ray
-differentials, whole pixels. At a hit the square projected onto the surface is written to ``si.duv_dx`` and
-``si.duv_dy``; stock integrators leave these at zero. Surfaces are taken as flat: curvature does not widen
-the cone. A scattered ray's cone is at least as wide as the density of its direction calls for.
+width grows per unit of length (Amanatides 1984; Akenine-Möller et al. 2019). The initial values are the
+sensor's ray differentials of whole pixels. At a hit the projection of the square onto the surface is written
+to ``si.duv_dx`` and ``si.duv_dy``, which Mitsuba's own integrators leave at zero. The curvature of surfaces
+is neglected. The spread of a scattered ray's cone is bounded below by the density of its direction.
 """
 
 from __future__ import annotations
@@ -15,16 +15,27 @@ import drjit as dr
 import mitsuba as mi
 
 from mbtf_core.errors import UsageError
-from mbtf_fit.mitsuba_plugin.bsdf import FOOTPRINTS_PASSED
-from mbtf_fit.mitsuba_plugin.registration import INTEGRATOR_NAME, refuse_unknown
-from mbtf_fit.mitsuba_plugin.scene import check_scene
+from mbtf_fit.mitsuba_plugin.bsdf import check_scene
+from mbtf_fit.mitsuba_plugin.names import INTEGRATOR_NAME, footprints_provided, refuse_unknown
+from mbtf_gen.render.types import (
+    DirectionSample3f,
+    Float,
+    Mask,
+    Properties,
+    Ray3f,
+    Sampler,
+    Scene,
+    Spectrum,
+    SurfaceInteraction3f,
+    Vector2f,
+    Vector3f,
+)
 
-# Spread of a scattered ray's cone, as a share of 1/√density, the side of the solid angle that a direction of
-# that density stands for.
+# Least spread of a scattered ray's cone, relative to 1/√density, the side of the solid angle per sample.
 SCATTERED = 0.25
 
 
-def write_footprint(si: Any, ray: Any, width: Any) -> Any:
+def write_footprint(si: SurfaceInteraction3f, ray: Ray3f, width: Float) -> SurfaceInteraction3f:
     """`si` with the uv partials of a square of side `width` across the ray, projected onto the surface."""
     si = type(si)(si)
     cosine = dr.maximum(dr.abs(dr.dot(si.n, ray.d)), 1e-3)
@@ -40,7 +51,7 @@ def write_footprint(si: Any, ray: Any, width: Any) -> Any:
     determinant = e * g - f * f
     inverse = dr.select(determinant > 0, 1.0 / determinant, 0.0)
 
-    def partials(step: Any) -> Any:
+    def partials(step: Vector3f) -> Vector2f:
         a, b = dr.dot(si.dp_du, step), dr.dot(si.dp_dv, step)
         return mi.Vector2f((g * a - f * b) * inverse, (e * b - f * a) * inverse)
 
@@ -48,16 +59,16 @@ def write_footprint(si: Any, ray: Any, width: Any) -> Any:
     return si
 
 
-def camera_cone(ray: Any, samples: int) -> tuple[Any, Any]:
-    """(width, spread) of a sensor's ray whose differentials the renderer has divided by √samples."""
+def camera_cone(ray: Ray3f, samples: int) -> tuple[Float, Float]:
+    """(width, spread) of a sensor's ray, whose differentials Mitsuba has divided by √samples."""
     scale = float(samples) ** 0.5
     width = dr.cross(ray.o_x - ray.o, ray.o_y - ray.o)
     spread = dr.cross(ray.d_x - ray.d, ray.d_y - ray.d)
     return tuple(scale * dr.sqrt(dr.abs(dr.dot(area, ray.d))) for area in (width, spread))
 
 
-def lets_through(scene: Any) -> bool:
-    """Whether light may pass straight through a surface of the scene; True where that cannot be told."""
+def may_transmit(scene: Scene) -> bool:
+    """Whether a surface of the scene may transmit light without refraction; True if unknown."""
     surfaces = [shape.bsdf() for shape in scene.shapes()]
     return any(bsdf is None or mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in surfaces)
 
@@ -72,7 +83,7 @@ class ConePath(mi.SamplingIntegrator):
     hide_emitters : the camera does not see emitters (default false)
     """
 
-    def __init__(self, props: Any) -> None:
+    def __init__(self, props: Properties) -> None:
         super().__init__(props)
         depth = int(props.get("max_depth", -1))
         self.max_depth = 0xFFFFFFFF if depth < 0 else depth
@@ -82,8 +93,8 @@ class ConePath(mi.SamplingIntegrator):
         self.hidden = bool(props.get("hide_emitters", False))
         refuse_unknown(props, ("max_depth", "rr_depth", "hide_emitters"), INTEGRATOR_NAME)
 
-    def render(self, scene: Any, *arguments: Any, **options: Any) -> Any:
-        """Stock rendering, after a check of the scene.
+    def render(self, scene: Scene, *arguments: Any, **options: Any) -> Any:
+        """Render after a check of the scene.
 
         Raises
         ------
@@ -93,24 +104,31 @@ class ConePath(mi.SamplingIntegrator):
         return super().render(scene, *arguments, **options)
 
     def sample(
-        self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True
-    ) -> tuple[Any, Any, list[Any]]:
-        """Radiance along a camera ray, whether it met a surface, no further channels."""
+        self, scene: Scene, sampler: Sampler, ray: Ray3f, medium: Any = None, active: Mask = True
+    ) -> tuple[Spectrum, Mask, list[Float]]:
+        """Radiance along a camera ray, whether it hit a surface, no further channels."""
         width, spread = camera_cone(ray, sampler.sample_count())
-        token = FOOTPRINTS_PASSED.set(True)
+        token = footprints_provided.set(True)
         try:
             first = mi.Ray3f(ray)
             value, valid = self._trace(
-                scene, sampler, first, width, spread, mi.Bool(active), lets_through(scene)
+                scene, sampler, first, width, spread, mi.Bool(active), may_transmit(scene)
             )
         finally:
-            FOOTPRINTS_PASSED.reset(token)
+            footprints_provided.reset(token)
         return value, valid, []
 
     @dr.syntax
     def _trace(
-        self, scene: Any, sampler: Any, ray: Any, width: Any, spread: Any, active: Any, holes: bool
-    ) -> tuple[Any, Any]:
+        self,
+        scene: Scene,
+        sampler: Sampler,
+        ray: Ray3f,
+        width: Float,
+        spread: Float,
+        active: Mask,
+        transmits: bool,
+    ) -> tuple[Spectrum, Mask]:
         radiance, throughput = mi.Spectrum(0.0), mi.Spectrum(1.0)
         depth, eta = mi.UInt32(0), mi.Float(1.0)
         pdf, specular = mi.Float(1.0), mi.Bool(True)
@@ -121,7 +139,7 @@ class ConePath(mi.SamplingIntegrator):
         while active:
             si = scene.ray_intersect(ray, mi.RayFlags.All, depth == 0, active)
             width = dr.fma(spread, dr.select(si.is_valid(), si.t, 0.0), width)
-            # Light that the ray meets.
+            # Emitters that the ray hits.
             emitter = si.emitter(scene)
             seen = active & (emitter != None) & ~((depth == 0) & hidden)  # noqa: E711
             ds = mi.DirectionSample3f(scene, si, last)
@@ -134,10 +152,10 @@ class ConePath(mi.SamplingIntegrator):
             si = write_footprint(si, ray, width)
             bsdf = si.bsdf()
             smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-            ds, light = scene.sample_emitter_direction(si, sampler.next_2d(active), not holes, smooth)
+            ds, light = scene.sample_emitter_direction(si, sampler.next_2d(active), not transmits, smooth)
             smooth &= ds.pdf > 0
-            if dr.hint(holes, mode="scalar"):
-                light *= self._through(scene, si, ds, width, smooth)
+            if dr.hint(transmits, mode="scalar"):
+                light *= self._transmitted(scene, si, ds, width, smooth)
             wo = si.to_local(ds.d)
             value, density = bsdf.eval_pdf(context, si, wo, smooth)
             weight = dr.select(ds.delta, 1.0, ds.pdf / (ds.pdf + density))
@@ -166,18 +184,20 @@ class ConePath(mi.SamplingIntegrator):
         return radiance, valid
 
     @dr.syntax
-    def _through(self, scene: Any, si: Any, ds: Any, width: Any, active: Any) -> Any:
-        """Share of an emitter's light that reaches a hit, through the holes of what lies between."""
-        share, active = mi.Spectrum(1.0), mi.Bool(active)
+    def _transmitted(
+        self, scene: Scene, si: SurfaceInteraction3f, ds: DirectionSample3f, width: Float, active: Mask
+    ) -> Spectrum:
+        """Transmittance of the surfaces between a hit and an emitter."""
+        through, active = mi.Spectrum(1.0), mi.Bool(active)
         ray = si.spawn_ray_to(ds.p)
         while active:
             hit = scene.ray_intersect(ray, mi.RayFlags.All, False, active)
             active &= hit.is_valid()
             bsdf = hit.bsdf()
             passes = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
-            # As wide as where the light arrives: what is near is seen as it is there.
+            # The width at the hit: an approximation that is exact for near surfaces.
             hit = write_footprint(hit, ray, width)
-            share[active] *= dr.select(passes, bsdf.eval_null_transmission(hit, passes), 0.0)
-            active &= dr.max(share) > 0.0
+            through[active] *= dr.select(passes, bsdf.eval_null_transmission(hit, passes), 0.0)
+            active &= dr.max(through) > 0.0
             ray = hit.spawn_ray_to(ds.p)
-        return share
+        return through

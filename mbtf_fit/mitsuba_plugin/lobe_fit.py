@@ -1,16 +1,14 @@
-"""Fits :mod:`~mbtf_fit.mitsuba_plugin.lobes` to a material's own values, by expectation maximization.
+"""Fit of :mod:`~mbtf_fit.mitsuba_plugin.lobes` to a material's values by expectation maximization.
 
-For every texel some views and lights are drawn, the material is evaluated there, and the values times the
-light's cosine are taken as weights of samples of the density that is wanted. The distribution of slopes is
-a bivariate Student distribution of two degrees of freedom (that is what GGX is), whose maximum-likelihood
-fit is a short fixed-point iteration (Lange, Little and Taylor 1989), as is that of a mixture's shares
-(Dempster, Laird and Rubin 1977). The light that falls below the surface and the normals' visibility are left
-out of the update: they shift the lobe a little and cost nothing but noise.
+For every texel, views and lights are sampled and the material is evaluated; the values times the light's
+cosine are the weights of samples of the target density. The GGX distribution of slopes is a bivariate Student
+distribution of two degrees of freedom, whose maximum-likelihood fit is a fixed-point iteration (Lange, Little
+and Taylor 1989), as is that of a mixture's weights (Dempster, Laird and Rubin 1977). The update neglects
+directions below the surface and the normals' visibility: both shift the lobe slightly, which increases the
+variance but causes no bias.
 """
 
 from __future__ import annotations
-
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -19,36 +17,37 @@ import numpy as np
 from mbtf_fit.mitsuba_plugin.evaluator import Evaluator
 from mbtf_fit.mitsuba_plugin.lobes import BANDS, CHANNELS, Lobe, Mixture, band_of, mixture_of
 from mbtf_fit.mitsuba_plugin.material_arrays import F32, StoredMaterial
+from mbtf_gen.render.types import Float, UInt32, Vector3f
 
-# Finest level that has lobes of its own, samples per texel, iterations.
+# Finest level with lobes, samples per texel, iterations.
 FINEST = 6
 SAMPLES = 256
 ITERATIONS = 10
-# What is drawn from besides the cosine, and where the iteration starts: a lobe of this α, with this share.
+# Initial lobe of the sampling and of the iteration: α and weight.
 FIRST_ALPHA = 0.4
-FIRST_SHARE = 0.5
-# Smallest α: below it, single precision and the values' own blur leave nothing to gain.
+FIRST_WEIGHT = 0.5
+# Smallest α: the values are blurred by the light kernel, and single precision is limited.
 SMALLEST_ALPHA = 0.03
-# Samples, of a texel's own, that the first lobe counts for.
+# Weight of the initial lobe as a prior, in samples of a texel.
 PRIOR = 1.5
-# Shares to choose from; the cosine always keeps some, so that no value is out of reach.
-SHARES = (0.0, 0.15, 0.3, 0.45, 0.6, 0.75, 0.9)
-# Weight of the level's mean in that choice.
-LEVEL_SAY = 0.5
-# What a share of one must gain at least: small gains are noise.
-DOUBT = 0.1
+# Candidate weights of the lobe, less than 1, so that every direction has a positive density.
+WEIGHTS = (0.0, 0.15, 0.3, 0.45, 0.6, 0.75, 0.9)
+# Weight of the level's mean in the selection.
+LEVEL_WEIGHT = 0.5
+# Penalty of a lobe of weight 1: small improvements are noise.
+PENALTY = 0.1
 # Lanes per launch.
 _LANES = 1 << 22
 
 
 def fit_lobes(stored: StoredMaterial) -> list[F32]:
-    """Numbers of the lobes (rows, columns, 8) of each level up to :data:`FINEST`, in a second or two."""
-    # The one arithmetic whose kernels do not depend on the material: they are compiled once.
+    """Lobes (rows, columns, 8) of each level up to :data:`FINEST`, in a second or two."""
+    # Cooperative kernels do not depend on the material: they are compiled once.
     return lobes_of(Evaluator(stored, "cooperative"))
 
 
 def lobes_of(evaluator: Evaluator) -> list[F32]:
-    """The same for anything that answers as an evaluator does."""
+    """The same for an evaluator."""
     lattice = evaluator.lattice
     out = []
     for level in range(min(lattice.finest, FINEST) + 1):
@@ -69,7 +68,7 @@ def _fit_texels(evaluator: Evaluator, level: int, first: int, count: int) -> F32
     texel = lane // SAMPLES
     at = texel + dr.opaque(mi.UInt32, first)
     row, column = at // dr.opaque(mi.UInt32, columns), at % dr.opaque(mi.UInt32, columns)
-    # One position of the texel, jittered: the lobe stands for all of it.
+    # Jittered positions: the lobe represents the whole texel.
     random = mi.PCG32(initstate=at, initseq=lane % SAMPLES)
     jitter_u, jitter_v = random.next_float32(), random.next_float32()
     u = mi.Point2f(
@@ -80,7 +79,7 @@ def _fit_texels(evaluator: Evaluator, level: int, first: int, count: int) -> F32
     viewer = mi.warp.square_to_cosine_hemisphere(xi)
     viewer.z = dr.maximum(viewer.z, 0.02)
     viewer = dr.normalize(viewer)
-    start = Mixture(_first_lobe(), mi.Float(FIRST_SHARE), viewer)
+    start = Mixture(_first_lobe(), mi.Float(FIRST_WEIGHT), viewer)
     choice = random.next_float32()
     light = start.sample(choice, mi.Point2f(random.next_float32(), random.next_float32()))
     above = light.z > 1e-3
@@ -88,12 +87,12 @@ def _fit_texels(evaluator: Evaluator, level: int, first: int, count: int) -> F32
     features = evaluator.features(u, dr.opaque(mi.Float, float(level)), viewer)
     value = evaluator.value(features, light, viewer)
     density = start.density(light)
-    wanted = dr.select(above, dr.mean(value) * light.z, 0.0)
-    weight = wanted / density
-    dr.eval(viewer, light, wanted, density, weight, texel)
+    target = dr.select(above, dr.mean(value) * light.z, 0.0)
+    weight = target / density
+    dr.eval(viewer, light, target, density, weight, texel)
     buffer = _iterate(weight, viewer, light, texel, count)
     out: F32 = np.array(buffer, np.float32).reshape(count, CHANNELS)
-    out[:, 5:] = _best_shares(buffer, wanted, density, viewer, light, texel, count)
+    out[:, 5:] = _best_weights(buffer, target, density, viewer, light, texel, count)
     return out
 
 
@@ -102,30 +101,31 @@ def _first_lobe() -> Lobe:
     return Lobe(a, mi.Float(0.0), a, mi.Float(0.0), mi.Float(0.0))
 
 
-def _iterate(weight: Any, viewer: Any, light: Any, texel: Any, count: int) -> Any:
+def _iterate(weight: Float, viewer: Vector3f, light: Vector3f, texel: UInt32, count: int) -> Float:
     """Expectation maximization: buffer of the lobes of `count` texels from samples with weights."""
 
-    def total(x: Any) -> Any:
+    def total(x: Float) -> Float:
         return dr.block_sum(x, SAMPLES)
 
-    first = np.array([FIRST_ALPHA, 0, FIRST_ALPHA, 0, 0, *3 * [FIRST_SHARE]], np.float32)
+    first = np.array([FIRST_ALPHA, 0, FIRST_ALPHA, 0, 0, *3 * [FIRST_WEIGHT]], np.float32)
     buffer = mi.Float(np.tile(first, count))
     half = light + viewer
-    # The prior counts as samples of the mean weight; a texel without any light keeps it.
+    # The prior counts as samples of the mean weight; a black texel keeps it.
     all_ = total(weight)
     prior = PRIOR * dr.maximum(all_ / SAMPLES, 1e-12)
     for _ in range(ITERATIONS):
         mixture = mixture_of(buffer, texel, viewer)
-        lobe, share = mixture.lobe, mixture.share
+        lobe, lobe_weight = mixture.lobe, mixture.weight
         density = lobe.density(light, viewer)
-        by_lobe = weight * share * density / dr.maximum(dr.lerp(dr.inv_pi * light.z, density, share), 1e-20)
+        mixed = dr.lerp(dr.inv_pi * light.z, density, lobe_weight)
+        by_lobe = weight * lobe_weight * density / dr.maximum(mixed, 1e-20)
         sx, sy, square = lobe.deviation(half)
         # Student weights (ν + 2)/(ν + δ) with ν = 2 and δ = 2|t|².
         robust = 2.0 * by_lobe / (1.0 + square)
         moments = [robust, robust * sx, robust * sy, robust * sx * sx, robust * sx * sy, robust * sy * sy]
         sums = [total(m) for m in moments]
         lobe_total = total(by_lobe) + prior
-        share = dr.clip((lobe_total - prior + FIRST_SHARE * prior) / (all_ + prior), 0.02, SHARES[-1])
+        lobe_weight = dr.clip((lobe_total - prior + FIRST_WEIGHT * prior) / (all_ + prior), 0.02, WEIGHTS[-1])
         s = sums[0] + prior
         x, y = sums[1] / s, sums[2] / s
         # Scatter about the new center; L Lᵀ is twice the Student distribution's own matrix.
@@ -139,28 +139,34 @@ def _iterate(weight: Any, viewer: Any, light: Any, texel: Any, count: int) -> An
         l22 = dr.sqrt(dr.maximum(2.0 * yy / lobe_total - l21 * l21, 0.0) + least)
         fresh = dr.zeros(mi.Float, CHANNELS * count)
         index = CHANNELS * dr.arange(mi.UInt32, count)
-        for k, number in enumerate((l11, l21, l22, x, y, share, share, share)):
+        for k, number in enumerate((l11, l21, l22, x, y, lobe_weight, lobe_weight, lobe_weight)):
             dr.scatter(fresh, number, index + k)
         dr.eval(fresh)
         buffer = fresh
     return buffer
 
 
-def _best_shares(
-    buffer: Any, wanted: Any, start: Any, viewer: Any, light: Any, texel: Any, count: int
+def _best_weights(
+    buffer: Float,
+    target: Float,
+    start: Float,
+    viewer: Vector3f,
+    light: Vector3f,
+    texel: UInt32,
+    count: int,
 ) -> F32:
-    """Share (count, 3) of the lobe in each band: that of :data:`SHARES` with the least second moment of
-    ``wanted / density``, which counts what the lobe loses below the surface."""
+    """Weight (count, 3) of the lobe in each band: that of :data:`WEIGHTS` with the least second moment of
+    ``target / density``, which includes the loss of directions below the surface."""
     lobe = mixture_of(buffer, texel, viewer).lobe.density(light, viewer)
     band = band_of(viewer.z)
-    moments = np.empty((count, len(BANDS) + 1, len(SHARES)))
-    for c, share in enumerate(SHARES):
-        moment = dr.square(wanted) / (start * dr.lerp(dr.inv_pi * light.z, lobe, mi.Float(share)))
+    moments = np.empty((count, len(BANDS) + 1, len(WEIGHTS)))
+    for c, lobe_weight in enumerate(WEIGHTS):
+        moment = dr.square(target) / (start * dr.lerp(dr.inv_pi * light.z, lobe, mi.Float(lobe_weight)))
         for k in range(len(BANDS) + 1):
             moments[:, k, c] = np.array(dr.block_sum(dr.select(band == k, moment, 0.0), SAMPLES))
-    # Few samples choose badly: the level's mean has a say.
+    # The selection from few samples is noisy: the level's mean regularizes it.
     relative = moments / np.maximum(moments.mean(-1, keepdims=True), 1e-30)
-    cost = (relative + LEVEL_SAY * relative.mean(0)) * (1.0 + DOUBT * np.array(SHARES))
+    cost = (relative + LEVEL_WEIGHT * relative.mean(0)) * (1.0 + PENALTY * np.array(WEIGHTS))
     best = np.argmin(cost, -1)
-    out: F32 = np.array(SHARES, np.float32)[best]
+    out: F32 = np.array(WEIGHTS, np.float32)[best]
     return out

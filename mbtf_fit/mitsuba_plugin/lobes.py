@@ -1,4 +1,4 @@
-r"""Where a material reflects to: a mixture of two densities per texel, for importance sampling.
+r"""Importance sampling of a material: a mixture of two densities per texel.
 
 One is the cosine-weighted hemisphere, the other reflects the view at the visible normals of an anisotropic,
 tilted GGX distribution. Its slopes are ``s = L t + s0`` with t distributed as ``1/(π (1+|t|²)²)``. The normal
@@ -8,7 +8,7 @@ density of the reflected direction is
 
     p(ω_i) = D(h) / (2 (|ω'| + ω'_z)),   D(h) = 1 / (π |det L| (1+|t|²)² h_z⁴).
 
-What falls below the surface is lost: the density integrates to less than one there. The share of the lobe
+Directions below the surface are discarded, so the density integrates to less than one. The weight of the lobe
 depends on the view's cosine, by bands.
 """
 
@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -24,14 +23,15 @@ import numpy as np
 
 from mbtf_fit.mitsuba_plugin.material_arrays import F32
 from mbtf_gen.render.bsdf.microfacet import visible_normal
+from mbtf_gen.render.types import Float, Point2f, UInt32, Vector3f
 
-# Numbers per texel: L (11, 21, 22), s0 (x, y), the lobe's share in each band of the view's cosine.
+# Numbers per texel: L (11, 21, 22), s0 (x, y), the lobe's weight in each band of the view's cosine.
 CHANNELS = 8
 # Inner edges of the bands.
 BANDS = (0.35, 0.7)
 
 
-def band_of(cosine: Any) -> Any:
+def band_of(cosine: Float) -> UInt32:
     """Number of the band of a view's cosine."""
     return dr.select(
         cosine < BANDS[0], mi.UInt32(0), dr.select(cosine < BANDS[1], mi.UInt32(1), mi.UInt32(2))
@@ -40,15 +40,15 @@ def band_of(cosine: Any) -> Any:
 
 @dataclass(frozen=True)
 class Lobe:
-    """A reflecting distribution of slopes, per lane: lower triangle of L, and s0."""
+    """Reflection at a distribution of slopes: lower triangle of L, and s0."""
 
-    l11: Any
-    l21: Any
-    l22: Any
-    x: Any
-    y: Any
+    l11: Float
+    l21: Float
+    l22: Float
+    x: Float
+    y: Float
 
-    def deviation(self, half: Any) -> tuple[Any, Any, Any]:
+    def deviation(self, half: Vector3f) -> tuple[Float, Float, Float]:
         """(slope x, slope y, |t|²) of half vectors of any length, z > 0."""
         inverse = 1.0 / half.z
         sx, sy = -half.x * inverse, -half.y * inverse
@@ -56,7 +56,7 @@ class Lobe:
         ty = (sy - self.y - self.l21 * tx) / self.l22
         return sx, sy, dr.fma(tx, tx, ty * ty)
 
-    def _stretched(self, viewer: Any) -> Any:
+    def _stretched(self, viewer: Vector3f) -> Vector3f:
         """Kᵀ ω."""
         return mi.Vector3f(
             dr.fma(self.l11, viewer.x, self.l21 * viewer.y),
@@ -64,8 +64,8 @@ class Lobe:
             viewer.z - self.x * viewer.x - self.y * viewer.y,
         )
 
-    def density(self, light: Any, viewer: Any) -> Any:
-        """Density in 1/sr of reflecting the viewer's direction into the light's, both with z > 0."""
+    def density(self, light: Vector3f, viewer: Vector3f) -> Float:
+        """Density of the light's direction in 1/sr for the viewer's direction, both with z > 0."""
         half = light + viewer
         _, _, square = self.deviation(half)
         cosine2 = dr.square(half.z) / dr.squared_norm(half)
@@ -77,7 +77,7 @@ class Lobe:
         below = 2.0 * dr.pi * self.l11 * self.l22 * dr.square((1.0 + square) * cosine2) * sum_
         return 1.0 / dr.maximum(below, 1e-20)
 
-    def reflect(self, viewer: Any, xi: Any) -> Any:
+    def reflect(self, viewer: Vector3f, xi: Point2f) -> Vector3f:
         """Direction with that density; z may be negative."""
         t = visible_normal(dr.normalize(self._stretched(viewer)), 1.0, xi)
         half = dr.normalize(
@@ -92,27 +92,27 @@ class Lobe:
 
 @dataclass(frozen=True)
 class Mixture:
-    """The density seen from one direction: the lobe with a share, else cosine-weighted."""
+    """The density for one view: the lobe with a weight, else cosine-weighted."""
 
     lobe: Lobe
-    share: Any
-    viewer: Any
+    weight: Float
+    viewer: Vector3f
 
     @classmethod
-    def cosine(cls, viewer: Any) -> Mixture:
-        """Nothing but the cosine-weighted hemisphere."""
+    def cosine(cls, viewer: Vector3f) -> Mixture:
+        """The cosine-weighted hemisphere alone."""
         one, none = mi.Float(1.0), mi.Float(0.0)
         return cls(Lobe(one, none, one, none, none), none, viewer)
 
-    def density(self, light: Any) -> Any:
+    def density(self, light: Vector3f) -> Float:
         """In 1/sr; 0 below the surface."""
-        value = dr.lerp(dr.inv_pi * light.z, self.lobe.density(light, self.viewer), self.share)
+        value = dr.lerp(dr.inv_pi * light.z, self.lobe.density(light, self.viewer), self.weight)
         return dr.select((light.z > 0) & (self.viewer.z > 0), value, 0.0)
 
-    def sample(self, choice: Any, xi: Any) -> Any:
-        """Direction; below the surface it is to be thrown away."""
+    def sample(self, choice: Float, xi: Point2f) -> Vector3f:
+        """Direction; to be discarded below the surface."""
         cosine = mi.warp.square_to_cosine_hemisphere(xi)
-        return dr.select(choice < self.share, self.lobe.reflect(self.viewer, xi), cosine)
+        return dr.select(choice < self.weight, self.lobe.reflect(self.viewer, xi), cosine)
 
 
 class LobeTextures:
@@ -132,7 +132,7 @@ class LobeTextures:
         self._finest = len(levels) - 1
         dr.eval(self._table, self._buffer)
 
-    def at(self, u: Any, level: Any, viewer: Any) -> Mixture:
+    def at(self, u: Point2f, level: Float, viewer: Vector3f) -> Mixture:
         """Mixture of the nearest texel of the nearest level at uv positions (Point2f)."""
         nearest = mi.UInt32(dr.clip(dr.round(level), 0.0, float(self._finest)))
         rows, columns, start, _ = dr.gather(mi.Vector4u, self._table, nearest)
@@ -141,10 +141,10 @@ class LobeTextures:
         return mixture_of(self._buffer, start + j * columns + i, viewer)
 
 
-def mixture_of(buffer: Any, texel: Any, viewer: Any) -> Mixture:
+def mixture_of(buffer: Float, texel: UInt32, viewer: Vector3f) -> Mixture:
     """Mixture of a texel of a buffer, by its number."""
     l11, l21, l22, x = dr.gather(mi.Vector4f, buffer, 2 * texel)
-    y, *shares = dr.gather(mi.Vector4f, buffer, 2 * texel + 1)
+    y, *weights = dr.gather(mi.Vector4f, buffer, 2 * texel + 1)
     band = band_of(viewer.z)
-    share = dr.select(band == 0, shares[0], dr.select(band == 1, shares[1], shares[2]))
-    return Mixture(Lobe(l11, l21, l22, x, y), share, viewer)
+    weight = dr.select(band == 0, weights[0], dr.select(band == 1, weights[1], weights[2]))
+    return Mixture(Lobe(l11, l21, l22, x, y), weight, viewer)

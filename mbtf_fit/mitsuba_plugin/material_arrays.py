@@ -1,4 +1,4 @@
-"""A material folder as NumPy arrays: what a renderer needs of it, checked."""
+"""A material folder as NumPy arrays, validated, for renderers."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from mbtf_core.lattice import Lattice
 from mbtf_fit.config import FitConfig, NetworkSection
 from mbtf_fit.material.format import CONFORMANCE, DESCRIPTION_NAME, check_conformance, read_description
 from mbtf_fit.material.transmittance import read_transmittance
+from mbtf_fit.models.constants import direction_size, position_size
 
 F32 = NDArray[np.float32]
 # (weight (outputs, inputs), bias (outputs,)) of each layer.
@@ -23,20 +24,32 @@ Layers = list[tuple[F32, F32]]
 
 @dataclass(frozen=True)
 class StoredMaterial:
-    """The weights of a fitted material.
+    """Weights of a fitted material as float32 arrays.
 
     Attributes
     ----------
-    folder : where it lies
-    lattice : texel grids of the tile
-    network : its architecture
-    pyramid : (rows, columns, channels) of each level, coarsest first
-    decoder : layers of the network that gives the value
-    offset_texture, offset_network : those of the neural offset; None without one
-    unit : factor of the value, 1/sr
-    calibration : (2, levels, knots, 3) factors by light's and view's elevation; None where there are none
-    transmittance : (rows, columns, 6) coefficients of each level; None for an opaque material
-    conformance : queries ``u``, ``sigma``, ``omega_i``, ``omega_o`` and their values ``rgb`` (n, 3)
+    folder : Path
+        Folder of the material.
+    lattice : Lattice
+        Texel grids of the tile.
+    network : NetworkSection
+        Architecture.
+    pyramid : list of (rows, columns, channels) arrays
+        Feature textures, coarsest level first.
+    decoder : list of (weight, bias)
+        Layers of the decoder: (outputs, inputs) and (outputs,) arrays.
+    offset_texture : (rows, columns, channels) array or None
+        Texture of the neural offset.
+    offset_network : list of (weight, bias) or None
+        Layers of the offset network.
+    unit : float
+        Factor of the value, in 1/sr.
+    calibration : (2, levels, knots, 3) array or None
+        Calibration factors by elevation of light and of view.
+    transmittance : list of (rows, columns, 6) arrays or None
+        Coefficients of the transmittance; None for an opaque material.
+    conformance : dict
+        Queries ``u``, ``sigma``, ``omega_i``, ``omega_o`` and their values ``rgb`` (n, 3).
     """
 
     folder: Path
@@ -55,9 +68,19 @@ class StoredMaterial:
 def read_material(folder: str | Path) -> StoredMaterial:
     """Read a material folder, without PyTorch.
 
+    Parameters
+    ----------
+    folder : str or Path
+        Folder made by ``mbtf-fit``.
+
+    Returns
+    -------
+    StoredMaterial
+
     Raises
     ------
-    InputError : missing, damaged, of another schema, or of a model or option that no plugin exists for
+    InputError
+        The folder is missing, corrupt, of another schema, or of an unsupported model.
     """
     folder = Path(folder)
     description, weights = read_description(folder)
@@ -75,17 +98,16 @@ def read_material(folder: str | Path) -> StoredMaterial:
     offset_texture, offset_network = None, None
     if network.offset != "none":
         offset_texture = reader.texture("offset_texture.0", lattice.shape())
-        answers = 1 if network.offset == "depth" else 2
-        offset_network = reader.layers("offset_network", offset_texture.shape[2] + 2, answers)
+        outputs = 1 if network.offset == "depth" else 2
+        offset_network = reader.layers("offset_network", offset_texture.shape[2] + 2, outputs)
     features = channels * (2 if network.blending == "concatenate" else 1)
-    directions = 2 * _size(3 if network.encoding.direction_xyz else 2, network.encoding.direction, network)
-    position = _size(2, network.encoding.position, network) if network.encoding.position else 0
+    encoded = position_size(network.encoding) + 2 * direction_size(network.encoding)
     return StoredMaterial(
         folder,
         lattice,
         network,
         pyramid,
-        reader.layers("decoder", features + position + directions, network.output_channels),
+        reader.layers("decoder", features + encoded, network.output_channels),
         offset_texture,
         offset_network,
         float(reader.take("unit", ())),
@@ -95,19 +117,19 @@ def read_material(folder: str | Path) -> StoredMaterial:
     )
 
 
-def _size(coordinates: int, bands: int, network: NetworkSection) -> int:
-    """Numbers that encode so many coordinates."""
-    return coordinates * (2 * bands + network.encoding.raw) if bands else coordinates
-
-
 def _supported(description: dict[str, Any], place: Path) -> NetworkSection:
-    """The architecture, or a refusal."""
-    # How it was trained is no concern of a renderer.
+    """The architecture.
+
+    Raises
+    ------
+    InputError : the plugin does not support it
+    """
+    # A renderer does not depend on the options of training.
     named = {key: description["config"][key] for key in ("model", "network") if key in description["config"]}
     config = build(FitConfig, named, source=str(place))
     if config.network.decoder != "mlp":
         raise InputError(
-            f"the renderer's plugin cannot evaluate '{config.model}', which looks at neighboring queries",
+            f"the renderer's plugin does not support the inception decoder of '{config.model}'",
             where=place,
             hint="fit the model neumip or neumip-baseline to the same shards",
         )

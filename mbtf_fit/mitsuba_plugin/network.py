@@ -1,10 +1,11 @@
-"""Small fully connected networks in Dr.Jit kernels, evaluated in one of three ways.
+"""Small fully connected networks in Dr.Jit kernels.
 
-- ``unrolled``: multiply-adds with the weights as literals of the kernel. Fastest on a CPU: the features stay
-  in registers and no weight is loaded twice. The kernel is compiled for one material.
-- ``cooperative``: :mod:`drjit.nn` cooperative vectors in single precision; one kernel for all materials.
-- ``half``: the same in half precision, what tensor cores of GPUs need. The first layer is unrolled in single
-  precision: half of the error, and most of an offset's, would come from rounding what the network sees.
+- ``unrolled``: multiply-adds with the weights as literals of the kernel. Fastest on a CPU, for networks that
+  compile in reasonable time. The kernel is compiled for one material.
+- ``cooperative``: cooperative vectors of :mod:`drjit.nn` in single precision; one kernel for all materials.
+- ``half``: cooperative vectors in half precision, for the tensor cores of GPUs. The first layer is unrolled
+  in
+  single precision, because rounded inputs would cause half of the error.
 """
 
 from __future__ import annotations
@@ -17,16 +18,16 @@ import mitsuba as mi
 from drjit import nn
 
 from mbtf_fit.mitsuba_plugin.material_arrays import Layers
+from mbtf_fit.models.constants import LEAK
+from mbtf_gen.render.types import Float
 
 Arithmetic = Literal["unrolled", "cooperative", "half"]
-# Weights beyond which unrolled code takes too long to compile.
+# Most weights of unrolled networks: larger ones take too long to compile.
 MOST_UNROLLED = 12_000
-# Slope of leaky-relu below zero.
-LEAK = 0.01
 
 
 def default_arithmetic(weights: int) -> Arithmetic:
-    """What suits the current variant and a number of weights."""
+    """Default for the current variant and a number of weights."""
     if mi.variant().startswith("cuda"):
         return "half"
     return "unrolled" if weights <= MOST_UNROLLED else "cooperative"
@@ -43,7 +44,7 @@ class Network:
     Parameters
     ----------
     layers : weights and biases
-    arithmetic : how it is evaluated
+    arithmetic : ``unrolled``, ``cooperative`` or ``half``
     activation : ``relu``, ``leaky-relu`` or ``sine``
     """
 
@@ -59,8 +60,8 @@ class Network:
             parts = [tensor(array) for weight, bias in rest for array in (weight, bias[:, None])]
             self._views = nn.pack(*parts, layout="inference")
 
-    def __call__(self, inputs: Sequence[Any]) -> list[Any]:
-        """Outputs of the last layer for lanes' inputs."""
+    def __call__(self, inputs: Sequence[Float]) -> list[Float]:
+        """Outputs of the last layer."""
         x = self._unrolled(inputs)
         return x if self._single == len(self.layers) else self._cooperative(x)
 
@@ -70,7 +71,7 @@ class Network:
             return dr.maximum(x, 0.0)
         return dr.sin(x) if self.activation == "sine" else dr.maximum(x, LEAK * x)
 
-    def _unrolled(self, inputs: Sequence[Any]) -> list[Any]:
+    def _unrolled(self, inputs: Sequence[Float]) -> list[Float]:
         x = list(inputs)
         for k, (weight, bias) in enumerate(self.layers[: self._single]):
             y = []
@@ -82,7 +83,7 @@ class Network:
             x = y
         return x
 
-    def _cooperative(self, inputs: Sequence[Any]) -> list[Any]:
+    def _cooperative(self, inputs: Sequence[Float]) -> list[Float]:
         number = mi.Float16 if self.arithmetic == "half" else mi.Float
         x = nn.CoopVec(*(number(value) for value in inputs))
         count = len(self.layers) - self._single

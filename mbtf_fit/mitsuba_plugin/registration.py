@@ -1,51 +1,60 @@
-"""Makes the plugins known to Mitsuba."""
+"""Registration of the plugins with Mitsuba."""
 
 from __future__ import annotations
 
-import difflib
 import sys
-from collections.abc import Sequence
 from typing import Any
 
 from mbtf_core.errors import EngineError, MbtfError, UsageError
-from mbtf_gen.render.runtime import CPU_VARIANT, CUDA_VARIANT, refuse_old_llvm
+from mbtf_fit.mitsuba_plugin.names import BSDF_NAME, INTEGRATOR_NAME, VARIANTS
+from mbtf_gen.render.runtime import CPU_VARIANT, load_mitsuba, refuse_old_llvm
+from mbtf_gen.render.types import Properties
 
-BSDF_NAME = "mbtf"
-INTEGRATOR_NAME = "mbtf_path"
-VARIANTS = (CPU_VARIANT, CUDA_VARIANT)
-
-# The plugins' classes derive from classes of one variant.
+# The variant whose classes the plugins derive from.
 _registered: str | None = None
-# What the last plugin said against its parameters; Mitsuba passes on no more than its text.
-last_error: MbtfError | None = None
+# The last error of a plugin's constructor. Mitsuba may construct plugins in its own threads, and passes on
+# the text of their exceptions only.
+_last_error: MbtfError | None = None
 
 
 def variant_is_set() -> bool:
-    """Has this process chosen a variant of Mitsuba?"""
+    """Whether this process has set a variant of Mitsuba."""
     mitsuba = sys.modules.get("mitsuba")
     return mitsuba is not None and mitsuba.variant() is not None
 
 
-def register() -> None:
-    """Register ``mbtf`` and ``mbtf_path`` with the current variant; a second call does nothing.
+def register(variant: str | None = None) -> None:
+    """Register ``mbtf`` and ``mbtf_path`` with Mitsuba; a second call does nothing.
+
+    Parameters
+    ----------
+    variant : str, optional
+        Load Mitsuba with this variant first: ``llvm_ad_rgb``, ``cuda_ad_rgb`` or ``auto``. Dr.Jit then uses
+        the LLVM of this installation; without it, Mitsuba must be imported and its variant set, and Dr.Jit
+        uses the LLVM of the system.
 
     Raises
     ------
-    UsageError : no variant is set, or one that the plugins do not run in
-    EngineError : they are registered with another variant already, or Dr.Jit has bound to an old
-        LLVM
+    UsageError
+        No variant is set, or one that the plugins do not support.
+    EngineError
+        The plugins are registered with another variant, or Mitsuba or its LLVM cannot be used.
     """
     global _registered
+    if variant is not None:
+        load_mitsuba(variant)
     if not variant_is_set():
-        raise UsageError("no variant of Mitsuba is set", hint='call mitsuba.set_variant("llvm_ad_rgb") first')
+        raise UsageError(
+            "no variant of Mitsuba is set", hint=f'call mbtf_fit.mitsuba_plugin.register("{CPU_VARIANT}")'
+        )
     import mitsuba as mi
 
-    variant = mi.variant()
-    if variant == _registered:
+    current = mi.variant()
+    if current == _registered:
         return
-    if variant not in VARIANTS:
+    if current not in VARIANTS:
         raise UsageError(
-            f"the plugin '{BSDF_NAME}' does not run in the variant {variant}",
+            f"the plugin '{BSDF_NAME}' does not run in the variant {current}",
             hint=f"set {VARIANTS[0]} or {VARIANTS[1]}",
         )
     if _registered is not None:
@@ -53,34 +62,27 @@ def register() -> None:
             f"the plugin '{BSDF_NAME}' is registered with the variant {_registered}",
             hint="use one variant per process",
         )
-    if variant == CPU_VARIANT:
+    if current == CPU_VARIANT:
         refuse_old_llvm()
     from mbtf_fit.mitsuba_plugin.bsdf import MbtfBSDF
     from mbtf_fit.mitsuba_plugin.integrator import ConePath
 
-    mi.register_bsdf(BSDF_NAME, lambda props: _made(MbtfBSDF, props))
-    mi.register_integrator(INTEGRATOR_NAME, lambda props: _made(ConePath, props))
-    _registered = variant
+    mi.register_bsdf(BSDF_NAME, lambda props: _construct(MbtfBSDF, props))
+    mi.register_integrator(INTEGRATOR_NAME, lambda props: _construct(ConePath, props))
+    _registered = current
 
 
-def refuse_unknown(props: Any, known: Sequence[str], where: str) -> None:
-    """Refuse a parameter that a plugin does not have; Mitsuba would say so in a report of several lines.
-
-    Raises
-    ------
-    UsageError : there is one
-    """
-    unknown = sorted(set(props.unqueried()) - set(known))
-    if unknown:
-        near = difflib.get_close_matches(unknown[0], known, n=1)
-        hint = f"did you mean '{near[0]}'?" if near else f"it has: {', '.join(known)}"
-        raise UsageError(f"has no parameter '{unknown[0]}'", where=where, hint=hint)
-
-
-def _made(plugin: Any, props: Any) -> Any:
-    global last_error
+def _construct(plugin: Any, props: Properties) -> Any:
+    global _last_error
     try:
         return plugin(props)
     except MbtfError as error:
-        last_error = error
+        _last_error = error
         raise
+
+
+def take_last_error() -> MbtfError | None:
+    """The last error of a plugin's constructor; it is forgotten."""
+    global _last_error
+    error, _last_error = _last_error, None
+    return error

@@ -1,4 +1,4 @@
-"""Loading of scenes with fitted materials, and what can be said against them before they are rendered."""
+"""Loading of scenes with fitted materials."""
 
 from __future__ import annotations
 
@@ -6,23 +6,34 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import mitsuba as mi
-
-from mbtf_core.errors import InputError, MbtfError
-from mbtf_fit.mitsuba_plugin import registration
+from mbtf_fit.mitsuba_plugin.registration import register, take_last_error
+from mbtf_gen.render.types import Scene
 
 
-def load_scene(source: str | Path | Mapping[str, Any]) -> Any:
-    """Load a scene and check it: a dictionary, an XML file's path, or XML text.
+def load_scene(source: str | Path | Mapping[str, Any]) -> Scene:
+    """Load and check a scene with fitted materials; errors of the plugins are raised as they are.
 
-    Mitsuba wraps errors of plugins into a report of several lines; this raises the plugin's own.
+    Parameters
+    ----------
+    source : str, Path or mapping
+        Path of an XML file, XML text, or a dictionary as for ``mitsuba.load_dict``.
+
+    Returns
+    -------
+    mitsuba.Scene
+        Or the object that a dictionary describes.
 
     Raises
     ------
-    MbtfError : what is wrong with a material, or a mesh with an ``mbtf`` material has no texture coordinates
+    MbtfError
+        A material cannot be used, or a mesh with an ``mbtf`` material has no texture coordinates.
     """
-    registration.register()
-    registration.last_error = None
+    register()
+    import mitsuba as mi
+
+    from mbtf_fit.mitsuba_plugin.bsdf import check_scene
+
+    take_last_error()
     try:
         if isinstance(source, Mapping):
             scene = mi.load_dict(dict(source))
@@ -31,28 +42,10 @@ def load_scene(source: str | Path | Mapping[str, Any]) -> Any:
         else:
             scene = mi.load_file(str(source))
     except Exception:
-        error: MbtfError | None = registration.last_error
+        error = take_last_error()
         if error is None:
             raise
         raise error from None
     if isinstance(scene, mi.Scene):
         check_scene(scene)
     return scene
-
-
-def check_scene(scene: Any) -> None:
-    """Refuse meshes that have an ``mbtf`` material but no texture coordinates.
-
-    Raises
-    ------
-    InputError : such a mesh
-    """
-    from mbtf_fit.mitsuba_plugin.bsdf import MbtfBSDF
-
-    for shape in scene.shapes():
-        if shape.is_mesh() and isinstance(shape.bsdf(), MbtfBSDF) and not shape.has_vertex_texcoords():
-            raise InputError(
-                "the mesh has an mbtf material but no texture coordinates",
-                where=f"shape '{shape.id()}'",
-                hint="give it uv coordinates: they place the material's tile",
-            )

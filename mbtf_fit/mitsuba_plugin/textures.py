@@ -1,25 +1,25 @@
 """Bilinear lookups in a packed pyramid of periodic textures, in Dr.Jit kernels.
 
 All levels lie one after the other in one buffer, texels of a level row by row (row 0 is the side ``v → 1``),
-channels padded to whole groups of :data:`GROUP`, so that a texel is read by wide loads.
+channels padded to a multiple of :data:`GROUP`, so that wide loads read a texel.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mbtf_fit.mitsuba_plugin.material_arrays import F32
+from mbtf_gen.render.types import Float, Point2f, UInt32
 
 # Channels that one gather reads.
 GROUP = 4
 
 
-def _in_image(u: Any) -> Any:
+def _in_image(u: Point2f) -> Point2f:
     """Position in the image, from its left and its top, in [0, 1]."""
     return mi.Point2f(u.x - dr.floor(u.x), 1.0 - (u.y - dr.floor(u.y)))
 
@@ -48,21 +48,21 @@ class Textures:
         self._table = mi.UInt32(np.array(table, np.uint32).reshape(-1))
         dr.eval(self.buffer, self._table)
 
-    def first(self, u: Any) -> list[Any]:
+    def first(self, u: Point2f) -> list[Float]:
         """Features of the first level at uv positions (Point2f), any real numbers: textures are periodic."""
         rows, columns = self.shapes[0]
-        place = (mi.UInt32(rows), mi.UInt32(columns), mi.UInt32(0))
-        return self._bilinear(_in_image(u), *place, None, [0.0] * self.channels)
+        layout = (mi.UInt32(rows), mi.UInt32(columns), mi.UInt32(0))
+        return self._bilinear(_in_image(u), *layout, None, [0.0] * self.channels)
 
-    def blended(self, u: Any, level: Any) -> list[Any]:
+    def blended(self, u: Point2f, level: Float) -> list[Float]:
         """Features between two levels: (1 - frac(level)) of the coarser, frac(level) of the finer one."""
         if len(self.shapes) == 1:
             return self.first(u)
         coarse, weight = self._coarse(level)
         return self._level(u, coarse + 1, weight, self._level(u, coarse, 1.0 - weight, [0.0] * self.channels))
 
-    def side_by_side(self, u: Any, level: Any) -> list[Any]:
-        """The same two terms, not added: that of the even level, then that of the odd one."""
+    def side_by_side(self, u: Point2f, level: Float) -> list[Float]:
+        """The same two terms, concatenated: that of the even level, then that of the odd one."""
         none = [0.0] * self.channels
         if len(self.shapes) == 1:
             return [*self.first(u), *(mi.Float(v) for v in none)]
@@ -72,23 +72,25 @@ class Textures:
         both = list(zip(low, high, strict=True))
         return [dr.select(odd, h, v) for v, h in both] + [dr.select(odd, v, h) for v, h in both]
 
-    def _coarse(self, level: Any) -> tuple[Any, Any]:
+    def _coarse(self, level: Float) -> tuple[UInt32, Float]:
         """(coarser level, weight of the finer one)."""
         level = dr.clip(level, 0.0, len(self.shapes) - 1.0)
         coarse = dr.minimum(mi.UInt32(level), len(self.shapes) - 2)
         return coarse, level - mi.Float(coarse)
 
-    def _level(self, u: Any, level: Any, scale: Any, out: list[Any]) -> list[Any]:
+    def _level(self, u: Point2f, level: UInt32, scale: Float, out: list[Float]) -> list[Float]:
         rows, columns, start, _ = dr.gather(mi.Vector4u, self._table, level)
         return self._bilinear(_in_image(u), rows, columns, start, scale, out)
 
-    def _bilinear(self, x: Any, rows: Any, columns: Any, start: Any, scale: Any, out: list[Any]) -> list[Any]:
+    def _bilinear(
+        self, x: Point2f, rows: UInt32, columns: UInt32, start: UInt32, scale: Float, out: list[Float]
+    ) -> list[Float]:
         """`out` plus the texture of one level times a scale, at image positions x in [0, 1]."""
         px, py = dr.fma(x.x, mi.Float(columns), -0.5), dr.fma(x.y, mi.Float(rows), -0.5)
         left, top = dr.floor(px), dr.floor(py)
         fx, fy = px - left, py - top
         i, j = mi.Int32(left), mi.Int32(top)
-        # x lies within the image: only the first texel's left and the last one's right neighbor wrap.
+        # x is in [0, 1]: only the first and the last texel have neighbors beyond the border.
         i0 = mi.UInt32(dr.select(i < 0, mi.Int32(columns) - 1, i))
         i1 = mi.UInt32(dr.select(i + 1 >= mi.Int32(columns), 0, i + 1))
         j0 = start + columns * mi.UInt32(dr.select(j < 0, mi.Int32(rows) - 1, j))
@@ -106,9 +108,8 @@ class Textures:
             out = [dr.fma(value, weight, total) for value, total in zip(texel, out, strict=True)]
         return out
 
-    def _texel(self, index: Any) -> list[Any]:
-        values: list[Any] = []
+    def _texel(self, index: UInt32) -> list[Float]:
+        values: list[Float] = []
         for group in range(self.groups):
-            place = index * self.groups + group
-            values += list(dr.gather(mi.Vector4f, self.buffer, place))
+            values += list(dr.gather(mi.Vector4f, self.buffer, index * self.groups + group))
         return values[: self.channels]

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 from mbtf_core.atomic import read_json, write_json, write_text
-from mbtf_core.config_file import differences, dump_yaml, in_short
+from mbtf_core.config_file import dump_yaml
+from mbtf_core.digest import data_sha256
 from mbtf_core.errors import InputError
+from mbtf_core.folders import ELSEWHERE, check_folder, make_folder, other_configuration
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import data_hash
 from mbtf_fit.material.export import LAYERS_NAME, TEXTURES_NAME
 from mbtf_fit.material.format import DESCRIPTION_NAME, WEIGHTS_NAME
-from mbtf_fit.material.storage import make_folder
 from mbtf_fit.material.transmittance import TRANSMITTANCE_NAME
 from mbtf_fit.training.checkpoint import CHECKPOINT_NAME
 from mbtf_fit.training.validation import HISTORY_NAME
@@ -36,7 +36,7 @@ def identity_of(config: FitConfig, data: Dataset) -> dict[str, Any]:
     files = {split: [e["file"] for e in data.manifest["splits"][split]["shards"]] for split in data.splits}
     described = {"hash": data_hash(data), "levels": data.lattice.finest, "aspect": data.lattice.aspect}
     lengths = {split: len(names) for split, names in files.items()}
-    config_hash = config.hash(json.dumps({**described, "files": files}, sort_keys=True))
+    config_hash = config.hash(data_sha256({**described, "files": files}))
     if config.init_from is not None:
         config_hash += f"-{weights_digest(config.init_from)}"
     return {
@@ -55,13 +55,8 @@ def claim(out: Path, identity: dict[str, Any], config: FitConfig, overwrite: boo
     ------
     InputError : it holds something else
     """
-    if out.exists() and not out.is_dir():
-        raise InputError("is a file, not a folder", where=out)
-    existing = out / FIT_NAME
-    if out.is_dir() and any(out.iterdir()):
-        if not existing.exists():
-            raise InputError("is not empty and holds no fit", where=out, hint="choose another folder with -o")
-        old = read_json(existing)
+    if check_folder(out, lambda path: (path / FIT_NAME).exists(), "fit"):
+        old = read_json(out / FIT_NAME)
         if old.get("config_hash") == identity["config_hash"] and not overwrite:
             return
         if not overwrite:
@@ -82,11 +77,7 @@ def _another_fit(out: Path, old: dict[str, Any], new: dict[str, Any]) -> InputEr
         return InputError(
             f"holds a fit of schema {old.get('schema')}; this version writes schema {_SCHEMA}",
             where=out,
-            hint="choose another folder with -o, or replace it with --overwrite",
+            hint=f"{ELSEWHERE}, or replace it with --overwrite",
         )
     before, after = ({**record.get("config", {}), "data": record.get("data")} for record in (old, new))
-    return InputError(
-        f"holds a fit of another configuration: {in_short(differences(before, after)) or 'other shards'}",
-        where=out,
-        hint="choose another folder with -o, or replace it with --overwrite",
-    )
+    return other_configuration(out, "a fit", before, after, "other shards")

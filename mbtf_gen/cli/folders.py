@@ -75,7 +75,7 @@ def repair(
     dry_run: DryRun = False,
     console: Console = CONSOLE,
 ) -> int:
-    """Make again what verify condemns: the data set is then the undisturbed one.
+    """Restore what verify finds missing or corrupt: the data set is then identical to the original.
 
     Parameters
     ----------
@@ -86,30 +86,30 @@ def repair(
     """
     from mbtf_gen.repairs import Corruption, RepairResult
 
-    damage = Corruption(folder, material)
+    found = Corruption(folder, material)
     if dry_run:
-        shards = [entry.file for entry in damage.entries]
-        done = RepairResult(str(folder), damage.faults, shards, damage.documents, damage.left, False, 0, 0.0)
+        shards = [entry.file for entry in found.entries]
+        done = RepairResult(str(folder), found.faults, shards, found.documents, found.left, False, 0, 0.0)
     else:
         with (
-            going_on(f"{folder}: what was made again is kept"),
-            console.progress(damage.paths, "repairing", "paths") as bar,
+            going_on(f"{folder}: the shards rendered so far are kept"),
+            console.progress(found.paths, "repairing", "paths") as bar,
         ):
-            done = damage.mend(bar.update)
+            done = found.repair(bar.update)
     data = {"dry_run": dry_run, **asdict(done)}
     console.report(data, _describe_repair(done, dry_run))
     return EXIT_BAD_INPUT if done.left else EXIT_OK
 
 
 def _describe_repair(done: RepairResult, dry_run: bool) -> str:
-    verb, wrote = ("would be made", "would be written") if dry_run else ("made", "written")
+    rendered, written = ("would be rendered", "would be written") if dry_run else ("rendered", "written")
     lines = [f"{done.folder}/{f.file}: {f.what}" for f in done.faults if not f.absent and f not in done.left]
     if done.shards:
         first = ", ".join(done.shards[:5]) + (", …" if len(done.shards) > 5 else "")
-        lines.append(f"{done.folder}: {len(done.shards)} shards {verb} again ({first})")
+        lines.append(f"{done.folder}: {len(done.shards)} shards {rendered} again ({first})")
     if done.documents:
-        lines.append(f"{done.folder}: {' and '.join(done.documents)} {wrote} again")
+        lines.append(f"{done.folder}: {' and '.join(done.documents)} {written} again")
     if not done.shards and not done.documents:
-        lines.append(f"{done.folder}: nothing to mend")
+        lines.append(f"{done.folder}: nothing to repair")
     lines += [f"{done.folder}/{f.file}: {f.what}, left alone; {f.hint}" for f in done.left]
     return "\n".join(lines)

@@ -51,12 +51,13 @@ def generate(
     resolved = resolve_config(options, material, as_assignments(GENERATOR[quality] if quality else {}))
     part = _slice(slice)
     from mbtf_gen.dataset.summary import summary_dict
-    from mbtf_gen.generation import Job, generate, paths_left
+    from mbtf_gen.generation import generate, paths_left
+    from mbtf_gen.job import Job, split_queries
 
     job = Job.prepare(resolved)
     console.note(
-        f"{resolved.material} -> {output}: {job.queries('train')} training + {job.queries('test')} test "
-        f"queries, finest level {job.lattice.finest}"
+        f"{resolved.material} -> {output}: {split_queries(job, 'train')} training + "
+        f"{split_queries(job, 'test')} test queries, finest level {job.lattice.finest}"
     )
     total = paths_left(job, output, *part)
     with (
@@ -64,13 +65,12 @@ def generate(
         console.progress(total=total, label="generating", unit="paths") as bar,
     ):
         summary = generate(
-            resolved,
+            job,
             output,
             overwrite=overwrite,
             slice_index=part[0],
             slice_count=part[1],
-            progress=lambda done, note: bar.update(done, note),
-            job=job,
+            progress=bar.update,
         )
     console.report(summary_dict(summary), describe(summary))
 

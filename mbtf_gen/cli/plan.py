@@ -1,10 +1,10 @@
-"""``mbtf-gen plan``: which effects a run would simulate, why, and what leaving the others out costs."""
+"""``mbtf-gen plan``: which effects a run would simulate, why, and the bias of leaving each one out."""
 
 from __future__ import annotations
 
 import math
 import textwrap
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
@@ -17,8 +17,8 @@ from mbtf_gen.config.presets import GENERATOR, QualityOption, as_assignments
 if TYPE_CHECKING:
     from mbtf_gen.planning.effects import Effect, EffectsPlan
 
-# Columns of the table before the reason, and its width.
-_NAME, _COST, _WIDTH = 24, 18, 100
+# Columns of the table before the explanation, and its width.
+_NAME, _BOUND, _WIDTH = 24, 24, 108
 
 
 @takes_options(GeneratorConfig)
@@ -44,9 +44,8 @@ def plan(
         Measure the bias of leaving out each simulated effect by a small run, and forecast the run.
     """
     resolved = resolve_config(options, material, as_assignments(GENERATOR[quality] if quality else {}))
-    from mbtf_gen.generation import Job
+    from mbtf_gen.job import Job, split_target
     from mbtf_gen.planning.effects_plan import plan_effects
-    from mbtf_gen.planning.pilot import measured
 
     job = Job.prepare(resolved)
     found = plan_effects(job)
@@ -54,25 +53,26 @@ def plan(
         console.report({**found.to_manifest(), "forecast": None}, table(found))
         return
     from mbtf_gen.forecast import forecast
-    from mbtf_gen.generation import allocated
+    from mbtf_gen.planning.pilot import measured
+    from mbtf_gen.planning.run_plan import allocate
 
-    expected = forecast(job, allocated(job, found))
+    expected = forecast(job, allocate(job, found))
     found = measured(job, found)
     data = {**found.to_manifest(), "forecast": expected.as_dict()}
-    text = f"{table(found)}\n{expected.describe(job.target('train'))}"
+    text = f"{table(found)}\n{expected.describe(split_target(job.config, 'train'))}"
     console.report(data, text)
 
 
 def table(plan: EffectsPlan) -> str:
     """The plan as a table, a line or two per effect."""
-    lines = [f"{'effect':<{_NAME}}{'':5}{'cost if left out':<{_COST}}why"]
+    lines = [f"{'effect':<{_NAME}}{'':5}{'bias bound if left out':<{_BOUND}}why"]
     for effect in plan.effects:
         lines += _row(effect)
-    left = plan.cost
-    share = "nothing" if left == 0 else f"at most {_percent(left)}"
-    lines.append(f"left out together: {share}, of {_percent(plan.tolerance)} allowed (effects.tolerance)")
+    bound = plan.bias_bound
+    share = "0 %" if bound == 0 else f"at most {_percent(bound)}"
+    lines.append(f"bias of all that is off: {share}, tolerance {_percent(plan.tolerance)} (--tolerance)")
     if plan.closed_form:
-        lines.append("M is known in closed form: nothing is traced")
+        lines.append("M has a closed form: no paths are traced")
     elif plan.max_depth:
         lines.append(f"paths end after {plan.max_depth} surface interactions")
     return "\n".join(lines)
@@ -81,26 +81,25 @@ def table(plan: EffectsPlan) -> str:
 def _row(effect: Effect) -> list[str]:
     from mbtf_gen.config.effects_request import EFFECTS
 
-    before = _NAME + 5 + _COST
-    reason = textwrap.wrap(effect.reason, _WIDTH - before) or [""]
-    first = f"{EFFECTS[effect.name]:<{_NAME}}{'on' if effect.on else 'off':<5}{cost_text(effect):<{_COST}}"
-    return [first + reason[0], *(" " * before + more for more in reason[1:])]
+    before = _NAME + 5 + _BOUND
+    why = textwrap.wrap(effect.explanation, _WIDTH - before) or [""]
+    first = f"{EFFECTS[effect.name]:<{_NAME}}{'on' if effect.on else 'off':<5}{bound_text(effect):<{_BOUND}}"
+    return [first + why[0], *(" " * before + more for more in why[1:])]
 
 
-def cost_text(effect: Any) -> str:
-    """The cost of leaving an effect out, and how it is known."""
-    if effect.cost is None:
+def bound_text(effect: Effect) -> str:
+    """The bias bound of leaving an effect out, with its error or as an upper bound."""
+    if effect.bias_bound is None:
         return "-"
-    if effect.known == "exact" and effect.cost == 0:
+    if effect.reason == "exact" and effect.bias_bound == 0:
         return "0 exactly"
-    if effect.known == "bound" or (effect.known == "pilot" and not effect.on):
-        return f"< {_percent(effect.cost)}"
+    if effect.reason == "bound" or not effect.on:
+        return f"< {_percent(effect.bias_bound)}"
     if effect.error:
-        low = effect.cost < 2.0 * effect.error
-        if low:
-            return f"< {_percent(effect.cost + 2 * effect.error)}"
-        return f"{_percent(effect.cost)[:-2]} ± {_percent(effect.error, 1)}"
-    return f"~ {_percent(effect.cost)}"
+        if effect.bias_bound < 2.0 * effect.error:
+            return f"< {_percent(effect.bias_bound + 2 * effect.error)}"
+        return f"{_percent(effect.bias_bound)[:-2]} ± {_percent(effect.error, 1)}"
+    return f"~ {_percent(effect.bias_bound)}"
 
 
 def _percent(share: float, digits: int = 2) -> str:

@@ -68,7 +68,7 @@ class _Preview:
 
     def __init__(self, config: PreviewConfig, dataset: Dataset | None, console: Console) -> None:
         from mbtf_core.directions import from_angles
-        from mbtf_gen.generation import Job
+        from mbtf_gen.job import Job
 
         self.config = config
         self.dataset = dataset
@@ -193,11 +193,12 @@ class _Preview:
         }
 
     def _beauty(self, file: Path) -> dict[str, Any]:
-        from mbtf_gen.generation import build_estimator
         from mbtf_gen.pictures.reference import render_reference, to_display, write_png
+        from mbtf_gen.planning.effects_plan import reference_plan
+        from mbtf_gen.planning.simulation import build_estimator
 
         assert self.job is not None
-        estimator = build_estimator(self.config, self.job.material)
+        estimator = build_estimator(self.job, reference_plan(self.job))
         spp = self.config.preview.spp
         image = render_reference(
             estimator, self.camera, self.omega_i, kind="pixel", spp=spp, seed=self.config.seed

@@ -33,10 +33,12 @@ def reference(
     resolved = resolve_config(options, material)
     from mbtf_core.directions import from_angles
     from mbtf_core.stats import pooled_relative_error
-    from mbtf_gen.generation import Job, build_estimator
+    from mbtf_gen.job import Job
     from mbtf_gen.pictures.camera import Camera, PixelKind
     from mbtf_gen.pictures.folder import PictureFolder
     from mbtf_gen.pictures.reference import auto_exposure, render_reference
+    from mbtf_gen.planning.effects_plan import reference_plan
+    from mbtf_gen.planning.simulation import build_estimator
 
     wanted = resolved.reference
     job = Job.prepare(resolved)
@@ -69,7 +71,7 @@ def reference(
                 facts = folder.finished(name)
                 kept = facts is not None
                 if facts is None:
-                    estimator = estimator or build_estimator(resolved, job.material)
+                    estimator = estimator or build_estimator(job, reference_plan(job))
                     image = render_reference(
                         estimator, camera, omega_i, kind=one, spp=wanted.spp, seed=resolved.seed, index=index
                     )

@@ -9,26 +9,24 @@ from mbtf_core.errors import UsageError
 
 # Effects by name, in the order in which light meets them, and what they are called.
 EFFECTS: dict[str, str] = {
-    "masking": "parallax and masking",
+    "parallax": "parallax and masking",
     "shadowing": "shadowing",
     "interreflection": "interreflection",
-    "neighbors": "periodic neighbors",
     "specular": "specular lobe",
     "metallic": "metallic",
-    "coat": "clear coat",
+    "clearcoat": "clearcoat",
     "sheen": "sheen",
     "normal": "normal map",
     "opacity": "opacity",
-    "fibers": "fiber scattering",
-    "mis": "BSDF sampling of light",
+    "bsdf_sampling": "BSDF sampling of light",
 }
-# Those that only a displaced tile has.
-OF_RELIEF = ("masking", "shadowing", "interreflection", "neighbors")
+# Those that only a displaced surface has.
+RELIEF_EFFECTS = ("parallax", "shadowing", "interreflection")
 
 
 @dataclass(frozen=True)
 class EffectsRequest:
-    """What was asked for: ``auto``, ``all`` or ``none``, and effects forced on or off."""
+    """The user's request: ``auto``, ``all`` or ``none``, and effects forced on or off."""
 
     base: Literal["auto", "all", "none"]
     forced: dict[str, bool]
@@ -50,7 +48,7 @@ class EffectsRequest:
                 forced[word[1:]] = word[0] == "+"
             else:
                 raise UsageError(
-                    f"'{word}' is no effect",
+                    f"'{word}' is not an effect",
                     where="--effects",
                     hint=f"auto, all or none, then +x or -x with x of {', '.join(EFFECTS)}",
                 )

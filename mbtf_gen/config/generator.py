@@ -6,14 +6,13 @@ leaves out what does not (launch size, progress).
 
 from __future__ import annotations
 
-import hashlib
-import json
 import re
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from mbtf_core.config_file import FileName, Settings
+from mbtf_core.digest import data_sha256
 from mbtf_core.errors import UsageError
 from mbtf_core.lattice import MAX_LEVEL
 from mbtf_core.options import Flag
@@ -238,5 +237,4 @@ class GeneratorConfig(Settings):
 
     def hash(self, inputs: dict[str, str]) -> str:
         """SHA-256 over :meth:`data_fields`, hexadecimal; `inputs` maps roles to digests of files."""
-        text = json.dumps(self.data_fields(inputs), sort_keys=True, separators=(",", ":"))
-        return hashlib.sha256(text.encode()).hexdigest()
+        return data_sha256(self.data_fields(inputs))

@@ -1,4 +1,4 @@
-"""The folder that a data set is written into: claimed, resumed, refused, or cleared."""
+"""The output folder of a data set: created, resumed, replaced, or refused."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mbtf_core.atomic import (
     TEMPORARY,
@@ -14,19 +14,19 @@ from mbtf_core.atomic import (
     create_file,
     read_checksummed,
     read_json,
-    remove_file,
     unwritable,
     write_text,
 )
-from mbtf_core.config_file import differences, dump_yaml, in_short
+from mbtf_core.config_file import differences, dump_yaml
 from mbtf_core.errors import InputError, PartialError
+from mbtf_core.folders import ELSEWHERE, check_folder, make_folder, other_configuration, remove_unfinished
 from mbtf_core.locks import brief_lock, lock_owner, take_lock
 from mbtf_core.shard_schema import CONFIG_NAME, FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, SPLITS
+from mbtf_gen.dataset.manifest import build_manifest
+from mbtf_gen.job import Job
+from mbtf_gen.planning.run_plan import RunPlan
 
-if TYPE_CHECKING:
-    from mbtf_gen.generation import Job
-
-# What a run writes into its folder, and what a killed one leaves there.
+# Files that a run writes, unfinished files that a killed run leaves, and locks.
 _SHARD = rf"(?:{'|'.join(SPLITS)})-\d+"
 _OWN = re.compile(rf"{re.escape(MANIFEST_NAME)}|{re.escape(CONFIG_NAME)}|{_SHARD}\.(?:npz|exr|json)")
 _UNFINISHED = re.compile(rf"\.({_OWN.pattern}){TEMPORARY}")
@@ -38,68 +38,54 @@ def _is_leftover(name: str) -> bool:
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """The manifest of a folder, to go on from: just as it was written.
+    """The manifest of a folder, exactly as it was written.
 
     Raises
     ------
     InputError : missing, unreadable, or changed
     """
-    return read_checksummed(folder / MANIFEST_NAME, "mend it with: mbtf-gen repair FOLDER")
+    return read_checksummed(folder / MANIFEST_NAME, "repair it with: mbtf-gen repair FOLDER")
 
 
-def holds(folder: Path, config_hash: str) -> bool:
-    """Whether a folder holds a data set of this configuration, finished or not."""
+def has_dataset(folder: Path, config_hash: str) -> bool:
+    """Whether a folder contains a data set of this configuration, finished or not."""
     path = folder / MANIFEST_NAME
     return path.exists() and read_json(path).get("config_hash") == config_hash
 
 
-def open_folder(
-    job: Job, folder: Path, like: dict[str, Any], begin: Callable[[], dict[str, Any]], overwrite: bool
-) -> None:
-    """Claim the output folder: new, empty, resumed, or replaced.
+def open_folder(job: Job, folder: Path, plan: Callable[[Job], RunPlan], overwrite: bool) -> None:
+    """Create, resume or replace a job's data set in a folder.
 
-    Of several writers that begin a data set at once, one writes the manifest and the others adopt it.
+    If several writers start a data set at once, one writes the manifest and the others adopt it.
 
     Parameters
     ----------
-    like : manifest of the data set to make, for comparison
-    begin : makes the manifest that is written where there is none yet, its effects planned
+    plan : plans the run; called only if a manifest is to be written
 
     Raises
     ------
-    InputError : it holds something else, or a damaged manifest
-    PartialError : it cannot be written, or others write what is to be replaced
+    InputError : the folder contains something else, or a corrupt manifest
+    PartialError : it cannot be written, or other processes write the data set that is to be replaced
     """
-    if folder.exists() and not folder.is_dir():
-        raise InputError("is a file, not a folder", where=folder)
     existing = folder / MANIFEST_NAME
-    replace = overwrite and existing.exists()
+    present = check_folder(folder, lambda path: (path / MANIFEST_NAME).exists(), "data set")
+    replace = overwrite and present
     if replace:
         _check_format(existing)
-    elif existing.exists():
-        _check_same(job, folder, like)
+    elif present:
+        _check_same(job, folder)
         if (folder / CONFIG_NAME).exists():
             return
-    elif folder.exists() and not all(_is_leftover(p.name) for p in folder.iterdir()):
-        if existing.exists():
-            # Another writer of the same data set made it between the two looks.
-            return open_folder(job, folder, like, begin, overwrite)
-        raise InputError(
-            "is not empty and holds no data set", where=folder, hint="choose another folder with -o"
-        )
-    # Planned before anything is touched, and not while others wait.
-    content = checksummed(begin()) if replace or not existing.exists() else b""
+    # Planning takes long: it comes before any change, and outside the lock.
+    content = checksummed(build_manifest(job, plan(job))) if replace or not existing.exists() else b""
     if replace:
         _clear(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot be made ({error.strerror})", where=folder) from None
+    make_folder(folder)
     with brief_lock(existing):
-        _remove_unfinished(folder, (MANIFEST_NAME, CONFIG_NAME))
-        # The manifest first: it makes the folder ours, whatever instant the run is killed at.
+        remove_unfinished(folder, (MANIFEST_NAME, CONFIG_NAME))
+        # The manifest comes first: it marks the folder as a data set, at whatever instant the run is killed.
         if content and not create_file(existing, content):
-            _check_same(job, folder, like)
+            _check_same(job, folder)
         if not (folder / CONFIG_NAME).exists():
             write_text(folder / CONFIG_NAME, dump_yaml(read_manifest(folder)["config"]))
 
@@ -107,14 +93,12 @@ def open_folder(
 def _check_format(path: Path) -> dict[str, Any]:
     manifest = read_json(path)
     if manifest.get("format") != FORMAT_NAME:
-        raise InputError(
-            f"is not a manifest of {FORMAT_NAME}", where=path, hint="choose another folder with -o"
-        )
+        raise InputError(f"is not a manifest of {FORMAT_NAME}", where=path, hint=ELSEWHERE)
     return manifest
 
 
-def _check_same(job: Job, folder: Path, like: dict[str, Any]) -> None:
-    """Refuse a folder whose manifest, which is there, is not of this job, or damaged."""
+def _check_same(job: Job, folder: Path) -> None:
+    """Refuse a folder whose manifest belongs to another job or is corrupt."""
     old = _check_format(folder / MANIFEST_NAME)
     if old.get("config_hash") == job.config_hash:
         read_manifest(folder)
@@ -122,34 +106,22 @@ def _check_same(job: Job, folder: Path, like: dict[str, Any]) -> None:
     config = old.get("config")
     before = {**(config if isinstance(config, dict) else {}), "inputs": old.get("inputs", {})}
     before["schema"] = old.get("schema")
-    after = {**like["config"], "inputs": like["inputs"], "schema": SCHEMA_VERSION}
-    changes = in_short(differences(before, after))
-    if not changes:
+    inputs = dict(job.material.digests)
+    after = {**job.config.model_dump(mode="json"), "inputs": inputs, "schema": SCHEMA_VERSION}
+    if not differences(before, after):
         read_manifest(folder)
-        changes = "inputs differ"
-    raise InputError(
-        f"holds a data set of another configuration: {changes}",
-        where=folder,
-        hint="choose another folder with -o, or replace it with --overwrite",
-    )
+    raise other_configuration(folder, "a data set", before, after)
 
 
 def _locks(folder: Path) -> Iterator[Path]:
-    """Files whose locks lie in a folder, by names that lead to them."""
+    """Paths from which :func:`take_lock` finds the locks of a folder."""
     for path in sorted(folder.iterdir()):
         if match := _LOCK.fullmatch(path.name):
             yield folder / f"{match[1]}.npz"
 
 
-def _remove_unfinished(folder: Path, names: tuple[str, ...]) -> None:
-    """Remove what killed runs left of files; hold their lock."""
-    for path in folder.iterdir():
-        if any(re.fullmatch(rf"\.{re.escape(name)}{TEMPORARY}", path.name) for name in names):
-            remove_file(path)
-
-
-def sweep(folder: Path) -> None:
-    """Remove the locks and unfinished files that killed runs left, where nobody holds them.
+def remove_leftovers(folder: Path) -> None:
+    """Remove the locks and unfinished files of killed runs, unless a process holds the lock.
 
     Raises
     ------
@@ -167,17 +139,17 @@ def sweep(folder: Path) -> None:
             continue
         try:
             files = [f"{stem}{suffix}" for suffix in (".npz", ".exr", ".json")]
-            _remove_unfinished(folder, (*files, *([CONFIG_NAME] if stem == general else [])))
+            remove_unfinished(folder, (*files, *([CONFIG_NAME] if stem == general else [])))
         finally:
             lock.release()
 
 
 def _clear(folder: Path) -> None:
-    """Remove a data set and nothing else; the manifest last, so that the rest never stands without it.
+    """Remove a data set and nothing else, the manifest last, so that shards never remain without it.
 
     Raises
     ------
-    PartialError : somebody is writing it, or the folder cannot be written
+    PartialError : another process writes it, or the folder cannot be written
     """
     with ExitStack() as held:
         for path in _locks(folder):
@@ -186,7 +158,7 @@ def _clear(folder: Path) -> None:
                 raise PartialError(
                     f"is being written by another process ({lock_owner(path)})",
                     where=folder,
-                    hint="wait for it or end it, then run the same command again",
+                    hint="wait for it or stop it, then run the same command again",
                 )
             held.callback(lock.release)
         names = [p.name for p in folder.iterdir() if _OWN.fullmatch(p.name) or _is_leftover(p.name)]

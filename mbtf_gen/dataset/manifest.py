@@ -1,35 +1,22 @@
-"""The manifest of a data set: what it holds, how it was made, what the numbers mean."""
+"""The manifest of a data set: its contents, how it was generated, and the meaning of its numbers."""
 
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mbtf_core.config_file import dump_yaml
+from mbtf_core.digest import data_sha256
 from mbtf_core.lattice import sigma_of_level
-from mbtf_core.shard_schema import ARRAYS, CONVENTIONS, FORMAT_NAME, SCHEMA_VERSION, SPLITS, Split
-from mbtf_gen.planning.effects import EffectsPlan
-
-if TYPE_CHECKING:
-    from mbtf_gen.generation import Job
-
-
-@dataclass(frozen=True)
-class ShardEntry:
-    """A shard to make: split, number within the split, file name, rows (queries or buffers)."""
-
-    split: Split
-    index: int
-    file: str
-    rows: int
+from mbtf_core.shard_schema import ARRAYS, CONVENTIONS, FORMAT_NAME, SCHEMA_VERSION, SPLITS
+from mbtf_gen.job import Job, split_queries, split_spp
+from mbtf_gen.planning.run_plan import RunPlan
 
 
 def software_versions() -> dict[str, str]:
-    """Versions of what the numbers depend on."""
+    """Versions of the software that the values depend on."""
     return dict(_versions())
 
 
@@ -47,21 +34,18 @@ def _versions() -> tuple[tuple[str, str], ...]:
     return tuple(out.items())
 
 
-def effects_digest(effects: Mapping[str, Any]) -> str:
-    """SHA-256 of an effects plan as the manifest holds it, hexadecimal: sidecars name the plan by it."""
-    text = json.dumps(effects, sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(text.encode()).hexdigest()
+def plan_digest(manifest: Mapping[str, Any]) -> str:
+    """SHA-256 of the run plan in a manifest, hexadecimal. The sidecars of all shards repeat it."""
+    return data_sha256({name: manifest.get(name) for name in ("effects", "allocation")})
 
 
-def build_manifest(job: Job, entries: list[ShardEntry], effects: EffectsPlan | None) -> dict[str, Any]:
-    """Manifest of a data set that is about to be made (``complete`` is false); without effects where they
-    are not known yet."""
+def build_manifest(job: Job, plan: RunPlan) -> dict[str, Any]:
+    """Manifest of a data set without shards (``complete`` is false)."""
     config, material, lattice = job.config, job.material, job.lattice
     plain = config.model_dump(mode="json")
-    grid = job.grid
-    plan = job.plan()
+    grid, queries = job.grid, job.query_plan
     rows, columns = lattice.shape()
-    lead = ["n"] if plan.layout == "shuffled" else ["items", "rows", "columns"]
+    lead = ["n"] if queries.layout == "shuffled" else ["items", "rows", "columns"]
     return {
         "format": FORMAT_NAME,
         "schema": SCHEMA_VERSION,
@@ -84,22 +68,22 @@ def build_manifest(job: Job, entries: list[ShardEntry], effects: EffectsPlan | N
             "finest": lattice.finest,
             "shape": [rows, columns],
             "sigma_finest": float(sigma_of_level(lattice.finest)),
-            "mixture": {"log_uniform": plan.mixture.log_uniform, "finest": plan.mixture.finest},
+            "mixture": {"log_uniform": queries.mixture.log_uniform, "finest": queries.mixture.finest},
         },
-        "layout": plan.layout,
-        "patch_size": plan.patch_size,
+        "layout": queries.layout,
+        "patch_size": queries.patch_size,
         "array_format": config.output.format,
         "arrays": {
             a.name: {"shape": [*lead, *a.trailing], "unit": a.unit, "meaning": a.meaning}
             for a in ARRAYS
-            if not a.optional or (a.name == "transmittance" and effects is not None and effects.on("opacity"))
+            if not a.optional or plan.effects.on("opacity")
         },
-        "effects": None if effects is None else effects.to_manifest(),
+        **plan.to_manifest(),
         "splits": {
             split: {
-                "queries": sum(e.rows for e in entries if e.split == split) * job.places,
-                "spp": job.spp(split),
-                "shards": [{"file": e.file, "rows": e.rows} for e in entries if e.split == split],
+                "queries": split_queries(job, split),
+                "spp": split_spp(config, split),
+                "shards": [{"file": e.file, "rows": e.rows} for e in job.shards if e.split == split],
             }
             for split in SPLITS
         },

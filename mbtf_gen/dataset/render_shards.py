@@ -1,4 +1,4 @@
-"""From a list of shards to files: claimed by locks, drawn ahead, rendered, written behind."""
+"""Renders shards to files: locks claim them, threads sample queries ahead and write shards behind."""
 
 from __future__ import annotations
 
@@ -9,33 +9,32 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from mbtf_core.atomic import Stored, remove_file, write_checksummed
 from mbtf_core.locks import Lock, lock_owner, take_lock
-from mbtf_core.shard_schema import FORMAT_NAME, SCHEMA_VERSION
-from mbtf_gen.dataset.folder import sweep
-from mbtf_gen.dataset.manifest import ShardEntry, effects_digest
+from mbtf_core.shard_schema import FORMAT_NAME, SCHEMA_VERSION, ShardEntry
+from mbtf_gen.dataset.folder import remove_leftovers
+from mbtf_gen.dataset.manifest import plan_digest
 from mbtf_gen.dataset.shard_io import write_shard
 from mbtf_gen.dataset.shard_statistics import ShardStatistics, refuse_nonfinite
 from mbtf_gen.dataset.verify import finished_record, sidecar_of
 from mbtf_gen.dataset.writer import ShardWriter
+from mbtf_gen.job import Job, most_paths, planned_paths, split_spp, split_target
 from mbtf_gen.planning.adaptive import estimate_shard
-from mbtf_gen.planning.effects import EffectsPlan
+from mbtf_gen.planning.run_plan import RunPlan
+from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.sampling.query_sampler import Queries
-
-if TYPE_CHECKING:
-    from mbtf_gen.generation import Job
 
 ProgressCallback = Callable[[float, str], None]
 
 
 @dataclass(frozen=True)
 class Claim:
-    """A shard that is ours to make."""
+    """A shard that this process renders, with its lock."""
 
     entry: ShardEntry
     path: Path
@@ -43,19 +42,19 @@ class Claim:
 
 
 class Claims:
-    """Takes the locks of the shards that have to be made, one at a time; a context manager.
+    """Locks the shards that are not finished, one at a time; a context manager.
 
-    Leaving the context releases those that were not handed on.
+    Leaving the context releases the locks that were not handed over.
 
     Parameters
     ----------
-    entries : the shards to look at
-    condemned : files to make again although they pass for finished
-    skipped : called for every shard that is not claimed, with its sidecar where it is finished
+    entries : the shards to check
+    corrupt : files to render again although they seem finished
+    skipped : called for every shard that is not claimed, with its sidecar if it is finished
 
     Attributes
     ----------
-    busy : files that other processes were making
+    busy : files that other processes render
     """
 
     def __init__(
@@ -63,14 +62,14 @@ class Claims:
         job: Job,
         folder: Path,
         entries: Iterable[ShardEntry],
-        condemned: Set[str],
+        corrupt: Set[str],
         skipped: Callable[[dict[str, Any] | None], None],
     ) -> None:
         self.busy: list[Path] = []
         self._job, self._folder, self._entries = job, folder, entries
         self._skipped = skipped
-        # What is condemned is another one once somebody has made it again.
-        self._stamps = {file: _stamp(folder / file) for file in condemned}
+        # A corrupt shard counts as finished once its sidecar has changed.
+        self._stamps = {file: _stamp(folder / file) for file in corrupt}
         self._held: set[Lock] = set()
 
     def __enter__(self) -> Claims:
@@ -81,8 +80,8 @@ class Claims:
             lock.release()
         self._held.clear()
 
-    def hand_on(self, lock: Lock) -> None:
-        """Leave a lock's release to somebody else."""
+    def hand_over(self, lock: Lock) -> None:
+        """Leave the release of a lock to the caller."""
         self._held.discard(lock)
 
     def _finished(self, entry: ShardEntry, path: Path) -> dict[str, Any] | None:
@@ -100,7 +99,7 @@ class Claims:
                     self.busy.append(path)
                 else:
                     self._held.add(lock)
-                    # Another process may have made it since.
+                    # Another process may have finished it since.
                     record = self._finished(entry, path)
                     if record is None:
                         yield Claim(entry, path, lock)
@@ -111,7 +110,7 @@ class Claims:
 
 
 def _stamp(path: Path) -> tuple[int, int] | None:
-    """What tells a sidecar from one that was written later; None without one."""
+    """Identity of a shard's sidecar, which changes when it is written again; None without one."""
     try:
         found = sidecar_of(path).stat()
     except OSError:
@@ -121,7 +120,7 @@ def _stamp(path: Path) -> tuple[int, int] | None:
 
 @dataclass(frozen=True)
 class RenderedShard:
-    """A shard that is to be written."""
+    """A rendered shard in memory."""
 
     entry: ShardEntry
     queries: Queries
@@ -131,14 +130,14 @@ class RenderedShard:
 
 @dataclass
 class RenderResult:
-    """What :func:`make_shards` did.
+    """Result of :func:`render_shards`.
 
     Attributes
     ----------
-    paths : traced; shards : their files; busy : files left to other processes
-    seconds : in all
-    writing : processor seconds that writing and digesting took beside the rendering
-    waiting : seconds that rendering waited for it
+    paths : traced; shards : files that were rendered; busy : files left to other processes
+    seconds : duration
+    writing : processor seconds of writing and digesting, parallel to the rendering
+    waiting : seconds that rendering waited for the writer
     """
 
     paths: int
@@ -149,81 +148,85 @@ class RenderResult:
     waiting: float
 
 
-def make_shards(
+def render_shards(
     job: Job,
     folder: Path,
     entries: Iterable[ShardEntry],
-    effects: EffectsPlan,
+    plan: RunPlan,
     *,
-    condemned: Set[str] = frozenset(),
+    corrupt: Set[str] = frozenset(),
     progress: ProgressCallback | None = None,
 ) -> RenderResult:
-    """Make those of the shards that are not finished.
+    """Render those of the shards that are not finished.
 
     Parameters
     ----------
-    condemned : files to make again although they pass for finished
-    progress : called with (paths so far, note), once per shard; counted as planned, whatever a target error
-        or an allocation made of them
+    corrupt : files to render again although they seem finished
+    progress : called with (paths so far, note), once per shard; paths count as planned, without the changes
+        by a target error or an allocation
 
     Raises
     ------
-    PartialError : the disk is full, or there are too many non-finite samples; what was finished is kept
+    PartialError : the disk is full, or there are too many non-finite samples; finished shards are kept
     """
     start = time.perf_counter()
-    reached, mine = ShardStatistics(), ShardStatistics()
-    made = RenderResult(0, [], [], 0.0, 0.0, 0.0)
+    total, own = ShardStatistics(), ShardStatistics()
+    result = RenderResult(0, [], [], 0.0, 0.0, 0.0)
     records: list[dict[str, Any]] = []
-    planned, everything = 0, job.most_paths()
+    planned, limit = 0, most_paths(job)
 
     def report(record: dict[str, Any] | None = None) -> None:
         for done in [*([] if record is None else [record]), *(records.pop() for _ in range(len(records)))]:
-            reached.add(done)
+            total.add(done)
         if progress is not None:
-            rate = made.paths / max(time.perf_counter() - start, 1e-9)
-            error = f", noise {reached.relative_error():.2%}" if reached.train else ""
+            rate = result.paths / max(time.perf_counter() - start, 1e-9)
+            error = f", noise {total.relative_error():.2%}" if total.train else ""
             progress(planned, f"{rate / 1e6:.2f} M paths/s{error}")
 
     def store(shard: RenderedShard, path: Path) -> None:
-        records.append(store_shard(job, shard, path, effects))
+        records.append(store_shard(job, shard, path, plan))
 
-    # What killed runs left takes room that may be wanting.
-    sweep(folder)
-    plan = job.plan()
+    # Leftovers of killed runs take disk space.
+    remove_leftovers(folder)
     estimator: Any = None
     with ExitStack() as stack:
-        claims = stack.enter_context(Claims(job, folder, entries, condemned, report))
+        claims = stack.enter_context(Claims(job, folder, entries, corrupt, report))
         ahead = stack.enter_context(ThreadPoolExecutor(1, "queries"))
         writer = stack.enter_context(ShardWriter())
-        for claim, drawn in _one_ahead(claims, ahead, plan.draw):
+        for claim, drawn in _one_ahead(claims, ahead, job.query_plan.draw):
             if estimator is None:
-                estimator = job.estimator(effects)
+                estimator = build_estimator(job, plan.effects)
             began = time.perf_counter()
             queries = drawn.result()
             entry = claim.entry
             stream = Stream(job.config.seed, entry.split, entry.index)
             estimates = estimate_shard(
-                estimator, queries.flat(), job.spp(entry.split), job.target(entry.split), stream, effects
+                estimator,
+                queries.flat(),
+                split_spp(job.config, entry.split),
+                split_target(job.config, entry.split),
+                stream,
+                plan.allocation,
             )
             shard = RenderedShard(entry, queries, estimates, time.perf_counter() - began)
             writer.submit(partial(store, shard, claim.path), claim.lock.release)
-            claims.hand_on(claim.lock)
-            made.paths += estimates.paths
-            planned += job.paths(entry)
-            made.shards.append(entry.file)
+            claims.hand_over(claim.lock)
+            result.paths += estimates.paths
+            planned += planned_paths(job, [entry])
+            result.shards.append(entry.file)
             report()
-            mine.add_quarantined(entry.file, quarantined(estimates))
-            # More than the whole data set may have: the rest cannot mend that.
-            refuse_nonfinite(mine, everything, folder)
-    made.busy, made.seconds = claims.busy, time.perf_counter() - start
-    made.writing, made.waiting = writer.busy, writer.waited
-    return made
+            own.add_quarantined(entry.file, quarantined(estimates))
+            # These shards alone may exceed the limit of the whole data set.
+            refuse_nonfinite(own, limit, folder)
+    result.busy, result.seconds = claims.busy, time.perf_counter() - start
+    result.writing, result.waiting = writer.busy, writer.waited
+    return result
 
 
 def _one_ahead(
     claims: Iterable[Claim], pool: ThreadPoolExecutor, draw: Callable[[str, int, int], Queries]
 ) -> Iterator[tuple[Claim, Future[Queries]]]:
-    """Claims with their queries, which are drawn while the shard before is rendered."""
+    """Claims with their queries, which are sampled while the previous shard is rendered."""
     previous: tuple[Claim, Future[Queries]] | None = None
     for claim in claims:
         entry = claim.entry
@@ -235,13 +238,13 @@ def _one_ahead(
         yield previous
 
 
-def store_shard(job: Job, shard: RenderedShard, path: Path, effects: EffectsPlan) -> dict[str, Any]:
+def store_shard(job: Job, shard: RenderedShard, path: Path, plan: RunPlan) -> dict[str, Any]:
     """Write a shard and its sidecar; returns the sidecar."""
-    # A sidecar of before would vouch for the new file if this run were killed between the two.
+    # If the run is killed between the two, an old sidecar would mark the new shard as finished.
     remove_file(sidecar_of(path))
     queries, estimates = shard.queries, shard.estimates
     lead, through = queries.lead, estimates.transmittance
-    spp = job.spp(shard.entry.split) if estimates.spp is None else estimates.spp.reshape(lead)
+    spp = split_spp(job.config, shard.entry.split) if estimates.spp is None else estimates.spp.reshape(lead)
     stored = write_shard(
         path,
         {
@@ -255,13 +258,13 @@ def store_shard(job: Job, shard: RenderedShard, path: Path, effects: EffectsPlan
             **({} if through is None else {"transmittance": through.reshape(lead)}),
         },
     )
-    record = sidecar(job, shard, path.name, stored, effects)
+    record = sidecar(job, shard, path.name, stored, plan)
     write_checksummed(sidecar_of(path), record)
     return record
 
 
 def quarantined(estimates: Estimates) -> dict[str, Any]:
-    """What a sidecar says of samples that were not stored."""
+    """A sidecar's record of samples that are not stored."""
     return {
         "nonfinite_samples": estimates.nonfinite,
         "lost_rays": estimates.lost,
@@ -270,9 +273,7 @@ def quarantined(estimates: Estimates) -> dict[str, Any]:
     }
 
 
-def sidecar(
-    job: Job, shard: RenderedShard, file: str, stored: Stored, effects: EffectsPlan
-) -> dict[str, Any]:
+def sidecar(job: Job, shard: RenderedShard, file: str, stored: Stored, plan: RunPlan) -> dict[str, Any]:
     """Content of a shard's sidecar."""
     entry, estimates = shard.entry, shard.estimates
     a, b = estimates.value_a, estimates.value_b
@@ -281,7 +282,7 @@ def sidecar(
         "format": FORMAT_NAME,
         "schema": SCHEMA_VERSION,
         "config_hash": job.config_hash,
-        "effects": effects_digest(effects.to_manifest()),
+        "plan": plan_digest(plan.to_manifest()),
         "file": file,
         "split": entry.split,
         "index": entry.index,
@@ -289,7 +290,7 @@ def sidecar(
         "bytes": stored.bytes,
         "sha256": stored.sha256,
         "seed": {"root": job.config.seed, "split": entry.split, "shard": entry.index},
-        "spp": job.spp(entry.split),
+        "spp": split_spp(job.config, entry.split),
         "queries": len(a),
         "paths": estimates.paths,
         "seconds": round(shard.seconds, 4),
@@ -303,7 +304,7 @@ def sidecar(
 
 
 def busy_message(busy: list[Path]) -> str:
-    """Shards that other processes write: how many, and who writes the first."""
+    """Message about shards that other processes write: their number, and the writer of the first."""
     owner = lock_owner(busy[0])
     who = "" if owner is None else f" ({owner})"
     return f"{len(busy)} shard(s) are being written by another process, first {busy[0].name}{who}"

@@ -1,7 +1,7 @@
 """One shard on disk: npz (uncompressed, memory-mappable) or EXR (named float32 channels).
 
 A shard is a mapping of array name to array; all arrays share their leading axes: ``(n,)`` queries in the
-``shuffled`` layout, ``(items, rows, columns)`` in the ``image`` layout. See ``docs/reference/data-format.md``.
+``shuffled`` layout, ``(items, rows, columns)`` in the ``image`` layout. See the data-format page.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from numpy.typing import NDArray
 
 from mbtf_core.atomic import Stored, write_chunks, write_through
 from mbtf_core.errors import InputError, reason
-from mbtf_core.shard_schema import ARRAY, ARRAYS, ArrayFormat
+from mbtf_core.shard_schema import ARRAY, ARRAYS
 from mbtf_gen.dataset.npz import npz_chunks
 
 Arrays = dict[str, NDArray[np.float32]]
 
 # Width of the EXR images that shuffled queries are folded into.
 _FOLD_WIDTH = 1024
-# An EXR header that claims more is damaged.
+# An EXR header that states more is corrupt.
 _MAX_PIXELS = 2**31
 
 
@@ -53,7 +53,7 @@ def _common_lead(arrays: Mapping[str, NDArray[np.float32]], where: object) -> tu
     lead: tuple[int, ...] | None = None
     for name, array in arrays.items():
         if name not in ARRAY:
-            raise InputError(f"shard holds an unknown array '{name}'", where=where)
+            raise InputError(f"shard has an unknown array '{name}'", where=where)
         trailing = ARRAY[name].trailing
         shape = array.shape[: array.ndim - len(trailing)]
         fits = array.shape[len(shape) :] == trailing and len(shape) in (1, 3)
@@ -61,7 +61,7 @@ def _common_lead(arrays: Mapping[str, NDArray[np.float32]], where: object) -> tu
             raise InputError(f"array '{name}' has the shape {array.shape}", where=where)
         lead = shape
     if lead is None:
-        raise InputError("shard holds no arrays", where=where)
+        raise InputError("shard has no arrays", where=where)
     return lead
 
 
@@ -117,7 +117,7 @@ def read_npz(path: Path, names: Iterable[str] | None = None, *, mapped: bool = T
         raise InputError("no such shard", where=path) from None
     except InputError:
         raise
-    except Exception as error:  # a damaged archive or header may make its parser raise anything
+    except Exception as error:  # the parser of a corrupt archive or header may raise anything
         raise InputError(f"shard cannot be read ({reason(error)})", where=path) from None
     return out
 
@@ -127,12 +127,12 @@ def _npy_header(stream: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any]]
         version = npy_format.read_magic(stream)
         readers = {(1, 0): npy_format.read_array_header_1_0, (2, 0): npy_format.read_array_header_2_0}
         return readers[version](stream)
-    except Exception:  # a damaged header may make its parser raise anything, the header's bytes included
-        raise ValueError("the header of an array is damaged") from None
+    except Exception:  # the parser of a corrupt header may raise anything, including the header's bytes
+        raise ValueError("the header of an array is corrupt") from None
 
 
 def _fold(array: NDArray[np.float32], lead: tuple[int, ...]) -> NDArray[np.float32]:
-    """Bring leading axes to (rows, columns) of one image: queries row by row, buffers stacked downwards."""
+    """Fold leading axes to (rows, columns) of one image: queries row by row, images stacked vertically."""
     trailing = array.shape[len(lead) :]
     if len(lead) == 1:
         rows = -(-lead[0] // _FOLD_WIDTH)
@@ -167,7 +167,7 @@ def write_exr(path: Path, arrays: Mapping[str, NDArray[np.float32]]) -> Stored:
         try:
             OpenEXR.File(header, channels).write(str(temporary))
         except RuntimeError as error:
-            # What the system said stands behind the library's words, which end with the file's name.
+            # The library's message ends with the file's name and the system's error.
             raise OSError(errno.EIO, reason(str(error).rpartition('". ')[2].rstrip("."))) from None
 
     return write_through(path, write)
@@ -184,7 +184,7 @@ def read_exr(path: Path, names: Iterable[str] | None = None) -> Arrays:
 
     if not path.exists():
         raise InputError("no such shard", where=path)
-    # Shards are stored uncompressed: one that claims more pixels than it has bytes is damaged.
+    # Shards are uncompressed: one that states more pixels than it has bytes is corrupt.
     header, stored = read_file(path, min(_MAX_PIXELS, path.stat().st_size))
     if "mbtf.lead" not in header:
         raise InputError("EXR image is not a shard (no 'mbtf.lead' in its header)", where=path)
@@ -206,11 +206,6 @@ def read_exr(path: Path, names: Iterable[str] | None = None) -> Arrays:
     return out
 
 
-def shard_suffix(array_format: ArrayFormat) -> str:
-    """File name suffix of a shard of the given format."""
-    return f".{array_format}"
-
-
 def write_shard(path: Path, arrays: Mapping[str, NDArray[np.float32]]) -> Stored:
     """Write a shard in the format that its suffix names, atomically; its size and digest."""
     return (write_exr if path.suffix == ".exr" else write_npz)(path, arrays)
@@ -221,7 +216,7 @@ def read_shard(path: Path, names: Iterable[str] | None = None, *, mapped: bool =
 
     Raises
     ------
-    InputError : missing, damaged, or arrays of shapes that do not fit together
+    InputError : missing, corrupt, or arrays with inconsistent shapes
     """
     arrays = read_exr(path, names) if path.suffix == ".exr" else read_npz(path, names, mapped=mapped)
     if arrays:

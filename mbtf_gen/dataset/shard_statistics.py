@@ -1,6 +1,6 @@
-"""Running sums over the sidecars of shards: counts, mean value, error reached, samples that were not finite.
+"""Running sums over the sidecars of shards: counts, mean value, error, non-finite samples.
 
-Of any number of shards it keeps a few numbers, not their records.
+They keep a few numbers for any number of shards.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import numpy as np
 
 from mbtf_core.errors import PartialError
 
-# A run fails beyond this share of non-finite samples, but not for so few that chance may bring them: at one
-# expected, more than four come once in three hundred runs.
+# A run fails beyond this share of non-finite samples, but never for so few: with one expected, more than four
+# occur by chance once in 300 runs.
 NONFINITE_SHARE = 1e-6
 NONFINITE_FEW = 4
 _SHOWN = 3
@@ -41,7 +41,7 @@ class ShardStatistics:
         self.located: list[str] = []
         self._value = np.zeros(3)
         self._variance = np.zeros(3)
-        self._aimed = self._missed = 0
+        self._targeted = self._missed = 0
         self._worst = self._square = 0.0
 
     def add(self, record: Mapping[str, Any]) -> None:
@@ -52,7 +52,7 @@ class ShardStatistics:
         self.add_quarantined(record["file"], record["quarantined"])
         target = record["target"]
         if target is not None:
-            self._aimed += target["queries"]
+            self._targeted += target["queries"]
             self._missed += target["missed"]
             self._worst = max(self._worst, target["worst"])
             self._square += target["queries"] * target["square"]
@@ -77,14 +77,14 @@ class ShardStatistics:
         return [float(v) for v in self._value / max(self.train, 1)]
 
     def target(self) -> dict[str, float] | None:
-        """What a run to a target error reached: RMS error, queries that missed it and their share, and the
-        worst one's error; None without a target."""
-        if not self._aimed:
+        """Result of a run with a target error: RMS error reached, number and share of queries that missed the
+        target, and the largest error among them; None without a target."""
+        if not self._targeted:
             return None
         return {
-            "reached": float(np.sqrt(self._square / self._aimed)),
+            "reached": float(np.sqrt(self._square / self._targeted)),
             "missed": self._missed,
-            "share": self._missed / self._aimed,
+            "share": self._missed / self._targeted,
             "worst": self._worst,
         }
 
@@ -96,7 +96,7 @@ class ShardStatistics:
 
 
 def refuse_nonfinite(totals: ShardStatistics, paths: int, folder: Path) -> None:
-    """Refuse shards with more non-finite samples than a data set may have.
+    """Fail if the shards have more non-finite samples than a data set may have.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What a folder of shards holds by now: its summary, and the completion of its manifest."""
+"""The summary of a data set, and the completion of its manifest."""
 
 from __future__ import annotations
 
@@ -13,31 +13,52 @@ from mbtf_core.config_file import check_document
 from mbtf_core.locks import brief_lock
 from mbtf_core.shard_schema import MANIFEST_NAME
 from mbtf_gen.config.effects_request import EFFECTS
-from mbtf_gen.dataset.folder import read_manifest, sweep
+from mbtf_gen.dataset.folder import read_manifest, remove_leftovers
 from mbtf_gen.dataset.manifest import software_versions
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.dataset.shard_statistics import COUNTS, ShardStatistics, refuse_nonfinite
 from mbtf_gen.dataset.verify import finished_record, sidecar_of
-from mbtf_gen.planning.effects import EffectsPlan
+from mbtf_gen.planning.run_plan import RunPlan
 
 
 @dataclass(frozen=True)
 class Summary:
-    """What a run made.
+    """Summary of a data set and of the run that ended.
 
     Attributes
     ----------
-    queries : finished, of all splits; splits : the same by split
-    paths, seconds : traced in this run, and its duration
-    writing_seconds : processor time that writing and digesting took beside the rendering
-    waiting_seconds : how long rendering waited for it
-    shard_seconds : of all finished shards, over all runs
-    relative_error : pooled relative standard error of the stored training values, √(mean variance) / mean
-        value
-    mean_value : mean training value per channel, 1/sr
-    lost, capped, nonfinite : rays lost or capped, samples drawn again, over all shards
-    target : under a target error, the RMS error reached, and how many queries missed it, their share, and the
-        worst one's error
+    folder : str
+        The data set.
+    complete : bool
+        Whether all shards of the manifest are finished.
+    queries : int
+        Queries in finished shards, of all splits.
+    splits : dict of str to int
+        The same by split.
+    paths : int
+        Paths traced in this run.
+    seconds : float
+        Duration of this run.
+    paths_per_second : float
+        Their ratio.
+    writing_seconds : float
+        Processor time of writing and digesting in this run, parallel to the rendering.
+    waiting_seconds : float
+        Time that rendering waited for the writer.
+    shard_seconds : float
+        Rendering time of all finished shards, over all runs.
+    relative_error : float
+        Pooled relative standard error of the training values, √(mean variance) / mean value.
+    mean_value : list of float
+        Mean training value per channel, 1/sr.
+    lost, capped, nonfinite : int
+        Rays that slipped through the surface, rays cut at the cap on tile crossings, and non-finite samples
+        that were sampled again, over all shards.
+    effects : list of str
+        Effects that are simulated, in words.
+    target : dict or None
+        Under a target error: the RMS error ``reached``, the number of queries that ``missed`` it, their
+        ``share``, and the ``worst`` error among them.
     """
 
     folder: str
@@ -65,11 +86,10 @@ _Color = tuple[_Number, _Number, _Number]
 
 class _Effect(BaseModel):
     name: Literal[tuple(EFFECTS)]  # type: ignore[valid-type]
-    effect: str
     on: bool
-    reason: str
-    cost: _Number | None
-    known: Literal["exact", "bound", "pilot", "asked"]
+    reason: Literal["exact", "bound", "pilot", "forced"]
+    explanation: str
+    bias_bound: _Number | None
     error: _Number
     present: bool
 
@@ -93,18 +113,18 @@ class _Effects(BaseModel):
     mode: str
     tolerance: _Number
     max_depth: int
-    cap_cost: _Number
+    cap_bias_bound: _Number
     roulette_depth: int
     closed_form: bool
-    allocation: _Allocation | None
     effects: Annotated[list[_Effect], Field(min_length=len(EFFECTS), max_length=len(EFFECTS))]
 
 
 class _Plan(BaseModel):
-    """What :func:`finish` relies on of a manifest, beside what every reader does."""
+    """Keys of a manifest that :func:`finish` needs, besides those that readers need."""
 
     complete: bool
     effects: _Effects
+    allocation: _Allocation | None
 
 
 class _Statistics(BaseModel):
@@ -124,8 +144,8 @@ class _Quarantined(BaseModel):
     capped_rays: int
 
 
-class _Made(BaseModel):
-    """What :func:`finish` relies on of a shard's sidecar."""
+class _Sidecar(BaseModel):
+    """Keys of a sidecar that :func:`finish` needs."""
 
     split: str
     file: str
@@ -137,19 +157,19 @@ class _Made(BaseModel):
     target: _Target | None
 
 
-_MEND = "look for damage with: mbtf-gen verify"
+_CHECK = "check the data set with: mbtf-gen verify"
 
 
-def planned_effects(folder: Path) -> EffectsPlan:
-    """The effects plan of a data set's manifest.
+def read_run_plan(folder: Path) -> RunPlan:
+    """The run plan in a data set's manifest.
 
     Raises
     ------
-    InputError : a damaged manifest
+    InputError : a corrupt manifest
     """
     manifest = read_manifest(folder)
-    check_document(_Plan, manifest, folder / MANIFEST_NAME, _MEND)
-    return EffectsPlan.from_manifest(manifest["effects"])
+    check_document(_Plan, manifest, folder / MANIFEST_NAME, _CHECK)
+    return RunPlan.from_manifest(manifest)
 
 
 def finish(
@@ -160,7 +180,7 @@ def finish(
     writing: float = 0.0,
     waiting: float = 0.0,
 ) -> Summary:
-    """Complete the manifest when every shard is there, and summarize (``mbtf-gen merge``).
+    """Complete the manifest if every shard is finished, and summarize (``mbtf-gen merge``).
 
     Parameters
     ----------
@@ -168,14 +188,14 @@ def finish(
 
     Raises
     ------
-    InputError : no data set there, or damaged documents
+    InputError : no data set, or a corrupt manifest or sidecar
     PartialError : too many non-finite samples, or the folder cannot be written
     """
     folder = Path(folder)
     path = folder / MANIFEST_NAME
     Dataset.open(folder)
     manifest = read_manifest(folder)
-    check_document(_Plan, manifest, path, _MEND)
+    check_document(_Plan, manifest, path, _CHECK)
     totals, complete = ShardStatistics(), True
     for content in manifest["splits"].values():
         for entry in content["shards"]:
@@ -184,7 +204,7 @@ def finish(
             if record is None:
                 complete = False
             else:
-                check_document(_Made, record, sidecar_of(file), _MEND)
+                check_document(_Sidecar, record, sidecar_of(file), _CHECK)
                 totals.add(record)
     if complete:
         refuse_nonfinite(totals, totals.paths, folder)
@@ -204,18 +224,18 @@ def finish(
         lost=totals.counts["lost_rays"],
         capped=totals.counts["capped_rays"],
         nonfinite=totals.counts["nonfinite_samples"],
-        effects=[e["effect"] for e in manifest["effects"]["effects"] if e["on"]],
+        effects=[EFFECTS[e["name"]] for e in manifest["effects"]["effects"] if e["on"]],
         target=totals.target(),
     )
     if complete and not manifest["complete"]:
         complete_manifest(folder, totals)
     if complete:
-        sweep(folder)
+        remove_leftovers(folder)
     return summary
 
 
 def complete_manifest(folder: Path, totals: ShardStatistics) -> None:
-    """Say in the manifest that every shard is there, and what they hold together.
+    """Write into the manifest that every shard is finished, with a summary of all.
 
     Raises
     ------

@@ -13,28 +13,39 @@ from typing import Any
 
 import numpy as np
 
-from mbtf_core.atomic import digest, read_checksummed
+from mbtf_core.atomic import read_checksummed
+from mbtf_core.digest import file_sha256
 from mbtf_core.errors import InputError, reason
-from mbtf_core.shard_schema import CONFIG_NAME, FORMAT_NAME, MANIFEST_NAME, SPLITS
-from mbtf_gen.dataset.manifest import ShardEntry, effects_digest
+from mbtf_core.shard_schema import CONFIG_NAME, FORMAT_NAME, MANIFEST_NAME, SPLITS, ShardEntry
+from mbtf_gen.dataset.manifest import plan_digest
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.dataset.shard_io import check_arrays, read_shard
 
-# What is said of a shard that is not there yet; an interrupted run leaves many of them.
+# Faults of shards that are not rendered yet; an interrupted run leaves many of them.
 _ABSENT = ("is missing", "is unfinished (no sidecar)")
 _INCOMPLETE = "is not complete"
 _TWICE = "is listed twice"
 _UNLISTED = "is not listed in the manifest"
-_MAKE = "run the same mbtf-gen command again: it makes what is missing"
-_REMAKE = "mend it with: mbtf-gen repair FOLDER"
+_RESUME = "run the same mbtf-gen command again: it renders the missing shards"
+_REPAIR = "repair it with: mbtf-gen repair FOLDER"
 
-# The reader of EXR files silences its library, which concerns the whole process.
+# The reader of EXR files redirects the standard error stream of the whole process.
 _ONE_AT_A_TIME = threading.Lock()
 
 
 @dataclass(frozen=True)
 class Fault:
-    """One thing that is wrong: the file, what it is, and what to do about it."""
+    """One fault of a data set.
+
+    Attributes
+    ----------
+    file : str
+        Name of the file.
+    what : str
+        The fault, in words.
+    hint : str
+        What to do about it.
+    """
 
     file: str
     what: str
@@ -42,7 +53,7 @@ class Fault:
 
     @property
     def absent(self) -> bool:
-        """Whether the file is only not there yet."""
+        """Whether the file is not written yet."""
         return self.what in _ABSENT
 
     @property
@@ -52,27 +63,27 @@ class Fault:
 
     @property
     def listing(self) -> bool:
-        """Whether the manifest is at fault, not the shard that it names."""
+        """Whether the fault lies in the manifest, not in the shard that it names."""
         return self.what == _TWICE
 
     @property
     def unlisted(self) -> bool:
-        """Whether the file is of somebody else's making, or a copy."""
+        """Whether the file is foreign, or a copy."""
         return self.what == _UNLISTED
 
 
 def sidecar_of(shard: Path) -> Path:
-    """The JSON file beside a shard; it is written last and makes the shard count as finished."""
+    """The JSON file beside a shard. It is written last and marks the shard as finished."""
     return shard.with_suffix(".json")
 
 
 def shard_fault(path: Path, rows: int, config_hash: str, *, digests: bool = True) -> str | None:
-    """What is wrong with one shard, or None.
+    """The fault of one shard, or None.
 
     Parameters
     ----------
-    rows : queries (or buffers) it must hold
-    digests : also read the whole file and compare its SHA-256; else only its sidecar and its size
+    rows : queries (or images) that it must contain
+    digests : read the whole file and compare its SHA-256; otherwise check only its sidecar and its size
     """
     return examine(path, rows, config_hash, digests=digests)[1]
 
@@ -94,7 +105,7 @@ def examine(
 
 
 def _record_of(path: Path, rows: int, config_hash: str) -> dict[str, Any] | str:
-    """Sidecar of a shard, or what is wrong with it or with the shard's size."""
+    """Sidecar of a shard, or the fault of the sidecar or of the shard's size."""
     sidecar = sidecar_of(path)
     if not path.exists():
         return _ABSENT[0]
@@ -103,30 +114,30 @@ def _record_of(path: Path, rows: int, config_hash: str) -> dict[str, Any] | str:
     try:
         record = read_checksummed(sidecar)
     except InputError as error:
-        return f"has a damaged sidecar: {error.what}"
+        return f"has a corrupt sidecar: {error.what}"
     if record.get("format") != FORMAT_NAME or record.get("config_hash") != config_hash:
         return "belongs to another data set"
     if record.get("file") != path.name:
         return f"has the sidecar of {record.get('file')}"
     if record["rows"] != rows:
-        return f"holds {record['rows']} rows, the manifest says {rows}"
+        return f"has {record['rows']} rows, the manifest says {rows}"
     if path.stat().st_size != record["bytes"]:
         return f"has {path.stat().st_size} bytes, its sidecar says {record['bytes']}"
     return record
 
 
 def _content_fault(path: Path, rows: int, record: dict[str, Any]) -> str | None:
-    """What is wrong with the bytes and the numbers of a shard."""
-    if digest(path) != record["sha256"]:
+    """The fault of a shard's bytes or values, or None."""
+    if file_sha256(path) != record["sha256"]:
         return "has changed since it was written (SHA-256 differs)"
     with _ONE_AT_A_TIME if path.suffix == ".exr" else contextlib.nullcontext():
         arrays = read_shard(path)
     if check_arrays(arrays, path)[0] != rows:
-        return f"holds {check_arrays(arrays, path)[0]} rows, the manifest says {rows}"
+        return f"has {check_arrays(arrays, path)[0]} rows, the manifest says {rows}"
     for name, array in arrays.items():
-        # Both pass on NaN, and an infinity is one of them.
+        # Minimum and maximum are NaN if any value is.
         if not (np.isfinite(np.min(array)) and np.isfinite(np.max(array))):
-            return f"holds NaN or infinite numbers in '{name}'"
+            return f"has NaN or infinite values in '{name}'"
     return None
 
 
@@ -135,22 +146,20 @@ def _manifest_faults(dataset: Dataset) -> Iterator[Fault]:
     try:
         read_checksummed(folder / MANIFEST_NAME)
     except InputError as error:
-        yield Fault(MANIFEST_NAME, error.what, _REMAKE)
+        yield Fault(MANIFEST_NAME, error.what, _REPAIR)
     config = folder / CONFIG_NAME
     if not config.exists():
-        yield Fault(CONFIG_NAME, "is not there", _REMAKE)
-    elif digest(config) != dataset.manifest.get("config_yaml"):
-        yield Fault(CONFIG_NAME, "has changed since it was written (SHA-256 differs)", _REMAKE)
+        yield Fault(CONFIG_NAME, "is missing", _REPAIR)
+    elif file_sha256(config) != dataset.manifest.get("config_yaml"):
+        yield Fault(CONFIG_NAME, "has changed since it was written (SHA-256 differs)", _REPAIR)
 
 
-def shard_faults(
-    folder: Path, entries: Sequence[ShardEntry], config_hash: str, effects: str
-) -> Iterator[Fault]:
-    """Faults of the listed shards, which several threads read at once.
+def shard_faults(folder: Path, entries: Sequence[ShardEntry], config_hash: str, plan: str) -> Iterator[Fault]:
+    """Faults of the listed shards, read by several threads.
 
     Parameters
     ----------
-    effects : digest of the effects plan that all shards were made with
+    plan : digest of the run plan that all shards must have
     """
     listed: set[str] = set()
     first: dict[str, str] = {}
@@ -158,26 +167,37 @@ def shard_faults(
         examined = pool.map(lambda e: examine(folder / e.file, e.rows, config_hash), entries)
         for entry, (record, fault) in zip(entries, examined, strict=True):
             if entry.file in listed:
-                yield Fault(entry.file, _TWICE, _REMAKE)
+                yield Fault(entry.file, _TWICE, _REPAIR)
             listed.add(entry.file)
-            if record is not None and record.get("effects") != effects:
-                fault = "was made under another effects plan"
+            if record is not None and record.get("plan") != plan:
+                fault = "was rendered with another plan"
             elif record is not None:
                 twin = first.setdefault(record["sha256"], entry.file)
                 if twin != entry.file:
                     fault = f"has the same content as {twin}"
-                    # Which of the two is the copy, nobody knows.
-                    yield Fault(twin, f"has the same content as {entry.file}", _REMAKE)
+                    # Either of the two may be the copy.
+                    yield Fault(twin, f"has the same content as {entry.file}", _REPAIR)
             if fault is not None:
-                yield Fault(entry.file, fault, _MAKE if fault in _ABSENT else _REMAKE)
+                yield Fault(entry.file, fault, _RESUME if fault in _ABSENT else _REPAIR)
 
 
 def verify(folder: Path) -> list[Fault]:
-    """All faults of a data set: flipped bytes, truncated, missing or foreign shards, an unfinished manifest.
+    """Find all faults of a data set: changed, truncated, missing or foreign files, an unfinished manifest.
+
+    Parameters
+    ----------
+    folder : Path
+        The data set.
+
+    Returns
+    -------
+    list of Fault
+        Empty for an intact, complete data set.
 
     Raises
     ------
-    InputError : the folder holds no data set of this schema
+    InputError
+        The folder contains no data set of this schema version.
     """
     folder = Path(folder)
     dataset = Dataset.open(folder)
@@ -187,8 +207,7 @@ def verify(folder: Path) -> list[Fault]:
         for split in SPLITS
         for index, entry in enumerate(dataset.manifest["splits"].get(split, {"shards": []})["shards"])
     ]
-    effects = effects_digest(dataset.manifest.get("effects") or {})
-    faults += shard_faults(folder, entries, dataset.manifest["config_hash"], effects)
+    faults += shard_faults(folder, entries, dataset.manifest["config_hash"], plan_digest(dataset.manifest))
     listed = {entry.file for entry in entries}
     for path in sorted(folder.iterdir()):
         if path.suffix in (".npz", ".exr") and path.name not in listed:
@@ -200,10 +219,10 @@ def verify(folder: Path) -> list[Fault]:
 
 
 def finished_record(path: Path, rows: int, config_hash: str) -> dict[str, Any] | None:
-    """Sidecar of a shard that is complete by its sidecar and size (its bytes are not read), or None."""
+    """Sidecar of a shard that is finished by its sidecar and size (its bytes are not read), or None."""
     return examine(path, rows, config_hash, digests=False)[0]
 
 
 def is_finished(path: Path, rows: int, config_hash: str) -> bool:
-    """Whether a shard is complete by its sidecar and size (its bytes are not read)."""
+    """Whether a shard is finished by its sidecar and size (its bytes are not read)."""
     return finished_record(path, rows, config_hash) is not None

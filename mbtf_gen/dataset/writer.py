@@ -1,4 +1,4 @@
-"""Shards are written by a thread of their own, while the next ones are rendered."""
+"""Writes shards in a thread while the next ones are rendered."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ Step = Callable[[], None]
 
 
 class ShardWriter:
-    """Writes what is handed to it, one thing after another, in a thread; a context manager.
+    """Runs submitted tasks in order, in a thread; a context manager.
 
-    Leaving the context waits until everything is written, also after an interruption: what has been rendered
-    is not lost. After a failure nothing more is written.
+    Leaving the context waits until all tasks are done, also after an interruption, so that no rendered shard
+    is lost. After a failure it skips the remaining tasks.
 
     Parameters
     ----------
-    waiting : how many may wait beside the one that is being written; submitting more waits
+    waiting : tasks in the queue at most; submitting more blocks
 
     Attributes
     ----------
-    busy : processor seconds spent writing
-    waited : seconds that the other side waited for it
+    busy : processor seconds spent in tasks
+    waited : seconds that the submitting thread waited
     """
 
     def __init__(self, waiting: int = 1) -> None:
@@ -35,7 +35,7 @@ class ShardWriter:
         self.waited = 0.0
         self._tasks: queue.Queue[tuple[Step, Step] | None] = queue.Queue(waiting)
         self._error: BaseException | None = None
-        # A second interruption ends the process without waiting for it.
+        # As a daemon it does not delay the exit after a second interruption.
         self._thread = threading.Thread(target=self._work, name="shard writer", daemon=True)
 
     def __enter__(self) -> Self:
@@ -53,11 +53,11 @@ class ShardWriter:
             self.check()
 
     def submit(self, write: Step, after: Step) -> None:
-        """Have `write()` called, then `after()` in any case.
+        """Call `write()` in the thread, then `after()` in any case.
 
         Raises
         ------
-        whatever an earlier one raised; `after` is not called then
+        the exception of an earlier task, if one failed; `after` is not called then
         """
         self.check()
         start = time.perf_counter()
@@ -65,7 +65,7 @@ class ShardWriter:
         self.waited += time.perf_counter() - start
 
     def check(self) -> None:
-        """Raise what writing has raised so far."""
+        """Raise the exception of a failed task, if there is one."""
         if self._error is not None:
             raise self._error
 

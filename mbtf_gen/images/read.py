@@ -14,15 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError, reason
 from mbtf_core.suggest import suggest_path
 from mbtf_gen.images.exr import read_channels, silenced
 from mbtf_gen.images.exr_layers import choose_channels
 from mbtf_gen.images.metadata import NO_TAGS, Tags, tags_of
-from mbtf_gen.images.png16 import header as png_header
-from mbtf_gen.images.png16 import read_png16
 from mbtf_gen.images.tiff import read_tiff
 
 # A header may claim any size; beyond this nothing is allocated (11 585² pixels).
@@ -56,6 +54,8 @@ _MAGIC = {
     b"MM\x00+": "TIFF",
     b"\x93NUMPY": "NPY",
 }
+# Channels of PNG color types of more than one channel.
+_PNG_COLORS = {2: 3, 4: 2, 6: 4}
 SUFFIXES = tuple(_KINDS)
 
 
@@ -245,14 +245,8 @@ def _from_pillow(path: Path, kind: str) -> Image:
     import PIL
     from PIL import Image as Pillow
 
-    head = None
-    if kind == "PNG":
-        with path.open("rb") as stream:
-            head = png_header(stream.read(33))
-    if head is not None:
-        _check_size(head[1], head[0], path)
-        if head[2] == 16 and head[3] > 1:
-            return replace(_from_codes(read_png16(path), 16, path), tags=_tags(path, kind))
+    if kind == "PNG" and (codes := _deep_png(path)) is not None:
+        return replace(_from_codes(codes, 16, path), tags=_tags(path, kind))
     if kind == "TIFF":
         array = read_tiff(path, _check_size)
         if array is not None:
@@ -275,6 +269,28 @@ def _from_pillow(path: Path, kind: str) -> Image:
         raise InputError(f"cannot be read as a {kind} image (its header is damaged)", where=path) from None
     except Exception as error:  # a damaged file may make the decoder raise anything
         raise InputError(f"cannot be read as a {kind} image ({reason(error)})", where=path) from None
+
+
+def _deep_png(path: Path) -> NDArray[np.uint16] | None:
+    """Codes (H, W, C) of a 16-bit color PNG, of which Pillow keeps the upper eight bits; None of others."""
+    with path.open("rb") as stream:
+        head = stream.read(33)
+    if len(head) < 33 or head[12:16] != b"IHDR":
+        return None
+    columns, rows = int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
+    _check_size(rows, columns, path)
+    channels = _PNG_COLORS.get(head[25])
+    if head[24] != 16 or channels is None:
+        return None
+    import imagecodecs
+
+    try:
+        with silenced():
+            codes = imagecodecs.png_decode(path.read_bytes())
+    except Exception as error:  # a damaged file may make the decoder raise anything
+        raise InputError(f"cannot be read as a PNG image ({reason(error)})", where=path) from None
+    # The decoder turns a transparent color into an alpha channel, which is left out.
+    return np.ascontiguousarray(codes.reshape(rows, columns, -1)[..., :channels])
 
 
 def _tags(path: Path, kind: str) -> Tags:
@@ -340,22 +356,3 @@ def gray(image: Image) -> tuple[NDArray[np.float64], list[str]]:
             f"{image.path}: is colored where one number per pixel is wanted; its luminance is used"
         )
     return rgb.astype(np.float64) @ np.asarray(LUMINANCE), warnings
-
-
-def srgb_to_linear(encoded: ArrayLike) -> NDArray[np.floating[Any]]:
-    """Linear light of sRGB-encoded numbers in [0, 1], any shape (IEC 61966-2-1)."""
-    c = _floating(encoded)
-    bent = ((np.maximum(c, 0.0) + c.dtype.type(0.055)) / c.dtype.type(1.055)) ** c.dtype.type(2.4)
-    return np.where(c <= 0.04045, c / c.dtype.type(12.92), bent)
-
-
-def linear_to_srgb(linear: ArrayLike) -> NDArray[np.floating[Any]]:
-    """sRGB encoding of linear light in [0, 1], any shape (IEC 61966-2-1); not clamped."""
-    c = _floating(linear)
-    root = np.maximum(c, 0.0) ** c.dtype.type(1.0 / 2.4)
-    return np.where(c <= 0.0031308, c * c.dtype.type(12.92), c.dtype.type(1.055) * root - c.dtype.type(0.055))
-
-
-def _floating(numbers: ArrayLike) -> NDArray[np.floating[Any]]:
-    c = np.asarray(numbers)
-    return c if c.dtype.kind == "f" else c.astype(np.float64)

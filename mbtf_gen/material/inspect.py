@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from mbtf_core.color import linear_to_srgb
 from mbtf_gen.geometry.slope_statistics import detail_size, repeats, rms_slope, slope_angles
-from mbtf_gen.images.read import LUMINANCE, linear_to_srgb
+from mbtf_gen.images.read import LUMINANCE
 from mbtf_gen.material.checks import misses
 from mbtf_gen.material.material import Material
 from mbtf_gen.material.tiling import broken

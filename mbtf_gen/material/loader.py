@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.atomic import digest
+from mbtf_core.color import srgb_to_linear
+from mbtf_core.digest import file_sha256
 from mbtf_core.errors import InputError
 from mbtf_gen.images.metadata import ColorSpace
-from mbtf_gen.images.read import Image, count_and_first, gray, read_image, srgb_to_linear
+from mbtf_gen.images.read import Image, count_and_first, gray, read_image
 from mbtf_gen.material.discovery import Convention, role_of
 from mbtf_gen.material.spec import ColorEntry, HeightEntry, NormalEntry, ShareEntry
 
@@ -215,4 +216,4 @@ class MapLoader:
 
     def digests(self) -> dict[str, str]:
         """role → SHA-256 of the file."""
-        return {role: digest(path) for role, path in self.files.items()}
+        return {role: file_sha256(path) for role, path in self.files.items()}

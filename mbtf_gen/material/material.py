@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.atomic import digest
+from mbtf_core.color import srgb_to_linear
+from mbtf_core.digest import data_sha256, file_sha256
 from mbtf_core.errors import InputError
 from mbtf_core.suggest import suggest_path
 from mbtf_gen.geometry.heightfield import HeightGrid
-from mbtf_gen.images.read import SUFFIXES, gray, is_image, srgb_to_linear
+from mbtf_gen.images.read import MAX_PIXELS, SUFFIXES, gray, is_image
 from mbtf_gen.images.resample import dequantize, resample
 from mbtf_gen.material.checks import (
     choose_convention,
@@ -36,7 +35,7 @@ from mbtf_gen.material.loader import DEFAULT_COLOR, Color, MapFacts, MapLoader, 
 from mbtf_gen.material.normal_map import NormalFit, fit_normals
 from mbtf_gen.material.quantization import Codes, code_use
 from mbtf_gen.material.spec import MaterialFile, NormalEntry, plain, read_material_file
-from mbtf_gen.material.tiling import Seam, Tiling, retile, seams
+from mbtf_gen.material.tiling import Seam, Tiling, retile, seams, tiling_note
 
 # Heights of integer images are shares of an unknown range: this many tile widths. Floats are tile widths.
 INTEGER_SCALE = 0.05
@@ -49,6 +48,11 @@ DEFAULT_CLEARCOAT_ROUGHNESS = 0.1
 DEFAULT_SHEEN_ROUGHNESS = 0.3
 # Mesh cells across the tile, at most, unless asked for.
 DEFAULT_MESH = 512
+# Attributes of a material that may be maps.
+_MAPS = (
+    *("height", "base_color", "roughness", "metallic", "specular", "clearcoat", "clearcoat_roughness"),
+    *("sheen", "sheen_color", "sheen_roughness", "normal", "opacity"),
+)
 _YAML = ("material.yaml", "material.yml")
 
 
@@ -170,7 +174,7 @@ def load_material(path: str | Path, tile: Tiling = "none") -> Material:
     """
     spec, folder, found = _described(Path(path))
     material = _assemble(spec, folder, found, tile)
-    return material if tile == "none" else retile(material, tile)
+    return material if tile == "none" else _retiled(material, tile)
 
 
 def _described(path: Path) -> tuple[MaterialFile, Path, FoundMaps]:
@@ -258,8 +262,7 @@ def _assemble(spec: MaterialFile, folder: Path, found: FoundMaps, tile: Tiling) 
         bsdf, load.settings["bsdf"] = _bsdf(plain(spec.bsdf), load)
     if tile != "none":
         load.settings["tile"] = tile
-    text = json.dumps(load.settings, sort_keys=True)
-    digests = {**load.digests(), "settings": hashlib.sha256(text.encode()).hexdigest()}
+    digests = {**load.digests(), "settings": data_sha256(load.settings)}
     return Material(
         height=height,
         height_scale=scale,
@@ -288,6 +291,30 @@ def _assemble(spec: MaterialFile, folder: Path, found: FoundMaps, tile: Tiling) 
         normal_fit=fit,
         normal_convention=convention,
     )
+
+
+def _retiled(material: Material, tile: Tiling) -> Material:
+    """The material with all its maps mirrored or blended.
+
+    Raises
+    ------
+    InputError : the maps are too large to be mirrored, or a BSDF reads textures by itself
+    """
+    folder = material.files["height"].parent
+    if any(role.startswith("bsdf.") for role in material.files):
+        raise InputError(
+            "the textures of its bsdf cannot be mirrored or blended",
+            where=folder,
+            hint="use --make-tileable none, or give maps in place of the bsdf",
+        )
+    if tile == "mirror" and any(4 * f.rows * f.columns > MAX_PIXELS for f in material.facts.values()):
+        raise InputError(
+            f"mirrored maps would have more than {MAX_PIXELS:,} pixels",
+            where=folder,
+            hint="use smaller maps, or --make-tileable blend",
+        )
+    maps = retile({name: getattr(material, name) for name in _MAPS}, tile)
+    return replace(material, **maps, notes=(*material.notes, tiling_note(tile)), tile=tile)
 
 
 def _normals(
@@ -352,7 +379,7 @@ def _bsdf(tree: dict[str, Any], load: MapLoader) -> tuple[dict[str, Any], dict[s
             if not found:
                 raise InputError("no such file (named in the bsdf)", where=path, hint=suggest_path(path))
             load.files[f"bsdf.{sum(r.startswith('bsdf.') for r in load.files)}"] = path
-            out[key], nameless[key] = str(path), digest(path)
+            out[key], nameless[key] = str(path), file_sha256(path)
         elif value is None or isinstance(value, str | bool | int | float | list):
             out[key] = nameless[key] = value
         else:

@@ -6,19 +6,14 @@ every period.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.errors import InputError
 from mbtf_core.shard_schema import Tiling
-from mbtf_gen.images.read import MAX_PIXELS
-
-if TYPE_CHECKING:
-    from mbtf_gen.material.material import Material
 
 Array = NDArray[np.floating[Any]]
 
@@ -139,56 +134,30 @@ def blend_normals(normal: NDArray[np.float32]) -> NDArray[np.float32]:
     return (up / np.linalg.norm(up, axis=-1, keepdims=True)).astype(np.float32)
 
 
-def retile(material: Material, tile: Tiling) -> Material:
-    """The material with all its maps mirrored or blended.
+def retile(maps: Mapping[str, Any], tile: Tiling) -> dict[str, Any]:
+    """Maps by role, mirrored or blended; constants and None stay as they are.
 
-    Lengths are in tile widths. A mirrored tile is two images wide, so that its heights count half: the shape
-    of the relief stays.
+    Lengths are in tile widths. A mirrored tile is two images wide, so its heights are halved: the shape of the
+    surface stays.
 
-    Raises
-    ------
-    InputError : the maps are too large to be mirrored, or a BSDF reads textures by itself
+    Parameters
+    ----------
+    maps : role → (H, W), (H, W, 3), a constant, or None; ``normal`` holds unit vectors, ``height`` lengths
+    tile : what to do to the maps
     """
     if tile == "none":
-        return material
-    if any(role.startswith("bsdf.") for role in material.files):
-        raise InputError(
-            "the textures of its bsdf cannot be mirrored or blended",
-            where=material.files["height"].parent,
-            hint="use --make-tileable none, or give maps in place of the bsdf",
-        )
-    if tile == "mirror" and any(4 * f.rows * f.columns > MAX_PIXELS for f in material.facts.values()):
-        raise InputError(
-            f"mirrored maps would have more than {MAX_PIXELS:,} pixels",
-            where=material.files["height"].parent,
-            hint="use smaller maps, or --make-tileable blend",
-        )
+        return dict(maps)
     change: Callable[[Array], Array] = mirror if tile == "mirror" else blend
-    normals = mirror_normals if tile == "mirror" else blend_normals
+    out = {role: change(value) if np.ndim(value) >= 2 else value for role, value in maps.items()}
+    if (normal := maps.get("normal")) is not None:
+        out["normal"] = (mirror_normals if tile == "mirror" else blend_normals)(normal)
+    if tile == "mirror":
+        out["height"] = 0.5 * out["height"]
+    return out
 
-    def changed(value: Any) -> Any:
-        return change(value) if np.ndim(value) >= 2 else value
 
-    said = (
-        "tile: two by two mirrored copies; the tile is two images wide, so heights in tile widths are half"
-        if tile == "mirror"
-        else f"tile: edges cross-faded over {BAND:g} of the tile"
-    )
-    height = changed(material.height)
-    return replace(
-        material,
-        height=0.5 * height if tile == "mirror" else height,
-        base_color=changed(material.base_color),
-        roughness=changed(material.roughness),
-        metallic=changed(material.metallic),
-        specular=changed(material.specular),
-        clearcoat=changed(material.clearcoat),
-        clearcoat_roughness=changed(material.clearcoat_roughness),
-        sheen=changed(material.sheen),
-        sheen_color=changed(material.sheen_color),
-        sheen_roughness=changed(material.sheen_roughness),
-        normal=None if material.normal is None else normals(material.normal),
-        opacity=changed(material.opacity),
-        notes=(*material.notes, said),
-        tile=tile,
-    )
+def tiling_note(tile: Tiling) -> str:
+    """What was done to make the maps tile, in words."""
+    if tile == "mirror":
+        return "tile: two by two mirrored copies; the tile is two images wide, so heights in tile widths are half"
+    return f"tile: edges cross-faded over {BAND:g} of the tile"

@@ -7,9 +7,6 @@ belong to somebody else and are never touched.
 
 from __future__ import annotations
 
-import hashlib
-import json
-import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,26 +14,17 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from mbtf_core.atomic import TEMPORARY, read_json, write_json, write_text
-from mbtf_core.config_file import check_document, differences, dump_yaml, in_short
+from mbtf_core.atomic import read_json, write_json, write_text
+from mbtf_core.config_file import check_document, dump_yaml
+from mbtf_core.digest import data_sha256
 from mbtf_core.errors import InputError
+from mbtf_core.folders import ELSEWHERE, check_folder, make_folder, other_configuration, remove_unfinished
 from mbtf_core.shard_schema import CONFIG_NAME
 
 RECORD_NAME = "pictures.json"
 FORMAT_NAME = "mbtf-pictures"
 _VERSION = 1
 _OURS = (CONFIG_NAME, RECORD_NAME)
-
-
-def _is_leftover(name: str, files: Iterable[str]) -> bool:
-    """Whether a file is what a kill leaves of writing one of `files`."""
-    match = re.fullmatch(rf"\.(.+?){TEMPORARY}", name)
-    return match is not None and match[1] in files
-
-
-def hash_of(depends: Mapping[str, Any]) -> str:
-    """SHA-256 over plain data, hexadecimal."""
-    return hashlib.sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()
 
 
 class _Picture(BaseModel):
@@ -95,47 +83,29 @@ class PictureFolder:
         """
         command = command or f"mbtf-gen {kind}"
         depends = {**{k: v for k, v in config.items() if k != "material"}, "inputs": dict(inputs)}
-        if path.exists() and not path.is_dir():
-            raise InputError("is a file, not a folder", where=path)
         existing = path / RECORD_NAME
-        if existing.exists():
+        if check_folder(path, lambda folder: (folder / RECORD_NAME).exists(), f"pictures of {command}"):
             old = read_json(existing)
             if old.get("format") != FORMAT_NAME or old.get("kind") != kind:
                 raise InputError(
-                    f"holds pictures of something else than {command}",
-                    where=path,
-                    hint="choose another folder with -o",
+                    f"holds pictures of something else than {command}", where=path, hint=ELSEWHERE
                 )
-            check_document(_Record, old, existing, "choose another folder with -o")
-            if not overwrite and old.get("hash") == hash_of(depends):
+            check_document(_Record, old, existing, ELSEWHERE)
+            if not overwrite and old.get("hash") == data_sha256(depends):
                 folder = cls(path, old)
                 folder._sweep()
                 if not (path / CONFIG_NAME).exists():
                     write_text(path / CONFIG_NAME, dump_yaml(config))
                 return folder
             if not overwrite:
-                changes = in_short(differences(old.get("depends", {}), depends))
-                raise InputError(
-                    f"holds pictures of another configuration: {changes}",
-                    where=path,
-                    hint="choose another folder with -o, or replace them with --overwrite",
-                )
+                raise other_configuration(path, "pictures", old.get("depends", {}), depends)
             cls(path, old)._clear()
-        elif path.exists() and any(not _is_leftover(p.name, _OURS) for p in path.iterdir()):
-            raise InputError(
-                f"is not empty and holds no pictures of {command}",
-                where=path,
-                hint="choose another folder with -o",
-            )
-        try:
-            path.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"cannot be made ({error.strerror})", where=path) from None
+        make_folder(path)
         record = {
             "format": FORMAT_NAME,
             "version": _VERSION,
             "kind": kind,
-            "hash": hash_of(depends),
+            "hash": data_sha256(depends),
             "depends": depends,
             "files": sorted(files),
             "pictures": {},
@@ -151,10 +121,7 @@ class PictureFolder:
 
     def _sweep(self) -> None:
         """Remove what a killed run left of its files."""
-        names = (*_OURS, *self.record.get("files", ()))
-        for path in list(self.path.iterdir()):
-            if _is_leftover(path.name, names):
-                path.unlink(missing_ok=True)
+        remove_unfinished(self.path, (*_OURS, *self.record.get("files", ())))
 
     def _clear(self) -> None:
         """Remove what the record lists and nothing else; the record last, so that the folder stays ours."""

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.atomic import write_file
+from mbtf_core.color import linear_to_srgb
 from mbtf_gen.dataset.shard_io import write_exr
 from mbtf_gen.pictures.camera import PIXEL_SIGMA, Camera, PixelKind
 from mbtf_gen.sampling.query_sampler import Queries
@@ -106,8 +107,7 @@ def to_display(value: NDArray[np.float32], exposure: float | None = None) -> NDA
     linear = np.clip(
         np.asarray(value, np.float64) * (auto_exposure(value) if exposure is None else exposure), 0, 1
     )
-    coded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    return np.round(255.0 * coded).astype(np.uint8)
+    return np.round(255.0 * linear_to_srgb(linear)).astype(np.uint8)
 
 
 def _camera_rays(camera: Camera, estimator: Estimator) -> Any:

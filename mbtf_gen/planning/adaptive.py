@@ -1,86 +1,80 @@
-r"""Paths of a shard's queries: a mean number of them, or as many as a target error takes.
+r"""Paths of a shard's queries: a mean number, or as many as a target error requires.
 
-Under a target ε every query first gets a pilot of its own, with random numbers of its own, that is thrown
-away. The variance of one path is taken from the sample variance V of the pilot's ν + 1 paths and what the
-run's allocation expects of such a query, s²:
+Under a target error ε every query first gets its own pilot, with its own random numbers, which is discarded.
+The variance of one path combines the sample variance V of the pilot's ν + 1 paths with s², the variance that
+the run's allocation predicts for such a query:
 
     v = (ν V + ν₀ c² s²) / (ν + ν₀)
 
-so that a pilot that happened to miss a few bright paths does not stop the query at once. The expectation
-follows large variances; what counts here is variance relative to the square of the tile mean. So the pilots
-of all of the shard's queries say by how much s² falls short in that sense: c² is the ratio of the means of
-both, never below one. From v follow the paths that bring the standard error to ε · max(value, tile mean),
-rounded up, and at most the cap. The value is the pilot's, drawn towards the tile mean as far as its own
-error leaves the difference in doubt (James and Stein 1961): a pilot with one bright path would otherwise
-allow the query a greater error for it. The counts depend on the pilot alone, and the stored paths are drawn
-afresh: values are unbiased, their halves are independent. Stopping when the paths drawn so far look good
-enough would be neither: it stops early where they missed the light. A second, longer look at queries that
-seem to need many paths was tried and did not pay: most of what is missed is missed by queries that seem to
-need few.
+so that a query does not stop at once because its pilot missed a few bright paths. The prediction follows
+large variances, but the target concerns the variance relative to the squared tile mean. The pilots of all
+queries of the shard therefore estimate by how much s² is too small in that sense: c² is the ratio of both
+means, at least one. The number of paths brings the standard error to ε · max(value, tile mean), is rounded
+up, and is limited by a cap. The value is the pilot's, shrunk toward the tile mean as far as the pilot's error
+leaves the difference uncertain (James and Stein 1961). Otherwise one bright path in the pilot would allow the
+query a larger error.
+
+The counts depend on the pilot alone, and the stored paths are sampled afresh: values are unbiased and their
+halves independent. A rule that stops when the paths so far agree well enough would be biased: it stops early
+when they missed the light. A second, longer pilot for queries that seem to need many paths did not pay,
+because most errors above the target occur in queries that seem to need few.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_gen.planning.sample_allocation import FEWEST
-from mbtf_gen.render.estimates import Estimates, Stream, TargetReached
+from mbtf_gen.planning.sample_allocation import FEWEST, Allocation
+from mbtf_gen.render.estimates import TARGET_PILOT_SPP, Estimates, Stream, Target, TargetReached
 from mbtf_gen.sampling.query_sampler import Queries
-
-if TYPE_CHECKING:
-    from mbtf_gen.planning.effects import EffectsPlan
 
 F64 = NDArray[np.float64]
 
-# Paths of a query's own pilot, and how many paths the run's expectation counts for beside it.
-PILOT_SPP = 16
+# Weight of the run's prediction beside the query's own pilot, as a number of paths (ν₀).
 PRIOR_PATHS = 16
-# The expectation is raised to what the shard's pilots say, at most to twice the deviation: the median of so
-# many groups of them, lest a single bright path decide, if each has at least so many queries.
+# The predicted deviation is raised to that of the shard's pilots, at most by this factor: by the median over
+# so many groups, so that no single bright path decides, if each group has at least so many queries.
 MOST_CORRECTION = 2.0
 GROUPS, FEWEST_IN_GROUP = 8, 16
-# A value's excess over the tile mean shrinks by this many of its squared standard errors: as many as leave
-# nothing of an excess that one path of the pilot brought, whose squared error is its square over this.
-DOUBT = (PILOT_SPP - 1 + PRIOR_PATHS) / (PILOT_SPP - 1)
-# Pilots draw in these passes, which the stored paths never reach.
+# A value's excess over the tile mean shrinks by this many of its squared standard errors over the excess. An
+# excess that a single path of the pilot causes shrinks to zero.
+DOUBT = (TARGET_PILOT_SPP - 1 + PRIOR_PATHS) / (TARGET_PILOT_SPP - 1)
+# Pilots use these passes of the random numbers, which the stored paths never reach.
 PILOT_PASS = 1024
 
 
-@dataclass(frozen=True)
-class Target:
-    """Standard error of every value to reach, relative to max(value, tile mean), with at most `cap` paths."""
-
-    error: float
-    cap: int
-
-
 def estimate_shard(
-    estimator: Any, queries: Queries, spp: int, target: Target | None, stream: Stream, effects: EffectsPlan
+    estimator: Any,
+    queries: Queries,
+    spp: int,
+    target: Target | None,
+    stream: Stream,
+    allocation: Allocation | None,
 ) -> Estimates:
     """Both halves of a shard's queries (one leading axis).
 
     Parameters
     ----------
-    spp : mean number of paths where there is no target
-    effects : the run's plan, with its allocation
+    spp : mean number of paths without a target
+    allocation : the run's allocation; without one all queries get `spp` paths
     """
-    allocation = effects.allocation
     found: Estimates
-    if effects.closed_form or allocation is None:
+    if allocation is None:
         found = estimator.estimate(queries, spp, stream)
         return found
     if target is None:
         found = estimator.estimate(queries, allocation.counts(queries, spp), stream)
         return found
-    pilot = estimator.estimate(queries, PILOT_SPP, replace(stream, first_pass=PILOT_PASS), path_variance=True)
-    expected = allocation.deviation(queries), allocation.tile_mean(queries)
-    wanted, scale = wanted_paths(pilot, PILOT_SPP, *expected, target.error)
-    counts = round_up(np.minimum(wanted, target.cap), target.cap)
+    pilot_stream = replace(stream, first_pass=PILOT_PASS)
+    pilot = estimator.estimate(queries, TARGET_PILOT_SPP, pilot_stream, path_variance=True)
+    predicted = allocation.deviation(queries), allocation.tile_mean(queries)
+    needed, scale = needed_paths(pilot, TARGET_PILOT_SPP, *predicted, target.error)
+    counts = round_up(np.minimum(needed, target.max_spp), target.max_spp)
     found = estimator.estimate(queries, counts, stream)
     return replace(
         found,
@@ -88,19 +82,19 @@ def estimate_shard(
         lost=found.lost + pilot.lost,
         capped=found.capped + pilot.capped,
         nonfinite=found.nonfinite + pilot.nonfinite,
-        target=_reached(found, wanted, scale, target),
+        target=_reached(found, needed, scale, target),
     )
 
 
-def wanted_paths(
+def needed_paths(
     pilot: Estimates, paths: int, deviation: F64, tile_mean: F64, error: float
 ) -> tuple[F64, F64]:
-    """Paths (n,) that queries need for a relative error, after a pilot of `paths` each, and the value (n,),
-    1/sr, that the error is relative to: no less than the tile mean.
+    """Paths (n,) that queries need for a relative error, from a pilot of `paths` each, and the value (n,),
+    1/sr, that the error is relative to: at least the tile mean.
 
     Parameters
     ----------
-    deviation, tile_mean : (n,) what the run's allocation expects
+    deviation, tile_mean : (n,) predicted by the run's allocation
     """
     assert pilot.path_variance is not None
     own, seen = paths - 1, pilot.path_variance.astype(np.float64)
@@ -114,20 +108,20 @@ def wanted_paths(
 
 
 def correction(variance: F64, deviation: F64, tile_mean: F64) -> float:
-    """Factor on the expected deviations, from 1 to :data:`MOST_CORRECTION`: the root of what pilots found of
-    the variance relative to the tile mean's square over what was expected of it.
+    """Factor c on the predicted deviations, from 1 to :data:`MOST_CORRECTION`: the root of the ratio of the
+    pilots' variance to the predicted one, both relative to the squared tile mean.
 
     Parameters
     ----------
     variance : (n,) sample variances of the pilots' paths
-    deviation, tile_mean : (n,) what the run's allocation expects
+    deviation, tile_mean : (n,) predicted by the run's allocation
     """
     if len(variance) < GROUPS * FEWEST_IN_GROUP:
         return 1.0
     square = np.where(tile_mean > 0, tile_mean, np.inf) ** 2
     found, expected = variance / square, deviation**2 / square
     ratios = sorted(
-        # Sums that no processor rounds otherwise.
+        # Exactly rounded sums, the same on every processor.
         math.fsum(found[g::GROUPS]) / max(math.fsum(expected[g::GROUPS]), 1e-300)
         for g in range(GROUPS)
     )
@@ -140,21 +134,21 @@ def _values(estimates: Estimates) -> F64:
     return 0.5 * np.mean(estimates.value_a.astype(np.float64) + estimates.value_b, axis=-1)
 
 
-def round_up(wanted: F64, cap: int) -> NDArray[np.int64]:
-    """The next number of paths that is a power of two or three times one, which fill nets of points, from
+def round_up(needed: F64, cap: int) -> NDArray[np.int64]:
+    """The next number of paths that completes a net of points, a power of two or three times one, from
     ``FEWEST`` to `cap`."""
-    fraction, power = np.frexp(np.maximum(wanted, FEWEST))
+    fraction, power = np.frexp(np.maximum(needed, FEWEST))
     power = np.where(fraction == 0.5, power - 1, power)
     whole = np.ldexp(1.0, power)
-    # 1.5 halves of a net: even, so that both halves have the same.
+    # 1.5 times half a net; even, so that both halves get the same number.
     between = np.where(power >= 3, 0.75 * whole, whole)
-    return np.minimum(np.where(wanted <= between, between, whole), cap).astype(np.int64)
+    return np.minimum(np.where(needed <= between, between, whole), cap).astype(np.int64)
 
 
-def _reached(found: Estimates, wanted: F64, scale: F64, target: Target) -> TargetReached:
-    # Over values that the stored paths do not enter: a bright path among them would divide its own error.
-    missed = wanted > target.cap
+def _reached(found: Estimates, needed: F64, scale: F64, target: Target) -> TargetReached:
+    # Relative to values from the pilot: a bright path among the stored ones would divide its own error.
+    missed = needed > target.max_spp
     error = np.mean((0.5 * (found.value_a.astype(np.float64) - found.value_b)) ** 2, axis=-1)
     relative = np.divide(error, scale**2, out=np.zeros(len(error)), where=scale > 0)
-    worst = target.error * float(np.sqrt(wanted.max() / target.cap)) if missed.any() else 0.0
-    return TargetReached(len(wanted), int(missed.sum()), worst, float(relative.mean()))
+    worst = target.error * float(np.sqrt(needed.max() / target.max_spp)) if missed.any() else 0.0
+    return TargetReached(len(needed), int(missed.sum()), worst, float(relative.mean()))

@@ -1,8 +1,8 @@
-"""What a relief does to light, estimated on its height grid alone, before anything is rendered.
+"""Bias bounds of a displaced Lambert surface, estimated on its height grid before anything is rendered.
 
-Rays are marched over the periodic heights, and a Lambert surface is shaded with and without an effect. The
-change at single points (σ → 0) is never smaller, in the root mean square, than that of footprint averages
-(Jensen), so it bounds the cost for any mixture of levels.
+Rays are marched over the periodic heights, and a Lambert surface is shaded with and without an effect. By
+Jensen's inequality the root mean square change at points (σ → 0) is at least that of footprint averages, so
+it bounds the bias for any mixture of levels.
 """
 
 from __future__ import annotations
@@ -23,24 +23,23 @@ F64 = NDArray[np.float64]
 POINTS = 4096
 # Standard errors of the mean square that are added to an estimate.
 CAUTION = 2.0
-# Steps after which a marched ray is taken to be free.
+# Steps after which a marched ray is assumed to be unoccluded.
 MAX_STEPS = 4096
 
 
 @dataclass(frozen=True)
 class ReliefBounds:
-    """Costs of leaving effects of the relief out, relative to the mean value, for a Lambert surface, with
-    :data:`CAUTION`.
+    """Bias bounds of leaving out effects of a displaced Lambert surface, relative to the mean value.
 
     Attributes
     ----------
-    masking : the plane with the mesh's slopes in place of the displaced tile, shadows left out too
-    shadowing : the displaced tile without shadows
+    parallax : the plane, shaded with the mesh's slopes and without shadows, replaces the displaced tile
+    shadowing : no shadows on the displaced tile
     normal : shading without the given residual slopes
-    opacity : surface and occluders opaque throughout
+    opacity : surface and occluders opaque everywhere
     """
 
-    masking: float
+    parallax: float
     shadowing: float
     normal: float
     opacity: float
@@ -74,26 +73,26 @@ class _Field:
 
 
 def _march(
-    field: _Field, origin: F64, direction: F64, step: float, relief: float
+    field: _Field, origin: F64, direction: F64, step: float, depth: float
 ) -> tuple[F64, NDArray[np.bool_]]:
-    """First points (n, 3) where rays dip below the heights, and which rays do before they leave the
-    relief."""
-    if relief == 0.0:
+    """First points (n, 3) of rays below the heights, and which rays reach one before they leave the heights'
+    range of `depth`."""
+    if depth == 0.0:
         return origin, np.zeros(len(origin), bool)
     horizontal = np.hypot(direction[:, 0], direction[:, 1])
-    # A step moves at most one cell sideways and a fiftieth of the relief up or down.
-    pace = 1.0 / np.maximum(horizontal / step, np.abs(direction[:, 2]) / (0.02 * relief))
+    # A step moves at most one cell horizontally and a fiftieth of the depth vertically.
+    pace = 1.0 / np.maximum(horizontal / step, np.abs(direction[:, 2]) / (0.02 * depth))
     point = origin.copy()
     hit = np.zeros(len(origin), bool)
-    going = np.arange(len(origin))
+    active = np.arange(len(origin))
     for _ in range(MAX_STEPS):
-        if not len(going):
+        if not len(active):
             break
-        point[going] += direction[going] * pace[going, None]
-        p = point[going]
+        point[active] += direction[active] * pace[active, None]
+        p = point[active]
         below = p[:, 2] < field(p[:, 0], p[:, 1])
-        hit[going[below]] = True
-        going = going[~below & (p[:, 2] <= 0.0) & (p[:, 2] >= -1.01 * relief)]
+        hit[active[below]] = True
+        active = active[~below & (p[:, 2] <= 0.0) & (p[:, 2] >= -1.01 * depth)]
     return point, hit
 
 
@@ -114,16 +113,16 @@ def relief_bounds(
     residual: F64 | None = None,
     through: F64 | None = None,
 ) -> ReliefBounds:
-    """Estimate costs from pairs of directions.
+    """Estimate bias bounds from pairs of directions.
 
     Parameters
     ----------
     grid : heights
-    omega_i, omega_o : (n, 3) directions as the run draws them
+    omega_i, omega_o : (n, 3) directions with the run's distribution
     kernel : light around omega_i
     albedo : (h, w, channels) reflectance, any resolution
     residual : (h, w, 2) slopes that a normal map adds
-    through : (h, w) share of the rays that pass through the surface
+    through : (h, w) fraction of the rays that pass through the surface
     """
     heights = _Field(grid.z, grid.aspect)
     slopes = _Field(height_slopes(grid), grid.aspect)
@@ -147,24 +146,24 @@ def relief_bounds(
     here = color(foot[:, 0], foot[:, 1]) * _lambert(slopes(foot[:, 0], foot[:, 1]), light, irradiance)
     mean = max(float(value.mean()), 1e-12)
 
-    def cost(change: F64) -> float:
+    def bound(change: F64) -> float:
         square = np.mean(change**2, axis=1)
         return float(np.sqrt(square.mean() + CAUTION * square.std() / np.sqrt(n))) / mean
 
     normal = 0.0
     if residual is not None:
         tilted = there + _Field(residual, grid.aspect)(met[:, 0], met[:, 1])
-        normal = cost(
+        normal = bound(
             np.where(shadowed, 0.0, color(met[:, 0], met[:, 1]) * _lambert(tilted, light, irradiance) - shade)
         )
     opacity = 0.0
     if through is not None:
         passing = _Field(through, grid.aspect)
         seen, lit = (passing(p[:, 0], p[:, 1])[:, None] for p in (met, occluder))
-        # What lies behind a hole is another place of the same relief, lit about as much: their squares add.
+        # Behind a hole lies another point of the same surface, lit about as strongly: the squares add.
         behind = np.roll(value, 1, axis=0)
         with_holes = (1.0 - seen) * np.where(shadowed, lit, 1.0) * shade
         change = np.sqrt((with_holes - value) ** 2 + (seen * behind) ** 2)
-        # Relative to what holes leave.
-        opacity = cost(change) * mean / max(float(with_holes.mean()), 1e-12)
-    return ReliefBounds(cost(here - value), cost(shade - value), normal, opacity)
+        # Relative to the mean value with holes.
+        opacity = bound(change) * mean / max(float(with_holes.mean()), 1e-12)
+    return ReliefBounds(bound(here - value), bound(shade - value), normal, opacity)

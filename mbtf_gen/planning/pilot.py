@@ -1,56 +1,54 @@
-"""Small runs of the generator itself that measure what leaving effects out costs."""
+"""Small runs of the generator that measure the bias of leaving effects out."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from mbtf_gen.config.effects_request import EFFECTS
+from mbtf_gen.job import Job
 from mbtf_gen.planning.bounds import CAUTION
-from mbtf_gen.planning.effects import Effect, EffectsPlan
+from mbtf_gen.planning.effects import Effect, EffectsPlan, without
+from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.sampling.query_sampler import Queries
 
-if TYPE_CHECKING:
-    from mbtf_gen.generation import Job
-
 # Queries of the pilot and paths of each.
 PILOT_QUERIES, PILOT_SPP = 8192, 4
-# Interactions before roulette: late ones that few paths reach with great weights would hardly be seen by both
-# halves of any query.
+# Interactions before roulette. With early roulette few paths would reach late interactions, with large
+# weights, and both halves of a query would hardly ever see the same.
 PILOT_ROULETTE = 12
-# Queries that change more than any that was seen hold, of the mean square, about so many times the share of
-# the largest one: α/(α-1) of it where the tail falls off like a power α, 10 for one as heavy as α = 1.1.
+# The contribution to the mean square of changes larger than the largest sampled one, in units of its own
+# contribution: α/(α-1) for a power-law tail of exponent α, so 10 is safe for α = 1.1.
 UNSEEN = 10.0
-# Where fewer queries change, the largest change may be one that none of them shows: it is taken to be as
-# large as the mean value.
+# If fewer queries than these change, the largest change may be unsampled; we assume it equals the mean value.
 FEW = 8
-# What happens to none of n queries happens to a share of less than 3/n, but for one chance in twenty.
+# An event that occurs in none of n queries has a probability below 3/n, at 95 % confidence (rule of three).
 NONE_OF = 3.0
 
 
 def pilot_queries(job: Job, count: int = PILOT_QUERIES, shard: int = 0) -> Queries:
-    """`count` queries drawn like the run's (one leading axis), from a stream of their own; others for every
+    """`count` queries (one leading axis) with the run's distribution, from a random stream of their own per
     `shard`.
 
-    Whatever the layout, each has a footprint and directions of its own: a few buffers would be a few.
+    In both layouts every query has its own footprint and directions: a few images would have few of them.
     """
-    return replace(job.plan(), layout="shuffled", patch_size=None).draw("pilot", shard, count)
+    return replace(job.query_plan, layout="shuffled", patch_size=None).draw("pilot", shard, count)
 
 
 @dataclass(frozen=True)
 class Change:
-    """What leaving something out changed in a sample of queries, relative to the mean value.
+    """Change of a sample of queries when something is left out, relative to the mean value.
 
     Attributes
     ----------
-    count : queries; changed : those with any change
-    square, error : mean square change, the product of the halves' changes, which is free of noise, and its
-        standard error
+    count : queries; changed : queries with any change
+    square, error : mean square change and its standard error. The product of both halves' changes estimates
+        it without bias from noise.
     shift, shift_error : mean change and its standard error
-    largest : largest change of any query
+    largest : largest change of a query
     """
 
     count: int
@@ -63,7 +61,7 @@ class Change:
 
     @classmethod
     def of(cls, full: Estimates, cut: Estimates) -> Change:
-        """Of queries estimated twice."""
+        """Change between two estimates of the same queries."""
         a = (full.value_a - cut.value_a).astype(np.float64)
         b = (full.value_b - cut.value_b).astype(np.float64)
         mean = 0.5 * float(np.mean(full.value_a + full.value_b))
@@ -83,23 +81,23 @@ class Change:
         )
 
     @property
-    def cost(self) -> float:
+    def rms(self) -> float:
         """Root mean square change."""
         return float(np.sqrt(max(self.square, 0.0)))
 
     @property
     def upper(self) -> float:
-        """The same plus :data:`CAUTION` standard errors. A root mean square is no smaller than the mean
-        change, which is seen also where it is too rare for both halves to show it."""
+        """Root mean square change plus :data:`CAUTION` standard errors, and at least the mean change plus as
+        many: rare changes that never occur in both halves still shift the mean."""
         square = max(self.square, 0.0) + CAUTION * self.error
         return max(float(np.sqrt(square)), abs(self.shift) + CAUTION * self.shift_error)
 
     def bound(self, most: float = np.inf) -> float:
-        """What the cost is not above, changes that are rarer than the sample shows included.
+        """Upper bound of the root mean square change, including changes too rare for the sample.
 
         Parameters
         ----------
-        most : no query changes by more than this. The mean square is then no more than that times the mean.
+        most : largest change possible. The mean square is then at most `most` times the mean.
         """
         largest = self.largest if self.changed >= FEW else max(self.largest, 1.0)
         seen = self.upper**2 + UNSEEN * largest**2 / self.count
@@ -108,22 +106,23 @@ class Change:
 
 
 def relative_change(full: Estimates, cut: Estimates) -> tuple[float, float]:
-    """(cost, the same plus :data:`CAUTION` standard errors) of queries estimated with and without
-    something."""
+    """(root mean square change, the same plus :data:`CAUTION` standard errors) between two estimates of the
+    same queries."""
     change = Change.of(full, cut)
-    return change.cost, change.upper
+    return change.rms, change.upper
 
 
 class Pilot:
-    """Queries of a run under one plan, to be compared with the same under others.
+    """Compares queries of a run under one plan with the same queries under others.
 
-    The random numbers are the same each time, so that what does not change cancels.
+    All estimates use the same random numbers, so that unchanged paths cancel.
     """
 
     def __init__(self, job: Job, plan: EffectsPlan, spp: int = PILOT_SPP) -> None:
         self.job, self.plan, self.spp = job, plan, spp
         self.queries = pilot_queries(job)
-        self.estimator = job.estimator(plan)
+        self._tiles: dict[frozenset[str], Any] = {}
+        self.estimator = build_estimator(job, plan, self._tiles)
         self.full = self._run(self.estimator)
 
     def _run(self, estimator: Any, limit: int | None = None) -> Estimates:
@@ -134,35 +133,36 @@ class Pilot:
         return found
 
     def limited(self, limit: int) -> Change:
-        """What a limit on surface interactions changes; the same kernel."""
+        """Change under a limit on surface interactions, with the same kernel."""
         return Change.of(self.full, self._run(self.estimator, limit))
 
     def changed(self, plan: EffectsPlan) -> Change:
-        """What another plan in place of this one changes."""
-        return Change.of(self.full, self._run(self.job.estimator(plan)))
+        """Change under another plan."""
+        return Change.of(self.full, self._run(build_estimator(self.job, plan, self._tiles)))
 
 
 def measured(job: Job, plan: EffectsPlan, spp: int = PILOT_SPP) -> EffectsPlan:
-    """The plan with the cost of every effect that is on measured, by leaving it out (with what needs it)."""
-    from mbtf_gen.planning.effects_plan import without
-
+    """The plan with measured bias bounds: each effect that is on is left out once, with its dependents."""
     if plan.closed_form:
         return plan
     pilot = Pilot(job, plan, spp)
 
-    def look(effect: Effect) -> Effect:
+    def measure(effect: Effect) -> Effect:
         if not effect.on or not effect.present:
             return effect
         cut = without(plan, effect.name)
-        gone = [
-            EFFECTS[e.name] for e in plan.effects if e.on and not cut.on(e.name) and e.name != effect.name
-        ]
-        reason = f"{effect.reason}; with it would go {_listed(gone)}" if gone else effect.reason
+        removed = [EFFECTS[name] for name in EFFECTS if name in plan.names_on - cut.names_on - {effect.name}]
+        text = f"; {_listed(removed)} would go with it" if removed else ""
         change = pilot.changed(cut)
-        error = (change.upper - change.cost) / CAUTION
-        return replace(effect, reason=reason, cost=change.cost, error=error, known="pilot")
+        return replace(
+            effect,
+            explanation=effect.explanation + text,
+            bias_bound=change.rms,
+            error=(change.upper - change.rms) / CAUTION,
+            reason="pilot",
+        )
 
-    return replace(plan, effects=tuple(look(e) for e in plan.effects))
+    return replace(plan, effects=tuple(measure(e) for e in plan.effects))
 
 
 def _listed(names: list[str]) -> str:

@@ -1,18 +1,18 @@
-r"""Which queries get how many paths: more where a pilot expects more noise.
+r"""Numbers of paths by query: more where a pilot predicts more noise.
 
-For a given number of paths in all, the mean squared error over queries is smallest when the paths of a query
-are in proportion to the standard deviation of one path (Neyman 1934). That deviation is not known, but much
-of it follows from level and directions. A pilot before the run, with random numbers of its own, fits
+For a given total number of paths, the mean squared error over queries is smallest when a query's number of
+paths is proportional to the standard deviation of one path (Neyman 1934). This deviation is unknown, but
+level and directions predict much of it. A pilot before the run, with its own random numbers, fits
 
     ln s = quadratic polynomial of (l, ln cos θi, ln cos θo, ω_i·ω_o sideways, ln of the half vector's slope,
                                     azimuths)
 
-and the counts of every query of every shard follow from these weights, which the manifest keeps, by exactly
-rounded operations. So the counts never look at the paths that they count: every half stays unbiased, the
-halves stay independent, and a shard can be made alone, on any machine.
+The manifest stores these weights, and all counts follow from them by exactly rounded operations. The counts
+are therefore independent of the stored paths: both halves stay unbiased and independent, and any machine can
+render a shard alone.
 
-The same pilot fits the mean value over directions. The mean of M over positions is the tile mean whatever the
-footprint, so this is a smooth estimate of the tile mean at any pair of directions.
+The same pilot fits the mean value over directions. The mean of M over positions is the tile mean for every
+footprint, so this fit is a smooth estimate of the tile mean at any pair of directions.
 """
 
 from __future__ import annotations
@@ -20,38 +20,38 @@ from __future__ import annotations
 import logging
 import math
 from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_gen.job import Job
+from mbtf_gen.planning.effects import EffectsPlan
+from mbtf_gen.planning.pilot import pilot_queries
+from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.sampling import exact_math as exact
 from mbtf_gen.sampling.query_sampler import Queries
-
-if TYPE_CHECKING:
-    from mbtf_gen.generation import Job
-    from mbtf_gen.planning.effects import EffectsPlan
 
 F64 = NDArray[np.float64]
 
 log = logging.getLogger(__name__)
 
-# Queries of the pilot and paths of each; a million paths tell little more.
+# Queries of the pilot and paths of each; a million paths improve the fit little.
 PILOT_QUERIES, PILOT_SPP = 16384, 16
-# Least expected deviation over the mean one: where the pilot saw little noise there may be some.
+# Smallest predicted deviation, relative to the mean one: the pilot may have missed noise.
 FLOOR = 0.125
-# Counts are powers of two, which fill the nets of the sequences, from one path in each half.
+# Counts are powers of two, which complete the nets of the sequences; at least one path in each half.
 FEWEST = 2
 MOST_OVER_MEAN = 64
 _RIDGE = 1e-3
-# Newton's method ends where a step would gain less than this per target, or has failed after so many steps or
-# where no part of a step down to the least helps.
+# Newton's method converges when a step would gain less than this per target. It fails after so many steps, or
+# when even the smallest part of a step increases the loss.
 _CONVERGED, _STEPS, _LEAST_PART = 1e-10, 50, 1e-9
 
 
 def _features(queries: Queries) -> list[F64]:
-    """What the polynomial is of, one array (n,) each, all of order one."""
+    """Variables of the polynomial, one array (n,) each, of order one."""
     wi, wo = queries.omega_i.astype(np.float64), queries.omega_o.astype(np.float64)
     level = -exact.log(2.0 * queries.sigma.astype(np.float64)) / math.log(2.0)
     half = wi + wo
@@ -70,7 +70,7 @@ def _features(queries: Queries) -> list[F64]:
 
 
 def _terms(queries: Queries, *, levels: bool = True) -> list[F64]:
-    """1, the features (the level among them or not), and their products in pairs."""
+    """Terms of the polynomial: 1, the features (with or without the level), and their pairwise products."""
     base = _features(queries)[0 if levels else 1 :]
     products = [base[i] * base[j] for i in range(len(base)) for j in range(i, len(base))]
     return [np.ones(len(queries.sigma)), *base, *products]
@@ -78,12 +78,11 @@ def _terms(queries: Queries, *, levels: bool = True) -> list[F64]:
 
 def fit_log_linear(terms: list[F64], target: F64) -> F64 | None:
     """Weights w that make ``exp(Σ w·term)`` the mean of a non-negative target (n,): Poisson regression with
-    a small ridge (per target, on every weight but the first), None where it did not converge.
+    a small ridge (per target, on every weight but the first); None if it does not converge.
 
-    It weighs large and small targets alike in proportion to their mean and needs no distribution beyond that.
-    The first term is the constant, so the mean of the fit over the data is that of the target. Newton's steps
-    are halved until they decrease the penalised likelihood, which is convex: whole ones overshoot where the
-    targets have a sharp peak.
+    Residuals count relative to the mean, and no distribution of the targets is assumed. The first term is the
+    constant, so the fit has the mean of the targets. Newton's steps are halved until they decrease the
+    penalized loss, which is convex: full steps overshoot where the targets have a sharp peak.
     """
     x = np.stack(terms, axis=1)
     weights = np.zeros(x.shape[1])
@@ -118,16 +117,21 @@ def fit_log_linear(terms: list[F64], target: F64) -> F64 | None:
 
 @dataclass(frozen=True)
 class Allocation:
-    """What a pilot expects of queries, and the counts of paths that follow.
+    """A pilot's predictions of noise and tile mean, and the numbers of paths that follow.
 
     Attributes
     ----------
-    weights : of the polynomial's terms, for ln s with s the deviation of one path, in 1/sr
-    typical : mean of s over the run's queries, in 1/sr; 0 where all queries get the same number of paths:
-        where nothing is noisy, and where the fit of s did not converge
-    scale : factor that makes the counts' mean the wanted one, over the run's queries
-    gain : mean squared error of equal counts over that of these, as the pilot's own data have it
-    mean_weights : of the terms without the level, for ln of the tile mean, in 1/sr
+    weights : tuple of float
+        Of the polynomial's terms, for ln s with s the standard deviation of one path, in 1/sr.
+    typical : float
+        Mean of s over the run's queries, in 1/sr; 0 if all queries get the same number of paths, because
+        nothing is noisy or the fit of s did not converge.
+    scale : float
+        Factor on the counts that gives them the requested mean over the run's queries.
+    gain : float
+        Mean squared error with equal counts over that with these, on the pilot's data.
+    mean_weights : tuple of float
+        Of the terms without the level, for ln of the tile mean, in 1/sr.
     """
 
     weights: tuple[float, ...]
@@ -137,15 +141,15 @@ class Allocation:
     mean_weights: tuple[float, ...]
 
     def deviation(self, queries: Queries) -> F64:
-        """Expected deviation s (n,) of one path, 1/sr."""
+        """Predicted standard deviation s (n,) of one path, 1/sr."""
         return np.maximum(_evaluate(self.weights, _terms(queries)), FLOOR * self.typical)
 
     def tile_mean(self, queries: Queries) -> F64:
-        """Expected tile mean (n,) at the queries' directions, 1/sr."""
+        """Predicted tile mean (n,) at the queries' directions, 1/sr."""
         return _evaluate(self.mean_weights, _terms(queries, levels=False))
 
     def counts(self, queries: Queries, spp: int) -> NDArray[np.int64]:
-        """Paths (n,) of queries for a mean of `spp` over the run, powers of two."""
+        """Numbers of paths (n,), powers of two, with a mean of `spp` over the run."""
         if self.typical <= 0.0:
             return np.full(len(queries.sigma), spp, np.int64)
         return _round_counts(self.deviation(queries) * (self.scale * spp / self.typical), spp)
@@ -163,7 +167,7 @@ class Allocation:
 
 
 def _evaluate(weights: tuple[float, ...], terms: list[F64]) -> F64:
-    # Term by term: a matrix product may round differently for other numbers of rows.
+    # Term by term: the rounding of a matrix product may depend on the number of rows.
     total = np.zeros(len(terms[0]))
     for weight, term in zip(weights, terms, strict=True):
         total += weight * term
@@ -177,18 +181,18 @@ def _constant(terms: list[F64], value: float) -> F64:
 
 
 def _round_counts(wanted: F64, spp: int) -> NDArray[np.int64]:
-    # The nearest power of two in the sense of ratios.
+    # The nearest power of two on a logarithmic scale.
     power = np.rint(exact.log(np.maximum(wanted, 1e-9)) / math.log(2.0))
     most = math.floor(math.log2(MOST_OVER_MEAN * spp))
     return np.int64(1) << np.clip(power, math.log2(FEWEST), most).astype(np.int64)
 
 
 def fit_deviation(terms: list[F64], size: F64) -> F64 | None:
-    """Weights of ln √E(size²) for sizes (n,) of differences; None where the fit did not converge.
+    """Weights of ln √E(size²) for sizes (n,) of differences; None if the fit does not converge.
 
-    The fit of the mean size is scaled so that the mean of its squares is that of the sizes' squares: means
-    fall short of root mean squares by a tenth or so for normal noise, and by factors for that of a few bright
-    paths. A fit of the squares themselves would follow the few largest.
+    The fit of the mean size is scaled to the root mean square of the sizes. Means fall short of root mean
+    squares by about a tenth for normal noise, and by factors for a few bright paths. A fit of the squares
+    would follow the few largest.
     """
     weights = fit_log_linear(terms, size)
     if weights is not None and size.any():
@@ -198,25 +202,25 @@ def fit_deviation(terms: list[F64], size: F64) -> F64 | None:
 
 
 def fit_allocation(queries: Queries, estimates: Estimates, paths: int, spp: int) -> Allocation:
-    """Allocation from a pilot's queries (one leading axis) and estimates of `paths` paths each, for a mean of
-    `spp` paths. Where a fit does not converge it is a constant, with a warning."""
+    """Allocation for a mean of `spp` paths, from a pilot's queries (one leading axis) of `paths` paths each.
+    A constant replaces a fit that does not converge, with a warning."""
     difference = estimates.value_a.astype(np.float64) - estimates.value_b
     noise = np.sqrt(np.mean(difference**2, axis=-1))
     value = 0.5 * np.mean(estimates.value_a.astype(np.float64) + estimates.value_b, axis=-1)
     terms, flat_terms = _terms(queries), _terms(queries, levels=False)
     mean_weights = fit_log_linear(flat_terms, value)
     if mean_weights is None:
-        log.warning("the fit of the tile mean over directions did not converge; taken to be constant")
+        log.warning("the fit of the tile mean over directions did not converge; a constant is used")
         mean_weights = _constant(flat_terms, float(value.mean()))
     sizes = noise * (0.5 * math.sqrt(paths))
     weights = fit_deviation(terms, sizes)
-    even = weights is None or not noise.any()
+    uniform = weights is None or not noise.any()
     if weights is None:
-        log.warning("the fit of the noise over queries did not converge; expected to be the same for all")
+        log.warning("the fit of the noise over queries did not converge; a constant is used")
         weights = _constant(terms, math.sqrt(float(np.mean(sizes**2))))
-    typical = 0.0 if even else float(_evaluate(tuple(weights), terms).mean())
+    typical = 0.0 if uniform else float(_evaluate(tuple(weights), terms).mean())
     flat = Allocation(tuple(weights.tolist()), typical, 1.0, 1.0, tuple(mean_weights.tolist()))
-    if even:
+    if uniform:
         return flat
     low, high = 1e-3, 1e3
     for _ in range(60):
@@ -231,10 +235,9 @@ def fit_allocation(queries: Queries, estimates: Estimates, paths: int, spp: int)
 
 
 def measure_allocation(job: Job, plan: EffectsPlan) -> Allocation:
-    """Allocation of a job under an effects plan, by a pilot with random numbers of its own."""
-    from mbtf_gen.planning.pilot import pilot_queries
-
+    """Allocation of a job under an effects plan, by a pilot with its own random numbers."""
     queries = pilot_queries(job, PILOT_QUERIES)
-    # Shard 0 of the pilots' split is that of the effects plan.
-    estimates = job.estimator(plan).estimate(queries, PILOT_SPP, Stream(job.config.seed, "pilot", 1))
+    # The effects plan's pilot uses shard 0 of this split.
+    stream = Stream(job.config.seed, "pilot", 1)
+    estimates = build_estimator(job, plan).estimate(queries, PILOT_SPP, stream)
     return fit_allocation(queries, estimates, PILOT_SPP, job.config.queries.spp)

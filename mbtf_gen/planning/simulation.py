@@ -1,31 +1,32 @@
-"""From an effects plan to what evaluates it: surface, tile, transport — or the closed form."""
+"""Estimators of M under an effects plan: surface, tile and transport, or the closed form."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_gen.geometry.slopes import height_slopes
+from mbtf_gen.geometry.slopes import height_slopes, residual_slopes
 from mbtf_gen.images.resample import resample
+from mbtf_gen.job import Job
 from mbtf_gen.planning.effects import EffectsPlan
 from mbtf_gen.render.estimates import Estimates, Stream
+from mbtf_gen.sampling.query_sampler import Queries
 
-if TYPE_CHECKING:
-    from mbtf_gen.generation import Job
-    from mbtf_gen.sampling.query_sampler import Queries
+# Effects that change the tile: its shape or its surface.
+_TILE_EFFECTS = frozenset({"parallax", "specular", "metallic", "clearcoat", "sheen", "normal", "opacity"})
 
 
 class MeanEstimator(Protocol):
     """Estimates M at queries."""
 
     def estimate(self, queries: Queries, spp: int | NDArray[np.int64], stream: Stream) -> Estimates:
-        """Both halves of each query; paths of all or of each."""
+        """Both halves of each query, with `spp` paths for all or one number for each."""
 
 
 class ClosedForm:
-    """M of a plane of one Lambert color, ``albedo/π`` at every query: nothing to trace, and no noise.
+    """M of a plane of one Lambert color: albedo/π at every query, without noise.
 
     Parameters
     ----------
@@ -41,11 +42,31 @@ class ClosedForm:
         return Estimates(value.copy(), value.copy(), None, 0, 0, 0, 0)
 
 
-def estimator_of(job: Job, plan: EffectsPlan, tiles: dict[Any, Any]) -> Any:
-    """Estimator of a job's material under a plan; `tiles` keeps meshes that several plans share."""
+def build_estimator(job: Job, plan: EffectsPlan, tiles: dict[frozenset[str], Any] | None = None) -> Any:
+    """Estimator of M for a job's material under an effects plan; loads Mitsuba unless M has a closed form.
+
+    Parameters
+    ----------
+    job : Job
+        Configuration and material.
+    plan : EffectsPlan
+        Effects to simulate.
+    tiles : dict, optional
+        Tiles of this job built so far, by the effects that change them. Plans that share a dictionary share
+        their tiles.
+
+    Returns
+    -------
+    MeanEstimator
+        An :class:`~mbtf_gen.render.estimator.Estimator`, or a :class:`ClosedForm`.
+
+    Raises
+    ------
+    InputError
+        Mitsuba does not accept the material's BSDF.
+    """
     if plan.closed_form:
-        base = np.asarray(job.material.base_color, np.float64).reshape(-1, 3)[0]
-        return ClosedForm(base)
+        return ClosedForm(np.asarray(job.material.base_color, np.float64).reshape(-1, 3)[0])
     from mbtf_gen.render.runtime import load_mitsuba
 
     load_mitsuba()
@@ -55,30 +76,39 @@ def estimator_of(job: Job, plan: EffectsPlan, tiles: dict[Any, Any]) -> Any:
     from mbtf_gen.render.scene import build_tile
     from mbtf_gen.sampling.light_kernel import LightKernel
 
-    of_surface = ("specular", "metallic", "coat", "sheen", "normal", "opacity")
-    parts = tuple(plan.on(n) for n in ("masking", *of_surface))
-    if parts not in tiles:
-        tiles[parts] = build_tile(job.grid, bsdf_of(job.material, plan, _slopes(job, plan)))
-    config = job.config
+    tiles = {} if tiles is None else tiles
+    key = plan.names_on & _TILE_EFFECTS
+    if key not in tiles:
+        tiles[key] = build_tile(job.grid, bsdf_of(job.material, key, _shading_slopes(job, plan)))
     transport = Transport(
         plan.max_depth,
         plan.roulette_depth,
-        config.transport.max_crossings,
-        displacement=plan.on("masking"),
+        job.config.transport.max_crossings,
+        displacement=plan.on("parallax"),
         shadowing=plan.on("shadowing"),
         interreflection=plan.on("interreflection"),
-        bsdf_sampling=plan.on("mis"),
+        bsdf_sampling=plan.on("bsdf_sampling"),
     )
-    return Estimator(tiles[parts], LightKernel(config.light.width), transport)
+    return Estimator(tiles[key], LightKernel(job.config.light.width), transport)
 
 
-def _slopes(job: Job, plan: EffectsPlan) -> NDArray[np.float64] | None:
-    """Slopes (h, w, 2) that shading adds to the geometry's: the residual of the normal map, and the relief's
-    own where it is not displaced."""
-    residual = job.residual[0] if job.residual is not None and plan.on("normal") else None
-    if plan.on("masking") or job.grid.displacement_range == 0.0:
+def normal_map_slopes(job: Job) -> tuple[NDArray[np.float64], float] | None:
+    """Slopes (h, w, 2) that the normal map adds to the mesh, and the share of the mesh's own slopes that the
+    map repeats; None without a map or where the options switch it off."""
+    material, mode = job.material, job.config.effects.normal
+    if material.normal is None or material.bsdf is not None or mode == "off":
+        return None
+    return residual_slopes(material.normal, job.grid, mode)
+
+
+def _shading_slopes(job: Job, plan: EffectsPlan) -> NDArray[np.float64] | None:
+    """Slopes (h, w, 2) that shading adds to the geometry's: those of the normal map, and those of the heights
+    where they are not displaced."""
+    mapped = normal_map_slopes(job) if plan.on("normal") else None
+    residual = None if mapped is None else mapped[0]
+    if plan.on("parallax") or job.grid.displacement_range == 0.0:
         return residual
-    relief = height_slopes(job.grid)
+    slopes = height_slopes(job.grid)
     if residual is None:
-        return relief
-    return residual + np.asarray(resample(relief, *residual.shape[:2]), np.float64)
+        return slopes
+    return residual + np.asarray(resample(slopes, *residual.shape[:2]), np.float64)

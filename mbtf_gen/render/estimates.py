@@ -7,8 +7,24 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-# Non-finite samples whose place is kept.
+# Non-finite samples whose location is kept.
 MOST_LOCATED = 8
+# Paths of each query's own pilot under a target error.
+TARGET_PILOT_SPP = 16
+
+
+@dataclass(frozen=True)
+class Target:
+    """Standard error that every value is to reach.
+
+    Attributes
+    ----------
+    error : relative to max(value, tile mean)
+    max_spp : paths that a query gets at most, without its pilot
+    """
+
+    error: float
+    max_spp: int
 
 
 @dataclass(frozen=True)

@@ -38,4 +38,7 @@ BSDFSample3f: TypeAlias = Any
 # Mitsuba objects, one for all lanes.
 Texture: TypeAlias = Any
 BSDF: TypeAlias = Any
+BSDFContext: TypeAlias = Any
 Properties: TypeAlias = Any
+Sampler: TypeAlias = Any
+Scene: TypeAlias = Any

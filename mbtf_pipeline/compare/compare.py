@@ -80,8 +80,10 @@ def compare(
     """
     from mbtf_fit import Material
     from mbtf_gen.dataset.reader import Dataset
-    from mbtf_gen.generation import build_estimator
+    from mbtf_gen.job import Job
     from mbtf_gen.material.material import load_material
+    from mbtf_gen.planning.effects_plan import reference_plan
+    from mbtf_gen.planning.simulation import build_estimator
 
     if section.st_lpips:
         require()
@@ -91,7 +93,8 @@ def compare(
     materials = {name: Material.load(folder) for name, folder in fits.items()}
     start = time.perf_counter()
     material = load_material(Path(generate.material), generate.geometry.make_tileable)
-    estimator = build_estimator(generate, material)
+    job = Job(generate, material)
+    estimator = build_estimator(job, reference_plan(job))
     rendered = _render(section, estimator, progress)
     seconds = {"references": time.perf_counter() - start}
     # The white point is that of what is compared with; without a query reference, of what there is.

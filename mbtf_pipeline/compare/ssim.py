@@ -10,6 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mbtf_core.color import linear_to_srgb
+
 # Standard deviation of the window in pixels, and where it ends; both the paper's (11 × 11 pixels).
 WINDOW = 1.5
 _WINDOW_SIZE = 11
@@ -24,10 +26,7 @@ DEFINITION = (
 def on_screen(picture: ArrayLike, white: float) -> NDArray[np.float64]:
     """What a screen shows of linear values (..., 3) in 1/sr, from 0 to 1: sRGB, cut off at `white`."""
     linear = np.clip(np.asarray(picture, np.float64) / white, 0.0, 1.0)
-    coded: NDArray[np.float64] = np.where(
-        linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
-    )
-    return coded
+    return np.asarray(linear_to_srgb(linear), np.float64)
 
 
 def ssim(picture: ArrayLike, reference: ArrayLike, white: float) -> float | None:

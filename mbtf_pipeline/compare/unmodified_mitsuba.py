@@ -29,7 +29,7 @@ from mbtf_pipeline.compare.pictures import PICTURES, write_picture, write_previe
 
 if TYPE_CHECKING:
     from mbtf_gen.config.generator import GeneratorConfig
-    from mbtf_gen.generation import Job
+    from mbtf_gen.job import Job
     from mbtf_gen.material.material import Material
     from mbtf_pipeline.recipe import CompareSection, Direction, View
 
@@ -186,8 +186,10 @@ def compare_with_stock(
     UsageError : the comparison has no scene for it
     """
     from mbtf_gen.config.generator import LightSection
-    from mbtf_gen.generation import Job, build_estimator
+    from mbtf_gen.job import Job
     from mbtf_gen.pictures.reference import render_reference
+    from mbtf_gen.planning.effects_plan import reference_plan
+    from mbtf_gen.planning.simulation import build_estimator
 
     view, light, tiles_across = pick_scene(section)
     config = generate.model_copy(update={"light": LightSection(width=0.0)})
@@ -195,12 +197,13 @@ def compare_with_stock(
     omega_i = from_angles(light.elevation, light.azimuth)
     out = []
     for surface, made in _surfaces(material).items():
-        estimator = build_estimator(config, made)
+        job = Job(config, made)
+        estimator = build_estimator(job, reference_plan(job))
         image = render_reference(
             estimator, camera, omega_i, kind="pixel", spp=section.spp, seed=section.seed, index=0
         )
         ours = tuple(x.astype(np.float64) for x in (image.value_a, image.value_b))
-        stock = render_stock(Job.of(config, made), camera, omega_i, section.spp, section.seed)
+        stock = render_stock(job, camera, omega_i, section.spp, section.seed)
         out.append(agreement(surface, (ours[0], ours[1]), stock, margin=4))
     return out
 
@@ -308,12 +311,13 @@ def _stock_surface(job: Job) -> dict[str, Any]:
     """Stock ``diffuse`` with the base color where the material is Lambert, else its own surface."""
     import mitsuba as mi
 
+    from mbtf_gen.planning.simulation import normal_map_slopes
     from mbtf_gen.render.bsdf.plugin import bsdf_of
 
     material = job.material
     if any(getattr(material, name) is not None for name in _BARE) or material.bsdf is not None:
-        slopes = None if job.residual is None else job.residual[0]
-        return bsdf_of(material, None, slopes)
+        mapped = normal_map_slopes(job)
+        return bsdf_of(material, slopes=None if mapped is None else mapped[0])
     base = np.asarray(material.base_color, np.float32)
     if base.ndim == 1:
         return {"type": "diffuse", "reflectance": {"type": "rgb", "value": [float(c) for c in base]}}

@@ -7,14 +7,14 @@ from functools import partial
 
 from mbtf_core.config_file import nested
 from mbtf_fit.presets import best_options
+from mbtf_pipeline.cost_study.repeats import FEWEST_SEEDS
 from mbtf_pipeline.cost_study.runs import DataRequest, Run
 
 # Shares of a study's time. The generator gets its own; runs get theirs for two seeds each. The rest is left
 # for start-up, the test set and evaluation.
-GENERATOR, WHOLE, DATA, MODELS = 0.12, 0.44, 0.14, 0.16
-SEEDS = 2
+GENERATOR, WHOLE, DATA, MODELS = 0.1, 0.42, 0.13, 0.15
 # Total times of whole runs, seconds: this one, twice, four times, ...; the share of each that generates.
-SHORTEST = 4.0
+SHORTEST = 8.0
 SHARE, OTHER_SHARES = 0.35, (0.6, 0.15)
 # Paths per query of the data, and the total paths at which they are compared, relative to their mean.
 PATHS = (2, 4, 16, 64)
@@ -41,7 +41,7 @@ def planned_runs(seconds: float, spp: int, query_seconds: QuerySeconds) -> list[
     ----------
     spp : paths per query of the recipe
     """
-    each = seconds / SEEDS
+    each = seconds / FEWEST_SEEDS
     return [
         *_whole(WHOLE * each, spp, query_seconds),
         *_models(MODELS * each, spp, query_seconds),

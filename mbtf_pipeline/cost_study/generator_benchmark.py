@@ -21,10 +21,12 @@ from numpy.typing import NDArray
 
 from mbtf_core.stats import Estimate, mean_estimate
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.generation import Job, allocated
+from mbtf_gen.job import Job, split_spp, split_target
 from mbtf_gen.material.material import Material
 from mbtf_gen.planning.adaptive import estimate_shard
 from mbtf_gen.planning.effects_plan import plan_effects
+from mbtf_gen.planning.run_plan import allocate
+from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Stream
 from mbtf_gen.sampling.query_sampler import Queries
 from mbtf_pipeline.cost_study.measurements import HALF_WIDTH, NORMAL
@@ -95,18 +97,18 @@ class GeneratorBenchmark:
         """The job with options changed, by dotted name."""
         data = self.config.model_dump(mode="json")
         fixed = {
-            "queries.resolution": 1 << Job.of(self.config, self.material).lattice.finest,
+            "queries.resolution": 1 << Job(self.config, self.material).lattice.finest,
             "queries.layout": "shuffled",
             "output.shard_queries": SHARD,
         }
         for name, value in {**fixed, **changes}.items():
             section, _, key = name.rpartition(".")
             (data[section] if section else data)[key] = value
-        return Job.of(GeneratorConfig.model_validate({**data, "seed": self.seed}), self.material)
+        return Job(GeneratorConfig.model_validate({**data, "seed": self.seed}), self.material)
 
     def _queries(self, job: Job, shard: int, count: int) -> Queries:
         """Queries of a test split, one leading axis."""
-        return job.plan().draw("test", shard, count)
+        return job.query_plan.draw("test", shard, count)
 
     def reference(self, changes: dict[str, Any], batch: int) -> _Reference:
         """One batch of the reference with these options."""
@@ -137,7 +139,7 @@ class GeneratorBenchmark:
         key = _key(changes)
         if key not in self._estimators:
             job = self.job({"effects.mode": "all", "transport.max_depth": 0, **changes})
-            self._estimators[key] = job, job.estimator(plan_effects(job))
+            self._estimators[key] = job, build_estimator(job, plan_effects(job))
         return self._estimators[key]
 
     def _bias_halves(
@@ -180,7 +182,7 @@ class GeneratorBenchmark:
         spp : paths of each query; the expected value does not depend on them
         """
         job = self.job(changes)
-        estimator = job.estimator(plan_effects(job))
+        estimator = build_estimator(job, plan_effects(job))
         mean = self.mean(against).value
         start = time.perf_counter()
         squares: list[NDArray[np.float64]] = []
@@ -200,13 +202,14 @@ class GeneratorBenchmark:
         Queries get paths as in a data set: equally many, more where more noise is expected, or as many as a
         target error takes. The pilot of that allocation is not timed: it runs once per data set.
         """
-        plan = allocated(job, plan_effects(job))
-        estimator, target, spp = job.estimator(plan), job.target("train"), job.spp("train")
+        plan = allocate(job, plan_effects(job))
+        estimator = build_estimator(job, plan.effects)
+        target, spp = split_target(job.config, "train"), split_spp(job.config, "train")
         paths: float = spp
         if target is not None:
             probe = self._queries(job, _FIRST_BATCH - 1, _PROBE)
             stream = Stream(self.seed, "test", _FIRST_BATCH - 1)
-            paths = estimate_shard(estimator, probe, spp, target, stream, plan).paths / _PROBE
+            paths = estimate_shard(estimator, probe, spp, target, stream, plan.allocation).paths / _PROBE
         count = max(1, round(_BATCH_PATHS / max(paths, _FEWEST_PATHS)))
         squares: list[NDArray[np.float64]] = []
         times: list[float] = []
@@ -215,7 +218,7 @@ class GeneratorBenchmark:
             shard = _FIRST_BATCH + len(squares)
             queries = self._queries(job, shard, count)
             start = time.perf_counter()
-            found = estimate_shard(estimator, queries, spp, target, Stream(self.seed, "test", shard), plan)
+            found = estimate_shard(estimator, queries, spp, target, Stream(self.seed, "test", shard), plan.allocation)
             times.append((time.perf_counter() - start) / count * 1e6)
             squares.append(((found.value_a.astype(np.float64) - found.value_b) ** 2 / 4.0).mean(axis=1))
             variance = mean_estimate(np.concatenate(squares)).scaled(1.0 / mean**2)

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.atomic import read_json, write_json
+from mbtf_core.digest import data_sha256
 from mbtf_core.errors import InputError
 from mbtf_core.stats import Estimate
-from mbtf_pipeline.stages import hash_of
 
 FORMAT = "mbtf-cost-measurement"
 # Raised when the method of measuring changes: older measurements are then repeated.
@@ -75,7 +75,7 @@ class MeasurementFolder:
         self.basis = basis
 
     def _path(self, study: str, key: dict[str, Any]) -> Path:
-        digest = hash_of({"schema": SCHEMA, "basis": self.basis, "study": study, "key": key})
+        digest = data_sha256({"schema": SCHEMA, "basis": self.basis, "study": study, "key": key})
         return self.folder / f"{study}-{digest[:16]}.json"
 
     def get(self, study: str, key: dict[str, Any]) -> Measurement | None:

@@ -23,8 +23,8 @@ from mbtf_core.stats import Estimate
 from mbtf_pipeline.cost_study.measurements import HALF_WIDTH, NORMAL, Measurement, MeasurementFolder
 from mbtf_pipeline.cost_study.runs import Run, RunRunner
 
-# Seeds of one configuration at most, and the fewest whose own deviation counts.
-MOST_SEEDS = 12
+# Seeds that every configuration gets, and at most; the fewest whose own deviation counts.
+FEWEST_SEEDS, MOST_SEEDS = 2, 12
 FEWEST_OWN = 3
 
 
@@ -88,14 +88,10 @@ class Repeated:
 
 
 def measure_runs(
-    runs: Sequence[Run],
-    store: MeasurementFolder,
-    runner: RunRunner,
-    fits: Callable[[Run], bool],
-    seeds: int,
+    runs: Sequence[Run], store: MeasurementFolder, runner: RunRunner, fits: Callable[[Run], bool], seeds: int
 ) -> Repeated:
-    """Measure each comparison with the study's seed and with another one, then runs whose 95 % interval is too
-    wide with further seeds; store every measurement. Repeats begin with the shortest run.
+    """Measure each comparison with the study's seed and with another one, then runs whose 95 % interval is
+    too wide with further seeds; store every measurement. Repeats begin with the shortest run.
 
     Parameters
     ----------
@@ -111,10 +107,18 @@ def measure_runs(
 
     def measure_seed(seed: int, places: Sequence[int]) -> None:
         tasks = {k: replace(runs[k], data=replace(runs[k].data, seed=seed)) for k in places}
-        todo = {k: task for k, task in tasks.items() if store.get(task.study, task.key) is None}
+        deviation = seed_deviation(out.groups)
+        todo = {
+            k: task
+            for k, task in tasks.items()
+            if store.get(task.study, task.key) is None
+            and seed < seeds
+            and k not in broken
+            and (seed < FEWEST_SEEDS or _is_wide(out.groups[k], deviation))
+        }
         for k, task in list(todo.items()):
             del todo[k]
-            if k not in broken and seed < seeds and fits(task):
+            if fits(task):
                 try:
                     store.put(task.key, runner.measure(task))
                 except InputError as error:
@@ -134,9 +138,8 @@ def measure_runs(
     for study in dict.fromkeys(run.study for run in runs):
         places = [k for k, run in enumerate(runs) if run.study == study]
         measure_seed(0, places)
-        measure_seed(1, measured(places, 1))
-    for seed in range(2, MOST_SEEDS):
-        deviation = seed_deviation(out.groups)
-        places = measured(range(len(runs)), seed)
-        measure_seed(seed, [k for k in places if _is_wide(out.groups[k], deviation) or seed >= seeds])
+        for seed in range(1, FEWEST_SEEDS):
+            measure_seed(seed, measured(places, seed))
+    for seed in range(FEWEST_SEEDS, MOST_SEEDS):
+        measure_seed(seed, measured(range(len(runs)), seed))
     return out

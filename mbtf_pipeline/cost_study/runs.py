@@ -17,13 +17,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mbtf_core.digest import data_sha256
 from mbtf_core.stats import Estimate, unexplained_variance
 from mbtf_core.units import parse_duration
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.generation import Job, generate
+from mbtf_gen.generation import generate
+from mbtf_gen.job import Job
 from mbtf_gen.material.material import load_material
 from mbtf_pipeline.cost_study.measurements import Measurement
-from mbtf_pipeline.stages import hash_of
 
 if TYPE_CHECKING:
     from mbtf_fit.data.queries import ShardQueries
@@ -124,13 +125,13 @@ class RunRunner:
         data["queries"] |= {"train": str(train[0]), "spp": train[1], "layout": "shuffled"}
         data["queries"] |= {"test": str(test[0]), "test_spp": test[1]}
         config = GeneratorConfig.model_validate(data)
-        folder = self.folder / f"data-{hash_of(data)[:12]}"
+        folder = self.folder / f"data-{data_sha256(data)[:12]}"
         # Data that an interrupted study left behind were not timed.
         shutil.rmtree(folder, ignore_errors=True)
         start = time.perf_counter()
         # `Job.prepare` would log the material's warnings for every data set.
-        job = Job.of(config, load_material(Path(config.material), config.geometry.make_tileable))
-        generate(config, folder, job=job)
+        job = Job(config, load_material(Path(config.material), config.geometry.make_tileable))
+        generate(job, folder)
         return folder, time.perf_counter() - start
 
     def data(self, request: DataRequest) -> tuple[Path, float]:
@@ -185,7 +186,7 @@ class RunRunner:
         folder, generation_seconds = self.data(run.data)
         self.progress(run.label)
         config = FitConfig.model_validate({"seed": self.config.seed + run.data.seed, **run.fit})
-        out = self.folder / f"fit-{hash_of(run.key)[:12]}"
+        out = self.folder / f"fit-{data_sha256(run.key)[:12]}"
         shutil.rmtree(out, ignore_errors=True)
         result = fit(config, folder, out)
         error = unexplained_variance(result.material.predict(test), test.value_a, test.value_b)

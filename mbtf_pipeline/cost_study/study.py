@@ -12,17 +12,18 @@ from typing import Any
 from mbtf_core.atomic import read_json, write_json, write_text
 from mbtf_core.config_file import dump_yaml
 from mbtf_core.errors import InputError
+from mbtf_core.folders import ELSEWHERE, check_folder, make_folder
 from mbtf_core.stats import Estimate, signal_variance
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.material.material import load_material
-from mbtf_pipeline.cost_study.fit_runs import GENERATOR, SEEDS, QuerySeconds, planned_runs
+from mbtf_pipeline.cost_study.fit_runs import GENERATOR, QuerySeconds, planned_runs
 from mbtf_pipeline.cost_study.generator_benchmark import GeneratorBenchmark
 from mbtf_pipeline.cost_study.generator_runs import generator_tasks
 from mbtf_pipeline.cost_study.measurements import Measurement, MeasurementFolder
-from mbtf_pipeline.cost_study.repeats import MOST_SEEDS, combined, measure_runs, seed_deviation
+from mbtf_pipeline.cost_study.repeats import FEWEST_SEEDS, MOST_SEEDS, combined, measure_runs, seed_deviation
 from mbtf_pipeline.cost_study.runs import Run, RunRunner
 from mbtf_pipeline.recipe import Recipe
-from mbtf_pipeline.run_folder import locked, machine, take
+from mbtf_pipeline.run_folder import locked, machine
 
 STUDY_NAME = "study.json"
 STUDY_FORMAT = "mbtf-cost"
@@ -69,19 +70,19 @@ def claim(folder: Path) -> None:
     ------
     InputError : it holds something else, or a study of another version or machine
     """
-    hint = "choose another folder with -o"
-    other = InputError("is not empty and holds no cost study", where=folder, hint=hint)
-    take(folder, lambda path: bool(_record(path)), other)
-    record = _record(folder)
-    if not record:
-        return
-    if record.get("schema") != STUDY_SCHEMA:
-        problem = f"holds a cost study of schema version {record.get('schema')}; this is {STUDY_SCHEMA}"
-        raise InputError(problem, where=folder, hint=hint)
-    there, here = record.get("machine", {}).get("system"), machine()["system"]
-    if there != here:
-        problem = f"holds a cost study of another kind of machine ({there}; this is {here})"
-        raise InputError(problem, where=folder, hint=hint)
+    check_folder(folder, lambda path: bool(_record(path)), "cost study")
+    make_folder(folder)
+    if record := _record(folder):
+        if record.get("schema") != STUDY_SCHEMA:
+            problem = f"holds a cost study of schema version {record.get('schema')}; this is {STUDY_SCHEMA}"
+            raise InputError(problem, where=folder, hint=ELSEWHERE)
+        there, here = record.get("machine", {}).get("system"), machine()["system"]
+        if there != here:
+            raise InputError(
+                f"holds a cost study made on another kind of machine ({there}; this is {here})",
+                where=folder,
+                hint=ELSEWHERE,
+            )
 
 
 def _record(folder: Path) -> dict[str, Any]:
@@ -211,7 +212,7 @@ def _measure_generator(
     for task in generator_tasks(benchmark):
         found = store.get(task.study, task.key)
         # Configurations take longer than their share where kernels are compiled.
-        if found is None and clock.left() > (1.0 - 1.5 * GENERATOR) * clock.seconds:
+        if found is None and clock.left() > (1.0 - 1.2 * GENERATOR) * clock.seconds:
             progress(clock.share(), task.label)
             found = task.run(benchmark, each)
             store.put(task.key, found)
@@ -230,12 +231,13 @@ def query_seconds(benchmark: GeneratorBenchmark, store: MeasurementFolder) -> Qu
     if found is None:
         from mbtf_gen.forecast import forecast
         from mbtf_gen.planning.effects_plan import plan_effects
+        from mbtf_gen.planning.run_plan import RunPlan
 
         at = []
         for paths in _TIMED_PATHS:
             options = {"queries.spp": paths, "queries.train": _TIMED_QUERIES, "queries.test": "1"}
             job = benchmark.job(options)
-            at.append(forecast(job, plan_effects(job), _TIMED_SECONDS).query_seconds)
+            at.append(forecast(job, RunPlan(plan_effects(job)), _TIMED_SECONDS).query_seconds)
         slope = max(0.0, (at[1] - at[0]) / (_TIMED_PATHS[1] - _TIMED_PATHS[0]))
         details = {"query": max(0.0, at[0] - slope * _TIMED_PATHS[0]), "path": slope}
         nothing = Estimate(math.nan, math.inf, 0)
@@ -257,7 +259,7 @@ def _measure_runs(
         # The additional time is for repeats alone.
         return clock.left(refining=run.data.seed > 0) > runner.expected_seconds(run)
 
-    found = measure_runs(runs, store, runner, fits, MOST_SEEDS if clock.refine else SEEDS)
+    found = measure_runs(runs, store, runner, fits, MOST_SEEDS if clock.refine else FEWEST_SEEDS)
     study.deviation = seed_deviation(found.groups)
     study.failed = found.failed
     for run, group in zip(runs, found.groups, strict=True):

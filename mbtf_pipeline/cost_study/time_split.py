@@ -28,6 +28,7 @@ import numpy as np
 
 from mbtf_core.atomic import read_json, write_json
 from mbtf_core.console import clock
+from mbtf_core.digest import data_sha256
 from mbtf_core.errors import InputError, UsageError
 from mbtf_core.units import format_duration
 from mbtf_fit.config import FitConfig
@@ -37,7 +38,6 @@ from mbtf_pipeline.cost_study.runs import DataRequest, Run, RunRunner
 from mbtf_pipeline.recipe import Recipe
 from mbtf_pipeline.run import layout_of
 from mbtf_pipeline.run_folder import claim, describe, locked
-from mbtf_pipeline.stages import hash_of
 
 SPLIT_NAME = "time_split.json"
 SPLIT_FORMAT = "mbtf-time-split"
@@ -51,6 +51,8 @@ PILOT, SHORTEST_PILOT = 0.04, 10.0
 SHORTEST = 60.0
 # Test set of the pilots: queries, and paths of each.
 _TEST = (1 << 17, 8)
+# Seconds of a fit besides training where there are no pilots.
+_FIT = 2.0
 _FEWEST_QUERIES = 4096
 # Seconds of a query at least: that of a closed form, written to disk.
 _CHEAPEST = 1e-8
@@ -146,7 +148,7 @@ def split_time(
             hint="leave out the fits of 'hierarchical'",
         )
     options = recipe.model_dump(mode="json", include={"generate", "fit"})
-    key = hash_of({"schema": SPLIT_SCHEMA, "time": seconds, "recipe": options})
+    key = data_sha256({"schema": SPLIT_SCHEMA, "time": seconds, "recipe": options})
     claim(folder)
     with locked(folder):
         split = _stored(folder, key)
@@ -185,11 +187,11 @@ def measure_costs(
     recipe: Recipe, length: float, folder: Path, progress: Callable[[str], None]
 ) -> tuple[list[tuple[float, float]], Costs]:
     """(share, unexplained variance) of pilots of so many seconds each, and the costs of a run. Lengths below
-    `SHORTEST_PILOT` and failed pilots leave no pilots, and the costs of a fit unknown."""
+    `SHORTEST_PILOT` and failed pilots leave no pilots."""
     query, start = _generating(recipe.generate)
     most = most_queries(recipe, folder)
     errors: list[tuple[float, float]] = []
-    fits = [(1.0, 0.0)]
+    fits = [(1.0, _FIT)]
     if length >= SHORTEST_PILOT:
         try:
             errors, fits = _pilots(recipe, length, query, most, progress)
@@ -203,14 +205,15 @@ def measure_costs(
 def _generating(config: GeneratorConfig) -> tuple[float, float]:
     """Seconds of a training query, and of starting the generator with its test split, by a forecast."""
     from mbtf_gen.forecast import forecast
-    from mbtf_gen.generation import Job, allocated
+    from mbtf_gen.job import Job, split_queries
     from mbtf_gen.material.material import load_material
     from mbtf_gen.planning.effects_plan import plan_effects
+    from mbtf_gen.planning.run_plan import allocate
 
-    job = Job.of(config, load_material(Path(config.material), config.geometry.make_tileable))
-    expected = forecast(job, allocated(job, plan_effects(job, pilots=False)))
+    job = Job(config, load_material(Path(config.material), config.geometry.make_tileable))
+    expected = forecast(job, allocate(job, plan_effects(job, pilots=False)))
     query = max(expected.query_seconds, _CHEAPEST)
-    return query, expected.start + max(0.0, expected.seconds - job.queries("train") * query)
+    return query, expected.start + max(0.0, expected.seconds - split_queries(job, "train") * query)
 
 
 def _pilots(

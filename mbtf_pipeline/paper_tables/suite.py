@@ -10,9 +10,10 @@ from typing import Any
 from mbtf_core.atomic import read_json, write_json
 from mbtf_core.console import Console
 from mbtf_core.errors import InputError
+from mbtf_core.folders import check_folder, make_folder
 from mbtf_pipeline.paper_tables.recipe import PaperRecipe, Planned
 from mbtf_pipeline.run import run_recipe
-from mbtf_pipeline.run_folder import locked, machine, take
+from mbtf_pipeline.run_folder import locked, machine
 
 PAPER_NAME = "paper.json"
 PAPER_FORMAT = "mbtf-paper"
@@ -70,8 +71,8 @@ def run_paper(
     from mbtf_pipeline.paper_tables.page import write_page
 
     console = console or Console(quiet=True)
-    hint = "choose another folder with -o"
-    take(folder, is_paper, InputError("is not empty and holds no paper recipe", where=folder, hint=hint))
+    check_folder(folder, is_paper, "paper recipe")
+    make_folder(folder)
     record: dict[str, Any] = {
         "format": PAPER_FORMAT,
         "schema": PAPER_SCHEMA,

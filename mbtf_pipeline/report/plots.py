@@ -240,7 +240,7 @@ def _scatter(clouds: Sequence[Cloud], x: str, y: str, front: Sequence[tuple[floa
     if front:
         fx, fy = np.asarray(front, float).T
         drawn = axes.step(fx, fy, where="post", color=_INK, linewidth=1.3, linestyle=(0, (4, 2)))
-        handles.append((drawn[0], "front"))
+        handles.append((drawn[0], "Pareto front"))
         for (x0, y0), (x1, y1) in pairwise(front):
             lines += [((x0, y0), (x1, y0)), ((x1, y0), (x1, y1))]
     axes.margins(y=0.1)

@@ -11,15 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.atomic import checksummed
-from mbtf_core.shard_schema import SPLITS
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.dataset.folder import open_folder
-from mbtf_gen.dataset.manifest import build_manifest
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.dataset.render_shards import RenderedShard, store_shard
 from mbtf_gen.dataset.summary import finish
-from mbtf_gen.generation import Job
-from mbtf_gen.planning.effects_plan import simulated
+from mbtf_gen.job import Job, split_spp
+from mbtf_gen.planning.effects_plan import reference_plan
+from mbtf_gen.planning.run_plan import RunPlan
 from mbtf_gen.render.estimates import Estimates
 from mbtf_gen.sampling.query_sampler import Queries
 
@@ -47,17 +46,15 @@ def write_dataset(folder: Path, *, rows: int = 4, columns: int = 8, **options: A
     np.save(heights, 0.1 * np.random.default_rng(0).random((rows, columns)))
     config = GeneratorConfig.model_validate({"material": str(heights), **options})
     job = Job.prepare(config)
-    entries = [entry for split in SPLITS for entry in job.shards(split)]
-    effects = simulated(job)
-    manifest = build_manifest(job, entries, effects)
-    open_folder(job, folder, manifest, lambda: manifest, False)
-    for number, entry in enumerate(entries):
-        queries = job.plan().draw(entry.split, entry.index, entry.rows)
+    plan = RunPlan(reference_plan(job))
+    open_folder(job, folder, lambda job: plan, False)
+    for number, entry in enumerate(job.shards):
+        queries = job.query_plan.draw(entry.split, entry.index, entry.rows)
         truth, rng = formula(queries), np.random.default_rng(number)
         a, b = ((truth * (1 + NOISE * rng.normal(size=truth.shape))).astype(np.float32) for _ in range(2))
-        paths = queries.sigma.size * job.spp(entry.split)
+        paths = queries.sigma.size * split_spp(config, entry.split)
         made = Estimates(a.reshape(-1, 3), b.reshape(-1, 3), None, paths, 0, 0, 0)
-        store_shard(job, RenderedShard(entry, queries, made, 0.1), folder / entry.file, effects)
+        store_shard(job, RenderedShard(entry, queries, made, 0.1), folder / entry.file, plan)
     finish(folder)
     return Dataset.open(folder)
 

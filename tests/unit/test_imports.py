@@ -108,7 +108,6 @@ def faults(source: str, module: str) -> list[str]:
     return out
 
 
-@pytest.mark.xfail(reason="the generator's Job and effects plan are being divided", strict=True)
 def test_imports_run_downwards() -> None:
     found = [fault for name, path in SOURCES.items() for fault in faults(path.read_text(), name)]
     assert found == []

@@ -36,10 +36,9 @@ def draw(config: PreviewConfig, path: Path, *, overwrite: bool, console: Console
         overwrite=overwrite,
     )
     sheet, turn = config.sheet, config.turntable
-    columns = len(sheet.views) * len(sheet.lights)
     shows = {
         SHEET_NAME: f"{len(sheet.views)} views x {len(sheet.lights)} lights (columns) x "
-        f"{len(sheet.tiles_across)} zooms (rows), {columns * len(sheet.tiles_across)} pictures, one exposure",
+        f"{len(sheet.tiles_across)} widths (rows) at one exposure",
         TURNTABLE_NAME: f"a ball of {turn.tiles} tiles around on a plate, {turn.frames} pictures of "
         f"{turn.spp} paths per pixel",
     }
@@ -58,5 +57,5 @@ def draw(config: PreviewConfig, path: Path, *, overwrite: bool, console: Console
                 pictures.turntable(folder.path / TURNTABLE_NAME, lambda: bar.advance(1))
                 folder.keep(TURNTABLE_NAME, [folder.path / TURNTABLE_NAME], {})
     made = [{"file": folder.path / name, "shows": text, "kept": kept[name]} for name, text in shows.items()]
-    lines = [f"{p['file']}: {p['shows']}{' (was there)' if p['kept'] else ''}" for p in made]
+    lines = [f"{p['file']}: {p['shows']}{' (kept)' if p['kept'] else ''}" for p in made]
     console.report({"folder": path, "pictures": made}, "\n".join(lines))

@@ -11,18 +11,18 @@ from mbtf_core.options import Flag
 from mbtf_core.units import parse_numbers
 from mbtf_gen.config.pictures import Direction
 
-# The whole sheet and the whole turntable are held in memory; this keeps both below a gigabyte.
+# Limits the memory of sheet and turntable to a gigabyte.
 MOST_PIXELS = 1 << 25
 
 Width = Annotated[float, Field(gt=0, le=1e4)]
 
 
 class SheetSection(Settings):
-    """The contact sheet: a column per view and light, a row per width."""
+    """The contact sheet: a column per view and light, a row per width of the field of view."""
 
     views: Annotated[list[Direction], Field(min_length=1, max_length=8)] = Field(
         [Direction(elevation=70, azimuth=-90), Direction(elevation=30, azimuth=-90)],
-        description="where the camera stands",
+        description="directions towards the camera",
     )
     lights: Annotated[list[Direction], Field(min_length=1, max_length=8)] = Field(
         [
@@ -30,7 +30,7 @@ class SheetSection(Settings):
             Direction(elevation=35, azimuth=180),
             Direction(elevation=20, azimuth=15),
         ],
-        description="where the light comes from",
+        description="directions towards the light",
     )
     tiles_across: Annotated[list[Width], BeforeValidator(parse_numbers), Flag("--tiles-across", "1,2,4")] = (
         Field(
@@ -46,7 +46,7 @@ class SheetSection(Settings):
 
 
 class TurntableSection(Settings):
-    """A ball on a plate that turns once."""
+    """A rotating ball on a plate."""
 
     size: Annotated[int, Flag("--turn-size")] = Field(
         240, ge=16, le=2048, description="pixels along each side of the turntable"
@@ -59,7 +59,7 @@ class TurntableSection(Settings):
 
 
 class PreviewConfig(Settings):
-    """Everything ``mbtf-fit preview`` needs."""
+    """Every option of ``mbtf-fit preview``."""
 
     material: str = Field(description="folder made by mbtf-fit")
     sheet: SheetSection = SheetSection()
@@ -70,5 +70,5 @@ class PreviewConfig(Settings):
         sheet, turn = self.sheet, self.turntable
         panels = len(sheet.views) * len(sheet.lights) * len(sheet.tiles_across)
         if max(panels * sheet.size**2, turn.frames * turn.size**2) > MOST_PIXELS:
-            raise ValueError(f"asks for more than {MOST_PIXELS:,} pixels; take smaller or fewer pictures")
+            raise ValueError(f"asks for more than {MOST_PIXELS:,} pixels; use smaller or fewer pictures")
         return self

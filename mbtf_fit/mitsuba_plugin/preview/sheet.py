@@ -1,7 +1,7 @@
-"""The contact sheet: a plane of the material from several views, under several lights, at several widths.
+"""The contact sheet: a plane of the material for several views, lights and widths of the field of view.
 
-A pixel is the material's value M at the pixel's position, footprint and directions, one query per pixel, as
-``mbtf-gen reference --kind query`` defines it; the light has unit irradiance on the plane.
+A pixel is the material's value M for a single query, as in ``mbtf-gen reference --kind query``; the light has
+unit irradiance on the plane.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from mbtf_gen.pictures.camera import Camera
 from mbtf_gen.pictures.reference import auto_exposure, to_display
 
 GAP, MARGIN, CAPTION = 4, 8, 34
-# Exposure as a share of what suits a picture alone: pictures of one sheet differ.
+# Factor of the automatic exposure: pictures of one sheet differ in brightness.
 HEADROOM = 0.8
 INK, PAPER = (30, 30, 30), (255, 255, 255)
 
@@ -65,9 +65,9 @@ def contact_sheet(values: F32, section: SheetSection) -> NDArray[np.uint8]:
     font = ImageFont.load_default(max(9, min(13, size // 12)))
     for view in range(views):
         for light in range(lights):
-            # Views stand a little apart.
+            # A wider gap separates views.
             left = MARGIN + (view * lights + light) * pitch + view * GAP
-            text = f"{_said('view', section.views[view])}\n{_said('light', section.lights[light])}"
+            text = f"{_caption('view', section.views[view])}\n{_caption('light', section.lights[light])}"
             draw.multiline_text((left + 1, MARGIN), text, INK, font, spacing=2)
             for row in range(widths):
                 picture = Image.fromarray(to_display(values[view, light, row], exposure))
@@ -78,7 +78,7 @@ def contact_sheet(values: F32, section: SheetSection) -> NDArray[np.uint8]:
     return np.asarray(sheet)
 
 
-def _said(name: str, direction: Direction) -> str:
+def _caption(name: str, direction: Direction) -> str:
     return f"{name} {direction.elevation:g}°, {direction.azimuth:g}°"
 
 
@@ -87,7 +87,7 @@ def _tiles(tiles_across: float) -> str:
 
 
 def _label(draw: ImageDraw.ImageDraw, corner: tuple[int, int], text: str, font: Any) -> None:
-    """Text in the lower left corner of a picture, on paper so that it can be read."""
+    """Text in the lower left corner of a picture, on a white background."""
     left, bottom = corner
     box = draw.textbbox((0, 0), text, font=font)
     top = bottom - (box[3] - box[1]) - 6

@@ -1,8 +1,7 @@
-"""The turntable: a ball of the material on a plate of the same, under a key light, a rim light and a dim sky.
+"""The turntable: a ball and a plate of the material, with a key light, a rim light and a dim sky.
 
-The ball's texture coordinates are those of Mercator's map, which keeps angles: tiles are square everywhere
-and shrink towards the poles, where footprints grow beyond them. The tile is as large on the plate as on the
-equator.
+The ball's texture coordinates are a Mercator projection, which is conformal: tiles are square everywhere and
+shrink towards the poles, where footprints exceed them. Tiles on the plate are as large as on the equator.
 """
 
 from __future__ import annotations
@@ -22,8 +21,9 @@ from mbtf_core.directions import from_angles
 from mbtf_fit.mitsuba_plugin.material_arrays import F32
 from mbtf_fit.mitsuba_plugin.preview.config import TurntableSection
 from mbtf_gen.pictures.reference import to_display
+from mbtf_gen.render.types import BSDF, Scene
 
-# Latitude beyond which Mercator's map, which has no end, goes on with the scale that it has there.
+# Latitude beyond which the projection continues with constant scale.
 STEEPEST = np.radians(84.0)
 # Cells around and from pole to pole; the plate's radius in those of the ball.
 CELLS = (192, 96)
@@ -32,12 +32,12 @@ PLATE = 1.9
 CAMERA, KEY, RIM = (24.0, -90.0), (42.0, -150.0), (25.0, 60.0)
 KEY_IRRADIANCE, RIM_IRRADIANCE, SKY = 2.6, 0.7, 0.22
 FIELD_OF_VIEW = 26.0
-# Milliseconds of one turn.
+# Milliseconds of one rotation.
 TURN = 2400
 
 
-def ball(bsdf: Any, tiles: int) -> Any:
-    """The unit sphere with so many tiles around its equator; texture coordinates are in tile widths."""
+def ball(bsdf: BSDF, tiles: int) -> Any:
+    """The unit sphere with a number of tiles around its equator; texture coordinates are in tile widths."""
     columns, rows = CELLS
     azimuth, latitude = np.meshgrid(
         np.linspace(0.0, 2.0 * np.pi, columns + 1), np.linspace(np.pi / 2, -np.pi / 2, rows + 1)
@@ -45,39 +45,39 @@ def ball(bsdf: Any, tiles: int) -> Any:
     steep = np.clip(latitude, -STEEPEST, STEEPEST)
     north = np.arctanh(np.sin(steep)) + (latitude - steep) / np.cos(STEEPEST)
     cosine = np.cos(latitude)
-    place = np.stack([cosine * np.cos(azimuth), cosine * np.sin(azimuth), np.sin(latitude)], -1)
+    position = np.stack([cosine * np.cos(azimuth), cosine * np.sin(azimuth), np.sin(latitude)], -1)
     # Mitsuba's v grows downwards, as the rows of images do.
     uv = np.stack([azimuth, -north], -1) * (tiles / (2.0 * np.pi))
     corner = np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)
     right, below = corner + 1, corner + columns + 1
     faces = np.stack([corner, below, below + 1, corner, below + 1, right], -1).reshape(-1, 3)
-    return _mesh("ball", bsdf, place.reshape(-1, 3), uv.reshape(-1, 2), faces, place.reshape(-1, 3))
+    return _mesh("ball", bsdf, position.reshape(-1, 3), uv.reshape(-1, 2), faces, position.reshape(-1, 3))
 
 
-def plate(bsdf: Any, tiles: int) -> Any:
+def plate(bsdf: BSDF, tiles: int) -> Any:
     """A disc under the ball."""
     angle = np.linspace(0.0, 2.0 * np.pi, CELLS[0], endpoint=False)
     flat = PLATE * np.concatenate([np.zeros((1, 2)), np.stack([np.cos(angle), np.sin(angle)], -1)])
-    place = np.concatenate([flat, np.full((len(flat), 1), -1.0)], 1)
+    position = np.concatenate([flat, np.full((len(flat), 1), -1.0)], 1)
     uv = flat * (1.0, -1.0) * (tiles / (2.0 * np.pi))
     rim = np.arange(CELLS[0])
     faces = np.stack([np.zeros_like(rim), 1 + rim, 1 + (rim + 1) % CELLS[0]], -1)
-    return _mesh("plate", bsdf, place, uv, faces)
+    return _mesh("plate", bsdf, position, uv, faces)
 
 
-def _mesh(name: str, bsdf: Any, place: Any, uv: Any, faces: Any, normals: Any = None) -> Any:
+def _mesh(name: str, bsdf: BSDF, position: Any, uv: Any, faces: Any, normals: Any = None) -> Any:
     properties = mi.Properties()
     properties["bsdf"] = bsdf
     mesh = mi.Mesh(
         name,
-        len(place),
+        len(position),
         len(faces),
         has_vertex_normals=normals is not None,
         has_vertex_texcoords=True,
         props=properties,
     )
     parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = place.astype(np.float32).ravel()
+    parameters["vertex_positions"] = position.astype(np.float32).ravel()
     parameters["vertex_texcoords"] = uv.astype(np.float32).ravel()
     parameters["faces"] = faces.astype(np.uint32).ravel()
     if normals is not None:
@@ -87,7 +87,7 @@ def _mesh(name: str, bsdf: Any, place: Any, uv: Any, faces: Any, normals: Any = 
 
 
 def _camera(turned: float) -> Any:
-    """Camera to world, after the plate has turned by so many degrees."""
+    """Camera to world, after a rotation of the plate in degrees."""
     towards = from_angles(CAMERA[0], CAMERA[1] - turned)
     target = np.array([0.0, 0.0, -0.25])
     origin = target + 2.1 / np.tan(np.radians(FIELD_OF_VIEW / 2.0)) * towards
@@ -95,13 +95,13 @@ def _camera(turned: float) -> Any:
 
 
 def _light(angles: tuple[float, float], turned: float) -> Any:
-    """Light to world: it shines along +z of its own frame."""
+    """Light to world: it emits along +z of its own frame."""
     towards = from_angles(angles[0], angles[1] - turned)
     return mi.ScalarTransform4f().look_at([0.0, 0.0, 0.0], [*map(float, -towards)], [0.0, 0.0, 1.0])
 
 
-def scene_of(bsdf: Any, section: TurntableSection) -> Any:
-    """The scene before it turns."""
+def scene_of(bsdf: BSDF, section: TurntableSection) -> Scene:
+    """The scene before its rotation."""
 
     def directional(angles: tuple[float, float], irradiance: float) -> dict[str, Any]:
         return {"type": "directional", "to_world": _light(angles, 0.0), "irradiance": irradiance}
@@ -130,8 +130,8 @@ def scene_of(bsdf: Any, section: TurntableSection) -> Any:
     )
 
 
-def frames(bsdf: Any, section: TurntableSection) -> Iterator[F32]:
-    """Linear pictures (size, size, 3) of one turn. Camera and lights go round, which looks the same."""
+def frames(bsdf: BSDF, section: TurntableSection) -> Iterator[F32]:
+    """Linear pictures (size, size, 3) of one rotation. Camera and lights rotate, which is equivalent."""
     scene = scene_of(bsdf, section)
     integrator = mi.load_dict({"type": "mbtf_path", "max_depth": 4})
     parameters = mi.traverse(scene)
@@ -147,7 +147,7 @@ def frames(bsdf: Any, section: TurntableSection) -> Iterator[F32]:
 
 
 def exposure_of(picture: F32) -> float:
-    """Factor that brings the 90th percentile of what is not sky to 0.6."""
+    """Factor that maps the 90th percentile of all pixels but the sky to 0.6."""
     bright = picture.mean(-1)
     shown = bright[np.abs(bright - SKY) > 1e-3 * SKY]
     level = float(np.percentile(shown, 90)) if shown.size else 0.0
@@ -155,13 +155,13 @@ def exposure_of(picture: F32) -> float:
 
 
 def to_pictures(linear: Sequence[F32]) -> list[NDArray[np.uint8]]:
-    """8-bit frames, exposed alike."""
+    """8-bit frames of equal exposure."""
     exposure = exposure_of(linear[0])
     return [to_display(picture, exposure) for picture in linear]
 
 
 def write_gif(path: Path, pictures: Sequence[NDArray[np.uint8]]) -> None:
-    """Write frames that repeat for ever, with one palette for all, atomically."""
+    """Write an endlessly repeated animation with a common palette, atomically."""
     strip = Image.fromarray(np.concatenate(pictures[:: max(1, len(pictures) // 8)], axis=0))
     palette = strip.quantize(255, method=Image.Quantize.MEDIANCUT)
     coded = [

@@ -16,7 +16,7 @@ from mbtf_core.shard_schema import Split
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.dataset.shard_io import read_shard
 from mbtf_gen.dataset.verify import is_finished
-from mbtf_gen.generation import Job
+from mbtf_gen.job import Job, split_queries
 from mbtf_gen.sampling.query_sampler import Mixture, Queries
 
 # Shards are taken until there are so many queries.
@@ -51,13 +51,13 @@ class QuerySample:
 
 def drawn(job: Job, split: Split = "train") -> QuerySample:
     """The first shards that a configuration draws."""
-    plan = job.plan()
-    parts = list(_enough(plan.draw(split, entry.index, entry.rows) for entry in job.shards(split)))
+    plan, entries = job.query_plan, [entry for entry in job.shards if entry.split == split]
+    parts = list(_enough(plan.draw(split, entry.index, entry.rows) for entry in entries))
     return QuerySample(
         *_columns(parts),
         split,
         len(parts),
-        job.queries(split),
+        split_queries(job, split),
         plan.mixture,
         job.lattice.finest,
         plan.min_cos,

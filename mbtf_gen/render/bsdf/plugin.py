@@ -29,7 +29,6 @@ from mbtf_gen.render.types import (
 
 if TYPE_CHECKING:
     from mbtf_gen.material.material import Material
-    from mbtf_gen.planning.effects import EffectsPlan
 
 # Parameters of ``mbtf_surface``: textures or numbers.
 NAMES = (
@@ -45,6 +44,8 @@ NAMES = (
     "slopes",
     "opacity",
 )
+# Effects of how a surface reflects.
+REFLECTION = frozenset({"specular", "metallic", "clearcoat", "sheen"})
 
 
 class SurfaceBSDF(mi.BSDF):
@@ -184,40 +185,33 @@ def _scalar(value: Any) -> Any:
 
 
 def bsdf_of(
-    material: Material, plan: EffectsPlan | None = None, slopes: NDArray[np.float64] | None = None
+    material: Material, on: frozenset[str] = REFLECTION, slopes: NDArray[np.float64] | None = None
 ) -> dict[str, Any]:
     """Mitsuba dictionary of a material's BSDF.
 
     Parameters
     ----------
-    plan : leaves out what it does not simulate; without one everything but opacity is in
+    on : names of the effects that are simulated; all but opacity by default
     slopes : (h, w, 2) slopes added to the mesh's
     """
     if material.bsdf is not None:
         return dict(material.bsdf)
-
-    def on(name: str) -> bool:
-        return plan is None or plan.on(name)
-
     out = {"type": "mbtf_surface", "base_color": _color(material.base_color)}
-    metallic = (
-        material.metallic is not None and bool(np.any(np.asarray(material.metallic) > 0)) and on("metallic")
-    )
     if material.roughness is not None:
         out["roughness"] = _scalar(material.roughness)
-    if material.specular is not None and on("specular"):
+    if material.specular is not None and "specular" in on:
         out["specular"] = _scalar(material.specular)
-    if metallic:
+    if "metallic" in on and material.metallic is not None and np.any(np.asarray(material.metallic) > 0):
         out["metallic"] = _scalar(material.metallic)
-    if material.clearcoat is not None and on("coat"):
+    if material.clearcoat is not None and "clearcoat" in on:
         out["clearcoat"] = _scalar(material.clearcoat)
         out["clearcoat_roughness"] = _scalar(material.clearcoat_roughness)
-    if material.sheen is not None and on("sheen"):
+    if material.sheen is not None and "sheen" in on:
         out["sheen"] = _scalar(material.sheen)
         out["sheen_color"] = _color(1.0 if material.sheen_color is None else material.sheen_color)
         out["sheen_roughness"] = _scalar(material.sheen_roughness)
     if slopes is not None:
         out["slopes"] = _texture(np.concatenate([slopes, np.zeros_like(slopes[..., :1])], axis=-1))
-    if plan is not None and plan.on("opacity"):
+    if "opacity" in on:
         out["opacity"] = _scalar(material.opacity)
     return out

@@ -84,7 +84,7 @@ def test_footprints_at_the_ends_and_between_levels_are_continuous(material: Mate
 
 
 @pytest.mark.parametrize("role", ["omega_i", "omega_o"])
-def test_directions_below_the_data_are_continued_gently(material: Material, role: str) -> None:
+def test_directions_below_the_data_are_continued_smoothly(material: Material, role: str) -> None:
     """From the data's edge (cosine 0.1) to 1e-4 and 0 on the projected disk is half a per cent of its radius:
     values stay below twice the largest within the data, and steps of 1e-5 in the cosine change them by less
     than 1e-3 of it, at the edge and at the horizon."""
@@ -97,7 +97,7 @@ def test_directions_below_the_data_are_continued_gently(material: Material, role
         assert np.abs(near - found).max() < 1e-3 * inside
 
 
-def test_offsets_at_grazing_views_keep_to_their_bound() -> None:
+def test_offsets_at_grazing_views_are_bounded() -> None:
     """``r / max(ω_o,z, 0.6) · ω_o,xy`` whatever r the network answers, so never longer than |r|/0.6; features
     at u' and their gradients are finite."""
     model = build_model("neumip", LATTICE)
@@ -132,7 +132,7 @@ def test_positions_far_away_repeat_the_tile(material: Material) -> None:
         assert np.abs(there - here).max() < 2e-3 * here.max()
 
 
-def test_half_precision_holds_values_of_any_size(material: Material, tmp_path: Path) -> None:
+def test_half_precision_is_accurate_for_values_of_any_size(material: Material, tmp_path: Path) -> None:
     """Half precision ends at 65504; values of 1e5 lie beyond. But weights are numbers of order one however
     large the values are: all but the unit, a single float32, go through half precision and change values by
     less than 1 % of the largest one."""

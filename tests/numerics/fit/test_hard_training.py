@@ -73,7 +73,7 @@ def assert_finite(trainer: Trainer) -> None:
     assert all(bool(t.isfinite().all()) for t in tensors.values())
 
 
-def test_long_after_convergence_the_error_does_not_climb_again() -> None:
+def test_the_error_does_not_rise_after_convergence() -> None:
     """Data without noise cannot be overfitted, so that errors may only fall once the blur is gone, but for
     the unrest of the steps, which the falling rates calm: at the end at most 1.1 of the least on the way."""
     value = parallax(*arrays().values())
@@ -96,7 +96,7 @@ def glossy(u: F32, sigma: F32, omega_i: F32, omega_o: F32) -> NDArray[np.float64
     return parallax(u, sigma, omega_i, omega_o) + 0.5 * np.exp((cosine - 1) / 0.05)[:, None]
 
 
-def test_few_noisy_queries_gone_round_many_times_stay_bounded() -> None:
+def test_many_epochs_of_few_noisy_queries_stay_bounded() -> None:
     """One half in ten has found the light, and is ten times too bright: noise five times the variance or
     more. 150 times round 4000 such queries the networks learn them by heart and, between them, answer
     whatever comes out of an exponential: 38 to 750 times the variance over three seeds. Pulled towards 0 as
@@ -118,7 +118,7 @@ def test_few_noisy_queries_gone_round_many_times_stay_bounded() -> None:
     assert found[default] < 1.6
 
 
-def test_a_few_wild_values_do_not_decide() -> None:
+def test_outliers_do_not_dominate() -> None:
     """Four values of 1e5 among 4000 around 0.1. Each pulls like an error of 10 times the value it should have
     (the bound), 4/4000 of all: one per cent of the mean, which is a few per cent of the deviation; locally
     more. So the error elsewhere is at most 0.1 of the variance more than without them."""
@@ -157,7 +157,7 @@ def test_black_data_give_exactly_black() -> None:
 
 
 @pytest.mark.parametrize("exponent", [-27, 17])
-def test_values_of_any_size_are_fitted_alike(exponent: int) -> None:
+def test_the_fit_does_not_depend_on_the_scale_of_the_values(exponent: int) -> None:
     """Models, losses and steps know values only in units of their mean, and a power of two costs no bit: data
     around 1e-9 or 1e4 give the predictions of those around 0.1 times that power, to the last bit."""
     value = parallax(*arrays().values()).astype(np.float32)

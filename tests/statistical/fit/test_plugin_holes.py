@@ -56,7 +56,7 @@ def render(
     return float(np.array(mi.render(loaded, integrator=tracer, spp=spp, seed=seed), np.float64).mean())
 
 
-def test_the_plugin_reads_the_share_that_was_fitted(tmp_path: Path) -> None:
+def test_the_plugin_evaluates_the_fitted_transmittance(tmp_path: Path) -> None:
     """Against NumPy, at all levels, seams and views, from both sides."""
     random = np.random.default_rng(2)
     lattice = Lattice(3, 2.0)
@@ -75,7 +75,7 @@ def test_the_plugin_reads_the_share_that_was_fitted(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("integrator", ["path", "mbtf_path"])
 @pytest.mark.parametrize(("elevation", "reflected"), [(50.0, np.pi * GRAY), (-50.0, 0.0)])
-def test_a_sheet_in_a_furnace_shows_what_it_reflects_and_what_it_lets_through(
+def test_a_sheet_in_a_furnace_conserves_energy(
     integrator: str, elevation: float, reflected: float, lace: dict[str, Any]
 ) -> None:
     """From below it reflects nothing, and lets through the same."""
@@ -83,7 +83,7 @@ def test_a_sheet_in_a_furnace_shows_what_it_reflects_and_what_it_lets_through(
     assert seen == pytest.approx(reflected + SHARE, abs=0.012)
 
 
-def test_light_shines_through_holes_onto_what_lies_below(lace: dict[str, Any]) -> None:
+def test_light_reaches_surfaces_below_holes(lace: dict[str, Any]) -> None:
     """A lamp without size, two sheets above each other, and the ground seen through neither."""
     sheets = {}
     for k, z in enumerate((3.0, 3.5)):
@@ -114,7 +114,7 @@ def test_emitters_behind_holes_are_counted_once(integrator: str, kind: str, lace
     assert seen == pytest.approx(0.8 * SHARE, abs=0.006)
 
 
-def test_samples_pass_or_reflect_with_the_density_that_is_stated(lace: dict[str, Any]) -> None:
+def test_transmitted_and_reflected_samples_have_the_stated_density(lace: dict[str, Any]) -> None:
     bsdf = mi.load_dict(lace | {"sampling": "lobes"})
     n = 50_000
     si = dr.zeros(mi.SurfaceInteraction3f, n)

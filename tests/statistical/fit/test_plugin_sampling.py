@@ -62,7 +62,7 @@ def test_samples_have_the_stated_density() -> None:
     assert np.median(p) > 0.1, p
 
 
-def test_the_judge_sees_lobes_a_tenth_too_wide() -> None:
+def test_the_chi_square_test_detects_lobes_a_tenth_too_wide() -> None:
     assert min(p_value(seed, 1.1) for seed in range(COUNT)) < 1e-6
 
 

@@ -67,7 +67,7 @@ def relative_error(model: TexturedMaterial, data: TrainingQueries) -> float:
     return float((found - data.value).square().mean() / data.value.square().mean()) ** 0.5
 
 
-def test_a_teachers_data_give_no_loss_at_its_parameters() -> None:
+def test_the_loss_is_zero_at_the_true_parameters() -> None:
     model = teacher()
     data = answers(model, 3000, 0)
     t = trainer(model, data, steps=1)
@@ -82,7 +82,7 @@ def test_a_teachers_data_give_no_loss_at_its_parameters() -> None:
     ("queries", "steps", "bound"),
     [(12_000, 250, 3e-3), pytest.param(60_000, 4000, 1e-4, marks=[pytest.mark.slow])],
 )
-def test_a_perturbed_teacher_returns(queries: int, steps: int, bound: float) -> None:
+def test_perturbed_parameters_are_recovered(queries: int, steps: int, bound: float) -> None:
     data, unseen = answers(teacher(), queries, 0), answers(teacher(), 5000, 9)
     model = teacher()
     generator = torch.Generator().manual_seed(5)
@@ -96,7 +96,7 @@ def test_a_perturbed_teacher_returns(queries: int, steps: int, bound: float) -> 
             data,
             steps=steps,
             batch=2000,
-            rate=2e-3,
+            learning_rate=2e-3,
             texture_learning_rate=2e-3,
             final_learning_rate_factor=1e-4,
         )
@@ -116,7 +116,7 @@ WIDE = {"width": 64, "channels": 16}
         pytest.param(WIDE, 200_000, 8000, 1e-2, 0.01, marks=[pytest.mark.slow]),
     ],
 )
-def test_a_random_start_approaches_the_teacher(
+def test_random_initializations_approach_the_true_values(
     network: dict[str, int], queries: int, steps: int, rate: float, bound: float
 ) -> None:
     """The bound is of the squared error, as a share of the variance of the values."""
@@ -128,13 +128,13 @@ def test_a_random_start_approaches_the_teacher(
         "texture_learning_rate": 1e-2,
         "final_learning_rate_factor": 1e-3 if rate > 1e-2 else 1e-4,
     }
-    finish(trainer(model, data, steps=steps, rate=rate, **options))
+    finish(trainer(model, data, steps=steps, learning_rate=rate, **options))
     variance = (unseen.value - unseen.value.mean()).square().mean()
     share = relative_error(model, unseen) ** 2 * float(unseen.value.square().mean() / variance)
     assert share < bound
 
 
-def test_the_third_coordinate_tells_low_lights_apart() -> None:
+def test_the_third_coordinate_distinguishes_low_lights() -> None:
     """A light that turns from stopped to twice as strong within 6 degrees above the horizon."""
     arrays = random_queries(np.random.default_rng(0), 40_000, LATTICE)
     # Half of all lights between cosines of 0.05 and 0.25, any azimuth.

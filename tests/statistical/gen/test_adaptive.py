@@ -1,4 +1,4 @@
-"""Runs to a target error: values stay unbiased, halves independent, and the error is what was asked for."""
+"""Runs to a target error: values stay unbiased, halves independent, and the error is the target."""
 
 from __future__ import annotations
 
@@ -17,12 +17,14 @@ from mbtf_core.stats import mean_estimate, noise_free_mse, z_test
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.dataset.summary import finish
-from mbtf_gen.generation import Job, generate, plan_run
-from mbtf_gen.planning.adaptive import Target, estimate_shard
-from mbtf_gen.planning.effects import EffectsPlan
+from mbtf_gen.generation import generate
+from mbtf_gen.job import Job, split_spp, split_target
+from mbtf_gen.planning.adaptive import estimate_shard
 from mbtf_gen.planning.effects_plan import plan_effects
-from mbtf_gen.planning.sample_allocation import fit_allocation
-from mbtf_gen.render.estimates import Estimates, Stream
+from mbtf_gen.planning.run_plan import plan_run
+from mbtf_gen.planning.sample_allocation import Allocation, fit_allocation
+from mbtf_gen.planning.simulation import build_estimator
+from mbtf_gen.render.estimates import Estimates, Stream, Target
 from mbtf_gen.render.runtime import load_mitsuba
 from mbtf_gen.sampling.query_sampler import Mixture, Queries, QueryPlan
 
@@ -56,15 +58,15 @@ class FewBrightPaths:
 
 
 @pytest.fixture(scope="module")
-def skewed() -> tuple[Queries, EffectsPlan]:
+def skewed() -> tuple[Queries, Allocation]:
     q = QueryPlan(Lattice(4), Mixture(0.6, 0.4), 0.1, "shuffled", 0, N).draw("train", 0, N)
     pilot = FewBrightPaths().estimate(q, 16, Stream(0, "pilot", 1))
-    return q, EffectsPlan((), allocation=fit_allocation(q, pilot, 16, 4))
+    return q, fit_allocation(q, pilot, 16, 4)
 
 
-def test_values_of_a_skewed_scene_are_unbiased(skewed: tuple[Queries, EffectsPlan]) -> None:
-    q, plan = skewed
-    e = estimate_shard(FewBrightPaths(), q, 4, Target(0.2, 512), Stream(1, "train", 0), plan)
+def test_values_of_a_skewed_scene_are_unbiased(skewed: tuple[Queries, Allocation]) -> None:
+    q, allocation = skewed
+    e = estimate_shard(FewBrightPaths(), q, 4, Target(0.2, 512), Stream(1, "train", 0), allocation)
     assert e.spp is not None
     assert len(np.unique(e.spp)) > 3
     a, b = e.value_a[:, 0].astype(np.float64), e.value_b[:, 0].astype(np.float64)
@@ -78,27 +80,26 @@ def test_values_of_a_skewed_scene_are_unbiased(skewed: tuple[Queries, EffectsPla
 
 
 def test_a_skewed_scene_comes_near_its_target_and_what_is_reported_is_so(
-    skewed: tuple[Queries, EffectsPlan],
+    skewed: tuple[Queries, Allocation],
 ) -> None:
-    q, plan = skewed
-    e = estimate_shard(FewBrightPaths(), q, 4, Target(0.2, 8192), Stream(1, "train", 0), plan)
+    q, allocation = skewed
+    e = estimate_shard(FewBrightPaths(), q, 4, Target(0.2, 8192), Stream(1, "train", 0), allocation)
     value = 0.5 * (e.value_a[:, 0].astype(np.float64) + e.value_b[:, 0])
     error = float(np.sqrt(np.mean((value - TRUTH) ** 2))) / TRUTH
     assert 0.2 < error < 1.2 * 0.2
     assert e.target is not None
     assert np.sqrt(e.target.square) == pytest.approx(error, rel=0.2)
     # What the pilot expects of a path is its root mean square deviation.
-    assert plan.allocation is not None
-    s = plan.allocation.deviation(q)
+    s = allocation.deviation(q)
     assert np.sqrt(np.mean(s**2)) == pytest.approx(np.sqrt(RARE * (1 - RARE)) * (BRIGHT - DIM), rel=0.05)
 
 
 def test_what_is_reported_does_not_hide_errors_that_the_cap_leaves(
-    skewed: tuple[Queries, EffectsPlan],
+    skewed: tuple[Queries, Allocation],
 ) -> None:
     """Bright paths among few make large values: an error divided by them would never be above one or so."""
-    q, plan = skewed
-    e = estimate_shard(FewBrightPaths(), q, 4, Target(0.2, 8), Stream(1, "train", 0), plan)
+    q, allocation = skewed
+    e = estimate_shard(FewBrightPaths(), q, 4, Target(0.2, 8), Stream(1, "train", 0), allocation)
     value = 0.5 * (e.value_a[:, 0].astype(np.float64) + e.value_b[:, 0])
     error = float(np.sqrt(np.mean((value - TRUTH) ** 2))) / TRUTH
     assert error > 1.0
@@ -135,7 +136,7 @@ def config(tmp_path_factory: pytest.TempPathFactory) -> GeneratorConfig:
     )
 
 
-def test_the_error_reached_is_what_was_asked_for(config: GeneratorConfig, tmp_path: Path) -> None:
+def test_the_error_reached_is_the_target(config: GeneratorConfig, tmp_path: Path) -> None:
     found = generate(config, tmp_path / "out")
     data = Dataset.open(tmp_path / "out").load("train")
     a, b, spp = data["value_a"], data["value_b"], data["spp"]
@@ -158,7 +159,7 @@ def test_the_error_reached_is_what_was_asked_for(config: GeneratorConfig, tmp_pa
     assert np.sqrt(squared.value) == pytest.approx(found.target["reached"], rel=0.15)
     manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
     assert manifest["summary"]["target"] == found.target
-    assert manifest["effects"]["allocation"]["typical"] > 0
+    assert manifest["allocation"]["typical"] > 0
 
 
 def of_kind(config: GeneratorConfig, kind: str) -> GeneratorConfig:
@@ -173,9 +174,9 @@ def of_kind(config: GeneratorConfig, kind: str) -> GeneratorConfig:
 @pytest.fixture
 def small_pilots(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every run is worth a pilot, and pilots are short."""
-    monkeypatch.setattr("mbtf_gen.generation.SMALL_RUN", 0)
+    monkeypatch.setattr("mbtf_gen.planning.run_plan.SMALL_RUN", 0)
     monkeypatch.setattr("mbtf_gen.planning.sample_allocation.PILOT_QUERIES", 1024)
-    monkeypatch.setattr("mbtf_gen.generation.plan_effects", lambda job, pilots: plan_effects(job))
+    monkeypatch.setattr("mbtf_gen.planning.run_plan.plan_effects", lambda job, pilots: plan_effects(job))
 
 
 @pytest.mark.parametrize("kind", ["target", "noise"])
@@ -190,7 +191,7 @@ def test_any_slices_merged_are_the_whole(
     generate(config, tmp_path / "whole")
     parts, whole = (contents(tmp_path / name) for name in ("parts", "whole"))
     assert parts == whole
-    assert whole["manifest.json"]["effects"]["allocation"] is not None
+    assert whole["manifest.json"]["allocation"] is not None
     assert len([name for name in whole if name.endswith(".npz")]) == 8
     assert len(np.unique(Dataset.open(tmp_path / "whole").load("train")["spp"])) > 3
 
@@ -202,15 +203,16 @@ def test_counts_do_not_depend_on_launches_or_threads(
     job = Job.prepare(of_kind(config, kind))
     plan = plan_run(job)
     n = 600
-    q = job.plan().draw("train", 1, n)
-    estimator = job.estimator(plan)
+    q = job.query_plan.draw("train", 1, n)
+    estimator = build_estimator(job, plan.effects)
     before, found = dr.thread_count(), []
     try:
         for launch, threads in ((1 << 20, 3), (1 << 9, 1), (777, 3)):
             dr.set_thread_count(threads)
             estimator.launch = launch
             stream = Stream(job.config.seed, "train", 1)
-            found.append(estimate_shard(estimator, q, job.spp("train"), job.target("train"), stream, plan))
+            options = split_spp(job.config, "train"), split_target(job.config, "train"), stream
+            found.append(estimate_shard(estimator, q, *options, plan.allocation))
     finally:
         dr.set_thread_count(before)
     one = found[0]

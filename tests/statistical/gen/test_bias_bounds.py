@@ -1,4 +1,4 @@
-"""What a plan leaves out and states: the plane with slopes against the relief, costs against a run."""
+"""Bias bounds against rendered differences, and the plane with slopes against the displaced tile."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ import pytest
 from numpy.typing import NDArray
 
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.generation import Job
+from mbtf_gen.job import Job
 from mbtf_gen.material.material import Material
 from mbtf_gen.planning import effects_plan as planning
 from mbtf_gen.planning.bounds import relief_bounds
-from mbtf_gen.planning.effects import Effect, EffectsPlan
-from mbtf_gen.planning.effects_plan import plan_effects, without
+from mbtf_gen.planning.effects import Effect, EffectsPlan, without
+from mbtf_gen.planning.effects_plan import plan_effects
 from mbtf_gen.planning.pilot import Change, pilot_queries, relative_change
+from mbtf_gen.planning.simulation import build_estimator, normal_map_slopes
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.sampling.light_kernel import LightKernel
 
@@ -34,7 +35,7 @@ def waves(rows: int, columns: int) -> NDArray[np.float64]:
 def job_of(stuff: Material, mode: str = "auto", **options: dict[str, Any]) -> Job:
     sections: dict[str, Any] = {"queries": {"min_cos": 0.4}, "transport": {"max_depth": 1}, **options}
     effects = {"mode": mode, **sections.pop("effects", {})}
-    return Job.of(GeneratorConfig.model_validate({"material": "m", "effects": effects, **sections}), stuff)
+    return Job(GeneratorConfig.model_validate({"material": "m", "effects": effects, **sections}), stuff)
 
 
 def lambert(height: NDArray[np.float64], scale: float, **more: Any) -> Material:
@@ -44,7 +45,9 @@ def lambert(height: NDArray[np.float64], scale: float, **more: Any) -> Material:
 
 
 def estimates(job: Job, plan: EffectsPlan, spp: int = 8) -> Estimates:
-    found: Estimates = job.estimator(plan).estimate(pilot_queries(job, QUERIES), spp, Stream(1, "test", 0))
+    found: Estimates = build_estimator(job, plan).estimate(
+        pilot_queries(job, QUERIES), spp, Stream(1, "test", 0)
+    )
     return found
 
 
@@ -59,12 +62,12 @@ def tilted(rows: int, columns: int) -> NDArray[np.float32]:
 
 @pytest.mark.parametrize("mapped", [False, True], ids=["plain", "normal map"])
 @pytest.mark.parametrize("shape", [(64, 64), (32, 64), (64, 32)])
-def test_a_plane_with_slopes_is_the_relief_but_for_its_parallax(shape: tuple[int, int], mapped: bool) -> None:
-    """Of a faint relief nearly everything is shading: a slope of the wrong sign or row would double it."""
+def test_a_plane_with_slopes_lacks_nothing_but_parallax(shape: tuple[int, int], mapped: bool) -> None:
+    """A faint displacement changes shading alone: slopes of the wrong sign or row would double the change."""
     stuff = lambert(waves(*shape), 0.004, normal=tilted(*shape) if mapped else None)
     high: dict[str, Any] = {"queries": {"min_cos": 0.7, "resolution": 32}}
-    full_job, cut_job = job_of(stuff, "all", **high), job_of(stuff, "all,-masking", **high)
-    bare_job = job_of(replace(stuff, height_scale=0.0), "all,-masking", **high)
+    full_job, cut_job = job_of(stuff, "all", **high), job_of(stuff, "all,-parallax", **high)
+    bare_job = job_of(replace(stuff, height_scale=0.0), "all,-parallax", **high)
     full = estimates(full_job, plan_effects(full_job))
     _, upper = relative_change(full, estimates(cut_job, plan_effects(cut_job)))
     bare = relative_change(full, estimates(bare_job, plan_effects(bare_job)))[0]
@@ -73,14 +76,14 @@ def test_a_plane_with_slopes_is_the_relief_but_for_its_parallax(shape: tuple[int
 
 
 def finest_job(stuff: Material, mode: str) -> Job:
-    """Footprints far smaller than a cell: what costs are estimated for."""
+    """Footprints far smaller than a cell, for which bounds are estimated."""
     queries = {"min_cos": 0.3, "resolution": 512, "mixture": {"log_uniform": 0.0, "finest": 1.0}}
     return job_of(stuff, mode, queries=queries, light={"width": 0.0})
 
 
 @pytest.mark.parametrize("shape", [(64, 64), (32, 64)])
-def test_costs_of_a_relief_are_those_of_a_run(shape: tuple[int, int]) -> None:
-    """At points, under a delta light, with direct light only: estimate and run show the same."""
+def test_bias_bounds_equal_the_rendered_change(shape: tuple[int, int]) -> None:
+    """They are tight at points, under a delta light, with direct light only."""
     rng = np.random.default_rng(4)
     base = np.repeat(np.repeat(0.1 + 0.8 * rng.random((8, 8)), shape[0] // 8, 0), shape[1] // 8, 1)
     stuff = replace(
@@ -90,30 +93,31 @@ def test_costs_of_a_relief_are_those_of_a_run(shape: tuple[int, int]) -> None:
     job = finest_job(stuff, "all")
     plan = plan_effects(job)
     queries = pilot_queries(job, QUERIES)
-    assert job.residual is not None
-    costs = relief_bounds(
+    mapped = normal_map_slopes(job)
+    assert mapped is not None
+    bounds = relief_bounds(
         job.grid,
         queries.omega_i.astype(np.float64),
         queries.omega_o.astype(np.float64),
         LightKernel(0.0),
         base[..., None],
-        job.residual[0],
+        mapped[0],
     )
-    # The plane's slopes alone: the estimate of masking has no normal map.
+    # The plane's slopes alone: the bound of parallax ignores the normal map.
     plain = finest_job(replace(stuff, normal=None), "all")
     bare = plan_effects(plain)
     full = estimates(plain, bare)
-    assert costs.opacity == 0.0
-    for name, cost in (("masking", costs.masking), ("shadowing", costs.shadowing)):
+    assert bounds.opacity == 0.0
+    for name, bound in (("parallax", bounds.parallax), ("shadowing", bounds.shadowing)):
         measured, _ = relative_change(full, estimates(plain, without(bare, name)))
-        assert cost == pytest.approx(measured, rel=0.3), name
+        assert bound == pytest.approx(measured, rel=0.3), name
     measured, _ = relative_change(estimates(job, plan), estimates(job, without(plan, "normal")))
-    assert costs.normal == pytest.approx(measured, rel=0.3)
+    assert bounds.normal == pytest.approx(measured, rel=0.3)
 
 
-def test_costs_count_the_cap_and_what_is_off() -> None:
-    effects = (Effect("masking", True, "", 0.5), Effect("shadowing", False, "", 0.001))
-    assert EffectsPlan(effects, max_depth=2, cap_cost=0.002).cost == pytest.approx(0.003)
+def test_the_bias_bound_sums_the_cap_and_what_is_off() -> None:
+    effects = (Effect("parallax", True, "", 0.5), Effect("shadowing", False, "", 0.001))
+    assert EffectsPlan(effects, max_depth=2, cap_bias_bound=0.002).bias_bound == pytest.approx(0.003)
 
 
 def test_the_change_is_relative_to_the_mean_and_free_of_noise() -> None:
@@ -133,20 +137,20 @@ def test_the_change_is_relative_to_the_mean_and_free_of_noise() -> None:
 
 
 def test_the_tolerance_is_shared_not_spent_twice() -> None:
-    """Two effects that fit one by one but not together: one of them stays."""
+    """Of two effects that fit the tolerance only one by one, one stays."""
     normal = tilted(32, 32)
     stuff = lambert(waves(32, 32), 0.05, normal=normal, opacity=np.full((4, 4), 0.99))
     alone = plan_effects(job_of(stuff, effects={"tolerance": 0.0}))
-    costs = sorted((alone["opacity"].cost or 0.0, alone["normal"].cost or 0.0))
-    assert costs[0] > 0
-    tolerance = costs[1] + 0.5 * costs[0]
+    bounds = sorted((alone["opacity"].bias_bound or 0.0, alone["normal"].bias_bound or 0.0))
+    assert bounds[0] > 0
+    tolerance = bounds[1] + 0.5 * bounds[0]
     plan = plan_effects(job_of(stuff, effects={"tolerance": tolerance}))
-    assert plan.cost <= tolerance
+    assert plan.bias_bound <= tolerance
     assert plan.on("opacity") != plan.on("normal")
 
 
-def test_the_cost_of_holes_is_that_of_a_run() -> None:
-    """Crests that let most light through are little of what is seen from above, but they shade the rest."""
+def test_the_bias_bound_of_holes_is_near_the_rendered_change() -> None:
+    """Crests that transmit most light cover little of the view from above, but they shade the rest."""
     heights = waves(64, 64)
     opacity = np.where(heights > np.quantile(heights, 0.8), 0.3, 1.0)
     stuff = lambert(heights, 0.4, opacity=opacity)
@@ -155,21 +159,21 @@ def test_the_cost_of_holes_is_that_of_a_run() -> None:
     found = relative_change(estimates(job, plan, 32), estimates(job, without(plan, "opacity"), 32))[0]
     stated = plan_effects(finest_job(stuff, "auto"))["opacity"]
     assert stated.on
-    assert stated.cost is not None
-    assert found < stated.cost < 1.6 * found
+    assert stated.bias_bound is not None
+    assert found < stated.bias_bound < 1.6 * found
 
 
-def test_on_a_plane_the_cost_of_holes_is_exact() -> None:
-    """M is ρ/π less what passes: holes of a share p in a hundredth of the tile, which is twice as bright."""
+def test_on_a_plane_the_bias_bound_of_holes_is_exact() -> None:
+    """M is opacity times ρ/π: a hundredth of the tile, twice as bright, transmits a share p."""
     opacity, base = np.ones((10, 10)), np.full((10, 10, 3), 0.4)
     opacity[3, 4], base[3, 4] = 0.7, 0.8
     stuff = replace(lambert(np.zeros((10, 10)), 1.0, opacity=opacity), base_color=base)
     mean = (0.4 * 99 + 0.8 * 0.7) / 100
-    assert plan_effects(job_of(stuff))["opacity"].cost == pytest.approx(0.3 * 0.8 / 10 / mean)
+    assert plan_effects(job_of(stuff))["opacity"].bias_bound == pytest.approx(0.3 * 0.8 / 10 / mean)
 
 
 class Rare:
-    """Stands in for a pilot that sees hardly any change, but a large one."""
+    """Replaces a pilot: few queries change, but by much."""
 
     hits, size = 3, 0.15
 
@@ -185,15 +189,15 @@ class Rare:
 
 
 def test_rare_large_changes_keep_an_effect_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Three queries of eight thousand changed: it may be nine. With two standard errors alone the tolerance
-    would seem to cover it."""
+    """Three of eight thousand queries changed, so nine may have. Two standard errors alone would fit the
+    tolerance."""
     monkeypatch.setattr(planning, "Pilot", Rare)
     job = job_of(lambert(waves(32, 32), 0.3), transport={"max_depth": 0})
     assert Rare().limited(1).upper < job.config.effects.tolerance
     plan = plan_effects(job)
     assert plan.on("interreflection")
     assert plan.max_depth == 0
-    # As small a change of all queries is left out.
+    # The same change spread over all queries is left out.
     monkeypatch.setattr(Rare, "hits", QUERIES)
     monkeypatch.setattr(Rare, "size", 0.002)
     assert not plan_effects(job).on("interreflection")
@@ -201,8 +205,8 @@ def test_rare_large_changes_keep_an_effect_on(monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.mark.parametrize("spread", [0.5, 1.0, 1.5])
 def test_bounds_hold_for_heavy_tails(spread: float) -> None:
-    """Lognormal changes: of a hundred samples, the bounds of all but a few lie above the true cost, two
-    standard errors of which fall short for one in nine."""
+    """Lognormal changes: in at most 5 of 100 samples the bound lies below the true value. Two standard errors
+    alone fail in one of nine."""
     rng = np.random.default_rng(2)
     one = np.ones((2000, 3), np.float32)
     scale = 0.01
@@ -218,27 +222,27 @@ def test_bounds_hold_for_heavy_tails(spread: float) -> None:
     assert wrong <= 5
 
 
-def test_what_no_query_shows_may_still_be_there() -> None:
+def test_the_bound_is_positive_where_no_query_changes() -> None:
     one = np.ones((2000, 3), np.float32)
     still = Estimates(one, one, None, 1, 0, 0, 0)
     none = Change.of(still, still)
     assert none.upper == 0.0
     assert none.bound() > 0.03
-    # Unless theory says that there is hardly anything to see.
+    # Theory may give a smaller bound.
     assert none.bound(1e-3) < 2e-3
 
 
 @pytest.mark.parametrize("slope", [0.02, 0.1, 0.3])
 @pytest.mark.parametrize("share", [1.0, 0.1, 1e-3])
 def test_the_bounce_bound_is_above_that_of_grooves(slope: float, share: float) -> None:
-    """V-grooves far finer than the patches of white on black: a facet sees 1-cos(atan s) of the other one,
-    lit from above like itself. White patches are a `share` of the tile, so RMS over mean is 1/√share."""
+    """V-grooves far finer than white patches on black: a facet sees 1-cos(atan s) of its neighbor, lit as
+    strongly. The patches cover a `share` of the tile, so RMS over mean is 1/√share."""
     columns = 1000
     z = np.tile(slope * np.array([0.0, 1.0, 2.0, 1.0]) / columns, (columns, columns // 4))
     base = np.zeros((1, columns, 3))
     base[:, : round(share * columns)] = 0.9
     stuff = replace(lambert(z, 1.0), base_color=base)
     job = job_of(stuff, queries={"min_cos": 0.99}, light={"width": 0.0}, geometry={"mesh": columns})
-    bound = planning._bounce_bound(planning._look(job, False))
+    bound = planning._bounce_bound(planning._analysis(job, False))
     seen = 0.9 * (1 - np.cos(np.arctan(slope)))
     assert bound > seen / np.sqrt(share)

@@ -13,14 +13,17 @@ import pytest
 from numpy.typing import NDArray
 
 from mbtf_core.atomic import write_checksummed
-from mbtf_gen import generation
 from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.dataset import render_shards
 from mbtf_gen.dataset.reader import Dataset
-from mbtf_gen.generation import Job, generate
+from mbtf_gen.generation import generate
+from mbtf_gen.job import Job
 from mbtf_gen.material.material import Material
-from mbtf_gen.planning.effects import EffectsPlan
-from mbtf_gen.planning.effects_plan import plan_effects, without
+from mbtf_gen.planning.effects import EffectsPlan, without
+from mbtf_gen.planning.effects_plan import plan_effects
 from mbtf_gen.planning.pilot import pilot_queries
+from mbtf_gen.planning.run_plan import RunPlan
+from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.render.runtime import load_mitsuba
 from mbtf_gen.sampling.query_sampler import Queries
@@ -44,18 +47,18 @@ def lambert(height: NDArray[np.float64], scale: float, color: Any = (0.5, 0.5, 0
 
 def job_of(stuff: Material, mode: str = "auto", **options: Any) -> Job:
     data = {"material": "m", "effects": {"mode": mode}, **options}
-    return Job.of(GeneratorConfig.model_validate(data), stuff)
+    return Job(GeneratorConfig.model_validate(data), stuff)
 
 
 OPACITY = np.where(np.random.default_rng(2).random((8, 8)) < 0.4, 0.2, 1.0)
 
 
 @pytest.mark.parametrize(
-    "mode", ["all", "all,-interreflection,-mis", "none,+opacity", "all,-opacity,-shadowing"]
+    "mode", ["all", "all,-interreflection,-bsdf_sampling", "none,+opacity", "all,-opacity,-shadowing"]
 )
 def test_values_do_not_depend_on_launches_whatever_is_simulated(mode: str) -> None:
     job = job_of(lambert(noise(16, 16), 0.05, opacity=OPACITY), mode)
-    estimator = job.estimator(plan_effects(job))
+    estimator = build_estimator(job, plan_effects(job))
     q = pilot_queries(job, 500)
     whole = estimator.estimate(q, 8, STREAM)
     small = Estimator(estimator.tile, estimator.light, estimator.transport, launch=8 * 77)
@@ -76,18 +79,18 @@ def test_the_closed_form_is_the_color_over_pi() -> None:
     plan = plan_effects(job)
     assert plan.closed_form
     q = pilot_queries(job, 50)
-    found = job.estimator(plan).estimate(q, 4, STREAM)
+    found = build_estimator(job, plan).estimate(q, 4, STREAM)
     for half in (found.value_a, found.value_b):
         np.testing.assert_allclose(half, np.tile(color / np.pi, (len(q.sigma), 1)), rtol=1e-6)
     # The same as traced.
-    traced = job.estimator(replace(plan, closed_form=False)).estimate(q, 4, STREAM)
+    traced = build_estimator(job, replace(plan, closed_form=False)).estimate(q, 4, STREAM)
     np.testing.assert_allclose(traced.value_a, found.value_a, rtol=1e-5)
 
 
 def test_a_manifest_keeps_every_number_of_a_plan() -> None:
     plan = plan_effects(job_of(lambert(noise(4, 4), 0.01), "none"))
     changed = replace(
-        plan, max_depth=3, cap_cost=0.25, roulette_depth=7, mode="x", tolerance=0.5, closed_form=True
+        plan, max_depth=3, cap_bias_bound=0.25, roulette_depth=7, mode="x", tolerance=0.5, closed_form=True
     )
     assert EffectsPlan.from_manifest(json.loads(json.dumps(changed.to_manifest()))) == changed
 
@@ -98,7 +101,7 @@ class Recorder:
     def __init__(self) -> None:
         self.plans: list[EffectsPlan] = []
 
-    def build(self, job: Job, plan: EffectsPlan, tiles: Any) -> Recorder:
+    def build(self, job: Job, plan: EffectsPlan) -> Recorder:
         self.plans.append(plan)
         return self
 
@@ -111,7 +114,7 @@ class Recorder:
 @pytest.fixture
 def recorder(monkeypatch: pytest.MonkeyPatch) -> Recorder:
     found = Recorder()
-    monkeypatch.setattr(generation, "estimator_of", found.build)
+    monkeypatch.setattr(render_shards, "build_estimator", found.build)
     return found
 
 
@@ -140,10 +143,10 @@ def test_resumed_and_sliced_runs_follow_the_plan_of_the_manifest(
     manifest["effects"] = stored.to_manifest()
     write_checksummed(out / "manifest.json", manifest)
 
-    def never(job: Job) -> EffectsPlan:
+    def never(job: Job) -> RunPlan:
         raise AssertionError("planned again although the manifest has a plan")
 
-    monkeypatch.setattr(generation, "plan_effects", never)
+    monkeypatch.setattr("mbtf_gen.generation.plan_run", never)
     generate(config, out, slice_index=2, slice_count=2)
     assert recorder.plans[-1] == stored
     assert json.loads((out / "manifest.json").read_text())["effects"] == stored.to_manifest()
@@ -159,11 +162,11 @@ def test_shards_hold_what_passed_through_the_holes(
 
 def test_what_passed_is_the_view_rays_alone() -> None:
     """Scattered rays that leave through holes are no transmittance: it is what it is without them."""
-    job = job_of(lambert(noise(16, 16), 0.15, (0.9, 0.9, 0.9), opacity=OPACITY), "all,-mis")
+    job = job_of(lambert(noise(16, 16), 0.15, (0.9, 0.9, 0.9), opacity=OPACITY), "all,-bsdf_sampling")
     plan = plan_effects(job)
     q = pilot_queries(job, 2000)
     full, direct = (
-        job.estimator(p).estimate(q, 16, STREAM).transmittance
+        build_estimator(job, p).estimate(q, 16, STREAM).transmittance
         for p in (plan, without(plan, "interreflection"))
     )
     np.testing.assert_array_equal(full, direct)
@@ -175,9 +178,9 @@ def test_a_cap_is_the_same_with_and_without_sampling_of_the_surface(depth: int) 
     stuff = lambert(noise(16, 16), 0.3, (0.9, 0.9, 0.9))
     options: dict[str, Any] = {"light": {"width": 0.0}, "queries": {"min_cos": 0.4}}
     means = []
-    for mode, limit in (("all", depth), ("all,-mis", depth), ("all,-mis", depth - 1)):
+    for mode, limit in (("all", depth), ("all,-bsdf_sampling", depth), ("all,-bsdf_sampling", depth - 1)):
         job = job_of(stuff, mode, transport={"max_depth": limit, "roulette_depth": 100}, **options)
-        found = job.estimator(plan_effects(job)).estimate(pilot_queries(job, 8192), 16, STREAM)
+        found = build_estimator(job, plan_effects(job)).estimate(pilot_queries(job, 8192), 16, STREAM)
         means.append(float(found.value_a.mean() + found.value_b.mean()))
     assert means[1] == pytest.approx(means[0], rel=0.01)
     assert means[2] < 0.95 * means[0]

@@ -9,11 +9,12 @@ import pytest
 from support.paths import ROOT
 
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.generation import Job
 from mbtf_gen.geometry.slopes import height_slopes
+from mbtf_gen.job import Job
 from mbtf_gen.material.material import Material, load_material
-from mbtf_gen.planning.effects_plan import simulated
+from mbtf_gen.planning.effects_plan import reference_plan
 from mbtf_gen.planning.pilot import pilot_queries, relative_change
+from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Estimates, Stream
 
 SPP = 16
@@ -41,10 +42,12 @@ def estimates(material: Material, mesh: int, normal: str) -> Estimates:
             "transport": {"max_depth": 1},
         }
     )
-    job = Job.of(config, material)
-    plan = simulated(job)
+    job = Job(config, material)
+    plan = reference_plan(job)
     assert plan.on("normal") == (normal != "off")
-    found: Estimates = job.estimator(plan).estimate(pilot_queries(job, 16384), SPP, Stream(2, "test", 0))
+    found: Estimates = build_estimator(job, plan).estimate(
+        pilot_queries(job, 16384), SPP, Stream(2, "test", 0)
+    )
     return found
 
 

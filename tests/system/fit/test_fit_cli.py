@@ -37,7 +37,7 @@ def material(shards: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_export_writes_what_it_says(material: Path, tmp_path: Path, run_python: RunPython) -> None:
+def test_export_writes_the_reported_files(material: Path, tmp_path: Path, run_python: RunPython) -> None:
     out = tmp_path / "export"
     done = run_python("-m", "mbtf_fit", "export", str(material), "--half", "-o", str(out), "--json")
     assert done.returncode == 0, done.stderr
@@ -91,9 +91,7 @@ def test_json_is_one_object(shards: Path, material: Path, tmp_path: Path, run_py
         json.loads(done.stdout)
 
 
-def test_a_finished_fit_says_that_nothing_was_trained(
-    shards: Path, material: Path, run_python: RunPython
-) -> None:
+def test_a_finished_fit_is_not_trained_again(shards: Path, material: Path, run_python: RunPython) -> None:
     before = (material / "material.json").read_bytes()
     done = run_python("-m", "mbtf_fit", str(shards), "-o", str(material), *QUICK)
     assert done.returncode == 0, done.stderr
@@ -107,7 +105,7 @@ def test_a_finished_fit_says_that_nothing_was_trained(
     assert "nothing was trained" not in done.stderr
 
 
-def test_another_material_s_data_are_warned_of(tmp_path: Path, run_python: RunPython) -> None:
+def test_data_of_another_material_cause_a_warning(tmp_path: Path, run_python: RunPython) -> None:
     made = {}
     for name, digest in (("own", "1"), ("other", "2")):
         made[name] = write_data(tmp_path / name, parallax, train=2000, test=500)
@@ -123,17 +121,6 @@ def test_another_material_s_data_are_warned_of(tmp_path: Path, run_python: RunPy
         assert json.loads(done.stdout)["foreign_inputs"] == foreign
         assert ("made from another material" in done.stderr) == bool(foreign)
         assert ("(height differs)" in done.stderr) == bool(foreign)
-
-
-def test_evaluate_and_info_speak_to_people(shards: Path, material: Path, run_python: RunPython) -> None:
-    done = run_python("-m", "mbtf_fit", "evaluate", str(material), str(shards))
-    for word in ("held-out directions", "training queries", "level 3", "cosine 0.7-1"):
-        assert word in done.stdout
-    done = run_python("-m", "mbtf_fit", "info", str(material))
-    assert "3254 network weights" in done.stdout
-    assert "conformance: 256 queries" in done.stdout
-    done = run_python("-m", "mbtf_fit", "info", str(shards))
-    assert "train: 3000 queries in 2 shards" in done.stdout
 
 
 def test_options_come_from_file_then_assignments_then_flags(
@@ -154,7 +141,7 @@ def test_options_come_from_file_then_assignments_then_flags(
     assert (out / "config.yaml").exists()
 
 
-def test_bad_input_ends_with_3_and_says_what_to_do(
+def test_bad_input_exits_with_3_and_a_hint(
     shards: Path, material: Path, tmp_path: Path, run_python: RunPython
 ) -> None:
     out = ["-o", str(tmp_path / "m")]
@@ -183,7 +170,7 @@ def test_a_damaged_shard_is_named(tmp_path: Path, run_python: RunPython) -> None
     assert "NaN" in said
 
 
-def test_nonsense_on_the_command_line_ends_with_2(shards: Path, run_python: RunPython) -> None:
+def test_invalid_command_lines_exit_with_2(shards: Path, run_python: RunPython) -> None:
     assert "mbtf-fit shards/" in fails(run_python, 2)
     assert "2min" in fails(run_python, 2, str(shards), "--time", "soon")
     assert "exclude each other" in fails(run_python, 2, str(shards), "--time", "1s", "--steps", "3")

@@ -61,7 +61,7 @@ def _empty(tmp_path: Path) -> Path:
     return folder
 
 
-def test_materials_are_called_like_their_data(tmp_path: Path) -> None:
+def test_materials_are_named_after_their_data(tmp_path: Path) -> None:
     out = Path("out")
     assert name_materials([tmp_path / "a", tmp_path / "b"], out) == [out / "a", out / "b"]
     found = name_materials([tmp_path / "rock" / "shards", tmp_path / "wool" / "shards"], out)

@@ -18,8 +18,8 @@ import sys
 for name in ("torch", "scipy", "trimesh", "matplotlib"):
     sys.modules[name] = None  # importing it fails
 import mbtf_fit.mitsuba_plugin
+mbtf_fit.mitsuba_plugin.register("llvm_ad_rgb")
 import mitsuba as mi
-mi.set_variant("llvm_ad_rgb")
 scene = mbtf_fit.mitsuba_plugin.load_scene({
     "type": "scene", "integrator": {"type": "mbtf_path", "max_depth": 3}, "light": {"type": "constant"},
     "ball": {"type": "sphere", "b": {"type": "mbtf", "material": sys.argv[1], "uv_scale": 3.0}},
@@ -37,7 +37,7 @@ print("rendered")
 
 def test_rendering_without_pytorch(tmp_path: Path, run_python: RunPython) -> None:
     write_material(tmp_path)
-    # No path to the compiler is handed down: importing the plugin must find it.
+    # Without the path of the compiler in the environment, registration must find it.
     done = run_python("-c", CODE, str(tmp_path), DRJIT_LIBLLVM_PATH=None)
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == ["rendered"]
@@ -61,7 +61,7 @@ def test_a_scene_in_xml_of_the_documentation_runs(tmp_path: Path, run_python: Ru
     page = (PROJECT / "docs" / "how-to" / "render-in-mitsuba.md").read_text(encoding="utf-8")
     (tmp_path / "scene.xml").write_text(page.split("```xml\n")[1].split("```")[0], encoding="utf-8")
     code = (
-        "import mbtf_fit.mitsuba_plugin, mitsuba as mi\nmi.set_variant('llvm_ad_rgb')\n"
+        "import mbtf_fit.mitsuba_plugin\nmbtf_fit.mitsuba_plugin.register('llvm_ad_rgb')\n"
         "scene = mbtf_fit.mitsuba_plugin.load_scene('scene.xml')\n"
         "print(type(scene.integrator()).__name__, scene.shapes()[0].bsdf().uv_scale)"
     )
@@ -70,7 +70,7 @@ def test_a_scene_in_xml_of_the_documentation_runs(tmp_path: Path, run_python: Ru
     assert done.stdout.split() == ["ConePath", "[4]"]
 
 
-def test_a_plugin_that_came_too_late_says_so(run_python: RunPython) -> None:
+def test_a_late_import_is_refused(run_python: RunPython) -> None:
     code = """
 import drjit.llvm, mitsuba as mi
 try:
@@ -95,9 +95,11 @@ else:
         assert said == "no LLVM without ours" or said.startswith("Dr.Jit was imported first")
 
 
-def test_registration_says_what_it_misses(run_python: RunPython) -> None:
+def test_registration_reports_missing_variants(run_python: RunPython) -> None:
     code = """
 import mbtf_fit.mitsuba_plugin
+from mbtf_gen.render.llvm import use_shipped_llvm
+use_shipped_llvm()
 try:
     mbtf_fit.mitsuba_plugin.register()
 except Exception as error:

@@ -18,6 +18,7 @@ from typing import BinaryIO
 import pytest
 
 from mbtf_core import atomic
+from mbtf_core.digest import file_sha256
 from mbtf_core.errors import InputError, PartialError
 
 
@@ -173,7 +174,7 @@ def test_bad_json_is_bad_input(tmp_path: Path, content: bytes | None, what: str)
 def test_digests_are_sha256(tmp_path: Path) -> None:
     path = tmp_path / "a"
     path.write_bytes(b"mbtf" * 99999)
-    assert atomic.digest(path) == hashlib.sha256(b"mbtf" * 99999).hexdigest()
+    assert file_sha256(path) == hashlib.sha256(b"mbtf" * 99999).hexdigest()
 
 
 def test_of_several_creators_one_wins_and_its_content_stays(tmp_path: Path) -> None:

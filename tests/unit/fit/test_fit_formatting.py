@@ -30,7 +30,7 @@ def errors(value: float | None, by_level: float | None) -> dict[str, Any]:
         (127.0, None, ["undefined: the noise exceeds", "above 1: worse than the mean value"]),
     ],
 )
-def test_numbers_that_surprise_are_explained(
+def test_undefined_and_large_errors_are_explained(
     value: float | None, by_level: float | None, remarks: list[str]
 ) -> None:
     lines = describe_errors(errors(value, by_level))

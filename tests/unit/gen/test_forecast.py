@@ -14,10 +14,12 @@ from mbtf_gen import forecast as module
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.forecast import forecast, row_bytes, size_text
-from mbtf_gen.generation import Job, allocated
+from mbtf_gen.job import Job, split_target
 from mbtf_gen.material.material import Material
+from mbtf_gen.planning import sample_allocation
 from mbtf_gen.planning.effects_plan import plan_effects
 from mbtf_gen.planning.pilot import pilot_queries
+from mbtf_gen.planning.run_plan import RunPlan, allocate
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.sampling.query_sampler import Queries
 
@@ -56,7 +58,7 @@ class Fake:
 def job_of(**queries: Any) -> Job:
     heights = np.random.default_rng(0).random((16, 16))
     material = Material(heights, height_scale=0.1, height_bits=None, base_color=np.array([0.5, 0.5, 0.5]))
-    return Job.of(GeneratorConfig.model_validate({"material": "m", "queries": queries}), material)
+    return Job(GeneratorConfig.model_validate({"material": "m", "queries": queries}), material)
 
 
 @pytest.mark.parametrize("options", [{}, {"layout": "image"}, {"layout": "image", "patch_size": 12}])
@@ -72,7 +74,8 @@ def test_pilots_ask_in_many_directions_whatever_the_layout(options: dict[str, An
 def faked(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = Clock()
     monkeypatch.setattr(module, "time", clock)
-    monkeypatch.setattr(Job, "estimator", lambda self, plan: Fake(clock))
+    monkeypatch.setattr(sample_allocation, "build_estimator", lambda job, plan: Fake(clock))
+    monkeypatch.setattr(module, "build_estimator", lambda job, plan: Fake(clock))
 
 
 @pytest.mark.parametrize(("each", "share"), [(2e-6, 0.25), (1e-4, 1.0)])
@@ -86,11 +89,11 @@ def test_writing_takes_its_share_of_the_processors(
         clock.now += each * len(queries.sigma)
 
     monkeypatch.setattr(module, "time", clock)
-    monkeypatch.setattr(Job, "estimator", lambda self, plan: Fake(clock))
+    monkeypatch.setattr(module, "build_estimator", lambda job, plan: Fake(clock))
     monkeypatch.setattr(module, "_write", write)
     monkeypatch.setattr(module.os, "cpu_count", lambda: 4)
     job = job_of(train="1000000", spp=8, test="20000", test_spp=64)
-    found = forecast(job, plan_effects(job, pilots=False), seconds=0.0)
+    found = forecast(job, RunPlan(plan_effects(job, pilots=False)), seconds=0.0)
     tracing = 8 / RATE if share < 1.0 else 0.0
     assert found.query_seconds == pytest.approx(tracing + share * each)
     assert found.paths_per_second == pytest.approx(RATE)
@@ -99,7 +102,7 @@ def test_writing_takes_its_share_of_the_processors(
 @pytest.mark.parametrize("layout", ["shuffled", "image"])
 def test_seconds_and_noise(faked: None, layout: str) -> None:
     job = job_of(train="1000000", spp=8, test="20000", test_spp=64, layout=layout)
-    found = forecast(job, plan_effects(job, pilots=False), seconds=0.0)
+    found = forecast(job, RunPlan(plan_effects(job, pilots=False)), seconds=0.0)
     assert found.paths_per_second == pytest.approx(RATE)
     assert found.paths == pytest.approx(1e6 * 8 + 2e4 * 64, rel=2e-2)
     assert found.seconds == pytest.approx(found.paths / RATE, rel=1e-6)
@@ -112,7 +115,7 @@ def test_a_target_error_decides_paths_and_seconds(faked: None) -> None:
     """All queries need the paths that bring 0.8 to 8 % of 0.25 or so, unless the cap is lower."""
     for cap, missed in ((8192, 0.0), (512, 1.0)):
         job = job_of(train="1000000", test="20000", test_spp=64, target_error="8%", max_spp=cap)
-        plan = allocated(job, plan_effects(job, pilots=False))
+        plan = allocate(job, plan_effects(job, pilots=False))
         found = forecast(job, plan, seconds=0.0)
         # 1600, rounded up to a power of two or three times one; less where a pilot's value is large.
         assert found.missed == pytest.approx(missed, abs=0.02)
@@ -124,7 +127,7 @@ def test_a_target_error_decides_paths_and_seconds(faked: None) -> None:
         assert found.paths == pytest.approx(1e6 * (stored + 16) + 2e4 * 64, rel=1e-3)
         assert found.seconds == pytest.approx(found.paths / RATE, rel=1e-3)
         assert found.relative_error == pytest.approx(0.8 / np.sqrt(stored) / 0.25, rel=0.1)
-        said = found.describe(job.target("train")).splitlines()
+        said = found.describe(split_target(job.config, "train")).splitlines()
         assert f"{stored:.0f} paths per training query for an error of 8.00% of" in said[1]
         assert said[1].endswith("of the queries stop at the cap of 512") == bool(missed)
 
@@ -138,7 +141,7 @@ def test_bytes_are_those_of_the_arrays(tmp_path: Path) -> None:
 
 def test_a_run_without_noise_is_forecast_too(faked: None) -> None:
     job = job_of(train="1000", test="10")
-    quiet = forecast(job, plan_effects(job, pilots=False), seconds=0.0)
+    quiet = forecast(job, RunPlan(plan_effects(job, pilots=False)), seconds=0.0)
     assert quiet.bytes == 1010 * row_bytes(False)
     assert str(size_text(quiet.bytes)) == "65 kB"
     assert "of the mean value" in quiet.describe()

@@ -1,8 +1,7 @@
-"""Making a data set without rendering: shards, slices, claiming a folder, resuming, giving way to others."""
+"""Generating a data set without tracing: folders, slices, resuming, several writers."""
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import json
 import shutil
@@ -14,17 +13,19 @@ import pytest
 from support.datasets import formula
 
 from mbtf_core.atomic import checksummed, create_file
-from mbtf_core.errors import InputError, PartialError, UsageError
+from mbtf_core.errors import InputError, PartialError
 from mbtf_core.locks import shard_lock
 from mbtf_gen import generation
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.dataset import render_shards as shard_making
+from mbtf_gen.dataset import render_shards
 from mbtf_gen.dataset.manifest import build_manifest
 from mbtf_gen.dataset.reader import Dataset
-from mbtf_gen.dataset.shard_statistics import ShardStatistics, refuse_nonfinite
 from mbtf_gen.dataset.summary import finish
 from mbtf_gen.dataset.verify import sidecar_of, verify
-from mbtf_gen.generation import Job, generate, paths_left
+from mbtf_gen.generation import generate, paths_left
+from mbtf_gen.job import Job, split_queries
+from mbtf_gen.planning.effects_plan import reference_plan
+from mbtf_gen.planning.run_plan import RunPlan
 from mbtf_gen.render.runtime import load_mitsuba
 
 load_mitsuba()
@@ -39,26 +40,30 @@ FILES = ["train-00000.npz", "train-00001.npz", "train-00002.npz", "test-00000.np
 
 
 class Formula:
-    """Stands in for the estimator: values from a formula, and a count of the shards it was asked for."""
+    """Replaces the estimator: values from a formula, and a list of the shards that it estimated."""
 
     def __init__(self) -> None:
-        self.asked: list[tuple[str, int]] = []
+        self.estimated: list[tuple[str, int]] = []
         self.fail_at: int | None = None
         self.bad = (BadSample(7, "direct light"),)
 
     def estimate(self, queries: Any, spp: int, stream: Any) -> Any:
-        if self.fail_at == len(self.asked):
+        if self.fail_at == len(self.estimated):
             raise KeyboardInterrupt
-        self.asked.append((stream.split, stream.shard))
+        self.estimated.append((stream.split, stream.shard))
         value = formula(queries).astype(np.float32)
         return Estimates(value, value, None, len(value) * spp, 1, 2, len(self.bad), self.bad)
+
+
+def cheap_plan(job: Job) -> RunPlan:
+    return RunPlan(reference_plan(job))
 
 
 @pytest.fixture
 def engine(monkeypatch: pytest.MonkeyPatch) -> Formula:
     fake = Formula()
-    monkeypatch.setattr(generation, "plan_effects", lambda job, pilots: generation.simulated(job))
-    monkeypatch.setattr(generation, "estimator_of", lambda job, plan, tiles: fake)
+    monkeypatch.setattr(generation, "plan_run", cheap_plan)
+    monkeypatch.setattr(render_shards, "build_estimator", lambda job, plan: fake)
     return fake
 
 
@@ -79,25 +84,6 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {p.name: p.read_bytes() for p in folder.iterdir() if p.suffix == ".npz"}
 
 
-def test_shards_cover_the_wanted_rows(config: GeneratorConfig) -> None:
-    entries = Job.prepare(config).shards("train") + Job.prepare(config).shards("test")
-    assert [(e.file, e.rows) for e in entries] == list(zip(FILES, (40, 40, 20, 30), strict=True))
-    # Image layout: whole buffers, 32 texels each; 100 queries are four of them, one per shard.
-    image = Job.prepare(changed(config, queries={"layout": "image"}))
-    assert [(e.file, e.rows) for e in image.shards("train")] == [(f"train-{i:05d}.npz", 1) for i in range(4)]
-    # Windows of 9 places: 100 queries are twelve of them, four per shard of 40 queries.
-    windows = Job.prepare(changed(config, queries={"layout": "image", "patch_size": 3}))
-    assert [e.rows for e in windows.shards("train")] == [4, 4, 4]
-    assert windows.queries("train") == 108
-    per_texel = Job.prepare(changed(config, queries={"train": "3/texel"}))
-    assert sum(e.rows for e in per_texel.shards("train")) == 96
-
-
-def test_more_shards_than_a_folder_can_hold_are_refused(config: GeneratorConfig) -> None:
-    with pytest.raises(UsageError, match=r"shards of 40"):
-        Job.prepare(changed(config, queries={"train": "1e12/texel"})).shards("train")
-
-
 def test_a_run_is_complete_and_counts(config: GeneratorConfig, engine: Formula, tmp_path: Path) -> None:
     seen: list[float] = []
     summary = generate(config, tmp_path / "out", progress=lambda done, note: seen.append(done))
@@ -114,10 +100,10 @@ def test_a_run_is_complete_and_counts(config: GeneratorConfig, engine: Formula, 
     assert not list((tmp_path / "out").glob(".*"))
 
 
-def test_progress_ends_where_it_was_to_end_whatever_queries_took(
+def test_progress_counts_planned_paths(
     config: GeneratorConfig, engine: Formula, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As under a target error: time left follows from the share that is done."""
+    """A target error changes the number of paths, not the share that is done."""
     real = Formula.estimate
 
     def more(self: Formula, *arguments: Any) -> Estimates:
@@ -136,7 +122,7 @@ def test_progress_ends_where_it_was_to_end_whatever_queries_took(
 def test_too_many_nonfinite_samples_fail_the_run_and_name_their_place(
     config: GeneratorConfig, engine: Formula, tmp_path: Path
 ) -> None:
-    """Two a shard: four are let pass in any run, the sixth is not; nor do they pass on a second try."""
+    """Two per shard: any run may have four, but not six, and not on a second try either."""
     engine.bad = (BadSample(7, "direct light"), BadSample(9, "interreflection"))
     place = "train-00000.npz query 7, direct light; train-00000.npz query 9, interreflection"
     with pytest.raises(PartialError, match=f"6 of 320 samples were NaN or infinite.*{place}"):
@@ -149,24 +135,6 @@ def test_too_many_nonfinite_samples_fail_the_run_and_name_their_place(
     assert not json.loads((tmp_path / "out/manifest.json").read_text())["complete"]
 
 
-def test_samples_are_held_against_all_paths_that_a_target_error_may_take(config: GeneratorConfig) -> None:
-    """A run is not stopped for samples that are few among its paths."""
-    assert Job.prepare(config).most_paths() == Job.prepare(config).all_paths() == 320
-    aimed = Job.prepare(changed(config, queries={"target_error": 0.02, "max_spp": 128}))
-    assert aimed.most_paths() == 100 * (128 + 16) + 30 * 4
-
-
-@pytest.mark.parametrize(
-    ("count", "paths", "refused"), [(4, 1, False), (5, 4_999_999, True), (5, 5_000_000, False)]
-)
-def test_one_sample_in_a_million_may_be_nonfinite(count: int, paths: int, refused: bool) -> None:
-    shard_statistics = ShardStatistics()
-    quarantined = {"nonfinite_samples": count, "lost_rays": 0, "capped_rays": 0, "nonfinite_at": []}
-    shard_statistics.add_quarantined("train-00000.npz", quarantined)
-    with pytest.raises(PartialError) if refused else contextlib.nullcontext():
-        refuse_nonfinite(shard_statistics, paths, Path("out"))
-
-
 def test_the_same_command_resumes_without_rendering(
     config: GeneratorConfig, engine: Formula, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -176,18 +144,18 @@ def test_the_same_command_resumes_without_rendering(
     def never(*_: Any) -> Any:
         raise AssertionError("the estimator was built although nothing is missing")
 
-    monkeypatch.setattr(generation, "estimator_of", never)
+    monkeypatch.setattr(render_shards, "build_estimator", never)
     second = generate(config, tmp_path / "out")
     assert (second.paths, second.complete, second.mean_value) == (0, True, first.mean_value)
     assert before == {p.name: (p.stat().st_mtime_ns, p.read_bytes()) for p in (tmp_path / "out").iterdir()}
 
 
 @pytest.mark.parametrize("done", range(4))
-def test_an_interrupted_run_goes_on_where_it_stopped(
+def test_an_interrupted_run_resumes(
     config: GeneratorConfig, engine: Formula, tmp_path: Path, done: int
 ) -> None:
     generate(config, tmp_path / "whole")
-    engine.asked.clear()
+    engine.estimated.clear()
     engine.fail_at = done
     with pytest.raises(KeyboardInterrupt):
         generate(config, tmp_path / "out")
@@ -195,11 +163,11 @@ def test_an_interrupted_run_goes_on_where_it_stopped(
     assert json.loads((tmp_path / "out/manifest.json").read_text())["complete"] is False
     engine.fail_at = None
     assert generate(config, tmp_path / "out").complete
-    assert engine.asked == [("train", 0), ("train", 1), ("train", 2), ("test", 0)]
+    assert engine.estimated == [("train", 0), ("train", 1), ("train", 2), ("test", 0)]
     assert contents(tmp_path / "out") == contents(tmp_path / "whole")
 
 
-def test_what_a_kill_leaves_is_cleared_away(config: GeneratorConfig, engine: Formula, tmp_path: Path) -> None:
+def test_leftovers_of_a_kill_are_removed(config: GeneratorConfig, engine: Formula, tmp_path: Path) -> None:
     out = tmp_path / "out"
     # Killed while the manifest was written: the folder holds a temporary file alone.
     out.mkdir()
@@ -218,16 +186,16 @@ def test_what_a_kill_leaves_is_cleared_away(config: GeneratorConfig, engine: For
     assert [p.name for p in out.glob(".train*")] == []
 
 
-def test_damage_that_changes_the_size_is_made_anew(
+def test_a_truncated_shard_is_rendered_again(
     config: GeneratorConfig, engine: Formula, tmp_path: Path
 ) -> None:
     generate(config, tmp_path / "out")
     path = tmp_path / "out" / FILES[2]
     intact = path.read_bytes()
     path.write_bytes(intact[:-7])
-    engine.asked.clear()
+    engine.estimated.clear()
     generate(config, tmp_path / "out")
-    assert engine.asked == [("train", 2)]
+    assert engine.estimated == [("train", 2)]
     assert path.read_bytes() == intact
 
 
@@ -329,7 +297,7 @@ def test_a_file_in_place_of_the_folder_is_refused(
             generate(config, out)
 
 
-def test_paths_left_are_those_that_the_run_will_trace(
+def test_paths_left_are_those_of_unfinished_shards(
     config: GeneratorConfig, engine: Formula, tmp_path: Path
 ) -> None:
     job, out = Job.prepare(config), tmp_path / "out"
@@ -344,58 +312,52 @@ def test_paths_left_are_those_that_the_run_will_trace(
     assert left == 240
     seen: list[float] = []
     assert generate(config, out, progress=lambda done, note: seen.append(done)).paths == left
-    # Shards that were there count for nothing, so that the time left is not underrated.
+    # Finished shards do not count, so that the time left is not underestimated.
     assert seen == [0, 80, 120, 240]
     assert paths_left(job, out) == 0
     image = Job.prepare(changed(config, queries={"layout": "image"}))
-    assert image.queries("train") == 4 * 32
+    assert split_queries(image, "train") == 4 * 32
     assert paths_left(image, out) == 4 * 32 * 2 + 32 * 4
 
 
-def test_of_two_writers_that_begin_at_once_the_second_adopts_the_plan_of_the_first(
+def test_the_second_of_two_concurrent_writers_adopts_the_plan_of_the_first(
     config: GeneratorConfig, engine: Formula, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Another process, whose plan differs, writes its manifest while this one plans."""
+    """Another process with another plan writes its manifest while this one plans."""
     out, job = tmp_path / "out", Job.prepare(config)
-    entries = job.shards("train") + job.shards("test")
-    other = generation.simulated(job)
-    other = dataclasses.replace(other, cap_cost=0.125)
+    other = RunPlan(dataclasses.replace(reference_plan(job), cap_bias_bound=0.125))
 
-    def plan(job: Job, pilots: bool) -> Any:
+    def plan(job: Job) -> RunPlan:
         out.mkdir()
-        assert create_file(out / "manifest.json", checksummed(build_manifest(job, entries, other)))
-        return generation.simulated(job)
+        assert create_file(out / "manifest.json", checksummed(build_manifest(job, other)))
+        return cheap_plan(job)
 
-    monkeypatch.setattr(generation, "plan_effects", plan)
+    monkeypatch.setattr(generation, "plan_run", plan)
     assert generate(config, out).complete
-    assert json.loads((out / "manifest.json").read_text())["effects"] == other.to_manifest()
-    assert other.to_manifest() != generation.simulated(job).to_manifest()
+    assert json.loads((out / "manifest.json").read_text())["effects"] == other.effects.to_manifest()
+    assert other != cheap_plan(job)
     assert verify(out) == []
 
 
-def test_of_two_writers_that_begin_different_data_sets_at_once_the_second_is_refused(
+def test_a_concurrent_writer_of_another_data_set_is_refused(
     config: GeneratorConfig, engine: Formula, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out, another = tmp_path / "out", Job.prepare(changed(config, queries={"spp": 8}))
-    content = checksummed(
-        build_manifest(
-            another, another.shards("train") + another.shards("test"), generation.simulated(another)
-        )
-    )
+    content = checksummed(build_manifest(another, cheap_plan(another)))
 
-    def plan(job: Job, pilots: bool) -> Any:
+    def plan(job: Job) -> RunPlan:
         out.mkdir()
         assert create_file(out / "manifest.json", content)
-        return generation.simulated(job)
+        return cheap_plan(job)
 
-    monkeypatch.setattr(generation, "plan_effects", plan)
+    monkeypatch.setattr(generation, "plan_run", plan)
     with pytest.raises(InputError, match=r"another configuration: queries\.spp"):
         generate(config, out)
     assert (out / "manifest.json").read_bytes() == content
     assert not contents(out)
 
 
-def test_what_another_process_is_writing_is_not_replaced(
+def test_a_data_set_that_another_process_writes_is_not_replaced(
     config: GeneratorConfig, engine: Formula, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
@@ -414,11 +376,11 @@ def test_slices_share_the_work_without_gap_or_overlap(
     count: int, config: GeneratorConfig, engine: Formula, tmp_path: Path
 ) -> None:
     generate(config, tmp_path / "whole")
-    engine.asked.clear()
+    engine.estimated.clear()
     for index in range(1, count + 1):
         summary = generate(config, tmp_path / "out", slice_index=index, slice_count=count)
         assert summary.complete == (len(contents(tmp_path / "out")) == len(FILES))
-    assert sorted(engine.asked) == [("test", 0), ("train", 0), ("train", 1), ("train", 2)]
+    assert sorted(engine.estimated) == [("test", 0), ("train", 0), ("train", 1), ("train", 2)]
     assert contents(tmp_path / "out") == contents(tmp_path / "whole")
     assert finish(tmp_path / "out").complete
 
@@ -439,14 +401,14 @@ def test_a_shard_that_another_process_writes_is_left_to_it(
     assert generate(config, out).complete
 
 
-def test_a_shard_that_was_finished_before_its_lock_was_had_is_not_made_again(
+def test_a_shard_finished_just_before_it_is_locked_is_not_rendered_again(
     config: GeneratorConfig, engine: Formula, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Between the look at a shard and its lock another process may finish it and let go."""
+    """Between the check of a shard and its lock another process may finish it and release the lock."""
     whole, out = tmp_path / "whole", tmp_path / "out"
     generate(config, whole)
-    engine.asked.clear()
-    take = shard_making.take_lock
+    engine.estimated.clear()
+    take = render_shards.take_lock
 
     def late(path: Path) -> Any:
         if path.name == FILES[1]:
@@ -454,16 +416,14 @@ def test_a_shard_that_was_finished_before_its_lock_was_had_is_not_made_again(
                 shutil.copy(whole / name, out / name)
         return take(path)
 
-    monkeypatch.setattr(shard_making, "take_lock", late)
+    monkeypatch.setattr(render_shards, "take_lock", late)
     assert generate(config, out).complete
-    assert engine.asked == [("train", 0), ("train", 2), ("test", 0)]
+    assert engine.estimated == [("train", 0), ("train", 2), ("test", 0)]
     assert contents(out) == contents(whole)
     assert not list(out.glob(".*"))
 
 
-def test_the_sidecar_says_what_the_shard_holds(
-    config: GeneratorConfig, engine: Formula, tmp_path: Path
-) -> None:
+def test_the_sidecar_describes_the_shard(config: GeneratorConfig, engine: Formula, tmp_path: Path) -> None:
     generate(config, tmp_path / "out")
     record = json.loads((tmp_path / "out/train-00002.json").read_text())
     assert (record["rows"], record["queries"], record["paths"], record["spp"]) == (20, 20, 40, 2)

@@ -1,4 +1,4 @@
-"""``repair`` makes again what ``verify`` condemns, and nothing else."""
+"""``repair`` restores what ``verify`` finds missing or corrupt, and nothing else."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from mbtf_core.errors import InputError, PartialError
 from mbtf_core.locks import shard_lock
 from mbtf_gen import repairs
 from mbtf_gen.dataset.verify import verify
-from mbtf_gen.planning.effects_plan import simulated
+from mbtf_gen.planning.effects_plan import reference_plan
+from mbtf_gen.planning.run_plan import RunPlan
 from mbtf_gen.planning.simulation import ClosedForm
 from mbtf_gen.repairs import Corruption, repair
 
@@ -83,7 +84,7 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], set[str], set[str]]] = {
 
 
 @pytest.mark.parametrize("name", DAMAGE)
-def test_what_is_condemned_is_made_again_and_nothing_else(name: str, out: Path) -> None:
+def test_faulty_files_are_restored_and_nothing_else(name: str, out: Path) -> None:
     damage, shards, documents = DAMAGE[name]
     damage(out)
     before = moments(out)
@@ -98,7 +99,7 @@ def test_what_is_condemned_is_made_again_and_nothing_else(name: str, out: Path) 
     touched = shards | {Path(s).with_suffix(".json").name for s in shards} | documents | {"manifest.json"}
     kept = set(before) - touched
     assert {f: t for f, t in moments(out).items() if f in kept} == {f: before[f] for f in kept}
-    # Nothing is left to mend, and nothing is written.
+    # A second repair finds nothing and writes nothing.
     before = moments(out)
     assert repair(out).faults == []
     assert moments(out) == before
@@ -118,7 +119,7 @@ def test_another_material_is_refused_untouched(out: Path) -> None:
     flip(out / "train-00000.npz", 700)
     np.save(out.parent / "plane.npy", np.full((4, 8), 0.25))
     before = contents(out)
-    with pytest.raises(InputError, match=r"not the one that made the data set \(height: [0-9a-f]{8}… -> "):
+    with pytest.raises(InputError, match=r"since the data set was generated \(height: [0-9a-f]{8}… -> "):
         repair(out)
     assert contents(out) == before
 
@@ -134,31 +135,31 @@ def test_a_material_that_has_moved_is_named(out: Path) -> None:
     assert contents(out) == contents(out.parent / "whole")
 
 
-def test_a_manifest_is_not_restored_without_witnesses(out: Path) -> None:
+def test_a_manifest_is_not_restored_without_sidecars(out: Path) -> None:
     flip(out / "manifest.json", 90)
     for sidecar in out.glob("t*.json"):
         flip(sidecar, 200)
     before = contents(out.parent / "whole")
-    with pytest.raises(InputError, match="no other file of the folder says what it held"):
+    with pytest.raises(InputError, match="no sidecar of the folder is intact"):
         repair(out)
     assert before == contents(out.parent / "whole")
 
 
-def test_a_manifest_is_not_restored_with_other_effects(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_manifest_is_not_restored_with_another_plan(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     flip(out / "manifest.json", 90)
 
-    def otherwise(job: repairs.Job) -> object:
+    def other_plan(job: repairs.Job) -> RunPlan:
         config = job.config.model_copy(
             update={"effects": job.config.effects.model_copy(update={"mode": "all"})}
         )
-        return simulated(repairs.Job.of(config, job.material))
+        return RunPlan(reference_plan(repairs.Job(config, job.material)))
 
-    monkeypatch.setattr(repairs, "plan_run", otherwise)
-    with pytest.raises(InputError, match="comes out otherwise"):
+    monkeypatch.setattr(repairs, "plan_run", other_plan)
+    with pytest.raises(InputError, match="plans the run differently"):
         repair(out)
 
 
-def test_while_shards_are_gone_the_manifest_does_not_say_complete(
+def test_the_manifest_is_incomplete_while_shards_are_missing(
     out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     flip(out / "train-00000.npz", 700)
@@ -175,7 +176,7 @@ def test_while_shards_are_gone_the_manifest_does_not_say_complete(
     assert contents(out) == contents(out.parent / "whole")
 
 
-def test_a_shard_that_another_process_makes_is_left_to_it(out: Path) -> None:
+def test_a_shard_that_another_process_renders_is_left_to_it(out: Path) -> None:
     flip(out / "train-00000.npz", 700)
     with shard_lock(out / "train-00000.npz") as held:
         assert held
@@ -184,7 +185,7 @@ def test_a_shard_that_another_process_makes_is_left_to_it(out: Path) -> None:
     assert repair(out).complete
 
 
-def test_a_dry_run_says_what_would_be_done(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_dry_run_changes_nothing(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
     flip(out / "train-00000.npz", 700)
     (out / "config.yaml").unlink()
     before = moments(out)
@@ -197,7 +198,7 @@ def test_a_dry_run_says_what_would_be_done(out: Path, capsys: pytest.CaptureFixt
     assert moments(out) == before
     assert generate(["repair", str(out)]) == 0
     text = capsys.readouterr().out
-    assert f"{out}: 1 shards made again (train-00000.npz)" in text
+    assert f"{out}: 1 shards rendered again (train-00000.npz)" in text
     assert f"{out}: config.yaml written again" in text
 
 

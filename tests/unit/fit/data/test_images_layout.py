@@ -71,7 +71,7 @@ def test_whole_images_are_held_out(tmp_path: Path) -> None:
     assert other != held[0]
 
 
-def test_the_sample_is_of_images_that_are_trained_on(tmp_path: Path) -> None:
+def test_the_sample_is_of_training_images(tmp_path: Path) -> None:
     """Equally many queries of each."""
     part = partition(
         write_images(tmp_path / "d", parallax, train=60), HeldOutSection(queries=0.4, radius=0.3)
@@ -82,7 +82,7 @@ def test_the_sample_is_of_images_that_are_trained_on(tmp_path: Path) -> None:
     assert len({sampled.count(k) for k in kept}) == 1
 
 
-def test_training_images_are_judged_by_a_quarter_of_their_sample(tmp_path: Path) -> None:
+def test_training_images_are_evaluated_on_a_quarter_of_their_sample(tmp_path: Path) -> None:
     """Of all images alike: neighborhoods take their time."""
     data = Dataset.open(write_images(tmp_path / "d", parallax, train=20, test=1))
     part = load_training(data, HeldOutSection(queries=0.1, radius=0), 0)
@@ -101,7 +101,7 @@ def test_training_images_are_judged_by_a_quarter_of_their_sample(tmp_path: Path)
     assert len(lights) == len(np.unique(part.sample.omega_i, axis=0)) == 18
 
 
-def test_some_image_is_held_out_where_any_shall_be(tmp_path: Path) -> None:
+def test_at_least_one_image_is_held_out(tmp_path: Path) -> None:
     folder = write_images(tmp_path / "d", parallax, train=6)
     few = HeldOutSection(queries=0.01, radius=0)
     assert len(partition(folder, few).held_out_queries) == 64
@@ -143,7 +143,7 @@ def test_neighbors_in_a_patch_are_a_texel_of_their_level_apart(aspect: float) ->
         torch.testing.assert_close((step - expected + 0.5) % 1 - 0.5, torch.zeros(8, 8, 2), atol=1e-6, rtol=0)
 
 
-def test_values_belong_to_the_places_within_the_margin() -> None:
+def test_values_belong_to_the_positions_within_the_margin() -> None:
     lattice = Lattice(3)
     data = images(lattice, [3.0, 2.0], regular=False)
     patches = data.patches(np.array([1, 0]), np.array([[5, 7], [2, 2]]), 4, 3)
@@ -166,7 +166,7 @@ def test_batches_take_every_image_and_resume_anywhere() -> None:
     assert len(many.sigma.unique()) == 5
 
 
-def patches_of_size(lattice: Lattice, size: int, count: int) -> TrainingImages:
+def small_images(lattice: Lattice, size: int, count: int) -> TrainingImages:
     """Windows as the generator draws them; the value's first channel numbers the queries."""
     q = QueryPlan(lattice, Mixture(1, 0), 0.2, "image", 3, count, patch_size=size).draw("train", 0, count)
     sigma = q.sigma[:, 0, 0]
@@ -178,9 +178,9 @@ def patches_of_size(lattice: Lattice, size: int, count: int) -> TrainingImages:
     return TrainingImages(*tensors[:5], ones, nearest_shapes(lattice, sigma))  # type: ignore[arg-type,call-arg]
 
 
-def test_patches_go_on_beyond_their_border() -> None:
+def test_patches_extend_beyond_the_border_of_small_images() -> None:
     lattice = Lattice(4, 0.5)
-    data = patches_of_size(lattice, 6, 30)
+    data = small_images(lattice, 6, 30)
     origin = np.array([[k % 3, k // 3 % 3] for k in range(30)])
     patches = data.patches(np.arange(30), origin, 4, 3)
     assert patches.u.shape == (30, 10, 10, 2)
@@ -195,7 +195,7 @@ def test_patches_go_on_beyond_their_border() -> None:
         torch.testing.assert_close(step, step.round().to(step.dtype), atol=1e-6, rtol=0)
 
 
-def test_patches_are_read_with_the_grids_that_they_lie_on(tmp_path: Path) -> None:
+def test_small_images_are_read_with_their_grids(tmp_path: Path) -> None:
     folder = write_images(tmp_path / "d", parallax, train=20, finest=4, aspect=0.5, patch_size=5)
     data = images_of(partition(folder, HeldOutSection(queries=0, radius=0)))
     assert data.u.shape == (20, 5, 5, 2)
@@ -208,8 +208,8 @@ def test_patches_are_read_with_the_grids_that_they_lie_on(tmp_path: Path) -> Non
         torch.testing.assert_close(step, step.round().to(step.dtype), atol=1e-6, rtol=0)
 
 
-def test_batches_cut_patches_within_images() -> None:
-    data = patches_of_size(Lattice(4), 6, 8)
+def test_patches_lie_inside_small_images() -> None:
+    data = small_images(Lattice(4), 6, 8)
     for batch in islice(data.batches(2 * 16, 0, 0, 2), 20):
         assert batch.value.shape == (1, 6, 6, 3)
     seen = set()
@@ -249,9 +249,7 @@ def test_training_and_evaluation_agree_on_regular_images(aspect: float, decoder:
     torch.nn.init.normal_(model.pyramid.texels, generator=torch.Generator().manual_seed(1))
     torch.nn.init.normal_(model.offset_texture.texels, generator=torch.Generator().manual_seed(2))
     whole = cut == "whole"
-    data = (
-        images(lattice, [4.0, 3.0, 2.3, 1.0, 0.0], regular=True) if whole else patches_of_size(lattice, 6, 5)
-    )
+    data = images(lattice, [4.0, 3.0, 2.3, 1.0, 0.0], regular=True) if whole else small_images(lattice, 6, 5)
     m = model.margin
     origin = np.array([[0, 0], [3, 9], [1, 1], [7, 15], [5, 2]]) if whole else np.zeros((5, 2), np.int64)
     patches = data.patches(np.arange(5), origin, 6, m)
@@ -266,7 +264,7 @@ def test_training_and_evaluation_agree_on_regular_images(aspect: float, decoder:
     torch.testing.assert_close(alone, together.reshape(-1, 3)[order], rtol=2e-3, atol=1e-5)
 
 
-def test_models_without_neighborhoods_answer_patches_place_by_place() -> None:
+def test_models_without_neighborhoods_evaluate_patches_pointwise() -> None:
     lattice = Lattice(3)
     model = build_model("neumip", lattice)
     model.initialize(torch.Generator().manual_seed(0), 0.1)
@@ -304,7 +302,7 @@ def test_a_hierarchical_material_is_fitted_and_loads_again(tmp_path: Path) -> No
     np.testing.assert_allclose(alone[0], found[500], rtol=1e-4, atol=1e-6)
 
 
-def test_the_other_layout_is_refused_with_the_cure(tmp_path: Path) -> None:
+def test_the_other_layout_is_refused_with_a_hint(tmp_path: Path) -> None:
     shuffled = write_data(tmp_path / "s", constant(0.1), train=100)
     with pytest.raises(InputError, match=r"shuffled layout, but hierarchical .*\n.*--layout image"):
         fit(quick(1), shuffled, tmp_path / "m")

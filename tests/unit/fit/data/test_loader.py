@@ -44,7 +44,7 @@ def test_every_query_is_either_trained_on_or_held_out(tmp_path: Path) -> None:
     assert 200 < len(sets[1]) < 400
 
 
-def test_the_sample_is_of_what_is_trained_on(tmp_path: Path) -> None:
+def test_the_sample_is_of_training_queries(tmp_path: Path) -> None:
     """It says how good a fit is on data that it knows, and how noisy they are: no held-out query is in it."""
     part = partition(write_data(tmp_path / "d", parallax, train=3000))
     t = part.training
@@ -53,7 +53,7 @@ def test_the_sample_is_of_what_is_trained_on(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("total", "size"), [(10, 4), (9, 5), (8, 8), (7, 1)])
-def test_no_query_is_left_out_for_good(total: int, size: int) -> None:
+def test_every_query_is_used_in_some_epoch(total: int, size: int) -> None:
     """Where batches do not come out even, each epoch leaves out others."""
     starts = list(islice(batch_starts(total, size, 0, 0), 60 * (total // size)))
     assert {k for start in starts for k in range(start, start + size)} == set(range(total))
@@ -64,7 +64,7 @@ def test_the_order_of_batches_follows_the_seed() -> None:
     assert first == again != other
 
 
-def test_shards_are_divided_each_in_its_own_way(tmp_path: Path) -> None:
+def test_shards_are_divided_independently(tmp_path: Path) -> None:
     """Rows of equal number share no fate."""
     folder = write_data(tmp_path / "d", parallax, train=2000)
     t = partition(folder, held_out=HeldOutSection(queries=0.3, radius=0)).selection
@@ -140,7 +140,7 @@ def test_nothing_to_train_on_is_refused(tmp_path: Path) -> None:
         load_split(Dataset.open(write_data(tmp_path / "t", parallax, train=9, test=0)), "test")
 
 
-def test_another_layout_is_refused_with_the_fix(tmp_path: Path) -> None:
+def test_another_layout_is_refused_with_a_hint(tmp_path: Path) -> None:
     folder = write_data(tmp_path / "d", parallax, train=100, layout="image")
     with pytest.raises(InputError, match=r"image layout, but neumip .*\n.*--layout shuffled"):
         open_data(folder, "shuffled", "neumip")

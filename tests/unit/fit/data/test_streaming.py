@@ -11,7 +11,7 @@ from support.fit_data import parallax, write_data
 
 import mbtf_fit.evaluation
 from mbtf_core.errors import InputError
-from mbtf_core.sizes import format_size, parse_size
+from mbtf_core.units import format_size, parse_size
 from mbtf_fit.config import FitConfig, HeldOutSection
 from mbtf_fit.data.loader import load_training
 from mbtf_fit.data.split import Partition
@@ -38,7 +38,7 @@ def test_batches_are_those_of_data_in_memory(tmp_path: Path) -> None:
             break
 
 
-def test_a_fit_from_disk_is_the_same_fit(tmp_path: Path) -> None:
+def test_a_streamed_fit_is_identical(tmp_path: Path) -> None:
     shards = write_data(tmp_path / "d", parallax, train=3000, test=500)
     found = []
     for memory in ("1GB", "1kB"):
@@ -77,7 +77,7 @@ def test_evaluation_leaves_training_queries_on_disk(
         assert errors[name]["mse"]["value"] == pytest.approx(expected["mse"]["value"], rel=1e-3)
 
 
-def test_rows_are_found_among_any_that_are_left_out() -> None:
+def test_selected_rows_are_found_by_index() -> None:
     random = np.random.default_rng(0)
     selection, wanted = Selection(), []
     for k, rows in enumerate((10_000, 1, 4096, 20_001)):

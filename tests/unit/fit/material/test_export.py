@@ -243,7 +243,7 @@ class Reader:
 
 @pytest.mark.parametrize("half", [False, True], ids=["single", "half"])
 @pytest.mark.parametrize("case", CASES)
-def test_textures_and_layers_suffice(case: str, half: bool, tmp_path: Path) -> None:
+def test_an_export_is_sufficient_for_evaluation(case: str, half: bool, tmp_path: Path) -> None:
     """An evaluation written from the description alone, in NumPy, meets the conformance values."""
     material = make(case, tmp_path)
     written = to_half(material)[0] if half else material

@@ -15,7 +15,7 @@ from safetensors.torch import load, save
 from support.damage import altered, damaged, examples, loads_or_refuses
 from support.fit_data import constant, write_data
 
-from mbtf_core.atomic import digest
+from mbtf_core.digest import file_sha256
 from mbtf_core.errors import InputError
 from mbtf_fit import FitConfig, Material, fit, read_history
 from mbtf_fit.material.storage import read_tensors
@@ -54,7 +54,9 @@ def write(folder: Path, whole: Path, description: str | None, weights: bytes | N
     before = (whole / WEIGHTS).read_bytes()
     (folder / WEIGHTS).write_bytes(before if weights is None else weights)
     text = description if description is not None else (whole / DESCRIPTION).read_text()
-    (folder / DESCRIPTION).write_text(text.replace(digest(whole / WEIGHTS), digest(folder / WEIGHTS)))
+    (folder / DESCRIPTION).write_text(
+        text.replace(file_sha256(whole / WEIGHTS), file_sha256(folder / WEIGHTS))
+    )
 
 
 @given(data=st.data())

@@ -57,7 +57,7 @@ def test_a_known_transmittance_is_found(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("patch_size", [None, 4])
-def test_images_tell_the_same(tmp_path: Path, patch_size: int | None) -> None:
+def test_images_give_the_same_transmittance(tmp_path: Path, patch_size: int | None) -> None:
     folder = write_images(tmp_path, constant(0.2), train=1500, through=lace, patch_size=patch_size)
     data = Dataset.open(folder)
     model = fit_transmittance(data, chosen(data))
@@ -124,7 +124,7 @@ def test_passes_over_the_data_change_nothing_but_memory(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("layout", ["shuffled", "image"])
-def test_what_is_held_out_is_judged_and_not_fitted(layout: str, tmp_path: Path) -> None:
+def test_held_out_queries_are_evaluated_and_not_fitted(layout: str, tmp_path: Path) -> None:
     """Where held-out rows say something else, the fit does not support, and its error there says so."""
     held_out = HeldOutSection(queries=0.2, radius=0.15)
     if layout == "image":
@@ -154,7 +154,7 @@ def test_what_is_held_out_is_judged_and_not_fitted(layout: str, tmp_path: Path) 
     assert honest["held_out"].mse.value < 2e-3
 
 
-def test_errors_hold_the_noise_of_the_data_and_say_how_much(tmp_path: Path) -> None:
+def test_errors_include_the_noise_and_its_bound(tmp_path: Path) -> None:
     """Holes are hit or missed: of four independent paths each, a quarter of p(1-p) is noise."""
     random = np.random.default_rng(3)
     folder = write_data(
@@ -198,7 +198,7 @@ def test_a_description_that_does_not_say_which_file_is_refused(tmp_path: Path) -
         check_message(caught.value)
 
 
-def test_a_view_is_a_line_through_the_plane() -> None:
+def test_opposite_views_have_the_same_transmittance() -> None:
     """Nothing but the polynomial of the view's projection, at a texel's center, clamped."""
     lattice = Lattice(0)
     texel = np.array([0.5, 0.2, -0.1, -0.3, 0.4, 0.1], np.float32).reshape(1, 1, 6)

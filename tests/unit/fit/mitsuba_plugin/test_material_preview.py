@@ -36,7 +36,7 @@ SECTION = SheetSection(
 )
 
 
-def test_every_picture_stands_at_its_view_light_and_width(tmp_path: Path) -> None:
+def test_pictures_are_ordered_by_view_light_and_width(tmp_path: Path) -> None:
     """Against PyTorch at the same pixels."""
     material = write_material(tmp_path, aspect=2.0, contrast=1.0)
     values = sheet.panels(Evaluator(read_material(tmp_path), "cooperative"), SECTION)
@@ -97,7 +97,7 @@ def test_tiles_on_the_plate_are_as_large_as_on_the_equator(tmp_path: Path) -> No
     assert dr.all(si.n.z > 0.999)
 
 
-def test_a_turn_of_a_uniform_material_changes_nothing_and_of_a_patterned_one_does(tmp_path: Path) -> None:
+def test_rotation_changes_patterned_materials_only(tmp_path: Path) -> None:
     """Camera and lights go round together; the material stays."""
     section = TurntableSection(size=24, frames=3, spp=64)
     same = list(turntable.frames(white(tmp_path / "white"), section))
@@ -115,7 +115,7 @@ def test_a_turn_of_a_uniform_material_changes_nothing_and_of_a_patterned_one_doe
     assert np.abs(turned[1] - turned[0]).mean() > 0.12 * turned[0].mean()
 
 
-def test_the_file_of_a_turn_repeats_and_keeps_its_frames(tmp_path: Path) -> None:
+def test_the_animation_repeats_and_keeps_its_frames(tmp_path: Path) -> None:
     pictures = [np.full((8, 8, 3), (40 * k, 90, 250 - 40 * k), np.uint8) for k in range(5)]
     turntable.write_gif(tmp_path / "turn.gif", pictures)
     with Image.open(tmp_path / "turn.gif") as file:
@@ -127,9 +127,9 @@ def test_the_file_of_a_turn_repeats_and_keeps_its_frames(tmp_path: Path) -> None
         assert file.n_frames == 5
 
 
-def test_options_that_make_no_sense_are_refused() -> None:
+def test_invalid_options_are_refused() -> None:
     for key, value, fault in (
-        ("sheet.size", 2000, "pixels; take smaller or fewer"),
+        ("sheet.size", 2000, "pixels; use smaller or fewer"),
         ("turntable.frames", 0, "turntable.frames"),
         ("sheet.tiles_across", [], "sheet.tiles_across"),
         ("sheet.view", 3, "did you mean 'views'"),

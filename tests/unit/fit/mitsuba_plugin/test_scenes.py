@@ -123,7 +123,7 @@ def test_more_samples_per_pixel_do_not_narrow_the_footprint(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("share", [0.05, 0.5, 0.95])
-def test_a_cone_goes_on_through_a_hole_as_if_it_were_not_there(tmp_path: Path, share: float) -> None:
+def test_holes_do_not_change_the_cone(tmp_path: Path, share: float) -> None:
     """A sheet that is nothing but a hole, at a share of the camera's height: a plane whose brightness tells σ
     looks the same behind it. Were the cone to begin again at the hole, or to widen, it would not."""
     import torch
@@ -156,7 +156,7 @@ def test_a_cone_goes_on_through_a_hole_as_if_it_were_not_there(tmp_path: Path, s
     np.testing.assert_allclose(behind, bare, rtol=2e-3)
 
 
-def test_stock_integrators_read_the_given_footprint_and_warn_once_without(
+def test_other_integrators_use_the_given_footprint_and_warn_once_without(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     fitted = write_material(tmp_path, finest=4, contrast=0.2, brightness=0.5)
@@ -223,7 +223,7 @@ def scene_of(folder: Path | str, **options: Any) -> dict[str, Any]:
         ({"color": 4.0}, "has no parameter 'color'\n  it has: material, uv_scale", UsageError),
     ],
 )
-def test_faults_of_a_scene_are_one_clear_line(
+def test_errors_of_a_scene_are_one_line(
     options: dict[str, Any], fault: str, kind: type[MbtfError], material: tuple[Path, Material]
 ) -> None:
     with pytest.raises(kind) as caught:
@@ -267,7 +267,7 @@ def test_a_mesh_without_texture_coordinates_is_refused(
     assert "no texture coordinates" in str(caught.value.__cause__ or caught.value.__context__)
 
 
-def test_a_refused_material_leaves_later_pictures_alone(material: tuple[Path, Material]) -> None:
+def test_a_refused_material_does_not_affect_later_renders(material: tuple[Path, Material]) -> None:
     """A traceback, as notebooks keep it, holds the instance that failed."""
     folder, fitted = material
     with pytest.raises(Exception, match="uv_scale must be a positive number") as kept:
@@ -277,13 +277,13 @@ def test_a_refused_material_leaves_later_pictures_alone(material: tuple[Path, Ma
     assert found.mean() > 0.0
 
 
-def test_values_that_are_not_the_materials_own_are_refused(tmp_path: Path) -> None:
+def test_deviations_from_conformance_values_are_refused(tmp_path: Path) -> None:
     """A material whose conformance values say otherwise than its weights."""
     import json
 
     from safetensors.numpy import load_file, save_file
 
-    from mbtf_core.atomic import digest
+    from mbtf_core.digest import file_sha256
 
     write_material(tmp_path)
     path = tmp_path / "weights.safetensors"
@@ -291,7 +291,7 @@ def test_values_that_are_not_the_materials_own_are_refused(tmp_path: Path) -> No
     tensors["conformance.rgb"][7] *= 1.01
     save_file(tensors, path)
     description = json.loads((tmp_path / "material.json").read_text())
-    description["weights"]["sha256"] = digest(path)
+    description["weights"]["sha256"] = file_sha256(path)
     (tmp_path / "material.json").write_text(json.dumps(description))
-    with pytest.raises(InputError, match="does not give its conformance values"):
+    with pytest.raises(InputError, match="does not reproduce its conformance values"):
         load_scene(scene_of(tmp_path, sampling="cosine", networks="cooperative"))

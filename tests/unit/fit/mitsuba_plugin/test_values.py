@@ -16,11 +16,10 @@ from support.scenes import mi
 
 from mbtf_core.errors import InputError
 from mbtf_core.lattice import Lattice
-from mbtf_fit.models import mlp, outputs, textured
 
 assert mi.variant()
 
-from mbtf_fit.mitsuba_plugin import encodings, evaluator, network  # noqa: E402
+from mbtf_fit.mitsuba_plugin import network  # noqa: E402
 from mbtf_fit.mitsuba_plugin.evaluator import Evaluator  # noqa: E402
 from mbtf_fit.mitsuba_plugin.material_arrays import read_material  # noqa: E402
 
@@ -92,7 +91,7 @@ def test_the_networks_of_the_paper_unrolled(tmp_path: Path) -> None:
     "options",
     [{}, {"finest": 6, "contrast": 0.5}, {"model": "neumip-baseline", "finest": 6, "contrast": 1.0}],
 )
-def test_half_precision_keeps_to_a_hundredth(options: dict[str, Any], tmp_path: Path) -> None:
+def test_half_precision_errs_by_less_than_one_percent(options: dict[str, Any], tmp_path: Path) -> None:
     """Also where neighboring texels differ much, so that an offset's rounding would show."""
     material = write_material(tmp_path, **options)
     half = Evaluator(read_material(tmp_path), "half")
@@ -100,7 +99,7 @@ def test_half_precision_keeps_to_a_hundredth(options: dict[str, Any], tmp_path: 
     assert 1e-5 < deviation(half.evaluate(*drawn.values()), material.evaluate(*drawn.values())) < 1e-2
 
 
-def test_half_precision_does_not_round_what_the_network_sees() -> None:
+def test_half_precision_does_not_round_inputs() -> None:
     """A difference of 2⁻¹², which half precision cannot hold beside 1, is seen by the first layer."""
     one = np.ones((1, 1), np.float32)
     layers = [(one, np.full(1, -1.0, np.float32)), (4096 * one, np.zeros(1, np.float32))]
@@ -108,22 +107,14 @@ def test_half_precision_does_not_round_what_the_network_sees() -> None:
     assert found[0] == 1.0
 
 
-def test_constants_are_those_of_the_models() -> None:
-    assert evaluator.OFFSET_SCALE == textured.OFFSET_SCALE
-    assert evaluator.GRAZING == textured.GRAZING
-    assert network.LEAK == mlp.LEAK
-    assert encodings.RGB_OF_YUV == outputs.RGB_OF_YUV
-    assert encodings.GATE == outputs.GATE
-
-
-def test_what_looks_at_neighbors_is_refused(tmp_path: Path) -> None:
+def test_the_inception_decoder_is_refused(tmp_path: Path) -> None:
     write_material(tmp_path)
     path = tmp_path / "material.json"
     description = json.loads(path.read_text())
     description["model"] = "hierarchical"
     description["config"] |= {"model": "hierarchical", "network": {}}
     path.write_text(json.dumps(description))
-    with pytest.raises(InputError, match="cannot evaluate 'hierarchical'") as caught:
+    with pytest.raises(InputError, match="does not support the inception decoder") as caught:
         read_material(tmp_path)
     check_message(caught.value)
 
@@ -136,15 +127,15 @@ def test_folders_that_are_no_material_are_refused(tmp_path: Path) -> None:
     write_material(tmp_path)
     path = tmp_path / "material.json"
     text = path.read_text()
-    path.write_text(text.replace('"schema": 1', '"schema": 7'))
-    with pytest.raises(InputError, match="schema 7; this version reads schema 1"):
+    path.write_text(text.replace('"schema": 2', '"schema": 7'))
+    with pytest.raises(InputError, match="schema 7; this version reads schema 2"):
         read_material(tmp_path)
     path.write_text(text)
     weights = tmp_path / "weights.safetensors"
     content = bytearray(weights.read_bytes())
     content[-1] ^= 1
     weights.write_bytes(content)
-    with pytest.raises(InputError, match="not the file that"):
+    with pytest.raises(InputError, match="is missing, or its SHA-256"):
         read_material(tmp_path)
 
 

@@ -33,7 +33,7 @@ def test_a_negligible_blur_changes_nothing() -> None:
     assert blur_texture(texture, 0.1) is texture
 
 
-def test_annealing_ends_with_its_share_of_the_budget() -> None:
+def test_annealing_ends_with_its_fraction_of_the_budget() -> None:
     sigmas = [annealed_sigma(share, 8.0, 0.25) for share in (0.0, 0.2, 0.5, 0.999, 1.0, 1.5)]
     assert sigmas[0] == 8.0
     assert sigmas[2] == pytest.approx((8.0 * 0.25) ** 0.5)

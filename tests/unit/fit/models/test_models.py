@@ -171,7 +171,7 @@ def test_without_an_offset_texture_the_view_alone_decides() -> None:
 
 
 @variants
-def test_stage_one_does_not_see_the_light(variant: str) -> None:
+def test_stage_one_does_not_depend_on_the_light(variant: str) -> None:
     model = random_model(variant)
     u, sigma, view, _ = arguments(9)
     features = model.stage1(u, sigma, view)
@@ -276,7 +276,7 @@ def test_encodings_are_sines_and_cosines_of_doubling_frequencies() -> None:
         assert encode_direction(omega, e).shape[1] == direction_size(e)
 
 
-def test_damped_encodings_are_equally_steep() -> None:
+def test_attenuated_bands_have_equal_slopes() -> None:
     options = EncodingSection(position=6, direction=4, direction_pi=False, band_attenuation=True)
     h = 1e-6
     up, tilt = torch.tensor([[0.0, 0.0, 1.0]], dtype=F64), torch.tensor([[h, h, 0.0]], dtype=F64)
@@ -306,7 +306,7 @@ def test_filtered_encodings_are_means_over_the_footprint() -> None:
 
 
 @variants
-def test_training_starts_as_the_documentation_says(variant: str) -> None:
+def test_initial_parameters_have_the_stated_distributions(variant: str) -> None:
     """Features of 0.1·N(0,1), no offset texture; variance-preserving weights, biases 0 but the answer's."""
     name, options = VARIANTS[variant]
     model = build_model(name, Lattice(5), **{**options, "width": 128}).requires_grad_(False)
@@ -351,7 +351,7 @@ def test_hierarchical_sees_nine_by_nine_texels_of_the_nearest_level() -> None:
         torch.testing.assert_close(places[5, 4] - places[4, 4], torch.tensor([0.0, -1 / rows], dtype=F64))
 
 
-def test_hierarchical_depends_on_every_place_of_its_neighborhood_and_no_other() -> None:
+def test_hierarchical_depends_on_its_neighborhood_alone() -> None:
     model = random_model("hierarchical")
     assert isinstance(model, Hierarchical)
     features = model.stage1(*(a[:1] for a in (*arguments(1)[:2], directions(1)))).detach().requires_grad_()
@@ -364,7 +364,7 @@ def test_hierarchical_depends_on_every_place_of_its_neighborhood_and_no_other() 
     assert touched.float().mean() > 0.8
 
 
-def test_a_query_has_the_same_value_in_any_company() -> None:
+def test_a_value_does_not_depend_on_other_queries() -> None:
     model = random_model("hierarchical")
     at = arguments(40)
     together = model(*at)

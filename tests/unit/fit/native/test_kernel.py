@@ -174,7 +174,7 @@ def test_the_largest_networks_are_those_of_the_reference(variant: str) -> None:
 
 @needs_kernel
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_outputs_of_any_size_become_values(variant: str) -> None:
+def test_outputs_of_any_size_give_finite_values(variant: str) -> None:
     """exp(x) - 1 to single precision, from where only the -1 is left to where it is infinite, and near 0
     where the two cancel; its slope likewise."""
     model = build_model("neumip-baseline", LATTICE, layers=2)
@@ -241,7 +241,7 @@ def test_the_quadratic_form_is_the_same_loss() -> None:
 
 
 @needs_kernel
-def test_threads_change_no_more_than_rounding_and_the_same_number_of_them_nothing() -> None:
+def test_threads_change_rounding_only_and_reproducibly() -> None:
     model, batch, loss = random_model("neumip", LATTICE), random_batch(1999), objective()
     found = [kernel_gradients(VARIANTS[0], model, loss, batch, threads) for threads in (1, 2, 2, 3)]
     for p in model.parameters():
@@ -270,7 +270,7 @@ def test_blur_is_that_of_the_reference(variant: str, aspect: float, sigma: float
 
 @needs_kernel
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_adam_is_pytorchs_and_goes_on_from_its_state(variant: str) -> None:
+def test_adam_equals_pytorchs_and_resumes_its_state(variant: str) -> None:
     torch.manual_seed(0)
     start = [torch.randn(3, 5), torch.randn(20_001)]
     sides = [[torch.nn.Parameter(t.clone()) for t in start] for _ in range(2)]
@@ -294,7 +294,7 @@ def test_adam_is_pytorchs_and_goes_on_from_its_state(variant: str) -> None:
 
 
 @needs_kernel
-def test_a_training_goes_the_way_that_pytorch_goes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_equals_that_of_pytorch(monkeypatch: pytest.MonkeyPatch) -> None:
     arrays = random_queries(np.random.default_rng(0), 4000, LATTICE)
     data = training_queries(arrays, parallax(*arrays.values()))
     trainers = [make_trainer(data, LATTICE, "neumip", steps=4, batch=1000, warmup=0)]
@@ -324,7 +324,7 @@ def test_many_queries_are_evaluated_by_all_threads_alike() -> None:
 @needs_kernel
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e30])
 @pytest.mark.parametrize("name", ["u", "sigma", "omega_i", "omega_o"])
-def test_numbers_that_are_none_stay_within_the_tables(bad: float, name: str) -> None:
+def test_nan_does_not_read_outside_the_tables(bad: float, name: str) -> None:
     model = random_model("neumip", LATTICE)
     arrays = random_queries(np.random.default_rng(0), 200, LATTICE)
     good = predict(model, *arrays.values())
@@ -344,7 +344,7 @@ def test_queries_of_another_shape_are_refused() -> None:
         predict(model, arrays[0], arrays[1][:3], arrays[2], arrays[3])
 
 
-def test_every_option_of_the_architecture_is_known_or_leads_to_pytorch() -> None:
+def test_unsupported_options_use_pytorch() -> None:
     assert _SUPPORTED.keys() | _SIZES == NetworkSection.model_fields.keys()
     options: list[dict[str, Any]] = [
         {"activation": "leaky-relu"},
@@ -372,7 +372,7 @@ def test_every_option_of_the_architecture_is_known_or_leads_to_pytorch() -> None
 
 
 @pytest.mark.parametrize("value", ["off", "z80"])
-def test_without_a_kernel_there_is_a_reason_and_pytorch(value: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_kernel_pytorch_is_used(value: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(library.ENVIRONMENT, value)
     library.reload()
     try:

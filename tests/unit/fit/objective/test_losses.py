@@ -62,7 +62,7 @@ def test_without_correction_curved_losses_are_biased(kind: str, least: float) ->
     assert minimum(objective(kind, correction="none", huber_delta=None), skewed(0.8)) < 1 - least
 
 
-def test_second_order_takes_most_of_the_bias_of_little_noise() -> None:
+def test_second_order_removes_most_of_the_bias_of_small_noise() -> None:
     value = skewed(0.3)
     plain = 1 - minimum(objective("log", correction="none", huber_delta=None), value)
     corrected = 1 - minimum(objective("log", 0.09, correction="second-order", huber_delta=None), value)
@@ -70,12 +70,12 @@ def test_second_order_takes_most_of_the_bias_of_little_noise() -> None:
     assert abs(corrected) < 0.1 * plain
 
 
-def test_the_default_s_robust_rule_costs_little_bias() -> None:
+def test_the_default_huber_threshold_causes_little_bias() -> None:
     """Ten times noise and scale: of skewed noise as large as the value, three in a million are beyond."""
     assert minimum(objective("relative", 1.0), skewed(1.0)) == pytest.approx(1.0, abs=1e-3)
 
 
-def test_a_wild_value_pulls_like_one_at_the_bound() -> None:
+def test_an_outlier_has_the_gradient_of_the_bound() -> None:
     loss = objective("squared", 0.04)
     pulls = []
     bound = 10 * (SCALE**2 + 0.04) ** 0.5
@@ -140,7 +140,7 @@ def test_corrected_absolute_terms_are_parabolas_of_the_noise() -> None:
 
 
 @pytest.mark.parametrize("shape", [(2, 1, 6, 3), (2, 6, 1, 3), (2, 1, 1, 3)])
-def test_a_single_row_of_places_has_gradients_along_it_alone(shape: tuple[int, ...]) -> None:
+def test_a_single_row_has_gradients_along_it_alone(shape: tuple[int, ...]) -> None:
     value = torch.rand(shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     data = queries(value[:, 0, 0])
     data = TrainingQueries(data.u, data.sigma, data.omega_i, data.omega_o, value)
@@ -153,7 +153,7 @@ def test_a_single_row_of_places_has_gradients_along_it_alone(shape: tuple[int, .
         assert bool(loss > 0) == (max(shape[1:3]) > 1)
 
 
-def test_the_gradient_term_sees_differences_of_neighbors_alone() -> None:
+def test_the_gradient_term_depends_on_differences_of_neighbors_alone() -> None:
     """A constant error costs nothing; an edge costs what it is high."""
     value = torch.zeros(1, 4, 6, 3, dtype=torch.float64)
     data = TrainingQueries(*(torch.ones(1, 3).double() for _ in range(4)), value)

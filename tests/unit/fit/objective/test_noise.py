@@ -69,7 +69,7 @@ def test_data_without_noise_have_none() -> None:
 
 
 @pytest.mark.parametrize("wild", [0, 5])
-def test_the_ratio_is_that_of_noise_to_true_values(wild: int) -> None:
+def test_the_ratio_is_noise_to_signal(wild: int) -> None:
     """To 5 %, wild values or not; where true values do not vary it is the most there is, since none can be
     told, and of a single query likewise."""
     queries, true, variance = noisy(wild=wild)
@@ -82,7 +82,7 @@ def test_the_ratio_is_that_of_noise_to_true_values(wild: int) -> None:
     assert NoiseModel.of(even, LATTICE, 1.0).ratio == 5.0
 
 
-def test_light_that_few_paths_find_is_noise() -> None:
+def test_rarely_sampled_light_is_noise() -> None:
     """One half in a hundred, a hundred times too bright, on few bright queries: noise far beyond the most."""
     random = np.random.default_rng(2)
     n = 60_000
@@ -106,7 +106,7 @@ def test_images_are_pooled_like_queries() -> None:
     assert model.variance(value, *first).shape == value.shape
 
 
-def test_the_typical_value_ignores_a_few_wild_ones() -> None:
+def test_the_typical_value_is_robust_to_outliers() -> None:
     value = np.random.default_rng(0).gamma(0.5, 2.0, (20_000, 3))
     assert typical_value(value) == pytest.approx(1.0, abs=0.05)
     value[:5] = 1e5

@@ -29,24 +29,24 @@ def pull(ratio: float, queries: int = 5000, **training: Any) -> WeightDecay:
     ("ratio", "texels", "weights"),
     [(0.0, 2.0, 0.0), (0.05, 2.0, 1e-3), (0.4, 2.0, 0.064), (2.0, 8.0, 0.4), (5.0, 20.0, 1.0)],
 )
-def test_noise_makes_pulls_stronger(ratio: float, texels: float, weights: float) -> None:
+def test_noise_increases_weight_decay(ratio: float, texels: float, weights: float) -> None:
     """Of texels from a ratio of a half on; of weights with its square up to there, then with it, up to 1."""
     found = pull(ratio, texture_weight_decay=2.0, noise_regularization=1000.0)
     assert (found.texels, found.weights) == (pytest.approx(texels), pytest.approx(weights))
 
 
-def test_many_queries_and_0_leave_weights_alone() -> None:
+def test_many_queries_and_0_disable_the_decay_of_weights() -> None:
     assert pull(1.0, 10**8, noise_regularization=1e5).weights == pytest.approx(1e-3)
     assert pull(5.0, 10, noise_regularization=0.0).weights == 0.0
 
 
-def test_no_pull_is_stronger_than_that_of_a_step_by_its_rate() -> None:
+def test_the_decay_is_bounded_by_the_learning_rate() -> None:
     """Else so few queries would have weights pulled to 0, and the fit would be a constant."""
     assert pull(5.0, 50, noise_regularization=1000.0).weights == 1.0
 
 
 @pytest.mark.parametrize("model", ["neumip", "neumip-baseline", "hierarchical"])
-def test_texels_and_matrices_shrink_and_biases_stay(model: ModelName) -> None:
+def test_texels_and_matrices_decay_and_biases_do_not(model: ModelName) -> None:
     found = build_model(model, LATTICE)
     with torch.no_grad():
         for p in found.parameters():
@@ -61,7 +61,7 @@ def test_texels_and_matrices_shrink_and_biases_stay(model: ModelName) -> None:
         torch.testing.assert_close(p.detach(), torch.full_like(p, expected))
 
 
-def test_a_trainer_pulls_as_all_its_queries_say() -> None:
+def test_a_trainer_counts_all_its_queries() -> None:
     """Not as those of a batch."""
     arrays = random_queries(np.random.default_rng(0), 5000, LATTICE)
     noise = NoiseModel(0.1, np.zeros(3), np.zeros((4, 3)), np.ones(4), 0.7)
@@ -73,7 +73,7 @@ def test_a_trainer_pulls_as_all_its_queries_say() -> None:
     )
 
 
-def test_a_fit_finds_the_ratio_in_its_data(tmp_path: Path) -> None:
+def test_a_fit_estimates_the_noise_ratio_of_its_data(tmp_path: Path) -> None:
     """Noise of 0.02 in each half is 2e-4 of variance in their mean."""
     folder = write_data(tmp_path / "data", parallax, train=20_000, noise=0.02)
     config = FitConfig.model_validate(

@@ -84,7 +84,7 @@ def test_means_at_each_elevation_become_those_of_the_data() -> None:
             assert np.abs(excess(calibration, sigma, axis)).mean() < 0.006
 
 
-def test_data_that_say_little_change_little() -> None:
+def test_noisy_data_change_the_factors_little() -> None:
     calibration = fit_calibration(truth, LATTICE, data(3000, 3.0), HELD_OUT, nothing)
     assert np.abs(calibration - 1).max() < 0.06
     # Where no data lie, and in black ones.
@@ -94,7 +94,7 @@ def test_data_that_say_little_change_little() -> None:
     np.testing.assert_allclose(black, 1.0)
 
 
-def test_wild_values_do_not_decide() -> None:
+def test_outliers_do_not_dominate() -> None:
     queries = data(50_000, 0.5)
     kept = fit_calibration(wrong, LATTICE, queries, HELD_OUT, lambda p: 2.0 + 0 * p)
     queries.value[::2500] = 1e6
@@ -155,7 +155,7 @@ def test_factors_of_another_shape_are_refused(shape: tuple[int, ...]) -> None:
     assert model.weights().keys() == weights.keys()
 
 
-def test_a_fit_is_calibrated_unless_told_otherwise(tmp_path: Path) -> None:
+def test_fits_are_calibrated_by_default(tmp_path: Path) -> None:
     """A fit that is cut short reflects too little at some elevations; its factors say so."""
 
     def bright(u: F32, sigma: F32, omega_i: F32, omega_o: F32) -> F32:

@@ -31,7 +31,7 @@ def errors(held_out: float, training: float, error: float = 0.002) -> dict[str, 
 
 
 @pytest.mark.parametrize("power", [0.25, 0.5, 1.0])
-def test_halving_takes_what_the_power_of_time_says(power: float) -> None:
+def test_halving_follows_the_power_law(power: float) -> None:
     found = marginal_cost_of(history(power), {}, validation_set="held_out_queries")
     assert found is not None
     assert found.describe().startswith("unexplained variance of held-out queries: 0.")
@@ -40,7 +40,7 @@ def test_halving_takes_what_the_power_of_time_says(power: float) -> None:
     assert found.halving == pytest.approx(80.0 * (2 ** (1 / power) - 1), rel=1e-6)
 
 
-def test_a_gain_below_its_error_bar_promises_nothing() -> None:
+def test_insignificant_improvements_give_no_estimate() -> None:
     found = marginal_cost_of(history(0.25, error=0.03), {})
     assert found is not None
     assert found.halving is None
@@ -54,7 +54,7 @@ def test_a_gain_below_its_error_bar_promises_nothing() -> None:
     assert flat.halving is None
 
 
-def test_half_of_the_distance_to_the_training_queries_is_learned_noise() -> None:
+def test_half_of_the_distance_to_the_training_error_is_overfitting() -> None:
     # Least squares with k free numbers and noise s² in n queries misses others by s²k/n, and seems to miss
     # its own by -s²k/n.
     found = marginal_cost_of(history(0.5), errors(0.2 + 0.05, 0.2 - 0.05), 0.3)
@@ -70,16 +70,14 @@ def test_half_of_the_distance_to_the_training_queries_is_learned_noise() -> None
 @pytest.mark.parametrize(
     ("noise", "share"), [(None, None), (0.0, None), (0.03, 0.12), (0.05, 0.2), (1.0, 0.2)]
 )
-def test_no_more_noise_is_learned_than_there_is(noise: float | None, share: float | None) -> None:
+def test_overfitting_is_bounded_by_the_noise(noise: float | None, share: float | None) -> None:
     """Few queries without noise leave the same distance: what lies between them was not learned."""
     found = marginal_cost_of(history(0.5), errors(0.25, 0.15), noise)
     assert found is not None
     assert found.noise_share == (share if share is None else pytest.approx(share))
 
 
-def test_histories_that_do_not_tell_give_no_price() -> None:
-    assert marginal_cost_of([], {}) is None
-    assert marginal_cost_of(history(0.5)[:-1], {}) is None
-    assert marginal_cost_of(history(0.5)[-1:], {}) is None
+def test_incomplete_histories_give_no_marginal_cost() -> None:
     unknown = [{**r, "unexplained": None, "unexplained_error": None} for r in history(0.5)]
-    assert marginal_cost_of(unknown, {}) is None
+    for records in ([], history(0.5)[:-1], history(0.5)[-1:], unknown):
+        assert marginal_cost_of(records, {}) is None

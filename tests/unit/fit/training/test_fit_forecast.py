@@ -24,7 +24,7 @@ def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_data(tmp_path_factory.mktemp("data") / "shards", parallax, train=6000, noise=0.01)
 
 
-def test_every_doubling_gains_a_share_of_the_one_before() -> None:
+def test_each_doubling_improves_by_a_fraction_of_the_one_before() -> None:
     gain = math.log(0.8 / 0.6)
     one, two = (extrapolated(0.8, 0.6, doublings) for doublings in (1, 2))
     assert math.log(0.6 / one) == pytest.approx(PERSISTENCE * gain)
@@ -43,14 +43,14 @@ def test_fits_several_doublings_apart_follow_the_same_law() -> None:
     assert extrapolated(0.8, 0.6, 5, persistence=0.9) < end < extrapolated(0.8, 0.6, 5, persistence=0.4)
 
 
-def test_what_pilots_do_not_show_is_not_promised() -> None:
+def test_forecasts_never_exceed_what_pilots_show() -> None:
     assert extrapolated(0.5, 0.6, 3) == 0.6
     assert extrapolated(0.8, 0.6, -2) == 0.6
     assert extrapolated(0.1, -0.01, 3) == -0.01
 
 
 @pytest.mark.parametrize("options", [{"time": "3s"}, {"steps": 12}])
-def test_a_forecast_is_of_the_fit_that_follows(
+def test_a_forecast_matches_the_fit_that_follows(
     shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: dict[str, object]
 ) -> None:
     monkeypatch.setattr(module, "PILOT_SECONDS", (0.05, 0.1))
@@ -75,7 +75,7 @@ def test_a_forecast_is_of_the_fit_that_follows(
         assert found.bytes < size < found.bytes + 20480
 
 
-def test_errors_are_those_of_the_test_split_where_it_can_tell(
+def test_a_large_test_split_is_the_validation_set(
     shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its queries have more paths, but few of them say less than what was held out."""
@@ -94,7 +94,7 @@ def test_errors_are_those_of_the_test_split_where_it_can_tell(
     assert looked_at(write_data(tmp_path / "enough", parallax, train=6000, test=30))[0] == "test"
 
 
-def test_a_fit_tells_the_error_of_the_queries_that_it_says(shards: Path, tmp_path: Path) -> None:
+def test_the_last_validation_is_the_error_of_the_fit(shards: Path, tmp_path: Path) -> None:
     """All test queries are looked at here, so the last look is the fit's error itself."""
     config = FitConfig.model_validate({"training": {"batch": 500, "steps": 12, "energy_calibration": False}})
     found = fit(config, shards, tmp_path / "material")
@@ -105,7 +105,7 @@ def test_a_fit_tells_the_error_of_the_queries_that_it_says(shards: Path, tmp_pat
 
 
 @pytest.mark.parametrize(("most", "step"), [(5000, 1), (2000, 1), (1999, 2), (150, 14)])
-def test_a_glance_is_of_all_parts(most: int, step: int) -> None:
+def test_the_validation_subset_is_spread_evenly(most: int, step: int) -> None:
     u = np.arange(2000.0, dtype=np.float32)[:, None].repeat(2, 1)
     three = u[:, :1].repeat(3, 1)
     queries = ShardQueries(u, u[:, 0], three, three, three, three)

@@ -41,7 +41,7 @@ def often(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("memory", ["1GB", "1kB"])
-def test_killed_at_random_steps_it_ends_with_the_same_bits(
+def test_a_fit_killed_at_random_steps_ends_with_the_same_bits(
     shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, often: None, memory: str
 ) -> None:
     whole = fit(config(), shards, tmp_path / "whole")

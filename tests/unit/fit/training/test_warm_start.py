@@ -34,7 +34,7 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return write_images(folder / "d", parallax, train=40), folder / "m"
 
 
-def test_textures_and_offset_are_taken_over_and_the_decoder_is_not(
+def test_textures_and_offset_are_copied_and_the_decoder_is_not(
     folders: tuple[Path, Path], tmp_path: Path
 ) -> None:
     images, start = folders
@@ -60,7 +60,7 @@ def test_textures_and_offset_are_taken_over_and_the_decoder_is_not(
     assert not torch.allclose(weights["own"]["pyramid.3"], weights["taken"]["pyramid.3"], atol=0.01)
 
 
-def test_another_material_to_start_from_is_another_fit(folders: tuple[Path, Path], tmp_path: Path) -> None:
+def test_another_initial_material_is_another_fit(folders: tuple[Path, Path], tmp_path: Path) -> None:
     images, _ = folders
     shuffled = write_data(tmp_path / "s", parallax, train=1000)
     fit(config("neumip", None), shuffled, tmp_path / "first")
@@ -75,7 +75,7 @@ def test_another_material_to_start_from_is_another_fit(folders: tuple[Path, Path
 @pytest.mark.parametrize(
     ("network", "lost"), [({"channels": 5}, "pyramid.0"), ({"offset": "direct"}, "offset_network")]
 )
-def test_other_textures_are_refused_with_the_cure(
+def test_other_textures_are_refused_with_a_hint(
     folders: tuple[Path, Path], tmp_path: Path, network: dict[str, Any], lost: str
 ) -> None:
     images, start = folders

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from support.datasets import edit, write_dataset
 
-from mbtf_core.atomic import digest
+from mbtf_core.digest import file_sha256
 from mbtf_core.errors import InputError
 from mbtf_gen.dataset.shard_io import read_shard, write_shard
 from mbtf_gen.dataset.verify import is_finished, shard_fault, sidecar_of, verify
@@ -136,7 +136,7 @@ def test_wrong_rows_and_bad_numbers_are_found_behind_a_true_digest(copy: Path) -
 
     def replace(arrays: dict[str, Any]) -> str:
         write_shard(path, arrays)
-        edit(sidecar_of(path), lambda r: r.update(bytes=path.stat().st_size, sha256=digest(path)))
+        edit(sidecar_of(path), lambda r: r.update(bytes=path.stat().st_size, sha256=file_sha256(path)))
         return faults(copy).get(path.name, "nothing")
 
     assert replace(intact) == "nothing"
@@ -144,7 +144,7 @@ def test_wrong_rows_and_bad_numbers_are_found_behind_a_true_digest(copy: Path) -
     for bad in (np.nan, np.inf):
         spoilt = intact["value_b"].copy()
         spoilt[7, 1] = bad
-        assert replace({**intact, "value_b": spoilt}) == "holds NaN or infinite numbers in 'value_b'"
+        assert replace({**intact, "value_b": spoilt}) == "has NaN or infinite values in 'value_b'"
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "{}", '{"format": "mbtf-shards"}'])
@@ -154,10 +154,10 @@ def test_a_broken_sidecar_is_a_fault_not_an_abort(copy: Path, text: str) -> None
     assert not is_finished(shard(copy), 40, "any")
 
 
-def test_a_shard_that_shows_other_effects_is_found(copy: Path) -> None:
-    edit(copy / "train-00001.json", lambda record: record.update(effects="0" * 64))
+def test_a_shard_of_another_plan_is_found(copy: Path) -> None:
+    edit(copy / "train-00001.json", lambda record: record.update(plan="0" * 64))
     found = [(f.file.partition(".")[0], f.what) for f in verify(copy)]
-    assert found == [("train-00001", "was made under another effects plan")]
+    assert found == [("train-00001", "was rendered with another plan")]
 
 
 def test_an_unfinished_manifest_is_found(copy: Path) -> None:

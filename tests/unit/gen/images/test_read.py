@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from support.image_files import exr, png, rng
 
+from mbtf_core.color import linear_to_srgb, srgb_to_linear
 from mbtf_core.errors import InputError
-from mbtf_gen.images.read import MAX_PIXELS, Image, gray, linear_to_srgb, read_image, srgb_to_linear
+from mbtf_gen.images.read import MAX_PIXELS, Image, gray, read_image
 
 
 @pytest.mark.parametrize(("color", "channels"), [(0, 1), (4, 2), (2, 3), (6, 4)])

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from PIL import Image
 from support.paths import ASSETS
 
+from mbtf_core.color import srgb_to_linear
 from mbtf_gen import load_material
-from mbtf_gen.images.read import srgb_to_linear
 
 # Material → does it state a constant beside its maps?
 MATERIALS = {

@@ -11,8 +11,8 @@ import pytest
 from numpy.typing import NDArray
 from support.paths import SHARED
 
+from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError
-from mbtf_gen.images.read import srgb_to_linear
 from mbtf_gen.material.discovery import normal_convention, role_of, tokens
 from mbtf_gen.material.material import load_material
 

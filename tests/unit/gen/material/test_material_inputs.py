@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from support.image_files import exr, png, rng
 
+from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError
-from mbtf_gen.images.read import srgb_to_linear
 from mbtf_gen.material.material import Material, load_material
 
 

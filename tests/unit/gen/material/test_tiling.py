@@ -124,7 +124,7 @@ class TestMaterial:
         )
         return tmp_path
 
-    def test_it_is_said_once_with_the_cure(self, folder: Path) -> None:
+    def test_it_is_said_once_with_the_hint(self, folder: Path) -> None:
         (warning,) = load_material(folder).warnings
         assert "height.png: does not tile along u and v: the seam is a step of 0.0" in warning
         assert "--make-tileable mirror" in warning
@@ -183,7 +183,7 @@ class TestMaterial:
             load_material(folder, "mirror")
 
     def test_size_is_bounded(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("mbtf_gen.material.tiling.MAX_PIXELS", 4 * 72 * 96 - 1)
+        monkeypatch.setattr("mbtf_gen.material.material.MAX_PIXELS", 4 * 72 * 96 - 1)
         with pytest.raises(InputError, match="more than 27,647 pixels"):
             load_material(folder, "mirror")
         assert load_material(folder, "blend").height.shape == (72, 96)
@@ -191,7 +191,7 @@ class TestMaterial:
 
 def test_jobs_use_it(tmp_path: Path) -> None:
     from mbtf_gen.config.generator import GeneratorConfig
-    from mbtf_gen.generation import Job
+    from mbtf_gen.job import Job
 
     path = save_heights(tmp_path / "h.png", cut(fractal(64, 64)))
     config = {"material": str(path), "geometry": {"make_tileable": "mirror"}}

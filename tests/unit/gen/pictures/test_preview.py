@@ -15,7 +15,7 @@ from mbtf_core.directions import from_angles
 from mbtf_core.errors import EngineError, InputError
 from mbtf_core.lattice import level_of_sigma, texel_centers
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.generation import Job
+from mbtf_gen.job import Job
 from mbtf_gen.material.material import Material
 from mbtf_gen.pictures.camera import Camera
 from mbtf_gen.pictures.preview import mesh
@@ -99,14 +99,8 @@ def test_a_large_mesh_is_drawn_coarser() -> None:
 
 def sample_of(count: int, seed: int = 0, **options: Any) -> QuerySample:
     config = GeneratorConfig.model_validate({"material": "m", "queries": {"train": str(count), **options}})
-    job = Job(config, material(), lattice=_lattice(config), config_hash="")
+    job = Job(config, material())
     return drawn(job)
-
-
-def _lattice(config: GeneratorConfig) -> Any:
-    from mbtf_core.lattice import Lattice
-
-    return Lattice.for_map(4, 8, config.queries.finest)
 
 
 @pytest.mark.parametrize("weights", [(0.6, 0.4), (1.0, 0.0), (0.0, 1.0)])

@@ -1,4 +1,4 @@
-"""Effects plan: what is asked for, what depends on what, and what a manifest keeps of it."""
+"""Effects plan: requests, dependencies between effects, and the manifest."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from mbtf_core.errors import UsageError
-from mbtf_gen.config.effects_request import EFFECTS, OF_RELIEF, EffectsRequest
+from mbtf_gen.config.effects_request import EFFECTS, RELIEF_EFFECTS, EffectsRequest
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.generation import Job
+from mbtf_gen.job import Job
 from mbtf_gen.material.material import Material
 from mbtf_gen.planning.effects import Effect, EffectsPlan
-from mbtf_gen.planning.effects_plan import plan_effects, simulated
+from mbtf_gen.planning.effects_plan import plan_effects, reference_plan
 
 HEIGHTS = np.array([[0.0, 0.1], [0.05, 0.02]])
 LAMBERT = Material(height=HEIGHTS, height_scale=1.0, height_bits=None, base_color=np.full(3, 0.5))
@@ -24,20 +24,20 @@ NORMAL = np.broadcast_to(np.float32([0.6, 0.0, 0.8]), (4, 4, 3))
 
 def job_of(material: Material, mode: str = "auto", **options: Any) -> Job:
     sections: dict[str, Any] = {"effects": {"mode": mode}, **options}
-    return Job.of(GeneratorConfig.model_validate({"material": "m", **sections}), material)
+    return Job(GeneratorConfig.model_validate({"material": "m", **sections}), material)
 
 
 def on(plan: EffectsPlan) -> set[str]:
     return {e.name for e in plan.effects if e.on}
 
 
-def test_a_plane_of_one_color_is_known_without_tracing() -> None:
+def test_a_plane_of_one_color_has_a_closed_form() -> None:
     for material in (FLAT, replace(LAMBERT, height=np.full((2, 2), 0.4))):
         plan = plan_effects(job_of(material))
         assert on(plan) == set()
         assert plan.closed_form
-        assert plan.cost == 0.0
-        assert all(e.known == "exact" for e in plan.effects)
+        assert plan.bias_bound == 0.0
+        assert all(e.reason == "exact" for e in plan.effects)
 
 
 @pytest.mark.parametrize(
@@ -50,59 +50,47 @@ def test_a_plane_of_one_color_is_known_without_tracing() -> None:
     ],
     ids=["pattern", "gloss", "normal map", "holes"],
 )
-def test_a_plane_with_more_on_it_is_not(change: dict[str, Any]) -> None:
+def test_other_planes_have_none(change: dict[str, Any]) -> None:
     plan = plan_effects(job_of(replace(FLAT, **change)))
     assert not plan.closed_form
-    assert not on(plan) & set(OF_RELIEF)
+    assert not on(plan) & set(RELIEF_EFFECTS)
 
 
-def test_black_is_known_whatever_the_relief() -> None:
+def test_black_has_a_closed_form_at_any_displacement() -> None:
     black = replace(LAMBERT, base_color=np.zeros(3))
     assert plan_effects(job_of(black)).closed_form
     # A black dielectric still has highlights, and black cloth still has holes.
     shiny = replace(black, roughness=0.5, specular=0.5, metallic=0.0)
-    assert not simulated(job_of(shiny)).closed_form
+    assert not reference_plan(job_of(shiny)).closed_form
     holes = replace(black, opacity=np.array([[1.0, 0.0], [1.0, 1.0]]))
     assert not plan_effects(job_of(holes, mode="-interreflection")).closed_form
 
 
-def test_all_and_none_force_everything_that_the_material_has() -> None:
+def test_all_and_none_switch_all_effects_of_the_material() -> None:
     everything = plan_effects(job_of(FLAT, "all"))
-    assert on(everything) == {*OF_RELIEF, "mis"}
+    assert on(everything) == {*RELIEF_EFFECTS, "bsdf_sampling"}
     assert not everything.closed_form
     nothing = plan_effects(job_of(replace(LAMBERT, roughness=0.5, specular=0.5, metallic=0.5), "none"))
     assert on(nothing) == set()
 
 
-def test_effects_can_be_asked_for_and_away() -> None:
-    plan = plan_effects(job_of(LAMBERT, "-interreflection,+mis"))
+def test_effects_can_be_forced_on_and_off() -> None:
+    plan = plan_effects(job_of(LAMBERT, "-interreflection,+bsdf_sampling"))
     assert not plan.on("interreflection")
-    assert plan.on("mis")
-    assert plan["interreflection"].reason.startswith("asked away")
+    assert plan.on("bsdf_sampling")
+    assert plan["interreflection"].reason == "forced"
+    assert plan["interreflection"].explanation.startswith("forced off")
     assert plan_effects(job_of(FLAT, "all,-shadowing")).on("shadowing") is False
 
 
-def test_what_needs_an_effect_goes_with_it() -> None:
-    assert on(plan_effects(job_of(LAMBERT, "-masking"))) == set()
+def test_effects_that_need_the_displaced_tile_are_off_without_it() -> None:
+    assert on(plan_effects(job_of(LAMBERT, "-parallax"))) == set()
     with pytest.raises(UsageError, match="'shadowing' needs 'parallax and masking'"):
-        plan_effects(job_of(LAMBERT, "-masking,+shadowing"))
+        plan_effects(job_of(LAMBERT, "-parallax,+shadowing"))
 
 
-def test_the_tile_repeats_by_construction() -> None:
-    with pytest.raises(UsageError, match="cannot be left out"):
-        plan_effects(job_of(LAMBERT, "-neighbors"))
-    low = plan_effects(job_of(LAMBERT, queries={"min_cos": 0.2}, light={"width": 0.0}), pilots=False)
-    # A relief of 0.1 seen from 11.5 degrees.
-    assert "up to 0.49 tiles" in low["neighbors"].reason
-    assert (
-        "any number"
-        in plan_effects(job_of(LAMBERT, queries={"min_cos": 0.01}), pilots=False)["neighbors"].reason
-    )
-    assert not plan_effects(job_of(FLAT)).on("neighbors")
-
-
-@pytest.mark.parametrize("name", ["specular", "metallic", "coat", "sheen", "normal", "opacity", "fibers"])
-def test_what_a_material_lacks_cannot_be_asked_for(name: str) -> None:
+@pytest.mark.parametrize("name", ["specular", "metallic", "clearcoat", "sheen", "normal", "opacity"])
+def test_effects_that_the_material_lacks_cannot_be_forced_on(name: str) -> None:
     with pytest.raises(UsageError, match="the material has none"):
         plan_effects(job_of(LAMBERT, f"+{name}"))
     assert not plan_effects(job_of(LAMBERT, "all")).on(name)
@@ -110,23 +98,23 @@ def test_what_a_material_lacks_cannot_be_asked_for(name: str) -> None:
 
 @pytest.mark.parametrize("text", ["", "every", "+", "-depth", "none,shadowing", "+shadowing,auto"])
 def test_unknown_words_are_refused(text: str) -> None:
-    with pytest.raises(UsageError, match="is no effect"):
+    with pytest.raises(UsageError, match="is not an effect"):
         EffectsRequest.parse(text)
 
 
-def test_a_manifest_keeps_the_plan() -> None:
-    plan = simulated(job_of(LAMBERT, "-mis"))
+def test_a_plan_survives_the_manifest() -> None:
+    plan = reference_plan(job_of(LAMBERT, "-bsdf_sampling"))
     assert [e.name for e in plan.effects] == list(EFFECTS)
     assert EffectsPlan.from_manifest(plan.to_manifest()) == plan
 
 
-def test_costs_add_up_over_what_is_left_out() -> None:
+def test_bias_bounds_add_up_over_what_is_off() -> None:
     effects = (
-        Effect("masking", True, "", 0.5),
+        Effect("parallax", True, "", 0.5),
         Effect("shadowing", False, "", 0.001),
-        Effect("mis", False, "", 0.002),
+        Effect("bsdf_sampling", False, "", 0.002),
     )
-    assert EffectsPlan(effects).cost == pytest.approx(0.003)
+    assert EffectsPlan(effects).bias_bound == pytest.approx(0.003)
 
 
 def test_a_depth_limit_is_kept() -> None:
@@ -136,64 +124,70 @@ def test_a_depth_limit_is_kept() -> None:
     assert (plan.on("interreflection"), plan.max_depth) == (True, 3)
 
 
-def test_a_small_run_is_not_looked_at_twice() -> None:
-    """What no theory decides stays on, without a cost."""
+def test_a_small_run_has_no_pilot() -> None:
+    """Effects without a bound from theory stay on."""
     plan = plan_effects(job_of(replace(LAMBERT, base_color=np.full(3, 0.05))), pilots=False)
-    assert on(plan) == set(OF_RELIEF)
-    assert (plan["interreflection"].cost, plan["masking"].cost, plan.max_depth) == (None, None, 0)
+    assert on(plan) == set(RELIEF_EFFECTS)
+    assert (plan["interreflection"].bias_bound, plan["parallax"].bias_bound, plan.max_depth) == (
+        None,
+        None,
+        0,
+    )
     assert plan_effects(job_of(FLAT), pilots=False).closed_form
 
 
 COAT: dict[str, Any] = {"clearcoat": 1.0, "clearcoat_roughness": 0.1}
 
 
-def test_black_under_a_coat_is_not_black() -> None:
+def test_black_under_a_clearcoat_is_not_black() -> None:
     black = replace(LAMBERT, base_color=np.zeros(3), **COAT)
     plan = plan_effects(job_of(black), pilots=False)
     assert not plan.closed_form
-    assert on(plan) >= {*OF_RELIEF, "coat"}
+    assert on(plan) >= {*RELIEF_EFFECTS, "clearcoat"}
 
 
 GLOSS: dict[str, Any] = {"roughness": 0.5, "specular": 0.5, "metallic": 0.0}
 
 
 @pytest.mark.parametrize("more", [GLOSS, COAT, {**GLOSS, **COAT}, {"sheen": 1.0, "sheen_roughness": 0.3}])
-def test_costs_of_lambert_are_not_stated_for_gloss(more: dict[str, Any]) -> None:
-    """Estimates shade Lambert; on anything else they would be wrong by any factor."""
+def test_bounds_for_lambert_do_not_apply_to_gloss(more: dict[str, Any]) -> None:
+    """They shade Lambert; on other surfaces their error has no limit."""
     stuff = replace(LAMBERT, normal=NORMAL, opacity=np.full((2, 2), 0.999), **more)
-    everything = dict.fromkeys(("masking", "shadowing", "normal", "opacity"))
+    everything = dict.fromkeys(("parallax", "shadowing", "normal", "opacity"))
     plan = plan_effects(job_of(stuff, transport={"max_depth": 1}, effects={"mode": "all"}))
-    assert {name: plan[name].cost for name in everything} == everything
+    assert {name: plan[name].bias_bound for name in everything} == everything
     lambert = replace(LAMBERT, normal=NORMAL, opacity=np.full((2, 2), 0.999))
     plan = plan_effects(job_of(lambert, transport={"max_depth": 1}))
-    assert all(plan[name].cost for name in everything)
+    assert all(plan[name].bias_bound for name in everything)
 
 
-def test_the_smoothest_place_decides_how_light_is_found() -> None:
-    """A light of one degree against lobes of 2α; Lambert needs no second way."""
+def test_the_smallest_roughness_decides_on_bsdf_sampling() -> None:
+    """A light of one degree against lobes of 2α; Lambert needs none."""
     dull = {"roughness": 0.6, "specular": 0.5, "metallic": 0.0}
     patch = np.full((8, 8), 0.6)
     patch[3, 3] = 0.02
-    assert not plan_effects(job_of(replace(FLAT, **dull))).on("mis")
-    assert plan_effects(job_of(replace(FLAT, **{**dull, "roughness": patch}))).on("mis")
-    assert plan_effects(job_of(replace(FLAT, **dull, clearcoat=1.0, clearcoat_roughness=0.05))).on("mis")
-    assert not plan_effects(job_of(FLAT, "+masking")).on("mis")
+    assert not plan_effects(job_of(replace(FLAT, **dull))).on("bsdf_sampling")
+    assert plan_effects(job_of(replace(FLAT, **{**dull, "roughness": patch}))).on("bsdf_sampling")
+    assert plan_effects(job_of(replace(FLAT, **dull, clearcoat=1.0, clearcoat_roughness=0.05))).on(
+        "bsdf_sampling"
+    )
+    assert not plan_effects(job_of(FLAT, "+parallax")).on("bsdf_sampling")
     sheen = {"sheen": 0.5, "sheen_roughness": 0.5}
-    assert not plan_effects(job_of(replace(FLAT, **sheen))).on("mis")
-    assert plan_effects(job_of(replace(FLAT, **{**sheen, "sheen_roughness": 0.05}))).on("mis")
+    assert not plan_effects(job_of(replace(FLAT, **sheen))).on("bsdf_sampling")
+    assert plan_effects(job_of(replace(FLAT, **{**sheen, "sheen_roughness": 0.05}))).on("bsdf_sampling")
 
 
 def test_the_configured_roulette_and_cap_reach_the_plan() -> None:
     plan = plan_effects(job_of(LAMBERT, transport={"roulette_depth": 7, "max_depth": 5}), pilots=False)
     assert (plan.roulette_depth, plan.max_depth) == (7, 5)
-    pictures = simulated(job_of(LAMBERT, "all,-shadowing"))
+    pictures = reference_plan(job_of(LAMBERT, "all,-shadowing"))
     assert not pictures.on("shadowing")
     assert pictures.max_depth == 0
 
 
-def test_a_bsdf_of_the_users_own_is_taken_as_it_is() -> None:
+def test_a_bsdf_of_the_user_cannot_be_switched() -> None:
     own = replace(LAMBERT, bsdf={"type": "diffuse"})
-    assert simulated(job_of(own, "none")).on("specular")
-    assert simulated(job_of(own, "+specular")).on("specular")
+    assert reference_plan(job_of(own, "none")).on("specular")
+    assert reference_plan(job_of(own, "+specular")).on("specular")
     with pytest.raises(UsageError, match="the material has none"):
-        simulated(job_of(own, "+metallic"))
+        reference_plan(job_of(own, "+metallic"))

@@ -10,7 +10,7 @@ from conftest import RunPython
 from numpy.typing import NDArray
 
 from mbtf_core.lattice import Lattice
-from mbtf_gen.planning.adaptive import DOUBT, MOST_CORRECTION, PRIOR_PATHS, correction, round_up, wanted_paths
+from mbtf_gen.planning.adaptive import DOUBT, MOST_CORRECTION, PRIOR_PATHS, correction, needed_paths, round_up
 from mbtf_gen.planning.sample_allocation import (
     FLOOR,
     Allocation,
@@ -99,8 +99,8 @@ def test_a_fit_that_does_not_converge_gives_even_counts(
     monkeypatch.setattr("mbtf_gen.planning.sample_allocation._STEPS", 2)
     allocation = fit_allocation(q, found, SPP, 12)
     assert caplog.messages == [
-        "the fit of the tile mean over directions did not converge; taken to be constant",
-        "the fit of the noise over queries did not converge; expected to be the same for all",
+        "the fit of the tile mean over directions did not converge; a constant is used",
+        "the fit of the noise over queries did not converge; a constant is used",
     ]
     assert (allocation.counts(q, 12) == 12).all()
     difference = found.value_a.astype(np.float64) - found.value_b
@@ -117,7 +117,7 @@ def test_expected_deviations_and_means_follow_the_pilot(fitted: Allocation) -> N
     assert fitted.tile_mean(q) / (0.2 * q.omega_o[:, 2]) == pytest.approx(np.ones(4000), rel=0.35)
 
 
-def test_counts_are_powers_of_two_about_the_wanted_mean(fitted: Allocation) -> None:
+def test_counts_are_powers_of_two_about_the_needed_mean(fitted: Allocation) -> None:
     q = some_queries(shard=2)
     for spp in (SPP, 256):
         counts = fitted.counts(q, spp)
@@ -149,7 +149,7 @@ def test_counts_of_a_query_do_not_depend_on_the_others(fitted: Allocation) -> No
 CODE = """
 import hashlib, json, sys
 import numpy as np
-from mbtf_gen.planning.adaptive import round_up, wanted_paths
+from mbtf_gen.planning.adaptive import round_up, needed_paths
 from mbtf_gen.planning.sample_allocation import Allocation
 from mbtf_gen.render.estimates import Estimates
 from mbtf_core.lattice import Lattice
@@ -161,9 +161,9 @@ rng = np.random.Generator(np.random.Philox(5))
 a, b, v = (0.3 * rng.random((n, k), dtype=np.float32) for k in (3, 3, 1))
 pilot = Estimates(a, b, None, 0, 0, 0, 0, path_variance=v[:, 0])
 expected = allocation.deviation(q), allocation.tile_mean(q)
-wanted, scale = wanted_paths(pilot, 16, *expected, 0.05)
+needed, scale = needed_paths(pilot, 16, *expected, 0.05)
 h = hashlib.sha256()
-for array in (*expected, wanted, scale, allocation.counts(q, 16), round_up(wanted, 1000)):
+for array in (*expected, needed, scale, allocation.counts(q, 16), round_up(needed, 1000)):
     h.update(array.tobytes())
 found = np.show_config(mode="dicts")["SIMD Extensions"].get("found", [])
 print(json.dumps({"found": found, "digest": h.hexdigest()}))
@@ -203,8 +203,8 @@ def test_no_noise_and_little_noise() -> None:
 
 
 def test_counts_under_a_target_are_rounded_up() -> None:
-    wanted = np.array([0.0, 2.0, 2.1, 4.1, 6.0, 6.1, 9.0, 12.1, 500.0, 1e9])
-    assert round_up(wanted, 1000).tolist() == [2, 2, 4, 6, 6, 8, 12, 16, 512, 1000]
+    needed = np.array([0.0, 2.0, 2.1, 4.1, 6.0, 6.1, 9.0, 12.1, 500.0, 1e9])
+    assert round_up(needed, 1000).tolist() == [2, 2, 4, 6, 6, 8, 12, 16, 512, 1000]
 
 
 def test_paths_for_a_target_error() -> None:
@@ -212,15 +212,15 @@ def test_paths_for_a_target_error() -> None:
     value = np.array([0.1, 2.0, 0.0, 0.1], np.float32)[:, None].repeat(3, axis=1)
     variance = np.array([0.01, 0.01, 0.0, 0.01], np.float32)
     found = Estimates(value, value, None, 0, 0, 0, 0, path_variance=variance)
-    wanted, scale = wanted_paths(found, 16, np.full(n, 0.1), np.array([0.2, 0.2, 0.2, 0.0]), 0.05)
+    needed, scale = needed_paths(found, 16, np.full(n, 0.1), np.array([0.2, 0.2, 0.2, 0.0]), 0.05)
     # The tile mean, or a value that is well above it.
     assert scale == pytest.approx([0.2, 2.0, 0.2, 0.1], rel=0.15)
     # Where pilot and expectation agree, the variance over the square of what is allowed.
     shrunken = 2.0 - DOUBT * 0.01 / 16 / 1.8
-    assert wanted[:2] == pytest.approx([0.01 / (0.05 * 0.2) ** 2, 0.01 / (0.05 * shrunken) ** 2])
+    assert needed[:2] == pytest.approx([0.01 / (0.05 * 0.2) ** 2, 0.01 / (0.05 * shrunken) ** 2])
     # A pilot that saw nothing does not overrule the expectation.
-    assert wanted[2] == pytest.approx(0.01 * PRIOR_PATHS / (15 + PRIOR_PATHS) / (0.05 * 0.2) ** 2)
-    assert wanted[3] == pytest.approx(0.01 / (0.05 * (0.1 - DOUBT * 0.01 / 16 / 0.1)) ** 2)
+    assert needed[2] == pytest.approx(0.01 * PRIOR_PATHS / (15 + PRIOR_PATHS) / (0.05 * 0.2) ** 2)
+    assert needed[3] == pytest.approx(0.01 / (0.05 * (0.1 - DOUBT * 0.01 / 16 / 0.1)) ** 2)
 
 
 def test_an_expectation_that_falls_short_of_the_pilots_is_raised() -> None:
@@ -247,8 +247,8 @@ def test_an_expectation_that_falls_short_of_the_pilots_is_raised() -> None:
     )
     assert found.path_variance is not None
     found.path_variance[:] = (1.5 * deviation) ** 2
-    wanted, _ = wanted_paths(found, 16, deviation, mean, 0.05)
-    assert wanted == pytest.approx(np.full(n, (1.5 * 0.3 / 0.05) ** 2), rel=1e-5)
+    needed, _ = needed_paths(found, 16, deviation, mean, 0.05)
+    assert needed == pytest.approx(np.full(n, (1.5 * 0.3 / 0.05) ** 2), rel=1e-5)
 
 
 def test_one_bright_path_of_a_pilot_allows_no_larger_error() -> None:
@@ -257,5 +257,5 @@ def test_one_bright_path_of_a_pilot_allows_no_larger_error() -> None:
     variance = np.array([paths.var(ddof=1)], np.float32)
     found = Estimates(value, value, None, 0, 0, 0, 0, path_variance=variance)
     for expected in (0.0, 0.5):
-        _, scale = wanted_paths(found, 16, np.array([expected]), np.array([0.2]), 0.05)
+        _, scale = needed_paths(found, 16, np.array([expected]), np.array([0.2]), 0.05)
         assert scale == pytest.approx([0.2], rel=1e-3)

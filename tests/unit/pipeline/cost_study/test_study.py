@@ -1,211 +1,253 @@
-"""Cost studies: what is measured is right where the answer is known, and nothing measured is lost."""
+"""Cost studies: within their time, resumable, never mixed with others; fronts and what follows from them."""
 
 from __future__ import annotations
 
 import csv
 import io
 import math
-from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
-from mbtf_pipeline.cost_study.seed_variance import seed_scatter, with_scatter
+from support.fake_runs import FakeRunner, run
+from support.paths import ROOT
 
 from mbtf_core.atomic import write_json
+from mbtf_core.errors import InputError
 from mbtf_core.stats import Estimate
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_pipeline.cost_study.measurements import Point, PointFolder
-from mbtf_pipeline.cost_study.page import half_widths, paths_slope
-from mbtf_pipeline.cost_study.pareto import marginal_price, pareto_front
+from mbtf_pipeline.cost_study import study as module
+from mbtf_pipeline.cost_study.measurements import Measurement, MeasurementFolder
+from mbtf_pipeline.cost_study.page import narrow_errors, noise_exponent
+from mbtf_pipeline.cost_study.pareto import extrapolation, pareto_front
+from mbtf_pipeline.cost_study.runs import Run
 from mbtf_pipeline.cost_study.tables import COLUMNS, to_csv
+from mbtf_pipeline.recipe import load_recipe
+from mbtf_pipeline.run_folder import machine
+
+RECIPE = ROOT / "pipelines" / "quickstart.yaml"
+ONE = Estimate(1.0, 0.1, 4)
 
 
-def test_the_slope_of_the_noise_is_that_of_its_variance() -> None:
-    one = Estimate(1.0, 0.0, 1)
-    points = [
-        Point("paths", "", "", {"queries.spp": n}, "", one, one, noise=Estimate(e, 0.01 * e, 9))
-        for n, e in ((n, 2.0 * n**-0.6) for n in (2, 8, 32))
-    ]
-    slope = paths_slope(points)
-    assert slope is not None
-    assert slope.value == pytest.approx(-1.2)
-    # All bars are alike, 2 % of the variance: that of the slope of a line.
-    assert slope.error == pytest.approx(0.02 / math.sqrt(2 * math.log(4) ** 2))
-    assert paths_slope(points[:2]) is None
+def point(seconds: float, error: float, study: str = "whole", **details: float) -> Measurement:
+    estimates = Estimate(seconds, 0.0, 1), Estimate(error, 0.01, 9)
+    return Measurement(study, "s", f"{seconds:g}", {}, "command", *estimates, details=details)
 
 
-def test_half_widths_are_those_of_95_percent() -> None:
-    # All bars are 0.01: 4 % of 0.5, 20 % of 0.1.
-    assert half_widths([point(1, 0.5), point(1, 0.1), point(1, 0.5, "seeds")]) == (1, 2)
+def test_the_front_holds_what_nothing_beats() -> None:
+    found = [(10, 0.5), (20, 0.6), (20, 0.4), (40, 0.4), (80, 0.1), (5, math.nan), (90, 0.2)]
+    front = pareto_front([point(*pair) for pair in found])
+    assert [(m.seconds.value, m.error.value) for m in front] == [(10, 0.5), (20, 0.4), (80, 0.1)]
 
 
-def point(seconds: float, error: float, study: str = "chain", **details: float) -> Point:
-    return Point(
-        study,
-        "s",
-        f"{seconds:g}",
-        {},
-        "command",
-        Estimate(seconds, 0.0, 1),
-        Estimate(error, 0.01, 9),
-        details=details,
-    )
+def test_the_extrapolation_follows_the_end_of_the_front() -> None:
+    """A front that starts steeply and ends with the power of one half: half the error takes four times as
+    long, three times as much more."""
+    front = [point(t, 0.2 * (t / 20) ** -2) for t in (5.0, 10.0)]
+    front += [point(t, 0.2 * (t / 20) ** -0.5) for t in (20.0, 40.0, 80.0)]
+    found = extrapolation(front)
+    assert found is not None
+    assert found[0] == pytest.approx(3 * 80.0)
+    assert found[1].value == pytest.approx(0.5)
+    assert found[1].error > 0
+    assert extrapolation(front[:2]) is None
+    # Nothing is promised where the error bars allow no progress.
+    assert extrapolation([point(t, e) for t, e in ((20.0, 0.2), (40.0, 0.199), (80.0, 0.198))]) is None
 
 
-def test_front_holds_what_nothing_beats() -> None:
-    points = [
-        point(10, 0.5),
-        point(20, 0.6),
-        point(20, 0.4),
-        point(40, 0.4),
-        point(80, 0.1),
-        point(5, math.nan),
-    ]
-    assert [(p.seconds.value, p.error.value) for p in pareto_front(points)] == [
-        (10, 0.5),
-        (20, 0.4),
-        (80, 0.1),
-    ]
+def test_the_noise_exponent_is_that_of_the_variance() -> None:
+    def paths(n: int, noise: float) -> Measurement:
+        estimate = Estimate(noise, 0.01 * noise, 9)
+        options = {"queries.spp": n}
+        return Measurement("paths", "uniform", "", options, "", ONE, estimate, noise=estimate)
+
+    found = [paths(n, 2.0 * n**-0.6) for n in (2, 8, 32)]
+    exponent = noise_exponent(found)
+    assert exponent is not None
+    assert exponent.value == pytest.approx(-1.2)
+    # The slope of a line through equal errors of 2 % of the variance.
+    assert exponent.error == pytest.approx(0.02 / math.sqrt(2 * math.log(4) ** 2))
+    assert noise_exponent(found[:2]) is None
 
 
-def test_price_of_half_the_error_follows_a_power_law() -> None:
-    front = [point(t, 2.0 * t**-0.5) for t in (10.0, 20.0, 40.0, 80.0)]
-    price = marginal_price(front)
-    assert price is not None
-    # At a power of one half, half the error takes four times as long: three times as much more.
-    assert price[0] == pytest.approx(3 * 80.0)
-    assert price[1].value == pytest.approx(0.5)
-    assert marginal_price(front[:2]) is None
+def test_narrow_errors_are_those_of_95_percent() -> None:
+    # All error bars are 0.01: 4 % of 0.5, 20 % of 0.1.
+    assert narrow_errors([point(1, 0.5), point(1, 0.1)]) == (1, 2)
 
 
-def test_the_price_of_more_is_that_of_the_front_s_end() -> None:
-    """A front that starts steeply, by the square, and ends with the power of a quarter."""
-    late = [(24.0, 0.115), (60.0, 0.115 * 2.5**-0.25), (120.0, 0.115 * 5**-0.25)]
-    front = [point(t, 0.115 * (t / 24) ** -2) for t in (8.0, 10.0, 14.0)] + [point(*p) for p in late]
-    price = marginal_price(front)
-    assert price is not None
-    assert price[1].value == pytest.approx(0.25)
-    assert price[0] == pytest.approx(15 * 120.0)
-    # What the bars do not tell from standing still is promised nothing.
-    assert marginal_price([point(t, e) for t, e in ((20.0, 0.2), (40.0, 0.199), (80.0, 0.198))]) is None
-    unknown = [replace(p, error=replace(p.error, error=math.inf)) for p in front]
-    assert marginal_price(unknown) is None
-
-
-def test_points_come_back_and_damaged_ones_are_measured_again(tmp_path: Path) -> None:
-    store = PointFolder(tmp_path, {"config": "abc"})
-    kept = Point(
-        "mesh", "mesh", "64 cells", {"geometry.mesh": 64}, "mbtf-gen …", Estimate(1.5, 0.1, 7),
-        Estimate(0.2, 0.01, 100), Estimate(0.1, math.inf, 100), None, {"bytes": 12.0},
-    )  # fmt: skip
+def test_measurements_come_back_and_damaged_ones_are_repeated(tmp_path: Path) -> None:
+    store = MeasurementFolder(tmp_path, {"config": "abc"})
+    error = Estimate(math.nan, math.inf, 100)
+    options = {"geometry.mesh": 64}
+    kept = Measurement("mesh", "mesh", "64 cells", options, "mbtf-gen", ONE, ONE, ONE, None, {"bytes": 12.0})
+    undefined = Measurement("models", "m", "5 s", {}, "", ONE, error)
     store.put({"changes": 1}, kept)
+    store.put({"n": 1}, undefined)
     assert store.get("mesh", {"changes": 1}) == kept
-    assert store.get("mesh", {"changes": 2}) is None
-    assert store.get("light", {"changes": 1}) is None
-    assert PointFolder(tmp_path, {"config": "abd"}).get("mesh", {"changes": 1}) is None
-    (path,) = store.folder.iterdir()
+    found = store.get("models", {"n": 1})
+    assert found is not None
+    assert math.isnan(found.error.value)
+    assert store.get("mesh", {"changes": 2}) is store.get("paths", {"changes": 1}) is None
+    assert MeasurementFolder(tmp_path, {"config": "abd"}).get("mesh", {"changes": 1}) is None
+    (path,) = store.folder.glob("mesh-*")
     path.write_text(path.read_text()[:-20])
     assert store.get("mesh", {"changes": 1}) is None
 
 
-def test_csv_holds_every_number_with_its_error() -> None:
+def test_the_csv_holds_every_number_with_its_error() -> None:
     rows = list(csv.DictReader(io.StringIO(to_csv([point(10, 0.5, bytes=3e5), point(20, math.nan)]))))
     assert tuple(rows[0]) == COLUMNS
     assert (rows[0]["seconds"], rows[0]["error"], rows[0]["error_se"]) == ("10", "0.5", "0.01")
-    assert rows[0]["bytes"] == "300000"
-    assert rows[0]["bias"] == rows[1]["error"] == ""
+    assert (rows[0]["bytes"], rows[0]["bias"], rows[1]["error"]) == ("300000", "", "")
 
 
-def chain(error: float, queries: int, study: str = "data", **more: Any) -> Point:
-    """A chain's point."""
-    five = Estimate(5.0, 0.0, 1)
-    setting = {"queries.train": str(queries), "queries.spp": 4, "training.time": "5s"}
-    return Point(study, "neumip", "a chain", setting | more, "", five, Estimate(error, 0.01, 9))
-
-
-@pytest.mark.parametrize("n", [3, 4, 9])
-def test_deviations_of_few_values_are_right_on_average(n: int) -> None:
-    from mbtf_pipeline.cost_study.seed_variance import _deviation
-
-    samples = np.random.default_rng(0).normal(size=(4000, n))
-    found = [_deviation(list(row)) for row in samples]
-    values = np.array([e.value for e in found])
-    assert abs(values.mean() - 1) < 4 * values.std() / math.sqrt(len(values))
-    # The bar is that of large samples, about.
-    assert 0.8 < np.mean([e.error for e in found]) / values.std() < 1.3
-
-
-def test_bars_of_chains_hold_the_scatter_of_seeds() -> None:
-    few, many = (0.22, 0.18, 0.21), (0.101, 0.099, 0.1)
-    points = [chain(0.2, 100), chain(0.1, 1600), chain(0.4, 400, "chain"), point(8, 0.3, "paths")]
-    seeds = [
-        chain(e, queries, "seeds", seed=n)
-        for queries, errors in ((100, few), (1600, many))
-        for n, e in enumerate(errors, start=1)
-    ]
-    scatter = seed_scatter([*points, *seeds])
-    assert scatter is not None
-    assert (scatter.spp, scatter.queries) == (4, (100, 1600))
-    # A sample's deviation is low by 8 % on average for four values.
-    deviations = [np.std(np.log(errors), ddof=1) / 0.9213 for errors in ((0.2, *few), (0.1, *many))]
-    assert [e.value for e in scatter.deviations] == pytest.approx(deviations, rel=1e-4)
-    # Half-way in the logarithm of the size, and no further than at its ends.
-    middle = np.mean(deviations)
-    assert scatter.of(points[2]) == pytest.approx(middle, rel=1e-4)
-    ends = [scatter.of(chain(0.3, n)) for n in (1, 10**8)]
-    assert ends == pytest.approx(deviations, rel=1e-4)
-    # Half of the paths per query are half of the data; twice as many for half as many queries are so too.
-    other = [chain(0.3, n, **{"queries.spp": spp}) for n, spp in ((800, 2), (400, 8))]
-    assert [scatter.of(p) for p in other] == pytest.approx([middle, middle], rel=1e-4)
-    assert scatter.describe().endswith("% at 0.0016 M queries × 4")
-    widened = with_scatter([*points, *seeds], scatter)
-    assert widened[2].error.error == pytest.approx(math.hypot(0.01, 0.4 * middle), rel=1e-4)
-    # The generator's errors are not those of fits.
-    assert widened[3] == points[3]
-    # Another setting's error is no part of it, and two values are too few to tell.
-    other = [chain(9.0, 100, **{"training.time": "9s"}), chain(9.0, 100, "fit")]
-    assert seed_scatter([*points, *seeds, *other]) == scatter
-    assert seed_scatter([points[0], seeds[0]]) is None
-    assert with_scatter([points[0], seeds[0]], None) == [points[0], seeds[0]]
-
-
-def test_a_study_of_a_folder_with_something_else_in_it_is_refused(tmp_path: Path) -> None:
-    from mbtf_core.errors import InputError
-    from mbtf_pipeline.cost_study.study import claim
-
+def test_folders_of_something_else_are_refused(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("")
     with pytest.raises(InputError, match="holds no cost study"):
-        claim(tmp_path)
+        module.claim(tmp_path)
+    folder = tmp_path / "study"
+    module.claim(folder)
+    record = {"format": module.STUDY_FORMAT, "schema": module.STUDY_SCHEMA, "machine": machine()}
+    changes: list[tuple[dict[str, Any], str | None]] = [
+        ({}, None),
+        ({"machine": {"system": "Plan 9"}}, r"another kind of machine .Plan 9; this is "),
+        ({"schema": 1}, "schema version 1"),
+    ]
+    for change, message in changes:
+        write_json(folder / module.STUDY_NAME, {**record, **change})
+        if message is None:
+            module.claim(folder)
+        else:
+            with pytest.raises(InputError, match=message):
+                module.claim(folder)
 
 
-def test_seconds_of_two_machines_are_not_mixed(tmp_path: Path) -> None:
-    from mbtf_core.errors import InputError
-    from mbtf_pipeline.cost_study import study
-    from mbtf_pipeline.run_folder import machine
-
-    claim_here = study.claim
-    claim_here(tmp_path / "new")
-    known = {"format": study.STUDY_FORMAT, "machine": machine()}
-    write_json(tmp_path / "new" / study.STUDY_NAME, known)
-    claim_here(tmp_path / "new")
-    known["machine"] = {"system": "Plan 9, 64 processors"}
-    write_json(tmp_path / "new" / study.STUDY_NAME, known)
-    with pytest.raises(InputError, match=r"another kind of machine .Plan 9, 64 processors; this is "):
-        claim_here(tmp_path / "new")
-
-
-def test_studies_count_paths_whatever_the_recipe_aims_at() -> None:
-    """With a target error all numbers of paths would be one setting; and fits learn from single queries."""
-    from mbtf_pipeline.cost_study.study import studied
-
-    queries = {"target_error": "5%", "layout": "image", "patch_size": 8, "spp": 6}
+def test_studies_vary_paths_whatever_the_recipe_sets() -> None:
+    queries = {"target_error": "5%", "layout": "image", "window": 8, "spp": 6}
     config = GeneratorConfig.model_validate({"material": "m", "seed": 3, "queries": queries})
-    found = studied(config, None)
+    found = module.study_config(config, None)
     assert found.queries.target_error is None
     assert (found.queries.layout, found.queries.spp, found.seed) == ("shuffled", 6, 3)
-    assert studied(config, 7).seed == 7
-    # A recipe without either is studied as it stands, and so finds the points that were measured of it.
-    plain = GeneratorConfig(material="m")
-    assert studied(plain, None) == plain
+    assert module.study_config(config, 7).seed == 7
+
+
+class Clock:
+    """Time that passes as runs take it."""
+
+    now = 0.0
+
+    def perf_counter(self) -> float:
+        return self.now
+
+    def strftime(self, form: str) -> str:
+        return "2001-02-03"
+
+
+RUNS = [run("whole", 3000, "long", 7200.0), run("whole", 2000, "short", 60.0), run("models", 1000, "m", 30.0)]
+
+
+@pytest.fixture
+def runners(monkeypatch: pytest.MonkeyPatch) -> list[FakeRunner]:
+    """Studies of one configuration of the generator and three runs, of which the first takes too long."""
+    found: list[FakeRunner] = []
+    clock = Clock()
+
+    class Runner(FakeRunner):
+        def __init__(self, config: Any, *_: Any) -> None:
+            super().__init__(seeds=0.5)
+            self.config = config
+            found.append(self)
+
+        def measure(self, run: Run) -> Measurement:
+            clock.now += self.expected_seconds(run)
+            return super().measure(run)
+
+    result = Measurement("paths", "uniform", "4", {"queries.spp": 4}, "", ONE, ONE, None, ONE)
+    task = SimpleNamespace(
+        study="paths",
+        series="uniform",
+        name="4",
+        label="paths: uniform, 4",
+        key={},
+        run=lambda *_: result,
+        command=lambda generator: generator,
+    )
+    monkeypatch.setattr(module, "time", clock)
+    monkeypatch.setattr(module, "RunRunner", Runner)
+    monkeypatch.setattr(module, "generator_tasks", lambda benchmark: [task])
+    monkeypatch.setattr(module, "query_seconds", lambda *_: lambda paths: 1e-9)
+    monkeypatch.setattr(module, "_check_variation", lambda benchmark: None)
+    monkeypatch.setattr(module, "planned_runs", lambda *_: RUNS)
+    return found
+
+
+def test_a_study_keeps_its_time_and_resumes(runners: list[FakeRunner], tmp_path: Path) -> None:
+    recipe, folder = load_recipe(RECIPE, []), tmp_path / "study"
+    # 60 + 60 s of whole runs, and one of models, 30 s.
+    first = module.run_study(recipe, folder, seconds=155.0)
+    assert [m.details.get("seeds") for m in first.measurements] == [None, 2, 1]
+    assert sum(r.fit["training"]["time"] for r in runners[0].measured) <= 155.0
+    assert first.skipped == ["whole: neumip, long"]
+    assert first.deviation is not None
+    # The second seed of the models is missing; nothing else is measured again.
+    second = module.run_study(recipe, folder, seconds=155.0)
+    assert [(r.name, r.data.seed) for r in runners[1].measured] == [("m", 1)]
+    # Refining takes its own time: 60 s for a third seed of the shorter runs.
+    module.run_study(recipe, folder, seconds=155.0, refine=3600.0)
+    assert {r.data.seed for r in runners[2].measured} >= {2}
+    assert all(r.name != "long" for r in runners[2].measured)
+    assert module.time_of(folder) == 155.0
+    assert module.time_of(tmp_path / "none") == module.NEW_TIME
+    assert second.measurements[1].error.value == first.measurements[1].error.value
+
+
+def test_measurements_of_other_seeds_and_materials_are_not_mixed(
+    runners: list[FakeRunner], tmp_path: Path
+) -> None:
+    recipe = load_recipe(RECIPE, [])
+    wool = load_recipe(RECIPE, ["generate.material=assets/twisted_wool"])
+    for one, seed, measured in ((recipe, None, 4), (recipe, None, 0), (recipe, 7, 4), (wool, None, 4)):
+        module.run_study(one, tmp_path / "study", seconds=600.0, seed=seed)
+        assert len(runners[-1].measured) == measured
+        assert runners[-1].config.seed == (seed or 0)
+
+
+def test_a_refused_study_leaves_the_folder_as_it_was(
+    runners: list[FakeRunner], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe, folder = load_recipe(RECIPE, []), tmp_path / "study"
+    module.run_study(recipe, folder, seconds=600.0)
+
+    def content() -> dict[Path, bytes]:
+        return {p: p.read_bytes() for p in folder.rglob("*") if p.is_file() and "lock" not in p.name}
+
+    before = content()
+
+    def refuse(benchmark: Any) -> None:
+        raise InputError("reflects nothing")
+
+    monkeypatch.setattr(module, "_check_variation", refuse)
+    with pytest.raises(InputError, match="reflects nothing"):
+        module.run_study(recipe, folder, seconds=60.0, seed=5)
+    assert content() == before
+
+
+def test_the_time_of_a_query_is_stored_and_linear_in_its_paths(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """0.6 µs to draw and write a query, 0.1 µs for each of its paths."""
+    calls: list[int] = []
+
+    def forecast(job: Any, plan: Any, seconds: float) -> Any:
+        calls.append(job["queries.spp"])
+        return SimpleNamespace(query_seconds=6e-7 + 1e-7 * job["queries.spp"])
+
+    monkeypatch.setattr("mbtf_gen.forecast.forecast", forecast)
+    monkeypatch.setattr("mbtf_gen.planning.effects_plan.plan_effects", lambda job: None)
+    benchmark: Any = SimpleNamespace(job=lambda options: options)
+    store = MeasurementFolder(tmp_path, {})
+    for _ in range(2):
+        seconds = module.query_seconds(benchmark, store)
+        assert [seconds(n) for n in (4, 64)] == pytest.approx([1e-6, 7e-6])
+    assert len(calls) == 2

@@ -1,0 +1,92 @@
+"""Output folders: new, empty, resumed, or refused.
+
+A command writes its record first, such as ``manifest.json``: the folder is then its own, whatever instant the
+process is killed at.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Container, Mapping
+from pathlib import Path
+from typing import Any
+
+from mbtf_core.atomic import TEMPORARY, remove_file
+from mbtf_core.config_file import differences, in_short
+from mbtf_core.errors import InputError
+
+ELSEWHERE = "choose another folder with -o"
+
+
+def check_folder(folder: Path, is_ours: Callable[[Path], bool], what: str) -> bool:
+    """Does an output folder hold what a command resumes? False where it is missing or empty.
+
+    Parameters
+    ----------
+    folder : the output folder; temporary files and locks in it do not count
+    is_ours : does the folder hold a record of this kind?
+    what : what the record stands for, for the message
+
+    Raises
+    ------
+    InputError : it is a file, or holds something else
+    """
+    if folder.exists() and not folder.is_dir():
+        raise InputError("is a file, not a folder", where=folder)
+    empty = not folder.exists() or all(is_leftover(path.name) for path in folder.iterdir())
+    # Asked last: another process may write the record meanwhile.
+    if is_ours(folder):
+        return True
+    if not empty:
+        raise InputError(f"is not empty and holds no {what}", where=folder, hint=ELSEWHERE)
+    return False
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder and those above it, where they are missing.
+
+    Raises
+    ------
+    InputError : it cannot be made
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot be made ({error.strerror})", where=folder) from None
+
+
+def other_configuration(
+    folder: Path, what: str, old: Mapping[str, Any], new: Mapping[str, Any], otherwise: str = "inputs differ"
+) -> InputError:
+    """The refusal of a folder that another configuration has filled.
+
+    Parameters
+    ----------
+    what : what the folder holds
+    old, new : plain data that decide the content: the folder's, and what is asked for
+    otherwise : the difference where these two have none
+    """
+    changes = in_short(differences(old, new)) or otherwise
+    return InputError(
+        f"holds {what} of another configuration: {changes}",
+        where=folder,
+        hint=f"{ELSEWHERE}, or replace it with --overwrite",
+    )
+
+
+def is_leftover(name: str) -> bool:
+    """Is this the name of a temporary file or a lock, such as a killed process leaves?"""
+    return re.fullmatch(rf"\..+(?:{TEMPORARY}|\.lock)", name) is not None
+
+
+def remove_unfinished(folder: Path, names: Container[str]) -> None:
+    """Remove the temporary files that killed processes left of the files `names`.
+
+    Raises
+    ------
+    PartialError : the folder cannot be written
+    """
+    for path in list(folder.iterdir()):
+        match = re.fullmatch(rf"\.(.+?){TEMPORARY}", path.name)
+        if match is not None and match[1] in names:
+            remove_file(path)

@@ -1,0 +1,196 @@
+"""A data set to generate: configuration, material, and the queries and shards that follow from both."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from mbtf_core.errors import UsageError
+from mbtf_core.lattice import Lattice
+from mbtf_core.shard_schema import SPLITS, ShardEntry, Split
+from mbtf_gen.config.generator import GeneratorConfig, count_queries
+from mbtf_gen.geometry.heightfield import HeightGrid
+from mbtf_gen.material.material import Material, load_material
+from mbtf_gen.render.estimates import TARGET_PILOT_SPP, Target
+from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
+
+log = logging.getLogger(__name__)
+
+# Neither folders nor manifests are usable with more.
+MAX_SHARD_FILES = 1_000_000
+
+
+@dataclass(frozen=True)
+class Job:
+    """A configuration with its material loaded: everything that determines the data.
+
+    Parameters
+    ----------
+    config : GeneratorConfig
+        All options.
+    material : Material
+        The maps that ``config.material`` names, loaded.
+
+    Attributes
+    ----------
+    lattice : Lattice
+        Texel grids of the levels.
+    config_hash : str
+        SHA-256 of the options and of the contents of the input files, hexadecimal.
+    grid : HeightGrid
+        Heights of the mesh, in tile widths.
+    query_plan : QueryPlan
+        Samples the queries of any shard.
+    shards : tuple of ShardEntry
+        All shards of all splits, the training split first.
+    """
+
+    config: GeneratorConfig
+    material: Material
+
+    @classmethod
+    def prepare(cls, config: GeneratorConfig) -> Job:
+        """Load the material of a configuration and log its notes and warnings.
+
+        Parameters
+        ----------
+        config : GeneratorConfig
+            All options.
+
+        Returns
+        -------
+        Job
+
+        Raises
+        ------
+        InputError
+            The material cannot be used.
+        """
+        job = cls(config, load_material(Path(config.material), config.geometry.make_tileable))
+        for note in job.material.notes:
+            log.info(note)
+        for warning in job.material.warnings_at(config.geometry.height_scale):
+            log.warning(warning)
+        rows, columns = job.grid.z.shape
+        log.info(
+            "mesh: %d x %d cells, displacement range %.4g tile widths",
+            columns,
+            rows,
+            job.grid.displacement_range,
+        )
+        return job
+
+    @cached_property
+    def lattice(self) -> Lattice:
+        """Texel grids of the levels."""
+        rows, columns = self.material.height.shape
+        return Lattice.for_map(rows, columns, self.config.queries.finest)
+
+    @cached_property
+    def config_hash(self) -> str:
+        """SHA-256 of the options and of the contents of the input files."""
+        return self.config.hash(self.material.digests)
+
+    @cached_property
+    def grid(self) -> HeightGrid:
+        """Heights of the mesh."""
+        return self.material.grid(self.config.geometry.height_scale, self.config.geometry.mesh)
+
+    @cached_property
+    def query_plan(self) -> QueryPlan:
+        """Samples the queries of any shard.
+
+        Raises
+        ------
+        UsageError : all weights of the mixture are zero
+        """
+        queries = self.config.queries
+        try:
+            mixture = Mixture(queries.mixture.log_uniform, queries.mixture.finest)
+        except ValueError as error:
+            raise UsageError(str(error), where="queries.mixture") from None
+        return QueryPlan(
+            self.lattice,
+            mixture,
+            queries.min_cos,
+            queries.layout,
+            self.config.seed,
+            _shard_rows(self),
+            queries.patch_size,
+        )
+
+    @cached_property
+    def shards(self) -> tuple[ShardEntry, ...]:
+        """All shards, the training split first.
+
+        Raises
+        ------
+        UsageError : a split has more than ``MAX_SHARD_FILES``
+        """
+        return tuple(entry for split in SPLITS for entry in _shards(self, split))
+
+
+def row_queries(job: Job) -> int:
+    """Queries in one row of a shard: one, or those of an image."""
+    queries = job.config.queries
+    if queries.layout == "shuffled":
+        return 1
+    return job.lattice.texels() if queries.patch_size is None else queries.patch_size**2
+
+
+def _shard_rows(job: Job) -> int:
+    return max(1, job.config.output.shard_queries // row_queries(job))
+
+
+def _shards(job: Job, split: Split) -> list[ShardEntry]:
+    config = job.config
+    count = config.queries.train if split == "train" else config.queries.test
+    rows = math.ceil(count_queries(count, job.lattice.texels()) / row_queries(job))
+    size = _shard_rows(job)
+    if rows > size * MAX_SHARD_FILES:
+        raise UsageError(
+            f"{count} {split} queries are more than {MAX_SHARD_FILES} shards of {size}",
+            where="queries",
+            hint="reduce them, or raise output.shard_queries",
+        )
+    return [
+        ShardEntry(
+            split, index, f"{split}-{index:05d}.{config.output.format}", min(size, rows - index * size)
+        )
+        for index in range(math.ceil(rows / size))
+    ]
+
+
+def split_spp(config: GeneratorConfig, split: Split) -> int:
+    """Mean number of paths per query of a split, both halves together."""
+    return config.queries.spp if split == "train" else config.queries.test_spp
+
+
+def split_target(config: GeneratorConfig, split: Split) -> Target | None:
+    """Target error of a split; None where it has a number of paths."""
+    error = config.queries.target_error
+    return None if split != "train" or error is None else Target(error, config.queries.max_spp)
+
+
+def split_queries(job: Job, split: Split) -> int:
+    """Queries of a split; the image layout rounds up to whole images."""
+    return row_queries(job) * sum(entry.rows for entry in job.shards if entry.split == split)
+
+
+def planned_paths(job: Job, entries: Iterable[ShardEntry]) -> int:
+    """Paths of some shards; a target error may change them."""
+    return row_queries(job) * sum(entry.rows * split_spp(job.config, entry.split) for entry in entries)
+
+
+def most_paths(job: Job) -> int:
+    """Paths of the whole data set at most: under a target error the pilots and the cap count."""
+    total = 0
+    for split in SPLITS:
+        target = split_target(job.config, split)
+        spp = split_spp(job.config, split) if target is None else target.max_spp + TARGET_PILOT_SPP
+        total += split_queries(job, split) * spp
+    return total

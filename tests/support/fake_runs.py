@@ -1,0 +1,85 @@
+"""Runs of a cost study whose true errors and seed variance are known, and which take no time."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from mbtf_core.errors import InputError
+from mbtf_core.stats import Estimate
+from mbtf_pipeline.cost_study.measurements import Measurement
+from mbtf_pipeline.cost_study.runs import DataRequest, Run
+
+# Unexplained variance by comparison, its relative deviation over seeds, and that of the test set.
+TRUE = {"whole": 0.05, "models": 0.1, "data": 0.2}
+SEEDS, TEST = 0.1, 0.02
+
+
+def run(study: str = "whole", queries: int = 1000, name: str = "a run", seconds: float = 5.0) -> Run:
+    fit: dict[str, Any] = {"model": "neumip", "training": {"time": seconds}, "name": name}
+    return Run(study, "neumip", name, DataRequest(queries, 4), fit)
+
+
+class FakeRunner:
+    """Stands for :class:`mbtf_pipeline.cost_study.runs.RunRunner`: errors of normal seed deviation around the
+    truth, all shifted by the one error of the test set."""
+
+    def __init__(self, seeds: float = SEEDS, test: float = TEST, study_seed: int = 0) -> None:
+        self.random = np.random.default_rng(study_seed)
+        self.seeds, self.test = seeds, test
+        self.shift = 1 + test * self.random.normal()
+        self.measured: list[Run] = []
+        self.generated: list[DataRequest] = []
+        self.stored: set[DataRequest] = set()
+        # Names of runs that fail.
+        self.failing: set[str] = set()
+
+    def measure(self, run: Run) -> Measurement:
+        self.measured.append(run)
+        if run.data not in self.stored:
+            self.generated.append(run.data)
+            self.stored.add(run.data)
+        if run.name in self.failing:
+            raise InputError("training diverged at step 7")
+        error = TRUE[run.study] * self.shift * (1 + self.seeds * self.random.normal())
+        seconds = run.fit["training"]["time"]
+        total = seconds + run.data.queries * 1e-6
+        return Measurement(
+            run.study,
+            run.series,
+            run.name,
+            {},
+            self.command_of(run),
+            Estimate(seconds, 0.0, 1),
+            Estimate(error, self.test * error, 1000),
+            details={"total_seconds": total, "seed": float(run.data.seed)},
+        )
+
+    def expected_seconds(self, run: Run) -> float:
+        return float(run.fit["training"]["time"])
+
+    def command_of(self, run: Run) -> str:
+        return f"command of {run.label}"
+
+    def has(self, data: DataRequest) -> bool:
+        return data in self.stored
+
+    def forget(self, data: DataRequest) -> None:
+        self.stored.discard(data)
+
+    def clear(self) -> None:
+        self.stored.clear()
+
+
+class MemoryStore:
+    """Stands for :class:`mbtf_pipeline.cost_study.measurements.MeasurementFolder`."""
+
+    def __init__(self) -> None:
+        self.found: dict[str, Measurement] = {}
+
+    def get(self, study: str, key: dict[str, Any]) -> Measurement | None:
+        return self.found.get(f"{study} {key}")
+
+    def put(self, key: dict[str, Any], found: Measurement) -> None:
+        self.found[f"{found.study} {key}"] = found

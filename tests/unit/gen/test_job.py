@@ -1,0 +1,54 @@
+"""Jobs: shards, queries and paths that follow from a configuration."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mbtf_core.errors import UsageError
+from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.job import Job, most_paths, planned_paths, split_queries
+
+
+@pytest.fixture
+def heights(tmp_path: Path) -> Path:
+    np.save(tmp_path / "height.npy", np.random.default_rng(0).random((4, 8)))
+    return tmp_path / "height.npy"
+
+
+def job_of(heights: Path, **queries: Any) -> Job:
+    """A job of 100 training and 30 test queries on 4 x 8 texels, in shards of 40 queries."""
+    options = {"train": "100", "test": "30", "spp": 2, "test_spp": 4, **queries}
+    config = {"material": str(heights), "queries": options, "output": {"shard_queries": 40}}
+    return Job.prepare(GeneratorConfig.model_validate(config))
+
+
+def rows(job: Job, split: str = "train") -> list[tuple[str, int]]:
+    return [(entry.file, entry.rows) for entry in job.shards if entry.split == split]
+
+
+def test_shards_cover_the_rows(heights: Path) -> None:
+    job = job_of(heights)
+    assert rows(job) == [(f"train-{i:05d}.npz", n) for i, n in enumerate((40, 40, 20))]
+    assert rows(job, "test") == [("test-00000.npz", 30)]
+    # Image layout: whole images of 32 texels; 100 queries are four of them, one per shard.
+    assert [n for _, n in rows(job_of(heights, layout="image"))] == [1] * 4
+    # Patches of 9 texels: 100 queries are twelve of them, four per shard of 40 queries.
+    patches = job_of(heights, layout="image", patch_size=3)
+    assert [n for _, n in rows(patches)] == [4, 4, 4]
+    assert split_queries(patches, "train") == 108
+    assert sum(n for _, n in rows(job_of(heights, train="3/texel"))) == 96
+
+
+def test_too_many_shards_are_refused(heights: Path) -> None:
+    with pytest.raises(UsageError, match=r"shards of 40"):
+        _ = job_of(heights, train="1e12/texel").shards
+
+
+def test_most_paths_include_pilots_and_cap(heights: Path) -> None:
+    job = job_of(heights)
+    assert most_paths(job) == planned_paths(job, job.shards) == 320
+    assert most_paths(job_of(heights, target_error=0.02, max_spp=128)) == 100 * (128 + 16) + 30 * 4
