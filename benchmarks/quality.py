@@ -32,6 +32,7 @@ from typing import Any, get_args
 from mbtf_core.atomic import read_json, write_json
 from mbtf_core.config_file import resolve
 from mbtf_core.console import clock
+from mbtf_core.digest import data_sha256
 from mbtf_core.errors import InputError
 from mbtf_fit.config import FitConfig
 from mbtf_fit.presets import FITTER, best_at
@@ -39,7 +40,6 @@ from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.config.presets import GENERATOR, Quality, as_assignments
 from mbtf_pipeline.presets import COMPARE
 from mbtf_pipeline.run_folder import machine
-from mbtf_core.digest import data_sha256
 
 ROOT = Path(__file__).resolve().parents[1]
 TEXTURE_SETS = ROOT.parent / "shared" / "data" / "materials"
@@ -143,9 +143,7 @@ def run(name: str, quality: Quality, resolution: int, work: Path) -> MeasuredRun
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True)
     recipe, out = work / "recipe.yaml", work / "run"
-    text = RECIPE.format(
-        material=json.dumps(str(material)), resolution=resolution, height=json.dumps(height)
-    )
+    text = RECIPE.format(material=json.dumps(str(material)), resolution=resolution, height=json.dumps(height))
     recipe.write_text(text, encoding="utf-8")
     command = [sys.executable, "-m", "mbtf_pipeline", "run", str(recipe), "--quality", quality]
     command += ["-o", str(out), "--json", "--quiet"]

@@ -34,6 +34,7 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import inspect
 import json as json_module
 import logging
 import math
@@ -346,6 +347,14 @@ def _commands(app: App) -> list[str]:
     return [name for name in app if not name.startswith("-")]
 
 
+def _join_lines(app: App) -> None:
+    """Join the lines of each paragraph of the commands' help, so that the terminal's width breaks them."""
+    for command in (part.default_command for part in (app, *(app[name] for name in _commands(app)))):
+        text, rule, rest = (inspect.getdoc(command) or "").partition("\n\nParameters\n---")
+        if command is not None:
+            command.__doc__ = re.sub(r"(?<!\n)\n(?!\n)", " ", text) + rule + rest
+
+
 def _first_word(app: App, tokens: Sequence[str]) -> int | None:
     """Index of the first token that is neither a flag nor a flag's value, by the flags of all commands."""
     values: dict[str, int] = {}
@@ -417,6 +426,8 @@ def run(app: App, argv: Sequence[str] | None = None) -> int:
             # A terminal without our signs (Greek letters, ±) shows question marks instead of failing.
             stream.reconfigure(errors="replace")
     try:
+        if {"-h", "--help"} & set(tokens):
+            _join_lines(app)
         tokens = _command_first(app, _join_negative_pairs(tokens))
         with _ended_like_interrupted():
             result = app(tokens)

@@ -1,1 +1,1 @@
-"""Chain generation, fitting, comparison and reports."""
+"""Recipes: generation, fits, comparison and report in one command."""

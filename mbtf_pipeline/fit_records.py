@@ -1,4 +1,4 @@
-"""What a fit says about its own training."""
+"""Training history of a fit."""
 
 from __future__ import annotations
 
@@ -9,14 +9,16 @@ from typing import Any
 
 
 @dataclass(frozen=True)
-class History:
-    """Training over time.
+class TrainingHistory:
+    """Loss and error over training time.
 
     Attributes
     ----------
-    steps, batch : number of steps and queries per step
-    seconds : of training; device : it ran on; threads : of the processor
-    records : one per look at the error, as ``mbtf_fit.read_history`` gives them
+    steps, batch : number of steps, and queries per step
+    seconds : of training
+    device : PyTorch device
+    threads : of the CPU
+    records : one per validation, from ``mbtf_fit.read_history``
     """
 
     steps: int
@@ -28,22 +30,22 @@ class History:
 
     @property
     def samples(self) -> int:
-        """Queries trained on, repetitions counted."""
+        """Number of training queries, counting repetitions."""
         return self.steps * self.batch
 
     @property
     def samples_per_second(self) -> float:
-        """While training."""
+        """Mean rate during training."""
         return self.samples / max(self.seconds, 1e-9)
 
     @property
     def loss(self) -> list[tuple[float, float]]:
-        """(seconds, training loss, noise included)."""
+        """(seconds, training loss including noise)."""
         return [(r["seconds"], r["loss"]) for r in self.records if _finite(r["loss"])]
 
     @property
     def unexplained(self) -> list[tuple[float, float, float]]:
-        """(seconds, unexplained variance of the queries looked at, its standard error)."""
+        """(seconds, unexplained variance of the validation queries, its standard error)."""
         return [
             (r["seconds"], r["unexplained"], r["unexplained_error"])
             for r in self.records
@@ -55,17 +57,17 @@ def _finite(x: float | None) -> bool:
     return x is not None and math.isfinite(x)
 
 
-def read_training(folder: Path) -> History:
-    """History of the fit in a folder.
+def read_training(folder: Path) -> TrainingHistory:
+    """TrainingHistory of the fit in a folder.
 
     Raises
     ------
-    InputError : no material there
+    InputError : the folder contains no material
     """
     from mbtf_fit import Material, read_history
 
     training = Material.load(folder).description["training"]
-    return History(
+    return TrainingHistory(
         training["steps"],
         training["batch"],
         training["seconds"],

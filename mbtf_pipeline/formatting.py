@@ -1,4 +1,4 @@
-"""Measured numbers in the report's words."""
+"""Text of measured numbers in reports and tables."""
 
 from __future__ import annotations
 
@@ -8,67 +8,78 @@ from typing import Any
 
 from mbtf_core.stats import Estimate
 
-# A value within so many standard errors of zero is not told from zero.
-BAR = 2.0
-BELOW = "below two error bars"
+# A value is significant if it differs from zero by more than so many standard errors.
+SIGNIFICANT = 2.0
+NOT_SIGNIFICANT = "not significant"
 
 
 def estimate(record: Mapping[str, Any]) -> Estimate:
-    """An estimate read back from JSON, where numbers that are not finite are null."""
+    """An estimate read from JSON, where values that are not finite are null."""
     value, error = record["value"], record["error"]
     return Estimate(math.nan if value is None else value, math.inf if error is None else error, record["n"])
 
 
-def below_bar(e: Estimate) -> bool:
-    """Whether a value cannot be told from zero."""
-    return math.isfinite(e.value) and abs(e.value) <= BAR * e.error
+def is_significant(e: Estimate) -> bool:
+    """Whether a value differs from zero by more than two standard errors; values not finite count as such."""
+    return not math.isfinite(e.value) or abs(e.value) > SIGNIFICANT * e.error
 
 
-def error_text(e: Estimate, factor: float = 1.0, unit: str = "", *, told: bool = True) -> str:
-    """``0.123 ± 0.004``, or that it lies below two error bars, with both numbers.
+def estimate_text(
+    e: Estimate, factor: float = 1.0, unit: str = "", *, significant: bool | None = None
+) -> str:
+    """``0.123 ± 0.004``, or ``not significant (0.003 ± 0.004)``.
 
     Parameters
     ----------
-    told : False where something else already says that the value is not told from zero
+    significant : overrides the test of the value itself
     """
     if not math.isfinite(e.value):
-        return "not defined"
-    text = f"{e.scaled(factor)}{unit}".replace("-", "−")
-    return text if told and not below_bar(e) else f"{BELOW} ({text})"
+        return "undefined"
+    text = signed(f"{e.scaled(factor)}{unit}")
+    return text if (is_significant(e) if significant is None else significant) else not_significant(text)
 
 
-def percent(e: Estimate, *, told: bool = True) -> str:
-    """:func:`error_text` in percent."""
-    return error_text(e, 100.0, " %", told=told)
+def percent(e: Estimate, *, significant: bool | None = None) -> str:
+    """:func:`estimate_text` in percent."""
+    return estimate_text(e, 100.0, " %", significant=significant)
+
+
+def not_significant(text: str) -> str:
+    """A number's text marked as not significantly different from zero."""
+    return f"{NOT_SIGNIFICANT} ({text})"
+
+
+def signed(text: str) -> str:
+    """The text of a number with a true minus sign."""
+    return text.replace("-", "−")
 
 
 def data_errors(record: Mapping[str, Any]) -> tuple[str, str]:
     """(unexplained variance in percent, MSE in 10⁻³/sr²) of the same queries.
 
-    One is the other over a variance with an error bar of its own. So both are told from zero, or neither is.
+    The former is the latter divided by a variance, so both are marked as significant or neither is.
     """
     unexplained, mse = estimate(record["unexplained"]), estimate(record["mse"])
-    told = not below_bar(unexplained) and not below_bar(mse)
-    return percent(unexplained, told=told), error_text(mse, 1e3, told=told)
+    significant = is_significant(unexplained) and is_significant(mse)
+    return percent(unexplained, significant=significant), estimate_text(mse, 1e3, significant=significant)
 
 
-def decibel(psnr: Mapping[str, Any], mse: Mapping[str, Any]) -> str:
-    """PSNR in dB; none where the error it stands for lies below two error bars."""
-    e, error = estimate(psnr), estimate(mse)
-    if not math.isfinite(e.value):
-        return f"error {BELOW}"
-    text = f"{e} dB".replace("-", "−")
-    return f"error {BELOW} ({text})" if below_bar(error) else text
+def decibel(psnr: Estimate, mse: Estimate) -> str:
+    """PSNR in dB, marked where the MSE is not significant."""
+    if not math.isfinite(psnr.value):
+        return f"MSE {NOT_SIGNIFICANT}"
+    text = signed(f"{psnr} dB")
+    return text if is_significant(mse) else f"MSE {not_significant(text)}"
 
 
 def direction(d: Mapping[str, float]) -> str:
     """``elevation 45°, azimuth −90°``."""
-    return f"elevation {d['elevation']:g}°, azimuth {d['azimuth']:g}°".replace("-", "−")
+    return signed(f"elevation {d['elevation']:g}°, azimuth {d['azimuth']:g}°")
 
 
 def short_direction(d: Mapping[str, float]) -> str:
     """``45° / −90°``: elevation and azimuth."""
-    return f"{d['elevation']:g}° / {d['azimuth']:g}°".replace("-", "−")
+    return signed(f"{d['elevation']:g}° / {d['azimuth']:g}°")
 
 
 def width(tiles_across: float) -> str:
@@ -77,7 +88,7 @@ def width(tiles_across: float) -> str:
 
 
 def levels(found: list[float], finest: int) -> str:
-    """Levels that a picture asks for, and whether the data have them."""
+    """Range of levels in an image, and whether the data contain them."""
     low, high = (f"{level:.1f}" for level in found)
     text = f"level {low}" if low == high else f"level {low}–{high}"
-    return text if found[1] <= finest + 0.1 else f"{text} (finest of the data {finest})"
+    return text if found[1] <= finest + 0.1 else f"{text} (finest level of the data: {finest})"

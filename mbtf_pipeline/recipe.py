@@ -1,4 +1,4 @@
-"""A recipe: one YAML file that says what is generated, fitted, compared and reported."""
+"""A recipe: one YAML file that defines data, fits, comparison and report of a run."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from mbtf_fit.config import FitConfig
 from mbtf_gen.config.generator import GeneratorConfig, Paths
 
 RECIPE_NAME = "recipe.yaml"
-# Names become files and folders, so they are plain.
+# Names become file and folder names.
 _NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]*$"
-# Field of view of the cameras in degrees: narrow, so that one picture shows about one elevation.
+# Field of view in degrees: narrow, so that the elevation hardly varies within an image.
 FIELD_OF_VIEW = 20.0
 
 Name = Annotated[str, Field(pattern=_NAME, max_length=100)]
 
 
-class Direction(Settings):
-    """A direction seen from the tile."""
+class SceneDirection(Settings):
+    """A direction as seen from the tile."""
 
     elevation: float = Field(gt=0, le=90, description="above the reference plane, in degrees")
     azimuth: float = Field(0.0, ge=-360, le=360, description="from +u towards +v, in degrees")
 
 
-class View(Direction):
-    """Where the camera stands; it must see no horizon."""
+class SceneView(SceneDirection):
+    """SceneDirection of the camera; high enough that no horizon is visible."""
 
     elevation: float = Field(
         ge=FIELD_OF_VIEW * 0.7 + 2, le=90, description="above the reference plane, in degrees"
@@ -40,57 +40,59 @@ class View(Direction):
 
 def _distinct(values: Sequence[Any]) -> Sequence[Any]:
     if any(value in values[:i] for i, value in enumerate(values)):
-        raise ValueError("holds the same entry twice")
+        raise ValueError("contains the same entry twice")
     return values
 
 
-Views = Annotated[list[View], Field(min_length=1), AfterValidator(_distinct)]
+Views = Annotated[list[SceneView], Field(min_length=1), AfterValidator(_distinct)]
 TilesAcross = Annotated[float, Field(gt=0, le=1e4)]
 
 
 class CompareSection(Settings):
-    """Pictures of the plane: every view under every light at every width, as reference and as each fit."""
+    """Images of the plane for every view, light and width of the field of view: references and fits."""
 
     views: Views = Field(
-        [View(elevation=90, azimuth=-90), View(elevation=35, azimuth=-90)], description="where cameras stand"
+        [SceneView(elevation=90, azimuth=-90), SceneView(elevation=35, azimuth=-90)],
+        description="directions of the cameras",
     )
-    lights: Annotated[list[Direction], Field(min_length=1), AfterValidator(_distinct)] = Field(
-        [Direction(elevation=45, azimuth=45), Direction(elevation=20, azimuth=160)],
-        description="where the light comes from",
+    lights: Annotated[list[SceneDirection], Field(min_length=1), AfterValidator(_distinct)] = Field(
+        [SceneDirection(elevation=45, azimuth=45), SceneDirection(elevation=20, azimuth=160)],
+        description="directions of the light",
     )
     tiles_across: Annotated[list[TilesAcross], Field(min_length=1), AfterValidator(_distinct)] = Field(
         [1.0, 4.0], description="widths of the field of view at the target, in tile widths"
     )
-    size: int = Field(256, ge=8, le=4096, description="pixels along each side of a picture")
-    spp: Paths = Field(128, description="paths per pixel, both halves together")
+    size: int = Field(256, ge=8, le=4096, description="pixels along each side of an image")
+    spp: Paths = Field(128, description="paths per pixel, over both halves")
     kinds: Annotated[list[Literal["query", "pixel"]], Field(min_length=1), AfterValidator(_distinct)] = Field(
-        ["query"], description="query: M at each pixel's footprint; pixel: the truly filtered image"
+        ["query"], description="query: M at each pixel's footprint; pixel: the filtered image"
     )
     offset_views: Views = Field(
-        [View(elevation=30, azimuth=a) for a in (-90, 0, 90, 180)],
-        description="views whose learned offsets are drawn",
+        [SceneView(elevation=30, azimuth=a) for a in (-90, 0, 90, 180)],
+        description="views for which learned offsets are shown",
     )
     st_lpips: bool = Field(
-        False, description="measure ST-LPIPS, too; its weights are the optional extra `perceptual`"
+        False, description="also compute ST-LPIPS; its weights come with the optional extra `perceptual`"
     )
-    stock: bool = Field(
-        False, description="render one reference again with stock parts of Mitsuba, as a check from outside"
+    unmodified_mitsuba: bool = Field(
+        False, description="render one reference again with unmodified Mitsuba, as an independent check"
     )
-    timing: bool = Field(False, description="time an evaluation of 1080p, part by part")
-    seed: int = Field(0, ge=0, lt=1 << 63, description="root seed of the pictures")
+    timing: bool = Field(False, description="time the evaluation of a 1080p image, part by part")
+    seed: int = Field(0, ge=0, lt=1 << 63, description="root seed of the images")
 
 
 class ReportSection(Settings):
-    """How the report looks."""
+    """Options of the report."""
 
-    title: str | None = Field(None, description="headline; default: the recipe's name")
+    title: str | None = Field(None, description="title; default: the recipe's name")
     exposure: float | None = Field(
-        None, gt=0, description="factor from 1/sr to display white; default: from the reference pictures"
+        None, gt=0, description="factor from 1/sr to display white; default: from the references"
     )
-    max_megabytes: float = Field(9.5, ge=1, le=100, description="largest size of the file")
+    max_megabytes: float = Field(9.5, ge=1, le=100, description="size limit of the file")
 
 
 def _is_single(fits: Mapping[str, Any]) -> bool:
+    """Whether the section holds the options of one fit, not fits by name."""
     known = FitConfig.model_fields
     return any(
         key in known or not isinstance(value, Mapping | FitConfig | None) for key, value in fits.items()
@@ -98,13 +100,13 @@ def _is_single(fits: Mapping[str, Any]) -> bool:
 
 
 def _named(fits: Any) -> Any:
-    """One fit's options become a fit of its model's name; a fit without a model has the model of its name."""
+    """Fits by name. The name of a fit defaults to its model, and its model to its name."""
     if isinstance(fits, FitConfig):
         return {fits.model: fits}
     if not isinstance(fits, Mapping):
         return fits
     if not fits:
-        raise ValueError("names no fit")
+        raise ValueError("contains no fit")
     if _is_single(fits):
         return {str(fits.get("model", FitConfig.model_fields["model"].default)): fits}
     out: dict[str, Any] = {}
@@ -119,9 +121,27 @@ Fits = Annotated[dict[Name, FitConfig], BeforeValidator(_named)]
 
 
 class Recipe(Settings):
-    """Everything ``mbtf-pipeline run`` needs."""
+    """Configuration of ``mbtf-pipeline run``.
 
-    version: Literal[1] = 1
+    Attributes
+    ----------
+    name : str
+        Name of the run.
+    description : str
+        Text for lists and the report.
+    output : str or None
+        Folder of the run; None stands for ``out/NAME``.
+    generate : GeneratorConfig
+        Material, geometry, queries, light and transport.
+    fit : dict of str to FitConfig
+        Fits by name.
+    compare : CompareSection
+        Views, lights and size of the compared images.
+    report : ReportSection
+        Title, exposure and size of the report.
+    """
+
+    version: Literal[2] = 2
     name: Name
     description: str = ""
     output: str | None = Field(None, description="folder of the run; default: out/NAME")
@@ -132,30 +152,38 @@ class Recipe(Settings):
 
     @property
     def folder(self) -> Path:
-        """Where the run goes unless the command line says otherwise, relative to the current folder."""
+        """Default folder of the run, relative to the current folder."""
         return Path(self.output) if self.output is not None else Path("out") / self.name
 
     @property
     def title(self) -> str:
-        """Headline of the report."""
+        """Title of the report."""
         return self.report.title or self.name
 
 
 def load_recipe(path: Path, assignments: Sequence[str] = ()) -> Recipe:
-    """Read a recipe; the material's path becomes one from the current folder.
+    """Read a recipe.
 
-    A material named in the file lies relative to the file, one named by an assignment relative to the current
-    folder.
+    The path of a material in the file is relative to the file, that in an assignment to the current folder.
 
     Parameters
     ----------
-    assignments : ``a.b=c``, laid over the file
+    path : Path
+        YAML file.
+    assignments : sequence of str
+        ``a.b=c``; override values of the file.
+
+    Returns
+    -------
+    Recipe
+        With the material's path relative to the current folder.
 
     Raises
     ------
-    InputError : the file cannot be read, or holds an unknown key or an unfit value (with its line), or the
-        material does not exist
-    UsageError : an assignment is at fault
+    InputError
+        The file cannot be read, contains an unknown key or an invalid value, or the material does not exist.
+    UsageError
+        An assignment is invalid.
     """
     path = _find(path)
     recipe = resolve(Recipe, file=path, assignments=assignments)
@@ -167,14 +195,14 @@ def load_recipe(path: Path, assignments: Sequence[str] = ()) -> Recipe:
         raise InputError(
             f"material '{written}' does not exist",
             where="--set generate.material" if assigned else f"{path}:{line}" if line else path,
-            hint=_cure(path, material, assigned),
+            hint=_material_hint(path, material, assigned),
         )
     generate = recipe.generate.model_copy(update={"material": os.path.normpath(material)})
     return recipe.model_copy(update={"generate": generate})
 
 
 def fit_names(path: Path) -> list[str]:
-    """Dotted names of the fits of a recipe's file: ``fit``, or ``fit.NAME`` of each.
+    """Dotted names of the fits in a recipe file: ``fit``, or ``fit.NAME`` for each.
 
     Raises
     ------
@@ -186,31 +214,31 @@ def fit_names(path: Path) -> list[str]:
     return [f"fit.{name}" for name in fits]
 
 
-# Materials that are published and not part of the project, by the name of their folder.
+# Published materials that are not part of the project, by name of their folder.
 _PUBLISHED = {"rock_cliff": "ambientCG Rock023 (CC0, https://ambientcg.com/view?id=Rock023)"}
 
 
-def _cure(path: Path, material: Path, assigned: bool) -> str:
-    """What to do about a material that is not there."""
-    looked = f"looked for {os.path.abspath(material)}"
+def _material_hint(path: Path, material: Path, assigned: bool) -> str:
+    """What to do about a missing material."""
+    searched = f"searched for {os.path.abspath(material)}"
     source = _PUBLISHED.get(material.name)
     if source is None:
-        return looked if assigned else f"{looked}; edit 'generate.material' in {path}"
-    named = "" if assigned else f" or edit 'generate.material' in {path}"
+        return searched if assigned else f"{searched}; edit 'generate.material' in {path}"
+    edit = "" if assigned else f", edit 'generate.material' in {path}"
     return (
-        f"{looked}; its maps are {source}: put them there{named}, or name their folder with "
+        f"{searched}; its maps are {source}: copy them there{edit}, or set their folder with "
         "--set generate.material=FOLDER"
     )
 
 
 def _find(path: Path) -> Path:
     if path.is_dir():
-        raise InputError("is a folder, not a recipe", where=path, hint="name a YAML file in it")
+        raise InputError("is a folder, not a recipe", where=path, hint="give a YAML file in it")
     return path
 
 
 def write_recipe(recipe: Recipe, folder: Path) -> None:
-    """Write the resolved recipe into a run's folder, from where it can be run again."""
+    """Write the resolved recipe into a run's folder; it can be run again from there."""
     from mbtf_core.atomic import write_text
 
     data = recipe.model_dump(mode="json")
@@ -219,17 +247,14 @@ def write_recipe(recipe: Recipe, folder: Path) -> None:
 
 
 def read_resolved(folder: Path) -> Recipe:
-    """The resolved recipe of a run's folder; its material need not exist any more.
+    """The resolved recipe of a run's folder; its material may be missing.
 
     Raises
     ------
-    InputError : no run there
+    InputError : the folder contains no run
     """
     path = folder / RECIPE_NAME
     if not path.exists():
-        raise InputError(
-            f"holds no run (no {RECIPE_NAME})",
-            where=folder,
-            hint="make one: mbtf-pipeline run RECIPE -o FOLDER",
-        )
+        hint = "create one: mbtf-pipeline run RECIPE -o FOLDER"
+        raise InputError(f"contains no run (no {RECIPE_NAME})", where=folder, hint=hint)
     return resolve(Recipe, file=path)

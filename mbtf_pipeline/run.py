@@ -1,4 +1,4 @@
-"""Runs a recipe: its stages, in the folder of the run."""
+"""Runs a recipe: its stages in the folder of the run."""
 
 from __future__ import annotations
 
@@ -15,12 +15,22 @@ from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_pipeline.compare.compare import COMPARISON_NAME, COMPARISON_SCHEMA
 from mbtf_pipeline.recipe import Recipe, read_resolved
 from mbtf_pipeline.report.report import LAYOUT
-from mbtf_pipeline.run_folder import COMPARE, FITS, REPORT, SHARDS, claim, clear, describe, locked
+from mbtf_pipeline.run_folder import (
+    COMPARE,
+    FITS,
+    REPORT,
+    SHARDS,
+    claim_run_folder,
+    clear,
+    is_run,
+    locked,
+    write_run_record,
+)
 from mbtf_pipeline.stages import (
     NOT_RUN,
     Decision,
-    Outcome,
     Stage,
+    StageResult,
     Stamp,
     decide,
     read_stamp,
@@ -33,12 +43,12 @@ Inputs = Mapping[str, str]
 
 
 def fit_stage(name: str) -> str:
-    """Name of the stage that makes one fit."""
+    """Name of a fit's stage."""
     return f"fit {name}"
 
 
 def stage_names(recipe: Recipe) -> list[str]:
-    """Stages of a recipe in the order in which they run."""
+    """Names of a recipe's stages in the order in which they run."""
     data = [d.stage for d in data_sets(recipe)]
     return [*data, *(fit_stage(name) for name in recipe.fit), COMPARE_STAGE, REPORT_STAGE]
 
@@ -49,7 +59,8 @@ class DataSet:
 
     Attributes
     ----------
-    stage : that makes it; sub : its folder in the run's
+    stage : name of its stage
+    sub : its folder within the run's
     config : of the generator
     """
 
@@ -59,16 +70,16 @@ class DataSet:
 
 
 def layout_of(config: FitConfig) -> str:
-    """Layout that a fit's model learns from."""
+    """Data layout that a fit's model requires."""
     from mbtf_fit.models.registry import MODELS
 
     return MODELS[config.model].layout
 
 
 def data_sets(recipe: Recipe) -> list[DataSet]:
-    """The recipe's own data set first, then one of the other layout where a model learns from that.
+    """The recipe's data set, and one of the other layout if a model requires it.
 
-    The second one has as many training queries. All fits are judged by the test split of the first.
+    The second one has as many training queries. All fits are evaluated on the test split of the first.
     """
     out = [DataSet(GENERATE_STAGE, SHARDS, recipe.generate)]
     own = recipe.generate.queries.layout
@@ -81,23 +92,28 @@ def data_sets(recipe: Recipe) -> list[DataSet]:
 
 @dataclass(frozen=True)
 class RunResult:
-    """What a run made.
+    """Result of a run.
 
     Attributes
     ----------
-    folder : of the run; report : the HTML file
-    outcomes : by stage, in order
-    comparison : content of the comparison's record
+    folder : Path
+        Folder of the run.
+    report : Path
+        HTML file.
+    stages : dict of str to StageResult
+        Results by name of the stage, in order.
+    comparison : dict
+        Content of ``compare/comparison.json``.
     """
 
     folder: Path
     report: Path
-    outcomes: dict[str, Outcome]
+    stages: dict[str, StageResult]
     comparison: dict[str, Any]
 
 
 @dataclass(frozen=True)
-class _Run:
+class _RecipeRun:
     """The stages of one recipe in one folder."""
 
     recipe: Recipe
@@ -105,7 +121,7 @@ class _Run:
     console: Console
 
     def stages(self, inputs: Inputs) -> list[Stage]:
-        """All stages; `inputs` are the digests of the material's files by role."""
+        """All stages; `inputs` holds the digests of the material's files by role."""
         recipe = self.recipe
         fits = [fit_stage(name) for name in recipe.fit]
         out: list[Stage] = []
@@ -132,7 +148,7 @@ class _Run:
         return out
 
     def _files(self, sub: str) -> Callable[[], list[Path]]:
-        """Lists the files below a sub-folder, hidden ones left out."""
+        """Lists the files below a sub-folder, without hidden ones."""
         top = self.folder / sub
         return lambda: [
             p
@@ -141,7 +157,7 @@ class _Run:
         ]
 
     def _data_of(self, config: FitConfig) -> DataSet:
-        """The data set that a fit learns from."""
+        """The data set that a fit is trained on."""
         layout = layout_of(config)
         return next(d for d in data_sets(self.recipe) if d.config.queries.layout == layout)
 
@@ -156,7 +172,7 @@ class _Run:
             job = Job.prepare(data.config)
             shards = self.folder / data.sub
             manifest = shards / MANIFEST_NAME
-            for path in decision.damaged:
+            for path in decision.changed_files:
                 path.unlink(missing_ok=True)
                 sidecar_of(path).unlink(missing_ok=True)
             if (
@@ -219,15 +235,15 @@ class _Run:
 
 
 def _unfinished(out: Path, config: FitConfig, shards: Path) -> bool:
-    """Whether a folder holds the beginning of this very fit, from a run that was interrupted."""
+    """Whether a folder contains this fit, unfinished, from an interrupted run."""
     from mbtf_core.shard_schema import MANIFEST_NAME
 
     try:
-        begun, manifest = read_json(out / "fit.json"), read_json(shards / MANIFEST_NAME)
+        record, manifest = read_json(out / "fit.json"), read_json(shards / MANIFEST_NAME)
     except InputError:
         return False
-    same_data = begun.get("data", {}).get("hash") == manifest.get("config_hash")
-    return same_data and begun.get("config") == config.fields()
+    same_data = record.get("data", {}).get("hash") == manifest.get("config_hash")
+    return same_data and record.get("config") == config.fields()
 
 
 def _material_inputs(recipe: Recipe) -> dict[str, str]:
@@ -248,39 +264,51 @@ def run_recipe(
 
     Parameters
     ----------
-    recipe : from :func:`~mbtf_pipeline.recipe.load_recipe`
-    folder : of the run; by default the recipe's own
-    force : run every stage
-    command : what the report names as the way to make it again
-    console : where progress goes; nowhere by default
+    recipe : Recipe
+        From :func:`~mbtf_pipeline.recipe.load_recipe`.
+    folder : Path, optional
+        Folder of the run; by default the recipe's own.
+    force : bool
+        Run every stage.
+    command : str
+        Command that the report shows for reproduction.
+    console : Console, optional
+        Receives progress; quiet by default.
+
+    Returns
+    -------
+    RunResult
+        Paths, results of the stages, and the comparison.
 
     Raises
     ------
-    InputError : the material, a data set or the folder cannot be used
-    PartialError : something else works in the folder, or the disk is full; the same command resumes
+    InputError
+        The material, a data set or the folder cannot be used.
+    PartialError
+        Another process uses the folder, or the disk is full; the same command resumes the run.
     """
     folder = recipe.folder if folder is None else folder
     console = console or Console(quiet=True)
     inputs = _material_inputs(recipe)
-    claim(folder)
+    claim_run_folder(folder)
 
-    def tell(stage: str, decision: Decision, stamp: Stamp | None) -> None:
+    def notify(stage: str, decision: Decision, stamp: Stamp | None) -> None:
         if stamp is None:
-            state = f"runs: {decision.reason}" if decision.runs else "up to date"
+            state = f"running ({decision.reason})" if decision.runs else "up to date"
             console.note(f"{stage}: {state}")
         elif decision.runs:
-            console.note(f"{stage}: done in {clock(stamp.seconds)}")
+            console.note(f"{stage}: finished in {clock(stamp.seconds)}")
 
     with locked(folder):
-        describe(folder, recipe, command)
-        run = _Run(recipe, folder, console)
-        outcomes = run_stages(folder, run.stages(inputs), force=force, tell=tell)
-    return RunResult(folder, folder / REPORT, outcomes, read_json(folder / COMPARE / COMPARISON_NAME))
+        write_run_record(folder, recipe, command)
+        run = _RecipeRun(recipe, folder, console)
+        results = run_stages(folder, run.stages(inputs), force=force, notify=notify)
+    return RunResult(folder, folder / REPORT, results, read_json(folder / COMPARE / COMPARISON_NAME))
 
 
 def survey(recipe: Recipe, folder: Path) -> dict[str, Decision]:
-    """What :func:`run_recipe` would do with each stage, without doing it."""
-    run = _Run(recipe, folder, Console(quiet=True))
+    """The decision of :func:`run_recipe` about each stage, without running any."""
+    run = _RecipeRun(recipe, folder, Console(quiet=True))
     out: dict[str, Decision] = {}
     for stage in run.stages(_material_inputs(recipe)):
         stamps = {name: read_stamp(folder, name) for name in stage.needs}
@@ -291,13 +319,25 @@ def survey(recipe: Recipe, folder: Path) -> dict[str, Decision]:
 
 
 def rerender(folder: Path) -> Path:
-    """Write the report of a finished run again; returns its path.
+    """Write the report of a finished run again.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the run.
+
+    Returns
+    -------
+    Path
+        HTML file.
 
     Raises
     ------
-    InputError : no run, or one without a finished comparison
+    InputError
+        The folder contains no run of this version, or its comparison is not finished.
     """
-    run = _Run(read_resolved(folder), folder, Console(quiet=True))
+    is_run(folder)
+    run = _RecipeRun(read_resolved(folder), folder, Console(quiet=True))
     with locked(folder):
         run_again(folder, run.stages({})[-1])
     return folder / REPORT

@@ -1,12 +1,12 @@
 """The folder of a run.
 
-out/NAME/run.json        which command made it
-         recipe.yaml     the resolved recipe, runnable again
-         shards/         the data set, as ``mbtf-gen`` makes it
-         fits/FIT/       each fitted material, as ``mbtf-fit`` makes it
-         compare/        pictures, offsets, errors
-         report.html     the report
-         stages/         a stamp per finished stage
+out/NAME/run.json        command and software versions
+         recipe.yaml     resolved recipe; can be run again
+         shards/         data set, as written by ``mbtf-gen``
+         fits/FIT/       fitted materials, as written by ``mbtf-fit``
+         compare/        images, offsets and errors
+         report.html     report
+         stages/         one stamp per finished stage
 """
 
 from __future__ import annotations
@@ -23,29 +23,29 @@ from mbtf_pipeline.recipe import Recipe, write_recipe
 
 RUN_NAME = "run.json"
 RUN_FORMAT = "mbtf-run"
-RUN_SCHEMA = 1
+RUN_SCHEMA = 2
 SHARDS, FITS, COMPARE, REPORT = "shards", "fits", "compare", "report.html"
 
 
 def clear(folder: Path) -> None:
-    """Remove what an earlier run left in one of our own sub-folders."""
+    """Remove a sub-folder of a run with everything in it."""
     if folder.exists():
         shutil.rmtree(folder)
 
 
-def claim(folder: Path) -> None:
-    """Make a run's folder, or take an empty one or one that holds a run.
+def claim_run_folder(folder: Path) -> None:
+    """Create a run's folder, or accept an empty one or one that contains a run.
 
     Raises
     ------
-    InputError : it holds something else
+    InputError : it contains something else
     """
     check_folder(folder, is_run, "run")
     make_folder(folder)
 
 
-def describe(folder: Path, recipe: Recipe, command: str) -> None:
-    """Write what is run, and the command that does it, into the run's folder."""
+def write_run_record(folder: Path, recipe: Recipe, command: str) -> None:
+    """Write the resolved recipe and the command into the run's folder."""
     write_json(
         folder / RUN_NAME,
         {
@@ -60,7 +60,7 @@ def describe(folder: Path, recipe: Recipe, command: str) -> None:
 
 
 def machine() -> dict[str, str]:
-    """Versions of what results depend on, and what they ran on."""
+    """Versions of the software that results depend on, and the system."""
     import os
     import platform
     from importlib.metadata import PackageNotFoundError, version
@@ -76,28 +76,52 @@ def machine() -> dict[str, str]:
 
 
 def is_run(folder: Path) -> bool:
-    """Whether a folder holds a run of a recipe."""
+    """Whether a folder contains a run of a recipe.
+
+    Raises
+    ------
+    InputError : it contains a run of another schema version
+    """
+    return has_record(folder, RUN_NAME, RUN_FORMAT, RUN_SCHEMA)
+
+
+def has_record(folder: Path, name: str, record_format: str, schema: int) -> bool:
+    """Whether a folder contains a record of this format.
+
+    Raises
+    ------
+    InputError : the record has another schema version
+    """
     try:
-        return read_json(folder / RUN_NAME).get("format") == RUN_FORMAT
+        record = read_json(folder / name)
     except InputError:
         return False
+    if record.get("format") != record_format:
+        return False
+    if record.get("schema") != schema:
+        raise InputError(
+            f"has schema version {record.get('schema')}, this program reads version {schema}",
+            where=folder / name,
+            hint="run the recipe again in another folder with -o",
+        )
+    return True
 
 
 @contextlib.contextmanager
 def locked(folder: Path, record: str = RUN_NAME) -> Iterator[None]:
-    """Hold a folder against other runs; `record` is the file that stands for it.
+    """Lock a folder against other processes; `record` names the lock.
 
     Raises
     ------
-    PartialError : another process holds it
+    PartialError : another process has locked it
     """
     from mbtf_core.locks import shard_lock
 
     with shard_lock(folder / record) as held:
         if not held:
             raise PartialError(
-                "another run is at work here",
+                "another run uses this folder",
                 where=folder,
-                hint="wait for it, or choose another folder with -o",
+                hint="wait until it has finished, or choose another folder with -o",
             )
         yield

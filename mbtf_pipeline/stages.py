@@ -1,9 +1,9 @@
-"""Stages that run only when something they depend on has changed, decided by content alone.
+"""Stages that run only if their inputs have changed, decided by content and not by date.
 
-A stage's key is a hash over its resolved configuration, the digests of its input files and of the outputs of
-the stages it needs, and the version of its scheme. When it has run, a stamp with the key and the digest of
-every file it wrote is written last, atomically: a stage without a stamp has not run. A stage is up to date
-while its key is the stamp's and its files are as the stamp says; dates and names of folders decide nothing.
+The key of a stage is a hash of its resolved configuration, the digests of its input files, the digests of
+the outputs of the stages it needs, and a schema version. After a stage has run, a stamp is written
+atomically. It holds the key and the digest of every output file. A stage is up to date if its key equals
+that of its stamp and its files match their digests; a stage without a stamp has not run.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from mbtf_core.digest import data_sha256, file_sha256
 from mbtf_core.errors import InputError
 
 STAMP_FORMAT = "mbtf-stage"
-# Part of every key: raise it when a stage makes something else from the same inputs.
-STAGE_SCHEMA = 1
+# Part of every key; raised when a stage produces different outputs from the same inputs.
+STAGE_SCHEMA = 2
 STAMPS = "stages"
 FORCED = "forced"
 NOT_RUN = "has not run"
@@ -35,10 +35,10 @@ class Stage:
     ----------
     name : unique; ``fit neumip`` for one fit of several
     needs : names of the stages whose outputs it reads
-    config : its resolved options, plain data
-    inputs : digests of files from outside the run, by role
-    outputs : lists the files it has written, when it has run
-    run : does the work, told why, and returns notes for the stamp
+    config : resolved options, plain data
+    inputs : digests of input files from outside the run, by role
+    outputs : lists the files it has written
+    run : does the work and returns notes for the stamp
     """
 
     name: str
@@ -51,14 +51,15 @@ class Stage:
 
 @dataclass(frozen=True)
 class Stamp:
-    """What a finished stage left behind.
+    """Record of a finished stage.
 
     Attributes
     ----------
-    key : the hash it ran with; depends : what that hash covers
+    key : the hash it ran with
+    depends : data covered by the hash
     outputs : file, relative to the run's folder → SHA-256
-    seconds : wall clock of the run that made them
-    notes : what the stage itself says about its work
+    seconds : wall-clock time of the run
+    notes : returned by the stage
     """
 
     stage: str
@@ -80,12 +81,12 @@ class Decision:
 
     Attributes
     ----------
-    reason : why it runs; empty where it is up to date
-    damaged : files of the last run that are missing or have changed since, where that is the reason
+    reason : why it runs; empty if it is up to date
+    changed_files : outputs that are missing or have changed, if that is the reason
     """
 
     reason: str
-    damaged: tuple[Path, ...] = ()
+    changed_files: tuple[Path, ...] = ()
 
     @property
     def runs(self) -> bool:
@@ -94,17 +95,17 @@ class Decision:
 
     @property
     def forced(self) -> bool:
-        """Whether it runs because it was asked to, so that nothing of its last run may be kept."""
+        """Whether the user forces it to run, so that nothing of the last run may be kept."""
         return self.reason == FORCED
 
 
 def stamp_path(folder: Path, stage: str) -> Path:
-    """Where a stage's stamp lies in a run's folder."""
+    """Path of a stage's stamp in a run's folder."""
     return folder / STAMPS / f"{stage.replace(' ', '-')}.json"
 
 
 def read_stamp(folder: Path, stage: str) -> Stamp | None:
-    """A stage's stamp; None where there is none that this version understands."""
+    """A stage's stamp; None if there is none that this version can read."""
     path = stamp_path(folder, stage)
     if not path.exists():
         return None
@@ -125,7 +126,7 @@ def _write_stamp(folder: Path, stamp: Stamp) -> None:
 
 def _depends(stage: Stage, upstream: Mapping[str, str]) -> dict[str, Any]:
     data = {"config": dict(stage.config), "inputs": dict(stage.inputs), "needs": dict(upstream)}
-    plain: dict[str, Any] = json.loads(json.dumps(data))  # as it will be read back: tuples become lists
+    plain: dict[str, Any] = json.loads(json.dumps(data))  # as JSON stores it: tuples become lists
     return plain
 
 
@@ -144,7 +145,7 @@ def _what_changed(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
         return f"input changed: {', '.join(names)}"
     before, after = old.get("needs", {}), new["needs"]
     names = [n for n in sorted({*before, *after}) if before.get(n) != after.get(n)]
-    return f"what it reads has changed: {', '.join(names)}" if names else "stage has another version"
+    return f"inputs changed: {', '.join(names)}" if names else "the version of the stage changed"
 
 
 def decide(folder: Path, stage: Stage, upstream: Mapping[str, str], fresh: Sequence[str] = ()) -> Decision:
@@ -152,8 +153,8 @@ def decide(folder: Path, stage: Stage, upstream: Mapping[str, str], fresh: Seque
 
     Parameters
     ----------
-    upstream : stage it needs → digest of what that one wrote
-    fresh : stages that have just run; whatever needs one of them runs too
+    upstream : digest of the outputs by name of each needed stage
+    fresh : stages that have just run; dependent stages run too
     """
     stamp = read_stamp(folder, stage.name)
     if stamp is None:
@@ -161,22 +162,22 @@ def decide(folder: Path, stage: Stage, upstream: Mapping[str, str], fresh: Seque
     depends = _depends(stage, upstream)
     if stamp.key != _key(stage, depends):
         return Decision(_what_changed(stamp.depends, depends))
-    damaged = tuple(
+    changed_files = tuple(
         folder / name
         for name, expected in stamp.outputs.items()
         if not (folder / name).is_file() or file_sha256(folder / name) != expected
     )
-    if damaged:
-        what = "is missing" if not damaged[0].exists() else "has changed"
-        return Decision(f"{damaged[0].relative_to(folder)} {what}", damaged)
+    if changed_files:
+        what = "is missing" if not changed_files[0].exists() else "has changed"
+        return Decision(f"{changed_files[0].relative_to(folder)} {what}", changed_files)
     if after := [n for n in stage.needs if n in fresh]:
         return Decision(f"follows {after[0]}")
     return Decision("")
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """What became of one stage in this run: its stamp, whether it ran, and why."""
+class StageResult:
+    """Result of one stage in this run: its stamp, whether it ran, and why."""
 
     stamp: Stamp
     ran: bool
@@ -188,37 +189,37 @@ def run_stages(
     stages: Sequence[Stage],
     *,
     force: bool = False,
-    tell: Callable[[str, Decision, Stamp | None], None] | None = None,
-) -> dict[str, Outcome]:
-    """Run what must run, in the given order (a stage after those it needs).
+    notify: Callable[[str, Decision, Stamp | None], None] | None = None,
+) -> dict[str, StageResult]:
+    """Run all stages that are not up to date, in the given order.
 
     Parameters
     ----------
     force : run every stage
-    tell : called with (stage, decision, None) before each stage, and with its stamp after it
+    notify : called before each stage with (stage, decision, None), and after it with its stamp
     """
-    done: dict[str, Outcome] = {}
+    done: dict[str, StageResult] = {}
     for stage in stages:
         upstream = {name: done[name].stamp.outputs_hash for name in stage.needs}
-        fresh = [name for name, outcome in done.items() if outcome.ran]
+        fresh = [name for name, result in done.items() if result.ran]
         decision = Decision(FORCED) if force else decide(folder, stage, upstream, fresh)
-        if tell is not None:
-            tell(stage.name, decision, None)
+        if notify is not None:
+            notify(stage.name, decision, None)
         stamp = read_stamp(folder, stage.name)
         if decision.runs or stamp is None:
             stamp = _run(folder, stage, upstream, decision)
-        done[stage.name] = Outcome(stamp, decision.runs, decision.reason)
-        if tell is not None:
-            tell(stage.name, decision, stamp)
+        done[stage.name] = StageResult(stamp, decision.runs, decision.reason)
+        if notify is not None:
+            notify(stage.name, decision, stamp)
     return done
 
 
 def run_again(folder: Path, stage: Stage) -> Stamp:
-    """Run one stage whatever its state; the stages it needs have finished.
+    """Run one stage regardless of its state; the stages it needs must have finished.
 
     Raises
     ------
-    InputError : one of them has not
+    InputError : one of them has not finished
     """
     upstream: dict[str, str] = {}
     for name in stage.needs:
@@ -232,7 +233,7 @@ def run_again(folder: Path, stage: Stage) -> Stamp:
 
 
 def _run(folder: Path, stage: Stage, upstream: Mapping[str, str], decision: Decision) -> Stamp:
-    # From here to the new stamp the stage counts as not run, whatever happens.
+    # Without a stamp, an interrupted stage counts as not run.
     stamp_path(folder, stage.name).unlink(missing_ok=True)
     start = time.perf_counter()
     notes = stage.run(decision)

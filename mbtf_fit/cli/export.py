@@ -23,7 +23,7 @@ def export_material(
     half: Switch = False,
     console: Console = CONSOLE,
 ) -> None:
-    """Write a material in forms that other programs read: mbtf-fit export material/ --to exr
+    """Export a material for other programs: mbtf-fit export material/ --to exr
 
     exr: the latent textures, a part per level and a channel per feature, and those of the transmittance of a
     material with holes. json: the networks as a list of layers, with formulas, conventions and queries with
@@ -38,10 +38,10 @@ def export_material(
     half
         Round all weights and texels to 16 bits, and print the error of that.
     """
+    from mbtf_core.folders import make_folder
     from mbtf_fit.material.export import LAYERS_NAME, TEXTURES_NAME, to_half, write_layers, write_textures
     from mbtf_fit.material.format import DESCRIPTION_NAME, WEIGHTS_NAME
     from mbtf_fit.material.material import Material, export
-    from mbtf_core.folders import make_folder
     from mbtf_fit.material.transmittance import TRANSMITTANCE_NAME
 
     wanted = list(dict.fromkeys(to or ["exr", "json"]))

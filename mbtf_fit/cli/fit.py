@@ -13,7 +13,7 @@ from mbtf_core.errors import PartialError, UsageError
 from mbtf_core.options import DryRun, Options, Output, Overwrite, takes_options
 from mbtf_fit.config import FitConfig
 from mbtf_fit.formatting import describe_fit, format_estimate, format_table
-from mbtf_gen.config.presets import QualityOption, as_assignments
+from mbtf_gen.config.presets import Quality, QualityOption, as_assignments
 
 
 @takes_options(FitConfig)
@@ -47,28 +47,16 @@ def fit(
         With --many, number of simultaneous fits.
     """
     if dry_run and many is not None:
-        raise UsageError("--dry-run looks at one data set", hint="mbtf-fit shards/ --dry-run")
+        raise UsageError("--dry-run takes one data set", hint="mbtf-fit shards/ --dry-run")
     if many is not None and shards is not None:
         raise UsageError("--many takes all data sets", hint=f"mbtf-fit --many {shards} ... -o materials/")
     if processes is not None and (many is None or processes < 1):
         raise UsageError("--processes is a positive number that goes with --many")
     if shards is None and many is None:
         raise UsageError("no shards given", hint="mbtf-fit shards/ -o material/")
-    given = options.given
-    if {"training.time", "training.steps"} <= set(given):
-        raise UsageError("--time and --steps exclude each other", hint="give one of them")
     from mbtf_core.units import format_duration
-    from mbtf_fit.presets import fitter_options, overrides_of
 
-    presets: list[str] = []
-    if quality is not None:
-        flags = [f"{key}={value}" for key, value in given.items()]
-        overrides = {"model": "neumip", **overrides_of(options.config, [*options.assignments, *flags])}
-        presets = as_assignments(fitter_options(quality, {"": overrides})[""])
-    if "training.time" in given:
-        # A time given with its flag overrides steps from anywhere else.
-        options = replace(options, assignments=[*options.assignments, "training.steps=null"])
-    resolved = options.resolve(presets)
+    resolved = resolve_config(options, quality)
     training = resolved.training
     budget = format_duration(training.time) if training.steps is None else f"{training.steps} steps"
     if many is not None:
@@ -109,6 +97,30 @@ def fit(
     data = result.as_dict()
     cost = [result.marginal_cost.describe()] if result.marginal_cost is not None else []
     console.report(data, "\n".join([describe_fit(data), *cost]))
+
+
+def resolve_config(options: Options[FitConfig], quality: Quality | None) -> FitConfig:
+    """Configuration of a fit.
+
+    Raises
+    ------
+    UsageError : a flag or an assignment is at fault
+    InputError : the file is at fault
+    """
+    from mbtf_fit.presets import fitter_options, overrides_of
+
+    given = options.given
+    if {"training.time", "training.steps"} <= set(given):
+        raise UsageError("--time and --steps exclude each other", hint="give one of them")
+    presets: list[str] = []
+    if quality is not None:
+        flags = [f"{key}={value}" for key, value in given.items()]
+        overrides = {"model": "neumip", **overrides_of(options.config, [*options.assignments, *flags])}
+        presets = as_assignments(fitter_options(quality, {"": overrides})[""])
+    if "training.time" in given:
+        # A time given with its flag overrides steps from anywhere else.
+        options = replace(options, assignments=[*options.assignments, "training.steps=null"])
+    return options.resolve(presets)
 
 
 def _fit_many(
@@ -159,5 +171,5 @@ def _fit_many(
         raise PartialError(
             f"{len(failed)} of {len(outcomes)} fits failed",
             where=output,
-            hint="the same command again takes up what is not finished",
+            hint="the same command resumes the others",
         )

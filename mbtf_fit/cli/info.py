@@ -1,4 +1,4 @@
-"""``mbtf-fit info``: what a material or a data set holds."""
+"""``mbtf-fit info``: description of a material or a data set."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mbtf_fit.formatting import describe_errors, describe_transmittance
 
 
 def info(path: Path, /, *, console: Console = CONSOLE) -> None:
-    """What a material or a data set holds.
+    """Describe a material or a data set.
 
     Parameters
     ----------

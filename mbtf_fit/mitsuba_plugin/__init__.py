@@ -6,23 +6,15 @@
     import mitsuba as mi
     bsdf = mi.load_dict({"type": "mbtf", "material": "material/"})
 
-Import this package before Mitsuba, or call ``register`` with a variant: Dr.Jit looks for its LLVM when it is
-first imported. Therefore the import of this package, alone among the packages, sets ``DRJIT_LIBLLVM_PATH`` and
-``DRJIT_CACHE_DIR`` where they are unset. If Mitsuba was imported first with an LLVM that is too old,
-:func:`register` raises an ``EngineError``.
-
-Importing this package registers the plugins with a variant that is already set. PyTorch is not needed, and
-never imported.
+Call ``register`` with a variant before the first import of Mitsuba, so that Dr.Jit uses the LLVM of this
+installation. Importing this package registers the plugins with a variant that is already set. PyTorch is not
+needed, and never imported.
 """
 
 from __future__ import annotations
 
 from importlib import import_module
 from typing import Any
-
-from mbtf_gen.render.llvm import use_shipped_llvm
-
-use_shipped_llvm()
 
 _PUBLIC = {
     "Evaluator": "evaluator",

@@ -1,4 +1,4 @@
-"""``mbtf-gen doctor``: what this machine has."""
+"""``mbtf-gen doctor``: whether the installation works."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from mbtf_core.console import CONSOLE, Console
 
 
 def doctor(*, console: Console = CONSOLE) -> int:
-    """Say what this machine has, prove each part by using it, and name the hint for what fails."""
+    """Test each part of the installation by using it, and name the remedy for what fails."""
     from mbtf_gen.diagnostics.doctor import as_json, as_text, diagnose, exit_code
 
     checks = diagnose()

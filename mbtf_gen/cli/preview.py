@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 from mbtf_core.console import CONSOLE, Console
-from mbtf_core.errors import InputError, PartialError, UsageError
+from mbtf_core.errors import UsageError
 from mbtf_core.options import Options, Output, Overwrite, Switch, takes_options
 from mbtf_gen.cli.common import resolve_config
 from mbtf_gen.config.pictures import RENDERING, PreviewConfig
-
-if TYPE_CHECKING:
-    from mbtf_gen.dataset.reader import Dataset
 
 _QUERIES = ("train", "resolution", "min_cos", "layout", "patch_size")
 
@@ -39,6 +34,7 @@ def preview(
         Also show the mesh in a window, where the mouse turns it.
     """
     from mbtf_core.shard_schema import MANIFEST_NAME
+    from mbtf_gen.pictures.preview.drawing import PreviewPictures
 
     if interactive:
         from mbtf_gen.pictures.preview.mesh import check_display
@@ -60,175 +56,4 @@ def preview(
         resolved = options.resolve(**dataset.manifest["config"])
     else:
         resolved = resolve_config(options, material)
-    _Preview(resolved, dataset, console).make(output, overwrite, interactive)
-
-
-class _Preview:
-    """One run of the command."""
-
-    def __init__(self, config: PreviewConfig, dataset: Dataset | None, console: Console) -> None:
-        from mbtf_core.directions import from_angles
-        from mbtf_gen.job import Job
-
-        self.config = config
-        self.dataset = dataset
-        self.console = console
-        wanted = config.preview
-        self.omega_i = from_angles(wanted.light.elevation, wanted.light.azimuth)
-        self.job: Job | None = None
-        try:
-            self.job = Job.prepare(config)
-            if dataset is not None and self.job.material.digests != dataset.manifest["inputs"]:
-                self.job = None
-                raise InputError("has changed since the data set was made", where=config.material)
-        except InputError as error:
-            # Its queries can be shown without the material.
-            if dataset is None:
-                raise
-            console.note(f"queries alone are shown: {error.where}: {error.what}")
-        if self.job is not None:
-            self._prepare_view(self.job)
-
-    def _prepare_view(self, job: Any) -> None:
-        from mbtf_gen.pictures.preview.view import block_camera
-
-        wanted = self.config.preview
-        grid = job.material.grid(self.config.geometry.height_scale, self.config.geometry.mesh)
-        self.camera = block_camera(
-            wanted.view.elevation,
-            wanted.view.azimuth,
-            tiles=wanted.tiles,
-            aspect=grid.aspect,
-            displacement_range=grid.displacement_range,
-            columns=wanted.size,
-        )
-        self.camera.queries(self.omega_i, grid.aspect)  # refuses a view of the horizon
-        self.seen = (
-            f"from elevation {wanted.view.elevation:g}, azimuth {wanted.view.azimuth:g}, "
-            f"light from {wanted.light.elevation:g}, {wanted.light.azimuth:g} degrees"
-        )
-
-    def make(self, path: Path, overwrite: bool, interactive: bool) -> None:
-        """Make the pictures that are missing, report them, and open the window.
-
-        Raises
-        ------
-        PartialError : the mesh could not be drawn; everything else was
-        EngineError : the window could not be shown
-        """
-        from mbtf_gen.pictures.folder import PictureFolder
-
-        inputs = dict(self.job.material.digests) if self.job is not None else {}
-        makers: dict[str, Callable[[Path], dict[str, Any]]] = {"queries": self._queries}
-        if self.job is not None:
-            makers = {"mesh": self._mesh, "beauty": self._beauty, **makers}
-        if self.dataset is not None:
-            inputs = {"data set": self.dataset.manifest["config_hash"], **inputs}
-        folder = PictureFolder.claim(
-            path,
-            "preview",
-            files=[f"{name}.png" for name in ("mesh", "beauty", "queries")],
-            config=self.config.model_dump(mode="json"),
-            inputs=inputs,
-            overwrite=overwrite,
-        )
-        pictures: list[dict[str, Any]] = []
-        fault = ""
-        with self.console.progress(total=len(makers), label="drawing", unit="pictures") as bar:
-            for name, maker in makers.items():
-                file = folder.path / f"{name}.png"
-                facts = folder.finished(name)
-                kept = facts is not None and facts.get("of") == self._stage(name)
-                if not kept:
-                    facts = {**maker(file), "of": self._stage(name)}
-                    if "fault" in facts:
-                        fault = facts["fault"]
-                        bar.advance(1)
-                        continue
-                    folder.keep(name, [file], facts)
-                assert facts is not None
-                pictures.append({"file": file, "kept": kept, **{k: v for k, v in facts.items() if k != "of"}})
-                bar.advance(1)
-        text = "\n".join(f"{p['file']}: {p['shows']}{' (was there)' if p['kept'] else ''}" for p in pictures)
-        self.console.report({"folder": path, "pictures": pictures, "fault": fault or None}, text)
-        if fault:
-            raise PartialError(
-                f"could not be drawn ({fault})",
-                where=path / "mesh.png",
-                hint="the other pictures are there; mbtf-gen doctor says what drawing needs, "
-                "then the same command draws it",
-            )
-        if interactive and self.job is not None:
-            from mbtf_gen.pictures.preview.mesh import show
-
-            self.console.note("the mesh is shown in a window: close it to go on")
-            show(self._block(), self.camera, self.omega_i)
-
-    def _stage(self, name: str) -> int:
-        """What a picture depends on besides the configuration: how many shards are finished."""
-        if name != "queries" or self.dataset is None:
-            return 0
-        from mbtf_gen.pictures.preview.sample import finished_shards
-
-        return len(finished_shards(self.dataset, "train"))
-
-    def _block(self) -> Any:
-        from mbtf_gen.pictures.preview.mesh import block_of
-
-        assert self.job is not None
-        geometry = self.config.geometry
-        return block_of(self.job.material, self.config.preview.tiles, geometry.height_scale, geometry.mesh)
-
-    def _mesh(self, file: Path) -> dict[str, Any]:
-        from mbtf_gen.pictures.preview.mesh import draw
-
-        block = self._block()
-        fault = draw(block, self.camera, self.omega_i, file)
-        if fault:
-            return {"fault": fault}
-        tiles, (rows, columns) = self.config.preview.tiles, block.cells
-        return {
-            "shows": f"the displaced mesh ({columns} x {rows} cells per tile) of {tiles} x {tiles} tiles "
-            f"with its base color, {self.seen}"
-        }
-
-    def _beauty(self, file: Path) -> dict[str, Any]:
-        from mbtf_gen.pictures.reference import render_reference, to_display, write_png
-        from mbtf_gen.planning.effects_plan import reference_plan
-        from mbtf_gen.planning.simulation import build_estimator
-
-        assert self.job is not None
-        estimator = build_estimator(self.job, reference_plan(self.job))
-        spp = self.config.preview.spp
-        image = render_reference(
-            estimator, self.camera, self.omega_i, kind="pixel", spp=spp, seed=self.config.seed
-        )
-        write_png(file, to_display(image.value))
-        return {"shows": f"the endless plane by the same camera, path-traced with {spp} paths per pixel"}
-
-    def _queries(self, file: Path) -> dict[str, Any]:
-        from mbtf_gen.pictures.preview.plots import level_histogram, write_plots
-        from mbtf_gen.pictures.preview.sample import drawn, stored
-
-        if self.dataset is not None:
-            sample = stored(self.dataset)
-            source = f"stored in {self.dataset.folder}"
-        else:
-            assert self.job is not None
-            sample = drawn(self.job)
-            source = f"to be drawn for {self.config.material}"
-        shown = f"{len(sample.u)} of {sample.total} training queries {source}"
-        if len(sample.level) < len(sample.u):
-            shown += f", in {len(sample.level)} buffers of one footprint, light and view each"
-        write_plots(file, sample, shown)
-        edges, found, expected = level_histogram(sample)
-        return {
-            "shows": f"positions, levels and directions of {shown}",
-            "queries": {
-                "shown": len(sample.u),
-                "total": sample.total,
-                "level_edges": edges.tolist(),
-                "level_density": found.tolist(),
-                "level_density_stated": expected.tolist(),
-            },
-        }
+    PreviewPictures(resolved, dataset, console).draw(output, overwrite, interactive)

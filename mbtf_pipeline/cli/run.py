@@ -111,10 +111,10 @@ def _summary(result: RunResult) -> dict[str, Any]:
     return {
         "folder": result.folder,
         "report": result.report,
-        "seconds": round(sum(o.stamp.seconds for o in result.outcomes.values() if o.ran), 3),
+        "seconds": round(sum(o.stamp.seconds for o in result.stages.values() if o.ran), 3),
         "stages": {
             name: {"ran": o.ran, "reason": o.reason or "up to date", "seconds": o.stamp.seconds}
-            for name, o in result.outcomes.items()
+            for name, o in result.stages.items()
         },
         "test": {
             fit: {
@@ -129,7 +129,7 @@ def _summary(result: RunResult) -> dict[str, Any]:
 def _describe(result: RunResult) -> str:
     from mbtf_pipeline.formatting import estimate
 
-    ran = [f"{n} {clock(o.stamp.seconds)}" for n, o in result.outcomes.items() if o.ran]
+    ran = [f"{n} {clock(o.stamp.seconds)}" for n, o in result.stages.items() if o.ran]
     lines = [f"{result.report}: {', '.join(ran) or 'everything up to date'}"]
     for fit, record in result.comparison["test"].items():
         lines.append(f"  {fit}: unexplained variance {estimate(record['splits']['test']['unexplained'])}")

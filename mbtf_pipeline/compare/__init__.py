@@ -1,1 +1,1 @@
-"""Comparison of fits with references: pictures, errors on data, offsets, timing."""
+"""Comparison of fits with references: images, errors on data, offsets, timing."""

@@ -1,4 +1,4 @@
-"""The compare stage: references and fits at the same pixels, and the errors of both pictures and data."""
+"""The compare stage: renders references, evaluates fits at the same pixels, and measures their errors."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from mbtf_core.atomic import write_json
 from mbtf_core.directions import from_angles
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_pipeline.compare.dataset_errors import errors_on_data
-from mbtf_pipeline.compare.metrics import DEFINITIONS, Score, halves_score, score, white_point
+from mbtf_pipeline.compare.dataset_errors import dataset_errors
+from mbtf_pipeline.compare.metrics import DEFINITIONS, image_errors, reference_difference, white_point
 from mbtf_pipeline.compare.offsets import write_offsets
-from mbtf_pipeline.compare.perceptual_metrics import visible_difference
+from mbtf_pipeline.compare.perceptual_metrics import perceptual_scores
 from mbtf_pipeline.compare.pictures import (
     PICTURES,
     Scene,
@@ -30,7 +30,7 @@ from mbtf_pipeline.compare.pictures import (
 )
 from mbtf_pipeline.compare.st_lpips import require
 from mbtf_pipeline.compare.timing import measure_timing, timed
-from mbtf_pipeline.compare.unmodified_mitsuba import pick_scene, write_stock
+from mbtf_pipeline.compare.unmodified_mitsuba import pick_scene, write_agreement
 from mbtf_pipeline.recipe import CompareSection
 
 if TYPE_CHECKING:
@@ -41,12 +41,12 @@ if TYPE_CHECKING:
 
 COMPARISON_NAME = "comparison.json"
 COMPARISON_FORMAT = "mbtf-comparison"
-# Raised when the record or what lies beside it changes; part of what the stage depends on.
-COMPARISON_SCHEMA = 5
+# Raised when the record or its files change; part of the stage's key.
+COMPARISON_SCHEMA = 6
 
 F32 = NDArray[np.float32]
 Progress = Callable[[str], None]
-# One query per pixel of 1080p is what timings are for.
+# Timings refer to one query per pixel of 1080p.
 _TIMED_PIXELS = 1920 * 1080
 
 
@@ -64,19 +64,36 @@ def compare(
     out: Path,
     progress: Progress,
 ) -> dict[str, Any]:
-    """Render, evaluate, measure; write everything into `out`.
+    """Render references, evaluate all fits at the same pixels, and measure their errors.
 
     Parameters
     ----------
-    generate : the material, its geometry, light and transport
-    shards : data set whose test split the fits are measured on
-    fits : name → folder of the fitted material
-    out : folder; ``comparison.json`` is written last
-    progress : called with what was just done
+    section : CompareSection
+        Views, lights, widths of the field of view, and image size.
+    generate : GeneratorConfig
+        Material, geometry, light and transport.
+    shards : Path
+        Data set whose test split the fits are evaluated on.
+    fits : mapping of str to Path
+        Folder of the fitted material by name of the fit.
+    out : Path
+        Folder for images and records; ``comparison.json`` is written last.
+    progress : callable
+        Called with a short note after each image.
 
     Returns
     -------
-    the content of ``comparison.json``
+    dict
+        Content of ``comparison.json``.
+
+    Raises
+    ------
+    InputError
+        The material, the data set or a fit cannot be read.
+    UsageError
+        ``unmodified_mitsuba`` is set and no scene is suitable for it.
+    EngineError
+        ST-LPIPS is requested and its weights are not installed.
     """
     from mbtf_fit import Material
     from mbtf_gen.dataset.reader import Dataset
@@ -87,7 +104,7 @@ def compare(
 
     if section.st_lpips:
         require()
-    if section.stock:
+    if section.unmodified_mitsuba:
         pick_scene(section)
     (out / PICTURES).mkdir(parents=True, exist_ok=True)
     materials = {name: Material.load(folder) for name, folder in fits.items()}
@@ -95,14 +112,14 @@ def compare(
     material = load_material(Path(generate.material), generate.geometry.make_tileable)
     job = Job(generate, material)
     estimator = build_estimator(job, reference_plan(job))
-    rendered = _render(section, estimator, progress)
+    rendered = _render_references(section, estimator, progress)
     seconds = {"references": time.perf_counter() - start}
-    # The white point is that of what is compared with; without a query reference, of what there is.
+    # From the query references if there are any, otherwise from the pixel references.
     white = white_point([next(iter(images.values())).value for _, images in rendered])
     start = time.perf_counter()
-    learned = section.st_lpips
     pictures = [
-        _picture(scene, images, materials, white, learned, out, progress) for scene, images in rendered
+        _compare_scene(scene, images, materials, white, section.st_lpips, out, progress)
+        for scene, images in rendered
     ]
     seconds["fits"] = time.perf_counter() - start
     data = Dataset.open(shards)
@@ -119,12 +136,12 @@ def compare(
         "test_spp": data.manifest["splits"]["test"]["spp"],
         "definitions": DEFINITIONS,
         "pictures": pictures,
-        "test": errors_on_data(materials, data),
+        "test": dataset_errors(materials, data),
         "offsets": offsets,
         "seconds": {k: round(v, 3) for k, v in seconds.items()},
     }
-    if section.stock:
-        record["stock"] = write_stock(section, generate, material, white, out)
+    if section.unmodified_mitsuba:
+        record["unmodified_mitsuba"] = write_agreement(section, generate, material, white, out)
     if section.timing:
         record["timing"] = _timings(fits)
     write_json(out / COMPARISON_NAME, record)
@@ -132,7 +149,7 @@ def compare(
 
 
 def _timings(fits: Mapping[str, Path]) -> dict[str, list[dict[str, Any]]]:
-    """Times of every fit, on the processor and, where there is one, on the GPU."""
+    """Times of every fit on the CPU and, if available, on the GPU."""
     import torch
 
     from mbtf_fit import Material
@@ -144,10 +161,10 @@ def _timings(fits: Mapping[str, Path]) -> dict[str, list[dict[str, Any]]]:
     }
 
 
-def _render(
+def _render_references(
     section: CompareSection, estimator: Estimator, progress: Progress
 ) -> list[tuple[Scene, dict[PixelKind, ReferenceImage]]]:
-    """All references by scene and kind, the query kind first."""
+    """References by scene and kind, the query kind first."""
     from mbtf_gen.pictures.reference import render_reference
 
     kinds = sorted(section.kinds, key=lambda kind: kind != "query")
@@ -169,16 +186,16 @@ def _render(
     return out
 
 
-def _picture(
+def _compare_scene(
     scene: Scene,
     images: Mapping[PixelKind, ReferenceImage],
     materials: Mapping[str, Material],
     white: float,
-    learned: bool,
+    with_st_lpips: bool,
     out: Path,
     progress: Progress,
 ) -> dict[str, Any]:
-    """Write one scene's pictures and measure them."""
+    """Write the images of one scene and measure their errors."""
     from mbtf_core.lattice import level_of_sigma
     from mbtf_core.stats import mse_difference, pooled_relative_error
 
@@ -191,11 +208,11 @@ def _picture(
         record["references"][kind] = {"file": file, "noise": noise.as_dict()}
     if len(images) == 2:
         query, pixel = images["query"], images["pixel"]
-        between = halves_score((query.value_a, query.value_b), pixel.value_a, pixel.value_b)
+        between = reference_difference((query.value_a, query.value_b), pixel.value_a, pixel.value_b)
         record["between_references"] = between.as_dict()
     main_kind, main = next(iter(images.items()))
-    noise_alone = visible_difference(main.value_a, main.value_b, white, learned=learned)
-    record["references"][main_kind] |= noise_alone.as_dict()
+    baseline = perceptual_scores(main.value_a, main.value_b, white, with_st_lpips=with_st_lpips)
+    record["references"][main_kind] |= baseline.as_dict()
     queries = main.queries
     level = level_of_sigma(queries.sigma)
     record["levels"] = [round(float(level.min()), 3), round(float(level.max()), 3)]
@@ -209,21 +226,21 @@ def _picture(
         file = scene.file(fit_name(name))
         write_picture(out / file, value)
         write_preview(out / file, value, white)
-        errors: dict[str, Score] = {
-            kind: score(value, image.value_a, image.value_b) for kind, image in images.items()
-        }
-        visible = visible_difference(value, main.value, white, learned=learned)
-        write_map(out / file, visible.flip.hdr_map)
+        scores = perceptual_scores(value, main.value, white, with_st_lpips=with_st_lpips)
+        write_map(out / file, scores.flip.hdr_map)
         record["fits"][name] = {
             "file": file,
             "seconds": round(seconds, 4),
-            "errors": {kind: s.as_dict(white) for kind, s in errors.items()},
-            **visible.as_dict(),
+            "errors": {
+                kind: image_errors(value, image.value_a, image.value_b).as_dict(white)
+                for kind, image in images.items()
+            },
+            **scores.as_dict(),
         }
         if values:
             halves = [x.reshape(-1, 3) for x in (main.value_a, main.value_b)]
-            apart = mse_difference(value.reshape(-1, 3), values[0].reshape(-1, 3), *halves)
-            record["fits"][name]["mse_less_first"] = apart.as_dict()
+            difference = mse_difference(value.reshape(-1, 3), values[0].reshape(-1, 3), *halves)
+            record["fits"][name]["mse_minus_first"] = difference.as_dict()
         values.append(value)
         progress(f"{name} {scene.name}")
     return record

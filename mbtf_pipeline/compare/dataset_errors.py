@@ -1,4 +1,4 @@
-"""Errors of fits on data, and which of two fits is the better one query by query."""
+"""Errors of fits on a data set, and paired differences between fits on the same queries."""
 
 from __future__ import annotations
 
@@ -6,26 +6,35 @@ from collections.abc import Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from mbtf_core.stats import by_group, level_groups, mse_difference
 from mbtf_gen.dataset.reader import Dataset
 
 if TYPE_CHECKING:
     from mbtf_fit import Material
-    from mbtf_fit.data.queries import ShardQueries
 
 
-def errors_on_data(materials: Mapping[str, Material], data: Dataset) -> dict[str, Any]:
-    """Errors of every fit on the test split of one data set, and on what its own training held out.
+def dataset_errors(materials: Mapping[str, Material], data: Dataset) -> dict[str, Any]:
+    """Errors of every fit on the test split of one data set, and on the splits held out in its own training.
 
-    The first fit's name leads; the others also have ``mse_less_first``, their MSE less the first one's on the
-    same test queries, overall and by level.
+    All fits but the first also have ``mse_minus_first``: their MSE minus that of the first fit on the same
+    test queries, overall and by level.
+
+    Parameters
+    ----------
+    materials : mapping of str to Material
+        Fitted materials by name of the fit.
+    data : Dataset
+        Data set whose test split is used.
+
+    Returns
+    -------
+    dict
+        Plain data by name of the fit.
 
     Raises
     ------
-    InputError : a test shard is missing or damaged
+    InputError
+        A test shard is missing or corrupt.
     """
     from mbtf_fit.data.loader import load_split
     from mbtf_fit.evaluation import split_errors
@@ -37,18 +46,18 @@ def errors_on_data(materials: Mapping[str, Material], data: Dataset) -> dict[str
     out: dict[str, Any] = {}
     for name, material in materials.items():
         value = material.predict(test)
-        found = split_errors(partial(_known, value), test, data.lattice)
+        found = split_errors(partial(_stored, value), test, data.lattice)
         own = material.description["training"]["errors"]
         splits = {split: errors for split, errors in own.items() if split != "test"}
         record = {
             "splits": {"test": None if found is None else found.as_dict(), **splits},
-            **_size(material),
+            **_parameter_counts(material),
         }
         if first is None:
             first = value
         else:
             levels = by_group(mse_difference, labels, value, first, *halves)
-            record["mse_less_first"] = {
+            record["mse_minus_first"] = {
                 **mse_difference(value, first, *halves).as_dict(),
                 "levels": {str(level): e.as_dict() for level, e in levels.items()},
             }
@@ -56,13 +65,13 @@ def errors_on_data(materials: Mapping[str, Material], data: Dataset) -> dict[str
     return out
 
 
-def _known(value: NDArray[np.float32], queries: ShardQueries) -> NDArray[np.float32]:
-    """A prediction that has been made."""
+def _stored(value: Any, queries: Any) -> Any:
+    """An evaluated prediction, as a function of the queries."""
     return value
 
 
-def _size(material: Material) -> dict[str, Any]:
-    """Numbers of a material: of its networks, one by one, and of its textures."""
+def _parameter_counts(material: Material) -> dict[str, Any]:
+    """Parameter counts of a material: per network, and of its textures."""
     weights = material.description["weights"]
     networks: dict[str, int] = {}
     textures = {id(texture.texels) for texture in material.model.textures()}

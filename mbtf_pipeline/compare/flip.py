@@ -1,9 +1,10 @@
-"""FLIP and HDR-FLIP of a picture against its reference, at stated exposures.
+"""FLIP and HDR-FLIP of an image against its reference, at stated exposures.
 
 FLIP: Andersson et al., "FLIP: A Difference Evaluator for Alternating Images", HPG 2020; HDR-FLIP: Andersson
-et al., "Visualizing Errors in Rendered High Dynamic Range Images", Eurographics 2021. Both answer how visible
-a difference is when the two pictures take turns on a screen: 0 none, 1 the largest. Noise of the reference is
-a difference as well, so the reference's two halves are compared in the same way beside it.
+et al., "Visualizing Errors in Rendered High Dynamic Range Images", Eurographics 2021. Both predict how
+visible a difference is when two images alternate on a screen, from 0 (none) to 1 (maximal). They respond to
+noise of the reference too, so the two halves of the reference are compared with each other as a noise
+baseline.
 """
 
 from __future__ import annotations
@@ -16,29 +17,29 @@ from numpy.typing import ArrayLike, NDArray
 
 F32 = NDArray[np.float32]
 
-# Exposures of HDR-FLIP in stops about the one at which the white point is shown as white.
+# Exposures of HDR-FLIP in stops; at 0 the white point is displayed as white.
 EXPOSURES = (-2.0, 0.0, 2.0)
 TONE_MAPPER = "ACES"
-# Pixels per degree of the viewer's sight: a 0.7 m wide screen of 3840 pixels seen from 0.7 m.
+# Pixels per degree of visual angle: a 0.7 m wide screen of 3840 pixels at a distance of 0.7 m.
 PIXELS_PER_DEGREE = 67.0
 
 DEFINITION = (
-    "LDR-FLIP (Andersson et al. 2020): mean over pixels of how visible the difference is at exposure 0 EV, "
-    "values above white cut off; HDR-FLIP (2021): per pixel the largest of the differences at "
+    "LDR-FLIP (Andersson et al. 2020) is the mean over pixels of the visible difference at 0 EV, with values "
+    "above white clipped. HDR-FLIP (2021) takes per pixel the largest difference at "
     + ", ".join(f"{stop:+g}".replace("-", "−").replace("+0", "0") for stop in EXPOSURES)
-    + f" EV, tone mapper {TONE_MAPPER}; both for {PIXELS_PER_DEGREE:g} pixels per degree; 0 is none, 1 the "
-    "largest. The reference's noise counts as difference: half against half shows what noise alone gives"
+    + f" EV, tone mapper {TONE_MAPPER}. Both assume {PIXELS_PER_DEGREE:g} pixels per degree; 0 is no "
+    "difference, 1 the largest. They include the reference noise; comparing its two halves gives a baseline."
 )
 
 
 @dataclass(frozen=True)
 class Flip:
-    """Visible difference of two pictures.
+    """FLIP of two images.
 
     Attributes
     ----------
-    ldr, hdr : means over pixels, from 0 to 1
-    hdr_map : (rows, columns), the HDR-FLIP of each pixel
+    ldr, hdr : mean over pixels, from 0 to 1
+    hdr_map : (rows, columns), HDR-FLIP per pixel
     """
 
     ldr: float
@@ -50,14 +51,14 @@ class Flip:
         return {"ldr": self.ldr, "hdr": self.hdr}
 
 
-def flip(picture: ArrayLike, reference: ArrayLike, white: float) -> Flip:
-    """FLIP of linear pictures (rows, columns, 3) in 1/sr.
+def flip(image: ArrayLike, reference: ArrayLike, white: float) -> Flip:
+    """FLIP of linear images (rows, columns, 3) in 1/sr.
 
     Parameters
     ----------
-    white : linear value shown as white at 0 EV, 1/sr
+    white : linear value displayed as white at 0 EV, 1/sr
     """
-    test, truth = (np.maximum(np.asarray(x, np.float32) / np.float32(white), 0) for x in (picture, reference))
+    test, truth = (np.maximum(np.asarray(x, np.float32) / np.float32(white), 0) for x in (image, reference))
     hdr_map, hdr = _evaluate(
         truth,
         test,
@@ -72,7 +73,7 @@ def flip(picture: ArrayLike, reference: ArrayLike, white: float) -> Flip:
 
 
 def _evaluate(reference: F32, test: F32, kind: str, **parameters: Any) -> tuple[F32, float]:
-    """(map, mean over pixels) of linear pictures."""
+    """(map, mean over pixels) of linear images."""
     import flip_evaluator
 
     field, mean, _ = flip_evaluator.evaluate(

@@ -1,8 +1,9 @@
-"""Offsets: how far from a point of the reference plane a view sees the surface, learned and traced.
+"""Parallax offsets: the lateral displacement between the reference plane and the visible surface.
 
-The ray against ω_o through the plane's point u goes on below the plane and meets the surface at height z < 0,
-displaced sideways by ``z · ω_o.xy / ω_o.z``. Models with a learned offset move their lookup by something of
-that kind; nothing forces them to find the same, so the two are shown side by side.
+The view ray through the point u of the reference plane continues below the plane and hits the surface at
+height z < 0, displaced laterally by ``z · ω_o.xy / ω_o.z``. Models with a learned offset shift their lookup
+in a similar way. Their training does not enforce equality, so learned and traced offsets are shown side by
+side.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from mbtf_core.atomic import write_through
 from mbtf_core.directions import from_angles
 from mbtf_core.lattice import Lattice, texel_centers
 from mbtf_pipeline.compare.pictures import fit_name
-from mbtf_pipeline.recipe import View
+from mbtf_pipeline.recipe import SceneView
 
 if TYPE_CHECKING:
     from mbtf_fit import Material
@@ -26,12 +27,12 @@ if TYPE_CHECKING:
 
 F32 = NDArray[np.float32]
 OFFSETS = "offsets"
-# Texels across, at most, of an offset picture.
-_LARGEST = 256
+# Largest number of texels across an offset image.
+_MAX_RESOLUTION = 256
 
 
 def traced_offset(estimator: Estimator, u: F32, omega_o: NDArray[np.float64]) -> F32:
-    """Sideways displacement (n, 2) in tile widths of what a view sees through points of the reference plane.
+    """Lateral displacement (n, 2) in tile widths of the surface seen through points of the reference plane.
 
     Parameters
     ----------
@@ -67,7 +68,7 @@ def read_offset(path: Path) -> F32:
 
     Raises
     ------
-    InputError : missing or damaged
+    InputError : missing or corrupt
     """
     from mbtf_gen.images.exr import read_channels
 
@@ -75,7 +76,7 @@ def read_offset(path: Path) -> F32:
     return np.stack([channels["X"], channels["Y"]], axis=-1).astype(np.float32)
 
 
-def towards_view(offset: F32, view: View) -> F32:
+def towards_view(offset: F32, view: SceneView) -> F32:
     """Component of displacements (..., 2) towards the viewer's azimuth, in tile widths."""
     along = from_angles(0.0, view.azimuth)[:2]
     out: F32 = (offset @ along).astype(np.float32)
@@ -83,14 +84,14 @@ def towards_view(offset: F32, view: View) -> F32:
 
 
 def _correlation(x: F32, y: F32) -> float | None:
-    """Pearson's r of two arrays; None where one of them is constant."""
+    """Pearson's r of two arrays; None if one of them is constant."""
     a, b = (v.astype(np.float64).ravel() - v.mean(dtype=np.float64) for v in (x, y))
     norm = float(np.linalg.norm(a) * np.linalg.norm(b))
     return float(a @ b) / norm if norm > 1e-20 else None
 
 
 def _slope(x: F32, y: F32) -> float | None:
-    """Slope of the line through y over x, both less their means; None where x is constant."""
+    """Slope of the regression of y on x; None if x is constant."""
     a, b = (v.astype(np.float64).ravel() - v.mean(dtype=np.float64) for v in (x, y))
     square = float(a @ a)
     return float(a @ b) / square if square > 1e-20 else None
@@ -99,19 +100,17 @@ def _slope(x: F32, y: F32) -> float | None:
 def write_offsets(
     estimator: Estimator,
     materials: Mapping[str, Material],
-    views: Sequence[View],
+    views: Sequence[SceneView],
     lattice: Lattice,
     out: Path,
 ) -> list[dict[str, Any]]:
-    """Write traced and learned offsets of every view below `out`; plain data about them.
+    """Write traced and learned offsets of every view below `out`; returns plain data about them.
 
-    Of displacements towards the viewer ``spread`` is the standard deviation over the tile in tile widths; of
-    learned ones ``correlation`` is that with the traced, and ``slope`` that of the line through them over the
-    traced, which is 1 for the same size.
-
-    Models that move nothing are left out; without any that does, nothing is written.
+    ``spread`` is the standard deviation over the tile of the displacement towards the viewer, in tile widths.
+    For learned offsets, ``correlation`` is Pearson's r with the traced offset and ``slope`` is that of the
+    regression on it, which is 1 for equal magnitude. Models without an offset are left out.
     """
-    level = min(lattice.finest, int(np.log2(_LARGEST)))
+    level = min(lattice.finest, int(np.log2(_MAX_RESOLUTION)))
     rows, columns = lattice.shape(level)
     u = texel_centers(rows, columns).reshape(-1, 2).astype(np.float32)
     directions = [from_angles(view.elevation, view.azimuth) for view in views]

@@ -1,8 +1,8 @@
-"""Which pictures a comparison holds, and their files."""
+"""Scenes of a comparison and the files of their images."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_gen.pictures.camera import Camera, PixelKind
-from mbtf_pipeline.recipe import FIELD_OF_VIEW, CompareSection, Direction, View
+from mbtf_pipeline.recipe import FIELD_OF_VIEW, CompareSection, SceneDirection, SceneView
 
 F32 = NDArray[np.float32]
 PICTURES = "pictures"
@@ -19,19 +19,19 @@ PICTURES = "pictures"
 
 @dataclass(frozen=True)
 class Scene:
-    """One view under one light at one width.
+    """One view under one light at one width of the field of view.
 
     Attributes
     ----------
-    index : number of the scene in the comparison
-    name : ``v1-l2-s3``: numbers of view, light and width, from 1
+    index : of the scene in the comparison, from 0
+    name : ``v1-l2-s3``: view, light and width, counted from 1
     tiles_across : width of the field of view at the target, in tile widths
     """
 
     index: int
     name: str
-    view: View
-    light: Direction
+    view: SceneView
+    light: SceneDirection
     tiles_across: float
 
     def camera(self, size: int) -> Camera:
@@ -55,7 +55,7 @@ class Scene:
         }
 
     def file(self, what: str) -> str:
-        """Name of one of the scene's pictures without its suffix, relative to the comparison's folder."""
+        """Path of one of the scene's images without its suffix, relative to the comparison's folder."""
         return f"{PICTURES}/{self.name}-{what}"
 
 
@@ -70,17 +70,17 @@ def scenes(compare: CompareSection) -> Iterator[Scene]:
 
 
 def reference_name(kind: PixelKind) -> str:
-    """What a reference's files are called."""
+    """Stem of a reference's files."""
     return f"reference-{kind}"
 
 
 def fit_name(fit: str) -> str:
-    """What a fit's files are called."""
+    """Stem of a fit's files."""
     return f"fit-{fit}"
 
 
 def with_ending(path: Path, ending: str) -> Path:
-    """The path with something appended to its name, which may hold dots."""
+    """The path with `ending` appended to its name, which may contain dots."""
     return path.with_name(f"{path.name}{ending}")
 
 
@@ -106,7 +106,7 @@ def write_preview(path: Path, value: F32, white: float) -> None:
     write_file(with_ending(path, ".png"), lambda stream: image.save(stream, "PNG", optimize=True))
 
 
-# What a fit's map of HDR-FLIP is called, beside its picture.
+# Ending of a fit's HDR-FLIP map.
 _FLIP = "-flip.png"
 
 
@@ -121,11 +121,11 @@ def write_map(path: Path, flip: F32) -> None:
 
 
 def read_map(path: Path) -> F32:
-    """The map (rows, columns) from 0 to 1 that :func:`write_map` wrote.
+    """Read a map (rows, columns) in [0, 1] written by :func:`write_map`.
 
     Raises
     ------
-    InputError : missing or damaged
+    InputError : missing or corrupt
     """
     from PIL import Image
 
@@ -137,7 +137,7 @@ def read_map(path: Path) -> F32:
             return (np.asarray(image.convert("L"), np.float32) / 255.0).astype(np.float32)
     except (OSError, ValueError) as error:
         raise InputError(
-            f"cannot be read ({error})", where=file, hint="run the recipe again: it is made anew"
+            f"cannot be read ({error})", where=file, hint="run the recipe again to recreate it"
         ) from None
 
 
@@ -146,26 +146,29 @@ def read_halves(path: Path) -> tuple[F32, F32]:
 
     Raises
     ------
-    InputError : missing or damaged
+    InputError : missing or corrupt
     """
     from mbtf_gen.images.exr import read_channels
 
-    channels = read_channels(with_ending(path, ".exr"), 1 << 26)
-    a, b = (np.stack([channels[f"value_{h}.{c}"] for c in "RGB"], axis=-1) for h in "ab")
-    return a.astype(np.float32), b.astype(np.float32)
+    return _halves(read_channels(with_ending(path, ".exr"), 1 << 26))
 
 
 def read_picture(path: Path) -> F32:
-    """Linear RGB (rows, columns, 3) of a picture: of a reference the mean of its halves.
+    """Linear RGB (rows, columns, 3) of an image; of a reference, the mean of its halves.
 
     Raises
     ------
-    InputError : missing or damaged
+    InputError : missing or corrupt
     """
     from mbtf_gen.images.exr import read_channels
 
     channels = read_channels(with_ending(path, ".exr"), 1 << 26)
     if "value_a.R" in channels:
-        halves = [np.stack([channels[f"value_{h}.{c}"] for c in "RGB"], axis=-1) for h in "ab"]
-        return (0.5 * (halves[0] + halves[1])).astype(np.float32)
+        a, b = _halves(channels)
+        return (0.5 * (a + b)).astype(np.float32)
     return np.stack([channels[c] for c in "RGB"], axis=-1).astype(np.float32)
+
+
+def _halves(channels: Mapping[str, NDArray[Any]]) -> tuple[F32, F32]:
+    a, b = (np.stack([channels[f"value_{h}.{c}"] for c in "RGB"], axis=-1) for h in "ab")
+    return a.astype(np.float32), b.astype(np.float32)

@@ -1,10 +1,10 @@
-"""ST-LPIPS of a picture against its reference: a difference learned from what people see.
+"""ST-LPIPS of an image against its reference: a learned perceptual distance.
 
 Ghildyal and Liu: "Shift-tolerant Perceptual Similarity Metric", ECCV 2022. The weights are those of the
-package ``stlpips-pytorch`` (network ``alex``), an optional extra; nothing else of it is used, because its
-own code wants packages that would bring another PyTorch. The network is AlexNet's convolutions, strides
-taken by a blur of 1 2 1; the features of five layers are normalized over channels, and their squared
-differences weighted per channel and averaged over places.
+package ``stlpips-pytorch`` (network ``alex``), an optional extra. Its code is not used, because its
+dependencies would install another PyTorch. The network consists of AlexNet's convolutions; a 1 2 1 blur
+replaces their strides. Features of five layers are normalized over channels. Their squared differences are
+weighted per channel and averaged over positions.
 """
 
 from __future__ import annotations
@@ -19,25 +19,24 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbtf_core.errors import EngineError
-from mbtf_pipeline.compare.ssim import on_screen
+from mbtf_pipeline.compare.ssim import to_srgb
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 PACKAGE = "stlpips_pytorch"
 _WEIGHTS = Path("weights/vST0.0/alex_shift_tolerant.pth")
-# Pictures smaller than this leave the deepest layer nothing to see.
+# Smallest image side for which the deepest layer is not empty.
 _SMALLEST = 32
 
 DEFINITION = (
-    "ST-LPIPS (Ghildyal and Liu 2022, network alex) of the pictures in sRGB at 0 EV, values above white "
-    "cut off; 0 is none. The reference's noise counts as difference: half against half shows what noise "
-    "alone gives"
+    "ST-LPIPS (Ghildyal and Liu 2022, network alex) of the images in sRGB at 0 EV, with values above white "
+    "clipped; 0 means equal. It includes the reference noise; comparing its two halves gives a baseline."
 )
 
 
 def weights_file() -> Path | None:
-    """Where the package's weights lie; None where it is not installed."""
+    """Path of the package's weights; None if it is not installed."""
     spec = find_spec(PACKAGE)
     places = [] if spec is None else list(spec.submodule_search_locations or [])
     found = [Path(place) / _WEIGHTS for place in places]
@@ -45,7 +44,7 @@ def weights_file() -> Path | None:
 
 
 def require() -> None:
-    """See to it that ST-LPIPS can be measured.
+    """Check that ST-LPIPS can be computed.
 
     Raises
     ------
@@ -55,13 +54,13 @@ def require() -> None:
         raise EngineError(
             "ST-LPIPS needs the weights of the package stlpips-pytorch, which is not installed",
             where="compare.st_lpips",
-            hint="pip install 'mbtf[perceptual]', or leave the option out",
+            hint="pip install 'mbtf[perceptual]', or remove the option",
         )
 
 
 @dataclass(frozen=True)
 class _Network:
-    """Numbers of the network by the names of the package's file."""
+    """Tensors of the network, named as in the package's file."""
 
     tensors: dict[str, Any]
 
@@ -70,8 +69,8 @@ class _Network:
 
         return conv2d(x, self.tensors[f"{name}.weight"], self.tensors[f"{name}.bias"], padding=padding)
 
-    def _halved(self, x: Tensor) -> Tensor:
-        """Every other row and column of the 1 2 1 blur; reflected edges, two pixels wide."""
+    def _blurred(self, x: Tensor) -> Tensor:
+        """1 2 1 blur with stride 2 and reflected edges, two pixels wide."""
         import torch
         from torch.nn.functional import conv2d, pad
 
@@ -79,24 +78,24 @@ class _Network:
         kernel = (row[:, None] * row).expand(x.shape[1], 1, 3, 3)
         return conv2d(pad(x, (2, 2, 2, 2), mode="reflect"), kernel, stride=2, groups=x.shape[1])
 
-    def _shrunk(self, x: Tensor) -> Tensor:
-        """Maximum over 3 × 3, then halved."""
+    def _pooled(self, x: Tensor) -> Tensor:
+        """Maximum over 3 × 3, then blurred with stride 2."""
         from torch.nn.functional import max_pool2d
 
-        return self._halved(max_pool2d(x, 3, stride=1))
+        return self._blurred(max_pool2d(x, 3, stride=1))
 
     def features(self, x: Tensor) -> list[Tensor]:
-        """Features of the five layers of pictures (n, 3, rows, columns) from -1 to 1."""
+        """Features of the five layers for images (n, 3, rows, columns) in [-1, 1]."""
         x = (x - self.tensors["scaling_layer.shift"]) / self.tensors["scaling_layer.scale"]
-        out = [self._halved(self._layer(x, "net.slice1.0", 2)).relu()]
-        out.append(self._layer(self._shrunk(out[-1]), "net.slice2.5", 2).relu())
-        out.append(self._layer(self._shrunk(out[-1]), "net.slice3.9", 1).relu())
+        out = [self._blurred(self._layer(x, "net.slice1.0", 2)).relu()]
+        out.append(self._layer(self._pooled(out[-1]), "net.slice2.5", 2).relu())
+        out.append(self._layer(self._pooled(out[-1]), "net.slice3.9", 1).relu())
         out.append(self._layer(out[-1], "net.slice4.11", 1).relu())
         out.append(self._layer(out[-1], "net.slice5.13", 1).relu())
         return out
 
     def distance(self, first: Tensor, second: Tensor) -> float:
-        """Distance of two pictures (1, 3, rows, columns)."""
+        """Distance of two images (1, 3, rows, columns)."""
         total = 0.0
         for layer, (x, y) in enumerate(zip(self.features(first), self.features(second), strict=True)):
             x, y = (f / (f.square().sum(1, keepdim=True).sqrt() + 1e-10) for f in (x, y))
@@ -115,12 +114,12 @@ def _network() -> _Network:
     return _Network(torch.load(file, map_location="cpu", weights_only=True))
 
 
-def st_lpips(picture: ArrayLike, reference: ArrayLike, white: float) -> float | None:
-    """ST-LPIPS of linear pictures (rows, columns, 3) in 1/sr; None for pictures too small for the network.
+def st_lpips(image: ArrayLike, reference: ArrayLike, white: float) -> float | None:
+    """ST-LPIPS of linear images (rows, columns, 3) in 1/sr; None for images too small for the network.
 
     Parameters
     ----------
-    white : linear value shown as white at 0 EV, 1/sr
+    white : linear value displayed as white at 0 EV, 1/sr
 
     Raises
     ------
@@ -132,8 +131,8 @@ def st_lpips(picture: ArrayLike, reference: ArrayLike, white: float) -> float | 
     if min(np.shape(reference)[:2]) < _SMALLEST:
         return None
     pair = [
-        torch.from_numpy((2.0 * on_screen(x, white) - 1.0).astype(np.float32).transpose(2, 0, 1)[None])
-        for x in (picture, reference)
+        torch.from_numpy((2.0 * to_srgb(x, white) - 1.0).astype(np.float32).transpose(2, 0, 1)[None])
+        for x in (image, reference)
     ]
     with torch.no_grad():
         return network.distance(*pair)

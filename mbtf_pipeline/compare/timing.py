@@ -1,8 +1,8 @@
-"""Where the time of one evaluation goes: offset texture, offset network, pyramid, decoder.
+"""Time of one evaluation, split into offset texture, offset network, pyramid and decoder.
 
-A model answers in two stages: stage 1 (offset and lookup) depends on the view alone, stage 2 on the light as
-well, so several lights share stage 1. Both are timed as PyTorch runs them, part by part, at random queries;
-the whole is also timed as :meth:`~mbtf_fit.Material.evaluate` runs it.
+A model evaluates in two stages. Stage 1 (offset and lookup) depends on the view only, stage 2 also on the
+light, so several lights share stage 1. Both are timed in PyTorch, part by part, at random queries. The
+whole evaluation is also timed through :meth:`~mbtf_fit.Material.evaluate`.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ if TYPE_CHECKING:
 
     from mbtf_fit import Material
 
-# Lights that one view is evaluated under.
+# Numbers of lights per view.
 LIGHTS = (1, 4, 16)
-# Queries that are evaluated at a time, and timings whose median counts, after one that does not.
+# Queries per batch, and number of timed repetitions after one warm-up run.
 _CHUNK = 1 << 15
 _TIMINGS = 3
 _SEED = 7
-# One of so many pixels is evaluated, and times are scaled: they grow with the number of queries alone.
-_THIN = 8
+# One of so many pixels is evaluated and the time scaled up: it is proportional to the number of queries.
+_SUBSAMPLING = 8
 
 T = TypeVar("T")
 
 
 def timed(work: Callable[[], T]) -> tuple[T, float]:
-    """What `work` returns, and the median of several timings in seconds, after one that is not counted."""
+    """What `work` returns, and the median of several timings in seconds after one warm-up run."""
     result = work()
     seconds = []
     for _ in range(_TIMINGS):
@@ -45,7 +45,7 @@ def timed(work: Callable[[], T]) -> tuple[T, float]:
 
 @dataclass(frozen=True)
 class Workload:
-    """Random queries as tensors, in chunks: positions, levels' footprints, light and view."""
+    """Random queries as tensors: positions, footprints, light and view directions."""
 
     u: Tensor
     sigma: Tensor
@@ -54,7 +54,7 @@ class Workload:
 
     @classmethod
     def random(cls, count: int, finest: int, device: str) -> Workload:
-        """So many queries of all levels, directions within 60° of the normal."""
+        """`count` queries over all levels, with directions within 60° of the normal."""
         import torch
 
         from mbtf_core.directions import from_projected_disk
@@ -75,8 +75,8 @@ class Workload:
             yield u, sigma, light, view
 
 
-def _once(work: Callable[[], Any]) -> Callable[[], None]:
-    """The work without gradients, waited for."""
+def _synchronized(work: Callable[[], Any]) -> Callable[[], None]:
+    """The work without gradients, including the wait for the GPU."""
     import torch
 
     def run() -> None:
@@ -89,30 +89,34 @@ def _once(work: Callable[[], Any]) -> Callable[[], None]:
 
 
 def measure_timing(material: Material, pixels: int, device: str = "cpu") -> dict[str, Any]:
-    """Milliseconds of one evaluation per pixel and their parts, plain data.
+    """Milliseconds of one evaluation per pixel, in total and by part; plain data.
 
-    An eighth of the pixels is evaluated, and where a model reads many places for one query as many fewer; the
-    times are scaled, ``queries`` says how many were evaluated.
+    An eighth of the pixels is evaluated, fewer for models that read several positions per query. The times
+    are scaled to all pixels; ``queries`` is the number evaluated.
 
     Parameters
     ----------
-    material : on `device`
-    pixels : queries that the times are for
+    material : Material
+        On `device`.
+    pixels : int
+        Number of queries that the times refer to.
+    device : str
+        PyTorch device.
     """
     model = material.model
-    count = max(1, pixels // (_THIN * model.positions))
+    count = max(1, pixels // (_SUBSAMPLING * model.positions))
     work = Workload.random(count, model.lattice.finest, device)
     size = max(1, _CHUNK // model.positions)
     scale = 1e3 * pixels / count
 
     def milliseconds(part: Callable[..., Any]) -> float:
-        whole = _once(lambda: [part(*chunk) for chunk in work.chunks(size)])
+        whole = _synchronized(lambda: [part(*chunk) for chunk in work.chunks(size)])
         return scale * timed(whole)[1]
 
     numpy = [a.cpu().numpy() for a in (work.u, work.sigma, work.omega_i, work.omega_o)]
-    whole = scale * timed(_once(lambda: material.evaluate(*numpy)))[1]
+    whole = scale * timed(_synchronized(lambda: material.evaluate(*numpy)))[1]
     first = milliseconds(lambda u, s, i, o: model.stage1(u, s, o))
-    # Stage 2 is timed with the features of the first chunk, over and over: what they are changes nothing.
+    # Stage 2 is timed with the features of the first chunk: its time does not depend on their values.
     features = _first_features(material, work, size)
     second = milliseconds(lambda u, s, i, o: model.stage2(features[: len(u)], i, o))
     parts = {name: milliseconds(part) for name, part in _parts(material).items()}
@@ -137,7 +141,7 @@ def _first_features(material: Material, work: Workload, size: int) -> Any:
 
 
 def _parts(material: Material) -> dict[str, Callable[..., Any]]:
-    """What stage 1 does, part by part, at one place per position that the model reads."""
+    """Parts of stage 1, evaluated once for each position that the model reads."""
     from mbtf_fit.models.encodings import encode_position
 
     model = material.model

@@ -1,12 +1,12 @@
-"""One reference rendered again by stock parts of Mitsuba alone, as a check from outside.
+"""Independent check: one reference rendered again with plugins of unmodified Mitsuba only.
 
-The picture is that of the ``pixel`` kind, near normal incidence, under a directional light without width.
-What is ours is replaced part by part: the endless height field by a finite block of instances of the
-tile's triangle mesh, read from a PLY file; the loop over a path by the integrator ``path``; camera rays by
-the sensor ``perspective`` with a ``gaussian`` filter of half a pixel; the light by the emitter
-``directional``; and the surface by ``diffuse`` with the base color as a ``bitmap``. No stock surface has the
-project's gloss (docs/surface.md), so a material with one is compared a second time with its own surface
-under all the other stock parts. Holes are left out: stock shadow rays do not pass through them.
+The image is of the ``pixel`` kind, near normal incidence, under a delta light. Plugins of Mitsuba replace
+every part of the generator. A finite block of instances of the tile's triangle mesh, read from a PLY file,
+replaces the periodic height field. The integrator ``path`` traces the paths, the sensor ``perspective``
+with a ``gaussian`` filter of half a pixel generates camera rays, the emitter ``directional`` is the light,
+and ``diffuse`` with a ``bitmap`` of the base color is the BSDF. Mitsuba has no equivalent of our glossy
+BSDF. A glossy material is therefore rendered a second time with our BSDF and everything else from Mitsuba.
+Opacity is ignored, because shadow rays of Mitsuba do not pass through masked surfaces.
 """
 
 from __future__ import annotations
@@ -31,23 +31,24 @@ if TYPE_CHECKING:
     from mbtf_gen.config.generator import GeneratorConfig
     from mbtf_gen.job import Job
     from mbtf_gen.material.material import Material
-    from mbtf_pipeline.recipe import CompareSection, Direction, View
+    from mbtf_pipeline.recipe import CompareSection, SceneDirection, SceneView
 
 F64 = NDArray[np.float64]
-# Elevation of the view and of the light that the finite block is good for.
+# Lowest elevations of view and light for which the finite block suffices.
 LOWEST_VIEW, LOWEST_LIGHT = 75.0, 30.0
-# Side of the squares of pixels that count as independent: neighbors share samples of the stock filter. What
-# squares share across their borders makes error bars 5 % too small, 12 % where they are the smallest. Small
-# pictures have smaller ones, so that there are _SQUARES along a side.
-_BLOCK, _SMALLEST, _SQUARES = 8, 4, 4
-# Squares below which the error bars say nothing: of one alone they are infinite, and all would agree.
-LEAST_SQUARES = 9
-# Differences that do not matter, relative to the mean value: of the mean, and root mean square over pixels.
+# Side in pixels of the blocks taken as independent: neighboring pixels share samples of the Gaussian filter.
+# Correlation across block borders makes error bars 5 % too small, 12 % for the smallest blocks. Small
+# images use smaller blocks, so that _BLOCKS_ACROSS fit along a side.
+_BLOCK, _MIN_BLOCK, _BLOCKS_ACROSS = 8, 4, 4
+# With fewer blocks the error bars are too uncertain to decide anything.
+MIN_BLOCKS = 9
+# Tolerated differences relative to the mean value: of the mean, and root mean square over pixels.
 MEAN_TOLERANCE, RMS_TOLERANCE = 0.005, 0.02
-# Error bars that a larger difference may lie within: of dozens of comparisons some exceed two by chance.
-BARS = 3.0
-# Parts of a material that Lambert has none of.
-_BARE = (
+# A larger difference is tolerated within so many standard errors: among dozens of comparisons, some exceed
+# two.
+MAX_STANDARD_ERRORS = 3.0
+# Properties that a Lambertian surface does not have.
+_NOT_LAMBERTIAN = (
     "roughness",
     "metallic",
     "specular",
@@ -61,26 +62,26 @@ _BARE = (
 )
 
 
-Verdict = Literal["agree", "DIFFER", "too small to tell"]
+Verdict = Literal["agree", "differ", "inconclusive"]
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """Two pictures of the same thing.
+    """Comparison of one scene rendered by mbtf and by unmodified Mitsuba.
 
     Attributes
     ----------
     surface : ``base color`` or ``full``
-    mean : difference of the means, ours less stock's, relative to the mean value
-    square : mean squared difference free of both sides' noise, relative to the squared mean value
-    ours, stock : (rows, columns, 3) values in 1/sr
+    mean : difference of the means, mbtf minus Mitsuba, relative to the mean value
+    square : noise-free mean squared difference, relative to the squared mean value
+    mbtf, mitsuba : (rows, columns, 3) values in 1/sr
     """
 
     surface: str
     mean: Estimate
     square: Estimate
-    ours: F64
-    stock: F64
+    mbtf: F64
+    mitsuba: F64
 
     @property
     def verdict(self) -> Verdict:
@@ -88,7 +89,7 @@ class Agreement:
         return verdict(self.mean, self.square)
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain data, without the pictures."""
+        """Plain data, without the images."""
         return {
             "surface": self.surface,
             "mean": self.mean.as_dict(),
@@ -97,42 +98,45 @@ class Agreement:
 
 
 def verdict(mean: Estimate, square: Estimate) -> Verdict:
-    """Whether relative differences, of the means and mean square over pixels, lie within their tolerances or
-    within three of their error bars."""
-    if min(mean.n, square.n) < LEAST_SQUARES:
-        return "too small to tell"
-    places = square.value <= max(RMS_TOLERANCE**2, BARS * square.error)
-    return "agree" if places and abs(mean.value) <= max(MEAN_TOLERANCE, BARS * mean.error) else "DIFFER"
+    """Whether both relative differences lie within their tolerance or within three standard errors."""
+    if min(mean.n, square.n) < MIN_BLOCKS:
+        return "inconclusive"
+    pixels_agree = square.value <= max(RMS_TOLERANCE**2, MAX_STANDARD_ERRORS * square.error)
+    return (
+        "agree"
+        if pixels_agree and abs(mean.value) <= max(MEAN_TOLERANCE, MAX_STANDARD_ERRORS * mean.error)
+        else "differ"
+    )
 
 
-def agreement(surface: str, ours: tuple[F64, F64], stock: tuple[F64, F64], margin: int = 0) -> Agreement:
-    """Compare two renders (rows, columns, 3), each as two independent halves.
+def agreement(surface: str, mbtf: tuple[F64, F64], mitsuba: tuple[F64, F64], margin: int = 0) -> Agreement:
+    """Compare two renderings (rows, columns, 3), each given as two independent halves.
 
     Parameters
     ----------
-    margin : pixels along every edge that are left out; fewer in pictures that would have none left
+    margin : pixels to ignore along every edge; reduced for images that would have none left
     """
-    margin = min(margin, (min(ours[0].shape[:2]) - 1) // 2)
+    margin = min(margin, (min(mbtf[0].shape[:2]) - 1) // 2)
     inner = slice(margin, -margin if margin else None)
-    a1, b1, a2, b2 = (_blocks(x[inner, inner]) for x in (*ours, *stock))
+    a1, b1, a2, b2 = (_blocks(x[inner, inner]) for x in (*mbtf, *mitsuba))
     mean = float((a1 + b1 + a2 + b2).mean() / 4.0)
     scale = 1.0 / max(mean, 1e-30)
     difference = mean_estimate((a1 + b1 - a2 - b2) / 2.0).scaled(scale)
     square = mean_estimate((a1 - a2) * (b1 - b2)).scaled(scale**2)
-    return Agreement(surface, difference, square, (ours[0] + ours[1]) / 2, (stock[0] + stock[1]) / 2)
+    return Agreement(surface, difference, square, (mbtf[0] + mbtf[1]) / 2, (mitsuba[0] + mitsuba[1]) / 2)
 
 
 def _blocks(picture: F64) -> F64:
-    """(blocks, pixels of a block, 3) of a picture; what is left over at the right and below is dropped."""
+    """(blocks, pixels of a block, 3) of an image; incomplete blocks at the right and bottom are dropped."""
     shortest = min(picture.shape[:2])
-    side = min(_BLOCK, shortest, max(_SMALLEST, shortest // _SQUARES))
+    side = min(_BLOCK, shortest, max(_MIN_BLOCK, shortest // _BLOCKS_ACROSS))
     rows, columns = (n // side for n in picture.shape[:2])
     cut = picture[: rows * side, : columns * side].reshape(rows, side, columns, side, 3)
     return cut.transpose(0, 2, 1, 3, 4).reshape(rows * columns, side * side, 3)
 
 
-def pick_scene(section: CompareSection) -> tuple[View, Direction, float]:
-    """The first view and the first light that are high enough, and the smallest width.
+def pick_scene(section: CompareSection) -> tuple[SceneView, SceneDirection, float]:
+    """The first view and the first light that are high enough, and the smallest field of view.
 
     Raises
     ------
@@ -142,30 +146,30 @@ def pick_scene(section: CompareSection) -> tuple[View, Direction, float]:
     lights = [light for light in section.lights if light.elevation >= LOWEST_LIGHT]
     if not views or not lights:
         raise UsageError(
-            f"stock parts want a view from {LOWEST_VIEW:g} degrees on, and a light from {LOWEST_LIGHT:g} on",
-            where="compare.stock",
-            hint="add them to compare.views and compare.lights, or leave the option out",
+            f"needs a view at {LOWEST_VIEW:g} degrees or higher and a light at {LOWEST_LIGHT:g} or higher",
+            where="compare.unmodified_mitsuba",
+            hint="add them to compare.views and compare.lights, or remove the option",
         )
     return views[0], lights[0], min(section.tiles_across)
 
 
-def write_stock(
+def write_agreement(
     section: CompareSection, generate: GeneratorConfig, material: Material, white: float, out: Path
 ) -> dict[str, Any]:
-    """Compare with stock parts, write both pictures of each surface below `out`; plain data about them.
+    """Compare with unmodified Mitsuba and write both images of each surface below `out`; returns plain data.
 
     Raises
     ------
-    UsageError : the comparison has no scene for it
+    UsageError : the comparison has no suitable scene
     """
     view, light, tiles_across = pick_scene(section)
     surfaces = []
-    for found in compare_with_stock(section, generate, material):
+    for found in compare_with_mitsuba(section, generate, material):
         files = {}
-        for route, value in (("ours", found.ours), ("stock", found.stock)):
-            files[route] = f"{PICTURES}/stock-{found.surface.replace(' ', '-')}-{route}"
-            write_picture(out / files[route], value.astype(np.float32))
-            write_preview(out / files[route], value.astype(np.float32), white)
+        for renderer, value in (("mbtf", found.mbtf), ("mitsuba", found.mitsuba)):
+            files[renderer] = f"{PICTURES}/check-{found.surface.replace(' ', '-')}-{renderer}"
+            write_picture(out / files[renderer], value.astype(np.float32))
+            write_preview(out / files[renderer], value.astype(np.float32), white)
         surfaces.append({**found.as_dict(), "files": files})
     return {
         "view": view.model_dump(),
@@ -176,14 +180,14 @@ def write_stock(
     }
 
 
-def compare_with_stock(
+def compare_with_mitsuba(
     section: CompareSection, generate: GeneratorConfig, material: Material
 ) -> list[Agreement]:
-    """Render one scene of a comparison by both routes: bare of gloss, and with the full surface.
+    """Render one scene with mbtf and with Mitsuba: the base color alone, and the full surface.
 
     Raises
     ------
-    UsageError : the comparison has no scene for it
+    UsageError : the comparison has no suitable scene
     """
     from mbtf_gen.config.generator import LightSection
     from mbtf_gen.job import Job
@@ -196,43 +200,43 @@ def compare_with_stock(
     camera = Camera(view.elevation, view.azimuth, tiles_across, rows=section.size, columns=section.size)
     omega_i = from_angles(light.elevation, light.azimuth)
     out = []
-    for surface, made in _surfaces(material).items():
-        job = Job(config, made)
+    for surface, variant in _surfaces(material).items():
+        job = Job(config, variant)
         estimator = build_estimator(job, reference_plan(job))
         image = render_reference(
             estimator, camera, omega_i, kind="pixel", spp=section.spp, seed=section.seed, index=0
         )
-        ours = tuple(x.astype(np.float64) for x in (image.value_a, image.value_b))
-        stock = render_stock(job, camera, omega_i, section.spp, section.seed)
-        out.append(agreement(surface, (ours[0], ours[1]), stock, margin=4))
+        mbtf = tuple(x.astype(np.float64) for x in (image.value_a, image.value_b))
+        mitsuba = render_with_mitsuba(job, camera, omega_i, section.spp, section.seed)
+        out.append(agreement(surface, (mbtf[0], mbtf[1]), mitsuba, margin=4))
     return out
 
 
 def _surfaces(material: Material) -> dict[str, Material]:
-    """The material as a Lambert surface of its base color, and as it is, without holes."""
+    """The material as a Lambertian surface of its base color, and as it is but without opacity."""
     if material.bsdf is not None:
         return {"full": material}
-    nothing: dict[str, Any] = dict.fromkeys(_BARE)
-    bare = dataclasses.replace(material, **nothing)
+    removed: dict[str, Any] = dict.fromkeys(_NOT_LAMBERTIAN)
+    lambertian = dataclasses.replace(material, **removed)
     full = dataclasses.replace(material, opacity=None)
-    glossy = any(getattr(full, name) is not None for name in _BARE)
-    return {"base color": bare, **({"full": full} if glossy else {})}
+    glossy = any(getattr(full, name) is not None for name in _NOT_LAMBERTIAN)
+    return {"base color": lambertian, **({"full": full} if glossy else {})}
 
 
-def render_stock(job: Job, camera: Camera, omega_i: F64, spp: int, seed: int) -> tuple[F64, F64]:
-    """Two independent renders (rows, columns, 3) in 1/sr of `spp`/2 paths per pixel."""
+def render_with_mitsuba(job: Job, camera: Camera, omega_i: F64, spp: int, seed: int) -> tuple[F64, F64]:
+    """Two independent renderings (rows, columns, 3) in 1/sr with `spp`/2 paths per pixel each."""
     import mitsuba as mi
 
     with tempfile.TemporaryDirectory() as folder:
-        scene = mi.load_dict(_stock_scene(job, camera, omega_i, Path(folder)))
+        scene = mi.load_dict(_mitsuba_scene(job, camera, omega_i, Path(folder)))
     rng = np.random.default_rng([seed, 1])
     seeds = [int(s) for s in rng.integers(1 << 31, size=2)]
     a, b = (np.array(mi.render(scene, spp=max(1, spp // 2), seed=s), np.float64) for s in seeds)
     return a[..., :3], b[..., :3]
 
 
-def _stock_scene(job: Job, camera: Camera, omega_i: F64, folder: Path) -> dict[str, Any]:
-    """Mitsuba dictionary of the scene; the target lies at the origin of the x-y plane."""
+def _mitsuba_scene(job: Job, camera: Camera, omega_i: F64, folder: Path) -> dict[str, Any]:
+    """Scene dictionary for Mitsuba."""
     import mitsuba as mi
 
     from mbtf_gen.geometry.heightfield import tile_mesh
@@ -250,17 +254,14 @@ def _stock_scene(job: Job, camera: Camera, omega_i: F64, folder: Path) -> dict[s
         "filename": str(file),
         "face_normals": True,
         "flip_tex_coords": True,
-        "bsdf": _stock_surface(job),
+        "bsdf": _mitsuba_bsdf(job),
     }
-    # What a pixel at the edge sees, and from where light and interreflection reach it.
-    reach = (
-        0.75 * camera.tiles_across
-        + 2.0 * grid.displacement_range / math.tan(math.radians(LOWEST_LIGHT))
-        + 1.0
-    )
+    # Surfaces within this distance affect a pixel at the edge by visibility, shadowing or interreflection.
+    slope = math.tan(math.radians(LOWEST_LIGHT))
+    reach = 0.75 * camera.tiles_across + 2.0 * grid.displacement_range / slope + 1.0
     columns, rows = (math.ceil(reach / side) for side in (1.0, grid.aspect))
     shift = mi.ScalarTransform4f().translate
-    # The tile that the camera looks at lies in the middle.
+    # The camera looks at the central tile.
     middle = np.array([camera.target[0] - 0.5, camera.target[1] - 0.5 * grid.aspect])
     instances = {
         f"tile_{i + columns}_{j + rows}": {
@@ -307,15 +308,15 @@ def _stock_scene(job: Job, camera: Camera, omega_i: F64, folder: Path) -> dict[s
     }
 
 
-def _stock_surface(job: Job) -> dict[str, Any]:
-    """Stock ``diffuse`` with the base color where the material is Lambert, else its own surface."""
+def _mitsuba_bsdf(job: Job) -> dict[str, Any]:
+    """``diffuse`` with the base color for a Lambertian material, otherwise our BSDF."""
     import mitsuba as mi
 
     from mbtf_gen.planning.simulation import normal_map_slopes
     from mbtf_gen.render.bsdf.plugin import bsdf_of
 
     material = job.material
-    if any(getattr(material, name) is not None for name in _BARE) or material.bsdf is not None:
+    if any(getattr(material, name) is not None for name in _NOT_LAMBERTIAN) or material.bsdf is not None:
         mapped = normal_map_slopes(job)
         return bsdf_of(material, slopes=None if mapped is None else mapped[0])
     base = np.asarray(material.base_color, np.float32)

@@ -218,7 +218,9 @@ class GeneratorBenchmark:
             shard = _FIRST_BATCH + len(squares)
             queries = self._queries(job, shard, count)
             start = time.perf_counter()
-            found = estimate_shard(estimator, queries, spp, target, Stream(self.seed, "test", shard), plan.allocation)
+            found = estimate_shard(
+                estimator, queries, spp, target, Stream(self.seed, "test", shard), plan.allocation
+            )
             times.append((time.perf_counter() - start) / count * 1e6)
             squares.append(((found.value_a.astype(np.float64) - found.value_b) ** 2 / 4.0).mean(axis=1))
             variance = mean_estimate(np.concatenate(squares)).scaled(1.0 / mean**2)

@@ -37,7 +37,7 @@ from mbtf_pipeline.cost_study.fit_runs import round_down
 from mbtf_pipeline.cost_study.runs import DataRequest, Run, RunRunner
 from mbtf_pipeline.recipe import Recipe
 from mbtf_pipeline.run import layout_of
-from mbtf_pipeline.run_folder import claim, describe, locked
+from mbtf_pipeline.run_folder import claim_run_folder, locked, write_run_record
 
 SPLIT_NAME = "time_split.json"
 SPLIT_FORMAT = "mbtf-time-split"
@@ -149,11 +149,11 @@ def split_time(
         )
     options = recipe.model_dump(mode="json", include={"generate", "fit"})
     key = data_sha256({"schema": SPLIT_SCHEMA, "time": seconds, "recipe": options})
-    claim(folder)
+    claim_run_folder(folder)
     with locked(folder):
         split = _stored(folder, key)
         if split is None:
-            describe(folder, recipe, command)
+            write_run_record(folder, recipe, command)
             split = _measure(recipe, seconds, folder, progress)
             write_json(folder / SPLIT_NAME, {"format": SPLIT_FORMAT, "key": key, **asdict(split)})
     return split

@@ -1,1 +1,1 @@
-"""Tables and figures as the papers have them: one recipe runs several, and measures nothing by itself."""
+"""Tables and figures of papers, made from several runs of one recipe."""

@@ -1,47 +1,45 @@
-"""Tables whose cells know how they are printed on a page and stored as CSV."""
+"""Tables whose columns know how to compute, print and export their cells."""
 
 from __future__ import annotations
 
 import csv
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from mbtf_core.stats import Estimate
-from mbtf_pipeline.compare.perceptual_metrics import Measure
-from mbtf_pipeline.formatting import decibel, error_text
+from mbtf_pipeline.compare.metrics import psnr
+from mbtf_pipeline.compare.perceptual_metrics import PerceptualMetric
+from mbtf_pipeline.formatting import decibel, estimate_text, is_significant, signed
 
-NOT_BUILT = "not built yet"
+NOT_IMPLEMENTED = "not implemented"
 
 
 @dataclass(frozen=True)
-class Decibel:
-    """PSNR with the noise-free MSE that it stands for."""
+class Psnr:
+    """A PSNR, given by a noise-free MSE and the peak, both in units of 1/sr."""
 
-    psnr: Estimate
     mse: Estimate
+    peak: float
 
-    @classmethod
-    def of(cls, mse: Estimate, peak: float) -> Decibel:
-        """10 log10(peak²/MSE); infinite where the MSE is not positive."""
-        if mse.value <= 0 or peak <= 0:
-            return cls(Estimate(math.inf, math.inf, mse.n), mse)
-        value = 10.0 * math.log10(peak**2 / mse.value)
-        return cls(Estimate(value, 10.0 / math.log(10.0) * mse.relative_error, mse.n), mse)
+    @property
+    def value(self) -> Estimate:
+        """In dB."""
+        return psnr(self.mse, self.peak)
 
 
 @dataclass(frozen=True)
-class Seen:
-    """A visible difference, and what noise alone gives."""
+class PerceptualCell:
+    """Value of a perceptual metric, and its value for noise alone."""
 
-    measure: Measure
+    metric: PerceptualMetric
     value: float
     noise: float | None
 
 
-Cell = Estimate | Decibel | Seen | float | int | str | None
+Cell = Estimate | Psnr | PerceptualCell | float | int | str | None
 
 
 @dataclass(frozen=True)
@@ -50,22 +48,32 @@ class Column:
 
     Attributes
     ----------
-    title : on the page, with its unit; key : in the CSV, whose numbers are in SI units and not scaled
+    title : on the page, with its unit
+    key : in the CSV file, whose numbers are not scaled
+    cell : computes the cell of a row from the row's items
     factor : from the stored number to the one on the page
-    digits : of plain numbers on the page
-    second : ending of a second CSV column: ``se`` (standard error) or ``noise`` (of noise alone); empty: none
+    digits : format of plain numbers on the page
     """
 
     title: str
     key: str
+    cell: Callable[..., Cell] = lambda *_: None
     factor: float = 1.0
     digits: str = ".3g"
-    second: str = ""
+
+
+MATERIAL = Column("material", "material", lambda run, *_: run.title)
+METHOD = Column("method", "method", lambda run, fit, *_: fit)
+
+
+def rows_of(columns: Sequence[Column], items: Iterable[Sequence[Any]]) -> list[list[Cell]]:
+    """One row per item; an item holds the arguments of the columns' functions."""
+    return [[column.cell(*item) for column in columns] for item in items]
 
 
 @dataclass(frozen=True)
-class Figure:
-    """A picture of a table: ``data:`` URI, what it is, and lines below it."""
+class Thumbnail:
+    """An image below a table: ``data:`` URI, label, and lines of its caption."""
 
     image: str
     label: str
@@ -74,7 +82,7 @@ class Figure:
 
 @dataclass(frozen=True)
 class Table:
-    """A table with its title, the text above it, plots, and rows of figures with a title each."""
+    """A table with a title, a text above it, plots, and titled rows of images."""
 
     key: str
     title: str
@@ -82,7 +90,7 @@ class Table:
     columns: Sequence[Column]
     rows: Sequence[Sequence[Cell]]
     plots: Sequence[Mapping[str, str]] = ()
-    figures: Sequence[tuple[str, Sequence[Figure]]] = field(default_factory=list)
+    images: Sequence[tuple[str, Sequence[Thumbnail]]] = field(default_factory=list)
 
     def for_page(self) -> dict[str, Any]:
         """Head and rows as text."""
@@ -90,19 +98,14 @@ class Table:
         return {"head": [c.title for c in self.columns], "rows": rows}
 
     def csv(self) -> str:
-        """All numbers; what is not known, or not measured, is empty."""
+        """All numbers as CSV, with columns for standard errors and noise; unknown numbers are empty."""
         stream = io.StringIO()
         writer = csv.writer(stream, lineterminator="\n")
-        head: list[str] = []
-        for column in self.columns:
-            head += [column.key, *([f"{column.key}_{column.second}"] if column.second else [])]
-        writer.writerow(head)
-        for row in self.rows:
-            cells: list[str] = []
-            for column, cell in zip(self.columns, row, strict=True):
-                first, second = _numbers(cell)
-                cells += [first, *([second] if column.second else [])]
-            writer.writerow(cells)
+        suffixes = [max(map(_suffix, cells)) for cells in zip(*self.rows, strict=True)]
+        names = [(c.key, f"{c.key}_{s}") for c, s in zip(self.columns, suffixes, strict=True)]
+        for row in (names, *([_numbers(cell) for cell in row] for row in self.rows)):
+            pairs = zip(row, suffixes, strict=True)
+            writer.writerow(x for pair, s in pairs for x in (pair if s else pair[:1]))
         return stream.getvalue()
 
 
@@ -112,46 +115,51 @@ def _text(column: Column, cell: Cell) -> str:
     if isinstance(cell, str):
         return cell
     if isinstance(cell, Estimate):
-        return error_text(cell, column.factor)
-    if isinstance(cell, Decibel):
-        return decibel(cell.psnr.as_dict(), cell.mse.as_dict())
-    if isinstance(cell, Seen):
-        more = ", not above noise alone" if cell.measure.is_noise(cell.value, cell.noise) else ""
-        return f"{cell.value:.3f}{more}"
+        return estimate_text(cell, column.factor)
+    if isinstance(cell, Psnr):
+        return decibel(cell.value, cell.mse)
+    if isinstance(cell, PerceptualCell):
+        return cell.metric.text(cell.value, cell.noise, with_noise=False)
     if isinstance(cell, int):
         return f"{cell:,}"
-    return f"{column.factor * cell:{column.digits}}".replace("-", "−")
+    return signed(f"{column.factor * cell:{column.digits}}")
 
 
 def _number(x: float | None) -> str:
     return "" if x is None or not math.isfinite(x) else f"{x:.6g}"
 
 
+def _suffix(cell: Cell) -> str:
+    """Suffix of the second CSV column: standard error, value for noise alone, or none."""
+    if isinstance(cell, Estimate | Psnr):
+        return "se"
+    return "noise" if isinstance(cell, PerceptualCell) else ""
+
+
 def _numbers(cell: Cell) -> tuple[str, str]:
-    """(value, standard error or noise) for the CSV."""
+    """(value, standard error or noise) for the CSV file."""
+    if isinstance(cell, Psnr):
+        cell = cell.value
     if isinstance(cell, Estimate):
         return _number(cell.value), _number(cell.error)
-    if isinstance(cell, Decibel):
-        return _number(cell.psnr.value), _number(cell.psnr.error)
-    if isinstance(cell, Seen):
+    if isinstance(cell, PerceptualCell):
         return _number(cell.value), _number(cell.noise)
-    if cell is None or isinstance(cell, str):
-        return cell or "", ""
-    return (str(cell) if isinstance(cell, int) else _number(cell)), ""
+    if cell is None or isinstance(cell, str | int):
+        return ("" if cell is None else str(cell)), ""
+    return _number(cell), ""
 
 
 def mean_of(estimates: Sequence[Estimate]) -> Estimate:
-    """Mean of independent estimates, with the error that follows from theirs."""
+    """Mean of independent estimates."""
     n = len(estimates)
     error = math.sqrt(sum(e.error**2 for e in estimates)) / n
     return Estimate(sum(e.value for e in estimates) / n, error, sum(e.n for e in estimates))
 
 
 def ratio_of(upper: Estimate, lower: Estimate) -> Estimate:
-    """Ratio of two estimates; their errors are taken as independent. Not defined where the lower one is not
-    told from zero."""
-    if lower.value <= 2.0 * lower.error:
-        return Estimate(math.nan, math.inf, min(upper.n, lower.n))
+    """Ratio of two independent estimates; undefined unless the lower one is significantly positive."""
+    n = min(upper.n, lower.n)
+    if lower.value <= 0 or not is_significant(lower):
+        return Estimate(math.nan, math.inf, n)
     value = upper.value / lower.value
-    error = math.hypot(upper.error, value * lower.error) / lower.value
-    return Estimate(value, error, min(upper.n, lower.n))
+    return Estimate(value, math.hypot(upper.error, value * lower.error) / lower.value, n)

@@ -1,4 +1,4 @@
-"""Pictures of a paper's page, as ``data:`` URIs."""
+"""Images of a paper recipe's page as ``data:`` URIs."""
 
 from __future__ import annotations
 
@@ -8,28 +8,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_pipeline.compare.pictures import read_picture, with_ending
-from mbtf_pipeline.report.embed import chart, photograph
+from mbtf_pipeline.report.embed import jpeg_uri, map_uri
 
 _QUALITY = 86
 
 
-def picture(path: Path) -> str:
-    """One of a comparison's previews (path without suffix), as it was exposed there."""
+def preview(path: Path) -> str:
+    """An image of the comparison (path without suffix) at its exposure."""
     from PIL import Image
 
     with Image.open(with_ending(path, ".png")) as image:
-        return photograph(np.asarray(image.convert("RGB")), _QUALITY)
+        return jpeg_uri(np.asarray(image.convert("RGB")), _QUALITY)
 
 
 def difference(path: Path, reference: Path, scale: float) -> str:
-    """Signed difference of two linear pictures (paths without suffix), mean of the channels; full color at
-    ± `scale`."""
-    field: NDArray[np.float64] = (
-        read_picture(path).astype(np.float64) - read_picture(reference).astype(np.float64)
-    ).mean(axis=-1)
-    return chart(field / scale, "signed", 256)
+    """Mean over channels of the difference of two linear images, saturated at ± `scale`."""
+    values, expected = (read_picture(p).astype(np.float64) for p in (path, reference))
+    return signed_map((values - expected).mean(axis=-1), scale)
 
 
-def signed(field: NDArray[np.float32], scale: float) -> str:
-    """A signed map (rows, columns), full color at ± `scale`."""
-    return chart((field / scale).astype(np.float64), "signed", 256)
+def signed_map(values: NDArray[np.floating], scale: float) -> str:
+    """A signed map (rows, columns), saturated at ± `scale`."""
+    return map_uri((values / scale).astype(np.float64), "signed", 256)

@@ -1,89 +1,100 @@
-"""One reference per material rendered again by stock parts of Mitsuba alone."""
+"""One reference per material, rendered again with unmodified Mitsuba."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from mbtf_core.stats import Estimate
 from mbtf_pipeline.compare.unmodified_mitsuba import (
-    BARS,
-    LEAST_SQUARES,
+    MAX_STANDARD_ERRORS,
     MEAN_TOLERANCE,
+    MIN_BLOCKS,
     RMS_TOLERANCE,
     verdict,
 )
 from mbtf_pipeline.formatting import direction, estimate
-from mbtf_pipeline.paper_tables.cells import Cell, Column, Figure, Table
-from mbtf_pipeline.paper_tables.figures import difference, picture
-from mbtf_pipeline.paper_tables.runs import Run, name_of
+from mbtf_pipeline.paper_tables.cells import MATERIAL, Column, Table, Thumbnail, rows_of
+from mbtf_pipeline.paper_tables.figures import difference, preview
+from mbtf_pipeline.paper_tables.runs import FinishedRun
 
-_ROUTES = {"base color": "stock parts alone", "full": "stock parts, the project’s surface"}
-# Colors of the difference pictures are full at this share of white.
+_RENDERERS = {"base color": "unmodified Mitsuba", "full": "Mitsuba with the BSDF of mbtf"}
+# The difference images saturate at this fraction of white.
 _SCALE = 0.1
+_TEXT = (
+    "The filtered image near normal incidence under a delta light, rendered by mbtf and by Mitsuba. "
+    "Mitsuba renders a block of instances of the tile’s mesh with the emitter directional, the sensor "
+    "perspective with a Gaussian filter of half a pixel, and the integrator path. The base color uses "
+    "Mitsuba’s BSDF diffuse; the full surface uses the BSDF of mbtf in both. Opacity is ignored. The "
+    f"images agree if their means differ by less than {100 * MEAN_TOLERANCE:g} % and their pixels by less "
+    f"than {100 * RMS_TOLERANCE:g} % RMS, or if the differences lie within {MAX_STANDARD_ERRORS:g} "
+    "standard errors. Images with fewer than 20 pixels a side are inconclusive. The detection limit is the "
+    "smallest RMS difference that would be detected despite the noise."
+)
+_COLUMNS = (
+    MATERIAL,
+    Column("surface", "surface", lambda run, found: found["surface"]),
+    Column("renderer", "renderer", lambda run, found: _RENDERERS[found["surface"]]),
+    Column(
+        "difference of the means [% of the mean]", "mean", lambda run, found: estimate(found["mean"]), 100.0
+    ),
+    Column("RMS difference, noise-free [% of the mean]", "rms", lambda run, found: _rms_text(_square(found))),
+    Column(
+        "detection limit, RMS [%]",
+        "rms_detectable",
+        lambda run, found: _detectable(_square(found)),
+        100.0,
+        ".2g",
+    ),
+    Column(
+        "verdict", "verdict", lambda run, found: verdict(estimate(found["mean"]), estimate(found["square"]))
+    ),
+)
 
 
-def independence(runs: Sequence[Run]) -> list[Table]:
-    """Differences of both routes, per material and surface."""
-    columns = [
-        Column("material", "material"),
-        Column("surface", "surface"),
-        Column("rendered by", "route"),
-        Column("difference of the means [% of the mean]", "mean", 100.0, second="se"),
-        Column("RMS difference, noise-free [% of the mean]", "rms"),
-        Column("RMS that would be seen [%]", "rms_seen", 100.0, digits=".2g"),
-        Column("verdict", "verdict"),
-    ]
-    rows: list[list[Cell]] = []
-    figures: list[tuple[str, list[Figure]]] = []
-    for run in runs:
-        record = run.comparison.get("stock")
-        if record is None:
-            continue
-        for found in record["surfaces"]:
-            square = estimate(found["square"])
-            rows.append(
-                [
-                    name_of(run.material),
-                    found["surface"],
-                    _ROUTES[found["surface"]],
-                    estimate(found["mean"]),
-                    _rms_text(square) if square.n >= LEAST_SQUARES else None,
-                    math.sqrt(BARS * square.error) if square.n >= LEAST_SQUARES else None,
-                    verdict(estimate(found["mean"]), square),
-                ]
-            )
-            ours, stock = (run.picture(found["files"][route]) for route in ("ours", "stock"))
-            figures.append(
-                (
-                    f"{name_of(run.material)}, {found['surface']}: view {direction(record['view'])}, "
-                    f"light {direction(record['light'])}",
-                    [
-                        Figure(picture(ours), "ours"),
-                        Figure(picture(stock), "stock"),
-                        Figure(
-                            difference(ours, stock, _SCALE * run.comparison["white"]),
-                            "ours − stock",
-                            [f"full color at ± {_SCALE:.0%} of white; noise of both shows"],
-                        ),
-                    ],
-                )
-            )
-    text = (
-        "The filtered picture near normal incidence, under a directional light without width: ours, and "
-        "by stock parts (a block of instances of the tile’s mesh, the emitter directional, the sensor "
-        "perspective with a Gaussian filter of half a pixel, the integrator path). With the base color "
-        "alone everything is stock, the surface, too (diffuse); the full surface is the project’s in "
-        "both, under stock everything else. Holes are left out. The two agree where the means differ by "
-        f"less than {100 * MEAN_TOLERANCE:g} % and pixels by less than {100 * RMS_TOLERANCE:g} % RMS, or "
-        "by less than three error bars, which pictures of less than 20 pixels a side are too small for; the "
-        "last but one column is the smallest RMS difference that the noise would let be seen."
+def independence(runs: Sequence[FinishedRun]) -> list[Table]:
+    """Differences of both renderers, per material and surface."""
+    checks = [(run, run.comparison.get("unmodified_mitsuba")) for run in runs]
+    items = [(run, found) for run, check in checks if check is not None for found in check["surfaces"]]
+    title = "References rendered with unmodified Mitsuba"
+    images = [_images(run, found) for run, found in items]
+    return [Table("independence", title, _TEXT, _COLUMNS, rows_of(_COLUMNS, items), images=images)]
+
+
+def _images(run: FinishedRun, found: Mapping[str, Any]) -> tuple[str, list[Thumbnail]]:
+    check = run.comparison["unmodified_mitsuba"]
+    mbtf, mitsuba = (run.file(found["files"][renderer]) for renderer in ("mbtf", "mitsuba"))
+    title = (
+        f"{run.title}, {found['surface']}: view {direction(check['view'])}, light {direction(check['light'])}"
     )
-    return [Table("independence", "References by stock parts", text, columns, rows, figures=figures)]
+    note = f"saturates at ± {_SCALE:.0%} of white; includes the noise of both"
+    signed = difference(mbtf, mitsuba, _SCALE * run.comparison["white"])
+    return title, [
+        Thumbnail(preview(mbtf), "mbtf"),
+        Thumbnail(preview(mitsuba), "Mitsuba"),
+        Thumbnail(signed, "mbtf − Mitsuba", [note]),
+    ]
 
 
-def _rms_text(square: Estimate) -> str:
-    """Root of a noise-free mean square, in percent; it may be negative, where noise hides it."""
+def _verdict(found: Mapping[str, Any]) -> str:
+    return verdict(estimate(found["mean"]), estimate(found["square"]))
+
+
+def _square(found: Mapping[str, Any]) -> Estimate | None:
+    """Mean squared difference; None if the image is too small."""
+    square = estimate(found["square"])
+    return square if square.n >= MIN_BLOCKS else None
+
+
+def _detectable(square: Estimate | None) -> float | None:
+    return None if square is None else math.sqrt(MAX_STANDARD_ERRORS * square.error)
+
+
+def _rms_text(square: Estimate | None) -> str | None:
+    """Root of a noise-free mean square in percent; an upper limit if it is not significant."""
+    if square is None:
+        return None
     if square.value <= 2.0 * square.error:
         return f"below {100 * math.sqrt(max(square.value, 0.0) + 2.0 * square.error):.2g} %"
     root = math.sqrt(square.value)

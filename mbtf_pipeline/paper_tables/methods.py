@@ -1,147 +1,143 @@
-"""Method comparison: errors on data and pictures, and ratios beside published ones."""
+"""Comparison of methods: errors on data and images, and ratios beside published ones."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import combinations
 from typing import Any
 
 from mbtf_core.stats import Estimate
-from mbtf_pipeline.compare.perceptual_metrics import MEASURES, Measure
-from mbtf_pipeline.formatting import estimate
+from mbtf_pipeline.compare.perceptual_metrics import PERCEPTUAL_METRICS, PerceptualMetric
+from mbtf_pipeline.formatting import estimate, signed
 from mbtf_pipeline.paper_tables.cells import (
-    NOT_BUILT,
+    MATERIAL,
+    METHOD,
+    NOT_IMPLEMENTED,
     Cell,
     Column,
-    Decibel,
-    Figure,
-    Seen,
+    PerceptualCell,
+    Psnr,
     Table,
+    Thumbnail,
     mean_of,
     ratio_of,
+    rows_of,
 )
-from mbtf_pipeline.paper_tables.figures import picture
+from mbtf_pipeline.paper_tables.figures import preview
 from mbtf_pipeline.paper_tables.published import NOT_HERE, mse_ratio
-from mbtf_pipeline.paper_tables.runs import Run, name_of
+from mbtf_pipeline.paper_tables.runs import FinishedRun, each_fit
 
 
-def methods(runs: Sequence[Run]) -> list[Table]:
+def methods(runs: Sequence[FinishedRun]) -> list[Table]:
     """Errors of every method on every material, and ratios of MSE beside published ones."""
     return [_errors(runs), _ratios(runs)]
 
 
-def visible_columns() -> list[Column]:
-    """Columns of all visible measures."""
-    return [Column(m.title, m.key.replace(".", "_"), second="noise") for m in MEASURES]
+def _metric_column(metric: PerceptualMetric) -> Column:
+    def mean(run: FinishedRun, fit: str, pictures: Sequence[dict[str, Any]] | None = None) -> Cell:
+        """Mean over images; None if one of them has no value."""
+        chosen = run.pictures if pictures is None else pictures
+        value = _mean([metric.of(p["fits"][fit]) for p in chosen])
+        noise = _mean([metric.of(p["references"][run.kind]) for p in chosen])
+        return None if value is None else PerceptualCell(metric, value, noise)
+
+    return Column(metric.title, metric.key.replace(".", "_"), mean)
 
 
-def mean_seen(run: Run, fit: str, measure: Measure, pictures: Sequence[dict[str, Any]] | None = None) -> Cell:
-    """Mean of a measure over pictures; None where one of them has none."""
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [v for v in values if v is not None]
+    return sum(known) / len(known) if len(known) == len(values) else None
+
+
+# Cells are means over the images given as a third argument, by default over all.
+METRIC_COLUMNS = [_metric_column(m) for m in PERCEPTUAL_METRICS]
+
+
+def picture_error(
+    run: FinishedRun, fit: str, key: str, pictures: Sequence[dict[str, Any]] | None = None, kind: str = ""
+) -> Estimate:
+    """Mean over images of ``mse`` or ``relative_mse``."""
     chosen = run.pictures if pictures is None else pictures
-    values = [measure.of(p["fits"][fit]) for p in chosen]
-    noises = [measure.of(p["references"][run.kind]) for p in chosen]
-    if any(v is None for v in values):
-        return None
-    noise = None if any(n is None for n in noises) else sum(n for n in noises if n is not None) / len(noises)
-    return Seen(measure, sum(v for v in values if v is not None) / len(values), noise)
+    return mean_of([estimate(p["fits"][fit]["errors"][kind or run.kind][key]) for p in chosen])
 
 
-def picture_error(run: Run, fit: str, key: str) -> Estimate:
-    """Mean over the run's pictures of ``mse`` or ``relative_mse``."""
-    return mean_of([estimate(p["fits"][fit]["errors"][run.kind][key]) for p in run.pictures])
+def _psnr(run: FinishedRun, fit: str) -> Psnr:
+    return Psnr(picture_error(run, fit, "mse"), run.comparison["white"])
 
 
-def _errors(runs: Sequence[Run]) -> Table:
-    columns = [
-        Column("material", "material"),
-        Column("method", "method"),
-        Column("unexplained variance [%]", "unexplained", 100.0, second="se"),
-        Column("MSE [10⁻³/sr²]", "mse", 1e3, second="se"),
-        Column("MSE less the first method’s [10⁻³/sr²]", "mse_less_first", 1e3, second="se"),
-        Column("PSNR of pictures", "psnr", second="se"),
-        Column("relative MSE of pictures", "relative_mse", second="se"),
-        *visible_columns(),
-        Column("training [s]", "training_seconds", digits=".0f"),
-        Column("network weights", "network_weights"),
-    ]
-    rows: list[list[Cell]] = []
-    for run in runs:
-        for fit in run.fits:
-            mse = picture_error(run, fit, "mse")
-            rows.append(
-                [
-                    name_of(run.material),
-                    fit,
-                    estimate(run.test(fit)["unexplained"]),
-                    run.mse(fit),
-                    run.less_first(fit),
-                    Decibel.of(mse, run.comparison["white"]),
-                    picture_error(run, fit, "relative_mse"),
-                    *(mean_seen(run, fit, m) for m in MEASURES),
-                    float(run.size(fit)["training_seconds"]),
-                    int(run.size(fit)["network_weights"]),
-                ]
-            )
-    for title, _, _ in NOT_HERE.values():
-        rows.append(["all", title, NOT_BUILT, *([None] * (len(columns) - 3))])
+def _relative(run: FinishedRun, fit: str) -> Estimate:
+    return picture_error(run, fit, "relative_mse")
+
+
+_ERRORS = [
+    MATERIAL,
+    METHOD,
+    Column("unexplained variance [%]", "unexplained", FinishedRun.unexplained, 100.0),
+    Column("MSE [10⁻³/sr²]", "mse", FinishedRun.mse, 1e3),
+    Column("MSE − MSE of the first method [10⁻³/sr²]", "mse_minus_first", FinishedRun.minus_first, 1e3),
+    Column("PSNR of images", "psnr", _psnr),
+    Column("relative MSE of images", "relative_mse", _relative),
+    *METRIC_COLUMNS,
+    Column(
+        "training [s]",
+        "training_seconds",
+        FinishedRun.seconds,
+        digits=".0f",
+    ),
+    Column("network weights", "network_weights", lambda run, fit: run.fit(fit)["network_weights"]),
+]
+
+
+def _errors(runs: Sequence[FinishedRun]) -> Table:
+    rows = rows_of(_ERRORS, each_fit(runs))
+    empty = [None] * (len(_ERRORS) - 3)
+    rows += [["all", title, NOT_IMPLEMENTED, *empty] for title, _, _ in NOT_HERE.values()]
     text = (
-        "Unexplained variance and MSE on the same test queries of each material, which no training saw; "
-        "the other measures on the same path-traced pictures, means over the pictures. MSE, relative MSE "
-        "and PSNR are free of the reference’s noise; FLIP, SSIM and ST-LPIPS are not, and say so where "
-        "noise alone gives as much. Differences are query by query; where one lies below two error bars, "
-        "the two methods are not told apart."
+        "Unexplained variance and MSE are measured on the same test queries of each material, which are "
+        "not used for training. The other metrics are means over the same path-traced images. MSE, "
+        "relative MSE and PSNR are noise-free; FLIP, SSIM and ST-LPIPS include the noise of the reference. "
+        "Differences are paired: they use the same queries."
     )
-    return Table("methods", "Method comparison", text, columns, rows, figures=_figures(runs))
+    return Table("methods", "Comparison of methods", text, _ERRORS, rows, images=_images(runs))
 
 
-def _figures(runs: Sequence[Run]) -> list[tuple[str, list[Figure]]]:
-    """The last picture of every run: reference and fits."""
+def _images(runs: Sequence[FinishedRun]) -> list[tuple[str, list[Thumbnail]]]:
+    """The last image of every run: reference and fits."""
     out = []
     for run in runs:
         shown = run.pictures[-1]
-        row = [Figure(picture(run.picture(shown["references"][run.kind]["file"])), "reference")]
+        row = [Thumbnail(preview(run.file(shown["references"][run.kind]["file"])), "reference")]
         for fit in run.fits:
-            made = shown["fits"][fit]
-            psnr = made["errors"][run.kind]["psnr"]["value"]
-            line = "" if psnr is None else f"{psnr:.1f} dB".replace("-", "−")
-            row.append(Figure(picture(run.picture(made["file"])), fit, [line]))
-        out.append((name_of(run.material), row))
+            record = shown["fits"][fit]
+            psnr = record["errors"][run.kind]["psnr"]["value"]
+            line = "" if psnr is None else signed(f"{psnr:.1f} dB")
+            row.append(Thumbnail(preview(run.file(record["file"])), fit, [line]))
+        out.append((run.title, row))
     return out
 
 
-def _ratios(runs: Sequence[Run]) -> Table:
+def _ratios(runs: Sequence[FinishedRun]) -> Table:
     columns = [
-        Column("material", "material"),
-        Column("method", "method"),
-        Column("over", "over"),
-        Column("MSE ratio, measured here", "measured", second="se"),
-        Column("MSE ratio, published, of a paper’s own material of this name", "published"),
+        MATERIAL,
+        METHOD,
+        Column("relative to", "relative_to"),
+        Column("MSE ratio, measured here", "measured"),
+        Column("MSE ratio, published for another material with the same name", "published"),
         Column("source", "source"),
     ]
     rows: list[list[Cell]] = []
     for run in runs:
-        pairs = [
-            (fit, base) for base in run.fits for fit in run.fits if run.fits.index(fit) > run.fits.index(base)
-        ]
-        for fit, base in pairs:
+        for base, fit in combinations(run.fits, 2):
             known = mse_ratio(run.material, fit, base)
-            measured = ratio_of(run.mse(fit), run.mse(base))
-            rows.append(
-                [
-                    name_of(run.material),
-                    fit,
-                    base,
-                    measured,
-                    None if known is None else known.ratio,
-                    None if known is None else known.source,
-                ]
-            )
+            published = (None, None) if known is None else (known.ratio, known.source)
+            rows.append([run.title, fit, base, ratio_of(run.mse(fit), run.mse(base)), *published])
         for method, (title, _, _) in NOT_HERE.items():
             known = mse_ratio(run.material, method, "neumip")
             if known is not None:
-                rows.append([name_of(run.material), title, "neumip", NOT_BUILT, known.ratio, known.source])
+                rows.append([run.title, title, "neumip", NOT_IMPLEMENTED, known.ratio, known.source])
     text = (
-        "Below 1 the method is better than the one that it is divided by. Published numbers belong to "
-        "other data: another material of the same name, other light, other training. Errors of the two "
-        "MSEs are taken as independent, which makes the bars rather too wide."
+        "A ratio below 1 means that the method is better than the one it is divided by. Published numbers "
+        "belong to other data: another material with the same name, other light, other training. The "
+        "errors of the two MSEs are taken as independent, which overestimates the error bars."
     )
-    return Table("ratios", "Ratios beside published ones", text, columns, rows)
+    return Table("ratios", "MSE ratios beside published ones", text, columns, rows)

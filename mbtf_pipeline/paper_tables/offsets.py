@@ -1,79 +1,70 @@
-"""Learned offsets over the view's elevation, against those traced from the heights."""
+"""Learned offsets by elevation of the view, compared with offsets traced through the heights."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from mbtf_pipeline.compare.offsets import read_offset, towards_view
-from mbtf_pipeline.paper_tables.cells import Cell, Column, Figure, Table
-from mbtf_pipeline.paper_tables.figures import signed
-from mbtf_pipeline.paper_tables.runs import Run, name_of
-from mbtf_pipeline.recipe import View
-from mbtf_pipeline.report.error_maps import common_scale
+from mbtf_pipeline.paper_tables.cells import MATERIAL, METHOD, Column, Table, Thumbnail, rows_of
+from mbtf_pipeline.paper_tables.figures import signed_map
+from mbtf_pipeline.paper_tables.runs import FinishedRun, each_fit
+from mbtf_pipeline.report.offsets import displacements
 from mbtf_pipeline.run_folder import COMPARE
 
 
-def offsets(runs: Sequence[Run]) -> list[Table]:
-    """Agreement of learned and traced offsets at every view."""
-    columns = [
-        Column("material", "material"),
-        Column("method", "method"),
-        Column("view: elevation", "elevation", digits=".0f"),
-        Column("azimuth", "azimuth", digits=".0f"),
-        Column("spread, traced [tile widths]", "spread_traced", digits=".2g"),
-        Column("spread, learned [tile widths]", "spread_learned", digits=".2g"),
-        Column("correlation", "correlation", digits=".2f"),
-        Column("slope of learned over traced", "slope", digits=".2f"),
+def _view(key: str) -> Any:
+    return lambda run, fit, record: float(record["view"][key])
+
+
+def _learned(key: str) -> Any:
+    return lambda run, fit, record: record["fits"][fit][key]
+
+
+_COLUMNS = (
+    MATERIAL,
+    METHOD,
+    Column("view: elevation", "elevation", _view("elevation"), digits=".0f"),
+    Column("azimuth", "azimuth", _view("azimuth"), digits=".0f"),
+    Column(
+        "spread, traced [tile widths]",
+        "spread_traced",
+        lambda run, fit, record: record["spread"],
+        digits=".2g",
+    ),
+    Column("spread, learned [tile widths]", "spread_learned", _learned("spread"), digits=".2g"),
+    Column("correlation", "correlation", _learned("correlation"), digits=".2f"),
+    Column("slope of learned on traced", "slope", _learned("slope"), digits=".2f"),
+)
+_TEXT = (
+    "Displacement towards the viewer between the point where a view ray crosses the reference plane and "
+    "the visible surface. Spread is the standard deviation over the tile. A slope of 1 means equal "
+    "magnitude. Fits learn their offsets from colors only, so the offsets need not agree with the traced "
+    "ones. Images of a row share one scale, blue away from the viewer and orange towards; the median of "
+    "each image is subtracted."
+)
+
+
+def offsets(runs: Sequence[FinishedRun]) -> list[Table]:
+    """Agreement of learned and traced offsets for every view."""
+    items = [
+        (run, fit, record)
+        for run, fit in each_fit(runs)
+        for record in run.comparison["offsets"]
+        if fit in record["fits"]
     ]
-    rows: list[list[Cell]] = []
-    for run in runs:
-        for fit in run.fits:
-            for record in run.comparison["offsets"]:
-                if fit not in record["fits"]:
-                    continue
-                made, view = record["fits"][fit], record["view"]
-                rows.append(
-                    [
-                        name_of(run.material),
-                        fit,
-                        float(view["elevation"]),
-                        float(view["azimuth"]),
-                        record["spread"],
-                        made["spread"],
-                        made["correlation"],
-                        made["slope"],
-                    ]
-                )
-    text = (
-        "How far the surface that a view sees lies from the point of the reference plane that its ray "
-        "passes, towards the viewer. Spread is the standard deviation over the tile; a slope of 1 is the "
-        "same size. Nothing forces a fit to find what is traced: it sees colors alone, and its offset "
-        "also stands for whatever else helps. Each row of pictures has one scale, blue away from the "
-        "viewer, orange towards; every picture less its median."
-    )
-    return [Table("offsets", "Learned offsets over view angle", text, columns, rows, figures=_figures(runs))]
+    rows = rows_of(_COLUMNS, items)
+    return [Table("offsets", "Learned offsets by view angle", _TEXT, _COLUMNS, rows, images=_images(runs))]
 
 
-def _figures(runs: Sequence[Run]) -> list[tuple[str, list[Figure]]]:
-    out: list[tuple[str, list[Figure]]] = []
+def _images(runs: Sequence[FinishedRun]) -> list[tuple[str, list[Thumbnail]]]:
+    out: list[tuple[str, list[Thumbnail]]] = []
     for run in runs:
         records = run.comparison["offsets"]
-        if not records:
-            continue
-        for fit in (None, *records[0]["fits"]):
-            fields: list[NDArray[np.float32]] = []
-            for record in records:
-                file = record["traced"] if fit is None else record["fits"][fit]["file"]
-                moved = towards_view(read_offset(run.folder / COMPARE / file), View(**record["view"]))
-                fields.append((moved - np.median(moved)).astype(np.float32))
-            scale = common_scale(fields)
+        for fit in (None, *records[0]["fits"]) if records else ():
+            maps, _, scale = displacements(run.folder / COMPARE, records, fit)
             row = [
-                Figure(signed(f, scale), f"elevation {record['view']['elevation']:g}°")
-                for f, record in zip(fields, records, strict=True)
+                Thumbnail(signed_map(m, scale), f"elevation {record['view']['elevation']:g}°")
+                for m, record in zip(maps, records, strict=True)
             ]
-            who = "traced" if fit is None else fit
-            out.append((f"{name_of(run.material)}, {who}: ± {scale:.2g} tile widths", row))
+            out.append((f"{run.title}, {fit or 'traced'}: ± {scale:.2g} tile widths", row))
     return out

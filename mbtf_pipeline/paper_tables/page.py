@@ -1,4 +1,4 @@
-"""The page of a paper recipe, and one CSV file per table."""
+"""The page of a paper recipe and its tables as CSV files."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from mbtf_pipeline.paper_tables.independence import independence
 from mbtf_pipeline.paper_tables.levels import levels
 from mbtf_pipeline.paper_tables.methods import methods
 from mbtf_pipeline.paper_tables.offsets import offsets
-from mbtf_pipeline.paper_tables.runs import Run
+from mbtf_pipeline.paper_tables.recipe import RUNS
+from mbtf_pipeline.paper_tables.runs import FinishedRun
 from mbtf_pipeline.paper_tables.sizes import timing, weights
-from mbtf_pipeline.paper_tables.suite import RUNS
 from mbtf_pipeline.paper_tables.zooms import zooms
-from mbtf_pipeline.report.plots import BARS_NOTE
+from mbtf_pipeline.report.plots import ERROR_BAR_NOTE
 from mbtf_pipeline.report.report import page_environment, template
 
 PAGE = "paper.html"
 TABLES = "tables"
-_MAKERS: dict[str, Callable[[Sequence[Run]], list[Table]]] = {
+_MAKERS: dict[str, Callable[[Sequence[FinishedRun]], list[Table]]] = {
     "methods": methods,
     "levels": levels,
     "weights": weights,
@@ -37,19 +37,19 @@ _MAKERS: dict[str, Callable[[Sequence[Run]], list[Table]]] = {
 }
 
 
-def read_runs(folder: Path, record: Mapping[str, Any]) -> list[Run]:
-    """Finished runs of a paper recipe.
+def read_runs(folder: Path, record: Mapping[str, Any]) -> list[FinishedRun]:
+    """Read the finished runs of a paper recipe.
 
     Raises
     ------
-    InputError : there is none, or one is damaged
+    InputError : there is none, or one is corrupt
     """
     if not record["runs"]:
-        raise InputError("has no finished run", where=folder, hint="run the recipe again: it resumes")
-    return [Run.read(r["material"], r["variant"], folder / RUNS / r["name"]) for r in record["runs"]]
+        raise InputError("contains no finished run", where=folder, hint="run the recipe again: it resumes")
+    return [FinishedRun.read(r["material"], r["variant"], folder / RUNS / r["name"]) for r in record["runs"]]
 
 
-def make_tables(names: Sequence[str], runs: Sequence[Run]) -> list[Table]:
+def make_tables(names: Sequence[str], runs: Sequence[FinishedRun]) -> list[Table]:
     """All tables of these names."""
     return [table for name in names for table in _MAKERS[name](runs)]
 
@@ -59,7 +59,7 @@ def write_page(folder: Path, record: Mapping[str, Any]) -> tuple[Path, list[Path
 
     Raises
     ------
-    InputError : a run is missing or damaged
+    InputError : a run is missing or corrupt
     """
     runs = read_runs(folder, record)
     tables = make_tables(record["tables"], runs)
@@ -79,8 +79,8 @@ def write_page(folder: Path, record: Mapping[str, Any]) -> tuple[Path, list[Path
             ],
             sizes=_sizes(runs),
             definitions=DEFINITIONS,
-            bars_note=BARS_NOTE,
-            learned=weights_file() is not None,
+            error_bar_note=ERROR_BAR_NOTE,
+            st_lpips=weights_file() is not None,
             style=template("report.css"),
         )
     )
@@ -88,12 +88,12 @@ def write_page(folder: Path, record: Mapping[str, Any]) -> tuple[Path, list[Path
     return folder / PAGE, files
 
 
-def _sizes(runs: Sequence[Run]) -> dict[str, Any]:
-    """What was computed, for the head of the page."""
+def _sizes(runs: Sequence[FinishedRun]) -> dict[str, Any]:
+    """Sizes of the first run, for the head of the page."""
     run = runs[0]
     splits = run.manifest["splits"]
     return {
-        "finest": 2 ** run.comparison["finest"],
+        "resolution": 2 ** run.comparison["finest"],
         "train": splits["train"]["queries"],
         "spp": splits["train"]["spp"],
         "test": splits["test"]["queries"],
@@ -101,5 +101,5 @@ def _sizes(runs: Sequence[Run]) -> dict[str, Any]:
         "pictures": len(run.pictures),
         "size": run.comparison["size"],
         "picture_spp": run.comparison["spp"],
-        "training": max(float(r.size(fit)["training_seconds"]) for r in runs for fit in r.fits),
+        "training": max(r.seconds(fit) for r in runs for fit in r.fits),
     }

@@ -1,7 +1,7 @@
-"""Numbers that papers print, for ratios that stand beside measured ones. Nothing here was measured by us.
+"""Published numbers, for ratios beside measured ones.
 
-Their data, light and units are their own, so only ratios between methods on the same material compare, and
-those of a material of the same name are still of another material.
+Papers use their own data, light and units. Only ratios between methods on the same material are comparable,
+and a material of the same name is not the same material.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ _NEUMIP_MSE: dict[str, tuple[float, float, float, float]] = {
 _COLUMNS = ("neumip-baseline", "neumip", "rainer2019", "rainer2020")
 # PSNR in dB: the hierarchical model, NeuMIP.
 _HIERARCHICAL_PSNR: dict[str, tuple[float, float]] = {"turtle_shell": (32.18, 30.79)}
-# MSE ×10⁻³ of twisted wool with offset by level of zoom, from the finest on.
+# MSE ×10⁻³ of twisted wool with offset by zoom, the finest first.
 _ZOOM_MSE = (3.98, 2.10, 1.47, 1.07, 0.74, 1.16, 1.17, 1.08)
 
 # Network weights by model.
 WEIGHTS: dict[str, tuple[str, str]] = {
-    "neumip": ("3332; 3254 with the three outputs that the text describes", NEUMIP),
+    "neumip": ("3332; 3254 with the three outputs described in the text", NEUMIP),
     "hierarchical": ("about 6500 to 7100, decoder", HIERARCHICAL),
 }
-# Methods without a model here: title, decoder weights, latent channels, as Kuznetsov et al. 2021 count them.
+# Methods not implemented here: title, decoder weights and latent channels according to Kuznetsov et al. 2021.
 NOT_HERE: dict[str, tuple[str, int, int]] = {
     "rainer2019": ("Rainer et al. 2019", 35725, 14),
     "rainer2020": ("Rainer et al. 2020", 38269, 38),
@@ -39,14 +39,14 @@ NOT_HERE: dict[str, tuple[str, int, int]] = {
 
 @dataclass(frozen=True)
 class Published:
-    """A published ratio and where it stands."""
+    """A published ratio and its source."""
 
     ratio: float
     source: str
 
 
 def mse_ratio(material: str, method: str, base: str) -> Published | None:
-    """MSE of a method over that of another on a paper's material of this name; None where no paper says."""
+    """MSE of a method divided by that of another on the published material of this name; None if unknown."""
     row = _NEUMIP_MSE.get(material)
     if row is not None and method in _COLUMNS and base in _COLUMNS:
         return Published(row[_COLUMNS.index(method)] / row[_COLUMNS.index(base)], NEUMIP)
@@ -57,7 +57,7 @@ def mse_ratio(material: str, method: str, base: str) -> Published | None:
 
 
 def level_ratios(material: str, method: str) -> list[Published] | None:
-    """MSE at each level over that at the finest, from the finest on; None where no paper says."""
+    """MSE at each level divided by that at the finest, the finest first; None if unknown."""
     if (material, method) != ("twisted_wool", "neumip"):
         return None
     return [Published(value / _ZOOM_MSE[0], f"{NEUMIP}, Table 3") for value in _ZOOM_MSE]

@@ -1,4 +1,4 @@
-"""A paper recipe: ordinary recipes for several materials and variants, and the tables made of them."""
+"""A paper recipe: recipes for several materials and variants, and tables of their results."""
 
 from __future__ import annotations
 
@@ -14,20 +14,22 @@ from mbtf_core.errors import InputError
 from mbtf_pipeline.compare.st_lpips import weights_file
 from mbtf_pipeline.recipe import Name, Recipe
 
+# Sub-folder of the runs.
+RUNS = "runs"
 TableName = Literal["methods", "levels", "weights", "ablations", "timing", "offsets", "zooms", "independence"]
 
 
 class Layer(Settings):
-    """Options of an ordinary recipe, nested; what is not given stays as the layer below has it."""
+    """Nested options of a recipe; missing ones are inherited from the layer below."""
 
     generate: dict[str, Any] = Field({}, description="of the generator")
-    each_fit: dict[str, Any] = Field({}, description="of every fit, below its own")
+    each_fit: dict[str, Any] = Field({}, description="of every fit; its own options override them")
     fit: dict[Name, dict[str, Any] | None] = Field({}, description="name → options of a fit")
     compare: dict[str, Any] = Field({}, description="of the comparison")
 
 
 def _layer(data: Any) -> Any:
-    """The name of a material stands for a layer that says no more."""
+    """A plain path stands for a layer with only this material."""
     return {"generate": {"material": data}} if isinstance(data, str) else data
 
 
@@ -35,21 +37,41 @@ MaterialLayer = Annotated[Layer, BeforeValidator(_layer)]
 
 
 class PaperRecipe(Settings):
-    """Everything a paper's table takes."""
+    """Configuration of a paper recipe.
 
-    version: Literal[1] = 1
+    Attributes
+    ----------
+    name : str
+        Name of the recipe.
+    title : str or None
+        Title of the page; None stands for the name.
+    description : str
+        Text below the title.
+    output : str or None
+        Folder of all runs; None stands for ``out/NAME`` or ``out/NAME-quick``.
+    tables : list of str
+        Names of the tables.
+    materials : dict of str to Layer
+        Options by material.
+    base, quick : Layer
+        Options of all runs, and those that override them in the quick size.
+    variants : dict of str to Layer
+        Options by variant; every material is run with every variant.
+    """
+
+    version: Literal[2] = 2
     name: Name
-    title: str | None = Field(None, description="headline; default: the name")
+    title: str | None = Field(None, description="title of the page; default: the name")
     description: str = ""
     output: str | None = Field(None, description="folder; default: out/NAME, or out/NAME-quick")
-    tables: list[TableName] = Field(min_length=1, description="what is made of the runs")
-    materials: dict[Name, MaterialLayer] = Field(min_length=1, description="name → path, or a layer")
+    tables: list[TableName] = Field(min_length=1, description="tables to write")
+    materials: dict[Name, MaterialLayer] = Field(min_length=1, description="name → path or layer")
     base: Layer = Field(description="options of all runs")
-    quick: Layer = Field(Layer(), description="laid over the base by --quick")
-    variants: dict[Name, Layer] = Field({}, description="name → options; one run of each material for each")
+    quick: Layer = Field(Layer(), description="overrides the base with --quick")
+    variants: dict[Name, Layer] = Field({}, description="name → options; run for every material")
 
     def folder(self, quick: bool) -> Path:
-        """Where it goes unless the command line says otherwise, relative to the current folder."""
+        """Default folder of all runs, relative to the current folder."""
         if self.output is not None:
             return Path(self.output)
         return Path("out") / (f"{self.name}-quick" if quick else self.name)
@@ -57,11 +79,11 @@ class PaperRecipe(Settings):
 
 @dataclass(frozen=True)
 class Planned:
-    """One ordinary recipe to be run.
+    """One recipe to run.
 
     Attributes
     ----------
-    material, variant : what it is of; the variant is empty where there are none
+    material, variant : their names; the variant is empty if there are none
     recipe : resolved
     """
 
@@ -71,12 +93,12 @@ class Planned:
 
     @property
     def name(self) -> str:
-        """Of the run, and of its folder."""
+        """Name of the run and its folder."""
         return f"{self.material}-{self.variant}" if self.variant else self.material
 
 
 def is_paper_recipe(path: Path) -> bool:
-    """Whether a file is a paper recipe: an ordinary one names no tables.
+    """Whether a file is a paper recipe, that is, lists tables.
 
     Raises
     ------
@@ -88,21 +110,51 @@ def is_paper_recipe(path: Path) -> bool:
 def load_paper_recipe(path: Path, assignments: list[str]) -> PaperRecipe:
     """Read a paper recipe.
 
+    Parameters
+    ----------
+    path : Path
+        YAML file.
+    assignments : list of str
+        ``a.b=c``; override values of the file.
+
+    Returns
+    -------
+    PaperRecipe
+        The recipe.
+
     Raises
     ------
-    InputError : it cannot be read, or holds an unknown key or an unfit value
-    UsageError : an assignment is at fault
+    InputError
+        The file cannot be read, or contains an unknown key or an invalid value.
+    UsageError
+        An assignment is invalid.
     """
     return resolve(PaperRecipe, file=path, assignments=assignments)
 
 
 def plan(paper: PaperRecipe, path: Path, quick: bool) -> tuple[list[Planned], dict[str, str]]:
-    """All ordinary recipes in the order in which they run, and materials that are not there with where they
-    were looked for. A material's path lies relative to the recipe's file.
+    """Resolve all recipes of a paper recipe.
+
+    Parameters
+    ----------
+    paper : PaperRecipe
+        From :func:`load_paper_recipe`.
+    path : Path
+        Its file; paths of materials are relative to it.
+    quick : bool
+        Whether to apply the options of the quick size.
+
+    Returns
+    -------
+    planned : list of Planned
+        Recipes in the order in which they run.
+    missing : dict of str to str
+        Absolute path of each missing material by its name.
 
     Raises
     ------
-    InputError : an option is unknown or unfit; none of the materials is there
+    InputError
+        An option is unknown or invalid, or all materials are missing.
     """
     planned: list[Planned] = []
     missing: dict[str, str] = {}
@@ -111,7 +163,7 @@ def plan(paper: PaperRecipe, path: Path, quick: bool) -> tuple[list[Planned], di
         given = own.generate.get("material")
         if given is None:
             raise InputError(
-                "names no file", where=f"{path}: materials.{material}", hint="add generate.material"
+                "has no path", where=f"{path}: materials.{material}", hint="add generate.material"
             )
         file = Path(os.path.normpath(path.parent / str(given)))
         if not file.exists():
@@ -122,9 +174,9 @@ def plan(paper: PaperRecipe, path: Path, quick: bool) -> tuple[list[Planned], di
             planned.append(Planned(material, variant, _compose(layers, material, variant, file, path)))
     if not planned:
         raise InputError(
-            "none of its materials is there",
+            "all of its materials are missing",
             where=path,
-            hint=f"looked for {next(iter(missing.values()))}; edit 'materials'",
+            hint=f"searched for {next(iter(missing.values()))}; edit 'materials'",
         )
     return planned, missing
 
@@ -138,7 +190,7 @@ def _compose(layers: list[Layer], material: str, variant: str, file: Path, path:
         name: deep_merge(each, {"model": name, **(own or {})}) for name, own in data["fit"].items()
     }
     data["generate"]["material"] = str(file)
-    # The optional measure is taken where its weights are there; the page says where they are not.
+    # The optional metric is computed if its weights are installed.
     data["compare"] = {"st_lpips": weights_file() is not None, **data["compare"]}
     name = f"{material}-{variant}" if variant else material
     data |= {"name": name, "report": {"title": name.replace("_", " ")}}

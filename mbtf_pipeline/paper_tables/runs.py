@@ -1,7 +1,8 @@
-"""Finished runs of a paper recipe, as tables read them."""
+"""Finished runs of a paper recipe."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,16 +12,18 @@ from mbtf_core.lattice import Lattice
 from mbtf_core.stats import Estimate
 from mbtf_pipeline.compare.compare import COMPARISON_NAME
 from mbtf_pipeline.formatting import estimate
+from mbtf_pipeline.report.errors import main_kind
 from mbtf_pipeline.run_folder import COMPARE, SHARDS
 
 
 @dataclass(frozen=True)
-class Run:
+class FinishedRun:
     """One finished run.
 
     Attributes
     ----------
-    material, variant : what it is of; folder : of the run
+    material, variant : names in the recipe
+    folder : of the run
     comparison : content of its ``comparison.json``
     manifest : of its first data set
     """
@@ -32,15 +35,20 @@ class Run:
     manifest: dict[str, Any]
 
     @classmethod
-    def read(cls, material: str, variant: str, folder: Path) -> Run:
+    def read(cls, material: str, variant: str, folder: Path) -> FinishedRun:
         """Read a run's folder.
 
         Raises
         ------
-        InputError : it is not finished
+        InputError : the run is not finished
         """
         comparison = read_json(folder / COMPARE / COMPARISON_NAME)
         return cls(material, variant, folder, comparison, read_json(folder / SHARDS / "manifest.json"))
+
+    @property
+    def title(self) -> str:
+        """The material's name in words."""
+        return self.material.replace("_", " ")
 
     @property
     def fits(self) -> list[str]:
@@ -48,46 +56,54 @@ class Run:
         return list(self.comparison["fits"])
 
     @property
-    def finest_shape(self) -> tuple[int, int]:
-        """Rows and columns of the finest level."""
+    def texels(self) -> int:
+        """Number of texels of the finest level."""
         finest, aspect = self.manifest["levels"]["finest"], self.manifest["tile"]["aspect"]
-        return Lattice(int(finest), float(aspect)).shape()
+        rows, columns = Lattice(int(finest), float(aspect)).shape()
+        return rows * columns
 
     @property
     def kind(self) -> str:
-        """Kind of the reference that visible measures are against."""
-        kinds = self.comparison["kinds"]
-        return "query" if "query" in kinds else str(kinds[0])
+        """Kind of the reference for perceptual metrics."""
+        return main_kind(self.comparison)
 
     @property
     def pictures(self) -> list[dict[str, Any]]:
-        """Records of the comparison's pictures."""
+        """Records of the comparison's images."""
         return list(self.comparison["pictures"])
+
+    def fit(self, name: str) -> dict[str, Any]:
+        """Record of a fit: errors, parameter counts and training time."""
+        record: dict[str, Any] = self.comparison["test"][name]
+        return record
 
     def test(self, fit: str) -> dict[str, Any]:
         """Errors of a fit on the test queries."""
-        record: dict[str, Any] = self.comparison["test"][fit]["splits"]["test"]
+        record: dict[str, Any] = self.fit(fit)["splits"]["test"]
         return record
+
+    def seconds(self, fit: str) -> float:
+        """Training time of a fit."""
+        return float(self.fit(fit)["training_seconds"])
+
+    def unexplained(self, fit: str) -> Estimate:
+        """Unexplained variance of a fit on the test queries."""
+        return estimate(self.test(fit)["unexplained"])
 
     def mse(self, fit: str) -> Estimate:
         """MSE of a fit on the test queries."""
         return estimate(self.test(fit)["mse"])
 
-    def less_first(self, fit: str) -> Estimate | None:
-        """MSE of a fit less that of the run's first fit, query by query; None of the first."""
-        found = self.comparison["test"][fit].get("mse_less_first")
+    def minus_first(self, fit: str) -> Estimate | None:
+        """Paired difference of the MSE to that of the first fit; None for the first."""
+        found = self.fit(fit).get("mse_minus_first")
         return None if found is None else estimate(found)
 
-    def size(self, fit: str) -> dict[str, Any]:
-        """Record of a fit: its sizes and its training."""
-        record: dict[str, Any] = self.comparison["test"][fit]
-        return record
-
-    def picture(self, file: str) -> Path:
-        """Path of one of the comparison's files, without its suffix."""
-        return self.folder / COMPARE / file
+    def file(self, name: str) -> Path:
+        """Path of a file of the comparison."""
+        return self.folder / COMPARE / name
 
 
-def name_of(material: str) -> str:
-    """A material's name in words."""
-    return material.replace("_", " ")
+def each_fit(runs: Sequence[FinishedRun]) -> Iterator[tuple[FinishedRun, str]]:
+    """All (run, fit)."""
+    return ((run, fit) for run in runs for fit in run.fits)

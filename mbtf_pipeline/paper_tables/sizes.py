@@ -1,98 +1,86 @@
-"""Weight counts, and where the time of one evaluation goes."""
+"""Parameter counts, and the time of one evaluation by part."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
-from mbtf_pipeline.paper_tables.cells import NOT_BUILT, Cell, Column, Table
+from mbtf_pipeline.paper_tables.cells import NOT_IMPLEMENTED, Column, Table, rows_of
 from mbtf_pipeline.paper_tables.published import NEUMIP, NOT_HERE, WEIGHTS
-from mbtf_pipeline.paper_tables.runs import Run
+from mbtf_pipeline.paper_tables.runs import FinishedRun
+
+_WEIGHTS = (
+    Column("method", "method", lambda fit, record: fit),
+    Column("decoder", "decoder", lambda fit, record: record["networks"]["decoder"]),
+    Column(
+        "offset network", "offset_network", lambda fit, record: record["networks"].get("offset_network", 0)
+    ),
+    Column("all networks", "network_weights", lambda fit, record: record["network_weights"]),
+    Column("texture values", "texels", lambda fit, record: record["texels"]),
+    Column("float32 [KiB]", "kib", lambda _, r: (r["network_weights"] + r["texels"]) / 256, digits=",.0f"),
+    Column("published", "published", lambda fit, record: WEIGHTS.get(record["model"], (None, None))[0]),
+    Column("source", "source", lambda fit, record: WEIGHTS.get(record["model"], (None, None))[1]),
+)
 
 
-def weights(runs: Sequence[Run]) -> list[Table]:
-    """Numbers of every model, beside published counts."""
-    columns = [
-        Column("method", "method"),
-        Column("decoder", "decoder"),
-        Column("offset network", "offset_network"),
-        Column("networks together", "network_weights"),
-        Column("texture values", "texels"),
-        Column("float32 [KiB]", "kib", digits=",.0f"),
-        Column("published", "published"),
-        Column("source", "source"),
-    ]
-    rows: list[list[Cell]] = []
+def weights(runs: Sequence[FinishedRun]) -> list[Table]:
+    """Parameter counts of every model, beside published ones."""
     run = runs[0]
-    for fit in run.fits:
-        size = run.size(fit)
-        count, source = WEIGHTS.get(size["model"], (None, None))
-        rows.append(
-            [
-                fit,
-                int(size["networks"]["decoder"]),
-                int(size["networks"].get("offset_network", 0)),
-                int(size["network_weights"]),
-                int(size["texels"]),
-                4 * (size["network_weights"] + size["texels"]) / 1024,
-                count,
-                source,
-            ]
-        )
+    rows = rows_of(_WEIGHTS, ((fit, run.fit(fit)) for fit in run.fits))
     for title, decoder, channels in NOT_HERE.values():
-        said = f"{decoder:,}, decoder; {channels} latent channels"
-        rows.append([title, NOT_BUILT, None, None, None, None, said, NEUMIP])
+        published = f"{decoder:,}, decoder; {channels} latent channels"
+        rows.append([title, NOT_IMPLEMENTED, None, None, None, None, published, NEUMIP])
     across = 2 ** run.comparison["finest"]
-    text = f"Biases count; textures are those of a finest level of {across} texels across."
-    return [Table("weights", "Weights", text, columns, rows)]
+    text = f"Counts include biases. Textures have {across} texels across at the finest level."
+    return [Table("weights", "Parameter counts", text, _WEIGHTS, rows)]
 
 
-_PARTS = ("offset texture", "offset network", "pyramid", "encoding")
+def _milliseconds(title: str, key: str, get: Any) -> Column:
+    return Column(title, f"{key}_ms", lambda fit, record: get(record), digits=",.1f")
 
 
-def timing(runs: Sequence[Run]) -> list[Table]:
-    """Milliseconds of one evaluation of 1080p and its parts."""
-    lights: list[str] = []
-    rows: list[list[Cell]] = []
-    for run in runs:
-        for fit, records in run.comparison.get("timing", {}).items():
-            for record in records:
-                lights = list(record["lights_ms"])
-                parts = record["parts_ms"]
-                rows.append(
-                    [
-                        fit,
-                        record["device"],
-                        record["evaluate_ms"],
-                        *(parts.get(name) for name in _PARTS),
-                        record["stage1_ms"],
-                        record["stage2_ms"],
-                        *(record["lights_ms"][n] for n in lights),
-                        int(record["queries"]),
-                    ]
-                )
-    for title, _, _ in NOT_HERE.values():
-        rows.append([title, NOT_BUILT, *([None] * (len(_PARTS) + len(lights) + 4))])
-    columns = [
-        Column("method", "method"),
-        Column("device", "device"),
-        Column("as a material evaluates", "evaluate_ms", digits=",.1f"),
-        Column("offset texture", "offset_texture_ms", digits=",.1f"),
-        Column("offset network", "offset_network_ms", digits=",.1f"),
-        Column("pyramid", "pyramid_ms", digits=",.1f"),
-        Column("encoded position", "encoding_ms", digits=",.1f"),
-        Column("stage 1 (per view)", "stage1_ms", digits=",.1f"),
-        Column("stage 2 (per light): decoder", "stage2_ms", digits=",.1f"),
-        *(Column(f"{n} light{'s' if n != '1' else ''}", f"lights_{n}_ms", digits=",.1f") for n in lights),
-        Column("queries timed", "queries"),
+def _part(title: str, name: str) -> Column:
+    return _milliseconds(title, name.replace(" ", "_"), lambda record: record["parts_ms"].get(name))
+
+
+def _lights(count: str) -> Column:
+    title = f"{count} light{'s' if count != '1' else ''}"
+    return _milliseconds(title, f"lights_{count}", lambda record: record["lights_ms"][count])
+
+
+_TIMING_TEXT = (
+    "Milliseconds for one query per pixel of 1920 × 1080: the median of three timings after a warm-up run. "
+    "The first number is the evaluation of a material, which uses a compiled kernel on the CPU if the "
+    "model has one. The others are parts timed in PyTorch. Stage 1 (offset and lookup) depends on the view "
+    "only and is shared by all lights; stage 2 runs once per light. An eighth of the pixels is evaluated, "
+    "fewer for models that read several positions per query, and the times are scaled up. For comparison, "
+    "Kuznetsov et al. 2021 report 5 ms for NeuMIP and 92 ms for Rainer et al. 2019 on an RTX 2080 Ti; Xue "
+    "et al. 2024 report 35 ms, and 28 ms for NeuMIP, for 512 × 512 pixels on a V100. Across machines, only "
+    "the ratios are comparable."
+)
+
+
+def timing(runs: Sequence[FinishedRun]) -> list[Table]:
+    """Milliseconds of one evaluation of 1080p, in total and by part."""
+    items = [
+        (fit, record)
+        for run in runs
+        for fit, records in run.comparison.get("timing", {}).items()
+        for record in records
     ]
-    text = (
-        "Milliseconds for one query per pixel of 1920 × 1080, medians of three timings after one that is "
-        "not counted. The first number is of evaluation as a material does it (on a processor a compiled "
-        "kernel where the model has one); the others are of PyTorch, part by part. Stage 1, offset and "
-        "lookup, depends on the view alone and is done once for all lights; stage 2 once per light. An "
-        "eighth of the pixels is evaluated, of models that read many places for one query as many fewer, "
-        "and the times are scaled. For comparison: Kuznetsov et al. 2021 state 5 ms for NeuMIP and 92 ms "
-        "for Rainer et al. 2019 on an RTX 2080 Ti, Xue et al. 2024 35 ms against NeuMIP’s 28 ms for 512 × "
-        "512 on a V100: other machines, so only their ratios compare."
-    )
-    return [Table("timing", "Time of one evaluation of 1080p", text, columns, rows)]
+    columns = [
+        Column("method", "method", lambda fit, record: fit),
+        Column("device", "device", lambda fit, record: record["device"]),
+        _milliseconds("material evaluation", "evaluate", lambda record: record["evaluate_ms"]),
+        _part("offset texture", "offset texture"),
+        _part("offset network", "offset network"),
+        _part("pyramid", "pyramid"),
+        _part("encoded position", "encoding"),
+        _milliseconds("stage 1 (per view)", "stage1", lambda record: record["stage1_ms"]),
+        _milliseconds("stage 2 (per light): decoder", "stage2", lambda record: record["stage2_ms"]),
+        *(_lights(count) for count in (items[-1][1]["lights_ms"] if items else ())),
+        Column("timed queries", "queries", lambda fit, record: record["queries"]),
+    ]
+    rows = rows_of(columns, items)
+    rows += [[title, NOT_IMPLEMENTED, *([None] * (len(columns) - 2))] for title, _, _ in NOT_HERE.values()]
+    return [Table("timing", "Time of one evaluation of 1080p", _TIMING_TEXT, columns, rows)]

@@ -1,80 +1,82 @@
-"""Materials at several zooms: pictures and their errors by the width of the field of view."""
+"""Materials at several zooms: images and their errors by width of the field of view."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
-from mbtf_pipeline.compare.perceptual_metrics import MEASURES
-from mbtf_pipeline.formatting import estimate, levels
-from mbtf_pipeline.paper_tables.cells import Cell, Column, Decibel, Figure, Table, mean_of
-from mbtf_pipeline.paper_tables.figures import picture
-from mbtf_pipeline.paper_tables.methods import mean_seen, visible_columns
-from mbtf_pipeline.paper_tables.runs import Run, name_of
+from mbtf_pipeline.formatting import levels
+from mbtf_pipeline.paper_tables.cells import MATERIAL, METHOD, Cell, Column, Psnr, Table, Thumbnail, rows_of
+from mbtf_pipeline.paper_tables.figures import preview
+from mbtf_pipeline.paper_tables.methods import METRIC_COLUMNS, picture_error
+from mbtf_pipeline.paper_tables.runs import FinishedRun
 
 _KINDS = {"query": "M at each pixel’s footprint", "pixel": "filtered pixels"}
+_TEXT = (
+    "The same view and light from near to far. The fits approximate M at the footprint of each pixel. The "
+    "filtered pixel is what a camera sees; the two differ for anisotropic footprints. All images of one "
+    "material share one exposure."
+)
 
 
-def zooms(runs: Sequence[Run]) -> list[Table]:
-    """Errors at every width, against every kind of reference, means over views and lights."""
-    kinds = list(dict.fromkeys(kind for run in runs for kind in run.comparison["kinds"]))
+def zooms(runs: Sequence[FinishedRun]) -> list[Table]:
+    """Errors for every field of view and kind of reference, averaged over views and lights."""
     columns = [
-        Column("material", "material"),
-        Column("tiles across", "tiles_across", digits="g"),
-        Column("level", "level"),
-        Column("method", "method"),
+        MATERIAL,
+        Column(
+            "tiles across",
+            "tiles_across",
+            lambda run, fit, chosen: float(chosen[0]["tiles_across"]),
+            digits="g",
+        ),
+        Column(
+            "level",
+            "level",
+            lambda run, fit, chosen: levels(chosen[0]["levels"], run.comparison["finest"]),
+        ),
+        METHOD,
     ]
-    for kind in kinds:
-        columns += [
-            Column(f"MSE against {_KINDS[kind]} [10⁻³/sr²]", f"mse_{kind}", 1e3, second="se"),
-            Column(f"PSNR against {_KINDS[kind]}", f"psnr_{kind}", second="se"),
-        ]
-    columns += visible_columns()
-    rows: list[list[Cell]] = []
-    for run in runs:
-        for tiles_across in _widths(run):
-            chosen = [p for p in run.pictures if p["tiles_across"] == tiles_across]
-            level = levels(chosen[0]["levels"], run.comparison["finest"])
-            for fit in run.fits:
-                row: list[Cell] = [name_of(run.material), float(tiles_across), level, fit]
-                for kind in kinds:
-                    row += _against(run, chosen, fit, kind)
-                rows.append([*row, *(mean_seen(run, fit, m, chosen) for m in MEASURES)])
-    text = (
-        "The same view and light from near to far. M at each pixel’s footprint is what the fits are "
-        "asked; the truly filtered pixel is what a camera sees, and differs from it where footprints are "
-        "far from round. Pictures of one material share one exposure."
-    )
-    return [Table("zooms", "Materials at several zooms", text, columns, rows, figures=_figures(runs))]
+    for kind in dict.fromkeys(kind for run in runs for kind in run.comparison["kinds"]):
+        columns += _errors(kind)
+    columns += METRIC_COLUMNS
+    items = [
+        (run, fit, [p for p in run.pictures if p["tiles_across"] == width])
+        for run in runs
+        for width in _widths(run)
+        for fit in run.fits
+    ]
+    rows = rows_of(columns, items)
+    return [Table("zooms", "Materials at several zooms", _TEXT, columns, rows, images=_images(runs))]
 
 
-def _widths(run: Run) -> list[float]:
+def _errors(kind: str) -> list[Column]:
+    def mse(run: FinishedRun, fit: str, chosen: Sequence[dict[str, object]]) -> Cell:
+        return picture_error(run, fit, "mse", chosen, kind) if kind in run.comparison["kinds"] else None
+
+    def psnr(run: FinishedRun, fit: str, chosen: Sequence[dict[str, object]]) -> Cell:
+        if kind not in run.comparison["kinds"]:
+            return None
+        return Psnr(picture_error(run, fit, "mse", chosen, kind), run.comparison["white"])
+
+    return [
+        Column(f"MSE against {_KINDS[kind]} [10⁻³/sr²]", f"mse_{kind}", mse, 1e3),
+        Column(f"PSNR against {_KINDS[kind]}", f"psnr_{kind}", psnr),
+    ]
+
+
+def _widths(run: FinishedRun) -> list[float]:
     return list(dict.fromkeys(p["tiles_across"] for p in run.pictures))
 
 
-def _against(run: Run, chosen: Sequence[dict[str, Any]], fit: str, kind: str) -> list[Cell]:
-    if kind not in run.comparison["kinds"]:
-        return [None, None]
-    mse = mean_of([estimate(p["fits"][fit]["errors"][kind]["mse"]) for p in chosen])
-    return [mse, Decibel.of(mse, run.comparison["white"])]
-
-
-def _figures(runs: Sequence[Run]) -> list[tuple[str, list[Figure]]]:
-    out: list[tuple[str, list[Figure]]] = []
+def _images(runs: Sequence[FinishedRun]) -> list[tuple[str, list[Thumbnail]]]:
+    out: list[tuple[str, list[Thumbnail]]] = []
     for run in runs:
-        shown = [
-            next(p for p in run.pictures if p["tiles_across"] == tiles_across)
-            for tiles_across in _widths(run)
-        ]
-        lines = [f"{p['tiles_across']:g} tiles across" for p in shown]
-        for kind in run.comparison["kinds"]:
-            files = [p["references"][kind]["file"] for p in shown]
-            out.append((f"{name_of(run.material)}: reference, {_KINDS[kind]}", _row(run, files, lines)))
-        for fit in run.fits:
-            files = [p["fits"][fit]["file"] for p in shown]
-            out.append((f"{name_of(run.material)}: {fit}", _row(run, files, lines)))
+        shown = [next(p for p in run.pictures if p["tiles_across"] == width) for width in _widths(run)]
+        sources = [(f"reference, {_KINDS[kind]}", "references", kind) for kind in run.comparison["kinds"]]
+        sources += [(fit, "fits", fit) for fit in run.fits]
+        for title, group, name in sources:
+            row = [
+                Thumbnail(preview(run.file(p[group][name]["file"])), f"{p['tiles_across']:g} tiles across")
+                for p in shown
+            ]
+            out.append((f"{run.title}: {title}", row))
     return out
-
-
-def _row(run: Run, files: list[str], lines: list[str]) -> list[Figure]:
-    return [Figure(picture(run.picture(f)), line) for f, line in zip(files, lines, strict=True)]

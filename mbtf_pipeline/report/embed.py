@@ -1,4 +1,4 @@
-"""Pictures as ``data:`` URIs and packed linear data, within a budget of bytes."""
+"""Images as ``data:`` URIs and compressed linear data, within a size limit."""
 
 from __future__ import annotations
 
@@ -15,54 +15,56 @@ from mbtf_pipeline.report.linear_images import Coding, pack
 
 U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
-Field = NDArray[np.floating]
+Pixels = NDArray[np.floating]
 Linear = Callable[[], F32]
 
 
-def shrink(values: Field, factor: int) -> Field:
-    """Average `factor` × `factor` pixels of (rows, columns, ...); rows and columns left over are cut off."""
+def shrink(values: Pixels, factor: int) -> Pixels:
+    """Average `factor` × `factor` pixels of (rows, columns, ...); incomplete blocks are dropped."""
     if factor == 1:
         return values
     factor = min(factor, *values.shape[:2])
     rows, columns = (n // factor for n in values.shape[:2])
     cut = values[: rows * factor, : columns * factor]
-    out: Field = cut.reshape(rows, factor, columns, factor, *values.shape[2:]).mean(axis=(1, 3))
+    out: Pixels = cut.reshape(rows, factor, columns, factor, *values.shape[2:]).mean(axis=(1, 3))
     return out
 
 
 @dataclass(frozen=True)
 class Encoding:
-    """How pictures are stored in the report.
+    """How images are stored in the report.
 
     Attributes
     ----------
-    bits : of a channel's logarithmic code
-    quality : of JPEG for the fixed pictures, without subsampling
-    shrink : this many pixels along each side become one
-    still : the same, for the fixed pictures only, on top of it
+    bits : per channel of a logarithmic code
+    quality : of the JPEG previews
+    shrink : downsampling factor
+    preview_shrink : additional downsampling factor of the previews
     shades : colors of a map
     """
 
     bits: int
     quality: int
     shrink: int = 1
-    still: int = 1
+    preview_shrink: int = 1
     shades: int = 256
 
     def describe(self, coding: Coding) -> str:
-        """In words."""
-        data = f"{self.bits} bits per channel on a logarithmic scale, within {coding.relative_error:.1%}"
-        less = [f"{self.shrink} × {self.shrink} pixels averaged"] if self.shrink > 1 else []
-        less += [f"maps in {self.shades} shades"] if self.shades < 256 else []
-        return f"{data}; to keep the file small: {', '.join(less)}" if less else data
+        """Text for the page."""
+        data = (
+            f"{self.bits} bits per channel on a logarithmic scale (error at most {coding.relative_error:.1%})"
+        )
+        reductions = [f"{self.shrink} × {self.shrink} pixels averaged"] if self.shrink > 1 else []
+        reductions += [f"maps in {self.shades} shades"] if self.shades < 256 else []
+        return f"{data}; reduced to limit the file size: {', '.join(reductions)}" if reductions else data
 
 
-# From the best to the smallest.
+# From best quality to smallest size.
 ENCODINGS = (
     Encoding(10, 88),
     Encoding(9, 82),
-    Encoding(9, 80, still=2, shades=64),
-    *(Encoding(8, 75, shrink, still=2, shades=32) for shrink in (1, 2, 4, 8, 16)),
+    Encoding(9, 80, preview_shrink=2, shades=64),
+    *(Encoding(8, 75, shrink, preview_shrink=2, shades=32) for shrink in (1, 2, 4, 8, 16)),
 )
 
 
@@ -71,8 +73,8 @@ def data_uri(media: str, content: bytes) -> str:
     return f"data:{media};base64,{base64.b64encode(content).decode()}"
 
 
-def photograph(display: U8, quality: int) -> str:
-    """``data:`` URI of an 8-bit sRGB picture as JPEG."""
+def jpeg_uri(display: U8, quality: int) -> str:
+    """``data:`` URI of an 8-bit sRGB image as JPEG."""
     from PIL import Image
 
     stream = io.BytesIO()
@@ -80,11 +82,11 @@ def photograph(display: U8, quality: int) -> str:
     return data_uri("image/jpeg", stream.getvalue())
 
 
-def chart(field: Field, name: Palette, shades: int) -> str:
-    """``data:`` URI of a map (rows, columns) as PNG, in so many of a palette's 256 colors."""
+def map_uri(values: Pixels, name: Palette, shades: int) -> str:
+    """``data:`` URI of a map (rows, columns) as PNG with `shades` colors of a palette."""
     from PIL import Image
 
-    steps = np.round(indices(field, name) * ((shades - 1) / 255.0))
+    steps = np.round(indices(values, name) * ((shades - 1) / 255.0))
     image = Image.fromarray(np.round(steps * (255.0 / (shades - 1))).astype(np.uint8))
     image.putpalette([channel for color in palette(name) for channel in color])
     stream = io.BytesIO()
@@ -94,28 +96,32 @@ def chart(field: Field, name: Palette, shades: int) -> str:
 
 @dataclass
 class Gallery:
-    """What the page shows, by name; read when it is encoded.
+    """Images of the page by name.
 
     Attributes
     ----------
-    white : linear value shown as white, 1/sr
-    linear : pictures (rows, columns, 3) in 1/sr
-    charts : maps (rows, columns) with their palettes, sizes from 0 to 1 or signed from -1 to 1
+    white : linear value displayed as white, 1/sr
+    linear : functions that read images (rows, columns, 3) in 1/sr
+    maps : palettes and maps (rows, columns), scaled to [0, 1] or, if signed, to [-1, 1]
     """
 
     white: float
     linear: dict[str, Linear] = field(default_factory=dict)
-    charts: dict[str, tuple[Palette, Callable[[], Field]]] = field(default_factory=dict)
+    maps: dict[str, tuple[Palette, Pixels]] = field(default_factory=dict)
+
+    def add_map(self, name: str, palette: Palette, values: Pixels) -> None:
+        """Add a scaled map."""
+        self.maps[name] = (palette, values)
 
 
 @dataclass(frozen=True)
 class Embedded:
-    """Everything encoded.
+    """Encoded images.
 
     Attributes
     ----------
-    images : name → ``data:`` URI, of linear pictures at 0 EV
-    packed : name of a linear picture → {rows, columns, data}
+    images : ``data:`` URIs of maps, and of linear images at 0 EV, by name
+    packed : rows, columns and data of linear images by name
     """
 
     encoding: Encoding
@@ -125,17 +131,12 @@ class Embedded:
 
     @property
     def size(self) -> int:
-        """Bytes of all that is embedded."""
+        """Total size in bytes."""
         return sum(map(len, self.images.values())) + sum(len(str(p["data"])) for p in self.packed.values())
 
 
 def embed(gallery: Gallery, budget: float) -> Embedded:
-    """Encode a gallery with the best encoding that fits.
-
-    Parameters
-    ----------
-    budget : bytes that all may take together; with the smallest encoding they may take more
-    """
+    """Encode a gallery with the best encoding within `budget` bytes, or else with the smallest."""
     for encoding in ENCODINGS:
         out = encode(gallery, encoding)
         if out.size <= budget:
@@ -144,7 +145,7 @@ def embed(gallery: Gallery, budget: float) -> Embedded:
 
 
 def encode(gallery: Gallery, encoding: Encoding) -> Embedded:
-    """Encode a gallery in one way."""
+    """Encode a gallery with a given encoding."""
     from mbtf_gen.pictures.reference import to_display
 
     pictures = {name: read() for name, read in gallery.linear.items()}
@@ -153,10 +154,12 @@ def encode(gallery: Gallery, encoding: Encoding) -> Embedded:
     packed: dict[str, Mapping[str, int | str]] = {}
     for name, picture in pictures.items():
         small = shrink(picture, encoding.shrink).astype(np.float32)
-        still = to_display(shrink(small, encoding.still).astype(np.float32), 1.0 / gallery.white)
-        images[name] = photograph(still, encoding.quality)
+        preview_shrink = to_display(
+            shrink(small, encoding.preview_shrink).astype(np.float32), 1.0 / gallery.white
+        )
+        images[name] = jpeg_uri(preview_shrink, encoding.quality)
         data = base64.b64encode(pack(coding.encode(small))).decode()
         packed[name] = {"rows": small.shape[0], "columns": small.shape[1], "data": data}
-    for name, (colors, read) in gallery.charts.items():
-        images[name] = chart(shrink(read(), encoding.shrink), colors, encoding.shades)
+    for name, (colors, values) in gallery.maps.items():
+        images[name] = map_uri(shrink(values, encoding.shrink), colors, encoding.shades)
     return Embedded(encoding, coding, images, packed)

@@ -1,4 +1,4 @@
-"""Error maps and their colors: what they show, on which scale, with a labeled color bar."""
+"""Error maps, their color maps and scales, and the ticks of their color bars."""
 
 from __future__ import annotations
 
@@ -14,21 +14,20 @@ U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-Palette = Literal["size", "flip", "signed"]
-# Color maps of sizes from 0 to 1. Both are perceptually uniform and told apart by lightness alone, so also
-# with any color-vision deficiency.
-_SIZES = {"size": "viridis", "flip": "magma"}
-# Colors of a signed difference from -1 to 1, sRGB: blue is too dark, orange too bright, near black is right.
-# Blue and orange stay apart under every common color-vision deficiency; lightness alone gives the size.
+Palette = Literal["local", "flip", "signed"]
+# Color maps of magnitudes from 0 to 1. Both are perceptually uniform, with monotonic lightness.
+_MAGNITUDES = {"local": "viridis", "flip": "magma"}
+# sRGB colors of a signed difference from -1 (blue) over 0 (nearly black) to 1 (orange). Lightness encodes the
+# magnitude. Blue and orange are distinguishable under every common color-vision deficiency.
 _STOPS = (-1.0, -0.5, 0.0, 0.5, 1.0)
 _COLORS = ((199, 233, 255), (34, 136, 209), (13, 15, 20), (214, 98, 16), (255, 232, 189))
-# Standard deviation in pixels of the window that errors are averaged over.
+# Standard deviation in pixels of the averaging window.
 WINDOW = 2.0
 
 
 @cache
 def palette(name: Palette) -> tuple[tuple[int, int, int], ...]:
-    """256 sRGB colors: of sizes from 0 to 1, or of signed numbers from -1 to 1."""
+    """256 sRGB colors for magnitudes from 0 to 1, or for signed values from -1 to 1."""
     if name == "signed":
         t = np.linspace(-1.0, 1.0, 256)
         channels = [np.interp(t, _STOPS, [c[i] for c in _COLORS]) for i in range(3)]
@@ -36,19 +35,19 @@ def palette(name: Palette) -> tuple[tuple[int, int, int], ...]:
     else:
         from matplotlib import colormaps
 
-        table = 255.0 * np.asarray(colormaps[_SIZES[name]](np.linspace(0.0, 1.0, 256)))[:, :3]
+        table = 255.0 * np.asarray(colormaps[_MAGNITUDES[name]](np.linspace(0.0, 1.0, 256)))[:, :3]
     rows = np.round(table).astype(int).tolist()
     return tuple((r, g, b) for r, g, b in rows)
 
 
 def gradient(name: Palette) -> str:
-    """CSS gradient with a palette's colors, the lower end on the left."""
+    """CSS gradient of a palette, with the lower end on the left."""
     colors = [palette(name)[i] for i in np.linspace(0, 255, 17).round().astype(int)]
     return f"linear-gradient(90deg, {', '.join(f'rgb({r} {g} {b})' for r, g, b in colors)})"
 
 
 def indices(field: ArrayLike, name: Palette) -> U8:
-    """Palette entries of numbers, clipped to the palette's range; what is not a number counts as 0."""
+    """Palette indices of values, clipped to the palette's range; NaN counts as 0."""
     x = np.nan_to_num(np.asarray(field, np.float64))
     if name == "signed":
         x = 0.5 * (x + 1.0)
@@ -56,11 +55,11 @@ def indices(field: ArrayLike, name: Palette) -> U8:
 
 
 def local_error(picture: F32, value_a: F32, value_b: F32) -> F64:
-    """Local root mean square error (rows, columns) in 1/sr, without the reference's noise.
+    """Local noise-free root mean square error (rows, columns) in 1/sr.
 
-    The root of the Gaussian average (standard deviation 2 pixels) of the channels' mean of ``(p-a)(p-b)``.
-    One pixel's product is as often negative as not where the error is small against the noise; averaging
-    brings out the error. Where also the average is negative, the error lies below the noise: 0 is shown.
+    The root of the Gaussian average (σ = 2 pixels) of the mean over channels of ``(p-a)(p-b)``. Single
+    products are often negative where the error is small compared to the noise, so they are averaged. The
+    map is 0 where the average is negative: the error lies below the noise.
     """
     from scipy.ndimage import gaussian_filter
 
@@ -71,7 +70,7 @@ def local_error(picture: F32, value_a: F32, value_b: F32) -> F64:
 
 
 def round_scale(x: float) -> float:
-    """The next of 1, 2, 5 times a power of ten that is not below x; 1 where x is not positive."""
+    """Smallest of 1, 2, 5 times a power of ten that is not below x; 1 if x is not positive."""
     if not x > 0 or not math.isfinite(x):
         return 1.0
     power = 10.0 ** math.floor(math.log10(x))
@@ -79,12 +78,12 @@ def round_scale(x: float) -> float:
 
 
 def common_scale(fields: Sequence[ArrayLike]) -> float:
-    """One rounded end of the scale for several maps: the 99th percentile of all sizes."""
+    """Rounded end of the scale of several maps: the 99th percentile of all magnitudes."""
     if not fields:
         return 1.0
     return round_scale(float(np.percentile(np.concatenate([np.abs(np.ravel(f)) for f in fields]), 99)))
 
 
 def ticks(low: float, high: float, factor: float = 1.0) -> list[str]:
-    """Five evenly spaced numbers for a color bar, times a factor, with a true minus sign."""
+    """Five evenly spaced numbers for a color bar, scaled by a factor."""
     return [f"{factor * x:.3g}".replace("-", "−") for x in np.linspace(low, high, 5)]

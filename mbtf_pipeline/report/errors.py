@@ -1,14 +1,15 @@
-"""The report's errors: facts on top, the table of fits, errors by level and elevation, definitions."""
+"""Errors of the report: summary figures, the table of fits, errors by level and cosine, definitions."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from statistics import median_high
 from typing import Any
 
 from mbtf_fit.formatting import SPLIT_NAMES
-from mbtf_pipeline.compare.perceptual_metrics import measured, visible_text
-from mbtf_pipeline.formatting import data_errors, decibel, error_text, estimate, short_direction
+from mbtf_pipeline.compare.perceptual_metrics import available_metrics
+from mbtf_pipeline.formatting import data_errors, decibel, estimate, estimate_text, short_direction
 from mbtf_pipeline.report.plots import points
 
 UNEXPLAINED = "unexplained variance"
@@ -23,48 +24,38 @@ _TERMS = {
 }
 
 
-def _first_split(comparison: Mapping[str, Any]) -> dict[str, Any]:
-    return {fit: record["splits"]["test"] for fit, record in comparison["test"].items()}
-
-
 def error_context(comparison: Mapping[str, Any], min_cos: float) -> dict[str, Any]:
-    """What the template shows about errors.
+    """Template data about errors.
 
     Parameters
     ----------
     min_cos : smallest cosine of light and view in the data
     """
+    tests = {fit: record["splits"]["test"] for fit, record in comparison["test"].items()}
     return {
-        "facts": _facts(comparison),
-        "test": next(iter(_first_split(comparison).values())),
+        "facts": _facts(comparison, tests),
+        "test": next(iter(tests.values())),
         "error_table": _table(comparison),
-        "error_plots": _plots(comparison, min_cos),
-        "group_tables": [_groups_table(comparison, grouping, min_cos) for grouping in _GROUPINGS],
+        "error_plots": [_plot(tests, grouping, min_cos) for grouping in _GROUPINGS],
+        "group_tables": [_group_table(tests, grouping, min_cos) for grouping in _GROUPINGS],
         "picture_table": _pictures_table(comparison),
         "definitions": [(_TERMS[k], v) for k, v in comparison["definitions"].items()],
     }
 
 
-def _facts(comparison: Mapping[str, Any]) -> list[dict[str, str]]:
-    out = []
-    for fit, split in _first_split(comparison).items():
-        value, _ = data_errors(split)
-        out.append({"value": value, "what": f"of the test values' variance unexplained by {fit}"})
+def _facts(comparison: Mapping[str, Any], tests: Mapping[str, Any]) -> list[dict[str, str]]:
+    out = [{"value": data_errors(e)[0], "what": f"{UNEXPLAINED} of {fit}"} for fit, e in tests.items()]
     fit = comparison["fits"][0]
-    decibels = [
-        p["fits"][fit]["errors"][main_kind(comparison)]["psnr"]["value"] for p in comparison["pictures"]
-    ]
-    finite = sorted(d for d in decibels if d is not None)
-    if finite:
-        middle = finite[len(finite) // 2]
-        out.append(
-            {"value": f"{middle:.1f} dB", "what": f"median PSNR of {fit} over {len(decibels)} pictures"}
-        )
-    visible = sorted(p["fits"][fit]["flip"]["hdr"] for p in comparison["pictures"])
-    out.append({"value": f"{visible[len(visible) // 2]:.3f}", "what": f"median HDR-FLIP of {fit}, 0 is none"})
+    records = [p["fits"][fit] for p in comparison["pictures"]]
+    decibels = [r["errors"][main_kind(comparison)]["psnr"]["value"] for r in records]
+    if finite := [d for d in decibels if d is not None]:
+        what = f"median PSNR of {fit} over {len(decibels)} images"
+        out.append({"value": f"{median_high(finite):.1f} dB", "what": what})
+    flip = median_high(r["flip"]["hdr"] for r in records)
+    out.append({"value": f"{flip:.3f}", "what": f"median HDR-FLIP of {fit} (0 is best)"})
     record = comparison["test"][fit]
     size = 4 * (record["network_weights"] + record["texels"]) / 1024
-    out.append({"value": f"{size:,.0f} KiB", "what": f"{fit}: textures and network as float32"})
+    out.append({"value": f"{size:,.0f} KiB", "what": f"{fit}: textures and networks as float32"})
     return out
 
 
@@ -87,7 +78,7 @@ def _table(comparison: Mapping[str, Any]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class _Grouping:
-    """A way to group queries: its key in the record, titles, and the name of a group."""
+    """A way to group queries: key in the record, title, axis of the plot, and head of the table."""
 
     key: str
     title: str
@@ -96,36 +87,32 @@ class _Grouping:
 
 
 _GROUPINGS = (
-    _Grouping("levels", "By level of detail (0 is the whole tile)", "level of the footprint", "level"),
-    _Grouping("elevations", "By lowest cosine of light and view", "lower cosine of light and view", "cos θ"),
+    _Grouping("levels", "By level of detail (level 0: the whole tile)", "level of the footprint", "level"),
+    _Grouping("elevations", "By lower cosine of light and view", "lower cosine of light and view", "cos θ"),
 )
 
 
 def group_label(name: str, min_cos: float) -> str:
-    """``4`` of a level, ``0.3–0.4`` of a band of cosines, which begins no lower than the data do."""
+    """``4`` for a level, ``0.3–0.4`` for a range of cosines, which is cut at the smallest in the data."""
     low, _, high = name.partition("-")
     if not high:
         return name
     return f"{min_cos:g}–{high}" if float(low) < min_cos < float(high) else f"{low}–{high}"
 
 
-def _plots(comparison: Mapping[str, Any], min_cos: float) -> list[dict[str, str]]:
-    out = []
-    splits = _first_split(comparison)
-    for grouping in _GROUPINGS:
-        names = _group_names(splits, grouping.key)
-        series = {
-            fit: [_value(split[grouping.key].get(n, {}).get("unexplained")) for n in names]
-            for fit, split in splits.items()
-        }
-        labels = [group_label(name, min_cos) for name in names]
-        svg = points(labels, series, grouping.axis, UNEXPLAINED, f"{UNEXPLAINED} {grouping.title}")
-        out.append({"title": grouping.title, "svg": svg})
-    return out
+def _group_names(tests: Mapping[str, Any], key: str) -> list[str]:
+    return sorted({n for test in tests.values() for n in test[key]}, key=lambda n: float(n.split("-")[0]))
 
 
-def _group_names(splits: Mapping[str, Any], key: str) -> list[str]:
-    return sorted({n for split in splits.values() for n in split[key]}, key=lambda n: float(n.split("-")[0]))
+def _plot(tests: Mapping[str, Any], grouping: _Grouping, min_cos: float) -> dict[str, str]:
+    names = _group_names(tests, grouping.key)
+    series = {
+        fit: [_value(test[grouping.key].get(n, {}).get("unexplained")) for n in names]
+        for fit, test in tests.items()
+    }
+    labels = [group_label(name, min_cos) for name in names]
+    svg = points(labels, series, grouping.axis, UNEXPLAINED, f"{UNEXPLAINED} {grouping.title}")
+    return {"title": grouping.title, "svg": svg}
 
 
 def _value(record: Mapping[str, Any] | None) -> tuple[float, float] | None:
@@ -134,19 +121,14 @@ def _value(record: Mapping[str, Any] | None) -> tuple[float, float] | None:
     return float(record["value"]), float(record["error"])
 
 
-def _groups_table(comparison: Mapping[str, Any], grouping: _Grouping, min_cos: float) -> dict[str, Any]:
-    key = grouping.key
-    splits = _first_split(comparison)
-    names = _group_names(splits, key)
+def _group_table(tests: Mapping[str, Any], grouping: _Grouping, min_cos: float) -> dict[str, Any]:
     rows = []
-    for name in names:
-        first = next(s for s in splits.values() if name in s[key])[key][name]
-        cells: list[str] = []
-        for split in splits.values():
-            group = split[key].get(name)
-            cells += ("–", "–") if group is None else data_errors(group)
+    for name in _group_names(tests, grouping.key):
+        groups = [test[grouping.key].get(name) for test in tests.values()]
+        first = next(group for group in groups if group is not None)
+        cells = [cell for group in groups for cell in (("–", "–") if group is None else data_errors(group))]
         rows.append([group_label(name, min_cos), f"{first['mse']['n']:,}", *cells])
-    heads = [h for fit in splits for h in (f"{fit}: unexplained", f"{fit}: MSE [10⁻³/sr²]")]
+    heads = [h for fit in tests for h in (f"{fit}: {UNEXPLAINED}", f"{fit}: MSE [10⁻³/sr²]")]
     return {
         "title": f"{grouping.title}, test split",
         "head": [grouping.head, "queries", *heads],
@@ -155,33 +137,32 @@ def _groups_table(comparison: Mapping[str, Any], grouping: _Grouping, min_cos: f
 
 
 def _pictures_table(comparison: Mapping[str, Any]) -> dict[str, Any]:
-    """One row per picture and fit, errors against each kind of reference."""
-    kinds = comparison["kinds"]
-    main = main_kind(comparison)
-    visible = measured(comparison["pictures"], comparison["fits"])
+    """One row per image and fit, with errors against each kind of reference."""
+    kinds, main = comparison["kinds"], main_kind(comparison)
+    metrics = available_metrics(comparison["pictures"], comparison["fits"])
     rows = []
     for picture in comparison["pictures"]:
+        noise = picture["references"][main]
         for fit in comparison["fits"]:
+            record = picture["fits"][fit]
             row = [short_direction(picture[d]) for d in ("view", "light")]
             row += [f"{picture['tiles_across']:g}", fit]
-            made = picture["fits"][fit]
             for kind in kinds:
-                errors = made["errors"][kind]
+                errors = {name: estimate(e) for name, e in record["errors"][kind].items()}
                 row += [
-                    error_text(estimate(errors["mse"]), 1e3),
+                    estimate_text(errors["mse"], 1e3),
                     decibel(errors["psnr"], errors["mse"]),
-                    error_text(estimate(errors["relative_mse"])),
+                    estimate_text(errors["relative_mse"]),
                 ]
-            row += [visible_text(m, made, picture["references"][main]) for m in visible]
-            rows.append(row)
-    measures = ("MSE [10⁻³/sr²]", "PSNR", "relative MSE")
-    heads = [f"{m}, {kind} reference" for kind in kinds for m in measures]
-    heads += [m.title for m in visible]
-    title = f"Pictures (PSNR’s peak and 0 EV: {comparison['white']:.3g} 1/sr is white)"
+            rows.append(row + [m.text(m.of(record), m.of(noise)) for m in metrics])
+    names = ("MSE [10⁻³/sr²]", "PSNR", "relative MSE")
+    heads = [f"{name}, {kind} reference" for kind in kinds for name in names]
+    heads += [m.title for m in metrics]
+    title = f"Images (white at 0 EV and peak of the PSNR: {comparison['white']:.3g} 1/sr)"
     return {"title": title, "head": ["view", "light", "tiles across", "fit", *heads], "rows": rows}
 
 
 def main_kind(comparison: Mapping[str, Any]) -> str:
-    """The kind of reference that FLIP and the maps are against."""
+    """Kind of the reference for FLIP and error maps."""
     kinds = comparison["kinds"]
     return "query" if "query" in kinds else str(kinds[0])

@@ -1,13 +1,12 @@
-"""Linear pictures for the page: codes on a logarithmic scale, packed small, from which it draws any exposure.
+"""Linear images for the page: logarithmic codes, compressed losslessly, which it displays at any exposure.
 
-A value v in 1/sr becomes code 0 where it is below the scale's lower end, else the nearest of
-``low · 2^((code-1) · step)``, codes up to ``2^bits - 1``: every value carries the same relative error. The
-page holds one table from code to brightness, whatever the picture shows, and makes it anew when the exposure
-moves.
+A value v in 1/sr is stored as code 0 if it lies below the scale, otherwise as the nearest of ``low ·
+2^((code-1) · step)`` with codes up to ``2^bits - 1``. All values have the same relative error. The page
+computes one table from code to brightness per exposure.
 
-Packed: codes as (g, r-g, b-g), each less its prediction (the mean, rounded down, of its left and upper
-neighbors; 0 beyond the border) and folded to positive numbers (0, -1, 1, -2 → 0, 1, 2, 3); then one plane of
-low bytes and one of high bytes per channel, all deflated (zlib format).
+Compression: codes are transformed to (g, r-g, b-g). Each channel is predicted by the mean, rounded down, of
+the left and upper neighbors (0 beyond the border). Residuals are mapped to non-negative numbers (0, -1, 1,
+-2 → 0, 1, 2, 3) and split into planes of low and high bytes, which are deflated (zlib format).
 """
 
 from __future__ import annotations
@@ -24,9 +23,9 @@ from numpy.typing import NDArray
 F32 = NDArray[np.float32]
 I32 = NDArray[np.int32]
 
-# Exposures that the page offers: this many stops both ways.
+# Range of the exposure control: this many stops in both directions.
 EXPOSURE_STOPS = 6.0
-# Stops below white that are kept: at the largest exposure of the page the end is still nearly black.
+# Range of the codes below white in stops; its end is nearly black even at the highest exposure.
 STOPS_BELOW = 16.0
 
 
@@ -36,7 +35,7 @@ class Coding:
 
     Attributes
     ----------
-    bits : of a code
+    bits : per code
     low, high : values in 1/sr of the lowest and the highest code
     """
 
@@ -46,8 +45,7 @@ class Coding:
 
     @classmethod
     def spanning(cls, pictures: Iterable[F32], white: float, bits: int) -> Coding:
-        """The scale for pictures with `white` shown as white: from the smallest value above 0, but at most 16
-        stops below white, to the largest."""
+        """The scale from the smallest positive value, but at most 16 stops below `white`, to the largest."""
         values = [np.ravel(np.nan_to_num(p, posinf=0.0)) for p in pictures]
         highest = max((float(v.max(initial=0)) for v in values), default=0.0)
         lowest = min((float(v[v > 0].min(initial=white)) for v in values), default=white)
@@ -82,12 +80,12 @@ class Coding:
         return np.where(codes > 0, value, 0.0).astype(np.float32)
 
     def describe(self) -> dict[str, Any]:
-        """What the page needs to read it."""
+        """Parameters for decoding on the page."""
         return {"bits": self.bits, "low": self.low, "step": self.step}
 
 
 def pack(codes: I32) -> bytes:
-    """Codes (rows, columns, 3) of at most 15 bits, packed as the module says."""
+    """Compress codes (rows, columns, 3) of at most 15 bits."""
     r, g, b = (codes[..., i].astype(np.int32) for i in range(3))
     planes = []
     for channel in (g, r - g, b - g):

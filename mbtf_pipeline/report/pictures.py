@@ -1,4 +1,4 @@
-"""The report's pictures: the viewer's scenes, and the sheet of references, fits and error maps."""
+"""Images of the report: scenes of the viewer, and the sheet of references, fits and error maps."""
 
 from __future__ import annotations
 
@@ -11,25 +11,32 @@ from typing import Any
 
 import numpy as np
 
-from mbtf_pipeline.compare.perceptual_metrics import measured, visible_text
+from mbtf_pipeline.compare.perceptual_metrics import available_metrics
 from mbtf_pipeline.compare.pictures import read_halves, read_map, read_picture
-from mbtf_pipeline.formatting import decibel, direction, error_text, estimate, levels, short_direction, width
-from mbtf_pipeline.report.embed import F32, Field, Gallery
+from mbtf_pipeline.formatting import (
+    decibel,
+    direction,
+    estimate,
+    estimate_text,
+    levels,
+    short_direction,
+    width,
+)
+from mbtf_pipeline.report.embed import F32, Gallery, Pixels
 from mbtf_pipeline.report.error_maps import Palette, common_scale, gradient, local_error, ticks
 
-# Sides that a picture's name and caption tell apart.
 _KIND = {"query": "Reference", "pixel": "Reference, filtered pixel"}
 
 
-def diagram(view: Mapping[str, float], light: Mapping[str, float]) -> str:
+def hemisphere(view: Mapping[str, float], light: Mapping[str, float]) -> str:
     """The hemisphere from above with the view (square) and the light (disk), as an ``<svg>`` element."""
 
-    def place(d: Mapping[str, float]) -> tuple[float, float]:
+    def position(d: Mapping[str, float]) -> tuple[float, float]:
         r = 20.0 * math.cos(math.radians(d["elevation"]))
         a = math.radians(d["azimuth"])
         return r * math.cos(a), -r * math.sin(a)
 
-    (vx, vy), (lx, ly) = place(view), place(light)
+    (vx, vy), (lx, ly) = position(view), position(light)
     return (
         '<svg viewBox="-24 -24 48 48" aria-hidden="true">'
         '<g fill="none" stroke="currentColor" opacity=".35"><circle r="20"/><circle r="10"/>'
@@ -40,14 +47,15 @@ def diagram(view: Mapping[str, float], light: Mapping[str, float]) -> str:
 
 
 @dataclass(frozen=True)
-class Bar:
+class ColorBar:
     """A labeled color bar.
 
     Attributes
     ----------
-    key : which map it belongs to; title : what is shown
-    gradient : CSS; ticks : numbers from end to end; unit : of the numbers
-    note : how the quantity is made
+    key : of its map
+    title, unit, note : shown quantity, unit of the ticks, and definition
+    gradient : CSS
+    ticks : numbers from end to end
     """
 
     key: str
@@ -57,54 +65,48 @@ class Bar:
     unit: str
     note: str
 
-    @classmethod
-    def of(cls, key: str, palette: Palette, title: str, numbers: list[str], unit: str, note: str) -> Bar:
-        """The bar of a palette."""
-        return cls(key, title, gradient(palette), numbers, unit, note)
-
 
 @dataclass(frozen=True)
-class Shown:
-    """The comparison's pictures as the page needs them.
+class PictureSection:
+    """Images of the comparison as the page needs them.
 
     Attributes
     ----------
-    groups : per view and light: title, diagram, blocks of figures, one block per width
-    scenes : what the viewer can show, plain data
-    bars : of the maps: local error, HDR-FLIP, signed difference
-    difference : end of the signed scale, as a share of white
+    groups : per view and light: title, diagram, blocks of figures
+    scenes : of the viewer, plain data
+    color_bars : of local error, HDR-FLIP and signed difference
+    difference : end of the signed scale, as a fraction of white
     """
 
     groups: list[dict[str, Any]]
     scenes: list[dict[str, Any]]
-    bars: list[Bar]
+    color_bars: list[ColorBar]
     difference: float
 
 
-def show_pictures(folder: Path, comparison: Mapping[str, Any], gallery: Gallery) -> Shown:
-    """Lay out all pictures of a comparison.
+def picture_section(folder: Path, comparison: Mapping[str, Any], gallery: Gallery) -> PictureSection:
+    """Lay out all images of a comparison.
 
     Parameters
     ----------
     folder : of the comparison
-    gallery : takes the pictures; errors are shown as shares of its white
+    gallery : receives the images; errors are shown as fractions of its white
     """
     pictures, fits = comparison["pictures"], comparison["fits"]
-    kinds = sorted(comparison["kinds"], key=lambda kind: kind != "query")
-    white = gallery.white
-    errors = {
-        p["fits"][fit]["file"]: _errors(folder, p["fits"][fit]["file"], p["references"][kinds[0]]["file"])
+    sheet = _Sheet(folder, comparison, gallery)
+    main, white = sheet.kinds[0], gallery.white
+    maps = {
+        p["fits"][fit]["file"]: _error_maps(folder, p["fits"][fit]["file"], p["references"][main]["file"])
         for p in pictures
         for fit in fits
     }
     scales = [
-        common_scale([e[i] / unit for e in errors.values()]) for i, unit in enumerate((white, 1.0, white))
+        common_scale([e[i] / unit for e in maps.values()]) for i, unit in enumerate((white, 1.0, white))
     ]
     scales[1] = min(scales[1], 1.0)
-    sheet = _Sheet(folder, comparison, kinds, gallery)
-    for file, (local, visible, _) in errors.items():
-        sheet.chart(file, "local", "size", local / (scales[0] * white))
-        sheet.chart(file, "flip", "flip", visible / scales[1])
+    for file, (local, flip, _) in maps.items():
+        gallery.add_map(f"{file}-local", "local", local / (scales[0] * white))
+        gallery.add_map(f"{file}-flip", "flip", flip / scales[1])
     groups: list[dict[str, Any]] = []
     scenes = []
     for number, picture in enumerate(pictures):
@@ -114,17 +116,17 @@ def show_pictures(folder: Path, comparison: Mapping[str, Any], gallery: Gallery)
                 {
                     "key": key,
                     "title": f"View {direction(key[0])}  ·  light {direction(key[1])}",
-                    "diagram": diagram(*key),
+                    "diagram": hemisphere(*key),
                     "short": [f"view {short_direction(key[0])}", f"light {short_direction(key[1])}"],
                     "blocks": [],
                 }
             )
         groups[-1]["blocks"].append(sheet.block(number, picture))
         scenes.append({"group": len(groups) - 1, **sheet.scene(picture)})
-    return Shown(groups, scenes, _bars(scales), scales[2])
+    return PictureSection(groups, scenes, _color_bars(*scales), scales[2])
 
 
-def _errors(folder: Path, fit: str, reference: str) -> tuple[Field, Field, Field]:
+def _error_maps(folder: Path, fit: str, reference: str) -> tuple[Pixels, Pixels, Pixels]:
     """(local error in 1/sr, HDR-FLIP, mean over channels of the signed difference in 1/sr)."""
     a, b = read_halves(folder / reference)
     value = read_picture(folder / fit)
@@ -132,120 +134,100 @@ def _errors(folder: Path, fit: str, reference: str) -> tuple[Field, Field, Field
     return local_error(value, a, b), read_map(folder / fit), signed
 
 
-def _bars(scales: list[float]) -> list[Bar]:
-    local, visible, signed = scales
+def _color_bars(local: float, flip: float, signed: float) -> list[ColorBar]:
+    def bar(key: Palette, title: str, numbers: list[str], unit: str, note: str) -> ColorBar:
+        return ColorBar(key, title, gradient(key), numbers, unit, note)
+
     return [
-        Bar.of(
+        bar(
             "local",
-            "size",
             "Local RMS error",
             ticks(0, local, 100),
             "% of white",
-            "without the reference’s noise: root of (p−a)(p−b) averaged over the channels and a Gaussian "
-            "window of 2 pixels; 0 where that average is negative: there the error lies below the noise",
+            "Noise-free: root of (p−a)(p−b), averaged over channels and a Gaussian window with σ = 2 pixels. "
+            "0 where the average is negative, because the error lies below the noise.",
         ),
-        Bar.of(
-            "flip",
+        bar(
             "flip",
             "HDR-FLIP",
-            ticks(0, visible),
-            "of 1, the largest",
-            "how visible the difference is at −2, 0 and +2 EV, the worst of the three; the reference’s noise "
-            "counts",
+            ticks(0, flip),
+            "from 0 to 1",
+            "Visible difference: maximum over −2, 0 and +2 EV. Includes the noise of the reference.",
         ),
-        Bar.of(
-            "signed",
+        bar(
             "signed",
             "Fit − reference",
             ticks(-signed, signed, 100),
             "% of white",
-            "mean of the channels; blue is too dark, orange too bright; the reference’s noise shows",
+            "Mean of the channels. Blue is too dark, orange too bright. Includes the noise of the reference.",
         ),
     ]
 
 
 class _Sheet:
-    """Figures of the sheet and scenes of the viewer, with their pictures put into the gallery."""
+    """Figures of the sheet and scenes of the viewer; adds their images to the gallery."""
 
-    def __init__(
-        self, folder: Path, comparison: Mapping[str, Any], kinds: list[str], gallery: Gallery
-    ) -> None:
+    def __init__(self, folder: Path, comparison: Mapping[str, Any], gallery: Gallery) -> None:
         self._folder = folder
-        self._comparison = comparison
-        self._kinds = kinds
+        self._fits = comparison["fits"]
+        self._finest = comparison["finest"]
+        self._metrics = available_metrics(comparison["pictures"], comparison["fits"])
+        self.kinds = sorted(comparison["kinds"], key=lambda kind: kind != "query")
         self._gallery = gallery
-
-    def chart(self, file: str, key: str, palette: Palette, values: Field) -> None:
-        self._gallery.charts[f"{file}-{key}"] = (palette, lambda: values)
 
     def _linear(self, file: str) -> str:
         self._gallery.linear[file] = _reader(self._folder / file)
         return file
 
+    def _title(self, picture: Mapping[str, Any]) -> str:
+        return f"{width(picture['tiles_across'])}, {levels(picture['levels'], self._finest)}"
+
     def block(self, number: int, picture: Mapping[str, Any]) -> dict[str, Any]:
         """Figures of one scene: rows of four, references in the first column."""
-        angles = f"view {direction(picture['view'])}, light {direction(picture['light'])}"
-        where = f"{angles}, {width(picture['tiles_across'])}"
-        cells: list[list[dict[str, Any] | None]] = []
-        references = [self._reference(picture, kind, where) for kind in self._kinds]
-        for index in range(max(len(references), len(self._comparison["fits"]))):
-            row: list[dict[str, Any] | None] = [references[index] if index < len(references) else None]
-            if index < len(self._comparison["fits"]):
-                row += self._fit(picture, self._comparison["fits"][index], where)
-            cells.append(row)
-        level = levels(picture["levels"], self._comparison["finest"])
-        return {"title": f"{width(picture['tiles_across'])}, {level}", "rows": cells, "scene": number}
+        where = f"view {direction(picture['view'])}, light {direction(picture['light'])}, "
+        where += width(picture["tiles_across"])
+        rows: list[list[dict[str, Any] | None]] = []
+        for index in range(max(len(self.kinds), len(self._fits))):
+            row: list[dict[str, Any] | None] = [None]
+            if index < len(self.kinds):
+                row = [self._reference(picture, self.kinds[index], where)]
+            if index < len(self._fits):
+                row += self._fit(picture, self._fits[index], where)
+            rows.append(row)
+        return {"title": self._title(picture), "rows": rows, "scene": number}
 
     def _reference(self, picture: Mapping[str, Any], kind: str, where: str) -> dict[str, Any]:
         reference = picture["references"][kind]
-        label = _KIND[kind]
-        lines = [f"noise {100 * estimate(reference['noise']).value:.1f} % per pixel"]
-        if kind != self._kinds[0] and "between_references" in picture:
-            lines.append(
-                f"MSE to the other {error_text(estimate(picture['between_references']), 1e3)} · 10⁻³/sr²"
-            )
-        return {
-            "image": self._linear(reference["file"]),
-            "linear": True,
-            "label": label,
-            "lines": lines,
-            "alt": f"{label}: {where}",
-        }
+        lines = [f"noise per pixel {100 * estimate(reference['noise']).value:.1f} %"]
+        if kind != self.kinds[0] and "between_references" in picture:
+            mse = estimate_text(estimate(picture["between_references"]), 1e3)
+            lines.append(f"MSE to the other reference {mse} · 10⁻³/sr²")
+        return _figure(self._linear(reference["file"]), _KIND[kind], lines, where, linear=True)
 
     def _fit(self, picture: Mapping[str, Any], fit: str, where: str) -> list[dict[str, Any] | None]:
-        made = picture["fits"][fit]
-        errors = made["errors"][self._kinds[0]]
-        file = made["file"]
+        record = picture["fits"][fit]
+        errors, file = record["errors"][self.kinds[0]], record["file"]
+        mse = estimate(errors["mse"])
+        of_fit = f"of {fit}: {where}"
         return [
-            {
-                "image": self._linear(file),
-                "linear": True,
-                "label": fit,
-                "lines": [f"PSNR {decibel(errors['psnr'], errors['mse'])}"],
-                "alt": f"{fit}: {where}",
-            },
-            {
-                "image": f"{file}-local",
-                "linear": False,
-                "label": "Local RMS error",
-                "lines": [f"MSE {error_text(estimate(errors['mse']), 1e3)} · 10⁻³/sr²"],
-                "alt": f"local RMS error of {fit}: {where}",
-            },
-            {
-                "image": f"{file}-flip",
-                "linear": False,
-                "label": "HDR-FLIP",
-                "lines": [f"mean {made['flip']['hdr']:.3f}"],
-                "alt": f"HDR-FLIP of {fit}: {where}",
-            },
+            _figure(
+                self._linear(file),
+                fit,
+                [f"PSNR {decibel(estimate(errors['psnr']), mse)}"],
+                where,
+                linear=True,
+            ),
+            _figure(
+                f"{file}-local", "Local RMS error", [f"MSE {estimate_text(mse, 1e3)} · 10⁻³/sr²"], of_fit
+            ),
+            _figure(f"{file}-flip", "HDR-FLIP", [f"mean {record['flip']['hdr']:.3f}"], of_fit),
         ]
 
     def scene(self, picture: Mapping[str, Any]) -> dict[str, Any]:
-        """What the viewer shows of a scene."""
-        level = levels(picture["levels"], self._comparison["finest"])
+        """Data of a scene for the viewer."""
         return {
             "where": f"View {direction(picture['view'])}; light {direction(picture['light'])}; "
-            f"{width(picture['tiles_across'])}, {level}",
+            f"{self._title(picture)}",
             "tiles_across": width(picture["tiles_across"]),
             "references": [
                 {
@@ -253,30 +235,32 @@ class _Sheet:
                     "picture": picture["references"][kind]["file"],
                     "rows": self._numbers(picture, kind),
                 }
-                for kind in self._kinds
+                for kind in self.kinds
             ],
-            "fits": [picture["fits"][fit]["file"] for fit in self._comparison["fits"]],
+            "fits": [picture["fits"][fit]["file"] for fit in self._fits],
         }
 
     def _numbers(self, picture: Mapping[str, Any], kind: str) -> list[list[str]]:
-        """Rows of the viewer's table: what, then one cell per fit."""
-        made = [picture["fits"][fit] for fit in self._comparison["fits"]]
-        errors = [m["errors"][kind] for m in made]
+        """Rows of the viewer's table: name of the metric, then one cell per fit."""
+        records = [picture["fits"][fit] for fit in self._fits]
+        errors = [{name: estimate(e) for name, e in record["errors"][kind].items()} for record in records]
         rows = [
-            ["MSE [10⁻³/sr²]", *(error_text(estimate(e["mse"]), 1e3) for e in errors)],
-            ["relative MSE", *(error_text(estimate(e["relative_mse"])) for e in errors)],
+            ["MSE [10⁻³/sr²]", *(estimate_text(e["mse"], 1e3) for e in errors)],
+            ["relative MSE", *(estimate_text(e["relative_mse"]) for e in errors)],
             ["PSNR", *(decibel(e["psnr"], e["mse"]) for e in errors)],
         ]
-        if kind == self._kinds[0]:
-            reference = picture["references"][kind]
-            rows += [
-                [m.title, *(visible_text(m, record, reference) for record in made)]
-                for m in measured([picture], self._comparison["fits"])
-            ]
-            if len(made) > 1:
-                cells = (error_text(estimate(m["mse_less_first"]), 1e3) for m in made[1:])
-                rows.append([f"MSE less {self._comparison['fits'][0]}’s [10⁻³/sr²]", "–", *cells])
+        if kind == self.kinds[0]:
+            noise = picture["references"][kind]
+            rows += [[m.title, *(m.text(m.of(r), m.of(noise)) for r in records)] for m in self._metrics]
+            if len(records) > 1:
+                cells = (estimate_text(estimate(r["mse_minus_first"]), 1e3) for r in records[1:])
+                rows.append([f"MSE − MSE of {self._fits[0]} [10⁻³/sr²]", "–", *cells])
         return rows
+
+
+def _figure(image: str, label: str, lines: list[str], where: str, *, linear: bool = False) -> dict[str, Any]:
+    alt = f"{label}: {where}" if linear else f"{label} {where}"
+    return {"image": image, "linear": linear, "label": label, "lines": lines, "alt": alt}
 
 
 def _reader(path: Path) -> Callable[[], F32]:

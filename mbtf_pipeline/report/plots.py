@@ -1,4 +1,4 @@
-"""Plots of the report as SVG text that takes the page's color and font."""
+"""Plots as SVG elements in the page's text color and font."""
 
 from __future__ import annotations
 
@@ -14,32 +14,40 @@ from typing import Any
 import numpy as np
 
 from mbtf_core.atomic import write_through
-from mbtf_pipeline.report.labels import Named, place_names
+from mbtf_pipeline.report.labels import Obstacle, place_labels
 
-# Okabe and Ito (2008), gray in place of black, without yellow: told apart under every common color-vision
-# deficiency.
+# Okabe and Ito (2008) with gray instead of black and without yellow: distinguishable under every common
+# color-vision deficiency.
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#7F7F7F")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
-# Stands for the page's own text color until the SVG is inlined.
+# Placeholder for the page's text color until the SVG is embedded.
 _INK = "#010203"
-# A logarithmic axis ends at most this factor below its smallest value and above its largest.
+# A logarithmic axis extends at most by this factor beyond the smallest and the largest value.
 _REACH = 2.0
-BARS_NOTE = (
-    "Bars and bands are one standard error. What lies below half the smallest positive value of a plot or "
-    "above twice the largest is cut off there: a logarithmic axis has no zero."
+ERROR_BAR_NOTE = (
+    "Error bars and bands show one standard error. Logarithmic axes end at half the smallest positive value "
+    "and at twice the largest."
 )
-_WIDTH = 5.6
-_HEIGHT = 3.3
+_WIDTH, _HEIGHT = 5.6, 3.3
+# Half the side of a marker and half the width of a line, in pixels.
+_MARKER, _LINE = 5.0, 1.5
 
 
 def color(index: int) -> str:
-    """Color of the fit with the given number."""
+    """Color of the series with the given number."""
     return COLORS[index % len(COLORS)]
 
 
 @dataclass(frozen=True)
 class Cloud:
-    """A named set of points: x, y and names (n,), and standard errors of both (n,)."""
+    """A named set of points.
+
+    Attributes
+    ----------
+    x, y : (n,); x_error, y_error : their standard errors, (n,)
+    labels : (n,), one per point; empty for none
+    joined : whether a line connects the points; hollow : whether markers are hollow
+    """
 
     name: str
     x: Sequence[float]
@@ -52,7 +60,7 @@ class Cloud:
 
 
 @dataclass(frozen=True)
-class Curve:
+class Line:
     """A named line: x and y (n,), and optionally the standard error of y (n,)."""
 
     name: str
@@ -61,7 +69,6 @@ class Curve:
     error: Sequence[float] | None = None
 
 
-# In place of the user's own matplotlib settings.
 _STYLE: dict[str, Any] = {
     "svg.fonttype": "none",
     "font.family": "sans-serif",
@@ -79,7 +86,7 @@ _STYLE: dict[str, Any] = {
 
 @contextlib.contextmanager
 def _style(label: str) -> Iterator[None]:
-    """Matplotlib's settings while a plot is drawn; with the label as salt its ids do not vary."""
+    """Matplotlib settings independent of the user's; the label makes the ids reproducible."""
     import matplotlib
 
     with matplotlib.rc_context():
@@ -88,83 +95,72 @@ def _style(label: str) -> Iterator[None]:
         yield
 
 
-def _figure(width: float = _WIDTH, height: float = _HEIGHT) -> Any:
+def _axes(x: str, y: str, scales: str, width: float = _WIDTH, height: float = _HEIGHT) -> Any:
+    """Axes of a new figure; `scales` names those that are logarithmic: ``xy``, ``y``, ``x`` or empty."""
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasSVG(figure)
     figure.patch.set_alpha(0.0)
-    return figure
-
-
-def _svg(figure: Any, label: str) -> str:
-    """The figure as an ``<svg>`` element whose ids are its own on the page."""
-    stream = io.StringIO()
-    nothing = dict.fromkeys(("Date", "Creator", "Type", "Format"))
-    figure.savefig(stream, format="svg", transparent=True, metadata=nothing)
-    text = stream.getvalue()
-    text = text[text.index("<svg") :]
-    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
-    prefix = re.sub(r"[^A-Za-z0-9]+", "-", label)
-    text = re.sub(r'\bid="([^"]+)"', rf'id="{prefix}-\1"', text)
-    text = re.sub(r'href="#([^"]+)"', rf'href="#{prefix}-\1"', text)
-    text = re.sub(r"url\(#([^)]+)\)", rf"url(#{prefix}-\1)", text)
-    text = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", text, count=1)
-    text = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1)
-    text = re.sub(r"font: ([\d.]+px) [^;\"]*", r"font-size: \1", text)
-    return text.replace("<svg ", f'<svg role="img" aria-label="{label}" ', 1).replace(_INK, "currentColor")
-
-
-def _axes(figure: Any, x: str, y: str, *, logx: bool = False, logy: bool = False) -> Any:
     axes = figure.add_subplot()
     axes.patch.set_alpha(0.0)
-    axes.set_xlabel(x)
-    axes.set_ylabel(y)
-    if logx:
-        axes.set_xscale("log")
-    if logy:
-        axes.set_yscale("log")
+    axes.set(xlabel=x, ylabel=y, **{f"{axis}scale": "log" for axis in scales})
     axes.grid(True, which="major", color=_INK, alpha=0.12, linewidth=0.6)
     return axes
 
 
-def curves(
-    lines: Sequence[Curve], x: str, y: str, label: str, *, logx: bool = False, logy: bool = True
-) -> str:
-    """Lines with bands of one standard error; axes named with units."""
-    with _style(label):
-        return _svg(_curves(lines, x, y, logx, logy), label)
+def _svg(figure: Any, label: str) -> str:
+    """The figure as an ``<svg>`` element with ids that are unique on the page."""
+    stream = io.StringIO()
+    figure.savefig(
+        stream,
+        format="svg",
+        transparent=True,
+        metadata=dict.fromkeys(("Date", "Creator", "Type", "Format")),
+    )
+    text = stream.getvalue()
+    text = text[text.index("<svg") :]
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    prefix = re.sub(r"[^A-Za-z0-9]+", "-", label)
+    text = re.sub(r'(\bid="|href="#|url\(#)', rf"\g<1>{prefix}-", text)
+    for side in ("width", "height"):
+        text = re.sub(rf'(<svg[^>]*?) {side}="[^"]*"', r"\1", text, count=1)
+    text = re.sub(r"font: ([\d.]+px) [^;\"]*", r"font-size: \1", text)
+    return text.replace("<svg ", f'<svg role="img" aria-label="{label}" ', 1).replace(_INK, "currentColor")
 
 
-def _curves(lines: Sequence[Curve], x: str, y: str, logx: bool, logy: bool) -> Any:
-    figure = _figure()
-    axes = _axes(figure, x, y, logx=logx, logy=logy)
-    low, high = _ends([v for line in lines for v in line.y]) if logy else (-np.inf, np.inf)
-    shown: list[float] = []
-    for index, line in enumerate(lines):
-        xs, values = np.asarray(line.x, float), np.asarray(line.y, float)
-        ys = np.clip(values, low, high)
-        axes.plot(xs, ys, color=color(index), linewidth=1.7, label=line.name)
-        shown += [ys.min(), ys.max()]
-        if line.error is not None:
-            e = np.asarray(line.error, float)
-            below, above = (np.clip(values + side, low, high) for side in (-e, e))
-            axes.fill_between(xs, below, above, color=color(index), alpha=0.18, linewidth=0)
-            shown += [below.min(), above.max()]
-    if logy:
-        axes.set_ylim(max(low, min(shown) / 1.05), min(high, max(shown) * 1.05))
-        _plain_ticks(axes.yaxis)
-    if logx:
-        _plain_ticks(axes.xaxis)
-    axes.legend(frameon=False)
-    return figure
-
-
-def _ends(values: Sequence[float]) -> tuple[float, float]:
-    """How far a logarithmic axis may reach for these values, of which those above zero count."""
+def _limits(values: Sequence[float]) -> tuple[float, float]:
+    """Range of a logarithmic axis for the positive ones of these values."""
     positive = [v for v in values if v > 0]
     return (min(positive) / _REACH, max(positive) * _REACH) if positive else (0.1, 1.0)
+
+
+def curves(
+    lines: Sequence[Line], x: str, y: str, label: str, *, logx: bool = False, logy: bool = True
+) -> str:
+    """Lines with bands of one standard error; `x` and `y` name the axes with units."""
+    with _style(label):
+        axes = _axes(x, y, "x" * logx + "y" * logy)
+        low, high = _limits([v for line in lines for v in line.y]) if logy else (-np.inf, np.inf)
+        shown: list[float] = []
+        for index, line in enumerate(lines):
+            values = np.asarray(line.y, float)
+            ys = np.clip(values, low, high)
+            axes.plot(line.x, ys, color=color(index), linewidth=1.7, label=line.name)
+            shown += [ys.min(), ys.max()]
+            if line.error is not None:
+                e = np.asarray(line.error, float)
+                below, above = (np.clip(values + side, low, high) for side in (-e, e))
+                axes.fill_between(line.x, below, above, color=color(index), alpha=0.18, linewidth=0)
+                shown += [below.min(), above.max()]
+        if logy:
+            axes.set_ylim(max(low, min(shown) / 1.05), min(high, max(shown) * 1.05))
+            _plain_ticks(axes.yaxis)
+        if logx:
+            _plain_ticks(axes.xaxis)
+        axes.legend(frameon=False)
+        return _svg(axes.figure, label)
 
 
 def scatter(
@@ -176,11 +172,11 @@ def scatter(
     front: Sequence[tuple[float, float]] = (),
     png: Path | None = None,
 ) -> str:
-    """Points with error bars on logarithmic axes, each with its name, and a front as a stepped line.
+    """Labeled points with error bars on logarithmic axes, and a Pareto front as a stepped line.
 
     Parameters
     ----------
-    png : also written there, on white
+    png : file for the same plot on white
     """
     with _style(label):
         figure = _scatter(clouds, x, y, front)
@@ -193,9 +189,10 @@ def _write_png(figure: Any, path: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     figure.patch.set_alpha(1.0)
+    canvas = FigureCanvasAgg(figure).figure
     write_through(
         path,
-        lambda temporary: FigureCanvasAgg(figure).figure.savefig(
+        lambda temporary: canvas.savefig(
             temporary, format="png", dpi=160, facecolor="white", metadata={"Software": None}
         ),
     )
@@ -203,56 +200,60 @@ def _write_png(figure: Any, path: Path) -> None:
 
 
 def _scatter(clouds: Sequence[Cloud], x: str, y: str, front: Sequence[tuple[float, float]]) -> Any:
-    figure = _figure(7.2, 4.2)
-    axes = _axes(figure, x, y, logx=True, logy=True)
-    floor = _ends([v for cloud in clouds for v in cloud.y])[0]
-    shown: list[tuple[float, float]] = []
-    named: list[Named] = []
-    lines: list[tuple[tuple[float, float], tuple[float, float]]] = []
+    axes = _axes(x, y, "xy", 7.2, 4.2)
+    floor = _limits([v for cloud in clouds for v in cloud.y])[0]
+    labels: list[tuple[float, float, str, str]] = []
+    obstacles: list[Obstacle] = []
     handles = []
     for index, cloud in enumerate(clouds):
         xs, ys = np.asarray(cloud.x, float), np.maximum(np.asarray(cloud.y, float), floor)
-        across = np.minimum(np.asarray(cloud.x_error, float), 0.95 * xs)
-        upright = np.minimum(np.asarray(cloud.y_error, float), 0.95 * ys)
-        drawn = axes.errorbar(
-            xs,
-            ys,
-            xerr=across,
-            yerr=upright,
-            fmt=MARKERS[index % len(MARKERS)],
-            color=color(index),
-            markerfacecolor="none" if cloud.hollow else color(index),
-            markersize=6,
-            capsize=2.5,
-            linewidth=1.1,
-        )
+        x_error = np.minimum(np.asarray(cloud.x_error, float), 0.95 * xs)
+        y_error = np.minimum(np.asarray(cloud.y_error, float), 0.95 * ys)
+        drawn = _error_bars(axes, index, xs, ys, x_error, y_error, cloud.hollow)
         handles.append((drawn.lines[0], cloud.name))
         if cloud.joined:
             axes.plot(xs, ys, color=color(index), linewidth=0.8, alpha=0.5)
-        for at_x, at_y, dx, dy in zip(xs, ys, across, upright, strict=True):
-            lines += [((at_x - dx, at_y), (at_x + dx, at_y)), ((at_x, at_y - dy), (at_x, at_y + dy))]
-        shown += list(zip(xs, ys, strict=True))
-        named += [
-            Named(at_x, at_y, text, color(index))
-            for at_x, at_y, text in zip(xs, ys, cloud.labels, strict=True)
-            if text
-        ]
+        for at_x, at_y, dx, dy, text in zip(xs, ys, x_error, y_error, cloud.labels, strict=True):
+            obstacles += [
+                ((at_x, at_y), (at_x, at_y), _MARKER),
+                ((at_x - dx, at_y), (at_x + dx, at_y), _LINE),
+                ((at_x, at_y - dy), (at_x, at_y + dy), _LINE),
+            ]
+            if text:
+                labels.append((at_x, at_y, text, color(index)))
     if front:
-        fx, fy = np.asarray(front, float).T
-        drawn = axes.step(fx, fy, where="post", color=_INK, linewidth=1.3, linestyle=(0, (4, 2)))
+        drawn = axes.step(*np.asarray(front, float).T, where="post", color=_INK, lw=1.3, ls=(0, (4, 2)))
         handles.append((drawn[0], "Pareto front"))
         for (x0, y0), (x1, y1) in pairwise(front):
-            lines += [((x0, y0), (x1, y0)), ((x1, y0), (x1, y1))]
+            obstacles += [((x0, y0), (x1, y0), _LINE), ((x1, y0), (x1, y1), _LINE)]
     axes.margins(y=0.1)
-    # Room for names on either side.
+    # Space for labels on either side.
     left, right = axes.get_xlim()
-    reach = right / left
-    axes.set_xlim(left / reach**0.06, right * reach**0.2)
+    axes.set_xlim(left / (right / left) ** 0.06, right * (right / left) ** 0.2)
     for axis in (axes.xaxis, axes.yaxis):
         _plain_ticks(axis)
-    _legend_above(figure, handles)
-    place_names(figure, axes, named, shown, lines)
-    return figure
+    _legend_above(axes.figure, handles)
+    place_labels(axes, labels, obstacles)
+    return axes.figure
+
+
+def _error_bars(
+    axes: Any, index: int, x: Any, y: Any, x_error: Any, y_error: Any, hollow: bool = False, **more: Any
+) -> Any:
+    """Points of one series with error bars."""
+    return axes.errorbar(
+        x,
+        y,
+        xerr=x_error,
+        yerr=y_error,
+        fmt=MARKERS[index % len(MARKERS)],
+        color=color(index),
+        markerfacecolor="none" if hollow else color(index),
+        markersize=5.5,
+        capsize=2.5,
+        linewidth=1.1,
+        **more,
+    )
 
 
 def points(
@@ -262,47 +263,28 @@ def points(
     y: str,
     label: str,
 ) -> str:
-    """Values with error bars for named groups along x, one series per fit; None leaves a point out."""
+    """Values with error bars by group, one series per fit; None leaves a point out."""
     with _style(label):
-        return _svg(_points(groups, series, x, y), label)
-
-
-def _points(
-    groups: Sequence[str], series: Mapping[str, Sequence[tuple[float, float] | None]], x: str, y: str
-) -> Any:
-    figure = _figure()
-    axes = _axes(figure, x, y, logy=True)
-    spread = 0.16
-    for index, (name, values) in enumerate(series.items()):
-        shift = (index - (len(series) - 1) / 2) * spread
-        shown = [(g + shift, *v) for g, v in enumerate(values) if v is not None and v[0] > 0]
-        if not shown:
-            continue
-        xs, ys, es = np.asarray(shown, float).T
-        es = np.minimum(es, 0.95 * ys)
-        axes.errorbar(
-            xs,
-            ys,
-            yerr=es,
-            fmt=MARKERS[index % len(MARKERS)],
-            color=color(index),
-            markersize=5,
-            capsize=2.5,
-            linewidth=1.2,
-            label=name,
-        )
-        axes.plot(xs, ys, color=color(index), linewidth=0.8, alpha=0.45)
-    axes.set_xticks(range(len(groups)), groups)
-    axes.set_xlim(-0.6, len(groups) - 0.4)
-    # A bar that reaches down to zero has no end on a logarithmic axis: the values set its range.
-    axes.set_ylim(*_ends([v[0] for row in series.values() for v in row if v is not None]))
-    _plain_ticks(axes.yaxis)
-    axes.legend(frameon=False)
-    return figure
+        axes = _axes(x, y, "y")
+        for index, (name, values) in enumerate(series.items()):
+            shift = 0.16 * (index - (len(series) - 1) / 2)
+            shown = [(g + shift, *v) for g, v in enumerate(values) if v is not None and v[0] > 0]
+            if not shown:
+                continue
+            xs, ys, es = np.asarray(shown, float).T
+            _error_bars(axes, index, xs, ys, None, np.minimum(es, 0.95 * ys), label=name)
+            axes.plot(xs, ys, color=color(index), linewidth=0.8, alpha=0.45)
+        axes.set_xticks(range(len(groups)), groups)
+        axes.set_xlim(-0.6, len(groups) - 0.4)
+        # The values set the range: an error bar that reaches zero has no end on a logarithmic axis.
+        axes.set_ylim(*_limits([v[0] for row in series.values() for v in row if v is not None]))
+        _plain_ticks(axes.yaxis)
+        axes.legend(frameon=False)
+        return _svg(axes.figure, label)
 
 
 def _legend_above(figure: Any, handles: Sequence[tuple[Any, str]]) -> None:
-    """Legend above the plot, where it hides no point, in as many columns as the figure is wide."""
+    """Legend above the plot, in as many columns as fit."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     renderer = FigureCanvasAgg(figure).get_renderer()
@@ -317,7 +299,7 @@ def _legend_above(figure: Any, handles: Sequence[tuple[Any, str]]) -> None:
 
 
 def _plain_ticks(axis: Any) -> None:
-    """Ticks of a logarithmic axis at 1, 2 and 5 of each decade (fewer or more where it is long or short)."""
+    """Ticks of a logarithmic axis at 1, 2 and 5 of each decade, denser for short ranges, sparser for long."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     low, high = axis.get_view_interval()
@@ -333,22 +315,14 @@ def _plain_ticks(axis: Any) -> None:
 
 
 def bars(parts: Sequence[tuple[str, float]], x: str, label: str) -> str:
-    """Horizontal bars, the first on top, each with its value written beside it."""
+    """Horizontal bars, the first on top, each labeled with its value."""
     with _style(label):
-        return _svg(_bars(parts, x), label)
-
-
-def _bars(parts: Sequence[tuple[str, float]], x: str) -> Any:
-    figure = _figure(_WIDTH, 0.42 * len(parts) + 0.75)
-    axes = _axes(figure, x, "")
-    names = [name for name, _ in parts]
-    values = [value for _, value in parts]
-    axes.barh(range(len(parts)), values, color=COLORS[0], height=0.62)
-    axes.set_yticks(range(len(parts)), names)
-    axes.invert_yaxis()
-    axes.grid(False, axis="y")
-    axes.set_axisbelow(True)
-    axes.set_xlim(0, 1.18 * max([*values, 1e-9]))
-    for row, value in enumerate(values):
-        axes.annotate(f"{value:.3g}", (value, row), (5, 0), textcoords="offset points", va="center")
-    return figure
+        axes = _axes(x, "", "", height=0.42 * len(parts) + 0.75)
+        names, values = zip(*parts, strict=True)
+        drawn = axes.barh(names, values, color=COLORS[0], height=0.62)
+        axes.bar_label(drawn, fmt="{:.3g}", padding=5)
+        axes.invert_yaxis()
+        axes.grid(False, axis="y")
+        axes.set_axisbelow(True)
+        axes.set_xlim(0, 1.18 * max([*values, 1e-9]))
+        return _svg(axes.figure, label)

@@ -1,4 +1,4 @@
-"""The report: one HTML file that holds everything it shows."""
+"""The report: one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -12,40 +12,40 @@ from mbtf_core.atomic import read_json, write_text
 from mbtf_core.errors import InputError
 from mbtf_pipeline.compare.compare import COMPARISON_NAME, COMPARISON_SCHEMA
 from mbtf_pipeline.fit_records import read_training
-from mbtf_pipeline.formatting import BELOW
+from mbtf_pipeline.formatting import NOT_SIGNIFICANT
 from mbtf_pipeline.recipe import RECIPE_NAME, Recipe
 from mbtf_pipeline.report.embed import ENCODINGS, Embedded, Gallery, embed, encode
 from mbtf_pipeline.report.error_maps import palette
 from mbtf_pipeline.report.errors import error_context
 from mbtf_pipeline.report.linear_images import EXPOSURE_STOPS
-from mbtf_pipeline.report.offsets import show_offsets
-from mbtf_pipeline.report.pictures import Shown, show_pictures
-from mbtf_pipeline.report.plots import BARS_NOTE
+from mbtf_pipeline.report.offsets import offset_section
+from mbtf_pipeline.report.pictures import PictureSection, picture_section
+from mbtf_pipeline.report.plots import ERROR_BAR_NOTE
 from mbtf_pipeline.report.times import provenance, time_context
 from mbtf_pipeline.report.training import training_context
 from mbtf_pipeline.run_folder import COMPARE, FITS, REPORT, RUN_NAME, SHARDS
 
-# Raised when the page changes; part of what the report's stage depends on.
-LAYOUT = 4
+# Raised when the page changes; part of the stage's key.
+LAYOUT = 5
 
 _TABLE = """
 <table><thead><tr>{% for h in t.head %}<th>{{ h }}</th>{% endfor %}</tr></thead><tbody>
 {% for row in t.rows %}<tr>
 {%- for cell in row %}
 {%- if cell is command %}<td class=command><code>{{ cell }}</code></td>
-{%- else %}<td{{ ' class=long' if cell is in_words }}>{{ cell }}</td>{% endif %}
+{%- else %}<td{{ ' class=long' if cell is long }}>{{ cell }}</td>{% endif %}
 {%- endfor %}</tr>
 {% endfor %}</tbody></table>
 """
 
 
 def page_environment() -> Any:
-    """Jinja environment of pages, with ``table`` as a function."""
+    """Jinja environment of all pages; ``table`` renders a table."""
     from jinja2 import Environment, StrictUndefined
     from markupsafe import Markup
 
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
-    environment.tests["in_words"] = lambda cell: BELOW in cell
+    environment.tests["long"] = lambda cell: NOT_SIGNIFICANT in cell
     environment.tests["command"] = lambda cell: cell.startswith("mbtf-")
     table = environment.from_string(_TABLE)
     environment.globals["table"] = lambda t: Markup(table.render(t=t))
@@ -53,25 +53,40 @@ def page_environment() -> Any:
 
 
 def write_report(folder: Path, recipe: Recipe, stages: Sequence[str]) -> int:
-    """Write ``report.html`` of the finished run in `folder`; returns its size in bytes.
+    """Write ``report.html`` of a finished run.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the run.
+    recipe : Recipe
+        Its title, exposure and size limit are used.
+    stages : sequence of str
+        Names of the stages whose times are shown.
+
+    Returns
+    -------
+    int
+        Size of the file in bytes.
 
     Raises
     ------
-    InputError : a file of the run is missing or damaged
+    InputError
+        A file of the run is missing, corrupt or of another version.
     """
     comparison = read_json(folder / COMPARE / COMPARISON_NAME)
     if comparison.get("schema") != COMPARISON_SCHEMA:
         raise InputError(
-            "was written by another version",
+            f"has schema version {comparison.get('schema')}, this program reads version {COMPARISON_SCHEMA}",
             where=folder / COMPARE / COMPARISON_NAME,
-            hint="run the recipe again: the pictures are compared anew, data and fits are kept",
+            hint="run the recipe again: it repeats the comparison and keeps data and fits",
         )
     manifest = read_json(folder / SHARDS / "manifest.json")
     run = read_json(folder / RUN_NAME)
     white = comparison["white"] if recipe.report.exposure is None else 1.0 / recipe.report.exposure
     gallery = Gallery(white)
-    shown = show_pictures(folder / COMPARE, comparison, gallery)
-    offsets = show_offsets(folder / COMPARE, comparison["offsets"], gallery)
+    shown = picture_section(folder / COMPARE, comparison, gallery)
+    offsets = offset_section(folder / COMPARE, comparison["offsets"], gallery)
     fit_folders = {name: folder / FITS / name for name in comparison["fits"]}
     histories = {name: read_training(path) for name, path in fit_folders.items()}
     context: dict[str, Any] = {
@@ -80,11 +95,10 @@ def write_report(folder: Path, recipe: Recipe, stages: Sequence[str]) -> int:
         "description": recipe.description,
         "groups": shown.groups,
         "scenes": shown.scenes,
-        "bars": {bar.key: bar for bar in shown.bars},
-        "bars_note": BARS_NOTE,
+        "color_bars": {bar.key: bar for bar in shown.color_bars},
+        "error_bar_note": ERROR_BAR_NOTE,
         "train_spp": manifest["splits"]["train"]["spp"],
         "offsets": offsets,
-        "offset_columns": len(offsets[0]["cells"]) if offsets else 1,
         "effects": manifest["effects"]["effects"],
         "command": run["command"],
         "recipe_yaml": (folder / RECIPE_NAME).read_text(encoding="utf-8"),
@@ -94,7 +108,7 @@ def write_report(folder: Path, recipe: Recipe, stages: Sequence[str]) -> int:
         **time_context(folder, stages, manifest, comparison, histories),
     }
     budget = recipe.report.max_megabytes * 1e6
-    # What is not pictures is measured with the smallest ones, and the rest is theirs.
+    # The size of the page without images, from the smallest encoding.
     smallest = encode(gallery, ENCODINGS[-1])
     rest = len(_render(context, comparison, shown, smallest, white).encode()) - smallest.size
     html = _render(context, comparison, shown, embed(gallery, budget - rest), white)
@@ -105,12 +119,11 @@ def write_report(folder: Path, recipe: Recipe, stages: Sequence[str]) -> int:
 def _render(
     context: Mapping[str, Any],
     comparison: Mapping[str, Any],
-    shown: Shown,
+    shown: PictureSection,
     embedded: Embedded,
     white: float,
 ) -> str:
-    """The page."""
-    pictures = {
+    images = {
         "images": embedded.images,
         "white": white,
         "encoding": embedded.encoding.describe(embedded.coding),
@@ -119,7 +132,7 @@ def _render(
         "style": template("report.css"),
         "script": template("report.js"),
     }
-    html: str = page_environment().from_string(template("report.html")).render(context, **pictures)
+    html: str = page_environment().from_string(template("report.html")).render(context, **images)
     return html
 
 
@@ -128,8 +141,8 @@ def template(name: str) -> str:
     return (files("mbtf_pipeline.report") / "templates" / name).read_text(encoding="utf-8")
 
 
-def _viewer(comparison: Mapping[str, Any], shown: Shown, embedded: Embedded, white: float) -> str:
-    """What the page's script reads, as JSON that may stand within a ``<script>`` element."""
+def _viewer(comparison: Mapping[str, Any], shown: PictureSection, embedded: Embedded, white: float) -> str:
+    """Data of the page's script, as JSON that is valid within a ``<script>`` element."""
     data = {
         "white": white,
         "coding": embedded.coding.describe(),

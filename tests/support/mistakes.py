@@ -6,7 +6,6 @@ import contextlib
 import io
 import json
 import logging
-import re
 import shutil
 from pathlib import Path
 
@@ -19,7 +18,7 @@ from .datasets import write_dataset
 from .fit_data import constant, write_data
 from .image_samples import jpgs, png, pngs
 
-# Group → command lines. Lines of one group are stored in one snapshot.
+# Group → command lines.
 LINES: dict[str, list[str]] = {
     "command lines": [
         "mbtf-gen --queries 5",
@@ -268,24 +267,6 @@ def _shards(folder: Path) -> None:
     (folder / "shards-rows" / "train-00000.json").write_text(json.dumps({"rows": 99}))
 
 
-# What other libraries said, which may differ from version to version.
-_THEIRS = re.compile(
-    r"((?:not valid YAML|not readable as JSON|shard cannot be read|cannot be read as an? [\w ]+) )\(.*\)"
-)
-
-
-def answer(line: str, folder: Path) -> str:
-    """A command line, how it ended, and what it printed, without what differs from run to run."""
-    done = call(line.split())
-    # Of standard error the complaints: notes on what was read are not about the mistake.
-    lines = done.err.splitlines(keepends=True)
-    first = next((i for i, text in enumerate(lines) if text.startswith("error: ")), len(lines))
-    complaints = [text for i, text in enumerate(lines) if i >= first or text.startswith("warning: ")]
-    text = _THEIRS.sub(r"\1(...)", "".join([done.out, *complaints])).replace(str(folder), "HERE")
-    text = re.sub(r"\b[0-9a-f]{8}…", "DIGEST…", text)
-    return f"$ {line}\nexit {done.code}\n{text}"
-
-
 def call(words: list[str]) -> Done:
     """Run a command line of one of the programs in this process, in the current folder."""
     import mbtf_fit.cli.app
@@ -298,7 +279,7 @@ def call(words: list[str]) -> Done:
         "mbtf-fit": mbtf_fit.cli.app,
         "mbtf-pipeline": mbtf_pipeline.cli.app,
     }
-    loggers = [logging.getLogger(name) for name in ("mbtf_gen", "mbtf_fit", "mbtf_pipeline")]
+    loggers = [logging.getLogger(name) for name in ("mbtf_core", "mbtf_gen", "mbtf_fit", "mbtf_pipeline")]
     before = [(logger, logger.handlers, logger.propagate, logger.level) for logger in loggers]
     out, err = io.StringIO(), io.StringIO()
     try:

@@ -38,15 +38,10 @@ def test_help_answers_without_heavy_modules(program: str, run_python: RunPython)
 @pytest.mark.parametrize(
     ("program", "command"),
     [
-        ("mbtf-gen", "doctor"),
-        ("mbtf-gen", "selftest"),
-        ("mbtf-gen", "verify"),
-        ("mbtf-gen", "inspect"),
-        ("mbtf-gen", "reference"),
-        ("mbtf-gen", "preview"),
-        ("mbtf-fit", "evaluate"),
-        ("mbtf-fit", "info"),
-        ("mbtf-pipeline", "run"),
+        *(("mbtf-gen", c) for c in ("plan", "inspect", "verify", "repair", "merge", "preview", "reference")),
+        *(("mbtf-gen", c) for c in ("selftest", "doctor")),
+        *(("mbtf-fit", c) for c in ("evaluate", "export", "info", "preview")),
+        *(("mbtf-pipeline", c) for c in ("run", "list", "report", "cost")),
     ],
 )
 def test_every_command_has_help(program: str, command: str, run_python: RunPython) -> None:

@@ -108,7 +108,7 @@ def show(block: Block, camera: Camera, omega_i: NDArray[np.float64]) -> None:
         raise EngineError(
             f"the window could not be shown ({fault})",
             where="--interactive",
-            hint="mbtf-gen doctor says more",
+            hint="run mbtf-gen doctor",
         )
 
 

@@ -4,20 +4,20 @@
   const { bits, low, step } = data.coding;
   const state = { group: 0, scene: 0, fit: 0, kind: 0, map: 'local', stops: 0, at: 0.5 };
 
-  // From base64 to bytes, inflated.
+  // Decodes base64 and inflates.
   const inflate = async text => {
     const raw = Uint8Array.from(atob(text), c => c.charCodeAt(0));
     const stream = new Blob([raw]).stream().pipeThrough(new DecompressionStream('deflate'));
     return new Uint8Array(await new Response(stream).arrayBuffer());
   };
 
-  // Codes of a picture, three per pixel; each picture is unpacked once.
-  const unpacked = new Map();
+  // Codes of an image, three per pixel; each image is decoded once.
+  const decoded = new Map();
   const codes = name => {
-    if (!unpacked.has(name)) unpacked.set(name, unpack(data.pictures[name]));
-    return unpacked.get(name);
+    if (!decoded.has(name)) decoded.set(name, decode(data.pictures[name]));
+    return decoded.get(name);
   };
-  const unpack = async ({ rows, columns, data: text }) => {
+  const decode = async ({ rows, columns, data: text }) => {
     const bytes = await inflate(text);
     const n = rows * columns;
     const channel = index => {
@@ -42,16 +42,16 @@
   };
 
   const linear = code => code ? low * 2 ** ((code - 1) * step) : 0;
-  // One table from code to 8-bit sRGB for every picture on the page, made anew for each exposure.
-  let table, tabled = null;
+  // One table from code to 8-bit sRGB for all images, recomputed for each exposure.
+  let table, tableStops = null;
   const brightness = () => {
-    if (tabled === state.stops) return table;
+    if (tableStops === state.stops) return table;
     const factor = 2 ** state.stops / data.white;
     table = Uint8ClampedArray.from({ length: 1 << bits }, (_, code) => {
       const x = Math.min(1, factor * linear(code));
       return Math.round(255 * (x <= 0.0031308 ? 12.92 * x : 1.055 * x ** (1 / 2.4) - 0.055));
     });
-    tabled = state.stops;
+    tableStops = state.stops;
     return table;
   };
 
@@ -102,30 +102,30 @@
   };
 
   const current = () => data.scenes[state.scene];
-  let turn = 0;
-  // Draws everything the choices ask for; of two draws in flight the later one stands.
+  let call = 0;
+  // Draws the current selection; a later call cancels an earlier one in progress.
   const show = async () => {
-    const mine = ++turn;
+    const own = ++call;
     const scene = current(), side = scene.references[state.kind];
     const [reference, fit, main] = await Promise.all([side.picture, scene.fits[state.fit], scene.references[0].picture].map(codes));
-    if (mine !== turn) return;
+    if (own !== call) return;
     drawLinear($('reference'), reference);
     drawLinear($('fit'), fit);
     const name = data.fits[state.fit];
     stage.querySelector('.left').textContent = side.label;
     stage.querySelector('.right').textContent = name;
     place(state.at);
-    $('said').textContent = `${scene.where}. Left of the border: ${side.label.toLowerCase()}, path-traced; right of it: ${name}. Both at ${exposureText()}.`;
+    $('caption').textContent = `${scene.where}. Left: ${side.label.toLowerCase()} (path-traced); right: ${name}. ${exposureText()}.`;
     const chart = $(`${scene.fits[state.fit]}-${state.map}`);
     $('map-image').hidden = !chart;
     $('map-canvas').hidden = !!chart;
-    const title = { local: 'Local RMS error', flip: 'HDR-FLIP', signed: 'Fit minus reference' }[state.map];
+    const title = { local: 'Local RMS error', flip: 'HDR-FLIP', signed: 'Fit − reference' }[state.map];
     if (chart) $('map-image').src = chart.src;
     else drawDifference($('map-canvas'), fit, main);
     for (const element of [$('map-image'), $('map-canvas')]) {
       element.setAttribute(chart ? 'alt' : 'aria-label', `${title} of ${name}: ${scene.where}`);
     }
-    document.querySelectorAll('#maps .bar').forEach(bar => { bar.hidden = bar.dataset.map !== state.map; });
+    document.querySelectorAll('#maps .color-bar').forEach(bar => { bar.hidden = bar.dataset.map !== state.map; });
     numbers(side.rows);
     stage.dataset.drawn = [state.scene, state.kind, state.fit, state.stops].join(' ');
   };
@@ -141,10 +141,10 @@
     body.replaceChildren(line('th', ['', ...data.fits]), ...rows.map(row => line('td', row)));
   };
 
-  // The sheet's fixed pictures become canvases that follow the exposure.
+  // Replaces the images of the sheet by canvases that follow the exposure.
   const sheet = [];
   const redrawSheet = () => sheet.forEach(([canvas, picture]) => drawLinear(canvas, picture));
-  const enliven = async () => {
+  const activateSheet = async () => {
     for (const img of document.querySelectorAll('img[data-linear]')) {
       const picture = await codes(img.dataset.linear);
       const canvas = document.createElement('canvas');
@@ -171,7 +171,7 @@
     waiting = setTimeout(() => { redrawSheet(); document.body.dataset.exposure = state.stops; }, 60);
   };
 
-  // Spans are those of the chosen view and light.
+  // Fields of view of the selected view and light.
   const widths = () => {
     const of = data.scenes.map((scene, i) => [scene, i]).filter(([scene]) => scene.group === state.group);
     const wanted = current().tiles_across;
@@ -221,7 +221,7 @@
     event.preventDefault();
   });
 
-  // Pictures of the sheet open in the viewer, other pictures in a dialog.
+  // Images of the sheet open in the viewer, other images in a dialog.
   const dialog = $('large');
   const enlarge = picture => {
     const [img, caption] = [dialog.querySelector('img'), dialog.querySelector('p')];
@@ -245,7 +245,7 @@
   });
   dialog.addEventListener('click', () => dialog.close());
 
-  // Paper has no closed boxes.
+  // Expands all details for printing.
   addEventListener('beforeprint', () => document.querySelectorAll('details').forEach(e => { e.open = true; }));
 
   const start = async () => {
@@ -253,7 +253,7 @@
     widths();
     expose(0);
     await show();
-    await enliven();
+    await activateSheet();
   };
   start().catch(error => {
     $('viewer').hidden = true;

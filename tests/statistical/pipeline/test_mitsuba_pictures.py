@@ -1,4 +1,4 @@
-"""A comparison's check from outside: stock parts of Mitsuba give the same picture, and no other."""
+"""Unmodified Mitsuba renders the same image, and differences are detected."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import pytest
 from mbtf_core.errors import UsageError
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.material.material import Material, load_material
-from mbtf_pipeline.compare import unmodified_mitsuba as stock
-from mbtf_pipeline.compare.unmodified_mitsuba import agreement, compare_with_stock
+from mbtf_pipeline.compare import unmodified_mitsuba
+from mbtf_pipeline.compare.unmodified_mitsuba import agreement, compare_with_mitsuba
 from mbtf_pipeline.recipe import CompareSection
 
 SECTION = CompareSection.model_validate(
@@ -27,7 +27,7 @@ SECTION = CompareSection.model_validate(
 
 @pytest.fixture(scope="module")
 def glossy(tmp_path_factory: pytest.TempPathFactory) -> Material:
-    """A relief of 2:1 with a colored, glossy surface and no symmetry."""
+    """A 2:1 height field with a colored, glossy surface and no symmetry."""
     folder = tmp_path_factory.mktemp("material")
     random = np.random.default_rng(5)
     np.save(folder / "height.npy", np.kron(random.random((8, 16)), np.ones((2, 2))))
@@ -45,22 +45,22 @@ def config(material: Path | str) -> GeneratorConfig:
     return GeneratorConfig.model_validate({"material": str(material), "geometry": {"mesh": 32}})
 
 
-def test_stock_parts_agree_with_and_without_gloss(glossy: Material) -> None:
-    found = compare_with_stock(SECTION, config("unused"), glossy)
+def test_mitsuba_agrees_with_and_without_gloss(glossy: Material) -> None:
+    found = compare_with_mitsuba(SECTION, config("unused"), glossy)
     assert [f.surface for f in found] == ["base color", "full"]
     for f in found:
         assert f.verdict == "agree", f.as_dict()
-        # The bars could hide something only where they are wide.
+        # Wide error bars could hide a difference.
         assert f.mean.error < 0.01
         assert f.square.error < 0.01
-    # Gloss is no small part of the picture: without it there is another one.
-    bare, full = (f.ours for f in found)
-    assert agreement("", (bare, bare), (full, full)).verdict == "DIFFER"
+    # Without gloss the image differs clearly.
+    bare, full = (f.mbtf for f in found)
+    assert agreement("", (bare, bare), (full, full)).verdict == "differ"
 
 
-def test_a_picture_from_elsewhere_does_not_agree(glossy: Material, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The tile under the stock camera is moved by a texel: same mean, other places."""
-    real = stock.render_stock
+def test_a_shifted_image_differs(glossy: Material, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The camera of Mitsuba is shifted by a texel, which preserves the mean."""
+    real = unmodified_mitsuba.render_with_mitsuba
 
     def moved(job: object, camera: object, *others: object) -> object:
         import dataclasses
@@ -68,13 +68,13 @@ def test_a_picture_from_elsewhere_does_not_agree(glossy: Material, monkeypatch: 
         target = (0.5 + 1 / 16, 0.5)
         return real(job, dataclasses.replace(camera, target=target), *others)  # type: ignore[type-var]
 
-    monkeypatch.setattr(stock, "render_stock", moved)
-    found = compare_with_stock(SECTION, config("unused"), glossy)[0]
-    assert found.verdict == "DIFFER"
+    monkeypatch.setattr(unmodified_mitsuba, "render_with_mitsuba", moved)
+    found = compare_with_mitsuba(SECTION, config("unused"), glossy)[0]
+    assert found.verdict == "differ"
     assert found.square.value > 10 * found.square.error
 
 
-def test_noise_of_both_sides_drops_out() -> None:
+def test_noise_of_both_sides_cancels() -> None:
     random = np.random.default_rng(3)
     truth = 0.5 + random.random((64, 64, 3))
     a, b, c, d = (truth + 0.3 * random.standard_normal(truth.shape) for _ in range(4))
@@ -84,30 +84,32 @@ def test_noise_of_both_sides_drops_out() -> None:
     wrong = truth + 0.2 * np.sign(random.standard_normal(truth.shape))
     other = agreement("", (a, b), (wrong, wrong))
     assert other.square.value == pytest.approx(0.04, abs=4 * other.square.error)
-    assert other.verdict == "DIFFER"
+    assert other.verdict == "differ"
 
 
 @pytest.mark.parametrize("size", [1, 8, 9])
-def test_small_pictures_keep_pixels_to_compare(size: int) -> None:
-    """Recipes may ask for pictures of eight pixels, whose edges would be all of them."""
+def test_small_images_keep_pixels_to_compare(size: int) -> None:
+    """The margin is reduced for images of few pixels."""
     one = np.ones((size, size, 3))
     found = agreement("", (one, one), (1.5 * one, 1.5 * one), margin=4)
     assert found.mean.value == pytest.approx(-0.4)
     assert found.square.value == pytest.approx(0.16)
 
 
-@pytest.mark.parametrize(("size", "told"), [(8, False), (19, False), (20, True), (24, True), (48, True)])
-def test_small_pictures_are_told_apart_or_said_to_be_too_small(size: int, told: bool) -> None:
+@pytest.mark.parametrize(
+    ("size", "conclusive"), [(8, False), (19, False), (20, True), (24, True), (48, True)]
+)
+def test_small_images_are_conclusive_from_20_pixels(size: int, conclusive: bool) -> None:
     random = np.random.default_rng(7)
     truth = 0.5 + random.random((size, size, 3))
     a, b, c, d = (truth + 0.02 * random.standard_normal(truth.shape) for _ in range(4))
     same = agreement("", (a, b), (c, d), margin=4)
     other = agreement("", (a, b), (1.5 * c, 1.5 * d), margin=4)
-    expected = ("agree", "DIFFER") if told else ("too small to tell",) * 2
+    expected = ("agree", "differ") if conclusive else ("inconclusive",) * 2
     assert (same.verdict, other.verdict) == expected
 
 
 def test_grazing_comparisons_are_refused() -> None:
     low = CompareSection.model_validate({"views": [{"elevation": 40}], "lights": [{"elevation": 50}]})
-    with pytest.raises(UsageError, match="stock parts want a view"):
-        stock.pick_scene(low)
+    with pytest.raises(UsageError, match="needs a view at 75"):
+        unmodified_mitsuba.pick_scene(low)

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 from conftest import RunPython
 from support.fit_data import parallax, write_data
+from support.mistakes import call
 
 from mbtf_gen.dataset.shard_io import read_shard, write_shard
 
@@ -56,39 +57,27 @@ def test_export_writes_the_reported_files(material: Path, tmp_path: Path, run_py
     assert deviation is not None
     # Between the values of PyTorch, which are stored, and those of whatever evaluates here.
     assert float(deviation[1]) < 1e-6
-    message = fails(run_python, 3, "export", str(material), "--to", "material")
+    message = fails(3, "export", str(material), "--to", "material")
     assert "name a new folder with -o" in message
 
 
-def fails(run_python: RunPython, code: int, *arguments: str) -> str:
+def fails(code: int, *arguments: str) -> str:
     """What a failing command says: at most two lines, no traceback, nothing on standard output."""
-    done = run_python("-m", "mbtf_fit", *arguments)
-    assert done.returncode == code, done.stderr
-    assert done.stdout == ""
-    lines = [
-        line
-        for line in done.stderr.splitlines()
-        if not any(word in line for word in ("training for", "fitting:", "note: "))
-    ]
-    assert 1 <= len(lines) <= 2, done.stderr
-    assert lines[0].startswith("error: ")
-    return "\n".join(lines)
+    done = call(["mbtf-fit", *arguments])
+    assert done.code == code, done.err
+    assert done.out == ""
+    start = done.err.index("error: ")
+    assert len(done.err[start:].splitlines()) <= 2, done.err
+    assert "Traceback" not in done.err
+    return done.err[start:]
 
 
-def test_json_is_one_object(shards: Path, material: Path, tmp_path: Path, run_python: RunPython) -> None:
+def test_json_is_one_object(shards: Path, tmp_path: Path, run_python: RunPython) -> None:
     done = run_python("-m", "mbtf_fit", str(shards), "-o", str(tmp_path / "m"), *QUICK, "--json")
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     assert found["training"]["steps"] == 5
     assert set(found["errors"]) == {"test", "held_out_queries", "held_out_directions", "training"}
-    for arguments in (
-        ["evaluate", str(material), str(shards)],
-        ["info", str(material)],
-        ["info", str(shards)],
-    ):
-        done = run_python("-m", "mbtf_fit", *arguments, "--json")
-        assert done.returncode == 0, done.stderr
-        json.loads(done.stdout)
 
 
 def test_a_finished_fit_is_not_trained_again(shards: Path, material: Path, run_python: RunPython) -> None:
@@ -123,63 +112,59 @@ def test_data_of_another_material_cause_a_warning(tmp_path: Path, run_python: Ru
         assert ("(height differs)" in done.stderr) == bool(foreign)
 
 
-def test_options_come_from_file_then_assignments_then_flags(
-    shards: Path, tmp_path: Path, run_python: RunPython
-) -> None:
-    (tmp_path / "c.yaml").write_text("model: neumip-baseline\ntraining: {steps: 9, batch: 300, warmup: 7}\n")
-    out = tmp_path / "m"
-    done = run_python(
-        "-m", "mbtf_fit", str(shards), "-o", str(out), "--config", str(tmp_path / "c.yaml"),
-        "--set", "training.batch=400", "--set", "training.steps=8", "--steps", "2",
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    config = json.loads((out / "material.json").read_text())["config"]
-    assert config["model"] == "neumip-baseline"
-    assert {k: config["training"][k] for k in ("steps", "batch", "warmup")} == {
-        "steps": 2, "batch": 400, "warmup": 7,
-    }  # fmt: skip
-    assert (out / "config.yaml").exists()
+def test_evaluate_and_info_report_text_and_json(shards: Path, material: Path) -> None:
+    for words, texts in (
+        (
+            ["evaluate", str(material), str(shards)],
+            ("held-out directions", "training queries", "level 3", "cosine 0.7-1"),
+        ),
+        (["info", str(material)], ("3254 network weights", "conformance: 256 queries")),
+        (["info", str(shards)], ("train: 3000 queries in 2 shards",)),
+    ):
+        done = call(["mbtf-fit", *words])
+        assert all(text in done.out for text in texts), done
+        done = call(["mbtf-fit", *words, "--json"])
+        assert done.code == 0, done.err
+        json.loads(done.out)
 
 
-def test_bad_input_exits_with_3_and_a_hint(
-    shards: Path, material: Path, tmp_path: Path, run_python: RunPython
-) -> None:
+def test_bad_input_exits_with_3_and_a_hint(shards: Path, material: Path, tmp_path: Path) -> None:
     out = ["-o", str(tmp_path / "m")]
-    assert "no such folder" in fails(run_python, 3, str(tmp_path / "none"), *out)
+    assert "no such folder" in fails(3, str(tmp_path / "none"), *out)
     empty = tmp_path / "empty"
     empty.mkdir()
-    assert "mbtf-gen" in fails(run_python, 3, str(empty), *out)
+    assert "mbtf-gen" in fails(3, str(empty), *out)
     other = write_data(tmp_path / "schema", parallax, train=10, schema=99)
-    assert "schema 99" in fails(run_python, 3, str(other), *out)
+    assert "schema 99" in fails(3, str(other), *out)
     image = write_data(tmp_path / "image", parallax, train=10, layout="image")
-    assert "--layout shuffled" in fails(run_python, 3, str(image), *out)
+    assert "--layout shuffled" in fails(3, str(image), *out)
     assert "training.batch: 500 -> 700" in fails(
-        run_python, 3, str(shards), "-o", str(material), "--steps", "5", "--batch", "700"
+        3, str(shards), "-o", str(material), "--steps", "5", "--batch", "700"
     )
-    assert "no such folder" in fails(run_python, 3, "info", str(tmp_path / "none"))
-    assert "no material.json" in fails(run_python, 3, "evaluate", str(empty), str(shards))
+    assert "no such folder" in fails(3, "info", str(tmp_path / "none"))
+    assert "no material.json" in fails(3, "evaluate", str(empty), str(shards))
 
 
-def test_a_damaged_shard_is_named(tmp_path: Path, run_python: RunPython) -> None:
+def test_a_damaged_shard_is_named(tmp_path: Path) -> None:
     folder = write_data(tmp_path / "d", parallax, train=100)
     arrays = read_shard(folder / "train-00000.npz", mapped=False)
     arrays["value_a"][3, 1] = float("nan")
     write_shard(folder / "train-00000.npz", arrays)
-    said = fails(run_python, 3, str(folder), "-o", str(tmp_path / "m"))
+    said = fails(3, str(folder), "-o", str(tmp_path / "m"))
     assert "train-00000.npz" in said
     assert "NaN" in said
 
 
-def test_invalid_command_lines_exit_with_2(shards: Path, run_python: RunPython) -> None:
-    assert "mbtf-fit shards/" in fails(run_python, 2)
-    assert "2min" in fails(run_python, 2, str(shards), "--time", "soon")
-    assert "exclude each other" in fails(run_python, 2, str(shards), "--time", "1s", "--steps", "3")
-    assert "training.bach" in fails(run_python, 2, str(shards), "--set", "training.bach=3")
-    fails(run_python, 2, str(shards), "--model", "neumop")
+def test_invalid_command_lines_exit_with_2(shards: Path) -> None:
+    assert "mbtf-fit shards/" in fails(2)
+    assert "2min" in fails(2, str(shards), "--time", "soon")
+    assert "exclude each other" in fails(2, str(shards), "--time", "1s", "--steps", "3")
+    assert "training.bach" in fails(2, str(shards), "--set", "training.bach=3")
+    fails(2, str(shards), "--model", "neumop")
 
 
 @pytest.mark.skipif(os.name != "posix", reason="sends SIGINT")
-def test_ctrl_c_keeps_the_last_checkpoint(shards: Path, tmp_path: Path, run_python: RunPython) -> None:
+def test_ctrl_c_keeps_the_last_checkpoint(shards: Path, tmp_path: Path) -> None:
     out = tmp_path / "m"
     code = (
         "import sys, mbtf_fit.training.fit as f\n"

@@ -1,4 +1,4 @@
-"""A paper recipe from maps to page and CSV: both layouts, a missing material, and what runs again."""
+"""A paper recipe from maps to page and CSV: both layouts, a missing material, and resuming."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ base:
     kinds: [query, pixel]
     offset_views: [{elevation: 40, azimuth: 0}]
     st_lpips: false
-    stock: true
+    unmodified_mitsuba: true
     timing: true
 quick:
   each_fit: {training: {steps: 4}}
@@ -52,7 +52,7 @@ def command(folder: Path, *options: str) -> list[str]:
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a finished quick run; timings are of few pixels."""
+    """The folder of a finished quick run; timings use few pixels."""
     folder = tmp_path_factory.mktemp("paper")
     np.save(folder / "bumps.npy", np.random.default_rng(1).random((8, 8)).astype(np.float32))
     (folder / "tiny.yaml").write_text(RECIPE)
@@ -67,13 +67,13 @@ def table(folder: Path, name: str) -> list[dict[str, str]]:
         return list(csv.DictReader(stream))
 
 
-def test_every_table_has_its_numbers(made: Path) -> None:
+def test_tables_contain_the_measured_numbers(made: Path) -> None:
     record: dict[str, Any] = json.loads((made / "out" / "paper.json").read_text())
     assert record["size"] == "quick"
     assert list(record["skipped"]) == ["elsewhere"]
     methods = table(made, "methods")
     assert [r["method"] for r in methods[:3]] == ["neumip-baseline", "neumip", "hierarchical"]
-    assert [r["unexplained"] for r in methods[3:]] == ["not built yet"] * 2
+    assert [r["unexplained"] for r in methods[3:]] == ["not implemented"] * 2
     run_folder = made / "out" / "runs" / "bumps"
     comparison = json.loads((run_folder / "compare" / "comparison.json").read_text())
     for row in methods[:3]:
@@ -89,21 +89,20 @@ def test_every_table_has_its_numbers(made: Path) -> None:
     assert {(r["tiles_across"], r["method"]) for r in table(made, "zooms")} == {
         (tiles_across, r["method"]) for tiles_across in ("0.5", "2") for r in methods[:3]
     }
-    # Pictures of 16 pixels are.
-    assert [r["verdict"] for r in table(made, "independence")] == ["too small to tell"]
+    assert [r["verdict"] for r in table(made, "independence")] == ["inconclusive"]
     for fit in ("neumip", "hierarchical"):
         begun = json.loads((run_folder / "fits" / fit / "fit.json").read_text())
         assert begun["config"]["training"]["steps"] == 4
 
 
-def test_the_page_stands_alone_and_says_which_size_ran(made: Path) -> None:
+def test_the_page_is_self_contained_and_names_the_size(made: Path) -> None:
     html = (made / "out" / "paper.html").read_text()
     found = loads(html)
     assert not found.external
     assert len(found.pictures) == 4 + 3 + 10 + 3
     assert all(p.startswith("data:image/") for p in found.pictures)
     assert "This is the quick size" in html
-    assert "Skipped, because their files are not there: elsewhere" in html
+    assert "Skipped because of missing files: elsewhere" in html
     assert "--quick" in html
 
 
@@ -127,7 +126,7 @@ def test_the_page_can_be_written_again(made: Path) -> None:
     assert (page.read_bytes(), rows.read_bytes()) == before
 
 
-def test_an_interrupted_recipe_has_a_page_that_says_so(
+def test_the_page_of_an_interrupted_recipe_is_marked(
     made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     shutil.copytree(made / "out", tmp_path / "out")
@@ -138,13 +137,13 @@ def test_an_interrupted_recipe_has_a_page_that_says_so(
     assert "1 of 3 runs are finished" in (tmp_path / "out" / "paper.html").read_text()
     record.write_text(json.dumps(data | {"runs": []}))
     assert run(app, ["report", str(tmp_path / "out")]) == 3
-    assert "has no finished run" in capsys.readouterr().err
+    assert "contains no finished run" in capsys.readouterr().err
 
 
-def test_a_folder_of_something_else_is_left_alone(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_foreign_folder_is_refused(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
     other = made / "other"
     other.mkdir()
     (other / "notes.txt").write_text("mine")
     assert run(app, ["run", str(made / "tiny.yaml"), "--quick", "-o", str(other)]) == 3
-    assert "is not empty and holds no paper recipe" in capsys.readouterr().err
+    assert "is not empty and contains no paper recipe" in capsys.readouterr().err
     assert [p.name for p in other.iterdir()] == ["notes.txt"]

@@ -1,4 +1,4 @@
-"""The report as people use it: opened in a headless browser, its slider moved, its exposure changed."""
+"""The report in a headless browser: slider, exposure, selections and error maps."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from support.paths import ROOT
 from mbtf_gen.pictures.reference import to_display
 from mbtf_pipeline.compare.pictures import read_picture
 
-# Seconds for anything the browser does, on a machine that is busy with something else.
-PATIENCE = 120
-# Size of the pictures, and of the stage in the window, a multiple of it.
+# Seconds to wait for the browser.
+TIMEOUT = 120
+# Size of the images, and of the stage, a multiple of it.
 PIXELS, STAGE = 48, 480
 FLAGS = (
     "--headless",
@@ -33,7 +33,7 @@ FLAGS = (
     "--hide-scrollbars",
     "--force-device-scale-factor=1",
     "--window-size=1300,1000",
-    # Nothing has a name, so nothing outside this machine can be asked.
+    # No name can be resolved, so no other machine can be reached.
     "--host-resolver-rules=MAP * ~NOTFOUND",
 )
 
@@ -42,16 +42,8 @@ FLAGS = (
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with two fits, two widths and both kinds of reference."""
     out = tmp_path_factory.mktemp("report") / "run"
-    command = [
-        sys.executable,
-        "-m",
-        "mbtf_pipeline",
-        "run",
-        str(ROOT / "pipelines" / "ci.yaml"),
-        "-o",
-        str(out),
-        "-q",
-    ]
+    recipe = str(ROOT / "pipelines" / "ci.yaml")
+    command = [sys.executable, "-m", "mbtf_pipeline", "run", recipe, "-o", str(out), "-q"]
     for assignment in (
         "fit.neumip.training={steps: 60, batch: 2048}",
         "fit.plain={model: neumip-baseline, training: {steps: 20, batch: 2048}}",
@@ -68,9 +60,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _start(profile: Path) -> Any:
-    """A browser of this machine with its driver; skips where there is none or it does not start."""
+    """An installed browser with its driver; skips if there is none or it does not start."""
     selenium = pytest.importorskip(
-        "selenium.webdriver", reason="no selenium: the report was not opened in a browser"
+        "selenium.webdriver", reason="no selenium; to enable: pip install selenium"
     )
     from selenium.common.exceptions import WebDriverException
     from selenium.webdriver.chrome.service import Service
@@ -80,7 +72,7 @@ def _start(profile: Path) -> Any:
     browser = next((path for name in names if (path := shutil.which(name))), None)
     driver = shutil.which("chromedriver")
     if browser is None or driver is None:
-        pytest.skip("no chromium with chromedriver here: the report was not opened in a browser")
+        pytest.skip("no browser; to enable on Debian: apt-get install chromium chromium-driver")
     options = selenium.ChromeOptions()
     options.binary_location = browser
     for flag in (*FLAGS, f"--user-data-dir={profile}"):
@@ -92,7 +84,7 @@ def _start(profile: Path) -> Any:
         return started
     except (WebDriverException, HTTPError, OSError) as error:
         first = (str(error).strip() or type(error).__name__).splitlines()[0]
-        pytest.skip(f"the browser does not start here ({first}): the report was not opened in it")
+        pytest.skip(f"the browser does not start ({first})")
 
 
 class Page:
@@ -104,8 +96,8 @@ class Page:
         self.record = json.loads((folder / "compare" / "comparison.json").read_text())
         self.errors: list[str] = []
         self.requests: list[str] = []
-        driver.set_page_load_timeout(PATIENCE)
-        driver.set_script_timeout(PATIENCE)
+        driver.set_page_load_timeout(TIMEOUT)
+        driver.set_script_timeout(TIMEOUT)
         driver.get((folder / "report.html").as_uri())
 
     def find(self, css: str) -> Any:
@@ -117,10 +109,10 @@ class Page:
     def until(self, condition: Callable[[], Any], what: str) -> None:
         from selenium.webdriver.support.ui import WebDriverWait
 
-        WebDriverWait(self.driver, PATIENCE, 0.05).until(lambda _: condition(), what)
+        WebDriverWait(self.driver, TIMEOUT, 0.05).until(lambda _: condition(), what)
 
     def drawn(self, scene: int, kind: int, fit: int, stops: str = "0") -> None:
-        """Wait until the stage shows this."""
+        """Wait until the stage shows this selection."""
         wanted = f"{scene} {kind} {fit} {stops}"
         self.until(lambda: self.js("return document.getElementById('stage').dataset.drawn") == wanted, wanted)
 
@@ -135,7 +127,7 @@ class Page:
         return np.array(values, np.int64).reshape(rows, columns, 4)[..., :3]
 
     def screen(self) -> np.ndarray:
-        """The stage as it is seen: colors at the centers of its pictures' pixels (rows, columns, 3)."""
+        """The stage on the screen: colors at the centers of the images' pixels (rows, columns, 3)."""
         png = self.find("#stage").screenshot_as_png
         image = np.asarray(Image.open(io.BytesIO(png)).convert("RGB"), np.int64)
         assert image.shape == (STAGE, STAGE, 3)
@@ -143,18 +135,18 @@ class Page:
         return image[step // 2 :: step, step // 2 :: step]
 
     def expected(self, scene: int, what: str, stops: float = 0.0) -> np.ndarray:
-        """A picture as it must be shown: ``query``, ``pixel``, or a fit's name."""
+        """Expected display of an image: ``query``, ``pixel``, or the name of a fit."""
         picture = self.record["pictures"][scene]
         file = (picture["references"] if what in ("query", "pixel") else picture["fits"])[what]["file"]
         value = read_picture(self.folder / "compare" / file)
         return to_display(value, 2.0**stops / self.record["white"]).astype(np.int64)
 
     def collect(self) -> None:
-        """Take in the browser's logs."""
+        """Collect the browser's logs."""
         self.errors += [e["message"] for e in self.driver.get_log("browser") if e["level"] == "SEVERE"]
         for entry in self.driver.get_log("performance"):
             message = json.loads(entry["message"])["message"]
-            # The browser's own first page asks for its parts, too.
+            # Ignores requests of the browser's start page.
             ours = message["params"].get("documentURL", "").endswith("/report.html")
             if message["method"] == "Network.requestWillBeSent" and ours:
                 self.requests.append(message["params"]["request"]["url"])
@@ -170,7 +162,7 @@ def page(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Pag
         try:
             opened = Page(driver, folder)
             opened.until(lambda: opened.js("return document.body.dataset.sheet") == "drawn", "the sheet")
-            # Whole screen pixels per picture pixel, so that what is seen can be told pixel by pixel.
+            # An integer number of screen pixels per image pixel allows exact comparisons.
             opened.js(
                 "const s = document.createElement('style'); document.head.append(s);"
                 f"s.textContent = '.stage {{ width: {STAGE}px; border-radius: 0 }}"
@@ -186,7 +178,7 @@ def page(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Pag
 
 @pytest.fixture
 def stage(page: Page) -> Iterator[Any]:
-    """The stage in its first state; the logs are looked at afterwards."""
+    """The stage in its initial state; afterwards, the logs must contain no error."""
     page.js(
         "for (const name of ['fit', 'kind', 'group'])"
         " document.querySelector(`input[name=${name}][value='0']`).click();"
@@ -200,14 +192,14 @@ def stage(page: Page) -> Iterator[Any]:
 
 
 def matches(found: np.ndarray, expected: np.ndarray) -> bool:
-    """Same up to the coding of the linear values: 10 bits, and one step of rounding."""
+    """Equal up to the 10-bit encoding of linear values and rounding."""
     return found.shape == expected.shape and int(np.abs(found - expected).max()) <= 3
 
 
-def test_pictures_are_those_that_were_compared(page: Page, stage: Any) -> None:
+def test_the_compared_images_are_shown(page: Page, stage: Any) -> None:
     assert matches(page.canvas("#reference"), page.expected(0, "query"))
     assert matches(page.canvas("#fit"), page.expected(0, "neumip"))
-    # They differ by far more than the coding, or the tests below would show nothing.
+    # They differ by far more than the encoding error.
     assert not matches(page.expected(0, "query"), page.expected(0, "neumip"))
 
 
@@ -249,7 +241,7 @@ def test_dragging_moves_the_border(page: Page, stage: Any, kind: str) -> None:
 
 
 @pytest.mark.parametrize(("key", "stops"), [("ARROW_RIGHT", 2.0), ("ARROW_LEFT", -2.0)])
-def test_exposure_acts_on_linear_values_of_both_sides(page: Page, stage: Any, key: str, stops: float) -> None:
+def test_exposure_scales_linear_values_of_both_sides(page: Page, stage: Any, key: str, stops: float) -> None:
     from selenium.webdriver.common.keys import Keys
 
     page.find("#stops").send_keys(*[getattr(Keys, key)] * 20)
@@ -260,22 +252,17 @@ def test_exposure_acts_on_linear_values_of_both_sides(page: Page, stage: Any, ke
     stage.send_keys(Keys.HOME)
     assert matches(page.screen(), page.expected(0, "neumip", stops))
     white = page.record["white"] / 2.0**stops
-    said = page.find("#said").text
-    assert f"{stops:+.1f} EV".replace("-", "−") in said
-    assert f"{float(f'{white:.3g}'):g} 1/sr is white" in said
-    # The sheet below follows.
+    caption = page.find("#caption").text
+    assert f"{stops:+.1f} EV".replace("-", "−") in caption
+    assert f"{float(f'{white:.3g}'):g} 1/sr is white" in caption
     page.until(lambda: page.js("return document.body.dataset.exposure") == text, "the sheet's exposure")
     cells = "button.zoom[data-scene='1'] canvas"
     assert matches(page.canvas(cells), page.expected(1, "query", stops))
 
 
-def test_choices_change_what_is_shown(page: Page, stage: Any) -> None:
+def test_selections_change_the_images(page: Page, stage: Any) -> None:
     def choose(name: str, value: str) -> None:
-        page.js(
-            "document.querySelector(`input[name=${arguments[0]}][value='${arguments[1]}']`).click()",
-            name,
-            value,
-        )
+        page.js(f"document.querySelector(`input[name={name}][value='{value}']`).click()")
 
     choose("fit", "1")
     page.drawn(0, 0, 1)
@@ -287,16 +274,18 @@ def test_choices_change_what_is_shown(page: Page, stage: Any) -> None:
     page.drawn(1, 1, 1)
     assert matches(page.canvas("#fit"), page.expected(1, "plain"))
     choose("group", "1")
-    # The chosen width stays.
+    # The field of view stays selected.
     page.drawn(3, 1, 1)
     assert matches(page.canvas("#fit"), page.expected(3, "plain"))
-    assert "4 tiles across" in page.find("#said").text
+    assert "4 tiles across" in page.find("#caption").text
 
 
-def test_maps_belong_to_the_choice(page: Page, stage: Any) -> None:
+def test_error_maps_match_the_selection(page: Page, stage: Any) -> None:
     def shown() -> list[str]:
         return [
-            bar.text for bar in page.driver.find_elements("css selector", "#maps .bar") if bar.is_displayed()
+            bar.text
+            for bar in page.driver.find_elements("css selector", "#maps .color-bar")
+            if bar.is_displayed()
         ]
 
     first = page.find("#map-image").get_attribute("src")
@@ -316,21 +305,21 @@ def test_maps_belong_to_the_choice(page: Page, stage: Any) -> None:
     assert colors[difference < -40, 2].mean() > colors[difference < -40, 0].mean()
 
 
-def test_a_picture_of_the_sheet_opens_above(page: Page, stage: Any) -> None:
+def test_an_image_of_the_sheet_opens_in_the_viewer(page: Page, stage: Any) -> None:
     page.js("document.querySelector(\"button.zoom[data-scene='2'][data-fit='1'][data-map=flip]\").click()")
     page.drawn(2, 0, 1)
     assert page.js("return document.activeElement.id") == "stage"
     assert page.js("return document.querySelector('input[name=map][value=flip]').checked")
 
 
-def test_nothing_is_asked_for_outside(page: Page, stage: Any) -> None:
+def test_the_page_makes_no_requests(page: Page, stage: Any) -> None:
     page.collect()
     assert any(url.endswith("report.html") for url in page.requests)
     here = (page.folder / "report.html").as_uri()
     assert [url for url in page.requests if url != here and not url.startswith(("data:", "blob:"))] == []
 
 
-def test_everything_has_a_name(page: Page, stage: Any) -> None:
+def test_every_control_has_an_accessible_name(page: Page, stage: Any) -> None:
     code = """
         const named = e => e.getAttribute('aria-label') || e.alt
             || (!e.hasAttribute('role') && e.textContent.trim())
@@ -342,7 +331,7 @@ def test_everything_has_a_name(page: Page, stage: Any) -> None:
     assert page.js(code) == []
 
 
-def test_the_log_would_show_a_script_s_error(page: Page) -> None:
+def test_errors_of_scripts_reach_the_log(page: Page) -> None:
     page.collect()
     before = len(page.errors)
     page.js("setTimeout(() => { throw new Error('planted'); }, 0)")
@@ -355,17 +344,16 @@ def test_the_log_would_show_a_script_s_error(page: Page) -> None:
     del page.errors[before:]
 
 
-def test_with_scripts_off_the_pictures_are_there(page: Page, folder: Path) -> None:
+def test_images_are_visible_without_scripts(page: Page, folder: Path) -> None:
     driver = page.driver
     driver.switch_to.new_window("window")
-    # Without scripts nothing scrolls to a picture: the first ones must be in sight.
+    # A tall window, because nothing can scroll without scripts.
     driver.set_window_size(1300, 2400)
     driver.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": True})
     driver.get((folder / "report.html").as_uri())
     png = page.find("img[data-linear]").screenshot_as_png
-    shown = np.asarray(
-        Image.open(io.BytesIO(png)).convert("RGB").resize((PIXELS, PIXELS), Image.Resampling.BOX)
-    )
+    image = Image.open(io.BytesIO(png)).convert("RGB")
+    shown = np.asarray(image.resize((PIXELS, PIXELS), Image.Resampling.BOX))
     expected = page.expected(0, "query")
     assert np.corrcoef(shown.ravel(), expected.ravel())[0, 1] > 0.9
     assert not page.find("#viewer").is_displayed()

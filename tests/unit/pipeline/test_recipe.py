@@ -1,4 +1,4 @@
-"""Recipes: what is read, what is refused, and in which words."""
+"""Recipes: reading, errors with lines and hints, and exit codes."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def written(folder: Path, text: str) -> Path:
     return path
 
 
-def test_material_lies_beside_the_recipe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_material_is_relative_to_the_recipe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = written(tmp_path, SINGLE)
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
@@ -51,7 +51,7 @@ def test_material_lies_beside_the_recipe(tmp_path: Path, monkeypatch: pytest.Mon
     assert recipe.folder == Path("out") / "small"
 
 
-def test_an_assigned_material_lies_in_the_current_folder(
+def test_an_assigned_material_is_relative_to_the_current_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = written(tmp_path, SINGLE)
@@ -72,7 +72,7 @@ def test_one_fit_is_named_after_its_model(tmp_path: Path) -> None:
     assert without.fit["neumip"].training.time == 9.0
 
 
-def test_a_fit_without_a_model_has_the_model_of_its_name(tmp_path: Path) -> None:
+def test_the_model_of_a_fit_defaults_to_its_name(tmp_path: Path) -> None:
     recipe = load_recipe(written(tmp_path, NAMED))
     assert {name: fit.model for name, fit in recipe.fit.items()} == {
         "neumip": "neumip",
@@ -92,7 +92,7 @@ def test_a_fit_without_a_model_has_the_model_of_its_name(tmp_path: Path) -> None
         (NAMED.replace("time: 5s", "tmie: 5s"), 10, "did you mean 'time'"),
         (NAMED.replace("model: neumip-baseline", "model: neural"), 8, "neumip-baseline"),
         (HEAD + "fit:\n  other:\n", 6, "'neumip' or 'hierarchical'"),
-        (HEAD + "fit: {}\n", 5, "names no fit"),
+        (HEAD + "fit: {}\n", 5, "contains no fit"),
         (SINGLE.replace("small", "a/b"), 1, "'name'"),
         (SINGLE + "compare:\n  views:\n  - {elevation: 3}\n", 8, "at least"),
         (SINGLE + "compare: {spp: 3}\n", 6, "must be even"),
@@ -101,7 +101,7 @@ def test_a_fit_without_a_model_has_the_model_of_its_name(tmp_path: Path) -> None
         (SINGLE + "report: {exposure: x}\n", 6, "must be a number"),
     ],
 )
-def test_faults_are_named_with_their_line(tmp_path: Path, text: str, line: int, what: str) -> None:
+def test_errors_name_the_line(tmp_path: Path, text: str, line: int, what: str) -> None:
     path = written(tmp_path, text)
     with pytest.raises(InputError) as caught:
         load_recipe(path)
@@ -122,13 +122,13 @@ def test_a_missing_material_is_one_clear_line(tmp_path: Path, capsys: pytest.Cap
     out, err = capsys.readouterr()
     first, second = err.splitlines()
     assert first == f"error: {path}:3: material '../nowhere/height.exr' does not exist"
-    looked = os.path.abspath(tmp_path / "../nowhere/height.exr")
-    assert second.strip() == f"looked for {looked}; edit 'generate.material' in {path}"
+    searched = os.path.abspath(tmp_path / "../nowhere/height.exr")
+    assert second.strip() == f"searched for {searched}; edit 'generate.material' in {path}"
     assert out == ""
     assert not (tmp_path / "out").exists()
 
 
-def test_published_maps_that_are_missing_are_named_with_their_source(
+def test_missing_published_maps_are_reported_with_their_source(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = written(tmp_path, SINGLE.replace("maps/height.npy", "../data/rock_cliff"))
@@ -152,7 +152,7 @@ def test_published_maps_that_are_missing_are_named_with_their_source(
         (["run", "recipe-under-test.yaml", "--set", "compare.sp=2"], 2, "did you mean 'spp'"),
         (["run", "recipe-under-test.yaml", "-o", "maps"], 3, "not empty"),
         (["run", "recipe-under-test.yaml", "-o", "maps/height.npy"], 3, "not a folder"),
-        (["report", "maps"], 3, "holds no run"),
+        (["report", "maps"], 3, "contains no run"),
         (["list", "absent"], 3, "no such folder"),
         (["rnu", "recipe-under-test.yaml"], 2, "rnu"),
     ],
@@ -175,7 +175,7 @@ def test_exit_codes(
     assert len(err.splitlines()) <= 2
 
 
-def test_a_folder_at_work_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_locked_folder_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = written(tmp_path, SINGLE)
     folder = tmp_path / "out"
     folder.mkdir()
@@ -184,11 +184,11 @@ def test_a_folder_at_work_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFi
     with shard_lock(folder / "run.json") as held:
         assert held
         assert run(app, ["run", str(path), "-o", str(folder), "-q"]) == 4
-    assert "another run is at work" in capsys.readouterr().err
+    assert "another run uses this folder" in capsys.readouterr().err
     assert list(folder.iterdir()) == []
 
 
-def test_a_wrong_assignment_is_an_error_of_usage(tmp_path: Path) -> None:
+def test_an_invalid_assignment_is_a_usage_error(tmp_path: Path) -> None:
     path = written(tmp_path, SINGLE)
     with pytest.raises(UsageError, match="size"):
         load_recipe(path, ["compare.size=0"])
@@ -211,7 +211,7 @@ def test_the_resolved_recipe_can_be_run_again(tmp_path: Path) -> None:
     assert read_resolved(folder).fit == recipe.fit
 
 
-def test_listing_names_recipes_and_faults(
+def test_listing_shows_recipes_and_errors(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     written(tmp_path, SINGLE + "description: four by four\n")
@@ -221,7 +221,6 @@ def test_listing_names_recipes_and_faults(
 
     assert run(app, ["list", "."]) == 0
     broken, small = capsys.readouterr().out.splitlines()
-    # The path stands once.
     assert broken.startswith("broken.yaml: line 2: unknown key 'fti'")
     assert small == "recipe-under-test.yaml: four by four"
     assert run(app, ["list", ".", "-v"]) == 0

@@ -1,4 +1,4 @@
-"""Stages run when, and only when, something they depend on has changed."""
+"""Stages run if, and only if, something they depend on has changed."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from mbtf_core.atomic import read_json
 from mbtf_core.errors import InputError
 from mbtf_pipeline.stages import (
     Decision,
-    Outcome,
     Stage,
+    StageResult,
     decide,
     read_stamp,
     run_again,
@@ -24,7 +24,7 @@ from mbtf_pipeline.stages import (
 Config = dict[str, dict[str, Any]]
 
 
-class Chain:
+class Pipeline:
     """generate → fit a, fit b → compare → report, each writing its config and what it read into one file."""
 
     needs: dict[str, tuple[str, ...]] = {  # noqa: RUF012
@@ -75,24 +75,24 @@ class Chain:
             for name, needs in self.needs.items()
         ]
 
-    def run(self, **options: Any) -> dict[str, Outcome]:
+    def run(self, **options: Any) -> dict[str, StageResult]:
         self.ran, self.decisions = [], {}
         return run_stages(self.folder, self.stages(), **options)
 
 
 @pytest.fixture
-def chain(tmp_path: Path) -> Chain:
-    chain = Chain(tmp_path)
-    chain.run()
-    assert chain.ran == list(Chain.needs)
-    return chain
+def pipeline(tmp_path: Path) -> Pipeline:
+    pipeline = Pipeline(tmp_path)
+    pipeline.run()
+    assert pipeline.ran == list(Pipeline.needs)
+    return pipeline
 
 
-def test_nothing_runs_twice(chain: Chain) -> None:
-    outcomes = chain.run()
-    assert chain.ran == []
-    assert not any(o.ran for o in outcomes.values())
-    assert outcomes["compare"].stamp.notes == {"note": "compare"}
+def test_nothing_runs_twice(pipeline: Pipeline) -> None:
+    results = pipeline.run()
+    assert pipeline.ran == []
+    assert not any(r.ran for r in results.values())
+    assert results["compare"].stamp.notes == {"note": "compare"}
 
 
 @pytest.mark.parametrize(
@@ -104,102 +104,102 @@ def test_nothing_runs_twice(chain: Chain) -> None:
         ("report", ["report"]),
     ],
 )
-def test_a_changed_option_runs_its_stage_and_what_follows(
-    chain: Chain, stage: str, expected: list[str]
+def test_a_changed_option_runs_its_stage_and_later_ones(
+    pipeline: Pipeline, stage: str, expected: list[str]
 ) -> None:
-    chain.config[stage] = {"option": 2}
-    chain.run()
-    assert chain.ran == expected
-    assert "option: 1 -> 2" in chain.decisions[stage].reason
-    chain.run()
-    assert chain.ran == []
+    pipeline.config[stage] = {"option": 2}
+    pipeline.run()
+    assert pipeline.ran == expected
+    assert "option: 1 -> 2" in pipeline.decisions[stage].reason
+    pipeline.run()
+    assert pipeline.ran == []
 
 
-def test_a_changed_input_file_runs_everything(chain: Chain) -> None:
-    chain.inputs = {"height": "digest 2"}
-    chain.run()
-    assert chain.ran == list(Chain.needs)
-    assert "height" in chain.decisions["generate"].reason
+def test_a_changed_input_file_runs_everything(pipeline: Pipeline) -> None:
+    pipeline.inputs = {"height": "digest 2"}
+    pipeline.run()
+    assert pipeline.ran == list(Pipeline.needs)
+    assert "height" in pipeline.decisions["generate"].reason
 
 
 @pytest.mark.parametrize("damage", ["missing", "changed"])
-def test_a_damaged_output_runs_its_stage_and_what_follows(chain: Chain, damage: str) -> None:
-    path = chain.file("fit a")
+def test_a_changed_output_runs_its_stage_and_later_ones(pipeline: Pipeline, damage: str) -> None:
+    path = pipeline.file("fit a")
     if damage == "missing":
         path.unlink()
     else:
         path.write_text("something else")
-    chain.run()
-    # Its file comes out as before, yet what follows runs: the user sees it made from what is there now.
-    assert chain.ran == ["fit a", "compare", "report"]
-    assert chain.decisions["fit a"].damaged == (path,)
-    assert "fit-a.txt" in chain.decisions["fit a"].reason
-    assert chain.decisions["compare"].reason == "follows fit a"
+    pipeline.run()
+    # Later stages run although the recreated file is identical.
+    assert pipeline.ran == ["fit a", "compare", "report"]
+    assert pipeline.decisions["fit a"].changed_files == (path,)
+    assert "fit-a.txt" in pipeline.decisions["fit a"].reason
+    assert pipeline.decisions["compare"].reason == "follows fit a"
 
 
-def test_dates_and_names_of_folders_decide_nothing(chain: Chain, tmp_path: Path) -> None:
-    for name in Chain.needs:
-        chain.file(name).touch()
+def test_dates_and_folder_names_do_not_matter(pipeline: Pipeline, tmp_path: Path) -> None:
+    for name in Pipeline.needs:
+        pipeline.file(name).touch()
     moved = tmp_path.with_name(tmp_path.name + "-moved")
     tmp_path.rename(moved)
-    chain.folder = moved
-    chain.run()
-    assert chain.ran == []
+    pipeline.folder = moved
+    pipeline.run()
+    assert pipeline.ran == []
 
 
-def test_an_interrupted_stage_has_not_run(chain: Chain) -> None:
-    chain.config["compare"] = {"option": 2}
-    chain.fail_in = "compare"
+def test_an_interrupted_stage_has_not_run(pipeline: Pipeline) -> None:
+    pipeline.config["compare"] = {"option": 2}
+    pipeline.fail_in = "compare"
     with pytest.raises(KeyboardInterrupt):
-        chain.run()
-    assert read_stamp(chain.folder, "compare") is None
-    # Even with its old options back, what an interrupted run may have left is not trusted.
-    chain.config["compare"] = {"option": 1}
-    chain.fail_in = ""
-    chain.run()
-    assert chain.ran == ["compare", "report"]
+        pipeline.run()
+    assert read_stamp(pipeline.folder, "compare") is None
+    # With the old options, outputs of an interrupted run are not trusted either.
+    pipeline.config["compare"] = {"option": 1}
+    pipeline.fail_in = ""
+    pipeline.run()
+    assert pipeline.ran == ["compare", "report"]
 
 
-def test_force_runs_everything(chain: Chain) -> None:
-    chain.run(force=True)
-    assert chain.ran == list(Chain.needs)
-    assert chain.decisions["generate"].forced
+def test_force_runs_everything(pipeline: Pipeline) -> None:
+    pipeline.run(force=True)
+    assert pipeline.ran == list(Pipeline.needs)
+    assert pipeline.decisions["generate"].forced
 
 
-def test_order_of_options_does_not_count(chain: Chain) -> None:
-    chain.config["compare"] = {"a": 1, "b": [2, 3]}
-    chain.run()
-    chain.config["compare"] = {"b": (2, 3), "a": 1}
-    chain.run()
-    assert chain.ran == []
+def test_the_order_of_options_does_not_matter(pipeline: Pipeline) -> None:
+    pipeline.config["compare"] = {"a": 1, "b": [2, 3]}
+    pipeline.run()
+    pipeline.config["compare"] = {"b": (2, 3), "a": 1}
+    pipeline.run()
+    assert pipeline.ran == []
 
 
-def test_a_stamp_that_cannot_be_read_is_none(chain: Chain) -> None:
-    path = stamp_path(chain.folder, "report")
+def test_an_unreadable_stamp_is_ignored(pipeline: Pipeline) -> None:
+    path = stamp_path(pipeline.folder, "report")
     assert read_json(path)["outputs"].keys() == {"report.txt"}
     path.write_text("{")
-    chain.run()
-    assert chain.ran == ["report"]
+    pipeline.run()
+    assert pipeline.ran == ["report"]
     path.write_text('{"format": "mbtf-stage", "schema": 999}')
-    chain.run()
-    assert chain.ran == ["report"]
+    pipeline.run()
+    assert pipeline.ran == ["report"]
 
 
-def test_deciding_changes_nothing(chain: Chain) -> None:
-    chain.config["compare"] = {"option": 2}
-    before = sorted(p.read_text() for p in chain.folder.rglob("*") if p.is_file())
-    stage = chain.stages()[3]
-    upstream = {n: read_stamp(chain.folder, n).outputs_hash for n in stage.needs}  # type: ignore[union-attr]
-    assert decide(chain.folder, stage, upstream).runs
-    assert sorted(p.read_text() for p in chain.folder.rglob("*") if p.is_file()) == before
+def test_deciding_changes_nothing(pipeline: Pipeline) -> None:
+    pipeline.config["compare"] = {"option": 2}
+    before = sorted(p.read_text() for p in pipeline.folder.rglob("*") if p.is_file())
+    stage = pipeline.stages()[3]
+    upstream = {n: read_stamp(pipeline.folder, n).outputs_hash for n in stage.needs}  # type: ignore[union-attr]
+    assert decide(pipeline.folder, stage, upstream).runs
+    assert sorted(p.read_text() for p in pipeline.folder.rglob("*") if p.is_file()) == before
 
 
-def test_running_one_stage_again(chain: Chain) -> None:
-    chain.ran = []
-    run_again(chain.folder, chain.stages()[-1])
-    assert chain.ran == ["report"]
-    chain.run()
-    assert chain.ran == []
-    stamp_path(chain.folder, "fit b").unlink()
+def test_running_one_stage_again(pipeline: Pipeline) -> None:
+    pipeline.ran = []
+    run_again(pipeline.folder, pipeline.stages()[-1])
+    assert pipeline.ran == ["report"]
+    pipeline.run()
+    assert pipeline.ran == []
+    stamp_path(pipeline.folder, "fit b").unlink()
     with pytest.raises(InputError, match="fit b"):
-        run_again(chain.folder, chain.stages()[-1])
+        run_again(pipeline.folder, pipeline.stages()[-1])

@@ -14,8 +14,8 @@ from mbtf_gen.render.bsdf.microfacet import (
     distribution,
     grazing_reflectance,
     half_tangent2,
-    sample_missing_energy,
     missing_energy_pdf,
+    sample_missing_energy,
     smith,
 )
 

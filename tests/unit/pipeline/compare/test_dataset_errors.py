@@ -1,4 +1,4 @@
-"""Fits of both layouts in one recipe, judged by one test split, and the time of their parts."""
+"""Fits of both layouts share one test split; times of their parts are scaled to all pixels."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mbtf_core.lattice import Lattice
 from mbtf_fit.models.registry import build_model
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_pipeline.compare import timing
-from mbtf_pipeline.compare.dataset_errors import errors_on_data
+from mbtf_pipeline.compare.dataset_errors import dataset_errors
 from mbtf_pipeline.compare.timing import LIGHTS, measure_timing
 from mbtf_pipeline.recipe import Recipe
 from mbtf_pipeline.run import data_sets, stage_names
@@ -27,7 +27,7 @@ def recipe(layout: str, *models: str) -> Recipe:
 
 
 @pytest.mark.parametrize("layout", ["shuffled", "image"])
-def test_a_model_of_the_other_layout_has_data_of_its_own(layout: str) -> None:
+def test_a_model_of_the_other_layout_gets_its_own_data_set(layout: str) -> None:
     other = {"shuffled": "image", "image": "shuffled"}[layout]
     made = recipe(layout, "neumip", "hierarchical")
     first, second = data_sets(made)
@@ -44,7 +44,7 @@ def test_one_layout_is_one_data_set() -> None:
 
 
 class Shifted:
-    """A material that is off by a constant."""
+    """A material with a constant error."""
 
     def __init__(self, model: str, shift: float) -> None:
         self.shift = shift
@@ -58,22 +58,22 @@ class Shifted:
         return (parallax(q.u, q.sigma, q.omega_i, q.omega_o) + self.shift).astype(np.float32)
 
 
-def test_all_fits_are_judged_by_the_same_test_queries(tmp_path: Path) -> None:
+def test_all_fits_are_evaluated_on_the_same_test_queries(tmp_path: Path) -> None:
     data = Dataset.open(write_data(tmp_path / "shards", parallax, train=64, noise=0.02))
     fits: Any = {"a": Shifted("neumip", 0.1), "b": Shifted("hierarchical", 0.05)}
-    found = errors_on_data(fits, data)
+    found = dataset_errors(fits, data)
     for name, square in (("a", 0.01), ("b", 0.0025)):
         mse = found[name]["splits"]["test"]["mse"]
         assert abs(mse["value"] - square) < 4 * mse["error"]
         assert found[name]["splits"]["held_out_queries"] == {"mse": "own"}
         assert sum(found[name]["networks"].values()) == found[name]["network_weights"]
-    less = found["b"]["mse_less_first"]
+    less = found["b"]["mse_minus_first"]
     assert abs(less["value"] - (0.0025 - 0.01)) < 4 * less["error"]
-    # Noise that both share cancels: the bar is that of the difference.
+    # Shared noise cancels in the paired difference.
     assert less["error"] < found["a"]["splits"]["test"]["mse"]["error"]
     assert set(less["levels"]) == {"0", "1", "2", "3"}
     assert all(e["value"] + 4 * e["error"] < 0 for e in less["levels"].values())
-    assert "mse_less_first" not in found["a"]
+    assert "mse_minus_first" not in found["a"]
 
 
 @pytest.mark.parametrize(
@@ -87,7 +87,7 @@ def test_all_fits_are_judged_by_the_same_test_queries(tmp_path: Path) -> None:
 def test_times_are_scaled_to_all_pixels(
     model: str, parts: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With a clock that takes a second for everything, only the scale is left."""
+    """If every part takes a second, only the scale remains."""
 
     def one_second(work: Any) -> tuple[Any, float]:
         return work(), 1.0

@@ -1,4 +1,4 @@
-"""FLIP at stated exposures: none for equal pictures, and the exposures and the white point count."""
+"""FLIP: zero for equal images, known for uniform ones, dependent on exposure and white point."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from mbtf_pipeline.compare.flip import flip
 
 @pytest.fixture(scope="module")
 def pictures() -> tuple[np.ndarray, np.ndarray]:
-    """A reference with a bright half, and a fit that is wrong there alone: 4 or 5 times white."""
+    """A reference with a bright half, and a fit that differs only there: 4 or 5 times white."""
     reference = np.full((24, 32, 3), 0.05, np.float32)
     reference[:, 16:] = 0.8
     fit = reference.copy()
@@ -18,13 +18,13 @@ def pictures() -> tuple[np.ndarray, np.ndarray]:
     return fit, reference
 
 
-def test_equal_pictures_do_not_differ(pictures: tuple[np.ndarray, np.ndarray]) -> None:
+def test_equal_images_do_not_differ(pictures: tuple[np.ndarray, np.ndarray]) -> None:
     found = flip(pictures[1], pictures[1], 0.2)
     assert found.ldr == found.hdr == 0
     assert not found.hdr_map.any()
 
 
-def test_only_hdr_sees_what_is_cut_off_at_white(pictures: tuple[np.ndarray, np.ndarray]) -> None:
+def test_only_hdr_flip_responds_above_white(pictures: tuple[np.ndarray, np.ndarray]) -> None:
     found = flip(*pictures, 0.2)
     assert found.ldr < 1e-6
     assert found.hdr > 0.01
@@ -33,18 +33,18 @@ def test_only_hdr_sees_what_is_cut_off_at_white(pictures: tuple[np.ndarray, np.n
     assert found.hdr == pytest.approx(float(found.hdr_map.mean()), rel=1e-3)
 
 
-def test_only_the_ratio_to_white_counts(pictures: tuple[np.ndarray, np.ndarray]) -> None:
+def test_only_the_ratio_to_white_matters(pictures: tuple[np.ndarray, np.ndarray]) -> None:
     fit, reference = pictures
     assert flip(7 * fit, 7 * reference, 1.4).hdr == pytest.approx(flip(fit, reference, 0.2).hdr, rel=1e-4)
     assert flip(fit, reference, 2.0).ldr > 0.01
 
 
-def test_a_black_reference_has_a_number(pictures: tuple[np.ndarray, np.ndarray]) -> None:
+def test_a_black_reference_is_valid(pictures: tuple[np.ndarray, np.ndarray]) -> None:
     found = flip(pictures[0], np.zeros_like(pictures[1]), 0.2)
     assert 0 < found.hdr <= 1
 
 
-def even(color: tuple[float, float, float]) -> np.ndarray:
+def uniform(color: tuple[float, float, float]) -> np.ndarray:
     return np.broadcast_to(np.array(color, np.float32), (40, 48, 3)).copy()
 
 
@@ -65,7 +65,7 @@ def hunt(color: np.ndarray) -> np.ndarray:
 
 
 def apart(first: np.ndarray, second: np.ndarray) -> float:
-    """FLIP of two even pictures: without edges and texture only HyAB's distance is left, redistributed."""
+    """FLIP of two uniform images: without edges and texture only the redistributed HyAB distance remains."""
 
     def distance(a: np.ndarray, b: np.ndarray) -> float:
         d = hunt(a) - hunt(b)
@@ -77,7 +77,7 @@ def apart(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def aces(x: np.ndarray) -> np.ndarray:
-    """The tone mapper of HDR-FLIP (Narkowicz's fit, 0.6 before it), cut off at 1."""
+    """The tone mapper of HDR-FLIP (Narkowicz's fit, 0.6 before it), clipped at 1."""
     y = 0.6 * x
     return np.clip(y * (2.51 * y + 0.03) / (y * (2.43 * y + 0.59) + 0.14), 0, 1)
 
@@ -86,11 +86,11 @@ def aces(x: np.ndarray) -> np.ndarray:
     ("first", "second"),
     [((0.2, 0.3, 0.1), (0.25, 0.3, 0.1)), ((0.05, 0.05, 0.05), (0.6, 0.1, 0.02)), ((0, 0, 0), (0.9, 1, 0.8))],
 )
-def test_flip_of_even_pictures_is_known(
+def test_flip_of_uniform_images_is_known(
     first: tuple[float, float, float], second: tuple[float, float, float]
 ) -> None:
     white = 0.5
-    found = flip(even(first), even(second), white)
+    found = flip(uniform(first), uniform(second), white)
     shown = [np.array(c) / white for c in (first, second)]
     assert found.ldr == pytest.approx(apart(*(np.minimum(c, 1) for c in shown)), rel=2e-3)
     exposed = [[aces(2.0**stop * c) for c in shown] for stop in (-2, 0, 2)]

@@ -1,4 +1,4 @@
-"""Offsets traced from heights are those of plane geometry, and survive their file."""
+"""Traced offsets match plane geometry, and files preserve them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mbtf_core.directions import from_angles
 from mbtf_gen.geometry.heightfield import HeightGrid
 from mbtf_gen.render.runtime import load_mitsuba
 from mbtf_pipeline.compare.offsets import _correlation, _write, read_offset, towards_view, traced_offset
-from mbtf_pipeline.recipe import View
+from mbtf_pipeline.recipe import SceneView
 
 DEPTH = 0.05
 
@@ -40,7 +40,7 @@ def test_a_plane_below_is_displaced_by_its_depth_over_the_tangent(
     distance = DEPTH / np.tan(np.radians(elevation))
     expected = -distance * np.array([np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth))])
     np.testing.assert_allclose(found, np.broadcast_to(expected, (3, 2)), atol=2e-6)
-    along = towards_view(found, View(elevation=elevation, azimuth=azimuth))
+    along = towards_view(found, SceneView(elevation=elevation, azimuth=azimuth))
     np.testing.assert_allclose(along, -distance, atol=2e-6)
 
 
@@ -53,7 +53,7 @@ def test_a_peak_at_the_plane_is_not_displaced(plane_below: object) -> None:
     assert np.abs(slanted).max() < 1e-4
 
 
-def test_offsets_survive_their_file(tmp_path: Path) -> None:
+def test_files_preserve_offsets(tmp_path: Path) -> None:
     offset = np.random.default_rng(1).normal(size=(5, 7, 2)).astype(np.float32)
     _write(tmp_path / "v1-fit-some.name.exr", offset)
     np.testing.assert_array_equal(read_offset(tmp_path / "v1-fit-some.name.exr"), offset)

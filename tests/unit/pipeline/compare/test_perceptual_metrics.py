@@ -1,4 +1,4 @@
-"""SSIM and ST-LPIPS against answers from elsewhere: closed forms, the definition, the published network."""
+"""SSIM and ST-LPIPS against closed forms, the definition and the published network."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from mbtf_core.errors import EngineError
 from mbtf_gen.pictures.reference import to_display
 from mbtf_pipeline.compare import st_lpips as perceptual
-from mbtf_pipeline.compare.ssim import on_screen, ssim
+from mbtf_pipeline.compare.ssim import ssim, to_srgb
 from mbtf_pipeline.compare.st_lpips import st_lpips, weights_file
 
 F64 = np.ndarray
@@ -19,37 +19,37 @@ needs_weights = pytest.mark.skipif(weights_file() is None, reason="stlpips-pytor
 
 
 def pair(shape: tuple[int, int] = (40, 33)) -> tuple[F64, F64]:
-    """A picture and its reference, linear, both within [0, 1]."""
+    """A linear image and its reference, both within [0, 1]."""
     random = np.random.default_rng(2)
     reference = random.random((*shape, 3))
     return np.clip(reference + 0.2 * random.standard_normal(reference.shape), 0, 1), reference
 
 
-def test_what_a_screen_shows() -> None:
+def test_srgb_matches_the_display_conversion() -> None:
     values = np.linspace(-0.1, 0.4, 300).reshape(10, 10, 3).astype(np.float32)
     np.testing.assert_allclose(
-        np.round(255 * on_screen(values, 0.25)), to_display(values, 1 / 0.25), rtol=0, atol=1e-9
+        np.round(255 * to_srgb(values, 0.25)), to_display(values, 1 / 0.25), rtol=0, atol=1e-9
     )
 
 
-def test_ssim_of_even_pictures_is_known() -> None:
-    """Without structure only the luminance term is left: (2xy + c)/(x² + y² + c), c = 0.01²."""
+def test_ssim_of_uniform_images_is_known() -> None:
+    """Without structure only the luminance term remains: (2xy + c)/(x² + y² + c), c = 0.01²."""
     x, y = 0.3, 0.6
     pictures = [np.full((16, 16, 3), v) for v in (x, y)]
-    a, b = (float(on_screen(np.array(v), 1.0)) for v in (x, y))
+    a, b = (float(to_srgb(np.array(v), 1.0)) for v in (x, y))
     expected = (2 * a * b + 1e-4) / (a * a + b * b + 1e-4)
     assert ssim(*pictures, 1.0) == pytest.approx(expected, rel=1e-9)
     assert ssim(pictures[0], pictures[0], 1.0) == pytest.approx(1.0)
 
 
-def test_ssim_is_the_definition() -> None:
-    """Equation 13 of the paper at every window that lies within the pictures."""
+def test_ssim_matches_its_definition() -> None:
+    """Equation 13 of the paper at every window within the images."""
     picture, reference = pair((18, 15))
     along = np.exp(-(np.arange(-5, 6) ** 2) / (2 * 1.5**2))
     window = np.outer(along, along) / along.sum() ** 2
     found = []
     for channel in range(3):
-        x, y = (on_screen(p, 1.0)[..., channel] for p in (picture, reference))
+        x, y = (to_srgb(p, 1.0)[..., channel] for p in (picture, reference))
         for i in range(x.shape[0] - 10):
             for j in range(x.shape[1] - 10):
                 p, q = (v[i : i + 11, j : j + 11] for v in (x, y))
@@ -61,17 +61,17 @@ def test_ssim_is_the_definition() -> None:
     assert ssim(picture, reference, 1.0) == pytest.approx(np.mean(found), rel=1e-6)
 
 
-def test_only_the_ratio_to_white_counts_and_what_is_above_is_cut() -> None:
+def test_only_the_ratio_to_white_matters_and_values_above_are_clipped() -> None:
     picture, reference = pair()
     assert ssim(7 * picture, 7 * reference, 7.0) == pytest.approx(ssim(picture, reference, 1.0))
     assert ssim(2 + picture, 2 + reference, 1.0) == pytest.approx(1.0)
 
 
-def test_pictures_smaller_than_the_window_have_no_ssim() -> None:
+def test_images_smaller_than_the_window_have_no_ssim() -> None:
     assert ssim(np.ones((10, 40, 3)), np.ones((10, 40, 3)), 1.0) is None
 
 
-def test_without_its_weights_st_lpips_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_weights_of_st_lpips_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(perceptual, "PACKAGE", "no_such_package_of_weights")
     perceptual._network.cache_clear()
     with pytest.raises(EngineError, match="ST-LPIPS needs the weights") as raised:
@@ -81,7 +81,7 @@ def test_without_its_weights_st_lpips_names_the_extra(monkeypatch: pytest.Monkey
 
 @pytest.fixture
 def published(monkeypatch: pytest.MonkeyPatch) -> object:
-    """The package's own network; what it imports but does not use here is left out."""
+    """The package's own network, with stubs for unused imports."""
     names = ("IPython", "torchvision", "torchvision.models", "torchsummary")
     modules = {name: types.ModuleType(name) for name in names}
     vars(modules["IPython"])["embed"] = None
@@ -98,13 +98,13 @@ def published(monkeypatch: pytest.MonkeyPatch) -> object:
 
 @needs_weights
 @pytest.mark.parametrize("shape", [(32, 32), (57, 40)])
-def test_st_lpips_is_the_published_network(published: object, shape: tuple[int, int]) -> None:
+def test_st_lpips_matches_the_published_network(published: object, shape: tuple[int, int]) -> None:
     import torch
 
     assert callable(published)
     pictures = pair(shape)
     tensors = [
-        torch.from_numpy((2 * on_screen(p, 1.0) - 1).astype(np.float32).transpose(2, 0, 1)[None])
+        torch.from_numpy((2 * to_srgb(p, 1.0) - 1).astype(np.float32).transpose(2, 0, 1)[None])
         for p in pictures
     ]
     with torch.no_grad():
@@ -113,7 +113,7 @@ def test_st_lpips_is_the_published_network(published: object, shape: tuple[int, 
 
 
 @needs_weights
-def test_st_lpips_of_equal_and_of_small_pictures() -> None:
+def test_st_lpips_of_equal_and_of_small_images() -> None:
     picture, reference = pair()
     assert st_lpips(reference, reference, 1.0) == 0.0
     assert st_lpips(picture, reference, 1.0) == pytest.approx(

@@ -1,4 +1,4 @@
-"""Paper recipes: layers in their order, materials that are missing, and what is refused."""
+"""Paper recipes: order of layers, missing materials, and invalid input."""
 
 from __future__ import annotations
 
@@ -47,17 +47,17 @@ def planned(path: Path, quick: bool = False, *assignments: str) -> tuple[dict[st
     return {one.name: one for one in found}, missing
 
 
-def test_layers_in_their_order(tmp_path: Path) -> None:
+def test_order_of_layers(tmp_path: Path) -> None:
     path = written(tmp_path)
     full, _ = planned(path)
     quick, _ = planned(path, True)
-    # The quick size goes over the base, a material's own options over both.
+    # The quick size overrides the base; options of a material override both.
     heights = [runs["here"].recipe.generate.geometry.height_scale for runs in (full, quick)]
     assert heights == [0.1, 0.2]
     assert {runs["steep"].recipe.generate.geometry.height_scale for runs in (full, quick)} == {0.5}
     assert quick["here"].recipe.generate.geometry.mesh == 8
     assert quick["here"].recipe.generate.queries.resolution == 4
-    # What holds for every fit lies below its own options.
+    # A fit's own options override those of every fit.
     fits = quick["here"].recipe.fit
     assert {name: f.model for name, f in fits.items()} == {
         "neumip-baseline": "neumip-baseline",
@@ -68,7 +68,7 @@ def test_layers_in_their_order(tmp_path: Path) -> None:
     assert fits["wide"].network.width == 40
 
 
-def test_variants_make_a_run_each(tmp_path: Path) -> None:
+def test_every_variant_is_one_run(tmp_path: Path) -> None:
     text = TEXT + "variants:\n  few: {generate: {queries: {train: 2/texel}}}\n  many: {}\n"
     runs, _ = planned(written(tmp_path, text), True)
     assert list(runs) == ["here-few", "here-many", "steep-few", "steep-many"]
@@ -76,18 +76,18 @@ def test_variants_make_a_run_each(tmp_path: Path) -> None:
     assert counts == ["2/texel", "4/texel"]
 
 
-def test_missing_materials_are_skipped_by_name(tmp_path: Path) -> None:
+def test_missing_materials_are_skipped_and_listed(tmp_path: Path) -> None:
     path = written(tmp_path)
     runs, missing = planned(path)
     assert list(runs) == ["here", "steep"]
     assert missing == {"elsewhere": str(tmp_path / "maps" / "nowhere.npy")}
     (tmp_path / "maps" / "height.npy").unlink()
-    with pytest.raises(InputError, match="none of its materials is there"):
+    with pytest.raises(InputError, match="all of its materials are missing"):
         planned(path)
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "key"),
     [
         (("train: 4/texel", "tarin: 4/texel"), "queries.tarin"),
         (("base:", "bass:"), "bass"),
@@ -96,14 +96,14 @@ def test_missing_materials_are_skipped_by_name(tmp_path: Path) -> None:
         (("steep: {generate: {material: maps/height.npy, ", "steep: {generate: {"), "steep"),
     ],
 )
-def test_mistakes_are_named(tmp_path: Path, change: tuple[str, str], said: str) -> None:
+def test_errors_name_the_key(tmp_path: Path, change: tuple[str, str], key: str) -> None:
     path = written(tmp_path, TEXT.replace(*change))
     with pytest.raises(InputError) as raised:
         planned(path, True)
-    assert said in str(raised.value)
+    assert key in str(raised.value)
 
 
-def test_ordinary_and_paper_recipes_are_told_apart(
+def test_ordinary_and_paper_recipes_are_distinguished(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from mbtf_pipeline.cli.app import app
@@ -120,7 +120,7 @@ def test_ordinary_and_paper_recipes_are_told_apart(
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=[p.stem for p in SHIPPED])
-def test_shipped_recipes_are_sound_and_quick_is_smaller(path: Path) -> None:
+def test_shipped_recipes_are_valid_and_quick_is_smaller(path: Path) -> None:
     full, missing = planned(path)
     quick, _ = planned(path, True)
     assert list(full) == list(quick)

@@ -1,4 +1,4 @@
-"""Tables of paper recipes: what is measured, what is published, and what cannot be told apart."""
+"""Tables of paper recipes: measured and published numbers, and marks for insignificant ones."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ import pytest
 from PIL import Image
 
 from mbtf_core.stats import Estimate
-from mbtf_pipeline.compare.perceptual_metrics import MEASURES
+from mbtf_pipeline.compare.perceptual_metrics import PERCEPTUAL_METRICS
 from mbtf_pipeline.paper_tables import published
 from mbtf_pipeline.paper_tables.ablations import ablations
-from mbtf_pipeline.paper_tables.cells import Column, Decibel, Seen, Table, mean_of, ratio_of
+from mbtf_pipeline.paper_tables.cells import Column, PerceptualCell, Psnr, Table, mean_of, ratio_of
 from mbtf_pipeline.paper_tables.independence import independence
 from mbtf_pipeline.paper_tables.levels import levels
 from mbtf_pipeline.paper_tables.methods import methods
-from mbtf_pipeline.paper_tables.runs import Run
+from mbtf_pipeline.paper_tables.runs import FinishedRun
 from mbtf_pipeline.paper_tables.sizes import timing, weights
 from mbtf_pipeline.paper_tables.zooms import zooms
 
@@ -35,7 +35,7 @@ def errors(mse: float, error: float = 1e-6) -> dict[str, Any]:
 
 
 def record(folder: Path, tiles_across: float = 1.0) -> dict[str, Any]:
-    """A comparison of two fits with one picture, whose files are there."""
+    """A comparison of two fits with one image, including its files."""
     for name in ("reference", *MSE):
         (folder / "compare").mkdir(parents=True, exist_ok=True)
         Image.new("RGB", (4, 4), (90, 80, 70)).save(folder / "compare" / f"{name}.png")
@@ -68,7 +68,7 @@ def record(folder: Path, tiles_across: float = 1.0) -> dict[str, Any]:
         }
         for fit, mse in MSE.items()
     }
-    test["neumip"]["mse_less_first"] = number(-2e-4, 3e-4)
+    test["neumip"]["mse_minus_first"] = number(-2e-4, 3e-4)
     return {
         "fits": list(MSE),
         "kinds": ["query"],
@@ -80,13 +80,13 @@ def record(folder: Path, tiles_across: float = 1.0) -> dict[str, Any]:
     }
 
 
-def make(folder: Path, material: str = "turtle_shell", variant: str = "", **more: Any) -> Run:
+def make(folder: Path, material: str = "turtle_shell", variant: str = "", **more: Any) -> FinishedRun:
     manifest = {
         "splits": {"train": {"queries": 1600}},
         "levels": {"finest": 1},
         "tile": {"aspect": 1.0},
     }
-    return Run(material, variant, folder, record(folder) | more, manifest)
+    return FinishedRun(material, variant, folder, record(folder) | more, manifest)
 
 
 def rows_of(table: Table) -> list[dict[str, str]]:
@@ -99,27 +99,27 @@ def csv_of(table: Table) -> list[dict[str, str]]:
     return list(csv.DictReader(io.StringIO(table.csv())))
 
 
-def test_methods_say_what_is_told_apart_and_what_is_not_there(tmp_path: Path) -> None:
+def test_methods_mark_insignificant_and_missing_numbers(tmp_path: Path) -> None:
     table, ratios = methods([make(tmp_path)])
     first, second, *absent = rows_of(table)
     assert first["MSE [10⁻³/sr²]"] == "0.4000 ± 0.0010"
-    assert second["MSE less the first method’s [10⁻³/sr²]"] == "below two error bars (−0.2 ± 0.3)"
-    assert second["HDR-FLIP"] == "0.300, not above noise alone"
+    assert second["MSE − MSE of the first method [10⁻³/sr²]"] == "not significant (−0.2 ± 0.3)"
+    assert second["HDR-FLIP"] == "0.300, within noise"
     assert second["LDR-FLIP"] == "0.200"
     assert second["ST-LPIPS"] == "–"
-    assert [row["unexplained variance [%]"] for row in absent] == ["not built yet"] * 2
+    assert [row["unexplained variance [%]"] for row in absent] == ["not implemented"] * 2
     assert [row["method"] for row in absent] == ["Rainer et al. 2019", "Rainer et al. 2020"]
-    # PSNR of the mean MSE over the pictures, with white as peak.
+    # PSNR of the mean MSE over the images, with white as peak.
     assert float(csv_of(table)[0]["psnr"]) == pytest.approx(10 * math.log10(0.04 / 4e-4), rel=1e-4)
-    assert csv_of(table)[1]["mse_less_first_se"] == "0.0003"
+    assert csv_of(table)[1]["mse_minus_first_se"] == "0.0003"
     measured, *unbuilt = rows_of(ratios)
     assert measured["MSE ratio, measured here"] == "0.500 ± 0.003"
     assert float(csv_of(ratios)[0]["published"]) == pytest.approx(1.31 / 3.35, rel=1e-4)
     assert measured["source"] == "Kuznetsov et al. 2021"
-    assert [row["MSE ratio, measured here"] for row in unbuilt] == ["not built yet"] * 2
+    assert [row["MSE ratio, measured here"] for row in unbuilt] == ["not implemented"] * 2
 
 
-def test_published_numbers_are_the_papers() -> None:
+def test_published_numbers_match_the_papers() -> None:
     found = published.mse_ratio("insulation_foam", "rainer2020", "neumip")
     assert found is not None
     assert found.ratio == pytest.approx(21.75 / 3.90)
@@ -133,13 +133,15 @@ def test_published_numbers_are_the_papers() -> None:
     assert [round(3.98 * p.ratio, 2) for p in zooms] == [3.98, 2.1, 1.47, 1.07, 0.74, 1.16, 1.17, 1.08]
 
 
-def test_levels_count_from_the_coarsest_and_zooms_from_the_finest(tmp_path: Path) -> None:
+def test_levels_start_at_the_coarsest_and_zooms_at_the_finest(tmp_path: Path) -> None:
     table, relative = levels([make(tmp_path, "twisted_wool")])
     assert csv_of(table)[0]["mse_level_0"] == "0.0001"
     assert csv_of(table)[0]["mse_level_1"] == "0.0004"
     assert "<svg" in table.plots[0]["svg"]
     rows = csv_of(relative)
-    assert [r["whose"] for r in rows] == ["measured here"] * 2 + ["published, Kuznetsov et al. 2021, Table 3"]
+    assert [r["source"] for r in rows] == ["measured here"] * 2 + [
+        "published, Kuznetsov et al. 2021, Table 3"
+    ]
     assert float(rows[0]["ratio_zoom_1"]) == pytest.approx(0.25)
     assert float(rows[2]["ratio_zoom_1"]) == pytest.approx(2.10 / 3.98, rel=1e-4)
 
@@ -148,13 +150,10 @@ def test_ablations_compare_with_the_first_row(tmp_path: Path) -> None:
     runs = [make(tmp_path, variant="architecture"), make(tmp_path, variant="queries-100")]
     rows = csv_of(ablations(runs)[0])
     assert [r["variant"] for r in rows] == ["neumip-baseline", "neumip"] * 2
-    assert rows[0]["turtle_shell_less_first"] == ""
-    # On the same data query by query, on other data from the two errors.
-    less = "turtle_shell_less_first"
-    assert (rows[1][less], rows[1][f"{less}_se"]) == (
-        "-0.0002",
-        "0.0003",
-    )
+    assert rows[0]["turtle_shell_minus_first"] == ""
+    # Paired on the same data, otherwise from two independent errors.
+    less = "turtle_shell_minus_first"
+    assert (rows[1][less], rows[1][f"{less}_se"]) == ("-0.0002", "0.0003")
     assert float(rows[3][less]) == pytest.approx(-2e-4)
     assert float(rows[3][f"{less}_se"]) == pytest.approx(math.hypot(1e-6, 1e-6), rel=1e-3)
     assert rows[0]["queries_per_texel"] == "400"
@@ -174,15 +173,15 @@ def test_sizes_and_times(tmp_path: Path) -> None:
     row, *unbuilt = rows_of(timing([run])[0])
     assert row["offset texture"] == "–"
     assert (row["pyramid"], row["1 light"], row["16 lights"]) == ("4.0", "7.0", "37.0")
-    assert [r["device"] for r in unbuilt] == ["not built yet"] * 2
+    assert [r["device"] for r in unbuilt] == ["not implemented"] * 2
     counted = rows_of(weights([run])[0])
-    assert counted[1]["networks together"] == "3,254"
+    assert counted[1]["all networks"] == "3,254"
     assert counted[1]["published"].startswith("3332; 3254")
-    assert counted[2]["decoder"] == "not built yet"
+    assert counted[2]["decoder"] == "not implemented"
     assert "35,725" in counted[2]["published"]
 
 
-def test_zooms_hold_one_row_per_span_and_fit(tmp_path: Path) -> None:
+def test_zooms_have_one_row_per_span_and_fit(tmp_path: Path) -> None:
     run = make(tmp_path)
     far = record(tmp_path, 8.0)["pictures"]
     run.comparison["pictures"] = run.pictures + far
@@ -190,15 +189,17 @@ def test_zooms_hold_one_row_per_span_and_fit(tmp_path: Path) -> None:
     assert [(r["tiles_across"], r["method"]) for r in csv_of(table)] == [
         (s, f) for s in ("1", "8") for f in MSE
     ]
-    assert [len(row) for _, row in table.figures] == [2, 2, 2]
+    assert [len(row) for _, row in table.images] == [2, 2, 2]
 
 
-def test_pictures_by_stock_parts_agree_or_differ(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_images_of_unmodified_mitsuba_agree_or_differ(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from mbtf_pipeline.paper_tables import independence as module
 
     monkeypatch.setattr(module, "difference", lambda *_: "data:,")
     direction = {"elevation": 85, "azimuth": 0}
-    files = {"ours": "reference", "stock": "neumip"}
+    files = {"mbtf": "reference", "mitsuba": "neumip"}
     surfaces = [
         {
             "surface": s,
@@ -208,39 +209,39 @@ def test_pictures_by_stock_parts_agree_or_differ(tmp_path: Path, monkeypatch: py
         }
         for s, square in (("base color", 1e-5), ("full", 4e-2))
     ]
-    stock = {"view": direction, "light": direction, "surfaces": surfaces}
-    table = independence([make(tmp_path, stock=stock)])[0]
+    check = {"view": direction, "light": direction, "surfaces": surfaces}
+    table = independence([make(tmp_path, unmodified_mitsuba=check)])[0]
     same, other = rows_of(table)
     rms = "RMS difference, noise-free [% of the mean]"
     assert (same["verdict"], same[rms]) == ("agree", "below 1.6 %")
-    assert (other["verdict"], other[rms]) == ("DIFFER", "20.00 ± 0.03 %")
-    # What would be seen is where the verdict changes.
+    assert (other["verdict"], other[rms]) == ("differ", "20.00 ± 0.03 %")
+    # The verdict changes at the detection limit.
     surfaces[0]["square"] = number(0.0, 1e-3)
-    seen = float(csv_of(independence([make(tmp_path, stock=stock)])[0])[0]["rms_seen"])
-    for factor, verdict in ((0.99, "agree"), (1.01, "DIFFER")):
+    seen = float(csv_of(independence([make(tmp_path, unmodified_mitsuba=check)])[0])[0]["rms_detectable"])
+    for factor, verdict in ((0.99, "agree"), (1.01, "differ")):
         surfaces[0]["square"] = number((factor * seen) ** 2, 1e-3)
-        assert rows_of(independence([make(tmp_path, stock=stock)])[0])[0]["verdict"] == verdict
-    # A single square of pixels has no error bar, and shows nothing.
+        assert rows_of(independence([make(tmp_path, unmodified_mitsuba=check)])[0])[0]["verdict"] == verdict
+    # A single block of pixels has no error bar and is inconclusive.
     surfaces[0] |= {key: {"value": 0.4, "error": None, "n": 1} for key in ("mean", "square")}
-    row = rows_of(independence([make(tmp_path, stock=stock)])[0])[0]
-    assert (row["verdict"], row[rms]) == ("too small to tell", "–")
+    row = rows_of(independence([make(tmp_path, unmodified_mitsuba=check)])[0])[0]
+    assert (row["verdict"], row[rms]) == ("inconclusive", "–")
 
 
-def test_cells_print_for_readers_and_store_for_programs() -> None:
-    columns = [Column("a", "a", 100.0, second="se"), Column("b", "b"), Column("c", "c", second="noise")]
-    seen = Seen(MEASURES[2], 0.97, 0.9)
+def test_cells_are_printed_and_exported() -> None:
+    columns = [Column("a", "a", factor=100.0), Column("b", "b"), Column("c", "c")]
+    seen = PerceptualCell(PERCEPTUAL_METRICS[2], 0.97, 0.9)
     table = Table("t", "", "", columns, [[Estimate(0.5, 0.01, 9), None, seen], ["x", 1200, None]])
     assert table.for_page()["rows"] == [
-        ["50.0 ± 1.0", "–", "0.970, not above noise alone"],
+        ["50.0 ± 1.0", "–", "0.970, within noise"],
         ["x", "1,200", "–"],
     ]
     assert table.csv().splitlines() == ["a,a_se,b,c,c_noise", "0.5,0.01,,0.97,0.9", "x,,1200,,"]
 
 
-def test_means_and_ratios_carry_their_errors() -> None:
+def test_means_and_ratios_have_error_bars() -> None:
     mean = mean_of([Estimate(1.0, 0.3, 10), Estimate(3.0, 0.4, 10)])
     assert (mean.value, mean.error) == (2.0, pytest.approx(0.25))
     ratio = ratio_of(Estimate(2.0, 0.2, 10), Estimate(4.0, 0.4, 10))
     assert (ratio.value, ratio.error) == (0.5, pytest.approx(0.5 * math.hypot(0.1, 0.1)))
     assert math.isnan(ratio_of(Estimate(2.0, 0.2, 10), Estimate(0.4, 0.4, 10)).value)
-    assert math.isinf(Decibel.of(Estimate(-1.0, 0.1, 9), 1.0).psnr.value)
+    assert math.isinf(Psnr(Estimate(-1.0, 0.1, 9), 1.0).value.value)

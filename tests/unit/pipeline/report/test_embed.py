@@ -1,4 +1,4 @@
-"""Embedded pictures: one exposure for the fixed ones, and a budget that holds."""
+"""Images of the report: encodings within a size limit, and previews that match their sources."""
 
 from __future__ import annotations
 
@@ -23,49 +23,43 @@ def decoded(uri: str) -> np.ndarray:
 @pytest.fixture
 def gallery() -> Gallery:
     noise = np.random.default_rng(1).random((96, 128, 3)).astype(np.float32)
-    field = np.tile(np.linspace(0, 1, 128), (96, 1))
-    return Gallery(
-        0.5,
-        {"a": lambda: noise, "b": lambda: 3 * noise[::-1]},
-        {"map": ("size", lambda: field), "offset": ("signed", lambda: 2 * field - 1)},
-    )
+    values = np.tile(np.linspace(0, 1, 128), (96, 1))
+    linear = {"a": lambda: noise, "b": lambda: 3 * noise[::-1]}
+    return Gallery(0.5, linear, {"map": ("local", values), "offset": ("signed", 2 * values - 1)})
 
 
-def test_the_best_encoding_that_fits(gallery: Gallery) -> None:
-    best = embed(gallery, 1e9)
-    assert best.encoding is ENCODINGS[0]
+def test_the_best_encoding_within_the_limit_is_used(gallery: Gallery) -> None:
+    assert embed(gallery, 1e9).encoding is ENCODINGS[0]
     sizes = [encode(gallery, e).size for e in ENCODINGS]
     assert sizes == sorted(sizes, reverse=True)
     for size, encoding in zip(sizes, ENCODINGS, strict=True):
-        found = embed(gallery, size)
-        assert found.encoding is encoding
-        assert found.size <= size
+        assert embed(gallery, size).encoding is encoding
     assert embed(gallery, 1.0).encoding is ENCODINGS[-1]
 
 
-def test_what_was_given_up_is_said(gallery: Gallery) -> None:
+def test_reductions_are_reported(gallery: Gallery) -> None:
     best, small = embed(gallery, 1e9), embed(gallery, 3e4)
     assert "averaged" not in best.encoding.describe(best.coding)
-    assert small.encoding.shrink > 1
     s = small.encoding.shrink
-    assert f"to keep the file small: {s} × {s} pixels averaged" in small.encoding.describe(small.coding)
+    assert s > 1
+    expected = f"reduced to limit the file size: {s} × {s} pixels averaged"
+    assert expected in small.encoding.describe(small.coding)
     assert small.packed["a"]["columns"] == 128 // s
 
 
-def test_fixed_pictures_are_what_they_say(gallery: Gallery) -> None:
+def test_previews_match_their_sources(gallery: Gallery) -> None:
     found = embed(gallery, 1e9)
     shown = decoded(found.images["b"]).astype(int)
     assert np.abs(shown - to_display(gallery.linear["b"](), 1 / 0.5)).mean() < 7
     colors = decoded(found.images["map"])
-    assert colors[0, 0].tolist() == list(palette("size")[0])
-    assert colors[0, -1].tolist() == list(palette("size")[-1])
+    assert colors[0, 0].tolist() == list(palette("local")[0])
+    assert colors[0, -1].tolist() == list(palette("local")[-1])
     assert decoded(found.images["offset"])[0, 64].max() < 40
 
 
-def test_averaging_keeps_the_mean() -> None:
+def test_averaging_preserves_the_mean() -> None:
     x = np.arange(6 * 9, dtype=float).reshape(6, 9)
     assert shrink(x, 3).shape == (2, 3)
     assert shrink(x, 3).mean() == pytest.approx(x.mean())
     assert shrink(x, 4).tolist() == [[x[:4, :4].mean(), x[:4, 4:8].mean()]]
     assert shrink(np.ones((5, 3, 3)), 16).shape == (1, 1, 3)
-    assert shrink(x, 1) is x

@@ -1,4 +1,4 @@
-"""Error maps: free of the reference's noise, on colors that can be told apart, with numbers at the scale."""
+"""Error maps are noise-free, color maps encode magnitude by lightness, and scales are round."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def luma(colors: np.ndarray) -> np.ndarray:
     return np.asarray(colors, float) @ [0.2126, 0.7152, 0.0722]
 
 
-def test_local_error_is_the_error_without_the_noise() -> None:
+def test_local_error_is_not_biased_by_noise() -> None:
     random = np.random.default_rng(1)
     truth = np.full((96, 96, 3), 0.5)
     a, b = (truth + 0.2 * random.standard_normal(truth.shape) for _ in range(2))
@@ -28,20 +28,20 @@ def test_local_error_is_the_error_without_the_noise() -> None:
     picture[:, 48:] += 0.3
     found = local_error(picture, a, b)
     assert found[:, 56:].mean() == pytest.approx(0.3, rel=0.05)
-    # Where the fit is right most of the map lies far below the noise, and half of it is shown as 0.
+    # Without an error, the map lies far below the noise, and half of it is 0.
     assert np.median(found[:, :40]) < 0.05
     assert 0.3 < np.mean(found[:, :40] == 0) < 0.7
     assert (found >= 0).all()
 
 
-@pytest.mark.parametrize("name", ["size", "flip"])
-def test_sizes_are_told_by_lightness_alone(name: str) -> None:
-    steps = np.diff(luma(palette(name)))  # type: ignore[arg-type]
-    assert steps.min() > -0.6
-    assert luma(palette(name))[-1] - luma(palette(name))[0] > 150  # type: ignore[arg-type]
+@pytest.mark.parametrize("name", ["local", "flip"])
+def test_lightness_encodes_magnitude(name: str) -> None:
+    lightness = luma(palette(name))  # type: ignore[arg-type]
+    assert np.diff(lightness).min() > -0.6
+    assert lightness[-1] - lightness[0] > 150
 
 
-def test_sign_and_size_of_a_difference_can_be_told() -> None:
+def test_signed_colors_encode_sign_and_magnitude() -> None:
     table = np.array(palette("signed"))
     colors = table[indices([-1.0, -0.5, 0.0, 0.5, 1.0, 7.0, np.nan], "signed")].astype(int)
     shades = luma(colors)
@@ -52,29 +52,21 @@ def test_sign_and_size_of_a_difference_can_be_told() -> None:
     assert colors[4, 0] > colors[4, 2]
     assert (colors[5] == colors[4]).all()
     assert (colors[6] == colors[2]).all()
+    assert indices([-1.0, 0.0, 0.5, 1.0, 9.0], "local").tolist() == [0, 0, 128, 255, 255]
 
 
-def test_entries_follow_sizes() -> None:
-    assert indices([-1.0, 0.0, 0.5, 1.0, 9.0], "size").tolist() == [0, 0, 128, 255, 255]
-
-
-@pytest.mark.parametrize(
-    ("x", "expected"), [(0.011, 0.02), (0.02, 0.02), (0.3, 0.5), (7.0, 10.0), (0.0, 1.0), (np.nan, 1.0)]
-)
-def test_scales_are_round(x: float, expected: float) -> None:
-    assert round_scale(x) == pytest.approx(expected)
-
-
-def test_one_scale_for_all_maps() -> None:
+def test_scales_are_round() -> None:
+    cases = {0.011: 0.02, 0.02: 0.02, 0.3: 0.5, 7.0: 10.0, 0.0: 1.0, np.nan: 1.0}
+    assert [round_scale(x) for x in cases] == pytest.approx(list(cases.values()))
     zero = np.zeros((10, 10))
     assert common_scale([zero - 0.03, zero]) == pytest.approx(0.05)
     assert common_scale([]) == 1.0
 
 
-def test_the_bar_has_the_map_s_colors_and_numbers() -> None:
+def test_color_bars_match_the_map() -> None:
     assert ticks(0, 0.2, 100) == ["0", "5", "10", "15", "20"]
     assert ticks(-0.5, 0.5) == ["−0.5", "−0.25", "0", "0.25", "0.5"]
-    first, last = palette("size")[0], palette("size")[-1]
-    text = gradient("size")
+    first, last = palette("local")[0], palette("local")[-1]
+    text = gradient("local")
     assert text.startswith("linear-gradient(90deg, rgb({} {} {}),".format(*first))
     assert text.endswith("rgb({} {} {}))".format(*last))

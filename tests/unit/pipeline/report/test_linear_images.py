@@ -1,4 +1,4 @@
-"""Linear pictures on the page: one relative error for every value, and packing that loses nothing."""
+"""Linear images of the page: constant relative error, and lossless compression."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mbtf_pipeline.report.linear_images import EXPOSURE_STOPS, STOPS_BELOW, Codi
 
 
 def unpacked(data: bytes, rows: int, columns: int) -> np.ndarray:
-    """Codes (rows, columns, 3), one pixel after the other."""
+    """Codes (rows, columns, 3), decoded pixel by pixel."""
     planes = np.frombuffer(zlib.decompress(data), np.uint8).reshape(3, 2, rows, columns).astype(int)
     folded = planes[:, 0] + 256 * planes[:, 1]
     rest = np.where(folded % 2, -(folded + 1) // 2, folded // 2)
@@ -26,20 +26,20 @@ def unpacked(data: bytes, rows: int, columns: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("bits", [8, 10])
-def test_packing_loses_nothing(bits: int) -> None:
+def test_compression_is_lossless(bits: int) -> None:
     codes = np.random.default_rng(bits).integers(0, 1 << bits, (7, 5, 3)).astype(np.int32)
     codes[0, 0], codes[3, 2] = 0, (1 << bits) - 1
     assert (unpacked(pack(codes), 7, 5) == codes).all()
 
 
-def test_smooth_pictures_pack_smaller_than_noise() -> None:
+def test_smooth_images_compress_better_than_noise() -> None:
     ramp = np.linspace(100, 900, 64, dtype=np.int32)[None, :, None] * np.ones((64, 1, 3), np.int32)
     noise = np.random.default_rng(0).integers(0, 1024, ramp.shape).astype(np.int32)
     assert len(pack(ramp)) < len(pack(noise)) / 10
 
 
 @pytest.mark.parametrize("bits", [8, 9, 10])
-def test_every_value_carries_the_same_relative_error(bits: int) -> None:
+def test_the_relative_error_is_constant(bits: int) -> None:
     picture = np.geomspace(1e-4, 30.0, 3000).astype(np.float32).reshape(50, 20, 3)
     coding = Coding.spanning([picture], 0.5, bits)
     found = coding.decode(coding.encode(picture))
@@ -49,7 +49,7 @@ def test_every_value_carries_the_same_relative_error(bits: int) -> None:
     assert coding.encode(picture).max() == coding.largest
 
 
-def test_black_stays_black_and_faults_do_no_harm() -> None:
+def test_black_stays_black_and_invalid_values_are_clipped() -> None:
     picture = np.array([[[0.0, -1.0, np.nan], [np.inf, 1e30, 1.0]]], np.float32)
     coding = Coding.spanning([np.ones((1, 1, 3), np.float32)], 1.0, 10)
     codes = coding.encode(picture)
@@ -57,9 +57,9 @@ def test_black_stays_black_and_faults_do_no_harm() -> None:
     assert coding.decode(codes)[0, 0].tolist() == [0, 0, 0]
 
 
-def test_what_is_cut_off_below_is_black_at_every_exposure() -> None:
+def test_values_below_the_scale_are_black_at_every_exposure() -> None:
     dim = np.full((2, 2, 3), 1e-12, np.float32)
     coding = Coding.spanning([dim, np.ones_like(dim)], 1.0, 10)
     assert coding.low == 2.0**-STOPS_BELOW
-    # The largest value that is cut off, at the largest exposure, in steps of an 8-bit sRGB display.
+    # The largest such value at the highest exposure, in steps of an 8-bit sRGB display.
     assert 255 * 12.92 * coding.low * 2.0**EXPOSURE_STOPS < 3.5

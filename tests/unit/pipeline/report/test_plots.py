@@ -1,4 +1,4 @@
-"""Plots are SVG elements that fit into a page: no loads, no fixed ink, ids of their own."""
+"""Plots are self-contained SVG elements in the page's text color, with unique ids and readable labels."""
 
 from __future__ import annotations
 
@@ -7,15 +7,18 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
-from mbtf_pipeline.report.plots import Curve, bars, color, curves, points
+from mbtf_pipeline.report.labels import place_labels
+from mbtf_pipeline.report.plots import Line, bars, curves, points
 
 SECONDS = list(np.linspace(2, 60, 30))
 ERROR = [0.3 + 1 / s for s in SECONDS]
 
 
 def training(label: str = "training") -> str:
-    lines = [Curve("first", SECONDS, ERROR, [0.01] * 30), Curve("second", SECONDS, [2 * e for e in ERROR])]
+    lines = [Line("first", SECONDS, ERROR, [0.01] * 30), Line("second", SECONDS, [2 * e for e in ERROR])]
     return curves(lines, "seconds of training", "unexplained variance", label)
 
 
@@ -45,7 +48,7 @@ def test_axes_and_series_are_named(svg: str, expected: set[str]) -> None:
 
 
 @pytest.mark.parametrize("svg", [training(), levels(), stages()])
-def test_nothing_is_loaded_and_the_ink_is_the_page_s(svg: str) -> None:
+def test_plots_are_self_contained_and_use_the_text_color(svg: str) -> None:
     without_names = re.sub(r'\sxmlns(:xlink)?="[^"]*"', "", svg)
     assert "http" not in without_names
     assert "<metadata" not in svg
@@ -56,7 +59,7 @@ def test_nothing_is_loaded_and_the_ink_is_the_page_s(svg: str) -> None:
     assert set(references) <= set(re.findall(r'\bid="([^"]+)"', svg))
 
 
-def test_ids_of_two_plots_differ_and_a_plot_is_always_the_same() -> None:
+def test_ids_are_unique_and_plots_are_reproducible() -> None:
     first, again, other = training("a plot"), training("a plot"), training("another")
     assert first == again
     ids = [set(re.findall(r'\bid="([^"]+)"', svg)) for svg in (first, other)]
@@ -64,19 +67,32 @@ def test_ids_of_two_plots_differ_and_a_plot_is_always_the_same() -> None:
     assert not ids[0] & ids[1]
 
 
-def test_every_series_has_its_color() -> None:
-    svg = training().lower()
-    assert color(0).lower() in svg
-    assert color(1).lower() in svg
-    assert color(0) != color(1)
+def test_labels_overlap_neither_each_other_nor_points_nor_lines() -> None:
+    figure = Figure(figsize=(7, 4))
+    axes = figure.add_subplot()
+    spots = [(0.5, 0.5), (0.52, 0.5), (0.54, 0.51), (0.95, 0.5)]
+    axes.set(xlim=(0, 1), ylim=(0, 1))
+    line = ((0.4, 0.5), (0.6, 0.5))
+    obstacles = [(*line, 1.5), *((spot, spot, 5.0) for spot in spots)]
+    place_labels(axes, [(*s, "a label of some length", "k") for s in spots], obstacles)
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    boxes = [t.get_window_extent(renderer) for t in axes.texts]
+    assert len(boxes) == len(spots)
+    for number, box in enumerate(boxes):
+        assert not any(box.overlaps(other) for other in boxes[:number])
+        assert not any(box.contains(*axes.transData.transform(s)) for s in spots)
+        # Text may be wider at another resolution.
+        assert box.x1 <= axes.get_window_extent(renderer).x1 - 0.02 * box.width
+        (x0, y), (x1, _) = (axes.transData.transform(end) for end in line)
+        assert not (box.x0 < x1 and box.x1 > x0 and box.y0 < y < box.y1)
 
 
-def test_a_bar_larger_than_its_value_does_not_stretch_the_axis() -> None:
+def test_an_error_bar_larger_than_its_value_does_not_stretch_the_axis() -> None:
     wide = points(["0"], {"a": [(0.2, 0.19999)], "b": [(0.3, 0.01)]}, "x", "y", "wide")
     assert "0.001" not in texts(wide)
 
 
-def test_a_band_that_reaches_zero_is_cut_off_where_the_values_end() -> None:
-    lines = [Curve("a", [10.0, 20.0, 30.0], [0.3, 0.2, -0.01], [0.31, 5.0, 0.1])]
+def test_a_band_that_reaches_zero_is_clipped() -> None:
+    lines = [Line("a", [10.0, 20.0, 30.0], [0.3, 0.2, -0.01], [0.31, 5.0, 0.1])]
     numbers = {float(t) for t in texts(curves(lines, "x", "y", "band")) if re.fullmatch(r"[\d.e-]+", t)}
     assert {n for n in numbers if n < 10} == {0.1, 0.2, 0.5}

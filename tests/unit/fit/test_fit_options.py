@@ -1,0 +1,44 @@
+"""The configuration that the options of ``mbtf-fit`` give."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mbtf_core.errors import UsageError
+from mbtf_fit.cli.app import app
+from mbtf_fit.cli.fit import resolve_config
+from mbtf_fit.config import FitConfig
+
+
+def config_of(*words: str) -> FitConfig:
+    command: Any
+    command, bound, _ = app.parse_args(["shards", *words], exit_on_error=False, print_error=False)
+    arguments = dict(bound.arguments)
+    return resolve_config(command.read_options(arguments), arguments.get("quality"))
+
+
+def test_flags_override_assignments_presets_and_files(tmp_path: Path) -> None:
+    file = tmp_path / "c.yaml"
+    file.write_text("model: neumip-baseline\ntraining: {steps: 9, batch: 300, warmup: 7}\n")
+    words = ("--config", str(file), "--set", "training.batch=400", "--set", "training.steps=8")
+    found = config_of(*words, "--steps", "2")
+    assert found.model == "neumip-baseline"
+    assert (found.training.steps, found.training.batch, found.training.warmup) == (2, 400, 7)
+    found = config_of(*words, "--time", "1min")
+    assert (found.training.steps, found.training.time) == (None, 60.0)
+    found = config_of("--quality", "paper", "--batch", "500")
+    assert (found.training.steps, found.training.batch, found.network.width) == (30_000, 500, 64)
+
+
+def test_presets_keep_what_flags_set() -> None:
+    assert config_of("--quality", "draft", "--model", "hierarchical").network.width == 25
+    assert config_of("--quality", "draft", "--init-from", "material/").network.width == 25
+    assert config_of("--quality", "draft").network.width == 40
+
+
+def test_time_and_steps_exclude_each_other() -> None:
+    with pytest.raises(UsageError, match="exclude each other"):
+        config_of("--time", "1s", "--steps", "3")
