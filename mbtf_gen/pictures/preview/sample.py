@@ -1,4 +1,4 @@
-"""The queries that a preview shows: those that a configuration draws, or those that shards hold."""
+"""The queries that a preview plots: those that a configuration samples, or those stored in shards."""
 
 from __future__ import annotations
 
@@ -19,21 +19,22 @@ from mbtf_gen.dataset.verify import is_finished
 from mbtf_gen.job import Job, split_queries
 from mbtf_gen.sampling.query_sampler import Mixture, Queries
 
-# Shards are taken until there are so many queries.
-ENOUGH = 1 << 20
+# Shards are read until there are this many queries.
+MAX_QUERIES = 1 << 20
 
 
 @dataclass(frozen=True)
 class QuerySample:
-    """Queries of one split, and what they are to follow.
+    """Queries of one split, and the distributions that they should follow.
 
     Attributes
     ----------
     u : (n, 2) uv
-    level : (m,) fractional levels; omega_i, omega_o : (m, 3). One per query, or one per buffer in the image
-        layout, whose queries share them.
-    split : of the data set; shards : taken; total : queries of the whole split
-    mixture, finest : of the levels; min_cos : of both directions; aspect : H/W of the tile
+    level : (m,) fractional levels; omega_i, omega_o : (m, 3) directions. One per query, or in the image
+        layout one per image, whose queries share them
+    split : split of the data set; shards : number of shards read; total : queries of the whole split
+    mixture, finest : distribution of the levels, and the finest level
+    min_cos : smallest cosine of both directions; aspect : H/W of the tile
     """
 
     u: NDArray[np.float32]
@@ -49,10 +50,10 @@ class QuerySample:
     aspect: float
 
 
-def drawn(job: Job, split: Split = "train") -> QuerySample:
-    """The first shards that a configuration draws."""
+def sampled_queries(job: Job, split: Split = "train") -> QuerySample:
+    """Queries of the first shards that a configuration samples."""
     plan, entries = job.query_plan, [entry for entry in job.shards if entry.split == split]
-    parts = list(_enough(plan.draw(split, entry.index, entry.rows) for entry in entries))
+    parts = list(_up_to_limit(plan.draw(split, entry.index, entry.rows) for entry in entries))
     return QuerySample(
         *_columns(parts),
         split,
@@ -75,8 +76,8 @@ def finished_shards(dataset: Dataset, split: Split) -> list[Path]:
     ]
 
 
-def stored(dataset: Dataset, split: Split = "train") -> QuerySample:
-    """The first finished shards of a data set, against the distributions that its manifest states.
+def stored_queries(dataset: Dataset, split: Split = "train") -> QuerySample:
+    """Queries of the first finished shards of a data set, with the distributions stated in its manifest.
 
     Raises
     ------
@@ -84,7 +85,7 @@ def stored(dataset: Dataset, split: Split = "train") -> QuerySample:
     """
     manifest = dataset.manifest
     names = ("u", "sigma", "omega_i", "omega_o")
-    parts = list(_enough(Queries(**read_shard(path, names)) for path in finished_shards(dataset, split)))
+    parts = list(_up_to_limit(Queries(**read_shard(path, names)) for path in finished_shards(dataset, split)))
     if not parts:
         raise InputError(
             f"holds no finished {split} shard yet",
@@ -103,12 +104,12 @@ def stored(dataset: Dataset, split: Split = "train") -> QuerySample:
     )
 
 
-def _enough(batches: Iterable[Queries]) -> Iterator[Queries]:
+def _up_to_limit(batches: Iterable[Queries]) -> Iterator[Queries]:
     count = 0
     for batch in batches:
         yield batch
         count += batch.sigma.size
-        if count >= ENOUGH:
+        if count >= MAX_QUERIES:
             return
 
 
@@ -116,7 +117,7 @@ def _columns(
     parts: list[Queries],
 ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float32], NDArray[np.float32]]:
     first = parts[0]
-    # The image layout repeats footprint and directions over a buffer: its first query stands for it.
+    # In the image layout all queries of an image share footprint and directions: its first one is used.
     one: Any = (slice(None), *(0,) * (len(first.lead) - 1))
     return (
         np.concatenate([p.u.reshape(-1, 2) for p in parts]),
