@@ -1,9 +1,9 @@
 """Perspective pictures of the infinitely repeated tile: pixels as queries, and exactly filtered pixels.
 
-The pixel filter is a Gaussian with a standard deviation of half a pixel. A picture of kind ``query`` evaluates
-M at each pixel's position, view direction and isotropic footprint σ, which is the geometric mean of the two
-radii of the projected filter. Kind ``pixel`` is the filtered image itself: every path has its own position and
-view direction. The two agree near normal incidence.
+The pixel filter is a Gaussian with a standard deviation of half a pixel. A picture of kind ``query``
+evaluates M at each pixel's position, view direction and isotropic footprint σ, which is the geometric mean of
+the two radii of the projected filter. Kind ``pixel`` is the filtered image itself: every path has its own
+position and view direction. The two agree near normal incidence.
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ class Camera:
             )
         distance = self.position[2] / cosine
         point = self.position + distance[..., None] * direction
-        # A pixel's solid angle is pitch² · cos³ of the angle to the image axis; the plane's cosine is `cosine`.
+        # A pixel's solid angle is pitch² · cos³ of its angle to the image axis; `cosine` is the plane's.
         area = distance**2 * self.pixel_pitch**2 / length**3 / cosine
         shape = (self.rows, self.columns)
         return Queries(

@@ -12,6 +12,7 @@ from mbtf_core.errors import InputError, PartialError
 if TYPE_CHECKING:
     from mbtf_gen.config.pictures import PreviewConfig
     from mbtf_gen.dataset.reader import Dataset
+    from mbtf_gen.pictures.preview.mesh import TiledMesh
 
 
 class PreviewPictures:
@@ -41,8 +42,8 @@ class PreviewPictures:
         self.config = config
         self.dataset = dataset
         self.console = console
-        wanted = config.preview
-        self.omega_i = from_angles(wanted.light.elevation, wanted.light.azimuth)
+        light = config.preview.light
+        self.omega_i = from_angles(light.elevation, light.azimuth)
         self.job: Job | None = None
         try:
             self.job = Job.prepare(config)
@@ -58,22 +59,22 @@ class PreviewPictures:
             self._prepare_view(self.job)
 
     def _prepare_view(self, job: Any) -> None:
-        from mbtf_gen.pictures.preview.view import block_camera
+        from mbtf_gen.pictures.preview.view import tiles_camera
 
-        wanted = self.config.preview
+        options = self.config.preview
         grid = job.material.grid(self.config.geometry.height_scale, self.config.geometry.mesh)
-        self.camera = block_camera(
-            wanted.view.elevation,
-            wanted.view.azimuth,
-            tiles=wanted.tiles,
+        self.camera = tiles_camera(
+            options.view.elevation,
+            options.view.azimuth,
+            tiles=options.tiles,
             aspect=grid.aspect,
             displacement_range=grid.displacement_range,
-            columns=wanted.size,
+            columns=options.size,
         )
         self.camera.queries(self.omega_i, grid.aspect)  # refuses a view of the horizon
         self.seen = (
-            f"from elevation {wanted.view.elevation:g}, azimuth {wanted.view.azimuth:g}, "
-            f"light from {wanted.light.elevation:g}, {wanted.light.azimuth:g} degrees"
+            f"from elevation {options.view.elevation:g}, azimuth {options.view.azimuth:g}, "
+            f"light from {options.light.elevation:g}, {options.light.azimuth:g} degrees"
         )
 
     def draw(self, path: Path, overwrite: bool, interactive: bool) -> None:
@@ -130,7 +131,7 @@ class PreviewPictures:
             from mbtf_gen.pictures.preview.mesh import show
 
             self.console.note("the mesh is shown in a window: close it to go on")
-            show(self._block(), self.camera, self.omega_i)
+            show(self._tiled_mesh(), self.camera, self.omega_i)
 
     def _stage(self, name: str) -> int:
         """What a picture depends on besides the configuration: how many shards are finished."""
@@ -140,21 +141,21 @@ class PreviewPictures:
 
         return len(finished_shards(self.dataset, "train"))
 
-    def _block(self) -> Any:
-        from mbtf_gen.pictures.preview.mesh import block_of
+    def _tiled_mesh(self) -> TiledMesh:
+        from mbtf_gen.pictures.preview.mesh import tiled_mesh
 
         assert self.job is not None
         geometry = self.config.geometry
-        return block_of(self.job.material, self.config.preview.tiles, geometry.height_scale, geometry.mesh)
+        return tiled_mesh(self.job.material, self.config.preview.tiles, geometry.height_scale, geometry.mesh)
 
     def _mesh(self, file: Path) -> dict[str, Any]:
         from mbtf_gen.pictures.preview.mesh import draw
 
-        block = self._block()
-        fault = draw(block, self.camera, self.omega_i, file)
+        mesh = self._tiled_mesh()
+        fault = draw(mesh, self.camera, self.omega_i, file)
         if fault:
             return {"fault": fault}
-        tiles, (rows, columns) = self.config.preview.tiles, block.cells
+        tiles, (rows, columns) = self.config.preview.tiles, mesh.cells
         return {
             "shows": f"the displaced mesh ({columns} x {rows} cells per tile) of {tiles} x {tiles} tiles "
             f"with its base color, {self.seen}"
@@ -172,22 +173,22 @@ class PreviewPictures:
             estimator, self.camera, self.omega_i, kind="pixel", spp=spp, seed=self.config.seed
         )
         write_png(file, to_display(image.value))
-        return {"shows": f"the endless plane by the same camera, path-traced with {spp} paths per pixel"}
+        return {"shows": f"the infinite plane from the same camera, path-traced with {spp} paths per pixel"}
 
     def _queries(self, file: Path) -> dict[str, Any]:
         from mbtf_gen.pictures.preview.plots import level_histogram, write_plots
-        from mbtf_gen.pictures.preview.sample import drawn, stored
+        from mbtf_gen.pictures.preview.sample import sampled_queries, stored_queries
 
         if self.dataset is not None:
-            sample = stored(self.dataset)
+            sample = stored_queries(self.dataset)
             source = f"stored in {self.dataset.folder}"
         else:
             assert self.job is not None
-            sample = drawn(self.job)
+            sample = sampled_queries(self.job)
             source = f"to be drawn for {self.config.material}"
         shown = f"{len(sample.u)} of {sample.total} training queries {source}"
         if len(sample.level) < len(sample.u):
-            shown += f", in {len(sample.level)} buffers of one footprint, light and view each"
+            shown += f", in {len(sample.level)} images of one footprint, light and view each"
         write_plots(file, sample, shown)
         edges, found, expected = level_histogram(sample)
         return {

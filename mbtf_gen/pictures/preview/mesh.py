@@ -1,4 +1,4 @@
-"""The displaced mesh with its base color, drawn by VTK in a child process: drivers fail by ending it."""
+"""The displaced mesh with its base color, drawn by VTK in a child process, which a driver may abort."""
 
 from __future__ import annotations
 
@@ -22,31 +22,31 @@ from mbtf_gen.material.material import Material
 from mbtf_gen.pictures.camera import Camera
 from mbtf_gen.pictures.reference import auto_exposure, to_display
 
-# Cells along each side of the whole block, and texels across the texture, at most.
+# Largest number of cells along each side of all tiles together, and of texels across the texture.
 MOST_CELLS = 1024
 MOST_TEXELS = 2048
-# Seconds; software rendering of the largest block takes ten.
+# Seconds; software rendering of the largest mesh takes ten.
 _TIMEOUT = 180.0
-# A window stays open as long as its user likes.
+# Seconds until the interactive window closes.
 _DAY = 86400.0
-# The picture is drawn so many times larger and averaged: smooth edges whatever the driver can do.
+# Factor of supersampling, because drivers need not support anti-aliasing.
 _OVERSAMPLING = 2
-# A flat place is shown in its base color; the light is at most so strong, lest low ones paint all white.
+# Ambient light, and the largest intensity of the light, which a flat surface needs to show its base color.
 _AMBIENT, _STRONGEST = 0.3, 3.0
 _BACKGROUND, _WALL = (0.95, 0.95, 0.95), (0.45, 0.45, 0.45)
-# VTK's windows that no screen shows; it falls back to them silently.
+# VTK's off-screen windows, to which it falls back silently.
 _UNSEEN = ("EGL", "OSOpenGL", "OSMesa")
 
 
 @dataclass(frozen=True)
-class Block:
-    """A block of repeated tiles as a mesh.
+class TiledMesh:
+    """A mesh of repeated tiles.
 
     Attributes
     ----------
-    points : (rows, columns, 3) tile widths; uv : (rows, columns, 2), beyond 1 where the tile repeats
-    hole : (rows-1, columns-1) cells that are left out, because less than half of the light is stopped there
-    texture : (h, w, 3) sRGB, row 0 at ``v → 1``, as bright as the path-traced picture is made
+    points : (rows, columns, 3) positions in tile widths; uv : (rows, columns, 2), above 1 where tiles repeat
+    hole : (rows-1, columns-1) cells that are left out, because their mean opacity is below 1/2
+    texture : (h, w, 3) sRGB, row 0 at ``v → 1``, at the exposure of the path-traced picture
     cells : (rows, columns) of one tile's mesh
     """
 
@@ -57,8 +57,10 @@ class Block:
     cells: tuple[int, int]
 
 
-def block_of(material: Material, tiles: int, height: float | None = None, mesh: int | None = None) -> Block:
-    """Block of `tiles` × `tiles` tiles of a material, with the mesh that is traced, or a coarser one.
+def tiled_mesh(
+    material: Material, tiles: int, height: float | None = None, mesh: int | None = None
+) -> TiledMesh:
+    """Mesh of `tiles` × `tiles` tiles of a material: the mesh that is traced, or a coarser one.
 
     Parameters
     ----------
@@ -81,7 +83,7 @@ def block_of(material: Material, tiles: int, height: float | None = None, mesh: 
     color = np.broadcast_to(color, (1, 1, 3)) if color.ndim == 1 else color
     share = min(1.0, MOST_TEXELS / max(color.shape[:2]))
     texels = (max(1, round(share * color.shape[0])), max(1, round(share * color.shape[1])))
-    return Block(
+    return TiledMesh(
         points.astype(np.float32),
         (points[..., :2] / (1.0, grid.aspect)).astype(np.float32),
         hole,
@@ -90,20 +92,20 @@ def block_of(material: Material, tiles: int, height: float | None = None, mesh: 
     )
 
 
-def draw(block: Block, camera: Camera, omega_i: NDArray[np.float64], path: Path) -> str:
-    """Write a PNG of a block as `camera` sees it under light from `omega_i`; returns why it failed, or ""."""
-    return _run("draw_in_child", block, camera, omega_i, path, timeout=_TIMEOUT)
+def draw(tiles: TiledMesh, camera: Camera, omega_i: NDArray[np.float64], path: Path) -> str:
+    """Write a PNG of the mesh under light from `omega_i`; returns the reason of a failure, or ""."""
+    return _run("draw_in_child", tiles, camera, omega_i, path, timeout=_TIMEOUT)
 
 
-def show(block: Block, camera: Camera, omega_i: NDArray[np.float64]) -> None:
-    """Show a block in a window until its user closes it.
+def show(tiles: TiledMesh, camera: Camera, omega_i: NDArray[np.float64]) -> None:
+    """Show the mesh in a window until the user closes it.
 
     Raises
     ------
     EngineError : there is no display, or VTK cannot draw on it
     """
     check_display()
-    fault = _run("show_in_child", block, camera, omega_i, None, timeout=_DAY)
+    fault = _run("show_in_child", tiles, camera, omega_i, None, timeout=_DAY)
     if fault:
         raise EngineError(
             f"the window could not be shown ({fault})",
@@ -126,7 +128,7 @@ def check_display() -> None:
 
 def _run(
     function: str,
-    block: Block,
+    tiles: TiledMesh,
     camera: Camera,
     omega_i: NDArray[np.float64],
     path: Path | None,
@@ -146,13 +148,13 @@ def _run(
     }
     with tempfile.TemporaryDirectory(prefix="mbtf-preview-") as folder:
         scene = Path(folder, "scene.npz")
-        np.savez(scene, points=block.points, uv=block.uv, hole=block.hole, texture=block.texture)
+        np.savez(scene, points=tiles.points, uv=tiles.uv, hole=tiles.hole, texture=tiles.texture)
         arguments = [str(scene), json.dumps(view), *([str(path)] if path is not None else [])]
         return run_child(__name__, function, *arguments, timeout=timeout).fault
 
 
 def _plotter(scene: str, view: dict[str, Any], **options: Any) -> Any:
-    """A plotter with the block, its walls, the light and the camera."""
+    """A plotter with the mesh, its walls, the light and the camera."""
     import pyvista
 
     with np.load(scene) as stored:
@@ -189,12 +191,12 @@ def _plotter(scene: str, view: dict[str, Any], **options: Any) -> Any:
 
 
 def _polygons(faces: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
-    """Triangles (n, 3) as VTK takes them: each with its number of corners in front."""
+    """Triangles (n, 3) in VTK's format, each preceded by its number of corners."""
     return np.column_stack([np.full(len(faces), 3), faces]).astype(np.int64)
 
 
 def _walls(points: NDArray[np.float32]) -> NDArray[np.float32] | None:
-    """The block's sides, down to its lowest point: pairs (edge, foot) around the border, (2n, 3)."""
+    """The sides of the mesh down to its lowest point: pairs (edge, foot) around the border, (2n, 3)."""
     edge = np.concatenate([points[0, :-1], points[:-1, -1], points[-1, :0:-1], points[:0:-1, 0]])
     edge = np.concatenate([edge, edge[:1]])
     if not np.ptp(points[..., 2]) > 0:

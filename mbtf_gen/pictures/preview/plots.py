@@ -1,4 +1,4 @@
-"""Plots of queries: positions on the tile, mixture of levels, directions of light and view."""
+"""Plots of queries: positions on the tile, levels, directions of light and view."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from mbtf_core.atomic import write_file
 from mbtf_gen.pictures.preview.sample import QuerySample
 
-# Below so many points a histogram says less than the points do.
+# Number of points below which points are plotted instead of a histogram.
 _SCATTER = 4000
-# Queries per bin of a histogram in two dimensions, about; and bins per side, at least and at most.
+# Approximate queries per bin of a 2D histogram, and smallest and largest number of bins per side.
 _PER_BIN, _FEWEST, _MOST = 60, 8, 96
 # Bins per level where there are at least _PER_BIN queries for each, else whole levels.
 _BINS_PER_LEVEL = 8
@@ -23,10 +23,10 @@ _INK, _STATED = "#3b6ea5", "#c2571a"
 def level_histogram(
     sample: QuerySample,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """(edges, density found, density stated) of the fractional level, in bins of an eighth of a level, or of
-    whole levels where there are few queries.
+    """(bin edges, density of the queries, stated density) of the fractional level.
 
-    With k = 0 there is one bin around 0, whose stated density is 1.
+    Bins are an eighth of a level wide, or a whole level where queries are few. With k = 0 there is one bin
+    around 0, whose stated density is 1.
     """
     if sample.finest == 0:
         edges = np.array([-0.5, 0.5])
@@ -36,7 +36,7 @@ def level_histogram(
         bins = sample.finest * (_BINS_PER_LEVEL if enough else 1)
         edges = np.linspace(0.0, sample.finest, bins + 1)
         stated = sample.mixture.density(0.5 * (edges[1:] + edges[:-1]), sample.finest)
-    # Footprints are stored in single precision: those of the finest level may round beyond k.
+    # Footprints are stored in single precision, so that levels may exceed k by rounding.
     inside = np.clip(sample.level, edges[0], edges[-1])
     found, _ = np.histogram(inside, edges, density=True)
     return edges, found, stated
@@ -72,18 +72,18 @@ def _points(axes: Any, x: Any, y: Any) -> None:
 
 
 def _relative(axes: Any, x: Any, y: Any, edges: Any, share: NDArray[np.float64], region: str) -> None:
-    """Map of counts over those of a uniform distribution, which has `share` of its queries in each bin."""
+    """Histogram relative to a uniform distribution, which has the fraction `share` of its queries per bin."""
     counts, _, _ = np.histogram2d(x, y, edges)
-    # A bin of which a sliver lies in the region says nothing; one outside of it must be empty.
+    # Bins that hardly overlap the region are left out; bins outside of it must be empty.
     full = share > 0.25 * share.max()
     ratio = np.where(full, counts / (len(x) * np.where(full, share, 1.0)), np.nan)
     ratio[(share == 0) & (counts > 0)] = 2.0
     shown = axes.pcolormesh(*edges, np.minimum(ratio, 2.0).T, vmin=0.0, vmax=2.0, cmap="RdBu_r")
-    axes.figure.colorbar(shown, ax=axes, label=f"queries over a uniform share of {region}", shrink=0.85)
+    axes.figure.colorbar(shown, ax=axes, label=f"density relative to uniform over {region}", shrink=0.85)
 
 
 def _disk_share(edges: NDArray[np.float64], radius: float) -> NDArray[np.float64]:
-    """Share of a disk around 0 in each bin of a square grid, from 16 × 16 points per bin."""
+    """Fraction of a disk around 0 in each bin of a square grid, from 16 × 16 points per bin."""
     step = (np.arange(16) + 0.5) / 16
     x = (edges[:-1, None] + step * np.diff(edges)[:, None]).ravel()
     inside = (x[:, None] ** 2 + x[None, :] ** 2 <= radius**2).astype(np.float64)

@@ -1,4 +1,4 @@
-"""The queries that a preview shows: those that a configuration draws, or those that shards hold."""
+"""The queries that a preview plots: those that a configuration samples, or those stored in shards."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from mbtf_gen.dataset.verify import is_finished
 from mbtf_gen.job import Job, split_queries
 from mbtf_gen.sampling.query_sampler import Mixture, Queries
 
-# Shards are taken until there are so many queries.
-ENOUGH = 1 << 20
+# Shards are read until there are this many queries.
+MAX_QUERIES = 1 << 20
 
 
 @dataclass(frozen=True)
 class QuerySample:
-    """Queries of one split, and what they are to follow.
+    """Queries of one split, and the distributions that they should follow.
 
     Attributes
     ----------
@@ -49,10 +49,10 @@ class QuerySample:
     aspect: float
 
 
-def drawn(job: Job, split: Split = "train") -> QuerySample:
-    """The first shards that a configuration draws."""
+def sampled_queries(job: Job, split: Split = "train") -> QuerySample:
+    """Queries of the first shards that a configuration samples."""
     plan, entries = job.query_plan, [entry for entry in job.shards if entry.split == split]
-    parts = list(_enough(plan.draw(split, entry.index, entry.rows) for entry in entries))
+    parts = list(_up_to_limit(plan.draw(split, entry.index, entry.rows) for entry in entries))
     return QuerySample(
         *_columns(parts),
         split,
@@ -75,8 +75,8 @@ def finished_shards(dataset: Dataset, split: Split) -> list[Path]:
     ]
 
 
-def stored(dataset: Dataset, split: Split = "train") -> QuerySample:
-    """The first finished shards of a data set, against the distributions that its manifest states.
+def stored_queries(dataset: Dataset, split: Split = "train") -> QuerySample:
+    """Queries of the first finished shards of a data set, with the distributions stated in its manifest.
 
     Raises
     ------
@@ -84,7 +84,7 @@ def stored(dataset: Dataset, split: Split = "train") -> QuerySample:
     """
     manifest = dataset.manifest
     names = ("u", "sigma", "omega_i", "omega_o")
-    parts = list(_enough(Queries(**read_shard(path, names)) for path in finished_shards(dataset, split)))
+    parts = list(_up_to_limit(Queries(**read_shard(path, names)) for path in finished_shards(dataset, split)))
     if not parts:
         raise InputError(
             f"holds no finished {split} shard yet",
@@ -103,12 +103,12 @@ def stored(dataset: Dataset, split: Split = "train") -> QuerySample:
     )
 
 
-def _enough(batches: Iterable[Queries]) -> Iterator[Queries]:
+def _up_to_limit(batches: Iterable[Queries]) -> Iterator[Queries]:
     count = 0
     for batch in batches:
         yield batch
         count += batch.sigma.size
-        if count >= ENOUGH:
+        if count >= MAX_QUERIES:
             return
 
 

@@ -13,7 +13,7 @@ _FILL = 0.94
 _PROPORTION = 0.75
 
 
-def block_camera(
+def tiles_camera(
     elevation: float, azimuth: float, *, tiles: int, aspect: float, displacement_range: float, columns: int
 ) -> Camera:
     """Camera that looks at the center of `tiles` × `tiles` tiles and just fits them; pictures are 4:3.

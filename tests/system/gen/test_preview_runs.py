@@ -18,8 +18,8 @@ from mbtf_core.directions import from_angles
 from mbtf_core.lattice import level_of_sigma
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.material.material import load_material
-from mbtf_gen.pictures.preview.mesh import block_of, draw
-from mbtf_gen.pictures.preview.view import block_camera
+from mbtf_gen.pictures.preview.mesh import draw, tiled_mesh
+from mbtf_gen.pictures.preview.view import tiles_camera
 
 # Quadrants of the map: top left, top right, bottom left, bottom right.
 QUADRANTS = {"red": (1, 0, 0), "green": (0, 1, 0), "blue": (0, 0, 1), "white": (1, 1, 1)}
@@ -55,8 +55,8 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def drawing(work: Path) -> None:
     """Skips tests of what VTK draws where it cannot."""
-    block = block_of(load_material(work / "maps"), 1)
-    camera = block_camera(40, -90, tiles=1, aspect=0.5, displacement_range=0.04, columns=64)
+    block = tiled_mesh(load_material(work / "maps"), 1)
+    camera = tiles_camera(40, -90, tiles=1, aspect=0.5, displacement_range=0.04, columns=64)
     fault = draw(block, camera, from_angles(35, 150), work / "trial.png")
     if fault:
         pytest.skip(f"VTK cannot draw off screen here: {fault}")

@@ -19,10 +19,10 @@ from mbtf_gen.job import Job
 from mbtf_gen.material.material import Material
 from mbtf_gen.pictures.camera import Camera
 from mbtf_gen.pictures.preview import mesh
-from mbtf_gen.pictures.preview.mesh import MOST_CELLS, block_of, check_display, draw
+from mbtf_gen.pictures.preview.mesh import MOST_CELLS, check_display, draw, tiled_mesh
 from mbtf_gen.pictures.preview.plots import level_histogram, query_figure, write_plots
-from mbtf_gen.pictures.preview.sample import QuerySample, drawn, finished_shards, stored
-from mbtf_gen.pictures.preview.view import block_camera
+from mbtf_gen.pictures.preview.sample import QuerySample, finished_shards, sampled_queries, stored_queries
+from mbtf_gen.pictures.preview.view import tiles_camera
 from mbtf_gen.sampling.query_sampler import Mixture
 
 LIGHT = from_angles(35, 150)
@@ -41,7 +41,7 @@ def material(rows: int = 4, columns: int = 8, **options: Any) -> Material:
 def test_the_camera_just_holds_the_block(
     aspect: float, elevation: float, azimuth: float, relief: float
 ) -> None:
-    camera = block_camera(elevation, azimuth, tiles=2, aspect=aspect, displacement_range=relief, columns=120)
+    camera = tiles_camera(elevation, azimuth, tiles=2, aspect=aspect, displacement_range=relief, columns=120)
     assert (camera.rows, camera.columns) == (90, 120)
     assert camera.target == (1.0, aspect)
     forward, right, up = camera.frame()
@@ -58,7 +58,7 @@ def test_the_camera_just_holds_the_block(
 @pytest.mark.parametrize("tiles", [1, 2, 3])
 def test_the_block_is_the_repeated_tile(tiles: int) -> None:
     m = material()
-    block = block_of(m, tiles)
+    block = tiled_mesh(m, tiles)
     assert block.cells == (4, 8)
     assert block.points.shape == (4 * tiles + 1, 8 * tiles + 1, 3)
     z = m.height - m.height.max()
@@ -79,28 +79,28 @@ def test_the_block_is_the_repeated_tile(tiles: int) -> None:
 def test_holes_are_cut_where_little_is_left() -> None:
     opacity = np.ones((4, 8), np.float32)
     opacity[1:3, 2:6] = 0.0
-    block = block_of(material(opacity=opacity), 2)
+    block = tiled_mesh(material(opacity=opacity), 2)
     assert block.hole.shape == (8, 16)
     # Cells lie between texel centers: those whose four corners average below one half.
     expected = np.zeros((4, 8), bool)
     expected[1:2, 2:5] = True
     np.testing.assert_array_equal(block.hole, np.tile(expected, (2, 2)))
-    assert block_of(material(opacity=0.2), 1).hole.all()
+    assert tiled_mesh(material(opacity=0.2), 1).hole.all()
 
 
 def test_a_large_mesh_is_drawn_coarser() -> None:
     m = material()
     for tiles, wide in ((1, MOST_CELLS), (4, MOST_CELLS // 4)):
-        block = block_of(m, tiles, mesh=4000)
+        block = tiled_mesh(m, tiles, mesh=4000)
         assert block.cells == (wide // 2, wide)
-    tall = block_of(material(8, 4), 2, mesh=2000)
+    tall = tiled_mesh(material(8, 4), 2, mesh=2000)
     assert tall.cells == (MOST_CELLS // 2, MOST_CELLS // 4)
 
 
 def sample_of(count: int, seed: int = 0, **options: Any) -> QuerySample:
     config = GeneratorConfig.model_validate({"material": "m", "queries": {"train": str(count), **options}})
     job = Job(config, material())
-    return drawn(job)
+    return sampled_queries(job)
 
 
 @pytest.mark.parametrize("weights", [(0.6, 0.4), (1.0, 0.0), (0.0, 1.0)])
@@ -137,14 +137,14 @@ def test_the_histogram_of_levels_follows_the_mixture() -> None:
 
 
 @pytest.mark.parametrize("layout", ["shuffled", "image"])
-def test_stored_queries_are_those_that_the_configuration_draws(layout: str, tmp_path: Path) -> None:
+def test_stored_queries_are_those_that_the_configuration_samples(layout: str, tmp_path: Path) -> None:
     dataset = write_dataset(
         tmp_path / "set",
         queries={"train": "100", "test": "8", "layout": layout},
         output={"shard_queries": 40},
     )
     config = GeneratorConfig.model_validate(dataset.manifest["config"])
-    a, b = stored(dataset), drawn(Job.prepare(config))
+    a, b = stored_queries(dataset), sampled_queries(Job.prepare(config))
     data = dataset.load("train")
     for sample in (a, b):
         np.testing.assert_array_equal(sample.u, data["u"].reshape(-1, 2))
@@ -163,12 +163,12 @@ def test_unfinished_shards_are_left_out(tmp_path: Path) -> None:
     )
     (tmp_path / "set/train-00001.json").unlink()
     assert [p.name for p in finished_shards(dataset, "train")] == ["train-00000.npz", "train-00002.npz"]
-    sample = stored(dataset)
+    sample = stored_queries(dataset)
     assert (len(sample.u), sample.shards, sample.total) == (60, 2, 100)
     for name in ("train-00000.npz", "train-00002.npz"):
         (tmp_path / "set" / name).unlink()
     with pytest.raises(InputError, match="no finished train shard"):
-        stored(dataset)
+        stored_queries(dataset)
 
 
 @pytest.mark.parametrize("count", [1, 300, 9000])
@@ -211,7 +211,7 @@ def test_a_crash_while_drawing_is_one_line(tmp_path: Path, monkeypatch: pytest.M
         return run_child("support.crashing", "crash", *arguments, timeout=timeout)
 
     monkeypatch.setattr(mesh, "run_child", crashing)
-    block, camera = block_of(material(), 1), Camera(rows=8, columns=8)
+    block, camera = tiled_mesh(material(), 1), Camera(rows=8, columns=8)
     fault = draw(block, camera, LIGHT, tmp_path / "mesh.png")
     assert fault == "the process was ended by SIGSEGV"
     assert list(tmp_path.iterdir()) == []
