@@ -29,7 +29,7 @@ from mbtf_core.units import parse_duration
 from mbtf_fit.presets import best_options
 from mbtf_gen.config.generator import count_queries
 from mbtf_gen.config.presets import Quality
-from mbtf_gen.job import Job
+from mbtf_gen.generation import Job
 from mbtf_gen.render.runtime import load_mitsuba
 from mbtf_pipeline.cost_study.runs import DataRequest, Run, RunRunner
 from mbtf_pipeline.run_folder import machine
@@ -54,10 +54,10 @@ def size_of(text: str) -> tuple[int, int]:
 
 
 def measure(
-    name: str, quality: Quality, seconds: float, sizes: list[tuple[int, int]], resolution: int, work: Path
+    name: str, quality: Quality, seconds: float, sizes: list[tuple[int, int]], levels: int, work: Path
 ) -> list[dict[str, Any]]:
     """A row for each size."""
-    config = generator_config(name, quality, resolution)
+    config = generator_config(name, quality, levels)
     count = count_queries(config.queries.train, Job.prepare(config).lattice.texels())
     data = DataRequest(count, config.queries.spp)
     runner = RunRunner(config, work, "", lambda note: print(note, file=sys.stderr))
@@ -112,7 +112,7 @@ def main() -> int:
     parser.add_argument("--quality", default="high", choices=get_args(Quality), help="of the data")
     parser.add_argument("--time", default="4min", help="training of each fit")
     parser.add_argument("--size", action="append", type=size_of, help="WIDTHxCHANNELS (repeatable)")
-    parser.add_argument("--resolution", type=int, default=128, help="texels across, a power of two")
+    parser.add_argument("--levels", type=int, default=7, help="finest level: 2^levels texels")
     arguments = parser.parse_args()
     try:
         load_mitsuba()
@@ -123,12 +123,7 @@ def main() -> int:
         sizes = list(dict.fromkeys([*(arguments.size or SIZES), chosen]))
         with tempfile.TemporaryDirectory() as work:
             rows = measure(
-                arguments.material,
-                arguments.quality,
-                seconds,
-                sizes,
-                arguments.resolution,
-                Path(work),
+                arguments.material, arguments.quality, seconds, sizes, arguments.levels, Path(work)
             )
     except (MbtfError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)

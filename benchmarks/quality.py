@@ -112,7 +112,7 @@ def source(name: str) -> tuple[Path, float | None]:
     return ROOT / "assets" / name, None
 
 
-def settings_hash(quality: Quality) -> str:
+def options_hash(quality: Quality) -> str:
     """Hash of all options of a preset and of the fitter's other training options."""
     options = best_at(quality) | FITTER[quality]
     training = resolve(FitConfig, assignments=as_assignments(options)).training.model_dump(mode="json")

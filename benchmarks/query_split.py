@@ -1,7 +1,7 @@
 """Many noisy queries or few clean ones? Test error of a fit at equal total paths.
 
     python benchmarks/query_split.py [MATERIAL ...] [--paths 1.6e6 --paths 6.4e6] [--spp 2 ...] [--steps N]
-                                     [--resolution 64] [--height-scale H] [--keep FILE] [--plot FILE]
+                                     [--levels 6] [--height H] [--keep FILE] [--plot FILE]
 
 For every material (by default three of ``assets/``), total of paths and number of paths per query, a data set
 is generated and ``neumip`` is trained on it for the same number of steps. All fits are evaluated on the same
@@ -72,11 +72,7 @@ def measure(
 ) -> list[dict[str, Any]]:
     """One row per total and number of paths per query."""
     config = GeneratorConfig.model_validate(
-        {
-            "material": str(material),
-            "geometry": {"height_scale": height},
-            "queries": {"resolution": 1 << levels, "test": "32768", "test_spp": 256},
-        }
+        {"material": str(material), "geometry": {"height": height}, "queries": {"levels": levels}}
     )
     rows = []
     fit = {"model": "neumip", "training": {"steps": steps}}
@@ -140,9 +136,9 @@ def main() -> int:
     parser.add_argument("--paths", type=float, action="append", help="total of paths; repeatable")
     parser.add_argument("--spp", type=int, action="append", help="paths per query; repeatable")
     parser.add_argument("--steps", type=int, default=400, help="training steps of each fit")
-    parser.add_argument("--resolution", type=int, default=64, help="texels across, a power of two")
-    parser.add_argument("--height-scale", type=float, help="factor on the stored heights")
-    parser.add_argument("--keep", type=Path, help="file of the points that were measured, to resume")
+    parser.add_argument("--levels", type=int, default=6)
+    parser.add_argument("--height", type=float, help="factor on the stored heights")
+    parser.add_argument("--keep", type=Path, help="file of stored measurements, to resume")
     parser.add_argument("--plot", type=Path, help="PNG of the table")
     arguments = parser.parse_args()
     rows: list[dict[str, Any]] = []
@@ -151,8 +147,8 @@ def main() -> int:
         for material in arguments.materials or [ROOT / "assets" / name for name in ASSETS]:
             rows += measure(
                 material,
-                arguments.height_scale,
-                arguments.resolution.bit_length() - 1,
+                arguments.height,
+                arguments.levels,
                 arguments.paths or PATHS,
                 arguments.spp or SPP,
                 arguments.steps,

@@ -92,7 +92,7 @@ def repair(
         done = RepairResult(str(folder), found.faults, shards, found.documents, found.left, False, 0, 0.0)
     else:
         with (
-            going_on(f"{folder}: the shards rendered so far are kept"),
+            resumable(f"{folder}: the shards rendered so far are kept"),
             console.progress(found.paths, "repairing", "paths") as bar,
         ):
             done = found.repair(bar.update)

@@ -61,7 +61,7 @@ def generate(
     )
     total = paths_left(job, output, *part)
     with (
-        going_on(f"the shards that are finished are kept in {output}"),
+        resumable(f"the shards that are finished are kept in {output}"),
         console.progress(total=total, label="generating", unit="paths") as bar,
     ):
         summary = generate(

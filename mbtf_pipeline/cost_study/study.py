@@ -73,17 +73,16 @@ def claim(folder: Path) -> None:
     """
     check_folder(folder, lambda path: bool(_record(path)), "cost study")
     make_folder(folder)
-    if record := _record(folder):
-        if record.get("schema") != STUDY_SCHEMA:
-            problem = f"holds a cost study of schema version {record.get('schema')}; this is {STUDY_SCHEMA}"
-            raise InputError(problem, where=folder, hint=ELSEWHERE)
-        there, here = record.get("machine", {}).get("system"), machine()["system"]
-        if there != here:
-            raise InputError(
-                f"holds a cost study made on another kind of machine ({there}; this is {here})",
-                where=folder,
-                hint=ELSEWHERE,
-            )
+    record = _record(folder)
+    if not record:
+        return
+    if record.get("schema") != STUDY_SCHEMA:
+        problem = f"holds a cost study of schema version {record.get('schema')}; this is {STUDY_SCHEMA}"
+        raise InputError(problem, where=folder, hint=ELSEWHERE)
+    there, here = record.get("machine", {}).get("system"), machine()["system"]
+    if there != here:
+        problem = f"holds a cost study of another kind of machine ({there}; this is {here})"
+        raise InputError(problem, where=folder, hint=ELSEWHERE)
 
 
 def _record(folder: Path) -> dict[str, Any]:

@@ -130,13 +130,13 @@ def split_time(
             hint="leave out the fits of 'hierarchical'",
         )
     options = recipe.model_dump(mode="json", include={"generate", "fit"})
-    key = data_sha256({"schema": SPLIT_SCHEMA, "time": seconds, "recipe": options})
+    key = data_sha256({"schema": SPLIT_SCHEMA, "time": seconds, "share": share, "recipe": options})
     claim_run_folder(folder)
     with locked(folder):
         split = _stored(folder, key)
         if split is None:
             write_run_record(folder, recipe, command)
-            split = _measure(recipe, seconds, folder, progress)
+            split = _measure(recipe, seconds, share, folder, progress)
             write_json(folder / SPLIT_NAME, {"format": SPLIT_FORMAT, "key": key, **asdict(split)})
     return split
 

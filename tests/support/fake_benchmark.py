@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.job import Job
+from mbtf_gen.generation import Job
 from mbtf_gen.material.material import Material
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.sampling.query_sampler import Queries
@@ -45,11 +46,12 @@ class FakeEstimator:
 
 
 def fake_benchmark(monkeypatch: pytest.MonkeyPatch) -> GeneratorBenchmark:
-    """Of a small relief, traced by :class:`FakeEstimator` until the test ends."""
+    """A small height field, traced by :class:`FakeEstimator` until the test ends."""
     module = "mbtf_pipeline.cost_study.generator_benchmark"
-    for name in (module, "mbtf_gen.planning.sample_allocation"):
-        monkeypatch.setattr(f"{name}.build_estimator", lambda job, plan: FakeEstimator(job))
-    monkeypatch.setattr(f"{module}.plan_effects", lambda job: None)
+    plan = SimpleNamespace(closed_form=False, allocation=None)
+    monkeypatch.setattr(Job, "estimator", lambda self, plan: FakeEstimator(self))
+    monkeypatch.setattr(f"{module}.plan_effects", lambda job: plan)
+    monkeypatch.setattr(f"{module}.allocated", lambda job, plan: plan)
     heights = np.random.default_rng(0).random((8, 8))
     material = Material(heights, height_scale=0.1, height_bits=None, base_color=np.array([0.5, 0.5, 0.5]))
     return GeneratorBenchmark(GeneratorConfig(material="heights.npy"), material, 0)
