@@ -37,7 +37,7 @@ from mbtf_gen.render.runtime import load_mitsuba
 from mbtf_pipeline.cost_study.generator_benchmark import GeneratorBenchmark
 from mbtf_pipeline.cost_study.generator_runs import UNIFORM, generator_tasks
 from mbtf_pipeline.cost_study.measurements import Measurement
-from mbtf_pipeline.cost_study.page import narrow_errors, noise_exponent
+from mbtf_pipeline.cost_study.page import narrow_errors
 from mbtf_pipeline.recipe import load_recipe
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -104,26 +104,26 @@ def normalized(a: Estimate, b: Estimate) -> float | None:
     return abs(a.value - b.value) / error if error > 0 and math.isfinite(error) else None
 
 
-def independent(recipe: Path, seconds: float) -> tuple[Estimate | None, dict[int, Estimate]]:
-    """With independent random numbers: exponent of the noise variance over paths, and the squared biases by
-    number of paths."""
+def independent(recipe: Path, seconds: float) -> tuple[Estimate, dict[int, Estimate]]:
+    """With independent random numbers: power of the number of paths with which the noise variance changes,
+    and the squared biases by number of paths."""
     import mbtf_gen.render.estimator as module
 
     benchmark = benchmark_of(recipe, 0)
     usual = module.sequence
     module.sequence = independent_points(usual)
     try:
-        found, biases = [], {}
+        noises, biases = [], {}
         for n in PATHS:
-            changes = {**BIASED, "queries.spp": n}
-            result = benchmark.measure(changes, None, seconds)
-            estimates = result.seconds, result.error, None, result.noise
-            found.append(Measurement("paths", "uniform", "", changes, "", *estimates))
+            noises.append(benchmark.measure({**BIASED, "queries.spp": n}, None, seconds)[3])
             biases[n] = benchmark.bias(BIASED, {}, 2 * seconds, n)
-            print(f"independent, {n} paths: noise {result.noise}, squared bias {biases[n]}")
+            print(f"independent, {n} paths: noise {noises[-1]}, squared bias {biases[n]}")
     finally:
         module.sequence = usual
-    return noise_exponent(found), biases
+    few, many = noises[0], noises[-1]
+    scale = 2.0 / math.log(PATHS[-1] / PATHS[0])
+    power = scale * math.log(many.value / few.value)
+    return Estimate(power, scale * math.hypot(few.relative_error, many.relative_error), 2), biases
 
 
 def compare(studies: list[Rows]) -> dict[str, list[float]]:
@@ -157,10 +157,9 @@ def main() -> int:
             measured = [measure(arguments.recipe, s, arguments.seconds) for s in range(arguments.seeds)]
             studies = [rows_of(found) for found in measured]
             figures["narrow_errors"] = [narrow_errors(found) for found in measured]
-            if exponent is not None:
-                figures["independent_noise_exponent"] = exponent.as_dict()
-                thresholds["independent_noise_exponent"] = [-1 - EXPONENT, -1 + EXPONENT]
-                met &= abs(exponent.value + 1) <= EXPONENT
+            figures["independent_noise_exponent"] = exponent.as_dict()
+            thresholds["independent_noise_exponent"] = [-1 - EXPONENT, -1 + EXPONENT]
+            met &= abs(exponent.value + 1) <= EXPONENT
             figures["squared_bias_by_paths"] = {n: e.as_dict() for n, e in biases.items()}
             figures["bias_difference"] = z = normalized(biases[PATHS[0]], biases[PATHS[-1]])
             thresholds["bias_difference"] = BIASES

@@ -86,7 +86,7 @@ def main() -> int:
         load_mitsuba()
         with tempfile.TemporaryDirectory() as folder:
             shards = Path(folder) / "shards"
-            generate(generator_config(options.material, "draft", options.resolution.bit_length() - 1), shards)
+            generate(generator_config(options.material, "draft", options.resolution), shards)
             rows = []
             for steps in options.steps or STEPS:
                 for noise_regularization in (0.0, DEFAULT):

@@ -40,7 +40,7 @@ ASSETS = ("cliff_rock", "insulation_foam", "straight_wool", "turtle_shell", "twi
 THRESHOLDS = {"seconds": 1.3, "error": 1.5}
 
 
-def generated(name: str, quality: Quality, levels: int, shards: Path) -> dict[str, Any]:
+def generated(name: str, quality: Quality, resolution: int, shards: Path) -> dict[str, Any]:
     """Forecast and run of the generator."""
     from mbtf_gen.forecast import forecast
     from mbtf_gen.generation import generate
@@ -48,7 +48,7 @@ def generated(name: str, quality: Quality, levels: int, shards: Path) -> dict[st
     from mbtf_gen.planning.effects_plan import plan_effects
     from mbtf_gen.planning.run_plan import allocate
 
-    config = generator_config(name, quality, levels)
+    config = generator_config(name, quality, resolution)
     job = Job.prepare(config)
     expected = forecast(job, allocate(job, plan_effects(job)))
     start = time.perf_counter()
@@ -123,11 +123,7 @@ def main() -> int:
                 continue
             with tempfile.TemporaryDirectory() as work:
                 shards = Path(work) / "shards"
-                parts = {
-                    "generator": generated(
-                        name, arguments.quality, arguments.resolution.bit_length() - 1, shards
-                    )
-                }
+                parts = {"generator": generated(name, arguments.quality, arguments.resolution, shards)}
                 for seconds in arguments.time or ["60s"]:
                     label = f"fitter {parse_duration(seconds):g} s"
                     parts[label] = fitted(shards, seconds, Path(work) / seconds)

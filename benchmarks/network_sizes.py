@@ -54,10 +54,10 @@ def size_of(text: str) -> tuple[int, int]:
 
 
 def measure(
-    name: str, quality: Quality, seconds: float, sizes: list[tuple[int, int]], levels: int, work: Path
+    name: str, quality: Quality, seconds: float, sizes: list[tuple[int, int]], resolution: int, work: Path
 ) -> list[dict[str, Any]]:
     """A row for each size."""
-    config = generator_config(name, quality, levels)
+    config = generator_config(name, quality, resolution)
     count = count_queries(config.queries.train, Job.prepare(config).lattice.texels())
     data = DataRequest(count, config.queries.spp)
     runner = RunRunner(config, work, "", lambda note: print(note, file=sys.stderr))
@@ -127,7 +127,7 @@ def main() -> int:
                 arguments.quality,
                 seconds,
                 sizes,
-                arguments.resolution.bit_length() - 1,
+                arguments.resolution,
                 Path(work),
             )
     except (MbtfError, ValueError) as error:

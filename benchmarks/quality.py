@@ -82,7 +82,7 @@ class MeasuredRun:
     seconds : of the whole run, start-up included; generate, fit : of these two stages
     unexplained, unexplained_error : unexplained variance of the test queries and its standard error
     data_bytes, material_bytes : on disk
-    settings : hash of the preset's options
+    options_hash : of the preset's options
     """
 
     material: str
@@ -95,7 +95,7 @@ class MeasuredRun:
     unexplained_error: float
     data_bytes: int
     material_bytes: int
-    settings: str
+    options_hash: str
 
     def __str__(self) -> str:
         return (
@@ -168,7 +168,7 @@ def run(name: str, quality: Quality, resolution: int, work: Path) -> MeasuredRun
         round(unexplained["error"], 4),
         sum(p.stat().st_size for p in (out / "shards").rglob("*") if p.is_file()),
         sum(p.stat().st_size for p in (out / "fits" / "neumip").glob("weights*")),
-        settings_hash(quality),
+        options_hash(quality),
     )
     shutil.rmtree(work)
     return found
@@ -197,7 +197,7 @@ def finished(path: Path) -> MeasuredRun | None:
     """A stored run; None where the file is missing or damaged, or its preset has changed since."""
     try:
         found = MeasuredRun(**read_json(path))
-        return found if found.settings == settings_hash(found.quality) else None
+        return found if found.options_hash == options_hash(found.quality) else None
     except (InputError, TypeError, KeyError):
         return None
 

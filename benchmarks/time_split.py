@@ -18,7 +18,6 @@ import json
 import math
 import sys
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,7 @@ from mbtf_core.units import parse_duration
 from mbtf_fit.presets import best_options
 from mbtf_gen.render.runtime import load_mitsuba
 from mbtf_pipeline.cost_study.runs import DataRequest, Run, RunRunner
-from mbtf_pipeline.cost_study.time_split import measure_costs, split_time, with_split
+from mbtf_pipeline.cost_study.time_split import split_time, with_split
 from mbtf_pipeline.recipe import Recipe
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -50,18 +49,12 @@ def measure(
     def note(text: str) -> None:
         print(f"{material.name}: {text}", file=sys.stderr)
 
-    chosen = split_time(recipe, seconds, work / "run", "", note)
-    note(chosen.describe())
-    # A pilot's length of zero: costs of the generator alone, the fit's are those found above.
-    _, costs = measure_costs(recipe, 0.0, work, note)
-    costs = replace(costs, fit=chosen.other, fit_query=0.0)
     runner = RunRunner(recipe.generate, work / "runs", "", lambda text: None)
     rows, errors = [], []
     for share in [*shares, None]:
-        split = chosen
-        if share is not None:
-            queries, _, training, _ = costs.split(seconds, share)
-            split = replace(chosen, queries=queries, training=training, share=share, pilot_seconds=0.0)
+        split = split_time(recipe, seconds, work / f"run-{share}", "", note, share)
+        note(split.describe())
+        pilots = split.pilot_seconds if share is None else 0.0
         data = DataRequest(split.queries, recipe.generate.queries.spp)
         options = with_split(recipe, split).fit["neumip"].fields()
         found = runner.measure(Run("whole", "neumip", f"{split.share:.0%}", data, options))
@@ -72,7 +65,7 @@ def measure(
                 "share": split.share,
                 "pilots": share is None,
                 "queries": split.queries,
-                "seconds": round(found.details["total_seconds"] + split.pilot_seconds, 1),
+                "seconds": round(found.details["total_seconds"] + pilots, 1),
                 "unexplained": found.error.as_dict(),
             }
         )

@@ -19,13 +19,13 @@ from mbtf_core.errors import InputError, PartialError, reason
 
 CHECKSUM = "checksum"
 # A checksummed document ends with its checksum, so that it can be found without a parser.
-_SEAL_TAIL = b'"\n}\n'
-_SEAL_HEAD = f'"{CHECKSUM}": "'.encode()
+_CHECKSUM_TAIL = b'"\n}\n'
+_CHECKSUM_HEAD = f'"{CHECKSUM}": "'.encode()
 _DIGITS = 64
 
-# What folders answer that cannot be opened or synced for what they are, not for what happens to the disk.
+# Errors of folders that cannot be opened or synced at all; others mean that the disk failed.
 _NO_FOLDER_SYNC = (errno.EACCES, errno.EPERM, errno.EISDIR, errno.EINVAL, errno.ENOTSUP, errno.ENOSYS)
-# What a file system without hard links answers.
+# Errors of file systems without hard links.
 _NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)
 
 Buffer = bytes | bytearray | memoryview
@@ -74,7 +74,7 @@ TEMPORARY = r"\.[0-9a-f]{8}-\d+\.tmp"
 
 @contextlib.contextmanager
 def _temporary(path: Path) -> Iterator[Path]:
-    """A fresh name to write to; what fails in between is partial work.
+    """A fresh name to write to; an error of the system becomes a PartialError.
 
     Raises
     ------
@@ -93,11 +93,11 @@ def _temporary(path: Path) -> Iterator[Path]:
 
 
 def unwritable(path: Path, error: OSError) -> PartialError:
-    """What a user is told of a file or folder that the system would not write."""
+    """The error for a file or folder that cannot be written."""
     return PartialError(
         f"cannot be written ({error.strerror or error})",
         where=path,
-        hint="what was finished is kept; free space or mend the folder, then run the same command again",
+        hint="finished files are kept; free space or fix the folder, then run the same command again",
     )
 
 
@@ -155,8 +155,8 @@ def write_through(path: Path, write: Callable[[Path], None]) -> Stored:
 def create_file(path: Path, content: bytes) -> bool:
     """Write a file where there is none; False where there is one, which stays as it is.
 
-    Of several writers one wins, also of those on different machines: the file gets its name by a hard link.
-    File systems without hard links leave a moment in which the last one wins.
+    One of several writers wins, also across machines: the file gets its name by a hard link. On file systems
+    without hard links there is a short window in which the last writer wins.
 
     Raises
     ------
@@ -221,7 +221,7 @@ def checksummed(data: Mapping[str, Any]) -> bytes:
 
 
 def _with_digits(text: bytes, digits: bytes) -> bytes:
-    end = len(text) - len(_SEAL_TAIL)
+    end = len(text) - len(_CHECKSUM_TAIL)
     return text[: end - _DIGITS] + digits + text[end:]
 
 
@@ -244,11 +244,11 @@ def read_checksummed(path: Path, hint: str = "") -> dict[str, Any]:
     """
     content = _content(path)
     data = _parsed(content, path, hint)
-    head = content[: -len(_SEAL_TAIL) - _DIGITS]
+    head = content[: -len(_CHECKSUM_TAIL) - _DIGITS]
     zeros = hashlib.sha256(_with_digits(content, b"0" * _DIGITS)).hexdigest()
     if (
-        not content.endswith(_SEAL_TAIL)
-        or not head.endswith(_SEAL_HEAD)
+        not content.endswith(_CHECKSUM_TAIL)
+        or not head.endswith(_CHECKSUM_HEAD)
         or content[len(head) : len(head) + _DIGITS] != zeros.encode()
     ):
         raise InputError("has changed since it was written (its checksum differs)", where=path, hint=hint)

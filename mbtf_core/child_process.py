@@ -1,6 +1,6 @@
-"""Run a function in a child process that may abort or hang, and say in one line how it ended.
+"""Run a function in a child process that may abort or hang, and report in one line how it ended.
 
-Compilers and drivers fail by ending the process; what could do so is tried in a child first.
+Compilers and drivers may crash the process, so they are tried in a child first.
 """
 
 from __future__ import annotations

@@ -46,11 +46,11 @@ FileName = Annotated[str, Field(min_length=1), AfterValidator(_file_name)]
 
 _COMMAND_LINE = "command line"
 
-# A configuration that is longer, deeper or (through YAML's aliases) larger than this is no configuration.
+# Bounds on the length, the depth and (because of YAML's aliases) the number of values of a configuration.
 _MAX_CHARACTERS = 1 << 18
 _MAX_DEPTH = 100
 _MAX_VALUES = 100_000
-# Tags that stand for plain values.
+# Tags of plain values.
 _TAGS = ("map", "seq", "str", "int", "float", "bool", "null", "timestamp", "binary", "set", "omap")
 
 
@@ -119,7 +119,7 @@ def _bracket_depth(text: str) -> int:
 
 
 def _check_tree(data: Any, where: object) -> None:
-    """Refuse what a few lines of YAML can hold but no configuration does.
+    """Refuse YAML that no configuration contains.
 
     Raises
     ------
@@ -133,10 +133,10 @@ def _check_tree(data: Any, where: object) -> None:
         seen += 1
         if depth > _MAX_DEPTH or seen > _MAX_VALUES:
             what = _too_deep() if depth > _MAX_DEPTH else f"holds more than {_MAX_VALUES:,} values"
-            raise InputError(what, where=where, hint="aliases (*name) count as what they stand for")
+            raise InputError(what, where=where, hint="each alias (*name) counts in full")
         tag = getattr(getattr(value, "tag", None), "value", None)
         if tag is not None and str(tag).removeprefix("tag:yaml.org,2002:") not in _TAGS:
-            raise InputError(f"holds the tag '{tag}'", where=where, hint="plain values are wanted")
+            raise InputError(f"holds the tag '{tag}'", where=where, hint="use plain values")
         if isinstance(value, Mapping):
             for key, inner in value.items():
                 if not isinstance(key, str):
@@ -245,7 +245,7 @@ def build(
 
 
 def check_document(model: type[BaseModel], data: Mapping[str, Any], path: Path, hint: str) -> None:
-    """Refuse a JSON document of ours whose content is not what `model` says: somebody else changed it.
+    """Refuse a JSON document of the programs whose content does not fit `model`.
 
     Raises
     ------
@@ -263,7 +263,7 @@ def _parse_value(text: str) -> Any:
 
     try:
         value = YAML(typ="safe", pure=True).load(text)
-    except Exception:  # what is no YAML stands for itself; the reader may raise anything
+    except Exception:  # text that is not YAML is taken as it is; the reader may raise anything
         return text
     _check_tree(value, "--set")
     return value
@@ -287,7 +287,7 @@ def nested(options: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def deep_merge(base: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """A new mapping: `given` laid over `base`, section by section."""
+    """A new mapping: `base`, overridden by `given` section by section."""
     out = dict(base)
     for key, value in given.items():
         under = out.get(key)
@@ -326,7 +326,7 @@ def resolve(
         given.append((key.strip(), _parse_value(text)))
     given += [(key, value) for key, value in (flags or {}).items() if value is not None]
     if file is not None:
-        # The file's own faults are the file's, also where the command line supplies a key that it lacks.
+        # Report errors of the file as such, also where the command line supplies a key that it lacks.
         for key, value in given:
             if key in model.model_fields and model.model_fields[key].is_required() and key not in data:
                 data[key] = value

@@ -2,7 +2,7 @@
 
 A program defines its commands with cyclopts and hands the application to :func:`run`::
 
-    # mbtf_fit/cli.py
+    # mbtf_fit/cli/app.py
     app = new_app("mbtf-fit", "Fit neural materials to multi-resolution BTF data.")
 
     @app.default
@@ -18,16 +18,16 @@ A program defines its commands with cyclopts and hands the application to :func:
 
     # mbtf_fit/__main__.py
     def main() -> int:
-        from .cli import app
+        from mbtf_fit.cli.app import app
         return run(app)
 
     if __name__ == "__main__":
         sys.exit(main())
 
-The default command answers ``mbtf-fit shards/``, the named ones ``mbtf-fit info …``; flags may stand before
-or after the command's name. A command returns None or an exit code and raises
-:class:`~mbtf_core.errors.MbtfError` for everything a user can cause. Results go to standard output; progress,
-notes and warnings (``logging.getLogger(__name__).warning(…)`` anywhere in the packages) go to standard error.
+``mbtf-fit shards/`` runs the default command, ``mbtf-fit info …`` a named one; flags may come before or after
+the command's name. A command returns None or an exit code, and raises
+:class:`~mbtf_core.errors.MbtfError` for every error that a user can cause. Results go to standard output.
+Progress, notes and warnings (of any logger of the packages) go to standard error.
 """
 
 from __future__ import annotations
@@ -244,12 +244,13 @@ class Console:
 
 
 @contextlib.contextmanager
-def going_on(kept: str, hint: str = "the same command goes on from there") -> Iterator[None]:
-    """Work that an interruption does not lose; says so where one comes.
+def resumable(kept: str, hint: str = "the same command resumes") -> Iterator[None]:
+    """Report what an interruption keeps, and how to resume.
 
     Parameters
     ----------
-    kept : what is kept, for the message; hint : how to go on
+    kept : what is kept, for the message
+    hint : how to resume
 
     Raises
     ------
@@ -267,13 +268,12 @@ def _interrupt(number: int, frame: object) -> None:
 
 @contextlib.contextmanager
 def _ended_like_interrupted() -> Iterator[None]:
-    """Have the system's request to end (SIGTERM, as batch systems send it) end the work as Ctrl-C does."""
+    """Treat SIGTERM, which batch systems send, like Ctrl-C."""
     usual = threading.current_thread() is threading.main_thread()
     usual = usual and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
     if usual:
         signal.signal(signal.SIGTERM, _interrupt)
-        # A renderer that ran in this process may have left a handler behind Python's back, which points to
-        # what is gone by now.
+        # A renderer in this process may have installed a native handler that is no longer valid.
         signal.signal(signal.SIGINT, signal.getsignal(signal.SIGINT) or signal.default_int_handler)
     try:
         yield
@@ -416,14 +416,14 @@ def run(app: App, argv: Sequence[str] | None = None) -> int:
     app : made by :func:`new_app`
     argv : arguments after the program's name; the process's own by default
 
-    Exit codes: 0 done, 2 usage, 3 bad input or machine, 4 partial and resumable, 130 interrupted, 1 a defect
-    of ours. Errors are one or two lines on standard error; ``--debug`` anywhere adds the traceback.
+    Exit codes: 0 done, 2 usage, 3 bad input or machine, 4 partial and resumable, 130 interrupted, 1 a bug.
+    Errors are one or two lines on standard error; ``--debug`` anywhere adds the traceback.
     """
     debug, tokens = _take_debug(sys.argv[1:] if argv is None else list(argv))
     _route_logs(tokens, debug)
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
-            # A terminal without our signs (Greek letters, ±) shows question marks instead of failing.
+            # A terminal that lacks Greek letters or ± shows question marks.
             stream.reconfigure(errors="replace")
     try:
         if {"-h", "--help"} & set(tokens):
@@ -440,7 +440,7 @@ def run(app: App, argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return _fail("interrupted", EXIT_INTERRUPTED, debug)
     except BrokenPipeError:
-        # The reader of our output has gone (`| head`); Python would complain again when it flushes at exit.
+        # The reader of the output has exited (`| head`); Python would fail again when it flushes at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _EXIT_BROKEN_PIPE
     except OSError as error:

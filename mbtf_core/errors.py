@@ -1,7 +1,7 @@
 """Errors a user can meet, each with its exit code.
 
-Every failure that a user can cause or hint is raised as an :class:`MbtfError`; the command lines print it
-as one or two lines (what, where, what to do) and exit with its code. Anything else is a defect of ours.
+Every failure that a user can cause or fix is raised as an :class:`MbtfError`; the command lines print it
+as one or two lines (what, where, what to do) and exit with its code. Anything else is a bug.
 """
 
 from __future__ import annotations

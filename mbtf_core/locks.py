@@ -1,8 +1,7 @@
-"""Locks per shard: a file beside the shard that names its writer, so that several writers share one folder.
+"""Locks per shard: a file beside the shard names its writer, so that several writers share one folder.
 
-The lock itself is the kernel's advisory lock on that file: it ends with its process, however that ends, and
-nobody has to guess whether a writer still lives. Machines that share a folder without sharing such locks go
-by what the file says: its writer's machine and its age, which the writer renews while it works.
+The lock is the kernel's advisory lock on that file, which ends with its process. Machines that share a folder
+but no advisory locks read the file: it names the writer's machine, and the writer renews its age.
 """
 
 from __future__ import annotations
@@ -23,12 +22,12 @@ from typing import ClassVar
 from mbtf_core.atomic import unwritable
 from mbtf_core.errors import PartialError
 
-# Seconds after which the lock of another machine counts as abandoned, and between two signs of life.
+# Age after which the lock of another machine counts as abandoned, and the interval of renewal.
 STALE_SECONDS = 1800.0
 RENEW_SECONDS = 300.0
-# What a file system without advisory locks answers.
+# Errors of file systems without advisory locks.
 _NO_LOCKS = (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK)
-# Waiting for a lock that is held for moments only.
+# Polling interval and patience for locks that are held briefly.
 _POLL_SECONDS = 0.02
 _PATIENCE_SECONDS = 60.0
 
@@ -79,7 +78,7 @@ class Lock:
 
     @classmethod
     def renew(cls) -> None:
-        """A sign of life for other machines, on every lock that this process holds."""
+        """Renew the age of every lock that this process holds, for other machines."""
         with cls._guard:
             for lock in cls._held:
                 with contextlib.suppress(OSError):

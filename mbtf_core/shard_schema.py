@@ -1,4 +1,4 @@
-"""The shard format's vocabulary: schema version, arrays, units, conventions in words.
+"""The shard format: schema version, arrays, units, conventions in words.
 
 Every other module, the manifest and ``docs/reference/data-format.md`` take their names and wording from here.
 """
@@ -17,7 +17,7 @@ CONFIG_NAME = "config.yaml"
 
 Layout = Literal["shuffled", "image"]
 ArrayFormat = Literal["npz", "exr"]
-# What is done to maps that do not tile.
+# How maps that do not tile are made tileable.
 Tiling = Literal["none", "mirror", "blend"]
 Split = Literal["train", "test"]
 SPLITS: tuple[Split, ...] = ("train", "test")
@@ -77,7 +77,7 @@ ARRAYS: tuple[ArraySpec, ...] = (
     _array("value_a", "R G B", "1/sr", "first independent estimate of M (linear Rec.709 RGB)"),
     _array("value_b", "R G B", "1/sr", "second independent estimate of M (linear Rec.709 RGB)"),
     _array("spp", "", "paths", "paths traced for this query, both halves together"),
-    _array("transmittance", "", "1", "share of the footprint that is seen through holes", optional=True),
+    _array("transmittance", "", "1", "fraction of the footprint that rays pass through", optional=True),
 )
 ARRAY: dict[str, ArraySpec] = {a.name: a for a in ARRAYS}
 

@@ -1,4 +1,4 @@
-"""What a missing file was probably meant to be."""
+"""Suggestions for misspelt file names."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import difflib
 from collections.abc import Callable
 from pathlib import Path
 
-# Least likeness, of 0 to 1, of names that one may be a slip of the other.
+# Smallest similarity, in [0, 1], of a suggested name.
 _LEAST = 0.6
 
 
@@ -15,10 +15,10 @@ def _stems_alike(a: str, b: str) -> bool:
 
 
 def suggest_path(path: Path, wanted: Callable[[Path], bool] | None = None) -> str:
-    """``did you mean 'rock/height.png'?`` for a path that does not exist; empty where nothing is like it.
+    """``did you mean 'rock/height.png'?`` for a path that does not exist; empty where no name is similar.
 
     The first part of the path that does not exist is compared, without regard to case, with what lies beside
-    it; a file of the same stem and another suffix counts as near too.
+    it; a file of the same stem and another suffix is suggested too.
 
     Parameters
     ----------
@@ -32,10 +32,10 @@ def suggest_path(path: Path, wanted: Callable[[Path], bool] | None = None) -> st
         beside = sorted(p for p in missing.parent.iterdir() if not p.name.startswith("."))
     except OSError:
         return ""
-    # A folder on the way is judged by its name alone; the last part is what the caller wants.
+    # `wanted` applies to the last part of the path only.
     names = {p.name.lower(): p for p in beside if missing != path or wanted is None or wanted(p)}
     near = difflib.get_close_matches(missing.name.lower(), list(names), n=3, cutoff=_LEAST)
-    # A suffix in common makes no two names alike.
+    # A common suffix alone does not make names similar.
     near = [n for n in near if _stems_alike(missing.name.lower(), n)]
     near = near or [n for n, p in names.items() if p.stem.lower() == missing.stem.lower()][:1]
     return f"did you mean '{names[near[0]]}'?" if near else ""

@@ -1,4 +1,4 @@
-"""What is wrong with a value of a configuration, in the programs' words instead of the validator's."""
+"""Pydantic's validation errors, rephrased for users of the programs."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def _limits(model: type[BaseModel], location: Sequence[str | int]) -> dict[str, 
 
 
 def explain(fault: Mapping[str, Any], model: type[BaseModel]) -> str:
-    """One of pydantic's faults as what the value must be.
+    """Say what a value must be, from one of pydantic's errors.
 
     Parameters
     ----------
@@ -71,8 +71,8 @@ def explain(fault: Mapping[str, Any], model: type[BaseModel]) -> str:
     kind, context = str(fault["type"]), fault.get("ctx", {})
     if kind in ("greater_than", "greater_than_equal", "less_than", "less_than_equal"):
         limits = {**_limits(model, fault["loc"]), **context}
-        said = [f"{word} {limits[name]:.10g}" for name, word in _BOUNDS if name in limits]
-        return "must be " + " and ".join(said)
+        bounds = [f"{word} {limits[name]:.10g}" for name, word in _BOUNDS if name in limits]
+        return "must be " + " and ".join(bounds)
     if kind == "literal_error":
         return f"must be {context['expected']}"
     if kind == "too_short":

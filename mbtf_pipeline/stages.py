@@ -71,7 +71,7 @@ class Stamp:
 
     @property
     def outputs_hash(self) -> str:
-        """One digest of everything the stage wrote."""
+        """One digest of all outputs."""
         return data_sha256(self.outputs)
 
 

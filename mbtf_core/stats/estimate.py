@@ -20,7 +20,7 @@ class Estimate:
     ----------
     value : the estimate, in its quantity's unit
     error : its standard error (one standard deviation), same unit; ``inf`` where it cannot be known
-    n : independent units it rests on: queries, or buffers in the image layout
+    n : independent units it rests on: queries, or images in the image layout
     dof : degrees of freedom of `error`; None stands for ``n - 1``
     """
 
@@ -72,7 +72,7 @@ def mean_estimate(samples: ArrayLike) -> Estimate:
     """Mean of independent samples (n, ...), axes after the first averaged before the error is taken.
 
     The sample mean is unbiased, and ``s²/n`` with the ``n-1`` divisor an unbiased variance of it. Averaging
-    the trailing axes first (channels of a query, texels of a buffer) keeps the error right however strongly
+    the trailing axes first (channels of a query, texels of an image) keeps the error right however strongly
     they are correlated.
     """
     units = per_unit(checked(samples, "samples"))

@@ -1,4 +1,4 @@
-"""What two independent halves tell: noise, and error and variance free of it.
+"""Paired (split-half) estimates: noise, and noise-free error and variance.
 
 Every query q is estimated twice, ``a_q = t_q + α_q`` and ``b_q = t_q + β_q``, with the truth ``t_q`` and
 noise α, β of mean zero, independent of each other and between queries. Products of an a with a b therefore
@@ -6,7 +6,7 @@ have the expectation they would have without noise; squares of one half do not.
 
 Arrays are ``(n,)``, ``(n, channels)`` or ``(items, rows, columns, channels)``. The first axis counts the
 independent units. Everything else is averaged within a unit before an error bar is taken: channels of one
-query are correlated, and texels of one buffer share its directions.
+query are correlated, and texels of one image share its directions.
 """
 
 from __future__ import annotations
@@ -123,11 +123,11 @@ def signal_variance(a: ArrayLike, b: ArrayLike) -> Estimate:
     """Variance of the true values over queries, free of noise: per channel about its mean, then averaged.
 
     For ``(n, channels)`` the sample covariance of a and b, ``Σ (a-ā)(b-b̄)/(n-1)``: given the queries, every
-    a is independent of every b, so its expectation is the covariance of t with itself. For buffers the term
-    subtracted with ``ā b̄`` is made good by the covariance of the buffers' means over n, which keeps it
-    unbiased when whole buffers are drawn. Unit: the values' squared.
+    a is independent of every b, so its expectation is the covariance of t with itself. For images the
+    covariance of the images' means over n compensates the term that ``ā b̄`` subtracts, so the estimate is
+    unbiased when whole images are drawn. Unit: the values' squared.
     """
-    products, correction = _centerd_products(*_pair(a, b))
+    products, correction = _centered_products(*_pair(a, b))
     spread = mean_estimate(products)
     if spread.n < 2:
         return Estimate(math.nan, math.inf, spread.n)
@@ -159,7 +159,7 @@ def unexplained_variance(
     """
     p, first, second = _with_prediction(prediction, a, b)
     w = _weights(weights, len(first))
-    products, correction = _centerd_products(first, second, w)
+    products, correction = _centered_products(first, second, w)
     return _ratio(per_unit((p - first) * (p - second)), products + correction, w)
 
 
@@ -173,7 +173,7 @@ def _weights(weights: ArrayLike | None, n: int) -> NDArray[np.float64]:
     return w / w.mean()
 
 
-def _centerd_products(
+def _centered_products(
     a: NDArray[np.float64], b: NDArray[np.float64], w: NDArray[np.float64] | None = None
 ) -> tuple[NDArray[np.float64], float]:
     """Per unit ``(a-ā)(b-b̄)`` (n,), and what must be added to its mean to make it unbiased (for weights of 1,

@@ -111,7 +111,7 @@ def t_test(x: Estimate, y: Estimate | float = 0.0, alternative: Alternative = "t
 def equivalence_test(x: Estimate, y: Estimate | float, tolerance: float) -> Outcome:
     """Is x within ±tolerance of y? Two one-sided t-tests (Schuirmann 1987).
 
-    Here the burden of proof is turned round: a **small** p-value shows that the two agree within the
+    The burden of proof is reversed: a **small** p-value shows that the two agree within the
     tolerance, and too little data gives a large one. The statistic is that of the side closer to being
     violated.
 

@@ -122,10 +122,10 @@ def check_conformance(
     missing = [name for name in CONFORMANCE if name not in tensors]
     if missing:
         raise InputError(f"lacks the tensor 'conformance.{missing[0]}'", where=weights)
-    wanted = {"u": (2,), "sigma": (), "omega_i": (3,), "omega_o": (3,), "rgb": (3,)}
+    shapes = {"u": (2,), "sigma": (), "omega_i": (3,), "omega_o": (3,), "rgb": (3,)}
     out = {name: np.asarray(tensors[name], np.float32) for name in CONFORMANCE}
     for name, array in out.items():
-        if array.shape != (description["conformance"]["count"], *wanted[name]):
+        if array.shape != (description["conformance"]["count"], *shapes[name]):
             raise InputError(f"its tensor 'conformance.{name}' has the shape {array.shape}", where=weights)
     return out
 

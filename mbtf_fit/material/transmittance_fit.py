@@ -88,14 +88,14 @@ class _Sums:
         ridge = _PRIOR if self.level else _FIRST_PRIOR
         for start in range(0, self.count, _TEXELS):
             part = slice(start, min(start + _TEXELS, self.count))
-            place = np.arange(self.first + part.start, self.first + part.stop)
-            prior = _from_coarser(levels, self.lattice, self.level, place)
-            matrix = np.empty((len(place), COEFFICIENTS, COEFFICIENTS))
+            texel = np.arange(self.first + part.start, self.first + part.stop)
+            prior = _from_coarser(levels, self.lattice, self.level, texel)
+            matrix = np.empty((len(texel), COEFFICIENTS, COEFFICIENTS))
             for k, (a, b) in enumerate(_PAIRS):
                 matrix[:, a, b] = matrix[:, b, a] = self.squares[k, part]
             matrix += ridge * np.eye(COEFFICIENTS)
             right = self.products[:, part].T + ridge * prior
-            out[place] = np.linalg.solve(matrix, right[..., None])[..., 0]
+            out[texel] = np.linalg.solve(matrix, right[..., None])[..., 0]
 
 
 def _from_coarser(levels: list[F32], lattice: Lattice, level: int, texel: NDArray[np.int64]) -> F64:

@@ -117,7 +117,7 @@ def read_material(folder: str | Path) -> StoredMaterial:
     )
 
 
-def _supported(description: dict[str, Any], place: Path) -> NetworkSection:
+def _supported(description: dict[str, Any], path: Path) -> NetworkSection:
     """The architecture.
 
     Raises
@@ -126,11 +126,11 @@ def _supported(description: dict[str, Any], place: Path) -> NetworkSection:
     """
     # A renderer does not depend on the options of training.
     named = {key: description["config"][key] for key in ("model", "network") if key in description["config"]}
-    config = build(FitConfig, named, source=str(place))
+    config = build(FitConfig, named, source=str(path))
     if config.network.decoder != "mlp":
         raise InputError(
             f"the renderer's plugin does not support the inception decoder of '{config.model}'",
-            where=place,
+            where=path,
             hint="fit the model neumip or neumip-baseline to the same shards",
         )
     return config.network

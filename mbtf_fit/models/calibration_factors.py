@@ -17,8 +17,8 @@ def interpolate_factors(table: Tensor, level: Tensor, cosine: Tensor) -> Tensor:
     between levels and knots, which are equidistant in [0, 1]."""
     last = max(1, table.shape[0] - 1)
     # An image whose rows are levels, in the coordinates of grid_sample: corners at -1 and 1.
-    place = torch.stack([2.0 * cosine - 1.0, (2.0 / last) * level - 1.0], -1)
+    position = torch.stack([2.0 * cosine - 1.0, (2.0 / last) * level - 1.0], -1)
     found = torch.nn.functional.grid_sample(
-        table.permute(2, 0, 1)[None], place[None, :, None], padding_mode="border", align_corners=True
+        table.permute(2, 0, 1)[None], position[None, :, None], padding_mode="border", align_corners=True
     )
     return found[0, :, :, 0].T

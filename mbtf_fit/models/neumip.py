@@ -92,8 +92,8 @@ class Neumip(TexturedMaterial):
         calibration = tensors.get(name)
         if calibration is not None:
             # Of any number of knots.
-            wanted = (2, self.lattice.finest + 1, calibration.shape[2] if calibration.ndim == 4 else 0, 3)
-            if calibration.shape != wanted or wanted[2] < 2:
+            shape = (2, self.lattice.finest + 1, calibration.shape[2] if calibration.ndim == 4 else 0, 3)
+            if calibration.shape != shape or shape[2] < 2:
                 raise InputError(f"the weights do not fit the model {self.name}: '{name}'")
         self.calibration = None if calibration is None else calibration.float().clone()
         super().load_weights(tensors)

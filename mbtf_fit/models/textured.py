@@ -117,11 +117,11 @@ class TexturedMaterial(NeuralMaterial):
             out["offset"] = f"r / max(omega_o.z, {GRAZING}) * (omega_o.x, omega_o.y), in tile widths"
         elif network.offset == "direct":
             out["offset"] = f"{OFFSET_SCALE} * {r}, in tile widths"
-        place = "u"
+        position = "u"
         if out:
             out["u'"] = "u + offset / (1, aspect)"
-            place = "u'"
-        textures = f"the textures pyramid.0 ... pyramid.k (level 0 to k) at {place}"
+            position = "u'"
+        textures = f"the textures pyramid.0 ... pyramid.k (level 0 to k) at {position}"
         if network.blending == "blend":
             out["features"] = f"{textures}, blended by level"
         else:

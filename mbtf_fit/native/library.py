@@ -195,8 +195,8 @@ def variants(library: Any) -> dict[str, int]:
 
 @cache
 def _load() -> tuple[Kernel | None, str]:
-    wanted = os.environ.get(ENVIRONMENT, "auto")
-    if wanted == "off":
+    requested = os.environ.get(ENVIRONMENT, "auto")
+    if requested == "off":
         return None, f"switched off by {ENVIRONMENT}"
     path = _path()
     if path is None:
@@ -206,9 +206,9 @@ def _load() -> tuple[Kernel | None, str]:
     except OSError as error:
         return None, f"cannot be loaded ({error})"
     found = variants(library)
-    name = next(iter(found)) if wanted == "auto" else wanted
+    name = next(iter(found)) if requested == "auto" else requested
     if name not in found:
-        return None, f"{ENVIRONMENT}={wanted} is none of: {', '.join(['auto', 'off', *found])}"
+        return None, f"{ENVIRONMENT}={requested} is none of: {', '.join(['auto', 'off', *found])}"
     return Kernel(library, found[name], name), ""
 
 

@@ -112,18 +112,18 @@ class NativeModel:
             packed = aligned(kernel.library.mbtf_packed_floats(ctypes.byref(target)))
             target.packed = packed.data_ptr()
             self._packed.append(packed)
-        for texture, place in zip(model.textures(), self._places(), strict=False):
+        for texture, layout in zip(model.textures(), self._layouts(), strict=False):
             shapes = texture.packing.shapes
-            place.levels, place.channels = len(shapes), texture.texels.shape[1]
-            place.rows[: len(shapes)] = [rows for rows, _ in shapes]
-            place.columns[: len(shapes)] = [columns for _, columns in shapes]
-            place.starts[: len(shapes) + 1] = texture.packing.starts
+            layout.levels, layout.channels = len(shapes), texture.texels.shape[1]
+            layout.rows[: len(shapes)] = [rows for rows, _ in shapes]
+            layout.columns[: len(shapes)] = [columns for _, columns in shapes]
+            layout.starts[: len(shapes) + 1] = texture.packing.starts
         self.refresh()
 
     def _targets(self) -> list[Network]:
         return [self.description.decoder, self.description.offset]
 
-    def _places(self) -> list[Textures]:
+    def _layouts(self) -> list[Textures]:
         return [self.description.pyramid, self.description.offset_texture]
 
     def refresh(self) -> None:
@@ -135,10 +135,10 @@ class NativeModel:
         for network, target, packed in zip(networks(self.model), self._targets(), self._packed, strict=False):
             held = [p.detach().contiguous() for p in parameters_of(network)]
             library.mbtf_pack(variant, ctypes.byref(target), pointers(held), packed.data_ptr())
-        for texture, place in zip(self.model.textures(), self._places(), strict=False):
+        for texture, layout in zip(self.model.textures(), self._layouts(), strict=False):
             table = texture.table.detach().contiguous()
             self._kept.append(table)
-            place.table = table.data_ptr()
+            layout.table = table.data_ptr()
 
     @property
     def textures(self) -> list[FeatureTextures]:

@@ -17,6 +17,15 @@ CHECKPOINT_NAME = "checkpoint.safetensors"
 _MOMENTS = ("step", "exp_avg", "exp_avg_sq")
 
 
+def state_tensors(trainer: Trainer) -> dict[str, Tensor]:
+    """Parameters and optimizer state by name."""
+    tensors = {f"model.{name}": p.detach() for name, p in trainer.model.named_parameters()}
+    for name, p in trainer.model.named_parameters():
+        for key, value in trainer.optimizer.state.get(p, {}).items():
+            tensors[f"adam.{key}.{name}"] = value
+    return tensors
+
+
 def write_checkpoint(trainer: Trainer, path: Path) -> None:
     """Write parameters, optimizer state and progress.
 
@@ -24,11 +33,7 @@ def write_checkpoint(trainer: Trainer, path: Path) -> None:
     ------
     PartialError : the disk is full or the folder cannot be written
     """
-    tensors = {f"model.{name}": p.detach() for name, p in trainer.model.named_parameters()}
-    for name, p in trainer.model.named_parameters():
-        for key, value in trainer.optimizer.state.get(p, {}).items():
-            tensors[f"adam.{key}.{name}"] = value
-    write_tensors(path, tensors, asdict(trainer.progress))
+    write_tensors(path, state_tensors(trainer), asdict(trainer.progress))
 
 
 def read_checkpoint(trainer: Trainer, path: Path) -> None:

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mbtf_core.console import CONSOLE, Console, clock, going_on
+from mbtf_core.console import CONSOLE, Console, clock, resumable
 from mbtf_core.errors import EXIT_BAD_INPUT, EXIT_OK
 from mbtf_core.options import DryRun
 from mbtf_gen.cli.generate import describe

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from mbtf_core.console import CONSOLE, Console, clock, going_on
+from mbtf_core.console import CONSOLE, Console, clock, resumable
 from mbtf_core.errors import UsageError
 from mbtf_core.options import Options, Output, Overwrite, takes_options
 from mbtf_gen.cli.common import resolve_config

@@ -51,14 +51,14 @@ def count_queries(text: str | int | float, texels: int) -> int:
 
 
 def _count(text: Any) -> str:
-    """One spelling per count, so that ``400 / texel`` and ``400/texel`` are one configuration."""
+    """One spelling per count: ``400 / texel`` and ``400/texel`` are one configuration."""
     number, per_texel = parse_count(text)
     digits = str(int(number)) if number == int(number) else repr(number)
     return f"{digits}/texel" if per_texel else digits
 
 
 def _share(text: Any) -> Any:
-    """A share as a number, also from ``2%``."""
+    """A fraction as a number, also from ``2%``."""
     if isinstance(text, str) and (match := _PERCENT.match(text)):
         return float(match[1]) / 100.0
     return text
@@ -114,7 +114,7 @@ class MixtureSection(Settings):
 
 
 class QueriesSection(Settings):
-    """Which queries are drawn and how many paths each gets."""
+    """Distribution and number of the queries, and paths per query."""
 
     train: Annotated[Count, Flag("--queries", "N|N/texel")] = Field(
         "100/texel", description="training queries, in all or per texel of the finest level"
@@ -173,7 +173,7 @@ class LightSection(Settings):
 
 
 class TransportSection(Settings):
-    """How light paths are followed."""
+    """Depth limits of light paths."""
 
     max_depth: Annotated[int, Flag("--max-depth")] = Field(
         0, ge=0, le=1000, description="surface interactions per path; 0: no limit (Russian roulette)"
@@ -191,7 +191,7 @@ def _effects(text: str) -> str:
 
 
 class EffectsSection(Settings):
-    """Which effects of light are simulated."""
+    """Which light transport effects are simulated."""
 
     mode: Annotated[str, AfterValidator(_effects), Flag("--effects")] = Field(
         "auto",
@@ -203,19 +203,19 @@ class EffectsSection(Settings):
     )
     normal: NormalMode = Field(
         "residual",
-        description="slopes of a normal map: those the mesh lacks, all in place of its own, or none",
+        description="normal map: add the slopes that the mesh lacks, replace the mesh's slopes, or ignore",
     )
 
 
 class OutputSection(Settings):
-    """How the data are stored."""
+    """File format and size of the shards."""
 
     format: Annotated[ArrayFormat, Flag("--format")] = Field("npz", description="file format of the shards")
     shard_queries: int = Field(1 << 18, ge=1, le=1 << 24, description="queries per shard")
 
 
 class GeneratorConfig(Settings):
-    """Everything ``mbtf-gen`` needs to make a data set."""
+    """Everything that ``mbtf-gen`` needs to generate a data set."""
 
     version: Literal[2] = 2
     material: FileName = Field(description="height map, folder of maps, or material.yaml")
@@ -230,8 +230,7 @@ class GeneratorConfig(Settings):
     )
 
     def data_fields(self, inputs: dict[str, str]) -> dict[str, Any]:
-        """What the data depend on: the options, and the digests of the input files in place of their
-        names."""
+        """What the data depend on: the options, and digests of the input files instead of their names."""
         fields = self.model_dump(exclude={"material"})
         return {"schema": SCHEMA_VERSION, "inputs": dict(sorted(inputs.items())), **fields}
 

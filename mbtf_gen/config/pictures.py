@@ -1,4 +1,4 @@
-"""Options of the commands that make pictures: those of the generator, and what the pictures show."""
+"""Options of the commands that render pictures: the generator's, and view, light and size."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mbtf_gen.config.generator import GeneratorConfig, Paths
 
 def _distinct(values: list[float]) -> list[float]:
     if len(set(values)) < len(values):
-        raise ValueError("holds the same width twice")
+        raise ValueError("lists the same width twice")
     return values
 
 
@@ -69,7 +69,7 @@ class ReferenceSection(Settings):
 
 
 class PreviewSection(Settings):
-    """Pictures for a first look."""
+    """Pictures of ``mbtf-gen preview``."""
 
     view: Annotated[Direction, Flag("--view", "ELEVATION,AZIMUTH")] = Field(
         Direction(elevation=40, azimuth=-90), description="direction of the camera in degrees"
@@ -99,5 +99,5 @@ class PreviewConfig(GeneratorConfig):
 
 
 def without_queries(config: GeneratorConfig) -> dict[str, Any]:
-    """The options, as plain data, of pictures that no query is drawn for."""
+    """The options, as plain data, without those of queries and output."""
     return config.model_dump(mode="json", exclude={"queries", "output"})

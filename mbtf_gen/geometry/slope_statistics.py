@@ -1,4 +1,4 @@
-"""Measures of a relief: slopes of its mesh, how fine its detail is, whether it repeats within the tile."""
+"""Statistics of heights: slopes of the mesh, size of detail, repetition within the tile."""
 
 from __future__ import annotations
 

@@ -107,7 +107,7 @@ class NormalEntry(Settings):
         return _short(data)
 
 
-# What a BSDF of the user's own stands in place of.
+# What a BSDF of the user's own replaces.
 _REFLECTANCE = (
     *("base_color", "roughness", "metallic", "specular", "clearcoat", "clearcoat_roughness"),
     *("sheen", "sheen_color", "sheen_roughness"),
@@ -119,27 +119,29 @@ _GOES_WITH = {"clearcoat_roughness": "clearcoat", "sheen_color": "sheen", "sheen
 class MaterialFile(Settings):
     """Content of a ``material.yaml``; file names are relative to its folder."""
 
-    height: HeightEntry = Field(description="heights; the only key that must be there")
+    height: HeightEntry = Field(description="heights; the only required key")
     base_color: ColorEntry | None = Field(None, description="color; default: linear gray 0.5")
     roughness: ShareEntry | None = Field(None, description="0 mirror to 1; default 0.5 once one is given")
     metallic: ShareEntry | None = Field(None, description="0 dielectric to 1 metal; default 0")
     specular: ShareEntry | None = Field(None, description="strength of the dielectric lobe; default 0.5")
-    clearcoat: ShareEntry | None = Field(None, description="share of a clear coat over it all; default 0")
-    clearcoat_roughness: ShareEntry | None = Field(None, description="of the coat; default 0.1")
-    sheen: ShareEntry | None = Field(None, description="weight of a sheen on top of it all; default 0")
-    sheen_color: ColorEntry | None = Field(None, description="of the sheen; default white")
-    sheen_roughness: ShareEntry | None = Field(None, description="of the sheen; default 0.3")
+    clearcoat: ShareEntry | None = Field(None, description="weight of a clear coat on top; default 0")
+    clearcoat_roughness: ShareEntry | None = Field(
+        None, description="roughness of the clear coat; default 0.1"
+    )
+    sheen: ShareEntry | None = Field(None, description="weight of a sheen on top; default 0")
+    sheen_color: ColorEntry | None = Field(None, description="color of the sheen; default white")
+    sheen_roughness: ShareEntry | None = Field(None, description="roughness of the sheen; default 0.3")
     normal: NormalEntry | None = Field(None, description="tangent-space normal map")
     opacity: ShareEntry | None = Field(None, description="1 opaque to 0 hole; default: opaque")
     bsdf: dict[str, Any] | None = Field(
-        None, description="Mitsuba BSDF in place of the maps, passed on as it is"
+        None, description="Mitsuba BSDF that replaces the maps, passed to Mitsuba unchanged"
     )
 
     @model_validator(mode="after")
     def _bsdf_alone(self) -> MaterialFile:
         given = [n for n in _REFLECTANCE if getattr(self, n) is not None]
         if self.bsdf is not None and given:
-            raise ValueError(f"'bsdf' stands in place of {', '.join(given)}; give one or the other")
+            raise ValueError(f"'bsdf' replaces {', '.join(given)}; give one or the other")
         for name, other in _GOES_WITH.items():
             if getattr(self, name) is not None and getattr(self, other) is None:
                 raise ValueError(f"'{name}' goes with '{other}'")

@@ -137,8 +137,8 @@ def blend_normals(normal: NDArray[np.float32]) -> NDArray[np.float32]:
 def retile(maps: Mapping[str, Any], tile: Tiling) -> dict[str, Any]:
     """Maps by role, mirrored or blended; constants and None stay as they are.
 
-    Lengths are in tile widths. A mirrored tile is two images wide, so its heights are halved: the shape of the
-    surface stays.
+    Lengths are in tile widths. A mirrored tile is two images wide, so its heights are halved: the shape of
+    the surface stays.
 
     Parameters
     ----------
@@ -159,5 +159,5 @@ def retile(maps: Mapping[str, Any], tile: Tiling) -> dict[str, Any]:
 def tiling_note(tile: Tiling) -> str:
     """What was done to make the maps tile, in words."""
     if tile == "mirror":
-        return "tile: two by two mirrored copies; the tile is two images wide, so heights in tile widths are half"
+        return "tile: two by two mirrored copies; the tile is two images wide, so heights count half"
     return f"tile: edges cross-faded over {BAND:g} of the tile"

@@ -2,8 +2,8 @@
 
 Positions are stratified: pass after pass over the finest level's texels in a new random order, one query at
 a random point of each. Levels are stratified within a shard over the cumulative mixture. Directions are
-uniform on the projected disk, ``r ≤ √(1 - cos²_min)``. All arithmetic is exactly rounded (see ``exact.py``),
-so queries are the same bits on every machine.
+uniform on the projected disk, ``r ≤ √(1 - cos²_min)``. All arithmetic is exactly rounded
+(:mod:`~mbtf_gen.sampling.exact_math`), so queries are the same bits on every machine.
 """
 
 from __future__ import annotations
@@ -29,7 +29,12 @@ class Queries:
 
     Attributes
     ----------
-    u : (..., 2) uv; sigma : (...) tile widths; omega_i, omega_o : (..., 3) unit vectors. float32.
+    u : (..., 2) float32 array
+        Positions on the reference plane, uv in [0, 1).
+    sigma : (...) float32 array
+        Standard deviations of the footprints, in tile widths.
+    omega_i, omega_o : (..., 3) float32 arrays
+        Unit vectors towards the light and towards the viewer.
     """
 
     u: F32
@@ -97,14 +102,24 @@ def _rounded(u: NDArray[np.float64], v: NDArray[np.float64]) -> F32:
 
 @dataclass(frozen=True)
 class QueryPlan:
-    """Draws the queries of any shard on its own.
+    """Samples the queries of any shard independently of other shards.
 
     Attributes
     ----------
-    lattice : texel grids; mixture : over levels; min_cos : smallest cosine of both directions
-    layout : ``shuffled`` or ``image``; root : root seed; shard_rows : queries (or buffers) per full shard
-    window : places along each side of a buffer, one texel of the level nearest to its footprint apart; None:
-        one place in each texel of the finest level
+    lattice : Lattice
+        Texel grids of the tile.
+    mixture : Mixture
+        Distribution of the levels.
+    min_cos : float
+        Smallest cosine of both directions to the normal, in (0, 1).
+    layout : "shuffled" or "image"
+    root : int
+        Root seed.
+    shard_rows : int
+        Queries (shuffled layout) or images (image layout) per full shard.
+    patch_size : int or None
+        Texels along each side of an image, of the level nearest to its footprint; None: an image covers the
+        finest level.
     """
 
     lattice: Lattice
@@ -116,8 +131,22 @@ class QueryPlan:
     patch_size: int | None = None
 
     def draw(self, split: str, shard: int, rows: int) -> Queries:
-        """Queries of one shard: `rows` queries, or `rows` buffers, each of the finest lattice or of a window
-        of the lattice nearest to its footprint."""
+        """Sample the queries of one shard.
+
+        Parameters
+        ----------
+        split : str
+            ``train``, ``test``, or a stream of :mod:`mbtf_gen.sampling.rng`.
+        shard : int
+            Number of the shard within the split.
+        rows : int
+            Number of queries (shuffled layout) or images (image layout).
+
+        Returns
+        -------
+        Queries
+            Leading axes ``(rows,)``, or ``(rows, height, width)`` of images.
+        """
         generator = numpy_generator(self.root, split, shard, Purpose.QUERIES)
         sigma = self._sigma(generator, rows)
         omega_i = self._directions(generator, rows)
@@ -154,8 +183,8 @@ class QueryPlan:
         return np.concatenate(parts)
 
     def _patch(self, generator: np.random.Generator, sigma: F32, size: int) -> F32:
-        """Places (n, size, size, 2): grids, one texel of the level nearest to footprints (n,) between
-        neighbors, that begin anywhere and go around the tile."""
+        """Texel positions (n, size, size, 2): patches of the level nearest to footprints (n,), at random
+        offsets, wrapped around the tile."""
         shapes = np.array([self.lattice.shape(s) for s in range(self.lattice.finest + 1)])
         extent = shapes[level_groups(sigma, self.lattice.finest)]
         start = generator.random((len(sigma), 2, 1))

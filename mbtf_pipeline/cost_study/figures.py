@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -26,18 +27,6 @@ def is_significant(bias: Estimate | None) -> bool:
     return bias is not None and bias.value > 2 * bias.error
 
 
-def _seconds(m: Measurement) -> Estimate:
-    return m.seconds
-
-
-def _error(m: Measurement) -> Estimate:
-    return m.error
-
-
-def _name(m: Measurement) -> str:
-    return m.name
-
-
 def _figure(
     clouds: Sequence[Cloud], x: str, y: str, name: str, folder: Path, caption: str = "", **options: Any
 ) -> dict[str, Any]:
@@ -51,29 +40,18 @@ def _figure(
 def _cloud(
     name: str,
     found: Sequence[Measurement],
-    y: Value = _error,
-    x: Value = _seconds,
+    y: Value = attrgetter("error"),
+    x: Value = attrgetter("seconds"),
     *,
-    label: Callable[[Measurement], str] = _name,
+    label: Callable[[Measurement], str] = attrgetter("name"),
     joined: bool = True,
     hollow: bool = False,
 ) -> Cloud:
     usable = [m for m in found if math.isfinite(y(m).value) and math.isfinite(x(m).value)]
     ordered = sorted(usable, key=lambda m: x(m).value)
-
-    def errors(of: Value) -> list[float]:
-        return [of(m).error if math.isfinite(of(m).error) else 0.0 for m in ordered]
-
-    return Cloud(
-        name,
-        [x(m).value for m in ordered],
-        [y(m).value for m in ordered],
-        errors(x),
-        errors(y),
-        [label(m) for m in ordered],
-        joined=joined,
-        hollow=hollow,
-    )
+    xs, ys = ([of(m).value for m in ordered] for of in (x, y))
+    dx, dy = ([e if math.isfinite(e := of(m).error) else 0.0 for m in ordered] for of in (x, y))
+    return Cloud(name, xs, ys, dx, dy, [label(m) for m in ordered], joined=joined, hollow=hollow)
 
 
 def _by_series(found: Sequence[Measurement], **options: Any) -> list[Cloud]:

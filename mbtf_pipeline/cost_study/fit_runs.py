@@ -12,7 +12,8 @@ from mbtf_pipeline.cost_study.runs import DataRequest, Run
 
 # Shares of a study's time. The generator gets its own; runs get theirs for two seeds each. The rest is left
 # for start-up, the test set and evaluation.
-GENERATOR, WHOLE, DATA, MODELS = 0.1, 0.42, 0.13, 0.15
+GENERATOR = 0.1
+RUN_SHARES = {"whole": 0.42, "models": 0.15, "data": 0.13}
 # Total times of whole runs, seconds: this one, twice, four times, ...; the share of each that generates.
 SHORTEST = 8.0
 SHARE, OTHER_SHARES = 0.35, (0.6, 0.15)
@@ -42,10 +43,11 @@ def planned_runs(seconds: float, spp: int, query_seconds: QuerySeconds) -> list[
     spp : paths per query of the recipe
     """
     each = seconds / FEWEST_SEEDS
+    planners = {"whole": _whole, "models": _models, "data": _data}
     return [
-        *_whole(WHOLE * each, spp, query_seconds),
-        *_models(MODELS * each, spp, query_seconds),
-        *_data(DATA * each, spp, query_seconds),
+        run
+        for study, share in RUN_SHARES.items()
+        for run in planners[study](share * each, spp, query_seconds)
     ]
 
 

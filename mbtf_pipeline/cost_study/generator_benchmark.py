@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 import statistics
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -50,23 +51,6 @@ _PROBE = 2048
 
 
 @dataclass(frozen=True)
-class BenchmarkResult:
-    """Time and error of a configuration.
-
-    Attributes
-    ----------
-    seconds : per million queries
-    bias, noise, error : root mean squares relative to the mean value of the reference; no bias where only the
-        number of paths differs from the reference
-    """
-
-    seconds: Estimate
-    bias: Estimate | None
-    noise: Estimate
-    error: Estimate
-
-
-@dataclass(frozen=True)
 class _Reference:
     """Queries and both halves (n, 3) of the reference's values there."""
 
@@ -88,10 +72,7 @@ class GeneratorBenchmark:
     config: GeneratorConfig
     material: Material
     seed: int
-    # By the options of the reference: estimator and mean value; by options and number: its batches.
-    _estimators: dict[str, tuple[Job, Any]] = field(default_factory=dict, repr=False)
-    _references: dict[tuple[str, int], _Reference] = field(default_factory=dict, repr=False)
-    _means: dict[str, Estimate] = field(default_factory=dict, repr=False)
+    _cache: dict[str, Any] = field(default_factory=dict, repr=False)
 
     def job(self, changes: dict[str, Any]) -> Job:
         """The job with options changed, by dotted name."""
@@ -110,30 +91,27 @@ class GeneratorBenchmark:
         """Queries of a test split, one leading axis."""
         return job.query_plan.draw("test", shard, count)
 
+    def _once(self, make: Callable[..., Any], changes: dict[str, Any], *rest: int) -> Any:
+        """What `make` gives for a reference with these options, made once."""
+        key = f"{make.__name__} {sorted(changes.items())} {rest}"
+        if key not in self._cache:
+            self._cache[key] = make(changes, *rest)
+        return self._cache[key]
+
     def reference(self, changes: dict[str, Any], batch: int) -> _Reference:
         """One batch of the reference with these options."""
-        key = _key(changes), batch
-        if key not in self._references:
-            job, estimator = self._estimator(changes)
-            queries = self._queries(job, _FIRST_REFERENCE + batch, BIAS_QUERIES)
-            self._references[key] = _Reference(
-                queries, *self._bias_halves(estimator, queries, batch, BIAS_SPP)
-            )
-        return self._references[key]
+        found: _Reference = self._once(self._make_reference, changes, batch)
+        return found
+
+    def _make_reference(self, changes: dict[str, Any], batch: int) -> _Reference:
+        job, estimator = self._once(self._make_estimator, changes)
+        queries = self._queries(job, _FIRST_REFERENCE + batch, BIAS_QUERIES)
+        return _Reference(queries, *self._bias_halves(estimator, queries, batch, BIAS_SPP))
 
     def mean(self, changes: dict[str, Any]) -> Estimate:
         """Mean value of the reference with these options, 1/sr."""
-        key = _key(changes)
-        if key not in self._means:
-            job, estimator = self._estimator(changes)
-            parts = []
-            for number in range(_MEAN_BATCHES):
-                shard = _FIRST_MEAN + number * (_MEAN_QUERIES // SHARD)
-                queries = self._queries(job, shard, _MEAN_QUERIES)
-                found = estimator.estimate(queries, _MEAN_SPP, Stream(self.seed, "test", shard))
-                parts.append(0.5 * (found.value_a.astype(np.float64) + found.value_b).mean(axis=1))
-            self._means[key] = mean_estimate(np.concatenate(parts))
-        return self._means[key]
+        found: Estimate = self._once(self._make_mean, changes)
+        return found
 
     def _estimator(self, changes: dict[str, Any]) -> tuple[Job, Any]:
         key = _key(changes)
@@ -151,8 +129,9 @@ class GeneratorBenchmark:
 
     def measure(
         self, changes: dict[str, Any], against: dict[str, Any] | None, seconds: float
-    ) -> BenchmarkResult:
-        """Time and error of a configuration.
+    ) -> tuple[Estimate, Estimate, Estimate | None, Estimate]:
+        """(seconds per million queries, error, bias, noise) of a configuration; errors are root mean squares
+        relative to the mean value of the reference.
 
         Parameters
         ----------
@@ -164,13 +143,12 @@ class GeneratorBenchmark:
         noise, time_per_million = self.noise(self.job(changes), seconds, mean.value)
         root = _relative_to(_root(noise), mean)
         if against is None:
-            return BenchmarkResult(time_per_million, None, root, root)
+            return time_per_million, root, None, root
         bias = self.bias(changes, against, seconds)
         # A squared bias that noise made negative counts as none.
         square = Estimate(max(bias.value, 0.0) + noise.value, math.hypot(bias.error, noise.error), noise.n)
-        return BenchmarkResult(
-            time_per_million, _relative_to(_root(bias), mean), root, _relative_to(_root(square), mean)
-        )
+        error, root_bias = (_relative_to(_root(e), mean) for e in (square, bias))
+        return time_per_million, error, root_bias, root
 
     def bias(
         self, changes: dict[str, Any], against: dict[str, Any], seconds: float, spp: int = BIAS_SPP
@@ -230,11 +208,6 @@ class GeneratorBenchmark:
             if len(squares) >= _FEWEST_BATCHES and (narrow or late):
                 # The first batch may compile kernels.
                 return variance, _median(times[1:])
-
-
-def _key(changes: dict[str, Any]) -> str:
-    """Options as a key, whatever their order."""
-    return repr(sorted(changes.items()))
 
 
 def _median(times: list[float]) -> Estimate:

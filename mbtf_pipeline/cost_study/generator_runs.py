@@ -50,8 +50,7 @@ class GeneratorTask:
     def run(self, benchmark: GeneratorBenchmark, seconds: float) -> Measurement:
         """Measure it, for at most so many seconds each of noise and bias."""
         found = benchmark.measure(self.changes, self.against, seconds)
-        parts = found.seconds, found.error, found.bias, found.noise
-        return Measurement(self.study, self.series, self.name, self.changes, "", *parts)
+        return Measurement(self.study, self.series, self.name, self.changes, "", *found)
 
     def command(self, generator: str) -> str:
         """Reproduces it: the generator's command with the study's configuration, and the changed options."""

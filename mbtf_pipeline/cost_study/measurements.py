@@ -54,13 +54,6 @@ class Measurement:
 _ESTIMATES = ("seconds", "error", "bias", "noise")
 
 
-def _estimate(record: dict[str, Any] | None) -> Estimate | None:
-    if record is None:
-        return None
-    value, error = (math.nan if record[k] is None else record[k] for k in ("value", "error"))
-    return Estimate(value, math.inf if math.isnan(error) else error, record["n"])
-
-
 class MeasurementFolder:
     """Finished measurements, one file each, so that a study resumes where it stopped.
 
@@ -87,7 +80,7 @@ class MeasurementFolder:
             data = read_json(path)
             if data.pop("format") != FORMAT or data.pop("schema") != SCHEMA:
                 return None
-            data |= {name: _estimate(data[name]) for name in _ESTIMATES}
+            data |= {name: e and estimate(e) for name in _ESTIMATES for e in (data[name],)}
             data["details"] = {k: math.nan if v is None else v for k, v in data["details"].items()}
             return Measurement(**data)
         except (InputError, KeyError, TypeError, AttributeError):

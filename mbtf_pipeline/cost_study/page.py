@@ -18,7 +18,7 @@ from mbtf_pipeline.cost_study.figures import (
     noise_figures,
 )
 from mbtf_pipeline.cost_study.measurements import HALF_WIDTH, NORMAL, Measurement
-from mbtf_pipeline.cost_study.pareto import extrapolation, pareto_front, power_law
+from mbtf_pipeline.cost_study.pareto import extrapolation, pareto_front
 from mbtf_pipeline.cost_study.study import STUDY_NAME, Study
 from mbtf_pipeline.cost_study.tables import generator_table, run_table, to_csv
 from mbtf_pipeline.report.report import page_environment, template
@@ -81,17 +81,6 @@ def whole_runs(found: Sequence[Measurement]) -> list[Measurement]:
     ]
 
 
-def noise_exponent(found: Sequence[Measurement]) -> Estimate | None:
-    """Power of the number of paths with which the noise variance changes; None for fewer than three numbers
-    of paths."""
-    known = [
-        (float(m.options["queries.spp"]), Estimate(m.noise.value**2, 2 * m.noise.value * m.noise.error, 1))
-        for m in found
-        if m.study == "paths" and m.series == "uniform" and m.noise and m.noise.value > 0 < m.noise.error
-    ]
-    return power_law(*zip(*known, strict=True)) if len(known) >= 3 else None
-
-
 def narrow_errors(found: Sequence[Measurement]) -> tuple[int, int]:
     """(errors whose 95 % interval is within `HALF_WIDTH` of them, all errors)."""
     widths = [NORMAL * m.error.relative_error for m in found if m.error.value > 0]
@@ -103,16 +92,10 @@ def _section(study: Study, name: str) -> dict[str, Any] | None:
     if not found:
         return None
     section = _SECTIONS[name]
-    text = section.text
-    if name == "paths" and (exponent := noise_exponent(found)) is not None:
-        text += (
-            f" With equally many paths the noise variance changes as paths to the power {exponent}; with "
-            "independent samples the power would be -1."
-        )
     return {
         "id": name,
         "title": section.title,
-        "text": text,
+        "text": section.text,
         "figures": section.figures(found, name, study.folder),
         "table": section.table(found),
         "open": False,

@@ -41,19 +41,12 @@ def extrapolation(front: Sequence[Measurement]) -> tuple[float, Estimate] | None
     last = [m for m in front if m.error.value > 0 and math.isfinite(m.error.error)][-_FEWEST:]
     if len(last) < _FEWEST:
         return None
-    slope = power_law(
-        [m.seconds.value for m in last],
-        [Estimate(m.error.value, max(m.error.error, _BEST_KNOWN * m.error.value), 1) for m in last],
-    )
-    if -slope.value <= max(2.0 * slope.error, math.log(2.0) / math.log(_FURTHEST)):
-        return None
-    return front[-1].seconds.value * (2.0 ** (-1.0 / slope.value) - 1.0), slope.scaled(-1.0)
-
-
-def power_law(xs: Sequence[float], ys: Sequence[Estimate]) -> Estimate:
-    """Exponent of a power law through points, by weighted least squares in logarithms."""
-    weights = np.array([1.0 / y.relative_error for y in ys])
-    x, y = np.log(xs), np.log([e.value for e in ys])
+    # Weighted least squares in logarithms.
+    weights = np.array([1.0 / max(m.error.relative_error, _BEST_KNOWN) for m in last])
+    x, y = np.log([m.seconds.value for m in last]), np.log([m.error.value for m in last])
     x -= np.average(x, weights=weights**2)
     spread = float(((weights * x) ** 2).sum())
-    return Estimate(float((weights**2 * x * y).sum()) / spread, 1.0 / math.sqrt(spread), len(xs))
+    power = Estimate(-float((weights**2 * x * y).sum()) / spread, 1.0 / math.sqrt(spread), len(last))
+    if power.value <= max(2.0 * power.error, math.log(2.0) / math.log(_FURTHEST)):
+        return None
+    return front[-1].seconds.value * (2.0 ** (1.0 / power.value) - 1.0), power

@@ -90,56 +90,42 @@ class Repeated:
 def measure_runs(
     runs: Sequence[Run], store: MeasurementFolder, runner: RunRunner, fits: Callable[[Run], bool], seeds: int
 ) -> Repeated:
-    """Measure each comparison with the study's seed and with another one, then runs whose 95 % interval is
-    too wide with further seeds; store every measurement. Repeats begin with the shortest run.
+    """Measure every run with two seeds before the next one, then runs whose 95 % interval is too wide with
+    further seeds; store every measurement.
 
     Parameters
     ----------
-    runs : the runs of one comparison follow each other
     fits : whether a run fits into the remaining time
     seeds : number of seeds that may be measured; stored measurements count in any case
     """
     out = Repeated([[] for _ in runs], [])
     broken: set[int] = set()
 
-    def length(k: int) -> float:
-        return out.groups[k][0].details["total_seconds"]
-
-    def measure_seed(seed: int, places: Sequence[int]) -> None:
-        tasks = {k: replace(runs[k], data=replace(runs[k].data, seed=seed)) for k in places}
+    def measure(tasks: Sequence[tuple[int, Run]]) -> None:
         deviation = seed_deviation(out.groups)
-        todo = {
-            k: task
-            for k, task in tasks.items()
-            if store.get(task.study, task.key) is None
-            and seed < seeds
-            and k not in broken
-            and (seed < FEWEST_SEEDS or _is_wide(out.groups[k], deviation))
-        }
-        for k, task in list(todo.items()):
-            del todo[k]
-            if fits(task):
+        for number, (k, task) in enumerate(tasks):
+            group, seed = out.groups[k], task.data.seed
+            found = store.get(task.study, task.key) if len(group) == seed else None
+            wanted = found is None and len(group) == seed < seeds and k not in broken
+            if wanted and (seed < FEWEST_SEEDS or _is_wide(group, deviation)) and fits(task):
                 try:
-                    store.put(task.key, runner.measure(task))
+                    found = runner.measure(task)
+                    store.put(task.key, found)
                 except InputError as error:
                     # The other runs are worth a page all the same.
                     out.failed.append(f"{task.label}: {error.what}")
                     broken.add(k)
-            if all(other.data != task.data for other in todo.values()):
-                runner.forget(task.data)
-        for k, task in tasks.items():
-            if (found := store.get(task.study, task.key)) is not None:
+            if found is not None:
                 command = runner.command_of(runs[k])
-                out.groups[k].append(replace(found, series=task.series, name=task.name, command=command))
+                group.append(replace(found, series=task.series, name=task.name, command=command))
+            if all(other.data != task.data for _, other in tasks[number + 1 :]):
+                runner.forget(task.data)
 
-    def measured(places: Sequence[int], seed: int) -> list[int]:
-        return sorted((k for k in places if len(out.groups[k]) == seed), key=length)
+    def with_seed(k: int, seed: int) -> tuple[int, Run]:
+        return k, replace(runs[k], data=replace(runs[k].data, seed=seed))
 
-    for study in dict.fromkeys(run.study for run in runs):
-        places = [k for k, run in enumerate(runs) if run.study == study]
-        measure_seed(0, places)
-        for seed in range(1, FEWEST_SEEDS):
-            measure_seed(seed, measured(places, seed))
-    for seed in range(FEWEST_SEEDS, MOST_SEEDS):
-        measure_seed(seed, measured(range(len(runs)), seed))
+    places = range(len(runs))
+    measure([with_seed(k, seed) for k in places for seed in range(FEWEST_SEEDS)])
+    for seed in range(1, MOST_SEEDS):
+        measure([with_seed(k, seed) for k in places])
     return out

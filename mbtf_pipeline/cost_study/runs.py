@@ -99,14 +99,14 @@ class RunRunner:
         folder: Path,
         command: str,
         progress: Callable[[str], None],
-        test: tuple[int, int] = TEST,
+        test: tuple[int, int] | None = None,
         query_seconds: Callable[[int], float] = lambda paths: 0.0,
     ) -> None:
         self.config = config
         self.folder = folder
         self.command = command
         self.progress = progress
-        self.test = test
+        self.test = test or TEST
         self.query_seconds = query_seconds
         # Seconds by which a run exceeds generating and training: the most of all so far, or a guess.
         self._overhead = _OVERHEAD
@@ -158,7 +158,8 @@ class RunRunner:
 
     def _planned_seconds(self, run: Run) -> float:
         generating = 0.0 if self.has(run.data) else run.data.queries * self.query_seconds(run.data.spp)
-        return generating + parse_duration(run.fit["training"].get("time", 0.0))
+        training = run.fit["training"].get("time")
+        return generating + (0.0 if training is None else parse_duration(training))
 
     def test_set(self) -> ShardQueries:
         """The test queries of all runs."""

@@ -1,8 +1,9 @@
-"""A cost study: measures what accuracy costs within a time budget, and resumes where it stopped."""
+"""A cost study: measures what accuracy costs within a given time, and resumes where it stopped."""
 
 from __future__ import annotations
 
 import math
+import shlex
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -16,7 +17,7 @@ from mbtf_core.folders import ELSEWHERE, check_folder, make_folder
 from mbtf_core.stats import Estimate, signal_variance
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.material.material import load_material
-from mbtf_pipeline.cost_study.fit_runs import GENERATOR, QuerySeconds, planned_runs
+from mbtf_pipeline.cost_study.fit_runs import GENERATOR, RUN_SHARES, QuerySeconds, planned_runs
 from mbtf_pipeline.cost_study.generator_benchmark import GeneratorBenchmark
 from mbtf_pipeline.cost_study.generator_runs import generator_tasks
 from mbtf_pipeline.cost_study.measurements import Measurement, MeasurementFolder
@@ -189,7 +190,7 @@ def run_study(
         write_text(folder / CONFIG_NAME, dump_yaml(config.model_dump(mode="json")))
         study = Study(folder, description)
         store = MeasurementFolder(folder, {"config": config.hash(material.digests)})
-        generator = f"mbtf-gen {config.material} --config {folder / CONFIG_NAME}"
+        generator = shlex.join(["mbtf-gen", config.material, "--config", str(folder / CONFIG_NAME)])
         _measure_generator(study, store, benchmark, generator, clock, progress)
         runner = RunRunner(config, folder / WORK, generator, lambda note: progress(clock.share(), note))
         try:
@@ -255,9 +256,16 @@ def _measure_runs(
     runner.query_seconds = query_seconds(benchmark, store)
     runs = planned_runs(clock.seconds, runner.config.queries.spp, runner.query_seconds)
 
+    # On a machine slower than planned, every comparison keeps its share of the time.
+    start, studies, shares = clock.left(), list(RUN_SHARES), list(RUN_SHARES.values())
+    reached = 0
+
     def fits(run: Run) -> bool:
+        nonlocal reached
+        reached = max(reached, studies.index(run.study))
+        reserved = start * sum(shares[reached + 1 :]) / sum(shares)
         # The additional time is for repeats alone.
-        return clock.left(refining=run.data.seed > 0) > runner.expected_seconds(run)
+        return clock.left(refining=run.data.seed > 0) - reserved > runner.expected_seconds(run)
 
     found = measure_runs(runs, store, runner, fits, MOST_SEEDS if clock.refine else FEWEST_SEEDS)
     study.deviation = seed_deviation(found.groups)

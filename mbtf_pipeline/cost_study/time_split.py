@@ -94,32 +94,13 @@ class Split:
         )
 
 
-@dataclass(frozen=True)
-class Costs:
-    """Measured times in seconds: per generated query, of starting the generator with its test split, of a fit
-    besides training, and of that per query; and the number of fits."""
-
-    query: float
-    start: float
-    fit: float
-    fit_query: float
-    fits: int
-
-    def split(self, seconds: float, share: float, most: float = math.inf) -> tuple[int, float, float, float]:
-        """(queries, seconds of generating, of training, of fits besides training) for a total time; at most
-        so many queries."""
-        left = seconds - self.start - self.fits * self.fit
-        # Of n queries, n (query / share + fits fit_query) is the time left.
-        count = min(most, left / (self.query / share + self.fits * self.fit_query))
-        queries = round_down(max(_FEWEST_QUERIES, count))
-        generating = queries * self.query
-        other = self.fits * (self.fit + queries * self.fit_query)
-        training = max(1.0 * self.fits, seconds - self.start - generating - other)
-        return queries, generating + self.start, training, other
-
-
 def split_time(
-    recipe: Recipe, seconds: float, folder: Path, command: str, progress: Callable[[str], None]
+    recipe: Recipe,
+    seconds: float,
+    folder: Path,
+    command: str,
+    progress: Callable[[str], None],
+    share: float | None = None,
 ) -> Split:
     """How to spend a total time on a recipe; stored in the run's folder, so that the same command resumes
     with the same split.
@@ -128,6 +109,7 @@ def split_time(
     ----------
     command : of the run, for its record
     progress : called with a note after every pilot
+    share : generate for this share of the time, without pilots
 
     Raises
     ------
@@ -172,34 +154,36 @@ def _stored(folder: Path, key: str) -> Split | None:
         return None
 
 
-def _measure(recipe: Recipe, seconds: float, folder: Path, progress: Callable[[str], None]) -> Split:
+def _measure(
+    recipe: Recipe, seconds: float, share: float | None, folder: Path, progress: Callable[[str], None]
+) -> Split:
     start = time.perf_counter()
-    pilots, costs = measure_costs(recipe, PILOT * seconds, folder, progress)
-    share = min(pilots, key=lambda p: p[1])[0] if pilots else DEFAULT_SHARE
-    took = time.perf_counter() - start
-    left = max(seconds - took, _LEAST_LEFT * seconds + costs.start + costs.fits * costs.fit)
-    queries, *parts = costs.split(left, share, most_queries(recipe, folder))
-    generating, training, other = (round(part, 1) for part in parts)
-    return Split(queries, generating, training, other, share, tuple(pilots), round(took, 1))
-
-
-def measure_costs(
-    recipe: Recipe, length: float, folder: Path, progress: Callable[[str], None]
-) -> tuple[list[tuple[float, float]], Costs]:
-    """(share, unexplained variance) of pilots of so many seconds each, and the costs of a run. Lengths below
-    `SHORTEST_PILOT` and failed pilots leave no pilots."""
-    query, start = _generating(recipe.generate)
+    query, generator = _generating(recipe.generate)
     most = most_queries(recipe, folder)
-    errors: list[tuple[float, float]] = []
-    fits = [(1.0, _FIT)]
-    if length >= SHORTEST_PILOT:
+    pilots: list[tuple[float, float]] = []
+    costs = [(1.0, _FIT)]
+    if share is None and PILOT * seconds >= SHORTEST_PILOT:
         try:
-            errors, fits = _pilots(recipe, length, query, most, progress)
+            pilots, costs = _pilots(recipe, PILOT * seconds, query, most, progress)
         except InputError as error:
             progress(f"pilot failed: {error.what}; {DEFAULT_SHARE:.0%} of the time generates")
     # The values of a flat plane do not vary: their unexplained variance is not defined.
-    errors = errors if all(math.isfinite(error) for _, error in errors) else []
-    return errors, Costs(query, start, *_line(fits), len(recipe.fit))
+    pilots = pilots if all(math.isfinite(error) for _, error in pilots) else []
+    if share is None:
+        share = min(pilots, key=lambda p: p[1])[0] if pilots else DEFAULT_SHARE
+    fits = len(recipe.fit)
+    fit, fit_query = _line(costs)
+    took = time.perf_counter() - start
+    left = max(seconds - took, _LEAST_LEFT * seconds + generator + fits * fit) - generator
+    # Of n queries, n (query / share + fits fit_query) is the time that is neither start nor `fit`.
+    count = min(most, (left - fits * fit) / (query / share + fits * fit_query))
+    queries = round_down(max(_FEWEST_QUERIES, count))
+    other = fits * (fit + queries * fit_query)
+    training = max(1.0 * fits, left - queries * query - other)
+    generating = round(queries * query + generator, 1)
+    return Split(
+        queries, generating, round(training, 1), round(other, 1), share, tuple(pilots), round(took, 1)
+    )
 
 
 def _generating(config: GeneratorConfig) -> tuple[float, float]:

@@ -37,27 +37,7 @@ MaterialLayer = Annotated[Layer, BeforeValidator(_layer)]
 
 
 class PaperRecipe(Settings):
-    """Configuration of a paper recipe.
-
-    Attributes
-    ----------
-    name : str
-        Name of the recipe.
-    title : str or None
-        Title of the page; None stands for the name.
-    description : str
-        Text below the title.
-    output : str or None
-        Folder of all runs; None stands for ``out/NAME`` or ``out/NAME-quick``.
-    tables : list of str
-        Names of the tables.
-    materials : dict of str to Layer
-        Options by material.
-    base, quick : Layer
-        Options of all runs, and those that override them in the quick size.
-    variants : dict of str to Layer
-        Options by variant; every material is run with every variant.
-    """
+    """Configuration of a paper recipe; each material is run with each variant."""
 
     version: Literal[2] = 2
     name: Name

@@ -10,6 +10,7 @@ from typing import Any
 
 from mbtf_core.atomic import read_json, write_text
 from mbtf_core.errors import InputError
+from mbtf_gen.config.effects_request import EFFECTS
 from mbtf_pipeline.compare.compare import COMPARISON_NAME, COMPARISON_SCHEMA
 from mbtf_pipeline.fit_records import read_training
 from mbtf_pipeline.formatting import NOT_SIGNIFICANT
@@ -100,6 +101,7 @@ def write_report(folder: Path, recipe: Recipe, stages: Sequence[str]) -> int:
         "train_spp": manifest["splits"]["train"]["spp"],
         "offsets": offsets,
         "effects": manifest["effects"]["effects"],
+        "effect_labels": EFFECTS,
         "command": run["command"],
         "recipe_yaml": (folder / RECIPE_NAME).read_text(encoding="utf-8"),
         "provenance": provenance(folder, manifest, fit_folders, run["machine"]),

@@ -1,7 +1,4 @@
-"""A material in other programs' forms: textures as EXR, networks as a list of layers, half precision.
-
-The folder that ``mbtf-fit`` writes is written by :mod:`mbtf_fit.material.material`.
-"""
+"""Exports for other programs: textures as EXR, networks as a list of layers, half precision."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Half precision: what rounding every weight and texel to 16 bits costs."""
+"""Half precision: weights and texels rounded to 16 bits, and the rounding error."""
 
 from __future__ import annotations
 
@@ -63,8 +63,8 @@ def round_to_half(name: str, tensor: Tensor) -> Tensor:
 
 
 def to_half(material: Material) -> tuple[Material, HalfError]:
-    """The material with all weights and texels rounded to 16 bits, and what that changes. Arithmetic stays in
-    single precision; the expected values become those of the rounded material.
+    """The material with all weights and texels rounded to 16 bits, and the rounding error. Arithmetic stays
+    in single precision; the conformance values become those of the rounded material.
 
     Raises
     ------

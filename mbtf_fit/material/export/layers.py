@@ -1,4 +1,4 @@
-"""Networks as a plain list of layers in JSON, for shader tool-kits and renderers."""
+"""Networks as a plain list of layers in JSON, for shaders and renderers."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def layers(material: Material, *, half: bool = False) -> dict[str, list[dict[str
 
 
 def _expected_transmittance(material: Material) -> dict[str, Any]:
-    """What passes through holes at the conformance queries, where there are some."""
+    """Transmittance of the conformance queries; empty for an opaque material."""
     if material.transmittance is None:
         return {}
     queries = (material.conformance[name] for name in ("u", "sigma", "omega_o"))
@@ -67,8 +67,8 @@ def _expected_transmittance(material: Material) -> dict[str, Any]:
 
 
 def write_layers(material: Material, path: Path, *, half: bool = False) -> None:
-    """Write everything but the textures: layers, formulas and conventions in words, shapes, and the
-    conformance queries with their expected values. What a material lets through is stated likewise.
+    """Write everything but the textures: layers, formulas and conventions as text, shapes, and the
+    conformance queries with their expected values. The transmittance follows in the same form.
 
     Parameters
     ----------

@@ -30,11 +30,10 @@ class QuerySample:
     Attributes
     ----------
     u : (n, 2) uv
-    level : (m,) fractional levels; omega_i, omega_o : (m, 3) directions. One per query, or in the image
-        layout one per image, whose queries share them
-    split : split of the data set; shards : number of shards read; total : queries of the whole split
-    mixture, finest : distribution of the levels, and the finest level
-    min_cos : smallest cosine of both directions; aspect : H/W of the tile
+    level : (m,) fractional levels; omega_i, omega_o : (m, 3). One per query, or one per image in the image
+        layout, whose queries share them.
+    split : of the data set; shards : taken; total : queries of the whole split
+    mixture, finest : of the levels; min_cos : of both directions; aspect : H/W of the tile
     """
 
     u: NDArray[np.float32]
@@ -117,7 +116,7 @@ def _columns(
     parts: list[Queries],
 ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float32], NDArray[np.float32]]:
     first = parts[0]
-    # In the image layout all queries of an image share footprint and directions: its first one is used.
+    # The image layout repeats footprint and directions over an image: its first query stands for it.
     one: Any = (slice(None), *(0,) * (len(first.lead) - 1))
     return (
         np.concatenate([p.u.reshape(-1, 2) for p in parts]),

@@ -22,6 +22,7 @@ from mbtf_core.lattice import Lattice
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.objective.noise import NoiseModel, typical_value
+from mbtf_fit.training.checkpoint import state_tensors
 from mbtf_fit.training.trainer import Trainer
 
 LATTICE = Lattice(2)
@@ -69,7 +70,7 @@ def rms(x: NDArray[np.floating]) -> float:
 
 def assert_finite(trainer: Trainer) -> None:
     """Every number of the state, means of gradients included."""
-    tensors, _ = trainer.state()
+    tensors = state_tensors(trainer)
     assert all(bool(t.isfinite().all()) for t in tensors.values())
 
 

@@ -147,7 +147,7 @@ class TestAggregate:
         assert alarms <= 300 * 0.05 + 4 * np.sqrt(300 * 0.05)
         assert_uniform(single)
 
-    def test_scatter_is_centerd_under_the_null(self) -> None:
+    def test_scatter_is_centered_under_the_null(self) -> None:
         rng = np.random.default_rng(10)
         truth = self.truth(rng)
         scatter = [

@@ -48,7 +48,7 @@ def p_value(seed: int, distort: float = 1.0) -> float:
     drawn = mixture(n)
     lobe = drawn.lobe
     wrong = Lobe(lobe.l11 * distort, lobe.l21, lobe.l22, lobe.x, lobe.y)
-    wo = np.array(Mixture(wrong, drawn.share, drawn.viewer).sample(*uniform(n, seed))).T
+    wo = np.array(Mixture(wrong, drawn.weight, drawn.viewer).sample(*uniform(n, seed))).T
 
     def density(w: np.ndarray) -> np.ndarray:
         return np.array(mixture(len(w)).density(mi.Vector3f(w.T.astype(np.float32))), np.float64)

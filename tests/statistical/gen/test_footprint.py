@@ -67,7 +67,7 @@ def test_query_rays_pass_the_reference_plane_at_their_point(aspect: float) -> No
     o, d = np.array(ray.o, np.float64).T, np.array(ray.d, np.float64).T
     np.testing.assert_allclose(d, -omega_o, atol=1e-6)
     plane = o[:, :2] - d[:, :2] * o[:, 2:] / d[:, 2:]
-    # The tile is centerd on the origin.
+    # The tile is centered on the origin.
     expected = (u % 1.0 - 0.5) * (unit, unit * aspect)
     np.testing.assert_allclose(plane, expected, atol=1e-4)
 

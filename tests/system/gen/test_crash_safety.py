@@ -231,7 +231,7 @@ def test_an_interruption_keeps_what_was_rendered_and_says_how_to_go_on(
     assert len(said) == 2
     assert said[0].startswith("error: interrupted; ")
     assert "is kept" in said[0] or "are kept" in said[0]
-    assert said[1] == "  the same command goes on from there"
+    assert said[1] == "  the same command resumes"
     # The shard that was rendered, and no other one of those to make.
     assert rendered == 1
     assert is_finished(small.out / "train-00000.npz", 40, small.hash)

@@ -276,9 +276,9 @@ def test_verify_counts_what_an_interrupted_run_has_not_made(tmp_path: Path) -> N
     assert (text.code, data.code) == (INPUT, INPUT)
     assert text.out.splitlines() == [
         "set: 4 of 11 shards are missing, first train-00003.npz; "
-        "run the same mbtf-gen command again: it makes what is missing",
+        "run the same mbtf-gen command again: it renders the missing shards",
         "set/train-00001.npz: has changed since it was written (SHA-256 differs); "
-        "mend it with: mbtf-gen repair FOLDER",
+        "repair it with: mbtf-gen repair FOLDER",
     ]
     assert [f["file"] for f in json.loads(data.out)["faults"]] == [
         f"train-{number:05d}.npz" for number in (1, 3, 4, 7, 8)

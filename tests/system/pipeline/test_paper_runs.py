@@ -138,12 +138,3 @@ def test_the_page_of_an_interrupted_recipe_is_marked(
     record.write_text(json.dumps(data | {"runs": []}))
     assert run(app, ["report", str(tmp_path / "out")]) == 3
     assert "contains no finished run" in capsys.readouterr().err
-
-
-def test_a_foreign_folder_is_refused(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    other = made / "other"
-    other.mkdir()
-    (other / "notes.txt").write_text("mine")
-    assert run(app, ["run", str(made / "tiny.yaml"), "--quick", "-o", str(other)]) == 3
-    assert "is not empty and contains no paper recipe" in capsys.readouterr().err
-    assert [p.name for p in other.iterdir()] == ["notes.txt"]

@@ -204,23 +204,37 @@ def test_a_run_of_another_schema_is_refused(
 def test_cost_study_measures_reports_and_goes_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Two configurations of the generator, then a third one and a run of two seeds."""
     from mbtf_pipeline.cli.app import app
     from mbtf_pipeline.cost_study import study
+    from mbtf_pipeline.cost_study.fit_runs import planned_runs
     from mbtf_pipeline.cost_study.generator_runs import generator_tasks
 
-    some = 2
-    monkeypatch.setattr(study, "generator_tasks", lambda bench: islice(generator_tasks(bench), some))
-    monkeypatch.setattr(study, "chains", lambda *arguments: [])
-    monkeypatch.setattr(study, "_SETTINGS", 1000)
+    some, runs = 2, 0
+    monkeypatch.setattr(study, "generator_tasks", lambda benchmark: islice(generator_tasks(benchmark), some))
+    monkeypatch.setattr(study, "planned_runs", lambda *arguments: planned_runs(30.0, *arguments[1:])[:runs])
+    monkeypatch.setattr(study, "_CONFIGURATIONS", 1000)
+    monkeypatch.setattr("mbtf_pipeline.cost_study.fit_runs.SHORTEST", 2.0)
+    monkeypatch.setattr("mbtf_pipeline.cost_study.runs.TEST", (4096, 8))
     out = tmp_path / "study"
-    # The budget is large enough never to decide what is measured.
+    # Long enough never to decide what is measured.
     command = ["cost", str(RECIPE), "--time", "1h", "-o", str(out), "--json", "--quiet"]
     assert run(app, command) == 0
     first = json.loads(capsys.readouterr().out)
-    assert first["points"] == 2
-    points = {p: p.read_bytes() for p in (out / "points").iterdir()}
-    # One is no setting: what a query costs on disk.
-    assert len([p for p in points if not p.name.startswith("price-")]) == first["points"]
+    assert first["measurements"] == 2
+    stored = {p: p.read_bytes() for p in (out / "measurements").iterdir()}
+    assert (out / "paths.png").stat().st_size > 1000
+    # The same command with more to do keeps what was measured; without a time, that of the study counts.
+    some, runs = 3, 1
+    flag = command.index("--time")
+    assert run(app, [*command[:flag], *command[flag + 2 :]]) == 0
+    second = json.loads(capsys.readouterr().out)
+    assert second["measurements"] == 4
+    assert all(p.read_bytes() == content for p, content in stored.items())
+    assert not (out / ".work").exists()
+    (point,) = second["front"]
+    assert 0 < point["unexplained"]["error"] < point["unexplained"]["value"] < 1
+    assert "mbtf-fit shards/" in point["command"]
     html = (out / "cost.html").read_text()
     assert not loads(html).external
     assert "Paths per query" in html

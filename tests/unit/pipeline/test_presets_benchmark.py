@@ -12,7 +12,7 @@ from support.scripts import benchmark_module
 def test_runs_of_other_options_and_damaged_ones_are_repeated(tmp_path: Path) -> None:
     quality = benchmark_module("quality")
     old = quality.MeasuredRun("rock", "high", 0.12, 800.0, 100.0, 600.0, 0.12, 0.003, 10**9, 10**6, "old")
-    now = replace(old, settings=quality.settings_hash("high"))
+    now = replace(old, options_hash=quality.options_hash("high"))
     texts = {"now": json.dumps(asdict(now)), "old": json.dumps(asdict(old)), "cut": '{"material": "ro'}
     for name, text in texts.items():
         (tmp_path / f"{name}-128.json").write_text(text)

@@ -348,7 +348,7 @@ class TestYaml:
             ("height: rock_height.npy\nmetallic: {file: a.png, value: 1}\n", "either 'file' or 'value'"),
             ("height: rock_height.npy\nroughness: gone.png\n", r"gone\.png: no such file"),
             ("height: rock_height.npy\nbsdf: {alpha: 1}\n", "needs a 'type'"),
-            ("height: rock_height.npy\nmetallic: 1\nbsdf: {type: diffuse}\n", "stands in place of metallic"),
+            ("height: rock_height.npy\nmetallic: 1\nbsdf: {type: diffuse}\n", "replaces metallic"),
             ("height: rock_height.npy\nbsdf: {type: diffuse, filename: no.png}\n", r"no\.png: no such file"),
             ("height: [\n", "not valid YAML"),
             ("", "key 'height' is missing"),

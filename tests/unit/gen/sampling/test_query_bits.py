@@ -107,7 +107,7 @@ def test_image_buffers_hold_every_texel_in_order_under_one_light_and_view(lattic
         for array in (q.sigma, q.omega_i, q.omega_o):
             first = array[item, 0, 0]
             assert (array[item] == first).all()
-    # Buffers differ from one another, jitter included.
+    # Images differ from one another, jitter included.
     assert len(np.unique(q.omega_i[:, 0, 0], axis=0)) == 3
     assert len(np.unique(q.u[:, 0, 0], axis=0)) == 3
 

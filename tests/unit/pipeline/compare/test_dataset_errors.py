@@ -38,11 +38,6 @@ def test_a_model_of_the_other_layout_gets_its_own_data_set(layout: str) -> None:
     assert stage_names(made)[:3] == ["generate", f"generate {other}", "fit neumip"]
 
 
-def test_one_layout_is_one_data_set() -> None:
-    assert [d.sub for d in data_sets(recipe("shuffled", "neumip", "neumip-baseline"))] == ["shards"]
-    assert [d.sub for d in data_sets(recipe("image", "hierarchical"))] == ["shards"]
-
-
 class Shifted:
     """A material with a constant error."""
 

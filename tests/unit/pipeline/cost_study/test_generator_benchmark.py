@@ -27,9 +27,18 @@ def benchmark(monkeypatch: pytest.MonkeyPatch) -> GeneratorBenchmark:
     return fake_benchmark(monkeypatch)
 
 
+class Found:
+    """A measurement by the names of its parts."""
+
+    def __init__(
+        self, benchmark: GeneratorBenchmark, changes: dict[str, Any], against: dict[str, Any] | None
+    ) -> None:
+        self.seconds, self.error, self.bias, self.noise = benchmark.measure(changes, against, 0.0)
+
+
 @pytest.mark.parametrize("spp", [4, 64])
 def test_bias_and_noise_are_separated(benchmark: GeneratorBenchmark, spp: int) -> None:
-    found = benchmark.measure({"transport.max_depth": 1, "queries.spp": spp}, {}, 0.0)
+    found = Found(benchmark, {"transport.max_depth": 1, "queries.spp": spp}, {})
     # Relative to the mean value 0.25: the bias is the shift times the values, the noise that of spp paths.
     bias = SHIFT * math.sqrt(np.mean((0.2 + 0.1 * np.linspace(0, 1, 10001)) ** 2)) / 0.25
     noise = NOISE / math.sqrt(spp)
@@ -41,20 +50,20 @@ def test_bias_and_noise_are_separated(benchmark: GeneratorBenchmark, spp: int) -
 
 
 def test_an_unbiased_configuration_shows_no_bias(benchmark: GeneratorBenchmark) -> None:
-    found = benchmark.measure({"transport.max_depth": 3}, {}, 0.0)
+    found = Found(benchmark, {"transport.max_depth": 3}, {})
     assert found.bias is not None
     assert found.bias.value == 0.0
-    assert benchmark.measure({"queries.spp": 8}, None, 0.0).bias is None
+    assert Found(benchmark, {"queries.spp": 8}, None).bias is None
 
 
 def test_error_bars_agree_with_other_seeds(benchmark: GeneratorBenchmark) -> None:
     """Differences of seeds over their error bars; a bar too narrow by a factor 2 gives a deviation of 2."""
     changes = {"transport.max_depth": 1, "queries.spp": 8}
     found = [
-        GeneratorBenchmark(benchmark.config, benchmark.material, seed).measure(changes, {}, 0.0)
+        Found(GeneratorBenchmark(benchmark.config, benchmark.material, seed), changes, {})
         for seed in range(6)
     ]
-    again = GeneratorBenchmark(benchmark.config, benchmark.material, 0).measure(changes, {}, 0.0)
+    again = Found(GeneratorBenchmark(benchmark.config, benchmark.material, 0), changes, {})
     assert (again.noise, again.bias) == (found[0].noise, found[0].bias)
     for part in ("noise", "bias", "error"):
         estimates: list[Estimate] = [getattr(one, part) for one in found]
@@ -92,9 +101,9 @@ def test_error_bars_include_the_error_of_the_mean_value(
     mean = benchmark.mean({})
     assert abs(mean.value - 0.25) < 4 * mean.error < 0.25 * 2e-3
     changes = {"transport.max_depth": 1, "queries.spp": 8}
-    found = benchmark.measure(changes, {}, 0.0)
+    found = Found(benchmark, changes, {})
     monkeypatch.setattr(benchmark, "mean", lambda against: Estimate(mean.value, 0.1 * mean.value, 9))
-    wide = benchmark.measure(changes, {}, 0.0)
+    wide = Found(benchmark, changes, {})
     for part in ("noise", "bias", "error"):
         a, b = getattr(found, part), getattr(wide, part)
         assert b.value == a.value

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,15 +19,7 @@ from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import Queries
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_pipeline.cost_study import runs as module
-from mbtf_pipeline.cost_study.fit_runs import (
-    DATA,
-    GENERATOR,
-    MODELS,
-    SHORTEST,
-    WHOLE,
-    planned_runs,
-    round_down,
-)
+from mbtf_pipeline.cost_study.fit_runs import GENERATOR, RUN_SHARES, SHORTEST, planned_runs, round_down
 from mbtf_pipeline.cost_study.runs import DataRequest, Run, RunRunner
 
 FIT = {"model": "neumip", "training": {"time": "5s"}}
@@ -48,9 +41,9 @@ def test_planned_runs_fit_into_the_time_twice(seconds: float, tmp_path: Path) ->
         generating = run.data.queries * price(run.data.spp) * (run.data not in made)
         made.add(run.data)
         spent[run.study] += generating + float(run.fit["training"]["time"].rstrip("s"))
-    for study, share in (("whole", WHOLE), ("models", MODELS), ("data", DATA)):
+    for study, share in RUN_SHARES.items():
         assert 0.5 * share * seconds / 2 < spent[study] <= 1.1 * share * seconds / 2
-    assert GENERATOR + WHOLE + MODELS + DATA < 0.9
+    assert GENERATOR + sum(RUN_SHARES.values()) < 0.9
     assert all(run.data.seed == 0 for run in found)
     assert len({str((run.study, run.key)) for run in found}) == len(found)
     # Equal total paths are compared, whatever their number per query.
@@ -139,6 +132,8 @@ def test_the_expected_time_learns_from_earlier_runs(clock: Clock, tmp_path: Path
     assert one.expected_seconds(run) == pytest.approx(5 + (7 + 6 + 2.5 - 9))
     one.forget(run.data)
     assert one.expected_seconds(run) == pytest.approx(7 + 6 + 2.5)
+    # Fits that count steps have no planned time.
+    assert one.expected_seconds(replace(run, fit={"training": {"steps": 3, "time": None}})) < 7 + 6 + 2.5
 
 
 def test_other_seeds_have_other_data_and_other_weights(
@@ -168,7 +163,7 @@ def test_commands_reproduce_their_run(
     monkeypatch.setattr(mbtf_fit, "fit", lambda config, *rest: used.append(config) or usual(config, *rest))
     one = runner(tmp_path, study_seed)
     write_text(tmp_path / "generate.yaml", dump_yaml(one.config.model_dump(mode="json")))
-    runs = [run for run in planned_runs(600.0, 4, lambda paths: 1e-6) if run.study == "models"]
+    runs = [run for run in planned_runs(600.0, 6, lambda paths: 1e-6) if run.study == "models"]
     for run in (runs[0], runs[-1]):
         used.clear()
         one.forget(run.data)

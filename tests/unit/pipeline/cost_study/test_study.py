@@ -19,7 +19,7 @@ from mbtf_core.stats import Estimate
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_pipeline.cost_study import study as module
 from mbtf_pipeline.cost_study.measurements import Measurement, MeasurementFolder
-from mbtf_pipeline.cost_study.page import narrow_errors, noise_exponent
+from mbtf_pipeline.cost_study.page import narrow_errors
 from mbtf_pipeline.cost_study.pareto import extrapolation, pareto_front
 from mbtf_pipeline.cost_study.runs import Run
 from mbtf_pipeline.cost_study.tables import COLUMNS, to_csv
@@ -54,21 +54,6 @@ def test_the_extrapolation_follows_the_end_of_the_front() -> None:
     assert extrapolation(front[:2]) is None
     # Nothing is promised where the error bars allow no progress.
     assert extrapolation([point(t, e) for t, e in ((20.0, 0.2), (40.0, 0.199), (80.0, 0.198))]) is None
-
-
-def test_the_noise_exponent_is_that_of_the_variance() -> None:
-    def paths(n: int, noise: float) -> Measurement:
-        estimate = Estimate(noise, 0.01 * noise, 9)
-        options = {"queries.spp": n}
-        return Measurement("paths", "uniform", "", options, "", ONE, estimate, noise=estimate)
-
-    found = [paths(n, 2.0 * n**-0.6) for n in (2, 8, 32)]
-    exponent = noise_exponent(found)
-    assert exponent is not None
-    assert exponent.value == pytest.approx(-1.2)
-    # The slope of a line through equal errors of 2 % of the variance.
-    assert exponent.error == pytest.approx(0.02 / math.sqrt(2 * math.log(4) ** 2))
-    assert noise_exponent(found[:2]) is None
 
 
 def test_narrow_errors_are_those_of_95_percent() -> None:
@@ -184,22 +169,23 @@ def runners(monkeypatch: pytest.MonkeyPatch) -> list[FakeRunner]:
 
 def test_a_study_keeps_its_time_and_resumes(runners: list[FakeRunner], tmp_path: Path) -> None:
     recipe, folder = load_recipe(RECIPE, []), tmp_path / "study"
-    # 60 + 60 s of whole runs, and one of models, 30 s.
-    first = module.run_study(recipe, folder, seconds=155.0)
-    assert [m.details.get("seeds") for m in first.measurements] == [None, 2, 1]
-    assert sum(r.fit["training"]["time"] for r in runners[0].measured) <= 155.0
+    # One whole run of 60 s; a second one would take the share of the models, 30 s twice.
+    first = module.run_study(recipe, folder, seconds=150.0)
+    assert [m.details.get("seeds") for m in first.measurements] == [None, 1, 2]
+    assert sum(r.fit["training"]["time"] for r in runners[0].measured) <= 150.0
     assert first.skipped == ["whole: neumip, long"]
     assert first.deviation is not None
-    # The second seed of the models is missing; nothing else is measured again.
-    second = module.run_study(recipe, folder, seconds=155.0)
-    assert [(r.name, r.data.seed) for r in runners[1].measured] == [("m", 1)]
-    # Refining takes its own time: 60 s for a third seed of the shorter runs.
-    module.run_study(recipe, folder, seconds=155.0, refine=3600.0)
+    # Only what is missing is measured: the second seed of the whole run.
+    second = module.run_study(recipe, folder, seconds=150.0)
+    assert [(r.name, r.data.seed) for r in runners[1].measured] == [("short", 1)]
+    # Refining takes its own time, for further seeds.
+    module.run_study(recipe, folder, seconds=150.0, refine=3600.0)
     assert {r.data.seed for r in runners[2].measured} >= {2}
     assert all(r.name != "long" for r in runners[2].measured)
-    assert module.time_of(folder) == 155.0
+    assert sum(r.fit["training"]["time"] for r in runners[2].measured) <= 3750.0
+    assert module.time_of(folder) == 150.0
     assert module.time_of(tmp_path / "none") == module.NEW_TIME
-    assert second.measurements[1].error.value == first.measurements[1].error.value
+    assert second.measurements[2].error.value == first.measurements[2].error.value
 
 
 def test_measurements_of_other_seeds_and_materials_are_not_mixed(

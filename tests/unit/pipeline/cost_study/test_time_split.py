@@ -17,7 +17,7 @@ from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import QUERY_BYTES
 from mbtf_pipeline.cost_study import time_split as module
 from mbtf_pipeline.cost_study.runs import RunRunner
-from mbtf_pipeline.cost_study.time_split import DEFAULT_SHARE, SHARES, Costs, split_time, with_split
+from mbtf_pipeline.cost_study.time_split import DEFAULT_SHARE, SHARES, split_time, with_split
 from mbtf_pipeline.recipe import Recipe, load_recipe
 
 # Seconds of a training query, of starting with the test split, of a fit besides training, and by query.
@@ -74,7 +74,7 @@ def split(
 
 @pytest.mark.parametrize("best", SHARES)
 def test_the_best_pilot_decides(fake: Machine, tmp_path: Path, best: float) -> None:
-    fake.best = best
+    fake.best, fake.pilot_takes = best, 80.0
     notes: list[str] = []
     found = split(tmp_path, notes=notes)
     times = [parse_duration(run.fit["training"]["time"]) for run in fake.pilots]
@@ -186,6 +186,8 @@ def test_the_costs_of_a_fit_are_a_line_that_never_falls() -> None:
         )
 
 
-def test_a_share_of_a_time_without_other_costs() -> None:
-    queries, generating, training, other = Costs(1e-6, 0.0, 0.0, 0.0, 1).split(100.0, 0.25)
-    assert (queries, generating, training, other) == (25_000_000, 25.0, 75.0, 0.0)
+def test_a_given_share_needs_no_pilots(fake: Machine, tmp_path: Path) -> None:
+    found = split_time(recipe(), 1000.0, tmp_path / "run", "command", print, 0.25)
+    assert not fake.pilots
+    making = found.generating - START
+    assert making / (making + found.training) == pytest.approx(0.25, rel=0.05)
