@@ -1,8 +1,8 @@
-"""A folder of pictures that a command makes, goes on with, and replaces.
+"""A folder of pictures that a command writes, resumes, and replaces.
 
 Beside the pictures lie ``config.yaml``, the resolved options, and ``pictures.json``, the record: it lists the
 files that the command writes, and the finished ones with their sizes. Files that the record does not list
-belong to somebody else and are never touched.
+belong to others and are never touched.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class _Record(BaseModel):
 
 @dataclass
 class PictureFolder:
-    """A folder that :meth:`claim` has made ours.
+    """A folder of pictures that was claimed by :meth:`claim`.
 
     Attributes
     ----------
@@ -70,12 +70,12 @@ class PictureFolder:
 
         Parameters
         ----------
-        kind : what pictures these are, as the record says it
-        files : names of all files that it may write there
-        config : resolved options, written beside the pictures; all but ``material`` decide what they show
-        inputs : what else decides it: digests of the input files, by role
+        kind : kind of the pictures, as stored in the record
+        files : names of all files that may be written
+        config : resolved options, written beside the pictures; all but ``material`` determine their content
+        inputs : digests of the input files by role, which determine it as well
         overwrite : remove what the folder's record lists, and start anew
-        command : that makes these pictures, for messages; by default ``mbtf-gen`` and the kind
+        command : command that draws these pictures, for messages; ``mbtf-gen`` and the kind by default
 
         Raises
         ------
@@ -111,7 +111,7 @@ class PictureFolder:
             "pictures": {},
         }
         folder = cls(path, record)
-        # The record first: it makes the folder ours, whatever instant the run is killed at.
+        # The record first: it claims the folder, even if the run is killed right after.
         folder._save()
         write_text(path / CONFIG_NAME, dump_yaml(config))
         return folder
@@ -120,17 +120,17 @@ class PictureFolder:
         write_json(self.path / RECORD_NAME, self.record)
 
     def _sweep(self) -> None:
-        """Remove what a killed run left of its files."""
+        """Remove unfinished files of a killed run."""
         remove_unfinished(self.path, (*_OURS, *self.record.get("files", ())))
 
     def _clear(self) -> None:
-        """Remove what the record lists and nothing else; the record last, so that the folder stays ours."""
+        """Remove the files that the record lists and nothing else; the record last, which keeps the claim."""
         self._sweep()
         for name in (*self.record.get("files", ()), CONFIG_NAME, RECORD_NAME):
             (self.path / Path(name).name).unlink(missing_ok=True)
 
     def finished(self, name: str) -> dict[str, Any] | None:
-        """What :meth:`keep` was told about a picture, where all its files are there in their full size."""
+        """Facts stored by :meth:`keep`, if all files of the picture exist with their full size."""
         entry: dict[str, Any] | None = self.record["pictures"].get(name)
         if entry is None:
             return None

@@ -1,9 +1,9 @@
 """The LLVM library with which Dr.Jit compiles its CPU kernels: its path and its version.
 
 The distribution ``karellen-llvm-core`` contains ``libLLVM.so.N.M``. Dr.Jit reads ``DRJIT_LIBLLVM_PATH`` once,
-when it is first imported. Therefore :func:`~mbtf_gen.render.runtime.load_mitsuba`, and the import of
-:mod:`mbtf_fit.mitsuba_plugin`, call :func:`use_shipped_llvm` first; importing the packages changes no
-environment variable. A path that the user set has priority.
+when it is first imported. Therefore :func:`~mbtf_gen.render.runtime.load_mitsuba` calls
+:func:`use_shipped_llvm` first; importing a package changes no environment variable. A path that the user set
+has priority.
 """
 
 from __future__ import annotations

@@ -84,7 +84,7 @@ def refuse_old_llvm() -> None:
     """Refuse to run with an LLVM that is too old: some kernel would abort the process.
 
     Dr.Jit has bound to such an LLVM where a program imports ``mitsuba`` or ``drjit`` before
-    :func:`load_mitsuba` or :mod:`mbtf_fit.mitsuba_plugin` and the system's LLVM is old.
+    :func:`load_mitsuba` or ``mbtf_fit.mitsuba_plugin.register("llvm_ad_rgb")`` and the system's LLVM is old.
 
     Raises
     ------
@@ -97,8 +97,7 @@ def refuse_old_llvm() -> None:
     if major < OLDEST_LLVM:
         raise EngineError(
             f"Dr.Jit was imported first and uses LLVM {major}, which is too old",
-            hint="import mbtf_fit.mitsuba_plugin, or call mbtf_gen.render.runtime.load_mitsuba(), before "
-            "importing mitsuba or drjit",
+            hint='call mbtf_fit.mitsuba_plugin.register("llvm_ad_rgb") before importing mitsuba or drjit',
         )
 
 

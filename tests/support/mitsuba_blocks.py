@@ -9,13 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_gen.geometry.heightfield import HeightGrid, tile_mesh
-from mbtf_gen.render.scene import CLEARANCE, LONG_SIDE
 from mbtf_gen.sampling.query_sampler import Queries
-from support.scenes import (
-    mi,
-    queries,
-    rocks,
-)
+from support.scenes import mi, queries, rocks
+
+# After support.scenes, which loads Mitsuba.
+from mbtf_gen.render.scene import CLEARANCE, LONG_SIDE  # isort: skip
 
 SPP = 32
 
@@ -52,7 +50,7 @@ def block(grid: HeightGrid, bsdf: dict[str, Any], folder: Path, tiles: int = 5) 
     return entries
 
 
-def stock_halves(
+def mitsuba_halves(
     entries: dict[str, Any],
     emitter: dict[str, Any],
     q: Queries,

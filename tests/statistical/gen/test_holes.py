@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.mitsuba_blocks import GRIDS, SPP, block, random_queries, stock_halves
+from support.mitsuba_blocks import GRIDS, SPP, block, mitsuba_halves, random_queries
 from support.scenes import (
     HeightGrid,
     LightKernel,
@@ -115,7 +115,7 @@ def test_an_opaque_map_changes_nothing() -> None:
 
 
 @pytest.mark.parametrize("depth", [1, 4], ids=["direct", "interreflection"])
-def test_stock_mitsuba_agrees_on_a_relief_with_holes(depth: int, tmp_path: Path) -> None:
+def test_mitsuba_agrees_on_a_height_field_with_an_opacity_mask(depth: int, tmp_path: Path) -> None:
     """Mitsuba's ``mask`` over a block of tiles under ``volpath``, whose light rays pass through holes."""
     rng = np.random.default_rng(3)
     pixels = np.where(rng.random((12, 12)) < 0.5, 0.15, 1.0).astype(np.float32)[..., None]
@@ -130,7 +130,7 @@ def test_stock_mitsuba_agrees_on_a_relief_with_holes(depth: int, tmp_path: Path)
         "irradiance": float(1 / omega_i[2]),
     }
     mask = {"type": "mask", "opacity": opacity, "bsdf": {"type": "diffuse", "reflectance": color}}
-    a, b = stock_halves(block(grid, mask, tmp_path), emitter, q, 1.0, depth + 1, "volpath")
+    a, b = mitsuba_halves(block(grid, mask, tmp_path), emitter, q, 1.0, depth + 1, "volpath")
     tile = build_tile(grid, {"type": "mbtf_surface", "base_color": color, "opacity": opacity})
     transport = Transport(max_depth=depth, roulette_depth=1000)
     ours = Estimator(tile, LightKernel(0.0), transport).estimate(q, SPP, Stream(5, "test", 0))
@@ -141,8 +141,8 @@ def test_stock_mitsuba_agrees_on_a_relief_with_holes(depth: int, tmp_path: Path)
     assert 0.1 < ours.transmittance.mean() < 0.9
 
 
-def test_what_passes_is_what_a_stock_ray_sees_behind(tmp_path: Path) -> None:
-    """Transmittance against a stock render of a black sheet over a glowing floor."""
+def test_transmittance_agrees_with_mitsuba(tmp_path: Path) -> None:
+    """Transmittance against Mitsuba's render of a black sheet over a glowing floor."""
     rng = np.random.default_rng(3)
     pixels = np.where(rng.random((12, 12)) < 0.5, 0.15, 1.0).astype(np.float32)[..., None]
     opacity = {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True, "filter_type": "nearest"}
@@ -156,7 +156,7 @@ def test_what_passes_is_what_a_stock_ray_sees_behind(tmp_path: Path) -> None:
         "to_world": to_world,
         "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 1.0}},
     }
-    a, b = stock_halves(
+    a, b = mitsuba_halves(
         block(grid, mask, tmp_path), {"type": "constant", "radiance": black}, q, 1.0, 30, "path", floor
     )
     tile = build_tile(grid, {"type": "mbtf_surface", "base_color": black, "opacity": opacity})

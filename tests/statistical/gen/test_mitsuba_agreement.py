@@ -1,8 +1,8 @@
-"""Stock Mitsuba, driven by the query sensor over a finite block of tiles, gives the same values.
+"""Unmodified Mitsuba, driven by the query sensor over a finite block of tiles, gives the same values.
 
-The block is made of stock parts alone: the tile's trimesh mesh written as PLY, instanced on a grid, lit by
-Mitsuba's own ``directional`` emitter and traced by its ``path`` integrator. Elevations are high enough that
-the block's border is out of reach: relief/tan(elevation) stays well inside it.
+The block is made of Mitsuba's own plugins: the tile's mesh written as PLY, instanced on a grid, lit by the
+emitter ``directional`` and traced by the integrator ``path``. Elevations are high enough that the block's
+border is out of reach: displacement range/tan(elevation) stays well inside it.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.mitsuba_blocks import GRIDS, SPP, block, random_queries, stock_halves
+from support.mitsuba_blocks import GRIDS, SPP, block, mitsuba_halves, random_queries
 from support.scenes import (
     LightKernel,
     Transport,
@@ -41,18 +41,18 @@ def heights(name: str) -> HeightGrid:
 @pytest.mark.parametrize("shape", ["wide", "turtle_shell", "rock_cliff"])
 @pytest.mark.parametrize("depth", [1, 4], ids=["direct", "interreflection"])
 @pytest.mark.parametrize("sigma", [1e-6, 0.3], ids=["point", "wide"])
-def test_stock_path_tracer_agrees(shape: str, depth: int, sigma: float, tmp_path: Path) -> None:
+def test_mitsuba_agrees(shape: str, depth: int, sigma: float, tmp_path: Path) -> None:
     grid = heights(shape)
     bsdf = colors((8, 16) if shape == "wide" else (16, 16))
     omega_i = direction(40, 70)
     q = random_queries(4096, sigma, omega_i)
-    # Stock depth counts the emitter's vertex too. Unit irradiance on the plane.
+    # Mitsuba's depth counts the emitter's vertex too. Unit irradiance on the plane.
     emitter = {
         "type": "directional",
         "direction": [float(-c) for c in omega_i],
         "irradiance": float(1 / omega_i[2]),
     }
-    a, b = stock_halves(block(grid, bsdf, tmp_path), emitter, q, grid.aspect, depth + 1)
+    a, b = mitsuba_halves(block(grid, bsdf, tmp_path), emitter, q, grid.aspect, depth + 1)
     ours = estimate(
         grid,
         bsdf,
@@ -64,7 +64,7 @@ def test_stock_path_tracer_agrees(shape: str, depth: int, sigma: float, tmp_path
     )
     groups = elevation_groups(q.omega_o, edges=(0.0, 0.8, 1.0))
     result = aggregate_test(ours.value_a, ours.value_b, a, b, groups)
-    # Stock rays leave a surface 5e-5 tile widths above it, ours 3e-7. Where point queries have next to no
+    # Mitsuba's rays leave a surface 5e-5 tile widths above it, ours 3e-7. Where point queries have next to no
     # noise, the light that slips past shadow edges shows: up to two thousandths of the mean.
     mean = float(ours.value_a.mean())
     allowed = {"mean": 2e-3 * mean, "scatter": 2e-3 * mean**2}
@@ -73,12 +73,12 @@ def test_stock_path_tracer_agrees(shape: str, depth: int, sigma: float, tmp_path
     assert mean > 0.02
 
 
-def test_smoothed_emitter_in_stock_integrator_agrees(tmp_path: Path) -> None:
-    """The registered emitter gives each query its own smoothed light under the stock integrator."""
+def test_smoothed_emitter_in_mitsubas_integrator_agrees(tmp_path: Path) -> None:
+    """The registered emitter gives each query its own smoothed light under Mitsuba's integrator."""
     grid = GRIDS["square"]
     q = random_queries(4096, 0.05)
     emitter = {"type": "mbtf_directional", "width": 5.0}
-    a, b = stock_halves(block(grid, colors(), tmp_path), emitter, q, 1.0, 3)
+    a, b = mitsuba_halves(block(grid, colors(), tmp_path), emitter, q, 1.0, 3)
     ours = estimate(
         grid,
         colors(),
@@ -105,14 +105,14 @@ def test_the_comparison_finds_a_shifted_map(tmp_path: Path) -> None:
         "irradiance": float(1 / omega_i[2]),
     }
     moved = HeightGrid(np.roll(grid.z, 1, axis=1), grid.aspect)
-    a, b = stock_halves(block(moved, colors(), tmp_path), emitter, q, 1.0, 2)
+    a, b = mitsuba_halves(block(moved, colors(), tmp_path), emitter, q, 1.0, 2)
     ours = estimate(grid, colors(), LightKernel(0.0), q, SPP, transport=Transport(max_depth=1))
     assert aggregate_test(ours.value_a, ours.value_b, a, b).p_value < 1e-6
 
 
-def test_stock_render_of_a_plane_is_albedo_over_pi() -> None:
+def test_mitsubas_render_of_a_plane_is_albedo_over_pi() -> None:
     bsdf = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}
     q = random_queries(640, 0.1)
     plane = {"plane": {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(500), "bsdf": bsdf}}
-    a, b = stock_halves(plane, {"type": "mbtf_directional", "width": 0.0}, q, flat().aspect, 2)
+    a, b = mitsuba_halves(plane, {"type": "mbtf_directional", "width": 0.0}, q, flat().aspect, 2)
     np.testing.assert_allclose([a, b], 0.5 / np.pi, rtol=1e-4)

@@ -154,7 +154,7 @@ def textbook_sheen(cosine: float, mu: Array, phi: Array, roughness: float) -> Ar
     return np.asarray(d / (1 + capital_lambda(cosine) + capital_lambda(mu)) / (4 * cosine * mu))
 
 
-def stock_albedo(bsdf: dict[str, Any], cosine: float, points: int = 1 << 14) -> float:
+def mitsuba_albedo(bsdf: dict[str, Any], cosine: float, points: int = 1 << 14) -> float:
     """∫ f μo dωo of a BSDF of Mitsuba's, by its own sampling."""
     xi = sobol(points, 3, seed=5)
     si = dr.zeros(mi.SurfaceInteraction3f, points)
@@ -173,16 +173,16 @@ def white(kind: str, **values: Any) -> dict[str, Any]:
 def test_principled_makes_energy_where_the_surface_does_not(metallic: float) -> None:
     """The reason for an own surface: Mitsuba's ``principled`` returns up to 1.5 times what it receives."""
     grid = list(itertools.product((0.02, 0.1, 0.3, 0.5, 1.0), (1.0, 0.5, 0.2, 0.05)))
-    stock, own = (
-        np.array([stock_albedo(white(k, roughness=r, metallic=metallic, specular=0.5), c) for r, c in grid])
+    mitsuba, own = (
+        np.array([mitsuba_albedo(white(k, roughness=r, metallic=metallic, specular=0.5), c) for r, c in grid])
         for k in ("principled", "mbtf_surface")
     )
     assert np.abs(own - 1).max() < TOLERANCE
     if metallic == 0:
-        assert stock.max() > 1.05
+        assert mitsuba.max() > 1.05
     else:
         # Its metal loses instead, for it scatters once.
-        assert stock.min() < 0.9
+        assert mitsuba.min() < 0.9
 
 
 def random_directions(n: int, seed: int, least: float = 1e-2) -> Array:
@@ -268,7 +268,7 @@ def test_diffuse_light_is_what_the_dielectric_lobe_leaves(roughness: float, cosi
     np.testing.assert_allclose(energy, share + base * (1 - share), atol=1e-3)
 
 
-def test_without_gloss_it_is_stock_diffuse() -> None:
+def test_without_gloss_it_is_mitsubas_diffuse() -> None:
     wi, wo = random_directions(500, 6), random_directions(500, 7)
     value = brdf(SurfaceParts(), wi, wo, base_color=0.37)
     np.testing.assert_allclose(value, 0.37 / np.pi, rtol=1e-5)
@@ -278,7 +278,7 @@ def test_without_gloss_it_is_stock_diffuse() -> None:
 
 
 @pytest.mark.parametrize("roughness", [0.05, 0.1, 0.2, 0.3])
-def test_narrow_metal_lobe_is_stock_roughconductor(roughness: float) -> None:
+def test_narrow_metal_lobe_is_mitsubas_roughconductor(roughness: float) -> None:
     """Where facets hardly hide one another the masking model, which differs, does not matter: Mitsuba's G is
     a product. What is scattered several times is 3e-3 of the peak at most."""
     rng = np.random.default_rng(8)
@@ -292,10 +292,10 @@ def test_narrow_metal_lobe_is_stock_roughconductor(roughness: float) -> None:
     own = np.array(point(METAL, wi, metallic=1.0, roughness=roughness).eval_pdf(vectors(wo))[0].x, np.float64)
     si = dr.zeros(mi.SurfaceInteraction3f, len(wi))
     si.wi = vectors(wi)
-    stock = mi.load_dict(
+    mitsuba = mi.load_dict(
         {"type": "roughconductor", "alpha": alpha, "distribution": "ggx", "material": "none"}
     )
-    expected = np.array(stock.eval(mi.BSDFContext(), si, vectors(wo)).x, np.float64)
+    expected = np.array(mitsuba.eval(mi.BSDFContext(), si, vectors(wo)).x, np.float64)
     np.testing.assert_allclose(own, expected, rtol=3e-3, atol=3e-3 * expected.max())
     assert np.mean(np.abs(own / expected - 1)) < 3e-3
 
@@ -319,5 +319,5 @@ def test_metal_gives_back_what_one_scattering_loses() -> None:
     expected = [reflected(cosine, b) for b in base] + several * (1 - reflected(cosine, 1.0))
     rows = np.array([[roughness, 1.0, 0.0, 0.0, 0.0, b, cosine] for b in base])
     np.testing.assert_allclose(albedos(rows, METAL, 1 << 15)[0], expected, atol=TOLERANCE)
-    stock = {"type": "roughconductor", "alpha": roughness**2, "distribution": "ggx", "material": "none"}
-    assert stock_albedo(stock, cosine) < 0.7
+    mitsuba = {"type": "roughconductor", "alpha": roughness**2, "distribution": "ggx", "material": "none"}
+    assert mitsuba_albedo(mitsuba, cosine) < 0.7

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from mitsuba.python.chi2 import ChiSquareTest
 from numpy.typing import NDArray
-from support.mitsuba_blocks import GRIDS, block, random_queries, stock_halves
+from support.mitsuba_blocks import GRIDS, block, mitsuba_halves, random_queries
 from support.scenes import LightKernel, Transport, direction, estimate, mi
 from support.surfaces import ALL, point, sobol, towards
 
@@ -153,7 +153,7 @@ def p_value(test: ChiSquareTest) -> float:
 
 @pytest.mark.parametrize("case", CASES, ids=lambda c: c[0].replace(" ", "-"))
 def test_weights_are_value_over_density(case: tuple[str, SurfaceParts, dict[str, Any]]) -> None:
-    """Also through the registered plugin, which a stock integrator asks in local directions."""
+    """Also through the registered plugin, which Mitsuba's integrators call with local directions."""
     name, parts, maps = case
     xi = sobol(1 << 12, 3)
     for wi in VIEWS.values():
@@ -212,7 +212,7 @@ def test_plugin_answers_as_the_surface_does() -> None:
     np.testing.assert_allclose(np.array(density), np.array(surface.eval_pdf(omega)[1]), rtol=2e-3, atol=1e-6)
 
 
-def test_stock_path_tracer_agrees_on_glossy_metal(tmp_path: Path) -> None:
+def test_mitsuba_agrees_on_glossy_metal(tmp_path: Path) -> None:
     """The plugin under ``mi.render`` and Mitsuba's ``path``, over a block of tiles, against the own loop."""
     grid = GRIDS["square"]
     omega_i = direction(50, 70)
@@ -223,7 +223,7 @@ def test_stock_path_tracer_agrees_on_glossy_metal(tmp_path: Path) -> None:
         "direction": [float(-c) for c in omega_i],
         "irradiance": float(1 / omega_i[2]),
     }
-    a, b = stock_halves(block(grid, bsdf, tmp_path), emitter, q, grid.aspect, 5)
+    a, b = mitsuba_halves(block(grid, bsdf, tmp_path), emitter, q, grid.aspect, 5)
     transport = Transport(max_depth=4, roulette_depth=1000)
     ours = estimate(grid, bsdf, LightKernel(0.0), q, 32, transport=transport, seed=5)
     groups = elevation_groups(q.omega_o, edges=(0.0, 0.8, 1.0))

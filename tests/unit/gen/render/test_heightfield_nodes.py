@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mbtf_gen.geometry.heightfield import HeightGrid, grid_faces, grid_vertices
-from mbtf_gen.render import heightfield_nodes as field_nodes
+from mbtf_gen.render import heightfield_nodes
 from mbtf_gen.render.heightfield_nodes import node_table
 
 SHAPES = [(1, 1), (1, 7), (2, 2), (5, 3), (8, 8), (13, 32), (33, 9)]
@@ -45,7 +45,7 @@ def test_cells_are_the_meshs_triangles(shape: tuple[int, int]) -> None:
 def test_no_vertex_pierces_a_plane(
     shape: tuple[int, int], below: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(field_nodes, "_PASS_NUMBERS", 100)
+    monkeypatch.setattr(heightfield_nodes, "_PASS_NUMBERS", 100)
     z = heights(shape)
     table = node_table(z, below)
     rows, columns = shape
