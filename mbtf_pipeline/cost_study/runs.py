@@ -21,12 +21,13 @@ from mbtf_core.digest import data_sha256
 from mbtf_core.stats import Estimate, unexplained_variance
 from mbtf_core.units import parse_duration
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.generation import Job, generate
+from mbtf_gen.generation import generate
+from mbtf_gen.job import Job
 from mbtf_gen.material.material import load_material
 from mbtf_pipeline.cost_study.measurements import Measurement
 
 if TYPE_CHECKING:
-    pass
+    from mbtf_fit.data.queries import ShardQueries
 
 # Test queries, and paths of each.
 TEST = (1 << 20, 8)

@@ -48,10 +48,10 @@ class FakeEstimator:
 def fake_benchmark(monkeypatch: pytest.MonkeyPatch) -> GeneratorBenchmark:
     """A small height field, traced by :class:`FakeEstimator` until the test ends."""
     module = "mbtf_pipeline.cost_study.generator_benchmark"
-    plan = SimpleNamespace(closed_form=False, allocation=None)
-    monkeypatch.setattr(Job, "estimator", lambda self, plan: FakeEstimator(self))
-    monkeypatch.setattr(f"{module}.plan_effects", lambda job: plan)
-    monkeypatch.setattr(f"{module}.allocated", lambda job, plan: plan)
+    plan = SimpleNamespace(effects=SimpleNamespace(closed_form=False), allocation=None)
+    monkeypatch.setattr(f"{module}.build_estimator", lambda job, plan: FakeEstimator(job))
+    monkeypatch.setattr(f"{module}.plan_effects", lambda job: plan.effects)
+    monkeypatch.setattr(f"{module}.allocate", lambda job, effects: plan)
     heights = np.random.default_rng(0).random((8, 8))
     material = Material(heights, height_scale=0.1, height_bits=None, base_color=np.array([0.5, 0.5, 0.5]))
     return GeneratorBenchmark(GeneratorConfig(material="heights.npy"), material, 0)

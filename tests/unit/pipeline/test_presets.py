@@ -61,7 +61,7 @@ def test_recipes_that_compare_networks_keep_them(quality: Quality, name: str) ->
     plain, raised = load_recipe(path), load_recipe(path, quality_assignments(path, quality))
     assert {n: f.network for n, f in raised.fit.items()} == {n: f.network for n, f in plain.fit.items()}
     for one, fit in raised.fit.items():
-        if plain.fit[one].training.blur.start == 0 or fit.model == "hierarchical":
+        if plain.fit[one].training.blur.initial_sigma == 0 or fit.model == "hierarchical":
             assert fit.training.blur == plain.fit[one].training.blur
 
 
@@ -72,11 +72,15 @@ def test_other_recipes_get_the_network_of_the_preset() -> None:
     fits["hierarchical"] = {"model": "hierarchical"}
     assert fitter_options("draft", fits)["hierarchical"] == FITTER["draft"]
     text = quality_assignments(path, "draft")
-    assert {"fit.neumip.network.width=40", "fit.neumip-baseline.training.decay=1.0"} <= set(text)
+    assert {"fit.neumip.network.width=40", "fit.neumip-baseline.training.texture_weight_decay=1.0"} <= set(
+        text
+    )
     # A network or smoothing set on the command line is kept as a whole.
-    text = quality_assignments(path, "draft", ["fit.neumip.network.width=25", "fit.neumip.training.decay=0"])
-    assert not any("network" in t or t.startswith("fit.neumip.training.decay") for t in text)
-    assert "fit.neumip.training.blur.floor=0.8" in text
+    text = quality_assignments(
+        path, "draft", ["fit.neumip.network.width=25", "fit.neumip.training.texture_weight_decay=0"]
+    )
+    assert not any("network" in t or t.startswith("fit.neumip.training.texture_weight_decay") for t in text)
+    assert "fit.neumip.training.blur.min_sigma=0.8" in text
 
 
 def test_longer_training_gets_a_larger_network() -> None:
@@ -93,9 +97,12 @@ def test_longer_training_gets_a_larger_network() -> None:
 
 def test_options_of_a_fit_file_are_kept(tmp_path: Path) -> None:
     file = tmp_path / "fit.yaml"
-    file.write_text("network: {channels: 5}\ntraining: {blur: {start: 4}}\n")
+    file.write_text("network: {channels: 5}\ntraining: {blur: {initial_sigma: 4}}\n")
     given = {"model": "neumip", **overrides_of(file, ["seed=3"])}
-    assert fitter_options("draft", {"": given})[""] == {"training.decay": 1.0, **FITTER["draft"]}
+    assert fitter_options("draft", {"": given})[""] == {
+        "training.texture_weight_decay": 1.0,
+        **FITTER["draft"],
+    }
     given = {"model": "neumip", **overrides_of(None, ["model=hierarchical"])}
     assert fitter_options("high", {"": given})[""] == FITTER["high"]
 

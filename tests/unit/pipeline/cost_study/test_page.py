@@ -16,7 +16,6 @@ from mbtf_pipeline.cost_study.fit_runs import MODELS_OF_PAPERS, PRESET, SIZES
 from mbtf_pipeline.cost_study.measurements import Measurement
 from mbtf_pipeline.cost_study.page import write_page
 from mbtf_pipeline.cost_study.study import Study
-from mbtf_pipeline.report.labels import Named, place_names
 from mbtf_pipeline.report.plots import COLORS, MARKERS, Cloud, _legend_above, scatter
 
 DESCRIPTION = {
@@ -62,30 +61,6 @@ def test_a_legend_of_long_names_is_no_wider_than_the_figure() -> None:
 def test_every_series_has_its_own_color_and_marker() -> None:
     count = 1 + len(MODELS_OF_PAPERS) + len(SIZES)
     assert count <= len(set(COLORS)) == len(set(MARKERS)) == len(COLORS)
-
-
-def test_names_cover_no_point_and_no_other_name() -> None:
-    """Points so close that names beside them would cover each other."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7, 4))
-    axes = figure.add_subplot()
-    spots = [(0.5, 0.5), (0.52, 0.5), (0.54, 0.51), (0.95, 0.5)]
-    axes.set(xlim=(0, 1), ylim=(0, 1))
-    line = ((0.4, 0.5), (0.6, 0.5))
-    place_names(figure, axes, [Named(*s, "a name of some length", "k") for s in spots], spots, [line])
-    renderer = FigureCanvasAgg(figure).get_renderer()
-    boxes = [t.get_window_extent(renderer) for t in axes.texts]
-    assert len(boxes) == len(spots)
-    for number, box in enumerate(boxes):
-        assert not any(box.overlaps(other) for other in boxes[:number])
-        assert not any(box.contains(*axes.transData.transform(s)) for s in spots)
-        # Letters at another resolution may be wider.
-        assert box.x1 <= axes.get_window_extent(renderer).x1 - 0.02 * box.width
-        ends = [axes.transData.transform(end) for end in line]
-        across = box.x0 < ends[1][0] and box.x1 > ends[0][0]
-        assert not (across and box.y0 < ends[0][1] < box.y1)
 
 
 def test_an_undefined_error_is_shown_as_such(tmp_path: Path) -> None:

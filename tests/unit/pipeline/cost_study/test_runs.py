@@ -16,7 +16,7 @@ import mbtf_fit
 from mbtf_core.atomic import write_text
 from mbtf_core.config_file import dump_yaml, resolve
 from mbtf_fit.config import FitConfig
-from mbtf_fit.data.loader import Queries
+from mbtf_fit.data.queries import ShardQueries
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_pipeline.cost_study import runs as module
 from mbtf_pipeline.cost_study.fit_runs import GENERATOR, RUN_SHARES, SHORTEST, planned_runs, round_down
@@ -103,7 +103,7 @@ def runner(folder: Path, seed: int = 0, **options: Any) -> RunRunner:
     )
     value = np.repeat(np.arange(1000) % 2.0, 3).reshape(1000, 3).astype(np.float32)
     zero = np.zeros((1000, 3), np.float32)
-    made._test_set = Queries(zero[:, :2], zero[:, 0], zero, zero, value, value)
+    made._test_set = ShardQueries(zero[:, :2], zero[:, 0], zero, zero, value, value)
     return made
 
 

@@ -109,7 +109,7 @@ def test_folders_of_something_else_are_refused(tmp_path: Path) -> None:
 
 
 def test_studies_vary_paths_whatever_the_recipe_sets() -> None:
-    queries = {"target_error": "5%", "layout": "image", "window": 8, "spp": 6}
+    queries = {"target_error": "5%", "layout": "image", "patch_size": 8, "spp": 6}
     config = GeneratorConfig.model_validate({"material": "m", "seed": 3, "queries": queries})
     found = module.study_config(config, None)
     assert found.queries.target_error is None
