@@ -1,14 +1,11 @@
 """Runs repeated with other seeds, and the error bars that follow.
 
-Another seed generates other data and starts from other weights. A configuration that was run n times is
-reported with the mean of its errors. Its error bar adds two independent parts in quadrature:
-
-- the error of the test set, which all runs of the study share, so that repeats do not reduce it;
-- the seed variance over n. It is estimated from all repeated configurations together: the pooled relative
-  standard deviation s of their errors, with the sum of (n - 1) as its degrees of freedom. A configuration of
-  three runs or more uses its own standard deviation where that is larger.
-
-Pooling is what makes two runs of each configuration enough: with some twenty of them s is known to 15 %.
+Another seed generates other data and another test set, and starts from other weights. A configuration that
+was run n times is reported with the mean of its errors, and the standard error s / √n. The relative standard
+deviation s is pooled over all repeated configurations, with the sum of (n - 1) as its degrees of freedom, so
+two runs of each are enough. A configuration of three runs or more uses its own standard deviation where that
+is larger. And s is no less than the error of the test set: all runs of a seed share it, so few seeds can miss
+it.
 """
 
 from __future__ import annotations
@@ -55,28 +52,24 @@ def combined(group: Sequence[Measurement], deviation: Estimate | None) -> Measur
     """The runs of one configuration as one measurement: name and command of the first one, means of all."""
     n = len(group)
     error = statistics.fmean(m.error.value for m in group)
-    test = statistics.fmean(m.error.error for m in group)
-    seeds = 0.0 if deviation is None else deviation.value
-    errors = _errors(group)
-    if len(errors) >= FEWEST_OWN:
-        seeds = max(seeds, math.sqrt(_relative_variance(errors)))
+    spread = 0.0 if deviation is None else deviation.value * error
+    if len(_errors(group)) >= FEWEST_OWN:
+        spread = max(spread, statistics.stdev(_errors(group)))
+    test = math.sqrt(statistics.fmean(m.error.error**2 for m in group))
     times = [m.seconds.value for m in group]
-    spread = statistics.stdev(times) / math.sqrt(n) if n > 1 else 0.0
+    jitter = statistics.stdev(times) / math.sqrt(n) if n > 1 else 0.0
     details = {k: statistics.fmean(m.details[k] for m in group) for k in group[0].details}
     return replace(
         group[0],
-        seconds=Estimate(statistics.fmean(times), spread, n),
-        error=Estimate(error, math.hypot(test, seeds * error / math.sqrt(n)), group[0].error.n),
+        seconds=Estimate(statistics.fmean(times), jitter, n),
+        error=Estimate(error, max(spread, test) / math.sqrt(n), group[0].error.n),
         details={**details, "seeds": float(n)},
     )
 
 
 def _is_wide(group: Sequence[Measurement], deviation: Estimate | None) -> bool:
-    """Whether the 95 % interval is too wide and more seeds can narrow it."""
-    error = combined(group, deviation).error
-    threshold = HALF_WIDTH / NORMAL * error.value
-    test = statistics.fmean(m.error.error for m in group)
-    return error.error > threshold > test
+    """Whether the 95 % interval is too wide."""
+    return NORMAL * combined(group, deviation).error.relative_error > HALF_WIDTH
 
 
 @dataclass

@@ -1,7 +1,7 @@
 """One run of the whole chain: training data of a size, a fit of a length, and its error on a test set.
 
-All runs of a study are evaluated on the same test set, which no fit is trained on: many queries of few
-paths. With halves a, b of its values and a prediction p, ``E[(p - a)(p - b)]`` is the squared error of p,
+All runs of a seed are evaluated on the same test set, which no fit is trained on: many queries of few paths.
+With halves a, b of its values and a prediction p, ``E[(p - a)(p - b)]`` is the squared error of p,
 free of the noise of the test values. Its error bar depends on the number of queries more than on that of
 paths. Data and fits come from the generator and the fitter, called as the programs call them.
 """
@@ -112,7 +112,9 @@ class RunRunner:
         self._overhead = _OVERHEAD
         # Folder and seconds by request.
         self._data: dict[DataRequest, tuple[Path, float]] = {}
-        self._test_set: ShardQueries | None = None
+        # By seed.
+        self._test_sets: dict[int, Queries] = {}
+        self._test_seconds = 0.0
 
     def clear(self) -> None:
         """Remove data and fits."""
@@ -154,24 +156,28 @@ class RunRunner:
 
     def expected_seconds(self, run: Run) -> float:
         """Expected time of measuring a run; existing data take none."""
-        return self._planned_seconds(run) + self._overhead
+        test = 0.0 if run.data.seed in self._test_sets else self._test_seconds
+        return test + self._planned_seconds(run) + self._overhead
 
     def _planned_seconds(self, run: Run) -> float:
         generating = 0.0 if self.has(run.data) else run.data.queries * self.query_seconds(run.data.spp)
         training = run.fit["training"].get("time")
         return generating + (0.0 if training is None else parse_duration(training))
 
-    def test_set(self) -> ShardQueries:
-        """The test queries of all runs."""
-        if self._test_set is None:
+    def test_set(self, seed: int) -> Queries:
+        """The test queries of all runs with an offset of the seed."""
+        if seed not in self._test_sets:
             from mbtf_fit.data.loader import load_split
             from mbtf_gen.dataset.reader import Dataset
 
             self.progress("test set")
-            folder, _ = self._generate(0, _NO_QUERIES, self.test)
-            self._test_set = load_split(Dataset.open(folder), "test")
+            folder, self._test_seconds = self._generate(seed, _NO_QUERIES, self.test)
+            if len(self._test_sets) > 1:
+                # Further seeds are measured one after the other.
+                self._test_sets.popitem()
+            self._test_sets[seed] = load_split(Dataset.open(folder), "test")
             shutil.rmtree(folder, ignore_errors=True)
-        return self._test_set
+        return self._test_sets[seed]
 
     def measure(self, run: Run) -> Measurement:
         """Generate the data, fit, and evaluate.
@@ -182,7 +188,7 @@ class RunRunner:
         """
         from mbtf_fit import FitConfig, fit
 
-        test = self.test_set()
+        test = self.test_set(run.data.seed)
         start, planned = time.perf_counter(), self._planned_seconds(run)
         folder, generation_seconds = self.data(run.data)
         self.progress(run.label)

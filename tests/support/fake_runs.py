@@ -23,12 +23,12 @@ def run(study: str = "whole", queries: int = 1000, name: str = "a run", seconds:
 
 class FakeRunner:
     """Stands for :class:`mbtf_pipeline.cost_study.runs.RunRunner`: errors of normal seed deviation around the
-    truth, all shifted by the one error of the test set."""
+    truth, those of each seed shifted by the error of its test set."""
 
     def __init__(self, seeds: float = SEEDS, test: float = TEST, study_seed: int = 0) -> None:
         self.random = np.random.default_rng(study_seed)
         self.seeds, self.test = seeds, test
-        self.shift = 1 + test * self.random.normal()
+        self.shifts = 1 + test * self.random.normal(size=20)
         self.measured: list[Run] = []
         self.generated: list[DataRequest] = []
         self.stored: set[DataRequest] = set()
@@ -42,7 +42,7 @@ class FakeRunner:
             self.stored.add(run.data)
         if run.name in self.failing:
             raise InputError("training diverged at step 7")
-        error = TRUE[run.study] * self.shift * (1 + self.seeds * self.random.normal())
+        error = TRUE[run.study] * self.shifts[run.data.seed] * (1 + self.seeds * self.random.normal())
         seconds = run.fit["training"]["time"]
         total = seconds + run.data.queries * 1e-6
         return Measurement(

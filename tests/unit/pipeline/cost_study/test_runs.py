@@ -103,7 +103,7 @@ def runner(folder: Path, seed: int = 0, **options: Any) -> RunRunner:
     )
     value = np.repeat(np.arange(1000) % 2.0, 3).reshape(1000, 3).astype(np.float32)
     zero = np.zeros((1000, 3), np.float32)
-    made._test_set = ShardQueries(zero[:, :2], zero[:, 0], zero, zero, value, value)
+    made._test_sets = dict.fromkeys((0, 2), Queries(zero[:, :2], zero[:, 0], zero, zero, value, value))
     return made
 
 
@@ -132,6 +132,11 @@ def test_the_expected_time_learns_from_earlier_runs(clock: Clock, tmp_path: Path
     assert one.expected_seconds(run) == pytest.approx(5 + (7 + 6 + 2.5 - 9))
     one.forget(run.data)
     assert one.expected_seconds(run) == pytest.approx(7 + 6 + 2.5)
+    # A seed without a test set takes the time of another one's.
+    one.test_set(2)
+    one._test_sets = {2: one.test_set(2)}
+    other = replace(run, data=replace(run.data, seed=2))
+    assert one.expected_seconds(run) == one.expected_seconds(other) + one._test_seconds
     # Fits that count steps have no planned time.
     assert one.expected_seconds(replace(run, fit={"training": {"steps": 3, "time": None}})) < 7 + 6 + 2.5
 
@@ -180,9 +185,7 @@ def test_commands_reproduce_their_run(
         one.forget(data)
 
 
-def test_the_test_set_is_of_the_study_s_seed_and_its_own_size(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_seed_has_one_test_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[GeneratorConfig] = []
     monkeypatch.setattr(module, "generate", lambda config, folder, job: asked.append(config))
     monkeypatch.setattr(module, "load_material", lambda *_: None)
@@ -190,7 +193,8 @@ def test_the_test_set_is_of_the_study_s_seed_and_its_own_size(
     monkeypatch.setattr("mbtf_gen.dataset.reader.Dataset.open", lambda folder: folder)
     monkeypatch.setattr("mbtf_fit.data.loader.load_split", lambda data, split: split)
     one = runner(tmp_path, 3, test=(1 << 17, 8))
-    one._test_set = None
-    assert one.test_set() == one.test_set() == "test"
-    (config,) = asked
-    assert (config.seed, config.queries.test, config.queries.test_spp) == (3, str(1 << 17), 8)
+    one._test_sets = {}
+    for seed in (0, 1, 0, 1, 2, 0, 2):
+        assert one.test_set(seed) == "test"
+    assert [config.seed for config in asked] == [3, 4, 5]
+    assert {(c.queries.test, c.queries.test_spp) for c in asked} == {(str(1 << 17), 8)}
