@@ -133,10 +133,9 @@ def test_the_expected_time_learns_from_earlier_runs(clock: Clock, tmp_path: Path
     one.forget(run.data)
     assert one.expected_seconds(run) == pytest.approx(7 + 6 + 2.5)
     # A seed without a test set takes the time of another one's.
-    one.test_set(2)
-    one._test_sets = {2: one.test_set(2)}
+    one._test_sets, one._test_seconds = {2: one.test_set(2)}, 3.0
     other = replace(run, data=replace(run.data, seed=2))
-    assert one.expected_seconds(run) == one.expected_seconds(other) + one._test_seconds
+    assert one.expected_seconds(run) == one.expected_seconds(other) + 3.0
     # Fits that count steps have no planned time.
     assert one.expected_seconds(replace(run, fit={"training": {"steps": 3, "time": None}})) < 7 + 6 + 2.5
 
