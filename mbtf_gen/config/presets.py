@@ -18,8 +18,8 @@ QualityOption = Annotated[
 
 # Options of the generator by preset, dotted names.
 GENERATOR: dict[Quality, dict[str, Any]] = {
-    # With half as many queries, fits of glossy materials overfit single bright paths. The test errors are
-    # free of noise and limited by their variance over queries, so many test queries get few paths each.
+    # With half as many queries, fits of glossy materials overfit single bright paths. Test errors are free of
+    # noise and limited by their variance over queries, so many test queries get few paths each.
     "draft": {
         "queries.train": "400/texel",
         "queries.spp": 4,

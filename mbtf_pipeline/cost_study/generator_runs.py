@@ -40,7 +40,8 @@ class GeneratorTask:
     @property
     def label(self) -> str:
         """Its name among all configurations."""
-        return f"{self.study}: {self.series}, {self.name}"
+        series = "" if self.series == self.study else f"{self.series}, "
+        return f"{self.study}: {series}{self.name}"
 
     @property
     def key(self) -> dict[str, Any]:
@@ -66,7 +67,7 @@ def generator_tasks(benchmark: GeneratorBenchmark) -> Iterator[GeneratorTask]:
     yield from _effects(benchmark)
     yield from _meshes(benchmark)
     for depth in DEPTHS:
-        name = f"{depth} interactions" if depth else "no limit"
+        name = f"{depth} interaction{'s' * (depth > 1)}" if depth else "no limit"
         changes = {**UNIFORM, "transport.max_depth": depth, "effects.mode": "all"}
         yield GeneratorTask("interactions", "interactions", name, changes)
     for n in PATHS[1::2]:
