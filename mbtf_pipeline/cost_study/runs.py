@@ -113,7 +113,7 @@ class RunRunner:
         # Folder and seconds by request.
         self._data: dict[DataRequest, tuple[Path, float]] = {}
         # By seed.
-        self._test_sets: dict[int, Queries] = {}
+        self._test_sets: dict[int, ShardQueries] = {}
         self._test_seconds = 0.0
 
     def clear(self) -> None:
@@ -164,7 +164,7 @@ class RunRunner:
         training = run.fit["training"].get("time")
         return generating + (0.0 if training is None else parse_duration(training))
 
-    def test_set(self, seed: int) -> Queries:
+    def test_set(self, seed: int) -> ShardQueries:
         """The test queries of all runs with an offset of the seed."""
         if seed not in self._test_sets:
             from mbtf_fit.data.loader import load_split

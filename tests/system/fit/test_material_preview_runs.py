@@ -49,7 +49,7 @@ def test_pictures_without_pytorch_kept_and_refused(tmp_path: Path, run_python: R
     (tmp_path / "out/turntable.gif").unlink()
     again = json.loads(run_python("-c", BLOCKED, *words, *SMALL, "--json").stdout)
     assert [p["kept"] for p in again["pictures"]] == [True, False]
-    other = run_python("-c", BLOCKED, *words, *SMALL, "--tiles", "5")
+    other = run_python("-c", BLOCKED, *words, *SMALL, "--tiles-around", "5")
     assert other.returncode == 3
     assert "holds pictures of another configuration: turntable.tiles: 8 -> 5" in other.stderr
     assert len(other.stderr.splitlines()) <= 2

@@ -143,7 +143,7 @@ def test_other_pictures_leave_data_and_fit_alone(again: Any) -> None:
 
 
 def test_a_report_that_would_be_too_large_gives_up_precision_and_says_so(again: Any, folder: Path) -> None:
-    larger = ("--set", "compare.size=256", "--set", "compare.spp=4", "--set", "compare.spans=[2, 4]")
+    larger = ("--set", "compare.size=256", "--set", "compare.spp=4", "--set", "compare.tiles_across=[2, 4]")
     assert list(again(*larger)) == ["compare", "report"]
     report = folder / "report.html"
     assert report.stat().st_size > 1.2e6

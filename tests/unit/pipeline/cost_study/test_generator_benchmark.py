@@ -13,10 +13,10 @@ from support.fake_benchmark import NOISE, SHIFT, FakeEstimator, fake_benchmark
 from mbtf_core.errors import InputError
 from mbtf_core.stats import Estimate
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.generation import Job
 from mbtf_gen.planning.effects_plan import plan_effects
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.sampling.query_sampler import Queries
+from mbtf_pipeline.cost_study import generator_benchmark as module
 from mbtf_pipeline.cost_study.generator_benchmark import GeneratorBenchmark, _median
 from mbtf_pipeline.cost_study.generator_runs import PATHS, TARGETS, generator_tasks
 from mbtf_pipeline.cost_study.study import _check_variation
@@ -86,7 +86,7 @@ def test_every_configuration_is_one_that_the_generator_takes(benchmark: Generato
     assert len({task.label for task in tasks}) == len({str((t.study, t.key)) for t in tasks}) == len(tasks)
     # All queries have equally many paths, except where allocations are compared.
     uniform = [t for t in tasks if t.study != "paths" or t.series == "uniform"]
-    assert {benchmark.job(t.changes).config.queries.allocation for t in uniform} == {"even"}
+    assert {benchmark.job(t.changes).config.queries.allocation for t in uniform} == {"uniform"}
 
 
 def test_other_work_on_the_machine_hardly_changes_the_time() -> None:
@@ -149,7 +149,7 @@ def test_materials_without_anything_to_learn_are_refused(
 
     benchmark = fake_benchmark(monkeypatch)
     assert isinstance(benchmark.config, GeneratorConfig)
-    monkeypatch.setattr(Job, "estimator", lambda self, plan: Even(self))
+    monkeypatch.setattr(module, "build_estimator", lambda job, plan: Even(job))
     if message is None:
         _check_variation(benchmark)
         return

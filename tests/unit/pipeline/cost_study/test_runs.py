@@ -90,7 +90,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 
     monkeypatch.setattr(module, "generate", generate)
     monkeypatch.setattr(module, "load_material", lambda *_: None)
-    monkeypatch.setattr(module.Job, "of", lambda *_: None)
+    monkeypatch.setattr(module, "Job", lambda *_: None)
     monkeypatch.setattr(module, "time", found)
     monkeypatch.setattr(mbtf_fit, "fit", fit)
     return found
@@ -103,7 +103,7 @@ def runner(folder: Path, seed: int = 0, **options: Any) -> RunRunner:
     )
     value = np.repeat(np.arange(1000) % 2.0, 3).reshape(1000, 3).astype(np.float32)
     zero = np.zeros((1000, 3), np.float32)
-    made._test_sets = dict.fromkeys((0, 2), Queries(zero[:, :2], zero[:, 0], zero, zero, value, value))
+    made._test_sets = dict.fromkeys((0, 2), ShardQueries(zero[:, :2], zero[:, 0], zero, zero, value, value))
     return made
 
 
@@ -188,7 +188,7 @@ def test_every_seed_has_one_test_set(tmp_path: Path, monkeypatch: pytest.MonkeyP
     asked: list[GeneratorConfig] = []
     monkeypatch.setattr(module, "generate", lambda config, folder, job: asked.append(config))
     monkeypatch.setattr(module, "load_material", lambda *_: None)
-    monkeypatch.setattr(module.Job, "of", lambda *_: None)
+    monkeypatch.setattr(module, "Job", lambda *_: None)
     monkeypatch.setattr("mbtf_gen.dataset.reader.Dataset.open", lambda folder: folder)
     monkeypatch.setattr("mbtf_fit.data.loader.load_split", lambda data, split: split)
     one = runner(tmp_path, 3, test=(1 << 17, 8))
