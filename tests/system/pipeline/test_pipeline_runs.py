@@ -1,4 +1,4 @@
-"""The whole chain on a small recipe: what it makes, what it makes again, and a report that stands alone."""
+"""A small recipe end to end: outputs, resuming, and a self-contained report."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def first(folder: Path) -> dict[str, Any]:
-    """What the first run prints, as a user starts it."""
+    """Output of the first run in a process of its own."""
     command = [sys.executable, "-m", "mbtf_pipeline", "run", str(RECIPE), "-o", str(folder), "--json", "-q"]
     done = subprocess.run(
         command, cwd=ROOT, capture_output=True, text=True, timeout=300, stdin=subprocess.DEVNULL, check=False
@@ -59,7 +59,7 @@ def first(folder: Path) -> dict[str, Any]:
 
 @pytest.fixture
 def again(first: dict[str, Any], folder: Path, capsys: pytest.CaptureFixture[str]) -> Any:
-    """Runs the recipe again in the same folder; returns which stages ran, by reason."""
+    """Runs the recipe again in the same folder; returns the reasons of the stages that ran."""
     from mbtf_pipeline.cli.app import app
 
     def execute(*options: str) -> dict[str, str]:
@@ -76,11 +76,11 @@ def test_every_stage_runs_and_the_material_is_learned(first: dict[str, Any], fol
     assert {name: s["ran"] for name, s in first["stages"].items()} == dict.fromkeys(STAGES, True)
     assert Path(first["report"]) == folder / "report.html"
     share = first["test"]["neumip"]["unexplained_variance"]
-    # The best constant leaves 1; the bar is far above what the fit reaches and far below that.
+    # 1 is the error of the best constant.
     assert share["value"] + 3 * share["error"] < 0.5
 
 
-def test_pictures_and_numbers_belong_together(first: dict[str, Any], folder: Path) -> None:
+def test_images_and_numbers_are_consistent(first: dict[str, Any], folder: Path) -> None:
     record = json.loads((folder / "compare" / "comparison.json").read_text())
     assert [p["name"] for p in record["pictures"]] == ["v1-l1-s1", "v2-l1-s1"]
     for picture in record["pictures"]:
@@ -90,7 +90,7 @@ def test_pictures_and_numbers_belong_together(first: dict[str, Any], folder: Pat
         assert reference.shape == fit.shape == (48, 48, 3)
         assert np.isfinite(reference).all()
         mse = made["errors"]["query"]["mse"]
-        # The plain error holds the reference's noise as well.
+        # The plain error includes the noise of the reference.
         plain = float(np.mean((fit.astype(np.float64) - reference) ** 2))
         assert mse["value"] - 4 * mse["error"] < plain
         assert made["errors"]["query"]["psnr"]["value"] == pytest.approx(
@@ -101,13 +101,12 @@ def test_pictures_and_numbers_belong_together(first: dict[str, Any], folder: Pat
     assert sum(g["mse"]["n"] for g in splits["test"]["levels"].values()) == splits["test"]["n"] == 4096
 
 
-def test_the_report_stands_alone(first: dict[str, Any], folder: Path) -> None:
+def test_the_report_is_self_contained(first: dict[str, Any], folder: Path) -> None:
     html = (folder / "report.html").read_text(encoding="utf-8")
     page = loads(html)
     assert page.external == []
     assert len(html) < 10e6
-    # Two scenes of two references, a fit and its two maps; offsets traced and learned; the viewer's map and
-    # the enlarged view have no picture of their own.
+    # Two scenes with two references, a fit and its two maps each; one traced and one learned offset.
     embedded = [p for p in page.pictures if p]
     assert len(embedded) == 2 * 5 + 2
     for uri in embedded:
@@ -134,7 +133,7 @@ def test_nothing_runs_twice(again: Any) -> None:
     assert again() == {}
 
 
-def test_other_pictures_leave_data_and_fit_alone(again: Any) -> None:
+def test_other_images_keep_data_and_fit(again: Any) -> None:
     ran = again("--set", "compare.spp=16")
     assert list(ran) == ["compare", "report"]
     assert "spp: 32 -> 16" in ran["compare"]
@@ -142,25 +141,25 @@ def test_other_pictures_leave_data_and_fit_alone(again: Any) -> None:
     assert list(again()) == ["compare", "report"]
 
 
-def test_a_report_that_would_be_too_large_gives_up_precision_and_says_so(again: Any, folder: Path) -> None:
+def test_a_size_limit_reduces_the_images(again: Any, folder: Path) -> None:
     larger = ("--set", "compare.size=256", "--set", "compare.spp=4", "--set", "compare.tiles_across=[2, 4]")
     assert list(again(*larger)) == ["compare", "report"]
     report = folder / "report.html"
     assert report.stat().st_size > 1.2e6
-    assert "to keep the file small" not in report.read_text()
+    assert "reduced to limit the file size" not in report.read_text()
     assert list(again(*larger, "--set", "report.max_megabytes=1")) == ["report"]
     assert report.stat().st_size <= 1e6
-    assert "to keep the file small" in report.read_text()
+    assert "reduced to limit the file size" in report.read_text()
     assert list(again()) == ["compare", "report"]
 
 
-def test_another_title_makes_only_the_report(again: Any, folder: Path) -> None:
+def test_another_title_repeats_only_the_report(again: Any, folder: Path) -> None:
     assert list(again("--set", "report.title=A <b> & c")) == ["report"]
     assert "<h1>A &lt;b&gt; &amp; c</h1>" in (folder / "report.html").read_text()
     assert list(again()) == ["report"]
 
 
-def test_a_fit_that_was_done_but_not_stamped_is_not_trained_again(again: Any, folder: Path) -> None:
+def test_a_finished_fit_without_a_stamp_is_not_trained_again(again: Any, folder: Path) -> None:
     weights = folder / "fits" / "neumip" / "weights.safetensors"
     before = weights.stat().st_mtime_ns
     (folder / "stages" / "fit-neumip.json").unlink()
@@ -168,7 +167,7 @@ def test_a_fit_that_was_done_but_not_stamped_is_not_trained_again(again: Any, fo
     assert weights.stat().st_mtime_ns == before
 
 
-def test_a_flipped_byte_is_found_and_mended(again: Any, folder: Path) -> None:
+def test_a_flipped_byte_is_detected_and_repaired(again: Any, folder: Path) -> None:
     shard = folder / "shards" / "test-00000.npz"
     whole = shard.read_bytes()
     middle = len(whole) // 2
@@ -179,15 +178,27 @@ def test_a_flipped_byte_is_found_and_mended(again: Any, folder: Path) -> None:
     assert shard.read_bytes() == whole
 
 
-def test_the_report_can_be_written_again(
-    again: Any, folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_report_can_be_written_again(again: Any, folder: Path) -> None:
     from mbtf_pipeline.cli.app import app
 
     (folder / "report.html").unlink()
     assert run(app, ["report", str(folder)]) == 0
     assert (folder / "report.html").exists()
     assert again() == {}
+
+
+def test_a_run_of_another_schema_is_refused(
+    first: dict[str, Any], folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from mbtf_pipeline.cli.app import app
+
+    record = json.loads((folder / "run.json").read_text()) | {"schema": 1}
+    (tmp_path / "run.json").write_text(json.dumps(record))
+    for command in (["run", str(RECIPE), "-o", str(tmp_path)], ["report", str(tmp_path)]):
+        assert run(app, command) == 3
+        error, hint = capsys.readouterr().err.splitlines()
+        assert error.endswith("run.json: has schema version 1, this program reads version 2")
+        assert "in another folder" in hint
 
 
 def test_a_cost_study_measures_reports_and_resumes(

@@ -90,7 +90,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 
     monkeypatch.setattr(module, "generate", generate)
     monkeypatch.setattr(module, "load_material", lambda *_: None)
-    monkeypatch.setattr(module, "Job", lambda *_: None)
+    monkeypatch.setattr(module, "Job", lambda config, material: SimpleNamespace(config=config))
     monkeypatch.setattr(module, "time", found)
     monkeypatch.setattr(mbtf_fit, "fit", fit)
     return found
@@ -145,7 +145,7 @@ def test_other_seeds_have_other_data_and_other_weights(
 ) -> None:
     seeds: list[int] = []
     usual = mbtf_fit.fit
-    monkeypatch.setattr(module, "generate", lambda config, folder, job: seeds.append(config.seed))
+    monkeypatch.setattr(module, "generate", lambda job, folder: seeds.append(job.config.seed))
     monkeypatch.setattr(
         mbtf_fit, "fit", lambda config, *rest: seeds.append(config.seed) or usual(config, *rest)
     )
@@ -162,7 +162,7 @@ def test_commands_reproduce_their_run(
 ) -> None:
     """The programs resolve the command to the configurations that were measured."""
     used: list[Any] = []
-    monkeypatch.setattr(module, "generate", lambda config, folder, job: used.append(config))
+    monkeypatch.setattr(module, "generate", lambda job, folder: used.append(job.config))
     usual = mbtf_fit.fit
     monkeypatch.setattr(mbtf_fit, "fit", lambda config, *rest: used.append(config) or usual(config, *rest))
     one = runner(tmp_path, study_seed)
@@ -186,9 +186,9 @@ def test_commands_reproduce_their_run(
 
 def test_every_seed_has_one_test_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[GeneratorConfig] = []
-    monkeypatch.setattr(module, "generate", lambda config, folder, job: asked.append(config))
+    monkeypatch.setattr(module, "generate", lambda job, folder: asked.append(job.config))
     monkeypatch.setattr(module, "load_material", lambda *_: None)
-    monkeypatch.setattr(module, "Job", lambda *_: None)
+    monkeypatch.setattr(module, "Job", lambda config, material: SimpleNamespace(config=config))
     monkeypatch.setattr("mbtf_gen.dataset.reader.Dataset.open", lambda folder: folder)
     monkeypatch.setattr("mbtf_fit.data.loader.load_split", lambda data, split: split)
     one = runner(tmp_path, 3, test=(1 << 17, 8))
