@@ -70,7 +70,7 @@ def table(plan: EffectsPlan) -> str:
         lines += _row(effect)
     bound = plan.bias_bound
     share = "0 %" if bound == 0 else f"at most {_percent(bound)}"
-    lines.append(f"bias of all that is off: {share}, tolerance {_percent(plan.tolerance)} (--tolerance)")
+    lines.append(f"bias of all that is off: {share}, tolerance {_percent(plan.tolerance)} (effects.tolerance)")
     if plan.closed_form:
         lines.append("M has a closed form: no paths are traced")
     elif plan.max_depth:
