@@ -41,9 +41,9 @@ def mean_of_halves(a: ArrayLike, b: ArrayLike) -> Estimate:
 
     Unbiased because each half is. The variance ``Σ (a-b)²/4 / n²`` is unbiased too: ``E(a-b)²`` is ``Var a
     + Var b`` and ``Var (a+b)/2`` a quarter of that. `dof` is the effective number of degrees of freedom of
-    this sum of single-pair variances v: Satterthwaite's (1946) ``(Σv)²/Σv²``, where a variance estimated
-    from one pair of normal halves has three times the square it should, so ``3 (Σv)²/Σv² - 2``. That is 1
-    for one query, about n for n alike ones, and few where few queries make the noise. Unlike
+    this sum of single-pair variances v: Satterthwaite's (1946) ``(Σv)²/Σv²``, where the square of a
+    variance from one pair of normal halves is three times too large, hence ``3 (Σv)²/Σv² - 2``. That is 1
+    for one query, about n for n similar ones, and small where few queries dominate the noise. Unlike
     :func:`mean_estimate` it does not include the variance over queries.
 
     Parameters
