@@ -33,7 +33,7 @@ Buffer = bytes | bytearray | memoryview
 
 @dataclass(frozen=True)
 class Stored:
-    """What a file holds: its size in bytes and its SHA-256, hexadecimal."""
+    """Size of a file in bytes, and its SHA-256 in hexadecimal."""
 
     bytes: int
     sha256: str
@@ -82,7 +82,7 @@ def _temporary(path: Path) -> Iterator[Path]:
     """
     temporary = temporary_of(path)
     try:
-        # A killed process of the same number may have left it, linked under its final name even.
+        # A killed process of the same number may have left it.
         temporary.unlink(missing_ok=True)
         yield temporary
     except OSError as error:
@@ -114,11 +114,15 @@ def write_file(path: Path, write: Callable[[BinaryIO], None]) -> None:
     PartialError : the disk is full or the folder cannot be written
     """
     with _temporary(path) as temporary:
-        with temporary.open("wb") as stream:
-            write(stream)
-            stream.flush()
-            os.fsync(stream.fileno())
+        _fill(temporary, write)
         _replace(temporary, path)
+
+
+def _fill(temporary: Path, write: Callable[[BinaryIO], object]) -> None:
+    with temporary.open("wb") as stream:
+        write(stream)
+        stream.flush()
+        os.fsync(stream.fileno())
 
 
 def write_chunks(path: Path, chunks: Iterable[Buffer]) -> Stored:
@@ -142,7 +146,7 @@ def write_chunks(path: Path, chunks: Iterable[Buffer]) -> Stored:
 
 
 def write_through(path: Path, write: Callable[[Path], None]) -> Stored:
-    """Like :func:`write_chunks` for libraries that want a file name: `write(temporary)` creates it."""
+    """Like :func:`write_chunks` for libraries that need a file name: `write(temporary)` creates it."""
     with _temporary(path) as temporary:
         write(temporary)
         with temporary.open("rb+") as stream:
@@ -153,20 +157,17 @@ def write_through(path: Path, write: Callable[[Path], None]) -> Stored:
 
 
 def create_file(path: Path, content: bytes) -> bool:
-    """Write a file where there is none; False where there is one, which stays as it is.
+    """Write a file unless it exists; False where it does.
 
-    One of several writers wins, also across machines: the file gets its name by a hard link. On file systems
-    without hard links there is a short window in which the last writer wins.
+    One of several writers succeeds, also across machines: a hard link names the file. On file systems without
+    hard links there is a short window in which the last writer succeeds.
 
     Raises
     ------
     PartialError : the disk is full or the folder cannot be written
     """
     with _temporary(path) as temporary:
-        with temporary.open("wb") as stream:
-            stream.write(content)
-            stream.flush()
-            os.fsync(stream.fileno())
+        _fill(temporary, lambda stream: stream.write(content))
         try:
             os.link(temporary, path)
         except FileExistsError:
@@ -197,19 +198,14 @@ def remove_file(path: Path) -> None:
         raise unwritable(path, error) from None
 
 
-def _put(stream: BinaryIO, text: str) -> None:
-    stream.write(text.encode())
-
-
 def write_json(path: Path, data: Mapping[str, Any]) -> None:
     """Write plain data as indented JSON, atomically. NaN and infinities are refused."""
-    text = json.dumps(data, indent=2, allow_nan=False) + "\n"
-    write_file(path, lambda stream: _put(stream, text))
+    write_text(path, json.dumps(data, indent=2, allow_nan=False) + "\n")
 
 
 def write_text(path: Path, text: str) -> None:
     """Write text as UTF-8, atomically."""
-    write_file(path, lambda stream: _put(stream, text))
+    write_chunks(path, [text.encode()])
 
 
 def checksummed(data: Mapping[str, Any]) -> bytes:
@@ -227,8 +223,7 @@ def _with_digits(text: bytes, digits: bytes) -> bytes:
 
 def write_checksummed(path: Path, data: Mapping[str, Any]) -> None:
     """Write :func:`checksummed` data, atomically."""
-    content = checksummed(data)
-    write_chunks(path, [content])
+    write_chunks(path, [checksummed(data)])
 
 
 def read_checksummed(path: Path, hint: str = "") -> dict[str, Any]:
@@ -236,7 +231,8 @@ def read_checksummed(path: Path, hint: str = "") -> dict[str, Any]:
 
     Parameters
     ----------
-    hint : what to do about a document that is damaged
+    path : Path
+    hint : what to do about a damaged document
 
     Raises
     ------

@@ -11,7 +11,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -51,11 +51,6 @@ class Outcome:
     seconds: float
 
 
-def _last_line(text: str) -> str:
-    lines = [line.strip() for line in text.splitlines() if line.strip()]
-    return lines[-1][:200] if lines else ""
-
-
 def _signal_name(number: int) -> str:
     try:
         return signal.Signals(number).name
@@ -70,7 +65,7 @@ def run_child(
 
     Parameters
     ----------
-    function : a generator of dicts that JSON can hold; an exception ends it and its message is the fault
+    function : a generator of JSON objects; the message of an exception becomes the fault
     timeout : seconds after which the child is killed
     environment : variables set for the child on top of this process's own
     """
@@ -97,8 +92,9 @@ def run_child(
             process.kill()
             raise
     answers: dict[str, Any] = {}
-    for answer in _answers(output):
-        answers.update(answer)
+    for line in output.splitlines():
+        if line.startswith(_MARK):
+            answers |= json.loads(line.removeprefix(_MARK))
     finished = answers.pop("finished", False)
     fault = answers.pop("fault", "")
     if late:
@@ -106,12 +102,6 @@ def run_child(
     elif not finished and not fault:
         code = process.returncode
         ending = f"ended by {_signal_name(-code)}" if code < 0 else f"ended with exit code {code}"
-        detail = _last_line(noise)
+        detail = next((line.strip()[:200] for line in reversed(noise.splitlines()) if line.strip()), "")
         fault = f"the process was {ending}" + (f" ({detail})" if detail else "")
     return Outcome(answers, fault, time.monotonic() - start)
-
-
-def _answers(output: str) -> Iterator[dict[str, Any]]:
-    for line in output.splitlines():
-        if line.startswith(_MARK):
-            yield json.loads(line.removeprefix(_MARK))

@@ -37,7 +37,7 @@ def _file_name(name: str) -> str:
     except UnicodeError:
         usable = False
     if not usable or len(name) > 4000:
-        raise ValueError("is no name that a file can have")
+        raise ValueError("is not a valid file name")
     return name
 
 
@@ -71,7 +71,7 @@ def read_yaml(path: Path) -> Any:
     ------
     InputError : the file is missing, unreadable, not YAML, or not a mapping
     """
-    from ruamel.yaml.error import MarkedYAMLError, YAMLError
+    from ruamel.yaml.error import MarkedYAMLError
 
     try:
         text = path.read_text(encoding="utf-8-sig")
@@ -91,8 +91,6 @@ def read_yaml(path: Path) -> Any:
         mark = error.problem_mark
         line = f":{mark.line + 1}" if mark is not None else ""
         raise InputError(f"not valid YAML ({reason(error.problem)})", where=f"{path}{line}") from None
-    except YAMLError as error:
-        raise InputError(f"not valid YAML ({reason(error)})", where=path) from None
     except RecursionError:
         raise InputError(_too_deep(), where=path) from None
     except Exception as error:  # the reader turns scalars into numbers and dates, and may raise anything
@@ -351,8 +349,8 @@ def differences(old: Mapping[str, Any], new: Mapping[str, Any], prefix: str = ""
 
 def in_short(changes: Sequence[str], most: int = 6) -> str:
     """The first of :func:`differences` on one line, with a count of the others."""
-    more = len(changes) - most
-    return "; ".join([*changes[:most], *([f"and {more} more"] if more > 0 else [])])
+    more = [f"and {len(changes) - most} more"] if len(changes) > most else []
+    return "; ".join([*changes[:most], *more])
 
 
 def _changed(old: Mapping[str, Any], new: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any, Any]]:

@@ -1,6 +1,6 @@
-"""What the three programs share on the command line: errors, exit codes, JSON, progress.
+"""Common command-line behavior of the three programs: errors, exit codes, JSON, progress.
 
-A program defines its commands with cyclopts and hands the application to :func:`run`::
+A program defines its commands with cyclopts and passes the application to :func:`run`::
 
     # mbtf_fit/cli/app.py
     app = new_app("mbtf-fit", "Fit neural materials to multi-resolution BTF data.")
@@ -72,7 +72,7 @@ _LINE_SECONDS = 10.0
 
 
 def clock(seconds: float) -> str:
-    """Duration as people read it: ``0:07``, ``12:03``, ``1:02:03``."""
+    """Readable duration: ``0:07``, ``12:03``, ``1:02:03``."""
     whole = max(0, round(seconds))
     hours, rest = divmod(whole, 3600)
     minutes, rest = divmod(rest, 60)
@@ -123,7 +123,7 @@ class Progress:
         self.update(self.done + step, note)
 
     def update(self, done: float, note: str | None = None) -> None:
-        """Say how much is done; `note` is shown beside it until the next one."""
+        """Set the units done; `note` is displayed until the next one."""
         self.done = done
         if note is not None:
             self.note = note
@@ -186,7 +186,7 @@ class _BarProgress(Progress):
             progress.TimeRemainingColumn(),
             progress.TextColumn("{task.fields[note]}", markup=False),
             console=RichConsole(stderr=True),
-            # Standard output carries results; rich would move it to standard error.
+            # Standard output is for results; rich would redirect it to standard error.
             redirect_stdout=False,
         )
         self._task = self._rich.add_task(label, total=total, note="")
@@ -202,7 +202,7 @@ class _BarProgress(Progress):
 @Parameter(name="*", group="Output")
 @dataclass(frozen=True)
 class Console:
-    """Where a command's output goes; every command takes one as its keyword parameter `console`.
+    """Output of a command; every command has a keyword parameter `console` of this type.
 
     Attributes
     ----------
@@ -309,7 +309,7 @@ def new_app(name: str, description: str) -> App:
 
 
 class _LogHandler(logging.Handler):
-    """Log records of our packages as plain lines on what standard error is at that moment."""
+    """Prints log records as plain lines on the current standard error."""
 
     def emit(self, record: logging.LogRecord) -> None:
         prefix = f"{record.levelname.lower()}: " if record.levelno > logging.INFO else ""
@@ -371,7 +371,7 @@ def _first_word(app: App, tokens: Sequence[str]) -> int | None:
 
 
 def _command_first(app: App, tokens: list[str]) -> list[str]:
-    """Tokens with the command's name in front, where flags stood before it.
+    """Tokens with the command's name first, also where flags precede it.
 
     Raises
     ------
@@ -391,7 +391,7 @@ def _command_first(app: App, tokens: list[str]) -> list[str]:
 
 
 def _usage_message(app: App, fault: CycloptsError, tokens: Sequence[str]) -> str:
-    """What cyclopts found wrong with the command line, with where to read on."""
+    """Message of a command-line error, with a pointer to the help."""
     if isinstance(fault, UnusedCliTokensError) and fault.unused_tokens:
         text = f"unexpected argument '{reason(fault.unused_tokens[0])}'"
     else:

@@ -17,9 +17,9 @@ _BLANKS = str.maketrans("\n\r\t", "   ")
 
 
 def printable(text: str) -> str:
-    """`text` with line breaks and tabs as blanks, and what else cannot be shown written as escapes.
+    """Replace line breaks and tabs by blanks, and other unprintable characters by escapes.
 
-    Names and values come from files of anyone's making; a terminal would obey the codes in them.
+    Names and values come from untrusted files and may contain control codes of terminals.
     """
     if text.isprintable():
         return text
@@ -32,9 +32,12 @@ class MbtfError(Exception):
 
     Parameters
     ----------
-    what : what is wrong, in one line
-    where : file, key or line the fault lies in; printed before `what`
-    hint : what to do about it; printed after `what`
+    what : str
+        The fault, in one line.
+    where : object
+        File, key or line of the fault; printed before `what`.
+    hint : str
+        A remedy; printed after `what`.
     """
 
     exit_code = 1
@@ -53,7 +56,7 @@ class MbtfError(Exception):
 
 
 class UsageError(MbtfError):
-    """The command line makes no sense (exit code 2)."""
+    """The command line is invalid (exit code 2)."""
 
     exit_code = EXIT_USAGE
 
@@ -71,19 +74,18 @@ class EngineError(MbtfError):
 
 
 class PartialError(MbtfError):
-    """Work is unfinished but what was done is kept; the same command resumes (exit code 4)."""
+    """Work is unfinished; finished parts are kept and the same command resumes (exit code 4)."""
 
     exit_code = EXIT_PARTIAL
 
 
 class Interrupted(MbtfError):
-    """The user or the system ended the run (exit code 130); what was done is kept."""
+    """The user or the system ended the run (exit code 130); finished parts are kept."""
 
     exit_code = EXIT_INTERRUPTED
 
 
 def reason(fault: BaseException | str | None, longest: int = 160) -> str:
-    """What another library said went wrong, fit to stand in brackets within a message: one line, at most
-    `longest` characters."""
+    """Message of another library's error, on one line of at most `longest` characters."""
     text = printable(" ".join((str(fault) or type(fault).__name__).split()))
     return text if len(text) <= longest else f"{text[: longest - 3]}..."

@@ -19,22 +19,30 @@ ELSEWHERE = "choose another folder with -o"
 
 
 def check_folder(folder: Path, is_ours: Callable[[Path], bool], what: str) -> bool:
-    """Does an output folder hold what a command resumes? False where it is missing or empty.
+    """Does an output folder contain a run to resume? False where it is missing or empty.
 
     Parameters
     ----------
-    folder : the output folder; temporary files and locks in it do not count
-    is_ours : does the folder hold a record of this kind?
-    what : what the record stands for, for the message
+    folder : Path
+        The output folder; temporary files and locks in it are ignored.
+    is_ours : callable
+        Does the folder contain a record of this kind?
+    what : str
+        Name of the record, for the message.
+
+    Returns
+    -------
+    bool
 
     Raises
     ------
-    InputError : it is a file, or holds something else
+    InputError
+        It is a file, or contains something else.
     """
     if folder.exists() and not folder.is_dir():
         raise InputError("is a file, not a folder", where=folder)
     empty = not folder.exists() or all(is_leftover(path.name) for path in folder.iterdir())
-    # Asked last: another process may write the record meanwhile.
+    # Checked last: another process may write the record meanwhile.
     if is_ours(folder):
         return True
     if not empty:
@@ -58,13 +66,21 @@ def make_folder(folder: Path) -> None:
 def other_configuration(
     folder: Path, what: str, old: Mapping[str, Any], new: Mapping[str, Any], otherwise: str = "inputs differ"
 ) -> InputError:
-    """The refusal of a folder that another configuration has filled.
+    """Error for a folder that was written with another configuration.
 
     Parameters
     ----------
-    what : what the folder holds
-    old, new : plain data that decide the content: the folder's, and what is asked for
-    otherwise : the difference where these two have none
+    folder : Path
+    what : str
+        Content of the folder, for the message.
+    old, new : mapping
+        Plain data that determine the content: those of the folder, and the requested ones.
+    otherwise : str
+        Message where these two do not differ.
+
+    Returns
+    -------
+    InputError
     """
     changes = in_short(differences(old, new)) or otherwise
     return InputError(

@@ -17,12 +17,34 @@ MAX_LEVEL = 14
 
 
 def sigma_of_level(level: ArrayLike) -> NDArray[np.float64]:
-    """Standard deviation, in tile widths, of the footprint of a (fractional) level. Any shape."""
+    """Footprint of a level of detail.
+
+    Parameters
+    ----------
+    level : array_like
+        Fractional levels l, any shape.
+
+    Returns
+    -------
+    float64 array
+        Standard deviation ``2^-l / 2`` in tile widths.
+    """
     return 0.5 * np.exp2(-np.asarray(level, np.float64))
 
 
 def level_of_sigma(sigma: ArrayLike) -> NDArray[np.float64]:
-    """Fractional level ``-log2(2σ)`` of footprints σ in tile widths. Any shape; not clamped."""
+    """Fractional level of a footprint, the inverse of :func:`sigma_of_level`.
+
+    Parameters
+    ----------
+    sigma : array_like
+        Standard deviations σ in tile widths, any shape.
+
+    Returns
+    -------
+    float64 array
+        ``-log2(2σ)``, not clamped.
+    """
     return -np.log2(2.0 * np.asarray(sigma, np.float64))
 
 
@@ -32,8 +54,15 @@ class Lattice:
 
     Attributes
     ----------
-    finest : the finest level k
-    aspect : height of the tile over its width, ``a = H/W``
+    finest : int
+        Finest level k, 0 to 14.
+    aspect : float
+        Height of the tile over its width, ``a = H/W``.
+
+    Raises
+    ------
+    ValueError
+        `finest` or `aspect` is out of range.
     """
 
     finest: int
@@ -47,8 +76,19 @@ class Lattice:
 
     @classmethod
     def for_map(cls, rows: int, columns: int, finest: int | None = None) -> Lattice:
-        """Lattice of a map of `rows` × `columns` pixels; by default ``k = floor(log2(columns))``, at most
-        14."""
+        """Lattice of a map.
+
+        Parameters
+        ----------
+        rows, columns : int
+            Size of the map in pixels.
+        finest : int or None
+            Finest level k; by default ``floor(log2(columns))``, at most 14.
+
+        Returns
+        -------
+        Lattice
+        """
         k = min(int(columns).bit_length() - 1, MAX_LEVEL) if finest is None else finest
         return cls(k, rows / columns)
 
@@ -64,13 +104,22 @@ class Lattice:
 
     @property
     def sigma_range(self) -> tuple[float, float]:
-        """Smallest and largest footprint of the data: those of the finest level and of level 0."""
+        """Footprints of the finest level and of level 0, in tile widths."""
         return float(sigma_of_level(self.finest)), float(sigma_of_level(0))
 
     def blend(self, sigma: ArrayLike) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-        """Levels to blend for footprints σ: (coarser, finer, weight of the finer), each of σ's shape.
+        """Adjacent levels between which footprints are interpolated; levels are clamped to [0, k].
 
-        The level is clamped to [0, k]; the weights are ``1 - frac(l)`` and ``frac(l)``.
+        Parameters
+        ----------
+        sigma : array_like
+            Standard deviations in tile widths, any shape.
+
+        Returns
+        -------
+        coarse, fine : int64 arrays
+        weight : float64 array
+            Weight of the finer level, ``frac(l)``.
         """
         level = np.clip(level_of_sigma(sigma), 0.0, self.finest)
         coarse = np.minimum(np.floor(level), max(self.finest - 1, 0)).astype(np.int64)

@@ -27,14 +27,14 @@ STALE_SECONDS = 1800.0
 RENEW_SECONDS = 300.0
 # Errors of file systems without advisory locks.
 _NO_LOCKS = (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK)
-# Polling interval and patience for locks that are held briefly.
+# Polling interval and timeout of locks that are used briefly.
 _POLL_SECONDS = 0.02
 _PATIENCE_SECONDS = 60.0
 
 
 @dataclass(frozen=True)
 class Owner:
-    """Who holds a lock: machine, process, and since when (seconds since 1970)."""
+    """Owner of a lock: machine, process, and start (seconds since 1970)."""
 
     host: str
     process: int
@@ -52,7 +52,7 @@ def _age(seconds: float) -> str:
 
 
 class Lock:
-    """A lock that is held; :meth:`release` lets go, from any thread."""
+    """An acquired lock; any thread may :meth:`release` it."""
 
     _held: ClassVar[set[Lock]] = set()
     _guard: ClassVar[threading.Lock] = threading.Lock()
@@ -64,13 +64,13 @@ class Lock:
             Lock._held.add(self)
 
     def release(self) -> None:
-        """Remove the file and let go; once is enough, and more does no harm."""
+        """Remove the file and release the lock; repeated calls do nothing."""
         with Lock._guard:
             if self not in Lock._held:
                 return
             Lock._held.discard(self)
             try:
-                # A file that cannot be removed locks nothing once its holder has let go.
+                # A file that cannot be removed is harmless without the system's lock.
                 with contextlib.suppress(OSError):
                     self.path.unlink()
             finally:
@@ -78,7 +78,7 @@ class Lock:
 
     @classmethod
     def renew(cls) -> None:
-        """Renew the age of every lock that this process holds, for other machines."""
+        """Renew the age of all locks of this process, for other machines."""
         with cls._guard:
             for lock in cls._held:
                 with contextlib.suppress(OSError):
@@ -91,8 +91,7 @@ def lock_file_of(path: Path) -> Path:
 
 
 def _locked(lock: Path) -> tuple[int, bool] | None:
-    """Descriptor of the locked file, and whether the system really locks; None where another process holds
-    it."""
+    """Descriptor of the locked file, and whether locks are supported; None if another process owns it."""
     while True:
         handle = os.open(lock, os.O_CREAT | os.O_RDWR, 0o666)
         real = True
@@ -107,7 +106,7 @@ def _locked(lock: Path) -> tuple[int, bool] | None:
                 raise
             real = False
         try:
-            # Its former holder removes the file before letting go: what is locked may be gone by now.
+            # The former owner removes the file before releasing it, so the locked file may be gone.
             if os.path.samestat(os.fstat(handle), os.stat(lock)):
                 return handle, real
         except FileNotFoundError:
@@ -127,7 +126,7 @@ def _parsed(content: bytes) -> Owner | None:
 
 
 def lock_owner(path: Path) -> Owner | None:
-    """Who holds (or held last) the lock of `path`, as its file says; None where that says nothing."""
+    """Current or last owner of the lock of `path` according to its file; None if unknown."""
     try:
         return _parsed(lock_file_of(path).read_bytes()[:4096])
     except OSError:
@@ -140,13 +139,15 @@ def _alive(process: int) -> bool:
     except (ProcessLookupError, OverflowError):
         return False
     except PermissionError:
-        return True
+        pass
     return True
 
 
 def _held_elsewhere(handle: int, real: bool, stale: float) -> bool:
-    """Whether the file's content speaks of a writer that the system's lock does not show: one on another
-    machine, not long ago, or, where there are no locks, another living process."""
+    """Does the file name an owner that the system's lock does not show?
+
+    That is a recent one on another machine or, without locks, another living process.
+    """
     owner = _parsed(os.pread(handle, 4096, 0))
     if owner is None:
         return False
@@ -156,11 +157,13 @@ def _held_elsewhere(handle: int, real: bool, stale: float) -> bool:
 
 
 def take_lock(path: Path, stale: float = STALE_SECONDS) -> Lock | None:
-    """Take the lock of the shard `path`; None when another writer holds it.
+    """Acquire the lock of the shard `path`; None when another writer owns it.
 
     Parameters
     ----------
-    stale : seconds without a sign of life after which another machine's lock counts as abandoned
+    path : Path
+    stale : float
+        Age in seconds above which another machine's lock counts as abandoned.
 
     Raises
     ------
@@ -189,7 +192,7 @@ def take_lock(path: Path, stale: float = STALE_SECONDS) -> Lock | None:
 
 @contextlib.contextmanager
 def shard_lock(path: Path) -> Iterator[bool]:
-    """Hold the lock of the shard `path`; yields False when another writer holds it."""
+    """Acquire the lock of the shard `path` for a block; yields False when another writer owns it."""
     lock = take_lock(path)
     try:
         yield lock is not None
@@ -200,11 +203,11 @@ def shard_lock(path: Path) -> Iterator[bool]:
 
 @contextlib.contextmanager
 def brief_lock(path: Path) -> Iterator[None]:
-    """Hold a lock that everybody holds for moments only, such as the manifest's; waits for it.
+    """Acquire a lock that is only used briefly, such as the manifest's, and wait for it if needed.
 
     Raises
     ------
-    PartialError : another process keeps it
+    PartialError : another process does not release it
     """
     give_up = time.monotonic() + _PATIENCE_SECONDS
     while (lock := take_lock(path, _PATIENCE_SECONDS)) is None:

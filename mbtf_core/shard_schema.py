@@ -1,6 +1,6 @@
 """The shard format: schema version, arrays, units, conventions in words.
 
-Every other module, the manifest and ``docs/reference/data-format.md`` take their names and wording from here.
+All other modules, the manifest and ``docs/reference/data-format.md`` use these names and descriptions.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ class ShardEntry:
     ----------
     split : {"train", "test"}
     index : int
-        Its number within the split, from 0.
+        Number within the split, from 0.
     file : str
-        Its file name.
+        File name.
     rows : int
-        Its queries, or its images in the image layout.
+        Number of queries, or of images in the image layout.
     """
 
     split: Split

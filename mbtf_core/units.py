@@ -1,4 +1,4 @@
-"""Values as people write them: durations (``90s``, ``2min``), sizes (``500MB``), lists (``1,2,4``)."""
+"""Parsing and formatting of durations (``90s``, ``2min``), sizes (``500MB``), lists (``1,2,4``)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Predicts time, disk space and noise of a run, by a pilot on this machine."""
+"""Forecast of the time, disk space and noise of a run, from a pilot on this machine."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Estimates, Stream, Target
 from mbtf_gen.sampling.query_sampler import Queries
 
-# Paths of one piece of the pilot, and the fewest pieces that are timed.
+# Paths of one piece of the pilot, and the minimum number of timed pieces.
 _PIECE_PATHS = 1 << 19
 _FEWEST = 3
 
@@ -181,12 +181,12 @@ def _piece(job: Job, plan: RunPlan, estimator: Any, split: Split, number: int, c
     start = time.perf_counter()
     queries = pilot_queries(job, max(1, min(count, split_queries(job, split))), number)
     stream = Stream(job.config.seed, "pilot", number)
-    drawn = time.perf_counter()
+    sampled = time.perf_counter()
     found = estimate_shard(estimator, queries, spp, target, stream, plan.allocation)
     traced = time.perf_counter()
     _write(queries, found)
-    beside = drawn - start + time.perf_counter() - traced
-    took = max(traced - drawn, 1e-9)
+    beside = sampled - start + time.perf_counter() - traced
+    took = max(traced - sampled, 1e-9)
     n = len(queries.sigma)
     stored = n * spp if found.spp is None else int(found.spp.sum())
     missed = 0 if found.target is None else found.target.missed
@@ -203,15 +203,8 @@ def _query_seconds(pieces: list[_Piece]) -> float:
 
 def _write(queries: Queries, found: Estimates) -> None:
     """Write a piece like a shard, and delete it."""
-    arrays = {
-        "u": queries.u,
-        "sigma": queries.sigma,
-        "omega_i": queries.omega_i,
-        "omega_o": queries.omega_o,
-        "value_a": found.value_a,
-        "value_b": found.value_b,
-        "spp": np.ones(len(queries.sigma), np.float32),
-    }
+    arrays = vars(queries) | {name: getattr(found, name) for name in ("value_a", "value_b")}
+    arrays["spp"] = np.ones(len(queries.sigma), np.float32)
     with tempfile.TemporaryDirectory(prefix="mbtf-forecast-") as folder:
         write_shard(Path(folder) / "piece.npz", arrays)
 

@@ -22,11 +22,16 @@ class Comparison:
 
     Attributes
     ----------
-    group, channel : which rows and which channel
-    kind : ``mean``: mean difference; ``scatter``: mean squared true difference
-    estimate : the quantity, expected to be zero
-    p_value : of this test alone
-    corrected : corrected for all tests made together (Holm)
+    group, channel : int
+        Label of the group, and channel.
+    kind : {"mean", "scatter"}
+        Mean difference, or mean squared true difference.
+    estimate : Estimate
+        The quantity, expected to be zero.
+    p_value : float
+        Of this test alone.
+    corrected : float
+        Corrected for the number of tests (Holm).
     """
 
     group: int
@@ -50,7 +55,7 @@ class Aggregate:
 
     @property
     def worst(self) -> Comparison:
-        """The comparison that speaks most strongly against agreement."""
+        """The comparison of the smallest p-value."""
         return min(self.comparisons, key=lambda c: c.p_value)
 
     def __str__(self) -> str:
@@ -80,15 +85,23 @@ def aggregate_test(
 
     Parameters
     ----------
-    a1, b1 : halves of the first data set, (n, channels) or (items, rows, columns, channels)
-    a2, b2 : halves of the second at the same queries in the same order, drawn independently of the first
-    groups : (n,) integer labels; one group by default; negative labels leave rows out
-    minimum : fewest units a group may have; a smaller one is refused because the tails of few heavy-tailed
-        values are not those of the t distribution
+    a1, b1 : (n, channels) or (items, rows, columns, channels) array_like
+        Halves of the first data set.
+    a2, b2 : array_like of the same shape
+        Halves of the second data set at the same queries, sampled independently.
+    groups : (n,) int array_like or None
+        Labels; one group by default. Rows with negative labels are ignored.
+    minimum : int
+        Smallest number of units per group, below which heavy tails invalidate the t distribution.
+
+    Returns
+    -------
+    Aggregate
 
     Raises
     ------
-    ValueError : shapes differ, no group, or a group has fewer than `minimum` units
+    ValueError
+        Shapes differ, there is no group, or a group has fewer than `minimum` units.
     """
     arrays = [_channels(array, name) for array, name in ((a1, "a1"), (b1, "b1"), (a2, "a2"), (b2, "b2"))]
     if len({array.shape for array in arrays}) > 1:

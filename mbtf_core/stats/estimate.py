@@ -14,14 +14,18 @@ from mbtf_core.errors import InputError
 
 @dataclass(frozen=True)
 class Estimate:
-    """A measured number; ``str()`` gives ``0.318 ± 0.004``.
+    """An estimate with its standard error; ``str()`` gives ``0.318 ± 0.004``.
 
     Attributes
     ----------
-    value : the estimate, in its quantity's unit
-    error : its standard error (one standard deviation), same unit; ``inf`` where it cannot be known
-    n : independent units it rests on: queries, or images in the image layout
-    dof : degrees of freedom of `error`; None stands for ``n - 1``
+    value : float
+        The estimate, in the unit of its quantity.
+    error : float
+        Standard error (one standard deviation), same unit; ``inf`` where it is unknown.
+    n : int
+        Number of independent units: queries, or images in the image layout.
+    dof : float or None
+        Degrees of freedom of `error`; None means ``n - 1``.
     """
 
     value: float
@@ -69,11 +73,20 @@ def _exponent(x: float) -> int:
 
 
 def mean_estimate(samples: ArrayLike) -> Estimate:
-    """Mean of independent samples (n, ...), axes after the first averaged before the error is taken.
+    """Mean of independent samples, with its standard error.
 
-    The sample mean is unbiased, and ``s²/n`` with the ``n-1`` divisor an unbiased variance of it. Averaging
-    the trailing axes first (channels of a query, texels of an image) keeps the error right however strongly
-    they are correlated.
+    The sample mean is unbiased, and ``s²/n`` with the ``n-1`` divisor an unbiased estimate of its variance.
+    Trailing axes (channels of a query, texels of an image) are averaged first, so their correlation does not
+    bias the error.
+
+    Parameters
+    ----------
+    samples : (n, ...) array_like
+
+    Returns
+    -------
+    Estimate
+        In the unit of the samples.
     """
     units = per_unit(checked(samples, "samples"))
     n = len(units)
@@ -82,10 +95,18 @@ def mean_estimate(samples: ArrayLike) -> Estimate:
 
 
 def paired_difference(x: ArrayLike, y: ArrayLike) -> Estimate:
-    """Mean of ``x - y`` over units measured under both conditions, each (n, ...) and in the same order.
+    """Mean of ``x - y`` over units measured under both conditions.
 
-    What the two share (the query, its reference noise) cancels in each difference, so the error is that of
-    the difference and not of two independent means.
+    Contributions that both share (the query, its reference noise) cancel in each difference.
+
+    Parameters
+    ----------
+    x, y : (n, ...) array_like
+        Measurements of the same units in the same order.
+
+    Returns
+    -------
+    Estimate
     """
     first, second = checked(x, "x"), checked(y, "y")
     if first.shape != second.shape:
@@ -103,7 +124,7 @@ def checked(array: ArrayLike, name: str) -> NDArray[np.float64]:
     """
     out = np.asarray(array, np.float64)
     if out.ndim == 0 or out.shape[0] == 0:
-        raise ValueError(f"{name} holds no rows")
+        raise ValueError(f"{name} has no rows")
     bad = ~np.isfinite(out)
     if bad.any():
         first = tuple(int(i) for i in np.argwhere(bad)[0])

@@ -13,17 +13,21 @@ from mbtf_core.stats.estimate import Estimate
 
 
 def by_group(function: Callable[..., Estimate], groups: ArrayLike, *arrays: ArrayLike) -> dict[int, Estimate]:
-    """A statistic of each group's rows: ``by_group(noise_free_mse, level_groups(sigma), p, a, b)``.
+    """Evaluate a statistic per group: ``by_group(noise_free_mse, level_groups(sigma), p, a, b)``.
 
     Parameters
     ----------
-    function : any function of this kit that takes arrays and returns an Estimate
-    groups : (n,) integer labels; a negative one leaves its row out
-    arrays : the function's arguments, each (n, ...)
+    function : callable
+        A function of this package that takes arrays and returns an Estimate.
+    groups : (n,) int array_like
+        Labels; rows with negative labels are ignored.
+    *arrays : (n, ...) array_like
+        Arguments of the function.
 
     Returns
     -------
-    label → Estimate, labels ascending; a group's estimate rests on its own rows alone
+    dict of int to Estimate
+        Estimate of each group from its own rows, by ascending label.
     """
     labels = group_labels(groups, len(np.asarray(arrays[0])))
     rows = [np.asarray(array) for array in arrays]
@@ -47,16 +51,36 @@ def group_labels(groups: ArrayLike, n: int) -> NDArray[np.int64]:
 
 
 def level_groups(sigma: ArrayLike, finest: int | None = None) -> NDArray[np.int64]:
-    """Label of each footprint σ (tile widths): the nearest level, ``round(-log2(2σ))``, kept in 0..finest."""
+    """Label footprints with their nearest level, ``round(-log2(2σ))``.
+
+    Parameters
+    ----------
+    sigma : array_like
+        Standard deviations in tile widths, any shape.
+    finest : int or None
+        Labels are clamped to 0..finest.
+
+    Returns
+    -------
+    int64 array
+    """
     level = np.rint(level_of_sigma(sigma)).astype(np.int64)
     return np.clip(level, 0, finest)
 
 
 def elevation_groups(*omegas: ArrayLike, edges: tuple[float, ...] = ELEVATION_BANDS) -> NDArray[np.int64]:
-    """Label of each query: the band that the smallest cosine of its directions (n, 3) falls into.
+    """Label queries with the elevation band of their most grazing direction.
 
-    Label i stands for ``edges[i] ≤ cos θ < edges[i+1]`` (the last band includes its upper edge); with ω_i and
-    ω_o given, the more grazing of the two decides.
+    Parameters
+    ----------
+    *omegas : (n, 3) array_like
+        Unit vectors, such as ω_i and ω_o.
+    edges : tuple of float
+        Band i is ``edges[i] ≤ cos θ < edges[i+1]``; the last band includes its upper edge.
+
+    Returns
+    -------
+    (n,) int64 array
     """
     cosine = np.min([np.asarray(w, np.float64)[..., 2] for w in omegas], axis=0)
     return np.clip(np.searchsorted(edges, cosine, side="right") - 1, 0, len(edges) - 2).astype(np.int64)

@@ -41,14 +41,20 @@ def mean_of_halves(a: ArrayLike, b: ArrayLike) -> Estimate:
 
     Unbiased because each half is. The variance ``Σ (a-b)²/4 / n²`` is unbiased too: ``E(a-b)²`` is ``Var a
     + Var b`` and ``Var (a+b)/2`` a quarter of that. `dof` is the effective number of degrees of freedom of
-    this sum of single-pair variances v: Satterthwaite's (1946) ``(Σv)²/Σv²``, where a variance estimated
-    from one pair of normal halves has three times the square it should, so ``3 (Σv)²/Σv² - 2``. That is 1
-    for one query, about n for n alike ones, and few where few queries make the noise. Unlike
-    :func:`mean_estimate` it ignores that other queries might have been drawn.
+    this sum of single-pair variances v: Satterthwaite's (1946) ``(Σv)²/Σv²``, where the square of a
+    variance from one pair of normal halves is three times too large, hence ``3 (Σv)²/Σv² - 2``. That is 1
+    for one query, about n for n similar ones, and small where few queries dominate the noise. Unlike
+    :func:`mean_estimate` it does not include the variance over queries.
+
+    Parameters
+    ----------
+    a, b : (n, ...) array_like
+        Independent halves of the values.
 
     Returns
     -------
-    Estimate in the values' unit
+    Estimate
+        In the unit of the values.
     """
     first, second = _pair(a, b)
     x, y = per_unit(first), per_unit(second)
@@ -62,7 +68,17 @@ def pooled_variance(a: ArrayLike, b: ArrayLike) -> Estimate:
     """Noise variance of one query's value ``(a+b)/2``, pooled over queries and channels.
 
     The mean of ``(a-b)²/4``. Unbiased for any noise, also of different variance in the two halves:
-    ``E(a-b)² = Var a + Var b = 4 Var (a+b)/2``. Unit: the values' squared.
+    ``E(a-b)² = Var a + Var b = 4 Var (a+b)/2``.
+
+    Parameters
+    ----------
+    a, b : (n, ...) array_like
+        Independent halves of the values.
+
+    Returns
+    -------
+    Estimate
+        In the squared unit of the values.
     """
     first, second = _pair(a, b)
     return mean_estimate((first - second) ** 2 / 4.0)
@@ -71,8 +87,17 @@ def pooled_variance(a: ArrayLike, b: ArrayLike) -> Estimate:
 def pooled_error(a: ArrayLike, b: ArrayLike) -> Estimate:
     """Root mean square noise of one query's value ``(a+b)/2``, in the values' unit.
 
-    The square root of :func:`pooled_variance`, whose error bar it takes by the delta method; the root of an
-    unbiased estimate is low by about ``error²/(2 value)``, negligible beyond some hundred queries.
+    The square root of :func:`pooled_variance`, with the error of the delta method. It is biased by about
+    ``-error²/(2 value)``, negligible for more than some hundred queries.
+
+    Parameters
+    ----------
+    a, b : (n, ...) array_like
+        Independent halves of the values.
+
+    Returns
+    -------
+    Estimate
     """
     return _root(pooled_variance(a, b))
 
@@ -82,11 +107,21 @@ def pooled_relative_error(a: ArrayLike, b: ArrayLike, floor: float | None = None
 
     Parameters
     ----------
-    floor : None divides the root mean square noise by the root mean square truth,
-        ``√(mean (a-b)²/4 / mean ab)``: both means are unbiased, the ratio is consistent. A number, such as
-        the tile mean, divides each query's noise by ``max(|a+b|/2, floor)`` first: the measure that a target
-        error is set in. Its denominators are noisy where the value is, so it is only as good as the floor is
-        large against the noise.
+    a, b : (n, ...) array_like
+        Independent halves of the values.
+    floor : float or None
+        None: the RMS noise over the RMS value, ``√(mean (a-b)²/4 / mean ab)``, which is consistent. A number,
+        such as the tile mean: the noise of each query over ``max(|a+b|/2, floor)``, as for target errors. It
+        is accurate where the floor is large compared with the noise.
+
+    Returns
+    -------
+    Estimate
+
+    Raises
+    ------
+    ValueError
+        `floor` is not positive.
     """
     first, second = _pair(a, b)
     noise = (first - second) ** 2 / 4.0
@@ -100,9 +135,20 @@ def pooled_relative_error(a: ArrayLike, b: ArrayLike, floor: float | None = None
 def noise_free_mse(prediction: ArrayLike, a: ArrayLike, b: ArrayLike) -> Estimate:
     """Mean squared error of a prediction against the truth, without the noise of the reference.
 
-    The mean of ``(p-a)(p-b)`` over queries and channels. Unbiased as long as p was not made from these
-    halves: ``E (p-t-α)(p-t-β) = (p-t)²`` because α and β are independent of mean zero. It may come out
-    negative when the true error lies below the noise. Unit: the values' squared.
+    The mean of ``(p-a)(p-b)`` over queries and channels. Unbiased if p is independent of these halves:
+    ``E (p-t-α)(p-t-β) = (p-t)²`` because α and β are independent with mean zero. It may be negative when the
+    true error is below the noise.
+
+    Parameters
+    ----------
+    prediction : (n, ...) array_like
+    a, b : (n, ...) array_like
+        Independent halves of the reference.
+
+    Returns
+    -------
+    Estimate
+        In the squared unit of the values.
     """
     p, first, second = _with_prediction(prediction, a, b)
     return mean_estimate((p - first) * (p - second))
@@ -111,8 +157,18 @@ def noise_free_mse(prediction: ArrayLike, a: ArrayLike, b: ArrayLike) -> Estimat
 def mse_difference(prediction: ArrayLike, other: ArrayLike, a: ArrayLike, b: ArrayLike) -> Estimate:
     """Noise-free mean squared error of `prediction` minus that of `other`, compared query by query.
 
-    Negative where `prediction` is better. Reference noise that both share cancels, so the error bar is much
-    smaller than that of two separate errors. Unbiased like :func:`noise_free_mse`.
+    Negative where `prediction` is better. Shared reference noise cancels, so the error bar is much smaller
+    than that of two separate errors. Unbiased like :func:`noise_free_mse`.
+
+    Parameters
+    ----------
+    prediction, other : (n, ...) array_like
+    a, b : (n, ...) array_like
+        Independent halves of the reference.
+
+    Returns
+    -------
+    Estimate
     """
     p, first, second = _with_prediction(prediction, a, b)
     q, _, _ = _with_prediction(other, a, b)
@@ -125,7 +181,17 @@ def signal_variance(a: ArrayLike, b: ArrayLike) -> Estimate:
     For ``(n, channels)`` the sample covariance of a and b, ``Σ (a-ā)(b-b̄)/(n-1)``: given the queries, every
     a is independent of every b, so its expectation is the covariance of t with itself. For images the
     covariance of the images' means over n compensates the term that ``ā b̄`` subtracts, so the estimate is
-    unbiased when whole images are drawn. Unit: the values' squared.
+    unbiased when whole images are sampled.
+
+    Parameters
+    ----------
+    a, b : (n, ...) array_like
+        Independent halves of the values.
+
+    Returns
+    -------
+    Estimate
+        In the squared unit of the values.
     """
     products, correction = _centered_products(*_pair(a, b))
     spread = mean_estimate(products)
@@ -137,7 +203,7 @@ def signal_variance(a: ArrayLike, b: ArrayLike) -> Estimate:
 def unexplained_variance(
     prediction: ArrayLike, a: ArrayLike, b: ArrayLike, weights: ArrayLike | None = None
 ) -> Estimate:
-    """Share of the true values' variance that a prediction misses: noise-free MSE ÷ signal variance.
+    """Fraction of unexplained variance, 1 - R²: noise-free MSE over signal variance.
 
     0 is perfect, 1 no better than the mean value, more is possible. Numerator and denominator are unbiased;
     the ratio is consistent, with a bias of order 1/n. The error bar is the delta method's, from the scatter
@@ -147,15 +213,22 @@ def unexplained_variance(
 
     Parameters
     ----------
-    prediction, a, b : equal shapes
-    weights : (n,) of the units, above 0: one over the probability with which each was taken, where they were
-        not taken all alike. Sums over units then stand for those over all that might have been taken
-        (Horvitz & Thompson 1952); only their ratios matter
+    prediction, a, b : (n, ...) array_like
+        The prediction, and independent halves of the reference.
+    weights : (n,) array_like or None
+        Positive weights of the units: inverse sampling probabilities (Horvitz & Thompson 1952), up to a
+        common factor. None: uniform sampling.
+
+    Returns
+    -------
+    Estimate
 
     Raises
     ------
-    InputError : a number is NaN or infinite
-    ValueError : shapes differ, or a weight is not above 0
+    InputError
+        A number is NaN or infinite.
+    ValueError
+        Shapes differ, or a weight is not positive.
     """
     p, first, second = _with_prediction(prediction, a, b)
     w = _weights(weights, len(first))

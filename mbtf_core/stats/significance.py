@@ -23,9 +23,12 @@ class Outcome:
 
     Attributes
     ----------
-    difference : what was tested against zero, with the error of the difference
-    statistic : difference over its error
-    p_value : probability of a statistic at least as extreme if the hypothesis holds
+    difference : Estimate
+        Quantity that is tested against zero.
+    statistic : float
+        Difference over its error.
+    p_value : float
+        Probability of a statistic at least as extreme under the null hypothesis.
     """
 
     difference: Estimate
@@ -78,13 +81,27 @@ def z_test(
 ) -> Outcome:
     """Does x differ from y, a known value or an independent estimate? Normal statistic.
 
-    The error bar is taken as exact, which holds for aggregates only: an error from one pair of halves has one
-    degree of freedom, and a z-test on it calls 30 % of faultless queries 2σ off instead of 5 %. So fewer
-    units than `minimum` are refused; use :func:`t_test` for them.
+    The error bar is treated as exact, which is valid for aggregates only: an error from one pair of halves
+    has one degree of freedom, and a z-test on it rejects 30 % of correct queries at 2σ instead of 5 %. Use
+    :func:`t_test` for fewer than `minimum` units.
+
+    Parameters
+    ----------
+    x : Estimate
+    y : Estimate or float
+        A known value or an independent estimate.
+    alternative : {"two-sided", "greater", "less"}
+    minimum : int
+        Smallest number of units.
+
+    Returns
+    -------
+    Outcome
 
     Raises
     ------
-    ValueError : an estimate rests on fewer than `minimum` units
+    ValueError
+        An estimate has fewer than `minimum` units.
     """
     for estimate in (x, y):
         if isinstance(estimate, Estimate) and estimate.n < minimum:
@@ -102,6 +119,17 @@ def t_test(x: Estimate, y: Estimate | float = 0.0, alternative: Alternative = "t
     The degrees of freedom are the estimate's own (``n-1``, or the effective number that
     :func:`~mbtf_core.stats.mean_of_halves` gives); those of two combine after Welch and Satterthwaite.
     Exact for normal noise of equal variance, at any n.
+
+    Parameters
+    ----------
+    x : Estimate
+    y : Estimate or float
+        A known value or an independent estimate.
+    alternative : {"two-sided", "greater", "less"}
+
+    Returns
+    -------
+    Outcome
     """
     difference = _difference(x, y)
     statistic = _statistic(difference)
@@ -117,7 +145,14 @@ def equivalence_test(x: Estimate, y: Estimate | float, tolerance: float) -> Outc
 
     Parameters
     ----------
-    tolerance : largest difference that does not matter, in the estimates' unit
+    x : Estimate
+    y : Estimate or float
+    tolerance : float
+        Largest irrelevant difference, in the unit of the estimates.
+
+    Returns
+    -------
+    Outcome
     """
     if not tolerance > 0:
         raise ValueError(f"tolerance must be positive, not {tolerance}")
@@ -135,7 +170,17 @@ def _p_values(p_values: ArrayLike) -> NDArray[np.float64]:
 
 
 def sidak(p_values: ArrayLike) -> NDArray[np.float64]:
-    """p-values corrected for their number m, ``1 - (1-p)^m``: exact for independent tests. Any shape."""
+    """p-values corrected for their number m, ``1 - (1-p)^m``: exact for independent tests.
+
+    Parameters
+    ----------
+    p_values : array_like
+        In [0, 1], any shape.
+
+    Returns
+    -------
+    float64 array
+    """
     p = _p_values(p_values)
     with np.errstate(divide="ignore"):
         return -np.expm1(p.size * np.log1p(-p))
@@ -144,8 +189,16 @@ def sidak(p_values: ArrayLike) -> NDArray[np.float64]:
 def holm(p_values: ArrayLike) -> NDArray[np.float64]:
     """p-values corrected for their number by Holm's step-down rule (1979). Any shape.
 
-    Holds the rate of any false alarm at the chosen level however the tests depend on each other, and is never
-    weaker than Bonferroni.
+    Bounds the familywise error rate for any dependence between the tests; at least as powerful as Bonferroni.
+
+    Parameters
+    ----------
+    p_values : array_like
+        In [0, 1], any shape.
+
+    Returns
+    -------
+    float64 array
     """
     p = _p_values(p_values)
     flat = p.ravel()

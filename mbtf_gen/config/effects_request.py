@@ -1,4 +1,4 @@
-"""The effects of light by name, and the request that a user makes of them with ``--effects``."""
+"""Names of the light transport effects, and the user's request for them (``--effects``)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from mbtf_core.errors import UsageError
 
-# Effects by name, in the order in which light meets them, and what they are called.
+# Effects by name, with their descriptions.
 EFFECTS: dict[str, str] = {
     "parallax": "parallax and masking",
     "shadowing": "shadowing",
@@ -20,7 +20,7 @@ EFFECTS: dict[str, str] = {
     "opacity": "opacity",
     "bsdf_sampling": "BSDF sampling of light",
 }
-# Those that only a displaced surface has.
+# Effects of displaced surfaces only.
 RELIEF_EFFECTS = ("parallax", "shadowing", "interreflection")
 
 

@@ -45,13 +45,13 @@ def parse_count(text: str | int | float) -> tuple[float, bool]:
 
 
 def count_queries(text: str | int | float, texels: int) -> int:
-    """Number of queries that ``N`` or ``N/texel`` stands for; at least 1."""
+    """Number of queries of ``N`` or ``N/texel``; at least 1."""
     number, per_texel = parse_count(text)
     return max(1, round(number * texels) if per_texel else int(number))
 
 
 def _count(text: Any) -> str:
-    """One spelling per count: ``400 / texel`` and ``400/texel`` are one configuration."""
+    """Canonical spelling of a count: ``400 / texel`` and ``400/texel`` are the same configuration."""
     number, per_texel = parse_count(text)
     digits = str(int(number)) if number == int(number) else repr(number)
     return f"{digits}/texel" if per_texel else digits
@@ -230,7 +230,17 @@ class GeneratorConfig(Settings):
     )
 
     def data_fields(self, inputs: dict[str, str]) -> dict[str, Any]:
-        """What the data depend on: the options, and digests of the input files instead of their names."""
+        """Everything that determines the data: options, and digests of the input files.
+
+        Parameters
+        ----------
+        inputs : dict of str to str
+            SHA-256 of the input file of each role.
+
+        Returns
+        -------
+        dict
+        """
         fields = self.model_dump(exclude={"material"})
         return {"schema": SCHEMA_VERSION, "inputs": dict(sorted(inputs.items())), **fields}
 

@@ -1,4 +1,4 @@
-"""Quality presets: options that belong together, from a quick draft to the sizes of the papers.
+"""Quality presets of the generator, from a quick draft to the sizes of the papers.
 
 A preset overrides the configuration file; ``--set`` and flags override the preset. ``benchmarks/quality.py``
 measures the time that each preset takes and the error that it reaches.
@@ -16,35 +16,20 @@ QualityOption = Annotated[
     Parameter(help="Preset of sizes and times; overrides the configuration, other options override it."),
 ]
 
+
+def _queries(train: str, spp: int, test: str, test_spp: int) -> dict[str, Any]:
+    return {"queries.train": train, "queries.spp": spp, "queries.test": test, "queries.test_spp": test_spp}
+
+
 # Options of the generator by preset, dotted names.
 GENERATOR: dict[Quality, dict[str, Any]] = {
     # With half as many queries, fits of glossy materials overfit single bright paths. Test errors are free of
     # noise and limited by their variance over queries, so many test queries get few paths each.
-    "draft": {
-        "queries.train": "400/texel",
-        "queries.spp": 4,
-        "queries.test": "65536",
-        "queries.test_spp": 16,
-    },
-    "standard": {
-        "queries.train": "800/texel",
-        "queries.spp": 4,
-        "queries.test": "131072",
-        "queries.test_spp": 32,
-    },
-    "high": {
-        "queries.train": "1600/texel",
-        "queries.spp": 4,
-        "queries.test": "262144",
-        "queries.test_spp": 128,
-    },
+    "draft": _queries("400/texel", 4, "65536", 16),
+    "standard": _queries("800/texel", 4, "131072", 32),
+    "high": _queries("1600/texel", 4, "262144", 128),
     # Kuznetsov et al. 2021: 200 to 400 queries per texel of 64 paths.
-    "paper": {
-        "queries.train": "400/texel",
-        "queries.spp": 64,
-        "queries.test": "262144",
-        "queries.test_spp": 256,
-    },
+    "paper": _queries("400/texel", 64, "262144", 256),
 }
 
 

@@ -3,7 +3,7 @@
 Mesh vertices sit on texel centers of the grid, ``uv = ((i+½)/W, 1-(j+½)/H)``, heights are
 ``z = height · (h - max h)``, and the cell between the last and the first column (row) closes the period.
 Meshes for other renderers may have an apron of repeated cells around the period, so that a ray near its
-border meets surface on both sides of it.
+border meets surface on both sides.
 """
 
 from __future__ import annotations
@@ -17,12 +17,14 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class HeightGrid:
-    """Heights of one tile in tile widths.
+    """Heights of one tile.
 
     Attributes
     ----------
-    z : (H, W) heights ≤ 0, maximum 0; row 0 is the side ``v → 1``
-    aspect : H/W of the tile
+    z : (H, W) float64 array
+        Heights ≤ 0 in tile widths, maximum 0; row 0 is the side ``v → 1``.
+    aspect : float
+        H/W of the tile.
     """
 
     z: NDArray[np.float64]
@@ -32,7 +34,7 @@ class HeightGrid:
     def from_map(cls, heights: NDArray[np.float64], scale: float, aspect: float | None = None) -> HeightGrid:
         """Grid of a height map (H, W) of stored numbers: ``z = scale · (h - max h)``; aspect H/W by default.
 
-        The maximum is taken after scaling, so that a negative scale turns the relief upside down.
+        The maximum is taken after scaling, so a negative scale inverts the heights.
         """
         z = scale * np.asarray(heights, np.float64)
         rows, columns = z.shape

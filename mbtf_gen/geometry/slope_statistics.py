@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mbtf_gen.geometry.heightfield import HeightGrid
 
-# A self-repetition shows as a peak of the autocorrelation at least so high, after a dip at least so low.
+# A repetition is a peak of the autocorrelation of at least the first value after a dip below the second.
 _PEAK, _DIP = 0.8, 0.5
 _SHORTEST = 4
 
@@ -59,7 +59,7 @@ def autocorrelation(height: NDArray[np.floating[Any]], axis: int) -> NDArray[np.
 
 
 def detail_size(height: NDArray[np.floating[Any]]) -> float:
-    """Texels within which heights lose half of their correlation, in the quicker direction (interpolated)."""
+    """Half width of the autocorrelation in texels, interpolated, the smaller one of both axes."""
     return min(_half_width(autocorrelation(height, axis)) for axis in (0, 1))
 
 
@@ -74,9 +74,9 @@ def _half_width(correlation: NDArray[np.float64]) -> float:
 
 
 def repeats(height: NDArray[np.floating[Any]], axis: int) -> int:
-    """How often heights (H, W) repeat themselves along an axis within the tile; 1 where they do not.
+    """Number of repetitions of heights (H, W) along an axis within the tile; 1 without repetition.
 
-    The first lag at which the autocorrelation peaks at 0.8 or more after falling below 0.5.
+    Found at the first lag at which the autocorrelation peaks at 0.8 or more after falling below 0.5.
     """
     correlation = autocorrelation(height, axis)
     dip = np.nonzero(correlation < _DIP)[0]

@@ -15,7 +15,7 @@ from mbtf_gen.images.resample import resample
 
 NormalMode = Literal["residual", "absolute", "off"]
 
-# Normals flatter than this against the plane, a slope of 20, are not told apart by 8-bit maps.
+# Smallest z, a slope of 20, that 8-bit maps resolve.
 _SMALLEST_Z = 0.05
 
 
@@ -28,8 +28,7 @@ def height_slopes(grid: HeightGrid) -> NDArray[np.float64]:
 
 
 def normal_slopes(normal: NDArray[np.floating[Any]], smallest_z: float = _SMALLEST_Z) -> NDArray[np.float64]:
-    """Slopes (h, w, 2) that unit normals (h, w, 3) with y along v stand for, z taken to be at least
-    `smallest_z`."""
+    """Slopes (h, w, 2) of unit normals (h, w, 3) with y along v, z clamped to at least `smallest_z`."""
     n = normal.astype(np.float64)
     return -n[..., :2] / np.maximum(n[..., 2:], smallest_z)
 

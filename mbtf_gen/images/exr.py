@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
 
-# Of all channels of all parts together, so many full images are read.
+# Limit of the numbers in all channels of all parts, in multiples of the largest image.
 _MOST_CHANNELS = 4
 # Tiles may be larger than the image, up to this.
 _TILE_PIXELS = 1 << 20
@@ -22,7 +22,7 @@ _TILE_PIXELS = 1 << 20
 
 @contextlib.contextmanager
 def silenced() -> Iterator[None]:
-    """Keep a native library's remarks on a broken file out of standard output and standard error."""
+    """Suppress what native libraries print on standard output and standard error."""
     sys.stdout.flush()
     sys.stderr.flush()
     saved = os.dup(1), os.dup(2)
@@ -49,20 +49,35 @@ def _window(header: dict[str, Any], name: str) -> tuple[int, int, int, int]:
 
 
 def read_file(path: Path, max_pixels: int) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """Header of the first part of an EXR file, and its channels (H, W) by name, float16 or float32.
+    """Read the first part of an EXR file.
+
+    Parameters
+    ----------
+    path : Path
+    max_pixels : int
+        Largest size that is read.
+
+    Returns
+    -------
+    header : dict
+    channels : dict of str to (H, W) float16 or float32 arrays
 
     Raises
     ------
-    InputError : broken, more than `max_pixels`, cropped (data window unlike the display window), deep,
-        subsampled, or channels of whole numbers
+    InputError
+        The file is damaged, too large, deep, subsampled or cropped (data window unlike the display window),
+        or stores integers.
     """
     head, channels = _read(path, max_pixels)[0]
+    check_floats(channels, path)
+    return head, channels
+
+
+def check_floats(channels: dict[str, NDArray[Any]], path: Path) -> None:
+    """Refuse channels of integers."""
     for name, channel in channels.items():
         if channel.dtype.kind != "f":
-            raise InputError(
-                f"channel '{name}' holds whole numbers", where=path, hint="save it as half or float"
-            )
-    return head, channels
+            raise InputError(f"channel '{name}' stores integers", where=path, hint="save it as half or float")
 
 
 def read_channels(path: Path, max_pixels: int) -> dict[str, NDArray[Any]]:
@@ -119,7 +134,7 @@ def _read(path: Path, max_pixels: int) -> list[tuple[dict[str, Any], dict[str, N
 
 
 def _checked_size(head: dict[str, Any], path: Path, max_pixels: int) -> tuple[int, int]:
-    """(rows, columns) of a part, unless it is of a kind that is refused."""
+    """(rows, columns) of a part; refuses unsupported kinds."""
     import OpenEXR
 
     if head["type"] not in (OpenEXR.scanlineimage, OpenEXR.tiledimage):
@@ -134,7 +149,7 @@ def _checked_size(head: dict[str, Any], path: Path, max_pixels: int) -> tuple[in
         )
     tiles = head["tiles"] if head["type"] == OpenEXR.tiledimage else None
     if tiles is not None and tiles.xSize * tiles.ySize > max(rows * columns, _TILE_PIXELS):
-        # The library takes memory for whole tiles, whatever the size of the image.
+        # The library allocates whole tiles, whatever the size of the image.
         raise InputError(f"claims tiles of {tiles.xSize} x {tiles.ySize} pixels", where=path)
     if any(c.xSampling != 1 or c.ySampling != 1 for c in head["channels"]):
         raise InputError("subsampled EXR channels are not supported", where=path, hint="save it as plain RGB")

@@ -1,4 +1,4 @@
-"""Which channels of an EXR file make up the image that is wanted."""
+"""Selection of channels and layers of EXR files."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 from mbtf_core.errors import InputError
 
-# Channels that belong together, in the order in which an image holds them; Y after XYZ, which holds a Y.
+# Channels of one image, in order; Y comes after XYZ, which contains a Y.
 _SETS = ("RGB", "XYZ", "Y")
 
 
@@ -57,7 +57,7 @@ def choose_channels(
         raise InputError(
             f"has no channel or layer '{channel}'",
             where=path,
-            hint=f"did you mean '{near[0]}'?" if near and near[0] else f"it holds {listed}",
+            hint=f"did you mean '{near[0]}'?" if near and near[0] else f"it has {listed}",
         )
     if len(found) == 1:
         return next(iter(found.values()))
@@ -72,6 +72,6 @@ def choose_channels(
     raise InputError(
         f"which of its channels are meant is unclear: {listed}",
         where=path,
-        hint="say so in a material.yaml, such as height: {file: "
+        hint="name one in a material.yaml, such as height: {file: "
         f"{path.name}, channel: {next(iter(found))}}}, or keep the channels R, G, B",
     )

@@ -1,4 +1,4 @@
-"""What an image file says about its colors and its orientation, as far as that is well defined."""
+"""Color space and orientation that an image file declares."""
 
 from __future__ import annotations
 
@@ -10,19 +10,23 @@ from typing import Any, Literal
 ColorSpace = Literal["srgb", "linear"]
 
 _ORIENTATION = 0x0112
-# Stored gammas are rounded to 1e-5; these are 1/2.2, which stands for sRGB, and 1.
-_SRGB_GAMMA, _LINEAR_GAMMA, _SLACK = 0.45455, 1.0, 0.005
+# Stored gammas of the known spaces (sRGB: 1/2.2), and the tolerance of their comparison.
+_GAMMAS: dict[ColorSpace, float] = {"srgb": 0.45455, "linear": 1.0}
+_SLACK = 0.005
 
 
 @dataclass(frozen=True)
 class Tags:
-    """Claims of a file about itself.
+    """Metadata of an image file.
 
     Attributes
     ----------
-    space : color space, where the file names one of the two that are known
-    foreign : what it claims otherwise, in words, such as ``color profile 'Display P3'``; None without
-    orientation : EXIF orientation, 1 upright
+    space : {"srgb", "linear"} or None
+        Declared color space, if supported.
+    foreign : str or None
+        Unsupported declaration, such as ``color profile 'Display P3'``.
+    orientation : int
+        EXIF orientation; 1 is upright.
     """
 
     space: ColorSpace | None = None
@@ -34,28 +38,26 @@ NO_TAGS = Tags()
 
 
 def tags_of(info: Mapping[Any, Any], exif: Mapping[int, Any]) -> Tags:
-    """Tags from what Pillow read of a file.
+    """Tags from the metadata that Pillow read.
 
-    Of several claims the profile comes before the ``sRGB`` chunk and that before ``gAMA``, as the PNG
-    specification (third edition, 4.3) has it. A gamma of 1 means linear, 1/2.2 sRGB; a profile whose
-    description names sRGB means sRGB. Other profiles and gammas are reported, not applied.
+    The profile takes precedence over the ``sRGB`` chunk, and that over ``gAMA`` (PNG specification, third
+    edition, 4.3). A gamma of 1 means linear, 1/2.2 sRGB; a profile whose description names sRGB means sRGB.
+    Other profiles and gammas are reported, not applied.
     """
     orientation = exif.get(_ORIENTATION, 1)
     turned = orientation if isinstance(orientation, int) and 1 <= orientation <= 8 else 1
+    space: ColorSpace | None = None
+    foreign = None
+    gamma = info.get("gamma")
     if info.get("icc_profile"):
         name = _profile_name(info["icc_profile"])
-        srgb = "srgb" in name.lower()
-        return Tags("srgb" if srgb else None, None if srgb else f"color profile '{name}'", turned)
-    if "srgb" in info:
-        return Tags("srgb", None, turned)
-    gamma = info.get("gamma")
-    if isinstance(gamma, float) and gamma > 0:
-        if abs(gamma - _SRGB_GAMMA) < _SLACK:
-            return Tags("srgb", None, turned)
-        if abs(gamma - _LINEAR_GAMMA) < _SLACK:
-            return Tags("linear", None, turned)
-        return Tags(None, f"gamma of {gamma:g}", turned)
-    return Tags(orientation=turned)
+        space, foreign = ("srgb", None) if "srgb" in name.lower() else (None, f"color profile '{name}'")
+    elif "srgb" in info:
+        space = "srgb"
+    elif isinstance(gamma, float) and gamma > 0:
+        space = next((s for s, g in _GAMMAS.items() if abs(gamma - g) < _SLACK), None)
+        foreign = None if space else f"gamma of {gamma:g}"
+    return Tags(space, foreign, turned)
 
 
 def _profile_name(profile: bytes) -> str:

@@ -1,7 +1,7 @@
-"""Images as arrays: EXR, PNG, JPG, TIFF and npy, decoded to numbers without loss.
+"""Images as arrays: EXR, PNG, JPG, TIFF and npy, decoded without loss.
 
-Integer images become ``code / largest code``; float images keep their numbers. No color space is applied
-here: which map is sRGB and which is data is the material's business.
+Integer images become ``code / largest code``; float images keep their numbers. The material decides which
+maps are sRGB; no color space is applied here.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError, reason
 from mbtf_core.suggest import suggest_path
-from mbtf_gen.images.exr import read_channels, silenced
+from mbtf_gen.images.exr import check_floats, read_channels, silenced
 from mbtf_gen.images.exr_layers import choose_channels
 from mbtf_gen.images.metadata import NO_TAGS, Tags, tags_of
 from mbtf_gen.images.tiff import read_tiff
 
-# A header may claim any size; beyond this nothing is allocated (11 585² pixels).
+# Largest image that is allocated (11 585² pixels), whatever size a header claims.
 MAX_PIXELS = 2**27
 
-# No compression of these formats does better (that of PNG reaches 1032 : 1, with 8 pixels in a byte).
+# Upper bound of the compression of these formats (PNG reaches 1032 : 1, with 8 pixels in a byte).
 _PIXELS_PER_BYTE = 1 << 14
 
 # Gray images stored as color JPG come back with channels that differ by rounding.
@@ -65,12 +65,16 @@ class Image:
 
     Attributes
     ----------
-    pixels : (H, W, C), row 0 the top, C = 1 gray, 2 gray and alpha, 3 RGB, 4 RGBA; float64 for one channel,
-        float32 for several; all finite
-    bits : 8 or 16 where the file holds integers (then pixels are code / largest code), None for floats
-    path : the file
-    tags : what the file says about its colors and orientation; nothing of it is applied here
-    channels : names of the channels that were chosen, where there was a choice
+    pixels : (H, W, C) float64 (C = 1) or float32 array
+        Row 0 is the top; C = 1 gray, 2 gray and alpha, 3 RGB, 4 RGBA; all finite.
+    bits : int or None
+        8 or 16 for integer files, whose pixels are code / largest code; None for floats.
+    path : Path
+        The file.
+    tags : Tags
+        Color space and orientation that the file declares; not applied here.
+    channels : tuple of str
+        Names of the selected channels; empty where the file has no others.
     """
 
     pixels: NDArray[np.floating[Any]]
@@ -86,7 +90,7 @@ class Image:
 
 
 def is_image(path: Path) -> bool:
-    """Does the file name end like an image that can be read?"""
+    """Is the suffix that of an image format that can be read?"""
     return path.suffix.lower() in _KINDS
 
 
@@ -97,16 +101,23 @@ def read_image(
 
     Parameters
     ----------
-    channel : what to take of it: a channel or a layer of an EXR file, R, G, B, A or Y of the others; by
-        default all that belongs together
-    prefer : of several layers of an EXR file, the one whose name this accepts (see
-        :func:`~mbtf_gen.images.exr_layers.choose_channels`)
+    path : str or Path
+        EXR, PNG, JPG, TIFF or npy file.
+    channel : str or None
+        A channel or layer of an EXR file; R, G, B, A or Y of other formats. None: see
+        :func:`~mbtf_gen.images.exr_layers.choose_channels`.
+    prefer : callable or None
+        Predicate on the layer names of an EXR file, for files of several layers.
+
+    Returns
+    -------
+    Image
 
     Raises
     ------
-    InputError : missing, empty, damaged, cut short, of another kind than its name says, of a kind that is not
-        supported, more than ``MAX_PIXELS`` pixels, without the channel, or with pixels that are NaN or
-        infinite (with their number and the first one's column and row)
+    InputError
+        The file is missing, empty, damaged, truncated, unsupported, larger than ``MAX_PIXELS``, or not of
+        the format of its suffix; the channel is missing; or pixels are NaN or infinite.
     """
     path = Path(path)
     kind = _kind(path)
@@ -131,7 +142,7 @@ def count_and_first(bad: NDArray[np.bool_]) -> str:
 
 
 def _kind(path: Path) -> str:
-    """What the file is by its first bytes, which must agree with its name."""
+    """Format of a file by its first bytes, which must agree with its suffix."""
     named = _KINDS.get(path.suffix.lower())
     if path.is_dir():
         raise InputError("is a folder, not an image", where=path)
@@ -155,7 +166,7 @@ def _kind(path: Path) -> str:
         raise InputError(f"is no {named} image", where=path)
     if found != named:
         suffix = next(s for s, kind in _KINDS.items() if kind == found)
-        raise InputError(f"holds {found} data", where=path, hint=f"rename it to {path.stem}{suffix}")
+        raise InputError(f"contains {found} data", where=path, hint=f"rename it to {path.stem}{suffix}")
     return found
 
 
@@ -163,36 +174,29 @@ def _check_size(rows: int, columns: int, path: Path) -> None:
     if rows * columns > MAX_PIXELS:
         raise InputError(f"claims {columns} x {rows} pixels; at most {MAX_PIXELS:,} are read", where=path)
     if rows * columns <= 0:
-        raise InputError("holds no pixels", where=path)
+        raise InputError("contains no pixels", where=path)
     size = path.stat().st_size
     if rows * columns > _PIXELS_PER_BYTE * size:
         raise InputError(f"is cut short: {size} bytes cannot hold {columns} x {rows} pixels", where=path)
 
 
-def _from_codes(codes: NDArray[Any], bits: int, path: Path) -> Image:
-    stacked = codes if codes.ndim == 3 else codes[..., None]
-    dtype = np.float64 if stacked.shape[2] == 1 else np.float32
-    return Image(np.divide(stacked, 2**bits - 1, dtype=dtype), bits, path)
-
-
-def _from_floats(numbers: NDArray[Any], path: Path) -> Image:
+def _decoded(numbers: NDArray[Any], path: Path) -> Image:
+    """Image of floats, uint8 or uint16, (H, W) or (H, W, C)."""
     stacked = numbers if numbers.ndim == 3 else numbers[..., None]
     dtype = np.float64 if stacked.shape[2] == 1 else np.float32
-    with np.errstate(
-        over="ignore", invalid="ignore"
-    ):  # too large for float32 becomes infinite and is reported as that
+    if stacked.dtype.kind != "f":
+        bits = 8 * stacked.dtype.itemsize
+        return Image(np.divide(stacked, 2**bits - 1, dtype=dtype), bits, path)
+    # Numbers beyond the range of float32 become infinite, which is reported later.
+    with np.errstate(over="ignore", invalid="ignore"):
         return Image(stacked.astype(dtype), None, path)
 
 
 def _from_exr(path: Path, channel: str | None, prefer: Callable[[str], bool] | None) -> Image:
     channels = read_channels(path, MAX_PIXELS)
     names = choose_channels(list(channels), path, channel, prefer)
-    for name in names:
-        if channels[name].dtype.kind != "f":
-            raise InputError(
-                f"channel '{name}' holds whole numbers", where=path, hint="save it as half or float"
-            )
-    image = _from_floats(np.stack([channels[n] for n in names], axis=-1), path)
+    check_floats({name: channels[name] for name in names}, path)
+    image = _decoded(np.stack([channels[n] for n in names], axis=-1), path)
     return replace(image, channels=tuple(names) if len(channels) > len(names) else ())
 
 
@@ -200,14 +204,14 @@ def _pick(image: Image, channel: str) -> Image:
     """One channel of an image by its letter."""
     names = {1: "Y", 2: "YA", 3: "RGB", 4: "RGBA"}[image.pixels.shape[2]]
     if channel.upper() not in tuple(names):
-        raise InputError(f"has no channel '{channel}'", where=image.path, hint=f"it holds {', '.join(names)}")
+        raise InputError(f"has no channel '{channel}'", where=image.path, hint=f"it has {', '.join(names)}")
     index = names.index(channel.upper())
     numbers = _exact(image.pixels[..., index], image.bits)
     return replace(image, pixels=numbers[..., None], channels=(names[index],))
 
 
 def _exact(numbers: NDArray[np.floating[Any]], bits: int | None) -> NDArray[np.float64]:
-    """Back from single precision to the exact fraction that a code stands for."""
+    """Exact fractions code / largest code from their single-precision values."""
     if bits is None:
         return numbers.astype(np.float64)
     largest = 2**bits - 1
@@ -215,10 +219,10 @@ def _exact(numbers: NDArray[np.floating[Any]], bits: int | None) -> NDArray[np.f
 
 
 def _npy_fault(error: Exception) -> str:
-    """What the array reader means: its own words quote the header's bytes or speak of its way of reading."""
+    """Message for an error of the npy reader, whose own text may quote the bytes of the header."""
     known = {
         "header": "its header is damaged",
-        "Python objects": "it holds Python objects",
+        "Python objects": "it contains Python objects",
         "mmap length": "it is cut short",
     }
     return next((said for word, said in known.items() if word in str(error)), reason(error))
@@ -230,15 +234,11 @@ def _from_npy(path: Path) -> Image:
     except Exception as error:  # a damaged header may make the parser raise anything, its bytes included
         raise InputError(f"cannot be read as an npy array ({_npy_fault(error)})", where=path) from None
     if array.ndim not in (2, 3) or (array.ndim == 3 and not 1 <= array.shape[2] <= 4):
-        raise InputError(
-            f"holds an array of shape {array.shape}; (H, W) or (H, W, 1..4) is wanted", where=path
-        )
+        raise InputError(f"has the shape {array.shape}; (H, W) or (H, W, 1..4) is wanted", where=path)
     _check_size(array.shape[0], array.shape[1], path)
-    if array.dtype.kind == "f":
-        return _from_floats(array, path)
-    if array.dtype in (np.uint8, np.uint16):
-        return _from_codes(array, 8 * array.dtype.itemsize, path)
-    raise InputError(f"holds {array.dtype} numbers; uint8, uint16 or floats are wanted", where=path)
+    if array.dtype.kind == "f" or array.dtype in (np.uint8, np.uint16):
+        return _decoded(array, path)
+    raise InputError(f"contains {array.dtype} numbers; uint8, uint16 or floats are wanted", where=path)
 
 
 def _from_pillow(path: Path, kind: str) -> Image:
@@ -246,13 +246,9 @@ def _from_pillow(path: Path, kind: str) -> Image:
     from PIL import Image as Pillow
 
     if kind == "PNG" and (codes := _deep_png(path)) is not None:
-        return replace(_from_codes(codes, 16, path), tags=_tags(path, kind))
-    if kind == "TIFF":
-        array = read_tiff(path, _check_size)
-        if array is not None:
-            floats = array.dtype.kind == "f"
-            image = _from_floats(array, path) if floats else _from_codes(array, 8 * array.itemsize, path)
-            return replace(image, tags=_tags(path, kind))
+        return replace(_decoded(codes, path), tags=_tags(path, kind))
+    if kind == "TIFF" and (array := read_tiff(path, _check_size)) is not None:
+        return replace(_decoded(array, path), tags=_tags(path, kind))
     try:
         with python_warnings.catch_warnings(), silenced() if kind == "TIFF" else contextlib.nullcontext():
             python_warnings.simplefilter("ignore")
@@ -265,10 +261,9 @@ def _from_pillow(path: Path, kind: str) -> Image:
         raise InputError(f"claims more than {MAX_PIXELS:,} pixels", where=path) from None
     except InputError:
         raise
-    except PIL.UnidentifiedImageError:
-        raise InputError(f"cannot be read as a {kind} image (its header is damaged)", where=path) from None
     except Exception as error:  # a damaged file may make the decoder raise anything
-        raise InputError(f"cannot be read as a {kind} image ({reason(error)})", where=path) from None
+        fault = "its header is damaged" if isinstance(error, PIL.UnidentifiedImageError) else reason(error)
+        raise InputError(f"cannot be read as a {kind} image ({fault})", where=path) from None
 
 
 def _deep_png(path: Path) -> NDArray[np.uint16] | None:
@@ -307,7 +302,7 @@ def _tags(path: Path, kind: str) -> Tags:
 
 
 def _refuse_deep_tiff(picture: Any, path: Path) -> None:
-    """The library reads color TIFF of 16 bits as 8: better refused than cut."""
+    """Refuse color TIFF of 16 bits, which Pillow would read as 8."""
     bits = getattr(picture, "tag_v2", {}).get(258, (8,))
     bits = bits if isinstance(bits, tuple) else (bits,)
     if len(bits) > 1 and max(bits) > 8:
@@ -318,30 +313,32 @@ def _refuse_deep_tiff(picture: Any, path: Path) -> None:
 
 def _from_picture(picture: Any, path: Path) -> Image:
     mode = picture.mode
-    if mode in ("P", "PA"):
-        transparent = mode == "PA" or "transparency" in picture.info
-        picture = picture.convert("RGBA" if transparent else "RGB")
-    elif mode == "1":
-        picture = picture.convert("L")
-    elif mode == "YCbCr":
-        picture = picture.convert("RGB")
-    if picture.mode in ("L", "LA", "RGB", "RGBA"):
-        return _from_codes(np.asarray(picture), 8, path)
-    if picture.mode.startswith("I;16"):
-        return _from_codes(np.asarray(picture).astype(np.uint16), 16, path)
-    if picture.mode == "F":
-        return _from_floats(np.asarray(picture), path)
-    if picture.mode == "I" and picture.format == "PNG":
-        return _from_codes(np.asarray(picture), 16, path)
-    raise InputError(f"holds pixels of the kind '{mode}'", where=path, hint="save it as gray or RGB")
+    plain = {"P": "RGBA" if "transparency" in picture.info else "RGB", "PA": "RGBA", "1": "L", "YCbCr": "RGB"}
+    if mode in plain:
+        deep = False
+        picture = picture.convert(plain[mode])
+    else:
+        deep = mode.startswith("I;16") or (mode == "I" and picture.format == "PNG")
+    if deep or picture.mode in ("L", "LA", "RGB", "RGBA", "F"):
+        numbers = np.asarray(picture)
+        return _decoded(numbers.astype(np.uint16) if deep else numbers, path)
+    raise InputError(f"has the unsupported pixel mode '{mode}'", where=path, hint="save it as gray or RGB")
 
 
 def gray(image: Image) -> tuple[NDArray[np.float64], list[str]]:
-    """One number per pixel, (H, W), and warnings about what was dropped.
+    """Reduce an image to one number per pixel.
 
-    A gray image is taken as it is. RGB whose channels agree (within two codes of 8 bits, which is JPG's
-    rounding) is gray too; other colors are reduced to their Rec.709 luminance with a warning. Alpha is
-    dropped, with a warning where it is not 1 everywhere.
+    RGB images become their Rec.709 luminance, with a warning where channels differ by more than the rounding
+    of JPG (two 8-bit codes). Alpha is dropped, with a warning where it is not 1.
+
+    Parameters
+    ----------
+    image : Image
+
+    Returns
+    -------
+    values : (H, W) float64 array
+    warnings : list of str
     """
     pixels, warnings = image.pixels, []
     if pixels.shape[2] in (2, 4) and np.any(pixels[..., -1] != 1.0):

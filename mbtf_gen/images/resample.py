@@ -15,21 +15,36 @@ Enlargement = Literal["linear", "cubic"]
 
 # Scales, in texels, that the steps of quantized heights are smoothed on, fine to coarse.
 _SCALES = tuple(0.5 * 2.0 ** (i / 2.0) for i in range(13))
-# Smoothing is believed where it moves heights by what rounding does (in its standard deviation): fully below
-# the first number, not at all beyond the second.
+# Smoothing is applied where it moves heights by no more than rounding does (RMS, in units of the standard
+# deviation of rounding): fully below the first number, not at all above the second.
 _BELIEVED = (0.9, 1.05)
 
 
 def resample(
     image: NDArray[np.floating[Any]], rows: int, columns: int, enlarge: Enlargement = "linear"
 ) -> NDArray[np.floating[Any]]:
-    """A map (H, W, ...) at another resolution (rows, columns, ...), same dtype, each axis by itself.
+    """Resample a periodic map, each axis separately.
 
-    *Fewer texels*: the box filter. A texel is the average of the area it covers, parts of texels by their
-    share; the mean is preserved exactly. *More texels*: interpolation at the new texel centers, by the tent
-    (``linear``, stays within the range of the data) or by the cubic of Keys (1981) with a = -1/2 (``cubic``,
-    continuous slopes, may overshoot); the mean is preserved exactly for whole factors. *As many*: the map
-    itself. Old and new centers follow the same rule, so nothing shifts; the edges wrap.
+    Fewer texels: the box filter, which preserves the mean. More texels: interpolation at the new texel
+    centers, which preserves the mean for integer factors. Edges wrap; texel centers do not shift.
+
+    Parameters
+    ----------
+    image : (H, W, ...) float array
+    rows, columns : int
+        New resolution.
+    enlarge : {"linear", "cubic"}
+        Interpolation: the tent, which stays within the range of the data, or the cubic of Keys (1981) with
+        a = -1/2, which has continuous slopes and may overshoot.
+
+    Returns
+    -------
+    (rows, columns, ...) array of the same dtype
+
+    Raises
+    ------
+    ValueError
+        `rows` or `columns` is below 1.
     """
     if rows < 1 or columns < 1:
         raise ValueError(f"a map needs at least one row and column, not {rows} x {columns}")
@@ -79,16 +94,21 @@ def _along(
 def dequantize(height: NDArray[np.float64], step: float) -> NDArray[np.float64]:
     """Smooth heights (H, W) that were rounded to multiples of `step`, within what the rounding allows.
 
-    Rounding to codes turns a gentle slope into terraces, whose risers a renderer sees as cliffs. Any surface
-    within half a step of the stored one is equally true to the file. This one takes, texel by texel, the
-    coarsest smoothing that still looks like rounding: rounding moves heights by ``step/√12`` (root mean
-    square), so where a smoothed map departs by more, locally, it has begun to eat detail and is not used. The
-    smoothing is a periodic Gaussian g applied as ``2g - g²``, which keeps curvature. Finally heights are
-    clipped to half a step about the stored ones, so none ever moves by more.
+    Quantization turns gentle slopes into terraces. Every surface within half a step of the stored one is
+    consistent with the file. We choose, per texel, the coarsest smoothing that is consistent with rounding:
+    rounding moves heights by ``step/√12`` (root mean square), and smoothing that moves them by more, locally,
+    removes detail. The smoothing is a periodic Gaussian g applied as ``2g - g²``, which preserves curvature.
+    Finally, heights are clipped to half a step about the stored ones.
 
     Parameters
     ----------
-    step : distance of neighboring codes in the unit of `height`: 1/255 for 8-bit images
+    height : (H, W) float64 array
+    step : float
+        Distance of neighboring codes in the unit of `height`, such as 1/255 for 8-bit images.
+
+    Returns
+    -------
+    (H, W) float64 array
     """
     if not step > 0:
         raise ValueError(f"step must be positive, not {step}")
@@ -103,7 +123,7 @@ def dequantize(height: NDArray[np.float64], step: float) -> NDArray[np.float64]:
         moved = np.fft.rfft2((smooth - stored) ** 2) * _gaussian(height.shape, 2.0 * scale)
         belief = np.clip((high - 12.0 * np.fft.irfft2(moved, height.shape)) / (high - low), 0.0, 1.0)
         if not belief.any():
-            break  # coarser smoothing departs further still
+            break  # coarser smoothing moves heights further
         out += belief * (smooth - out)
     moved_by = np.clip(out - stored, -0.5, 0.5).astype(np.float64)
     return height + step * moved_by

@@ -18,19 +18,22 @@ _GRAY, _RGB = 1, 2
 def read_tiff(path: Path, check_size: Callable[[int, int, Path], None]) -> NDArray[Any] | None:
     """The first image of a file, (H, W, C), C = 1..4, as stored: uint8, uint16 or floats.
 
-    None where it is of a kind that another reader knows better: palettes, single bits, inverted gray, YCbCr.
+    None for kinds that Pillow reads: palettes, single bits, inverted gray, YCbCr.
 
     Parameters
     ----------
-    check_size : called with rows, columns and the path before any pixel is read; raises to refuse
+    path : Path
+    check_size : callable
+        Called with rows, columns and the path before any pixel is read; raises to refuse.
 
     Raises
     ------
-    InputError : damaged, cut short, or of a kind that is not supported
+    InputError
+        The file is damaged, truncated or not supported.
     """
     import tifffile
 
-    # What is wrong with a file is said by the exception; the library would log it as well.
+    # The library logs faults that its exception already reports.
     logging.getLogger("tifffile").setLevel(logging.CRITICAL)
     try:
         with tifffile.TiffFile(path) as file:
@@ -44,7 +47,7 @@ def read_tiff(path: Path, check_size: Callable[[int, int, Path], None]) -> NDArr
                 return None if page.bitspersample < 8 else _refuse(f"{page.bitspersample}-bit", path)
             if page.dtype.kind == "f" or page.dtype in (np.uint8, np.uint16):
                 if not 1 <= channels <= 4 or page.imagedepth != 1:
-                    raise InputError(f"holds {channels} channels; 1 to 4 are wanted", where=path)
+                    raise InputError(f"has {channels} channels; 1 to 4 are wanted", where=path)
                 if not page.is_contiguous:
                     _check_segments(page, path)
                 array = page.asarray(maxworkers=1)
@@ -64,11 +67,11 @@ def read_tiff(path: Path, check_size: Callable[[int, int, Path], None]) -> NDArr
 
 
 def _refuse(kind: str, path: Path) -> NoReturn:
-    raise InputError(f"holds {kind} numbers", where=path, hint="save it as 8 or 16 bits or as floats")
+    raise InputError(f"contains {kind} numbers", where=path, hint="save it as 8 or 16 bits or as floats")
 
 
 def _check_segments(page: Any, path: Path) -> None:
-    """Every strip or tile must lie in the file: what is missing would come back as zeros."""
+    """Refuse a truncated file, whose missing strips or tiles would be read as zeros."""
     size = path.stat().st_size
     for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True):
         if offset + count > size:

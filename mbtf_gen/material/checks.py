@@ -1,4 +1,4 @@
-"""What the maps of a material say about each other, put into words: heights, tiling, normals."""
+"""Consistency checks of a material's maps, as messages: heights, tiling, normals."""
 
 from __future__ import annotations
 
@@ -20,19 +20,14 @@ CONVENTION_NAMES: dict[Convention, str] = {"gl": "OpenGL", "dx": "DirectX"}
 _COLORED = 0.02
 # Levels, and codes between them, that 8-bit heights in a 16-bit file have.
 _FEW_LEVELS, _FAR_APART = 1024, 16.0
-# Beyond so many tile widths of relief a default factor is probably not what was meant.
+# Displacement range, in tile widths, above which a default height scale is probably wrong.
 _STEEP = 0.5
-# So many times more or less than the normal map suggests is far off.
+# Largest plausible ratio of a height scale to the one that the normal map suggests.
 _FAR_OFF = 3.0
 
 
 def refuse_color(image: Image) -> None:
-    """A color picture is no height map.
-
-    Raises
-    ------
-    InputError : the channels differ by more than 2 % on average
-    """
+    """Refuse a color image as a height map: channels that differ by more than 2 % on average."""
     if image.pixels.shape[2] < 3:
         return
     rgb = image.pixels[..., :3].astype(np.float64)
@@ -44,13 +39,13 @@ def refuse_color(image: Image) -> None:
     raise InputError(
         f"is colored{' like a normal map' if normals else ''}; a height map is gray",
         where=image.path,
-        hint="if one of its channels holds the heights, name it in a material.yaml: "
+        hint="if one of its channels stores the heights, name it in a material.yaml: "
         f"height: {{file: {image.path.name}, channel: R}}",
     )
 
 
 def coarse_step(codes: Codes, bits: int) -> float | None:
-    """Step, in codes, that heights were rounded to, where it is coarse enough to show as terraces."""
+    """Quantization step of the heights in codes; None where it is too fine to show as terraces."""
     if bits == 8:
         return codes.rounding
     hidden = codes.levels <= _FEW_LEVELS and codes.spacing >= _FAR_APART
@@ -58,11 +53,11 @@ def coarse_step(codes: Codes, bits: int) -> float | None:
 
 
 def level_remark(path: Path, codes: Codes, bits: int, step: float, smoothed: bool) -> str:
-    """The remark that heights come in few levels."""
+    """The remark that heights have few levels."""
     apart = f" {codes.spacing:.4g} codes apart" if codes.spacing > 1 else ""
     hint = f"smoothed within {'half a code' if step == 1 else f'{step / 2:.3g} codes'}"
     return f"{path}: heights of {bits} bits, {codes.levels} levels{apart}; " + (
-        hint if smoothed else "their steps stay, as asked for"
+        hint if smoothed else "not smoothed, because dequantize is off"
     )
 
 
@@ -80,7 +75,7 @@ def seam_warning(path: Path, seams: Sequence[Seam], factor: float) -> str | None
 
 
 def orientation_warning(fit: NormalFit, normal: Path, height: Path) -> str | None:
-    """The warning that a normal map and the heights do not belong together as they are."""
+    """The warning that the normal map matches the heights only when turned, mirrored or inverted."""
     if not fit.misfit:
         return None
     found = f"correlation of their slopes {fit.best:.2f} so, {fit.as_is:.2f} as it is"
@@ -96,19 +91,21 @@ def orientation_warning(fit: NormalFit, normal: Path, height: Path) -> str | Non
 def choose_convention(
     fit: NormalFit | None, named: Convention | None, asked: Convention | None, path: Path
 ) -> tuple[Convention, str, str | None]:
-    """(convention to read by, how it is known, warning or None): what is asked for comes before what the data
-    show, that before the name, and OpenGL is assumed at last."""
+    """(convention, its source, warning or None) of a normal map.
+
+    The material file takes precedence over the data, the data over the file name; the default is OpenGL.
+    """
     shown = None if fit is None else fit.convention
     chosen: Convention = asked or shown or named or "gl"
     if shown is None or fit is None:
-        how = "as asked for" if asked else "as named" if named else "assumed: the heights do not tell"
+        how = "as asked for" if asked else "as named" if named else "assumed: the heights do not decide"
         return chosen, how, None
     claim = asked or named
     if claim is None or claim == shown:
         return chosen, "as the heights' slopes show", None
     said = "convention in the material file" if asked else "name"
     warning = (
-        f"{path}: the {said} says {CONVENTION_NAMES[claim]}, the heights' slopes say "
+        f"{path}: the {said} implies {CONVENTION_NAMES[claim]}, the heights' slopes imply "
         f"{CONVENTION_NAMES[shown]} (correlation {fit.as_is:.2f} against {min(fit.gl, fit.dx):.2f}); "
         f"read as {CONVENTION_NAMES[chosen]}"
     )
@@ -116,24 +113,19 @@ def choose_convention(
 
 
 def signed(correlation: float) -> str:
-    """A correlation as text; NaN, where one of the two has no slopes, as such."""
+    """A correlation as text; NaN, where either has no slopes, as ``undefined``."""
     return "undefined" if math.isnan(correlation) else f"{correlation:+.2f}"
 
 
-def flat_warning(path: Path, heights: NDArray[np.float64]) -> str | None:
-    """The warning that there is no relief."""
-    return f"{path}: its heights are constant: the tile is flat" if np.ptp(heights) == 0 else None
-
-
-def relief_warning(path: Path, relief: float) -> str | None:
-    """The warning that a default factor makes too much, in tile widths, of the heights."""
-    if relief <= _STEEP:
+def range_warning(path: Path, extent: float) -> str | None:
+    """The warning that a default scale gives an unlikely displacement range, in tile widths."""
+    if extent <= _STEEP:
         return None
-    return f"{path}: the relief is {relief:.4g} tile widths; is another --height-scale meant?"
+    return f"{path}: the displacement range is {extent:.4g} tile widths; is another --height-scale meant?"
 
 
 def suggestion_warning(path: Path, fit: NormalFit | None, factor: float) -> str | None:
-    """The warning that a default factor is far from the one that a normal map was made with."""
+    """The warning that the default height scale is far from the one that the normal map suggests."""
     if not misses(fit, factor) or fit is None:
         return None
     ratio = factor / fit.scale
@@ -144,7 +136,7 @@ def suggestion_warning(path: Path, fit: NormalFit | None, factor: float) -> str 
 
 
 def misses(fit: NormalFit | None, factor: float) -> bool:
-    """Is a factor more than three times, or less than a third of, what a normal map clearly suggests?"""
+    """Is a height scale over three times, or under a third of, the one that the normal map suggests?"""
     if fit is None or not fit.fits or fit.scale == 0:
         return False
     return not 1 / _FAR_OFF <= factor / fit.scale <= _FAR_OFF
@@ -153,7 +145,7 @@ def misses(fit: NormalFit | None, factor: float) -> bool:
 def normal_note(
     path: Path, fit: NormalFit | None, convention: Convention, how: str, factor: float, default: bool
 ) -> str:
-    """What a normal map is read as, how it fits, and the height that it suggests."""
+    """Convention of a normal map, its correlation with the heights, and the height scale it suggests."""
     text = f"normal map: {path.name}, {CONVENTION_NAMES[convention]}, {how}"
     if fit is None:
         return text
@@ -167,5 +159,5 @@ def normal_note(
 
 
 def holes(opacity: NDArray[np.float64] | float | None) -> float:
-    """Share of the tile that is more transparent than opaque."""
+    """Fraction of the tile with an opacity below 0.5."""
     return 0.0 if opacity is None else float(np.mean(np.asarray(opacity) < 0.5))

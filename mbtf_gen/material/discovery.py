@@ -1,4 +1,4 @@
-"""Which file of a folder is which map, by the names that texture libraries customarily use."""
+"""Recognition of maps by the file names that texture libraries customarily use."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mbtf_gen.images.read import SUFFIXES, is_image
 Role = Literal["height", "base_color", "roughness", "metallic", "normal", "opacity"]
 Convention = Literal["gl", "dx"]
 
-# Words of file names that mean a map.
+# Words of file names that denote a map.
 WORDS: dict[Role, tuple[str, ...]] = {
     "height": ("height", "heightmap", "displacement", "disp", "bump"),
     "base_color": ("basecolor", "basecolour", "albedo", "color", "colour", "col", "diffuse", "diff"),
@@ -24,7 +24,7 @@ WORDS: dict[Role, tuple[str, ...]] = {
     "opacity": ("opacity", "alpha", "mask"),
 }
 _ROLES: dict[str, Role] = {word: role for role, words in WORDS.items() for word in words}
-# Words of maps that are known but not used by themselves, and why.
+# Words of maps that are known but not used, and the reason.
 UNUSED: dict[str, str] = {
     **dict.fromkeys(("ao", "occlusion"), "ambient occlusion comes out of the simulation"),
     **dict.fromkeys(
@@ -63,9 +63,12 @@ class FoundMaps:
 
     Attributes
     ----------
-    maps : role → file
-    unused : name of an image that is not used → why
-    notes, warnings : remarks for the user
+    maps : dict of str to Path
+        File of each role.
+    unused : dict of str to str
+        Reason why an image is not used, by file name.
+    notes, warnings : list of str
+        Messages for the user.
     """
 
     maps: dict[Role, Path] = field(default_factory=dict)
@@ -80,14 +83,21 @@ def tokens(name: str) -> list[str]:
 
 
 def role_of(name: str, shared: int = 0) -> Role | None:
-    """What a file's name says it holds: the **last** word that means a map decides.
+    """Role of a file by the **last** word of its name that denotes a map.
 
-    So ``metal_plate_disp.png`` holds heights and ``rock_height_mask.png`` opacity. None where no word does,
-    or the last one means a map that is not used.
+    ``metal_plate_disp.png`` contains heights and ``rock_height_mask.png`` opacity.
 
     Parameters
     ----------
-    shared : number of leading words that do not count, because all files of the folder share them
+    name : str
+        File name.
+    shared : int
+        Number of leading words to ignore, because all files of the folder share them.
+
+    Returns
+    -------
+    str or None
+        None without such a word, or where it denotes a map that is not used.
     """
     word = _last_word(name, shared)
     return _ROLES.get(word) if word else None
@@ -110,23 +120,31 @@ def _shared_words(names: list[str]) -> int:
 
 
 def normal_convention(name: str) -> Convention | None:
-    """``gl`` or ``dx`` where a normal map's name says so."""
-    words = tokens(name)
-    if any(w in ("gl", "opengl", "normalgl") for w in words):
+    """``gl`` or ``dx`` if a normal map's name contains it."""
+    words = set(tokens(name))
+    if words & {"gl", "opengl", "normalgl"}:
         return "gl"
-    return "dx" if any(w in ("dx", "directx", "normaldx") for w in words) else None
+    return "dx" if words & {"dx", "directx", "normaldx"} else None
 
 
 def find_maps(folder: Path) -> FoundMaps:
-    """Maps in a folder, not below it.
+    """Find the maps in a folder, without its subfolders.
 
-    Words that all names begin with do not count, unless there is no height map without them: of
-    ``Metal004.png`` and ``Metal004_Color.png`` the former is a picture of the material. Of two normal maps of
-    which one is named for OpenGL that one is taken.
+    Leading words that all names share are ignored, unless only they denote a height map: of ``Metal004.png``
+    and ``Metal004_Color.png`` the former is a picture of the material. An OpenGL normal map is preferred.
+
+    Parameters
+    ----------
+    folder : Path
+
+    Returns
+    -------
+    FoundMaps
 
     Raises
     ------
-    InputError : the folder cannot be read, holds no image, no height map, or two candidates for one map
+    InputError
+        The folder is unreadable, has no image or no height map, or two candidates for one map.
     """
     files = _images(folder)
     if not files:
@@ -167,7 +185,7 @@ def find_maps(folder: Path) -> FoundMaps:
 
 
 def unpack(path: Path) -> str:
-    """The hint for an archive that was given; empty for any other file."""
+    """The hint to unpack an archive; empty for other files."""
     return f"unpack {path.name} and give its folder" if path.suffix.lower() in _ARCHIVES else ""
 
 
@@ -183,7 +201,7 @@ def _content(folder: Path) -> list[Path]:
 
 
 def _elsewhere(folder: Path) -> str:
-    """Where the maps may be instead, as a hint: an archive, or a folder below with a height map."""
+    """Hint at another place of the maps: an archive, or a subfolder with a height map."""
     content = _content(folder)
     for below in (p for p in content if p.is_dir()):
         try:
@@ -211,14 +229,11 @@ def _no_heights(folder: Path, files: list[Path], shared: int) -> InputError:
 
 
 def _lost_warning(path: Path, word: str | None, maps: dict[Role, Path]) -> str | None:
-    """The warning that an unused image holds a map that is missing."""
+    """The warning that an unused image contains a missing map."""
+    options = {role: f"channel: {channel}" for role, channel in PACKED.get(word or "", {}).items()}
     if word in _GLOSS:
-        entries = {} if "roughness" in maps else {"roughness": f"{{file: {path.name}, invert: true}}"}
-    else:
-        channels = PACKED.get(word or "", {})
-        entries = {
-            str(r): f"{{file: {path.name}, channel: {c}}}" for r, c in channels.items() if r not in maps
-        }
+        options = {"roughness": "invert: true"}
+    entries = {r: f"{{file: {path.name}, {option}}}" for r, option in options.items() if r not in maps}
     if not entries:
         return None
     lambert = "roughness" not in maps and "metallic" not in maps

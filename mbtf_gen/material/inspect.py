@@ -1,4 +1,4 @@
-"""What a material is, in numbers: for ``mbtf-gen inspect``."""
+"""Statistics of a material for ``mbtf-gen inspect``."""
 
 from __future__ import annotations
 
@@ -12,47 +12,58 @@ from mbtf_core.color import linear_to_srgb
 from mbtf_gen.geometry.slope_statistics import detail_size, repeats, rms_slope, slope_angles
 from mbtf_gen.images.read import LUMINANCE
 from mbtf_gen.material.checks import misses
-from mbtf_gen.material.material import Material
+from mbtf_gen.material.material import MAPS, Material
 from mbtf_gen.material.tiling import broken
 
-# Luminance of what exists: charcoal to fresh snow. Beyond, a color map is probably not albedo.
+# Luminance from charcoal to fresh snow; outside, a color map is probably not albedo.
 ALBEDO_RANGE = (0.02, 0.95)
 # A color map that varies by less (RMS of the sRGB-encoded channels) is almost one color.
 _CONSTANT = 0.05
-# Detail finer than so many texels.
+# Half width of the autocorrelation, in texels, below which detail is reported as fine.
 _FINE = 4.0
-# A mesh that keeps less of the map's slopes is remarked on.
+# Fraction of the map's RMS slope below which a mesh is reported.
 _KEPT = 0.9
-# Texels beyond which so few different floats are no accident of a small map.
+# Texels above which few distinct floats indicate quantization.
 _MANY = 4096
-# Levels below which 8-bit heights are remarked on.
+# Levels below which 8-bit heights are reported.
 _FEW_LEVELS = 128
 
 
 def inspect_material(
     material: Material, height: float | None = None, mesh: int | None = None
 ) -> dict[str, Any]:
-    """Everything that is known of a material, as plain data; ``oddities`` are what is out of the ordinary.
+    """Collect the statistics of a material.
 
     Parameters
     ----------
-    height, mesh : as :meth:`mbtf_gen.material.material.Material.grid` takes them
+    material : Material
+    height, mesh : float or None, int or None
+        As in :meth:`mbtf_gen.material.material.Material.grid`.
+
+    Returns
+    -------
+    dict
+        Plain data; ``oddities`` lists unusual properties in words.
     """
     grid = material.grid(height, mesh)
     factor = material.height_scale if height is None else height
     full = material.grid(height, material.height.shape[1])
     median, high, steepest = slope_angles(grid)
     whole = rms_slope(full)
+    default = "material" if material.height_given else "default"
     found: dict[str, Any] = {
         "aspect": material.aspect,
         "tile": material.tile,
-        "maps": {role: _map(material, role) for role in material.facts},
+        "maps": {
+            role: {**asdict(facts), "file": str(facts.file), "names": list(facts.names)}
+            for role, facts in material.facts.items()
+        },
         "constants": _constants(material),
         "surface": _surface(material),
         "geometry": {
             "height": factor,
             "material_height": material.height_scale,
-            "height_from": _height_from(material, height),
+            "height_from": default if height is None else "asked",
             "map": list(material.height.shape),
             "mesh": list(grid.z.shape),
             "relief": abs(grid.displacement_range),
@@ -83,12 +94,6 @@ def inspect_material(
     return {**found, "oddities": [*_oddities(found), *_surface_oddities(found), *suggested]}
 
 
-def _height_from(material: Material, height: float | None) -> str:
-    if height is not None:
-        return "asked"
-    return "material" if material.height_given else "default"
-
-
 def _rms_step(material: Material) -> float:
     """Root mean square difference of neighboring columns, relative to the range of the heights."""
     steps = np.roll(material.height, -1, 1) - material.height
@@ -96,25 +101,10 @@ def _rms_step(material: Material) -> float:
     return float(np.sqrt(np.mean(steps**2))) / extent if extent > 0 else 0.0
 
 
-def _map(material: Material, role: str) -> dict[str, Any]:
-    facts = material.facts[role]
-    return {**asdict(facts), "file": str(facts.file), "names": list(facts.names)}
-
-
 def _constants(material: Material) -> dict[str, Any]:
     """What is one number or color for the whole tile."""
-    values = {
-        "base_color": material.base_color if material.bsdf is None else None,
-        "roughness": material.roughness,
-        "metallic": material.metallic,
-        "specular": material.specular,
-        "clearcoat": material.clearcoat,
-        "clearcoat_roughness": material.clearcoat_roughness,
-        "sheen": material.sheen,
-        "sheen_color": material.sheen_color,
-        "sheen_roughness": material.sheen_roughness,
-        "opacity": material.opacity,
-    }
+    roles = (r for r in MAPS if r not in ("height", "normal"))
+    values = {r: getattr(material, r) for r in roles if r != "base_color" or material.bsdf is None}
     return {n: np.asarray(v).tolist() for n, v in values.items() if v is not None and np.ndim(v) < 2}
 
 
@@ -225,8 +215,9 @@ def _surface_oddities(found: dict[str, Any]) -> list[str]:
             out.append(
                 f"{albedo['share_below']:.0%} of the albedo lies below {ALBEDO_RANGE[0]}: blacker than coal"
             )
-    if "metallic" in found["maps"] and found["maps"]["metallic"]["low"] < found["maps"]["metallic"]["high"]:
-        low, high = (found["maps"]["metallic"][k] for k in ("low", "high"))
+    metallic = found["maps"].get("metallic")
+    if metallic is not None and metallic["low"] < metallic["high"]:
+        low, high = metallic["low"], metallic["high"]
         out.append(f"metallic varies from {low:.2g} to {high:.2g}: metal and dielectric mixed")
     if opacity is not None and opacity["holes"] > 0:
         out.append(f"real holes: {opacity['holes']:.1%} of the tile is see-through")

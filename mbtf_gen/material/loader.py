@@ -1,4 +1,4 @@
-"""Reads the maps that a material names and checks that they fit together and hold what they should."""
+"""Reads the maps of a material and validates their aspects and values."""
 
 from __future__ import annotations
 
@@ -25,28 +25,35 @@ DEFAULT_COLOR = 0.5
 _ROUNDING = 1e-6
 # Float normals this far below 0 are signed, not (n+1)/2.
 _SIGNED = -0.05
-# Components beyond this are no normal's, whatever its encoding and its rounding.
+# Largest component of a normal in any encoding, with rounding.
 _LONGEST = 1.5
 _NORMALS = "its pixels are (n+1)/2, or the components of n themselves in a float image"
-# What maps of colors are called.
+# Names of color maps in messages.
 _COLORS = {"base_color": "base color", "sheen_color": "sheen's color"}
-# A smaller share of normals that point into the surface is not worth a word.
+# Fraction of normals pointing into the surface above which a warning is given.
 _STRAY = 1e-4
 _FileEntry = HeightEntry | ColorEntry | ShareEntry | NormalEntry
 
 
 @dataclass(frozen=True)
 class MapFacts:
-    """What a map's file holds.
+    """Content of a map's file.
 
     Attributes
     ----------
-    rows, columns : size of the image
-    bits : 8 or 16 for integers, None for floats
-    channels : number of channels taken
-    names : their names, where there was a choice
-    low, high : smallest and largest stored number of these channels, alpha left out
-    colorspace : what the numbers were read as
+    file : Path
+    rows, columns : int
+        Size of the image.
+    bits : int or None
+        8 or 16 for integers, None for floats.
+    channels : int
+        Number of selected channels.
+    names : tuple of str
+        Their names, where the file has others.
+    low, high : float
+        Smallest and largest stored number of these channels, without alpha.
+    colorspace : {"linear", "srgb"}
+        Color space that the numbers were read in.
     """
 
     file: Path
@@ -61,13 +68,16 @@ class MapFacts:
 
 
 class MapLoader:
-    """Reads the maps of one material; collects files, remarks, and what else changes the data.
+    """Reads the maps of one material; collects files, messages and settings.
 
     Attributes
     ----------
-    files, facts : role → file, and what it holds, of everything read
-    settings : role → options and constants that change the data, for the digest
-    warnings, notes : remarks for the user
+    files, facts : dict
+        File and content of each role.
+    settings : dict
+        Options and constants of each role that change the data, for the digest.
+    warnings, notes : list of str
+        Messages for the user.
     """
 
     def __init__(self, folder: Path, notes: list[str]) -> None:
@@ -79,23 +89,14 @@ class MapLoader:
         self.settings: dict[str, Any] = {}
 
     def image(self, role: str, entry: _FileEntry, space: ColorSpace = "linear") -> Image:
-        """Read the file of a role; its aspect must be that of the heights, unless it is a single pixel."""
+        """Read the file of a role, of one pixel or of the heights' aspect."""
         path = self.folder / str(entry.file)
         image = read_image(path, entry.channel, lambda label: role_of(label) == role)
         rows, columns = image.shape
         used = image.pixels[..., :-1] if image.pixels.shape[2] in (2, 4) else image.pixels
         self.files[role] = path
-        self.facts[role] = MapFacts(
-            path,
-            rows,
-            columns,
-            image.bits,
-            image.pixels.shape[2],
-            image.channels,
-            float(used.min()),
-            float(used.max()),
-            space,
-        )
+        low, high, count = float(used.min()), float(used.max()), image.pixels.shape[2]
+        self.facts[role] = MapFacts(path, rows, columns, image.bits, count, image.channels, low, high, space)
         if entry.channel is not None:
             self.settings[f"{role}.channel"] = entry.channel
         elif image.channels:
@@ -170,13 +171,13 @@ class MapLoader:
         return linear[0, 0] if image.shape == (1, 1) else linear
 
     def _color_space(self, role: str, image: Image, entry: ColorEntry) -> ColorSpace:
-        """What is asked for, else linear if the file says so, else sRGB for integers, linear for floats."""
+        """The given color space, else linear if the file declares it, else sRGB for integers."""
         space: ColorSpace = "linear" if image.bits is None else "srgb"
         why = "the default for " + ("floats" if image.bits is None else "integers")
         if entry.colorspace is not None:
             space, why = entry.colorspace, "as asked for"
         elif image.tags.space == "linear":
-            space, why = "linear", "its gAMA chunk says so"
+            space, why = "linear", "its gAMA chunk is 1"
         elif image.tags.foreign is not None:
             self.warnings.append(
                 f"{image.path}: its {image.tags.foreign} is not applied, it is read as "
@@ -205,7 +206,7 @@ class MapLoader:
         return np.where(length > 1e-6, vectors / np.maximum(length, 1e-6), up).astype(np.float32)
 
     def turned_green(self, vectors: NDArray[np.float32], convention: Convention) -> NDArray[np.float32]:
-        """The vectors that :meth:`normals` read, by the map's convention."""
+        """Vectors of :meth:`normals` in the map's convention: y changes its sign for DirectX."""
         self.settings["normal"] = convention
         return vectors * np.array([1.0, 1.0 if convention == "gl" else -1.0, 1.0], np.float32)
 

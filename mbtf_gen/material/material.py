@@ -1,4 +1,4 @@
-"""A material: heights and what covers them, from a height map, a folder of maps, or a ``material.yaml``."""
+"""A material: heights and reflectance, from a height map, a folder of maps, or a ``material.yaml``."""
 
 from __future__ import annotations
 
@@ -20,13 +20,12 @@ from mbtf_gen.images.resample import dequantize, resample
 from mbtf_gen.material.checks import (
     choose_convention,
     coarse_step,
-    flat_warning,
     holes,
     level_remark,
     normal_note,
     orientation_warning,
+    range_warning,
     refuse_color,
-    relief_warning,
     seam_warning,
     suggestion_warning,
 )
@@ -37,19 +36,16 @@ from mbtf_gen.material.quantization import Codes, code_use
 from mbtf_gen.material.spec import MaterialFile, NormalEntry, plain, read_material_file
 from mbtf_gen.material.tiling import Seam, Tiling, retile, seams, tiling_note
 
-# Heights of integer images are shares of an unknown range: this many tile widths. Floats are tile widths.
+# Tile widths per stored height: the range of integer images is unknown, floats are in tile widths.
 INTEGER_SCALE = 0.05
 FLOAT_SCALE = 1.0
-# What stands in for the maps that are not given.
-DEFAULT_ROUGHNESS = 0.5
-DEFAULT_METALLIC = 0.0
-DEFAULT_SPECULAR = 0.5
-DEFAULT_CLEARCOAT_ROUGHNESS = 0.1
-DEFAULT_SHEEN_ROUGHNESS = 0.3
-# Mesh cells across the tile, at most, unless asked for.
+# Defaults of a glossy surface, and of the roughness of its layers.
+_LOBES = {"roughness": 0.5, "metallic": 0.0, "specular": 0.5}
+_LAYER_ROUGHNESS = {"clearcoat": 0.1, "sheen": 0.3}
+# Default limit of the mesh cells across the tile.
 DEFAULT_MESH = 512
 # Attributes of a material that may be maps.
-_MAPS = (
+MAPS = (
     *("height", "base_color", "roughness", "metallic", "specular", "clearcoat", "clearcoat_roughness"),
     *("sheen", "sheen_color", "sheen_roughness", "normal", "opacity"),
 )
@@ -58,35 +54,57 @@ _YAML = ("material.yaml", "material.yml")
 
 @dataclass(frozen=True)
 class Material:
-    """Everything that a tile is made of. All maps have row 0 at ``v → 1``; resolutions may differ.
+    """Maps and constants of one tile, as :func:`load_material` returns them.
+
+    All maps have row 0 at ``v → 1``; their resolutions may differ.
 
     Attributes
     ----------
-    height : (H, W) stored numbers: code / largest code of integer images, the number itself of float images;
-        heights of few levels are smoothed within half a level; halved in a mirrored tile, whose width is two
-        images
-    height_scale : factor from stored numbers to tile widths unless the configuration says another
-    height_given : does the material file state that factor? It is a default otherwise
-    height_bits : 8, 16, or None for floats
-    base_color : (h, w, 3) or (3,), linear Rec.709 in [0, 1]
-    roughness, metallic, specular : (h, w) or one number in [0, 1]; all three None for Lambert
-    clearcoat, clearcoat_roughness : share and roughness, (h, w) or one number in [0, 1]; None without
-    sheen, sheen_roughness : weight of a sheen on top of it all and its roughness, (h, w) or one number in
-        [0, 1]; None without one
-    sheen_color : (h, w, 3) or (3,), linear Rec.709 in [0, 1]; None for white, or without sheen
-    normal : (h, w, 3) unit vectors, x along u and y along v (OpenGL); None without a map
-    opacity : (h, w) or one number in [0, 1]; None where nothing is transparent
-    bsdf : Mitsuba dictionary that stands in place of the maps, or None
-    files : role → file
-    digests : role → SHA-256 of the file's content; ``settings`` covers everything else that changes the data
-    warnings, notes : what the user should see, whatever height is asked for; what the user may want to know
-    unused : name of an image of the folder that is not used → why
-    facts : role → what the map's file holds
-    codes : use that integer heights make of their codes; None for floats
-    seams : seams of the heights as they are in the file
-    normal_fit : how the normal map relates to the heights; None without a map, or where neither has slopes
-    normal_convention : how the normal map was read; None without a map
-    tile : what was done to make the maps tile
+    height : (H, W) float64 array
+        Stored heights: code / largest code of integer images, unchanged numbers of float images. Quantized
+        heights are smoothed within half a level; heights of a mirrored tile are halved.
+    height_scale : float
+        Tile widths per stored height, from the material file or the default.
+    height_given : bool
+        True where the material file states `height_scale`.
+    height_bits : int or None
+        8 or 16; None for floats.
+    base_color : (h, w, 3) or (3,) array
+        Linear Rec.709 in [0, 1].
+    roughness, metallic, specular : (h, w) float64 array, float or None
+        In [0, 1]; all three are None for a Lambert surface.
+    clearcoat, clearcoat_roughness : (h, w) float64 array, float or None
+        Weight and roughness of the clear coat in [0, 1]; None without one.
+    sheen, sheen_roughness : (h, w) float64 array, float or None
+        Weight and roughness of the sheen in [0, 1]; None without one.
+    sheen_color : (h, w, 3) or (3,) array or None
+        Linear Rec.709 in [0, 1]; None for white, or without a sheen.
+    normal : (h, w, 3) float32 array or None
+        Unit vectors, x along u and y along v (OpenGL); None without a normal map.
+    opacity : (h, w) float64 array, float or None
+        In [0, 1]; None for an opaque material.
+    bsdf : dict or None
+        Mitsuba dictionary that replaces the reflectance maps.
+    files : dict of str to Path
+        File of each role.
+    digests : dict of str to str
+        SHA-256 of each role's file; ``settings`` covers all other inputs that change the data.
+    warnings, notes : tuple of str
+        Warnings that apply at any height scale, and remarks.
+    unused : dict of str to str
+        Reason why an image of the folder is not used, by file name.
+    facts : dict of str to MapFacts
+        Content of each role's file.
+    codes : Codes or None
+        Distribution of integer height codes; None for floats.
+    seams : tuple of Seam
+        Seams of the heights before any tiling method.
+    normal_fit : NormalFit or None
+        Comparison of the normal map with the heights; None without a map, or where either is flat.
+    normal_convention : {"gl", "dx"} or None
+        Convention that the normal map was read in; None without a map.
+    tile : {"none", "mirror", "blend"}
+        Method that made the maps tileable.
     """
 
     height: NDArray[np.float64]
@@ -125,30 +143,43 @@ class Material:
     @property
     def is_lambert(self) -> bool:
         """Is the surface Lambert because no roughness, metallic or specular is given?"""
-        return (
-            self.bsdf is None and self.roughness is None and self.metallic is None and self.specular is None
-        )
+        return self.bsdf is None and all(getattr(self, role) is None for role in _LOBES)
 
     def warnings_at(self, height: float | None = None) -> tuple[str, ...]:
-        """All warnings where `height` is the factor asked for: a default one is questioned."""
-        flat = flat_warning(self.files["height"], self.height)
-        if flat is not None or height is not None or self.height_given:
-            return (*self.warnings, *([flat] if flat else []))
-        text = None
-        if "normal" in self.files:
-            text = suggestion_warning(self.files["normal"], self.normal_fit, self.height_scale)
-        relief = abs(self.height_scale) * float(np.ptp(self.height))
-        text = text or relief_warning(self.files["height"], relief)
-        return (*self.warnings, *([text] if text else []))
-
-    def grid(self, height: float | None = None, mesh: int | None = None) -> HeightGrid:
-        """Heights in tile widths on the mesh's grid.
+        """Warnings at a height scale.
 
         Parameters
         ----------
-        height : factor on the stored numbers; the material's own by default
-        mesh : cells across the tile; the map's width, at most 512, by default. Coarser grids average the map
-            (box), finer ones interpolate it (cubic).
+        height : float or None
+            Height scale that the user gave. None: `height_scale`, with a warning where that is an unlikely
+            default.
+
+        Returns
+        -------
+        tuple of str
+        """
+        path, extent = self.files["height"], float(np.ptp(self.height))
+        text = f"{path}: its heights are constant: the tile is flat" if extent == 0 else None
+        if extent != 0 and height is None and not self.height_given:
+            if "normal" in self.files:
+                text = suggestion_warning(self.files["normal"], self.normal_fit, self.height_scale)
+            text = text or range_warning(path, abs(self.height_scale) * extent)
+        return (*self.warnings, *([text] if text else []))
+
+    def grid(self, height: float | None = None, mesh: int | None = None) -> HeightGrid:
+        """Resample the heights to the grid of the mesh.
+
+        Parameters
+        ----------
+        height : float or None
+            Tile widths per stored height; `height_scale` by default.
+        mesh : int or None
+            Cells across the tile; by default the width of the map, at most 512. Coarser grids average the
+            map (box filter), finer grids interpolate it (cubic).
+
+        Returns
+        -------
+        HeightGrid
         """
         columns = min(self.height.shape[1], DEFAULT_MESH) if mesh is None else mesh
         rows = max(1, round(self.aspect * columns))
@@ -163,14 +194,21 @@ def load_material(path: str | Path, tile: Tiling = "none") -> Material:
 
     Parameters
     ----------
-    path : a height map; a folder of maps with customary names, or with a ``material.yaml`` in it; or a YAML
-        file of that kind. A bare height map stands alone, whatever lies beside it.
-    tile : what to do so that the maps tile: nothing; ``mirror``, two by two mirrored copies, a tile of twice
-        the width; ``blend``, a cross-fade over an eighth of the tile at each edge
+    path : str or Path
+        A height map, a ``material.yaml``, or a folder that contains one or maps with customary names. Other
+        maps beside a height map are ignored.
+    tile : {"none", "mirror", "blend"}
+        Method for maps that do not tile. ``mirror``: 2 × 2 mirrored copies, a tile of twice the width;
+        ``blend``: a cross-fade over an eighth of the tile at each edge.
+
+    Returns
+    -------
+    Material
 
     Raises
     ------
-    InputError : something is missing, unreadable, ambiguous, out of its range, or maps of different aspect
+    InputError
+        A file is missing, unreadable or ambiguous, a value is out of range, or aspects differ.
     """
     spec, folder, found = _described(Path(path))
     material = _assemble(spec, folder, found, tile)
@@ -178,7 +216,7 @@ def load_material(path: str | Path, tile: Tiling = "none") -> Material:
 
 
 def _described(path: Path) -> tuple[MaterialFile, Path, FoundMaps]:
-    """Maps and constants of a material, the folder that file names are relative to, and what lies there."""
+    """Material file, the folder that its file names are relative to, and the maps found there."""
     if path.is_dir():
         described = next((path / name for name in _YAML if (path / name).is_file()), None)
         if described is not None:
@@ -201,7 +239,7 @@ def _described(path: Path) -> tuple[MaterialFile, Path, FoundMaps]:
 
 
 def _siblings(path: Path) -> Iterator[str]:
-    """The hint that a bare height map's folder holds more maps."""
+    """The hint that the folder of a height map contains more maps."""
     try:
         others = {role: file for role, file in find_maps(path.parent).maps.items() if file != path}
     except InputError:
@@ -220,43 +258,31 @@ def _assemble(spec: MaterialFile, folder: Path, found: FoundMaps, tile: Tiling) 
     warning = seam_warning(load.files["height"], edges, scale)
     if warning is not None and tile == "none":
         load.warnings.append(warning)
-    roughness, metallic, specular = (
-        load.share(role, getattr(spec, role)) for role in ("roughness", "metallic", "specular")
-    )
+    maps: dict[str, Any] = {role: load.share(role, getattr(spec, role)) for role in _LOBES}
     if spec.bsdf is not None:
         load.notes.append(f"surface: the BSDF '{spec.bsdf['type']}' of the material file")
-    elif roughness is None and metallic is None and specular is None:
-        layers = [
-            n for n, on in (("a clear coat", spec.clearcoat), ("a sheen", spec.sheen)) if on is not None
-        ]
+    elif all(value is None for value in maps.values()):
+        layers = [text for text, on in (("a clear coat", spec.clearcoat), ("a sheen", spec.sheen)) if on]
         under = f" under {' and '.join(layers)}" if layers else ""
         load.notes.append(f"surface: Lambert{under}, because no roughness, metallic or specular is given")
     else:
-        constants = {
-            "roughness": DEFAULT_ROUGHNESS,
-            "metallic": DEFAULT_METALLIC,
-            "specular": DEFAULT_SPECULAR,
-        }
-        given = {"roughness": roughness, "metallic": metallic, "specular": specular}
-        filled = [f"{name} {constants[name]}" for name, value in given.items() if value is None]
-        roughness, metallic, specular = (constants[n] if v is None else v for n, v in given.items())
-        load.notes.append(f"surface: glossy{', constants ' + ', '.join(filled) if filled else ''}")
-    base_color = load.base_color(spec.base_color) if spec.bsdf is None else np.full(3, DEFAULT_COLOR)
-    normal, convention, fit = None, None, None
+        constants = {role: value for role, value in _LOBES.items() if maps[role] is None}
+        maps |= constants
+        filled = ", ".join(f"{role} {value}" for role, value in constants.items())
+        load.notes.append(f"surface: glossy{', constants ' + filled if filled else ''}")
+    maps["base_color"] = load.base_color(spec.base_color) if spec.bsdf is None else np.full(3, DEFAULT_COLOR)
+    convention, fit = None, None
     if spec.normal is not None:
-        normal, convention, fit = _normals(spec, spec.normal, load, height, scale)
-    opacity = load.share("opacity", spec.opacity)
-    if opacity is not None:
-        load.notes.append(f"opacity: {holes(opacity):.0%} of the tile are holes")
-    clearcoat, clearcoat_roughness = (
-        load.share(n, getattr(spec, n)) for n in ("clearcoat", "clearcoat_roughness")
-    )
-    if clearcoat is not None and clearcoat_roughness is None:
-        clearcoat_roughness = DEFAULT_CLEARCOAT_ROUGHNESS
-    sheen, sheen_roughness = (load.share(n, getattr(spec, n)) for n in ("sheen", "sheen_roughness"))
-    sheen_color = None if spec.sheen_color is None else load.color("sheen_color", spec.sheen_color)
-    if sheen is not None and sheen_roughness is None:
-        sheen_roughness = DEFAULT_SHEEN_ROUGHNESS
+        maps["normal"], convention, fit = _normals(spec, spec.normal, load, height, scale)
+    maps["opacity"] = load.share("opacity", spec.opacity)
+    if maps["opacity"] is not None:
+        load.notes.append(f"opacity: {holes(maps['opacity']):.0%} of the tile are holes")
+    for layer, roughness in _LAYER_ROUGHNESS.items():
+        maps[layer] = load.share(layer, getattr(spec, layer))
+        own = load.share(f"{layer}_roughness", getattr(spec, f"{layer}_roughness"))
+        maps[f"{layer}_roughness"] = roughness if maps[layer] is not None and own is None else own
+    if spec.sheen_color is not None:
+        maps["sheen_color"] = load.color("sheen_color", spec.sheen_color)
     bsdf = None
     if spec.bsdf is not None:
         bsdf, load.settings["bsdf"] = _bsdf(plain(spec.bsdf), load)
@@ -267,18 +293,8 @@ def _assemble(spec: MaterialFile, folder: Path, found: FoundMaps, tile: Tiling) 
         height=height,
         height_scale=scale,
         height_bits=load.facts["height"].bits,
-        base_color=base_color,
-        roughness=roughness,
-        metallic=metallic,
-        specular=specular,
-        clearcoat=clearcoat,
-        clearcoat_roughness=clearcoat_roughness,
-        sheen=sheen,
-        sheen_color=sheen_color,
-        sheen_roughness=sheen_roughness,
-        normal=normal,
-        opacity=opacity,
         bsdf=bsdf,
+        **maps,
         height_given=spec.height.scale is not None,
         files=load.files,
         digests=digests,
@@ -313,14 +329,14 @@ def _retiled(material: Material, tile: Tiling) -> Material:
             where=folder,
             hint="use smaller maps, or --make-tileable blend",
         )
-    maps = retile({name: getattr(material, name) for name in _MAPS}, tile)
+    maps = retile({name: getattr(material, name) for name in MAPS}, tile)
     return replace(material, **maps, notes=(*material.notes, tiling_note(tile)), tile=tile)
 
 
 def _normals(
     spec: MaterialFile, entry: NormalEntry, load: MapLoader, height: NDArray[np.float64], scale: float
 ) -> tuple[NDArray[np.float32], Convention, NormalFit | None]:
-    """Unit vectors (h, w, 3), the convention they were read by, and how they fit the heights."""
+    """Unit vectors (h, w, 3), their convention, and their comparison with the heights."""
     vectors = load.normals(entry)
     path = load.files["normal"]
     fit = fit_normals(height, vectors)
@@ -332,7 +348,7 @@ def _normals(
 
 
 def _heights(spec: MaterialFile, load: MapLoader) -> tuple[NDArray[np.float64], Codes | None, float]:
-    """Stored heights, the use they make of their codes, and the factor to tile widths."""
+    """Stored heights, their codes, and the factor to tile widths."""
     entry = spec.height
     image = load.image("height", entry, entry.colorspace)
     refuse_color(image)
@@ -384,7 +400,5 @@ def _bsdf(tree: dict[str, Any], load: MapLoader) -> tuple[dict[str, Any], dict[s
             out[key] = nameless[key] = value
         else:
             kind = type(value).__name__
-            raise InputError(
-                f"the bsdf's '{key}' is a {kind}; text and numbers are wanted", where=load.folder
-            )
+            raise InputError(f"the bsdf's '{key}' is a {kind}, not text or a number", where=load.folder)
     return out, nameless

@@ -1,10 +1,10 @@
-"""How a normal map relates to the heights it comes with: convention, orientation, scale.
+"""Comparison of a normal map with its height map: convention, orientation, scale.
 
-A normal map usually repeats the slopes of its height map. So both can be held against each other: the slopes
-that the normals claim, ``t = (-n_x/n_z, -n_y/n_z)``, and those of the heights, ``s = (∂h/∂u, ∂h/∂y)``,
-y = a·v. Their correlation over all texels and both components, ``Σ s·t / √(Σ s² Σ t²)``, is near 1 where they
-agree. It is taken for every way in which the two may have been confused: one of the images turned or mirrored
-(the eight symmetries of a square), the green channel upside down (DirectX), heights upside down.
+A normal map usually repeats the slopes of its height map. We compare the slopes of the normals,
+``t = (-n_x/n_z, -n_y/n_z)``, with those of the heights, ``s = (∂h/∂u, ∂h/∂y)``, y = a·v. Their correlation
+over all texels and both components, ``Σ s·t / √(Σ s² Σ t²)``, is near 1 where they agree. We evaluate it for
+all likely errors: one image turned or mirrored (the eight symmetries of a square), an inverted green channel
+(DirectX), inverted heights.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _SMALLEST = 4
 
 @dataclass(frozen=True)
 class NormalFit:
-    """What the data say about a normal map.
+    """Result of :func:`fit_normals`.
 
     Attributes
     ----------
@@ -109,10 +109,19 @@ def slopes_of_normals(normal: Array) -> Array:
 
 
 def fit_normals(height: Array, normal: Array) -> NormalFit | None:
-    """Hold normals (h, w, 3), y along v (OpenGL), against heights (H, W) of the same tile.
+    """Compare a normal map with the heights of the same tile.
 
-    Both are averaged (box) to the coarser of the two resolutions. None where heights or normals are flat, or
-    too small to tell.
+    Parameters
+    ----------
+    height : (H, W) array
+        Stored heights.
+    normal : (h, w, 3) array
+        Unit vectors, y along v (OpenGL).
+
+    Returns
+    -------
+    NormalFit or None
+        None where heights or normals are flat or too small. Both are box-filtered to the coarser resolution.
     """
     fitted = _common(height, normal, _FITTED)
     if min(fitted[0].shape) < _SMALLEST:

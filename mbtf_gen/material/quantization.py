@@ -1,4 +1,4 @@
-"""How finely a height map's integer codes really resolve heights."""
+"""Effective resolution of a height map's integer codes."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-# Share of texels at either end of the histogram that the spacing is not judged by: rare codes leave gaps.
+# Fraction of texels at either end of the histogram that is ignored, because rare codes leave gaps.
 _TAIL = 0.005
-# Fewer levels are a terraced or binary surface that is meant as it is.
+# Fewer levels are treated as an intentionally terraced or binary surface.
 _FEWEST = 16
 # Codes of a stretched histogram lie this close to a straight line over their rank: rounding, and a little.
 _STRAIGHT = 0.75
@@ -19,7 +19,7 @@ _STRAIGHT = 0.75
 
 @dataclass(frozen=True)
 class Codes:
-    """Use that a height map makes of its codes.
+    """Distribution of the integer codes of a height map.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""``material.yaml``: which maps and constants make up a material."""
+"""Schema of ``material.yaml``: maps and constants of a material."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def _gray(value: Any) -> Any:
 
 
 def _short(data: Any) -> Any:
-    """``roughness: 0.4`` and ``roughness: rough.png`` stand for their long forms."""
+    """Long form of ``roughness: 0.4`` and ``roughness: rough.png``."""
     if isinstance(data, str):
         return {"file": data}
     if isinstance(data, int | float | Sequence) and not isinstance(data, bool):
@@ -29,7 +29,14 @@ def _short(data: Any) -> Any:
     return data
 
 
-class HeightEntry(Settings):
+class _Entry(Settings):
+    @model_validator(mode="before")
+    @classmethod
+    def _long(cls, data: Any) -> Any:
+        return _short(data)
+
+
+class HeightEntry(_Entry):
     """The height map."""
 
     file: FileName = Field(description="the height map")
@@ -43,20 +50,10 @@ class HeightEntry(Settings):
     dequantize: bool = Field(True, description="smooth heights of few levels within half a level")
     colorspace: ColorSpace = Field("linear", description="srgb decodes the stored numbers first")
 
-    @model_validator(mode="before")
-    @classmethod
-    def _long(cls, data: Any) -> Any:
-        return _short(data)
 
-
-class _FileOrValue(Settings):
+class _FileOrValue(_Entry):
     file: FileName | None = Field(None, description="the map; either this or value")
     channel: Channel | None = Field(None, description=_CHANNEL)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _long(cls, data: Any) -> Any:
-        return _short(data)
 
     @model_validator(mode="after")
     def _one(self) -> _FileOrValue:
@@ -92,7 +89,7 @@ class ShareEntry(_FileOrValue):
         return self
 
 
-class NormalEntry(Settings):
+class NormalEntry(_Entry):
     """A tangent-space normal map."""
 
     file: FileName = Field(description="the normal map")
@@ -101,18 +98,13 @@ class NormalEntry(Settings):
         None, description="green up (gl) or down (dx); default: as the heights' slopes show, else by the name"
     )
 
-    @model_validator(mode="before")
-    @classmethod
-    def _long(cls, data: Any) -> Any:
-        return _short(data)
 
-
-# What a BSDF of the user's own replaces.
+# Keys that a BSDF replaces.
 _REFLECTANCE = (
     *("base_color", "roughness", "metallic", "specular", "clearcoat", "clearcoat_roughness"),
     *("sheen", "sheen_color", "sheen_roughness"),
 )
-# Keys that say more about another key.
+# Keys that require another key.
 _GOES_WITH = {"clearcoat_roughness": "clearcoat", "sheen_color": "sheen", "sheen_roughness": "sheen"}
 
 

@@ -1,7 +1,6 @@
-"""Does a map continue across its edges, and what to do where it does not.
+"""Detection of seams, and methods that make maps tileable.
 
-A tile is repeated without end, so a map whose last column does not lead on to its first one shows a cliff at
-every period.
+The tile is periodic, so a map whose last column does not continue in its first one has a cliff per period.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ class Seam:
 
     @property
     def ratio(self) -> float:
-        """Seam step over interior step; 1 and below: the seam looks like any other place."""
+        """Seam step over interior step; at most 1 where the seam is not visible."""
         return self.step / self.interior if self.interior > 0 else (0.0 if self.step == 0 else float("inf"))
 
 
@@ -70,7 +69,7 @@ def seams(height: Array, rounding: float = 0.0) -> tuple[Seam, ...]:
 
 
 def broken(seam: Seam) -> bool:
-    """Does the seam stand out: more than 1.5 times the interior's 99th percentile?"""
+    """Is the seam's step more than 1.5 times the interior's 99th percentile?"""
     return seam.ratio > _LIMIT
 
 
@@ -135,7 +134,7 @@ def blend_normals(normal: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def retile(maps: Mapping[str, Any], tile: Tiling) -> dict[str, Any]:
-    """Maps by role, mirrored or blended; constants and None stay as they are.
+    """Mirror or blend maps by role; constants and None are unchanged.
 
     Lengths are in tile widths. A mirrored tile is two images wide, so its heights are halved: the shape of
     the surface stays.
@@ -157,7 +156,7 @@ def retile(maps: Mapping[str, Any], tile: Tiling) -> dict[str, Any]:
 
 
 def tiling_note(tile: Tiling) -> str:
-    """What was done to make the maps tile, in words."""
+    """Description of a tiling method."""
     if tile == "mirror":
         return "tile: two by two mirrored copies; the tile is two images wide, so heights count half"
     return f"tile: edges cross-faded over {BAND:g} of the tile"

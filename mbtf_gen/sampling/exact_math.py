@@ -6,24 +6,16 @@ must not. Relative error below 1e-14, far below the float32 in which queries are
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
 
 # Taylor coefficients of sin and cos about 0 in x², to be used on |x| ≤ π/4.
-_SIN = (1.0, -1 / 6, 1 / 120, -1 / 5040, 1 / 362880, -1 / 39916800, 1 / 6227020800, -1 / 1307674368000)
-_COS = (
-    1.0,
-    -1 / 2,
-    1 / 24,
-    -1 / 720,
-    1 / 40320,
-    -1 / 3628800,
-    1 / 479001600,
-    -1 / 87178291200,
-    1 / 20922789888000,
-)
+_SIN = tuple((-1) ** k / math.factorial(2 * k + 1) for k in range(8))
+_COS = tuple((-1) ** k / math.factorial(2 * k) for k in range(9))
 # Taylor coefficients of exp about 0, to be used on |x| ≤ ln(2)/2.
 _EXP = tuple(1.0 / float(f) for f in np.cumprod([1.0, *range(1, 16)]))
 _LN2 = 0.6931471805599453
@@ -39,7 +31,17 @@ def _horner(coefficients: tuple[float, ...], x: F64) -> F64:
 
 
 def sincos_turns(turns: F64) -> tuple[F64, F64]:
-    """(sin, cos) of 2π·turns, any shape."""
+    """Sine and cosine of an angle in turns.
+
+    Parameters
+    ----------
+    turns : float64 array
+        Angles over 2π, any shape.
+
+    Returns
+    -------
+    sine, cosine : float64 arrays
+    """
     t = np.asarray(turns, np.float64)
     quarter = np.floor(4.0 * t + 0.5)
     x = (t - 0.25 * quarter) * (2.0 * np.pi)

@@ -22,19 +22,19 @@ from numpy.typing import ArrayLike, NDArray
 
 # The uniform sphere has an RMS angle of 69° per axis; beyond this a lobe is no longer a light from one side.
 MAX_WIDTH_DEG = 45.0
-# A lobe narrower than this cannot be told from a delta light in single precision.
+# In single precision, narrower lobes are indistinguishable from a delta light.
 MIN_WIDTH_DEG = 0.01
 
 
-# The horizon cuts nothing that counts from lobes that stand this many widths above it.
+# Elevation, in widths of the lobe, above which the horizon removes a negligible part of it.
 NEAR_WIDTHS = 10.0
 
-# Worked out once: nodes of high order take a tenth of a second.
+# Cached, because nodes of high order take a tenth of a second.
 _gauss = cache(np.polynomial.legendre.leggauss)
 
 
 def _theta_nodes(kappa: float, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Gauss–Legendre nodes and weights over the polar angle, up to where the lobe holds e^-40 of its peak."""
+    """Gauss–Legendre nodes and weights over the polar angle, up to e^-40 of the lobe's peak."""
     end = float(np.arccos(max(-1.0, 1.0 - 40.0 / kappa)))
     x, w = _gauss(count)
     return 0.5 * end * (x + 1.0), 0.5 * end * w
@@ -88,11 +88,8 @@ def lobe_irradiance(kappa: float, elevation: ArrayLike) -> NDArray[np.float64]:
         half = 0.5 * (high - low)
         # Squaring the abscissa towards the kink removes the root singularity that the mean has there.
         s = 0.5 * (x + 1.0)
-        t = (
-            low[..., None] + 2.0 * half[..., None] * s**2
-            if low is kink
-            else high[..., None] - 2.0 * half[..., None] * s**2
-        )
+        offset = 2.0 * half[..., None] * s**2
+        t = low[..., None] + offset if low is kink else high[..., None] - offset
         jacobian = 4.0 * half[..., None] * s * 0.5
         density = _density(kappa, 2.0 * np.sin(0.5 * t) ** 2) * 2.0 * np.pi * np.sin(t)
         inner = _mean_positive_part(
@@ -119,7 +116,15 @@ class LightKernel:
 
     Attributes
     ----------
-    width_deg : RMS angle per axis in degrees; 0 is a delta light
+    width_deg : float
+        RMS angle per axis in degrees, 0 or in [0.01, 45]; 0 is a delta light.
+    kappa : float
+        Concentration κ of the lobe; infinite for a delta light.
+
+    Raises
+    ------
+    ValueError
+        The width is out of range.
     """
 
     width_deg: float
@@ -127,15 +132,11 @@ class LightKernel:
     _table: Any = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        if self.width_deg == 0:
-            object.__setattr__(self, "kappa", np.inf)
-            object.__setattr__(self, "_table", None)
-            return
-        if not MIN_WIDTH_DEG <= self.width_deg <= MAX_WIDTH_DEG:
+        if self.width_deg != 0 and not MIN_WIDTH_DEG <= self.width_deg <= MAX_WIDTH_DEG:
             raise ValueError(
                 f"light width must be 0 or {MIN_WIDTH_DEG}..{MAX_WIDTH_DEG} degrees, not {self.width_deg}"
             )
-        kappa, table = _lobe(float(self.width_deg))
+        kappa, table = (np.inf, None) if self.is_delta else _lobe(float(self.width_deg))
         object.__setattr__(self, "kappa", kappa)
         object.__setattr__(self, "_table", table)
 
@@ -145,11 +146,21 @@ class LightKernel:
         return self.width_deg == 0
 
     def irradiance(self, omega_i: ArrayLike) -> NDArray[np.float64]:
-        """Irradiance E of the unnormalized lobe for directions (..., 3) with z ≥ 0; the divisor of L."""
+        """Irradiance E of the lobe on the reference plane, the divisor of the radiance.
+
+        Parameters
+        ----------
+        omega_i : (..., 3) array
+            Unit vectors towards the light, z ≥ 0.
+
+        Returns
+        -------
+        (...) float64 array
+        """
         w = np.asarray(omega_i, np.float64)
         if self.is_delta:
             return w[..., 2].copy()
-        # Where nothing of the lobe is cut off: its mean cosine.
+        # Away from the horizon: the mean cosine of the whole lobe.
         out = np.array(w[..., 2] * (1.0 / np.tanh(self.kappa) - 1.0 / self.kappa))
         widest = NEAR_WIDTHS * np.radians(self.width_deg)
         near = w[..., 2] < (np.sin(widest) if widest < np.pi / 2 else np.inf)
@@ -158,13 +169,34 @@ class LightKernel:
         return out
 
     def density(self, omega: ArrayLike, omega_i: ArrayLike) -> NDArray[np.float64]:
-        """Lobe p(ω) in 1/sr for directions (..., 3), not cut at the horizon. Not defined for a delta
-        light."""
+        """Density p(ω) of the lobe, not cut at the horizon; undefined for a delta light.
+
+        Parameters
+        ----------
+        omega, omega_i : (..., 3) arrays
+            Unit vectors: the direction, and the axis of the lobe.
+
+        Returns
+        -------
+        (...) float64 array
+            Density in 1/sr.
+        """
         difference = np.asarray(omega, np.float64) - np.asarray(omega_i, np.float64)
         return _density(self.kappa, 0.5 * np.sum(difference**2, axis=-1))
 
     def sample(self, omega_i: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
-        """Directions (n, 3) drawn from the lobe around each of omega_i (n, 3), not cut at the horizon."""
+        """Sample one direction from the lobe around each axis, not cut at the horizon.
+
+        Parameters
+        ----------
+        omega_i : (n, 3) float64 array
+            Unit vectors towards the light.
+        rng : numpy.random.Generator
+
+        Returns
+        -------
+        (n, 3) float64 array
+        """
         if self.is_delta:
             return omega_i
         xi, turn = rng.random(len(omega_i)), 2.0 * np.pi * rng.random(len(omega_i))
@@ -178,6 +210,17 @@ class LightKernel:
         return np.asarray((1.0 - versine)[:, None] * omega_i + sine[:, None] * aside)
 
     def radiance(self, omega: ArrayLike, omega_i: ArrayLike) -> NDArray[np.float64]:
-        """Arriving radiance L(ω) in 1/sr per unit irradiance: the lobe, cut and normalized."""
+        """Incident radiance L(ω): the lobe, cut at the horizon and normalized to unit irradiance.
+
+        Parameters
+        ----------
+        omega, omega_i : (..., 3) arrays
+            Unit vectors: the direction, and the axis of the lobe.
+
+        Returns
+        -------
+        (...) float64 array
+            Radiance in 1/sr.
+        """
         above = np.asarray(omega)[..., 2] > 0
         return np.where(above, self.density(omega, omega_i), 0.0) / self.irradiance(omega_i)

@@ -44,7 +44,7 @@ class Queries:
 
     @property
     def lead(self) -> tuple[int, ...]:
-        """The leading axes."""
+        """Shape of the leading axes."""
         return self.sigma.shape
 
     def flat(self) -> Queries:
@@ -57,13 +57,26 @@ class Queries:
         )
 
     def take(self, rows: Any) -> Queries:
-        """Some along the first axis: a slice, an index array or a mask."""
+        """Select along the first axis by a slice, an index array or a mask."""
         return Queries(self.u[rows], self.sigma[rows], self.omega_i[rows], self.omega_o[rows])
 
 
 @dataclass(frozen=True)
 class Mixture:
-    """Distribution of the fractional level: with weights that sum to 1, l ~ U[0,k] and l ~ U[k-1,k]."""
+    """Mixture distribution of the fractional level; weights are normalized to sum 1.
+
+    Attributes
+    ----------
+    log_uniform : float
+        Weight of l ~ U[0, k].
+    finest : float
+        Weight of l ~ U[k-1, k].
+
+    Raises
+    ------
+    ValueError
+        Both weights are 0.
+    """
 
     log_uniform: float
     finest: float
@@ -76,7 +89,20 @@ class Mixture:
         object.__setattr__(self, "finest", self.finest / total)
 
     def level(self, xi: NDArray[np.float64], finest: int) -> NDArray[np.float64]:
-        """Fractional level in [0, k] from numbers in [0, 1), any shape."""
+        """Fractional levels by inversion of the cumulative distribution.
+
+        Parameters
+        ----------
+        xi : float64 array
+            Numbers in [0, 1), any shape.
+        finest : int
+            Finest level k.
+
+        Returns
+        -------
+        float64 array
+            Levels in [0, k].
+        """
         first = xi < self.log_uniform
         low = max(finest - 1, 0)
         share = xi / self.log_uniform if self.log_uniform > 0 else xi
@@ -84,7 +110,19 @@ class Mixture:
         return np.where(first, share * finest, low + rest * (finest - low))
 
     def density(self, level: NDArray[np.float64], finest: int) -> NDArray[np.float64]:
-        """Density per level at fractional levels (any shape) for k = `finest` ≥ 1; 0 outside [0, k]."""
+        """Probability density at fractional levels; 0 outside [0, k].
+
+        Parameters
+        ----------
+        level : float64 array
+            Fractional levels, any shape.
+        finest : int
+            Finest level k ≥ 1.
+
+        Returns
+        -------
+        float64 array
+        """
         low = max(finest - 1, 0)
         inside = (level >= 0) & (level <= finest)
         near = inside & (level >= low)
@@ -102,7 +140,7 @@ def _rounded(u: NDArray[np.float64], v: NDArray[np.float64]) -> F32:
 
 @dataclass(frozen=True)
 class QueryPlan:
-    """Samples the queries of any shard independently of other shards.
+    """Sampler of the queries of each shard, independent of other shards.
 
     Attributes
     ----------
@@ -159,28 +197,23 @@ class QueryPlan:
             texel = np.broadcast_to(np.arange(self.lattice.texels()).reshape(shape[1:]), shape)
             positions = self._positions(generator, texel)
         else:
-            shape = (rows, self.patch_size, self.patch_size)
             positions = self._patch(generator, sigma, self.patch_size)
-        return Queries(
-            positions,
-            np.ascontiguousarray(np.broadcast_to(sigma[:, None, None], shape)),
-            np.ascontiguousarray(np.broadcast_to(omega_i[:, None, None], (*shape, 3))),
-            np.ascontiguousarray(np.broadcast_to(omega_o[:, None, None], (*shape, 3))),
-        )
+
+        def per_texel(of_image: F32) -> F32:
+            shape = (*positions.shape[:3], *of_image.shape[1:])
+            return np.ascontiguousarray(np.broadcast_to(of_image[:, None, None], shape))
+
+        return Queries(positions, per_texel(sigma), per_texel(omega_i), per_texel(omega_o))
 
     def _texels(self, split: str, start: int, count: int) -> NDArray[np.int64]:
-        """Texel of query number start … start+count-1 of a split: a new random order for every pass."""
+        """Texels of the queries start … start+count-1 of a split: a new random order for every pass."""
         texels = self.lattice.texels()
-        parts = []
-        position, left = start, count
-        while left > 0:
-            sweep, offset = divmod(position, texels)
-            generator = numpy_generator(self.root, split, sweep, Purpose.TEXEL_ORDER)
-            order = generator.permutation(texels)
-            take = min(left, texels - offset)
-            parts.append(order[offset : offset + take])
-            position, left = position + take, left - take
-        return np.concatenate(parts)
+        first = start // texels
+        orders = [
+            numpy_generator(self.root, split, sweep, Purpose.TEXEL_ORDER).permutation(texels)
+            for sweep in range(first, -(-(start + count) // texels))
+        ]
+        return np.concatenate(orders)[start - first * texels :][:count]
 
     def _patch(self, generator: np.random.Generator, sigma: F32, size: int) -> F32:
         """Texel positions (n, size, size, 2): patches of the level nearest to footprints (n,), at random
@@ -189,12 +222,7 @@ class QueryPlan:
         extent = shapes[level_groups(sigma, self.lattice.finest)]
         start = generator.random((len(sigma), 2, 1))
         down, across = (start[:, k] + np.arange(size) / extent[:, k, None] for k in (0, 1))
-        shape = (len(sigma), size, size)
-        u, v = (
-            np.broadcast_to(across[:, None] % 1.0, shape),
-            np.broadcast_to(1 - down[:, :, None] % 1.0, shape),
-        )
-        return _rounded(u, v)
+        return _rounded(*np.broadcast_arrays(across[:, None] % 1.0, 1 - down[:, :, None] % 1.0))
 
     def _positions(self, generator: np.random.Generator, texel: NDArray[np.int64]) -> F32:
         rows, columns = self.lattice.shape()

@@ -1,9 +1,9 @@
 """Random streams, an injective function of (root seed, split, shard, purpose, pass, half).
 
-Queries are drawn with NumPy's Philox, a counter-based generator whose key holds all of these numbers
-unhashed. Paths draw from low-discrepancy sequences inside kernels (:mod:`mbtf_gen.sampling.sobol`), one for
-each half of each query. The fields are hashed into a key of 64 bits, from which the queries of one stream
-derive distinct keys, so that no value depends on how paths are grouped into launches.
+Queries are sampled with NumPy's Philox, a counter-based generator whose key contains all of these numbers
+unhashed. Paths use low-discrepancy sequences inside kernels (:mod:`mbtf_gen.sampling.sobol`), one for each
+half of each query. The fields are hashed into a 64-bit key, from which the queries of one stream derive
+distinct keys, so that values do not depend on how paths are grouped into launches.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ if TYPE_CHECKING:
     from mbtf_gen.sampling.sobol import SobolSampler
 
 MAX_SHARDS = 1 << 28
-# Data splits, reference pictures and pilots draw from streams of their own.
+# Data splits, reference pictures and pilots have separate streams.
 _SPLIT_NUMBER: dict[str, int] = {"train": 0, "test": 1, "reference": 2, "pilot": 3}
 
 
 class Purpose(IntEnum):
-    """What a stream is for."""
+    """Purpose of a stream."""
 
     TEXEL_ORDER = 0
     QUERIES = 1
@@ -46,7 +46,7 @@ def stream_number(split: str, shard: int, purpose: Purpose, pass_index: int = 0,
 def numpy_generator(
     root: int, split: str, shard: int, purpose: Purpose, pass_index: int = 0
 ) -> np.random.Generator:
-    """NumPy generator of a stream; its bits are the same on every machine."""
+    """NumPy generator of a stream; its bits are the same on every machine (see :func:`stream_number`)."""
     key = np.array([root, stream_number(split, shard, purpose, pass_index)], np.uint64)
     return np.random.Generator(np.random.Philox(key=key))
 
@@ -63,23 +63,31 @@ def _mix(x: int) -> int:
 
 def stream_key(root: int, number: int) -> int:
     """64-bit key of the paths of a stream; `number` from :func:`stream_number`."""
-    # Each is hashed before the next is added: neighboring root seeds share nothing then.
+    # Each is hashed before the next is added, so that neighboring root seeds are independent.
     return _mix(_mix(number + 1) + root & _WORD)
 
 
 def sequence(key: Any, salt: Any, query: Any, index: Any) -> SobolSampler:
-    """Points inside a kernel, one sequence per query of a stream.
+    """Low-discrepancy points inside a kernel, one sequence per query of a stream.
 
     Parameters
     ----------
-    key, salt : ``mi.UInt32``, lower and upper half of :func:`stream_key`, one or one per lane
-    query : ``mi.UInt32``, number of the query in its shard; index : of the path within its half of the query
+    key, salt : mi.UInt32
+        Lower and upper half of :func:`stream_key`, one or one per lane.
+    query : mi.UInt32
+        Number of the query in its shard.
+    index : mi.UInt32
+        Number of the path within its half of the query.
+
+    Returns
+    -------
+    SobolSampler
     """
     import mitsuba as mi
 
     from mbtf_gen.sampling.sobol import SobolSampler, mix
 
-    # Both are bijections of the query's number, and unrelated ones.
+    # Two independent bijections of the query's number.
     return SobolSampler(
         mix(query ^ key), mix(query * mi.UInt32(0x2C1B3C6D) + salt), mi.UInt32(index), mi.UInt32(query) * 0
     )

@@ -1,16 +1,16 @@
 r"""Low-discrepancy points inside kernels: Owen-scrambled Sobol' points, padded pair by pair.
 
 The paths of one half of a query are the points 0, 1, 2, … of one randomized sequence; half, query, shard and
-root seed choose the randomization, so halves are independent and no number depends on how paths are grouped
-into launches. Every draw of a path is one *dimension* of the sequence, of one or two coordinates:
+root seed select the randomization, so halves are independent and values do not depend on how paths are
+grouped into launches. Every sample of a path is one *dimension* of the sequence, of one or two coordinates:
 
 - the coordinates are the first one or two of Sobol' (1967), for two a (0, m, 2)-net: any 2^m consecutive
   points that begin at a multiple of 2^m put exactly one point into each of the 2^m boxes of every shape
   2^-j × 2^-(m-j);
-- each coordinate is scrambled after Owen (1995), which keeps that and makes every single point uniform, so
+- each coordinate is scrambled after Owen (1995), which preserves the net and makes every point uniform, so
   that estimates are unbiased for any number of points;
-- the order of the points is scrambled too, anew for each dimension, so that dimensions are independent of
-  each other (Burley 2020, "Practical Hash-based Owen Scrambling").
+- the order of the points is scrambled separately for each dimension, so that dimensions are independent
+  (Burley 2020, "Practical Hash-based Owen Scrambling").
 
 Scrambling by hashing follows Laine and Karras (2011) with the constants of Vegdahl (2021). All of it is
 32-bit integer arithmetic, and a path's state is four numbers.
@@ -30,15 +30,14 @@ _DIMENSIONS = _CHANCE_STEP - 1
 
 
 def mix(x: Any) -> Any:
-    """A bijection of ``mi.UInt32`` in which every bit of x changes each bit of the result half of the time
-    (``lowbias32``, Wellons 2018)."""
+    """Hash of ``mi.UInt32``, a bijection: ``lowbias32`` (Wellons 2018)."""
     x = (x ^ (x >> 16)) * mi.UInt32(0x7FEB352D)
     x = (x ^ (x >> 15)) * mi.UInt32(0x846CA68B)
     return x ^ (x >> 16)
 
 
 def _scramble(x: Any, seed: Any) -> Any:
-    """Owen's scrambling of a bit-reversed number: what becomes of a bit depends on the lower ones alone."""
+    """Owen scrambling of a bit-reversed number: each bit's flip depends on the lower bits alone."""
     x = x ^ (x * mi.UInt32(0x3D20ADEA))
     x = (x + seed) * ((seed >> 16) | 1)
     x = x ^ (x * mi.UInt32(0x05526C56))
@@ -61,13 +60,16 @@ def _unit(x: Any) -> Any:
 
 @dataclass
 class SobolSampler:
-    """State of lanes' sequences; all ``mi.UInt32``, one per lane.
+    """State of the sequences of all lanes.
 
     Attributes
     ----------
-    key, salt : which randomization: 64 bits, see :func:`mbtf_gen.sampling.rng.sequence`
-    index : number of the point
-    counter : dimensions drawn so far, and in the upper half plain numbers
+    key, salt : mi.UInt32
+        Randomization of 64 bits, from :func:`mbtf_gen.sampling.rng.sequence`.
+    index : mi.UInt32
+        Number of the point.
+    counter : mi.UInt32
+        Dimensions sampled so far (lower half) and plain random numbers (upper half).
     """
 
     key: Any
@@ -97,8 +99,7 @@ class SobolSampler:
         return mi.Point2f(_unit(x), _unit(y))
 
     def chance(self) -> Any:
-        """A plain random number in [0, 1), which is no dimension of the sequence: for decisions that some
-        paths take more often than others."""
+        """A pseudo-random number in [0, 1) outside the sequence, for decisions that not all paths make."""
         number = self.counter >> 16
         self.counter = self.counter + _CHANCE_STEP
         return _unit(mix(self._seed(~number) ^ mix(self.index + 0x68E31DA4)))

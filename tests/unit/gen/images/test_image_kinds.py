@@ -147,7 +147,7 @@ class TestLayers:
     def test_whole_numbers_matter_only_where_they_are_meant(self, tmp_path: Path) -> None:
         path = exr(tmp_path / "x.exr", {"Y": np.ones((4, 6), np.float32), "id": np.zeros((4, 6), np.uint32)})
         assert read_image(path).pixels.shape == (4, 6, 1)
-        with pytest.raises(InputError, match="'id' holds whole numbers"):
+        with pytest.raises(InputError, match="'id' stores integers"):
             read_image(path, "id")
 
 

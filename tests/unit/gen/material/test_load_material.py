@@ -150,7 +150,7 @@ class TestBareFile:
     def test_a_great_relief_at_the_default_factor_is_questioned(self, tmp_path: Path) -> None:
         material = load_material(npy(tmp_path / "h.npy", np.array([[0.0, 0.6]])))
         (warning,) = material.warnings_at()
-        assert "the relief is 0.6 tile widths; is another --height-scale meant?" in warning
+        assert "the displacement range is 0.6 tile widths; is another --height-scale meant?" in warning
         assert material.warnings_at(1.0) == ()
         assert load_material(npy(tmp_path / "h.npy", np.array([[0.0, 0.5]]))).warnings_at() == ()
         yaml = tmp_path / "m.yaml"

@@ -157,7 +157,7 @@ class TestMaterial:
     def test_a_name_that_is_wrong(self, tmp_path: Path, name: str, dx: bool) -> None:
         material = load_material(self.folder(tmp_path, fractal(96, 96), name, dx=dx))
         (warning,) = material.warnings
-        assert "the name says" in warning
+        assert "the name implies" in warning
         assert f"read as {'DirectX' if dx else 'OpenGL'}" in warning
         assert material.normal_convention == ("dx" if dx else "gl")
 
@@ -165,7 +165,7 @@ class TestMaterial:
         folder = self.folder(tmp_path, fractal(96, 96), "n.png", dx=True)
         (folder / "material.yaml").write_text("height: height.png\nnormal: {file: n.png, convention: gl}\n")
         material = load_material(folder)
-        assert "the material file says OpenGL, the heights' slopes say DirectX" in material.warnings[0]
+        assert "the material file implies OpenGL, the heights' slopes imply DirectX" in material.warnings[0]
         assert "read as OpenGL" in material.warnings[0]
         assert material.normal_convention == "gl"
 

@@ -122,5 +122,5 @@ class TestMaterial:
         path = tmp_path / "material.yaml"
         path.write_text("height: {file: h.png, dequantize: false}\n")
         material = load_material(path)
-        assert "their steps stay, as asked for" in material.warnings[0]
+        assert "not smoothed, because dequantize is off" in material.warnings[0]
         assert np.array_equal(np.rint(material.height * 255), material.height * 255)
