@@ -10,9 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .image_samples import png_chunk
+
 
 def rng() -> np.random.Generator:
-    """The same numbers wherever they are drawn."""
+    """A generator that gives the same numbers in every test."""
     return np.random.default_rng(7)
 
 
@@ -41,13 +43,8 @@ def scan_lines(codes: NDArray[Any], bits: int, filters: list[int] | None = None)
 ADAM7 = [
     (slice(y, None, dy), slice(x, None, dx))
     for y, dy, x, dx in (
-        (0, 8, 0, 8),
-        (0, 8, 4, 8),
-        (4, 8, 0, 4),
-        (0, 4, 2, 4),
-        (2, 4, 0, 2),
-        (0, 2, 1, 2),
-        (1, 2, 0, 1),
+        *((0, 8, 0, 8), (0, 8, 4, 8), (4, 8, 0, 4), (0, 4, 2, 4)),
+        *((2, 4, 0, 2), (0, 2, 1, 2), (1, 2, 0, 1)),
     )
 ]
 
@@ -63,22 +60,16 @@ def png(
     extra: tuple[tuple[bytes, bytes], ...] = (),
 ) -> Path:
     """Write a PNG from its specification; `extra` chunks stand before the pixels."""
-
-    def chunk(kind: bytes, content: bytes) -> bytes:
-        return (
-            struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
-        )
-
     rows, columns, _ = codes.shape
     out = b"".join(
         scan_lines(codes[part], bits, filters) for part in (ADAM7 if interlace else [...]) if codes[part].size
     )
     path.write_bytes(
         b"\x89PNG\r\n\x1a\n"
-        + chunk(b"IHDR", struct.pack(">IIBBBBB", columns, rows, bits, color, 0, 0, int(interlace)))
-        + b"".join(chunk(*c) for c in extra)
-        + chunk(b"IDAT", zlib.compress(out))
-        + chunk(b"IEND", b"")
+        + png_chunk(b"IHDR", struct.pack(">IIBBBBB", columns, rows, bits, color, 0, 0, int(interlace)))
+        + b"".join(png_chunk(*c) for c in extra)
+        + png_chunk(b"IDAT", zlib.compress(out))
+        + png_chunk(b"IEND", b"")
     )
     return path
 

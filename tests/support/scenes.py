@@ -36,8 +36,8 @@ def flat(aspect: float = 1.0) -> HeightGrid:
     return HeightGrid(np.zeros((4, 4)), aspect)
 
 
-def rocks(resolution: int = 64, relief: float = 0.15, seed: int = 3) -> HeightGrid:
-    """A rough, periodic, asymmetric relief with steep flanks."""
+def rocks(resolution: int = 64, displacement_range: float = 0.15, seed: int = 3) -> HeightGrid:
+    """A rough, periodic, asymmetric height field with steep flanks."""
     rng = np.random.default_rng(seed)
     frequency = np.fft.fftfreq(resolution, 1.0 / resolution)
     radius = np.hypot(frequency[:, None], frequency[None, :])
@@ -46,7 +46,7 @@ def rocks(resolution: int = 64, relief: float = 0.15, seed: int = 3) -> HeightGr
     h = (h - h.min()) / (h.max() - h.min())
     # Terraces: flat tops, steep flanks, a tilt that breaks every symmetry.
     h = 0.7 * np.floor(5.0 * h) / 5.0 + 0.3 * h
-    return HeightGrid.from_map(h, relief / (h.max() - h.min()))
+    return HeightGrid.from_map(h, displacement_range / (h.max() - h.min()))
 
 
 def real_heights(name: str, resolution: int = 96) -> HeightGrid:

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from conftest import RunPython
 from support.fit_data import parallax, write_data
-from support.mistakes import call
+from support.invalid_inputs import call
 
 from mbtf_gen.dataset.shard_io import read_shard, write_shard
 

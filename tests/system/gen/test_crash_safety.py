@@ -67,7 +67,7 @@ class Small:
         shutil.copytree(self.whole, self.out)
         edit(self.out / "manifest.json", lambda manifest: manifest.update(complete=False, summary=None))
 
-    def damaged(self) -> None:
+    def corrupt(self) -> None:
         """A shard, a sidecar, the configuration, and what a kill leaves."""
         self.absent()
         shutil.copytree(self.whole, self.out)
@@ -76,9 +76,9 @@ class Small:
         (self.out / ".train-00001.lock").write_text("{}")
         (self.out / ".train-00001.json.0123abcd-9.tmp").write_text("{")
 
-    def disowned(self) -> None:
-        """As before, and the manifest is damaged."""
-        self.damaged()
+    def corrupt_manifest(self) -> None:
+        """As before, and the manifest is corrupt."""
+        self.corrupt()
         (self.out / "config.yaml").write_bytes((self.whole / "config.yaml").read_bytes())
         flip(self.out / "manifest.json", 2000)
 
@@ -109,8 +109,8 @@ def operations(line: list[str], small: Small, prepare: Callable[[], None], thoro
 COMMANDS = {
     "run": (Small.absent, lambda s: s.line),
     "merge": (Small.unmerged, lambda s: ["merge", str(s.out)]),
-    "repair": (Small.damaged, lambda s: ["repair", str(s.out), "-q"]),
-    "repair of the manifest": (Small.disowned, lambda s: ["repair", str(s.out), "-q"]),
+    "repair": (Small.corrupt, lambda s: ["repair", str(s.out), "-q"]),
+    "repair of the manifest": (Small.corrupt_manifest, lambda s: ["repair", str(s.out), "-q"]),
     "overwrite": (Small.unmerged, lambda s: [*s.line, "--overwrite"]),
 }
 # The normal suite tries a sample of the commands that write most, the slow one everything.
@@ -142,19 +142,19 @@ def test_any_file_operation_may_fail(
             with FileOperations(small.out, fail) as watch:
                 code = generate(line)
             captured = capsys.readouterr()
-            said = [x for x in captured.err.splitlines() if not x.startswith("warning: ")]
-            where = f"{operation} {errno.errorcode[number]}: {code} {said}"
+            errors = [x for x in captured.err.splitlines() if not x.startswith("warning: ")]
+            where = f"{operation} {errno.errorcode[number]}: {code} {errors}"
             assert operation in watch.seen
-            if code == 4 and not said:
+            if code == 4 and not errors:
                 assert "unfinished" in captured.out, where
             elif code:
                 refused += 1
                 assert code in PARTIAL_OR_INPUT, where
-                assert 1 <= len(said) <= 2, where
-                assert said[0].startswith(f"error: {small.out}"), where
+                assert 1 <= len(errors) <= 2, where
+                assert errors[0].startswith(f"error: {small.out}"), where
             else:
                 # It did not matter, as for a lock that stays behind.
-                assert said == [], where
+                assert errors == [], where
             assert generate(line) == 0, where
             assert contents(small.out) == small.expected, where
     assert refused > 3
@@ -183,9 +183,9 @@ def test_a_kill_at_any_file_operation_loses_nothing(name: str, thorough: bool, s
     assert killed > 3
 
 
-def test_a_sidecar_never_vouches_for_a_later_shard(small: Small) -> None:
+def test_a_sidecar_is_removed_before_its_shard_is_replaced(small: Small) -> None:
     """The shard is gone, its sidecar not: it goes before another shard takes the name."""
-    small.damaged()
+    small.corrupt()
     (small.out / "train-00001.npz").unlink()
     with FileOperations(small.out) as watch:
         assert generate(["repair", str(small.out), "-q"]) == 0
@@ -200,7 +200,7 @@ def test_a_sidecar_never_vouches_for_a_later_shard(small: Small) -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("name", ["run", "repair"])
-def test_an_interruption_keeps_what_was_rendered_and_says_how_to_go_on(
+def test_an_interrupted_run_keeps_its_shards(
     name: str,
     number: signal.Signals,
     small: Small,
@@ -227,11 +227,11 @@ def test_an_interruption_keeps_what_was_rendered_and_says_how_to_go_on(
             assert generate(line) == 130
     finally:
         signal.signal(signal.SIGINT, handler)
-    said = [x for x in capsys.readouterr().err.splitlines() if not x.startswith("warning: ")]
-    assert len(said) == 2
-    assert said[0].startswith("error: interrupted; ")
-    assert "is kept" in said[0] or "are kept" in said[0]
-    assert said[1] == "  the same command resumes"
+    errors = [x for x in capsys.readouterr().err.splitlines() if not x.startswith("warning: ")]
+    assert len(errors) == 2
+    assert errors[0].startswith("error: interrupted; ")
+    assert "is kept" in errors[0] or "are kept" in errors[0]
+    assert errors[1] == "  the same command resumes"
     # The shard that was rendered, and no other one of those to make.
     assert rendered == 1
     assert is_finished(small.out / "train-00000.npz", 40, small.hash)
@@ -252,23 +252,14 @@ def test_two_runs_at_once_make_every_shard_once(tmp_path: Path) -> None:
     assert contents(tmp_path / "out") == contents(tmp_path / "whole")
 
 
-def test_any_slices_merged_are_the_whole(tmp_path: Path) -> None:
-    assert generate(command(tmp_path, tmp_path / "whole", train=600)) == 0
-    line = command(tmp_path, tmp_path / "out", train=600)
-    for index in (3, 1, 7, 2, 6, 5, 4):
-        assert generate([*line, "--slice", f"{index}/7", "--overwrite"]) == 0
-    assert generate(["merge", str(tmp_path / "out")]) == 0
-    assert contents(tmp_path / "out") == contents(tmp_path / "whole")
-
-
 # Runs the program on a file system of 60 kB, gives it more room, and runs it again.
 FULL = """
 set -e
 mount -t tmpfs -o size=60k none full
 status=0
-"$@" 2> said || status=$?
+"$@" 2> errors || status=$?
 mount -o remount,size=10m full
-"$@" 2> said-again
+"$@" 2> errors_again
 cp -r full/out out
 echo $status
 """
@@ -276,7 +267,7 @@ echo $status
 
 @pytest.mark.skipif(shutil.which("unshare") is None, reason="no unshare: no file system to fill")
 @pytest.mark.parametrize("suffix", ["npz", "exr"])
-def test_a_full_disk_ends_in_one_message_and_room_mends_it(suffix: str, tmp_path: Path) -> None:
+def test_a_full_disk_ends_in_one_message_and_more_room_repairs_it(suffix: str, tmp_path: Path) -> None:
     spaces = ["unshare", "--user", "--map-root-user", "--mount"]
     (tmp_path / "full").mkdir()
     probe = subprocess.run([*spaces, "mount", "-t", "tmpfs", "none", tmp_path / "full"], capture_output=True)
@@ -290,9 +281,9 @@ def test_a_full_disk_ends_in_one_message_and_room_mends_it(suffix: str, tmp_path
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[-1] == "4"
-    said = [x for x in (tmp_path / "said").read_text().splitlines() if not x.startswith("warning: ")]
-    assert len(said) == 2, said
-    assert "No space left on device" in said[0]
+    errors = [x for x in (tmp_path / "errors").read_text().splitlines() if not x.startswith("warning: ")]
+    assert len(errors) == 2, errors
+    assert "No space left on device" in errors[0]
     assert verify(tmp_path / "out") == []
     assert not list((tmp_path / "out").glob(".*"))
 
@@ -304,7 +295,7 @@ def test_a_full_disk_ends_in_one_message_and_room_mends_it(suffix: str, tmp_path
         pytest.param("--kills 150 --flips 3000 --repairs 60 --rendered 6", marks=pytest.mark.slow),
     ],
 )
-def test_random_kills_lose_nothing_and_random_damage_is_found(amounts: str, run_python: RunPython) -> None:
+def test_random_kills_lose_nothing_and_corruption_is_found(amounts: str, run_python: RunPython) -> None:
     script = ROOT / "benchmarks/crash_safety.py"
     done = run_python(str(script), *amounts.split())
     assert done.returncode == 0, done.stdout + done.stderr

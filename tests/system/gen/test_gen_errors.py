@@ -8,112 +8,91 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pytest
 from PIL import Image
 from support.commands import Done, finished, run_all, start
 from support.datasets import write_dataset
-
-from mbtf_gen.dataset.shard_io import read_shard
+from support.image_files import exr
 
 INPUT, USAGE = 3, 2
 
-# name → (command line, exit code, texts that the message must hold)
-CASES: dict[str, tuple[str, int, list[str]]] = {
-    "missing file": ("nowhere.exr", INPUT, ["nowhere.exr", "no such file"]),
-    "text as EXR": ("text.exr", INPUT, ["text.exr", "EXR"]),
-    "cut EXR": ("cut.exr", INPUT, ["cut.exr", "damaged or cut short"]),
-    "cut PNG": ("cut.png", INPUT, ["cut.png", "PNG"]),
-    "empty PNG": ("empty.png", INPUT, ["empty.png", "is empty"]),
-    "garbage npy": ("garbage.npy", INPUT, ["garbage.npy", "npy"]),
-    "PNG named EXR": ("misnamed.exr", INPUT, ["holds PNG data", "misnamed.png"]),
-    "no image at all": ("notes.txt", INPUT, ["'.txt'", ".exr"]),
-    "NaN": ("nan.npy", INPUT, ["nan.npy", "3 pixels, the first at column 5, row 2"]),
-    "Inf": ("inf.npy", INPUT, ["inf.npy", "1 pixel, at column 0, row 3"]),
-    "NaN in EXR": ("nan.exr", INPUT, ["nan.exr", "2 pixels, the first at column 1, row 0"]),
-    "two aspects": ("aspects", INPUT, ["base_color.npy", "8 x 4", "8 x 8", "aspect"]),
-    "share beyond one": ("beyond", INPUT, ["roughness.npy", "1 pixel, at column 3, row 1", "[0, 1]"]),
-    "empty folder": ("empty", INPUT, ["empty", "no image"]),
-    "two height maps": ("twice", INPUT, ["two maps of height"]),
-    "unknown material key": ("unknown.yaml", INPUT, ["unknown.yaml:2", "'ruoghness'", "'roughness'"]),
-    "no YAML": ("broken.yaml", INPUT, ["broken.yaml:2", "YAML"]),
-    "map of a material missing": ("lost.yaml", INPUT, ["nowhere.png", "no such file"]),
-    "unknown config key": (
-        "heights.npy --config config.yaml",
-        INPUT,
-        ["config.yaml:3", "'queries.mincos'", "'min_cos'"],
-    ),
-    "unknown config key and a flag": (
-        "heights.npy --config config.yaml --seed 1",
-        INPUT,
-        ["config.yaml:3", "'queries.mincos'"],
-    ),
-    "config without a file": ("heights.npy --config no.yaml", INPUT, ["no.yaml", "no such file"]),
-    "other schema": ("verify schema", INPUT, ["schema 99", "schema 2"]),
-    "merge of another schema": ("merge schema", INPUT, ["schema 99"]),
-    "verify an empty folder": ("verify empty", INPUT, ["empty", "manifest.json"]),
-    "merge an empty folder": ("merge empty", INPUT, ["empty", "manifest.json"]),
-    "verify nothing": ("verify nowhere", INPUT, ["nowhere", "no such folder"]),
-    "output that is a file": ("heights.npy -o notes.txt", INPUT, ["notes.txt", "not a folder"]),
-    "pictures among files of others": ("reference heights.npy -o aspects", INPUT, ["aspects", "no pictures"]),
-    "pictures in a file": ("reference heights.npy -o notes.txt", INPUT, ["notes.txt", "not a folder"]),
-    "preview of a missing file": ("preview nowhere.exr", INPUT, ["nowhere.exr", "no such file"]),
-    "preview of no image": ("preview notes.txt", INPUT, ["'.txt'"]),
-    "preview without paths": ("preview heights.npy --spp 0", USAGE, ["--spp", "at least 2"]),
-    "preview among files of others": ("preview heights.npy -o aspects", INPUT, ["aspects", "no pictures"]),
-    "preview of a data set of another schema": ("preview schema", INPUT, ["schema 99"]),
-    "output of others": ("heights.npy -o aspects", INPUT, ["aspects", "holds no data set"]),
-    "output below a file": ("heights.npy -o notes.txt/below", INPUT, ["notes.txt"]),
-    "words as a count": ("heights.npy --queries many", USAGE, ["--queries", "'many'", "400/texel"]),
-    "a negative count": ("heights.npy --queries -5", USAGE, ["--queries", "'-5'"]),
-    "no queries": ("heights.npy --queries 0/texel", USAGE, ["--queries", "positive"]),
-    "a count per pixel": ("heights.npy --queries 4/pixel", USAGE, ["--queries", "'4/pixel'"]),
-    "too many queries": ("heights.npy --queries 1e12/texel", USAGE, ["shards", "output.shard_queries"]),
-    "nonsense as test queries": ("heights.npy --test-queries x", USAGE, ["--test-queries", "'x'"]),
-    "odd paths": ("heights.npy --spp 5", USAGE, ["queries.spp", "even", "5"]),
-    "odd test paths": ("heights.npy --test-spp 7", USAGE, ["queries.test_spp", "even"]),
-    "odd paths of a reference": ("reference heights.npy --spp 3", USAGE, ["--spp", "reference.spp", "even"]),
-    "words as paths": ("heights.npy --spp few", USAGE, ["--spp", "few"]),
-    "level too fine": (
-        "heights.npy --resolution 99",
-        USAGE,
-        ["--resolution: 'queries.resolution': must be a power of two from 1 to 16384 (given '99')"],
-    ),
-    "light too wide": ("heights.npy --light-width 60", USAGE, ["light.width", "45"]),
-    "light too narrow": ("heights.npy --light-width 0.001", USAGE, ["light.width", "delta"]),
-    "horizontal directions": ("heights.npy --min-cos 0", USAGE, ["queries.min_cos"]),
-    "no mixture": (
-        "heights.npy --set queries.mixture.finest=0 --set queries.mixture.log_uniform=0",
-        USAGE,
-        ["mixture", "zero"],
-    ),
-    "unknown key to set": ("heights.npy --set queries.ssp=4", USAGE, ["'queries.ssp'", "'spp'"]),
-    "nothing to set": ("heights.npy --set queries", USAGE, ["--set", "key=value"]),
-    "no such slice": ("heights.npy --slice 4/3", USAGE, ["--slice", "4/3"]),
-    "slice zero": ("heights.npy --slice 0/3", USAGE, ["--slice", "0/3"]),
-    "unknown layout": ("heights.npy --layout rows", USAGE, ["--layout"]),
-    "unknown flag": ("heights.npy --qeries 5", USAGE, ["qeries", "Did you mean --queries", "--help"]),
-    "misspelt command": ("verfy empty", USAGE, ["verfy", "mbtf-gen verify"]),
-    "no material": ("--queries 5", USAGE, ["no material"]),
-    "two materials": ("heights.npy nan.npy", USAGE, ["nan.npy"]),
-    "horizon": ("reference heights.npy --view 5,0", USAGE, ["horizon", "elevation"]),
-    "view from below": (
-        "reference heights.npy --view -10,0",
-        USAGE,
-        ["--view: 'reference.view.elevation': must be above 0 and at most 90 (given -10.0)"],
-    ),
-    "view from below, with a sign of equality": (
-        "reference heights.npy --view=-10,0",
-        USAGE,
-        ["--view", "-10"],
-    ),
-    "flag in place of a view": ("reference heights.npy --view --spp 4", USAGE, ["--view"]),
-    "half a view": ("reference heights.npy --view 60", USAGE, ["--view", "'60'"]),
-    "light in words": ("reference heights.npy --light high", USAGE, ["--light", "'high'"]),
-    "no width": ("reference heights.npy --tiles-across 1,zwei", USAGE, ["--tiles-across", "zwei"]),
-    "no width at all": ("reference heights.npy --tiles-across 0", USAGE, ["--tiles-across", "above 0"]),
-    "one width twice": ("reference heights.npy --tiles-across 1,1.0", USAGE, ["--tiles-across", "twice"]),
-    "picture of nothing": ("reference heights.npy --size 0", USAGE, ["--size"]),
+# Command line → texts that the message must contain.
+INPUT_CASES = {
+    "nowhere.exr": ["nowhere.exr", "no such file"],
+    "text.exr": ["text.exr", "EXR"],
+    "cut.exr": ["cut.exr", "damaged or cut short"],
+    "cut.png": ["cut.png", "PNG"],
+    "empty.png": ["empty.png", "is empty"],
+    "garbage.npy": ["garbage.npy", "npy"],
+    "misnamed.exr": ["holds PNG data", "misnamed.png"],
+    "notes.txt": ["'.txt'", ".exr"],
+    "nan.npy": ["nan.npy", "3 pixels, the first at column 5, row 2"],
+    "inf.npy": ["inf.npy", "1 pixel, at column 0, row 3"],
+    "nan.exr": ["nan.exr", "2 pixels, the first at column 1, row 0"],
+    "aspects": ["base_color.npy", "8 x 4", "8 x 8", "aspect"],
+    "beyond": ["roughness.npy", "1 pixel, at column 3, row 1", "[0, 1]"],
+    "empty": ["empty", "no image"],
+    "twice": ["two maps of height"],
+    "unknown.yaml": ["unknown.yaml:2", "'ruoghness'", "'roughness'"],
+    "broken.yaml": ["broken.yaml:2", "YAML"],
+    "lost.yaml": ["nowhere.png", "no such file"],
+    "heights.npy --config config.yaml": ["config.yaml:3", "'queries.mincos'", "'min_cos'"],
+    "heights.npy --config config.yaml --seed 1": ["config.yaml:3", "'queries.mincos'"],
+    "heights.npy --config no.yaml": ["no.yaml", "no such file"],
+    "verify schema": ["schema 99", "schema 2"],
+    "merge schema": ["schema 99"],
+    "verify empty": ["empty", "manifest.json"],
+    "merge empty": ["empty", "manifest.json"],
+    "verify nowhere": ["nowhere", "no such folder"],
+    "heights.npy -o notes.txt": ["notes.txt", "not a folder"],
+    "reference heights.npy -o aspects": ["aspects", "no pictures"],
+    "reference heights.npy -o notes.txt": ["notes.txt", "not a folder"],
+    "preview nowhere.exr": ["nowhere.exr", "no such file"],
+    "preview notes.txt": ["'.txt'"],
+    "preview heights.npy -o aspects": ["aspects", "no pictures"],
+    "preview schema": ["schema 99"],
+    "heights.npy -o aspects": ["aspects", "holds no data set"],
+    "heights.npy -o notes.txt/below": ["notes.txt"],
 }
+USAGE_CASES = {
+    "preview heights.npy --spp 0": ["--spp", "at least 2"],
+    "heights.npy --queries many": ["--queries", "'many'", "400/texel"],
+    "heights.npy --queries -5": ["--queries", "'-5'"],
+    "heights.npy --queries 0/texel": ["--queries", "positive"],
+    "heights.npy --queries 4/pixel": ["--queries", "'4/pixel'"],
+    "heights.npy --queries 1e12/texel": ["shards", "output.shard_queries"],
+    "heights.npy --test-queries x": ["--test-queries", "'x'"],
+    "heights.npy --spp 5": ["queries.spp", "even", "5"],
+    "heights.npy --test-spp 7": ["queries.test_spp", "even"],
+    "reference heights.npy --spp 3": ["--spp", "reference.spp", "even"],
+    "heights.npy --spp few": ["--spp", "few"],
+    "heights.npy --resolution 99": ["--resolution: 'queries.resolution': must be a power of two"],
+    "heights.npy --light-width 60": ["light.width", "45"],
+    "heights.npy --light-width 0.001": ["light.width", "delta"],
+    "heights.npy --min-cos 0": ["queries.min_cos"],
+    "heights.npy --set queries.mixture.finest=0 --set queries.mixture.log_uniform=0": ["mixture", "zero"],
+    "heights.npy --set queries.ssp=4": ["'queries.ssp'", "'spp'"],
+    "heights.npy --set queries": ["--set", "key=value"],
+    "heights.npy --slice 4/3": ["--slice", "4/3"],
+    "heights.npy --slice 0/3": ["--slice", "0/3"],
+    "heights.npy --layout rows": ["--layout"],
+    "heights.npy --qeries 5": ["qeries", "Did you mean --queries", "--help"],
+    "verfy empty": ["verfy", "mbtf-gen verify"],
+    "--queries 5": ["no material"],
+    "heights.npy nan.npy": ["nan.npy"],
+    "reference heights.npy --view 5,0": ["horizon", "elevation"],
+    "reference heights.npy --view -10,0": ["'reference.view.elevation': must be above 0 and at most 90"],
+    "reference heights.npy --view=-10,0": ["--view", "-10"],
+    "reference heights.npy --view --spp 4": ["--view"],
+    "reference heights.npy --view 60": ["--view", "'60'"],
+    "reference heights.npy --light high": ["--light", "'high'"],
+    "reference heights.npy --tiles-across 1,zwei": ["--tiles-across", "zwei"],
+    "reference heights.npy --tiles-across 0": ["--tiles-across", "above 0"],
+    "reference heights.npy --tiles-across 1,1.0": ["--tiles-across", "twice"],
+    "reference heights.npy --size 0": ["--size"],
+}
+CASES = INPUT_CASES | USAGE_CASES
 
 
 def write_inputs(folder: Path) -> None:
@@ -127,17 +106,12 @@ def write_inputs(folder: Path) -> None:
     Image.fromarray(np.arange(64, dtype=np.uint8).reshape(8, 8)).save(folder / "whole.png")
     (folder / "cut.png").write_bytes((folder / "whole.png").read_bytes()[:50])
     shutil.move(folder / "whole.png", folder / "misnamed.exr")
-    import OpenEXR
-
-    def exr(name: str, pixels: np.ndarray) -> None:
-        header = {"compression": OpenEXR.NO_COMPRESSION, "type": OpenEXR.scanlineimage}
-        OpenEXR.File(header, {"Y": pixels.astype(np.float32)}).write(str(folder / name))
-
-    exr("cut.exr", heights)
+    plain = {"compression": OpenEXR.NO_COMPRESSION}
+    exr(folder / "cut.exr", {"Y": heights.astype(np.float32)}, **plain)
     (folder / "cut.exr").write_bytes((folder / "cut.exr").read_bytes()[:-40])
     spoilt = heights.copy()
     spoilt[0, 1] = spoilt[3, 7] = np.nan
-    exr("nan.exr", spoilt)
+    exr(folder / "nan.exr", {"Y": spoilt.astype(np.float32)}, **plain)
     spoilt = heights.copy()
     spoilt[2, 5] = spoilt[3, 0] = spoilt[3, 7] = np.nan
     np.save(folder / "nan.npy", spoilt)
@@ -172,24 +146,23 @@ def answers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Done]:
     folder = tmp_path_factory.mktemp("errors")
     write_inputs(folder)
     before = listing(folder)
-    done = run_all([line.split() for line, _, _ in CASES.values()], folder)
+    done = run_all([line.split() for line in CASES], folder)
     # Neither a data set nor pictures, nor anything else.
     assert listing(folder) == before
     return dict(zip(CASES, done, strict=True))
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_bad_input_is_explained_in_a_line_or_two(name: str, answers: dict[str, Done]) -> None:
-    _, code, texts = CASES[name]
-    done = answers[name]
-    assert done.code == code, done
+@pytest.mark.parametrize("line", CASES)
+def test_invalid_input_is_explained_in_two_lines(line: str, answers: dict[str, Done]) -> None:
+    done = answers[line]
+    assert done.code == (INPUT if line in INPUT_CASES else USAGE), done
     assert done.out == ""
     assert "Traceback" not in done.err
     lines = done.err.splitlines()
     first = next(i for i, line in enumerate(lines) if line.startswith("error: "))
     assert len(lines) - first <= 2, done.err
     message = "\n".join(lines[first:])
-    for text in texts:
+    for text in CASES[line]:
         assert text in message, message
 
 
@@ -197,68 +170,6 @@ def test_the_program_itself_ends_with_the_code(tmp_path: Path) -> None:
     done = finished(start(["nowhere.exr", "--queries", "5"], tmp_path))
     assert done == Done(INPUT, "", "error: nowhere.exr: no such file or folder\n")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_another_configuration_is_refused_field_by_field(tmp_path: Path) -> None:
-    write_dataset(tmp_path / "set", queries={"train": "40", "test": "8"}, light={"width": 2.0})
-    before = listing(tmp_path)
-    line = "set.npy -o set --queries 40 --test-queries 8 --light-width 3 --min-cos 0.3 --json"
-    (done,) = run_all([line.split()], tmp_path)
-    assert done.code == INPUT
-    assert done.out == ""
-    error = done.err[done.err.index("error: ") :]
-    assert "set: holds a data set of another configuration" in error
-    for part in ("light.width: 2.0 -> 3.0", "queries.min_cos: 0.1 -> 0.3", "--overwrite"):
-        assert part in error
-    assert "seed" not in error
-    assert listing(tmp_path) == before
-
-
-@pytest.mark.parametrize("suffix", ["npz", "exr"])
-def test_verify_names_every_fault(suffix: str, tmp_path: Path) -> None:
-    names = ["intact", "flipped", "cut", "missing", "doubled", "foreign"]
-    write_dataset(
-        tmp_path / "intact",
-        queries={"train": "100", "test": "20"},
-        output={"shard_queries": 40, "format": suffix},
-    )
-    for name in names[1:]:
-        shutil.copytree(tmp_path / "intact", tmp_path / name)
-
-    def shard(name: str, number: int = 1) -> Path:
-        return tmp_path / name / f"train-{number:05d}.{suffix}"
-
-    damaged = bytearray(shard("flipped").read_bytes())
-    damaged[len(damaged) // 2] ^= 1
-    shard("flipped").write_bytes(damaged)
-    shard("cut").write_bytes(shard("cut").read_bytes()[:-1])
-    shard("missing").unlink()
-    for path in (shard("doubled"), shard("doubled").with_suffix(".json")):
-        shutil.copy(path, path.with_name(path.name.replace("00001", "00003")))
-    (tmp_path / "foreign/render.exr").write_bytes(b"of somebody else")
-    done = run_all(
-        [["verify", name] for name in names] + [["verify", name, "--json"] for name in names], tmp_path
-    )
-    expected = {
-        "intact": ("", "intact"),
-        "flipped": (shard("flipped").name, "SHA-256"),
-        "cut": (shard("cut").name, "bytes"),
-        "missing": (shard("missing").name, "1 of 4 shards are missing, first"),
-        "doubled": (shard("doubled", 3).name, "not listed"),
-        "foreign": ("render.exr", "not listed"),
-    }
-    for name, text, data in zip(names, done[: len(names)], done[len(names) :], strict=True):
-        file, says = expected[name]
-        code = 0 if name == "intact" else INPUT
-        assert (text.code, data.code) == (code, code), name
-        assert file in text.out
-        assert says in text.out
-        faults = json.loads(data.out)["faults"]
-        assert [f["file"] for f in faults] == ([file] if file else [])
-        assert len(text.out.splitlines()) == 1
-        if faults:
-            assert text.out.rstrip().endswith(f"; {faults[0]['hint']}")
-    assert set(read_shard(shard("intact"))) >= {"u", "value_a", "value_b"}
 
 
 def test_verify_counts_what_an_interrupted_run_has_not_made(tmp_path: Path) -> None:

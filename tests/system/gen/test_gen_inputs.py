@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 from support.commands import run_all
+from support.height_maps import fractal, normals_of, save_heights, save_normals
 from support.image_files import png, rng
-from support.reliefs import fractal, normals_of, save_heights, save_normals
 
 
 def test_a_set_of_unequal_maps_that_do_not_tile(tmp_path: Path) -> None:

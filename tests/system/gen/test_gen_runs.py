@@ -27,6 +27,7 @@ MAP = (8, 16)
 SMALL = "--queries 16/texel --test-queries 200 --test-spp 8 --set output.shard_queries=64"
 COMMAND = f"maps {SMALL}".split()
 SHARDS = 16 * 8 * 16 // 64 + 4
+PICTURES = "reference maps -o pictures --view 50,20 --light 60,80 --tiles-across 0.5,2 --size 24"
 
 
 def write_material(folder: Path) -> None:
@@ -144,7 +145,6 @@ def batch(work: Path, whole: Path) -> dict[str, Done]:
     image = f"{few} --layout image --set output.shard_queries=256"
     lines = {
         "again": f"{' '.join(COMMAND)} -o again --json",
-        "again in words": f"{' '.join(COMMAND)} -o again",
         "unmerged": "merge unmerged",
         "verify": "verify again --json",
         "changed seed": f"{' '.join(COMMAND)} -o replaced --seed 3",
@@ -157,16 +157,11 @@ def batch(work: Path, whole: Path) -> dict[str, Done]:
         "plain exr": f"maps {few} --format exr -o plain-exr",
         "images": f"maps {image} -o images",
         "image exr": f"maps {image} --format exr -o image-exr",
-        "reference": "reference maps -o pictures --json --view 50,20 --light 60,80 --tiles-across 0.5,2 "
-        "--size 24 --spp 4",
-        "pictures again": "reference maps -o pictures --json --view 50,20 --light 60,80 --tiles-across 0.5,2 "
-        "--size 24 --spp 4",
-        "pictures changed": "reference maps -o pictures --view 50,20 --light 60,80 --tiles-across 0.5,2 "
-        "--size 24",
+        "reference": f"{PICTURES} --json --spp 4",
+        "pictures again": f"{PICTURES} --json --spp 4",
+        "pictures changed": PICTURES,
         "from its own file": "reference maps -o pictures --json --config pictures/config.yaml",
         "one reference": "reference maps/height.npy -o one --tiles-across 1 --size 8 --spp 2 --kind query",
-        "one replaced": "reference maps/height.npy -o one --tiles-across 2 --size 8 --spp 2 --kind pixel "
-        "--overwrite",
     }
     done = run_all([line.split() for line in lines.values()], work)
     return dict(zip(lines, done, strict=True))
@@ -224,22 +219,6 @@ def test_formats_hold_the_same_numbers(batch: dict[str, Done], work: Path) -> No
     assert summary(batch["plain exr"])["mean_value"] == summary(batch["flags first"])["mean_value"]
 
 
-def test_image_layout_holds_buffers_of_one_light_and_view(batch: dict[str, Done], work: Path) -> None:
-    assert summary(batch["images"])["queries"] == (2 + 1) * 8 * 16
-    dataset = Dataset.open(work / "images")
-    assert dataset.layout == "image"
-    data = dataset.load("train")
-    assert data["value_a"].shape == (2, *MAP, 3)
-    for name in ("sigma", "omega_i", "omega_o"):
-        first = data[name][:, :1, :1]
-        assert (data[name] == first).all()
-    assert not np.array_equal(data["omega_i"][0, 0, 0], data["omega_i"][1, 0, 0])
-    # Texel order: row 0 is the side v → 1.
-    rows, columns = MAP
-    assert (np.floor(data["u"][..., 0] * columns) == np.arange(columns)).all()
-    assert (np.floor((1 - data["u"][..., 1]) * rows) == np.arange(rows)[:, None]).all()
-
-
 def test_reference_writes_pictures_for_people_and_programs(batch: dict[str, Done], work: Path) -> None:
     report = summary(batch["reference"])
     stems = {f"{kind}-tiles{tiles_across}" for kind in ("query", "pixel") for tiles_across in ("0.5", "2")}
@@ -280,24 +259,3 @@ def test_pictures_that_are_there_are_kept_and_others_refused(batch: dict[str, Do
     assert refused.code == 3
     assert "pictures: holds pictures of another configuration: reference.spp: 4 -> 256" in refused.err
     assert "size: 24" in (work / "pictures/config.yaml").read_text()
-
-
-def test_overwriting_pictures_leaves_none_of_before(batch: dict[str, Done], work: Path) -> None:
-    assert batch["one replaced"].code == 0, batch["one replaced"].err
-    assert {p.name for p in (work / "one").iterdir()} == {
-        "config.yaml",
-        "pictures.json",
-        "pixel-tiles2.exr",
-        "pixel-tiles2.png",
-    }
-
-
-def test_the_report_counts_training_and_test_queries(batch: dict[str, Done], work: Path) -> None:
-    again = batch["again in words"]
-    assert "2048 training + 200 test queries, finest level 4" in again.err
-    assert again.out.splitlines()[:2] == [
-        "again: 2048 training + 200 test queries, complete",
-        "  this run: nothing left to do",
-    ]
-    # Merging traces nothing by its nature, and says nothing of it.
-    assert "this run" not in batch["unmerged"].out

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from importlib.metadata import entry_points, version
+from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
@@ -31,11 +31,6 @@ def test_the_three_programs_are_installed() -> None:
         "mbtf-fit": "mbtf_fit.__main__:main",
         "mbtf-pipeline": "mbtf_pipeline.__main__:main",
     }
-
-
-def test_pinned_versions_are_installed() -> None:
-    assert version("mitsuba") == "3.9.1"
-    assert version("torch").split("+")[0] == "2.13.0"
 
 
 @pytest.mark.parametrize("content", [b"no library\n", b"\x7fELF" + bytes(4096), None])

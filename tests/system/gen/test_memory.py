@@ -34,8 +34,8 @@ print(json.dumps(seen))
 def test_memory_does_not_grow_with_the_number_of_shards(
     shards: int, tmp_path: Path, run_python: RunPython
 ) -> None:
-    np.save(tmp_path / "relief.npy", 0.1 * np.random.default_rng(0).random((16, 16)))
-    done = run_python("-c", CODE, str(tmp_path / "relief.npy"), str(shards), str(tmp_path / "out"))
+    np.save(tmp_path / "height.npy", 0.1 * np.random.default_rng(0).random((16, 16)))
+    done = run_python("-c", CODE, str(tmp_path / "height.npy"), str(shards), str(tmp_path / "out"))
     assert done.returncode == 0, done.stderr
     resident = np.array(json.loads(done.stdout.splitlines()[-1]), np.float64)
     assert len(resident) >= shards

@@ -41,8 +41,6 @@ def write_inputs(folder: Path) -> None:
     write_dataset(folder / "data", queries={"train": "5000", "test": "8"}, output={"shard_queries": 2000})
     write_dataset(folder / "lonely", queries={"train": "90", "test": "8"})
     (folder / "lonely.npy").unlink()
-    (folder / "others").mkdir()
-    (folder / "others/mesh.png").write_text("of somebody else")
 
 
 @pytest.fixture(scope="module")
@@ -72,10 +70,7 @@ def batch(work: Path) -> dict[str, Done]:
         "again": f"preview maps -o tilted --tiles 1 {FAST} --json",
         "changed": f"preview maps -o tilted --tiles 2 {FAST}",
         "replaced": f"preview flat.npy -o flat --tiles 1 --overwrite {FAST} --json",
-        "others": f"preview maps -o others {FAST} --overwrite",
         "data": "preview data -o data-pictures --size 64 --spp 2 --json",
-        "buffers": "preview flat.npy -o buffers --size 64 --spp 2 --set queries.layout=image "
-        "--set queries.train=200",
         "lonely": "preview lonely -o lonely-pictures --json",
         "settled": "preview data -o nowhere --min-cos 0.2",
         "settled too": "preview data -o nowhere --set queries.min_cos=0.2",
@@ -139,31 +134,14 @@ def test_colors_lie_in_the_quadrants_of_the_map(batch: dict[str, Done], work: Pa
 @pytest.mark.usefixtures("drawing")
 def test_no_picture_is_blank(batch: dict[str, Done], work: Path) -> None:
     for name in ("tilted", "two"):
-        assert {p.name for p in (work / name).iterdir()} == {
-            "config.yaml",
-            "pictures.json",
-            "mesh.png",
-            "beauty.png",
-            "queries.png",
-        }
+        files = "config.yaml pictures.json mesh.png beauty.png queries.png"
+        assert {p.name for p in (work / name).iterdir()} == set(files.split())
         for file in ("mesh", "beauty", "queries"):
             assert np.ptp(pixels(work / name / f"{file}.png")) > 0.5, (name, file)
     # A flat gray tile is a gray quadrangle before the background, and a gray plane.
     mesh, beauty = (pixels(work / "flat" / f"{n}.png") for n in ("mesh", "beauty"))
     assert mesh[36, 48].max() < mesh[0, 0].min() - 0.03
     assert 0.3 < beauty.mean() < 0.99
-
-
-@pytest.mark.usefixtures("drawing")
-def test_each_picture_has_a_line_that_says_what_it_shows(batch: dict[str, Done]) -> None:
-    lines = batch["two"].out.splitlines()
-    assert [line.partition(": ")[0] for line in lines] == [
-        f"two/{n}.png" for n in ("mesh", "beauty", "queries")
-    ]
-    assert "32 x 16 cells per tile) of 2 x 2 tiles" in lines[0]
-    assert "4 paths per pixel" in lines[1]
-    assert "3000 of 3000 training queries to be drawn for maps" in lines[2]
-    assert "256 of 256 training queries to be drawn for flat.npy, in 4 images of one" in batch["buffers"].out
 
 
 @pytest.mark.usefixtures("drawing")
@@ -175,12 +153,6 @@ def test_the_same_command_keeps_and_another_is_refused(batch: dict[str, Done], w
     assert "tiles: 1" in (work / "tilted/config.yaml").read_text()
     assert [p["kept"] for p in report(batch["replaced"])["pictures"]] == [False] * 3
     assert "tiles: 1" in (work / "flat/config.yaml").read_text()
-
-
-def test_files_of_others_stay(batch: dict[str, Done], work: Path) -> None:
-    assert batch["others"].code == 3
-    assert "holds no pictures" in batch["others"].err
-    assert [p.read_text() for p in (work / "others").iterdir()] == ["of somebody else"]
 
 
 @pytest.mark.usefixtures("drawing")
@@ -215,7 +187,7 @@ def test_queries_can_be_seen_without_their_material(batch: dict[str, Done], work
         ("below", "--light: 'preview.light.elevation': must be above 0"),
     ],
 )
-def test_mistakes_are_named_before_anything_is_written(
+def test_invalid_inputs_are_named_before_anything_is_written(
     name: str, says: str, batch: dict[str, Done], work: Path
 ) -> None:
     done = batch[name]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.damage import damaged, examples, loads_or_refuses
+from support.fuzzing import damaged, examples, loads_or_refuses
 
 from mbtf_core.config_file import read_yaml, resolve
 from mbtf_core.errors import InputError

@@ -62,8 +62,8 @@ def job_of(**queries: Any) -> Job:
 
 
 @pytest.mark.parametrize("options", [{}, {"layout": "image"}, {"layout": "image", "patch_size": 12}])
-def test_pilots_ask_in_many_directions_whatever_the_layout(options: dict[str, Any]) -> None:
-    """A buffer of the image layout has one pair of directions and one footprint, however many places."""
+def test_pilots_sample_many_directions_in_every_layout(options: dict[str, Any]) -> None:
+    """An image of the image layout has one pair of directions and one footprint for all its texels."""
     queries = pilot_queries(job_of(**options), 200, 1)
     assert queries.u.shape == (200, 2)
     for array in (queries.sigma[:, None], queries.omega_i, queries.omega_o):
@@ -79,7 +79,7 @@ def faked(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(("each", "share"), [(2e-6, 0.25), (1e-4, 1.0)])
-def test_writing_takes_its_share_of_the_processors(
+def test_writing_takes_a_share_of_the_cores(
     monkeypatch: pytest.MonkeyPatch, each: float, share: float
 ) -> None:
     """Of four processors it takes a quarter of its time, unless it is what everything waits for."""
@@ -127,9 +127,9 @@ def test_a_target_error_decides_paths_and_seconds(faked: None) -> None:
         assert found.paths == pytest.approx(1e6 * (stored + 16) + 2e4 * 64, rel=1e-3)
         assert found.seconds == pytest.approx(found.paths / RATE, rel=1e-3)
         assert found.relative_error == pytest.approx(0.8 / np.sqrt(stored) / 0.25, rel=0.1)
-        said = found.describe(split_target(job.config, "train")).splitlines()
-        assert f"{stored:.0f} paths per training query for an error of 8.00% of" in said[1]
-        assert said[1].endswith("of the queries stop at the cap of 512") == bool(missed)
+        lines = found.describe(split_target(job.config, "train")).splitlines()
+        assert f"{stored:.0f} paths per training query for an error of 8.00% of" in lines[1]
+        assert lines[1].endswith("of the queries stop at the cap of 512") == bool(missed)
 
 
 def test_bytes_are_those_of_the_arrays(tmp_path: Path) -> None:
@@ -139,14 +139,9 @@ def test_bytes_are_those_of_the_arrays(tmp_path: Path) -> None:
     assert row_bytes(True) == row_bytes(False) + 4
 
 
-def test_a_run_without_noise_is_forecast_too(faked: None) -> None:
+def test_a_run_without_noise_has_a_forecast(faked: None) -> None:
     job = job_of(train="1000", test="10")
     quiet = forecast(job, RunPlan(plan_effects(job, pilots=False)), seconds=0.0)
     assert quiet.bytes == 1010 * row_bytes(False)
     assert str(size_text(quiet.bytes)) == "65 kB"
     assert "of the mean value" in quiet.describe()
-
-
-@pytest.mark.parametrize(("size", "text"), [(812e3, "812 kB"), (6.4e7, "64 MB"), (1.68e9, "1.7 GB")])
-def test_sizes_read_well(size: float, text: str) -> None:
-    assert size_text(size) == text

@@ -59,12 +59,17 @@ def cheap_plan(job: Job) -> RunPlan:
     return RunPlan(reference_plan(job))
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def engine(monkeypatch: pytest.MonkeyPatch) -> Formula:
     fake = Formula()
     monkeypatch.setattr(generation, "plan_run", cheap_plan)
     monkeypatch.setattr(render_shards, "build_estimator", lambda job, plan: fake)
     return fake
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    return tmp_path / "out"
 
 
 @pytest.fixture
@@ -80,28 +85,32 @@ def changed(config: GeneratorConfig, **sections: dict[str, Any]) -> GeneratorCon
     return GeneratorConfig.model_validate(data)
 
 
+def listing(folder: Path) -> dict[str, bytes]:
+    return {p.name: p.read_bytes() for p in folder.iterdir()}
+
+
 def contents(folder: Path) -> dict[str, bytes]:
     return {p.name: p.read_bytes() for p in folder.iterdir() if p.suffix == ".npz"}
 
 
-def test_a_run_is_complete_and_counts(config: GeneratorConfig, engine: Formula, tmp_path: Path) -> None:
+def test_a_run_is_complete_and_counts(config: GeneratorConfig, out: Path) -> None:
     seen: list[float] = []
-    summary = generate(config, tmp_path / "out", progress=lambda done, note: seen.append(done))
+    summary = generate(config, out, progress=lambda done, note: seen.append(done))
     # Progress counts paths: a test query takes twice as many as a training query.
     assert seen == [80, 160, 200, 320]
     assert (summary.complete, summary.queries, summary.paths) == (True, 130, 100 * 2 + 30 * 4)
     assert summary.splits == {"train": 100, "test": 30}
     assert (summary.lost, summary.capped, summary.nonfinite) == (4, 8, 4)
     assert summary.relative_error == 0.0
-    data = Dataset.open(tmp_path / "out").load("train")
+    data = Dataset.open(out).load("train")
     np.testing.assert_allclose(summary.mean_value, data["value_a"].astype(np.float64).mean(axis=0), rtol=1e-6)
     assert set(data["spp"]) == {2.0}
-    assert verify(tmp_path / "out") == []
-    assert not list((tmp_path / "out").glob(".*"))
+    assert verify(out) == []
+    assert not list(out.glob(".*"))
 
 
 def test_progress_counts_planned_paths(
-    config: GeneratorConfig, engine: Formula, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    config: GeneratorConfig, monkeypatch: pytest.MonkeyPatch, out: Path
 ) -> None:
     """A target error changes the number of paths, not the share that is done."""
     real = Formula.estimate
@@ -112,63 +121,60 @@ def test_progress_counts_planned_paths(
 
     monkeypatch.setattr(Formula, "estimate", more)
     seen: list[float] = []
-    left = paths_left(Job.prepare(config), tmp_path / "out")
-    summary = generate(config, tmp_path / "out", progress=lambda done, note: seen.append(done))
+    left = paths_left(Job.prepare(config), out)
+    summary = generate(config, out, progress=lambda done, note: seen.append(done))
     assert seen == [80, 160, 200, 320]
     assert seen[-1] == left
     assert summary.paths == 7 * 320
 
 
-def test_too_many_nonfinite_samples_fail_the_run_and_name_their_place(
-    config: GeneratorConfig, engine: Formula, tmp_path: Path
-) -> None:
+def test_too_many_nonfinite_samples_fail_the_run(config: GeneratorConfig, engine: Formula, out: Path) -> None:
     """Two per shard: any run may have four, but not six, and not on a second try either."""
     engine.bad = (BadSample(7, "direct light"), BadSample(9, "interreflection"))
     place = "train-00000.npz query 7, direct light; train-00000.npz query 9, interreflection"
     with pytest.raises(PartialError, match=f"6 of 320 samples were NaN or infinite.*{place}"):
-        generate(config, tmp_path / "out")
-    assert len(contents(tmp_path / "out")) == 3
+        generate(config, out)
+    assert len(contents(out)) == 3
     with pytest.raises(PartialError, match=f"8 of 320 samples.*{place}"):
-        generate(config, tmp_path / "out")
+        generate(config, out)
     with pytest.raises(PartialError, match="8 of 320"):
-        finish(tmp_path / "out")
-    assert not json.loads((tmp_path / "out/manifest.json").read_text())["complete"]
+        finish(out)
+    assert not json.loads((out / "manifest.json").read_text())["complete"]
 
 
-def test_the_same_command_resumes_without_rendering(
-    config: GeneratorConfig, engine: Formula, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_finished_run_renders_nothing(
+    config: GeneratorConfig, monkeypatch: pytest.MonkeyPatch, out: Path
 ) -> None:
-    first = generate(config, tmp_path / "out")
-    before = {p.name: (p.stat().st_mtime_ns, p.read_bytes()) for p in (tmp_path / "out").iterdir()}
+    first = generate(config, out)
+    before = {p.name: (p.stat().st_mtime_ns, p.read_bytes()) for p in out.iterdir()}
 
     def never(*_: Any) -> Any:
         raise AssertionError("the estimator was built although nothing is missing")
 
     monkeypatch.setattr(render_shards, "build_estimator", never)
-    second = generate(config, tmp_path / "out")
+    second = generate(config, out)
     assert (second.paths, second.complete, second.mean_value) == (0, True, first.mean_value)
-    assert before == {p.name: (p.stat().st_mtime_ns, p.read_bytes()) for p in (tmp_path / "out").iterdir()}
+    assert before == {p.name: (p.stat().st_mtime_ns, p.read_bytes()) for p in out.iterdir()}
 
 
 @pytest.mark.parametrize("done", range(4))
 def test_an_interrupted_run_resumes(
-    config: GeneratorConfig, engine: Formula, tmp_path: Path, done: int
+    config: GeneratorConfig, engine: Formula, tmp_path: Path, done: int, out: Path
 ) -> None:
     generate(config, tmp_path / "whole")
     engine.estimated.clear()
     engine.fail_at = done
     with pytest.raises(KeyboardInterrupt):
-        generate(config, tmp_path / "out")
-    assert len(contents(tmp_path / "out")) == done
-    assert json.loads((tmp_path / "out/manifest.json").read_text())["complete"] is False
+        generate(config, out)
+    assert len(contents(out)) == done
+    assert json.loads((out / "manifest.json").read_text())["complete"] is False
     engine.fail_at = None
-    assert generate(config, tmp_path / "out").complete
+    assert generate(config, out).complete
     assert engine.estimated == [("train", 0), ("train", 1), ("train", 2), ("test", 0)]
-    assert contents(tmp_path / "out") == contents(tmp_path / "whole")
+    assert contents(out) == contents(tmp_path / "whole")
 
 
-def test_leftovers_of_a_kill_are_removed(config: GeneratorConfig, engine: Formula, tmp_path: Path) -> None:
-    out = tmp_path / "out"
+def test_temporary_files_of_a_killed_run_are_removed(config: GeneratorConfig, out: Path) -> None:
     # Killed while the manifest was written: the folder holds a temporary file alone.
     out.mkdir()
     (out / ".manifest.json.0123abcd-123.tmp").write_text("{")
@@ -186,25 +192,22 @@ def test_leftovers_of_a_kill_are_removed(config: GeneratorConfig, engine: Formul
     assert [p.name for p in out.glob(".train*")] == []
 
 
-def test_a_truncated_shard_is_rendered_again(
-    config: GeneratorConfig, engine: Formula, tmp_path: Path
-) -> None:
-    generate(config, tmp_path / "out")
-    path = tmp_path / "out" / FILES[2]
+def test_a_truncated_shard_is_rendered_again(config: GeneratorConfig, engine: Formula, out: Path) -> None:
+    generate(config, out)
+    path = out / FILES[2]
     intact = path.read_bytes()
     path.write_bytes(intact[:-7])
     engine.estimated.clear()
-    generate(config, tmp_path / "out")
+    generate(config, out)
     assert engine.estimated == [("train", 2)]
     assert path.read_bytes() == intact
 
 
-def test_another_configuration_is_refused_field_by_field_and_nothing_is_touched(
-    config: GeneratorConfig, engine: Formula, tmp_path: Path
+def test_another_configuration_is_refused_field_by_field(
+    config: GeneratorConfig, tmp_path: Path, out: Path
 ) -> None:
-    out = tmp_path / "out"
     generate(config, out)
-    before = {p.name: p.read_bytes() for p in out.iterdir()}
+    before = listing(out)
     other = changed(config, queries={"spp": 8, "min_cos": 0.2}, light={"width": 3.0})
     with pytest.raises(InputError) as caught:
         generate(other, out)
@@ -214,13 +217,10 @@ def test_another_configuration_is_refused_field_by_field_and_nothing_is_touched(
     np.save(tmp_path / "height.npy", np.zeros((4, 8)))
     with pytest.raises(InputError, match=r"inputs\.height"):
         generate(config, out)
-    assert before == {p.name: p.read_bytes() for p in out.iterdir()}
+    assert before == listing(out)
 
 
-def test_overwrite_replaces_the_data_set_and_nothing_else(
-    config: GeneratorConfig, engine: Formula, tmp_path: Path
-) -> None:
-    out = tmp_path / "out"
+def test_overwrite_replaces_only_the_data_set(config: GeneratorConfig, out: Path) -> None:
     generate(config, out)
     mine = {"notes.txt": "kept", ".hidden": "kept", "train-notes.json": "kept", "render.png": "kept"}
     for name, text in mine.items():
@@ -236,10 +236,9 @@ def test_overwrite_replaces_the_data_set_and_nothing_else(
     assert Dataset.open(out).manifest["complete"]
 
 
-def test_a_kill_while_overwriting_leaves_a_data_set_that_can_be_overwritten(
-    config: GeneratorConfig, engine: Formula, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_an_interrupted_overwrite_can_be_repeated(
+    config: GeneratorConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, out: Path
 ) -> None:
-    out = tmp_path / "out"
     generate(config, out)
     count = len(list(out.iterdir()))
     unlink, removed = Path.unlink, 0
@@ -277,10 +276,9 @@ def test_a_kill_while_overwriting_leaves_a_data_set_that_can_be_overwritten(
     ],
     ids=["notes", "config", "hidden", "foreign manifest", "broken manifest", "orphan"],
 )
-def test_folders_of_others_are_refused_untouched(
-    files: dict[str, str], overwrite: bool, config: GeneratorConfig, engine: Formula, tmp_path: Path
+def test_foreign_folders_are_refused_untouched(
+    files: dict[str, str], overwrite: bool, config: GeneratorConfig, out: Path
 ) -> None:
-    out = tmp_path / "out"
     out.mkdir()
     for name, text in files.items():
         (out / name).write_text(text)
@@ -289,18 +287,10 @@ def test_folders_of_others_are_refused_untouched(
     assert {p.name: p.read_text() for p in out.iterdir()} == files
 
 
-def test_a_file_in_place_of_the_folder_is_refused(
-    config: GeneratorConfig, engine: Formula, tmp_path: Path
-) -> None:
-    for out in (tmp_path / "height.npy", tmp_path / "height.npy" / "below"):
-        with pytest.raises(InputError):
-            generate(config, out)
-
-
 def test_paths_left_are_those_of_unfinished_shards(
-    config: GeneratorConfig, engine: Formula, tmp_path: Path
+    config: GeneratorConfig, engine: Formula, out: Path
 ) -> None:
-    job, out = Job.prepare(config), tmp_path / "out"
+    job = Job.prepare(config)
     # Shards of 40, 40, 20 training queries at 2 paths and 30 test queries at 4.
     assert paths_left(job, out) == 80 + 80 + 40 + 120
     assert [paths_left(job, out, i, 2) for i in (1, 2)] == [80 + 40, 80 + 120]
@@ -320,11 +310,11 @@ def test_paths_left_are_those_of_unfinished_shards(
     assert paths_left(image, out) == 4 * 32 * 2 + 32 * 4
 
 
-def test_the_second_of_two_concurrent_writers_adopts_the_plan_of_the_first(
-    config: GeneratorConfig, engine: Formula, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_the_second_writer_adopts_the_plan_of_the_first(
+    config: GeneratorConfig, monkeypatch: pytest.MonkeyPatch, out: Path
 ) -> None:
     """Another process with another plan writes its manifest while this one plans."""
-    out, job = tmp_path / "out", Job.prepare(config)
+    job = Job.prepare(config)
     other = RunPlan(dataclasses.replace(reference_plan(job), cap_bias_bound=0.125))
 
     def plan(job: Job) -> RunPlan:
@@ -340,9 +330,9 @@ def test_the_second_of_two_concurrent_writers_adopts_the_plan_of_the_first(
 
 
 def test_a_concurrent_writer_of_another_data_set_is_refused(
-    config: GeneratorConfig, engine: Formula, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    config: GeneratorConfig, monkeypatch: pytest.MonkeyPatch, out: Path
 ) -> None:
-    out, another = tmp_path / "out", Job.prepare(changed(config, queries={"spp": 8}))
+    out, another = out, Job.prepare(changed(config, queries={"spp": 8}))
     content = checksummed(build_manifest(another, cheap_plan(another)))
 
     def plan(job: Job) -> RunPlan:
@@ -357,38 +347,32 @@ def test_a_concurrent_writer_of_another_data_set_is_refused(
     assert not contents(out)
 
 
-def test_a_data_set_that_another_process_writes_is_not_replaced(
-    config: GeneratorConfig, engine: Formula, tmp_path: Path
-) -> None:
-    out = tmp_path / "out"
+def test_a_data_set_being_written_is_not_replaced(config: GeneratorConfig, out: Path) -> None:
     generate(config, out)
-    before = {p.name: p.read_bytes() for p in out.iterdir()}
+    before = listing(out)
     with shard_lock(out / FILES[1]) as held:
         assert held
         with pytest.raises(PartialError, match="is being written by another process"):
             generate(changed(config, seed=7), out, overwrite=True)
-    assert {p.name: p.read_bytes() for p in out.iterdir()} == before
+    assert listing(out) == before
     assert generate(changed(config, seed=7), out, overwrite=True).complete
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 5, 7])
-def test_slices_share_the_work_without_gap_or_overlap(
-    count: int, config: GeneratorConfig, engine: Formula, tmp_path: Path
+def test_slices_cover_every_shard_once(
+    count: int, config: GeneratorConfig, engine: Formula, tmp_path: Path, out: Path
 ) -> None:
     generate(config, tmp_path / "whole")
     engine.estimated.clear()
     for index in range(1, count + 1):
-        summary = generate(config, tmp_path / "out", slice_index=index, slice_count=count)
-        assert summary.complete == (len(contents(tmp_path / "out")) == len(FILES))
+        summary = generate(config, out, slice_index=index, slice_count=count)
+        assert summary.complete == (len(contents(out)) == len(FILES))
     assert sorted(engine.estimated) == [("test", 0), ("train", 0), ("train", 1), ("train", 2)]
-    assert contents(tmp_path / "out") == contents(tmp_path / "whole")
-    assert finish(tmp_path / "out").complete
+    assert contents(out) == contents(tmp_path / "whole")
+    assert finish(out).complete
 
 
-def test_a_shard_that_another_process_writes_is_left_to_it(
-    config: GeneratorConfig, engine: Formula, tmp_path: Path
-) -> None:
-    out = tmp_path / "out"
+def test_a_locked_shard_is_left_to_its_writer(config: GeneratorConfig, engine: Formula, out: Path) -> None:
     engine.fail_at = 0
     with pytest.raises(KeyboardInterrupt):
         generate(config, out)
@@ -401,11 +385,11 @@ def test_a_shard_that_another_process_writes_is_left_to_it(
     assert generate(config, out).complete
 
 
-def test_a_shard_finished_just_before_it_is_locked_is_not_rendered_again(
-    config: GeneratorConfig, engine: Formula, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_shard_finished_before_its_lock_is_not_rendered(
+    config: GeneratorConfig, engine: Formula, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, out: Path
 ) -> None:
     """Between the check of a shard and its lock another process may finish it and release the lock."""
-    whole, out = tmp_path / "whole", tmp_path / "out"
+    whole = tmp_path / "whole"
     generate(config, whole)
     engine.estimated.clear()
     take = render_shards.take_lock
@@ -423,9 +407,9 @@ def test_a_shard_finished_just_before_it_is_locked_is_not_rendered_again(
     assert not list(out.glob(".*"))
 
 
-def test_the_sidecar_describes_the_shard(config: GeneratorConfig, engine: Formula, tmp_path: Path) -> None:
-    generate(config, tmp_path / "out")
-    record = json.loads((tmp_path / "out/train-00002.json").read_text())
+def test_the_sidecar_describes_the_shard(config: GeneratorConfig, out: Path) -> None:
+    generate(config, out)
+    record = json.loads((out / "train-00002.json").read_text())
     assert (record["rows"], record["queries"], record["paths"], record["spp"]) == (20, 20, 40, 2)
     assert record["seed"] == {"root": 0, "split": "train", "shard": 2}
     assert record["quarantined"] == {
@@ -434,7 +418,7 @@ def test_the_sidecar_describes_the_shard(config: GeneratorConfig, engine: Formul
         "capped_rays": 2,
         "nonfinite_at": [{"query": 7, "effect": "direct light"}],
     }
-    manifest = json.loads((tmp_path / "out/manifest.json").read_text())
+    manifest = json.loads((out / "manifest.json").read_text())
     assert manifest["summary"]["nonfinite_samples"] == 4
     assert manifest["summary"]["paths"] == 320
     assert manifest["levels"]["mixture"] == {"log_uniform": 0.6, "finest": 0.4}

@@ -48,13 +48,13 @@ def moments(folder: Path) -> dict[str, int]:
 
 
 def replace_by_another(out: Path) -> None:
-    """Shard 1 is a copy of shard 0, and says otherwise."""
+    """Shard 1 is a copy of shard 0 under its own name."""
     for suffix in (".npz", ".json"):
         shutil.copy(out / f"train-00000{suffix}", out / f"train-00001{suffix}")
     edit(out / "train-00001.json", lambda record: record.update(file="train-00001.npz", index=1))
 
 
-DAMAGE: dict[str, tuple[Callable[[Path], object], set[str], set[str]]] = {
+CORRUPTIONS: dict[str, tuple[Callable[[Path], object], set[str], set[str]]] = {
     "nothing": (lambda out: None, set(), set()),
     "byte": (lambda out: flip(out / "train-00002.npz", 2000), {"train-00002.npz"}, set()),
     "cut": (lambda out: os.truncate(out / "test-00000.npz", 900), {"test-00000.npz"}, set()),
@@ -83,10 +83,10 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], set[str], set[str]]] = {
 }
 
 
-@pytest.mark.parametrize("name", DAMAGE)
+@pytest.mark.parametrize("name", CORRUPTIONS)
 def test_faulty_files_are_restored_and_nothing_else(name: str, out: Path) -> None:
-    damage, shards, documents = DAMAGE[name]
-    damage(out)
+    corrupt, shards, documents = CORRUPTIONS[name]
+    corrupt(out)
     before = moments(out)
     planned = Corruption(out)
     assert {e.file for e in planned.entries} == shards
@@ -105,7 +105,7 @@ def test_faulty_files_are_restored_and_nothing_else(name: str, out: Path) -> Non
     assert moments(out) == before
 
 
-def test_files_of_others_are_named_and_left_alone(out: Path) -> None:
+def test_foreign_files_are_named_and_left_alone(out: Path) -> None:
     shutil.copy(out / "train-00000.npz", out / "train-00007.npz")
     flip(out / "train-00000.npz", 700)
     done = repair(out)
@@ -159,9 +159,7 @@ def test_a_manifest_is_not_restored_with_another_plan(out: Path, monkeypatch: py
         repair(out)
 
 
-def test_the_manifest_is_incomplete_while_shards_are_missing(
-    out: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupted_repair_is_incomplete(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     flip(out / "train-00000.npz", 700)
 
     def interrupted(*_: object) -> None:
@@ -176,7 +174,7 @@ def test_the_manifest_is_incomplete_while_shards_are_missing(
     assert contents(out) == contents(out.parent / "whole")
 
 
-def test_a_shard_that_another_process_renders_is_left_to_it(out: Path) -> None:
+def test_a_locked_shard_is_left_to_its_writer(out: Path) -> None:
     flip(out / "train-00000.npz", 700)
     with shard_lock(out / "train-00000.npz") as held:
         assert held
@@ -191,10 +189,10 @@ def test_a_dry_run_changes_nothing(out: Path, capsys: pytest.CaptureFixture[str]
     before = moments(out)
     capsys.readouterr()
     assert generate(["repair", str(out), "--dry-run", "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
-    assert said["dry_run"] is True
-    assert (said["shards"], said["documents"]) == (["train-00000.npz"], ["config.yaml"])
-    assert {f["file"] for f in said["faults"]} == {"train-00000.npz", "config.yaml"}
+    report = json.loads(capsys.readouterr().out)
+    assert report["dry_run"] is True
+    assert (report["shards"], report["documents"]) == (["train-00000.npz"], ["config.yaml"])
+    assert {f["file"] for f in report["faults"]} == {"train-00000.npz", "config.yaml"}
     assert moments(out) == before
     assert generate(["repair", str(out)]) == 0
     text = capsys.readouterr().out
@@ -203,8 +201,8 @@ def test_a_dry_run_changes_nothing(out: Path, capsys: pytest.CaptureFixture[str]
 
 
 def test_folders_without_a_data_set_are_refused(tmp_path: Path) -> None:
-    for folder, says in ((tmp_path / "nowhere", "no such folder"), (tmp_path, r"no manifest\.json")):
-        with pytest.raises(InputError, match=says):
+    for folder, message in ((tmp_path / "nowhere", "no such folder"), (tmp_path, r"no manifest\.json")):
+        with pytest.raises(InputError, match=message):
             repair(folder)
     (tmp_path / "manifest.json").write_text('{"name": "a web page"}')
     with pytest.raises(InputError):

@@ -12,8 +12,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from safetensors.torch import load, save
-from support.damage import altered, damaged, examples, loads_or_refuses
 from support.fit_data import constant, write_data
+from support.fuzzing import altered, damaged, examples, loads_or_refuses
 
 from mbtf_core.digest import file_sha256
 from mbtf_core.errors import InputError

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.damage import check_message
 from support.fit_data import constant, random_queries, write_data
+from support.fuzzing import check_message
 from support.image_data import write_images
 from support.plugin_materials import write_material
 

@@ -9,7 +9,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from PIL import Image
-from support.damage import check_message
+from support.fuzzing import check_message
 from support.plugin_materials import write_material
 from support.scenes import mi
 

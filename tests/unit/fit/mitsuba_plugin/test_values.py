@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from support.damage import check_message
 from support.fit_data import random_queries
+from support.fuzzing import check_message
 from support.plugin_materials import deviation, write_material
 from support.scenes import mi
 

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
-from mbtf_core.shard_schema import ARRAY, ARRAYS
+from mbtf_core.shard_schema import ARRAYS
 from mbtf_gen.dataset.shard_io import check_arrays, read_npz, read_shard, write_shard
 
 SHUFFLED = (2500,)
@@ -34,7 +34,7 @@ def arrays(lead: tuple[int, ...], holes: bool = False) -> dict[str, NDArray[np.f
 @pytest.mark.parametrize("suffix", FORMATS)
 @pytest.mark.parametrize("lead", [SHUFFLED, IMAGE, (1,), (1024,), (1, 1, 1), (2, 5, 3)])
 @pytest.mark.parametrize("holes", [False, True])
-def test_every_number_comes_back(tmp_path: Path, suffix: str, lead: tuple[int, ...], holes: bool) -> None:
+def test_arrays_round_trip(tmp_path: Path, suffix: str, lead: tuple[int, ...], holes: bool) -> None:
     path = tmp_path / f"train-00000.{suffix}"
     written = arrays(lead, holes)
     write_shard(path, written)
@@ -85,13 +85,13 @@ def test_bytes_depend_on_the_arrays_alone(tmp_path: Path) -> None:
 
 
 def test_exr_has_named_float_channels_of_the_right_place(tmp_path: Path) -> None:
-    """Shuffled queries lie row by row, buffers one below the other; any EXR reader finds them by name."""
+    """Shuffled queries lie row by row, images one below the other; any EXR reader finds them by name."""
     import OpenEXR
 
     flat, stacked = tmp_path / "flat.exr", tmp_path / "stacked.exr"
-    queries, buffers = arrays(SHUFFLED), arrays(IMAGE)
+    queries, images = arrays(SHUFFLED), arrays(IMAGE)
     write_shard(flat, queries)
-    write_shard(stacked, buffers)
+    write_shard(stacked, images)
     with OpenEXR.File(str(flat), separate_channels=True) as file:
         assert set(file.channels()) == {c for a in ARRAYS if not a.optional for c in a.channels}
         image = file.channels()["omega_i.z"].pixels
@@ -101,7 +101,7 @@ def test_exr_has_named_float_channels_of_the_right_place(tmp_path: Path) -> None
     with OpenEXR.File(str(stacked), separate_channels=True) as file:
         image = file.channels()["value_a.G"].pixels
         assert image.shape == (3 * 4, 8)
-        assert image[2 * 4 + 1, 5] == buffers["value_a"][2, 1, 5, 1]
+        assert image[2 * 4 + 1, 5] == images["value_a"][2, 1, 5, 1]
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
@@ -126,9 +126,7 @@ def test_arrays_that_do_not_belong_together_are_refused() -> None:
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
-def test_missing_empty_and_foreign_files(
-    tmp_path: Path, suffix: str, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_unreadable_files_are_refused(tmp_path: Path, suffix: str, capfd: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / f"x.{suffix}"
     with pytest.raises(InputError, match="no such shard"):
         read_shard(path)
@@ -136,12 +134,6 @@ def test_missing_empty_and_foreign_files(
         path.write_bytes(content)
         with pytest.raises(InputError, match="cannot be read"):
             read_shard(path)
-    assert capfd.readouterr() == ("", "")
-
-
-@pytest.mark.parametrize("suffix", FORMATS)
-def test_truncated_files(tmp_path: Path, suffix: str, capfd: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / f"x.{suffix}"
     write_shard(path, arrays(SHUFFLED))
     whole = path.read_bytes()
     for share in (0.001, 0.1, 0.5, 0.99):
@@ -149,26 +141,6 @@ def test_truncated_files(tmp_path: Path, suffix: str, capfd: pytest.CaptureFixtu
         with pytest.raises(InputError):
             read_shard(path)
     assert capfd.readouterr() == ("", "")
-
-
-@pytest.mark.parametrize("suffix", FORMATS)
-def test_damage_ends_in_an_input_error_or_in_other_numbers(tmp_path: Path, suffix: str) -> None:
-    """Flipped bytes are found by digests; reading a damaged file must at least never crash."""
-    path = tmp_path / f"x.{suffix}"
-    write_shard(path, arrays((64,)))
-    whole = np.frombuffer(path.read_bytes(), np.uint8)
-    rng = np.random.default_rng(2)
-    refused = 0
-    for _ in range(150):
-        bad = whole.copy()
-        bad[rng.integers(0, len(bad), 8)] = rng.integers(0, 256, 8)
-        bad[rng.integers(0, 600, 2)] = rng.integers(0, 256, 2)
-        path.write_bytes(bad.tobytes())
-        try:
-            read_shard(path)
-        except InputError:
-            refused += 1
-    assert refused > 20
 
 
 def test_compressed_and_double_precision_archives_are_refused(tmp_path: Path) -> None:
@@ -204,10 +176,3 @@ def test_an_exr_image_that_is_no_shard(tmp_path: Path) -> None:
     OpenEXR.File({**header, "mbtf.lead": "16"}, {"sigma": np.zeros((4, 4), np.float32)}).write(str(path))
     with pytest.raises(InputError, match="lacks the array 'u'"):
         read_shard(path)
-
-
-def test_the_vocabulary_is_consistent() -> None:
-    assert len(ARRAY) == len(ARRAYS)
-    for spec in ARRAYS:
-        assert len(spec.channels) == (spec.trailing[0] if spec.trailing else 1)
-        assert all(c == spec.name or c.startswith(f"{spec.name}.") for c in spec.channels)

@@ -12,7 +12,6 @@ import pytest
 from support.datasets import edit, write_dataset
 
 from mbtf_core.digest import file_sha256
-from mbtf_core.errors import InputError
 from mbtf_gen.dataset.shard_io import read_shard, write_shard
 from mbtf_gen.dataset.verify import is_finished, shard_fault, sidecar_of, verify
 
@@ -105,13 +104,22 @@ def test_a_doubled_shard_is_found(copy: Path) -> None:
     }
 
 
-def test_a_shard_listed_twice_is_found(copy: Path) -> None:
-    def double(manifest: dict[str, Any]) -> None:
-        shards = manifest["splits"]["train"]["shards"]
+def test_wrong_records_are_found(copy: Path) -> None:
+    manifest, sidecar = copy / "manifest.json", sidecar_of(shard(copy))
+    intact = manifest.read_text()
+
+    def double(record: dict[str, Any]) -> None:
+        shards = record["splits"]["train"]["shards"]
         shards.append(shards[0])
 
-    edit(copy / "manifest.json", double)
+    edit(manifest, double)
     assert faults(copy) == {shard(copy, 0).name: "is listed twice"}
+    manifest.write_text(intact)
+    edit(manifest, lambda record: record.update(complete=False))
+    assert "not complete" in faults(copy)["manifest.json"]
+    manifest.write_text(intact)
+    edit(sidecar, lambda record: record.update(plan="0" * 64))
+    assert list(faults(copy).values()) == ["was rendered with another plan"]
 
 
 def test_foreign_files_are_found(copy: Path, made: dict[str, Path], tmp_path: Path) -> None:
@@ -152,32 +160,6 @@ def test_a_broken_sidecar_is_a_fault_not_an_abort(copy: Path, text: str) -> None
     sidecar_of(shard(copy)).write_text(text)
     assert list(faults(copy)) == [shard(copy).name]
     assert not is_finished(shard(copy), 40, "any")
-
-
-def test_a_shard_of_another_plan_is_found(copy: Path) -> None:
-    edit(copy / "train-00001.json", lambda record: record.update(plan="0" * 64))
-    found = [(f.file.partition(".")[0], f.what) for f in verify(copy)]
-    assert found == [("train-00001", "was rendered with another plan")]
-
-
-def test_an_unfinished_manifest_is_found(copy: Path) -> None:
-    edit(copy / "manifest.json", lambda manifest: manifest.update(complete=False))
-    assert "not complete" in faults(copy)["manifest.json"]
-
-
-def test_folders_without_a_data_set_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"manifest\.json"):
-        verify(tmp_path)
-    with pytest.raises(InputError, match="no such folder"):
-        verify(tmp_path / "nowhere")
-    for text, says in (
-        ("{", "JSON"),
-        ('{"format": "other"}', "not a manifest"),
-        ('{"format": "mbtf-shards", "schema": 99}', "schema 99"),
-    ):
-        (tmp_path / "manifest.json").write_text(text)
-        with pytest.raises(InputError, match=says):
-            verify(tmp_path)
 
 
 def test_sizes_alone_are_checked_where_digests_are_not_wanted(copy: Path) -> None:

@@ -1,4 +1,4 @@
-"""Closed forms against the reliefs themselves, by marching rays over the cross-section."""
+"""Closed forms against the height fields themselves, by marching rays over the cross-section."""
 
 from __future__ import annotations
 
@@ -14,32 +14,32 @@ from mbtf_gen.diagnostics.closed_forms import Groove, Wall
 PAIRS = [((70, 0), (80, 0)), ((35, 10), (50, 200)), ((20, 180), (60, 30)), ((15, 60), (25, 75))]
 
 
-def profile(relief: Any, x: NDArray[np.float64]) -> NDArray[np.float64]:
+def profile(field: Any, x: NDArray[np.float64]) -> NDArray[np.float64]:
     """Height of the cross-section."""
-    z = relief.grid.z[0]
+    z = field.grid.z[0]
     n = len(z)
     return np.interp(x, (np.arange(-n, 2 * n) + 0.5) / n, np.tile(z, 3), period=None)
 
 
-def seen_point(relief: Any, x: float, view: NDArray[np.float64]) -> float:
-    """Where the line along `view` through x of the reference plane first meets the relief."""
-    d = np.linspace(0.0, relief.grid.displacement_range, 20_001)
+def seen_point(field: Any, x: float, view: NDArray[np.float64]) -> float:
+    """Where the line along `view` through x of the reference plane first meets the height field."""
+    d = np.linspace(0.0, field.grid.displacement_range, 20_001)
     at = x - d * view[0] / view[2]
-    below = -d <= profile(relief, at % 1.0)
+    below = -d <= profile(field, at % 1.0)
     return float(at[np.argmax(below)] % 1.0)
 
 
-def brute(relief: Any, x: float, light: NDArray[np.float64], view: NDArray[np.float64]) -> float:
+def brute(field: Any, x: float, light: NDArray[np.float64], view: NDArray[np.float64]) -> float:
     """B at x of the reference plane."""
-    at = seen_point(relief, x, view)
+    at = seen_point(field, x, view)
     e = 1e-5
-    slope = (profile(relief, np.array([at + e])) - profile(relief, np.array([at - e])))[0] / (2 * e)
-    z = profile(relief, np.array([at]))[0]
+    slope = (profile(field, np.array([at + e])) - profile(field, np.array([at - e])))[0] / (2 * e)
+    z = profile(field, np.array([at]))[0]
     rise = np.linspace(1e-4, -z, 5001) if z < -1e-4 else np.zeros(0)
     along = (at + rise * light[0] / light[2]) % 1.0
-    if np.any(profile(relief, along) > z + rise + 1e-6):
+    if np.any(profile(field, along) > z + rise + 1e-6):
         return 0.0
-    return relief.albedo / np.pi * max(0.0, (light[2] - slope * light[0]) / np.hypot(1, slope)) / light[2]
+    return field.albedo / np.pi * max(0.0, (light[2] - slope * light[0]) / np.hypot(1, slope)) / light[2]
 
 
 @pytest.mark.parametrize(("light", "view"), PAIRS)

@@ -1,4 +1,4 @@
-"""The displaced meshes that fitted materials are compared with have the relief that data are made with."""
+"""The displaced meshes that fitted materials are compared with have the height field of the data set."""
 
 from __future__ import annotations
 

@@ -15,10 +15,10 @@ def grid(rows: int, columns: int, seed: int = 0) -> HeightGrid:
     return HeightGrid.from_map(np.random.default_rng(seed).random((rows, columns)), 0.3)
 
 
-def test_heights_hang_from_the_reference_plane() -> None:
+def test_heights_lie_below_the_reference_plane() -> None:
     stored = np.array([[0.2, 0.5], [0.3, -0.1]])
     np.testing.assert_allclose(HeightGrid.from_map(stored, 2.0).z, 2 * (stored - 0.5))
-    # A negative factor turns the relief upside down; its highest point still touches the plane.
+    # A negative factor turns the height field upside down; its highest point still touches the plane.
     np.testing.assert_allclose(HeightGrid.from_map(stored, -2.0).z, -2 * (stored + 0.1))
     assert HeightGrid.from_map(stored, 0.0).displacement_range == 0.0
     assert HeightGrid.from_map(stored, -2.0).displacement_range == pytest.approx(1.2)

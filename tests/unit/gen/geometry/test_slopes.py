@@ -1,4 +1,4 @@
-"""Slopes of heights and normal maps, and what of a normal map the mesh lacks."""
+"""Slopes of heights and normal maps, and the residual of a normal map that the mesh lacks."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_slopes_of_normals_are_those_they_were_made_of() -> None:
 
 @pytest.mark.parametrize("factor", [0.3, 1.0])
 def test_a_map_that_repeats_the_heights_leaves_what_they_lack(factor: float) -> None:
-    """The map of a relief of which the mesh carries a share: together they are the map's slopes, once."""
+    """The mesh carries a share of the map's slopes; mesh and residual together give all of them, once."""
     z, slopes = waves(128, 128)
     grid = HeightGrid.from_map(z, factor)
     residual, share = residual_slopes(normals(slopes), grid)
@@ -52,7 +52,7 @@ def test_a_map_that_repeats_the_heights_leaves_what_they_lack(factor: float) -> 
     np.testing.assert_allclose(height_slopes(grid) + residual, slopes, atol=0.01)
 
 
-def test_an_exaggerated_relief_stays_as_it_is() -> None:
+def test_exaggerated_heights_leave_no_residual() -> None:
     z, slopes = waves(128, 128)
     residual, share = residual_slopes(normals(slopes), HeightGrid.from_map(z, 5.0))
     assert share == pytest.approx(0.2, rel=0.01)

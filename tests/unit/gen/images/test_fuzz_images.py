@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.damage import check_message, damaged, examples, loads_or_refuses, with_checksums
+from support.fuzzing import check_message, damaged, examples, loads_or_refuses, with_checksums
 from support.image_samples import exrs, jpgs, npys, pngs, tiffs
 
 from mbtf_core.errors import InputError

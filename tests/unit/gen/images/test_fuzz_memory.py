@@ -22,7 +22,7 @@ SIDE = 60_000
 # (threads reserve some without using them; a claim of 60000 x 60000 asks for 3400 at least).
 ALLOWED, ADDRESSES = 100, 1000
 
-# Reads each file; then says what came of it and by how much the peak of memory rose, in MiB. The limit on
+# Reads each file; then message what came of it and by how much the peak of memory rose, in MiB. The limit on
 # addresses makes sure that memory taken and never touched counts as well.
 _CODE = """
 import json, resource, sys
@@ -36,7 +36,7 @@ read_image(sys.argv[3])
 size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
 resource.setrlimit(resource.RLIMIT_AS, (size + allowed * 2**20, resource.RLIM_INFINITY))
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-said = {}
+found = {}
 for path in sorted(Path(sys.argv[1]).iterdir()):
     try:
         if path.name.startswith("shard"):
@@ -44,11 +44,11 @@ for path in sorted(Path(sys.argv[1]).iterdir()):
                 read_shard(path, mapped=mapped)
         else:
             read_image(path)
-        said[path.name] = "was read"
+        found[path.name] = "was read"
     except MbtfError as error:
-        said[path.name] = error.what
+        found[path.name] = error.what
 rise = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) // 1024
-print(json.dumps([rise, said]))
+print(json.dumps([rise, found]))
 """
 
 
@@ -108,7 +108,7 @@ def _window(columns: int, rows: int) -> bytes:
 
 
 def write_claims(folder: Path, beside: Path) -> dict[str, str]:
-    """Files that claim more than they hold; name → what must be said of each."""
+    """Files that claim more than they hold; name → text of the refusal."""
     lines = zlib.compress(bytes(100_000))
     huge = _window(SIDE, SIDE)
     claims: dict[str, tuple[bytes, str]] = {
@@ -147,7 +147,7 @@ def write_claims(folder: Path, beside: Path) -> dict[str, str]:
     }
     for name, (content, _) in claims.items():
         (folder / name).write_bytes(content)
-    return {name: says for name, (_, says) in claims.items()}
+    return {name: message for name, (_, message) in claims.items()}
 
 
 def _bomb() -> bytes:
@@ -183,9 +183,9 @@ def test_claims_take_no_memory(tmp_path: Path) -> None:
     assert child.returncode == 0, child.stderr
     # Nothing but the answer: no remark of a decoder.
     assert child.stderr == ""
-    rise, said = json.loads(child.stdout)
-    for name, says in expected.items():
-        assert says in said[name], (name, said[name])
+    rise, found = json.loads(child.stdout)
+    for name, message in expected.items():
+        assert message in found[name], (name, found[name])
         # Refused by what it claims, not because memory ran out.
-        assert "memory" not in said[name].lower(), (name, said[name])
-    assert rise < ALLOWED, said
+        assert "memory" not in found[name].lower(), (name, found[name])
+    assert rise < ALLOWED, found

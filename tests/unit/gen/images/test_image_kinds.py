@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -51,19 +50,6 @@ class TestTiff:
         for name in ("tiled.tif", "planes.tif"):
             assert np.array_equal(np.rint(read_image(tmp_path / name).pixels.astype(float) * 65535), codes)
 
-    def test_palette_and_single_bits(self, tmp_path: Path) -> None:
-        from PIL import Image as Pillow
-
-        codes = rng().integers(0, 4, (5, 6)).astype(np.uint8)
-        palette = np.array([[0, 0, 0], [255, 10, 20], [30, 40, 50], [255, 255, 255]], np.uint8)
-        picture = Pillow.fromarray(codes)
-        picture.putpalette(palette.tobytes())
-        picture.save(tmp_path / "p.tif")
-        assert np.array_equal(np.rint(read_image(tmp_path / "p.tif").pixels * 255), palette[codes])
-        holes = rng().random((5, 9)) < 0.5
-        Pillow.fromarray(holes).save(tmp_path / "b.tif")
-        assert np.array_equal(read_image(tmp_path / "b.tif").pixels[..., 0], holes.astype(float))
-
     def test_what_cannot_be_kept_is_refused(self, tmp_path: Path) -> None:
         tifffile.imwrite(tmp_path / "x.tif", np.zeros((4, 4), np.uint32))
         with pytest.raises(InputError, match="uint32 numbers"):
@@ -84,24 +70,6 @@ class TestTiff:
                 path.write_bytes(data[: int(share * len(data))])
                 with pytest.raises(InputError):
                     read_image(path)
-
-    def test_a_large_claim_allocates_nothing(self, tmp_path: Path) -> None:
-        path = tmp_path / "x.tif"
-        tifffile.imwrite(path, np.zeros((4, 4, 3), np.uint16), photometric="rgb")
-        data = bytearray(path.read_bytes())
-        for tag in (256, 257):
-            at = data.index(tag.to_bytes(2, "little") + b"\x04\x00\x01\x00\x00\x00")
-            data[at : at + 12] = (
-                tag.to_bytes(2, "little") + b"\x04\x00\x01\x00\x00\x00" + (60000).to_bytes(4, "little")
-            )
-        path.write_bytes(data)
-        with pytest.raises(InputError, match="60000 x 60000"):
-            read_image(path)
-        tracemalloc.start()
-        with pytest.raises(InputError):
-            read_image(path)
-        assert tracemalloc.get_traced_memory()[1] < 4_000_000
-        tracemalloc.stop()
 
 
 class TestLayers:
@@ -199,7 +167,7 @@ class TestClaims:
         picture.save(tmp_path / "b.png", icc_profile=b"broken")
         assert read_image(tmp_path / "b.png").tags.foreign == "color profile 'unreadable'"
 
-    def test_orientation_is_told_and_not_applied(self, tmp_path: Path) -> None:
+    def test_orientation_is_reported_but_not_applied(self, tmp_path: Path) -> None:
         from PIL import Image as Pillow
 
         codes = np.zeros((8, 16), np.uint8)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import struct
-import zlib
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +10,7 @@ from support.image_files import exr, png, rng
 
 from mbtf_core.color import linear_to_srgb, srgb_to_linear
 from mbtf_core.errors import InputError
-from mbtf_gen.images.read import MAX_PIXELS, Image, gray, read_image
+from mbtf_gen.images.read import Image, gray, read_image
 
 
 @pytest.mark.parametrize(("color", "channels"), [(0, 1), (4, 2), (2, 3), (6, 4)])
@@ -33,43 +30,30 @@ def test_png_keeps_every_code(tmp_path: Path, color: int, channels: int, bits: i
         assert np.array_equal(image.pixels, codes / largest)
 
 
-def test_palette_png(tmp_path: Path) -> None:
+@pytest.mark.parametrize("suffix", ["png", "tif"])
+def test_palettes_and_single_bits(suffix: str, tmp_path: Path) -> None:
     from PIL import Image as Pillow
 
     codes = rng().integers(0, 4, (5, 6)).astype(np.uint8)
     palette = np.array([[0, 0, 0], [255, 10, 20], [30, 40, 50], [255, 255, 255]], np.uint8)
     picture = Pillow.fromarray(codes)
     picture.putpalette(palette.tobytes())
-    picture.save(tmp_path / "x.png")
-    image = read_image(tmp_path / "x.png")
+    picture.save(tmp_path / f"x.{suffix}")
+    image = read_image(tmp_path / f"x.{suffix}")
     assert image.bits == 8
     assert np.array_equal(np.rint(image.pixels * 255), palette[codes])
     picture.save(tmp_path / "y.png", transparency=2)
     assert np.array_equal(read_image(tmp_path / "y.png").pixels[..., 3] == 0.0, codes == 2)
+    mask = rng().random((5, 9)) < 0.5
+    Pillow.fromarray(mask).save(tmp_path / f"b.{suffix}")
+    assert np.array_equal(read_image(tmp_path / f"b.{suffix}").pixels[..., 0], mask.astype(float))
 
 
-def test_one_bit_png(tmp_path: Path) -> None:
+def test_jpg(tmp_path: Path) -> None:
     from PIL import Image as Pillow
 
-    holes = rng().random((5, 9)) < 0.5
-    Pillow.fromarray(holes).save(tmp_path / "x.png")
-    assert np.array_equal(read_image(tmp_path / "x.png").pixels[..., 0], holes.astype(float))
-
-
-def test_jpg_and_tiff(tmp_path: Path) -> None:
-    from PIL import Image as Pillow
-
-    codes = np.full((16, 24), 77, np.uint8)
-    Pillow.fromarray(codes).save(tmp_path / "x.JPG", "JPEG", quality=95)
+    Pillow.fromarray(np.full((16, 24), 77, np.uint8)).save(tmp_path / "x.JPG", "JPEG", quality=95)
     assert read_image(tmp_path / "x.JPG").pixels[..., 0] == pytest.approx(77 / 255, abs=1.5 / 255)
-    deep = rng().integers(0, 65536, (5, 6)).astype(np.uint16)
-    Pillow.fromarray(deep).save(tmp_path / "x.tif")
-    assert np.array_equal(read_image(tmp_path / "x.tif").pixels[..., 0], deep / 65535)
-    numbers = rng().normal(size=(5, 6)).astype(np.float32)
-    Pillow.fromarray(numbers).save(tmp_path / "f.tiff")
-    image = read_image(tmp_path / "f.tiff")
-    assert image.bits is None
-    assert np.array_equal(image.pixels[..., 0], numbers)
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32])
@@ -160,94 +144,6 @@ def test_truncated_files_are_refused(tmp_path: Path, share: float, capfd: pytest
     assert capfd.readouterr() == ("", "")
 
 
-def test_damaged_files_never_end_in_anything_but_an_input_error(tmp_path: Path) -> None:
-    rng = np.random.default_rng(3)
-    messages = []
-    for path in good_files(tmp_path):
-        data = np.frombuffer(path.read_bytes(), np.uint8)
-        for _ in range(25):
-            bad = data.copy()
-            at = rng.integers(0, len(bad) if rng.random() < 0.5 else min(400, len(bad)), 3)
-            bad[at] = rng.integers(0, 256, 3)
-            path.write_bytes(bad.tobytes())
-            try:
-                image = read_image(path)
-            except InputError as error:
-                messages.append(error.what)
-            else:
-                assert np.isfinite(image.pixels).all()
-    assert messages
-    assert not any("\n" in message for message in messages)
-
-
-def big_png(path: Path) -> None:
-    png(path, np.zeros((1, 1, 1), int), 0, 8)
-    data = bytearray(path.read_bytes())
-    data[16:24] = struct.pack(">II", 60000, 60000)
-    data[29:33] = struct.pack(">I", zlib.crc32(bytes(data[12:29])))
-    path.write_bytes(data)
-
-
-def big_deep_png(path: Path) -> None:
-    png(path, np.zeros((1, 1, 3), int), 2, 16)
-    data = bytearray(path.read_bytes())
-    data[16:24] = struct.pack(">II", 60000, 60000)
-    data[29:33] = struct.pack(">I", zlib.crc32(bytes(data[12:29])))
-    path.write_bytes(data)
-
-
-def big_exr(path: Path) -> None:
-    exr(path, {"Y": np.zeros((4, 4), np.float32)})
-    data = bytearray(path.read_bytes())
-    for window in (b"dataWindow\0box2i\0", b"displayWindow\0box2i\0"):
-        at = data.index(window) + len(window) + 4
-        data[at : at + 16] = struct.pack("<4i", 0, 0, 59999, 59999)
-    path.write_bytes(data)
-
-
-def big_npy(path: Path) -> None:
-    header = b"{'descr': '<f4', 'fortran_order': False, 'shape': (60000, 60000), }".ljust(117) + b"\n"
-    path.write_bytes(b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + bytes(64))
-
-
-def big_tiff(path: Path) -> None:
-    from PIL import Image as Pillow
-
-    Pillow.fromarray(np.zeros((4, 4), np.uint8)).save(path)
-    data = path.read_bytes()
-    for tag in (256, 257):
-        entry = data.index(struct.pack("<HH", tag, 4))
-        data = data[: entry + 8] + struct.pack("<I", 60000) + data[entry + 12 :]
-    path.write_bytes(data)
-
-
-@pytest.mark.parametrize(
-    ("name", "make"),
-    [
-        ("x.png", big_png),
-        ("y.png", big_deep_png),
-        ("x.exr", big_exr),
-        ("x.npy", big_npy),
-        ("x.tif", big_tiff),
-    ],
-)
-def test_a_header_that_claims_too_much_allocates_nothing(
-    tmp_path: Path, name: str, make: Callable[[Path], None]
-) -> None:
-    import tracemalloc
-
-    path = tmp_path / name
-    make(path)
-    with pytest.raises(InputError, match=r"60000|134,217,728|npy array"):
-        read_image(path)  # first use imports the decoder
-    tracemalloc.start()
-    with pytest.raises(InputError):
-        read_image(path)
-    assert tracemalloc.get_traced_memory()[1] < 4_000_000
-    tracemalloc.stop()
-    assert MAX_PIXELS < 60000**2
-
-
 def test_files_that_are_no_images(tmp_path: Path) -> None:
     cases = {
         "missing.png": (None, "no such file"),
@@ -292,8 +188,7 @@ class TestGray:
         numbers, warnings = gray(image)
         assert np.array_equal(numbers, codes[..., 0] / 255)
         assert warnings == []
-
-    def test_rounding_of_jpg_is_no_color(self) -> None:
+        # Rounding of JPG is no color.
         pixels = np.full((4, 5, 3), 100 / 255, np.float32)
         pixels[0, 0, 1] = 102 / 255
         assert gray(Image(pixels, 8, Path("x.jpg")))[1] == []

@@ -84,16 +84,12 @@ def test_materials_load_without_a_warning(name: str) -> None:
     assert 0.5 < material.specular < 0.6 if MATERIALS[name] else material.specular == 0.5
 
 
-def test_materials_are_told_apart_by_their_colors() -> None:
+def test_materials_differ_in_color() -> None:
     """Mean linear colors differ by more than a tenth of the brighter one in some channel."""
     means = [srgb_to_linear(pixels(ASSETS / m / "base_color.png") / 255).mean((0, 1)) for m in MATERIALS]
     for i, one in enumerate(means):
         for other in means[:i]:
             assert np.abs(one - other).max() > 0.1 * max(one.max(), other.max())
-
-
-def test_the_folder_is_small() -> None:
-    assert sum(p.stat().st_size for name in MATERIALS for p in (ASSETS / name).iterdir()) < 4_000_000
 
 
 @pytest.mark.parametrize("axis", [0, 1])

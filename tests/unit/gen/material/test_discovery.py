@@ -42,23 +42,15 @@ class TestSharedWords:
         assert "name it in a material.yaml" in caught.value.hint
 
     @pytest.mark.parametrize(
-        ("names", "expected"),
+        "expected",
         [
-            (["rock_height.png"], {"height": "rock_height.png"}),
-            (
-                ["rock_height.png", "rock_height_mask.png"],
-                {"height": "rock_height.png", "opacity": "rock_height_mask.png"},
-            ),
-            (
-                ["metal_disp.png", "metal_rough.png", "metal_metal.png"],
-                {"height": "metal_disp.png", "roughness": "metal_rough.png", "metallic": "metal_metal.png"},
-            ),
+            {"height": "rock_height.png"},
+            {"height": "rock_height.png", "opacity": "rock_height_mask.png"},
+            {"height": "metal_disp.png", "roughness": "metal_rough.png", "metallic": "metal_metal.png"},
         ],
     )
-    def test_words_count_where_they_must(
-        self, names: list[str], expected: dict[str, str], tmp_path: Path
-    ) -> None:
-        assert found(tmp_path, *names) == expected
+    def test_words_decide_roles(self, expected: dict[str, str], tmp_path: Path) -> None:
+        assert found(tmp_path, *expected.values()) == expected
 
 
 class TestPacked:
@@ -71,7 +63,7 @@ class TestPacked:
         ("name", "roughness", "metallic"),
         [("x_orm", "G", "B"), ("x_ARM", "G", "B"), ("x_rma", "R", "G"), ("x_metallicRoughness", "G", "B")],
     )
-    def test_it_is_warned_of_where_its_maps_are_missing(
+    def test_a_packed_map_warns_where_maps_are_missing(
         self, name: str, roughness: str, metallic: str, tmp_path: Path
     ) -> None:
         maps = find_maps(fill(tmp_path, "x_height.png", f"{name}.png"))
@@ -98,7 +90,7 @@ class TestPacked:
         assert list(material.unused) == ["orm.npy"]
 
 
-class TestElsewhere:
+class TestOtherPlaces:
     def test_an_archive_is_to_be_unpacked(self, tmp_path: Path) -> None:
         with pytest.raises(InputError, match="holds no image") as caught:
             find_maps(fill(tmp_path, "Rock.zip", "LICENSE.txt"))

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from support.paths import SHARED
 
 from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError
@@ -18,11 +17,8 @@ from mbtf_gen.material.material import load_material
 
 
 def rng() -> np.random.Generator:
-    """The same numbers wherever they are drawn."""
+    """A generator that gives the same numbers in every test."""
     return np.random.default_rng(3)
-
-
-MATERIALS = SHARED / "data/materials"
 
 
 def png(path: Path, codes: NDArray[Any]) -> Path:
@@ -58,42 +54,29 @@ def folder(tmp_path: Path) -> Path:
     return out
 
 
+# Role → names of files that have it.
+ROLES: dict[str | None, str] = {
+    "height": "height.png Bricks102_1K-JPG_Displacement.jpg metal_plate_disp_1k.png BUMP.tif",
+    "base_color": "Fabric_Knitted_006_basecolor.jpg base_color.png woodBaseColor.png albedo.jpg "
+    "Bricks102_1K-JPG_Color.jpg bark_col_2k.jpg arm_chair_diff.png",
+    "roughness": "metal_plate_rough_1k.png",
+    "metallic": "metal_plate_metal_1k.png Metalness.png",
+    "normal": "metal_plate_nor_gl_1k.png NormalDX.png rock_normaldx.png",
+    "opacity": "color_mask.png Fabric_Knitted_006_opacity.jpg",
+    None: "rock_ao.png ambientOcclusion.png rock_arm_1k.png Rock023.png colorful.png",
+}
+
+
 class TestNames:
     def test_tokens(self) -> None:
         assert tokens("Bricks102_1K-JPG_NormalGL.jpg") == ["bricks", "102", "1", "k", "jpg", "normal", "gl"]
         assert tokens("Fabric_Knitted_006_ambientOcclusion.png")[-2:] == ["ambient", "occlusion"]
 
-    @pytest.mark.parametrize(
-        ("name", "role"),
-        [
-            ("height.png", "height"),
-            ("Bricks102_1K-JPG_Displacement.jpg", "height"),
-            ("metal_plate_disp_1k.png", "height"),
-            ("BUMP.tif", "height"),
-            ("Fabric_Knitted_006_basecolor.jpg", "base_color"),
-            ("base_color.png", "base_color"),
-            ("woodBaseColor.png", "base_color"),
-            ("Bricks102_1K-JPG_Color.jpg", "base_color"),
-            ("albedo.jpg", "base_color"),
-            ("bark_col_2k.jpg", "base_color"),
-            ("arm_chair_diff.png", "base_color"),
-            ("metal_plate_rough_1k.png", "roughness"),
-            ("metal_plate_metal_1k.png", "metallic"),
-            ("Metalness.png", "metallic"),
-            ("metal_plate_nor_gl_1k.png", "normal"),
-            ("NormalDX.png", "normal"),
-            ("rock_normaldx.png", "normal"),
-            ("color_mask.png", "opacity"),
-            ("Fabric_Knitted_006_opacity.jpg", "opacity"),
-            ("rock_ao.png", None),
-            ("ambientOcclusion.png", None),
-            ("rock_arm_1k.png", None),
-            ("Rock023.png", None),
-            ("colorful.png", None),
-        ],
-    )
-    def test_roles(self, name: str, role: str | None) -> None:
-        assert role_of(name) == role
+    @pytest.mark.parametrize("role", ROLES)
+    def test_roles(self, role: str | None) -> None:
+        assert {name: role_of(name) for name in ROLES[role].split()} == dict.fromkeys(
+            ROLES[role].split(), role
+        )
 
     def test_normal_conventions(self) -> None:
         assert normal_convention("metal_plate_nor_gl_1k.png") == "gl"
@@ -127,18 +110,13 @@ class TestBareFile:
         assert not np.array_equal(material.height, ramp / 255)
         assert "8 bits, 11 levels" in material.warnings[0]
 
-    def test_it_stands_alone_but_says_what_lies_beside_it(self, folder: Path) -> None:
+    def test_other_maps_of_the_folder_are_noted(self, folder: Path) -> None:
         material = load_material(folder / "rock_height.npy")
         assert material.is_lambert
         assert set(material.files) == {"height"}
         hint = material.notes[0]
         assert "Rock_BaseColor.png" in hint
         assert str(folder) in hint
-
-    def test_no_hint_without_company(self, tmp_path: Path) -> None:
-        npy(tmp_path / "other_height.npy", np.zeros((2, 2)))
-        material = load_material(npy(tmp_path / "h.npy", np.zeros((2, 2))))
-        assert not any("give the folder" in note for note in material.notes)
 
     @pytest.mark.parametrize("shape", [(1, 1), (1, 7), (5, 1), (3, 10)])
     def test_any_shape_and_constant_heights(self, tmp_path: Path, shape: tuple[int, int]) -> None:
@@ -147,7 +125,7 @@ class TestBareFile:
         assert material.grid().displacement_range == 0.0
         assert material.aspect == shape[0] / shape[1]
 
-    def test_a_great_relief_at_the_default_factor_is_questioned(self, tmp_path: Path) -> None:
+    def test_a_large_displacement_at_the_default_scale_warns(self, tmp_path: Path) -> None:
         material = load_material(npy(tmp_path / "h.npy", np.array([[0.0, 0.6]])))
         (warning,) = material.warnings_at()
         assert "the displacement range is 0.6 tile widths; is another --height-scale meant?" in warning
@@ -156,12 +134,6 @@ class TestBareFile:
         yaml = tmp_path / "m.yaml"
         yaml.write_text("height: {file: h.npy, scale: 2}\n")
         assert load_material(yaml).warnings_at() == ()
-
-    def test_constant_heights_are_told(self, tmp_path: Path) -> None:
-        material = load_material(npy(tmp_path / "h.npy", np.full((4, 4), 0.25)))
-        for height in (None, 0.1):
-            assert any("heights are constant: the tile is flat" in w for w in material.warnings_at(height))
-        assert str(material.grid().displacement_range) == "0.0"
 
 
 class TestGrid:
@@ -203,9 +175,7 @@ class TestFolder:
         (folder / "Rock_BaseColor.png").unlink()
         linear = npy(folder / "color.npy", rng().random((4, 8, 3)))
         assert load_material(folder).base_color == pytest.approx(np.load(linear), abs=1e-7)
-
-    def test_gray_base_color(self, folder: Path) -> None:
-        (folder / "Rock_BaseColor.png").unlink()
+        linear.unlink()
         png(folder / "albedo.png", np.full((8, 16), 255, np.uint8))
         assert np.array_equal(load_material(folder).base_color, np.ones((8, 16, 3)))
 
@@ -220,9 +190,7 @@ class TestFolder:
         dx = load_material(folder).normal
         assert dx is not None
         assert dx * [1, -1, 1] == pytest.approx(gl)
-
-    def test_both_conventions_side_by_side(self, folder: Path) -> None:
-        png(folder / "rockNormalDX.png", codes(8, 16, 3))
+        png(folder / "rockNormalGL.png", codes(8, 16, 3))
         assert load_material(folder).files["normal"].name == "rockNormalGL.png"
 
     def test_single_pixels_are_constants_of_any_aspect(self, folder: Path) -> None:
@@ -265,9 +233,7 @@ class TestFolder:
         rough = np.full((4, 8), 0.5)
         rough[1, 6], rough[3, 2] = -0.1, 1.5
         npy(folder / "rough.npy", rough)
-        with pytest.raises(
-            InputError, match=r"rough\.npy: 2 pixels, the first at column 6, row 1, are outside"
-        ):
+        with pytest.raises(InputError, match=r"rough\.npy: 2 pixels, the first at column 6, row 1, are"):
             load_material(folder)
         (folder / "rough.npy").unlink()
         (folder / "Rock_BaseColor.png").unlink()
@@ -338,10 +304,7 @@ class TestYaml:
                 r"material\.yaml:3: unknown key 'height\.scal'.*\n.*'scale'",
             ),
             ("roughness: 0.5\n", "key 'height' is missing"),
-            (
-                "height: rock_height.npy\nroughness: 1.5\n",
-                r"material\.yaml:2: .*roughness.*at most 1",
-            ),
+            ("height: rock_height.npy\nroughness: 1.5\n", r"material\.yaml:2: .*roughness.*at most 1"),
             ("height: rock_height.npy\nbase_color: [0.1, 0.2]\n", r"material\.yaml:2: .*base_color"),
             ("height: rock_height.npy\nbase_color: [0.1, 0.2, 1.2]\n", r"at most 1"),
             ("height: rock_height.npy\nmetallic: {}\n", "either 'file' or 'value'"),
@@ -354,7 +317,7 @@ class TestYaml:
             ("", "key 'height' is missing"),
         ],
     )
-    def test_mistakes_are_named(self, folder: Path, text: str, message: str) -> None:
+    def test_invalid_inputs_are_named(self, folder: Path, text: str, message: str) -> None:
         with pytest.raises(InputError, match=message):
             load_material(self.write(folder, text))
 
@@ -379,9 +342,8 @@ class TestDigests:
             return load_material(path).digests
 
         base = digests("height: rock_height.npy\nroughness: 0.5\n")
-        assert (
-            digests("# remark\nroughness: {value: 0.5}\nheight: {file: rock_height.npy, scale: 1}\n") == base
-        )
+        same = "# remark\nroughness: {value: 0.5}\nheight: {file: rock_height.npy, scale: 1}\n"
+        assert digests(same) == base
         for text in (
             "height: rock_height.npy\nroughness: 0.6\n",
             "height: rock_height.npy\nmetallic: 0.5\n",
@@ -407,31 +369,3 @@ def test_paths_that_are_no_material(tmp_path: Path) -> None:
     (tmp_path / "x.txt").write_text("hello")
     with pytest.raises(InputError, match=r"'\.txt' is no height map"):
         load_material(tmp_path / "x.txt")
-
-
-@pytest.mark.parametrize(
-    ("name", "bits", "shape", "roles"),
-    [
-        ("rock_cliff", 8, (1024, 1024), {"base_color", "roughness", "normal"}),
-        ("metal_plate", 16, (1024, 1024), {"roughness", "metallic", "normal"}),
-        ("stone_bricks", 8, (512, 1024), {"base_color", "roughness", "normal"}),
-        ("knit_fabric", 8, (1024, 1024), {"base_color", "roughness", "normal", "opacity"}),
-        ("leather_fine", 8, (1024, 1024), {"base_color", "roughness", "normal"}),
-        ("tree_bark", 8, (1024, 1024), {"base_color", "roughness", "normal"}),
-    ],
-)
-def test_real_materials(name: str, bits: int, shape: tuple[int, int], roles: set[str]) -> None:
-    if not (MATERIALS / name).is_dir():
-        pytest.skip(f"{name} is not beside the project")
-    material = load_material(MATERIALS / name)
-    assert material.height.shape == shape
-    assert material.height_bits == bits
-    assert set(material.files) == roles | {"height"}
-    assert material.grid().aspect == shape[0] / shape[1]
-    # Normals and heights must agree on orientation: slopes of one correlate with the other's.
-    assert material.normal is not None
-    slope_u = np.roll(material.height, -1, 1) - np.roll(material.height, 1, 1)
-    slope_v = np.roll(material.height, 1, 0) - np.roll(material.height, -1, 0)
-    for slope, component in ((slope_u, 0), (slope_v, 1)):
-        tilt = -material.normal[..., component] / np.maximum(material.normal[..., 2], 0.1)
-        assert np.corrcoef(slope.ravel(), tilt.ravel())[0, 1] > 0.7

@@ -27,16 +27,13 @@ def heights(tmp_path: Path) -> Path:
 
 class TestHeights:
     def test_color_is_refused_with_the_way_out(self, tmp_path: Path) -> None:
-        path = png(tmp_path / "height.png", rng().integers(0, 256, (8, 8, 3)), 2, 8)
+        codes = rng().integers(0, 256, (8, 8, 3))
+        path = png(tmp_path / "height.png", codes, 2, 8)
         with pytest.raises(InputError, match=r"height\.png: is colored; a height map is gray") as caught:
             load_material(path)
         assert "channel: R" in caught.value.hint
-        codes = rng().integers(0, 256, (8, 8, 3))
-        material = load_material(
-            write(
-                png(path, codes, 2, 8).parent, "height: {file: height.png, channel: G, dequantize: false}\n"
-            )
-        )
+        text = "height: {file: height.png, channel: G, dequantize: false}\n"
+        material = load_material(write(tmp_path, text))
         assert np.array_equal(np.rint(material.height * 255), codes[..., 1])
 
     def test_a_normal_map_is_recognized(self, tmp_path: Path) -> None:
@@ -90,7 +87,7 @@ class TestLayers:
         assert "'extra'" in caught.value.hint
 
 
-class TestShares:
+class TestScalars:
     def test_packed_channels(self, heights: Path) -> None:
         codes = rng().integers(0, 256, (8, 16, 3))
         png(heights / "rock_arm.png", codes, 2, 8)
@@ -132,7 +129,7 @@ class TestColor:
         png(folder / "c.png", self.codes, 2, 8, extra=chunks)
         return load_material(write(folder, f"height: height.npy\nbase_color: {{file: c.png{option}}}\n"))
 
-    def test_integers_are_srgb_unless_said_otherwise(self, heights: Path) -> None:
+    def test_integers_are_srgb_by_default(self, heights: Path) -> None:
         linear_chunk = (b"gAMA", (100000).to_bytes(4, "big"))
         cases = {
             ("", ()): True,
@@ -149,7 +146,7 @@ class TestColor:
             assert material.warnings == ()
             assert any(("read as sRGB" if bent else "read as linear") in note for note in material.notes)
 
-    def test_other_gammas_are_told_and_not_applied(self, heights: Path) -> None:
+    def test_other_gammas_warn_and_are_not_applied(self, heights: Path) -> None:
         odd = (b"gAMA", (55556).to_bytes(4, "big"))
         material = self.color(heights, "", odd)
         (warning,) = material.warnings
@@ -172,7 +169,7 @@ class TestNormals:
         assert any("100.00% of its normals point into" in w for w in load_material(heights).warnings)
 
 
-def test_orientation_is_ignored_alike_and_told(heights: Path) -> None:
+def test_orientation_is_ignored_with_a_warning(heights: Path) -> None:
     from PIL import Image as Pillow
 
     exif = Pillow.Exif()

@@ -1,4 +1,4 @@
-"""A normal map is held against its heights: convention, orientation, scale; silence where nothing shows."""
+"""A normal map is compared with its heights: convention, orientation and scale, or no finding."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.height_maps import Floats, fractal, normals_of, save_heights, save_normals
 from support.paths import ROOT
-from support.reliefs import Floats, fractal, normals_of, save_heights, save_normals
 
 from mbtf_gen.images.read import gray, read_image
 from mbtf_gen.material.material import load_material
@@ -23,7 +23,7 @@ UNDO = {
 ASSET = ROOT / "assets/turtle_shell/height.exr"
 
 
-def relief(kind: str) -> Floats:
+def height_map(kind: str) -> Floats:
     if kind == "fractal":
         return fractal(96, 96)
     return np.asarray(gray(read_image(ASSET))[0], np.float64)
@@ -38,7 +38,7 @@ def fit(height: Floats, normal: Floats) -> NormalFit:
 @pytest.mark.parametrize("kind", ["fractal", "asset"])
 @pytest.mark.parametrize("green", [1, -1])
 def test_convention_and_scale(kind: str, green: int) -> None:
-    height = relief(kind)
+    height = height_map(kind)
     found = fit(height, normals_of(height, 0.07) * [1, green, 1])
     assert found.fits
     assert not found.misfit
@@ -53,7 +53,7 @@ def test_convention_and_scale(kind: str, green: int) -> None:
 @pytest.mark.parametrize("turn", TURNS)
 @pytest.mark.parametrize("green", [1, -1])
 def test_turned_heights(kind: str, turn: str, green: int) -> None:
-    height = relief(kind)
+    height = height_map(kind)
     moved = SYMMETRIES[turn](height)
     found = fit(moved, normals_of(height, 0.05) * [1, green, 1])
     assert found.misfit
@@ -99,7 +99,7 @@ def test_other_resolutions() -> None:
     assert found.scale == pytest.approx(0.05, rel=0.05)
 
 
-class TestSilence:
+class TestNoFinding:
     def test_flat(self) -> None:
         up = np.zeros((32, 32, 3))
         up[..., 2] = 1
@@ -116,7 +116,7 @@ class TestSilence:
             assert not found.misfit
             assert found.convention is None
 
-    def test_ridges_tell_no_convention(self) -> None:
+    def test_ridges_have_no_convention(self) -> None:
         """Slopes along u only: the green channel is empty."""
         ridges = np.tile(fractal(64, 64)[:1], (64, 1))
         found = fit(ridges, normals_of(ridges, 0.05))
@@ -134,7 +134,7 @@ class TestSilence:
 
 
 class TestMaterial:
-    """What a user is told."""
+    """Notes and warnings of a loaded material."""
 
     def folder(self, tmp_path: Path, height: Floats, name: str, *, dx: bool) -> Path:
         save_heights(tmp_path / "height.png", height)
@@ -169,12 +169,6 @@ class TestMaterial:
         assert "read as OpenGL" in material.warnings[0]
         assert material.normal_convention == "gl"
 
-    def test_turned_heights(self, tmp_path: Path) -> None:
-        folder = self.folder(tmp_path, np.rot90(fractal(96, 96), -1), "normal.png", dx=False)
-        (warning,) = load_material(folder).warnings
-        assert "height.png: fits normal.png only when turned by 90 degrees counter-clockwise" in warning
-        assert "correlation of their slopes 1.00 so," in warning
-
     def test_ridges_have_no_second_correlation(self, tmp_path: Path) -> None:
         ridges = np.tile(fractal(96, 96)[:1], (96, 1))
         save_heights(tmp_path / "height.png", ridges)
@@ -186,8 +180,12 @@ class TestMaterial:
             "DirectX, as named; correlation with them u +1.00, v undefined" in n for n in material.notes
         )
 
-    def test_heights_upside_down(self, tmp_path: Path) -> None:
-        folder = self.folder(tmp_path, 1 - fractal(96, 96), "normal.png", dx=False)
+    def test_turned_and_inverted_heights_warn(self, tmp_path: Path) -> None:
+        folder = self.folder(tmp_path, np.rot90(fractal(96, 96), -1), "normal.png", dx=False)
+        (warning,) = load_material(folder).warnings
+        assert "height.png: fits normal.png only when turned by 90 degrees counter-clockwise" in warning
+        assert "correlation of their slopes 1.00 so," in warning
+        save_heights(folder / "height.png", 1 - fractal(96, 96))
         (warning,) = load_material(folder).warnings
         assert "upside down" in warning
         assert "negative --height-scale" in warning

@@ -1,4 +1,4 @@
-"""Maps that do not tile are found, and mirrored or blended alike, normals with the right signs."""
+"""Maps that do not tile are found, and mirrored or blended alike; normals keep the right signs."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.reliefs import Floats, fractal, normals_of, save_heights, save_normals
+from support.height_maps import Floats, fractal, normals_of, save_heights, save_normals
 
 from mbtf_core.errors import InputError
 from mbtf_core.lattice import texel_centers
@@ -51,7 +51,7 @@ class TestSeams:
         assert broken(seams(height)[0])
         assert not broken(seams(height, 1 / 255)[0])
 
-    def test_too_small_to_tell(self) -> None:
+    def test_small_maps_have_no_verdict(self) -> None:
         assert seams(np.random.default_rng(0).random((15, 15))) == ()
         assert [s.axis for s in seams(np.zeros((1, 16)))] == ["u"]
 
@@ -124,7 +124,7 @@ class TestMaterial:
         )
         return tmp_path
 
-    def test_it_is_said_once_with_the_hint(self, folder: Path) -> None:
+    def test_a_seam_warns_once(self, folder: Path) -> None:
         (warning,) = load_material(folder).warnings
         assert "height.png: does not tile along u and v: the seam is a step of 0.0" in warning
         assert "--make-tileable mirror" in warning
@@ -139,7 +139,7 @@ class TestMaterial:
         assert mirrored.base_color.shape == (144, 192, 3)
         assert np.shape(mirrored.opacity) == (144, 192)
         assert mirrored.metallic == 0.0
-        # The same relief: the tile is twice as wide, so heights in tile widths are half.
+        # The same heights: the tile is twice as wide, so heights in tile widths are half.
         assert mirrored.grid(0.3, 192).displacement_range == pytest.approx(
             0.5 * plain.grid(0.3, 96).displacement_range
         )
@@ -154,16 +154,8 @@ class TestMaterial:
 
     def test_blend_treats_all_maps_alike(self, folder: Path) -> None:
         plain, blended = load_material(folder), load_material(folder, "blend")
-        for name in (
-            "height",
-            "roughness",
-            "base_color",
-            "opacity",
-            "normal",
-            "clearcoat",
-            "sheen",
-            "sheen_color",
-        ):
+        names = "height roughness base_color opacity normal clearcoat sheen sheen_color"
+        for name in names.split():
             before, after = getattr(plain, name), getattr(blended, name)
             assert np.shape(after) == np.shape(before)
             rows, columns = np.shape(before)[:2]
@@ -171,7 +163,7 @@ class TestMaterial:
             assert np.abs(after - before)[0].max() > 0.01
 
     @pytest.mark.parametrize("tile", ["mirror", "blend"])
-    def test_it_counts_for_the_digest(self, folder: Path, tile: Tiling) -> None:
+    def test_tiling_changes_the_digest(self, folder: Path, tile: Tiling) -> None:
         assert load_material(folder, tile).digests["settings"] != load_material(folder).digests["settings"]
 
     def test_what_cannot_be_mirrored_is_refused(self, folder: Path) -> None:

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from mbtf_core.directions import from_angles
-from mbtf_core.errors import UsageError
 from mbtf_gen.pictures.camera import Camera
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -43,8 +42,3 @@ def test_views_point_from_the_plane_to_the_camera(aspect: float) -> None:
     np.testing.assert_allclose(omega[30, 40], from_angles(30.0, 40.0), atol=1e-6)
     np.testing.assert_allclose(x[30, 40], CAMERA.target, atol=1e-5)
     assert np.linalg.norm(x[30, 80] - x[30, 0]) * 81 / 80 == pytest.approx(CAMERA.tiles_across, rel=1e-2)
-
-
-def test_a_view_of_the_horizon_is_refused() -> None:
-    with pytest.raises(UsageError, match="horizon"):
-        Camera(elevation=5.0, rows=8, columns=8, field_of_view=20.0).queries(UP)

@@ -19,7 +19,7 @@ from mbtf_gen.job import Job
 from mbtf_gen.material.material import Material
 from mbtf_gen.pictures.camera import Camera
 from mbtf_gen.pictures.preview import mesh
-from mbtf_gen.pictures.preview.mesh import MOST_CELLS, check_display, draw, tiled_mesh
+from mbtf_gen.pictures.preview.mesh import MOST_CELLS, draw, tiled_mesh
 from mbtf_gen.pictures.preview.plots import level_histogram, query_figure, write_plots
 from mbtf_gen.pictures.preview.sample import QuerySample, finished_shards, sampled_queries, stored_queries
 from mbtf_gen.pictures.preview.view import tiles_camera
@@ -37,17 +37,19 @@ def material(rows: int = 4, columns: int = 8, **options: Any) -> Material:
 
 @pytest.mark.parametrize("aspect", [0.5, 1.0, 3.0])
 @pytest.mark.parametrize(("elevation", "azimuth"), [(90, -90), (40, -90), (25, 30)])
-@pytest.mark.parametrize("relief", [0.0, 0.3, 5.0])
-def test_the_camera_just_holds_the_block(
-    aspect: float, elevation: float, azimuth: float, relief: float
+@pytest.mark.parametrize("depth_range", [0.0, 0.3, 5.0])
+def test_the_camera_frames_the_block(
+    aspect: float, elevation: float, azimuth: float, depth_range: float
 ) -> None:
-    camera = tiles_camera(elevation, azimuth, tiles=2, aspect=aspect, displacement_range=relief, columns=120)
+    camera = tiles_camera(
+        elevation, azimuth, tiles=2, aspect=aspect, displacement_range=depth_range, columns=120
+    )
     assert (camera.rows, camera.columns) == (90, 120)
     assert camera.target == (1.0, aspect)
     forward, right, up = camera.frame()
     reach = []
     for corner in np.ndindex(2, 2, 2):
-        offset = np.array(corner) * (2.0, 2.0 * aspect, -relief) - camera.position
+        offset = np.array(corner) * (2.0, 2.0 * aspect, -depth_range) - camera.position
         depth = offset @ forward
         assert depth > 0
         half = camera.pixel_pitch / 2 * depth
@@ -88,7 +90,7 @@ def test_holes_are_cut_where_little_is_left() -> None:
     assert tiled_mesh(material(opacity=0.2), 1).hole.all()
 
 
-def test_a_large_mesh_is_drawn_coarser() -> None:
+def test_a_large_mesh_is_coarsened() -> None:
     m = material()
     for tiles, wide in ((1, MOST_CELLS), (4, MOST_CELLS // 4)):
         block = tiled_mesh(m, tiles, mesh=4000)
@@ -105,7 +107,7 @@ def sample_of(count: int, seed: int = 0, **options: Any) -> QuerySample:
 
 @pytest.mark.parametrize("weights", [(0.6, 0.4), (1.0, 0.0), (0.0, 1.0)])
 @pytest.mark.parametrize("finest", [1, 2, 5])
-def test_the_stated_density_is_that_of_the_levels_drawn(weights: tuple[float, float], finest: int) -> None:
+def test_the_stated_density_is_that_of_the_levels(weights: tuple[float, float], finest: int) -> None:
     mixture = Mixture(*weights)
     at = np.linspace(-1, finest + 1, 20_001)
     density = mixture.density(at, finest)
@@ -218,13 +220,3 @@ def test_a_crash_while_drawing_is_one_line(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setenv("DISPLAY", ":0")
     with pytest.raises(EngineError, match=r"SIGSEGV.*\n.*doctor"):
         mesh.show(block, camera, LIGHT)
-
-
-def test_a_window_needs_a_display(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sys.platform", "linux")
-    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
-    with pytest.raises(EngineError, match="no display"):
-        check_display()
-    monkeypatch.setenv("WAYLAND_DISPLAY", "wayland-0")
-    check_display()

@@ -19,6 +19,8 @@ from mbtf_gen.planning.effects_plan import plan_effects, reference_plan
 HEIGHTS = np.array([[0.0, 0.1], [0.05, 0.02]])
 LAMBERT = Material(height=HEIGHTS, height_scale=1.0, height_bits=None, base_color=np.full(3, 0.5))
 FLAT = replace(LAMBERT, height_scale=0.0)
+GLOSS: dict[str, Any] = {"roughness": 0.5, "specular": 0.5, "metallic": 0.0}
+COAT: dict[str, Any] = {"clearcoat": 1.0, "clearcoat_roughness": 0.1}
 NORMAL = np.broadcast_to(np.float32([0.6, 0.0, 0.8]), (4, 4, 3))
 
 
@@ -44,7 +46,7 @@ def test_a_plane_of_one_color_has_a_closed_form() -> None:
     "change",
     [
         {"base_color": np.full((2, 2, 3), 0.5) * [[[1.0], [0.5]]]},
-        {"roughness": 0.5, "specular": 0.5, "metallic": 0.0},
+        GLOSS,
         {"normal": NORMAL},
         {"opacity": np.array([[1.0, 0.0], [1.0, 1.0]])},
     ],
@@ -60,8 +62,11 @@ def test_black_has_a_closed_form_at_any_displacement() -> None:
     black = replace(LAMBERT, base_color=np.zeros(3))
     assert plan_effects(job_of(black)).closed_form
     # A black dielectric still has highlights, and black cloth still has holes.
-    shiny = replace(black, roughness=0.5, specular=0.5, metallic=0.0)
+    shiny = replace(black, **GLOSS)
     assert not reference_plan(job_of(shiny)).closed_form
+    coated = plan_effects(job_of(replace(black, **COAT)), pilots=False)
+    assert not coated.closed_form
+    assert on(coated) >= {*RELIEF_EFFECTS, "clearcoat"}
     holes = replace(black, opacity=np.array([[1.0, 0.0], [1.0, 1.0]]))
     assert not plan_effects(job_of(holes, mode="-interreflection")).closed_form
 
@@ -117,36 +122,13 @@ def test_bias_bounds_add_up_over_what_is_off() -> None:
     assert EffectsPlan(effects).bias_bound == pytest.approx(0.003)
 
 
-def test_a_depth_limit_is_kept() -> None:
-    plan = plan_effects(job_of(LAMBERT, transport={"max_depth": 1}))
-    assert not plan.on("interreflection")
-    plan = plan_effects(job_of(LAMBERT, transport={"max_depth": 3}))
-    assert (plan.on("interreflection"), plan.max_depth) == (True, 3)
-
-
 def test_a_small_run_has_no_pilot() -> None:
     """Effects without a bound from theory stay on."""
     plan = plan_effects(job_of(replace(LAMBERT, base_color=np.full(3, 0.05))), pilots=False)
     assert on(plan) == set(RELIEF_EFFECTS)
-    assert (plan["interreflection"].bias_bound, plan["parallax"].bias_bound, plan.max_depth) == (
-        None,
-        None,
-        0,
-    )
+    assert plan["interreflection"].bias_bound is plan["parallax"].bias_bound is None
+    assert plan.max_depth == 0
     assert plan_effects(job_of(FLAT), pilots=False).closed_form
-
-
-COAT: dict[str, Any] = {"clearcoat": 1.0, "clearcoat_roughness": 0.1}
-
-
-def test_black_under_a_clearcoat_is_not_black() -> None:
-    black = replace(LAMBERT, base_color=np.zeros(3), **COAT)
-    plan = plan_effects(job_of(black), pilots=False)
-    assert not plan.closed_form
-    assert on(plan) >= {*RELIEF_EFFECTS, "clearcoat"}
-
-
-GLOSS: dict[str, Any] = {"roughness": 0.5, "specular": 0.5, "metallic": 0.0}
 
 
 @pytest.mark.parametrize("more", [GLOSS, COAT, {**GLOSS, **COAT}, {"sheen": 1.0, "sheen_roughness": 0.3}])
@@ -163,23 +145,28 @@ def test_bounds_for_lambert_do_not_apply_to_gloss(more: dict[str, Any]) -> None:
 
 def test_the_smallest_roughness_decides_on_bsdf_sampling() -> None:
     """A light of one degree against lobes of 2α; Lambert needs none."""
-    dull = {"roughness": 0.6, "specular": 0.5, "metallic": 0.0}
+
+    def sampled(**maps: Any) -> bool:
+        return plan_effects(job_of(replace(FLAT, **maps))).on("bsdf_sampling")
+
     patch = np.full((8, 8), 0.6)
     patch[3, 3] = 0.02
-    assert not plan_effects(job_of(replace(FLAT, **dull))).on("bsdf_sampling")
-    assert plan_effects(job_of(replace(FLAT, **{**dull, "roughness": patch}))).on("bsdf_sampling")
-    assert plan_effects(job_of(replace(FLAT, **dull, clearcoat=1.0, clearcoat_roughness=0.05))).on(
-        "bsdf_sampling"
-    )
+    dull = {**GLOSS, "roughness": 0.6}
+    assert not sampled(**dull)
+    assert sampled(**{**dull, "roughness": patch})
+    assert sampled(**dull, clearcoat=1.0, clearcoat_roughness=0.05)
     assert not plan_effects(job_of(FLAT, "+parallax")).on("bsdf_sampling")
-    sheen = {"sheen": 0.5, "sheen_roughness": 0.5}
-    assert not plan_effects(job_of(replace(FLAT, **sheen))).on("bsdf_sampling")
-    assert plan_effects(job_of(replace(FLAT, **{**sheen, "sheen_roughness": 0.05}))).on("bsdf_sampling")
+    assert not sampled(sheen=0.5, sheen_roughness=0.5)
+    assert sampled(sheen=0.5, sheen_roughness=0.05)
 
 
 def test_the_configured_roulette_and_cap_reach_the_plan() -> None:
     plan = plan_effects(job_of(LAMBERT, transport={"roulette_depth": 7, "max_depth": 5}), pilots=False)
     assert (plan.roulette_depth, plan.max_depth) == (7, 5)
+    for depth, interreflection in ((1, False), (3, True)):
+        plan = plan_effects(job_of(LAMBERT, transport={"max_depth": depth}))
+        assert plan.on("interreflection") is interreflection
+    assert plan.max_depth == 3
     pictures = reference_plan(job_of(LAMBERT, "all,-shadowing"))
     assert not pictures.on("shadowing")
     assert pictures.max_depth == 0

@@ -91,7 +91,7 @@ def test_a_sharp_lobe_is_fitted_to_the_end(seed: int) -> None:
     assert np.mean(s**2) == pytest.approx(0.25 * SPP * np.mean(noise**2), rel=1e-3)
 
 
-def test_a_fit_that_does_not_converge_gives_even_counts(
+def test_a_failed_fit_gives_even_counts(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     q = some_queries(2000)
@@ -129,7 +129,7 @@ def test_counts_are_powers_of_two_about_the_needed_mean(fitted: Allocation) -> N
     assert share.max() / share.min() < 2.0001
 
 
-def test_they_make_errors_smaller_and_the_gain_says_by_how_much(fitted: Allocation) -> None:
+def test_counts_reduce_the_error_by_the_stated_gain(fitted: Allocation) -> None:
     q = some_queries(shard=3)
     variance = deviation(q) ** 2
     gain = np.mean(variance / SPP) / np.mean(variance / fitted.counts(q, SPP))
@@ -223,7 +223,7 @@ def test_paths_for_a_target_error() -> None:
     assert needed[3] == pytest.approx(0.01 / (0.05 * (0.1 - DOUBT * 0.01 / 16 / 0.1)) ** 2)
 
 
-def test_an_expectation_that_falls_short_of_the_pilots_is_raised() -> None:
+def test_an_expectation_below_the_pilots_is_raised() -> None:
     """In proportion to the tile mean's square, and by no more than a factor; one path decides nothing."""
     rng = np.random.default_rng(0)
     n = 4000

@@ -123,27 +123,20 @@ def test_a_library_that_is_no_llvm_is_refused(monkeypatch: pytest.MonkeyPatch) -
         engine.check_llvm()
 
 
-@pytest.mark.parametrize(
-    ("name", "version"),
-    [
-        ("libLLVM.so.23.1", (23, 1, 0)),
-        ("libLLVM-15.so.1", (15, 0, 0)),
-        ("libLLVM-14.0.6.so.1", (14, 0, 6)),
-        ("libLLVM.so", None),
-        ("other.so.3", None),
-    ],
-)
-def test_versions_in_names(name: str, version: llvm.Version | None, tmp_path: Path) -> None:
-    assert llvm.version_in_name(tmp_path / name) == version
-
-
-def test_versions_are_read_through_links(tmp_path: Path) -> None:
+def test_versions_are_read_from_names_and_through_links(tmp_path: Path) -> None:
+    versions = {
+        "libLLVM.so.23.1": (23, 1, 0),
+        "libLLVM-15.so.1": (15, 0, 0),
+        "libLLVM-14.0.6.so.1": (14, 0, 6),
+    }
+    for name, version in {**versions, "libLLVM.so": None, "other.so.3": None}.items():
+        assert llvm.version_in_name(tmp_path / name) == version
     (tmp_path / "libLLVM.so.19.1").touch()
     (tmp_path / "libLLVM.so").symlink_to("libLLVM.so.19.1")
     assert llvm.version_in_name(tmp_path / "libLLVM.so") == (19, 1, 0)
 
 
-def test_an_installation_nobody_started_as_its_owner_works(run_python: RunPython, tmp_path: Path) -> None:
+def test_an_installation_never_started_by_its_owner_works(run_python: RunPython, tmp_path: Path) -> None:
     # Links of the C++ runtime appear at the first start that may write; here they never did.
     shipped = llvm.shipped_llvm()
     assert shipped is not None
@@ -165,13 +158,17 @@ def test_an_installation_nobody_started_as_its_owner_works(run_python: RunPython
     assert done.stdout == "llvm_ad_rgb\n"
 
 
-def test_a_proof_is_remembered_and_forgotten_with_the_library(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    library = tmp_path / "libLLVM.so.20.1"
-    library.write_bytes(b"x")
-    monkeypatch.setenv(llvm.VARIABLE, str(library))
+@pytest.fixture
+def library(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A library that the user chose, and an empty cache."""
+    path = tmp_path / "libLLVM.so.20.1"
+    path.write_bytes(b"x")
+    monkeypatch.setenv(llvm.VARIABLE, str(path))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return path
+
+
+def test_a_proof_is_cached_per_library(library: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     proofs = []
 
     def prove(variant: str) -> object:
@@ -187,11 +184,8 @@ def test_a_proof_is_remembered_and_forgotten_with_the_library(
     assert len(proofs) == 2
 
 
-def test_a_failed_proof_is_not_remembered(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    library = tmp_path / "libLLVM.so.20.1"
-    library.write_bytes(b"x")
-    monkeypatch.setenv(llvm.VARIABLE, str(library))
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+@pytest.mark.usefixtures("library")
+def test_a_failed_proof_is_not_cached(monkeypatch: pytest.MonkeyPatch) -> None:
     fault = "the process was ended by SIGABRT (LLVM ERROR: Cannot select)"
     monkeypatch.setattr(engine, "prove", lambda variant: engine.Outcome({"llvm": [20, 1, 2]}, fault, 0.0))
     for _ in range(2):
@@ -236,7 +230,7 @@ def answer(text):  # type: ignore[no-untyped-def]
 
 def fail():  # type: ignore[no-untyped-def]
     yield {"step": 1}
-    raise EngineError("is\nbroken", where="here", hint="mend it")
+    raise EngineError("is\nbroken", where="here", hint="repair it")
 
 
 def leave():  # type: ignore[no-untyped-def]
@@ -269,7 +263,7 @@ def test_the_proof_catches_the_abort_of_llvm_15(monkeypatch: pytest.MonkeyPatch,
         ("hang", [], {"step": 1}, "no answer within 1 s"),
     ],
 )
-def test_how_a_child_ended_is_said(
+def test_the_end_of_a_child_is_reported(
     function: str, arguments: list[str], answers: dict[str, object], fault: str
 ) -> None:
     outcome = run_child(__name__, function, *arguments, timeout=1 if function == "hang" else 60)

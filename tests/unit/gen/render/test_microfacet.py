@@ -121,7 +121,7 @@ def test_half_vectors_keep_the_digits_of_narrow_lobes(cosine: float) -> None:
 
 
 def test_samples_of_missing_energy_have_its_density() -> None:
-    """Quantiles of drawn cosines are those of the integrated density; azimuths are even."""
+    """Quantiles of sampled cosines are those of the integrated density; azimuths are even."""
     for alpha in (1e-5, 1e-2, 0.3, 1.0):
         w = np.array(sample_missing_energy(mi.Float(alpha), mi.Point2f(sobol(1 << 12, 2).T)), np.float64)
         np.testing.assert_allclose(np.linalg.norm(w, axis=0), 1.0, atol=1e-6)

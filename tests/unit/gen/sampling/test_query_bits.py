@@ -1,4 +1,4 @@
-"""Queries are the same bits wherever and however they are drawn, and every pass covers every texel once."""
+"""Queries have the same bits on every machine, and every pass covers every texel once."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ print(json.dumps({"found": found, "digest": h.hexdigest()}))
 DIGEST = "29bf97bc8100b9038a075a49ff564f26538593acf0f925c65b3ebb6c16f59908"
 
 
-def drawn_in_child(run_python: RunPython, **variables: str | None) -> tuple[list[str], str]:
+def sampled_in_child(run_python: RunPython, **variables: str | None) -> tuple[list[str], str]:
     done = run_python("-c", CODE, **variables)
     assert done.returncode == 0, done.stderr
     answer = json.loads(done.stdout)
@@ -45,13 +45,13 @@ def drawn_in_child(run_python: RunPython, **variables: str | None) -> tuple[list
 
 
 def test_bits_do_not_depend_on_the_processors_features(run_python: RunPython) -> None:
-    found, digest = drawn_in_child(run_python, NPY_DISABLE_CPU_FEATURES=None)
+    found, digest = sampled_in_child(run_python, NPY_DISABLE_CPU_FEATURES=None)
     # The same bits as on every machine so far: data sets are made by several of them.
     assert digest == DIGEST
     if not found:
         pytest.skip("NumPy uses no optional features of this processor")
     for disabled in (found, found[-1:]):
-        left, again = drawn_in_child(run_python, NPY_DISABLE_CPU_FEATURES=" ".join(disabled))
+        left, again = sampled_in_child(run_python, NPY_DISABLE_CPU_FEATURES=" ".join(disabled))
         assert len(left) < len(found)
         assert again == digest
 
@@ -99,7 +99,7 @@ def test_each_pass_covers_each_texel_once_across_shards(lattice: Lattice, shard_
 
 
 @pytest.mark.parametrize("lattice", LATTICES, ids=lambda k: "x".join(map(str, k.shape())))
-def test_image_buffers_hold_every_texel_in_order_under_one_light_and_view(lattice: Lattice) -> None:
+def test_images_hold_every_texel_in_order_under_one_light_and_view(lattice: Lattice) -> None:
     q = plan(lattice, 3, "image").draw("train", 2, 3)
     assert q.lead == (3, *lattice.shape())
     for item in range(3):
@@ -113,7 +113,7 @@ def test_image_buffers_hold_every_texel_in_order_under_one_light_and_view(lattic
 
 
 @pytest.mark.parametrize("lattice", LATTICES, ids=lambda k: "x".join(map(str, k.shape())))
-def test_windows_are_grids_of_the_level_nearest_to_their_footprint(lattice: Lattice) -> None:
+def test_patches_are_grids_of_the_level_nearest_to_their_footprint(lattice: Lattice) -> None:
     q = QueryPlan(lattice, Mixture(1, 0), 0.2, "image", 5, 40, patch_size=5).draw("train", 1, 40)
     assert q.lead == (40, 5, 5)
     assert ((q.u >= 0) & (q.u < 1)).all()
@@ -137,7 +137,7 @@ def equal(a: Queries, b: Queries) -> bool:
     return all(np.array_equal(getattr(a, n), getattr(b, n)) for n in ("u", "sigma", "omega_i", "omega_o"))
 
 
-def test_a_shard_is_drawn_alone_as_in_company() -> None:
+def test_a_shard_does_not_depend_on_the_others() -> None:
     company = plan(LATTICES[1], 50)
     many = [company.draw("train", s, 50) for s in range(6)]
     for s in (5, 0, 3):

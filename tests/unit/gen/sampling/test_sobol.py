@@ -31,19 +31,24 @@ def points(queries: int = QUERIES, length: int = LENGTH, half: int = 0, root: in
     )
 
 
-def pairs(drawn: SobolSampler, length: int = LENGTH) -> NDArray[np.float64]:
+def pairs(sampler: SobolSampler, length: int = LENGTH) -> NDArray[np.float64]:
     """(queries, length, 2) coordinates of the next dimension."""
-    return np.array(drawn.next_2d(), np.float64).T.reshape(-1, length, 2)
+    return np.array(sampler.next_2d(), np.float64).T.reshape(-1, length, 2)
 
 
 def uniform(q: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.ones(len(q))
 
 
+def p_value(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
+    """Of the hypothesis that pairs are uniform and independent."""
+    return chi_square_test(np.column_stack([x, y]), uniform, Rectangle(), (16, 16)).p_value
+
+
 def test_two_coordinates_fill_every_elementary_interval_once() -> None:
-    drawn = points(256)
+    sampler = points(256)
     for _ in range(6):
-        xy = pairs(drawn)
+        xy = pairs(sampler)
         for m, start in itertools.product(range(1, 5), (0, 8)):
             n = 1 << m
             if start % n or start + n > LENGTH:
@@ -56,9 +61,9 @@ def test_two_coordinates_fill_every_elementary_interval_once() -> None:
 
 
 def test_one_coordinate_is_stratified() -> None:
-    drawn = points(256)
+    sampler = points(256)
     for _ in range(6):
-        x = np.array(drawn.next_1d(), np.float64).reshape(-1, LENGTH)
+        x = np.array(sampler.next_1d(), np.float64).reshape(-1, LENGTH)
         for n in (2, 4, 8, 16):
             assert (np.sort(np.floor(x[:, :n] * n), axis=1) == np.arange(n)).all()
 
@@ -66,26 +71,25 @@ def test_one_coordinate_is_stratified() -> None:
 @pytest.mark.parametrize("index", [0, 1, 7])
 def test_every_point_of_a_sequence_is_uniform(index: int) -> None:
     """Over queries; else estimates would be biased for numbers of paths that fill no net."""
-    drawn = points(1 << 15, 8)
-    p = [chi_square_test(pairs(drawn, 8)[:, index], uniform, Rectangle(), (16, 16)).p_value for _ in range(4)]
+    sampler = points(1 << 15, 8)
+    p = [
+        chi_square_test(pairs(sampler, 8)[:, index], uniform, Rectangle(), (16, 16)).p_value for _ in range(4)
+    ]
     assert sidak(p).min() > 1e-3
 
 
 def test_dimensions_of_a_point_are_independent_of_each_other() -> None:
-    drawn = points(1 << 14, 4)
-    columns = [c for _ in range(4) for c in np.moveaxis(pairs(drawn, 4), -1, 0)]
-    p = [
-        chi_square_test(np.column_stack([x[:, 1], y[:, 1]]), uniform, Rectangle(), (16, 16)).p_value
-        for x, y in itertools.combinations(columns, 2)
-    ]
+    sampler = points(1 << 14, 4)
+    columns = [c for _ in range(4) for c in np.moveaxis(pairs(sampler, 4), -1, 0)]
+    p = [p_value(x[:, 1], y[:, 1]) for x, y in itertools.combinations(columns, 2)]
     assert sidak(p).min() > 1e-3
 
 
 def test_the_order_of_points_differs_between_dimensions() -> None:
     """How many of eight points lie in the upper half of two dimensions: one order for all would make it 0 or
     4."""
-    drawn = points(1 << 15, 8)
-    first, second = (np.array(drawn.next_1d(), np.float64).reshape(-1, 8) > 0.5 for _ in range(2))
+    sampler = points(1 << 15, 8)
+    first, second = (np.array(sampler.next_1d(), np.float64).reshape(-1, 8) > 0.5 for _ in range(2))
     both = (first & second).sum(axis=1).astype(np.float64)
     assert z_test(mean_estimate(both), 2.0).p_value > 1e-3
     # Independent points: 8 · 1/4 · 3/4.
@@ -95,15 +99,10 @@ def test_the_order_of_points_differs_between_dimensions() -> None:
 def test_halves_are_independent() -> None:
     """In each of the first dimensions, and of one dimension from another."""
     first, second = (points(1 << 13, 4, half) for half in (0, 1))
-    a, b = ([pairs(drawn, 4) for _ in range(4)] for drawn in (first, second))
+    a, b = ([pairs(sampler, 4) for _ in range(4)] for sampler in (first, second))
     p = []
     for m, n in [(0, 0), (1, 1), (2, 2), (3, 3), (0, 2), (3, 1)]:
-        p += [
-            chi_square_test(
-                np.column_stack([a[m][:, i, k], b[n][:, j, k]]), uniform, Rectangle(), (16, 16)
-            ).p_value
-            for i, j, k in itertools.product((0, 3), (0, 3), (0, 1))
-        ]
+        p += [p_value(a[m][:, i, k], b[n][:, j, k]) for i, j, k in itertools.product((0, 3), (0, 3), (0, 1))]
         # Means over a half as well, which within one net hardly vary.
         product = [(a[m][..., k].mean(axis=1) - 0.5) * (b[n][..., k].mean(axis=1) - 0.5) for k in (0, 1)]
         p += [z_test(mean_estimate(x)).p_value for x in product]
@@ -116,9 +115,9 @@ def test_lengths_that_fill_no_net_are_unbiased_and_no_worse_than_independent_poi
     first, second = (points(1 << 13, length, half) for half in (0, 1))
     exact = (1 - np.cos(3.0)) / 3.0 * (np.e - 1)
     means = []
-    for drawn in (first, second):
-        drawn.next_2d()
-        xy = pairs(drawn, length)
+    for sampler in (first, second):
+        sampler.next_2d()
+        xy = pairs(sampler, length)
         value = np.sin(3.0 * xy[..., 0]) * np.exp(xy[..., 1])
         means.append(value.mean(axis=1) - exact)
         assert z_test(mean_estimate(means[-1])).p_value > 1e-3
@@ -141,9 +140,8 @@ def test_a_smooth_integral_converges_faster_than_independent_points() -> None:
 
 
 def test_plain_numbers_are_uniform_and_leave_the_dimensions_alone() -> None:
-    plain, drawn = points(1 << 12), points(1 << 12)
+    plain, sampler = points(1 << 12), points(1 << 12)
     numbers = np.array([np.array(plain.chance(), np.float64) for _ in range(2)])
-    assert chi_square_test(numbers.T, uniform, Rectangle(), (16, 16)).p_value > 1e-3
-    neighbors = np.column_stack([numbers[0, :-1:2], numbers[0, 1::2]])
-    assert chi_square_test(neighbors, uniform, Rectangle(), (16, 16)).p_value > 1e-3
-    assert (pairs(plain) == pairs(drawn)).all()
+    assert p_value(*numbers) > 1e-3
+    assert p_value(numbers[0, :-1:2], numbers[0, 1::2]) > 1e-3
+    assert (pairs(plain) == pairs(sampler)).all()

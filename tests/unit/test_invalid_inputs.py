@@ -1,22 +1,22 @@
-"""Mistakes that people make with the three programs are refused in one or two lines, with an exit code."""
+"""The three programs refuse invalid input in one or two lines, with an exit code."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import pytest
-from support.mistakes import LINES, call, write_files
+from support.invalid_inputs import LINES, call, write_files
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    made = tmp_path_factory.mktemp("mistakes").resolve()
+    made = tmp_path_factory.mktemp("inputs").resolve()
     write_files(made)
     return made
 
 
 @pytest.mark.parametrize("group", LINES)
-def test_every_mistake_is_refused_in_two_lines(
+def test_invalid_input_is_refused_in_two_lines(
     group: str, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(folder)
@@ -24,7 +24,7 @@ def test_every_mistake_is_refused_in_two_lines(
         done = call(line.split())
         assert done.code in (2, 3), (line, done)
         errors = done.err[done.err.find("error: ") :].splitlines() if "error: " in done.err else []
-        # `verify` reports what it found on standard output.
+        # `verify` reports faults on standard output.
         assert len(errors) <= 2, (line, done)
         assert errors or done.out, (line, done)
         assert "Traceback" not in done.err
@@ -42,7 +42,9 @@ def test_every_mistake_is_refused_in_two_lines(
         ["x" * 5000],
     ],
 )
-def test_odd_words_are_quoted_safely(line: list[str], folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_control_characters_are_escaped(
+    line: list[str], folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(folder)
     done = call(["mbtf-gen", *line])
     assert done.code in (2, 3)

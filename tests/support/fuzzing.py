@@ -1,4 +1,4 @@
-"""Damaged files for hypothesis, and what a loader may do with them: load, or refuse in a line or two."""
+"""Corrupted files for hypothesis; a loader loads them or refuses them in one or two lines."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mbtf_core.errors import MbtfError
 
 # Bytes that headers are sensitive to.
 _BYTES = st.one_of(st.sampled_from([0, 1, 2, 8, 16, 127, 128, 254, 255]), st.integers(0, 255))
-# Values that a JSON document of ours does not hold where it holds something else.
+# Values that replace those of a JSON document.
 _VALUES = ["null", "[]", "{}", '""', '"x"', '"../x.npz"', "-1", "0", "9" * 30, "1e300", "1.5", "true", "[[]]"]
 
 

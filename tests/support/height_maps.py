@@ -1,4 +1,4 @@
-"""Periodic reliefs without any symmetry, and the normal maps that belong to them."""
+"""Periodic height maps without any symmetry, and their normal maps."""
 
 from __future__ import annotations
 
@@ -19,6 +19,16 @@ def fractal(rows: int, columns: int, exponent: float = 2.0, seed: int = 5) -> Fl
     spectrum *= np.where(frequency > 0, 1.0, 0.0) / np.maximum(frequency, 1.0) ** exponent
     h = np.fft.irfft2(spectrum, (rows, columns))
     return (h - h.min()) / np.ptp(h)
+
+
+def rms(x: Floats) -> float:
+    """Root mean square."""
+    return float(np.sqrt(np.mean(x**2)))
+
+
+def slopes(h: Floats) -> Floats:
+    """Periodic differences of neighboring heights along v and u."""
+    return np.stack([np.roll(h, -1, 0) - h, np.roll(h, -1, 1) - h])
 
 
 def normals_of(height: Floats, factor: float) -> Floats:
