@@ -252,7 +252,7 @@ def test_two_runs_at_once_make_every_shard_once(tmp_path: Path) -> None:
     assert contents(tmp_path / "out") == contents(tmp_path / "whole")
 
 
-def test_any_slices_merged_are_the_whole(tmp_path: Path) -> None:
+def test_slices_equal_a_run(tmp_path: Path) -> None:
     assert generate(command(tmp_path, tmp_path / "whole", train=600)) == 0
     line = command(tmp_path, tmp_path / "out", train=600)
     for index in (3, 1, 7, 2, 6, 5, 4):
