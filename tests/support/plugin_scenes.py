@@ -36,12 +36,6 @@ def plane(bsdf: dict[str, Any], to_uv: Any = None, aspect: float = 1.0, half: fl
     return mesh
 
 
-def directional(omega_i: NDArray[np.float64], irradiance: float = 1.0) -> dict[str, Any]:
-    """Delta light from `omega_i` with an irradiance on z = 0, from above or from below."""
-    towards = [-float(c) for c in omega_i]
-    return {"type": "directional", "direction": towards, "irradiance": float(irradiance / abs(omega_i[2]))}
-
-
 def sensor_of(camera: Camera, spp: int = 1) -> dict[str, Any]:
     """The same camera as a sensor of Mitsuba."""
     target = np.array([*camera.target, 0.0])

@@ -1,5 +1,4 @@
-"""A material beyond its data: footprints from 0 to many tiles, directions down to the horizon, positions far
-away, numbers stored with half precision."""
+"""A material beyond its data: any footprint, direction and position; half precision."""
 
 from __future__ import annotations
 
@@ -58,20 +57,17 @@ def evaluate(material: Material, **changed: object) -> np.ndarray:
     return found
 
 
-@pytest.mark.parametrize("sigma", [0.0, 1e-38, 1e-12, 0.5 * 2.0**-3 * 0.999])
-def test_footprints_below_the_finest_level_read_the_finest(material: Material, sigma: float) -> None:
-    """Levels are clamped, to the last bit: the answer is that of σ_k = 2^-k / 2."""
-    assert np.array_equal(
-        evaluate(material, sigma=np.float32(sigma)), evaluate(material, sigma=np.float32(0.5 * 2.0**-3))
-    )
-
-
-@pytest.mark.parametrize("sigma", [0.5001, 1.0, 1000.0, 1e30, np.inf])
-def test_footprints_above_the_tile_read_the_coarsest_level(material: Material, sigma: float) -> None:
-    """The same for σ_0 = ½, infinite footprints included: a tile seen from afar stays what it is."""
-    assert np.array_equal(
-        evaluate(material, sigma=np.float32(sigma)), evaluate(material, sigma=np.float32(0.5))
-    )
+@pytest.mark.parametrize(
+    ("sigmas", "level"),
+    [((0.0, 1e-38, 1e-12, 0.5 * 2.0**-3 * 0.999), 3), ((0.5001, 1.0, 1e3, 1e30, np.inf), 0)],
+)
+def test_footprints_are_clamped_to_the_levels(
+    material: Material, sigmas: tuple[float, ...], level: int
+) -> None:
+    """To the last bit: the answer is that of σ_k = 2^-k / 2, for k = 0 and the finest."""
+    expected = evaluate(material, sigma=np.float32(0.5 * 2.0**-level))
+    for sigma in sigmas:
+        assert np.array_equal(evaluate(material, sigma=np.float32(sigma)), expected)
 
 
 def test_footprints_at_the_ends_and_between_levels_are_continuous(material: Material) -> None:

@@ -1,5 +1,4 @@
-"""Training where it is hard: long after convergence, with outliers, constant or black channels, values of
-any size, directions down to the horizon."""
+"""Difficult training: many epochs, outliers, constant or black channels, any scale, the horizon."""
 
 from __future__ import annotations
 
@@ -99,9 +98,9 @@ def glossy(u: F32, sigma: F32, omega_i: F32, omega_o: F32) -> NDArray[np.float64
 
 def test_many_epochs_of_few_noisy_queries_stay_bounded() -> None:
     """One half in ten has found the light, and is ten times too bright: noise five times the variance or
-    more. 150 times round 4000 such queries the networks learn them by heart and, between them, answer
-    whatever comes out of an exponential: 38 to 750 times the variance over three seeds. Pulled towards 0 as
-    noise and number ask for they miss 0.9 to 1.3 of it; 1 is what the mean value misses."""
+    more. 150 times round 4000 such queries the networks overfit the noise and, between them, give
+    arbitrary values: 38 to 750 times the variance over three seeds. With noise
+    regularization they miss 0.9 to 1.3 of it; 1 is what the mean value misses."""
     random = np.random.default_rng(0)
     at, true = arrays(), glossy(*arrays().values())
     a, b = (10 * true * (random.random((len(true), 1)) < 0.1) for _ in range(2))
@@ -120,9 +119,8 @@ def test_many_epochs_of_few_noisy_queries_stay_bounded() -> None:
 
 
 def test_outliers_do_not_dominate() -> None:
-    """Four values of 1e5 among 4000 around 0.1. Each pulls like an error of 10 times the value it should have
-    (the bound), 4/4000 of all: one per cent of the mean, which is a few per cent of the deviation; locally
-    more. So the error elsewhere is at most 0.1 of the variance more than without them."""
+    """Four values of 1e5 among 4000 around 0.1. Each has the gradient of an error of 10 times its true
+    value (the bound). They increase the error elsewhere by at most 0.1 of the variance."""
     value = parallax(*arrays().values())
     clean = missed(predictions(fitted(value)), unseen())
     value[np.random.default_rng(3).choice(len(value), 4, replace=False)] = 1e5

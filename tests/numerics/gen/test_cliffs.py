@@ -1,7 +1,4 @@
-"""Cliffs, needles, towers and whispers: reliefs of slope 100, of ten tiles and of 1e-6, maps of odd shapes.
-
-Whatever the relief, a white furnace returns 1, black returns 0, and the tile mean is reciprocal.
-"""
+"""Steep, high and tiny reliefs and maps of odd shapes: white furnace, black, and reciprocity."""
 
 from __future__ import annotations
 
@@ -116,7 +113,7 @@ def test_grazing_light_and_view_stay_finite(relief: HeightGrid) -> None:
         assert e.lost <= 1e-3 * e.paths
 
 
-def test_a_whisper_of_relief_is_a_plane() -> None:
+def test_a_tiny_displacement_is_a_plane() -> None:
     """Heights of 1e-6 tile widths, displaced: albedo/π within the slopes, 1e-4."""
     n = 500
     q = queries(np.random.default_rng(0).random((n, 2)), 0.01, direction(60, 20), direction(70, 100), n)

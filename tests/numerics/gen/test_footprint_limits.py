@@ -25,14 +25,8 @@ def test_a_vanishing_footprint_is_a_point(
     omega_i, omega_o = direction(elevation_i, azimuth_i), direction(elevation_o, azimuth_o)
     n = 500
     x = (np.arange(n) + 0.37) / n
-    e = estimate(
-        GROOVE.grid,
-        lambert(0.7),
-        LightKernel(0.0),
-        queries(np.column_stack([x, x[::-1]]), sigma, omega_i, omega_o, n),
-        2,
-        transport=DIRECT,
-    )
+    q = queries(np.column_stack([x, x[::-1]]), sigma, omega_i, omega_o, n)
+    e = estimate(GROOVE.grid, lambert(0.7), LightKernel(0.0), q, 2, transport=DIRECT)
     near = np.stack([GROOVE.value(x + d, omega_i, omega_o) for d in (-1e-4, 0.0, 1e-4)])
     clear = np.all(near == near[0], axis=0)
     assert clear.mean() > 0.98
@@ -46,14 +40,8 @@ def test_a_huge_footprint_is_the_tile_mean(sigma: float) -> None:
     omega_i, omega_o = direction(35, 10), direction(50, 200)
     expected = GROOVE.tile_mean(omega_i, omega_o)
     for u in ([0.25, 0.0], [0.75, 0.5]):
-        e = estimate(
-            GROOVE.grid,
-            lambert(0.7),
-            LightKernel(0.0),
-            queries(u, sigma, omega_i, omega_o, 8000),
-            32,
-            transport=DIRECT,
-        )
+        q = queries(u, sigma, omega_i, omega_o, 8000)
+        e = estimate(GROOVE.grid, lambert(0.7), LightKernel(0.0), q, 32, transport=DIRECT)
         mean = mean_estimate(0.5 * (e.value_a + e.value_b)[:, 0])
         assert mean.relative_error < 5e-3
         assert z_test(mean, expected).p_value > 1e-4

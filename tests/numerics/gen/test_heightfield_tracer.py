@@ -33,15 +33,8 @@ def narrow(rows: int, columns: int, aspect: float) -> HeightGrid:
     return HeightGrid(0.2 * (heights - heights.max()), aspect)
 
 
-GRIDS = [
-    rocks(64),
-    odd(),
-    needles(),
-    HeightGrid(np.array([[0.0, -0.3]]), 0.5),
-    narrow(7, 3, 0.31),
-    narrow(9, 1, 0.6),
-    narrow(4, 16, 0.25),
-]
+SMALL = [narrow(7, 3, 0.31), narrow(9, 1, 0.6), narrow(4, 16, 0.25)]
+GRIDS = [rocks(64), odd(), needles(), HeightGrid(np.array([[0.0, -0.3]]), 0.5), *SMALL]
 NAMES = ["rocks", "23 x 37", "needles", "1 x 2", "7 x 3", "9 x 1", "4 x 16"]
 
 
@@ -188,8 +181,7 @@ def numbers(n: int) -> Any:
 
 
 def test_borders_are_counted_through_holes() -> None:
-    """A ray that passes through holes has crossed as many borders as a straight line to where it ends, and
-    the cap cuts just those that cross more."""
+    """Rays through holes cross as many borders as a straight line; the cap cuts those that cross more."""
     grid, n = rocks(32), 20_000
     field = HeightField.of(grid, 32.0, True)
     rng = np.random.default_rng(3)

@@ -1,11 +1,9 @@
-"""What must not change a value: where the tile begins, from where a position or a height is counted, the
-renderer's unit of length, the number of threads."""
+"""Values do not depend on the tile's origin, offsets of position or height, or the unit of length."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-import drjit as dr
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
@@ -13,12 +11,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from support.scenes import (
     DIRECT,
-    Estimator,
     HeightGrid,
     LightKernel,
-    Stream,
     Transport,
-    build_tile,
     direction,
     estimate,
     lambert,
@@ -128,21 +123,6 @@ def test_the_unit_of_length_is_of_no_consequence(unit: float, monkeypatch: pytes
         mean = mean_of_halves(e.value_a[:, 0], e.value_b[:, 0])
         assert abs(mean.value - 1.0) < 2e-4 + 4 * mean.error
         assert e.lost <= 2
-
-
-def test_values_do_not_depend_on_the_number_of_threads() -> None:
-    q = queries(positions(), 0.05, LIGHT, VIEW, N)
-    e = Estimator(build_tile(RELIEF, lambert(0.8)), LightKernel(5.0), Transport())
-    before, found = dr.thread_count(), []
-    try:
-        for threads in (1, 3):
-            dr.set_thread_count(threads)
-            found.append(e.estimate(q, 8, Stream(0, "train", 0)))
-    finally:
-        dr.set_thread_count(before)
-    one, three = found
-    assert np.array_equal(one.value_a, three.value_a)
-    assert np.array_equal(one.value_b, three.value_b)
 
 
 def test_faint_values_are_as_exact_as_others() -> None:

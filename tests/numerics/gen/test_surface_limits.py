@@ -1,5 +1,4 @@
-"""Mirrors, grazing views, values out of range and NaN, shading normals: the surface through the whole
-estimator, on a plane where the answer is known."""
+"""The surface at its limits, on a plane: mirrors, grazing views, clipped values, NaN, shading normals."""
 
 from __future__ import annotations
 
@@ -23,13 +22,9 @@ GOLD = np.array([0.9, 0.6, 0.3])
 
 def bitmap(pixels: ArrayLike, filter_type: str = "bilinear") -> dict[str, Any]:
     array = np.ascontiguousarray(pixels, np.float32)
-    return {
-        "type": "bitmap",
-        "bitmap": mi.Bitmap(array[..., None] if array.ndim == 2 else array),
-        "raw": True,
-        "filter_type": filter_type,
-        "wrap_mode": "repeat",
-    }
+    image = mi.Bitmap(array[..., None] if array.ndim == 2 else array)
+    more = {"raw": True, "filter_type": filter_type, "wrap_mode": "repeat"}
+    return {"type": "bitmap", "bitmap": image, **more}
 
 
 def surface(color: ArrayLike = 1.0, **values: Any) -> dict[str, Any]:
@@ -96,18 +91,15 @@ def test_polished_dielectric_mirrors_and_scatters_the_rest() -> None:
 @pytest.mark.parametrize("kind", ["metallic", "specular", "clearcoat"])
 @pytest.mark.parametrize("width", [0.05, 0.2, 1.0])
 def test_value_is_continuous_from_a_mirror_on(kind: str, width: float) -> None:
-    """The mirror below roughness 0.00316 and the lobe above it cannot be told apart, even at the mirrored
+    """The mirror below roughness 0.00316 and the lobe above it do not differ, even at the mirrored
     direction under a light narrower than the sun."""
     light = LightKernel(width)
     omega_o = towards(np.array([0.95, 0.5, 0.2, 0.05]), 10.0)
     omega_i = mirrored(omega_o)
     seen = []
     for r in (0.0, 0.00315, 0.00318):
-        given = (
-            {"clearcoat": 1.0, "clearcoat_roughness": r}
-            if kind == "clearcoat"
-            else {kind: 1.0, "roughness": r}
-        )
+        own = {"clearcoat": 1.0, "clearcoat_roughness": r}
+        given = own if kind == "clearcoat" else {kind: 1.0, "roughness": r}
         seen.append(values(surface(0.5, **given), light, omega_i, omega_o, 1 << 16)[:, 0])
     for a, b in itertools.pairwise(seen):
         np.testing.assert_allclose(a, b, rtol=0.006)
@@ -170,15 +162,8 @@ def test_grazing_light_and_view_give_finite_values() -> None:
 def test_roughness_outside_its_range_is_clipped(name: str) -> None:
     given = {"metallic": 1.0} if name == "roughness" else {"clearcoat": 1.0}
     for out, limit in ((-1e-3, 0.0), (1.001, 1.0)):
-        a, b = (
-            values(
-                surface(0.5, **given, **{name: bitmap(np.full((2, 2), x))}),
-                LightKernel(2.0),
-                direction(50, 0),
-                direction(50, 180),
-            )
-            for x in (out, limit)
-        )
+        bsdfs = (surface(0.5, **given, **{name: bitmap(np.full((2, 2), x))}) for x in (out, limit))
+        a, b = (values(bsdf, LightKernel(2.0), direction(50, 0), direction(50, 180)) for bsdf in bsdfs)
         np.testing.assert_allclose(a, b, rtol=1e-6)
 
 
@@ -191,18 +176,11 @@ def test_black_is_black(roughness: float) -> None:
 
 
 # Every parameter as a map, so that all cases share their kernels.
-MAPS = {
-    "base_color": np.full((2, 2, 3), 0.5),
-    "roughness": np.full((2, 2), 0.3),
-    "metallic": np.full((2, 2), 0.5),
-    "specular": np.full((2, 2), 0.5),
-    "clearcoat": np.full((2, 2), 0.5),
-    "clearcoat_roughness": np.full((2, 2), 0.2),
-    "sheen": np.full((2, 2), 0.5),
-    "sheen_color": np.full((2, 2, 3), 0.5),
-    "sheen_roughness": np.full((2, 2), 0.3),
-    "slopes": np.zeros((2, 2, 3)),
-}
+NUMBERS = {"roughness": 0.3, "metallic": 0.5, "specular": 0.5, "clearcoat": 0.5, "clearcoat_roughness": 0.2}
+NUMBERS |= {"sheen": 0.5, "sheen_roughness": 0.3}
+MAPS = {name: np.full((2, 2), value) for name, value in NUMBERS.items()}
+MAPS |= {name: np.full((2, 2, 3), 0.5) for name in ("base_color", "sheen_color")}
+MAPS["slopes"] = np.zeros((2, 2, 3))
 
 
 @pytest.mark.parametrize(

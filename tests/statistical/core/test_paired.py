@@ -1,8 +1,4 @@
-"""The kit's estimates are unbiased and their error bars honest: repeated experiments with known truth.
-
-Each experiment draws queries and noise anew from a fixed seed; over many experiments the estimates must
-scatter about the truth as their own error bars say.
-"""
+"""Estimates are unbiased and their error bars correct, over repeated experiments with known truth."""
 
 from __future__ import annotations
 
@@ -24,6 +20,7 @@ from mbtf_core.stats import (
 )
 
 Floats = NDArray[np.float64]
+Experiment = Callable[[np.random.Generator], Estimate]
 EXPERIMENTS = 600
 QUERIES = 1000
 # Noise of the two halves differs, is skewed, and grows with the value: nothing in the kit may rely on less.
@@ -40,7 +37,7 @@ def draw(rng: np.random.Generator, shape: tuple[int, ...] = (QUERIES, 3)) -> tup
     return truth, a, b
 
 
-def pulls(experiment: Callable[[np.random.Generator], Estimate], truth: float) -> tuple[Floats, Floats]:
+def normalized_deviations(experiment: Experiment, truth: float) -> tuple[Floats, Floats]:
     """Values over experiments, and their deviations from the truth in their own standard errors."""
     rng = np.random.default_rng(20260101)
     found = [experiment(rng) for _ in range(EXPERIMENTS)]
@@ -48,25 +45,29 @@ def pulls(experiment: Callable[[np.random.Generator], Estimate], truth: float) -
     return values, (values - truth) / np.array([e.error for e in found])
 
 
-def values_of(experiment: Callable[[np.random.Generator], Estimate]) -> Floats:
+def values_of(experiment: Experiment) -> Floats:
     """Values over experiments that are too small for error bars."""
     rng = np.random.default_rng(20260101)
     return np.array([experiment(rng).value for _ in range(EXPERIMENTS)])
 
 
-def assert_honest(experiment: Callable[[np.random.Generator], Estimate], truth: float) -> None:
-    """Mean of the values on the truth (4.5σ), spread of the pulls 1 (4.5σ and 3 % for skewness)."""
-    values, pull = pulls(experiment, truth)
+def assert_honest(experiment: Experiment, truth: float) -> None:
+    """Unbiased values (4.5σ); normalized deviations have standard deviation 1 (4.5σ, 3 % for skewness)."""
+    values, deviations = normalized_deviations(experiment, truth)
     assert abs(values.mean() - truth) < 4.5 * values.std(ddof=1) / np.sqrt(EXPERIMENTS)
-    assert abs(pull.std(ddof=1) - 1.0) < 4.5 / np.sqrt(2.0 * EXPERIMENTS) + 0.03
+    assert abs(deviations.std(ddof=1) - 1.0) < 4.5 / np.sqrt(2.0 * EXPERIMENTS) + 0.03
 
 
 VARIANCE = (NOISE_A**2 + NOISE_B**2) / 4.0
 SIGNAL = (0.5**2 + 1.0**2 + 1.5**2) / 3.0
 
 
-def test_pooled_variance() -> None:
-    assert_honest(lambda rng: pooled_variance(*draw(rng)[1:]), VARIANCE)
+@pytest.mark.parametrize(
+    ("estimator", "truth"),
+    [(pooled_variance, VARIANCE), (pooled_error, float(np.sqrt(VARIANCE))), (signal_variance, SIGNAL)],
+)
+def test_variances_of_noise_and_signal(estimator: Callable[[Floats, Floats], Estimate], truth: float) -> None:
+    assert_honest(lambda rng: estimator(*draw(rng)[1:]), truth)
 
 
 def test_a_wrong_divisor_is_caught() -> None:
@@ -78,10 +79,6 @@ def test_a_wrong_divisor_is_caught() -> None:
 
     with pytest.raises(AssertionError):
         assert_honest(wrong, VARIANCE)
-
-
-def test_pooled_error() -> None:
-    assert_honest(lambda rng: pooled_error(*draw(rng)[1:]), float(np.sqrt(VARIANCE)))
 
 
 def test_noise_free_mse() -> None:
@@ -116,18 +113,14 @@ def test_channels_of_a_query_are_no_extra_samples() -> None:
     assert_honest(lambda rng: signal_variance(*(h[:, [0, 0, 0]] for h in draw(rng)[1:])), 0.25)
 
 
-def test_signal_variance() -> None:
-    assert_honest(lambda rng: signal_variance(*draw(rng)[1:]), SIGNAL)
-
-
 @pytest.mark.parametrize("queries", [2, 5])
 def test_signal_variance_is_unbiased_for_few_queries(queries: int) -> None:
     values = values_of(lambda rng: signal_variance(*draw(rng, (queries, 3))[1:]))
     assert abs(values.mean() - SIGNAL) < 4.5 * values.std(ddof=1) / np.sqrt(EXPERIMENTS)
 
 
-def test_signal_variance_of_buffers() -> None:
-    """Texels of a buffer share directions; with few buffers the correction for their means matters."""
+def test_signal_variance_of_images() -> None:
+    """Texels of an image share directions; with few images the correction for their means matters."""
 
     def experiment(rng: np.random.Generator) -> Estimate:
         return signal_variance(*draw(rng, (4, 3, 5, 3))[1:])
@@ -149,15 +142,15 @@ def test_unexplained_variance() -> None:
     assert_honest(experiment, 0.16)
 
 
-def test_unexplained_variance_of_buffers_has_an_error_bar_by_buffer() -> None:
+def test_unexplained_variance_of_images_has_an_error_bar_by_image() -> None:
     def experiment(rng: np.random.Generator) -> Estimate:
         truth, a, b = draw(rng, (200, 2, 2, 3))
         return unexplained_variance(
             np.array([1.0, 2.0, 3.0]) + 0.0 * truth + rng.normal(size=(200, 1, 1, 1)), a, b
         )
 
-    _, pull = pulls(experiment, 1.0 + 1.0 / SIGNAL)
-    assert abs(pull.std(ddof=1) - 1.0) < 0.2
+    _, deviations = normalized_deviations(experiment, 1.0 + 1.0 / SIGNAL)
+    assert abs(deviations.std(ddof=1) - 1.0) < 0.2
 
 
 def test_unexplained_variance_of_queries_taken_by_their_brightness() -> None:
@@ -205,9 +198,8 @@ def test_mse_difference_is_sharper_than_two_errors() -> None:
     assert_honest(experiment, 0.10**2 - 0.12**2)
     truth, a, b = draw(np.random.default_rng(5))
     p, q = truth + 0.10, truth + 0.12
-    assert mse_difference(p, q, a, b).error < 0.3 * np.hypot(
-        noise_free_mse(p, a, b).error, noise_free_mse(q, a, b).error
-    )
+    separate = [noise_free_mse(x, a, b).error for x in (p, q)]
+    assert mse_difference(p, q, a, b).error < 0.3 * np.hypot(*separate)
 
 
 def test_mean_of_halves_counts_noise_alone() -> None:
@@ -215,9 +207,7 @@ def test_mean_of_halves_counts_noise_alone() -> None:
     truth, _, _ = draw(np.random.default_rng(1))
 
     def experiment(rng: np.random.Generator) -> Estimate:
-        return mean_of_halves(
-            truth + NOISE_A * (rng.exponential(size=truth.shape) - 1.0),
-            truth + NOISE_B * (rng.exponential(size=truth.shape) - 1.0),
-        )
+        noise = (s * (rng.exponential(size=truth.shape) - 1.0) for s in (NOISE_A, NOISE_B))
+        return mean_of_halves(*(truth + n for n in noise))
 
     assert_honest(experiment, float(truth.mean()))

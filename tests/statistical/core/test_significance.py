@@ -31,10 +31,8 @@ def assert_uniform(p_values: list[float]) -> None:
 def halves(rng: np.random.Generator, truth: Floats, noise: float = 1.0) -> tuple[Floats, Floats]:
     """Two halves with heavy-tailed noise of the given standard deviation (Student, 5 degrees of freedom)."""
     scale = noise / np.sqrt(5.0 / 3.0)
-    return (
-        truth + scale * rng.standard_t(5, size=truth.shape),
-        truth + scale * rng.standard_t(5, size=truth.shape),
-    )
+    a, b = (truth + scale * rng.standard_t(5, size=truth.shape) for _ in range(2))
+    return a, b
 
 
 def test_z_test_is_uniform_under_the_null() -> None:
@@ -88,7 +86,7 @@ def test_a_bias_of_one_sigma_per_query_is_found_in_the_aggregate() -> None:
     assert z_test(mean_of_halves(a, b), float(truth.mean())).p_value < 1e-12
 
 
-def test_equivalence_turns_the_burden_of_proof_round() -> None:
+def test_equivalence_needs_evidence_of_closeness() -> None:
     close, vague = Estimate(1.001, 0.002, 5000), Estimate(1.001, 0.2, 5000)
     assert equivalence_test(close, 1.0, 0.01).p_value < 1e-4
     assert equivalence_test(vague, 1.0, 0.01).p_value > 0.4
@@ -107,9 +105,9 @@ def test_corrections() -> None:
     assert sidak([0.01, 0.5]) == pytest.approx([1 - 0.99**2, 0.75])
     assert sidak([1e-18, 1.0]) == pytest.approx([2e-18, 1.0], rel=1e-12)
     rng = np.random.default_rng(8)
-    drawn = rng.random((2000, 20))
+    p_values = rng.random((2000, 20))
     for correct in (holm, sidak):
-        rate = np.mean([correct(row).min() < 0.05 for row in drawn])
+        rate = np.mean([correct(row).min() < 0.05 for row in p_values])
         assert rate == pytest.approx(0.05, abs=4.0 * np.sqrt(0.05 * 0.95 / 2000))
 
 

@@ -101,7 +101,7 @@ def test_light_reaches_surfaces_below_holes(lace: dict[str, Any]) -> None:
 @pytest.mark.parametrize("kind", ["mbtf", "mask"])
 def test_emitters_behind_holes_are_counted_once(integrator: str, kind: str, lace: dict[str, Any]) -> None:
     """Ground below a wide sheet below a sky. In ``mbtf_path`` emitter sampling and the path's own directions
-    share the light; stock shadow rays end at the sheet."""
+    share the light; Mitsuba's shadow rays end at the sheet."""
     mask = {"type": "mask", "opacity": 1.0 - SHARE, "b": {"type": "diffuse", "reflectance": 0.0}}
     sheet = {
         "type": "rectangle",

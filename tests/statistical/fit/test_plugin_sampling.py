@@ -38,17 +38,17 @@ def uniform(n: int, seed: int) -> tuple[Any, Any]:
 
 
 def p_value(seed: int, distort: float = 1.0) -> float:
-    """χ² of a random mixture's samples; `distort` scales the slopes of what is drawn."""
+    """χ² of a random mixture's samples; `distort` scales the slopes of the samples."""
     n = 40_000
     viewer = random_directions(np.random.default_rng(100 + seed), 1)[0]
 
     def mixture(width: int) -> Mixture:
         return random_mixture(np.random.default_rng(seed), viewer, width)
 
-    drawn = mixture(n)
-    lobe = drawn.lobe
+    sampled = mixture(n)
+    lobe = sampled.lobe
     wrong = Lobe(lobe.l11 * distort, lobe.l21, lobe.l22, lobe.x, lobe.y)
-    wo = np.array(Mixture(wrong, drawn.weight, drawn.viewer).sample(*uniform(n, seed))).T
+    wo = np.array(Mixture(wrong, sampled.weight, sampled.viewer).sample(*uniform(n, seed))).T
 
     def density(w: np.ndarray) -> np.ndarray:
         return np.array(mixture(len(w)).density(mi.Vector3f(w.T.astype(np.float32))), np.float64)
@@ -165,21 +165,17 @@ def test_weights_are_value_over_density_of_the_same_directions(folder: Path) -> 
     assert chi_square_test(wo, density, Cap(cos_min=0.0), bins=(12, 24)).p_value > 1e-3
 
 
+def film(size: int) -> dict[str, Any]:
+    return {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgb"}
+
+
 def furnace(bsdf: dict[str, Any], integrator: str, seed: int, spp: int = 64) -> np.ndarray:
     """Pixels of a sphere under constant white light, where it is seen."""
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "ball": {"type": "sphere", "bsdf": bsdf},
-            "light": {"type": "constant"},
-            "sensor": {
-                "type": "orthographic",
-                "to_world": mi.ScalarTransform4f().look_at([3, 2, 4], [0, 0, 0], [0, 1, 0])
-                @ mi.ScalarTransform4f().scale(0.6),
-                "film": {"type": "hdrfilm", "width": 12, "height": 12, "pixel_format": "rgb"},
-            },
-        }
-    )
+    view = mi.ScalarTransform4f().look_at([3, 2, 4], [0, 0, 0], [0, 1, 0])
+    to_world = view @ mi.ScalarTransform4f().scale(0.6)
+    sensor = {"type": "orthographic", "to_world": to_world, "film": film(12)}
+    ball = {"type": "sphere", "bsdf": bsdf}
+    scene = mi.load_dict({"type": "scene", "ball": ball, "light": {"type": "constant"}, "sensor": sensor})
     tracer = mi.load_dict({"type": integrator, "max_depth": 2})
     return np.array(mi.render(scene, integrator=tracer, spp=spp, seed=seed), np.float64)
 
@@ -202,24 +198,16 @@ def test_a_constant_material_equals_mitsubas_diffuse(integrator: str, tmp_path: 
     write_material(tmp_path, constant=tuple(c / np.pi for c in color))
     ours = {"type": "mbtf", "material": str(tmp_path), "networks": "cooperative"}
     theirs = {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(color)}}
+    lamp = {"type": "point", "position": [2, 1, 3], "intensity": 20.0}
+    lights = {"lamp": lamp, "sky": {"type": "constant", "radiance": 0.3}}
+    view = mi.ScalarTransform4f().look_at([1, -5, 3], [0, 0, 0.4], [0, 0, 1])
+    sensor = {"type": "perspective", "fov": 35, "to_world": view, "film": film(24)}
     means = {}
     for name, bsdf, kind, first in (("ours", ours, integrator, 0), ("theirs", theirs, "path", 100)):
         tracer = mi.load_dict({"type": kind, "max_depth": 5})
-        scene = mi.load_dict(
-            {
-                "type": "scene",
-                "ground": plane(bsdf, half=3.0),
-                "ball": {"type": "sphere", "center": [0, 0, 0.8], "radius": 0.8, "bsdf": bsdf},
-                "lamp": {"type": "point", "position": [2, 1, 3], "intensity": 20.0},
-                "sky": {"type": "constant", "radiance": 0.3},
-                "sensor": {
-                    "type": "perspective",
-                    "fov": 35,
-                    "to_world": mi.ScalarTransform4f().look_at([1, -5, 3], [0, 0, 0.4], [0, 0, 1]),
-                    "film": {"type": "hdrfilm", "width": 24, "height": 24, "pixel_format": "rgb"},
-                },
-            }
-        )
+        ball = {"type": "sphere", "center": [0, 0, 0.8], "radius": 0.8, "bsdf": bsdf}
+        entries = {"ground": plane(bsdf, half=3.0), "ball": ball, "sensor": sensor}
+        scene = mi.load_dict({"type": "scene", **entries, **lights})
         runs = [np.array(mi.render(scene, integrator=tracer, spp=16, seed=first + k)) for k in range(8)]
         means[name] = np.array([run.mean((0, 1)) for run in runs], np.float64)
     for channel in range(3):

@@ -42,13 +42,8 @@ def answers(model: TexturedMaterial, n: int, seed: int) -> TrainingQueries:
 
 
 def trainer(model: TexturedMaterial, data: TrainingQueries, **training: Any) -> Trainer:
-    options = {
-        "losses": [{"kind": "squared"}],
-        "huber_delta": None,
-        "warmup": 20,
-        "blur": {"initial_sigma": 0, "offset_sigma": 0},
-        **training,
-    }
+    blur = {"initial_sigma": 0, "offset_sigma": 0}
+    options = {"losses": [{"kind": "squared"}], "huber_delta": None, "warmup": 20, "blur": blur, **training}
     config = FitConfig.model_validate({"training": options})
     return Trainer(config, model, data, NoiseModel.silent(0.02, LATTICE))
 
@@ -90,17 +85,8 @@ def test_perturbed_parameters_are_recovered(queries: int, steps: int, bound: flo
         for p in model.parameters():
             p.add_(0.03 * p.std(correction=0) * torch.randn(p.shape, generator=generator))
     before = relative_error(model, unseen)
-    finish(
-        trainer(
-            model,
-            data,
-            steps=steps,
-            batch=2000,
-            learning_rate=2e-3,
-            texture_learning_rate=2e-3,
-            final_learning_rate_factor=1e-4,
-        )
-    )
+    rates = {"learning_rate": 2e-3, "texture_learning_rate": 2e-3, "final_learning_rate_factor": 1e-4}
+    finish(trainer(model, data, steps=steps, batch=2000, **rates))
     assert before > 5 * bound
     assert relative_error(model, unseen) < bound
 
@@ -123,11 +109,8 @@ def test_random_initializations_approach_the_true_values(
     data, unseen = answers(teacher(), queries, 0), answers(teacher(), 5000, 9)
     model = build_model("neumip", LATTICE, **network)
     model.initialize(torch.Generator().manual_seed(7), float(data.value.mean()))
-    options = {
-        "batch": 2000,
-        "texture_learning_rate": 1e-2,
-        "final_learning_rate_factor": 1e-3 if rate > 1e-2 else 1e-4,
-    }
+    final = 1e-3 if rate > 1e-2 else 1e-4
+    options = {"batch": 2000, "texture_learning_rate": 1e-2, "final_learning_rate_factor": final}
     finish(trainer(model, data, steps=steps, learning_rate=rate, **options))
     variance = (unseen.value - unseen.value.mean()).square().mean()
     share = relative_error(model, unseen) ** 2 * float(unseen.value.square().mean() / variance)
@@ -187,16 +170,8 @@ def sunk_plane(u: F32, sigma: F32, omega_i: F32, omega_o: F32) -> NDArray[np.flo
 
 
 DEPTH = 0.04
-WAVES = [
-    (1, 0, 0.3),
-    (0, 1, 1.0),
-    (1, 1, 2.0),
-    (2, -1, 0.5),
-    (1, 2, 4.0),
-    (-1, 2, 5.0),
-    (3, 1, 0.0),
-    (1, -3, 1.5),
-]
+WAVES = [(1, 0, 0.3), (0, 1, 1.0), (1, 1, 2.0), (2, -1, 0.5), (1, 2, 4.0), (-1, 2, 5.0), (3, 1, 0.0)]
+WAVES += [(1, -3, 1.5)]
 
 
 def test_the_offset_of_a_sunk_plane_is_its_depth(tmp_path: Path) -> None:

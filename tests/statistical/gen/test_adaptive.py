@@ -79,9 +79,7 @@ def test_values_of_a_skewed_scene_are_unbiased(skewed: tuple[Queries, Allocation
     assert z_test(mean_estimate((a - TRUTH) * (b - TRUTH))).p_value > 1e-3
 
 
-def test_a_skewed_scene_comes_near_its_target_and_what_is_reported_is_so(
-    skewed: tuple[Queries, Allocation],
-) -> None:
+def test_a_skewed_scene_comes_near_its_target_and_reports_it(skewed: tuple[Queries, Allocation]) -> None:
     q, allocation = skewed
     e = estimate_shard(FewBrightPaths(), q, 4, Target(0.2, 8192), Stream(1, "train", 0), allocation)
     value = 0.5 * (e.value_a[:, 0].astype(np.float64) + e.value_b[:, 0])
@@ -94,9 +92,7 @@ def test_a_skewed_scene_comes_near_its_target_and_what_is_reported_is_so(
     assert np.sqrt(np.mean(s**2)) == pytest.approx(np.sqrt(RARE * (1 - RARE)) * (BRIGHT - DIM), rel=0.05)
 
 
-def test_what_is_reported_does_not_hide_errors_that_the_cap_leaves(
-    skewed: tuple[Queries, Allocation],
-) -> None:
+def test_errors_that_the_cap_leaves_are_reported(skewed: tuple[Queries, Allocation]) -> None:
     """Bright paths among few make large values: an error divided by them would never be above one or so."""
     q, allocation = skewed
     e = estimate_shard(FewBrightPaths(), q, 4, Target(0.2, 8), Stream(1, "train", 0), allocation)
@@ -126,14 +122,9 @@ def config(tmp_path_factory: pytest.TempPathFactory) -> GeneratorConfig:
     folder = tmp_path_factory.mktemp("maps")
     rng = np.random.default_rng(4)
     np.save(folder / "height.npy", np.kron(rng.random((8, 8)), np.ones((2, 2))))
-    return GeneratorConfig.model_validate(
-        {
-            "material": str(folder / "height.npy"),
-            "geometry": {"height_scale": 0.05},
-            "queries": {"train": "1500", "test": "8", "test_spp": 4, "target_error": "6%", "max_spp": 256},
-            "output": {"shard_queries": 500},
-        }
-    )
+    queries = {"train": "1500", "test": "8", "test_spp": 4, "target_error": "6%", "max_spp": 256}
+    rest = {"geometry": {"height_scale": 0.05}, "queries": queries, "output": {"shard_queries": 500}}
+    return GeneratorConfig.model_validate({"material": str(folder / "height.npy"), **rest})
 
 
 def test_the_error_reached_is_the_target(config: GeneratorConfig, tmp_path: Path) -> None:
@@ -147,9 +138,8 @@ def test_the_error_reached_is_the_target(config: GeneratorConfig, tmp_path: Path
     assert len(np.unique(spp)) > 4
     assert found.target["missed"] <= (spp == 256).sum()
     # Against a run of many paths: the squared error that the halves do not know of.
-    fixed = config.model_dump() | {
-        "queries": {**config.model_dump()["queries"], "target_error": None, "spp": 512}
-    }
+    fixed = config.model_dump()
+    fixed["queries"] |= {"target_error": None, "spp": 512}
     generate(GeneratorConfig.model_validate(fixed), tmp_path / "many")
     many = Dataset.open(tmp_path / "many").load("train")
     np.testing.assert_array_equal(many["u"], data["u"])
@@ -180,9 +170,7 @@ def small_pilots(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("kind", ["target", "noise"])
-def test_any_slices_merged_are_the_whole(
-    kind: str, config: GeneratorConfig, small_pilots: None, tmp_path: Path
-) -> None:
+def test_slices_equal_a_run(kind: str, config: GeneratorConfig, small_pilots: None, tmp_path: Path) -> None:
     """Seven of them, in any order: the same numbers of paths for every query, and the same values."""
     config = of_kind(config, kind)
     for index in (4, 2, 7, 1, 6, 3, 5):
@@ -197,9 +185,7 @@ def test_any_slices_merged_are_the_whole(
 
 
 @pytest.mark.parametrize("kind", ["target", "noise"])
-def test_counts_do_not_depend_on_launches_or_threads(
-    kind: str, config: GeneratorConfig, small_pilots: None
-) -> None:
+def test_counts_ignore_launches_and_threads(kind: str, config: GeneratorConfig, small_pilots: None) -> None:
     job = Job.prepare(of_kind(config, kind))
     plan = plan_run(job)
     n = 600
@@ -227,35 +213,21 @@ def test_counts_do_not_depend_on_launches_or_threads(
 
 def test_a_closed_form_needs_no_paths(tmp_path: Path) -> None:
     np.save(tmp_path / "height.npy", np.zeros((4, 4)))
-    flat = GeneratorConfig.model_validate(
-        {
-            "material": str(tmp_path / "height.npy"),
-            "queries": {"train": "50", "test": "8", "target_error": 0.01},
-        }
-    )
+    queries = {"train": "50", "test": "8", "target_error": 0.01}
+    flat = GeneratorConfig.model_validate({"material": str(tmp_path / "height.npy"), "queries": queries})
     found = generate(flat, tmp_path / "out")
     assert found.paths == 0
     assert found.relative_error == 0.0
     assert found.target is None
 
 
-def test_image_buffers_and_holes_keep_their_shape(tmp_path: Path) -> None:
+def test_images_and_transmittance_keep_their_shape(tmp_path: Path) -> None:
     rng = np.random.default_rng(4)
     np.save(tmp_path / "height.npy", rng.random((8, 8)))
     np.save(tmp_path / "opacity.npy", (rng.random((8, 8)) > 0.3).astype(np.float32))
-    config = GeneratorConfig.model_validate(
-        {
-            "material": str(tmp_path),
-            "geometry": {"height_scale": 0.02},
-            "queries": {
-                "train": "256",
-                "test": "64",
-                "test_spp": 4,
-                "layout": "image",
-                "target_error": "10%",
-            },
-        }
-    )
+    queries = {"train": "256", "test": "64", "test_spp": 4, "layout": "image", "target_error": "10%"}
+    sections = {"geometry": {"height_scale": 0.02}, "queries": queries}
+    config = GeneratorConfig.model_validate({"material": str(tmp_path), **sections})
     generate(config, tmp_path / "out")
     data = Dataset.open(tmp_path / "out").load("train")
     assert data["spp"].shape == data["transmittance"].shape == data["value_a"].shape[:-1] == (4, 8, 8)

@@ -95,14 +95,8 @@ def test_bias_bounds_equal_the_rendered_change(shape: tuple[int, int]) -> None:
     queries = pilot_queries(job, QUERIES)
     mapped = normal_map_slopes(job)
     assert mapped is not None
-    bounds = relief_bounds(
-        job.grid,
-        queries.omega_i.astype(np.float64),
-        queries.omega_o.astype(np.float64),
-        LightKernel(0.0),
-        base[..., None],
-        mapped[0],
-    )
+    light_and_view = (w.astype(np.float64) for w in (queries.omega_i, queries.omega_o))
+    bounds = relief_bounds(job.grid, *light_and_view, LightKernel(0.0), base[..., None], mapped[0])
     # The plane's slopes alone: the bound of parallax ignores the normal map.
     plain = finest_job(replace(stuff, normal=None), "all")
     bare = plan_effects(plain)
@@ -189,8 +183,7 @@ class Rare:
 
 
 def test_rare_large_changes_keep_an_effect_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Three of eight thousand queries changed, so nine may have. Two standard errors alone would fit the
-    tolerance."""
+    """Three of eight thousand queries changed, so the bound allows for nine."""
     monkeypatch.setattr(planning, "Pilot", Rare)
     job = job_of(lambert(waves(32, 32), 0.3), transport={"max_depth": 0})
     assert Rare().limited(1).upper < job.config.effects.tolerance

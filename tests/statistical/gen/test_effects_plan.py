@@ -49,18 +49,9 @@ def material(relief: float, albedo: Any = 0.5, **more: Any) -> Material:
 def job_of(
     stuff: Material, mode: str = "auto", min_cos: float = 0.1, width: float = 1.0, depth: int = 0
 ) -> Job:
-    return Job(
-        GeneratorConfig.model_validate(
-            {
-                "material": "m",
-                "effects": {"mode": mode},
-                "queries": {"min_cos": min_cos, "resolution": 64},
-                "light": {"width": width},
-                "transport": {"max_depth": depth},
-            }
-        ),
-        stuff,
-    )
+    sections = {"effects": {"mode": mode}, "light": {"width": width}, "transport": {"max_depth": depth}}
+    sections["queries"] = {"min_cos": min_cos, "resolution": 64}
+    return Job(GeneratorConfig.model_validate({"material": "m", **sections}), stuff)
 
 
 def estimates(job: Job, plan: EffectsPlan, seed: int = 1) -> Estimates:

@@ -1,5 +1,4 @@
-"""What a plan decides reaches the traced paths and the shards: aprons, launches, colors, transmittance,
-resumed plans."""
+"""The plan decides which paths are traced and what the shards store; resumed runs keep it."""
 
 from __future__ import annotations
 
@@ -89,9 +88,8 @@ def test_the_closed_form_is_the_color_over_pi() -> None:
 
 def test_a_manifest_keeps_every_number_of_a_plan() -> None:
     plan = plan_effects(job_of(lambert(noise(4, 4), 0.01), "none"))
-    changed = replace(
-        plan, max_depth=3, cap_bias_bound=0.25, roulette_depth=7, mode="x", tolerance=0.5, closed_form=True
-    )
+    limits = {"max_depth": 3, "cap_bias_bound": 0.25, "roulette_depth": 7}
+    changed = replace(plan, **limits, mode="x", tolerance=0.5, closed_form=True)
     assert EffectsPlan.from_manifest(json.loads(json.dumps(changed.to_manifest()))) == changed
 
 
@@ -121,14 +119,9 @@ def recorder(monkeypatch: pytest.MonkeyPatch) -> Recorder:
 @pytest.fixture
 def config(tmp_path: Path) -> GeneratorConfig:
     np.save(tmp_path / "height.npy", noise(4, 8))
-    return GeneratorConfig.model_validate(
-        {
-            "material": str(tmp_path / "height.npy"),
-            "queries": {"train": "100", "test": "30", "spp": 2, "test_spp": 4},
-            "output": {"shard_queries": 40},
-            "effects": {"mode": "all"},
-        }
-    )
+    queries = {"train": "100", "test": "30", "spp": 2, "test_spp": 4}
+    rest = {"queries": queries, "output": {"shard_queries": 40}, "effects": {"mode": "all"}}
+    return GeneratorConfig.model_validate({"material": str(tmp_path / "height.npy"), **rest})
 
 
 def test_resumed_and_sliced_runs_follow_the_plan_of_the_manifest(
@@ -152,9 +145,7 @@ def test_resumed_and_sliced_runs_follow_the_plan_of_the_manifest(
     assert json.loads((out / "manifest.json").read_text())["effects"] == stored.to_manifest()
 
 
-def test_shards_hold_what_passed_through_the_holes(
-    config: GeneratorConfig, recorder: Recorder, tmp_path: Path
-) -> None:
+def test_shards_store_the_transmittance(config: GeneratorConfig, recorder: Recorder, tmp_path: Path) -> None:
     generate(config, tmp_path / "out")
     data = Dataset.open(tmp_path / "out").load("train")
     np.testing.assert_array_equal(data["transmittance"], data["u"][:, 0])

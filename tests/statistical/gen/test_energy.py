@@ -44,10 +44,8 @@ def test_closed_white_furnace_returns_one(view: tuple[float, float]) -> None:
 @pytest.mark.parametrize("light", [LightKernel(2.0), None], ids=["lobe", "furnace"])
 def test_roulette_changes_nothing_but_the_noise(light: LightKernel | None) -> None:
     q = tile_mean_queries(direction(40, 60), direction(55, 200), 20_000)
-    with_it, without = (
-        estimate(rocks(), lambert(0.7), light, q, 16, transport=Transport(roulette_depth=r), seed=r)
-        for r in (1, 1000)
-    )
+    seeds = {r: Transport(roulette_depth=r) for r in (1, 1000)}.items()
+    with_it, without = (estimate(rocks(), lambert(0.7), light, q, 16, transport=t, seed=r) for r, t in seeds)
     first, second = (mean_of_halves(e.value_a[:, 0], e.value_b[:, 0]) for e in (with_it, without))
     assert first.relative_error < 5e-3
     assert first.error > second.error
@@ -59,10 +57,8 @@ def test_roulette_changes_nothing_but_the_noise(light: LightKernel | None) -> No
 def test_roulette_leaves_direct_light_alone(albedo: float, width: float) -> None:
     """Light that surface sampling finds must not hang on the few paths that roulette spares."""
     q = tile_mean_queries(direction(40, 60), direction(55, 200), 8_000)
-    early, late = (
-        estimate(rocks(), lambert(albedo), LightKernel(width), q, 8, transport=Transport(roulette_depth=r))
-        for r in (1, 1000)
-    )
+    light, limits = LightKernel(width), [Transport(roulette_depth=r) for r in (1, 1000)]
+    early, late = (estimate(rocks(), lambert(albedo), light, q, 8, transport=t) for t in limits)
     noise = [float(np.mean((e.value_a.astype(np.float64) - e.value_b) ** 2)) for e in (early, late)]
     assert noise[0] < 2.0 * noise[1]
 
@@ -111,10 +107,7 @@ class NoCosine(mi.BSDF):  # type: ignore[misc]
 
 def test_reciprocity_fails_without_a_cosine() -> None:
     one, other = direction(*PAIRS[1][0]), direction(*PAIRS[1][1])
-    forward, backward = (
-        tile_mean(rocks(), lambert(0.9), one, other, 1),
-        tile_mean(rocks(), lambert(0.9), other, one, 2),
-    )
+    forward, backward = (tile_mean(rocks(), lambert(0.9), *w) for w in ((one, other, 1), (other, one, 2)))
     # Values divided by the light's cosine, as some published data are: no longer reciprocal.
     assert z_test(forward.scaled(1 / one[2]), backward.scaled(1 / other[2])).p_value < 1e-6
     # The cosine dropped inside the BSDF.

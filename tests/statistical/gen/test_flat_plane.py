@@ -1,5 +1,4 @@
-"""A homogeneous plane: M is the BRDF averaged over the light kernel, for every position, footprint and
-direction."""
+"""A homogeneous plane: M is the BRDF averaged over the light kernel, at every query."""
 
 from __future__ import annotations
 
@@ -76,21 +75,14 @@ def kernel_average(
 
 
 ROUGH = {"type": "roughconductor", "alpha": 0.3, "distribution": "ggx", "material": "none"}
-PRINCIPLED = {
-    "type": "principled",
-    "base_color": {"type": "rgb", "value": [0.6, 0.6, 0.6]},
-    "roughness": 0.35,
-    "metallic": 0.4,
-    "specular": 0.5,
-}
+GRAY = {"type": "rgb", "value": [0.6, 0.6, 0.6]}
+PRINCIPLED = {"type": "principled", "base_color": GRAY, "roughness": 0.35, "metallic": 0.4, "specular": 0.5}
 
 
 @pytest.mark.parametrize("description", [ROUGH, PRINCIPLED], ids=["roughconductor", "principled"])
 @pytest.mark.parametrize("width", [1.0, 10.0])
 @pytest.mark.parametrize(("light", "view"), [(60, 50), (25, 30), (0.8, 20), (5, 5)])
-def test_glossy_is_the_kernel_average(
-    description: dict[str, Any], width: float, light: float, view: float
-) -> None:
+def test_glossy_kernel_average(description: dict[str, Any], width: float, light: float, view: float) -> None:
     omega_i, omega_o = direction(light, 10), direction(view, 175)
     expected = kernel_average(mi.load_dict(description), omega_i, omega_o, width)
     e = estimate(

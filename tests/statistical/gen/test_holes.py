@@ -8,15 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support.mitsuba_blocks import GRIDS, SPP, block, mitsuba_halves, random_queries
-from support.scenes import (
-    HeightGrid,
-    LightKernel,
-    direction,
-    flat,
-    mi,
-    queries,
-    rocks,
-)
+from support.scenes import HeightGrid, LightKernel, direction, directional, flat, mi, queries, rocks
 
 from mbtf_core.stats import aggregate_test, elevation_groups, mean_of_halves
 from mbtf_gen.render.estimator import Estimator, Stream
@@ -84,7 +76,7 @@ def test_paths_cut_at_the_cap_have_not_passed() -> None:
     assert e.lost == 0
 
 
-def test_a_path_that_is_drawn_again_passes_or_does_not() -> None:
+def test_resampled_paths_have_consistent_transmittance() -> None:
     """The transmittance is that of the paths that are stored: with one path per half, the share of halves
     that saw nothing."""
     n, bad = 4000, 0.1
@@ -124,13 +116,8 @@ def test_mitsuba_agrees_on_a_height_field_with_an_opacity_mask(depth: int, tmp_p
     grid = GRIDS["square"]
     omega_i = direction(22, 70)
     q = random_queries(4096, 0.02, omega_i)
-    emitter = {
-        "type": "directional",
-        "direction": [float(-c) for c in omega_i],
-        "irradiance": float(1 / omega_i[2]),
-    }
     mask = {"type": "mask", "opacity": opacity, "bsdf": {"type": "diffuse", "reflectance": color}}
-    a, b = mitsuba_halves(block(grid, mask, tmp_path), emitter, q, 1.0, depth + 1, "volpath")
+    a, b = mitsuba_halves(block(grid, mask, tmp_path), directional(omega_i), q, 1.0, depth + 1, "volpath")
     tile = build_tile(grid, {"type": "mbtf_surface", "base_color": color, "opacity": opacity})
     transport = Transport(max_depth=depth, roulette_depth=1000)
     ours = Estimator(tile, LightKernel(0.0), transport).estimate(q, SPP, Stream(5, "test", 0))
@@ -151,11 +138,8 @@ def test_transmittance_agrees_with_mitsuba(tmp_path: Path) -> None:
     black = {"type": "rgb", "value": 0.0}
     mask = {"type": "mask", "opacity": opacity, "bsdf": {"type": "diffuse", "reflectance": black}}
     to_world = mi.ScalarTransform4f().translate([0, 0, -12]) @ mi.ScalarTransform4f().scale(1000)
-    floor = {
-        "type": "rectangle",
-        "to_world": to_world,
-        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 1.0}},
-    }
+    glow = {"type": "area", "radiance": {"type": "rgb", "value": 1.0}}
+    floor = {"type": "rectangle", "to_world": to_world, "emitter": glow}
     a, b = mitsuba_halves(
         block(grid, mask, tmp_path), {"type": "constant", "radiance": black}, q, 1.0, 30, "path", floor
     )
@@ -167,7 +151,7 @@ def test_transmittance_agrees_with_mitsuba(tmp_path: Path) -> None:
     assert np.corrcoef(0.5 * (a + b)[:, 0], ours.transmittance)[0, 1] > 0.8
 
 
-def test_pictures_keep_what_passes(tmp_path: Path) -> None:
+def test_pictures_store_the_transmittance(tmp_path: Path) -> None:
     """A picture straight from above shows the holes where the map has them, and stores them."""
     from mbtf_gen.images.exr import read_channels
     from mbtf_gen.pictures.camera import Camera

@@ -21,28 +21,20 @@ def directional_light(width: float, elevation: float, lanes: int = 1) -> Directi
     e = np.radians(elevation)
     omega_i = np.array([[np.cos(e), 0.0, np.sin(e)]], np.float32)
     w = mi.Vector3f(np.repeat(omega_i, lanes, axis=0).T.copy())
-    return DirectionalLight(
-        "lobe",
-        w,
-        mi.Float(np.full(lanes, 1.0 / kernel.irradiance(omega_i)[0], np.float32)),
-        mi.Float(kernel.kappa),
-    )
+    scale = np.full(lanes, 1.0 / kernel.irradiance(omega_i)[0], np.float32)
+    return DirectionalLight("lobe", w, mi.Float(scale), mi.Float(kernel.kappa))
 
 
 def polar_grid(width: float, elevation: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Directions and solid-angle weights about ω_i, dense enough that the cut at the horizon is integrated
-    to 1e-5."""
+    """Directions and solid-angle weights about ω_i; the cut at the horizon is integrated to 1e-5."""
     end = min(np.pi, 9.0 * np.radians(width))
     theta = (np.arange(600) + 0.5) / 600 * end
     phi = (np.arange(400) + 0.5) / 400 * 2 * np.pi
     t, p = np.meshgrid(theta, phi, indexing="ij")
     weight = np.sin(t) * (end / 600) * (2 * np.pi / 400)
     e = np.radians(elevation)
-    axis, up, side = (
-        np.array([np.cos(e), 0, np.sin(e)]),
-        np.array([-np.sin(e), 0, np.cos(e)]),
-        np.array([0, 1.0, 0]),
-    )
+    axis, up = np.array([np.cos(e), 0, np.sin(e)]), np.array([-np.sin(e), 0, np.cos(e)])
+    side = np.array([0, 1.0, 0])
     omega = (
         np.cos(t)[..., None] * axis
         + (np.sin(t) * np.cos(p))[..., None] * up

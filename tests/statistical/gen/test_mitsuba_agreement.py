@@ -1,9 +1,4 @@
-"""Unmodified Mitsuba, driven by the query sensor over a finite block of tiles, gives the same values.
-
-The block is made of Mitsuba's own plugins: the tile's mesh written as PLY, instanced on a grid, lit by the
-emitter ``directional`` and traced by the integrator ``path``. Elevations are high enough that the block's
-border is out of reach: displacement range/tan(elevation) stays well inside it.
-"""
+"""Unmodified Mitsuba gives the same values: a block of instanced tiles under its ``path`` integrator."""
 
 from __future__ import annotations
 
@@ -13,15 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support.mitsuba_blocks import GRIDS, SPP, block, mitsuba_halves, random_queries
-from support.scenes import (
-    LightKernel,
-    Transport,
-    direction,
-    estimate,
-    flat,
-    mi,
-    real_heights,
-)
+from support.scenes import LightKernel, Transport, direction, directional, estimate, flat, mi, real_heights
 
 from mbtf_core.stats import aggregate_test, elevation_groups
 from mbtf_gen.geometry.heightfield import HeightGrid
@@ -47,21 +34,9 @@ def test_mitsuba_agrees(shape: str, depth: int, sigma: float, tmp_path: Path) ->
     omega_i = direction(40, 70)
     q = random_queries(4096, sigma, omega_i)
     # Mitsuba's depth counts the emitter's vertex too. Unit irradiance on the plane.
-    emitter = {
-        "type": "directional",
-        "direction": [float(-c) for c in omega_i],
-        "irradiance": float(1 / omega_i[2]),
-    }
-    a, b = mitsuba_halves(block(grid, bsdf, tmp_path), emitter, q, grid.aspect, depth + 1)
-    ours = estimate(
-        grid,
-        bsdf,
-        LightKernel(0.0),
-        q,
-        SPP,
-        transport=Transport(max_depth=depth, roulette_depth=1000),
-        seed=5,
-    )
+    a, b = mitsuba_halves(block(grid, bsdf, tmp_path), directional(omega_i), q, grid.aspect, depth + 1)
+    transport = Transport(max_depth=depth, roulette_depth=1000)
+    ours = estimate(grid, bsdf, LightKernel(0.0), q, SPP, transport=transport, seed=5)
     groups = elevation_groups(q.omega_o, edges=(0.0, 0.8, 1.0))
     result = aggregate_test(ours.value_a, ours.value_b, a, b, groups)
     # Mitsuba's rays leave a surface 5e-5 tile widths above it, ours 3e-7. Where point queries have next to no
@@ -79,18 +54,10 @@ def test_smoothed_emitter_in_mitsubas_integrator_agrees(tmp_path: Path) -> None:
     q = random_queries(4096, 0.05)
     emitter = {"type": "mbtf_directional", "width": 5.0}
     a, b = mitsuba_halves(block(grid, colors(), tmp_path), emitter, q, 1.0, 3)
-    ours = estimate(
-        grid,
-        colors(),
-        LightKernel(5.0),
-        q,
-        SPP,
-        transport=Transport(max_depth=2, roulette_depth=1000),
-        seed=5,
-    )
-    result = aggregate_test(
-        ours.value_a, ours.value_b, a, b, elevation_groups(q.omega_i, edges=(0.0, 0.8, 1.0))
-    )
+    transport = Transport(max_depth=2, roulette_depth=1000)
+    ours = estimate(grid, colors(), LightKernel(5.0), q, SPP, transport=transport, seed=5)
+    groups = elevation_groups(q.omega_i, edges=(0.0, 0.8, 1.0))
+    result = aggregate_test(ours.value_a, ours.value_b, a, b, groups)
     assert result.p_value > 1e-3, str(result)
 
 
@@ -99,13 +66,8 @@ def test_the_comparison_finds_a_shifted_map(tmp_path: Path) -> None:
     grid = GRIDS["square"]
     omega_i = direction(40, 70)
     q = random_queries(4096, 1e-6, omega_i)
-    emitter = {
-        "type": "directional",
-        "direction": [float(-c) for c in omega_i],
-        "irradiance": float(1 / omega_i[2]),
-    }
     moved = HeightGrid(np.roll(grid.z, 1, axis=1), grid.aspect)
-    a, b = mitsuba_halves(block(moved, colors(), tmp_path), emitter, q, 1.0, 2)
+    a, b = mitsuba_halves(block(moved, colors(), tmp_path), directional(omega_i), q, 1.0, 2)
     ours = estimate(grid, colors(), LightKernel(0.0), q, SPP, transport=Transport(max_depth=1))
     assert aggregate_test(ours.value_a, ours.value_b, a, b).p_value < 1e-6
 

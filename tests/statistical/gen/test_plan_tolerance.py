@@ -112,12 +112,8 @@ def test_reference_pictures_leave_out_what_the_user_switches_off(mode: str) -> N
 @pytest.mark.parametrize("tolerance", [0.0, 1e-4])
 def test_no_plan_exceeds_its_tolerance(tolerance: float) -> None:
     """The sum includes the bound of shadowing, from the tail of the lobe."""
-    job = job_of(
-        stuff(fractal(64, 3.0), 0.002),
-        effects={"tolerance": tolerance},
-        queries={"min_cos": 0.6},
-        transport={"max_depth": 1},
-    )
+    options = {"queries": {"min_cos": 0.6}, "transport": {"max_depth": 1}}
+    job = job_of(stuff(fractal(64, 3.0), 0.002), effects={"tolerance": tolerance}, **options)
     plan = plan_effects(job)
     assert plan.bias_bound <= tolerance
 
@@ -140,7 +136,7 @@ def test_a_cap_has_a_positive_bias_bound() -> None:
 
 
 def test_a_seam_does_not_make_slopes_count_more_than_once() -> None:
-    """A crop whose normal map has the slopes of its heights except at the seam: it adds nothing elsewhere."""
+    """A normal map with the slopes of its heights adds nothing except at the seam of a cropped tile."""
     big = fractal(256, 3.0)
     slope = height_slopes(HeightGrid(0.2 * big - 0.2, 1.0))[:128, :128]
     grid = HeightGrid.from_map(big[:128, :128], 0.4)

@@ -22,7 +22,7 @@ def draw(layout: str = "shuffled", mixture: Mixture | None = None, lattice: Latt
 
 
 @pytest.fixture(scope="module")
-def drawn() -> Queries:
+def sampled() -> Queries:
     return draw()
 
 
@@ -31,10 +31,10 @@ def uniform(points: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize("name", ["omega_i", "omega_o"])
-def test_directions_are_uniform_on_the_projected_disk(name: str, drawn: Queries) -> None:
+def test_directions_are_uniform_on_the_projected_disk(name: str, sampled: Queries) -> None:
     """Uniform on the disk of radius √(1 - cos²_min): ω_z / (π (1 - cos²_min)) per steradian."""
     area = np.pi * (1 - MIN_COS**2)
-    omega = getattr(drawn, name)
+    omega = getattr(sampled, name)
     result = chi_square_test(omega, lambda w: w[:, 2] / area, Cap((0.0, 0.0, 1.0), MIN_COS))
     assert result.p_value > 1e-3, str(result)
 
@@ -44,19 +44,16 @@ def coordinates(q: Queries, mixture: Mixture) -> dict[str, NDArray[np.float64]]:
     span = 1 - MIN_COS**2
     level = level_of_sigma(q.sigma)
     k = LATTICE.finest
-    out = {
-        "u": q.u[:, 0],
-        "v": q.u[:, 1],
-        "level": mixture.log_uniform * level / k + mixture.finest * np.maximum(0.0, level - (k - 1)),
-    }
+    cumulative = mixture.log_uniform * level / k + mixture.finest * np.maximum(0.0, level - (k - 1))
+    out = {"u": q.u[:, 0], "v": q.u[:, 1], "level": cumulative}
     for name, omega in (("i", q.omega_i.astype(np.float64)), ("o", q.omega_o.astype(np.float64))):
         out[f"radius {name}"] = (1 - omega[:, 2] ** 2) / span
         out[f"azimuth {name}"] = np.arctan2(omega[:, 1], omega[:, 0]) / (2 * np.pi) % 1.0
     return {name: np.clip(x.astype(np.float64), 0.0, 1.0 - 1e-9) for name, x in out.items()}
 
 
-def test_all_variables_are_uniform_and_pairwise_independent(drawn: Queries) -> None:
-    x = coordinates(drawn, Mixture(0.6, 0.4))
+def test_all_variables_are_uniform_and_pairwise_independent(sampled: Queries) -> None:
+    x = coordinates(sampled, Mixture(0.6, 0.4))
     names = list(x)
     assert len(names) == 7
     pairs = [(a, b) for n, a in enumerate(names) for b in names[:n]]
@@ -88,14 +85,14 @@ def test_log_uniform_footprints_have_equal_shares_per_octave() -> None:
     np.testing.assert_allclose(np.bincount(octave) / ROWS, 1 / LATTICE.finest, atol=2 / ROWS)
 
 
-def test_positions_are_uniform_within_their_texels(drawn: Queries) -> None:
+def test_positions_are_uniform_within_their_texels(sampled: Queries) -> None:
     rows, columns = LATTICE.shape()
-    inside = (drawn.u.astype(np.float64) * (columns, rows)) % 1.0
+    inside = (sampled.u.astype(np.float64) * (columns, rows)) % 1.0
     result = chi_square_test(inside, uniform, Rectangle(), (16, 16))
     assert result.p_value > 1e-3, str(result)
 
 
-def test_buffers_of_images_have_levels_in_strata_too() -> None:
+def test_images_have_stratified_levels() -> None:
     lattice = Lattice(1, 1.0)
     q = draw("image", Mixture(1.0, 0.0), lattice)
     level = np.sort(level_of_sigma(q.sigma[:, 0, 0]))

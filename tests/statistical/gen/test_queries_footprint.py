@@ -51,12 +51,11 @@ def wrapped(offset: NDArray[np.float64], sigma: float) -> NDArray[np.float64]:
 @pytest.mark.parametrize("sigma", [0.1, 0.3, 0.5])
 def test_on_the_torus_they_follow_the_wrapped_gaussian(sigma: float, aspect: float) -> None:
     p = points(sigma, aspect)
-    result = chi_square_test(
-        p - np.floor(p),
-        lambda q: wrapped(q[:, 0] - CENTER[0], sigma) * wrapped(q[:, 1] - CENTER[1], sigma / aspect),
-        Rectangle(),
-        (24, 24),
-    )
+
+    def density(q: NDArray[np.float64]) -> NDArray[np.float64]:
+        return wrapped(q[:, 0] - CENTER[0], sigma) * wrapped(q[:, 1] - CENTER[1], sigma / aspect)
+
+    result = chi_square_test(p - np.floor(p), density, Rectangle(), (24, 24))
     assert result.p_value > 1e-3, str(result)
 
 

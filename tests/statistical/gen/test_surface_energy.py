@@ -1,5 +1,4 @@
-"""The surface returns no more than it receives, exactly that where it is white, the same both ways round —
-and what other formulas say where they overlap."""
+"""The surface conserves energy, is reciprocal, and agrees with other formulas where they overlap."""
 
 from __future__ import annotations
 
@@ -27,25 +26,12 @@ TOLERANCE = 2e-3
 
 
 def albedos(rows: Array, parts: SurfaceParts, points: int = 1 << 12) -> tuple[Array, Array]:
-    """(∫ f μo dωo, greatest sampling weight) of surfaces seen from given cosines.
-
-    Columns of `rows`: roughness, metallic, specular, coat, coat roughness, base, cosine, and with sheen its
-    weight and roughness. Each branch of the sampler is fed its own low-discrepancy points, by way of the
-    third coordinate.
-    """
+    """(∫ f μo dωo, greatest sampling weight) of surfaces with the parameters and cosines of `rows`."""
     xi = sobol(points, 3, seed=11)
     energy, greatest = [], []
     for part in np.array_split(rows, max(1, len(rows) * points // (1 << 22))):
-        names = (
-            "roughness",
-            "metallic",
-            "specular",
-            "clearcoat",
-            "clearcoat_roughness",
-            "base_color",
-            "cosine",
-        )
-        names += ("sheen", "sheen_roughness")
+        names = ["roughness", "metallic", "specular", "clearcoat", "clearcoat_roughness", "base_color"]
+        names += ["cosine", "sheen", "sheen_roughness"]
         lanes = {n: np.repeat(c, points) for n, c in zip(names, part.T, strict=False)}
         wi = towards(lanes.pop("cosine"))
         chosen, u, v = (mi.Float(np.tile(xi[:, k], len(part))) for k in range(3))
@@ -110,7 +96,7 @@ def test_surfaces_under_sheen_return_at_most_what_they_receive() -> None:
 @pytest.mark.parametrize("roughness", [0.1, 0.3, 0.45, 1.0])
 @pytest.mark.parametrize("cosine", [1.0, 0.5, 0.1, 1e-2])
 def test_sheen_takes_from_the_base_what_it_reflects(roughness: float, cosine: float) -> None:
-    """Against a quadrature of the textbook: D of Estevez and Kulla 2017, masked as Smith's theory says; the
+    """Against a quadrature of the textbook: D of Estevez and Kulla 2017, masked by Smith's model; the
     base gets what is left at the direction, of view and light, where that is less."""
     x, w = np.polynomial.legendre.leggauss(160)
     t, phi = np.meshgrid(0.5 * (x + 1), 0.5 * np.pi * (x + 1), indexing="ij")

@@ -1,5 +1,4 @@
-"""The project's surface is sampled with the density and the weights that it states; Mitsuba's χ² test is the
-judge, and Mitsuba's path integrator a second one."""
+"""The surface is sampled with the density and weights that it states: χ² tests, and Mitsuba's ``path``."""
 
 from __future__ import annotations
 
@@ -13,7 +12,7 @@ import pytest
 from mitsuba.python.chi2 import ChiSquareTest
 from numpy.typing import NDArray
 from support.mitsuba_blocks import GRIDS, block, mitsuba_halves, random_queries
-from support.scenes import LightKernel, Transport, direction, estimate, mi
+from support.scenes import LightKernel, Transport, direction, directional, estimate, mi
 from support.surfaces import ALL, point, sobol, towards
 
 from mbtf_core.stats import aggregate_test, elevation_groups
@@ -36,10 +35,7 @@ def sloping(parts: SurfaceParts) -> SurfaceParts:
 
 
 class Hemisphere:
-    """Directions above the plane on [-1, 1]², finer around a lobe of a given width.
-
-    The azimuth from the lobe's is sinh-spaced over ±π, the polar angle sinh-spaced around the lobe's.
-    """
+    """Directions above the plane on [-1, 1]², sinh-spaced in both angles around a lobe of a given width."""
 
     def __init__(self, center: NDArray[np.float64], width: float) -> None:
         self.theta = float(np.arccos(np.clip(center[2], -1.0, 1.0)))
@@ -82,11 +78,8 @@ def chi_square(
     widths = [maps.get("roughness", 0.3) ** 2] if parts.specular or parts.metallic else [1.0]
     if parts.clearcoat:
         widths.append(maps.get("clearcoat_roughness", 0.3) ** 2)
-    normal = (
-        np.array([-maps["slopes"][0][0], -maps["slopes"][1][0], 1.0])
-        if parts.slopes
-        else np.array([0, 0, 1.0])
-    )
+    slope = maps["slopes"] if parts.slopes else [[0.0], [0.0]]
+    normal = np.array([-slope[0][0], -slope[1][0], 1.0])
     normal /= np.linalg.norm(normal)
     domain = Hemisphere(2 * (wi @ normal) * normal - wi, min(1.0, 2.0 * min(widths)))
 
@@ -141,8 +134,8 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_the_judge_finds_a_fault(name: str) -> None:
-    """Samples of a slightly different surface are told apart."""
+def test_the_chi_square_test_finds_a_fault(name: str) -> None:
+    """Samples of a slightly different surface fail the test."""
     _, parts, maps = next(c for c in CASES if c[0] == name)
     assert p_value(chi_square(parts, VIEWS["oblique"], maps, FAULTS[name])) < 1e-4
 
@@ -178,25 +171,12 @@ def plugin(**values: Any) -> dict[str, Any]:
 
 
 def test_plugin_answers_as_the_surface_does() -> None:
-    bsdf = mi.load_dict(
-        plugin(
-            base_color=(0.7, 0.7, 0.7), roughness=0.4, metallic=0.3, specular=0.6, clearcoat=0.5, sheen=0.4
-        )
-    )
+    shared = {"roughness": 0.4, "metallic": 0.3, "specular": 0.6, "clearcoat": 0.5, "sheen": 0.4}
+    bsdf = mi.load_dict(plugin(base_color=(0.7, 0.7, 0.7), **shared))
     xi = sobol(1 << 10, 3)
     wi = towards(0.5, 30)
-    surface = point(
-        ALL,
-        np.tile(wi, (len(xi), 1)),
-        base_color=0.7,
-        roughness=0.4,
-        metallic=0.3,
-        specular=0.6,
-        clearcoat=0.5,
-        clearcoat_roughness=0.1,
-        sheen=0.4,
-        sheen_roughness=0.3,
-    )
+    rest = {"clearcoat_roughness": 0.1, "sheen_roughness": 0.3}
+    surface = point(ALL, np.tile(wi, (len(xi), 1)), base_color=0.7, **shared, **rest)
     si = dr.zeros(mi.SurfaceInteraction3f, len(xi))
     si.n = mi.Normal3f(0, 0, 1)
     si.sh_frame = mi.Frame3f(si.n)
@@ -218,12 +198,7 @@ def test_mitsuba_agrees_on_glossy_metal(tmp_path: Path) -> None:
     omega_i = direction(50, 70)
     bsdf = plugin(roughness=0.45, metallic=1.0)
     q = random_queries(4096, 0.3, omega_i)
-    emitter = {
-        "type": "directional",
-        "direction": [float(-c) for c in omega_i],
-        "irradiance": float(1 / omega_i[2]),
-    }
-    a, b = mitsuba_halves(block(grid, bsdf, tmp_path), emitter, q, grid.aspect, 5)
+    a, b = mitsuba_halves(block(grid, bsdf, tmp_path), directional(omega_i), q, grid.aspect, 5)
     transport = Transport(max_depth=4, roulette_depth=1000)
     ours = estimate(grid, bsdf, LightKernel(0.0), q, 32, transport=transport, seed=5)
     groups = elevation_groups(q.omega_o, edges=(0.0, 0.8, 1.0))

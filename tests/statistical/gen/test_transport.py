@@ -54,8 +54,7 @@ def test_rays_that_meet_nothing_are_black_and_counted() -> None:
 
 
 def test_rays_below_the_surface_meet_it_from_below() -> None:
-    """White, but half of the rays go through, in and out of ridges: every path ends in the sky or is lost
-    below; nothing is swallowed on the way."""
+    """White, half transparent: every path ends in the sky or is lost below."""
     n, spp = 4000, 16
     white = {"type": "twosided", "bsdf": lambert(1.0)}
     ridges = HeightGrid(np.tile([0.0, -0.5], (2, 1)), 1.0)
@@ -68,8 +67,7 @@ def test_rays_below_the_surface_meet_it_from_below() -> None:
 
 @pytest.mark.parametrize("cap", [0, 5, 100])
 def test_endless_rays_end_at_the_cap(cap: int) -> None:
-    """A level ray inside a trough never hits and never leaves: it counts as capped, a shadow ray as
-    occluded."""
+    """A level ray inside a trough is capped, a shadow ray occluded."""
     tile = build_tile(TROUGH, lambert(0.5))
     z = -0.9 * tile.unit
     ray = mi.Ray3f(mi.Point3f([0.0, 0.5], 0.0, z), mi.Vector3f(0.0, [1.0, -1.0], 0.0))
@@ -107,10 +105,7 @@ def test_a_low_cap_darkens_and_is_counted() -> None:
 
 
 def test_white_furnace_of_a_deep_trough() -> None:
-    """Paths of more bounces than roulette's patience still bring all of their light back.
-
-    Much deeper, their weights vary so much that error bars mean little.
-    """
+    """Paths of more bounces than the roulette depth conserve energy."""
     trough = HeightGrid(4.0 * TROUGH.z, 1.0)
     q = tile_mean_queries([0, 0, 1], direction(80, 0), 20_000)
     e = estimate(trough, lambert(1.0), None, q, 16)

@@ -14,15 +14,8 @@ from mbtf_pipeline.compare import unmodified_mitsuba
 from mbtf_pipeline.compare.unmodified_mitsuba import agreement, compare_with_mitsuba
 from mbtf_pipeline.recipe import CompareSection
 
-SECTION = CompareSection.model_validate(
-    {
-        "views": [{"elevation": 82, "azimuth": -60}],
-        "lights": [{"elevation": 45, "azimuth": 35}],
-        "tiles_across": [0.6],
-        "size": 40,
-        "spp": 32,
-    }
-)
+SCENE = {"views": [{"elevation": 82, "azimuth": -60}], "lights": [{"elevation": 45, "azimuth": 35}]}
+SECTION = CompareSection.model_validate({**SCENE, "tiles_across": [0.6], "size": 40, "spp": 32})
 
 
 @pytest.fixture(scope="module")

@@ -34,7 +34,7 @@ def test_one_that_fails_does_not_stop_the_others(tmp_path: Path, run_python: Run
     assert "train-00000.npz" in fits[1]["error"]
     assert fits[0]["result"]["training"]["steps"] == 3
     assert (tmp_path / "out" / "c" / "material.json").exists()
-    # Mended, the same command finishes the one and leaves the others as they are.
+    # After the repair, the same command finishes the one and leaves the others as they are.
     arrays["value_a"] = whole
     write_shard(shard, arrays)
     done = run_python(*command)
@@ -51,14 +51,9 @@ def test_data_sets_come_from_folders_folders_of_folders_and_lists(tmp_path: Path
     (tmp_path / "list.txt").write_text("# mine\nthree\n\nx/one\n")
     names = [p.relative_to(tmp_path).as_posix() for p in find_data([tmp_path / "x", tmp_path / "list.txt"])]
     assert names == ["x/one", "x/two", "three", "x/one"]
+    (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="holds no data sets"):
-        find_data([_empty(tmp_path)])
-
-
-def _empty(tmp_path: Path) -> Path:
-    folder = tmp_path / "empty"
-    folder.mkdir()
-    return folder
+        find_data([tmp_path / "empty"])
 
 
 def test_materials_are_named_after_their_data(tmp_path: Path) -> None:

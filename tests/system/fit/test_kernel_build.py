@@ -24,24 +24,9 @@ pytestmark = pytest.mark.skipif(SETUPTOOLS < 77, reason="pip install 'setuptools
 
 def build(out: Path, **variables: str) -> list[Path]:
     """Run the build step of an installation; returns the libraries that it made."""
-    command = [
-        sys.executable,
-        "setup.py",
-        "build_ext",
-        "--build-lib",
-        str(out),
-        "--build-temp",
-        str(out / "temp"),
-    ]
-    done = subprocess.run(
-        command,
-        cwd=ROOT,
-        env={**os.environ, **variables},
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
+    command = ["setup.py", "build_ext", "--build-lib", str(out), "--build-temp", str(out / "temp")]
+    options = {"capture_output": True, "text": True, "timeout": 300, "check": False}
+    done = subprocess.run([sys.executable, *command], cwd=ROOT, env={**os.environ, **variables}, **options)
     assert done.returncode == 0, done.stderr
     return sorted((out / "mbtf_fit").rglob(f"{library.LIBRARY}*"))
 

@@ -20,18 +20,8 @@ from mbtf_fit.__main__ import main
 sys.argv = ["mbtf-fit", *sys.argv[1:]]
 sys.exit(main())
 """
-SMALL = (
-    "--size",
-    "64",
-    "--turn-size",
-    "16",
-    "--frames",
-    "2",
-    "--spp",
-    "1",
-    "--set",
-    "sheet.tiles_across=[1, 3]",
-)
+SIZES = "--size 64 --turn-size 16 --frames 2 --spp 1"
+SMALL = (*SIZES.split(), "--set", "sheet.tiles_across=[1, 3]")
 
 
 def test_pictures_without_pytorch_kept_and_refused(tmp_path: Path, run_python: RunPython) -> None:

@@ -88,11 +88,11 @@ else:
 """
     done = run_python("-c", code, DRJIT_LIBLLVM_PATH=None)
     assert done.returncode == 0, done.stderr
-    said = done.stdout.strip()
-    if said.startswith("registered"):
-        assert int(said.split()[1]) >= OLDEST_LLVM
+    message = done.stdout.strip()
+    if message.startswith("registered"):
+        assert int(message.split()[1]) >= OLDEST_LLVM
     else:
-        assert said == "no LLVM without ours" or said.startswith("Dr.Jit was imported first")
+        assert message == "no LLVM without ours" or message.startswith("Dr.Jit was imported first")
 
 
 def test_registration_reports_missing_variants(run_python: RunPython) -> None:

@@ -82,10 +82,7 @@ def test_tables_contain_the_measured_numbers(made: Path) -> None:
         assert mse["n"] == 512
     assert len(table(made, "levels")) == 3
     assert len(table(made, "timing")) == 5
-    assert [r["fit"] if "fit" in r else r["method"] for r in table(made, "offsets")] == [
-        "neumip",
-        "hierarchical",
-    ]
+    assert [r.get("fit", r.get("method")) for r in table(made, "offsets")] == ["neumip", "hierarchical"]
     assert {(r["tiles_across"], r["method"]) for r in table(made, "zooms")} == {
         (tiles_across, r["method"]) for tiles_across in ("0.5", "2") for r in methods[:3]
     }
@@ -126,9 +123,7 @@ def test_the_page_can_be_written_again(made: Path) -> None:
     assert (page.read_bytes(), rows.read_bytes()) == before
 
 
-def test_the_page_of_an_interrupted_recipe_is_marked(
-    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_incomplete_page_is_marked(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shutil.copytree(made / "out", tmp_path / "out")
     record = tmp_path / "out" / "paper.json"
     data = json.loads(record.read_text()) | {"planned": 3}

@@ -111,7 +111,7 @@ class Page:
 
         WebDriverWait(self.driver, TIMEOUT, 0.05).until(lambda _: condition(), what)
 
-    def drawn(self, scene: int, kind: int, fit: int, stops: str = "0") -> None:
+    def wait_for(self, scene: int, kind: int, fit: int, stops: str = "0") -> None:
         """Wait until the stage shows this selection."""
         wanted = f"{scene} {kind} {fit} {stops}"
         self.until(lambda: self.js("return document.getElementById('stage').dataset.drawn") == wanted, wanted)
@@ -170,7 +170,7 @@ def page(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Pag
                 ".side, .border { visibility: hidden }"
                 "#stage:focus { outline: none }';"
             )
-            opened.drawn(0, 0, 0)
+            opened.wait_for(0, 0, 0)
             yield opened
         finally:
             driver.quit()
@@ -185,7 +185,7 @@ def stage(page: Page) -> Iterator[Any]:
         "document.querySelector('#tiles-across input').click(); document.getElementById('zero').click();"
         "document.querySelector('input[name=map]').click()"
     )
-    page.drawn(0, 0, 0)
+    page.wait_for(0, 0, 0)
     yield page.find("#stage")
     page.collect()
     assert page.errors == []
@@ -246,7 +246,7 @@ def test_exposure_scales_linear_values_of_both_sides(page: Page, stage: Any, key
 
     page.find("#stops").send_keys(*[getattr(Keys, key)] * 20)
     text = f"{stops:g}"
-    page.drawn(0, 0, 0, text)
+    page.wait_for(0, 0, 0, text)
     assert matches(page.canvas("#reference"), page.expected(0, "query", stops))
     assert matches(page.canvas("#fit"), page.expected(0, "neumip", stops))
     stage.send_keys(Keys.HOME)
@@ -265,17 +265,17 @@ def test_selections_change_the_images(page: Page, stage: Any) -> None:
         page.js(f"document.querySelector(`input[name={name}][value='{value}']`).click()")
 
     choose("fit", "1")
-    page.drawn(0, 0, 1)
+    page.wait_for(0, 0, 1)
     assert matches(page.canvas("#fit"), page.expected(0, "plain"))
     choose("kind", "1")
-    page.drawn(0, 1, 1)
+    page.wait_for(0, 1, 1)
     assert matches(page.canvas("#reference"), page.expected(0, "pixel"))
     choose("scene", "1")
-    page.drawn(1, 1, 1)
+    page.wait_for(1, 1, 1)
     assert matches(page.canvas("#fit"), page.expected(1, "plain"))
     choose("group", "1")
     # The field of view stays selected.
-    page.drawn(3, 1, 1)
+    page.wait_for(3, 1, 1)
     assert matches(page.canvas("#fit"), page.expected(3, "plain"))
     assert "4 tiles across" in page.find("#caption").text
 
@@ -307,7 +307,7 @@ def test_error_maps_match_the_selection(page: Page, stage: Any) -> None:
 
 def test_an_image_of_the_sheet_opens_in_the_viewer(page: Page, stage: Any) -> None:
     page.js("document.querySelector(\"button.zoom[data-scene='2'][data-fit='1'][data-map=flip]\").click()")
-    page.drawn(2, 0, 1)
+    page.wait_for(2, 0, 1)
     assert page.js("return document.activeElement.id") == "stage"
     assert page.js("return document.querySelector('input[name=map][value=flip]').checked")
 

@@ -44,23 +44,15 @@ def write(tmp_path: Path) -> Any:
     return write
 
 
-def test_defaults_stand_alone() -> None:
-    assert resolve(Whole) == Whole()
-
-
-def test_an_empty_file_is_all_defaults(write: Any) -> None:
-    assert resolve(Whole, file=write("# nothing yet\n")) == Whole()
+def test_defaults(write: Any) -> None:
+    assert resolve(Whole) == resolve(Whole, file=write("# nothing yet\n")) == Whole()
 
 
 def test_flags_win_over_assignments_over_the_file(write: Any) -> None:
     path = write("height: 0.1\nlevels: 3\nlight:\n  width_deg: 2\n")
     assert resolve(Whole, file=path).height == 0.1
-    whole = resolve(
-        Whole,
-        file=path,
-        assignments=["height=0.2", "levels=4", "light.width_deg=5"],
-        flags={"height": 0.3, "levels": None},
-    )
+    assignments = ["height=0.2", "levels=4", "light.width_deg=5"]
+    whole = resolve(Whole, file=path, assignments=assignments, flags={"height": 0.3, "levels": None})
     assert (whole.height, whole.levels, whole.light.width_deg) == (0.3, 4, 5.0)
 
 
@@ -94,7 +86,7 @@ def test_assignments_are_read_as_yaml() -> None:
         ("stages:\n- spp: 2\n", 2, "key 'stages.0.name' is missing", "add it"),
     ],
 )
-def test_faults_name_line_and_cure(write: Any, text: str, where: int, what: str, hint: str) -> None:
+def test_faults_name_line_and_hint(write: Any, text: str, where: int, what: str, hint: str) -> None:
     path = write(text)
     with pytest.raises(InputError) as caught:
         resolve(Whole, file=path)
@@ -137,12 +129,7 @@ def test_required_keys_may_come_from_flags(write: Any) -> None:
 
 @pytest.mark.parametrize(
     ("text", "what", "line"),
-    [
-        ("a: [1\nb: 2\n", "not valid YAML", 2),
-        ("a: 1\na: 2\n", "not valid YAML", 2),
-        ("- 1\n- 2\n", "must hold a mapping", None),
-        ("just text\n", "must hold a mapping", None),
-    ],
+    [("a: [1\nb: 2\n", "not valid YAML", 2), ("just text\n", "must hold a mapping", None)],
 )
 def test_files_that_are_no_mapping_are_refused(write: Any, text: str, what: str, line: int | None) -> None:
     path = write(text)
@@ -206,7 +193,7 @@ class Items(Settings):
 
 
 @pytest.mark.parametrize(
-    ("data", "says"),
+    ("data", "message"),
     [
         ({"widths": [1, 0]}, "'widths.1': must be above 0 and at most 10 (given 0)"),
         ({"widths": []}, "'widths': must hold at least 1 (given [])"),
@@ -216,10 +203,10 @@ class Items(Settings):
         ({"on": "perhaps"}, "'on': must be true or false (given 'perhaps')"),
     ],
 )
-def test_faults_are_worded_for_people(data: dict[str, Any], says: str) -> None:
+def test_faults_are_readable(data: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError) as caught:
         build(Items, data, source="x")
-    assert caught.value.what == says
+    assert caught.value.what == message
 
 
 def test_differences_lead_with_settings_and_shorten_digests() -> None:

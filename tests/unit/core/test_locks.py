@@ -135,21 +135,6 @@ def test_of_many_that_take_over_at_once_one_gets_it(shard: Path) -> None:
     assert not lock_of(shard).exists()
 
 
-def test_without_advisory_locks_the_file_still_keeps_other_machines_out(
-    shard: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def unsupported(handle: int, operation: int) -> None:
-        raise OSError(errno.ENOSYS, "not implemented")
-
-    monkeypatch.setattr("fcntl.flock", unsupported)
-    plant(shard, owner(f"{socket.gethostname()}-other", 1))
-    with shard_lock(shard) as held:
-        assert not held
-    plant(shard, "")
-    with shard_lock(shard) as held:
-        assert held
-
-
 def test_locks_of_other_machines_count_by_age(shard: Path) -> None:
     text = owner(f"{socket.gethostname()}-other", 1)
     plant(shard, text, age=STALE_SECONDS - 60)
@@ -160,22 +145,21 @@ def test_locks_of_other_machines_count_by_age(shard: Path) -> None:
         assert held
 
 
-def test_without_advisory_locks_a_living_process_keeps_its_lock(
-    shard: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize(("host", "stale"), [("-other", ""), ("", owner(socket.gethostname(), 2**31 - 1))])
+def test_without_advisory_locks(host: str, stale: str, shard: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Locks of other machines and of living processes stay; half-written and abandoned ones do not."""
+
     def unsupported(handle: int, operation: int) -> None:
         raise OSError(errno.ENOSYS, "not implemented")
 
     monkeypatch.setattr("fcntl.flock", unsupported)
-    plant(shard, owner(socket.gethostname(), os.getppid()))
-    with shard_lock(shard) as held:
-        assert not held
-    plant(shard, owner(socket.gethostname(), 2**31 - 1))
-    with shard_lock(shard) as held:
-        assert held
+    for text, free in ((owner(f"{socket.gethostname()}{host}", os.getppid()), False), (stale, True)):
+        plant(shard, text)
+        with shard_lock(shard) as held:
+            assert held == free
 
 
-def test_a_lock_says_who_holds_it_and_for_how_long(shard: Path) -> None:
+def test_lock_owners_are_named(shard: Path) -> None:
     assert lock_owner(shard) is None
     since = time.time() - 7300
     plant(shard, json.dumps({"host": "oak", "process": 12, "since": since}))

@@ -82,13 +82,9 @@ def test_a_command_takes_them_as_its_own(capsys: pytest.CaptureFixture[str]) -> 
 def test_values_go_over_presets_and_files(tmp_path: Path) -> None:
     file = tmp_path / "c.yaml"
     file.write_text("material: map.exr\nqueries: {spp: 2, mixture: 0.1}\nlayout: image\n")
-    options = Options(
-        Config,
-        {"queries.spp": "--spp"},
-        {"queries.spp": "8"},
-        file,
-        ["queries.mixture=0.3", "queries.train=9x"],
-    )
+    given = {"queries.spp": "8"}
+    assignments = ["queries.mixture=0.3", "queries.train=9x"]
+    options = Options(Config, {"queries.spp": "--spp"}, given, file, assignments)
     resolved = options.resolve(["queries.mixture=0.2", "layout=shuffled", "queries.spp=6"], material=None)
     assert resolved.queries == Query(train="9x", spp=8, mixture=0.3)
     assert resolved.layout == "shuffled"
@@ -116,14 +112,6 @@ def test_two_options_of_one_flag_are_refused() -> None:
 
 
 def test_a_command_line_can_be_given_to_a_shell() -> None:
-    line = command_line(
-        "mbtf-pipeline",
-        "run",
-        Path("a b.yaml"),
-        quick=True,
-        force=False,
-        time=None,
-        output=Path("o"),
-        set=["a=1"],
-    )
+    options = {"quick": True, "force": False, "time": None, "output": Path("o"), "set": ["a=1"]}
+    line = command_line("mbtf-pipeline", "run", Path("a b.yaml"), **options)
     assert line == "mbtf-pipeline run 'a b.yaml' --quick -o o --set a=1"

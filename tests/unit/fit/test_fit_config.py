@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import pytest
 
-from mbtf_core.config_file import resolve
-from mbtf_core.errors import UsageError
 from mbtf_core.units import format_duration, parse_duration
 from mbtf_fit.config import FitConfig
 
@@ -50,10 +48,3 @@ def test_hash_covers_data_and_options_but_not_the_device() -> None:
     assert config.hash("data") != config.hash("other data")
     assert config.hash("data") != FitConfig(seed=1).hash("data")
     assert config.hash("data") == FitConfig.model_validate({"training": {"time": "120s"}}).hash("data")
-
-
-def test_unknown_keys_name_the_nearest_valid_one() -> None:
-    with pytest.raises(UsageError, match=r"training\.bach.*\n.*batch"):
-        resolve(FitConfig, assignments=["training.bach=3"])
-    with pytest.raises(UsageError, match="neumip"):
-        resolve(FitConfig, flags={"model": "neumop"})

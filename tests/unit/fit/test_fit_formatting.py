@@ -1,4 +1,4 @@
-"""What the fitter says beside its table of errors."""
+"""Remarks beside the table of errors."""
 
 from __future__ import annotations
 
@@ -11,10 +11,8 @@ from mbtf_fit.formatting import describe_errors
 
 def errors(value: float | None, by_level: float | None) -> dict[str, Any]:
     def group(unexplained: float | None) -> dict[str, Any]:
-        return {
-            "n": 100,
-            "unexplained": {"value": unexplained, "error": None if unexplained is None else 0.1},
-        }
+        error = None if unexplained is None else 0.1
+        return {"n": 100, "unexplained": {"value": unexplained, "error": error}}
 
     return {"test": group(value) | {"levels": {"0": group(by_level)}, "elevations": {}}}
 
@@ -30,9 +28,7 @@ def errors(value: float | None, by_level: float | None) -> dict[str, Any]:
         (127.0, None, ["undefined: the noise exceeds", "above 1: worse than the mean value"]),
     ],
 )
-def test_undefined_and_large_errors_are_explained(
-    value: float | None, by_level: float | None, remarks: list[str]
-) -> None:
+def test_bad_errors_are_explained(value: float | None, by_level: float | None, remarks: list[str]) -> None:
     lines = describe_errors(errors(value, by_level))
     assert lines[3].split() == ["queries", "100"]
     assert len(lines) == 4 + len(remarks)

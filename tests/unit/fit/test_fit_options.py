@@ -5,9 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import pytest
-
-from mbtf_core.errors import UsageError
 from mbtf_fit.cli.app import app
 from mbtf_fit.cli.fit import resolve_config
 from mbtf_fit.config import FitConfig
@@ -37,8 +34,3 @@ def test_presets_keep_what_flags_set() -> None:
     assert config_of("--quality", "draft", "--model", "hierarchical").network.width == 25
     assert config_of("--quality", "draft", "--init-from", "material/").network.width == 25
     assert config_of("--quality", "draft").network.width == 40
-
-
-def test_time_and_steps_exclude_each_other() -> None:
-    with pytest.raises(UsageError, match="exclude each other"):
-        config_of("--time", "1s", "--steps", "3")

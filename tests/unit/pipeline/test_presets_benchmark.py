@@ -19,12 +19,3 @@ def test_runs_of_other_options_and_damaged_ones_are_repeated(tmp_path: Path) -> 
     assert quality.finished(tmp_path / "now-128.json") == now
     assert all(quality.finished(tmp_path / f"{name}-128.json") is None for name in ("old", "cut", "none"))
     assert quality.finished_runs(tmp_path, 128) == [now]
-
-
-def test_the_table_shows_the_stored_figures() -> None:
-    quality = benchmark_module("quality")
-    rows = quality.markdown_table(quality.stored_runs()).splitlines()
-    assert len(rows) == 2 + 2 * len(quality.HEIGHT_SCALES) + 1
-    assert rows[2].startswith(
-        "| `draft` | knit_fabric, height scale 0.05 | 0:52 | 0:13 | 0:31 | 0.024 ± 0.001"
-    )

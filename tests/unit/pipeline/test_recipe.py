@@ -11,6 +11,7 @@ import pytest
 from mbtf_core.console import run
 from mbtf_core.errors import InputError
 from mbtf_core.locks import shard_lock
+from mbtf_pipeline.cli.app import app
 from mbtf_pipeline.recipe import load_recipe, read_resolved, write_recipe
 
 HEAD = """\
@@ -51,9 +52,7 @@ def test_the_material_is_relative_to_the_recipe(tmp_path: Path, monkeypatch: pyt
     assert recipe.folder == Path("out") / "small"
 
 
-def test_an_assigned_material_is_relative_to_the_current_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_assigned_materials_are_relative_to_cwd(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = written(tmp_path, SINGLE)
     other = tmp_path / "other"
     other.mkdir()
@@ -108,8 +107,6 @@ def test_errors_name_the_line(tmp_path: Path, text: str, line: int, what: str) -
 
 def test_a_missing_material_is_one_clear_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = written(tmp_path, SINGLE.replace("maps/height.npy", "../nowhere/height.exr"))
-    from mbtf_pipeline.cli.app import app
-
     assert run(app, ["run", str(path), "-o", str(tmp_path / "out")]) == 3
     out, err = capsys.readouterr()
     first, second = err.splitlines()
@@ -146,8 +143,6 @@ def test_exit_codes(
 ) -> None:
     written(tmp_path, SINGLE)
     monkeypatch.chdir(tmp_path)
-    from mbtf_pipeline.cli.app import app
-
     assert run(app, arguments) == code
     err = capsys.readouterr().err
     assert what in err
@@ -158,8 +153,6 @@ def test_a_locked_folder_is_refused(tmp_path: Path, capsys: pytest.CaptureFixtur
     path = written(tmp_path, SINGLE)
     folder = tmp_path / "out"
     folder.mkdir()
-    from mbtf_pipeline.cli.app import app
-
     with shard_lock(folder / "run.json") as held:
         assert held
         assert run(app, ["run", str(path), "-o", str(folder), "-q"]) == 4
@@ -187,8 +180,6 @@ def test_listing_shows_recipes_and_errors(
     written(tmp_path, SINGLE + "description: four by four\n")
     (tmp_path / "broken.yaml").write_text("name: broken\nfti: {}\n")
     monkeypatch.chdir(tmp_path)
-    from mbtf_pipeline.cli.app import app
-
     assert run(app, ["list", "."]) == 0
     broken, small = capsys.readouterr().out.splitlines()
     assert broken.startswith("broken.yaml: line 2: unknown key 'fti'")

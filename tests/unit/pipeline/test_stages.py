@@ -96,9 +96,7 @@ def test_nothing_runs_twice(pipeline: Pipeline) -> None:
         ("report", ["report"]),
     ],
 )
-def test_a_changed_option_runs_its_stage_and_later_ones(
-    pipeline: Pipeline, stage: str, expected: list[str]
-) -> None:
+def test_changed_options_run_later_stages(pipeline: Pipeline, stage: str, expected: list[str]) -> None:
     pipeline.config[stage] = {"option": 2}
     pipeline.run()
     assert pipeline.ran == expected

@@ -47,11 +47,8 @@ def test_estimates_print_with_as_many_digits_as_they_know(value: float, error: f
 
 
 def test_estimates_go_into_json() -> None:
-    assert json.loads(json.dumps(Estimate(math.nan, math.inf, 1).as_dict(), allow_nan=False)) == {
-        "value": None,
-        "error": None,
-        "n": 1,
-    }
+    undefined = json.dumps(Estimate(math.nan, math.inf, 1).as_dict(), allow_nan=False)
+    assert json.loads(undefined) == {"value": None, "error": None, "n": 1}
     assert Estimate(2.0, 0.1, 5).as_dict() == {"value": 2.0, "error": 0.1, "n": 5}
 
 

@@ -222,9 +222,7 @@ def test_patches_lie_inside_small_images() -> None:
 
 
 @pytest.mark.parametrize("patch_size", [None, 6])
-def test_smaller_patches_make_batches_of_more_lights_and_views(
-    tmp_path: Path, patch_size: int | None
-) -> None:
+def test_smaller_patches_give_more_lights_and_views(tmp_path: Path, patch_size: int | None) -> None:
     folder = write_images(tmp_path / "d", constant(0.1), train=40, patch_size=patch_size)
     for patch, shape in ((2, (16, 2, 2, 3)), (4, (4, 4, 4, 3))):
         training = {"steps": 1, "batch": 64, "patch_size": patch}
@@ -276,13 +274,8 @@ def test_models_without_neighborhoods_evaluate_patches_pointwise() -> None:
 
 
 def quick(steps: int, **network: object) -> FitConfig:
-    return FitConfig.model_validate(
-        {
-            "model": "hierarchical",
-            "network": network,
-            "training": {"steps": steps, "batch": 1024, "warmup": 5},
-        }
-    )
+    training = {"steps": steps, "batch": 1024, "warmup": 5}
+    return FitConfig.model_validate({"model": "hierarchical", "network": network, "training": training})
 
 
 def test_a_hierarchical_material_is_fitted_and_loads_again(tmp_path: Path) -> None:

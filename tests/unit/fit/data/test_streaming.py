@@ -51,21 +51,19 @@ def test_a_streamed_fit_is_identical(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".exr"])
-def test_evaluation_leaves_training_queries_on_disk(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str
-) -> None:
-    """Data that a fit streams can be evaluated too, and are judged by the queries that the fit held out."""
+def test_evaluation_streams_its_queries(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str) -> None:
+    """Data that a fit streams can be evaluated too, on the queries that the fit held out."""
     folder = write_data(tmp_path / "d", parallax, train=3000, test=500, suffix=suffix)
     held_out = {"queries": 0.2, "radius": 0.3}
     config = FitConfig.model_validate(
         {"training": {"steps": 2, "batch": 500}, "held_out": held_out, "seed": 3}
     )
     result = fit(config, folder, tmp_path / "m")
-    judged, found = mbtf_fit.evaluation.evaluate_splits, []
+    original, found = mbtf_fit.evaluation.evaluate_splits, []
 
     def watched(predict: Predict, data: Dataset, partition: Partition) -> dict[str, SplitErrors]:
         found.append(partition.training)
-        return judged(predict, data, partition)
+        return original(predict, data, partition)
 
     monkeypatch.setattr(mbtf_fit.evaluation, "evaluate_splits", watched)
     evaluated = mbtf_fit.evaluation.evaluate(result.material, folder).values
@@ -110,8 +108,7 @@ def test_nonsense_amounts_are_refused(text: str) -> None:
 
 
 def test_memory_does_not_grow_with_the_data(tmp_path: Path, run_python: RunPython) -> None:
-    """48 MB of shards more take less than 14 MB more at the peak, all of them read and trained on; in memory
-    they would take 38."""
+    """48 MB more of shards take less than 14 MB more at the peak; in memory they would take 38."""
     peaks = []
     for shards in (2, 10):
         folder = write_data(tmp_path / str(shards), parallax, train=100_000 * shards, test=10, shards=shards)

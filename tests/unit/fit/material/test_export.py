@@ -20,34 +20,25 @@ from mbtf_fit.material.transmittance import Transmittance
 from mbtf_fit.models.registry import build_model
 
 F64 = NDArray[np.float64]
+
+
+def of(model: str, **network: Any) -> tuple[str, dict[str, Any]]:
+    return model, network
+
+
+FILTERED = {"raw": True, "band_attenuation": True, "footprint_filtered": True}
 CASES: dict[str, tuple[str, dict[str, Any]]] = {
-    "baseline": ("neumip-baseline", {}),
-    "calibrated": ("neumip", {}),
-    "with holes": ("neumip", {}),
-    "neumip": ("neumip", {}),
-    "direct, six outputs": ("neumip", {"offset": "direct", "output_channels": 6, "activation": "leaky-relu"}),
-    "side by side, sine": (
-        "neumip",
-        {"blending": "concatenate", "activation": "sine", "output_transform": "softplus"},
+    "baseline": of("neumip-baseline"),
+    "calibrated": of("neumip"),
+    "with holes": of("neumip"),
+    "neumip": of("neumip"),
+    "direct, six outputs": of("neumip", offset="direct", output_channels=6, activation="leaky-relu"),
+    "concatenated": of("neumip", blending="concatenate", activation="sine", output_transform="softplus"),
+    "hierarchical": of("hierarchical"),
+    "eleven channels": of(
+        "hierarchical", decoder="mlp", channels=11, encoding={"raw": True, "direction_xyz": True}
     ),
-    "hierarchical": ("hierarchical", {}),
-    "eleven channels": (
-        "hierarchical",
-        {"decoder": "mlp", "channels": 11, "encoding": {"raw": True, "direction_xyz": True}},
-    ),
-    "encoded": (
-        "neumip",
-        {
-            "encoding": {
-                "position": 4,
-                "direction": 2,
-                "direction_pi": False,
-                "raw": True,
-                "band_attenuation": True,
-                "footprint_filtered": True,
-            }
-        },
-    ),
+    "encoded": of("neumip", encoding={"position": 4, "direction": 2, "direction_pi": False, **FILTERED}),
 }
 
 
@@ -120,12 +111,8 @@ class Reader:
             y = np.einsum("nrcixy,oixy->nrco", window, weight, optimize=True) + bias
         else:
             y = x @ weight.reshape(weight.shape[:2]).T + bias
-        functions = {
-            "relu": lambda v: np.maximum(v, 0),
-            "leaky-relu": lambda v: np.where(v > 0, v, 0.01 * v),
-            "sine": np.sin,
-            "none": lambda v: v,
-        }
+        functions = {"relu": lambda v: np.maximum(v, 0), "sine": np.sin, "none": lambda v: v}
+        functions["leaky-relu"] = lambda v: np.where(v > 0, v, 0.01 * v)
         return np.asarray(functions[activation](y))
 
     def network(self, name: str, x: F64) -> F64:

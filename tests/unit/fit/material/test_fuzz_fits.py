@@ -89,17 +89,15 @@ def test_a_damaged_history(content: bytes, whole: Path, folder: Path) -> None:
 
 
 def odd_tensors(whole: Path) -> dict[str, tuple[dict[str, torch.Tensor], str]]:
-    """What the weights could hold instead, and what is said of it."""
+    """Invalid contents of the weights and their messages."""
     good = load((whole / WEIGHTS).read_bytes())
     name = next(n for n in good if n.endswith("weight"))
+    no_fit = "do not fit the model"
     return {
         "none": ({}, "lacks the tensor 'conformance.u'"),
-        "no weights": (
-            {n: t for n, t in good.items() if n.startswith("conformance")},
-            "do not fit the model",
-        ),
-        "one too many": ({**good, "extra": torch.zeros(1)}, "do not fit the model"),
-        "another shape": ({**good, name: torch.zeros(1)}, "do not fit the model"),
+        "no weights": ({n: t for n, t in good.items() if n.startswith("conformance")}, no_fit),
+        "one too many": ({**good, "extra": torch.zeros(1)}, no_fit),
+        "another shape": ({**good, name: torch.zeros(1)}, no_fit),
         "few queries": ({**good, "conformance.u": torch.zeros(3, 2)}, "has the shape (3, 2)"),
         "flat queries": ({**good, "conformance.rgb": torch.zeros(256)}, "has the shape (256,)"),
     }
@@ -109,20 +107,18 @@ def odd_tensors(whole: Path) -> dict[str, tuple[dict[str, torch.Tensor], str]]:
     "case", ["none", "no weights", "one too many", "another shape", "few queries", "flat queries"]
 )
 def test_odd_tensors(case: str, whole: Path, folder: Path) -> None:
-    tensors, says = odd_tensors(whole)[case]
+    tensors, message = odd_tensors(whole)[case]
     padding = {} if tensors else {"padding": torch.zeros(1000)}
     write(folder, whole, None, save({**tensors, **padding}))
     with pytest.raises(InputError) as caught:
         Material.load(folder)
-    assert says in caught.value.what
+    assert message in caught.value.what
 
 
 @pytest.mark.parametrize(
     ("key", "value"), [("levels.finest", 14), ("tile.aspect", 1e6), ("config.network.channels", 64)]
 )
-def test_a_description_cannot_claim_more_than_the_weights_hold(
-    key: str, value: Any, whole: Path, folder: Path
-) -> None:
+def test_descriptions_larger_than_the_weights(key: str, value: Any, whole: Path, folder: Path) -> None:
     description = json.loads((whole / DESCRIPTION).read_text())
     *sections, last = key.split(".")
     place = description

@@ -85,52 +85,6 @@ def test_the_folder_states_what_it_holds(fitted: FitResult) -> None:
     assert fitted.errors["test"]["n"] == 2000
 
 
-def test_stored_weights_and_formula_suffice(fitted: FitResult) -> None:
-    """An evaluation written from the description alone, in NumPy, meets the conformance values."""
-    weights = load_file(fitted.folder / "weights.safetensors")
-    aspect, finest = 0.5, 3
-    u, sigma, omega_i, omega_o = (
-        weights[f"conformance.{k}"].astype(np.float64) for k in ("u", "sigma", "omega_i", "omega_o")
-    )
-
-    def texture(name: str, at: np.ndarray) -> np.ndarray:
-        t = weights[name]
-        rows, columns = t.shape[:2]
-        x, y = at[:, 0] * columns - 0.5, (1 - at[:, 1]) * rows - 0.5
-        i, j = np.floor(x).astype(int), np.floor(y).astype(int)
-        fx, fy = (x - i)[:, None], (y - j)[:, None]
-        rows_of = [t[(j + k) % rows] for k in (0, 1)]
-        q = np.arange(len(at))
-        across = [r[q, i % columns] * (1 - fx) + r[q, (i + 1) % columns] * fx for r in rows_of]
-        return across[0] * (1 - fy) + across[1] * fy
-
-    def network(name: str, x: np.ndarray) -> np.ndarray:
-        for k in range(4):
-            x = x @ weights[f"{name}.{k}.weight"].T + weights[f"{name}.{k}.bias"]
-            x = np.maximum(x, 0) if k < 3 else x
-        return x
-
-    r = 0.1 * network("offset_network", np.concatenate([texture("offset_texture.0", u), omega_o[:, :2]], 1))
-    offset = r / np.maximum(omega_o[:, 2:], 0.6) * omega_o[:, :2]
-    np.testing.assert_allclose(fitted.material.offset(u, omega_o), offset, atol=1e-6)
-    moved = u + offset / [1, aspect]
-    level = np.clip(-np.log2(2 * sigma), 0, finest)
-    low = np.floor(level).astype(int)
-    levels = np.stack([texture(f"pyramid.{s}", moved) for s in range(finest + 1)])
-    q, fine = np.arange(len(u)), (level - low)[:, None]
-    features = (1 - fine) * levels[low, q] + fine * levels[np.minimum(low + 1, finest), q]
-    x = network("decoder", np.concatenate([features, omega_i[:, :2], omega_o[:, :2]], 1))
-    rgb = np.maximum(weights["unit"] * np.expm1(x), 0)
-    low = np.minimum(low, finest - 1)
-    for table, omega in zip(weights["calibration"], (omega_i, omega_o), strict=True):
-        cosines = np.linspace(0, 1, table.shape[1])
-        for c in range(3):
-            at = np.stack([np.interp(omega[:, 2], cosines, row[:, c]) for row in table])
-            rgb[:, c] *= at[low, q] + (level - low) * (at[low + 1, q] - at[low, q])
-    np.testing.assert_allclose(rgb, weights["conformance.rgb"], atol=2e-6)
-    assert fitted.material.deviation() < 1e-6
-
-
 @pytest.mark.parametrize("finest", [0, 4])
 def test_conformance_queries_include_seams_and_end_levels(finest: int) -> None:
     """Seams of the tile, footprints at both ends and beyond, light and view from straight above."""
@@ -150,9 +104,7 @@ def test_conformance_queries_include_seams_and_end_levels(finest: int) -> None:
         np.testing.assert_allclose(np.linalg.norm(queries[name], axis=1), 1, atol=1e-6)
 
 
-def test_conformance_values_come_from_pytorch(
-    fitted: FitResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_conformance_is_pytorchs(fitted: FitResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A fault in fast evaluation shows as a deviation from what is stored."""
     true = mbtf_fit.material.material.predict
 
@@ -178,14 +130,6 @@ def test_evaluation_takes_any_number_of_queries(fitted: FitResult) -> None:
     assert material.evaluate(*(a[:0] for a in queries.values())).shape == (0, 3)
     shifted = material.evaluate(queries["u"] + np.array([2.0, -1.0]), *list(queries.values())[1:])
     np.testing.assert_allclose(shifted, found, atol=1e-4)
-
-
-def test_a_moved_material_loads(fitted: FitResult, tmp_path: Path) -> None:
-    moved = fitted.folder.rename(fitted.folder.with_name("moved"))
-    try:
-        assert Material.load(moved).deviation() == fitted.material.deviation()
-    finally:
-        moved.rename(fitted.folder)
 
 
 def test_damaged_materials_are_refused(fitted: FitResult, tmp_path: Path) -> None:
@@ -254,7 +198,7 @@ def test_data_that_were_read_before_give_the_same_fit(fitted: FitResult, data: P
     partition = load_training(Dataset.open(data), default.held_out, default.seed)
     again = fit(default, data, tmp_path / "m", partition=partition)
     assert again.errors == fitted.errors
-    # They are what is trained on and judged by, whatever the folder holds.
+    # They are used for training and evaluation, whatever the folder holds.
     few = dataclasses.replace(partition, held_out_queries=partition.held_out_queries.take(slice(7)))
     other = fit(default, data, tmp_path / "o", partition=few)
     assert other.errors["held_out_queries"]["unexplained"]["n"] == 7

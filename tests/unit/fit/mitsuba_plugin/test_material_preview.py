@@ -1,4 +1,4 @@
-"""``mbtf-fit preview``: which picture stands where, what turns, and that the scene is as it is said to be."""
+"""``mbtf-fit preview``: order of the pictures, turntable, and scene."""
 
 from __future__ import annotations
 
@@ -142,21 +142,13 @@ def test_invalid_options_are_refused() -> None:
         check_message(caught.value)
 
 
-def test_a_folder_that_is_no_material_is_refused_before_anything_is_made(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_input_of_previews_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from mbtf_core.console import run
     from mbtf_fit.cli.app import app
 
     for code, what, *words in (
         (3, "no material.json", str(tmp_path), "-o", str(tmp_path / "out")),
-        (
-            2,
-            "--tiles-across: 'sheet.tiles_across': must be numbers",
-            "m",
-            "--tiles-across",
-            "1;2",
-        ),
+        (2, "--tiles-across: 'sheet.tiles_across': must be numbers", "m", "--tiles-across", "1;2"),
         (2, "no material given"),
     ):
         assert run(app, ["preview", *words]) == code

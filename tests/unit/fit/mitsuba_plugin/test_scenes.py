@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 from support.plugin_materials import deviation, write_material
-from support.plugin_scenes import directional, plane, sensor_of, through_pixel_centers
-from support.scenes import mi
+from support.plugin_scenes import plane, sensor_of, through_pixel_centers
+from support.scenes import directional, mi
 
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import InputError, MbtfError, UsageError
@@ -33,29 +33,25 @@ def material(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Material]:
 
 def bsdf(folder: Path, **options: Any) -> dict[str, Any]:
     """The plugin with the cheapest of settings to compile."""
-    return {
-        "type": "mbtf",
-        "material": str(folder),
-        "sampling": "cosine",
-        "networks": "cooperative",
-        **options,
-    }
+    fast = {"sampling": "cosine", "networks": "cooperative"}
+    return {"type": "mbtf", "material": str(folder), **fast, **options}
 
 
 def cones() -> Any:
     return mi.load_dict({"type": "mbtf_path", "max_depth": 2})
 
 
+def lit(mesh: Any, sensor: Any, light: Any = LIGHT, **more: Any) -> Any:
+    return mi.load_dict({"type": "scene", "m": mesh, "e": directional(light), "sensor": sensor, **more})
+
+
 def shown(mesh: Any, camera: Camera = CAMERA, light: Any = LIGHT) -> np.ndarray:
     """What ``mbtf_path`` sees of a plane through the pixels' centers, under unit irradiance."""
-    scene = mi.load_dict({"type": "scene", "m": mesh, "e": directional(light), "sensor": sensor_of(camera)})
-    return through_pixel_centers(scene, camera, cones())
+    return through_pixel_centers(lit(mesh, sensor_of(camera), light), camera, cones())
 
 
 @pytest.mark.parametrize("zoom", [0.5, 1.0, 8.0, 64.0])
-def test_a_plane_equals_the_material_at_the_pixels_queries(
-    material: tuple[Path, Material], zoom: float
-) -> None:
+def test_a_plane_equals_the_material_at_its_pixels(material: tuple[Path, Material], zoom: float) -> None:
     """Positions, footprints, directions, orientation of the tile: all of them, at all distances."""
     folder, fitted = material
     camera = Camera(**{**CAMERA.__dict__, "tiles_across": CAMERA.tiles_across * zoom})
@@ -70,9 +66,7 @@ ROTATION = np.array([[np.cos(0.5), -np.sin(0.5)], [np.sin(0.5), np.cos(0.5)]])
 
 @pytest.mark.parametrize("mirrored", [False, True])
 @pytest.mark.parametrize("scale", [1.0, 2.5])
-def test_the_tile_follows_the_texture_coordinates(
-    material: tuple[Path, Material], mirrored: bool, scale: float
-) -> None:
+def test_the_tile_follows_its_uv(material: tuple[Path, Material], mirrored: bool, scale: float) -> None:
     """Turned, mirrored and scaled coordinates: the plane equals the material at turned, mirrored queries."""
     folder, fitted = material
     turn = ROTATION @ np.diag([1.0, -1.0 if mirrored else 1.0])
@@ -100,7 +94,7 @@ def seen_places(camera: Camera) -> np.ndarray:
 
 
 def test_more_samples_per_pixel_do_not_narrow_the_footprint(tmp_path: Path) -> None:
-    """Levels of different constant features: brightness tells σ."""
+    """Levels of different constant features: brightness depends on σ."""
     import torch
 
     levels = {f"pyramid.{s}": torch.full((2**s, 2**s, 7), 0.5 * s) for s in range(5)}
@@ -109,14 +103,7 @@ def test_more_samples_per_pixel_do_not_narrow_the_footprint(tmp_path: Path) -> N
     wanted = fitted.predict(camera.queries(LIGHT).flat()).mean()  # type: ignore[arg-type]
     at_double = camera.queries(LIGHT).flat()
     narrower = fitted.evaluate(at_double.u, at_double.sigma / 4, at_double.omega_i, at_double.omega_o).mean()
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "m": plane(bsdf(tmp_path)),
-            "e": directional(LIGHT),
-            "sensor": sensor_of(camera, 16),
-        }
-    )
+    scene = lit(plane(bsdf(tmp_path)), sensor_of(camera, 16))
     found = np.array(mi.render(scene, integrator=cones(), spp=16)).mean()
     assert abs(narrower / wanted - 1) > 0.05
     assert found == pytest.approx(wanted, rel=5e-3)
@@ -124,8 +111,7 @@ def test_more_samples_per_pixel_do_not_narrow_the_footprint(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("share", [0.05, 0.5, 0.95])
 def test_holes_do_not_change_the_cone(tmp_path: Path, share: float) -> None:
-    """A sheet that is nothing but a hole, at a share of the camera's height: a plane whose brightness tells σ
-    looks the same behind it. Were the cone to begin again at the hole, or to widen, it would not."""
+    """The cone passes a transparent sheet unchanged: a plane whose brightness depends on σ looks the same."""
     import torch
 
     levels = {f"pyramid.{s}": torch.full((2**s, 2**s, 7), 0.5 * s) for s in range(5)}
@@ -136,17 +122,11 @@ def test_holes_do_not_change_the_cone(tmp_path: Path, share: float) -> None:
     write_material(tmp_path / "sheet", finest=0, constant=(0.0,) * 3, transmittance=hole)
     camera = Camera(elevation=55.0, tiles_across=3.0, rows=6, columns=6)
     at = mi.ScalarTransform4f().translate([0, 0, share * float(camera.position[2])]).scale(300.0)
-    scene = {
-        "type": "scene",
-        "m": plane(bsdf(tmp_path / "plane")),
-        "e": directional(LIGHT),
-        "sensor": sensor_of(camera),
-    }
     sheet = {"type": "rectangle", "to_world": at, "b": bsdf(tmp_path / "sheet")}
     tracer = mi.load_dict({"type": "mbtf_path", "max_depth": 3})
-    bare, behind = (
-        through_pixel_centers(mi.load_dict(scene | more), camera, tracer) for more in ({}, {"s": sheet})
-    )
+    mesh, sensor = plane(bsdf(tmp_path / "plane")), sensor_of(camera)
+    scenes = lit(mesh, sensor), lit(mesh, sensor, s=sheet)
+    bare, behind = (through_pixel_centers(scene, camera, tracer) for scene in scenes)
     bare, behind = bare[..., 0], behind[..., 0]
     q = camera.queries(LIGHT).flat()
     narrower, wider = (
@@ -156,28 +136,19 @@ def test_holes_do_not_change_the_cone(tmp_path: Path, share: float) -> None:
     np.testing.assert_allclose(behind, bare, rtol=2e-3)
 
 
-def test_other_integrators_use_the_given_footprint_and_warn_once_without(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_other_integrators_use_the_given_footprint(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     fitted = write_material(tmp_path, finest=4, contrast=0.2, brightness=0.5)
     queries = CAMERA.queries(LIGHT).flat()
-    stock = mi.load_dict({"type": "path", "max_depth": 2})
+    unmodified = mi.load_dict({"type": "path", "max_depth": 2})
     for given, sigma in (({"sigma": 0.1}, 0.1), ({}, fitted.lattice.sigma_range[0])):
         wanted = fitted.evaluate(
             queries.u, np.full_like(queries.sigma, sigma), queries.omega_i, queries.omega_o
         )
         caplog.clear()
         for _ in range(2):
-            scene = mi.load_dict(
-                {
-                    "type": "scene",
-                    "m": plane(bsdf(tmp_path, **given)),
-                    "e": directional(LIGHT),
-                    "sensor": sensor_of(CAMERA),
-                }
-            )
+            scene = lit(plane(bsdf(tmp_path, **given)), sensor_of(CAMERA))
             with caplog.at_level(logging.WARNING, logger="mbtf_fit"):
-                found = through_pixel_centers(scene, CAMERA, stock).reshape(-1, 3)
+                found = through_pixel_centers(scene, CAMERA, unmodified).reshape(-1, 3)
         assert deviation(found, wanted) < 4e-3
         assert len([r for r in caplog.records if "mbtf_path" in r.message]) == (0 if given else 1)
 
@@ -205,10 +176,8 @@ def test_parameters_can_be_changed(material: tuple[Path, Material]) -> None:
 
 
 def scene_of(folder: Path | str, **options: Any) -> dict[str, Any]:
-    return {
-        "type": "scene",
-        "ball": {"type": "sphere", "b": {"type": "mbtf", "material": str(folder), **options}},
-    }
+    material = {"type": "mbtf", "material": str(folder), **options}
+    return {"type": "scene", "ball": {"type": "sphere", "b": material}}
 
 
 @pytest.mark.parametrize(
@@ -250,9 +219,7 @@ def test_xml_is_loaded_and_refused_alike(material: tuple[Path, Material], tmp_pa
         load_scene({"type": "scene", "ball": {"type": "sphere", "b": {"type": "mbtf"}}})
 
 
-def test_a_mesh_without_texture_coordinates_is_refused(
-    material: tuple[Path, Material], tmp_path: Path
-) -> None:
+def test_a_mesh_without_uv_is_refused(material: tuple[Path, Material], tmp_path: Path) -> None:
     path = tmp_path / "bare.ply"
     path.write_text(
         "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
@@ -261,7 +228,7 @@ def test_a_mesh_without_texture_coordinates_is_refused(
     bare = {"type": "scene", "bare": {"type": "ply", "filename": str(path), "b": bsdf(material[0])}}
     with pytest.raises(InputError, match="shape 'bare': the mesh has an mbtf material but no texture"):
         load_scene(bare)
-    # Mitsuba says no more than that the rendering failed; the cause says why.
+    # Mitsuba's message is only that the rendering failed; the cause has ours.
     with pytest.raises(RuntimeError) as caught:
         mi.render(mi.load_dict({**bare, "sensor": sensor_of(CAMERA)}), integrator=cones())
     assert "no texture coordinates" in str(caught.value.__cause__ or caught.value.__context__)

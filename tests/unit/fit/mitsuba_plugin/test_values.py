@@ -24,43 +24,37 @@ from mbtf_fit.mitsuba_plugin.evaluator import Evaluator  # noqa: E402
 from mbtf_fit.mitsuba_plugin.material_arrays import read_material  # noqa: E402
 
 RANDOM = torch.Generator().manual_seed(1)
+
+
+def net(**options: Any) -> dict[str, Any]:
+    return {"network": options}
+
+
+def calibration(levels: int) -> dict[str, Any]:
+    return {"weights": {"calibration": 0.7 + 0.6 * torch.rand((2, levels, 6, 3), generator=RANDOM)}}
+
+
 VARIANTS: dict[str, dict[str, Any]] = {
     "neumip": {},
     "baseline": {"model": "neumip-baseline"},
     "tall tile": {"aspect": 2.3},
     "flat tile": {"aspect": 0.1},
     "one texel": {"finest": 0},
-    "calibrated": {"weights": {"calibration": 0.7 + 0.6 * torch.rand((2, 4, 6, 3), generator=RANDOM)}},
-    "calibrated, one texel": {
-        "finest": 0,
-        "weights": {"calibration": 0.7 + 0.6 * torch.rand((2, 1, 6, 3), generator=RANDOM)},
-    },
-    "six outputs": {"network": {"output_channels": 6}},
-    "direct offset": {
-        "network": {"offset": "direct", "activation": "leaky-relu", "output_transform": "softplus"}
-    },
-    "concatenated": {"network": {"blending": "concatenate", "activation": "sine", "output_transform": "exp"}},
-    "concatenated, one texel": {"finest": 0, "network": {"blending": "concatenate"}},
-    "encoded": {
-        "network": {
-            "encoding": {"position": 2, "direction": 2, "raw": True, "direction_xyz": True, "pi": False}
-        }
-    },
-    "encoded with pi": {
-        "network": {"encoding": {"position": 3, "direction": 1}, "output_transform": "identity"}
-    },
-    "footprint_filtered": {
-        "aspect": 0.5,
-        "network": {"encoding": {"position": 4, "footprint_filtered": True}},
-    },
-    "band_attenuation": {
-        "network": {
-            "encoding": {"position": 3, "direction": 3, "direction_pi": False, "band_attenuation": True}
-        }
-    },
-    "fourth root": {"network": {"output_transform": "fourth-root", "channels": 9, "width": 8, "layers": 2}},
+    "calibrated": calibration(4),
+    "calibrated, one texel": {"finest": 0, **calibration(1)},
+    "six outputs": net(output_channels=6),
+    "direct offset": net(offset="direct", activation="leaky-relu", output_transform="softplus"),
+    "concatenated": net(blending="concatenate", activation="sine", output_transform="exp"),
+    "concatenated, one texel": {"finest": 0, **net(blending="concatenate")},
+    "encoded": net(encoding={"position": 2, "direction": 2, "raw": True, "direction_xyz": True, "pi": False}),
+    "encoded with pi": net(encoding={"position": 3, "direction": 1}, output_transform="identity"),
+    "footprint_filtered": {"aspect": 0.5, **net(encoding={"position": 4, "footprint_filtered": True})},
+    "attenuated": net(
+        encoding={"position": 3, "direction": 3, "direction_pi": False, "band_attenuation": True}
+    ),
+    "fourth root": net(output_transform="fourth-root", channels=9, width=8, layers=2),
 }
-UNROLLED = ("fourth root", "encoded")
+UNROLLED = ("neumip", "fourth root", "encoded")
 
 
 @pytest.mark.parametrize("name", VARIANTS)
@@ -70,21 +64,14 @@ def test_conformance_and_random_queries(name: str, tmp_path: Path) -> None:
     # Unrolled kernels take a second to compile.
     plugin = Evaluator(read_material(tmp_path), "unrolled" if name in UNROLLED else "cooperative")
     stored = material.conformance
-    queries = [stored[k] for k in ("u", "sigma", "omega_i", "omega_o")]
+    known = [stored[k] for k in ("u", "sigma", "omega_i", "omega_o")]
     assert stored["rgb"].std() > 0.01
-    assert deviation(plugin.evaluate(*queries), stored["rgb"]) < 1e-4
-    drawn = random_queries(np.random.default_rng(3), 4000, Lattice(material.lattice.finest))
-    drawn["u"] = 5 * drawn["u"] - 2
-    drawn["sigma"] *= np.float32(1.5)
-    found, wanted = plugin.evaluate(*drawn.values()), material.evaluate(*drawn.values())
+    assert deviation(plugin.evaluate(*known), stored["rgb"]) < 1e-4
+    queries = random_queries(np.random.default_rng(3), 4000, Lattice(material.lattice.finest))
+    queries["u"] = 5 * queries["u"] - 2
+    queries["sigma"] *= np.float32(1.5)
+    found, wanted = plugin.evaluate(*queries.values()), material.evaluate(*queries.values())
     assert deviation(found, wanted) < 1e-4
-
-
-def test_the_networks_of_the_paper_unrolled(tmp_path: Path) -> None:
-    material = write_material(tmp_path)
-    stored = material.conformance
-    queries = [stored[k] for k in ("u", "sigma", "omega_i", "omega_o")]
-    assert deviation(Evaluator(read_material(tmp_path), "unrolled").evaluate(*queries), stored["rgb"]) < 1e-4
 
 
 @pytest.mark.parametrize(
@@ -95,8 +82,8 @@ def test_half_precision_errs_by_less_than_one_percent(options: dict[str, Any], t
     """Also where neighboring texels differ much, so that an offset's rounding would show."""
     material = write_material(tmp_path, **options)
     half = Evaluator(read_material(tmp_path), "half")
-    drawn = random_queries(np.random.default_rng(4), 20_000, material.lattice)
-    assert 1e-5 < deviation(half.evaluate(*drawn.values()), material.evaluate(*drawn.values())) < 1e-2
+    queries = random_queries(np.random.default_rng(4), 20_000, material.lattice)
+    assert 1e-5 < deviation(half.evaluate(*queries.values()), material.evaluate(*queries.values())) < 1e-2
 
 
 def test_half_precision_does_not_round_inputs() -> None:
@@ -147,9 +134,7 @@ def test_folders_that_are_no_material_are_refused(tmp_path: Path) -> None:
         ({"activation": "gelu"}, "activation"),
     ],
 )
-def test_weights_of_another_architecture_are_refused(
-    network: dict[str, Any], fault: str, tmp_path: Path
-) -> None:
+def test_weights_of_other_networks_are_refused(network: dict[str, Any], fault: str, tmp_path: Path) -> None:
     write_material(tmp_path)
     path = tmp_path / "material.json"
     description = json.loads(path.read_text())

@@ -1,9 +1,4 @@
-"""Pictures of a fitted material from near to far: as bright and as rich in contrast as filtered pixels are.
-
-The material is a texture whose levels are filtered; nothing is left but the footprint, and the blend of two
-levels that stands for what lies between. Contrast in excess of the filtered texture's is aliasing, what is
-missing is blur.
-"""
+"""At any distance, mean and contrast of a fitted material are those of filtered pixels."""
 
 from __future__ import annotations
 
@@ -15,8 +10,8 @@ import pytest
 import torch
 from numpy.typing import NDArray
 from support.plugin_materials import write_material
-from support.plugin_scenes import directional, plane, sensor_of, through_pixel_centers
-from support.scenes import mi
+from support.plugin_scenes import plane, sensor_of, through_pixel_centers
+from support.scenes import directional, mi
 
 from mbtf_core.directions import from_angles
 from mbtf_gen.pictures.camera import Camera
@@ -65,21 +60,14 @@ def material(texture: NDArray[np.float64], tmp_path_factory: pytest.TempPathFact
 
 
 @pytest.mark.parametrize("tiles_across", [0.25, 1.0, 3.0, 10.0, 30.0, 300.0])
-def test_mean_and_contrast_are_those_of_filtered_pixels(
-    material: Path, texture: NDArray[np.float64], tiles_across: float
-) -> None:
+def test_pixels_are_filtered(material: Path, texture: NDArray[np.float64], tiles_across: float) -> None:
     camera = Camera(
         80.0, -70.0, tiles_across=tiles_across, target=(0.3, 0.6), rows=64, columns=64, field_of_view=6.0
     )
     bsdf: Any = {"type": "mbtf", "material": str(material), "sampling": "cosine", "networks": "cooperative"}
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "m": plane(bsdf, half=2.0 * tiles_across + 2.0),
-            "e": directional(LIGHT),
-            "sensor": sensor_of(camera),
-        }
-    )
+    mesh = plane(bsdf, half=2.0 * tiles_across + 2.0)
+    parts = {"m": mesh, "e": directional(LIGHT), "sensor": sensor_of(camera)}
+    scene = mi.load_dict({"type": "scene", **parts})
     integrator = mi.load_dict({"type": "mbtf_path", "max_depth": 2})
     found = through_pixel_centers(scene, camera, integrator)[..., 0]
     queries = camera.queries(LIGHT)

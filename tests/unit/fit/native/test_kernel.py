@@ -41,7 +41,7 @@ def kernel_of(variant: str) -> Kernel:
 
 
 def random_model(name: str, lattice: Lattice, **network: Any) -> Neumip:
-    """A model with all parameters drawn, biases and offset texture too."""
+    """A model with random parameters, biases and offset texture included."""
     model = build_model(name, lattice, **network)
     assert isinstance(model, Neumip)
     generator = torch.Generator().manual_seed(0)
@@ -158,12 +158,12 @@ def test_values_and_gradients_are_those_of_the_reference(
 @needs_kernel
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_the_largest_networks_are_those_of_the_reference(variant: str) -> None:
-    """As many channels, features and layers as it says that it takes."""
+    """The largest supported numbers of channels, features and layers."""
     model = random_model("neumip", LATTICE, channels=64, width=128, layers=16)
     assert unsupported_reason(model) is None
     with torch.no_grad():
         for network in networks(model):
-            # So many layers of weights drawn anew would answer beyond what exp can take.
+            # So many random layers would overflow exp.
             network.weights[-1] *= 1e-3
     batch, loss = random_batch(200), objective()
     exact_loss, expected = exact_gradients(model, loss, batch)
@@ -175,8 +175,7 @@ def test_the_largest_networks_are_those_of_the_reference(variant: str) -> None:
 @needs_kernel
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_outputs_of_any_size_give_finite_values(variant: str) -> None:
-    """exp(x) - 1 to single precision, from where only the -1 is left to where it is infinite, and near 0
-    where the two cancel; its slope likewise."""
+    """exp(x) - 1 and its slope to single precision, from underflow to overflow and near 0."""
     model = build_model("neumip-baseline", LATTICE, layers=2)
     small = 10.0 ** np.arange(-9, 1)
     answers = np.concatenate([[-200, -87.1, 88.2, 88.8, 200], np.linspace(-86.9, 88.2, 66), small, -small])
@@ -204,9 +203,7 @@ def test_outputs_of_any_size_give_finite_values(variant: str) -> None:
 
 @needs_kernel
 @pytest.mark.parametrize("kind", ["log", "fourth-root"])
-def test_any_other_loss_goes_through_pytorch_piece_by_piece(
-    kind: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_other_losses_go_through_pytorch_in_pieces(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mbtf_fit.native.gradients._PIECE_BYTES", 1)
     model, batch = random_model("neumip", LATTICE), random_batch(1500)
     loss = objective(losses=[{"kind": kind, "weight": 1.0}, {"kind": "relative", "weight": 0.5}])
@@ -347,26 +344,17 @@ def test_queries_of_another_shape_are_refused() -> None:
 def test_unsupported_options_use_pytorch() -> None:
     assert _SUPPORTED.keys() | _SIZES == NetworkSection.model_fields.keys()
     options: list[dict[str, Any]] = [
-        {"activation": "leaky-relu"},
-        {"output_channels": 6},
-        {"output_transform": "exp"},
-        {"offset": "direct"},
-        {"blending": "concatenate"},
-        {"encoding": {"position": 2}},
-        {"encoding": {"direction": 1}},
-        {"width": 129},
-        {"layers": 16, "width": 500},
+        *({"activation": "leaky-relu"}, {"output_channels": 6}, {"output_transform": "exp"}),
+        *({"offset": "direct"}, {"blending": "concatenate"}, {"width": 129}, {"layers": 16, "width": 500}),
+        *({"encoding": {"position": 2}}, {"encoding": {"direction": 1}}),
     ]
     for option in options:
         model = build_model("neumip", LATTICE, **option)
         assert unsupported_reason(model) is not None, option
     assert unsupported_reason(build_model("hierarchical", LATTICE)) is not None
     assert unsupported_reason(build_model("neumip", LATTICE).double()) is not None
-    known: list[dict[str, Any]] = [
-        {"offset": "none"},
-        {"channels": 64, "width": 128, "layers": 16},
-        {"encoding": {"direction_xyz": True}},
-    ]
+    known: list[dict[str, Any]] = [{"offset": "none"}, {"channels": 64, "width": 128, "layers": 16}]
+    known.append({"encoding": {"direction_xyz": True}})
     for option in known:
         assert unsupported_reason(build_model("neumip", LATTICE, **option)) is None
 

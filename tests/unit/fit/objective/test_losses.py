@@ -77,15 +77,15 @@ def test_the_default_huber_threshold_causes_little_bias() -> None:
 
 def test_an_outlier_has_the_gradient_of_the_bound() -> None:
     loss = objective("squared", 0.04)
-    pulls = []
+    gradients = []
     bound = 10 * (SCALE**2 + 0.04) ** 0.5
     for off in (0.5 * bound, bound, 2 * bound, 1e5):
         p = torch.full((1, 3), 1.0, dtype=torch.float64, requires_grad=True)
         value = torch.full((1, 3), 1.0 + off, dtype=torch.float64)
         (gradient,) = torch.autograd.grad(loss(p, queries(value)), p)
-        pulls.append(float(gradient[0, 0]))
-    assert pulls[0] == pytest.approx(pulls[1] / 2)
-    assert pulls[1] == pytest.approx(pulls[2]) == pytest.approx(pulls[3])
+        gradients.append(float(gradient[0, 0]))
+    assert gradients[0] == pytest.approx(gradients[1] / 2)
+    assert gradients[1] == pytest.approx(gradients[2]) == pytest.approx(gradients[3])
 
 
 @pytest.mark.parametrize("curve", [Log(), FourthRoot()], ids=["log", "fourth-root"])

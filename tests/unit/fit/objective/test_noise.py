@@ -15,8 +15,7 @@ LATTICE = Lattice(3)
 
 
 def noisy(n: int = 60_000, wild: int = 0) -> tuple[ShardQueries, np.ndarray, np.ndarray]:
-    """(queries, true values, variance of the mean of their halves): variance 0.2 t² at coarse levels, 0.05 t²
-    at fine ones, twice that where light or view is low."""
+    """(queries, true values, variance of the mean): 0.2 t² or 0.05 t² by level, twice that at low angles."""
     random = np.random.default_rng(0)
     arrays = random_queries(random, n, LATTICE)
     true = parallax(*arrays.values())
@@ -70,8 +69,8 @@ def test_data_without_noise_have_none() -> None:
 
 @pytest.mark.parametrize("wild", [0, 5])
 def test_the_ratio_is_noise_to_signal(wild: int) -> None:
-    """To 5 %, wild values or not; where true values do not vary it is the most there is, since none can be
-    told, and of a single query likewise."""
+    """To 5 %, wild values or not; where true values do not vary and for a single query, it is the upper
+    bound."""
     queries, true, variance = noisy(wild=wild)
     found = NoiseModel.of(queries, LATTICE, 0.05).ratio
     assert found == pytest.approx(variance.mean() / true.var(0).mean(), rel=0.05)

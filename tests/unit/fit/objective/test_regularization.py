@@ -1,4 +1,4 @@
-"""Pulls towards 0: as strong as noise and number of the queries ask for, on what they should act on."""
+"""Weight decay: its strength follows noise and number of the queries, and biases are exempt."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from mbtf_fit.training.fit import prepare_trainer
 LATTICE = Lattice(3)
 
 
-def pull(ratio: float, queries: int = 5000, **training: Any) -> WeightDecay:
+def decay_of(ratio: float, queries: int = 5000, **training: Any) -> WeightDecay:
     return WeightDecay.of(FitConfig.model_validate({"training": training}).training, ratio, queries)
 
 
@@ -31,18 +31,18 @@ def pull(ratio: float, queries: int = 5000, **training: Any) -> WeightDecay:
 )
 def test_noise_increases_weight_decay(ratio: float, texels: float, weights: float) -> None:
     """Of texels from a ratio of a half on; of weights with its square up to there, then with it, up to 1."""
-    found = pull(ratio, texture_weight_decay=2.0, noise_regularization=1000.0)
+    found = decay_of(ratio, texture_weight_decay=2.0, noise_regularization=1000.0)
     assert (found.texels, found.weights) == (pytest.approx(texels), pytest.approx(weights))
 
 
 def test_many_queries_and_0_disable_the_decay_of_weights() -> None:
-    assert pull(1.0, 10**8, noise_regularization=1e5).weights == pytest.approx(1e-3)
-    assert pull(5.0, 10, noise_regularization=0.0).weights == 0.0
+    assert decay_of(1.0, 10**8, noise_regularization=1e5).weights == pytest.approx(1e-3)
+    assert decay_of(5.0, 10, noise_regularization=0.0).weights == 0.0
 
 
 def test_the_decay_is_bounded_by_the_learning_rate() -> None:
-    """Else so few queries would have weights pulled to 0, and the fit would be a constant."""
-    assert pull(5.0, 50, noise_regularization=1000.0).weights == 1.0
+    """Otherwise few queries would decay all weights to 0, and the fit would be a constant."""
+    assert decay_of(5.0, 50, noise_regularization=1000.0).weights == 1.0
 
 
 @pytest.mark.parametrize("model", ["neumip", "neumip-baseline", "hierarchical"])
@@ -67,10 +67,8 @@ def test_a_trainer_counts_all_its_queries() -> None:
     noise = NoiseModel(0.1, np.zeros(3), np.zeros((4, 3)), np.ones(4), 0.7)
     data = training_queries(arrays, parallax(*arrays.values()))
     trainer = make_trainer(data, LATTICE, noise=noise, batch=1000, steps=1, noise_regularization=1000.0)
-    assert (trainer.weight_decay.texels, trainer.weight_decay.weights) == (
-        0.0,
-        pytest.approx(0.7 * 1000 / 5000),
-    )
+    assert trainer.weight_decay.texels == 0.0
+    assert trainer.weight_decay.weights == pytest.approx(0.7 * 1000 / 5000)
 
 
 def test_a_fit_estimates_the_noise_ratio_of_its_data(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""What a fit says about its price follows from what it measured."""
+"""The marginal cost of a fit follows from its validations."""
 
 from __future__ import annotations
 
@@ -11,16 +11,10 @@ from mbtf_fit.training.convergence import marginal_cost_of
 
 
 def history(power: float, error: float = 1e-4, total: float = 80.0) -> list[dict[str, Any]]:
-    """Looks at an error that falls with a power of time."""
-    return [
-        {
-            "fraction": fraction,
-            "seconds": fraction * total,
-            "unexplained": 0.2 * fraction**-power,
-            "unexplained_error": error,
-        }
-        for fraction in (0.1, 0.2, 0.31, 0.49, 0.7, 1.0)
-    ]
+    """Validations of an error that falls with a power of time."""
+    fractions = (0.1, 0.2, 0.31, 0.49, 0.7, 1.0)
+    times = [{"fraction": fraction, "seconds": fraction * total} for fraction in fractions]
+    return [t | {"unexplained": 0.2 * t["fraction"] ** -power, "unexplained_error": error} for t in times]
 
 
 def errors(held_out: float, training: float, error: float = 0.002) -> dict[str, Any]:

@@ -24,28 +24,19 @@ def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_data(tmp_path_factory.mktemp("data") / "shards", parallax, train=6000, noise=0.01)
 
 
-def test_each_doubling_improves_by_a_fraction_of_the_one_before() -> None:
+def test_extrapolation_follows_its_law() -> None:
+    """Each doubling improves by a fraction of the one before; the limit is finite; errors never increase."""
     gain = math.log(0.8 / 0.6)
     one, two = (extrapolated(0.8, 0.6, doublings) for doublings in (1, 2))
     assert math.log(0.6 / one) == pytest.approx(PERSISTENCE * gain)
     assert math.log(one / two) == pytest.approx(PERSISTENCE**2 * gain)
-    # In the end all of them together gain a finite part.
     assert extrapolated(0.8, 0.6, 60) == pytest.approx(0.6 * (0.6 / 0.8) ** (PERSISTENCE / (1 - PERSISTENCE)))
-
-
-def test_fits_several_doublings_apart_follow_the_same_law() -> None:
-    """Errors of the law itself at 1, 2, 8 and 64 times: any two tell the third."""
-    eight = extrapolated(0.8, 0.6, 2)
-    end = extrapolated(0.8, 0.6, 5)
+    # Of the errors at 1, 2, 8 and 64 times, any two determine the third.
+    eight, end = (extrapolated(0.8, 0.6, doublings) for doublings in (2, 5))
     assert extrapolated(0.6, eight, 3, apart=2) == pytest.approx(end)
     assert extrapolated(0.8, eight, 3, apart=3) == pytest.approx(end)
-    # Gains that last promise more.
     assert extrapolated(0.8, 0.6, 5, persistence=0.9) < end < extrapolated(0.8, 0.6, 5, persistence=0.4)
-
-
-def test_forecasts_never_exceed_what_pilots_show() -> None:
-    assert extrapolated(0.5, 0.6, 3) == 0.6
-    assert extrapolated(0.8, 0.6, -2) == 0.6
+    assert extrapolated(0.5, 0.6, 3) == extrapolated(0.8, 0.6, -2) == 0.6
     assert extrapolated(0.1, -0.01, 3) == -0.01
 
 
@@ -75,9 +66,7 @@ def test_a_forecast_matches_the_fit_that_follows(
         assert found.bytes < size < found.bytes + 20480
 
 
-def test_a_large_test_split_is_the_validation_set(
-    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_validation_uses_a_large_split(shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its queries have more paths, but few of them say less than what was held out."""
 
     def looked_at(shards: Path) -> tuple[str, ShardQueries]:

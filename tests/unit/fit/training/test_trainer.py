@@ -43,9 +43,7 @@ def trainer(data: TrainingQueries, model: str = "neumip", **training: Any) -> Tr
         ((16, 16), 0.0, 0.0),
     ],
 )
-def test_blur_begins_at_an_eighth_of_the_tile_at_most(
-    shape: tuple[int, int], asked: float, start: float
-) -> None:
+def test_initial_blur_is_at_most_an_eighth(shape: tuple[int, int], asked: float, start: float) -> None:
     """Wider blur leaves nothing to find: offsets wander off and textures become sharp where they are."""
     lattice = Lattice.for_map(*shape)
     arrays = random_queries(np.random.default_rng(0), 500, lattice)
@@ -129,9 +127,8 @@ def test_textures_and_networks_learn_at_their_own_rates(compiled: bool) -> None:
 
 
 def test_the_blur_ends_with_its_fraction_of_the_budget() -> None:
-    t = trainer(
-        queries(10), blur={"initial_sigma": 1.0, "final_sigma": 0.25, "fraction": 0.25, "offset_sigma": 0.0}
-    )
+    blur = {"initial_sigma": 1.0, "final_sigma": 0.25, "fraction": 0.25, "offset_sigma": 0.0}
+    t = trainer(queries(10), blur=blur)
     found = []
     for step in (0, 5, 9, 10, 40):
         t.progress.step = step
@@ -144,15 +141,8 @@ def test_texels_without_a_gradient_decay_with_the_rate(compiled: bool) -> None:
     arrays = random_queries(np.random.default_rng(0), 64, LATTICE)
     arrays["sigma"][:] = 0.5
     data = training_queries(arrays, parallax(*arrays.values()))
-    t = trainer(
-        data,
-        steps=5,
-        texture_weight_decay=2.0,
-        texture_learning_rate=0.05,
-        warmup=0,
-        final_learning_rate_factor=0.1,
-        blur={"initial_sigma": 0.0},
-    )
+    rates = {"texture_learning_rate": 0.05, "warmup": 0, "final_learning_rate_factor": 0.1}
+    t = trainer(data, steps=5, texture_weight_decay=2.0, blur={"initial_sigma": 0.0}, **rates)
     t._stepper = t._stepper if compiled else None
     first = t.model.textures()[0].texels.detach().clone()
     rates = [0.05 * learning_rate_factor(t.config.training, k, k / 5) for k in range(5)]

@@ -15,14 +15,9 @@ from mbtf_fit import FitConfig, Material, fit
 
 
 def config(model: str, start: Path | None, steps: int = 3, **network: Any) -> FitConfig:
-    return FitConfig.model_validate(
-        {
-            "model": model,
-            "init_from": None if start is None else str(start),
-            "network": network,
-            "training": {"steps": steps, "batch": 256, "blur": {"initial_sigma": 0, "offset_sigma": 0}},
-        }
-    )
+    training = {"steps": steps, "batch": 256, "blur": {"initial_sigma": 0, "offset_sigma": 0}}
+    options = {"init_from": None if start is None else str(start), "network": network, "training": training}
+    return FitConfig.model_validate({"model": model, **options})
 
 
 @pytest.fixture(scope="module")
@@ -34,18 +29,11 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return write_images(folder / "d", parallax, train=40), folder / "m"
 
 
-def test_textures_and_offset_are_copied_and_the_decoder_is_not(
-    folders: tuple[Path, Path], tmp_path: Path
-) -> None:
+def test_textures_and_offset_are_copied(folders: tuple[Path, Path], tmp_path: Path) -> None:
     images, start = folders
     # At rates this low what training started from is what it ends with.
-    slow = {
-        "steps": 1,
-        "batch": 64,
-        "learning_rate": 1e-9,
-        "texture_learning_rate": 1e-9,
-        "blur": {"initial_sigma": 0, "offset_sigma": 0},
-    }
+    rates = {"learning_rate": 1e-9, "texture_learning_rate": 1e-9}
+    slow = {"steps": 1, "batch": 64, "blur": {"initial_sigma": 0, "offset_sigma": 0}, **rates}
     options = {"model": "hierarchical", "training": slow}
     weights = {}
     for name, more in (("own", {}), ("taken", {"init_from": str(start)})):

@@ -79,9 +79,7 @@ def test_all_fits_are_evaluated_on_the_same_test_queries(tmp_path: Path) -> None
         ("hierarchical", ["offset texture", "offset network", "pyramid", "encoding"]),
     ],
 )
-def test_times_are_scaled_to_all_pixels(
-    model: str, parts: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_times_scale_to_all_pixels(model: str, parts: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """If every part takes a second, only the scale remains."""
 
     def one_second(work: Any) -> tuple[Any, float]:

@@ -7,6 +7,8 @@ import pytest
 
 from mbtf_pipeline.compare.flip import flip
 
+Color = tuple[float, float, float]
+
 
 @pytest.fixture(scope="module")
 def pictures() -> tuple[np.ndarray, np.ndarray]:
@@ -39,19 +41,15 @@ def test_only_the_ratio_to_white_matters(pictures: tuple[np.ndarray, np.ndarray]
     assert flip(fit, reference, 2.0).ldr > 0.01
 
 
-def uniform(color: tuple[float, float, float]) -> np.ndarray:
+def uniform(color: Color) -> np.ndarray:
     return np.broadcast_to(np.array(color, np.float32), (40, 48, 3)).copy()
 
 
 def hunt(color: np.ndarray) -> np.ndarray:
     """CIELAB of linear Rec.709 under its own white, chroma scaled by lightness (Andersson et al. 2020)."""
-    to_xyz = np.array(
-        [
-            [10135552 / 24577794, 8788810 / 24577794, 4435075 / 24577794],
-            [2613072 / 12288897, 8788810 / 12288897, 887015 / 12288897],
-            [1425312 / 73733382, 8788810 / 73733382, 70074185 / 73733382],
-        ]
-    )
+    red, green = (10135552, 8788810, 4435075), (2613072, 8788810, 887015)
+    blue = (1425312, 8788810, 70074185)
+    to_xyz = np.array([red, green, blue]) / np.array([[24577794], [12288897], [73733382]])
     x = to_xyz @ color / (to_xyz @ np.ones(3))
     bend = 6 / 29
     f = np.where(x > bend**3, np.cbrt(x), x / (3 * bend**2) + 4 / 29)
@@ -81,9 +79,7 @@ def aces(x: np.ndarray) -> np.ndarray:
     ("first", "second"),
     [((0.2, 0.3, 0.1), (0.25, 0.3, 0.1)), ((0.05, 0.05, 0.05), (0.6, 0.1, 0.02)), ((0, 0, 0), (0.9, 1, 0.8))],
 )
-def test_flip_of_uniform_images_is_known(
-    first: tuple[float, float, float], second: tuple[float, float, float]
-) -> None:
+def test_flip_of_uniform_images_is_known(first: Color, second: Color) -> None:
     white = 0.5
     found = flip(uniform(first), uniform(second), white)
     shown = [np.array(c) / white for c in (first, second)]

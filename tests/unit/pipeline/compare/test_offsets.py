@@ -32,9 +32,7 @@ def plane_below() -> object:
 
 
 @pytest.mark.parametrize(("elevation", "azimuth"), [(30, 0), (30, 135), (60, -90), (90, 0), (20, 250)])
-def test_a_plane_below_is_displaced_by_its_depth_over_the_tangent(
-    plane_below: object, elevation: float, azimuth: float
-) -> None:
+def test_a_plane_below_is_displaced(plane_below: object, elevation: float, azimuth: float) -> None:
     u = np.array([[0.5, 0.5], [0.7, 0.4], [0.3, 0.6]], np.float32)
     found = traced_offset(plane_below, u, from_angles(elevation, azimuth))  # type: ignore[arg-type]
     distance = DEPTH / np.tan(np.radians(elevation))

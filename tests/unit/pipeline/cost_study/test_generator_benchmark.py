@@ -59,10 +59,8 @@ def test_an_unbiased_configuration_shows_no_bias(benchmark: GeneratorBenchmark) 
 def test_error_bars_agree_with_other_seeds(benchmark: GeneratorBenchmark) -> None:
     """Differences of seeds over their error bars; a bar too narrow by a factor 2 gives a deviation of 2."""
     changes = {"transport.max_depth": 1, "queries.spp": 8}
-    found = [
-        Found(GeneratorBenchmark(benchmark.config, benchmark.material, seed), changes, {})
-        for seed in range(6)
-    ]
+    runs = [GeneratorBenchmark(benchmark.config, benchmark.material, seed) for seed in range(6)]
+    found = [Found(run, changes, {}) for run in runs]
     again = Found(GeneratorBenchmark(benchmark.config, benchmark.material, 0), changes, {})
     assert (again.noise, again.bias) == (found[0].noise, found[0].bias)
     for part in ("noise", "bias", "error"):
@@ -95,9 +93,7 @@ def test_other_work_on_the_machine_hardly_changes_the_time() -> None:
     assert 0.0 < found.error < 0.02
 
 
-def test_error_bars_include_the_error_of_the_mean_value(
-    benchmark: GeneratorBenchmark, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_error_bars_include_the_mean(benchmark: GeneratorBenchmark, monkeypatch: pytest.MonkeyPatch) -> None:
     mean = benchmark.mean({})
     assert abs(mean.value - 0.25) < 4 * mean.error < 0.25 * 2e-3
     changes = {"transport.max_depth": 1, "queries.spp": 8}
@@ -110,9 +106,7 @@ def test_error_bars_include_the_error_of_the_mean_value(
         assert b.error == pytest.approx(math.hypot(a.error, 0.1 * a.value), rel=1e-3)
 
 
-def test_closed_forms_come_in_batches_that_fit_into_memory(
-    benchmark: GeneratorBenchmark, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_closed_forms_fit_into_memory(benchmark: GeneratorBenchmark, monkeypatch: pytest.MonkeyPatch) -> None:
     """They take no paths, so that paths alone would not limit the queries of a batch."""
     sizes: list[int] = []
 

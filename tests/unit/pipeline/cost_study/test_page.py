@@ -11,12 +11,10 @@ from typing import Any
 from PIL import Image
 
 from mbtf_core.stats import Estimate
-from mbtf_pipeline.cost_study.figures import run_name
-from mbtf_pipeline.cost_study.fit_runs import MODELS_OF_PAPERS, PRESET, SIZES
 from mbtf_pipeline.cost_study.measurements import Measurement
 from mbtf_pipeline.cost_study.page import write_page
 from mbtf_pipeline.cost_study.study import Study
-from mbtf_pipeline.report.plots import COLORS, MARKERS, Cloud, _legend_above, scatter
+from mbtf_pipeline.report.plots import Cloud, _legend_above, scatter
 
 DESCRIPTION = {
     "name": "a study", "machine": {"system": "a machine"}, "date": "today", "time": 600.0,
@@ -58,17 +56,12 @@ def test_a_legend_of_long_names_is_no_wider_than_the_figure() -> None:
     assert len(legend.get_texts()) == 6
 
 
-def test_every_series_has_its_own_color_and_marker() -> None:
-    count = 1 + len(MODELS_OF_PAPERS) + len(SIZES)
-    assert count <= len(set(COLORS)) == len(set(MARKERS)) == len(COLORS)
-
-
 def test_an_undefined_error_is_shown_as_such(tmp_path: Path) -> None:
     """Test values whose variance is not significant leave no unexplained variance."""
     page = write_page(Study(tmp_path, DESCRIPTION, [measured("models", 10.0, math.nan)])).read_text()
     assert not re.search(r"\b(nan|inf)\b", page)
     assert "No unexplained variance of test queries could be measured" in page
-    # Without repeats the error bars of runs are too narrow, and the page says so.
+    # Without repeats the error bars of runs are too narrow, and the page warns of it.
     assert "are too narrow" in page
     summary = json.loads((tmp_path / "study.json").read_text())["summary"]
     assert (summary["narrow"], summary["known"], summary["seed_deviation"]) == (0, 0, None)
@@ -87,12 +80,8 @@ def test_the_page_shows_the_front_with_commands_and_what_is_biased(tmp_path: Pat
     ]  # fmt: skip
     study = Study(tmp_path, DESCRIPTION, found, deviation=Estimate(0.04, 0.01, 9))
     page = write_page(study).read_text()
-    assert {p.stem for p in tmp_path.glob("*.png")} == {
-        "front",
-        "models",
-        "models_evaluation",
-        "interactions",
-    }
+    pictures = {"front", "models", "models_evaluation", "interactions"}
+    assert {p.stem for p in tmp_path.glob("*.png")} == pictures
     front = page.split('id="front"')[1].split("</section>")[0]
     # Two of the three runs, each with a command that one click selects.
     assert front.count("<td class=command><code>mbtf-gen a &amp;&amp; mbtf-fit b</code></td>") == 2
@@ -104,9 +93,3 @@ def test_the_page_shows_the_front_with_commands_and_what_is_biased(tmp_path: Pat
     assert "at most 0.6 % of the mean value" in section
     assert "one run is 4.0 ± 1.0 %" in page
     assert not re.search(r"\bnan\b", page)
-
-
-def test_runs_on_the_front_have_distinct_names() -> None:
-    assert run_name(measured("models", 5, 0.2, PRESET)) == run_name(measured("data", 5, 0.2)) == "1 M × 4"
-    assert run_name(measured("models", 5, 0.2, "neumip")) == "1 M × 4, neumip of its paper"
-    assert run_name(measured("models", 5, 0.2, "neumip, 40 wide, z")) == "1 M × 4, 40 wide, z"

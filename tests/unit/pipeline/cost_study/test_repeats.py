@@ -14,13 +14,9 @@ from mbtf_pipeline.cost_study.measurements import HALF_WIDTH, NORMAL
 from mbtf_pipeline.cost_study.repeats import MOST_SEEDS, Repeated, combined, measure_runs, seed_deviation
 from mbtf_pipeline.cost_study.runs import Run
 
-RUNS = [
-    run("whole", 3000, "long", 9.0),
-    run("whole", 3000, "short", 4.0),
-    run("models", 2000, "one"),
-    run("models", 2000, "two"),
-    *(run("data", 1000 + n, f"{n}") for n in range(8)),
-]
+RUNS = [run("whole", 3000, "long", 9.0), run("whole", 3000, "short", 4.0)]
+RUNS += [run("models", 2000, "one"), run("models", 2000, "two")]
+RUNS += [run("data", 1000 + n, f"{n}") for n in range(8)]
 
 
 def repeat(store: MemoryStore, runner: FakeRunner, seeds: int = 2, most: int = 10**6) -> Repeated:
@@ -99,18 +95,18 @@ def test_a_run_that_fails_leaves_the_others() -> None:
 def test_error_bars_are_honest(deviation: float, test: float) -> None:
     """Studies with other seeds: the difference from the truth over the error bar has mean 0 and deviation 1.
     An error bar too narrow by a factor 2 gives a deviation of 2."""
-    pulls = []
+    deviations = []
     for seed in range(60):
         runner = FakeRunner(deviation, test, study_seed=seed)
         found = repeat(MemoryStore(), runner)
         pooled = seed_deviation(found.groups)
         for one, group in zip(RUNS, found.groups, strict=True):
             error = combined(group, pooled).error
-            pulls.append((error.value - TRUE[one.study]) / error.error)
+            deviations.append((error.value - TRUE[one.study]) / error.error)
     # All runs of a seed share the error of its test set, so there are fewer independent values.
-    assert abs(np.mean(pulls)) < 4 / math.sqrt(60)
-    assert 0.8 < np.std(pulls) < 1.2
-    assert 0.9 < np.mean(np.abs(pulls) < NORMAL) < 0.99
+    assert abs(np.mean(deviations)) < 4 / math.sqrt(60)
+    assert 0.8 < np.std(deviations) < 1.2
+    assert 0.9 < np.mean(np.abs(deviations) < NORMAL) < 0.99
 
 
 def test_the_seed_deviation_is_pooled_and_unbiased() -> None:

@@ -31,14 +31,14 @@ def test_counts_keep_two_digits() -> None:
 
 @pytest.mark.parametrize("seconds", [300.0, 600.0, 3600.0])
 def test_planned_runs_fit_into_the_time_twice(seconds: float, tmp_path: Path) -> None:
-    def price(spp: int) -> float:
+    def query_seconds(spp: int) -> float:
         return 1e-6 + spp * 5e-7
 
-    found = planned_runs(seconds, 4, price)
+    found = planned_runs(seconds, 4, query_seconds)
     spent = dict.fromkeys(("whole", "models", "data"), 0.0)
     made: set[DataRequest] = set()
     for run in found:
-        generating = run.data.queries * price(run.data.spp) * (run.data not in made)
+        generating = run.data.queries * query_seconds(run.data.spp) * (run.data not in made)
         made.add(run.data)
         spent[run.study] += generating + float(run.fit["training"]["time"].rstrip("s"))
     for study, share in RUN_SHARES.items():
@@ -50,7 +50,7 @@ def test_planned_runs_fit_into_the_time_twice(seconds: float, tmp_path: Path) ->
     totals = {run.data.queries * run.data.spp for run in found if run.study == "data"}
     assert max(totals) / min(totals) == pytest.approx(4, rel=0.01)
     # Whole runs double, so that a longer study keeps those of a shorter one.
-    longer = planned_runs(2 * seconds, 4, price)
+    longer = planned_runs(2 * seconds, 4, query_seconds)
     whole = [run for run in found if run.study == "whole" and "35%" in run.series]
     assert all(run in longer for run in whole)
     assert [run.name for run in whole] == [f"{SHORTEST * 2**n:g} s planned" for n in range(len(whole))]
@@ -108,9 +108,7 @@ def runner(folder: Path, seed: int = 0, **options: Any) -> RunRunner:
 
 
 @pytest.mark.parametrize(("study", "seconds"), [("whole", 13.0), ("data", 7.0), ("models", 5.0)])
-def test_a_run_measures_what_it_took_and_left(
-    clock: Clock, tmp_path: Path, study: str, seconds: float
-) -> None:
+def test_a_run_measures_time_and_error(clock: Clock, tmp_path: Path, study: str, seconds: float) -> None:
     found = runner(tmp_path).measure(Run(study, "", "", DataRequest(640, 4), FIT))
     assert found.seconds.value == seconds
     d = found.details
@@ -140,9 +138,7 @@ def test_the_expected_time_learns_from_earlier_runs(clock: Clock, tmp_path: Path
     assert one.expected_seconds(replace(run, fit={"training": {"steps": 3, "time": None}})) < 7 + 6 + 2.5
 
 
-def test_other_seeds_have_other_data_and_other_weights(
-    clock: Clock, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_seeds_change_data_and_fit(clock: Clock, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seeds: list[int] = []
     usual = mbtf_fit.fit
     monkeypatch.setattr(module, "generate", lambda job, folder: seeds.append(job.config.seed))

@@ -42,8 +42,7 @@ def test_the_front_holds_what_nothing_beats() -> None:
 
 
 def test_the_extrapolation_follows_the_end_of_the_front() -> None:
-    """A front that starts steeply and ends with the power of one half: half the error takes four times as
-    long, three times as much more."""
+    """A front that ends with the power of one half: half the error takes four times as long."""
     front = [point(t, 0.2 * (t / 20) ** -2) for t in (5.0, 10.0)]
     front += [point(t, 0.2 * (t / 20) ** -0.5) for t in (20.0, 40.0, 80.0)]
     found = extrapolation(front)
@@ -149,15 +148,8 @@ def runners(monkeypatch: pytest.MonkeyPatch) -> list[FakeRunner]:
             return super().measure(run)
 
     result = Measurement("paths", "uniform", "4", {"queries.spp": 4}, "", ONE, ONE, None, ONE)
-    task = SimpleNamespace(
-        study="paths",
-        series="uniform",
-        name="4",
-        label="paths: uniform, 4",
-        key={},
-        run=lambda *_: result,
-        command=lambda generator: generator,
-    )
+    task = SimpleNamespace(study="paths", series="uniform", name="4", label="paths: uniform, 4", key={})
+    task.run, task.command = lambda *_: result, lambda generator: generator
     monkeypatch.setattr(module, "time", clock)
     monkeypatch.setattr(module, "RunRunner", Runner)
     monkeypatch.setattr(module, "generator_tasks", lambda benchmark: [task])
@@ -188,9 +180,7 @@ def test_a_study_keeps_its_time_and_resumes(runners: list[FakeRunner], tmp_path:
     assert second.measurements[2].error.value == first.measurements[2].error.value
 
 
-def test_measurements_of_other_seeds_and_materials_are_not_mixed(
-    runners: list[FakeRunner], tmp_path: Path
-) -> None:
+def test_other_seeds_and_materials_are_not_mixed(runners: list[FakeRunner], tmp_path: Path) -> None:
     recipe = load_recipe(RECIPE, [])
     wool = load_recipe(RECIPE, ["generate.material=assets/twisted_wool"])
     for one, seed, measured in ((recipe, None, 4), (recipe, None, 0), (recipe, 7, 4), (wool, None, 4)):
@@ -219,9 +209,7 @@ def test_a_refused_study_leaves_the_folder_as_it_was(
     assert content() == before
 
 
-def test_the_time_of_a_query_is_stored_and_linear_in_its_paths(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_query_time_is_linear_in_paths_and_stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """0.6 µs to draw and write a query, 0.1 µs for each of its paths."""
     calls: list[int] = []
 

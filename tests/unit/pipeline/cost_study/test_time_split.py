@@ -90,7 +90,7 @@ def test_the_best_pilot_decides(fake: Machine, tmp_path: Path, best: float) -> N
 
 
 @pytest.mark.parametrize("seconds", [60.0, 100.0, 250.0, 1000.0, 36000.0])
-def test_the_time_pays_for_everything(fake: Machine, tmp_path: Path, seconds: float) -> None:
+def test_all_parts_fit_into_the_time(fake: Machine, tmp_path: Path, seconds: float) -> None:
     fake.pilot_takes = 0.05 * seconds
     found = split(tmp_path, seconds)
     # Both fits load what is generated.

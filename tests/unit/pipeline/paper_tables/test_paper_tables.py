@@ -39,53 +39,30 @@ def record(folder: Path, tiles_across: float = 1.0) -> dict[str, Any]:
     for name in ("reference", *MSE):
         (folder / "compare").mkdir(parents=True, exist_ok=True)
         Image.new("RGB", (4, 4), (90, 80, 70)).save(folder / "compare" / f"{name}.png")
+    relative = {"psnr": number(30, 1), "relative_mse": number(0.1, 0.01)}
+    metrics = {"flip": {"ldr": 0.2, "hdr": 0.3}, "ssim": 0.9, "st_lpips": None}
     fits = {
-        fit: {
-            "file": fit,
-            "errors": {
-                "query": {"mse": number(mse, 1e-6), "psnr": number(30, 1), "relative_mse": number(0.1, 0.01)}
-            },
-            "flip": {"ldr": 0.2, "hdr": 0.3},
-            "ssim": 0.9,
-            "st_lpips": None,
-        }
+        fit: {"file": fit, "errors": {"query": {"mse": number(mse, 1e-6), **relative}}, **metrics}
         for fit, mse in MSE.items()
     }
     noise = {"file": "reference", "flip": {"ldr": 0.1, "hdr": 0.35}, "ssim": 0.95, "st_lpips": None}
-    picture = {
-        "tiles_across": tiles_across,
-        "levels": [2.0, 2.0],
-        "references": {"query": noise},
-        "fits": fits,
-    }
+    picture = {"levels": [2.0, 2.0], "references": {"query": noise}, "fits": fits}
+    picture["tiles_across"] = tiles_across
     sizes = {"networks": {"decoder": 1678, "offset_network": 1576}, "texels": 700, "network_weights": 3254}
     test = {
         fit: {
             "splits": {"test": {**errors(mse), "levels": {"0": errors(mse / 4), "1": errors(mse)}}},
-            "training_seconds": 12.0,
-            "model": fit,
-            **sizes,
+            **{"training_seconds": 12.0, "model": fit, **sizes},
         }
         for fit, mse in MSE.items()
     }
     test["neumip"]["mse_minus_first"] = number(-2e-4, 3e-4)
-    return {
-        "fits": list(MSE),
-        "kinds": ["query"],
-        "white": 0.2,
-        "finest": 1,
-        "pictures": [picture],
-        "test": test,
-        "offsets": [],
-    }
+    common = {"fits": list(MSE), "kinds": ["query"], "white": 0.2, "finest": 1, "offsets": []}
+    return common | {"pictures": [picture], "test": test}
 
 
 def make(folder: Path, material: str = "turtle_shell", variant: str = "", **more: Any) -> FinishedRun:
-    manifest = {
-        "splits": {"train": {"queries": 1600}},
-        "levels": {"finest": 1},
-        "tile": {"aspect": 1.0},
-    }
+    manifest = {"splits": {"train": {"queries": 1600}}, "levels": {"finest": 1}, "tile": {"aspect": 1.0}}
     return FinishedRun(material, variant, folder, record(folder) | more, manifest)
 
 
@@ -160,15 +137,8 @@ def test_ablations_compare_with_the_first_row(tmp_path: Path) -> None:
 
 
 def test_sizes_and_times(tmp_path: Path) -> None:
-    times = {
-        "device": "cpu",
-        "queries": 7,
-        "evaluate_ms": 9.0,
-        "stage1_ms": 5.0,
-        "stage2_ms": 2.0,
-        "lights_ms": {"1": 7.0, "16": 37.0},
-        "parts_ms": {"pyramid": 4.0},
-    }
+    times = {"device": "cpu", "queries": 7, "evaluate_ms": 9.0, "stage1_ms": 5.0, "stage2_ms": 2.0}
+    times |= {"lights_ms": {"1": 7.0, "16": 37.0}, "parts_ms": {"pyramid": 4.0}}
     run = make(tmp_path, timing={"neumip": [times]})
     row, *unbuilt = rows_of(timing([run])[0])
     assert row["offset texture"] == "–"
@@ -192,21 +162,14 @@ def test_zooms_have_one_row_per_span_and_fit(tmp_path: Path) -> None:
     assert [len(row) for _, row in table.images] == [2, 2, 2]
 
 
-def test_images_of_unmodified_mitsuba_agree_or_differ(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unmodified_mitsuba_agrees_or_differs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from mbtf_pipeline.paper_tables import independence as module
 
     monkeypatch.setattr(module, "difference", lambda *_: "data:,")
     direction = {"elevation": 85, "azimuth": 0}
     files = {"mbtf": "reference", "mitsuba": "neumip"}
     surfaces = [
-        {
-            "surface": s,
-            "mean": number(1e-3, 1e-3),
-            "square": number(square, 1.2e-4),
-            "files": files,
-        }
+        {"surface": s, "mean": number(1e-3, 1e-3), "square": number(square, 1.2e-4), "files": files}
         for s, square in (("base color", 1e-5), ("full", 4e-2))
     ]
     check = {"view": direction, "light": direction, "surfaces": surfaces}
@@ -231,10 +194,7 @@ def test_cells_are_printed_and_exported() -> None:
     columns = [Column("a", "a", factor=100.0), Column("b", "b"), Column("c", "c")]
     seen = PerceptualCell(PERCEPTUAL_METRICS[2], 0.97, 0.9)
     table = Table("t", "", "", columns, [[Estimate(0.5, 0.01, 9), None, seen], ["x", 1200, None]])
-    assert table.for_page()["rows"] == [
-        ["50.0 ± 1.0", "–", "0.970, within noise"],
-        ["x", "1,200", "–"],
-    ]
+    assert table.for_page()["rows"] == [["50.0 ± 1.0", "–", "0.970, within noise"], ["x", "1,200", "–"]]
     assert table.csv().splitlines() == ["a,a_se,b,c,c_noise", "0.5,0.01,,0.97,0.9", "x,,1200,,"]
 
 

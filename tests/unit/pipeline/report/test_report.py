@@ -30,21 +30,12 @@ def test_both_errors_of_a_group_are_significant_or_neither() -> None:
     error = {"psnr": number(30, 1), "mse": number(1e-4, 1e-6), "relative_mse": number(0.1, 0.01)}
     flip = {"ldr": 0.1, "hdr": 0.2}
     direction = {"elevation": 45, "azimuth": 0}
-    picture = {
-        "view": direction,
-        "light": direction,
-        "tiles_across": 1,
-        "references": {"query": {"flip": flip}},
-        "fits": {"a": {"errors": {"query": error}, "flip": flip}},
-    }
-    record = {
-        "fits": ["a"],
-        "kinds": ["query"],
-        "white": 1.0,
-        "definitions": {},
-        "pictures": [picture],
-        "test": {"a": {"splits": {"test": split}, "network_weights": 9, "texels": 9}},
-    }
+    picture: dict[str, Any] = {"view": direction, "light": direction, "tiles_across": 1}
+    picture["references"] = {"query": {"flip": flip}}
+    picture["fits"] = {"a": {"errors": {"query": error}, "flip": flip}}
+    test = {"a": {"splits": {"test": split}, "network_weights": 9, "texels": 9}}
+    record: dict[str, Any] = {"fits": ["a"], "kinds": ["query"], "white": 1.0, "definitions": {}}
+    record |= {"pictures": [picture], "test": test}
     context = error_context(record, 0.3)
     levels, cosines = (table["rows"] for table in context["group_tables"])
     assert levels[0] == ["0", "50", "not significant (11 ± 6 %)", "not significant (0.20 ± 0.09)"]
