@@ -37,7 +37,7 @@ def _file_name(name: str) -> str:
     except UnicodeError:
         usable = False
     if not usable or len(name) > 4000:
-        raise ValueError("is no name that a file can have")
+        raise ValueError("is not a valid file name")
     return name
 
 

@@ -158,7 +158,7 @@ def test_a_damaged_shard_is_named(tmp_path: Path) -> None:
 def test_invalid_command_lines_exit_with_2(shards: Path) -> None:
     assert "mbtf-fit shards/" in fails(2)
     assert "2min" in fails(2, str(shards), "--time", "soon")
-    assert "exclude each other" in fails(2, str(shards), "--time", "1s", "--steps", "3")
+    assert "mutually exclusive" in fails(2, str(shards), "--time", "1s", "--steps", "3")
     assert "training.bach" in fails(2, str(shards), "--set", "training.bach=3")
     fails(2, str(shards), "--model", "neumop")
 

@@ -245,5 +245,5 @@ def test_brackets_are_counted_before_they_are_read(
 def test_names_that_no_file_can_have(name: str, line: str, tmp_path: Path) -> None:
     path = tmp_path / "material.yaml"
     path.write_text(line.format(f'"{name}"'))
-    with pytest.raises(InputError, match="is no name that a file can have"):
+    with pytest.raises(InputError, match="is not a valid file name"):
         load_material(path)

@@ -40,5 +40,5 @@ def test_presets_keep_what_flags_set() -> None:
 
 
 def test_time_and_steps_exclude_each_other() -> None:
-    with pytest.raises(UsageError, match="exclude each other"):
+    with pytest.raises(UsageError, match="mutually exclusive"):
         config_of("--time", "1s", "--steps", "3")

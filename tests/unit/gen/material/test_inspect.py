@@ -128,7 +128,7 @@ class TestNumbers:
         for name, height in (("a", fractal(96, 96)), ("b", np.rint(fractal(96, 96) * 200) / 200)):
             np.save(tmp_path / f"{name}.npy", 0.1 * height)
             oddities = inspect_material(load_material(tmp_path / f"{name}.npy"))["oddities"]
-            assert any("different values" in o for o in oddities) == (name == "b")
+            assert any("distinct values" in o for o in oddities) == (name == "b")
 
     @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (5, 1), (2, 3)])
     def test_tiny_maps(self, tmp_path: Path, shape: tuple[int, int]) -> None:
@@ -142,7 +142,7 @@ class TestNumbers:
     def test_a_flat_plain_map_is_nothing_special(self, tmp_path: Path) -> None:
         np.save(tmp_path / "h.npy", np.zeros((4, 4)))
         found = inspect_material(load_material(tmp_path / "h.npy"))
-        assert "relief 0 tile widths" in inspection_text(found, "flat")
+        assert "displacement range 0 tile widths" in inspection_text(found, "flat")
         assert found["geometry"]["slope_max_deg"] == 0.0
         assert found["geometry"]["slope_kept"] == 1.0
         assert found["oddities"] == ["no base color map: linear RGB 0.5, 0.5, 0.5 everywhere"]
@@ -159,13 +159,13 @@ class TestText:
 
     def test_one_screen(self, folder: Path) -> None:
         lines = self.lines(inspect_material(load_material(folder)))
-        assert lines[0] == "rock: tile 1 x 0.5, surface glossy, tile=none"
+        assert lines[0] == "rock: tile 1 x 0.5, surface glossy, make-tileable none"
         text = "\n".join(lines)
         for part in (
             "displaces the mesh",
             "slopes     median",
             "OpenGL",
-            "suggests height 0.1",
+            "suggests the height scale 0.1",
             "holes 25.0%",
         ):
             assert part in text
@@ -205,7 +205,7 @@ class TestText:
         for name in (
             "orm.png: name its channels",
             "gloss.png: in a",
-            "ao.png: ambient",
+            "ao.png: the simulation",
             "view.png: its name",
         ):
             assert name in text
@@ -256,7 +256,7 @@ class TestCommand:
 
     def test_text_and_tile(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert run(app, ["inspect", str(folder), "--make-tileable", "mirror"]) == 0
-        assert "tile=mirror" in capsys.readouterr().out
+        assert "make-tileable mirror" in capsys.readouterr().out
 
     def test_what_is_missing(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert run(app, ["inspect", str(folder.parent / "rok")]) == 3

@@ -22,10 +22,10 @@ SETS: dict[str, tuple[str, list[str], float, tuple[float, float]]] = {
     "knit_fabric": (
         "8-bit RGBA",
         [
-            "heights of 8 bits, 132 levels",
+            "8-bit heights with 132 distinct values",
             "gray stored in 4 channels",
             "fine detail",
-            "repeats 32 x",
+            "repeat 32 x",
             "base color is almost constant",
             "real holes",
             "--mesh 1024 keeps all",
@@ -35,7 +35,7 @@ SETS: dict[str, tuple[str, list[str], float, tuple[float, float]]] = {
     ),
     "leather_fine": (
         "8-bit gray",
-        ["heights of 8 bits, 256 levels", "JPG", "fine detail", "--mesh 1024 keeps all"],
+        ["8-bit heights with 256 distinct values", "JPG", "fine detail", "--mesh 1024 keeps all"],
         0.0009,
         (0.93, 0.93),
     ),
@@ -47,19 +47,19 @@ SETS: dict[str, tuple[str, list[str], float, tuple[float, float]]] = {
     ),
     "rock_cliff": (
         "8-bit gray",
-        ["heights of 8 bits, 115 levels 2.238 codes apart", "115 levels only"],
+        ["8-bit heights with 115 distinct values 2.238 codes apart", "only 115 distinct values"],
         0.0333,
         (0.89, 0.90),
     ),
     "stone_bricks": (
         "8-bit gray",
-        ["heights of 8 bits, 219 levels", "not square: 1024 x 512", "JPG"],
+        ["8-bit heights with 219 distinct values", "not square: 1024 x 512", "JPG"],
         0.0088,
         (0.92, 0.90),
     ),
     "tree_bark": (
         "8-bit gray",
-        ["heights of 8 bits, 104 levels", "104 levels only, codes 109 to 237", "JPG"],
+        ["8-bit heights with 104 distinct values", "only 104 distinct values, codes 109 to 237", "JPG"],
         0.0111,
         (0.83, 0.77),
     ),
@@ -94,7 +94,7 @@ def test_nothing_is_warned_of_that_is_not_so(name: str) -> None:
     """All six tile, and their normal maps fit; the default height is far off for those of gentle relief."""
     found = inspected(folder_of(name))
     assert [t["tiles"] for t in found["tiling"]] == [True, True]
-    allowed = ("heights of 8 bits", "opacity: read", "its slopes suggest --height-scale")
+    allowed = ("8-bit heights", "opacity: read", "its slopes suggest --height-scale")
     assert [w for w in found["warnings"] if not any(part in w for part in allowed)] == []
     assert any("suggest --height-scale" in w for w in found["warnings"]) == (SETS[name][2] < 0.05 / 3)
 
