@@ -85,13 +85,13 @@ def test_a_finished_fit_is_not_trained_again(shards: Path, material: Path, run_p
     done = run_python("-m", "mbtf_fit", str(shards), "-o", str(material), *QUICK)
     assert done.returncode == 0, done.stderr
     assert done.stderr.splitlines() == [
-        f"{material}: this fit is finished, nothing was trained; --overwrite trains it again"
+        f"{material}: this fit is already finished; --overwrite trains it again"
     ]
     assert "unexplained variance  test" in done.stdout
     assert (material / "material.json").read_bytes() == before
     done = run_python("-m", "mbtf_fit", str(shards), "-o", str(material), *QUICK, "--overwrite")
     assert "training for 5 steps" in done.stderr
-    assert "nothing was trained" not in done.stderr
+    assert "already finished" not in done.stderr
 
 
 def test_data_of_another_material_cause_a_warning(tmp_path: Path, run_python: RunPython) -> None:

@@ -243,7 +243,7 @@ def test_verify_names_every_fault(suffix: str, tmp_path: Path) -> None:
         "intact": ("", "intact"),
         "flipped": (shard("flipped").name, "SHA-256"),
         "cut": (shard("cut").name, "bytes"),
-        "missing": (shard("missing").name, "1 of 4 shards are missing, first"),
+        "missing": (shard("missing").name, "1 of 4 shards missing, first"),
         "doubled": (shard("doubled", 3).name, "not listed"),
         "foreign": ("render.exr", "not listed"),
     }
@@ -275,7 +275,7 @@ def test_verify_counts_what_an_interrupted_run_has_not_made(tmp_path: Path) -> N
     text, data = run_all([["verify", "set"], ["verify", "set", "--json"]], tmp_path)
     assert (text.code, data.code) == (INPUT, INPUT)
     assert text.out.splitlines() == [
-        "set: 4 of 11 shards are missing, first train-00003.npz; "
+        "set: 4 of 11 shards missing, first train-00003.npz; "
         "run the same mbtf-gen command again: it renders the missing shards",
         "set/train-00001.npz: has changed since it was written (SHA-256 differs); "
         "repair it with: mbtf-gen repair FOLDER",

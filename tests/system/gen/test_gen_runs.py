@@ -294,7 +294,7 @@ def test_overwriting_pictures_leaves_none_of_before(batch: dict[str, Done], work
 
 def test_the_report_counts_training_and_test_queries(batch: dict[str, Done], work: Path) -> None:
     again = batch["again in words"]
-    assert "2048 training + 200 test queries, finest level 4" in again.err
+    assert "2048 training + 200 test queries, resolution 16" in again.err
     assert again.out.splitlines()[:2] == [
         "again: 2048 training + 200 test queries, complete",
         "  this run: nothing left to do",
