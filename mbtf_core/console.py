@@ -211,7 +211,7 @@ class Console:
     """
 
     json: Annotated[Switch, Parameter(help="Print one JSON object on standard output.")] = False
-    quiet: Annotated[Switch, Parameter(alias="-q", help="No progress, no notes.")] = False
+    quiet: Annotated[Switch, Parameter(alias="-q", help="Hide progress and notes.")] = False
 
     def note(self, text: str) -> None:
         """A line for people, on standard error."""

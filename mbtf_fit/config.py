@@ -76,10 +76,10 @@ class BlurSection(Settings):
         8.0, ge=0, le=256, description="sigma at the start, at most an eighth of the tile; 0: no blur"
     )
     final_sigma: float = Field(0.25, gt=0, le=256, description="sigma at the end of the annealing")
-    fraction: float = Field(0.5, gt=0, le=1, description="fraction of the budget that the annealing takes")
-    min_sigma: float = Field(0.0, ge=0, le=256, description="least sigma of the pyramid, kept for good")
+    fraction: float = Field(0.5, gt=0, le=1, description="fraction of the training that the annealing takes")
+    min_sigma: float = Field(0.0, ge=0, le=256, description="minimum sigma of the pyramid, also after the annealing")
     offset_sigma: float = Field(
-        2.0, ge=0, le=256, description="least sigma of the offset texture, kept for good"
+        2.0, ge=0, le=256, description="minimum sigma of the offset texture, also after the annealing"
     )
 
 
@@ -231,7 +231,7 @@ class FitConfig(Settings):
         0, ge=0, lt=1 << 63, description="root seed of all random numbers"
     )
     device: Annotated[Literal["auto", "cpu", "cuda"], Flag("--device")] = Field(
-        "auto", description="processor that trains; auto: cuda if available"
+        "auto", description="device for training; auto: cuda if available"
     )
 
     @model_validator(mode="before")

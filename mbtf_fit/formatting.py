@@ -79,7 +79,7 @@ def format_estimate(estimate: dict[str, Any]) -> str:
 def describe_coverage(coverage: dict[str, float]) -> str:
     """One line: levels whose texels have received gradients."""
     partly = [f"{share:.1%} of level {level}" for level, share in coverage.items() if share < 1]
-    return f"gradients reached every texel{', but only ' + ', '.join(partly) if partly else ''}"
+    return f"gradients reached only {', '.join(partly)}" if partly else "gradients reached every texel"
 
 
 def describe_fit(data: dict[str, Any]) -> str:
@@ -87,7 +87,7 @@ def describe_fit(data: dict[str, Any]) -> str:
     rate = training["steps"] * training["batch"] / max(training["seconds"], 1e-9)
     lines = [
         f"{data['material']}: {data['model']}, {training['steps']} steps of {training['batch']} queries in "
-        f"{clock(training['seconds'])} on {training['device']} by {training['backend']} "
+        f"{clock(training['seconds'])} on {training['device']} with {training['backend']} "
         f"({rate / 1e6:.2f} M queries/s)",
         describe_coverage(training["coverage"]),
         *describe_errors(data["errors"]),

@@ -76,8 +76,8 @@ class Forecast:
     def describe(self, target: Target | None = None) -> str:
         """One line, two under a target error."""
         line = (
-            f"forecast: {clock(self.seconds)} of tracing and writing ({self.paths_per_second / 1e6:.2f} M "
-            f"paths/s traced, after {self.start:.0f} s of starting), {size_text(self.bytes)}, noise of "
+            f"forecast: {clock(self.seconds)} to trace and write ({self.paths_per_second / 1e6:.2f} M "
+            f"paths/s after {self.start:.0f} s of startup), {size_text(self.bytes)}, noise of "
             f"one training value {self.relative_error:.0%} of the mean value"
         )
         if target is None:

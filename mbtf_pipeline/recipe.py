@@ -63,7 +63,7 @@ class CompareSection(Settings):
         [1.0, 4.0], description="widths of the field of view at the target, in tile widths"
     )
     size: int = Field(256, ge=8, le=4096, description="pixels along each side of an image")
-    spp: Paths = Field(128, description="paths per pixel, over both halves")
+    spp: Paths = Field(128, description="paths per pixel, both estimates together")
     kinds: Annotated[list[Literal["query", "pixel"]], Field(min_length=1), AfterValidator(_distinct)] = Field(
         ["query"], description="query: M at each pixel's footprint; pixel: the filtered image"
     )

@@ -9,9 +9,9 @@ from mbtf_fit.formatting import describe_errors, describe_transmittance
 
 
 def evaluate(material: Path, shards: Path, /, *, console: Console = CONSOLE) -> None:
-    """Errors of a material on a data set, free of the data's noise.
+    """Measure the errors of a material on a data set, without the noise of the data.
 
-    On the test split, and on the queries and directions that were held out of training: overall, by level of
+    Errors are listed for the test split and for held-out queries and directions: overall, by level of
     detail, and by elevation.
 
     Parameters
@@ -29,8 +29,8 @@ def evaluate(material: Path, shards: Path, /, *, console: Console = CONSOLE) -> 
     if foreign:
         console.note(
             f"warning: {shards} was made from another material than {material} was trained on "
-            f"({', '.join(foreign)} differ{'s' if len(foreign) == 1 else ''}); these errors say how far the "
-            "two are apart, not how good the fit is"
+            f"({', '.join(foreign)} differ{'s' if len(foreign) == 1 else ''}); the errors compare two "
+            "materials and do not measure the quality of the fit"
         )
     found = evaluate(loaded, shards)
     errors = {name: e.as_dict() for name, e in found.values.items()}

@@ -23,7 +23,7 @@ def export_material(
     half: Switch = False,
     console: Console = CONSOLE,
 ) -> None:
-    """Export a material for other programs: mbtf-fit export material/ --to exr
+    """Export a material to other programs: mbtf-fit export material/ --to exr
 
     exr: the latent textures, a part per level and a channel per feature, and those of the transmittance of a
     material with holes. json: the networks as a list of layers, with formulas, conventions and queries with
@@ -34,9 +34,9 @@ def export_material(
     material
         Folder made by mbtf-fit.
     to
-        Form to write. Repeatable.
+        Format to write. Repeatable.
     half
-        Round all weights and texels to 16 bits, and print the error of that.
+        Round all weights and texels to 16 bits, and print the resulting error.
     """
     from mbtf_core.folders import make_folder
     from mbtf_fit.material.export import LAYERS_NAME, TEXTURES_NAME, to_half, write_layers, write_textures
@@ -49,7 +49,7 @@ def export_material(
     loaded = Material.load(material)
     if "material" in wanted and folder.is_dir() and any(folder.iterdir()):
         raise InputError(
-            "holds something already", where=folder, hint="name a new folder with -o for --to material"
+            "is not empty", where=folder, hint="name a new folder with -o for --to material"
         )
     written, error = loaded, None
     if half:

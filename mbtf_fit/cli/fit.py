@@ -42,16 +42,16 @@ def fit(
         Folder made by mbtf-gen.
     many
         Fit several data sets, one material each: folders made by mbtf-gen, folders of such folders, or text
-        files with one folder per line. A failure stops none of the others.
+        files with one folder per line. A fit that fails does not stop the others.
     processes
         With --many, number of simultaneous fits.
     """
     if dry_run and many is not None:
         raise UsageError("--dry-run takes one data set", hint="mbtf-fit shards/ --dry-run")
     if many is not None and shards is not None:
-        raise UsageError("--many takes all data sets", hint=f"mbtf-fit --many {shards} ... -o materials/")
+        raise UsageError("--many replaces the argument SHARDS", hint=f"mbtf-fit --many {shards} ... -o materials/")
     if processes is not None and (many is None or processes < 1):
-        raise UsageError("--processes is a positive number that goes with --many")
+        raise UsageError("--processes must be a positive number and requires --many")
     if shards is None and many is None:
         raise UsageError("no shards given", hint="mbtf-fit shards/ -o material/")
     from mbtf_core.units import format_duration
@@ -93,7 +93,7 @@ def fit(
             progress=lambda fraction, note: bar.update(round(100 * fraction, 1), note),
         )
     if finished:
-        console.note(f"{output}: this fit is finished, nothing was trained; --overwrite trains it again")
+        console.note(f"{output}: this fit is already finished; --overwrite trains it again")
     data = result.as_dict()
     cost = [result.marginal_cost.describe()] if result.marginal_cost is not None else []
     console.report(data, "\n".join([describe_fit(data), *cost]))
@@ -111,7 +111,7 @@ def resolve_config(options: Options[FitConfig], quality: Quality | None) -> FitC
 
     given = options.given
     if {"training.time", "training.steps"} <= set(given):
-        raise UsageError("--time and --steps exclude each other", hint="give one of them")
+        raise UsageError("--time and --steps are mutually exclusive", hint="give one of them")
     presets: list[str] = []
     if quality is not None:
         flags = [f"{key}={value}" for key, value in given.items()]
@@ -139,7 +139,7 @@ def _fit_many(
         import torch
 
         processes = max(1, torch.cuda.device_count()) if config.device != "cpu" else 1
-    console.note(f"{len(shards)} data sets -> {output}: {config.model}, {processes} at a time")
+    console.note(f"{len(shards)} data set{'s' * (len(shards) != 1)} -> {output}: {config.model}, {processes} at a time")
     with console.progress(total=len(shards), label="fitting", unit="data sets") as bar:
 
         def finished(outcome: FitOutcome) -> None:

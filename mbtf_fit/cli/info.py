@@ -40,7 +40,7 @@ def _shards_info(path: Path) -> tuple[dict[str, Any], str]:
     lines = [
         f"{path}: shards, {data.layout} layout",
         f"levels 0 to {lattice.finest}, finest {columns} x {rows} texels, aspect {lattice.aspect:g}",
-        *(f"{s}: {n['rows']} {kind} in {n['shards']} shards" for s, n in splits.items()),
+        *(f"{s}: {n['rows']} {kind} in {n['shards']} {'shard' if n['shards'] == 1 else 'shards'}" for s, n in splits.items()),
     ]
     return {
         "shards": path,
@@ -66,10 +66,10 @@ def _material_info(path: Path) -> tuple[dict[str, Any], str]:
         f"{path}: {description['model']}",
         f"levels 0 to {material.lattice.finest}, finest {columns} x {rows} texels, "
         f"aspect {material.lattice.aspect:g}",
-        f"{weights['network_weights']} network weights, {weights['texels']} numbers in textures, "
+        f"{weights['network_weights']} network weights, {weights['texels']} texture values, "
         f"{size / 1e6:.2f} MB",
-        f"trained {training['steps']} steps of {training['batch']} in {clock(training['seconds'])}",
-        f"this machine's CPU evaluates by: {describe()}",
+        f"trained for {training['steps']} steps of {training['batch']} queries in {clock(training['seconds'])}",
+        f"evaluation on this CPU: {describe()}",
         *describe_errors(training["errors"]),
         *describe_transmittance(training.get("transmittance")),
         f"conformance: {description['conformance']['count']} queries, largest deviation {deviation:.2g}",

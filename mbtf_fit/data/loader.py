@@ -41,7 +41,7 @@ def open_data(folder: str | Path, layout: Layout, model: str) -> Dataset:
     data = Dataset.open(folder)
     if data.layout != layout:
         raise InputError(
-            f"shards are in the {data.layout} layout, but {model} learns from the {layout} one",
+            f"the data set has the {data.layout} layout, but {model} needs the {layout} layout",
             where=folder,
             hint=f"generate them with: mbtf-gen ... --layout {layout}",
         )
@@ -66,7 +66,7 @@ def read_checked(shard: Shard) -> ShardQueries:
         raise InputError(
             f"shard holds {rows} rows, its sidecar says {shard.rows}",
             where=shard.path,
-            hint="look for damage with: mbtf-gen verify",
+            hint="check the data set with: mbtf-gen verify",
         )
     for name, array in arrays.items():
         # A sum is finite exactly when no addend is NaN or infinite, short of overflow; look closer only then.
@@ -77,7 +77,7 @@ def read_checked(shard: Shard) -> ShardQueries:
             raise InputError(
                 f"'{name}' holds NaN or infinite numbers: {len(bad)}, the first in row {bad[0][0]}",
                 where=shard.path,
-                hint="look for damage with: mbtf-gen verify",
+                hint="check the data set with: mbtf-gen verify",
             )
     return ShardQueries(**arrays)
 
@@ -102,7 +102,7 @@ def load_training(
     total = sum(shard.rows for shard in shards)
     if total == 0:
         raise InputError(
-            "its train split holds no queries", where=data.folder, hint="generate some: --queries"
+            "its train split holds no queries", where=data.folder, hint="generate more: --queries"
         )
     if data.layout == "image":
         return _load_images(data, shards, held_out, seed)

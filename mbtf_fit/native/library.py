@@ -208,7 +208,7 @@ def _load() -> tuple[Kernel | None, str]:
     found = variants(library)
     name = next(iter(found)) if requested == "auto" else requested
     if name not in found:
-        return None, f"{ENVIRONMENT}={requested} is none of: {', '.join(['auto', 'off', *found])}"
+        return None, f"{ENVIRONMENT}={requested} is not one of: {', '.join(['auto', 'off', *found])}"
     return Kernel(library, found[name], name), ""
 
 

@@ -69,7 +69,7 @@ class FitForecast:
         ]
         if self.unexplained is not None:
             lines.append(
-                f"unexplained variance of {self.validation_set} about {self.unexplained:.2f}; "
+                f"expected unexplained variance of {self.validation_set}: about {self.unexplained:.2f}, and "
                 f"{self.at_most:.2f} after {clock(PILOT_SECONDS[1])}"
             )
         return "\n".join(lines)

@@ -6,7 +6,7 @@ from mbtf_core.console import CONSOLE, Console
 
 
 def doctor(*, console: Console = CONSOLE) -> int:
-    """Test each part of the installation by using it, and name the remedy for what fails."""
+    """Test each part of the installation, and suggest a fix for each failure."""
     from mbtf_gen.diagnostics.doctor import as_json, as_text, diagnose, exit_code
 
     checks = diagnose()

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def merge(folder: Path, /, *, console: Console = CONSOLE) -> int:
-    """Complete the manifest of a folder that slices (--slice i/n) were written into.
+    """Complete the manifest of a data set after all of its slices (--slice i/n) are finished.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ def merge(folder: Path, /, *, console: Console = CONSOLE) -> int:
 
 
 def verify(folder: Path, /, *, console: Console = CONSOLE) -> int:
-    """Check every byte of a data set against its digests and the manifest.
+    """Check every byte of a data set against its checksums and the manifest.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ def verify(folder: Path, /, *, console: Console = CONSOLE) -> int:
     read = sum(path.stat().st_size for path in files if path.exists())
     lines = [f"{folder / f.file}: {f.what}; {f.hint}" for f in faults if not f.absent]
     if absent := [f for f in faults if f.absent]:
-        missing = f"{len(absent)} of {len(files)} shards are missing, first {absent[0].file}"
+        missing = f"{len(absent)} of {len(files)} shards missing, first {absent[0].file}"
         lines.insert(0, f"{folder}: {missing}; {absent[0].hint}")
     data = {
         "folder": folder,
@@ -75,14 +75,14 @@ def repair(
     dry_run: DryRun = False,
     console: Console = CONSOLE,
 ) -> int:
-    """Restore what verify finds missing or corrupt: the data set is then identical to the original.
+    """Generate missing and corrupt shards again; the data set is then identical to the original.
 
     Parameters
     ----------
     folder
         Folder of shards.
     material
-        Where the material is now, if it was moved.
+        Path of the material, if it was moved.
     """
     from mbtf_gen.repairs import Corruption, RepairResult
 

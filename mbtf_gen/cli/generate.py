@@ -57,7 +57,7 @@ def generate(
     job = Job.prepare(resolved)
     console.note(
         f"{resolved.material} -> {output}: {split_queries(job, 'train')} training + "
-        f"{split_queries(job, 'test')} test queries, finest level {job.lattice.finest}"
+        f"{split_queries(job, 'test')} test queries, resolution {job.lattice.shape()[1]}"
     )
     total = paths_left(job, output, *part)
     with (
@@ -116,9 +116,9 @@ def describe(summary: Any, *, ran: bool = True) -> str:
     odd = [
         f"{n} {what}"
         for n, what in (
-            (summary.nonfinite, "non-finite samples (drawn again)"),
-            (summary.lost, "rays slipped below the surface at a crease (they bring no light)"),
-            (summary.capped, "rays cut at the cap on tile crossings"),
+            (summary.nonfinite, "non-finite samples (sampled again)"),
+            (summary.lost, "rays passed through the surface at a crease (counted as black)"),
+            (summary.capped, "rays ended at the limit on tile crossings"),
         )
         if n
     ]

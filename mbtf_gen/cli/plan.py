@@ -34,14 +34,14 @@ def plan(
     """Report which effects of light a run would simulate and why, and forecast its time, size and noise.
 
     The bias bound of an effect is the root mean square change of M over the run's queries if the effect is
-    left out, in percent of its mean value. A pilot on this machine gives the forecast.
+    left out, in percent of its mean value. The forecast is measured by a pilot run on this machine.
 
     Parameters
     ----------
     material
         Height map, folder of maps, or material.yaml.
     measure
-        Measure the bias of leaving out each simulated effect by a small run, and forecast the run.
+        Measure the bias of omitting each simulated effect by a pilot run, and forecast the run.
     """
     resolved = resolve_config(options, material, as_assignments(GENERATOR[quality] if quality else {}))
     from mbtf_gen.job import Job, split_target
@@ -65,12 +65,12 @@ def plan(
 
 def table(plan: EffectsPlan) -> str:
     """The plan as a table, a line or two per effect."""
-    lines = [f"{'effect':<{_NAME}}{'':5}{'bias bound if left out':<{_BOUND}}why"]
+    lines = [f"{'effect':<{_NAME}}{'':5}{'bias bound if omitted':<{_BOUND}}reason"]
     for effect in plan.effects:
         lines += _row(effect)
     bound = plan.bias_bound
     share = "0 %" if bound == 0 else f"at most {_percent(bound)}"
-    lines.append(f"bias of all that is off: {share}, tolerance {_percent(plan.tolerance)} (effects.tolerance)")
+    lines.append(f"bias of all omitted effects: {share}; effects.tolerance is {_percent(plan.tolerance)}")
     if plan.closed_form:
         lines.append("M has a closed form: no paths are traced")
     elif plan.max_depth:
@@ -92,7 +92,7 @@ def bound_text(effect: Effect) -> str:
     if effect.bias_bound is None:
         return "-"
     if effect.reason == "exact" and effect.bias_bound == 0:
-        return "0 exactly"
+        return "0 (exact)"
     if effect.reason == "bound" or not effect.on:
         return f"< {_percent(effect.bias_bound)}"
     if effect.error:

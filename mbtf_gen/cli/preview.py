@@ -49,7 +49,7 @@ def preview(
         given += ["--config"] * (options.config is not None) + ["--set"] * bool(options.assignments)
         if given:
             raise UsageError(
-                f"{material} holds a data set, whose configuration is settled",
+                f"{material} holds a data set, whose configuration is fixed",
                 where=given[0],
                 hint="leave it out, or name the material instead of its shards",
             )

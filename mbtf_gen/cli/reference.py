@@ -21,7 +21,7 @@ def reference(
     overwrite: Overwrite = False,
     console: Console = CONSOLE,
 ) -> None:
-    """Render reference pictures of the micro-geometry on the plane: EXR with both halves, and PNG.
+    """Render reference pictures of the micro-geometry on the plane: EXR with two independent estimates, and PNG.
 
     The same command again renders the missing pictures.
 
@@ -92,7 +92,7 @@ def reference(
                 )
                 bar.advance(1)
     text = "\n".join(
-        f"{p['file']}: noise {p['relative_noise']:.2%} of the mean value{' (was there)' if p['kept'] else ''}"
+        f"{p['file']}: noise {p['relative_noise']:.2%} of the mean value{' (kept)' if p['kept'] else ''}"
         for p in pictures
     )
     console.report({"pictures": pictures, "exposure": exposure}, text)

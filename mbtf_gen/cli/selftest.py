@@ -10,7 +10,7 @@ from mbtf_core.options import Time
 
 
 def selftest(*, report: Path | None = None, time: Time = "2min", console: Console = CONSOLE) -> int:
-    """Check physics with known answers on this machine, and report the largest deviation.
+    """Check the physics against known results on this machine, and report the largest deviation.
 
     Each check runs at least once; a longer time means smaller statistical errors. Exit code 0 when every
     check passed, 3 otherwise.

@@ -66,7 +66,7 @@ def _share(text: Any) -> Any:
 
 def _even(spp: int) -> int:
     if spp % 2:
-        raise ValueError("must be even: the paths of a query are split into two independent halves")
+        raise ValueError("must be even: the paths of a query are divided between two independent estimates")
     return spp
 
 
@@ -117,16 +117,16 @@ class QueriesSection(Settings):
     """Distribution and number of the queries, and paths per query."""
 
     train: Annotated[Count, Flag("--queries", "N|N/texel")] = Field(
-        "100/texel", description="training queries, in all or per texel of the finest level"
+        "100/texel", description="training queries, in total or per texel of the finest level"
     )
     test: Annotated[Count, Flag("--test-queries", "N|N/texel")] = Field(
-        "8192", description="test queries, in all or per texel of the finest level"
+        "8192", description="test queries, in total or per texel of the finest level"
     )
     spp: Annotated[Paths, Flag("--spp")] = Field(
-        4, description="mean number of paths per training query, both halves together (even)"
+        4, description="mean number of paths per training query, both estimates together (even)"
     )
     test_spp: Annotated[Paths, Flag("--test-spp")] = Field(
-        256, description="mean number of paths per test query, both halves together (even)"
+        256, description="mean number of paths per test query, both estimates together (even)"
     )
     allocation: Literal["noise", "uniform"] = Field(
         "noise", description="paths per query: more where a pilot expects more noise, or the same for all"
@@ -186,7 +186,7 @@ def _effects(text: str) -> str:
     try:
         EffectsRequest.parse(text)
     except UsageError as error:
-        raise ValueError(str(error)) from None
+        raise ValueError(f"{error.what}; choose {error.hint}") from None
     return text
 
 
@@ -199,7 +199,7 @@ class EffectsSection(Settings):
         "comma-separated",
     )
     tolerance: float = Field(
-        0.005, ge=0, lt=1, description="cost of all effects left out together, relative to the mean value"
+        0.005, ge=0, lt=1, description="allowed bias of all omitted effects together, relative to the mean value"
     )
     normal: NormalMode = Field(
         "residual",

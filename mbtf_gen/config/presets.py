@@ -13,7 +13,7 @@ from cyclopts import Parameter
 Quality = Literal["draft", "standard", "high", "paper"]
 QualityOption = Annotated[
     Quality | None,
-    Parameter(help="Preset of sizes and times; overrides the configuration, other options override it."),
+    Parameter(help="Preset of sizes and times; overrides the file of --config; other options override the preset."),
 ]
 
 

@@ -139,7 +139,7 @@ def _llvm() -> Part:
 def _cuda() -> Part:
     outcome = prove(CUDA_VARIANT)
     if outcome.fault:
-        return Part("CUDA", "absent", False, f"{outcome.fault}; the processor is used")
+        return Part("CUDA", "absent", False, f"{outcome.fault}; the CPU is used")
     return Part("CUDA", "ok", False, "ran test kernels")
 
 
@@ -283,7 +283,7 @@ PROBES = {
     "Drawing": Probe(
         "use_drawing",
         lambda a: f"pyvista {a['pyvista']} drew a sphere off screen",
-        "only 3D pictures need it; install OpenGL (software will do), on Debian: "
+        "only 3D pictures need it; install OpenGL (software rendering is enough), on Debian: "
         "apt install libgl1 libegl1 libosmesa6",
         required=False,
     ),

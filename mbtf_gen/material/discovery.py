@@ -26,14 +26,14 @@ WORDS: dict[Role, tuple[str, ...]] = {
 _ROLES: dict[str, Role] = {word: role for role, words in WORDS.items() for word in words}
 # Words of maps that are known but not used, and the reason.
 UNUSED: dict[str, str] = {
-    **dict.fromkeys(("ao", "occlusion"), "ambient occlusion comes out of the simulation"),
+    **dict.fromkeys(("ao", "occlusion"), "the simulation computes ambient occlusion"),
     **dict.fromkeys(
         ("arm", "orm", "rma", "metallicroughness", "roughnessmetallic"),
         "name its channels in a material.yaml, as in roughness: {file: …, channel: G}",
     ),
     **dict.fromkeys(("specular", "spec"), "name it in a material.yaml to use it"),
     **dict.fromkeys(("gloss", "glossiness"), "in a material.yaml it is roughness: {file: …, invert: true}"),
-    **dict.fromkeys(("emissive", "emission", "preview", "thumb"), "it has no use here"),
+    **dict.fromkeys(("emissive", "emission", "preview", "thumb"), "mbtf does not use it"),
 }
 # Words of packed maps → their channels of roughness and metallic.
 PACKED: dict[str, dict[Role, str]] = {
@@ -50,7 +50,7 @@ _JOINED = {
     for metal in ("metallic", "metalness")
     for first, second in ((metal, "roughness"), ("roughness", metal))
 }
-_NAMELESS = "its name says no map"
+_NAMELESS = "its name matches no map"
 _ARCHIVES = (".zip", ".7z", ".rar", ".tar", ".tgz", ".gz")
 # Names listed in a message.
 _LISTED = 6
@@ -151,7 +151,7 @@ def find_maps(folder: Path) -> FoundMaps:
         raise InputError(
             "the folder holds no image",
             where=folder,
-            hint=_elsewhere(folder) or f"a height map is wanted ({', '.join(SUFFIXES)})",
+            hint=_elsewhere(folder) or f"a height map is required ({', '.join(SUFFIXES)})",
         )
     shared = _shared_words([p.name for p in files])
     if not any(role_of(p.name, shared) == "height" for p in files):
@@ -218,9 +218,9 @@ def _no_heights(folder: Path, files: list[Path], shared: int) -> InputError:
         return ", ".join(names[:_LISTED]) + (", …" if len(names) > _LISTED else "")
 
     nameless = [p.name for p in files if _last_word(p.name, shared) is None]
-    hint = f"its name must hold one of: {', '.join(WORDS['height'])}; or name it in a material.yaml"
+    hint = f"its name must contain one of: {', '.join(WORDS['height'])}; or name it in a material.yaml"
     if nameless:
-        hint += f" (what they hold is unknown: {listed(nameless)})"
+        hint += f" (their names match no map: {listed(nameless)})"
     return InputError(
         f"no height map among {listed([p.name for p in files])}",
         where=folder,

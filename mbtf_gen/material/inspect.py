@@ -173,22 +173,22 @@ def _oddities(found: dict[str, Any]) -> list[str]:
         out.append(f"{Path(height['file']).name}: gray stored in {height['channels']} channels")
     codes = heights["codes"]
     if codes is not None and height["bits"] == 8 and 1 < codes["levels"] < _FEW_LEVELS:
-        out.append(f"heights use {codes['levels']} levels only, codes {codes['low']} to {codes['high']}")
+        out.append(f"heights have only {codes['levels']} distinct values, codes {codes['low']} to {codes['high']}")
     if height["bits"] is None and 1 < heights["distinct"] <= 256 and rows * columns > _MANY:
         out.append(
-            f"heights are floats of {heights['distinct']} different values: if they were integers once, "
-            "their terraces are still there"
+            f"heights are floats with only {heights['distinct']} distinct values: if they were converted from integers, "
+            "they form terraces"
         )
     if Path(height["file"]).suffix.lower() in (".jpg", ".jpeg"):
-        out.append("heights come from a JPG: its compression is part of the relief")
+        out.append("heights come from a JPG: its compression is part of the surface")
     if geometry["relief"] > 0 and heights["detail_texels"] < _FINE:
         out.append(
-            f"fine detail: heights lose half their correlation within {heights['detail_texels']:.1f} texels, "
+            f"fine detail: the correlation of heights falls to half within {heights['detail_texels']:.1f} texels, "
             f"RMS step {heights['rms_step']:.0%} of the range per texel"
         )
     if max(heights["repeats"]) > 1:
         u, v = heights["repeats"]
-        out.append(f"the relief repeats {u} x {v} times (u x v) within the tile")
+        out.append(f"the heights repeat {u} x {v} times (u x v) within the tile")
     if geometry["slope_kept"] < _KEPT:
         out.append(
             f"the mesh keeps {geometry['slope_kept']:.0%} of the map's RMS slope; "
@@ -220,7 +220,7 @@ def _surface_oddities(found: dict[str, Any]) -> list[str]:
         low, high = metallic["low"], metallic["high"]
         out.append(f"metallic varies from {low:.2g} to {high:.2g}: metal and dielectric mixed")
     if opacity is not None and opacity["holes"] > 0:
-        out.append(f"real holes: {opacity['holes']:.1%} of the tile is see-through")
+        out.append(f"holes: {opacity['holes']:.1%} of the tile is see-through")
     return out
 
 
@@ -231,4 +231,4 @@ def _suggestion_oddity(found: dict[str, Any]) -> list[str]:
     ratio = found["geometry"]["height"] / suggested
     if 0.8 < ratio < 1.25:
         return []
-    return [f"the height in use is {ratio:.3g} times the {suggested:.3g} that the normal map suggests"]
+    return [f"the height scale in use is {ratio:.3g} times the {suggested:.3g} that the normal map suggests"]

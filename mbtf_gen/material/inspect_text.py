@@ -18,18 +18,18 @@ USES = {
     "height": "displaces the mesh",
     "base_color": "reflectance",
     "roughness": "width of the specular lobe",
-    "metallic": "share that reflects as metal",
+    "metallic": "fraction of metal",
     "specular": "strength of the dielectric lobe",
-    "clearcoat": "share under a clear coat",
-    "clearcoat_roughness": "width of the coat's lobe",
-    "sheen": "weight of a sheen on top",
+    "clearcoat": "weight of the clear coat",
+    "clearcoat_roughness": "roughness of the clear coat",
+    "sheen": "weight of the sheen",
     "sheen_color": "color of the sheen",
-    "sheen_roughness": "how far the sheen spreads",
+    "sheen_roughness": "roughness of the sheen",
     "normal": "slopes that the mesh lacks",
     "opacity": "holes",
 }
-# Where the factor on the heights comes from.
-_SOURCES = {"asked": "as asked for", "material": "the material file's", "default": "the default"}
+# Where the height scale comes from.
+_SOURCES = {"asked": "--height-scale", "material": "material file", "default": "default"}
 # Lines, at most, on images that are not used.
 _UNUSED_LINES = 8
 _KINDS = {1: "gray", 2: "gray+alpha", 3: "RGB", 4: "RGBA"}
@@ -41,10 +41,10 @@ def inspection_text(found: dict[str, Any], name: str) -> str:
     given = {*found["maps"], *found["constants"]}
     layers = [text for role, text in (("clearcoat", "a clear coat"), ("sheen", "a sheen")) if role in given]
     surface = f"{found['surface']}{' under ' + ' and '.join(layers) if layers else ''}"
-    head = [f"{name}: tile 1 x {found['aspect']:g}, surface {surface}, tile={found['tile']}", ""]
+    head = [f"{name}: tile 1 x {found['aspect']:g}, surface {surface}, make-tileable {found['tile']}", ""]
     body = [*_maps(found), *_unused(found), "", *_geometry(found), *_color(found), *_normal(found)]
     room = LINES - len(head) - len(body) - 2
-    oddities = _list("odd", found["oddities"])
+    oddities = _list("remarks", found["oddities"])
     warnings = _list("warnings", [_short(w) for w in found["warnings"]])
     tail = [*warnings, *oddities]
     if len(tail) > room:
@@ -74,7 +74,7 @@ def _maps(found: dict[str, Any]) -> list[str]:
     first = max(10, *map(len, roles))
     # The names of files give way to long names of roles.
     second = 38 - first
-    out = [f"{'map':<{first}} {'file':<{second}} {'size':<11} {'kind':<14} what it does"]
+    out = [f"{'map':<{first}} {'file':<{second}} {'size':<11} {'kind':<14} use"]
     for role, facts in found["maps"].items():
         if role.startswith("bsdf"):
             continue
@@ -113,19 +113,19 @@ def _geometry(found: dict[str, Any]) -> list[str]:
     u, v = h["repeats"]
     low, high = found["maps"]["height"]["low"], found["maps"]["height"]["high"]
     out = [
-        f"height     factor {g['height']:.4g} ({source}), stored {low:.4g} .. {high:.4g}, "
-        f"relief {g['relief']:.4g} tile widths",
+        f"height     scale {g['height']:.4g} ({source}), stored {low:.4g} .. {high:.4g}, "
+        f"displacement range {g['relief']:.4g} tile widths",
         f"mesh       {g['mesh'][1]} x {g['mesh'][0]} of {g['map'][1]} x {g['map'][0]} texels, keeps "
         f"{g['slope_kept']:.0%} of the map's RMS slope",
         f"slopes     median {g['slope_median_deg']:.1f}°, 99th percentile {g['slope_p99_deg']:.1f}°, "
         f"steepest {g['slope_max_deg']:.1f}°",
-        f"detail     half the correlation within {h['detail_texels']:.1f} texels"
+        f"detail     the correlation of heights falls to half within {h['detail_texels']:.1f} texels"
         + (f"; repeats {u} x {v} times" if max(u, v) > 1 else ""),
     ]
     if h["codes"] is not None:
         codes = h["codes"]
         apart = f", {codes['spacing']:.4g} codes apart" if codes["spacing"] > 1 else ""
-        out.append(f"levels     {codes['levels']}, codes {codes['low']} .. {codes['high']}{apart}")
+        out.append(f"values     {codes['levels']} distinct, codes {codes['low']} .. {codes['high']}{apart}")
     if found["tiling"]:
         seams = "; ".join(
             f"along {t['axis']} {'tiles' if t['tiles'] else 'DOES NOT TILE'} ({t['ratio']:.2f})"
@@ -169,7 +169,7 @@ def _normal(found: dict[str, Any]) -> list[str]:
         out.append(f"           correlation {n['best']:.2f}, next best {n['runner_up']:.2f}")
     elif n["suggested_height"] is not None:
         out.append(
-            f"           the normal map suggests height {n['suggested_height']:.3g} tile widths; "
+            f"           the normal map suggests the height scale {n['suggested_height']:.3g}; "
             f"in use {n['height_in_use']:.3g}"
         )
     return out

@@ -175,9 +175,9 @@ class MapLoader:
         space: ColorSpace = "linear" if image.bits is None else "srgb"
         why = "the default for " + ("floats" if image.bits is None else "integers")
         if entry.colorspace is not None:
-            space, why = entry.colorspace, "as asked for"
+            space, why = entry.colorspace, "as configured"
         elif image.tags.space == "linear":
-            space, why = "linear", "its gAMA chunk is 1"
+            space, why = "linear", "according to its gAMA chunk"
         elif image.tags.foreign is not None:
             self.warnings.append(
                 f"{image.path}: its {image.tags.foreign} is not applied, it is read as "

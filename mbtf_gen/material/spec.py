@@ -47,7 +47,7 @@ class HeightEntry(_Entry):
         le=100,
         description="factor on the stored heights, tile widths; default 1 for floats, 0.05 for integers",
     )
-    dequantize: bool = Field(True, description="smooth heights of few levels within half a level")
+    dequantize: bool = Field(True, description="smooth quantized heights within half a quantization step")
     colorspace: ColorSpace = Field("linear", description="srgb decodes the stored numbers first")
 
 

@@ -240,7 +240,7 @@ def _normal(scene: _Analysis, bounds: ReliefBounds | None) -> Effect:
     rms = float(np.sqrt(np.mean(np.sum(slopes**2, axis=-1))))
     text = f"adds slopes of {np.degrees(np.arctan(rms)):.2g}° (RMS)"
     if job.config.effects.normal == "residual" and not scene.flat:
-        text += f"; the map repeats {100.0 * share:.0f} % of the mesh's slopes, which count once"
+        text += f"; {100.0 * share:.0f} % of the mesh's slopes are also in the map and are counted once"
     if rms == 0.0:
         return Effect("normal", False, text, 0.0)
     return Effect("normal", True, text, bounds.normal if bounds else None, "pilot")
@@ -304,7 +304,7 @@ def _relief_plan(
         # Without the displaced tile its other effects are off too; the sum includes their bounds.
         parallax = replace(parallax, on=False, bias_bound=bounds.parallax + bounces)
         for name in RELIEF_EFFECTS[1:]:
-            decided[name] = decide(request, Effect(name, False, "no displaced tile", 0.0, "pilot"))
+            decided[name] = decide(request, Effect(name, False, "no displacement", 0.0, "pilot"))
         decided["parallax"] = decide(request, parallax)
         return _assemble(job, consistent(decided, request), cap)
     decided["parallax"] = decide(request, parallax)
@@ -388,7 +388,7 @@ def _interreflection(
     most = _bounce_bound(scene) if scene.lambert else np.inf
     text = "light between facets"
     if most <= left:
-        text += f"; slopes up to {_degrees(scene.steepest)} exchange little"
+        text += f"; slopes up to {_degrees(scene.steepest)} interreflect little"
         return Effect("interreflection", False, text, most, "bound"), 1, 0.0
     if not scene.pilots:
         return replace(effect, explanation="displaced; the run is too small for a pilot"), depth, 0.0
@@ -410,7 +410,7 @@ def _interreflection(
             continue
         upper = pilot.limited(cap).bound()
         if upper <= left:
-            text += f"; paths end after {cap} interactions, further ones add less than {100.0 * upper:.1g} %"
+            text += f"; paths end after {cap} interactions; further ones add less than {100.0 * upper:.1g} %"
             return replace(found, explanation=text), cap, upper
     return replace(found, explanation=f"{text}; Russian roulette ends paths, without a limit"), 0, 0.0
 

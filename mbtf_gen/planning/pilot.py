@@ -152,7 +152,7 @@ def measured(job: Job, plan: EffectsPlan, spp: int = PILOT_SPP) -> EffectsPlan:
             return effect
         cut = without(plan, effect.name)
         removed = [EFFECTS[name] for name in EFFECTS if name in plan.names_on - cut.names_on - {effect.name}]
-        text = f"; {_listed(removed)} would go with it" if removed else ""
+        text = f"; the bound includes {_listed(removed)}" if removed else ""
         change = pilot.changed(cut)
         return replace(
             effect,

@@ -157,7 +157,7 @@ def _ensure_working(variant: str) -> None:
     fault = prove(CUDA_VARIANT).fault
     if fault:
         raise EngineError(
-            f"no usable CUDA device ({fault})", hint=f"use the processor: variant {CPU_VARIANT}"
+            f"no usable CUDA device ({fault})", hint=f"use the CPU: variant {CPU_VARIANT}"
         )
 
 

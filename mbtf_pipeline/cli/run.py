@@ -39,7 +39,7 @@ def run(
     recipe
         YAML file.
     quick
-        The quick size of a paper recipe: minutes in place of hours.
+        Use the small sizes of a paper recipe: minutes in place of hours.
     force
         Run every stage, also those that are up to date.
     """
@@ -57,7 +57,7 @@ def run(
         _run_paper(recipe, output, quick, force, assignments or [], command, console)
         return
     if quick:
-        raise UsageError("only paper recipes have a quick size", where="--quick", hint="use --quality draft")
+        raise UsageError("only paper recipes have quick sizes", where="--quick", hint="use --quality draft")
     from mbtf_pipeline.presets import quality_assignments
     from mbtf_pipeline.recipe import load_recipe
     from mbtf_pipeline.run import run_recipe

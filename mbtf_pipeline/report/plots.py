@@ -229,6 +229,8 @@ def _scatter(clouds: Sequence[Cloud], x: str, y: str, front: Sequence[tuple[floa
     axes.margins(y=0.1)
     # Space for labels on either side.
     left, right = axes.get_xlim()
+    if right < 1.01 * left:  # A single time: the limits differ by rounding alone.
+        left, right = left / 1.5, right * 1.5
     axes.set_xlim(left / (right / left) ** 0.06, right * (right / left) ** 0.2)
     for axis in (axes.xaxis, axes.yaxis):
         _plain_ticks(axis)

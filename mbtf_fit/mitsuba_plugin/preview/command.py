@@ -38,8 +38,8 @@ def draw(config: PreviewConfig, path: Path, *, overwrite: bool, console: Console
     sheet, turn = config.sheet, config.turntable
     shows = {
         SHEET_NAME: f"{len(sheet.views)} views x {len(sheet.lights)} lights (columns) x "
-        f"{len(sheet.tiles_across)} widths (rows) at one exposure",
-        TURNTABLE_NAME: f"a ball of {turn.tiles} tiles around on a plate, {turn.frames} pictures of "
+        f"{len(sheet.tiles_across)} zooms (rows), one exposure",
+        TURNTABLE_NAME: f"a ball with {turn.tiles} tiles around its equator on a plate; {turn.frames} frames, "
         f"{turn.spp} paths per pixel",
     }
     kept = {name: folder.finished(name) is not None for name in shows}

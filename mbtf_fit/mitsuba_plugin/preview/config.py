@@ -51,7 +51,7 @@ class TurntableSection(Settings):
     size: Annotated[int, Flag("--turn-size")] = Field(
         240, ge=16, le=2048, description="pixels along each side of the turntable"
     )
-    frames: Annotated[int, Flag("--frames")] = Field(24, ge=1, le=360, description="pictures of one turn")
+    frames: Annotated[int, Flag("--frames")] = Field(24, ge=1, le=360, description="frames of the turntable")
     spp: Annotated[int, Flag("--spp")] = Field(16, ge=1, le=65536, description="paths per pixel")
     tiles: Annotated[int, Flag("--tiles-around")] = Field(
         8, ge=1, le=1000, description="tiles around the ball's equator"

@@ -54,7 +54,7 @@ class PreviewPictures:
             # Its queries can be shown without the material.
             if dataset is None:
                 raise
-            console.note(f"queries alone are shown: {error.where}: {error.what}")
+            console.note(f"only the queries are drawn: {error.where}: {error.what}")
         if self.job is not None:
             self._prepare_view(self.job)
 
@@ -118,19 +118,19 @@ class PreviewPictures:
                 assert facts is not None
                 pictures.append({"file": file, "kept": kept, **{k: v for k, v in facts.items() if k != "of"}})
                 bar.advance(1)
-        text = "\n".join(f"{p['file']}: {p['shows']}{' (was there)' if p['kept'] else ''}" for p in pictures)
+        text = "\n".join(f"{p['file']}: {p['shows']}{' (kept)' if p['kept'] else ''}" for p in pictures)
         self.console.report({"folder": path, "pictures": pictures, "fault": fault or None}, text)
         if fault:
             raise PartialError(
                 f"could not be drawn ({fault})",
                 where=path / "mesh.png",
-                hint="the other pictures are there; mbtf-gen doctor says what drawing needs, "
+                hint="the other pictures are finished; mbtf-gen doctor names the missing package, "
                 "then the same command draws it",
             )
         if interactive and self.job is not None:
             from mbtf_gen.pictures.preview.mesh import show
 
-            self.console.note("the mesh is shown in a window: close it to go on")
+            self.console.note("the mesh is shown in a window: close it to continue")
             show(self._tiled_mesh(), self.camera, self.omega_i)
 
     def _stage(self, name: str) -> int:
@@ -185,7 +185,7 @@ class PreviewPictures:
         else:
             assert self.job is not None
             sample = sampled_queries(self.job)
-            source = f"to be drawn for {self.config.material}"
+            source = f"sampled for {self.config.material}"
         shown = f"{len(sample.u)} of {sample.total} training queries {source}"
         if len(sample.level) < len(sample.u):
             shown += f", in {len(sample.level)} images of one footprint, light and view each"

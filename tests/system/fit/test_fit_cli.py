@@ -80,13 +80,13 @@ def test_a_finished_fit_is_not_trained_again(shards: Path, material: Path, run_p
     done = run_python("-m", "mbtf_fit", str(shards), "-o", str(material), *QUICK)
     assert done.returncode == 0, done.stderr
     assert done.stderr.splitlines() == [
-        f"{material}: this fit is finished, nothing was trained; --overwrite trains it again"
+        f"{material}: this fit is already finished; --overwrite trains it again"
     ]
     assert "unexplained variance  test" in done.stdout
     assert (material / "material.json").read_bytes() == before
     done = run_python("-m", "mbtf_fit", str(shards), "-o", str(material), *QUICK, "--overwrite")
     assert "training for 5 steps" in done.stderr
-    assert "nothing was trained" not in done.stderr
+    assert "already finished" not in done.stderr
 
 
 def test_data_of_another_material_cause_a_warning(tmp_path: Path, run_python: RunPython) -> None:
@@ -143,6 +143,6 @@ def test_bad_input_exits_with_3_and_a_hint(shards: Path, material: Path, tmp_pat
 def test_invalid_command_lines_exit_with_2(shards: Path) -> None:
     assert "mbtf-fit shards/" in fails(2)
     assert "2min" in fails(2, str(shards), "--time", "soon")
-    assert "exclude each other" in fails(2, str(shards), "--time", "1s", "--steps", "3")
+    assert "mutually exclusive" in fails(2, str(shards), "--time", "1s", "--steps", "3")
     assert "training.bach" in fails(2, str(shards), "--set", "training.bach=3")
     fails(2, str(shards), "--model", "neumop")

@@ -61,5 +61,5 @@ def test_materials_are_named_after_their_data(tmp_path: Path) -> None:
     assert name_materials([tmp_path / "a", tmp_path / "b"], out) == [out / "a", out / "b"]
     found = name_materials([tmp_path / "rock" / "shards", tmp_path / "wool" / "shards"], out)
     assert found == [out / "rock-shards", out / "wool-shards"]
-    with pytest.raises(UsageError, match="2 data sets are called"):
+    with pytest.raises(UsageError, match="2 data sets have the name"):
         name_materials([tmp_path / "a" / "s", tmp_path / "b" / ".." / "a" / "s"], out)

@@ -214,7 +214,7 @@ def test_a_preview_without_drawing_is_partial_and_resumes(
     assert "doctor" in err
     assert run(app, line) == 0
     out, _ = capsys.readouterr()
-    assert [text.endswith("(was there)") for text in out.splitlines()] == [False, True, True]
+    assert [text.endswith("(kept)") for text in out.splitlines()] == [False, True, True]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems always have a display")

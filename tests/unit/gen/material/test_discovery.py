@@ -30,7 +30,7 @@ class TestSharedWords:
         expected = {"base_color": plain[0], "height": plain[1]}
         names = [*plain, "PaintedMetal004.png"]
         assert found(tmp_path / "a", *names) == expected
-        assert find_maps(tmp_path / "a").unused == {"PaintedMetal004.png": "its name says no map"}
+        assert find_maps(tmp_path / "a").unused == {"PaintedMetal004.png": "its name matches no map"}
         metal = "PaintedMetal004_1K_Metalness.png"
         assert found(tmp_path / "b", *names, metal) == {**expected, "metallic": metal}
 
@@ -38,7 +38,7 @@ class TestSharedWords:
         names = [f"T_MetalPlate_{letter}.png" for letter in "DHN"]
         with pytest.raises(InputError, match="no height map among") as caught:
             find_maps(fill(tmp_path, *names))
-        assert f"(what they hold is unknown: {', '.join(names)})" in caught.value.hint
+        assert f"(their names match no map: {', '.join(names)})" in caught.value.hint
         assert "name it in a material.yaml" in caught.value.hint
 
     @pytest.mark.parametrize(

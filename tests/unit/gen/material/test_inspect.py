@@ -126,7 +126,7 @@ class TestNumbers:
         for name, height in (("a", fractal(96, 96)), ("b", np.rint(fractal(96, 96) * 200) / 200)):
             np.save(tmp_path / f"{name}.npy", 0.1 * height)
             oddities = inspect_material(load_material(tmp_path / f"{name}.npy"))["oddities"]
-            assert any("different values" in o for o in oddities) == (name == "b")
+            assert any("distinct values" in o for o in oddities) == (name == "b")
 
     @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (5, 1), (2, 3)])
     def test_tiny_maps(self, tmp_path: Path, shape: tuple[int, int]) -> None:
@@ -140,7 +140,7 @@ class TestNumbers:
     def test_a_flat_map_has_no_slopes(self, tmp_path: Path) -> None:
         np.save(tmp_path / "h.npy", np.zeros((4, 4)))
         found = inspect_material(load_material(tmp_path / "h.npy"))
-        assert "relief 0 tile widths" in inspection_text(found, "flat")
+        assert "displacement range 0 tile widths" in inspection_text(found, "flat")
         assert found["geometry"]["slope_max_deg"] == 0.0
         assert found["geometry"]["slope_kept"] == 1.0
         assert found["oddities"] == ["no base color map: linear RGB 0.5, 0.5, 0.5 everywhere"]
@@ -155,7 +155,20 @@ class TestText:
         assert max(map(len, lines)) <= WIDTH
         return lines
 
-    def test_misfits_and_seams_are_in_capitals(self, folder: Path) -> None:
+    def test_one_screen(self, folder: Path) -> None:
+        lines = self.lines(inspect_material(load_material(folder)))
+        assert lines[0] == "rock: tile 1 x 0.5, surface glossy, make-tileable none"
+        text = "\n".join(lines)
+        for part in (
+            "displaces the mesh",
+            "slopes     median",
+            "OpenGL",
+            "suggests the height scale 0.1",
+            "holes 25.0%",
+        ):
+            assert part in text
+
+    def test_misfits_and_seams_are_shouted(self, folder: Path) -> None:
         height: Floats = fractal(48, 96)[:, ::-1]
         save_heights(folder / "height.png", height * np.linspace(0.1, 1, 96))
         text = "\n".join(self.lines(inspect_material(load_material(folder))))
@@ -181,6 +194,23 @@ class TestText:
         lines = self.lines(inspect_material(material))
         assert "surface diffuse under a clear coat" in lines[0]
         assert any(line.startswith("clearcoat_roughness constant 0.1") for line in lines)
+
+    def test_maps_that_are_not_used_are_shown(self, folder: Path) -> None:
+        for name in ("orm.png", "gloss.png", "ao.png", "view.png"):
+            save_heights(folder / name, fractal(48, 96))
+        lines = self.lines(inspect_material(load_material(folder)))
+        text = "\n".join(line for line in lines if line.startswith("not used"))
+        for name in (
+            "orm.png: name its channels",
+            "gloss.png: in a",
+            "ao.png: the simulation",
+            "view.png: its name",
+        ):
+            assert name in text
+        assert any("orm.png: is not used, and its map is missing" in line for line in lines)
+        found = inspect_material(load_material(folder))
+        found["unused"] = {f"{i} {'long ' * 20}.png": f"reason {i}" for i in range(30)}
+        assert any("… more with --json" in line for line in self.lines(found))
 
     def test_a_default_height_far_from_the_suggested_one(self, folder: Path) -> None:
         save_normals(folder / "normal.png", normals_of(fractal(48, 96), 0.01))
@@ -223,7 +253,7 @@ class TestCommand:
         assert found["maps"]["height"]["bits"] == 16
 
         assert run(app, ["inspect", str(folder), "--make-tileable", "mirror"]) == 0
-        assert "tile=mirror" in capsys.readouterr().out
+        assert "make-tileable mirror" in capsys.readouterr().out
 
     def test_a_missing_material_is_refused(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert run(app, ["inspect", str(folder.parent / "rok")]) == 3

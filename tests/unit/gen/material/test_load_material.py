@@ -101,14 +101,14 @@ class TestBareFile:
         material = load_material(png(tmp_path / "h.png", numbers))
         assert np.array_equal(material.height, numbers / 65535)
         assert (material.height_scale, material.height_bits) == (0.05, 16)
-        assert any("factor 0.05" in note for note in material.notes)
+        assert any("height scale 0.05" in note for note in material.notes)
 
     def test_eight_bits_are_smoothed_within_half_a_code_with_a_warning(self, tmp_path: Path) -> None:
         ramp = np.rint(np.tile(100 + 5 * np.sin(np.arange(64) / 64 * 2 * np.pi), (64, 1))).astype(np.uint8)
         material = load_material(png(tmp_path / "h.png", ramp))
         assert np.abs(material.height - ramp / 255).max() <= 0.5 / 255 * (1 + 1e-9)
         assert not np.array_equal(material.height, ramp / 255)
-        assert "8 bits, 11 levels" in material.warnings[0]
+        assert "8-bit heights with 11 distinct values" in material.warnings[0]
 
     def test_other_maps_of_the_folder_are_noted(self, folder: Path) -> None:
         material = load_material(folder / "rock_height.npy")
@@ -128,7 +128,7 @@ class TestBareFile:
     def test_a_large_displacement_at_the_default_scale_warns(self, tmp_path: Path) -> None:
         material = load_material(npy(tmp_path / "h.npy", np.array([[0.0, 0.6]])))
         (warning,) = material.warnings_at()
-        assert "the displacement range is 0.6 tile widths; is another --height-scale meant?" in warning
+        assert "the displacement range is 0.6 tile widths; check --height-scale" in warning
         assert material.warnings_at(1.0) == ()
         assert load_material(npy(tmp_path / "h.npy", np.array([[0.0, 0.5]]))).warnings_at() == ()
         yaml = tmp_path / "m.yaml"
@@ -163,7 +163,7 @@ class TestFolder:
         assert material.base_color.shape == (16, 32, 3)
         assert np.shape(material.roughness) == (4, 8)
         assert material.specular == 0.5
-        assert any("constants specular 0.5" in note for note in material.notes)
+        assert any("default specular 0.5" in note for note in material.notes)
         assert any("rock_ao.png is not used" in note for note in material.notes)
         assert any(note.startswith("opacity: ") for note in material.notes)
 

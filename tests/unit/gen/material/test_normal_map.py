@@ -149,7 +149,7 @@ class TestMaterial:
         note = next(n for n in material.notes if n.startswith("normal map: normal.png"))
         assert ("DirectX" if dx else "OpenGL") in note
         assert "u +1.00, v +1.00" in note
-        assert "suggests --height-scale 0.05 " in note
+        assert "suggested --height-scale 0.05 " in note
         assert material.normal is not None
         assert np.abs(material.normal - normals_of(fractal(96, 96), 0.05)).max() < 0.02
 
@@ -169,6 +169,12 @@ class TestMaterial:
         assert "read as OpenGL" in material.warnings[0]
         assert material.normal_convention == "gl"
 
+    def test_turned_heights(self, tmp_path: Path) -> None:
+        folder = self.folder(tmp_path, np.rot90(fractal(96, 96), -1), "normal.png", dx=False)
+        (warning,) = load_material(folder).warnings
+        assert "height.png: fits normal.png only when turned by 90 degrees counter-clockwise" in warning
+        assert "correlation of their slopes 1.00, against" in warning
+
     def test_ridges_have_no_second_correlation(self, tmp_path: Path) -> None:
         ridges = np.tile(fractal(96, 96)[:1], (96, 1))
         save_heights(tmp_path / "height.png", ridges)
@@ -177,7 +183,7 @@ class TestMaterial:
         assert material.warnings == ()
         assert material.normal_convention == "dx"
         assert any(
-            "DirectX, as named; correlation with them u +1.00, v undefined" in n for n in material.notes
+            "DirectX, by its name; correlation of the slopes u +1.00, v undefined" in n for n in material.notes
         )
 
     def test_turned_and_inverted_heights_warn(self, tmp_path: Path) -> None:

@@ -78,7 +78,7 @@ class TestMaterial:
         codes = stretched(fractal(128, 128, 2.5), 115)
         Pillow.fromarray(codes.astype(np.uint8)).save(tmp_path / "height.png")
         material = load_material(tmp_path)
-        assert "8 bits, 115 levels 2.237 codes apart; smoothed within 1.23 codes" in material.warnings[0]
+        assert "8-bit heights with 115 distinct values 2.237 codes apart; smoothed within 1.23 codes" in material.warnings[0]
         moved = np.abs(material.height - codes / 255).max() * 255
         assert 0.6 < moved <= 0.5 * np.hypot(255 / 114, 1) * (1 + 1e-3)
 
@@ -88,7 +88,7 @@ class TestMaterial:
         codes = np.rint(fractal(128, 128) * 255) * 257
         Pillow.fromarray(codes.astype(np.uint16)).save(tmp_path / "height.png")
         material = load_material(tmp_path)
-        assert "heights of 16 bits" in material.warnings[0]
+        assert "16-bit heights" in material.warnings[0]
         assert "257 codes apart" in material.warnings[0]
         assert np.abs(material.height * 65535 - codes).max() <= 128.5 + 1e-6
         assert len(np.unique(material.height)) > 1000
@@ -109,5 +109,5 @@ class TestMaterial:
         path = tmp_path / "material.yaml"
         path.write_text("height: {file: h.png, dequantize: false}\n")
         material = load_material(path)
-        assert "not smoothed, because dequantize is off" in material.warnings[0]
+        assert "not smoothed (dequantize: false)" in material.warnings[0]
         assert np.array_equal(np.rint(material.height * 255), material.height * 255)
