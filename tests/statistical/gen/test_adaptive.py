@@ -30,6 +30,8 @@ from mbtf_gen.sampling.query_sampler import Mixture, Queries, QueryPlan
 
 load_mitsuba()
 
+from mbtf_gen.render.estimator import MAX_RESAMPLES  # noqa: E402
+
 N = 20_000
 RARE, BRIGHT, DIM = 0.04, 4.0, 0.05
 TRUTH = RARE * BRIGHT + (1 - RARE) * DIM
@@ -79,7 +81,27 @@ def test_values_of_a_skewed_scene_are_unbiased(skewed: tuple[Queries, Allocation
     assert z_test(mean_estimate((a - TRUTH) * (b - TRUTH))).p_value > 1e-3
 
 
-def test_a_skewed_scene_comes_near_its_target_and_reports_it(skewed: tuple[Queries, Allocation]) -> None:
+def test_the_pilot_draws_random_numbers_of_its_own(skewed: tuple[Queries, Allocation]) -> None:
+    """Paths that decide on their own number would be biased."""
+    streams = []
+
+    class Recording(FewBrightPaths):
+        def estimate(self, queries: Queries, spp: Any, stream: Stream, **options: Any) -> Estimates:
+            streams.append(stream)
+            return super().estimate(queries, spp, stream, **options)
+
+    q, allocation = skewed
+    stream = Stream(1, "train", 0)
+    estimate_shard(Recording(), q.take(slice(100)), 4, Target(0.2, 64), stream, allocation)
+    pilot, stored = streams
+    assert stored == stream
+    # Samples that are not finite are drawn again in the passes that follow.
+    assert abs(pilot.first_pass - stored.first_pass) > MAX_RESAMPLES
+
+
+def test_a_skewed_scene_comes_near_its_target_and_what_is_reported_is_so(
+    skewed: tuple[Queries, Allocation],
+) -> None:
     q, allocation = skewed
     e = estimate_shard(FewBrightPaths(), q, 4, Target(0.2, 8192), Stream(1, "train", 0), allocation)
     value = 0.5 * (e.value_a[:, 0].astype(np.float64) + e.value_b[:, 0])

@@ -74,6 +74,8 @@ SCENES: dict[str, tuple[Material, dict[str, Any]]] = {
     "white relief": (material(0.15, 0.95), {}),
     "faint relief": (material(2e-5, pattern()), {"min_cos": 0.3}),
     "gentle relief": (material(0.002, pattern()), {"min_cos": 0.6}),
+    # Slopes up to 60°, light down to 33°.
+    "rare shadows": (material(0.11, 0.5), {"min_cos": 0.6}),
     "pattern on a plane": (material(0.0, pattern()), {}),
     "gloss on a plane": (material(0.0, pattern(), **GLOSS), {}),
     "normal map on a plane": (material(0.0, 0.5, normal=bumps(0.3)), {}),
@@ -120,6 +122,7 @@ CASES = [
     ("parallax", "gray relief", "pattern on a plane"),
     ("parallax", "gray relief", "faint relief"),
     ("shadowing", "gray relief", "gentle relief"),
+    ("shadowing", "rare shadows", "gentle relief"),
     ("interreflection", "white relief", "gentle relief"),
     ("specular", "glossy relief", "gray relief"),
     ("metallic", "metal relief", "glossy relief"),

@@ -20,6 +20,7 @@ from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.dataset import render_shards
 from mbtf_gen.dataset.manifest import build_manifest
 from mbtf_gen.dataset.reader import Dataset
+from mbtf_gen.dataset.shard_io import read_shard
 from mbtf_gen.dataset.summary import finish
 from mbtf_gen.dataset.verify import sidecar_of, verify
 from mbtf_gen.generation import generate, paths_left
@@ -107,6 +108,23 @@ def test_a_run_is_complete_and_counts(config: GeneratorConfig, out: Path) -> Non
     assert set(data["spp"]) == {2.0}
     assert verify(out) == []
     assert not list(out.glob(".*"))
+
+
+@pytest.mark.parametrize("layout", ["shuffled", "image"])
+def test_shards_hold_what_was_drawn_and_estimated(
+    config: GeneratorConfig, engine: Formula, tmp_path: Path, layout: str
+) -> None:
+    """To the last bit."""
+    engine.bad = ()
+    job = Job.prepare(changed(config, queries={"layout": layout}))
+    generate(job, tmp_path / "out")
+    for entry in job.shards:
+        drawn = job.query_plan.draw(entry.split, entry.index, entry.rows)
+        value = formula(drawn.flat()).astype(np.float32).reshape(*drawn.lead, 3)
+        stored = read_shard(tmp_path / "out" / entry.file)
+        expected = {**vars(drawn), "value_a": value, "value_b": value}
+        for name, array in expected.items():
+            np.testing.assert_array_equal(stored[name], array, err_msg=name)
 
 
 def test_progress_counts_planned_paths(

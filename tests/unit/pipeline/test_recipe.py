@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,8 @@ from mbtf_core.errors import InputError
 from mbtf_core.locks import shard_lock
 from mbtf_pipeline.cli.app import app
 from mbtf_pipeline.recipe import load_recipe, read_resolved, write_recipe
+from mbtf_pipeline.run import survey
+from mbtf_pipeline.stages import Decision, Stage, run_stages
 
 HEAD = """\
 name: small
@@ -52,7 +55,28 @@ def test_the_material_is_relative_to_the_recipe(tmp_path: Path, monkeypatch: pyt
     assert recipe.folder == Path("out") / "small"
 
 
-def test_assigned_materials_are_relative_to_cwd(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_data_are_out_of_date_when_a_map_has_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By its content, not by its date."""
+    recipe, folder = load_recipe(written(tmp_path, SINGLE)), tmp_path / "out"
+
+    def finish(where: Path, stage: Stage, *others: object) -> Decision:
+        """Stands in for a run of the stage."""
+        run_stages(where, [replace(stage, needs=(), outputs=tuple, run=lambda decision: {})])
+        return Decision("")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("mbtf_pipeline.run.decide", finish)
+        survey(recipe, folder)
+    path = tmp_path / "maps" / "height.npy"
+    path.touch()
+    assert not survey(recipe, folder)["generate"].runs
+    np.save(path, np.ones((4, 4), np.float32))
+    assert survey(recipe, folder)["generate"].reason == "input changed: height"
+
+
+def test_an_assigned_material_is_relative_to_the_current_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = written(tmp_path, SINGLE)
     other = tmp_path / "other"
     other.mkdir()

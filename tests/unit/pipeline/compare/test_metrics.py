@@ -26,6 +26,14 @@ def test_noise_of_the_reference_does_not_bias_the_error() -> None:
     assert np.mean((truth + 0.1 - (a + b) / 2) ** 2) > 0.05
 
 
+def test_noise_of_the_reference_hardly_biases_the_relative_error() -> None:
+    """Only the denominator includes it; the square of one half's difference would be twice as large."""
+    truth = np.ones((96, 96, 3))
+    found = image_errors(truth + 0.03, *noisy(truth, 0.03, 7)).relative_mse
+    assert found.value == pytest.approx(0.03**2 / 1.01, rel=0.15)
+    assert found.error < 0.03 * found.value
+
+
 def test_psnr_of_a_known_error() -> None:
     truth = np.full((16, 16, 3), 0.4)
     assert psnr(image_errors(truth + 0.02, truth, truth).mse, 2.0).value == pytest.approx(40.0)
