@@ -40,7 +40,10 @@ def _shards_info(path: Path) -> tuple[dict[str, Any], str]:
     lines = [
         f"{path}: shards, {data.layout} layout",
         f"levels 0 to {lattice.finest}, finest {columns} x {rows} texels, aspect {lattice.aspect:g}",
-        *(f"{s}: {n['rows']} {kind} in {n['shards']} {'shard' if n['shards'] == 1 else 'shards'}" for s, n in splits.items()),
+        *(
+            f"{s}: {n['rows']} {kind} in {n['shards']} {'shard' if n['shards'] == 1 else 'shards'}"
+            for s, n in splits.items()
+        ),
     ]
     return {
         "shards": path,

@@ -173,7 +173,9 @@ def _oddities(found: dict[str, Any]) -> list[str]:
         out.append(f"{Path(height['file']).name}: gray stored in {height['channels']} channels")
     codes = heights["codes"]
     if codes is not None and height["bits"] == 8 and 1 < codes["levels"] < _FEW_LEVELS:
-        out.append(f"heights have only {codes['levels']} distinct values, codes {codes['low']} to {codes['high']}")
+        out.append(
+            f"heights have only {codes['levels']} distinct values, codes {codes['low']} to {codes['high']}"
+        )
     if height["bits"] is None and 1 < heights["distinct"] <= 256 and rows * columns > _MANY:
         out.append(
             f"heights are floats with only {heights['distinct']} distinct values: if they were converted from integers, "

@@ -266,17 +266,12 @@ def _assemble(spec: MaterialFile, folder: Path, found: FoundMaps, tile: Tiling) 
         under = f" under {' and '.join(layers)}" if layers else ""
         load.notes.append(f"surface: Lambert{under}, because no roughness, metallic or specular is given")
     else:
-        constants = {
-            "roughness": DEFAULT_ROUGHNESS,
-            "metallic": DEFAULT_METALLIC,
-            "specular": DEFAULT_SPECULAR,
-        }
-        given = {"roughness": roughness, "metallic": metallic, "specular": specular}
-        filled = [f"{name} {constants[name]}" for name, value in given.items() if value is None]
-        roughness, metallic, specular = (constants[n] if v is None else v for n, v in given.items())
-        load.notes.append(f"surface: glossy{'; default ' + ', '.join(filled) if filled else ''}")
-    base_color = load.base_color(spec.base_color) if spec.bsdf is None else np.full(3, DEFAULT_COLOR)
-    normal, convention, fit = None, None, None
+        constants = {role: value for role, value in _LOBES.items() if maps[role] is None}
+        maps |= constants
+        filled = ", ".join(f"{role} {value}" for role, value in constants.items())
+        load.notes.append(f"surface: glossy{', constants ' + filled if filled else ''}")
+    maps["base_color"] = load.base_color(spec.base_color) if spec.bsdf is None else np.full(3, DEFAULT_COLOR)
+    convention, fit = None, None
     if spec.normal is not None:
         maps["normal"], convention, fit = _normals(spec, spec.normal, load, height, scale)
     maps["opacity"] = load.share("opacity", spec.opacity)
@@ -379,7 +374,7 @@ def _heights(spec: MaterialFile, load: MapLoader) -> tuple[NDArray[np.float64], 
     kind = "floats" if image.bits is None else f"{image.bits}-bit integers"
     load.notes.append(
         f"heights: {image.path.name}, {image.shape[1]} x {image.shape[0]} {kind}, "
-        f"displacement range {relief:.4g} tile widths at its own height scale {scale:g}"
+        f"relief {relief:.4g} tile widths at its factor {scale:g}"
     )
     return height, codes, scale
 

@@ -1,19 +1,26 @@
-"""Symmetric V-grooves under a delta light: tile means and finite footprints against the closed form."""
+"""Symmetric V-grooves under a delta light have a closed form: shares of each facet that are lit and visible.
+
+Cross-section: ridges at x = 1/4 + n (height 0), valleys at x = 3/4 + n (height -h); the groove runs along y,
+so only ω_x/ω_z matters for occlusion, at any azimuth. From direction ω the lower part ``t`` of a facet is
+hidden by the ridge opposite it; lit and visible is ``1 - max(t_i, t_o)`` of the facet, because both hide its
+lower end.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from support.scenes import DIRECT, direction, estimate, lambert, queries, tile_mean_queries
+from scipy.special import ndtr
+from support.scenes import DIRECT, HeightGrid, direction, estimate, lambert, queries, tile_mean_queries
 
 from mbtf_core.stats import Estimate, aggregate_test, mean_of_halves, z_test
-from mbtf_gen.diagnostics.closed_forms import Groove
 from mbtf_gen.sampling.light_kernel import LightKernel
 
+HEIGHT = 0.4
+HALF = 0.5
 ALBEDO = 0.7
-GROOVE = Groove(0.4, ALBEDO)
-F64 = NDArray[np.float64]
+SIDES = (1.0, -1.0)
 
 
 def grooves(count: int) -> HeightGrid:
@@ -34,13 +41,59 @@ PAIRS = [
 ]
 
 
-def footprint_mean(u: F64, sigma: float, omega_i: F64, omega_o: F64) -> F64:
-    """M at positions u (n,): the closed form at points, averaged over a periodic Gaussian."""
-    n = 1 << 15
-    x = np.arange(n) / n
-    filtered = np.fft.rfft(GROOVE.value(x, omega_i, omega_o))
-    filtered *= np.exp(-2 * (np.pi * sigma * np.arange(n // 2 + 1)) ** 2)
-    return np.interp(u % 1.0, x, np.fft.irfft(filtered, n), period=1.0)
+def normal(side: float) -> NDArray[np.float64]:
+    """Normal of the facet that descends from its ridge towards `side`·x."""
+    n = np.array([side * HEIGHT / HALF, 0.0, 1.0])
+    return n / np.linalg.norm(n)
+
+
+def hidden(omega: NDArray[np.float64], side: float) -> float:
+    """Share of a facet, from the valley up, that does not see direction ω."""
+    if normal(side) @ omega <= 0:
+        return 1.0
+    across = side * omega[0]
+    if across <= 0:
+        return 0.0
+    # The ray past the opposite ridge, 2·HALF away at height 0, meets the facet at this distance from its
+    # ridge.
+    reach = 2 * HALF - across * 2 * HEIGHT / (omega[2] + HEIGHT * across / HALF)
+    return float(np.clip((HALF - reach) / HALF, 0.0, 1.0))
+
+
+def facet_radiance(omega_i: NDArray[np.float64], side: float) -> float:
+    """Radiance of the lit part of a facet: albedo/π times the irradiance on it, 1 on the plane."""
+    return ALBEDO / np.pi * max(0.0, normal(side) @ omega_i) / omega_i[2]
+
+
+def tile_mean(omega_i: NDArray[np.float64], omega_o: NDArray[np.float64]) -> float:
+    """Closed form of the tile mean."""
+    total = 0.0
+    for side in SIDES:
+        share = 1 - max(hidden(omega_i, side), hidden(omega_o, side))
+        projected = HALF * max(0.0, normal(side) @ omega_o) / (normal(side)[2] * omega_o[2])
+        total += facet_radiance(omega_i, side) * share * projected
+    return total
+
+
+def footprint_mean(
+    u: NDArray[np.float64], sigma: float, omega_i: NDArray[np.float64], omega_o: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Closed form of M at positions u (n,): Gaussian mass of each lit and visible facet, seen on the
+    reference plane."""
+    total = np.zeros_like(u)
+    for side in SIDES:
+        seen = 1 - max(hidden(omega_i, side), hidden(omega_o, side))
+        # Facet from its ridge (x = 1/4) down to where it is hidden; a point at depth z meets the plane at x
+        # + z·ω_x/ω_z.
+        slope = omega_o[0] / omega_o[2]
+        top = 0.25
+        low = 0.25 + side * HALF * seen + HEIGHT * seen * slope
+        left, right = min(top, low), max(top, low)
+        for n in range(-4, 6):
+            total += facet_radiance(omega_i, side) * (
+                ndtr((right + n - u) / sigma) - ndtr((left + n - u) / sigma)
+            )
+    return total
 
 
 @pytest.mark.parametrize("count", [1, 1024])
@@ -72,8 +125,14 @@ def test_finite_footprint(light: tuple[float, float], view: tuple[float, float],
     omega_i, omega_o = direction(*light), direction(*view)
     n = 3000
     u = np.random.default_rng(3).random((n, 2))
-    q = queries(u, sigma, omega_i, omega_o, n)
-    e = estimate(GROOVE.grid, lambert(ALBEDO), LightKernel(0.0), q, 64, transport=DIRECT)
+    e = estimate(
+        GROOVE,
+        lambert(ALBEDO),
+        LightKernel(0.0),
+        queries(u, sigma, omega_i, omega_o, n),
+        64,
+        transport=DIRECT,
+    )
     exact = footprint_mean(u[:, 0], sigma, omega_i, omega_o)[:, None]
     # Mean and scatter, by thirds of the tile: a mirrored or shifted profile has the right mean.
     thirds = np.floor(3 * u[:, 0]).astype(int)
@@ -99,7 +158,8 @@ def test_a_mirrored_offset_is_caught() -> None:
     omega_i, omega_o = direction(35, 0), direction(50, 200)
     n = 3000
     u = np.random.default_rng(3).random((n, 2))
-    q = queries(u, 0.08, omega_i, omega_o, n)
-    e = estimate(GROOVE.grid, lambert(ALBEDO), LightKernel(0.0), q, 64, transport=DIRECT)
+    e = estimate(
+        GROOVE, lambert(ALBEDO), LightKernel(0.0), queries(u, 0.08, omega_i, omega_o, n), 64, transport=DIRECT
+    )
     mirrored = footprint_mean(1 - u[:, 0] - 0.5, 0.08, omega_i, omega_o)[:, None]
     assert aggregate_test(e.value_a[:, :1], e.value_b[:, :1], mirrored, mirrored, minimum=500).p_value < 1e-6

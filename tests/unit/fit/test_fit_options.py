@@ -34,8 +34,3 @@ def test_presets_keep_what_flags_set() -> None:
     assert config_of("--quality", "draft", "--model", "hierarchical").network.width == 25
     assert config_of("--quality", "draft", "--init-from", "material/").network.width == 25
     assert config_of("--quality", "draft").network.width == 40
-
-
-def test_time_and_steps_exclude_each_other() -> None:
-    with pytest.raises(UsageError, match="mutually exclusive"):
-        config_of("--time", "1s", "--steps", "3")
