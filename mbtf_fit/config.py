@@ -77,7 +77,9 @@ class BlurSection(Settings):
     )
     final_sigma: float = Field(0.25, gt=0, le=256, description="sigma at the end of the annealing")
     fraction: float = Field(0.5, gt=0, le=1, description="fraction of the training that the annealing takes")
-    min_sigma: float = Field(0.0, ge=0, le=256, description="minimum sigma of the pyramid, also after the annealing")
+    min_sigma: float = Field(
+        0.0, ge=0, le=256, description="minimum sigma of the pyramid, also after the annealing"
+    )
     offset_sigma: float = Field(
         2.0, ge=0, le=256, description="minimum sigma of the offset texture, also after the annealing"
     )

@@ -48,9 +48,7 @@ def export_material(
     folder = material if output is None else output
     loaded = Material.load(material)
     if "material" in wanted and folder.is_dir() and any(folder.iterdir()):
-        raise InputError(
-            "is not empty", where=folder, hint="name a new folder with -o for --to material"
-        )
+        raise InputError("is not empty", where=folder, hint="name a new folder with -o for --to material")
     written, error = loaded, None
     if half:
         written, error = to_half(loaded)

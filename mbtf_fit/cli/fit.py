@@ -49,7 +49,9 @@ def fit(
     if dry_run and many is not None:
         raise UsageError("--dry-run takes one data set", hint="mbtf-fit shards/ --dry-run")
     if many is not None and shards is not None:
-        raise UsageError("--many replaces the argument SHARDS", hint=f"mbtf-fit --many {shards} ... -o materials/")
+        raise UsageError(
+            "--many replaces the argument SHARDS", hint=f"mbtf-fit --many {shards} ... -o materials/"
+        )
     if processes is not None and (many is None or processes < 1):
         raise UsageError("--processes must be a positive number and requires --many")
     if shards is None and many is None:
@@ -139,7 +141,9 @@ def _fit_many(
         import torch
 
         processes = max(1, torch.cuda.device_count()) if config.device != "cpu" else 1
-    console.note(f"{len(shards)} data set{'s' * (len(shards) != 1)} -> {output}: {config.model}, {processes} at a time")
+    console.note(
+        f"{len(shards)} data set{'s' * (len(shards) != 1)} -> {output}: {config.model}, {processes} at a time"
+    )
     with console.progress(total=len(shards), label="fitting", unit="data sets") as bar:
 
         def finished(outcome: FitOutcome) -> None:

@@ -63,7 +63,9 @@ def find_data(arguments: Sequence[Path]) -> list[Path]:
         else:
             mine = sorted(p.parent for p in argument.glob(f"*/{MANIFEST_NAME}"))
         if not mine:
-            raise InputError("holds no data sets", where=argument, hint="generate some: mbtf-gen ... -o FOLDER")
+            raise InputError(
+                "holds no data sets", where=argument, hint="generate some: mbtf-gen ... -o FOLDER"
+            )
         found += mine
     return found
 
@@ -82,7 +84,8 @@ def name_materials(shards: Sequence[Path], out: Path) -> list[Path]:
     for name, count in Counter(names).items():
         if count > 1:
             raise UsageError(
-                f"{count} data sets have the name {name}", hint="list each once, rename them, or fit them one by one"
+                f"{count} data sets have the name {name}",
+                hint="list each once, rename them, or fit them one by one",
             )
     return [out / name for name in names]
 

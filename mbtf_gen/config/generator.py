@@ -199,7 +199,10 @@ class EffectsSection(Settings):
         "comma-separated",
     )
     tolerance: float = Field(
-        0.005, ge=0, lt=1, description="allowed bias of all omitted effects together, relative to the mean value"
+        0.005,
+        ge=0,
+        lt=1,
+        description="allowed bias of all omitted effects together, relative to the mean value",
     )
     normal: NormalMode = Field(
         "residual",

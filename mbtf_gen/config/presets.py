@@ -13,7 +13,9 @@ from cyclopts import Parameter
 Quality = Literal["draft", "standard", "high", "paper"]
 QualityOption = Annotated[
     Quality | None,
-    Parameter(help="Preset of sizes and times; overrides the file of --config; other options override the preset."),
+    Parameter(
+        help="Preset of sizes and times; overrides the file of --config; other options override the preset."
+    ),
 ]
 
 # Options of the generator by preset, dotted names.

@@ -156,9 +156,7 @@ def _ensure_working(variant: str) -> None:
         return
     fault = prove(CUDA_VARIANT).fault
     if fault:
-        raise EngineError(
-            f"no usable CUDA device ({fault})", hint=f"use the CPU: variant {CPU_VARIANT}"
-        )
+        raise EngineError(f"no usable CUDA device ({fault})", hint=f"use the CPU: variant {CPU_VARIANT}")
 
 
 def _proof_file(library: str | None) -> Path | None:

@@ -183,7 +183,8 @@ class TestMaterial:
         assert material.warnings == ()
         assert material.normal_convention == "dx"
         assert any(
-            "DirectX, by its name; correlation of the slopes u +1.00, v undefined" in n for n in material.notes
+            "DirectX, by its name; correlation of the slopes u +1.00, v undefined" in n
+            for n in material.notes
         )
 
     def test_heights_upside_down(self, tmp_path: Path) -> None:

@@ -91,7 +91,10 @@ class TestMaterial:
         codes = stretched(fractal(128, 128, 2.5), 115)
         Pillow.fromarray(codes.astype(np.uint8)).save(tmp_path / "height.png")
         material = load_material(tmp_path)
-        assert "8-bit heights with 115 distinct values 2.237 codes apart; smoothed within 1.23 codes" in material.warnings[0]
+        assert (
+            "8-bit heights with 115 distinct values 2.237 codes apart; smoothed within 1.23 codes"
+            in material.warnings[0]
+        )
         moved = np.abs(material.height - codes / 255).max() * 255
         assert 0.6 < moved <= 0.5 * np.hypot(255 / 114, 1) * (1 + 1e-3)
 
