@@ -71,7 +71,8 @@ def _material_info(path: Path) -> tuple[dict[str, Any], str]:
         f"aspect {material.lattice.aspect:g}",
         f"{weights['network_weights']} network weights, {weights['texels']} texture values, "
         f"{size / 1e6:.2f} MB",
-        f"trained for {training['steps']} steps of {training['batch']} queries in {clock(training['seconds'])}",
+        f"trained for {training['steps']} steps of {training['batch']} queries in "
+        f"{clock(training['seconds'])}",
         f"evaluation on this CPU: {describe()}",
         *describe_errors(training["errors"]),
         *describe_transmittance(training.get("transmittance")),

@@ -57,8 +57,8 @@ class MarginalCost:
             lines[0] += f"; halving the error takes about {clock(self.halving)} more, or longer"
         if self.noise_share is not None:
             lines.append(
-                f"overfitting to noise causes {self.noise_share:.0%} of the error of held-out queries: use more "
-                "queries, or more paths per query"
+                f"overfitting to noise causes {self.noise_share:.0%} of the error of held-out queries: "
+                "use more queries, or more paths per query"
             )
         return "\n".join(lines)
 

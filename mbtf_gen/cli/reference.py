@@ -21,7 +21,7 @@ def reference(
     overwrite: Overwrite = False,
     console: Console = CONSOLE,
 ) -> None:
-    """Render reference pictures of the micro-geometry on the plane: EXR with two independent estimates, and PNG.
+    """Render reference pictures of the micro-geometry on the plane: EXR with two estimates, and PNG.
 
     The same command again renders the missing pictures.
 

@@ -178,14 +178,16 @@ def _oddities(found: dict[str, Any]) -> list[str]:
         )
     if height["bits"] is None and 1 < heights["distinct"] <= 256 and rows * columns > _MANY:
         out.append(
-            f"heights are floats with only {heights['distinct']} distinct values: if they were converted from integers, "
+            f"heights are floats with only {heights['distinct']} distinct values: "
+            "if they were converted from integers, "
             "they form terraces"
         )
     if Path(height["file"]).suffix.lower() in (".jpg", ".jpeg"):
         out.append("heights come from a JPG: its compression is part of the surface")
     if geometry["relief"] > 0 and heights["detail_texels"] < _FINE:
         out.append(
-            f"fine detail: the correlation of heights falls to half within {heights['detail_texels']:.1f} texels, "
+            f"fine detail: the correlation of heights falls to half within "
+            f"{heights['detail_texels']:.1f} texels, "
             f"RMS step {heights['rms_step']:.0%} of the range per texel"
         )
     if max(heights["repeats"]) > 1:

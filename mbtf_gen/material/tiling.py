@@ -158,5 +158,5 @@ def retile(maps: Mapping[str, Any], tile: Tiling) -> dict[str, Any]:
 def tiling_note(tile: Tiling) -> str:
     """Description of a tiling method."""
     if tile == "mirror":
-        return "tile: two by two mirrored copies; the tile is two images wide, so heights in tile widths are halved"
+        return "tile: 2 x 2 mirrored copies, two images wide, so heights in tile widths are halved"
     return f"tile: edges cross-faded over {BAND:g} of the tile"

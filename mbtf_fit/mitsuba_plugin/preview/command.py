@@ -39,7 +39,8 @@ def draw(config: PreviewConfig, path: Path, *, overwrite: bool, console: Console
     shows = {
         SHEET_NAME: f"{len(sheet.views)} views x {len(sheet.lights)} lights (columns) x "
         f"{len(sheet.tiles_across)} zooms (rows), one exposure",
-        TURNTABLE_NAME: f"a ball with {turn.tiles} tiles around its equator on a plate; {turn.frames} frames, "
+        TURNTABLE_NAME: f"a ball with {turn.tiles} tiles around its equator on a plate; "
+        f"{turn.frames} frames, "
         f"{turn.spp} paths per pixel",
     }
     kept = {name: folder.finished(name) is not None for name in shows}

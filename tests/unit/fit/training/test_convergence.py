@@ -54,7 +54,7 @@ def test_half_of_the_distance_to_the_training_error_is_overfitting() -> None:
     found = marginal_cost_of(history(0.5), errors(0.2 + 0.05, 0.2 - 0.05), 0.3)
     assert found is not None
     assert found.noise_share == pytest.approx(0.05 / 0.25)
-    assert "overfitting to noise is 20% of the error" in found.describe()
+    assert "overfitting to noise causes 20% of the error" in found.describe()
     for same in (errors(0.25, 0.248), errors(0.25, 0.3), {}, errors(math.nan, 0.1)):
         other = marginal_cost_of(history(0.5), same, 0.3)
         assert other is not None
