@@ -31,9 +31,9 @@ from typing import Any, get_args
 
 from mbtf_core.atomic import read_json, write_json
 from mbtf_core.config_file import resolve
-from mbtf_core.console import clock
 from mbtf_core.digest import data_sha256
 from mbtf_core.errors import InputError
+from mbtf_core.units import clock
 from mbtf_fit.config import FitConfig
 from mbtf_fit.presets import FITTER, best_at
 from mbtf_gen.config.generator import GeneratorConfig

@@ -43,7 +43,6 @@ import re
 import signal
 import sys
 import threading
-import time
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -63,20 +62,11 @@ from mbtf_core.errors import (
     reason,
 )
 from mbtf_core.options import Switch
+from mbtf_core.progress import BarProgress, LineProgress, Progress
 
 EXIT_INTERNAL = 1
 _EXIT_BROKEN_PIPE = 141
 _PACKAGES = ("mbtf_core", "mbtf_gen", "mbtf_fit", "mbtf_pipeline")
-# Seconds between two plain progress lines.
-_LINE_SECONDS = 10.0
-
-
-def clock(seconds: float) -> str:
-    """Readable duration: ``0:07``, ``12:03``, ``1:02:03``."""
-    whole = max(0, round(seconds))
-    hours, rest = divmod(whole, 3600)
-    minutes, rest = divmod(rest, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
 def _plain(value: Any) -> Any:
@@ -94,109 +84,6 @@ def _plain(value: Any) -> Any:
     if hasattr(value, "tolist"):
         return _plain(value.tolist())
     return str(value)
-
-
-class Progress:
-    """Progress of one job, made by :meth:`Console.progress`; this class itself shows nothing.
-
-    Attributes
-    ----------
-    total : units the job has; None where that is not known
-    done : units done so far
-    """
-
-    def __init__(self, total: float | None, label: str, unit: str) -> None:
-        self.total = total
-        self.label = label
-        self.unit = unit
-        self.done = 0.0
-        self.note = ""
-        self._start = time.monotonic()
-
-    @property
-    def seconds(self) -> float:
-        """Seconds since the job began."""
-        return time.monotonic() - self._start
-
-    def advance(self, step: float = 1, note: str | None = None) -> None:
-        """Count `step` more as done."""
-        self.update(self.done + step, note)
-
-    def update(self, done: float, note: str | None = None) -> None:
-        """Set the units done; `note` is displayed until the next one."""
-        self.done = done
-        if note is not None:
-            self.note = note
-        self._show()
-
-    def _show(self) -> None:
-        """Display the new state."""
-
-    def _close(self) -> None:
-        """Display the last state."""
-
-
-class _LineProgress(Progress):
-    """Plain lines at intervals, for logs and pipes."""
-
-    def __init__(self, total: float | None, label: str, unit: str) -> None:
-        super().__init__(total, label, unit)
-        self._next = self._start + _LINE_SECONDS
-        self._shown: float | None = None
-
-    def _show(self) -> None:
-        if time.monotonic() >= self._next:
-            self._next = time.monotonic() + _LINE_SECONDS
-            self._print()
-
-    def _close(self) -> None:
-        if self.done and self._shown != self.done:
-            self._print()
-
-    def _print(self) -> None:
-        self._shown = self.done
-        parts = [f"{self.label}: {self.done:.10g}"]
-        if self.unit == "%":
-            parts[0] = f"{self.label}: {self.done:.0f}%"
-        elif self.total:
-            parts[0] += f"/{self.total:.10g} {self.unit}".rstrip() + f" ({self.done / self.total:.0%})"
-        elif self.unit:
-            parts[0] += f" {self.unit}"
-        parts.append(f"{clock(self.seconds)} elapsed")
-        if self.total and 0 < self.done < self.total:
-            parts.append(f"{clock(self.seconds * (self.total - self.done) / self.done)} left")
-        if self.note:
-            parts.append(self.note)
-        print(", ".join(parts), file=sys.stderr, flush=True)
-
-
-class _BarProgress(Progress):
-    """A bar that redraws itself, for terminals."""
-
-    def __init__(self, total: float | None, label: str, unit: str) -> None:
-        super().__init__(total, label, unit)
-        from rich import progress
-        from rich.console import Console as RichConsole
-
-        self._rich = progress.Progress(
-            progress.TextColumn("{task.description}", markup=False),
-            progress.BarColumn(),
-            progress.TaskProgressColumn(),
-            progress.TimeElapsedColumn(),
-            progress.TimeRemainingColumn(),
-            progress.TextColumn("{task.fields[note]}", markup=False),
-            console=RichConsole(stderr=True),
-            # Standard output is for results; rich would redirect it to standard error.
-            redirect_stdout=False,
-        )
-        self._task = self._rich.add_task(label, total=total, note="")
-        self._rich.start()
-
-    def _show(self) -> None:
-        self._rich.update(self._task, completed=self.done, note=self.note)
-
-    def _close(self) -> None:
-        self._rich.stop()
 
 
 @Parameter(name="*", group="Output")
@@ -235,7 +122,7 @@ class Console:
         """
         kind: type[Progress] = Progress
         if not self.quiet:
-            kind = _BarProgress if sys.stderr.isatty() else _LineProgress
+            kind = BarProgress if sys.stderr.isatty() else LineProgress
         bar = kind(total, label, unit)
         try:
             yield bar

@@ -87,3 +87,11 @@ def parse_numbers(value: Any) -> Any:
         return [float(part) for part in value.split(",")]
     except ValueError:
         raise ValueError("must be numbers separated by commas, such as 1,2,4") from None
+
+
+def clock(seconds: float) -> str:
+    """Readable duration: ``0:07``, ``12:03``, ``1:02:03``."""
+    whole = max(0, round(seconds))
+    hours, rest = divmod(whole, 3600)
+    minutes, rest = divmod(rest, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from mbtf_core.console import clock
+from mbtf_core.units import clock
 
 SPLIT_NAMES = {
     "test": "test queries",

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.console import clock
 from mbtf_core.shard_schema import ARRAYS, Split
 from mbtf_core.stats import pooled_error
+from mbtf_core.units import clock
 from mbtf_gen.dataset.shard_io import write_shard
 from mbtf_gen.job import Job, split_queries, split_spp, split_target
 from mbtf_gen.planning.adaptive import estimate_shard

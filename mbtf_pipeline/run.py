@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.atomic import read_json
-from mbtf_core.console import Console, clock
+from mbtf_core.console import Console
 from mbtf_core.errors import InputError
+from mbtf_core.units import clock
 from mbtf_fit.config import FitConfig
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_pipeline.compare.compare import COMPARISON_NAME, COMPARISON_SCHEMA

@@ -8,9 +8,10 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from mbtf_core.console import CONSOLE, Console, clock
+from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import PartialError, UsageError
 from mbtf_core.options import DryRun, Options, Output, Overwrite, takes_options
+from mbtf_core.units import clock
 from mbtf_fit.config import FitConfig
 from mbtf_fit.formatting import describe_fit, format_estimate, format_table
 from mbtf_gen.config.presets import Quality, QualityOption, as_assignments

@@ -6,7 +6,7 @@ import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from mbtf_core.console import clock
+from mbtf_core.units import clock
 from mbtf_fit.formatting import SPLIT_NAMES
 
 # Fractions of the budget between which a record counts as the middle of training.

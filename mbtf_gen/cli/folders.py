@@ -7,9 +7,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mbtf_core.console import CONSOLE, Console, clock, resumable
+from mbtf_core.console import CONSOLE, Console, resumable
 from mbtf_core.errors import EXIT_BAD_INPUT, EXIT_OK
 from mbtf_core.options import DryRun
+from mbtf_core.units import clock
 from mbtf_gen.cli.generate import describe
 
 if TYPE_CHECKING:

@@ -8,9 +8,10 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from mbtf_core.console import CONSOLE, Console, clock, resumable
+from mbtf_core.console import CONSOLE, Console, resumable
 from mbtf_core.errors import UsageError
 from mbtf_core.options import Options, Output, Overwrite, takes_options
+from mbtf_core.units import clock
 from mbtf_gen.cli.common import resolve_config
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.config.presets import GENERATOR, QualityOption, as_assignments

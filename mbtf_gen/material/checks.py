@@ -56,8 +56,8 @@ def level_remark(path: Path, codes: Codes, bits: int, step: float, smoothed: boo
     """The remark that heights have few levels."""
     apart = f" {codes.spacing:.4g} codes apart" if codes.spacing > 1 else ""
     hint = f"smoothed within {'half a code' if step == 1 else f'{step / 2:.3g} codes'}"
-    return f"{path}: heights of {bits} bits, {codes.levels} levels{apart}; " + (
-        hint if smoothed else "not smoothed, because dequantize is off"
+    return f"{path}: {bits}-bit heights with {codes.levels} distinct values{apart}; " + (
+        hint if smoothed else "not smoothed (dequantize: false)"
     )
 
 
@@ -78,7 +78,7 @@ def orientation_warning(fit: NormalFit, normal: Path, height: Path) -> str | Non
     """The warning that the normal map matches the heights only when turned, mirrored or inverted."""
     if not fit.misfit:
         return None
-    found = f"correlation of their slopes {fit.best:.2f} so, {fit.as_is:.2f} as it is"
+    found = f"correlation of their slopes {fit.best:.2f}, against {fit.as_is:.2f} as given"
     if not fit.turn:
         return (
             f"{normal}: fits the heights only upside down ({found}); "
@@ -98,7 +98,7 @@ def choose_convention(
     shown = None if fit is None else fit.convention
     chosen: Convention = asked or shown or named or "gl"
     if shown is None or fit is None:
-        how = "as asked for" if asked else "as named" if named else "assumed: the heights do not decide"
+        how = "as configured" if asked else "by its name" if named else "assumed: the heights do not decide"
         return chosen, how, None
     claim = asked or named
     if claim is None or claim == shown:
@@ -109,7 +109,7 @@ def choose_convention(
         f"{CONVENTION_NAMES[shown]} (correlation {fit.as_is:.2f} against {min(fit.gl, fit.dx):.2f}); "
         f"read as {CONVENTION_NAMES[chosen]}"
     )
-    return chosen, "as asked for" if asked else "as the heights' slopes show", warning
+    return chosen, "as configured" if asked else "as the heights' slopes show", warning
 
 
 def signed(correlation: float) -> str:
@@ -121,7 +121,7 @@ def range_warning(path: Path, extent: float) -> str | None:
     """The warning that a default scale gives an unlikely displacement range, in tile widths."""
     if extent <= _STEEP:
         return None
-    return f"{path}: the displacement range is {extent:.4g} tile widths; is another --height-scale meant?"
+    return f"{path}: the displacement range is {extent:.4g} tile widths; check --height-scale"
 
 
 def suggestion_warning(path: Path, fit: NormalFit | None, factor: float) -> str | None:
@@ -151,10 +151,10 @@ def normal_note(
         return text
     sign = 1.0 if convention == "gl" else -1.0
     u, v = signed(fit.correlation_u), signed(sign * fit.correlation_v)
-    text += f"; correlation with them u {u}, v {v}"
+    text += f"; correlation of the slopes u {u}, v {v}"
     if fit.fits:
         own = "the default" if default else "the material file's"
-        text += f"; it suggests --height-scale {fit.scale:.3g} ({own} is {factor:.3g})"
+        text += f"; suggested --height-scale {fit.scale:.3g} ({own} is {factor:.3g})"
     return text
 
 

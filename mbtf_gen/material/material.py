@@ -269,7 +269,7 @@ def _assemble(spec: MaterialFile, folder: Path, found: FoundMaps, tile: Tiling) 
         constants = {role: value for role, value in _LOBES.items() if maps[role] is None}
         maps |= constants
         filled = ", ".join(f"{role} {value}" for role, value in constants.items())
-        load.notes.append(f"surface: glossy{', constants ' + filled if filled else ''}")
+        load.notes.append(f"surface: glossy{'; default ' + filled if filled else ''}")
     maps["base_color"] = load.base_color(spec.base_color) if spec.bsdf is None else np.full(3, DEFAULT_COLOR)
     convention, fit = None, None
     if spec.normal is not None:
@@ -374,7 +374,7 @@ def _heights(spec: MaterialFile, load: MapLoader) -> tuple[NDArray[np.float64], 
     kind = "floats" if image.bits is None else f"{image.bits}-bit integers"
     load.notes.append(
         f"heights: {image.path.name}, {image.shape[1]} x {image.shape[0]} {kind}, "
-        f"relief {relief:.4g} tile widths at its factor {scale:g}"
+        f"displacement range {relief:.4g} tile widths at its own height scale {scale:g}"
     )
     return height, codes, scale
 

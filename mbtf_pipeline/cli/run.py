@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from mbtf_core.console import CONSOLE, Console, clock
+from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import UsageError
 from mbtf_core.options import Output, Set, Switch, Time, command_line
+from mbtf_core.units import clock
 from mbtf_gen.config.presets import QualityOption
 
 if TYPE_CHECKING:

@@ -27,10 +27,9 @@ from pathlib import Path
 import numpy as np
 
 from mbtf_core.atomic import read_json, write_json
-from mbtf_core.console import clock
 from mbtf_core.digest import data_sha256
 from mbtf_core.errors import InputError, UsageError
-from mbtf_core.units import format_duration
+from mbtf_core.units import clock, format_duration
 from mbtf_fit.config import FitConfig
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_pipeline.cost_study.fit_runs import round_down

@@ -25,7 +25,7 @@ INPUT_CASES = {
     "cut.png": ["cut.png", "PNG"],
     "empty.png": ["empty.png", "is empty"],
     "garbage.npy": ["garbage.npy", "npy"],
-    "misnamed.exr": ["holds PNG data", "misnamed.png"],
+    "misnamed.exr": ["contains PNG data", "misnamed.png"],
     "notes.txt": ["'.txt'", ".exr"],
     "nan.npy": ["nan.npy", "3 pixels, the first at column 5, row 2"],
     "inf.npy": ["inf.npy", "1 pixel, at column 0, row 3"],
@@ -186,7 +186,7 @@ def test_verify_counts_what_an_interrupted_run_has_not_made(tmp_path: Path) -> N
     text, data = run_all([["verify", "set"], ["verify", "set", "--json"]], tmp_path)
     assert (text.code, data.code) == (INPUT, INPUT)
     assert text.out.splitlines() == [
-        "set: 4 of 11 shards are missing, first train-00003.npz; "
+        "set: 4 of 11 shards missing, first train-00003.npz; "
         "run the same mbtf-gen command again: it renders the missing shards",
         "set/train-00001.npz: has changed since it was written (SHA-256 differs); "
         "repair it with: mbtf-gen repair FOLDER",

@@ -259,24 +259,3 @@ def test_pictures_that_are_there_are_kept_and_others_refused(batch: dict[str, Do
     assert refused.code == 3
     assert "pictures: holds pictures of another configuration: reference.spp: 4 -> 256" in refused.err
     assert "size: 24" in (work / "pictures/config.yaml").read_text()
-
-
-def test_overwriting_pictures_leaves_none_of_before(batch: dict[str, Done], work: Path) -> None:
-    assert batch["one replaced"].code == 0, batch["one replaced"].err
-    assert {p.name for p in (work / "one").iterdir()} == {
-        "config.yaml",
-        "pictures.json",
-        "pixel-tiles2.exr",
-        "pixel-tiles2.png",
-    }
-
-
-def test_the_report_counts_training_and_test_queries(batch: dict[str, Done], work: Path) -> None:
-    again = batch["again in words"]
-    assert "2048 training + 200 test queries, resolution 16" in again.err
-    assert again.out.splitlines()[:2] == [
-        "again: 2048 training + 200 test queries, complete",
-        "  this run: nothing left to do",
-    ]
-    # Merging traces nothing by its nature, and says nothing of it.
-    assert "this run" not in batch["unmerged"].out

@@ -173,7 +173,7 @@ def test_plots_of_a_data_set_are_of_its_stored_queries(batch: dict[str, Done], w
 def test_queries_can_be_seen_without_their_material(batch: dict[str, Done], work: Path) -> None:
     pictures = report(batch["lonely"])["pictures"]
     assert [Path(p["file"]).name for p in pictures] == ["queries.png"]
-    assert "queries alone are shown" in batch["lonely"].err
+    assert "only the queries are drawn" in batch["lonely"].err
     assert not (work / "lonely-pictures/mesh.png").exists()
 
 

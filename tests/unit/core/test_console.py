@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 from cyclopts import App
 
-from mbtf_core.console import CONSOLE, Console, clock, new_app, run
+from mbtf_core.console import CONSOLE, Console, new_app, run
 from mbtf_core.errors import EngineError, InputError, MbtfError, PartialError, UsageError
+from mbtf_core.units import clock
 
 
 @pytest.fixture
@@ -199,7 +200,7 @@ def test_plain_progress_ends_with_a_line(capsys: pytest.CaptureFixture[str]) -> 
 
 def test_progress_intervals(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     now = 0.0
-    monkeypatch.setattr("mbtf_core.console.time.monotonic", lambda: now)
+    monkeypatch.setattr("mbtf_core.progress.time.monotonic", lambda: now)
     with CONSOLE.progress(100, "fitting", "steps") as bar:
         for _ in range(50):
             now += 0.5

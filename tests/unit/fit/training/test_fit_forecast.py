@@ -58,7 +58,7 @@ def test_a_forecast_matches_the_fit_that_follows(
     doublings = math.log2(found.seconds / 0.1)
     assert found.unexplained == pytest.approx(extrapolated(*found.pilots, doublings), rel=1e-9)
     assert len(found.describe().splitlines()) == 2
-    assert "unexplained variance of test queries about" in found.describe()
+    assert "unexplained variance of test queries: about" in found.describe()
     if "steps" in options:
         fit(config, shards, tmp_path / "material")
         # Names and shapes stand before the numbers, conformance queries beside them.

@@ -28,13 +28,13 @@ SETS: dict[str, tuple[str, float, tuple[float, float]]] = {
 }
 # Set → parts of its warnings and oddities, separated by semicolons.
 ODDITIES = {
-    "knit_fabric": "heights of 8 bits, 132 levels;gray stored in 4 channels;fine detail;repeats 32 x;"
-    "base color is almost constant;real holes;--mesh 1024 keeps all",
-    "leather_fine": "heights of 8 bits, 256 levels;JPG;fine detail;--mesh 1024 keeps all",
+    "knit_fabric": "8-bit heights with 132 distinct values;gray stored in 4 channels;fine detail;repeat 32 x;"
+    "base color is almost constant;see-through;--mesh 1024 keeps all",
+    "leather_fine": "8-bit heights with 256 distinct values;JPG;fine detail;--mesh 1024 keeps all",
     "metal_plate": "no base color map: linear RGB 0.5, 0.5, 0.5;metallic varies from 0 to 1",
-    "rock_cliff": "heights of 8 bits, 115 levels 2.238 codes apart;115 levels only",
-    "stone_bricks": "heights of 8 bits, 219 levels;not square: 1024 x 512;JPG",
-    "tree_bark": "heights of 8 bits, 104 levels;104 levels only, codes 109 to 237;JPG",
+    "rock_cliff": "8-bit heights with 115 distinct values 2.238 codes apart;only 115 distinct values",
+    "stone_bricks": "8-bit heights with 219 distinct values;not square: 1024 x 512;JPG",
+    "tree_bark": "8-bit heights with 104 distinct values;only 104 distinct values, codes 109 to 237;JPG",
 }
 
 
@@ -65,7 +65,7 @@ def test_there_is_no_false_warning(name: str) -> None:
     """All six tile, and their normal maps fit; the default height is far off for those of gentle slopes."""
     found = inspected(folder_of(name))
     assert [t["tiles"] for t in found["tiling"]] == [True, True]
-    allowed = ("heights of 8 bits", "opacity: read", "its slopes suggest --height-scale")
+    allowed = ("8-bit heights", "opacity: read", "its slopes suggest --height-scale")
     assert [w for w in found["warnings"] if not any(part in w for part in allowed)] == []
     assert any("suggest --height-scale" in w for w in found["warnings"]) == (SETS[name][1] < 0.05 / 3)
 

@@ -191,7 +191,7 @@ class TestMaterial:
         folder = self.folder(tmp_path, np.rot90(fractal(96, 96), -1), "normal.png", dx=False)
         (warning,) = load_material(folder).warnings
         assert "height.png: fits normal.png only when turned by 90 degrees counter-clockwise" in warning
-        assert "correlation of their slopes 1.00 so," in warning
+        assert "correlation of their slopes 1.00, against" in warning
         save_heights(folder / "height.png", 1 - fractal(96, 96))
         (warning,) = load_material(folder).warnings
         assert "upside down" in warning

@@ -108,7 +108,7 @@ def test_paper_recipes_are_distinguished(tmp_path: Path, capsys: pytest.CaptureF
     files = (SHIPPED[0], PIPELINES / "ci.yaml", ordinary, tmp_path)
     assert [is_paper_recipe(p) for p in files] == [True, False, False, False]
     assert run(app, ["run", str(PIPELINES / "ci.yaml"), "--quick"]) == 2
-    assert "only paper recipes have a quick size" in capsys.readouterr().err
+    assert "only paper recipes have quick sizes" in capsys.readouterr().err
     assert run(app, ["run", str(SHIPPED[0]), "--quality", "draft"]) == 2
     assert "a paper recipe has sizes and times of its own" in capsys.readouterr().err
 

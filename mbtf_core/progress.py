@@ -1,0 +1,114 @@
+"""Progress of a long job: a bar on terminals, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import sys
+import time
+
+from mbtf_core.units import clock
+
+# Seconds between two plain progress lines.
+_LINE_SECONDS = 10.0
+
+
+class Progress:
+    """Progress of one job, made by :meth:`Console.progress`; this class itself shows nothing.
+
+    Attributes
+    ----------
+    total : units the job has; None where that is not known
+    done : units done so far
+    """
+
+    def __init__(self, total: float | None, label: str, unit: str) -> None:
+        self.total = total
+        self.label = label
+        self.unit = unit
+        self.done = 0.0
+        self.note = ""
+        self._start = time.monotonic()
+
+    @property
+    def seconds(self) -> float:
+        """Seconds since the job began."""
+        return time.monotonic() - self._start
+
+    def advance(self, step: float = 1, note: str | None = None) -> None:
+        """Count `step` more as done."""
+        self.update(self.done + step, note)
+
+    def update(self, done: float, note: str | None = None) -> None:
+        """Set the units done; `note` is displayed until the next one."""
+        self.done = done
+        if note is not None:
+            self.note = note
+        self._show()
+
+    def _show(self) -> None:
+        """Display the new state."""
+
+    def _close(self) -> None:
+        """Display the last state."""
+
+
+class LineProgress(Progress):
+    """Plain lines at intervals, for logs and pipes."""
+
+    def __init__(self, total: float | None, label: str, unit: str) -> None:
+        super().__init__(total, label, unit)
+        self._next = self._start + _LINE_SECONDS
+        self._shown: float | None = None
+
+    def _show(self) -> None:
+        if time.monotonic() >= self._next:
+            self._next = time.monotonic() + _LINE_SECONDS
+            self._print()
+
+    def _close(self) -> None:
+        if self.done and self._shown != self.done:
+            self._print()
+
+    def _print(self) -> None:
+        self._shown = self.done
+        parts = [f"{self.label}: {self.done:.10g}"]
+        if self.unit == "%":
+            parts[0] = f"{self.label}: {self.done:.0f}%"
+        elif self.total:
+            parts[0] += f"/{self.total:.10g} {self.unit}".rstrip() + f" ({self.done / self.total:.0%})"
+        elif self.unit:
+            parts[0] += f" {self.unit}"
+        parts.append(f"{clock(self.seconds)} elapsed")
+        if self.total and 0 < self.done < self.total:
+            parts.append(f"{clock(self.seconds * (self.total - self.done) / self.done)} left")
+        if self.note:
+            parts.append(self.note)
+        print(", ".join(parts), file=sys.stderr, flush=True)
+
+
+class BarProgress(Progress):
+    """A bar that redraws itself, for terminals."""
+
+    def __init__(self, total: float | None, label: str, unit: str) -> None:
+        super().__init__(total, label, unit)
+        from rich import progress
+        from rich.console import Console as RichConsole
+
+        self._rich = progress.Progress(
+            progress.TextColumn("{task.description}", markup=False),
+            progress.BarColumn(),
+            progress.TaskProgressColumn(),
+            progress.TimeElapsedColumn(),
+            progress.TimeRemainingColumn(),
+            progress.TextColumn("{task.fields[note]}", markup=False),
+            console=RichConsole(stderr=True),
+            # Standard output is for results; rich would redirect it to standard error.
+            redirect_stdout=False,
+        )
+        self._task = self._rich.add_task(label, total=total, note="")
+        self._rich.start()
+
+    def _show(self) -> None:
+        self._rich.update(self._task, completed=self.done, note=self.note)
+
+    def _close(self) -> None:
+        self._rich.stop()
