@@ -15,7 +15,9 @@ from mbtf_pipeline.compare.ssim import ssim, to_srgb
 from mbtf_pipeline.compare.st_lpips import st_lpips, weights_file
 
 F64 = np.ndarray
-needs_weights = pytest.mark.skipif(weights_file() is None, reason="stlpips-pytorch is not installed")
+needs_weights = pytest.mark.skipif(
+    weights_file() is None, reason="no ST-LPIPS weights; to enable: .venv/bin/pip install -e '.[perceptual]'"
+)
 
 
 def pair(shape: tuple[int, int] = (40, 33)) -> tuple[F64, F64]:
