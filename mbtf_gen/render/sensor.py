@@ -16,9 +16,6 @@ import mitsuba as mi
 from mbtf_gen.render.types import Float, Mask, Point2f, Properties, Ray3f, Spectrum, UInt32, Vector3f
 from mbtf_gen.sampling.query_sampler import Queries
 
-# Query numbers are stored as float32 times, which is exact up to here.
-MAX_MITSUBA_QUERIES = 1 << 24
-
 
 def ray_through(point: Point2f, omega_o: Vector3f, unit: Float, aspect: Float, start: Float) -> Ray3f:
     """Ray against ω_o that intersects the reference plane at uv `point`, wrapped into the tile.

@@ -6,9 +6,10 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 # Runs each command line as the program's entry point does, with its output kept apart.
 _CODE = """
@@ -33,6 +34,13 @@ class Done:
     out: str
     err: str
 
+    def result(self) -> dict[str, Any]:
+        """The JSON object that a successful command printed."""
+        assert self.code == 0, self.err
+        parsed = json.loads(self.out)
+        assert isinstance(parsed, dict)
+        return parsed
+
 
 def run_all(lines: Sequence[Sequence[object]], folder: Path) -> list[Done]:
     """Run command lines (without the program's name) one after another in one child, in `folder`."""
@@ -47,6 +55,11 @@ def run_all(lines: Sequence[Sequence[object]], folder: Path) -> list[Done]:
     )
     assert child.returncode == 0, child.stderr
     return [Done(*answer) for answer in json.loads(child.stdout)]
+
+
+def run_named(lines: Mapping[str, str], folder: Path) -> dict[str, Done]:
+    """:func:`run_all` of command lines by name, as one types them."""
+    return dict(zip(lines, run_all([line.split() for line in lines.values()], folder), strict=True))
 
 
 def start(line: Sequence[object], folder: Path) -> subprocess.Popen[str]:

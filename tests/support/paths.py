@@ -6,6 +6,5 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 ASSETS = ROOT / "assets"
-DOCS = ROOT / "docs"
 # Texture sets that lie beside a checkout on some machines; tests that need them skip where they are missing.
 SHARED = ROOT.parent / "shared"

@@ -7,13 +7,12 @@ import shutil
 import signal
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
-from support.commands import Done, finished, run_all, start
+from support.commands import Done, finished, run_all, run_named, start
 from support.datasets import edit
 
 from mbtf_gen.dataset.reader import Dataset
@@ -163,23 +162,15 @@ def batch(work: Path, whole: Path) -> dict[str, Done]:
         "from its own file": "reference maps -o pictures --json --config pictures/config.yaml",
         "one reference": "reference maps/height.npy -o one --tiles-across 1 --size 8 --spp 2 --kind query",
     }
-    done = run_all([line.split() for line in lines.values()], work)
-    return dict(zip(lines, done, strict=True))
-
-
-def summary(done: Done) -> dict[str, Any]:
-    assert done.code == 0, done.err
-    parsed = json.loads(done.out)
-    assert isinstance(parsed, dict)
-    return parsed
+    return run_named(lines, work)
 
 
 def test_the_same_command_twice_renders_nothing(batch: dict[str, Done], work: Path, whole: Path) -> None:
-    again = summary(batch["again"])
+    again = batch["again"].result()
     assert (again["paths"], again["complete"], again["queries"]) == (0, True, 2248)
     for path in whole.iterdir():
         assert (work / "again" / path.name).read_bytes() == path.read_bytes()
-    assert summary(batch["verify"])["faults"] == []
+    assert batch["verify"].result()["faults"] == []
 
 
 def test_merging_what_is_not_there_is_partial(batch: dict[str, Done]) -> None:
@@ -192,7 +183,7 @@ def test_another_seed_is_refused_and_overwrite_replaces(
 ) -> None:
     assert batch["changed seed"].code == 3
     assert "seed: 0 -> 3" in batch["changed seed"].err
-    assert summary(batch["overwrite"])["paths"] == 2048 * 4 + 200 * 8
+    assert batch["overwrite"].result()["paths"] == 2048 * 4 + 200 * 8
     assert verify(work / "replaced") == []
     new, old = load(work / "replaced"), load(whole)
     for name in ("u", "sigma", "omega_i", "value_a"):
@@ -201,7 +192,7 @@ def test_another_seed_is_refused_and_overwrite_replaces(
 
 def test_every_form_of_the_command_makes_the_same_data(batch: dict[str, Done], work: Path) -> None:
     for name in ("flags first", "yaml", "set", "file"):
-        assert summary(batch[name])["complete"] is True
+        assert batch[name].result()["complete"] is True
     assert equal(work / "first", work / "yaml")
     assert equal(work / "first", work / "set")
     # A bare height map stands alone, gray: same queries, other values.
@@ -216,11 +207,11 @@ def test_formats_hold_the_same_numbers(batch: dict[str, Done], work: Path) -> No
         assert equal(work / npz, work / exr)
         assert verify(work / exr) == []
         assert not list((work / exr).glob("*.npz"))
-    assert summary(batch["plain exr"])["mean_value"] == summary(batch["flags first"])["mean_value"]
+    assert batch["plain exr"].result()["mean_value"] == batch["flags first"].result()["mean_value"]
 
 
 def test_reference_writes_pictures_for_people_and_programs(batch: dict[str, Done], work: Path) -> None:
-    report = summary(batch["reference"])
+    report = batch["reference"].result()
     stems = {f"{kind}-tiles{tiles_across}" for kind in ("query", "pixel") for tiles_across in ("0.5", "2")}
     assert {p.name for p in (work / "pictures").iterdir()} == {
         "config.yaml",
@@ -246,10 +237,10 @@ def test_reference_writes_pictures_for_people_and_programs(batch: dict[str, Done
 
 
 def test_pictures_that_are_there_are_kept_and_others_refused(batch: dict[str, Done], work: Path) -> None:
-    first = summary(batch["reference"])
+    first = batch["reference"].result()
     assert [p["kept"] for p in first["pictures"]] == [False] * 4
     for name in ("pictures again", "from its own file"):
-        again = summary(batch[name])
+        again = batch[name].result()
         assert [p["kept"] for p in again["pictures"]] == [True] * 4, name
         assert again["exposure"] == first["exposure"]
         assert [p["relative_noise"] for p in again["pictures"]] == [

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
-from support.commands import Done, finished, run_all, start
+from support.commands import Done, finished, run_named, start
 from support.datasets import write_dataset
 
 from mbtf_core.directions import from_angles
@@ -78,15 +76,7 @@ def batch(work: Path) -> dict[str, Done]:
         "horizon": "preview maps -o nowhere --view 3,0",
         "below": "preview maps -o nowhere --light -3,0",
     }
-    done = run_all([line.split() for line in lines.values()], work)
-    return dict(zip(lines, done, strict=True))
-
-
-def report(done: Done) -> dict[str, Any]:
-    assert done.code == 0, done.err
-    parsed = json.loads(done.out)
-    assert isinstance(parsed, dict)
-    return parsed
+    return run_named(lines, work)
 
 
 def pixels(path: Path) -> NDArray[np.float64]:
@@ -106,7 +96,7 @@ def quadrant(picture: NDArray[np.float64]) -> NDArray[np.intp]:
 def test_mesh_and_path_traced_picture_show_the_same_thing(
     name: str, batch: dict[str, Done], work: Path
 ) -> None:
-    report(batch[name])
+    batch[name].result()
     mesh, beauty = (pixels(work / name / f"{n}.png") for n in ("mesh", "beauty"))
     assert mesh.shape == beauty.shape == (72, 96, 3)
     block = np.abs(mesh - mesh[0, 0]).max(axis=-1) > 0.1
@@ -146,18 +136,18 @@ def test_no_picture_is_blank(batch: dict[str, Done], work: Path) -> None:
 
 @pytest.mark.usefixtures("drawing")
 def test_the_same_command_keeps_and_another_is_refused(batch: dict[str, Done], work: Path) -> None:
-    assert [p["kept"] for p in report(batch["tilted"])["pictures"]] == [False] * 3
-    assert [p["kept"] for p in report(batch["again"])["pictures"]] == [True] * 3
+    assert [p["kept"] for p in batch["tilted"].result()["pictures"]] == [False] * 3
+    assert [p["kept"] for p in batch["again"].result()["pictures"]] == [True] * 3
     assert batch["changed"].code == 3
     assert "preview.tiles: 1 -> 2" in batch["changed"].err
     assert "tiles: 1" in (work / "tilted/config.yaml").read_text()
-    assert [p["kept"] for p in report(batch["replaced"])["pictures"]] == [False] * 3
+    assert [p["kept"] for p in batch["replaced"].result()["pictures"]] == [False] * 3
     assert "tiles: 1" in (work / "flat/config.yaml").read_text()
 
 
 @pytest.mark.usefixtures("drawing")
 def test_plots_of_a_data_set_are_of_its_stored_queries(batch: dict[str, Done], work: Path) -> None:
-    pictures = {Path(p["file"]).stem: p for p in report(batch["data"])["pictures"]}
+    pictures = {Path(p["file"]).stem: p for p in batch["data"].result()["pictures"]}
     assert list(pictures) == ["mesh", "beauty", "queries"]
     assert "stored in data" in pictures["queries"]["shows"]
     found = pictures["queries"]["queries"]
@@ -171,7 +161,7 @@ def test_plots_of_a_data_set_are_of_its_stored_queries(batch: dict[str, Done], w
 
 
 def test_queries_can_be_seen_without_their_material(batch: dict[str, Done], work: Path) -> None:
-    pictures = report(batch["lonely"])["pictures"]
+    pictures = batch["lonely"].result()["pictures"]
     assert [Path(p["file"]).name for p in pictures] == ["queries.png"]
     assert "only the queries are drawn" in batch["lonely"].err
     assert not (work / "lonely-pictures/mesh.png").exists()
