@@ -242,6 +242,19 @@ def build(
         raise error(what, where=where, hint=hint) from None
 
 
+def check_schema(document: Mapping[str, Any], version: int, where: Path, hint: str) -> None:
+    """Refuse a JSON document of the programs that another version of them wrote.
+
+    Raises
+    ------
+    InputError : with both schema versions
+    """
+    found = document.get("schema")
+    if found != version:
+        what = f"has schema version {found}, this program reads version {version}"
+        raise InputError(what, where=where, hint=hint)
+
+
 def check_document(model: type[BaseModel], data: Mapping[str, Any], path: Path, hint: str) -> None:
     """Refuse a JSON document of the programs whose content does not fit `model`.
 

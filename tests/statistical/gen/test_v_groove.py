@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 from support.scenes import DIRECT, HeightGrid, direction, estimate, lambert, queries, tile_mean_queries
 
-from mbtf_core.stats import Estimate, aggregate_test, mean_of_halves, z_test
+from mbtf_core.stats import Estimate, aggregate_test, mean_of_halves, t_test
 from mbtf_gen.sampling.light_kernel import LightKernel
 
 HEIGHT = 0.4
@@ -115,7 +115,7 @@ def test_tile_mean(light: tuple[float, float], view: tuple[float, float], count:
     assert mean.error < 6e-3 * max(expected, 0.05)
     # A facet that fills the view has no variance at all; single precision is what remains.
     rounded = Estimate(mean.value, float(np.hypot(mean.error, 1e-6 * expected)), mean.n)
-    assert z_test(rounded, expected).p_value > 1e-4
+    assert t_test(rounded, expected).p_value > 1e-4
     assert e.lost == 0
 
 

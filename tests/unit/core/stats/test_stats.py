@@ -18,7 +18,6 @@ from mbtf_core.stats import (
     mean_estimate,
     mean_of_halves,
     noise_free_mse,
-    paired_difference,
     pooled_relative_error,
     pooled_variance,
     signal_variance,
@@ -87,27 +86,16 @@ def test_effective_degrees_of_freedom() -> None:
     assert mean_of_halves(a, b).degrees == 1.0
 
 
-def test_one_query_has_no_signal_variance() -> None:
+def test_one_query_and_constant_data_have_no_unexplained_share() -> None:
     one = np.ones((1, 3))
     assert math.isnan(signal_variance(one, one).value)
     assert math.isnan(unexplained_variance(one, one, one).value)
-
-
-def test_constant_data_have_no_unexplained_share() -> None:
     values = np.full((100, 3), 0.2)
     result = unexplained_variance(values + 0.1, values, values)
     assert math.isnan(result.value)
     assert result.error == math.inf
     with pytest.raises(ValueError, match="cannot be tested"):
         t_test(result, 0.0)
-
-
-def test_paired_difference() -> None:
-    x = np.array([1.0, 20.0, 300.0])
-    estimate = paired_difference(x + 0.5, x)
-    assert estimate == Estimate(pytest.approx(0.5), pytest.approx(0.0, abs=1e-12), 3)
-    with pytest.raises(ValueError, match="equal shapes"):
-        paired_difference(x, x[:2])
 
 
 def test_numbers_that_are_not_finite_are_refused_with_their_place() -> None:
