@@ -35,16 +35,10 @@ class Part:
 
     Attributes
     ----------
-    name : str
-        The part.
-    state : {"ok", "failed", "absent"}
-        ``absent`` parts are not there and not needed.
-    required : bool
-        Whether the programs need it.
-    found : str
-        What was found, or what went wrong.
-    hint : str
-        What to do about it; empty where nothing is to be done.
+    state : ``absent`` parts are not there and not needed
+    required : whether the programs need it
+    found : what was found, or what went wrong
+    hint : what to do about it; empty where nothing is to be done
     """
 
     name: str
@@ -62,13 +56,6 @@ class Probe:
     found: Callable[[Answers], str]
     hint: str
     required: bool = True
-
-    def run(self, name: str) -> Part:
-        """Test the part."""
-        outcome = run_child(__name__, self.use, timeout=_TIMEOUT)
-        if outcome.fault:
-            return Part(name, "failed", self.required, outcome.fault, self.hint)
-        return Part(name, "ok", self.required, self.found(outcome.answers))
 
 
 def diagnose() -> list[Part]:
@@ -108,7 +95,11 @@ def as_text(parts: Sequence[Part]) -> str:
 
 def probe(name: str) -> Part:
     """Test one of the parts in :data:`PROBES`."""
-    return PROBES[name].run(name)
+    test = PROBES[name]
+    outcome = run_child(__name__, test.use, timeout=_TIMEOUT)
+    if outcome.fault:
+        return Part(name, "failed", test.required, outcome.fault, test.hint)
+    return Part(name, "ok", test.required, test.found(outcome.answers))
 
 
 def _python() -> Part:
@@ -121,11 +112,11 @@ def _llvm() -> Part:
     # Tested again: a cached result does not show the state of today.
     outcome = prove(CPU_VARIANT)
     if not outcome.fault:
-        shipped = shipped_llvm()
-        origin = "of the installation" if shipped and library == str(shipped) else "set by the user"
+        version, shipped = ".".join(str(n) for n in outcome.answers["llvm"]), shipped_llvm()
         if library is None:
             origin = "of the system"
-        version = ".".join(str(n) for n in outcome.answers["llvm"])
+        else:
+            origin = "of the installation" if library == str(shipped) else "set by the user"
         found = f"{version} {origin}, ran test kernels, {library or 'found by Dr.Jit'}"
         return Part("LLVM", "ok", True, found)
     try:

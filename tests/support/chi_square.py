@@ -91,26 +91,25 @@ class ChiSquare(NamedTuple):
 def chi_square_test(
     samples: ArrayLike,
     pdf: Callable[[Floats], ArrayLike],
-    domain: Rectangle | Cap | None = None,
+    domain: Rectangle | Cap,
     bins: tuple[int, int] = (16, 32),
 ) -> ChiSquare:
     """Do the samples follow the density, (m, 2 or 3) → (m,) per unit area or steradian?
 
     Counts samples in equal cells of the domain's parameters and compares with the density's integral over
     each cell (which may jump within the cell). Cells that expect few samples are pooled. Everything outside
-    the domain (the unit square by default) is one more cell that expects what the density leaves over; a
+    the domain is one more cell that expects what the density leaves over; a
     density that is not normalized therefore fails. The statistic ``Σ (O-E)²/E`` follows χ² with one degree of
     freedom less than cells. Choose the domain as large as the density's bulk, because a peak much narrower
     than a cell can slip through the quadrature.
     """
-    where = domain or Rectangle()
     drawn = checked(samples, "samples")
     n = len(drawn)
-    s0, s1, t0, t1 = where.bounds
+    s0, s1, t0, t1 = domain.bounds
     s, t = np.linspace(s0, s1, bins[0] + 1), np.linspace(t0, t1, bins[1] + 1)
-    observed, _, _ = np.histogram2d(*where.parameters(drawn).T, bins=(s, t))
+    observed, _, _ = np.histogram2d(*domain.parameters(drawn).T, bins=(s, t))
     corners = np.stack(np.meshgrid(s[:-1], t[:-1], indexing="ij"), axis=-1).reshape(-1, 2)
-    integrals, uncertainty = _integrate(pdf, where, corners, np.array([s[1] - s0, t[1] - t0]), n)
+    integrals, uncertainty = _integrate(pdf, domain, corners, np.array([s[1] - s0, t[1] - t0]), n)
     left, outside = 1.0 - float(integrals.sum()), n - observed.sum()
     o, e = observed.ravel(), n * integrals
     if left > uncertainty + _ROUNDING:
@@ -131,6 +130,11 @@ def chi_square_test(
     if len(e) < 2:
         raise ValueError("fewer than two cells expect enough samples: draw more or choose a smaller domain")
     return ChiSquare(float(chdtrc(len(e) - 1, ((o - e) ** 2 / e).sum())), f"{note}; {len(e)} cells")
+
+
+def uniformity(x: ArrayLike, y: ArrayLike, bins: tuple[int, int] = (16, 16)) -> float:
+    """p-value of the hypothesis that numbers in [0, 1) are uniform, and independent pair by pair."""
+    return chi_square_test(np.column_stack([x, y]), lambda q: np.ones(len(q)), Rectangle(), bins).p_value
 
 
 def _integrate(

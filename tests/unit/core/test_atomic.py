@@ -18,20 +18,11 @@ from typing import BinaryIO
 import pytest
 
 from mbtf_core import atomic
-from mbtf_core.digest import file_sha256
 from mbtf_core.errors import InputError, PartialError
 
 
 def no_leftovers(folder: Path) -> bool:
     return not any(p.name.endswith(".tmp") for p in folder.iterdir())
-
-
-def test_a_file_is_written_and_replaced(tmp_path: Path) -> None:
-    path = tmp_path / "a.bin"
-    for content in (b"old" * 1000, b"new"):
-        atomic.write_file(path, lambda stream, content=content: stream.write(content) and None)
-        assert path.read_bytes() == content
-    assert no_leftovers(tmp_path)
 
 
 def test_a_failing_writer_leaves_the_old_file(tmp_path: Path) -> None:
@@ -145,12 +136,6 @@ def test_bad_json_is_bad_input(tmp_path: Path, content: bytes | None, what: str)
     assert caught.value.where == str(path)
 
 
-def test_digests_are_sha256(tmp_path: Path) -> None:
-    path = tmp_path / "a"
-    path.write_bytes(b"mbtf" * 99999)
-    assert file_sha256(path) == hashlib.sha256(b"mbtf" * 99999).hexdigest()
-
-
 def test_of_several_creators_one_wins_and_its_content_stays(tmp_path: Path) -> None:
     path = tmp_path / "a"
     gate, won = threading.Barrier(8), []
@@ -228,6 +213,7 @@ def test_what_a_library_wrote_is_digested_not_what_it_replaces(tmp_path: Path) -
         stored = atomic.write_through(tmp_path / "a", lambda temporary, c=content: temporary.write_bytes(c))
         assert stored == atomic.Stored(len(content), hashlib.sha256(content).hexdigest())
         assert (tmp_path / "a").read_bytes() == content
+    assert no_leftovers(tmp_path)
 
 
 def test_pieces_are_digested_as_they_are_written(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from mbtf_gen.sampling.light_kernel import LightKernel
 
 
 def check(measure: Any, **options: Any) -> Check:
-    return Check("groove", "it holds", "relative", 1e-3, measure, **options)
+    return Check("groove", "it holds", 1e-3, measure, **options)
 
 
 def found(*cases: Case, **options: Any) -> Finding:
