@@ -88,22 +88,18 @@ def test_a_missing_folder_is_partial(tmp_path: Path) -> None:
 
 def test_the_data_are_synced_before_the_rename(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     events: list[str] = []
-    fsync, replace = os.fsync, os.replace
-    monkeypatch.setattr(atomic.os, "fsync", lambda handle: events.append("fsync") or fsync(handle))
-    monkeypatch.setattr(atomic.os, "replace", lambda *a: events.append("replace") or replace(*a))
-    atomic.write_file(tmp_path / "a", lambda stream: None)
-    assert events == ["fsync", "replace", "fsync"]
-    events.clear()
-    atomic.write_through(tmp_path / "b", lambda temporary: temporary.touch())
-    assert events == ["fsync", "replace", "fsync"]
-    events.clear()
-    link = os.link
-    monkeypatch.setattr(atomic.os, "link", lambda *a: events.append("link") or link(*a))
-    assert atomic.create_file(tmp_path / "c", b"text")
-    assert events == ["fsync", "link", "fsync"]
-    events.clear()
-    atomic.remove_file(tmp_path / "a")
-    assert events == ["fsync"]
+    for name in ("fsync", "replace", "link"):
+        real = getattr(os, name)
+        monkeypatch.setattr(atomic.os, name, lambda *a, n=name, f=real: events.append(n) or f(*a))
+    for operation, expected in (
+        (lambda: atomic.write_file(tmp_path / "a", lambda stream: None), ["fsync", "replace", "fsync"]),
+        (lambda: atomic.write_through(tmp_path / "b", Path.touch), ["fsync", "replace", "fsync"]),
+        (lambda: atomic.create_file(tmp_path / "c", b"text"), ["fsync", "link", "fsync"]),
+        (lambda: atomic.remove_file(tmp_path / "a"), ["fsync"]),
+    ):
+        events.clear()
+        operation()
+        assert events == expected
 
 
 def test_json_goes_there_and_back(tmp_path: Path) -> None:
