@@ -23,7 +23,7 @@ _PUBLIC = {
     "verify": "mbtf_gen.dataset.verify",
 }
 
-__all__ = list(_PUBLIC)
+__all__ = [*_PUBLIC]
 
 
 def __getattr__(name: str) -> Any:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.atomic import read_json, write_json, write_text
-from mbtf_core.config_file import check_schema, dump_yaml
+from mbtf_core.config_file import dump_yaml
 from mbtf_core.errors import InputError
 from mbtf_core.folders import ELSEWHERE, check_folder, make_folder
 from mbtf_core.stats import Estimate, signal_variance
@@ -76,7 +76,9 @@ def claim(folder: Path) -> None:
     record = _record(folder)
     if not record:
         return
-    check_schema(record, STUDY_SCHEMA, folder / STUDY_NAME, ELSEWHERE)
+    if record.get("schema") != STUDY_SCHEMA:
+        problem = f"holds a cost study of schema version {record.get('schema')}; this is {STUDY_SCHEMA}"
+        raise InputError(problem, where=folder, hint=ELSEWHERE)
     there, here = record.get("machine", {}).get("system"), machine()["system"]
     if there != here:
         problem = f"holds a cost study of another kind of machine ({there}; this is {here})"

@@ -31,7 +31,7 @@ def test_lambert_is_albedo_over_pi(width: float, light: float, view: float) -> N
         if width == 0:
             np.testing.assert_allclose([a, b], albedo / np.pi, rtol=2e-6)
         else:
-            # A uniform tolerance beside the z-test: error bars of a thousandth, so a percent off never
+            # A uniform tolerance beside the t-test: error bars of a thousandth, so a percent off never
             # passes.
             mean = mean_of_halves(a, b)
             assert mean.relative_error < 2e-2
