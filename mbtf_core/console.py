@@ -120,22 +120,12 @@ class Console:
 
 
 @contextlib.contextmanager
-def resumable(kept: str, hint: str = "the same command resumes") -> Iterator[None]:
-    """Report what an interruption keeps, and how to resume.
-
-    Parameters
-    ----------
-    kept : what is kept, for the message
-    hint : how to resume
-
-    Raises
-    ------
-    Interrupted : in place of KeyboardInterrupt
-    """
+def resumable(kept: str) -> Iterator[None]:
+    """Report an interruption as :class:`Interrupted`, which says what is kept."""
     try:
         yield
     except KeyboardInterrupt:
-        raise Interrupted(f"interrupted; {kept}", hint=hint) from None
+        raise Interrupted(f"interrupted; {kept}", hint="the same command resumes") from None
 
 
 def _interrupt(number: int, frame: object) -> None:

@@ -102,34 +102,22 @@ def pooled_error(a: ArrayLike, b: ArrayLike) -> Estimate:
     return _root(pooled_variance(a, b))
 
 
-def pooled_relative_error(a: ArrayLike, b: ArrayLike, floor: float | None = None) -> Estimate:
+def pooled_relative_error(a: ArrayLike, b: ArrayLike) -> Estimate:
     """Noise of the values relative to the values, pooled; a pure number.
+
+    The RMS noise over the RMS value, ``√(mean (a-b)²/4 / mean ab)``, which is consistent.
 
     Parameters
     ----------
     a, b : (n, ...) array_like
         Independent halves of the values.
-    floor : float or None
-        None: the RMS noise over the RMS value, ``√(mean (a-b)²/4 / mean ab)``, which is consistent. A number,
-        such as the tile mean: the noise of each query over ``max(|a+b|/2, floor)``, as for target errors. It
-        is accurate where the floor is large compared with the noise.
 
     Returns
     -------
     Estimate
-
-    Raises
-    ------
-    ValueError
-        `floor` is not positive.
     """
     first, second = _pair(a, b)
-    noise = (first - second) ** 2 / 4.0
-    if floor is not None:
-        if not floor > 0:
-            raise ValueError(f"floor must be positive, not {floor}")
-        return _root(mean_estimate(noise / np.maximum(np.abs(first + second) / 2.0, floor) ** 2))
-    return _root(_ratio(per_unit(noise), per_unit(first * second)))
+    return _root(_ratio(per_unit((first - second) ** 2 / 4.0), per_unit(first * second)))
 
 
 def noise_free_mse(prediction: ArrayLike, a: ArrayLike, b: ArrayLike) -> Estimate:
