@@ -38,6 +38,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+from support.chi_square import Cap, chi_square_test
+
 from mbtf_core.directions import from_angles, from_projected_disk
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -96,8 +100,6 @@ def uniform(mi: Any, n: int, seed: int) -> tuple[Any, Any]:
 
 def chi_squares(mi: Any, dr: Any, bsdf: Any) -> list[float]:
     """p-values of the samples at random places, footprints and views."""
-    from mbtf_core.stats import Cap, chi_square_test
-
     random = np.random.default_rng(11)
     lattice, context = bsdf.lattice, mi.BSDFContext()
     u, views = random.random((PLACES, 2)), random_views(random, PLACES)

@@ -17,11 +17,7 @@ from typing import Any, BinaryIO
 from mbtf_core.digest import file_sha256
 from mbtf_core.errors import InputError, PartialError, reason
 
-CHECKSUM = "checksum"
-# A checksummed document ends with its checksum, so that it can be found without a parser.
-_CHECKSUM_TAIL = b'"\n}\n'
-_CHECKSUM_HEAD = f'"{CHECKSUM}": "'.encode()
-_DIGITS = 64
+_CHECKSUM = "checksum"
 
 # Errors of folders that cannot be opened or synced at all; others mean that the disk failed.
 _NO_FOLDER_SYNC = (errno.EACCES, errno.EPERM, errno.EISDIR, errno.EINVAL, errno.ENOTSUP, errno.ENOSYS)
@@ -48,17 +44,13 @@ def sync_folder(folder: Path) -> None:
     """
     try:
         handle = os.open(folder, os.O_RDONLY)
-    except OSError as error:
-        if error.errno in _NO_FOLDER_SYNC:
-            return
-        raise
-    try:
-        os.fsync(handle)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
     except OSError as error:
         if error.errno not in _NO_FOLDER_SYNC:
             raise
-    finally:
-        os.close(handle)
 
 
 def temporary_of(path: Path) -> Path:
@@ -74,12 +66,7 @@ TEMPORARY = r"\.[0-9a-f]{8}-\d+\.tmp"
 
 @contextlib.contextmanager
 def _temporary(path: Path) -> Iterator[Path]:
-    """A fresh name to write to; an error of the system becomes a PartialError.
-
-    Raises
-    ------
-    PartialError : the disk is full or the folder cannot be written
-    """
+    """A fresh name to write to; an error of the system becomes a PartialError."""
     temporary = temporary_of(path)
     try:
         # A killed process of the same number may have left it.
@@ -211,14 +198,11 @@ def write_text(path: Path, text: str) -> None:
 def checksummed(data: Mapping[str, Any]) -> bytes:
     """`data` as indented JSON whose last key, ``checksum``, is the SHA-256 of the text itself with the 64
     digits of that key set to 0. NaN and infinities are refused."""
-    document = {**{k: v for k, v in data.items() if k != CHECKSUM}, CHECKSUM: "0" * _DIGITS}
-    text = (json.dumps(document, indent=2, allow_nan=False) + "\n").encode()
-    return _with_digits(text, hashlib.sha256(text).hexdigest().encode())
-
-
-def _with_digits(text: bytes, digits: bytes) -> bytes:
-    end = len(text) - len(_CHECKSUM_TAIL)
-    return text[: end - _DIGITS] + digits + text[end:]
+    zeros = "0" * 64
+    document = {**{k: v for k, v in data.items() if k != _CHECKSUM}, _CHECKSUM: zeros}
+    text = json.dumps(document, indent=2, allow_nan=False) + "\n"
+    head, _, tail = text.rpartition(zeros)
+    return f"{head}{hashlib.sha256(text.encode()).hexdigest()}{tail}".encode()
 
 
 def write_checksummed(path: Path, data: Mapping[str, Any]) -> None:
@@ -238,37 +222,30 @@ def read_checksummed(path: Path, hint: str = "") -> dict[str, Any]:
     ------
     InputError : missing, unreadable, not a JSON object, or not what was written
     """
-    content = _content(path)
-    data = _parsed(content, path, hint)
-    head = content[: -len(_CHECKSUM_TAIL) - _DIGITS]
-    zeros = hashlib.sha256(_with_digits(content, b"0" * _DIGITS)).hexdigest()
-    if (
-        not content.endswith(_CHECKSUM_TAIL)
-        or not head.endswith(_CHECKSUM_HEAD)
-        or content[len(head) : len(head) + _DIGITS] != zeros.encode()
-    ):
+    content, data = _read_json(path, hint)
+    try:
+        unchanged = checksummed(data) == content
+    except (ValueError, RecursionError):  # a number beyond float64; nested too deeply
+        unchanged = False
+    if not unchanged:
         raise InputError("has changed since it was written (its checksum differs)", where=path, hint=hint)
-    del data[CHECKSUM]
+    del data[_CHECKSUM]
     return data
 
 
-def _content(path: Path) -> bytes:
+def _read_json(path: Path, hint: str = "") -> tuple[bytes, dict[str, Any]]:
     try:
-        return path.read_bytes()
+        content = path.read_bytes()
+        data = json.loads(content.decode(), parse_constant=_refuse_constant)
     except FileNotFoundError:
         raise InputError("no such file", where=path) from None
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", where=path) from None
-
-
-def _parsed(content: bytes, path: Path, hint: str = "") -> dict[str, Any]:
-    try:
-        data = json.loads(content.decode(), parse_constant=_refuse_constant)
     except (ValueError, RecursionError) as error:
         raise InputError(f"not readable as JSON ({reason(error)})", where=path, hint=hint) from None
     if not isinstance(data, dict):
         raise InputError("must hold a JSON object", where=path, hint=hint)
-    return data
+    return content, data
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -278,7 +255,7 @@ def read_json(path: Path) -> dict[str, Any]:
     ------
     InputError : missing, unreadable, or not a JSON object
     """
-    return _parsed(_content(path), path)
+    return _read_json(path)[1]
 
 
 def _refuse_constant(name: str) -> None:

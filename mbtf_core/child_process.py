@@ -51,13 +51,6 @@ class Outcome:
     seconds: float
 
 
-def _signal_name(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return f"signal {number}"
-
-
 def run_child(
     module: str, function: str, *arguments: str, timeout: float, environment: Mapping[str, str] | None = None
 ) -> Outcome:
@@ -71,37 +64,34 @@ def run_child(
     """
     path = json.dumps([entry or os.getcwd() for entry in sys.path])
     start = time.monotonic()
-    process = subprocess.Popen(
-        [sys.executable, "-c", _CODE, path, module, function, *arguments],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        errors="replace",
-        env={**os.environ, **(environment or {})},
-    )
-    with process:
-        late = False
-        try:
-            output, noise = process.communicate(timeout=timeout)
-        except subprocess.TimeoutExpired:
-            late = True
-            process.kill()
-            output, noise = process.communicate()
-        except BaseException:
-            process.kill()
-            raise
+    code: int | None = None
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", _CODE, path, module, function, *arguments],
+            check=False,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            env={**os.environ, **(environment or {})},
+            timeout=timeout,
+        )
+        output, noise, code = done.stdout, done.stderr, done.returncode
+    except subprocess.TimeoutExpired as late:
+        output, noise = late.stdout or b"", b""
     answers: dict[str, Any] = {}
-    for line in output.splitlines():
+    for line in output.decode(errors="replace").splitlines():
         if line.startswith(_MARK):
             answers |= json.loads(line.removeprefix(_MARK))
     finished = answers.pop("finished", False)
     fault = answers.pop("fault", "")
-    if late:
+    if code is None:
         fault = f"no answer within {timeout:.0f} s"
     elif not finished and not fault:
-        code = process.returncode
-        ending = f"ended by {_signal_name(-code)}" if code < 0 else f"ended with exit code {code}"
-        detail = next((line.strip()[:200] for line in reversed(noise.splitlines()) if line.strip()), "")
-        fault = f"the process was {ending}" + (f" ({detail})" if detail else "")
+        signals = {int(s): s.name for s in signal.Signals}
+        ending = (
+            f"ended by {signals.get(-code, f'signal {-code}')}"
+            if code < 0
+            else f"ended with exit code {code}"
+        )
+        last = [line.strip() for line in noise.decode(errors="replace").splitlines() if line.strip()][-1:]
+        fault = f"the process was {ending}" + (f" ({last[0][:200]})" if last else "")
     return Outcome(answers, fault, time.monotonic() - start)

@@ -50,6 +50,7 @@ _COMMAND_LINE = "command line"
 _MAX_CHARACTERS = 1 << 18
 _MAX_DEPTH = 100
 _MAX_VALUES = 100_000
+_TOO_DEEP = f"is nested more than {_MAX_DEPTH} levels deep"
 # Tags of plain values.
 _TAGS = ("map", "seq", "str", "int", "float", "bool", "null", "timestamp", "binary", "set", "omap")
 
@@ -84,7 +85,7 @@ def read_yaml(path: Path) -> Any:
     if len(text) > _MAX_CHARACTERS:
         raise InputError(f"is too long: more than {_MAX_CHARACTERS:,} characters", where=path)
     if _bracket_depth(text) > _MAX_DEPTH:
-        raise InputError(_too_deep(), where=path)
+        raise InputError(_TOO_DEEP, where=path)
     try:
         data = _yaml().load(text)
     except MarkedYAMLError as error:
@@ -92,7 +93,7 @@ def read_yaml(path: Path) -> Any:
         line = f":{mark.line + 1}" if mark is not None else ""
         raise InputError(f"not valid YAML ({reason(error.problem)})", where=f"{path}{line}") from None
     except RecursionError:
-        raise InputError(_too_deep(), where=path) from None
+        raise InputError(_TOO_DEEP, where=path) from None
     except Exception as error:  # the reader turns scalars into numbers and dates, and may raise anything
         raise InputError(f"not valid YAML ({reason(error)})", where=path) from None
     if data is None:
@@ -101,10 +102,6 @@ def read_yaml(path: Path) -> Any:
         raise InputError("must hold a mapping of keys to values", where=path)
     _check_tree(data, path)
     return data
-
-
-def _too_deep() -> str:
-    return f"is nested more than {_MAX_DEPTH} levels deep"
 
 
 def _bracket_depth(text: str) -> int:
@@ -130,7 +127,7 @@ def _check_tree(data: Any, where: object) -> None:
         value, depth = waiting.pop()
         seen += 1
         if depth > _MAX_DEPTH or seen > _MAX_VALUES:
-            what = _too_deep() if depth > _MAX_DEPTH else f"holds more than {_MAX_VALUES:,} values"
+            what = _TOO_DEEP if depth > _MAX_DEPTH else f"holds more than {_MAX_VALUES:,} values"
             raise InputError(what, where=where, hint="each alias (*name) counts in full")
         tag = getattr(getattr(value, "tag", None), "value", None)
         if tag is not None and str(tag).removeprefix("tag:yaml.org,2002:") not in _TAGS:
@@ -240,6 +237,19 @@ def build(
     except ValidationError as fault:
         where, what, hint = _explain(fault, model, data, source, spelled or {})
         raise error(what, where=where, hint=hint) from None
+
+
+def check_schema(document: Mapping[str, Any], version: int, where: Path, hint: str) -> None:
+    """Refuse a JSON document of the programs that another version of them wrote.
+
+    Raises
+    ------
+    InputError : with both schema versions
+    """
+    found = document.get("schema")
+    if found != version:
+        what = f"has schema version {found}, this program reads version {version}"
+        raise InputError(what, where=where, hint=hint)
 
 
 def check_document(model: type[BaseModel], data: Mapping[str, Any], path: Path, hint: str) -> None:

@@ -2,27 +2,16 @@
 
 A program defines its commands with cyclopts and passes the application to :func:`run`::
 
-    # mbtf_fit/cli/app.py
     app = new_app("mbtf-fit", "Fit neural materials to multi-resolution BTF data.")
 
     @app.default
     def fit(shards: Path, /, *, time: str = "2min", console: Console = CONSOLE) -> None:
         "…docstring in numpydoc style: cyclopts shows its parameters…"
         with console.progress(total=steps, label="fitting", unit="steps") as bar:
-            for step in range(steps):
-                bar.advance(1, note=f"loss {loss:.4f}")
+            bar.advance(1, note=f"loss {loss:.4f}")
         console.report({"loss": loss}, f"loss {loss:.4f}")
 
-    @app.command
-    def info(material: Path, /, *, console: Console = CONSOLE) -> int: ...
-
-    # mbtf_fit/__main__.py
-    def main() -> int:
-        from mbtf_fit.cli.app import app
-        return run(app)
-
-    if __name__ == "__main__":
-        sys.exit(main())
+    sys.exit(run(app))
 
 ``mbtf-fit shards/`` runs the default command, ``mbtf-fit info …`` a named one; flags may come before or after
 the command's name. A command returns None or an exit code, and raises
@@ -131,22 +120,12 @@ class Console:
 
 
 @contextlib.contextmanager
-def resumable(kept: str, hint: str = "the same command resumes") -> Iterator[None]:
-    """Report what an interruption keeps, and how to resume.
-
-    Parameters
-    ----------
-    kept : what is kept, for the message
-    hint : how to resume
-
-    Raises
-    ------
-    Interrupted : in place of KeyboardInterrupt
-    """
+def resumable(kept: str) -> Iterator[None]:
+    """Report an interruption as :class:`Interrupted`, which says what is kept."""
     try:
         yield
     except KeyboardInterrupt:
-        raise Interrupted(f"interrupted; {kept}", hint=hint) from None
+        raise Interrupted(f"interrupted; {kept}", hint="the same command resumes") from None
 
 
 def _interrupt(number: int, frame: object) -> None:
@@ -330,15 +309,9 @@ def run(app: App, argv: Sequence[str] | None = None) -> int:
         # The reader of the output has exited (`| head`); Python would fail again when it flushes at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _EXIT_BROKEN_PIPE
-    except OSError as error:
-        if error.filename is None:
-            return _internal(error, debug)
-        return _fail(f"{reason(str(error.filename))}: {error.strerror}", EXIT_BAD_INPUT, debug)
     except Exception as error:
-        return _internal(error, debug)
-
-
-def _internal(error: Exception, debug: bool) -> int:
-    text = reason(error, 1000)
-    hint = "" if debug else " (run again with --debug for the traceback)"
-    return _fail(f"internal error: {type(error).__name__}: {text}{hint}", EXIT_INTERNAL, debug)
+        if isinstance(error, OSError) and error.filename is not None:
+            return _fail(f"{reason(str(error.filename))}: {error.strerror}", EXIT_BAD_INPUT, debug)
+        hint = "" if debug else " (run again with --debug for the traceback)"
+        text = f"internal error: {type(error).__name__}: {reason(error, 1000)}{hint}"
+        return _fail(text, EXIT_INTERNAL, debug)

@@ -15,6 +15,9 @@ from mbtf_core.atomic import TEMPORARY, remove_file
 from mbtf_core.config_file import differences, in_short
 from mbtf_core.errors import InputError
 
+# Names of temporary files and locks, such as a killed process leaves.
+_LEFTOVER = re.compile(rf"\..+(?:{TEMPORARY}|\.lock)")
+
 ELSEWHERE = "choose another folder with -o"
 
 
@@ -41,7 +44,7 @@ def check_folder(folder: Path, is_ours: Callable[[Path], bool], what: str) -> bo
     """
     if folder.exists() and not folder.is_dir():
         raise InputError("is a file, not a folder", where=folder)
-    empty = not folder.exists() or all(is_leftover(path.name) for path in folder.iterdir())
+    empty = not folder.exists() or all(_LEFTOVER.fullmatch(p.name) for p in folder.iterdir())
     # Checked last: another process may write the record meanwhile.
     if is_ours(folder):
         return True
@@ -88,11 +91,6 @@ def other_configuration(
         where=folder,
         hint=f"{ELSEWHERE}, or replace it with --overwrite",
     )
-
-
-def is_leftover(name: str) -> bool:
-    """Is this the name of a temporary file or a lock, such as a killed process leaves?"""
-    return re.fullmatch(rf"\..+(?:{TEMPORARY}|\.lock)", name) is not None
 
 
 def remove_unfinished(folder: Path, names: Container[str]) -> None:

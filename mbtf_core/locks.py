@@ -90,33 +90,6 @@ def lock_file_of(path: Path) -> Path:
     return path.with_name(f".{path.stem}.lock")
 
 
-def _locked(lock: Path) -> tuple[int, bool] | None:
-    """Descriptor of the locked file, and whether locks are supported; None if another process owns it."""
-    while True:
-        handle = os.open(lock, os.O_CREAT | os.O_RDWR, 0o666)
-        real = True
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            os.close(handle)
-            return None
-        except OSError as error:
-            if error.errno not in _NO_LOCKS:
-                os.close(handle)
-                raise
-            real = False
-        try:
-            # The former owner removes the file before releasing it, so the locked file may be gone.
-            if os.path.samestat(os.fstat(handle), os.stat(lock)):
-                return handle, real
-        except FileNotFoundError:
-            pass
-        except OSError:
-            os.close(handle)
-            raise
-        os.close(handle)
-
-
 def _parsed(content: bytes) -> Owner | None:
     try:
         data = json.loads(content)
@@ -170,24 +143,42 @@ def take_lock(path: Path, stale: float = STALE_SECONDS) -> Lock | None:
     PartialError : the folder cannot be written
     """
     file = lock_file_of(path)
+    while True:
+        with contextlib.ExitStack() as stack:
+            try:
+                handle = os.open(file, os.O_CREAT | os.O_RDWR, 0o666)
+                stack.callback(os.close, handle)
+                supported = _flock(handle)
+                if supported is None:
+                    return None
+                try:
+                    # The former owner removes the file before releasing it, so the locked file may be gone.
+                    if not os.path.samestat(os.fstat(handle), os.stat(file)):
+                        continue
+                except FileNotFoundError:
+                    continue
+                if _held_elsewhere(handle, supported, stale):
+                    return None
+                owner = {"host": socket.gethostname(), "process": os.getpid(), "since": time.time()}
+                os.ftruncate(handle, 0)
+                os.pwrite(handle, json.dumps(owner).encode(), 0)
+            except OSError as error:
+                raise unwritable(file, error) from None
+            stack.pop_all()
+            return Lock(file, handle)
+
+
+def _flock(handle: int) -> bool | None:
+    """Lock a file: True; None if another process owns it; False if the file system has no such locks."""
     try:
-        found = _locked(file)
-        if found is None:
-            return None
-        handle, real = found
-        try:
-            if _held_elsewhere(handle, real, stale):
-                os.close(handle)
-                return None
-            owner = {"host": socket.gethostname(), "process": os.getpid(), "since": time.time()}
-            os.ftruncate(handle, 0)
-            os.pwrite(handle, json.dumps(owner).encode(), 0)
-        except OSError:
-            os.close(handle)
-            raise
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return None
     except OSError as error:
-        raise unwritable(file, error) from None
-    return Lock(file, handle)
+        if error.errno not in _NO_LOCKS:
+            raise
+        return False
+    return True
 
 
 @contextlib.contextmanager

@@ -92,6 +92,13 @@ class ConfigOption:
         """Name of the Python parameter."""
         return self.flag.lstrip("-").replace("-", "_")
 
+    @property
+    def annotation(self) -> Any:
+        """Type of the Python parameter, with what the help shows."""
+        default = self.default or False
+        shown = Parameter(name=self.flag, metavar=self.metavar, help=self.help, show_default=default)
+        return Annotated[self.type | None, shown]
+
 
 def config_options(model: type[BaseModel], *keys: str) -> list[ConfigOption]:
     """Options of a configuration in its own order.
@@ -224,8 +231,11 @@ def takes_options(model: type[BaseModel], *keys: str) -> Callable[[C], C]:
 
     def decorate(command: C) -> C:
         hints = typing.get_type_hints(command, include_extras=True)
-        generated = [_parameter(o.parameter, _annotation(o)) for o in options]
-        generated += [_parameter("config", Config), _parameter("assignments", Set)]
+        annotations = {o.parameter: o.annotation for o in options} | {"config": Config, "assignments": Set}
+        generated = [
+            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
+            for name, annotation in annotations.items()
+        ]
         parameters: list[inspect.Parameter] = []
         for parameter in inspect.signature(command).parameters.values():
             own = parameter.replace(annotation=hints[parameter.name])
@@ -252,17 +262,6 @@ def takes_options(model: type[BaseModel], *keys: str) -> Callable[[C], C]:
         return typing.cast(C, run)
 
     return decorate
-
-
-def _parameter(name: str, annotation: Any) -> inspect.Parameter:
-    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
-
-
-def _annotation(option: ConfigOption) -> Any:
-    shown = Parameter(
-        name=option.flag, metavar=option.metavar, help=option.help, show_default=option.default or False
-    )
-    return Annotated[option.type | None, shown]
 
 
 def command_line(*words: object, **options: Any) -> str:

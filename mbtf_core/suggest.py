@@ -10,10 +10,6 @@ from pathlib import Path
 _LEAST = 0.6
 
 
-def _stems_alike(a: str, b: str) -> bool:
-    return difflib.SequenceMatcher(None, Path(a).stem, Path(b).stem).ratio() >= _LEAST
-
-
 def suggest_path(path: Path, wanted: Callable[[Path], bool] | None = None) -> str:
     """``did you mean 'rock/height.png'?`` for a path that does not exist; empty where no name is similar.
 
@@ -36,6 +32,7 @@ def suggest_path(path: Path, wanted: Callable[[Path], bool] | None = None) -> st
     names = {p.name.lower(): p for p in beside if missing != path or wanted is None or wanted(p)}
     near = difflib.get_close_matches(missing.name.lower(), list(names), n=3, cutoff=_LEAST)
     # A common suffix alone does not make names similar.
-    near = [n for n in near if _stems_alike(missing.name.lower(), n)]
-    near = near or [n for n, p in names.items() if p.stem.lower() == missing.stem.lower()][:1]
+    stem = missing.stem.lower()
+    alike = [n for n in near if difflib.SequenceMatcher(None, stem, Path(n).stem).ratio() >= _LEAST]
+    near = alike or [n for n, p in names.items() if p.stem.lower() == stem][:1]
     return f"did you mean '{names[near[0]]}'?" if near else ""

@@ -10,8 +10,14 @@ from typing import Annotated, Any, Union
 from pydantic import BaseModel
 
 _BOUNDS = (("ge", "at least"), ("gt", "above"), ("le", "at most"), ("lt", "below"))
+_TEMPLATES = {
+    "literal_error": "must be {expected}",
+    "too_short": "must hold at least {min_length}",
+    "string_pattern_mismatch": "must match {pattern}",
+    "string_too_short": "must not be empty",
+}
 # Beginnings of pydantic's names of faults → what was expected.
-_KINDS = {
+_FAMILIES = {
     "int": "must be a whole number",
     "float": "must be a number",
     "finite": "must be a finite number",
@@ -69,22 +75,14 @@ def explain(fault: Mapping[str, Any], model: type[BaseModel]) -> str:
     model : what was validated
     """
     kind, context = str(fault["type"]), fault.get("ctx", {})
-    if kind in ("greater_than", "greater_than_equal", "less_than", "less_than_equal"):
+    if kind.startswith(("greater_than", "less_than")):
         limits = {**_limits(model, fault["loc"]), **context}
         bounds = [f"{word} {limits[name]:.10g}" for name, word in _BOUNDS if name in limits]
         return "must be " + " and ".join(bounds)
-    if kind == "literal_error":
-        return f"must be {context['expected']}"
-    if kind == "too_short":
-        return f"must hold at least {context['min_length']}"
-    if kind == "string_pattern_mismatch":
-        return f"must match {context['pattern']}"
-    if kind == "string_too_short":
-        return "must not be empty"
-    expected = (
-        _KINDS.get(kind.split("_")[0])
-        if kind.endswith(("_type", "_parsing", "_number", "_float", "_unicode"))
-        else None
-    )
+    if kind in _TEMPLATES:
+        return _TEMPLATES[kind].format(**context)
+    family, _, ending = kind.partition("_")
+    if family in _FAMILIES and ending.endswith(("type", "parsing", "number", "float", "unicode")):
+        return _FAMILIES[family]
     message: str = fault["msg"]
-    return expected or message.removeprefix("Value error, ").removeprefix("Assertion failed, ")
+    return message.removeprefix("Value error, ").removeprefix("Assertion failed, ")

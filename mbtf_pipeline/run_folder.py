@@ -17,6 +17,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from mbtf_core.atomic import read_json, write_json
+from mbtf_core.config_file import check_schema
 from mbtf_core.errors import InputError, PartialError
 from mbtf_core.folders import check_folder, make_folder
 from mbtf_pipeline.recipe import Recipe, write_recipe
@@ -98,12 +99,7 @@ def has_record(folder: Path, name: str, record_format: str, schema: int) -> bool
         return False
     if record.get("format") != record_format:
         return False
-    if record.get("schema") != schema:
-        raise InputError(
-            f"has schema version {record.get('schema')}, this program reads version {schema}",
-            where=folder / name,
-            hint="run the recipe again in another folder with -o",
-        )
+    check_schema(record, schema, folder / name, "run the recipe again in another folder with -o")
     return True
 
 

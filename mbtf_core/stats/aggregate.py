@@ -11,9 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 from mbtf_core.stats.estimate import Estimate, checked, mean_estimate
 from mbtf_core.stats.groups import group_labels
 from mbtf_core.stats.paired import mean_of_halves
-from mbtf_core.stats.significance import Z_MINIMUM, holm, t_test
+from mbtf_core.stats.significance import holm, t_test
 
 Kind = Literal["mean", "scatter"]
+
+# Below this many independent units the t distribution of heavy-tailed noise is not trusted.
+_MINIMUM = 1000
 
 
 @dataclass(frozen=True)
@@ -73,7 +76,7 @@ def aggregate_test(
     b2: ArrayLike,
     groups: ArrayLike | None = None,
     *,
-    minimum: int = Z_MINIMUM,
+    minimum: int = _MINIMUM,
 ) -> Aggregate:
     """Compare two data sets at the same queries, by group and channel, corrected for the number of tests.
 
@@ -116,10 +119,13 @@ def aggregate_test(
                 f"group {label} has {len(x1)} units, fewer than {minimum}: merge groups or lower `minimum`"
             )
         for c in range(channels):
-            mean = _mean_difference(x1[..., c], y1[..., c], x2[..., c], y2[..., c])
-            scatter = mean_estimate((x1[..., c] - x2[..., c]) * (y1[..., c] - y2[..., c]))
-            found.append((int(label), c, "mean", mean, t_test(mean).p_value))
-            found.append((int(label), c, "scatter", scatter, t_test(scatter, 0.0, "greater").p_value))
+            # The two noises add, each with its own degrees of freedom.
+            mean = t_test(mean_of_halves(x1[..., c], y1[..., c]), mean_of_halves(x2[..., c], y2[..., c]))
+            scatter = t_test(
+                mean_estimate((x1[..., c] - x2[..., c]) * (y1[..., c] - y2[..., c])), 0.0, "greater"
+            )
+            found.append((int(label), c, "mean", mean.difference, mean.p_value))
+            found.append((int(label), c, "scatter", scatter.difference, scatter.p_value))
     if not found:
         raise ValueError("no group to compare")
     corrected = holm([p for *_, p in found])
@@ -130,10 +136,3 @@ def _channels(array: ArrayLike, name: str) -> NDArray[np.float64]:
     """(n, texels, channels) of any accepted shape."""
     x = checked(array, name)
     return x.reshape(len(x), -1, x.shape[-1] if x.ndim > 1 else 1)
-
-
-def _mean_difference(
-    a1: NDArray[np.float64], b1: NDArray[np.float64], a2: NDArray[np.float64], b2: NDArray[np.float64]
-) -> Estimate:
-    """Mean difference over these queries; the two noises add, each with its own degrees of freedom."""
-    return t_test(mean_of_halves(a1, b1), mean_of_halves(a2, b2)).difference

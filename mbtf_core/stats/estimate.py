@@ -94,26 +94,6 @@ def mean_estimate(samples: ArrayLike) -> Estimate:
     return Estimate(float(units.mean()), error, n)
 
 
-def paired_difference(x: ArrayLike, y: ArrayLike) -> Estimate:
-    """Mean of ``x - y`` over units measured under both conditions.
-
-    Contributions that both share (the query, its reference noise) cancel in each difference.
-
-    Parameters
-    ----------
-    x, y : (n, ...) array_like
-        Measurements of the same units in the same order.
-
-    Returns
-    -------
-    Estimate
-    """
-    first, second = checked(x, "x"), checked(y, "y")
-    if first.shape != second.shape:
-        raise ValueError(f"pairs need equal shapes, not {first.shape} and {second.shape}")
-    return mean_estimate(first - second)
-
-
 def checked(array: ArrayLike, name: str) -> NDArray[np.float64]:
     """The array as float64, at least one unit long, every number finite.
 

@@ -102,34 +102,22 @@ def pooled_error(a: ArrayLike, b: ArrayLike) -> Estimate:
     return _root(pooled_variance(a, b))
 
 
-def pooled_relative_error(a: ArrayLike, b: ArrayLike, floor: float | None = None) -> Estimate:
+def pooled_relative_error(a: ArrayLike, b: ArrayLike) -> Estimate:
     """Noise of the values relative to the values, pooled; a pure number.
+
+    The RMS noise over the RMS value, ``√(mean (a-b)²/4 / mean ab)``, which is consistent.
 
     Parameters
     ----------
     a, b : (n, ...) array_like
         Independent halves of the values.
-    floor : float or None
-        None: the RMS noise over the RMS value, ``√(mean (a-b)²/4 / mean ab)``, which is consistent. A number,
-        such as the tile mean: the noise of each query over ``max(|a+b|/2, floor)``, as for target errors. It
-        is accurate where the floor is large compared with the noise.
 
     Returns
     -------
     Estimate
-
-    Raises
-    ------
-    ValueError
-        `floor` is not positive.
     """
     first, second = _pair(a, b)
-    noise = (first - second) ** 2 / 4.0
-    if floor is not None:
-        if not floor > 0:
-            raise ValueError(f"floor must be positive, not {floor}")
-        return _root(mean_estimate(noise / np.maximum(np.abs(first + second) / 2.0, floor) ** 2))
-    return _root(_ratio(per_unit(noise), per_unit(first * second)))
+    return _root(_ratio(per_unit((first - second) ** 2 / 4.0), per_unit(first * second)))
 
 
 def noise_free_mse(prediction: ArrayLike, a: ArrayLike, b: ArrayLike) -> Estimate:
@@ -200,9 +188,7 @@ def signal_variance(a: ArrayLike, b: ArrayLike) -> Estimate:
     return Estimate(spread.value + correction, spread.error, spread.n)
 
 
-def unexplained_variance(
-    prediction: ArrayLike, a: ArrayLike, b: ArrayLike, weights: ArrayLike | None = None
-) -> Estimate:
+def unexplained_variance(prediction: ArrayLike, a: ArrayLike, b: ArrayLike) -> Estimate:
     """Fraction of unexplained variance, 1 - R²: noise-free MSE over signal variance.
 
     0 is perfect, 1 no better than the mean value, more is possible. Numerator and denominator are unbiased;
@@ -215,9 +201,6 @@ def unexplained_variance(
     ----------
     prediction, a, b : (n, ...) array_like
         The prediction, and independent halves of the reference.
-    weights : (n,) array_like or None
-        Positive weights of the units: inverse sampling probabilities (Horvitz & Thompson 1952), up to a
-        common factor. None: uniform sampling.
 
     Returns
     -------
@@ -228,54 +211,35 @@ def unexplained_variance(
     InputError
         A number is NaN or infinite.
     ValueError
-        Shapes differ, or a weight is not positive.
+        Shapes differ.
     """
     p, first, second = _with_prediction(prediction, a, b)
-    w = _weights(weights, len(first))
-    products, correction = _centered_products(first, second, w)
-    return _ratio(per_unit((p - first) * (p - second)), products + correction, w)
+    products, correction = _centered_products(first, second)
+    return _ratio(per_unit((p - first) * (p - second)), products + correction)
 
 
-def _weights(weights: ArrayLike | None, n: int) -> NDArray[np.float64]:
-    """Weights (n,) of mean 1."""
-    if weights is None:
-        return np.ones(n)
-    w = checked(weights, "weights")
-    if w.shape != (n,) or not np.all(w > 0):
-        raise ValueError(f"weights must be {n} numbers above 0, one for each unit")
-    return w / w.mean()
-
-
-def _centered_products(
-    a: NDArray[np.float64], b: NDArray[np.float64], w: NDArray[np.float64] | None = None
-) -> tuple[NDArray[np.float64], float]:
-    """Per unit ``(a-ā)(b-b̄)`` (n,), and what must be added to its mean to make it unbiased (for weights of 1,
-    the mean of `w`)."""
+def _centered_products(a: NDArray[np.float64], b: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Per unit ``(a-ā)(b-b̄)`` (n,), and what must be added to its mean to make it unbiased."""
     n = len(a)
     channels = a.shape[-1] if a.ndim > 1 else 1
     x, y = a.reshape(n, -1, channels), b.reshape(n, -1, channels)
     # Constant data must come out as exactly zero, without the rounding of their mean.
     x, y = x - x[0, 0], y - y[0, 0]
-    x, y = (v - np.average(v.mean(axis=1), axis=0, weights=w) for v in (x, y))
-    squares = 1.0 if w is None else w[:, None] ** 2
-    between = float((squares * x.mean(axis=1) * y.mean(axis=1)).sum(axis=0).mean())
+    x, y = (v - v.mean(axis=1).mean(axis=0) for v in (x, y))
+    between = float((x.mean(axis=1) * y.mean(axis=1)).sum(axis=0).mean())
     return per_unit(x * y), between / (n * (n - 1)) if n > 1 else 0.0
 
 
-def _ratio(
-    numerator: NDArray[np.float64], denominator: NDArray[np.float64], w: NDArray[np.float64] | None = None
-) -> Estimate:
-    """Ratio of the weighted means of two correlated per-unit arrays (n,), with the delta method's error."""
-    n = len(numerator)
-    w = np.ones(n) if w is None else w
-    below = float((w * denominator).mean())
-    # Of a ratio of weighted sums: that of the residuals, whose weighted mean is zero.
+def _ratio(numerator: NDArray[np.float64], denominator: NDArray[np.float64]) -> Estimate:
+    """Ratio of the means of two correlated per-unit arrays (n,), with the delta method's error."""
+    n, below = len(numerator), float(denominator.mean())
     scale = 1.0 / math.sqrt(n * (n - 1)) if n > 1 else math.inf
-    if n < 2 or below <= 2.0 * scale * float(np.linalg.norm(w * (denominator - below))):
+    if n < 2 or below <= 2.0 * scale * float(np.linalg.norm(denominator - below)):
         return Estimate(math.nan, math.inf, n)
-    ratio = float((w * numerator).mean()) / below
+    ratio = float(numerator.mean()) / below
+    # The mean of the residuals is zero.
     residual = numerator - ratio * denominator
-    return Estimate(ratio, scale * float(np.linalg.norm(w * residual)) / below, n)
+    return Estimate(ratio, scale * float(np.linalg.norm(residual)) / below, n)
 
 
 def _root(estimate: Estimate) -> Estimate:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, Field
 
 from mbtf_core.atomic import read_json
-from mbtf_core.config_file import check_document
+from mbtf_core.config_file import check_document, check_schema
 from mbtf_core.digest import file_sha256
 from mbtf_core.errors import InputError
 from mbtf_core.lattice import MAX_LEVEL
@@ -93,12 +93,7 @@ def read_description(folder: Path) -> tuple[dict[str, Any], Path]:
     description = read_json(path)
     if description.get("format") != FORMAT_NAME:
         raise InputError(f"does not describe a material ({FORMAT_NAME})", where=path)
-    if description.get("schema") != SCHEMA_VERSION:
-        raise InputError(
-            f"material of schema {description.get('schema')}; this version reads schema {SCHEMA_VERSION}",
-            where=path,
-            hint="fit it again with this version of mbtf-fit",
-        )
+    check_schema(description, SCHEMA_VERSION, path, "fit it again with this version of mbtf-fit")
     check_document(_Description, description, path, "fit it again, or copy it again")
     weights = folder / WEIGHTS_NAME
     if not weights.is_file() or file_sha256(weights) != description["weights"]["sha256"]:

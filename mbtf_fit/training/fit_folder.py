@@ -6,9 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.atomic import read_json, write_json, write_text
-from mbtf_core.config_file import dump_yaml
+from mbtf_core.config_file import check_schema, dump_yaml
 from mbtf_core.digest import data_sha256
-from mbtf_core.errors import InputError
 from mbtf_core.folders import ELSEWHERE, check_folder, make_folder, other_configuration
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import data_hash
@@ -60,7 +59,9 @@ def claim(out: Path, identity: dict[str, Any], config: FitConfig, overwrite: boo
         if old.get("config_hash") == identity["config_hash"] and not overwrite:
             return
         if not overwrite:
-            raise _another_fit(out, old, identity)
+            check_schema(old, _SCHEMA, out / FIT_NAME, f"{ELSEWHERE}, or replace it with --overwrite")
+            before, after = ({**r.get("config", {}), "data": r.get("data")} for r in (old, identity))
+            raise other_configuration(out, "a fit", before, after, "other shards")
         # The description goes first: without it nothing counts as a finished material.
         for name in (
             *(DESCRIPTION_NAME, FIT_NAME, CONFIG_NAME, HISTORY_NAME, CHECKPOINT_NAME),
@@ -70,14 +71,3 @@ def claim(out: Path, identity: dict[str, Any], config: FitConfig, overwrite: boo
     make_folder(out)
     write_text(out / CONFIG_NAME, dump_yaml(config.model_dump(mode="json")))
     write_json(out / FIT_NAME, identity)
-
-
-def _another_fit(out: Path, old: dict[str, Any], new: dict[str, Any]) -> InputError:
-    if old.get("schema") != _SCHEMA:
-        return InputError(
-            f"holds a fit of schema {old.get('schema')}; this version writes schema {_SCHEMA}",
-            where=out,
-            hint=f"{ELSEWHERE}, or replace it with --overwrite",
-        )
-    before, after = ({**record.get("config", {}), "data": record.get("data")} for record in (old, new))
-    return other_configuration(out, "a fit", before, after, "other shards")

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import BaseModel, Field
 
 from mbtf_core.atomic import read_json
-from mbtf_core.config_file import check_document
+from mbtf_core.config_file import check_document, check_schema
 from mbtf_core.errors import InputError
 from mbtf_core.lattice import MAX_LEVEL, Lattice
 from mbtf_core.shard_schema import ARRAYS, FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, Layout
@@ -118,12 +118,9 @@ class Dataset:
         manifest = read_json(path)
         if manifest.get("format") != FORMAT_NAME:
             raise InputError(f"is not a manifest of {FORMAT_NAME}", where=path)
-        if manifest.get("schema") != SCHEMA_VERSION:
-            raise InputError(
-                f"shards of schema {manifest.get('schema')}; this version reads schema {SCHEMA_VERSION}",
-                where=path,
-                hint="generate them again with this version of mbtf-gen",
-            )
+        check_schema(
+            manifest, SCHEMA_VERSION, path, "generate the shards again with this version of mbtf-gen"
+        )
         check_document(_Manifest, manifest, path, _MAKE_AGAIN)
         return cls(folder, manifest)
 

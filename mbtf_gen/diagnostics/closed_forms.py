@@ -41,7 +41,7 @@ class Groove:
         """Slope of the facets."""
         return 2.0 * self.depth
 
-    def _reach(self, omega: F64, side: int) -> float:
+    def reach(self, omega: F64, side: int) -> float:
         """Depth down to which the facet that descends towards `side`·x is visible from direction ω (3,)."""
         if side * self.slope * omega[0] + omega[2] <= 0:
             return 0.0
@@ -50,7 +50,8 @@ class Groove:
         run = 1.0 / self.slope + side * omega[0] / omega[2]
         return self.depth if run <= 0 else min(self.depth, 1.0 / run)
 
-    def _radiance(self, omega_i: F64, side: int) -> float:
+    def radiance(self, omega_i: F64, side: int) -> float:
+        """Radiance of the lit part of the facet that descends towards `side`·x, in 1/sr."""
         cosine = (side * self.slope * omega_i[0] + omega_i[2]) / np.hypot(1.0, self.slope)
         return float(self.albedo / np.pi * max(0.0, cosine) / omega_i[2])
 
@@ -59,10 +60,10 @@ class Groove:
         light, view = np.asarray(omega_i, np.float64), np.asarray(omega_o, np.float64)
         total = 0.0
         for side in (1, -1):
-            both = min(self._reach(light, side), self._reach(view, side))
+            both = min(self.reach(light, side), self.reach(view, side))
             # The shadow of a facet's depth d on the reference plane, along the view.
             length = both * (1.0 / self.slope + side * view[0] / view[2])
-            total += self._radiance(light, side) * length
+            total += self.radiance(light, side) * length
         return total
 
     def value(self, x: ArrayLike, omega_i: ArrayLike, omega_o: ArrayLike) -> F64:
@@ -71,14 +72,14 @@ class Groove:
         position = np.asarray(x, np.float64)
         out = np.zeros_like(position)
         for side in (1, -1):
-            seen, lit = self._reach(view, side), self._reach(light, side)
+            seen, lit = self.reach(view, side), self.reach(light, side)
             if seen == 0:
                 continue
             length = side / self.slope + view[0] / view[2]
             # Distance from the facet's ridge on the plane, in the direction in which the facet lies, 0 … 1.
             away = (position - 0.25) * np.sign(length) % 1.0
             depth = away / abs(length)
-            out = np.where(depth <= min(seen, lit), self._radiance(light, side), out)
+            out = np.where(depth <= min(seen, lit), self.radiance(light, side), out)
         return out
 
 

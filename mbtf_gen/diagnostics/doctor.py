@@ -15,14 +15,14 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from mbtf_core.child_process import run_child
 from mbtf_core.errors import EXIT_BAD_INPUT, EXIT_OK, EngineError
 from mbtf_gen.render.llvm import CACHE_VARIABLE, chosen_llvm, shipped_llvm, use_shipped_llvm
 from mbtf_gen.render.runtime import CPU_VARIANT, CUDA_VARIANT, check_llvm, load_mitsuba, prove
 
-Answers = dict[str, Any]
+Found = dict[Literal["found"], str]
 
 # Seconds; first starts from a slow network disk take tens of them.
 _TIMEOUT = 180.0
@@ -35,16 +35,10 @@ class Part:
 
     Attributes
     ----------
-    name : str
-        The part.
-    state : {"ok", "failed", "absent"}
-        ``absent`` parts are not there and not needed.
-    required : bool
-        Whether the programs need it.
-    found : str
-        What was found, or what went wrong.
-    hint : str
-        What to do about it; empty where nothing is to be done.
+    state : ``absent`` parts are not there and not needed
+    required : whether the programs need it
+    found : what was found, or what went wrong
+    hint : what to do about it; empty where nothing is to be done
     """
 
     name: str
@@ -54,21 +48,12 @@ class Part:
     hint: str = ""
 
 
-@dataclass(frozen=True)
-class Probe:
-    """How a part is tested: `use` runs in a child process, `found` describes its answers in words."""
+class Probe(NamedTuple):
+    """How a part is tested: `use` runs in a child process and yields ``found``, what it found in words."""
 
-    use: str
-    found: Callable[[Answers], str]
+    use: Callable[[], Iterator[Found]]
     hint: str
     required: bool = True
-
-    def run(self, name: str) -> Part:
-        """Test the part."""
-        outcome = run_child(__name__, self.use, timeout=_TIMEOUT)
-        if outcome.fault:
-            return Part(name, "failed", self.required, outcome.fault, self.hint)
-        return Part(name, "ok", self.required, self.found(outcome.answers))
 
 
 def diagnose() -> list[Part]:
@@ -108,7 +93,11 @@ def as_text(parts: Sequence[Part]) -> str:
 
 def probe(name: str) -> Part:
     """Test one of the parts in :data:`PROBES`."""
-    return PROBES[name].run(name)
+    use, hint, required = PROBES[name]
+    outcome = run_child(__name__, use.__name__, timeout=_TIMEOUT)
+    if outcome.fault:
+        return Part(name, "failed", required, outcome.fault, hint)
+    return Part(name, "ok", required, outcome.answers["found"])
 
 
 def _python() -> Part:
@@ -121,11 +110,11 @@ def _llvm() -> Part:
     # Tested again: a cached result does not show the state of today.
     outcome = prove(CPU_VARIANT)
     if not outcome.fault:
-        shipped = shipped_llvm()
-        origin = "of the installation" if shipped and library == str(shipped) else "set by the user"
+        version, shipped = ".".join(str(n) for n in outcome.answers["llvm"]), shipped_llvm()
         if library is None:
             origin = "of the system"
-        version = ".".join(str(n) for n in outcome.answers["llvm"])
+        else:
+            origin = "of the installation" if library == str(shipped) else "set by the user"
         found = f"{version} {origin}, ran test kernels, {library or 'found by Dr.Jit'}"
         return Part("LLVM", "ok", True, found)
     try:
@@ -146,14 +135,13 @@ def _cuda() -> Part:
 # The functions below run in child processes.
 
 
-def use_mitsuba() -> Iterator[Answers]:
+def use_mitsuba() -> Iterator[Found]:
     """Mitsuba renders a sphere."""
     from importlib.metadata import version
 
     mi = load_mitsuba(CPU_VARIANT)
     import drjit as dr
 
-    yield {"mitsuba": version("mitsuba"), "drjit": version("drjit")}
     look_at = mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0])
     scene = mi.load_dict(
         {
@@ -172,9 +160,10 @@ def use_mitsuba() -> Iterator[Answers]:
     # A convex body of albedo 0.5 under a constant light of radiance 1.
     if not abs(mean - 0.5) < 0.01:
         raise EngineError(f"a test image has the mean {mean:.3f} instead of 0.5")
+    yield {"found": f"{version('mitsuba')} with Dr.Jit {version('drjit')}, rendered a test image"}
 
 
-def use_threads() -> Iterator[Answers]:
+def use_threads() -> Iterator[Found]:
     """A sum over many lanes is right."""
     mi = load_mitsuba(CPU_VARIANT)
     import drjit as dr
@@ -184,26 +173,25 @@ def use_threads() -> Iterator[Answers]:
     if total != count // 2:
         raise EngineError("a parallel sum is wrong")
     processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    yield {"threads": dr.thread_count(), "processors": processors, "quota": _processor_quota()}
+    yield {"found": f"{dr.thread_count()} render threads on {processors} processors{_processor_quota()}"}
 
 
-def _processor_quota() -> float | None:
-    """Processor time that a container may use, in processors; None without such a limit."""
+def _processor_quota() -> str:
+    """Processor time that a container may use, in processors; empty without such a limit."""
     try:
         quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
-        return int(quota) / int(period)
+        return f", limited to the time of {int(quota) / int(period):g}"
     except (OSError, ValueError):
-        return None
+        return ""
 
 
-def use_torch() -> Iterator[Answers]:
+def use_torch() -> Iterator[Found]:
     """PyTorch takes a training step."""
     # By name: this package does not depend on PyTorch, but the fitter in the same installation does.
     from importlib import import_module
 
     torch: Any = import_module("torch")
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    yield {"torch": torch.__version__, "device": device}
     weight = torch.zeros(1, device=device, requires_grad=True)
     optimizer = torch.optim.SGD([weight], lr=0.25)
     loss = (weight - 1).square().sum()
@@ -211,16 +199,16 @@ def use_torch() -> Iterator[Answers]:
     optimizer.step()
     if abs(weight.item() - 0.5) > 1e-6:
         raise EngineError(f"a training step gave {weight.item()} instead of 0.5")
+    yield {"found": f"{torch.__version__} on {device}, took a training step"}
 
 
-def use_openexr() -> Iterator[Answers]:
+def use_openexr() -> Iterator[Found]:
     """OpenEXR writes and reads an image."""
     from importlib.metadata import version
 
     import numpy as np
     import OpenEXR
 
-    yield {"openexr": version("OpenEXR")}
     image = np.linspace(0, 1, 12, dtype=np.float32).reshape(3, 4)
     with tempfile.TemporaryDirectory(prefix="mbtf-doctor-") as folder:
         path = str(Path(folder, "test.exr"))
@@ -229,13 +217,13 @@ def use_openexr() -> Iterator[Answers]:
         with OpenEXR.File(path, separate_channels=True) as file:
             if not np.array_equal(file.channels()["Y"].pixels, image):
                 raise EngineError("an image came back changed")
+    yield {"found": f"{version('OpenEXR')}, wrote an image and read it back"}
 
 
-def use_drawing() -> Iterator[Answers]:
+def use_drawing() -> Iterator[Found]:
     """PyVista draws a sphere off screen."""
     import pyvista
 
-    yield {"pyvista": pyvista.__version__}
     plotter = pyvista.Plotter(off_screen=True, window_size=[64, 64])
     plotter.set_background("black")
     plotter.add_mesh(pyvista.Sphere(), color="white")
@@ -243,9 +231,10 @@ def use_drawing() -> Iterator[Answers]:
     plotter.close()
     if picture is None or not picture.max() > picture.min() + 100:
         raise EngineError("the picture is empty")
+    yield {"found": f"pyvista {pyvista.__version__} drew a sphere off screen"}
 
 
-def use_kernel_cache() -> Iterator[Answers]:
+def use_kernel_cache() -> Iterator[Found]:
     """The folder of compiled kernels is writable."""
     folder = os.environ.get(CACHE_VARIABLE) or str(Path("~/.drjit").expanduser())
     Path(folder).mkdir(parents=True, exist_ok=True)
@@ -253,43 +242,25 @@ def use_kernel_cache() -> Iterator[Answers]:
         stream.write(b"mbtf")
         stream.flush()
     sizes = [entry.stat().st_size for entry in os.scandir(folder)]
-    yield {"folder": folder, "files": len(sizes), "bytes": sum(sizes)}
+    yield {"found": f"{folder}, {len(sizes)} files, {sum(sizes) / 2**10:.0f} KiB"}
 
 
 PROBES = {
-    "Mitsuba": Probe(
-        "use_mitsuba",
-        lambda a: f"{a['mitsuba']} with Dr.Jit {a['drjit']}, rendered a test image",
-        f"see LLVM; if that works, {_REINSTALL} mitsuba==3.9.1",
-    ),
-    "Threads": Probe(
-        "use_threads",
-        lambda a: (
-            f"{a['threads']} render threads on {a['processors']} processors"
-            + (f", limited to the time of {a['quota']:g}" if a["quota"] else "")
-        ),
-        "see LLVM",
-    ),
-    "PyTorch": Probe(
-        "use_torch",
-        lambda a: f"{a['torch']} on {a['device']}, took a training step",
-        f"{_REINSTALL} torch==2.13.0",
-    ),
+    "Mitsuba": Probe(use_mitsuba, f"see LLVM; if that works, {_REINSTALL} mitsuba==3.9.1"),
+    "Threads": Probe(use_threads, "see LLVM"),
+    "PyTorch": Probe(use_torch, f"{_REINSTALL} torch==2.13.0"),
     "OpenEXR": Probe(
-        "use_openexr",
-        lambda a: f"{a['openexr']}, wrote an image and read it back",
+        use_openexr,
         f"{_REINSTALL} OpenEXR; make sure that the temporary folder ({tempfile.gettempdir()}) can be written",
     ),
     "Drawing": Probe(
-        "use_drawing",
-        lambda a: f"pyvista {a['pyvista']} drew a sphere off screen",
+        use_drawing,
         "only 3D pictures need it; install OpenGL (software rendering is enough), on Debian: "
         "apt install libgl1 libegl1 libosmesa6",
         required=False,
     ),
     "Kernel cache": Probe(
-        "use_kernel_cache",
-        lambda a: f"{a['folder']}, {a['files']} files, {a['bytes'] / 2**10:.0f} KiB",
+        use_kernel_cache,
         f"without it every run compiles its kernels again; make its folder writable or set {CACHE_VARIABLE}",
         required=False,
     ),

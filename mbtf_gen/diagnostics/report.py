@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from html import escape
 from typing import Any
 
-from mbtf_gen.diagnostics.selftest import STANDARD_ERRORS, Case, Finding
+from mbtf_core.errors import EXIT_OK
+from mbtf_gen.diagnostics.selftest import STANDARD_ERRORS, Case, Finding, exit_code
 
 _HEAD = ("check", "worst error", "± statistical", "tolerance", "cases", "")
 _UNITS = {"relative": "", "count": "", "rad": " rad"}
@@ -31,22 +32,20 @@ def _number(x: float, unit: str) -> str:
 
 
 def _row(finding: Finding) -> tuple[str, ...]:
-    check, worst = finding.check, finding.worst
-    tolerance = _number(check.tolerance, check.unit)
-    if worst is None:
-        return (check.name, "-", "-", tolerance, "-", finding.state)
-    case = worst[1]
-    error = _number(abs(case.off), check.unit)
-    random = _number(case.error, check.unit) if case.error else "exact"
-    return (check.name, error, random, tolerance, str(len(finding.cases)), finding.state)
+    check = finding.check
+    error = random = cases = "-"
+    if finding.worst is not None:
+        case = finding.worst[1]
+        error = _number(abs(case.off), check.unit)
+        random = _number(case.error, check.unit) if case.error else "exact"
+        cases = str(len(finding.cases))
+    return (check.name, error, random, _number(check.tolerance, check.unit), cases, finding.state)
 
 
 def verdict(findings: Sequence[Finding]) -> str:
     """The result in a sentence."""
     failed = [f.check.name for f in findings if f.state == "failed"]
-    if not failed:
-        return "every check passed"
-    return f"failed: {', '.join(failed)}"
+    return f"failed: {', '.join(failed)}" if failed else "every check passed"
 
 
 def as_text(findings: Sequence[Finding]) -> str:
@@ -103,7 +102,7 @@ def as_html(findings: Sequence[Finding]) -> str:
 def as_json(findings: Sequence[Finding]) -> dict[str, Any]:
     """Plain data for ``--json``."""
     return {
-        "ok": all(f.state != "failed" for f in findings if f.check.required),
+        "ok": exit_code(findings) == EXIT_OK,
         "seconds": round(sum(f.seconds for f in findings), 2),
         "checks": [f.as_dict() for f in findings],
         "machine": machine(),

@@ -43,19 +43,19 @@ class Check:
     Attributes
     ----------
     name, statement : in a few words, and in a sentence
-    unit : of the measured quantity: ``relative``, ``count``, ``rad``
     tolerance : error that a case may have, beside its statistical error
     measure : cases by name of one round; each round, numbered from 0, has its own random numbers. None means
         that the part under test is absent
+    unit : of the measured quantity
     repeated : more rounds reduce the statistical error
     required : a failure fails the self-test
     """
 
     name: str
     statement: str
-    unit: Unit
     tolerance: float
     measure: Callable[[int], Mapping[str, Case] | None]
+    unit: Unit = "relative"
     repeated: bool = True
     required: bool = True
 
@@ -107,17 +107,16 @@ class Finding:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data for ``--json``."""
-        worst = self.worst
+        name, worst = self.worst or (None, None)
         return {
-            "name": self.check.name,
-            "statement": self.check.statement,
+            **{
+                key: getattr(self.check, key)
+                for key in ("name", "statement", "required", "unit", "tolerance")
+            },
             "state": self.state,
-            "required": self.check.required,
-            "unit": self.check.unit,
-            "worst_case": worst[0] if worst else None,
-            "worst": worst[1].off if worst else None,
-            "error": worst[1].error if worst else None,
-            "tolerance": self.check.tolerance,
+            "worst_case": name,
+            "worst": worst and worst.off,
+            "error": worst and worst.error,
             "cases": len(self.cases),
             "rounds": self.rounds,
             "seconds": round(self.seconds, 2),

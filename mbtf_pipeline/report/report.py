@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.atomic import read_json, write_text
-from mbtf_core.errors import InputError
+from mbtf_core.config_file import check_schema
 from mbtf_gen.config.effects_request import EFFECTS
 from mbtf_pipeline.compare.compare import COMPARISON_NAME, COMPARISON_SCHEMA
 from mbtf_pipeline.fit_records import read_training
@@ -75,13 +75,10 @@ def write_report(folder: Path, recipe: Recipe, stages: Sequence[str]) -> int:
     InputError
         A file of the run is missing, corrupt or of another version.
     """
-    comparison = read_json(folder / COMPARE / COMPARISON_NAME)
-    if comparison.get("schema") != COMPARISON_SCHEMA:
-        raise InputError(
-            f"has schema version {comparison.get('schema')}, this program reads version {COMPARISON_SCHEMA}",
-            where=folder / COMPARE / COMPARISON_NAME,
-            hint="run the recipe again: it repeats the comparison and keeps data and fits",
-        )
+    path = folder / COMPARE / COMPARISON_NAME
+    comparison = read_json(path)
+    hint = "run the recipe again: it repeats the comparison and keeps data and fits"
+    check_schema(comparison, COMPARISON_SCHEMA, path, hint)
     manifest = read_json(folder / SHARDS / "manifest.json")
     run = read_json(folder / RUN_NAME)
     white = comparison["white"] if recipe.report.exposure is None else 1.0 / recipe.report.exposure

@@ -17,7 +17,7 @@ from support.scenes import (
 )
 from support.surfaces import towards
 
-from mbtf_core.stats import Estimate, mean_estimate, mean_of_halves, z_test
+from mbtf_core.stats import Estimate, mean_estimate, mean_of_halves, t_test
 from mbtf_gen.diagnostics.closed_forms import Wall
 
 
@@ -78,7 +78,7 @@ def test_black_is_exactly_black(relief: HeightGrid, light: LightKernel | None) -
 
 
 def test_tile_mean_is_reciprocal(relief: HeightGrid) -> None:
-    """Light and view exchanged, interreflection included: z-test, error bars below 2 %."""
+    """Light and view exchanged, interreflection included: t-test, error bars below 2 %."""
     one, other = direction(35, 25), direction(60, 250)
 
     def mean(omega_i: object, omega_o: object, seed: int) -> Estimate:
@@ -90,7 +90,7 @@ def test_tile_mean_is_reciprocal(relief: HeightGrid) -> None:
 
     forward, backward = mean(one, other, 1), mean(other, one, 2)
     assert max(forward.relative_error, backward.relative_error) < 0.02
-    assert z_test(forward, backward).p_value > 1e-4
+    assert t_test(forward, backward).p_value > 1e-4
 
 
 def test_grazing_light_and_view_stay_finite(relief: HeightGrid) -> None:

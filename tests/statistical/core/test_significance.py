@@ -7,17 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats as reference
 
-from mbtf_core.stats import (
-    Estimate,
-    aggregate_test,
-    equivalence_test,
-    holm,
-    mean_estimate,
-    mean_of_halves,
-    sidak,
-    t_test,
-    z_test,
-)
+from mbtf_core.stats import aggregate_test, holm, mean_estimate, mean_of_halves, t_test
 
 Floats = NDArray[np.float64]
 EXPERIMENTS = 1000
@@ -35,36 +25,19 @@ def halves(rng: np.random.Generator, truth: Floats, noise: float = 1.0) -> tuple
     return a, b
 
 
-def test_z_test_is_uniform_under_the_null() -> None:
-    rng = np.random.default_rng(1)
-    truth = rng.normal(size=(1000, 3))
-    assert_uniform(
-        [z_test(mean_of_halves(*halves(rng, truth)), float(truth.mean())).p_value for _ in range(EXPERIMENTS)]
-    )
-
-
 @pytest.mark.parametrize("n", [2, 4, 20])
 def test_t_test_is_uniform_for_few_samples(n: int) -> None:
     rng = np.random.default_rng(2)
     assert_uniform([t_test(mean_estimate(rng.normal(3.0, 2.0, n)), 3.0).p_value for _ in range(EXPERIMENTS)])
 
 
-def test_t_test_of_one_pair_of_halves_is_uniform() -> None:
-    """One query, one pair: one degree of freedom."""
+# One query, one pair: one degree of freedom. Many: the normal distribution.
+@pytest.mark.parametrize("queries", [1, 1000])
+def test_t_test_of_halves_is_uniform(queries: int) -> None:
     rng = np.random.default_rng(3)
     assert_uniform(
-        [t_test(mean_of_halves(rng.normal(size=1), rng.normal(size=1))).p_value for _ in range(EXPERIMENTS)]
+        [t_test(mean_of_halves(*rng.normal(size=(2, queries)))).p_value for _ in range(EXPERIMENTS)]
     )
-
-
-def test_z_scores_per_query_raise_false_alarms() -> None:
-    """The reason for the guard: with single pairs |z| > 2 happens in 30 % of faultless queries, not 5 %."""
-    rng = np.random.default_rng(4)
-    a, b = rng.normal(size=(2, 100_000))
-    z = np.abs(a + b) / np.abs(a - b)
-    assert np.mean(z > 2.0) == pytest.approx(1.0 - 2.0 / np.pi * np.arctan(2.0), abs=0.01)
-    with pytest.raises(ValueError, match="1000 independent units, not 16"):
-        z_test(Estimate(1.0, 0.1, 16), 1.0)
 
 
 def test_two_estimates_of_unequal_precision() -> None:
@@ -79,39 +52,12 @@ def test_two_estimates_of_unequal_precision() -> None:
     assert t_test(mean_estimate(x), mean_estimate(y)).p_value == pytest.approx(expected)
 
 
-def test_a_bias_of_one_sigma_per_query_is_found_in_the_aggregate() -> None:
-    rng = np.random.default_rng(6)
-    truth = rng.normal(size=(1000, 3))
-    a, b = halves(rng, truth + 1.0 / np.sqrt(2.0))
-    assert z_test(mean_of_halves(a, b), float(truth.mean())).p_value < 1e-12
-
-
-def test_equivalence_needs_evidence_of_closeness() -> None:
-    close, vague = Estimate(1.001, 0.002, 5000), Estimate(1.001, 0.2, 5000)
-    assert equivalence_test(close, 1.0, 0.01).p_value < 1e-4
-    assert equivalence_test(vague, 1.0, 0.01).p_value > 0.4
-    assert equivalence_test(Estimate(1.02, 0.002, 5000), 1.0, 0.01).p_value > 0.99
-    rng = np.random.default_rng(7)
-    at_the_limit = [
-        equivalence_test(mean_estimate(rng.normal(0.5, 1.0, 40)), 0.0, 0.5).p_value < 0.05
-        for _ in range(EXPERIMENTS)
-    ]
-    assert np.mean(at_the_limit) < 0.05 + 4.0 * np.sqrt(0.05 * 0.95 / EXPERIMENTS)
-
-
-def test_corrections() -> None:
+def test_correction_for_the_number_of_tests() -> None:
     p = np.array([[0.01, 0.04], [0.03, 0.005]])
     assert holm(p) == pytest.approx(np.array([[0.03, 0.06], [0.06, 0.02]]))
-    assert sidak([0.01, 0.5]) == pytest.approx([1 - 0.99**2, 0.75])
-    assert sidak([1e-18, 1.0]) == pytest.approx([2e-18, 1.0], rel=1e-12)
-    rng = np.random.default_rng(8)
-    p_values = rng.random((2000, 20))
-    for correct in (holm, sidak):
-        rate = np.mean([correct(row).min() < 0.05 for row in p_values])
-        assert rate == pytest.approx(0.05, abs=4.0 * np.sqrt(0.05 * 0.95 / 2000))
-
-
-def test_a_p_value_outside_its_range_is_refused() -> None:
+    p_values = np.random.default_rng(8).random((2000, 20))
+    rate = np.mean([holm(row).min() < 0.05 for row in p_values])
+    assert rate == pytest.approx(0.05, abs=4.0 * np.sqrt(0.05 * 0.95 / 2000))
     with pytest.raises(ValueError, match=r"\[0, 1\]"):
         holm([0.5, 1.5])
 
@@ -136,24 +82,18 @@ class TestAggregate:
     def test_null(self) -> None:
         rng = np.random.default_rng(9)
         truth = self.truth(rng)
-        alarms, single = 0, []
+        alarms, single, scatter = 0, [], []
         for _ in range(300):
             result = aggregate_test(*self.pair(rng, truth, truth), self.GROUPS)
             alarms += result.p_value < 0.05
-            single += [c.p_value for c in result.comparisons if c.channel == 1 and c.kind == "mean"]
+            for c in result.comparisons:
+                if c.channel == 1 and c.kind == "mean":
+                    single.append(c.p_value)
+                elif c.channel == 0 and c.kind == "scatter":
+                    scatter.append(c.estimate.value / c.estimate.error)
         assert len(result.comparisons) == 6 * 3 * 2
         assert alarms <= 300 * 0.05 + 4 * np.sqrt(300 * 0.05)
         assert_uniform(single)
-
-    def test_scatter_is_centered_under_the_null(self) -> None:
-        rng = np.random.default_rng(10)
-        truth = self.truth(rng)
-        scatter = [
-            c.estimate.value / c.estimate.error
-            for _ in range(60)
-            for c in aggregate_test(*self.pair(rng, truth, truth), self.GROUPS).comparisons
-            if c.kind == "scatter" and c.channel == 0
-        ]
         assert abs(np.mean(scatter)) < 4.5 / np.sqrt(len(scatter))
         assert np.std(scatter) == pytest.approx(1.0, abs=0.15)
 
@@ -176,11 +116,6 @@ class TestAggregate:
         assert result.p_value < 1e-3
         assert result.worst.kind == "scatter"
         assert min(means) > 1e-4
-
-    def test_exchanged_channels_are_found(self) -> None:
-        rng = np.random.default_rng(13)
-        truth = self.truth(rng)
-        assert aggregate_test(*self.pair(rng, truth, truth[:, ::-1]), self.GROUPS).p_value < 1e-12
 
     def test_known_values_in_place_of_the_second_data_set(self) -> None:
         rng = np.random.default_rng(14)

@@ -9,13 +9,14 @@ from typing import Any
 import drjit as dr
 import numpy as np
 import pytest
+from support.chi_square import Cap, chi_square_test
 from support.fit_data import random_directions
 from support.plugin_materials import write_material
 from support.plugin_scenes import plane
 from support.scenes import mi
 
 from mbtf_core.lattice import Lattice
-from mbtf_core.stats import Cap, Estimate, chi_square_test, t_test
+from mbtf_core.stats import Estimate, t_test
 from mbtf_fit.mitsuba_plugin.lobe_fit import lobes_of
 from mbtf_fit.mitsuba_plugin.lobes import Lobe, LobeTextures, Mixture
 

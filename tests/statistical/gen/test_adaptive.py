@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from support.small_runs import contents
 
 from mbtf_core.lattice import Lattice
-from mbtf_core.stats import mean_estimate, noise_free_mse, z_test
+from mbtf_core.stats import mean_estimate, noise_free_mse, t_test
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.dataset.summary import finish
@@ -72,13 +72,13 @@ def test_values_of_a_skewed_scene_are_unbiased(skewed: tuple[Queries, Allocation
     assert e.spp is not None
     assert len(np.unique(e.spp)) > 3
     a, b = e.value_a[:, 0].astype(np.float64), e.value_b[:, 0].astype(np.float64)
-    assert z_test(mean_estimate(0.5 * (a + b)), TRUTH).p_value > 1e-3
+    assert t_test(mean_estimate(0.5 * (a + b)), TRUTH).p_value > 1e-3
     # Within every count as well, and the halves' errors do not go together.
     for count in np.unique(e.spp):
         some = e.spp == count
         if some.sum() >= 1000:
-            assert z_test(mean_estimate(0.5 * (a + b)[some]), TRUTH).p_value > 1e-4
-    assert z_test(mean_estimate((a - TRUTH) * (b - TRUTH))).p_value > 1e-3
+            assert t_test(mean_estimate(0.5 * (a + b)[some]), TRUTH).p_value > 1e-4
+    assert t_test(mean_estimate((a - TRUTH) * (b - TRUTH))).p_value > 1e-3
 
 
 def test_the_pilot_draws_random_numbers_of_its_own(skewed: tuple[Queries, Allocation]) -> None:
@@ -135,7 +135,7 @@ def test_stopping_when_the_paths_so_far_look_good_is_biased() -> None:
         value[stop] = mean[stop]
         open_ &= ~stop
     found = mean_estimate(value)
-    assert z_test(found, TRUTH).p_value < 1e-9
+    assert t_test(found, TRUTH).p_value < 1e-9
     assert found.value < 0.9 * TRUTH
 
 

@@ -20,7 +20,7 @@ from support.scenes import (
     tile_mean_queries,
 )
 
-from mbtf_core.stats import Estimate, mean_of_halves, z_test
+from mbtf_core.stats import Estimate, mean_of_halves, t_test
 from mbtf_gen.geometry.heightfield import HeightGrid
 from mbtf_gen.sampling.light_kernel import LightKernel
 
@@ -49,7 +49,7 @@ def test_roulette_changes_nothing_but_the_noise(light: LightKernel | None) -> No
     first, second = (mean_of_halves(e.value_a[:, 0], e.value_b[:, 0]) for e in (with_it, without))
     assert first.relative_error < 5e-3
     assert first.error > second.error
-    assert z_test(first, second).p_value > 1e-3
+    assert t_test(first, second).p_value > 1e-3
 
 
 @pytest.mark.parametrize("albedo", [0.02, 0.7])
@@ -83,7 +83,7 @@ def test_tile_mean_is_reciprocal(
     one, other = direction(*light), direction(*view)
     forward, backward = tile_mean(grid, bsdf, one, other, 1), tile_mean(grid, bsdf, other, one, 2)
     assert max(forward.relative_error, backward.relative_error) < 0.01
-    assert z_test(forward, backward).p_value > 1e-3
+    assert t_test(forward, backward).p_value > 1e-3
 
 
 class NoCosine(mi.BSDF):  # type: ignore[misc]
@@ -109,11 +109,11 @@ def test_reciprocity_fails_without_a_cosine() -> None:
     one, other = direction(*PAIRS[1][0]), direction(*PAIRS[1][1])
     forward, backward = (tile_mean(rocks(), lambert(0.9), *w) for w in ((one, other, 1), (other, one, 2)))
     # Values divided by the light's cosine, as some published data are: no longer reciprocal.
-    assert z_test(forward.scaled(1 / one[2]), backward.scaled(1 / other[2])).p_value < 1e-6
+    assert t_test(forward.scaled(1 / one[2]), backward.scaled(1 / other[2])).p_value < 1e-6
     # The cosine dropped inside the BSDF.
     faulty = NoCosine(mi.Properties())
     forward, backward = tile_mean(rocks(), faulty, one, other, 1), tile_mean(rocks(), faulty, other, one, 2)
-    assert z_test(forward, backward).p_value < 1e-6
+    assert t_test(forward, backward).p_value < 1e-6
 
 
 @pytest.mark.parametrize("light", [(80, 0), (20, 130)])
@@ -132,5 +132,5 @@ def test_tile_mean_returns_at_most_what_arrives(light: tuple[float, float]) -> N
         v = np.pi * 0.5 * (e.value_a + e.value_b)[:, 0].astype(np.float64)
         values[name] = Estimate(float(v.mean()), float(v.std(ddof=1) / np.sqrt(n)), n)
     # Albedo 1 loses nothing: all of the light comes back, none of it more than once.
-    assert z_test(values["all"], 1.0).p_value > 1e-3
+    assert t_test(values["all"], 1.0).p_value > 1e-3
     assert values["direct"].value < 1.0 - 5 * values["direct"].error

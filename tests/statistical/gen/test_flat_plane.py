@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from support.scenes import direction, estimate, flat, lambert, mi, queries
 
-from mbtf_core.stats import mean_of_halves, z_test
+from mbtf_core.stats import mean_of_halves, t_test
 from mbtf_gen.sampling.light_kernel import LightKernel
 
 GRAZING = float(np.degrees(np.arcsin(0.01)))
@@ -31,14 +31,14 @@ def test_lambert_is_albedo_over_pi(width: float, light: float, view: float) -> N
         if width == 0:
             np.testing.assert_allclose([a, b], albedo / np.pi, rtol=2e-6)
         else:
-            # A uniform tolerance beside the z-test: error bars of a thousandth, so a percent off never
+            # A uniform tolerance beside the t-test: error bars of a thousandth, so a percent off never
             # passes.
             mean = mean_of_halves(a, b)
             assert mean.relative_error < 2e-2
             # Of a lobe of 0.05° two parts in 10⁵ come from BSDF samples that hit its outskirts, once in a run
             # or two of this size: an error bar without such a hit does not know of them.
             off = abs(mean.value * np.pi / albedo - 1)
-            assert off < 1e-4 or z_test(mean, albedo / np.pi).p_value > 1e-4
+            assert off < 1e-4 or t_test(mean, albedo / np.pi).p_value > 1e-4
     assert e.lost == 0
     assert e.capped == 0
 
@@ -90,4 +90,4 @@ def test_glossy_kernel_average(description: dict[str, Any], width: float, light:
     )
     mean = mean_of_halves(e.value_a[:, 0], e.value_b[:, 0])
     assert mean.relative_error < 1e-2
-    assert z_test(mean, expected).p_value > 1e-4
+    assert t_test(mean, expected).p_value > 1e-4

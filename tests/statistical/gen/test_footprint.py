@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from support.scenes import Estimator, LightKernel, Stream, Transport, build_tile, direction, flat, mi, queries
 
-from mbtf_core.stats import mean_of_halves, z_test
+from mbtf_core.stats import mean_of_halves, t_test
 from mbtf_gen.pictures.camera import Camera
 from mbtf_gen.pictures.reference import _camera_rays
 from mbtf_gen.render.scene import CLEARANCE, LONG_SIDE
@@ -86,4 +86,4 @@ def test_positions_in_the_footprint_do_not_follow_light_directions(azimuth: floa
     for channel in (0, 1):
         mean = mean_of_halves(e.value_a[:, channel], e.value_b[:, channel])
         assert mean.relative_error < 5e-3
-        assert z_test(mean, 0.5 / np.pi).p_value > 1e-3
+        assert t_test(mean, 0.5 / np.pi).p_value > 1e-3

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from support.chi_square import Cap, Rectangle, chi_square_test
 from support.scenes import mi
 
-from mbtf_core.stats import Cap, Rectangle, chi_square_test
 from mbtf_gen.render.directional_light import DirectionalLight
 from mbtf_gen.sampling.light_kernel import LightKernel, concentration, rms_angle_deg
 

@@ -56,13 +56,11 @@ def test_flags_win_over_assignments_over_the_file(write: Any) -> None:
     assert (whole.height, whole.levels, whole.light.width_deg) == (0.3, 4, 5.0)
 
 
-def test_later_assignments_win_and_reach_sections_not_in_the_file() -> None:
-    whole = resolve(Whole, assignments=["light.width_deg=5", "light.width_deg=6", "light.kind=delta"])
+def test_assignments_are_read_as_yaml_and_later_ones_win() -> None:
+    assignments = ["stages=[{name: a, spp: 4}]", "levels=null", "height=1e-6"]
+    assignments += ["light.width_deg=5", "light.width_deg=6", "light.kind=delta"]
+    whole = resolve(Whole, assignments=assignments)
     assert whole.light == Light(width_deg=6, kind="delta")
-
-
-def test_assignments_are_read_as_yaml() -> None:
-    whole = resolve(Whole, assignments=["stages=[{name: a, spp: 4}]", "levels=null", "height=1e-6"])
     assert whole.stages == (Stage(name="a", spp=4),)
     assert whole.levels is None
     assert whole.height == 1e-6

@@ -104,6 +104,16 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
+@pytest.fixture
+def write(tmp_path: Path) -> Callable[[str], Path]:
+    def write(text: str) -> Path:
+        path = tmp_path / "a.yaml"
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return write
+
+
 @st.composite
 def odd(draw: st.DrawFn, text: str) -> str:
     """The text with some of its words or lines exchanged for odd ones, repeated, or shifted."""
@@ -171,8 +181,6 @@ BOMB = "a: &a [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
 )
 HOSTILE = {
     "a bomb of aliases": (BOMB, "holds more than 100,000 values"),
-    "brackets": ("a: " + "[" * 100_000, "nested more than 100 levels deep"),
-    "braces": ("a: " + "{a: " * 50_000, "nested more than 100 levels deep"),
     "indentation": ("\n".join(" " * i + "a:" for i in range(400)), "nested more than 100 levels deep"),
     "dashes": ("a:\n" + " - " * 5000, "nested more than 100 levels deep"),
     "a flood": ("a: 1\n" * 100_000, "is too long"),
@@ -191,10 +199,9 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("case", HOSTILE)
-def test_hostile_yaml(case: str, tmp_path: Path) -> None:
+def test_hostile_yaml(case: str, write: Callable[[str], Path]) -> None:
     text, message = HOSTILE[case]
-    path = tmp_path / "a.yaml"
-    path.write_text(text)
+    path = write(text)
     with pytest.raises(InputError) as caught:
         read_yaml(path)
     assert message in caught.value.what
@@ -202,9 +209,8 @@ def test_hostile_yaml(case: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["a: &a [*a]\n", "a: &a\n  b: *a\n", "&a a: {b: *a}\n"])
-def test_a_value_that_holds_itself(text: str, tmp_path: Path) -> None:
-    path = tmp_path / "a.yaml"
-    path.write_text(text)
+def test_a_value_that_holds_itself(text: str, write: Callable[[str], Path]) -> None:
+    path = write(text)
     loads_or_refuses(lambda: resolve(GeneratorConfig, file=path))
     loads_or_refuses(lambda: load_material(path))
 
@@ -217,10 +223,8 @@ def test_a_value_that_holds_itself(text: str, tmp_path: Path) -> None:
     ],
     ids=["byte order mark", "alias"],
 )
-def test_harmless_yaml_is_read(text: str, data: dict[str, Any], tmp_path: Path) -> None:
-    path = tmp_path / "a.yaml"
-    path.write_text(text, encoding="utf-8")
-    assert read_yaml(path) == data
+def test_harmless_yaml_is_read(text: str, data: dict[str, Any], write: Callable[[str], Path]) -> None:
+    assert read_yaml(write(text)) == data
 
 
 def test_a_hostile_assignment_is_refused() -> None:
@@ -229,19 +233,17 @@ def test_a_hostile_assignment_is_refused() -> None:
 
 
 @pytest.mark.parametrize("text", ["a: " + "[" * 100_000, "a: " + "{a: " * 50_000])
-def test_brackets_are_counted_first(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_brackets_are_counted_first(
+    text: str, write: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
     # The reader's time grows with the square of their depth.
     monkeypatch.setattr("mbtf_core.config_file._yaml", lambda: pytest.fail("the text was read"))
-    path = tmp_path / "a.yaml"
-    path.write_text(text)
     with pytest.raises(InputError, match="levels deep"):
-        read_yaml(path)
+        read_yaml(write(text))
 
 
 @pytest.mark.parametrize("name", ["a\\0b", "x" * 300, "folder/" + "y" * 300, "z/" * 3000])
 @pytest.mark.parametrize("line", ["height: {}", "height: heights.npy\nroughness: {}"])
-def test_names_that_no_file_can_have(name: str, line: str, tmp_path: Path) -> None:
-    path = tmp_path / "material.yaml"
-    path.write_text(line.format(f'"{name}"'))
+def test_names_that_no_file_can_have(name: str, line: str, write: Callable[[str], Path]) -> None:
     with pytest.raises(InputError, match="is not a valid file name"):
-        load_material(path)
+        load_material(write(line.format(f'"{name}"')))

@@ -18,7 +18,6 @@ from mbtf_core.stats import (
     mean_estimate,
     mean_of_halves,
     noise_free_mse,
-    paired_difference,
     pooled_relative_error,
     pooled_variance,
     signal_variance,
@@ -72,7 +71,6 @@ def test_halves_by_hand() -> None:
     assert pooled_variance(a, b).value == 0.5
     assert mean_of_halves(a, b) == Estimate(2.5, 0.5, 2, 1.0)
     assert noise_free_mse(np.array([[2.0], [5.0]]), a, b).value == pytest.approx((-1.0 + 4.0) / 2.0)
-    assert pooled_relative_error(a, b, floor=10.0).value == pytest.approx(math.sqrt(0.5) / 10.0)
     a, b = np.tile(a, (10, 1)), np.tile(b, (10, 1))
     assert pooled_relative_error(a, b).value == pytest.approx(math.sqrt(0.5 / 6.0))
 
@@ -87,27 +85,16 @@ def test_effective_degrees_of_freedom() -> None:
     assert mean_of_halves(a, b).degrees == 1.0
 
 
-def test_one_query_has_no_signal_variance() -> None:
+def test_one_query_and_constant_data_have_no_unexplained_share() -> None:
     one = np.ones((1, 3))
     assert math.isnan(signal_variance(one, one).value)
     assert math.isnan(unexplained_variance(one, one, one).value)
-
-
-def test_constant_data_have_no_unexplained_share() -> None:
     values = np.full((100, 3), 0.2)
     result = unexplained_variance(values + 0.1, values, values)
     assert math.isnan(result.value)
     assert result.error == math.inf
     with pytest.raises(ValueError, match="cannot be tested"):
         t_test(result, 0.0)
-
-
-def test_paired_difference() -> None:
-    x = np.array([1.0, 20.0, 300.0])
-    estimate = paired_difference(x + 0.5, x)
-    assert estimate == Estimate(pytest.approx(0.5), pytest.approx(0.0, abs=1e-12), 3)
-    with pytest.raises(ValueError, match="equal shapes"):
-        paired_difference(x, x[:2])
 
 
 def test_numbers_that_are_not_finite_are_refused_with_their_place() -> None:
@@ -127,8 +114,6 @@ def test_shapes_that_do_not_fit_are_refused() -> None:
         noise_free_mse(a[:, 0], a, a)
     with pytest.raises(ValueError, match="no rows"):
         pooled_variance(a[:0], a[:0])
-    with pytest.raises(ValueError, match="floor must be positive"):
-        pooled_relative_error(a, a, floor=0.0)
 
 
 def test_groups() -> None:

@@ -115,7 +115,7 @@ def test_folders_that_are_no_material_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "material.json"
     text = path.read_text()
     path.write_text(text.replace('"schema": 2', '"schema": 7'))
-    with pytest.raises(InputError, match="schema 7; this version reads schema 2"):
+    with pytest.raises(InputError, match="schema version 7, this program reads version 2"):
         read_material(tmp_path)
     path.write_text(text)
     weights = tmp_path / "weights.safetensors"

@@ -105,8 +105,8 @@ def test_folders_that_hold_no_data_set(tmp_path: Path) -> None:
         ("{", "not readable as JSON"),
         ("[1]", "must hold a JSON object"),
         ('{"format": "other"}', "is not a manifest"),
-        ('{"format": "mbtf-shards", "schema": 99}', "shards of schema 99; this version reads schema 2"),
-        ('{"format": "mbtf-shards"}', "shards of schema None"),
+        ('{"format": "mbtf-shards", "schema": 99}', "schema version 99, this program reads version 2"),
+        ('{"format": "mbtf-shards"}', "schema version None"),
     ):
         path.write_text(text)
         with pytest.raises(InputError, match=message) as caught:
