@@ -30,22 +30,14 @@ def silenced() -> Iterator[None]:
     try:
         os.dup2(sink, 1)
         os.dup2(sink, 2)
-        with (
-            open(os.devnull, "w") as nothing,
-            contextlib.redirect_stdout(nothing),
-            contextlib.redirect_stderr(nothing),
-        ):
+        # OpenEXR prints through Python's streams as well.
+        with open(os.devnull, "w") as no, contextlib.redirect_stdout(no), contextlib.redirect_stderr(no):
             yield
     finally:
         os.dup2(saved[0], 1)
         os.dup2(saved[1], 2)
         for handle in (*saved, sink):
             os.close(handle)
-
-
-def _window(header: dict[str, Any], name: str) -> tuple[int, int, int, int]:
-    low, high = header[name]
-    return int(low[0]), int(low[1]), int(high[0]), int(high[1])
 
 
 def read_file(path: Path, max_pixels: int) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
@@ -139,11 +131,11 @@ def _checked_size(head: dict[str, Any], path: Path, max_pixels: int) -> tuple[in
 
     if head["type"] not in (OpenEXR.scanlineimage, OpenEXR.tiledimage):
         raise InputError("deep EXR images are not supported", where=path, hint="flatten the image")
-    window = _window(head, "dataWindow")
+    window, shown = (tuple(int(n) for n in np.ravel(head[name])) for name in ("dataWindow", "displayWindow"))
     columns, rows = window[2] - window[0] + 1, window[3] - window[1] + 1
     if rows * columns > max_pixels:
         raise InputError(f"claims {columns} x {rows} pixels; at most {max_pixels:,} are read", where=path)
-    if window != _window(head, "displayWindow"):
+    if window != shown:
         raise InputError(
             "data window and display window differ: a cropped tile", where=path, hint="crop the image"
         )

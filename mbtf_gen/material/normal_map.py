@@ -86,7 +86,7 @@ class NormalFit:
 def slopes_of_heights(height: Array) -> Array:
     """Slopes (2, H-2, W-2) of heights (H, W) along u and y = a·v, in stored heights per tile width. The
     outermost texels are left out: heights need not tile."""
-    grid = HeightGrid(height, height.shape[0] / height.shape[1])
+    grid = HeightGrid(np.asarray(height, np.float64), height.shape[0] / height.shape[1])
     return np.moveaxis(height_slopes(grid)[1:-1, 1:-1], -1, 0)
 
 
