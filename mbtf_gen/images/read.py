@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError, reason
 from mbtf_core.suggest import suggest_path
-from mbtf_gen.images.exr import check_floats, read_channels, silenced
-from mbtf_gen.images.exr_layers import choose_channels
+from mbtf_gen.images.exr import check_floats, choose_channels, read_channels, silenced
 from mbtf_gen.images.metadata import NO_TAGS, Tags, tags_of
 from mbtf_gen.images.tiff import read_tiff
 
@@ -105,7 +104,7 @@ def read_image(
         EXR, PNG, JPG, TIFF or npy file.
     channel : str or None
         A channel or layer of an EXR file; R, G, B, A or Y of other formats. None: see
-        :func:`~mbtf_gen.images.exr_layers.choose_channels`.
+        :func:`~mbtf_gen.images.exr.choose_channels`.
     prefer : callable or None
         Predicate on the layer names of an EXR file, for files of several layers.
 
