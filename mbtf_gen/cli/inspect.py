@@ -23,8 +23,7 @@ def inspect(
     material
         Height map, folder of maps, or material.yaml.
     """
-    from mbtf_gen.material.inspect import inspect_material
-    from mbtf_gen.material.inspect_text import inspection_text
+    from mbtf_gen.material.inspect import inspect_material, inspection_text
     from mbtf_gen.material.material import load_material
 
     resolved = resolve_config(options, material)

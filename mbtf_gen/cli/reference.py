@@ -8,7 +8,7 @@ from typing import Any
 from mbtf_core.console import CONSOLE, Console
 from mbtf_core.options import Options, Output, Overwrite, takes_options
 from mbtf_gen.cli.common import resolve_config
-from mbtf_gen.config.pictures import RENDERING, ReferenceConfig, without_queries
+from mbtf_gen.config.pictures import RENDERING, ReferenceConfig
 
 
 @takes_options(ReferenceConfig, "reference", *RENDERING)
@@ -57,7 +57,7 @@ def reference(
         output,
         "reference",
         files=[f"{name}.{suffix}" for name in names.values() for suffix in ("exr", "png")],
-        config=without_queries(resolved),
+        config=resolved.model_dump(mode="json", exclude={"queries", "output"}),
         inputs=job.material.digests,
         overwrite=overwrite,
     )

@@ -21,7 +21,6 @@ from mbtf_gen.config.effects_request import EffectsRequest
 from mbtf_gen.geometry.slopes import NormalMode
 from mbtf_gen.sampling.light_kernel import MAX_WIDTH_DEG, MIN_WIDTH_DEG
 
-_RESOLUTIONS = [1 << level for level in range(MAX_LEVEL + 1)]
 _PERCENT = re.compile(r"^\s*(\d+(?:\.\d*)?|\.\d+)\s*%\s*$")
 _COUNT = re.compile(r"^\s*(\d+(?:\.\d+)?(?:[eE][+]?\d+)?)\s*(/\s*texel)?\s*$")
 
@@ -76,15 +75,13 @@ def _light_width(width: float) -> float:
     return width
 
 
-Count = Annotated[str, BeforeValidator(_count)]
-
-
 def _power_of_two(resolution: int) -> int:
-    if resolution not in _RESOLUTIONS:
-        raise ValueError(f"must be a power of two from 1 to {_RESOLUTIONS[-1]}")
+    if not 1 <= resolution <= 1 << MAX_LEVEL or resolution.bit_count() != 1:
+        raise ValueError(f"must be a power of two from 1 to {1 << MAX_LEVEL}")
     return resolution
 
 
+Count = Annotated[str, BeforeValidator(_count)]
 Resolution = Annotated[int, AfterValidator(_power_of_two)]
 Paths = Annotated[int, Field(ge=2, le=1 << 20), AfterValidator(_even)]
 
@@ -232,21 +229,7 @@ class GeneratorConfig(Settings):
         0, ge=0, lt=1 << 63, description="root seed of all random numbers"
     )
 
-    def data_fields(self, inputs: dict[str, str]) -> dict[str, Any]:
-        """Everything that determines the data: options, and digests of the input files.
-
-        Parameters
-        ----------
-        inputs : dict of str to str
-            SHA-256 of the input file of each role.
-
-        Returns
-        -------
-        dict
-        """
-        fields = self.model_dump(exclude={"material"})
-        return {"schema": SCHEMA_VERSION, "inputs": dict(sorted(inputs.items())), **fields}
-
     def hash(self, inputs: dict[str, str]) -> str:
-        """SHA-256 over :meth:`data_fields`, hexadecimal; `inputs` maps roles to digests of files."""
-        return data_sha256(self.data_fields(inputs))
+        """SHA-256 of everything that determines the data: options, and digests of the input files by role."""
+        fields = self.model_dump(exclude={"material"})
+        return data_sha256({"schema": SCHEMA_VERSION, "inputs": inputs, **fields})

@@ -96,8 +96,3 @@ class PreviewConfig(GeneratorConfig):
     """Everything ``mbtf-gen preview`` needs."""
 
     preview: PreviewSection = PreviewSection()
-
-
-def without_queries(config: GeneratorConfig) -> dict[str, Any]:
-    """The options, as plain data, without those of queries and output."""
-    return config.model_dump(mode="json", exclude={"queries", "output"})

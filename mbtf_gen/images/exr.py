@@ -1,11 +1,12 @@
-"""Channels of an EXR file, with the size checked before any pixel is read."""
+"""Channels and layers of an EXR file, with the size checked before any pixel is read."""
 
 from __future__ import annotations
 
 import contextlib
+import difflib
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,8 @@ from mbtf_core.errors import InputError
 _MOST_CHANNELS = 4
 # Tiles may be larger than the image, up to this.
 _TILE_PIXELS = 1 << 20
+# Channels of one image, in order; Y comes after XYZ, which contains a Y.
+_SETS = ("RGB", "XYZ", "Y")
 
 
 @contextlib.contextmanager
@@ -30,22 +33,14 @@ def silenced() -> Iterator[None]:
     try:
         os.dup2(sink, 1)
         os.dup2(sink, 2)
-        with (
-            open(os.devnull, "w") as nothing,
-            contextlib.redirect_stdout(nothing),
-            contextlib.redirect_stderr(nothing),
-        ):
+        # OpenEXR prints through Python's streams as well.
+        with open(os.devnull, "w") as no, contextlib.redirect_stdout(no), contextlib.redirect_stderr(no):
             yield
     finally:
         os.dup2(saved[0], 1)
         os.dup2(saved[1], 2)
         for handle in (*saved, sink):
             os.close(handle)
-
-
-def _window(header: dict[str, Any], name: str) -> tuple[int, int, int, int]:
-    low, high = header[name]
-    return int(low[0]), int(low[1]), int(high[0]), int(high[1])
 
 
 def read_file(path: Path, max_pixels: int) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
@@ -139,11 +134,11 @@ def _checked_size(head: dict[str, Any], path: Path, max_pixels: int) -> tuple[in
 
     if head["type"] not in (OpenEXR.scanlineimage, OpenEXR.tiledimage):
         raise InputError("deep EXR images are not supported", where=path, hint="flatten the image")
-    window = _window(head, "dataWindow")
+    window, shown = (tuple(int(n) for n in np.ravel(head[name])) for name in ("dataWindow", "displayWindow"))
     columns, rows = window[2] - window[0] + 1, window[3] - window[1] + 1
     if rows * columns > max_pixels:
         raise InputError(f"claims {columns} x {rows} pixels; at most {max_pixels:,} are read", where=path)
-    if window != _window(head, "displayWindow"):
+    if window != shown:
         raise InputError(
             "data window and display window differ: a cropped tile", where=path, hint="crop the image"
         )
@@ -154,3 +149,68 @@ def _checked_size(head: dict[str, Any], path: Path, max_pixels: int) -> tuple[in
     if any(c.xSampling != 1 or c.ySampling != 1 for c in head["channels"]):
         raise InputError("subsampled EXR channels are not supported", where=path, hint="save it as plain RGB")
     return rows, columns
+
+
+def layers(names: list[str]) -> dict[str, list[str]]:
+    """Images in a file: label → channels in order.
+
+    ``R G B (A)``, ``X Y Z`` or ``Y (A)`` of one prefix are an image whose label is the prefix (empty for
+    none); every other channel is an image by itself, labeled with its whole name.
+    """
+    out: dict[str, list[str]] = {}
+    left = set(names)
+    for layer in sorted({n.rpartition(".")[0] for n in names}):
+        prefix = f"{layer}." if layer else ""
+        base = next((b for b in _SETS if all(prefix + c in left for c in b)), None)
+        if base is not None:
+            taken = [prefix + c for c in base]
+            if base != "XYZ" and f"{prefix}A" in left:
+                taken.append(f"{prefix}A")
+            out[layer] = taken
+            left -= set(taken)
+    return {**out, **{name: [name] for name in sorted(left)}}
+
+
+def choose_channels(
+    names: list[str], path: Path, channel: str | None, prefer: Callable[[str], bool] | None = None
+) -> list[str]:
+    """Channels to read, in order.
+
+    Parameters
+    ----------
+    channel : the name of a channel or of a layer; None to choose: the only image, else the only one whose
+        label `prefer` accepts, else the one without a prefix, else the only one of several channels
+
+    Raises
+    ------
+    InputError : no such channel, or the choice is unclear
+    """
+    found = layers(names)
+    listed = ", ".join(sorted(names))
+    if channel is not None:
+        if channel in names:
+            return [channel]
+        if channel in found:
+            return found[channel]
+        near = difflib.get_close_matches(channel, [*names, *found], n=1, cutoff=0.5)
+        raise InputError(
+            f"has no channel or layer '{channel}'",
+            where=path,
+            hint=f"did you mean '{near[0]}'?" if near and near[0] else f"it has {listed}",
+        )
+    if len(found) == 1:
+        return next(iter(found.values()))
+    preferred = [label for label in found if label and prefer is not None and prefer(label)]
+    if len(preferred) == 1:
+        return found[preferred[0]]
+    if not preferred and "" in found:
+        return found[""]
+    images = [label for label, channels in found.items() if channels != [label]]
+    if not preferred and len(images) == 1:
+        return found[images[0]]
+    raise InputError(
+        f"which of its channels are meant is unclear: {listed}",
+        where=path,
+        hint="name one in a material.yaml, such as height: {file: "
+        f"{path.name}, channel: {next(iter(found))}}}, or keep the channels R, G, B",
+    )

@@ -9,7 +9,6 @@ from typing import Any, Literal
 
 ColorSpace = Literal["srgb", "linear"]
 
-_ORIENTATION = 0x0112
 # Stored gammas of the known spaces (sRGB: 1/2.2), and the tolerance of their comparison.
 _GAMMAS: dict[ColorSpace, float] = {"srgb": 0.45455, "linear": 1.0}
 _SLACK = 0.005
@@ -21,12 +20,9 @@ class Tags:
 
     Attributes
     ----------
-    space : {"srgb", "linear"} or None
-        Declared color space, if supported.
-    foreign : str or None
-        Unsupported declaration, such as ``color profile 'Display P3'``.
-    orientation : int
-        EXIF orientation; 1 is upright.
+    space : declared color space, if supported
+    foreign : unsupported declaration, such as ``color profile 'Display P3'``
+    orientation : of EXIF; 1 is upright
     """
 
     space: ColorSpace | None = None
@@ -44,8 +40,10 @@ def tags_of(info: Mapping[Any, Any], exif: Mapping[int, Any]) -> Tags:
     edition, 4.3). A gamma of 1 means linear, 1/2.2 sRGB; a profile whose description names sRGB means sRGB.
     Other profiles and gammas are reported, not applied.
     """
-    orientation = exif.get(_ORIENTATION, 1)
-    turned = orientation if isinstance(orientation, int) and 1 <= orientation <= 8 else 1
+    from PIL import ExifTags
+
+    orientation = exif.get(ExifTags.Base.Orientation, 1)
+    turned = orientation if orientation in range(1, 9) else 1
     space: ColorSpace | None = None
     foreign = None
     gamma = info.get("gamma")

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError, reason
 from mbtf_core.suggest import suggest_path
-from mbtf_gen.images.exr import check_floats, read_channels, silenced
-from mbtf_gen.images.exr_layers import choose_channels
+from mbtf_gen.images.exr import check_floats, choose_channels, read_channels, silenced
 from mbtf_gen.images.metadata import NO_TAGS, Tags, tags_of
 from mbtf_gen.images.tiff import read_tiff
 
@@ -105,7 +104,7 @@ def read_image(
         EXR, PNG, JPG, TIFF or npy file.
     channel : str or None
         A channel or layer of an EXR file; R, G, B, A or Y of other formats. None: see
-        :func:`~mbtf_gen.images.exr_layers.choose_channels`.
+        :func:`~mbtf_gen.images.exr.choose_channels`.
     prefer : callable or None
         Predicate on the layer names of an EXR file, for files of several layers.
 
@@ -218,21 +217,12 @@ def _exact(numbers: NDArray[np.floating[Any]], bits: int | None) -> NDArray[np.f
     return np.rint(numbers.astype(np.float64) * largest) / largest
 
 
-def _npy_fault(error: Exception) -> str:
-    """Message for an error of the npy reader, whose own text may quote the bytes of the header."""
-    known = {
-        "header": "its header is damaged",
-        "Python objects": "it contains Python objects",
-        "mmap length": "it is cut short",
-    }
-    return next((said for word, said in known.items() if word in str(error)), reason(error))
-
-
 def _from_npy(path: Path) -> Image:
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except Exception as error:  # a damaged header may make the parser raise anything, its bytes included
-        raise InputError(f"cannot be read as an npy array ({_npy_fault(error)})", where=path) from None
+    except Exception:  # a damaged header may make the parser raise anything, its bytes included
+        what = "cannot be read as an npy array: it is damaged, cut short, or holds Python objects"
+        raise InputError(what, where=path) from None
     if array.ndim not in (2, 3) or (array.ndim == 3 and not 1 <= array.shape[2] <= 4):
         raise InputError(f"has the shape {array.shape}; (H, W) or (H, W, 1..4) is wanted", where=path)
     _check_size(array.shape[0], array.shape[1], path)
@@ -245,16 +235,16 @@ def _from_pillow(path: Path, kind: str) -> Image:
     import PIL
     from PIL import Image as Pillow
 
-    if kind == "PNG" and (codes := _deep_png(path)) is not None:
+    codes: NDArray[Any] | None = None
+    if kind != "JPEG":
+        codes = _deep_png(path) if kind == "PNG" else read_tiff(path, _check_size)
+    if codes is not None:
         return replace(_decoded(codes, path), tags=_tags(path, kind))
-    if kind == "TIFF" and (array := read_tiff(path, _check_size)) is not None:
-        return replace(_decoded(array, path), tags=_tags(path, kind))
     try:
         with python_warnings.catch_warnings(), silenced() if kind == "TIFF" else contextlib.nullcontext():
             python_warnings.simplefilter("ignore")
             with Pillow.open(path, formats=[kind]) as picture:
                 _check_size(picture.height, picture.width, path)
-                _refuse_deep_tiff(picture, path)
                 picture.load()
                 return replace(_from_picture(picture, path), tags=tags_of(picture.info, picture.getexif()))
     except Pillow.DecompressionBombError:
@@ -301,24 +291,12 @@ def _tags(path: Path, kind: str) -> Tags:
         return NO_TAGS
 
 
-def _refuse_deep_tiff(picture: Any, path: Path) -> None:
-    """Refuse color TIFF of 16 bits, which Pillow would read as 8."""
-    bits = getattr(picture, "tag_v2", {}).get(258, (8,))
-    bits = bits if isinstance(bits, tuple) else (bits,)
-    if len(bits) > 1 and max(bits) > 8:
-        raise InputError(
-            f"color TIFF of {max(bits)} bits is not read", where=path, hint="save it as PNG or EXR"
-        )
-
-
 def _from_picture(picture: Any, path: Path) -> Image:
     mode = picture.mode
     plain = {"P": "RGBA" if "transparency" in picture.info else "RGB", "PA": "RGBA", "1": "L", "YCbCr": "RGB"}
+    deep = mode.startswith("I;16") or (mode == "I" and picture.format == "PNG")
     if mode in plain:
-        deep = False
         picture = picture.convert(plain[mode])
-    else:
-        deep = mode.startswith("I;16") or (mode == "I" and picture.format == "PNG")
     if deep or picture.mode in ("L", "LA", "RGB", "RGBA", "F"):
         numbers = np.asarray(picture)
         return _decoded(numbers.astype(np.uint16) if deep else numbers, path)

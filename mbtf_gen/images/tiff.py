@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from mbtf_core.errors import InputError, reason
 
 _GRAY, _RGB = 1, 2
+_SHORT = "cannot be read as a TIFF image (file ends early)"
 
 
 def read_tiff(path: Path, check_size: Callable[[int, int, Path], None]) -> NDArray[Any] | None:
@@ -48,8 +49,10 @@ def read_tiff(path: Path, check_size: Callable[[int, int, Path], None]) -> NDArr
             if page.dtype.kind == "f" or page.dtype in (np.uint8, np.uint16):
                 if not 1 <= channels <= 4 or page.imagedepth != 1:
                     raise InputError(f"has {channels} channels; 1 to 4 are wanted", where=path)
-                if not page.is_contiguous:
-                    _check_segments(page, path)
+                # Missing strips or tiles of a truncated file would be read as zeros.
+                ends = (o + n for o, n in zip(page.dataoffsets, page.databytecounts, strict=True))
+                if not page.is_contiguous and any(end > path.stat().st_size for end in ends):
+                    raise InputError(_SHORT, where=path)
                 array = page.asarray(maxworkers=1)
             elif page.dtype.kind in "ui" and page.dtype.itemsize > 1:
                 _refuse(page.dtype.name, path)
@@ -62,17 +65,9 @@ def read_tiff(path: Path, check_size: Callable[[int, int, Path], None]) -> NDArr
     if page.planarconfig == 2 and channels > 1:
         array = np.moveaxis(array.reshape(channels, rows, columns), 0, -1)
     if array.size != rows * columns * channels:
-        raise InputError("cannot be read as a TIFF image (file ends early)", where=path)
+        raise InputError(_SHORT, where=path)
     return array.reshape(rows, columns, channels)
 
 
 def _refuse(kind: str, path: Path) -> NoReturn:
     raise InputError(f"contains {kind} numbers", where=path, hint="save it as 8 or 16 bits or as floats")
-
-
-def _check_segments(page: Any, path: Path) -> None:
-    """Refuse a truncated file, whose missing strips or tiles would be read as zeros."""
-    size = path.stat().st_size
-    for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True):
-        if offset + count > size:
-            raise InputError("cannot be read as a TIFF image (file ends early)", where=path)

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
 from mbtf_gen.images.read import Image
-from mbtf_gen.material.normal_map import Convention, NormalFit
+from mbtf_gen.material.discovery import Convention
+from mbtf_gen.material.normal_map import NormalFit
 from mbtf_gen.material.quantization import Codes
 from mbtf_gen.material.tiling import Seam, broken
 
@@ -20,8 +20,6 @@ CONVENTION_NAMES: dict[Convention, str] = {"gl": "OpenGL", "dx": "DirectX"}
 _COLORED = 0.02
 # Levels, and codes between them, that 8-bit heights in a 16-bit file have.
 _FEW_LEVELS, _FAR_APART = 1024, 16.0
-# Displacement range, in tile widths, above which a default height scale is probably wrong.
-_STEEP = 0.5
 # Largest plausible ratio of a height scale to the one that the normal map suggests.
 _FAR_OFF = 3.0
 
@@ -46,19 +44,16 @@ def refuse_color(image: Image) -> None:
 
 def coarse_step(codes: Codes, bits: int) -> float | None:
     """Quantization step of the heights in codes; None where it is too fine to show as terraces."""
-    if bits == 8:
-        return codes.rounding
     hidden = codes.levels <= _FEW_LEVELS and codes.spacing >= _FAR_APART
-    return codes.rounding if hidden else None
+    return codes.rounding if bits == 8 or hidden else None
 
 
-def level_remark(path: Path, codes: Codes, bits: int, step: float, smoothed: bool) -> str:
-    """The remark that heights have few levels."""
+def level_warning(path: Path, codes: Codes, bits: int, step: float, smoothed: bool) -> str:
+    """The warning that heights have few levels."""
     apart = f" {codes.spacing:.4g} codes apart" if codes.spacing > 1 else ""
-    hint = f"smoothed within {'half a code' if step == 1 else f'{step / 2:.3g} codes'}"
-    return f"{path}: {bits}-bit heights with {codes.levels} distinct values{apart}; " + (
-        hint if smoothed else "not smoothed (dequantize: false)"
-    )
+    within = f"smoothed within {'half a code' if step == 1 else f'{step / 2:.3g} codes'}"
+    done = within if smoothed else "not smoothed (dequantize: false)"
+    return f"{path}: {bits}-bit heights with {codes.levels} distinct values{apart}; {done}"
 
 
 def seam_warning(path: Path, seams: Sequence[Seam], factor: float) -> str | None:
@@ -95,21 +90,24 @@ def choose_convention(
 
     The material file takes precedence over the data, the data over the file name; the default is OpenGL.
     """
+    claim = asked or named
     shown = None if fit is None else fit.convention
     chosen: Convention = asked or shown or named or "gl"
-    if shown is None or fit is None:
-        how = "as configured" if asked else "by its name" if named else "assumed: the heights do not decide"
+    if asked and asked != shown:
+        how = "as configured"
+    elif shown:
+        how = "as the heights' slopes show"
+    else:
+        how = "by its name" if named else "assumed: the heights do not decide"
+    if fit is None or shown is None or claim is None or claim == shown:
         return chosen, how, None
-    claim = asked or named
-    if claim is None or claim == shown:
-        return chosen, "as the heights' slopes show", None
-    said = "convention in the material file" if asked else "name"
     warning = (
-        f"{path}: the {said} implies {CONVENTION_NAMES[claim]}, the heights' slopes imply "
-        f"{CONVENTION_NAMES[shown]} (correlation {fit.as_is:.2f} against {min(fit.gl, fit.dx):.2f}); "
+        f"{path}: the {'convention in the material file' if asked else 'name'} implies "
+        f"{CONVENTION_NAMES[claim]}, the heights' slopes imply {CONVENTION_NAMES[shown]} "
+        f"(correlation {fit.as_is:.2f} against {min(fit.gl, fit.dx):.2f}); "
         f"read as {CONVENTION_NAMES[chosen]}"
     )
-    return chosen, "as configured" if asked else "as the heights' slopes show", warning
+    return chosen, how, warning
 
 
 def signed(correlation: float) -> str:
@@ -117,29 +115,18 @@ def signed(correlation: float) -> str:
     return "undefined" if math.isnan(correlation) else f"{correlation:+.2f}"
 
 
-def range_warning(path: Path, extent: float) -> str | None:
-    """The warning that a default scale gives an unlikely displacement range, in tile widths."""
-    if extent <= _STEEP:
-        return None
-    return f"{path}: the displacement range is {extent:.4g} tile widths; check --height-scale"
-
-
 def suggestion_warning(path: Path, fit: NormalFit | None, factor: float) -> str | None:
-    """The warning that the default height scale is far from the one that the normal map suggests."""
-    if not misses(fit, factor) or fit is None:
+    """The warning that a default height scale is over three times, or under a third of, the one that the
+    normal map suggests."""
+    if fit is None or not fit.fits or fit.scale == 0:
         return None
     ratio = factor / fit.scale
+    if 1 / _FAR_OFF <= ratio <= _FAR_OFF:
+        return None
     return (
         f"{path}: its slopes suggest --height-scale {fit.scale:.3g}; the default of {factor:.3g} is "
         f"{ratio:{'.0f' if ratio >= 10 else '.2g'}} times as much"
     )
-
-
-def misses(fit: NormalFit | None, factor: float) -> bool:
-    """Is a height scale over three times, or under a third of, the one that the normal map suggests?"""
-    if fit is None or not fit.fits or fit.scale == 0:
-        return False
-    return not 1 / _FAR_OFF <= factor / fit.scale <= _FAR_OFF
 
 
 def normal_note(
@@ -149,15 +136,9 @@ def normal_note(
     text = f"normal map: {path.name}, {CONVENTION_NAMES[convention]}, {how}"
     if fit is None:
         return text
-    sign = 1.0 if convention == "gl" else -1.0
-    u, v = signed(fit.correlation_u), signed(sign * fit.correlation_v)
-    text += f"; correlation of the slopes u {u}, v {v}"
+    v = fit.correlation_v if convention == "gl" else -fit.correlation_v
+    text += f"; correlation of the slopes u {signed(fit.correlation_u)}, v {signed(v)}"
     if fit.fits:
         own = "the default" if default else "the material file's"
         text += f"; suggested --height-scale {fit.scale:.3g} ({own} is {factor:.3g})"
     return text
-
-
-def holes(opacity: NDArray[np.float64] | float | None) -> float:
-    """Fraction of the tile with an opacity below 0.5."""
-    return 0.0 if opacity is None else float(np.mean(np.asarray(opacity) < 0.5))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from dataclasses import dataclass, field
 from itertools import takewhile
@@ -24,33 +25,26 @@ WORDS: dict[Role, tuple[str, ...]] = {
     "opacity": ("opacity", "alpha", "mask"),
 }
 _ROLES: dict[str, Role] = {word: role for role, words in WORDS.items() for word in words}
+# Words of packed maps → their channels of roughness and metallic.
+_PACKED = {
+    **dict.fromkeys(("arm", "orm", "metallicroughness", "roughnessmetallic"), ("G", "B")),
+    "rma": ("R", "G"),
+}
+_GLOSS = ("gloss", "glossiness")
 # Words of maps that are known but not used, and the reason.
 UNUSED: dict[str, str] = {
     **dict.fromkeys(("ao", "occlusion"), "the simulation computes ambient occlusion"),
-    **dict.fromkeys(
-        ("arm", "orm", "rma", "metallicroughness", "roughnessmetallic"),
-        "name its channels in a material.yaml, as in roughness: {file: …, channel: G}",
-    ),
+    **dict.fromkeys(_PACKED, "name its channels in a material.yaml, as in roughness: {file: …, channel: G}"),
     **dict.fromkeys(("specular", "spec"), "name it in a material.yaml to use it"),
-    **dict.fromkeys(("gloss", "glossiness"), "in a material.yaml it is roughness: {file: …, invert: true}"),
+    **dict.fromkeys(_GLOSS, "in a material.yaml it is roughness: {file: …, invert: true}"),
     **dict.fromkeys(("emissive", "emission", "preview", "thumb"), "mbtf does not use it"),
 }
-# Words of packed maps → their channels of roughness and metallic.
-PACKED: dict[str, dict[Role, str]] = {
-    **{
-        word: {"roughness": "G", "metallic": "B"}
-        for word in ("arm", "orm", "metallicroughness", "roughnessmetallic")
-    },
-    "rma": {"roughness": "R", "metallic": "G"},
-}
-_GLOSS = ("gloss", "glossiness")
-# Neighbouring words that are one.
+# Neighboring words that are one.
 _JOINED = {
     (first, second): "metallicroughness" if second == "roughness" else "roughnessmetallic"
     for metal in ("metallic", "metalness")
     for first, second in ((metal, "roughness"), ("roughness", metal))
 }
-_NAMELESS = "its name matches no map"
 _ARCHIVES = (".zip", ".7z", ".rar", ".tar", ".tgz", ".gz")
 # Names listed in a message.
 _LISTED = 6
@@ -63,12 +57,9 @@ class FoundMaps:
 
     Attributes
     ----------
-    maps : dict of str to Path
-        File of each role.
-    unused : dict of str to str
-        Reason why an image is not used, by file name.
-    notes, warnings : list of str
-        Messages for the user.
+    maps : file of each role
+    unused : reason why an image is not used, by file name
+    notes, warnings : messages for the user
     """
 
     maps: dict[Role, Path] = field(default_factory=dict)
@@ -83,24 +74,12 @@ def tokens(name: str) -> list[str]:
 
 
 def role_of(name: str, shared: int = 0) -> Role | None:
-    """Role of a file by the **last** word of its name that denotes a map.
+    """Role of a file by the **last** word of its name that denotes a map, without `shared` leading words.
 
-    ``metal_plate_disp.png`` contains heights and ``rock_height_mask.png`` opacity.
-
-    Parameters
-    ----------
-    name : str
-        File name.
-    shared : int
-        Number of leading words to ignore, because all files of the folder share them.
-
-    Returns
-    -------
-    str or None
-        None without such a word, or where it denotes a map that is not used.
+    ``metal_plate_disp.png`` contains heights and ``rock_height_mask.png`` opacity. None without such a word,
+    or where it denotes a map that is not used.
     """
-    word = _last_word(name, shared)
-    return _ROLES.get(word) if word else None
+    return _ROLES.get(_last_word(name, shared) or "")
 
 
 def _last_word(name: str, shared: int = 0) -> str | None:
@@ -133,14 +112,6 @@ def find_maps(folder: Path) -> FoundMaps:
     Leading words that all names share are ignored, unless only they denote a height map: of ``Metal004.png``
     and ``Metal004_Color.png`` the former is a picture of the material. An OpenGL normal map is preferred.
 
-    Parameters
-    ----------
-    folder : Path
-
-    Returns
-    -------
-    FoundMaps
-
     Raises
     ------
     InputError
@@ -161,11 +132,11 @@ def find_maps(folder: Path) -> FoundMaps:
     candidates: dict[Role, list[Path]] = {}
     unused: dict[str, str] = {}
     for path in files:
-        role, word = role_of(path.name, shared), _last_word(path.name, shared)
-        if role is not None:
-            candidates.setdefault(role, []).append(path)
+        word = _last_word(path.name, shared)
+        if word in _ROLES:
+            candidates.setdefault(_ROLES[word], []).append(path)
         else:
-            unused[path.name] = UNUSED[word] if word is not None else _NAMELESS
+            unused[path.name] = UNUSED.get(word or "", "its name matches no map")
     normals = candidates.get("normal", [])
     gl = [p for p in normals if normal_convention(p.name) == "gl"]
     if len(normals) > 1 and len(gl) == 1:
@@ -179,7 +150,7 @@ def find_maps(folder: Path) -> FoundMaps:
                 hint="remove one, or say which is meant in a material.yaml",
             )
     maps = {role: paths[0] for role, paths in candidates.items()}
-    lost = (_lost_warning(p, _last_word(p.name, shared), maps) for p in files if p.name in unused)
+    lost = (_lost_warning(folder / name, _last_word(name, shared), maps) for name in unused)
     notes = [f"{name} is not used: {why}" for name, why in unused.items()]
     return FoundMaps(maps, unused, notes, [text for text in lost if text is not None])
 
@@ -189,10 +160,6 @@ def unpack(path: Path) -> str:
     return f"unpack {path.name} and give its folder" if path.suffix.lower() in _ARCHIVES else ""
 
 
-def _images(folder: Path) -> list[Path]:
-    return [p for p in _content(folder) if p.is_file() and is_image(p)]
-
-
 def _content(folder: Path) -> list[Path]:
     try:
         return sorted(p for p in folder.iterdir() if not p.name.startswith("."))
@@ -200,17 +167,18 @@ def _content(folder: Path) -> list[Path]:
         raise InputError(f"cannot be read ({error.strerror})", where=folder) from None
 
 
+def _images(folder: Path) -> list[Path]:
+    return [p for p in _content(folder) if p.is_file() and is_image(p)]
+
+
 def _elsewhere(folder: Path) -> str:
     """Hint at another place of the maps: an archive, or a subfolder with a height map."""
     content = _content(folder)
     for below in (p for p in content if p.is_dir()):
-        try:
-            held = _images(below)
-        except InputError:
-            continue
-        if any(role_of(p.name) == "height" for p in held):
-            return f"did you mean '{below}'?"
-    return next((unpack(p) for p in content if p.is_file() and unpack(p)), "")
+        with contextlib.suppress(InputError):
+            if any(role_of(p.name) == "height" for p in _images(below)):
+                return f"did you mean '{below}'?"
+    return next(filter(None, map(unpack, content)), "")
 
 
 def _no_heights(folder: Path, files: list[Path], shared: int) -> InputError:
@@ -230,15 +198,17 @@ def _no_heights(folder: Path, files: list[Path], shared: int) -> InputError:
 
 def _lost_warning(path: Path, word: str | None, maps: dict[Role, Path]) -> str | None:
     """The warning that an unused image contains a missing map."""
-    options = {role: f"channel: {channel}" for role, channel in PACKED.get(word or "", {}).items()}
-    if word in _GLOSS:
+    options: dict[Role, str] = {}
+    if word in _PACKED:
+        roughness, metallic = _PACKED[word]
+        options = {"roughness": f"channel: {roughness}", "metallic": f"channel: {metallic}"}
+    elif word in _GLOSS:
         options = {"roughness": "invert: true"}
-    entries = {r: f"{{file: {path.name}, {option}}}" for r, option in options.items() if r not in maps}
+    entries = [f"{r}: {{file: {path.name}, {option}}}" for r, option in options.items() if r not in maps]
     if not entries:
         return None
     lambert = "roughness" not in maps and "metallic" not in maps
     return (
         f"{path}: is not used, {'so that the surface is Lambert' if lambert else 'and its map is missing'}; "
-        "a material.yaml that names all maps can use it: "
-        + ", ".join(f"{r}: {e}" for r, e in entries.items())
+        f"a material.yaml that names all maps can use it: {', '.join(entries)}"
     )

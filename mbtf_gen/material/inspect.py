@@ -1,32 +1,45 @@
-"""Statistics of a material for ``mbtf-gen inspect``."""
+"""Statistics of a material for ``mbtf-gen inspect``, as data and as text."""
 
 from __future__ import annotations
 
+import textwrap
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mbtf_core.color import linear_to_srgb
 from mbtf_gen.geometry.slope_statistics import detail_size, repeats, rms_slope, slope_angles
 from mbtf_gen.images.read import LUMINANCE
-from mbtf_gen.material.checks import misses
-from mbtf_gen.material.material import MAPS, Material
+from mbtf_gen.material.checks import CONVENTION_NAMES, signed
+from mbtf_gen.material.material import MAPS, Material, layers_above
 from mbtf_gen.material.tiling import broken
 
 # Luminance from charcoal to fresh snow; outside, a color map is probably not albedo.
 ALBEDO_RANGE = (0.02, 0.95)
-# A color map that varies by less (RMS of the sRGB-encoded channels) is almost one color.
-_CONSTANT = 0.05
-# Half width of the autocorrelation, in texels, below which detail is reported as fine.
-_FINE = 4.0
 # Fraction of the map's RMS slope below which a mesh is reported.
 _KEPT = 0.9
 # Texels above which few distinct floats indicate quantization.
 _MANY = 4096
-# Levels below which 8-bit heights are reported.
-_FEW_LEVELS = 128
+# Width to which long texts are wrapped.
+_WIDTH = 100
+
+# What each map does to the simulation.
+USES = {
+    "height": "displaces the mesh",
+    "base_color": "reflectance",
+    "roughness": "width of the specular lobe",
+    "metallic": "fraction of metal",
+    "specular": "strength of the dielectric lobe",
+    "clearcoat": "weight of the clear coat",
+    "clearcoat_roughness": "roughness of the clear coat",
+    "sheen": "weight of the sheen",
+    "sheen_color": "color of the sheen",
+    "sheen_roughness": "roughness of the sheen",
+    "normal": "slopes that the mesh lacks",
+    "opacity": "holes",
+}
+_KINDS = {1: "gray", 2: "gray+alpha", 3: "RGB", 4: "RGBA"}
 
 
 def inspect_material(
@@ -46,24 +59,25 @@ def inspect_material(
         Plain data; ``oddities`` lists unusual properties in words.
     """
     grid = material.grid(height, mesh)
-    factor = material.height_scale if height is None else height
-    full = material.grid(height, material.height.shape[1])
     median, high, steepest = slope_angles(grid)
-    whole = rms_slope(full)
-    default = "material" if material.height_given else "default"
+    whole = rms_slope(material.grid(height, material.height.shape[1]))
+    source = "material file" if material.height_given else "default"
+    constants = {role: getattr(material, role) for role in MAPS if role not in ("height", "normal")}
+    if material.bsdf is not None:
+        del constants["base_color"]
     found: dict[str, Any] = {
         "aspect": material.aspect,
         "tile": material.tile,
-        "maps": {
-            role: {**asdict(facts), "file": str(facts.file), "names": list(facts.names)}
-            for role, facts in material.facts.items()
+        "maps": {role: {**asdict(f), "file": str(f.file)} for role, f in material.facts.items()},
+        "constants": {
+            role: np.asarray(value).tolist()
+            for role, value in constants.items()
+            if value is not None and np.ndim(value) < 2
         },
-        "constants": _constants(material),
-        "surface": _surface(material),
+        "surface": material.bsdf["type"] if material.bsdf else "diffuse" if material.is_lambert else "glossy",
         "geometry": {
-            "height": factor,
-            "material_height": material.height_scale,
-            "height_from": default if height is None else "asked",
+            "height": material.height_scale if height is None else height,
+            "height_from": source if height is None else "--height-scale",
             "map": list(material.height.shape),
             "mesh": list(grid.z.shape),
             "relief": abs(grid.displacement_range),
@@ -75,43 +89,18 @@ def inspect_material(
         "heights": {
             "codes": None if material.codes is None else asdict(material.codes),
             "distinct": len(np.unique(material.height)),
-            "low": float(material.height.min()),
-            "high": float(material.height.max()),
-            "rms_step": _rms_step(material),
             "detail_texels": detail_size(material.height),
             "repeats": [repeats(material.height, axis) for axis in (1, 0)],
         },
         "tiling": [{**asdict(s), "ratio": s.ratio, "tiles": not broken(s)} for s in material.seams],
         "albedo": _albedo(material),
-        "normal": _normal(material, factor),
+        "normal": _normal(material),
         "opacity": _opacity(material),
         "unused": material.unused,
         "warnings": list(material.warnings_at(height)),
         "notes": list(material.notes),
     }
-    warned = found["geometry"]["height_from"] == "default" and misses(material.normal_fit, factor)
-    suggested = [] if warned else _suggestion_oddity(found)
-    return {**found, "oddities": [*_oddities(found), *_surface_oddities(found), *suggested]}
-
-
-def _rms_step(material: Material) -> float:
-    """Root mean square difference of neighboring columns, relative to the range of the heights."""
-    steps = np.roll(material.height, -1, 1) - material.height
-    extent = float(np.ptp(material.height))
-    return float(np.sqrt(np.mean(steps**2))) / extent if extent > 0 else 0.0
-
-
-def _constants(material: Material) -> dict[str, Any]:
-    """What is one number or color for the whole tile."""
-    roles = (r for r in MAPS if r not in ("height", "normal"))
-    values = {r: getattr(material, r) for r in roles if r != "base_color" or material.bsdf is None}
-    return {n: np.asarray(v).tolist() for n, v in values.items() if v is not None and np.ndim(v) < 2}
-
-
-def _surface(material: Material) -> str:
-    if material.bsdf is not None:
-        return str(material.bsdf["type"])
-    return "diffuse" if material.is_lambert else "glossy"
+    return {**found, "oddities": _oddities(found)}
 
 
 def _albedo(material: Material) -> dict[str, Any] | None:
@@ -119,38 +108,29 @@ def _albedo(material: Material) -> dict[str, Any] | None:
         return None
     color = np.asarray(material.base_color, np.float64)
     luminance = color @ np.asarray(LUMINANCE)
-    mean = color.reshape(-1, 3).mean(axis=0)
-    encoded = np.asarray(linear_to_srgb(color), np.float64)
-    spread = float(np.sqrt(np.mean((encoded - encoded.reshape(-1, 3).mean(axis=0)) ** 2)))
     low, high = ALBEDO_RANGE
     return {
         "min": float(luminance.min()),
         "median": float(np.median(luminance)),
         "max": float(luminance.max()),
-        "mean_rgb": mean.tolist(),
-        "spread_srgb": spread,
+        "mean_rgb": color.reshape(-1, 3).mean(axis=0).tolist(),
         "share_above": float(np.mean(luminance > high)),
         "share_below": float(np.mean(luminance < low)),
-        "plausible": [low, high],
-        "given": "base_color" in material.facts,
     }
 
 
-def _normal(material: Material, factor: float) -> dict[str, Any] | None:
+def _normal(material: Material) -> dict[str, Any] | None:
     if material.normal is None:
         return None
-    out: dict[str, Any] = {"convention": material.normal_convention}
     tilt = np.degrees(np.arccos(np.clip(material.normal[..., 2], -1.0, 1.0)))
-    out["tilt_median_deg"], out["tilt_p99_deg"] = (float(p) for p in np.percentile(tilt, (50, 99)))
+    median, high = (float(p) for p in np.percentile(tilt, (50, 99)))
+    out: dict[str, Any] = {"tilt_median_deg": median, "tilt_p99_deg": high}
     fit = material.normal_fit
     if fit is not None:
         sign = 1.0 if material.normal_convention == "gl" else -1.0
-        shown = asdict(fit)
-        out |= {**shown, "convention": material.normal_convention, "shown_convention": shown["convention"]}
-        out["correlation_v"] = sign * fit.correlation_v
+        out |= {**asdict(fit), "correlation_v": sign * fit.correlation_v}
         out["suggested_height"] = fit.scale if fit.fits else None
-        out["height_in_use"] = factor
-    return out
+    return {**out, "convention": material.normal_convention}
 
 
 def _opacity(material: Material) -> dict[str, Any] | None:
@@ -165,74 +145,138 @@ def _opacity(material: Material) -> dict[str, Any] | None:
 
 def _oddities(found: dict[str, Any]) -> list[str]:
     out = []
-    height, heights, geometry = found["maps"]["height"], found["heights"], found["geometry"]
-    rows, columns = height["rows"], height["columns"]
-    if rows != columns:
-        out.append(f"the tile is not square: {columns} x {rows} texels, 1 wide and {found['aspect']:g} high")
-    if height["channels"] > 1:
-        out.append(f"{Path(height['file']).name}: gray stored in {height['channels']} channels")
-    codes = heights["codes"]
-    if codes is not None and height["bits"] == 8 and 1 < codes["levels"] < _FEW_LEVELS:
+    file, distinct, geometry = found["maps"]["height"], found["heights"]["distinct"], found["geometry"]
+    if file["bits"] is None and 1 < distinct <= 256 and file["rows"] * file["columns"] > _MANY:
         out.append(
-            f"heights have only {codes['levels']} distinct values, codes {codes['low']} to {codes['high']}"
+            f"heights are floats with only {distinct} distinct values: terraces, if they were once integers"
         )
-    if height["bits"] is None and 1 < heights["distinct"] <= 256 and rows * columns > _MANY:
-        out.append(
-            f"heights are floats with only {heights['distinct']} distinct values: "
-            "if they were converted from integers, "
-            "they form terraces"
-        )
-    if Path(height["file"]).suffix.lower() in (".jpg", ".jpeg"):
+    if Path(file["file"]).suffix.lower() in (".jpg", ".jpeg"):
         out.append("heights come from a JPG: its compression is part of the surface")
-    if geometry["relief"] > 0 and heights["detail_texels"] < _FINE:
-        out.append(
-            f"fine detail: the correlation of heights falls to half within "
-            f"{heights['detail_texels']:.1f} texels, "
-            f"RMS step {heights['rms_step']:.0%} of the range per texel"
-        )
-    if max(heights["repeats"]) > 1:
-        u, v = heights["repeats"]
-        out.append(f"the heights repeat {u} x {v} times (u x v) within the tile")
     if geometry["slope_kept"] < _KEPT:
+        kept, columns = geometry["slope_kept"], geometry["map"][1]
+        out.append(f"the mesh keeps {kept:.0%} of the map's RMS slope; --mesh {columns} keeps all")
+    albedo = found["albedo"] or {"share_above": 0.0, "share_below": 0.0}
+    low, high = ALBEDO_RANGE
+    if albedo["share_above"] > 0:
+        out.append(f"{albedo['share_above']:.2%} of the albedo lies above {high}: brighter than snow")
+    if albedo["share_below"] > 0.5:
+        out.append(f"{albedo['share_below']:.0%} of the albedo lies below {low}: blacker than coal")
+    return out
+
+
+def inspection_text(found: dict[str, Any], name: str) -> str:
+    """The data of :func:`inspect_material` as text for people."""
+    surface = found["surface"] + layers_above({*found["maps"], *found["constants"]})
+    lines = [
+        f"{name}: tile 1 x {found['aspect']:g}, surface {surface}, make-tileable {found['tile']}",
+        "",
+        *_maps(found),
+        *_unused(found),
+        "",
+        *_geometry(found),
+        *_color(found),
+        *_normals(found),
+    ]
+    # Warnings without the folders of their files, which the heading names.
+    warnings = [
+        f"{Path(path).name}: {rest}" for path, _, rest in (w.partition(": ") for w in found["warnings"])
+    ]
+    for title, texts in (("warnings", warnings), ("remarks", found["oddities"])):
+        lines += ["", title] if texts else []
+        for text in texts:
+            lines += textwrap.wrap(text, _WIDTH, initial_indent="  - ", subsequent_indent="    ")
+    return "\n".join(lines)
+
+
+def _maps(found: dict[str, Any]) -> list[str]:
+    rows = [["map", "file", "size", "kind", "use"]]
+    for role, facts in found["maps"].items():
+        if role.startswith("bsdf"):
+            continue
+        name = Path(facts["file"]).name + (f"[{','.join(facts['names'])}]" if facts["names"] else "")
+        depth = "float" if facts["bits"] is None else f"{facts['bits']}-bit"
+        decoded = ", sRGB decoded" if facts["colorspace"] == "srgb" else ""
+        linear = ", linear" if role == "base_color" and not decoded else ""
+        size, kind = f"{facts['columns']}x{facts['rows']}", f"{depth} {_KINDS[facts['channels']]}"
+        rows.append([role, name, size, kind, USES[role] + decoded + linear])
+    for role, value in found["constants"].items():
+        if role not in found["maps"]:
+            shown = ", ".join(f"{number:.3g}" for number in np.atleast_1d(value))
+            rows.append([role, f"constant {shown}", "", "", USES[role]])
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    padded = (map(str.ljust, row, widths) for row in rows)
+    return [" ".join(cells).rstrip() for cells in padded]
+
+
+def _unused(found: dict[str, Any]) -> list[str]:
+    """Images of the folder that are not used, those of one reason together."""
+    reasons: dict[str, list[str]] = {}
+    for name, why in found["unused"].items():
+        reasons.setdefault(why, []).append(name)
+    out = []
+    for why, names in reasons.items():
+        text = f"{', '.join(names)}: {why}"
+        out += textwrap.wrap(text, _WIDTH, initial_indent="not used   ", subsequent_indent=" " * 11)
+    return out
+
+
+def _geometry(found: dict[str, Any]) -> list[str]:
+    g, h, file = found["geometry"], found["heights"], found["maps"]["height"]
+    u, v = h["repeats"]
+    out = [
+        f"height     scale {g['height']:.4g} ({g['height_from']}), stored {file['low']:.4g} .. "
+        f"{file['high']:.4g}, displacement range {g['relief']:.4g} tile widths",
+        f"mesh       {g['mesh'][1]} x {g['mesh'][0]} of {g['map'][1]} x {g['map'][0]} texels, keeps "
+        f"{g['slope_kept']:.0%} of the map's RMS slope",
+        f"slopes     median {g['slope_median_deg']:.1f}°, 99th percentile {g['slope_p99_deg']:.1f}°, "
+        f"steepest {g['slope_max_deg']:.1f}°",
+        f"detail     the correlation of heights falls to half within {h['detail_texels']:.1f} texels"
+        + (f"; repeats {u} x {v} times" if max(u, v) > 1 else ""),
+    ]
+    if (codes := h["codes"]) is not None:
+        apart = f", {codes['spacing']:.4g} codes apart" if codes["spacing"] > 1 else ""
+        out.append(f"values     {codes['levels']} distinct, codes {codes['low']} .. {codes['high']}{apart}")
+    if found["tiling"]:
+        seams = "; ".join(
+            f"along {t['axis']} {'tiles' if t['tiles'] else 'DOES NOT TILE'} ({t['ratio']:.2f})"
+            for t in found["tiling"]
+        )
+        out.append(f"tiling     {seams} (seam / 99th percentile of steps inside)")
+    return out
+
+
+def _color(found: dict[str, Any]) -> list[str]:
+    out = []
+    if (a := found["albedo"]) is not None:
+        mean = " ".join(f"{c:.2f}" for c in a["mean_rgb"])
+        luminance = f"{a['min']:.3f} .. {a['max']:.3f}, median {a['median']:.3f}"
+        out.append(f"albedo     mean {mean}, luminance {luminance}")
+    if (o := found["opacity"]) is not None:
+        out.append(f"opacity    holes {o['holes']:.1%} of the tile, partly transparent {o['partly']:.1%}")
+    return out
+
+
+def _normals(found: dict[str, Any]) -> list[str]:
+    n = found["normal"]
+    if n is None:
+        return []
+    tilt = (
+        f"normals    {CONVENTION_NAMES[n['convention']]}, tilt median {n['tilt_median_deg']:.1f}°, "
+        f"99th percentile {n['tilt_p99_deg']:.1f}°"
+    )
+    if "best" not in n:
+        return [f"{tilt}; nothing to compare with the heights"]
+    out = [
+        tilt,
+        f"           correlation with the heights' slopes: u {signed(n['correlation_u'])}, "
+        f"v {signed(n['correlation_v'])}; OpenGL {n['gl']:.2f}, DirectX {n['dx']:.2f}",
+    ]
+    if n["misfit"]:
+        how = f"the {n['image']} map {n['turn']}" if n["turn"] else "heights upside down"
+        out.append(f"           DOES NOT FIT; fits with {how}: correlation {n['best']:.2f}")
+    elif n["suggested_height"] is not None:
         out.append(
-            f"the mesh keeps {geometry['slope_kept']:.0%} of the map's RMS slope; "
-            f"--mesh {geometry['map'][1]} keeps all"
+            f"           the normal map suggests the height scale {n['suggested_height']:.3g}; "
+            f"in use {found['geometry']['height']:.3g}"
         )
     return out
-
-
-def _surface_oddities(found: dict[str, Any]) -> list[str]:
-    out = []
-    albedo, opacity = found["albedo"], found["opacity"]
-    if albedo is not None:
-        if not albedo["given"] and "base_color" in found["constants"]:
-            shown = ", ".join(f"{c:.3g}" for c in albedo["mean_rgb"])
-            out.append(f"no base color map: linear RGB {shown} everywhere")
-        elif albedo["given"] and albedo["spread_srgb"] < _CONSTANT:
-            codes = 255.0 * albedo["spread_srgb"]
-            out.append(f"the base color is almost constant: {codes:.1f} of 255 codes RMS")
-        if albedo["share_above"] > 0:
-            out.append(
-                f"{albedo['share_above']:.2%} of the albedo lies above {ALBEDO_RANGE[1]}: brighter than snow"
-            )
-        if albedo["share_below"] > 0.5:
-            out.append(
-                f"{albedo['share_below']:.0%} of the albedo lies below {ALBEDO_RANGE[0]}: blacker than coal"
-            )
-    metallic = found["maps"].get("metallic")
-    if metallic is not None and metallic["low"] < metallic["high"]:
-        low, high = metallic["low"], metallic["high"]
-        out.append(f"metallic varies from {low:.2g} to {high:.2g}: metal and dielectric mixed")
-    if opacity is not None and opacity["holes"] > 0:
-        out.append(f"holes: {opacity['holes']:.1%} of the tile is see-through")
-    return out
-
-
-def _suggestion_oddity(found: dict[str, Any]) -> list[str]:
-    suggested = None if found["normal"] is None else found["normal"].get("suggested_height")
-    if not suggested:
-        return []
-    ratio = found["geometry"]["height"] / suggested
-    if 0.8 < ratio < 1.25:
-        return []
-    return [f"the height scale in use is {ratio:.3g} times the {suggested:.3g} that the normal map suggests"]

@@ -10,18 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.color import srgb_to_linear
-from mbtf_core.digest import file_sha256
 from mbtf_core.errors import InputError
 from mbtf_gen.images.metadata import ColorSpace
 from mbtf_gen.images.read import Image, count_and_first, gray, read_image
-from mbtf_gen.material.discovery import Convention, role_of
+from mbtf_gen.material.discovery import role_of
 from mbtf_gen.material.spec import ColorEntry, HeightEntry, NormalEntry, ShareEntry
 
 Color = NDArray[np.floating[Any]]
 Share = NDArray[np.float64] | float | None
 
-# Linear gray where no base color is given.
-DEFAULT_COLOR = 0.5
 _ROUNDING = 1e-6
 # Float normals this far below 0 are signed, not (n+1)/2.
 _SIGNED = -0.05
@@ -41,19 +38,11 @@ class MapFacts:
 
     Attributes
     ----------
-    file : Path
-    rows, columns : int
-        Size of the image.
-    bits : int or None
-        8 or 16 for integers, None for floats.
-    channels : int
-        Number of selected channels.
-    names : tuple of str
-        Their names, where the file has others.
-    low, high : float
-        Smallest and largest stored number of these channels, without alpha.
-    colorspace : {"linear", "srgb"}
-        Color space that the numbers were read in.
+    bits : 8 or 16 for integers, None for floats
+    channels : number of selected channels
+    names : their names, where the file has others
+    low, high : smallest and largest stored number of these channels, without alpha
+    colorspace : in which the numbers were read
     """
 
     file: Path
@@ -92,11 +81,11 @@ class MapLoader:
         """Read the file of a role, of one pixel or of the heights' aspect."""
         path = self.folder / str(entry.file)
         image = read_image(path, entry.channel, lambda label: role_of(label) == role)
-        rows, columns = image.shape
-        used = image.pixels[..., :-1] if image.pixels.shape[2] in (2, 4) else image.pixels
+        count = image.pixels.shape[2]
+        used = image.pixels[..., :-1] if count in (2, 4) else image.pixels
+        low, high = float(used.min()), float(used.max())
         self.files[role] = path
-        low, high, count = float(used.min()), float(used.max()), image.pixels.shape[2]
-        self.facts[role] = MapFacts(path, rows, columns, image.bits, count, image.channels, low, high, space)
+        self.facts[role] = MapFacts(path, *image.shape, image.bits, count, image.channels, low, high, space)
         if entry.channel is not None:
             self.settings[f"{role}.channel"] = entry.channel
         elif image.channels:
@@ -106,8 +95,8 @@ class MapLoader:
                 f"{path}: its EXIF orientation ({image.tags.orientation}) is ignored, as for every map; "
                 "save it upright if it looks turned"
             )
-        if role != "height" and image.shape != (1, 1):
-            self._check_aspect(path, rows, columns)
+        if image.shape != (1, 1):
+            self._check_aspect(path, *image.shape)
         return image
 
     def _check_aspect(self, path: Path, rows: int, columns: int) -> None:
@@ -143,13 +132,6 @@ class MapLoader:
         if entry.colorspace == "srgb" or entry.invert:
             self.settings[f"{role}.encoding"] = [entry.colorspace, entry.invert]
         return float(numbers[0, 0]) if numbers.shape == (1, 1) else numbers
-
-    def base_color(self, entry: ColorEntry | None) -> Color:
-        """(h, w, 3) or (3,) linear base color; gray where none is given."""
-        if entry is None:
-            self.notes.append(f"base color: {DEFAULT_COLOR} gray, none is given")
-            return np.full(3, DEFAULT_COLOR)
-        return self.color("base_color", entry)
 
     def color(self, role: str, entry: ColorEntry) -> Color:
         """(h, w, 3) or (3,) linear color."""
@@ -205,16 +187,7 @@ class MapLoader:
         up = np.array([0.0, 0.0, 1.0], np.float32)
         return np.where(length > 1e-6, vectors / np.maximum(length, 1e-6), up).astype(np.float32)
 
-    def turned_green(self, vectors: NDArray[np.float32], convention: Convention) -> NDArray[np.float32]:
-        """Vectors of :meth:`normals` in the map's convention: y changes its sign for DirectX."""
-        self.settings["normal"] = convention
-        return vectors * np.array([1.0, 1.0 if convention == "gl" else -1.0, 1.0], np.float32)
-
     def _within(self, role: str, numbers: Any, bad: Any) -> Any:
         if bad.any():
             raise InputError(f"{count_and_first(bad)} outside [0, 1]", where=self.files[role])
         return np.clip(numbers, 0.0, 1.0)
-
-    def digests(self) -> dict[str, str]:
-        """role → SHA-256 of the file."""
-        return {role: file_sha256(path) for role, path in self.files.items()}

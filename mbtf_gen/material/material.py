@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import contextlib
+import json
+from collections.abc import Container
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +15,7 @@ from numpy.typing import NDArray
 from mbtf_core.color import srgb_to_linear
 from mbtf_core.digest import data_sha256, file_sha256
 from mbtf_core.errors import InputError
+from mbtf_core.shard_schema import Tiling
 from mbtf_core.suggest import suggest_path
 from mbtf_gen.geometry.heightfield import HeightGrid
 from mbtf_gen.images.read import MAX_PIXELS, SUFFIXES, gray, is_image
@@ -20,28 +23,29 @@ from mbtf_gen.images.resample import dequantize, resample
 from mbtf_gen.material.checks import (
     choose_convention,
     coarse_step,
-    holes,
-    level_remark,
+    level_warning,
     normal_note,
     orientation_warning,
-    range_warning,
     refuse_color,
     seam_warning,
     suggestion_warning,
 )
 from mbtf_gen.material.discovery import Convention, FoundMaps, find_maps, normal_convention, unpack
-from mbtf_gen.material.loader import DEFAULT_COLOR, Color, MapFacts, MapLoader, Share
+from mbtf_gen.material.loader import Color, MapFacts, MapLoader, Share
 from mbtf_gen.material.normal_map import NormalFit, fit_normals
 from mbtf_gen.material.quantization import Codes, code_use
-from mbtf_gen.material.spec import MaterialFile, NormalEntry, plain, read_material_file
-from mbtf_gen.material.tiling import Seam, Tiling, retile, seams, tiling_note
+from mbtf_gen.material.spec import MaterialFile, NormalEntry, read_material_file
+from mbtf_gen.material.tiling import BAND, Seam, retile, seams
 
 # Tile widths per stored height: the range of integer images is unknown, floats are in tile widths.
-INTEGER_SCALE = 0.05
-FLOAT_SCALE = 1.0
+_INTEGER_SCALE, _FLOAT_SCALE = 0.05, 1.0
+# Displacement range, in tile widths, above which a default height scale is probably wrong.
+_STEEP = 0.5
 # Defaults of a glossy surface, and of the roughness of its layers.
 _LOBES = {"roughness": 0.5, "metallic": 0.0, "specular": 0.5}
 _LAYER_ROUGHNESS = {"clearcoat": 0.1, "sheen": 0.3}
+# Linear gray where no base color is given.
+_DEFAULT_COLOR = 0.5
 # Default limit of the mesh cells across the tile.
 DEFAULT_MESH = 512
 # Attributes of a material that may be maps.
@@ -64,37 +68,29 @@ class Material:
         Stored heights: code / largest code of integer images, unchanged numbers of float images. Quantized
         heights are smoothed within half a level; heights of a mirrored tile are halved.
     height_scale : float
-        Tile widths per stored height, from the material file or the default.
-    height_given : bool
-        True where the material file states `height_scale`.
+        Tile widths per stored height, from the material file (then `height_given` is True) or the default.
     height_bits : int or None
         8 or 16; None for floats.
-    base_color : (h, w, 3) or (3,) array
-        Linear Rec.709 in [0, 1].
+    base_color, sheen_color : (h, w, 3) or (3,) array
+        Linear Rec.709 in [0, 1]; `sheen_color` is None for white, or without a sheen.
     roughness, metallic, specular : (h, w) float64 array, float or None
         In [0, 1]; all three are None for a Lambert surface.
-    clearcoat, clearcoat_roughness : (h, w) float64 array, float or None
-        Weight and roughness of the clear coat in [0, 1]; None without one.
-    sheen, sheen_roughness : (h, w) float64 array, float or None
-        Weight and roughness of the sheen in [0, 1]; None without one.
-    sheen_color : (h, w, 3) or (3,) array or None
-        Linear Rec.709 in [0, 1]; None for white, or without a sheen.
+    clearcoat, clearcoat_roughness, sheen, sheen_roughness : (h, w) float64 array, float or None
+        Weight and roughness of each layer in [0, 1]; None without it.
     normal : (h, w, 3) float32 array or None
         Unit vectors, x along u and y along v (OpenGL); None without a normal map.
     opacity : (h, w) float64 array, float or None
         In [0, 1]; None for an opaque material.
     bsdf : dict or None
         Mitsuba dictionary that replaces the reflectance maps.
-    files : dict of str to Path
-        File of each role.
+    files, facts : dict of str to Path, dict of str to MapFacts
+        File of each role, and its content.
     digests : dict of str to str
         SHA-256 of each role's file; ``settings`` covers all other inputs that change the data.
     warnings, notes : tuple of str
         Warnings that apply at any height scale, and remarks.
     unused : dict of str to str
         Reason why an image of the folder is not used, by file name.
-    facts : dict of str to MapFacts
-        Content of each role's file.
     codes : Codes or None
         Distribution of integer height codes; None for floats.
     seams : tuple of Seam
@@ -146,25 +142,18 @@ class Material:
         return self.bsdf is None and all(getattr(self, role) is None for role in _LOBES)
 
     def warnings_at(self, height: float | None = None) -> tuple[str, ...]:
-        """Warnings at a height scale.
-
-        Parameters
-        ----------
-        height : float or None
-            Height scale that the user gave. None: `height_scale`, with a warning where that is an unlikely
-            default.
-
-        Returns
-        -------
-        tuple of str
-        """
+        """Warnings at a height scale that the user gave; by default at the material's own."""
         path, extent = self.files["height"], float(np.ptp(self.height))
-        text = f"{path}: its heights are constant: the tile is flat" if extent == 0 else None
-        if extent != 0 and height is None and not self.height_given:
+        text = None
+        if extent == 0:
+            text = f"{path}: its heights are constant: the tile is flat"
+        elif height is None and not self.height_given:
             if "normal" in self.files:
                 text = suggestion_warning(self.files["normal"], self.normal_fit, self.height_scale)
-            text = text or range_warning(path, abs(self.height_scale) * extent)
-        return (*self.warnings, *([text] if text else []))
+            extent *= abs(self.height_scale)
+            if text is None and extent > _STEEP:
+                text = f"{path}: the displacement range is {extent:.4g} tile widths; check --height-scale"
+        return self.warnings if text is None else (*self.warnings, text)
 
     def grid(self, height: float | None = None, mesh: int | None = None) -> HeightGrid:
         """Resample the heights to the grid of the mesh.
@@ -235,18 +224,21 @@ def _described(path: Path) -> tuple[MaterialFile, Path, FoundMaps]:
             hint=unpack(path) or f"give a folder, a .yaml file, or {', '.join(SUFFIXES)}",
         )
     spec = MaterialFile.model_validate({"height": path.name})
-    return spec, path.parent, FoundMaps(notes=list(_siblings(path)))
-
-
-def _siblings(path: Path) -> Iterator[str]:
-    """The hint that the folder of a height map contains more maps."""
-    try:
+    notes = []
+    with contextlib.suppress(InputError):
         others = {role: file for role, file in find_maps(path.parent).maps.items() if file != path}
-    except InputError:
-        return
-    if others and "height" not in others:
-        names = ", ".join(file.name for file in others.values())
-        yield f"only the heights of {path.name} are used; for {names} too, give the folder {path.parent}"
+        if others and "height" not in others:
+            names = ", ".join(file.name for file in others.values())
+            notes = [
+                f"only the heights of {path.name} are used; for {names} too, give the folder {path.parent}"
+            ]
+    return spec, path.parent, FoundMaps(notes=notes)
+
+
+def layers_above(given: Container[str]) -> str:
+    """``" under a clear coat and a sheen"``, as far as they are among the given roles."""
+    texts = [text for role, text in (("clearcoat", "a clear coat"), ("sheen", "a sheen")) if role in given]
+    return f" under {' and '.join(texts)}" if texts else ""
 
 
 def _assemble(spec: MaterialFile, folder: Path, found: FoundMaps, tile: Tiling) -> Material:
@@ -262,38 +254,41 @@ def _assemble(spec: MaterialFile, folder: Path, found: FoundMaps, tile: Tiling) 
     if spec.bsdf is not None:
         load.notes.append(f"surface: the BSDF '{spec.bsdf['type']}' of the material file")
     elif all(value is None for value in maps.values()):
-        layers = [text for text, on in (("a clear coat", spec.clearcoat), ("a sheen", spec.sheen)) if on]
-        under = f" under {' and '.join(layers)}" if layers else ""
+        under = layers_above({layer for layer in _LAYER_ROUGHNESS if getattr(spec, layer) is not None})
         load.notes.append(f"surface: Lambert{under}, because no roughness, metallic or specular is given")
     else:
         constants = {role: value for role, value in _LOBES.items() if maps[role] is None}
         maps |= constants
         filled = ", ".join(f"{role} {value}" for role, value in constants.items())
         load.notes.append(f"surface: glossy{'; default ' + filled if filled else ''}")
-    maps["base_color"] = load.base_color(spec.base_color) if spec.bsdf is None else np.full(3, DEFAULT_COLOR)
+    maps["base_color"] = np.full(3, _DEFAULT_COLOR)
+    if spec.base_color is not None:
+        maps["base_color"] = load.color("base_color", spec.base_color)
+    elif spec.bsdf is None:
+        load.notes.append(f"base color: {_DEFAULT_COLOR} gray, none is given")
     convention, fit = None, None
     if spec.normal is not None:
         maps["normal"], convention, fit = _normals(spec, spec.normal, load, height, scale)
     maps["opacity"] = load.share("opacity", spec.opacity)
     if maps["opacity"] is not None:
-        load.notes.append(f"opacity: {holes(maps['opacity']):.0%} of the tile are holes")
+        holes = np.mean(np.asarray(maps["opacity"]) < 0.5)
+        load.notes.append(f"opacity: {holes:.0%} of the tile are holes")
     for layer, roughness in _LAYER_ROUGHNESS.items():
         maps[layer] = load.share(layer, getattr(spec, layer))
         own = load.share(f"{layer}_roughness", getattr(spec, f"{layer}_roughness"))
         maps[f"{layer}_roughness"] = roughness if maps[layer] is not None and own is None else own
     if spec.sheen_color is not None:
         maps["sheen_color"] = load.color("sheen_color", spec.sheen_color)
-    bsdf = None
     if spec.bsdf is not None:
-        bsdf, load.settings["bsdf"] = _bsdf(plain(spec.bsdf), load)
+        maps["bsdf"], load.settings["bsdf"] = _bsdf(spec.bsdf, load)
     if tile != "none":
         load.settings["tile"] = tile
-    digests = {**load.digests(), "settings": data_sha256(load.settings)}
+    digests = {role: file_sha256(path) for role, path in load.files.items()}
+    digests["settings"] = data_sha256(load.settings)
     return Material(
         height=height,
         height_scale=scale,
         height_bits=load.facts["height"].bits,
-        bsdf=bsdf,
         **maps,
         height_given=spec.height.scale is not None,
         files=load.files,
@@ -309,13 +304,8 @@ def _assemble(spec: MaterialFile, folder: Path, found: FoundMaps, tile: Tiling) 
     )
 
 
-def _retiled(material: Material, tile: Tiling) -> Material:
-    """The material with all its maps mirrored or blended.
-
-    Raises
-    ------
-    InputError : the maps are too large to be mirrored, or a BSDF reads textures by itself
-    """
+def _retiled(material: Material, tile: Literal["mirror", "blend"]) -> Material:
+    """The material with all its maps mirrored or blended."""
     folder = material.files["height"].parent
     if any(role.startswith("bsdf.") for role in material.files):
         raise InputError(
@@ -329,8 +319,11 @@ def _retiled(material: Material, tile: Tiling) -> Material:
             where=folder,
             hint="use smaller maps, or --make-tileable blend",
         )
+    note = f"tile: edges cross-faded over {BAND:g} of the tile"
+    if tile == "mirror":
+        note = "tile: 2 x 2 mirrored copies, two images wide, so heights in tile widths are halved"
     maps = retile({name: getattr(material, name) for name in MAPS}, tile)
-    return replace(material, **maps, notes=(*material.notes, tiling_note(tile)), tile=tile)
+    return replace(material, **maps, notes=(*material.notes, note), tile=tile)
 
 
 def _normals(
@@ -341,10 +334,12 @@ def _normals(
     path = load.files["normal"]
     fit = fit_normals(height, vectors)
     convention, how, warning = choose_convention(fit, normal_convention(path.name), entry.convention, path)
-    found = (warning, None if fit is None else orientation_warning(fit, path, load.files["height"]))
-    load.warnings += [text for text in found if text is not None]
+    misfit = None if fit is None else orientation_warning(fit, path, load.files["height"])
+    load.warnings += filter(None, (warning, misfit))
     load.notes.append(normal_note(path, fit, convention, how, scale, spec.height.scale is None))
-    return load.turned_green(vectors, convention), convention, fit
+    load.settings["normal"] = convention
+    green = np.array([1.0, 1.0 if convention == "gl" else -1.0, 1.0], np.float32)
+    return vectors * green, convention, fit
 
 
 def _heights(spec: MaterialFile, load: MapLoader) -> tuple[NDArray[np.float64], Codes | None, float]:
@@ -354,16 +349,15 @@ def _heights(spec: MaterialFile, load: MapLoader) -> tuple[NDArray[np.float64], 
     refuse_color(image)
     height, warnings = gray(image)
     load.warnings += warnings
-    scale = entry.scale
-    if scale is None:
-        scale = FLOAT_SCALE if image.bits is None else INTEGER_SCALE
+    default = _FLOAT_SCALE if image.bits is None else _INTEGER_SCALE
+    scale = default if entry.scale is None else entry.scale
     codes, step = None, None
     if image.bits is not None:
         largest = 2**image.bits - 1
         codes = code_use(np.rint(height * largest))
         step = coarse_step(codes, image.bits)
         if step is not None and codes.levels > 1:
-            load.warnings.append(level_remark(image.path, codes, image.bits, step, entry.dequantize))
+            load.warnings.append(level_warning(image.path, codes, image.bits, step, entry.dequantize))
             if entry.dequantize:
                 height = dequantize(height, step / largest)
     load.settings["height"] = [scale, step if entry.dequantize else None]
@@ -381,24 +375,35 @@ def _heights(spec: MaterialFile, load: MapLoader) -> tuple[NDArray[np.float64], 
 
 def _bsdf(tree: dict[str, Any], load: MapLoader) -> tuple[dict[str, Any], dict[str, Any]]:
     """The BSDF with its file names made absolute, and the same with digests in place of file names."""
-    out: dict[str, Any] = {}
-    nameless: dict[str, Any] = {}
-    for key, value in tree.items():
-        if isinstance(value, dict):
-            out[key], nameless[key] = _bsdf(value, load)
-        elif key == "filename" and isinstance(value, str):
-            try:
-                path = (load.folder / value).resolve()
-                found = path.is_file()
-            except (OSError, ValueError):
-                raise InputError("the bsdf names a file that cannot be", where=load.folder) from None
-            if not found:
-                raise InputError("no such file (named in the bsdf)", where=path, hint=suggest_path(path))
-            load.files[f"bsdf.{sum(r.startswith('bsdf.') for r in load.files)}"] = path
-            out[key], nameless[key] = str(path), file_sha256(path)
-        elif value is None or isinstance(value, str | bool | int | float | list):
-            out[key] = nameless[key] = value
-        else:
-            kind = type(value).__name__
-            raise InputError(f"the bsdf's '{key}' is a {kind}, not text or a number", where=load.folder)
-    return out, nameless
+
+    def refuse(value: Any) -> None:
+        kind = type(value).__name__
+        raise InputError(f"the bsdf holds a {kind}, not text or a number", where=load.folder)
+
+    def resolved(node: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+        out: dict[str, Any] = {}
+        nameless: dict[str, Any] = {}
+        for key, value in node.items():
+            if isinstance(value, dict):
+                out[key], nameless[key] = resolved(value)
+            elif key == "filename" and isinstance(value, str):
+                path = _bsdf_file(value, load)
+                out[key], nameless[key] = str(path), file_sha256(path)
+            else:
+                out[key] = nameless[key] = value
+        return out, nameless
+
+    # The same data in Python's own types, without what a YAML reader attaches.
+    return resolved(json.loads(json.dumps(tree, default=refuse)))
+
+
+def _bsdf_file(name: str, load: MapLoader) -> Path:
+    try:
+        path = (load.folder / name).resolve()
+        found = path.is_file()
+    except (OSError, ValueError):
+        raise InputError("the bsdf names a file that cannot be", where=load.folder) from None
+    if not found:
+        raise InputError("no such file (named in the bsdf)", where=path, hint=suggest_path(path))
+    load.files[f"bsdf.{sum(role.startswith('bsdf.') for role in load.files)}"] = path
+    return path

@@ -17,15 +17,16 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_gen.geometry.slopes import normal_slopes
+from mbtf_gen.geometry.heightfield import HeightGrid
+from mbtf_gen.geometry.slopes import height_slopes, normal_slopes
 from mbtf_gen.images.resample import resample
+from mbtf_gen.material.discovery import Convention
 
-Convention = Literal["gl", "dx"]
 Array = NDArray[np.floating[Any]]
+Turned = Literal["height", "normal"] | None
 
 # What has to be done to an image, as one sees it.
 SYMMETRIES: dict[str, Callable[[Array], Array]] = {
-    "": lambda a: a,
     "turned by 90 degrees counter-clockwise": lambda a: np.rot90(a, 1),
     "turned by 180 degrees": lambda a: np.rot90(a, 2),
     "turned by 90 degrees clockwise": lambda a: np.rot90(a, 3),
@@ -57,9 +58,9 @@ class NormalFit:
     convention : the one of the two that the data show; None where they do not decide
     fits : do the data clearly say that the two belong together as they are?
     misfit : do they clearly say that one is turned or mirrored, or the heights upside down?
-    image, turn, inverted : the best explanation: which image has to be turned or mirrored to fit ("height",
-        "normal", None), how (one of :data:`SYMMETRIES`, empty for not at all), are heights upside down
-    best, runner_up : correlation of the best explanation, and of the next best one that differs from it
+    image, turn : the best explanation: which image has to be turned or mirrored to fit, and how (one of
+        :data:`SYMMETRIES`); None and empty for not at all, where a misfit means heights upside down
+    best : correlation of the best explanation
     scale : factor on the stored heights whose slopes fit the normals best (least squares) as the images are,
         in the better convention; tile widths, signed
     """
@@ -71,11 +72,9 @@ class NormalFit:
     convention: Convention | None
     fits: bool
     misfit: bool
-    image: Literal["height", "normal"] | None
+    image: Turned
     turn: str
-    inverted: bool
     best: float
-    runner_up: float
     scale: float
 
     @property
@@ -84,26 +83,15 @@ class NormalFit:
         return max(self.gl, self.dx)
 
 
-@dataclass(frozen=True)
-class _Guess:
-    score: float
-    image: Literal["height", "normal"] | None
-    turn: str
-    convention: Convention
-    inverted: bool
-
-
 def slopes_of_heights(height: Array) -> Array:
-    """Slopes (2, H-2, W-2) of heights (H, W) along u and y = a·v, by central differences, in stored heights
-    per tile width. The outermost texels are left out: heights need not tile."""
-    along_u = height[1:-1, 2:] - height[1:-1, :-2]
-    along_v = height[:-2, 1:-1] - height[2:, 1:-1]
-    return np.stack([along_u, along_v]) * (0.5 * height.shape[1])
+    """Slopes (2, H-2, W-2) of heights (H, W) along u and y = a·v, in stored heights per tile width. The
+    outermost texels are left out: heights need not tile."""
+    grid = HeightGrid(np.asarray(height, np.float64), height.shape[0] / height.shape[1])
+    return np.moveaxis(height_slopes(grid)[1:-1, 1:-1], -1, 0)
 
 
 def slopes_of_normals(normal: Array) -> Array:
-    """Slopes (2, H-2, W-2) along u and y that normals (H, W, 3) claim, their mean removed, without the
-    outermost texels."""
+    """Slopes (2, H-2, W-2) along u and y that normals (H, W, 3) claim, their mean removed."""
     slopes = np.moveaxis(normal_slopes(normal[1:-1, 1:-1], _FLATTEST), -1, 0)
     return slopes - slopes.mean(axis=(1, 2), keepdims=True)
 
@@ -129,40 +117,35 @@ def fit_normals(height: Array, normal: Array) -> NormalFit | None:
     s, t = slopes_of_heights(fitted[0]), slopes_of_normals(fitted[1])
     if not _energy(s) > 0 or not _energy(t) > 1e-9 * t.size:
         return None
-    along = [_correlation(s[i : i + 1], t[i : i + 1]) for i in (0, 1)]
     h, n = _common(height, normal, _COMPARED)
     guesses = _guesses(h, n)
-    highest = max(g.score for g in guesses)
+    gl, dx, highest = guesses[0][0], guesses[1][0], max(score for score, _, _ in guesses)
     # Symmetric tiles fit in several ways: the likeliest one that is as good as any.
-    best = next(g for g in guesses if g.score >= highest - _TIE)
-    as_is = {g.convention: g.score for g in guesses if not g.turn and not g.inverted}
-    here = max(as_is.values())
+    best, image, turn = next(guess for guess in guesses if guess[0] >= highest - _TIE)
+    here = max(gl, dx)
     clear, ahead = (max(low, factor / math.sqrt(h.size)) for low, factor in (_CLEAR, _AHEAD))
     misfit = highest >= clear and highest - here >= ahead
     fits = here >= clear and not misfit
-    known = fits and abs(as_is["gl"] - as_is["dx"]) >= ahead
-    better: Convention = "gl" if as_is["gl"] >= as_is["dx"] else "dx"
+    better: Convention = "gl" if gl >= dx else "dx"
     sign = np.array([1.0, 1.0 if better == "gl" else -1.0])[:, None, None]
     return NormalFit(
-        correlation_u=along[0],
-        correlation_v=along[1],
-        gl=as_is["gl"],
-        dx=as_is["dx"],
-        convention=better if known else None,
+        correlation_u=_correlation(s[0], t[0]),
+        correlation_v=_correlation(s[1], t[1]),
+        gl=gl,
+        dx=dx,
+        convention=better if fits and abs(gl - dx) >= ahead else None,
         fits=fits,
         misfit=misfit,
-        image=best.image,
-        turn=best.turn,
-        inverted=best.inverted,
-        best=best.score,
-        runner_up=max((g.score for g in guesses if g.score < highest - _TIE), default=-1.0),
+        image=image,
+        turn=turn,
+        best=best,
         scale=float((s * t * sign).sum() / _energy(s)),
     )
 
 
 def _common(height: Array, normal: Array, limit: int) -> tuple[Array, Array]:
-    rows = min(height.shape[0], normal.shape[0])
-    columns = min(height.shape[1], normal.shape[1])
+    """Both at the coarser of their resolutions, of at most `limit` texels along a side."""
+    rows, columns = (min(height.shape[axis], normal.shape[axis]) for axis in (0, 1))
     shrink = max(1.0, max(rows, columns) / limit)
     size = max(1, round(rows / shrink)), max(1, round(columns / shrink))
     return resample(height, *size), resample(normal, *size)
@@ -177,24 +160,24 @@ def _correlation(s: Array, t: Array) -> float:
     return float((s * t).sum()) / norm if norm > 0 else float("nan")
 
 
-def _guesses(height: Array, normal: Array) -> list[_Guess]:
-    """Every explanation with its correlation, likelier ones before others that fit as well."""
+def _guesses(height: Array, normal: Array) -> list[tuple[float, Turned, str]]:
+    """Every explanation (correlation, image to turn, how), likelier ones before others that fit as well.
+
+    The first two are the images as they are, read as OpenGL and as DirectX; then heights upside down.
+    """
     s, t = slopes_of_heights(height), slopes_of_normals(normal)
     norm = math.sqrt(_energy(s) * _energy(t))
-    out = []
+
+    def scores(a: Array, b: Array) -> tuple[float, float]:
+        along_u, along_v = float((a[0] * b[0]).sum()), float((a[1] * b[1]).sum())
+        return (along_u + along_v) / norm, (along_u - along_v) / norm
+
+    gl, dx = scores(s, t)
+    out: list[tuple[float, Turned, str]] = [(score, None, "") for score in (gl, dx, -gl, -dx)]
     for turn, move in SYMMETRIES.items():
         if move(height).shape != height.shape:
             continue
-        moved: list[tuple[Literal["height", "normal"] | None, Array, Array]]
-        if turn:
-            # Pixels are turned, their vectors are not; slopes of turned heights follow.
-            turned = np.stack([move(t[0]), move(t[1])])
-            moved = [("height", slopes_of_heights(move(height)), t), ("normal", s, turned)]
-        else:
-            moved = [(None, s, t)]
-        for image, a, b in moved:
-            along_u, along_v = float((a[0] * b[0]).sum()), float((a[1] * b[1]).sum())
-            for sign in (1.0, -1.0) if not turn else (1.0,):
-                gl, dx = sign * (along_u + along_v) / norm, sign * (along_u - along_v) / norm
-                out += [_Guess(gl, image, turn, "gl", sign < 0), _Guess(dx, image, turn, "dx", sign < 0)]
+        # Pixels are turned, their vectors are not; slopes of turned heights follow.
+        out += [(score, "height", turn) for score in scores(slopes_of_heights(move(height)), t)]
+        out += [(score, "normal", turn) for score in scores(s, np.stack([move(t[0]), move(t[1])]))]
     return out

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -20,20 +20,16 @@ def _gray(value: Any) -> Any:
     return (value, value, value) if isinstance(value, int | float) and not isinstance(value, bool) else value
 
 
-def _short(data: Any) -> Any:
-    """Long form of ``roughness: 0.4`` and ``roughness: rough.png``."""
-    if isinstance(data, str):
-        return {"file": data}
-    if isinstance(data, int | float | Sequence) and not isinstance(data, bool):
-        return {"value": data}
-    return data
-
-
 class _Entry(Settings):
     @model_validator(mode="before")
     @classmethod
     def _long(cls, data: Any) -> Any:
-        return _short(data)
+        """Long form of ``roughness: 0.4`` and ``roughness: rough.png``."""
+        if isinstance(data, str):
+            return {"file": data}
+        if isinstance(data, int | float | Sequence) and not isinstance(data, bool):
+            return {"value": data}
+        return data
 
 
 class HeightEntry(_Entry):
@@ -143,25 +139,5 @@ class MaterialFile(Settings):
 
 
 def read_material_file(path: Path) -> MaterialFile:
-    """Read a ``material.yaml``.
-
-    Raises
-    ------
-    InputError : missing, not YAML, an unknown key (with its line and the nearest valid one), a value out of
-        its range
-    """
+    """Read a ``material.yaml``."""
     return build(MaterialFile, read_yaml(path), source=str(path))
-
-
-def plain(data: Any) -> Any:
-    """The same nested data in Python's own types, without what a YAML reader attaches."""
-    if isinstance(data, Mapping):
-        return {str(key): plain(value) for key, value in data.items()}
-    if isinstance(data, str):
-        return str(data)
-    if isinstance(data, Sequence):
-        return [plain(value) for value in data]
-    for kind in (bool, int, float):
-        if isinstance(data, kind):
-            return kind(data)
-    return data

@@ -5,14 +5,12 @@ The tile is periodic, so a map whose last column does not continue in its first 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-
-from mbtf_core.shard_schema import Tiling
 
 Array = NDArray[np.floating[Any]]
 
@@ -58,13 +56,13 @@ def seams(height: Array, rounding: float = 0.0) -> tuple[Seam, ...]:
     rounding : step that heights were rounded to; no interior step counts as less
     """
     out = []
-    for axis, name in ((1, "u"), (0, "v")):
-        if height.shape[axis] < _FEWEST:
-            continue
-        # The step behind the last line is the seam's.
-        steps = np.sqrt(np.mean((np.roll(height, -1, axis) - height) ** 2, axis=1 - axis))
-        interior = max(float(np.percentile(steps[:-1], 99)), rounding)
-        out.append(Seam("u" if name == "u" else "v", float(steps[-1]), interior))
+    axes: tuple[tuple[Literal["u", "v"], int], ...] = (("u", 1), ("v", 0))
+    for name, axis in axes:
+        if height.shape[axis] >= _FEWEST:
+            # The step behind the last line is the seam's.
+            steps = np.sqrt(np.mean((np.roll(height, -1, axis) - height) ** 2, axis=1 - axis))
+            interior = max(float(np.percentile(steps[:-1], 99)), rounding)
+            out.append(Seam(name, float(steps[-1]), interior))
     return tuple(out)
 
 
@@ -73,27 +71,10 @@ def broken(seam: Seam) -> bool:
     return seam.ratio > _LIMIT
 
 
-def mirror(image: Array, flip_u: int | None = None, flip_v: int | None = None) -> Array:
-    """Two by two copies, (2H, 2W, ...), every other one mirrored, so that all edges meet.
-
-    Parameters
-    ----------
-    flip_u, flip_v : component of a vector that changes its sign in copies mirrored along u, along v
-    """
-    right = np.flip(image, 1)
-    if flip_u is not None:
-        right = _negated(right, flip_u)
-    top = np.concatenate([image, right], axis=1)
-    low = np.flip(top, 0)
-    if flip_v is not None:
-        low = _negated(low, flip_v)
-    return np.concatenate([top, low], axis=0)
-
-
-def _negated(image: Array, component: int) -> Array:
-    out = image.copy()
-    out[..., component] *= -1.0
-    return out
+def mirror(image: Array) -> Array:
+    """Two by two copies, (2H, 2W, ...), every other one mirrored, so that all edges meet."""
+    top = np.concatenate([image, np.flip(image, 1)], axis=1)
+    return np.concatenate([top, np.flip(top, 0)], axis=0)
 
 
 def blend(image: Array) -> Array:
@@ -108,9 +89,7 @@ def blend(image: Array) -> Array:
         size = out.shape[axis]
         edge = np.minimum(np.arange(size) + 0.5, size - np.arange(size) - 0.5) / size
         x = np.clip(edge / BAND, 0.0, 1.0)
-        shape = [1] * out.ndim
-        shape[axis] = size
-        w = (x * x * (3.0 - 2.0 * x)).reshape(shape)
+        w = (x * x * (3.0 - 2.0 * x)).reshape(-1, *[1] * (out.ndim - 1 - axis))
         half = size // 2
         other = 0.5 * (np.roll(out, half, axis) + np.roll(out, size - half, axis))
         out = w * out + (1.0 - w) * other
@@ -119,7 +98,11 @@ def blend(image: Array) -> Array:
 
 def mirror_normals(normal: NDArray[np.float32]) -> NDArray[np.float32]:
     """:func:`mirror` of unit vectors (H, W, 3), x along u and y along v: the mirrored axis changes sign."""
-    return mirror(normal, flip_u=0, flip_v=1).astype(np.float32)
+    rows, columns = normal.shape[:2]
+    out = mirror(normal).astype(np.float32)
+    out[:, columns:, 0] *= -1.0
+    out[rows:, ..., 1] *= -1.0
+    return out
 
 
 def blend_normals(normal: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -133,7 +116,7 @@ def blend_normals(normal: NDArray[np.float32]) -> NDArray[np.float32]:
     return (up / np.linalg.norm(up, axis=-1, keepdims=True)).astype(np.float32)
 
 
-def retile(maps: Mapping[str, Any], tile: Tiling) -> dict[str, Any]:
+def retile(maps: Mapping[str, Any], tile: Literal["mirror", "blend"]) -> dict[str, Any]:
     """Mirror or blend maps by role; constants and None are unchanged.
 
     Lengths are in tile widths. A mirrored tile is two images wide, so its heights are halved: the shape of
@@ -142,21 +125,11 @@ def retile(maps: Mapping[str, Any], tile: Tiling) -> dict[str, Any]:
     Parameters
     ----------
     maps : role → (H, W), (H, W, 3), a constant, or None; ``normal`` holds unit vectors, ``height`` lengths
-    tile : what to do to the maps
     """
-    if tile == "none":
-        return dict(maps)
-    change: Callable[[Array], Array] = mirror if tile == "mirror" else blend
+    change, turn = (mirror, mirror_normals) if tile == "mirror" else (blend, blend_normals)
     out = {role: change(value) if np.ndim(value) >= 2 else value for role, value in maps.items()}
-    if (normal := maps.get("normal")) is not None:
-        out["normal"] = (mirror_normals if tile == "mirror" else blend_normals)(normal)
+    if maps["normal"] is not None:
+        out["normal"] = turn(maps["normal"])
     if tile == "mirror":
         out["height"] = 0.5 * out["height"]
     return out
-
-
-def tiling_note(tile: Tiling) -> str:
-    """Description of a tiling method."""
-    if tile == "mirror":
-        return "tile: 2 x 2 mirrored copies, two images wide, so heights in tile widths are halved"
-    return f"tile: edges cross-faded over {BAND:g} of the tile"

@@ -8,7 +8,8 @@ position and view direction. The two agree near normal incidence.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any, Literal
 
 import numpy as np
@@ -24,6 +25,8 @@ PixelKind = Literal["query", "pixel"]
 PIXEL_SIGMA = 0.5
 # Smallest cosine between the plane's normal and a pixel's ray; at the horizon footprints are unbounded.
 SMALLEST_COSINE = 0.01
+# Fraction of a picture, along its tighter side, that tiles fill, and its height over its width.
+_FILL, _PROPORTION = 0.94, 0.75
 
 
 def pixel_sigma(area: Any) -> Any:
@@ -110,7 +113,6 @@ class Camera:
         Returns
         -------
         Queries
-            One query per pixel.
 
         Raises
         ------
@@ -140,3 +142,27 @@ class Camera:
             np.broadcast_to(np.asarray(omega_i, np.float32), (*shape, 3)).copy(),
             (-direction).astype(np.float32),
         )
+
+
+def tiles_camera(
+    elevation: float, azimuth: float, *, tiles: int, aspect: float, displacement_range: float, columns: int
+) -> Camera:
+    """Camera that looks at the center of `tiles` × `tiles` tiles and just fits them.
+
+    Parameters
+    ----------
+    elevation, azimuth : direction towards the camera, in degrees
+    aspect : H/W of the tile
+    displacement_range : largest depth of the tile, in tile widths
+    columns : pixels across; pictures are 4:3
+    """
+    x, y = 0.5 * tiles, 0.5 * tiles * aspect
+    rows = max(1, round(_PROPORTION * columns))
+    camera = Camera(elevation, azimuth, 1.0, (x, y), rows, columns)
+    forward, right, up = camera.frame()
+    # Relative to the target. At distance d, a corner c fits if |c·right| ≤ half the width · (d + c·forward).
+    corners = np.array(list(product((-x, x), (-y, y), (0.0, -displacement_range))))
+    half = 0.5 * _FILL * camera.pixel_pitch
+    across, along = np.abs(corners @ right) / (half * columns), np.abs(corners @ up) / (half * rows)
+    distance = float((np.maximum(across, along) - corners @ forward).max())
+    return replace(camera, tiles_across=distance / camera.distance)

@@ -24,7 +24,6 @@ from mbtf_core.shard_schema import CONFIG_NAME
 RECORD_NAME = "pictures.json"
 FORMAT_NAME = "mbtf-pictures"
 _VERSION = 1
-_OURS = (CONFIG_NAME, RECORD_NAME)
 
 
 class _Picture(BaseModel):
@@ -91,15 +90,17 @@ class PictureFolder:
                     f"holds pictures of something else than {command}", where=path, hint=ELSEWHERE
                 )
             check_document(_Record, old, existing, ELSEWHERE)
-            if not overwrite and old.get("hash") == data_sha256(depends):
-                folder = cls(path, old)
-                folder._sweep()
+            if not overwrite and old["hash"] != data_sha256(depends):
+                raise other_configuration(path, "pictures", old["depends"], depends)
+            # Unfinished files of a killed run.
+            remove_unfinished(path, (CONFIG_NAME, RECORD_NAME, *old["files"]))
+            if not overwrite:
                 if not (path / CONFIG_NAME).exists():
                     write_text(path / CONFIG_NAME, dump_yaml(config))
-                return folder
-            if not overwrite:
-                raise other_configuration(path, "pictures", old.get("depends", {}), depends)
-            cls(path, old)._clear()
+                return cls(path, old)
+            # What the record lists and nothing else; the record last, which keeps the claim.
+            for name in (*old["files"], CONFIG_NAME, RECORD_NAME):
+                (path / Path(name).name).unlink(missing_ok=True)
         make_folder(path)
         record = {
             "format": FORMAT_NAME,
@@ -119,19 +120,9 @@ class PictureFolder:
     def _save(self) -> None:
         write_json(self.path / RECORD_NAME, self.record)
 
-    def _sweep(self) -> None:
-        """Remove unfinished files of a killed run."""
-        remove_unfinished(self.path, (*_OURS, *self.record.get("files", ())))
-
-    def _clear(self) -> None:
-        """Remove the files that the record lists and nothing else; the record last, which keeps the claim."""
-        self._sweep()
-        for name in (*self.record.get("files", ()), CONFIG_NAME, RECORD_NAME):
-            (self.path / Path(name).name).unlink(missing_ok=True)
-
     def finished(self, name: str) -> dict[str, Any] | None:
         """Facts stored by :meth:`keep`, if all files of the picture exist with their full size."""
-        entry: dict[str, Any] | None = self.record["pictures"].get(name)
+        entry = self.record["pictures"].get(name)
         if entry is None:
             return None
         for file, size in entry["files"].items():

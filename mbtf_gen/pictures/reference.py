@@ -71,20 +71,12 @@ class ReferenceImage:
         (Path, Path)
             The EXR image with all channels, and the sRGB PNG.
         """
-        lead = (1, *self.queries.lead)
-        arrays = {
-            "u": self.queries.u.reshape(*lead, 2),
-            "sigma": self.queries.sigma.reshape(lead),
-            "omega_i": self.queries.omega_i.reshape(*lead, 3),
-            "omega_o": self.queries.omega_o.reshape(*lead, 3),
-            "value_a": self.value_a.reshape(*lead, 3),
-            "value_b": self.value_b.reshape(*lead, 3),
-            "spp": np.full(lead, self.spp, np.float32),
-        }
+        spp = np.full(self.queries.lead, self.spp, np.float32)
+        arrays = {**vars(self.queries), "value_a": self.value_a, "value_b": self.value_b, "spp": spp}
         if self.transmittance is not None:
-            arrays["transmittance"] = self.transmittance.reshape(lead)
+            arrays["transmittance"] = self.transmittance
         exr, png = (path.with_name(f"{path.name}{suffix}") for suffix in (".exr", ".png"))
-        write_exr(exr, arrays)
+        write_exr(exr, {name: array[None] for name, array in arrays.items()})
         write_png(png, to_display(self.value, exposure))
         return exr, png
 
@@ -104,9 +96,8 @@ def auto_exposure(value: NDArray[np.float32]) -> float:
 
 def to_display(value: NDArray[np.float32], exposure: float | None = None) -> NDArray[np.uint8]:
     """8-bit sRGB of linear values (..., 3) times an exposure factor (by default :func:`auto_exposure`)."""
-    linear = np.clip(
-        np.asarray(value, np.float64) * (auto_exposure(value) if exposure is None else exposure), 0, 1
-    )
+    factor = auto_exposure(value) if exposure is None else exposure
+    linear = np.clip(np.asarray(value, np.float64) * factor, 0, 1)
     return np.round(255.0 * linear_to_srgb(linear)).astype(np.uint8)
 
 

@@ -4,15 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mbtf_core.console import Console
+from mbtf_core.directions import from_angles
 from mbtf_core.errors import InputError, PartialError
-
-if TYPE_CHECKING:
-    from mbtf_gen.config.pictures import PreviewConfig
-    from mbtf_gen.dataset.reader import Dataset
-    from mbtf_gen.pictures.preview.mesh import TiledMesh
+from mbtf_gen.config.pictures import PreviewConfig
+from mbtf_gen.dataset.reader import Dataset
+from mbtf_gen.job import Job
+from mbtf_gen.pictures.camera import tiles_camera
+from mbtf_gen.pictures.folder import PictureFolder
+from mbtf_gen.pictures.preview import mesh
+from mbtf_gen.pictures.preview.plots import level_histogram, write_plots
+from mbtf_gen.pictures.preview.sample import finished_shards, sampled_queries, stored_queries
+from mbtf_gen.pictures.reference import render_reference, to_display, write_png
+from mbtf_gen.planning.effects_plan import reference_plan
+from mbtf_gen.planning.simulation import build_estimator
 
 
 class PreviewPictures:
@@ -36,45 +43,34 @@ class PreviewPictures:
     """
 
     def __init__(self, config: PreviewConfig, dataset: Dataset | None, console: Console) -> None:
-        from mbtf_core.directions import from_angles
-        from mbtf_gen.job import Job
-
-        self.config = config
-        self.dataset = dataset
-        self.console = console
-        light = config.preview.light
-        self.omega_i = from_angles(light.elevation, light.azimuth)
+        self.config, self.dataset, self.console = config, dataset, console
+        options = config.preview
+        view, light = options.view, options.light
         self.job: Job | None = None
         try:
-            self.job = Job.prepare(config)
-            if dataset is not None and self.job.material.digests != dataset.manifest["inputs"]:
-                self.job = None
+            job = Job.prepare(config)
+            if dataset is not None and job.material.digests != dataset.manifest["inputs"]:
                 raise InputError("has changed since the data set was made", where=config.material)
         except InputError as error:
             # Its queries can be shown without the material.
             if dataset is None:
                 raise
             console.note(f"only the queries are drawn: {error.where}: {error.what}")
-        if self.job is not None:
-            self._prepare_view(self.job)
-
-    def _prepare_view(self, job: Any) -> None:
-        from mbtf_gen.pictures.preview.view import tiles_camera
-
-        options = self.config.preview
-        grid = job.material.grid(self.config.geometry.height_scale, self.config.geometry.mesh)
+            return
+        self.job = job
+        self.omega_i = from_angles(light.elevation, light.azimuth)
         self.camera = tiles_camera(
-            options.view.elevation,
-            options.view.azimuth,
+            view.elevation,
+            view.azimuth,
             tiles=options.tiles,
-            aspect=grid.aspect,
-            displacement_range=grid.displacement_range,
+            aspect=job.grid.aspect,
+            displacement_range=job.grid.displacement_range,
             columns=options.size,
         )
-        self.camera.queries(self.omega_i, grid.aspect)  # refuses a view of the horizon
+        self.camera.queries(self.omega_i, job.grid.aspect)  # refuses a view of the horizon
         self.seen = (
-            f"from elevation {options.view.elevation:g}, azimuth {options.view.azimuth:g}, "
-            f"light from {options.light.elevation:g}, {options.light.azimuth:g} degrees"
+            f"from elevation {view.elevation:g}, azimuth {view.azimuth:g}, "
+            f"light from {light.elevation:g}, {light.azimuth:g} degrees"
         )
 
     def draw(self, path: Path, overwrite: bool, interactive: bool) -> None:
@@ -85,18 +81,20 @@ class PreviewPictures:
         PartialError : the mesh could not be drawn; everything else was
         EngineError : the window could not be shown
         """
-        from mbtf_gen.pictures.folder import PictureFolder
-
-        inputs = dict(self.job.material.digests) if self.job is not None else {}
         makers: dict[str, Callable[[Path], dict[str, Any]]] = {"queries": self._queries}
+        inputs: dict[str, str] = {}
+        # Plots of stored queries also depend on how many shards are finished.
+        stages = {"mesh": 0, "beauty": 0, "queries": 0}
         if self.job is not None:
             makers = {"mesh": self._mesh, "beauty": self._beauty, **makers}
+            inputs |= self.job.material.digests
         if self.dataset is not None:
-            inputs = {"data set": self.dataset.manifest["config_hash"], **inputs}
+            inputs["data set"] = self.dataset.manifest["config_hash"]
+            stages["queries"] = len(finished_shards(self.dataset))
         folder = PictureFolder.claim(
             path,
             "preview",
-            files=[f"{name}.png" for name in ("mesh", "beauty", "queries")],
+            files=[f"{name}.png" for name in stages],
             config=self.config.model_dump(mode="json"),
             inputs=inputs,
             overwrite=overwrite,
@@ -105,19 +103,17 @@ class PreviewPictures:
         fault = ""
         with self.console.progress(total=len(makers), label="drawing", unit="pictures") as bar:
             for name, maker in makers.items():
-                file = folder.path / f"{name}.png"
-                facts = folder.finished(name)
-                kept = facts is not None and facts.get("of") == self._stage(name)
-                if not kept:
-                    facts = {**maker(file), "of": self._stage(name)}
-                    if "fault" in facts:
-                        fault = facts["fault"]
-                        bar.advance(1)
-                        continue
-                    folder.keep(name, [file], facts)
-                assert facts is not None
-                pictures.append({"file": file, "kept": kept, **{k: v for k, v in facts.items() if k != "of"}})
+                file, facts = folder.path / f"{name}.png", folder.finished(name)
+                kept = facts is not None and facts.get("of") == stages[name]
+                if facts is None or not kept:
+                    facts = {**maker(file), "of": stages[name]}
                 bar.advance(1)
+                if "fault" in facts:
+                    fault = facts["fault"]
+                    continue
+                if not kept:
+                    folder.keep(name, [file], facts)
+                pictures.append({"file": file, "kept": kept, **{k: v for k, v in facts.items() if k != "of"}})
         text = "\n".join(f"{p['file']}: {p['shows']}{' (kept)' if p['kept'] else ''}" for p in pictures)
         self.console.report({"folder": path, "pictures": pictures, "fault": fault or None}, text)
         if fault:
@@ -128,64 +124,38 @@ class PreviewPictures:
                 "then the same command draws it",
             )
         if interactive and self.job is not None:
-            from mbtf_gen.pictures.preview.mesh import show
-
             self.console.note("the mesh is shown in a window: close it to continue")
-            show(self._tiled_mesh(), self.camera, self.omega_i)
+            mesh.show(self._tiled_mesh(self.job), self.camera, self.omega_i)
 
-    def _stage(self, name: str) -> int:
-        """What a picture depends on besides the configuration: how many shards are finished."""
-        if name != "queries" or self.dataset is None:
-            return 0
-        from mbtf_gen.pictures.preview.sample import finished_shards
-
-        return len(finished_shards(self.dataset, "train"))
-
-    def _tiled_mesh(self) -> TiledMesh:
-        from mbtf_gen.pictures.preview.mesh import tiled_mesh
-
-        assert self.job is not None
+    def _tiled_mesh(self, job: Job) -> mesh.TiledMesh:
         geometry = self.config.geometry
-        return tiled_mesh(self.job.material, self.config.preview.tiles, geometry.height_scale, geometry.mesh)
+        return mesh.tiled_mesh(job.material, self.config.preview.tiles, geometry.height_scale, geometry.mesh)
 
     def _mesh(self, file: Path) -> dict[str, Any]:
-        from mbtf_gen.pictures.preview.mesh import draw
-
-        mesh = self._tiled_mesh()
-        fault = draw(mesh, self.camera, self.omega_i, file)
-        if fault:
+        assert self.job is not None
+        drawn = self._tiled_mesh(self.job)
+        if fault := mesh.draw(drawn, self.camera, self.omega_i, file):
             return {"fault": fault}
-        tiles, (rows, columns) = self.config.preview.tiles, mesh.cells
+        tiles, (rows, columns) = self.config.preview.tiles, drawn.cells
         return {
             "shows": f"the displaced mesh ({columns} x {rows} cells per tile) of {tiles} x {tiles} tiles "
             f"with its base color, {self.seen}"
         }
 
     def _beauty(self, file: Path) -> dict[str, Any]:
-        from mbtf_gen.pictures.reference import render_reference, to_display, write_png
-        from mbtf_gen.planning.effects_plan import reference_plan
-        from mbtf_gen.planning.simulation import build_estimator
-
         assert self.job is not None
         estimator = build_estimator(self.job, reference_plan(self.job))
-        spp = self.config.preview.spp
-        image = render_reference(
-            estimator, self.camera, self.omega_i, kind="pixel", spp=spp, seed=self.config.seed
-        )
+        spp, seed = self.config.preview.spp, self.config.seed
+        image = render_reference(estimator, self.camera, self.omega_i, kind="pixel", spp=spp, seed=seed)
         write_png(file, to_display(image.value))
         return {"shows": f"the infinite plane from the same camera, path-traced with {spp} paths per pixel"}
 
     def _queries(self, file: Path) -> dict[str, Any]:
-        from mbtf_gen.pictures.preview.plots import level_histogram, write_plots
-        from mbtf_gen.pictures.preview.sample import sampled_queries, stored_queries
-
         if self.dataset is not None:
-            sample = stored_queries(self.dataset)
-            source = f"stored in {self.dataset.folder}"
+            sample, source = stored_queries(self.dataset), f"stored in {self.dataset.folder}"
         else:
             assert self.job is not None
-            sample = sampled_queries(self.job)
-            source = f"sampled for {self.config.material}"
+            sample, source = sampled_queries(self.job), f"sampled for {self.config.material}"
         shown = f"{len(sample.u)} of {sample.total} training queries {source}"
         if len(sample.level) < len(sample.u):
             shown += f", in {len(sample.level)} images of one footprint, light and view each"

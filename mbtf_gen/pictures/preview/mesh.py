@@ -94,7 +94,7 @@ def tiled_mesh(
 
 def draw(tiles: TiledMesh, camera: Camera, omega_i: NDArray[np.float64], path: Path) -> str:
     """Write a PNG of the mesh under light from `omega_i`; returns the reason of a failure, or ""."""
-    return _run("draw_in_child", tiles, camera, omega_i, path, timeout=_TIMEOUT)
+    return _run(tiles, camera, omega_i, str(path), _TIMEOUT)
 
 
 def show(tiles: TiledMesh, camera: Camera, omega_i: NDArray[np.float64]) -> None:
@@ -102,23 +102,18 @@ def show(tiles: TiledMesh, camera: Camera, omega_i: NDArray[np.float64]) -> None
 
     Raises
     ------
-    EngineError : there is no display, or VTK cannot draw on it
+    EngineError : VTK cannot draw on the display
     """
-    check_display()
-    fault = _run("show_in_child", tiles, camera, omega_i, None, timeout=_DAY)
+    fault = _run(tiles, camera, omega_i, "", _DAY)
     if fault:
-        raise EngineError(
-            f"the window could not be shown ({fault})",
-            where="--interactive",
-            hint="run mbtf-gen doctor",
-        )
+        what = f"the window could not be shown ({fault})"
+        raise EngineError(what, where="--interactive", hint="run mbtf-gen doctor")
 
 
 def check_display() -> None:
-    """Raise the error of :func:`show` where the environment names no display."""
-    if sys.platform.startswith("linux") and not (
-        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    ):
+    """Refuse to show a window where the environment names no display."""
+    named = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    if sys.platform.startswith("linux") and not named:
         raise EngineError(
             "there is no display",
             where="--interactive",
@@ -126,21 +121,12 @@ def check_display() -> None:
         )
 
 
-def _run(
-    function: str,
-    tiles: TiledMesh,
-    camera: Camera,
-    omega_i: NDArray[np.float64],
-    path: Path | None,
-    *,
-    timeout: float,
-) -> str:
+def _run(tiles: TiledMesh, camera: Camera, omega_i: NDArray[np.float64], path: str, timeout: float) -> str:
+    """Draw into a file, or in a window where `path` is empty; returns the reason of a failure, or ""."""
     forward, _, up = camera.frame()
     target = camera.position + camera.distance * forward
     view = {
-        "position": camera.position.tolist(),
-        "target": target.tolist(),
-        "up": up.tolist(),
+        "camera": [camera.position.tolist(), target.tolist(), up.tolist()],
         "angle": camera.field_of_view,
         "size": [camera.columns, camera.rows],
         "light": (target + camera.distance * np.asarray(omega_i)).tolist(),
@@ -149,8 +135,7 @@ def _run(
     with tempfile.TemporaryDirectory(prefix="mbtf-preview-") as folder:
         scene = Path(folder, "scene.npz")
         np.savez(scene, points=tiles.points, uv=tiles.uv, hole=tiles.hole, texture=tiles.texture)
-        arguments = [str(scene), json.dumps(view), *([str(path)] if path is not None else [])]
-        return run_child(__name__, function, *arguments, timeout=timeout).fault
+        return run_child(__name__, "child", str(scene), json.dumps(view), path, timeout=timeout).fault
 
 
 def _plotter(scene: str, view: dict[str, Any], **options: Any) -> Any:
@@ -161,80 +146,52 @@ def _plotter(scene: str, view: dict[str, Any], **options: Any) -> Any:
         points, uv, hole, texture = (stored[name] for name in ("points", "uv", "hole", "texture"))
     rows, columns = points.shape[:2]
     faces = grid_faces(rows, columns)[np.repeat(~hole.ravel(), 2)]
-    mesh = pyvista.PolyData(points.reshape(-1, 3), _polygons(faces))
+    mesh = pyvista.PolyData.from_regular_faces(points.reshape(-1, 3), faces.astype(np.int64))
     mesh.active_texture_coordinates = uv.reshape(-1, 2)
     image = pyvista.Texture(np.ascontiguousarray(texture))
-    image.repeat = True
-    image.interpolate = True
-    image.mipmap = True
+    image.repeat = image.interpolate = image.mipmap = True
     plotter = pyvista.Plotter(lighting="none", **options)
     plotter.set_background(_BACKGROUND)
     look = {"ambient": _AMBIENT, "diffuse": 1.0, "specular": 0.0}
     plotter.add_mesh(mesh, texture=image, **look)
-    wall = _walls(points)
-    if wall is not None:
-        plotter.add_mesh(pyvista.PolyData(wall, _polygons(_strip(len(wall)))), color=_WALL, **look)
+    if np.ptp(points[..., 2]) > 0:
+        # The sides of the mesh, from its border down to its lowest point.
+        edge = np.concatenate([points[0, :-1], points[:-1, -1], points[-1, :0:-1], points[::-1, 0]])
+        foot = np.column_stack([edge[:, :2], np.full(len(edge), points[..., 2].min())])
+        wall = pyvista.StructuredGrid(*np.moveaxis(np.stack([edge, foot]), -1, 0))
+        plotter.add_mesh(wall, color=_WALL, **look)
     light = pyvista.Light(
         position=view["light"],
-        focal_point=view["target"],
+        focal_point=view["camera"][1],
         light_type="scene light",
         intensity=view["intensity"],
+        positional=False,
     )
-    light.positional = False
     plotter.add_light(light)
-    plotter.camera.position, plotter.camera.focal_point = view["position"], view["target"]
-    plotter.camera.up = view["up"]
+    plotter.camera_position = view["camera"]
     plotter.camera.SetUseHorizontalViewAngle(True)
     plotter.camera.view_angle = view["angle"]
     plotter.reset_camera_clipping_range()
     return plotter
 
 
-def _polygons(faces: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
-    """Triangles (n, 3) in VTK's format, each preceded by its number of corners."""
-    return np.column_stack([np.full(len(faces), 3), faces]).astype(np.int64)
-
-
-def _walls(points: NDArray[np.float32]) -> NDArray[np.float32] | None:
-    """The sides of the mesh down to its lowest point: pairs (edge, foot) around the border, (2n, 3)."""
-    edge = np.concatenate([points[0, :-1], points[:-1, -1], points[-1, :0:-1], points[:0:-1, 0]])
-    edge = np.concatenate([edge, edge[:1]])
-    if not np.ptp(points[..., 2]) > 0:
-        return None
-    foot = edge.copy()
-    foot[:, 2] = points[..., 2].min()
-    return np.stack([edge, foot], axis=1).reshape(-1, 3)
-
-
-def _strip(count: int) -> NDArray[np.int64]:
-    """Triangles of a strip of `count` points, taken in pairs."""
-    first = np.arange(0, count - 2, 2)
-    return np.concatenate(
-        [np.column_stack([first, first + 1, first + 3]), np.column_stack([first, first + 3, first + 2])]
-    )
-
-
-def draw_in_child(scene: str, view_json: str, path: str) -> Iterator[dict[str, Any]]:
-    """Child process of :func:`draw`."""
+def child(scene: str, view_json: str, path: str) -> Iterator[dict[str, Any]]:
+    """Child process of :func:`draw` and :func:`show`."""
     from PIL import Image
 
     view = json.loads(view_json)
-    size = [_OVERSAMPLING * n for n in view["size"]]
-    plotter = _plotter(scene, view, off_screen=True, window_size=size)
-    picture = plotter.screenshot(return_img=True)
-    plotter.close()
-    if picture is None or not int(picture.max()) > int(picture.min()):
-        raise EngineError("the picture came out empty")
-    Image.fromarray(picture).reduce(_OVERSAMPLING).save(path, format="PNG")
-    yield {"drawn": True}
-
-
-def show_in_child(scene: str, view_json: str) -> Iterator[dict[str, Any]]:
-    """Child process of :func:`show`."""
-    view = json.loads(view_json)
-    plotter = _plotter(scene, view, window_size=view["size"])
-    window = type(plotter.render_window).__name__
-    if any(word in window for word in _UNSEEN):
-        raise EngineError(f"the display {os.environ.get('DISPLAY', '')} cannot be opened")
-    plotter.show(title="mbtf-gen preview")
-    yield {"shown": True}
+    if not path:
+        plotter = _plotter(scene, view, window_size=view["size"])
+        window = type(plotter.render_window).__name__
+        if any(word in window for word in _UNSEEN):
+            raise EngineError(f"the display {os.environ.get('DISPLAY', '')} cannot be opened")
+        plotter.show(title="mbtf-gen preview")
+    else:
+        size = [_OVERSAMPLING * n for n in view["size"]]
+        plotter = _plotter(scene, view, off_screen=True, window_size=size)
+        picture = plotter.screenshot(return_img=True)
+        plotter.close()
+        if picture is None or not int(picture.max()) > int(picture.min()):
+            raise EngineError("the picture came out empty")
+        Image.fromarray(picture).reduce(_OVERSAMPLING).save(path, format="PNG")
+    yield {"done": True}

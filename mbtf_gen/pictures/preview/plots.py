@@ -29,8 +29,7 @@ def level_histogram(
     around 0, whose stated density is 1.
     """
     if sample.finest == 0:
-        edges = np.array([-0.5, 0.5])
-        stated = np.ones(1)
+        edges, stated = np.array([-0.5, 0.5]), np.ones(1)
     else:
         enough = len(sample.level) >= _PER_BIN * _BINS_PER_LEVEL * sample.finest
         bins = sample.finest * (_BINS_PER_LEVEL if enough else 1)
@@ -124,12 +123,7 @@ def _directions(axes: Any, omega: NDArray[np.float32], min_cos: float, title: st
         edges = np.linspace(-1.0, 1.0, _bins(len(x)) + 1)
         _relative(axes, x, y, (edges, edges), _disk_share(edges, radius), "the disk")
     angle = np.linspace(0.0, 2.0 * np.pi, 361)
-    axes.plot(np.cos(angle), np.sin(angle), color="0.6", linewidth=1.0, label="horizon")
-    axes.plot(
-        radius * np.cos(angle),
-        radius * np.sin(angle),
-        color=_STATED,
-        linewidth=1.5,
-        label=f"cos = {min_cos:g}",
-    )
+    ring = np.stack([np.cos(angle), np.sin(angle)])
+    axes.plot(*ring, color="0.6", linewidth=1.0, label="horizon")
+    axes.plot(*(radius * ring), color=_STATED, linewidth=1.5, label=f"cos = {min_cos:g}")
     axes.legend(loc="upper right", frameon=False, fontsize="small")

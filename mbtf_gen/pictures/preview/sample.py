@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
 from mbtf_core.lattice import level_of_sigma
-from mbtf_core.shard_schema import Split
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.dataset.shard_io import read_shard
 from mbtf_gen.dataset.verify import is_finished
@@ -25,14 +24,14 @@ MAX_QUERIES = 1 << 20
 
 @dataclass(frozen=True)
 class QuerySample:
-    """Queries of one split, and the distributions that they should follow.
+    """Training queries, and the distributions that they should follow.
 
     Attributes
     ----------
     u : (n, 2) uv
     level : (m,) fractional levels; omega_i, omega_o : (m, 3). One per query, or one per image in the image
         layout, whose queries share them.
-    split : of the data set; shards : taken; total : queries of the whole split
+    total : training queries of the whole data set
     mixture, finest : of the levels; min_cos : of both directions; aspect : H/W of the tile
     """
 
@@ -40,8 +39,6 @@ class QuerySample:
     level: NDArray[np.float64]
     omega_i: NDArray[np.float32]
     omega_o: NDArray[np.float32]
-    split: Split
-    shards: int
     total: int
     mixture: Mixture
     finest: int
@@ -49,53 +46,42 @@ class QuerySample:
     aspect: float
 
 
-def sampled_queries(job: Job, split: Split = "train") -> QuerySample:
+def sampled_queries(job: Job) -> QuerySample:
     """Queries of the first shards that a configuration samples."""
-    plan, entries = job.query_plan, [entry for entry in job.shards if entry.split == split]
-    parts = list(_up_to_limit(plan.draw(split, entry.index, entry.rows) for entry in entries))
-    return QuerySample(
-        *_columns(parts),
-        split,
-        len(parts),
-        split_queries(job, split),
-        plan.mixture,
-        job.lattice.finest,
-        plan.min_cos,
-        job.lattice.aspect,
-    )
+    plan, entries = job.query_plan, (entry for entry in job.shards if entry.split == "train")
+    columns = _columns(plan.draw("train", entry.index, entry.rows) for entry in entries)
+    total = split_queries(job, "train")
+    return QuerySample(*columns, total, plan.mixture, job.lattice.finest, plan.min_cos, job.lattice.aspect)
 
 
-def finished_shards(dataset: Dataset, split: Split) -> list[Path]:
-    """Files of a split's finished shards, in order."""
+def finished_shards(dataset: Dataset) -> list[Path]:
+    """Files of the finished training shards, in order."""
     manifest = dataset.manifest
     return [
         dataset.folder / entry["file"]
-        for entry in manifest["splits"][split]["shards"]
+        for entry in manifest["splits"]["train"]["shards"]
         if is_finished(dataset.folder / entry["file"], entry["rows"], manifest["config_hash"])
     ]
 
 
-def stored_queries(dataset: Dataset, split: Split = "train") -> QuerySample:
+def stored_queries(dataset: Dataset) -> QuerySample:
     """Queries of the first finished shards of a data set, with the distributions stated in its manifest.
 
     Raises
     ------
-    InputError : no shard of the split is finished, or one cannot be read
+    InputError : no shard is finished, or one cannot be read
     """
-    manifest = dataset.manifest
-    names = ("u", "sigma", "omega_i", "omega_o")
-    parts = list(_up_to_limit(Queries(**read_shard(path, names)) for path in finished_shards(dataset, split)))
-    if not parts:
+    manifest, files = dataset.manifest, finished_shards(dataset)
+    if not files:
         raise InputError(
-            f"holds no finished {split} shard yet",
+            "holds no finished train shard yet",
             where=dataset.folder,
             hint="run the mbtf-gen command that made the folder again: it resumes",
         )
+    names = ("u", "sigma", "omega_i", "omega_o")
     return QuerySample(
-        *_columns(parts),
-        split,
-        len(parts),
-        int(manifest["splits"][split]["queries"]),
+        *_columns(Queries(**read_shard(path, names)) for path in files),
+        int(manifest["splits"]["train"]["queries"]),
         Mixture(**manifest["levels"]["mixture"]),
         dataset.lattice.finest,
         float(manifest["config"]["queries"]["min_cos"]),
@@ -103,21 +89,15 @@ def stored_queries(dataset: Dataset, split: Split = "train") -> QuerySample:
     )
 
 
-def _up_to_limit(batches: Iterable[Queries]) -> Iterator[Queries]:
-    count = 0
+def _columns(batches: Iterable[Queries]) -> tuple[Any, Any, Any, Any]:
+    """Positions, levels and directions of the first batches that reach the limit."""
+    parts: list[Queries] = []
     for batch in batches:
-        yield batch
-        count += batch.sigma.size
-        if count >= MAX_QUERIES:
-            return
-
-
-def _columns(
-    parts: list[Queries],
-) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float32], NDArray[np.float32]]:
-    first = parts[0]
+        parts.append(batch)
+        if sum(part.sigma.size for part in parts) >= MAX_QUERIES:
+            break
     # The image layout repeats footprint and directions over an image: its first query stands for it.
-    one: Any = (slice(None), *(0,) * (len(first.lead) - 1))
+    one: Any = (slice(None), *(0,) * (len(parts[0].lead) - 1))
     return (
         np.concatenate([p.u.reshape(-1, 2) for p in parts]),
         level_of_sigma(np.concatenate([p.sigma[one] for p in parts])),

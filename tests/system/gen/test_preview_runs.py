@@ -16,8 +16,8 @@ from mbtf_core.directions import from_angles
 from mbtf_core.lattice import level_of_sigma
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.material.material import load_material
+from mbtf_gen.pictures.camera import tiles_camera
 from mbtf_gen.pictures.preview.mesh import draw, tiled_mesh
-from mbtf_gen.pictures.preview.view import tiles_camera
 
 # Quadrants of the map: top left, top right, bottom left, bottom right.
 QUADRANTS = {"red": (1, 0, 0), "green": (0, 1, 0), "blue": (0, 0, 1), "white": (1, 1, 1)}

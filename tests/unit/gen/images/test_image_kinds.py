@@ -11,7 +11,7 @@ import tifffile
 from support.image_files import exr, png, rng
 
 from mbtf_core.errors import InputError
-from mbtf_gen.images.exr_layers import choose_channels, layers
+from mbtf_gen.images.exr import choose_channels, layers
 from mbtf_gen.images.read import read_image
 
 

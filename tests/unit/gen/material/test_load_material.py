@@ -200,26 +200,6 @@ class TestFolder:
         assert material.roughness == pytest.approx(0.2)
         assert material.base_color == pytest.approx(np.ones(3))
 
-    def test_two_candidates_are_both_named(self, folder: Path) -> None:
-        npy(folder / "rock_disp.npy", np.zeros((8, 16)))
-        with pytest.raises(InputError, match=r"two maps of height: rock_disp\.npy and rock_height\.npy"):
-            load_material(folder)
-
-    def test_folders_without_heights(self, tmp_path: Path) -> None:
-        empty = tmp_path / "empty"
-        empty.mkdir()
-        with pytest.raises(InputError, match="holds no image"):
-            load_material(empty)
-        png(empty / "albedo.png", codes(2, 2, 3))
-        with pytest.raises(InputError, match=r"no height map among albedo\.png") as caught:
-            load_material(empty)
-        assert "displacement" in caught.value.hint
-
-    def test_other_aspect_is_refused_with_both_sizes(self, folder: Path) -> None:
-        png(folder / "rock-rough.png", codes(16, 16))
-        with pytest.raises(InputError, match=r"rock-rough\.png: is 16 x 16 pixels, the height map .* 16 x 8"):
-            load_material(folder)
-
     def test_rounded_sizes_are_no_other_aspect(self, tmp_path: Path) -> None:
         npy(tmp_path / "height.npy", np.zeros((683, 1024)))
         png(tmp_path / "rough.png", codes(1365, 2048))
@@ -361,11 +341,3 @@ class TestDigests:
         before = load_material(folder).digests["settings"]
         (folder / "rockNormalGL.png").rename(folder / "rockNormalDX.png")
         assert load_material(folder).digests["settings"] != before
-
-
-def test_paths_that_are_no_material(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no such file or folder"):
-        load_material(tmp_path / "gone")
-    (tmp_path / "x.txt").write_text("hello")
-    with pytest.raises(InputError, match=r"'\.txt' is no height map"):
-        load_material(tmp_path / "x.txt")

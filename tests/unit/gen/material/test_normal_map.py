@@ -13,10 +13,9 @@ from mbtf_gen.images.read import gray, read_image
 from mbtf_gen.material.material import load_material
 from mbtf_gen.material.normal_map import SYMMETRIES, NormalFit, fit_normals
 
-TURNS = [turn for turn in SYMMETRIES if turn]
 # What undoes each symmetry.
 UNDO = {
-    **{turn: turn for turn in TURNS},
+    **{turn: turn for turn in SYMMETRIES},
     "turned by 90 degrees counter-clockwise": "turned by 90 degrees clockwise",
     "turned by 90 degrees clockwise": "turned by 90 degrees counter-clockwise",
 }
@@ -50,7 +49,7 @@ def test_convention_and_scale(kind: str, green: int) -> None:
 
 
 @pytest.mark.parametrize("kind", ["fractal", "asset"])
-@pytest.mark.parametrize("turn", TURNS)
+@pytest.mark.parametrize("turn", SYMMETRIES)
 @pytest.mark.parametrize("green", [1, -1])
 def test_turned_heights(kind: str, turn: str, green: int) -> None:
     height = height_map(kind)
@@ -62,10 +61,9 @@ def test_turned_heights(kind: str, turn: str, green: int) -> None:
     assert (found.image, found.turn) == ("height", UNDO[turn])
     assert found.best > 0.99
     assert found.best - found.as_is > 0.1
-    assert found.runner_up < found.best
 
 
-@pytest.mark.parametrize("turn", [t for t in TURNS if "mirrored top" not in t])
+@pytest.mark.parametrize("turn", [t for t in SYMMETRIES if "mirrored top" not in t])
 def test_turned_pixels_of_the_normal_map(turn: str) -> None:
     """Turned as an image, vectors and all left as they were."""
     height = fractal(96, 96)
@@ -78,7 +76,6 @@ def test_heights_upside_down() -> None:
     height = fractal(64, 128)
     found = fit(1 - height, normals_of(height, 0.05))
     assert found.misfit
-    assert found.inverted
     assert found.turn == ""
 
 
@@ -168,12 +165,6 @@ class TestMaterial:
         assert "the material file implies OpenGL, the heights' slopes imply DirectX" in material.warnings[0]
         assert "read as OpenGL" in material.warnings[0]
         assert material.normal_convention == "gl"
-
-    def test_turned_heights(self, tmp_path: Path) -> None:
-        folder = self.folder(tmp_path, np.rot90(fractal(96, 96), -1), "normal.png", dx=False)
-        (warning,) = load_material(folder).warnings
-        assert "height.png: fits normal.png only when turned by 90 degrees counter-clockwise" in warning
-        assert "correlation of their slopes 1.00, against" in warning
 
     def test_ridges_have_no_second_correlation(self, tmp_path: Path) -> None:
         ridges = np.tile(fractal(96, 96)[:1], (96, 1))
