@@ -199,7 +199,7 @@ def load_material(path: str | Path, tile: Tiling = "none") -> Material:
         maps beside a height map are ignored.
     tile : {"none", "mirror", "blend"}
         Method for maps that do not tile. ``mirror``: 2 × 2 mirrored copies, a tile of twice the width;
-        ``blend``: a cross-fade over an eighth of the tile at each edge.
+        ``blend``: the edges blended over an eighth of the tile (:mod:`mbtf_gen.material.blending`).
 
     Returns
     -------
