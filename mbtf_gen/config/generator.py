@@ -99,7 +99,7 @@ class GeometrySection(Settings):
         None, ge=1, le=8192, description="mesh cells across the tile; default: the map's width, at most 512"
     )
     make_tileable: Annotated[Tiling, Flag("--make-tileable")] = Field(
-        "none", description="method for maps that do not tile: 2 x 2 mirrored copies, or cross-faded edges"
+        "none", description="method for maps that do not tile: 2 x 2 mirrored copies, or blended edges"
     )
 
 

@@ -20,6 +20,7 @@ from mbtf_core.suggest import suggest_path
 from mbtf_gen.geometry.heightfield import HeightGrid
 from mbtf_gen.images.read import MAX_PIXELS, SUFFIXES, gray, is_image
 from mbtf_gen.images.resample import dequantize, resample
+from mbtf_gen.material.blending import BAND
 from mbtf_gen.material.checks import (
     choose_convention,
     coarse_step,
@@ -35,7 +36,7 @@ from mbtf_gen.material.loader import Color, MapFacts, MapLoader, Share
 from mbtf_gen.material.normal_map import NormalFit, fit_normals
 from mbtf_gen.material.quantization import Codes, code_use
 from mbtf_gen.material.spec import MaterialFile, NormalEntry, read_material_file
-from mbtf_gen.material.tiling import BAND, Seam, retile, seams
+from mbtf_gen.material.tiling import Seam, retile, seams
 
 # Tile widths per stored height: the range of integer images is unknown, floats are in tile widths.
 _INTEGER_SCALE, _FLOAT_SCALE = 0.05, 1.0
@@ -188,7 +189,7 @@ def load_material(path: str | Path, tile: Tiling = "none") -> Material:
         maps beside a height map are ignored.
     tile : {"none", "mirror", "blend"}
         Method for maps that do not tile. ``mirror``: 2 × 2 mirrored copies, a tile of twice the width;
-        ``blend``: a cross-fade over an eighth of the tile at each edge.
+        ``blend``: the edges blended over an eighth of the tile (:mod:`mbtf_gen.material.blending`).
 
     Returns
     -------
@@ -319,7 +320,7 @@ def _retiled(material: Material, tile: Literal["mirror", "blend"]) -> Material:
             where=folder,
             hint="use smaller maps, or --make-tileable blend",
         )
-    note = f"tile: edges cross-faded over {BAND:g} of the tile"
+    note = f"tile: edges blended over {BAND:g} of the tile"
     if tile == "mirror":
         note = "tile: 2 x 2 mirrored copies, two images wide, so heights in tile widths are halved"
     maps = retile({name: getattr(material, name) for name in MAPS}, tile)

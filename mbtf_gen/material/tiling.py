@@ -12,16 +12,14 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_gen.material.blending import blend_maps
+
 Array = NDArray[np.floating[Any]]
 
-# Share of the tile, at each edge, over which `blend` cross-fades.
-BAND = 0.125
 # A seam this many times the interior's 99th percentile is reported.
 _LIMIT = 1.5
 # Lines along an axis below which no percentile of the interior exists.
 _FEWEST = 16
-# Slopes are taken from normals no closer to the plane than this.
-_FLATTEST = 0.01
 
 
 @dataclass(frozen=True)
@@ -77,25 +75,6 @@ def mirror(image: Array) -> Array:
     return np.concatenate([top, np.flip(top, 0)], axis=0)
 
 
-def blend(image: Array) -> Array:
-    """Cross-fade at all edges, same shape (H, W, ...).
-
-    Along each axis the map is mixed with itself shifted by half a tile, which runs on smoothly where the map
-    has its seam: ``w(x)·f(x) + (1-w(x))·f(x+½)``, w rising from 0 at the edges to 1 over an eighth of the
-    tile (smoothstep). Maps of any resolution are treated alike; odd sizes interpolate the half texel.
-    """
-    out = np.asarray(image, np.float64)
-    for axis in (0, 1):
-        size = out.shape[axis]
-        edge = np.minimum(np.arange(size) + 0.5, size - np.arange(size) - 0.5) / size
-        x = np.clip(edge / BAND, 0.0, 1.0)
-        w = (x * x * (3.0 - 2.0 * x)).reshape(-1, *[1] * (out.ndim - 1 - axis))
-        half = size // 2
-        other = 0.5 * (np.roll(out, half, axis) + np.roll(out, size - half, axis))
-        out = w * out + (1.0 - w) * other
-    return out.astype(image.dtype)
-
-
 def mirror_normals(normal: NDArray[np.float32]) -> NDArray[np.float32]:
     """:func:`mirror` of unit vectors (H, W, 3), x along u and y along v: the mirrored axis changes sign."""
     rows, columns = normal.shape[:2]
@@ -103,17 +82,6 @@ def mirror_normals(normal: NDArray[np.float32]) -> NDArray[np.float32]:
     out[:, columns:, 0] *= -1.0
     out[rows:, ..., 1] *= -1.0
     return out
-
-
-def blend_normals(normal: NDArray[np.float32]) -> NDArray[np.float32]:
-    """:func:`blend` of unit vectors (H, W, 3): their slopes are mixed, as the heights' own are.
-
-    The slope that the cross-fade itself gives the heights is not in it: that is the mesh's.
-    """
-    n = normal.astype(np.float64)
-    slopes = blend(n[..., :2] / np.maximum(n[..., 2:], _FLATTEST))
-    up = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
-    return (up / np.linalg.norm(up, axis=-1, keepdims=True)).astype(np.float32)
 
 
 def retile(maps: Mapping[str, Any], tile: Literal["mirror", "blend"]) -> dict[str, Any]:
@@ -126,10 +94,10 @@ def retile(maps: Mapping[str, Any], tile: Literal["mirror", "blend"]) -> dict[st
     ----------
     maps : role → (H, W), (H, W, 3), a constant, or None; ``normal`` holds unit vectors, ``height`` lengths
     """
-    change, turn = (mirror, mirror_normals) if tile == "mirror" else (blend, blend_normals)
-    out = {role: change(value) if np.ndim(value) >= 2 else value for role, value in maps.items()}
+    if tile == "blend":
+        return blend_maps(maps)
+    out = {role: mirror(value) if np.ndim(value) >= 2 else value for role, value in maps.items()}
     if maps["normal"] is not None:
-        out["normal"] = turn(maps["normal"])
-    if tile == "mirror":
-        out["height"] = 0.5 * out["height"]
+        out["normal"] = mirror_normals(maps["normal"])
+    out["height"] = 0.5 * out["height"]
     return out

@@ -9,11 +9,10 @@ import pytest
 from support.height_maps import Floats, fractal, normals_of, save_heights, save_normals
 
 from mbtf_core.errors import InputError
-from mbtf_core.lattice import texel_centers
 from mbtf_core.shard_schema import Tiling
 from mbtf_gen.material.material import Material, load_material
 from mbtf_gen.material.normal_map import fit_normals
-from mbtf_gen.material.tiling import BAND, blend, blend_normals, broken, mirror, mirror_normals, seams
+from mbtf_gen.material.tiling import broken, mirror, mirror_normals, seams
 
 
 def cut(height: Floats) -> Floats:
@@ -72,41 +71,6 @@ class TestMirror:
             for line in (0, size - 1, size, 2 * size - 1):
                 np.moveaxis(inner, axis, 0)[line] = False
         assert np.abs(got - expected)[inner].max() < 1e-6
-
-
-class TestBlend:
-    @pytest.mark.parametrize("shape", [(96, 96), (61, 83)])
-    def test_seams_close(self, shape: tuple[int, int]) -> None:
-        height = cut(fractal(128, 128))[: shape[0], : shape[1]]
-        assert any(broken(s) for s in seams(height))
-        assert not any(broken(s) for s in seams(blend(height)))
-
-    def test_the_middle_stays(self) -> None:
-        height = fractal(96, 64)
-        out = blend(height)
-        band_v, band_u = (int(BAND * n) + 1 for n in height.shape)
-        middle = (slice(band_v, -band_v), slice(band_u, -band_u))
-        assert np.array_equal(out[middle], height[middle])
-        assert blend(np.full((9, 7, 3), 0.3)) == pytest.approx(0.3)
-
-    def test_resolutions_agree(self) -> None:
-        """The same function of uv at two resolutions, one of them odd, stays the same function."""
-
-        def wave(n: int) -> Floats:
-            uv = texel_centers(n, n)
-            return np.sin(2 * np.pi * 0.7 * uv[..., 0] + 0.3) * np.cos(2 * np.pi * 0.6 * uv[..., 1])
-
-        from mbtf_gen.images.resample import resample
-
-        small = blend(wave(63))
-        big = blend(wave(63 * 5))
-        assert np.abs(resample(big, 63, 63) - small).max() < 0.015
-
-    def test_normals_stay_unit_and_keep_the_middle(self) -> None:
-        normals = normals_of(cut(fractal(64, 64)), 0.1).astype(np.float32)
-        out = blend_normals(normals)
-        assert np.linalg.norm(out, axis=-1) == pytest.approx(1.0, abs=1e-6)
-        assert out[24, 24] == pytest.approx(normals[24, 24], abs=1e-6)
 
 
 class TestMaterial:
