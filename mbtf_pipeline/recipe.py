@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -45,6 +46,13 @@ def _distinct(values: Sequence[Any]) -> Sequence[Any]:
 
 
 Views = Annotated[list[SceneView], Field(min_length=1), AfterValidator(_distinct)]
+# The main kind, "query", comes first.
+Kinds = Annotated[
+    list[Literal["query", "pixel"]],
+    Field(min_length=1),
+    AfterValidator(_distinct),
+    AfterValidator(partial(sorted, reverse=True)),
+]
 TilesAcross = Annotated[float, Field(gt=0, le=1e4)]
 
 
@@ -64,7 +72,7 @@ class CompareSection(Settings):
     )
     size: int = Field(256, ge=8, le=4096, description="pixels along each side of an image")
     spp: Paths = Field(128, description="paths per pixel, both estimates together")
-    kinds: Annotated[list[Literal["query", "pixel"]], Field(min_length=1), AfterValidator(_distinct)] = Field(
+    kinds: Kinds = Field(
         ["query"], description="query: M at each pixel's footprint; pixel: the filtered image"
     )
     offset_views: Views = Field(

@@ -61,7 +61,7 @@ def test_data_are_out_of_date_when_a_map_has_changed(tmp_path: Path, monkeypatch
 
     def finish(where: Path, stage: Stage, *others: object) -> Decision:
         """Stands in for a run of the stage."""
-        run_stages(where, [replace(stage, needs=(), outputs=tuple, run=lambda decision: {})])
+        run_stages(where, [replace(stage, needs=(), outputs=tuple, run=lambda decision: None)])
         return Decision("")
 
     with monkeypatch.context() as patched:
