@@ -102,27 +102,18 @@ class ReportSection(Settings):
 def _is_single(fits: Mapping[str, Any]) -> bool:
     """Whether the section holds the options of one fit, not fits by name."""
     known = FitConfig.model_fields
-    return any(
-        key in known or not isinstance(value, Mapping | FitConfig | None) for key, value in fits.items()
-    )
+    return any(key in known or not isinstance(value, Mapping | None) for key, value in fits.items())
 
 
 def _named(fits: Any) -> Any:
     """Fits by name. The name of a fit defaults to its model, and its model to its name."""
-    if isinstance(fits, FitConfig):
-        return {fits.model: fits}
     if not isinstance(fits, Mapping):
         return fits
     if not fits:
         raise ValueError("contains no fit")
     if _is_single(fits):
         return {str(fits.get("model", FitConfig.model_fields["model"].default)): fits}
-    out: dict[str, Any] = {}
-    for name, options in fits.items():
-        if not isinstance(options, FitConfig):
-            options = {"model": name, **(options or {})}
-        out[str(name)] = options
-    return out
+    return {str(name): {"model": name, **(options or {})} for name, options in fits.items()}
 
 
 Fits = Annotated[dict[Name, FitConfig], BeforeValidator(_named)]

@@ -76,8 +76,6 @@ def round_scale(x: float) -> float:
 
 def common_scale(fields: Sequence[ArrayLike]) -> float:
     """Rounded end of the scale of several maps: the 99th percentile of all magnitudes."""
-    if not fields:
-        return 1.0
     return round_scale(float(np.percentile(np.concatenate([np.abs(np.ravel(f)) for f in fields]), 99)))
 
 

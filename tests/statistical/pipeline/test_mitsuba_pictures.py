@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from mbtf_core.errors import UsageError
 from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.job import Job
 from mbtf_gen.material.material import Material, load_material
+from mbtf_gen.pictures.camera import Camera
 from mbtf_pipeline.compare import unmodified_mitsuba
 from mbtf_pipeline.compare.unmodified_mitsuba import agreement, compare_with_mitsuba
 from mbtf_pipeline.recipe import CompareSection
@@ -24,10 +29,8 @@ def glossy(tmp_path_factory: pytest.TempPathFactory) -> Material:
     folder = tmp_path_factory.mktemp("material")
     random = np.random.default_rng(5)
     np.save(folder / "height.npy", np.kron(random.random((8, 16)), np.ones((2, 2))))
-    import PIL.Image
-
     colors = np.kron(random.integers(40, 255, (8, 16, 3)), np.ones((2, 2, 1))).astype(np.uint8)
-    PIL.Image.fromarray(colors).save(folder / "base_color.png")
+    Image.fromarray(colors).save(folder / "base_color.png")
     (folder / "material.yaml").write_text(
         "height: {file: height.npy, scale: 0.06}\nbase_color: base_color.png\nroughness: 0.4\n"
     )
@@ -55,11 +58,8 @@ def test_a_shifted_image_differs(glossy: Material, monkeypatch: pytest.MonkeyPat
     """The camera of Mitsuba is shifted by a texel, which preserves the mean."""
     real = unmodified_mitsuba.render_with_mitsuba
 
-    def moved(job: object, camera: object, *others: object) -> object:
-        import dataclasses
-
-        target = (0.5 + 1 / 16, 0.5)
-        return real(job, dataclasses.replace(camera, target=target), *others)  # type: ignore[type-var]
+    def moved(job: Job, camera: Camera, *others: Any) -> object:
+        return real(job, dataclasses.replace(camera, target=(0.5 + 1 / 16, 0.5)), *others)
 
     monkeypatch.setattr(unmodified_mitsuba, "render_with_mitsuba", moved)
     found = compare_with_mitsuba(SECTION, config("unused"), glossy)["base color"]
