@@ -56,8 +56,8 @@ def _random_queries(count: int, finest: int) -> list[NDArray[np.float32]]:
     return [np.asarray(a, np.float32) for a in arrays]
 
 
-def _synchronized(work: Callable[[], Any]) -> Callable[[], None]:
-    """The work without gradients, including the wait for the GPU."""
+def _seconds(work: Callable[[], Any]) -> float:
+    """Time of the work without gradients, including the wait for the GPU."""
     import torch
 
     def run() -> None:
@@ -66,7 +66,7 @@ def _synchronized(work: Callable[[], Any]) -> Callable[[], None]:
         if torch.cuda.is_available():
             torch.cuda.synchronize()
 
-    return run
+    return timed(run)[1]
 
 
 def measure_timing(material: Material, pixels: int, device: str) -> dict[str, Any]:
@@ -85,9 +85,9 @@ def measure_timing(material: Material, pixels: int, device: str) -> dict[str, An
     scale = 1e3 * pixels / count
 
     def milliseconds(part: Callable[..., Any]) -> float:
-        return scale * timed(_synchronized(lambda: [part(*chunk) for chunk in chunks]))[1]
+        return scale * _seconds(lambda: [part(*chunk) for chunk in chunks])
 
-    whole = scale * timed(_synchronized(lambda: material.evaluate(*queries)))[1]
+    whole = scale * _seconds(lambda: material.evaluate(*queries))
     first = milliseconds(lambda u, s, i, o: model.stage1(u, s, o))
     # Stage 2 is timed with the features of the first chunk: its time does not depend on their values.
     u, sigma, _, view = chunks[0]

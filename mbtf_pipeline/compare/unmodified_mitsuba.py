@@ -192,11 +192,13 @@ def _surfaces(material: Material) -> dict[str, Material]:
     """The material as a Lambertian surface of its base color, and as it is but without opacity."""
     if material.bsdf is not None:
         return {"full": material}
-    removed: dict[str, Any] = dict.fromkeys(_NOT_LAMBERTIAN)
-    lambertian = dataclasses.replace(material, **removed)
+    lambertian = dataclasses.replace(material, **dict.fromkeys(_NOT_LAMBERTIAN))
     full = dataclasses.replace(material, opacity=None)
-    glossy = any(getattr(full, name) is not None for name in _NOT_LAMBERTIAN)
-    return {"base color": lambertian, **({"full": full} if glossy else {})}
+    return {"base color": lambertian, **({} if _is_lambertian(full) else {"full": full})}
+
+
+def _is_lambertian(material: Material) -> bool:
+    return all(getattr(material, name) is None for name in _NOT_LAMBERTIAN)
 
 
 def render_with_mitsuba(job: Job, camera: Camera, omega_i: F64, spp: int, seed: int) -> tuple[F64, F64]:
@@ -292,7 +294,7 @@ def _mitsuba_bsdf(job: Job) -> dict[str, Any]:
     from mbtf_gen.render.bsdf.plugin import bsdf_of
 
     material = job.material
-    if any(getattr(material, name) is not None for name in _NOT_LAMBERTIAN) or material.bsdf is not None:
+    if material.bsdf is not None or not _is_lambertian(material):
         mapped = normal_map_slopes(job)
         return bsdf_of(material, slopes=None if mapped is None else mapped[0])
     base = np.asarray(material.base_color, np.float32)

@@ -9,7 +9,6 @@ from typing import Any
 
 from mbtf_core.atomic import read_json, write_text
 from mbtf_core.errors import InputError
-from mbtf_gen.config.effects_request import EFFECTS
 from mbtf_pipeline.compare.compare import COMPARISON_NAME, COMPARISON_SCHEMA
 from mbtf_pipeline.formatting import NOT_SIGNIFICANT
 from mbtf_pipeline.recipe import RECIPE_NAME, Recipe
@@ -93,7 +92,6 @@ def write_report(folder: Path, recipe: Recipe, stages: Sequence[str]) -> None:
         "train_spp": manifest["splits"]["train"]["spp"],
         "offsets": offset_section(folder / COMPARE, comparison["offsets"], gallery),
         "effects": manifest["effects"]["effects"],
-        "effect_labels": EFFECTS,
         "command": run["command"],
         "recipe_yaml": (folder / RECIPE_NAME).read_text(encoding="utf-8"),
         "provenance": provenance(folder, manifest, fit_folders, run["machine"]),
