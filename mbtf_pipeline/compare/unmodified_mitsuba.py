@@ -192,7 +192,8 @@ def _surfaces(material: Material) -> dict[str, Material]:
     """The material as a Lambertian surface of its base color, and as it is but without opacity."""
     if material.bsdf is not None:
         return {"full": material}
-    lambertian = dataclasses.replace(material, **dict.fromkeys(_NOT_LAMBERTIAN))
+    removed: dict[str, Any] = dict.fromkeys(_NOT_LAMBERTIAN)
+    lambertian = dataclasses.replace(material, **removed)
     full = dataclasses.replace(material, opacity=None)
     return {"base color": lambertian, **({} if _is_lambertian(full) else {"full": full})}
 
