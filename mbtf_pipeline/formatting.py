@@ -27,21 +27,11 @@ def is_significant(e: Estimate) -> bool:
 def estimate_text(
     e: Estimate, factor: float = 1.0, unit: str = "", *, significant: bool | None = None
 ) -> str:
-    """``0.123 ± 0.004``, or ``not significant (0.003 ± 0.004)``.
-
-    Parameters
-    ----------
-    significant : overrides the test of the value itself
-    """
+    """``0.123 ± 0.004``, or ``not significant (0.003 ± 0.004)``; `significant` overrides the value's test."""
     if not math.isfinite(e.value):
         return "undefined"
     text = signed(f"{e.scaled(factor)}{unit}")
     return text if (is_significant(e) if significant is None else significant) else not_significant(text)
-
-
-def percent(e: Estimate, *, significant: bool | None = None) -> str:
-    """:func:`estimate_text` in percent."""
-    return estimate_text(e, 100.0, " %", significant=significant)
 
 
 def not_significant(text: str) -> str:
@@ -61,7 +51,10 @@ def data_errors(record: Mapping[str, Any]) -> tuple[str, str]:
     """
     unexplained, mse = estimate(record["unexplained"]), estimate(record["mse"])
     significant = is_significant(unexplained) and is_significant(mse)
-    return percent(unexplained, significant=significant), estimate_text(mse, 1e3, significant=significant)
+    return (
+        estimate_text(unexplained, 100.0, " %", significant=significant),
+        estimate_text(mse, 1e3, significant=significant),
+    )
 
 
 def decibel(psnr: Estimate, mse: Estimate) -> str:

@@ -33,9 +33,9 @@ def quality_assignments(path: Path, quality: Quality | None, assignments: Sequen
     if quality is None:
         return []
     out = as_assignments(GENERATOR[quality], "generate.")
-    prefixes = fit_names(path)
     given = overrides_of(path, assignments)
-    for prefix, options in fitter_options(quality, {p: _options_of_fit(given, p) for p in prefixes}).items():
+    fits = {prefix: _options_of_fit(given, prefix) for prefix in fit_names(path)}
+    for prefix, options in fitter_options(quality, fits).items():
         out += as_assignments(options, f"{prefix}.")
     return out + as_assignments(COMPARE[quality])
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -45,6 +46,13 @@ def _distinct(values: Sequence[Any]) -> Sequence[Any]:
 
 
 Views = Annotated[list[SceneView], Field(min_length=1), AfterValidator(_distinct)]
+# The main kind, "query", comes first.
+Kinds = Annotated[
+    list[Literal["query", "pixel"]],
+    Field(min_length=1),
+    AfterValidator(_distinct),
+    AfterValidator(partial(sorted, reverse=True)),
+]
 TilesAcross = Annotated[float, Field(gt=0, le=1e4)]
 
 
@@ -64,7 +72,7 @@ class CompareSection(Settings):
     )
     size: int = Field(256, ge=8, le=4096, description="pixels along each side of an image")
     spp: Paths = Field(128, description="paths per pixel, both estimates together")
-    kinds: Annotated[list[Literal["query", "pixel"]], Field(min_length=1), AfterValidator(_distinct)] = Field(
+    kinds: Kinds = Field(
         ["query"], description="query: M at each pixel's footprint; pixel: the filtered image"
     )
     offset_views: Views = Field(
@@ -94,27 +102,18 @@ class ReportSection(Settings):
 def _is_single(fits: Mapping[str, Any]) -> bool:
     """Whether the section holds the options of one fit, not fits by name."""
     known = FitConfig.model_fields
-    return any(
-        key in known or not isinstance(value, Mapping | FitConfig | None) for key, value in fits.items()
-    )
+    return any(key in known or not isinstance(value, Mapping | None) for key, value in fits.items())
 
 
 def _named(fits: Any) -> Any:
     """Fits by name. The name of a fit defaults to its model, and its model to its name."""
-    if isinstance(fits, FitConfig):
-        return {fits.model: fits}
     if not isinstance(fits, Mapping):
         return fits
     if not fits:
         raise ValueError("contains no fit")
     if _is_single(fits):
         return {str(fits.get("model", FitConfig.model_fields["model"].default)): fits}
-    out: dict[str, Any] = {}
-    for name, options in fits.items():
-        if not isinstance(options, FitConfig):
-            options = {"model": name, **(options or {})}
-        out[str(name)] = options
-    return out
+    return {str(name): {"model": name, **(options or {})} for name, options in fits.items()}
 
 
 Fits = Annotated[dict[Name, FitConfig], BeforeValidator(_named)]

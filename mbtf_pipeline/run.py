@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from mbtf_core.atomic import read_json
 from mbtf_core.console import Console
@@ -34,13 +35,11 @@ from mbtf_pipeline.stages import (
     StageResult,
     Stamp,
     decide,
-    read_stamp,
     run_again,
     run_stages,
 )
 
 GENERATE_STAGE, COMPARE_STAGE, REPORT_STAGE = "generate", "compare", "report"
-Inputs = Mapping[str, str]
 
 
 def fit_stage(name: str) -> str:
@@ -48,22 +47,8 @@ def fit_stage(name: str) -> str:
     return f"fit {name}"
 
 
-def stage_names(recipe: Recipe) -> list[str]:
-    """Names of a recipe's stages in the order in which they run."""
-    data = [d.stage for d in data_sets(recipe)]
-    return [*data, *(fit_stage(name) for name in recipe.fit), COMPARE_STAGE, REPORT_STAGE]
-
-
-@dataclass(frozen=True)
-class DataSet:
-    """A data set of a run.
-
-    Attributes
-    ----------
-    stage : name of its stage
-    sub : its folder within the run's
-    config : of the generator
-    """
+class DataSet(NamedTuple):
+    """A data set of a run: name of its stage, its folder within the run's, options of the generator."""
 
     stage: str
     sub: str
@@ -121,22 +106,22 @@ class _RecipeRun:
     folder: Path
     console: Console
 
-    def stages(self, inputs: Inputs) -> list[Stage]:
+    def stages(self, inputs: Mapping[str, str]) -> list[Stage]:
         """All stages; `inputs` holds the digests of the material's files by role."""
         recipe = self.recipe
-        fits = [fit_stage(name) for name in recipe.fit]
         out: list[Stage] = []
+        data_of: dict[str, DataSet] = {}
         for data in data_sets(recipe):
+            data_of[data.config.queries.layout] = data
             generate = data.config.model_dump(mode="json", exclude={"material"})
-            out.append(Stage(data.stage, (), generate, inputs, self._files(data.sub), self._generate(data)))
+            files, run = self._files(data.sub), partial(self._generate, data)
+            out.append(Stage(data.stage, (), generate, inputs, files, run))
         for name, config in recipe.fit.items():
-            data = self._data_of(config)
-            files = self._files(f"{FITS}/{name}")
-            out.append(
-                Stage(fit_stage(name), (data.stage,), config.fields(), {}, files, self._fit(name, data))
-            )
+            data = data_of[layout_of(config)]
+            files, run = self._files(f"{FITS}/{name}"), partial(self._fit, name, data)
+            out.append(Stage(fit_stage(name), (data.stage,), config.fields(), {}, files, run))
         compared = {"record": COMPARISON_SCHEMA, **recipe.compare.model_dump(mode="json")}
-        needs = (GENERATE_STAGE, *fits)
+        needs = (GENERATE_STAGE, *map(fit_stage, recipe.fit))
         out.append(Stage(COMPARE_STAGE, needs, compared, {}, self._files(COMPARE), self._compare))
         shown = {
             "name": recipe.name,
@@ -157,86 +142,55 @@ class _RecipeRun:
             if p.is_file() and not any(part.startswith(".") for part in p.relative_to(top).parts)
         ]
 
-    def _data_of(self, config: FitConfig) -> DataSet:
-        """The data set that a fit is trained on."""
-        layout = layout_of(config)
-        return next(d for d in data_sets(self.recipe) if d.config.queries.layout == layout)
+    def _generate(self, data: DataSet, decision: Decision) -> None:
+        from mbtf_core.shard_schema import MANIFEST_NAME
+        from mbtf_gen.dataset.verify import sidecar_of
+        from mbtf_gen.generation import generate, paths_left
+        from mbtf_gen.job import Job
 
-    def _generate(self, data: DataSet) -> Callable[[Decision], dict[str, Any]]:
-        def run(decision: Decision) -> dict[str, Any]:
-            from mbtf_core.shard_schema import MANIFEST_NAME
-            from mbtf_gen.dataset.summary import summary_dict
-            from mbtf_gen.dataset.verify import sidecar_of
-            from mbtf_gen.generation import generate, paths_left
-            from mbtf_gen.job import Job
+        job = Job.prepare(data.config)
+        shards = self.folder / data.sub
+        manifest = shards / MANIFEST_NAME
+        for path in decision.changed_files:
+            path.unlink(missing_ok=True)
+            sidecar_of(path).unlink(missing_ok=True)
+        if (
+            decision.forced
+            or not manifest.exists()
+            or read_json(manifest).get("config_hash") != job.config_hash
+        ):
+            clear(shards)
+        with self.console.progress(paths_left(job, shards), data.stage, "paths") as bar:
+            generate(job, shards, progress=bar.update)
 
-            job = Job.prepare(data.config)
-            shards = self.folder / data.sub
-            manifest = shards / MANIFEST_NAME
-            for path in decision.changed_files:
-                path.unlink(missing_ok=True)
-                sidecar_of(path).unlink(missing_ok=True)
-            if (
-                decision.forced
-                or not manifest.exists()
-                or read_json(manifest).get("config_hash") != job.config_hash
-            ):
-                clear(shards)
-            with self.console.progress(paths_left(job, shards), data.stage, "paths") as bar:
-                summary = generate(job, shards, progress=lambda done, note: bar.update(done, note))
-            return summary_dict(summary)
+    def _fit(self, name: str, data: DataSet, decision: Decision) -> None:
+        from mbtf_fit import fit
 
-        return run
+        config, shards, out = self.recipe.fit[name], self.folder / data.sub, self.folder / FITS / name
+        if decision.reason != NOT_RUN or not _unfinished(out, config, shards):
+            clear(out)
+        steps = config.training.steps
+        budget, unit = (config.training.time, "s") if steps is None else (steps, "steps")
+        with self.console.progress(budget, fit_stage(name), unit) as bar:
+            fit(config, shards, out, progress=lambda share, note: bar.update(round(share * budget, 1), note))
 
-    def _fit(self, name: str, data: DataSet) -> Callable[[Decision], dict[str, Any]]:
-        def run(decision: Decision) -> dict[str, Any]:
-            from mbtf_fit import fit
-
-            config, shards, out = self.recipe.fit[name], self.folder / data.sub, self.folder / FITS / name
-            if decision.reason != NOT_RUN or not _unfinished(out, config, shards):
-                clear(out)
-            budget, unit = (
-                (config.training.time, "s")
-                if config.training.steps is None
-                else (config.training.steps, "steps")
-            )
-            with self.console.progress(budget, fit_stage(name), unit) as bar:
-                result = fit(
-                    config,
-                    shards,
-                    out,
-                    progress=lambda share, note: bar.update(round(share * budget, 1), note),
-                )
-            return {"seconds": result.seconds, "resumed": result.resumed}
-
-        return run
-
-    def _compare(self, decision: Decision) -> dict[str, Any]:
+    def _compare(self, decision: Decision) -> None:
         from mbtf_pipeline.compare.compare import compare, steps
 
-        out = self.folder / COMPARE
+        out, shards = self.folder / COMPARE, self.folder / SHARDS
         clear(out)
-        fits = {name: self.folder / FITS / name for name in self.recipe.fit}
-        with self.console.progress(steps(self.recipe.compare, len(fits)), "compare", "pictures") as bar:
-            record = compare(
-                self.recipe.compare,
-                self.recipe.generate,
-                self.folder / SHARDS,
-                fits,
-                out,
-                lambda note: bar.advance(1, note),
-            )
-        return {"seconds": record["seconds"]}
+        recipe, fits = self.recipe, {name: self.folder / FITS / name for name in self.recipe.fit}
+        with self.console.progress(steps(recipe.compare, len(fits)), "compare", "pictures") as bar:
+            compare(recipe.compare, recipe.generate, shards, fits, out, lambda note: bar.advance(1, note))
 
-    def _report(self, decision: Decision) -> dict[str, Any]:
+    def _report(self, decision: Decision) -> None:
         from mbtf_pipeline.report.report import write_report
 
-        size = write_report(self.folder, self.recipe, stage_names(self.recipe)[:-1])
-        return {"bytes": size}
+        write_report(self.folder, self.recipe, [stage.name for stage in self.stages({})][:-1])
 
 
 def _unfinished(out: Path, config: FitConfig, shards: Path) -> bool:
-    """Whether a folder contains this fit, unfinished, from an interrupted run."""
+    """Whether a folder contains this fit from an interrupted run."""
     from mbtf_core.shard_schema import MANIFEST_NAME
 
     try:
@@ -312,10 +266,7 @@ def survey(recipe: Recipe, folder: Path) -> dict[str, Decision]:
     run = _RecipeRun(recipe, folder, Console(quiet=True))
     out: dict[str, Decision] = {}
     for stage in run.stages(_material_inputs(recipe)):
-        stamps = {name: read_stamp(folder, name) for name in stage.needs}
-        upstream = {name: stamp.outputs_hash if stamp is not None else "" for name, stamp in stamps.items()}
-        fresh = [name for name, decision in out.items() if decision.runs]
-        out[stage.name] = decide(folder, stage, upstream, fresh)
+        out[stage.name] = decide(folder, stage, [name for name, decision in out.items() if decision.runs])
     return out
 
 

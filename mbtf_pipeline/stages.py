@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from mbtf_core.errors import InputError
 
 STAMP_FORMAT = "mbtf-stage"
 # Part of every key; raised when a stage produces different outputs from the same inputs.
-STAGE_SCHEMA = 2
+STAGE_SCHEMA = 3
 STAMPS = "stages"
 FORCED = "forced"
 NOT_RUN = "has not run"
@@ -38,7 +38,7 @@ class Stage:
     config : resolved options, plain data
     inputs : digests of input files from outside the run, by role
     outputs : lists the files it has written
-    run : does the work and returns notes for the stamp
+    run : does the work
     """
 
     name: str
@@ -46,7 +46,7 @@ class Stage:
     config: Mapping[str, Any]
     inputs: Mapping[str, str]
     outputs: Callable[[], Sequence[Path]]
-    run: Callable[[Decision], Mapping[str, Any]]
+    run: Callable[[Decision], None]
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,6 @@ class Stamp:
     depends : data covered by the hash
     outputs : file, relative to the run's folder → SHA-256
     seconds : wall-clock time of the run
-    notes : returned by the stage
     """
 
     stage: str
@@ -67,7 +66,6 @@ class Stamp:
     depends: dict[str, Any]
     outputs: dict[str, str]
     seconds: float
-    notes: dict[str, Any] = field(default_factory=dict)
 
     @property
     def outputs_hash(self) -> str:
@@ -106,11 +104,8 @@ def stamp_path(folder: Path, stage: str) -> Path:
 
 def read_stamp(folder: Path, stage: str) -> Stamp | None:
     """A stage's stamp; None if there is none that this version can read."""
-    path = stamp_path(folder, stage)
-    if not path.exists():
-        return None
     try:
-        data = read_json(path)
+        data = read_json(stamp_path(folder, stage))
         if data.pop("format") != STAMP_FORMAT or data.pop("schema") != STAGE_SCHEMA:
             return None
         return Stamp(**data)
@@ -118,49 +113,35 @@ def read_stamp(folder: Path, stage: str) -> Stamp | None:
         return None
 
 
-def _write_stamp(folder: Path, stamp: Stamp) -> None:
-    path = stamp_path(folder, stamp.stage)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_json(path, {"format": STAMP_FORMAT, "schema": STAGE_SCHEMA, **vars(stamp)})
-
-
-def _depends(stage: Stage, upstream: Mapping[str, str]) -> dict[str, Any]:
-    data = {"config": dict(stage.config), "inputs": dict(stage.inputs), "needs": dict(upstream)}
+def _depends(folder: Path, stage: Stage) -> tuple[dict[str, Any], str]:
+    """Data that the outputs of a stage depend on, and their hash."""
+    stamps = {name: read_stamp(folder, name) for name in stage.needs}
+    needs = {name: "" if stamp is None else stamp.outputs_hash for name, stamp in stamps.items()}
+    data = {"config": dict(stage.config), "inputs": dict(stage.inputs), "needs": needs}
     plain: dict[str, Any] = json.loads(json.dumps(data))  # as JSON stores it: tuples become lists
-    return plain
-
-
-def _key(stage: Stage, depends: Mapping[str, Any]) -> str:
-    return data_sha256({"schema": STAGE_SCHEMA, "stage": stage.name, **depends})
+    return plain, data_sha256({"schema": STAGE_SCHEMA, "stage": stage.name, **plain})
 
 
 def _what_changed(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
     from mbtf_core.config_file import differences
 
-    if changes := differences(old.get("config", {}), new["config"]):
+    if changes := differences(old["config"], new["config"]):
         more = f" and {len(changes) - 3} more" if len(changes) > 3 else ""
         return f"options changed: {'; '.join(changes[:3])}{more}"
-    before, after = old.get("inputs", {}), new["inputs"]
-    if names := [n for n in sorted({*before, *after}) if before.get(n) != after.get(n)]:
-        return f"input changed: {', '.join(names)}"
-    before, after = old.get("needs", {}), new["needs"]
-    names = [n for n in sorted({*before, *after}) if before.get(n) != after.get(n)]
-    return f"inputs changed: {', '.join(names)}" if names else "the version of the stage changed"
+    for part, what in (("inputs", "input"), ("needs", "inputs")):
+        before, after = old[part], new[part]
+        if names := [n for n in sorted({*before, *after}) if before.get(n) != after.get(n)]:
+            return f"{what} changed: {', '.join(names)}"
+    return "the version of the stage changed"
 
 
-def decide(folder: Path, stage: Stage, upstream: Mapping[str, str], fresh: Sequence[str] = ()) -> Decision:
-    """Whether a stage of the run in `folder` must run.
-
-    Parameters
-    ----------
-    upstream : digest of the outputs by name of each needed stage
-    fresh : stages that have just run; dependent stages run too
-    """
+def decide(folder: Path, stage: Stage, fresh: Sequence[str] = ()) -> Decision:
+    """Whether a stage of the run in `folder` must run; it does if it needs one of the stages in `fresh`."""
     stamp = read_stamp(folder, stage.name)
     if stamp is None:
         return Decision(NOT_RUN)
-    depends = _depends(stage, upstream)
-    if stamp.key != _key(stage, depends):
+    depends, key = _depends(folder, stage)
+    if stamp.key != key:
         return Decision(_what_changed(stamp.depends, depends))
     changed_files = tuple(
         folder / name
@@ -200,46 +181,44 @@ def run_stages(
     """
     done: dict[str, StageResult] = {}
     for stage in stages:
-        upstream = {name: done[name].stamp.outputs_hash for name in stage.needs}
         fresh = [name for name, result in done.items() if result.ran]
-        decision = Decision(FORCED) if force else decide(folder, stage, upstream, fresh)
+        decision = Decision(FORCED) if force else decide(folder, stage, fresh)
         if notify is not None:
             notify(stage.name, decision, None)
         stamp = read_stamp(folder, stage.name)
         if decision.runs or stamp is None:
-            stamp = _run(folder, stage, upstream, decision)
+            stamp = _run(folder, stage, decision)
         done[stage.name] = StageResult(stamp, decision.runs, decision.reason)
         if notify is not None:
             notify(stage.name, decision, stamp)
     return done
 
 
-def run_again(folder: Path, stage: Stage) -> Stamp:
-    """Run one stage regardless of its state; the stages it needs must have finished.
+def run_again(folder: Path, stage: Stage) -> None:
+    """Run one stage regardless of its state.
 
     Raises
     ------
-    InputError : one of them has not finished
+    InputError : a stage that it needs has not finished
     """
-    upstream: dict[str, str] = {}
     for name in stage.needs:
-        stamp = read_stamp(folder, name)
-        if stamp is None:
+        if read_stamp(folder, name) is None:
             raise InputError(
                 f"stage '{name}' is not finished", where=folder, hint="run the recipe again: it resumes"
             )
-        upstream[name] = stamp.outputs_hash
-    return _run(folder, stage, upstream, Decision(FORCED))
+    _run(folder, stage, Decision(FORCED))
 
 
-def _run(folder: Path, stage: Stage, upstream: Mapping[str, str], decision: Decision) -> Stamp:
+def _run(folder: Path, stage: Stage, decision: Decision) -> Stamp:
+    path = stamp_path(folder, stage.name)
     # Without a stamp, an interrupted stage counts as not run.
-    stamp_path(folder, stage.name).unlink(missing_ok=True)
+    path.unlink(missing_ok=True)
     start = time.perf_counter()
-    notes = stage.run(decision)
+    stage.run(decision)
     seconds = time.perf_counter() - start
-    depends = _depends(stage, upstream)
-    outputs = {path.relative_to(folder).as_posix(): file_sha256(path) for path in sorted(stage.outputs())}
-    stamp = Stamp(stage.name, _key(stage, depends), depends, outputs, round(seconds, 3), dict(notes))
-    _write_stamp(folder, stamp)
+    depends, key = _depends(folder, stage)
+    outputs = {file.relative_to(folder).as_posix(): file_sha256(file) for file in sorted(stage.outputs())}
+    stamp = Stamp(stage.name, key, depends, outputs, round(seconds, 3))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(path, {"format": STAMP_FORMAT, "schema": STAGE_SCHEMA, **vars(stamp)})
     return stamp

@@ -63,15 +63,14 @@ def cost(
             ),
             progress=lambda share, note: bar.update(round(100 * share, 1), note),
         )
-    page = write_page(study)
+    page, measured = write_page(study), len(study.measurements)
     front = pareto_front(whole_runs(study.measurements))
-    measured, skipped = len(study.measurements), len(study.skipped)
-    lines = [f"{page}: {measured} configurations measured, {skipped} skipped for lack of time"]
+    lines = [f"{page}: {measured} configurations measured, {len(study.skipped)} skipped for lack of time"]
     lines += [f"failed: {text}" for text in study.failed]
     lines += [f"  {m.seconds.value:.0f} s: unexplained variance {m.error}   {m.command}" for m in front]
     data = {
         "page": page,
-        "measurements": len(study.measurements),
+        "measurements": measured,
         "skipped": study.skipped,
         "failed": study.failed,
         "front": [

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
@@ -48,22 +48,21 @@ def run(
 
     given = {"quality": quality, "time": time, "quick": quick, "output": output, "set": assignments}
     command = command_line("mbtf-pipeline", "run", recipe, **given)
+    own = assignments or []
     if is_paper_recipe(recipe):
-        for name in ("quality", "time"):
-            if given[name] is not None:
-                hint = "leave it out; --quick is the small size"
-                raise UsageError(
-                    "a paper recipe has sizes and times of its own", where=f"--{name}", hint=hint
-                )
-        _run_paper(recipe, output, quick, force, assignments or [], command, console)
-        return
+        if quality is not None or time is not None:
+            raise UsageError(
+                "a paper recipe has sizes and times of its own",
+                where="--time" if quality is None else "--quality",
+                hint="leave it out; --quick is the small size",
+            )
+        return _run_paper(recipe, output, quick, force, own, command, console)
     if quick:
         raise UsageError("only paper recipes have quick sizes", where="--quick", hint="use --quality draft")
     from mbtf_pipeline.presets import quality_assignments
     from mbtf_pipeline.recipe import load_recipe
     from mbtf_pipeline.run import run_recipe
 
-    own = assignments or []
     loaded = load_recipe(recipe, [*quality_assignments(recipe, quality, own), *own])
     if time is not None:
         from mbtf_core.units import asked_duration
@@ -74,7 +73,7 @@ def run(
         console.note(split.describe())
         loaded = with_split(loaded, split)
     result = run_recipe(loaded, output, force=force, command=command, console=console)
-    console.report(_summary(result), _describe(result))
+    _report(result, console)
 
 
 def _run_paper(
@@ -97,41 +96,29 @@ def _run_paper(
     )
     skipped = f", {len(missing)} skipped: {', '.join(missing)}" if missing else ""
     size = done.record["size"]
-    data = {
-        "folder": done.folder,
-        "page": done.page,
-        "size": size,
-        "tables": done.tables,
-        "runs": [one.name for one in planned],
-        "skipped": missing,
-    }
+    data = {"folder": done.folder, "page": done.page, "size": size, "tables": done.tables}
+    data |= {"runs": [one.name for one in planned], "skipped": missing}
     console.report(data, f"{done.page}: {size} size, {len(planned)} runs{skipped}")
 
 
-def _summary(result: RunResult) -> dict[str, Any]:
-    return {
+def _report(result: RunResult, console: Console) -> None:
+    from mbtf_pipeline.formatting import estimate
+
+    tests = {fit: record["splits"]["test"] for fit, record in result.comparison["test"].items()}
+    ran = {name: stage.stamp.seconds for name, stage in result.stages.items() if stage.ran}
+    data = {
         "folder": result.folder,
         "report": result.report,
-        "seconds": round(sum(o.stamp.seconds for o in result.stages.values() if o.ran), 3),
+        "seconds": round(sum(ran.values()), 3),
         "stages": {
             name: {"ran": o.ran, "reason": o.reason or "up to date", "seconds": o.stamp.seconds}
             for name, o in result.stages.items()
         },
         "test": {
-            fit: {
-                "unexplained_variance": r["splits"]["test"]["unexplained"],
-                "mse": r["splits"]["test"]["mse"],
-            }
-            for fit, r in result.comparison["test"].items()
+            fit: {"unexplained_variance": e["unexplained"], "mse": e["mse"]} for fit, e in tests.items()
         },
     }
-
-
-def _describe(result: RunResult) -> str:
-    from mbtf_pipeline.formatting import estimate
-
-    ran = [f"{n} {clock(o.stamp.seconds)}" for n, o in result.stages.items() if o.ran]
-    lines = [f"{result.report}: {', '.join(ran) or 'everything up to date'}"]
-    for fit, record in result.comparison["test"].items():
-        lines.append(f"  {fit}: unexplained variance {estimate(record['splits']['test']['unexplained'])}")
-    return "\n".join(lines)
+    times = ", ".join(f"{name} {clock(seconds)}" for name, seconds in ran.items())
+    lines = [f"{result.report}: {times or 'everything up to date'}"]
+    lines += [f"  {fit}: unexplained variance {estimate(e['unexplained'])}" for fit, e in tests.items()]
+    console.report(data, "\n".join(lines))

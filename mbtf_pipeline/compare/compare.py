@@ -21,12 +21,9 @@ from mbtf_pipeline.compare.perceptual_metrics import perceptual_scores
 from mbtf_pipeline.compare.pictures import (
     PICTURES,
     Scene,
-    fit_name,
-    reference_name,
     scenes,
     write_map,
     write_picture,
-    write_preview,
 )
 from mbtf_pipeline.compare.st_lpips import require
 from mbtf_pipeline.compare.timing import measure_timing, timed
@@ -42,7 +39,7 @@ if TYPE_CHECKING:
 COMPARISON_NAME = "comparison.json"
 COMPARISON_FORMAT = "mbtf-comparison"
 # Raised when the record or its files change; part of the stage's key.
-COMPARISON_SCHEMA = 6
+COMPARISON_SCHEMA = 7
 
 F32 = NDArray[np.float32]
 Progress = Callable[[str], None]
@@ -52,8 +49,7 @@ _TIMED_PIXELS = 1920 * 1080
 
 def steps(compare: CompareSection, fits: int) -> int:
     """How often :func:`compare` reports progress."""
-    pictures = sum(1 for _ in scenes(compare))
-    return pictures * (len(compare.kinds) + fits)
+    return len(list(scenes(compare))) * (len(compare.kinds) + fits)
 
 
 def compare(
@@ -63,37 +59,21 @@ def compare(
     fits: Mapping[str, Path],
     out: Path,
     progress: Progress,
-) -> dict[str, Any]:
+) -> None:
     """Render references, evaluate all fits at the same pixels, and measure their errors.
 
     Parameters
     ----------
-    section : CompareSection
-        Views, lights, widths of the field of view, and image size.
-    generate : GeneratorConfig
-        Material, geometry, light and transport.
-    shards : Path
-        Data set whose test split the fits are evaluated on.
-    fits : mapping of str to Path
-        Folder of the fitted material by name of the fit.
-    out : Path
-        Folder for images and records; ``comparison.json`` is written last.
-    progress : callable
-        Called with a short note after each image.
-
-    Returns
-    -------
-    dict
-        Content of ``comparison.json``.
+    shards : data set whose test split the fits are evaluated on
+    fits : folder of the fitted material by name of the fit
+    out : folder for images and records; ``comparison.json`` is written last
+    progress : called with a short note after each image
 
     Raises
     ------
-    InputError
-        The material, the data set or a fit cannot be read.
-    UsageError
-        ``unmodified_mitsuba`` is set and no scene is suitable for it.
-    EngineError
-        ST-LPIPS is requested and its weights are not installed.
+    InputError : the material, the data set or a fit cannot be read
+    UsageError : ``unmodified_mitsuba`` is set and no scene is suitable for it
+    EngineError : ST-LPIPS is requested and its weights are not installed
     """
     from mbtf_fit import Material
     from mbtf_gen.dataset.reader import Dataset
@@ -113,17 +93,14 @@ def compare(
     job = Job(generate, material)
     estimator = build_estimator(job, reference_plan(job))
     rendered = _render_references(section, estimator, progress)
-    seconds = {"references": time.perf_counter() - start}
+    seconds = time.perf_counter() - start
     # From the query references if there are any, otherwise from the pixel references.
     white = white_point([next(iter(images.values())).value for _, images in rendered])
-    start = time.perf_counter()
     pictures = [
         _compare_scene(scene, images, materials, white, section.st_lpips, out, progress)
         for scene, images in rendered
     ]
-    seconds["fits"] = time.perf_counter() - start
     data = Dataset.open(shards)
-    offsets = write_offsets(estimator, materials, section.offset_views, data.lattice, out)
     record: dict[str, Any] = {
         "format": COMPARISON_FORMAT,
         "schema": COMPARISON_SCHEMA,
@@ -137,50 +114,36 @@ def compare(
         "definitions": DEFINITIONS,
         "pictures": pictures,
         "test": dataset_errors(materials, data),
-        "offsets": offsets,
-        "seconds": {k: round(v, 3) for k, v in seconds.items()},
+        "offsets": write_offsets(estimator, materials, section.offset_views, data.lattice, out),
+        "seconds": {"references": round(seconds, 3)},
     }
     if section.unmodified_mitsuba:
         record["unmodified_mitsuba"] = write_agreement(section, generate, material, white, out)
     if section.timing:
-        record["timing"] = _timings(fits)
+        import torch
+
+        devices = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+        record["timing"] = {
+            name: [measure_timing(Material.load(folder, d), _TIMED_PIXELS, d) for d in devices]
+            for name, folder in fits.items()
+        }
     write_json(out / COMPARISON_NAME, record)
-    return record
-
-
-def _timings(fits: Mapping[str, Path]) -> dict[str, list[dict[str, Any]]]:
-    """Times of every fit on the CPU and, if available, on the GPU."""
-    import torch
-
-    from mbtf_fit import Material
-
-    devices = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
-    return {
-        name: [measure_timing(Material.load(folder, d), _TIMED_PIXELS, d) for d in devices]
-        for name, folder in fits.items()
-    }
 
 
 def _render_references(
     section: CompareSection, estimator: Estimator, progress: Progress
 ) -> list[tuple[Scene, dict[PixelKind, ReferenceImage]]]:
-    """References by scene and kind, the query kind first."""
+    """References by scene and kind."""
     from mbtf_gen.pictures.reference import render_reference
 
-    kinds = sorted(section.kinds, key=lambda kind: kind != "query")
+    options = {"spp": section.spp, "seed": section.seed}
     out = []
     for scene in scenes(section):
         images: dict[PixelKind, ReferenceImage] = {}
-        for kind in kinds:
-            images[kind] = render_reference(
-                estimator,
-                scene.camera(section.size),
-                from_angles(scene.light.elevation, scene.light.azimuth),
-                kind=kind,
-                spp=section.spp,
-                seed=section.seed,
-                index=scene.index,
-            )
+        camera = scene.camera(section.size)
+        light = from_angles(scene.light.elevation, scene.light.azimuth)
+        for kind in section.kinds:
+            images[kind] = render_reference(estimator, camera, light, kind=kind, index=scene.index, **options)
             progress(f"reference {scene.name}")
         out.append((scene, images))
     return out
@@ -199,10 +162,16 @@ def _compare_scene(
     from mbtf_core.lattice import level_of_sigma
     from mbtf_core.stats import mse_difference, pooled_relative_error
 
-    record: dict[str, Any] = scene.describe()
-    record["references"] = {}
+    record: dict[str, Any] = {
+        "name": scene.name,
+        "view": scene.view.model_dump(),
+        "light": scene.light.model_dump(),
+        "tiles_across": scene.tiles_across,
+        "references": {},
+        "fits": {},
+    }
     for kind, image in images.items():
-        file = scene.file(reference_name(image.kind))
+        file = scene.file(f"reference-{kind}")
         image.write(out / file, 1.0 / white)
         noise = pooled_relative_error(image.value_a.reshape(-1, 3), image.value_b.reshape(-1, 3))
         record["references"][kind] = {"file": file, "noise": noise.as_dict()}
@@ -211,36 +180,31 @@ def _compare_scene(
         between = reference_difference((query.value_a, query.value_b), pixel.value_a, pixel.value_b)
         record["between_references"] = between.as_dict()
     main_kind, main = next(iter(images.items()))
-    baseline = perceptual_scores(main.value_a, main.value_b, white, with_st_lpips=with_st_lpips)
-    record["references"][main_kind] |= baseline.as_dict()
-    queries = main.queries
-    level = level_of_sigma(queries.sigma)
+    record["references"][main_kind] |= perceptual_scores(main.value_a, main.value_b, white, with_st_lpips)[0]
+    level = level_of_sigma(main.queries.sigma)
     record["levels"] = [round(float(level.min()), 3), round(float(level.max()), 3)]
-    record["fits"] = {}
-    values: list[F32] = []
+    flat = main.queries.flat()
+    arrays = flat.u, flat.sigma, flat.omega_i, flat.omega_o
+    halves = [x.reshape(-1, 3) for x in (main.value_a, main.value_b)]
+    first: F32 | None = None
     for name, material in materials.items():
-        flat = queries.flat()
-        evaluate = partial(material.evaluate, flat.u, flat.sigma, flat.omega_i, flat.omega_o)
-        flat_value, seconds = timed(evaluate)
-        value = np.asarray(flat_value, np.float32).reshape(*queries.lead, 3)
-        file = scene.file(fit_name(name))
-        write_picture(out / file, value)
-        write_preview(out / file, value, white)
-        scores = perceptual_scores(value, main.value, white, with_st_lpips=with_st_lpips)
-        write_map(out / file, scores.flip.hdr_map)
+        flat_value, seconds = timed(partial(material.evaluate, *arrays))
+        value = flat_value.reshape(main.value.shape)
+        file = scene.file(f"fit-{name}")
+        write_picture(out / file, value, white)
+        scores, hdr_flip = perceptual_scores(value, main.value, white, with_st_lpips)
+        write_map(out / file, hdr_flip)
+        errors = {kind: image_errors(value, x.value_a, x.value_b, white) for kind, x in images.items()}
         record["fits"][name] = {
             "file": file,
             "seconds": round(seconds, 4),
-            "errors": {
-                kind: image_errors(value, image.value_a, image.value_b).as_dict(white)
-                for kind, image in images.items()
-            },
-            **scores.as_dict(),
+            "errors": {kind: {key: e.as_dict() for key, e in of.items()} for kind, of in errors.items()},
+            **scores,
         }
-        if values:
-            halves = [x.reshape(-1, 3) for x in (main.value_a, main.value_b)]
-            difference = mse_difference(value.reshape(-1, 3), values[0].reshape(-1, 3), *halves)
+        if first is None:
+            first = flat_value
+        else:
+            difference = mse_difference(flat_value, first, *halves)
             record["fits"][name]["mse_minus_first"] = difference.as_dict()
-        values.append(value)
         progress(f"{name} {scene.name}")
     return record

@@ -17,24 +17,11 @@ def dataset_errors(materials: Mapping[str, Material], data: Dataset) -> dict[str
     """Errors of every fit on the test split of one data set, and on the splits held out in its own training.
 
     All fits but the first also have ``mse_minus_first``: their MSE minus that of the first fit on the same
-    test queries, overall and by level.
-
-    Parameters
-    ----------
-    materials : mapping of str to Material
-        Fitted materials by name of the fit.
-    data : Dataset
-        Data set whose test split is used.
-
-    Returns
-    -------
-    dict
-        Plain data by name of the fit.
+    test queries, overall and by level. Returns plain data by name of the fit.
 
     Raises
     ------
-    InputError
-        A test shard is missing or corrupt.
+    InputError : a test shard is missing or corrupt
     """
     from mbtf_fit.data.loader import load_split
     from mbtf_fit.evaluation import split_errors

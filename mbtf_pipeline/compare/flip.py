@@ -9,8 +9,7 @@ baseline.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -32,23 +31,12 @@ DEFINITION = (
 )
 
 
-@dataclass(frozen=True)
-class Flip:
-    """FLIP of two images.
-
-    Attributes
-    ----------
-    ldr, hdr : mean over pixels, from 0 to 1
-    hdr_map : (rows, columns), HDR-FLIP per pixel
-    """
+class Flip(NamedTuple):
+    """FLIP of two images: means over pixels from 0 to 1, and HDR-FLIP per pixel (rows, columns)."""
 
     ldr: float
     hdr: float
     hdr_map: F32
-
-    def as_dict(self) -> dict[str, float]:
-        """Plain data, without the map."""
-        return {"ldr": self.ldr, "hdr": self.hdr}
 
 
 def flip(image: ArrayLike, reference: ArrayLike, white: float) -> Flip:
@@ -59,15 +47,12 @@ def flip(image: ArrayLike, reference: ArrayLike, white: float) -> Flip:
     white : linear value displayed as white at 0 EV, 1/sr
     """
     test, truth = (np.maximum(np.asarray(x, np.float32) / np.float32(white), 0) for x in (image, reference))
-    hdr_map, hdr = _evaluate(
-        truth,
-        test,
-        "HDR",
-        startExposure=EXPOSURES[0],
-        stopExposure=EXPOSURES[-1],
-        numExposures=len(EXPOSURES),
-        tonemapper=TONE_MAPPER,
-    )
+    exposures = {
+        "startExposure": EXPOSURES[0],
+        "stopExposure": EXPOSURES[-1],
+        "numExposures": len(EXPOSURES),
+    }
+    hdr_map, hdr = _evaluate(truth, test, "HDR", **exposures, tonemapper=TONE_MAPPER)
     _, ldr = _evaluate(np.minimum(truth, 1), np.minimum(test, 1), "LDR")
     return Flip(ldr, hdr, hdr_map)
 

@@ -8,8 +8,6 @@ therefore does not bias the error. Error bars are one standard error over pixels
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -57,32 +55,16 @@ def psnr(mse: Estimate, peak: float) -> Estimate:
     return Estimate(value, 10.0 / math.log(10.0) * mse.relative_error, mse.n)
 
 
-@dataclass(frozen=True)
-class ImageErrors:
-    """Errors of one image.
+def image_errors(
+    image: ArrayLike, value_a: ArrayLike, value_b: ArrayLike, peak: float
+) -> dict[str, Estimate]:
+    """Errors of an image (rows, columns, 3) against both halves of its reference, same shape.
 
-    Attributes
-    ----------
-    mse : Estimate
-        Noise-free mean squared error, 1/sr².
-    relative_mse : Estimate
-        Dimensionless.
+    Returns
+    -------
+    dict
+        ``mse`` in 1/sr², ``psnr`` in dB for full scale at `peak` in 1/sr, ``relative_mse``.
     """
-
-    mse: Estimate
-    relative_mse: Estimate
-
-    def as_dict(self, peak: float) -> dict[str, Any]:
-        """Plain data; values that are not finite become None."""
-        return {
-            "mse": self.mse.as_dict(),
-            "psnr": psnr(self.mse, peak).as_dict(),
-            "relative_mse": self.relative_mse.as_dict(),
-        }
-
-
-def image_errors(image: ArrayLike, value_a: ArrayLike, value_b: ArrayLike) -> ImageErrors:
-    """Errors of an image (rows, columns, 3) against both halves of its reference, same shape."""
     p, a, b = (np.asarray(x, np.float64).reshape(-1, 3) for x in (image, value_a, value_b))
     t = 0.5 * (a + b)
     floor = RELATIVE_FLOOR * float(t.mean())
@@ -90,7 +72,8 @@ def image_errors(image: ArrayLike, value_a: ArrayLike, value_b: ArrayLike) -> Im
         relative = mean_estimate((p - a) * (p - b) / (t**2 + floor**2))
     else:  # a black reference has no scale
         relative = Estimate(math.nan, math.inf, len(p))
-    return ImageErrors(noise_free_mse(p, a, b), relative)
+    mse = noise_free_mse(p, a, b)
+    return {"mse": mse, "psnr": psnr(mse, peak), "relative_mse": relative}
 
 
 def reference_difference(

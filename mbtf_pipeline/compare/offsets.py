@@ -15,10 +15,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.atomic import write_through
 from mbtf_core.directions import from_angles
 from mbtf_core.lattice import Lattice, texel_centers
-from mbtf_pipeline.compare.pictures import fit_name
+from mbtf_pipeline.compare.pictures import write_channels
 from mbtf_pipeline.recipe import SceneView
 
 if TYPE_CHECKING:
@@ -54,15 +53,6 @@ def traced_offset(estimator: Estimator, u: F32, omega_o: NDArray[np.float64]) ->
     return (z[:, None] * omega_o[None, :2] / omega_o[2]).astype(np.float32)
 
 
-def _write(path: Path, offset: F32) -> None:
-    """Store (rows, columns, 2) as the channels X and Y of an EXR image."""
-    import OpenEXR
-
-    channels = {name: np.ascontiguousarray(offset[..., i]) for i, name in enumerate("XY")}
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    write_through(path, lambda p: OpenEXR.File(header, channels).write(str(p)))
-
-
 def read_offset(path: Path) -> F32:
     """Displacements (rows, columns, 2) in tile widths.
 
@@ -78,23 +68,15 @@ def read_offset(path: Path) -> F32:
 
 def towards_view(offset: F32, view: SceneView) -> F32:
     """Component of displacements (..., 2) towards the viewer's azimuth, in tile widths."""
-    along = from_angles(0.0, view.azimuth)[:2]
-    out: F32 = (offset @ along).astype(np.float32)
-    return out
+    along: F32 = (offset @ from_angles(0.0, view.azimuth)[:2]).astype(np.float32)
+    return along
 
 
-def _correlation(x: F32, y: F32) -> float | None:
-    """Pearson's r of two arrays; None if one of them is constant."""
+def _regression(x: F32, y: F32) -> dict[str, float | None]:
+    """Pearson's r, and slope of the regression of y on x; None where they are undefined."""
     a, b = (v.astype(np.float64).ravel() - v.mean(dtype=np.float64) for v in (x, y))
-    norm = float(np.linalg.norm(a) * np.linalg.norm(b))
-    return float(a @ b) / norm if norm > 1e-20 else None
-
-
-def _slope(x: F32, y: F32) -> float | None:
-    """Slope of the regression of y on x; None if x is constant."""
-    a, b = (v.astype(np.float64).ravel() - v.mean(dtype=np.float64) for v in (x, y))
-    square = float(a @ a)
-    return float(a @ b) / square if square > 1e-20 else None
+    norms = {"correlation": float(np.linalg.norm(a) * np.linalg.norm(b)), "slope": float(a @ a)}
+    return {name: float(a @ b) / norm if norm > 1e-20 else None for name, norm in norms.items()}
 
 
 def write_offsets(
@@ -127,19 +109,18 @@ def write_offsets(
     for number, (view, direction) in enumerate(zip(views, directions, strict=True), 1):
         truth = traced_offset(estimator, u, direction)
         file = f"{OFFSETS}/v{number}-traced.exr"
-        _write(out / file, truth.reshape(rows, columns, 2))
+        write_channels(out / file, truth.reshape(rows, columns, 2), "XY")
         along = towards_view(truth, view)
         record: dict[str, Any] = {"view": view.model_dump(), "traced": file, "fits": {}}
         record["spread"] = float(along.std(dtype=np.float64))
         for name, offsets in learned.items():
             offset = offsets[number - 1]
-            file = f"{OFFSETS}/v{number}-{fit_name(name)}.exr"
-            _write(out / file, offset.reshape(rows, columns, 2))
+            file = f"{OFFSETS}/v{number}-fit-{name}.exr"
+            write_channels(out / file, offset.reshape(rows, columns, 2), "XY")
             moved = towards_view(offset, view)
             record["fits"][name] = {
                 "file": file,
-                "correlation": _correlation(moved, along),
-                "slope": _slope(along, moved),
+                **_regression(along, moved),
                 "spread": float(moved.std(dtype=np.float64)),
             }
         records.append(record)

@@ -8,34 +8,17 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from mbtf_pipeline.compare.flip import Flip, flip
+from mbtf_pipeline.compare.flip import F32, flip
 from mbtf_pipeline.compare.ssim import ssim
 from mbtf_pipeline.compare.st_lpips import st_lpips
 
 
-@dataclass(frozen=True)
-class PerceptualScores:
-    """Perceptual metrics of two images.
-
-    Attributes
-    ----------
-    ssim : None if the images are too small for it
-    st_lpips : None if the images are too small, or it was not requested
-    """
-
-    flip: Flip
-    ssim: float | None
-    st_lpips: float | None
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain data, without the FLIP map."""
-        return {"flip": self.flip.as_dict(), "ssim": self.ssim, "st_lpips": self.st_lpips}
-
-
 def perceptual_scores(
-    image: ArrayLike, reference: ArrayLike, white: float, *, with_st_lpips: bool = False
-) -> PerceptualScores:
-    """All perceptual metrics of linear images (rows, columns, 3) in 1/sr.
+    image: ArrayLike, reference: ArrayLike, white: float, with_st_lpips: bool
+) -> tuple[dict[str, Any], F32]:
+    """Perceptual metrics of linear images (rows, columns, 3) in 1/sr, and the map of HDR-FLIP.
+
+    SSIM and ST-LPIPS are None for images that are too small.
 
     Parameters
     ----------
@@ -45,11 +28,13 @@ def perceptual_scores(
     ------
     EngineError : ST-LPIPS was requested and its weights are not installed
     """
-    return PerceptualScores(
-        flip(image, reference, white),
-        ssim(image, reference, white),
-        st_lpips(image, reference, white) if with_st_lpips else None,
-    )
+    ldr, hdr, hdr_map = flip(image, reference, white)
+    learned = st_lpips(image, reference, white) if with_st_lpips else None
+    return {
+        "flip": {"ldr": ldr, "hdr": hdr},
+        "ssim": ssim(image, reference, white),
+        "st_lpips": learned,
+    }, hdr_map
 
 
 @dataclass(frozen=True)

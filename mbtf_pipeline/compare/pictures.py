@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_gen.pictures.camera import Camera, PixelKind
+from mbtf_gen.pictures.camera import Camera
 from mbtf_pipeline.recipe import FIELD_OF_VIEW, CompareSection, SceneDirection, SceneView
 
 F32 = NDArray[np.float32]
@@ -36,23 +36,15 @@ class Scene:
 
     def camera(self, size: int) -> Camera:
         """The scene's camera, `size` pixels along each side."""
+        view = self.view
         return Camera(
-            self.view.elevation,
-            self.view.azimuth,
+            view.elevation,
+            view.azimuth,
             self.tiles_across,
             rows=size,
             columns=size,
             field_of_view=FIELD_OF_VIEW,
         )
-
-    def describe(self) -> dict[str, Any]:
-        """Plain data for the comparison's record."""
-        return {
-            "name": self.name,
-            "view": self.view.model_dump(),
-            "light": self.light.model_dump(),
-            "tiles_across": self.tiles_across,
-        }
 
     def file(self, what: str) -> str:
         """Path of one of the scene's images without its suffix, relative to the comparison's folder."""
@@ -69,41 +61,28 @@ def scenes(compare: CompareSection) -> Iterator[Scene]:
                 index += 1
 
 
-def reference_name(kind: PixelKind) -> str:
-    """Stem of a reference's files."""
-    return f"reference-{kind}"
-
-
-def fit_name(fit: str) -> str:
-    """Stem of a fit's files."""
-    return f"fit-{fit}"
-
-
 def with_ending(path: Path, ending: str) -> Path:
     """The path with `ending` appended to its name, which may contain dots."""
     return path.with_name(f"{path.name}{ending}")
 
 
-def write_picture(path: Path, value: F32) -> None:
-    """Write linear RGB (rows, columns, 3) in 1/sr as ``path`` + ``.exr`` (float32), atomically."""
+def write_channels(path: Path, values: NDArray[Any], names: str) -> None:
+    """Write an array (rows, columns, channels) as a float32 EXR image, atomically."""
     import OpenEXR
 
     from mbtf_core.atomic import write_through
 
-    channels = {name: np.ascontiguousarray(value[..., i], np.float32) for i, name in enumerate("RGB")}
+    channels = {name: np.ascontiguousarray(values[..., i], np.float32) for i, name in enumerate(names)}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    write_through(with_ending(path, ".exr"), lambda p: OpenEXR.File(header, channels).write(str(p)))
+    write_through(path, lambda p: OpenEXR.File(header, channels).write(str(p)))
 
 
-def write_preview(path: Path, value: F32, white: float) -> None:
-    """Write ``path`` + ``.png``, sRGB with the linear value `white` at full scale, atomically."""
-    from PIL import Image
+def write_picture(path: Path, value: NDArray[Any], white: float) -> None:
+    """Write linear RGB (rows, columns, 3) in 1/sr as ``path`` + ``.exr``, and with `white` as ``.png``."""
+    from mbtf_gen.pictures.reference import to_display, write_png
 
-    from mbtf_core.atomic import write_file
-    from mbtf_gen.pictures.reference import to_display
-
-    image = Image.fromarray(to_display(value, 1.0 / white))
-    write_file(with_ending(path, ".png"), lambda stream: image.save(stream, "PNG", optimize=True))
+    write_channels(with_ending(path, ".exr"), value, "RGB")
+    write_png(with_ending(path, ".png"), to_display(value, 1.0 / white))
 
 
 # Ending of a fit's HDR-FLIP map.
@@ -112,12 +91,9 @@ _FLIP = "-flip.png"
 
 def write_map(path: Path, flip: F32) -> None:
     """Write a map (rows, columns) from 0 to 1 as ``path`` + ``-flip.png``, 8-bit gray, atomically."""
-    from PIL import Image
+    from mbtf_gen.pictures.reference import write_png
 
-    from mbtf_core.atomic import write_file
-
-    image = Image.fromarray(np.round(255.0 * np.clip(flip, 0.0, 1.0)).astype(np.uint8))
-    write_file(with_ending(path, _FLIP), lambda stream: image.save(stream, "PNG", optimize=True))
+    write_png(with_ending(path, _FLIP), np.round(255.0 * np.clip(flip, 0.0, 1.0)).astype(np.uint8))
 
 
 def read_map(path: Path) -> F32:
@@ -150,7 +126,9 @@ def read_halves(path: Path) -> tuple[F32, F32]:
     """
     from mbtf_gen.images.exr import read_channels
 
-    return _halves(read_channels(with_ending(path, ".exr"), 1 << 26))
+    channels = read_channels(with_ending(path, ".exr"), 1 << 26)
+    a, b = (np.stack([channels[f"value_{h}.{c}"] for c in "RGB"], axis=-1) for h in "ab")
+    return a.astype(np.float32), b.astype(np.float32)
 
 
 def read_picture(path: Path) -> F32:
@@ -163,12 +141,7 @@ def read_picture(path: Path) -> F32:
     from mbtf_gen.images.exr import read_channels
 
     channels = read_channels(with_ending(path, ".exr"), 1 << 26)
-    if "value_a.R" in channels:
-        a, b = _halves(channels)
+    if "R" not in channels:
+        a, b = read_halves(path)
         return (0.5 * (a + b)).astype(np.float32)
     return np.stack([channels[c] for c in "RGB"], axis=-1).astype(np.float32)
-
-
-def _halves(channels: Mapping[str, NDArray[Any]]) -> tuple[F32, F32]:
-    a, b = (np.stack([channels[f"value_{h}.{c}"] for c in "RGB"], axis=-1) for h in "ab")
-    return a.astype(np.float32), b.astype(np.float32)

@@ -38,24 +38,25 @@ DEFINITION = (
 def weights_file() -> Path | None:
     """Path of the package's weights; None if it is not installed."""
     spec = find_spec(PACKAGE)
-    places = [] if spec is None else list(spec.submodule_search_locations or [])
-    found = [Path(place) / _WEIGHTS for place in places]
-    return next((path for path in found if path.is_file()), None)
+    places = (spec and spec.submodule_search_locations) or []
+    return next((path for place in places if (path := Path(place) / _WEIGHTS).is_file()), None)
 
 
-def require() -> None:
-    """Check that ST-LPIPS can be computed.
+def require() -> Path:
+    """Path of the weights.
 
     Raises
     ------
     EngineError : the package with its weights is not installed
     """
-    if weights_file() is None:
+    file = weights_file()
+    if file is None:
         raise EngineError(
             "ST-LPIPS needs the weights of the package stlpips-pytorch, which is not installed",
             where="compare.st_lpips",
             hint="pip install 'mbtf[perceptual]', or remove the option",
         )
+    return file
 
 
 @dataclass(frozen=True)
@@ -87,12 +88,11 @@ class _Network:
     def features(self, x: Tensor) -> list[Tensor]:
         """Features of the five layers for images (n, 3, rows, columns) in [-1, 1]."""
         x = (x - self.tensors["scaling_layer.shift"]) / self.tensors["scaling_layer.scale"]
-        out = [self._blurred(self._layer(x, "net.slice1.0", 2)).relu()]
-        out.append(self._layer(self._pooled(out[-1]), "net.slice2.5", 2).relu())
-        out.append(self._layer(self._pooled(out[-1]), "net.slice3.9", 1).relu())
-        out.append(self._layer(out[-1], "net.slice4.11", 1).relu())
-        out.append(self._layer(out[-1], "net.slice5.13", 1).relu())
-        return out
+        first = self._blurred(self._layer(x, "net.slice1.0", 2)).relu()
+        second = self._layer(self._pooled(first), "net.slice2.5", 2).relu()
+        third = self._layer(self._pooled(second), "net.slice3.9", 1).relu()
+        fourth = self._layer(third, "net.slice4.11", 1).relu()
+        return [first, second, third, fourth, self._layer(fourth, "net.slice5.13", 1).relu()]
 
     def distance(self, first: Tensor, second: Tensor) -> float:
         """Distance of two images (1, 3, rows, columns)."""
@@ -108,10 +108,7 @@ class _Network:
 def _network() -> _Network:
     import torch
 
-    require()
-    file = weights_file()
-    assert file is not None
-    return _Network(torch.load(file, map_location="cpu", weights_only=True))
+    return _Network(torch.load(require(), map_location="cpu", weights_only=True))
 
 
 def st_lpips(image: ArrayLike, reference: ArrayLike, white: float) -> float | None:

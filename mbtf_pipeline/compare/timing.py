@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -43,40 +43,21 @@ def timed(work: Callable[[], T]) -> tuple[T, float]:
     return result, statistics.median(seconds)
 
 
-@dataclass(frozen=True)
-class Workload:
-    """Random queries as tensors: positions, footprints, light and view directions."""
+def _random_queries(count: int, finest: int) -> list[NDArray[np.float32]]:
+    """u, σ, ω_i and ω_o of queries over all levels, with directions within 60° of the normal."""
+    from mbtf_core.directions import from_projected_disk
+    from mbtf_core.lattice import sigma_of_level
 
-    u: Tensor
-    sigma: Tensor
-    omega_i: Tensor
-    omega_o: Tensor
-
-    @classmethod
-    def random(cls, count: int, finest: int, device: str) -> Workload:
-        """`count` queries over all levels, with directions within 60° of the normal."""
-        import torch
-
-        from mbtf_core.directions import from_projected_disk
-        from mbtf_core.lattice import sigma_of_level
-
-        rng = np.random.default_rng(_SEED)
-        angle = 2 * np.pi * rng.random((2, count))
-        radius = np.sqrt(0.75 * rng.random((2, count)))
-        light, view = from_projected_disk(np.stack([radius * np.cos(angle), radius * np.sin(angle)], -1))
-        arrays = (rng.random((count, 2)), sigma_of_level(finest * rng.random(count)), light, view)
-        return cls(*(torch.from_numpy(np.asarray(a, np.float32)).to(device) for a in arrays))
-
-    def chunks(self, size: int) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
-        """All queries, `size` at a time."""
-        arrays = (self.u, self.sigma, self.omega_i, self.omega_o)
-        for start in range(0, len(self.u), size):
-            u, sigma, light, view = (a[start : start + size] for a in arrays)
-            yield u, sigma, light, view
+    rng = np.random.default_rng(_SEED)
+    angle = 2 * np.pi * rng.random((2, count))
+    radius = np.sqrt(0.75 * rng.random((2, count)))
+    light, view = from_projected_disk(np.stack([radius * np.cos(angle), radius * np.sin(angle)], -1))
+    arrays = (rng.random((count, 2)), sigma_of_level(finest * rng.random(count)), light, view)
+    return [np.asarray(a, np.float32) for a in arrays]
 
 
-def _synchronized(work: Callable[[], Any]) -> Callable[[], None]:
-    """The work without gradients, including the wait for the GPU."""
+def _seconds(work: Callable[[], Any]) -> float:
+    """Time of the work without gradients, including the wait for the GPU."""
     import torch
 
     def run() -> None:
@@ -85,39 +66,33 @@ def _synchronized(work: Callable[[], Any]) -> Callable[[], None]:
         if torch.cuda.is_available():
             torch.cuda.synchronize()
 
-    return run
+    return timed(run)[1]
 
 
-def measure_timing(material: Material, pixels: int, device: str = "cpu") -> dict[str, Any]:
-    """Milliseconds of one evaluation per pixel, in total and by part; plain data.
+def measure_timing(material: Material, pixels: int, device: str) -> dict[str, Any]:
+    """Milliseconds of one evaluation per pixel on a PyTorch device, in total and by part; plain data.
 
     An eighth of the pixels is evaluated, fewer for models that read several positions per query. The times
     are scaled to all pixels; ``queries`` is the number evaluated.
-
-    Parameters
-    ----------
-    material : Material
-        On `device`.
-    pixels : int
-        Number of queries that the times refer to.
-    device : str
-        PyTorch device.
     """
+    import torch
+
     model = material.model
     count = max(1, pixels // (_SUBSAMPLING * model.positions))
-    work = Workload.random(count, model.lattice.finest, device)
+    queries = _random_queries(count, model.lattice.finest)
     size = max(1, _CHUNK // model.positions)
+    chunks = list(zip(*(torch.from_numpy(a).to(device).split(size) for a in queries), strict=True))
     scale = 1e3 * pixels / count
 
     def milliseconds(part: Callable[..., Any]) -> float:
-        whole = _synchronized(lambda: [part(*chunk) for chunk in work.chunks(size)])
-        return scale * timed(whole)[1]
+        return scale * _seconds(lambda: [part(*chunk) for chunk in chunks])
 
-    numpy = [a.cpu().numpy() for a in (work.u, work.sigma, work.omega_i, work.omega_o)]
-    whole = scale * timed(_synchronized(lambda: material.evaluate(*numpy)))[1]
+    whole = scale * _seconds(lambda: material.evaluate(*queries))
     first = milliseconds(lambda u, s, i, o: model.stage1(u, s, o))
     # Stage 2 is timed with the features of the first chunk: its time does not depend on their values.
-    features = _first_features(material, work, size)
+    u, sigma, _, view = chunks[0]
+    with torch.no_grad():
+        features = model.stage1(u, sigma, view)
     second = milliseconds(lambda u, s, i, o: model.stage2(features[: len(u)], i, o))
     parts = {name: milliseconds(part) for name, part in _parts(material).items()}
     return {
@@ -132,14 +107,6 @@ def measure_timing(material: Material, pixels: int, device: str = "cpu") -> dict
     }
 
 
-def _first_features(material: Material, work: Workload, size: int) -> Any:
-    import torch
-
-    u, sigma, _, view = next(work.chunks(size))
-    with torch.no_grad():
-        return material.model.stage1(u, sigma, view)
-
-
 def _parts(material: Material) -> dict[str, Callable[..., Any]]:
     """Parts of stage 1, evaluated once for each position that the model reads."""
     from mbtf_fit.models.encodings import encode_position
@@ -152,14 +119,9 @@ def _parts(material: Material) -> dict[str, Callable[..., Any]]:
 
     out: dict[str, Callable[..., Any]] = {}
     if model.network.offset != "none":
-        channels = model.network.channels
+        inputs = model.network.channels + 2
         out["offset texture"] = lambda u, s, i, o: model.offset_texture(spread(u))
-
-        def offset_network(u: Tensor, s: Tensor, i: Tensor, o: Tensor) -> Any:
-            seen = u.new_zeros(len(u) * around, channels + 2)
-            return model.offset_network(seen)
-
-        out["offset network"] = offset_network
+        out["offset network"] = lambda u, s, i, o: model.offset_network(u.new_zeros(len(u) * around, inputs))
     out["pyramid"] = lambda u, s, i, o: model.read(spread(u), model.level(spread(s)))
     encoding = model.network.encoding
     if encoding.position:

@@ -25,7 +25,7 @@ from mbtf_core.directions import from_angles
 from mbtf_core.errors import UsageError
 from mbtf_core.stats import Estimate, mean_estimate
 from mbtf_gen.pictures.camera import PIXEL_SIGMA, Camera
-from mbtf_pipeline.compare.pictures import PICTURES, write_picture, write_preview
+from mbtf_pipeline.compare.pictures import PICTURES, write_picture
 
 if TYPE_CHECKING:
     from mbtf_gen.config.generator import GeneratorConfig
@@ -71,13 +71,11 @@ class Agreement:
 
     Attributes
     ----------
-    surface : ``base color`` or ``full``
     mean : difference of the means, mbtf minus Mitsuba, relative to the mean value
     square : noise-free mean squared difference, relative to the squared mean value
     mbtf, mitsuba : (rows, columns, 3) values in 1/sr
     """
 
-    surface: str
     mean: Estimate
     square: Estimate
     mbtf: F64
@@ -88,28 +86,17 @@ class Agreement:
         """:func:`verdict` of its two differences."""
         return verdict(self.mean, self.square)
 
-    def as_dict(self) -> dict[str, Any]:
-        """Plain data, without the images."""
-        return {
-            "surface": self.surface,
-            "mean": self.mean.as_dict(),
-            "square": self.square.as_dict(),
-        }
-
 
 def verdict(mean: Estimate, square: Estimate) -> Verdict:
     """Whether both relative differences lie within their tolerance or within three standard errors."""
     if min(mean.n, square.n) < MIN_BLOCKS:
         return "inconclusive"
     pixels_agree = square.value <= max(RMS_TOLERANCE**2, MAX_STANDARD_ERRORS * square.error)
-    return (
-        "agree"
-        if pixels_agree and abs(mean.value) <= max(MEAN_TOLERANCE, MAX_STANDARD_ERRORS * mean.error)
-        else "differ"
-    )
+    means_agree = abs(mean.value) <= max(MEAN_TOLERANCE, MAX_STANDARD_ERRORS * mean.error)
+    return "agree" if pixels_agree and means_agree else "differ"
 
 
-def agreement(surface: str, mbtf: tuple[F64, F64], mitsuba: tuple[F64, F64], margin: int = 0) -> Agreement:
+def agreement(mbtf: tuple[F64, F64], mitsuba: tuple[F64, F64], margin: int = 0) -> Agreement:
     """Compare two renderings (rows, columns, 3), each given as two independent halves.
 
     Parameters
@@ -123,7 +110,7 @@ def agreement(surface: str, mbtf: tuple[F64, F64], mitsuba: tuple[F64, F64], mar
     scale = 1.0 / max(mean, 1e-30)
     difference = mean_estimate((a1 + b1 - a2 - b2) / 2.0).scaled(scale)
     square = mean_estimate((a1 - a2) * (b1 - b2)).scaled(scale**2)
-    return Agreement(surface, difference, square, (mbtf[0] + mbtf[1]) / 2, (mitsuba[0] + mitsuba[1]) / 2)
+    return Agreement(difference, square, (mbtf[0] + mbtf[1]) / 2, (mitsuba[0] + mitsuba[1]) / 2)
 
 
 def _blocks(picture: F64) -> F64:
@@ -156,39 +143,28 @@ def pick_scene(section: CompareSection) -> tuple[SceneView, SceneDirection, floa
 def write_agreement(
     section: CompareSection, generate: GeneratorConfig, material: Material, white: float, out: Path
 ) -> dict[str, Any]:
-    """Compare with unmodified Mitsuba and write both images of each surface below `out`; returns plain data.
-
-    Raises
-    ------
-    UsageError : the comparison has no suitable scene
-    """
+    """Compare with unmodified Mitsuba and write the images below `out`; returns plain data."""
     view, light, tiles_across = pick_scene(section)
     surfaces = []
-    for found in compare_with_mitsuba(section, generate, material):
-        files = {}
-        for renderer, value in (("mbtf", found.mbtf), ("mitsuba", found.mitsuba)):
-            files[renderer] = f"{PICTURES}/check-{found.surface.replace(' ', '-')}-{renderer}"
-            write_picture(out / files[renderer], value.astype(np.float32))
-            write_preview(out / files[renderer], value.astype(np.float32), white)
-        surfaces.append({**found.as_dict(), "files": files})
+    for surface, found in compare_with_mitsuba(section, generate, material).items():
+        stem = f"{PICTURES}/check-{surface.replace(' ', '-')}"
+        files = {renderer: f"{stem}-{renderer}" for renderer in ("mbtf", "mitsuba")}
+        for file, value in zip(files.values(), (found.mbtf, found.mitsuba), strict=True):
+            write_picture(out / file, value.astype(np.float32), white)
+        mean, square = found.mean.as_dict(), found.square.as_dict()
+        surfaces.append({"surface": surface, "mean": mean, "square": square, "files": files})
     return {
         "view": view.model_dump(),
         "light": light.model_dump(),
         "tiles_across": tiles_across,
-        "tolerances": {"mean": MEAN_TOLERANCE, "rms": RMS_TOLERANCE},
         "surfaces": surfaces,
     }
 
 
 def compare_with_mitsuba(
     section: CompareSection, generate: GeneratorConfig, material: Material
-) -> list[Agreement]:
-    """Render one scene with mbtf and with Mitsuba: the base color alone, and the full surface.
-
-    Raises
-    ------
-    UsageError : the comparison has no suitable scene
-    """
+) -> dict[str, Agreement]:
+    """Render one scene with mbtf and with Mitsuba: the ``base color`` alone, and the ``full`` surface."""
     from mbtf_gen.config.generator import LightSection
     from mbtf_gen.job import Job
     from mbtf_gen.pictures.reference import render_reference
@@ -199,16 +175,16 @@ def compare_with_mitsuba(
     config = generate.model_copy(update={"light": LightSection(width=0.0)})
     camera = Camera(view.elevation, view.azimuth, tiles_across, rows=section.size, columns=section.size)
     omega_i = from_angles(light.elevation, light.azimuth)
-    out = []
+    out = {}
     for surface, variant in _surfaces(material).items():
         job = Job(config, variant)
         estimator = build_estimator(job, reference_plan(job))
         image = render_reference(
             estimator, camera, omega_i, kind="pixel", spp=section.spp, seed=section.seed, index=0
         )
-        mbtf = tuple(x.astype(np.float64) for x in (image.value_a, image.value_b))
+        mbtf = image.value_a.astype(np.float64), image.value_b.astype(np.float64)
         mitsuba = render_with_mitsuba(job, camera, omega_i, section.spp, section.seed)
-        out.append(agreement(surface, (mbtf[0], mbtf[1]), mitsuba, margin=4))
+        out[surface] = agreement(mbtf, mitsuba, margin=4)
     return out
 
 
@@ -219,8 +195,11 @@ def _surfaces(material: Material) -> dict[str, Material]:
     removed: dict[str, Any] = dict.fromkeys(_NOT_LAMBERTIAN)
     lambertian = dataclasses.replace(material, **removed)
     full = dataclasses.replace(material, opacity=None)
-    glossy = any(getattr(full, name) is not None for name in _NOT_LAMBERTIAN)
-    return {"base color": lambertian, **({"full": full} if glossy else {})}
+    return {"base color": lambertian, **({} if _is_lambertian(full) else {"full": full})}
+
+
+def _is_lambertian(material: Material) -> bool:
+    return all(getattr(material, name) is None for name in _NOT_LAMBERTIAN)
 
 
 def render_with_mitsuba(job: Job, camera: Camera, omega_i: F64, spp: int, seed: int) -> tuple[F64, F64]:
@@ -316,7 +295,7 @@ def _mitsuba_bsdf(job: Job) -> dict[str, Any]:
     from mbtf_gen.render.bsdf.plugin import bsdf_of
 
     material = job.material
-    if any(getattr(material, name) is not None for name in _NOT_LAMBERTIAN) or material.bsdf is not None:
+    if material.bsdf is not None or not _is_lambertian(material):
         mapped = normal_map_slopes(job)
         return bsdf_of(material, slopes=None if mapped is None else mapped[0])
     base = np.asarray(material.base_color, np.float32)

@@ -21,7 +21,7 @@ from mbtf_pipeline.cost_study.measurements import HALF_WIDTH, NORMAL, Measuremen
 from mbtf_pipeline.cost_study.pareto import extrapolation, pareto_front
 from mbtf_pipeline.cost_study.study import STUDY_NAME, Study
 from mbtf_pipeline.cost_study.tables import generator_table, run_table, to_csv
-from mbtf_pipeline.report.report import page_environment, template
+from mbtf_pipeline.report.report import render
 
 CSV_NAME, PAGE_NAME = "cost.csv", "cost.html"
 
@@ -135,23 +135,19 @@ def write_page(study: Study) -> Path:
     narrow, known = narrow_errors(study.measurements)
     narrow_runs, known_runs = narrow_errors(runs)
     deviation = None if study.deviation is None else f"{study.deviation.scaled(100.0)} %"
-    html: str = (
-        page_environment()
-        .from_string(template("cost.html"))
-        .render(
-            style=template("report.css"),
-            study=study.description,
-            time=clock(study.description["time"]),
-            sections=[s for s in sections if s is not None],
-            skipped=study.skipped,
-            failed=study.failed,
-            runs=bool(runs),
-            deviation=deviation,
-            seeds=round(max((m.details.get("seeds", 1.0) for m in runs), default=1.0)),
-            narrow=narrow,
-            known=known,
-            refine=narrow_runs < known_runs,
-        )
+    html = render(
+        "cost.html",
+        study=study.description,
+        time=clock(study.description["time"]),
+        sections=[s for s in sections if s is not None],
+        skipped=study.skipped,
+        failed=study.failed,
+        runs=bool(runs),
+        deviation=deviation,
+        seeds=round(max((m.details.get("seeds", 1.0) for m in runs), default=1.0)),
+        narrow=narrow,
+        known=known,
+        refine=narrow_runs < known_runs,
     )
     path = study.folder / PAGE_NAME
     write_text(path, html)

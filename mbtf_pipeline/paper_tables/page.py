@@ -21,7 +21,7 @@ from mbtf_pipeline.paper_tables.runs import FinishedRun
 from mbtf_pipeline.paper_tables.sizes import timing, weights
 from mbtf_pipeline.paper_tables.zooms import zooms
 from mbtf_pipeline.report.plots import ERROR_BAR_NOTE
-from mbtf_pipeline.report.report import page_environment, template
+from mbtf_pipeline.report.report import render
 
 PAGE = "paper.html"
 TABLES = "tables"
@@ -68,21 +68,15 @@ def write_page(folder: Path, record: Mapping[str, Any]) -> tuple[Path, list[Path
     for table in tables:
         files.append(folder / TABLES / f"{table.key}.csv")
         write_text(files[-1], table.csv())
-    html = (
-        page_environment()
-        .from_string(template("paper.html"))
-        .render(
-            record=record,
-            tables=tables,
-            reports=[
-                (r["name"].replace("_", " "), f"{RUNS}/{r['name']}/report.html") for r in record["runs"]
-            ],
-            sizes=_sizes(runs),
-            definitions=DEFINITIONS,
-            error_bar_note=ERROR_BAR_NOTE,
-            st_lpips=weights_file() is not None,
-            style=template("report.css"),
-        )
+    html = render(
+        "paper.html",
+        record=record,
+        tables=tables,
+        reports=[(r["name"].replace("_", " "), f"{RUNS}/{r['name']}/report.html") for r in record["runs"]],
+        sizes=_sizes(runs),
+        definitions=DEFINITIONS,
+        error_bar_note=ERROR_BAR_NOTE,
+        st_lpips=weights_file() is not None,
     )
     write_text(folder / PAGE, html)
     return folder / PAGE, files

@@ -12,7 +12,6 @@ from mbtf_core.lattice import Lattice
 from mbtf_core.stats import Estimate
 from mbtf_pipeline.compare.compare import COMPARISON_NAME
 from mbtf_pipeline.formatting import estimate
-from mbtf_pipeline.report.errors import main_kind
 from mbtf_pipeline.run_folder import COMPARE, SHARDS
 
 
@@ -65,7 +64,7 @@ class FinishedRun:
     @property
     def kind(self) -> str:
         """Kind of the reference for perceptual metrics."""
-        return main_kind(self.comparison)
+        return str(self.comparison["kinds"][0])
 
     @property
     def pictures(self) -> list[dict[str, Any]]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,6 @@ from mbtf_pipeline.report.linear_images import Coding, pack
 U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
 Pixels = NDArray[np.floating]
-Linear = Callable[[], F32]
 
 
 def shrink(values: Pixels, factor: int) -> Pixels:
@@ -68,18 +67,17 @@ ENCODINGS = (
 )
 
 
-def data_uri(media: str, content: bytes) -> str:
-    """``data:`` URI of a file's content."""
-    return f"data:{media};base64,{base64.b64encode(content).decode()}"
+def _data_uri(image: Any, kind: str, **options: int) -> str:
+    stream = io.BytesIO()
+    image.save(stream, kind, optimize=True, **options)
+    return f"data:image/{kind};base64,{base64.b64encode(stream.getvalue()).decode()}"
 
 
 def jpeg_uri(display: U8, quality: int) -> str:
     """``data:`` URI of an 8-bit sRGB image as JPEG."""
     from PIL import Image
 
-    stream = io.BytesIO()
-    Image.fromarray(display).save(stream, "JPEG", quality=quality, subsampling=0, optimize=True)
-    return data_uri("image/jpeg", stream.getvalue())
+    return _data_uri(Image.fromarray(display), "jpeg", quality=quality, subsampling=0)
 
 
 def map_uri(values: Pixels, name: Palette, shades: int) -> str:
@@ -89,9 +87,7 @@ def map_uri(values: Pixels, name: Palette, shades: int) -> str:
     steps = np.round(indices(values, name) * ((shades - 1) / 255.0))
     image = Image.fromarray(np.round(steps * (255.0 / (shades - 1))).astype(np.uint8))
     image.putpalette([channel for color in palette(name) for channel in color])
-    stream = io.BytesIO()
-    image.save(stream, "PNG", optimize=True)
-    return data_uri("image/png", stream.getvalue())
+    return _data_uri(image, "png")
 
 
 @dataclass
@@ -101,65 +97,37 @@ class Gallery:
     Attributes
     ----------
     white : linear value displayed as white, 1/sr
-    linear : functions that read images (rows, columns, 3) in 1/sr
+    linear : images (rows, columns, 3) in 1/sr
     maps : palettes and maps (rows, columns), scaled to [0, 1] or, if signed, to [-1, 1]
     """
 
     white: float
-    linear: dict[str, Linear] = field(default_factory=dict)
+    linear: dict[str, F32] = field(default_factory=dict)
     maps: dict[str, tuple[Palette, Pixels]] = field(default_factory=dict)
 
-    def add_map(self, name: str, palette: Palette, values: Pixels) -> None:
-        """Add a scaled map."""
-        self.maps[name] = (palette, values)
 
+def encode(
+    gallery: Gallery, encoding: Encoding
+) -> tuple[Coding, dict[str, str], dict[str, dict[str, int | str]]]:
+    """Encode a gallery.
 
-@dataclass(frozen=True)
-class Embedded:
-    """Encoded images.
-
-    Attributes
-    ----------
+    Returns
+    -------
+    coding : of all linear images
     images : ``data:`` URIs of maps, and of linear images at 0 EV, by name
     packed : rows, columns and data of linear images by name
     """
-
-    encoding: Encoding
-    coding: Coding
-    images: dict[str, str]
-    packed: dict[str, Mapping[str, int | str]]
-
-    @property
-    def size(self) -> int:
-        """Total size in bytes."""
-        return sum(map(len, self.images.values())) + sum(len(str(p["data"])) for p in self.packed.values())
-
-
-def embed(gallery: Gallery, budget: float) -> Embedded:
-    """Encode a gallery with the best encoding within `budget` bytes, or else with the smallest."""
-    for encoding in ENCODINGS:
-        out = encode(gallery, encoding)
-        if out.size <= budget:
-            break
-    return out
-
-
-def encode(gallery: Gallery, encoding: Encoding) -> Embedded:
-    """Encode a gallery with a given encoding."""
     from mbtf_gen.pictures.reference import to_display
 
-    pictures = {name: read() for name, read in gallery.linear.items()}
-    coding = Coding.spanning(pictures.values(), gallery.white, encoding.bits)
+    coding = Coding.spanning(gallery.linear.values(), gallery.white, encoding.bits)
     images: dict[str, str] = {}
-    packed: dict[str, Mapping[str, int | str]] = {}
-    for name, picture in pictures.items():
+    packed: dict[str, dict[str, int | str]] = {}
+    for name, picture in gallery.linear.items():
         small = shrink(picture, encoding.shrink).astype(np.float32)
-        preview_shrink = to_display(
-            shrink(small, encoding.preview_shrink).astype(np.float32), 1.0 / gallery.white
-        )
-        images[name] = jpeg_uri(preview_shrink, encoding.quality)
+        preview = shrink(small, encoding.preview_shrink).astype(np.float32)
+        images[name] = jpeg_uri(to_display(preview, 1.0 / gallery.white), encoding.quality)
         data = base64.b64encode(pack(coding.encode(small))).decode()
         packed[name] = {"rows": small.shape[0], "columns": small.shape[1], "data": data}
     for name, (colors, values) in gallery.maps.items():
         images[name] = map_uri(shrink(values, encoding.shrink), colors, encoding.shades)
-    return Embedded(encoding, coding, images, packed)
+    return coding, images, packed

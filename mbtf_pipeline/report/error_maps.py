@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import cache
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,14 +30,12 @@ def palette(name: Palette) -> tuple[tuple[int, int, int], ...]:
     """256 sRGB colors for magnitudes from 0 to 1, or for signed values from -1 to 1."""
     if name == "signed":
         t = np.linspace(-1.0, 1.0, 256)
-        channels = [np.interp(t, _STOPS, [c[i] for c in _COLORS]) for i in range(3)]
-        table = np.stack(channels, axis=-1)
+        table = np.stack([np.interp(t, _STOPS, channel) for channel in zip(*_COLORS, strict=True)], axis=-1)
     else:
         from matplotlib import colormaps
 
         table = 255.0 * np.asarray(colormaps[_MAGNITUDES[name]](np.linspace(0.0, 1.0, 256)))[:, :3]
-    rows = np.round(table).astype(int).tolist()
-    return tuple((r, g, b) for r, g, b in rows)
+    return tuple((r, g, b) for r, g, b in np.round(table).astype(int).tolist())
 
 
 def gradient(name: Palette) -> str:
@@ -64,9 +62,8 @@ def local_error(picture: F32, value_a: F32, value_b: F32) -> F64:
     from scipy.ndimage import gaussian_filter
 
     p, a, b = (np.asarray(x, np.float64) for x in (picture, value_a, value_b))
-    squared = gaussian_filter(((p - a) * (p - b)).mean(axis=-1), WINDOW, mode="nearest")
-    out: F64 = np.sqrt(np.maximum(squared, 0.0))
-    return out
+    squared: F64 = gaussian_filter(((p - a) * (p - b)).mean(axis=-1), WINDOW, mode="nearest")
+    return np.sqrt(np.maximum(squared, 0.0))
 
 
 def round_scale(x: float) -> float:
@@ -79,11 +76,20 @@ def round_scale(x: float) -> float:
 
 def common_scale(fields: Sequence[ArrayLike]) -> float:
     """Rounded end of the scale of several maps: the 99th percentile of all magnitudes."""
-    if not fields:
-        return 1.0
     return round_scale(float(np.percentile(np.concatenate([np.abs(np.ravel(f)) for f in fields]), 99)))
 
 
-def ticks(low: float, high: float, factor: float = 1.0) -> list[str]:
-    """Five evenly spaced numbers for a color bar, scaled by a factor."""
-    return [f"{factor * x:.3g}".replace("-", "−") for x in np.linspace(low, high, 5)]
+def color_bar(
+    key: Palette, title: str, high: float, unit: str, note: str, factor: float = 1.0
+) -> dict[str, Any]:
+    """A labeled color bar with five evenly spaced numbers.
+
+    Parameters
+    ----------
+    high : end of the scale; `factor` converts it to `unit`
+    note : definition of the quantity
+    """
+    low = -high if key == "signed" else 0.0
+    ticks = [f"{factor * x:.3g}".replace("-", "−") for x in np.linspace(low, high, 5)]
+    bar = {"key": key, "title": title, "gradient": gradient(key), "ticks": ticks}
+    return {**bar, "unit": unit, "note": note}

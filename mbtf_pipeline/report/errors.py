@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from statistics import median_high
 from typing import Any
 
@@ -36,8 +36,8 @@ def error_context(comparison: Mapping[str, Any], min_cos: float) -> dict[str, An
         "facts": _facts(comparison, tests),
         "test": next(iter(tests.values())),
         "error_table": _table(comparison),
-        "error_plots": [_plot(tests, grouping, min_cos) for grouping in _GROUPINGS],
-        "group_tables": [_group_table(tests, grouping, min_cos) for grouping in _GROUPINGS],
+        "error_plots": [_plot(tests, min_cos, *grouping[:3]) for grouping in _GROUPINGS],
+        "group_tables": [_group_table(tests, min_cos, *grouping) for grouping in _GROUPINGS],
         "picture_table": _pictures_table(comparison),
         "definitions": [(_TERMS[k], v) for k, v in comparison["definitions"].items()],
     }
@@ -47,7 +47,7 @@ def _facts(comparison: Mapping[str, Any], tests: Mapping[str, Any]) -> list[dict
     out = [{"value": data_errors(e)[0], "what": f"{UNEXPLAINED} of {fit}"} for fit, e in tests.items()]
     fit = comparison["fits"][0]
     records = [p["fits"][fit] for p in comparison["pictures"]]
-    decibels = [r["errors"][main_kind(comparison)]["psnr"]["value"] for r in records]
+    decibels = [r["errors"][comparison["kinds"][0]]["psnr"]["value"] for r in records]
     if finite := [d for d in decibels if d is not None]:
         what = f"median PSNR of {fit} over {len(decibels)} images"
         out.append({"value": f"{median_high(finite):.1f} dB", "what": what})
@@ -76,19 +76,10 @@ def _table(comparison: Mapping[str, Any]) -> dict[str, Any]:
     return {"head": head, "rows": rows}
 
 
-@dataclass(frozen=True)
-class _Grouping:
-    """A way to group queries: key in the record, title, axis of the plot, and head of the table."""
-
-    key: str
-    title: str
-    axis: str
-    head: str
-
-
+# Ways to group queries: key in the record, title, axis of the plot, and head of the table.
 _GROUPINGS = (
-    _Grouping("levels", "By level of detail (level 0: the whole tile)", "level of the footprint", "level"),
-    _Grouping("elevations", "By lower cosine of light and view", "lower cosine of light and view", "cos θ"),
+    ("levels", "By level of detail (level 0: the whole tile)", "level of the footprint", "level"),
+    ("elevations", "By lower cosine of light and view", "lower cosine of light and view", "cos θ"),
 )
 
 
@@ -104,65 +95,52 @@ def _group_names(tests: Mapping[str, Any], key: str) -> list[str]:
     return sorted({n for test in tests.values() for n in test[key]}, key=lambda n: float(n.split("-")[0]))
 
 
-def _plot(tests: Mapping[str, Any], grouping: _Grouping, min_cos: float) -> dict[str, str]:
-    names = _group_names(tests, grouping.key)
-    series = {
-        fit: [_value(test[grouping.key].get(n, {}).get("unexplained")) for n in names]
-        for fit, test in tests.items()
-    }
+def _plot(tests: Mapping[str, Any], min_cos: float, key: str, title: str, axis: str) -> dict[str, str]:
+    names = _group_names(tests, key)
+    series = {fit: [_value(test[key].get(n)) for n in names] for fit, test in tests.items()}
     labels = [group_label(name, min_cos) for name in names]
-    svg = points(labels, series, grouping.axis, UNEXPLAINED, f"{UNEXPLAINED} {grouping.title}")
-    return {"title": grouping.title, "svg": svg}
+    svg = points(labels, series, axis, UNEXPLAINED, f"{UNEXPLAINED} {title}")
+    return {"title": title, "svg": svg}
 
 
-def _value(record: Mapping[str, Any] | None) -> tuple[float, float] | None:
-    if record is None or record["value"] is None or record["error"] is None:
+def _value(group: Mapping[str, Any] | None) -> tuple[float, float] | None:
+    if group is None:
         return None
-    return float(record["value"]), float(record["error"])
+    e = estimate(group["unexplained"])
+    return (e.value, e.error) if math.isfinite(e.value) and math.isfinite(e.error) else None
 
 
-def _group_table(tests: Mapping[str, Any], grouping: _Grouping, min_cos: float) -> dict[str, Any]:
+def _group_table(
+    tests: Mapping[str, Any], min_cos: float, key: str, title: str, axis: str, head: str
+) -> dict[str, Any]:
     rows = []
-    for name in _group_names(tests, grouping.key):
-        groups = [test[grouping.key].get(name) for test in tests.values()]
+    for name in _group_names(tests, key):
+        groups = [test[key].get(name) for test in tests.values()]
         first = next(group for group in groups if group is not None)
         cells = [cell for group in groups for cell in (("–", "–") if group is None else data_errors(group))]
         rows.append([group_label(name, min_cos), f"{first['mse']['n']:,}", *cells])
     heads = [h for fit in tests for h in (f"{fit}: {UNEXPLAINED}", f"{fit}: MSE [10⁻³/sr²]")]
-    return {
-        "title": f"{grouping.title}, test split",
-        "head": [grouping.head, "queries", *heads],
-        "rows": rows,
-    }
+    return {"title": f"{title}, test split", "head": [head, "queries", *heads], "rows": rows}
 
 
 def _pictures_table(comparison: Mapping[str, Any]) -> dict[str, Any]:
     """One row per image and fit, with errors against each kind of reference."""
-    kinds, main = comparison["kinds"], main_kind(comparison)
+    kinds = comparison["kinds"]
     metrics = available_metrics(comparison["pictures"], comparison["fits"])
     rows = []
     for picture in comparison["pictures"]:
-        noise = picture["references"][main]
+        noise = picture["references"][kinds[0]]
         for fit in comparison["fits"]:
             record = picture["fits"][fit]
             row = [short_direction(picture[d]) for d in ("view", "light")]
             row += [f"{picture['tiles_across']:g}", fit]
             for kind in kinds:
                 errors = {name: estimate(e) for name, e in record["errors"][kind].items()}
-                row += [
-                    estimate_text(errors["mse"], 1e3),
-                    decibel(errors["psnr"], errors["mse"]),
-                    estimate_text(errors["relative_mse"]),
-                ]
+                row += [estimate_text(errors["mse"], 1e3), decibel(errors["psnr"], errors["mse"])]
+                row.append(estimate_text(errors["relative_mse"]))
             rows.append(row + [m.text(m.of(record), m.of(noise)) for m in metrics])
     names = ("MSE [10⁻³/sr²]", "PSNR", "relative MSE")
     heads = [f"{name}, {kind} reference" for kind in kinds for name in names]
     heads += [m.title for m in metrics]
     title = f"Images (white at 0 EV and peak of the PSNR: {comparison['white']:.3g} 1/sr)"
     return {"title": title, "head": ["view", "light", "tiles across", "fit", *heads], "rows": rows}
-
-
-def main_kind(comparison: Mapping[str, Any]) -> str:
-    """Kind of the reference for FLIP and error maps."""
-    kinds = comparison["kinds"]
-    return "query" if "query" in kinds else str(kinds[0])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +11,7 @@ from mbtf_pipeline.compare.offsets import read_offset, towards_view
 from mbtf_pipeline.formatting import direction, signed
 from mbtf_pipeline.recipe import SceneView
 from mbtf_pipeline.report.embed import Gallery, Pixels
-from mbtf_pipeline.report.error_maps import common_scale, gradient, ticks
-from mbtf_pipeline.report.pictures import ColorBar
+from mbtf_pipeline.report.error_maps import color_bar, common_scale
 
 
 def displacements(
@@ -37,9 +35,7 @@ def displacements(
 
 def offset_section(folder: Path, records: list[dict[str, Any]], gallery: Gallery) -> list[dict[str, Any]]:
     """Rows of offset images: traced, then learned by each fit."""
-    if not records:
-        return []
-    return [_row(folder, records, fit, gallery) for fit in (None, *records[0]["fits"])]
+    return [_row(folder, records, fit, gallery) for fit in ((None, *records[0]["fits"]) if records else ())]
 
 
 def _row(folder: Path, records: list[dict[str, Any]], fit: str | None, gallery: Gallery) -> dict[str, Any]:
@@ -48,16 +44,11 @@ def _row(folder: Path, records: list[dict[str, Any]], fit: str | None, gallery: 
     cells = []
     for number, (record, values, median) in enumerate(zip(records, maps, medians, strict=True)):
         name = f"offset-{fit or 'traced'}-{number}"
-        gallery.add_map(name, "signed", values / scale)
-        lines = [f"view {direction(record['view'])}", signed(f"median {median:.2g} tile widths")]
-        lines += _correlation(record, fit)
-        alt = f"{title}, view {direction(record['view'])}"
-        cells.append({"image": name, "label": title, "lines": lines, "alt": alt})
+        gallery.maps[name] = "signed", values / scale
+        view = f"view {direction(record['view'])}"
+        lines = [view, signed(f"median {median:.2g} tile widths")]
+        if fit is not None and (found := record["fits"][fit]["correlation"]) is not None:
+            lines.append(f"correlation with the traced offset {found:.2f}")
+        cells.append({"image": name, "label": title, "lines": lines, "alt": f"{title}, {view}"})
     note = "Displacement towards the viewer’s azimuth, minus the median of each image."
-    bar = ColorBar("offset", "Displacement", gradient("signed"), ticks(-scale, scale), "tile widths", note)
-    return {"cells": cells, "bar": bar}
-
-
-def _correlation(record: Mapping[str, Any], fit: str | None) -> list[str]:
-    found = None if fit is None else record["fits"][fit]["correlation"]
-    return [] if found is None else [f"correlation with the traced offset {found:.2f}"]
+    return {"cells": cells, "bar": color_bar("signed", "Displacement", scale, "tile widths", note)}

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from functools import lru_cache
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +20,8 @@ from mbtf_pipeline.formatting import (
     short_direction,
     width,
 )
-from mbtf_pipeline.report.embed import F32, Gallery, Pixels
-from mbtf_pipeline.report.error_maps import Palette, common_scale, gradient, local_error, ticks
+from mbtf_pipeline.report.embed import Gallery, Pixels
+from mbtf_pipeline.report.error_maps import color_bar, common_scale, local_error
 
 _KIND = {"query": "Reference", "pixel": "Reference, filtered pixel"}
 
@@ -46,70 +44,38 @@ def hemisphere(view: Mapping[str, float], light: Mapping[str, float]) -> str:
     )
 
 
-@dataclass(frozen=True)
-class ColorBar:
-    """A labeled color bar.
-
-    Attributes
-    ----------
-    key : of its map
-    title, unit, note : shown quantity, unit of the ticks, and definition
-    gradient : CSS
-    ticks : numbers from end to end
-    """
-
-    key: str
-    title: str
-    gradient: str
-    ticks: list[str]
-    unit: str
-    note: str
-
-
-@dataclass(frozen=True)
-class PictureSection:
-    """Images of the comparison as the page needs them.
-
-    Attributes
-    ----------
-    groups : per view and light: title, diagram, blocks of figures
-    scenes : of the viewer, plain data
-    color_bars : of local error, HDR-FLIP and signed difference
-    difference : end of the signed scale, as a fraction of white
-    """
-
-    groups: list[dict[str, Any]]
-    scenes: list[dict[str, Any]]
-    color_bars: list[ColorBar]
-    difference: float
-
-
-def picture_section(folder: Path, comparison: Mapping[str, Any], gallery: Gallery) -> PictureSection:
+def picture_section(folder: Path, comparison: Mapping[str, Any], gallery: Gallery) -> dict[str, Any]:
     """Lay out all images of a comparison.
 
     Parameters
     ----------
     folder : of the comparison
     gallery : receives the images; errors are shown as fractions of its white
+
+    Returns
+    -------
+    groups : per view and light: title, diagram, blocks of figures
+    scenes : of the viewer, plain data
+    color_bars : of local error, HDR-FLIP and signed difference
+    difference : end of the signed scale, as a fraction of white
     """
-    pictures, fits = comparison["pictures"], comparison["fits"]
-    sheet = _Sheet(folder, comparison, gallery)
-    main, white = sheet.kinds[0], gallery.white
-    maps = {
-        p["fits"][fit]["file"]: _error_maps(folder, p["fits"][fit]["file"], p["references"][main]["file"])
-        for p in pictures
-        for fit in fits
-    }
-    scales = [
-        common_scale([e[i] / unit for e in maps.values()]) for i, unit in enumerate((white, 1.0, white))
-    ]
-    scales[1] = min(scales[1], 1.0)
-    for file, (local, flip, _) in maps.items():
-        gallery.add_map(f"{file}-local", "local", local / (scales[0] * white))
-        gallery.add_map(f"{file}-flip", "flip", flip / scales[1])
+    sheet = _Sheet(comparison)
     groups: list[dict[str, Any]] = []
     scenes = []
-    for number, picture in enumerate(pictures):
+    maps: dict[str, tuple[Pixels, Pixels, Pixels]] = {}
+    for number, picture in enumerate(comparison["pictures"]):
+        references = [picture["references"][kind]["file"] for kind in sheet.kinds]
+        fits = [picture["fits"][fit]["file"] for fit in sheet.fits]
+        gallery.linear |= {file: read_picture(folder / file) for file in (*references, *fits)}
+        a, b = read_halves(folder / references[0])
+        for file in fits:
+            value = gallery.linear[file]
+            signed = (value.astype(np.float64) - 0.5 * (a.astype(np.float64) + b)).mean(axis=-1)
+            maps[file] = (
+                local_error(value, a, b) / gallery.white,
+                read_map(folder / file),
+                signed / gallery.white,
+            )
         key = (picture["view"], picture["light"])
         if not groups or groups[-1]["key"] != key:
             groups.append(
@@ -123,61 +89,48 @@ def picture_section(folder: Path, comparison: Mapping[str, Any], gallery: Galler
             )
         groups[-1]["blocks"].append(sheet.block(number, picture))
         scenes.append({"group": len(groups) - 1, **sheet.scene(picture)})
-    return PictureSection(groups, scenes, _color_bars(*scales), scales[2])
-
-
-def _error_maps(folder: Path, fit: str, reference: str) -> tuple[Pixels, Pixels, Pixels]:
-    """(local error in 1/sr, HDR-FLIP, mean over channels of the signed difference in 1/sr)."""
-    a, b = read_halves(folder / reference)
-    value = read_picture(folder / fit)
-    signed = (value.astype(np.float64) - 0.5 * (a.astype(np.float64) + b)).mean(axis=-1)
-    return local_error(value, a, b), read_map(folder / fit), signed
-
-
-def _color_bars(local: float, flip: float, signed: float) -> list[ColorBar]:
-    def bar(key: Palette, title: str, numbers: list[str], unit: str, note: str) -> ColorBar:
-        return ColorBar(key, title, gradient(key), numbers, unit, note)
-
-    return [
-        bar(
+    local, flip, signed_end = (common_scale([e[i] for e in maps.values()]) for i in range(3))
+    flip = min(flip, 1.0)
+    for file, (error, visible, _) in maps.items():
+        gallery.maps[f"{file}-local"] = "local", error / local
+        gallery.maps[f"{file}-flip"] = "flip", visible / flip
+    color_bars = (
+        color_bar(
             "local",
             "Local RMS error",
-            ticks(0, local, 100),
+            local,
             "% of white",
             "Noise-free: root of (p−a)(p−b), averaged over channels and a Gaussian window with σ = 2 pixels. "
             "0 where the average is negative, because the error lies below the noise.",
+            100,
         ),
-        bar(
+        color_bar(
             "flip",
             "HDR-FLIP",
-            ticks(0, flip),
+            flip,
             "from 0 to 1",
             "Visible difference: maximum over −2, 0 and +2 EV. Includes the noise of the reference.",
         ),
-        bar(
+        color_bar(
             "signed",
             "Fit − reference",
-            ticks(-signed, signed, 100),
+            signed_end,
             "% of white",
             "Mean of the channels. Blue is too dark, orange too bright. Includes the noise of the reference.",
+            100,
         ),
-    ]
+    )
+    bars = {bar["key"]: bar for bar in color_bars}
+    return {"groups": groups, "scenes": scenes, "color_bars": bars, "difference": signed_end}
 
 
 class _Sheet:
-    """Figures of the sheet and scenes of the viewer; adds their images to the gallery."""
+    """Figures of the sheet and scenes of the viewer."""
 
-    def __init__(self, folder: Path, comparison: Mapping[str, Any], gallery: Gallery) -> None:
-        self._folder = folder
-        self._fits = comparison["fits"]
+    def __init__(self, comparison: Mapping[str, Any]) -> None:
+        self.fits, self.kinds = comparison["fits"], comparison["kinds"]
         self._finest = comparison["finest"]
         self._metrics = available_metrics(comparison["pictures"], comparison["fits"])
-        self.kinds = sorted(comparison["kinds"], key=lambda kind: kind != "query")
-        self._gallery = gallery
-
-    def _linear(self, file: str) -> str:
-        self._gallery.linear[file] = _reader(self._folder / file)
-        return file
 
     def _title(self, picture: Mapping[str, Any]) -> str:
         return f"{width(picture['tiles_across'])}, {levels(picture['levels'], self._finest)}"
@@ -187,62 +140,57 @@ class _Sheet:
         where = f"view {direction(picture['view'])}, light {direction(picture['light'])}, "
         where += width(picture["tiles_across"])
         rows: list[list[dict[str, Any] | None]] = []
-        for index in range(max(len(self.kinds), len(self._fits))):
+        for index in range(max(len(self.kinds), len(self.fits))):
             row: list[dict[str, Any] | None] = [None]
             if index < len(self.kinds):
                 row = [self._reference(picture, self.kinds[index], where)]
-            if index < len(self._fits):
-                row += self._fit(picture, self._fits[index], where)
+            if index < len(self.fits):
+                row += self._fit(picture, self.fits[index], where)
             rows.append(row)
         return {"title": self._title(picture), "rows": rows, "scene": number}
 
     def _reference(self, picture: Mapping[str, Any], kind: str, where: str) -> dict[str, Any]:
         reference = picture["references"][kind]
         lines = [f"noise per pixel {100 * estimate(reference['noise']).value:.1f} %"]
-        if kind != self.kinds[0] and "between_references" in picture:
+        if kind != self.kinds[0]:
             mse = estimate_text(estimate(picture["between_references"]), 1e3)
             lines.append(f"MSE to the other reference {mse} · 10⁻³/sr²")
-        return _figure(self._linear(reference["file"]), _KIND[kind], lines, where, linear=True)
+        return _figure(reference["file"], _KIND[kind], lines, f": {where}", linear=True)
 
-    def _fit(self, picture: Mapping[str, Any], fit: str, where: str) -> list[dict[str, Any] | None]:
+    def _fit(self, picture: Mapping[str, Any], fit: str, where: str) -> list[dict[str, Any]]:
         record = picture["fits"][fit]
-        errors, file = record["errors"][self.kinds[0]], record["file"]
+        file, errors = record["file"], record["errors"][self.kinds[0]]
         mse = estimate(errors["mse"])
-        of_fit = f"of {fit}: {where}"
+        of_fit = f" of {fit}: {where}"
+        psnr = [f"PSNR {decibel(estimate(errors['psnr']), mse)}"]
+        local = [f"MSE {estimate_text(mse, 1e3)} · 10⁻³/sr²"]
         return [
-            _figure(
-                self._linear(file),
-                fit,
-                [f"PSNR {decibel(estimate(errors['psnr']), mse)}"],
-                where,
-                linear=True,
-            ),
-            _figure(
-                f"{file}-local", "Local RMS error", [f"MSE {estimate_text(mse, 1e3)} · 10⁻³/sr²"], of_fit
-            ),
+            _figure(file, fit, psnr, f": {where}", linear=True),
+            _figure(f"{file}-local", "Local RMS error", local, of_fit),
             _figure(f"{file}-flip", "HDR-FLIP", [f"mean {record['flip']['hdr']:.3f}"], of_fit),
         ]
 
     def scene(self, picture: Mapping[str, Any]) -> dict[str, Any]:
         """Data of a scene for the viewer."""
+        references = [
+            {
+                "label": _KIND[kind],
+                "picture": picture["references"][kind]["file"],
+                "rows": self._numbers(picture, kind),
+            }
+            for kind in self.kinds
+        ]
         return {
             "where": f"View {direction(picture['view'])}; light {direction(picture['light'])}; "
             f"{self._title(picture)}",
             "tiles_across": width(picture["tiles_across"]),
-            "references": [
-                {
-                    "label": _KIND[kind],
-                    "picture": picture["references"][kind]["file"],
-                    "rows": self._numbers(picture, kind),
-                }
-                for kind in self.kinds
-            ],
-            "fits": [picture["fits"][fit]["file"] for fit in self._fits],
+            "references": references,
+            "fits": [picture["fits"][fit]["file"] for fit in self.fits],
         }
 
     def _numbers(self, picture: Mapping[str, Any], kind: str) -> list[list[str]]:
         """Rows of the viewer's table: name of the metric, then one cell per fit."""
-        records = [picture["fits"][fit] for fit in self._fits]
+        records = [picture["fits"][fit] for fit in self.fits]
         errors = [{name: estimate(e) for name, e in record["errors"][kind].items()} for record in records]
         rows = [
             ["MSE [10⁻³/sr²]", *(estimate_text(e["mse"], 1e3) for e in errors)],
@@ -254,18 +202,9 @@ class _Sheet:
             rows += [[m.title, *(m.text(m.of(r), m.of(noise)) for r in records)] for m in self._metrics]
             if len(records) > 1:
                 cells = (estimate_text(estimate(r["mse_minus_first"]), 1e3) for r in records[1:])
-                rows.append([f"MSE − MSE of {self._fits[0]} [10⁻³/sr²]", "–", *cells])
+                rows.append([f"MSE − MSE of {self.fits[0]} [10⁻³/sr²]", "–", *cells])
         return rows
 
 
 def _figure(image: str, label: str, lines: list[str], where: str, *, linear: bool = False) -> dict[str, Any]:
-    alt = f"{label}: {where}" if linear else f"{label} {where}"
-    return {"image": image, "linear": linear, "label": label, "lines": lines, "alt": alt}
-
-
-def _reader(path: Path) -> Callable[[], F32]:
-    @lru_cache(maxsize=1)
-    def read() -> F32:
-        return read_picture(path)
-
-    return read
+    return {"image": image, "linear": linear, "label": label, "lines": lines, "alt": f"{label}{where}"}

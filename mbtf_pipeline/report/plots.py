@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import io
+import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -14,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from mbtf_core.atomic import write_through
-from mbtf_pipeline.report.labels import Obstacle, place_labels
 
 # Okabe and Ito (2008) with gray instead of black and without yellow: distinguishable under every common
 # color-vision deficiency.
@@ -31,6 +31,16 @@ ERROR_BAR_NOTE = (
 _WIDTH, _HEIGHT = 5.6, 3.3
 # Half the side of a marker and half the width of a line, in pixels.
 _MARKER, _LINE = 5.0, 1.5
+_LABEL_SIZE = 7.5
+# Candidate offsets of a label from its point, in points; their signs give the alignment.
+_OFFSETS = (
+    *((7, 0), (5, 6), (5, -6), (-7, 0), (-5, 6), (-5, -6)),
+    *((0, 9), (0, -9), (8, 16), (8, -16), (-8, 16), (-8, -16)),
+)
+# Distance in pixels to the left and right edges: text may be wider at another resolution.
+_EDGE = 16.0
+# An obstacle: both ends in data coordinates, and half its width in pixels.
+Obstacle = tuple[tuple[float, float], tuple[float, float], float]
 
 
 def color(index: int) -> str:
@@ -84,15 +94,11 @@ _STYLE: dict[str, Any] = {
 }
 
 
-@contextlib.contextmanager
-def _style(label: str) -> Iterator[None]:
+def _style(label: str) -> contextlib.AbstractContextManager[None]:
     """Matplotlib settings independent of the user's; the label makes the ids reproducible."""
-    import matplotlib
+    from matplotlib import style
 
-    with matplotlib.rc_context():
-        matplotlib.rcdefaults()
-        matplotlib.rcParams.update({**_STYLE, "svg.hashsalt": label})
-        yield
+    return style.context({**_STYLE, "svg.hashsalt": label}, after_reset=True)
 
 
 def _axes(x: str, y: str, scales: str, width: float = _WIDTH, height: float = _HEIGHT) -> Any:
@@ -113,12 +119,8 @@ def _axes(x: str, y: str, scales: str, width: float = _WIDTH, height: float = _H
 def _svg(figure: Any, label: str) -> str:
     """The figure as an ``<svg>`` element with ids that are unique on the page."""
     stream = io.StringIO()
-    figure.savefig(
-        stream,
-        format="svg",
-        transparent=True,
-        metadata=dict.fromkeys(("Date", "Creator", "Type", "Format")),
-    )
+    metadata = dict.fromkeys(("Date", "Creator", "Type", "Format"))
+    figure.savefig(stream, format="svg", transparent=True, metadata=metadata)
     text = stream.getvalue()
     text = text[text.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
@@ -136,13 +138,11 @@ def _limits(values: Sequence[float]) -> tuple[float, float]:
     return (min(positive) / _REACH, max(positive) * _REACH) if positive else (0.1, 1.0)
 
 
-def curves(
-    lines: Sequence[Line], x: str, y: str, label: str, *, logx: bool = False, logy: bool = True
-) -> str:
+def curves(lines: Sequence[Line], x: str, y: str, label: str, *, scales: str = "y") -> str:
     """Lines with bands of one standard error; `x` and `y` name the axes with units."""
     with _style(label):
-        axes = _axes(x, y, "x" * logx + "y" * logy)
-        low, high = _limits([v for line in lines for v in line.y]) if logy else (-np.inf, np.inf)
+        axes = _axes(x, y, scales)
+        low, high = _limits([v for line in lines for v in line.y])
         shown: list[float] = []
         for index, line in enumerate(lines):
             values = np.asarray(line.y, float)
@@ -154,11 +154,9 @@ def curves(
                 below, above = (np.clip(values + side, low, high) for side in (-e, e))
                 axes.fill_between(line.x, below, above, color=color(index), alpha=0.18, linewidth=0)
                 shown += [below.min(), above.max()]
-        if logy:
-            axes.set_ylim(max(low, min(shown) / 1.05), min(high, max(shown) * 1.05))
-            _plain_ticks(axes.yaxis)
-        if logx:
-            _plain_ticks(axes.xaxis)
+        axes.set_ylim(max(low, min(shown) / 1.05), min(high, max(shown) * 1.05))
+        for scale in scales:
+            _plain_ticks(getattr(axes, f"{scale}axis"))
         axes.legend(frameon=False)
         return _svg(axes.figure, label)
 
@@ -181,22 +179,11 @@ def scatter(
     with _style(label):
         figure = _scatter(clouds, x, y, front)
         if png is not None:
-            _write_png(figure, png)
+            options = {"dpi": 160, "facecolor": "white", "metadata": {"Software": None}}
+            figure.patch.set_alpha(1.0)
+            write_through(png, lambda path: figure.savefig(path, format="png", **options))
+            figure.patch.set_alpha(0.0)
         return _svg(figure, label)
-
-
-def _write_png(figure: Any, path: Path) -> None:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    figure.patch.set_alpha(1.0)
-    canvas = FigureCanvasAgg(figure).figure
-    write_through(
-        path,
-        lambda temporary: canvas.savefig(
-            temporary, format="png", dpi=160, facecolor="white", metadata={"Software": None}
-        ),
-    )
-    figure.patch.set_alpha(0.0)
 
 
 def _scatter(clouds: Sequence[Cloud], x: str, y: str, front: Sequence[tuple[float, float]]) -> Any:
@@ -213,14 +200,12 @@ def _scatter(clouds: Sequence[Cloud], x: str, y: str, front: Sequence[tuple[floa
         handles.append((drawn.lines[0], cloud.name))
         if cloud.joined:
             axes.plot(xs, ys, color=color(index), linewidth=0.8, alpha=0.5)
-        for at_x, at_y, dx, dy, text in zip(xs, ys, x_error, y_error, cloud.labels, strict=True):
-            obstacles += [
-                ((at_x, at_y), (at_x, at_y), _MARKER),
-                ((at_x - dx, at_y), (at_x + dx, at_y), _LINE),
-                ((at_x, at_y - dy), (at_x, at_y + dy), _LINE),
-            ]
+        for x0, y0, dx, dy, text in zip(xs, ys, x_error, y_error, cloud.labels, strict=True):
+            obstacles.append(((x0, y0), (x0, y0), _MARKER))
+            obstacles.append(((x0 - dx, y0), (x0 + dx, y0), _LINE))
+            obstacles.append(((x0, y0 - dy), (x0, y0 + dy), _LINE))
             if text:
-                labels.append((at_x, at_y, text, color(index)))
+                labels.append((x0, y0, text, color(index)))
     if front:
         drawn = axes.step(*np.asarray(front, float).T, where="post", color=_INK, lw=1.3, ls=(0, (4, 2)))
         handles.append((drawn[0], "Pareto front"))
@@ -246,8 +231,8 @@ def _error_bars(
     return axes.errorbar(
         x,
         y,
-        xerr=x_error,
-        yerr=y_error,
+        y_error,
+        x_error,
         fmt=MARKERS[index % len(MARKERS)],
         color=color(index),
         markerfacecolor="none" if hollow else color(index),
@@ -256,6 +241,45 @@ def _error_bars(
         linewidth=1.1,
         **more,
     )
+
+
+def place_labels(
+    axes: Any, labels: Sequence[tuple[float, float, str, str]], obstacles: Sequence[Obstacle]
+) -> None:
+    """Write every label (x, y, text, color) at the candidate offset with the least overlap."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.transforms import Bbox
+
+    renderer = FigureCanvasAgg(axes.figure).get_renderer()
+    axes.figure.draw_without_rendering()
+    occupied = []
+    for first, second, half_width in obstacles:
+        ends = axes.transData.transform((first, second))
+        occupied.append(Bbox([ends.min(axis=0), ends.max(axis=0)]).padded(half_width))
+    frame = axes.get_window_extent(renderer).padded(-_EDGE, 0.0)
+    for x, y, text, color in labels:
+        note = axes.annotate(
+            text, (x, y), (0, 0), textcoords="offset points", fontsize=_LABEL_SIZE, color=color
+        )
+
+        def box_at(offset: tuple[int, int], note: Any = note) -> Any:
+            note.xyann = offset
+            horizontal, vertical = (int(np.sign(o)) for o in offset)
+            note.set(ha=("center", "left", "right")[horizontal], va=("center", "bottom", "top")[vertical])
+            return note.get_window_extent(renderer)
+
+        def overlap(offset: tuple[int, int]) -> float:
+            box = box_at(offset)
+            outside = box.width * box.height - _area(Bbox.intersection(box, frame))
+            return round(outside + sum(_area(Bbox.intersection(box, other)) for other in occupied), 6)
+
+        occupied.append(box_at(min(_OFFSETS, key=overlap)))
+        # Otherwise constrained layout would shrink the axes for the label.
+        note.set_in_layout(False)
+
+
+def _area(box: Any) -> float:
+    return 0.0 if box is None else float(box.width * box.height)
 
 
 def points(
@@ -291,10 +315,9 @@ def _legend_above(figure: Any, handles: Sequence[tuple[Any, str]]) -> None:
 
     renderer = FigureCanvasAgg(figure).get_renderer()
     marks, names = zip(*handles, strict=True)
+    options = {"loc": "outside upper left", "frameon": False, "fontsize": 8.5}
     for columns in (4, 3, 2, 1):
-        legend = figure.legend(
-            marks, names, loc="outside upper left", frameon=False, fontsize=8.5, ncols=columns
-        )
+        legend = figure.legend(marks, names, ncols=columns, **options)
         if columns == 1 or legend.get_window_extent(renderer).width <= figure.bbox.width:
             return
         legend.remove()
@@ -306,11 +329,13 @@ def _plain_ticks(axis: Any) -> None:
 
     low, high = axis.get_view_interval()
     decades = float(np.log10(high / low)) if 0 < low < high else 9.0
-    subs: tuple[float, ...] = (1.0, 2.0, 5.0) if decades < 2.2 else (1.0,)
-    if decades < 0.6:
-        subs = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0)
-    if decades < 0.35:
-        subs = tuple(np.arange(1.0, 10.0, 0.5))
+    densities = {
+        0.35: np.arange(1.0, 10.0, 0.5),
+        0.6: (1, 1.5, 2, 3, 4, 5, 7),
+        2.2: (1, 2, 5),
+        math.inf: (1,),
+    }
+    subs = next(subs for most, subs in densities.items() if decades < most)
     axis.set_major_locator(LogLocator(base=10, subs=subs))
     axis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
     axis.set_minor_formatter(NullFormatter())

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from mbtf_core.stats import Estimate
-from mbtf_pipeline.fit_records import TrainingHistory
 from mbtf_pipeline.formatting import estimate, estimate_text
 from mbtf_pipeline.report.plots import Line, bars, curves
+from mbtf_pipeline.report.training import TrainingHistory
 from mbtf_pipeline.run_folder import FITS
 from mbtf_pipeline.stages import read_stamp
 
@@ -36,26 +36,17 @@ def time_context(
     stamps = {name: read_stamp(folder, name) for name in stages}
     seconds = [(name, stamp.seconds) for name, stamp in stamps.items() if stamp is not None]
     total = sum(s for _, s in seconds)
-    plots = [
-        {
-            "title": f"Seconds per stage, {total:.0f} in total",
-            "svg": bars(seconds, "seconds", "seconds per stage"),
-        }
-    ]
+    svg = bars(seconds, "seconds", "seconds per stage")
+    plots = [{"title": f"Seconds per stage, {total:.0f} in total", "svg": svg}]
     generation = float(manifest["summary"]["shard_seconds"])
     lines = [
-        Line(name, [generation + r[0] for r in rows], [r[1] for r in rows], [r[2] for r in rows])
-        for name, rows in ((name, h.unexplained) for name, h in histories.items())
-        if rows
+        Line(name, [generation + seconds for seconds in found[0]], *found[1:])
+        for name, h in histories.items()
+        if (found := h.unexplained)
     ]
     if lines:
-        svg = curves(
-            lines,
-            "seconds of generation and training",
-            "unexplained variance",
-            "error over total time",
-            logx=True,
-        )
+        axes = ("seconds of generation and training", "unexplained variance")
+        svg = curves(lines, *axes, "error over total time", scales="xy")
         plots.append({"title": "Error over total time", "svg": svg})
     tables = [_generation(manifest), _fits(histories), _comparison(comparison)]
     return {"time_plots": plots, "time_tables": tables}
@@ -81,8 +72,9 @@ def _at(history: TrainingHistory, fraction: float) -> str:
     """Validation error nearest to a fraction of the training time."""
     if not history.unexplained:
         return "–"
-    wanted = fraction * history.seconds
-    seconds, value, error = min(history.unexplained, key=lambda r: abs(r[0] - wanted))
+    wanted = fraction * history.training["seconds"]
+    rows = zip(*history.unexplained, strict=True)
+    seconds, value, error = min(rows, key=lambda row: abs(row[0] - wanted))
     return f"{estimate_text(Estimate(value, error, 0))} at {seconds:.0f} s"
 
 
@@ -93,9 +85,9 @@ def _fits(histories: Mapping[str, TrainingHistory]) -> dict[str, Any]:
         "rows": [
             [
                 name,
-                f"{h.seconds:.1f}",
+                f"{h.training['seconds']:.1f}",
                 f"{h.samples / 1e6:.1f} M",
-                f"{h.samples_per_second / 1e6:.2f} M/s",
+                f"{h.rate:.2f} M/s",
                 *(_at(h, fraction) for fraction in _FRACTIONS),
             ]
             for name, h in histories.items()

@@ -40,7 +40,7 @@ mbtf_fit.training
 mbtf_fit.mitsuba_plugin
 mbtf_fit.cli
 mbtf_fit
-mbtf_pipeline.recipe mbtf_pipeline.stages mbtf_pipeline.presets mbtf_pipeline.run_folder mbtf_pipeline.formatting mbtf_pipeline.fit_records
+mbtf_pipeline.recipe mbtf_pipeline.stages mbtf_pipeline.presets mbtf_pipeline.run_folder mbtf_pipeline.formatting
 mbtf_pipeline.compare
 mbtf_pipeline.report
 mbtf_pipeline.run

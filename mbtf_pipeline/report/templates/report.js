@@ -42,17 +42,13 @@
   };
 
   const linear = code => code ? low * 2 ** ((code - 1) * step) : 0;
-  // One table from code to 8-bit sRGB for all images, recomputed for each exposure.
-  let table, tableStops = null;
+  // A table from code to 8-bit sRGB at the selected exposure.
   const brightness = () => {
-    if (tableStops === state.stops) return table;
     const factor = 2 ** state.stops / data.white;
-    table = Uint8ClampedArray.from({ length: 1 << bits }, (_, code) => {
+    return Uint8ClampedArray.from({ length: 1 << bits }, (_, code) => {
       const x = Math.min(1, factor * linear(code));
       return Math.round(255 * (x <= 0.0031308 ? 12.92 * x : 1.055 * x ** (1 / 2.4) - 0.055));
     });
-    tableStops = state.stops;
-    return table;
   };
 
   const draw = (canvas, picture, color) => {

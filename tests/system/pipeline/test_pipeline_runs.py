@@ -113,16 +113,7 @@ def test_the_report_is_self_contained(first: dict[str, Any], folder: Path) -> No
         head, _, data = uri.partition(",")
         assert head in ("data:image/png;base64", "data:image/jpeg;base64")
         assert len(base64.b64decode(data, validate=True)) > 100
-    for text in (
-        "unexplained variance",
-        "1/sr is white",
-        "HDR-FLIP",
-        "% of white",
-        "flip-evaluator",
-        "seconds of training",
-        "mbtf-pipeline run",
-        "mitsuba",
-    ):
+    for text in ("1/sr is white", "HDR-FLIP", "% of white", "flip-evaluator", "mbtf-pipeline run", "mitsuba"):
         assert text in html
     assert html.count("<svg") >= 6
     ids = re.findall(r'\bid="([^"]+)"', html)
@@ -143,16 +134,12 @@ def test_a_size_limit_reduces_the_images(again: Any, folder: Path) -> None:
     report = folder / "report.html"
     assert report.stat().st_size > 1.2e6
     assert "reduced to limit the file size" not in report.read_text()
-    assert list(again(*larger, "--set", "report.max_megabytes=1")) == ["report"]
+    smaller = ("--set", "report.max_megabytes=1", "--set", "report.title=A <b> & c")
+    assert list(again(*larger, *smaller)) == ["report"]
     assert report.stat().st_size <= 1e6
     assert "reduced to limit the file size" in report.read_text()
+    assert "<h1>A &lt;b&gt; &amp; c</h1>" in report.read_text()
     assert list(again()) == ["compare", "report"]
-
-
-def test_another_title_repeats_only_the_report(again: Any, folder: Path) -> None:
-    assert list(again("--set", "report.title=A <b> & c")) == ["report"]
-    assert "<h1>A &lt;b&gt; &amp; c</h1>" in (folder / "report.html").read_text()
-    assert list(again()) == ["report"]
 
 
 def test_a_finished_fit_without_a_stamp_is_not_trained_again(again: Any, folder: Path) -> None:
@@ -224,7 +211,7 @@ def test_a_cost_study_measures_reports_and_resumes(
     assert all(p.read_bytes() == content for p, content in stored.items())
     assert not (out / ".work").exists()
     (point,) = second["front"]
-    assert 0 < point["unexplained"]["error"] < point["unexplained"]["value"] < 1
+    assert 0 < point["unexplained"]["error"] < point["unexplained"]["value"]
     assert "mbtf-fit shards/" in point["command"]
     html = (out / "cost.html").read_text()
     assert not loads(html).external

@@ -5,8 +5,6 @@ from __future__ import annotations
 import io
 import json
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -16,7 +14,9 @@ import pytest
 from PIL import Image
 from support.paths import ROOT
 
+from mbtf_core.console import run
 from mbtf_gen.pictures.reference import to_display
+from mbtf_pipeline.cli.app import app
 from mbtf_pipeline.compare.pictures import read_picture
 
 # Seconds to wait for the browser.
@@ -38,25 +38,14 @@ FLAGS = (
 )
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run with two fits, two widths and both kinds of reference."""
-    out = tmp_path_factory.mktemp("report") / "run"
-    recipe = str(ROOT / "pipelines" / "ci.yaml")
-    command = [sys.executable, "-m", "mbtf_pipeline", "run", recipe, "-o", str(out), "-q"]
-    for assignment in (
-        "fit.neumip.training={steps: 60, batch: 2048}",
-        "fit.plain={model: neumip-baseline, training: {steps: 20, batch: 2048}}",
-        "compare.tiles_across=[2, 4]",
-        f"compare.size={PIXELS}",
-        "compare.spp=16",
-    ):
-        command += ["--set", assignment]
-    done = subprocess.run(
-        command, cwd=ROOT, capture_output=True, text=True, timeout=300, stdin=subprocess.DEVNULL, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    return out
+# A run with two fits, two widths and both kinds of reference.
+OPTIONS = (
+    "fit.neumip.training={steps: 60, batch: 2048}",
+    "fit.plain={model: neumip-baseline, training: {steps: 20, batch: 2048}}",
+    "compare.tiles_across=[2, 4]",
+    f"compare.size={PIXELS}",
+    "compare.spp=16",
+)
 
 
 def _start(profile: Path) -> Any:
@@ -153,13 +142,18 @@ class Page:
 
 
 @pytest.fixture(scope="module")
-def page(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    folder = tmp_path_factory.mktemp("report") / "run"
     with pytest.MonkeyPatch.context() as patch:
         for name in ("no_proxy", "NO_PROXY"):
             patch.setenv(name, "localhost,127.0.0.1")
         patch.setenv("SE_OFFLINE", "true")
         driver = _start(tmp_path_factory.mktemp("profile"))
         try:
+            options = [word for option in OPTIONS for word in ("--set", option)]
+            assert (
+                run(app, ["run", str(ROOT / "pipelines" / "ci.yaml"), "-o", str(folder), "-q", *options]) == 0
+            )
             opened = Page(driver, folder)
             opened.until(lambda: opened.js("return document.body.dataset.sheet") == "drawn", "the sheet")
             # An integer number of screen pixels per image pixel allows exact comparisons.
@@ -282,16 +276,11 @@ def test_selections_change_the_images(page: Page, stage: Any) -> None:
 
 def test_error_maps_match_the_selection(page: Page, stage: Any) -> None:
     def shown() -> list[str]:
-        return [
-            bar.text
-            for bar in page.driver.find_elements("css selector", "#maps .color-bar")
-            if bar.is_displayed()
-        ]
+        bars = page.driver.find_elements("css selector", "#maps .color-bar")
+        return [bar.text for bar in bars if bar.is_displayed()]
 
     first = page.find("#map-image").get_attribute("src")
-    assert first == page.js(
-        "return document.getElementById(arguments[0]).src", "pictures/v1-l1-s1-fit-neumip-local"
-    )
+    assert first == page.js("return document.getElementById('pictures/v1-l1-s1-fit-neumip-local').src")
     assert [bar.startswith("Local RMS error, % of white") for bar in shown()] == [True]
     page.js("document.querySelector('input[name=map][value=flip]').click()")
     page.until(lambda: page.find("#map-image").get_attribute("src") != first, "the other map")
@@ -344,13 +333,13 @@ def test_errors_of_scripts_reach_the_log(page: Page) -> None:
     del page.errors[before:]
 
 
-def test_images_are_visible_without_scripts(page: Page, folder: Path) -> None:
+def test_images_are_visible_without_scripts(page: Page) -> None:
     driver = page.driver
     driver.switch_to.new_window("window")
     # A tall window, because nothing can scroll without scripts.
     driver.set_window_size(1300, 2400)
     driver.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": True})
-    driver.get((folder / "report.html").as_uri())
+    driver.get((page.folder / "report.html").as_uri())
     png = page.find("img[data-linear]").screenshot_as_png
     image = Image.open(io.BytesIO(png)).convert("RGB")
     shown = np.asarray(image.resize((PIXELS, PIXELS), Image.Resampling.BOX))

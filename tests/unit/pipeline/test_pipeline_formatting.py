@@ -8,7 +8,7 @@ import pytest
 
 from mbtf_core.stats import Estimate
 from mbtf_pipeline.compare.perceptual_metrics import PERCEPTUAL_METRICS, available_metrics
-from mbtf_pipeline.formatting import data_errors, decibel, estimate_text, levels, percent
+from mbtf_pipeline.formatting import data_errors, decibel, estimate_text, levels
 
 
 @pytest.mark.parametrize("value", [0.03, -0.03, 0.0])
@@ -21,7 +21,7 @@ def test_values_within_two_error_bars_are_marked(value: float) -> None:
 def test_other_values_are_printed_as_they_are() -> None:
     assert estimate_text(Estimate(0.123, 0.004, 100), 100.0, " %") == "12.3 ± 0.4 %"
     assert estimate_text(Estimate(-0.123, 0.004, 100)) == "−0.123 ± 0.004"
-    assert percent(Estimate(math.nan, math.inf, 1)) == "undefined"
+    assert estimate_text(Estimate(math.nan, math.inf, 1)) == "undefined"
 
 
 def test_both_errors_of_the_same_queries_are_marked_or_neither() -> None:

@@ -68,13 +68,11 @@ def test_other_recipes_get_the_network_of_the_preset() -> None:
     fits["hierarchical"] = {"model": "hierarchical"}
     assert fitter_options("draft", fits)["hierarchical"] == FITTER["draft"]
     text = quality_assignments(path, "draft")
-    assert {"fit.neumip.network.width=40", "fit.neumip-baseline.training.texture_weight_decay=1.0"} <= set(
-        text
-    )
+    assert "fit.neumip.network.width=40" in text
+    assert "fit.neumip-baseline.training.texture_weight_decay=1.0" in text
     # A network or smoothing set on the command line is kept as a whole.
-    text = quality_assignments(
-        path, "draft", ["fit.neumip.network.width=25", "fit.neumip.training.texture_weight_decay=0"]
-    )
+    own = ["fit.neumip.network.width=25", "fit.neumip.training.texture_weight_decay=0"]
+    text = quality_assignments(path, "draft", own)
     assert not any("network" in t or t.startswith("fit.neumip.training.texture_weight_decay") for t in text)
     assert "fit.neumip.training.blur.min_sigma=0.8" in text
 
@@ -86,9 +84,8 @@ def test_longer_training_gets_a_larger_network() -> None:
     # The network follows the training time; counted steps count as the longest.
     assert best_at("draft") == best_options(20.0)
     assert best_at("high") == best_options(600.0) == best_at("paper")
-    known = {"high": "network.width=64", "draft": "network.width=40"}
-    for quality, text in known.items():
-        assert f"fit.neumip.{text}" in quality_assignments(ROOT / "pipelines" / "rock_cliff.yaml", quality)
+    path = ROOT / "pipelines" / "rock_cliff.yaml"
+    assert "fit.neumip.network.width=64" in quality_assignments(path, "high")
 
 
 def test_options_of_a_fit_file_are_kept(tmp_path: Path) -> None:

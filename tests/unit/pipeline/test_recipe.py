@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mbtf_core.console import run
+from mbtf_core.console import Console, run
 from mbtf_core.errors import InputError
 from mbtf_core.locks import shard_lock
 from mbtf_pipeline.cli.app import app
 from mbtf_pipeline.recipe import load_recipe, read_resolved, write_recipe
-from mbtf_pipeline.run import survey
-from mbtf_pipeline.stages import Decision, Stage, run_stages
+from mbtf_pipeline.run import _material_inputs, _RecipeRun, survey
+from mbtf_pipeline.stages import run_stages
 
 HEAD = """\
 name: small
@@ -55,18 +55,11 @@ def test_the_material_is_relative_to_the_recipe(tmp_path: Path, monkeypatch: pyt
     assert recipe.folder == Path("out") / "small"
 
 
-def test_data_are_out_of_date_when_a_map_has_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_data_are_out_of_date_when_a_map_has_changed(tmp_path: Path) -> None:
     """By its content, not by its date."""
     recipe, folder = load_recipe(written(tmp_path, SINGLE)), tmp_path / "out"
-
-    def finish(where: Path, stage: Stage, *others: object) -> Decision:
-        """Stands in for a run of the stage."""
-        run_stages(where, [replace(stage, needs=(), outputs=tuple, run=lambda decision: {})])
-        return Decision("")
-
-    with monkeypatch.context() as patched:
-        patched.setattr("mbtf_pipeline.run.decide", finish)
-        survey(recipe, folder)
+    stages = _RecipeRun(recipe, folder, Console(quiet=True)).stages(_material_inputs(recipe))
+    run_stages(folder, [replace(stage, outputs=tuple, run=lambda decision: None) for stage in stages])
     path = tmp_path / "maps" / "height.npy"
     path.touch()
     assert not survey(recipe, folder)["generate"].runs
@@ -191,9 +184,8 @@ def test_the_resolved_recipe_can_be_run_again(tmp_path: Path) -> None:
     write_recipe(recipe, folder)
     again = load_recipe(folder / "recipe.yaml")
     assert Path(again.generate.material).samefile(recipe.generate.material)
-    assert again.model_dump(exclude={"generate": {"material"}}) == recipe.model_dump(
-        exclude={"generate": {"material"}}
-    )
+    others = {"exclude": {"generate": {"material"}}}
+    assert again.model_dump(**others) == recipe.model_dump(**others)
     (tmp_path / "maps" / "height.npy").unlink()
     assert read_resolved(folder).fit == recipe.fit
 

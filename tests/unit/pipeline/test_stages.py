@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -46,26 +45,21 @@ class Pipeline:
     def file(self, name: str) -> Path:
         return self.folder / f"{name.replace(' ', '-')}.txt"
 
-    def work(self, name: str) -> Callable[[Decision], dict[str, Any]]:
-        def run(decision: Decision) -> dict[str, Any]:
+    def stage(self, name: str) -> Stage:
+        inputs = {} if self.needs[name] else self.inputs
+
+        def work(decision: Decision) -> None:
             self.ran.append(name)
             self.decisions[name] = decision
             if name == self.fail_in:
                 raise KeyboardInterrupt
             read = [self.file(n).read_text() for n in self.needs[name]]
-            inputs = self.inputs if name == "generate" else {}
             self.file(name).write_text(f"{name} {self.config[name]} {inputs} of {read}")
-            return {"note": name}
 
-        return run
+        return Stage(name, self.needs[name], self.config[name], inputs, lambda: [self.file(name)], work)
 
     def stages(self) -> list[Stage]:
-        def stage(name: str) -> Stage:
-            inputs = self.inputs if name == "generate" else {}
-            outputs = lambda: [self.file(name)]  # noqa: E731
-            return Stage(name, self.needs[name], self.config[name], inputs, outputs, self.work(name))
-
-        return [stage(name) for name in self.needs]
+        return [self.stage(name) for name in self.needs]
 
     def run(self, **options: Any) -> dict[str, StageResult]:
         self.ran, self.decisions = [], {}
@@ -84,7 +78,6 @@ def test_nothing_runs_twice(pipeline: Pipeline) -> None:
     results = pipeline.run()
     assert pipeline.ran == []
     assert not any(r.ran for r in results.values())
-    assert results["compare"].stamp.notes == {"note": "compare"}
 
 
 @pytest.mark.parametrize(
@@ -159,29 +152,25 @@ def test_force_runs_everything(pipeline: Pipeline) -> None:
 def test_an_unreadable_stamp_is_ignored(pipeline: Pipeline) -> None:
     path = stamp_path(pipeline.folder, "report")
     assert read_json(path)["outputs"].keys() == {"report.txt"}
-    path.write_text("{")
-    pipeline.run()
-    assert pipeline.ran == ["report"]
-    path.write_text('{"format": "mbtf-stage", "schema": 999}')
-    pipeline.run()
-    assert pipeline.ran == ["report"]
+    for text in ("{", '{"format": "mbtf-stage", "schema": 999}'):
+        path.write_text(text)
+        pipeline.run()
+        assert pipeline.ran == ["report"]
 
 
 def test_deciding_changes_nothing(pipeline: Pipeline) -> None:
     pipeline.config["compare"] = {"option": 2}
     before = sorted(p.read_text() for p in pipeline.folder.rglob("*") if p.is_file())
-    stage = pipeline.stages()[3]
-    upstream = {n: read_stamp(pipeline.folder, n).outputs_hash for n in stage.needs}  # type: ignore[union-attr]
-    assert decide(pipeline.folder, stage, upstream).runs
+    assert decide(pipeline.folder, pipeline.stage("compare")).runs
     assert sorted(p.read_text() for p in pipeline.folder.rglob("*") if p.is_file()) == before
 
 
 def test_running_one_stage_again(pipeline: Pipeline) -> None:
     pipeline.ran = []
-    run_again(pipeline.folder, pipeline.stages()[-1])
+    run_again(pipeline.folder, pipeline.stage("report"))
     assert pipeline.ran == ["report"]
     pipeline.run()
     assert pipeline.ran == []
     stamp_path(pipeline.folder, "fit b").unlink()
     with pytest.raises(InputError, match="fit b"):
-        run_again(pipeline.folder, pipeline.stages()[-1])
+        run_again(pipeline.folder, pipeline.stage("report"))

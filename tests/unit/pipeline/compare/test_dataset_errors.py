@@ -11,6 +11,7 @@ import pytest
 import torch
 from support.fit_data import parallax, write_data
 
+from mbtf_core.console import Console
 from mbtf_core.lattice import Lattice
 from mbtf_fit.models.registry import build_model
 from mbtf_gen.dataset.reader import Dataset
@@ -18,7 +19,7 @@ from mbtf_pipeline.compare import timing
 from mbtf_pipeline.compare.dataset_errors import dataset_errors
 from mbtf_pipeline.compare.timing import LIGHTS, measure_timing
 from mbtf_pipeline.recipe import Recipe
-from mbtf_pipeline.run import data_sets, stage_names
+from mbtf_pipeline.run import _RecipeRun, data_sets
 
 
 def recipe(layout: str, *models: str) -> Recipe:
@@ -35,7 +36,8 @@ def test_a_model_of_the_other_layout_gets_its_own_data_set(layout: str) -> None:
     assert (second.stage, second.sub) == (f"generate {other}", f"shards-{other}")
     assert second.config.queries.layout == other
     assert second.config.queries.train == made.generate.queries.train
-    assert stage_names(made)[:3] == ["generate", f"generate {other}", "fit neumip"]
+    stages = _RecipeRun(made, Path(), Console(quiet=True)).stages({})
+    assert [stage.name for stage in stages][:3] == ["generate", f"generate {other}", "fit neumip"]
 
 
 class Shifted:
@@ -90,7 +92,7 @@ def test_times_scale_to_all_pixels(model: str, parts: list[str], monkeypatch: py
     network.initialize(torch.Generator().manual_seed(0), 1.0)
     material: Any = SimpleNamespace(model=network, evaluate=lambda *arrays: arrays)
     pixels = 8 * 81 * 20
-    found = measure_timing(material, pixels)
+    found = measure_timing(material, pixels, "cpu")
     count = 20 if model == "hierarchical" else 81 * 20
     assert found["queries"] == count
     assert list(found["parts_ms"]) == parts

@@ -10,7 +10,8 @@ import pytest
 from mbtf_core.directions import from_angles
 from mbtf_gen.geometry.heightfield import HeightGrid
 from mbtf_gen.render.runtime import load_mitsuba
-from mbtf_pipeline.compare.offsets import _correlation, _write, read_offset, towards_view, traced_offset
+from mbtf_pipeline.compare.offsets import _regression, read_offset, towards_view, traced_offset
+from mbtf_pipeline.compare.pictures import write_channels
 from mbtf_pipeline.recipe import SceneView
 
 DEPTH = 0.05
@@ -53,12 +54,12 @@ def test_a_peak_at_the_plane_is_not_displaced(plane_below: object) -> None:
 
 def test_files_preserve_offsets(tmp_path: Path) -> None:
     offset = np.random.default_rng(1).normal(size=(5, 7, 2)).astype(np.float32)
-    _write(tmp_path / "v1-fit-some.name.exr", offset)
+    write_channels(tmp_path / "v1-fit-some.name.exr", offset, "XY")
     np.testing.assert_array_equal(read_offset(tmp_path / "v1-fit-some.name.exr"), offset)
 
 
 def test_correlation() -> None:
     x = np.linspace(0, 1, 50, dtype=np.float32)
-    assert _correlation(x, 3 * x - 2) == pytest.approx(1.0)
-    assert _correlation(x, -x) == pytest.approx(-1.0)
-    assert _correlation(x, np.zeros_like(x)) is None
+    assert _regression(x, 3 * x - 2) == pytest.approx({"correlation": 1.0, "slope": 3.0})
+    assert _regression(x, -x) == pytest.approx({"correlation": -1.0, "slope": -1.0})
+    assert _regression(np.zeros_like(x), x) == {"correlation": None, "slope": None}

@@ -29,9 +29,7 @@ def pair(shape: tuple[int, int] = (40, 33)) -> tuple[F64, F64]:
 
 def test_srgb_matches_the_display_conversion() -> None:
     values = np.linspace(-0.1, 0.4, 300).reshape(10, 10, 3).astype(np.float32)
-    np.testing.assert_allclose(
-        np.round(255 * to_srgb(values, 0.25)), to_display(values, 1 / 0.25), rtol=0, atol=1e-9
-    )
+    np.testing.assert_array_equal(np.round(255 * to_srgb(values, 0.25)), to_display(values, 1 / 0.25))
 
 
 def test_ssim_of_uniform_images_is_known() -> None:
@@ -67,10 +65,8 @@ def test_only_the_ratio_to_white_matters_and_values_above_are_clipped() -> None:
     picture, reference = pair()
     assert ssim(7 * picture, 7 * reference, 7.0) == pytest.approx(ssim(picture, reference, 1.0))
     assert ssim(2 + picture, 2 + reference, 1.0) == pytest.approx(1.0)
-
-
-def test_images_smaller_than_the_window_have_no_ssim() -> None:
-    assert ssim(np.ones((10, 40, 3)), np.ones((10, 40, 3)), 1.0) is None
+    # None if a side is shorter than the window.
+    assert ssim(picture[:10], reference[:10], 1.0) is None
 
 
 def test_missing_weights_of_st_lpips_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -105,12 +101,9 @@ def test_st_lpips_matches_the_published_network(published: object, shape: tuple[
 
     assert callable(published)
     pictures = pair(shape)
-    tensors = [
-        torch.from_numpy((2 * to_srgb(p, 1.0) - 1).astype(np.float32).transpose(2, 0, 1)[None])
-        for p in pictures
-    ]
+    srgb = ((2 * to_srgb(p, 1.0) - 1).astype(np.float32) for p in pictures)
     with torch.no_grad():
-        expected = float(published(*tensors))
+        expected = float(published(*(torch.from_numpy(x.transpose(2, 0, 1)[None]) for x in srgb)))
     assert st_lpips(*pictures, 1.0) == pytest.approx(expected, rel=1e-5)
 
 
@@ -118,7 +111,6 @@ def test_st_lpips_matches_the_published_network(published: object, shape: tuple[
 def test_st_lpips_of_equal_and_of_small_images() -> None:
     picture, reference = pair()
     assert st_lpips(reference, reference, 1.0) == 0.0
-    assert st_lpips(picture, reference, 1.0) == pytest.approx(
-        st_lpips(5 * picture, 5 * reference, 5.0), rel=1e-5
-    )
+    expected = pytest.approx(st_lpips(5 * picture, 5 * reference, 5.0), rel=1e-5)
+    assert st_lpips(picture, reference, 1.0) == expected
     assert st_lpips(picture[:20], reference[:20], 1.0) is None

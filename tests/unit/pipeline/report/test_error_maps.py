@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mbtf_pipeline.report.error_maps import common_scale, gradient, indices, local_error, palette, ticks
+from mbtf_pipeline.report.error_maps import color_bar, common_scale, indices, local_error, palette
 
 
 def luma(colors: np.ndarray) -> np.ndarray:
@@ -52,13 +52,13 @@ def test_scales_are_round() -> None:
         assert common_scale([np.full(100, size)]) == pytest.approx(expected)
     zero = np.zeros((10, 10))
     assert common_scale([zero - 0.03, zero]) == pytest.approx(0.05)
-    assert common_scale([]) == 1.0
 
 
 def test_color_bars_match_the_map() -> None:
-    assert ticks(0, 0.2, 100) == ["0", "5", "10", "15", "20"]
-    assert ticks(-0.5, 0.5) == ["−0.5", "−0.25", "0", "0.25", "0.5"]
+    bar = color_bar("local", "", 0.2, "%", "", 100)
+    assert bar["ticks"] == ["0", "5", "10", "15", "20"]
+    assert color_bar("signed", "", 0.5, "", "")["ticks"] == ["−0.5", "−0.25", "0", "0.25", "0.5"]
     first, last = palette("local")[0], palette("local")[-1]
-    text = gradient("local")
+    text = bar["gradient"]
     assert text.startswith("linear-gradient(90deg, rgb({} {} {}),".format(*first))
     assert text.endswith("rgb({} {} {}))".format(*last))

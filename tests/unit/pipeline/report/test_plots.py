@@ -10,8 +10,7 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from mbtf_pipeline.report.labels import place_labels
-from mbtf_pipeline.report.plots import Line, bars, curves, points
+from mbtf_pipeline.report.plots import Line, bars, curves, place_labels, points
 
 SECONDS = list(np.linspace(2, 60, 30))
 ERROR = [0.3 + 1 / s for s in SECONDS]

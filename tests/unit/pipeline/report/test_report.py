@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 
 from mbtf_pipeline.compare import timing
-from mbtf_pipeline.fit_records import TrainingHistory
 from mbtf_pipeline.report.errors import error_context, group_label
 from mbtf_pipeline.report.times import _comparison, _fits
+from mbtf_pipeline.report.training import TrainingHistory
 
 
 @pytest.mark.parametrize(
@@ -48,7 +48,8 @@ def test_errors_over_training_time_have_error_bars() -> None:
     rows = [(10.0, 0.5, 0.01), (50.0, 0.4, 0.03), (90.0, 0.039, 0.069)]
     records = [{"seconds": s, "loss": 1.0, "unexplained": v, "unexplained_error": e} for s, v, e in rows]
     # Records without a validation are skipped.
-    history = TrainingHistory(1000, 4096, 100.0, "cpu", 2, [*records, {"seconds": 95.0, "loss": 1.0}])
+    training = {"steps": 1000, "batch": 4096, "seconds": 100.0}
+    history = TrainingHistory(training, [*records, {"seconds": 95.0, "loss": 1.0}])
     cells = _fits({"a": history})["rows"][0]
     assert cells[-4] == "0.500 ± 0.010 at 10 s"
     assert cells[-1] == "not significant (0.04 ± 0.07) at 90 s"
