@@ -23,20 +23,7 @@ _PUBLIC = {
     "verify": "mbtf_gen.dataset.verify",
 }
 
-__all__ = [
-    "Camera",
-    "Dataset",
-    "GeneratorConfig",
-    "Lattice",
-    "LightKernel",
-    "MbtfError",
-    "Queries",
-    "generate",
-    "load_material",
-    "render_reference",
-    "repair",
-    "verify",
-]
+__all__ = [*_PUBLIC]
 
 
 def __getattr__(name: str) -> Any:

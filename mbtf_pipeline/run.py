@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -165,7 +165,6 @@ class _RecipeRun:
     def _generate(self, data: DataSet) -> Callable[[Decision], dict[str, Any]]:
         def run(decision: Decision) -> dict[str, Any]:
             from mbtf_core.shard_schema import MANIFEST_NAME
-            from mbtf_gen.dataset.summary import summary_dict
             from mbtf_gen.dataset.verify import sidecar_of
             from mbtf_gen.generation import generate, paths_left
             from mbtf_gen.job import Job
@@ -184,7 +183,7 @@ class _RecipeRun:
                 clear(shards)
             with self.console.progress(paths_left(job, shards), data.stage, "paths") as bar:
                 summary = generate(job, shards, progress=lambda done, note: bar.update(done, note))
-            return summary_dict(summary)
+            return asdict(summary)
 
         return run
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from mbtf_core.errors import PartialError
-from mbtf_gen.dataset.shard_statistics import ShardStatistics, refuse_nonfinite
+from mbtf_gen.dataset.summary import ShardStatistics, refuse_nonfinite
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from support.datasets import edit, write_dataset
 
 from mbtf_core.digest import file_sha256
 from mbtf_gen.dataset.shard_io import read_shard, write_shard
-from mbtf_gen.dataset.verify import is_finished, shard_fault, sidecar_of, verify
+from mbtf_gen.dataset.verify import examine, finished_record, sidecar_of, verify
 
 FORMATS = ["npz", "exr"]
 
@@ -70,8 +70,8 @@ def test_a_truncated_shard_is_found(copy: Path, kept: int) -> None:
     assert "bytes" in faults(copy)[path.name]
     # Size alone decides whether it counts as finished on resuming.
     manifest = json.loads((copy / "manifest.json").read_text())
-    assert not is_finished(path, 40, manifest["config_hash"])
-    assert is_finished(shard(copy, 0), 40, manifest["config_hash"])
+    assert not finished_record(path, 40, manifest["config_hash"])
+    assert finished_record(shard(copy, 0), 40, manifest["config_hash"])
 
 
 def test_missing_parts_are_found(copy: Path) -> None:
@@ -159,7 +159,7 @@ def test_wrong_rows_and_bad_numbers_are_found_behind_a_true_digest(copy: Path) -
 def test_a_broken_sidecar_is_a_fault_not_an_abort(copy: Path, text: str) -> None:
     sidecar_of(shard(copy)).write_text(text)
     assert list(faults(copy)) == [shard(copy).name]
-    assert not is_finished(shard(copy), 40, "any")
+    assert not finished_record(shard(copy), 40, "any")
 
 
 def test_sizes_alone_are_checked_where_digests_are_not_wanted(copy: Path) -> None:
@@ -168,7 +168,7 @@ def test_sizes_alone_are_checked_where_digests_are_not_wanted(copy: Path) -> Non
     damaged[len(damaged) // 2] ^= 1
     path.write_bytes(damaged)
     wanted = json.loads((copy / "manifest.json").read_text())["config_hash"]
-    assert shard_fault(path, 40, wanted, digests=False) is None
-    assert "SHA-256" in str(shard_fault(path, 40, wanted))
-    assert "rows" in str(shard_fault(path, 39, wanted))
-    assert shard_fault(path, 40, "0" * 64) == "belongs to another data set"
+    assert finished_record(path, 40, wanted)
+    assert "SHA-256" in str(examine(path, 40, wanted)[1])
+    assert "rows" in str(examine(path, 39, wanted)[1])
+    assert examine(path, 40, "0" * 64) == (None, "belongs to another data set")
