@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import threading
 from collections.abc import Iterator, Sequence
@@ -33,7 +32,8 @@ _CHANGED = "has changed since it was written (SHA-256 differs)"
 _RESUME = "run the same mbtf-gen command again: it renders the missing shards"
 _REPAIR = "repair it with: mbtf-gen repair FOLDER"
 
-# The reader of EXR files redirects the standard error stream of the whole process.
+# The reader of EXR files redirects the standard error stream of the whole process. NumPy parses headers with
+# `ast`, which may fail in several threads before Python 3.11.8 and 3.12.2 (CPython issue 106905).
 _ONE_AT_A_TIME = threading.Lock()
 
 
@@ -111,7 +111,7 @@ def _check_content(path: Path, rows: int, record: dict[str, Any]) -> None:
     """An InputError where the bytes or values of a shard are at fault."""
     if file_sha256(path) != record["sha256"]:
         raise InputError(_CHANGED)
-    with _ONE_AT_A_TIME if path.suffix == ".exr" else contextlib.nullcontext():
+    with _ONE_AT_A_TIME:
         arrays = read_shard(path)
     found = check_arrays(arrays, path)[0]
     if found != rows:
