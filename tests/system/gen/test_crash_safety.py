@@ -252,15 +252,6 @@ def test_two_runs_at_once_make_every_shard_once(tmp_path: Path) -> None:
     assert contents(tmp_path / "out") == contents(tmp_path / "whole")
 
 
-def test_slices_equal_a_run(tmp_path: Path) -> None:
-    assert generate(command(tmp_path, tmp_path / "whole", train=600)) == 0
-    line = command(tmp_path, tmp_path / "out", train=600)
-    for index in (3, 1, 7, 2, 6, 5, 4):
-        assert generate([*line, "--slice", f"{index}/7", "--overwrite"]) == 0
-    assert generate(["merge", str(tmp_path / "out")]) == 0
-    assert contents(tmp_path / "out") == contents(tmp_path / "whole")
-
-
 # Runs the program on a file system of 60 kB, gives it more room, and runs it again.
 FULL = """
 set -e
