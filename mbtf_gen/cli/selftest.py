@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from mbtf_core.console import CONSOLE, Console
-from mbtf_core.errors import InputError, UsageError
+from mbtf_core.errors import UsageError
 from mbtf_core.options import Time
 
 
@@ -38,9 +38,6 @@ def selftest(*, report: Path | None = None, time: Time = "2min", console: Consol
     if report is not None:
         from mbtf_core.atomic import write_text
 
-        try:
-            write_text(report, as_html(findings))
-        except OSError as error:
-            raise InputError(f"cannot be written ({error.strerror})", where=report) from None
+        write_text(report, as_html(findings))
     console.report(as_json(findings), as_text(findings))
     return exit_code(findings)

@@ -64,17 +64,6 @@ class _Analysis:
         """Whether nothing is displaced."""
         return self.job.grid.displacement_range == 0.0
 
-    @property
-    def lowest_light(self) -> float:
-        """Elevation in radians below which the cut light lobe has no light; ≤ 0 if there is none."""
-        config = self.job.config
-        return float(np.arcsin(config.queries.min_cos) - LOBE_TAIL * np.radians(config.light.width))
-
-    @property
-    def below_lowest(self) -> float:
-        """Upper bound of the share of the light below that elevation."""
-        return LOBE_TAIL_SHARE if self.job.config.light.width > 0 else 0.0
-
 
 def plan_effects(job: Job, *, pilots: bool = True) -> EffectsPlan:
     """Decide which effects a run simulates.
@@ -300,11 +289,14 @@ def _relief_plan(
 
 
 def _shadowing(scene: _Analysis, bounds: ReliefBounds | None) -> Effect:
-    lowest = scene.lowest_light
+    config = scene.job.config
+    # Elevation in radians below which the cut light lobe has no light; ≤ 0 if there is none.
+    lowest = float(np.arcsin(config.queries.min_cos) - LOBE_TAIL * np.radians(config.light.width))
     slopes = f"slopes up to {_degrees(scene.steepest)}"
     if lowest > 0 and scene.steepest <= np.tan(lowest):
         text = f"{slopes}, light no lower than {_degrees(np.tan(lowest))}"
-        return Effect("shadowing", True, text, scene.below_lowest, "bound")
+        below = LOBE_TAIL_SHARE if config.light.width > 0 else 0.0
+        return Effect("shadowing", True, text, below, "bound")
     text = f"{slopes}, light down to {'the horizon' if lowest <= 0 else _degrees(np.tan(lowest))}"
     return Effect("shadowing", True, text, bounds.shadowing if bounds else None, "pilot")
 
