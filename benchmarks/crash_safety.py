@@ -39,7 +39,7 @@ from support.file_operations import FileOperations, Operation
 from support.small_runs import command, contents, die, ending, generate, in_child, noisy_plane
 
 from mbtf_core.errors import InputError
-from mbtf_gen.dataset.verify import verify
+from mbtf_gen.dataset.verify import ABSENT, INCOMPLETE, verify
 from mbtf_gen.planning.simulation import ClosedForm
 
 KILLED = -signal.SIGKILL
@@ -59,8 +59,7 @@ def damaged(folder: Path) -> list[str]:
     """Files that are there and are not what they should be, in a folder whose run was killed."""
     if not (folder / "manifest.json").exists():
         return []
-    innocent = ("is not complete", "is not there")
-    return [f.file for f in verify(folder) if not f.absent and f.what not in innocent]
+    return [f.file for f in verify(folder) if f.what not in (*ABSENT, INCOMPLETE)]
 
 
 def killed_runs(folder: Path, kills: int, dice: random.Random) -> dict[str, Any]:

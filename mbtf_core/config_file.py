@@ -252,15 +252,15 @@ def check_schema(document: Mapping[str, Any], version: int, where: Path, hint: s
         raise InputError(what, where=where, hint=hint)
 
 
-def check_document(model: type[BaseModel], data: Mapping[str, Any], path: Path, hint: str) -> None:
-    """Refuse a JSON document of the programs whose content does not fit `model`.
+def check_document(model: type[S], data: Mapping[str, Any], path: Path, hint: str) -> S:
+    """A JSON document of the programs as `model`.
 
     Raises
     ------
     InputError : with the first key that is missing or holds something else
     """
     try:
-        build(model, data, source=str(path))
+        return build(model, data, source=str(path))
     except InputError as error:
         raise InputError(f"is damaged ({error.what})", where=path, hint=hint) from None
 

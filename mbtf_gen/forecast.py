@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import math
 import os
 import statistics
 import tempfile
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.shard_schema import ARRAYS, Split
+from mbtf_core.shard_schema import Split
 from mbtf_core.stats import pooled_error
 from mbtf_core.units import clock
-from mbtf_gen.dataset.shard_io import write_shard
+from mbtf_gen.dataset.shard_io import row_bytes, write_shard
 from mbtf_gen.job import Job, split_queries, split_spp, split_target
 from mbtf_gen.planning.adaptive import estimate_shard
 from mbtf_gen.planning.pilot import pilot_queries
@@ -82,17 +81,13 @@ class Forecast:
         )
         if target is None:
             return line
-        missed = (
-            f"; {self.missed:.1%} of the queries stop at the cap of {target.max_spp}" if self.missed else ""
+        line += (
+            f"\n  {self.paths_per_query:.0f} paths per training query for an error of {target.error:.2%} of "
+            "max(value, tile mean)"
         )
-        need = f"{self.paths_per_query:.0f} paths per training query for an error of {target.error:.2%}"
-        return f"{line}\n  {need} of max(value, tile mean){missed}"
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain data for JSON; numbers that are not finite become None."""
-        return {
-            k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in asdict(self).items()
-        }
+        if self.missed:
+            line += f"; {self.missed:.1%} of the queries stop at the cap of {target.max_spp}"
+        return line
 
 
 def size_text(size: float) -> str:
@@ -101,11 +96,6 @@ def size_text(size: float) -> str:
         if size >= factor:
             return f"{size / factor:.{1 if size < 10 * factor else 0}f} {unit}"
     return f"{size / 1e3:.0f} kB"
-
-
-def row_bytes(holes: bool) -> int:
-    """Bytes of one query in a shard."""
-    return sum(4 * max(1, math.prod(a.trailing)) for a in ARRAYS if holes or not a.optional)
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,9 @@ from pathlib import Path
 from mbtf_core.errors import PartialError
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.dataset.folder import has_dataset, open_folder
-from mbtf_gen.dataset.render_shards import ProgressCallback, busy_message, render_shards
+from mbtf_gen.dataset.render_shards import ProgressCallback, render_shards
 from mbtf_gen.dataset.summary import Summary, finish, read_run_plan
-from mbtf_gen.dataset.verify import is_finished
+from mbtf_gen.dataset.verify import finished_record
 from mbtf_gen.job import Job, planned_paths
 from mbtf_gen.planning.run_plan import plan_run
 
@@ -18,9 +18,8 @@ from mbtf_gen.planning.run_plan import plan_run
 def paths_left(job: Job, folder: str | Path, slice_index: int = 1, slice_count: int = 1) -> int:
     """Paths that :func:`generate` has yet to trace: those of the slice's unfinished shards."""
     entries = job.shards[slice_index - 1 :: slice_count]
-    return planned_paths(
-        job, [e for e in entries if not is_finished(Path(folder) / e.file, e.rows, job.config_hash)]
-    )
+    left = [e for e in entries if not finished_record(Path(folder) / e.file, e.rows, job.config_hash)]
+    return planned_paths(job, left)
 
 
 def generate(
@@ -71,16 +70,9 @@ def generate(
     open_folder(job, folder, plan_run, overwrite)
     entries = job.shards[slice_index - 1 :: slice_count]
     result = render_shards(job, folder, entries, read_run_plan(folder), progress=progress)
-    if result.busy:
-        raise PartialError(
-            busy_message(result.busy), where=folder, hint="wait for it, then run the same command again"
-        )
+    seconds = time.perf_counter() - start
     summary = finish(
-        folder,
-        paths=result.paths,
-        seconds=time.perf_counter() - start,
-        writing=result.writing,
-        waiting=result.waiting,
+        folder, paths=result.paths, seconds=seconds, writing=result.writing, waiting=result.waiting
     )
     if slice_count == 1 and not summary.complete:
         raise PartialError(

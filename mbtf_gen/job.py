@@ -34,19 +34,6 @@ class Job:
         All options.
     material : Material
         The maps that ``config.material`` names, loaded.
-
-    Attributes
-    ----------
-    lattice : Lattice
-        Texel grids of the levels.
-    config_hash : str
-        SHA-256 of the options and of the contents of the input files, hexadecimal.
-    grid : HeightGrid
-        Heights of the mesh, in tile widths.
-    query_plan : QueryPlan
-        Samples the queries of any shard.
-    shards : tuple of ShardEntry
-        All shards of all splits, the training split first.
     """
 
     config: GeneratorConfig
@@ -92,22 +79,17 @@ class Job:
 
     @cached_property
     def config_hash(self) -> str:
-        """SHA-256 of the options and of the contents of the input files."""
+        """SHA-256 of the options and of the contents of the input files, hexadecimal."""
         return self.config.hash(self.material.digests)
 
     @cached_property
     def grid(self) -> HeightGrid:
-        """Heights of the mesh."""
+        """Heights of the mesh, in tile widths."""
         return self.material.grid(self.config.geometry.height_scale, self.config.geometry.mesh)
 
     @cached_property
     def query_plan(self) -> QueryPlan:
-        """Samples the queries of any shard.
-
-        Raises
-        ------
-        UsageError : all weights of the mixture are zero
-        """
+        """Samples the queries of any shard; a UsageError if all weights of the mixture are zero."""
         queries = self.config.queries
         try:
             mixture = Mixture(queries.mixture.log_uniform, queries.mixture.finest)
@@ -125,12 +107,7 @@ class Job:
 
     @cached_property
     def shards(self) -> tuple[ShardEntry, ...]:
-        """All shards, the training split first.
-
-        Raises
-        ------
-        UsageError : a split has more than ``MAX_SHARD_FILES``
-        """
+        """All shards, the training split first; a UsageError if a split has more than ``MAX_SHARD_FILES``."""
         return tuple(entry for split in SPLITS for entry in _shards(self, split))
 
 

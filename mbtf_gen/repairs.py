@@ -18,19 +18,20 @@ from pydantic import ValidationError
 
 from mbtf_core.atomic import read_checksummed, read_json, write_checksummed, write_text
 from mbtf_core.config_file import differences, dump_yaml, in_short, read_yaml
-from mbtf_core.errors import InputError, MbtfError, PartialError
+from mbtf_core.errors import InputError, MbtfError
 from mbtf_core.locks import brief_lock
 from mbtf_core.shard_schema import CONFIG_NAME, FORMAT_NAME, MANIFEST_NAME, ShardEntry
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.dataset.manifest import build_manifest, plan_digest
 from mbtf_gen.dataset.reader import Dataset
-from mbtf_gen.dataset.render_shards import ProgressCallback, busy_message, render_shards
+from mbtf_gen.dataset.render_shards import ProgressCallback, render_shards
 from mbtf_gen.dataset.summary import finish, read_run_plan
-from mbtf_gen.dataset.verify import Fault, shard_faults, verify
+from mbtf_gen.dataset.verify import INCOMPLETE, TWICE, UNLISTED, Fault, shard_faults, verify
 from mbtf_gen.job import Job, planned_paths
 from mbtf_gen.planning.run_plan import RunPlan, plan_run
 
 _AGAIN = "generate the data set again, into another folder"
+_DOCUMENTS = (MANIFEST_NAME, CONFIG_NAME)
 
 
 @dataclass(frozen=True)
@@ -69,16 +70,9 @@ class RepairResult:
 
 @dataclass
 class Corruption:
-    """The faults of a data set and how to repair them; :meth:`repair` does.
+    """The faults of the data set in `folder` and how to repair them; :meth:`repair` does.
 
-    Parameters
-    ----------
-    folder : of the data set
-    material : current path of its material; by default the path in its configuration
-
-    Raises
-    ------
-    InputError : no data set
+    Its properties raise an InputError where a repair is impossible.
     """
 
     folder: Path
@@ -121,29 +115,22 @@ class Corruption:
 
     def _configurations(self) -> Iterator[GeneratorConfig]:
         """Configurations that can be read, the manifest's first."""
-        stored: list[Any] = []
-        for path in (self.folder / MANIFEST_NAME, self.folder / CONFIG_NAME):
+        first = None
+        for read in (
+            lambda: read_json(self.folder / MANIFEST_NAME)["config"],
+            lambda: read_yaml(self.folder / CONFIG_NAME),
+        ):
             try:
-                stored.append(read_json(path)["config"] if path.name == MANIFEST_NAME else read_yaml(path))
-            except (MbtfError, KeyError):
+                config = GeneratorConfig.model_validate(read())
+            except (MbtfError, KeyError, ValidationError):
                 continue
-        for number, data in enumerate(stored):
-            if data in stored[:number]:
-                continue
-            try:
-                config = GeneratorConfig.model_validate(data)
-            except ValidationError:
-                continue
-            yield config.model_copy(update={"material": self.material}) if self.material else config
+            if config != first:
+                yield config.model_copy(update={"material": self.material}) if self.material else config
+            first = config
 
     @cached_property
     def job(self) -> Job:
-        """The job of the data set.
-
-        Raises
-        ------
-        InputError : no evidence of it is left, or its material is missing or has changed
-        """
+        """The job of the data set."""
         expected = self._evidence[0] if self._manifest is None else self._manifest["config_hash"]
         if expected is None:
             raise InputError(
@@ -151,7 +138,7 @@ class Corruption:
                 where=self.folder / MANIFEST_NAME,
                 hint=_AGAIN,
             )
-        other: Job | None = None
+        tried: list[Job] = []
         for config in self._configurations():
             if not Path(config.material).exists():
                 raise InputError(
@@ -162,18 +149,15 @@ class Corruption:
             job = Job.prepare(config)
             if job.config_hash == expected:
                 return job
-            other = other or job
-        raise self._refusal(other)
-
-    def _refusal(self, job: Job | None) -> InputError:
-        if job is None:
-            return InputError(
+            tried.append(job)
+        if not tried:
+            raise InputError(
                 f"neither {MANIFEST_NAME} nor {CONFIG_NAME} can be read", where=self.folder, hint=_AGAIN
             )
         before = (self._manifest or {}).get("inputs", {})
-        changes = in_short(differences(before, dict(sorted(job.material.digests.items()))))
+        changes = in_short(differences(before, tried[0].material.digests))
         what = f" ({changes})" if before and changes else ""
-        return InputError(
+        raise InputError(
             f"the material or the configuration has changed since the data set was generated{what}",
             where=self.folder,
             hint="restore it, or generate the data set again",
@@ -181,12 +165,7 @@ class Corruption:
 
     @cached_property
     def plan(self) -> RunPlan:
-        """The run plan of the data set.
-
-        Raises
-        ------
-        InputError : it is lost
-        """
+        """The run plan of the data set."""
         if self._manifest is not None:
             return read_run_plan(self.folder)
         plan = plan_run(self.job)
@@ -201,28 +180,24 @@ class Corruption:
     @cached_property
     def documents(self) -> list[str]:
         """Manifest and configuration, if they have to be written again."""
-        names = {f.file for f in self.faults if f.file in (MANIFEST_NAME, CONFIG_NAME) and not f.unfinished}
-        if self._manifest is None or any(f.listing for f in self.faults):
+        names = {f.file for f in self.faults if f.file in _DOCUMENTS and f.what != INCOMPLETE}
+        if self._manifest is None or any(f.what == TWICE for f in self.faults):
             names.add(MANIFEST_NAME)
         return sorted(names, reverse=True)
 
     @cached_property
     def entries(self) -> list[ShardEntry]:
-        """Shards that are missing or corrupt."""
-        faulty = {f.file for f in self._shard_faults()}
-        return [e for e in self.job.shards if e.file in faulty]
+        """Shards that are missing or corrupt; with a corrupt manifest, those of the restored one."""
+        job, faults = self.job, self.faults
+        if self._manifest is None:
+            faults = [*shard_faults(self.folder, job.shards, job.config_hash, str(self._evidence[1]))]
+        faulty = {f.file for f in faults if self._manifest is None or f.what not in (UNLISTED, TWICE)}
+        return [e for e in job.shards if e.file in faulty]
 
     @cached_property
     def left(self) -> list[Fault]:
         """Faults that a repair leaves."""
-        return [f for f in self.faults if f.unlisted]
-
-    def _shard_faults(self) -> list[Fault]:
-        """Faults of shards; with a corrupt manifest, of those that the restored one lists."""
-        if self._manifest is not None:
-            return [f for f in self.faults if not (f.unlisted or f.listing)]
-        job = self.job
-        return list(shard_faults(self.folder, job.shards, job.config_hash, str(self._evidence[1])))
+        return [f for f in self.faults if f.what == UNLISTED]
 
     @property
     def paths(self) -> int:
@@ -230,48 +205,31 @@ class Corruption:
         return planned_paths(self.job, self.entries)
 
     def repair(self, progress: ProgressCallback | None = None) -> RepairResult:
-        """Write the documents and render the shards again.
-
-        Raises
-        ------
-        InputError : see :attr:`job` and :attr:`plan`
-        PartialError : other processes write the data set, or the disk is full; the same command resumes
-        """
+        """See :func:`repair`."""
         documents, entries, plan = self.documents, self.entries, self.plan
-        if documents or entries:
-            self._write_documents(documents, bool(entries))
-        result = render_shards(
-            self.job, self.folder, entries, plan, corrupt={e.file for e in entries}, progress=progress
-        )
-        if result.busy:
-            raise PartialError(
-                busy_message(result.busy),
-                where=self.folder,
-                hint="wait for it, then run the same command again",
-            )
-        summary = finish(self.folder)
-        return RepairResult(
-            str(self.folder),
-            self.faults,
-            result.shards,
-            documents,
-            self.left,
-            summary.complete,
-            result.paths,
-            round(result.seconds, 3),
-        )
-
-    def _write_documents(self, documents: list[str], unfinished: bool) -> None:
         path = self.folder / MANIFEST_NAME
-        with brief_lock(path):
-            if MANIFEST_NAME in documents:
-                write_checksummed(path, build_manifest(self.job, self.plan))
-            manifest = read_checksummed(path)
-            if unfinished and manifest["complete"]:
-                # Readers rely on this key, and rendering removes the corrupt shards.
-                write_checksummed(path, {**manifest, "complete": False, "summary": None})
-            if CONFIG_NAME in documents:
-                write_text(self.folder / CONFIG_NAME, dump_yaml(manifest["config"]))
+        if documents or entries:
+            with brief_lock(path):
+                if MANIFEST_NAME in documents:
+                    write_checksummed(path, build_manifest(self.job, plan))
+                manifest = read_checksummed(path)
+                if entries and manifest["complete"]:
+                    # Readers rely on this key, and rendering removes the corrupt shards.
+                    write_checksummed(path, {**manifest, "complete": False, "summary": None})
+                if CONFIG_NAME in documents:
+                    write_text(self.folder / CONFIG_NAME, dump_yaml(manifest["config"]))
+        corrupt = {e.file for e in entries}
+        result = render_shards(self.job, self.folder, entries, plan, corrupt=corrupt, progress=progress)
+        return RepairResult(
+            folder=str(self.folder),
+            faults=self.faults,
+            shards=result.shards,
+            documents=documents,
+            left=self.left,
+            complete=finish(self.folder).complete,
+            paths=result.paths,
+            seconds=round(result.seconds, 3),
+        )
 
 
 def repair(

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mbtf_core.console import CONSOLE, Console, resumable
-from mbtf_core.errors import EXIT_BAD_INPUT, EXIT_OK
+from mbtf_core.errors import EXIT_BAD_INPUT, EXIT_OK, EXIT_PARTIAL
 from mbtf_core.options import DryRun
 from mbtf_core.units import clock
 from mbtf_gen.cli.generate import describe
@@ -25,13 +25,10 @@ def merge(folder: Path, /, *, console: Console = CONSOLE) -> int:
     folder
         Folder of shards.
     """
-    from mbtf_core.errors import EXIT_PARTIAL
-    from mbtf_gen.dataset.reader import Dataset
-    from mbtf_gen.dataset.summary import finish, summary_dict
+    from mbtf_gen.dataset.summary import finish
 
-    Dataset.open(folder)
     summary = finish(folder)
-    console.report(summary_dict(summary), describe(summary, ran=False))
+    console.report(asdict(summary), describe(summary, ran=False))
     return EXIT_OK if summary.complete else EXIT_PARTIAL
 
 
@@ -44,7 +41,7 @@ def verify(folder: Path, /, *, console: Console = CONSOLE) -> int:
         Folder of shards.
     """
     from mbtf_gen.dataset.reader import Dataset
-    from mbtf_gen.dataset.verify import verify
+    from mbtf_gen.dataset.verify import ABSENT, verify
 
     start = time.perf_counter()
     faults = verify(folder)
@@ -52,8 +49,8 @@ def verify(folder: Path, /, *, console: Console = CONSOLE) -> int:
     dataset = Dataset.open(folder)
     files = [folder / e["file"] for s in dataset.manifest["splits"].values() for e in s["shards"]]
     read = sum(path.stat().st_size for path in files if path.exists())
-    lines = [f"{folder / f.file}: {f.what}; {f.hint}" for f in faults if not f.absent]
-    if absent := [f for f in faults if f.absent]:
+    lines = [f"{folder / f.file}: {f.what}; {f.hint}" for f in faults if f.what not in ABSENT]
+    if absent := [f for f in faults if f.what in ABSENT]:
         missing = f"{len(absent)} of {len(files)} shards missing, first {absent[0].file}"
         lines.insert(0, f"{folder}: {missing}; {absent[0].hint}")
     data = {
@@ -103,8 +100,11 @@ def repair(
 
 
 def _describe_repair(done: RepairResult, dry_run: bool) -> str:
+    from mbtf_gen.dataset.verify import ABSENT
+
     rendered, written = ("would be rendered", "would be written") if dry_run else ("rendered", "written")
-    lines = [f"{done.folder}/{f.file}: {f.what}" for f in done.faults if not f.absent and f not in done.left]
+    shown = [f for f in done.faults if f.what not in ABSENT and f not in done.left]
+    lines = [f"{done.folder}/{f.file}: {f.what}" for f in shown]
     if done.shards:
         first = ", ".join(done.shards[:5]) + (", …" if len(done.shards) > 5 else "")
         lines.append(f"{done.folder}: {len(done.shards)} shards {rendered} again ({first})")

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 from cyclopts import Parameter
 
@@ -12,11 +13,26 @@ from mbtf_core.console import CONSOLE, Console, resumable
 from mbtf_core.errors import UsageError
 from mbtf_core.options import Options, Output, Overwrite, takes_options
 from mbtf_core.units import clock
-from mbtf_gen.cli.common import resolve_config
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.config.presets import GENERATOR, QualityOption, as_assignments
+from mbtf_gen.config.presets import GENERATOR, Quality, QualityOption, as_assignments
 
-_SPLIT_WORDS = {"train": "training"}
+if TYPE_CHECKING:
+    from mbtf_gen.dataset.summary import Summary
+
+G = TypeVar("G", bound=GeneratorConfig)
+
+
+def resolve_config(options: Options[G], material: str | None, quality: Quality | None = None) -> G:
+    """Configuration of a command for a material.
+
+    Raises
+    ------
+    UsageError : no material, or a flag or an assignment is at fault
+    InputError : the file is at fault
+    """
+    if material is None and options.config is None:
+        raise UsageError("no material given", hint="mbtf-gen heightfield.exr --queries 400/texel -o shards/")
+    return options.resolve(as_assignments(GENERATOR[quality] if quality else {}), material=material)
 
 
 def _slice(text: str) -> tuple[int, int]:
@@ -49,9 +65,8 @@ def generate(
     slice
         Render only every n-th shard, from the i-th; finish with mbtf-gen merge.
     """
-    resolved = resolve_config(options, material, as_assignments(GENERATOR[quality] if quality else {}))
+    resolved = resolve_config(options, material, quality)
     part = _slice(slice)
-    from mbtf_gen.dataset.summary import summary_dict
     from mbtf_gen.generation import generate, paths_left
     from mbtf_gen.job import Job, split_queries
 
@@ -60,67 +75,48 @@ def generate(
         f"{resolved.material} -> {output}: {split_queries(job, 'train')} training + "
         f"{split_queries(job, 'test')} test queries, resolution {job.lattice.shape()[1]}"
     )
-    total = paths_left(job, output, *part)
     with (
         resumable(f"the shards that are finished are kept in {output}"),
-        console.progress(total=total, label="generating", unit="paths") as bar,
+        console.progress(paths_left(job, output, *part), "generating", "paths") as bar,
     ):
+        index, count = part
         summary = generate(
-            job,
-            output,
-            overwrite=overwrite,
-            slice_index=part[0],
-            slice_count=part[1],
-            progress=bar.update,
+            job, output, overwrite=overwrite, slice_index=index, slice_count=count, progress=bar.update
         )
-    console.report(summary_dict(summary), describe(summary))
+    console.report(asdict(summary), describe(summary))
 
 
-def _target_line(summary: Any) -> list[str]:
-    target = summary.target
-    if target is None:
-        return []
-    line = f"  error of a training value: {target['reached']:.2%} of max(value, tile mean), RMS"
-    if target["missed"]:
-        line += (
-            f"; {target['missed']} queries ({target['share']:.2%}) stopped at the cap, the worst at "
-            f"{target['worst']:.1%}"
-        )
-    return [line]
-
-
-def _price(summary: Any) -> str:
-    """What halving the noise of every value would take: its variance falls at least like one over the number
-    of paths."""
-    if not summary.complete or summary.relative_error <= 0:
-        return ""
-    return f"; halving it would take about {clock(3.0 * summary.shard_seconds)} more (four times the paths)"
-
-
-def describe(summary: Any, *, ran: bool = True) -> str:
+def describe(summary: Summary, *, ran: bool = True) -> str:
     """What a folder of shards holds and, where it `ran`, what the run added."""
     state = "complete" if summary.complete else "unfinished: run the other slices, then mbtf-gen merge"
-    counts = " + ".join(f"{n} {_SPLIT_WORDS.get(split, split)}" for split, n in summary.splits.items())
-    work = "nothing left to do"
-    if summary.paths:
-        speed = f"{summary.paths_per_second / 1e6:.2f} M paths/s"
-        disk = f"{summary.waiting_seconds:.1f} s of it waiting for the disk"
-        work = f"{summary.paths} paths in {clock(summary.seconds)} ({speed}), {disk}"
-    lines = [
-        f"{summary.folder}: {counts} queries, {state}",
-        *([f"  this run: {work}"] if ran else []),
-        f"  mean value {sum(summary.mean_value) / 3:.4g} 1/sr, "
-        f"pooled noise of a training query {summary.relative_error:.1%} of the mean{_price(summary)}",
-        *_target_line(summary),
-        f"  simulated: {', '.join(summary.effects) or 'nothing beyond a flat Lambert plane'}",
-    ]
-    odd = [
-        f"{n} {what}"
-        for n, what in (
-            (summary.nonfinite, "non-finite samples (sampled again)"),
-            (summary.lost, "rays passed through the surface at a crease (counted as black)"),
-            (summary.capped, "rays ended at the limit on tile crossings"),
+    counts = " + ".join(f"{n} {'training' if k == 'train' else k}" for k, n in summary.splits.items())
+    lines = [f"{summary.folder}: {counts} queries, {state}"]
+    if ran and summary.paths:
+        lines.append(
+            f"  this run: {summary.paths} paths in {clock(summary.seconds)} "
+            f"({summary.paths_per_second / 1e6:.2f} M paths/s), "
+            f"{summary.waiting_seconds:.1f} s of it waiting for the disk"
         )
-        if n
-    ]
-    return "\n".join([*lines, f"  noted: {', '.join(odd)}"] if odd else lines)
+    elif ran:
+        lines.append("  this run: nothing left to do")
+    noise = f"pooled noise of a training query {summary.relative_error:.1%} of the mean"
+    if summary.complete and summary.relative_error > 0:
+        # The variance of every value falls at least like one over the number of paths.
+        more = clock(3.0 * summary.shard_seconds)
+        noise += f"; halving it would take about {more} more (four times the paths)"
+    lines.append(f"  mean value {sum(summary.mean_value) / 3:.4g} 1/sr, {noise}")
+    if target := summary.target:
+        line = f"  error of a training value: {target['reached']:.2%} of max(value, tile mean), RMS"
+        if target["missed"]:
+            line += f"; {target['missed']} queries ({target['share']:.2%}) stopped at the cap"
+            line += f", the worst at {target['worst']:.1%}"
+        lines.append(line)
+    lines.append(f"  simulated: {', '.join(summary.effects) or 'nothing beyond a flat Lambert plane'}")
+    noted = {
+        "non-finite samples (sampled again)": summary.nonfinite,
+        "rays passed through the surface at a crease (counted as black)": summary.lost,
+        "rays ended at the limit on tile crossings": summary.capped,
+    }
+    if any(noted.values()):
+        lines.append(f"  noted: {', '.join(f'{n} {what}' for what, n in noted.items() if n)}")
+    return "\n".join(lines)

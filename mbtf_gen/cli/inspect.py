@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from mbtf_core.console import CONSOLE, Console
 from mbtf_core.options import Options, takes_options
-from mbtf_gen.cli.common import resolve_config
+from mbtf_gen.cli.generate import resolve_config
 from mbtf_gen.config.generator import GeneratorConfig
 
 

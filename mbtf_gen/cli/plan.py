@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 import textwrap
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
 from mbtf_core.console import CONSOLE, Console
 from mbtf_core.options import Options, takes_options
-from mbtf_gen.cli.common import resolve_config
+from mbtf_gen.cli.generate import resolve_config
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.config.presets import GENERATOR, QualityOption, as_assignments
+from mbtf_gen.config.presets import QualityOption
 
 if TYPE_CHECKING:
     from mbtf_gen.planning.effects import Effect, EffectsPlan
@@ -43,7 +44,7 @@ def plan(
     measure
         Measure the bias of omitting each simulated effect by a pilot run, and forecast the run.
     """
-    resolved = resolve_config(options, material, as_assignments(GENERATOR[quality] if quality else {}))
+    resolved = resolve_config(options, material, quality)
     from mbtf_gen.job import Job, split_target
     from mbtf_gen.planning.effects_plan import plan_effects
 
@@ -58,16 +59,21 @@ def plan(
 
     expected = forecast(job, allocate(job, found))
     found = measured(job, found)
-    data = {**found.to_manifest(), "forecast": expected.as_dict()}
     text = f"{table(found)}\n{expected.describe(split_target(job.config, 'train'))}"
-    console.report(data, text)
+    console.report({**found.to_manifest(), "forecast": asdict(expected)}, text)
 
 
 def table(plan: EffectsPlan) -> str:
     """The plan as a table, a line or two per effect."""
+    from mbtf_gen.config.effects_request import EFFECTS
+
+    before = _NAME + 5 + _BOUND
     lines = [f"{'effect':<{_NAME}}{'':5}{'bias bound if omitted':<{_BOUND}}reason"]
-    for effect in plan.effects:
-        lines += _row(effect)
+    for e in plan.effects:
+        first, *rest = textwrap.wrap(e.explanation, _WIDTH - before) or [""]
+        state = "on" if e.on else "off"
+        lines.append(f"{EFFECTS[e.name]:<{_NAME}}{state:<5}{bound_text(e):<{_BOUND}}{first}")
+        lines += [" " * before + more for more in rest]
     bound = plan.bias_bound
     share = "0 %" if bound == 0 else f"at most {_percent(bound)}"
     lines.append(f"bias of all omitted effects: {share}; effects.tolerance is {_percent(plan.tolerance)}")
@@ -76,15 +82,6 @@ def table(plan: EffectsPlan) -> str:
     elif plan.max_depth:
         lines.append(f"paths end after {plan.max_depth} surface interactions")
     return "\n".join(lines)
-
-
-def _row(effect: Effect) -> list[str]:
-    from mbtf_gen.config.effects_request import EFFECTS
-
-    before = _NAME + 5 + _BOUND
-    why = textwrap.wrap(effect.explanation, _WIDTH - before) or [""]
-    first = f"{EFFECTS[effect.name]:<{_NAME}}{'on' if effect.on else 'off':<5}{bound_text(effect):<{_BOUND}}"
-    return [first + why[0], *(" " * before + more for more in why[1:])]
 
 
 def bound_text(effect: Effect) -> str:
@@ -107,5 +104,5 @@ def _percent(share: float, digits: int = 2) -> str:
     percent = 100.0 * share
     if percent <= 0.0:
         return "0 %"
-    places = max(0, digits - 1 - math.floor(math.log10(percent)))
-    return f"{round(percent, digits - 1 - math.floor(math.log10(percent))):.{places}f} %"
+    places = digits - 1 - math.floor(math.log10(percent))
+    return f"{round(percent, places):.{max(0, places)}f} %"

@@ -7,7 +7,7 @@ from pathlib import Path
 from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import UsageError
 from mbtf_core.options import Options, Output, Overwrite, Switch, takes_options
-from mbtf_gen.cli.common import resolve_config
+from mbtf_gen.cli.generate import resolve_config
 from mbtf_gen.config.pictures import RENDERING, PreviewConfig
 
 _QUERIES = ("train", "resolution", "min_cos", "layout", "patch_size")

@@ -7,7 +7,7 @@ from typing import Any
 
 from mbtf_core.console import CONSOLE, Console
 from mbtf_core.options import Options, Output, Overwrite, takes_options
-from mbtf_gen.cli.common import resolve_config
+from mbtf_gen.cli.generate import resolve_config
 from mbtf_gen.config.pictures import RENDERING, ReferenceConfig
 
 

@@ -20,7 +20,7 @@ from mbtf_core.atomic import (
 from mbtf_core.config_file import differences, dump_yaml
 from mbtf_core.errors import InputError, PartialError
 from mbtf_core.folders import ELSEWHERE, check_folder, make_folder, other_configuration, remove_unfinished
-from mbtf_core.locks import brief_lock, lock_owner, take_lock
+from mbtf_core.locks import brief_lock, lock_owner, shard_lock, take_lock
 from mbtf_core.shard_schema import CONFIG_NAME, FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, SPLITS
 from mbtf_gen.dataset.manifest import build_manifest
 from mbtf_gen.job import Job
@@ -33,17 +33,8 @@ _UNFINISHED = re.compile(rf"\.({_OWN.pattern}){TEMPORARY}")
 _LOCK = re.compile(rf"\.({_SHARD}|{re.escape(Path(MANIFEST_NAME).stem)})\.lock")
 
 
-def _is_leftover(name: str) -> bool:
-    return bool(_UNFINISHED.fullmatch(name) or _LOCK.fullmatch(name))
-
-
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """The manifest of a folder, exactly as it was written.
-
-    Raises
-    ------
-    InputError : missing, unreadable, or changed
-    """
+    """The manifest of a folder; an InputError unless it is exactly as it was written."""
     return read_checksummed(folder / MANIFEST_NAME, "repair it with: mbtf-gen repair FOLDER")
 
 
@@ -103,9 +94,8 @@ def _check_same(job: Job, folder: Path) -> None:
     if old.get("config_hash") == job.config_hash:
         read_manifest(folder)
         return
-    config = old.get("config")
-    before = {**(config if isinstance(config, dict) else {}), "inputs": old.get("inputs", {})}
-    before["schema"] = old.get("schema")
+    config = old["config"] if isinstance(old.get("config"), dict) else {}
+    before = {**config, "inputs": old.get("inputs", {}), "schema": old.get("schema")}
     inputs = dict(job.material.digests)
     after = {**job.config.model_dump(mode="json"), "inputs": inputs, "schema": SCHEMA_VERSION}
     if not differences(before, after):
@@ -121,36 +111,21 @@ def _locks(folder: Path) -> Iterator[Path]:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove the locks and unfinished files of killed runs, unless a process holds the lock.
-
-    Raises
-    ------
-    PartialError : the folder cannot be written
-    """
+    """Remove the locks and unfinished files of killed runs, unless a process holds the lock."""
     general = Path(MANIFEST_NAME).stem
     stems = {path.stem for path in _locks(folder)}
     for path in folder.iterdir():
         if match := _UNFINISHED.fullmatch(path.name):
-            stem = Path(match[1]).stem
-            stems.add(general if match[1] == CONFIG_NAME else stem)
+            stems.add(general if match[1] == CONFIG_NAME else Path(match[1]).stem)
     for stem in sorted(stems):
-        lock = take_lock(folder / f"{stem}.npz")
-        if lock is None:
-            continue
-        try:
-            files = [f"{stem}{suffix}" for suffix in (".npz", ".exr", ".json")]
-            remove_unfinished(folder, (*files, *([CONFIG_NAME] if stem == general else [])))
-        finally:
-            lock.release()
+        with shard_lock(folder / f"{stem}.npz") as held:
+            if held:
+                files = [f"{stem}{suffix}" for suffix in (".npz", ".exr", ".json")]
+                remove_unfinished(folder, [*files, *([CONFIG_NAME] if stem == general else [])])
 
 
 def _clear(folder: Path) -> None:
-    """Remove a data set and nothing else, the manifest last, so that shards never remain without it.
-
-    Raises
-    ------
-    PartialError : another process writes it, or the folder cannot be written
-    """
+    """Remove a data set and nothing else, the manifest last, so that shards never remain without it."""
     with ExitStack() as held:
         for path in _locks(folder):
             lock = take_lock(path)
@@ -161,9 +136,9 @@ def _clear(folder: Path) -> None:
                     hint="wait for it or stop it, then run the same command again",
                 )
             held.callback(lock.release)
-        names = [p.name for p in folder.iterdir() if _OWN.fullmatch(p.name) or _is_leftover(p.name)]
+        files = [f for f in folder.iterdir() if any(p.fullmatch(f.name) for p in (_OWN, _UNFINISHED, _LOCK))]
         try:
-            for name in sorted(names, key=lambda name: name == MANIFEST_NAME):
-                (folder / name).unlink(missing_ok=True)
+            for file in sorted(files, key=lambda file: file.name == MANIFEST_NAME):
+                file.unlink(missing_ok=True)
         except OSError as error:
             raise unwritable(folder, error) from None

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import platform
 from collections.abc import Mapping
-from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 from mbtf_core.config_file import dump_yaml
@@ -17,21 +18,13 @@ from mbtf_gen.planning.run_plan import RunPlan
 
 def software_versions() -> dict[str, str]:
     """Versions of the software that the values depend on."""
-    return dict(_versions())
-
-
-@cache
-def _versions() -> tuple[tuple[str, str], ...]:
-    import platform
-    from importlib.metadata import PackageNotFoundError, version
-
     out = {"python": platform.python_version(), "machine": platform.machine()}
     for name in ("mbtf", "mitsuba", "drjit", "numpy", "trimesh"):
         try:
             out[name] = version(name)
         except PackageNotFoundError:
             out[name] = "not installed"
-    return tuple(out.items())
+    return out
 
 
 def plan_digest(manifest: Mapping[str, Any]) -> str:
@@ -44,7 +37,6 @@ def build_manifest(job: Job, plan: RunPlan) -> dict[str, Any]:
     config, material, lattice = job.config, job.material, job.lattice
     plain = config.model_dump(mode="json")
     grid, queries = job.grid, job.query_plan
-    rows, columns = lattice.shape()
     lead = ["n"] if queries.layout == "shuffled" else ["items", "rows", "columns"]
     return {
         "format": FORMAT_NAME,
@@ -66,9 +58,9 @@ def build_manifest(job: Job, plan: RunPlan) -> dict[str, Any]:
         },
         "levels": {
             "finest": lattice.finest,
-            "shape": [rows, columns],
+            "shape": list(lattice.shape()),
             "sigma_finest": float(sigma_of_level(lattice.finest)),
-            "mixture": {"log_uniform": queries.mixture.log_uniform, "finest": queries.mixture.finest},
+            "mixture": vars(queries.mixture),
         },
         "layout": queries.layout,
         "patch_size": queries.patch_size,

@@ -14,15 +14,13 @@ from mbtf_core.atomic import read_json
 from mbtf_core.config_file import check_document, check_schema
 from mbtf_core.errors import InputError
 from mbtf_core.lattice import MAX_LEVEL, Lattice
-from mbtf_core.shard_schema import ARRAYS, FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, Layout
+from mbtf_core.shard_schema import FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, Layout
 from mbtf_core.suggest import suggest_path
-from mbtf_gen.dataset.shard_io import Arrays, read_shard
+from mbtf_gen.dataset.shard_io import Arrays, read_shard, row_bytes
 
 _Count = Annotated[int, Field(strict=True, ge=0, lt=1 << 40)]
 _FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*\.(npz|exr)$", max_length=100)]
 _MAKE_AGAIN = "generate or download the data set again"
-# Bytes of a query in a shard.
-_QUERY_BYTES = sum(max(1, sum(a.trailing)) * a.dtype.itemsize for a in ARRAYS if not a.optional)
 
 
 class _Entry(BaseModel):
@@ -177,7 +175,7 @@ class Dataset:
                 )
             record = read_json(sidecar)
             check_document(_Sidecar, record, sidecar, _MAKE_AGAIN)
-            if record["rows"] * _QUERY_BYTES > path.stat().st_size:
+            if record["rows"] * row_bytes(holes=False) > path.stat().st_size:
                 raise InputError(
                     f"is too short for the {record['rows']} rows in its sidecar",
                     where=path,
@@ -207,8 +205,7 @@ class Dataset:
             See :meth:`shards`; or a shard cannot be read.
         """
         wanted = None if names is None else list(names)
-        for shard in self.shards(split):
-            yield read_shard(shard.path, wanted)
+        yield from (read_shard(shard.path, wanted) for shard in self.shards(split))
 
     def load(self, split: str, names: Iterable[str] | None = None) -> Arrays:
         """All queries of a split in memory.

@@ -7,9 +7,10 @@ A shard is a mapping of array name to array; all arrays share their leading axes
 from __future__ import annotations
 
 import errno
+import io
 import math
 import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -20,7 +21,6 @@ from numpy.typing import NDArray
 from mbtf_core.atomic import Stored, write_chunks, write_through
 from mbtf_core.errors import InputError, reason
 from mbtf_core.shard_schema import ARRAY, ARRAYS
-from mbtf_gen.dataset.npz import npz_chunks
 
 Arrays = dict[str, NDArray[np.float32]]
 
@@ -28,56 +28,85 @@ Arrays = dict[str, NDArray[np.float32]]
 _FOLD_WIDTH = 1024
 # An EXR header that states more is corrupt.
 _MAX_PIXELS = 2**31
+# Offsets of arrays in an npz archive are multiples of this, so that mapped arrays are aligned.
+_ALIGNMENT = 64
+# Bytes of a local header without name and extra fields, and of the extra field of 64-bit sizes (APPNOTE.TXT
+# 6.3.3, sections 4.3.7 and 4.5.3).
+_HEADER, _SIZES_64 = 30, 20
 
 
-def check_arrays(arrays: Mapping[str, NDArray[np.float32]], where: object) -> tuple[int, ...]:
-    """Leading axes shared by all arrays of a shard.
+def row_bytes(holes: bool) -> int:
+    """Bytes of one query in a shard."""
+    return sum(4 * max(1, math.prod(a.trailing)) for a in ARRAYS if holes or not a.optional)
+
+
+def check_arrays(
+    arrays: Mapping[str, NDArray[np.float32]], where: object, *, complete: bool = True
+) -> tuple[int, ...]:
+    """Leading axes shared by arrays of a shard; by default, none of the required arrays may be missing.
 
     Raises
     ------
-    InputError : a required array is missing, unknown, or of the wrong shape
+    InputError : an array is missing, unknown, or of the wrong shape
     """
-    missing = [a.name for a in ARRAYS if not a.optional and a.name not in arrays]
+    missing = [a.name for a in ARRAYS if complete and not a.optional and a.name not in arrays]
     if missing:
         raise InputError(f"shard lacks the array(s) {', '.join(missing)}", where=where)
-    return _common_lead(arrays, where)
-
-
-def _common_lead(arrays: Mapping[str, NDArray[np.float32]], where: object) -> tuple[int, ...]:
-    """Leading axes shared by arrays of a shard, not necessarily all of them.
-
-    Raises
-    ------
-    InputError : an array is unknown or of the wrong shape
-    """
-    lead: tuple[int, ...] | None = None
+    leads = set()
     for name, array in arrays.items():
         if name not in ARRAY:
             raise InputError(f"shard has an unknown array '{name}'", where=where)
         trailing = ARRAY[name].trailing
-        shape = array.shape[: array.ndim - len(trailing)]
-        fits = array.shape[len(shape) :] == trailing and len(shape) in (1, 3)
-        if not fits or lead not in (None, shape):
+        lead = array.shape[: array.ndim - len(trailing)]
+        leads.add(lead)
+        if array.shape[len(lead) :] != trailing or len(lead) not in (1, 3) or len(leads) > 1:
             raise InputError(f"array '{name}' has the shape {array.shape}", where=where)
-        lead = shape
-    if lead is None:
-        raise InputError("shard has no arrays", where=where)
-    return lead
+    return leads.pop()
+
+
+class _Chunks(list[bytes | memoryview]):
+    """A stream that collects what is written to it. It cannot seek, so that no chunk changes later."""
+
+    def write(self, data: bytes | memoryview) -> int:
+        self.append(data)
+        return memoryview(data).nbytes
+
+    def flush(self) -> None:
+        pass
+
+
+def _npz_chunks(arrays: Iterable[tuple[str, NDArray[np.float32]]]) -> Iterator[bytes | memoryview]:
+    """The bytes of an npz archive of C-ordered arrays, in consecutive chunks, so that a digest can be
+    computed while they are written."""
+    chunks = _Chunks()
+    position = 0
+    with zipfile.ZipFile(chunks, "w") as archive:  # type: ignore[call-overload]
+        for name, array in arrays:
+            head = io.BytesIO()
+            npy_format.write_array_header_1_0(head, npy_format.header_data_from_array_1_0(array))
+            # The default date is the earliest of the format, so the bytes depend on the arrays alone.
+            info = zipfile.ZipInfo(f"{name}.npy")
+            info.create_system = 3
+            padding = -(position + _HEADER + len(info.filename) + _SIZES_64 + 4) % _ALIGNMENT
+            info.extra = b"MT" + padding.to_bytes(2, "little") + bytes(padding)
+            with archive.open(info, "w", force_zip64=True) as member:
+                member.write(head.getvalue())
+                member.write(array.reshape(-1).view(np.uint8).data)
+            position += sum(memoryview(chunk).nbytes for chunk in chunks)
+            yield from chunks
+            chunks.clear()
+    yield from chunks
 
 
 def write_npz(path: Path, arrays: Mapping[str, NDArray[np.float32]]) -> Stored:
     """Write a shard as npz, atomically; the bytes depend on the arrays alone."""
     check_arrays(arrays, path)
     present = ((s.name, np.ascontiguousarray(arrays[s.name], s.dtype)) for s in ARRAYS if s.name in arrays)
-    return write_chunks(path, npz_chunks(present))
+    return write_chunks(path, _npz_chunks(present))
 
 
 def read_npz(path: Path, names: Iterable[str] | None = None, *, mapped: bool = True) -> Arrays:
-    """Arrays of an npz shard, memory-mapped read-only by default.
-
-    Parameters
-    ----------
-    names : arrays wanted; all by default
+    """Arrays of an npz shard, all or those in `names`, memory-mapped read-only by default.
 
     Raises
     ------
@@ -87,9 +116,8 @@ def read_npz(path: Path, names: Iterable[str] | None = None, *, mapped: bool = T
     try:
         with zipfile.ZipFile(path) as archive, path.open("rb") as stream:
             members = {i.filename.removesuffix(".npy"): i for i in archive.infolist()}
-            wanted = list(members) if names is None else list(names)
             size = path.stat().st_size
-            for name in wanted:
+            for name in members if names is None else names:
                 if name not in members:
                     raise InputError(f"shard lacks the array '{name}'", where=path)
                 info = members[name]
@@ -107,12 +135,10 @@ def read_npz(path: Path, names: Iterable[str] | None = None, *, mapped: bool = T
                 end = stream.tell() + count * dtype.itemsize
                 if count < 0 or end - start != info.file_size or end > size:
                     raise InputError(f"array '{name}' is not as long as its header says", where=path)
-                array: NDArray[np.float32]
                 if mapped and 0 not in shape:
-                    array = np.memmap(path, dtype, mode="r", offset=stream.tell(), shape=shape)
+                    out[name] = np.memmap(path, dtype, mode="r", offset=stream.tell(), shape=shape)
                 else:
-                    array = np.fromfile(stream, dtype, count).reshape(shape)
-                out[name] = array
+                    out[name] = np.fromfile(stream, dtype, count).reshape(shape)
     except FileNotFoundError:
         raise InputError("no such shard", where=path) from None
     except InputError:
@@ -134,12 +160,10 @@ def _npy_header(stream: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any]]
 def _fold(array: NDArray[np.float32], lead: tuple[int, ...]) -> NDArray[np.float32]:
     """Fold leading axes to (rows, columns) of one image: queries row by row, images stacked vertically."""
     trailing = array.shape[len(lead) :]
+    width = _FOLD_WIDTH if len(lead) == 1 else lead[2]
     if len(lead) == 1:
-        rows = -(-lead[0] // _FOLD_WIDTH)
-        folded = np.zeros((rows * _FOLD_WIDTH, *trailing), np.float32)
-        folded[: lead[0]] = array
-        return folded.reshape(rows, _FOLD_WIDTH, *trailing)
-    return array.reshape(lead[0] * lead[1], lead[2], *trailing)
+        array = np.pad(array, [(0, -lead[0] % width), *[(0, 0)] * len(trailing)])
+    return array.reshape(-1, width, *trailing)
 
 
 def write_exr(path: Path, arrays: Mapping[str, NDArray[np.float32]]) -> Stored:
@@ -151,9 +175,7 @@ def write_exr(path: Path, arrays: Mapping[str, NDArray[np.float32]]) -> Stored:
 
     lead = check_arrays(arrays, path)
     channels: dict[str, Any] = {}
-    for spec in ARRAYS:
-        if spec.name not in arrays:
-            continue
+    for spec in (a for a in ARRAYS if a.name in arrays):
         image = _fold(np.asarray(arrays[spec.name], np.float32), lead)
         for index, channel in enumerate(spec.channels):
             channels[channel] = np.ascontiguousarray(image[..., index] if spec.trailing else image)
@@ -190,16 +212,15 @@ def read_exr(path: Path, names: Iterable[str] | None = None) -> Arrays:
         raise InputError("EXR image is not a shard (no 'mbtf.lead' in its header)", where=path)
     out: Arrays = {}
     try:
-        lead = tuple(int(n) for n in header["mbtf.lead"].split(","))
+        lead = [int(n) for n in header["mbtf.lead"].split(",")]
         for spec in ARRAYS:
-            if spec.name not in (names if names is not None else [spec.name]):
+            if names is not None and spec.name not in names:
                 continue
             if any(c not in stored for c in spec.channels):
                 if spec.optional and names is None:
                     continue
                 raise InputError(f"shard lacks the array '{spec.name}'", where=path)
-            count = math.prod(lead)
-            flat = np.stack([stored[c].reshape(-1)[:count] for c in spec.channels], axis=-1)
+            flat = np.stack([stored[c].reshape(-1)[: math.prod(lead)] for c in spec.channels], axis=-1)
             out[spec.name] = np.ascontiguousarray(flat.reshape(*lead, *spec.trailing), np.float32)
     except (ValueError, AttributeError):
         raise InputError("shard cannot be read (its 'mbtf.lead' does not fit its size)", where=path) from None
@@ -220,5 +241,5 @@ def read_shard(path: Path, names: Iterable[str] | None = None, *, mapped: bool =
     """
     arrays = read_exr(path, names) if path.suffix == ".exr" else read_npz(path, names, mapped=mapped)
     if arrays:
-        _common_lead(arrays, path)
+        check_arrays(arrays, path, complete=False)
     return arrays

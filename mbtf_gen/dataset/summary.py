@@ -1,24 +1,37 @@
-"""The summary of a data set, and the completion of its manifest."""
+"""The summary of a data set, from the sidecars of its shards, and the completion of its manifest."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
-from pydantic import BaseModel, Field
+import numpy as np
+from pydantic import BaseModel, PositiveInt, field_validator
 
 from mbtf_core.atomic import write_checksummed
 from mbtf_core.config_file import check_document
+from mbtf_core.errors import PartialError
 from mbtf_core.locks import brief_lock
 from mbtf_core.shard_schema import MANIFEST_NAME
 from mbtf_gen.config.effects_request import EFFECTS
 from mbtf_gen.dataset.folder import read_manifest, remove_leftovers
 from mbtf_gen.dataset.manifest import software_versions
 from mbtf_gen.dataset.reader import Dataset
-from mbtf_gen.dataset.shard_statistics import COUNTS, ShardStatistics, refuse_nonfinite
 from mbtf_gen.dataset.verify import finished_record, sidecar_of
+from mbtf_gen.planning.effects import EffectsPlan
 from mbtf_gen.planning.run_plan import RunPlan
+from mbtf_gen.planning.sample_allocation import Allocation
+from mbtf_gen.render.estimates import BadSample, TargetReached
+
+# A run fails beyond this share of non-finite samples, but never for so few: with one expected, more than four
+# occur by chance once in 300 runs.
+NONFINITE_SHARE = 1e-6
+NONFINITE_FEW = 4
+_SHOWN = 3
+_CHECK = "check the data set with: mbtf-gen verify"
 
 
 @dataclass(frozen=True)
@@ -35,12 +48,8 @@ class Summary:
         Queries in finished shards, of all splits.
     splits : dict of str to int
         The same by split.
-    paths : int
-        Paths traced in this run.
-    seconds : float
-        Duration of this run.
-    paths_per_second : float
-        Their ratio.
+    paths, seconds, paths_per_second : int, float, float
+        Paths traced in this run, its duration, their ratio.
     writing_seconds : float
         Processor time of writing and digesting in this run, parallel to the rendering.
     waiting_seconds : float
@@ -80,105 +89,138 @@ class Summary:
     target: dict[str, float] | None
 
 
-_Number = Annotated[float, Field(allow_inf_nan=False)]
-_Color = tuple[_Number, _Number, _Number]
+class ShardStatistics:
+    """Sums over shards.
+
+    Attributes
+    ----------
+    queries : by split; paths, seconds : over all shards
+    counts : of quarantined samples, by the sidecar's names
+    located : the first few non-finite samples, as words
+    """
+
+    def __init__(self) -> None:
+        self.queries: Counter[str] = Counter()
+        self.paths = 0
+        self.seconds = 0.0
+        self.counts = dict.fromkeys(("nonfinite_samples", "lost_rays", "capped_rays"), 0)
+        self.located: list[str] = []
+        self._value = np.zeros(3)
+        self._variance = np.zeros(3)
+        self._targeted = self._missed = 0
+        self._worst = self._square = 0.0
+
+    def add(self, record: Mapping[str, Any]) -> None:
+        """Add a shard by its sidecar."""
+        self.queries[record["split"]] += record["queries"]
+        self.paths += record["paths"]
+        self.seconds += record["seconds"]
+        self.add_quarantined(record["file"], record["quarantined"])
+        target = record["target"]
+        if target is not None:
+            self._targeted += target["queries"]
+            self._missed += target["missed"]
+            self._worst = max(self._worst, target["worst"])
+            self._square += target["queries"] * target["square"]
+        if record["split"] == "train":
+            self._value += record["queries"] * np.asarray(record["statistics"]["mean_value"])
+            self._variance += record["queries"] * np.asarray(record["statistics"]["mean_variance"])
+
+    def add_quarantined(self, file: str, quarantined: Mapping[str, Any]) -> None:
+        """Add a shard's quarantined samples alone."""
+        for name in self.counts:
+            self.counts[name] += quarantined[name]
+        for bad in quarantined["nonfinite_at"][: _SHOWN - len(self.located)]:
+            self.located.append(f"{file} query {bad['query']}, {bad['effect']}")
+
+    @property
+    def train(self) -> int:
+        """Training queries."""
+        return self.queries["train"]
+
+    def mean_value(self) -> list[float]:
+        """Mean training value per channel, 1/sr; 0 without any."""
+        return [float(v) for v in self._value / max(self.train, 1)]
+
+    def target(self) -> dict[str, float] | None:
+        """Result of a run with a target error: RMS error reached, number and share of queries that missed the
+        target, and the largest error among them; None without a target."""
+        if not self._targeted:
+            return None
+        return {
+            "reached": float(np.sqrt(self._square / self._targeted)),
+            "missed": self._missed,
+            "share": self._missed / self._targeted,
+            "worst": self._worst,
+        }
+
+    def relative_error(self) -> float:
+        """Pooled relative standard error of the training values, √(mean variance) / mean value."""
+        mean = float(self._value.mean()) / max(self.train, 1)
+        variance = float(self._variance.mean()) / max(self.train, 1)
+        return float(np.sqrt(variance)) / mean if mean > 0 else 0.0
 
 
-class _Effect(BaseModel):
-    name: Literal[tuple(EFFECTS)]  # type: ignore[valid-type]
-    on: bool
-    reason: Literal["exact", "bound", "pilot", "forced"]
-    explanation: str
-    bias_bound: _Number | None
-    error: _Number
-    present: bool
+def refuse_nonfinite(totals: ShardStatistics, paths: int, folder: Path) -> None:
+    """Fail if the shards have more non-finite samples than a data set of `paths` may have."""
+    count = totals.counts["nonfinite_samples"]
+    if count > max(NONFINITE_FEW, NONFINITE_SHARE * paths):
+        raise PartialError(
+            f"{count} of {paths} samples were NaN or infinite, more than 1 in 10⁶: "
+            f"{'; '.join(totals.located)}",
+            where=folder,
+            hint="check the material's values, then run again with --overwrite",
+        )
 
 
-class _Allocation(BaseModel):
-    weights: list[_Number]
-    typical: _Number
-    scale: _Number
-    gain: _Number
-    mean_weights: list[_Number]
-
-
-class _Target(BaseModel):
-    queries: Annotated[int, Field(ge=1)]
-    missed: int
-    worst: _Number
-    square: _Number
-
-
-class _Effects(BaseModel):
-    mode: str
-    tolerance: _Number
-    max_depth: int
-    cap_bias_bound: _Number
-    roulette_depth: int
-    closed_form: bool
-    effects: Annotated[list[_Effect], Field(min_length=len(EFFECTS), max_length=len(EFFECTS))]
-
-
-class _Plan(BaseModel):
-    """Keys of a manifest that :func:`finish` needs, besides those that readers need."""
+class _Plan(BaseModel, allow_inf_nan=False):
+    """Keys of a manifest that a run needs, besides those that readers need."""
 
     complete: bool
-    effects: _Effects
-    allocation: _Allocation | None
+    effects: EffectsPlan
+    allocation: Allocation | None
+
+    @field_validator("effects")
+    @classmethod
+    def _lists_all(cls, plan: EffectsPlan) -> EffectsPlan:
+        if [e.name for e in plan.effects] != list(EFFECTS):
+            raise ValueError("must list all effects")
+        return plan
 
 
-class _Statistics(BaseModel):
-    mean_value: _Color
-    mean_variance: _Color
-
-
-class _BadSample(BaseModel):
-    query: int
-    effect: str
+class _Statistics(BaseModel, allow_inf_nan=False):
+    mean_value: tuple[float, float, float]
+    mean_variance: tuple[float, float, float]
 
 
 class _Quarantined(BaseModel):
     nonfinite_samples: int
-    nonfinite_at: list[_BadSample]
+    nonfinite_at: list[BadSample]
     lost_rays: int
     capped_rays: int
 
 
-class _Sidecar(BaseModel):
+class _Sidecar(BaseModel, allow_inf_nan=False):
     """Keys of a sidecar that :func:`finish` needs."""
 
     split: str
     file: str
-    queries: Annotated[int, Field(ge=1)]
+    queries: PositiveInt
     paths: int
-    seconds: _Number
+    seconds: float
     statistics: _Statistics
     quarantined: _Quarantined
-    target: _Target | None
-
-
-_CHECK = "check the data set with: mbtf-gen verify"
+    target: TargetReached | None
 
 
 def read_run_plan(folder: Path) -> RunPlan:
-    """The run plan in a data set's manifest.
-
-    Raises
-    ------
-    InputError : a corrupt manifest
-    """
-    manifest = read_manifest(folder)
-    check_document(_Plan, manifest, folder / MANIFEST_NAME, _CHECK)
-    return RunPlan.from_manifest(manifest)
+    """The run plan in a data set's manifest; an InputError where that is corrupt."""
+    found = check_document(_Plan, read_manifest(folder), folder / MANIFEST_NAME, _CHECK)
+    return RunPlan(found.effects, found.allocation)
 
 
 def finish(
-    folder: str | Path,
-    *,
-    paths: int = 0,
-    seconds: float = 0.0,
-    writing: float = 0.0,
-    waiting: float = 0.0,
+    folder: Path, *, paths: int = 0, seconds: float = 0.0, writing: float = 0.0, waiting: float = 0.0
 ) -> Summary:
     """Complete the manifest if every shard is finished, and summarize (``mbtf-gen merge``).
 
@@ -191,11 +233,9 @@ def finish(
     InputError : no data set, or a corrupt manifest or sidecar
     PartialError : too many non-finite samples, or the folder cannot be written
     """
-    folder = Path(folder)
-    path = folder / MANIFEST_NAME
     Dataset.open(folder)
     manifest = read_manifest(folder)
-    check_document(_Plan, manifest, path, _CHECK)
+    effects = check_document(_Plan, manifest, folder / MANIFEST_NAME, _CHECK).effects
     totals, complete = ShardStatistics(), True
     for content in manifest["splits"].values():
         for entry in content["shards"]:
@@ -208,56 +248,35 @@ def finish(
                 totals.add(record)
     if complete:
         refuse_nonfinite(totals, totals.paths, folder)
-    summary = Summary(
+    sums: dict[str, Any] = {
+        "queries": totals.queries.total(),
+        "shard_seconds": round(totals.seconds, 3),
+        "relative_error": totals.relative_error(),
+        "mean_value": totals.mean_value(),
+        "target": totals.target(),
+    }
+    if complete and not manifest["complete"]:
+        with brief_lock(folder / MANIFEST_NAME):
+            # Another process may have completed it since.
+            manifest = read_manifest(folder)
+            if not manifest["complete"]:
+                manifest |= {"complete": True, "software": software_versions()}
+                manifest["summary"] = {**sums, "paths": totals.paths, **totals.counts}
+                write_checksummed(folder / MANIFEST_NAME, manifest)
+    if complete:
+        remove_leftovers(folder)
+    return Summary(
         folder=str(folder),
         complete=complete,
-        queries=totals.queries.total(),
         splits={split: totals.queries[split] for split in manifest["splits"]},
         paths=paths,
         seconds=round(seconds, 3),
         paths_per_second=round(paths / seconds, 1) if seconds > 0 else 0.0,
         writing_seconds=round(writing, 3),
         waiting_seconds=round(waiting, 3),
-        shard_seconds=round(totals.seconds, 3),
-        relative_error=totals.relative_error(),
-        mean_value=totals.mean_value(),
         lost=totals.counts["lost_rays"],
         capped=totals.counts["capped_rays"],
         nonfinite=totals.counts["nonfinite_samples"],
-        effects=[EFFECTS[e["name"]] for e in manifest["effects"]["effects"] if e["on"]],
-        target=totals.target(),
+        effects=[EFFECTS[e.name] for e in effects.effects if e.on],
+        **sums,
     )
-    if complete and not manifest["complete"]:
-        complete_manifest(folder, totals)
-    if complete:
-        remove_leftovers(folder)
-    return summary
-
-
-def complete_manifest(folder: Path, totals: ShardStatistics) -> None:
-    """Write into the manifest that every shard is finished, with a summary of all.
-
-    Raises
-    ------
-    PartialError : the folder cannot be written
-    """
-    with brief_lock(folder / MANIFEST_NAME):
-        manifest = read_manifest(folder)
-        if not manifest["complete"]:
-            manifest["complete"] = True
-            manifest["software"] = software_versions()
-            manifest["summary"] = {
-                "queries": totals.queries.total(),
-                "paths": totals.paths,
-                "shard_seconds": round(totals.seconds, 3),
-                "relative_error": totals.relative_error(),
-                "mean_value": totals.mean_value(),
-                "target": totals.target(),
-                **{name: totals.counts[name] for name in COUNTS},
-            }
-            write_checksummed(folder / MANIFEST_NAME, manifest)
-
-
-def summary_dict(summary: Summary) -> dict[str, Any]:
-    """Summary as plain data for ``--json``."""
-    return asdict(summary)

@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_gen.planning.sample_allocation import FEWEST, Allocation
+from mbtf_gen.planning.sample_allocation import FEWEST, Allocation, mean_values
 from mbtf_gen.render.estimates import TARGET_PILOT_SPP, Estimates, Stream, Target, TargetReached
 from mbtf_gen.sampling.query_sampler import Queries
 
@@ -64,11 +64,9 @@ def estimate_shard(
     allocation : the run's allocation; without one all queries get `spp` paths
     """
     found: Estimates
-    if allocation is None:
-        found = estimator.estimate(queries, spp, stream)
-        return found
-    if target is None:
-        found = estimator.estimate(queries, allocation.counts(queries, spp), stream)
+    if allocation is None or target is None:
+        planned = spp if allocation is None else allocation.counts(queries, spp)
+        found = estimator.estimate(queries, planned, stream)
         return found
     pilot_stream = replace(stream, first_pass=PILOT_PASS)
     pilot = estimator.estimate(queries, TARGET_PILOT_SPP, pilot_stream, path_variance=True)
@@ -78,10 +76,7 @@ def estimate_shard(
     found = estimator.estimate(queries, counts, stream)
     return replace(
         found,
-        paths=found.paths + pilot.paths,
-        lost=found.lost + pilot.lost,
-        capped=found.capped + pilot.capped,
-        nonfinite=found.nonfinite + pilot.nonfinite,
+        **{k: getattr(found, k) + getattr(pilot, k) for k in ("paths", "lost", "capped", "nonfinite")},
         target=_reached(found, needed, scale, target),
     )
 
@@ -89,18 +84,14 @@ def estimate_shard(
 def needed_paths(
     pilot: Estimates, paths: int, deviation: F64, tile_mean: F64, error: float
 ) -> tuple[F64, F64]:
-    """Paths (n,) that queries need for a relative error, from a pilot of `paths` each, and the value (n,),
-    1/sr, that the error is relative to: at least the tile mean.
-
-    Parameters
-    ----------
-    deviation, tile_mean : (n,) predicted by the run's allocation
-    """
+    """Paths (n,) that queries need for a relative error, from a pilot of `paths` each and the deviation and
+    tile mean (n,) that the run's allocation predicts; and the value (n,), 1/sr, that the error is relative
+    to: at least the tile mean."""
     assert pilot.path_variance is not None
     own, seen = paths - 1, pilot.path_variance.astype(np.float64)
     expected = (correction(seen, deviation, tile_mean) * deviation) ** 2
     variance = (own * seen + PRIOR_PATHS * expected) / (own + PRIOR_PATHS)
-    excess = np.maximum(_values(pilot) - tile_mean, 0.0)
+    excess = np.maximum(mean_values(pilot) - tile_mean, 0.0)
     doubt = np.divide(DOUBT * variance / paths, excess, out=np.zeros(len(excess)), where=excess > 0)
     scale = tile_mean + np.maximum(excess - doubt, 0.0)
     allowed = error * scale
@@ -108,14 +99,8 @@ def needed_paths(
 
 
 def correction(variance: F64, deviation: F64, tile_mean: F64) -> float:
-    """Factor c on the predicted deviations, from 1 to :data:`MOST_CORRECTION`: the root of the ratio of the
-    pilots' variance to the predicted one, both relative to the squared tile mean.
-
-    Parameters
-    ----------
-    variance : (n,) sample variances of the pilots' paths
-    deviation, tile_mean : (n,) predicted by the run's allocation
-    """
+    """Factor c on the predicted deviations (n,), from 1 to :data:`MOST_CORRECTION`: the root of the ratio of
+    the pilots' sample variance (n,) to the predicted one, both relative to the squared tile mean."""
     if len(variance) < GROUPS * FEWEST_IN_GROUP:
         return 1.0
     square = np.where(tile_mean > 0, tile_mean, np.inf) ** 2
@@ -127,11 +112,6 @@ def correction(variance: F64, deviation: F64, tile_mean: F64) -> float:
     )
     middle = 0.5 * (ratios[GROUPS // 2 - 1] + ratios[GROUPS // 2])
     return min(max(math.sqrt(middle), 1.0), MOST_CORRECTION)
-
-
-def _values(estimates: Estimates) -> F64:
-    """Mean over channels and halves (n,)."""
-    return 0.5 * np.mean(estimates.value_a.astype(np.float64) + estimates.value_b, axis=-1)
 
 
 def round_up(needed: F64, cap: int) -> NDArray[np.int64]:

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_gen.geometry.heightfield import HeightGrid
-from mbtf_gen.geometry.slope_statistics import triangle_slopes
 from mbtf_gen.geometry.slopes import height_slopes
 from mbtf_gen.sampling.light_kernel import LightKernel
 
@@ -43,11 +42,6 @@ class ReliefBounds:
     shadowing: float
     normal: float
     opacity: float
-
-
-def largest_slope(grid: HeightGrid) -> float:
-    """Largest slope of any triangle of the mesh (tangent of its angle to the plane)."""
-    return float(triangle_slopes(grid).max())
 
 
 class _Field:

@@ -13,8 +13,6 @@ from typing import Any, Literal
 from mbtf_core.errors import UsageError
 from mbtf_gen.config.effects_request import EFFECTS, RELIEF_EFFECTS, EffectsRequest
 
-# What a decision rests on: the material and the options alone; a bound from theory; a pilot or an estimate on
-# the maps; or the user's request.
 Reason = Literal["exact", "bound", "pilot", "forced"]
 
 
@@ -34,8 +32,8 @@ class Effect:
         Root mean square change of M without the effect, relative to the mean of M: an upper bound where the
         effect is off, an estimate where it is on. None where it is unknown.
     reason : {"exact", "bound", "pilot", "forced"}
-        What the decision rests on: the material and the options alone, a bound from theory, a pilot, or the
-        user's request.
+        What the decision rests on: the material and the options alone, a bound from theory, a pilot or an
+        estimate on the maps, or the user's request.
     present : bool
         Whether the effect can be switched. If not, the material lacks it or requires it.
     error : float
@@ -100,22 +98,8 @@ class EffectsPlan:
 
     def to_manifest(self) -> dict[str, Any]:
         """Plain data for the manifest."""
-        return {
-            "mode": self.mode,
-            "tolerance": self.tolerance,
-            "bias_bound": self.bias_bound,
-            "max_depth": self.max_depth,
-            "cap_bias_bound": self.cap_bias_bound,
-            "roulette_depth": self.roulette_depth,
-            "closed_form": self.closed_form,
-            "effects": [asdict(effect) for effect in self.effects],
-        }
-
-    @classmethod
-    def from_manifest(cls, data: dict[str, Any]) -> EffectsPlan:
-        """Inverse of :meth:`to_manifest`."""
-        fields = {name: data[name] for name in cls.__dataclass_fields__ if name != "effects"}
-        return cls(tuple(Effect(**effect) for effect in data["effects"]), **fields)
+        effects = [asdict(effect) for effect in self.effects]
+        return {**vars(self), "bias_bound": self.bias_bound, "effects": effects}
 
 
 def decide(request: EffectsRequest, effect: Effect) -> Effect:

@@ -6,23 +6,20 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_gen.config.effects_request import EFFECTS, RELIEF_EFFECTS, EffectsRequest
+from mbtf_gen.geometry.slope_statistics import triangle_slopes
 from mbtf_gen.images.resample import resample
 from mbtf_gen.job import Job
-from mbtf_gen.planning.bounds import POINTS, ReliefBounds, largest_slope, relief_bounds
+from mbtf_gen.planning.bounds import POINTS, ReliefBounds, relief_bounds
 from mbtf_gen.planning.effects import Effect, EffectsPlan, consistent, decide, without
 from mbtf_gen.planning.pilot import Pilot, pilot_queries
 from mbtf_gen.planning.simulation import normal_map_slopes
 from mbtf_gen.sampling.light_kernel import LightKernel
-
-if TYPE_CHECKING:
-    from mbtf_gen.material.loader import Share
-    from mbtf_gen.material.material import Material
 
 # The light lobe is cut at this many standard deviations; the second number is the tail of a Gaussian there.
 LOBE_TAIL = 3.5
@@ -54,8 +51,8 @@ class _Analysis:
 
     @cached_property
     def steepest(self) -> float:
-        """Largest slope of the mesh."""
-        return largest_slope(self.job.grid)
+        """Largest slope of any triangle of the mesh (tangent of its angle to the plane)."""
+        return float(triangle_slopes(self.job.grid).max())
 
     @cached_property
     def mapped(self) -> tuple[NDArray[np.float64], float] | None:
@@ -66,17 +63,6 @@ class _Analysis:
     def flat(self) -> bool:
         """Whether nothing is displaced."""
         return self.job.grid.displacement_range == 0.0
-
-    @property
-    def lowest_light(self) -> float:
-        """Elevation in radians below which the cut light lobe has no light; ≤ 0 if there is none."""
-        config = self.job.config
-        return float(np.arcsin(config.queries.min_cos) - LOBE_TAIL * np.radians(config.light.width))
-
-    @property
-    def below_lowest(self) -> float:
-        """Upper bound of the share of the light below that elevation."""
-        return LOBE_TAIL_SHARE if self.job.config.light.width > 0 else 0.0
 
 
 def plan_effects(job: Job, *, pilots: bool = True) -> EffectsPlan:
@@ -146,26 +132,29 @@ def _analysis(job: Job, pilots: bool) -> _Analysis:
 def _relief_bounds(scene: _Analysis) -> ReliefBounds | None:
     """Bias bounds of displacement and normal map; None unless they apply, to a Lambert surface that is not
     black."""
-    job = scene.job
-    nothing = scene.flat and scene.mapped is None
-    if nothing or not scene.lambert or not scene.albedo.any() or not scene.pilots:
+    job, mapped = scene.job, scene.mapped
+    if (scene.flat and mapped is None) or not (scene.lambert and scene.albedo.any() and scene.pilots):
         return None
-    residual = None if scene.mapped is None else scene.mapped[0]
-    kernel = LightKernel(job.config.light.width)
     queries = pilot_queries(job, POINTS)
-    omega_i, omega_o = queries.omega_i.astype(np.float64), queries.omega_o.astype(np.float64)
-    return relief_bounds(job.grid, omega_i, omega_o, kernel, scene.albedo, residual, _through(scene))
+    return relief_bounds(
+        job.grid,
+        queries.omega_i.astype(np.float64),
+        queries.omega_o.astype(np.float64),
+        LightKernel(job.config.light.width),
+        scene.albedo,
+        None if mapped is None else mapped[0],
+        _through(scene),
+    )
 
 
 def _affordable(effects: list[Effect], tolerance: float) -> list[Effect]:
     """Switch effects off in the order of their bias bounds, while the sum is within the tolerance."""
     out = {e.name: e for e in effects}
-    bounded = [e for e in effects if e.on and e.bias_bound is not None]
-    for e in sorted(bounded, key=lambda e: e.bias_bound or 0.0):
-        bound = e.bias_bound or 0.0
+    bounded = [(e.bias_bound, e.name) for e in effects if e.on and e.bias_bound is not None]
+    for bound, name in sorted(bounded, key=lambda one: one[0]):
         if bound > tolerance:
             break
-        out[e.name] = replace(e, on=False)
+        out[name] = replace(out[name], on=False)
         tolerance -= bound
     return list(out.values())
 
@@ -178,43 +167,27 @@ def _surface(scene: _Analysis, measured: Sequence[str] = ()) -> list[Effect]:
         on = Effect("specular", True, text, present=False)
         others = ("metallic", "clearcoat", "sheen")
         return [on, *(Effect(n, False, text, 0.0, present=False) for n in others)]
-    strengths = _strengths(material)
+    no_specular = "specular is 0 everywhere"
+    if material.specular is None:
+        no_specular = "Lambert: no roughness, metallic or specular"
+    tint = 1.0 if material.sheen_color is None else float(np.max(material.sheen_color))
     words = {
-        "specular": ("F0 up to {:.2g} %", "specular is 0 everywhere", 0.08 * 100.0),
-        "metallic": ("metallic up to {:.2g}", "no metal anywhere", 1.0),
-        "clearcoat": ("covers up to {:.2g} %", "no map", 100.0),
-        "sheen": ("weight up to {:.2g}", "no map", 1.0),
+        "specular": ("F0 up to {:.2g} %", 8.0, no_specular),
+        "metallic": ("metallic up to {:.2g}", 1.0, "no metal anywhere"),
+        "clearcoat": ("covers up to {:.2g} %", 100.0, "no map"),
+        "sheen": ("weight up to {:.2g}", 1.0, "no map"),
     }
     out = []
-    for name, (text, absent, unit) in words.items():
-        strength = strengths[name]
+    for name, (text, unit, absent) in words.items():
+        share = getattr(material, name)
+        strength = 0.0 if share is None else float(np.max(share)) * (tint if name == "sheen" else 1.0)
         if strength > 0.0:
             faint = name in measured and strength * LAYERS[name] < FAINT
             bound = _faint_bound(scene, name, strength * LAYERS[name]) if faint else None
-            found = text.format(strength * unit)
-            out.append(Effect(name, True, found, bound, "pilot" if faint else "exact"))
+            out.append(Effect(name, True, text.format(strength * unit), bound, "pilot" if faint else "exact"))
         else:
-            if name == "specular" and material.specular is None:
-                absent = "Lambert: no roughness, metallic or specular"
             out.append(Effect(name, False, absent, 0.0, present=False))
     return out
-
-
-def _strengths(material: Material) -> dict[str, float]:
-    """Largest value of each layer of the surface."""
-    sheen = 0.0 if material.sheen is None else float(np.max(material.sheen))
-    if material.sheen_color is not None:
-        sheen *= float(np.max(material.sheen_color))
-
-    def largest(share: Share) -> float:
-        return 0.0 if share is None else float(np.max(share))
-
-    return {
-        "specular": largest(material.specular),
-        "metallic": largest(material.metallic),
-        "clearcoat": largest(material.clearcoat),
-        "sheen": sheen,
-    }
 
 
 def _faint_bound(scene: _Analysis, name: str, strength: float) -> float | None:
@@ -223,8 +196,8 @@ def _faint_bound(scene: _Analysis, name: str, strength: float) -> float | None:
     if not scene.pilots:
         return None
     material = scene.job.material
-    scaled: dict[str, Any] = {name: np.asarray(getattr(material, name)) / strength}
-    job = Job(scene.job.config, replace(material, **scaled))
+    full: dict[str, Any] = {name: np.asarray(getattr(material, name)) / strength}
+    job = Job(scene.job.config, replace(material, **full))
     plan = reference_plan(job)
     return FAINT_CAUTION * strength * Pilot(job, plan).changed(without(plan, name)).bound()
 
@@ -233,8 +206,7 @@ def _normal(scene: _Analysis, bounds: ReliefBounds | None) -> Effect:
     job = scene.job
     if scene.mapped is None:
         text = "no map" if job.material.normal is None else "off in the configuration"
-        if scene.own_bsdf:
-            text = "the material has its own BSDF"
+        text = "the material has its own BSDF" if scene.own_bsdf else text
         return Effect("normal", False, text, 0.0, present=False)
     slopes, share = scene.mapped
     rms = float(np.sqrt(np.mean(np.sum(slopes**2, axis=-1))))
@@ -317,11 +289,14 @@ def _relief_plan(
 
 
 def _shadowing(scene: _Analysis, bounds: ReliefBounds | None) -> Effect:
-    lowest = scene.lowest_light
+    config = scene.job.config
+    # Elevation in radians below which the cut light lobe has no light; ≤ 0 if there is none.
+    lowest = float(np.arcsin(config.queries.min_cos) - LOBE_TAIL * np.radians(config.light.width))
     slopes = f"slopes up to {_degrees(scene.steepest)}"
     if lowest > 0 and scene.steepest <= np.tan(lowest):
         text = f"{slopes}, light no lower than {_degrees(np.tan(lowest))}"
-        return Effect("shadowing", True, text, scene.below_lowest, "bound")
+        below = LOBE_TAIL_SHARE if config.light.width > 0 else 0.0
+        return Effect("shadowing", True, text, below, "bound")
     text = f"{slopes}, light down to {'the horizon' if lowest <= 0 else _degrees(np.tan(lowest))}"
     return Effect("shadowing", True, text, bounds.shadowing if bounds else None, "pilot")
 

@@ -93,12 +93,8 @@ class Change:
         return max(float(np.sqrt(square)), abs(self.shift) + CAUTION * self.shift_error)
 
     def bound(self, most: float = np.inf) -> float:
-        """Upper bound of the root mean square change, including changes too rare for the sample.
-
-        Parameters
-        ----------
-        most : largest change possible. The mean square is then at most `most` times the mean.
-        """
+        """Upper bound of the root mean square change, including changes too rare for the sample. If no change
+        exceeds `most`, the mean square is at most `most` times the mean."""
         largest = self.largest if self.changed >= FEW else max(self.largest, 1.0)
         seen = self.upper**2 + UNSEEN * largest**2 / self.count
         mean = abs(self.shift) + CAUTION * self.shift_error + NONE_OF * largest / self.count
@@ -118,8 +114,8 @@ class Pilot:
     All estimates use the same random numbers, so that unchanged paths cancel.
     """
 
-    def __init__(self, job: Job, plan: EffectsPlan, spp: int = PILOT_SPP) -> None:
-        self.job, self.plan, self.spp = job, plan, spp
+    def __init__(self, job: Job, plan: EffectsPlan) -> None:
+        self.job = job
         self.queries = pilot_queries(job)
         self._tiles: dict[frozenset[str], Any] = {}
         self.estimator = build_estimator(job, plan, self._tiles)
@@ -128,7 +124,7 @@ class Pilot:
     def _run(self, estimator: Any, limit: int | None = None) -> Estimates:
         stream = Stream(self.job.config.seed, "pilot", 0)
         found: Estimates = estimator.estimate(
-            self.queries, self.spp, stream, limit=limit, roulette=PILOT_ROULETTE
+            self.queries, PILOT_SPP, stream, limit=limit, roulette=PILOT_ROULETTE
         )
         return found
 
@@ -141,18 +137,19 @@ class Pilot:
         return Change.of(self.full, self._run(build_estimator(self.job, plan, self._tiles)))
 
 
-def measured(job: Job, plan: EffectsPlan, spp: int = PILOT_SPP) -> EffectsPlan:
+def measured(job: Job, plan: EffectsPlan) -> EffectsPlan:
     """The plan with measured bias bounds: each effect that is on is left out once, with its dependents."""
     if plan.closed_form:
         return plan
-    pilot = Pilot(job, plan, spp)
+    pilot = Pilot(job, plan)
 
     def measure(effect: Effect) -> Effect:
         if not effect.on or not effect.present:
             return effect
         cut = without(plan, effect.name)
         removed = [EFFECTS[name] for name in EFFECTS if name in plan.names_on - cut.names_on - {effect.name}]
-        text = f"; the bound includes {_listed(removed)}" if removed else ""
+        listed = " and ".join([", ".join(removed[:-1]), *removed[-1:]]).removeprefix(" and ")
+        text = f"; the bound includes {listed}" if removed else ""
         change = pilot.changed(cut)
         return replace(
             effect,
@@ -163,7 +160,3 @@ def measured(job: Job, plan: EffectsPlan, spp: int = PILOT_SPP) -> EffectsPlan:
         )
 
     return replace(plan, effects=tuple(measure(e) for e in plan.effects))
-
-
-def _listed(names: list[str]) -> str:
-    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from mbtf_gen.job import Job, planned_paths
@@ -31,17 +31,8 @@ class RunPlan:
 
     def to_manifest(self) -> dict[str, Any]:
         """The manifest's keys ``effects`` and ``allocation``."""
-        allocation = None if self.allocation is None else self.allocation.to_manifest()
+        allocation = None if self.allocation is None else asdict(self.allocation)
         return {"effects": self.effects.to_manifest(), "allocation": allocation}
-
-    @classmethod
-    def from_manifest(cls, manifest: dict[str, Any]) -> RunPlan:
-        """Inverse of :meth:`to_manifest`; other keys are ignored."""
-        allocation = manifest["allocation"]
-        return cls(
-            EffectsPlan.from_manifest(manifest["effects"]),
-            None if allocation is None else Allocation.from_manifest(allocation),
-        )
 
 
 def _is_large(job: Job) -> bool:

@@ -19,8 +19,7 @@ from __future__ import annotations
 
 import logging
 import math
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -154,17 +153,6 @@ class Allocation:
             return np.full(len(queries.sigma), spp, np.int64)
         return _round_counts(self.deviation(queries) * (self.scale * spp / self.typical), spp)
 
-    def to_manifest(self) -> dict[str, Any]:
-        """Plain data for the manifest."""
-        return asdict(self)
-
-    @classmethod
-    def from_manifest(cls, data: dict[str, Any]) -> Allocation:
-        """Inverse of :meth:`to_manifest`."""
-        names = ("typical", "scale", "gain")
-        weights, mean = (tuple(data[name]) for name in ("weights", "mean_weights"))
-        return cls(weights=weights, mean_weights=mean, **{name: data[name] for name in names})
-
 
 def _evaluate(weights: tuple[float, ...], terms: list[F64]) -> F64:
     # Term by term: the rounding of a matrix product may depend on the number of rows.
@@ -201,12 +189,17 @@ def fit_deviation(terms: list[F64], size: F64) -> F64 | None:
     return weights
 
 
+def mean_values(estimates: Estimates) -> F64:
+    """Mean over channels and halves (n,)."""
+    return 0.5 * np.mean(estimates.value_a.astype(np.float64) + estimates.value_b, axis=-1)
+
+
 def fit_allocation(queries: Queries, estimates: Estimates, paths: int, spp: int) -> Allocation:
     """Allocation for a mean of `spp` paths, from a pilot's queries (one leading axis) of `paths` paths each.
     A constant replaces a fit that does not converge, with a warning."""
     difference = estimates.value_a.astype(np.float64) - estimates.value_b
     noise = np.sqrt(np.mean(difference**2, axis=-1))
-    value = 0.5 * np.mean(estimates.value_a.astype(np.float64) + estimates.value_b, axis=-1)
+    value = mean_values(estimates)
     terms, flat_terms = _terms(queries), _terms(queries, levels=False)
     mean_weights = fit_log_linear(flat_terms, value)
     if mean_weights is None:

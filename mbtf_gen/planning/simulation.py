@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,20 +18,8 @@ from mbtf_gen.sampling.query_sampler import Queries
 _TILE_EFFECTS = frozenset({"parallax", "specular", "metallic", "clearcoat", "sheen", "normal", "opacity"})
 
 
-class MeanEstimator(Protocol):
-    """Estimates M at queries."""
-
-    def estimate(self, queries: Queries, spp: int | NDArray[np.int64], stream: Stream) -> Estimates:
-        """Both halves of each query, with `spp` paths for all or one number for each."""
-
-
 class ClosedForm:
-    """M of a plane of one Lambert color: albedo/π at every query, without noise.
-
-    Parameters
-    ----------
-    albedo : (3,) linear
-    """
+    """M of a plane of one Lambert color: linear albedo (3,)/π at every query, without noise."""
 
     def __init__(self, albedo: NDArray[np.float64]) -> None:
         self.value = (np.asarray(albedo, np.float64) / np.pi).astype(np.float32)
@@ -57,8 +45,7 @@ def build_estimator(job: Job, plan: EffectsPlan, tiles: dict[frozenset[str], Any
 
     Returns
     -------
-    MeanEstimator
-        An :class:`~mbtf_gen.render.estimator.Estimator`, or a :class:`ClosedForm`.
+    Estimator or ClosedForm
 
     Raises
     ------

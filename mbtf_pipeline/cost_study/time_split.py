@@ -237,7 +237,7 @@ def most_queries(recipe: Recipe, folder: Path) -> int:
     """Training queries that disk and memory hold: a quarter of the free space of `folder`, and the larger of
     ``data.memory`` of the fits and half of the machine's memory."""
     from mbtf_fit.data.queries import QUERY_BYTES
-    from mbtf_gen.forecast import row_bytes
+    from mbtf_gen.dataset.shard_io import row_bytes
 
     size = row_bytes(holes=True)
     on_disk = _DISK * shutil.disk_usage(folder).free / size

@@ -107,7 +107,8 @@ def chi_square_test(
     n = len(drawn)
     s0, s1, t0, t1 = domain.bounds
     s, t = np.linspace(s0, s1, bins[0] + 1), np.linspace(t0, t1, bins[1] + 1)
-    observed, _, _ = np.histogram2d(*domain.parameters(drawn).T, bins=(s, t))
+    u, v = domain.parameters(drawn).T
+    observed, _, _ = np.histogram2d(u, v, bins=[s, t])
     corners = np.stack(np.meshgrid(s[:-1], t[:-1], indexing="ij"), axis=-1).reshape(-1, 2)
     integrals, uncertainty = _integrate(pdf, domain, corners, np.array([s[1] - s0, t[1] - t0]), n)
     left, outside = 1.0 - float(integrals.sum()), n - observed.sum()

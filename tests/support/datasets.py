@@ -14,7 +14,7 @@ from mbtf_core.atomic import checksummed
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.dataset.folder import open_folder
 from mbtf_gen.dataset.reader import Dataset
-from mbtf_gen.dataset.render_shards import RenderedShard, store_shard
+from mbtf_gen.dataset.render_shards import store_shard
 from mbtf_gen.dataset.summary import finish
 from mbtf_gen.job import Job, split_spp
 from mbtf_gen.planning.effects_plan import reference_plan
@@ -54,7 +54,7 @@ def write_dataset(folder: Path, *, rows: int = 4, columns: int = 8, **options: A
         a, b = ((truth * (1 + NOISE * rng.normal(size=truth.shape))).astype(np.float32) for _ in range(2))
         paths = queries.sigma.size * split_spp(config, entry.split)
         made = Estimates(a.reshape(-1, 3), b.reshape(-1, 3), None, paths, 0, 0, 0)
-        store_shard(job, RenderedShard(entry, queries, made, 0.1), folder / entry.file, plan)
+        store_shard(job, folder, plan, entry, queries, made, 0.1)
     finish(folder)
     return Dataset.open(folder)
 

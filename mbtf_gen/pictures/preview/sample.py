@@ -14,7 +14,7 @@ from mbtf_core.errors import InputError
 from mbtf_core.lattice import level_of_sigma
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.dataset.shard_io import read_shard
-from mbtf_gen.dataset.verify import is_finished
+from mbtf_gen.dataset.verify import finished_record
 from mbtf_gen.job import Job, split_queries
 from mbtf_gen.sampling.query_sampler import Mixture, Queries
 
@@ -60,7 +60,7 @@ def finished_shards(dataset: Dataset) -> list[Path]:
     return [
         dataset.folder / entry["file"]
         for entry in manifest["splits"]["train"]["shards"]
-        if is_finished(dataset.folder / entry["file"], entry["rows"], manifest["config_hash"])
+        if finished_record(dataset.folder / entry["file"], entry["rows"], manifest["config_hash"])
     ]
 
 

@@ -20,7 +20,7 @@ from support.file_operations import FileOperations, Operation
 from support.paths import ROOT
 from support.small_runs import command, contents, die, ending, generate, in_child, noisy_plane
 
-from mbtf_gen.dataset.verify import is_finished, verify
+from mbtf_gen.dataset.verify import finished_record, verify
 from mbtf_gen.planning.simulation import ClosedForm
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.sampling.query_sampler import Queries
@@ -234,8 +234,8 @@ def test_an_interrupted_run_keeps_its_shards(
     assert errors[1] == "  the same command resumes"
     # The shard that was rendered, and no other one of those to make.
     assert rendered == 1
-    assert is_finished(small.out / "train-00000.npz", 40, small.hash)
-    assert not is_finished(small.out / "test-00000.npz", 30, small.hash)
+    assert finished_record(small.out / "train-00000.npz", 40, small.hash)
+    assert not finished_record(small.out / "test-00000.npz", 30, small.hash)
     assert (small.out / "train-00000.npz").read_bytes() == small.expected["train-00000.npz"]
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
     assert generate(line) == 0
@@ -249,15 +249,6 @@ def test_two_runs_at_once_make_every_shard_once(tmp_path: Path) -> None:
     # A shard that another one still writes at the end is left to it.
     assert {ending(child) for child in children} <= {0, 4}
     assert generate(line) == 0
-    assert contents(tmp_path / "out") == contents(tmp_path / "whole")
-
-
-def test_slices_equal_a_run(tmp_path: Path) -> None:
-    assert generate(command(tmp_path, tmp_path / "whole", train=600)) == 0
-    line = command(tmp_path, tmp_path / "out", train=600)
-    for index in (3, 1, 7, 2, 6, 5, 4):
-        assert generate([*line, "--slice", f"{index}/7", "--overwrite"]) == 0
-    assert generate(["merge", str(tmp_path / "out")]) == 0
     assert contents(tmp_path / "out") == contents(tmp_path / "whole")
 
 

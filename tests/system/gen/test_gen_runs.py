@@ -135,7 +135,6 @@ def test_slices_written_at_once_and_merged_are_the_whole(work: Path, whole: Path
 @pytest.fixture(scope="module")
 def batch(work: Path, whole: Path) -> dict[str, Done]:
     """Many commands in one process."""
-    shutil.copytree(whole, work / "again")
     shutil.copytree(whole, work / "replaced")
     shutil.copytree(whole, work / "unmerged")
     (work / "unmerged/test-00001.npz").unlink()
@@ -143,9 +142,7 @@ def batch(work: Path, whole: Path) -> dict[str, Done]:
     few = "--queries 2/texel --test-queries 100 --spp 2 --test-spp 2 --seed 3 --json"
     image = f"{few} --layout image --set output.shard_queries=256"
     lines = {
-        "again": f"{' '.join(COMMAND)} -o again --json",
         "unmerged": "merge unmerged",
-        "verify": "verify again --json",
         "changed seed": f"{' '.join(COMMAND)} -o replaced --seed 3",
         "overwrite": f"{' '.join(COMMAND)} -o replaced --seed 3 --overwrite --json",
         "file": f"maps/height.npy {few} -o file",
@@ -163,14 +160,6 @@ def batch(work: Path, whole: Path) -> dict[str, Done]:
         "one reference": "reference maps/height.npy -o one --tiles-across 1 --size 8 --spp 2 --kind query",
     }
     return run_named(lines, work)
-
-
-def test_the_same_command_twice_renders_nothing(batch: dict[str, Done], work: Path, whole: Path) -> None:
-    again = batch["again"].result()
-    assert (again["paths"], again["complete"], again["queries"]) == (0, True, 2248)
-    for path in whole.iterdir():
-        assert (work / "again" / path.name).read_bytes() == path.read_bytes()
-    assert batch["verify"].result()["faults"] == []
 
 
 def test_merging_what_is_not_there_is_partial(batch: dict[str, Done]) -> None:

@@ -13,7 +13,8 @@ from support.datasets import write_dataset
 from mbtf_gen import forecast as module
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.dataset.reader import Dataset
-from mbtf_gen.forecast import forecast, row_bytes, size_text
+from mbtf_gen.dataset.shard_io import row_bytes
+from mbtf_gen.forecast import forecast, size_text
 from mbtf_gen.job import Job, split_target
 from mbtf_gen.material.material import Material
 from mbtf_gen.planning import sample_allocation

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import shutil
 from pathlib import Path
 from typing import Any
@@ -47,13 +48,14 @@ class Formula:
         self.estimated: list[tuple[str, int]] = []
         self.fail_at: int | None = None
         self.bad = (BadSample(7, "direct light"),)
+        self.more = 1
 
     def estimate(self, queries: Any, spp: int, stream: Any) -> Any:
         if self.fail_at == len(self.estimated):
             raise KeyboardInterrupt
         self.estimated.append((stream.split, stream.shard))
         value = formula(queries).astype(np.float32)
-        return Estimates(value, value, None, len(value) * spp, 1, 2, len(self.bad), self.bad)
+        return Estimates(value, value, None, self.more * len(value) * spp, 1, 2, len(self.bad), self.bad)
 
 
 def cheap_plan(job: Job) -> RunPlan:
@@ -127,17 +129,9 @@ def test_shards_hold_what_was_drawn_and_estimated(
             np.testing.assert_array_equal(stored[name], array, err_msg=name)
 
 
-def test_progress_counts_planned_paths(
-    config: GeneratorConfig, monkeypatch: pytest.MonkeyPatch, out: Path
-) -> None:
+def test_progress_counts_planned_paths(config: GeneratorConfig, engine: Formula, out: Path) -> None:
     """A target error changes the number of paths, not the share that is done."""
-    real = Formula.estimate
-
-    def more(self: Formula, *arguments: Any) -> Estimates:
-        found: Estimates = real(self, *arguments)
-        return dataclasses.replace(found, paths=7 * found.paths)
-
-    monkeypatch.setattr(Formula, "estimate", more)
+    engine.more = 7
     seen: list[float] = []
     left = paths_left(Job.prepare(config), out)
     summary = generate(config, out, progress=lambda done, note: seen.append(done))
@@ -165,11 +159,8 @@ def test_a_finished_run_renders_nothing(
 ) -> None:
     first = generate(config, out)
     before = {p.name: (p.stat().st_mtime_ns, p.read_bytes()) for p in out.iterdir()}
-
-    def never(*_: Any) -> Any:
-        raise AssertionError("the estimator was built although nothing is missing")
-
-    monkeypatch.setattr(render_shards, "build_estimator", never)
+    # Nothing is missing, so no estimator is built.
+    monkeypatch.setattr(render_shards, "build_estimator", None)
     second = generate(config, out)
     assert (second.paths, second.complete, second.mean_value) == (0, True, first.mean_value)
     assert before == {p.name: (p.stat().st_mtime_ns, p.read_bytes()) for p in out.iterdir()}
@@ -328,19 +319,25 @@ def test_paths_left_are_those_of_unfinished_shards(
     assert paths_left(image, out) == 4 * 32 * 2 + 32 * 4
 
 
+def write_while_planning(patch: pytest.MonkeyPatch, out: Path, job: Job, plan: RunPlan) -> bytes:
+    """Let another process write this manifest while the next run plans."""
+    content = checksummed(build_manifest(job, plan))
+
+    def plan_run(job: Job) -> RunPlan:
+        out.mkdir()
+        assert create_file(out / "manifest.json", content)
+        return cheap_plan(job)
+
+    patch.setattr(generation, "plan_run", plan_run)
+    return content
+
+
 def test_the_second_writer_adopts_the_plan_of_the_first(
     config: GeneratorConfig, monkeypatch: pytest.MonkeyPatch, out: Path
 ) -> None:
-    """Another process with another plan writes its manifest while this one plans."""
     job = Job.prepare(config)
     other = RunPlan(dataclasses.replace(reference_plan(job), cap_bias_bound=0.125))
-
-    def plan(job: Job) -> RunPlan:
-        out.mkdir()
-        assert create_file(out / "manifest.json", checksummed(build_manifest(job, other)))
-        return cheap_plan(job)
-
-    monkeypatch.setattr(generation, "plan_run", plan)
+    write_while_planning(monkeypatch, out, job, other)
     assert generate(config, out).complete
     assert json.loads((out / "manifest.json").read_text())["effects"] == other.effects.to_manifest()
     assert other != cheap_plan(job)
@@ -350,15 +347,8 @@ def test_the_second_writer_adopts_the_plan_of_the_first(
 def test_a_concurrent_writer_of_another_data_set_is_refused(
     config: GeneratorConfig, monkeypatch: pytest.MonkeyPatch, out: Path
 ) -> None:
-    out, another = out, Job.prepare(changed(config, queries={"spp": 8}))
-    content = checksummed(build_manifest(another, cheap_plan(another)))
-
-    def plan(job: Job) -> RunPlan:
-        out.mkdir()
-        assert create_file(out / "manifest.json", content)
-        return cheap_plan(job)
-
-    monkeypatch.setattr(generation, "plan_run", plan)
+    another = Job.prepare(changed(config, queries={"spp": 8}))
+    content = write_while_planning(monkeypatch, out, another, cheap_plan(another))
     with pytest.raises(InputError, match=r"another configuration: queries\.spp"):
         generate(config, out)
     assert (out / "manifest.json").read_bytes() == content
@@ -383,7 +373,8 @@ def test_slices_cover_every_shard_once(
     generate(config, tmp_path / "whole")
     engine.estimated.clear()
     for index in range(1, count + 1):
-        summary = generate(config, out, slice_index=index, slice_count=count)
+        # What other slices have begun is kept.
+        summary = generate(config, out, slice_index=index, slice_count=count, overwrite=True)
         assert summary.complete == (len(contents(out)) == len(FILES))
     assert sorted(engine.estimated) == [("test", 0), ("train", 0), ("train", 1), ("train", 2)]
     assert contents(out) == contents(tmp_path / "whole")
@@ -397,7 +388,7 @@ def test_a_locked_shard_is_left_to_its_writer(config: GeneratorConfig, engine: F
     engine.fail_at = None
     with shard_lock(out / FILES[1]) as held:
         assert held
-        with pytest.raises(PartialError, match=FILES[1]):
+        with pytest.raises(PartialError, match=rf"{FILES[1]} \(process {os.getpid()} on .*, for 0 s\)"):
             generate(config, out)
         assert sorted(contents(out)) == sorted(set(FILES) - {FILES[1]})
     assert generate(config, out).complete

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -63,6 +62,8 @@ def test_npz_is_read_by_numpy_itself(tmp_path: Path) -> None:
         assert set(archive.files) == set(written)
         for name, array in written.items():
             assert np.array_equal(archive[name], array)
+    np.savez(path, **written)  # type: ignore[arg-type]
+    assert np.array_equal(read_shard(path)["u"], written["u"])
 
 
 def test_npz_is_mapped_and_aligned(tmp_path: Path) -> None:
@@ -141,23 +142,6 @@ def test_unreadable_files_are_refused(tmp_path: Path, suffix: str, capfd: pytest
         with pytest.raises(InputError):
             read_shard(path)
     assert capfd.readouterr() == ("", "")
-
-
-def test_compressed_and_double_precision_archives_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "x.npz"
-    good = arrays((16,))
-    np.savez_compressed(path, **good)  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="stored uncompressed"):
-        read_shard(path)
-    np.savez(path, **{k: v.astype(np.float64) for k, v in good.items()})  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="not C-ordered float32"):
-        read_shard(path)
-    np.savez(path, **good)  # type: ignore[arg-type]
-    assert np.array_equal(read_shard(path)["u"], good["u"])
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("u.npy", "not an array")
-    with pytest.raises(InputError, match="cannot be read"):
-        read_shard(path)
 
 
 def test_an_exr_image_that_is_no_shard(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import TypeAdapter
 
 from mbtf_core.errors import UsageError
 from mbtf_gen.config.effects_request import EFFECTS, RELIEF_EFFECTS, EffectsRequest
@@ -110,7 +111,7 @@ def test_unknown_words_are_refused(text: str) -> None:
 def test_a_plan_survives_the_manifest() -> None:
     plan = reference_plan(job_of(LAMBERT, "-bsdf_sampling"))
     assert [e.name for e in plan.effects] == list(EFFECTS)
-    assert EffectsPlan.from_manifest(plan.to_manifest()) == plan
+    assert TypeAdapter(EffectsPlan).validate_python(plan.to_manifest()) == plan
 
 
 def test_bias_bounds_add_up_over_what_is_off() -> None:
