@@ -15,7 +15,7 @@ from mbtf_fit.models.interface import NeuralMaterial
 from mbtf_fit.models.neumip import Neumip
 from mbtf_fit.native import Kernel, kernel
 from mbtf_fit.native.library import QueryPointers
-from mbtf_fit.native.model import NativeModel, unsupported_reason
+from mbtf_fit.native.model import NativeModel, supports
 
 # Queries per chunk: bounds memory and keeps activations in the cache.
 _CHUNK = 1 << 15
@@ -47,7 +47,7 @@ def predict(
 ) -> NDArray[np.float32]:
     """Values (n, 3) of a model in 1/sr, clamped at 0."""
     found = kernel()
-    if found is not None and unsupported_reason(model) is None:
+    if found is not None and supports(model):
         return _predict_natively(found, model, u, sigma, omega_i, omega_o)
     device = next(model.parameters()).device
     arrays = (u, sigma, omega_i, omega_o)
