@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from support.fit_data import random_directions
 from support.plugin_materials import write_material
-from support.plugin_scenes import plane
+from support.plugin_scenes import interaction, plane
 from support.scenes import mi
 
 from mbtf_core.lattice import Lattice
@@ -138,13 +138,9 @@ def test_weights_are_value_over_density_of_the_same_directions(folder: Path) -> 
     """sample, eval, pdf and eval_pdf of the plugin agree, and its samples pass χ² through a turned frame."""
     bsdf = mi.load_dict({"type": "mbtf", "material": str(folder), "networks": "cooperative"})
     n = 100_000
-    si = dr.zeros(mi.SurfaceInteraction3f, n)
-    si.n = mi.Normal3f(0, 0, 1)
-    si.sh_frame = mi.Frame3f(si.n)
-    si.uv = mi.Point2f(0.3, 1.7)
-    si.dp_du, si.dp_dv = mi.Vector3f(0.6, 0.8, 0), mi.Vector3f(0.8, -0.3, 0)
-    si.duv_dx, si.duv_dy = mi.Vector2f(0.1, 0.02), mi.Vector2f(0.01, 0.3)
-    si.wi = dr.normalize(mi.Vector3f(0.5, 0.4, 0.5))
+    partials = {"dp_du": mi.Vector3f(0.6, 0.8, 0), "dp_dv": mi.Vector3f(0.8, -0.3, 0)}
+    pixel = {"duv_dx": mi.Vector2f(0.1, 0.02), "duv_dy": mi.Vector2f(0.01, 0.3)}
+    si = interaction(n, (0.5, 0.4, 0.5), uv=mi.Point2f(0.3, 1.7), **partials, **pixel)
     context = mi.BSDFContext()
     bs, weight = bsdf.sample(context, si, *uniform(n, 3))
     kept = np.array(bs.pdf) > 0
