@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
 
 import numpy as np
 import torch
@@ -73,11 +72,8 @@ def _predict_natively(found: Kernel, model: NeuralMaterial, *arrays: ArrayLike) 
 
     count = max(1, min(torch.get_num_threads(), n // _PER_THREAD))
     edges = [n * k // count for k in range(count + 1)]
-    if count == 1:
-        evaluate(0, n)
-    else:
-        with ThreadPoolExecutor(count) as pool:
-            list(pool.map(lambda edge: evaluate(*edge), pairwise(edges)))
+    with ThreadPoolExecutor(count) as pool:
+        list(pool.map(evaluate, edges[:-1], edges[1:]))
     if model.calibration is not None:
         out *= evaluate_in_chunks(model.calibration_factors, torch.device("cpu"), 3, *inputs[1:])
     return out

@@ -118,7 +118,8 @@ class MbtfBSDF(mi.BSDF):
         _check_conformance(self.evaluator, stored)
         self.lobes = None
         if self._choice(props, "sampling", ("lobes", "cosine")) != "cosine":
-            self.lobes = LobeTextures(fit_lobes(stored))
+            # Cooperative kernels do not depend on the material: they are compiled once.
+            self.lobes = LobeTextures(fit_lobes(Evaluator(stored, "cooperative")))
         self.uv_scale = self._positive(props, "uv_scale", 1.0)
         self.sigma_given = "sigma" in props
         self.sigma = self._positive(props, "sigma", stored.lattice.sigma_range[0])

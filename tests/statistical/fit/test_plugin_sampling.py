@@ -16,7 +16,7 @@ from support.scenes import mi
 
 from mbtf_core.lattice import Lattice
 from mbtf_core.stats import Cap, Estimate, chi_square_test, t_test
-from mbtf_fit.mitsuba_plugin.lobe_fit import lobes_of
+from mbtf_fit.mitsuba_plugin.lobe_fit import fit_lobes
 from mbtf_fit.mitsuba_plugin.lobes import Lobe, LobeTextures, Mixture
 
 COUNT = 32
@@ -93,10 +93,10 @@ def second_moment(value: Any, mixture: Mixture, n: int) -> tuple[float, float]:
     return float(x.mean()), float(x.var())
 
 
-def test_the_lobes_of_a_known_material_are_found() -> None:
+def test_the_fit_lobes_a_known_material_are_found() -> None:
     """Its parameters, and a variance far below the cosine's."""
     glossy: Any = Glossy()
-    levels = lobes_of(glossy)
+    levels = fit_lobes(glossy)
     assert [level.shape for level in levels] == [(1, 1, 8), (2, 2, 8)]
     found = np.mean([texel for level in levels for texel in level.reshape(-1, 8)], 0)
     np.testing.assert_allclose(found[[0, 2]], Glossy.alphas, rtol=0.25)
@@ -124,7 +124,7 @@ def test_a_lambert_material_keeps_the_cosine() -> None:
         features=lambda u, level, viewer: [],
         value=lambda features, light, viewer: mi.Color3f(0.2),
     )
-    assert np.concatenate([level[..., 5:].ravel() for level in lobes_of(evaluator)]).max() == 0
+    assert np.concatenate([level[..., 5:].ravel() for level in fit_lobes(evaluator)]).max() == 0
 
 
 @pytest.fixture(scope="module")
