@@ -184,7 +184,7 @@ def fit_alone(
     def array(value: Any) -> Any:
         return np.ascontiguousarray(np.array(value, np.float32).T[rows])
 
-    u = array(bsdf.place(si))
+    u = array(bsdf.uv(si))
     queries = Queries(u - np.floor(u), array(bsdf.footprint(si)), array(lights), array(views))
     queries.u[queries.u >= 1.0] = 0.0
     traced = estimator.estimate(queries, 4, Stream(1, "reference", 0))

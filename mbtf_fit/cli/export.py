@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -75,6 +76,6 @@ def export_material(
     sizes = {name: (folder / name).stat().st_size for name in files}
     lines = [f"{folder / name}: {size / 1e6:.3f} MB" for name, size in sizes.items()]
     console.report(
-        {"folder": folder, "files": sizes, "half": None if error is None else error.as_dict()},
+        {"folder": folder, "files": sizes, "half": None if error is None else asdict(error)},
         "\n".join([*lines, *([] if error is None else [str(error)])]),
     )

@@ -17,26 +17,26 @@ from mbtf_core.atomic import read_json
 from mbtf_core.config_file import check_document, check_schema
 from mbtf_core.digest import file_sha256
 from mbtf_core.errors import InputError
-from mbtf_core.lattice import MAX_LEVEL
+from mbtf_core.lattice import MAX_LEVEL, Lattice
 from mbtf_core.suggest import suggest_path
 
 FORMAT_NAME = "mbtf-material"
 SCHEMA_VERSION = 2
 DESCRIPTION_NAME = "material.json"
 WEIGHTS_NAME = "weights.safetensors"
-# Conformance queries, with expected values, of every exported material.
+# Number of conformance queries; their arrays, expected values last, and the shape of a query in each.
 CONFORMANCE_COUNT = 256
-CONFORMANCE = ("u", "sigma", "omega_i", "omega_o", "rgb")
+CONFORMANCE = {"u": (2,), "sigma": (), "omega_i": (3,), "omega_o": (3,), "rgb": (3,)}
+QUERY = tuple(CONFORMANCE)[:-1]
 
 
-class _Weights(BaseModel):
+class _File(BaseModel):
     sha256: str
+
+
+class _Weights(_File):
     network_weights: int
     texels: int
-
-
-class _Transmittance(BaseModel):
-    sha256: str
 
 
 class _Levels(BaseModel):
@@ -71,7 +71,7 @@ class _Description(BaseModel):
     conformance: _Conformance
     training: _Training
     data: dict[str, Any]
-    transmittance: _Transmittance | None = None
+    transmittance: _File | None = None
 
 
 def read_description(folder: Path) -> tuple[dict[str, Any], Path]:
@@ -95,33 +95,43 @@ def read_description(folder: Path) -> tuple[dict[str, Any], Path]:
         raise InputError(f"does not describe a material ({FORMAT_NAME})", where=path)
     check_schema(description, SCHEMA_VERSION, path, "fit it again with this version of mbtf-fit")
     check_document(_Description, description, path, "fit it again, or copy it again")
-    weights = folder / WEIGHTS_NAME
-    if not weights.is_file() or file_sha256(weights) != description["weights"]["sha256"]:
-        raise InputError("is missing, or its SHA-256 differs from the one in material.json", where=weights)
-    return description, weights
+    return description, check_digest(folder / WEIGHTS_NAME, description["weights"])
+
+
+def check_digest(path: Path, stated: Mapping[str, Any]) -> Path:
+    """The path of a file whose digest is the stated one.
+
+    Raises
+    ------
+    InputError : it is missing or corrupt
+    """
+    if not path.is_file() or file_sha256(path) != stated["sha256"]:
+        raise InputError("is missing, or its SHA-256 differs from the one in material.json", where=path)
+    return path
+
+
+def lattice_of(description: Mapping[str, Any]) -> Lattice:
+    """Texel grids of a described material."""
+    return Lattice(description["levels"]["finest"], description["tile"]["aspect"])
 
 
 def check_conformance(
     tensors: Mapping[str, ArrayLike], description: Mapping[str, Any], weights: Path
 ) -> dict[str, NDArray[np.float32]]:
-    """The stored conformance queries and their values ``rgb``, by name.
-
-    Parameters
-    ----------
-    tensors : those of :data:`CONFORMANCE` that the file holds
+    """The conformance queries among a file's tensors and their values ``rgb``, by name.
 
     Raises
     ------
     InputError : one is missing or of a wrong shape
     """
-    missing = [name for name in CONFORMANCE if name not in tensors]
-    if missing:
-        raise InputError(f"lacks the tensor 'conformance.{missing[0]}'", where=weights)
-    shapes = {"u": (2,), "sigma": (), "omega_i": (3,), "omega_o": (3,), "rgb": (3,)}
-    out = {name: np.asarray(tensors[name], np.float32) for name in CONFORMANCE}
-    for name, array in out.items():
-        if array.shape != (description["conformance"]["count"], *shapes[name]):
-            raise InputError(f"its tensor 'conformance.{name}' has the shape {array.shape}", where=weights)
+    out = {}
+    for name, width in CONFORMANCE.items():
+        tensor = f"conformance.{name}"
+        if tensor not in tensors:
+            raise InputError(f"lacks the tensor '{tensor}'", where=weights)
+        out[name] = np.asarray(tensors[tensor], np.float32)
+        if out[name].shape != (description["conformance"]["count"], *width):
+            raise InputError(f"its tensor '{tensor}' has the shape {out[name].shape}", where=weights)
     return out
 
 

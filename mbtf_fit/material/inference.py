@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
 
 import numpy as np
 import torch
@@ -15,7 +14,7 @@ from mbtf_fit.models.interface import NeuralMaterial
 from mbtf_fit.models.neumip import Neumip
 from mbtf_fit.native import Kernel, kernel
 from mbtf_fit.native.library import QueryPointers
-from mbtf_fit.native.model import NativeModel, unsupported_reason
+from mbtf_fit.native.model import NativeModel, supports
 
 # Queries per chunk: bounds memory and keeps activations in the cache.
 _CHUNK = 1 << 15
@@ -47,7 +46,7 @@ def predict(
 ) -> NDArray[np.float32]:
     """Values (n, 3) of a model in 1/sr, clamped at 0."""
     found = kernel()
-    if found is not None and unsupported_reason(model) is None:
+    if found is not None and supports(model):
         return _predict_natively(found, model, u, sigma, omega_i, omega_o)
     device = next(model.parameters()).device
     arrays = (u, sigma, omega_i, omega_o)
@@ -73,11 +72,8 @@ def _predict_natively(found: Kernel, model: NeuralMaterial, *arrays: ArrayLike) 
 
     count = max(1, min(torch.get_num_threads(), n // _PER_THREAD))
     edges = [n * k // count for k in range(count + 1)]
-    if count == 1:
-        evaluate(0, n)
-    else:
-        with ThreadPoolExecutor(count) as pool:
-            list(pool.map(lambda edge: evaluate(*edge), pairwise(edges)))
+    with ThreadPoolExecutor(count) as pool:
+        list(pool.map(evaluate, edges[:-1], edges[1:]))
     if model.calibration is not None:
         out *= evaluate_in_chunks(model.calibration_factors, torch.device("cpu"), 3, *inputs[1:])
     return out

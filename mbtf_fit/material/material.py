@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from mbtf_core.atomic import write_json
 from mbtf_core.config_file import build
-from mbtf_core.digest import file_sha256
 from mbtf_core.directions import from_projected_disk
 from mbtf_core.errors import InputError
 from mbtf_core.lattice import Lattice, sigma_of_level
@@ -21,14 +20,15 @@ from mbtf_core.shard_schema import CONVENTIONS
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.material.format import (
-    CONFORMANCE,
     CONFORMANCE_COUNT,
     DESCRIPTION_NAME,
     FORMAT_NAME,
     MATERIAL_CONVENTIONS,
+    QUERY,
     SCHEMA_VERSION,
     WEIGHTS_NAME,
     check_conformance,
+    lattice_of,
     read_description,
 )
 from mbtf_fit.material.inference import evaluate_in_chunks, predict
@@ -48,19 +48,10 @@ def conformance_queries(lattice: Lattice) -> dict[str, NDArray[np.float32]]:
     """Conformance queries of a lattice; they include seams and the first and last level."""
     random = np.random.Generator(np.random.Philox(key=[0x636F6E66, lattice.finest]))
     u = random.random((CONFORMANCE_COUNT, 2))
-    seams = [
-        [0, 0],
-        [0, 0.5],
-        [0.5, 0],
-        [0.999, 0.999],
-        [0.001, 0.999],
-        [0.5, 0.5],
-        [0.25, 0.75],
-        [0.75, 0.25],
-    ]
-    u[:8] = np.array(seams)
+    u[:8, 0] = [0, 0, 0.5, 0.999, 0.001, 0.5, 0.25, 0.75]
+    u[:8, 1] = [0, 0.5, 0, 0.999, 0.999, 0.5, 0.75, 0.25]
     level = random.random(CONFORMANCE_COUNT) * lattice.finest
-    level[8:12] = np.array([0, lattice.finest, -1, lattice.finest + 1], np.float64)
+    level[8:12] = [0, lattice.finest, -1, lattice.finest + 1]
     level[12:16] = np.floor(level[12:16])
     disk = np.sqrt(0.99 * random.random((2, CONFORMANCE_COUNT)))
     angle = 2 * np.pi * random.random((2, CONFORMANCE_COUNT))
@@ -117,24 +108,16 @@ class Material:
         """
         description, weights = read_description(Path(folder))
         config = build(FitConfig, description["config"], source=str(weights.with_name(DESCRIPTION_NAME)))
-        lattice = Lattice(description["levels"]["finest"], description["tile"]["aspect"])
+        lattice = lattice_of(description)
         # A small file cannot ask for the memory of a large model.
         number = 2 if description["weights"].get("dtype") == "float16" else 4
         if number * lattice.texels() * config.network.channels > weights.stat().st_size:
             raise InputError("is too small for the levels that material.json describes", where=weights)
         model = build_model(config.model, lattice, **config.network.model_dump())
-        tensors, _ = read_tensors(weights, device)
-        conformance = check_conformance(
-            {
-                n: tensors.pop(f"conformance.{n}").float().cpu().numpy()
-                for n in CONFORMANCE
-                if f"conformance.{n}" in tensors
-            },
-            description,
-            weights,
-        )
+        tensors, _ = read_tensors(weights)
+        conformance = check_conformance(tensors, description, weights)
+        model.load_weights({n: t for n, t in tensors.items() if not n.startswith("conformance.")})
         model.to(device).requires_grad_(False)
-        model.load_weights(tensors)
         return cls(model, config, description, conformance, read_transmittance(Path(folder), description))
 
     @property
@@ -186,7 +169,7 @@ class Material:
 
     def deviation(self) -> float:
         """Largest deviation of this machine from the conformance values, in 1/sr."""
-        found = self.evaluate(*(self.conformance[name] for name in CONFORMANCE[:-1]))
+        found = self.evaluate(*(self.conformance[name] for name in QUERY))
         return float(np.abs(found - self.conformance["rgb"]).max())
 
 
@@ -196,8 +179,23 @@ def conformance_values(
     """Expected values (n, 3) of conformance queries."""
     device = next(model.parameters()).device
     with torch.no_grad():
-        rgb = model(*(torch.from_numpy(queries[name]).to(device) for name in CONFORMANCE[:-1]))
+        rgb = model(*(torch.from_numpy(queries[name]).to(device) for name in QUERY))
     return np.asarray(rgb.clamp_min(0).cpu().numpy())
+
+
+def describe_model(model: NeuralMaterial) -> dict[str, Any]:
+    """Formulas, conventions and shapes of a model, for readers of its tensors."""
+    lattice = model.lattice
+    return {
+        "model": model.name,
+        "formula": model.formula(),
+        "conventions": CONVENTIONS | MATERIAL_CONVENTIONS,
+        "tile": {"aspect": lattice.aspect},
+        "levels": {
+            "finest": lattice.finest,
+            "shapes": [list(lattice.shape(s)) for s in range(lattice.finest + 1)],
+        },
+    }
 
 
 def export(
@@ -217,54 +215,41 @@ def export(
     data : identity of the data set
     training : summary of the training: steps, seconds, errors
     half : store 16-bit floats; the weights are rounded already
-    transmittance : None for an opaque material
 
     Raises
     ------
     PartialError : the folder cannot be written
     """
-    lattice = model.lattice
     extra: dict[str, Any] = {}
     if transmittance is not None:
-        write_transmittance(transmittance, folder / TRANSMITTANCE_NAME)
-        extra["transmittance"] = {
-            "file": TRANSMITTANCE_NAME,
-            "sha256": file_sha256(folder / TRANSMITTANCE_NAME),
-        }
-    queries = conformance_queries(lattice)
+        written = write_transmittance(transmittance, folder / TRANSMITTANCE_NAME)
+        extra["transmittance"] = {"file": TRANSMITTANCE_NAME, "sha256": written.sha256}
+    queries = conformance_queries(model.lattice)
     weights = model.weights()
     if half:
         weights = {name: tensor.half() if tensor.ndim else tensor for name, tensor in weights.items()}
     queries["rgb"] = conformance_values(model, queries)
     conformance = {f"conformance.{k}": torch.from_numpy(v) for k, v in queries.items()}
-    path = folder / WEIGHTS_NAME
+    texels, others = model.parameter_groups()
     # The description names the weights' digest, so it comes last: a folder with one is complete.
-    write_tensors(path, {**weights, **conformance}, {})
-    shape = {name: list(tensor.shape) for name, tensor in weights.items()}
+    written = write_tensors(folder / WEIGHTS_NAME, {**weights, **conformance}, {})
     write_json(
         folder / DESCRIPTION_NAME,
         {
             "format": FORMAT_NAME,
             "schema": SCHEMA_VERSION,
-            "model": model.name,
-            "formula": model.formula(),
-            "conventions": CONVENTIONS | MATERIAL_CONVENTIONS,
-            "tile": {"aspect": lattice.aspect},
-            "levels": {
-                "finest": lattice.finest,
-                "shapes": [list(lattice.shape(s)) for s in range(lattice.finest + 1)],
-            },
+            **describe_model(model),
             "weights": {
                 "file": WEIGHTS_NAME,
-                "sha256": file_sha256(path),
+                "sha256": written.sha256,
                 "dtype": "float16" if half else "float32",
-                "shapes": shape,
-                "network_weights": sum(p.numel() for p in model.parameter_groups()[1]),
-                "texels": sum(p.numel() for p in model.parameter_groups()[0]),
+                "shapes": {name: list(tensor.shape) for name, tensor in weights.items()},
+                "network_weights": sum(p.numel() for p in others),
+                "texels": sum(p.numel() for p in texels),
             },
             "conformance": {
                 "count": CONFORMANCE_COUNT,
-                "tensors": [f"conformance.{name}" for name in CONFORMANCE],
+                "tensors": list(conformance),
                 "tolerance": 1e-4,
                 "note": "evaluating the first four must give the fifth within tolerance * max(1, value)",
             },

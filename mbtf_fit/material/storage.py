@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any
 
-import torch
-from torch import Tensor
-
-from mbtf_core.atomic import write_file
+from mbtf_core.atomic import Stored, write_chunks
 from mbtf_core.errors import InputError, reason
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 _KEY = "mbtf"
 
 
-def write_tensors(path: Path, tensors: dict[str, Tensor], data: dict[str, Any]) -> None:
+def write_tensors(path: Path, tensors: dict[str, Tensor], data: dict[str, Any]) -> Stored:
     """Write tensors, and JSON data in the file's header.
 
     Raises
@@ -25,16 +25,11 @@ def write_tensors(path: Path, tensors: dict[str, Tensor], data: dict[str, Any]) 
     from safetensors.torch import save
 
     plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    content = save(plain, metadata={_KEY: json.dumps(data)})
-
-    def write(stream: BinaryIO) -> None:
-        stream.write(content)
-
-    write_file(path, write)
+    return write_chunks(path, [save(plain, metadata={_KEY: json.dumps(data)})])
 
 
-def read_tensors(path: Path, device: torch.device | str = "cpu") -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read a file of :func:`write_tensors`: (tensors, data).
+def read_tensors(path: Path, framework: str = "pt") -> tuple[dict[str, Any], dict[str, Any]]:
+    """Read a safetensors file: (PyTorch tensors, or NumPy arrays of the framework ``np``; data).
 
     Raises
     ------
@@ -43,10 +38,10 @@ def read_tensors(path: Path, device: torch.device | str = "cpu") -> tuple[dict[s
     from safetensors import SafetensorError, safe_open
 
     try:
-        with safe_open(path, framework="pt", device=str(device)) as file:
+        with safe_open(path, framework=framework) as file:
             data = json.loads((file.metadata() or {}).get(_KEY, "{}"))
             return {name: file.get_tensor(name) for name in file.keys()}, data  # noqa: SIM118
     except FileNotFoundError:
         raise InputError("no such file", where=path) from None
-    except (SafetensorError, OSError, ValueError, RecursionError) as error:
+    except (SafetensorError, OSError, TypeError, ValueError, RecursionError) as error:
         raise InputError(f"cannot be read as tensors ({reason(error)})", where=path) from None

@@ -13,16 +13,18 @@ with bilinear interpolation in a level and linear interpolation between levels, 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mbtf_core.atomic import write_file
-from mbtf_core.digest import file_sha256
+from mbtf_core.atomic import Stored, write_chunks
 from mbtf_core.errors import InputError
 from mbtf_core.lattice import Lattice, level_of_sigma
+from mbtf_fit.material.format import check_digest, lattice_of
+from mbtf_fit.material.storage import read_tensors
 
 TRANSMITTANCE_NAME = "transmittance.safetensors"
 COEFFICIENTS = 6
@@ -58,18 +60,12 @@ def corners(u: ArrayLike, shape: tuple[int, int]) -> tuple[NDArray[np.int64], F6
     return texel, weight
 
 
+@dataclass(frozen=True)
 class Transmittance:
-    """The fitted polynomial model.
+    """The fitted polynomial model: coefficients (rows, columns, 6) of each level, coarsest first."""
 
-    Parameters
-    ----------
-    lattice : texel grids of the tile
-    levels : (rows, columns, 6) each, coarsest first
-    """
-
-    def __init__(self, lattice: Lattice, levels: list[F32]) -> None:
-        self.lattice = lattice
-        self.levels = levels
+    lattice: Lattice
+    levels: list[F32]
 
     def evaluate(self, u: ArrayLike, sigma: ArrayLike, omega_o: ArrayLike) -> F32:
         """Transmittance (n,) in [0, 1] at uv positions (n, 2), footprints (n,) and views (n, 3)."""
@@ -87,7 +83,7 @@ class Transmittance:
         return np.clip(total, 0.0, 1.0).astype(np.float32)
 
 
-def write_transmittance(model: Transmittance, path: Path) -> None:
+def write_transmittance(model: Transmittance, path: Path) -> Stored:
     """Write the coefficients: a tensor ``level.s`` (rows, columns, 6) per level.
 
     Raises
@@ -96,20 +92,12 @@ def write_transmittance(model: Transmittance, path: Path) -> None:
     """
     from safetensors.numpy import save
 
-    content = save({f"level.{s}": np.ascontiguousarray(a) for s, a in enumerate(model.levels)})
-    write_file(path, lambda stream: _write(stream, content))
-
-
-def _write(stream: BinaryIO, content: bytes) -> None:
-    stream.write(content)
+    levels = {f"level.{s}": np.ascontiguousarray(a) for s, a in enumerate(model.levels)}
+    return write_chunks(path, [save(levels)])
 
 
 def read_transmittance(folder: Path, description: Mapping[str, Any]) -> Transmittance | None:
-    """The transmittance of a material folder; None for an opaque material.
-
-    Parameters
-    ----------
-    description : content of its ``material.json``
+    """The transmittance of a material folder of that description; None for an opaque material.
 
     Raises
     ------
@@ -118,14 +106,9 @@ def read_transmittance(folder: Path, description: Mapping[str, Any]) -> Transmit
     stated = description.get("transmittance")
     if stated is None:
         return None
-    path = folder / TRANSMITTANCE_NAME
-    if not path.is_file() or file_sha256(path) != stated["sha256"]:
-        raise InputError("is missing, or its SHA-256 differs from the one in material.json", where=path)
-    from safetensors.numpy import load_file
-
-    lattice = Lattice(description["levels"]["finest"], description["tile"]["aspect"])
-    tensors = load_file(path)
-    levels = []
+    path = check_digest(folder / TRANSMITTANCE_NAME, stated)
+    lattice, levels = lattice_of(description), []
+    tensors, _ = read_tensors(path, "np")
     for s in range(lattice.finest + 1):
         array = tensors.get(f"level.{s}")
         if array is None or array.shape != (*lattice.shape(s), COEFFICIENTS) or not np.isfinite(array).all():

@@ -31,9 +31,6 @@ _TRAILING = {"u": (2,), "sigma": (), "omega_o": (3,), "transmittance": (), "spp"
 _BLOCK, _TEXELS, _EVALUATED = 1 << 16, 1 << 16, 1 << 18
 # Upper triangle of a texel's matrix.
 _PAIRS = [(a, b) for a in range(COEFFICIENTS) for b in range(a, COEFFICIENTS)]
-_TEXEL_BYTES = 8 * (len(_PAIRS) + COEFFICIENTS)
-# Bytes for the sums; more need several passes over the shards.
-MEMORY = 1e9
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -56,12 +53,12 @@ def _blocks(path: Path, chosen: NDArray[np.bool_] | None = None) -> Iterator[Arr
 
 
 class _Sums:
-    """Normal equations of consecutive texels of a level."""
+    """Normal equations of a level's texels."""
 
-    def __init__(self, lattice: Lattice, level: int, first: int, count: int) -> None:
-        self.lattice, self.level, self.first, self.count = lattice, level, first, count
-        self.squares = np.zeros((len(_PAIRS), count))
-        self.products = np.zeros((COEFFICIENTS, count))
+    def __init__(self, lattice: Lattice, level: int) -> None:
+        self.lattice, self.level = lattice, level
+        self.squares = np.zeros((len(_PAIRS), lattice.texels(level)))
+        self.products = np.zeros((COEFFICIENTS, lattice.texels(level)))
 
     def add(self, block: Arrays) -> None:
         """Add a block of queries."""
@@ -69,11 +66,10 @@ class _Sums:
         near = np.flatnonzero(np.abs(level - self.level) < 1.0)
         texel, share = corners(block["u"][near], self.lattice.shape(self.level))
         share *= (1.0 - np.abs(level[near] - self.level))[:, None]
-        inside = (texel >= self.first) & (texel < self.first + self.count)
-        query = np.broadcast_to(np.arange(len(near))[:, None], texel.shape)[inside]
+        query = np.repeat(np.arange(len(near)), 4)
         # Most texels of a fine level have no query in the block.
-        found, index = np.unique(texel[inside] - self.first, return_inverse=True)
-        weight, terms = share[inside], basis(block["omega_o"][near])
+        found, index = np.unique(texel.ravel(), return_inverse=True)
+        weight, terms = share.ravel(), basis(block["omega_o"][near])
         through = block["transmittance"][near].astype(np.float64)
         for k, (a, b) in enumerate(_PAIRS):
             x = weight * (terms[:, a] * terms[:, b])[query]
@@ -86,16 +82,15 @@ class _Sums:
         """Solve for the texels of the level and write them to `levels`, whose coarser level is complete."""
         out = levels[self.level].reshape(-1, COEFFICIENTS)
         ridge = _PRIOR if self.level else _FIRST_PRIOR
-        for start in range(0, self.count, _TEXELS):
-            part = slice(start, min(start + _TEXELS, self.count))
-            texel = np.arange(self.first + part.start, self.first + part.stop)
-            prior = _from_coarser(levels, self.lattice, self.level, texel)
-            matrix = np.empty((len(texel), COEFFICIENTS, COEFFICIENTS))
+        for start in range(0, len(out), _TEXELS):
+            part = slice(start, min(start + _TEXELS, len(out)))
+            prior = _from_coarser(levels, self.lattice, self.level, np.arange(part.start, part.stop))
+            matrix = np.empty((len(prior), COEFFICIENTS, COEFFICIENTS))
             for k, (a, b) in enumerate(_PAIRS):
                 matrix[:, a, b] = matrix[:, b, a] = self.squares[k, part]
             matrix += ridge * np.eye(COEFFICIENTS)
             right = self.products[:, part].T + ridge * prior
-            out[texel] = np.linalg.solve(matrix, right[..., None])[..., 0]
+            out[part] = np.linalg.solve(matrix, right[..., None])[..., 0]
 
 
 def _from_coarser(levels: list[F32], lattice: Lattice, level: int, texel: NDArray[np.int64]) -> F64:
@@ -110,43 +105,19 @@ def _from_coarser(levels: list[F32], lattice: Lattice, level: int, texel: NDArra
     return out
 
 
-def _passes(lattice: Lattice, memory: float) -> list[list[tuple[int, int, int]]]:
-    """(level, first texel, texels) of each pass over the data, coarse to fine; sums of a pass fit into
-    `memory`."""
-    room = most = max(1, int(memory / _TEXEL_BYTES))
-    out: list[list[tuple[int, int, int]]] = [[]]
-    for level in range(lattice.finest + 1):
-        first, texels = 0, lattice.texels(level)
-        while first < texels:
-            if room == 0:
-                out.append([])
-                room = most
-            count = min(room, texels - first)
-            out[-1].append((level, first, count))
-            first, room = first + count, room - count
-    return out
-
-
-def fit_transmittance(data: Dataset, selection: Selection, memory: float = MEMORY) -> Transmittance | None:
-    """Fit the transmittance to the training queries; None for an opaque material.
-
-    Parameters
-    ----------
-    selection : rows of the shards that are trained on, as in :class:`~mbtf_fit.data.split.Partition`
-    memory : bytes for the sums
-    """
+def fit_transmittance(data: Dataset, selection: Selection) -> Transmittance | None:
+    """Fit the transmittance to the training queries, the rows of `selection`; None for an opaque material."""
     if not has_transmittance(data):
         return None
     lattice = data.lattice
     levels = [np.zeros((*lattice.shape(s), COEFFICIENTS), np.float32) for s in range(lattice.finest + 1)]
-    for slots in _passes(lattice, memory):
-        sums = [_Sums(lattice, *slot) for slot in slots]
-        for path, chosen in selection.masks():
-            for block in _blocks(path, chosen):
-                for part in sums:
-                    part.add(block)
-        for part in sums:
-            part.solve(levels)
+    sums = [_Sums(lattice, s) for s in range(lattice.finest + 1)]
+    for path, chosen in selection.masks():
+        for block in _blocks(path, chosen):
+            for part in sums:
+                part.add(block)
+    for part in sums:
+        part.solve(levels)
     return Transmittance(lattice, levels)
 
 
@@ -170,12 +141,8 @@ class TransmittanceError:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data for JSON."""
-        return {
-            "n": self.n,
-            "mse": self.mse.as_dict(),
-            "noise": self.noise.as_dict(),
-            "variance": self.variance,
-        }
+        estimates = {"mse": self.mse.as_dict(), "noise": self.noise.as_dict()}
+        return {"n": self.n, **estimates, "variance": self.variance}
 
 
 def evaluate_transmittance(

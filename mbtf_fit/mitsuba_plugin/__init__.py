@@ -16,13 +16,13 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
+from mbtf_fit.mitsuba_plugin.registration import load_scene, register, variant_is_set
+
 _PUBLIC = {
     "Evaluator": "evaluator",
     "StoredMaterial": "material_arrays",
     "check_scene": "bsdf",
-    "load_scene": "scene",
     "read_material": "material_arrays",
-    "register": "registration",
 }
 
 __all__ = ["Evaluator", "StoredMaterial", "check_scene", "load_scene", "read_material", "register"]
@@ -34,11 +34,5 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
-def _register_if_set() -> None:
-    from mbtf_fit.mitsuba_plugin.registration import register, variant_is_set
-
-    if variant_is_set():
-        register()
-
-
-_register_if_set()
+if variant_is_set():
+    register()

@@ -16,6 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from mbtf_core.errors import InputError, UsageError
+from mbtf_fit.material.format import QUERY
 from mbtf_fit.mitsuba_plugin.evaluator import Evaluator
 from mbtf_fit.mitsuba_plugin.lobe_fit import fit_lobes
 from mbtf_fit.mitsuba_plugin.lobes import LobeTextures, Mixture
@@ -117,22 +118,21 @@ class MbtfBSDF(mi.BSDF):
         _check_conformance(self.evaluator, stored)
         self.lobes = None
         if self._choice(props, "sampling", ("lobes", "cosine")) != "cosine":
-            self.lobes = LobeTextures(fit_lobes(stored))
+            # Cooperative kernels do not depend on the material: they are compiled once.
+            self.lobes = LobeTextures(fit_lobes(Evaluator(stored, "cooperative")))
         self.uv_scale = self._positive(props, "uv_scale", 1.0)
         self.sigma_given = "sigma" in props
         self.sigma = self._positive(props, "sigma", stored.lattice.sigma_range[0])
         self.folder = folder
         super().__init__(props)
-        flags = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide | mi.BSDFFlags.SpatiallyVarying
-        flags |= mi.BSDFFlags.Anisotropic
-        self.m_components = [flags]
-        self.m_flags = flags
+        known = mi.BSDFFlags
+        self.m_flags = known.GlossyReflection | known.FrontSide | known.SpatiallyVarying | known.Anisotropic
+        self.m_components = [self.m_flags]
         self.transmits = stored.transmittance is not None
         if self.transmits:
-            through = mi.BSDFFlags.Null | mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide
-            through |= mi.BSDFFlags.SpatiallyVarying
-            self.m_components = [flags, through]
-            self.m_flags = flags | through
+            through = known.Null | known.FrontSide | known.BackSide | known.SpatiallyVarying
+            self.m_components = [self.m_flags, through]
+            self.m_flags |= through
 
     @staticmethod
     def _name(props: Properties) -> str:
@@ -175,7 +175,7 @@ class MbtfBSDF(mi.BSDF):
     def _view(self, si: SurfaceInteraction3f) -> View:
         self._warn_once()
         frame = Frame.at(si)
-        return View(self, si, frame, frame.to_tile(si.wi))
+        return View(self, frame, self.uv(si), self.evaluator.level(self.footprint(si)), frame.to_tile(si.wi))
 
     def sample(
         self,
@@ -191,20 +191,19 @@ class MbtfBSDF(mi.BSDF):
         through = view.transmission_probability(ctx)
         transmitted = active & (sample1 < through)
         reused = dr.clip((sample1 - through) / dr.maximum(1.0 - through, 1e-6), 0.0, 1.0)
-        wo = view.mixture().sample(reused, sample2)
+        mixture = view.mixture()
+        wo = mixture.sample(reused, sample2)
         good = active & ~transmitted & view.reflects(ctx) & (view.wi.z > 0) & (wo.z > 0)
         wo = dr.select(good, wo, mi.Vector3f(0, 0, 1))
-        value, pdf = view.eval_pdf(ctx, wo)
-        pdf *= 1.0 - through
+        value, pdf = view.value(ctx, wo), mixture.density(wo) * (1.0 - through)
         good &= pdf > 0
         bs = dr.zeros(mi.BSDFSample3f, dr.width(wo))
         bs.wo = dr.select(transmitted, -si.wi, view.frame.to_local(wo))
         bs.pdf = dr.select(transmitted, through, dr.select(good, pdf, 0.0))
         bs.eta = 1.0
-        bs.sampled_type = dr.select(
-            transmitted, mi.UInt32(int(mi.BSDFFlags.Null)), mi.UInt32(int(mi.BSDFFlags.GlossyReflection))
-        )
-        bs.sampled_component = dr.select(transmitted, mi.UInt32(1), mi.UInt32(0))
+        kinds = (mi.UInt32(int(kind)) for kind in (mi.BSDFFlags.Null, mi.BSDFFlags.GlossyReflection))
+        bs.sampled_type = dr.select(transmitted, *kinds)
+        bs.sampled_component = dr.select(transmitted, mi.UInt32(1), 0)
         return bs, dr.select(transmitted, 1.0, dr.select(good, value / pdf, 0.0))
 
     def eval_pdf(
@@ -213,22 +212,18 @@ class MbtfBSDF(mi.BSDF):
         """(f·cos, density) of a local direction."""
         view = self._view(si)
         good = active & view.reflects(ctx) & (view.wi.z > 0) & (wo.z > 0)
-        value, pdf = view.eval_pdf(ctx, view.frame.to_tile(wo))
-        return dr.select(good, value, 0.0), dr.select(
-            good, pdf * (1.0 - view.transmission_probability(ctx)), 0.0
-        )
+        to_light = view.frame.to_tile(wo)
+        pdf = view.mixture().density(to_light) * (1.0 - view.transmission_probability(ctx))
+        return dr.select(good, view.value(ctx, to_light), 0.0), dr.select(good, pdf, 0.0)
 
+    # Dr.Jit drops what the caller does not use.
     def eval(self, ctx: BSDFContext, si: SurfaceInteraction3f, wo: Vector3f, active: Mask = True) -> Color3f:
         """f·cos of a local direction."""
-        view = self._view(si)
-        value = view.value(ctx, view.frame.to_tile(wo))
-        return dr.select(active & view.reflects(ctx) & (view.wi.z > 0) & (wo.z > 0), value, 0.0)
+        return self.eval_pdf(ctx, si, wo, active)[0]
 
     def pdf(self, ctx: BSDFContext, si: SurfaceInteraction3f, wo: Vector3f, active: Mask = True) -> Float:
         """Density of a local direction."""
-        view = self._view(si)
-        pdf = view.mixture().density(view.frame.to_tile(wo)) * (1.0 - view.transmission_probability(ctx))
-        return dr.select(active & view.reflects(ctx) & (wo.z > 0), pdf, 0.0)
+        return self.eval_pdf(ctx, si, wo, active)[1]
 
     def eval_null_transmission(self, si: SurfaceInteraction3f, active: Mask = True) -> Color3f:
         """Transmittance in the direction of the ray."""
@@ -249,18 +244,17 @@ class MbtfBSDF(mi.BSDF):
 
 @dataclass(frozen=True)
 class View:
-    """A material at hits, for the view direction wi; directions are in the tile's frame."""
+    """A material at hits: position, level and view direction wi; directions are in the tile's frame."""
 
     bsdf: MbtfBSDF
-    si: SurfaceInteraction3f
     frame: Frame
+    u: Point2f
+    level: Float
     wi: Vector3f
 
     def transmittance(self) -> Float:
         """Transparent fraction of the footprint."""
-        bsdf = self.bsdf
-        level = bsdf.evaluator.level(bsdf.footprint(self.si))
-        return bsdf.evaluator.transmittance(bsdf.uv(self.si), level, self.wi)
+        return self.bsdf.evaluator.transmittance(self.u, self.level, self.wi)
 
     def reflects(self, ctx: BSDFContext) -> bool:
         """Whether the context enables reflection."""
@@ -274,35 +268,22 @@ class View:
 
     def mixture(self) -> Mixture:
         """Density of the sampled directions."""
-        bsdf = self.bsdf
-        if bsdf.lobes is None:
-            return Mixture.cosine(self.wi)
-        return bsdf.lobes.at(bsdf.uv(self.si), bsdf.evaluator.level(bsdf.footprint(self.si)), self.wi)
+        lobes = self.bsdf.lobes
+        return Mixture.cosine(self.wi) if lobes is None else lobes.at(self.u, self.level, self.wi)
 
     def value(self, ctx: BSDFContext, wo: Vector3f) -> Color3f:
-        """f·cos; light travels towards si.wi, or away from it where paths start at lights."""
-        bsdf = self.bsdf
+        """f·cos; light travels towards wi, or away from it where paths start at lights."""
         viewer, light = clamped(self.wi), clamped(wo)
         if ctx.mode == mi.TransportMode.Importance:
             viewer, light = light, viewer
-        evaluator = bsdf.evaluator
-        features = evaluator.features(bsdf.uv(self.si), evaluator.level(bsdf.footprint(self.si)), viewer)
-        return evaluator.value(features, light, viewer) * dr.maximum(wo.z, 0.0)
-
-    def eval_pdf(self, ctx: BSDFContext, wo: Vector3f) -> tuple[Color3f, Float]:
-        """(f·cos, density)."""
-        return self.value(ctx, wo), self.mixture().density(wo)
+        features = self.bsdf.evaluator.features(self.u, self.level, viewer)
+        return self.bsdf.evaluator.value(features, light, viewer) * dr.maximum(wo.z, 0.0)
 
 
 def _check_conformance(evaluator: Evaluator, stored: StoredMaterial) -> None:
-    """Compare the evaluator with the material's conformance values.
-
-    Raises
-    ------
-    InputError : they differ
-    """
+    """Refuse an evaluator that does not reproduce the material's conformance values."""
     expected = stored.conformance["rgb"]
-    found = evaluator.evaluate(*(stored.conformance[name] for name in ("u", "sigma", "omega_i", "omega_o")))
+    found = evaluator.evaluate(*(stored.conformance[name] for name in QUERY))
     scale = np.maximum(np.abs(expected), max(float(expected.mean()), 1e-12))
     worst = float(np.max(np.abs(found - expected) / scale))
     if not worst <= TOLERANCE[evaluator.arithmetic]:

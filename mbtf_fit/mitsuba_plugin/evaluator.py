@@ -11,8 +11,6 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbtf_fit.mitsuba_plugin.calibration_factors import CalibrationFactors
-from mbtf_fit.mitsuba_plugin.encodings import encode_direction, encode_position, to_value
 from mbtf_fit.mitsuba_plugin.material_arrays import F32, StoredMaterial
 from mbtf_fit.mitsuba_plugin.network import (
     MOST_UNROLLED,
@@ -20,10 +18,41 @@ from mbtf_fit.mitsuba_plugin.network import (
     Network,
     count_weights,
     default_arithmetic,
+    encode_direction,
+    encode_position,
+    to_value,
 )
 from mbtf_fit.mitsuba_plugin.textures import Textures
 from mbtf_fit.models.constants import GRAZING, OFFSET_SCALE
-from mbtf_gen.render.types import Color3f, Float, Point2f, Vector3f
+from mbtf_gen.render.types import Color3f, Float, Point2f, UInt32, Vector3f
+
+
+class CalibrationFactors:
+    """Calibration tables (2, levels, knots, 3) of a material, by light and by view; the formula is that of
+    :mod:`mbtf_fit.models.calibration_factors`."""
+
+    def __init__(self, tables: F32) -> None:
+        _, self._levels, self._knots, _ = tables.shape
+        self._buffer = mi.Float(np.pad(tables, ((0, 0), (0, 0), (0, 0), (0, 1))).reshape(-1))
+        dr.eval(self._buffer)
+
+    def at(self, table: int, level: Float, cosine: Float) -> Color3f:
+        """Factors of the light's cosine (table 0) or of the view's (1) at fractional levels."""
+        x = dr.clip(cosine, 0.0, 1.0) * (self._knots - 1)
+        left = dr.minimum(mi.UInt32(x), self._knots - 2)
+        inside = x - mi.Float(left)
+        if self._levels == 1:
+            return self._along(table * self._knots + left, inside)
+        level = dr.clip(level, 0.0, self._levels - 1.0)
+        coarse = dr.minimum(mi.UInt32(level), self._levels - 2)
+        first = (table * self._levels + coarse) * self._knots + left
+        pair = (self._along(first, inside), self._along(first + self._knots, inside))
+        return dr.lerp(*pair, level - mi.Float(coarse))
+
+    def _along(self, first: UInt32, inside: Float) -> Color3f:
+        pair = (dr.gather(mi.Vector4f, self._buffer, first + k) for k in (0, 1))
+        found = dr.lerp(*pair, inside)
+        return mi.Color3f(found.x, found.y, found.z)
 
 
 class Evaluator:
@@ -31,11 +60,8 @@ class Evaluator:
 
     Parameters
     ----------
-    stored : StoredMaterial
-        Weights of the material.
-    arithmetic : str, optional
-        Evaluation of the networks: ``unrolled``, ``cooperative`` or ``half``. The default depends on variant
-        and size.
+    stored : weights of the material
+    arithmetic : ``unrolled``, ``cooperative`` or ``half`` networks; the default depends on variant and size
     """
 
     def __init__(self, stored: StoredMaterial, arithmetic: Arithmetic | None = None) -> None:
@@ -51,14 +77,11 @@ class Evaluator:
         self.offset_texture: Textures | None = None
         if stored.offset_texture is not None and stored.offset_network is not None:
             self.offset_texture = Textures([stored.offset_texture])
+            # Single precision for small networks: the value is sensitive to errors of the offset.
+            small = self.arithmetic == "half" and count_weights(stored.offset_network) <= MOST_UNROLLED
             self.offset_network = Network(
-                stored.offset_network, self._offset_arithmetic(stored), stored.network.activation
+                stored.offset_network, "unrolled" if small else self.arithmetic, stored.network.activation
             )
-
-    def _offset_arithmetic(self, stored: StoredMaterial) -> Arithmetic:
-        """Single precision for small networks: the value is sensitive to errors of the offset."""
-        small = count_weights(stored.offset_network or []) <= MOST_UNROLLED
-        return "unrolled" if self.arithmetic == "half" and small else self.arithmetic
 
     def level(self, sigma: Float) -> Float:
         """Fractional level of footprints in tile widths."""
@@ -79,19 +102,18 @@ class Evaluator:
         read = self.pyramid.blended if self.network.blending == "blend" else self.pyramid.side_by_side
         encoded = encode_position(u, level, self.lattice.aspect, self.network.encoding)
         features = [*read(moved, level), *encoded]
-        return (
-            features if self.factors is None else [*features, *self.factors.by_view(level, omega_o.z), level]
-        )
+        return features if self.factors is None else [*features, *self.factors.at(1, level, omega_o.z), level]
 
     def value(self, features: list[Float], omega_i: Vector3f, omega_o: Vector3f) -> Color3f:
         """Stage 2: value in 1/sr, at least 0."""
         options = self.network.encoding
         directions = [*encode_direction(omega_i, options), *encode_direction(omega_o, options)]
+        inputs = features if self.factors is None else features[:-4]
+        value = to_value(self.decoder([*inputs, *directions]), self.unit, self.network)
         if self.factors is None:
-            return to_value(self.decoder([*features, *directions]), self.unit, self.network)
-        *features, red, green, blue, level = features
-        value = to_value(self.decoder([*features, *directions]), self.unit, self.network)
-        return value * mi.Color3f(red, green, blue) * self.factors.by_light(level, omega_i.z)
+            return value
+        *by_view, level = features[-4:]
+        return value * mi.Color3f(*by_view) * self.factors.at(0, level, omega_i.z)
 
     def transmittance(self, u: Point2f, level: Float, omega_o: Vector3f) -> Float:
         """Transparent fraction of the footprint for unit vectors on either side of the plane, equal for

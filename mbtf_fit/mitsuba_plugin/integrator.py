@@ -110,13 +110,10 @@ class ConePath(mi.SamplingIntegrator):
         width, spread = camera_cone(ray, sampler.sample_count())
         token = footprints_provided.set(True)
         try:
-            first = mi.Ray3f(ray)
-            value, valid = self._trace(
-                scene, sampler, first, width, spread, mi.Bool(active), may_transmit(scene)
-            )
+            cone = (mi.Ray3f(ray), width, spread)
+            return *self._trace(scene, sampler, *cone, mi.Bool(active), may_transmit(scene)), []
         finally:
             footprints_provided.reset(token)
-        return value, valid, []
 
     @dr.syntax
     def _trace(

@@ -16,7 +16,7 @@ import numpy as np
 
 from mbtf_fit.mitsuba_plugin.evaluator import Evaluator
 from mbtf_fit.mitsuba_plugin.lobes import BANDS, CHANNELS, Lobe, Mixture, band_of, mixture_of
-from mbtf_fit.mitsuba_plugin.material_arrays import F32, StoredMaterial
+from mbtf_fit.mitsuba_plugin.material_arrays import F32
 from mbtf_gen.render.types import Float, UInt32, Vector3f
 
 # Finest level with lobes, samples per texel, iterations.
@@ -40,24 +40,13 @@ PENALTY = 0.1
 _LANES = 1 << 22
 
 
-def fit_lobes(stored: StoredMaterial) -> list[F32]:
+def fit_lobes(evaluator: Evaluator) -> list[F32]:
     """Lobes (rows, columns, 8) of each level up to :data:`FINEST`, in a second or two."""
-    # Cooperative kernels do not depend on the material: they are compiled once.
-    return lobes_of(Evaluator(stored, "cooperative"))
-
-
-def lobes_of(evaluator: Evaluator) -> list[F32]:
-    """The same for an evaluator."""
-    lattice = evaluator.lattice
-    out = []
+    lattice, most, out = evaluator.lattice, _LANES // SAMPLES, []
     for level in range(min(lattice.finest, FINEST) + 1):
-        rows, columns = lattice.shape(level)
-        most = _LANES // SAMPLES
-        parts = [
-            _fit_texels(evaluator, level, first, min(most, rows * columns - first))
-            for first in range(0, rows * columns, most)
-        ]
-        out.append(np.concatenate(parts).reshape(rows, columns, CHANNELS))
+        texels = lattice.texels(level)
+        parts = [_fit_texels(evaluator, level, k, min(most, texels - k)) for k in range(0, texels, most)]
+        out.append(np.concatenate(parts).reshape(*lattice.shape(level), CHANNELS))
     return out
 
 
@@ -79,7 +68,8 @@ def _fit_texels(evaluator: Evaluator, level: int, first: int, count: int) -> F32
     viewer = mi.warp.square_to_cosine_hemisphere(xi)
     viewer.z = dr.maximum(viewer.z, 0.02)
     viewer = dr.normalize(viewer)
-    start = Mixture(_first_lobe(), mi.Float(FIRST_WEIGHT), viewer)
+    alpha, none = mi.Float(FIRST_ALPHA), mi.Float(0.0)
+    start = Mixture(Lobe(alpha, none, alpha, none, none), mi.Float(FIRST_WEIGHT), viewer)
     choice = random.next_float32()
     light = start.sample(choice, mi.Point2f(random.next_float32(), random.next_float32()))
     above = light.z > 1e-3
@@ -92,13 +82,9 @@ def _fit_texels(evaluator: Evaluator, level: int, first: int, count: int) -> F32
     dr.eval(viewer, light, target, density, weight, texel)
     buffer = _iterate(weight, viewer, light, texel, count)
     out: F32 = np.array(buffer, np.float32).reshape(count, CHANNELS)
-    out[:, 5:] = _best_weights(buffer, target, density, viewer, light, texel, count)
+    lobe = mixture_of(buffer, texel, viewer).lobe.density(light, viewer)
+    out[:, 5:] = _best_weights(lobe, target, density, viewer, light)
     return out
-
-
-def _first_lobe() -> Lobe:
-    a = mi.Float(FIRST_ALPHA)
-    return Lobe(a, mi.Float(0.0), a, mi.Float(0.0), mi.Float(0.0))
 
 
 def _iterate(weight: Float, viewer: Vector3f, light: Vector3f, texel: UInt32, count: int) -> Float:
@@ -146,20 +132,11 @@ def _iterate(weight: Float, viewer: Vector3f, light: Vector3f, texel: UInt32, co
     return buffer
 
 
-def _best_weights(
-    buffer: Float,
-    target: Float,
-    start: Float,
-    viewer: Vector3f,
-    light: Vector3f,
-    texel: UInt32,
-    count: int,
-) -> F32:
-    """Weight (count, 3) of the lobe in each band: that of :data:`WEIGHTS` with the least second moment of
-    ``target / density``, which includes the loss of directions below the surface."""
-    lobe = mixture_of(buffer, texel, viewer).lobe.density(light, viewer)
+def _best_weights(lobe: Float, target: Float, start: Float, viewer: Vector3f, light: Vector3f) -> F32:
+    """Weight (texels, 3) of the lobe of that density in each band: that of :data:`WEIGHTS` with the least
+    second moment of ``target / density``, which includes the loss of directions below the surface."""
     band = band_of(viewer.z)
-    moments = np.empty((count, len(BANDS) + 1, len(WEIGHTS)))
+    moments = np.empty((dr.width(target) // SAMPLES, len(BANDS) + 1, len(WEIGHTS)))
     for c, lobe_weight in enumerate(WEIGHTS):
         moment = dr.square(target) / (start * dr.lerp(dr.inv_pi * light.z, lobe, mi.Float(lobe_weight)))
         for k in range(len(BANDS) + 1):

@@ -14,14 +14,12 @@ depends on the view's cosine, by bands.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
-from mbtf_fit.mitsuba_plugin.material_arrays import F32
+from mbtf_fit.mitsuba_plugin.textures import Textures, in_image
 from mbtf_gen.render.bsdf.microfacet import visible_normal
 from mbtf_gen.render.types import Float, Point2f, UInt32, Vector3f
 
@@ -33,9 +31,7 @@ BANDS = (0.35, 0.7)
 
 def band_of(cosine: Float) -> UInt32:
     """Number of the band of a view's cosine."""
-    return dr.select(
-        cosine < BANDS[0], mi.UInt32(0), dr.select(cosine < BANDS[1], mi.UInt32(1), mi.UInt32(2))
-    )
+    return dr.select(cosine < BANDS[0], mi.UInt32(0), dr.select(cosine < BANDS[1], mi.UInt32(1), 2))
 
 
 @dataclass(frozen=True)
@@ -115,30 +111,17 @@ class Mixture:
         return dr.select(choice < self.weight, self.lobe.reflect(self.viewer, xi), cosine)
 
 
-class LobeTextures:
-    """Lobes of a material by level and texel.
-
-    Parameters
-    ----------
-    levels : (rows, columns, 8) each, coarsest first
-    """
-
-    def __init__(self, levels: Sequence[F32]) -> None:
-        shapes = [level.shape[:2] for level in levels]
-        starts = np.cumsum([0, *(rows * columns for rows, columns in shapes)])
-        table = [[rows, columns, start, 0] for (rows, columns), start in zip(shapes, starts, strict=False)]
-        self._table = mi.UInt32(np.array(table, np.uint32).reshape(-1))
-        self._buffer = mi.Float(np.concatenate([level.reshape(-1) for level in levels]))
-        self._finest = len(levels) - 1
-        dr.eval(self._table, self._buffer)
+class LobeTextures(Textures):
+    """Lobes of a material by level and texel: textures of :data:`CHANNELS` channels."""
 
     def at(self, u: Point2f, level: Float, viewer: Vector3f) -> Mixture:
         """Mixture of the nearest texel of the nearest level at uv positions (Point2f)."""
-        nearest = mi.UInt32(dr.clip(dr.round(level), 0.0, float(self._finest)))
-        rows, columns, start, _ = dr.gather(mi.Vector4u, self._table, nearest)
-        i = dr.minimum(mi.UInt32((u.x - dr.floor(u.x)) * mi.Float(columns)), columns - 1)
-        j = dr.minimum(mi.UInt32((1.0 - (u.y - dr.floor(u.y))) * mi.Float(rows)), rows - 1)
-        return mixture_of(self._buffer, start + j * columns + i, viewer)
+        nearest = mi.UInt32(dr.clip(dr.round(level), 0.0, len(self.shapes) - 1.0))
+        rows, columns, start, _ = dr.gather(mi.Vector4u, self.table, nearest)
+        x = in_image(u)
+        i = dr.minimum(mi.UInt32(x.x * mi.Float(columns)), columns - 1)
+        j = dr.minimum(mi.UInt32(x.y * mi.Float(rows)), rows - 1)
+        return mixture_of(self.buffer, start + j * columns + i, viewer)
 
 
 def mixture_of(buffer: Float, texel: UInt32, viewer: Vector3f) -> Mixture:

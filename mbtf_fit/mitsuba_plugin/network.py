@@ -1,25 +1,27 @@
-"""Small fully connected networks in Dr.Jit kernels.
+"""Small fully connected networks in Dr.Jit kernels, their inputs and outputs by the options of
+``config.network``; the key ``formula`` of each ``material.json`` states the formulas.
 
 - ``unrolled``: multiply-adds with the weights as literals of the kernel. Fastest on a CPU, for networks that
   compile in reasonable time. The kernel is compiled for one material.
 - ``cooperative``: cooperative vectors of :mod:`drjit.nn` in single precision; one kernel for all materials.
 - ``half``: cooperative vectors in half precision, for the tensor cores of GPUs. The first layer is unrolled
-  in
-  single precision, because rounded inputs would cause half of the error.
+  in single precision, because rounded inputs would cause half of the error.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import drjit as dr
 import mitsuba as mi
 from drjit import nn
 
+from mbtf_fit.config import EncodingSection, NetworkSection
 from mbtf_fit.mitsuba_plugin.material_arrays import Layers
-from mbtf_fit.models.constants import LEAK
-from mbtf_gen.render.types import Float
+from mbtf_fit.models.constants import GATE, LEAK, RGB_OF_YUV
+from mbtf_gen.render.types import Color3f, Float, Point2f, Vector3f
 
 Arithmetic = Literal["unrolled", "cooperative", "half"]
 # Most weights of unrolled networks: larger ones take too long to compile.
@@ -92,3 +94,61 @@ class Network:
             if k < count - 1:
                 x = self._activated(x) if self.activation == "relu" else nn.CoopVec(*map(self._activated, x))
         return [mi.Float(value) for value in x]
+
+
+def encode(
+    p: Sequence[Float],
+    bands: int,
+    pi: bool,
+    options: EncodingSection,
+    spread: Sequence[Float] | None = None,
+) -> list[Float]:
+    """Coordinates → [themselves,] sines of doubling frequencies, cosines; without bands themselves alone.
+    With `spread`, their means over Gaussians of these standard deviations."""
+    if bands == 0:
+        return list(p)
+    unit = math.pi if pi else 1.0
+    frequencies = [unit * 2.0**k for k in range(bands)]
+    pairs = [dr.sincos(x * f) for x in p for f in frequencies]
+    if options.band_attenuation:
+        pairs = [(s * 0.5**k, c * 0.5**k) for (s, c), k in zip(pairs, [*range(bands)] * len(p), strict=True)]
+    if spread is not None:
+        left = [dr.exp(-0.5 * dr.square(s * f)) for s in spread for f in frequencies]
+        pairs = [(s * a, c * a) for (s, c), a in zip(pairs, left, strict=True)]
+    return [*(p if options.raw else ()), *(s for s, _ in pairs), *(c for _, c in pairs)]
+
+
+def encode_direction(omega: Vector3f, options: EncodingSection) -> list[Float]:
+    """Encoded direction."""
+    coordinates = [omega.x, omega.y, omega.z] if options.direction_xyz else [omega.x, omega.y]
+    return encode(coordinates, options.direction, options.direction_pi, options)
+
+
+def encode_position(u: Point2f, level: Float, aspect: float, options: EncodingSection) -> list[Float]:
+    """Encoded uv position at a fractional level: empty without bands."""
+    if options.position == 0:
+        return []
+    p = [2.0 * (x - dr.floor(x)) - 1.0 for x in (u.x, u.y)]
+    across = dr.exp2(-level)
+    spread = [across, across / aspect] if options.footprint_filtered else None
+    return encode(p, options.position, options.pi, options, spread)
+
+
+_TRANSFORMS: dict[str, Callable[[Float], Float]] = {
+    "expm1": lambda x: dr.exp(x) - 1.0,
+    "exp": lambda x: dr.exp(x),
+    "softplus": lambda x: dr.maximum(x, 0.0) + dr.log(1.0 + dr.exp(-dr.abs(x))),
+    "fourth-root": lambda x: x * dr.square(x) * dr.abs(x),
+    "identity": lambda x: x,
+}
+
+
+def to_value(x: Sequence[Float], unit: float, network: NetworkSection) -> Color3f:
+    """Value in 1/sr, at least 0, of a decoder's three or six outputs."""
+    gates = [GATE + dr.rcp(1.0 + dr.exp(-v)) for v in x[3:]]
+    if gates:
+        x = [sum(weight * v for weight, v in zip(row, x[:3], strict=True) if weight) for row in RGB_OF_YUV]
+    colors = [unit * _TRANSFORMS[network.output_transform](v) for v in x]
+    if gates:
+        colors = [color * gate for color, gate in zip(colors, gates, strict=True)]
+    return mi.Color3f(*(dr.maximum(v, 0.0) for v in colors))

@@ -1,14 +1,16 @@
-"""Registration of the plugins with Mitsuba."""
+"""Registration of the plugins with Mitsuba, and loading of scenes with fitted materials."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from mbtf_core.errors import EngineError, MbtfError, UsageError
 from mbtf_fit.mitsuba_plugin.names import BSDF_NAME, INTEGRATOR_NAME, VARIANTS
 from mbtf_gen.render.runtime import CPU_VARIANT, load_mitsuba, refuse_old_llvm
-from mbtf_gen.render.types import Properties
+from mbtf_gen.render.types import Properties, Scene
 
 # The variant whose classes the plugins derive from.
 _registered: str | None = None
@@ -81,8 +83,43 @@ def _construct(plugin: Any, props: Properties) -> Any:
         raise
 
 
-def take_last_error() -> MbtfError | None:
-    """The last error of a plugin's constructor; it is forgotten."""
+def load_scene(source: str | Path | Mapping[str, Any]) -> Scene:
+    """Load and check a scene with fitted materials; errors of the plugins are raised as they are.
+
+    Parameters
+    ----------
+    source : str, Path or mapping
+        Path of an XML file, XML text, or a dictionary as for ``mitsuba.load_dict``.
+
+    Returns
+    -------
+    mitsuba.Scene
+        Or the object that a dictionary describes.
+
+    Raises
+    ------
+    MbtfError
+        A material cannot be used, or a mesh with an ``mbtf`` material has no texture coordinates.
+    """
+    register()
+    import mitsuba as mi
+
+    from mbtf_fit.mitsuba_plugin.bsdf import check_scene
+
     global _last_error
-    error, _last_error = _last_error, None
-    return error
+    _last_error = None
+    try:
+        if isinstance(source, Mapping):
+            scene = mi.load_dict(dict(source))
+        elif str(source).lstrip().startswith("<"):
+            scene = mi.load_string(str(source))
+        else:
+            scene = mi.load_file(str(source))
+    except Exception:
+        error, _last_error = _last_error, None
+        if error is None:
+            raise
+        raise error from None
+    if isinstance(scene, mi.Scene):
+        check_scene(scene)
+    return scene

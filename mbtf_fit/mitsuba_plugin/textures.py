@@ -19,7 +19,7 @@ from mbtf_gen.render.types import Float, Point2f, UInt32
 GROUP = 4
 
 
-def _in_image(u: Point2f) -> Point2f:
+def in_image(u: Point2f) -> Point2f:
     """Position in the image, from its left and its top, in [0, 1]."""
     return mi.Point2f(u.x - dr.floor(u.x), 1.0 - (u.y - dr.floor(u.y)))
 
@@ -42,17 +42,15 @@ class Textures:
         self.shapes = [level.shape[:2] for level in levels]
         starts = np.cumsum([0, *(rows * columns for rows, columns in self.shapes)])
         self.buffer = mi.Float(np.concatenate(padded))
-        table = [
-            [rows, columns, start, 0] for (rows, columns), start in zip(self.shapes, starts, strict=False)
-        ]
-        self._table = mi.UInt32(np.array(table, np.uint32).reshape(-1))
-        dr.eval(self.buffer, self._table)
+        table = [(*shape, start, 0) for shape, start in zip(self.shapes, starts, strict=False)]
+        self.table = mi.UInt32(np.array(table, np.uint32).reshape(-1))
+        dr.eval(self.buffer, self.table)
 
     def first(self, u: Point2f) -> list[Float]:
         """Features of the first level at uv positions (Point2f), any real numbers: textures are periodic."""
         rows, columns = self.shapes[0]
         layout = (mi.UInt32(rows), mi.UInt32(columns), mi.UInt32(0))
-        return self._bilinear(_in_image(u), *layout, None, [0.0] * self.channels)
+        return self._bilinear(in_image(u), *layout, None, [0.0] * self.channels)
 
     def blended(self, u: Point2f, level: Float) -> list[Float]:
         """Features between two levels: (1 - frac(level)) of the coarser, frac(level) of the finer one."""
@@ -79,8 +77,8 @@ class Textures:
         return coarse, level - mi.Float(coarse)
 
     def _level(self, u: Point2f, level: UInt32, scale: Float, out: list[Float]) -> list[Float]:
-        rows, columns, start, _ = dr.gather(mi.Vector4u, self._table, level)
-        return self._bilinear(_in_image(u), rows, columns, start, scale, out)
+        rows, columns, start, _ = dr.gather(mi.Vector4u, self.table, level)
+        return self._bilinear(in_image(u), rows, columns, start, scale, out)
 
     def _bilinear(
         self, x: Point2f, rows: UInt32, columns: UInt32, start: UInt32, scale: Float, out: list[Float]

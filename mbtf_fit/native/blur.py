@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from mbtf_fit.models.blur import NEGLIGIBLE, gaussian_taps
 from mbtf_fit.models.textures import FeatureTextures
 from mbtf_fit.native.library import Kernel
+from mbtf_fit.native.model import share
 
 if TYPE_CHECKING:
     from mbtf_fit.objective.parallel import Workers
@@ -21,13 +21,8 @@ _SMALL = 1 << 12
 
 
 class Blur:
-    """Blurs one packed set of textures by the same width in tile widths at every level.
-
-    Parameters
-    ----------
-    texture : whose tables are blurred
-    sigma : texels of the finest level
-    """
+    """Blurs one packed set of textures by a Gaussian of `sigma` texels of the finest level, the same width in
+    tile widths at every level."""
 
     def __init__(self, kernel: Kernel, texture: FeatureTextures, sigma: float) -> None:
         self.kernel = kernel
@@ -56,10 +51,7 @@ class Blur:
     def _pass(self, axis: int, source: Tensor, target: Tensor, part: int, parts: int) -> None:
         starts = self.packing.starts
         for s, (rows, columns) in enumerate(self.packing.shapes):
-            if rows * columns < _SMALL:
-                first, last = (0, rows) if part == 0 else (0, 0)
-            else:
-                first, last = rows * part // parts, rows * (part + 1) // parts
+            first, last = share(rows, part, parts, whole=rows * columns < _SMALL)
             if first == last:
                 continue
             taps = self._taps[s]
@@ -68,41 +60,20 @@ class Blur:
                 target[cells] = source[cells]
                 continue
             offset = 4 * starts[s] * self.channels
-            filtered = taps[axis]
-            number = len(filtered)
-            addresses = np.empty(number, np.uintp)
-            library, variant = self.kernel.library, self.kernel.variant
             here, there = source.data_ptr() + offset, target.data_ptr() + offset
-            weights = filtered.ctypes.data
+            number = len(taps[axis])
+            addresses = np.empty(number, np.uintp)
+            work = (taps[axis].ctypes.data, number, first, last, addresses.ctypes.data)
+            library, variant = self.kernel.library, self.kernel.variant
             if axis == 0:
-                width = columns * self.channels
-                library.mbtf_blur_down(
-                    variant, here, rows, width, weights, number, first, last, addresses.ctypes.data, there
-                )
+                library.mbtf_blur_down(variant, here, rows, columns * self.channels, *work, there)
             else:
                 wide = np.empty((columns + number) * self.channels, np.float32)
-                library.mbtf_blur_across(
-                    *(variant, here, columns, self.channels, weights, number, first, last),
-                    *(addresses.ctypes.data, wide.ctypes.data, there),
-                )
+                size = (columns, self.channels)
+                library.mbtf_blur_across(variant, here, *size, *work, wide.ctypes.data, there)
 
 
 def _taps(sigma: float, size: int) -> NDArray[np.float32]:
     if size == 1:
         return np.ones(1, np.float32)
     return np.ascontiguousarray(gaussian_taps(sigma, size).numpy(), np.float32)
-
-
-def blur_table(kernel: Kernel, texture: FeatureTextures, sigma: float, workers: Workers) -> Tensor:
-    """The texels of a texture, blurred by a Gaussian of `sigma` texels of the finest level, as a new
-    table."""
-    blur = Blur(kernel, texture, sigma)
-    texels = texture.texels.detach()
-    if blur.idle:
-        return texels
-    out = torch.empty_like(texels)
-    blur.apply(texels, torch.empty_like(texels), out, workers)
-    return out
-
-
-__all__ = ["Blur", "blur_table"]

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.native.library import GradientSums, QuadraticLoss, QueryPointers
-from mbtf_fit.native.model import NativeModel, aligned, networks, parameters_of, pointers
+from mbtf_fit.native.model import NativeModel, aligned, networks, parameters_of, pointers, share
 from mbtf_fit.objective.losses import Objective, Quadratic
 from mbtf_fit.objective.parallel import Workers
 
@@ -33,10 +33,9 @@ class _Sums:
     """Sums and working memory of one thread."""
 
     def __init__(self, native: NativeModel, piece: int) -> None:
-        lanes = native.kernel.lanes
-        self.textures = [
-            aligned(t.packing.texels * (-(-t.texels.shape[1] // 8) * 8)) for t in native.textures
-        ]
+        lanes = int(native.kernel.library.mbtf_lanes())
+        textures = native.model.textures()
+        self.textures = [aligned(t.packing.texels * (-(-t.texels.shape[1] // 8) * 8)) for t in textures]
         self.networks = [aligned(lanes * network.count) for network in networks(native.model)]
         self.state = native.state(piece)
         self.scratch = aligned(int(native.kernel.library.mbtf_scratch_floats()))
@@ -49,10 +48,6 @@ class _Sums:
 class NativeGradients:
     """Computes gradients of one model for many batches; holds the memory for it.
 
-    Parameters
-    ----------
-    native : the model
-
     Attributes
     ----------
     textures, networks : gradients by the tables and by the weights of each network, of the last batch
@@ -64,26 +59,24 @@ class NativeGradients:
         per_block = 4 * native.kernel.library.mbtf_state_floats(ctypes.byref(native.description))
         self.piece = block * max(4, _PIECE_BYTES // per_block)
         self._sums: list[_Sums] = []
-        self.textures = [torch.empty_like(t.texels) for t in native.textures]
+        self.textures = [torch.empty_like(t.texels) for t in native.model.textures()]
         self.networks = [[torch.empty_like(p) for p in parameters_of(n)] for n in networks(native.model)]
 
     def compute(self, objective: Objective, batch: TrainingQueries, workers: Workers) -> Tensor:
         """Mean loss of a batch; the gradients by tables and weights are left in :attr:`textures` and
         :attr:`networks`."""
-        n, count = len(batch), workers.count
-        if len(self._sums) != count:
-            self._sums = [_Sums(self.native, self.piece) for _ in range(count)]
-        edges = [n * k // count for k in range(count + 1)]
+        if len(self._sums) != workers.count:
+            self._sums = [_Sums(self.native, self.piece) for _ in range(workers.count)]
         self.native.refresh()
-
         quadratic = objective.quadratic()
 
         def work(k: int) -> Tensor:
+            first, last = share(len(batch), k, workers.count)
             if quadratic is not None:
-                return self._learn(self._sums[k], quadratic, batch, edges[k], edges[k + 1])
+                return self._learn(self._sums[k], quadratic, batch, first, last)
             total = torch.zeros(())
-            for start in range(edges[k], edges[k + 1], self.piece):
-                stop = min(start + self.piece, edges[k + 1])
+            for start in range(first, last, self.piece):
+                stop = min(start + self.piece, last)
                 total += self._piece(self._sums[k], objective, batch, start, stop)
             return total
 
@@ -99,9 +92,8 @@ class NativeGradients:
 
     def _learn(self, sums: _Sums, loss: Quadratic, batch: TrainingQueries, start: int, stop: int) -> Tensor:
         native = self.native
-        bounded = loss.bound is not None
         bound = (ctypes.c_float * 3)(*(loss.bound or (0.0, 0.0, 0.0)))
-        form = QuadraticLoss(loss.relative, loss.squared, loss.scale, bound, bounded)
+        form = QuadraticLoss(loss.relative, loss.squared, loss.scale, bound, loss.bound is not None)
         queries = query_pointers(batch, start, stop)
         weight = 1.0 / (3 * len(batch))
         total = native.kernel.library.mbtf_learn(
@@ -152,8 +144,6 @@ class NativeGradients:
         kernel, count = self.native.kernel, len(self._sums)
         for k, gradient in enumerate(self.textures):
             texels, channels = gradient.shape
-            edges = [texels * part // count, texels * (part + 1) // count]
             sums = pointers([s.textures[k] for s in self._sums])
-            kernel.library.mbtf_collect(
-                kernel.variant, sums, len(self._sums), channels, *edges, gradient.data_ptr()
-            )
+            edges = share(texels, part, count)
+            kernel.library.mbtf_collect(kernel.variant, sums, count, channels, *edges, gradient.data_ptr())

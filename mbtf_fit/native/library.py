@@ -23,22 +23,15 @@ _I32, _I64, _F32, _POINTER = ctypes.c_int32, ctypes.c_int64, ctypes.c_float, cty
 class Network(ctypes.Structure):
     """``mbtf_network``"""
 
-    _fields_ = (
-        ("layers", _I32),
-        ("wanted", _I32),
-        ("widths", _I32 * (MAX_LAYERS + 1)),
-        ("packed", _POINTER),
-    )
+    _fields_ = (("layers", _I32), ("wanted", _I32), ("widths", _I32 * (MAX_LAYERS + 1)), ("packed", _POINTER))
 
 
 class Textures(ctypes.Structure):
     """``mbtf_textures``"""
 
     _fields_ = (
-        ("levels", _I32),
-        ("channels", _I32),
-        ("rows", _I32 * MAX_LEVELS),
-        ("columns", _I32 * MAX_LEVELS),
+        *((name, _I32) for name in ("levels", "channels")),
+        *((name, _I32 * MAX_LEVELS) for name in ("rows", "columns")),
         ("starts", _I64 * (MAX_LEVELS + 1)),
         ("table", _POINTER),
     )
@@ -48,14 +41,9 @@ class Model(ctypes.Structure):
     """``mbtf_model``"""
 
     _fields_ = (
-        ("pyramid", Textures),
-        ("offset_texture", Textures),
-        ("decoder", Network),
-        ("offset", Network),
-        ("unit", _F32),
-        ("offset_scale", _F32),
-        ("grazing", _F32),
-        ("aspect", _F32),
+        *((name, Textures) for name in ("pyramid", "offset_texture")),
+        *((name, Network) for name in ("decoder", "offset")),
+        *((name, _F32) for name in ("unit", "offset_scale", "grazing", "aspect")),
         ("coordinates", _I32),
     )
 
@@ -63,33 +51,20 @@ class Model(ctypes.Structure):
 class QueryPointers(ctypes.Structure):
     """``mbtf_queries``"""
 
-    _fields_ = (
-        ("n", _I64),
-        ("u", _POINTER),
-        ("sigma", _POINTER),
-        ("omega_i", _POINTER),
-        ("omega_o", _POINTER),
-    )
+    _fields_ = (("n", _I64), *((name, _POINTER) for name in ("u", "sigma", "omega_i", "omega_o")))
 
 
 class GradientSums(ctypes.Structure):
     """``mbtf_gradients``"""
 
-    _fields_ = (
-        ("pyramid", _POINTER),
-        ("offset_texture", _POINTER),
-        ("decoder", _POINTER),
-        ("offset", _POINTER),
-    )
+    _fields_ = tuple((name, _POINTER) for name in ("pyramid", "offset_texture", "decoder", "offset"))
 
 
 class QuadraticLoss(ctypes.Structure):
     """``mbtf_loss``"""
 
     _fields_ = (
-        ("relative", _F32),
-        ("squared", _F32),
-        ("scale", _F32),
+        *((name, _F32) for name in ("relative", "squared", "scale")),
         ("bound", _F32 * 3),
         ("bounded", _I32),
     )
@@ -98,42 +73,33 @@ class QuadraticLoss(ctypes.Structure):
 class AdamStep(ctypes.Structure):
     """``mbtf_adam_step``"""
 
-    _fields_ = (
-        ("rate", _F32),
-        ("beta1", _F32),
-        ("beta2", _F32),
-        ("epsilon", _F32),
-        ("root_correction2", _F32),
-    )
+    _fields_ = tuple((name, _F32) for name in ("rate", "beta1", "beta2", "epsilon", "root_correction2"))
 
 
-_PROTOTYPES: dict[str, tuple[Any, tuple[Any, ...]]] = {
-    "mbtf_variants": (_I32, ()),
-    "mbtf_variant_name": (ctypes.c_char_p, (_I32,)),
-    "mbtf_block": (_I32, ()),
-    "mbtf_lanes": (_I32, ()),
-    "mbtf_layout": (_I32, ()),
-    "mbtf_state_floats": (_I64, (_POINTER,)),
-    "mbtf_scratch_floats": (_I64, ()),
-    "mbtf_packed_floats": (_I64, (_POINTER,)),
-    "mbtf_pack": (None, (_I32, _POINTER, _POINTER, _POINTER)),
-    "mbtf_forward": (None, (_I32, _POINTER, _POINTER, _I32, _I32, _POINTER, _POINTER)),
-    "mbtf_backward": (None, (_I32, _POINTER, _POINTER, _POINTER, _POINTER, _POINTER, _POINTER)),
-    "mbtf_learn": (
-        ctypes.c_double,
-        (_I32, _POINTER, _POINTER, _POINTER, _POINTER, _F32, _POINTER, _POINTER, _POINTER, _POINTER),
-    ),
-    "mbtf_collect_weights": (None, (_POINTER, _POINTER, _I64, _POINTER)),
-    "mbtf_collect": (None, (_I32, _POINTER, _I64, _I64, _I64, _I64, _POINTER)),
-    "mbtf_adam": (None, (_I32, _POINTER, _I64, _POINTER, _POINTER, _POINTER, _POINTER)),
-    "mbtf_blur_down": (
-        None,
-        (_I32, _POINTER, _I64, _I64, _POINTER, _I64, _I64, _I64, _POINTER, _POINTER),
-    ),
-    "mbtf_blur_across": (
-        None,
-        (_I32, _POINTER, _I64, _I64, _POINTER, _I64, _I64, _I64, _POINTER, _POINTER, _POINTER),
-    ),
+# Types of results and arguments by letter.
+_TYPES: dict[str, Any] = {
+    **{"i": _I32, "l": _I64, "f": _F32, "d": ctypes.c_double},
+    **{"s": ctypes.c_char_p, "p": _POINTER, "v": None},
+}
+# Of each function the result, then the arguments.
+_PROTOTYPES = {
+    "mbtf_variants": "i",
+    "mbtf_variant_name": "si",
+    "mbtf_block": "i",
+    "mbtf_lanes": "i",
+    "mbtf_layout": "i",
+    "mbtf_state_floats": "lp",
+    "mbtf_scratch_floats": "l",
+    "mbtf_packed_floats": "lp",
+    "mbtf_pack": "vippp",
+    "mbtf_forward": "vippiipp",
+    "mbtf_backward": "vipppppp",
+    "mbtf_learn": "dippppfpppp",
+    "mbtf_collect_weights": "vpplp",
+    "mbtf_collect": "vipllllp",
+    "mbtf_adam": "viplpppp",
+    "mbtf_blur_down": "vipllplllpp",
+    "mbtf_blur_across": "vipllplllppp",
 }
 
 
@@ -156,17 +122,6 @@ class Kernel:
         """Queries per block."""
         return int(self.library.mbtf_block())
 
-    @property
-    def lanes(self) -> int:
-        """Partial sums of each weight's gradient."""
-        return int(self.library.mbtf_lanes())
-
-
-def _path() -> Path | None:
-    here = Path(__file__).parent
-    found = (here / f"{LIBRARY}{suffix}" for suffix in EXTENSION_SUFFIXES)
-    return next((path for path in found if path.is_file()), None)
-
 
 def open_library(path: Path) -> Any:
     """Load a library.
@@ -176,12 +131,12 @@ def open_library(path: Path) -> Any:
     OSError : it cannot be loaded, lacks a function, or was built from other sources
     """
     library = ctypes.CDLL(str(path))
-    for name, (result, arguments) in _PROTOTYPES.items():
+    for name, letters in _PROTOTYPES.items():
         try:
             function = getattr(library, name)
         except AttributeError:
             raise OSError(f"it lacks {name}") from None
-        function.restype, function.argtypes = result, list(arguments)
+        function.restype, *function.argtypes = (_TYPES[letter] for letter in letters)
     if library.mbtf_layout() != ctypes.sizeof(Model) + 4096 * ctypes.sizeof(QueryPointers):
         raise OSError("it was built from other sources")
     return library
@@ -198,7 +153,8 @@ def _load() -> tuple[Kernel | None, str]:
     requested = os.environ.get(ENVIRONMENT, "auto")
     if requested == "off":
         return None, f"switched off by {ENVIRONMENT}"
-    path = _path()
+    paths = (Path(__file__).with_name(f"{LIBRARY}{suffix}") for suffix in EXTENSION_SUFFIXES)
+    path = next((path for path in paths if path.is_file()), None)
     if path is None:
         return None, "not built: no C compiler was found when mbtf was installed"
     try:

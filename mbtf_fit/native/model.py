@@ -13,7 +13,6 @@ from mbtf_fit.models.constants import GRAZING, OFFSET_SCALE, direction_size
 from mbtf_fit.models.interface import NeuralMaterial
 from mbtf_fit.models.mlp import Mlp
 from mbtf_fit.models.neumip import Neumip, NeumipBaseline
-from mbtf_fit.models.textures import FeatureTextures
 from mbtf_fit.native.library import (
     MAX_CHANNELS,
     MAX_LAYERS,
@@ -23,7 +22,6 @@ from mbtf_fit.native.library import (
     Model,
     Network,
     QueryPointers,
-    Textures,
 )
 
 # Values of the architecture's options that the kernel supports; sizes are limited by the kernel's constants.
@@ -39,28 +37,21 @@ _SUPPORTED: dict[str, tuple[Any, ...]] = {
 _SIZES = {"channels", "width", "layers"}
 
 
-def unsupported_reason(model: NeuralMaterial) -> str | None:
-    """Why the kernel cannot evaluate a model; None where it can."""
+def supports(model: NeuralMaterial) -> bool:
+    """Whether the kernel can evaluate a model."""
     if type(model) not in (Neumip, NeumipBaseline):
-        return f"it does not support the model {model.name}"
-    options = model.network.model_dump()
-    for name, supported in _SUPPORTED.items():
-        if options.pop(name) not in supported:
-            return f"it does not support network.{name}={getattr(model.network, name)}"
-    if options.keys() - _SIZES:
-        return f"it does not support network.{min(options.keys() - _SIZES)}"
-    tensors = [*model.parameters(), *(t.table for t in model.textures())]
-    if any(t.device.type != "cpu" or t.dtype != torch.float32 for t in tensors):
-        return "it runs on CPUs, in float32"
-    for network in networks(model):
-        if len(network.weights) > MAX_LAYERS or max(max(w.shape) for w in network.weights) > MAX_WIDTH:
-            return f"its networks have at most {MAX_LAYERS} layers of {MAX_WIDTH} features"
-    for texture in model.textures():
-        if texture.texels.shape[1] > MAX_CHANNELS or len(texture.packing.shapes) > MAX_LEVELS:
-            return f"its textures have at most {MAX_LEVELS} levels of {MAX_CHANNELS} channels"
-        if texture.packing.texels >= 1 << 31:
-            return "its textures have less than 2^31 texels"
-    return None
+        return False
+    options, textures = model.network.model_dump(), model.textures()
+    tensors = [*model.parameters(), *(t.table for t in textures)]
+    return (
+        options.keys() == _SUPPORTED.keys() | _SIZES
+        and all(options[name] in supported for name, supported in _SUPPORTED.items())
+        and all(t.device.type == "cpu" and t.dtype == torch.float32 for t in tensors)
+        and all(len(network.weights) <= MAX_LAYERS for network in networks(model))
+        and all(max(w.shape) <= MAX_WIDTH for network in networks(model) for w in network.weights)
+        and all(t.texels.shape[1] <= MAX_CHANNELS and len(t.packing.shapes) <= MAX_LEVELS for t in textures)
+        and all(t.packing.texels < 1 << 31 for t in textures)
+    )
 
 
 def networks(model: NeuralMaterial) -> list[Mlp]:
@@ -87,32 +78,33 @@ def aligned(floats: int) -> Tensor:
     return whole[skip : skip + floats]
 
 
+def share(n: int, part: int, parts: int, *, whole: bool = False) -> tuple[int, int]:
+    """(first, last) of `n` things for one of several threads; `whole`: all for the first one."""
+    if whole:
+        return 0, 0 if part else n
+    return n * part // parts, n * (part + 1) // parts
+
+
 class NativeModel:
-    """A supported model, evaluated by the kernel.
-
-    :meth:`refresh` copies the model's current weights.
-
-    Attributes
-    ----------
-    description : as the C functions take it
-    """
+    """A supported model, evaluated by the kernel; :meth:`refresh` copies the model's current weights. Its
+    `description` is what the C functions take."""
 
     def __init__(self, kernel: Kernel, model: NeuralMaterial) -> None:
         self.kernel = kernel
         self.model = model
-        self.description = Model()
-        self.description.offset_scale, self.description.grazing = OFFSET_SCALE, GRAZING
-        self.description.aspect = model.lattice.aspect
-        self.description.coordinates = direction_size(model.network.encoding)
-        self._packed: list[Tensor] = []
-        for network, target in zip(networks(model), self._targets(), strict=False):
+        self.description = d = Model()
+        d.offset_scale, d.grazing, d.aspect = OFFSET_SCALE, GRAZING, model.lattice.aspect
+        d.coordinates = direction_size(model.network.encoding)
+        self._networks: list[tuple[Mlp, Network, Tensor]] = []
+        for network, target in zip(networks(model), (d.decoder, d.offset), strict=False):
             widths = [network.weights[0].shape[1], *(len(w) for w in network.weights)]
             target.layers, target.wanted = len(network.weights), model.textures()[0].texels.shape[1]
             target.widths[: len(widths)] = widths
             packed = aligned(kernel.library.mbtf_packed_floats(ctypes.byref(target)))
             target.packed = packed.data_ptr()
-            self._packed.append(packed)
-        for texture, layout in zip(model.textures(), self._layouts(), strict=False):
+            self._networks.append((network, target, packed))
+        self._textures = list(zip(model.textures(), (d.pyramid, d.offset_texture), strict=False))
+        for texture, layout in self._textures:
             shapes = texture.packing.shapes
             layout.levels, layout.channels = len(shapes), texture.texels.shape[1]
             layout.rows[: len(shapes)] = [rows for rows, _ in shapes]
@@ -120,30 +112,18 @@ class NativeModel:
             layout.starts[: len(shapes) + 1] = texture.packing.starts
         self.refresh()
 
-    def _targets(self) -> list[Network]:
-        return [self.description.decoder, self.description.offset]
-
-    def _layouts(self) -> list[Textures]:
-        return [self.description.pyramid, self.description.offset_texture]
-
     def refresh(self) -> None:
         """Copy the current weights, and the tables that lookups read."""
         library, variant = self.kernel.library, self.kernel.variant
         assert isinstance(self.model, Neumip)
         self.description.unit = float(self.model.unit)
-        self._kept: list[Tensor] = []
-        for network, target, packed in zip(networks(self.model), self._targets(), self._packed, strict=False):
+        for network, target, packed in self._networks:
             held = [p.detach().contiguous() for p in parameters_of(network)]
             library.mbtf_pack(variant, ctypes.byref(target), pointers(held), packed.data_ptr())
-        for texture, layout in zip(self.model.textures(), self._layouts(), strict=False):
-            table = texture.table.detach().contiguous()
-            self._kept.append(table)
+        # Kept: the description has their addresses.
+        self._tables = [texture.table.detach().contiguous() for texture, _ in self._textures]
+        for (_, layout), table in zip(self._textures, self._tables, strict=True):
             layout.table = table.data_ptr()
-
-    @property
-    def textures(self) -> list[FeatureTextures]:
-        """The model's textures: the pyramid, then the offset's."""
-        return self.model.textures()
 
     def state(self, queries: int) -> Tensor:
         """Memory for the activations of a number of queries."""
@@ -151,13 +131,7 @@ class NativeModel:
         return aligned(blocks * int(self.kernel.library.mbtf_state_floats(ctypes.byref(self.description))))
 
     def forward(
-        self,
-        queries: QueryPointers,
-        state: Tensor,
-        out: int,
-        *,
-        clamp: bool = False,
-        keep: bool = False,
+        self, queries: QueryPointers, state: Tensor, out: int, *, clamp: bool = False, keep: bool = False
     ) -> None:
         """Values (n, 3), written to the address `out`; `keep` activations of all blocks for backward, else
         `state` needs room for one block."""

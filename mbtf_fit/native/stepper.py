@@ -1,31 +1,30 @@
-"""One step of training by the kernel."""
+"""One step of training by the kernel. Adam works on the state of PyTorch's own optimizer, so that both are
+interchangeable."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import ctypes
+import math
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
 
 from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.models.interface import NeuralMaterial
-from mbtf_fit.native.adam import adam
 from mbtf_fit.native.blur import Blur
 from mbtf_fit.native.gradients import NativeGradients
-from mbtf_fit.native.library import Kernel
-from mbtf_fit.native.model import NativeModel, networks, parameters_of
+from mbtf_fit.native.library import AdamStep, Kernel
+from mbtf_fit.native.model import NativeModel, networks, parameters_of, share
 from mbtf_fit.objective.losses import Objective
 from mbtf_fit.objective.parallel import Workers
 
+# Parameters with fewer numbers are updated by one thread.
+_SMALL = 1 << 14
+
 
 class NativeStepper:
-    """Training steps of one model.
-
-    Parameters
-    ----------
-    model : supported by the kernel
-    optimizer : state and learning rates
-    """
+    """Training steps of one model that the kernel supports."""
 
     def __init__(self, kernel: Kernel, model: NeuralMaterial, optimizer: torch.optim.Adam) -> None:
         self.kernel = kernel
@@ -33,10 +32,10 @@ class NativeStepper:
         self.optimizer = optimizer
         self._native = NativeModel(kernel, model)
         self._gradients = NativeGradients(self._native)
-        texels = [texture.texels for texture in model.textures()]
-        self._tables = [torch.empty_like(t) for t in texels]
-        self._between = [torch.empty_like(t) for t in texels]
-        self._blurred = [torch.empty_like(t) for t in texels]
+        # Memory for the blur of each texture and of its gradient.
+        self._tables, self._between, self._blurred = (
+            [torch.empty_like(texture.texels) for texture in model.textures()] for _ in range(3)
+        )
 
     def step(
         self, objective: Objective, batch: TrainingQueries, sigmas: Sequence[float], workers: Workers
@@ -63,3 +62,38 @@ class NativeStepper:
             found.update(zip(parameters_of(network), gradients, strict=True))
         adam(self.kernel, self.optimizer, found, workers)
         return loss
+
+
+def adam(
+    kernel: Kernel, optimizer: torch.optim.Adam, gradients: Mapping[Tensor, Tensor], workers: Workers
+) -> None:
+    """One step for the parameters that have a gradient (contiguous float32, same shape), as
+    ``optimizer.step()`` takes it, on the same state: without weight decay, with the groups' rates and
+    decays."""
+    tasks: list[tuple[AdamStep, Tensor, Tensor, Tensor, Tensor]] = []
+    for group in optimizer.param_groups:
+        beta1, beta2 = group["betas"]
+        for parameter in group["params"]:
+            gradient = gradients.get(parameter)
+            if gradient is None:
+                continue
+            state = optimizer.state[parameter]
+            if not state:
+                zeros = {name: torch.zeros_like(parameter) for name in ("exp_avg", "exp_avg_sq")}
+                state.update(step=torch.zeros(()), **zeros)
+            state["step"] += 1
+            t = float(state["step"])
+            step = AdamStep(
+                float(group["lr"]) / (1 - beta1**t), beta1, beta2, group["eps"], math.sqrt(1 - beta2**t)
+            )
+            tasks.append((step, gradient, parameter, state["exp_avg"], state["exp_avg_sq"]))
+
+    def step_part(part: int) -> None:
+        for step, *tensors in tasks:
+            n = tensors[0].numel()
+            first, last = share(n, part, workers.count, whole=n < _SMALL)
+            if first < last:
+                addresses = (tensor.data_ptr() + 4 * first for tensor in tensors)
+                kernel.library.mbtf_adam(kernel.variant, ctypes.byref(step), last - first, *addresses)
+
+    workers.each(step_part)

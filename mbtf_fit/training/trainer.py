@@ -25,7 +25,7 @@ from mbtf_fit.material.inference import predict
 from mbtf_fit.models.interface import NeuralMaterial
 from mbtf_fit.models.neumip import Neumip
 from mbtf_fit.native import kernel
-from mbtf_fit.native.model import unsupported_reason
+from mbtf_fit.native.model import supports
 from mbtf_fit.native.stepper import NativeStepper
 from mbtf_fit.objective.losses import Objective
 from mbtf_fit.objective.noise import NoiseModel
@@ -86,9 +86,7 @@ class Trainer:
         self.weight_decay = WeightDecay.of(config.training, noise.ratio, len(queries))
         found = kernel()
         self._stepper = (
-            NativeStepper(found, model, self.optimizer)
-            if found is not None and unsupported_reason(model) is None
-            else None
+            NativeStepper(found, model, self.optimizer) if found is not None and supports(model) else None
         )
 
     @property

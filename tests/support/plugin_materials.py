@@ -64,6 +64,11 @@ def write_material(
     )
 
 
+def net(**options: Any) -> dict[str, Any]:
+    """The option of :func:`write_material` for an architecture."""
+    return {"network": options}
+
+
 def deviation(found: np.ndarray, wanted: np.ndarray) -> float:
     """Largest difference as a share of max(value, mean)."""
     return float((np.abs(found - wanted) / np.maximum(wanted, wanted.mean())).max())

@@ -36,6 +36,17 @@ def plane(bsdf: dict[str, Any], to_uv: Any = None, aspect: float = 1.0, half: fl
     return mesh
 
 
+def interaction(n: int, wi: tuple[float, float, float], **fields: Any) -> Any:
+    """`n` hits on a plane with the normal z, seen from `wi`."""
+    si = dr.zeros(mi.SurfaceInteraction3f, n)
+    si.n = mi.Normal3f(0, 0, 1)
+    si.sh_frame = mi.Frame3f(si.n)
+    si.wi = dr.normalize(mi.Vector3f(*wi))
+    for name, value in fields.items():
+        setattr(si, name, value)
+    return si
+
+
 def sensor_of(camera: Camera, spp: int = 1) -> dict[str, Any]:
     """The same camera as a sensor of Mitsuba."""
     target = np.array([*camera.target, 0.0])

@@ -6,6 +6,7 @@ unit irradiance on the plane.
 
 from __future__ import annotations
 
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -35,22 +36,14 @@ def panels(evaluator: Evaluator, section: SheetSection) -> F32:
     """
     aspect = evaluator.lattice.aspect
     lights = [from_angles(light.elevation, light.azimuth) for light in section.lights]
+    size, target = section.size, (0.5, 0.5 * aspect)
     pictures = []
-    for view in section.views:
-        for light in lights:
-            for tiles_across in section.tiles_across:
-                camera = Camera(
-                    view.elevation,
-                    view.azimuth,
-                    tiles_across=tiles_across,
-                    target=(0.5, 0.5 * aspect),
-                    rows=section.size,
-                    columns=section.size,
-                )
-                q = camera.queries(light, aspect).flat()
-                pictures.append(evaluator.evaluate(q.u, q.sigma, q.omega_i, q.omega_o))
+    for view, light, tiles_across in product(section.views, lights, section.tiles_across):
+        camera = Camera(view.elevation, view.azimuth, tiles_across, target, rows=size, columns=size)
+        q = camera.queries(light, aspect).flat()
+        pictures.append(evaluator.evaluate(q.u, q.sigma, q.omega_i, q.omega_o))
     lead = (len(section.views), len(lights), len(section.tiles_across))
-    return np.stack(pictures).reshape(*lead, section.size, section.size, 3)
+    return np.stack(pictures).reshape(*lead, size, size, 3)
 
 
 def contact_sheet(values: F32, section: SheetSection) -> NDArray[np.uint8]:
@@ -74,16 +67,14 @@ def contact_sheet(values: F32, section: SheetSection) -> NDArray[np.uint8]:
                 top = MARGIN + CAPTION + row * pitch
                 sheet.paste(picture, (left, top))
                 if view == light == 0:
-                    _label(draw, (left, top + size), _tiles(section.tiles_across[row]), font)
+                    across = section.tiles_across[row]
+                    label = f"{across:g} tile{'' if across == 1 else 's'} wide"
+                    _label(draw, (left, top + size), label, font)
     return np.asarray(sheet)
 
 
 def _caption(name: str, direction: Direction) -> str:
     return f"{name} {direction.elevation:g}°, {direction.azimuth:g}°"
-
-
-def _tiles(tiles_across: float) -> str:
-    return f"{tiles_across:g} tile{'' if tiles_across == 1 else 's'} wide"
 
 
 def _label(draw: ImageDraw.ImageDraw, corner: tuple[int, int], text: str, font: Any) -> None:

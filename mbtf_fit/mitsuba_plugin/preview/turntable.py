@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -86,44 +86,35 @@ def _mesh(name: str, bsdf: BSDF, position: Any, uv: Any, faces: Any, normals: An
     return mesh
 
 
-def _camera(turned: float) -> Any:
-    """Camera to world, after a rotation of the plate in degrees."""
-    towards = from_angles(CAMERA[0], CAMERA[1] - turned)
+def _transforms(turned: float) -> dict[str, Any]:
+    """Camera and lights to world, after a rotation of the plate in degrees; lights emit along +z of their own
+    frames."""
+    camera, key, rim = (from_angles(elevation, azimuth - turned) for elevation, azimuth in (CAMERA, KEY, RIM))
     target = np.array([0.0, 0.0, -0.25])
-    origin = target + 2.1 / np.tan(np.radians(FIELD_OF_VIEW / 2.0)) * towards
-    return mi.ScalarTransform4f().look_at([*map(float, origin)], [*map(float, target)], [0.0, 0.0, 1.0])
-
-
-def _light(angles: tuple[float, float], turned: float) -> Any:
-    """Light to world: it emits along +z of its own frame."""
-    towards = from_angles(angles[0], angles[1] - turned)
-    return mi.ScalarTransform4f().look_at([0.0, 0.0, 0.0], [*map(float, -towards)], [0.0, 0.0, 1.0])
+    origin = target + 2.1 / np.tan(np.radians(FIELD_OF_VIEW / 2.0)) * camera
+    ends = {"sensor": (origin, target), "key": (np.zeros(3), -key), "rim": (np.zeros(3), -rim)}
+    return {
+        name: mi.ScalarTransform4f().look_at(a.tolist(), b.tolist(), [0.0, 0.0, 1.0])
+        for name, (a, b) in ends.items()
+    }
 
 
 def scene_of(bsdf: BSDF, section: TurntableSection) -> Scene:
     """The scene before its rotation."""
-
-    def directional(angles: tuple[float, float], irradiance: float) -> dict[str, Any]:
-        return {"type": "directional", "to_world": _light(angles, 0.0), "irradiance": irradiance}
-
+    at = _transforms(0.0)
     return mi.load_dict(
         {
             "type": "scene",
             "ball": ball(bsdf, section.tiles),
             "plate": plate(bsdf, section.tiles),
-            "key": directional(KEY, KEY_IRRADIANCE),
-            "rim": directional(RIM, RIM_IRRADIANCE),
+            "key": {"type": "directional", "to_world": at["key"], "irradiance": KEY_IRRADIANCE},
+            "rim": {"type": "directional", "to_world": at["rim"], "irradiance": RIM_IRRADIANCE},
             "sky": {"type": "constant", "radiance": SKY},
             "sensor": {
                 "type": "perspective",
                 "fov": FIELD_OF_VIEW,
-                "to_world": _camera(0.0),
-                "film": {
-                    "type": "hdrfilm",
-                    "width": section.size,
-                    "height": section.size,
-                    "pixel_format": "rgb",
-                },
+                "to_world": at["sensor"],
+                "film": {"type": "hdrfilm", "width": section.size, "height": section.size},
                 "sampler": {"type": "independent"},
             },
         }
@@ -136,28 +127,21 @@ def frames(bsdf: BSDF, section: TurntableSection) -> Iterator[F32]:
     integrator = mi.load_dict({"type": "mbtf_path", "max_depth": 4})
     parameters = mi.traverse(scene)
     for frame in range(section.frames):
-        turned = 360.0 * frame / section.frames
-        parameters["sensor.to_world"] = mi.Transform4f(_camera(turned))
-        for name, angles in (("key", KEY), ("rim", RIM)):
-            parameters[f"{name}.to_world"] = mi.Transform4f(_light(angles, turned))
+        for name, to_world in _transforms(360.0 * frame / section.frames).items():
+            parameters[f"{name}.to_world"] = mi.Transform4f(to_world)
         parameters.update()
         picture = mi.render(scene, integrator=integrator, spp=section.spp, seed=frame)
         dr.eval(picture)
         yield np.array(picture, np.float32)
 
 
-def exposure_of(picture: F32) -> float:
-    """Factor that maps the 90th percentile of all pixels but the sky to 0.6."""
-    bright = picture.mean(-1)
+def to_pictures(linear: Sequence[F32]) -> list[NDArray[np.uint8]]:
+    """8-bit frames of one exposure, which maps the 90th percentile of all pixels of the first but the sky to
+    0.6."""
+    bright = linear[0].mean(-1)
     shown = bright[np.abs(bright - SKY) > 1e-3 * SKY]
     level = float(np.percentile(shown, 90)) if shown.size else 0.0
-    return 0.6 / level if level > 0 else 1.0
-
-
-def to_pictures(linear: Sequence[F32]) -> list[NDArray[np.uint8]]:
-    """8-bit frames of equal exposure."""
-    exposure = exposure_of(linear[0])
-    return [to_display(picture, exposure) for picture in linear]
+    return [to_display(picture, 0.6 / level if level > 0 else 1.0) for picture in linear]
 
 
 def write_gif(path: Path, pictures: Sequence[NDArray[np.uint8]]) -> None:
@@ -169,8 +153,5 @@ def write_gif(path: Path, pictures: Sequence[NDArray[np.uint8]]) -> None:
     ]
     pause = max(20, round(TURN / len(coded)))
 
-    def save(file: BinaryIO) -> None:
-        options = {"append_images": coded[1:], "duration": pause, "loop": 0, "optimize": False}
-        coded[0].save(file, format="GIF", save_all=True, **options)
-
-    write_file(path, save)
+    options = {"append_images": coded[1:], "duration": pause, "loop": 0, "optimize": False}
+    write_file(path, lambda file: coded[0].save(file, format="GIF", save_all=True, **options))

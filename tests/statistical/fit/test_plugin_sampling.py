@@ -12,12 +12,12 @@ import pytest
 from support.chi_square import Cap, chi_square_test
 from support.fit_data import random_directions
 from support.plugin_materials import write_material
-from support.plugin_scenes import plane
+from support.plugin_scenes import interaction, plane
 from support.scenes import mi
 
 from mbtf_core.lattice import Lattice
 from mbtf_core.stats import Estimate, t_test
-from mbtf_fit.mitsuba_plugin.lobe_fit import lobes_of
+from mbtf_fit.mitsuba_plugin.lobe_fit import fit_lobes
 from mbtf_fit.mitsuba_plugin.lobes import Lobe, LobeTextures, Mixture
 
 COUNT = 32
@@ -94,10 +94,10 @@ def second_moment(value: Any, mixture: Mixture, n: int) -> tuple[float, float]:
     return float(x.mean()), float(x.var())
 
 
-def test_the_lobes_of_a_known_material_are_found() -> None:
+def test_the_fit_lobes_a_known_material_are_found() -> None:
     """Its parameters, and a variance far below the cosine's."""
     glossy: Any = Glossy()
-    levels = lobes_of(glossy)
+    levels = fit_lobes(glossy)
     assert [level.shape for level in levels] == [(1, 1, 8), (2, 2, 8)]
     found = np.mean([texel for level in levels for texel in level.reshape(-1, 8)], 0)
     np.testing.assert_allclose(found[[0, 2]], Glossy.alphas, rtol=0.25)
@@ -125,7 +125,7 @@ def test_a_lambert_material_keeps_the_cosine() -> None:
         features=lambda u, level, viewer: [],
         value=lambda features, light, viewer: mi.Color3f(0.2),
     )
-    assert np.concatenate([level[..., 5:].ravel() for level in lobes_of(evaluator)]).max() == 0
+    assert np.concatenate([level[..., 5:].ravel() for level in fit_lobes(evaluator)]).max() == 0
 
 
 @pytest.fixture(scope="module")
@@ -139,13 +139,9 @@ def test_weights_are_value_over_density_of_the_same_directions(folder: Path) -> 
     """sample, eval, pdf and eval_pdf of the plugin agree, and its samples pass χ² through a turned frame."""
     bsdf = mi.load_dict({"type": "mbtf", "material": str(folder), "networks": "cooperative"})
     n = 100_000
-    si = dr.zeros(mi.SurfaceInteraction3f, n)
-    si.n = mi.Normal3f(0, 0, 1)
-    si.sh_frame = mi.Frame3f(si.n)
-    si.uv = mi.Point2f(0.3, 1.7)
-    si.dp_du, si.dp_dv = mi.Vector3f(0.6, 0.8, 0), mi.Vector3f(0.8, -0.3, 0)
-    si.duv_dx, si.duv_dy = mi.Vector2f(0.1, 0.02), mi.Vector2f(0.01, 0.3)
-    si.wi = dr.normalize(mi.Vector3f(0.5, 0.4, 0.5))
+    partials = {"dp_du": mi.Vector3f(0.6, 0.8, 0), "dp_dv": mi.Vector3f(0.8, -0.3, 0)}
+    pixel = {"duv_dx": mi.Vector2f(0.1, 0.02), "duv_dy": mi.Vector2f(0.01, 0.3)}
+    si = interaction(n, (0.5, 0.4, 0.5), uv=mi.Point2f(0.3, 1.7), **partials, **pixel)
     context = mi.BSDFContext()
     bs, weight = bsdf.sample(context, si, *uniform(n, 3))
     kept = np.array(bs.pdf) > 0

@@ -10,63 +10,46 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from support.plugin_materials import net, write_material
 
 from mbtf_core.errors import InputError
 from mbtf_core.lattice import Lattice
-from mbtf_fit import FitConfig, Material
+from mbtf_fit import Material
 from mbtf_fit.material.export import to_half, write_layers, write_textures
 from mbtf_fit.material.material import export
 from mbtf_fit.material.transmittance import Transmittance
-from mbtf_fit.models.registry import build_model
 
 F64 = NDArray[np.float64]
 
 
-def of(model: str, **network: Any) -> tuple[str, dict[str, Any]]:
-    return model, network
-
-
 FILTERED = {"raw": True, "band_attenuation": True, "footprint_filtered": True}
-CASES: dict[str, tuple[str, dict[str, Any]]] = {
-    "baseline": of("neumip-baseline"),
-    "calibrated": of("neumip"),
-    "with holes": of("neumip"),
-    "neumip": of("neumip"),
-    "direct, six outputs": of("neumip", offset="direct", output_channels=6, activation="leaky-relu"),
-    "concatenated": of("neumip", blending="concatenate", activation="sine", output_transform="softplus"),
-    "hierarchical": of("hierarchical"),
-    "eleven channels": of(
-        "hierarchical", decoder="mlp", channels=11, encoding={"raw": True, "direction_xyz": True}
-    ),
-    "encoded": of("neumip", encoding={"position": 4, "direction": 2, "direction_pi": False, **FILTERED}),
+CASES: dict[str, dict[str, Any]] = {
+    "baseline": {"model": "neumip-baseline"},
+    "calibrated": {},
+    "with holes": {},
+    "neumip": {},
+    "direct, six outputs": net(offset="direct", output_channels=6, activation="leaky-relu"),
+    "concatenated": net(blending="concatenate", activation="sine", output_transform="softplus"),
+    "hierarchical": {"model": "hierarchical"},
+    "eleven channels": {
+        "model": "hierarchical",
+        **net(decoder="mlp", channels=11, encoding={"raw": True, "direction_xyz": True}),
+    },
+    "encoded": net(encoding={"position": 4, "direction": 2, "direction_pi": False, **FILTERED}),
 }
 
 
-def make(case: str, folder: Path, scale: float = 1.0) -> Material:
-    name, options = CASES[case]
-    config = FitConfig.model_validate({"model": name, "network": options})
-    model = build_model(name, Lattice(4, 0.5), **options)
-    generator = torch.Generator().manual_seed(0)
-    model.initialize(generator, 0.1)
-    for texture in model.textures():
-        torch.nn.init.normal_(texture.texels, 0.0, scale, generator=generator)
-    with torch.no_grad():
-        for parameter in model.parameters():
-            if parameter.ndim == 1:
-                parameter.add_(0.1 * torch.randn(parameter.shape, generator=generator))
-    model.requires_grad_(False)
-    lattice, holes = model.lattice, None
+def make(case: str, folder: Path, contrast: float = 1.0) -> Material:
+    generator, lattice = torch.Generator().manual_seed(0), Lattice(4, 0.5)
+    options = {"finest": 4, "aspect": 0.5, "contrast": contrast, **CASES[case]}
     if case == "calibrated":
-        calibration = 0.7 + 0.6 * torch.rand((2, lattice.finest + 1, 6, 3), generator=generator)
-        model.load_weights(model.weights() | {"calibration": calibration})
+        calibration = 0.7 + 0.6 * torch.rand((2, 5, 6, 3), generator=generator)
+        options["weights"] = {"calibration": calibration}
     if case == "with holes":
-        shapes = [(*lattice.shape(s), 6) for s in range(lattice.finest + 1)]
-        holes = Transmittance(
-            lattice, [0.3 + 0.2 * torch.randn(s, generator=generator).numpy() for s in shapes]
-        )
-    folder.mkdir(parents=True, exist_ok=True)
-    training = {"steps": 1, "batch": 1, "seconds": 0.0, "device": "cpu", "threads": 1, "errors": {}}
-    return export(model, config, folder, data={}, training=training, transmittance=holes)
+        shapes = [(*lattice.shape(s), 6) for s in range(5)]
+        coefficients = [0.3 + 0.2 * torch.randn(s, generator=generator).numpy() for s in shapes]
+        options["transmittance"] = Transmittance(lattice, coefficients)
+    return write_material(folder, **options)
 
 
 class Reader:
@@ -286,4 +269,4 @@ def test_a_material_in_half_precision_loads_like_any_other(tmp_path: Path) -> No
 
 def test_numbers_beyond_half_precision_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"'pyramid\.\d' holds .* beyond half precision"):
-        to_half(make("neumip", tmp_path, scale=1e5))
+        to_half(make("neumip", tmp_path, contrast=1e5))

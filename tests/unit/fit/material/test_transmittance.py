@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -101,26 +100,6 @@ def test_a_fit_writes_it_beside_the_weights_and_only_for_holes(tmp_path: Path) -
     with pytest.raises(InputError, match="is missing, or its SHA-256") as caught:
         read_transmittance(tmp_path / "b", description)
     check_message(caught.value)
-
-
-def test_passes_over_the_data_change_nothing_but_memory(tmp_path: Path) -> None:
-    """Sums that take more than they may are made band by band, to the last bit alike."""
-    data = Dataset.open(
-        write_data(tmp_path, constant(0.2), train=20_000, finest=8, aspect=0.5, through=lace, noise=0.1)
-    )
-    found, peaks = [], []
-    for memory in (1e9, 1e6):
-        tracemalloc.start()
-        found.append(fit_transmittance(data, chosen(data), memory))
-        peaks.append(tracemalloc.get_traced_memory()[1])
-        tracemalloc.stop()
-    whole, banded = found
-    assert whole is not None
-    assert banded is not None
-    for mine, theirs in zip(whole.levels, banded.levels, strict=True):
-        np.testing.assert_array_equal(mine, theirs)
-    assert data.lattice.texels() * 27 * 8 > 7e6
-    assert peaks[0] - peaks[1] > 4e6
 
 
 @pytest.mark.parametrize("layout", ["shuffled", "image"])

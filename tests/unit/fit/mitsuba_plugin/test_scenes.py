@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
+from safetensors.numpy import load_file, save_file
 from support.plugin_materials import deviation, write_material
 from support.plugin_scenes import plane, sensor_of, through_pixel_centers
 from support.scenes import directional, mi
 
+from mbtf_core.digest import file_sha256
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import InputError, MbtfError, UsageError
 from mbtf_core.lattice import Lattice
@@ -93,12 +97,14 @@ def seen_places(camera: Camera) -> np.ndarray:
     return (camera.position + ray * (camera.position[2] / -ray[..., 2:]))[..., :2]
 
 
-def test_more_samples_per_pixel_do_not_narrow_the_footprint(tmp_path: Path) -> None:
+def write_levels(folder: Path) -> Material:
     """Levels of different constant features: brightness depends on σ."""
-    import torch
-
     levels = {f"pyramid.{s}": torch.full((2**s, 2**s, 7), 0.5 * s) for s in range(5)}
-    fitted = write_material(tmp_path, model="neumip-baseline", finest=4, weights=levels)
+    return write_material(folder, model="neumip-baseline", finest=4, weights=levels)
+
+
+def test_more_samples_per_pixel_do_not_narrow_the_footprint(tmp_path: Path) -> None:
+    fitted = write_levels(tmp_path)
     camera = Camera(elevation=70.0, tiles_across=3.0, rows=8, columns=8)
     wanted = fitted.predict(camera.queries(LIGHT).flat()).mean()  # type: ignore[arg-type]
     at_double = camera.queries(LIGHT).flat()
@@ -112,10 +118,7 @@ def test_more_samples_per_pixel_do_not_narrow_the_footprint(tmp_path: Path) -> N
 @pytest.mark.parametrize("share", [0.05, 0.5, 0.95])
 def test_holes_do_not_change_the_cone(tmp_path: Path, share: float) -> None:
     """The cone passes a transparent sheet unchanged: a plane whose brightness depends on σ looks the same."""
-    import torch
-
-    levels = {f"pyramid.{s}": torch.full((2**s, 2**s, 7), 0.5 * s) for s in range(5)}
-    fitted = write_material(tmp_path / "plane", model="neumip-baseline", finest=4, weights=levels)
+    fitted = write_levels(tmp_path / "plane")
     texel = np.zeros((1, 1, 6), np.float32)
     texel[..., 0] = 1.0
     hole = Transmittance(Lattice(0), [texel])
@@ -246,12 +249,6 @@ def test_a_refused_material_does_not_affect_later_renders(material: tuple[Path, 
 
 def test_deviations_from_conformance_values_are_refused(tmp_path: Path) -> None:
     """A material whose conformance values say otherwise than its weights."""
-    import json
-
-    from safetensors.numpy import load_file, save_file
-
-    from mbtf_core.digest import file_sha256
-
     write_material(tmp_path)
     path = tmp_path / "weights.safetensors"
     tensors = load_file(path)

@@ -11,7 +11,7 @@ import pytest
 import torch
 from support.fit_data import random_queries
 from support.fuzzing import check_message
-from support.plugin_materials import deviation, write_material
+from support.plugin_materials import deviation, net, write_material
 from support.scenes import mi
 
 from mbtf_core.errors import InputError
@@ -24,10 +24,6 @@ from mbtf_fit.mitsuba_plugin.evaluator import Evaluator  # noqa: E402
 from mbtf_fit.mitsuba_plugin.material_arrays import read_material  # noqa: E402
 
 RANDOM = torch.Generator().manual_seed(1)
-
-
-def net(**options: Any) -> dict[str, Any]:
-    return {"network": options}
 
 
 def calibration(levels: int) -> dict[str, Any]:
@@ -104,26 +100,6 @@ def test_the_inception_decoder_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="does not support the inception decoder") as caught:
         read_material(tmp_path)
     check_message(caught.value)
-
-
-def test_folders_that_are_no_material_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no such folder"):
-        read_material(tmp_path / "none")
-    with pytest.raises(InputError, match=r"no material\.json"):
-        read_material(tmp_path)
-    write_material(tmp_path)
-    path = tmp_path / "material.json"
-    text = path.read_text()
-    path.write_text(text.replace('"schema": 2', '"schema": 7'))
-    with pytest.raises(InputError, match="schema version 7, this program reads version 2"):
-        read_material(tmp_path)
-    path.write_text(text)
-    weights = tmp_path / "weights.safetensors"
-    content = bytearray(weights.read_bytes())
-    content[-1] ^= 1
-    weights.write_bytes(content)
-    with pytest.raises(InputError, match="is missing, or its SHA-256"):
-        read_material(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -19,11 +19,11 @@ from mbtf_fit.material.inference import evaluate_in_chunks, predict
 from mbtf_fit.models.neumip import Neumip
 from mbtf_fit.models.registry import build_model
 from mbtf_fit.native import library
-from mbtf_fit.native.adam import adam
-from mbtf_fit.native.blur import blur_table
+from mbtf_fit.native.blur import Blur
 from mbtf_fit.native.gradients import NativeGradients, query_pointers
 from mbtf_fit.native.library import Kernel, variants
-from mbtf_fit.native.model import _SIZES, _SUPPORTED, NativeModel, networks, parameters_of, unsupported_reason
+from mbtf_fit.native.model import _SIZES, _SUPPORTED, NativeModel, networks, parameters_of, supports
+from mbtf_fit.native.stepper import adam
 from mbtf_fit.objective.losses import Objective
 from mbtf_fit.objective.noise import NoiseModel
 from mbtf_fit.objective.parallel import Workers
@@ -160,7 +160,7 @@ def test_values_and_gradients_are_those_of_the_reference(
 def test_the_largest_networks_are_those_of_the_reference(variant: str) -> None:
     """The largest supported numbers of channels, features and layers."""
     model = random_model("neumip", LATTICE, channels=64, width=128, layers=16)
-    assert unsupported_reason(model) is None
+    assert supports(model)
     with torch.no_grad():
         for network in networks(model):
             # So many random layers would overflow exp.
@@ -261,7 +261,8 @@ def test_blur_is_that_of_the_reference(variant: str, aspect: float, sigma: float
     model = random_model("neumip", Lattice(6, aspect), channels=5)
     for texture in model.textures():
         with Workers(CPU, 2, limit=2) as workers:
-            found = blur_table(kernel_of(variant), texture, sigma, workers)
+            table, found = texture.texels.detach(), torch.empty_like(texture.texels)
+            Blur(kernel_of(variant), texture, sigma).apply(table, torch.empty_like(table), found, workers)
         torch.testing.assert_close(found, texture.blurred(sigma).detach(), rtol=1e-5, atol=1e-6)
 
 
@@ -350,13 +351,13 @@ def test_unsupported_options_use_pytorch() -> None:
     ]
     for option in options:
         model = build_model("neumip", LATTICE, **option)
-        assert unsupported_reason(model) is not None, option
-    assert unsupported_reason(build_model("hierarchical", LATTICE)) is not None
-    assert unsupported_reason(build_model("neumip", LATTICE).double()) is not None
+        assert not supports(model), option
+    assert not supports(build_model("hierarchical", LATTICE))
+    assert not supports(build_model("neumip", LATTICE).double())
     known: list[dict[str, Any]] = [{"offset": "none"}, {"channels": 64, "width": 128, "layers": 16}]
     known.append({"encoding": {"direction_xyz": True}})
     for option in known:
-        assert unsupported_reason(build_model("neumip", LATTICE, **option)) is None
+        assert supports(build_model("neumip", LATTICE, **option))
 
 
 @pytest.mark.parametrize("value", ["off", "z80"])
