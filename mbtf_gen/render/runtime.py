@@ -8,7 +8,6 @@ imported after :func:`load_mitsuba`.
 from __future__ import annotations
 
 import hashlib
-import os
 import platform
 import tempfile
 from collections.abc import Iterator
