@@ -44,25 +44,15 @@ class SmoothedDirectional(mi.Emitter):
         self.kernel = LightKernel(float(props.get("width", 1.0)))
         flags = mi.EmitterFlags.Infinite
         self.m_flags = flags | mi.EmitterFlags.DeltaDirection if self.kernel.is_delta else flags
-        self.kappa = dr.opaque(mi.Float, 0.0 if self.kernel.is_delta else self.kernel.kappa)
         direction = props.get("direction", mi.ScalarVector3f(0, 0, 1))
         self.set_directions(np.asarray(direction, np.float32).reshape(1, 3))
 
     def set_directions(self, omega_i: ArrayLike) -> None:
         """Set the light directions (n, 3) of a batch of queries; a single row is used for all rays."""
-        w = np.asarray(omega_i, np.float32)
-        self.omega_i = mi.Vector3f(w.T.copy())
-        self.inverse = mi.Float((1.0 / self.kernel.irradiance(w)).astype(np.float32))
-        dr.eval(self.omega_i, self.inverse)
+        self.lights = DirectionalLight.of(self.kernel, omega_i)
 
     def _light(self, time: Float) -> DirectionalLight:
-        index = dr.minimum(mi.UInt32(time), dr.width(self.inverse) - 1)
-        return DirectionalLight(
-            "delta" if self.kernel.is_delta else "lobe",
-            dr.gather(mi.Vector3f, self.omega_i, index),
-            dr.gather(mi.Float, self.inverse, index),
-            self.kappa,
-        )
+        return self.lights.at(dr.minimum(mi.UInt32(time), dr.width(self.lights.omega_i) - 1))
 
     def eval(self, si: SurfaceInteraction3f, active: Mask = True) -> Spectrum:
         """Radiance arriving against ``si.wi`` from above the horizon."""

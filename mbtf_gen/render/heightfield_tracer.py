@@ -1,7 +1,7 @@
 """Intersection of rays with the periodic height field of the displaced tile.
 
 The surface is a grid of cells, each of two triangles. A ray traverses a quadtree of blocks of cells. Each
-block stores a plane that bounds its surface from above (:mod:`~mbtf_gen.render.heightfield_nodes`). If the
+block stores a plane that bounds its surface from above (:mod:`~mbtf_gen.render.heightfield`). If the
 ray may intersect a block, traversal descends one level. Otherwise it skips the block, and ascends one level
 where the ray leaves the parent as well (Tevs, Ihrke and Seidel 2008, "Maximum mipmaps for fast, accurate,
 and scalable dynamic height field rendering", with planes in place of maxima). Cell indices wrap at the
@@ -23,7 +23,6 @@ import drjit as dr
 import mitsuba as mi
 
 from mbtf_gen.render.heightfield import HeightField
-from mbtf_gen.render.surface_interaction import interaction
 from mbtf_gen.render.types import (
     Float,
     Int32,
@@ -239,7 +238,7 @@ def _surface(
     )
     dz_dx, dz_dy = (node.y + fold) / heightfield.cell[0], (node.z + fold) / heightfield.cell[1]
     n = dr.normalize(mi.Normal3f(-dz_dx, -dz_dy, 1.0))
-    return interaction(p, n, d, heightfield.size, state.hit)
+    return heightfield.interaction(p, n, d, state.hit)
 
 
 @dr.syntax

@@ -18,7 +18,6 @@ from mbtf_gen.geometry.heightfield import HeightGrid
 from mbtf_gen.render.bsdf.plugin import SurfaceBSDF, surface_of
 from mbtf_gen.render.emitter import SmoothedDirectional
 from mbtf_gen.render.heightfield import HeightField
-from mbtf_gen.render.path_tracer import World
 from mbtf_gen.render.sensor import QuerySensor
 from mbtf_gen.render.types import BSDF
 
@@ -45,13 +44,16 @@ class Tile:
         Heights in tile widths.
     unit : float
         Scene units per tile width.
-    world : World
-        Geometry and reflection in scene units.
+    heightfield : HeightField
+        Geometry in scene units.
+    surface : Surface or MitsubaSurface
+        Reflection, see :mod:`mbtf_gen.render.bsdf.surface`.
     """
 
     grid: HeightGrid
     unit: float
-    world: World
+    heightfield: HeightField
+    surface: Any
 
     @property
     def aspect(self) -> float:
@@ -90,4 +92,4 @@ def build_tile(grid: HeightGrid, bsdf: Mapping[str, Any] | BSDF) -> Tile:
     register_plugins()
     unit = unit_of(grid.aspect)
     surface = surface_of(_load_bsdf(bsdf) if isinstance(bsdf, Mapping) else bsdf)
-    return Tile(grid, unit, World(HeightField.of(grid, unit, surface.transmits), surface))
+    return Tile(grid, unit, HeightField.of(grid, unit, surface.transmits), surface)
