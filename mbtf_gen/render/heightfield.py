@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -64,9 +64,9 @@ class HeightField:
     both_log2: Int32
     finest: Int32
     below: Int32
-    low: tuple[Float, ...]
-    cell: tuple[Float, ...]
-    size: tuple[Float, ...]
+    low: tuple[Float, Float]
+    cell: tuple[Float, Float]
+    size: tuple[Float, Float]
     bottom: Float
     top: Float
     offset: Float
@@ -86,25 +86,27 @@ class HeightField:
         cell = (size[0] / columns, size[1] / rows)
         extent = max(0.5 * size[0], 0.5 * size[1], grid.displacement_range * unit)
 
-        def floats(*numbers: float) -> Any:
-            return tuple(dr.opaque(mi.Float, float(x)) for x in numbers)
-
-        def integers(*numbers: int) -> Any:
-            return tuple(dr.opaque(mi.Int32, n) for n in numbers)
-
+        number, count = partial(dr.opaque, mi.Float), partial(dr.opaque, mi.Int32)
         # A copy: NumPy's memory need not have the alignment that reads of whole rows require.
-        nodes = mi.Float(np.concatenate(tables).ravel()) + dr.opaque(mi.Float, 0.0)
+        nodes = mi.Float(np.concatenate(tables).ravel()) + number(0.0)
         dr.eval(nodes)
         return cls(
             nodes,
-            *integers(columns, rows, rows * columns),
-            *integers(columns_log2, columns_log2 + rows_log2, min(columns_log2, rows_log2), len(tables[0])),
-            floats(0.5 * (cell[0] - size[0]), 0.5 * (cell[1] - size[1])),
-            floats(*cell),
-            floats(*size),
-            *floats(z.min(), z.max(), _RELATIVE_OFFSET * extent),
+            count(columns),
+            count(rows),
+            count(rows * columns),
+            count(columns_log2),
+            count(columns_log2 + rows_log2),
+            count(min(columns_log2, rows_log2)),
+            count(len(tables[0])),
+            (number(0.5 * (cell[0] - size[0])), number(0.5 * (cell[1] - size[1]))),
+            (number(cell[0]), number(cell[1])),
+            (number(size[0]), number(size[1])),
+            number(float(z.min())),
+            number(float(z.max())),
+            number(_RELATIVE_OFFSET * extent),
             two_sided,
-            powers=1 << columns_log2 == columns and 1 << rows_log2 == rows,
+            1 << columns_log2 == columns and 1 << rows_log2 == rows,
         )
 
     def leave(self, si: SurfaceInteraction3f, d: Vector3f) -> Ray3f:
