@@ -129,21 +129,10 @@ class QueryPlan:
     patch_size: int | None = None
 
     def draw(self, split: str, shard: int, rows: int) -> Queries:
-        """Sample the queries of one shard.
+        """Sample `rows` queries (shuffled layout) or images (image layout) of a shard.
 
-        Parameters
-        ----------
-        split : str
-            ``train``, ``test``, or a stream of :mod:`mbtf_gen.sampling.rng`.
-        shard : int
-            Number of the shard within the split.
-        rows : int
-            Number of queries (shuffled layout) or images (image layout).
-
-        Returns
-        -------
-        Queries
-            Leading axes ``(rows,)``, or ``(rows, height, width)`` of images.
+        The split is ``train``, ``test``, or a stream of :mod:`mbtf_gen.sampling.rng`. Leading axes are
+        ``(rows,)``, or ``(rows, height, width)`` of images.
         """
         generator = numpy_generator(self.root, split, shard, Purpose.QUERIES)
         sigma = self._sigma(generator, rows)

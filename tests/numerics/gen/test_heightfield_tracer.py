@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from support.scenes import HeightGrid, build_tile, lambert, mi, rocks
 
-from mbtf_gen.geometry.mesh import mesh_of_grid
+from mbtf_gen.geometry.heightfield import mesh_of_grid
 from mbtf_gen.render.heightfield import HeightField
 from mbtf_gen.render.heightfield_tracer import closest_hit, hit_and_shadow, occluded
 from mbtf_gen.sampling.rng import sequence
