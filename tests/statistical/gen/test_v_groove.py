@@ -1,34 +1,18 @@
-"""Symmetric V-grooves under a delta light have a closed form: shares of each facet that are lit and visible.
-
-Cross-section: ridges at x = 1/4 + n (height 0), valleys at x = 3/4 + n (height -h); the groove runs along y,
-so only ω_x/ω_z matters for occlusion, at any azimuth. From direction ω the lower part ``t`` of a facet is
-hidden by the ridge opposite it; lit and visible is ``1 - max(t_i, t_o)`` of the facet, because both hide its
-lower end.
-"""
+"""Symmetric V-grooves under a delta light: tile means and footprints against the closed form."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.special import ndtr
 from support.scenes import DIRECT, HeightGrid, direction, estimate, lambert, queries, tile_mean_queries
 
 from mbtf_core.stats import Estimate, aggregate_test, mean_of_halves, z_test
+from mbtf_gen.diagnostics.closed_forms import Groove
 from mbtf_gen.sampling.light_kernel import LightKernel
 
-HEIGHT = 0.4
-HALF = 0.5
 ALBEDO = 0.7
-SIDES = (1.0, -1.0)
-
-
-def grooves(count: int) -> HeightGrid:
-    """Grooves of the same shape, side by side across the tile."""
-    return HeightGrid(np.tile([0.0, -HEIGHT / count], (2, count)), 1.0)
-
-
-GROOVE = grooves(1)
+GROOVE = Groove(0.4, ALBEDO)
 
 PAIRS = [
     ((70, 0), (80, 0)),
@@ -41,59 +25,15 @@ PAIRS = [
 ]
 
 
-def normal(side: float) -> NDArray[np.float64]:
-    """Normal of the facet that descends from its ridge towards `side`·x."""
-    n = np.array([side * HEIGHT / HALF, 0.0, 1.0])
-    return n / np.linalg.norm(n)
-
-
-def hidden(omega: NDArray[np.float64], side: float) -> float:
-    """Share of a facet, from the valley up, that does not see direction ω."""
-    if normal(side) @ omega <= 0:
-        return 1.0
-    across = side * omega[0]
-    if across <= 0:
-        return 0.0
-    # The ray past the opposite ridge, 2·HALF away at height 0, meets the facet at this distance from its
-    # ridge.
-    reach = 2 * HALF - across * 2 * HEIGHT / (omega[2] + HEIGHT * across / HALF)
-    return float(np.clip((HALF - reach) / HALF, 0.0, 1.0))
-
-
-def facet_radiance(omega_i: NDArray[np.float64], side: float) -> float:
-    """Radiance of the lit part of a facet: albedo/π times the irradiance on it, 1 on the plane."""
-    return ALBEDO / np.pi * max(0.0, normal(side) @ omega_i) / omega_i[2]
-
-
-def tile_mean(omega_i: NDArray[np.float64], omega_o: NDArray[np.float64]) -> float:
-    """Closed form of the tile mean."""
-    total = 0.0
-    for side in SIDES:
-        share = 1 - max(hidden(omega_i, side), hidden(omega_o, side))
-        projected = HALF * max(0.0, normal(side) @ omega_o) / (normal(side)[2] * omega_o[2])
-        total += facet_radiance(omega_i, side) * share * projected
-    return total
-
-
 def footprint_mean(
     u: NDArray[np.float64], sigma: float, omega_i: NDArray[np.float64], omega_o: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Closed form of M at positions u (n,): Gaussian mass of each lit and visible facet, seen on the
-    reference plane."""
-    total = np.zeros_like(u)
-    for side in SIDES:
-        seen = 1 - max(hidden(omega_i, side), hidden(omega_o, side))
-        # Facet from its ridge (x = 1/4) down to where it is hidden; a point at depth z meets the plane at x
-        # + z·ω_x/ω_z.
-        slope = omega_o[0] / omega_o[2]
-        top = 0.25
-        low = 0.25 + side * HALF * seen + HEIGHT * seen * slope
-        left, right = min(top, low), max(top, low)
-        for n in range(-4, 6):
-            total += facet_radiance(omega_i, side) * (
-                ndtr((right + n - u) / sigma) - ndtr((left + n - u) / sigma)
-            )
-    return total
+    """Closed form convolved with the footprint, at positions u (n,)."""
+    n = 1 << 18
+    x = (np.arange(n) + 0.5) / n
+    damping = np.exp(-2.0 * (np.pi * sigma * np.arange(n // 2 + 1)) ** 2)
+    blurred = np.fft.irfft(np.fft.rfft(GROOVE.value(x, omega_i, omega_o)) * damping, n)
+    return np.interp(u, x, blurred, period=1.0)
 
 
 @pytest.mark.parametrize("count", [1, 1024])
@@ -102,9 +42,9 @@ def test_tile_mean(light: tuple[float, float], view: tuple[float, float], count:
     """Fine grooves have the mean of a large one. A ray offset of 5e-5 tile widths, Mitsuba's own, would lift
     rays out of them."""
     omega_i, omega_o = direction(*light), direction(*view)
-    expected = tile_mean(omega_i, omega_o)
+    expected = GROOVE.tile_mean(omega_i, omega_o)
     e = estimate(
-        grooves(count),
+        HeightGrid(np.tile(GROOVE.grid.z / count, count), 1.0),
         lambert(ALBEDO),
         LightKernel(0.0),
         tile_mean_queries(omega_i, omega_o, 20_000),
@@ -126,7 +66,7 @@ def test_finite_footprint(light: tuple[float, float], view: tuple[float, float],
     n = 3000
     u = np.random.default_rng(3).random((n, 2))
     e = estimate(
-        GROOVE,
+        GROOVE.grid,
         lambert(ALBEDO),
         LightKernel(0.0),
         queries(u, sigma, omega_i, omega_o, n),
@@ -159,7 +99,12 @@ def test_a_mirrored_offset_is_caught() -> None:
     n = 3000
     u = np.random.default_rng(3).random((n, 2))
     e = estimate(
-        GROOVE, lambert(ALBEDO), LightKernel(0.0), queries(u, 0.08, omega_i, omega_o, n), 64, transport=DIRECT
+        GROOVE.grid,
+        lambert(ALBEDO),
+        LightKernel(0.0),
+        queries(u, 0.08, omega_i, omega_o, n),
+        64,
+        transport=DIRECT,
     )
     mirrored = footprint_mean(1 - u[:, 0] - 0.5, 0.08, omega_i, omega_o)[:, None]
     assert aggregate_test(e.value_a[:, :1], e.value_b[:, :1], mirrored, mirrored, minimum=500).p_value < 1e-6
