@@ -66,7 +66,7 @@ def independent_points(sequence: Callable[..., Any]) -> Callable[..., Any]:
 def sides(job: Job, count: int, spp: int) -> tuple[dict[str, Callable[[int], Estimates]], float, Any]:
     """(what to run by name, seconds of the pilot, the queries)."""
     import mbtf_gen.render.estimator as module
-    from mbtf_gen.render import russian_roulette as tracing
+    from mbtf_gen.render import path_tracer as tracing
 
     plan = reference_plan(job)
     estimator = build_estimator(job, plan)

@@ -114,7 +114,7 @@ def stock_run(material: Material, grid: HeightGrid, count: int, spp: int) -> Run
     import drjit as dr
     import mitsuba as mi
 
-    from mbtf_gen.geometry.mesh import mesh_of_grid
+    from mbtf_gen.geometry.heightfield import mesh_of_grid
     from mbtf_gen.render.bsdf.plugin import bsdf_of
     from mbtf_gen.render.scene import unit_of
 

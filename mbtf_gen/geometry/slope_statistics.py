@@ -51,11 +51,7 @@ def autocorrelation(height: NDArray[np.floating[Any]], axis: int) -> NDArray[np.
     lines = np.moveaxis(np.asarray(height, np.float64), axis, -1)
     power = np.abs(np.fft.rfft(lines - lines.mean(), axis=-1)) ** 2
     covariance = np.fft.irfft(power.mean(axis=0), size)[: size // 2 + 1]
-    if covariance[0] <= 0:
-        out = np.zeros(size // 2 + 1)
-        out[0] = 1.0
-        return out
-    return covariance / covariance[0]
+    return covariance / covariance[0] if covariance[0] > 0 else np.eye(1, len(covariance))[0]
 
 
 def detail_size(height: NDArray[np.floating[Any]]) -> float:
@@ -67,9 +63,8 @@ def _half_width(correlation: NDArray[np.float64]) -> float:
     below = np.nonzero(correlation < 0.5)[0]
     if not len(below):
         return float(len(correlation))
-    after = int(below[0])
-    before = after - 1
-    drop = correlation[before] - correlation[after]
+    before = int(below[0]) - 1
+    drop = correlation[before] - correlation[before + 1]
     return before + float((correlation[before] - 0.5) / drop)
 
 

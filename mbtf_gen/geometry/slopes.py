@@ -58,8 +58,9 @@ def residual_slopes(
     carried = np.asarray(resample(height_slopes(grid), rows, columns), np.float64)
     # Heights need not tile: the cliff at a seam is no slope that the map could repeat.
     edge = [-(-2 * size // have) for size, have in zip((rows, columns), grid.z.shape, strict=True)]
+    if min(rows - 2 * edge[0], columns - 2 * edge[1]) < 1:
+        edge = [0, 0]
     inner = (slice(edge[0], rows - edge[0]), slice(edge[1], columns - edge[1]))
-    whole = min(rows - 2 * edge[0], columns - 2 * edge[1]) < 1
-    share = carried_share(stated, carried) if whole else carried_share(stated[inner], carried[inner])
+    share = carried_share(stated[inner], carried[inner])
     taken = 1.0 if mode == "absolute" else min(share, 1.0)
     return stated - taken * carried, share

@@ -29,15 +29,8 @@ class Target:
 
 @dataclass(frozen=True)
 class BadSample:
-    """A non-finite sample.
-
-    Attributes
-    ----------
-    query : int
-        Number of its query in the batch, or in the shard.
-    effect : str
-        Effect that caused it: ``direct light`` or ``interreflection``.
-    """
+    """A non-finite sample: number of its query in the shard, and the effect that caused it (``direct light``
+    or ``interreflection``)."""
 
     query: int
     effect: str
@@ -49,14 +42,9 @@ class TargetReached:
 
     Attributes
     ----------
-    queries : int
-        Number of queries.
-    missed : int
-        Queries that needed more paths than the cap.
-    worst : float
-        Largest error of a missed query that the pilot predicts; 0 without missed queries.
-    square : float
-        Mean square of the relative error, from the stored halves.
+    queries, missed : number of queries, and of those that needed more paths than the cap
+    worst : largest error of a missed query that the pilot predicts; 0 without missed queries
+    square : mean square of the relative error, from the stored halves
     """
 
     queries: int
@@ -75,16 +63,11 @@ class Estimates:
         Independent halves of spp/2 paths each, in 1/sr.
     transmittance : (n,) float32 array or None
         Fraction of the view rays that the opacity mask transmits; None without a mask.
-    paths : int
-        Paths traced.
-    lost : int
-        Rays that passed through the surface without a hit.
-    capped : int
-        Rays that reached the cap on crossings.
-    nonfinite : int
-        Non-finite samples, which were drawn again.
-    bad_samples : tuple of BadSample
-        The first of them, at most ``MOST_LOCATED``.
+    paths, lost, capped : int
+        Paths traced, rays that passed through the surface without a hit, and rays that reached the cap on
+        crossings.
+    nonfinite, bad_samples : int, tuple of BadSample
+        Number of non-finite samples, which were drawn again, and the first ``MOST_LOCATED`` of them.
     spp : (n,) int64 array or None
         Paths of each query, both halves together; None where all have the same number.
     path_variance : (n,) float32 array or None
@@ -112,14 +95,9 @@ class Stream:
 
     Attributes
     ----------
-    root : int
-        Root seed.
-    split : str
-        Split of the shard.
-    shard : int
-        Number of the shard in the split.
-    first_pass : int
-        Number of the first pass. Every pass draws all paths anew; later passes replace non-finite samples.
+    root, split, shard : root seed; split of the shard; number of the shard in the split
+    first_pass : number of the first pass. Every pass draws all paths anew; later passes replace non-finite
+        samples
     """
 
     root: int

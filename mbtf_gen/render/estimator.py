@@ -7,7 +7,6 @@ number in the shard, so values do not depend on how queries are grouped into lau
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import drjit as dr
@@ -18,9 +17,9 @@ from numpy.typing import NDArray
 from mbtf_core.errors import PartialError
 from mbtf_gen.render.directional_light import DirectionalLight
 from mbtf_gen.render.estimates import MOST_LOCATED, BadSample, Estimates, Stream
-from mbtf_gen.render.path_tracer import TraceOptions, Transport, trace
+from mbtf_gen.render.path_tracer import PathTracer, Transport
 from mbtf_gen.render.scene import CLEARANCE, Tile
-from mbtf_gen.render.types import Color3f, Float, Float64, Point2f, Ray3f, UInt32, Vector3f
+from mbtf_gen.render.types import Color3f, Float, Float64, Point2f, Ray3f, UInt32
 from mbtf_gen.sampling.light_kernel import LightKernel
 from mbtf_gen.sampling.query_sampler import Queries
 from mbtf_gen.sampling.rng import Purpose, sequence, stream_key, stream_number
@@ -43,99 +42,6 @@ class RaySource(Protocol):
 
     def ray(self, query: UInt32, point: Point2f) -> Ray3f:
         """Ray through such a point, in scene units."""
-
-
-def _position_key(point: Point2f) -> UInt32:
-    """Upper half of a path's sorting key: 8 bits of a Morton curve over the tile."""
-    cell = mi.Vector2u((point - dr.floor(point)) * 16.0)
-
-    def spread(x: UInt32) -> UInt32:
-        x = (x | (x << 2)) & 0x33
-        return (x | (x << 1)) & 0x55
-
-    return (spread(cell.x) | (spread(cell.y) << 1)) << 8
-
-
-def _direction_key(queries: Queries) -> UInt32:
-    """Lower half of the sorting key: 4 bits each of the cosines of ω_o and ω_i."""
-    view, light = (
-        np.clip(16.0 * omega[:, 2], 0, 15).astype(np.uint32) for omega in (queries.omega_o, queries.omega_i)
-    )
-    return _aligned(view << 4 | light)
-
-
-def _aligned(numbers: NDArray[Any]) -> UInt32:
-    """Lane numbers as a copy: NumPy's memory is aligned or not by chance, and kernels would be compiled for
-    either case."""
-    copied = mi.UInt32(numbers.astype(np.uint32)) + dr.opaque(mi.UInt32, 0)
-    dr.eval(copied)
-    return copied
-
-
-def _launches(counts: NDArray[np.int64], launch: int) -> list[slice]:
-    """Consecutive queries that together have at most `launch` paths, or one query that has more."""
-    ends = np.cumsum(counts)
-    out, start, traced = [], 0, 0
-    while start < len(counts):
-        stop = max(start + 1, int(np.searchsorted(ends, traced + launch, side="right")))
-        out.append(slice(start, stop))
-        start, traced = stop, int(ends[stop - 1])
-    return out
-
-
-@dataclass(frozen=True)
-class Lanes:
-    """The lanes of a launch: all paths of its queries, one query after the other.
-
-    Attributes
-    ----------
-    first : number of the first query in the shard
-    counts : (n,) paths of each query; starts : (n,) its first lane
-    query : query of each lane
-    start, half : first lane of each query, and the paths of one half
-    direction_key : lower half of the sorting key of each query
-    """
-
-    first: int
-    counts: NDArray[np.int64]
-    starts: NDArray[np.int64]
-    query: UInt32
-    start: UInt32
-    half: UInt32
-    direction_key: UInt32
-
-    @classmethod
-    def of(cls, first: int, counts: NDArray[np.int64], queries: Queries) -> Lanes:
-        """Lanes of consecutive queries."""
-        starts = np.cumsum(counts) - counts
-        query = np.repeat(np.arange(len(counts), dtype=np.uint32), counts)
-        columns = [*(_aligned(x) for x in (query, starts, counts // 2)), _direction_key(queries)]
-        return cls(first, counts, starts, *columns)
-
-    def number(self, lane: int) -> int:
-        """Number of a lane's query in the shard."""
-        return self.first + int(np.searchsorted(self.starts, lane, side="right")) - 1
-
-    def halves(self, x: Float | Color3f) -> NDArray[np.float64]:
-        """Mean of each half of each query, (n, 2, channels), of one number or color per lane."""
-        which = dr.arange(mi.UInt32, 2 * len(self.counts))
-        query, second = which >> 1, which & 1
-        half = dr.gather(mi.UInt32, self.half, query)
-        begin = dr.gather(mi.UInt32, self.start, query) + second * half
-        totals = [_sum_of(channel, begin, begin + half) for channel in (x if dr.depth_v(x) == 2 else [x])]
-        dr.eval(totals)
-        total = np.stack([np.array(t) for t in totals], axis=-1)
-        return total.reshape(len(self.counts), 2, -1) / (self.counts // 2)[:, None, None]
-
-
-@dr.syntax
-def _sum_of(x: Float, lane: UInt32, end: UInt32) -> Float64:
-    """Sums over ranges of lanes, in order, so that they do not depend on threads or launches."""
-    total, lane = mi.Float64(0.0), mi.UInt32(lane)
-    while dr.hint(lane < end, exclude=[x, end]):
-        total += mi.Float64(dr.gather(mi.Float, x, lane))
-        lane += 1
-    return total
 
 
 class Estimator:
@@ -165,11 +71,10 @@ class Estimator:
         self.light = light
         self.transport = transport
         self.launch = launch
-        self.holes = bool(tile.world.surface.parts.opacity)
+        self.holes = bool(tile.surface.parts.opacity)
         self._sensor = mi.load_dict(
             {"type": "mbtf_queries", "unit": tile.unit, "aspect": tile.aspect, "start": CLEARANCE}
         )
-        self._kappa = dr.opaque(mi.Float, 0.0 if light is None or light.is_delta else light.kappa)
 
     def estimate(
         self,
@@ -212,201 +117,240 @@ class Estimator:
         PartialError
             Samples stay non-finite after several draws; says which query and which effect.
         """
-        n = len(queries.sigma)
-        counts = np.full(n, spp, np.int64) if isinstance(spp, int) else spp
-        if n and (counts.min() < 2 or (counts % 2).any()):
+        counts = np.full(len(queries.sigma), spp, np.int64) if isinstance(spp, int) else spp
+        if counts.min() < 2 or (counts % 2).any():
             raise ValueError(f"spp must be even, for two equal halves, not {spp}")
-        options = TraceOptions(
-            dr.opaque(mi.UInt32, self.transport.limit if limit is None else limit),
-            dr.opaque(mi.UInt32, self.transport.roulette_depth if roulette is None else roulette),
-            path_variance,
-        )
+        most = dr.opaque(mi.UInt32, self.transport.limit if limit is None else limit)
+        late = dr.opaque(mi.UInt32, self.transport.roulette_depth if roulette is None else roulette)
         parts = [
-            self._batch(queries, rows, counts[rows], stream, source or self._sensor, options)
+            _Launch(
+                self, queries.take(rows), rows.start, counts[rows], stream, source or self._sensor, most, late
+            ).estimates(path_variance)
             for rows in _launches(counts, self.launch)
         ]
+
+        def joined(name: str) -> Any:
+            arrays = [getattr(p, name) for p in parts]
+            return None if arrays[0] is None else np.concatenate(arrays)
+
         return Estimates(
-            np.concatenate([p.value_a for p in parts]),
-            np.concatenate([p.value_b for p in parts]),
-            np.concatenate([p.transmittance for p in parts]) if self.holes else None,
+            joined("value_a"),
+            joined("value_b"),
+            joined("transmittance"),
             int(counts.sum()),
             sum(p.lost for p in parts),
             sum(p.capped for p in parts),
             sum(p.nonfinite for p in parts),
             tuple(b for p in parts for b in p.bad_samples)[:MOST_LOCATED],
             spp=None if isinstance(spp, int) else counts,
-            path_variance=np.concatenate([p.path_variance for p in parts]) if path_variance else None,
+            path_variance=joined("path_variance"),
         )
 
-    def _batch(
+
+class _Launch:
+    """All paths of consecutive queries, one lane per path, one query after the other.
+
+    Parameters
+    ----------
+    queries : the launch's queries; first : number of the first of them in the shard
+    counts : (n,) paths of each query
+    limit, roulette : as of :class:`~mbtf_gen.render.path_tracer.PathTracer`
+    """
+
+    def __init__(
         self,
+        estimator: Estimator,
         queries: Queries,
-        rows: slice,
+        first: int,
         counts: NDArray[np.int64],
         stream: Stream,
         source: RaySource,
-        options: TraceOptions,
-    ) -> Estimates:
-        part = queries.take(rows)
-        source.set_queries(part, rows.start)
-        omega_i = mi.Vector3f(part.omega_i.T.copy())
-        if self.light is None:
-            inverse = mi.Float(0.0)
-        else:
-            inverse = mi.Float((1.0 / self.light.irradiance(part.omega_i)).astype(np.float32))
-        # Evaluated before any kernel reads them: otherwise the number of queries would be part of the kernel.
-        dr.eval(omega_i, inverse)
-        lanes = Lanes.of(rows.start, counts, part)
+        limit: UInt32,
+        roulette: UInt32,
+    ) -> None:
+        self.estimator, self.first, self.counts, self.stream = estimator, first, counts, stream
+        self.source, self.limit, self.roulette = source, limit, roulette
+        source.set_queries(queries, first)
+        self.lights = DirectionalLight.of(estimator.light, queries.omega_i)
+        # First lane of each query, and the paths of one half of it.
+        self.starts = np.cumsum(counts) - counts
+        self.start, self.half = _aligned(self.starts), _aligned(counts // 2)
+        # Query of each lane.
+        self.query = _aligned(np.repeat(np.arange(len(counts), dtype=np.uint32), counts))
+        # Lower half of the sorting key: 4 bits each of the cosines of ω_o and ω_i.
+        view, light = (
+            np.clip(16.0 * w[:, 2], 0, 15).astype(np.uint32) for w in (queries.omega_o, queries.omega_i)
+        )
+        self.direction_key = _aligned(view << 4 | light)
 
-        def trace_lanes(which: UInt32 | None, attempt: int) -> tuple[Color3f, Float, int, int]:
-            return self._trace(source, lanes, which, stream, omega_i, inverse, attempt, options)
-
-        radiance, passed, lost, capped = trace_lanes(None, 0)
-        values = lanes.halves(radiance)
+    def estimates(self, path_variance: bool) -> Estimates:
+        """Estimates of the queries; samples that are not finite are drawn again."""
+        radiance, passed, lost, capped = self._trace()
+        values = self._halves(radiance)
         # Few launches have non-finite samples: their lanes are searched only then.
-        bad = np.zeros(0, np.uint32) if np.isfinite(values).all() else self._nonfinite(radiance)
+        bad = np.zeros(0, np.uint32) if np.isfinite(values).all() else _nonfinite(radiance)
+        located = self._located(bad[:MOST_LOCATED])
         nonfinite = len(bad)
-        located = self._located(source, lanes, bad[:MOST_LOCATED], stream, omega_i, inverse, options)
         for attempt in range(1, MAX_RESAMPLES + 1):
             if not len(bad):
                 break
-            again, through, more_lost, more_capped = trace_lanes(mi.UInt32(bad), attempt)
-            dr.scatter(radiance, again, mi.UInt32(bad))
-            dr.eval(radiance)
-            if self.holes:
-                dr.scatter(passed, through, mi.UInt32(bad))
-                dr.eval(passed)
+            lanes = mi.UInt32(bad)
+            again, through, more_lost, more_capped = self._trace(lanes, attempt)
+            dr.scatter(radiance, again, lanes)
+            if self.estimator.holes:
+                dr.scatter(passed, through, lanes)
+            dr.eval(radiance, passed)
             lost, capped = lost + more_lost, capped + more_capped
-            bad = bad[self._nonfinite(again)]
+            bad = bad[_nonfinite(again)]
             nonfinite += len(bad)
         if len(bad):
             raise PartialError(
                 f"{len(bad)} samples stay NaN or infinite after {MAX_RESAMPLES} draws, first at "
-                f"query {lanes.number(int(bad[0]))} ({located[0].effect})",
-                where=f"{stream.split} shard {stream.shard}",
+                f"query {self._number(bad[0])} ({located[0].effect})",
+                where=f"{self.stream.split} shard {self.stream.shard}",
                 hint="check the material's values",
             )
         if nonfinite:
-            values = lanes.halves(radiance)
+            values = self._halves(radiance)
         return Estimates(
             values[:, 0].astype(np.float32),
             values[:, 1].astype(np.float32),
-            lanes.halves(passed).mean(axis=(1, 2)).astype(np.float32) if self.holes else None,
-            int(counts.sum()),
+            self._halves(passed).mean(axis=(1, 2)).astype(np.float32) if self.estimator.holes else None,
+            int(self.counts.sum()),
             lost,
             capped,
             nonfinite,
             located,
-            path_variance=self._variances(lanes, radiance, values) if options.path_variance else None,
+            path_variance=self._variances(radiance, values) if path_variance else None,
         )
 
-    def _located(
-        self,
-        source: RaySource,
-        lanes: Lanes,
-        bad: NDArray[np.uint32],
-        stream: Stream,
-        omega_i: Vector3f,
-        inverse: Float,
-        options: TraceOptions,
-    ) -> tuple[BadSample, ...]:
+    def _number(self, lane: int) -> int:
+        """Number of a lane's query in the shard."""
+        return self.first + int(np.searchsorted(self.starts, lane, side="right")) - 1
+
+    def _halves(self, x: Float | Color3f) -> NDArray[np.float64]:
+        """Mean of each half of each query, (n, 2, channels), of one number or color per lane."""
+        which = dr.arange(mi.UInt32, 2 * len(self.counts))
+        query, second = which >> 1, which & 1
+        half = dr.gather(mi.UInt32, self.half, query)
+        begin = dr.gather(mi.UInt32, self.start, query) + second * half
+        totals = [_sum_of(channel, begin, begin + half) for channel in (x if dr.depth_v(x) == 2 else [x])]
+        dr.eval(totals)
+        total = np.stack([np.array(t) for t in totals], axis=-1)
+        return total.reshape(len(self.counts), 2, -1) / (self.counts // 2)[:, None, None]
+
+    def _variances(self, radiance: Color3f, values: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Sample variance of each query's paths, mean over channels."""
+        square = self._halves(dr.squared_norm(radiance)).mean(axis=(1, 2)) / 3.0
+        spread = square - np.mean(values.mean(axis=1) ** 2, axis=-1)
+        return np.maximum(spread * self.counts / (self.counts - 1), 0.0).astype(np.float32)
+
+    def _located(self, bad: NDArray[np.uint32]) -> tuple[BadSample, ...]:
         """Queries of non-finite lanes, and the effect at fault: direct light, if their paths are non-finite
         after one interaction."""
         if not len(bad):
             return ()
-        short = replace(options, limit=dr.opaque(mi.UInt32, 1))
-        radiance = self._trace(source, lanes, mi.UInt32(bad), stream, omega_i, inverse, 0, short)[0]
-        direct = np.isin(np.arange(len(bad)), self._nonfinite(radiance))
+        direct = _nonfinite(self._trace(mi.UInt32(bad), limit=dr.opaque(mi.UInt32, 1))[0])
         return tuple(
-            BadSample(lanes.number(int(lane)), "direct light" if at_once else "interreflection")
-            for lane, at_once in zip(bad, direct, strict=True)
+            BadSample(self._number(lane), "direct light" if k in direct else "interreflection")
+            for k, lane in enumerate(bad)
         )
 
-    def _variances(self, lanes: Lanes, radiance: Color3f, values: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Sample variance of each query's paths, mean over channels."""
-        square = lanes.halves(dr.squared_norm(radiance)).mean(axis=(1, 2)) / 3.0
-        spread = square - np.mean(values.mean(axis=1) ** 2, axis=-1)
-        return np.maximum(spread * lanes.counts / (lanes.counts - 1), 0.0).astype(np.float32)
-
-    def _nonfinite(self, radiance: Color3f) -> NDArray[np.uint32]:
-        finite = dr.isfinite(radiance.x) & dr.isfinite(radiance.y) & dr.isfinite(radiance.z)
-        if dr.all(finite)[0]:
-            return np.zeros(0, np.uint32)
-        return np.nonzero(~np.array(finite))[0].astype(np.uint32)
+    def _points(self, lane: UInt32, query: UInt32, purpose: Purpose, attempt: int) -> SobolSampler:
+        """Random numbers of paths."""
+        path = lane - dr.gather(mi.UInt32, self.start, query)
+        half = dr.gather(mi.UInt32, self.half, query)
+        second = path >= half
+        # Both halves take the same points, of differently scrambled sequences.
+        s, number = self.stream, self.stream.first_pass + attempt
+        keys = [stream_key(s.root, stream_number(s.split, s.shard, purpose, number, h)) for h in (1, 0)]
+        low, high = (
+            dr.select(second, *(dr.opaque(mi.UInt32, key >> shift & 0xFFFFFFFF) for key in keys))
+            for shift in (0, 32)
+        )
+        of_shard = query + dr.opaque(mi.UInt32, self.first)
+        return sequence(low, high, of_shard, dr.select(second, path - half, path))
 
     def _trace(
-        self,
-        source: RaySource,
-        lanes: Lanes,
-        which: UInt32 | None,
-        stream: Stream,
-        omega_i: Vector3f,
-        inverse: Float,
-        attempt: int,
-        options: TraceOptions,
+        self, which: UInt32 | None = None, attempt: int = 0, limit: UInt32 | None = None
     ) -> tuple[Color3f, Float, int, int]:
         """Radiance of some of the lanes (all, if None); with an opacity mask, 1 where the first ray was
         transmitted; counts of lost and capped rays."""
-
-        def generator(lane: UInt32, query: UInt32, purpose: Purpose) -> SobolSampler:
-            path = lane - dr.gather(mi.UInt32, lanes.start, query)
-            half = dr.gather(mi.UInt32, lanes.half, query)
-            second = path >= half
-            # Both halves take the same points, of differently scrambled sequences.
-            a, b = (
-                stream_key(
-                    stream.root,
-                    stream_number(stream.split, stream.shard, purpose, stream.first_pass + attempt, h),
-                )
-                for h in (0, 1)
-            )
-            words = [
-                dr.select(
-                    second,
-                    dr.opaque(mi.UInt32, b >> shift & 0xFFFFFFFF),
-                    dr.opaque(mi.UInt32, a >> shift & 0xFFFFFFFF),
-                )
-                for shift in (0, 32)
-            ]
-            number = query + dr.opaque(mi.UInt32, lanes.first)
-            return sequence(words[0], words[1], number, dr.select(second, path - half, path))
-
         everything = which is None
         if everything:
-            which, query = dr.arange(mi.UInt32, int(lanes.counts.sum())), lanes.query
+            which, query = dr.arange(mi.UInt32, int(self.counts.sum())), self.query
         else:
-            query = dr.gather(mi.UInt32, lanes.query, which)
-        point = source.footprint(query, generator(which, query, Purpose.FOOTPRINT).next_2d())
-        key = _position_key(point) | dr.gather(mi.UInt32, lanes.direction_key, query)
+            query = dr.gather(mi.UInt32, self.query, which)
+        xi = self._points(which, query, Purpose.FOOTPRINT, attempt).next_2d()
+        point = self.source.footprint(query, xi)
+        key = _position_key(point) | dr.gather(mi.UInt32, self.direction_key, query)
         dr.eval(point, key)
         order = _aligned(np.argsort(np.array(key).astype(np.uint16), kind="stable"))
 
         lane = order if everything else dr.gather(mi.UInt32, which, order)
-        query = dr.gather(mi.UInt32, lanes.query, lane)
-        ray = source.ray(query, dr.gather(mi.Point2f, point, order))
-        if self.light is None:
-            light = DirectionalLight("constant")
-        else:
-            light = DirectionalLight(
-                "delta" if self.light.is_delta else "lobe",
-                dr.gather(mi.Vector3f, omega_i, query),
-                dr.gather(mi.Float, inverse, query),
-                self._kappa,
-            )
-        path = trace(
-            self.tile.world,
-            ray,
-            light,
-            self.transport,
-            options,
-            generator(lane, query, Purpose.PATH),
-            mi.Bool(True),
+        query = dr.gather(mi.UInt32, self.query, lane)
+        tracer = PathTracer(
+            self.estimator.tile,
+            self.estimator.transport,
+            self.lights.at(query),
+            self.limit if limit is None else limit,
+            self.roulette,
         )
+        ray = self.source.ray(query, dr.gather(mi.Point2f, point, order))
+        path = tracer.trace(ray, self._points(lane, query, Purpose.PATH, attempt))
         radiance = dr.zeros(mi.Color3f, dr.width(which))
         dr.scatter(radiance, path.radiance, order)
         passed = None
-        if self.holes:
+        if self.estimator.holes:
             passed = dr.zeros(mi.Float, dr.width(which))
             dr.scatter(passed, dr.select(path.passed, 1.0, 0.0), order)
         dr.eval(radiance, passed, path.lost, path.capped)
         return radiance, passed, int(dr.count(path.lost)[0]), int(dr.sum(path.capped)[0])
+
+
+def _nonfinite(radiance: Color3f) -> NDArray[np.uint32]:
+    """Lanes of colors that are NaN or infinite."""
+    finite = dr.isfinite(radiance.x) & dr.isfinite(radiance.y) & dr.isfinite(radiance.z)
+    if dr.all(finite)[0]:
+        return np.zeros(0, np.uint32)
+    return np.nonzero(~np.array(finite))[0].astype(np.uint32)
+
+
+def _position_key(point: Point2f) -> UInt32:
+    """Upper half of a path's sorting key: 8 bits of a Morton curve over the tile."""
+    cell = mi.Vector2u((point - dr.floor(point)) * 16.0)
+
+    def spread(x: UInt32) -> UInt32:
+        x = (x | (x << 2)) & 0x33
+        return (x | (x << 1)) & 0x55
+
+    return (spread(cell.x) | (spread(cell.y) << 1)) << 8
+
+
+def _aligned(numbers: NDArray[Any]) -> UInt32:
+    """Lane numbers as a copy: NumPy's memory is aligned or not by chance, and kernels would be compiled for
+    either case."""
+    copied = mi.UInt32(numbers.astype(np.uint32)) + dr.opaque(mi.UInt32, 0)
+    dr.eval(copied)
+    return copied
+
+
+def _launches(counts: NDArray[np.int64], launch: int) -> list[slice]:
+    """Consecutive queries that together have at most `launch` paths, or one query that has more."""
+    ends = np.cumsum(counts)
+    out, start, traced = [], 0, 0
+    while start < len(counts):
+        stop = max(start + 1, int(np.searchsorted(ends, traced + launch, side="right")))
+        out.append(slice(start, stop))
+        start, traced = stop, int(ends[stop - 1])
+    return out
+
+
+@dr.syntax
+def _sum_of(x: Float, lane: UInt32, end: UInt32) -> Float64:
+    """Sums over ranges of lanes, in order, so that they do not depend on threads or launches."""
+    total, lane = mi.Float64(0.0), mi.UInt32(lane)
+    while dr.hint(lane < end, exclude=[x, end]):
+        total += mi.Float64(dr.gather(mi.Float, x, lane))
+        lane += 1
+    return total

@@ -1,7 +1,7 @@
 """Intersection of rays with the periodic height field of the displaced tile.
 
 The surface is a grid of cells, each of two triangles. A ray traverses a quadtree of blocks of cells. Each
-block stores a plane that bounds its surface from above (:mod:`~mbtf_gen.render.heightfield_nodes`). If the
+block stores a plane that bounds its surface from above (:mod:`~mbtf_gen.render.heightfield`). If the
 ray may intersect a block, traversal descends one level. Otherwise it skips the block, and ascends one level
 where the ray leaves the parent as well (Tevs, Ihrke and Seidel 2008, "Maximum mipmaps for fast, accurate,
 and scalable dynamic height field rendering", with planes in place of maxima). Cell indices wrap at the
@@ -23,17 +23,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mbtf_gen.render.heightfield import HeightField
-from mbtf_gen.render.surface_interaction import interaction
-from mbtf_gen.render.types import (
-    Float,
-    Int32,
-    Mask,
-    Ray3f,
-    SurfaceInteraction3f,
-    UInt32,
-    Vector3f,
-    Vector4f,
-)
+from mbtf_gen.render.types import Float, Int32, Mask, Ray3f, SurfaceInteraction3f, UInt32, Vector3f, Vector4f
 from mbtf_gen.sampling.sobol import SobolSampler
 
 # Smallest magnitude of a direction's component, which avoids 0/0 for rays parallel to an axis.
@@ -239,7 +229,7 @@ def _surface(
     )
     dz_dx, dz_dy = (node.y + fold) / heightfield.cell[0], (node.z + fold) / heightfield.cell[1]
     n = dr.normalize(mi.Normal3f(-dz_dx, -dz_dy, 1.0))
-    return interaction(p, n, d, heightfield.size, state.hit)
+    return heightfield.interaction(p, n, d, state.hit)
 
 
 @dr.syntax
@@ -350,15 +340,8 @@ def occluded(
     holes: Any = None,
     rng: SobolSampler | None = None,
 ) -> tuple[Mask, UInt32, Mask, Any]:
-    """Occlusion of rays by the periodic height field; parameters as of :func:`closest_hit`.
-
-    Returns
-    -------
-    blocked : Mask
-        Lanes whose ray is occluded; rays that reached the cap count as occluded.
-    crossings, capped, rng
-        As of :func:`closest_hit`.
-    """
+    """(lanes whose ray is occluded, crossings, capped lanes, state of the random numbers); parameters as of
+    :func:`closest_hit`. Rays that reached the cap count as occluded."""
     state, _, rng = _search(heightfield, ray, active, max_crossings, below, holes, rng)
     return state.hit | state.capped, state.crossings, state.capped, rng
 
@@ -373,19 +356,9 @@ def hit_and_shadow(
     below: Mask = False,
     shadow_below: Mask = False,
 ) -> tuple[SurfaceInteraction3f, Mask, Mask, Mask]:
-    """:func:`closest_hit` of a ray and :func:`occluded` of a shadow ray in one loop, for opaque surfaces.
-
-    Returns
-    -------
-    si : SurfaceInteraction3f
-        Hits of the first ray.
-    capped : Mask
-        Lanes whose first ray reached the cap.
-    blocked : Mask
-        Lanes whose shadow ray is occluded.
-    shadow_capped : Mask
-        Lanes whose shadow ray reached the cap.
-    """
+    """:func:`closest_hit` of a ray and :func:`occluded` of a shadow ray in one loop, for opaque surfaces:
+    (hits of the first ray, lanes where it reached the cap, lanes whose shadow ray is occluded, lanes where
+    that reached the cap)."""
     state, constants = _start(heightfield, ray, active, below)
     shadow, shadow_constants = _start(heightfield, shadow_ray, shadow_active, shadow_below)
     state, shadow = _follow_two(heightfield, state, constants, shadow, shadow_constants, max_crossings)

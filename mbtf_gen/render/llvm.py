@@ -1,4 +1,4 @@
-"""The LLVM library with which Dr.Jit compiles its CPU kernels: its path and its version.
+"""The LLVM library with which Dr.Jit compiles its CPU kernels.
 
 The distribution ``karellen-llvm-core`` contains ``libLLVM.so.N.M``. Dr.Jit reads ``DRJIT_LIBLLVM_PATH`` once,
 when it is first imported. Therefore :func:`~mbtf_gen.render.runtime.load_mitsuba` calls
@@ -11,7 +11,6 @@ from __future__ import annotations
 import ctypes
 import os
 import re
-import sys
 from pathlib import Path
 
 VARIABLE = "DRJIT_LIBLLVM_PATH"
@@ -19,11 +18,7 @@ CACHE_VARIABLE = "DRJIT_CACHE_DIR"
 # LLVM 14 is refused by Dr.Jit; 15 is accepted and then aborts the process at the first `minimum`.
 OLDEST_LLVM = 16
 
-Version = tuple[int, int, int]
-
-_DISTRIBUTION = re.compile(r"karellen_llvm_core-[^/]*\.dist-info")
-_RECORDED = re.compile(r"^([^,\n]*libLLVM\.(?:so\.[0-9.]+|dylib)),", re.MULTILINE)
-_NUMBERS = re.compile(r"libLLVM[-.](?:so\.)?(\d+)(?:\.(\d+))?(?:\.(\d+))?")
+_LIBRARY = re.compile(r"libLLVM\.(so\.[0-9.]+|dylib)")
 # Dependencies of libLLVM, in a folder beside it. It loads them by links to these names.
 _RUNTIME = ("libunwind.so.1.0", "libc++abi.so.1.0", "libc++.so.1.0")
 
@@ -34,22 +29,14 @@ def shipped_llvm() -> Path | None:
     It is found through the list of files of the installed distribution, in virtual environments, user and
     prefix installations alike.
     """
-    # importlib.metadata would find the same but takes ten times as long to import.
-    for entry in sys.path:
-        try:
-            names = [name for name in os.listdir(entry or ".") if _DISTRIBUTION.fullmatch(name)]
-        except OSError:
-            continue
-        for name in names:
-            try:
-                record = Path(entry, name, "RECORD").read_text(encoding="utf-8")
-            except OSError:
-                continue
-            for recorded in _RECORDED.findall(record):
-                library = Path(os.path.abspath(Path(entry, recorded)))
-                if library.is_file():
-                    return library
-    return None
+    from importlib.metadata import PackageNotFoundError, files
+
+    try:
+        recorded = files("karellen-llvm-core") or []
+    except PackageNotFoundError:
+        return None
+    libraries = (Path(os.path.abspath(f.locate())) for f in recorded if _LIBRARY.fullmatch(f.name))
+    return next((path for path in libraries if path.is_file()), None)
 
 
 def chosen_llvm() -> str | None:
@@ -59,8 +46,7 @@ def chosen_llvm() -> str | None:
 
 def cache_folder() -> Path:
     """Cache folder: ``$XDG_CACHE_HOME/mbtf``, by default ``~/.cache/mbtf``."""
-    base = os.environ.get("XDG_CACHE_HOME")
-    return Path(base) / "mbtf" if base else Path(os.path.expanduser("~"), ".cache", "mbtf")
+    return Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "mbtf")
 
 
 def _load_runtime(library: Path) -> None:
@@ -78,7 +64,7 @@ def use_shipped_llvm() -> None:
     """Make Dr.Jit use the shipped LLVM and a kernel cache of its own, unless the user chose others.
 
     Sets ``DRJIT_LIBLLVM_PATH`` and ``DRJIT_CACHE_DIR`` where they are unset. It must run before ``drjit`` is
-    imported and has no effect afterwards. It takes about a millisecond.
+    imported and has no effect afterwards.
     """
     library = chosen_llvm()
     shipped = shipped_llvm()
@@ -92,17 +78,8 @@ def use_shipped_llvm() -> None:
     os.environ.setdefault(CACHE_VARIABLE, str(cache_folder() / f"kernels-{Path(library).resolve().name}"))
 
 
-def version_in_name(library: str | Path) -> Version | None:
-    """Version in a library's file name (``libLLVM.so.23.1``, ``libLLVM-15.so.1``); None where it has none."""
-    match = _NUMBERS.match(Path(library).resolve().name)
-    if match is None:
-        return None
-    major, minor, patch = (int(n or 0) for n in match.groups())
-    return major, minor, patch
-
-
-def version_of(library: str) -> Version | None:
-    """Version that a library reports; None where it reports none (LLVM up to 15, or another library).
+def has_version(library: str) -> bool:
+    """Whether a library reports a version: LLVM 16 and newer do.
 
     It loads the library: call it in a child process.
 
@@ -110,9 +87,4 @@ def version_of(library: str) -> Version | None:
     ------
     OSError : the library cannot be loaded
     """
-    loaded = ctypes.CDLL(library)
-    if not hasattr(loaded, "LLVMGetVersion"):
-        return None
-    numbers = [ctypes.c_uint() for _ in range(3)]
-    loaded.LLVMGetVersion(*(ctypes.byref(n) for n in numbers))
-    return numbers[0].value, numbers[1].value, numbers[2].value
+    return hasattr(ctypes.CDLL(library), "LLVMGetVersion")

@@ -1,12 +1,13 @@
 """The path tracer: radiance that leaves the displaced tile along given rays, one light per ray.
 
-The value of a path is the sum of the simulated effects, each in one function:
+The value of a path is the sum of the simulated effects, each in one method of :class:`PathTracer`:
 
-- :func:`_visible`: parallax, periodicity and opacity masks, or the reference plane without them;
-- :func:`_direct`: direct light by next-event estimation, with shadowing where it is simulated;
-- :func:`_escaped`: light found by BSDF sampling, weighted against next-event estimation by the balance
+- ``_visible``: parallax, periodicity and opacity masks, or the reference plane without them;
+- ``_direct``: direct light by next-event estimation, with shadowing where it is simulated;
+- ``_escaped``: light found by BSDF sampling, weighted against next-event estimation by the balance
   heuristic (Veach 1997, "Robust Monte Carlo Methods for Light Transport Simulation", section 9.2);
-- interreflection: the loop around them, with Russian roulette, which ends paths without bias.
+- interreflection: the loop around them, with Russian roulette: paths end at random, without bias, where
+  little throughput is left (Arvo and Kirk 1990, "Particle Transport and Image Synthesis").
 
 Reflection at a point (diffuse and specular lobes, clear coat, sheen, normal map) is in
 :mod:`mbtf_gen.render.bsdf.surface`. An effect that is switched off is not compiled into the kernel.
@@ -21,10 +22,8 @@ import drjit as dr
 import mitsuba as mi
 
 from mbtf_gen.render.directional_light import DirectionalLight
-from mbtf_gen.render.heightfield import HeightField
 from mbtf_gen.render.heightfield_tracer import closest_hit, hit_and_shadow, occluded
-from mbtf_gen.render.russian_roulette import survival_probability
-from mbtf_gen.render.surface_interaction import interaction
+from mbtf_gen.render.scene import Tile
 from mbtf_gen.render.types import (
     Float,
     Mask,
@@ -40,32 +39,35 @@ from mbtf_gen.sampling.sobol import SobolSampler
 
 NO_LIMIT = 0xFFFFFFFF
 
+# Paths of throughput one always survive up to this many interactions: in white cracks, dividing by smaller
+# survival probabilities would let their weights grow without bound. Later they survive with LATE_SURVIVAL.
+LATE_DEPTH = 64
+LATE_SURVIVAL = 0.995
+# Survival probability over throughput. Interactions after the first take half of the time and contribute a
+# tenth of the variance; on stone, cloth, metal and bark, 2 was cheaper than 1 and 4.
+SURVIVAL_PER_THROUGHPUT = 2.0
+# Random numbers are multiples of 2^-24, which approximate smaller probabilities coarsely.
+LEAST_SURVIVAL = 2.0**-10
+# A path sampled from a lobe at least this narrow (density in 1/sr) may carry light that light sampling
+# misses: Russian roulette starts this many interactions later.
+NARROW_PDF = 4.0
+NARROW_EXTRA_DEPTH = 2
+
 
 @dataclass(frozen=True)
 class Transport:
     """Light transport: which effects of geometry and light are simulated, and where paths end.
 
-    Parameters
+    Attributes
     ----------
-    max_depth : int
-        Largest number of surface interactions of a path; 0 means no limit.
-    roulette_depth : int
-        Interactions before Russian roulette starts.
-    max_crossings : int
-        Tile borders that one ray may cross.
-    displacement : bool
-        Rays intersect the displaced tile; otherwise the reference plane, which has no shadows.
-    shadowing : bool
-        Shadow rays are tested for occlusion.
-    interreflection : bool
-        Paths continue after their first interaction.
-    bsdf_sampling : bool
-        Light is also found by sampling the BSDF.
-
-    Raises
-    ------
-    ValueError
-        A plane is to have shadows or interreflection.
+    max_depth : largest number of surface interactions of a path; 0 means no limit
+    roulette_depth : interactions before Russian roulette starts
+    max_crossings : tile borders that one ray may cross
+    displacement : rays intersect the displaced tile; otherwise the reference plane, which has no shadows and
+        no interreflection: both must be off
+    shadowing : shadow rays are tested for occlusion
+    interreflection : paths continue after their first interaction
+    bsdf_sampling : light is also found by sampling the BSDF
     """
 
     max_depth: int = 0
@@ -76,54 +78,10 @@ class Transport:
     interreflection: bool = True
     bsdf_sampling: bool = True
 
-    def __post_init__(self) -> None:
-        if not self.displacement and (self.shadowing or self.interreflection):
-            raise ValueError("a plane has no shadows and no interreflection")
-
     @property
     def limit(self) -> int:
         """Largest number of surface interactions of a path."""
-        if not self.interreflection:
-            return 1
-        return self.max_depth or NO_LIMIT
-
-
-PLANE = Transport(displacement=False, shadowing=False, interreflection=False)
-
-
-@dataclass(frozen=True)
-class TraceOptions:
-    """Options of one estimate, which share the compiled kernel.
-
-    Attributes
-    ----------
-    limit : UInt32
-        Largest number of surface interactions of a path; opaque, of width 1.
-    roulette : UInt32
-        Interactions before Russian roulette starts; opaque, of width 1.
-    path_variance : bool
-        The sample variance of single paths is estimated as well.
-    """
-
-    limit: UInt32
-    roulette: UInt32
-    path_variance: bool = False
-
-
-@dataclass(frozen=True)
-class World:
-    """The scene: the displaced tile and its reflection.
-
-    Attributes
-    ----------
-    heightfield : HeightField
-        Geometry of the tile.
-    surface : Surface or MitsubaSurface
-        Reflection, see :mod:`mbtf_gen.render.bsdf.surface`.
-    """
-
-    heightfield: HeightField
-    surface: Any
+        return (self.max_depth or NO_LIMIT) if self.interreflection else 1
 
 
 @dataclass
@@ -190,53 +148,214 @@ class Shadow:
     radiance: Spectrum
 
 
-def _on_plane(world: World, ray: Ray3f, active: Mask) -> SurfaceInteraction3f:
-    """Intersections of rays with the reference plane."""
-    p = ray(-ray.o.z / ray.d.z)
-    return interaction(p, mi.Normal3f(0, 0, 1), ray.d, world.heightfield.size, active & (ray.d.z < 0))
+@dataclass(frozen=True)
+class PathTracer:
+    """Traces paths on one tile.
 
+    Attributes
+    ----------
+    tile : Tile
+        Geometry and reflection.
+    transport : Transport
+        Effects that are simulated.
+    light : DirectionalLight
+        The light of each lane.
+    limit, roulette : UInt32
+        Largest number of surface interactions of a path, and interactions before Russian roulette starts;
+        opaque and of width 1, so that different numbers share the compiled kernel.
+    """
 
-def _visible(
-    world: World, path: Path, scattered: ScatteredRay, shadow: Shadow | None, transport: Transport
-) -> tuple[SurfaceInteraction3f, Mask]:
-    """Parallax, shadowing, periodicity, opacity masks: (hits of the paths' rays, lanes that reached the cap).
-    Contributions of shadow rays that are not occluded are added to the paths."""
-    holes = world.surface if world.surface.parts.opacity else None
-    heightfield, most = world.heightfield, transport.max_crossings
-    if shadow is None:
-        if not transport.displacement:
-            si = _on_plane(world, scattered.ray, path.active)
-            if holes is not None:
-                si.t = dr.select(path.rng.chance() < holes.opacity(si), si.t, dr.inf)
-            return si, mi.Bool(False)
-        si, _, capped, path.rng = closest_hit(
-            heightfield, scattered.ray, path.active, most, scattered.below, holes, path.rng
+    tile: Tile
+    transport: Transport
+    light: DirectionalLight
+    limit: UInt32
+    roulette: UInt32
+
+    @property
+    def _holes(self) -> Any:
+        """The surface where it has an opacity mask, otherwise None."""
+        return self.tile.surface if self.tile.surface.parts.opacity else None
+
+    @property
+    def _bsdf_sampling(self) -> bool:
+        """Whether light is also found by sampling the BSDF, which alone finds constant light."""
+        return self.transport.bsdf_sampling or self.light.kind == "constant"
+
+    def trace(self, ray: Ray3f, rng: SobolSampler) -> Path:
+        """Trace paths to their ends.
+
+        The first interaction of all lanes is one kernel without a loop over paths. Paths that hit the surface
+        again are compacted and continue in a second kernel; otherwise most lanes would idle beside a few long
+        paths.
+
+        Parameters
+        ----------
+        ray : Ray3f
+            First rays, in scene units.
+        rng : SobolSampler
+            Random numbers, one sequence per lane.
+
+        Returns
+        -------
+        Path
+            Final state: ``radiance`` towards the rays' origins in 1/sr for unit irradiance, ``passed``, and
+            the counts ``lost`` and ``capped``.
+        """
+        path = Path(
+            p=mi.Point3f(0.0),
+            n=mi.Normal3f(0.0, 0.0, 1.0),
+            d=mi.Vector3f(0.0, 0.0, -1.0),
+            radiance=mi.Spectrum(0.0),
+            throughput=mi.Spectrum(1.0),
+            depth=mi.UInt32(0),
+            rng=rng,
+            capped=mi.UInt32(0),
+            lost=mi.Bool(False),
+            passed=mi.Bool(False),
+            active=mi.Bool(True),
         )
-        return si, capped
-    if holes is None:
-        si, capped, blocked, shadow_capped = hit_and_shadow(
-            heightfield,
-            scattered.ray,
-            path.active,
+        # The first ray that can find constant light always survives.
+        tracer = replace(self, roulette=self.roulette + 1) if self.light.kind == "constant" else self
+        return tracer._trace(path, ScatteredRay(ray, mi.Bool(False), mi.Float(dr.inf)))
+
+    def _trace(self, path: Path, first: ScatteredRay) -> Path:
+        self._follow(path, first, None)
+        scattered, shadow = self._interact(path)
+        if not (self.transport.interreflection or self._bsdf_sampling):
+            if shadow is not None:
+                self._trace_shadow(path, shadow)
+            return path
+        self._follow(path, scattered, shadow)
+        if not self.transport.interreflection:
+            return path
+        # The lights as well: the second kernel gathers those of its lanes.
+        dr.eval(path, self.light)
+        lanes = dr.compress(path.active)
+        if len(lanes):
+            rest = _gather_lanes(path, lanes)
+            rest.radiance, rest.capped, rest.lost = mi.Spectrum(0.0), mi.UInt32(0), mi.Bool(False)
+            rest = replace(self, light=_gather_lanes(self.light, lanes))._loop(rest)
+            dr.eval(rest.radiance, rest.capped, rest.lost)
+
+            def scattered_back(values: Any) -> Any:
+                out = dr.zeros(type(values), dr.width(path.active))
+                dr.scatter(out, values, lanes)
+                return out
+
+            path.radiance += scattered_back(rest.radiance)
+            path.capped += scattered_back(rest.capped)
+            path.lost |= scattered_back(rest.lost)
+        return path
+
+    @dr.syntax
+    def _loop(self, path: Path) -> Path:
+        """Trace paths from a vertex to their ends."""
+        while dr.hint(path.active, exclude=[self]):
+            scattered, shadow = self._interact(path)
+            self._follow(path, scattered, shadow)
+        return path
+
+    def _follow(self, path: Path, scattered: ScatteredRay, shadow: Shadow | None) -> None:
+        """Trace paths along their rays to the next vertex, or to the light."""
+        si, capped = self._visible(path, scattered, shadow)
+        path.capped[capped] += 1
+        escaped = path.active & ~si.is_valid() & ~capped
+        downward = escaped & (scattered.ray.d.z <= 0)
+        if self._holes is not None:
+            path.passed |= downward & (path.depth == 0)
+        else:
+            path.lost |= downward
+        path.radiance += self._escaped(path, scattered, escaped)
+        path.active &= si.is_valid() & (path.depth < self.limit)
+        path.p, path.n, path.d = mi.Point3f(si.p), mi.Normal3f(si.n), mi.Vector3f(scattered.ray.d)
+
+    def _visible(
+        self, path: Path, scattered: ScatteredRay, shadow: Shadow | None
+    ) -> tuple[SurfaceInteraction3f, Mask]:
+        """Parallax, shadowing, periodicity, opacity masks: (hits of the paths' rays, lanes that reached the
+        cap). Contributions of shadow rays that are not occluded are added to the paths."""
+        heightfield, holes, most = self.tile.heightfield, self._holes, self.transport.max_crossings
+        ray, below = scattered.ray, scattered.below
+        if shadow is not None and holes is None:
+            si, capped, blocked, shadow_capped = hit_and_shadow(
+                heightfield, ray, path.active, shadow.ray, shadow.active, most, below, shadow.below
+            )
+            _add_unoccluded(path, shadow, blocked, shadow_capped)
+            return si, capped
+        if shadow is not None:
+            self._trace_shadow(path, shadow)
+        if self.transport.displacement:
+            si, _, capped, path.rng = closest_hit(heightfield, ray, path.active, most, below, holes, path.rng)
+            return si, capped
+        p = ray(-ray.o.z / ray.d.z)
+        si = heightfield.interaction(p, mi.Normal3f(0, 0, 1), ray.d, path.active & (ray.d.z < 0))
+        if holes is not None:
+            si.t = dr.select(path.rng.chance() < holes.opacity(si), si.t, dr.inf)
+        return si, mi.Bool(False)
+
+    def _trace_shadow(self, path: Path, shadow: Shadow) -> None:
+        """Shadowing alone, for paths that end."""
+        blocked, _, capped, path.rng = occluded(
+            self.tile.heightfield,
             shadow.ray,
             shadow.active,
-            most,
-            scattered.below,
+            self.transport.max_crossings,
             shadow.below,
+            self._holes,
+            path.rng,
         )
-        _add_unoccluded(path, shadow, blocked, shadow_capped)
-        return si, capped
-    _trace_shadow(world, path, shadow, transport)
-    return _visible(world, path, scattered, None, transport)
+        _add_unoccluded(path, shadow, blocked, capped)
 
+    def _interact(self, path: Path) -> tuple[ScatteredRay, Shadow | None]:
+        """One surface interaction of every path: its scattered ray and its shadow ray."""
+        heightfield = self.tile.heightfield
+        si = heightfield.interaction(path.p, path.n, path.d, path.active)
+        point = self.tile.surface.at(si, -path.d)
+        shadow = self._direct(path, si, point)
+        path.depth[path.active] += 1
+        if not self._bsdf_sampling:
+            path.active &= path.depth < self.limit
+        omega, weight, pdf = point.sample(path.rng.next_1d(), path.rng.next_2d())
+        path.throughput *= weight
+        pdf = pdf * _russian_roulette(path, pdf, self.roulette)
+        return ScatteredRay(heightfield.leave(si, omega), dr.dot(si.n, omega) < 0, pdf), shadow
 
-def _trace_shadow(world: World, path: Path, shadow: Shadow, transport: Transport) -> None:
-    """Shadowing alone, for paths that end."""
-    holes = world.surface if world.surface.parts.opacity else None
-    blocked, _, capped, path.rng = occluded(
-        world.heightfield, shadow.ray, shadow.active, transport.max_crossings, shadow.below, holes, path.rng
-    )
-    _add_unoccluded(path, shadow, blocked, capped)
+    def _direct(self, path: Path, si: SurfaceInteraction3f, point: Any) -> Shadow | None:
+        """Direct light reflected at a vertex, by next-event estimation. Without shadowing it is added to the
+        path, otherwise the shadow ray returned decides."""
+        light = self.light
+        if light.kind == "constant":
+            return None
+        if light.kind == "delta":
+            omega, incoming = light.omega_i, light.inverse_irradiance
+        else:
+            omega = light.sample(path.rng.next_2d())
+            incoming = light.radiance(omega)
+        value, pdf = point.eval_pdf(omega)
+        if light.kind == "lobe":
+            density = light.sampling_density(omega)
+            if self._bsdf_sampling:
+                strongest = dr.max(path.throughput * value) / dr.maximum(pdf, 1e-30)
+                survival = survival_probability(strongest, path.depth + 1, pdf, self.roulette)
+                density = density + survival * pdf
+            incoming = incoming / density
+        # NaN counts as light: it must reach the value, where the sample is detected and drawn again.
+        lit = path.active & ~(dr.max(value) <= 0)
+        radiance = path.throughput * (value * incoming)
+        if self.transport.shadowing:
+            return Shadow(self.tile.heightfield.leave(si, omega), dr.dot(si.n, omega) < 0, lit, radiance)
+        path.radiance += dr.select(lit, radiance, 0.0)
+        return None
+
+    def _escaped(self, path: Path, scattered: ScatteredRay, escaped: Mask) -> Spectrum:
+        """Light found by BSDF sampling: radiance along rays that left the tile upwards."""
+        light = self.light
+        if light.kind == "delta" or not self._bsdf_sampling:
+            return mi.Spectrum(0.0)
+        d, pdf = scattered.ray.d, scattered.pdf
+        share = dr.select(dr.isinf(pdf), 1.0, pdf / (pdf + light.sampling_density(d)))
+        found = escaped & (path.depth > 0) & (d.z > 0)
+        return dr.select(found, path.throughput * (light.radiance(d) * share), 0.0)
 
 
 def _add_unoccluded(path: Path, shadow: Shadow, blocked: Mask, capped: Mask) -> None:
@@ -244,89 +363,16 @@ def _add_unoccluded(path: Path, shadow: Shadow, blocked: Mask, capped: Mask) -> 
     path.capped[capped] += 1
 
 
-def _direct(
-    world: World,
-    path: Path,
-    si: SurfaceInteraction3f,
-    point: Any,
-    light: DirectionalLight,
-    transport: Transport,
-    options: TraceOptions,
-) -> Shadow | None:
-    """Direct light reflected at a vertex, by next-event estimation. Without shadowing it is added to the
-    path, otherwise the shadow ray returned decides."""
-    if light.kind == "constant":
-        return None
-    if light.kind == "delta":
-        omega, incoming = light.omega_i, light.inverse_irradiance
-    else:
-        omega = light.sample(path.rng.next_2d())
-        incoming = light.radiance(omega)
-    value, pdf = point.eval_pdf(omega)
-    if light.kind == "lobe":
-        density = light.sampling_density(omega)
-        if transport.bsdf_sampling:
-            strongest = dr.max(path.throughput * value) / dr.maximum(pdf, 1e-30)
-            density = density + survival_probability(strongest, path.depth + 1, pdf, options.roulette) * pdf
-        incoming = incoming / density
-    # NaN counts as light: it must reach the value, where the sample is detected and drawn again.
-    lit = path.active & ~(dr.max(value) <= 0)
-    radiance = path.throughput * (value * incoming)
-    if transport.shadowing:
-        return Shadow(world.heightfield.leave(si, omega), dr.dot(si.n, omega) < 0, lit, radiance)
-    path.radiance += dr.select(lit, radiance, 0.0)
-    return None
+def survival_probability(strongest: Float, depth: UInt32, pdf: Float, start: UInt32) -> Float:
+    """Survival probability of Russian roulette, from the largest channel of the throughput.
 
-
-def _escaped(
-    path: Path, scattered: ScatteredRay, light: DirectionalLight, escaped: Mask, transport: Transport
-) -> Spectrum:
-    """Light found by BSDF sampling: radiance along rays that left the tile upwards."""
-    if light.kind == "delta" or not (transport.bsdf_sampling or light.kind == "constant"):
-        return mi.Spectrum(0.0)
-    d, pdf = scattered.ray.d, scattered.pdf
-    share = dr.select(dr.isinf(pdf), 1.0, pdf / (pdf + light.sampling_density(d)))
-    found = escaped & (path.depth > 0) & (d.z > 0)
-    return dr.select(found, path.throughput * (light.radiance(d) * share), 0.0)
-
-
-def _follow(
-    world: World,
-    path: Path,
-    scattered: ScatteredRay,
-    shadow: Shadow | None,
-    light: DirectionalLight,
-    transport: Transport,
-    options: TraceOptions,
-) -> None:
-    """Trace paths along their rays to the next vertex, or to the light."""
-    si, capped = _visible(world, path, scattered, shadow, transport)
-    path.capped[capped] += 1
-    escaped = path.active & ~si.is_valid() & ~capped
-    downward = escaped & (scattered.ray.d.z <= 0)
-    if world.surface.parts.opacity:
-        path.passed |= downward & (path.depth == 0)
-    else:
-        path.lost |= downward
-    path.radiance += _escaped(path, scattered, light, escaped, transport)
-    path.active &= si.is_valid() & (path.depth < options.limit)
-    path.p, path.n, path.d = mi.Point3f(si.p), mi.Normal3f(si.n), mi.Vector3f(scattered.ray.d)
-
-
-def _interact(
-    world: World, path: Path, light: DirectionalLight, transport: Transport, options: TraceOptions
-) -> tuple[ScatteredRay, Shadow | None]:
-    """One surface interaction of every path: its scattered ray and its shadow ray."""
-    si = interaction(path.p, path.n, path.d, world.heightfield.size, path.active)
-    point = world.surface.at(si, -path.d)
-    shadow = _direct(world, path, si, point, light, transport, options)
-    path.depth[path.active] += 1
-    if not transport.bsdf_sampling and light.kind != "constant":
-        path.active &= path.depth < options.limit
-    omega, weight, pdf = point.sample(path.rng.next_1d(), path.rng.next_2d())
-    path.throughput *= weight
-    pdf = pdf * _russian_roulette(path, pdf, options.roulette)
-    return ScatteredRay(world.heightfield.leave(si, omega), dr.dot(si.n, omega) < 0, pdf), shadow
+    Both densities of the balance heuristic include it. Otherwise, on dark surfaces, light found by BSDF
+    sampling would be carried by the few paths that survive, with large weights.
+    """
+    largest = dr.select(depth < LATE_DEPTH, 1.0, LATE_SURVIVAL)
+    likely = dr.clip(SURVIVAL_PER_THROUGHPUT * strongest, LEAST_SURVIVAL, largest)
+    start = dr.select(pdf > NARROW_PDF, start + NARROW_EXTRA_DEPTH, start)
+    return dr.select(depth >= start, likely, 1.0)
 
 
 def _russian_roulette(path: Path, pdf: Float, start: UInt32) -> Float:
@@ -341,84 +387,6 @@ def _russian_roulette(path: Path, pdf: Float, start: UInt32) -> Float:
     return survival
 
 
-def trace(
-    world: World,
-    ray: Ray3f,
-    light: DirectionalLight,
-    transport: Transport,
-    options: TraceOptions,
-    rng: SobolSampler,
-    active: Mask,
-) -> Path:
-    """Trace paths to their ends.
-
-    The first interaction of all lanes is one kernel without a loop over paths. Paths that hit the surface
-    again are compacted and continue in a second kernel; otherwise most lanes would idle beside a few long
-    paths.
-
-    Parameters
-    ----------
-    world : World
-        The tile and its reflection.
-    ray : Ray3f
-        First rays, in scene units.
-    light : DirectionalLight
-        The light of each lane.
-    transport : Transport
-        Effects that are simulated.
-    options : TraceOptions
-        Limit of the depth, and start of Russian roulette.
-    rng : SobolSampler
-        Random numbers, one sequence per lane.
-    active : Mask
-        Lanes to trace.
-
-    Returns
-    -------
-    Path
-        Final state: ``radiance`` towards the rays' origins in 1/sr for unit irradiance, ``passed``, and the
-        counts ``lost`` and ``capped``.
-    """
-    path = Path(
-        mi.Point3f(0.0),
-        mi.Normal3f(0.0, 0.0, 1.0),
-        mi.Vector3f(0.0, 0.0, -1.0),
-        mi.Spectrum(0.0),
-        mi.Spectrum(1.0),
-        mi.UInt32(0),
-        rng,
-        mi.UInt32(0),
-        mi.Bool(False),
-        mi.Bool(False),
-        mi.Bool(active),
-    )
-    if light.kind == "constant":
-        # BSDF sampling alone finds this light: the first ray that can always survives.
-        options = replace(options, roulette=options.roulette + 1)
-    first = ScatteredRay(ray, mi.Bool(False), mi.Float(dr.inf))
-    _follow(world, path, first, None, light, transport, options)
-    scattered, shadow = _interact(world, path, light, transport, options)
-    if not (transport.interreflection or transport.bsdf_sampling or light.kind == "constant"):
-        if shadow is not None:
-            _trace_shadow(world, path, shadow, transport)
-        return path
-    _follow(world, path, scattered, shadow, light, transport, options)
-    if not transport.interreflection:
-        return path
-    # The lights as well: the second kernel gathers those of its lanes.
-    dr.eval(path, light)
-    active_lanes = dr.compress(path.active)
-    if len(active_lanes):
-        rest = _gather_lanes(path, active_lanes)
-        rest.radiance, rest.capped, rest.lost = mi.Spectrum(0.0), mi.UInt32(0), mi.Bool(False)
-        rest = _loop(world, rest, _gather_lanes(light, active_lanes), transport, options)
-        dr.eval(rest.radiance, rest.capped, rest.lost)
-        path.radiance += _scatter_lanes(rest.radiance, active_lanes, dr.width(path.active))
-        path.capped += _scatter_lanes(rest.capped, active_lanes, dr.width(path.active))
-        path.lost |= _scatter_lanes(rest.lost, active_lanes, dr.width(path.active))
-    return path
-
-
 def _gather_lanes(state: Any, lanes: UInt32) -> Any:
     """Some lanes of a dataclass of arrays; other attributes are unchanged."""
 
@@ -430,21 +398,3 @@ def _gather_lanes(state: Any, lanes: UInt32) -> Any:
         return dr.gather(type(value), value, lanes)
 
     return replace(state, **{f.name: pick(getattr(state, f.name)) for f in fields(state)})
-
-
-def _scatter_lanes(values: Any, lanes: UInt32, width: int) -> Any:
-    """Values scattered to some lanes, zero in the others."""
-    out = dr.zeros(type(values), width)
-    dr.scatter(out, values, lanes)
-    return out
-
-
-@dr.syntax
-def _loop(
-    world: World, path: Path, light: DirectionalLight, transport: Transport, options: TraceOptions
-) -> Path:
-    """Trace paths from a vertex to their ends."""
-    while dr.hint(path.active, exclude=[world, light, transport, options]):
-        scattered, shadow = _interact(world, path, light, transport, options)
-        _follow(world, path, scattered, shadow, light, transport, options)
-    return path

@@ -8,27 +8,24 @@ imported after :func:`load_mitsuba`.
 from __future__ import annotations
 
 import hashlib
-import os
 import platform
 import tempfile
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from mbtf_core.atomic import read_json, write_json
 from mbtf_core.child_process import Outcome, run_child
-from mbtf_core.errors import EngineError, MbtfError, UsageError
+from mbtf_core.errors import EngineError, UsageError
 from mbtf_gen.render.llvm import (
     CACHE_VARIABLE,
     OLDEST_LLVM,
     VARIABLE,
-    Version,
     cache_folder,
     chosen_llvm,
+    has_version,
     shipped_llvm,
     use_shipped_llvm,
-    version_in_name,
-    version_of,
 )
 
 CPU_VARIANT = "llvm_ad_rgb"
@@ -66,7 +63,10 @@ def load_mitsuba(variant: str = CPU_VARIANT) -> Any:
     if variant not in (CPU_VARIANT, CUDA_VARIANT):
         raise UsageError(f"no variant '{variant}'", hint=f"choose {CPU_VARIANT}, {CUDA_VARIANT} or auto")
     if variant not in _working:
-        _ensure_working(variant)
+        if variant == CPU_VARIANT:
+            check_llvm()
+        elif fault := prove(variant).fault:
+            raise EngineError(f"no usable CUDA device ({fault})", hint=f"use the CPU: variant {CPU_VARIANT}")
     try:
         import mitsuba
 
@@ -104,7 +104,7 @@ def refuse_old_llvm() -> None:
 def prove(variant: str) -> Outcome:
     """Compile and run test kernels of `variant` in a child process, without the disk cache.
 
-    The answers contain ``llvm`` (version) for the CPU variant, and ``device`` once a kernel has run.
+    The answers contain ``llvm`` (version) for the CPU variant.
     """
     use_shipped_llvm()
     with tempfile.TemporaryDirectory(prefix="mbtf-proof-") as folder:
@@ -113,8 +113,8 @@ def prove(variant: str) -> Outcome:
         )
 
 
-def check_llvm() -> Version:
-    """Version of the LLVM that Dr.Jit will use, tested on this machine now or by an earlier run.
+def check_llvm() -> None:
+    """Test the LLVM that Dr.Jit will use, unless an earlier run on this machine did.
 
     Raises
     ------
@@ -123,44 +123,22 @@ def check_llvm() -> Version:
     """
     use_shipped_llvm()
     library = chosen_llvm()
-    if library is not None and os.sep in library and not Path(library).is_file():
-        raise _llvm_error(library, "is not a file" if Path(library).exists() else "no such file")
-    stated = version_in_name(library) if library is not None else None
-    if stated is not None and stated[0] < OLDEST_LLVM:
-        raise _llvm_error(library, _too_old(stated[0]))
-    remembered = _proof_file(library)
-    if remembered is not None and remembered.exists():
-        try:
-            major, minor, patch = read_json(remembered)["llvm"]
-            return int(major), int(minor), int(patch)
-        except (MbtfError, KeyError, TypeError, ValueError):
-            remembered.unlink(missing_ok=True)
-    outcome = prove(CPU_VARIANT)
-    if outcome.fault:
-        if "llvm" not in outcome.answers and "No module named" in outcome.fault:
-            raise _mitsuba_error(outcome.fault)
-        raise _llvm_error(library, outcome.fault)
-    major, minor, patch = outcome.answers["llvm"]
-    if remembered is not None:
-        try:
-            remembered.parent.mkdir(parents=True, exist_ok=True)
-            write_json(remembered, {"library": library, "llvm": [major, minor, patch]})
-        except (OSError, MbtfError):
-            pass  # without a writable cache the next process tests it again
-    return major, minor, patch
-
-
-def _ensure_working(variant: str) -> None:
-    if variant == CPU_VARIANT:
-        check_llvm()
+    passed = _proof_file(library)
+    if passed is not None and passed.exists():
         return
-    fault = prove(CUDA_VARIANT).fault
+    fault = prove(CPU_VARIANT).fault
+    if "No module named" in fault:
+        raise _mitsuba_error(fault)
     if fault:
-        raise EngineError(f"no usable CUDA device ({fault})", hint=f"use the CPU: variant {CPU_VARIANT}")
+        raise _llvm_error(library, fault)
+    if passed is not None:
+        with suppress(OSError):  # without a writable cache the next process tests it again
+            passed.parent.mkdir(parents=True, exist_ok=True)
+            passed.touch()
 
 
 def _proof_file(library: str | None) -> Path | None:
-    """Cached result of the test: of this library file, this Dr.Jit, this machine's name."""
+    """File that exists once the test passed: of this library file, this Dr.Jit, this machine's name."""
     from importlib.metadata import PackageNotFoundError, version
 
     if library is None or not Path(library).is_file():
@@ -172,12 +150,7 @@ def _proof_file(library: str | None) -> Path | None:
     real = Path(library).resolve()
     state = real.stat()
     key = f"{real}|{state.st_size}|{state.st_mtime_ns}|{drjit}|{platform.node()}"
-    return cache_folder() / f"llvm-proof-{hashlib.sha256(key.encode()).hexdigest()[:16]}.json"
-
-
-def _too_old(major: int | None) -> str:
-    name = f"LLVM {major}" if major is not None else f"older than LLVM {OLDEST_LLVM}, or not LLVM at all"
-    return f"is {name}; LLVM {OLDEST_LLVM} or newer is needed"
+    return cache_folder() / f"llvm-proof-{hashlib.sha256(key.encode()).hexdigest()[:16]}"
 
 
 def _llvm_error(library: str | None, fault: str) -> EngineError:
@@ -194,12 +167,8 @@ def _llvm_error(library: str | None, fault: str) -> EngineError:
             where=library,
             hint="install it again: pip install --force-reinstall karellen-llvm-core",
         )
-    hint = (
-        "unset it to use the LLVM of the installation"
-        if shipped is not None
-        else "pip install karellen-llvm-core"
-    )
-    return EngineError(fault, where=f"{VARIABLE}={library}", hint=f"{hint}, or name a newer libLLVM")
+    use = "unset it to use the LLVM of the installation" if shipped else "pip install karellen-llvm-core"
+    return EngineError(fault, where=f"{VARIABLE}={library}", hint=f"{use}, or name a newer libLLVM")
 
 
 def _mitsuba_error(fault: str) -> EngineError:
@@ -213,16 +182,14 @@ def _proof(variant: str) -> Iterator[dict[str, Any]]:
     """Child process of :func:`prove`."""
     use_shipped_llvm()
     library = chosen_llvm()
+    needed = f"LLVM {OLDEST_LLVM} or newer is needed"
     if variant == CPU_VARIANT and library is not None:
         try:
-            stated = version_of(library)
+            new = has_version(library)
         except OSError as error:
             raise EngineError(f"cannot be loaded ({str(error).removeprefix(f'{library}: ')})") from None
-        if stated is None:
-            raise EngineError(_too_old(None))
-        yield {"llvm": stated}
-        if stated[0] < OLDEST_LLVM:
-            raise EngineError(_too_old(stated[0]))
+        if not new:
+            raise EngineError(f"is older than LLVM {OLDEST_LLVM}, or not LLVM at all; {needed}")
     import drjit as dr
     import mitsuba as mi
 
@@ -236,9 +203,8 @@ def _proof(variant: str) -> Iterator[dict[str, Any]]:
         found = dr.detail.llvm_version()
         yield {"llvm": found}
         if found[0] < OLDEST_LLVM:
-            raise EngineError(_too_old(found[0]))
+            raise EngineError(f"is LLVM {found[0]}; {needed}")
     _exercise(mi, dr)
-    yield {"device": "cuda" if variant == CUDA_VARIANT else "cpu"}
 
 
 def _exercise(mi: Any, dr: Any) -> None:

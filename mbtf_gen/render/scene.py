@@ -16,9 +16,8 @@ import mitsuba as mi
 from mbtf_core.errors import InputError, reason
 from mbtf_gen.geometry.heightfield import HeightGrid
 from mbtf_gen.render.bsdf.plugin import SurfaceBSDF, surface_of
-from mbtf_gen.render.emitter import SmoothedDirectional
+from mbtf_gen.render.directional_light import SmoothedDirectional
 from mbtf_gen.render.heightfield import HeightField
-from mbtf_gen.render.path_tracer import World
 from mbtf_gen.render.sensor import QuerySensor
 from mbtf_gen.render.types import BSDF
 
@@ -45,26 +44,21 @@ class Tile:
         Heights in tile widths.
     unit : float
         Scene units per tile width.
-    world : World
-        Geometry and reflection in scene units.
+    heightfield : HeightField
+        Geometry in scene units.
+    surface : Surface or MitsubaSurface
+        Reflection, see :mod:`mbtf_gen.render.bsdf.surface`.
     """
 
     grid: HeightGrid
     unit: float
-    world: World
+    heightfield: HeightField
+    surface: Any
 
     @property
     def aspect(self) -> float:
         """H/W of the tile."""
         return self.grid.aspect
-
-
-def _load_bsdf(bsdf: Mapping[str, Any]) -> BSDF:
-    try:
-        return mi.load_dict(dict(bsdf))
-    except Exception as error:  # whatever the plugins raise about their parameters
-        text = re.sub(r"\[\w+\.cpp:\d+\]\s*", "", reason(error, 250))
-        raise InputError(f"Mitsuba rejects the BSDF '{bsdf.get('type')}' ({text})") from None
 
 
 def unit_of(aspect: float) -> float:
@@ -89,5 +83,11 @@ def build_tile(grid: HeightGrid, bsdf: Mapping[str, Any] | BSDF) -> Tile:
     """
     register_plugins()
     unit = unit_of(grid.aspect)
-    surface = surface_of(_load_bsdf(bsdf) if isinstance(bsdf, Mapping) else bsdf)
-    return Tile(grid, unit, World(HeightField.of(grid, unit, surface.transmits), surface))
+    if isinstance(bsdf, Mapping):
+        try:
+            bsdf = mi.load_dict(dict(bsdf))
+        except Exception as error:  # whatever the plugins raise about their parameters
+            text = re.sub(r"\[\w+\.cpp:\d+\]\s*", "", reason(error, 250))
+            raise InputError(f"Mitsuba rejects the BSDF '{bsdf.get('type')}' ({text})") from None
+    surface = surface_of(bsdf)
+    return Tile(grid, unit, HeightField.of(grid, unit, surface.transmits), surface)

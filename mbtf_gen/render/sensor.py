@@ -3,7 +3,7 @@
 Every sample is one ray through a point of the query's Gaussian footprint on the reference plane, against its
 view direction. The generator's own loop requests rays by query number. ``mi.render`` calls ``sample_ray``:
 the n-th pixel of the film, in row order, is the n-th query. The ray's time stores the query's number, from
-which :class:`~mbtf_gen.render.emitter.SmoothedDirectional` finds the query's light in Mitsuba's integrators.
+which :class:`~mbtf_gen.render.directional_light.SmoothedDirectional` finds the query's light.
 """
 
 from __future__ import annotations

@@ -31,25 +31,13 @@ def _horner(coefficients: tuple[float, ...], x: F64) -> F64:
 
 
 def sincos_turns(turns: F64) -> tuple[F64, F64]:
-    """Sine and cosine of an angle in turns.
-
-    Parameters
-    ----------
-    turns : float64 array
-        Angles over 2π, any shape.
-
-    Returns
-    -------
-    sine, cosine : float64 arrays
-    """
+    """Sine and cosine of angles in turns (angle/2π), any shape."""
     t = np.asarray(turns, np.float64)
     quarter = np.floor(4.0 * t + 0.5)
     x = (t - 0.25 * quarter) * (2.0 * np.pi)
     s, c = x * _horner(_SIN, x * x), _horner(_COS, x * x)
     which = quarter.astype(np.int64) & 3
-    sine = np.choose(which, [s, c, -s, -c])
-    cosine = np.choose(which, [c, -s, -c, s])
-    return sine, cosine
+    return np.choose(which, [s, c, -s, -c]), np.choose(which, [c, -s, -c, s])
 
 
 def exp2(x: F64) -> F64:

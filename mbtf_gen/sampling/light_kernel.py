@@ -13,8 +13,8 @@ a few hundred distinct values left.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from functools import cache, lru_cache
+from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -24,20 +24,11 @@ from numpy.typing import ArrayLike, NDArray
 MAX_WIDTH_DEG = 45.0
 # In single precision, narrower lobes are indistinguishable from a delta light.
 MIN_WIDTH_DEG = 0.01
-
-
 # Elevation, in widths of the lobe, above which the horizon removes a negligible part of it.
 NEAR_WIDTHS = 10.0
 
 # Cached, because nodes of high order take a tenth of a second.
 _gauss = cache(np.polynomial.legendre.leggauss)
-
-
-def _theta_nodes(kappa: float, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Gauss–Legendre nodes and weights over the polar angle, up to e^-40 of the lobe's peak."""
-    end = float(np.arccos(max(-1.0, 1.0 - 40.0 / kappa)))
-    x, w = _gauss(count)
-    return 0.5 * end * (x + 1.0), 0.5 * end * w
 
 
 def _density(kappa: float, versine: ArrayLike) -> NDArray[np.float64]:
@@ -48,24 +39,21 @@ def _density(kappa: float, versine: ArrayLike) -> NDArray[np.float64]:
 
 def rms_angle_deg(kappa: float) -> float:
     """RMS angle per axis, in degrees, of a von Mises–Fisher lobe of concentration κ."""
-    theta, weight = _theta_nodes(kappa, 400)
+    # Up to e^-40 of the lobe's peak.
+    end = float(np.arccos(max(-1.0, 1.0 - 40.0 / kappa)))
+    x, w = _gauss(400)
+    theta, weight = 0.5 * end * (x + 1.0), 0.5 * end * w
     density = _density(kappa, 2.0 * np.sin(0.5 * theta) ** 2) * 2.0 * np.pi * np.sin(theta)
     return float(np.degrees(np.sqrt(0.5 * np.sum(weight * density * theta**2) / np.sum(weight * density))))
 
 
-@lru_cache(maxsize=64)
 def concentration(width_deg: float) -> float:
     """Concentration κ of the lobe whose RMS angle per axis is `width_deg` degrees."""
     from scipy.optimize import brentq
 
     start = 1.0 / np.radians(width_deg) ** 2
-    log_kappa = brentq(
-        lambda x: rms_angle_deg(float(np.exp(x))) - width_deg,
-        np.log(start) - 1.0,
-        np.log(start) + 1.0,
-        xtol=1e-13,
-    )
-    return float(np.exp(log_kappa))
+    low, high = np.log(start) - 1.0, np.log(start) + 1.0
+    return float(np.exp(brentq(lambda x: rms_angle_deg(float(np.exp(x))) - width_deg, low, high, xtol=1e-13)))
 
 
 def _mean_positive_part(mean: NDArray[np.float64], amplitude: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -99,7 +87,7 @@ def lobe_irradiance(kappa: float, elevation: ArrayLike) -> NDArray[np.float64]:
     return total.reshape(np.shape(elevation))
 
 
-@lru_cache(maxsize=16)
+@cache
 def _lobe(width_deg: float) -> tuple[float, Any]:
     """Concentration of a lobe, and its irradiance as a spline over low elevations; a fifth of a second."""
     from scipy.interpolate import CubicSpline
@@ -118,8 +106,6 @@ class LightKernel:
     ----------
     width_deg : float
         RMS angle per axis in degrees, 0 or in [0.01, 45]; 0 is a delta light.
-    kappa : float
-        Concentration κ of the lobe; infinite for a delta light.
 
     Raises
     ------
@@ -128,22 +114,22 @@ class LightKernel:
     """
 
     width_deg: float
-    kappa: float = field(init=False)
-    _table: Any = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if self.width_deg != 0 and not MIN_WIDTH_DEG <= self.width_deg <= MAX_WIDTH_DEG:
             raise ValueError(
                 f"light width must be 0 or {MIN_WIDTH_DEG}..{MAX_WIDTH_DEG} degrees, not {self.width_deg}"
             )
-        kappa, table = (np.inf, None) if self.is_delta else _lobe(float(self.width_deg))
-        object.__setattr__(self, "kappa", kappa)
-        object.__setattr__(self, "_table", table)
 
     @property
     def is_delta(self) -> bool:
         """True for width 0."""
         return self.width_deg == 0
+
+    @property
+    def kappa(self) -> float:
+        """Concentration κ of the lobe; infinite for a delta light."""
+        return np.inf if self.is_delta else _lobe(float(self.width_deg))[0]
 
     def irradiance(self, omega_i: ArrayLike) -> NDArray[np.float64]:
         """Irradiance E of the lobe on the reference plane, the divisor of the radiance.
@@ -165,7 +151,9 @@ class LightKernel:
         widest = NEAR_WIDTHS * np.radians(self.width_deg)
         near = w[..., 2] < (np.sin(widest) if widest < np.pi / 2 else np.inf)
         low = w[near]
-        out[near] = self._table(np.arctan2(low[..., 2], np.hypot(low[..., 0], low[..., 1])))
+        out[near] = _lobe(float(self.width_deg))[1](
+            np.arctan2(low[..., 2], np.hypot(low[..., 0], low[..., 1]))
+        )
         return out
 
     def density(self, omega: ArrayLike, omega_i: ArrayLike) -> NDArray[np.float64]:

@@ -67,15 +67,7 @@ class Mixture:
 
     Attributes
     ----------
-    log_uniform : float
-        Weight of l ~ U[0, k].
-    finest : float
-        Weight of l ~ U[k-1, k].
-
-    Raises
-    ------
-    ValueError
-        Both weights are 0.
+    log_uniform, finest : weights of l ~ U[0, k] and of l ~ U[k-1, k]
     """
 
     log_uniform: float
@@ -89,20 +81,8 @@ class Mixture:
         object.__setattr__(self, "finest", self.finest / total)
 
     def level(self, xi: NDArray[np.float64], finest: int) -> NDArray[np.float64]:
-        """Fractional levels by inversion of the cumulative distribution.
-
-        Parameters
-        ----------
-        xi : float64 array
-            Numbers in [0, 1), any shape.
-        finest : int
-            Finest level k.
-
-        Returns
-        -------
-        float64 array
-            Levels in [0, k].
-        """
+        """Fractional levels in [0, k] from numbers in [0, 1), by inversion of the cumulative distribution;
+        `finest` is k."""
         first = xi < self.log_uniform
         low = max(finest - 1, 0)
         share = xi / self.log_uniform if self.log_uniform > 0 else xi
@@ -110,25 +90,11 @@ class Mixture:
         return np.where(first, share * finest, low + rest * (finest - low))
 
     def density(self, level: NDArray[np.float64], finest: int) -> NDArray[np.float64]:
-        """Probability density at fractional levels; 0 outside [0, k].
-
-        Parameters
-        ----------
-        level : float64 array
-            Fractional levels, any shape.
-        finest : int
-            Finest level k ≥ 1.
-
-        Returns
-        -------
-        float64 array
-        """
+        """Probability density at fractional levels, for the finest level k ≥ 1; 0 outside [0, k]."""
         low = max(finest - 1, 0)
         inside = (level >= 0) & (level <= finest)
-        near = inside & (level >= low)
-        return np.where(inside, self.log_uniform / finest, 0.0) + np.where(
-            near, self.finest / (finest - low), 0.0
-        )
+        near = np.where(inside & (level >= low), self.finest / (finest - low), 0.0)
+        return np.where(inside, self.log_uniform / finest, 0.0) + near
 
 
 def _rounded(u: NDArray[np.float64], v: NDArray[np.float64]) -> F32:
@@ -144,20 +110,14 @@ class QueryPlan:
 
     Attributes
     ----------
-    lattice : Lattice
-        Texel grids of the tile.
-    mixture : Mixture
-        Distribution of the levels.
-    min_cos : float
-        Smallest cosine of both directions to the normal, in (0, 1).
+    lattice : texel grids of the tile
+    mixture : distribution of the levels
+    min_cos : smallest cosine of both directions to the normal, in (0, 1)
     layout : "shuffled" or "image"
-    root : int
-        Root seed.
-    shard_rows : int
-        Queries (shuffled layout) or images (image layout) per full shard.
-    patch_size : int or None
-        Texels along each side of an image, of the level nearest to its footprint; None: an image covers the
-        finest level.
+    root : root seed
+    shard_rows : queries (shuffled layout) or images (image layout) per full shard
+    patch_size : texels along each side of an image, of the level nearest to its footprint; None: an image
+        covers the finest level
     """
 
     lattice: Lattice
@@ -169,21 +129,10 @@ class QueryPlan:
     patch_size: int | None = None
 
     def draw(self, split: str, shard: int, rows: int) -> Queries:
-        """Sample the queries of one shard.
+        """Sample `rows` queries (shuffled layout) or images (image layout) of a shard.
 
-        Parameters
-        ----------
-        split : str
-            ``train``, ``test``, or a stream of :mod:`mbtf_gen.sampling.rng`.
-        shard : int
-            Number of the shard within the split.
-        rows : int
-            Number of queries (shuffled layout) or images (image layout).
-
-        Returns
-        -------
-        Queries
-            Leading axes ``(rows,)``, or ``(rows, height, width)`` of images.
+        The split is ``train``, ``test``, or a stream of :mod:`mbtf_gen.sampling.rng`. Leading axes are
+        ``(rows,)``, or ``(rows, height, width)`` of images.
         """
         generator = numpy_generator(self.root, split, shard, Purpose.QUERIES)
         sigma = self._sigma(generator, rows)

@@ -72,16 +72,10 @@ def sequence(key: Any, salt: Any, query: Any, index: Any) -> SobolSampler:
 
     Parameters
     ----------
-    key, salt : mi.UInt32
+    key, salt : UInt32
         Lower and upper half of :func:`stream_key`, one or one per lane.
-    query : mi.UInt32
-        Number of the query in its shard.
-    index : mi.UInt32
-        Number of the path within its half of the query.
-
-    Returns
-    -------
-    SobolSampler
+    query, index : UInt32
+        Number of the query in its shard, and of the path within its half of the query.
     """
     import mitsuba as mi
 

@@ -7,6 +7,7 @@ is the side ``v → 1``, because of the mesh's texture coordinates.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
@@ -30,54 +31,38 @@ from mbtf_gen.render.types import (
 if TYPE_CHECKING:
     from mbtf_gen.material.material import Material
 
-# Parameters of ``mbtf_surface``: textures or numbers.
-NAMES = (
-    "base_color",
-    "roughness",
-    "metallic",
-    "specular",
-    "clearcoat",
-    "clearcoat_roughness",
-    "sheen",
-    "sheen_color",
-    "sheen_roughness",
-    "slopes",
-    "opacity",
-)
-# Effects of how a surface reflects.
-REFLECTION = frozenset({"specular", "metallic", "clearcoat", "sheen"})
+# Parameters of ``mbtf_surface``, textures or numbers: those that have defaults, and those that add a term.
+DEFAULTS = {
+    "base_color": 0.5,
+    "roughness": 0.5,
+    "clearcoat_roughness": 0.1,
+    "sheen_color": 1.0,
+    "sheen_roughness": 0.3,
+}
+TERMS = ("specular", "metallic", "clearcoat", "sheen", "slopes", "opacity")
+# Parameters of each effect of how a surface reflects.
+REFLECTION = {
+    "specular": ("specular",),
+    "metallic": ("metallic",),
+    "clearcoat": ("clearcoat", "clearcoat_roughness"),
+    "sheen": ("sheen", "sheen_color", "sheen_roughness"),
+}
 
 
 class SurfaceBSDF(mi.BSDF):
     """``mbtf_surface``: the project's BSDF as a Mitsuba plugin.
 
-    Plugin parameters are the names of :data:`NAMES`, each a texture or a number. The simulated terms are
-    those whose parameters are given: ``specular`` (with ``roughness``), ``metallic``, ``clearcoat``,
-    ``sheen``, ``slopes``. Opacity is only supported by the generator's own loop.
+    Plugin parameters are the names of :data:`DEFAULTS` and :data:`TERMS`, each a texture or a number. The
+    simulated terms are those whose parameters are given. Opacity is only supported by the generator's own
+    loop.
     """
 
     def __init__(self, props: Properties) -> None:
         super().__init__(props)
-        textures = {name: props.get_texture(name) for name in NAMES if name in props}
-        numbers = {
-            "base_color": 0.5,
-            "roughness": 0.5,
-            "clearcoat_roughness": 0.1,
-            "sheen_color": 1.0,
-            "sheen_roughness": 0.3,
-        }
-        for name, number in numbers.items():
-            if name not in textures:
-                textures[name] = props.get_texture(name, number)
-        parts = SurfaceParts(
-            diffuse=bool(props.get("diffuse", True)),
-            specular="specular" in textures,
-            metallic="metallic" in textures,
-            clearcoat="clearcoat" in textures,
-            sheen="sheen" in textures,
-            slopes="slopes" in textures,
-            opacity="opacity" in textures,
-        )
+        given = [name for name in TERMS if name in props]
+        textures = {name: props.get_texture(name, number) for name, number in DEFAULTS.items()}
+        textures |= {name: props.get_texture(name) for name in given}
+        parts = SurfaceParts(bool(props.get("diffuse", True)), **dict.fromkeys(given, True))
         self.surface = Surface(parts, textures)
         flags = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide
         if parts.specular or parts.metallic or parts.clearcoat:
@@ -158,11 +143,14 @@ def surface_of(bsdf: BSDF) -> Surface | MitsubaSurface:
     return bsdf.surface if isinstance(bsdf, SurfaceBSDF) else MitsubaSurface(bsdf)
 
 
-def _texture(value: Any) -> dict[str, Any]:
-    """Bilinear periodic bitmap of an (H, W) or (H, W, 3) array of linear values."""
-    pixels: NDArray[np.float32] = np.ascontiguousarray(value, np.float32)
-    if pixels.ndim == 2:
-        pixels = pixels[..., None]
+def _parameter(value: Any, color: bool) -> Any:
+    """Plugin parameter of a number or a color, or a bilinear periodic bitmap of an (H, W) or (H, W, 3) array
+    of linear values."""
+    array = np.asarray(value, np.float64)
+    if array.ndim < 2:
+        constant = {"type": "rgb", "value": [float(c) for c in np.broadcast_to(array, 3)]}
+        return constant if color else float(array)
+    pixels = np.ascontiguousarray(array if array.ndim == 3 else array[..., None], np.float32)
     return {
         "type": "bitmap",
         "bitmap": mi.Bitmap(pixels),
@@ -172,20 +160,8 @@ def _texture(value: Any) -> dict[str, Any]:
     }
 
 
-def _color(value: Any) -> dict[str, Any]:
-    array = np.asarray(value, np.float64)
-    if array.ndim >= 2:
-        return _texture(array)
-    return {"type": "rgb", "value": [float(c) for c in np.broadcast_to(array, 3)]}
-
-
-def _scalar(value: Any) -> Any:
-    array = np.asarray(value, np.float64)
-    return _texture(array) if array.ndim >= 2 else float(array)
-
-
 def bsdf_of(
-    material: Material, on: frozenset[str] = REFLECTION, slopes: NDArray[np.float64] | None = None
+    material: Material, on: Collection[str] = REFLECTION, slopes: NDArray[np.float64] | None = None
 ) -> dict[str, Any]:
     """Mitsuba dictionary of a material's BSDF.
 
@@ -196,22 +172,13 @@ def bsdf_of(
     """
     if material.bsdf is not None:
         return dict(material.bsdf)
-    out = {"type": "mbtf_surface", "base_color": _color(material.base_color)}
-    if material.roughness is not None:
-        out["roughness"] = _scalar(material.roughness)
-    if material.specular is not None and "specular" in on:
-        out["specular"] = _scalar(material.specular)
-    if "metallic" in on and material.metallic is not None and np.any(np.asarray(material.metallic) > 0):
-        out["metallic"] = _scalar(material.metallic)
-    if material.clearcoat is not None and "clearcoat" in on:
-        out["clearcoat"] = _scalar(material.clearcoat)
-        out["clearcoat_roughness"] = _scalar(material.clearcoat_roughness)
-    if material.sheen is not None and "sheen" in on:
-        out["sheen"] = _scalar(material.sheen)
-        out["sheen_color"] = _color(1.0 if material.sheen_color is None else material.sheen_color)
-        out["sheen_roughness"] = _scalar(material.sheen_roughness)
+    names = ["base_color", "roughness"]
+    for effect, group in {**REFLECTION, "opacity": ("opacity",)}.items():
+        weight = getattr(material, effect)
+        if effect in on and weight is not None and (effect != "metallic" or np.any(np.asarray(weight) > 0)):
+            names += group
+    given = {name: getattr(material, name) for name in names}
     if slopes is not None:
-        out["slopes"] = _texture(np.concatenate([slopes, np.zeros_like(slopes[..., :1])], axis=-1))
-    if "opacity" in on:
-        out["opacity"] = _scalar(material.opacity)
-    return out
+        given["slopes"] = np.concatenate([slopes, np.zeros_like(slopes[..., :1])], axis=-1)
+    parameters = {n: _parameter(v, n.endswith("color")) for n, v in given.items() if v is not None}
+    return {"type": "mbtf_surface", **parameters}

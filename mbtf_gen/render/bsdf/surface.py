@@ -23,6 +23,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -60,15 +61,9 @@ LOBE_PROBABILITIES = (0.1, 0.98)
 
 
 @cache
-def energy_tables(variant: str) -> EnergyTables:
+def _tables(kind: Any, variant: str) -> Any:
     """Tables of the current Mitsuba variant, made once per process."""
-    return EnergyTables()
-
-
-@cache
-def sheen_tables(variant: str) -> SheenTables:
-    """Tables of the current Mitsuba variant, made once per process."""
-    return SheenTables()
+    return kind()
 
 
 @dataclass(frozen=True)
@@ -140,10 +135,8 @@ class Surface:
     parts : SurfaceParts
         Terms that are simulated.
     textures : dict of str to Texture
-        Mitsuba textures named ``base_color``, ``roughness``, ``metallic``, ``specular``, ``clearcoat``,
-        ``clearcoat_roughness``, ``sheen``, ``sheen_color``, ``sheen_roughness``, ``slopes``, ``opacity``.
-        Those that no term needs may be missing. ``slopes`` are residual slopes along x and y, which are added
-        to those of the geometry.
+        Mitsuba textures by the names of ``mbtf_surface``. Those that no term needs may be missing. ``slopes``
+        are residual slopes along x and y, which are added to those of the geometry.
 
     Attributes
     ----------
@@ -156,8 +149,8 @@ class Surface:
         self.textures = textures
         self.transmits = parts.opacity
         glossy = parts.specular or parts.metallic or parts.clearcoat
-        self.tables = energy_tables(mi.variant()) if glossy else None
-        self.sheen_tables = sheen_tables(mi.variant()) if parts.sheen else None
+        self.tables: Any = _tables(EnergyTables, mi.variant()) if glossy else None
+        self.sheen_tables: Any = _tables(SheenTables, mi.variant()) if parts.sheen else None
 
     def at(self, si: SurfaceInteraction3f, towards_viewer: Vector3f) -> SurfacePoint:
         """The BSDF at surface interactions, of which p, n, uv and validity are used."""
@@ -173,8 +166,8 @@ class SurfacePoint:
     results are in the scene's frame; shading normals may differ from the geometric normal."""
 
     def __init__(self, surface: Surface, si: SurfaceInteraction3f, towards_viewer: Vector3f) -> None:
-        parts, maps, tables = surface.parts, surface.textures, surface.tables
-        self.parts, self.tables = parts, tables
+        parts, maps = surface.parts, surface.textures
+        self.parts, self.tables, self.sheen_tables = parts, surface.tables, surface.sheen_tables
         self.geometric_normal = si.n
         self.visible = dr.dot(si.n, towards_viewer) > 0
         normal = si.n
@@ -192,21 +185,17 @@ class SurfacePoint:
         if parts.clearcoat:
             self._clearcoat(maps, si)
         if parts.sheen:
-            assert surface.sheen_tables is not None
-            self.sheen_tables = surface.sheen_tables
             self._sheen(maps, si)
 
     def _lobe(self, maps: dict[str, Texture], si: SurfaceInteraction3f) -> None:
         roughness = dr.clip(maps["roughness"].eval_1(si), 0.0, 1.0)
-        tables = self.tables
-        assert tables is not None
-        pair, mean = tables.at(self.wi.z, roughness), tables.average(roughness)
+        pair, mean = self.tables.at(self.wi.z, roughness), self.tables.average(roughness)
         dielectric = 0.08 * maps["specular"].eval_1(si) if self.parts.specular else mi.Float(0.0)
         edge = grazing_reflectance(dielectric)
         m = self.metallic
         normal = dr.lerp(mi.Color3f(dielectric), self.base, m)
         grazing = dr.lerp(mi.Color3f(edge), grazing_reflectance(self.base), m)
-        self.lobe = Lobe(roughness, normal, grazing, tables, pair)
+        self.lobe = Lobe(roughness, normal, grazing, self.tables, pair)
         # Energy that the dielectric's lobe does not reflect: 1 - E(μi) and 1 - Ē.
         self.dielectric, self.edge = dielectric, edge
         self.transmitted = 1.0 - (dielectric * (1.0 - pair[0] - pair[1]) + edge * pair[1])
@@ -221,11 +210,10 @@ class SurfacePoint:
 
     def _clearcoat(self, maps: dict[str, Texture], si: SurfaceInteraction3f) -> None:
         roughness = dr.clip(maps["clearcoat_roughness"].eval_1(si), 0.0, 1.0)
-        tables = self.tables
-        assert tables is not None
-        pair = tables.at(self.wi.z, roughness)
+        pair = self.tables.at(self.wi.z, roughness)
         self.clearcoat_weight = maps["clearcoat"].eval_1(si)
-        self.clearcoat = Lobe(roughness, mi.Color3f(CLEARCOAT_REFLECTANCE), mi.Color3f(1.0), tables, pair)
+        normal, grazing = mi.Color3f(CLEARCOAT_REFLECTANCE), mi.Color3f(1.0)
+        self.clearcoat = Lobe(roughness, normal, grazing, self.tables, pair)
 
     def _sheen(self, maps: dict[str, Texture], si: SurfaceInteraction3f) -> None:
         self.sheen_roughness = dr.clip(maps["sheen_roughness"].eval_1(si), 0.0, 1.0)
@@ -238,7 +226,6 @@ class SurfacePoint:
         diffuse = self.base * (1.0 - self.metallic)
         if not (self.parts.specular or self.parts.metallic):
             return diffuse
-        assert self.tables is not None
         missing, b = self.tables.at(cosine, self.lobe.roughness)
         transmitted = 1.0 - (self.dielectric * (1.0 - missing - b) + self.edge * b)
         value = mi.Color3f(0.0)

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from support.scenes import HeightGrid, build_tile, lambert, mi, rocks
 
-from mbtf_gen.geometry.mesh import mesh_of_grid
+from mbtf_gen.geometry.heightfield import mesh_of_grid
 from mbtf_gen.render.heightfield import HeightField
 from mbtf_gen.render.heightfield_tracer import closest_hit, hit_and_shadow, occluded
 from mbtf_gen.sampling.rng import sequence
@@ -62,7 +62,7 @@ def test_hits_and_shadows_are_those_of_the_mesh(grid: HeightGrid) -> None:
     scene = mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, "mesh": mesh})
     ray = ray_of(*rays(rng, grid, tile.unit))
     expected = scene.ray_intersect(ray)
-    found, _, capped, _ = closest_hit(tile.world.heightfield, ray, mi.Bool(True), 100)
+    found, _, capped, _ = closest_hit(tile.heightfield, ray, mi.Bool(True), 100)
     assert np.all(np.array(expected.is_valid()))
     assert np.all(np.array(found.is_valid()))
     assert not np.any(np.array(capped))
@@ -78,8 +78,8 @@ def test_hits_and_shadows_are_those_of_the_mesh(grid: HeightGrid) -> None:
     assert np.mean(np.abs(u - np.round(u)).max(axis=0) > 2e-4) < 1e-4
 
     light = np.array([0.75, -0.55, 0.37]) * (rng.choice([-1, 1], (N, 1)) * [1, 1, 0] + [0, 0, 1])
-    shadow = tile.world.heightfield.leave(found, ray_of(light, light).d)
-    blocked, _, capped, _ = occluded(tile.world.heightfield, shadow, mi.Bool(True), 100)
+    shadow = tile.heightfield.leave(found, ray_of(light, light).d)
+    blocked, _, capped, _ = occluded(tile.heightfield, shadow, mi.Bool(True), 100)
     assert not np.any(np.array(capped))
     truth = np.array(scene.ray_test(shadow))
     assert 0.02 < truth.mean() < 0.98
@@ -144,7 +144,7 @@ def test_grazing_rays_and_rays_that_bounced_meet_what_the_mesh_has() -> None:
 
     def compared(ray: mi.Ray3f, most: float) -> tuple[Any, NDArray]:
         expected = scene.ray_intersect(ray)
-        found, _, capped, _ = closest_hit(tile.world.heightfield, ray, mi.Bool(True), 4096)
+        found, _, capped, _ = closest_hit(tile.heightfield, ray, mi.Bool(True), 4096)
         assert not np.any(np.array(capped))
         met = np.array(found.is_valid())
         # Rays that leave upwards leave the mesh as well.
@@ -162,7 +162,7 @@ def test_grazing_rays_and_rays_that_bounced_meet_what_the_mesh_has() -> None:
     normal = np.array(first.n).T
     d *= np.sign(np.sum(d * normal, axis=1))[:, None]
     d /= np.linalg.norm(d, axis=1)[:, None]
-    _, met = compared(tile.world.heightfield.leave(first, ray_of(d, d).d), 2e-3)
+    _, met = compared(tile.heightfield.leave(first, ray_of(d, d).d), 2e-3)
     assert 0.2 < met.mean() < 0.9
 
 

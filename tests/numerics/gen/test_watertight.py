@@ -24,7 +24,7 @@ def misses(grid: HeightGrid, uv: NDArray[np.float64], direction: NDArray[np.floa
     for part in range(0, len(uv), 1 << 20):
         o, d = (np.ascontiguousarray(x[part : part + (1 << 20)].T, np.float32) for x in (origin, direction))
         si, _, capped, _ = closest_hit(
-            tile.world.heightfield, mi.Ray3f(mi.Point3f(o), mi.Vector3f(d)), mi.Bool(True), 4096
+            tile.heightfield, mi.Ray3f(mi.Point3f(o), mi.Vector3f(d)), mi.Bool(True), 4096
         )
         total += int(np.sum(~np.array(si.is_valid()))) + int(np.sum(np.array(capped)))
     return total

@@ -12,10 +12,11 @@ from support.scenes import HeightGrid, LightKernel, direction, directional, flat
 
 from mbtf_core.stats import aggregate_test, elevation_groups, mean_of_halves
 from mbtf_gen.render.estimator import Estimator, Stream
-from mbtf_gen.render.path_tracer import PLANE, Transport
+from mbtf_gen.render.path_tracer import Transport
 from mbtf_gen.render.scene import Tile, build_tile
 
 N = 8000
+PLANE = Transport(displacement=False, shadowing=False, interreflection=False)
 
 
 def half_open(share: float = 0.0) -> np.ndarray[Any, Any]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support.chi_square import Cap, Rectangle, chi_square_test
-from support.scenes import mi
+from support.scenes import direction, mi
 
 from mbtf_gen.render.directional_light import DirectionalLight
 from mbtf_gen.sampling.light_kernel import LightKernel, concentration, rms_angle_deg
@@ -17,12 +17,7 @@ ELEVATIONS = [1e-4, 0.01, 0.1, 0.5, 1.0, 3.0, 10.0, 30.0, 60.0, 89.9]
 
 def directional_light(width: float, elevation: float, lanes: int = 1) -> DirectionalLight:
     """Light of many equal lanes, as the renderer makes it."""
-    kernel = LightKernel(width)
-    e = np.radians(elevation)
-    omega_i = np.array([[np.cos(e), 0.0, np.sin(e)]], np.float32)
-    w = mi.Vector3f(np.repeat(omega_i, lanes, axis=0).T.copy())
-    scale = np.full(lanes, 1.0 / kernel.irradiance(omega_i)[0], np.float32)
-    return DirectionalLight("lobe", w, mi.Float(scale), mi.Float(kernel.kappa))
+    return DirectionalLight.of(LightKernel(width), np.tile(direction(elevation, 0), (lanes, 1)))
 
 
 def polar_grid(width: float, elevation: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -84,9 +79,7 @@ def sampled(
     """(samples (n, 3), axis of the lobe)."""
     rng = np.random.default_rng(11)
     xi = mi.Point2f(rng.random((2, n)).astype(np.float32))
-    e = np.radians(elevation)
-    axis = np.array([np.cos(e), 0.0, np.sin(e)])
-    return np.array(directional_light(width, elevation, n).sample(xi), np.float64).T, axis
+    return np.array(directional_light(width, elevation, n).sample(xi), np.float64).T, direction(elevation, 0)
 
 
 @pytest.mark.parametrize(("width", "elevation"), [(0.05, 60.0), (1.0, 30.0), (30.0, 80.0)])
@@ -122,8 +115,3 @@ def test_width_is_the_rms_angle_per_axis(width: float) -> None:
     versine = -np.log1p(-rng.random(1_000_000) * -np.expm1(-2 * kappa)) / kappa
     theta = 2 * np.arcsin(np.sqrt(versine / 2))
     assert np.degrees(np.sqrt(np.mean(theta**2) / 2)) == pytest.approx(width, rel=5e-3)
-
-
-def test_width_outside_its_range_is_refused() -> None:
-    with pytest.raises(ValueError, match="degrees"):
-        LightKernel(60.0)

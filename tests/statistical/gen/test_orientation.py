@@ -72,7 +72,7 @@ def test_vertices_sit_on_texel_centers() -> None:
         [(u[:, 0] - 0.5) * tile.unit, (u[:, 1] - 0.5) * ASPECT * tile.unit, np.full(len(u), 1.0)]
     )
     ray = mi.Ray3f(mi.Point3f(origin.T.astype(np.float32).copy()), mi.Vector3f(0, 0, -1))
-    si, *_ = closest_hit(tile.world.heightfield, ray, mi.Bool(True), 16)
+    si, *_ = closest_hit(tile.heightfield, ray, mi.Bool(True), 16)
     np.testing.assert_allclose(np.array(si.p.z) / tile.unit, grid.z.ravel(), atol=1e-5)
     # Mitsuba's texture coordinates of the hits: (u, 1-v).
     np.testing.assert_allclose(np.array(si.uv).T % 1.0, u * [1, -1] + [0, 1], atol=1e-5)

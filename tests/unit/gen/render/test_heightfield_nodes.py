@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from mbtf_gen.geometry.heightfield import HeightGrid, grid_faces, grid_vertices
-from mbtf_gen.render import heightfield_nodes
-from mbtf_gen.render.heightfield_nodes import node_table
+from mbtf_gen.render import heightfield
+from mbtf_gen.render.heightfield import node_table
 
 SHAPES = [(1, 1), (1, 7), (2, 2), (5, 3), (8, 8), (13, 32), (33, 9)]
 
@@ -27,7 +27,7 @@ def value(row: NDArray[np.float32], x: float, y: float) -> float:
 def test_cells_are_the_meshs_triangles(shape: tuple[int, int]) -> None:
     z = heights(shape)
     rows, columns = shape
-    cells = node_table(z).rows[: z.size].reshape(rows, columns, 4)
+    cells = node_table(z)[: z.size].reshape(rows, columns, 4)
     # The mesh counts rows from the side v → 1, the table along +y.
     vertices = grid_vertices(HeightGrid(z[::-1], 1.0))
     triangles = vertices.reshape(-1, 3)[grid_faces(rows + 1, columns + 1)].reshape(rows, columns, 2, 3, 3)
@@ -45,17 +45,19 @@ def test_cells_are_the_meshs_triangles(shape: tuple[int, int]) -> None:
 def test_no_vertex_pierces_a_plane(
     shape: tuple[int, int], below: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(heightfield_nodes, "_PASS_NUMBERS", 100)
+    monkeypatch.setattr(heightfield, "_PASS_NUMBERS", 100)
     z = heights(shape)
     table = node_table(z, below)
     rows, columns = shape
+    columns_log2, rows_log2 = ((n - 1).bit_length() for n in (columns, rows))
+    finest = min(columns_log2, rows_log2)
     touched = 0
-    for level in range(1, table.finest + 1):
+    for level in range(1, finest + 1):
         side = 1 << level
         for j in range(-(-rows // side)):
             for i in range(-(-columns // side)):
-                first = z.size + (1 << (table.columns_log2 + table.rows_log2 - 2 * level))
-                plane = table.rows[first + (j << (table.columns_log2 - level)) + i]
+                first = z.size + (1 << (columns_log2 + rows_log2 - 2 * level))
+                plane = table[first + (j << (columns_log2 - level)) + i]
                 x = np.arange(min(side, columns - i * side) + 1)
                 y = np.arange(min(side, rows - j * side) + 1)[:, None]
                 h = z[(y + j * side) % rows, (x + i * side) % columns]
@@ -65,7 +67,7 @@ def test_no_vertex_pierces_a_plane(
                 touched += gap.min() < 1e-5
                 assert plane[3] == 0
     # As low as they can be.
-    assert touched == sum(-(-rows // s) * -(-columns // s) for s in 2 ** np.arange(1, table.finest + 1))
+    assert touched == sum(-(-rows // s) * -(-columns // s) for s in 2 ** np.arange(1, finest + 1))
 
 
 def test_planes_follow_a_slope() -> None:
@@ -73,6 +75,6 @@ def test_planes_follow_a_slope() -> None:
     z = np.tile(np.arange(8.0), (8, 1))
     table = node_table(z)
     first = z.size + (1 << 4)
-    planes = table.rows[first : first + 16].reshape(4, 4, 4)
+    planes = table[first : first + 16].reshape(4, 4, 4)
     np.testing.assert_allclose(planes[:, :3, 0], np.tile([0.0, 2.0, 4.0], (4, 1)), atol=1e-5)
     np.testing.assert_allclose(planes[:, :3, 1], 1.0, atol=1e-6)

@@ -44,9 +44,7 @@ def test_the_installation_has_a_new_enough_llvm() -> None:
     library = llvm.shipped_llvm()
     assert library is not None
     assert library.is_file()
-    version = llvm.version_in_name(library)
-    assert version is not None
-    assert version[0] >= llvm.OLDEST_LLVM
+    assert llvm.has_version(str(library))
 
 
 def test_it_is_found_and_works_with_nothing_set(run_python: RunPython, tmp_path: Path) -> None:
@@ -90,25 +88,16 @@ def test_a_text_file_is_refused_in_one_line(run_python: RunPython, tmp_path: Pat
 
 def test_a_missing_file_and_a_folder_are_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv(llvm.VARIABLE, str(tmp_path / "libLLVM.so"))
-    with pytest.raises(EngineError, match="no such file"):
+    with pytest.raises(EngineError, match=r"cannot be loaded .*No such file"):
         engine.check_llvm()
     monkeypatch.setenv(llvm.VARIABLE, str(tmp_path))
-    with pytest.raises(EngineError, match="is not a file"):
+    with pytest.raises(EngineError, match=r"cannot be loaded .*Is a directory"):
         engine.check_llvm()
 
 
 @pytest.mark.parametrize("major", [14, 15])
-def test_an_old_llvm_is_refused_by_its_name(major: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(llvm.VARIABLE, old_llvm(major))
-    with pytest.raises(EngineError, match=f"is LLVM {major}; LLVM {llvm.OLDEST_LLVM} or newer is needed"):
-        engine.check_llvm()
-
-
-@pytest.mark.parametrize("major", [14, 15])
-def test_an_old_llvm_under_another_name_is_refused(major: int, run_python: RunPython, tmp_path: Path) -> None:
-    disguised = tmp_path / "compiler.so"
-    shutil.copy(old_llvm(major), disguised)
-    done = run_python("-c", LOAD, DRJIT_LIBLLVM_PATH=str(disguised))
+def test_an_old_llvm_is_refused(major: int, run_python: RunPython) -> None:
+    done = run_python("-c", LOAD, DRJIT_LIBLLVM_PATH=old_llvm(major))
     assert done.returncode == 0
     assert "is older than LLVM 16" in done.stdout
     assert done.stderr == ""
@@ -121,19 +110,6 @@ def test_a_library_that_is_no_llvm_is_refused(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setenv(llvm.VARIABLE, name)
     with pytest.raises(EngineError, match="not LLVM at all"):
         engine.check_llvm()
-
-
-def test_versions_are_read_from_names_and_through_links(tmp_path: Path) -> None:
-    versions = {
-        "libLLVM.so.23.1": (23, 1, 0),
-        "libLLVM-15.so.1": (15, 0, 0),
-        "libLLVM-14.0.6.so.1": (14, 0, 6),
-    }
-    for name, version in {**versions, "libLLVM.so": None, "other.so.3": None}.items():
-        assert llvm.version_in_name(tmp_path / name) == version
-    (tmp_path / "libLLVM.so.19.1").touch()
-    (tmp_path / "libLLVM.so").symlink_to("libLLVM.so.19.1")
-    assert llvm.version_in_name(tmp_path / "libLLVM.so") == (19, 1, 0)
 
 
 def test_an_installation_never_started_by_its_owner_works(run_python: RunPython, tmp_path: Path) -> None:
@@ -176,8 +152,8 @@ def test_a_proof_is_cached_per_library(library: Path, monkeypatch: pytest.Monkey
         return engine.Outcome({"llvm": [20, 1, 2]}, "", 0.0)
 
     monkeypatch.setattr(engine, "prove", prove)
-    assert engine.check_llvm() == (20, 1, 2)
-    assert engine.check_llvm() == (20, 1, 2)
+    engine.check_llvm()
+    engine.check_llvm()
     assert len(proofs) == 1
     library.write_bytes(b"changed")
     engine.check_llvm()
@@ -197,8 +173,8 @@ def test_an_unwritable_cache_does_no_harm(monkeypatch: pytest.MonkeyPatch, tmp_p
     (tmp_path / "file").touch()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     monkeypatch.delenv(llvm.VARIABLE, raising=False)
-    monkeypatch.setattr(engine, "prove", lambda variant: engine.Outcome({"llvm": [23, 1, 4]}, "", 0.0))
-    assert engine.check_llvm() == (23, 1, 4)
+    monkeypatch.setattr(engine, "prove", lambda variant: engine.Outcome({}, "", 0.0))
+    engine.check_llvm()
 
 
 def test_unknown_variants_are_usage_errors() -> None:
@@ -240,7 +216,7 @@ def leave():  # type: ignore[no-untyped-def]
 
 def prove_whatever_the_version():  # type: ignore[no-untyped-def]
     engine.OLDEST_LLVM = 0
-    engine.version_of = lambda library: (15, 0, 0)
+    engine.has_version = lambda library: True
     yield from engine._proof(engine.CPU_VARIANT)
 
 
@@ -250,7 +226,6 @@ def test_the_proof_catches_the_abort_of_llvm_15(monkeypatch: pytest.MonkeyPatch,
     environment = {llvm.CACHE_VARIABLE: str(tmp_path)}
     outcome = run_child(__name__, "prove_whatever_the_version", timeout=60, environment=environment)
     assert "ended by SIGABRT" in outcome.fault
-    assert "device" not in outcome.answers
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -145,16 +146,25 @@ def test_a_shard_does_not_depend_on_the_others() -> None:
     assert not equal(many[0], many[1])
 
 
+def test_splits_shards_and_roots_have_different_queries() -> None:
+    samples = [
+        plan(LATTICES[1], 1000, root=root).draw(split, shard, 1000)
+        for root, split, shard in ((3, "train", 0), (3, "train", 1), (3, "test", 0), (4, "train", 0))
+    ]
+    for a, b in combinations(samples, 2):
+        for name in ("u", "sigma", "omega_i", "omega_o"):
+            one, other = (getattr(q, name).reshape(1000, -1)[:, 0] for q in (a, b))
+            assert np.mean(one == other) < 0.01
+            assert abs(np.corrcoef(one, other)[0, 1]) < 5 / np.sqrt(1000)
+
+
 @pytest.mark.parametrize("layout", ["shuffled", "image"])
 def test_every_number_is_within_its_range(layout: str) -> None:
     lattice = Lattice(6, 0.75)
     low, high = lattice.sigma_range
     for shard in range(3):
-        q = (
-            plan(lattice, 20_000 if layout == "shuffled" else 6, layout)
-            .draw("test", shard, 20_000 if layout == "shuffled" else 6)
-            .flat()
-        )
+        rows = 20_000 if layout == "shuffled" else 6
+        q = plan(lattice, rows, layout).draw("test", shard, rows).flat()
         assert (q.u >= 0).all()
         assert (q.u < 1).all()
         assert (q.sigma >= np.float32(low)).all()
