@@ -22,9 +22,8 @@ from mbtf_core.stats import (
     signal_variance,
     unexplained_variance,
 )
-from mbtf_fit.data.loader import load_split, load_training
+from mbtf_fit.data.loader import MAX_HELD_OUT_OF_IMAGES, SAMPLE, Partition, load_split, load_training
 from mbtf_fit.data.queries import ShardQueries
-from mbtf_fit.data.split import MAX_HELD_OUT_OF_IMAGES, SAMPLE, Partition
 from mbtf_fit.material.transmittance_fit import TransmittanceError, evaluate_transmittance, has_transmittance
 from mbtf_gen.dataset.reader import Dataset
 
@@ -128,10 +127,6 @@ def evaluate_splits(predict: Predict, data: Dataset, partition: Partition) -> di
 
     The error on training queries is underestimated by twice the covariance of prediction and noise: its
     distance from the error on held-out queries measures overfitting.
-
-    Raises
-    ------
-    InputError : a test shard is missing or corrupt
     """
     parts: dict[str, ShardQueries] = {}
     if "test" in data.splits and data.shards("test"):
@@ -148,12 +143,7 @@ def evaluate_splits(predict: Predict, data: Dataset, partition: Partition) -> di
 
 def foreign_inputs(material: Material, shards: str | Path) -> list[str]:
     """Inputs (height, base_color, …) that differ between a data set and the training data of a material;
-    empty where either records none.
-
-    Raises
-    ------
-    InputError : shards are missing or corrupt
-    """
+    empty where either records none."""
     trained, given = material.description["data"].get("inputs"), Dataset.open(shards).manifest.get("inputs")
     if not trained or not given:
         return []

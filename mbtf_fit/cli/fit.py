@@ -103,13 +103,7 @@ def fit(
 
 
 def resolve_config(options: Options[FitConfig], quality: Quality | None) -> FitConfig:
-    """Configuration of a fit.
-
-    Raises
-    ------
-    UsageError : a flag or an assignment is at fault
-    InputError : the file is at fault
-    """
+    """Configuration of a fit."""
     from mbtf_fit.presets import fitter_options, overrides_of
 
     given = options.given

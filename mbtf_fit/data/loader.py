@@ -1,43 +1,58 @@
-"""Loading of data sets: training queries, held-out queries, and whole splits."""
+"""Loading of data sets: the train split, divided into training and held-out queries, and whole splits."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
 from mbtf_core.shard_schema import Layout, Split
 from mbtf_fit.config import HeldOutSection
 from mbtf_fit.data.images import TrainingImages, nearest_shapes, philox, strides
 from mbtf_fit.data.queries import NEEDED, QUERY_BYTES, ShardQueries, TrainingQueries, mean_value
-from mbtf_fit.data.split import (
-    HELD_OUT_DIRECTION,
-    HELD_OUT_QUERY,
-    MAX_HELD_OUT,
-    MAX_HELD_OUT_OF_IMAGES,
-    SAMPLE,
-    SPLIT_STREAM,
-    TRAINING,
-    Partition,
-    label_images,
-    label_queries,
-    sample_images,
-)
 from mbtf_fit.data.streaming import Selection, StreamedQueries
 from mbtf_gen.dataset.reader import Dataset, Shard
 from mbtf_gen.dataset.shard_io import Arrays, read_shard
 
+# Training queries that are kept with both halves, as a sample of all.
+SAMPLE = 1 << 16
+# Most held-out queries of each kind. Queries of one image are correlated, so the image layout keeps fewer.
+MAX_HELD_OUT = 1 << 16
+MAX_HELD_OUT_OF_IMAGES = 1 << 14
+# Random stream of the image layout's split; the streams of its batches count up from 0.
+SPLIT_STREAM = 1 << 62
+# Labels of the rows of the train split.
+TRAINING, HELD_OUT_QUERY, HELD_OUT_DIRECTION = np.int8(0), np.int8(1), np.int8(2)
+
+
+@dataclass(frozen=True)
+class Partition:
+    """The train split, divided into training queries and held-out queries.
+
+    Attributes
+    ----------
+    training : training queries in the order of the shards; images in the image layout; streamed from disk
+        where they exceed the memory limit
+    held_out_queries : a random fraction of the queries outside the held-out region
+    held_out_directions : queries with light or view in the held-out region; at most `MAX_HELD_OUT`
+    sample : a sample of the training queries with both halves; about `SAMPLE` queries from all shards
+    selection : rows of the shards that are trained on: queries, or images in the image layout
+    """
+
+    training: TrainingQueries | TrainingImages | StreamedQueries
+    held_out_queries: ShardQueries
+    held_out_directions: ShardQueries
+    sample: ShardQueries
+    selection: Selection
+
 
 def open_data(folder: str | Path, layout: Layout, model: str) -> Dataset:
-    """Open a folder of shards to train a model that needs a layout.
-
-    Raises
-    ------
-    InputError : no data set, or of another layout
-    """
+    """Open a folder of shards to train a model that needs a layout."""
     data = Dataset.open(folder)
     if data.layout != layout:
         raise InputError(
@@ -54,12 +69,7 @@ def data_hash(data: Dataset) -> str:
 
 
 def read_checked(shard: Shard) -> ShardQueries:
-    """One shard, every number checked.
-
-    Raises
-    ------
-    InputError : NaN or infinity, or another number of rows than its sidecar states
-    """
+    """One shard, every number checked."""
     arrays: Arrays = read_shard(shard.path, NEEDED)
     rows = len(arrays["sigma"])
     if rows != shard.rows:
@@ -80,6 +90,48 @@ def read_checked(shard: Shard) -> ShardQueries:
                 hint="check the data set with: mbtf-gen verify",
             )
     return ShardQueries(**arrays)
+
+
+def in_region(held_out: HeldOutSection, omega: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Mask (n,) of the directions (n, 3) in the held-out region, a disk on the projected hemisphere."""
+    if held_out.radius == 0:
+        return np.zeros(len(omega), bool)
+    center = np.asarray(held_out.direction, np.float32)
+    with np.errstate(over="ignore"):  # of corrupt shards
+        return ((omega[:, :2] - center) ** 2).sum(1) < np.float32(held_out.radius) ** 2
+
+
+def label_queries(held_out: HeldOutSection, queries: ShardQueries, seed: int, shard: int) -> NDArray[np.int8]:
+    """Label of each query of a shard."""
+    random = np.random.Generator(np.random.Philox(key=[seed, shard])).random(len(queries))
+    labels = np.where(random < held_out.queries, HELD_OUT_QUERY, TRAINING)
+    region = in_region(held_out, queries.omega_i) | in_region(held_out, queries.omega_o)
+    return np.where(region, HELD_OUT_DIRECTION, labels)
+
+
+def label_images(data: Dataset, held_out: HeldOutSection, random: np.random.Generator) -> NDArray[np.int8]:
+    """Label of each image of the train split. Where ``held_out.queries`` is not 0, at least one image is held
+    out."""
+    parts = []
+    for shard in data.shards("train"):
+        arrays = read_shard(shard.path, ("omega_i", "omega_o"))
+        light, view = (np.array(arrays[name][:, 0, 0]) for name in ("omega_i", "omega_o"))
+        parts.append(in_region(held_out, light) | in_region(held_out, view))
+    labels = np.where(np.concatenate(parts), HELD_OUT_DIRECTION, TRAINING)
+    inside = np.flatnonzero(labels == TRAINING)
+    count = max(1, round(held_out.queries * len(inside))) if held_out.queries and len(inside) > 1 else 0
+    labels[random.permutation(inside)[:count]] = HELD_OUT_QUERY
+    return labels
+
+
+def sample_images(images: ShardQueries, most: int, random: np.random.Generator) -> ShardQueries:
+    """At most `most` queries of images, equally many of each, in random order."""
+    count, rows, columns = images.sigma.shape
+    if count == 0:
+        return images.flat()
+    each = min(rows * columns, -(-most // count))
+    chosen = [k * rows * columns + random.permutation(rows * columns)[:each] for k in range(count)]
+    return images.flat().take(random.permutation(np.concatenate(chosen))[:most])
 
 
 def load_training(

@@ -132,7 +132,7 @@ def fit_transmittance(data: Dataset, selection: Selection, memory: float = MEMOR
 
     Parameters
     ----------
-    selection : rows of the shards that are trained on, as in :class:`~mbtf_fit.data.split.Partition`
+    selection : rows of the shards that are trained on, as in :class:`~mbtf_fit.data.loader.Partition`
     memory : bytes for the sums
     """
     if not has_transmittance(data):

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.native.library import GradientSums, QuadraticLoss, QueryPointers
-from mbtf_fit.native.model import NativeModel, aligned, networks, parameters_of, pointers
+from mbtf_fit.native.model import NativeModel, aligned, networks, pointers
 from mbtf_fit.objective.losses import Objective, Quadratic
 from mbtf_fit.objective.parallel import Workers
 
@@ -37,7 +37,8 @@ class _Sums:
         self.textures = [
             aligned(t.packing.texels * (-(-t.texels.shape[1] // 8) * 8)) for t in native.textures
         ]
-        self.networks = [aligned(lanes * network.count) for network in networks(native.model)]
+        sizes = [sum(p.numel() for p in network.parameters()) for network in networks(native.model)]
+        self.networks = [aligned(lanes * size) for size in sizes]
         self.state = native.state(piece)
         self.scratch = aligned(int(native.kernel.library.mbtf_scratch_floats()))
         self.out = torch.empty(max(piece, 2 * native.kernel.block), 3)
@@ -65,7 +66,7 @@ class NativeGradients:
         self.piece = block * max(4, _PIECE_BYTES // per_block)
         self._sums: list[_Sums] = []
         self.textures = [torch.empty_like(t.texels) for t in native.textures]
-        self.networks = [[torch.empty_like(p) for p in parameters_of(n)] for n in networks(native.model)]
+        self.networks = [[torch.empty_like(p) for p in n.parameters()] for n in networks(native.model)]
 
     def compute(self, objective: Objective, batch: TrainingQueries, workers: Workers) -> Tensor:
         """Mean loss of a batch; the gradients by tables and weights are left in :attr:`textures` and

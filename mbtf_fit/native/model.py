@@ -70,11 +70,6 @@ def networks(model: NeuralMaterial) -> list[Mlp]:
     return [model.decoder, *([] if model.network.offset == "none" else [model.offset_network])]
 
 
-def parameters_of(network: Mlp) -> list[Tensor]:
-    """Weight 0, bias 0, weight 1, ..."""
-    return [p for pair in zip(network.weights, network.biases, strict=True) for p in pair]
-
-
 def pointers(tensors: list[Tensor]) -> Any:
     """Addresses of tensors, as the kernel takes them."""
     return (ctypes.c_void_p * len(tensors))(*(t.data_ptr() for t in tensors))
@@ -133,7 +128,7 @@ class NativeModel:
         self.description.unit = float(self.model.unit)
         self._kept: list[Tensor] = []
         for network, target, packed in zip(networks(self.model), self._targets(), self._packed, strict=False):
-            held = [p.detach().contiguous() for p in parameters_of(network)]
+            held = [p.detach().contiguous() for p in network.parameters()]
             library.mbtf_pack(variant, ctypes.byref(target), pointers(held), packed.data_ptr())
         for texture, layout in zip(self.model.textures(), self._layouts(), strict=False):
             table = texture.table.detach().contiguous()

@@ -27,22 +27,12 @@ def state_tensors(trainer: Trainer) -> dict[str, Tensor]:
 
 
 def write_checkpoint(trainer: Trainer, path: Path) -> None:
-    """Write parameters, optimizer state and progress.
-
-    Raises
-    ------
-    PartialError : the disk is full or the folder cannot be written
-    """
+    """Write parameters, optimizer state and progress."""
     write_tensors(path, state_tensors(trainer), asdict(trainer.progress))
 
 
 def read_checkpoint(trainer: Trainer, path: Path) -> None:
-    """Resume from a checkpoint of the same configuration and data, with identical results.
-
-    Raises
-    ------
-    InputError : the checkpoint is corrupt, or of another model
-    """
+    """Resume from a checkpoint of the same configuration and data, with identical results."""
     try:
         _restore(trainer, *read_tensors(path))
     except (InputError, KeyError, TypeError, ValueError, RuntimeError):

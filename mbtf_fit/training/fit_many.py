@@ -44,12 +44,7 @@ class FitOutcome:
 
 def find_data(arguments: Sequence[Path]) -> list[Path]:
     """Data sets of the arguments: a data set's folder, a folder of such folders, or a text file with one
-    folder per line, relative to the file; lines that start with # are comments.
-
-    Raises
-    ------
-    InputError : an argument has no data set
-    """
+    folder per line, relative to the file; lines that start with # are comments."""
     found: list[Path] = []
     for argument in arguments:
         if argument.is_file():
@@ -71,12 +66,7 @@ def find_data(arguments: Sequence[Path]) -> list[Path]:
 
 
 def name_materials(shards: Sequence[Path], out: Path) -> list[Path]:
-    """A folder in `out` for each data set, with its name; equal names are prefixed by the parent's name.
-
-    Raises
-    ------
-    UsageError : two names are still equal
-    """
+    """A folder in `out` for each data set, with its name; equal names are prefixed by the parent's name."""
     names = [path.resolve().name for path in shards]
     often = Counter(names)
     parts = [path.resolve().parts[-2:] for path in shards]

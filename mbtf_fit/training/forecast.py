@@ -87,13 +87,7 @@ def extrapolated(
 
 
 def forecast_fit(config: FitConfig, shards: str | Path) -> FitForecast:
-    """Forecast the fit of a configuration by two pilot fits; nothing is written.
-
-    Raises
-    ------
-    InputError : shards cannot be used
-    EngineError : the device is not available
-    """
+    """Forecast the fit of a configuration by two pilot fits; nothing is written."""
     began = time.perf_counter()
     device = choose_device(config.device)
     data = open_data(shards, MODELS[config.model].layout, config.model)

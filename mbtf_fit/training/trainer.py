@@ -17,11 +17,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mbtf_core.errors import InputError
-from mbtf_fit.config import FitConfig
+from mbtf_fit.config import FitConfig, TrainingSection
 from mbtf_fit.data.images import Patches, TrainingImages
 from mbtf_fit.data.queries import ShardQueries, TrainingQueries
 from mbtf_fit.data.streaming import Selection, StreamedQueries
 from mbtf_fit.material.inference import predict
+from mbtf_fit.models.blur import annealed_sigma
+from mbtf_fit.models.hierarchical import Hierarchical
 from mbtf_fit.models.interface import NeuralMaterial
 from mbtf_fit.models.neumip import Neumip
 from mbtf_fit.native import kernel
@@ -29,13 +31,23 @@ from mbtf_fit.native.model import unsupported_reason
 from mbtf_fit.native.stepper import NativeStepper
 from mbtf_fit.objective.losses import Objective
 from mbtf_fit.objective.noise import NoiseModel
-from mbtf_fit.objective.parallel import MAX_KERNEL_THREADS, Batch, Workers
+from mbtf_fit.objective.parallel import MAX_KERNEL_THREADS, MAX_THREADS, Batch, Workers
 from mbtf_fit.objective.regularization import WeightDecay
 from mbtf_fit.training.calibration import fit_calibration
-from mbtf_fit.training.schedule import blur_sigmas, learning_rate_factor
 
 # Decay rates of Adam's moments.
 BETAS = (0.8, 0.95)
+# Widest blur, in tile widths. A blur of half a tile made training unstable on textures of 16 × 16 texels: the
+# offsets of three of eight fits diverged before the textures became sharp.
+WIDEST_BLUR = 0.125
+
+
+def learning_rate_factor(training: TrainingSection, step: int, fraction: float) -> float:
+    """Factor of the learning rates after a fraction of the budget: linear warm-up, then cosine decay."""
+    rise = min(1.0, (step + 1) / (training.warmup + 1))
+    last = training.final_learning_rate_factor
+    fall = last + (1 - last) * 0.5 * (1 + math.cos(math.pi * min(fraction, 1.0)))
+    return rise * fall
 
 
 @dataclass
@@ -105,7 +117,7 @@ class Trainer:
         return min(1.0, self.progress.seconds / training.time)
 
     def _batches(self) -> Iterator[Batch]:
-        """Endless batches from the current step on."""
+        """Endless batches, from the current step on."""
         return self.queries.batches(self.batch, self.config.seed, self.progress.step, self.model.margin)
 
     def train(self, seconds: float, stop: Event | None = None) -> bool:
@@ -124,7 +136,7 @@ class Trainer:
         losses: list[Tensor] = []
         health: list[Tensor] = []
         batches = self._batches()
-        limit = None if self._stepper is None else MAX_KERNEL_THREADS
+        limit = MAX_THREADS if self._stepper is None else MAX_KERNEL_THREADS
         with Workers(self.device, limit=limit) as workers:
             while self.fraction < 1.0 and not (stop is not None and stop.is_set() and losses):
                 start = time.perf_counter()
@@ -152,12 +164,7 @@ class Trainer:
             return torch.stack([p.sum() for p in self.model.parameter_groups()[1]]).sum()
 
     def _stop_diverged(self, first: int, losses: list[Tensor], health: list[Tensor]) -> NoReturn:
-        """Report the first bad batch of the steps since `first`.
-
-        Raises
-        ------
-        InputError : always
-        """
+        """Report the first bad batch of the steps since `first`."""
         good = 0
         for loss, weights in zip(losses, health, strict=False):
             if not math.isfinite(float(loss) + float(weights)):
@@ -174,14 +181,19 @@ class Trainer:
 
     def _sigmas(self) -> list[float]:
         """Current blur of each texture, in texels of the finest level."""
-        return blur_sigmas(self.config.training.blur, self.model, self.fraction)
+        blur, model = self.config.training.blur, self.model
+        start = min(blur.initial_sigma, max(WIDEST_BLUR * min(model.lattice.shape()), blur.final_sigma))
+        sigma = annealed_sigma(self.fraction / blur.fraction, start, blur.final_sigma)
+        return [
+            max(sigma, blur.offset_sigma if t.moves_lookups else blur.min_sigma) for t in model.textures()
+        ]
 
     def _tables(self) -> list[Tensor]:
         """The textures with the current blur."""
         return [t.blurred(sigma) for t, sigma in zip(self.model.textures(), self._sigmas(), strict=True)]
 
     def _loss(self, batch: Batch) -> Tensor:
-        evaluate = self.model.evaluate_patches if isinstance(batch, Patches) else self.model
+        evaluate = self.model.evaluate_patches if isinstance(self.model, Hierarchical) else self.model
         prediction = evaluate(batch.u, batch.sigma, batch.omega_i, batch.omega_o)
         return self.loss(prediction, batch)
 

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 
 from mbtf_core.stats import Estimate, unexplained_variance
-from mbtf_fit.data.loader import load_split
+from mbtf_fit.data.loader import Partition, load_split
 from mbtf_fit.data.queries import ShardQueries
-from mbtf_fit.data.split import Partition
 from mbtf_fit.training.trainer import Trainer
 from mbtf_gen.dataset.reader import Dataset
 

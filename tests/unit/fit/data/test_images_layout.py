@@ -16,9 +16,8 @@ from mbtf_core.lattice import Lattice, sigma_of_level
 from mbtf_fit import FitConfig, Material, evaluate, fit
 from mbtf_fit.config import HeldOutSection
 from mbtf_fit.data.images import Patches, TrainingImages, nearest_shapes, strides
-from mbtf_fit.data.loader import load_split, load_training
+from mbtf_fit.data.loader import Partition, in_region, load_split, load_training
 from mbtf_fit.data.queries import ShardQueries
-from mbtf_fit.data.split import Partition, in_region
 from mbtf_fit.evaluation import evaluate_splits
 from mbtf_fit.models.hierarchical import Hierarchical
 from mbtf_fit.models.registry import build_model
@@ -260,17 +259,6 @@ def test_training_and_evaluation_agree_on_regular_images(aspect: float, decoder:
     assert together.shape == (5, 6, 6, 3)
     assert together.std() > 0.01
     torch.testing.assert_close(alone, together.reshape(-1, 3)[order], rtol=2e-3, atol=1e-5)
-
-
-def test_models_without_neighborhoods_evaluate_patches_pointwise() -> None:
-    lattice = Lattice(3)
-    model = build_model("neumip", lattice)
-    model.initialize(torch.Generator().manual_seed(0), 0.1)
-    patches = images(lattice, [3.0, 2.0], regular=False).patches(np.arange(2), np.zeros((2, 2), int), 4, 0)
-    with torch.no_grad():
-        found = model.evaluate_patches(patches.u, patches.sigma, patches.omega_i, patches.omega_o)
-        one = model(patches.u[1, 2, 3:4], patches.sigma[1:], patches.omega_i[1:], patches.omega_o[1:])
-    torch.testing.assert_close(found[1, 2, 3], one[0])
 
 
 def quick(steps: int, **network: object) -> FitConfig:

@@ -13,8 +13,7 @@ import mbtf_fit.evaluation
 from mbtf_core.errors import InputError
 from mbtf_core.units import format_size, parse_size
 from mbtf_fit.config import FitConfig, HeldOutSection
-from mbtf_fit.data.loader import load_training
-from mbtf_fit.data.split import Partition
+from mbtf_fit.data.loader import Partition, load_training
 from mbtf_fit.data.streaming import Selection, StreamedQueries
 from mbtf_fit.evaluation import Predict, SplitErrors
 from mbtf_fit.training.fit import fit
