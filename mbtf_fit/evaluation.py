@@ -54,24 +54,10 @@ class Errors:
     variance: Estimate
     unexplained: Estimate
 
-    @classmethod
-    def of(cls, prediction: NDArray[np.float32], a: NDArray[np.float32], b: NDArray[np.float32]) -> Errors:
-        """Errors of predictions (n, 3) against both halves (n, 3)."""
-        return cls(
-            len(prediction),
-            noise_free_mse(prediction, a, b),
-            signal_variance(a, b),
-            unexplained_variance(prediction, a, b),
-        )
-
     def as_dict(self) -> dict[str, Any]:
         """Plain data for JSON."""
-        return {
-            "n": self.n,
-            "mse": self.mse.as_dict(),
-            "variance": self.variance.as_dict(),
-            "unexplained": self.unexplained.as_dict(),
-        }
+        estimates = ("mse", "variance", "unexplained")
+        return {"n": self.n, **{name: getattr(self, name).as_dict() for name in estimates}}
 
 
 @dataclass(frozen=True)
@@ -112,13 +98,12 @@ def split_errors(predict: Predict, queries: ShardQueries, lattice: Lattice) -> S
     """Errors of a prediction on queries; None where there are none."""
     if len(queries) == 0:
         return None
-    arrays = (predict(queries), queries.value_a, queries.value_b)
+    arrays = predict(queries), queries.value_a, queries.value_b
+    overall = noise_free_mse(*arrays), signal_variance(*arrays[1:]), unexplained_variance(*arrays)
     levels = _grouped(level_groups(queries.sigma, lattice.finest), *arrays)
     bands = _grouped(elevation_groups(queries.omega_i, queries.omega_o), *arrays)
-    edges = ELEVATION_BANDS
-    return SplitErrors(
-        Errors.of(*arrays), levels, {(edges[k], edges[k + 1]): errors for k, errors in bands.items()}
-    )
+    elevations = {(ELEVATION_BANDS[k], ELEVATION_BANDS[k + 1]): errors for k, errors in bands.items()}
+    return SplitErrors(Errors(len(queries), *overall), levels, elevations)
 
 
 def evaluate_splits(predict: Predict, data: Dataset, partition: Partition) -> dict[str, SplitErrors]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -71,7 +71,7 @@ def fit(
 
         expected = forecast_fit(resolved, shards)
         console.report(
-            {"shards": shards, "model": resolved.model, "forecast": expected.as_dict()}, expected.describe()
+            {"shards": shards, "model": resolved.model, "forecast": asdict(expected)}, expected.describe()
         )
         return
     from mbtf_fit.material.format import DESCRIPTION_NAME

@@ -96,7 +96,7 @@ class FitResult:
             "resumed": self.resumed,
             "training": self.material.description["training"],
             "errors": self.errors,
-            "marginal_cost": None if cost is None else cost.as_dict(),
+            "marginal_cost": None if cost is None else asdict(cost),
         }
 
     @property
@@ -201,6 +201,8 @@ def fit(
     _train(trainer, subset, out, progress or (lambda fraction, note: None))
     trainer.calibrate()
     errors = evaluate_splits(trainer.predict, data, partition)
+    variance = errors["training"].overall.variance.value
+    noise = pooled_variance(partition.sample.value_a, partition.sample.value_b).value
     training = {
         "steps": trainer.progress.step,
         "batch": trainer.batch,
@@ -215,7 +217,8 @@ def fit(
         "backend": trainer.backend,
         "torch": torch.__version__,
         "errors": {split: e.as_dict() for split, e in errors.items()},
-        "noise_ratio": _noise_ratio(partition.sample, errors["training"].overall.variance.value),
+        # Variance of the noise of values over that of the values.
+        "noise_ratio": noise / variance if variance > 0 else None,
     }
     transmittance = fit_transmittance(data, partition.selection)
     if transmittance is not None:
@@ -224,11 +227,6 @@ def fit(
     export(trainer.model, config, out, data=identity["data"], training=training, transmittance=transmittance)
     (out / CHECKPOINT_NAME).unlink(missing_ok=True)
     return _finished(out, time.perf_counter() - begin, resumed=resumed)
-
-
-def _noise_ratio(sample: ShardQueries, variance: float) -> float | None:
-    """Variance of the noise of values over that of the values; None for constant values."""
-    return pooled_variance(sample.value_a, sample.value_b).value / variance if variance > 0 else None
 
 
 def prepare_trainer(config: FitConfig, data: Dataset, partition: Partition, device: torch.device) -> Trainer:

@@ -66,13 +66,8 @@ class Trainer:
     ----------
     model : initialized, on the device
     queries : on the device
-    noise : model of their noise; :meth:`NoiseModel.silent` for none
+    noise : model of their noise
     selection : rows of the shards that the queries are, to name a bad batch
-
-    Attributes
-    ----------
-    progress : steps, seconds and loss so far
-    weight_decay : of texels and network weights
     """
 
     def __init__(
@@ -121,16 +116,8 @@ class Trainer:
         return self.queries.batches(self.batch, self.config.seed, self.progress.step, self.model.margin)
 
     def train(self, seconds: float, stop: Event | None = None) -> bool:
-        """Train for about so long, or until the budget is spent; returns whether it is.
-
-        Parameters
-        ----------
-        stop : if set, training ends after the current step
-
-        Raises
-        ------
-        InputError : training diverged
-        """
+        """Train for about so long, or until the budget is spent; returns whether it is. Once `stop` is set,
+        training ends after the current step."""
         until = time.perf_counter() + seconds
         first = self.progress.step
         losses: list[Tensor] = []
@@ -165,12 +152,8 @@ class Trainer:
 
     def _stop_diverged(self, first: int, losses: list[Tensor], health: list[Tensor]) -> NoReturn:
         """Report the first bad batch of the steps since `first`."""
-        good = 0
-        for loss, weights in zip(losses, health, strict=False):
-            if not math.isfinite(float(loss) + float(weights)):
-                break
-            good += 1
-        step = first + good
+        finite = [math.isfinite(float(a) + float(b)) for a, b in zip(losses, health, strict=False)]
+        step = first + [*finite, False].index(False)
         ranges = self.queries.batch_ranges(self.batch, self.config.seed, step)
         named = f", {self.selection.describe(ranges)}," if self.selection is not None else ""
         raise InputError(
@@ -248,10 +231,9 @@ class Trainer:
 
     def coverage(self) -> dict[int, float]:
         """Level → fraction of the pyramid's texels that have received gradients."""
-        pyramid = max(self.model.textures(), key=lambda t: len(t.packing.shapes))
+        pyramid = self.model.pyramid
         moment = self.optimizer.state.get(pyramid.texels, {}).get("exp_avg_sq")
-        starts = pyramid.packing.starts
         return {
             s: 0.0 if moment is None else float((moment[a:b] > 0).any(1).float().mean())
-            for s, (a, b) in enumerate(pairwise(starts))
+            for s, (a, b) in enumerate(pairwise(pyramid.packing.starts))
         }
