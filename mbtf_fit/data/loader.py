@@ -63,11 +63,6 @@ def open_data(folder: str | Path, layout: Layout, model: str) -> Dataset:
     return data
 
 
-def data_hash(data: Dataset) -> str:
-    """Hash of the generator's configuration, which identifies a data set."""
-    return str(data.manifest.get("config_hash", ""))
-
-
 def read_checked(shard: Shard) -> ShardQueries:
     """One shard, every number checked."""
     arrays: Arrays = read_shard(shard.path, NEEDED)
@@ -182,21 +177,17 @@ def load_training(
         rows = np.flatnonzero(labels == TRAINING)
         # Shards store queries in random order, so the first ones are a random sample.
         sample.append(queries.take(rows[: -(-SAMPLE * len(rows) // total)]))
-        if streamed:
-            continue
-        part = slice(selection.starts[-2], selection.starts[-1])
-        for name in ("u", "sigma", "omega_i", "omega_o"):
-            np.take(getattr(queries, name), rows, axis=0, out=store[name][part], mode="clip")
-        store["value"][part] = mean_value(queries.value_a[rows], queries.value_b[rows])
+        if not streamed:
+            part = slice(*selection.starts[-2:])
+            for name in ("u", "sigma", "omega_i", "omega_o"):
+                np.take(getattr(queries, name), rows, axis=0, out=store[name][part], mode="clip")
+            store["value"][part] = mean_value(queries.value_a[rows], queries.value_b[rows])
     if len(selection) == 0:
         raise _all_held_out(data, f"{total} queries")
-    training: TrainingQueries | StreamedQueries
-    if streamed:
-        training = StreamedQueries(selection)
-    else:
+    training: TrainingQueries | StreamedQueries = StreamedQueries(selection)
+    if not streamed:
         training = TrainingQueries(**{n: torch.from_numpy(a[: len(selection)]) for n, a in store.items()})
-    joined = [ShardQueries.join(group) for group in (*kept_out, sample)]
-    return Partition(training, joined[0], joined[1], joined[2], selection)
+    return Partition(training, *(ShardQueries.join(group) for group in (*kept_out, sample)), selection)
 
 
 def _all_held_out(data: Dataset, what: str) -> InputError:
@@ -221,7 +212,7 @@ def _load_images(data: Dataset, shards: list[Shard], held_out: HeldOutSection, s
     kept_out: tuple[list[ShardQueries], list[ShardQueries]] = ([], [])
     sample: list[ShardQueries] = []
     selection = Selection()
-    read = filled = 0
+    read = 0
     for shard in shards:
         images = read_checked(shard)
         mine = labels[read : read + len(images)]
@@ -231,22 +222,17 @@ def _load_images(data: Dataset, shards: list[Shard], held_out: HeldOutSection, s
         kept = np.flatnonzero(mine == TRAINING)
         selection.add(shard.path, mine == TRAINING)
         sample.append(sample_images(images.take(kept), -(-SAMPLE * len(kept) // count), random))
-        part = slice(filled, filled + len(kept))
+        part = slice(*selection.starts[-2:])
         u[part], sigma[part] = images.u[kept], images.sigma[kept, 0, 0]
         omega[0, part], omega[1, part] = images.omega_i[kept, 0, 0], images.omega_o[kept, 0, 0]
         value[part] = mean_value(images.value_a[kept], images.value_b[kept])
-        filled += len(kept)
     training = TrainingImages(
-        torch.from_numpy(u),
-        torch.from_numpy(sigma),
-        torch.from_numpy(omega[0]),
-        torch.from_numpy(omega[1]),
-        torch.from_numpy(value),
+        *map(torch.from_numpy, (u, sigma, *omega, value)),
         strides(data.lattice, sigma) if patch_size is None else np.ones((count, 2), np.int64),
         None if patch_size is None else nearest_shapes(data.lattice, sigma),
     )
-    groups = [sample_images(ShardQueries.join(g), MAX_HELD_OUT_OF_IMAGES, random) for g in kept_out]
-    return Partition(training, groups[0], groups[1], ShardQueries.join(sample), selection)
+    groups = (sample_images(ShardQueries.join(g), MAX_HELD_OUT_OF_IMAGES, random) for g in kept_out)
+    return Partition(training, *groups, ShardQueries.join(sample), selection)
 
 
 def load_split(data: Dataset, split: Split, limit: int | None = None) -> ShardQueries:

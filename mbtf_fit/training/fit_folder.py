@@ -11,7 +11,6 @@ from mbtf_core.digest import data_sha256
 from mbtf_core.errors import InputError
 from mbtf_core.folders import ELSEWHERE, check_folder, make_folder, other_configuration
 from mbtf_fit.config import FitConfig
-from mbtf_fit.data.loader import data_hash
 from mbtf_fit.material.export import LAYERS_NAME, TEXTURES_NAME
 from mbtf_fit.material.format import DESCRIPTION_NAME, WEIGHTS_NAME, read_description
 from mbtf_fit.material.transmittance import TRANSMITTANCE_NAME
@@ -28,7 +27,11 @@ _SCHEMA = 2
 def identity_of(config: FitConfig, data: Dataset) -> dict[str, Any]:
     """Content of ``fit.json``: configuration and data of a fit, and the hash of both."""
     files = {split: [e["file"] for e in data.manifest["splits"][split]["shards"]] for split in data.splits}
-    described = {"hash": data_hash(data), "levels": data.lattice.finest, "aspect": data.lattice.aspect}
+    described = {
+        "hash": str(data.manifest.get("config_hash", "")),
+        "levels": data.lattice.finest,
+        "aspect": data.lattice.aspect,
+    }
     lengths = {split: len(names) for split, names in files.items()}
     config_hash = config.hash(data_sha256({**described, "files": files}))
     if config.init_from is not None:

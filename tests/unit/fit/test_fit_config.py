@@ -35,13 +35,6 @@ def test_durations_survive_writing(seconds: float) -> None:
     assert parse_duration(format_duration(seconds)) == seconds
 
 
-def test_configuration_survives_writing() -> None:
-    config = FitConfig.model_validate(
-        {"training": {"time": "90s", "batch": 1000}, "held_out": {"radius": 0.2}}
-    )
-    assert FitConfig.model_validate(config.model_dump(mode="json")) == config
-
-
 def test_hash_covers_data_and_options_but_not_the_device() -> None:
     config = FitConfig()
     assert config.hash("data") == FitConfig(device="cpu").hash("data")

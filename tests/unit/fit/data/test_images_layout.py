@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import islice
 from pathlib import Path
 
@@ -37,15 +38,20 @@ def images_of(part: Partition) -> TrainingImages:
     return part.training
 
 
-def images(lattice: Lattice, levels: list[float], *, regular: bool) -> TrainingImages:
-    """One image per level; the value's first channel numbers the queries."""
-    q = random_images(np.random.default_rng(0), len(levels), lattice, regular=regular)
-    sigma = sigma_of_level(levels).astype(np.float32)
+def numbered(q: Mapping[str, np.ndarray], *shape: np.ndarray) -> TrainingImages:
+    """Images of queries (images, rows, columns, ...); the value's first channel numbers the queries."""
     number = np.arange(q["sigma"].size, dtype=np.float32).reshape(q["sigma"].shape)
     value = np.stack([number, 0 * number, 0 * number], -1)
-    u, light, view = q["u"], q["omega_i"][:, 0, 0], q["omega_o"][:, 0, 0]
-    tensors = [torch.from_numpy(np.ascontiguousarray(a)) for a in (u, sigma, light, view, value)]
-    return TrainingImages(*tensors[:5], strides(lattice, sigma))  # type: ignore[arg-type,call-arg]
+    arrays = (q["u"], *(q[name][:, 0, 0] for name in ("sigma", "omega_i", "omega_o")), value)
+    tensors = [torch.from_numpy(np.ascontiguousarray(a, np.float32)) for a in arrays]
+    return TrainingImages(*tensors, *shape)  # type: ignore[arg-type]
+
+
+def images(lattice: Lattice, levels: list[float], *, regular: bool) -> TrainingImages:
+    """One image per level."""
+    q = random_images(np.random.default_rng(0), len(levels), lattice, regular=regular)
+    q["sigma"][:] = sigma_of_level(levels)[:, None, None]
+    return numbered(q, strides(lattice, q["sigma"][:, 0, 0]))
 
 
 def test_whole_images_are_held_out(tmp_path: Path) -> None:
@@ -166,15 +172,9 @@ def test_batches_take_every_image_and_resume_anywhere() -> None:
 
 
 def small_images(lattice: Lattice, size: int, count: int) -> TrainingImages:
-    """Windows as the generator draws them; the value's first channel numbers the queries."""
+    """Images of limited size, as the generator draws them."""
     q = QueryPlan(lattice, Mixture(1, 0), 0.2, "image", 3, count, patch_size=size).draw("train", 0, count)
-    sigma = q.sigma[:, 0, 0]
-    number = np.arange(q.sigma.size, dtype=np.float32).reshape(q.sigma.shape)
-    value = np.stack([number, 0 * number, 0 * number], -1)
-    arrays = (q.u, sigma, q.omega_i[:, 0, 0], q.omega_o[:, 0, 0], value)
-    tensors = [torch.from_numpy(np.ascontiguousarray(a)) for a in arrays]
-    ones = np.ones((count, 2), np.int64)
-    return TrainingImages(*tensors[:5], ones, nearest_shapes(lattice, sigma))  # type: ignore[arg-type,call-arg]
+    return numbered(vars(q), np.ones((count, 2), np.int64), nearest_shapes(lattice, q.sigma[:, 0, 0]))
 
 
 def test_patches_extend_beyond_the_border_of_small_images() -> None:

@@ -33,13 +33,7 @@ def trainer(data: TrainingQueries, model: str = "neumip", **training: Any) -> Tr
 
 @pytest.mark.parametrize(
     ("shape", "asked", "start"),
-    [
-        ((16, 16), 8.0, 2.0),
-        ((64, 64), 8.0, 8.0),
-        ((64, 16), 8.0, 2.0),
-        ((64, 64), 3.0, 3.0),
-        ((16, 16), 0.0, 0.0),
-    ],
+    [((16, 16), 8, 2), ((64, 64), 8, 8), ((64, 16), 8, 2), ((64, 64), 3, 3), ((16, 16), 0, 0)],
 )
 def test_initial_blur_is_at_most_an_eighth(shape: tuple[int, int], asked: float, start: float) -> None:
     """Wider blur leaves nothing to find: offsets wander off and textures become sharp where they are."""
