@@ -40,8 +40,7 @@ def best_options(seconds: float) -> dict[str, Any]:
 
 
 def best_at(quality: Quality) -> dict[str, Any]:
-    """:func:`best_options` for the training time of a quality preset; without a limit where its budget is a
-    number of steps."""
+    """:func:`best_options` for the training time of a quality preset: infinite for a number of steps."""
     training = FITTER[quality].get("training.time")
     return best_options(math.inf if training is None else parse_duration(training))
 

@@ -10,15 +10,7 @@ from mbtf_fit.config import FitConfig
 
 @pytest.mark.parametrize(
     ("text", "seconds"),
-    [
-        ("90s", 90.0),
-        ("2min", 120.0),
-        ("2 m", 120.0),
-        ("1h", 3600.0),
-        ("1.5h", 5400.0),
-        (45, 45.0),
-        ("0.5s", 0.5),
-    ],
+    [("90s", 90.0), ("2min", 120.0), ("2 m", 120.0), ("1.5h", 5400.0), (45, 45.0), ("0.5s", 0.5)],
 )
 def test_durations_are_read(text: str | float, seconds: float) -> None:
     assert parse_duration(text) == seconds

@@ -78,9 +78,8 @@ def test_whole_images_are_held_out(tmp_path: Path) -> None:
 
 def test_the_sample_is_of_training_images(tmp_path: Path) -> None:
     """Equally many queries of each."""
-    part = partition(
-        write_images(tmp_path / "d", parallax, train=60), HeldOutSection(queries=0.4, radius=0.3)
-    )
+    folder = write_images(tmp_path / "d", parallax, train=60)
+    part = partition(folder, HeldOutSection(queries=0.4, radius=0.3))
     kept = {row.tobytes() for row in images_of(part).omega_i.numpy()}
     sampled = [row.tobytes() for row in part.sample.omega_i]
     assert set(sampled) == kept

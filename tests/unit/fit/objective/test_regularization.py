@@ -72,9 +72,8 @@ def test_a_trainer_counts_all_its_queries() -> None:
 def test_a_fit_estimates_the_noise_ratio_of_its_data(tmp_path: Path) -> None:
     """Noise of 0.02 in each half is 2e-4 of variance in their mean."""
     folder = write_data(tmp_path / "data", parallax, train=20_000, noise=0.02)
-    config = FitConfig.model_validate(
-        {"training": {"noise_regularization": 1000.0, "texture_weight_decay": 1.0}}
-    )
+    training = {"noise_regularization": 1000.0, "texture_weight_decay": 1.0}
+    config = FitConfig.model_validate({"training": training})
     data = open_data(folder, "shuffled", "neumip")
     partition = load_training(data, config.held_out, config.seed, config.data.memory)
     trainer = prepare_trainer(config, data, partition, torch.device("cpu"))
