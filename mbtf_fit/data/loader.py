@@ -187,7 +187,8 @@ def load_training(
     training: TrainingQueries | StreamedQueries = StreamedQueries(selection)
     if not streamed:
         training = TrainingQueries(**{n: torch.from_numpy(a[: len(selection)]) for n, a in store.items()})
-    return Partition(training, *(ShardQueries.join(group) for group in (*kept_out, sample)), selection)
+    queries, directions, sampled = (ShardQueries.join(group) for group in (*kept_out, sample))
+    return Partition(training, queries, directions, sampled, selection)
 
 
 def _all_held_out(data: Dataset, what: str) -> InputError:
@@ -226,13 +227,17 @@ def _load_images(data: Dataset, shards: list[Shard], held_out: HeldOutSection, s
         u[part], sigma[part] = images.u[kept], images.sigma[kept, 0, 0]
         omega[0, part], omega[1, part] = images.omega_i[kept, 0, 0], images.omega_o[kept, 0, 0]
         value[part] = mean_value(images.value_a[kept], images.value_b[kept])
-    training = TrainingImages(
-        *map(torch.from_numpy, (u, sigma, *omega, value)),
-        strides(data.lattice, sigma) if patch_size is None else np.ones((count, 2), np.int64),
-        None if patch_size is None else nearest_shapes(data.lattice, sigma),
+    at, footprint, light, view, mean = map(torch.from_numpy, (u, sigma, *omega, value))
+    step, extent = np.ones((count, 2), np.int64), None
+    if patch_size is None:
+        step = strides(data.lattice, sigma)
+    else:
+        extent = nearest_shapes(data.lattice, sigma)
+    training = TrainingImages(at, footprint, light, view, mean, step, extent)
+    queries, directions = (
+        sample_images(ShardQueries.join(group), MAX_HELD_OUT_OF_IMAGES, random) for group in kept_out
     )
-    groups = (sample_images(ShardQueries.join(g), MAX_HELD_OUT_OF_IMAGES, random) for g in kept_out)
-    return Partition(training, *groups, ShardQueries.join(sample), selection)
+    return Partition(training, queries, directions, ShardQueries.join(sample), selection)
 
 
 def load_split(data: Dataset, split: Split, limit: int | None = None) -> ShardQueries:

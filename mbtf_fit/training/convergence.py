@@ -85,10 +85,13 @@ def marginal_cost_of(
         if doublings < _MOST_DOUBLINGS:
             halving = last["seconds"] * (2.0**doublings - 1.0)
     return MarginalCost(
-        SPLIT_NAMES[validation_set],
-        *(record[key] for record in (half, last) for key in ("unexplained", "unexplained_error")),
-        halving,
-        _noise_share(errors, noise),
+        validation_set=SPLIT_NAMES[validation_set],
+        half=before,
+        half_error=half["unexplained_error"],
+        end=after,
+        end_error=last["unexplained_error"],
+        halving=halving,
+        noise_share=_noise_share(errors, noise),
     )
 
 

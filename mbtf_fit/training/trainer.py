@@ -112,7 +112,7 @@ class Trainer:
         return min(1.0, self.progress.seconds / training.time)
 
     def _batches(self) -> Iterator[Batch]:
-        """Endless batches, from the current step on."""
+        """Endless batches from the current step on."""
         return self.queries.batches(self.batch, self.config.seed, self.progress.step, self.model.margin)
 
     def train(self, seconds: float, stop: Event | None = None) -> bool:
