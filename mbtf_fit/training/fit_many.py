@@ -128,12 +128,12 @@ def fit_many(
             process.start()
             theirs.close()
             result, error = mine.recv()
+            process.join()
         except EOFError:
             process.join()
             result, error = None, f"its process ended with code {process.exitcode}"
         finally:
             free.put(worker)
-        process.join()
         return FitOutcome(data, folder, result, error)
 
     with ThreadPoolExecutor(processes) as pool:
