@@ -47,7 +47,7 @@ from mbtf_fit.models.neumip import Neumip
 from mbtf_fit.models.registry import build_model
 from mbtf_fit.native import library
 from mbtf_fit.objective.noise import NoiseModel
-from mbtf_fit.objective.parallel import MAX_KERNEL_THREADS, Workers
+from mbtf_fit.objective.parallel import MAX_KERNEL_THREADS, MAX_THREADS, Workers
 from mbtf_fit.training.fit import keep_freed_memory
 from mbtf_fit.training.trainer import BETAS, Trainer
 
@@ -224,7 +224,7 @@ class Ours:
         unit = float(queries.value.mean())
         self.trainer = Trainer(config, model, queries, NoiseModel.silent(unit, model.lattice))
         self.backend = self.trainer.backend
-        self.limit = MAX_KERNEL_THREADS if kernel else None
+        self.limit = MAX_KERNEL_THREADS if kernel else MAX_THREADS
 
     def __call__(self, batch: TrainingQueries, share: float) -> None:
         self.trainer.progress.step = round(share * STEPS)

@@ -36,12 +36,11 @@ from rock_cliff_128 import RECIPE, make_shards
 from mbtf_core.errors import MbtfError
 from mbtf_core.lattice import Lattice
 from mbtf_fit import FitConfig, Material, fit, read_history
-from mbtf_fit.data.loader import load_split, load_training, open_data
-from mbtf_fit.data.split import Partition
+from mbtf_fit.data.loader import Partition, load_split, load_training, open_data
 from mbtf_fit.evaluation import split_errors
 from mbtf_fit.models.registry import build_model
 from mbtf_fit.objective.noise import NoiseModel
-from mbtf_fit.objective.parallel import MAX_KERNEL_THREADS, Workers
+from mbtf_fit.objective.parallel import MAX_KERNEL_THREADS, MAX_THREADS, Workers
 from mbtf_fit.training.trainer import Trainer
 from mbtf_gen.dataset.reader import Dataset
 
@@ -104,7 +103,7 @@ def seconds_per_step(name: str, lattice: Lattice) -> float:
     model.initialize(torch.Generator().manual_seed(0), 0.2)
     trainer = Trainer(config, model, queries, NoiseModel.silent(0.2, lattice))
     found = []
-    limit = None if trainer.backend == "pytorch" else MAX_KERNEL_THREADS
+    limit = MAX_THREADS if trainer.backend == "pytorch" else MAX_KERNEL_THREADS
     with Workers(torch.device("cpu"), limit=limit) as workers:
         for _ in range(ROUNDS + 1):
             start = time.perf_counter()

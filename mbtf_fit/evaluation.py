@@ -22,9 +22,8 @@ from mbtf_core.stats import (
     signal_variance,
     unexplained_variance,
 )
-from mbtf_fit.data.loader import load_split, load_training
+from mbtf_fit.data.loader import MAX_HELD_OUT_OF_IMAGES, SAMPLE, Partition, load_split, load_training
 from mbtf_fit.data.queries import ShardQueries
-from mbtf_fit.data.split import MAX_HELD_OUT_OF_IMAGES, SAMPLE, Partition
 from mbtf_fit.material.transmittance_fit import TransmittanceError, evaluate_transmittance, has_transmittance
 from mbtf_gen.dataset.reader import Dataset
 
@@ -55,24 +54,10 @@ class Errors:
     variance: Estimate
     unexplained: Estimate
 
-    @classmethod
-    def of(cls, prediction: NDArray[np.float32], a: NDArray[np.float32], b: NDArray[np.float32]) -> Errors:
-        """Errors of predictions (n, 3) against both halves (n, 3)."""
-        return cls(
-            len(prediction),
-            noise_free_mse(prediction, a, b),
-            signal_variance(a, b),
-            unexplained_variance(prediction, a, b),
-        )
-
     def as_dict(self) -> dict[str, Any]:
         """Plain data for JSON."""
-        return {
-            "n": self.n,
-            "mse": self.mse.as_dict(),
-            "variance": self.variance.as_dict(),
-            "unexplained": self.unexplained.as_dict(),
-        }
+        estimates = ("mse", "variance", "unexplained")
+        return {"n": self.n, **{name: getattr(self, name).as_dict() for name in estimates}}
 
 
 @dataclass(frozen=True)
@@ -113,13 +98,12 @@ def split_errors(predict: Predict, queries: ShardQueries, lattice: Lattice) -> S
     """Errors of a prediction on queries; None where there are none."""
     if len(queries) == 0:
         return None
-    arrays = (predict(queries), queries.value_a, queries.value_b)
+    arrays = predict(queries), queries.value_a, queries.value_b
+    overall = noise_free_mse(*arrays), signal_variance(*arrays[1:]), unexplained_variance(*arrays)
     levels = _grouped(level_groups(queries.sigma, lattice.finest), *arrays)
     bands = _grouped(elevation_groups(queries.omega_i, queries.omega_o), *arrays)
-    edges = ELEVATION_BANDS
-    return SplitErrors(
-        Errors.of(*arrays), levels, {(edges[k], edges[k + 1]): errors for k, errors in bands.items()}
-    )
+    elevations = {(ELEVATION_BANDS[k], ELEVATION_BANDS[k + 1]): errors for k, errors in bands.items()}
+    return SplitErrors(Errors(len(queries), *overall), levels, elevations)
 
 
 def evaluate_splits(predict: Predict, data: Dataset, partition: Partition) -> dict[str, SplitErrors]:
@@ -128,10 +112,6 @@ def evaluate_splits(predict: Predict, data: Dataset, partition: Partition) -> di
 
     The error on training queries is underestimated by twice the covariance of prediction and noise: its
     distance from the error on held-out queries measures overfitting.
-
-    Raises
-    ------
-    InputError : a test shard is missing or corrupt
     """
     parts: dict[str, ShardQueries] = {}
     if "test" in data.splits and data.shards("test"):
@@ -148,12 +128,7 @@ def evaluate_splits(predict: Predict, data: Dataset, partition: Partition) -> di
 
 def foreign_inputs(material: Material, shards: str | Path) -> list[str]:
     """Inputs (height, base_color, …) that differ between a data set and the training data of a material;
-    empty where either records none.
-
-    Raises
-    ------
-    InputError : shards are missing or corrupt
-    """
+    empty where either records none."""
     trained, given = material.description["data"].get("inputs"), Dataset.open(shards).manifest.get("inputs")
     if not trained or not given:
         return []

@@ -32,26 +32,17 @@ FITTER: dict[Quality, dict[str, Any]] = {
 }
 
 
-def _network(seconds: float) -> dict[str, Any]:
-    size = [size for least, size in _SIZES if seconds >= least][-1]
-    return size | _XYZ
-
-
 def best_options(seconds: float) -> dict[str, Any]:
     """Network and smoothing options of `neumip` and its baseline, dotted names, for a training time (seconds)
     on two processor cores."""
-    return _network(seconds) | _SMOOTH
+    size = [size for least, size in _SIZES if seconds >= least][-1]
+    return size | _XYZ | _SMOOTH
 
 
 def best_at(quality: Quality) -> dict[str, Any]:
-    """:func:`best_options` for the training time of a quality preset."""
-    return best_options(_seconds(quality))
-
-
-def _seconds(quality: Quality) -> float:
-    """Training time in seconds; infinite where the budget is a number of steps."""
+    """:func:`best_options` for the training time of a quality preset: infinite for a number of steps."""
     training = FITTER[quality].get("training.time")
-    return math.inf if training is None else parse_duration(training)
+    return best_options(math.inf if training is None else parse_duration(training))
 
 
 def fitter_options(quality: Quality, fits: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
@@ -69,11 +60,13 @@ def fitter_options(quality: Quality, fits: Mapping[str, Mapping[str, Any]]) -> d
     for name, given in fits.items():
         training = given.get("training")
         training = training if isinstance(training, Mapping) else {}
-        options: dict[str, Any] = {}
-        if given.get("model") in _MODELS:
-            options |= _network(_seconds(quality)) if free else {}
-            options |= {k: v for k, v in _SMOOTH.items() if k.split(".")[1] not in training}
-        out[name] = options | FITTER[quality]
+        best = best_at(quality) if given.get("model") in _MODELS else {}
+        kept = {
+            key: value
+            for key, value in best.items()
+            if (free if key.startswith("network.") else key.split(".")[1] not in training)
+        }
+        out[name] = kept | FITTER[quality]
     return out
 
 

@@ -68,19 +68,19 @@ def level_groups(sigma: ArrayLike, finest: int | None = None) -> NDArray[np.int6
     return np.clip(level, 0, finest)
 
 
-def elevation_groups(*omegas: ArrayLike) -> NDArray[np.int64]:
+def elevation_groups(*omegas: ArrayLike, edges: tuple[float, ...] = ELEVATION_BANDS) -> NDArray[np.int64]:
     """Label queries with the elevation band of their most grazing direction.
-
-    Band i is ``ELEVATION_BANDS[i] ≤ cos θ < ELEVATION_BANDS[i+1]``; the last one includes its upper edge.
 
     Parameters
     ----------
     *omegas : (n, 3) array_like
         Unit vectors, such as ω_i and ω_o.
+    edges : tuple of float
+        Band i is ``edges[i] ≤ cos θ < edges[i+1]``; the last band includes its upper edge.
 
     Returns
     -------
     (n,) int64 array
     """
     cosine = np.min([np.asarray(w, np.float64)[..., 2] for w in omegas], axis=0)
-    return np.searchsorted(ELEVATION_BANDS[1:-1], cosine, side="right").astype(np.int64)
+    return np.clip(np.searchsorted(edges, cosine, side="right") - 1, 0, len(edges) - 2).astype(np.int64)

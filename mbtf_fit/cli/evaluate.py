@@ -34,17 +34,9 @@ def evaluate(material: Path, shards: Path, /, *, console: Console = CONSOLE) -> 
         )
     found = evaluate(loaded, shards)
     errors = {name: e.as_dict() for name, e in found.values.items()}
-    through = (
-        None if found.transmittance is None else {n: e.as_dict() for n, e in found.transmittance.items()}
-    )
+    through = {name: e.as_dict() for name, e in (found.transmittance or {}).items()}
     lines = [f"{material}: {loaded.config.model} on {shards}", *describe_errors(errors)]
-    console.report(
-        {
-            "material": material,
-            "shards": shards,
-            "foreign_inputs": foreign,
-            "errors": errors,
-            **({} if through is None else {"transmittance": through}),
-        },
-        "\n".join(lines + describe_transmittance(through)),
-    )
+    report = {"material": material, "shards": shards, "foreign_inputs": foreign, "errors": errors}
+    if found.transmittance is not None:
+        report["transmittance"] = through
+    console.report(report, "\n".join(lines + describe_transmittance(through)))

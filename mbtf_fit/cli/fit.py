@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -11,7 +11,7 @@ from cyclopts import Parameter
 from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import PartialError, UsageError
 from mbtf_core.options import DryRun, Options, Output, Overwrite, takes_options
-from mbtf_core.units import clock
+from mbtf_core.units import clock, format_duration
 from mbtf_fit.config import FitConfig
 from mbtf_fit.formatting import describe_fit, format_estimate, format_table
 from mbtf_gen.config.presets import Quality, QualityOption, as_assignments
@@ -57,11 +57,7 @@ def fit(
         raise UsageError("--processes must be a positive number and requires --many")
     if shards is None and many is None:
         raise UsageError("no shards given", hint="mbtf-fit shards/ -o material/")
-    from mbtf_core.units import format_duration
-
     resolved = resolve_config(options, quality)
-    training = resolved.training
-    budget = format_duration(training.time) if training.steps is None else f"{training.steps} steps"
     if many is not None:
         _fit_many(resolved, many, output, processes, overwrite, console)
         return
@@ -71,22 +67,23 @@ def fit(
 
         expected = forecast_fit(resolved, shards)
         console.report(
-            {"shards": shards, "model": resolved.model, "forecast": expected.as_dict()}, expected.describe()
+            {"shards": shards, "model": resolved.model, "forecast": asdict(expected)}, expected.describe()
         )
         return
     from mbtf_fit.material.format import DESCRIPTION_NAME
+    from mbtf_fit.native import missing_reason
     from mbtf_fit.training.fit import fit
 
     finished = not overwrite and (output / DESCRIPTION_NAME).exists()
     if not finished:
+        training = resolved.training
+        budget = format_duration(training.time) if training.steps is None else f"{training.steps} steps"
         console.note(
             f"{shards} -> {output}: {resolved.model}, training for {budget} "
             "(change it with --time or --steps)"
         )
-    from mbtf_fit.native import missing_reason
-
-    if missing_reason():
-        console.note(f"note: training runs in PyTorch, not in the compiled kernel ({missing_reason()})")
+    if missing := missing_reason():
+        console.note(f"note: training runs in PyTorch, not in the compiled kernel ({missing})")
     with console.progress(total=100, label="fitting", unit="%") as bar:
         result = fit(
             resolved,
@@ -103,13 +100,7 @@ def fit(
 
 
 def resolve_config(options: Options[FitConfig], quality: Quality | None) -> FitConfig:
-    """Configuration of a fit.
-
-    Raises
-    ------
-    UsageError : a flag or an assignment is at fault
-    InputError : the file is at fault
-    """
+    """Configuration of a fit."""
     from mbtf_fit.presets import fitter_options, overrides_of
 
     given = options.given
@@ -159,15 +150,8 @@ def _fit_many(
             rows.append([outcome.folder.name, "failed", "-", "-"])
             continue
         training, errors = outcome.result["training"], outcome.result["errors"]
-        test = errors.get("test") or next(iter(errors.values()))
-        rows.append(
-            [
-                outcome.folder.name,
-                format_estimate(test["unexplained"]),
-                str(training["steps"]),
-                clock(training["seconds"]),
-            ]
-        )
+        error = format_estimate((errors.get("test") or next(iter(errors.values())))["unexplained"])
+        rows.append([outcome.folder.name, error, str(training["steps"]), clock(training["seconds"])])
     console.report({"fits": [o.as_dict() for o in outcomes]}, format_table(rows))
     failed = [o for o in outcomes if o.error is not None]
     for outcome in failed:

@@ -1,43 +1,58 @@
-"""Loading of data sets: training queries, held-out queries, and whole splits."""
+"""Loading of data sets: the train split, divided into training and held-out queries, and whole splits."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
 from mbtf_core.shard_schema import Layout, Split
 from mbtf_fit.config import HeldOutSection
 from mbtf_fit.data.images import TrainingImages, nearest_shapes, philox, strides
 from mbtf_fit.data.queries import NEEDED, QUERY_BYTES, ShardQueries, TrainingQueries, mean_value
-from mbtf_fit.data.split import (
-    HELD_OUT_DIRECTION,
-    HELD_OUT_QUERY,
-    MAX_HELD_OUT,
-    MAX_HELD_OUT_OF_IMAGES,
-    SAMPLE,
-    SPLIT_STREAM,
-    TRAINING,
-    Partition,
-    label_images,
-    label_queries,
-    sample_images,
-)
 from mbtf_fit.data.streaming import Selection, StreamedQueries
 from mbtf_gen.dataset.reader import Dataset, Shard
 from mbtf_gen.dataset.shard_io import Arrays, read_shard
 
+# Training queries that are kept with both halves, as a sample of all.
+SAMPLE = 1 << 16
+# Most held-out queries of each kind. Queries of one image are correlated, so the image layout keeps fewer.
+MAX_HELD_OUT = 1 << 16
+MAX_HELD_OUT_OF_IMAGES = 1 << 14
+# Random stream of the image layout's split; the streams of its batches count up from 0.
+SPLIT_STREAM = 1 << 62
+# Labels of the rows of the train split.
+TRAINING, HELD_OUT_QUERY, HELD_OUT_DIRECTION = np.int8(0), np.int8(1), np.int8(2)
+
+
+@dataclass(frozen=True)
+class Partition:
+    """The train split, divided into training queries and held-out queries.
+
+    Attributes
+    ----------
+    training : training queries in the order of the shards; images in the image layout; streamed from disk
+        where they exceed the memory limit
+    held_out_queries : a random fraction of the queries outside the held-out region
+    held_out_directions : queries with light or view in the held-out region; at most `MAX_HELD_OUT`
+    sample : a sample of the training queries with both halves; about `SAMPLE` queries from all shards
+    selection : rows of the shards that are trained on: queries, or images in the image layout
+    """
+
+    training: TrainingQueries | TrainingImages | StreamedQueries
+    held_out_queries: ShardQueries
+    held_out_directions: ShardQueries
+    sample: ShardQueries
+    selection: Selection
+
 
 def open_data(folder: str | Path, layout: Layout, model: str) -> Dataset:
-    """Open a folder of shards to train a model that needs a layout.
-
-    Raises
-    ------
-    InputError : no data set, or of another layout
-    """
+    """Open a folder of shards to train a model that needs a layout."""
     data = Dataset.open(folder)
     if data.layout != layout:
         raise InputError(
@@ -48,18 +63,8 @@ def open_data(folder: str | Path, layout: Layout, model: str) -> Dataset:
     return data
 
 
-def data_hash(data: Dataset) -> str:
-    """Hash of the generator's configuration, which identifies a data set."""
-    return str(data.manifest.get("config_hash", ""))
-
-
 def read_checked(shard: Shard) -> ShardQueries:
-    """One shard, every number checked.
-
-    Raises
-    ------
-    InputError : NaN or infinity, or another number of rows than its sidecar states
-    """
+    """One shard, every number checked."""
     arrays: Arrays = read_shard(shard.path, NEEDED)
     rows = len(arrays["sigma"])
     if rows != shard.rows:
@@ -80,6 +85,48 @@ def read_checked(shard: Shard) -> ShardQueries:
                 hint="check the data set with: mbtf-gen verify",
             )
     return ShardQueries(**arrays)
+
+
+def in_region(held_out: HeldOutSection, omega: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Mask (n,) of the directions (n, 3) in the held-out region, a disk on the projected hemisphere."""
+    if held_out.radius == 0:
+        return np.zeros(len(omega), bool)
+    center = np.asarray(held_out.direction, np.float32)
+    with np.errstate(over="ignore"):  # of corrupt shards
+        return ((omega[:, :2] - center) ** 2).sum(1) < np.float32(held_out.radius) ** 2
+
+
+def label_queries(held_out: HeldOutSection, queries: ShardQueries, seed: int, shard: int) -> NDArray[np.int8]:
+    """Label of each query of a shard."""
+    random = np.random.Generator(np.random.Philox(key=[seed, shard])).random(len(queries))
+    labels = np.where(random < held_out.queries, HELD_OUT_QUERY, TRAINING)
+    region = in_region(held_out, queries.omega_i) | in_region(held_out, queries.omega_o)
+    return np.where(region, HELD_OUT_DIRECTION, labels)
+
+
+def label_images(data: Dataset, held_out: HeldOutSection, random: np.random.Generator) -> NDArray[np.int8]:
+    """Label of each image of the train split. Where ``held_out.queries`` is not 0, at least one image is held
+    out."""
+    parts = []
+    for shard in data.shards("train"):
+        arrays = read_shard(shard.path, ("omega_i", "omega_o"))
+        light, view = (np.array(arrays[name][:, 0, 0]) for name in ("omega_i", "omega_o"))
+        parts.append(in_region(held_out, light) | in_region(held_out, view))
+    labels = np.where(np.concatenate(parts), HELD_OUT_DIRECTION, TRAINING)
+    inside = np.flatnonzero(labels == TRAINING)
+    count = max(1, round(held_out.queries * len(inside))) if held_out.queries and len(inside) > 1 else 0
+    labels[random.permutation(inside)[:count]] = HELD_OUT_QUERY
+    return labels
+
+
+def sample_images(images: ShardQueries, most: int, random: np.random.Generator) -> ShardQueries:
+    """At most `most` queries of images, equally many of each, in random order."""
+    count, rows, columns = images.sigma.shape
+    if count == 0:
+        return images.flat()
+    each = min(rows * columns, -(-most // count))
+    chosen = [k * rows * columns + random.permutation(rows * columns)[:each] for k in range(count)]
+    return images.flat().take(random.permutation(np.concatenate(chosen))[:most])
 
 
 def load_training(
@@ -130,21 +177,18 @@ def load_training(
         rows = np.flatnonzero(labels == TRAINING)
         # Shards store queries in random order, so the first ones are a random sample.
         sample.append(queries.take(rows[: -(-SAMPLE * len(rows) // total)]))
-        if streamed:
-            continue
-        part = slice(selection.starts[-2], selection.starts[-1])
-        for name in ("u", "sigma", "omega_i", "omega_o"):
-            np.take(getattr(queries, name), rows, axis=0, out=store[name][part], mode="clip")
-        store["value"][part] = mean_value(queries.value_a[rows], queries.value_b[rows])
+        if not streamed:
+            part = slice(*selection.starts[-2:])
+            for name in ("u", "sigma", "omega_i", "omega_o"):
+                np.take(getattr(queries, name), rows, axis=0, out=store[name][part], mode="clip")
+            store["value"][part] = mean_value(queries.value_a[rows], queries.value_b[rows])
     if len(selection) == 0:
         raise _all_held_out(data, f"{total} queries")
-    training: TrainingQueries | StreamedQueries
-    if streamed:
-        training = StreamedQueries(selection)
-    else:
+    training: TrainingQueries | StreamedQueries = StreamedQueries(selection)
+    if not streamed:
         training = TrainingQueries(**{n: torch.from_numpy(a[: len(selection)]) for n, a in store.items()})
-    joined = [ShardQueries.join(group) for group in (*kept_out, sample)]
-    return Partition(training, joined[0], joined[1], joined[2], selection)
+    queries, directions, sampled = (ShardQueries.join(group) for group in (*kept_out, sample))
+    return Partition(training, queries, directions, sampled, selection)
 
 
 def _all_held_out(data: Dataset, what: str) -> InputError:
@@ -169,7 +213,7 @@ def _load_images(data: Dataset, shards: list[Shard], held_out: HeldOutSection, s
     kept_out: tuple[list[ShardQueries], list[ShardQueries]] = ([], [])
     sample: list[ShardQueries] = []
     selection = Selection()
-    read = filled = 0
+    read = 0
     for shard in shards:
         images = read_checked(shard)
         mine = labels[read : read + len(images)]
@@ -179,22 +223,21 @@ def _load_images(data: Dataset, shards: list[Shard], held_out: HeldOutSection, s
         kept = np.flatnonzero(mine == TRAINING)
         selection.add(shard.path, mine == TRAINING)
         sample.append(sample_images(images.take(kept), -(-SAMPLE * len(kept) // count), random))
-        part = slice(filled, filled + len(kept))
+        part = slice(*selection.starts[-2:])
         u[part], sigma[part] = images.u[kept], images.sigma[kept, 0, 0]
         omega[0, part], omega[1, part] = images.omega_i[kept, 0, 0], images.omega_o[kept, 0, 0]
         value[part] = mean_value(images.value_a[kept], images.value_b[kept])
-        filled += len(kept)
-    training = TrainingImages(
-        torch.from_numpy(u),
-        torch.from_numpy(sigma),
-        torch.from_numpy(omega[0]),
-        torch.from_numpy(omega[1]),
-        torch.from_numpy(value),
-        strides(data.lattice, sigma) if patch_size is None else np.ones((count, 2), np.int64),
-        None if patch_size is None else nearest_shapes(data.lattice, sigma),
+    at, footprint, light, view, mean = map(torch.from_numpy, (u, sigma, *omega, value))
+    step, extent = np.ones((count, 2), np.int64), None
+    if patch_size is None:
+        step = strides(data.lattice, sigma)
+    else:
+        extent = nearest_shapes(data.lattice, sigma)
+    training = TrainingImages(at, footprint, light, view, mean, step, extent)
+    queries, directions = (
+        sample_images(ShardQueries.join(group), MAX_HELD_OUT_OF_IMAGES, random) for group in kept_out
     )
-    groups = [sample_images(ShardQueries.join(g), MAX_HELD_OUT_OF_IMAGES, random) for g in kept_out]
-    return Partition(training, groups[0], groups[1], ShardQueries.join(sample), selection)
+    return Partition(training, queries, directions, ShardQueries.join(sample), selection)
 
 
 def load_split(data: Dataset, split: Split, limit: int | None = None) -> ShardQueries:

@@ -85,13 +85,8 @@ class Selection:
 
 
 class StreamedQueries:
-    """Training queries on disk; each batch maps the shards that it reads, and then releases them.
-
-    Parameters
-    ----------
-    selection : rows to train on; npz shards
-    device : of the batches
-    """
+    """Training queries on disk: rows of npz shards, and the device of the batches. Each batch maps the shards
+    that it reads, and then releases them."""
 
     def __init__(self, selection: Selection, device: torch.device | None = None) -> None:
         self.selection = selection

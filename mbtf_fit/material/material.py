@@ -41,7 +41,6 @@ from mbtf_fit.material.transmittance import (
 )
 from mbtf_fit.models.interface import NeuralMaterial
 from mbtf_fit.models.registry import build_model
-from mbtf_fit.models.textured import TexturedMaterial
 
 
 def conformance_queries(lattice: Lattice) -> dict[str, NDArray[np.float32]]:
@@ -67,7 +66,7 @@ class Material:
 
     Attributes
     ----------
-    model : TexturedMaterial
+    model : NeuralMaterial
         The model with its weights.
     config : FitConfig
         Options of the fit.
@@ -80,7 +79,7 @@ class Material:
         Transparent fraction of footprints; None for an opaque material.
     """
 
-    model: TexturedMaterial
+    model: NeuralMaterial
     config: FitConfig
     description: dict[str, Any]
     conformance: dict[str, NDArray[np.float32]]

@@ -28,11 +28,10 @@ from torch import Tensor
 
 from mbtf_core.shard_schema import Layout
 from mbtf_fit.models.inception import InceptionDecoder
-from mbtf_fit.models.mlp import Mlp
-from mbtf_fit.models.textured import TexturedMaterial
+from mbtf_fit.models.interface import NeuralMaterial
 
 
-class Hierarchical(TexturedMaterial):
+class Hierarchical(NeuralMaterial):
     """Textures, offset, and a decoder that reads a neighborhood on the material.
 
     With ``network.decoder: mlp`` the neighborhood is the query alone.
@@ -41,35 +40,11 @@ class Hierarchical(TexturedMaterial):
     name = "hierarchical"
     layout: ClassVar[Layout] = "image"
 
-    def _make_decoder(self, features: int, directions: int) -> Mlp | InceptionDecoder:
-        network = self.network
-        if network.decoder == "mlp":
-            hidden = [network.width] * (network.layers - 1)
-            return Mlp([features + directions, *hidden, network.output_channels], network.activation)
-        return InceptionDecoder(
-            features,
-            directions,
-            network.width,
-            network.layers - 2,
-            network.output_channels,
-            network.activation,
-        )
-
-    @property
-    def margin(self) -> int:
-        """Radius of the decoder's receptive field, in texels of the nearest level."""
-        return self.decoder.margin if isinstance(self.decoder, InceptionDecoder) else 0
-
-    def nearest_shape(self, sigma: Tensor) -> Tensor:
-        """(rows, columns) of the level nearest to footprints (n,): (n, 2), whole numbers."""
-        shapes = torch.tensor([self.lattice.shape(s) for s in range(self.lattice.finest + 1)])
-        nearest = (self.level(sigma) + 0.5).floor().long()
-        return shapes.to(sigma.device)[nearest]
-
     def neighborhood(self, u: Tensor, sigma: Tensor) -> Tensor:
         """Positions (n, 2·margin+1, 2·margin+1, 2) around `u` (n, 2), a texel of the nearest level apart:
         image rows downwards, columns to the right."""
-        rows, columns = self.nearest_shape(sigma).to(u.dtype).unbind(1)
+        shapes = u.new_tensor([self.lattice.shape(s) for s in range(self.lattice.finest + 1)])
+        rows, columns = shapes[(self.level(sigma) + 0.5).floor().long()].unbind(1)
         steps = torch.arange(-self.margin, self.margin + 1, dtype=u.dtype, device=u.device)
         along_u = u[:, :1] + steps / columns[:, None]
         along_v = u[:, 1:] - steps / rows[:, None]
@@ -100,6 +75,8 @@ class Hierarchical(TexturedMaterial):
         return self.to_value(x).view(items, rows, columns, 3)
 
     def evaluate_patches(self, u: Tensor, sigma: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
+        """Values (items, rows, columns, 3) at positions (items, rows+2·margin, columns+2·margin, 2) that
+        share footprint (items,), light and view (items, 3)."""
         return self.decode(self.read_features(u, sigma, omega_o), omega_i, omega_o)
 
     def stage1(self, u: Tensor, sigma: Tensor, omega_o: Tensor) -> Tensor:

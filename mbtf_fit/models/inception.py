@@ -8,9 +8,6 @@ at each border; there is no padding.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
-
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import conv2d, linear, max_pool2d
@@ -21,19 +18,10 @@ from mbtf_fit.models.mlp import ACTIVATIONS, Activation
 REACH = 2
 
 
-class Convolution(nn.Module):
-    """Parameters of a convolution: `weight` (outputs, inputs, size, size) and `bias` (outputs,)."""
+class Convolution(nn.Conv2d):
+    """A convolution of arrays (items, rows, columns, inputs) without padding."""
 
-    def __init__(self, inputs: int, outputs: int, size: int = 1) -> None:
-        super().__init__()
-        self.weight = nn.Parameter(torch.empty(outputs, inputs, size, size))
-        self.bias = nn.Parameter(torch.empty(outputs))
-
-    def initialize(self, generator: torch.Generator, gain: float) -> None:
-        """Weights normal with variance gain²/inputs, biases 0."""
-        with torch.no_grad():
-            self.weight.normal_(0.0, gain / math.sqrt(self.weight[0].numel()), generator=generator)
-            self.bias.zero_()
+    bias: Tensor
 
     @property
     def matrix(self) -> Tensor:
@@ -42,29 +30,26 @@ class Convolution(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(items, rows, columns, inputs) → (items, rows-size+1, columns-size+1, outputs)."""
-        if self.weight.shape[-1] == 1:
+        if self.kernel_size == (1, 1):
             return linear(x, self.matrix, self.bias)
         return conv2d(x.permute(0, 3, 1, 2), self.weight, self.bias).permute(0, 2, 3, 1)
 
 
-def branch_widths(width: int) -> tuple[int, int, int, int, int, int]:
-    """(1×1, before 3×3, 3×3, before 5×5, 5×5, behind the maximum): 7, 3, 12, 5, 3, 3 of the paper's 25, and
-    in proportion for other widths."""
-    share = [max(1, round(width * n / 25)) for n in (7, 3, 12, 5, 3)]
-    return share[0], share[1], share[2], share[3], share[4], width - share[0] - share[2] - share[4]
-
-
 class Inception(nn.Module):
-    """One module, `width` → `width` channels."""
+    """One module, `width` → `width` channels.
+
+    The branches have 7 (1×1), 3 then 12 (3×3), 5 then 3 (5×5) and 3 (maximum) of the paper's 25 channels, and
+    in proportion for other widths.
+    """
 
     def __init__(self, width: int, activation: Activation) -> None:
         super().__init__()
         self.activate = ACTIVATIONS[activation]
-        one, before3, three, before5, five, pooled = branch_widths(width)
-        self.one = Convolution(width, one)
-        self.before3, self.three = Convolution(width, before3), Convolution(before3, three, 3)
-        self.before5, self.five = Convolution(width, before5), Convolution(before5, five, 5)
-        self.pooled = Convolution(width, pooled)
+        one, before3, three, before5, five = (max(1, round(width * n / 25)) for n in (7, 3, 12, 5, 3))
+        self.one = Convolution(width, one, 1)
+        self.before3, self.three = Convolution(width, before3, 1), Convolution(before3, three, 3)
+        self.before5, self.five = Convolution(width, before5, 1), Convolution(before5, five, 5)
+        self.pooled = Convolution(width, width - one - three - five, 1)
 
     def forward(self, x: Tensor) -> Tensor:
         """(items, rows, columns, width) → (items, rows-4, columns-4, width)."""
@@ -95,30 +80,14 @@ class InceptionDecoder(nn.Module):
         super().__init__()
         self.features = features
         self.activation: Activation = activation
-        self.first = Convolution(features + directions, width)
+        self.first = Convolution(features + directions, width, 1)
         self.modules_ = nn.ModuleList(Inception(width, activation) for _ in range(modules))
-        self.last = Convolution(width, outputs)
-
-    def initialize(self, generator: torch.Generator) -> None:
-        """Variance 2/inputs before an activation, 1/inputs in the last layer; biases 0."""
-        for module in self.modules():
-            if isinstance(module, Convolution):
-                module.initialize(generator, 1.0 if module is self.last else math.sqrt(2.0))
+        self.last = Convolution(width, outputs, 1)
 
     @property
     def margin(self) -> int:
         """Radius of the receptive field, in samples."""
         return REACH * len(self.modules_)
-
-    @property
-    def last_bias(self) -> Tensor:
-        """Biases of the outputs."""
-        return self.last.bias
-
-    @property
-    def count(self) -> int:
-        """Number of weights, biases included."""
-        return sum(p.numel() for p in self.parameters())
 
     def forward(self, x: Tensor, directions: Tensor) -> Tensor:
         """Features (items, rows, columns, f) and inputs shared by an item (items, d) → (items, rows-2·margin,
@@ -131,22 +100,3 @@ class InceptionDecoder(nn.Module):
             x = module(x)
         out: Tensor = self.last(x)
         return out
-
-    def _layers(self) -> dict[str, Convolution]:
-        named = {name.replace("modules_.", ""): m for name, m in self.named_modules()}
-        return {name: m for name, m in named.items() if isinstance(m, Convolution)}
-
-    def export(self) -> dict[str, Tensor]:
-        """``first.weight`` (outputs, inputs, 1, 1), ``first.bias``, ``0.one.weight``, …, ``last.bias``."""
-        return {
-            f"{name}.{kind}": p.detach().clone()
-            for name, layer in self._layers().items()
-            for kind, p in (("weight", layer.weight), ("bias", layer.bias))
-        }
-
-    def load(self, tensors: Mapping[str, Tensor]) -> None:
-        """Load tensors of :meth:`export`; other entries are ignored."""
-        with torch.no_grad():
-            for name, layer in self._layers().items():
-                layer.weight.copy_(tensors[f"{name}.weight"])
-                layer.bias.copy_(tensors[f"{name}.bias"])

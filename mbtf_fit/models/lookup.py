@@ -25,12 +25,7 @@ from mbtf_core.lattice import Lattice
 
 @dataclass(frozen=True)
 class Packing:
-    """Layout of a pyramid's levels in their table.
-
-    Attributes
-    ----------
-    shapes : (rows, columns) of each level, coarsest first
-    """
+    """Layout of a pyramid's levels in their table: (rows, columns) of each, coarsest first."""
 
     shapes: tuple[tuple[int, int], ...]
 
@@ -62,17 +57,10 @@ def coarse_level(level: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
 
 def lookup_reference(table: Tensor, packing: Packing, u: Tensor, level: Tensor | None = None) -> Tensor:
-    """Texture values at positions, in plain PyTorch.
+    """Texture values (n, channels) at uv positions `u` (n, 2), in plain PyTorch; differentiable in `table`
+    (texels, channels) and `u`.
 
-    Parameters
-    ----------
-    table : (texels, channels)
-    u : (n, 2) uv, any real numbers: the textures are periodic
-    level : (n,) fractional index into ``packing.shapes``; None reads level 0 alone
-
-    Returns
-    -------
-    (n, channels), differentiable in `table` and `u`
+    `level` (n,) is a fractional index into ``packing.shapes``; None reads level 0 alone.
     """
     starts = packing.starts
     out = table.new_zeros(len(u), table.shape[1])
@@ -176,11 +164,8 @@ def _weighted(table: Tensor, index: Tensor, weights: Tensor) -> Tensor:
 
 
 def add_up(index: Tensor, weights: Tensor, values: Tensor, rows: int) -> Tensor:
-    """Transpose of a weighted gather: ``out[index[q, c]] += weights[q, c]·values[q]``.
-
-    Parameters
-    ----------
-    index, weights : (n, corners); values : (n, channels); rows : of the result
+    """Transpose of a weighted gather: ``out[index[q, c]] += weights[q, c]·values[q]``, (rows, channels), for
+    index and weights (n, corners) and values (n, channels).
 
     On a CPU one sparse product, whose order of summation is fixed: an order of magnitude faster than
     ``index_add_`` of rows this short, and the same bits at every run.

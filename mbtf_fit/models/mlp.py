@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Any, Literal
 
@@ -18,6 +18,22 @@ ACTIVATIONS: dict[Activation, Callable[[Tensor], Tensor]] = {
     "leaky-relu": lambda x: nn.functional.leaky_relu(x, LEAK),
     "sine": torch.sin,
 }
+
+
+def initialize_layers(network: nn.Module, generator: torch.Generator) -> None:
+    """Weights normal with variance 2/inputs before an activation (He et al. 2015; behind a sine, whose
+    variance is ½, it is the same), 1/inputs in the last layer; biases 0.
+
+    The papers state no initialization. PyTorch's own (uniform, with random biases) left half of a 25-wide
+    layer without a gradient for good at the learning rates used here.
+    """
+    *hidden, last = (m for m in network.modules() if isinstance(m, nn.Linear | nn.Conv2d))
+    with torch.no_grad():
+        for layer in (*hidden, last):
+            gain = 1.0 if layer is last else math.sqrt(2.0)
+            weight, bias = layer.parameters()
+            weight.normal_(0.0, gain / math.sqrt(weight[0].numel()), generator=generator)
+            bias.zero_()
 
 
 class _FusedMlp(torch.autograd.Function):
@@ -53,7 +69,7 @@ class _FusedMlp(torch.autograd.Function):
         return g, *by_parameter
 
 
-class Mlp(nn.Module):
+class Mlp(nn.Sequential):
     """Fully connected network with an activation between its layers and none after the last.
 
     Parameters
@@ -62,63 +78,25 @@ class Mlp(nn.Module):
     """
 
     def __init__(self, widths: Sequence[int], activation: Activation = "relu") -> None:
-        super().__init__()
+        super().__init__(*(nn.Linear(i, o) for i, o in pairwise(widths)))
         self.activation: Activation = activation
-        pairs = list(pairwise(widths))
-        self.weights = nn.ParameterList(nn.Parameter(torch.empty(o, i)) for i, o in pairs)
-        self.biases = nn.ParameterList(nn.Parameter(torch.empty(o)) for _, o in pairs)
-
-    def initialize(self, generator: torch.Generator, last_gain: float = 1.0) -> None:
-        """Weights normal with variance 2/inputs before an activation (He et al. 2015; behind a sine, whose
-        variance is ½, it is the same), `last_gain`²/inputs in the last layer; biases 0.
-
-        The papers state no initialization. PyTorch's own (uniform, with random biases) left half of a 25-wide
-        layer without a gradient for good at the learning rates used here.
-        """
-        with torch.no_grad():
-            for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-                gain = last_gain if k == len(self.weights) - 1 else math.sqrt(2.0)
-                weight.normal_(0.0, gain / math.sqrt(weight.shape[1]), generator=generator)
-                bias.zero_()
 
     @property
-    def count(self) -> int:
-        """Number of weights, biases included."""
-        return sum(p.numel() for p in self.parameters())
-
-    @property
-    def last_bias(self) -> Tensor:
-        """Biases of the outputs."""
-        return self.biases[-1]
-
-    def export(self) -> dict[str, Tensor]:
-        """``0.weight`` (outputs, inputs), ``0.bias`` (outputs,), ``1.weight``, …"""
-        layers = enumerate(zip(self.weights, self.biases, strict=True))
-        return {
-            f"{k}.{kind}": p.detach().clone()
-            for k, layer in layers
-            for kind, p in zip(("weight", "bias"), layer, strict=True)
-        }
-
-    def load(self, tensors: Mapping[str, Tensor]) -> None:
-        """Load tensors of :meth:`export`; other entries are ignored."""
-        with torch.no_grad():
-            for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-                weight.copy_(tensors[f"{k}.weight"])
-                bias.copy_(tensors[f"{k}.bias"])
+    def weights(self) -> list[nn.Parameter]:
+        """Matrix (outputs, inputs) of each layer."""
+        return [*self.parameters()][::2]
 
     def forward(self, x: Tensor) -> Tensor:
         """(n, inputs) → (n, outputs); differentiable once."""
         if self.activation != "relu":
             return self.reference(x)
-        parameters = [p for pair in zip(self.weights, self.biases, strict=True) for p in pair]
-        out: Tensor = _FusedMlp.apply(x, *parameters)
+        out: Tensor = _FusedMlp.apply(x, *self.parameters())
         return out
 
     def reference(self, x: Tensor) -> Tensor:
         """The same network in plain PyTorch."""
-        last = len(self.weights) - 1
-        for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            x = nn.functional.linear(x, weight, bias)
-            x = x if k == last else ACTIVATIONS[self.activation](x)
+        *hidden, last = self
+        for layer in hidden:
+            x = ACTIVATIONS[self.activation](layer(x))
+        x = last(x)
         return x

@@ -21,21 +21,31 @@ Deviations from the paper:
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import torch
 from torch import Tensor
 
 from mbtf_core.errors import InputError
 from mbtf_core.lattice import Lattice
-from mbtf_core.shard_schema import Layout
 from mbtf_fit.config import NetworkSection
-from mbtf_fit.models.calibration_factors import interpolate_factors
-from mbtf_fit.models.mlp import Mlp
-from mbtf_fit.models.textured import TexturedMaterial
+from mbtf_fit.models.interface import NeuralMaterial
+
+# Knots of the cosine in a fitted table: 0, 1/16, ..., 1.
+KNOTS = 17
 
 
-class Neumip(TexturedMaterial):
+def interpolate_factors(table: Tensor, level: Tensor, cosine: Tensor) -> Tensor:
+    """Calibration factors (n, 3) of a table (levels, knots, 3) at fractional levels (n,) and cosines (n,):
+    bilinear between levels and knots, which are equidistant in [0, 1]."""
+    last = max(1, table.shape[0] - 1)
+    # An image whose rows are levels, in the coordinates of grid_sample: corners at -1 and 1.
+    position = torch.stack([2.0 * cosine - 1.0, (2.0 / last) * level - 1.0], -1)
+    found = torch.nn.functional.grid_sample(
+        table.permute(2, 0, 1)[None], position[None, :, None], padding_mode="border", align_corners=True
+    )
+    return found[0, :, :, 0].T
+
+
+class Neumip(NeuralMaterial):
     """NeuMIP with the neural offset.
 
     ``u' = u + r / max(ω_o,z, 0.6) · ω_o,xy`` with ``r = F_off(T_off(u), ω_o,xy)``; T_off is one texture of
@@ -48,17 +58,11 @@ class Neumip(TexturedMaterial):
     """
 
     name = "neumip"
-    layout: ClassVar[Layout] = "shuffled"
 
     def __init__(self, lattice: Lattice, network: NetworkSection) -> None:
         super().__init__(lattice, network)
         self.calibration: Tensor | None
         self.register_buffer("calibration", None)
-
-    def _make_decoder(self, features: int, directions: int) -> Mlp:
-        network = self.network
-        hidden = [network.width] * (network.layers - 1)
-        return Mlp([features + directions, *hidden, network.output_channels], network.activation)
 
     def stage1(self, u: Tensor, sigma: Tensor, omega_o: Tensor) -> Tensor:
         features = self.features(u, sigma, omega_o)

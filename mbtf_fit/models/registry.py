@@ -7,13 +7,13 @@ from typing import Any
 from mbtf_core.lattice import Lattice
 from mbtf_fit.config import FitConfig
 from mbtf_fit.models.hierarchical import Hierarchical
+from mbtf_fit.models.interface import NeuralMaterial
 from mbtf_fit.models.neumip import Neumip, NeumipBaseline
-from mbtf_fit.models.textured import TexturedMaterial
 
-MODELS: dict[str, type[TexturedMaterial]] = {m.name: m for m in (NeumipBaseline, Neumip, Hierarchical)}
+MODELS: dict[str, type[NeuralMaterial]] = {m.name: m for m in (NeumipBaseline, Neumip, Hierarchical)}
 
 
-def build_model(name: str, lattice: Lattice, **network: Any) -> TexturedMaterial:
+def build_model(name: str, lattice: Lattice, **network: Any) -> NeuralMaterial:
     """An uninitialized model; `network` are keys of the configuration's section, by default the model's."""
     config = FitConfig.model_validate({"model": name, "network": network})
     return MODELS[name](lattice, config.network)

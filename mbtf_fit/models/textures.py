@@ -25,7 +25,6 @@ class FeatureTextures(nn.Module):
     Attributes
     ----------
     texels : (texels, channels) parameter, all levels one after the other
-    table : table that lookups read: the texels, or the last argument of :meth:`read`
     """
 
     def __init__(
@@ -39,12 +38,12 @@ class FeatureTextures(nn.Module):
 
     @property
     def table(self) -> Tensor:
+        """What lookups read: the texels, or the last argument of :meth:`read`."""
         return self.texels if self._table is None else self._table
 
     def read(self, table: Tensor | None) -> None:
         """Let lookups read a table instead of the texels; None restores the texels."""
-        # Unblurred, the table is the texels themselves, which must not become a second parameter of the
-        # module.
+        # The texels themselves must not become a second parameter of the module.
         self._table = None if table is self.texels else table
 
     def blurred(self, sigma: float) -> Tensor:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.native.library import GradientSums, QuadraticLoss, QueryPointers
-from mbtf_fit.native.model import NativeModel, aligned, networks, parameters_of, pointers, share
+from mbtf_fit.native.model import NativeModel, aligned, networks, pointers, share
 from mbtf_fit.objective.losses import Objective, Quadratic
 from mbtf_fit.objective.parallel import Workers
 
@@ -36,7 +36,10 @@ class _Sums:
         lanes = int(native.kernel.library.mbtf_lanes())
         textures = native.model.textures()
         self.textures = [aligned(t.packing.texels * (-(-t.texels.shape[1] // 8) * 8)) for t in textures]
-        self.networks = [aligned(lanes * network.count) for network in networks(native.model)]
+        self.networks = [
+            aligned(lanes * sum(p.numel() for p in network.parameters()))
+            for network in networks(native.model)
+        ]
         self.state = native.state(piece)
         self.scratch = aligned(int(native.kernel.library.mbtf_scratch_floats()))
         self.out = torch.empty(max(piece, 2 * native.kernel.block), 3)
@@ -60,7 +63,7 @@ class NativeGradients:
         self.piece = block * max(4, _PIECE_BYTES // per_block)
         self._sums: list[_Sums] = []
         self.textures = [torch.empty_like(t.texels) for t in native.model.textures()]
-        self.networks = [[torch.empty_like(p) for p in parameters_of(n)] for n in networks(native.model)]
+        self.networks = [[torch.empty_like(p) for p in n.parameters()] for n in networks(native.model)]
 
     def compute(self, objective: Objective, batch: TrainingQueries, workers: Workers) -> Tensor:
         """Mean loss of a batch; the gradients by tables and weights are left in :attr:`textures` and

@@ -61,11 +61,6 @@ def networks(model: NeuralMaterial) -> list[Mlp]:
     return [model.decoder, *([] if model.network.offset == "none" else [model.offset_network])]
 
 
-def parameters_of(network: Mlp) -> list[Tensor]:
-    """Weight 0, bias 0, weight 1, ..."""
-    return [p for pair in zip(network.weights, network.biases, strict=True) for p in pair]
-
-
 def pointers(tensors: list[Tensor]) -> Any:
     """Addresses of tensors, as the kernel takes them."""
     return (ctypes.c_void_p * len(tensors))(*(t.data_ptr() for t in tensors))
@@ -118,7 +113,7 @@ class NativeModel:
         assert isinstance(self.model, Neumip)
         self.description.unit = float(self.model.unit)
         for network, target, packed in self._networks:
-            held = [p.detach().contiguous() for p in parameters_of(network)]
+            held = [p.detach().contiguous() for p in network.parameters()]
             library.mbtf_pack(variant, ctypes.byref(target), pointers(held), packed.data_ptr())
         # Kept: the description has their addresses.
         self._tables = [texture.table.detach().contiguous() for texture, _ in self._textures]

@@ -15,7 +15,7 @@ from mbtf_fit.models.interface import NeuralMaterial
 from mbtf_fit.native.blur import Blur
 from mbtf_fit.native.gradients import NativeGradients
 from mbtf_fit.native.library import AdamStep, Kernel
-from mbtf_fit.native.model import NativeModel, networks, parameters_of, share
+from mbtf_fit.native.model import NativeModel, networks, share
 from mbtf_fit.objective.losses import Objective
 from mbtf_fit.objective.parallel import Workers
 
@@ -59,7 +59,7 @@ class NativeStepper:
                 gradient = self._blurred[k]
             found[texture.texels] = gradient
         for network, gradients in zip(networks(self.model), self._gradients.networks, strict=True):
-            found.update(zip(parameters_of(network), gradients, strict=True))
+            found.update(zip(network.parameters(), gradients, strict=True))
         adam(self.kernel, self.optimizer, found, workers)
         return loss
 

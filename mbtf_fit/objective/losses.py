@@ -26,7 +26,6 @@ themselves are not clamped: where they agree, the prediction moves until they ar
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -49,32 +48,19 @@ _ROOT_FLOOR = 1e-2
 _LOG_START = -0.5
 
 
-class Curve(ABC):
-    """An increasing function f of values in units of s, defined for all real numbers."""
+class Curve:
+    """An increasing function f of values in units of s, defined for all real numbers: here f(x) = x."""
 
-    @abstractmethod
     def value(self, x: Tensor) -> Tensor:
         """f(x)"""
-
-    @abstractmethod
-    def slope(self, x: Tensor) -> Tensor:
-        """f'(x)"""
-
-    @abstractmethod
-    def curvature(self, x: Tensor) -> Tensor:
-        """f''(x)"""
-
-
-class Identity(Curve):
-    """f(x) = x."""
-
-    def value(self, x: Tensor) -> Tensor:
         return x
 
     def slope(self, x: Tensor) -> Tensor:
+        """f'(x)"""
         return torch.ones_like(x)
 
     def curvature(self, x: Tensor) -> Tensor:
+        """f''(x)"""
         return torch.zeros_like(x)
 
 
@@ -125,11 +111,10 @@ def absolute(error: Tensor, noise: Tensor | None) -> Tensor:
 def absolute_gradient(error: Tensor, noise: Tensor | None) -> Tensor:
     """Mean :func:`absolute` of the differences between neighbors along rows and columns of patches (items,
     rows, columns, 3)."""
-    # A single row or column has no neighbors.
     total = 0.0 * error.sum()
     for axis in (1, 2):
         n = error.shape[axis] - 1
-        if n == 0:
+        if n == 0:  # a single row or column has no neighbors
             continue
         both = None if noise is None else noise.narrow(axis, 0, n) + noise.narrow(axis, 1, n)
         total = total + absolute(error.narrow(axis, 1, n) - error.narrow(axis, 0, n), both)
@@ -146,14 +131,8 @@ class CurveTerm:
     def __call__(
         self, p: Tensor, detached: Tensor, t: Tensor, variance: Tensor | None, correction: Correction
     ) -> Tensor:
-        """Mean of the term over arrays (n, 3), or (items, rows, columns, 3), in units of s.
-
-        Parameters
-        ----------
-        p : prediction; detached : the same, constant under differentiation
-        t : value
-        variance : of t; None without correction
-        """
+        """Mean of the term over arrays (n, 3), or (items, rows, columns, 3), in units of s: prediction p, the
+        same constant under differentiation, value t, and its variance (None without correction)."""
         if variance is None:
             return self.measure(self.curve.value(p) - self.curve.value(t), None)
         if correction == "second-order":
@@ -167,18 +146,15 @@ class CurveTerm:
 def relative(
     p: Tensor, detached: Tensor, t: Tensor, variance: Tensor | None, correction: Correction
 ) -> Tensor:
-    """``(p-t)² / (p² + s²)`` with a detached denominator: a weight that depends on the prediction has no
-    bias.
-
-    Lehtinen et al. (Noise2Noise, ICML 2018) use this form for HDR images.
-    """
+    """``(p-t)² / (p² + s²)`` with a detached denominator, so that the weight causes no bias (for HDR images:
+    Lehtinen et al., Noise2Noise, ICML 2018)."""
     return ((p - t).square() / (detached.square() + 1)).mean()
 
 
 _TERMS: dict[LossKind, Callable[[Tensor, Tensor, Tensor, Tensor | None, Correction], Tensor]] = {
     "relative": relative,
-    "squared": CurveTerm(Identity(), squared),
-    "linear": CurveTerm(Identity(), absolute),
+    "squared": CurveTerm(Curve(), squared),
+    "linear": CurveTerm(Curve(), absolute),
     "log": CurveTerm(Log(), squared),
     "fourth-root": CurveTerm(FourthRoot(), absolute),
     "gradient": CurveTerm(FourthRoot(), absolute_gradient),

@@ -7,10 +7,9 @@ runs single-threaded operations in parallel.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
-from types import TracebackType
 from typing import Any, TypeVar
 
 import torch
@@ -40,11 +39,10 @@ class Workers:
     limit : most threads
     """
 
-    def __init__(self, device: torch.device, threads: int | None = None, *, limit: int | None = None) -> None:
+    def __init__(self, device: torch.device, threads: int | None = None, *, limit: int = MAX_THREADS) -> None:
         self._cores = torch.get_num_threads()
         self._precision = torch.get_float32_matmul_precision()
-        most = MAX_THREADS if limit is None else limit
-        self.count = 1 if device.type == "cuda" else min(threads or self._cores, most)
+        self.count = 1 if device.type == "cuda" else min(threads or self._cores, limit)
         self._pool = ThreadPoolExecutor(self.count) if self.count > 1 else None
 
     def __enter__(self) -> Workers:
@@ -54,39 +52,32 @@ class Workers:
         torch.set_num_threads(max(1, self._cores // self.count))
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         if self._pool is not None:
             self._pool.shutdown()
         torch.set_num_threads(self._cores)
         torch.set_float32_matmul_precision(self._precision)
 
-    def each(self, work: Callable[[int], T]) -> list[T]:
-        """Results of ``work(k)`` for every thread k, in this order."""
-        parts = range(self.count)
+    def each(self, work: Callable[[Any], T], parts: Iterable[Any] | None = None) -> list[T]:
+        """Results of ``work(part)``, in this order; by default for the number of every thread."""
+        parts = range(self.count) if parts is None else parts
         return list(map(work, parts) if self._pool is None else self._pool.map(work, parts))
 
     def gradients(self, loss: Loss, batch: Batch, inputs: Sequence[Tensor]) -> tuple[Tensor, list[Tensor]]:
-        """Mean loss of a batch, and its gradients by `inputs`.
-
-        Parameters
-        ----------
-        loss : mean over the queries of its argument; called from several threads
-        """
+        """Mean loss of a batch, and its gradients by `inputs`; `loss` is called from several threads."""
         n = len(batch)
         edges = [n * k // self.count for k in range(self.count + 1)]
-        parts: list[Batch] = [batch.slice(a, b) for a, b in pairwise(edges) if b > a]
+        parts = [batch.slice(a, b) for a, b in pairwise(edges) if b > a]
 
         def work(part: Batch) -> tuple[Tensor, tuple[Tensor, ...]]:
             value = loss(part) * (len(part) / n)
             return value.detach(), torch.autograd.grad(value, inputs)
 
-        found = list(map(work, parts) if self._pool is None else self._pool.map(work, parts))
+        found = self.each(work, parts)
         # Added in a fixed order: the sum does not depend on which thread finishes first.
-        total, gradients = found[0][0], list(found[0][1])
-        for value, more in found[1:]:
+        (total, gradients), *rest = found
+        for value, more in rest:
             total = total + value
             for mine, other in zip(gradients, more, strict=True):
                 mine += other
-        return total, gradients
+        return total, [*gradients]

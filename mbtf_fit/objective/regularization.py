@@ -9,7 +9,7 @@ themselves, not to the gradients (Loshchilov and Hutter, ICLR 2019).
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import torch
 
@@ -25,12 +25,7 @@ _MOST = 1.0
 
 @dataclass(frozen=True)
 class WeightDecay:
-    """Decay per step, relative to the learning rate.
-
-    Attributes
-    ----------
-    texels : of the textures; weights : of the networks' matrices
-    """
+    """Decay per step, relative to the learning rate: of the textures, and of the networks' matrices."""
 
     texels: float
     weights: float
@@ -41,10 +36,6 @@ class WeightDecay:
         relative = noise_ratio / _REFERENCE_NOISE
         weights = training.noise_regularization * noise_ratio * min(1.0, relative) / queries
         return cls(training.texture_weight_decay * max(1.0, relative), min(_MOST, weights))
-
-    def as_dict(self) -> dict[str, float]:
-        """Plain data for JSON."""
-        return asdict(self)
 
     def apply(self, model: NeuralMaterial, texture_rate: float, rate: float) -> None:
         """Decay a model's parameters by one step at these learning rates."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -27,39 +26,27 @@ def state_tensors(trainer: Trainer) -> dict[str, Tensor]:
 
 
 def write_checkpoint(trainer: Trainer, path: Path) -> None:
-    """Write parameters, optimizer state and progress.
-
-    Raises
-    ------
-    PartialError : the disk is full or the folder cannot be written
-    """
+    """Write parameters, optimizer state and progress."""
     write_tensors(path, state_tensors(trainer), asdict(trainer.progress))
 
 
 def read_checkpoint(trainer: Trainer, path: Path) -> None:
-    """Resume from a checkpoint of the same configuration and data, with identical results.
-
-    Raises
-    ------
-    InputError : the checkpoint is corrupt, or of another model
-    """
+    """Resume from a checkpoint of the same configuration and data, with identical results."""
     try:
-        _restore(trainer, *read_tensors(path))
+        tensors, progress = read_tensors(path)
+        with torch.no_grad():
+            for name, p in trainer.model.named_parameters():
+                p.copy_(tensors[f"model.{name}"])
+                trainer.optimizer.state[p] = {
+                    key: tensors[f"adam.{key}.{name}"].to(p.device)
+                    for key in _MOMENTS
+                    if f"adam.{key}.{name}" in tensors
+                }
+        step, seconds, loss = (progress[key] for key in ("step", "seconds", "loss"))
+        trainer.progress = Progress(int(step), float(seconds), float(loss))
     except (InputError, KeyError, TypeError, ValueError, RuntimeError):
         raise InputError(
             "is no checkpoint of this fit: corrupt, or of an older version",
             where=path,
             hint="remove it: the same command then starts from the beginning",
         ) from None
-
-
-def _restore(trainer: Trainer, tensors: dict[str, Tensor], data: dict[str, Any]) -> None:
-    with torch.no_grad():
-        for name, p in trainer.model.named_parameters():
-            p.copy_(tensors[f"model.{name}"])
-            trainer.optimizer.state[p] = {
-                key: tensors[f"adam.{key}.{name}"].to(p.device)
-                for key in _MOMENTS
-                if f"adam.{key}.{name}" in tensors
-            }
-    trainer.progress = Progress(int(data["step"]), float(data["seconds"]), float(data["loss"]))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 from mbtf_core.units import clock
@@ -41,26 +41,22 @@ class MarginalCost:
     halving: float | None
     noise_share: float | None
 
-    def as_dict(self) -> dict[str, Any]:
-        """Plain data for JSON."""
-        return asdict(self)
-
     def describe(self) -> str:
         """One line, or two."""
-        lines = [
+        text = (
             f"unexplained variance of {self.validation_set}: {self.half:.3f} ± {self.half_error:.3f} at half "
-            f"of the training time, {self.end:.3f} ± {self.end_error:.3f} at the end"
-        ]
+            f"of the training time, {self.end:.3f} ± {self.end_error:.3f} at the end; "
+        )
         if self.halving is None:
-            lines[0] += "; longer training alone would hardly reduce it"
+            text += "longer training alone would hardly reduce it"
         else:
-            lines[0] += f"; halving the error takes about {clock(self.halving)} more, or longer"
+            text += f"halving the error takes about {clock(self.halving)} more, or longer"
         if self.noise_share is not None:
-            lines.append(
-                f"overfitting to noise causes {self.noise_share:.0%} of the error of held-out queries: "
+            text += (
+                f"\noverfitting to noise causes {self.noise_share:.0%} of the error of held-out queries: "
                 "use more queries, or more paths per query"
             )
-        return "\n".join(lines)
+        return text
 
 
 def marginal_cost_of(
@@ -69,14 +65,11 @@ def marginal_cost_of(
     noise: float | None = None,
     validation_set: str = "test",
 ) -> MarginalCost | None:
-    """Marginal cost of a finished fit; None where its history does not resolve it.
+    """Marginal cost of a finished fit, from the records of its history and its errors by split; None where
+    the history does not resolve it.
 
-    Parameters
-    ----------
-    history : records with ``fraction``, ``seconds``, ``unexplained`` and ``unexplained_error``
-    errors : of the finished fit by split, as plain data
-    noise : variance of the noise of training values over that of the values; None where unknown
-    validation_set : the split that the history is of
+    `noise` is the variance of the noise of training values over that of the values (None: unknown),
+    `validation_set` the split that the history is of.
     """
     known = [r for r in history if _number(r.get("unexplained")) and _number(r.get("unexplained_error"))]
     middle = [r for r in known if _MIDDLE[0] <= r.get("fraction", -1.0) <= _MIDDLE[1]]

@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +21,13 @@ from mbtf_core.atomic import write_text
 from mbtf_core.errors import EngineError, InputError
 from mbtf_core.stats import pooled_variance
 from mbtf_fit.config import FitConfig
-from mbtf_fit.data.loader import load_training, open_data
+from mbtf_fit.data.loader import Partition, load_training, open_data
 from mbtf_fit.data.queries import ShardQueries, mean_value
-from mbtf_fit.data.split import Partition
 from mbtf_fit.evaluation import evaluate_splits
 from mbtf_fit.material.format import DESCRIPTION_NAME
 from mbtf_fit.material.material import Material, export
 from mbtf_fit.material.transmittance_fit import evaluate_transmittance, fit_transmittance
+from mbtf_fit.models.interface import NeuralMaterial
 from mbtf_fit.models.registry import MODELS, build_model
 from mbtf_fit.objective.noise import NoiseModel, typical_value
 from mbtf_fit.training.checkpoint import CHECKPOINT_NAME, read_checkpoint, write_checkpoint
@@ -42,13 +42,14 @@ from mbtf_fit.training.validation import (
     validation_set,
     validation_subset,
 )
-from mbtf_fit.training.warm_start import initialize_from
 from mbtf_gen.dataset.reader import Dataset
 
 # Seconds of training between two validations, and between two checkpoints.
 _REPORT_SECONDS = 2.0
 _CHECKPOINT_SECONDS = 15.0
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
+# Tensors that ``init_from`` copies, by the first part of their names; the decoder keeps its initialization.
+_SHARED = ("pyramid", "offset_texture", "offset_network")
 
 # Called with the fraction of the budget that is spent, and one line of text.
 ProgressCallback = Callable[[float, str], None]
@@ -95,7 +96,7 @@ class FitResult:
             "resumed": self.resumed,
             "training": self.material.description["training"],
             "errors": self.errors,
-            "marginal_cost": None if cost is None else cost.as_dict(),
+            "marginal_cost": None if cost is None else asdict(cost),
         }
 
     @property
@@ -108,12 +109,7 @@ class FitResult:
 
 
 def choose_device(name: str) -> torch.device:
-    """The device to train on; ``auto`` is CUDA if available.
-
-    Raises
-    ------
-    EngineError : no CUDA device is available
-    """
+    """The device to train on; ``auto`` is CUDA if available."""
     available = torch.cuda.is_available()
     if name == "cuda" and not available:
         raise EngineError(
@@ -205,6 +201,8 @@ def fit(
     _train(trainer, subset, out, progress or (lambda fraction, note: None))
     trainer.calibrate()
     errors = evaluate_splits(trainer.predict, data, partition)
+    variance = errors["training"].overall.variance.value
+    noise = pooled_variance(partition.sample.value_a, partition.sample.value_b).value
     training = {
         "steps": trainer.progress.step,
         "batch": trainer.batch,
@@ -212,14 +210,15 @@ def fit(
         "seconds": round(trainer.progress.seconds, 3),
         "loss": trainer.progress.loss,
         "validation_set": name,
-        "weight_decay": trainer.weight_decay.as_dict(),
+        "weight_decay": asdict(trainer.weight_decay),
         "coverage": {str(level): fraction for level, fraction in trainer.coverage().items()},
         "device": str(device),
         "threads": torch.get_num_threads(),
         "backend": trainer.backend,
         "torch": torch.__version__,
         "errors": {split: e.as_dict() for split, e in errors.items()},
-        "noise_ratio": _noise_ratio(partition.sample, errors["training"].overall.variance.value),
+        # Variance of the noise of values over that of the values.
+        "noise_ratio": noise / variance if variance > 0 else None,
     }
     transmittance = fit_transmittance(data, partition.selection)
     if transmittance is not None:
@@ -230,34 +229,38 @@ def fit(
     return _finished(out, time.perf_counter() - begin, resumed=resumed)
 
 
-def _noise_ratio(sample: ShardQueries, variance: float) -> float | None:
-    """Variance of the noise of values over that of the values; None for constant values."""
-    return pooled_variance(sample.value_a, sample.value_b).value / variance if variance > 0 else None
-
-
 def prepare_trainer(config: FitConfig, data: Dataset, partition: Partition, device: torch.device) -> Trainer:
-    """A trainer at its first step, for the model and the data of a configuration.
-
-    Raises
-    ------
-    InputError : the material that initializes the fit is missing, or has other textures
-    """
+    """A trainer at its first step, for the model and the data of a configuration."""
     model = build_model(config.model, data.lattice, **config.network.model_dump())
     unit = typical_value(mean_value(partition.sample.value_a, partition.sample.value_b))
     model.initialize(torch.Generator().manual_seed(config.seed), unit)
     if config.init_from is not None:
-        initialize_from(model, config.init_from)
+        _initialize_from(model, config.init_from)
     noise = NoiseModel.of(partition.sample, data.lattice, unit)
     return Trainer(config, model.to(device), partition.training.to(device), noise, partition.selection)
 
 
-def _resume(trainer: Trainer, out: Path) -> bool:
-    """Resume from the checkpoint, if there is one.
+def _initialize_from(model: NeuralMaterial, folder: str | Path) -> None:
+    """Copy textures and offset of a material into a model of like levels, channels, width and offset.
 
-    Raises
-    ------
-    InputError : it is corrupt, or of another model
+    A step of the hierarchical model takes a hundred times as long per query as a step of ``neumip``. Both
+    share textures and offset, which ``neumip`` learns sooner.
     """
+    given, mine = Material.load(folder).model.weights(), model.weights()
+    names = [name for name in mine if name.partition(".")[0] in _SHARED]
+    for name in names:
+        if name not in given or given[name].shape != mine[name].shape:
+            raise InputError(
+                f"its '{name}' does not have the shape that the fit needs",
+                where=folder,
+                hint="fit it with the same levels, network.channels, network.width, network.layers and "
+                "network.offset",
+            )
+    model.load_weights({**mine, **{name: given[name] for name in names}})
+
+
+def _resume(trainer: Trainer, out: Path) -> bool:
+    """Resume from the checkpoint, if there is one."""
     path = out / CHECKPOINT_NAME
     if not path.exists():
         (out / HISTORY_NAME).unlink(missing_ok=True)

@@ -10,13 +10,11 @@ from mbtf_core.config_file import check_schema, dump_yaml
 from mbtf_core.digest import data_sha256
 from mbtf_core.folders import ELSEWHERE, check_folder, make_folder, other_configuration
 from mbtf_fit.config import FitConfig
-from mbtf_fit.data.loader import data_hash
 from mbtf_fit.material.export import LAYERS_NAME, TEXTURES_NAME
-from mbtf_fit.material.format import DESCRIPTION_NAME, WEIGHTS_NAME
+from mbtf_fit.material.format import DESCRIPTION_NAME, WEIGHTS_NAME, read_description
 from mbtf_fit.material.transmittance import TRANSMITTANCE_NAME
 from mbtf_fit.training.checkpoint import CHECKPOINT_NAME
 from mbtf_fit.training.validation import HISTORY_NAME
-from mbtf_fit.training.warm_start import weights_digest
 from mbtf_gen.dataset.reader import Dataset
 
 FIT_NAME = "fit.json"
@@ -26,18 +24,18 @@ _SCHEMA = 2
 
 
 def identity_of(config: FitConfig, data: Dataset) -> dict[str, Any]:
-    """Content of ``fit.json``: configuration and data of a fit, and the hash of both.
-
-    Raises
-    ------
-    InputError : the material that initializes the fit is missing
-    """
+    """Content of ``fit.json``: configuration and data of a fit, and the hash of both."""
     files = {split: [e["file"] for e in data.manifest["splits"][split]["shards"]] for split in data.splits}
-    described = {"hash": data_hash(data), "levels": data.lattice.finest, "aspect": data.lattice.aspect}
+    described = {
+        "hash": str(data.manifest.get("config_hash", "")),
+        "levels": data.lattice.finest,
+        "aspect": data.lattice.aspect,
+    }
     lengths = {split: len(names) for split, names in files.items()}
     config_hash = config.hash(data_sha256({**described, "files": files}))
     if config.init_from is not None:
-        config_hash += f"-{weights_digest(config.init_from)}"
+        description, _ = read_description(Path(config.init_from))
+        config_hash += f"-{description['weights']['sha256']}"
     return {
         "format": _FORMAT,
         "schema": _SCHEMA,
@@ -48,12 +46,7 @@ def identity_of(config: FitConfig, data: Dataset) -> dict[str, Any]:
 
 
 def claim(out: Path, identity: dict[str, Any], config: FitConfig, overwrite: bool) -> None:
-    """Claim the folder for a fit, or check that it already belongs to it.
-
-    Raises
-    ------
-    InputError : it holds something else
-    """
+    """Claim the folder for a fit, or check that it already belongs to it."""
     if check_folder(out, lambda path: (path / FIT_NAME).exists(), "fit"):
         old = read_json(out / FIT_NAME)
         if old.get("config_hash") == identity["config_hash"] and not overwrite:

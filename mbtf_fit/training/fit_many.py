@@ -6,9 +6,11 @@ import multiprocessing
 import os
 from collections import Counter
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import Connection
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 from mbtf_core.errors import InputError, MbtfError, UsageError, reason
@@ -18,14 +20,7 @@ from mbtf_fit.config import FitConfig
 
 @dataclass(frozen=True)
 class FitOutcome:
-    """Result or error of one data set.
-
-    Attributes
-    ----------
-    shards, folder : of the data and of the material
-    result : see :meth:`FitResult.as_dict`; None where the fit failed
-    error : message of the failure
-    """
+    """Folders of data and material, and the result (:meth:`FitResult.as_dict`) or the error of the fit."""
 
     shards: Path
     folder: Path
@@ -44,12 +39,7 @@ class FitOutcome:
 
 def find_data(arguments: Sequence[Path]) -> list[Path]:
     """Data sets of the arguments: a data set's folder, a folder of such folders, or a text file with one
-    folder per line, relative to the file; lines that start with # are comments.
-
-    Raises
-    ------
-    InputError : an argument has no data set
-    """
+    folder per line, relative to the file; lines that start with # are comments."""
     found: list[Path] = []
     for argument in arguments:
         if argument.is_file():
@@ -71,12 +61,7 @@ def find_data(arguments: Sequence[Path]) -> list[Path]:
 
 
 def name_materials(shards: Sequence[Path], out: Path) -> list[Path]:
-    """A folder in `out` for each data set, with its name; equal names are prefixed by the parent's name.
-
-    Raises
-    ------
-    UsageError : two names are still equal
-    """
+    """A folder in `out` for each data set, with its name; equal names are prefixed by the parent's name."""
     names = [path.resolve().name for path in shards]
     often = Counter(names)
     parts = [path.resolve().parts[-2:] for path in shards]
@@ -121,50 +106,43 @@ def fit_many(
     folders: Sequence[Path],
     *,
     processes: int,
-    overwrite: bool = False,
-    finished: Callable[[FitOutcome], None] | None = None,
+    overwrite: bool,
+    finished: Callable[[FitOutcome], None],
 ) -> list[FitOutcome]:
     """Fit every data set, at most `processes` at a time; outcomes in the order of the data sets.
 
     Each fit has its own process, so that a failure does not stop the others. With CUDA each worker uses the
-    GPU of its number; on CPUs the workers divide the cores.
-
-    Parameters
-    ----------
-    finished : called with each outcome
+    GPU of its number; on CPUs the workers divide the cores. `finished` is called with each outcome.
     """
     context = multiprocessing.get_context("spawn")
-    waiting = list(range(len(shards)))
-    running: dict[int, tuple[int, Any, Connection]] = {}
-    outcomes: dict[int, FitOutcome] = {}
-    try:
-        while waiting or running:
-            for worker in sorted({*range(processes)} - {*running}):
-                if waiting:
-                    k = waiting.pop(0)
-                    mine, theirs = context.Pipe(duplex=False)
-                    arguments = (config, shards[k], folders[k], overwrite, worker, processes, theirs)
-                    process = context.Process(target=_work, args=arguments)
-                    process.start()
-                    theirs.close()
-                    running[worker] = k, process, mine
-            wait([pipe for _, _, pipe in running.values()])
-            for worker, (k, process, pipe) in list(running.items()):
-                if not pipe.poll():
-                    continue
-                try:
-                    result, error = pipe.recv()
-                    process.join()
-                except EOFError:
-                    process.join()
-                    result, error = None, f"its process ended with code {process.exitcode}"
-                del running[worker]
-                outcomes[k] = FitOutcome(shards[k], folders[k], result, error)
-                if finished is not None:
-                    finished(outcomes[k])
-    except KeyboardInterrupt:
-        # A terminal sends Ctrl-C to the children too, which write their checkpoints and exit.
-        for _, process, _ in running.values():
+    free: SimpleQueue[int] = SimpleQueue()
+    for worker in range(processes):
+        free.put(worker)
+
+    def run(data: Path, folder: Path) -> FitOutcome:
+        worker = free.get()
+        mine, theirs = context.Pipe(duplex=False)
+        arguments = (config, data, folder, overwrite, worker, processes, theirs)
+        process = context.Process(target=_work, args=arguments)
+        try:
+            process.start()
+            theirs.close()
+            result, error = mine.recv()
             process.join()
-        raise
-    return [outcomes[k] for k in range(len(shards))]
+        except EOFError:
+            process.join()
+            result, error = None, f"its process ended with code {process.exitcode}"
+        finally:
+            free.put(worker)
+        return FitOutcome(data, folder, result, error)
+
+    with ThreadPoolExecutor(processes) as pool:
+        fits = [pool.submit(run, *pair) for pair in zip(shards, folders, strict=True)]
+        try:
+            for outcome in as_completed(fits):
+                finished(outcome.result())
+        except KeyboardInterrupt:
+            # A terminal sends Ctrl-C to the children too, which write their checkpoints and exit.
+            pool.shutdown(cancel_futures=True)
+            raise
+    return [fit.result() for fit in fits]

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from mbtf_core.units import clock
 from mbtf_fit.config import FitConfig
@@ -24,8 +23,6 @@ PILOT_SECONDS = (4.0, 8.0)
 PERSISTENCE = 0.45
 # Most queries of the validation subset.
 _SUBSET = 1 << 17
-# Bytes of a number in the material's file.
-_NUMBER = 4
 
 
 @dataclass(frozen=True)
@@ -56,23 +53,19 @@ class FitForecast:
     bytes: int
     pilot_seconds: float
 
-    def as_dict(self) -> dict[str, Any]:
-        """Plain data for JSON."""
-        return asdict(self)
-
     def describe(self) -> str:
         """Two lines."""
-        size = f"{self.bytes / 1e6:.2f} MB"
-        lines = [
+        text = (
             f"forecast: {clock(self.seconds)} of training, {self.steps} steps at "
-            f"{self.queries_per_second / 1e6:.2f} M queries/s, after {self.loading:.0f} s of loading; {size}"
-        ]
+            f"{self.queries_per_second / 1e6:.2f} M queries/s, after {self.loading:.0f} s of loading; "
+            f"{self.bytes / 1e6:.2f} MB"
+        )
         if self.unexplained is not None:
-            lines.append(
-                f"expected unexplained variance of {self.validation_set}: about {self.unexplained:.2f}, and "
-                f"{self.at_most:.2f} after {clock(PILOT_SECONDS[1])}"
+            text += (
+                f"\nexpected unexplained variance of {self.validation_set}: about {self.unexplained:.2f}, "
+                f"and {self.at_most:.2f} after {clock(PILOT_SECONDS[1])}"
             )
-        return "\n".join(lines)
+        return text
 
 
 def extrapolated(
@@ -87,13 +80,7 @@ def extrapolated(
 
 
 def forecast_fit(config: FitConfig, shards: str | Path) -> FitForecast:
-    """Forecast the fit of a configuration by two pilot fits; nothing is written.
-
-    Raises
-    ------
-    InputError : shards cannot be used
-    EngineError : the device is not available
-    """
+    """Forecast the fit of a configuration by two pilot fits; nothing is written."""
     began = time.perf_counter()
     device = choose_device(config.device)
     data = open_data(shards, MODELS[config.model].layout, config.model)
@@ -126,6 +113,6 @@ def forecast_fit(config: FitConfig, shards: str | Path) -> FitForecast:
         unexplained=extrapolated(errors[0], errors[1], doublings) if errors else None,
         at_most=errors[-1] if errors else None,
         pilots=tuple(errors),
-        bytes=_NUMBER * sum(p.numel() for p in trainer.model.parameters()),
+        bytes=sum(p.nbytes for p in trainer.model.parameters()),
         pilot_seconds=time.perf_counter() - began,
     )

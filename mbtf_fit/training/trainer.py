@@ -17,11 +17,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mbtf_core.errors import InputError
-from mbtf_fit.config import FitConfig
+from mbtf_fit.config import FitConfig, TrainingSection
 from mbtf_fit.data.images import Patches, TrainingImages
 from mbtf_fit.data.queries import ShardQueries, TrainingQueries
 from mbtf_fit.data.streaming import Selection, StreamedQueries
 from mbtf_fit.material.inference import predict
+from mbtf_fit.models.blur import annealed_sigma
+from mbtf_fit.models.hierarchical import Hierarchical
 from mbtf_fit.models.interface import NeuralMaterial
 from mbtf_fit.models.neumip import Neumip
 from mbtf_fit.native import kernel
@@ -29,13 +31,23 @@ from mbtf_fit.native.model import supports
 from mbtf_fit.native.stepper import NativeStepper
 from mbtf_fit.objective.losses import Objective
 from mbtf_fit.objective.noise import NoiseModel
-from mbtf_fit.objective.parallel import MAX_KERNEL_THREADS, Batch, Workers
+from mbtf_fit.objective.parallel import MAX_KERNEL_THREADS, MAX_THREADS, Batch, Workers
 from mbtf_fit.objective.regularization import WeightDecay
 from mbtf_fit.training.calibration import fit_calibration
-from mbtf_fit.training.schedule import blur_sigmas, learning_rate_factor
 
 # Decay rates of Adam's moments.
 BETAS = (0.8, 0.95)
+# Widest blur, in tile widths. A blur of half a tile made training unstable on textures of 16 × 16 texels: the
+# offsets of three of eight fits diverged before the textures became sharp.
+WIDEST_BLUR = 0.125
+
+
+def learning_rate_factor(training: TrainingSection, step: int, fraction: float) -> float:
+    """Factor of the learning rates after a fraction of the budget: linear warm-up, then cosine decay."""
+    rise = min(1.0, (step + 1) / (training.warmup + 1))
+    last = training.final_learning_rate_factor
+    fall = last + (1 - last) * 0.5 * (1 + math.cos(math.pi * min(fraction, 1.0)))
+    return rise * fall
 
 
 @dataclass
@@ -54,13 +66,8 @@ class Trainer:
     ----------
     model : initialized, on the device
     queries : on the device
-    noise : model of their noise; :meth:`NoiseModel.silent` for none
+    noise : model of their noise
     selection : rows of the shards that the queries are, to name a bad batch
-
-    Attributes
-    ----------
-    progress : steps, seconds and loss so far
-    weight_decay : of texels and network weights
     """
 
     def __init__(
@@ -107,22 +114,14 @@ class Trainer:
         return self.queries.batches(self.batch, self.config.seed, self.progress.step, self.model.margin)
 
     def train(self, seconds: float, stop: Event | None = None) -> bool:
-        """Train for about so long, or until the budget is spent; returns whether it is.
-
-        Parameters
-        ----------
-        stop : if set, training ends after the current step
-
-        Raises
-        ------
-        InputError : training diverged
-        """
+        """Train for about so long, or until the budget is spent; returns whether it is. Once `stop` is set,
+        training ends after the current step."""
         until = time.perf_counter() + seconds
         first = self.progress.step
         losses: list[Tensor] = []
         health: list[Tensor] = []
         batches = self._batches()
-        limit = None if self._stepper is None else MAX_KERNEL_THREADS
+        limit = MAX_THREADS if self._stepper is None else MAX_KERNEL_THREADS
         with Workers(self.device, limit=limit) as workers:
             while self.fraction < 1.0 and not (stop is not None and stop.is_set() and losses):
                 start = time.perf_counter()
@@ -150,18 +149,9 @@ class Trainer:
             return torch.stack([p.sum() for p in self.model.parameter_groups()[1]]).sum()
 
     def _stop_diverged(self, first: int, losses: list[Tensor], health: list[Tensor]) -> NoReturn:
-        """Report the first bad batch of the steps since `first`.
-
-        Raises
-        ------
-        InputError : always
-        """
-        good = 0
-        for loss, weights in zip(losses, health, strict=False):
-            if not math.isfinite(float(loss) + float(weights)):
-                break
-            good += 1
-        step = first + good
+        """Report the first bad batch of the steps since `first`."""
+        finite = [math.isfinite(float(a) + float(b)) for a, b in zip(losses, health, strict=False)]
+        step = first + [*finite, False].index(False)
         ranges = self.queries.batch_ranges(self.batch, self.config.seed, step)
         named = f", {self.selection.describe(ranges)}," if self.selection is not None else ""
         raise InputError(
@@ -172,14 +162,19 @@ class Trainer:
 
     def _sigmas(self) -> list[float]:
         """Current blur of each texture, in texels of the finest level."""
-        return blur_sigmas(self.config.training.blur, self.model, self.fraction)
+        blur, model = self.config.training.blur, self.model
+        start = min(blur.initial_sigma, max(WIDEST_BLUR * min(model.lattice.shape()), blur.final_sigma))
+        sigma = annealed_sigma(self.fraction / blur.fraction, start, blur.final_sigma)
+        return [
+            max(sigma, blur.offset_sigma if t.moves_lookups else blur.min_sigma) for t in model.textures()
+        ]
 
     def _tables(self) -> list[Tensor]:
         """The textures with the current blur."""
         return [t.blurred(sigma) for t, sigma in zip(self.model.textures(), self._sigmas(), strict=True)]
 
     def _loss(self, batch: Batch) -> Tensor:
-        evaluate = self.model.evaluate_patches if isinstance(batch, Patches) else self.model
+        evaluate = self.model.evaluate_patches if isinstance(self.model, Hierarchical) else self.model
         prediction = evaluate(batch.u, batch.sigma, batch.omega_i, batch.omega_o)
         return self.loss(prediction, batch)
 
@@ -234,10 +229,9 @@ class Trainer:
 
     def coverage(self) -> dict[int, float]:
         """Level → fraction of the pyramid's texels that have received gradients."""
-        pyramid = max(self.model.textures(), key=lambda t: len(t.packing.shapes))
+        pyramid = self.model.pyramid
         moment = self.optimizer.state.get(pyramid.texels, {}).get("exp_avg_sq")
-        starts = pyramid.packing.starts
         return {
             s: 0.0 if moment is None else float((moment[a:b] > 0).any(1).float().mean())
-            for s, (a, b) in enumerate(pairwise(starts))
+            for s, (a, b) in enumerate(pairwise(pyramid.packing.starts))
         }

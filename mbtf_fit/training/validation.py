@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 
 from mbtf_core.stats import Estimate, unexplained_variance
-from mbtf_fit.data.loader import load_split
+from mbtf_fit.data.loader import Partition, load_split
 from mbtf_fit.data.queries import ShardQueries
-from mbtf_fit.data.split import Partition
 from mbtf_fit.training.trainer import Trainer
 from mbtf_gen.dataset.reader import Dataset
 
@@ -49,19 +48,16 @@ def validation_error(trainer: Trainer, queries: ShardQueries) -> Estimate:
 def history_record(trainer: Trainer, subset: ShardQueries) -> dict[str, Any]:
     """Progress and validation error of the current model."""
     state = trainer.progress
-    record: dict[str, Any] = {
+    found = validation_error(trainer, subset).as_dict() if len(subset) else {}
+    return {
         "step": state.step,
         "seconds": round(state.seconds, 3),
         "fraction": round(trainer.fraction, 5),
         "loss": state.loss,
-        "unexplained": None,
-        "unexplained_error": None,
+        "unexplained": found.get("value"),
+        "unexplained_error": found.get("error"),
         "queries_per_second": round(state.step * trainer.batch / max(state.seconds, 1e-9)),
     }
-    if len(subset):
-        found = validation_error(trainer, subset).as_dict()
-        record |= {"unexplained": found["value"], "unexplained_error": found["error"]}
-    return record
 
 
 def describe_record(record: dict[str, Any]) -> str:

@@ -12,6 +12,7 @@ from support.surfaces import towards
 
 from mbtf_core.lattice import Lattice
 from mbtf_fit.config import FitConfig
+from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.material.material import Material, export
 from mbtf_fit.models.constants import GRAZING
 from mbtf_fit.models.neumip import Neumip
@@ -34,18 +35,13 @@ def material(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
     data = training_queries(arrays, parallax(*arrays.values()))
     options = {"steps": 120, "batch": 500, "warmup": 20, "blur": {"initial_sigma": 2.0, "offset_sigma": 1.0}}
     trainer = train_fully(make_trainer(data, LATTICE, request.param, **options))
-    trainer.predict(as_held_out(queries()))
+    nothing = np.zeros((N, 3), np.float32)
+    # Lookups read the blurred textures from then on.
+    trainer.predict(ShardQueries(*queries().values(), nothing, nothing))
     folder = tmp_path_factory.mktemp("material")
     config = FitConfig.model_validate({"model": request.param})
     training = {"steps": 120, "batch": 500, "seconds": 0.0, "device": "cpu", "threads": 1, "errors": {}}
     return export(trainer.model, config, folder, data={}, training=training)
-
-
-def as_held_out(arrays: dict[str, np.ndarray]):  # type: ignore[no-untyped-def]
-    from mbtf_fit.data.queries import ShardQueries
-
-    nothing = np.zeros((len(arrays["sigma"]), 3), np.float32)
-    return ShardQueries(*arrays.values(), nothing, nothing)
 
 
 def evaluate(material: Material, **changed: object) -> np.ndarray:

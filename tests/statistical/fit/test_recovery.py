@@ -14,15 +14,15 @@ from support.fit_data import F32, random_queries, write_data
 from mbtf_core.lattice import Lattice
 from mbtf_fit import FitConfig, fit
 from mbtf_fit.data.queries import TrainingQueries
+from mbtf_fit.models.interface import NeuralMaterial
 from mbtf_fit.models.registry import build_model
-from mbtf_fit.models.textured import TexturedMaterial
 from mbtf_fit.objective.noise import NoiseModel
 from mbtf_fit.training.trainer import Trainer
 
 LATTICE = Lattice(2)
 
 
-def teacher() -> TexturedMaterial:
+def teacher() -> NeuralMaterial:
     model = build_model("neumip", LATTICE)
     generator = torch.Generator().manual_seed(1)
     model.initialize(generator, 0.1)
@@ -30,18 +30,18 @@ def teacher() -> TexturedMaterial:
         torch.nn.init.normal_(texture.texels, 0.0, 0.5, generator=generator)
     # Values are positive on average, as those of materials are: exp(x) - 1 in negative units could not rise.
     with torch.no_grad():
-        model.decoder.last_bias.fill_(1.0)
+        list(model.decoder.parameters())[-1].fill_(1.0)
     return model
 
 
-def answers(model: TexturedMaterial, n: int, seed: int) -> TrainingQueries:
+def answers(model: NeuralMaterial, n: int, seed: int) -> TrainingQueries:
     arrays = random_queries(np.random.default_rng(seed), n, LATTICE)
     tensors = [torch.from_numpy(a) for a in arrays.values()]
     with torch.no_grad():
         return TrainingQueries(*tensors, model(*tensors))
 
 
-def trainer(model: TexturedMaterial, data: TrainingQueries, **training: Any) -> Trainer:
+def trainer(model: NeuralMaterial, data: TrainingQueries, **training: Any) -> Trainer:
     blur = {"initial_sigma": 0, "offset_sigma": 0}
     options = {"losses": [{"kind": "squared"}], "huber_delta": None, "warmup": 20, "blur": blur, **training}
     config = FitConfig.model_validate({"training": options})
@@ -55,7 +55,7 @@ def finish(t: Trainer) -> None:
         texture.read(None)
 
 
-def relative_error(model: TexturedMaterial, data: TrainingQueries) -> float:
+def relative_error(model: NeuralMaterial, data: TrainingQueries) -> float:
     """Root of the mean squared error over the mean square."""
     with torch.no_grad():
         found = model(data.u, data.sigma, data.omega_i, data.omega_o)

@@ -130,7 +130,7 @@ def test_bad_input_exits_with_3_and_a_hint(shards: Path, material: Path, tmp_pat
     empty.mkdir()
     assert "mbtf-gen" in fails(3, str(empty), *out)
     other = write_data(tmp_path / "schema", parallax, train=10, schema=99)
-    assert "schema 99" in fails(3, str(other), *out)
+    assert "schema version 99" in fails(3, str(other), *out)
     image = write_data(tmp_path / "image", parallax, train=10, layout="image")
     assert "--layout shuffled" in fails(3, str(image), *out)
     assert "training.batch: 500 -> 700" in fails(

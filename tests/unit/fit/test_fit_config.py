@@ -10,15 +10,7 @@ from mbtf_fit.config import FitConfig
 
 @pytest.mark.parametrize(
     ("text", "seconds"),
-    [
-        ("90s", 90.0),
-        ("2min", 120.0),
-        ("2 m", 120.0),
-        ("1h", 3600.0),
-        ("1.5h", 5400.0),
-        (45, 45.0),
-        ("0.5s", 0.5),
-    ],
+    [("90s", 90.0), ("2min", 120.0), ("2 m", 120.0), ("1.5h", 5400.0), (45, 45.0), ("0.5s", 0.5)],
 )
 def test_durations_are_read(text: str | float, seconds: float) -> None:
     assert parse_duration(text) == seconds
@@ -33,13 +25,6 @@ def test_nonsense_durations_are_refused(text: str) -> None:
 @pytest.mark.parametrize("seconds", [0.25, 45.0, 90.0, 120.0, 3600.0, 5400.0, 7261.0])
 def test_durations_survive_writing(seconds: float) -> None:
     assert parse_duration(format_duration(seconds)) == seconds
-
-
-def test_configuration_survives_writing() -> None:
-    config = FitConfig.model_validate(
-        {"training": {"time": "90s", "batch": 1000}, "held_out": {"radius": 0.2}}
-    )
-    assert FitConfig.model_validate(config.model_dump(mode="json")) == config
 
 
 def test_hash_covers_data_and_options_but_not_the_device() -> None:

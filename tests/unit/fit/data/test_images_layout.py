@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import islice
 from pathlib import Path
 
@@ -16,9 +17,8 @@ from mbtf_core.lattice import Lattice, sigma_of_level
 from mbtf_fit import FitConfig, Material, evaluate, fit
 from mbtf_fit.config import HeldOutSection
 from mbtf_fit.data.images import Patches, TrainingImages, nearest_shapes, strides
-from mbtf_fit.data.loader import load_split, load_training
+from mbtf_fit.data.loader import Partition, in_region, load_split, load_training
 from mbtf_fit.data.queries import ShardQueries
-from mbtf_fit.data.split import Partition, in_region
 from mbtf_fit.evaluation import evaluate_splits
 from mbtf_fit.models.hierarchical import Hierarchical
 from mbtf_fit.models.registry import build_model
@@ -38,15 +38,20 @@ def images_of(part: Partition) -> TrainingImages:
     return part.training
 
 
-def images(lattice: Lattice, levels: list[float], *, regular: bool) -> TrainingImages:
-    """One image per level; the value's first channel numbers the queries."""
-    q = random_images(np.random.default_rng(0), len(levels), lattice, regular=regular)
-    sigma = sigma_of_level(levels).astype(np.float32)
+def numbered(q: Mapping[str, np.ndarray], *shape: np.ndarray) -> TrainingImages:
+    """Images of queries (images, rows, columns, ...); the value's first channel numbers the queries."""
     number = np.arange(q["sigma"].size, dtype=np.float32).reshape(q["sigma"].shape)
     value = np.stack([number, 0 * number, 0 * number], -1)
-    u, light, view = q["u"], q["omega_i"][:, 0, 0], q["omega_o"][:, 0, 0]
-    tensors = [torch.from_numpy(np.ascontiguousarray(a)) for a in (u, sigma, light, view, value)]
-    return TrainingImages(*tensors[:5], strides(lattice, sigma))  # type: ignore[arg-type,call-arg]
+    arrays = (q["u"], *(q[name][:, 0, 0] for name in ("sigma", "omega_i", "omega_o")), value)
+    tensors = [torch.from_numpy(np.ascontiguousarray(a, np.float32)) for a in arrays]
+    return TrainingImages(*tensors, *shape)  # type: ignore[arg-type]
+
+
+def images(lattice: Lattice, levels: list[float], *, regular: bool) -> TrainingImages:
+    """One image per level."""
+    q = random_images(np.random.default_rng(0), len(levels), lattice, regular=regular)
+    q["sigma"][:] = sigma_of_level(levels)[:, None, None]
+    return numbered(q, strides(lattice, q["sigma"][:, 0, 0]))
 
 
 def test_whole_images_are_held_out(tmp_path: Path) -> None:
@@ -73,9 +78,8 @@ def test_whole_images_are_held_out(tmp_path: Path) -> None:
 
 def test_the_sample_is_of_training_images(tmp_path: Path) -> None:
     """Equally many queries of each."""
-    part = partition(
-        write_images(tmp_path / "d", parallax, train=60), HeldOutSection(queries=0.4, radius=0.3)
-    )
+    folder = write_images(tmp_path / "d", parallax, train=60)
+    part = partition(folder, HeldOutSection(queries=0.4, radius=0.3))
     kept = {row.tobytes() for row in images_of(part).omega_i.numpy()}
     sampled = [row.tobytes() for row in part.sample.omega_i]
     assert set(sampled) == kept
@@ -167,15 +171,9 @@ def test_batches_take_every_image_and_resume_anywhere() -> None:
 
 
 def small_images(lattice: Lattice, size: int, count: int) -> TrainingImages:
-    """Windows as the generator draws them; the value's first channel numbers the queries."""
+    """Images of limited size, as the generator draws them."""
     q = QueryPlan(lattice, Mixture(1, 0), 0.2, "image", 3, count, patch_size=size).draw("train", 0, count)
-    sigma = q.sigma[:, 0, 0]
-    number = np.arange(q.sigma.size, dtype=np.float32).reshape(q.sigma.shape)
-    value = np.stack([number, 0 * number, 0 * number], -1)
-    arrays = (q.u, sigma, q.omega_i[:, 0, 0], q.omega_o[:, 0, 0], value)
-    tensors = [torch.from_numpy(np.ascontiguousarray(a)) for a in arrays]
-    ones = np.ones((count, 2), np.int64)
-    return TrainingImages(*tensors[:5], ones, nearest_shapes(lattice, sigma))  # type: ignore[arg-type,call-arg]
+    return numbered(vars(q), np.ones((count, 2), np.int64), nearest_shapes(lattice, q.sigma[:, 0, 0]))
 
 
 def test_patches_extend_beyond_the_border_of_small_images() -> None:
@@ -260,17 +258,6 @@ def test_training_and_evaluation_agree_on_regular_images(aspect: float, decoder:
     assert together.shape == (5, 6, 6, 3)
     assert together.std() > 0.01
     torch.testing.assert_close(alone, together.reshape(-1, 3)[order], rtol=2e-3, atol=1e-5)
-
-
-def test_models_without_neighborhoods_evaluate_patches_pointwise() -> None:
-    lattice = Lattice(3)
-    model = build_model("neumip", lattice)
-    model.initialize(torch.Generator().manual_seed(0), 0.1)
-    patches = images(lattice, [3.0, 2.0], regular=False).patches(np.arange(2), np.zeros((2, 2), int), 4, 0)
-    with torch.no_grad():
-        found = model.evaluate_patches(patches.u, patches.sigma, patches.omega_i, patches.omega_o)
-        one = model(patches.u[1, 2, 3:4], patches.sigma[1:], patches.omega_i[1:], patches.omega_o[1:])
-    torch.testing.assert_close(found[1, 2, 3], one[0])
 
 
 def quick(steps: int, **network: object) -> FitConfig:

@@ -11,9 +11,8 @@ from support.fit_data import constant, parallax, write_data
 
 from mbtf_core.errors import InputError
 from mbtf_fit.config import HeldOutSection
-from mbtf_fit.data.loader import load_split, load_training
+from mbtf_fit.data.loader import Partition, in_region, load_split, load_training
 from mbtf_fit.data.queries import ShardQueries, batch_starts
-from mbtf_fit.data.split import Partition, in_region
 from mbtf_gen.dataset.reader import Dataset
 
 HELD_OUT = HeldOutSection(queries=0.1, radius=0.3)

@@ -147,7 +147,7 @@ def test_damaged_materials_are_refused(fitted: FitResult, tmp_path: Path) -> Non
         Material.load(tmp_path)
     description = json.loads((tmp_path / "material.json").read_text())
     (tmp_path / "material.json").write_text(json.dumps({**description, "schema": 99}))
-    with pytest.raises(InputError, match="schema 99"):
+    with pytest.raises(InputError, match="schema version 99"):
         Material.load(tmp_path)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,11 @@ def queries(value: Tensor) -> TrainingQueries:
     n = len(value)
     up = torch.tensor([0.0, 0.0, 1.0]).expand(n, 3)
     return TrainingQueries(torch.zeros(n, 2), torch.full((n,), 0.1), up, up, value)
+
+
+def patches(value: Tensor) -> TrainingQueries:
+    """Values (items, rows, columns, 3) with the footprint, light and view of each item."""
+    return replace(queries(value[:, 0, 0]), value=value)
 
 
 def minimum(loss: Objective, value: Tensor) -> float:
@@ -130,20 +136,17 @@ def test_corrected_absolute_terms_are_parabolas_of_the_noise() -> None:
     loss = objective("gradient", 0.04, huber_delta=None)
     value = torch.ones(1, 4, 4, 3, dtype=torch.float64)
     value[:, ::2] += 1e-3
-    data = queries(value[:, 0, 0])
-    data = TrainingQueries(data.u, data.sigma, data.omega_i, data.omega_o, value)
     slope = float(FourthRoot().slope(torch.tensor(1.0 / SCALE, dtype=torch.float64)))
     edge, noise = slope * 1e-3 / SCALE, 2 * slope**2 * v
     # All differences down the columns, none along the rows.
     expected = edge**2 / 2 / (noise + 0.01) ** 0.5 / 2
-    assert float(loss(torch.ones_like(value), data)) == pytest.approx(expected, rel=1e-3)
+    assert float(loss(torch.ones_like(value), patches(value))) == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.parametrize("shape", [(2, 1, 6, 3), (2, 6, 1, 3), (2, 1, 1, 3)])
 def test_a_single_row_has_gradients_along_it_alone(shape: tuple[int, ...]) -> None:
     value = torch.rand(shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    data = queries(value[:, 0, 0])
-    data = TrainingQueries(data.u, data.sigma, data.omega_i, data.omega_o, value)
+    data = patches(value)
     for correction in ("none", "linear"):
         p = torch.zeros_like(value, requires_grad=True)
         loss = objective("gradient", 0.01, correction=correction)(p, data)
@@ -156,8 +159,7 @@ def test_a_single_row_has_gradients_along_it_alone(shape: tuple[int, ...]) -> No
 def test_the_gradient_term_depends_on_differences_of_neighbors_alone() -> None:
     """A constant error costs nothing; an edge costs what it is high."""
     value = torch.zeros(1, 4, 6, 3, dtype=torch.float64)
-    data = TrainingQueries(*(torch.ones(1, 3).double() for _ in range(4)), value)
-    data = TrainingQueries(data.u, torch.full((1,), 0.1), data.omega_i, data.omega_o, value)
+    data = patches(value)
     loss = objective("gradient", correction="none")
     assert float(loss(value + 0.1, data)) == pytest.approx(0.0, abs=1e-12)
     edge = value.clone()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ import torch
 from support.fit_data import make_trainer, parallax, random_queries, training_queries, write_data
 
 from mbtf_core.lattice import Lattice
-from mbtf_fit.config import FitConfig, ModelName
+from mbtf_fit.config import FitConfig, ModelName, TrainingSection
 from mbtf_fit.data.loader import load_training, open_data
 from mbtf_fit.models.registry import build_model
 from mbtf_fit.objective.noise import NoiseModel
@@ -21,28 +20,27 @@ from mbtf_fit.training.fit import prepare_trainer
 LATTICE = Lattice(3)
 
 
-def decay_of(ratio: float, queries: int = 5000, **training: Any) -> WeightDecay:
-    return WeightDecay.of(FitConfig.model_validate({"training": training}).training, ratio, queries)
-
-
 @pytest.mark.parametrize(
-    ("ratio", "texels", "weights"),
-    [(0.0, 2.0, 0.0), (0.05, 2.0, 1e-3), (0.4, 2.0, 0.064), (2.0, 8.0, 0.4), (5.0, 20.0, 1.0)],
+    ("ratio", "queries", "strength", "texels", "weights"),
+    [
+        (0.0, 5000, 1000.0, 2.0, 0.0),
+        (0.05, 5000, 1000.0, 2.0, 1e-3),
+        (0.4, 5000, 1000.0, 2.0, 0.064),
+        (2.0, 5000, 1000.0, 8.0, 0.4),
+        (5.0, 5000, 1000.0, 20.0, 1.0),
+        (1.0, 10**8, 1e5, 4.0, 1e-3),
+        (5.0, 10, 0.0, 20.0, 0.0),
+        (5.0, 50, 1000.0, 20.0, 1.0),
+    ],
 )
-def test_noise_increases_weight_decay(ratio: float, texels: float, weights: float) -> None:
-    """Of texels from a ratio of a half on; of weights with its square up to there, then with it, up to 1."""
-    found = decay_of(ratio, texture_weight_decay=2.0, noise_regularization=1000.0)
+def test_noise_increases_weight_decay(
+    ratio: float, queries: int, strength: float, texels: float, weights: float
+) -> None:
+    """Of texels from a ratio of a half on; of weights with its square up to there, then with it, over the
+    number of queries; at most 1, or few queries would decay all weights to 0."""
+    section = TrainingSection(texture_weight_decay=2.0, noise_regularization=strength)
+    found = WeightDecay.of(section, ratio, queries)
     assert (found.texels, found.weights) == (pytest.approx(texels), pytest.approx(weights))
-
-
-def test_many_queries_and_0_disable_the_decay_of_weights() -> None:
-    assert decay_of(1.0, 10**8, noise_regularization=1e5).weights == pytest.approx(1e-3)
-    assert decay_of(5.0, 10, noise_regularization=0.0).weights == 0.0
-
-
-def test_the_decay_is_bounded_by_the_learning_rate() -> None:
-    """Otherwise few queries would decay all weights to 0, and the fit would be a constant."""
-    assert decay_of(5.0, 50, noise_regularization=1000.0).weights == 1.0
 
 
 @pytest.mark.parametrize("model", ["neumip", "neumip-baseline", "hierarchical"])
@@ -74,9 +72,8 @@ def test_a_trainer_counts_all_its_queries() -> None:
 def test_a_fit_estimates_the_noise_ratio_of_its_data(tmp_path: Path) -> None:
     """Noise of 0.02 in each half is 2e-4 of variance in their mean."""
     folder = write_data(tmp_path / "data", parallax, train=20_000, noise=0.02)
-    config = FitConfig.model_validate(
-        {"training": {"noise_regularization": 1000.0, "texture_weight_decay": 1.0}}
-    )
+    training = {"noise_regularization": 1000.0, "texture_weight_decay": 1.0}
+    config = FitConfig.model_validate({"training": training})
     data = open_data(folder, "shuffled", "neumip")
     partition = load_training(data, config.held_out, config.seed, config.data.memory)
     trainer = prepare_trainer(config, data, partition, torch.device("cpu"))

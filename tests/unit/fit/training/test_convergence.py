@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from mbtf_fit.training.convergence import marginal_cost_of
+from mbtf_fit.training.convergence import MarginalCost, marginal_cost_of
 
 
 def history(power: float, error: float = 1e-4, total: float = 80.0) -> list[dict[str, Any]]:
@@ -24,10 +24,15 @@ def errors(held_out: float, training: float, error: float = 0.002) -> dict[str, 
     }
 
 
+def cost(records: list[dict[str, Any]], *arguments: Any, **options: Any) -> MarginalCost:
+    found = marginal_cost_of(records, *arguments, **options)
+    assert found is not None
+    return found
+
+
 @pytest.mark.parametrize("power", [0.25, 0.5, 1.0])
 def test_halving_follows_the_power_law(power: float) -> None:
-    found = marginal_cost_of(history(power), {}, validation_set="held_out_queries")
-    assert found is not None
+    found = cost(history(power), {}, validation_set="held_out_queries")
     assert found.describe().startswith("unexplained variance of held-out queries: 0.")
     assert found.end == pytest.approx(0.2)
     assert found.half == pytest.approx(0.2 * 0.49**-power)
@@ -35,30 +40,22 @@ def test_halving_follows_the_power_law(power: float) -> None:
 
 
 def test_insignificant_improvements_give_no_estimate() -> None:
-    found = marginal_cost_of(history(0.25, error=0.03), {})
-    assert found is not None
+    found = cost(history(0.25, error=0.03), {})
     assert found.halving is None
     assert "would hardly reduce it" in found.describe()
-    worse = marginal_cost_of(history(-0.2), {})
-    assert worse is not None
-    assert worse.halving is None
+    assert cost(history(-0.2), {}).halving is None
     # Hardly falling at all: more years than anyone has, or than a number holds.
-    flat = marginal_cost_of(history(1e-4, error=1e-9), {})
-    assert flat is not None
-    assert flat.halving is None
+    assert cost(history(1e-4, error=1e-9), {}).halving is None
 
 
 def test_half_of_the_distance_to_the_training_error_is_overfitting() -> None:
     # Least squares with k free numbers and noise s² in n queries misses others by s²k/n, and seems to miss
     # its own by -s²k/n.
-    found = marginal_cost_of(history(0.5), errors(0.2 + 0.05, 0.2 - 0.05), 0.3)
-    assert found is not None
+    found = cost(history(0.5), errors(0.2 + 0.05, 0.2 - 0.05), 0.3)
     assert found.noise_share == pytest.approx(0.05 / 0.25)
     assert "overfitting to noise causes 20% of the error" in found.describe()
     for same in (errors(0.25, 0.248), errors(0.25, 0.3), {}, errors(math.nan, 0.1)):
-        other = marginal_cost_of(history(0.5), same, 0.3)
-        assert other is not None
-        assert other.noise_share is None
+        assert cost(history(0.5), same, 0.3).noise_share is None
 
 
 @pytest.mark.parametrize(
@@ -66,9 +63,8 @@ def test_half_of_the_distance_to_the_training_error_is_overfitting() -> None:
 )
 def test_overfitting_is_bounded_by_the_noise(noise: float | None, share: float | None) -> None:
     """Few queries without noise leave the same distance: what lies between them was not learned."""
-    found = marginal_cost_of(history(0.5), errors(0.25, 0.15), noise)
-    assert found is not None
-    assert found.noise_share == (share if share is None else pytest.approx(share))
+    found = cost(history(0.5), errors(0.25, 0.15), noise).noise_share
+    assert found == (share if share is None else pytest.approx(share))
 
 
 def test_incomplete_histories_give_no_marginal_cost() -> None:

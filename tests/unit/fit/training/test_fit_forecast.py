@@ -107,7 +107,5 @@ def test_data_without_variance_have_none_to_forecast(tmp_path: Path, monkeypatch
     monkeypatch.setattr(module, "PILOT_SECONDS", (0.05, 0.1))
     config = FitConfig.model_validate({"training": {"batch": 500, "time": "3s"}})
     found = forecast_fit(config, write_data(tmp_path, constant(0.2), train=2000))
-    assert found.unexplained is None
-    assert found.at_most is None
-    assert found.pilots == ()
+    assert (found.unexplained, found.at_most, found.pilots) == (None, None, ())
     assert "nan" not in found.describe()
