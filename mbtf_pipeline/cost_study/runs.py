@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import shutil
 import time
+import timeit
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -24,7 +25,7 @@ from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation import generate
 from mbtf_gen.job import Job
 from mbtf_gen.material.material import load_material
-from mbtf_pipeline.cost_study.measurements import Measurement
+from mbtf_pipeline.cost_study.measurements import Configuration, Measurement
 
 if TYPE_CHECKING:
     from mbtf_fit.data.queries import ShardQueries
@@ -52,31 +53,25 @@ class DataRequest:
 
 
 @dataclass(frozen=True)
-class Run:
+class Run(Configuration):
     """A run to measure.
 
     Attributes
     ----------
-    study, series, name : see :class:`~mbtf_pipeline.cost_study.measurements.Measurement`
     data : its training data; the seed offset is that of the fit, too
     fit : options of the fitter, nested as in its configuration
     """
 
-    study: str
-    series: str
-    name: str
     data: DataRequest
     fit: dict[str, Any] = field(default_factory=dict)
 
     @property
     def label(self) -> str:
-        """Its name among all runs."""
         seed = f", seed + {self.data.seed}" if self.data.seed else ""
-        return f"{self.study}: {self.series}, {self.name}{seed}"
+        return f"{super().label}{seed}"
 
     @property
     def key(self) -> dict[str, Any]:
-        """What its measurement depends on besides the study's basis."""
         return {**asdict(self.data), "fit": self.fit}
 
 
@@ -144,10 +139,6 @@ class RunRunner:
             self._data[request] = self._generate(request.seed, train, _NO_QUERIES)
         return self._data[request]
 
-    def has(self, request: DataRequest) -> bool:
-        """Whether training data exist."""
-        return request in self._data
-
     def forget(self, request: DataRequest) -> None:
         """Remove training data that no other run needs."""
         folder, _ = self._data.pop(request, (None, 0.0))
@@ -160,9 +151,9 @@ class RunRunner:
         return test + self._planned_seconds(run) + self._overhead
 
     def _planned_seconds(self, run: Run) -> float:
-        generating = 0.0 if self.has(run.data) else run.data.queries * self.query_seconds(run.data.spp)
+        generating = run.data.queries * self.query_seconds(run.data.spp) * (run.data not in self._data)
         training = run.fit["training"].get("time")
-        return generating + (0.0 if training is None else parse_duration(training))
+        return generating + (parse_duration(training) if training else 0.0)
 
     def test_set(self, seed: int) -> ShardQueries:
         """The test queries of all runs with an offset of the seed."""
@@ -208,11 +199,9 @@ class RunRunner:
         }
         shutil.rmtree(out, ignore_errors=True)
         self._overhead = max(self._overhead, time.perf_counter() - start - planned)
-        options = {"queries.train": str(run.data.queries), "queries.spp": run.data.spp, **_flat(run.fit)}
         seconds = Estimate(details[_SECONDS[run.study]], 0.0, 1)
-        return Measurement(
-            run.study, run.series, run.name, options, self.command_of(run), seconds, error, details=details
-        )
+        command = self.command_of(run)
+        return Measurement(run.study, run.series, run.name, command, seconds, error, details=details)
 
     def command_of(self, run: Run) -> str:
         """The command that reproduces a run; the test split is that of the recipe."""
@@ -240,10 +229,7 @@ def _evaluation_seconds(material: Any, test: ShardQueries) -> float:
     """Seconds for one query per pixel of 1080p, at random queries."""
     rows = np.resize(np.arange(len(test)), _TIMED_QUERIES)
     arrays = [getattr(test, name)[rows] for name in ("u", "sigma", "omega_i", "omega_o")]
-    times = []
-    for _ in range(_TIMED):
-        start = time.perf_counter()
-        material.evaluate(*arrays)
-        times.append(time.perf_counter() - start)
     # The smallest: the disk may still be writing generated data.
-    return min(times) * PIXELS / _TIMED_QUERIES
+    timer = time.perf_counter
+    seconds = min(timeit.repeat(lambda: material.evaluate(*arrays), timer=timer, number=1, repeat=_TIMED))
+    return seconds * PIXELS / _TIMED_QUERIES

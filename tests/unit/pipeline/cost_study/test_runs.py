@@ -53,7 +53,7 @@ def test_planned_runs_fit_into_the_time_twice(seconds: float, tmp_path: Path) ->
     longer = planned_runs(2 * seconds, 4, query_seconds)
     whole = [run for run in found if run.study == "whole" and "35%" in run.series]
     assert all(run in longer for run in whole)
-    assert [run.name for run in whole] == [f"{SHORTEST * 2**n:g} s planned" for n in range(len(whole))]
+    assert [run.name for run in whole] == [f"planned for {SHORTEST * 2**n:g} s" for n in range(len(whole))]
 
 
 class Clock:
