@@ -263,6 +263,4 @@ def _measure_runs(study: Study, store: MeasurementFolder, runner: RunRunner, clo
     study.deviation = seed_deviation(groups)
     study.failed = list(failed.values())
     study.measurements += [combined(group, study.deviation) for group in groups if group]
-    study.skipped += [
-        run.label for k, run in enumerate(runs) if not groups[k] and k not in failed
-    ]
+    study.skipped += [run.label for k, run in enumerate(runs) if not groups[k] and k not in failed]

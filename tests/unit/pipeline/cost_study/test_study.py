@@ -19,8 +19,8 @@ from mbtf_core.errors import InputError
 from mbtf_core.stats import Estimate
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_pipeline.cost_study import study as module
-from mbtf_pipeline.cost_study.measurements import Measurement, MeasurementFolder
 from mbtf_pipeline.cost_study.generator_runs import GeneratorTask
+from mbtf_pipeline.cost_study.measurements import Measurement, MeasurementFolder
 from mbtf_pipeline.cost_study.page import COLUMNS, to_csv
 from mbtf_pipeline.cost_study.pareto import extrapolation, pareto_front
 from mbtf_pipeline.cost_study.runs import Run
