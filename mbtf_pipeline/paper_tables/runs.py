@@ -42,8 +42,8 @@ class FinishedRun:
         ------
         InputError : the run is not finished
         """
-        comparison = read_json(folder / COMPARE / COMPARISON_NAME)
-        return cls(material, variant, folder, comparison, read_json(folder / SHARDS / "manifest.json"))
+        records = (folder / COMPARE / COMPARISON_NAME, folder / SHARDS / "manifest.json")
+        return cls(material, variant, folder, *map(read_json, records))
 
     @property
     def title(self) -> str:
