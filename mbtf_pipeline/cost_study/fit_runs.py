@@ -31,18 +31,18 @@ SIZES: dict[str, dict[str, object]] = {
 _FEWEST_QUERIES = 20_000
 
 
-def planned_runs(seconds: float, spp: int, query_seconds: Callable[[int], float]) -> list[Run]:
+def planned_runs(seconds: float, spp: int, path_seconds: float) -> list[Run]:
     """All runs of a study of so many seconds, in the order of measuring, each with the study's own seed.
 
     Parameters
     ----------
     spp : paths per query of the recipe
-    query_seconds : seconds to generate a query, by its number of paths
+    path_seconds : seconds to generate such a query over its number of paths
     """
 
     def data(length: float) -> DataRequest:
         """The queries of the recipe that take so many seconds."""
-        return DataRequest(round_down(max(_FEWEST_QUERIES, length / query_seconds(spp))), spp)
+        return DataRequest(round_down(max(_FEWEST_QUERIES, length / (spp * path_seconds))), spp)
 
     planners = {"whole": _whole, "models": _models, "data": _data}
     return [

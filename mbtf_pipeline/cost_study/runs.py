@@ -23,7 +23,7 @@ from mbtf_core.stats import Estimate, unexplained_variance
 from mbtf_core.units import parse_duration
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation import generate
-from mbtf_gen.job import Job
+from mbtf_gen.job import Job, split_queries
 from mbtf_gen.material.material import load_material
 from mbtf_pipeline.cost_study.measurements import Configuration, Measurement
 
@@ -39,6 +39,8 @@ PIXELS = 1920 * 1080
 _TIMED_QUERIES = 1 << 18
 _TIMED = 5
 _OVERHEAD = 2.0
+# Seconds of a query at least: that of a closed form, written to disk.
+_CHEAPEST = 1e-8
 # The time that each study reports, by name of the detail.
 _SECONDS = {"data": "generation_seconds", "models": "training_seconds", "whole": "total_seconds"}
 
@@ -85,7 +87,7 @@ class RunRunner:
     command : of the generator with the study's configuration
     progress : called with a note
     test : number of test queries, and paths of each
-    query_seconds : time to generate a query, by its number of paths
+    path_seconds : time to generate a query over its number of paths
     """
 
     def __init__(
@@ -95,14 +97,14 @@ class RunRunner:
         command: str,
         progress: Callable[[str], None],
         test: tuple[int, int] | None = None,
-        query_seconds: Callable[[int], float] = lambda paths: 0.0,
+        path_seconds: float = 0.0,
     ) -> None:
         self.config = config
         self.folder = folder
         self.command = command
         self.progress = progress
         self.test = test or TEST
-        self.query_seconds = query_seconds
+        self.path_seconds = path_seconds
         # Seconds by which a run exceeds generating and training: the most of all so far, or a guess.
         self._overhead = _OVERHEAD
         # Folder and seconds by request.
@@ -151,9 +153,9 @@ class RunRunner:
         return test + self._planned_seconds(run) + self._overhead
 
     def _planned_seconds(self, run: Run) -> float:
-        generating = run.data.queries * self.query_seconds(run.data.spp) * (run.data not in self._data)
+        paths = 0 if run.data in self._data else run.data.queries * run.data.spp
         training = run.fit["training"].get("time")
-        return generating + (parse_duration(training) if training else 0.0)
+        return paths * self.path_seconds + (parse_duration(training) if training else 0.0)
 
     def test_set(self, seed: int) -> ShardQueries:
         """The test queries of all runs with an offset of the seed."""
@@ -215,6 +217,18 @@ class RunRunner:
             f"{self.command} --queries {run.data.queries} --spp {run.data.spp}{own} -o shards/ && "
             f"mbtf-fit shards/{flags} -o material/"
         )
+
+
+def forecast_seconds(config: GeneratorConfig) -> tuple[float, float]:
+    """Seconds of a training query, and of starting the generator with its test split, by a forecast."""
+    from mbtf_gen.forecast import forecast
+    from mbtf_gen.planning.effects_plan import plan_effects
+    from mbtf_gen.planning.run_plan import allocate
+
+    job = Job(config, load_material(Path(config.material), config.geometry.make_tileable))
+    expected = forecast(job, allocate(job, plan_effects(job, pilots=False)))
+    query = max(expected.query_seconds, _CHEAPEST)
+    return query, expected.start + max(0.0, expected.seconds - split_queries(job, "train") * query)
 
 
 def _flat(options: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -21,7 +21,7 @@ from mbtf_pipeline.cost_study.generator_benchmark import GeneratorBenchmark
 from mbtf_pipeline.cost_study.generator_runs import generator_tasks
 from mbtf_pipeline.cost_study.measurements import Measurement, MeasurementFolder
 from mbtf_pipeline.cost_study.repeats import FEWEST_SEEDS, MOST_SEEDS, combined, measure_runs, seed_deviation
-from mbtf_pipeline.cost_study.runs import Run, RunRunner
+from mbtf_pipeline.cost_study.runs import Run, RunRunner, forecast_seconds
 from mbtf_pipeline.recipe import Recipe
 from mbtf_pipeline.run_folder import has_record, locked, machine
 
@@ -36,8 +36,6 @@ NEW_TIME = 600.0
 _LEAST_VARIATION = 0.005
 # About as many configurations of the generator share its time.
 _CONFIGURATIONS = 35
-# Paths per query at which the time of generating is measured, seconds of each measurement, and queries.
-_TIMED_PATHS, _TIMED_SECONDS, _TIMED_QUERIES = (2, 32), 0.5, "1e6"
 
 
 @dataclass
@@ -189,7 +187,7 @@ def run_study(
             folder / WORK,
             generator,
             lambda note: progress(clock.share(), note),
-            query_seconds=query_seconds(benchmark, store),
+            path_seconds=path_seconds(config, store),
         )
         try:
             _measure_runs(study, store, runner, clock)
@@ -222,32 +220,21 @@ def _measure_generator(
             study.measurements.append(found)
 
 
-def query_seconds(benchmark: GeneratorBenchmark, store: MeasurementFolder) -> Callable[[int], float]:
-    """Seconds to generate a query by its number of paths, linear in it: from forecasts at two numbers. They
-    are stored, so that a resumed study plans the same runs."""
+def path_seconds(config: GeneratorConfig, store: MeasurementFolder) -> float:
+    """Seconds to generate a query over its number of paths, stored, so that a resumed study plans the same
+    runs."""
     path = store.folder / f"seconds-{store.basis[:16]}.json"
     try:
-        line = read_json(path)
+        return float(read_json(path)["path_seconds"])
     except InputError:
-        from mbtf_gen.forecast import forecast
-        from mbtf_gen.planning.effects_plan import plan_effects
-        from mbtf_gen.planning.run_plan import RunPlan
-
-        at = []
-        for paths in _TIMED_PATHS:
-            options = {"queries.spp": paths, "queries.train": _TIMED_QUERIES, "queries.test": "1"}
-            job = benchmark.job(options)
-            at.append(forecast(job, RunPlan(plan_effects(job)), _TIMED_SECONDS).query_seconds)
-        slope = max(0.0, (at[1] - at[0]) / (_TIMED_PATHS[1] - _TIMED_PATHS[0]))
-        line = {"query": max(0.0, at[0] - slope * _TIMED_PATHS[0]), "path": slope}
-        write_json(path, line)
-    # A closed form takes hardly any time.
-    return lambda paths: float(max(1e-8, line["query"] + line["path"] * paths))
+        found = forecast_seconds(config)[0] / config.queries.spp
+        write_json(path, {"path_seconds": found})
+        return found
 
 
 def _measure_runs(study: Study, store: MeasurementFolder, runner: RunRunner, clock: _Clock) -> None:
     """Measure runs and their repeats in the remaining time."""
-    runs = planned_runs(clock.seconds, runner.config.queries.spp, runner.query_seconds)
+    runs = planned_runs(clock.seconds, runner.config.queries.spp, runner.path_seconds)
     # On a machine slower than planned, every comparison keeps its share of the time.
     start, studies, shares = clock.left(), list(RUN_SHARES), list(RUN_SHARES.values())
     reached = 0

@@ -34,9 +34,8 @@ from mbtf_core.digest import data_sha256
 from mbtf_core.errors import InputError, UsageError
 from mbtf_core.units import clock, format_duration
 from mbtf_fit.config import FitConfig
-from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_pipeline.cost_study.fit_runs import round_down
-from mbtf_pipeline.cost_study.runs import DataRequest, Run, RunRunner
+from mbtf_pipeline.cost_study.runs import DataRequest, Run, RunRunner, forecast_seconds
 from mbtf_pipeline.recipe import Recipe
 from mbtf_pipeline.run import layout_of
 from mbtf_pipeline.run_folder import claim_run_folder, locked, write_run_record
@@ -55,8 +54,6 @@ _TEST = (1 << 17, 8)
 # Seconds of a fit besides training where there are no pilots.
 _FIT = 2.0
 _FEWEST_QUERIES = 4096
-# Seconds of a query at least: that of a closed form, written to disk.
-_CHEAPEST = 1e-8
 # Shares of the free disk space and of the machine's memory that training queries may take.
 _DISK, _MEMORY = 0.25, 0.5
 # Share of the total time that remains at least, however long the pilots took.
@@ -154,7 +151,7 @@ def _measure(
     recipe: Recipe, seconds: float, share: float | None, folder: Path, progress: Callable[[str], None]
 ) -> Split:
     start = time.perf_counter()
-    query, generator = _generating(recipe.generate)
+    query, generator = forecast_seconds(recipe.generate)
     most = _most_queries(folder)
     pilots: list[list[float]] = []
     fit, fit_query = _FIT, 0.0
@@ -177,20 +174,6 @@ def _measure(
     training = max(1.0 * fits, left - queries * query - other)
     generating = round(queries * query + generator, 1)
     return Split(queries, generating, round(training, 1), round(other, 1), share, pilots, round(took, 1))
-
-
-def _generating(config: GeneratorConfig) -> tuple[float, float]:
-    """Seconds of a training query, and of starting the generator with its test split, by a forecast."""
-    from mbtf_gen.forecast import forecast
-    from mbtf_gen.job import Job, split_queries
-    from mbtf_gen.material.material import load_material
-    from mbtf_gen.planning.effects_plan import plan_effects
-    from mbtf_gen.planning.run_plan import allocate
-
-    job = Job(config, load_material(Path(config.material), config.geometry.make_tileable))
-    expected = forecast(job, allocate(job, plan_effects(job, pilots=False)))
-    query = max(expected.query_seconds, _CHEAPEST)
-    return query, expected.start + max(0.0, expected.seconds - split_queries(job, "train") * query)
 
 
 def _pilots(

@@ -7,7 +7,6 @@ import io
 import math
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -132,11 +131,11 @@ def runners(monkeypatch: pytest.MonkeyPatch) -> list[FakeRunner]:
     clock = Clock()
 
     class Runner(FakeRunner):
-        def __init__(self, config: Any, *_: Any, query_seconds: Any) -> None:
+        def __init__(self, config: Any, *_: Any, path_seconds: Any) -> None:
             super().__init__(seeds=0.5)
             self.config = config
             found.append(self)
-            self.query_seconds = query_seconds
+            self.path_seconds = path_seconds
 
         def measure(self, run: Run) -> Measurement:
             clock.now += self.expected_seconds(run)
@@ -148,7 +147,7 @@ def runners(monkeypatch: pytest.MonkeyPatch) -> list[FakeRunner]:
     monkeypatch.setattr(module, "time", clock)
     monkeypatch.setattr(module, "RunRunner", Runner)
     monkeypatch.setattr(module, "generator_tasks", lambda benchmark: [task])
-    monkeypatch.setattr(module, "query_seconds", lambda *_: lambda paths: 1e-9)
+    monkeypatch.setattr(module, "path_seconds", lambda *_: 1e-9)
     monkeypatch.setattr(module, "_check_variation", lambda benchmark: None)
     monkeypatch.setattr(module, "planned_runs", lambda *_: RUNS)
     return found
@@ -204,19 +203,9 @@ def test_a_refused_study_leaves_the_folder_as_it_was(
     assert content() == before
 
 
-def test_query_time_is_linear_in_paths_and_stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """0.6 µs to draw and write a query, 0.1 µs for each of its paths."""
-    calls: list[int] = []
-
-    def forecast(job: Any, plan: Any, seconds: float) -> Any:
-        calls.append(job["queries.spp"])
-        return SimpleNamespace(query_seconds=6e-7 + 1e-7 * job["queries.spp"])
-
-    monkeypatch.setattr("mbtf_gen.forecast.forecast", forecast)
-    monkeypatch.setattr("mbtf_gen.planning.effects_plan.plan_effects", lambda job: None)
-    benchmark: Any = SimpleNamespace(job=lambda options: options)
+def test_the_forecast_of_the_generator_is_stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = [(2e-6, 1.0)]
+    monkeypatch.setattr(module, "forecast_seconds", lambda config: found.pop())
+    config = GeneratorConfig.model_validate({"material": "m", "queries": {"spp": 4}})
     store = MeasurementFolder(tmp_path, "abc")
-    for _ in range(2):
-        seconds = module.query_seconds(benchmark, store)
-        assert [seconds(n) for n in (4, 64)] == pytest.approx([1e-6, 7e-6])
-    assert len(calls) == 2
+    assert [module.path_seconds(config, store) for _ in range(2)] == [5e-7, 5e-7]

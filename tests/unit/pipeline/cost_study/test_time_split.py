@@ -56,7 +56,7 @@ class Machine:
 def fake(monkeypatch: pytest.MonkeyPatch) -> Machine:
     made = Machine()
     monkeypatch.setattr(RunRunner, "measure", lambda self, run: made.measure(run))
-    monkeypatch.setattr(module, "_generating", lambda config: (made.query, START))
+    monkeypatch.setattr(module, "forecast_seconds", lambda config: (made.query, START))
     monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: made.now))
     monkeypatch.setattr(module.shutil, "disk_usage", lambda path: SimpleNamespace(free=made.free))
     monkeypatch.setattr(module, "_physical_memory", lambda: made.memory)
