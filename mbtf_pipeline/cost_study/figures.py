@@ -20,6 +20,8 @@ ERROR_AXIS = "unexplained variance of test queries"
 TIME_AXIS = "seconds per million queries"
 
 Value = Callable[[Measurement], Estimate]
+# Figures of measurements, also written to this PNG and others beside it.
+Figures = Callable[[Sequence[Measurement], Path], list[dict[str, Any]]]
 
 
 def _figure(
@@ -53,9 +55,9 @@ def _by_series(found: Sequence[Measurement], **options: Any) -> list[Cloud]:
     return [_cloud(n, [m for m in found if m.series == n], **options) for n in names]
 
 
-def noise_figures(found: Sequence[Measurement], png: Path) -> list[dict[str, Any]]:
-    """Noise over seconds, one line per series."""
-    return [_figure(_by_series(found), TIME_AXIS, NOISE_AXIS, png)]
+def lines(x: str, y: str) -> Figures:
+    """Error over seconds, one line per series; axes with these titles."""
+    return lambda found, png: [_figure(_by_series(found), x, y, png)]
 
 
 def bias_figures(found: Sequence[Measurement], png: Path) -> list[dict[str, Any]]:
@@ -76,11 +78,6 @@ def bias_figures(found: Sequence[Measurement], png: Path) -> list[dict[str, Any]
     limit = 100 * max((2 * max(m.bias.error, m.bias.value) for m in unbiased if m.bias), default=0.0)
     caption = f"Labels at the noise: the bias is not significant, at most {limit:.2g} % of the mean value."
     return [_figure(clouds, TIME_AXIS, NOISE_AXIS, png, caption if unbiased else "")]
-
-
-def data_figures(found: Sequence[Measurement], png: Path) -> list[dict[str, Any]]:
-    """Error over seconds of generating."""
-    return [_figure(_by_series(found), "seconds of generating", ERROR_AXIS, png)]
 
 
 def model_figures(found: Sequence[Measurement], png: Path) -> list[dict[str, Any]]:

@@ -33,12 +33,7 @@ _FEWEST_QUERIES = 20_000
 
 def planned_runs(seconds: float, spp: int, path_seconds: float) -> list[Run]:
     """All runs of a study of so many seconds, in the order of measuring, each with the study's own seed.
-
-    Parameters
-    ----------
-    spp : paths per query of the recipe
-    path_seconds : seconds to generate such a query over its number of paths
-    """
+    Queries have `spp` paths in the recipe, each of which takes `path_seconds` to generate."""
 
     def data(length: float) -> DataRequest:
         """The queries of the recipe that take so many seconds."""

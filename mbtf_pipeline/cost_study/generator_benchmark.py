@@ -115,14 +115,8 @@ class GeneratorBenchmark:
         self, changes: dict[str, Any], against: dict[str, Any] | None, seconds: float
     ) -> tuple[Estimate, Estimate, Estimate | None, Estimate]:
         """(seconds per million queries, error, bias, noise) of a configuration; errors are root mean squares
-        relative to the mean value of the reference.
-
-        Parameters
-        ----------
-        changes : options of the configuration
-        against : options of its reference; None where only paths per query differ, which adds no bias
-        seconds : largest time of each of noise and bias; less once the error bars are small
-        """
+        relative to the mean value of the reference. Without options of a reference only paths per query
+        differ, which adds no bias. Noise and bias take at most so many seconds each."""
         noise, time_per_million = self._noise(self.job(changes), seconds, self.reference(against or {}).mean)
         if against is None:
             return time_per_million, _root(noise), None, _root(noise)

@@ -22,13 +22,8 @@ UNIFORM = {"queries.allocation": "uniform"}
 
 @dataclass(frozen=True)
 class GeneratorTask(Configuration):
-    """A configuration of the generator.
-
-    Attributes
-    ----------
-    changes : options that differ from the recipe
-    against : options of its reference; None where only paths per query differ
-    """
+    """A configuration of the generator: options that differ from the recipe, and those of its reference (None
+    where only paths per query differ)."""
 
     changes: dict[str, Any]
     against: dict[str, Any] | None = field(default_factory=dict)

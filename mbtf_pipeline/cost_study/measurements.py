@@ -79,13 +79,8 @@ class Measurement(Configuration):
 
 
 class MeasurementFolder:
-    """Finished measurements, one file each, so that a study resumes where it stopped.
-
-    Parameters
-    ----------
-    folder : of the study
-    basis : what all measurements depend on: the hash of the material and the configuration, with its seed
-    """
+    """Finished measurements, one file each, so that a study resumes where it stopped; `basis` is the hash of
+    the material and the configuration with its seed."""
 
     def __init__(self, folder: Path, basis: str) -> None:
         self.folder = folder / FOLDER
@@ -108,11 +103,6 @@ class MeasurementFolder:
             return None
 
     def put(self, task: Configuration, found: Measurement) -> None:
-        """Store a measurement.
-
-        Raises
-        ------
-        PartialError : the disk is full or the folder cannot be written
-        """
+        """Store a measurement."""
         numbers = {name: e and e.as_dict() for name in ESTIMATES for e in (getattr(found, name),)}
         write_json(self._path(task), {"label": task.label, **numbers, "details": found.details})

@@ -14,11 +14,14 @@ from mbtf_core.atomic import write_json, write_text
 from mbtf_core.stats import Estimate
 from mbtf_core.units import clock
 from mbtf_pipeline.cost_study.figures import (
+    ERROR_AXIS,
+    NOISE_AXIS,
+    TIME_AXIS,
+    Figures,
     bias_figures,
-    data_figures,
     front_figures,
+    lines,
     model_figures,
-    noise_figures,
 )
 from mbtf_pipeline.cost_study.measurements import ESTIMATES, Measurement
 from mbtf_pipeline.cost_study.pareto import extrapolation, pareto_front
@@ -100,7 +103,7 @@ def _table(columns: _Columns, found: Sequence[Measurement]) -> dict[str, Any]:
 class _Section(NamedTuple):
     title: str
     text: str
-    figures: Callable[[Sequence[Measurement], Path], list[dict[str, Any]]]
+    figures: Figures
     columns: _Columns = _GENERATOR
 
 
@@ -109,7 +112,7 @@ _SECTIONS = {
         "Queries or paths?",
         "Training data of equal total paths, divided among many noisy or few clean queries. Every fit trains "
         "equally long.",
-        data_figures,
+        lines("seconds of generating", ERROR_AXIS),
         _RUNS,
     ),
     "models": _Section(
@@ -123,7 +126,7 @@ _SECTIONS = {
         "Paths per query",
         "More paths reduce the noise and leave no bias. Queries get equally many paths, more where a pilot "
         "expects more noise, or as many as a target error takes.",
-        noise_figures,
+        lines(TIME_AXIS, NOISE_AXIS),
     ),
     "effects": _Section(
         "Effects",
@@ -154,61 +157,50 @@ def whole_runs(found: Sequence[Measurement]) -> list[Measurement]:
 
 def _sections(study: Study) -> list[dict[str, Any]]:
     runs = whole_runs(study.measurements)
-    sections = [_front_section(study, runs)] if runs else []
-    for name, section in _SECTIONS.items():
-        found = [m for m in study.measurements if m.study == name]
-        if found:
-            sections.append(
-                {
-                    "id": name,
-                    "title": section.title,
-                    "text": section.text,
-                    "figures": section.figures(found, study.folder / f"{name}.png"),
-                    "table": _table(section.columns, found),
-                    "open": False,
-                }
-            )
-    return sections
-
-
-def _front_section(study: Study, runs: Sequence[Measurement]) -> dict[str, Any]:
     front = pareto_front(runs)
+    front_section = _Section("Complete runs", _front_text(front), front_figures, _RUNS)
+    shown = {name: [m for m in study.measurements if m.study == name] for name in _SECTIONS}
+    shown["front"] = runs
+    return [
+        {
+            "id": name,
+            "title": section.title,
+            "text": section.text,
+            "figures": section.figures(shown[name], study.folder / f"{name}.png"),
+            "table": _table(section.columns, front if name == "front" else shown[name]),
+        }
+        for name, section in {"front": front_section, **_SECTIONS}.items()
+        if shown[name]
+    ]
+
+
+def _front_text(front: Sequence[Measurement]) -> str:
     text = "All runs, and the Pareto front: the runs that no other one beats in both time and error."
     further = extrapolation(front)
-    if further is not None:
-        seconds, exponent = further
-        text += (
-            " Extrapolation: we fit a power law to the last three points of the front. The error falls as "
-            f"time to the power -{exponent}, so halving the last error takes about {clock(seconds)} more. "
-            "Expect longer, because gains shrink with time."
-        )
-    return {
-        "id": "front",
-        "title": "Complete runs",
-        "text": text,
-        "figures": front_figures(runs, study.folder / "front.png"),
-        "table": _table(_RUNS, front),
-        "open": True,
-    }
+    if further is None:
+        return text
+    seconds, exponent = further
+    return (
+        f"{text} Extrapolation: we fit a power law to the last three points of the front. The error falls as "
+        f"time to the power -{exponent}, so halving the last error takes about {clock(seconds)} more. "
+        "Expect longer, because gains shrink with time."
+    )
 
 
 def write_page(study: Study) -> Path:
     """Write CSV, page and plots into the study's folder, and a summary into its record; returns the path of
     the page."""
     write_text(study.folder / CSV_NAME, to_csv(study.measurements))
-    html: str = (
-        page_environment()
-        .from_string(template("cost.html"))
-        .render(
-            style=template("report.css"),
-            study=study.description,
-            time=clock(study.description["time"]),
-            sections=_sections(study),
-            skipped=study.skipped,
-            failed=study.failed,
-            deviation=None if study.deviation is None else f"{study.deviation.scaled(100.0)} %",
-            seeds=round(max((m.details.get("seeds", 0.0) for m in study.measurements), default=0.0)),
-        )
+    page = page_environment().from_string(template("cost.html"))
+    html = page.render(
+        style=template("report.css"),
+        study=study.description,
+        time=clock(study.description["time"]),
+        sections=_sections(study),
+        skipped=study.skipped,
+        failed=study.failed,
+        deviation=None if study.deviation is None else f"{study.deviation.scaled(100.0)} %",
+        seeds=round(max((m.details.get("seeds", 0.0) for m in study.measurements), default=0.0)),
     )
     path = study.folder / PAGE_NAME
     write_text(path, html)

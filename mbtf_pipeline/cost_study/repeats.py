@@ -55,17 +55,9 @@ def measure_runs(
     runs: Sequence[Run], store: MeasurementFolder, runner: RunRunner, fits: Callable[[Run], bool], seeds: int
 ) -> tuple[list[list[Measurement]], dict[int, str]]:
     """Measure every run with two seeds before the next one, then runs whose 95 % interval is too wide with
-    further seeds; store every measurement.
+    further seeds, up to `seeds`, while they fit into the remaining time; store every measurement.
 
-    Parameters
-    ----------
-    fits : whether a run fits into the remaining time
-    seeds : number of seeds that may be measured; stored measurements count in any case
-
-    Returns
-    -------
-    groups : the measurements of every run, one per seed
-    failed : why runs failed, by their place in the plan
+    Returns the measurements of every run, one per seed, and why runs failed, by their place in the plan.
     """
     groups: list[list[Measurement]] = [[] for _ in runs]
     failed: dict[int, str] = {}

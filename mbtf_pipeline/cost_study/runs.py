@@ -56,13 +56,8 @@ class DataRequest:
 
 @dataclass(frozen=True)
 class Run(Configuration):
-    """A run to measure.
-
-    Attributes
-    ----------
-    data : its training data; the seed offset is that of the fit, too
-    fit : options of the fitter, nested as in its configuration
-    """
+    """A run to measure: its data, whose seed offset is that of the fit, too, and nested options of the
+    fitter."""
 
     data: DataRequest
     fit: dict[str, Any] = field(default_factory=dict)
@@ -82,10 +77,7 @@ class RunRunner:
 
     Parameters
     ----------
-    config : the recipe's generator
-    folder : to work in; removed by :meth:`clear`
     command : of the generator with the study's configuration
-    progress : called with a note
     test : number of test queries, and paths of each
     path_seconds : time to generate a query over its number of paths
     """
@@ -109,7 +101,6 @@ class RunRunner:
         self._overhead = _OVERHEAD
         # Folder and seconds by request.
         self._data: dict[DataRequest, tuple[Path, float]] = {}
-        # By seed.
         self._test_sets: dict[int, ShardQueries] = {}
         self._test_seconds = 0.0
 
@@ -173,12 +164,7 @@ class RunRunner:
         return self._test_sets[seed]
 
     def measure(self, run: Run) -> Measurement:
-        """Generate the data, fit, and evaluate.
-
-        Raises
-        ------
-        InputError : the fit failed
-        """
+        """Generate the data, fit, and evaluate."""
         from mbtf_fit import FitConfig, fit
 
         test = self.test_set(run.data.seed)

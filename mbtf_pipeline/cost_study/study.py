@@ -40,44 +40,27 @@ _CONFIGURATIONS = 35
 
 @dataclass
 class Study:
-    """What a study has measured.
-
-    Attributes
-    ----------
-    folder : of the study
-    description : name, command, time, seed, machine, date
-    measurements : one per configuration
-    deviation : relative standard deviation of runs over seeds, part of their error bars; None where no run
-        was repeated
-    skipped : configurations for which no time was left
-    failed : runs that failed, and why
-    """
+    """What a study has measured."""
 
     folder: Path
+    # Name, command, time, seed, machine and date.
     description: dict[str, Any]
+    # One per configuration.
     measurements: list[Measurement] = field(default_factory=list)
+    # Relative standard deviation of runs over seeds, part of their error bars; None without repeats.
     deviation: Estimate | None = None
+    # Configurations for which no time was left, and runs that failed, with the reason.
     skipped: list[str] = field(default_factory=list)
     failed: list[str] = field(default_factory=list)
 
 
 def is_study(folder: Path) -> bool:
-    """Whether a folder contains a cost study.
-
-    Raises
-    ------
-    InputError : it contains one of another schema version
-    """
+    """Whether a folder contains a cost study; one of another schema version is refused."""
     return has_record(folder, STUDY_NAME, STUDY_FORMAT, STUDY_SCHEMA)
 
 
 def claim(folder: Path) -> None:
-    """Create a study's folder, or take an empty one or one that holds a study of this kind of machine.
-
-    Raises
-    ------
-    InputError : it holds something else, or a study of another version or machine
-    """
+    """Create a study's folder, or take an empty one or one that holds a study of this kind of machine."""
     if not check_folder(folder, is_study, "cost study"):
         make_folder(folder)
         return
@@ -93,12 +76,7 @@ def time_of(folder: Path) -> float:
 
 
 def _check_variation(benchmark: GeneratorBenchmark) -> None:
-    """Refuse a material that gives a fit nothing to learn.
-
-    Raises
-    ------
-    InputError : it reflects nothing, or the same everywhere and in all directions
-    """
+    """Refuse a material that gives a fit nothing to learn."""
     reference, where = benchmark.reference({}), benchmark.config.material
     if not reference.mean > 0:
         hint = "study a material with a base color or gloss"
@@ -115,20 +93,6 @@ def study_config(config: GeneratorConfig, seed: int | None) -> GeneratorConfig:
     queries = config.queries.model_copy(update={"target_error": None, "layout": "shuffled"})
     seeds = {} if seed is None else {"seed": seed}
     return config.model_copy(update={"queries": queries, **seeds})
-
-
-class _Clock:
-    """The remaining time of a study, and the share of it that is spent."""
-
-    def __init__(self, seconds: float, refine: float) -> None:
-        self.begin = time.perf_counter()
-        self.seconds, self.refine = seconds, refine
-
-    def left(self, *, refining: bool = False) -> float:
-        return self.seconds + refining * self.refine - (time.perf_counter() - self.begin)
-
-    def share(self) -> float:
-        return min(1.0, (time.perf_counter() - self.begin) / (self.seconds + self.refine))
 
 
 def run_study(
@@ -156,13 +120,20 @@ def run_study(
     InputError : the material or the folder cannot be used
     PartialError : another process works in the folder, or the disk is full; the same command resumes
     """
-    clock = _Clock(seconds, refine)
+    start = time.perf_counter()
+
+    def spent() -> float:
+        return time.perf_counter() - start
+
+    def note(text: str) -> None:
+        progress(min(1.0, spent() / (seconds + refine)), text)
+
     config = study_config(recipe.generate, seed)
     material = load_material(Path(config.material), config.geometry.make_tileable)
     claim(folder)
     with locked(folder, STUDY_NAME):
         benchmark = GeneratorBenchmark(config, material)
-        progress(0.0, "reference")
+        note("reference")
         # Before anything is written: a refused study leaves the folder as it was.
         _check_variation(benchmark)
         description = {
@@ -181,43 +152,25 @@ def run_study(
         study = Study(folder, description)
         store = MeasurementFolder(folder, config.hash(material.digests))
         generator = shlex.join(["mbtf-gen", config.material, "--config", str(folder / CONFIG_NAME)])
-        _measure_generator(study, store, benchmark, generator, clock, progress)
-        runner = RunRunner(
-            config,
-            folder / WORK,
-            generator,
-            lambda note: progress(clock.share(), note),
-            path_seconds=path_seconds(config, store),
-        )
+        each = 0.5 * GENERATOR * seconds / _CONFIGURATIONS
+        for task in generator_tasks(benchmark):
+            found = store.get(task, task.command(generator))
+            # Configurations take longer than their share where kernels are compiled.
+            if found is None and spent() < 1.2 * GENERATOR * seconds:
+                note(task.label)
+                found = task.run(benchmark, each, task.command(generator))
+                store.put(task, found)
+            if found is None:
+                study.skipped.append(task.label)
+            else:
+                study.measurements.append(found)
+        runner = RunRunner(config, folder / WORK, generator, note, path_seconds=path_seconds(config, store))
         try:
-            _measure_runs(study, store, runner, clock)
+            seeds = MOST_SEEDS if refine else FEWEST_SEEDS
+            _measure_runs(study, store, runner, lambda again: seconds + again * refine - spent(), seeds)
         finally:
             runner.clear()
     return study
-
-
-def _measure_generator(
-    study: Study,
-    store: MeasurementFolder,
-    benchmark: GeneratorBenchmark,
-    generator: str,
-    clock: _Clock,
-    progress: Callable[[float, str], None],
-) -> None:
-    """Measure the generator's configurations in its share of the time."""
-    each = 0.5 * GENERATOR * clock.seconds / _CONFIGURATIONS
-    for task in generator_tasks(benchmark):
-        command = task.command(generator)
-        found = store.get(task, command)
-        # Configurations take longer than their share where kernels are compiled.
-        if found is None and clock.left() > (1.0 - 1.2 * GENERATOR) * clock.seconds:
-            progress(clock.share(), task.label)
-            found = task.run(benchmark, each, command)
-            store.put(task, found)
-        if found is None:
-            study.skipped.append(task.label)
-        else:
-            study.measurements.append(found)
 
 
 def path_seconds(config: GeneratorConfig, store: MeasurementFolder) -> float:
@@ -232,21 +185,23 @@ def path_seconds(config: GeneratorConfig, store: MeasurementFolder) -> float:
         return found
 
 
-def _measure_runs(study: Study, store: MeasurementFolder, runner: RunRunner, clock: _Clock) -> None:
-    """Measure runs and their repeats in the remaining time."""
-    runs = planned_runs(clock.seconds, runner.config.queries.spp, runner.path_seconds)
+def _measure_runs(
+    study: Study, store: MeasurementFolder, runner: RunRunner, left: Callable[[bool], float], seeds: int
+) -> None:
+    """Measure runs in the remaining time, which is longer for repeats than for others."""
+    start = left(False)
+    runs = planned_runs(study.description["time"], runner.config.queries.spp, runner.path_seconds)
     # On a machine slower than planned, every comparison keeps its share of the time.
-    start, studies, shares = clock.left(), list(RUN_SHARES), list(RUN_SHARES.values())
+    studies, shares = list(RUN_SHARES), list(RUN_SHARES.values())
     reached = 0
 
     def fits(run: Run) -> bool:
         nonlocal reached
         reached = max(reached, studies.index(run.study))
         reserved = start * sum(shares[reached + 1 :]) / sum(shares)
-        # The additional time is for repeats alone.
-        return clock.left(refining=run.data.seed > 0) - reserved > runner.expected_seconds(run)
+        return left(run.data.seed > 0) - reserved > runner.expected_seconds(run)
 
-    groups, failed = measure_runs(runs, store, runner, fits, MOST_SEEDS if clock.refine else FEWEST_SEEDS)
+    groups, failed = measure_runs(runs, store, runner, fits, seeds)
     study.deviation = seed_deviation(groups)
     study.failed = list(failed.values())
     study.measurements += [combined(group, study.deviation) for group in groups if group]

@@ -62,23 +62,19 @@ _LEAST_LEFT = 0.25
 
 @dataclass(frozen=True)
 class Split:
-    """How a total time is spent.
+    """How a total time is spent."""
 
-    Attributes
-    ----------
-    queries : training queries to generate
-    generating, training, other : seconds of generating, of training all fits, and of fits besides training
-    share : of generating in generating and training
-    pilots : (share, unexplained variance) of each pilot; empty for short times
-    pilot_seconds : time of forecast and pilots
-    """
-
+    # Training queries to generate.
     queries: int
+    # Seconds of generating, of training all fits, and of fits besides training.
     generating: float
     training: float
     other: float
+    # Share of generating in generating and training.
     share: float
+    # (share, unexplained variance) of each pilot; empty for short times.
     pilots: list[list[float]]
+    # Time of forecast and pilots.
     pilot_seconds: float
 
     def describe(self) -> str:
@@ -101,20 +97,7 @@ def split_time(
     share: float | None = None,
 ) -> Split:
     """How to spend a total time on a recipe; stored in the run's folder, so that the same command resumes
-    with the same split.
-
-    Parameters
-    ----------
-    command : of the run, for its record
-    progress : called with a note after every pilot
-    share : generate for this share of the time, without pilots
-
-    Raises
-    ------
-    UsageError : the time is too short, or a model of the recipe needs another layout
-    InputError : the folder holds something else
-    PartialError : another process works in it
-    """
+    with the same split. Without pilots where the share that generates is given."""
     if seconds < SHORTEST:
         raise UsageError(
             f"{format_duration(seconds)} is too short: starting up takes most of it",

@@ -59,13 +59,7 @@ class PaperRecipe(Settings):
 
 @dataclass(frozen=True)
 class Planned:
-    """One recipe to run.
-
-    Attributes
-    ----------
-    material, variant : their names; the variant is empty if there are none
-    recipe : resolved
-    """
+    """One resolved recipe to run; `variant` is empty if there are none."""
 
     material: str
     variant: str
@@ -78,12 +72,7 @@ class Planned:
 
 
 def is_paper_recipe(path: Path) -> bool:
-    """Whether a file is a paper recipe, that is, lists tables.
-
-    Raises
-    ------
-    InputError : it cannot be read
-    """
+    """Whether a file is a paper recipe, that is, lists tables."""
     return path.is_file() and "tables" in read_yaml(path)
 
 

@@ -68,12 +68,7 @@ class PaperResult:
 
 
 def is_paper(folder: Path) -> bool:
-    """Whether a folder contains the runs of a paper recipe.
-
-    Raises
-    ------
-    InputError : it contains those of another schema version
-    """
+    """Whether a folder contains the runs of a paper recipe; those of another schema version are refused."""
     return has_record(folder, PAPER_NAME, PAPER_FORMAT, PAPER_SCHEMA)
 
 
@@ -150,12 +145,7 @@ def run_paper(
 
 
 def write_again(folder: Path) -> Path:
-    """Write the page and tables of the finished runs again; returns the page's path.
-
-    Raises
-    ------
-    InputError : no run is finished, or one is corrupt
-    """
+    """Write the page and tables of the finished runs again; returns the page's path."""
     with locked(folder, PAPER_NAME):
         return _write_page(folder, read_json(folder / PAPER_NAME))[0]
 
