@@ -71,8 +71,10 @@ def measure_runs(
             group, seed = groups[k], task.data.seed
             if len(group) == seed:
                 found = store.get(task, runner.command_of(runs[k]))
-                wide = seed < FEWEST_SEEDS or _is_wide(combined(group, deviation))
-                if found is None and seed < seeds and k not in failed and wide and fits(task):
+                wanted = seed < FEWEST_SEEDS or (
+                    seed < seeds and NORMAL * combined(group, deviation).error.relative_error > HALF_WIDTH
+                )
+                if found is None and wanted and k not in failed and fits(task):
                     try:
                         found = runner.measure(task)
                         store.put(task, found)
@@ -83,8 +85,3 @@ def measure_runs(
             if all(other.data != task.data for _, other in tasks[number + 1 :]):
                 runner.forget(task.data)
     return groups, failed
-
-
-def _is_wide(found: Measurement) -> bool:
-    """Whether the 95 % interval of the error is too wide."""
-    return NORMAL * found.error.relative_error > HALF_WIDTH

@@ -72,37 +72,26 @@ class Run(Configuration):
         return {**asdict(self.data), "fit": self.fit}
 
 
+@dataclass
 class RunRunner:
-    """Generates data and fits models in a working folder, and keeps data that several runs share.
+    """Generates data and fits models in a working folder, and keeps data that several runs share."""
 
-    Parameters
-    ----------
-    command : of the generator with the study's configuration
-    test : number of test queries, and paths of each
-    path_seconds : time to generate a query over its number of paths
-    """
-
-    def __init__(
-        self,
-        config: GeneratorConfig,
-        folder: Path,
-        command: str,
-        progress: Callable[[str], None],
-        test: tuple[int, int] | None = None,
-        path_seconds: float = 0.0,
-    ) -> None:
-        self.config = config
-        self.folder = folder
-        self.command = command
-        self.progress = progress
-        self.test = test or TEST
-        self.path_seconds = path_seconds
-        # Seconds by which a run exceeds generating and training: the most of all so far, or a guess.
-        self._overhead = _OVERHEAD
-        # Folder and seconds by request.
-        self._data: dict[DataRequest, tuple[Path, float]] = {}
-        self._test_sets: dict[int, ShardQueries] = {}
-        self._test_seconds = 0.0
+    config: GeneratorConfig
+    folder: Path
+    # The generator's, with the study's configuration.
+    command: str
+    progress: Callable[[str], None]
+    # Number of test queries, and paths of each.
+    test: tuple[int, int] = field(default_factory=lambda: TEST)
+    # Time to generate a query over its number of paths.
+    path_seconds: float = 0.0
+    # Seconds by which a run exceeds generating and training: the most of all so far, or a guess.
+    _overhead: float = _OVERHEAD
+    # Folder and seconds by request.
+    _data: dict[DataRequest, tuple[Path, float]] = field(default_factory=dict)
+    # By seed.
+    _test_sets: dict[int, ShardQueries] = field(default_factory=dict)
+    _test_seconds: float = 0.0
 
     def clear(self) -> None:
         """Remove data and fits."""

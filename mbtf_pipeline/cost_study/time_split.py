@@ -99,17 +99,11 @@ def split_time(
     """How to spend a total time on a recipe; stored in the run's folder, so that the same command resumes
     with the same split. Without pilots where the share that generates is given."""
     if seconds < SHORTEST:
-        raise UsageError(
-            f"{format_duration(seconds)} is too short: starting up takes most of it",
-            where="--time",
-            hint=f"give {format_duration(SHORTEST)} or more",
-        )
+        problem = f"{format_duration(seconds)} is too short: starting up takes most of it"
+        raise UsageError(problem, where="--time", hint=f"give {format_duration(SHORTEST)} or more")
     if any(layout_of(fit) != "shuffled" for fit in recipe.fit.values()):
-        raise UsageError(
-            "only models of the shuffled layout can share a time",
-            where="--time",
-            hint="leave out the fits of 'hierarchical'",
-        )
+        problem = "only models of the shuffled layout can share a time"
+        raise UsageError(problem, where="--time", hint="leave out the fits of 'hierarchical'")
     options = recipe.model_dump(mode="json", include={"generate", "fit"})
     key = data_sha256({"schema": SPLIT_SCHEMA, "time": seconds, "share": share, "recipe": options})
     claim_run_folder(folder)

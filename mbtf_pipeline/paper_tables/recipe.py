@@ -68,7 +68,7 @@ class Planned:
     @property
     def name(self) -> str:
         """Name of the run and its folder."""
-        return f"{self.material}-{self.variant}" if self.variant else self.material
+        return self.recipe.name
 
 
 def is_paper_recipe(path: Path) -> bool:
@@ -131,36 +131,30 @@ def plan(paper: PaperRecipe, path: Path, quick: bool) -> tuple[list[Planned], di
     for material, own in paper.materials.items():
         given = own.generate.get("material")
         if given is None:
-            raise InputError(
-                "has no path", where=f"{path}: materials.{material}", hint="add generate.material"
-            )
+            where = f"{path}: materials.{material}"
+            raise InputError("has no path", where=where, hint="add generate.material")
         file = Path(os.path.normpath(path.parent / str(given)))
         if not file.exists():
             missing[material] = os.path.abspath(file)
             continue
         for variant, over in variants.items():
             layers = [paper.base, *([paper.quick] if quick else []), own, over]
-            planned.append(Planned(material, variant, _compose(layers, material, variant, file, path)))
+            name = f"{material}-{variant}" if variant else material
+            planned.append(Planned(material, variant, _compose(layers, name, file, path)))
     if not planned:
-        raise InputError(
-            "all of its materials are missing",
-            where=path,
-            hint=f"searched for {next(iter(missing.values()))}; edit 'materials'",
-        )
+        hint = f"searched for {next(iter(missing.values()))}; edit 'materials'"
+        raise InputError("all of its materials are missing", where=path, hint=hint)
     return planned, missing
 
 
-def _compose(layers: list[Layer], material: str, variant: str, file: Path, path: Path) -> Recipe:
+def _compose(layers: list[Layer], name: str, file: Path, path: Path) -> Recipe:
     data: dict[str, Any] = {}
     for layer in layers:
         data = deep_merge(data, layer.model_dump(mode="json"))
     each = data.pop("each_fit")
-    data["fit"] = {
-        name: deep_merge(each, {"model": name, **(own or {})}) for name, own in data["fit"].items()
-    }
+    data["fit"] = {fit: deep_merge(each, {"model": fit, **(own or {})}) for fit, own in data["fit"].items()}
     data["generate"]["material"] = str(file)
     # The optional metric is computed if its weights are installed.
     data["compare"] = {"st_lpips": weights_file() is not None, **data["compare"]}
-    name = f"{material}-{variant}" if variant else material
     data |= {"name": name, "report": {"title": name.replace("_", " ")}}
     return build(Recipe, data, source=f"{path}: {name}")
