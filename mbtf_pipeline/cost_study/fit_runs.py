@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from itertools import product
 
 from mbtf_core.config_file import nested
 from mbtf_fit.presets import best_options
@@ -58,10 +59,10 @@ def _preset(seconds: float) -> dict[str, object]:
     return nested({"model": "neumip", **best_options(seconds), "training.time": f"{seconds:.3g}s"})
 
 
-def _plain(model: str, seconds: float, network: dict[str, object] | None = None) -> dict[str, object]:
+def _plain(model: str, seconds: float, **network: object) -> dict[str, object]:
     """A fit as in the paper of its model, except for `network`."""
-    options = {} if network is None else {"network": network}
-    return {"model": model, "training": {"time": f"{seconds:.3g}s", "noise_regularization": 0.0}, **options}
+    training = {"time": f"{seconds:.3g}s", "noise_regularization": 0.0}
+    return {"model": model, "network": network, "training": training}
 
 
 def _whole(seconds: float, data: Callable[[float], DataRequest]) -> Iterator[Run]:
@@ -69,13 +70,12 @@ def _whole(seconds: float, data: Callable[[float], DataRequest]) -> Iterator[Run
     totals = [SHORTEST]
     while sum(totals) + 2 * totals[-1] <= seconds:
         totals.append(2 * totals[-1])
-    planned = [(total, SHARE) for total in totals]
     left = seconds - sum(totals)
-    for total in totals:
-        for share in OTHER_SHARES:
-            if total <= left:
-                planned.append((total, share))
-                left -= total
+    planned = [(total, SHARE) for total in totals]
+    for total, share in product(totals, OTHER_SHARES):
+        if total <= left:
+            planned.append((total, share))
+            left -= total
     for total, share in planned:
         series, fit = f"{share:.0%} of the time for generating", _preset((1 - share) * total)
         yield Run("whole", series, f"planned for {total:g} s", data(share * total), fit)
@@ -85,11 +85,10 @@ def _data(seconds: float, data: Callable[[float], DataRequest]) -> Iterator[Run]
     """Data of equal total paths, divided among many or few queries, each with an equally long fit."""
     each = seconds / (len(TOTAL_PATHS) * len(PATHS))
     mean = data(each / 3)
-    for n in PATHS:
-        for factor in TOTAL_PATHS:
-            queries = max(_FEWEST_QUERIES, int(factor * mean.spp * mean.queries) // n)
-            name = f"{queries * n / 1e6:.3g} M paths"
-            yield Run("data", f"{n} paths per query", name, DataRequest(queries, n), _preset(2 * each / 3))
+    for n, factor in product(PATHS, TOTAL_PATHS):
+        queries = max(_FEWEST_QUERIES, int(factor * mean.spp * mean.queries) // n)
+        name = f"{queries * n / 1e6:.3g} M paths"
+        yield Run("data", f"{n} paths per query", name, DataRequest(queries, n), _preset(2 * each / 3))
 
 
 def _models(seconds: float, data: Callable[[float], DataRequest]) -> Iterator[Run]:
@@ -99,6 +98,6 @@ def _models(seconds: float, data: Callable[[float], DataRequest]) -> Iterator[Ru
     shared = data(generating * unit)
     fits = [(PRESET, t, _preset(t)) for t in (unit, 2 * unit)]
     fits += [(model, t, _plain(model, t)) for model in MODELS_OF_PAPERS for t in (unit, 2 * unit)]
-    fits += [(f"neumip, {s}", 2 * unit, _plain("neumip", 2 * unit, net)) for s, net in SIZES.items()]
+    fits += [(f"neumip, {s}", 2 * unit, _plain("neumip", 2 * unit, **net)) for s, net in SIZES.items()]
     for series, length, fit in fits:
         yield Run("models", series, f"{length:.3g} s of training", shared, fit)

@@ -105,20 +105,14 @@ def run_study(
     command: str = "",
     progress: Callable[[float, str], None] = lambda share, note: None,
 ) -> Study:
-    """Measure what the time allows; stored measurements are kept.
+    """Measure what the time allows for the material and generator of a recipe; stored measurements are kept
+    and cost no time.
 
     Parameters
     ----------
-    recipe : its material and generator are studied; its fits and comparison are not used
-    seconds : time of everything; stored measurements cost none of it
     refine : additional seconds for repeating runs with wide error bars
     seed : of queries, paths and initial weights; the recipe's by default
     progress : called with (share of the time spent, note)
-
-    Raises
-    ------
-    InputError : the material or the folder cannot be used
-    PartialError : another process works in the folder, or the disk is full; the same command resumes
     """
     start = time.perf_counter()
 

@@ -89,7 +89,6 @@ def load_paper_recipe(path: Path, assignments: list[str]) -> PaperRecipe:
     Returns
     -------
     PaperRecipe
-        The recipe.
 
     Raises
     ------

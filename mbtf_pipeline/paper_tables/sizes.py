@@ -39,7 +39,7 @@ def _milliseconds(title: str, key: str, *path: str) -> Column:
     def get(fit: str, record: Any) -> Cell:
         for name in path:
             record = record.get(name)
-        return record  # type: ignore[no-any-return]
+        return record
 
     return Column(title, f"{key}_ms", get, digits=",.1f")
 

@@ -88,7 +88,6 @@ def run_paper(
     Parameters
     ----------
     paper : PaperRecipe
-        From :func:`~mbtf_pipeline.paper_tables.recipe.load_paper_recipe`.
     planned, missing
         From :func:`~mbtf_pipeline.paper_tables.recipe.plan`.
     folder : Path
@@ -105,7 +104,6 @@ def run_paper(
     Returns
     -------
     PaperResult
-        Paths and record.
 
     Raises
     ------

@@ -18,7 +18,8 @@ from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.sampling.query_sampler import Queries
 from mbtf_pipeline.cost_study import generator_benchmark as module
 from mbtf_pipeline.cost_study.generator_benchmark import GeneratorBenchmark, _median
-from mbtf_pipeline.cost_study.generator_runs import PATHS, TARGETS, generator_tasks
+from mbtf_pipeline.cost_study.generator_runs import PATHS, TARGETS, GeneratorTask, generator_tasks
+from mbtf_pipeline.cost_study.measurements import Measurement
 from mbtf_pipeline.cost_study.study import _check_variation
 
 
@@ -27,18 +28,13 @@ def benchmark(monkeypatch: pytest.MonkeyPatch) -> GeneratorBenchmark:
     return fake_benchmark(monkeypatch)
 
 
-class Found:
-    """A measurement by the names of its parts."""
-
-    def __init__(
-        self, benchmark: GeneratorBenchmark, changes: dict[str, Any], against: dict[str, Any] | None
-    ) -> None:
-        self.seconds, self.error, self.bias, self.noise = benchmark.measure(changes, against, 0.0)
+def measure(benchmark: GeneratorBenchmark, changes: dict[str, Any], *against: Any) -> Measurement:
+    return GeneratorTask("paths", "", "", changes, *against).run(benchmark, 0.0)
 
 
 @pytest.mark.parametrize("spp", [4, 64])
 def test_bias_and_noise_are_separated(benchmark: GeneratorBenchmark, spp: int) -> None:
-    found = Found(benchmark, {"transport.max_depth": 1, "queries.spp": spp}, {})
+    found = measure(benchmark, {"transport.max_depth": 1, "queries.spp": spp})
     # Relative to the mean value 0.25: the bias is the shift times the values, the noise that of spp paths.
     bias = SHIFT * math.sqrt(np.mean((0.2 + 0.1 * np.linspace(0, 1, 10001)) ** 2)) / 0.25
     noise = NOISE / math.sqrt(spp)
@@ -50,10 +46,10 @@ def test_bias_and_noise_are_separated(benchmark: GeneratorBenchmark, spp: int) -
 
 
 def test_an_unbiased_configuration_shows_no_bias(benchmark: GeneratorBenchmark) -> None:
-    found = Found(benchmark, {"transport.max_depth": 3}, {})
+    found = measure(benchmark, {"transport.max_depth": 3})
     assert found.bias is not None
     assert found.bias.value == 0.0
-    assert Found(benchmark, {"queries.spp": 8}, None).bias is None
+    assert measure(benchmark, {"queries.spp": 8}, None).bias is None
 
 
 def test_error_bars_agree_with_other_seeds(benchmark: GeneratorBenchmark) -> None:
@@ -61,7 +57,7 @@ def test_error_bars_agree_with_other_seeds(benchmark: GeneratorBenchmark) -> Non
     changes = {"transport.max_depth": 1, "queries.spp": 8}
     configs = [benchmark.config.model_copy(update={"seed": seed}) for seed in (*range(6), 0)]
     runs = [GeneratorBenchmark(config, benchmark.material) for config in configs]
-    *found, again = (Found(run, changes, {}) for run in runs)
+    *found, again = (measure(run, changes) for run in runs)
     assert (again.noise, again.bias) == (found[0].noise, found[0].bias)
     for part in ("noise", "bias", "error"):
         estimates: list[Estimate] = [getattr(one, part) for one in found]

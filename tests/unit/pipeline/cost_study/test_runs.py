@@ -53,20 +53,11 @@ def test_planned_runs_fit_into_the_time_twice(seconds: float, tmp_path: Path) ->
     assert [run.name for run in whole] == [f"planned for {SHORTEST * 2**n:g} s" for n in range(len(whole))]
 
 
-class Clock:
-    """Time that passes where a test lets it."""
-
-    now = 0.0
-
-    def perf_counter(self) -> float:
-        return self.now
-
-
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+def clock(monkeypatch: pytest.MonkeyPatch) -> Any:
     """Generating takes seven seconds, fitting five, one more to load; evaluating 2¹⁸ queries half a second.
     The fit answers with a constant 0.1 where values are 0 and 1."""
-    found = Clock()
+    found = SimpleNamespace(now=0.0, perf_counter=lambda: found.now)
 
     class Material:
         def predict(self, queries: Any) -> Any:
@@ -105,7 +96,7 @@ def runner(folder: Path, seed: int = 0, **options: Any) -> RunRunner:
 
 
 @pytest.mark.parametrize(("study", "seconds"), [("whole", 13.0), ("data", 7.0), ("models", 5.0)])
-def test_a_run_measures_time_and_error(clock: Clock, tmp_path: Path, study: str, seconds: float) -> None:
+def test_a_run_measures_time_and_error(clock: Any, tmp_path: Path, study: str, seconds: float) -> None:
     found = runner(tmp_path).measure(Run(study, "", "", DataRequest(640, 4), FIT))
     assert found.seconds.value == seconds
     d = found.details
@@ -117,7 +108,7 @@ def test_a_run_measures_time_and_error(clock: Clock, tmp_path: Path, study: str,
     assert 0 < found.error.error < 0.1 * found.error.value
 
 
-def test_the_expected_time_learns_from_earlier_runs(clock: Clock, tmp_path: Path) -> None:
+def test_the_expected_time_learns_from_earlier_runs(clock: Any, tmp_path: Path) -> None:
     one = runner(tmp_path, path_seconds=1e-3)
     run = Run("whole", "", "", DataRequest(1000, 4), FIT)
     before = one.expected_seconds(run)
@@ -135,7 +126,7 @@ def test_the_expected_time_learns_from_earlier_runs(clock: Clock, tmp_path: Path
     assert one.expected_seconds(replace(run, fit={"training": {"steps": 3, "time": None}})) < 7 + 6 + 2.5
 
 
-def test_seeds_change_data_and_fit(clock: Clock, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_seeds_change_data_and_fit(clock: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seeds: list[int] = []
     usual = mbtf_fit.fit
     monkeypatch.setattr(module, "generate", lambda job, folder: seeds.append(job.config.seed))
@@ -151,7 +142,7 @@ def test_seeds_change_data_and_fit(clock: Clock, tmp_path: Path, monkeypatch: py
 
 @pytest.mark.parametrize(("study_seed", "offset"), [(0, 0), (0, 2), (5, 0), (5, 2)])
 def test_commands_reproduce_their_run(
-    clock: Clock, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, study_seed: int, offset: int
+    clock: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, study_seed: int, offset: int
 ) -> None:
     """The programs resolve the command to the configurations that were measured."""
     used: list[Any] = []

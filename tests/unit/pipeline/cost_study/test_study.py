@@ -7,6 +7,7 @@ import io
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -109,18 +110,6 @@ def test_studies_vary_paths_whatever_the_recipe_sets() -> None:
     assert module.study_config(config, 7).seed == 7
 
 
-class Clock:
-    """Time that passes as runs take it."""
-
-    now = 0.0
-
-    def perf_counter(self) -> float:
-        return self.now
-
-    def strftime(self, form: str) -> str:
-        return "2001-02-03"
-
-
 RUNS = [run("whole", 3000, "long", 7200.0), run("whole", 2000, "short", 60.0), run("models", 1000, "m", 30.0)]
 
 
@@ -128,7 +117,7 @@ RUNS = [run("whole", 3000, "long", 7200.0), run("whole", 2000, "short", 60.0), r
 def runners(monkeypatch: pytest.MonkeyPatch) -> list[FakeRunner]:
     """Studies of one configuration of the generator and three runs, of which the first takes too long."""
     found: list[FakeRunner] = []
-    clock = Clock()
+    clock = SimpleNamespace(now=0.0, perf_counter=lambda: clock.now, strftime=lambda form: "2001-02-03")
 
     class Runner(FakeRunner):
         def __init__(self, config: Any, *_: Any, path_seconds: Any) -> None:
