@@ -77,7 +77,7 @@ def _whole(seconds: float, data: Callable[[float], DataRequest]) -> Iterator[Run
             planned.append((total, share))
             left -= total
     for total, share in planned:
-        series, fit = f"{share:.0%} of the time for generating", _preset((1 - share) * total)
+        series, fit = f"{100 * share:.0f} % of the time for generating", _preset((1 - share) * total)
         yield Run("whole", series, f"planned for {total:g} s", data(share * total), fit)
 
 

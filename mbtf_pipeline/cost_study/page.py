@@ -158,7 +158,8 @@ def whole_runs(found: Sequence[Measurement]) -> list[Measurement]:
 def _sections(study: Study) -> list[dict[str, Any]]:
     runs = whole_runs(study.measurements)
     front = pareto_front(runs)
-    front_section = _Section("Complete runs", _front_text(front), front_figures, _RUNS)
+    columns = {**_RUNS, "run": lambda m: m.label}
+    front_section = _Section("All runs", _front_text(front), front_figures, columns)
     shown = {name: [m for m in study.measurements if m.study == name] for name in _SECTIONS}
     shown["front"] = runs
     return [
@@ -175,7 +176,7 @@ def _sections(study: Study) -> list[dict[str, Any]]:
 
 
 def _front_text(front: Sequence[Measurement]) -> str:
-    text = "All runs, and the Pareto front: the runs that no other one beats in both time and error."
+    text = "Error over total time, and the Pareto front: the runs that no other one beats in both."
     further = extrapolation(front)
     if further is None:
         return text

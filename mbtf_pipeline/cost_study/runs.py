@@ -123,9 +123,8 @@ class RunRunner:
 
     def forget(self, request: DataRequest) -> None:
         """Remove training data that no other run needs."""
-        folder, _ = self._data.pop(request, (None, 0.0))
-        if folder is not None:
-            shutil.rmtree(folder, ignore_errors=True)
+        if request in self._data:
+            shutil.rmtree(self._data.pop(request)[0], ignore_errors=True)
 
     def expected_seconds(self, run: Run) -> float:
         """Expected time of measuring a run; existing data take none."""
