@@ -37,7 +37,6 @@ from mbtf_gen.render.runtime import load_mitsuba
 from mbtf_pipeline.cost_study.generator_benchmark import GeneratorBenchmark
 from mbtf_pipeline.cost_study.generator_runs import UNIFORM, generator_tasks
 from mbtf_pipeline.cost_study.measurements import Measurement
-from mbtf_pipeline.cost_study.page import narrow_errors
 from mbtf_pipeline.recipe import load_recipe
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -57,7 +56,7 @@ def benchmark_of(recipe: Path, seed: int) -> GeneratorBenchmark:
     """The generator of a recipe with another seed."""
     config = load_recipe(recipe).generate
     material = load_material(Path(config.material), config.geometry.make_tileable)
-    return GeneratorBenchmark(config.model_copy(update={"seed": seed}), material, seed)
+    return GeneratorBenchmark(config.model_copy(update={"seed": seed}), material)
 
 
 def measure(recipe: Path, seed: int, seconds: float) -> list[Measurement]:
@@ -73,7 +72,7 @@ def measure(recipe: Path, seed: int, seconds: float) -> list[Measurement]:
 def rows_of(found: list[Measurement]) -> Rows:
     """Bias and noise of measured configurations."""
     return {
-        (f"{m.study} {m.series} {m.name}", part): e
+        (m.label, part): e
         for m in found
         for part, e in (("noise", m.noise), ("bias", m.bias))
         if e is not None
@@ -156,7 +155,6 @@ def main() -> int:
             exponent, biases = independent(arguments.recipe, arguments.seconds)
             measured = [measure(arguments.recipe, s, arguments.seconds) for s in range(arguments.seeds)]
             studies = [rows_of(found) for found in measured]
-            figures["narrow_errors"] = [narrow_errors(found) for found in measured]
             figures["independent_noise_exponent"] = exponent.as_dict()
             thresholds["independent_noise_exponent"] = [-1 - EXPONENT, -1 + EXPONENT]
             met &= abs(exponent.value + 1) <= EXPONENT

@@ -1,7 +1,7 @@
 """Many noisy queries or few clean ones? Test error of a fit at equal total paths.
 
     python benchmarks/query_split.py [MATERIAL ...] [--paths 1.6e6 --paths 6.4e6] [--spp 2 ...] [--steps N]
-                                     [--levels 6] [--height H] [--keep FILE] [--plot FILE]
+                                     [--resolution 64] [--height-scale H] [--keep FILE] [--plot FILE]
 
 For every material (by default three of ``assets/``), total of paths and number of paths per query, a data set
 is generated and ``neumip`` is trained on it for the same number of steps. All fits are evaluated on the same
@@ -34,7 +34,7 @@ ASSETS = ("cliff_rock", "straight_wool", "turtle_shell")
 SPP = (2, 4, 8, 16, 64, 256)
 PATHS = (1.6e6, 6.4e6)
 # What identifies a measurement.
-KEY = ("material", "height", "levels", "steps", "paths", "spp", "schema")
+KEY = ("material", "height_scale", "resolution", "steps", "paths", "spp", "schema")
 
 
 class Kept:
@@ -63,16 +63,17 @@ class Kept:
 
 def measure(
     material: Path,
-    height: float | None,
-    levels: int,
+    height_scale: float | None,
+    resolution: int,
     totals: Sequence[float],
     spps: Sequence[int],
     steps: int,
     kept: Kept,
 ) -> list[dict[str, Any]]:
     """One row per total and number of paths per query."""
+    geometry = {} if height_scale is None else {"height_scale": height_scale}
     config = GeneratorConfig.model_validate(
-        {"material": str(material), "geometry": {"height": height}, "queries": {"levels": levels}}
+        {"material": str(material), "geometry": geometry, "queries": {"resolution": resolution}}
     )
     rows = []
     fit = {"model": "neumip", "training": {"steps": steps}}
@@ -82,7 +83,7 @@ def measure(
         )
         for total in totals:
             for spp in spps:
-                values = (material.name, height, levels, steps, int(total), spp, SCHEMA)
+                values = (material.name, height_scale, resolution, steps, int(total), spp, SCHEMA)
                 key = dict(zip(KEY, values, strict=True))
                 row = kept.find(key)
                 if row is None:
@@ -136,8 +137,8 @@ def main() -> int:
     parser.add_argument("--paths", type=float, action="append", help="total of paths; repeatable")
     parser.add_argument("--spp", type=int, action="append", help="paths per query; repeatable")
     parser.add_argument("--steps", type=int, default=400, help="training steps of each fit")
-    parser.add_argument("--levels", type=int, default=6)
-    parser.add_argument("--height", type=float, help="factor on the stored heights")
+    parser.add_argument("--resolution", type=int, default=64, help="texels across at the finest level")
+    parser.add_argument("--height-scale", type=float, help="factor on the stored heights")
     parser.add_argument("--keep", type=Path, help="file of stored measurements, to resume")
     parser.add_argument("--plot", type=Path, help="PNG of the table")
     arguments = parser.parse_args()
@@ -147,8 +148,8 @@ def main() -> int:
         for material in arguments.materials or [ROOT / "assets" / name for name in ASSETS]:
             rows += measure(
                 material,
-                arguments.height,
-                arguments.levels,
+                arguments.height_scale,
+                arguments.resolution,
                 arguments.paths or PATHS,
                 arguments.spp or SPP,
                 arguments.steps,

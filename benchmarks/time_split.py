@@ -1,6 +1,6 @@
 """Total times split between generating and training: fixed shares, and the share of ``run --time``.
 
-    python benchmarks/time_split.py [MATERIAL ...] [--time 5min] [--share 0.2 ...] [--levels 7]
+    python benchmarks/time_split.py [MATERIAL ...] [--time 5min] [--share 0.2 ...] [--resolution 128]
 
 Each run generates for its share of the time and trains `neumip` with the options of the presets for the rest,
 start-up, loading and evaluation included. All runs are evaluated on the same test set. ``run --time`` pays
@@ -38,9 +38,11 @@ THRESHOLD = 1.2
 TRAINING = 0.5
 
 
-def measure(material: Path, seconds: float, shares: list[float], levels: int, work: Path) -> dict[str, Any]:
+def measure(
+    material: Path, seconds: float, shares: list[float], resolution: int, work: Path
+) -> dict[str, Any]:
     """Errors of the fixed shares and of ``run --time``."""
-    generate = {"material": str(material), "queries": {"levels": levels, "test_spp": 16}}
+    generate = {"material": str(material), "queries": {"resolution": resolution, "test_spp": 16}}
     fit = nested({"model": "neumip", **best_options(TRAINING * seconds)})
     recipe = Recipe.model_validate({"name": "time", "generate": generate, "fit": fit})
 
@@ -80,7 +82,7 @@ def main() -> int:
     parser.add_argument("materials", nargs="*", type=Path)
     parser.add_argument("--time", default="5min", help="total time of a run")
     parser.add_argument("--share", action="append", type=float, help="share that generates (repeatable)")
-    parser.add_argument("--levels", type=int, default=7, help="finest level: 2^levels texels")
+    parser.add_argument("--resolution", type=int, default=128, help="texels across at the finest level")
     arguments = parser.parse_args()
     found = []
     try:
@@ -89,7 +91,7 @@ def main() -> int:
         for material in arguments.materials or [ROOT / "assets" / name for name in ASSETS]:
             with tempfile.TemporaryDirectory() as work:
                 shares = arguments.share or list(SHARES)
-                found.append(measure(material, seconds, shares, arguments.levels, Path(work)))
+                found.append(measure(material, seconds, shares, arguments.resolution, Path(work)))
     except (MbtfError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 3

@@ -69,9 +69,9 @@ def front_rows(folder: Path) -> list[dict[str, str]]:
 
 
 def table(studies: list[Path]) -> str:
-    """How well errors are known, and the Pareto fronts of all studies with commands, as Markdown."""
+    """The seed variance, and the Pareto fronts of all studies with commands, as Markdown."""
     records = {f: json.loads((f / "study.json").read_text(encoding="utf-8")) for f in studies}
-    lines = ["| study | errors within ± 10 % (95 %) | standard deviation over seeds |", "|---|---|---|"]
+    lines = ["| study | standard deviation over seeds |", "|---|---|"]
     for folder, study in records.items():
         found = study.get("summary")
         if found is None:
@@ -80,7 +80,7 @@ def table(studies: list[Path]) -> str:
         text = (
             "–" if deviation is None else f"{100 * deviation['value']:.1f} ± {100 * deviation['error']:.1f} %"
         )
-        lines.append(f"| `{folder.name}` | {found['narrow']} of {found['known']} | {text} |")
+        lines.append(f"| `{folder.name}` | {text} |")
     lines.append("")
     for folder, study in records.items():
         where = f"{study['machine']['system']}, {study['date']}"

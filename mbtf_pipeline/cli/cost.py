@@ -25,7 +25,7 @@ def cost(
     """Measure error against time for this material and machine: mbtf-pipeline cost RECIPE
 
     Writes cost.html, cost.csv and PNGs. The same command resumes. A longer time keeps the measurements of the
-    generator and of whole runs, and adds longer runs.
+    generator and of complete runs, and adds longer runs.
 
     Parameters
     ----------

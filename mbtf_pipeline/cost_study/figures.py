@@ -10,31 +10,27 @@ from typing import Any
 
 from mbtf_core.stats import Estimate
 from mbtf_pipeline.cost_study.fit_runs import PRESET
-from mbtf_pipeline.cost_study.measurements import Measurement
+from mbtf_pipeline.cost_study.measurements import COMPARISONS, Measurement
 from mbtf_pipeline.cost_study.pareto import pareto_front
+from mbtf_pipeline.formatting import is_significant
 from mbtf_pipeline.report.plots import Cloud, scatter
 
 NOISE_AXIS = "RMS error relative to the mean value"
 ERROR_AXIS = "unexplained variance of test queries"
 TIME_AXIS = "seconds per million queries"
-_RUNS = {"whole": "whole runs", "models": "models and sizes", "data": "queries or paths"}
 
 Value = Callable[[Measurement], Estimate]
-
-
-def is_significant(bias: Estimate | None) -> bool:
-    """Whether a bias differs from zero by more than two standard errors."""
-    return bias is not None and bias.value > 2 * bias.error
+# Figures of measurements, also written to this PNG and others beside it.
+Figures = Callable[[Sequence[Measurement], Path], list[dict[str, Any]]]
 
 
 def _figure(
-    clouds: Sequence[Cloud], x: str, y: str, name: str, folder: Path, caption: str = "", **options: Any
+    clouds: Sequence[Cloud], x: str, y: str, png: Path, caption: str = "", **options: Any
 ) -> dict[str, Any]:
     shown = [c for c in clouds if len(c.x)]
     if not shown:
         return {"svg": "", "caption": f"No {y} could be measured."}
-    svg = scatter(shown, x, y, f"cost {name}", png=folder / f"{name}.png", **options)
-    return {"svg": svg, "caption": caption}
+    return {"svg": scatter(shown, x, y, f"cost {png.stem}", png=png, **options), "caption": caption}
 
 
 def _cloud(
@@ -55,59 +51,49 @@ def _cloud(
 
 
 def _by_series(found: Sequence[Measurement], **options: Any) -> list[Cloud]:
-    names = list(dict.fromkeys(m.series for m in found))
+    names = dict.fromkeys(m.series for m in found)
     return [_cloud(n, [m for m in found if m.series == n], **options) for n in names]
 
 
-def noise_figures(found: Sequence[Measurement], name: str, folder: Path) -> list[dict[str, Any]]:
-    """Noise over seconds, one line per series."""
-    return [_figure(_by_series(found), TIME_AXIS, NOISE_AXIS, name, folder)]
+def lines(x: str, y: str) -> Figures:
+    """Error over seconds, one line per series; axes with these titles."""
+    return lambda found, png: [_figure(_by_series(found), x, y, png)]
 
 
-def bias_figures(found: Sequence[Measurement], name: str, folder: Path) -> list[dict[str, Any]]:
+def bias_figures(found: Sequence[Measurement], png: Path) -> list[dict[str, Any]]:
     """Bias and noise over seconds."""
-    biased = [m for m in found if is_significant(m.bias)]
+    biased = [m for m in found if m.bias and is_significant(m.bias)]
+    unbiased = [m for m in found if m not in biased]
     clouds = [
-        _cloud("bias", biased, lambda m: m.bias or m.error, joined=False),
+        _cloud("bias", biased, attrgetter("bias"), joined=False),
         _cloud(
             "noise",
             found,
-            lambda m: m.noise or m.error,
-            label=lambda m: "" if is_significant(m.bias) else m.name,
+            attrgetter("noise"),
+            label=lambda m: m.name if m in unbiased else "",
             joined=False,
             hollow=True,
         ),
     ]
-    limits = [2 * max(m.bias.error, m.bias.value) for m in found if m.bias and not is_significant(m.bias)]
-    caption = ""
-    if limits:
-        limit = 100 * max(limits)
-        caption = (
-            f"Labels at the noise: the bias is not significant, at most {limit:.2g} % of the mean value."
-        )
-    return [_figure(clouds, TIME_AXIS, NOISE_AXIS, name, folder, caption)]
+    limit = 100 * max((2 * max(m.bias.error, m.bias.value) for m in unbiased if m.bias), default=0.0)
+    caption = f"Labels at the noise: the bias is not significant, at most {limit:.2g} % of the mean value."
+    return [_figure(clouds, TIME_AXIS, NOISE_AXIS, png, caption if unbiased else "")]
 
 
-def data_figures(found: Sequence[Measurement], name: str, folder: Path) -> list[dict[str, Any]]:
-    """Error over seconds of generating."""
-    return [_figure(_by_series(found), "seconds of generating", ERROR_AXIS, name, folder)]
-
-
-def model_figures(found: Sequence[Measurement], name: str, folder: Path) -> list[dict[str, Any]]:
+def model_figures(found: Sequence[Measurement], png: Path) -> list[dict[str, Any]]:
     """Error over seconds of training, and over milliseconds of evaluation."""
-    series = dict.fromkeys(m.series for m in found)
-    longest = [max((m for m in found if m.series == s), key=lambda m: m.seconds.value) for s in series]
+    longest = {m.series: m for m in sorted(found, key=lambda m: m.seconds.value)}
     evaluated = _by_series(
-        longest,
-        x=lambda m: Estimate(m.details.get("evaluation_ms_1080p", math.nan), 0.0, 1),
+        list(longest.values()),
+        x=lambda m: Estimate(m.details["evaluation_ms_1080p"], 0.0, 1),
         label=lambda m: m.series.removeprefix("neumip, "),
         joined=False,
     )
     axis = "milliseconds for a 1080p image, one query per pixel"
-    caption = "The longest training of each."
+    second = png.with_name(f"{png.stem}_evaluation.png")
     return [
-        _figure(_by_series(found), "seconds of training", ERROR_AXIS, name, folder),
-        _figure(evaluated, axis, ERROR_AXIS, f"{name}_evaluation", folder, caption),
+        _figure(_by_series(found), "seconds of training", ERROR_AXIS, png),
+        _figure(evaluated, axis, ERROR_AXIS, second, "The longest training of each."),
     ]
 
 
@@ -119,19 +105,19 @@ def run_name(m: Measurement) -> str:
     return f"{name}, {m.series.partition(', ')[2] or f'{m.series} of its paper'}"
 
 
-def front_figures(runs: Sequence[Measurement], folder: Path) -> list[dict[str, Any]]:
+def front_figures(runs: Sequence[Measurement], png: Path) -> list[dict[str, Any]]:
     """All runs and their Pareto front, whose points have names."""
     front = pareto_front(runs)
     clouds = [
         _cloud(
-            title,
+            COMPARISONS[study],
             [m for m in runs if m.study == study],
             label=lambda m: run_name(m) if m in front else "",
             joined=False,
         )
-        for study, title in _RUNS.items()
+        for study in dict.fromkeys(m.study for m in runs)
     ]
     axis = "seconds in total, from height map to material"
     caption = "Names on the front: training queries × paths per query, and models other than the preset's."
     points = [(m.seconds.value, m.error.value) for m in front]
-    return [_figure(clouds, axis, ERROR_AXIS, "front", folder, caption, front=points)]
+    return [_figure(clouds, axis, ERROR_AXIS, png, caption, front=points)]

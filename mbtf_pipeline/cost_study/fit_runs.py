@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from functools import partial
+from itertools import product
 
 from mbtf_core.config_file import nested
 from mbtf_fit.presets import best_options
@@ -14,7 +14,7 @@ from mbtf_pipeline.cost_study.runs import DataRequest, Run
 # for start-up, the test set and evaluation.
 GENERATOR = 0.1
 RUN_SHARES = {"whole": 0.42, "models": 0.15, "data": 0.13}
-# Total times of whole runs, seconds: this one, twice, four times, ...; the share of each that generates.
+# Total times of complete runs, seconds: this one, twice, four times, ...; the share of each that generates.
 SHORTEST = 8.0
 SHARE, OTHER_SHARES = 0.35, (0.6, 0.15)
 # Paths per query of the data, and the total paths at which they are compared, relative to their mean.
@@ -31,29 +31,21 @@ SIZES: dict[str, dict[str, object]] = {
 }
 _FEWEST_QUERIES = 20_000
 
-# Seconds to generate a query, by its number of paths.
-QuerySeconds = Callable[[int], float]
 
-
-def planned_runs(seconds: float, spp: int, query_seconds: QuerySeconds) -> list[Run]:
+def planned_runs(seconds: float, spp: int, path_seconds: float) -> list[Run]:
     """All runs of a study of so many seconds, in the order of measuring, each with the study's own seed.
+    Queries have `spp` paths in the recipe, each of which takes `path_seconds` to generate."""
 
-    Parameters
-    ----------
-    spp : paths per query of the recipe
-    """
-    each = seconds / FEWEST_SEEDS
+    def data(length: float) -> DataRequest:
+        """The queries of the recipe that take so many seconds."""
+        return DataRequest(round_down(max(_FEWEST_QUERIES, length / (spp * path_seconds))), spp)
+
     planners = {"whole": _whole, "models": _models, "data": _data}
     return [
         run
         for study, share in RUN_SHARES.items()
-        for run in planners[study](share * each, spp, query_seconds)
+        for run in planners[study](share * seconds / FEWEST_SEEDS, data)
     ]
-
-
-def _queries(seconds: float, spp: int, query_seconds: QuerySeconds) -> int:
-    """Number of queries that take so many seconds, rounded to two digits."""
-    return round_down(max(_FEWEST_QUERIES, seconds / query_seconds(spp)))
 
 
 def round_down(count: float) -> int:
@@ -67,54 +59,45 @@ def _preset(seconds: float) -> dict[str, object]:
     return nested({"model": "neumip", **best_options(seconds), "training.time": f"{seconds:.3g}s"})
 
 
-def _plain(model: str, seconds: float, network: dict[str, object] | None = None) -> dict[str, object]:
+def _plain(model: str, seconds: float, **network: object) -> dict[str, object]:
     """A fit as in the paper of its model, except for `network`."""
-    options = {} if network is None else {"network": network}
-    return {"model": model, "training": {"time": f"{seconds:.3g}s", "noise_regularization": 0.0}, **options}
+    training = {"time": f"{seconds:.3g}s", "noise_regularization": 0.0}
+    return {"model": model, "network": network, "training": training}
 
 
-def _whole(seconds: float, spp: int, query_seconds: QuerySeconds) -> Iterator[Run]:
+def _whole(seconds: float, data: Callable[[float], DataRequest]) -> Iterator[Run]:
     """Runs of doubling total time; the remaining time goes to other shares of generating, shortest first."""
     totals = [SHORTEST]
     while sum(totals) + 2 * totals[-1] <= seconds:
         totals.append(2 * totals[-1])
-    planned = [(total, SHARE) for total in totals]
     left = seconds - sum(totals)
-    for total in totals:
-        for share in OTHER_SHARES:
-            if total <= left:
-                planned.append((total, share))
-                left -= total
+    planned = [(total, SHARE) for total in totals]
+    for total, share in product(totals, OTHER_SHARES):
+        if total <= left:
+            planned.append((total, share))
+            left -= total
     for total, share in planned:
-        data = DataRequest(_queries(share * total, spp, query_seconds), spp)
-        yield Run(
-            "whole", f"{share:.0%} generating", f"{total:g} s planned", data, _preset((1 - share) * total)
-        )
+        series, fit = f"{100 * share:.0f} % of the time for generating", _preset((1 - share) * total)
+        yield Run("whole", series, f"planned for {total:g} s", data(share * total), fit)
 
 
-def _data(seconds: float, spp: int, query_seconds: QuerySeconds) -> Iterator[Run]:
+def _data(seconds: float, data: Callable[[float], DataRequest]) -> Iterator[Run]:
     """Data of equal total paths, divided among many or few queries, each with an equally long fit."""
     each = seconds / (len(TOTAL_PATHS) * len(PATHS))
-    paths = spp * _queries(each / 3, spp, query_seconds)
-    for n in PATHS:
-        for factor in TOTAL_PATHS:
-            queries = max(_FEWEST_QUERIES, int(factor * paths) // n)
-            data = DataRequest(queries, n)
-            yield Run(
-                "data", f"{n} paths/query", f"{queries * n / 1e6:.3g} M paths", data, _preset(2 * each / 3)
-            )
+    mean = data(each / 3)
+    for n, factor in product(PATHS, TOTAL_PATHS):
+        queries = max(_FEWEST_QUERIES, int(factor * mean.spp * mean.queries) // n)
+        name = f"{queries * n / 1e6:.3g} M paths"
+        yield Run("data", f"{n} paths per query", name, DataRequest(queries, n), _preset(2 * each / 3))
 
 
-def _models(seconds: float, spp: int, query_seconds: QuerySeconds) -> Iterator[Run]:
+def _models(seconds: float, data: Callable[[float], DataRequest]) -> Iterator[Run]:
     """Models and network sizes over training time, on one data set."""
     generating = 1.5
     unit = seconds / (generating + 3 * (1 + len(MODELS_OF_PAPERS)) + 2 * len(SIZES))
-    data = DataRequest(_queries(generating * unit, spp, query_seconds), spp)
-    fits: dict[str, Callable[[float], dict[str, object]]] = {PRESET: _preset}
-    fits.update({m: partial(_plain, m) for m in MODELS_OF_PAPERS})
-    for name, fit in fits.items():
-        for length in (unit, 2 * unit):
-            yield Run("models", name, f"{length:.3g} s", data, fit(length))
-    for size, network in SIZES.items():
-        length = 2 * unit
-        yield Run("models", f"neumip, {size}", f"{length:.3g} s", data, _plain("neumip", length, network))
+    shared = data(generating * unit)
+    fits = [(PRESET, t, _preset(t)) for t in (unit, 2 * unit)]
+    fits += [(model, t, _plain(model, t)) for model in MODELS_OF_PAPERS for t in (unit, 2 * unit)]
+    fits += [(f"neumip, {s}", 2 * unit, _plain("neumip", 2 * unit, **net)) for s, net in SIZES.items()]
+    for series, length, fit in fits:
+        yield Run("models", series, f"{length:.3g} s of training", shared, fit)

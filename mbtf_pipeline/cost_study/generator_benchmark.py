@@ -4,22 +4,21 @@ A configuration is compared with a reference at the same queries. With halves a,
 r, s of the reference, (a, r) independent of (b, s), ``E[(a - r)(b - s)]`` is the squared bias, free of the
 noise of both. Within a half both use the same random numbers, so most of the noise cancels in the differences
 and biases far below the noise are significant. ``E[(a - b)²/4]`` is the variance of the configuration's
-noise. Both are given as root mean squares relative to the mean value of the reference; the error of that mean
-is part of their error bars.
+noise. Both are given as root mean squares relative to the mean value of the reference.
 """
 
 from __future__ import annotations
 
 import math
-import statistics
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import median_abs_deviation
 
+from mbtf_core.config_file import deep_merge, nested
 from mbtf_core.stats import Estimate, mean_estimate
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job, split_spp, split_target
@@ -35,8 +34,8 @@ from mbtf_pipeline.cost_study.measurements import HALF_WIDTH, NORMAL
 # Queries of one batch of the reference, and paths of each there and in the configuration.
 BIAS_QUERIES, BIAS_SPP = 1 << 14, 64
 _MOST_BIAS_BATCHES = 16
-# Batches of queries for the mean value, and paths of each query.
-_MEAN_BATCHES, _MEAN_QUERIES, _MEAN_SPP = 4, 1 << 17, 2
+# Queries for the mean value, and paths of each.
+_MEAN_QUERIES, _MEAN_SPP = 1 << 19, 2
 # Paths of one timed batch, and the fewest batches. Closed forms take fewer paths per query than counted here.
 _BATCH_PATHS = 1 << 19
 _FEWEST_BATCHES = 8
@@ -46,142 +45,106 @@ _NEGLIGIBLE = 0.005
 # Random streams of the study stand for shards of so many queries, from these numbers on.
 SHARD = 1 << 14
 _FIRST_MEAN, _FIRST_REFERENCE, _FIRST_BATCH = 1_001, 5_001, 10_001
-# Queries that measure how many paths a target error takes.
+# Queries that measure how many paths a batch takes.
 _PROBE = 2048
 
-
-@dataclass(frozen=True)
-class _Reference:
-    """Queries and both halves (n, 3) of the reference's values there."""
-
-    queries: Queries
-    a: NDArray[np.float64]
-    b: NDArray[np.float64]
+Halves = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
-@dataclass
+def _halves(job: Job, estimator: Any, queries: Queries, spp: int, shard: int) -> Halves:
+    """Both halves (n, 3) of values, with the random numbers of a shard."""
+    found = estimator.estimate(queries, spp, Stream(job.config.seed, "test", shard))
+    return found.value_a.astype(np.float64), found.value_b.astype(np.float64)
+
+
+class Reference:
+    """Values of a configuration with all effects and unlimited paths, made when they are first needed."""
+
+    def __init__(self, job: Job) -> None:
+        self.job = job
+        self.estimator = build_estimator(job, plan_effects(job))
+        self._batches: list[tuple[Queries, Halves]] = []
+
+    @cached_property
+    def mean(self) -> float:
+        """Mean value, 1/sr."""
+        queries = self.job.query_plan.draw("test", _FIRST_MEAN, _MEAN_QUERIES)
+        a, b = _halves(self.job, self.estimator, queries, _MEAN_SPP, _FIRST_MEAN)
+        return float(0.5 * (a + b).mean())
+
+    def batch(self, number: int) -> tuple[Queries, Halves]:
+        """Queries, and both halves (n, 3) of the values there; batches are made in their order."""
+        if number == len(self._batches):
+            shard = _FIRST_REFERENCE + number
+            queries = self.job.query_plan.draw("test", shard, BIAS_QUERIES)
+            self._batches.append((queries, _halves(self.job, self.estimator, queries, BIAS_SPP, shard)))
+        return self._batches[number]
+
+
 class GeneratorBenchmark:
     """Measures configurations of one material against references with all effects and unlimited paths.
 
     Parameters
     ----------
     config : the recipe's generator; its finest level is fixed, so that all configurations have equal queries
-    seed : of queries and paths
     """
 
-    config: GeneratorConfig
-    material: Material
-    seed: int
-    _cache: dict[str, Any] = field(default_factory=dict, repr=False)
+    def __init__(self, config: GeneratorConfig, material: Material) -> None:
+        self.config, self.material = config, material
+        self._references: dict[str, Reference] = {}
 
     def job(self, changes: dict[str, Any]) -> Job:
         """The job with options changed, by dotted name."""
-        data = self.config.model_dump(mode="json")
         fixed = {
             "queries.resolution": 1 << Job(self.config, self.material).lattice.finest,
             "queries.layout": "shuffled",
             "output.shard_queries": SHARD,
         }
-        for name, value in {**fixed, **changes}.items():
-            section, _, key = name.rpartition(".")
-            (data[section] if section else data)[key] = value
-        return Job(GeneratorConfig.model_validate({**data, "seed": self.seed}), self.material)
+        data = deep_merge(self.config.model_dump(mode="json"), nested({**fixed, **changes}))
+        return Job(GeneratorConfig.model_validate(data), self.material)
 
-    def _queries(self, job: Job, shard: int, count: int) -> Queries:
-        """Queries of a test split, one leading axis."""
-        return job.query_plan.draw("test", shard, count)
-
-    def _once(self, make: Callable[..., Any], changes: dict[str, Any], *rest: int) -> Any:
-        """What `make` gives for a reference with these options, made once."""
-        key = f"{make.__name__} {sorted(changes.items())} {rest}"
-        if key not in self._cache:
-            self._cache[key] = make(changes, *rest)
-        return self._cache[key]
-
-    def reference(self, changes: dict[str, Any], batch: int) -> _Reference:
-        """One batch of the reference with these options."""
-        found: _Reference = self._once(self._make_reference, changes, batch)
-        return found
-
-    def _make_reference(self, changes: dict[str, Any], batch: int) -> _Reference:
-        job, estimator = self._once(self._make_estimator, changes)
-        queries = self._queries(job, _FIRST_REFERENCE + batch, BIAS_QUERIES)
-        return _Reference(queries, *self._bias_halves(estimator, queries, batch, BIAS_SPP))
-
-    def mean(self, changes: dict[str, Any]) -> Estimate:
-        """Mean value of the reference with these options, 1/sr."""
-        found: Estimate = self._once(self._make_mean, changes)
-        return found
-
-    def _make_mean(self, changes: dict[str, Any]) -> Estimate:
-        job, estimator = self._once(self._make_estimator, changes)
-        parts = []
-        for number in range(_MEAN_BATCHES):
-            shard = _FIRST_MEAN + number * (_MEAN_QUERIES // SHARD)
-            queries = self._queries(job, shard, _MEAN_QUERIES)
-            found = estimator.estimate(queries, _MEAN_SPP, Stream(self.seed, "test", shard))
-            parts.append(0.5 * (found.value_a.astype(np.float64) + found.value_b).mean(axis=1))
-        return mean_estimate(np.concatenate(parts))
-
-    def _make_estimator(self, changes: dict[str, Any]) -> tuple[Job, Any]:
-        job = self.job({"effects.mode": "all", "transport.max_depth": 0, **changes})
-        return job, build_estimator(job, plan_effects(job))
-
-    def _bias_halves(
-        self, estimator: Any, queries: Queries, batch: int, spp: int
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Both halves (n, 3) of values with the random numbers of a batch of the reference."""
-        found = estimator.estimate(queries, spp, Stream(self.seed, "test", _FIRST_REFERENCE + batch))
-        return found.value_a.astype(np.float64), found.value_b.astype(np.float64)
+    def reference(self, changes: dict[str, Any]) -> Reference:
+        """The reference with these options."""
+        key = repr(changes)
+        if key not in self._references:
+            job = self.job({"effects.mode": "all", "transport.max_depth": 0, **changes})
+            self._references[key] = Reference(job)
+        return self._references[key]
 
     def measure(
         self, changes: dict[str, Any], against: dict[str, Any] | None, seconds: float
     ) -> tuple[Estimate, Estimate, Estimate | None, Estimate]:
         """(seconds per million queries, error, bias, noise) of a configuration; errors are root mean squares
-        relative to the mean value of the reference.
-
-        Parameters
-        ----------
-        changes : options of the configuration
-        against : options of its reference; None where only paths per query differ, which adds no bias
-        seconds : largest time of each of noise and bias; less once the error bars are small
-        """
-        mean = self.mean(against or {})
-        noise, time_per_million = self.noise(self.job(changes), seconds, mean.value)
-        root = _relative_to(_root(noise), mean)
+        relative to the mean value of the reference. Without options of a reference only paths per query
+        differ, which adds no bias. Noise and bias take at most so many seconds each."""
+        noise, time_per_million = self._noise(self.job(changes), seconds, self.reference(against or {}).mean)
         if against is None:
-            return time_per_million, root, None, root
+            return time_per_million, _root(noise), None, _root(noise)
         bias = self.bias(changes, against, seconds)
         # A squared bias that noise made negative counts as none.
         square = Estimate(max(bias.value, 0.0) + noise.value, math.hypot(bias.error, noise.error), noise.n)
-        error, root_bias = (_relative_to(_root(e), mean) for e in (square, bias))
-        return time_per_million, error, root_bias, root
+        return time_per_million, _root(square), _root(bias), _root(noise)
 
     def bias(
         self, changes: dict[str, Any], against: dict[str, Any], seconds: float, spp: int = BIAS_SPP
     ) -> Estimate:
-        """Squared bias relative to the squared mean value.
-
-        Parameters
-        ----------
-        spp : paths of each query; the expected value does not depend on them
-        """
-        job = self.job(changes)
+        """Squared bias relative to the squared mean value; `spp` paths of each query do not change its
+        expected value."""
+        job, reference = self.job(changes), self.reference(against)
         estimator = build_estimator(job, plan_effects(job))
-        mean = self.mean(against).value
         start = time.perf_counter()
         squares: list[NDArray[np.float64]] = []
         while True:
-            reference = self.reference(against, len(squares))
-            a, b = self._bias_halves(estimator, reference.queries, len(squares), spp)
-            squares.append(((a - reference.a) * (b - reference.b)).mean(axis=1) / mean**2)
+            queries, (r, s) = reference.batch(len(squares))
+            a, b = _halves(job, estimator, queries, spp, _FIRST_REFERENCE + len(squares))
+            squares.append(((a - r) * (b - s)).mean(axis=1) / reference.mean**2)
             square = mean_estimate(np.concatenate(squares))
             enough = NORMAL * square.error <= max(2 * HALF_WIDTH * square.value, _NEGLIGIBLE**2)
             late = time.perf_counter() - start > seconds or len(squares) == _MOST_BIAS_BATCHES
             if enough or late:
                 return square
 
-    def noise(self, job: Job, seconds: float, mean: float) -> tuple[Estimate, Estimate]:
+    def _noise(self, job: Job, seconds: float, mean: float) -> tuple[Estimate, Estimate]:
         """Noise variance of one query relative to the squared mean value, and seconds per million queries.
 
         Queries get paths as in a data set: equally many, more where more noise is expected, or as many as a
@@ -190,27 +153,26 @@ class GeneratorBenchmark:
         plan = allocate(job, plan_effects(job))
         estimator = build_estimator(job, plan.effects)
         target, spp = split_target(job.config, "train"), split_spp(job.config, "train")
-        paths: float = spp
-        if target is not None:
-            probe = self._queries(job, _FIRST_BATCH - 1, _PROBE)
-            stream = Stream(self.seed, "test", _FIRST_BATCH - 1)
-            paths = estimate_shard(estimator, probe, spp, target, stream, plan.allocation).paths / _PROBE
-        count = max(1, round(_BATCH_PATHS / max(paths, _FEWEST_PATHS)))
+
+        def batch(shard: int, count: int) -> tuple[Any, float]:
+            queries = job.query_plan.draw("test", shard, count)
+            stream = Stream(job.config.seed, "test", shard)
+            start = time.perf_counter()
+            found = estimate_shard(estimator, queries, spp, target, stream, plan.allocation)
+            return found, (time.perf_counter() - start) / count * 1e6
+
+        paths = batch(_FIRST_BATCH - 1, _PROBE)[0].paths / _PROBE
+        count = round(_BATCH_PATHS / max(paths, _FEWEST_PATHS))
         squares: list[NDArray[np.float64]] = []
         times: list[float] = []
         began = time.perf_counter()
         while True:
-            shard = _FIRST_BATCH + len(squares)
-            queries = self._queries(job, shard, count)
-            start = time.perf_counter()
-            found = estimate_shard(
-                estimator, queries, spp, target, Stream(self.seed, "test", shard), plan.allocation
-            )
-            times.append((time.perf_counter() - start) / count * 1e6)
+            found, seconds_per_million = batch(_FIRST_BATCH + len(squares), count)
+            times.append(seconds_per_million)
             squares.append(((found.value_a.astype(np.float64) - found.value_b) ** 2 / 4.0).mean(axis=1))
             variance = mean_estimate(np.concatenate(squares)).scaled(1.0 / mean**2)
             # The 95 % interval of its root.
-            narrow = NORMAL * variance.error <= 2 * HALF_WIDTH * variance.value or variance.value == 0
+            narrow = NORMAL * variance.error <= 2 * HALF_WIDTH * variance.value
             late = time.perf_counter() - began > seconds
             if len(squares) >= _FEWEST_BATCHES and (narrow or late):
                 # The first batch may compile kernels.
@@ -220,16 +182,8 @@ class GeneratorBenchmark:
 def _median(times: list[float]) -> Estimate:
     """Median, which other work on the machine changes little, and its standard error from the median absolute
     deviation, both as for a normal distribution."""
-    middle = statistics.median(times)
-    deviation = 1.4826 * statistics.median(abs(t - middle) for t in times)
-    return Estimate(middle, 1.2533 * deviation / math.sqrt(len(times)), len(times))
-
-
-def _relative_to(relative: Estimate, mean: Estimate) -> Estimate:
-    """A number relative to a mean value, with the error of that mean."""
-    return Estimate(
-        relative.value, math.hypot(relative.error, relative.value * mean.relative_error), relative.n
-    )
+    deviation = float(median_abs_deviation(times, scale="normal"))
+    return Estimate(float(np.median(times)), 1.2533 * deviation / math.sqrt(len(times)), len(times))
 
 
 def _root(square: Estimate) -> Estimate:

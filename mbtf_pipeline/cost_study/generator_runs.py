@@ -8,7 +8,7 @@ from typing import Any
 
 from mbtf_gen.planning.effects_plan import plan_effects
 from mbtf_pipeline.cost_study.generator_benchmark import GeneratorBenchmark
-from mbtf_pipeline.cost_study.measurements import Measurement
+from mbtf_pipeline.cost_study.measurements import Configuration, Measurement
 
 PATHS = (2, 4, 8, 16, 32, 64, 128)
 TARGETS = ("40%", "20%", "10%")
@@ -21,37 +21,21 @@ UNIFORM = {"queries.allocation": "uniform"}
 
 
 @dataclass(frozen=True)
-class GeneratorTask:
-    """One configuration to measure.
+class GeneratorTask(Configuration):
+    """A configuration of the generator: options that differ from the recipe, and those of its reference (None
+    where only paths per query differ)."""
 
-    Attributes
-    ----------
-    study, series, name : see :class:`~mbtf_pipeline.cost_study.measurements.Measurement`
-    changes : options of the configuration
-    against : options of its reference; None where only paths per query differ
-    """
-
-    study: str
-    series: str
-    name: str
     changes: dict[str, Any]
     against: dict[str, Any] | None = field(default_factory=dict)
 
     @property
-    def label(self) -> str:
-        """Its name among all configurations."""
-        series = "" if self.series == self.study else f"{self.series}, "
-        return f"{self.study}: {series}{self.name}"
-
-    @property
     def key(self) -> dict[str, Any]:
-        """What its measurement depends on besides the study's basis."""
         return {"changes": self.changes, "against": self.against}
 
-    def run(self, benchmark: GeneratorBenchmark, seconds: float) -> Measurement:
+    def run(self, benchmark: GeneratorBenchmark, seconds: float, command: str = "") -> Measurement:
         """Measure it, for at most so many seconds each of noise and bias."""
         found = benchmark.measure(self.changes, self.against, seconds)
-        return Measurement(self.study, self.series, self.name, self.changes, "", *found)
+        return Measurement(self.study, self.series, self.name, command, *found)
 
     def command(self, generator: str) -> str:
         """Reproduces it: the generator's command with the study's configuration, and the changed options."""
@@ -61,35 +45,29 @@ class GeneratorTask:
 
 def generator_tasks(benchmark: GeneratorBenchmark) -> Iterator[GeneratorTask]:
     """All configurations, the most important first."""
+
+    def paths(series: str, name: str, **changes: Any) -> GeneratorTask:
+        options = {f"queries.{key}": value for key, value in changes.items()}
+        return GeneratorTask("paths", series, name, options, None)
+
     for n in PATHS:
-        changes: dict[str, Any] = {**UNIFORM, "queries.spp": n}
-        yield GeneratorTask("paths", "uniform", f"{n} paths", changes, None)
-    yield from _effects(benchmark)
-    yield from _meshes(benchmark)
-    for depth in DEPTHS:
-        name = f"{depth} interaction{'s' * (depth > 1)}" if depth else "no limit"
-        changes = {**UNIFORM, "transport.max_depth": depth, "effects.mode": "all"}
-        yield GeneratorTask("interactions", "interactions", name, changes)
-    for n in PATHS[1::2]:
-        changes = {"queries.allocation": "noise", "queries.spp": n}
-        yield GeneratorTask("paths", "by expected noise", f"{n} paths", changes, None)
-    for error in TARGETS:
-        changes = {"queries.target_error": error}
-        yield GeneratorTask("paths", "by target error", error.replace("%", " %"), changes, None)
-
-
-def _effects(benchmark: GeneratorBenchmark) -> Iterator[GeneratorTask]:
+        yield paths("uniform", f"{n} paths", allocation="uniform", spp=n)
     everything = plan_effects(benchmark.job({"effects.mode": "all"}), pilots=False)
     modes = {"auto": "auto", "all": "all"}
     # An effect that the material does not have cannot be left out.
     modes |= {f"without {e.name}": f"all,-{e.name}" for e in everything.effects if e.on and e.present}
     for name, mode in modes.items():
-        yield GeneratorTask("effects", "effects", name, {**UNIFORM, "effects.mode": mode})
-
-
-def _meshes(benchmark: GeneratorBenchmark) -> Iterator[GeneratorTask]:
+        yield GeneratorTask("effects", "", name, {**UNIFORM, "effects.mode": mode})
     own = benchmark.job({}).grid.z.shape[1]
     sizes = sorted({max(8, min(FINEST_MESH, round(factor * own))) for factor in MESH_FACTORS} | {own})
     for cells in sizes:
         changes, against = {**UNIFORM, "geometry.mesh": cells}, {"geometry.mesh": sizes[-1]}
-        yield GeneratorTask("mesh", "mesh", f"{cells} cells", changes, against)
+        yield GeneratorTask("mesh", "", f"{cells} cells", changes, against)
+    for depth in DEPTHS:
+        name = f"{depth} interaction{'s' * (depth > 1)}" if depth else "no limit"
+        changes = {**UNIFORM, "transport.max_depth": depth, "effects.mode": "all"}
+        yield GeneratorTask("interactions", "", name, changes)
+    for n in PATHS[1::2]:
+        yield paths("by expected noise", f"{n} paths", allocation="noise", spp=n)
+    for error in TARGETS:
+        yield paths("by target error", error.replace("%", " %"), target_error=error)

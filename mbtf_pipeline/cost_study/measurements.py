@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,25 +12,56 @@ from mbtf_core.errors import InputError
 from mbtf_core.stats import Estimate
 from mbtf_pipeline.formatting import estimate
 
-FORMAT = "mbtf-cost-measurement"
 # Raised when the method of measuring changes: older measurements are then repeated.
-SCHEMA = 6
+SCHEMA = 7
 FOLDER = "measurements"
 # Relative half-width of a 95 % interval that a study aims at, and that half-width over the standard error.
 HALF_WIDTH = 0.1
 NORMAL = 1.96
+# The comparisons of a study, in words.
+COMPARISONS = {
+    "whole": "complete run",
+    "models": "models and sizes",
+    "data": "queries or paths",
+    "paths": "paths per query",
+    "effects": "effects",
+    "mesh": "mesh",
+    "interactions": "surface interactions",
+}
+ESTIMATES = ("seconds", "error", "bias", "noise")
 
 
 @dataclass(frozen=True)
-class Measurement:
+class Configuration:
+    """What is measured: the comparison that it belongs to, its line in the plot of that comparison (empty
+    where there is only one), and its name on that line."""
+
+    study: str
+    series: str
+    name: str
+
+    @property
+    def title(self) -> str:
+        """Series and name."""
+        return ", ".join(filter(None, (self.series, self.name)))
+
+    @property
+    def label(self) -> str:
+        """Its name among all configurations."""
+        return f"{COMPARISONS[self.study]}: {self.title}"
+
+    @property
+    def key(self) -> dict[str, Any]:
+        """What its measurement depends on besides the study's basis."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class Measurement(Configuration):
     """A measured configuration.
 
     Attributes
     ----------
-    study : the comparison that it belongs to
-    series : its line in the plot of that comparison
-    name : its name within the series
-    options : of the configuration, by dotted name, as ``--set`` takes them
     command : reproduces it with the programs
     seconds : its time: per million queries for the generator; of generating in ``data``, of training in
         ``models``, of both with everything around them in ``whole``
@@ -40,10 +70,6 @@ class Measurement:
     details : further numbers by name: generation and training seconds, bytes, milliseconds
     """
 
-    study: str
-    series: str
-    name: str
-    options: dict[str, Any]
     command: str
     seconds: Estimate
     error: Estimate
@@ -52,51 +78,31 @@ class Measurement:
     details: dict[str, float] = field(default_factory=dict)
 
 
-_ESTIMATES = ("seconds", "error", "bias", "noise")
-
-
 class MeasurementFolder:
-    """Finished measurements, one file each, so that a study resumes where it stopped.
+    """Finished measurements, one file each, so that a study resumes where it stopped; `basis` is the hash of
+    the material and the configuration with its seed."""
 
-    Parameters
-    ----------
-    folder : of the study
-    basis : what all measurements depend on: the hash of the material and the configuration, with its seed
-    """
-
-    def __init__(self, folder: Path, basis: dict[str, Any]) -> None:
+    def __init__(self, folder: Path, basis: str) -> None:
         self.folder = folder / FOLDER
         self.basis = basis
-
-    def _path(self, study: str, key: dict[str, Any]) -> Path:
-        digest = data_sha256({"schema": SCHEMA, "basis": self.basis, "study": study, "key": key})
-        return self.folder / f"{study}-{digest[:16]}.json"
-
-    def get(self, study: str, key: dict[str, Any]) -> Measurement | None:
-        """The stored measurement of a configuration; None where it is missing or its file is damaged."""
-        path = self._path(study, key)
-        if not path.exists():
-            return None
-        try:
-            data = read_json(path)
-            if data.pop("format") != FORMAT or data.pop("schema") != SCHEMA:
-                return None
-            data |= {name: e and estimate(e) for name in _ESTIMATES for e in (data[name],)}
-            data["details"] = {k: math.nan if v is None else v for k, v in data["details"].items()}
-            return Measurement(**data)
-        except (InputError, KeyError, TypeError, AttributeError):
-            return None
-
-    def put(self, key: dict[str, Any], found: Measurement) -> None:
-        """Store a measurement.
-
-        Raises
-        ------
-        PartialError : the disk is full or the folder cannot be written
-        """
         self.folder.mkdir(parents=True, exist_ok=True)
-        data = asdict(found) | {
-            name: None if (e := getattr(found, name)) is None else e.as_dict() for name in _ESTIMATES
-        }
-        data["details"] = {k: v if math.isfinite(v) else None for k, v in found.details.items()}
-        write_json(self._path(found.study, key), {"format": FORMAT, "schema": SCHEMA, **data})
+
+    def _path(self, task: Configuration) -> Path:
+        key = {"schema": SCHEMA, "basis": self.basis, "study": task.study, "key": task.key}
+        return self.folder / f"{task.study}-{data_sha256(key)[:16]}.json"
+
+    def get(self, task: Configuration, command: str = "") -> Measurement | None:
+        """The stored measurement of a configuration; None where it is missing or its file is damaged."""
+        try:
+            data = read_json(self._path(task))
+            numbers = {name: data[name] and estimate(data[name]) for name in ESTIMATES}
+            return Measurement(
+                task.study, task.series, task.name, command, **numbers, details=data["details"]
+            )
+        except (InputError, KeyError, TypeError):
+            return None
+
+    def put(self, task: Configuration, found: Measurement) -> None:
+        """Store a measurement."""
+        numbers = {name: e and e.as_dict() for name in ESTIMATES for e in (getattr(found, name),)}
+        write_json(self._path(task), {"label": task.label, **numbers, "details": found.details})

@@ -10,9 +10,9 @@ import numpy as np
 from mbtf_core.stats import Estimate
 from mbtf_pipeline.cost_study.measurements import Measurement
 
-# The extrapolation uses at least so many points of the front, and never goes further than so many times the
-# seconds of the last one.
-_FEWEST = 3
+# The extrapolation uses so many points of the front, and never goes further than so many times the seconds
+# of the last one.
+_POINTS = 3
 _FURTHEST = 1000.0
 # Relative errors are taken to be known no better than this.
 _BEST_KNOWN = 1e-3
@@ -38,15 +38,13 @@ def extrapolation(front: Sequence[Measurement]) -> tuple[float, Estimate] | None
 
     None where there are fewer, where the exponent is not significant, or where the result is too far away.
     """
-    last = [m for m in front if m.error.value > 0 and math.isfinite(m.error.error)][-_FEWEST:]
-    if len(last) < _FEWEST:
+    last = [m for m in front if m.error.value > 0 and math.isfinite(m.error.error)][-_POINTS:]
+    if len(last) < _POINTS:
         return None
-    # Weighted least squares in logarithms.
-    weights = np.array([1.0 / max(m.error.relative_error, _BEST_KNOWN) for m in last])
     x, y = np.log([m.seconds.value for m in last]), np.log([m.error.value for m in last])
-    x -= np.average(x, weights=weights**2)
-    spread = float(((weights * x) ** 2).sum())
-    power = Estimate(-float((weights**2 * x * y).sum()) / spread, 1.0 / math.sqrt(spread), len(last))
+    weights = [1.0 / max(m.error.relative_error, _BEST_KNOWN) for m in last]
+    (slope, _), covariance = np.polyfit(x, y, 1, w=weights, cov="unscaled")
+    power = Estimate(-float(slope), math.sqrt(covariance[0, 0]), len(last))
     if power.value <= max(2.0 * power.error, math.log(2.0) / math.log(_FURTHEST)):
         return None
     return front[-1].seconds.value * (2.0 ** (1.0 / power.value) - 1.0), power

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import shutil
 import time
+import timeit
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -22,9 +23,9 @@ from mbtf_core.stats import Estimate, unexplained_variance
 from mbtf_core.units import parse_duration
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation import generate
-from mbtf_gen.job import Job
+from mbtf_gen.job import Job, split_queries
 from mbtf_gen.material.material import load_material
-from mbtf_pipeline.cost_study.measurements import Measurement
+from mbtf_pipeline.cost_study.measurements import Configuration, Measurement
 
 if TYPE_CHECKING:
     from mbtf_fit.data.queries import ShardQueries
@@ -38,6 +39,8 @@ PIXELS = 1920 * 1080
 _TIMED_QUERIES = 1 << 18
 _TIMED = 5
 _OVERHEAD = 2.0
+# Seconds of a query at least: that of a closed form, written to disk.
+_CHEAPEST = 1e-8
 # The time that each study reports, by name of the detail.
 _SECONDS = {"data": "generation_seconds", "models": "training_seconds", "whole": "total_seconds"}
 
@@ -52,69 +55,43 @@ class DataRequest:
 
 
 @dataclass(frozen=True)
-class Run:
-    """A run to measure.
+class Run(Configuration):
+    """A run to measure: its data, whose seed offset is that of the fit, too, and nested options of the
+    fitter."""
 
-    Attributes
-    ----------
-    study, series, name : see :class:`~mbtf_pipeline.cost_study.measurements.Measurement`
-    data : its training data; the seed offset is that of the fit, too
-    fit : options of the fitter, nested as in its configuration
-    """
-
-    study: str
-    series: str
-    name: str
     data: DataRequest
     fit: dict[str, Any] = field(default_factory=dict)
 
     @property
     def label(self) -> str:
-        """Its name among all runs."""
         seed = f", seed + {self.data.seed}" if self.data.seed else ""
-        return f"{self.study}: {self.series}, {self.name}{seed}"
+        return f"{super().label}{seed}"
 
     @property
     def key(self) -> dict[str, Any]:
-        """What its measurement depends on besides the study's basis."""
         return {**asdict(self.data), "fit": self.fit}
 
 
+@dataclass
 class RunRunner:
-    """Generates data and fits models in a working folder, and keeps data that several runs share.
+    """Generates data and fits models in a working folder, and keeps data that several runs share."""
 
-    Parameters
-    ----------
-    config : the recipe's generator
-    folder : to work in; removed by :meth:`clear`
-    command : of the generator with the study's configuration
-    progress : called with a note
-    test : number of test queries, and paths of each
-    query_seconds : time to generate a query, by its number of paths
-    """
-
-    def __init__(
-        self,
-        config: GeneratorConfig,
-        folder: Path,
-        command: str,
-        progress: Callable[[str], None],
-        test: tuple[int, int] | None = None,
-        query_seconds: Callable[[int], float] = lambda paths: 0.0,
-    ) -> None:
-        self.config = config
-        self.folder = folder
-        self.command = command
-        self.progress = progress
-        self.test = test or TEST
-        self.query_seconds = query_seconds
-        # Seconds by which a run exceeds generating and training: the most of all so far, or a guess.
-        self._overhead = _OVERHEAD
-        # Folder and seconds by request.
-        self._data: dict[DataRequest, tuple[Path, float]] = {}
-        # By seed.
-        self._test_sets: dict[int, ShardQueries] = {}
-        self._test_seconds = 0.0
+    config: GeneratorConfig
+    folder: Path
+    # The generator's, with the study's configuration.
+    command: str
+    progress: Callable[[str], None]
+    # Number of test queries, and paths of each.
+    test: tuple[int, int] = field(default_factory=lambda: TEST)
+    # Time to generate a query over its number of paths.
+    path_seconds: float = 0.0
+    # Seconds by which a run exceeds generating and training: the most of all so far, or a guess.
+    _overhead: float = _OVERHEAD
+    # Folder and seconds by request.
+    _data: dict[DataRequest, tuple[Path, float]] = field(default_factory=dict)
+    # By seed.
+    _test_sets: dict[int, ShardQueries] = field(default_factory=dict)
+    _test_seconds: float = 0.0
 
     def clear(self) -> None:
         """Remove data and fits."""
@@ -144,15 +121,10 @@ class RunRunner:
             self._data[request] = self._generate(request.seed, train, _NO_QUERIES)
         return self._data[request]
 
-    def has(self, request: DataRequest) -> bool:
-        """Whether training data exist."""
-        return request in self._data
-
     def forget(self, request: DataRequest) -> None:
         """Remove training data that no other run needs."""
-        folder, _ = self._data.pop(request, (None, 0.0))
-        if folder is not None:
-            shutil.rmtree(folder, ignore_errors=True)
+        if request in self._data:
+            shutil.rmtree(self._data.pop(request)[0], ignore_errors=True)
 
     def expected_seconds(self, run: Run) -> float:
         """Expected time of measuring a run; existing data take none."""
@@ -160,9 +132,9 @@ class RunRunner:
         return test + self._planned_seconds(run) + self._overhead
 
     def _planned_seconds(self, run: Run) -> float:
-        generating = 0.0 if self.has(run.data) else run.data.queries * self.query_seconds(run.data.spp)
+        paths = 0 if run.data in self._data else run.data.queries * run.data.spp
         training = run.fit["training"].get("time")
-        return generating + (0.0 if training is None else parse_duration(training))
+        return paths * self.path_seconds + (parse_duration(training) if training else 0.0)
 
     def test_set(self, seed: int) -> ShardQueries:
         """The test queries of all runs with an offset of the seed."""
@@ -180,12 +152,7 @@ class RunRunner:
         return self._test_sets[seed]
 
     def measure(self, run: Run) -> Measurement:
-        """Generate the data, fit, and evaluate.
-
-        Raises
-        ------
-        InputError : the fit failed
-        """
+        """Generate the data, fit, and evaluate."""
         from mbtf_fit import FitConfig, fit
 
         test = self.test_set(run.data.seed)
@@ -208,11 +175,9 @@ class RunRunner:
         }
         shutil.rmtree(out, ignore_errors=True)
         self._overhead = max(self._overhead, time.perf_counter() - start - planned)
-        options = {"queries.train": str(run.data.queries), "queries.spp": run.data.spp, **_flat(run.fit)}
         seconds = Estimate(details[_SECONDS[run.study]], 0.0, 1)
-        return Measurement(
-            run.study, run.series, run.name, options, self.command_of(run), seconds, error, details=details
-        )
+        command = self.command_of(run)
+        return Measurement(run.study, run.series, run.name, command, seconds, error, details=details)
 
     def command_of(self, run: Run) -> str:
         """The command that reproduces a run; the test split is that of the recipe."""
@@ -228,6 +193,18 @@ class RunRunner:
         )
 
 
+def forecast_seconds(config: GeneratorConfig) -> tuple[float, float]:
+    """Seconds of a training query, and of starting the generator with its test split, by a forecast."""
+    from mbtf_gen.forecast import forecast
+    from mbtf_gen.planning.effects_plan import plan_effects
+    from mbtf_gen.planning.run_plan import allocate
+
+    job = Job(config, load_material(Path(config.material), config.geometry.make_tileable))
+    expected = forecast(job, allocate(job, plan_effects(job, pilots=False)))
+    query = max(expected.query_seconds, _CHEAPEST)
+    return query, expected.start + max(0.0, expected.seconds - split_queries(job, "train") * query)
+
+
 def _flat(options: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """Nested options by dotted name."""
     out: dict[str, Any] = {}
@@ -240,10 +217,7 @@ def _evaluation_seconds(material: Any, test: ShardQueries) -> float:
     """Seconds for one query per pixel of 1080p, at random queries."""
     rows = np.resize(np.arange(len(test)), _TIMED_QUERIES)
     arrays = [getattr(test, name)[rows] for name in ("u", "sigma", "omega_i", "omega_o")]
-    times = []
-    for _ in range(_TIMED):
-        start = time.perf_counter()
-        material.evaluate(*arrays)
-        times.append(time.perf_counter() - start)
     # The smallest: the disk may still be writing generated data.
-    return min(times) * PIXELS / _TIMED_QUERIES
+    timer = time.perf_counter
+    seconds = min(timeit.repeat(lambda: material.evaluate(*arrays), timer=timer, number=1, repeat=_TIMED))
+    return seconds * PIXELS / _TIMED_QUERIES

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 import shlex
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +16,14 @@ from mbtf_core.folders import ELSEWHERE, check_folder, make_folder
 from mbtf_core.stats import Estimate, signal_variance
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.material.material import load_material
-from mbtf_pipeline.cost_study.fit_runs import GENERATOR, RUN_SHARES, QuerySeconds, planned_runs
+from mbtf_pipeline.cost_study.fit_runs import GENERATOR, RUN_SHARES, planned_runs
 from mbtf_pipeline.cost_study.generator_benchmark import GeneratorBenchmark
 from mbtf_pipeline.cost_study.generator_runs import generator_tasks
 from mbtf_pipeline.cost_study.measurements import Measurement, MeasurementFolder
 from mbtf_pipeline.cost_study.repeats import FEWEST_SEEDS, MOST_SEEDS, combined, measure_runs, seed_deviation
-from mbtf_pipeline.cost_study.runs import Run, RunRunner
+from mbtf_pipeline.cost_study.runs import Run, RunRunner, forecast_seconds
 from mbtf_pipeline.recipe import Recipe
-from mbtf_pipeline.run_folder import locked, machine
+from mbtf_pipeline.run_folder import has_record, locked, machine
 
 STUDY_NAME = "study.json"
 STUDY_FORMAT = "mbtf-cost"
@@ -37,83 +36,53 @@ NEW_TIME = 600.0
 _LEAST_VARIATION = 0.005
 # About as many configurations of the generator share its time.
 _CONFIGURATIONS = 35
-# Paths per query at which the time of generating is measured, seconds of each measurement, and queries.
-_TIMED_PATHS, _TIMED_SECONDS, _TIMED_QUERIES = (2, 32), 0.5, "1e6"
 
 
 @dataclass
 class Study:
-    """What a study has measured.
-
-    Attributes
-    ----------
-    folder : of the study
-    description : name, command, time, seed, machine, date
-    measurements : one per configuration
-    deviation : relative standard deviation of runs over seeds, part of their error bars; None where no run
-        was repeated
-    skipped : configurations for which no time was left
-    failed : runs that failed, and why
-    """
+    """What a study has measured."""
 
     folder: Path
+    # Name, command, time, seed, machine and date.
     description: dict[str, Any]
+    # One per configuration.
     measurements: list[Measurement] = field(default_factory=list)
+    # Relative standard deviation of runs over seeds, part of their error bars; None without repeats.
     deviation: Estimate | None = None
+    # Configurations for which no time was left, and runs that failed, with the reason.
     skipped: list[str] = field(default_factory=list)
     failed: list[str] = field(default_factory=list)
 
 
-def claim(folder: Path) -> None:
-    """Create a study's folder, or take an empty one or one that holds a study of this kind of machine.
+def is_study(folder: Path) -> bool:
+    """Whether a folder contains a cost study; one of another schema version is refused."""
+    return has_record(folder, STUDY_NAME, STUDY_FORMAT, STUDY_SCHEMA)
 
-    Raises
-    ------
-    InputError : it holds something else, or a study of another version or machine
-    """
-    check_folder(folder, lambda path: bool(_record(path)), "cost study")
-    make_folder(folder)
-    record = _record(folder)
-    if not record:
+
+def claim(folder: Path) -> None:
+    """Create a study's folder, or take an empty one or one that holds a study of this kind of machine."""
+    if not check_folder(folder, is_study, "cost study"):
+        make_folder(folder)
         return
-    if record.get("schema") != STUDY_SCHEMA:
-        problem = f"holds a cost study of schema version {record.get('schema')}; this is {STUDY_SCHEMA}"
-        raise InputError(problem, where=folder, hint=ELSEWHERE)
-    there, here = record.get("machine", {}).get("system"), machine()["system"]
+    there, here = read_json(folder / STUDY_NAME)["machine"]["system"], machine()["system"]
     if there != here:
         problem = f"holds a cost study of another kind of machine ({there}; this is {here})"
         raise InputError(problem, where=folder, hint=ELSEWHERE)
 
 
-def _record(folder: Path) -> dict[str, Any]:
-    """The record of the study in a folder; empty where there is none."""
-    try:
-        found = read_json(folder / STUDY_NAME)
-    except InputError:
-        return {}
-    return found if found.get("format") == STUDY_FORMAT else {}
-
-
 def time_of(folder: Path) -> float:
     """Time in seconds of the study in a folder; that of a new one where there is none."""
-    seconds = _record(folder).get("time")
-    return float(seconds) if isinstance(seconds, int | float) and seconds > 0 else NEW_TIME
+    return float(read_json(folder / STUDY_NAME)["time"]) if is_study(folder) else NEW_TIME
 
 
 def _check_variation(benchmark: GeneratorBenchmark) -> None:
-    """Refuse a material that gives a fit nothing to learn.
-
-    Raises
-    ------
-    InputError : it reflects nothing, or the same everywhere and in all directions
-    """
-    reference, mean = benchmark.reference({}, 0), benchmark.mean({}).value
-    where = benchmark.config.material
-    if not mean > 0:
+    """Refuse a material that gives a fit nothing to learn."""
+    reference, where = benchmark.reference({}), benchmark.config.material
+    if not reference.mean > 0:
         hint = "study a material with a base color or gloss"
         raise InputError("reflects nothing: every value is 0", where=where, hint=hint)
-    variance = signal_variance(reference.a, reference.b)
-    if variance.value + 2 * variance.error < (_LEAST_VARIATION * mean) ** 2:
+    variance = signal_variance(*reference.batch(0)[1])
+    if variance.value + 2 * variance.error < (_LEAST_VARIATION * reference.mean) ** 2:
         problem = "reflects the same everywhere and in all directions: there is nothing to fit"
         raise InputError(problem, where=where, hint="study a material with displacement or textures")
 
@@ -126,20 +95,6 @@ def study_config(config: GeneratorConfig, seed: int | None) -> GeneratorConfig:
     return config.model_copy(update={"queries": queries, **seeds})
 
 
-class _Clock:
-    """The remaining time of a study, and the share of it that is spent."""
-
-    def __init__(self, seconds: float, refine: float) -> None:
-        self.begin = time.perf_counter()
-        self.seconds, self.refine = seconds, refine
-
-    def left(self, *, refining: bool = False) -> float:
-        return self.seconds + refining * self.refine - (time.perf_counter() - self.begin)
-
-    def share(self) -> float:
-        return min(1.0, (time.perf_counter() - self.begin) / (self.seconds + self.refine))
-
-
 def run_study(
     recipe: Recipe,
     folder: Path,
@@ -150,26 +105,31 @@ def run_study(
     command: str = "",
     progress: Callable[[float, str], None] = lambda share, note: None,
 ) -> Study:
-    """Measure what the time allows; stored measurements are kept.
+    """Measure what the time allows for the material and generator of a recipe; stored measurements are kept
+    and cost no time.
 
     Parameters
     ----------
-    recipe : its material and generator are studied; its fits and comparison are not used
-    seconds : time of everything; stored measurements cost none of it
     refine : additional seconds for repeating runs with wide error bars
     seed : of queries, paths and initial weights; the recipe's by default
     progress : called with (share of the time spent, note)
-
-    Raises
-    ------
-    InputError : the material or the folder cannot be used
-    PartialError : another process works in the folder, or the disk is full; the same command resumes
     """
-    clock = _Clock(seconds, refine)
+    start = time.perf_counter()
+
+    def spent() -> float:
+        return time.perf_counter() - start
+
+    def note(text: str) -> None:
+        progress(min(1.0, spent() / (seconds + refine)), text)
+
     config = study_config(recipe.generate, seed)
     material = load_material(Path(config.material), config.geometry.make_tileable)
     claim(folder)
     with locked(folder, STUDY_NAME):
+        benchmark = GeneratorBenchmark(config, material)
+        note("reference")
+        # Before anything is written: a refused study leaves the folder as it was.
+        _check_variation(benchmark)
         description = {
             "format": STUDY_FORMAT,
             "schema": STUDY_SCHEMA,
@@ -181,96 +141,62 @@ def run_study(
             "date": time.strftime("%Y-%m-%d"),
             "machine": machine(),
         }
-        benchmark = GeneratorBenchmark(config, material, config.seed)
-        progress(0.0, "reference")
-        # Before anything is written: a refused study leaves the folder as it was.
-        _check_variation(benchmark)
         write_json(folder / STUDY_NAME, description)
         write_text(folder / CONFIG_NAME, dump_yaml(config.model_dump(mode="json")))
         study = Study(folder, description)
-        store = MeasurementFolder(folder, {"config": config.hash(material.digests)})
+        store = MeasurementFolder(folder, config.hash(material.digests))
         generator = shlex.join(["mbtf-gen", config.material, "--config", str(folder / CONFIG_NAME)])
-        _measure_generator(study, store, benchmark, generator, clock, progress)
-        runner = RunRunner(config, folder / WORK, generator, lambda note: progress(clock.share(), note))
+        each = 0.5 * GENERATOR * seconds / _CONFIGURATIONS
+        for task in generator_tasks(benchmark):
+            found = store.get(task, task.command(generator))
+            # Configurations take longer than their share where kernels are compiled.
+            if found is None and spent() < 1.2 * GENERATOR * seconds:
+                note(task.label)
+                found = task.run(benchmark, each, task.command(generator))
+                store.put(task, found)
+            if found is None:
+                study.skipped.append(task.label)
+            else:
+                study.measurements.append(found)
+        runner = RunRunner(config, folder / WORK, generator, note, path_seconds=path_seconds(config, store))
         try:
-            _measure_runs(study, store, runner, benchmark, clock)
+            seeds = MOST_SEEDS if refine else FEWEST_SEEDS
+            _measure_runs(study, store, runner, lambda again: seconds + again * refine - spent(), seeds)
         finally:
             runner.clear()
     return study
 
 
-def _measure_generator(
-    study: Study,
-    store: MeasurementFolder,
-    benchmark: GeneratorBenchmark,
-    generator: str,
-    clock: _Clock,
-    progress: Callable[[float, str], None],
-) -> None:
-    """Measure the generator's configurations in its share of the time."""
-    each = 0.5 * GENERATOR * clock.seconds / _CONFIGURATIONS
-    for task in generator_tasks(benchmark):
-        found = store.get(task.study, task.key)
-        # Configurations take longer than their share where kernels are compiled.
-        if found is None and clock.left() > (1.0 - 1.2 * GENERATOR) * clock.seconds:
-            progress(clock.share(), task.label)
-            found = task.run(benchmark, each)
-            store.put(task.key, found)
-        if found is None:
-            study.skipped.append(task.label)
-        else:
-            command = task.command(generator)
-            found = replace(found, series=task.series, name=task.name, command=command)
-            study.measurements.append(found)
-
-
-def query_seconds(benchmark: GeneratorBenchmark, store: MeasurementFolder) -> QuerySeconds:
-    """Seconds to generate a query by its number of paths, linear in it: from forecasts at two numbers. They
-    are stored, so that a resumed study plans the same runs."""
-    found = store.get("seconds", {})
-    if found is None:
-        from mbtf_gen.forecast import forecast
-        from mbtf_gen.planning.effects_plan import plan_effects
-        from mbtf_gen.planning.run_plan import RunPlan
-
-        at = []
-        for paths in _TIMED_PATHS:
-            options = {"queries.spp": paths, "queries.train": _TIMED_QUERIES, "queries.test": "1"}
-            job = benchmark.job(options)
-            at.append(forecast(job, RunPlan(plan_effects(job)), _TIMED_SECONDS).query_seconds)
-        slope = max(0.0, (at[1] - at[0]) / (_TIMED_PATHS[1] - _TIMED_PATHS[0]))
-        details = {"query": max(0.0, at[0] - slope * _TIMED_PATHS[0]), "path": slope}
-        nothing = Estimate(math.nan, math.inf, 0)
-        found = Measurement("seconds", "", "", {}, "", nothing, nothing, details=details)
-        store.put({}, found)
-    details = found.details
-    # A closed form takes hardly any time.
-    return lambda paths: max(1e-8, details["query"] + details["path"] * paths)
+def path_seconds(config: GeneratorConfig, store: MeasurementFolder) -> float:
+    """Seconds to generate a query over its number of paths, stored, so that a resumed study plans the same
+    runs."""
+    path = store.folder / f"seconds-{store.basis[:16]}.json"
+    try:
+        return float(read_json(path)["path_seconds"])
+    except InputError:
+        found = forecast_seconds(config)[0] / config.queries.spp
+        write_json(path, {"path_seconds": found})
+        return found
 
 
 def _measure_runs(
-    study: Study, store: MeasurementFolder, runner: RunRunner, benchmark: GeneratorBenchmark, clock: _Clock
+    study: Study, store: MeasurementFolder, runner: RunRunner, left: Callable[[bool], float], seeds: int
 ) -> None:
-    """Measure runs and their repeats in the remaining time."""
-    runner.query_seconds = query_seconds(benchmark, store)
-    runs = planned_runs(clock.seconds, runner.config.queries.spp, runner.query_seconds)
-
+    """Measure runs in the remaining time, which is longer for repeats than for others."""
+    start = left(False)
+    runs = planned_runs(study.description["time"], runner.config.queries.spp, runner.path_seconds)
     # On a machine slower than planned, every comparison keeps its share of the time.
-    start, studies, shares = clock.left(), list(RUN_SHARES), list(RUN_SHARES.values())
+    studies, shares = list(RUN_SHARES), list(RUN_SHARES.values())
     reached = 0
 
     def fits(run: Run) -> bool:
         nonlocal reached
         reached = max(reached, studies.index(run.study))
         reserved = start * sum(shares[reached + 1 :]) / sum(shares)
-        # The additional time is for repeats alone.
-        return clock.left(refining=run.data.seed > 0) - reserved > runner.expected_seconds(run)
+        return left(run.data.seed > 0) - reserved > runner.expected_seconds(run)
 
-    found = measure_runs(runs, store, runner, fits, MOST_SEEDS if clock.refine else FEWEST_SEEDS)
-    study.deviation = seed_deviation(found.groups)
-    study.failed = found.failed
-    for run, group in zip(runs, found.groups, strict=True):
-        if group:
-            study.measurements.append(combined(group, study.deviation))
-        elif not any(text.startswith(run.label) for text in found.failed):
-            study.skipped.append(run.label)
+    groups, failed = measure_runs(runs, store, runner, fits, seeds)
+    study.deviation = seed_deviation(groups)
+    study.failed = list(failed.values())
+    study.measurements += [combined(group, study.deviation) for group in groups if group]
+    study.skipped += [run.label for k, run in enumerate(runs) if not groups[k] and k not in failed]

@@ -10,7 +10,8 @@ evaluation),
 
     T = c + n g + f (a + b n) + training,    n g = share (n g + training),
 
-where a line through the pilots gives a and b. Disk space and memory limit n; training gets what is left.
+where a line through the pilots gives a and b, neither negative. Disk space and memory limit n; training gets
+what is left.
 """
 
 from __future__ import annotations
@@ -20,27 +21,27 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.optimize import nnls
 
 from mbtf_core.atomic import read_json, write_json
+from mbtf_core.config_file import deep_merge
 from mbtf_core.digest import data_sha256
 from mbtf_core.errors import InputError, UsageError
 from mbtf_core.units import clock, format_duration
 from mbtf_fit.config import FitConfig
-from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_pipeline.cost_study.fit_runs import round_down
-from mbtf_pipeline.cost_study.runs import DataRequest, Run, RunRunner
+from mbtf_pipeline.cost_study.runs import DataRequest, Run, RunRunner, forecast_seconds
 from mbtf_pipeline.recipe import Recipe
 from mbtf_pipeline.run import layout_of
 from mbtf_pipeline.run_folder import claim_run_folder, locked, write_run_record
 
 SPLIT_NAME = "time_split.json"
-SPLIT_FORMAT = "mbtf-time-split"
-SPLIT_SCHEMA = 3
+SPLIT_SCHEMA = 4
 # Shares that the pilots generate for, and the one without pilots.
 SHARES = (0.15, 0.35, 0.6)
 DEFAULT_SHARE = 0.35
@@ -53,8 +54,6 @@ _TEST = (1 << 17, 8)
 # Seconds of a fit besides training where there are no pilots.
 _FIT = 2.0
 _FEWEST_QUERIES = 4096
-# Seconds of a query at least: that of a closed form, written to disk.
-_CHEAPEST = 1e-8
 # Shares of the free disk space and of the machine's memory that training queries may take.
 _DISK, _MEMORY = 0.25, 0.5
 # Share of the total time that remains at least, however long the pilots took.
@@ -63,23 +62,19 @@ _LEAST_LEFT = 0.25
 
 @dataclass(frozen=True)
 class Split:
-    """How a total time is spent.
+    """How a total time is spent."""
 
-    Attributes
-    ----------
-    queries : training queries to generate
-    generating, training, other : seconds of generating, of training all fits, and of fits besides training
-    share : of generating in generating and training
-    pilots : (share, unexplained variance) of each pilot; empty for short times
-    pilot_seconds : time of forecast and pilots
-    """
-
+    # Training queries to generate.
     queries: int
+    # Seconds of generating, of training all fits, and of fits besides training.
     generating: float
     training: float
     other: float
+    # Share of generating in generating and training.
     share: float
-    pilots: tuple[tuple[float, float], ...]
+    # (share, unexplained variance) of each pilot; empty for short times.
+    pilots: list[list[float]]
+    # Time of forecast and pilots.
     pilot_seconds: float
 
     def describe(self) -> str:
@@ -102,32 +97,13 @@ def split_time(
     share: float | None = None,
 ) -> Split:
     """How to spend a total time on a recipe; stored in the run's folder, so that the same command resumes
-    with the same split.
-
-    Parameters
-    ----------
-    command : of the run, for its record
-    progress : called with a note after every pilot
-    share : generate for this share of the time, without pilots
-
-    Raises
-    ------
-    UsageError : the time is too short, or a model of the recipe needs another layout
-    InputError : the folder holds something else
-    PartialError : another process works in it
-    """
+    with the same split. Without pilots where the share that generates is given."""
     if seconds < SHORTEST:
-        raise UsageError(
-            f"{format_duration(seconds)} is too short: starting up takes most of it",
-            where="--time",
-            hint=f"give {format_duration(SHORTEST)} or more",
-        )
+        problem = f"{format_duration(seconds)} is too short: starting up takes most of it"
+        raise UsageError(problem, where="--time", hint=f"give {format_duration(SHORTEST)} or more")
     if any(layout_of(fit) != "shuffled" for fit in recipe.fit.values()):
-        raise UsageError(
-            "only models of the shuffled layout can share a time",
-            where="--time",
-            hint="leave out the fits of 'hierarchical'",
-        )
+        problem = "only models of the shuffled layout can share a time"
+        raise UsageError(problem, where="--time", hint="leave out the fits of 'hierarchical'")
     options = recipe.model_dump(mode="json", include={"generate", "fit"})
     key = data_sha256({"schema": SPLIT_SCHEMA, "time": seconds, "share": share, "recipe": options})
     claim_run_folder(folder)
@@ -136,20 +112,15 @@ def split_time(
         if split is None:
             write_run_record(folder, recipe, command)
             split = _measure(recipe, seconds, share, folder, progress)
-            write_json(folder / SPLIT_NAME, {"format": SPLIT_FORMAT, "key": key, **asdict(split)})
+            write_json(folder / SPLIT_NAME, {"key": key, "split": asdict(split)})
     return split
 
 
 def _stored(folder: Path, key: str) -> Split | None:
-    path = folder / SPLIT_NAME
-    if not path.exists():
-        return None
     try:
-        data = read_json(path)
-        if data.pop("format") != SPLIT_FORMAT or data.pop("key") != key:
-            return None
-        return Split(**data | {"pilots": tuple((p[0], p[1]) for p in data["pilots"])})
-    except (InputError, KeyError, TypeError, IndexError):
+        data = read_json(folder / SPLIT_NAME)
+        return Split(**data["split"]) if data["key"] == key else None
+    except (InputError, KeyError, TypeError):
         return None
 
 
@@ -157,13 +128,13 @@ def _measure(
     recipe: Recipe, seconds: float, share: float | None, folder: Path, progress: Callable[[str], None]
 ) -> Split:
     start = time.perf_counter()
-    query, generator = _generating(recipe.generate)
-    most = most_queries(recipe, folder)
-    pilots: list[tuple[float, float]] = []
-    costs = [(1.0, _FIT)]
+    query, generator = forecast_seconds(recipe.generate)
+    most = _most_queries(folder)
+    pilots: list[list[float]] = []
+    fit, fit_query = _FIT, 0.0
     if share is None and PILOT * seconds >= SHORTEST_PILOT:
         try:
-            pilots, costs = _pilots(recipe, PILOT * seconds, query, most, progress)
+            pilots, (fit, fit_query) = _pilots(recipe, PILOT * seconds, query, most, progress)
         except InputError as error:
             progress(f"pilot failed: {error.what}; {DEFAULT_SHARE:.0%} of the time generates")
     # The values of a flat plane do not vary: their unexplained variance is not defined.
@@ -171,7 +142,6 @@ def _measure(
     if share is None:
         share = min(pilots, key=lambda p: p[1])[0] if pilots else DEFAULT_SHARE
     fits = len(recipe.fit)
-    fit, fit_query = _line(costs)
     took = time.perf_counter() - start
     left = max(seconds - took, _LEAST_LEFT * seconds + generator + fits * fit) - generator
     # Of n queries, n (query / share + fits fit_query) is the time that is neither start nor `fit`.
@@ -180,31 +150,15 @@ def _measure(
     other = fits * (fit + queries * fit_query)
     training = max(1.0 * fits, left - queries * query - other)
     generating = round(queries * query + generator, 1)
-    return Split(
-        queries, generating, round(training, 1), round(other, 1), share, tuple(pilots), round(took, 1)
-    )
-
-
-def _generating(config: GeneratorConfig) -> tuple[float, float]:
-    """Seconds of a training query, and of starting the generator with its test split, by a forecast."""
-    from mbtf_gen.forecast import forecast
-    from mbtf_gen.job import Job, split_queries
-    from mbtf_gen.material.material import load_material
-    from mbtf_gen.planning.effects_plan import plan_effects
-    from mbtf_gen.planning.run_plan import allocate
-
-    job = Job(config, load_material(Path(config.material), config.geometry.make_tileable))
-    expected = forecast(job, allocate(job, plan_effects(job, pilots=False)))
-    query = max(expected.query_seconds, _CHEAPEST)
-    return query, expected.start + max(0.0, expected.seconds - split_queries(job, "train") * query)
+    return Split(queries, generating, round(training, 1), round(other, 1), share, pilots, round(took, 1))
 
 
 def _pilots(
-    recipe: Recipe, length: float, query: float, most: int, progress: Callable[[str], None]
-) -> tuple[list[tuple[float, float]], list[tuple[float, float]]]:
-    """(share, error) of each pilot, and (queries, seconds of its fit besides training)."""
+    recipe: Recipe, length: float, query: float, most: float, progress: Callable[[str], None]
+) -> tuple[list[list[float]], tuple[float, float]]:
+    """(share, error) of each pilot; seconds of a fit besides training: in any case, and for each query."""
     name, fit = next(iter(recipe.fit.items()))
-    errors, fits = [], []
+    errors, counts, others = [], [], []
     with tempfile.TemporaryDirectory(prefix="mbtf-time-split-") as work:
         runner = RunRunner(recipe.generate, Path(work), "", lambda note: None, _TEST)
         for share in SHARES:
@@ -216,38 +170,24 @@ def _pilots(
             found = runner.measure(Run("whole", name, f"{share:.0%}", data, options))
             runner.forget(data)
             d = found.details
-            errors.append((share, found.error.value))
-            fits.append(
-                (float(queries), d["total_seconds"] - d["generation_seconds"] - d["training_seconds"])
-            )
+            errors.append([share, found.error.value])
+            counts.append(queries)
+            others.append(d["total_seconds"] - d["generation_seconds"] - d["training_seconds"])
             progress(f"pilot: {share:.0%} of {length:.0f} s generating, error {found.error.value:.3f}")
-    return errors, fits
+    fixed, slope = nnls(np.column_stack([np.ones(len(counts)), counts]), others)[0]
+    return errors, (float(fixed), float(slope))
 
 
-def _line(points: Sequence[tuple[float, float]]) -> tuple[float, float]:
-    """(height at 0, slope) of the least-squares line through points, neither negative."""
-    xs, ys = np.array(points).T
-    spread = float(((xs - xs.mean()) ** 2).sum())
-    slope = float(((xs - xs.mean()) * ys).sum()) / spread if spread > 0 else 0.0
-    slope = min(max(0.0, slope), max(0.0, float(ys.mean())) / float(xs.mean()))
-    return max(0.0, float(ys.mean()) - slope * float(xs.mean())), slope
-
-
-def most_queries(recipe: Recipe, folder: Path) -> int:
-    """Training queries that disk and memory hold: a quarter of the free space of `folder`, and the larger of
-    ``data.memory`` of the fits and half of the machine's memory."""
-    from mbtf_fit.data.queries import QUERY_BYTES
+def _most_queries(folder: Path) -> float:
+    """Training queries that disk and memory hold. What is read from disk passes through the file system's
+    memory."""
     from mbtf_gen.dataset.shard_io import row_bytes
 
-    size = row_bytes(holes=True)
-    on_disk = _DISK * shutil.disk_usage(folder).free / size
-    loaded = min(fit.data.memory for fit in recipe.fit.values()) / QUERY_BYTES
-    # What is read from disk passes through the file system's memory.
-    mapped = _MEMORY * physical_memory() / size
-    return max(_FEWEST_QUERIES, int(min(on_disk, max(loaded, mapped))))
+    free = min(_DISK * shutil.disk_usage(folder).free, _MEMORY * _physical_memory())
+    return max(_FEWEST_QUERIES, free / row_bytes(holes=True))
 
 
-def physical_memory() -> float:
+def _physical_memory() -> float:
     """Bytes of the machine's memory; infinite where it is unknown."""
     try:
         return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
@@ -256,9 +196,8 @@ def physical_memory() -> float:
 
 
 def _with_time(fit: FitConfig, seconds: float) -> FitConfig:
-    return FitConfig.model_validate(
-        {**fit.model_dump(), "training": {**fit.training.model_dump(), "time": seconds, "steps": None}}
-    )
+    data = deep_merge(fit.model_dump(), {"training": {"time": seconds, "steps": None}})
+    return FitConfig.model_validate(data)
 
 
 def with_split(recipe: Recipe, split: Split) -> Recipe:

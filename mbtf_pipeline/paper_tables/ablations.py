@@ -4,17 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
 from mbtf_core.stats import Estimate
 from mbtf_pipeline.paper_tables.cells import Cell, Column, Table, rows_of
 from mbtf_pipeline.paper_tables.runs import FinishedRun, each_fit
 
+# The runs of one variant, by material.
 Runs = dict[str, FinishedRun]
+_TEXT = (
+    "The first row is the baseline; every other row changes one option. Differences are of MSE on the same "
+    "test queries. They are paired for fits on the same data. For fits on other data, the two errors are "
+    "taken as independent, so the error bars are wider."
+)
 
 
 def ablations(runs: Sequence[FinishedRun]) -> list[Table]:
     """Every fit of every variant against the first fit of the first variant, per material."""
-    first = {run.material: run for run in reversed(runs)}
     columns = [
         Column("variant", "variant", _label),
         Column("network weights", "network_weights", lambda own, fit: _any(own).fit(fit)["network_weights"]),
@@ -22,19 +28,13 @@ def ablations(runs: Sequence[FinishedRun]) -> list[Table]:
         Column("queries per texel", "queries_per_texel", lambda own, fit: _density(_any(own)), digits=".0f"),
     ]
     for material in dict.fromkeys(run.material for run in runs):
-        columns += _of_material(material, first[material])
-    # Rows hold the runs of one variant by material: all fits of the first variant, then of the next.
-    settings = dict.fromkeys((run.variant, fit) for run, fit in each_fit(runs))
+        columns += _of_material(next(run for run in runs if run.material == material))
+    # All fits of the first variant, then of the next.
     items = [
         ({run.material: run for run in runs if run.variant == variant and fit in run.fits}, fit)
-        for variant, fit in settings
+        for variant, fit in dict.fromkeys((run.variant, fit) for run, fit in each_fit(runs))
     ]
-    text = (
-        "The first row is the baseline; every other row changes one option. Differences are of MSE on the "
-        "same test queries. They are paired for fits on the same data. For fits on other data, the two "
-        "errors are taken as independent, so the error bars are wider."
-    )
-    return [Table("ablations", "Ablations", text, columns, rows_of(columns, items))]
+    return [Table("ablations", "Ablations", _TEXT, columns, rows_of(columns, items))]
 
 
 def _any(own: Runs) -> FinishedRun:
@@ -50,9 +50,14 @@ def _density(run: FinishedRun) -> float:
     return float(run.manifest["splits"]["train"]["queries"] / run.texels)
 
 
-def _of_material(material: str, first: FinishedRun) -> list[Column]:
-    def of(get: Callable[[FinishedRun, str], Cell]) -> Callable[[Runs, str], Cell]:
-        return lambda own, fit: get(own[material], fit) if material in own else None
+def _of_material(first: FinishedRun) -> list[Column]:
+    """Columns of the material whose baseline is the first fit of this run."""
+
+    def column(title: str, key: str, get: Callable[[FinishedRun, str], Cell], *look: Any) -> Column:
+        def cell(own: Runs, fit: str) -> Cell:
+            return get(own[first.material], fit) if first.material in own else None
+
+        return Column(f"{first.title}: {title}", f"{first.material}_{key}", cell, *look)
 
     def difference(run: FinishedRun, fit: str) -> Cell:
         if run is first:
@@ -60,11 +65,8 @@ def _of_material(material: str, first: FinishedRun) -> list[Column]:
         mse, base = run.mse(fit), first.mse(first.fits[0])
         return Estimate(mse.value - base.value, math.hypot(mse.error, base.error), min(mse.n, base.n))
 
-    name = first.title
     return [
-        Column(
-            f"{name}: unexplained variance [%]", f"{material}_unexplained", of(FinishedRun.unexplained), 100.0
-        ),
-        Column(f"{name}: MSE − MSE of the first [10⁻³/sr²]", f"{material}_minus_first", of(difference), 1e3),
-        Column(f"{name}: training [s]", f"{material}_seconds", of(FinishedRun.seconds), digits=".0f"),
+        column("unexplained variance [%]", "unexplained", FinishedRun.unexplained, 100.0),
+        column("MSE − MSE of the first [10⁻³/sr²]", "minus_first", difference, 1e3),
+        column("training [s]", "seconds", FinishedRun.seconds, 1.0, ".0f"),
     ]

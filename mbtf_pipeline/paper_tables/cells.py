@@ -6,40 +6,46 @@ import csv
 import io
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from mbtf_core.stats import Estimate
 from mbtf_pipeline.compare.metrics import psnr
 from mbtf_pipeline.compare.perceptual_metrics import PerceptualMetric
+from mbtf_pipeline.compare.pictures import with_ending
 from mbtf_pipeline.formatting import decibel, estimate_text, is_significant, signed
+from mbtf_pipeline.report.embed import jpeg_uri, map_uri
 
 NOT_IMPLEMENTED = "not implemented"
+_QUALITY = 86
 
 
-@dataclass(frozen=True)
-class Psnr:
-    """A PSNR, given by a noise-free MSE and the peak, both in units of 1/sr."""
+class Shown(NamedTuple):
+    """A number with a text of its own, and a second number for the column with this suffix of the CSV file:
+    ``se`` for a standard error, ``noise`` for the value of noise alone."""
 
-    mse: Estimate
-    peak: float
-
-    @property
-    def value(self) -> Estimate:
-        """In dB."""
-        return psnr(self.mse, self.peak)
-
-
-@dataclass(frozen=True)
-class PerceptualCell:
-    """Value of a perceptual metric, and its value for noise alone."""
-
-    metric: PerceptualMetric
+    text: str
     value: float
-    noise: float | None
+    second: float | None
+    suffix: str
 
 
-Cell = Estimate | Psnr | PerceptualCell | float | int | str | None
+def psnr_cell(mse: Estimate, peak: float) -> Shown:
+    """A PSNR in dB, from a noise-free MSE and the peak, both in units of 1/sr."""
+    found = psnr(mse, peak)
+    return Shown(decibel(found, mse), found.value, found.error, "se")
+
+
+def perceptual_cell(metric: PerceptualMetric, value: float, noise: float | None) -> Shown:
+    """Value of a perceptual metric, and its value for noise alone."""
+    return Shown(metric.text(value, noise, with_noise=False), value, noise, "noise")
+
+
+Cell = Estimate | Shown | float | int | str | None
 
 
 @dataclass(frozen=True)
@@ -61,6 +67,32 @@ class Column:
     factor: float = 1.0
     digits: str = ".3g"
 
+    def text(self, cell: Cell) -> str:
+        """A cell on the page."""
+        if cell is None:
+            return "–"
+        if isinstance(cell, str):
+            return cell
+        if isinstance(cell, Shown):
+            return cell.text
+        if isinstance(cell, Estimate):
+            return estimate_text(cell, self.factor)
+        return f"{cell:,}" if isinstance(cell, int) else signed(f"{self.factor * cell:{self.digits}}")
+
+    def numbers(self, cell: Cell) -> dict[str, str]:
+        """A cell in the CSV file, by key."""
+        if isinstance(cell, Shown):
+            return {self.key: _number(cell.value), f"{self.key}_{cell.suffix}": _number(cell.second)}
+        if isinstance(cell, Estimate):
+            return {self.key: _number(cell.value), f"{self.key}_se": _number(cell.error)}
+        return {self.key: _number(cell)}
+
+
+def _number(x: float | str | None) -> str:
+    if isinstance(x, float):
+        return f"{x:.6g}" if math.isfinite(x) else ""
+    return "" if x is None else str(x)
+
 
 MATERIAL = Column("material", "material", lambda run, *_: run.title)
 METHOD = Column("method", "method", lambda run, fit, *_: fit)
@@ -71,13 +103,25 @@ def rows_of(columns: Sequence[Column], items: Iterable[Sequence[Any]]) -> list[l
     return [[column.cell(*item) for column in columns] for item in items]
 
 
-@dataclass(frozen=True)
-class Thumbnail:
+class Thumbnail(NamedTuple):
     """An image below a table: ``data:`` URI, label, and lines of its caption."""
 
     image: str
     label: str
     lines: Sequence[str] = ()
+
+
+def preview(path: Path, label: str, *lines: str) -> Thumbnail:
+    """An image of the comparison (path without suffix) at its exposure."""
+    from PIL import Image
+
+    with Image.open(with_ending(path, ".png")) as image:
+        return Thumbnail(jpeg_uri(np.asarray(image.convert("RGB")), _QUALITY), label, lines)
+
+
+def signed_map(values: NDArray[np.floating], scale: float, label: str, *lines: str) -> Thumbnail:
+    """A signed map (rows, columns), saturated at ± `scale`."""
+    return Thumbnail(map_uri((values / scale).astype(np.float64), "signed", 256), label, lines)
 
 
 @dataclass(frozen=True)
@@ -90,63 +134,23 @@ class Table:
     columns: Sequence[Column]
     rows: Sequence[Sequence[Cell]]
     plots: Sequence[Mapping[str, str]] = ()
-    images: Sequence[tuple[str, Sequence[Thumbnail]]] = field(default_factory=list)
+    images: Sequence[tuple[str, Sequence[Thumbnail]]] = ()
 
     def for_page(self) -> dict[str, Any]:
         """Head and rows as text."""
-        rows = [[_text(c, x) for c, x in zip(self.columns, row, strict=True)] for row in self.rows]
+        rows = [[c.text(x) for c, x in zip(self.columns, row, strict=True)] for row in self.rows]
         return {"head": [c.title for c in self.columns], "rows": rows}
 
     def csv(self) -> str:
         """All numbers as CSV, with columns for standard errors and noise; unknown numbers are empty."""
+        rows = [[c.numbers(x) for c, x in zip(self.columns, row, strict=True)] for row in self.rows]
+        # Numbers precede their errors.
+        names = [sorted({c.key}.union(*(row[k] for row in rows))) for k, c in enumerate(self.columns)]
         stream = io.StringIO()
-        writer = csv.writer(stream, lineterminator="\n")
-        suffixes = [max(map(_suffix, cells)) for cells in zip(*self.rows, strict=True)]
-        names = [(c.key, f"{c.key}_{s}") for c, s in zip(self.columns, suffixes, strict=True)]
-        for row in (names, *([_numbers(cell) for cell in row] for row in self.rows)):
-            pairs = zip(row, suffixes, strict=True)
-            writer.writerow(x for pair, s in pairs for x in (pair if s else pair[:1]))
+        writer = csv.DictWriter(stream, [key for keys in names for key in keys], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows({key: x for cell in row for key, x in cell.items()} for row in rows)
         return stream.getvalue()
-
-
-def _text(column: Column, cell: Cell) -> str:
-    if cell is None:
-        return "–"
-    if isinstance(cell, str):
-        return cell
-    if isinstance(cell, Estimate):
-        return estimate_text(cell, column.factor)
-    if isinstance(cell, Psnr):
-        return decibel(cell.value, cell.mse)
-    if isinstance(cell, PerceptualCell):
-        return cell.metric.text(cell.value, cell.noise, with_noise=False)
-    if isinstance(cell, int):
-        return f"{cell:,}"
-    return signed(f"{column.factor * cell:{column.digits}}")
-
-
-def _number(x: float | None) -> str:
-    return "" if x is None or not math.isfinite(x) else f"{x:.6g}"
-
-
-def _suffix(cell: Cell) -> str:
-    """Suffix of the second CSV column: standard error, value for noise alone, or none."""
-    if isinstance(cell, Estimate | Psnr):
-        return "se"
-    return "noise" if isinstance(cell, PerceptualCell) else ""
-
-
-def _numbers(cell: Cell) -> tuple[str, str]:
-    """(value, standard error or noise) for the CSV file."""
-    if isinstance(cell, Psnr):
-        cell = cell.value
-    if isinstance(cell, Estimate):
-        return _number(cell.value), _number(cell.error)
-    if isinstance(cell, PerceptualCell):
-        return _number(cell.value), _number(cell.noise)
-    if cell is None or isinstance(cell, str | int):
-        return ("" if cell is None else str(cell)), ""
-    return _number(cell), ""
 
 
 def mean_of(estimates: Sequence[Estimate]) -> Estimate:

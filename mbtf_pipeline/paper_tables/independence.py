@@ -6,7 +6,10 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from mbtf_core.stats import Estimate
+from mbtf_pipeline.compare.pictures import read_picture
 from mbtf_pipeline.compare.unmodified_mitsuba import (
     MAX_STANDARD_ERRORS,
     MEAN_TOLERANCE,
@@ -14,9 +17,16 @@ from mbtf_pipeline.compare.unmodified_mitsuba import (
     RMS_TOLERANCE,
     verdict,
 )
-from mbtf_pipeline.formatting import direction, estimate
-from mbtf_pipeline.paper_tables.cells import MATERIAL, Column, Table, Thumbnail, rows_of
-from mbtf_pipeline.paper_tables.figures import difference, preview
+from mbtf_pipeline.formatting import direction, estimate, is_significant
+from mbtf_pipeline.paper_tables.cells import (
+    MATERIAL,
+    Column,
+    Table,
+    Thumbnail,
+    preview,
+    rows_of,
+    signed_map,
+)
 from mbtf_pipeline.paper_tables.runs import FinishedRun
 
 _RENDERERS = {"base color": "unmodified Mitsuba", "full": "Mitsuba with the BSDF of mbtf"}
@@ -32,33 +42,42 @@ _TEXT = (
     "standard errors. Images with fewer than 20 pixels a side are inconclusive. The detection limit is the "
     "smallest RMS difference that would be detected despite the noise."
 )
+
+
+def _rms_text(square: Estimate) -> str | None:
+    """Root of a noise-free mean square in percent; an upper limit if it is not significant. None for images
+    that are too small."""
+    if square.n < MIN_BLOCKS:
+        return None
+    if square.value <= 0 or not is_significant(square):
+        return f"below {100 * math.sqrt(max(square.value, 0.0) + 2.0 * square.error):.2g} %"
+    root = math.sqrt(square.value)
+    return f"{Estimate(100 * root, 100 * square.error / (2 * root), square.n)} %"
+
+
+def _detectable(square: Estimate) -> float | None:
+    return math.sqrt(MAX_STANDARD_ERRORS * square.error) if square.n >= MIN_BLOCKS else None
+
+
+# Of a run, the record of a surface, and its differences of the mean and in mean square.
 _COLUMNS = (
     MATERIAL,
-    Column("surface", "surface", lambda run, found: found["surface"]),
-    Column("renderer", "renderer", lambda run, found: _RENDERERS[found["surface"]]),
-    Column(
-        "difference of the means [% of the mean]", "mean", lambda run, found: estimate(found["mean"]), 100.0
-    ),
-    Column("RMS difference, noise-free [% of the mean]", "rms", lambda run, found: _rms_text(_square(found))),
-    Column(
-        "detection limit, RMS [%]",
-        "rms_detectable",
-        lambda run, found: _detectable(_square(found)),
-        100.0,
-        ".2g",
-    ),
-    Column(
-        "verdict", "verdict", lambda run, found: verdict(estimate(found["mean"]), estimate(found["square"]))
-    ),
+    Column("surface", "surface", lambda run, found, *_: found["surface"]),
+    Column("renderer", "renderer", lambda run, found, *_: _RENDERERS[found["surface"]]),
+    Column("difference of the means [% of the mean]", "mean", lambda run, found, mean, _: mean, 100.0),
+    Column("RMS difference, noise-free [% of the mean]", "rms", lambda *item: _rms_text(item[-1])),
+    Column("detection limit, RMS [%]", "rms_detectable", lambda *item: _detectable(item[-1]), 100.0, ".2g"),
+    Column("verdict", "verdict", lambda run, found, mean, square: verdict(mean, square)),
 )
 
 
 def independence(runs: Sequence[FinishedRun]) -> list[Table]:
     """Differences of both renderers, per material and surface."""
     checks = [(run, run.comparison.get("unmodified_mitsuba")) for run in runs]
-    items = [(run, found) for run, check in checks if check is not None for found in check["surfaces"]]
+    surfaces = [(run, found) for run, check in checks if check for found in check["surfaces"]]
+    items = [(run, found, estimate(found["mean"]), estimate(found["square"])) for run, found in surfaces]
     title = "References rendered with unmodified Mitsuba"
-    images = [_images(run, found) for run, found in items]
+    images = [_images(run, found) for run, found in surfaces]
     return [Table("independence", title, _TEXT, _COLUMNS, rows_of(_COLUMNS, items), images=images)]
 
 
@@ -69,33 +88,7 @@ def _images(run: FinishedRun, found: Mapping[str, Any]) -> tuple[str, list[Thumb
         f"{run.title}, {found['surface']}: view {direction(check['view'])}, light {direction(check['light'])}"
     )
     note = f"saturates at ± {_SCALE:.0%} of white; includes the noise of both"
-    signed = difference(mbtf, mitsuba, _SCALE * run.comparison["white"])
-    return title, [
-        Thumbnail(preview(mbtf), "mbtf"),
-        Thumbnail(preview(mitsuba), "Mitsuba"),
-        Thumbnail(signed, "mbtf − Mitsuba", [note]),
-    ]
-
-
-def _verdict(found: Mapping[str, Any]) -> str:
-    return verdict(estimate(found["mean"]), estimate(found["square"]))
-
-
-def _square(found: Mapping[str, Any]) -> Estimate | None:
-    """Mean squared difference; None if the image is too small."""
-    square = estimate(found["square"])
-    return square if square.n >= MIN_BLOCKS else None
-
-
-def _detectable(square: Estimate | None) -> float | None:
-    return None if square is None else math.sqrt(MAX_STANDARD_ERRORS * square.error)
-
-
-def _rms_text(square: Estimate | None) -> str | None:
-    """Root of a noise-free mean square in percent; an upper limit if it is not significant."""
-    if square is None:
-        return None
-    if square.value <= 2.0 * square.error:
-        return f"below {100 * math.sqrt(max(square.value, 0.0) + 2.0 * square.error):.2g} %"
-    root = math.sqrt(square.value)
-    return f"{Estimate(100 * root, 100 * square.error / (2 * root), square.n)} %"
+    own, other = (read_picture(path).astype(np.float64) for path in (mbtf, mitsuba))
+    scale = _SCALE * run.comparison["white"]
+    signed = signed_map((own - other).mean(axis=-1), scale, "mbtf − Mitsuba", note)
+    return title, [preview(mbtf, "mbtf"), preview(mitsuba, "Mitsuba"), signed]

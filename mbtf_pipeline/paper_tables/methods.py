@@ -15,17 +15,21 @@ from mbtf_pipeline.paper_tables.cells import (
     NOT_IMPLEMENTED,
     Cell,
     Column,
-    PerceptualCell,
-    Psnr,
+    Shown,
     Table,
     Thumbnail,
     mean_of,
+    perceptual_cell,
+    preview,
+    psnr_cell,
     ratio_of,
     rows_of,
 )
-from mbtf_pipeline.paper_tables.figures import preview
 from mbtf_pipeline.paper_tables.published import NOT_HERE, mse_ratio
 from mbtf_pipeline.paper_tables.runs import FinishedRun, each_fit
+
+# Records of images.
+Pictures = Sequence[dict[str, Any]]
 
 
 def methods(runs: Sequence[FinishedRun]) -> list[Table]:
@@ -34,12 +38,12 @@ def methods(runs: Sequence[FinishedRun]) -> list[Table]:
 
 
 def _metric_column(metric: PerceptualMetric) -> Column:
-    def mean(run: FinishedRun, fit: str, pictures: Sequence[dict[str, Any]] | None = None) -> Cell:
+    def mean(run: FinishedRun, fit: str, pictures: Pictures | None = None) -> Shown | None:
         """Mean over images; None if one of them has no value."""
-        chosen = run.pictures if pictures is None else pictures
+        chosen = pictures or run.pictures
         value = _mean([metric.of(p["fits"][fit]) for p in chosen])
         noise = _mean([metric.of(p["references"][run.kind]) for p in chosen])
-        return None if value is None else PerceptualCell(metric, value, noise)
+        return None if value is None else perceptual_cell(metric, value, noise)
 
     return Column(metric.title, metric.key.replace(".", "_"), mean)
 
@@ -54,19 +58,15 @@ METRIC_COLUMNS = [_metric_column(m) for m in PERCEPTUAL_METRICS]
 
 
 def picture_error(
-    run: FinishedRun, fit: str, key: str, pictures: Sequence[dict[str, Any]] | None = None, kind: str = ""
+    run: FinishedRun, fit: str, key: str, pictures: Pictures | None = None, kind: str = ""
 ) -> Estimate:
     """Mean over images of ``mse`` or ``relative_mse``."""
-    chosen = run.pictures if pictures is None else pictures
-    return mean_of([estimate(p["fits"][fit]["errors"][kind or run.kind][key]) for p in chosen])
+    errors = [p["fits"][fit]["errors"][kind or run.kind] for p in pictures or run.pictures]
+    return mean_of([estimate(e[key]) for e in errors])
 
 
-def _psnr(run: FinishedRun, fit: str) -> Psnr:
-    return Psnr(picture_error(run, fit, "mse"), run.comparison["white"])
-
-
-def _relative(run: FinishedRun, fit: str) -> Estimate:
-    return picture_error(run, fit, "relative_mse")
+def _psnr(run: FinishedRun, fit: str) -> Shown:
+    return psnr_cell(picture_error(run, fit, "mse"), run.comparison["white"])
 
 
 _ERRORS = [
@@ -76,14 +76,9 @@ _ERRORS = [
     Column("MSE [10⁻³/sr²]", "mse", FinishedRun.mse, 1e3),
     Column("MSE − MSE of the first method [10⁻³/sr²]", "mse_minus_first", FinishedRun.minus_first, 1e3),
     Column("PSNR of images", "psnr", _psnr),
-    Column("relative MSE of images", "relative_mse", _relative),
+    Column("relative MSE of images", "relative_mse", lambda r, fit: picture_error(r, fit, "relative_mse")),
     *METRIC_COLUMNS,
-    Column(
-        "training [s]",
-        "training_seconds",
-        FinishedRun.seconds,
-        digits=".0f",
-    ),
+    Column("training [s]", "training_seconds", FinishedRun.seconds, digits=".0f"),
     Column("network weights", "network_weights", lambda run, fit: run.fit(fit)["network_weights"]),
 ]
 
@@ -106,12 +101,12 @@ def _images(runs: Sequence[FinishedRun]) -> list[tuple[str, list[Thumbnail]]]:
     out = []
     for run in runs:
         shown = run.pictures[-1]
-        row = [Thumbnail(preview(run.file(shown["references"][run.kind]["file"])), "reference")]
+        row = [preview(run.file(shown["references"][run.kind]["file"]), "reference")]
         for fit in run.fits:
             record = shown["fits"][fit]
             psnr = record["errors"][run.kind]["psnr"]["value"]
             line = "" if psnr is None else signed(f"{psnr:.1f} dB")
-            row.append(Thumbnail(preview(run.file(record["file"])), fit, [line]))
+            row.append(preview(run.file(record["file"]), fit, line))
         out.append((run.title, row))
     return out
 
@@ -128,13 +123,12 @@ def _ratios(runs: Sequence[FinishedRun]) -> Table:
     rows: list[list[Cell]] = []
     for run in runs:
         for base, fit in combinations(run.fits, 2):
-            known = mse_ratio(run.material, fit, base)
-            published = (None, None) if known is None else (known.ratio, known.source)
+            published = mse_ratio(run.material, fit, base) or (None, None)
             rows.append([run.title, fit, base, ratio_of(run.mse(fit), run.mse(base)), *published])
         for method, (title, _, _) in NOT_HERE.items():
             known = mse_ratio(run.material, method, "neumip")
             if known is not None:
-                rows.append([run.title, title, "neumip", NOT_IMPLEMENTED, known.ratio, known.source])
+                rows.append([run.title, title, "neumip", NOT_IMPLEMENTED, *known])
     text = (
         "A ratio below 1 means that the method is better than the one it is divided by. Published numbers "
         "belong to other data: another material with the same name, other light, other training. The "

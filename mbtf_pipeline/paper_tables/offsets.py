@@ -3,37 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
-from mbtf_pipeline.paper_tables.cells import MATERIAL, METHOD, Column, Table, Thumbnail, rows_of
-from mbtf_pipeline.paper_tables.figures import signed_map
+from mbtf_pipeline.paper_tables.cells import MATERIAL, METHOD, Column, Table, Thumbnail, rows_of, signed_map
 from mbtf_pipeline.paper_tables.runs import FinishedRun, each_fit
 from mbtf_pipeline.report.offsets import displacements
 from mbtf_pipeline.run_folder import COMPARE
 
 
-def _view(key: str) -> Any:
-    return lambda run, fit, record: float(record["view"][key])
+def _view(title: str, key: str) -> Column:
+    return Column(title, key, lambda run, fit, record: float(record["view"][key]), digits=".0f")
 
 
-def _learned(key: str) -> Any:
-    return lambda run, fit, record: record["fits"][fit][key]
+def _learned(title: str, key: str, name: str, digits: str) -> Column:
+    return Column(title, name, lambda run, fit, record: record["fits"][fit][key], digits=digits)
 
 
 _COLUMNS = (
     MATERIAL,
     METHOD,
-    Column("view: elevation", "elevation", _view("elevation"), digits=".0f"),
-    Column("azimuth", "azimuth", _view("azimuth"), digits=".0f"),
-    Column(
-        "spread, traced [tile widths]",
-        "spread_traced",
-        lambda run, fit, record: record["spread"],
-        digits=".2g",
-    ),
-    Column("spread, learned [tile widths]", "spread_learned", _learned("spread"), digits=".2g"),
-    Column("correlation", "correlation", _learned("correlation"), digits=".2f"),
-    Column("slope of learned on traced", "slope", _learned("slope"), digits=".2f"),
+    _view("view: elevation", "elevation"),
+    _view("azimuth", "azimuth"),
+    Column("spread, traced [tile widths]", "spread_traced", lambda *item: item[-1]["spread"], digits=".2g"),
+    _learned("spread, learned [tile widths]", "spread", "spread_learned", ".2g"),
+    _learned("correlation", "correlation", "correlation", ".2f"),
+    _learned("slope of learned on traced", "slope", "slope", ".2f"),
 )
 _TEXT = (
     "Displacement towards the viewer between the point where a view ray crosses the reference plane and "
@@ -57,13 +50,13 @@ def offsets(runs: Sequence[FinishedRun]) -> list[Table]:
 
 
 def _images(runs: Sequence[FinishedRun]) -> list[tuple[str, list[Thumbnail]]]:
-    out: list[tuple[str, list[Thumbnail]]] = []
+    out = []
     for run in runs:
         records = run.comparison["offsets"]
         for fit in (None, *records[0]["fits"]) if records else ():
             maps, _, scale = displacements(run.folder / COMPARE, records, fit)
             row = [
-                Thumbnail(signed_map(m, scale), f"elevation {record['view']['elevation']:g}°")
+                signed_map(m, scale, f"elevation {record['view']['elevation']:g}°")
                 for m, record in zip(maps, records, strict=True)
             ]
             out.append((f"{run.title}, {fit or 'traced'}: ± {scale:.2g} tile widths", row))

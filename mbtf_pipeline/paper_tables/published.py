@@ -6,8 +6,6 @@ and a material of the same name is not the same material.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 NEUMIP = "Kuznetsov et al. 2021"
 HIERARCHICAL = "Xue et al. 2024"
 
@@ -37,27 +35,20 @@ NOT_HERE: dict[str, tuple[str, int, int]] = {
 }
 
 
-@dataclass(frozen=True)
-class Published:
-    """A published ratio and its source."""
-
-    ratio: float
-    source: str
-
-
-def mse_ratio(material: str, method: str, base: str) -> Published | None:
-    """MSE of a method divided by that of another on the published material of this name; None if unknown."""
+def mse_ratio(material: str, method: str, base: str) -> tuple[float, str] | None:
+    """MSE of a method divided by that of another on the published material of this name, and its source; None
+    if unknown."""
     row = _NEUMIP_MSE.get(material)
     if row is not None and method in _COLUMNS and base in _COLUMNS:
-        return Published(row[_COLUMNS.index(method)] / row[_COLUMNS.index(base)], NEUMIP)
+        return row[_COLUMNS.index(method)] / row[_COLUMNS.index(base)], NEUMIP
     pair = _HIERARCHICAL_PSNR.get(material)
     if pair is not None and (method, base) == ("hierarchical", "neumip"):
-        return Published(10.0 ** ((pair[1] - pair[0]) / 10.0), f"{HIERARCHICAL}, from PSNR")
+        return 10.0 ** ((pair[1] - pair[0]) / 10.0), f"{HIERARCHICAL}, from PSNR"
     return None
 
 
-def level_ratios(material: str, method: str) -> list[Published] | None:
-    """MSE at each level divided by that at the finest, the finest first; None if unknown."""
+def level_ratios(material: str, method: str) -> tuple[list[float], str] | None:
+    """MSE at each level over that at the finest, the finest first, and their source; None if unknown."""
     if (material, method) != ("twisted_wool", "neumip"):
         return None
-    return [Published(value / _ZOOM_MSE[0], f"{NEUMIP}, Table 3") for value in _ZOOM_MSE]
+    return [value / _ZOOM_MSE[0] for value in _ZOOM_MSE], f"{NEUMIP}, Table 3"

@@ -59,13 +59,7 @@ class PaperRecipe(Settings):
 
 @dataclass(frozen=True)
 class Planned:
-    """One recipe to run.
-
-    Attributes
-    ----------
-    material, variant : their names; the variant is empty if there are none
-    recipe : resolved
-    """
+    """One resolved recipe to run; `variant` is empty if there are none."""
 
     material: str
     variant: str
@@ -74,16 +68,11 @@ class Planned:
     @property
     def name(self) -> str:
         """Name of the run and its folder."""
-        return f"{self.material}-{self.variant}" if self.variant else self.material
+        return self.recipe.name
 
 
 def is_paper_recipe(path: Path) -> bool:
-    """Whether a file is a paper recipe, that is, lists tables.
-
-    Raises
-    ------
-    InputError : it cannot be read
-    """
+    """Whether a file is a paper recipe, that is, lists tables."""
     return path.is_file() and "tables" in read_yaml(path)
 
 
@@ -100,7 +89,6 @@ def load_paper_recipe(path: Path, assignments: list[str]) -> PaperRecipe:
     Returns
     -------
     PaperRecipe
-        The recipe.
 
     Raises
     ------
@@ -142,36 +130,30 @@ def plan(paper: PaperRecipe, path: Path, quick: bool) -> tuple[list[Planned], di
     for material, own in paper.materials.items():
         given = own.generate.get("material")
         if given is None:
-            raise InputError(
-                "has no path", where=f"{path}: materials.{material}", hint="add generate.material"
-            )
+            where = f"{path}: materials.{material}"
+            raise InputError("has no path", where=where, hint="add generate.material")
         file = Path(os.path.normpath(path.parent / str(given)))
         if not file.exists():
             missing[material] = os.path.abspath(file)
             continue
         for variant, over in variants.items():
             layers = [paper.base, *([paper.quick] if quick else []), own, over]
-            planned.append(Planned(material, variant, _compose(layers, material, variant, file, path)))
+            name = f"{material}-{variant}" if variant else material
+            planned.append(Planned(material, variant, _compose(layers, name, file, path)))
     if not planned:
-        raise InputError(
-            "all of its materials are missing",
-            where=path,
-            hint=f"searched for {next(iter(missing.values()))}; edit 'materials'",
-        )
+        hint = f"searched for {next(iter(missing.values()))}; edit 'materials'"
+        raise InputError("all of its materials are missing", where=path, hint=hint)
     return planned, missing
 
 
-def _compose(layers: list[Layer], material: str, variant: str, file: Path, path: Path) -> Recipe:
+def _compose(layers: list[Layer], name: str, file: Path, path: Path) -> Recipe:
     data: dict[str, Any] = {}
     for layer in layers:
         data = deep_merge(data, layer.model_dump(mode="json"))
     each = data.pop("each_fit")
-    data["fit"] = {
-        name: deep_merge(each, {"model": name, **(own or {})}) for name, own in data["fit"].items()
-    }
+    data["fit"] = {fit: deep_merge(each, {"model": fit, **(own or {})}) for fit, own in data["fit"].items()}
     data["generate"]["material"] = str(file)
     # The optional metric is computed if its weights are installed.
     data["compare"] = {"st_lpips": weights_file() is not None, **data["compare"]}
-    name = f"{material}-{variant}" if variant else material
     data |= {"name": name, "report": {"title": name.replace("_", " ")}}
     return build(Recipe, data, source=f"{path}: {name}")

@@ -17,15 +17,7 @@ from mbtf_pipeline.run_folder import COMPARE, SHARDS
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """One finished run.
-
-    Attributes
-    ----------
-    material, variant : names in the recipe
-    folder : of the run
-    comparison : content of its ``comparison.json``
-    manifest : of its first data set
-    """
+    """One finished run: names in the recipe, folder, ``comparison.json``, manifest of its first data set."""
 
     material: str
     variant: str
@@ -35,14 +27,9 @@ class FinishedRun:
 
     @classmethod
     def read(cls, material: str, variant: str, folder: Path) -> FinishedRun:
-        """Read a run's folder.
-
-        Raises
-        ------
-        InputError : the run is not finished
-        """
-        comparison = read_json(folder / COMPARE / COMPARISON_NAME)
-        return cls(material, variant, folder, comparison, read_json(folder / SHARDS / "manifest.json"))
+        """Read a run's folder."""
+        records = (folder / COMPARE / COMPARISON_NAME, folder / SHARDS / "manifest.json")
+        return cls(material, variant, folder, *map(read_json, records))
 
     @property
     def title(self) -> str:
@@ -71,15 +58,13 @@ class FinishedRun:
         """Records of the comparison's images."""
         return list(self.comparison["pictures"])
 
-    def fit(self, name: str) -> dict[str, Any]:
+    def fit(self, name: str) -> Any:
         """Record of a fit: errors, parameter counts and training time."""
-        record: dict[str, Any] = self.comparison["test"][name]
-        return record
+        return self.comparison["test"][name]
 
-    def test(self, fit: str) -> dict[str, Any]:
+    def test(self, fit: str) -> Any:
         """Errors of a fit on the test queries."""
-        record: dict[str, Any] = self.fit(fit)["splits"]["test"]
-        return record
+        return self.fit(fit)["splits"]["test"]
 
     def seconds(self, fit: str) -> float:
         """Training time of a fit."""

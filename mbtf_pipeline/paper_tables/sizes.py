@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from mbtf_pipeline.paper_tables.cells import NOT_IMPLEMENTED, Column, Table, rows_of
+from mbtf_pipeline.paper_tables.cells import NOT_IMPLEMENTED, Cell, Column, Table, rows_of
 from mbtf_pipeline.paper_tables.published import NEUMIP, NOT_HERE, WEIGHTS
 from mbtf_pipeline.paper_tables.runs import FinishedRun
 
 _WEIGHTS = (
     Column("method", "method", lambda fit, record: fit),
     Column("decoder", "decoder", lambda fit, record: record["networks"]["decoder"]),
-    Column(
-        "offset network", "offset_network", lambda fit, record: record["networks"].get("offset_network", 0)
-    ),
+    Column("offset network", "offset_network", lambda _, r: r["networks"].get("offset_network", 0)),
     Column("all networks", "network_weights", lambda fit, record: record["network_weights"]),
     Column("texture values", "texels", lambda fit, record: record["texels"]),
     Column("float32 [KiB]", "kib", lambda _, r: (r["network_weights"] + r["texels"]) / 256, digits=",.0f"),
@@ -35,17 +33,15 @@ def weights(runs: Sequence[FinishedRun]) -> list[Table]:
     return [Table("weights", "Parameter counts", text, _WEIGHTS, rows)]
 
 
-def _milliseconds(title: str, key: str, get: Any) -> Column:
-    return Column(title, f"{key}_ms", lambda fit, record: get(record), digits=",.1f")
+def _milliseconds(title: str, key: str, *path: str) -> Column:
+    """Milliseconds at a path in the record of a timing."""
 
+    def get(fit: str, record: Any) -> Cell:
+        for name in path:
+            record = record.get(name)
+        return record
 
-def _part(title: str, name: str) -> Column:
-    return _milliseconds(title, name.replace(" ", "_"), lambda record: record["parts_ms"].get(name))
-
-
-def _lights(count: str) -> Column:
-    title = f"{count} light{'s' if count != '1' else ''}"
-    return _milliseconds(title, f"lights_{count}", lambda record: record["lights_ms"][count])
+    return Column(title, f"{key}_ms", get, digits=",.1f")
 
 
 _TIMING_TEXT = (
@@ -68,17 +64,18 @@ def timing(runs: Sequence[FinishedRun]) -> list[Table]:
         for fit, records in run.comparison.get("timing", {}).items()
         for record in records
     ]
+    lights = items[-1][1]["lights_ms"] if items else ()
     columns = [
         Column("method", "method", lambda fit, record: fit),
         Column("device", "device", lambda fit, record: record["device"]),
-        _milliseconds("material evaluation", "evaluate", lambda record: record["evaluate_ms"]),
-        _part("offset texture", "offset texture"),
-        _part("offset network", "offset network"),
-        _part("pyramid", "pyramid"),
-        _part("encoded position", "encoding"),
-        _milliseconds("stage 1 (per view)", "stage1", lambda record: record["stage1_ms"]),
-        _milliseconds("stage 2 (per light): decoder", "stage2", lambda record: record["stage2_ms"]),
-        *(_lights(count) for count in (items[-1][1]["lights_ms"] if items else ())),
+        _milliseconds("material evaluation", "evaluate", "evaluate_ms"),
+        _milliseconds("offset texture", "offset_texture", "parts_ms", "offset texture"),
+        _milliseconds("offset network", "offset_network", "parts_ms", "offset network"),
+        _milliseconds("pyramid", "pyramid", "parts_ms", "pyramid"),
+        _milliseconds("encoded position", "encoding", "parts_ms", "encoding"),
+        _milliseconds("stage 1 (per view)", "stage1", "stage1_ms"),
+        _milliseconds("stage 2 (per light): decoder", "stage2", "stage2_ms"),
+        *(_milliseconds(f"{n} light{'s' * (n != '1')}", f"lights_{n}", "lights_ms", n) for n in lights),
         Column("timed queries", "queries", lambda fit, record: record["queries"]),
     ]
     rows = rows_of(columns, items)

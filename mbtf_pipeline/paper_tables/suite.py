@@ -1,23 +1,48 @@
-"""Runs all recipes of a paper recipe; runs that are up to date are kept."""
+"""Runs all recipes of a paper recipe, keeps those that are up to date, and writes page and tables."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mbtf_core.atomic import read_json, write_json
+from mbtf_core.atomic import read_json, write_json, write_text
 from mbtf_core.console import Console
+from mbtf_core.errors import InputError
 from mbtf_core.folders import check_folder, make_folder
-from mbtf_pipeline.paper_tables.page import write_page
+from mbtf_pipeline.compare.metrics import DEFINITIONS
+from mbtf_pipeline.compare.st_lpips import weights_file
+from mbtf_pipeline.paper_tables.ablations import ablations
+from mbtf_pipeline.paper_tables.cells import Table
+from mbtf_pipeline.paper_tables.independence import independence
+from mbtf_pipeline.paper_tables.levels import levels
+from mbtf_pipeline.paper_tables.methods import methods
+from mbtf_pipeline.paper_tables.offsets import offsets
 from mbtf_pipeline.paper_tables.recipe import RUNS, PaperRecipe, Planned
+from mbtf_pipeline.paper_tables.runs import FinishedRun
+from mbtf_pipeline.paper_tables.sizes import timing, weights
+from mbtf_pipeline.paper_tables.zooms import zooms
+from mbtf_pipeline.report.plots import ERROR_BAR_NOTE
+from mbtf_pipeline.report.report import render
 from mbtf_pipeline.run import run_recipe
 from mbtf_pipeline.run_folder import has_record, locked, machine
 
 PAPER_NAME = "paper.json"
 PAPER_FORMAT = "mbtf-paper"
 PAPER_SCHEMA = 2
+PAGE = "paper.html"
+TABLES = "tables"
+_MAKERS: dict[str, Callable[[Sequence[FinishedRun]], list[Table]]] = {
+    "methods": methods,
+    "levels": levels,
+    "weights": weights,
+    "ablations": ablations,
+    "timing": timing,
+    "offsets": offsets,
+    "zooms": zooms,
+    "independence": independence,
+}
 
 
 @dataclass(frozen=True)
@@ -43,12 +68,7 @@ class PaperResult:
 
 
 def is_paper(folder: Path) -> bool:
-    """Whether a folder contains the runs of a paper recipe.
-
-    Raises
-    ------
-    InputError : it contains those of another schema version
-    """
+    """Whether a folder contains the runs of a paper recipe; those of another schema version are refused."""
     return has_record(folder, PAPER_NAME, PAPER_FORMAT, PAPER_SCHEMA)
 
 
@@ -68,7 +88,6 @@ def run_paper(
     Parameters
     ----------
     paper : PaperRecipe
-        From :func:`~mbtf_pipeline.paper_tables.recipe.load_paper_recipe`.
     planned, missing
         From :func:`~mbtf_pipeline.paper_tables.recipe.plan`.
     folder : Path
@@ -85,7 +104,6 @@ def run_paper(
     Returns
     -------
     PaperResult
-        Paths and record.
 
     Raises
     ------
@@ -120,16 +138,53 @@ def run_paper(
             run_recipe(one.recipe, folder / RUNS / one.name, force=force, command=command, console=console)
             record["runs"].append({"material": one.material, "variant": one.variant, "name": one.name})
             write_json(folder / PAPER_NAME, record)
-        page, tables = write_page(folder, record)
+        page, tables = _write_page(folder, record)
     return PaperResult(folder, page, tables, record)
 
 
 def write_again(folder: Path) -> Path:
-    """Write the page and tables of the finished runs again; returns the page's path.
-
-    Raises
-    ------
-    InputError : no run is finished, or one is corrupt
-    """
+    """Write the page and tables of the finished runs again; returns the page's path."""
     with locked(folder, PAPER_NAME):
-        return write_page(folder, read_json(folder / PAPER_NAME))[0]
+        return _write_page(folder, read_json(folder / PAPER_NAME))[0]
+
+
+def _write_page(folder: Path, record: Mapping[str, Any]) -> tuple[Path, list[Path]]:
+    """Write ``paper.html`` and ``tables/*.csv`` of the finished runs; returns their paths."""
+    if not record["runs"]:
+        raise InputError("contains no finished run", where=folder, hint="run the recipe again: it resumes")
+    runs = [FinishedRun.read(r["material"], r["variant"], folder / RUNS / r["name"]) for r in record["runs"]]
+    tables = [table for name in record["tables"] for table in _MAKERS[name](runs)]
+    (folder / TABLES).mkdir(exist_ok=True)
+    files = [folder / TABLES / f"{table.key}.csv" for table in tables]
+    for file, table in zip(files, tables, strict=True):
+        write_text(file, table.csv())
+    reports = [(r["name"].replace("_", " "), f"{RUNS}/{r['name']}/report.html") for r in record["runs"]]
+    html = render(
+        "paper.html",
+        record=record,
+        tables=tables,
+        reports=reports,
+        sizes=_sizes(runs),
+        definitions=DEFINITIONS,
+        error_bar_note=ERROR_BAR_NOTE,
+        st_lpips=weights_file() is not None,
+    )
+    write_text(folder / PAGE, html)
+    return folder / PAGE, files
+
+
+def _sizes(runs: Sequence[FinishedRun]) -> dict[str, Any]:
+    """Sizes of the first run, for the head of the page."""
+    run = runs[0]
+    splits = run.manifest["splits"]
+    return {
+        "resolution": 2 ** run.comparison["finest"],
+        "train": splits["train"]["queries"],
+        "spp": splits["train"]["spp"],
+        "test": splits["test"]["queries"],
+        "test_spp": splits["test"]["spp"],
+        "pictures": len(run.pictures),
+        "size": run.comparison["size"],
+        "picture_spp": run.comparison["spp"],
+        "training": max(r.seconds(fit) for r in runs for fit in r.fits),
+    }

@@ -4,10 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from mbtf_core.stats import Estimate
 from mbtf_pipeline.formatting import levels
-from mbtf_pipeline.paper_tables.cells import MATERIAL, METHOD, Cell, Column, Psnr, Table, Thumbnail, rows_of
-from mbtf_pipeline.paper_tables.figures import preview
-from mbtf_pipeline.paper_tables.methods import METRIC_COLUMNS, picture_error
+from mbtf_pipeline.paper_tables.cells import (
+    MATERIAL,
+    METHOD,
+    Column,
+    Shown,
+    Table,
+    Thumbnail,
+    preview,
+    psnr_cell,
+    rows_of,
+)
+from mbtf_pipeline.paper_tables.methods import METRIC_COLUMNS, Pictures, picture_error
 from mbtf_pipeline.paper_tables.runs import FinishedRun
 
 _KINDS = {"query": "M at each pixel’s footprint", "pixel": "filtered pixels"}
@@ -22,17 +32,8 @@ def zooms(runs: Sequence[FinishedRun]) -> list[Table]:
     """Errors for every field of view and kind of reference, averaged over views and lights."""
     columns = [
         MATERIAL,
-        Column(
-            "tiles across",
-            "tiles_across",
-            lambda run, fit, chosen: float(chosen[0]["tiles_across"]),
-            digits="g",
-        ),
-        Column(
-            "level",
-            "level",
-            lambda run, fit, chosen: levels(chosen[0]["levels"], run.comparison["finest"]),
-        ),
+        Column("tiles across", "tiles_across", lambda *item: float(item[-1][0]["tiles_across"]), digits="g"),
+        Column("level", "level", lambda run, _, shown: levels(shown[0]["levels"], run.comparison["finest"])),
         METHOD,
     ]
     for kind in dict.fromkeys(kind for run in runs for kind in run.comparison["kinds"]):
@@ -49,13 +50,14 @@ def zooms(runs: Sequence[FinishedRun]) -> list[Table]:
 
 
 def _errors(kind: str) -> list[Column]:
-    def mse(run: FinishedRun, fit: str, chosen: Sequence[dict[str, object]]) -> Cell:
-        return picture_error(run, fit, "mse", chosen, kind) if kind in run.comparison["kinds"] else None
+    """MSE and PSNR against one kind of reference, where a run has it."""
 
-    def psnr(run: FinishedRun, fit: str, chosen: Sequence[dict[str, object]]) -> Cell:
-        if kind not in run.comparison["kinds"]:
-            return None
-        return Psnr(picture_error(run, fit, "mse", chosen, kind), run.comparison["white"])
+    def mse(run: FinishedRun, fit: str, shown: Pictures) -> Estimate | None:
+        return picture_error(run, fit, "mse", shown, kind) if kind in run.comparison["kinds"] else None
+
+    def psnr(run: FinishedRun, fit: str, shown: Pictures) -> Shown | None:
+        found = mse(run, fit, shown)
+        return None if found is None else psnr_cell(found, run.comparison["white"])
 
     return [
         Column(f"MSE against {_KINDS[kind]} [10⁻³/sr²]", f"mse_{kind}", mse, 1e3),
@@ -68,14 +70,14 @@ def _widths(run: FinishedRun) -> list[float]:
 
 
 def _images(runs: Sequence[FinishedRun]) -> list[tuple[str, list[Thumbnail]]]:
-    out: list[tuple[str, list[Thumbnail]]] = []
+    out = []
     for run in runs:
         shown = [next(p for p in run.pictures if p["tiles_across"] == width) for width in _widths(run)]
         sources = [(f"reference, {_KINDS[kind]}", "references", kind) for kind in run.comparison["kinds"]]
         sources += [(fit, "fits", fit) for fit in run.fits]
         for title, group, name in sources:
             row = [
-                Thumbnail(preview(run.file(p[group][name]["file"])), f"{p['tiles_across']:g} tiles across")
+                preview(run.file(p[group][name]["file"]), f"{p['tiles_across']:g} tiles across")
                 for p in shown
             ]
             out.append((f"{run.title}: {title}", row))

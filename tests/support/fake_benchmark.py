@@ -54,4 +54,4 @@ def fake_benchmark(monkeypatch: pytest.MonkeyPatch) -> GeneratorBenchmark:
     monkeypatch.setattr(f"{module}.allocate", lambda job, effects: plan)
     heights = np.random.default_rng(0).random((8, 8))
     material = Material(heights, height_scale=0.1, height_bits=None, base_color=np.array([0.5, 0.5, 0.5]))
-    return GeneratorBenchmark(GeneratorConfig(material="heights.npy"), material, 0)
+    return GeneratorBenchmark(GeneratorConfig(material="heights.npy"), material)

@@ -49,7 +49,6 @@ class FakeRunner:
             run.study,
             run.series,
             run.name,
-            {},
             self.command_of(run),
             Estimate(seconds, 0.0, 1),
             Estimate(error, self.test * error, 1000),
@@ -61,9 +60,6 @@ class FakeRunner:
 
     def command_of(self, run: Run) -> str:
         return f"command of {run.label}"
-
-    def has(self, data: DataRequest) -> bool:
-        return data in self.stored
 
     def forget(self, data: DataRequest) -> None:
         self.stored.discard(data)
@@ -78,8 +74,8 @@ class MemoryStore:
     def __init__(self) -> None:
         self.found: dict[str, Measurement] = {}
 
-    def get(self, study: str, key: dict[str, Any]) -> Measurement | None:
-        return self.found.get(f"{study} {key}")
+    def get(self, task: Run, command: str = "") -> Measurement | None:
+        return self.found.get(f"{task.study} {task.key}")
 
-    def put(self, key: dict[str, Any], found: Measurement) -> None:
-        self.found[f"{found.study} {key}"] = found
+    def put(self, task: Run, found: Measurement) -> None:
+        self.found[f"{task.study} {task.key}"] = found

@@ -31,14 +31,11 @@ def test_counts_keep_two_digits() -> None:
 
 @pytest.mark.parametrize("seconds", [300.0, 600.0, 3600.0])
 def test_planned_runs_fit_into_the_time_twice(seconds: float, tmp_path: Path) -> None:
-    def query_seconds(spp: int) -> float:
-        return 1e-6 + spp * 5e-7
-
-    found = planned_runs(seconds, 4, query_seconds)
+    found = planned_runs(seconds, 4, 7.5e-7)
     spent = dict.fromkeys(("whole", "models", "data"), 0.0)
     made: set[DataRequest] = set()
     for run in found:
-        generating = run.data.queries * query_seconds(run.data.spp) * (run.data not in made)
+        generating = 7.5e-7 * run.data.queries * run.data.spp * (run.data not in made)
         made.add(run.data)
         spent[run.study] += generating + float(run.fit["training"]["time"].rstrip("s"))
     for study, share in RUN_SHARES.items():
@@ -50,26 +47,17 @@ def test_planned_runs_fit_into_the_time_twice(seconds: float, tmp_path: Path) ->
     totals = {run.data.queries * run.data.spp for run in found if run.study == "data"}
     assert max(totals) / min(totals) == pytest.approx(4, rel=0.01)
     # Whole runs double, so that a longer study keeps those of a shorter one.
-    longer = planned_runs(2 * seconds, 4, query_seconds)
-    whole = [run for run in found if run.study == "whole" and "35%" in run.series]
+    longer = planned_runs(2 * seconds, 4, 7.5e-7)
+    whole = [run for run in found if run.study == "whole" and "35 %" in run.series]
     assert all(run in longer for run in whole)
-    assert [run.name for run in whole] == [f"{SHORTEST * 2**n:g} s planned" for n in range(len(whole))]
-
-
-class Clock:
-    """Time that passes where a test lets it."""
-
-    now = 0.0
-
-    def perf_counter(self) -> float:
-        return self.now
+    assert [run.name for run in whole] == [f"planned for {SHORTEST * 2**n:g} s" for n in range(len(whole))]
 
 
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+def clock(monkeypatch: pytest.MonkeyPatch) -> Any:
     """Generating takes seven seconds, fitting five, one more to load; evaluating 2¹⁸ queries half a second.
     The fit answers with a constant 0.1 where values are 0 and 1."""
-    found = Clock()
+    found = SimpleNamespace(now=0.0, perf_counter=lambda: found.now)
 
     class Material:
         def predict(self, queries: Any) -> Any:
@@ -108,7 +96,7 @@ def runner(folder: Path, seed: int = 0, **options: Any) -> RunRunner:
 
 
 @pytest.mark.parametrize(("study", "seconds"), [("whole", 13.0), ("data", 7.0), ("models", 5.0)])
-def test_a_run_measures_time_and_error(clock: Clock, tmp_path: Path, study: str, seconds: float) -> None:
+def test_a_run_measures_time_and_error(clock: Any, tmp_path: Path, study: str, seconds: float) -> None:
     found = runner(tmp_path).measure(Run(study, "", "", DataRequest(640, 4), FIT))
     assert found.seconds.value == seconds
     d = found.details
@@ -120,8 +108,8 @@ def test_a_run_measures_time_and_error(clock: Clock, tmp_path: Path, study: str,
     assert 0 < found.error.error < 0.1 * found.error.value
 
 
-def test_the_expected_time_learns_from_earlier_runs(clock: Clock, tmp_path: Path) -> None:
-    one = runner(tmp_path, query_seconds=lambda paths: 1e-3 * paths)
+def test_the_expected_time_learns_from_earlier_runs(clock: Any, tmp_path: Path) -> None:
+    one = runner(tmp_path, path_seconds=1e-3)
     run = Run("whole", "", "", DataRequest(1000, 4), FIT)
     before = one.expected_seconds(run)
     assert 4 + 5 < before < 4 + 5 + 5
@@ -138,7 +126,7 @@ def test_the_expected_time_learns_from_earlier_runs(clock: Clock, tmp_path: Path
     assert one.expected_seconds(replace(run, fit={"training": {"steps": 3, "time": None}})) < 7 + 6 + 2.5
 
 
-def test_seeds_change_data_and_fit(clock: Clock, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_seeds_change_data_and_fit(clock: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seeds: list[int] = []
     usual = mbtf_fit.fit
     monkeypatch.setattr(module, "generate", lambda job, folder: seeds.append(job.config.seed))
@@ -154,7 +142,7 @@ def test_seeds_change_data_and_fit(clock: Clock, tmp_path: Path, monkeypatch: py
 
 @pytest.mark.parametrize(("study_seed", "offset"), [(0, 0), (0, 2), (5, 0), (5, 2)])
 def test_commands_reproduce_their_run(
-    clock: Clock, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, study_seed: int, offset: int
+    clock: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, study_seed: int, offset: int
 ) -> None:
     """The programs resolve the command to the configurations that were measured."""
     used: list[Any] = []
@@ -163,7 +151,7 @@ def test_commands_reproduce_their_run(
     monkeypatch.setattr(mbtf_fit, "fit", lambda config, *rest: used.append(config) or usual(config, *rest))
     one = runner(tmp_path, study_seed)
     write_text(tmp_path / "generate.yaml", dump_yaml(one.config.model_dump(mode="json")))
-    runs = [run for run in planned_runs(600.0, 6, lambda paths: 1e-6) if run.study == "models"]
+    runs = [run for run in planned_runs(600.0, 6, 1.5e-7) if run.study == "models"]
     for run in (runs[0], runs[-1]):
         used.clear()
         one.forget(run.data)

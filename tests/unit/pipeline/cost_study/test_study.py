@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,11 +19,11 @@ from mbtf_core.errors import InputError
 from mbtf_core.stats import Estimate
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_pipeline.cost_study import study as module
+from mbtf_pipeline.cost_study.generator_runs import GeneratorTask
 from mbtf_pipeline.cost_study.measurements import Measurement, MeasurementFolder
-from mbtf_pipeline.cost_study.page import narrow_errors
+from mbtf_pipeline.cost_study.page import COLUMNS, to_csv
 from mbtf_pipeline.cost_study.pareto import extrapolation, pareto_front
 from mbtf_pipeline.cost_study.runs import Run
-from mbtf_pipeline.cost_study.tables import COLUMNS, to_csv
 from mbtf_pipeline.recipe import load_recipe
 from mbtf_pipeline.run_folder import machine
 
@@ -32,7 +33,7 @@ ONE = Estimate(1.0, 0.1, 4)
 
 def point(seconds: float, error: float, study: str = "whole", **details: float) -> Measurement:
     estimates = Estimate(seconds, 0.0, 1), Estimate(error, 0.01, 9)
-    return Measurement(study, "s", f"{seconds:g}", {}, "command", *estimates, details=details)
+    return Measurement(study, "s", f"{seconds:g}", "command", *estimates, details=details)
 
 
 def test_the_front_holds_what_nothing_beats() -> None:
@@ -55,28 +56,21 @@ def test_the_extrapolation_follows_the_end_of_the_front() -> None:
     assert extrapolation([point(t, e) for t, e in ((20.0, 0.2), (40.0, 0.199), (80.0, 0.198))]) is None
 
 
-def test_narrow_errors_are_those_of_95_percent() -> None:
-    # All error bars are 0.01: 4 % of 0.5, 20 % of 0.1.
-    assert narrow_errors([point(1, 0.5), point(1, 0.1)]) == (1, 2)
-
-
 def test_measurements_come_back_and_damaged_ones_are_repeated(tmp_path: Path) -> None:
-    store = MeasurementFolder(tmp_path, {"config": "abc"})
-    error = Estimate(math.nan, math.inf, 100)
-    options = {"geometry.mesh": 64}
-    kept = Measurement("mesh", "mesh", "64 cells", options, "mbtf-gen", ONE, ONE, ONE, None, {"bytes": 12.0})
-    undefined = Measurement("models", "m", "5 s", {}, "", ONE, error)
-    store.put({"changes": 1}, kept)
-    store.put({"n": 1}, undefined)
-    assert store.get("mesh", {"changes": 1}) == kept
-    found = store.get("models", {"n": 1})
+    store = MeasurementFolder(tmp_path, "abc")
+    mesh = GeneratorTask("mesh", "", "64 cells", {"geometry.mesh": 64})
+    kept = Measurement("mesh", "", "64 cells", "mbtf-gen", ONE, ONE, ONE, None, {"bytes": 12.0})
+    store.put(mesh, kept)
+    store.put(run("models"), Measurement("models", "m", "5 s", "", ONE, Estimate(math.nan, math.inf, 100)))
+    assert store.get(mesh, "mbtf-gen") == kept
+    found = store.get(run("models"))
     assert found is not None
     assert math.isnan(found.error.value)
-    assert store.get("mesh", {"changes": 2}) is store.get("paths", {"changes": 1}) is None
-    assert MeasurementFolder(tmp_path, {"config": "abd"}).get("mesh", {"changes": 1}) is None
+    assert store.get(replace(mesh, changes={})) is store.get(replace(mesh, study="paths")) is None
+    assert MeasurementFolder(tmp_path, "abd").get(mesh) is None
     (path,) = store.folder.glob("mesh-*")
     path.write_text(path.read_text()[:-20])
-    assert store.get("mesh", {"changes": 1}) is None
+    assert store.get(mesh) is None
 
 
 def test_the_csv_holds_every_number_with_its_error() -> None:
@@ -116,18 +110,6 @@ def test_studies_vary_paths_whatever_the_recipe_sets() -> None:
     assert module.study_config(config, 7).seed == 7
 
 
-class Clock:
-    """Time that passes as runs take it."""
-
-    now = 0.0
-
-    def perf_counter(self) -> float:
-        return self.now
-
-    def strftime(self, form: str) -> str:
-        return "2001-02-03"
-
-
 RUNS = [run("whole", 3000, "long", 7200.0), run("whole", 2000, "short", 60.0), run("models", 1000, "m", 30.0)]
 
 
@@ -135,25 +117,26 @@ RUNS = [run("whole", 3000, "long", 7200.0), run("whole", 2000, "short", 60.0), r
 def runners(monkeypatch: pytest.MonkeyPatch) -> list[FakeRunner]:
     """Studies of one configuration of the generator and three runs, of which the first takes too long."""
     found: list[FakeRunner] = []
-    clock = Clock()
+    clock = SimpleNamespace(now=0.0, perf_counter=lambda: clock.now, strftime=lambda form: "2001-02-03")
 
     class Runner(FakeRunner):
-        def __init__(self, config: Any, *_: Any) -> None:
+        def __init__(self, config: Any, *_: Any, path_seconds: Any) -> None:
             super().__init__(seeds=0.5)
             self.config = config
             found.append(self)
+            self.path_seconds = path_seconds
 
         def measure(self, run: Run) -> Measurement:
             clock.now += self.expected_seconds(run)
             return super().measure(run)
 
-    result = Measurement("paths", "uniform", "4", {"queries.spp": 4}, "", ONE, ONE, None, ONE)
-    task = SimpleNamespace(study="paths", series="uniform", name="4", label="paths: uniform, 4", key={})
-    task.run, task.command = lambda *_: result, lambda generator: generator
+    result = Measurement("paths", "uniform", "4", "", ONE, ONE, None, ONE)
+    monkeypatch.setattr(GeneratorTask, "run", lambda *_: result)
+    task = GeneratorTask("paths", "uniform", "4", {"queries.spp": 4}, None)
     monkeypatch.setattr(module, "time", clock)
     monkeypatch.setattr(module, "RunRunner", Runner)
     monkeypatch.setattr(module, "generator_tasks", lambda benchmark: [task])
-    monkeypatch.setattr(module, "query_seconds", lambda *_: lambda paths: 1e-9)
+    monkeypatch.setattr(module, "path_seconds", lambda *_: 1e-9)
     monkeypatch.setattr(module, "_check_variation", lambda benchmark: None)
     monkeypatch.setattr(module, "planned_runs", lambda *_: RUNS)
     return found
@@ -165,7 +148,7 @@ def test_a_study_keeps_its_time_and_resumes(runners: list[FakeRunner], tmp_path:
     first = module.run_study(recipe, folder, seconds=150.0)
     assert [m.details.get("seeds") for m in first.measurements] == [None, 1, 2]
     assert sum(r.fit["training"]["time"] for r in runners[0].measured) <= 150.0
-    assert first.skipped == ["whole: neumip, long"]
+    assert first.skipped == ["complete run: neumip, long"]
     assert first.deviation is not None
     # Only what is missing is measured: the second seed of the whole run.
     second = module.run_study(recipe, folder, seconds=150.0)
@@ -209,19 +192,9 @@ def test_a_refused_study_leaves_the_folder_as_it_was(
     assert content() == before
 
 
-def test_query_time_is_linear_in_paths_and_stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """0.6 µs to draw and write a query, 0.1 µs for each of its paths."""
-    calls: list[int] = []
-
-    def forecast(job: Any, plan: Any, seconds: float) -> Any:
-        calls.append(job["queries.spp"])
-        return SimpleNamespace(query_seconds=6e-7 + 1e-7 * job["queries.spp"])
-
-    monkeypatch.setattr("mbtf_gen.forecast.forecast", forecast)
-    monkeypatch.setattr("mbtf_gen.planning.effects_plan.plan_effects", lambda job: None)
-    benchmark: Any = SimpleNamespace(job=lambda options: options)
-    store = MeasurementFolder(tmp_path, {})
-    for _ in range(2):
-        seconds = module.query_seconds(benchmark, store)
-        assert [seconds(n) for n in (4, 64)] == pytest.approx([1e-6, 7e-6])
-    assert len(calls) == 2
+def test_the_forecast_of_the_generator_is_stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = [(2e-6, 1.0)]
+    monkeypatch.setattr(module, "forecast_seconds", lambda config: found.pop())
+    config = GeneratorConfig.model_validate({"material": "m", "queries": {"spp": 4}})
+    store = MeasurementFolder(tmp_path, "abc")
+    assert [module.path_seconds(config, store) for _ in range(2)] == [5e-7, 5e-7]

@@ -14,7 +14,6 @@ from mbtf_core.errors import InputError, UsageError
 from mbtf_core.stats import Estimate
 from mbtf_core.units import parse_duration
 from mbtf_fit.config import FitConfig
-from mbtf_fit.data.loader import QUERY_BYTES
 from mbtf_pipeline.cost_study import time_split as module
 from mbtf_pipeline.cost_study.runs import RunRunner
 from mbtf_pipeline.cost_study.time_split import DEFAULT_SHARE, SHARES, split_time, with_split
@@ -57,10 +56,10 @@ class Machine:
 def fake(monkeypatch: pytest.MonkeyPatch) -> Machine:
     made = Machine()
     monkeypatch.setattr(RunRunner, "measure", lambda self, run: made.measure(run))
-    monkeypatch.setattr(module, "_generating", lambda config: (made.query, START))
+    monkeypatch.setattr(module, "forecast_seconds", lambda config: (made.query, START))
     monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: made.now))
     monkeypatch.setattr(module.shutil, "disk_usage", lambda path: SimpleNamespace(free=made.free))
-    monkeypatch.setattr(module, "physical_memory", lambda: made.memory)
+    monkeypatch.setattr(module, "_physical_memory", lambda: made.memory)
     return made
 
 
@@ -107,7 +106,7 @@ def test_all_parts_fit_into_the_time(fake: Machine, tmp_path: Path, seconds: flo
 def test_pilots_that_fail_or_have_nothing_to_learn_leave_the_default(fake: Machine, tmp_path: Path) -> None:
     fake.undefined = True
     found = split(tmp_path / "flat")
-    assert (found.share, found.pilots) == (DEFAULT_SHARE, ())
+    assert (found.share, found.pilots) == (DEFAULT_SHARE, [])
     fake.failing = True
     notes: list[str] = []
     assert split(tmp_path / "failed", notes=notes).share == DEFAULT_SHARE
@@ -128,10 +127,10 @@ def test_disk_and_memory_limit_the_queries(fake: Machine, tmp_path: Path, scarce
     if scarce == "disk":
         fake.free = 8e7
     else:
-        fake.memory = 10e6
-    found = split(tmp_path, of=recipe("fit.neumip.data.memory=20 MB"))
-    # A quarter of the disk, 68 bytes a query; or what the fit may hold, more than half the memory.
-    most = 20e6 / (68 if scarce == "disk" else QUERY_BYTES)
+        fake.memory = 4e7
+    found = split(tmp_path)
+    # A quarter of the disk or half of the memory, 68 bytes a query.
+    most = 20e6 / 68
     assert 0.9 * most < found.queries <= most
     assert [run.data.queries for run in fake.pilots] == [found.queries] * 3
     assert found.training > 980.0
@@ -172,18 +171,6 @@ def test_what_cannot_be_split_is_refused(fake: Machine, tmp_path: Path) -> None:
     (tmp_path / "run" / "file").write_text("")
     with pytest.raises(InputError, match="holds no run"):
         split(tmp_path, 100.0)
-
-
-def test_the_costs_of_a_fit_are_a_line_that_never_falls() -> None:
-    for seconds, line in (
-        ((4.0, 5.0, 7.0), (3.0, 1.0)),
-        ((5.0, 5.0, 5.0), (5.0, 0.0)),
-        ((7.0, 5.0, 4.0), (16 / 3, 0.0)),
-        ((0.0, 1.0, 5.0), (0.0, 6 / 7)),
-    ):
-        assert module._line(list(zip((1.0, 2.0, 4.0), seconds, strict=True))) == pytest.approx(
-            line, abs=1e-12
-        )
 
 
 def test_a_given_share_needs_no_pilots(fake: Machine, tmp_path: Path) -> None:
