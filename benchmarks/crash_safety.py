@@ -101,7 +101,7 @@ def killed_runs(folder: Path, kills: int, dice: random.Random) -> dict[str, Any]
         # Beside a process that is killed, the other one completes the data set, or leaves it a shard.
         counts["refused"] += sum(code not in (0, 4, KILLED) for code in codes)
         counts["damaged"] += len(damaged(out))
-        if not hit or dice.random() < 0.2:
+        if not hit or dice.random() < 0.2 or counts["kills"] == kills:
             code = quietly(lambda: generate(line))()
             counts["refused"] += code != 0
             counts["data sets"] += 1
