@@ -13,7 +13,7 @@ from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
 from mbtf_gen.material.material import Material
 from mbtf_gen.planning import effects_plan as planning
-from mbtf_gen.planning.bounds import relief_bounds
+from mbtf_gen.planning.bounds import displacement_bounds
 from mbtf_gen.planning.effects import Effect, EffectsPlan, without
 from mbtf_gen.planning.effects_plan import plan_effects
 from mbtf_gen.planning.pilot import Change, pilot_queries, relative_change
@@ -96,7 +96,7 @@ def test_bias_bounds_equal_the_rendered_change(shape: tuple[int, int]) -> None:
     mapped = normal_map_slopes(job)
     assert mapped is not None
     light_and_view = (w.astype(np.float64) for w in (queries.omega_i, queries.omega_o))
-    bounds = relief_bounds(job.grid, *light_and_view, LightKernel(0.0), base[..., None], mapped[0])
+    bounds = displacement_bounds(job.grid, *light_and_view, LightKernel(0.0), base[..., None], mapped[0])
     # The plane's slopes alone: the bound of parallax ignores the normal map.
     plain = finest_job(replace(stuff, normal=None), "all")
     bare = plan_effects(plain)

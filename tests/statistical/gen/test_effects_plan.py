@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from support.scenes import rocks
 
 from mbtf_core.stats import Estimate, mean_of_halves
-from mbtf_gen.config.effects_request import RELIEF_EFFECTS
+from mbtf_gen.config.effects_request import DISPLACEMENT_EFFECTS
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
 from mbtf_gen.material.material import Material
@@ -150,7 +150,7 @@ def test_an_effect_is_on_where_it_matters_and_off_where_not(name: str, needed: s
 def test_a_faint_relief_becomes_its_slopes() -> None:
     """Without displacement the slopes still shade the plane."""
     plan = planned("faint relief")[1]
-    assert not any(plan.on(name) for name in RELIEF_EFFECTS)
+    assert not any(plan.on(name) for name in DISPLACEMENT_EFFECTS)
     assert 0 < plan["parallax"].bias_bound <= plan.tolerance
     bare = replace(SCENES["faint relief"][0], height_scale=0.0)
     plane = job_of(bare, min_cos=0.3)
