@@ -1,4 +1,4 @@
-"""The effects plan leaves out what is negligible, and keeps what is not."""
+"""The effects plan omits negligible effects and keeps all others."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def planned(scene: str) -> tuple[Job, EffectsPlan]:
 
 @pytest.mark.parametrize("scene", SCENES)
 def test_what_is_left_out_does_not_matter(scene: str) -> None:
-    """Against everything on: a z-test of the mean values with the bias bound as tolerance."""
+    """Against all effects on: a z-test of the mean values with the bias bound as tolerance."""
     job, plan = planned(scene)
     stuff, options = SCENES[scene]
     everything = job_of(stuff, "all", **options)
@@ -168,7 +168,7 @@ def test_the_bias_of_a_cap_is_within_its_bound() -> None:
 
 
 def test_light_is_sampled_both_ways_only_where_it_helps() -> None:
-    """Leaving BSDF sampling out never changes the mean, and hardly the variance where the plan does so."""
+    """Omitting BSDF sampling never changes the mean, and hardly the variance where the plan omits it."""
     job, plan = planned("glossy relief")
     assert not plan.on("bsdf_sampling")
     effects = tuple(replace(e, on=e.on or e.name == "bsdf_sampling") for e in plan.effects)
