@@ -16,8 +16,21 @@ def pages_in_order() -> list[Path]:
     return [ROOT / "README.md", *(ROOT / "docs" / f"{name}.md" for name in names)]
 
 
+# Output folders of commands without -o; '' is the command without a name.
+DEFAULTS = {
+    "mbtf-gen": {"": "shards/", "preview": "preview/", "reference": "reference/"},
+    "mbtf-fit": {"": "material/", "preview": "preview/"},
+}
+NAMES = re.compile(r"^[a-z]+$")
+
+
 def output_of(words: list[str]) -> str | None:
-    return words[words.index("-o") + 1] if "-o" in words else None
+    if "-o" in words:
+        return words[words.index("-o") + 1]
+    if "--write" in words:
+        return f"{Path(words[words.index('--write') + 1]).parent}/"
+    name = words[1] if NAMES.match(words[1]) else ""
+    return None if "--dry-run" in words else DEFAULTS.get(words[0], {}).get(name)
 
 
 def configuration(text: str) -> str:
