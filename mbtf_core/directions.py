@@ -9,32 +9,75 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-# Band edges of cos θ used wherever errors are reported per elevation.
+# Edges of the bands of cos θ in which errors are reported.
 ELEVATION_BANDS: tuple[float, ...] = (0.0, 0.2, 0.4, 0.7, 1.0)
 
 
 def from_projected_disk(xy: ArrayLike) -> NDArray[np.float64]:
-    """Lift points (..., 2) of the projected disk to unit vectors (..., 3) with z ≥ 0."""
+    """Lift points of the projected disk to unit vectors.
+
+    Parameters
+    ----------
+    xy : (..., 2) array_like
+        Points (x, y); outside the unit disk z is 0.
+
+    Returns
+    -------
+    (..., 3) float64 array
+        Vectors with z ≥ 0.
+    """
     p = np.asarray(xy, np.float64)
     z = np.sqrt(np.maximum(0.0, 1.0 - p[..., 0] ** 2 - p[..., 1] ** 2))
     return np.concatenate([p, z[..., None]], axis=-1)
 
 
 def from_angles(elevation_deg: ArrayLike, azimuth_deg: ArrayLike) -> NDArray[np.float64]:
-    """Unit vectors (..., 3) from the elevation above the plane and the azimuth from +u towards +v, in
-    degrees."""
+    """Unit vectors from elevation and azimuth.
+
+    Parameters
+    ----------
+    elevation_deg : array_like
+        Angle above the reference plane in degrees.
+    azimuth_deg : array_like
+        Angle from +u towards +v in degrees; broadcast with the elevation.
+
+    Returns
+    -------
+    (..., 3) float64 array
+    """
     e, a = np.broadcast_arrays(np.radians(elevation_deg), np.radians(azimuth_deg))
     return np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], axis=-1)
 
 
 def to_angles(omega: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(elevation, azimuth) in degrees of unit vectors (..., 3); azimuth in [0, 360)."""
+    """Elevation and azimuth of unit vectors.
+
+    Parameters
+    ----------
+    omega : (..., 3) array_like
+        Unit vectors.
+
+    Returns
+    -------
+    elevation, azimuth : (...) float64 array
+        Degrees; the azimuth is in [0, 360).
+    """
     w = np.asarray(omega, np.float64)
     elevation = np.degrees(np.arctan2(w[..., 2], np.hypot(w[..., 0], w[..., 1])))
     return elevation, np.degrees(np.arctan2(w[..., 1], w[..., 0])) % 360.0
 
 
 def normalize(omega: ArrayLike) -> NDArray[np.float64]:
-    """Unit vectors (..., 3) of the given directions."""
+    """Scale vectors to unit length.
+
+    Parameters
+    ----------
+    omega : (..., 3) array_like
+        Vectors of any nonzero length.
+
+    Returns
+    -------
+    (..., 3) float64 array
+    """
     w = np.asarray(omega, np.float64)
     return w / np.linalg.norm(w, axis=-1, keepdims=True)

@@ -85,7 +85,8 @@ CONVENTIONS: dict[str, str] = {
     "tile": "the material's period; uv in [0,1)^2; position on the reference plane x = (u, a*v), "
     "z its normal; a = H/W is the aspect; lengths (sigma, heights) are in tile widths, isotropic in x",
     "image_rows": "row 0 of every map is the side v -> 1; texel centers at ((i+1/2)/W, 1-(j+1/2)/H)",
-    "heights": "z = height_scale * (h - max h): the highest point touches the reference plane z = 0",
+    "heights": "z = height_scale * h - max(height_scale * h) with the heights h on the grid of the mesh: "
+    "the highest vertex touches the reference plane z = 0",
     "directions": "omega_i from the surface towards the light, omega_o from the surface towards the viewer, "
     "unit vectors in the tile's frame, z > 0",
     "light": "von Mises-Fisher lobe p around omega_i, cut at the horizon and normalized so that the "

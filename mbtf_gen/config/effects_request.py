@@ -21,7 +21,7 @@ EFFECTS: dict[str, str] = {
     "bsdf_sampling": "BSDF sampling of light",
 }
 # Effects of displaced surfaces only.
-RELIEF_EFFECTS = ("parallax", "shadowing", "interreflection")
+DISPLACEMENT_EFFECTS = ("parallax", "shadowing", "interreflection")
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,9 @@
 """Displaced periodic tile: heights on a grid → triangles.
 
 Mesh vertices sit on texel centers of the grid, ``uv = ((i+½)/W, 1-(j+½)/H)``, heights are
-``z = height · (h - max h)``, and the cell between the last and the first column (row) closes the period.
-Meshes for other renderers may have an apron of repeated cells around the period, so that a ray near its
-border meets surface on both sides.
+``z = scale · h - max(scale · h)``, and the cell between the last and the first column (row) closes the
+period. Meshes for other renderers may have an apron of repeated cells around the period, so that a ray near
+its border meets surface on both sides.
 """
 
 from __future__ import annotations
@@ -32,9 +32,8 @@ class HeightGrid:
 
     @classmethod
     def from_map(cls, heights: NDArray[np.float64], scale: float, aspect: float | None = None) -> HeightGrid:
-        """Grid of a height map (H, W) of stored numbers: ``z = scale · (h - max h)``; aspect H/W by default.
-
-        The maximum is taken after scaling, so a negative scale inverts the heights.
+        """Grid of a height map (H, W) of stored numbers: ``z = scale · h - max(scale · h)``, so that a
+        negative scale inverts the heights; aspect H/W by default.
         """
         z = scale * np.asarray(heights, np.float64)
         rows, columns = z.shape

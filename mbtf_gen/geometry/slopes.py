@@ -45,13 +45,23 @@ def residual_slopes(
 ) -> tuple[NDArray[np.float64], float]:
     """Slopes to add to the mesh's own, and the share c of the mesh's slopes that the map repeats.
 
-    ``residual``: slopes of the map less ``min(c, 1)`` times those of the mesh, so that what both carry counts
-    once. A relief lower than the map's own is brought up to it; a higher one stays as it is. ``absolute``:
-    the map's slopes in place of the mesh's.
-
     Parameters
     ----------
-    normal : (h, w, 3) unit vectors, y along v
+    normal : (h, w, 3) float array
+        Unit vectors, y along v.
+    grid : HeightGrid
+        Heights of the mesh.
+    mode : {"residual", "absolute", "off"}
+        ``residual``: slopes of the map less ``min(c, 1)`` times those of the mesh, so that slopes of both
+        count once and displacement beyond the map's stays. ``absolute``: the map's slopes in place of the
+        mesh's.
+
+    Returns
+    -------
+    slopes : (h, w, 2) float64 array
+        Slopes at the texels of the map.
+    share : float
+        c ≥ 0.
     """
     rows, columns = normal.shape[:2]
     stated = normal_slopes(normal)

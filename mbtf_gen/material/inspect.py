@@ -80,7 +80,7 @@ def inspect_material(
             "height_from": source if height is None else "--height-scale",
             "map": list(material.height.shape),
             "mesh": list(grid.z.shape),
-            "relief": abs(grid.displacement_range),
+            "displacement_range": abs(grid.displacement_range),
             "slope_median_deg": median,
             "slope_p99_deg": high,
             "slope_max_deg": steepest,
@@ -225,7 +225,7 @@ def _geometry(found: dict[str, Any]) -> list[str]:
     u, v = h["repeats"]
     out = [
         f"height     scale {g['height']:.4g} ({g['height_from']}), stored {file['low']:.4g} .. "
-        f"{file['high']:.4g}, displacement range {g['relief']:.4g} tile widths",
+        f"{file['high']:.4g}, displacement range {g['displacement_range']:.4g} tile widths",
         f"mesh       {g['mesh'][1]} x {g['mesh'][0]} of {g['map'][1]} x {g['map'][0]} texels, keeps "
         f"{g['slope_kept']:.0%} of the map's RMS slope",
         f"slopes     median {g['slope_median_deg']:.1f}°, 99th percentile {g['slope_p99_deg']:.1f}°, "

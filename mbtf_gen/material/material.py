@@ -365,11 +365,11 @@ def _heights(spec: MaterialFile, load: MapLoader) -> tuple[NDArray[np.float64], 
     if entry.colorspace == "srgb":
         height = np.asarray(srgb_to_linear(height), np.float64)
         load.settings["height.encoding"] = entry.colorspace
-    relief = abs(scale) * float(np.ptp(height))
+    displacement = abs(scale) * float(np.ptp(height))
     kind = "floats" if image.bits is None else f"{image.bits}-bit integers"
     load.notes.append(
         f"heights: {image.path.name}, {image.shape[1]} x {image.shape[0]} {kind}, "
-        f"displacement range {relief:.4g} tile widths at its own height scale {scale:g}"
+        f"displacement range {displacement:.4g} tile widths at its own height scale {scale:g}"
     )
     return height, codes, scale
 

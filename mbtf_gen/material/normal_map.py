@@ -25,7 +25,7 @@ from mbtf_gen.material.discovery import Convention
 Array = NDArray[np.floating[Any]]
 Turned = Literal["height", "normal"] | None
 
-# What has to be done to an image, as one sees it.
+# Rotations and mirrorings of an image, as displayed.
 SYMMETRIES: dict[str, Callable[[Array], Array]] = {
     "turned by 90 degrees counter-clockwise": lambda a: np.rot90(a, 1),
     "turned by 180 degrees": lambda a: np.rot90(a, 2),
@@ -52,17 +52,26 @@ class NormalFit:
 
     Attributes
     ----------
-    correlation_u, correlation_v : of the slopes along u and along v, as the images are, the vectors read as
-        OpenGL; NaN where either has no slopes
-    gl, dx : correlation over both components of the images as they are, read as OpenGL and as DirectX
-    convention : the one of the two that the data show; None where they do not decide
-    fits : do the data clearly say that the two belong together as they are?
-    misfit : do they clearly say that one is turned or mirrored, or the heights upside down?
-    image, turn : the best explanation: which image has to be turned or mirrored to fit, and how (one of
-        :data:`SYMMETRIES`); None and empty for not at all, where a misfit means heights upside down
-    best : correlation of the best explanation
-    scale : factor on the stored heights whose slopes fit the normals best (least squares) as the images are,
-        in the better convention; tile widths, signed
+    correlation_u, correlation_v : float
+        Correlation of the slopes along u and along v, of the unchanged images in the OpenGL convention; NaN
+        where either has no slopes.
+    gl, dx : float
+        Correlation over both components of the unchanged images, in the OpenGL and the DirectX convention.
+    convention : {"gl", "dx"} or None
+        The convention with the clearly larger correlation; None if the data do not decide.
+    fits : bool
+        Whether the unchanged images clearly match.
+    misfit : bool
+        Whether they clearly match only after one is rotated or mirrored, or the heights are inverted.
+    image : {"height", "normal"} or None
+        Image to be rotated or mirrored for the best match. With None, a misfit means inverted heights.
+    turn : str
+        How it is to be rotated or mirrored: a key of :data:`SYMMETRIES`, or empty.
+    best : float
+        Correlation of the best match.
+    scale : float
+        Height scale in tile widths (signed) whose slopes fit the normals of the unchanged images best in the
+        better convention (least squares).
     """
 
     correlation_u: float
@@ -104,12 +113,12 @@ def fit_normals(height: Array, normal: Array) -> NormalFit | None:
     height : (H, W) array
         Stored heights.
     normal : (h, w, 3) array
-        Unit vectors, y along v (OpenGL).
+        Unit vectors, y along v (OpenGL). Both maps are box-filtered to the coarser resolution.
 
     Returns
     -------
     NormalFit or None
-        None where heights or normals are flat or too small. Both are box-filtered to the coarser resolution.
+        None if heights or normals are flat, or have fewer than 4 texels along a side.
     """
     fitted = _common(height, normal, _FITTED)
     if min(fitted[0].shape) < _SMALLEST:
@@ -120,7 +129,7 @@ def fit_normals(height: Array, normal: Array) -> NormalFit | None:
     h, n = _common(height, normal, _COMPARED)
     guesses = _guesses(h, n)
     gl, dx, highest = guesses[0][0], guesses[1][0], max(score for score, _, _ in guesses)
-    # Symmetric tiles fit in several ways: the likeliest one that is as good as any.
+    # Symmetric tiles match in several ways: of the best ones, the most likely.
     best, image, turn = next(guess for guess in guesses if guess[0] >= highest - _TIE)
     here = max(gl, dx)
     clear, ahead = (max(low, factor / math.sqrt(h.size)) for low, factor in (_CLEAR, _AHEAD))
@@ -161,9 +170,9 @@ def _correlation(s: Array, t: Array) -> float:
 
 
 def _guesses(height: Array, normal: Array) -> list[tuple[float, Turned, str]]:
-    """Every explanation (correlation, image to turn, how), likelier ones before others that fit as well.
+    """Every candidate (correlation, image to turn, how), the more likely ones first.
 
-    The first two are the images as they are, read as OpenGL and as DirectX; then heights upside down.
+    The first two are the unchanged images in the OpenGL and the DirectX convention; then inverted heights.
     """
     s, t = slopes_of_heights(height), slopes_of_normals(normal)
     norm = math.sqrt(_energy(s) * _energy(t))

@@ -27,7 +27,7 @@ MAX_STEPS = 4096
 
 
 @dataclass(frozen=True)
-class ReliefBounds:
+class DisplacementBounds:
     """Bias bounds of leaving out effects of a displaced Lambert surface, relative to the mean value.
 
     Attributes
@@ -98,7 +98,7 @@ def _lambert(slope: F64, light: F64, irradiance: F64) -> F64:
     return np.asarray(lit[:, None])
 
 
-def relief_bounds(
+def displacement_bounds(
     grid: HeightGrid,
     omega_i: F64,
     omega_o: F64,
@@ -106,7 +106,7 @@ def relief_bounds(
     albedo: F64,
     residual: F64 | None = None,
     through: F64 | None = None,
-) -> ReliefBounds:
+) -> DisplacementBounds:
     """Estimate bias bounds from pairs of directions.
 
     Parameters
@@ -160,4 +160,4 @@ def relief_bounds(
         change = np.sqrt((with_holes - value) ** 2 + (seen * behind) ** 2)
         # Relative to the mean value with holes.
         opacity = bound(change) * mean / max(float(with_holes.mean()), 1e-12)
-    return ReliefBounds(bound(here - value), bound(shade - value), normal, opacity)
+    return DisplacementBounds(bound(here - value), bound(shade - value), normal, opacity)

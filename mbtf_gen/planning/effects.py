@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 from mbtf_core.errors import UsageError
-from mbtf_gen.config.effects_request import EFFECTS, RELIEF_EFFECTS, EffectsRequest
+from mbtf_gen.config.effects_request import DISPLACEMENT_EFFECTS, EFFECTS, EffectsRequest
 
 Reason = Literal["exact", "bound", "pilot", "forced"]
 
@@ -135,7 +135,7 @@ def consistent(decided: dict[str, Effect], request: EffectsRequest) -> dict[str,
     if out["parallax"].on:
         return out
     needed = EFFECTS["parallax"]
-    for name in RELIEF_EFFECTS[1:]:
+    for name in DISPLACEMENT_EFFECTS[1:]:
         if out[name].on:
             if request.forced.get(name):
                 raise UsageError(f"'{EFFECTS[name]}' needs '{needed}'", where=f"--effects +{name}")

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_gen.config.effects_request import EFFECTS, RELIEF_EFFECTS, EffectsRequest
+from mbtf_gen.config.effects_request import DISPLACEMENT_EFFECTS, EFFECTS, EffectsRequest
 from mbtf_gen.geometry.slope_statistics import triangle_slopes
 from mbtf_gen.images.resample import resample
 from mbtf_gen.job import Job
-from mbtf_gen.planning.bounds import POINTS, ReliefBounds, relief_bounds
+from mbtf_gen.planning.bounds import POINTS, DisplacementBounds, displacement_bounds
 from mbtf_gen.planning.effects import Effect, EffectsPlan, consistent, decide, without
 from mbtf_gen.planning.pilot import Pilot, pilot_queries
 from mbtf_gen.planning.simulation import normal_map_slopes
@@ -92,11 +92,11 @@ def plan_effects(job: Job, *, pilots: bool = True) -> EffectsPlan:
     left = tolerance - sum(e.bias_bound or 0.0 for e in decided.values() if not e.on)
     if not any(e.on for e in decided.values()):
         scene = replace(scene, lambert=True)
-    bounds = _relief_bounds(scene)
+    bounds = _displacement_bounds(scene)
     others = _affordable([_normal(scene, bounds), _opacity(scene, bounds)], left)
     decided |= {e.name: decide(request, e) for e in others}
     left = tolerance - sum(e.bias_bound or 0.0 for e in decided.values() if not e.on)
-    plan = _relief_plan(scene, request, decided, bounds, left)
+    plan = _displacement_plan(scene, request, decided, bounds, left)
     if request.base != "all" and _has_closed_form(scene, plan):
         plan = replace(plan, closed_form=True)
     return replace(plan, mode=job.config.effects.mode, tolerance=tolerance)
@@ -108,7 +108,7 @@ def reference_plan(job: Job) -> EffectsPlan:
     scene = _analysis(job, False)
     effects = [*_surface(scene), _normal(scene, None), _opacity(scene, None)]
     explanation = "flat" if scene.flat else "displaced"
-    effects += [Effect(name, not scene.flat, explanation) for name in RELIEF_EFFECTS]
+    effects += [Effect(name, not scene.flat, explanation) for name in DISPLACEMENT_EFFECTS]
     effects.append(Effect("bsdf_sampling", True, "reference"))
     decided = consistent({e.name: decide(request, e) for e in effects}, request)
     plan = _assemble(job, decided, job.config.transport.max_depth)
@@ -129,14 +129,14 @@ def _analysis(job: Job, pilots: bool) -> _Analysis:
     )
 
 
-def _relief_bounds(scene: _Analysis) -> ReliefBounds | None:
+def _displacement_bounds(scene: _Analysis) -> DisplacementBounds | None:
     """Bias bounds of displacement and normal map; None unless they apply, to a Lambert surface that is not
     black."""
     job, mapped = scene.job, scene.mapped
     if (scene.flat and mapped is None) or not (scene.lambert and scene.albedo.any() and scene.pilots):
         return None
     queries = pilot_queries(job, POINTS)
-    return relief_bounds(
+    return displacement_bounds(
         job.grid,
         queries.omega_i.astype(np.float64),
         queries.omega_o.astype(np.float64),
@@ -202,7 +202,7 @@ def _faint_bound(scene: _Analysis, name: str, strength: float) -> float | None:
     return FAINT_CAUTION * strength * Pilot(job, plan).changed(without(plan, name)).bound()
 
 
-def _normal(scene: _Analysis, bounds: ReliefBounds | None) -> Effect:
+def _normal(scene: _Analysis, bounds: DisplacementBounds | None) -> Effect:
     job = scene.job
     if scene.mapped is None:
         text = "no map" if job.material.normal is None else "off in the configuration"
@@ -218,7 +218,7 @@ def _normal(scene: _Analysis, bounds: ReliefBounds | None) -> Effect:
     return Effect("normal", True, text, bounds.normal if bounds else None, "pilot")
 
 
-def _opacity(scene: _Analysis, bounds: ReliefBounds | None) -> Effect:
+def _opacity(scene: _Analysis, bounds: DisplacementBounds | None) -> Effect:
     through = _through(scene)
     if through is None:
         opacity = scene.job.material.opacity
@@ -246,11 +246,11 @@ def _through(scene: _Analysis) -> NDArray[np.float64] | None:
     return 1.0 - np.atleast_2d(np.asarray(opacity, np.float64))
 
 
-def _relief_plan(
+def _displacement_plan(
     scene: _Analysis,
     request: EffectsRequest,
     decided: dict[str, Effect],
-    bounds: ReliefBounds | None,
+    bounds: DisplacementBounds | None,
     left: float,
 ) -> EffectsPlan:
     """The plan, given the decisions on the surface: decides on displacement and on BSDF sampling."""
@@ -260,7 +260,7 @@ def _relief_plan(
     black = not scene.albedo.any() and scene.lambert and not decided["opacity"].on
     if scene.flat or black:
         text = "flat" if scene.flat else "black: reflects nothing"
-        for name in RELIEF_EFFECTS:
+        for name in DISPLACEMENT_EFFECTS:
             decided[name] = decide(request, Effect(name, False, text, 0.0))
         return _assemble(job, consistent(decided, request), cap)
     shadowing = _shadowing(scene, bounds)
@@ -275,7 +275,7 @@ def _relief_plan(
     if bounds is not None and bounds.parallax + bounces <= left:
         # Without the displaced tile its other effects are off too; the sum includes their bounds.
         parallax = replace(parallax, on=False, bias_bound=bounds.parallax + bounces)
-        for name in RELIEF_EFFECTS[1:]:
+        for name in DISPLACEMENT_EFFECTS[1:]:
             decided[name] = decide(request, Effect(name, False, "no displacement", 0.0, "pilot"))
         decided["parallax"] = decide(request, parallax)
         return _assemble(job, consistent(decided, request), cap)
@@ -288,7 +288,7 @@ def _relief_plan(
     return _assemble(job, consistent(decided, request), cap, bound)
 
 
-def _shadowing(scene: _Analysis, bounds: ReliefBounds | None) -> Effect:
+def _shadowing(scene: _Analysis, bounds: DisplacementBounds | None) -> Effect:
     config = scene.job.config
     # Elevation in radians below which the cut light lobe has no light; ≤ 0 if there is none.
     lowest = float(np.arcsin(config.queries.min_cos) - LOBE_TAIL * np.radians(config.light.width))

@@ -27,7 +27,8 @@ DEFINITION = (
     "above white clipped. HDR-FLIP (2021) takes per pixel the largest difference at "
     + ", ".join(f"{stop:+g}".replace("-", "−").replace("+0", "0") for stop in EXPOSURES)
     + f" EV, tone mapper {TONE_MAPPER}. Both assume {PIXELS_PER_DEGREE:g} pixels per degree; 0 is no "
-    "difference, 1 the largest. They include the reference noise; comparing its two halves gives a baseline."
+    "difference, 1 the largest. They include the reference noise; its two estimates, compared, give a "
+    "baseline."
 )
 
 

@@ -20,7 +20,7 @@ _WINDOW_SIZE = 11
 DEFINITION = (
     "structural similarity (Wang et al. 2004) of the images in sRGB at 0 EV, values above white clipped: "
     f"mean over pixels and channels, Gaussian window with σ = {WINDOW:g} pixels; 1 means equal. It includes "
-    "the reference noise; comparing its two halves gives a baseline."
+    "the reference noise; its two estimates, compared, give a baseline."
 )
 
 

@@ -31,7 +31,7 @@ _SMALLEST = 32
 
 DEFINITION = (
     "ST-LPIPS (Ghildyal and Liu 2022, network alex) of the images in sRGB at 0 EV, with values above white "
-    "clipped; 0 means equal. It includes the reference noise; comparing its two halves gives a baseline."
+    "clipped; 0 means equal. It includes the reference noise; its two estimates, compared, give a baseline."
 )
 
 

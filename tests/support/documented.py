@@ -14,6 +14,7 @@ PACKAGES = ("mbtf_core", "mbtf_gen", "mbtf_fit", "mbtf_pipeline")
 _PROGRAM = r"mbtf-(?:gen|fit|pipeline)"
 # A command at the start of a line, after a prompt, a path to the programs, variables or another command.
 _START = rf"(?:^|(?<=[;|&] )|(?<=\$ )|(?<=/))(?={_PROGRAM}\b)"
+_FENCED = re.compile(r"^( *)```[^\n]*\n(.*?)^\1```", re.DOTALL | re.MULTILINE)
 # In sentences a command ends with the clause.
 _CLAUSE = re.compile(r"[;,:)`\n]|\.(?:\s|$)|\s-- |''")
 
@@ -42,12 +43,16 @@ def _name(path: Path) -> str:
     return str(path.relative_to(ROOT))
 
 
+def in_blocks(text: str, where: str) -> Iterator[Shown]:
+    """Commands in fenced blocks: those that a reader runs."""
+    for block in _FENCED.finditer(text):
+        yield from _in_lines(block[2], where)
+
+
 def in_markdown(text: str, where: str) -> Iterator[Shown]:
     """Commands in fenced and indented blocks, and in inline code."""
-    fenced = re.compile(r"^( *)```[^\n]*\n(.*?)^\1```", re.DOTALL | re.MULTILINE)
-    for block in fenced.finditer(text):
-        yield from _in_lines(block[2], where)
-    prose = fenced.sub("", text)
+    yield from in_blocks(text, where)
+    prose = _FENCED.sub("", text)
     yield from _in_lines("\n".join(re.findall(r"^(?: {4,}|\t)(.*(?:\\\n.*)*)", prose, re.MULTILINE)), where)
     for code in re.findall(r"`([^`]+)`", prose):
         if re.match(rf"{_PROGRAM}\b", code.strip()):

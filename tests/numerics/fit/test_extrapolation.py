@@ -30,7 +30,7 @@ def queries(seed: int = 1) -> dict[str, np.ndarray]:
 
 @pytest.fixture(scope="module", params=["neumip-baseline", "neumip"])
 def material(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Material:
-    """Fitted to a wave that dims towards grazing light, far enough that its weights are no longer random."""
+    """Fitted to a wave that darkens towards grazing light, until its weights are no longer random."""
     arrays = random_queries(np.random.default_rng(0), 4000, LATTICE)
     data = training_queries(arrays, parallax(*arrays.values()))
     options = {"steps": 120, "batch": 500, "warmup": 20, "blur": {"initial_sigma": 2.0, "offset_sigma": 1.0}}
@@ -45,7 +45,7 @@ def material(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
 
 
 def evaluate(material: Material, **changed: object) -> np.ndarray:
-    """Values at the queries with some arrays replaced; finite and not negative, whatever they are."""
+    """Values at the queries with some arrays replaced; always finite and nonnegative."""
     arrays = {**queries(), **changed}
     found = material.evaluate(**{k: np.broadcast_to(v, queries()[k].shape) for k, v in arrays.items()})
     assert np.isfinite(found).all()
@@ -60,15 +60,15 @@ def evaluate(material: Material, **changed: object) -> np.ndarray:
 def test_footprints_are_clamped_to_the_levels(
     material: Material, sigmas: tuple[float, ...], level: int
 ) -> None:
-    """To the last bit: the answer is that of σ_k = 2^-k / 2, for k = 0 and the finest."""
+    """Bit for bit the value at σ_k = 2^-k / 2, for k = 0 and the finest level."""
     expected = evaluate(material, sigma=np.float32(0.5 * 2.0**-level))
     for sigma in sigmas:
         assert np.array_equal(evaluate(material, sigma=np.float32(sigma)), expected)
 
 
 def test_footprints_at_the_ends_and_between_levels_are_continuous(material: Material) -> None:
-    """A footprint a millionth off changes values by less than 1e-4 of the largest one, at the clamped ends
-    and where the levels that are blended change."""
+    """Changing a footprint by a millionth changes values by less than 1e-4 of the largest one, at the clamped
+    ends and where the interpolated levels change."""
     for level in range(4):
         sigma = 0.5 * 2.0**-level
         low, high = (evaluate(material, sigma=np.float32(sigma * f)) for f in (1 - 1e-6, 1 + 1e-6))
@@ -116,8 +116,8 @@ def test_offsets_at_grazing_views_are_bounded() -> None:
 
 
 def test_positions_far_away_repeat_the_tile(material: Material) -> None:
-    """u and u + 1000 tiles are the same place, to the rounding of the latter: 6e-5 tiles, with slopes below
-    the largest value per quarter texel."""
+    """u and u + 1000 tiles are the same position up to rounding, 6e-5 tiles; slopes are below the largest
+    value per quarter texel."""
     here = evaluate(material)
     for shift in (-1000.0, -1.0, 1.0, 1000.0):
         there = evaluate(material, u=queries()["u"] + np.float32(shift))
@@ -125,9 +125,8 @@ def test_positions_far_away_repeat_the_tile(material: Material) -> None:
 
 
 def test_half_precision_is_accurate_for_values_of_any_size(material: Material, tmp_path: Path) -> None:
-    """Half precision ends at 65504; values of 1e5 lie beyond. But weights are numbers of order one however
-    large the values are: all but the unit, a single float32, go through half precision and change values by
-    less than 1 % of the largest one."""
+    """Half precision ends at 65504, but weights are of order one for data of any scale. With all weights but
+    the unit in half precision, values change by less than 1 % of the largest one."""
     weights = material.model.weights()
     large = {name: tensor.clone() for name, tensor in weights.items()}
     large["unit"] = large["unit"] * 1e6

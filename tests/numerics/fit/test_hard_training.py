@@ -48,7 +48,7 @@ def fitted(value: NDArray[np.floating], **training: object) -> Trainer:
 
 
 def predictions(trainer: Trainer) -> F32:
-    """At queries that were not trained on, whose true values :func:`unseen` has."""
+    """Predictions at queries that were not used for training, whose true values :func:`unseen` has."""
     nothing = np.zeros((2000, 3), np.float32)
     return trainer.predict(ShardQueries(*arrays(2000, seed=1).values(), nothing, nothing))
 
@@ -68,14 +68,14 @@ def rms(x: NDArray[np.floating]) -> float:
 
 
 def assert_finite(trainer: Trainer) -> None:
-    """Every number of the state, means of gradients included."""
+    """All numbers of the optimizer state are finite, gradient moments included."""
     tensors = state_tensors(trainer)
     assert all(bool(t.isfinite().all()) for t in tensors.values())
 
 
 def test_the_error_does_not_rise_after_convergence() -> None:
-    """Data without noise cannot be overfitted, so that errors may only fall once the blur is gone, but for
-    the unrest of the steps, which the falling rates calm: at the end at most 1.1 of the least on the way."""
+    """Data without noise cannot be overfitted, so errors fall after the blur has ended, apart from the noise
+    of the steps: the last error is at most 1.1 times the minimum."""
     value = parallax(*arrays().values())
     options = {**SMALL, "batch": 250, "blur": {**SMALL["blur"], "fraction": 0.1}}
     trainer = make_trainer(training_queries(arrays(), value), LATTICE, steps=1200, **options)
@@ -97,10 +97,9 @@ def glossy(u: F32, sigma: F32, omega_i: F32, omega_o: F32) -> NDArray[np.float64
 
 
 def test_many_epochs_of_few_noisy_queries_stay_bounded() -> None:
-    """One half in ten has found the light, and is ten times too bright: noise five times the variance or
-    more. 150 times round 4000 such queries the networks overfit the noise and, between them, give
-    arbitrary values: 38 to 750 times the variance over three seeds. With noise
-    regularization they miss 0.9 to 1.3 of it; 1 is what the mean value misses."""
+    """One half in ten is ten times too bright: the noise is five times the variance or more. After 150 epochs
+    of 4000 such queries the networks overfit the noise: errors are 38 to 750 times the variance over three
+    seeds. With noise regularization they are 0.9 to 1.3 times; predicting the mean gives 1."""
     random = np.random.default_rng(0)
     at, true = arrays(), glossy(*arrays().values())
     a, b = (10 * true * (random.random((len(true), 1)) < 0.1) for _ in range(2))
@@ -119,8 +118,8 @@ def test_many_epochs_of_few_noisy_queries_stay_bounded() -> None:
 
 
 def test_outliers_do_not_dominate() -> None:
-    """Four values of 1e5 among 4000 around 0.1. Each has the gradient of an error of 10 times its true
-    value (the bound). They increase the error elsewhere by at most 0.1 of the variance."""
+    """Four values of 1e5 among 4000 around 0.1. The loss limits their gradients to that of an error of 10
+    times the value. They increase the error elsewhere by at most 0.1 of the variance."""
     value = parallax(*arrays().values())
     clean = missed(predictions(fitted(value)), unseen())
     value[np.random.default_rng(3).choice(len(value), 4, replace=False)] = 1e5
@@ -131,8 +130,8 @@ def test_outliers_do_not_dominate() -> None:
 
 @pytest.mark.parametrize("level", [0.0, 0.5])
 def test_a_constant_channel_is_constant_and_costs_the_others_little(level: float) -> None:
-    """Root mean square error 2 % of the largest channel's mean; the others' error at most three times
-    that of channels that all vary: a constant far brighter than they are doubles it, over six seeds."""
+    """RMS error below 2 % of the mean of the brightest channel; the error of the others at most three times
+    that of fits without a constant channel. Over six seeds, a far brighter constant doubles it."""
     value = parallax(*arrays().values())
     free = missed(predictions(fitted(value))[:, [0, 2]], unseen()[:, [0, 2]])
     value[:, 1] = level
@@ -143,7 +142,7 @@ def test_a_constant_channel_is_constant_and_costs_the_others_little(level: float
 
 @pytest.mark.parametrize("level", [0.3, 1e-8, 1e5])
 def test_constant_data_give_a_constant(level: float) -> None:
-    """To 2 % root mean square, 10 % anywhere."""
+    """Within 2 % RMS, 10 % anywhere."""
     found = predictions(fitted(np.full((4000, 3), level)))
     assert rms(found / level - 1) < 0.02
     np.testing.assert_allclose(found, level, rtol=0.1)
@@ -157,8 +156,8 @@ def test_black_data_give_exactly_black() -> None:
 
 @pytest.mark.parametrize("exponent", [-27, 17])
 def test_the_fit_does_not_depend_on_the_scale_of_the_values(exponent: int) -> None:
-    """Models, losses and steps know values only in units of their mean, and a power of two costs no bit: data
-    around 1e-9 or 1e4 give the predictions of those around 0.1 times that power, to the last bit."""
+    """Models, losses and steps use values relative to their mean, and powers of two are exact: data around
+    1e-9 or 1e4 give the predictions of data around 0.1 times that power, bit for bit."""
     value = parallax(*arrays().values()).astype(np.float32)
     factor = np.float32(2.0**exponent)
     plain, scaled = (predictions(fitted(v, steps=40)) for v in (value, value * factor))

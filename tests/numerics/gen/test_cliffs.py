@@ -1,4 +1,4 @@
-"""Steep, high and tiny reliefs and maps of odd shapes: white furnace, black, and reciprocity."""
+"""Steep, high and tiny height fields and maps of odd shapes: white furnace, black, and reciprocity."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def relief(request: pytest.FixtureRequest) -> HeightGrid:
 
 @pytest.mark.parametrize("cosine", [1.0, 0.2, 1e-4])
 def test_white_furnace_returns_one(relief: HeightGrid, cosine: float) -> None:
-    """No energy made: 1e-3 and five standard errors; and none lost, where paths find out of the relief."""
+    """No energy is created, within 1e-3 and five standard errors; none is lost where paths can escape."""
     # Slots a hundred times deeper than wide hold paths for thousands of bounces, which ever fewer of ever
     # greater weight survive: no error bar holds then.
     trapped = relief.displacement_range > 3
@@ -94,8 +94,8 @@ def test_tile_mean_is_reciprocal(relief: HeightGrid) -> None:
 
 
 def test_grazing_light_and_view_stay_finite(relief: HeightGrid) -> None:
-    """Cosines down to 1e-4 on both sides: finite, not negative, and at most what the steepest facet may send,
-    albedo/π over the light's cosine, of all bounces together a few times that."""
+    """Cosines down to 1e-4 on both sides: finite, nonnegative, and at most a few times albedo/π over the
+    cosine of the light."""
     n = 600
     rng = np.random.default_rng(6)
     cosine = 10 ** rng.uniform(-4, 0, (2, n))

@@ -21,7 +21,7 @@ AZIMUTHS = st.floats(0.0, 360.0)
 def test_a_vanishing_footprint_is_a_point(
     elevation_i: float, azimuth_i: float, elevation_o: float, azimuth_o: float, sigma: float
 ) -> None:
-    """B in closed form, 2e-5 at every point that is 1e-4 off an edge of shadow or sight."""
+    """B in closed form within 2e-5, at points at least 1e-4 away from edges of shadow and visibility."""
     omega_i, omega_o = direction(elevation_i, azimuth_i), direction(elevation_o, azimuth_o)
     n = 500
     x = (np.arange(n) + 0.37) / n
@@ -36,7 +36,7 @@ def test_a_vanishing_footprint_is_a_point(
 
 @pytest.mark.parametrize("sigma", [2.0, 10.0, 1e3])
 def test_a_huge_footprint_is_the_tile_mean(sigma: float) -> None:
-    """At every position the same: the closed form's tile mean, by t-test with an error bar below 0.5 %."""
+    """The closed form of the tile mean at every position, by t-test with an error bar below 0.5 %."""
     omega_i, omega_o = direction(35, 10), direction(50, 200)
     expected = GROOVE.tile_mean(omega_i, omega_o)
     for u in ([0.25, 0.0], [0.75, 0.5]):

@@ -1,4 +1,4 @@
-"""Rays over the height field meet what Embree meets on a mesh of many tiles."""
+"""Rays over the height field hit the same points as in Embree on a mesh of many tiles."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_hits_and_shadows_are_those_of_the_mesh(grid: HeightGrid) -> None:
 
 @pytest.mark.parametrize("grid", [rocks(64), odd()], ids=["rocks", "23 x 37"])
 def test_rays_from_below_meet_the_surface_from_below(grid: HeightGrid) -> None:
-    """Turned over, what lies below is what lies above: the same hits at mirrored places."""
+    """Hits from below equal those from above on the inverted height field, at mirrored positions."""
     rng = np.random.default_rng(1)
     upside_down = HeightGrid.from_map(grid.z, -1.0, grid.aspect)
     field, mirrored = (HeightField.of(g, 32.0, True) for g in (grid, upside_down))
@@ -105,7 +105,7 @@ def test_rays_from_below_meet_the_surface_from_below(grid: HeightGrid) -> None:
 
 
 def test_two_rays_at_once_are_as_each_alone() -> None:
-    """One ray may end, at the cap too, while the other goes on: what it has found stays as it is."""
+    """If one ray ends first, at the cap too, its result does not change while the other continues."""
     grid, rng = rocks(64), np.random.default_rng(2)
     field = HeightField.of(grid, 32.0, False)
     n = N // 4
@@ -129,8 +129,8 @@ def test_two_rays_at_once_are_as_each_alone() -> None:
 
 
 def test_grazing_rays_and_rays_that_bounced_meet_what_the_mesh_has() -> None:
-    """First hits of rays down to a cosine of 1e-3, and what rays meet that leave those places at random: the
-    second bounce. Embree counts positions from far away at grazing angles, so a few may differ."""
+    """First hits of rays down to a cosine of 1e-3, and second hits of rays that leave those points in random
+    directions. A few may differ, because Embree has large coordinates at grazing angles."""
     grid, around = HeightGrid(rocks(16).z * 0.15, 1.0), 26
     tile = build_tile(grid, lambert(0.5))
     n = N // 2
@@ -167,7 +167,7 @@ def test_grazing_rays_and_rays_that_bounced_meet_what_the_mesh_has() -> None:
 
 
 class Sieve:
-    """Stops a share of the rays."""
+    """Stops a fraction of the rays."""
 
     def __init__(self, share: float) -> None:
         self.share = share
@@ -181,7 +181,7 @@ def numbers(n: int) -> Any:
 
 
 def test_borders_are_counted_through_holes() -> None:
-    """Rays through holes cross as many borders as a straight line; the cap cuts those that cross more."""
+    """Rays through holes cross as many borders as straight lines; the cap ends those that cross more."""
     grid, n = rocks(32), 20_000
     field = HeightField.of(grid, 32.0, True)
     rng = np.random.default_rng(3)
@@ -218,7 +218,7 @@ def test_borders_are_counted_through_holes() -> None:
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_rays_that_are_not_finite_end(bad: float) -> None:
-    """Nothing is read from outside the table, and no kernel runs for ever."""
+    """They read no memory outside the table, and every kernel terminates."""
     field = HeightField.of(rocks(16), 32.0, False)
     for place in range(6):
         o, d = np.array([[0.0, 0.0, 0.1]]), np.array([[0.3, 0.4, -0.5]])

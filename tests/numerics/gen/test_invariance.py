@@ -52,8 +52,8 @@ def positions() -> NDArray[np.float64]:
 @example(31, 1)
 @given(st.integers(0, 31), st.integers(0, 31))
 def test_the_border_may_lie_anywhere(rows: int, columns: int) -> None:
-    """A map rolled by whole texels, positions with it: the same values but for rounding, which decides at
-    edges of shadows. At most 1 % of the queries differ by 1e-3 of the mean, all together by 1e-3."""
+    """A map rolled by whole texels, and positions with it: equal values up to rounding at shadow edges. At
+    most 1 % of the queries differ by 1e-3 of the mean; the overall mean differs by at most 1e-3."""
     rolled = HeightGrid(np.roll(RELIEF.z, (rows, columns), (0, 1)), 1.0)
     u = positions()
     here, there = values(RELIEF, u), values(rolled, u + np.array([columns / 32, -rows / 32]))
@@ -63,8 +63,8 @@ def test_the_border_may_lie_anywhere(rows: int, columns: int) -> None:
 
 @pytest.mark.parametrize("along", [0, 1], ids=["tall", "long"])
 def test_a_tile_may_be_many_times_as_long_as_wide(along: int) -> None:
-    """A tile and 64 of it in a row, counted as one: the same values, and no energy made or lost, although
-    coordinates along it have fewer digits left for the steps off the surface."""
+    """64 copies of a tile in a row, treated as one tile, give the same values and energy, although ray
+    offsets have fewer significant digits."""
     count = 64
     row = np.concatenate([RELIEF.z] * count, axis=along)
     # Lengths are in widths of the tile.
@@ -94,7 +94,7 @@ def test_a_tile_may_be_many_times_as_long_as_wide(along: int) -> None:
 
 @pytest.mark.parametrize("shift", [(1.0, 0.0), (-3.0, 2.0), (1000.0, -1000.0)])
 def test_positions_may_be_counted_from_far_away(shift: tuple[float, float]) -> None:
-    """u + whole tiles: single precision holds multiples of 1/1024 up to 16384 exactly."""
+    """u + whole tiles: single precision represents multiples of 1/1024 exactly up to 16384."""
     u = positions()
     here, there = values(RELIEF, u), values(RELIEF, u + shift)
     assert np.mean(np.abs(here - there) > 1e-3 * here.mean()) < 0.03
@@ -102,7 +102,7 @@ def test_positions_may_be_counted_from_far_away(shift: tuple[float, float]) -> N
 
 
 def test_heights_may_be_counted_from_anywhere() -> None:
-    """A map + 2¹⁰, in steps that double precision holds exactly: the same bits."""
+    """A map + 2¹⁰, in steps that double precision represents exactly, gives the same bits."""
     h = np.round(RELIEF.z * 2**20) / 2**20
     u = positions()
     here, there = (values(HeightGrid.from_map(h + offset, 1.0), u) for offset in (0.0, 1024.0))
@@ -111,7 +111,7 @@ def test_heights_may_be_counted_from_anywhere() -> None:
 
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
 def test_the_unit_of_length_is_of_no_consequence(unit: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The tile 1e-3 … 1e3 scene units wide: the same values, the same energy, no ray lost."""
+    """With 1e-3 to 1e3 scene units per tile width: the same values and energy, and no lost rays."""
     u = positions()
     here = values(RELIEF, u)
     monkeypatch.setattr(scene, "LONG_SIDE", unit)
@@ -126,7 +126,7 @@ def test_the_unit_of_length_is_of_no_consequence(unit: float, monkeypatch: pytes
 
 
 def test_faint_values_are_as_exact_as_others() -> None:
-    """Albedo 1e-8: M is linear in it where light is reflected once, to 1e-6."""
+    """Albedo 1e-8: M of single reflection is linear in it, within 1e-6."""
 
     def direct(albedo: float) -> NDArray[np.float64]:
         q = queries(positions(), 0.01, LIGHT, VIEW, N)
@@ -139,8 +139,8 @@ def test_faint_values_are_as_exact_as_others() -> None:
 
 
 def test_huge_values_are_exact_and_survive_the_format(tmp_path: Path) -> None:
-    """A normal that faces a light 1e-6 above the horizon: albedo/π · (n·ω_i)/ω_i,z, beyond half precision, to
-    1e-5, also from an EXR."""
+    """A normal that faces a light 1e-6 above the horizon: albedo/π · (n·ω_i)/ω_i,z exceeds half precision and
+    is exact to 1e-5, also in EXR."""
     slope = {"type": "bitmap", "bitmap": mi.Bitmap(np.full((2, 2, 3), -1.0, np.float32)), "raw": True}
     bsdf = {"type": "mbtf_surface", "base_color": {"type": "rgb", "value": 0.9}, "slopes": slope}
     light = np.array([np.sqrt(1 - 1e-12), 0.0, 1e-6])

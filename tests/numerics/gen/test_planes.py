@@ -1,5 +1,4 @@
-"""A plane at the edges of the definitions: M = albedo/π whatever the light, view, footprint, place and
-shape of the map."""
+"""A plane in extreme cases: M = albedo/π for every light, view, footprint, position and map size."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ N = 3000
 
 
 def stored(omega: NDArray[np.float64], suffix: str) -> NDArray[np.float64]:
-    """Directions as a shard gives them back, of light and of view."""
+    """Directions of light and view as read back from a shard."""
     n = len(omega)
     o = omega.astype(np.float32)
     value = np.ones((n, 3), np.float32)
@@ -38,8 +38,8 @@ def stored(omega: NDArray[np.float64], suffix: str) -> NDArray[np.float64]:
 @settings(max_examples=8)
 @given(st.floats(-9.0, 0.0), st.floats(0.0, 360.0), st.integers(0, 1000))
 def test_directions_survive(suffix: str, lowest: float, azimuth: float, seed: int) -> None:
-    """Angles of 1e-6 rad, cosines of 1e-6 of themselves, from the pole down to 1e-9 above the horizon; angles
-    in degrees go there and back."""
+    """Within 1e-6 rad and 1e-6 of the cosine, from the pole to 1e-9 above the horizon; conversion to degrees
+    and back included."""
     rng = np.random.default_rng(seed)
     cosine = 10 ** rng.uniform(lowest, 0, N)
     cosine[:2] = 1.0, 10**lowest

@@ -65,7 +65,7 @@ def test_mirror_under_a_lobe_shows_the_lobe(width: float, roughness: float) -> N
 
 
 def test_polished_dielectric_mirrors_and_scatters_the_rest() -> None:
-    """Mirror of F0 = 4 % over a base of 0.5: both terms in closed form, E being Fresnel's reflectance."""
+    """Mirror of F0 = 4 % over a base of 0.5: both terms in closed form, with the Fresnel reflectance as E."""
     light = LightKernel(1.0)
     omega_o = towards(np.array([0.9, 0.5, 0.15]), 30.0)
     omega_i = mirrored(omega_o)
@@ -106,8 +106,8 @@ def test_value_is_continuous_from_a_mirror_on(kind: str, width: float) -> None:
 
 
 def smeared(alpha: float, light: LightKernel, omega_i: Array, cosine: float) -> float:
-    """White metal at the mirrored direction: its lobe under a light, by quadrature over slopes of facets, in
-    double precision. What facets hide of each other is left out, which narrow lobes at such views do not."""
+    """White metal at the mirrored direction: its lobe under a light, by quadrature over facet slopes in
+    double precision. Masking is neglected, which narrow lobes permit at such views."""
     x, w = np.polynomial.legendre.leggauss(120)
     t, phi = np.meshgrid(0.5 * (x + 1), np.pi * (x + 1), indexing="ij")
     tangent = alpha * t / (1 - t)
@@ -128,7 +128,7 @@ def smeared(alpha: float, light: LightKernel, omega_i: Array, cosine: float) -> 
 @pytest.mark.parametrize("alpha", [1.1e-5, 4e-5, 3e-4])
 @pytest.mark.parametrize("cosine", [0.9, 0.4, 0.1])
 def test_narrow_lobes_keep_their_digits(alpha: float, cosine: float) -> None:
-    """Metal far smoother than the light is wide, down to where a mirror takes over, in single precision."""
+    """Metal far smoother than the width of the light, down to the mirror threshold, in single precision."""
     light = LightKernel(0.05)
     omega_o = towards(cosine)
     omega_i = mirrored(omega_o)
@@ -139,7 +139,7 @@ def test_narrow_lobes_keep_their_digits(alpha: float, cosine: float) -> None:
 @pytest.mark.parametrize("cosine", [1e-2, 1e-3, 1e-4])
 @pytest.mark.parametrize("metallic", [0.0, 1.0])
 def test_grazing_views_of_white_surfaces_keep_all_light(cosine: float, metallic: float) -> None:
-    """White furnace: 1 at every view. 2e-3 are those of the energy tables."""
+    """White furnace: 1 at every view, within the 2e-3 of the energy tables."""
     for r in (0.0, 0.0033, 0.012, 0.03, 0.1, 0.5, 1.0):
         bsdf = surface(1.0, roughness=r, metallic=metallic, specular=0.5)
         got = values(bsdf, None, np.array([0.0, 0, 1]), towards(cosine), 1 << 16)
@@ -202,7 +202,7 @@ def test_nan_of_a_lambert_surface_is_reported(name: str, light: LightKernel | No
 
 
 def slopes(along_x: ArrayLike, along_y: ArrayLike) -> dict[str, Any]:
-    """Map of residual slopes, not interpolated, so that it may jump at creases."""
+    """Map of residual slopes without interpolation, so that slopes may be discontinuous at creases."""
     x, y = np.broadcast_arrays(np.asarray(along_x, np.float64), np.asarray(along_y, np.float64))
     stacked = np.stack([x, y, 0 * x], axis=-1)
     return bitmap(np.broadcast_to(stacked, (2, 2, 3)) if x.ndim == 0 else stacked, "nearest")
@@ -228,7 +228,8 @@ def test_rows_of_slopes_go_down_from_v_1() -> None:
 
 @pytest.mark.parametrize("axis", [0, 1])
 def test_slopes_add_to_those_of_the_mesh(axis: int) -> None:
-    """Slopes that undo those of a roof leave the light of a plane; doubled ones that of a steeper roof."""
+    """Slopes opposite to those of a roof give the value of a plane; equal slopes give that of a roof twice as
+    steep."""
     slope, cells = 0.3, 8
     # A ridge and a valley on vertices, which lie on texel centers: creases where the map's texels end.
     x = np.abs(np.arange(cells) - cells // 2) / cells * slope
@@ -256,7 +257,7 @@ def test_slopes_add_to_those_of_the_mesh(axis: int) -> None:
 
 
 def test_what_lies_behind_the_face_or_the_shading_plane_is_black() -> None:
-    """A normal tilted towards +x by 45°: light below the face, or on the far side of the normal, is none."""
+    """A normal tilted towards +x by 45°: light from below the face or behind the shading plane gives zero."""
     parts = SurfaceParts(specular=True, slopes=True)
     lights = np.array([[0.9, 0, -0.2], [-0.9, 0, 0.2], [0.9, 0, 0.2], [0, 0, 1]])
     lights /= np.linalg.norm(lights, axis=1, keepdims=True)
@@ -270,7 +271,7 @@ def test_what_lies_behind_the_face_or_the_shading_plane_is_black() -> None:
 @pytest.mark.parametrize("view", [(90, 0), (30, 0), (30, 180), (3, 0), (3, 180)])
 @pytest.mark.parametrize("metallic", [None, 1.0])
 def test_a_normal_map_makes_no_energy(view: tuple[float, float], metallic: float | None) -> None:
-    """White furnace: light below the shading horizon or behind the face is lost, none is made."""
+    """White furnace: light below the shading horizon or behind the face is lost; energy is never created."""
     given = {} if metallic is None else {"metallic": metallic, "roughness": 0.4}
     for slope in (0.2, 2.0, -2.0):
         bsdf = surface(1.0, slopes=slopes(slope, 0.0), **given)

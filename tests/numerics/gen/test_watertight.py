@@ -1,4 +1,4 @@
-"""No ray slips through the tile: borders, corners, vertices, edges, creases, any elevation."""
+"""No ray passes through the tile: borders, corners, vertices, edges, creases, any elevation."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def misses(grid: HeightGrid, uv: NDArray[np.float64], direction: NDArray[np.floa
 
 
 def downward(rng: np.random.Generator, n: int, smallest_cosine: float) -> NDArray[np.float64]:
-    """Directions that go down, a fifth of them straight, the rest log-uniform in the cosine."""
+    """Downward directions: a fifth of them vertical, the rest log-uniform in the cosine."""
     z = np.exp(rng.uniform(np.log(smallest_cosine), 0, n))
     z[: n // 5] = 1.0
     phi = 2 * np.pi * rng.random(n)

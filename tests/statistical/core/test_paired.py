@@ -92,7 +92,8 @@ def test_noise_free_mse() -> None:
 
 
 def test_channels_of_a_query_are_no_extra_samples() -> None:
-    """Counting correlated channels as independent queries makes the error bar too small, which is caught."""
+    """Counting correlated channels as independent queries makes error bars too small, which
+    the test detects."""
 
     def wrong(rng: np.random.Generator) -> Estimate:
         _, a, b = draw(rng)
@@ -136,7 +137,7 @@ def test_unexplained_variance_of_images_has_an_error_bar_by_image() -> None:
 
 
 def test_mse_difference_is_sharper_than_two_errors() -> None:
-    """A small improvement that two separate error bars hide shows in the paired difference."""
+    """The paired difference detects an improvement that two separate error bars hide."""
 
     def experiment(rng: np.random.Generator) -> Estimate:
         truth, a, b = draw(rng)
@@ -150,7 +151,7 @@ def test_mse_difference_is_sharper_than_two_errors() -> None:
 
 
 def test_mean_of_halves_counts_noise_alone() -> None:
-    """At fixed queries the mean scatters by the Monte Carlo noise only, whatever the queries' own spread."""
+    """At fixed queries the mean varies by Monte Carlo noise only, not by the spread of the queries."""
     truth, _, _ = draw(np.random.default_rng(1))
 
     def experiment(rng: np.random.Generator) -> Estimate:

@@ -1,4 +1,4 @@
-"""The tests hold their false-alarm rate under null experiments and find planted faults."""
+"""The tests keep their false-positive rate in null experiments and detect planted differences."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ class TestAggregate:
         assert "group 4" in str(result)
 
     def test_a_difference_that_averages_out_is_found_by_its_scatter(self) -> None:
-        """Swapped neighbors keep every mean: what a shifted or flipped map does."""
+        """Swapping neighbors keeps every mean, as a shifted or flipped map does."""
         rng = np.random.default_rng(12)
         truth = self.truth(rng)
         shifted = truth.reshape(-1, 2, 3)[:, ::-1].reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""A material with parallax, noise and all levels of detail: what the offset is there for, it does."""
+"""The neural offset reduces the error on a material with parallax, with noise and all levels of detail."""
 
 from __future__ import annotations
 

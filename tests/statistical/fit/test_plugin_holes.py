@@ -1,4 +1,4 @@
-"""Holes of a fitted material: what passes, what is shadowed, and that nothing is counted twice."""
+"""Holes of a fitted material: transmitted light, shadows, and no light counted twice."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ GRAY, SHARE = 0.1, 0.35
 
 
 def even(finest: int = 2) -> Transmittance:
-    """The same share everywhere."""
+    """Constant transmittance."""
     levels = []
     for s in range(finest + 1):
         texels = np.zeros((2**s, 2**s, 6), np.float32)
@@ -32,7 +32,7 @@ def even(finest: int = 2) -> Transmittance:
 
 @pytest.fixture(scope="module")
 def lace(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """A gray material that lets some of the light through."""
+    """A gray material with partial transmittance."""
     folder = tmp_path_factory.mktemp("lace")
     write_material(folder, constant=(GRAY,) * 3, finest=2, transmittance=even())
     return {"type": "mbtf", "material": str(folder), "networks": "cooperative", "sampling": "cosine"}
@@ -77,13 +77,13 @@ def test_the_plugin_evaluates_the_fitted_transmittance(tmp_path: Path) -> None:
 def test_a_sheet_in_a_furnace_conserves_energy(
     integrator: str, elevation: float, reflected: float, lace: dict[str, Any]
 ) -> None:
-    """From below it reflects nothing, and lets through the same."""
+    """From below it reflects nothing and transmits as much as from above."""
     seen = render(integrator, elevation, m=plane(lace), e={"type": "constant"})
     assert seen == pytest.approx(reflected + SHARE, abs=0.012)
 
 
 def test_light_reaches_surfaces_below_holes(lace: dict[str, Any]) -> None:
-    """A lamp without size, two sheets above each other, and the ground seen through neither."""
+    """A point light, two sheets above each other, and the ground visible through neither."""
     sheets = {}
     for k, z in enumerate((3.0, 3.5)):
         to_world = mi.ScalarTransform4f().translate([3.0 * z / 4.0, 0, z]).scale(1.0)

@@ -1,4 +1,4 @@
-"""Directions of the fitted materials' plugin have the density it states, and its light adds up."""
+"""Directions sampled by the plugin follow its density, and estimates of reflected light are unbiased."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ COUNT = 32
 
 
 def random_mixture(random: np.random.Generator, viewer: np.ndarray, width: int) -> Mixture:
-    """Any lobe that a fit may give: narrow, wide, tilted, sheared; any share."""
+    """A random mixture of fitted lobes: any width, tilt, shear and weight."""
     l11, l22 = np.exp(random.uniform(np.log(0.05), np.log(1.0), 2))
     l21, x, y = random.normal(0, 0.3, 3)
     lanes = [mi.Float(np.full(width, v, np.float32)) for v in (l11, l21, l22, x, y)]
@@ -179,7 +179,7 @@ def furnace(bsdf: dict[str, Any], integrator: str, seed: int, spp: int = 64) -> 
 
 @pytest.mark.parametrize("integrator", ["path", "mbtf_path"])
 def test_a_white_sphere_vanishes_in_a_furnace(integrator: str, tmp_path: Path) -> None:
-    """For a material of value 1/π everywhere; its sampling makes no difference."""
+    """A material of value 1/π everywhere, with every sampling method."""
     write_material(tmp_path, constant=(1 / np.pi,) * 3)
     seen = furnace({"type": "mbtf", "material": str(tmp_path), "networks": "cooperative"}, integrator, 0)
     np.testing.assert_allclose(seen.mean((0, 1)), 1.0, atol=0.005)

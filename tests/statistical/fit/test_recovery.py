@@ -1,4 +1,4 @@
-"""What is known is found again: a model's own data, a homogeneous BRDF, a plane below the reference plane."""
+"""Fits recover known data: those of a model itself, a homogeneous BRDF, a plane below the reference plane."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ WIDE = {"width": 64, "channels": 16}
 def test_random_initializations_approach_the_true_values(
     network: dict[str, int], queries: int, steps: int, rate: float, bound: float
 ) -> None:
-    """The bound is of the squared error, as a share of the variance of the values."""
+    """The bound applies to the squared error over the variance of the values."""
     data, unseen = answers(teacher(), queries, 0), answers(teacher(), 5000, 9)
     model = build_model("neumip", LATTICE, **network)
     model.initialize(torch.Generator().manual_seed(7), float(data.value.mean()))
@@ -118,7 +118,7 @@ def test_random_initializations_approach_the_true_values(
 
 
 def test_the_third_coordinate_distinguishes_low_lights() -> None:
-    """A light that turns from stopped to twice as strong within 6 degrees above the horizon."""
+    """Reflected light rises from zero to twice its mean within 6 degrees above the horizon."""
     arrays = random_queries(np.random.default_rng(0), 40_000, LATTICE)
     # Half of all lights between cosines of 0.05 and 0.25, any azimuth.
     low = arrays["omega_i"][::2]
@@ -145,7 +145,7 @@ def glossy(u: F32, sigma: F32, omega_i: F32, omega_o: F32) -> NDArray[np.float64
 
 
 def test_a_homogeneous_brdf_is_fitted_to_the_noise_floor(tmp_path: Path) -> None:
-    """Of noise of variance s² in N values, a fit of P parameters keeps about s² P/N."""
+    """With noise of variance s² in N values, the error of a fit of P parameters is about s² P/N."""
     noise, train = 0.1, 40_000
     folder = write_data(tmp_path / "d", glossy, train=train, test=10_000, noise=noise)
     options = {"steps": 300, "batch": 4000, "warmup": 20}
@@ -160,7 +160,7 @@ def test_a_homogeneous_brdf_is_fitted_to_the_noise_floor(tmp_path: Path) -> None
 
 
 def sunk_plane(u: F32, sigma: F32, omega_i: F32, omega_o: F32) -> NDArray[np.float64]:
-    """A flat texture 0.04 tile widths below the reference plane, that of all lights and footprints."""
+    """A texture on a plane 0.04 tile widths below the reference plane, for all lights and footprints."""
     at = u.astype(np.float64) - DEPTH * omega_o[:, :2] / omega_o[:, 2:]
     value = np.full((len(u), 3), 0.2)
     for k, (i, j, phase) in enumerate(WAVES):

@@ -1,4 +1,4 @@
-"""Runs to a target error: values stay unbiased, halves independent, and the error is the target."""
+"""Runs to a target error: unbiased values, independent halves, and the requested error."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ TRUTH = RARE * BRIGHT + (1 - RARE) * DIM
 
 
 class FewBrightPaths:
-    """Stands in for an estimator: every path brings a little light, one in twenty-five a lot."""
+    """Replaces an estimator: most paths carry little light, one in twenty-five much."""
 
     def paths(self, n: int, spp: int, stream: Stream) -> NDArray[np.float64]:
         seed = [stream.root, stream.shard, stream.first_pass, spp]
@@ -82,7 +82,7 @@ def test_values_of_a_skewed_scene_are_unbiased(skewed: tuple[Queries, Allocation
 
 
 def test_the_pilot_draws_random_numbers_of_its_own(skewed: tuple[Queries, Allocation]) -> None:
-    """Paths that decide on their own number would be biased."""
+    """Values are biased if the paths that choose a query's number of paths are also stored."""
     streams = []
 
     class Recording(FewBrightPaths):
@@ -115,7 +115,7 @@ def test_a_skewed_scene_comes_near_its_target_and_what_is_reported_is_so(
 
 
 def test_errors_that_the_cap_leaves_are_reported(skewed: tuple[Queries, Allocation]) -> None:
-    """Bright paths among few make large values: an error divided by them would never be above one or so."""
+    """Rare bright paths increase the value itself, so relative errors would rarely exceed one."""
     q, allocation = skewed
     e = estimate_shard(FewBrightPaths(), q, 4, Target(0.2, 8), Stream(1, "train", 0), allocation)
     value = 0.5 * (e.value_a[:, 0].astype(np.float64) + e.value_b[:, 0])
@@ -126,7 +126,7 @@ def test_errors_that_the_cap_leaves_are_reported(skewed: tuple[Queries, Allocati
 
 
 def test_stopping_when_the_paths_so_far_look_good_is_biased() -> None:
-    """What the pilot is thrown away for: the same rule on the stored paths themselves."""
+    """The reason for discarding the pilot: the same rule applied to the stored paths is biased."""
     y = FewBrightPaths().paths(N, 512, Stream(1, "train", 0))
     value, open_ = np.zeros(N), np.ones(N, bool)
     for n in (16, 32, 64, 128, 256, 512):
@@ -185,7 +185,7 @@ def of_kind(config: GeneratorConfig, kind: str) -> GeneratorConfig:
 
 @pytest.fixture
 def small_pilots(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every run is worth a pilot, and pilots are short."""
+    """Runs of any size use a pilot, and pilots are short."""
     monkeypatch.setattr("mbtf_gen.planning.run_plan.SMALL_RUN", 0)
     monkeypatch.setattr("mbtf_gen.planning.sample_allocation.PILOT_QUERIES", 1024)
     monkeypatch.setattr("mbtf_gen.planning.run_plan.plan_effects", lambda job, pilots: plan_effects(job))
@@ -193,7 +193,7 @@ def small_pilots(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("kind", ["target", "noise"])
 def test_slices_equal_a_run(kind: str, config: GeneratorConfig, small_pilots: None, tmp_path: Path) -> None:
-    """Seven of them, in any order: the same numbers of paths for every query, and the same values."""
+    """Seven slices in any order give the same numbers of paths and the same values."""
     config = of_kind(config, kind)
     for index in (4, 2, 7, 1, 6, 3, 5):
         generate(config, tmp_path / "parts", slice_index=index, slice_count=7)

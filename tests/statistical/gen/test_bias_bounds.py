@@ -13,7 +13,7 @@ from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
 from mbtf_gen.material.material import Material
 from mbtf_gen.planning import effects_plan as planning
-from mbtf_gen.planning.bounds import relief_bounds
+from mbtf_gen.planning.bounds import displacement_bounds
 from mbtf_gen.planning.effects import Effect, EffectsPlan, without
 from mbtf_gen.planning.effects_plan import plan_effects
 from mbtf_gen.planning.pilot import Change, pilot_queries, relative_change
@@ -63,7 +63,7 @@ def tilted(rows: int, columns: int) -> NDArray[np.float32]:
 @pytest.mark.parametrize("mapped", [False, True], ids=["plain", "normal map"])
 @pytest.mark.parametrize("shape", [(64, 64), (32, 64), (64, 32)])
 def test_a_plane_with_slopes_lacks_nothing_but_parallax(shape: tuple[int, int], mapped: bool) -> None:
-    """A faint displacement changes shading alone: slopes of the wrong sign or row would double the change."""
+    """A faint displacement changes shading only; slopes of the wrong sign or row would double the change."""
     stuff = lambert(waves(*shape), 0.004, normal=tilted(*shape) if mapped else None)
     high: dict[str, Any] = {"queries": {"min_cos": 0.7, "resolution": 32}}
     full_job, cut_job = job_of(stuff, "all", **high), job_of(stuff, "all,-parallax", **high)
@@ -76,7 +76,7 @@ def test_a_plane_with_slopes_lacks_nothing_but_parallax(shape: tuple[int, int], 
 
 
 def finest_job(stuff: Material, mode: str) -> Job:
-    """Footprints far smaller than a cell, for which bounds are estimated."""
+    """A job with footprints far smaller than a cell, for which bounds are estimated."""
     queries = {"min_cos": 0.3, "resolution": 512, "mixture": {"log_uniform": 0.0, "finest": 1.0}}
     return job_of(stuff, mode, queries=queries, light={"width": 0.0})
 
@@ -96,7 +96,7 @@ def test_bias_bounds_equal_the_rendered_change(shape: tuple[int, int]) -> None:
     mapped = normal_map_slopes(job)
     assert mapped is not None
     light_and_view = (w.astype(np.float64) for w in (queries.omega_i, queries.omega_o))
-    bounds = relief_bounds(job.grid, *light_and_view, LightKernel(0.0), base[..., None], mapped[0])
+    bounds = displacement_bounds(job.grid, *light_and_view, LightKernel(0.0), base[..., None], mapped[0])
     # The plane's slopes alone: the bound of parallax ignores the normal map.
     plain = finest_job(replace(stuff, normal=None), "all")
     bare = plan_effects(plain)
@@ -131,7 +131,7 @@ def test_the_change_is_relative_to_the_mean_and_free_of_noise() -> None:
 
 
 def test_the_tolerance_is_shared_not_spent_twice() -> None:
-    """Of two effects that fit the tolerance only one by one, one stays."""
+    """If two effects fit the tolerance only one at a time, one of them stays on."""
     normal = tilted(32, 32)
     stuff = lambert(waves(32, 32), 0.05, normal=normal, opacity=np.full((4, 4), 0.99))
     alone = plan_effects(job_of(stuff, effects={"tolerance": 0.0}))
@@ -183,7 +183,7 @@ class Rare:
 
 
 def test_rare_large_changes_keep_an_effect_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Three of eight thousand queries changed, so the bound allows for nine."""
+    """Three of eight thousand queries change, so the bound must allow for nine."""
     monkeypatch.setattr(planning, "Pilot", Rare)
     job = job_of(lambert(waves(32, 32), 0.3), transport={"max_depth": 0})
     assert Rare().limited(1).upper < job.config.effects.tolerance

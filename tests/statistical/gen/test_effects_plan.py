@@ -1,4 +1,4 @@
-"""The effects plan leaves out what is negligible, and keeps what is not."""
+"""The effects plan omits negligible effects and keeps all others."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from support.scenes import rocks
 
 from mbtf_core.stats import Estimate, mean_of_halves
-from mbtf_gen.config.effects_request import RELIEF_EFFECTS
+from mbtf_gen.config.effects_request import DISPLACEMENT_EFFECTS
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
 from mbtf_gen.material.material import Material
@@ -105,7 +105,7 @@ def planned(scene: str) -> tuple[Job, EffectsPlan]:
 
 @pytest.mark.parametrize("scene", SCENES)
 def test_what_is_left_out_does_not_matter(scene: str) -> None:
-    """Against everything on: a z-test of the mean values with the bias bound as tolerance."""
+    """Against all effects on: a z-test of the mean values with the bias bound as tolerance."""
     job, plan = planned(scene)
     stuff, options = SCENES[scene]
     everything = job_of(stuff, "all", **options)
@@ -150,7 +150,7 @@ def test_an_effect_is_on_where_it_matters_and_off_where_not(name: str, needed: s
 def test_a_faint_relief_becomes_its_slopes() -> None:
     """Without displacement the slopes still shade the plane."""
     plan = planned("faint relief")[1]
-    assert not any(plan.on(name) for name in RELIEF_EFFECTS)
+    assert not any(plan.on(name) for name in DISPLACEMENT_EFFECTS)
     assert 0 < plan["parallax"].bias_bound <= plan.tolerance
     bare = replace(SCENES["faint relief"][0], height_scale=0.0)
     plane = job_of(bare, min_cos=0.3)
@@ -168,7 +168,7 @@ def test_the_bias_of_a_cap_is_within_its_bound() -> None:
 
 
 def test_light_is_sampled_both_ways_only_where_it_helps() -> None:
-    """Leaving BSDF sampling out never changes the mean, and hardly the variance where the plan does so."""
+    """Omitting BSDF sampling never changes the mean, and hardly the variance where the plan omits it."""
     job, plan = planned("glossy relief")
     assert not plan.on("bsdf_sampling")
     effects = tuple(replace(e, on=e.on or e.name == "bsdf_sampling") for e in plan.effects)

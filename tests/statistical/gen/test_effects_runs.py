@@ -1,4 +1,4 @@
-"""The plan decides which paths are traced and what the shards store; resumed runs keep it."""
+"""The effects plan determines the traced paths and the contents of shards; resumed runs keep it."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_a_manifest_keeps_every_number_of_a_plan() -> None:
 
 
 class Recorder:
-    """Stands in for the estimator and remembers which plans it was built for."""
+    """Replaces the estimator and records the plans it was built for."""
 
     def __init__(self) -> None:
         self.plans: list[EffectsPlan] = []
@@ -128,7 +128,7 @@ def config(tmp_path: Path) -> GeneratorConfig:
 def test_resumed_and_sliced_runs_follow_the_plan_of_the_manifest(
     config: GeneratorConfig, recorder: Recorder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Another machine may decide otherwise; the plan of the manifest holds, nothing is planned anew."""
+    """The plan of the manifest applies, even where another machine would choose another one."""
     out = tmp_path / "out"
     generate(config, out, slice_index=1, slice_count=2)
     first = recorder.plans[-1]
@@ -153,7 +153,7 @@ def test_shards_store_the_transmittance(config: GeneratorConfig, recorder: Recor
 
 
 def test_what_passed_is_the_view_rays_alone() -> None:
-    """Scattered rays that leave through holes are no transmittance: it is what it is without them."""
+    """Scattered rays that leave through holes do not count as transmittance."""
     job = job_of(lambert(noise(16, 16), 0.15, (0.9, 0.9, 0.9), opacity=OPACITY), "all,-bsdf_sampling")
     plan = plan_effects(job)
     q = pilot_queries(job, 2000)
@@ -166,7 +166,7 @@ def test_what_passed_is_the_view_rays_alone() -> None:
 
 @pytest.mark.parametrize("depth", [2, 3])
 def test_a_cap_is_the_same_with_and_without_sampling_of_the_surface(depth: int) -> None:
-    """Under a delta light sampling the surface finds nothing, so the cap alone decides."""
+    """BSDF samples cannot hit a delta light, so only the cap affects the values."""
     stuff = lambert(noise(16, 16), 0.3, (0.9, 0.9, 0.9))
     options: dict[str, Any] = {"light": {"width": 0.0}, "queries": {"min_cos": 0.4}}
     means = []

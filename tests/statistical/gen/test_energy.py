@@ -55,7 +55,7 @@ def test_roulette_changes_nothing_but_the_noise(light: LightKernel | None) -> No
 @pytest.mark.parametrize("albedo", [0.02, 0.7])
 @pytest.mark.parametrize("width", [1.0, 20.0])
 def test_roulette_leaves_direct_light_alone(albedo: float, width: float) -> None:
-    """Light that surface sampling finds must not hang on the few paths that roulette spares."""
+    """Russian roulette must not affect direct light that BSDF sampling finds."""
     q = tile_mean_queries(direction(40, 60), direction(55, 200), 8_000)
     light, limits = LightKernel(width), [Transport(roulette_depth=r) for r in (1, 1000)]
     early, late = (estimate(rocks(), lambert(albedo), light, q, 8, transport=t) for t in limits)
@@ -66,7 +66,8 @@ def test_roulette_leaves_direct_light_alone(albedo: float, width: float) -> None
 def tile_mean(
     grid: HeightGrid, bsdf: Any, omega_i: NDArray[np.float64], omega_o: NDArray[np.float64], seed: int
 ) -> Estimate:
-    """Tile mean over independent positions: its error holds the positions' scatter and the paths' noise."""
+    """Tile mean over independent positions; its error includes the variance between positions and the noise
+    of the paths."""
     q = tile_mean_queries(omega_i, omega_o, 30_000, seed)
     e = estimate(grid, bsdf, LightKernel(0.0), q, 16, seed=seed)
     v = 0.5 * (e.value_a + e.value_b)[:, 0].astype(np.float64)
@@ -87,7 +88,7 @@ def test_tile_mean_is_reciprocal(
 
 
 class NoCosine(mi.BSDF):  # type: ignore[misc]
-    """A Lambert reflector whose author forgot the light's cosine: the fault that reciprocity must catch."""
+    """A Lambert reflector without the cosine of the light, a fault that reciprocity must detect."""
 
     def __init__(self, props: Any) -> None:
         mi.BSDF.__init__(self, props)
@@ -118,7 +119,7 @@ def test_reciprocity_fails_without_a_cosine() -> None:
 
 @pytest.mark.parametrize("light", [(80, 0), (20, 130)])
 def test_tile_mean_returns_at_most_what_arrives(light: tuple[float, float]) -> None:
-    """∫ M cos θ_o dω_o of the tile mean is the tile's albedo: positive, and below that of its facets."""
+    """∫ M cos θ_o dω_o of the tile mean is the albedo of the tile: positive, and below that of its facets."""
     omega_i = direction(*light)
     n = 40_000
     rng = np.random.default_rng(9)

@@ -1,4 +1,4 @@
-"""The estimator gives every path random numbers of its own, and values that depend on nothing else."""
+"""Each path of the estimator has its own random numbers; values depend on nothing else."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_values_differ_between_streams_and_are_uncorrelated() -> None:
 
 
 def test_launches_of_any_size_share_their_kernels() -> None:
-    """Compiling takes seconds, a launch tenths of one: nothing of a launch may be part of its kernels."""
+    """Compiling takes seconds and a launch tenths of a second, so kernels must not depend on the launch."""
     surface = {"type": "mbtf_surface", "roughness": 0.3, "specular": 0.5, "metallic": 0.4, "clearcoat": 0.3}
     e = Estimator(build_tile(rocks(32), surface), LightKernel(5.0), Transport())
     e.estimate(same_query(300), 8, Stream(0, "train", 0))
@@ -109,8 +109,8 @@ def test_nonfinite_samples_are_resampled_and_counted(bad: float) -> None:
 
 
 def test_nonfinite_samples_are_located() -> None:
-    """A groove whose facet towards u = 0 has a bad stripe: queries on it fail at once, those on the other
-    facet by what the stripe reflects to them."""
+    """The facet of a groove towards u = 0 has a faulty stripe: queries on it fail directly, those on the
+    other facet by light reflected from the stripe."""
     groove = HeightGrid(np.tile([0.0, -0.4], (2, 1)), 1.0)
     e = Estimator(build_tile(groove, Faulty(mi.Properties(), np.nan, 1.0)), LightKernel(0.0), Transport())
     n = 500

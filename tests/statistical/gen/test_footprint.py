@@ -1,4 +1,4 @@
-"""The Gaussian footprint: isotropic in tile widths on tiles of any aspect, and apart from the paths."""
+"""The Gaussian footprint: isotropic in tile widths at any aspect, and independent of the paths."""
 
 from __future__ import annotations
 
@@ -74,8 +74,8 @@ def test_camera_rays_fill_the_pixel_that_its_query_states(aspect: float) -> None
 
 @pytest.mark.parametrize("azimuth", [0, 90, 200])
 def test_positions_in_the_footprint_do_not_follow_light_directions(azimuth: float) -> None:
-    """Under a wide light every direction brings its own irradiance; if it depended on the position, a
-    ramp of color would not average to its middle."""
+    """Under a wide light each direction has its own irradiance. If it depended on the position, the mean over
+    a color ramp would be biased."""
     ramp = np.linspace(0.0, 1.0, 64, dtype=np.float32)
     pixels = np.zeros((64, 64, 3), np.float32)
     pixels[..., 0], pixels[..., 1] = ramp[None, :], ramp[::-1, None]

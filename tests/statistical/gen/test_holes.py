@@ -1,4 +1,4 @@
-"""Opacity: rays pass through holes, see black, and what passed is stored as transmittance."""
+"""Opacity: rays pass through holes, end in black, and are stored as transmittance."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PLANE = Transport(displacement=False, shadowing=False, interreflection=False)
 
 
 def half_open(share: float = 0.0) -> np.ndarray[Any, Any]:
-    """Opacity (32, 32): the left half opaque, the right one lets all but `share` through."""
+    """Opacity (32, 32): the left half is opaque, the right half stops a fraction `share` of the rays."""
     opacity = np.ones((32, 32), np.float32)
     opacity[:, 16:] = share
     return opacity
@@ -65,7 +65,7 @@ def test_holes_lie_where_the_map_says() -> None:
 
 
 def test_paths_cut_at_the_cap_have_not_passed() -> None:
-    """Where nothing stops a ray, each passes or is cut, and all are counted."""
+    """Where nothing stops a ray, each ray either passes or reaches the cap, and all are counted."""
     n, spp = 1000, 4
     q = queries((0.5, 0.5), 0.3, direction(50, 20), direction(8, 200), n)
     tile = sheet(rocks(), np.zeros((4, 4)))
@@ -78,8 +78,8 @@ def test_paths_cut_at_the_cap_have_not_passed() -> None:
 
 
 def test_resampled_paths_have_consistent_transmittance() -> None:
-    """The transmittance is that of the paths that are stored: with one path per half, the share of halves
-    that saw nothing."""
+    """The transmittance belongs to the stored paths: with one path per half, it is the fraction of halves
+    that hit nothing."""
     n, bad = 4000, 0.1
     pixels = np.full((1, 20, 3), 0.5, np.float32)
     pixels[:, :2] = np.nan
@@ -97,7 +97,7 @@ def test_resampled_paths_have_consistent_transmittance() -> None:
 
 
 def test_an_opaque_map_changes_nothing() -> None:
-    """Whether a hit lets a ray through is no dimension of a path's sequence."""
+    """Opacity decisions use no dimension of a path's sequence."""
     closed = sheet(rocks(), np.ones((4, 4)))
     plain = build_tile(rocks(), {"type": "mbtf_surface", "base_color": {"type": "rgb", "value": [0.6] * 3}})
     a, b = run(closed, Transport()), run(plain, Transport())
@@ -109,7 +109,7 @@ def test_an_opaque_map_changes_nothing() -> None:
 
 @pytest.mark.parametrize("depth", [1, 4], ids=["direct", "interreflection"])
 def test_mitsuba_agrees_on_a_height_field_with_an_opacity_mask(depth: int, tmp_path: Path) -> None:
-    """Mitsuba's ``mask`` over a block of tiles under ``volpath``, whose light rays pass through holes."""
+    """Mitsuba's ``mask`` over a block of tiles under ``volpath``, whose shadow rays pass through holes."""
     rng = np.random.default_rng(3)
     pixels = np.where(rng.random((12, 12)) < 0.5, 0.15, 1.0).astype(np.float32)[..., None]
     opacity = {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True, "filter_type": "nearest"}

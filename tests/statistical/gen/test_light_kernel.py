@@ -1,4 +1,4 @@
-"""The light: unit irradiance at every elevation, its sampler draws from the density it states."""
+"""The light: unit irradiance at every elevation, and samples that follow the stated density."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_irradiance_is_one(width: float, elevation: float) -> None:
 @pytest.mark.parametrize("width", WIDTHS)
 @pytest.mark.parametrize("elevation", [1e-4, 0.5, 10.0, 60.0])
 def test_sampled_irradiance_is_one(width: float, elevation: float) -> None:
-    """The sampler and its density, without looking at the lobe: E[L ω_z / q] = 1."""
+    """From samples and their density alone: E[L ω_z / q] = 1."""
     n = 1 << 19
     light = directional_light(width, elevation, n)
     rng = np.random.default_rng(7)

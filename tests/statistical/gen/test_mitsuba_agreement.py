@@ -15,13 +15,13 @@ from mbtf_gen.geometry.heightfield import HeightGrid
 
 
 def colors(shape: tuple[int, int] = (16, 16)) -> dict[str, Any]:
-    """A Lambert reflector with a random color map: a flipped or shifted map would show."""
+    """A Lambert reflector with a random color map, which detects flips and shifts."""
     pixels = np.random.default_rng(12).random((*shape, 3)).astype(np.float32)
     return {"type": "diffuse", "reflectance": {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True}}
 
 
 def heights(name: str) -> HeightGrid:
-    """A made relief, square or wide, or that of a real material."""
+    """A synthetic height field, square or wide, or that of a material."""
     return GRIDS[name] if name in GRIDS else real_heights(name)
 
 
@@ -62,7 +62,7 @@ def test_smoothed_emitter_in_mitsubas_integrator_agrees(tmp_path: Path) -> None:
 
 
 def test_the_comparison_finds_a_shifted_map(tmp_path: Path) -> None:
-    """Half a texel of shift between the two routes does not pass."""
+    """The comparison detects a shift by half a texel."""
     grid = GRIDS["square"]
     omega_i = direction(40, 70)
     q = random_queries(4096, 1e-6, omega_i)

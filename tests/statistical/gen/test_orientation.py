@@ -138,7 +138,7 @@ def test_tilted_picture_is_not_mirrored() -> None:
 
 
 def test_pixel_kind_and_query_kind_agree_from_above() -> None:
-    """Seen from above, pictures of pixels and of queries agree on an asymmetric textured relief."""
+    """At normal incidence both kinds of picture of an asymmetric textured height field agree."""
     from support.scenes import rocks
 
     from mbtf_core.stats import aggregate_test

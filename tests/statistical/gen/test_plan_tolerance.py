@@ -58,13 +58,13 @@ def scratches() -> Material:
 
 
 def checks() -> Material:
-    """Red and green of one brightness on a faint relief."""
+    """Red and green of equal luminance on a faint displacement."""
     red = np.random.default_rng(4).random((256, 256)) < 0.5
     return stuff(fractal(64, 3.0), 4e-4, np.where(red[..., None], [0.8, 0.1, 0.1], [0.1, 0.8, 0.1]))
 
 
 def bright_veil() -> Material:
-    """All that is bright lets a little through."""
+    """Bright texels transmit a little light."""
     opacity, base = np.ones((64, 64)), np.full((64, 64, 3), 0.005)
     opacity[:, :2], base[:, :2] = 254 / 255, 0.9
     return stuff(np.zeros((4, 4)), 1.0, base, opacity=opacity)

@@ -1,4 +1,4 @@
-"""The query sensor's points under the random numbers that it gets: a Gaussian wrapped on the torus."""
+"""Points sampled by the query sensor follow a Gaussian wrapped on the torus."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Normal maps add what the mesh lacks, and count nothing twice: a coarse mesh against the fine one."""
+"""A residual normal map adds the slopes that a coarse mesh lacks, and none twice."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The surface conserves energy, is reciprocal, and agrees with other formulas where they overlap."""
+"""The surface conserves energy, is reciprocal, and agrees with published formulas where they apply."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_coated_surfaces_return_at_most_what_they_receive() -> None:
 
 
 def test_surfaces_under_sheen_return_at_most_what_they_receive() -> None:
-    """Whatever lies below, and hardly less of a white base."""
+    """For any base; a white one loses little."""
     binary = (0.0, 1.0)
     below = itertools.product((0.0, 0.4), binary, (0.0, 0.5), binary, (0.2,), binary)
     grid = itertools.product(below, COSINES, (1.0,), (0.07, 0.3, 1.0))
@@ -96,8 +96,8 @@ def test_surfaces_under_sheen_return_at_most_what_they_receive() -> None:
 @pytest.mark.parametrize("roughness", [0.1, 0.3, 0.45, 1.0])
 @pytest.mark.parametrize("cosine", [1.0, 0.5, 0.1, 1e-2])
 def test_sheen_takes_from_the_base_what_it_reflects(roughness: float, cosine: float) -> None:
-    """Against a quadrature of the textbook: D of Estevez and Kulla 2017, masked by Smith's model; the
-    base gets what is left at the direction, of view and light, where that is less."""
+    """Against a quadrature of the published model: D of Estevez and Kulla 2017 with Smith masking. The base
+    receives the smaller remainder of the two directions, of view and light."""
     x, w = np.polynomial.legendre.leggauss(160)
     t, phi = np.meshgrid(0.5 * (x + 1), 0.5 * np.pi * (x + 1), indexing="ij")
     mu = t**2
@@ -157,7 +157,7 @@ def white(kind: str, **values: Any) -> dict[str, Any]:
 
 @pytest.mark.parametrize("metallic", [0.0, 1.0])
 def test_principled_makes_energy_where_the_surface_does_not(metallic: float) -> None:
-    """The reason for an own surface: Mitsuba's ``principled`` returns up to 1.5 times what it receives."""
+    """Mitsuba's ``principled`` returns up to 1.5 times the light it receives."""
     grid = list(itertools.product((0.02, 0.1, 0.3, 0.5, 1.0), (1.0, 0.5, 0.2, 0.05)))
     mitsuba, own = (
         np.array([mitsuba_albedo(white(k, roughness=r, metallic=metallic, specular=0.5), c) for r, c in grid])
@@ -265,8 +265,8 @@ def test_without_gloss_it_is_mitsubas_diffuse() -> None:
 
 @pytest.mark.parametrize("roughness", [0.05, 0.1, 0.2, 0.3])
 def test_narrow_metal_lobe_is_mitsubas_roughconductor(roughness: float) -> None:
-    """Where facets hardly hide one another the masking model, which differs, does not matter: Mitsuba's G is
-    a product. What is scattered several times is 3e-3 of the peak at most."""
+    """At low roughness the masking model hardly matters (Mitsuba's G is a product). Multiple scattering is at
+    most 3e-3 of the peak."""
     rng = np.random.default_rng(8)
     wi = towards(rng.uniform(0.5, 1, 2000), 360 * rng.random(2000))
     alpha = roughness**2
@@ -287,7 +287,8 @@ def test_narrow_metal_lobe_is_mitsubas_roughconductor(roughness: float) -> None:
 
 
 def test_metal_gives_back_what_one_scattering_loses() -> None:
-    """Kulla and Conty 2017: of what one scattering loses, Fms = F̄ (F̄ Ā + F̄² (1-Ā) Ā + …) comes back."""
+    """Kulla and Conty 2017: of the energy lost by single scattering, Fms = F̄ (F̄ Ā + F̄² (1-Ā) Ā + …) is
+    returned."""
     roughness, cosine = 1.0, 0.7
     x, w = np.polynomial.legendre.leggauss(160)
     mu, phi = np.meshgrid(0.5 * (x + 1), 0.5 * np.pi * (x + 1), indexing="ij")

@@ -1,4 +1,4 @@
-"""The surface is sampled with the density and weights that it states: χ² tests, and Mitsuba's ``path``."""
+"""The surface is sampled with its stated density and weights: χ² tests, and Mitsuba's ``path``."""
 
 from __future__ import annotations
 

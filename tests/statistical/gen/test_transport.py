@@ -1,4 +1,4 @@
-"""Rays over the repeated tile that end nowhere, and bounces without a density: mirrors, voids, caps."""
+"""Rays over the periodic tile that hit nothing, and bounces without a density: mirrors, voids, caps."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ TROUGH = HeightGrid(np.tile([0.0, -1.0, -1.0, -1.0], (4, 1)), 1.0)
 
 @pytest.mark.parametrize("width", [0.5, 5.0])
 def test_a_mirror_shows_the_light_itself(width: float) -> None:
-    """No sample of the light reaches a mirror's lobe: the bounce carries all of the radiance, unweighted."""
+    """Light samples never hit a mirror's lobe, so the bounce carries all of the radiance."""
     light = LightKernel(width)
     omega_i, omega_o = direction(50, 30), direction(50 + width, 210 - width)
     e = estimate(flat(), MIRROR, light, queries([0.2, 0.6], 0.1, omega_i, omega_o, 8), 4)
@@ -40,7 +40,7 @@ def test_a_mirror_shows_the_light_itself(width: float) -> None:
 
 
 def test_rays_that_meet_nothing_are_black_and_counted() -> None:
-    """A user's BSDF that lets rays through in the middle half of the tile: they never come back."""
+    """A user-supplied BSDF transmits rays in the middle half of the tile."""
     through = np.ones((8, 8, 1), np.float32)
     through[2:6, 2:6] = 0.0
     bitmap = {"type": "bitmap", "bitmap": mi.Bitmap(through), "raw": True, "filter_type": "nearest"}
@@ -54,7 +54,7 @@ def test_rays_that_meet_nothing_are_black_and_counted() -> None:
 
 
 def test_rays_below_the_surface_meet_it_from_below() -> None:
-    """White, half transparent: every path ends in the sky or is lost below."""
+    """White, half transparent: every path ends in the sky or is counted as lost."""
     n, spp = 4000, 16
     white = {"type": "twosided", "bsdf": lambert(1.0)}
     ridges = HeightGrid(np.tile([0.0, -0.5], (2, 1)), 1.0)
@@ -91,7 +91,7 @@ def test_rays_that_leave_upwards_are_neither_capped_nor_occluded() -> None:
 
 
 def test_a_low_cap_darkens_and_is_counted() -> None:
-    """Light that the cap cuts off is missing from the values, never invented."""
+    """Light beyond the cap is missing from the values, never added."""
     q = tile_mean_queries(direction(1.0, 30), direction(60, 200), 2000)
     full, cut = (
         estimate(rocks(), lambert(0.8), LightKernel(0.0), q, 8, transport=replace(DIRECT, max_crossings=c))

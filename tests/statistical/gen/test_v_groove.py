@@ -94,7 +94,7 @@ def test_finite_footprint(light: tuple[float, float], view: tuple[float, float],
 
 
 def test_a_mirrored_offset_is_caught() -> None:
-    """The finite-footprint test has the power it is there for."""
+    """The test of finite footprints detects a mirrored offset."""
     omega_i, omega_o = direction(35, 0), direction(50, 200)
     n = 3000
     u = np.random.default_rng(3).random((n, 2))

@@ -98,7 +98,7 @@ class TestNumbers:
         assert found["surface"] == "glossy"
         assert found["geometry"]["mesh"] == [24, 48]
         assert found["geometry"]["height"] == 0.2
-        assert found["geometry"]["relief"] <= 0.2
+        assert found["geometry"]["displacement_range"] <= 0.2
         assert 0.3 < found["geometry"]["slope_kept"] < 0.95
         assert found["albedo"]["share_above"] == 0.25
         assert found["albedo"]["share_below"] == 0.125

@@ -10,7 +10,7 @@ import pytest
 from pydantic import TypeAdapter
 
 from mbtf_core.errors import UsageError
-from mbtf_gen.config.effects_request import EFFECTS, RELIEF_EFFECTS, EffectsRequest
+from mbtf_gen.config.effects_request import DISPLACEMENT_EFFECTS, EFFECTS, EffectsRequest
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
 from mbtf_gen.material.material import Material
@@ -56,7 +56,7 @@ def test_a_plane_of_one_color_has_a_closed_form() -> None:
 def test_other_planes_have_none(change: dict[str, Any]) -> None:
     plan = plan_effects(job_of(replace(FLAT, **change)))
     assert not plan.closed_form
-    assert not on(plan) & set(RELIEF_EFFECTS)
+    assert not on(plan) & set(DISPLACEMENT_EFFECTS)
 
 
 def test_black_has_a_closed_form_at_any_displacement() -> None:
@@ -67,14 +67,14 @@ def test_black_has_a_closed_form_at_any_displacement() -> None:
     assert not reference_plan(job_of(shiny)).closed_form
     coated = plan_effects(job_of(replace(black, **COAT)), pilots=False)
     assert not coated.closed_form
-    assert on(coated) >= {*RELIEF_EFFECTS, "clearcoat"}
+    assert on(coated) >= {*DISPLACEMENT_EFFECTS, "clearcoat"}
     holes = replace(black, opacity=np.array([[1.0, 0.0], [1.0, 1.0]]))
     assert not plan_effects(job_of(holes, mode="-interreflection")).closed_form
 
 
 def test_all_and_none_switch_all_effects_of_the_material() -> None:
     everything = plan_effects(job_of(FLAT, "all"))
-    assert on(everything) == {*RELIEF_EFFECTS, "bsdf_sampling"}
+    assert on(everything) == {*DISPLACEMENT_EFFECTS, "bsdf_sampling"}
     assert not everything.closed_form
     nothing = plan_effects(job_of(replace(LAMBERT, roughness=0.5, specular=0.5, metallic=0.5), "none"))
     assert on(nothing) == set()
@@ -126,7 +126,7 @@ def test_bias_bounds_add_up_over_what_is_off() -> None:
 def test_a_small_run_has_no_pilot() -> None:
     """Effects without a bound from theory stay on."""
     plan = plan_effects(job_of(replace(LAMBERT, base_color=np.full(3, 0.05))), pilots=False)
-    assert on(plan) == set(RELIEF_EFFECTS)
+    assert on(plan) == set(DISPLACEMENT_EFFECTS)
     assert plan["interreflection"].bias_bound is plan["parallax"].bias_bound is None
     assert plan.max_depth == 0
     assert plan_effects(job_of(FLAT), pilots=False).closed_form
