@@ -248,6 +248,21 @@ def test_xml_is_loaded_and_refused_alike(material: tuple[Path, Material], tmp_pa
         load_scene({"type": "scene", "ball": {"type": "sphere", "b": {"type": "mbtf"}}})
 
 
+@pytest.mark.parametrize("planted", [None, -1e-3, np.nan])
+def test_environment_maps_with_negative_texels_are_warned_about(
+    planted: float | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    texels = np.ones((8, 16, 3), np.float32)
+    if planted is not None:
+        texels[2, 3, 1] = planted
+    sky = {"type": "envmap", "id": "sky", "bitmap": mi.Bitmap(texels)}
+    with caplog.at_level(logging.WARNING, logger="mbtf_fit"):
+        load_scene({"type": "scene", "sky": sky, "lamp": {"type": "point"}})
+        load_scene({"type": "scene", "sky": {"type": "constant"}})
+        load_scene({"type": "scene"})
+    assert [("'sky' has texels" in r.message) for r in caplog.records] == [True] * (planted is not None)
+
+
 def test_a_mesh_without_uv_is_refused(material: tuple[Path, Material], tmp_path: Path) -> None:
     path = tmp_path / "bare.ply"
     path.write_text(
