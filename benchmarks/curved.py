@@ -176,7 +176,7 @@ def fit_alone(
     si = write_footprint(si, ray, dr.fma(spread, si.t, width))
     ds, arriving = scene.sample_emitter_direction(si, mi.Point2f(s, t), True)
     frame = Frame.at(si)
-    views, lights = clamped(frame.to_tile(si.wi)), frame.to_tile(si.to_local(ds.d))
+    views, lights = clamped(frame.to_tile(si.wi), bsdf.min_cos), frame.to_tile(si.to_local(ds.d))
     good = si.is_valid() & (si.wi.z > 0) & (lights.z > 1e-3) & (dr.max(arriving) > 0)
     weight = np.array(arriving * lights.z).T
     rows = np.flatnonzero(np.array(good))
@@ -188,7 +188,7 @@ def fit_alone(
     queries = Queries(u - np.floor(u), array(bsdf.footprint(si)), array(lights), array(views))
     queries.u[queries.u >= 1.0] = 0.0
     traced = estimator.estimate(queries, 4, Stream(1, "reference", 0))
-    low = np.array(clamped(mi.Vector3f(queries.omega_i.T))).T
+    low = np.array(clamped(mi.Vector3f(queries.omega_i.T), bsdf.min_cos)).T
     fit = bsdf.evaluator.evaluate(queries.u, queries.sigma, low, queries.omega_o)
     true = (0.5 * (traced.value_a + traced.value_b) * weight[rows]).mean(-1).astype(np.float64)
     found = (fit * weight[rows]).mean(-1).astype(np.float64)

@@ -39,6 +39,7 @@ from typing import Annotated, Any
 
 from cyclopts import App, CycloptsError, Parameter, UnusedCliTokensError
 
+from mbtf_core.completion import CompletedApp, add_completion
 from mbtf_core.errors import (
     EXIT_BAD_INPUT,
     EXIT_INTERRUPTED,
@@ -160,7 +161,7 @@ def new_app(name: str, description: str) -> App:
 
         return f"{name} {installed('mbtf')}"
 
-    return App(
+    app = CompletedApp(
         name=name,
         help=description,
         version=version,
@@ -172,6 +173,8 @@ def new_app(name: str, description: str) -> App:
         suppress_keyboard_interrupt=False,
         result_action="return_value",
     )
+    add_completion(app)
+    return app
 
 
 class _LogHandler(logging.Handler):

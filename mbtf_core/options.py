@@ -23,7 +23,7 @@ import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Generic, Literal, TypeVar, Union
+from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, TypeVar, Union
 
 from cyclopts import Parameter
 from pydantic import BaseModel, TypeAdapter
@@ -38,6 +38,11 @@ C = TypeVar("C", bound=Callable[..., Any])
 _DEFAULT = "; default: "
 _METAVARS = {int: "INT", float: "FLOAT"}
 
+if TYPE_CHECKING:
+    PathText = str
+else:
+    # A path as it was given, of type str; shells complete it as a file.
+    PathText = str | Path
 Switch = Annotated[bool, Parameter(negative="", show_default=False)]
 Output = Annotated[Path, Parameter(name=["--output", "-o"], help="Output folder.")]
 Overwrite = Annotated[Switch, Parameter(help="Replace the content of the output folder.")]

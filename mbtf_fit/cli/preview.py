@@ -6,13 +6,13 @@ from pathlib import Path
 
 from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import UsageError
-from mbtf_core.options import Options, Output, Overwrite, takes_options
+from mbtf_core.options import Options, Output, Overwrite, PathText, takes_options
 from mbtf_fit.mitsuba_plugin.preview.config import PreviewConfig
 
 
 @takes_options(PreviewConfig)
 def preview(
-    material: str | None = None,
+    material: PathText | None = None,
     /,
     *,
     output: Output = Path("preview"),

@@ -24,6 +24,8 @@ FORMAT_NAME = "mbtf-material"
 SCHEMA_VERSION = 2
 DESCRIPTION_NAME = "material.json"
 WEIGHTS_NAME = "weights.safetensors"
+# Smallest cosine of the directions in data that do not state one.
+DEFAULT_MIN_COS = 0.1
 # Number of conformance queries; their arrays, expected values last, and the shape of a query in each.
 CONFORMANCE_COUNT = 256
 CONFORMANCE = {"u": (2,), "sigma": (), "omega_i": (3,), "omega_o": (3,), "rgb": (3,)}
@@ -60,6 +62,10 @@ class _Training(BaseModel):
     errors: dict[str, Any]
 
 
+class _Data(BaseModel):
+    min_cos: Annotated[float, Field(strict=True, gt=0, lt=1)] = DEFAULT_MIN_COS
+
+
 class _Description(BaseModel):
     """Keys of ``material.json`` that readers require; it has more."""
 
@@ -70,7 +76,7 @@ class _Description(BaseModel):
     tile: _Tile
     conformance: _Conformance
     training: _Training
-    data: dict[str, Any]
+    data: _Data
     transmittance: _File | None = None
 
 

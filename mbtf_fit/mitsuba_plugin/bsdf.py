@@ -37,8 +37,6 @@ from mbtf_gen.render.types import (
     Vector3f,
 )
 
-# Largest sine of the directions in the data: lower directions are raised to the lowest one with data.
-LARGEST_SINE = 0.99**0.5
 # Largest deviation from the conformance values, as a share of max(value, their mean), that loading accepts.
 TOLERANCE = {"unrolled": 1e-4, "cooperative": 1e-4, "half": 1e-2}
 
@@ -79,12 +77,12 @@ class Frame:
         return mi.Vector3f(dr.fma(self.c, w.x, -self.s * y), dr.fma(self.s, w.x, self.c * y), w.z)
 
 
-def clamped(w: Vector3f) -> Vector3f:
+def clamped(w: Vector3f, min_cos: Float) -> Vector3f:
     """Directions, raised to the lowest ones with data."""
-    sine = dr.sqrt(dr.fma(w.x, w.x, w.y * w.y))
-    low = sine > LARGEST_SINE
-    scale = dr.select(low, LARGEST_SINE / sine, 1.0)
-    return mi.Vector3f(w.x * scale, w.y * scale, dr.select(low, (1.0 - LARGEST_SINE**2) ** 0.5, w.z))
+    sine, largest = dr.sqrt(dr.fma(w.x, w.x, w.y * w.y)), dr.sqrt(1.0 - min_cos * min_cos)
+    low = sine > largest
+    scale = dr.select(low, largest / sine, 1.0)
+    return mi.Vector3f(w.x * scale, w.y * scale, dr.select(low, min_cos, w.z))
 
 
 class MbtfBSDF(mi.BSDF):
@@ -113,6 +111,7 @@ class MbtfBSDF(mi.BSDF):
         folder = Path(str(mi.file_resolver().resolve(str(props["material"]))))
         stored = read_material(folder)
         self.lattice = stored.lattice
+        self.min_cos = dr.opaque(mi.Float, stored.min_cos)
         networks = self._choice(props, "networks", get_args(Arithmetic))
         self.evaluator = Evaluator(stored, networks)
         _check_conformance(self.evaluator, stored)
@@ -273,7 +272,7 @@ class View:
 
     def value(self, ctx: BSDFContext, wo: Vector3f) -> Color3f:
         """f·cos; light travels towards wi, or away from it where paths start at lights."""
-        viewer, light = clamped(self.wi), clamped(wo)
+        viewer, light = (clamped(w, self.bsdf.min_cos) for w in (self.wi, wo))
         if ctx.mode == mi.TransportMode.Importance:
             viewer, light = light, viewer
         features = self.bsdf.evaluator.features(self.u, self.level, viewer)

@@ -13,7 +13,13 @@ from mbtf_core.config_file import build
 from mbtf_core.errors import InputError
 from mbtf_core.lattice import Lattice
 from mbtf_fit.config import FitConfig, NetworkSection
-from mbtf_fit.material.format import DESCRIPTION_NAME, check_conformance, lattice_of, read_description
+from mbtf_fit.material.format import (
+    DEFAULT_MIN_COS,
+    DESCRIPTION_NAME,
+    check_conformance,
+    lattice_of,
+    read_description,
+)
 from mbtf_fit.material.storage import read_tensors
 from mbtf_fit.material.transmittance import read_transmittance
 from mbtf_fit.models.constants import direction_size, position_size
@@ -31,6 +37,7 @@ class StoredMaterial:
     ----------
     folder, network : the material's folder and architecture
     lattice : texel grids of the tile
+    min_cos : smallest cosine of the directions in the data
     pyramid : feature textures (rows, columns, channels), coarsest level first
     decoder : layers of the decoder
     offset_texture, offset_network : those of the neural offset; None for a material without
@@ -42,6 +49,7 @@ class StoredMaterial:
 
     folder: Path
     lattice: Lattice
+    min_cos: float
     network: NetworkSection
     pyramid: list[F32]
     decoder: Layers
@@ -98,6 +106,7 @@ def read_material(folder: str | Path) -> StoredMaterial:
     return StoredMaterial(
         folder,
         lattice,
+        description["data"].get("min_cos", DEFAULT_MIN_COS),
         network,
         pyramid,
         reader.layers("decoder", features + encoded, network.output_channels),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,6 +13,7 @@ from mbtf_fit.mitsuba_plugin.names import BSDF_NAME, INTEGRATOR_NAME, VARIANTS
 from mbtf_gen.render.runtime import CPU_VARIANT, load_mitsuba, refuse_old_llvm
 from mbtf_gen.render.types import Properties, Scene
 
+_log = logging.getLogger(__name__)
 # The variant whose classes the plugins derive from.
 _registered: str | None = None
 # The last error of a plugin's constructor. Mitsuba may construct plugins in its own threads, and passes on
@@ -122,4 +124,26 @@ def load_scene(source: str | Path | Mapping[str, Any]) -> Scene:
         raise error from None
     if isinstance(scene, mi.Scene):
         check_scene(scene)
+        _check_environment(scene)
     return scene
+
+
+def _check_environment(scene: Scene) -> None:
+    """Warn of an environment map with texels that are no radiance, such as resampling leaves."""
+    import mitsuba as mi
+    import numpy as np
+
+    emitter = scene.environment()
+    data = mi.traverse(emitter) if emitter is not None else {}
+    if "data" not in data:
+        return
+    texels = np.array(data["data"])
+    bad = ~(np.isfinite(texels) & (texels >= 0)).all(axis=-1)
+    if bad.any():
+        _log.warning(
+            "the environment map '%s' has texels that are negative or not finite (%.2g %%, the lowest %.3g): "
+            "they darken the picture; set them to 0",
+            emitter.id(),
+            100.0 * bad.mean(),
+            np.nanmin(texels),
+        )

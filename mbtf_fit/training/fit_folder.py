@@ -36,12 +36,14 @@ def identity_of(config: FitConfig, data: Dataset) -> dict[str, Any]:
     if config.init_from is not None:
         description, _ = read_description(Path(config.init_from))
         config_hash += f"-{description['weights']['sha256']}"
+    queries = data.manifest.get("config", {}).get("queries", {})
+    directions = {"min_cos": queries["min_cos"]} if "min_cos" in queries else {}
     return {
         "format": _FORMAT,
         "schema": _SCHEMA,
         "config_hash": config_hash,
         "config": config.fields(),
-        "data": {**described, "shards": lengths, "inputs": data.manifest.get("inputs", {})},
+        "data": {**described, **directions, "shards": lengths, "inputs": data.manifest.get("inputs", {})},
     }
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from mbtf_core.console import CONSOLE, Console, resumable
 from mbtf_core.errors import EXIT_BAD_INPUT, EXIT_OK, EXIT_PARTIAL
-from mbtf_core.options import DryRun
+from mbtf_core.options import DryRun, PathText
 from mbtf_core.units import clock
 from mbtf_gen.cli.generate import describe
 
@@ -69,7 +69,7 @@ def repair(
     folder: Path,
     /,
     *,
-    material: str | None = None,
+    material: PathText | None = None,
     dry_run: DryRun = False,
     console: Console = CONSOLE,
 ) -> int:

@@ -11,7 +11,7 @@ from cyclopts import Parameter
 
 from mbtf_core.console import CONSOLE, Console, resumable
 from mbtf_core.errors import UsageError
-from mbtf_core.options import Options, Output, Overwrite, takes_options
+from mbtf_core.options import Options, Output, Overwrite, PathText, takes_options
 from mbtf_core.units import clock
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.config.presets import GENERATOR, Quality, QualityOption, as_assignments
@@ -44,7 +44,7 @@ def _slice(text: str) -> tuple[int, int]:
 
 @takes_options(GeneratorConfig)
 def generate(
-    material: str | None = None,
+    material: PathText | None = None,
     /,
     *,
     output: Output = Path("shards"),

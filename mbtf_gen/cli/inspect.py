@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from mbtf_core.console import CONSOLE, Console
-from mbtf_core.options import Options, takes_options
+from mbtf_core.options import Options, PathText, takes_options
 from mbtf_gen.cli.generate import resolve_config
 from mbtf_gen.config.generator import GeneratorConfig
 
 
 @takes_options(GeneratorConfig, "geometry")
 def inspect(
-    material: str | None = None,
+    material: PathText | None = None,
     /,
     *,
     options: Options[GeneratorConfig],

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from mbtf_core.console import CONSOLE, Console
-from mbtf_core.options import Options, takes_options
+from mbtf_core.options import Options, PathText, takes_options
 from mbtf_gen.cli.generate import resolve_config
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.config.presets import QualityOption
@@ -24,7 +24,7 @@ _NAME, _BOUND, _WIDTH = 24, 24, 108
 
 @takes_options(GeneratorConfig)
 def plan(
-    material: str | None = None,
+    material: PathText | None = None,
     /,
     *,
     quality: QualityOption = None,

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import UsageError
-from mbtf_core.options import Options, Output, Overwrite, Switch, takes_options
+from mbtf_core.options import Options, Output, Overwrite, PathText, Switch, takes_options
 from mbtf_gen.cli.generate import resolve_config
 from mbtf_gen.config.pictures import RENDERING, PreviewConfig
 
@@ -15,7 +15,7 @@ _QUERIES = ("train", "resolution", "min_cos", "layout", "patch_size")
 
 @takes_options(PreviewConfig, "preview", *(f"queries.{key}" for key in _QUERIES), *RENDERING)
 def preview(
-    material: str | None = None,
+    material: PathText | None = None,
     /,
     *,
     output: Output = Path("preview"),

@@ -6,14 +6,14 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.console import CONSOLE, Console
-from mbtf_core.options import Options, Output, Overwrite, takes_options
+from mbtf_core.options import Options, Output, Overwrite, PathText, takes_options
 from mbtf_gen.cli.generate import resolve_config
 from mbtf_gen.config.pictures import RENDERING, ReferenceConfig
 
 
 @takes_options(ReferenceConfig, "reference", *RENDERING)
 def reference(
-    material: str | None = None,
+    material: PathText | None = None,
     /,
     *,
     output: Output = Path("reference"),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import platform
+import shutil
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -24,8 +25,12 @@ from mbtf_gen.render.runtime import CPU_VARIANT, CUDA_VARIANT, check_llvm, load_
 
 Found = dict[Literal["found"], str]
 
+# Names of the browser that the tests of the report drive.
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 # Seconds; first starts from a slow network disk take tens of them.
 _TIMEOUT = 180.0
+# Bytes below which free disk and memory are reported: the demo needs about half as much.
+_LITTLE_DISK, _LITTLE_MEMORY = 1e9, 2e9
 _REINSTALL = "install again: pip install --force-reinstall"
 
 
@@ -59,7 +64,7 @@ class Probe(NamedTuple):
 def diagnose() -> list[Part]:
     """Test every part, several at a time. It takes seconds and never raises."""
     use_shipped_llvm()
-    tests = [_python, _llvm, _cuda, *(partial(probe, name) for name in PROBES)]
+    tests = [_python, _disk, _memory, _llvm, _cuda, _browser, *(partial(probe, name) for name in PROBES)]
     with ThreadPoolExecutor(max_workers=min(4, os.cpu_count() or 1)) as pool:
         return list(pool.map(lambda test: test(), tests))
 
@@ -103,6 +108,54 @@ def probe(name: str) -> Part:
 def _python() -> Part:
     found = f"{platform.python_version()} on {platform.platform(terse=True)}, {sys.executable}"
     return Part("Python", "ok", True, found)
+
+
+def _disk() -> Part:
+    folders = {str(Path.cwd()): "", tempfile.gettempdir(): " (temporary files)"}
+    free = {folder: shutil.disk_usage(folder).free for folder in folders}
+    found = ", ".join(f"{free[folder] / 1e9:.1f} GB free in {folder}{use}" for folder, use in folders.items())
+    if min(free.values()) < _LITTLE_DISK:
+        return Part(
+            "Disk", "failed", False, found, "free some, or write elsewhere with -o; TMPDIR moves the latter"
+        )
+    return Part("Disk", "ok", False, found)
+
+
+def _memory() -> Part:
+    """Memory that is free, by the system and by the limit of a container."""
+    try:
+        pages = (line.split() for line in Path("/proc/meminfo").read_text().splitlines())
+        sizes = {words[0]: 1024.0 * int(words[1]) for words in pages}
+        free, total = sizes["MemAvailable:"], sizes["MemTotal:"]
+    except (OSError, ValueError, KeyError, IndexError):
+        return Part("Memory", "absent", False, "this system does not state it")
+    found = f"{free / 1e9:.1f} GB free of {total / 1e9:.1f} GB"
+    group = Path("/sys/fs/cgroup")
+    try:
+        limit, used = (float((group / name).read_text()) for name in ("memory.max", "memory.current"))
+        free, found = min(free, limit - used), f"{found}, limited to {limit / 1e9:.1f} GB"
+    except (OSError, ValueError):
+        pass
+    if free < _LITTLE_MEMORY:
+        return Part(
+            "Memory", "failed", False, found, "end other programs; --memory limits what mbtf-fit takes"
+        )
+    return Part("Memory", "ok", False, found)
+
+
+def _browser() -> Part:
+    browser = next((path for name in BROWSERS if (path := shutil.which(name))), None)
+    driver = shutil.which("chromedriver")
+    missing = [name for name, path in (("chromium", browser), ("chromedriver", driver)) if path is None]
+    if not missing:
+        return Part("Browser", "ok", False, f"{browser} with {driver}")
+    return Part(
+        "Browser",
+        "absent",
+        False,
+        f"no {' and no '.join(missing)}; only tests of the report need them",
+        "on Debian: apt install chromium chromium-driver",
+    )
 
 
 def _llvm() -> Part:

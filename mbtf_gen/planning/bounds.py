@@ -22,6 +22,10 @@ F64 = NDArray[np.float64]
 POINTS = 4096
 # Standard errors of the mean square that are added to an estimate.
 CAUTION = 2.0
+# If fewer samples than these change, the largest change may be unsampled.
+FEW = 8
+# An event that occurs in none of n samples has a probability below 3/n, at 95 % confidence (rule of three).
+NONE_OF = 3.0
 # Steps after which a marched ray is assumed to be unoccluded.
 MAX_STEPS = 4096
 
@@ -140,9 +144,14 @@ def displacement_bounds(
     here = color(foot[:, 0], foot[:, 1]) * _lambert(slopes(foot[:, 0], foot[:, 1]), light, irradiance)
     mean = max(float(value.mean()), 1e-12)
 
+    largest = float(max(shade.max(), here.max())) ** 2
+
     def bound(change: F64) -> float:
         square = np.mean(change**2, axis=1)
-        return float(np.sqrt(square.mean() + CAUTION * square.std() / np.sqrt(n))) / mean
+        upper = square.mean() + CAUTION * square.std() / np.sqrt(n)
+        if np.count_nonzero(square) < FEW:
+            upper += NONE_OF * largest / n
+        return float(np.sqrt(upper)) / mean
 
     normal = 0.0
     if residual is not None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from mbtf_gen.config.effects_request import EFFECTS
 from mbtf_gen.job import Job
-from mbtf_gen.planning.bounds import CAUTION
+from mbtf_gen.planning.bounds import CAUTION, FEW, NONE_OF
 from mbtf_gen.planning.effects import Effect, EffectsPlan, without
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Estimates, Stream
@@ -23,10 +23,6 @@ PILOT_ROULETTE = 12
 # The contribution to the mean square of changes larger than the largest sampled one, in units of its own
 # contribution: α/(α-1) for a power-law tail of exponent α, so 10 is safe for α = 1.1.
 UNSEEN = 10.0
-# If fewer queries than these change, the largest change may be unsampled; we assume it equals the mean value.
-FEW = 8
-# An event that occurs in none of n queries has a probability below 3/n, at 95 % confidence (rule of three).
-NONE_OF = 3.0
 
 
 def pilot_queries(job: Job, count: int = PILOT_QUERIES, shard: int = 0) -> Queries:
@@ -95,6 +91,7 @@ class Change:
     def bound(self, most: float = np.inf) -> float:
         """Upper bound of the root mean square change, including changes too rare for the sample. If no change
         exceeds `most`, the mean square is at most `most` times the mean."""
+        # We assume that an unsampled change equals the mean value.
         largest = self.largest if self.changed >= FEW else max(self.largest, 1.0)
         seen = self.upper**2 + UNSEEN * largest**2 / self.count
         mean = abs(self.shift) + CAUTION * self.shift_error + NONE_OF * largest / self.count
@@ -151,11 +148,12 @@ def measured(job: Job, plan: EffectsPlan) -> EffectsPlan:
         listed = " and ".join([", ".join(removed[:-1]), *removed[-1:]]).removeprefix(" and ")
         text = f"; the bound includes {listed}" if removed else ""
         change = pilot.changed(cut)
+        upper = change.upper if change.changed >= FEW else change.bound()
         return replace(
             effect,
             explanation=effect.explanation + text,
             bias_bound=change.rms,
-            error=(change.upper - change.rms) / CAUTION,
+            error=(upper - change.rms) / CAUTION,
             reason="pilot",
         )
 

@@ -12,6 +12,7 @@ from mbtf_pipeline.formatting import direction, signed
 from mbtf_pipeline.recipe import SceneView
 from mbtf_pipeline.report.embed import Gallery, Pixels
 from mbtf_pipeline.report.error_maps import color_bar, common_scale
+from mbtf_pipeline.report.pictures import exr_link
 
 
 def displacements(
@@ -48,7 +49,9 @@ def _row(folder: Path, records: list[dict[str, Any]], fit: str | None, gallery: 
         view = f"view {direction(record['view'])}"
         lines = [view, signed(f"median {median:.2g} tile widths")]
         if fit is not None and (found := record["fits"][fit]["correlation"]) is not None:
-            lines.append(f"correlation with the traced offset {found:.2f}")
-        cells.append({"image": name, "label": title, "lines": lines, "alt": f"{title}, {view}"})
+            lines.append(signed(f"correlation with the traced offset {found:.2f}"))
+        file = record["traced"] if fit is None else record["fits"][fit]["file"]
+        cell = {"image": name, "label": title, "lines": lines, "alt": f"{title}, {view}"}
+        cells.append(cell | {"file": exr_link(file)})
     note = "Displacement towards the viewer’s azimuth, minus the median of each image."
     return {"cells": cells, "bar": color_bar("signed", "Displacement", scale, "tile widths", note)}

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from mbtf_pipeline.formatting import (
 )
 from mbtf_pipeline.report.embed import Gallery, Pixels
 from mbtf_pipeline.report.error_maps import color_bar, common_scale, local_error
+from mbtf_pipeline.run_folder import COMPARE
 
 _KIND = {"query": "Reference", "pixel": "Reference, filtered pixel"}
 
@@ -207,4 +209,10 @@ class _Sheet:
 
 
 def _figure(image: str, label: str, lines: list[str], where: str, *, linear: bool = False) -> dict[str, Any]:
-    return {"image": image, "linear": linear, "label": label, "lines": lines, "alt": f"{label}{where}"}
+    figure = {"image": image, "linear": linear, "label": label, "lines": lines, "alt": f"{label}{where}"}
+    return figure | {"file": exr_link(image) if linear else ""}
+
+
+def exr_link(file: str) -> str:
+    """Address, relative to the report, of an EXR file of the comparison."""
+    return quote(f"{COMPARE}/{file.removesuffix('.exr')}.exr")

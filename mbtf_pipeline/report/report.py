@@ -16,6 +16,7 @@ from mbtf_pipeline.report.embed import ENCODINGS, Gallery, encode
 from mbtf_pipeline.report.error_maps import palette
 from mbtf_pipeline.report.errors import error_context
 from mbtf_pipeline.report.linear_images import EXPOSURE_STOPS
+from mbtf_pipeline.report.material import material_section
 from mbtf_pipeline.report.offsets import offset_section
 from mbtf_pipeline.report.pictures import picture_section
 from mbtf_pipeline.report.plots import ERROR_BAR_NOTE
@@ -24,7 +25,7 @@ from mbtf_pipeline.report.training import read_training, training_context
 from mbtf_pipeline.run_folder import COMPARE, FITS, REPORT, RUN_NAME, SHARDS
 
 # Raised when the page changes; part of the stage's key.
-LAYOUT = 5
+LAYOUT = 6
 
 _TABLE = """
 <table><thead><tr>{% for h in t.head %}<th>{{ h }}</th>{% endfor %}</tr></thead><tbody>
@@ -88,6 +89,7 @@ def write_report(folder: Path, recipe: Recipe, stages: Sequence[str]) -> None:
         "error_bar_note": ERROR_BAR_NOTE,
         "train_spp": manifest["splits"]["train"]["spp"],
         "offsets": offset_section(folder / COMPARE, comparison["offsets"], gallery),
+        "material": material_section(recipe.generate, manifest["inputs"]),
         "effects": manifest["effects"]["effects"],
         "command": run["command"],
         "recipe_yaml": (folder / RECIPE_NAME).read_text(encoding="utf-8"),

@@ -23,7 +23,9 @@ class Loads(HTMLParser):
         for name, value in attrs:
             if name == "style":
                 self._css(value or "")
-            if name in ("src", "href", "xlink:href", "srcset", "data", "poster", "action", "background"):
+            loading = ("src", "href", "xlink:href", "srcset", "data", "poster", "action", "background")
+            # A link loads nothing until it is followed.
+            if tag != "a" and name in loading:
                 if tag == "img" and name == "src":
                     self.pictures.append(value or "")
                 if not (value or "").startswith(("data:", "#")):

@@ -30,6 +30,7 @@ def write_material(
     brightness: float = 0.3,
     seed: int = 0,
     transmittance: Transmittance | None = None,
+    **data: Any,
 ) -> Material:
     """Write a material of random weights that all matter, and return it as read back.
 
@@ -40,6 +41,7 @@ def write_material(
     contrast : standard deviation of the features
     brightness : mean of all biases
     transmittance : None for an opaque material
+    data : what material.json states of the data set
     """
     config = FitConfig.model_validate({"model": model, "network": network or {}})
     torch.manual_seed(seed)
@@ -59,9 +61,8 @@ def write_material(
     tensors |= weights or {}
     built.load_weights(tensors)
     folder.mkdir(parents=True, exist_ok=True)
-    return export(
-        built, config, folder, data={"hash": "0" * 64}, training=_TRAINING, transmittance=transmittance
-    )
+    stated = {"hash": "0" * 64, **data}
+    return export(built, config, folder, data=stated, training=_TRAINING, transmittance=transmittance)
 
 
 def net(**options: Any) -> dict[str, Any]:

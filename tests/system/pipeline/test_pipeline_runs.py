@@ -101,14 +101,21 @@ def test_images_and_numbers_are_consistent(first: dict[str, Any], folder: Path) 
     assert sum(g["mse"]["n"] for g in splits["test"]["levels"].values()) == splits["test"]["n"] == 4096
 
 
+def test_the_report_links_its_exr_files_and_shows_the_material(first: dict[str, Any], folder: Path) -> None:
+    html = (folder / "report.html").read_text(encoding="utf-8")
+    links = set(re.findall(r'<a href="(compare/[^"]*)"', html))
+    assert links == {str(p.relative_to(folder)) for p in (folder / "compare").rglob("*.exr")}
+    assert 'alt="Height: height.exr"' in html
+
+
 def test_the_report_is_self_contained(first: dict[str, Any], folder: Path) -> None:
     html = (folder / "report.html").read_text(encoding="utf-8")
     page = loads(html)
     assert page.external == []
     assert len(html) < 10e6
-    # Two scenes with two references, a fit and its two maps each; one traced and one learned offset.
+    # Two scenes with two references, a fit and its two maps each; one traced and one learned offset; one map.
     embedded = [p for p in page.pictures if p]
-    assert len(embedded) == 2 * 5 + 2
+    assert len(embedded) == 2 * 5 + 2 + 1
     for uri in embedded:
         head, _, data = uri.partition(",")
         assert head in ("data:image/png;base64", "data:image/jpeg;base64")

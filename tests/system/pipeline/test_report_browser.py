@@ -15,6 +15,7 @@ from PIL import Image
 from support.paths import ROOT
 
 from mbtf_core.console import run
+from mbtf_gen.diagnostics.doctor import BROWSERS
 from mbtf_gen.pictures.reference import to_display
 from mbtf_pipeline.cli.app import app
 from mbtf_pipeline.compare.pictures import read_picture
@@ -57,8 +58,7 @@ def _start(profile: Path) -> Any:
     from selenium.webdriver.chrome.service import Service
     from urllib3.exceptions import HTTPError
 
-    names = ("chromium", "chromium-browser", "google-chrome")
-    browser = next((path for name in names if (path := shutil.which(name))), None)
+    browser = next((path for name in BROWSERS if (path := shutil.which(name))), None)
     driver = shutil.which("chromedriver")
     if browser is None or driver is None:
         pytest.skip("no browser; to enable on Debian: apt-get install chromium chromium-driver")

@@ -39,6 +39,14 @@ def fitted(data: Path, tmp_path_factory: pytest.TempPathFactory) -> FitResult:
     return fit(config(), data, tmp_path_factory.mktemp("fit") / "material")
 
 
+def test_a_fit_states_the_lowest_direction_of_its_data(tmp_path: Path) -> None:
+    folder = write_data(tmp_path / "d", constant(0.25))
+    path = folder / "manifest.json"
+    manifest = json.loads(path.read_text())
+    path.write_text(json.dumps(manifest | {"config": {"queries": {"min_cos": 0.3}}}))
+    assert fit(config(), folder, tmp_path / "m").material.description["data"]["min_cos"] == 0.3
+
+
 @pytest.mark.parametrize("model", ["neumip", "neumip-baseline"])
 def test_a_homogeneous_constant_is_fitted(model: str, tmp_path: Path) -> None:
     folder = write_data(tmp_path / "d", constant(0.25), noise=0.05)

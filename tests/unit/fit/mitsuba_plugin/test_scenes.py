@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import torch
 from safetensors.numpy import load_file, save_file
-from support.plugin_materials import deviation, write_material
-from support.plugin_scenes import plane, sensor_of, through_pixel_centers
+from support.plugin_materials import deviation, net, write_material
+from support.plugin_scenes import interaction, plane, sensor_of, through_pixel_centers
 from support.scenes import directional, mi
 
 from mbtf_core.digest import file_sha256
@@ -167,6 +167,32 @@ def test_nothing_is_seen_from_below_or_lit_from_below(material: tuple[Path, Mate
     assert shown(both, under, below).mean() > 0.02
 
 
+@pytest.mark.parametrize("min_cos", [None, 0.02, 0.3])
+def test_directions_below_the_data_are_raised_to_their_edge(min_cos: float | None, tmp_path: Path) -> None:
+    """The edge is that of the data set which the material was fitted to; 0.1 where none is stated."""
+    stated = {} if min_cos is None else {"min_cos": min_cos}
+    with_z = net(encoding={"direction_xyz": True})
+    fitted = write_material(tmp_path, contrast=0.2, brightness=0.5, **with_z, **stated)
+    edge = 0.1 if min_cos is None else min_cos
+    cosine = np.array([0.01, 0.05, 0.15, 0.4])
+    azimuth = np.linspace(0.3, 5.0, len(cosine))
+
+    def towards(z: np.ndarray) -> np.ndarray:
+        sine = np.sqrt(1 - z * z)
+        return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), z], -1)
+
+    plugin = mi.load_dict(bsdf(tmp_path, sigma=0.1))
+    hits = interaction(len(cosine), (0.3, 0.2, 0.9), dp_du=mi.Vector3f(1, 0, 0), dp_dv=mi.Vector3f(0, -1, 0))
+    light = mi.Vector3f(*towards(cosine).T)
+    found = np.array(plugin.eval(mi.BSDFContext(), hits, light)).T / cosine[:, None]
+    viewer = np.tile(np.array(hits.wi)[:, :1].T, (len(cosine), 1))
+    at = np.tile([0.0, 1.0], (len(cosine), 1)), np.full(len(cosine), 0.1)
+    wanted = fitted.evaluate(*at, towards(np.maximum(cosine, edge)), viewer)
+    unraised = fitted.evaluate(*at, towards(cosine), viewer)
+    assert deviation(found, wanted) < 1e-4
+    assert deviation(unraised, wanted) > 1e-3
+
+
 def test_parameters_can_be_changed(material: tuple[Path, Material]) -> None:
     mesh = plane(bsdf(material[0]))
     before = shown(mesh)
@@ -220,6 +246,21 @@ def test_xml_is_loaded_and_refused_alike(material: tuple[Path, Material], tmp_pa
         load_scene({"type": "scene", "integrator": {"type": "mbtf_path", "maxdepth": 3}})
     with pytest.raises(UsageError, match="names no material"):
         load_scene({"type": "scene", "ball": {"type": "sphere", "b": {"type": "mbtf"}}})
+
+
+@pytest.mark.parametrize("planted", [None, -1e-3, np.nan])
+def test_environment_maps_with_negative_texels_are_warned_about(
+    planted: float | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    texels = np.ones((8, 16, 3), np.float32)
+    if planted is not None:
+        texels[2, 3, 1] = planted
+    sky = {"type": "envmap", "id": "sky", "bitmap": mi.Bitmap(texels)}
+    with caplog.at_level(logging.WARNING, logger="mbtf_fit"):
+        load_scene({"type": "scene", "sky": sky, "lamp": {"type": "point"}})
+        load_scene({"type": "scene", "sky": {"type": "constant"}})
+        load_scene({"type": "scene"})
+    assert [("'sky' has texels" in r.message) for r in caplog.records] == [True] * (planted is not None)
 
 
 def test_a_mesh_without_uv_is_refused(material: tuple[Path, Material], tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -18,6 +19,33 @@ def test_only_required_parts_fail_the_diagnosis(required: bool) -> None:
     assert doctor.exit_code(checks) == (3 if required else 0)
     assert doctor.as_json(checks)["healthy"] is not required
     assert "                → unset it" in doctor.as_text(checks).splitlines()
+
+
+def test_disk_and_memory_are_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    disk, memory = doctor._disk(), doctor._memory()
+    assert f"GB free in {tmp_path}" in disk.found
+    assert "GB free of" in memory.found
+    monkeypatch.setattr(doctor.shutil, "disk_usage", lambda folder: SimpleNamespace(free=2e8))
+    monkeypatch.setattr(doctor, "_LITTLE_MEMORY", 1e18)
+    for part in (doctor._disk(), doctor._memory()):
+        assert part.state == "failed"
+        assert not part.required
+        assert part.hint
+    assert "0.2 GB free" in doctor._disk().found
+
+
+@pytest.mark.parametrize("missing", [(), ("chromedriver",), ("chromium", "chromedriver")])
+def test_the_browser_of_the_tests_is_optional(
+    missing: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    there = {"chromium", "chromedriver"} - {*missing}
+    monkeypatch.setattr(doctor.shutil, "which", lambda name: f"/bin/{name}" if name in there else None)
+    part = doctor._browser()
+    assert part.state == ("absent" if missing else "ok")
+    assert all(f"no {name}" in part.found for name in missing)
+    assert ("apt install chromium chromium-driver" in part.hint) is bool(missing)
+    assert doctor.exit_code([part]) == 0
 
 
 def test_a_broken_llvm_is_a_finding_not_a_crash(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
