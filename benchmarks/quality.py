@@ -11,8 +11,8 @@ finished run, so the same command resumes; a run is repeated only if its preset 
 ``--store`` writes the runs of FOLDER to ``quality_measured.json`` beside this script. ``--table`` prints that
 file as the Markdown table of the documentation. ``--check`` compares FOLDER with that file.
 
-The last line is one JSON object with the figures and their thresholds. On two cores, at 128 texels across, a
-draft takes at most a minute and a standard run ten minutes. Under ``--check`` seconds differ by at most 30 %
+The last line is one JSON object with the figures and their thresholds. On two cores, a draft takes at most a
+minute and a standard run ten minutes. Under ``--check`` seconds differ by at most 30 %
 and errors by at most a factor 1.5. Exit code 1 where a threshold is exceeded.
 """
 
@@ -37,7 +37,7 @@ from mbtf_core.units import clock
 from mbtf_fit.config import FitConfig
 from mbtf_fit.presets import FITTER, best_at
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.config.presets import GENERATOR, Quality, as_assignments
+from mbtf_gen.config.presets import GENERATOR, RESOLUTION, Quality, as_assignments
 from mbtf_pipeline.presets import COMPARE
 from mbtf_pipeline.run_folder import machine
 
@@ -58,7 +58,6 @@ HEIGHT_SCALES: dict[str, float] = {
 LONG = "rock_cliff"
 # Seconds of a whole run.
 THRESHOLDS = {"draft": 60.0, "standard": 600.0}
-RESOLUTION = 128
 # Largest factors between a stored figure and a new one.
 CHECK = {"seconds": 1.3, "error": 1.5}
 QUALITIES: tuple[Quality, ...] = get_args(Quality)
@@ -67,7 +66,6 @@ name: quality
 generate:
   material: {material}
   geometry: {{height_scale: {height}}}
-  queries: {{resolution: {resolution}}}
 fit: {{model: neumip}}
 """
 
@@ -119,6 +117,11 @@ def options_hash(quality: Quality) -> str:
     return data_sha256([GENERATOR[quality], options, training, COMPARE[quality]])[:12]
 
 
+def resolution_of(quality: Quality, resolution: int | None) -> int:
+    """Texels across: the given number, or that of the preset."""
+    return int(resolution or GENERATOR[quality][RESOLUTION])
+
+
 def generator_config(name: str, quality: Quality, resolution: int) -> GeneratorConfig:
     """Configuration of the generator for a material at a preset."""
     material, height = source(name)
@@ -143,10 +146,10 @@ def run(name: str, quality: Quality, resolution: int, work: Path) -> MeasuredRun
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True)
     recipe, out = work / "recipe.yaml", work / "run"
-    text = RECIPE.format(material=json.dumps(str(material)), resolution=resolution, height=json.dumps(height))
+    text = RECIPE.format(material=json.dumps(str(material)), height=json.dumps(height))
     recipe.write_text(text, encoding="utf-8")
     command = [sys.executable, "-m", "mbtf_pipeline", "run", str(recipe), "--quality", quality]
-    command += ["-o", str(out), "--json", "--quiet"]
+    command += ["-o", str(out), "--json", "--quiet", "--set", f"generate.{RESOLUTION}={resolution}"]
     start = time.perf_counter()
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
     seconds = time.perf_counter() - start
@@ -202,11 +205,13 @@ def finished(path: Path) -> MeasuredRun | None:
         return None
 
 
-def finished_runs(folder: Path, resolution: int) -> list[MeasuredRun]:
-    """All stored runs of a resolution, in the order of the table."""
+def finished_runs(folder: Path, resolution: int | None) -> list[MeasuredRun]:
+    """All stored runs of a resolution, by default those of the presets, in the order of the table."""
     found = []
-    for path in folder.glob(f"*-{resolution}.json"):
+    for path in folder.glob("*-*.json"):
         one = finished(path)
+        if one is not None and not path.stem.endswith(f"-{resolution_of(one.quality, resolution)}"):
+            continue
         if one is None:
             print(f"{path}: ignored, damaged or measured with other options", file=sys.stderr)
         else:
@@ -214,7 +219,7 @@ def finished_runs(folder: Path, resolution: int) -> list[MeasuredRun]:
     return sorted(found, key=lambda r: (QUALITIES.index(r.quality), r.material))
 
 
-def store(runs: Sequence[MeasuredRun], resolution: int) -> None:
+def store(runs: Sequence[MeasuredRun], resolution: int | None) -> None:
     """Write the figures beside this script."""
     data = {
         "format": FORMAT,
@@ -270,7 +275,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--out", type=Path, help="folder of the finished runs")
     parser.add_argument("--only", action="append", help="MATERIAL:QUALITY (repeatable)")
-    parser.add_argument("--resolution", type=int, default=RESOLUTION, help="texels across, a power of two")
+    parser.add_argument("--resolution", type=int, help="texels across; default: the preset's")
     parser.add_argument("--store", action="store_true", help="write quality_measured.json")
     parser.add_argument("--table", action="store_true", help="print quality_measured.json as Markdown")
     parser.add_argument("--check", action="store_true", help="compare with quality_measured.json")
@@ -282,17 +287,18 @@ def main() -> int:
         parser.error("--out is required")
     arguments.out.mkdir(parents=True, exist_ok=True)
     for name, quality in requested(arguments.only):
-        path = arguments.out / f"{name}-{quality}-{arguments.resolution}.json"
+        resolution = resolution_of(quality, arguments.resolution)
+        path = arguments.out / f"{name}-{quality}-{resolution}.json"
         if finished(path) is not None:
             continue
         if not source(name)[0].is_dir():
             print(f"{name}: skipped, {source(name)[0]} is missing", file=sys.stderr)
             continue
-        found = run(name, quality, arguments.resolution, arguments.out / ".work")
+        found = run(name, quality, resolution, arguments.out / ".work")
         write_json(path, asdict(found))
         print(found, flush=True)
     runs = finished_runs(arguments.out, arguments.resolution)
-    timed = [r for r in runs if r.quality in THRESHOLDS and arguments.resolution <= RESOLUTION]
+    timed = [r for r in runs if r.quality in THRESHOLDS and arguments.resolution is None]
     met = all(r.seconds <= THRESHOLDS[r.quality] for r in timed)
     report: dict[str, Any] = {"figures": [asdict(r) for r in runs], "thresholds": {**THRESHOLDS}}
     if arguments.check:

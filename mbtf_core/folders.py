@@ -7,6 +7,7 @@ process is killed at.
 from __future__ import annotations
 
 import re
+import shutil
 from collections.abc import Callable, Container, Mapping
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from typing import Any
 from mbtf_core.atomic import TEMPORARY, remove_file
 from mbtf_core.config_file import differences, in_short
 from mbtf_core.errors import InputError
+from mbtf_core.units import size_text
 
 # Names of temporary files and locks, such as a killed process leaves.
 _LEFTOVER = re.compile(rf"\..+(?:{TEMPORARY}|\.lock)")
@@ -51,6 +53,29 @@ def check_folder(folder: Path, is_ours: Callable[[Path], bool], what: str) -> bo
     if not empty:
         raise InputError(f"is not empty and holds no {what}", where=folder, hint=ELSEWHERE)
     return False
+
+
+def check_space(folder: Path, size: float, hint: str) -> None:
+    """Refuse what does not fit on the disk of an output folder.
+
+    Parameters
+    ----------
+    folder : Path
+        The output folder, which may be missing.
+    size : float
+        Bytes that are to be written.
+    hint : str
+        The option to change.
+
+    Raises
+    ------
+    InputError
+        Less is free.
+    """
+    there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+    free = shutil.disk_usage(there).free
+    if size > free:
+        raise InputError(f"needs {size_text(size)}; {size_text(free)} are free", where=folder, hint=hint)
 
 
 def make_folder(folder: Path) -> None:

@@ -37,9 +37,11 @@ class Progress:
         """Count `step` more as done."""
         self.update(self.done + step, note)
 
-    def update(self, done: float, note: str | None = None) -> None:
-        """Set the units done; `note` is displayed until the next one."""
+    def update(self, done: float, note: str | None = None, total: float | None = None) -> None:
+        """Set the units done; `note` and `total` stay until the next ones."""
         self.done = done
+        if total is not None:
+            self.total = total
         if note is not None:
             self.note = note
         self._show()
@@ -108,7 +110,7 @@ class BarProgress(Progress):
         self._rich.start()
 
     def _show(self) -> None:
-        self._rich.update(self._task, completed=self.done, note=self.note)
+        self._rich.update(self._task, completed=self.done, total=self.total, note=self.note)
 
     def _close(self) -> None:
         self._rich.stop()

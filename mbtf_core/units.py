@@ -74,6 +74,20 @@ def format_size(size: float) -> str:
     return _format(size, _BYTES, "")
 
 
+def size_text(size: float) -> str:
+    """Readable size: ``812 kB``, ``64 MB``, ``1.7 GB``."""
+    for unit, factor in (("GB", 1e9), ("MB", 1e6)):
+        if size >= factor:
+            return f"{size / factor:.{1 if size < 10 * factor else 0}f} {unit}"
+    return f"{size / 1e3:.0f} kB"
+
+
+def expectation(seconds: float | None, size: float) -> str:
+    """What a command expects to take, in one line; unknown seconds are left out."""
+    time = "" if seconds is None else f"about {clock(seconds)}, "
+    return f"expected: {time}{size_text(size)} on disk"
+
+
 def parse_numbers(value: Any) -> Any:
     """Numbers of a text such as ``"1,2,4"``; any other value as it is.
 

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any
 
-from mbtf_core.config_file import merge, read_yaml
 from mbtf_core.units import parse_duration
 from mbtf_gen.config.presets import Quality
 
@@ -45,7 +43,9 @@ def best_at(quality: Quality) -> dict[str, Any]:
     return best_options(math.inf if training is None else parse_duration(training))
 
 
-def fitter_options(quality: Quality, fits: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+def fitter_options(
+    quality: Quality, fits: Mapping[str, Mapping[str, Any]], seconds: float | None = None
+) -> dict[str, dict[str, Any]]:
     """Options of fits at a quality preset, dotted names: their budget, and for `neumip` and its baseline
     :func:`best_at`. Explicit values override the preset.
 
@@ -54,13 +54,15 @@ def fitter_options(quality: Quality, fits: Mapping[str, Mapping[str, Any]]) -> d
     Parameters
     ----------
     fits : name → explicit options of files and command line, nested, with the model
+    seconds : training time that decides the network; the preset's by default
     """
     free = not any("network" in given or given.get("init_from") for given in fits.values())
     out = {}
     for name, given in fits.items():
         training = given.get("training")
         training = training if isinstance(training, Mapping) else {}
-        best = best_at(quality) if given.get("model") in _MODELS else {}
+        chosen = best_at(quality) if seconds is None else best_options(seconds)
+        best = chosen if given.get("model") in _MODELS else {}
         kept = {
             key: value
             for key, value in best.items()
@@ -68,18 +70,3 @@ def fitter_options(quality: Quality, fits: Mapping[str, Mapping[str, Any]]) -> d
         }
         out[name] = kept | FITTER[quality]
     return out
-
-
-def overrides_of(file: Path | None, assignments: Sequence[str]) -> dict[str, Any]:
-    """Options of a configuration file and of ``a.b=c``, nested; values of the latter as text.
-
-    Raises
-    ------
-    InputError : the file cannot be read
-    """
-    found = read_yaml(file) if file is not None else {}
-    given = dict(found) if isinstance(found, Mapping) else {}
-    for text in assignments:
-        name, _, value = text.partition("=")
-        merge(given, name.strip().split("."), value.strip())
-    return given

@@ -6,6 +6,7 @@ import os
 import statistics
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,11 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.shard_schema import Split
+from mbtf_core.shard_schema import ShardEntry, Split
 from mbtf_core.stats import pooled_error
-from mbtf_core.units import clock
+from mbtf_core.units import clock, size_text
 from mbtf_gen.dataset.shard_io import row_bytes, write_shard
-from mbtf_gen.job import Job, split_queries, split_spp, split_target
+from mbtf_gen.job import Job, most_paths, planned_paths, split_queries, split_spp, split_target
 from mbtf_gen.planning.adaptive import estimate_shard
 from mbtf_gen.planning.pilot import pilot_queries
 from mbtf_gen.planning.run_plan import RunPlan
@@ -28,6 +29,8 @@ from mbtf_gen.sampling.query_sampler import Queries
 # Paths of one piece of the pilot, and the minimum number of timed pieces.
 _PIECE_PATHS = 1 << 19
 _FEWEST = 3
+# Fewer paths take less than a minute at half a million paths per second.
+LONG_RUN = 30_000_000
 
 
 @dataclass(frozen=True)
@@ -45,7 +48,7 @@ class Forecast:
     paths : int
         Of all splits, including the queries' own pilots under a target error.
     paths_per_second : float
-        Of the training split, in the pilot.
+        Paths of both halves over all seconds of the run, startup included, as in a run's summary.
     paths_per_query : float
         Mean over the training split, without pilots.
     missed : float
@@ -75,9 +78,9 @@ class Forecast:
     def describe(self, target: Target | None = None) -> str:
         """One line, two under a target error."""
         line = (
-            f"forecast: {clock(self.seconds)} to trace and write ({self.paths_per_second / 1e6:.2f} M "
-            f"paths/s after {self.start:.0f} s of startup), {size_text(self.bytes)}, noise of "
-            f"one training value {self.relative_error:.0%} of the mean value"
+            f"forecast: {clock(self.start + self.seconds)}, {self.paths_per_second / 1e6:.2f} M paths/s "
+            f"({self.start:.0f} s of startup included), {size_text(self.bytes)}, noise of one training value "
+            f"{self.relative_error:.0%} of the mean value"
         )
         if target is None:
             return line
@@ -88,14 +91,6 @@ class Forecast:
         if self.missed:
             line += f"; {self.missed:.1%} of the queries stop at the cap of {target.max_spp}"
         return line
-
-
-def size_text(size: float) -> str:
-    """``812 kB``, ``64 MB``, ``1.7 GB``."""
-    for unit, factor in (("GB", 1e9), ("MB", 1e6)):
-        if size >= factor:
-            return f"{size / factor:.{1 if size < 10 * factor else 0}f} {unit}"
-    return f"{size / 1e3:.0f} kB"
 
 
 @dataclass(frozen=True)
@@ -143,19 +138,19 @@ def forecast(job: Job, plan: RunPlan, seconds: float = 2.0) -> Forecast:
     error = pooled_error(a, b).scaled(1.0 / mean if mean > 0 else 0.0)
     traced, count = sum(p.queries for p in train), split_queries(job, "train")
     paths = round(count * sum(p.paths for p in train) / traced)
-    rate = statistics.median(p.paths / p.seconds for p in train)
     each = _query_seconds(train)
     total = each * count
     test_spp, test_count = split_spp(job.config, "test"), split_queries(job, "test")
     if test_count:
         part = _pilot(job, plan, estimator, "test", 0.25 * seconds, _PIECE_PATHS // test_spp)
         total += _query_seconds(part) * test_count
+    paths += test_count * test_spp
     return Forecast(
         seconds=total,
         start=start,
         query_seconds=each,
-        paths=paths + test_count * test_spp,
-        paths_per_second=rate,
+        paths=paths,
+        paths_per_second=paths / max(start + total, 1e-9),
         paths_per_query=sum(p.stored for p in train) / traced,
         missed=sum(p.missed for p in train) / traced,
         bytes=(count + test_count) * row_bytes(plan.effects.on("opacity")),
@@ -163,6 +158,15 @@ def forecast(job: Job, plan: RunPlan, seconds: float = 2.0) -> Forecast:
         relative_error_se=error.error,
         pilot_seconds=time.perf_counter() - began,
     )
+
+
+def time_left(job: Job, plan: RunPlan, entries: Sequence[ShardEntry]) -> float | None:
+    """Forecast of the seconds to render some of the job's shards; None where no machine needs a minute."""
+    share = planned_paths(job, entries) / max(planned_paths(job, job.shards), 1)
+    if share * most_paths(job) < LONG_RUN or plan.effects.closed_form:
+        return None
+    expected = forecast(job, plan, seconds=1.0)
+    return expected.start + share * expected.seconds
 
 
 def _piece(job: Job, plan: RunPlan, estimator: Any, split: Split, number: int, count: int) -> _Piece:

@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from mbtf_core.errors import PartialError
+from mbtf_core.shard_schema import ShardEntry
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.dataset.folder import has_dataset, open_folder
 from mbtf_gen.dataset.render_shards import ProgressCallback, render_shards
 from mbtf_gen.dataset.summary import Summary, finish, read_run_plan
 from mbtf_gen.dataset.verify import finished_record
-from mbtf_gen.job import Job, planned_paths
-from mbtf_gen.planning.run_plan import plan_run
+from mbtf_gen.job import Job
+from mbtf_gen.planning.run_plan import RunPlan, plan_run
 
 
-def paths_left(job: Job, folder: str | Path, slice_index: int = 1, slice_count: int = 1) -> int:
-    """Paths that :func:`generate` has yet to trace: those of the slice's unfinished shards."""
+def unfinished(
+    job: Job, folder: str | Path, slice_index: int = 1, slice_count: int = 1, overwrite: bool = False
+) -> list[ShardEntry]:
+    """Shards of a slice that :func:`generate` has yet to render."""
     entries = job.shards[slice_index - 1 :: slice_count]
-    left = [e for e in entries if not finished_record(Path(folder) / e.file, e.rows, job.config_hash)]
-    return planned_paths(job, left)
+    folder = Path(folder)
+    return [e for e in entries if overwrite or not finished_record(folder / e.file, e.rows, job.config_hash)]
 
 
 def generate(
@@ -29,6 +33,7 @@ def generate(
     overwrite: bool = False,
     slice_index: int = 1,
     slice_count: int = 1,
+    planned: Callable[[RunPlan], None] | None = None,
     progress: ProgressCallback | None = None,
 ) -> Summary:
     """Generate a data set, or finish an unfinished one.
@@ -46,9 +51,11 @@ def generate(
         because another slice may have begun it.
     slice_index, slice_count : int
         Generate every `slice_count`-th shard only, starting with number `slice_index`, from 1.
+    planned : callable, optional
+        Called with the run's plan. A new data set is not yet written then.
     progress : callable, optional
-        Called after every shard with the number of planned paths that are done in this run (see
-        :func:`paths_left`) and a note.
+        Called after every shard with the paths of this run so far, a note, and the paths that the run is
+        expected to trace (None where a target error leaves it open).
 
     Returns
     -------
@@ -67,9 +74,20 @@ def generate(
     start = time.perf_counter()
     job = source if isinstance(source, Job) else Job.prepare(source)
     overwrite = overwrite and not (slice_count > 1 and has_dataset(folder, job.config_hash))
-    open_folder(job, folder, plan_run, overwrite)
-    entries = job.shards[slice_index - 1 :: slice_count]
-    result = render_shards(job, folder, entries, read_run_plan(folder), progress=progress)
+    plans: list[RunPlan] = []
+
+    def new_plan(job: Job) -> RunPlan:
+        plans.append(plan_run(job))
+        if planned is not None:
+            planned(plans[0])
+        return plans[0]
+
+    open_folder(job, folder, new_plan, overwrite)
+    plan = read_run_plan(folder)
+    entries = unfinished(job, folder, slice_index, slice_count)
+    if planned is not None and not plans and entries:
+        planned(plan)
+    result = render_shards(job, folder, entries, plan, start=start, progress=progress)
     seconds = time.perf_counter() - start
     summary = finish(
         folder, paths=result.paths, seconds=seconds, writing=result.writing, waiting=result.waiting

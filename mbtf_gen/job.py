@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -109,6 +109,16 @@ class Job:
     def shards(self) -> tuple[ShardEntry, ...]:
         """All shards, the training split first; a UsageError if a split has more than ``MAX_SHARD_FILES``."""
         return tuple(entry for split in SPLITS for entry in _shards(self, split))
+
+
+def limit_resolution(job: Job) -> Job:
+    """A job whose resolution is at most that of its map, which has no finer detail."""
+    finest = Lattice.for_map(*job.material.height.shape).finest
+    config = job.config
+    if config.queries.finest is None or config.queries.finest <= finest:
+        return job
+    queries = config.queries.model_copy(update={"resolution": 1 << finest})
+    return replace(job, config=config.model_copy(update={"queries": queries}))
 
 
 def row_queries(job: Job) -> int:

@@ -27,7 +27,7 @@ from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.dataset.render_shards import ProgressCallback, render_shards
 from mbtf_gen.dataset.summary import finish, read_run_plan
 from mbtf_gen.dataset.verify import INCOMPLETE, TWICE, UNLISTED, Fault, shard_faults, verify
-from mbtf_gen.job import Job, planned_paths
+from mbtf_gen.job import Job
 from mbtf_gen.planning.run_plan import RunPlan, plan_run
 
 _AGAIN = "generate the data set again, into another folder"
@@ -199,11 +199,6 @@ class Corruption:
         """Faults that a repair leaves."""
         return [f for f in self.faults if f.what == UNLISTED]
 
-    @property
-    def paths(self) -> int:
-        """Paths to trace."""
-        return planned_paths(self.job, self.entries)
-
     def repair(self, progress: ProgressCallback | None = None) -> RepairResult:
         """See :func:`repair`."""
         documents, entries, plan = self.documents, self.entries, self.plan
@@ -244,7 +239,7 @@ def repair(
     material : str, optional
         Current path of the material; by default the path in the data set's configuration.
     progress : callable, optional
-        Called after every shard with the number of planned paths that are done and a note.
+        As in :func:`~mbtf_gen.generation.generate`.
 
     Returns
     -------

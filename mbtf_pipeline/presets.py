@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mbtf_fit.presets import fitter_options, overrides_of
-from mbtf_gen.config.presets import GENERATOR, Quality, as_assignments
-from mbtf_pipeline.recipe import fit_names
+from mbtf_fit.presets import fitter_options
+from mbtf_gen.config.presets import RESOLUTION, Quality, as_assignments, generator_options, overrides_of
+from mbtf_pipeline.recipe import Recipe, fit_names, load_recipe
 
 # Options of the comparison by preset.
 COMPARE: dict[Quality, dict[str, Any]] = {
@@ -19,12 +19,15 @@ COMPARE: dict[Quality, dict[str, Any]] = {
 }
 
 
-def quality_assignments(path: Path, quality: Quality | None, assignments: Sequence[str] = ()) -> list[str]:
+def quality_assignments(
+    path: Path, quality: Quality | None, assignments: Sequence[str] = (), training: float | None = None
+) -> list[str]:
     """Assignments ``a.b=c`` that apply a preset to the recipe of a file.
 
     Parameters
     ----------
     assignments : those that will override them
+    training : seconds of training that decide the networks; the preset's by default
 
     Raises
     ------
@@ -32,12 +35,41 @@ def quality_assignments(path: Path, quality: Quality | None, assignments: Sequen
     """
     if quality is None:
         return []
-    out = as_assignments(GENERATOR[quality], "generate.")
     given = overrides_of(path, assignments)
+    generate = given.get("generate")
+    preset = generator_options(quality, generate if isinstance(generate, Mapping) else {})
+    out = as_assignments(preset, "generate.")
     fits = {prefix: _options_of_fit(given, prefix) for prefix in fit_names(path)}
-    for prefix, options in fitter_options(quality, fits).items():
+    for prefix, options in fitter_options(quality, fits, training).items():
         out += as_assignments(options, f"{prefix}.")
     return out + as_assignments(COMPARE[quality])
+
+
+def preset_recipe(
+    path: Path, quality: Quality | None, assignments: Sequence[str] = (), training: float | None = None
+) -> Recipe:
+    """The recipe of a file at a quality preset.
+
+    Parameters
+    ----------
+    assignments : ``a.b=c``, which override the preset
+    training : as in :func:`quality_assignments`
+
+    Raises
+    ------
+    InputError : file or material cannot be read
+    UsageError : an assignment is invalid
+    """
+    preset = quality_assignments(path, quality, assignments, training)
+    recipe = load_recipe(path, [*preset, *assignments])
+    if not any(text.startswith(f"generate.{RESOLUTION}=") for text in preset):
+        return recipe
+    from mbtf_gen.job import Job, limit_resolution
+    from mbtf_gen.material.material import load_material
+
+    generate = recipe.generate
+    job = Job(generate, load_material(Path(generate.material), generate.geometry.make_tileable))
+    return recipe.model_copy(update={"generate": limit_resolution(job).config})
 
 
 def _options_of_fit(given: Mapping[str, Any], prefix: str) -> dict[str, Any]:

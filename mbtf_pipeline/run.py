@@ -145,7 +145,7 @@ class _RecipeRun:
     def _generate(self, data: DataSet, decision: Decision) -> None:
         from mbtf_core.shard_schema import MANIFEST_NAME
         from mbtf_gen.dataset.verify import sidecar_of
-        from mbtf_gen.generation import generate, paths_left
+        from mbtf_gen.generation import generate
         from mbtf_gen.job import Job
 
         job = Job.prepare(data.config)
@@ -160,7 +160,7 @@ class _RecipeRun:
             or read_json(manifest).get("config_hash") != job.config_hash
         ):
             clear(shards)
-        with self.console.progress(paths_left(job, shards), data.stage, "paths") as bar:
+        with self.console.progress(None, data.stage, "paths") as bar:
             generate(job, shards, progress=bar.update)
 
     def _fit(self, name: str, data: DataSet, decision: Decision) -> None:
@@ -214,6 +214,7 @@ def run_recipe(
     force: bool = False,
     command: str = "",
     console: Console | None = None,
+    generated: Callable[[Recipe], Recipe] | None = None,
 ) -> RunResult:
     """Run a recipe; stages whose inputs have not changed are skipped.
 
@@ -229,6 +230,8 @@ def run_recipe(
         Command that the report shows for reproduction.
     console : Console, optional
         Receives progress; quiet by default.
+    generated : callable, optional
+        Called once the data are generated; returns the recipe of the other stages.
 
     Returns
     -------
@@ -256,8 +259,15 @@ def run_recipe(
 
     with locked(folder):
         write_run_record(folder, recipe, command)
-        run = _RecipeRun(recipe, folder, console)
-        results = run_stages(folder, run.stages(inputs), force=force, notify=notify)
+        stages = _RecipeRun(recipe, folder, console).stages(inputs)
+        results: dict[str, StageResult] = {}
+        if generated is not None:
+            count = len(data_sets(recipe))
+            results = run_stages(folder, stages[:count], force=force, notify=notify)
+            recipe = generated(recipe)
+            write_run_record(folder, recipe, command)
+            stages = _RecipeRun(recipe, folder, console).stages(inputs)[count:]
+        results |= run_stages(folder, stages, force=force, notify=notify)
     return RunResult(folder, folder / REPORT, results, read_json(folder / COMPARE / COMPARISON_NAME))
 
 

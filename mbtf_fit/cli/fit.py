@@ -11,10 +11,10 @@ from cyclopts import Parameter
 from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import PartialError, UsageError
 from mbtf_core.options import DryRun, Options, Output, Overwrite, takes_options
-from mbtf_core.units import clock, format_duration
+from mbtf_core.units import clock, expectation, format_duration
 from mbtf_fit.config import FitConfig
 from mbtf_fit.formatting import describe_fit, format_estimate, format_table
-from mbtf_gen.config.presets import Quality, QualityOption, as_assignments
+from mbtf_gen.config.presets import Quality, QualityOption, as_assignments, overrides_of
 
 
 @takes_options(FitConfig)
@@ -70,18 +70,30 @@ def fit(
             {"shards": shards, "model": resolved.model, "forecast": asdict(expected)}, expected.describe()
         )
         return
+    from mbtf_core.folders import check_space
+    from mbtf_fit.data.loader import open_data
     from mbtf_fit.material.format import DESCRIPTION_NAME
+    from mbtf_fit.models.registry import MODELS
     from mbtf_fit.native import missing_reason
     from mbtf_fit.training.fit import fit
+    from mbtf_fit.training.forecast import FIT_SECONDS, QUERY_SECONDS, fit_bytes, training_seconds
 
     finished = not overwrite and (output / DESCRIPTION_NAME).exists()
+    partition = None
     if not finished:
+        data = open_data(shards, MODELS[resolved.model].layout, resolved.model)
+        size = fit_bytes(resolved, data.lattice)
+        check_space(output, size, "reduce network.channels, or choose another folder with -o")
         training = resolved.training
         budget = format_duration(training.time) if training.steps is None else f"{training.steps} steps"
         console.note(
             f"{shards} -> {output}: {resolved.model}, training for {budget} "
             "(change it with --time or --steps)"
         )
+        seconds, partition = training_seconds(resolved, shards)
+        seconds += FIT_SECONDS + QUERY_SECONDS * int(data.manifest["splits"]["train"].get("queries", 0))
+        if seconds >= 60.0 or size >= 1e9:
+            console.note(expectation(seconds, size))
     if missing := missing_reason():
         console.note(f"note: training runs in PyTorch, not in the compiled kernel ({missing})")
     with console.progress(total=100, label="fitting", unit="%") as bar:
@@ -91,17 +103,18 @@ def fit(
             output,
             overwrite=overwrite,
             progress=lambda fraction, note: bar.update(round(100 * fraction, 1), note),
+            partition=partition,
         )
     if finished:
         console.note(f"{output}: this fit is already finished; --overwrite trains it again")
-    data = result.as_dict()
+    summary = result.as_dict()
     cost = [result.marginal_cost.describe()] if result.marginal_cost is not None else []
-    console.report(data, "\n".join([describe_fit(data), *cost]))
+    console.report(summary, "\n".join([describe_fit(summary), *cost]))
 
 
 def resolve_config(options: Options[FitConfig], quality: Quality | None) -> FitConfig:
     """Configuration of a fit."""
-    from mbtf_fit.presets import fitter_options, overrides_of
+    from mbtf_fit.presets import fitter_options
 
     given = options.given
     if {"training.time", "training.steps"} <= set(given):

@@ -7,11 +7,14 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
+
+from mbtf_core.lattice import Lattice
 from mbtf_core.units import clock
 from mbtf_fit.config import FitConfig
-from mbtf_fit.data.loader import load_training, open_data
+from mbtf_fit.data.loader import Partition, load_training, open_data
 from mbtf_fit.formatting import SPLIT_NAMES
-from mbtf_fit.models.registry import MODELS
+from mbtf_fit.models.registry import MODELS, build_model
 from mbtf_fit.training.fit import choose_device, keep_freed_memory, prepare_trainer
 from mbtf_fit.training.validation import validation_error, validation_set, validation_subset
 
@@ -21,6 +24,13 @@ PILOT_SECONDS = (4.0, 8.0)
 # squares over fits of 60 s with quality options on draft data of eleven materials
 # (benchmarks/forecasts.py).
 PERSISTENCE = 0.45
+# Seconds of a fit besides training (loading, calibration, evaluation), and of each query of its data, on two
+# processor cores (benchmarks/quality.py).
+FIT_SECONDS, QUERY_SECONDS = 1.5, 0.6e-6
+# Fits of fewer queries in all steps take less than a minute at a third of a million queries per second.
+LONG_FIT = 20_000_000
+# Seconds of the pilot of a fit by steps.
+_STEPS_PILOT = 2.0
 # Most queries of the validation subset.
 _SUBSET = 1 << 17
 
@@ -77,6 +87,29 @@ def extrapolated(
     improvement = max(0.0, math.log(short / long)) if min(short, long) > 0 else 0.0
     ratio = persistence**apart / (1.0 - persistence**apart)
     return long * math.exp(-improvement * ratio * (1.0 - persistence ** max(doublings, 0.0)))
+
+
+def fit_bytes(config: FitConfig, lattice: Lattice) -> int:
+    """Bytes that a fit writes at most: a checkpoint of weights and two moments, while it replaces another."""
+    with torch.device("meta"):
+        model = build_model(config.model, lattice, **config.network.model_dump())
+    return 6 * sum(p.nbytes for p in model.parameters())
+
+
+def training_seconds(config: FitConfig, shards: str | Path) -> tuple[float, Partition | None]:
+    """Seconds that a fit trains, and the data where they were loaded: a number of steps is timed by a pilot,
+    unless no machine needs a minute."""
+    steps, batch = config.training.steps, config.training.batch
+    if steps is None:
+        return config.training.time, None
+    if steps * batch < LONG_FIT:
+        return 0.0, None
+    data = open_data(shards, MODELS[config.model].layout, config.model)
+    keep_freed_memory()
+    partition = load_training(data, config.held_out, config.seed, config.data.memory)
+    trainer = prepare_trainer(config, data, partition, choose_device(config.device))
+    trainer.train(_STEPS_PILOT)
+    return steps * trainer.progress.seconds / trainer.progress.step, partition
 
 
 def forecast_fit(config: FitConfig, shards: str | Path) -> FitForecast:

@@ -91,7 +91,7 @@ def repair(
     else:
         with (
             resumable(f"{folder}: the shards rendered so far are kept"),
-            console.progress(found.paths, "repairing", "paths") as bar,
+            console.progress(None, "repairing", "paths") as bar,
         ):
             done = found.repair(bar.update)
     data = {"dry_run": dry_run, **asdict(done)}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeVar
@@ -12,17 +13,29 @@ from cyclopts import Parameter
 from mbtf_core.console import CONSOLE, Console, resumable
 from mbtf_core.errors import UsageError
 from mbtf_core.options import Options, Output, Overwrite, PathText, takes_options
-from mbtf_core.units import clock
+from mbtf_core.units import clock, expectation, size_text
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.config.presets import GENERATOR, Quality, QualityOption, as_assignments
+from mbtf_gen.config.presets import (
+    RESOLUTION,
+    Quality,
+    QualityOption,
+    as_assignments,
+    generator_options,
+    overrides_of,
+)
 
 if TYPE_CHECKING:
     from mbtf_gen.dataset.summary import Summary
+    from mbtf_gen.job import Job
+    from mbtf_gen.planning.run_plan import RunPlan
 
 G = TypeVar("G", bound=GeneratorConfig)
 
 
-def resolve_config(options: Options[G], material: str | None, quality: Quality | None = None) -> G:
+SMALLER = "reduce --queries or --resolution, or choose another folder with -o"
+
+
+def resolve_config(options: Options[G], material: str | None, presets: Sequence[str] = ()) -> G:
     """Configuration of a command for a material.
 
     Raises
@@ -32,7 +45,20 @@ def resolve_config(options: Options[G], material: str | None, quality: Quality |
     """
     if material is None and options.config is None:
         raise UsageError("no material given", hint="mbtf-gen heightfield.exr --queries 400/texel -o shards/")
-    return options.resolve(as_assignments(GENERATOR[quality] if quality else {}), material=material)
+    return options.resolve(presets, material=material)
+
+
+def prepare_job(
+    options: Options[GeneratorConfig], material: str | None, quality: Quality | None = None
+) -> Job:
+    """The data set that a command line asks for, with its material loaded; errors as :func:`resolve_config`
+    and of the material."""
+    from mbtf_gen.job import Job, limit_resolution
+
+    flags = [f"{key}={value}" for key, value in options.given.items()]
+    preset = generator_options(quality, overrides_of(options.config, [*options.assignments, *flags]))
+    job = Job.prepare(resolve_config(options, material, as_assignments(preset)))
+    return limit_resolution(job) if RESOLUTION in preset else job
 
 
 def _slice(text: str) -> tuple[int, int]:
@@ -65,23 +91,39 @@ def generate(
     slice
         Render only every n-th shard, from the i-th; finish with mbtf-gen merge.
     """
-    resolved = resolve_config(options, material, quality)
-    part = _slice(slice)
-    from mbtf_gen.generation import generate, paths_left
-    from mbtf_gen.job import Job, split_queries
+    index, count = _slice(slice)
+    job = prepare_job(options, material, quality)
+    from mbtf_core.folders import check_space
+    from mbtf_gen.dataset.shard_io import data_bytes
+    from mbtf_gen.forecast import time_left
+    from mbtf_gen.generation import generate, unfinished
+    from mbtf_gen.job import split_queries
 
-    job = Job.prepare(resolved)
+    left = unfinished(job, output, index, count, overwrite)
+    size = data_bytes(job, left)
     console.note(
-        f"{resolved.material} -> {output}: {split_queries(job, 'train')} training + "
-        f"{split_queries(job, 'test')} test queries, resolution {job.lattice.shape()[1]}"
+        f"{job.config.material} -> {output}: {split_queries(job, 'train')} training + "
+        f"{split_queries(job, 'test')} test queries, resolution {job.lattice.shape()[1]}, {size_text(size)}"
     )
+    check_space(output, size, SMALLER)
+
+    def announce(plan: RunPlan) -> None:
+        seconds = time_left(job, plan, left)
+        if seconds is not None:
+            console.note(expectation(seconds, size))
+
     with (
         resumable(f"the shards that are finished are kept in {output}"),
-        console.progress(paths_left(job, output, *part), "generating", "paths") as bar,
+        console.progress(None, "generating", "paths") as bar,
     ):
-        index, count = part
         summary = generate(
-            job, output, overwrite=overwrite, slice_index=index, slice_count=count, progress=bar.update
+            job,
+            output,
+            overwrite=overwrite,
+            slice_index=index,
+            slice_count=count,
+            planned=announce,
+            progress=bar.update,
         )
     console.report(asdict(summary), describe(summary))
 

@@ -11,7 +11,7 @@ from cyclopts import Parameter
 
 from mbtf_core.console import CONSOLE, Console
 from mbtf_core.options import Options, PathText, takes_options
-from mbtf_gen.cli.generate import resolve_config
+from mbtf_gen.cli.generate import prepare_job
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.config.presets import QualityOption
 
@@ -44,11 +44,10 @@ def plan(
     measure
         Measure the bias of omitting each simulated effect by a pilot run, and forecast the run.
     """
-    resolved = resolve_config(options, material, quality)
-    from mbtf_gen.job import Job, split_target
+    from mbtf_gen.job import split_target
     from mbtf_gen.planning.effects_plan import plan_effects
 
-    job = Job.prepare(resolved)
+    job = prepare_job(options, material, quality)
     found = plan_effects(job)
     if not measure:
         console.report({**found.to_manifest(), "forecast": None}, table(found))

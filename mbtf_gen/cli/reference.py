@@ -7,6 +7,7 @@ from typing import Any
 
 from mbtf_core.console import CONSOLE, Console
 from mbtf_core.options import Options, Output, Overwrite, PathText, takes_options
+from mbtf_core.units import expectation
 from mbtf_gen.cli.generate import resolve_config
 from mbtf_gen.config.pictures import RENDERING, ReferenceConfig
 
@@ -32,11 +33,14 @@ def reference(
     """
     resolved = resolve_config(options, material)
     from mbtf_core.directions import from_angles
+    from mbtf_core.folders import check_space
     from mbtf_core.stats import pooled_relative_error
+    from mbtf_gen.dataset.shard_io import row_bytes
+    from mbtf_gen.forecast import LONG_RUN
     from mbtf_gen.job import Job
     from mbtf_gen.pictures.camera import Camera, PixelKind
     from mbtf_gen.pictures.folder import PictureFolder
-    from mbtf_gen.pictures.reference import auto_exposure, render_reference
+    from mbtf_gen.pictures.reference import PNG_BYTES, auto_exposure, picture_seconds, render_reference
     from mbtf_gen.planning.effects_plan import reference_plan
     from mbtf_gen.planning.simulation import build_estimator
 
@@ -53,6 +57,8 @@ def reference(
         camera.queries(omega_i)  # refuses a view of the horizon before anything is written
     kinds: tuple[PixelKind, ...] = ("query", "pixel") if wanted.kind == "both" else (wanted.kind,)
     names = {(camera, one): f"{one}-tiles{camera.tiles_across:g}" for camera in cameras for one in kinds}
+    size = len(names) * wanted.size**2 * (row_bytes(job.material.opacity is not None) + PNG_BYTES)
+    check_space(output, size, "reduce --size, or choose another folder with -o")
     folder = PictureFolder.claim(
         output,
         "reference",
@@ -61,7 +67,12 @@ def reference(
         inputs=job.material.digests,
         overwrite=overwrite,
     )
+    left = sum(camera.rows * camera.columns for (camera, _), n in names.items() if not folder.finished(n))
     estimator: Any = None
+    if left * wanted.spp >= LONG_RUN:
+        estimator = build_estimator(job, reference_plan(job))
+        seconds = picture_seconds(estimator, cameras[0], omega_i, left * wanted.spp)
+        console.note(expectation(seconds, size))
     pictures: list[dict[str, Any]] = []
     exposure: float | None = None
     with console.progress(total=len(cameras) * len(kinds), label="rendering", unit="pictures") as bar:

@@ -8,6 +8,9 @@ from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import UsageError
 from mbtf_core.options import Time
 
+# Of the HTML report, about.
+REPORT_BYTES = 100_000
+
 
 def selftest(*, report: Path | None = None, time: Time = "2min", console: Console = CONSOLE) -> int:
     """Check the physics against known results on this machine, and report the largest deviation.
@@ -20,7 +23,7 @@ def selftest(*, report: Path | None = None, time: Time = "2min", console: Consol
     report
         Write every case to this HTML file.
     """
-    from mbtf_core.units import asked_duration
+    from mbtf_core.units import asked_duration, expectation
 
     seconds = asked_duration(time or "2min", "--time")
     if report is not None and report.suffix != ".html":
@@ -30,6 +33,7 @@ def selftest(*, report: Path | None = None, time: Time = "2min", console: Consol
     from mbtf_gen.diagnostics.selftest import exit_code, run_checks
     from mbtf_gen.render.runtime import load_mitsuba
 
+    console.note(expectation(seconds, 0 if report is None else REPORT_BYTES))
     load_mitsuba()
     with console.progress(total=seconds, label="checking", unit="s") as bar:
         findings = run_checks(

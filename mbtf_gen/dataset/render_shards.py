@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterable, Set
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, closing
@@ -31,7 +31,8 @@ from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.sampling.query_sampler import Queries
 
-ProgressCallback = Callable[[float, str], None]
+# Called with the paths so far, a note, and the paths expected in all (None: not known yet).
+ProgressCallback = Callable[[float, str, float | None], None]
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,32 @@ class _Claim:
     queries: Future[Queries]
 
 
+class _ExpectedPaths:
+    """Paths of shards to come. A target error or an allocation changes the planned number; it is corrected by
+    the ratio of traced and planned paths of the shards so far, by split."""
+
+    def __init__(self, job: Job) -> None:
+        self._job = job
+        self._planned: Counter[str] = Counter()
+        self._traced: Counter[str] = Counter()
+
+    def add(self, entry: ShardEntry, paths: int) -> None:
+        self._planned[entry.split] += planned_paths(self._job, [entry])
+        self._traced[entry.split] += paths
+
+    def paths(self, entries: Iterable[ShardEntry]) -> float | None:
+        """None where a target error decides, and no shard is done."""
+        total = 0.0
+        for entry in entries:
+            ratio = 1.0
+            if done := self._planned[entry.split]:
+                ratio = self._traced[entry.split] / done
+            elif split_target(self._job.config, entry.split) is not None:
+                return None
+            total += ratio * planned_paths(self._job, [entry])
+        return round(total)
+
+
 @dataclass
 class RenderResult:
     """Result of :func:`render_shards`.
@@ -50,7 +77,7 @@ class RenderResult:
     Attributes
     ----------
     paths : traced; shards : files that were rendered
-    seconds : duration
+    seconds : duration since the start of the run
     writing : processor seconds of writing and digesting, parallel to the rendering
     waiting : seconds that rendering waited for the writer
     """
@@ -69,6 +96,7 @@ def render_shards(
     plan: RunPlan,
     *,
     corrupt: Set[str] = frozenset(),
+    start: float | None = None,
     progress: ProgressCallback | None = None,
 ) -> RenderResult:
     """Render those of the shards that are not finished.
@@ -76,20 +104,28 @@ def render_shards(
     Parameters
     ----------
     corrupt : files to render again although they seem finished
-    progress : called with (paths so far, note), once per shard; paths count as planned, without the changes
-        by a target error or an allocation
+    start : when the run began, by ``time.perf_counter``; now by default. Seconds and paths per second count
+        from it
+    progress : called once per shard
 
     Raises
     ------
     PartialError : other processes render some of them, the disk is full, or there are too many non-finite
         samples; finished shards are kept
     """
-    start = time.perf_counter()
+    start = time.perf_counter() if start is None else start
+    entries = list(entries)
+    pending = {entry.file: entry for entry in entries}
+    expected = _ExpectedPaths(job)
     total, own = ShardStatistics(), ShardStatistics()
     result = RenderResult()
     records: list[dict[str, Any]] = []
     busy: list[Path] = []
-    planned, limit = 0, most_paths(job)
+    limit = most_paths(job)
+
+    def skip(entry: ShardEntry, record: dict[str, Any] | None) -> None:
+        del pending[entry.file]
+        report(record)
 
     def report(record: dict[str, Any] | None = None) -> None:
         for done in [*([] if record is None else [record]), *(records.pop() for _ in range(len(records)))]:
@@ -97,7 +133,9 @@ def render_shards(
         if progress is not None:
             rate = result.paths / max(time.perf_counter() - start, 1e-9)
             error = f", noise {total.relative_error():.2%}" if total.train else ""
-            progress(planned, f"{rate / 1e6:.2f} M paths/s{error}")
+            left = expected.paths(pending.values())
+            total_paths = None if left is None else result.paths + left
+            progress(result.paths, f"{rate / 1e6:.2f} M paths/s{error}", total_paths)
 
     def store(entry: ShardEntry, *rendered: Any) -> None:
         records.append(store_shard(job, folder, plan, entry, *rendered))
@@ -107,7 +145,7 @@ def render_shards(
     estimator: Any = None
     with ExitStack() as stack:
         ahead = stack.enter_context(ThreadPoolExecutor(1, "queries"))
-        claims = stack.enter_context(closing(_claims(job, folder, entries, corrupt, ahead, busy, report)))
+        claims = stack.enter_context(closing(_claims(job, folder, entries, corrupt, ahead, busy, skip)))
         writer = stack.enter_context(ShardWriter())
         for claim in claims:
             if estimator is None:
@@ -125,7 +163,7 @@ def render_shards(
             seconds = time.perf_counter() - began
             writer.submit(partial(store, entry, queries, estimates, seconds), claim.lock.release)
             result.paths += estimates.paths
-            planned += planned_paths(job, [entry])
+            expected.add(pending.pop(entry.file), estimates.paths)
             result.shards.append(entry.file)
             report()
             own.add_quarantined(entry.file, _quarantined(estimates))
@@ -150,7 +188,7 @@ def _claims(
     corrupt: Set[str],
     pool: ThreadPoolExecutor,
     busy: list[Path],
-    skipped: Callable[[dict[str, Any] | None], None],
+    skipped: Callable[[ShardEntry, dict[str, Any] | None], None],
 ) -> Generator[_Claim]:
     """Lock the shards that are not finished, one ahead of the caller, so that their queries are sampled while
     the previous shard is rendered.
@@ -186,7 +224,7 @@ def _claims(
                         held.popleft()
                     continue
                 lock.release()
-            skipped(record)
+            skipped(entry, record)
         while held:
             yield held[0]
             held.popleft()

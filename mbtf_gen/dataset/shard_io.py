@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from mbtf_core.atomic import Stored, write_chunks, write_through
 from mbtf_core.errors import InputError, reason
-from mbtf_core.shard_schema import ARRAY, ARRAYS
+from mbtf_core.shard_schema import ARRAY, ARRAYS, ShardEntry
+from mbtf_gen.job import Job, row_queries
 
 Arrays = dict[str, NDArray[np.float32]]
 
@@ -38,6 +39,12 @@ _HEADER, _SIZES_64 = 30, 20
 def row_bytes(holes: bool) -> int:
     """Bytes of one query in a shard."""
     return sum(4 * max(1, math.prod(a.trailing)) for a in ARRAYS if holes or not a.optional)
+
+
+def data_bytes(job: Job, entries: Iterable[ShardEntry]) -> int:
+    """Bytes of some shards of a job."""
+    queries = row_queries(job) * sum(entry.rows for entry in entries)
+    return queries * row_bytes(job.material.opacity is not None)
 
 
 def check_arrays(

@@ -61,6 +61,7 @@ def cost(
                 seed=seed,
                 set=assignments,
             ),
+            announce=console.note,
             progress=lambda share, note: bar.update(round(100 * share, 1), note),
         )
     page, measured = write_page(study), len(study.measurements)

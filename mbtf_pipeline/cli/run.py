@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time as clocks
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,7 +12,7 @@ from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import UsageError
 from mbtf_core.options import Output, Set, Switch, Time, command_line
 from mbtf_core.units import clock
-from mbtf_gen.config.presets import QualityOption
+from mbtf_gen.config.presets import Quality, QualityOption
 
 if TYPE_CHECKING:
     from mbtf_pipeline.run import RunResult
@@ -32,8 +33,8 @@ def run(
     """Run a recipe: mbtf-pipeline run pipelines/quickstart.yaml
 
     A stage whose inputs have not changed is skipped; the same command again resumes an interrupted run.
-    --time replaces the recipe's numbers of queries and training times: pilots on this machine divide it
-    between generation and training. Comparison and report take their time on top.
+    --time is the time of everything: it takes the best preset of --quality that fits, with more queries and
+    longer training, and replaces the recipe's own.
 
     Parameters
     ----------
@@ -44,6 +45,8 @@ def run(
     force
         Run every stage, also those that are up to date.
     """
+    # Python itself has run for about a second.
+    began = clocks.perf_counter() - 1.0
     from mbtf_pipeline.paper_tables.recipe import is_paper_recipe
 
     given = {"quality": quality, "time": time, "quick": quick, "output": output, "set": assignments}
@@ -59,21 +62,34 @@ def run(
         return _run_paper(recipe, output, quick, force, own, command, console)
     if quick:
         raise UsageError("only paper recipes have quick sizes", where="--quick", hint="use --quality draft")
-    from mbtf_pipeline.presets import quality_assignments
-    from mbtf_pipeline.recipe import load_recipe
     from mbtf_pipeline.run import run_recipe
 
-    loaded = load_recipe(recipe, [*quality_assignments(recipe, quality, own), *own])
     if time is not None:
         from mbtf_core.units import asked_duration
-        from mbtf_pipeline.cost_study.time_split import split_time, with_split
+        from mbtf_pipeline.cost_study.time_split import TimedRun
 
         seconds = asked_duration(time, "--time")
-        split = split_time(loaded, seconds, output or loaded.folder, command, console.note)
-        console.note(split.describe())
-        loaded = with_split(loaded, split)
+        timed = TimedRun(
+            recipe, seconds, output, command, console.note, quality=quality, assignments=own, began=began
+        )
+        result = run_recipe(
+            timed.recipe,
+            timed.folder,
+            force=force,
+            command=command,
+            console=console,
+            generated=timed.generated,
+        )
+        return _report(result, console, timed.split.quality)
+    from mbtf_pipeline.forecast import forecast_left
+    from mbtf_pipeline.presets import preset_recipe
+
+    loaded = preset_recipe(recipe, quality, own)
+    expected = forecast_left(loaded, output or loaded.folder)
+    if expected is not None:
+        console.note(expected.describe())
     result = run_recipe(loaded, output, force=force, command=command, console=console)
-    _report(result, console)
+    _report(result, console, quality)
 
 
 def _run_paper(
@@ -101,7 +117,7 @@ def _run_paper(
     console.report(data, f"{done.page}: {size} size, {len(planned)} runs{skipped}")
 
 
-def _report(result: RunResult, console: Console) -> None:
+def _report(result: RunResult, console: Console, quality: Quality | None) -> None:
     from mbtf_pipeline.formatting import estimate
 
     tests = {fit: record["splits"]["test"] for fit, record in result.comparison["test"].items()}
@@ -109,6 +125,7 @@ def _report(result: RunResult, console: Console) -> None:
     data = {
         "folder": result.folder,
         "report": result.report,
+        "quality": quality,
         "seconds": round(sum(ran.values()), 3),
         "stages": {
             name: {"ran": o.ran, "reason": o.reason or "up to date", "seconds": o.stamp.seconds}

@@ -23,7 +23,7 @@ from mbtf_core.stats import Estimate, unexplained_variance
 from mbtf_core.units import parse_duration
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation import generate
-from mbtf_gen.job import Job, split_queries
+from mbtf_gen.job import Job
 from mbtf_gen.material.material import load_material
 from mbtf_pipeline.cost_study.measurements import Configuration, Measurement
 
@@ -193,16 +193,14 @@ class RunRunner:
         )
 
 
-def forecast_seconds(config: GeneratorConfig) -> tuple[float, float]:
-    """Seconds of a training query, and of starting the generator with its test split, by a forecast."""
+def forecast_seconds(config: GeneratorConfig) -> float:
+    """Seconds of a training query, by a forecast."""
     from mbtf_gen.forecast import forecast
     from mbtf_gen.planning.effects_plan import plan_effects
     from mbtf_gen.planning.run_plan import allocate
 
     job = Job(config, load_material(Path(config.material), config.geometry.make_tileable))
-    expected = forecast(job, allocate(job, plan_effects(job, pilots=False)))
-    query = max(expected.query_seconds, _CHEAPEST)
-    return query, expected.start + max(0.0, expected.seconds - split_queries(job, "train") * query)
+    return max(forecast(job, allocate(job, plan_effects(job, pilots=False))).query_seconds, _CHEAPEST)
 
 
 def _flat(options: dict[str, Any], prefix: str = "") -> dict[str, Any]:

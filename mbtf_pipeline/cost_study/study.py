@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,16 +12,18 @@ from typing import Any
 from mbtf_core.atomic import read_json, write_json, write_text
 from mbtf_core.config_file import dump_yaml
 from mbtf_core.errors import InputError
-from mbtf_core.folders import ELSEWHERE, check_folder, make_folder
+from mbtf_core.folders import ELSEWHERE, check_folder, check_space, make_folder
 from mbtf_core.stats import Estimate, signal_variance
+from mbtf_core.units import expectation
 from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.dataset.shard_io import row_bytes
 from mbtf_gen.material.material import load_material
 from mbtf_pipeline.cost_study.fit_runs import GENERATOR, RUN_SHARES, planned_runs
 from mbtf_pipeline.cost_study.generator_benchmark import GeneratorBenchmark
 from mbtf_pipeline.cost_study.generator_runs import generator_tasks
 from mbtf_pipeline.cost_study.measurements import Measurement, MeasurementFolder
 from mbtf_pipeline.cost_study.repeats import FEWEST_SEEDS, MOST_SEEDS, combined, measure_runs, seed_deviation
-from mbtf_pipeline.cost_study.runs import Run, RunRunner, forecast_seconds
+from mbtf_pipeline.cost_study.runs import TEST, Run, RunRunner, forecast_seconds
 from mbtf_pipeline.recipe import Recipe
 from mbtf_pipeline.run_folder import has_record, locked, machine
 
@@ -104,6 +106,7 @@ def run_study(
     seed: int | None = None,
     command: str = "",
     progress: Callable[[float, str], None] = lambda share, note: None,
+    announce: Callable[[str], None] = lambda text: None,
 ) -> Study:
     """Measure what the time allows for the material and generator of a recipe; stored measurements are kept
     and cost no time.
@@ -113,6 +116,7 @@ def run_study(
     refine : additional seconds for repeating runs with wide error bars
     seed : of queries, paths and initial weights; the recipe's by default
     progress : called with (share of the time spent, note)
+    announce : called with expected time and size as a line, before anything is written
     """
     start = time.perf_counter()
 
@@ -130,6 +134,11 @@ def run_study(
         note("reference")
         # Before anything is written: a refused study leaves the folder as it was.
         _check_variation(benchmark)
+        store = MeasurementFolder(folder, config.hash(material.digests))
+        path = path_seconds(config, store)
+        size = disk_bytes(planned_runs(seconds, config.queries.spp, path))
+        check_space(folder, size, "give a shorter --time, or choose another folder with -o")
+        announce(expectation(seconds + refine, size))
         description = {
             "format": STUDY_FORMAT,
             "schema": STUDY_SCHEMA,
@@ -144,7 +153,7 @@ def run_study(
         write_json(folder / STUDY_NAME, description)
         write_text(folder / CONFIG_NAME, dump_yaml(config.model_dump(mode="json")))
         study = Study(folder, description)
-        store = MeasurementFolder(folder, config.hash(material.digests))
+        keep_path_seconds(store, path)
         generator = shlex.join(["mbtf-gen", config.material, "--config", str(folder / CONFIG_NAME)])
         each = 0.5 * GENERATOR * seconds / _CONFIGURATIONS
         for task in generator_tasks(benchmark):
@@ -158,7 +167,7 @@ def run_study(
                 study.skipped.append(task.label)
             else:
                 study.measurements.append(found)
-        runner = RunRunner(config, folder / WORK, generator, note, path_seconds=path_seconds(config, store))
+        runner = RunRunner(config, folder / WORK, generator, note, path_seconds=path)
         try:
             seeds = MOST_SEEDS if refine else FEWEST_SEEDS
             _measure_runs(study, store, runner, lambda again: seconds + again * refine - spent(), seeds)
@@ -168,15 +177,27 @@ def run_study(
 
 
 def path_seconds(config: GeneratorConfig, store: MeasurementFolder) -> float:
-    """Seconds to generate a query over its number of paths, stored, so that a resumed study plans the same
-    runs."""
-    path = store.folder / f"seconds-{store.basis[:16]}.json"
+    """Seconds to generate a query over its number of paths; those stored, so that a resumed study plans the
+    same runs."""
     try:
-        return float(read_json(path)["path_seconds"])
+        return float(read_json(_seconds_file(store))["path_seconds"])
     except InputError:
-        found = forecast_seconds(config)[0] / config.queries.spp
-        write_json(path, {"path_seconds": found})
-        return found
+        return forecast_seconds(config) / config.queries.spp
+
+
+def keep_path_seconds(store: MeasurementFolder, seconds: float) -> None:
+    """Store what :func:`path_seconds` then returns."""
+    write_json(_seconds_file(store), {"path_seconds": seconds})
+
+
+def _seconds_file(store: MeasurementFolder) -> Path:
+    return store.folder / f"seconds-{store.basis[:16]}.json"
+
+
+def disk_bytes(runs: Sequence[Run]) -> int:
+    """Disk space that runs take at most: the test set, and data of two seeds."""
+    most = max((run.data.queries for run in runs), default=0)
+    return (TEST[0] + 2 * most) * row_bytes(holes=True)
 
 
 def _measure_runs(

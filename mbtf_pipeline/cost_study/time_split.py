@@ -1,17 +1,14 @@
-"""Splits a total time between generating and training.
+"""Fits a whole run into a total time: the best quality preset that fits, with more data and longer training.
 
-Three short pilot runs on the same material and machine generate for 15, 35 and 60 % of their time and train
-for the rest. The share with the lowest error is used for the remaining time: the error changes slowly near
-its minimum, so a finer search gains nothing. A short total time uses 35 % without pilots.
+A pilot of the generator forecasts the time of each preset on this machine, from start to report. The best
+one that fits is scaled: s times as many queries and s times the training, so that generating keeps its share.
+With n queries, f fits, and the seconds g of generating a query and b of loading and evaluating it,
 
-The time T left after the pilots pays for everything: with n queries, f fits, and the measured seconds g per
-generated query, c of start and test split, and a + b n of each fit besides training (loading, calibration,
-evaluation),
+    T = fixed + n g + f n b + training.
 
-    T = c + n g + f (a + b n) + training,    n g = share (n g + training),
-
-where a line through the pilots gives a and b, neither negative. Disk space and memory limit n; training gets
-what is left.
+Disk space, memory and the queries per texel of the largest preset limit n; training gets what is left. Once
+the data are generated, training gets the time that is then left, so that a run that generates slower than
+expected still ends in time.
 """
 
 from __future__ import annotations
@@ -19,172 +16,206 @@ from __future__ import annotations
 import math
 import os
 import shutil
-import tempfile
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-
-import numpy as np
-from scipy.optimize import nnls
 
 from mbtf_core.atomic import read_json, write_json
 from mbtf_core.config_file import deep_merge
 from mbtf_core.digest import data_sha256
 from mbtf_core.errors import InputError, UsageError
+from mbtf_core.folders import check_space
 from mbtf_core.units import clock, format_duration
 from mbtf_fit.config import FitConfig
+from mbtf_fit.training.forecast import QUERY_SECONDS
+from mbtf_gen.config.generator import count_queries
+from mbtf_gen.config.presets import GENERATOR, Quality
+from mbtf_gen.dataset.shard_io import row_bytes
+from mbtf_gen.job import Job, split_queries
 from mbtf_pipeline.cost_study.fit_runs import round_down
-from mbtf_pipeline.cost_study.runs import DataRequest, Run, RunRunner, forecast_seconds
+from mbtf_pipeline.forecast import RunForecaster
+from mbtf_pipeline.presets import preset_recipe
 from mbtf_pipeline.recipe import Recipe
 from mbtf_pipeline.run import layout_of
 from mbtf_pipeline.run_folder import claim_run_folder, locked, write_run_record
 
 SPLIT_NAME = "time_split.json"
-SPLIT_SCHEMA = 4
-# Shares that the pilots generate for, and the one without pilots.
-SHARES = (0.15, 0.35, 0.6)
-DEFAULT_SHARE = 0.35
-# Share of the total time that one pilot takes, and its shortest length in seconds.
-PILOT, SHORTEST_PILOT = 0.04, 10.0
+SPLIT_SCHEMA = 5
+# Presets that a time chooses from; `paper` needs a GPU.
+PRESETS: tuple[Quality, ...] = ("draft", "standard", "high")
 # The shortest total time, seconds: start-up takes most of a shorter one.
 SHORTEST = 60.0
-# Test set of the pilots: queries, and paths of each.
-_TEST = (1 << 17, 8)
-# Seconds of a fit besides training where there are no pilots.
-_FIT = 2.0
+# Share of the time that is left for what the forecast does not know.
+_RESERVE = 0.04
 _FEWEST_QUERIES = 4096
 # Shares of the free disk space and of the machine's memory that training queries may take.
 _DISK, _MEMORY = 0.25, 0.5
-# Share of the total time that remains at least, however long the pilots took.
-_LEAST_LEFT = 0.25
 
 
 @dataclass(frozen=True)
 class Split:
-    """How a total time is spent."""
+    """How a total time is spent.
 
-    # Training queries to generate.
+    Attributes
+    ----------
+    quality : the preset; queries : of training, `scale` times those of the preset
+    training_each : seconds of training each fit, and the preset's
+    generating : seconds of generating
+    after : seconds of loading, evaluation, comparison and report
+    final : whether the training time counts how long generating took
+    """
+
+    quality: Quality
     queries: int
-    # Seconds of generating, of training all fits, and of fits besides training.
+    scale: float
+    training_each: float
     generating: float
-    training: float
-    other: float
-    # Share of generating in generating and training.
-    share: float
-    # (share, unexplained variance) of each pilot; empty for short times.
-    pilots: list[list[float]]
-    # Time of forecast and pilots.
-    pilot_seconds: float
+    after: float
+    final: bool = False
 
     def describe(self) -> str:
         """One line."""
-        errors = ", ".join(f"{share:.0%} {error:.3f}" for share, error in self.pilots)
-        how = f"pilots' unexplained variance by share: {errors}" if errors else "fixed share"
         return (
-            f"time: {clock(self.generating)} for {self.queries} queries, {clock(self.training)} of training, "
-            f"{clock(self.other)} of loading and evaluation, after {clock(self.pilot_seconds)} of pilots "
-            f"({self.share:.0%} generating; {how})"
+            f"time: preset {self.quality} with {self.queries} queries ({self.scale:.2g} times the preset's), "
+            f"{clock(self.generating)} of generating, {clock(self.training_each)} of training each fit, "
+            f"{clock(self.after)} of evaluation, comparison and report"
         )
 
 
-def split_time(
-    recipe: Recipe,
-    seconds: float,
-    folder: Path,
-    command: str,
-    progress: Callable[[str], None],
-    share: float | None = None,
-) -> Split:
-    """How to spend a total time on a recipe; stored in the run's folder, so that the same command resumes
-    with the same split. Without pilots where the share that generates is given."""
-    if seconds < SHORTEST:
-        problem = f"{format_duration(seconds)} is too short: starting up takes most of it"
-        raise UsageError(problem, where="--time", hint=f"give {format_duration(SHORTEST)} or more")
-    if any(layout_of(fit) != "shuffled" for fit in recipe.fit.values()):
-        problem = "only models of the shuffled layout can share a time"
-        raise UsageError(problem, where="--time", hint="leave out the fits of 'hierarchical'")
-    options = recipe.model_dump(mode="json", include={"generate", "fit"})
-    key = data_sha256({"schema": SPLIT_SCHEMA, "time": seconds, "share": share, "recipe": options})
-    claim_run_folder(folder)
-    with locked(folder):
-        split = _stored(folder, key)
-        if split is None:
-            write_run_record(folder, recipe, command)
-            split = _measure(recipe, seconds, share, folder, progress)
-            write_json(folder / SPLIT_NAME, {"key": key, "split": asdict(split)})
-    return split
+class TimedRun:
+    """A recipe that is to end within a total time.
 
+    Parameters
+    ----------
+    file, assignments : recipe and ``a.b=c``, which override presets
+    seconds : total time
+    folder : of the run; it stores the split, so that the same command resumes with the same one
+    quality : the preset to use; by default the best that fits
+    progress : receives the split as a line
+    began : start of the run by ``time.perf_counter``; now by default
 
-def _stored(folder: Path, key: str) -> Split | None:
-    try:
-        data = read_json(folder / SPLIT_NAME)
-        return Split(**data["split"]) if data["key"] == key else None
-    except (InputError, KeyError, TypeError):
-        return None
+    Raises
+    ------
+    UsageError : the time is too short, or a model's data layout cannot be timed
+    InputError : recipe, material or folder cannot be used
+    """
 
+    def __init__(
+        self,
+        file: Path,
+        seconds: float,
+        folder: Path | None,
+        command: str,
+        progress: Callable[[str], None],
+        *,
+        quality: Quality | None = None,
+        assignments: Sequence[str] = (),
+        began: float | None = None,
+    ) -> None:
+        self._began = time.perf_counter() if began is None else began
+        self._seconds, self._file, self._assignments = seconds, file, assignments
+        if seconds < SHORTEST:
+            problem = f"{format_duration(seconds)} is too short: starting up takes most of it"
+            raise UsageError(problem, where="--time", hint=f"give {format_duration(SHORTEST)} or more")
+        names = PRESETS if quality is None else (quality,)
+        recipes = {name: preset_recipe(file, name, assignments) for name in names}
+        first = recipes[names[0]]
+        if any(layout_of(fit) != "shuffled" for fit in first.fit.values()):
+            problem = "only models of the shuffled layout can share a time"
+            raise UsageError(problem, where="--time", hint="leave out the fits of 'hierarchical'")
+        self.folder = first.folder if folder is None else folder
+        options = [
+            r.model_dump(mode="json", include={"generate", "fit", "compare"}) for r in recipes.values()
+        ]
+        self._key = data_sha256({"schema": SPLIT_SCHEMA, "time": seconds, "recipes": options})
+        claim_run_folder(self.folder)
+        with locked(self.folder):
+            split = self._stored()
+            if split is None:
+                split = self._plan(recipes)
+                write_run_record(self.folder, first, command)
+            self._store(split)
+        progress(split.describe())
 
-def _measure(
-    recipe: Recipe, seconds: float, share: float | None, folder: Path, progress: Callable[[str], None]
-) -> Split:
-    start = time.perf_counter()
-    query, generator = forecast_seconds(recipe.generate)
-    most = _most_queries(folder)
-    pilots: list[list[float]] = []
-    fit, fit_query = _FIT, 0.0
-    if share is None and PILOT * seconds >= SHORTEST_PILOT:
+    @property
+    def recipe(self) -> Recipe:
+        """The recipe with the split's queries, network and training time."""
+        split = self.split
+        recipe = preset_recipe(self._file, split.quality, self._assignments, split.training_each)
+        queries = recipe.generate.queries.model_copy(update={"train": str(split.queries)})
+        fits = {name: _with_time(fit, split.training_each) for name, fit in recipe.fit.items()}
+        generate = recipe.generate.model_copy(update={"queries": queries})
+        return recipe.model_copy(update={"generate": generate, "fit": fits})
+
+    def generated(self, recipe: Recipe) -> Recipe:
+        """The recipe with the training time that is left now that the data are generated."""
+        if not self.split.final:
+            left = self._left() - self.split.after
+            each = max(1.0, round(left / len(recipe.fit), 1))
+            self._store(replace(self.split, training_each=each, final=True))
+        fits = {name: _with_time(fit, self.split.training_each) for name, fit in recipe.fit.items()}
+        return recipe.model_copy(update={"fit": fits})
+
+    def _left(self) -> float:
+        return (1.0 - _RESERVE) * self._seconds - (time.perf_counter() - self._began)
+
+    def _stored(self) -> Split | None:
         try:
-            pilots, (fit, fit_query) = _pilots(recipe, PILOT * seconds, query, most, progress)
-        except InputError as error:
-            progress(f"pilot failed: {error.what}; {DEFAULT_SHARE:.0%} of the time generates")
-    # The values of a flat plane do not vary: their unexplained variance is not defined.
-    pilots = pilots if all(math.isfinite(error) for _, error in pilots) else []
-    if share is None:
-        share = min(pilots, key=lambda p: p[1])[0] if pilots else DEFAULT_SHARE
-    fits = len(recipe.fit)
-    took = time.perf_counter() - start
-    left = max(seconds - took, _LEAST_LEFT * seconds + generator + fits * fit) - generator
-    # Of n queries, n (query / share + fits fit_query) is the time that is neither start nor `fit`.
-    count = min(most, (left - fits * fit) / (query / share + fits * fit_query))
-    queries = round_down(max(_FEWEST_QUERIES, count))
-    other = fits * (fit + queries * fit_query)
-    training = max(1.0 * fits, left - queries * query - other)
-    generating = round(queries * query + generator, 1)
-    return Split(queries, generating, round(training, 1), round(other, 1), share, pilots, round(took, 1))
+            data = read_json(self.folder / SPLIT_NAME)
+            return Split(**data["split"]) if data["key"] == self._key else None
+        except (InputError, KeyError, TypeError):
+            return None
+
+    def _store(self, split: Split) -> None:
+        self.split = split
+        write_json(self.folder / SPLIT_NAME, {"key": self._key, "split": asdict(split)})
+
+    def _plan(self, recipes: dict[Quality, Recipe]) -> Split:
+        """The split of the best preset that fits; of the first one, reduced, if none does."""
+        forecaster = RunForecaster(next(iter(recipes.values())))
+        free = shutil.disk_usage(self.folder).free
+        found = [self._scaled(name, recipe, forecaster) for name, recipe in recipes.items()]
+        fitting = [one for one in found if one[0].scale >= 1.0 and one[1] <= free]
+        split, size = (fitting or found[:1])[-1]
+        hint = "choose another folder with -o, or a lower resolution: --set generate.queries.resolution=64"
+        check_space(self.folder, size, hint)
+        return split
+
+    def _scaled(self, quality: Quality, recipe: Recipe, forecaster: RunForecaster) -> tuple[Split, int]:
+        """A preset scaled to the time, and its bytes."""
+        whole, fits = forecaster.of(recipe), len(recipe.fit)
+        start, path = forecaster.speed
+        job = Job(recipe.generate, forecaster.material)
+        own = split_queries(job, "train")
+        query = recipe.generate.queries.spp * path + fits * QUERY_SECONDS
+        fixed = whole.seconds - own * query - whole.training
+        left = self._left() - fixed
+        # `paper` counts steps; its training takes what is left.
+        scale = left / (own * query + whole.training)
+        most = max(own, _most_queries(self.folder, recipe, job.lattice.texels()))
+        queries = round_down(max(_FEWEST_QUERIES, min(scale * own, most)))
+        if scale >= 1.0:
+            queries, scale = max(queries, own), max(queries, own) / own
+        more = queries - own
+        each = max(1.0, (left - queries * query) / fits)
+        split = Split(
+            quality=quality,
+            queries=queries,
+            scale=scale,
+            training_each=round(each, 1),
+            generating=round(start + whole.generating + more * recipe.generate.queries.spp * path, 1),
+            after=round(whole.evaluating + whole.comparing + more * fits * QUERY_SECONDS, 1),
+        )
+        return split, whole.bytes + more * row_bytes(holes=True)
 
 
-def _pilots(
-    recipe: Recipe, length: float, query: float, most: float, progress: Callable[[str], None]
-) -> tuple[list[list[float]], tuple[float, float]]:
-    """(share, error) of each pilot; seconds of a fit besides training: in any case, and for each query."""
-    name, fit = next(iter(recipe.fit.items()))
-    errors, counts, others = [], [], []
-    with tempfile.TemporaryDirectory(prefix="mbtf-time-split-") as work:
-        runner = RunRunner(recipe.generate, Path(work), "", lambda note: None, _TEST)
-        for share in SHARES:
-            queries = round_down(min(max(_FEWEST_QUERIES, share * length / query), most))
-            trained = _with_time(fit, (1 - share) * length)
-            # Device and memory are no part of `fields`, as they do not change the result.
-            options = {**trained.fields(), **trained.model_dump(mode="json", include={"device", "data"})}
-            data = DataRequest(queries, recipe.generate.queries.spp)
-            found = runner.measure(Run("whole", name, f"{share:.0%}", data, options))
-            runner.forget(data)
-            d = found.details
-            errors.append([share, found.error.value])
-            counts.append(queries)
-            others.append(d["total_seconds"] - d["generation_seconds"] - d["training_seconds"])
-            progress(f"pilot: {share:.0%} of {length:.0f} s generating, error {found.error.value:.3f}")
-    fixed, slope = nnls(np.column_stack([np.ones(len(counts)), counts]), others)[0]
-    return errors, (float(fixed), float(slope))
-
-
-def _most_queries(folder: Path) -> float:
-    """Training queries that disk and memory hold. What is read from disk passes through the file system's
-    memory."""
-    from mbtf_gen.dataset.shard_io import row_bytes
-
-    free = min(_DISK * shutil.disk_usage(folder).free, _MEMORY * _physical_memory())
-    return max(_FEWEST_QUERIES, free / row_bytes(holes=True))
+def _most_queries(folder: Path, recipe: Recipe, texels: int) -> float:
+    """Training queries to which a preset is scaled at most. What is read from disk passes through the file
+    system's memory."""
+    memory = min(fit.data.memory for fit in recipe.fit.values())
+    space = min(_DISK * shutil.disk_usage(folder).free, _MEMORY * _physical_memory(), memory)
+    return min(space / row_bytes(holes=True), count_queries(GENERATOR["high"]["queries.train"], texels))
 
 
 def _physical_memory() -> float:
@@ -198,15 +229,3 @@ def _physical_memory() -> float:
 def _with_time(fit: FitConfig, seconds: float) -> FitConfig:
     data = deep_merge(fit.model_dump(), {"training": {"time": seconds, "steps": None}})
     return FitConfig.model_validate(data)
-
-
-def with_split(recipe: Recipe, split: Split) -> Recipe:
-    """The recipe with the queries and training times of a split."""
-    queries = recipe.generate.queries.model_copy(update={"train": str(split.queries)})
-    each = max(1.0, round(split.training / len(recipe.fit), 1))
-    return recipe.model_copy(
-        update={
-            "generate": recipe.generate.model_copy(update={"queries": queries}),
-            "fit": {name: _with_time(fit, each) for name, fit in recipe.fit.items()},
-        }
-    )

@@ -44,6 +44,7 @@ mbtf_pipeline.recipe mbtf_pipeline.stages mbtf_pipeline.presets mbtf_pipeline.ru
 mbtf_pipeline.compare
 mbtf_pipeline.report
 mbtf_pipeline.run
+mbtf_pipeline.forecast
 mbtf_pipeline.cost_study
 mbtf_pipeline.paper_tables
 mbtf_pipeline.cli

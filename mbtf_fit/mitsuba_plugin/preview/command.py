@@ -21,12 +21,19 @@ def draw(config: PreviewConfig, path: Path, *, overwrite: bool, console: Console
     InputError : the material cannot be used, or the folder holds something else
     UsageError : a view shows the horizon
     """
+    from mbtf_core.folders import check_space
+    from mbtf_core.units import expectation
     from mbtf_fit.material.format import read_description
     from mbtf_fit.mitsuba_plugin import load_scene
+    from mbtf_gen.forecast import LONG_RUN
     from mbtf_gen.pictures.folder import PictureFolder
-    from mbtf_gen.pictures.reference import write_png
+    from mbtf_gen.pictures.reference import PNG_BYTES, write_png
     from mbtf_gen.render.runtime import load_mitsuba
 
+    sheet, turn = config.sheet, config.turntable
+    panels_of = len(sheet.views) * len(sheet.lights) * len(sheet.tiles_across)
+    size = PNG_BYTES * (panels_of * sheet.size**2 + turn.frames * turn.size**2)
+    check_space(path, size, "reduce --size or --frames, or choose another folder with -o")
     description, _ = read_description(Path(config.material))
     folder = PictureFolder.claim(
         path,
@@ -37,7 +44,6 @@ def draw(config: PreviewConfig, path: Path, *, overwrite: bool, console: Console
         inputs={"weights": description["weights"]["sha256"]},
         overwrite=overwrite,
     )
-    sheet, turn = config.sheet, config.turntable
     shows = {
         SHEET_NAME: f"{len(sheet.views)} views x {len(sheet.lights)} lights (columns) x "
         f"{len(sheet.tiles_across)} zooms (rows), one exposure",
@@ -48,9 +54,12 @@ def draw(config: PreviewConfig, path: Path, *, overwrite: bool, console: Console
     if not all(kept.values()):
         load_mitsuba()
         from mbtf_fit.mitsuba_plugin.preview.sheet import contact_sheet, panels
-        from mbtf_fit.mitsuba_plugin.preview.turntable import frames, to_pictures, write_gif
+        from mbtf_fit.mitsuba_plugin.preview.turntable import frames, seconds_of, to_pictures, write_gif
 
         bsdf = load_scene({"type": "mbtf", "material": config.material})
+        paths = turn.frames * turn.size**2 * turn.spp
+        if paths >= LONG_RUN and not kept[TURNTABLE_NAME]:
+            console.note(expectation(seconds_of(bsdf, turn, paths), size))
         with console.progress(total=turn.frames + 1, label="drawing", unit="pictures") as bar:
             if not kept[SHEET_NAME]:
                 write_png(folder.path / SHEET_NAME, contact_sheet(panels(bsdf.evaluator, sheet), sheet))

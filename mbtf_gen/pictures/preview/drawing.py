@@ -9,15 +9,18 @@ from typing import Any
 from mbtf_core.console import Console
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import InputError, PartialError
+from mbtf_core.folders import check_space
+from mbtf_core.units import expectation
 from mbtf_gen.config.pictures import PreviewConfig
 from mbtf_gen.dataset.reader import Dataset
+from mbtf_gen.forecast import LONG_RUN
 from mbtf_gen.job import Job
 from mbtf_gen.pictures.camera import tiles_camera
 from mbtf_gen.pictures.folder import PictureFolder
 from mbtf_gen.pictures.preview import mesh
 from mbtf_gen.pictures.preview.plots import level_histogram, write_plots
 from mbtf_gen.pictures.preview.sample import finished_shards, sampled_queries, stored_queries
-from mbtf_gen.pictures.reference import render_reference, to_display, write_png
+from mbtf_gen.pictures.reference import PNG_BYTES, picture_seconds, render_reference, to_display, write_png
 from mbtf_gen.planning.effects_plan import reference_plan
 from mbtf_gen.planning.simulation import build_estimator
 
@@ -91,6 +94,8 @@ class PreviewPictures:
         if self.dataset is not None:
             inputs["data set"] = self.dataset.manifest["config_hash"]
             stages["queries"] = len(finished_shards(self.dataset))
+        size = len(stages) * PNG_BYTES * self.config.preview.size**2
+        check_space(path, size, "reduce --size, or choose another folder with -o")
         folder = PictureFolder.claim(
             path,
             "preview",
@@ -146,6 +151,10 @@ class PreviewPictures:
         assert self.job is not None
         estimator = build_estimator(self.job, reference_plan(self.job))
         spp, seed = self.config.preview.spp, self.config.seed
+        paths = self.camera.rows * self.camera.columns * self.config.preview.spp
+        if paths >= LONG_RUN:
+            seconds = picture_seconds(estimator, self.camera, self.omega_i, paths)
+            self.console.note(expectation(seconds, PNG_BYTES * self.config.preview.size**2))
         image = render_reference(estimator, self.camera, self.omega_i, kind="pixel", spp=spp, seed=seed)
         write_png(file, to_display(image.value))
         return {"shows": f"the infinite plane from the same camera, path-traced with {spp} paths per pixel"}

@@ -24,7 +24,7 @@ config = GeneratorConfig.model_validate({
     "output": {"shard_queries": 512},
 })
 seen = []
-generate(config, sys.argv[3], progress=lambda done, note: seen.append(resident()))
+generate(config, sys.argv[3], progress=lambda *_: seen.append(resident()))
 print(json.dumps(seen))
 """
 

@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from mbtf_core import folders
 from mbtf_core.atomic import temporary_of
 from mbtf_core.errors import InputError
-from mbtf_core.folders import check_folder, make_folder, other_configuration, remove_unfinished
+from mbtf_core.folders import (
+    check_folder,
+    check_space,
+    make_folder,
+    other_configuration,
+    remove_unfinished,
+)
+from mbtf_core.units import expectation
 
 
 def is_ours(folder: Path) -> bool:
@@ -50,3 +59,13 @@ def test_only_unfinished_files_of_ours_are_removed(tmp_path: Path) -> None:
         temporary_of(tmp_path / name).touch()
     remove_unfinished(tmp_path, ["a.npz"])
     assert [p.name for p in tmp_path.iterdir()] == [temporary_of(tmp_path / "b.npz").name]
+
+
+def test_what_does_not_fit_on_the_disk_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(folders.shutil, "disk_usage", lambda path: SimpleNamespace(free=3e9))
+    check_space(tmp_path / "new" / "folder", 3e9, "hint")
+    with pytest.raises(InputError, match=r"new/folder: needs 27 GB; 3.0 GB are free\n  reduce --queries"):
+        check_space(tmp_path / "new" / "folder", 27e9, "reduce --queries")
+    assert not (tmp_path / "new").exists()
+    assert expectation(75.0, 27e9) == "expected: about 1:15, 27 GB on disk"
+    assert expectation(None, 5e5) == "expected: 500 kB on disk"

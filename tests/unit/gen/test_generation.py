@@ -6,6 +6,7 @@ import dataclasses
 import json
 import os
 import shutil
+import time
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +25,8 @@ from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.dataset.shard_io import read_shard
 from mbtf_gen.dataset.summary import finish
 from mbtf_gen.dataset.verify import sidecar_of, verify
-from mbtf_gen.generation import generate, paths_left
-from mbtf_gen.job import Job, split_queries
+from mbtf_gen.generation import generate, unfinished
+from mbtf_gen.job import Job, planned_paths, split_queries
 from mbtf_gen.planning.effects_plan import reference_plan
 from mbtf_gen.planning.run_plan import RunPlan
 from mbtf_gen.render.runtime import load_mitsuba
@@ -98,7 +99,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 def test_a_run_is_complete_and_counts(config: GeneratorConfig, out: Path) -> None:
     seen: list[float] = []
-    summary = generate(config, out, progress=lambda done, note: seen.append(done))
+    summary = generate(config, out, progress=lambda done, note, total: seen.append(done))
     # Progress counts paths: a test query takes twice as many as a training query.
     assert seen == [80, 160, 200, 320]
     assert (summary.complete, summary.queries, summary.paths) == (True, 130, 100 * 2 + 30 * 4)
@@ -129,15 +130,39 @@ def test_shards_hold_what_was_drawn_and_estimated(
             np.testing.assert_array_equal(stored[name], array, err_msg=name)
 
 
-def test_progress_counts_planned_paths(config: GeneratorConfig, engine: Formula, out: Path) -> None:
-    """A target error changes the number of paths, not the share that is done."""
+def test_progress_counts_traced_paths(config: GeneratorConfig, engine: Formula, out: Path) -> None:
+    """A target error changes the number of paths; the expected total follows the shards that are done."""
     engine.more = 7
-    seen: list[float] = []
-    left = paths_left(Job.prepare(config), out)
-    summary = generate(config, out, progress=lambda done, note: seen.append(done))
-    assert seen == [80, 160, 200, 320]
-    assert seen[-1] == left
-    assert summary.paths == 7 * 320
+    seen: list[tuple[float, float | None]] = []
+    summary = generate(config, out, progress=lambda done, note, total: seen.append((done, total)))
+    # The test split, of 120 planned paths, comes last: until then it counts as planned.
+    train, test = 7 * 200, 7 * 120
+    assert seen == [(560, train + 120), (1120, train + 120), (train, train + 120), (train + test,) * 2]
+    assert summary.paths == train + test
+
+
+def test_progress_and_summary_state_one_rate(
+    config: GeneratorConfig, engine: Formula, out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Paths of both halves over the seconds since the run began, planning included."""
+    begun = time.perf_counter()
+
+    def slow_plan(job: Job) -> RunPlan:
+        time.sleep(0.5)
+        return cheap_plan(job)
+
+    monkeypatch.setattr(generation, "plan_run", slow_plan)
+    rates: list[float] = []
+
+    def note(done: float, text: str, total: float | None) -> None:
+        stated = float(text.split(" M paths/s")[0]) * 1e6
+        assert stated <= done / 0.5 + 5e3
+        rates.append(stated)
+
+    summary = generate(config, out, progress=note)
+    assert rates
+    took = time.perf_counter() - begun
+    assert summary.paths / took <= summary.paths_per_second <= summary.paths / 0.5
 
 
 def test_too_many_nonfinite_samples_fail_the_run(config: GeneratorConfig, engine: Formula, out: Path) -> None:
@@ -296,27 +321,34 @@ def test_foreign_folders_are_refused_untouched(
     assert {p.name: p.read_text() for p in out.iterdir()} == files
 
 
+def left_of(job: Job, out: Path, *part: int) -> int:
+    """Paths of the shards that are not finished."""
+    return planned_paths(job, unfinished(job, out, *part))
+
+
 def test_paths_left_are_those_of_unfinished_shards(
     config: GeneratorConfig, engine: Formula, out: Path
 ) -> None:
     job = Job.prepare(config)
     # Shards of 40, 40, 20 training queries at 2 paths and 30 test queries at 4.
-    assert paths_left(job, out) == 80 + 80 + 40 + 120
-    assert [paths_left(job, out, i, 2) for i in (1, 2)] == [80 + 40, 80 + 120]
+    assert left_of(job, out) == 80 + 80 + 40 + 120
+    assert [left_of(job, out, i, 2) for i in (1, 2)] == [80 + 40, 80 + 120]
     engine.fail_at = 1
     with pytest.raises(KeyboardInterrupt):
         generate(config, out)
     engine.fail_at = None
-    left = paths_left(job, out)
+    left = left_of(job, out)
     assert left == 240
-    seen: list[float] = []
-    assert generate(config, out, progress=lambda done, note: seen.append(done)).paths == left
+    seen: list[tuple[float, float | None]] = []
+    done = generate(config, out, progress=lambda done, note, total: seen.append((done, total)))
+    assert done.paths == left
     # Finished shards do not count, so that the time left is not underestimated.
-    assert seen == [0, 80, 120, 240]
-    assert paths_left(job, out) == 0
+    assert seen == [(80, 240), (120, 240), (240, 240)]
+    assert left_of(job, out) == 0
+    assert len(unfinished(job, out, overwrite=True)) == len(job.shards)
     image = Job.prepare(changed(config, queries={"layout": "image"}))
     assert split_queries(image, "train") == 4 * 32
-    assert paths_left(image, out) == 4 * 32 * 2 + 32 * 4
+    assert left_of(image, out) == 4 * 32 * 2 + 32 * 4
 
 
 def write_while_planning(patch: pytest.MonkeyPatch, out: Path, job: Job, plan: RunPlan) -> bytes:

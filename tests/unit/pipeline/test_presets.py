@@ -6,15 +6,16 @@ import math
 from pathlib import Path
 from typing import get_args
 
+import numpy as np
 import pytest
 from support.paths import ROOT
 
 from mbtf_core.config_file import resolve
 from mbtf_fit.config import FitConfig
-from mbtf_fit.presets import FITTER, best_at, best_options, fitter_options, overrides_of
+from mbtf_fit.presets import FITTER, best_at, best_options, fitter_options
 from mbtf_gen.config.generator import GeneratorConfig, count_queries
-from mbtf_gen.config.presets import GENERATOR, Quality, as_assignments
-from mbtf_pipeline.presets import COMPARE, quality_assignments
+from mbtf_gen.config.presets import GENERATOR, Quality, as_assignments, overrides_of
+from mbtf_pipeline.presets import COMPARE, preset_recipe, quality_assignments
 from mbtf_pipeline.recipe import load_recipe
 
 QUALITIES: tuple[Quality, ...] = get_args(Quality)
@@ -107,3 +108,18 @@ def test_explicit_options_override_the_preset(tmp_path: Path) -> None:
     resolved = resolve(FitConfig, file=file, assignments=as_assignments(FITTER["draft"]))
     assert resolved.training.steps is None
     assert resolved.training.time == 20
+
+
+def test_a_preset_sets_the_resolution_unless_told(tmp_path: Path) -> None:
+    """A draft of large maps is a draft; explicit resolutions of recipes and assignments are kept."""
+    np.save(tmp_path / "height.npy", np.zeros((256, 256)))
+    path = tmp_path / "recipe.yaml"
+    text = "name: r\ngenerate: {material: height.npy, geometry: {height_scale: 1}}\nfit: {model: neumip}\n"
+    path.write_text(text)
+    found = [preset_recipe(path, quality).generate.queries.resolution for quality in QUALITIES]
+    # No finer than the map, whose own is the paper's.
+    assert found == [128, 256, 256, None]
+    told = preset_recipe(path, "draft", ["generate.queries.resolution=512"])
+    assert told.generate.queries.resolution == 512
+    quickstart = ROOT / "pipelines" / "quickstart.yaml"
+    assert preset_recipe(quickstart, "high").generate.queries.resolution == 128

@@ -1,4 +1,4 @@
-"""A total time is kept, and the same command splits it the same way."""
+"""A total time takes the best preset that fits, counts everything, and is kept by the same command."""
 
 from __future__ import annotations
 
@@ -7,174 +7,189 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from support.paths import ROOT
 
 from mbtf_core.errors import InputError, UsageError
-from mbtf_core.stats import Estimate
-from mbtf_core.units import parse_duration
-from mbtf_fit.config import FitConfig
+from mbtf_core.lattice import Lattice
+from mbtf_gen.config.generator import count_queries
+from mbtf_gen.config.presets import GENERATOR
 from mbtf_pipeline.cost_study import time_split as module
-from mbtf_pipeline.cost_study.runs import RunRunner
-from mbtf_pipeline.cost_study.time_split import DEFAULT_SHARE, SHARES, split_time, with_split
-from mbtf_pipeline.recipe import Recipe, load_recipe
+from mbtf_pipeline.cost_study.time_split import TimedRun
+from mbtf_pipeline.forecast import RunForecaster
+from mbtf_pipeline.presets import preset_recipe
 
-# Seconds of a training query, of starting with the test split, of a fit besides training, and by query.
-QUERY, START, FIT, FIT_QUERY = 2e-6, 4.5, 4.0, 5e-7
-
-
-def recipe(*assignments: str) -> Recipe:
-    return load_recipe(ROOT / "pipelines" / "quickstart.yaml", list(assignments))
+FILE = ROOT / "pipelines" / "quickstart.yaml"
+# One fit, at the resolution of each preset.
+ONE = """\
+name: one
+generate: {material: maps/height.npy, geometry: {height_scale: 0.1}}
+fit: {model: neumip}
+"""
+START, PATH = 4.5, 4e-7
 
 
 class Machine:
-    """Pilots take no time here; their error is lowest where `best` of their time generates."""
+    """Time passes only where a test says so."""
 
     def __init__(self) -> None:
-        self.best = 0.6
-        self.pilots: list[Any] = []
-        self.failing = self.undefined = False
-        self.free, self.memory, self.query = 1e15, 1e15, QUERY
-        self.now = self.pilot_takes = 0.0
-
-    def measure(self, run: Any) -> Any:
-        self.pilots.append(run)
-        self.now += self.pilot_takes
-        if self.failing:
-            raise InputError("training diverged at step 7", hint="lower the learning rate")
-        generating = run.data.queries * self.query
-        training = parse_duration(run.fit["training"]["time"])
-        share = generating / (generating + training)
-        error = math.nan if self.undefined else 0.1 + (share - self.best) ** 2
-        other = FIT + FIT_QUERY * run.data.queries
-        details = {"generation_seconds": generating, "training_seconds": training}
-        details["total_seconds"] = generating + training + other
-        return SimpleNamespace(error=Estimate(error, 0.01, 10), details=details)
+        self.now, self.path = 0.0, PATH
+        self.free, self.memory = 1e15, 1e15
+        self.pilots = 0
 
 
 @pytest.fixture
 def fake(monkeypatch: pytest.MonkeyPatch) -> Machine:
     made = Machine()
-    monkeypatch.setattr(RunRunner, "measure", lambda self, run: made.measure(run))
-    monkeypatch.setattr(module, "forecast_seconds", lambda config: (made.query, START))
+
+    def speed(self: RunForecaster) -> tuple[float, float]:
+        made.pilots += 1
+        return START, made.path
+
+    monkeypatch.setattr(RunForecaster, "speed", property(speed))
     monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: made.now))
     monkeypatch.setattr(module.shutil, "disk_usage", lambda path: SimpleNamespace(free=made.free))
     monkeypatch.setattr(module, "_physical_memory", lambda: made.memory)
     return made
 
 
-def split(
-    folder: Path, seconds: float = 1000.0, of: Recipe | None = None, notes: list[str] | None = None
-) -> Any:
-    return split_time(
-        of or recipe(), seconds, folder / "run", "command", ([] if notes is None else notes).append
-    )
+@pytest.fixture
+def one(tmp_path: Path) -> Path:
+    (tmp_path / "maps").mkdir()
+    np.save(tmp_path / "maps" / "height.npy", np.random.default_rng(0).random((512, 512)))
+    (tmp_path / "one.yaml").write_text(ONE)
+    return tmp_path / "one.yaml"
 
 
-@pytest.mark.parametrize("best", SHARES)
-def test_the_best_pilot_decides(fake: Machine, tmp_path: Path, best: float) -> None:
-    fake.best, fake.pilot_takes = best, 80.0
-    notes: list[str] = []
-    found = split(tmp_path, notes=notes)
-    times = [parse_duration(run.fit["training"]["time"]) for run in fake.pilots]
-    assert times == pytest.approx([40 * (1 - s) for s in SHARES], rel=0.01)
-    assert [run.data.queries * QUERY for run in fake.pilots] == pytest.approx(
-        [40 * s for s in SHARES], rel=0.1
-    )
-    assert len(notes) == len(found.pilots) == 3
-    assert found.share == best
-    making = found.generating - START
-    assert making / (making + found.training) == pytest.approx(best, rel=0.1)
-    assert making == pytest.approx(found.queries * QUERY, abs=0.1)
+def timed(file: Path, seconds: float, *assignments: str, **options: Any) -> TimedRun:
+    """In a folder beside the recipe."""
+    options = {"progress": lambda note: None, "folder": file.parent / "run", **options}
+    return TimedRun(file, seconds, command="command", assignments=assignments, **options)
 
 
-@pytest.mark.parametrize("seconds", [60.0, 100.0, 250.0, 1000.0, 36000.0])
-def test_all_parts_fit_into_the_time(fake: Machine, tmp_path: Path, seconds: float) -> None:
-    fake.pilot_takes = 0.05 * seconds
-    found = split(tmp_path, seconds)
-    # Both fits load what is generated.
-    pilots = 0.15 * seconds if fake.pilots else 0.0
-    assert found.pilot_seconds == pytest.approx(pilots)
-    other = 2 * (FIT + FIT_QUERY * found.queries) if fake.pilots else found.other
-    assert found.other == pytest.approx(other, abs=0.1)
-    spent = found.pilot_seconds + found.generating + found.training + found.other
-    assert spent == pytest.approx(seconds, abs=0.3)
-    assert bool(fake.pilots) == (seconds >= 250)
-    assert fake.pilots or found.share == DEFAULT_SHARE
+def seconds_of(run: TimedRun) -> float:
+    """Forecast of the run as it was split."""
+    return RunForecaster(run.recipe).of(run.recipe).seconds
 
 
-def test_pilots_that_fail_or_have_nothing_to_learn_leave_the_default(fake: Machine, tmp_path: Path) -> None:
-    fake.undefined = True
-    found = split(tmp_path / "flat")
-    assert (found.share, found.pilots) == (DEFAULT_SHARE, [])
-    fake.failing = True
-    notes: list[str] = []
-    assert split(tmp_path / "failed", notes=notes).share == DEFAULT_SHARE
-    assert notes == ["pilot failed: training diverged at step 7; 35% of the time generates"]
+@pytest.mark.parametrize("seconds", [100.0, 300.0, 900.0, 7200.0])
+def test_the_best_preset_that_fits_is_scaled_to_the_time(fake: Machine, one: Path, seconds: float) -> None:
+    found = timed(one, seconds)
+    stated = {}
+    for name in module.PRESETS:
+        recipe = preset_recipe(one, name)
+        stated[name] = RunForecaster(recipe).of(recipe).seconds
+    fitting = [name for name in module.PRESETS if stated[name] <= 0.96 * seconds]
+    assert found.split.quality == (fitting or ["draft"])[-1]
+    # Neither fewer queries nor less training than the preset: never worse.
+    preset = preset_recipe(one, found.split.quality)
+    lattice = Lattice.for_map(512, 512, preset.generate.queries.finest)
+    assert found.split.queries >= count_queries(preset.generate.queries.train, lattice.texels())
+    assert found.recipe.fit["neumip"].training.time >= preset.fit["neumip"].training.time
+    assert found.recipe.fit["neumip"].network.width >= preset.fit["neumip"].network.width
+    assert found.recipe.generate.queries.resolution == preset.generate.queries.resolution
+    # Everything is counted: starting, generating, loading, training, evaluation, comparison.
+    assert seconds_of(found) == pytest.approx(0.96 * seconds, rel=0.02)
 
 
-def test_pilots_train_where_the_fit_does(fake: Machine, tmp_path: Path) -> None:
-    split(tmp_path, of=recipe("fit.neumip.device=cpu", "fit.neumip.data.memory=3 GB"))
-    for run in fake.pilots:
-        config = FitConfig.model_validate(run.fit)
-        assert (config.device, config.data.memory) == ("cpu", 3e9)
+def test_longer_training_gets_the_larger_network(fake: Machine, one: Path) -> None:
+    found = timed(one, 1500.0, "generate.queries.resolution=64")
+    assert found.split.training_each > 300.0
+    assert found.recipe.fit["neumip"].network.width == 64
 
 
-@pytest.mark.parametrize("scarce", ["disk", "memory"])
-def test_disk_and_memory_limit_the_queries(fake: Machine, tmp_path: Path, scarce: str) -> None:
-    """Queries of a closed form would fill the disk in any time, which goes to training instead."""
-    fake.query = 1e-12
+def test_less_than_a_draft_is_a_smaller_draft(fake: Machine, one: Path) -> None:
+    fake.path *= 8.0
+    found = timed(one, 90.0)
+    assert found.split.quality == "draft"
+    assert found.split.scale < 1.0
+    assert found.split.queries < 400 * 128**2
+    assert found.split.training_each < 20.0
+    assert seconds_of(found) == pytest.approx(0.96 * 90.0, rel=0.02)
+
+
+def test_training_is_shortened_when_generating_overran(fake: Machine, one: Path) -> None:
+    found = timed(one, 120.0)
+    planned = found.recipe
+    before = planned.fit["neumip"].training.time
+    fake.now = found.split.generating + 15.0
+    after = found.generated(planned).fit["neumip"].training.time
+    # The starting time, which the forecast counts although the clock has not run, is what it gains.
+    assert before - 15.0 <= after <= before - 15.0 + 3.0
+    assert after == pytest.approx(0.96 * 120.0 - fake.now - found.split.after, abs=0.1)
+    # The same command resumes with the same time, however late.
+    fake.now = 1e4
+    again = timed(one, 120.0)
+    assert again.generated(again.recipe).fit["neumip"].training.time == after
+    fake.now = 0.0
+    late = timed(one, 120.0, folder=one.parent / "late")
+    fake.now = 500.0
+    assert late.generated(late.recipe).fit["neumip"].training.time == 1.0
+
+
+@pytest.mark.parametrize("scarce", ["disk", "memory", "data.memory", "preset"])
+def test_queries_are_limited_and_the_rest_is_training(fake: Machine, one: Path, scarce: str) -> None:
+    """Where paths cost nothing, any time would fill the disk."""
+    fake.path = 1e-12
+    assignments = ["generate.queries.resolution=128"]
+    most = 1600.0 * 128**2
     if scarce == "disk":
-        fake.free = 8e7
-    else:
-        fake.memory = 4e7
-    found = split(tmp_path)
-    # A quarter of the disk or half of the memory, 68 bytes a query.
-    most = 20e6 / 68
-    assert 0.9 * most < found.queries <= most
-    assert [run.data.queries for run in fake.pilots] == [found.queries] * 3
-    assert found.training > 980.0
+        fake.free = 4 * 68 * 7e6
+    elif scarce == "memory":
+        fake.memory = 2 * 68 * 7e6
+    elif scarce == "data.memory":
+        assignments.append("fit.data.memory=476MB")
+    if scarce != "preset":
+        most = 7e6
+    found = timed(one, 1000.0, *assignments, quality="draft")
+    assert 0.9 * most < found.split.queries <= most
+    assert found.split.training_each > 900.0
 
 
-def test_fits_share_the_time_of_training(fake: Machine, tmp_path: Path) -> None:
-    plain = recipe()
-    found = split(tmp_path, 100.0)
-    changed = with_split(plain, found)
-    assert changed.generate.queries.train == str(found.queries)
-    assert len(changed.fit) == 2
-    assert sum(fit.training.time for fit in changed.fit.values()) == pytest.approx(found.training, abs=0.2)
-    assert all(fit.training.steps is None for fit in changed.fit.values())
-    assert changed.compare == plain.compare
-    assert changed.generate.light == plain.generate.light
+def test_a_preset_that_does_not_fit_on_the_disk_is_not_chosen(fake: Machine, one: Path) -> None:
+    fake.path = 1e-12
+    fake.free = 5e9
+    assert timed(one, 1200.0).split.quality == "standard"
+    fake.free = 1e5
+    with pytest.raises(InputError, match="are free"):
+        timed(one, 1000.0, folder=one.parent / "full")
+    assert not [path for path in (one.parent / "full").iterdir() if path.suffix != ".lock"]
 
 
-def test_the_same_command_resumes_with_the_same_split(fake: Machine, tmp_path: Path) -> None:
-    first = split(tmp_path)
-    fake.query *= 1.5
-    assert split(tmp_path) == first
-    assert len(fake.pilots) == 3
+def test_a_given_preset_is_kept_and_fits_share_the_training(fake: Machine, one: Path) -> None:
+    notes: list[str] = []
+    found = timed(FILE, 300.0, folder=one.parent / "run", quality="draft", progress=notes.append)
+    assert found.split.quality == "draft"
+    assert len(found.recipe.fit) == 2
+    assert all(fit.training.steps is None for fit in found.recipe.fit.values())
+    assert {fit.training.time for fit in found.recipe.fit.values()} == {found.split.training_each}
+    assert found.recipe.generate.queries.test == GENERATOR["draft"]["queries.test"]
+    assert found.recipe.generate.light == preset_recipe(FILE, None).generate.light
+    assert len(notes) == 1
+    assert "preset draft with" in notes[0]
+
+
+def test_the_same_command_resumes_with_the_same_split(fake: Machine, one: Path) -> None:
+    first = timed(one, 200.0)
+    fake.path *= 1.5
+    assert timed(one, 200.0).split == first.split
     # Another time, or a damaged record, is split anew.
-    assert split(tmp_path, 900.0) != first
-    again = split(tmp_path)
-    assert again.queries < first.queries
-    (tmp_path / "run" / module.SPLIT_NAME).write_text('{"format": "mbtf-time-split"}')
-    assert split(tmp_path) == again
+    assert timed(one, 190.0).split != first.split
+    again = timed(one, 200.0)
+    assert again.split.queries < first.split.queries
+    (one.parent / "run" / module.SPLIT_NAME).write_text('{"key": 1}')
+    assert timed(one, 200.0).split == again.split
 
 
-def test_what_cannot_be_split_is_refused(fake: Machine, tmp_path: Path) -> None:
+def test_what_cannot_be_split_is_refused(fake: Machine, one: Path) -> None:
     with pytest.raises(UsageError, match="too short"):
-        split(tmp_path, 5.0)
+        timed(one, 5.0)
     with pytest.raises(UsageError, match="layout"):
-        split(tmp_path, 100.0, recipe("fit.h.model=hierarchical"))
-    assert not (tmp_path / "run").exists()
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "file").write_text("")
+        timed(one, 100.0, "fit.model=hierarchical")
+    assert not (one.parent / "run").exists()
+    (one.parent / "run").mkdir()
+    (one.parent / "run" / "file").write_text("")
     with pytest.raises(InputError, match="holds no run"):
-        split(tmp_path, 100.0)
-
-
-def test_a_given_share_needs_no_pilots(fake: Machine, tmp_path: Path) -> None:
-    found = split_time(recipe(), 1000.0, tmp_path / "run", "command", print, 0.25)
-    assert not fake.pilots
-    making = found.generating - START
-    assert making / (making + found.training) == pytest.approx(0.25, rel=0.05)
+        timed(one, 100.0)
+    assert math.isfinite(module._physical_memory())
