@@ -15,7 +15,7 @@ from mbtf_core.errors import InputError
 from mbtf_core.folders import ELSEWHERE, check_folder, make_folder
 from mbtf_core.stats import Estimate, signal_variance
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.material.material import load_material
+from mbtf_gen.job import Job
 from mbtf_pipeline.cost_study.fit_runs import GENERATOR, RUN_SHARES, planned_runs
 from mbtf_pipeline.cost_study.generator_benchmark import GeneratorBenchmark
 from mbtf_pipeline.cost_study.generator_runs import generator_tasks
@@ -123,7 +123,8 @@ def run_study(
         progress(min(1.0, spent() / (seconds + refine)), text)
 
     config = study_config(recipe.generate, seed)
-    material = load_material(Path(config.material), config.geometry.make_tileable)
+    job = Job.prepare(config)
+    config, material = job.config, job.material
     claim(folder)
     with locked(folder, STUDY_NAME):
         benchmark = GeneratorBenchmark(config, material)
