@@ -138,14 +138,13 @@ def energies(material: Path, shards: Path, evaluator: Any) -> list[dict[str, flo
     from mbtf_gen.config.generator import GeneratorConfig
     from mbtf_gen.dataset.reader import Dataset
     from mbtf_gen.job import Job
-    from mbtf_gen.material.material import load_material
     from mbtf_gen.planning.effects_plan import reference_plan
     from mbtf_gen.planning.simulation import build_estimator
     from mbtf_gen.render.estimator import Stream
     from mbtf_gen.sampling.query_sampler import Queries
 
     config = GeneratorConfig.model_validate(Dataset.open(shards).manifest["config"])
-    job = Job(config, load_material(material, config.geometry.make_tileable))
+    job = Job.load(config)
     estimator = build_estimator(job, reference_plan(job))
     random = np.random.default_rng([14, zlib.crc32(material.name.encode())])
     n, rows, lowest = ENERGY_QUERIES, [], config.queries.min_cos

@@ -45,7 +45,7 @@ else:
     PathText = str | Path
 Switch = Annotated[bool, Parameter(negative="", show_default=False)]
 Output = Annotated[Path, Parameter(name=["--output", "-o"], help="Output folder.")]
-Overwrite = Annotated[Switch, Parameter(help="Replace the content of the output folder.")]
+Overwrite = Annotated[Switch, Parameter(help="Replace existing output.")]
 Time = Annotated[str | None, Parameter(metavar="DURATION", help="Time budget: 90s, 2min, 1h.")]
 DryRun = Annotated[Switch, Parameter(help="Write nothing; only report what would be done.")]
 Config = Annotated[Path | None, Parameter(help="YAML file with the options.")]

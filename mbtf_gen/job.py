@@ -40,8 +40,8 @@ class Job:
     material: Material
 
     @classmethod
-    def prepare(cls, config: GeneratorConfig) -> Job:
-        """Load the material of a configuration and log its notes and warnings.
+    def load(cls, config: GeneratorConfig) -> Job:
+        """Load the material of a configuration. Its height scale, tiling and resolution replace unset ones.
 
         Parameters
         ----------
@@ -57,16 +57,49 @@ class Job:
         InputError
             The material cannot be used.
         """
-        job = cls(config, load_material(Path(config.material), config.geometry.make_tileable))
+        return cls.of(config, load_material(Path(config.material), config.geometry.make_tileable))
+
+    @classmethod
+    def of(cls, config: GeneratorConfig, material: Material) -> Job:
+        """The job of a loaded material, whose height scale, tiling and resolution replace unset ones."""
+        geometry, queries = config.geometry, config.queries
+        scale = material.height_scale if geometry.height_scale is None else geometry.height_scale
+        own = {
+            "geometry": geometry.model_copy(update={"height_scale": scale, "make_tileable": material.tile}),
+            "queries": queries.model_copy(update={"resolution": queries.resolution or material.resolution}),
+        }
+        return cls(config.model_copy(update=own), material)
+
+    @classmethod
+    def prepare(cls, config: GeneratorConfig) -> Job:
+        """:meth:`load`, and log the material's notes and warnings.
+
+        Parameters
+        ----------
+        config : GeneratorConfig
+            All options.
+
+        Returns
+        -------
+        Job
+
+        Raises
+        ------
+        InputError
+            The material cannot be used.
+        """
+        job, given = cls.load(config), config.geometry.height_scale
         for note in job.material.notes:
             log.info(note)
-        for warning in job.material.warnings_at(config.geometry.height_scale):
+        for warning in job.material.warnings_at(given):
             log.warning(warning)
         rows, columns = job.grid.z.shape
         log.info(
-            "mesh: %d x %d cells, displacement range %.4g tile widths",
+            "mesh: %d x %d cells, height scale %.4g (%s), displacement range %.4g tile widths",
             columns,
             rows,
+            job.material.height_scale if given is None else given,
+            job.material.height_source(given),
             job.grid.displacement_range,
         )
         return job
@@ -74,8 +107,7 @@ class Job:
     @cached_property
     def lattice(self) -> Lattice:
         """Texel grids of the levels."""
-        rows, columns = self.material.height.shape
-        return Lattice.for_map(rows, columns, self.config.queries.finest)
+        return self.material.lattice(self.config.queries.resolution)
 
     @cached_property
     def config_hash(self) -> str:
@@ -112,13 +144,14 @@ class Job:
 
 
 def limit_resolution(job: Job) -> Job:
-    """A job whose resolution is at most that of its map, which has no finer detail."""
-    finest = Lattice.for_map(*job.material.height.shape).finest
-    config = job.config
-    if config.queries.finest is None or config.queries.finest <= finest:
+    """A job whose resolution is that of a preset: the material's own overrides it, and maps of lower
+    resolution have no finer detail."""
+    own, preset = job.material.resolution, job.config.queries.resolution
+    highest = own or 1 << Lattice.for_map(*job.material.height.shape).finest
+    if preset is None or (own is None and preset <= highest):
         return job
-    queries = config.queries.model_copy(update={"resolution": 1 << finest})
-    return replace(job, config=config.model_copy(update={"queries": queries}))
+    queries = job.config.queries.model_copy(update={"resolution": highest})
+    return replace(job, config=job.config.model_copy(update={"queries": queries}))
 
 
 def row_queries(job: Job) -> int:

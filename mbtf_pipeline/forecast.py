@@ -10,7 +10,6 @@ from pathlib import Path
 from mbtf_core.folders import check_folder, check_space
 from mbtf_core.units import clock, expectation
 from mbtf_gen.job import Job, planned_paths, split_queries
-from mbtf_gen.material.material import load_material
 from mbtf_pipeline.compare.pictures import scenes
 from mbtf_pipeline.recipe import Recipe
 from mbtf_pipeline.run import COMPARE_STAGE, data_sets, fit_stage, survey
@@ -74,8 +73,7 @@ class RunForecaster:
 
     def __init__(self, recipe: Recipe) -> None:
         self.recipe = recipe
-        self._geometry = recipe.generate.geometry
-        self.material = load_material(Path(recipe.generate.material), self._geometry.make_tileable)
+        self.material = Job.load(recipe.generate).material
 
     @cached_property
     def speed(self) -> tuple[float, float]:
@@ -84,7 +82,7 @@ class RunForecaster:
         from mbtf_gen.planning.effects_plan import plan_effects
         from mbtf_gen.planning.run_plan import allocate
 
-        job = Job(self.recipe.generate, self.material)
+        job = Job.of(self.recipe.generate, self.material)
         found = forecast(job, allocate(job, plan_effects(job, pilots=False)), seconds=1.0)
         return found.start, found.query_seconds / self.recipe.generate.queries.spp
 
@@ -108,7 +106,7 @@ class RunForecaster:
 
         paths = size = queries = 0
         for data in data_sets(recipe):
-            job = Job(data.config, self.material)
+            job = Job.of(data.config, self.material)
             queries = split_queries(job, "train")
             if runs(data.stage):
                 from mbtf_gen.dataset.shard_io import data_bytes

@@ -65,11 +65,8 @@ def preset_recipe(
     if not any(text.startswith(f"generate.{RESOLUTION}=") for text in preset):
         return recipe
     from mbtf_gen.job import Job, limit_resolution
-    from mbtf_gen.material.material import load_material
 
-    generate = recipe.generate
-    job = Job(generate, load_material(Path(generate.material), generate.geometry.make_tileable))
-    return recipe.model_copy(update={"generate": limit_resolution(job).config})
+    return recipe.model_copy(update={"generate": limit_resolution(Job.load(recipe.generate)).config})
 
 
 def _options_of_fit(given: Mapping[str, Any], prefix: str) -> dict[str, Any]:

@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+from cyclopts import Parameter
+
 from mbtf_core.console import CONSOLE, Console
-from mbtf_core.options import Options, PathText, takes_options
+from mbtf_core.errors import InputError, UsageError
+from mbtf_core.folders import make_folder
+from mbtf_core.options import Options, Overwrite, PathText, takes_options
 from mbtf_gen.cli.generate import resolve_config
 from mbtf_gen.config.generator import GeneratorConfig
 
 
-@takes_options(GeneratorConfig, "geometry")
+@takes_options(GeneratorConfig, "geometry", "queries.resolution")
 def inspect(
     material: PathText | None = None,
     /,
     *,
     options: Options[GeneratorConfig],
+    write: Annotated[Path | None, Parameter(metavar="FILE")] = None,
+    export: Annotated[Path | None, Parameter(metavar="FILE")] = None,
+    overwrite: Overwrite = False,
     console: Console = CONSOLE,
 ) -> None:
     """Describe a material and each of its maps: sizes, heights, slopes, tiling, albedo, warnings.
@@ -22,12 +33,44 @@ def inspect(
     ----------
     material
         Height map, folder of maps, or material.yaml.
+    write
+        Store the height scale, tiling, resolution, normal convention and color space in a material.yaml, as
+        given or as the maps suggest. Other commands then need no flags.
+    export
+        Write the heights in use, on the mesh and in tile widths, as an EXR file.
     """
+    resolved = resolve_config(options, material)
+    _check_new(write, "--write", (".yaml", ".yml"), overwrite)
+    _check_new(export, "--export", (".exr",), overwrite)
+    from mbtf_gen.images.exr import write_channels
+    from mbtf_gen.material.choices import write_material_file
     from mbtf_gen.material.inspect import inspect_material, inspection_text
     from mbtf_gen.material.material import load_material
 
-    resolved = resolve_config(options, material)
     geometry = resolved.geometry
+    height, resolution = geometry.height_scale, resolved.queries.resolution
     loaded = load_material(resolved.material, geometry.make_tileable)
-    found = {"material": resolved.material, **inspect_material(loaded, geometry.height_scale, geometry.mesh)}
+    outputs: dict[str, Any] = {}
+    if write is not None:
+        choices = write_material_file(write, loaded, resolved)
+        outputs["written"] = {"file": write, "choices": {name: asdict(c) for name, c in choices.items()}}
+        # What follows describes the material as other commands will use it.
+        loaded, height, resolution = replace(load_material(write), unused=loaded.unused), None, None
+    if export is not None:
+        make_folder(export.parent)
+        write_channels(export, {"Y": loaded.grid(height, geometry.mesh).z.astype("float32")})
+        outputs["exported"] = export
+    described = inspect_material(loaded, height, geometry.mesh, resolution)
+    found = {"material": resolved.material, **described, **outputs}
     console.report(found, inspection_text(found, resolved.material))
+
+
+def _check_new(path: Path | None, flag: str, suffixes: tuple[str, ...], overwrite: bool) -> None:
+    """Refuse an output file of another suffix, or one that exists."""
+    if path is None:
+        return
+    if path.suffix.lower() not in suffixes:
+        raise UsageError(f"'{path}' must end in {' or '.join(suffixes)}", where=flag)
+    if path.exists() and not (overwrite and path.is_file()):
+        hint = "--overwrite replaces it" if path.is_file() else "name a file"
+        raise InputError("exists already", where=path, hint=hint)

@@ -63,7 +63,7 @@ def reference(
         output,
         "reference",
         files=[f"{name}.{suffix}" for name in names.values() for suffix in ("exr", "png")],
-        config=resolved.model_dump(mode="json", exclude={"queries", "output"}),
+        config=job.config.model_dump(mode="json", exclude={"queries", "output"}),
         inputs=job.material.digests,
         overwrite=overwrite,
     )

@@ -21,6 +21,8 @@ from mbtf_gen.config.effects_request import EffectsRequest
 from mbtf_gen.geometry.slopes import NormalMode
 from mbtf_gen.sampling.light_kernel import MAX_WIDTH_DEG, MIN_WIDTH_DEG
 
+# Largest height scale.
+MAX_SCALE = 100
 _PERCENT = re.compile(r"^\s*(\d+(?:\.\d*)?|\.\d+)\s*%\s*$")
 _COUNT = re.compile(r"^\s*(\d+(?:\.\d+)?(?:[eE][+]?\d+)?)\s*(/\s*texel)?\s*$")
 
@@ -91,15 +93,17 @@ class GeometrySection(Settings):
 
     height_scale: Annotated[float | None, Flag("--height-scale")] = Field(
         None,
-        ge=-100,
-        le=100,
+        ge=-MAX_SCALE,
+        le=MAX_SCALE,
         description="factor on the stored heights, in tile widths; default: the material's own",
     )
     mesh: Annotated[int | None, Flag("--mesh")] = Field(
         None, ge=1, le=8192, description="mesh cells across the tile; default: the map's width, at most 512"
     )
-    make_tileable: Annotated[Tiling, Flag("--make-tileable")] = Field(
-        "none", description="method for maps that do not tile: 2 x 2 mirrored copies, or blended edges"
+    make_tileable: Annotated[Tiling | None, Flag("--make-tileable")] = Field(
+        None,
+        description="method for maps that do not tile: 2 x 2 mirrored copies, or blended edges; "
+        "default: the material's own, else none",
     )
 
 
@@ -138,7 +142,8 @@ class QueriesSection(Settings):
     max_spp: Paths = Field(1024, description="most paths per query under a target error")
     resolution: Annotated[Resolution | None, Flag("--resolution")] = Field(
         None,
-        description="texels across at the finest level, a power of two; default: from the map's width",
+        description="texels across at the finest level, a power of two; default: the material's own, else "
+        "from the map's width",
     )
     mixture: MixtureSection = MixtureSection()
     min_cos: Annotated[float, Flag("--min-cos")] = Field(
@@ -154,11 +159,6 @@ class QueriesSection(Settings):
         description="image layout: texels along each side of an image, of the level nearest to its "
         "footprint; default: one query in every texel of the finest level",
     )
-
-    @property
-    def finest(self) -> int | None:
-        """The finest level k, ``log2(resolution)``; None: from the map's width."""
-        return None if self.resolution is None else self.resolution.bit_length() - 1
 
 
 class LightSection(Settings):

@@ -6,7 +6,6 @@ A shard is a mapping of array name to array; all arrays share their leading axes
 
 from __future__ import annotations
 
-import errno
 import io
 import math
 import zipfile
@@ -18,7 +17,7 @@ import numpy as np
 from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 
-from mbtf_core.atomic import Stored, write_chunks, write_through
+from mbtf_core.atomic import Stored, write_chunks
 from mbtf_core.errors import InputError, reason
 from mbtf_core.shard_schema import ARRAY, ARRAYS, ShardEntry
 from mbtf_gen.job import Job, row_queries
@@ -178,7 +177,7 @@ def write_exr(path: Path, arrays: Mapping[str, NDArray[np.float32]]) -> Stored:
 
     The header's string ``mbtf.lead`` holds the leading axes ("n" or "items,rows,columns").
     """
-    import OpenEXR
+    from mbtf_gen.images.exr import write_channels
 
     lead = check_arrays(arrays, path)
     channels: dict[str, Any] = {}
@@ -186,20 +185,7 @@ def write_exr(path: Path, arrays: Mapping[str, NDArray[np.float32]]) -> Stored:
         image = _fold(np.asarray(arrays[spec.name], np.float32), lead)
         for index, channel in enumerate(spec.channels):
             channels[channel] = np.ascontiguousarray(image[..., index] if spec.trailing else image)
-    header = {
-        "compression": OpenEXR.NO_COMPRESSION,
-        "type": OpenEXR.scanlineimage,
-        "mbtf.lead": ",".join(str(n) for n in lead),
-    }
-
-    def write(temporary: Path) -> None:
-        try:
-            OpenEXR.File(header, channels).write(str(temporary))
-        except RuntimeError as error:
-            # The library's message ends with the file's name and the system's error.
-            raise OSError(errno.EIO, reason(str(error).rpartition('". ')[2].rstrip("."))) from None
-
-    return write_through(path, write)
+    return write_channels(path, channels, {"mbtf.lead": ",".join(str(n) for n in lead)})
 
 
 def read_exr(path: Path, names: Iterable[str] | None = None) -> Arrays:

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import errno
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.errors import InputError
+from mbtf_core.atomic import Stored, write_through
+from mbtf_core.errors import InputError, reason
 
 # Limit of the numbers in all channels of all parts, in multiples of the largest image.
 _MOST_CHANNELS = 4
@@ -149,6 +151,33 @@ def _checked_size(head: dict[str, Any], path: Path, max_pixels: int) -> tuple[in
     if any(c.xSampling != 1 or c.ySampling != 1 for c in head["channels"]):
         raise InputError("subsampled EXR channels are not supported", where=path, hint="save it as plain RGB")
     return rows, columns
+
+
+def write_channels(
+    path: Path, channels: Mapping[str, NDArray[np.float32]], header: Mapping[str, Any] | None = None
+) -> Stored:
+    """Write an uncompressed EXR file of named channels (H, W), atomically.
+
+    Parameters
+    ----------
+    header : attributes of the file
+
+    Raises
+    ------
+    PartialError : the disk is full or the folder cannot be written
+    """
+    import OpenEXR
+
+    head = {"compression": OpenEXR.NO_COMPRESSION, "type": OpenEXR.scanlineimage, **(header or {})}
+
+    def write(temporary: Path) -> None:
+        try:
+            OpenEXR.File(head, dict(channels)).write(str(temporary))
+        except RuntimeError as error:
+            # The library's message ends with the file's name and the system's error.
+            raise OSError(errno.EIO, reason(str(error).rpartition('". ')[2].rstrip("."))) from None
+
+    return write_through(path, write)
 
 
 def layers(names: list[str]) -> dict[str, list[str]]:

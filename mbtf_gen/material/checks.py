@@ -20,8 +20,8 @@ CONVENTION_NAMES: dict[Convention, str] = {"gl": "OpenGL", "dx": "DirectX"}
 _COLORED = 0.02
 # Levels, and codes between them, that 8-bit heights in a 16-bit file have.
 _FEW_LEVELS, _FAR_APART = 1024, 16.0
-# Largest plausible ratio of a height scale to the one that the normal map suggests.
-_FAR_OFF = 3.0
+# Ratio of a height scale to the one that the normal map suggests, above which a warning is given.
+_FAR_OFF = 1.5
 
 
 def refuse_color(image: Image) -> None:
@@ -116,29 +116,24 @@ def signed(correlation: float) -> str:
 
 
 def suggestion_warning(path: Path, fit: NormalFit | None, factor: float) -> str | None:
-    """The warning that a default height scale is over three times, or under a third of, the one that the
-    normal map suggests."""
+    """The warning that the height scale in use is over 1.5 times, or under 1/1.5 of, the one that the normal
+    map suggests."""
     if fit is None or not fit.fits or fit.scale == 0:
         return None
     ratio = factor / fit.scale
     if 1 / _FAR_OFF <= ratio <= _FAR_OFF:
         return None
     return (
-        f"{path}: its slopes suggest --height-scale {fit.scale:.3g}; the default of {factor:.3g} is "
-        f"{ratio:{'.0f' if ratio >= 10 else '.2g'}} times as much"
+        f"{path}: its slopes suggest --height-scale {fit.scale:.3g}; {factor:.3g} is in use, "
+        f"{ratio:{'.0f' if abs(ratio) >= 10 else '.2g'}} times as much"
     )
 
 
-def normal_note(
-    path: Path, fit: NormalFit | None, convention: Convention, how: str, factor: float, default: bool
-) -> str:
+def normal_note(path: Path, fit: NormalFit | None, convention: Convention, how: str) -> str:
     """Convention of a normal map, its correlation with the heights, and the height scale it suggests."""
     text = f"normal map: {path.name}, {CONVENTION_NAMES[convention]}, {how}"
     if fit is None:
         return text
     v = fit.correlation_v if convention == "gl" else -fit.correlation_v
     text += f"; correlation of the slopes u {signed(fit.correlation_u)}, v {signed(v)}"
-    if fit.fits:
-        own = "the default" if default else "the material file's"
-        text += f"; suggested --height-scale {fit.scale:.3g} ({own} is {factor:.3g})"
-    return text
+    return f"{text}; suggested --height-scale {fit.scale:.3g}" if fit.fits else text

@@ -43,7 +43,7 @@ _KINDS = {1: "gray", 2: "gray+alpha", 3: "RGB", 4: "RGBA"}
 
 
 def inspect_material(
-    material: Material, height: float | None = None, mesh: int | None = None
+    material: Material, height: float | None = None, mesh: int | None = None, resolution: int | None = None
 ) -> dict[str, Any]:
     """Collect the statistics of a material.
 
@@ -52,6 +52,8 @@ def inspect_material(
     material : Material
     height, mesh : float or None, int or None
         As in :meth:`mbtf_gen.material.material.Material.grid`.
+    resolution : int or None
+        Texels across at the finest level; by default that of the material file, else from the map's width.
 
     Returns
     -------
@@ -61,13 +63,13 @@ def inspect_material(
     grid = material.grid(height, mesh)
     median, high, steepest = slope_angles(grid)
     whole = rms_slope(material.grid(height, material.height.shape[1]))
-    source = "material file" if material.height_given else "default"
     constants = {role: getattr(material, role) for role in MAPS if role not in ("height", "normal")}
     if material.bsdf is not None:
         del constants["base_color"]
     found: dict[str, Any] = {
         "aspect": material.aspect,
-        "tile": material.tile,
+        "make_tileable": material.tile,
+        "resolution": material.lattice(resolution).shape()[1],
         "maps": {role: {**asdict(f), "file": str(f.file)} for role, f in material.facts.items()},
         "constants": {
             role: np.asarray(value).tolist()
@@ -76,8 +78,8 @@ def inspect_material(
         },
         "surface": material.bsdf["type"] if material.bsdf else "diffuse" if material.is_lambert else "glossy",
         "geometry": {
-            "height": material.height_scale if height is None else height,
-            "height_from": source if height is None else "--height-scale",
+            "height_scale": material.height_scale if height is None else height,
+            "height_scale_from": material.height_source(height),
             "map": list(material.height.shape),
             "mesh": list(grid.z.shape),
             "displacement_range": abs(grid.displacement_range),
@@ -129,7 +131,7 @@ def _normal(material: Material) -> dict[str, Any] | None:
     if fit is not None:
         sign = 1.0 if material.normal_convention == "gl" else -1.0
         out |= {**asdict(fit), "correlation_v": sign * fit.correlation_v}
-        out["suggested_height"] = fit.scale if fit.fits else None
+        out["suggested_height_scale"] = fit.scale if fit.fits else None
     return {**out, "convention": material.normal_convention}
 
 
@@ -168,7 +170,8 @@ def inspection_text(found: dict[str, Any], name: str) -> str:
     """The data of :func:`inspect_material` as text for people."""
     surface = found["surface"] + layers_above({*found["maps"], *found["constants"]})
     lines = [
-        f"{name}: tile 1 x {found['aspect']:g}, surface {surface}, make-tileable {found['tile']}",
+        f"{name}: tile 1 x {found['aspect']:g}, surface {surface}, make-tileable {found['make_tileable']}, "
+        f"resolution {found['resolution']}",
         "",
         *_maps(found),
         *_unused(found),
@@ -177,6 +180,12 @@ def inspection_text(found: dict[str, Any], name: str) -> str:
         *_color(found),
         *_normals(found),
     ]
+    if written := found.get("written"):
+        stored = (f"{name} {c['value']} ({c['reason']})" for name, c in written["choices"].items())
+        lines += ["", *_wrapped("written    ", f"{written['file']}: {', '.join(stored)}")]
+    if exported := found.get("exported"):
+        rows, columns = found["geometry"]["mesh"]
+        lines.append(f"exported   {exported}: {columns} x {rows} heights z in tile widths")
     # Warnings without the folders of their files, which the heading names.
     warnings = [
         f"{Path(path).name}: {rest}" for path, _, rest in (w.partition(": ") for w in found["warnings"])
@@ -184,8 +193,13 @@ def inspection_text(found: dict[str, Any], name: str) -> str:
     for title, texts in (("warnings", warnings), ("remarks", found["oddities"])):
         lines += ["", title] if texts else []
         for text in texts:
-            lines += textwrap.wrap(text, _WIDTH, initial_indent="  - ", subsequent_indent="    ")
+            lines += _wrapped("  - ", text)
     return "\n".join(lines)
+
+
+def _wrapped(head: str, text: str) -> list[str]:
+    """Lines of a text behind its head, all of them indented by the width of the head."""
+    return textwrap.wrap(text, _WIDTH, initial_indent=head, subsequent_indent=" " * len(head))
 
 
 def _maps(found: dict[str, Any]) -> list[str]:
@@ -216,7 +230,7 @@ def _unused(found: dict[str, Any]) -> list[str]:
     out = []
     for why, names in reasons.items():
         text = f"{', '.join(names)}: {why}"
-        out += textwrap.wrap(text, _WIDTH, initial_indent="not used   ", subsequent_indent=" " * 11)
+        out += _wrapped("not used   ", text)
     return out
 
 
@@ -224,7 +238,7 @@ def _geometry(found: dict[str, Any]) -> list[str]:
     g, h, file = found["geometry"], found["heights"], found["maps"]["height"]
     u, v = h["repeats"]
     out = [
-        f"height     scale {g['height']:.4g} ({g['height_from']}), stored {file['low']:.4g} .. "
+        f"height     scale {g['height_scale']:.4g} ({g['height_scale_from']}), stored {file['low']:.4g} .. "
         f"{file['high']:.4g}, displacement range {g['displacement_range']:.4g} tile widths",
         f"mesh       {g['mesh'][1]} x {g['mesh'][0]} of {g['map'][1]} x {g['map'][0]} texels, keeps "
         f"{g['slope_kept']:.0%} of the map's RMS slope",
@@ -242,6 +256,8 @@ def _geometry(found: dict[str, Any]) -> list[str]:
             for t in found["tiling"]
         )
         out.append(f"tiling     {seams} (seam / 99th percentile of steps inside)")
+        if found["make_tileable"] != "none":
+            out.append(f"           before make-tileable {found['make_tileable']}, which closes the seams")
     return out
 
 
@@ -274,9 +290,9 @@ def _normals(found: dict[str, Any]) -> list[str]:
     if n["misfit"]:
         how = f"the {n['image']} map {n['turn']}" if n["turn"] else "heights upside down"
         out.append(f"           DOES NOT FIT; fits with {how}: correlation {n['best']:.2f}")
-    elif n["suggested_height"] is not None:
+    elif n["suggested_height_scale"] is not None:
         out.append(
-            f"           the normal map suggests the height scale {n['suggested_height']:.3g}; "
-            f"in use {found['geometry']['height']:.3g}"
+            f"           the normal map suggests the height scale {n['suggested_height_scale']:.3g}; "
+            f"in use {found['geometry']['height_scale']:.3g}"
         )
     return out

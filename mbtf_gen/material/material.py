@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from mbtf_core.color import srgb_to_linear
 from mbtf_core.digest import data_sha256, file_sha256
 from mbtf_core.errors import InputError
+from mbtf_core.lattice import Lattice
 from mbtf_core.shard_schema import Tiling
 from mbtf_core.suggest import suggest_path
 from mbtf_gen.geometry.heightfield import HeightGrid
@@ -102,6 +103,8 @@ class Material:
         Convention that the normal map was read in; None without a map.
     tile : {"none", "mirror", "blend"}
         Method that made the maps tileable.
+    resolution : int or None
+        Texels across at the finest level, from the material file; None without one there.
     """
 
     height: NDArray[np.float64]
@@ -131,6 +134,7 @@ class Material:
     normal_fit: NormalFit | None = None
     normal_convention: Convention | None = None
     tile: Tiling = "none"
+    resolution: int | None = None
 
     @property
     def aspect(self) -> float:
@@ -148,13 +152,24 @@ class Material:
         text = None
         if extent == 0:
             text = f"{path}: its heights are constant: the tile is flat"
-        elif height is None and not self.height_given:
-            if "normal" in self.files:
-                text = suggestion_warning(self.files["normal"], self.normal_fit, self.height_scale)
-            extent *= abs(self.height_scale)
-            if text is None and extent > _STEEP:
-                text = f"{path}: the displacement range is {extent:.4g} tile widths; check --height-scale"
+        elif "normal" in self.files:
+            factor = self.height_scale if height is None else height
+            text = suggestion_warning(self.files["normal"], self.normal_fit, factor)
+        extent *= abs(self.height_scale)
+        if text is None and height is None and not self.height_given and extent > _STEEP:
+            text = f"{path}: the displacement range is {extent:.4g} tile widths; check --height-scale"
         return self.warnings if text is None else (*self.warnings, text)
+
+    def height_source(self, height: float | None = None) -> str:
+        """Origin of the height scale in use, in words, where the user gave `height` or none."""
+        return "given" if height is not None else "material file" if self.height_given else "default"
+
+    def lattice(self, resolution: int | None = None) -> Lattice:
+        """Texel grids of the levels, the finest of `resolution` texels across; by default of the material's
+        own resolution, else from the map's width."""
+        across = resolution or self.resolution
+        rows, columns = self.height.shape
+        return Lattice.for_map(rows, columns, None if across is None else across.bit_length() - 1)
 
     def grid(self, height: float | None = None, mesh: int | None = None) -> HeightGrid:
         """Resample the heights to the grid of the mesh.
@@ -179,7 +194,7 @@ class Material:
         )
 
 
-def load_material(path: str | Path, tile: Tiling = "none") -> Material:
+def load_material(path: str | Path, tile: Tiling | None = None) -> Material:
     """Load a material.
 
     Parameters
@@ -187,9 +202,10 @@ def load_material(path: str | Path, tile: Tiling = "none") -> Material:
     path : str or Path
         A height map, a ``material.yaml``, or a folder that contains one or maps with customary names. Other
         maps beside a height map are ignored.
-    tile : {"none", "mirror", "blend"}
+    tile : {"none", "mirror", "blend"} or None
         Method for maps that do not tile. ``mirror``: 2 × 2 mirrored copies, a tile of twice the width;
-        ``blend``: the edges blended over an eighth of the tile (:mod:`mbtf_gen.material.blending`).
+        ``blend``: the edges blended over an eighth of the tile (:mod:`mbtf_gen.material.blending`); None:
+        that of the material file, else ``none``.
 
     Returns
     -------
@@ -200,13 +216,30 @@ def load_material(path: str | Path, tile: Tiling = "none") -> Material:
     InputError
         A file is missing, unreadable or ambiguous, a value is out of range, or aspects differ.
     """
-    spec, folder, found = _described(Path(path))
+    spec, folder, found = described(Path(path))
+    tile = tile or spec.make_tileable or "none"
     material = _assemble(spec, folder, found, tile)
     return material if tile == "none" else _retiled(material, tile)
 
 
-def _described(path: Path) -> tuple[MaterialFile, Path, FoundMaps]:
-    """Material file, the folder that its file names are relative to, and the maps found there."""
+def described(path: Path) -> tuple[MaterialFile, Path, FoundMaps]:
+    """Material file of what :func:`load_material` loads.
+
+    Parameters
+    ----------
+    path : Path
+        As for :func:`load_material`.
+
+    Returns
+    -------
+    (MaterialFile, Path, FoundMaps)
+        The file, the folder that its file names are relative to, and the maps found there.
+
+    Raises
+    ------
+    InputError
+        Nothing usable is at the path.
+    """
     if path.is_dir():
         described = next((path / name for name in _YAML if (path / name).is_file()), None)
         if described is not None:
@@ -269,7 +302,7 @@ def _assemble(spec: MaterialFile, folder: Path, found: FoundMaps, tile: Tiling) 
         load.notes.append(f"base color: {_DEFAULT_COLOR} gray, none is given")
     convention, fit = None, None
     if spec.normal is not None:
-        maps["normal"], convention, fit = _normals(spec, spec.normal, load, height, scale)
+        maps["normal"], convention, fit = _normals(spec.normal, load, height)
     maps["opacity"] = load.share("opacity", spec.opacity)
     if maps["opacity"] is not None:
         holes = np.mean(np.asarray(maps["opacity"]) < 0.5)
@@ -282,8 +315,8 @@ def _assemble(spec: MaterialFile, folder: Path, found: FoundMaps, tile: Tiling) 
         maps["sheen_color"] = load.color("sheen_color", spec.sheen_color)
     if spec.bsdf is not None:
         maps["bsdf"], load.settings["bsdf"] = _bsdf(spec.bsdf, load)
-    if tile != "none":
-        load.settings["tile"] = tile
+    load.settings |= {} if tile == "none" else {"tile": tile}
+    load.settings |= {} if spec.resolution is None else {"resolution": spec.resolution}
     digests = {role: file_sha256(path) for role, path in load.files.items()}
     digests["settings"] = data_sha256(load.settings)
     return Material(
@@ -302,6 +335,7 @@ def _assemble(spec: MaterialFile, folder: Path, found: FoundMaps, tile: Tiling) 
         seams=edges,
         normal_fit=fit,
         normal_convention=convention,
+        resolution=spec.resolution,
     )
 
 
@@ -328,7 +362,7 @@ def _retiled(material: Material, tile: Literal["mirror", "blend"]) -> Material:
 
 
 def _normals(
-    spec: MaterialFile, entry: NormalEntry, load: MapLoader, height: NDArray[np.float64], scale: float
+    entry: NormalEntry, load: MapLoader, height: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], Convention, NormalFit | None]:
     """Unit vectors (h, w, 3), their convention, and their comparison with the heights."""
     vectors = load.normals(entry)
@@ -337,7 +371,7 @@ def _normals(
     convention, how, warning = choose_convention(fit, normal_convention(path.name), entry.convention, path)
     misfit = None if fit is None else orientation_warning(fit, path, load.files["height"])
     load.warnings += filter(None, (warning, misfit))
-    load.notes.append(normal_note(path, fit, convention, how, scale, spec.height.scale is None))
+    load.notes.append(normal_note(path, fit, convention, how))
     load.settings["normal"] = convention
     green = np.array([1.0, 1.0 if convention == "gl" else -1.0, 1.0], np.float32)
     return vectors * green, convention, fit
@@ -365,12 +399,8 @@ def _heights(spec: MaterialFile, load: MapLoader) -> tuple[NDArray[np.float64], 
     if entry.colorspace == "srgb":
         height = np.asarray(srgb_to_linear(height), np.float64)
         load.settings["height.encoding"] = entry.colorspace
-    displacement = abs(scale) * float(np.ptp(height))
     kind = "floats" if image.bits is None else f"{image.bits}-bit integers"
-    load.notes.append(
-        f"heights: {image.path.name}, {image.shape[1]} x {image.shape[0]} {kind}, "
-        f"displacement range {displacement:.4g} tile widths at its own height scale {scale:g}"
-    )
+    load.notes.append(f"heights: {image.path.name}, {image.shape[1]} x {image.shape[0]} {kind}")
     return height, codes, scale
 
 

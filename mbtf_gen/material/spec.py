@@ -9,6 +9,8 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, model_validator
 
 from mbtf_core.config_file import FileName, Settings, build, read_yaml
+from mbtf_core.shard_schema import Tiling
+from mbtf_gen.config.generator import MAX_SCALE, Resolution
 from mbtf_gen.images.metadata import ColorSpace
 
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -39,8 +41,8 @@ class HeightEntry(_Entry):
     channel: Channel | None = Field(None, description=_CHANNEL)
     scale: float | None = Field(
         None,
-        ge=-100,
-        le=100,
+        ge=-MAX_SCALE,
+        le=MAX_SCALE,
         description="factor on the stored heights, tile widths; default 1 for floats, 0.05 for integers",
     )
     dequantize: bool = Field(True, description="smooth quantized heights within half a quantization step")
@@ -123,6 +125,15 @@ class MaterialFile(Settings):
     opacity: ShareEntry | None = Field(None, description="1 opaque to 0 hole; default: opaque")
     bsdf: dict[str, Any] | None = Field(
         None, description="Mitsuba BSDF that replaces the maps, passed to Mitsuba unchanged"
+    )
+    make_tileable: Tiling | None = Field(
+        None,
+        description="method for maps that do not tile: 2 x 2 mirrored copies, or blended edges; "
+        "default: none",
+    )
+    resolution: Resolution | None = Field(
+        None,
+        description="texels across at the finest level, a power of two; default: from the map's width",
     )
 
     @model_validator(mode="after")

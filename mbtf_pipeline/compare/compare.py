@@ -78,7 +78,6 @@ def compare(
     from mbtf_fit import Material
     from mbtf_gen.dataset.reader import Dataset
     from mbtf_gen.job import Job
-    from mbtf_gen.material.material import load_material
     from mbtf_gen.planning.effects_plan import reference_plan
     from mbtf_gen.planning.simulation import build_estimator
 
@@ -89,8 +88,7 @@ def compare(
     (out / PICTURES).mkdir(parents=True, exist_ok=True)
     materials = {name: Material.load(folder) for name, folder in fits.items()}
     start = time.perf_counter()
-    material = load_material(Path(generate.material), generate.geometry.make_tileable)
-    job = Job(generate, material)
+    job = Job.load(generate)
     estimator = build_estimator(job, reference_plan(job))
     rendered = _render_references(section, estimator, progress)
     seconds = time.perf_counter() - start
@@ -118,7 +116,7 @@ def compare(
         "seconds": {"references": round(seconds, 3)},
     }
     if section.unmodified_mitsuba:
-        record["unmodified_mitsuba"] = write_agreement(section, generate, material, white, out)
+        record["unmodified_mitsuba"] = write_agreement(section, job.config, job.material, white, out)
     if section.timing:
         import torch
 

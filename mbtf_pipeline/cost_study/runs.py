@@ -24,7 +24,6 @@ from mbtf_core.units import parse_duration
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation import generate
 from mbtf_gen.job import Job
-from mbtf_gen.material.material import load_material
 from mbtf_pipeline.cost_study.measurements import Configuration, Measurement
 
 if TYPE_CHECKING:
@@ -109,7 +108,7 @@ class RunRunner:
         shutil.rmtree(folder, ignore_errors=True)
         start = time.perf_counter()
         # `Job.prepare` would log the material's warnings for every data set.
-        job = Job(config, load_material(Path(config.material), config.geometry.make_tileable))
+        job = Job.load(config)
         generate(job, folder)
         return folder, time.perf_counter() - start
 
@@ -199,7 +198,7 @@ def forecast_seconds(config: GeneratorConfig) -> float:
     from mbtf_gen.planning.effects_plan import plan_effects
     from mbtf_gen.planning.run_plan import allocate
 
-    job = Job(config, load_material(Path(config.material), config.geometry.make_tileable))
+    job = Job.load(config)
     return max(forecast(job, allocate(job, plan_effects(job, pilots=False))).query_seconds, _CHEAPEST)
 
 

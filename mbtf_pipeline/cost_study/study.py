@@ -17,7 +17,7 @@ from mbtf_core.stats import Estimate, signal_variance
 from mbtf_core.units import expectation
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.dataset.shard_io import row_bytes
-from mbtf_gen.material.material import load_material
+from mbtf_gen.job import Job
 from mbtf_pipeline.cost_study.fit_runs import GENERATOR, RUN_SHARES, planned_runs
 from mbtf_pipeline.cost_study.generator_benchmark import GeneratorBenchmark
 from mbtf_pipeline.cost_study.generator_runs import generator_tasks
@@ -127,7 +127,8 @@ def run_study(
         progress(min(1.0, spent() / (seconds + refine)), text)
 
     config = study_config(recipe.generate, seed)
-    material = load_material(Path(config.material), config.geometry.make_tileable)
+    job = Job.prepare(config)
+    config, material = job.config, job.material
     claim(folder)
     with locked(folder, STUDY_NAME):
         benchmark = GeneratorBenchmark(config, material)

@@ -60,7 +60,7 @@ class PreviewPictures:
                 raise
             console.note(f"only the queries are drawn: {error.where}: {error.what}")
             return
-        self.job = job
+        self.job, self.config = job, config.model_copy(update=dict(job.config))
         self.omega_i = from_angles(light.elevation, light.azimuth)
         self.camera = tiles_camera(
             view.elevation,

@@ -112,3 +112,14 @@ def test_a_preset_sets_the_resolution_up_to_that_of_the_map(
     arguments = dict(bound.arguments)
     job = prepare_job(command.read_options(arguments), str(heights), arguments["quality"])
     assert job.lattice.shape() == (resolution, resolution)
+
+
+def test_the_resolution_of_a_material_overrides_that_of_a_preset(heights: Path) -> None:
+    from mbtf_core.config_file import build
+    from mbtf_gen.config.generator import GeneratorConfig
+    from mbtf_gen.job import Job, limit_resolution
+
+    file = heights.with_name("material.yaml")
+    file.write_text(f"height: {heights.name}\nresolution: 32\n")
+    config = build(GeneratorConfig, {"material": str(file), "queries": {"resolution": 128}}, source="")
+    assert limit_resolution(Job.load(config)).lattice.shape() == (32, 32)

@@ -97,7 +97,7 @@ class TestNumbers:
         assert found["aspect"] == 0.5
         assert found["surface"] == "glossy"
         assert found["geometry"]["mesh"] == [24, 48]
-        assert found["geometry"]["height"] == 0.2
+        assert found["geometry"]["height_scale"] == 0.2
         assert found["geometry"]["displacement_range"] <= 0.2
         assert 0.3 < found["geometry"]["slope_kept"] < 0.95
         assert found["albedo"]["share_above"] == 0.25
@@ -105,7 +105,7 @@ class TestNumbers:
         assert found["albedo"]["median"] == pytest.approx(0.5)
         assert (found["albedo"]["min"], found["albedo"]["max"]) == pytest.approx((0.01, 0.97))
         assert found["opacity"] == {"holes": 0.25, "partly": 0.0}
-        assert found["normal"]["suggested_height"] == pytest.approx(0.1, rel=0.01)
+        assert found["normal"]["suggested_height_scale"] == pytest.approx(0.1, rel=0.01)
         assert found["constants"] == {"roughness": 0.5, "specular": 0.5}
         assert [t["tiles"] for t in found["tiling"]] == [True, True]
         texts = "\n".join(found["oddities"])
@@ -141,7 +141,7 @@ class TestNumbers:
 class TestText:
     def test_heading_and_figures(self, folder: Path) -> None:
         text = inspection_text(inspect_material(load_material(folder)), "rock")
-        assert text.startswith("rock: tile 1 x 0.5, surface glossy, make-tileable none\n")
+        assert text.startswith("rock: tile 1 x 0.5, surface glossy, make-tileable none, resolution 64\n")
         for part in (
             "displaces the mesh",
             "slopes     median",
@@ -160,7 +160,7 @@ class TestText:
 
     def test_every_entry_of_a_material_file(self, folder: Path) -> None:
         """Each as a map and as a constant, but the heights, normals and BSDF, which are no numbers."""
-        assert set(USES) == set(MaterialFile.model_fields) - {"bsdf"}
+        assert set(USES) == set(MaterialFile.model_fields) - {"bsdf", "make_tileable", "resolution"}
         shares = sorted(set(USES) - {"height", "normal"})
         for value in ("0.5", "metallic.npy"):
             text = "height: height.png\n" + "".join(f"{name}: {value}\n" for name in shares)
@@ -191,25 +191,24 @@ class TestText:
             assert f"not used   {name}" in text
         assert "orm.png: is not used, and its map is missing" in text
 
-    def test_a_default_height_far_from_the_suggested_one(self, folder: Path) -> None:
+    def test_a_height_scale_far_from_the_suggested_one(self, folder: Path) -> None:
         save_normals(folder / "normal.png", normals_of(fractal(48, 96), 0.01))
 
         def warned(height: float | None = None) -> bool:
             warnings = inspect_material(load_material(folder), height)["warnings"]
-            return any("; the default of 0.05 is 5 times as much" in warning for warning in warnings)
+            return any("; 0.05 is in use, 5 times as much" in warning for warning in warnings)
 
         assert warned()
-        assert any("(the default is 0.05)" in note for note in load_material(folder).notes)
-        assert not warned(0.05)
+        assert warned(0.05)
+        assert not warned(0.012)
         save_heights(folder / "height.png", fractal(48, 96) / 50)
         (warning,) = (w for w in load_material(folder).warnings_at() if "suggest" in w)
-        assert "is 0.1 times as much" in warning
+        assert "in use, 0.1 times as much" in warning
         save_heights(folder / "height.png", fractal(48, 96))
         (folder / "material.yaml").write_text("height: {file: height.png, scale: 0.05}\nnormal: normal.png\n")
-        assert not warned()
-        assert any("(the material file's is 0.05)" in note for note in load_material(folder).notes)
+        assert warned()
         (folder / "material.yaml").unlink()
-        save_normals(folder / "normal.png", normals_of(fractal(48, 96), 0.02))
+        save_normals(folder / "normal.png", normals_of(fractal(48, 96), 0.04))
         assert not any("slopes suggest" in w for w in load_material(folder).warnings_at())
 
 
@@ -218,7 +217,7 @@ class TestCommand:
         assert run(app, ["inspect", str(folder), *["--json", "--height-scale", "0.3", "--mesh", "10"]]) == 0
         found = json.loads(capsys.readouterr().out)
         assert found["material"] == str(folder)
-        assert found["geometry"]["height"] == 0.3
+        assert found["geometry"]["height_scale"] == 0.3
         assert found["geometry"]["mesh"] == [5, 10]
         assert found["maps"]["height"]["bits"] == 16
 

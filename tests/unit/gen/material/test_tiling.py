@@ -151,7 +151,7 @@ def test_jobs_use_it(tmp_path: Path) -> None:
 
     path = save_heights(tmp_path / "h.png", cut(fractal(64, 64)))
     config = {"material": str(path), "geometry": {"make_tileable": "mirror"}}
-    assert GeneratorConfig.model_validate({"material": "m"}).geometry.make_tileable == "none"
+    assert GeneratorConfig.model_validate({"material": "m"}).geometry.make_tileable is None
     job = Job.prepare(GeneratorConfig.model_validate(config))
     assert job.material.height.shape == (96, 96)
     assert job.material.tile == "mirror"
