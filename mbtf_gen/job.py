@@ -107,7 +107,7 @@ class Job:
     @cached_property
     def lattice(self) -> Lattice:
         """Texel grids of the levels."""
-        return self.material.lattice(self.config.queries.resolution)
+        return self.material.lattice(self.config.queries.finest)
 
     @cached_property
     def config_hash(self) -> str:

@@ -48,19 +48,19 @@ def inspect(
     from mbtf_gen.material.material import load_material
 
     geometry = resolved.geometry
-    height, resolution = geometry.height_scale, resolved.queries.resolution
+    height, finest = geometry.height_scale, resolved.queries.finest
     loaded = load_material(resolved.material, geometry.make_tileable)
     outputs: dict[str, Any] = {}
     if write is not None:
         choices = write_material_file(write, loaded, resolved)
         outputs["written"] = {"file": write, "choices": {name: asdict(c) for name, c in choices.items()}}
         # What follows describes the material as other commands will use it.
-        loaded, height, resolution = replace(load_material(write), unused=loaded.unused), None, None
+        loaded, height, finest = replace(load_material(write), unused=loaded.unused), None, None
     if export is not None:
         make_folder(export.parent)
         write_channels(export, {"Y": loaded.grid(height, geometry.mesh).z.astype("float32")})
         outputs["exported"] = export
-    described = inspect_material(loaded, height, geometry.mesh, resolution)
+    described = inspect_material(loaded, height, geometry.mesh, finest)
     found = {"material": resolved.material, **described, **outputs}
     console.report(found, inspection_text(found, resolved.material))
 

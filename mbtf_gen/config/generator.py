@@ -160,6 +160,11 @@ class QueriesSection(Settings):
         "footprint; default: one query in every texel of the finest level",
     )
 
+    @property
+    def finest(self) -> int | None:
+        """The finest level k, ``log2(resolution)``; None: the material's own."""
+        return None if self.resolution is None else self.resolution.bit_length() - 1
+
 
 class LightSection(Settings):
     """The smoothed directional light."""

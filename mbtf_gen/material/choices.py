@@ -36,6 +36,11 @@ def choose(spec: MaterialFile, material: Material, config: GeneratorConfig) -> d
     spec : the material as described
     material : the same, loaded
     config : its options of the geometry and its resolution are given ones
+
+    Returns
+    -------
+    dict of str to Choice
+        By dotted key; without those that nothing decides.
     """
     out = {
         "height.scale": _height_scale(spec, material, config.geometry.height_scale),
@@ -90,6 +95,11 @@ def write_material_file(path: Path, material: Material, config: GeneratorConfig)
     path : the file; replaced if it exists
     material : loaded as `config` says
     config : names the material, and the options that were given
+
+    Returns
+    -------
+    dict of str to Choice
+        The choices.
 
     Raises
     ------

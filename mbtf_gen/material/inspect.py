@@ -43,7 +43,7 @@ _KINDS = {1: "gray", 2: "gray+alpha", 3: "RGB", 4: "RGBA"}
 
 
 def inspect_material(
-    material: Material, height: float | None = None, mesh: int | None = None, resolution: int | None = None
+    material: Material, height: float | None = None, mesh: int | None = None, finest: int | None = None
 ) -> dict[str, Any]:
     """Collect the statistics of a material.
 
@@ -52,8 +52,8 @@ def inspect_material(
     material : Material
     height, mesh : float or None, int or None
         As in :meth:`mbtf_gen.material.material.Material.grid`.
-    resolution : int or None
-        Texels across at the finest level; by default that of the material file, else from the map's width.
+    finest : int or None
+        As in :meth:`mbtf_gen.material.material.Material.lattice`.
 
     Returns
     -------
@@ -69,7 +69,7 @@ def inspect_material(
     found: dict[str, Any] = {
         "aspect": material.aspect,
         "make_tileable": material.tile,
-        "resolution": material.lattice(resolution).shape()[1],
+        "resolution": material.lattice(finest).shape()[1],
         "maps": {role: {**asdict(f), "file": str(f.file)} for role, f in material.facts.items()},
         "constants": {
             role: np.asarray(value).tolist()

@@ -164,12 +164,13 @@ class Material:
         """Origin of the height scale in use, in words, where the user gave `height` or none."""
         return "given" if height is not None else "material file" if self.height_given else "default"
 
-    def lattice(self, resolution: int | None = None) -> Lattice:
-        """Texel grids of the levels, the finest of `resolution` texels across; by default of the material's
-        own resolution, else from the map's width."""
-        across = resolution or self.resolution
+    def lattice(self, finest: int | None = None) -> Lattice:
+        """Texel grids of the levels up to `finest`; by default up to the material's own resolution, else to
+        that of the map."""
+        if finest is None and self.resolution is not None:
+            finest = self.resolution.bit_length() - 1
         rows, columns = self.height.shape
-        return Lattice.for_map(rows, columns, None if across is None else across.bit_length() - 1)
+        return Lattice.for_map(rows, columns, finest)
 
     def grid(self, height: float | None = None, mesh: int | None = None) -> HeightGrid:
         """Resample the heights to the grid of the mesh.

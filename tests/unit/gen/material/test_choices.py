@@ -106,11 +106,13 @@ class TestWrite:
     )
     def test_the_hash_covers_the_file(self, maps: Path, key: str, value: Any) -> None:
         content = written(maps, "--resolution", "16")
-        before = job_of(maps).config_hash
+        before, digests = job_of(maps).config_hash, load_material(maps).digests
         assert job_of(maps).config_hash == before
         content[key] = {**content[key], **value} if isinstance(value, dict) else value
         (maps / "material.yaml").write_text(json.dumps(content))
         assert job_of(maps).config_hash != before
+        # Recipes know the material by its digests.
+        assert load_material(maps).digests["settings"] != digests["settings"]
 
     def test_names_are_relative_to_the_file(self, maps: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         (maps.parent / "link").symlink_to(maps.parent)

@@ -77,8 +77,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Any:
         return SimpleNamespace(material=Material(), seconds=5.0, total_seconds=6.0)
 
     monkeypatch.setattr(module, "generate", generate)
-    monkeypatch.setattr(module, "load_material", lambda *_: None)
-    monkeypatch.setattr(module, "Job", lambda config, material: SimpleNamespace(config=config))
+    monkeypatch.setattr(module, "Job", SimpleNamespace(load=lambda config: SimpleNamespace(config=config)))
     monkeypatch.setattr(module, "time", found)
     monkeypatch.setattr(mbtf_fit, "fit", fit)
     return found
@@ -171,8 +170,7 @@ def test_commands_reproduce_their_run(
 def test_every_seed_has_one_test_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[GeneratorConfig] = []
     monkeypatch.setattr(module, "generate", lambda job, folder: asked.append(job.config))
-    monkeypatch.setattr(module, "load_material", lambda *_: None)
-    monkeypatch.setattr(module, "Job", lambda config, material: SimpleNamespace(config=config))
+    monkeypatch.setattr(module, "Job", SimpleNamespace(load=lambda config: SimpleNamespace(config=config)))
     monkeypatch.setattr("mbtf_gen.dataset.reader.Dataset.open", lambda folder: folder)
     monkeypatch.setattr("mbtf_fit.data.loader.load_split", lambda data, split: split)
     one = runner(tmp_path, 3, test=(1 << 17, 8))
