@@ -9,8 +9,8 @@ from mbtf_core.errors import PartialError
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.dataset.folder import has_dataset, open_folder
 from mbtf_gen.dataset.render_shards import ProgressCallback, render_shards
+from mbtf_gen.dataset.sidecar import finished_record
 from mbtf_gen.dataset.summary import Summary, finish, read_run_plan
-from mbtf_gen.dataset.verify import finished_record
 from mbtf_gen.job import Job, planned_paths
 from mbtf_gen.planning.run_plan import plan_run
 
@@ -18,7 +18,7 @@ from mbtf_gen.planning.run_plan import plan_run
 def paths_left(job: Job, folder: str | Path, slice_index: int = 1, slice_count: int = 1) -> int:
     """Paths that :func:`generate` has yet to trace: those of the slice's unfinished shards."""
     entries = job.shards[slice_index - 1 :: slice_count]
-    left = [e for e in entries if not finished_record(Path(folder) / e.file, e.rows, job.config_hash)]
+    left = [e for e in entries if not finished_record(Path(folder), e, job.config_hash)]
     return planned_paths(job, left)
 
 
