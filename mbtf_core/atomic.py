@@ -238,7 +238,7 @@ def _read_json(path: Path, hint: str = "") -> tuple[bytes, dict[str, Any]]:
         content = path.read_bytes()
         data = json.loads(content.decode(), parse_constant=_refuse_constant)
     except FileNotFoundError:
-        raise InputError("no such file", where=path) from None
+        raise InputError("no such file", where=path, hint=hint) from None
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", where=path) from None
     except (ValueError, RecursionError) as error:
@@ -248,14 +248,19 @@ def _read_json(path: Path, hint: str = "") -> tuple[bytes, dict[str, Any]]:
     return content, data
 
 
-def read_json(path: Path) -> dict[str, Any]:
+def read_json(path: Path, hint: str = "") -> dict[str, Any]:
     """JSON object stored in a file.
+
+    Parameters
+    ----------
+    path : Path
+    hint : what to do about a damaged document
 
     Raises
     ------
     InputError : missing, unreadable, or not a JSON object
     """
-    return _read_json(path)[1]
+    return _read_json(path, hint)[1]
 
 
 def _refuse_constant(name: str) -> None:

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 FORMAT_NAME = "mbtf-shards"
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 MANIFEST_NAME = "manifest.json"
 CONFIG_NAME = "config.yaml"
 

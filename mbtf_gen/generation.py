@@ -11,8 +11,8 @@ from mbtf_core.shard_schema import ShardEntry
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.dataset.folder import has_dataset, open_folder
 from mbtf_gen.dataset.render_shards import ProgressCallback, render_shards
+from mbtf_gen.dataset.sidecar import finished_record
 from mbtf_gen.dataset.summary import Summary, finish, read_run_plan
-from mbtf_gen.dataset.verify import finished_record
 from mbtf_gen.job import Job
 from mbtf_gen.planning.run_plan import RunPlan, plan_run
 
@@ -23,7 +23,7 @@ def unfinished(
     """Shards of a slice that :func:`generate` has yet to render."""
     entries = job.shards[slice_index - 1 :: slice_count]
     folder = Path(folder)
-    return [e for e in entries if overwrite or not finished_record(folder / e.file, e.rows, job.config_hash)]
+    return [e for e in entries if overwrite or not finished_record(folder, e, job.config_hash)]
 
 
 def generate(

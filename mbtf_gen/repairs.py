@@ -1,15 +1,15 @@
 """Restores what ``verify`` finds missing or corrupt, and nothing else.
 
-The manifest describes the data set. If it is corrupt, the sidecars replace it as evidence. Each contains the
-hash of the configuration and the digest of the run plan. A manifest rebuilt from ``config.yaml`` and the
-material is accepted only if both match.
+The manifest describes the data set. If it is corrupt or missing, the sidecars replace it as evidence. Each
+contains the hash of the configuration and the digest of the run plan. A manifest rebuilt from ``config.yaml``
+and the material is accepted only if both match. Where manifest, sidecars and ``config.yaml`` disagree,
+nothing is changed until the user chooses which of them to keep.
 """
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -18,15 +18,17 @@ from pydantic import ValidationError
 
 from mbtf_core.atomic import read_checksummed, read_json, write_checksummed, write_text
 from mbtf_core.config_file import differences, dump_yaml, in_short, read_yaml
+from mbtf_core.digest import file_sha256
 from mbtf_core.errors import InputError, MbtfError
 from mbtf_core.locks import brief_lock
-from mbtf_core.shard_schema import CONFIG_NAME, FORMAT_NAME, MANIFEST_NAME, ShardEntry
+from mbtf_core.shard_schema import CONFIG_NAME, FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, ShardEntry
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.dataset.manifest import build_manifest, plan_digest
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.dataset.render_shards import ProgressCallback, render_shards
+from mbtf_gen.dataset.sidecar import sidecars
 from mbtf_gen.dataset.summary import finish, read_run_plan
-from mbtf_gen.dataset.verify import INCOMPLETE, TWICE, UNLISTED, Fault, shard_faults, verify
+from mbtf_gen.dataset.verify import INCOMPLETE, TWICE, Fault, foreign_files, shard_faults, verify
 from mbtf_gen.job import Job
 from mbtf_gen.planning.run_plan import RunPlan, plan_run
 
@@ -48,8 +50,8 @@ class RepairResult:
         Files of the shards that were rendered again.
     documents : list of str
         Manifest and configuration, if they were written again.
-    left : list of Fault
-        Faults that remain: files that the manifest does not list.
+    foreign : list of str
+        Files in the folder that are no part of the data set; they are left alone.
     complete : bool
         Whether all shards are finished now.
     paths : int
@@ -62,10 +64,25 @@ class RepairResult:
     faults: list[Fault]
     shards: list[str]
     documents: list[str]
-    left: list[Fault]
+    foreign: list[str]
     complete: bool
     paths: int
     seconds: float
+
+
+@dataclass
+class Group:
+    """Files of a folder that belong to one data set, by the configuration and run plan that they state."""
+
+    config_hash: str
+    plan: str
+    name: str
+    shards: int = 0
+    documents: list[str] = field(default_factory=list)
+
+    def __str__(self) -> str:
+        shards = [f"{self.shards} shard{'s' if self.shards > 1 else ''}"] if self.shards else []
+        return f"{self.name} ({', '.join([*self.documents, *shards])})"
 
 
 @dataclass
@@ -77,23 +94,28 @@ class Corruption:
 
     folder: Path
     material: str | None = None
+    keep: str | None = None
+    _jobs: dict[str, Job] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not self.folder.is_dir():
             raise InputError("no such folder", where=self.folder)
-        if not (self.folder / MANIFEST_NAME).exists() and self._evidence[0] is None:
+        lost = not (self.folder / MANIFEST_NAME).exists()
+        if self._intact is not None or (lost and not sidecars(self.folder)):
             Dataset.open(self.folder)
 
     @cached_property
     def faults(self) -> list[Fault]:
-        """The faults that :func:`verify` finds, or that the manifest cannot be read."""
+        """The faults that :func:`verify` finds, or that the manifest cannot be read or is foreign."""
+        if self._intact is not None and self._manifest is None:
+            return [Fault(MANIFEST_NAME, "belongs to another data set", _AGAIN)]
         try:
             return verify(self.folder)
         except InputError as error:
             return [Fault(MANIFEST_NAME, error.what, _AGAIN)]
 
     @cached_property
-    def _manifest(self) -> dict[str, Any] | None:
+    def _intact(self) -> dict[str, Any] | None:
         """The manifest, if it is intact."""
         try:
             return read_checksummed(self.folder / MANIFEST_NAME)
@@ -101,17 +123,85 @@ class Corruption:
             return None
 
     @cached_property
-    def _evidence(self) -> tuple[str | None, str | None]:
-        """Hash of the configuration and digest of the run plan, by majority of the intact sidecars."""
-        seen: Counter[tuple[str, str]] = Counter()
-        for path in self.folder.glob("*-*.json"):
+    def _manifest(self) -> dict[str, Any] | None:
+        """The manifest, if it is intact and of the data set that is repaired."""
+        return self._intact if self.kept is not None and MANIFEST_NAME in self.kept.documents else None
+
+    @cached_property
+    def groups(self) -> list[Group]:
+        """Which files belong together. ``config.yaml`` is left out where it is damaged."""
+        found: dict[tuple[str, str], Group] = {}
+
+        def group(config_hash: object, plan: object) -> Group:
+            key = str(config_hash), str(plan)
+            same = any(config == key[0] and key not in found for config, _ in found)
+            return found.setdefault(key, Group(*key, "-".join(k[:8] for k in key[: 1 + same])))
+
+        manifest, listed = self._intact, sidecars(self.folder)
+        if manifest is not None:
+            group(manifest["config_hash"], plan_digest(manifest)).documents.append(MANIFEST_NAME)
+            entries = (e for content in manifest["splits"].values() for e in content["shards"])
+            names = {Path(entry["file"]).stem for entry in entries}
+            listed = [path for path in listed if path.stem in names]
+        for path in listed:
             try:
                 record = read_checksummed(path)
             except InputError:
                 continue
-            if record.get("format") == FORMAT_NAME:
-                seen[str(record.get("config_hash")), str(record.get("plan"))] += 1
-        return seen.most_common(1)[0][0] if seen else (None, None)
+            if (record.get("format"), record.get("schema")) == (FORMAT_NAME, SCHEMA_VERSION):
+                group(record.get("config_hash"), record.get("plan")).shards += 1
+        if found and (config_hash := self._config_hash({key[0] for key in found})):
+            plans = [plan for config, plan in found if config == config_hash]
+            group(config_hash, plans[0] if plans else None).documents.append(CONFIG_NAME)
+        return [*found.values()]
+
+    def _config_hash(self, known: set[str]) -> str | None:
+        """Hash of the configuration in ``config.yaml``; None where it is unknown."""
+        path, intact, guess = self.folder / CONFIG_NAME, self._intact, None
+        try:
+            config = GeneratorConfig.model_validate(read_yaml(path))
+        except (MbtfError, ValidationError):
+            return None
+        if intact is not None:
+            if file_sha256(path) == intact.get("config_yaml"):
+                return str(intact["config_hash"])
+            # The options with the manifest's inputs: the material may be elsewhere by now.
+            guess = config.hash(intact.get("inputs", {}))
+            if known == {guess}:
+                return guess
+        try:
+            found = self._prepare(self._located(config)).config_hash
+        except MbtfError:
+            found = None
+        if found in known:
+            return found
+        return None if guess in known else guess
+
+    def _prepare(self, config: GeneratorConfig) -> Job:
+        """Job of a configuration, whose material is loaded once."""
+        key = config.model_dump_json()
+        if key not in self._jobs:
+            self._jobs[key] = Job.prepare(config)
+        return self._jobs[key]
+
+    def _located(self, config: GeneratorConfig) -> GeneratorConfig:
+        return config.model_copy(update={"material": self.material}) if self.material else config
+
+    @cached_property
+    def kept(self) -> Group | None:
+        """The data set that is repaired; an InputError if there are several and none is chosen."""
+        groups, chosen = self.groups, self.keep
+        if chosen is None and len(groups) < 2:
+            return groups[0] if groups else None
+        for found in groups:
+            if found.name == chosen and (found.shards or MANIFEST_NAME in found.documents):
+                return found
+        what = f"its files belong to {len(groups)} data sets: {', '.join(map(str, groups))}"
+        if chosen is not None:
+            names = ", ".join(map(str, groups)) or "none"
+            what = f"--keep {chosen} names no data set that can be restored; there are: {names}"
+        hint = f"nothing was changed; choose one: mbtf-gen repair {self.folder} --keep NAME"
+        raise InputError(what, where=self.folder, hint=hint)
 
     def _configurations(self) -> Iterator[GeneratorConfig]:
         """Configurations that can be read, the manifest's first."""
@@ -125,14 +215,13 @@ class Corruption:
             except (MbtfError, KeyError, ValidationError):
                 continue
             if config != first:
-                yield config.model_copy(update={"material": self.material}) if self.material else config
+                yield self._located(config)
             first = config
 
     @cached_property
     def job(self) -> Job:
         """The job of the data set."""
-        expected = self._evidence[0] if self._manifest is None else self._manifest["config_hash"]
-        if expected is None:
+        if self.kept is None:
             raise InputError(
                 "cannot be restored: no sidecar of the folder is intact",
                 where=self.folder / MANIFEST_NAME,
@@ -146,8 +235,8 @@ class Corruption:
                     where=self.folder,
                     hint="give its path: mbtf-gen repair FOLDER --material PATH",
                 )
-            job = Job.prepare(config)
-            if job.config_hash == expected:
+            job = self._prepare(config)
+            if job.config_hash == self.kept.config_hash:
                 return job
             tried.append(job)
         if not tried:
@@ -169,7 +258,7 @@ class Corruption:
         if self._manifest is not None:
             return read_run_plan(self.folder)
         plan = plan_run(self.job)
-        if plan_digest(plan.to_manifest()) != self._evidence[1]:
+        if self.kept is None or plan_digest(plan.to_manifest()) != self.kept.plan:
             raise InputError(
                 "cannot be restored: this machine plans the run differently",
                 where=self.folder / MANIFEST_NAME,
@@ -183,6 +272,10 @@ class Corruption:
         names = {f.file for f in self.faults if f.file in _DOCUMENTS and f.what != INCOMPLETE}
         if self._manifest is None or any(f.what == TWICE for f in self.faults):
             names.add(MANIFEST_NAME)
+        if self._manifest is None:
+            path = self.folder / CONFIG_NAME
+            restored = build_manifest(self.job, self.plan)["config_yaml"]
+            names |= {CONFIG_NAME} if not path.exists() or file_sha256(path) != restored else set()
         return sorted(names, reverse=True)
 
     @cached_property
@@ -190,14 +283,15 @@ class Corruption:
         """Shards that are missing or corrupt; with a corrupt manifest, those of the restored one."""
         job, faults = self.job, self.faults
         if self._manifest is None:
-            faults = [*shard_faults(self.folder, job.shards, job.config_hash, str(self._evidence[1]))]
-        faulty = {f.file for f in faults if self._manifest is None or f.what not in (UNLISTED, TWICE)}
+            digest = plan_digest(self.plan.to_manifest())
+            faults = [*shard_faults(self.folder, job.shards, job.config_hash, digest)]
+        faulty = {f.file for f in faults if f.what != TWICE}
         return [e for e in job.shards if e.file in faulty]
 
-    @cached_property
-    def left(self) -> list[Fault]:
-        """Faults that a repair leaves."""
-        return [f for f in self.faults if f.what == UNLISTED]
+    @property
+    def foreign(self) -> list[str]:
+        """Files that are no part of the data set."""
+        return foreign_files(self.folder, self.job.shards)
 
     def repair(self, progress: ProgressCallback | None = None) -> RepairResult:
         """See :func:`repair`."""
@@ -220,7 +314,7 @@ class Corruption:
             faults=self.faults,
             shards=result.shards,
             documents=documents,
-            left=self.left,
+            foreign=self.foreign,
             complete=finish(self.folder).complete,
             paths=result.paths,
             seconds=round(result.seconds, 3),
@@ -228,7 +322,11 @@ class Corruption:
 
 
 def repair(
-    folder: str | Path, *, material: str | None = None, progress: ProgressCallback | None = None
+    folder: str | Path,
+    *,
+    material: str | None = None,
+    keep: str | None = None,
+    progress: ProgressCallback | None = None,
 ) -> RepairResult:
     """Restore what ``verify`` finds missing or corrupt; the data set is then identical to the original.
 
@@ -238,6 +336,8 @@ def repair(
         The data set.
     material : str, optional
         Current path of the material; by default the path in the data set's configuration.
+    keep : str, optional
+        Which data set to restore where the files belong to several, by the name in that error.
     progress : callable, optional
         As in :func:`~mbtf_gen.generation.generate`.
 
@@ -248,8 +348,8 @@ def repair(
     Raises
     ------
     InputError
-        No data set, or its material is missing or has changed.
+        No data set, its material is missing or has changed, or its files belong to several data sets.
     PartialError
         Other processes write the data set, or the disk is full. The same command resumes.
     """
-    return Corruption(Path(folder), material).repair(progress)
+    return Corruption(Path(folder), material, keep).repair(progress)

@@ -144,20 +144,23 @@ class _RecipeRun:
 
     def _generate(self, data: DataSet, decision: Decision) -> None:
         from mbtf_core.shard_schema import MANIFEST_NAME
-        from mbtf_gen.dataset.verify import sidecar_of
+        from mbtf_gen.dataset.folder import read_manifest
+        from mbtf_gen.dataset.reader import is_dataset
+        from mbtf_gen.dataset.sidecar import sidecar_of
         from mbtf_gen.generation import generate
         from mbtf_gen.job import Job
 
         job = Job.prepare(data.config)
         shards = self.folder / data.sub
-        manifest = shards / MANIFEST_NAME
         for path in decision.changed_files:
-            path.unlink(missing_ok=True)
-            sidecar_of(path).unlink(missing_ok=True)
+            if path.name != MANIFEST_NAME:
+                path.unlink(missing_ok=True)
+                sidecar_of(path).unlink(missing_ok=True)
+        # A lost or damaged manifest is refused: the shards may be whole.
         if (
             decision.forced
-            or not manifest.exists()
-            or read_json(manifest).get("config_hash") != job.config_hash
+            or not is_dataset(shards)
+            or read_manifest(shards)["config_hash"] != job.config_hash
         ):
             clear(shards)
         with self.console.progress(None, data.stage, "paths") as bar:

@@ -22,9 +22,9 @@ def info(path: Path, /, *, console: Console = CONSOLE) -> None:
     """
     if not path.is_dir():
         raise InputError("no such folder", where=path, hint=suggest_path(path, Path.is_dir))
-    from mbtf_core.shard_schema import MANIFEST_NAME
+    from mbtf_gen.dataset.reader import is_dataset
 
-    data, text = _shards_info(path) if (path / MANIFEST_NAME).exists() else _material_info(path)
+    data, text = _shards_info(path) if is_dataset(path) else _material_info(path)
     console.report(data, text)
 
 

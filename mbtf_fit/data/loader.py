@@ -17,7 +17,6 @@ from mbtf_fit.data.images import TrainingImages, nearest_shapes, philox, strides
 from mbtf_fit.data.queries import NEEDED, QUERY_BYTES, ShardQueries, TrainingQueries, mean_value
 from mbtf_fit.data.streaming import Selection, StreamedQueries
 from mbtf_gen.dataset.reader import Dataset, Shard
-from mbtf_gen.dataset.shard_io import Arrays, read_shard
 
 # Training queries that are kept with both halves, as a sample of all.
 SAMPLE = 1 << 16
@@ -65,26 +64,7 @@ def open_data(folder: str | Path, layout: Layout, model: str) -> Dataset:
 
 def read_checked(shard: Shard) -> ShardQueries:
     """One shard, every number checked."""
-    arrays: Arrays = read_shard(shard.path, NEEDED)
-    rows = len(arrays["sigma"])
-    if rows != shard.rows:
-        raise InputError(
-            f"shard holds {rows} rows, its sidecar says {shard.rows}",
-            where=shard.path,
-            hint="check the data set with: mbtf-gen verify",
-        )
-    for name, array in arrays.items():
-        # A sum is finite exactly when no addend is NaN or infinite, short of overflow; look closer only then.
-        with np.errstate(all="ignore"):
-            suspicious = not np.isfinite(np.sum(array, dtype=np.float64))
-        if suspicious and not np.isfinite(array).all():
-            bad = np.argwhere(~np.isfinite(array))
-            raise InputError(
-                f"'{name}' holds NaN or infinite numbers: {len(bad)}, the first in row {bad[0][0]}",
-                where=shard.path,
-                hint="check the data set with: mbtf-gen verify",
-            )
-    return ShardQueries(**arrays)
+    return ShardQueries(**shard.read(NEEDED))
 
 
 def in_region(held_out: HeldOutSection, omega: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -109,7 +89,7 @@ def label_images(data: Dataset, held_out: HeldOutSection, random: np.random.Gene
     out."""
     parts = []
     for shard in data.shards("train"):
-        arrays = read_shard(shard.path, ("omega_i", "omega_o"))
+        arrays = shard.read(("omega_i", "omega_o"))
         light, view = (np.array(arrays[name][:, 0, 0]) for name in ("omega_i", "omega_o"))
         parts.append(in_region(held_out, light) | in_region(held_out, view))
     labels = np.where(np.concatenate(parts), HELD_OUT_DIRECTION, TRAINING)

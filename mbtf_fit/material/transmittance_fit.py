@@ -18,7 +18,7 @@ from mbtf_core.lattice import Lattice, level_of_sigma
 from mbtf_core.stats import Estimate, mean_estimate
 from mbtf_fit.material.transmittance import COEFFICIENTS, Transmittance, basis, corners
 from mbtf_gen.dataset.reader import Dataset
-from mbtf_gen.dataset.shard_io import Arrays, read_shard
+from mbtf_gen.dataset.shard_io import Arrays, check_values, read_shard
 
 if TYPE_CHECKING:
     from mbtf_fit.data.streaming import Selection
@@ -44,6 +44,7 @@ def has_transmittance(data: Dataset) -> bool:
 def _blocks(path: Path, chosen: NDArray[np.bool_] | None = None) -> Iterator[Arrays]:
     """Blocks of arrays (n, ...) of the chosen rows of a shard, or of all."""
     arrays = read_shard(path, _TRAILING)
+    check_values(arrays, path)
     count = len(arrays["sigma"])
     rows = np.arange(count) if chosen is None else np.flatnonzero(chosen)
     step = max(1, _BLOCK * max(count, 1) // max(arrays["sigma"].size, 1))

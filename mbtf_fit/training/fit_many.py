@@ -14,8 +14,8 @@ from queue import SimpleQueue
 from typing import Any
 
 from mbtf_core.errors import InputError, MbtfError, UsageError, reason
-from mbtf_core.shard_schema import MANIFEST_NAME
 from mbtf_fit.config import FitConfig
+from mbtf_gen.dataset.reader import is_dataset
 
 
 @dataclass(frozen=True)
@@ -48,10 +48,10 @@ def find_data(arguments: Sequence[Path]) -> list[Path]:
             except (OSError, UnicodeDecodeError) as error:
                 raise InputError(f"cannot be read as a list ({reason(error)})", where=argument) from None
             mine = [argument.parent / line for line in lines if line and not line.startswith("#")]
-        elif (argument / MANIFEST_NAME).exists() or not argument.is_dir():
+        elif not argument.is_dir() or is_dataset(argument):
             mine = [argument]
         else:
-            mine = sorted(p.parent for p in argument.glob(f"*/{MANIFEST_NAME}"))
+            mine = sorted(path for path in argument.iterdir() if path.is_dir() and is_dataset(path))
         if not mine:
             raise InputError(
                 "holds no data sets", where=argument, hint="generate some: mbtf-gen ... -o FOLDER"

@@ -41,13 +41,15 @@ def verify(folder: Path, /, *, console: Console = CONSOLE) -> int:
         Folder of shards.
     """
     from mbtf_gen.dataset.reader import Dataset
-    from mbtf_gen.dataset.verify import ABSENT, verify
+    from mbtf_gen.dataset.sidecar import ABSENT
+    from mbtf_gen.dataset.verify import foreign_files, verify
 
     start = time.perf_counter()
     faults = verify(folder)
     seconds = time.perf_counter() - start
     dataset = Dataset.open(folder)
-    files = [folder / e["file"] for s in dataset.manifest["splits"].values() for e in s["shards"]]
+    entries = [entry for split in dataset.splits for entry in dataset.entries(split)]
+    files, foreign = [folder / entry.file for entry in entries], foreign_files(folder, entries)
     read = sum(path.stat().st_size for path in files if path.exists())
     lines = [f"{folder / f.file}: {f.what}; {f.hint}" for f in faults if f.what not in ABSENT]
     if absent := [f for f in faults if f.what in ABSENT]:
@@ -59,8 +61,10 @@ def verify(folder: Path, /, *, console: Console = CONSOLE) -> int:
         "bytes": read,
         "seconds": round(seconds, 3),
         "faults": [asdict(f) for f in faults],
+        "foreign": foreign,
     }
-    console.report(data, "\n".join(lines) or f"{folder}: {len(files)} shards, all intact")
+    lines = lines or [f"{folder}: {len(files)} shards, all intact"]
+    console.report(data, "\n".join([*lines, *_describe_foreign(folder, foreign)]))
     console.note(f"{read / 1e6:.1f} MB read in {clock(seconds)} ({read / 1e6 / max(seconds, 1e-9):.0f} MB/s)")
     return EXIT_BAD_INPUT if faults else EXIT_OK
 
@@ -70,6 +74,7 @@ def repair(
     /,
     *,
     material: PathText | None = None,
+    keep: str | None = None,
     dry_run: DryRun = False,
     console: Console = CONSOLE,
 ) -> int:
@@ -81,13 +86,15 @@ def repair(
         Folder of shards.
     material
         Path of the material, if it was moved.
+    keep
+        Which data set to restore, if the files belong to several: the name that the message gives it.
     """
     from mbtf_gen.repairs import Corruption, RepairResult
 
-    found = Corruption(folder, material)
+    found = Corruption(folder, material, keep)
     if dry_run:
         shards = [entry.file for entry in found.entries]
-        done = RepairResult(str(folder), found.faults, shards, found.documents, found.left, False, 0, 0.0)
+        done = RepairResult(str(folder), found.faults, shards, found.documents, found.foreign, False, 0, 0.0)
     else:
         with (
             resumable(f"{folder}: the shards rendered so far are kept"),
@@ -96,14 +103,14 @@ def repair(
             done = found.repair(bar.update)
     data = {"dry_run": dry_run, **asdict(done)}
     console.report(data, _describe_repair(done, dry_run))
-    return EXIT_BAD_INPUT if done.left else EXIT_OK
+    return EXIT_OK if done.complete or dry_run else EXIT_PARTIAL
 
 
 def _describe_repair(done: RepairResult, dry_run: bool) -> str:
-    from mbtf_gen.dataset.verify import ABSENT
+    from mbtf_gen.dataset.sidecar import ABSENT
 
     rendered, written = ("would be rendered", "would be written") if dry_run else ("rendered", "written")
-    shown = [f for f in done.faults if f.what not in ABSENT and f not in done.left]
+    shown = [f for f in done.faults if f.what not in ABSENT]
     lines = [f"{done.folder}/{f.file}: {f.what}" for f in shown]
     if done.shards:
         first = ", ".join(done.shards[:5]) + (", …" if len(done.shards) > 5 else "")
@@ -112,5 +119,11 @@ def _describe_repair(done: RepairResult, dry_run: bool) -> str:
         lines.append(f"{done.folder}: {' and '.join(done.documents)} {written} again")
     if not done.shards and not done.documents:
         lines.append(f"{done.folder}: nothing to repair")
-    lines += [f"{done.folder}/{f.file}: {f.what}, left alone; {f.hint}" for f in done.left]
-    return "\n".join(lines)
+    return "\n".join([*lines, *_describe_foreign(Path(done.folder), done.foreign)])
+
+
+def _describe_foreign(folder: Path, names: list[str]) -> list[str]:
+    if not names:
+        return []
+    shown = ", ".join(names[:5]) + (", …" if len(names) > 5 else "")
+    return [f"{folder}: not part of the data set, left alone: {shown}"]

@@ -33,7 +33,7 @@ def preview(
     interactive
         Also show the mesh in a window, where the mouse turns it.
     """
-    from mbtf_core.shard_schema import MANIFEST_NAME
+    from mbtf_gen.dataset.reader import Dataset, is_dataset
     from mbtf_gen.pictures.preview.drawing import PreviewPictures
 
     if interactive:
@@ -41,9 +41,7 @@ def preview(
 
         check_display()
     dataset = None
-    if material is not None and Path(material, MANIFEST_NAME).is_file():
-        from mbtf_gen.dataset.reader import Dataset
-
+    if material is not None and is_dataset(Path(material)):
         dataset = Dataset.open(material)
         given = [options.flags[key] for key in options.given if not key.startswith("preview.")]
         given += ["--config"] * (options.config is not None) + ["--set"] * bool(options.assignments)

@@ -23,6 +23,7 @@ from mbtf_core.folders import ELSEWHERE, check_folder, make_folder, other_config
 from mbtf_core.locks import brief_lock, lock_owner, shard_lock, take_lock
 from mbtf_core.shard_schema import CONFIG_NAME, FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, SPLITS
 from mbtf_gen.dataset.manifest import build_manifest
+from mbtf_gen.dataset.sidecar import repair_hint, sidecars
 from mbtf_gen.job import Job
 from mbtf_gen.planning.run_plan import RunPlan
 
@@ -33,15 +34,20 @@ _UNFINISHED = re.compile(rf"\.({_OWN.pattern}){TEMPORARY}")
 _LOCK = re.compile(rf"\.({_SHARD}|{re.escape(Path(MANIFEST_NAME).stem)})\.lock")
 
 
+def is_leftover(name: str) -> bool:
+    """Whether a file is a lock, or what a killed run left unfinished."""
+    return bool(_LOCK.fullmatch(name) or _UNFINISHED.fullmatch(name))
+
+
 def read_manifest(folder: Path) -> dict[str, Any]:
     """The manifest of a folder; an InputError unless it is exactly as it was written."""
-    return read_checksummed(folder / MANIFEST_NAME, "repair it with: mbtf-gen repair FOLDER")
+    return read_checksummed(folder / MANIFEST_NAME, repair_hint(folder))
 
 
 def has_dataset(folder: Path, config_hash: str) -> bool:
     """Whether a folder contains a data set of this configuration, finished or not."""
     path = folder / MANIFEST_NAME
-    return path.exists() and read_json(path).get("config_hash") == config_hash
+    return path.exists() and read_json(path, repair_hint(folder)).get("config_hash") == config_hash
 
 
 def open_folder(job: Job, folder: Path, plan: Callable[[Job], RunPlan], overwrite: bool) -> None:
@@ -59,6 +65,8 @@ def open_folder(job: Job, folder: Path, plan: Callable[[Job], RunPlan], overwrit
     PartialError : it cannot be written, or other processes write the data set that is to be replaced
     """
     existing = folder / MANIFEST_NAME
+    if folder.is_dir() and not existing.exists() and sidecars(folder):
+        raise InputError(f"no {MANIFEST_NAME} in it", where=folder, hint=repair_hint(folder))
     present = check_folder(folder, lambda path: (path / MANIFEST_NAME).exists(), "data set")
     replace = overwrite and present
     if replace:
@@ -82,7 +90,7 @@ def open_folder(job: Job, folder: Path, plan: Callable[[Job], RunPlan], overwrit
 
 
 def _check_format(path: Path) -> dict[str, Any]:
-    manifest = read_json(path)
+    manifest = read_json(path, repair_hint(path.parent))
     if manifest.get("format") != FORMAT_NAME:
         raise InputError(f"is not a manifest of {FORMAT_NAME}", where=path, hint=ELSEWHERE)
     return manifest

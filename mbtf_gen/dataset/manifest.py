@@ -28,8 +28,14 @@ def software_versions() -> dict[str, str]:
 
 
 def plan_digest(manifest: Mapping[str, Any]) -> str:
-    """SHA-256 of the run plan in a manifest, hexadecimal. The sidecars of all shards repeat it."""
-    return data_sha256({name: manifest.get(name) for name in ("effects", "allocation")})
+    """SHA-256 of what the run plan in a manifest decides, hexadecimal. The sidecars of all shards repeat it.
+
+    Explanations and bias bounds are left out: they decide nothing, and other versions word them differently.
+    """
+    plan = manifest.get("effects", {})
+    decided = {key: plan.get(key) for key in ("max_depth", "roulette_depth", "closed_form")}
+    on = sorted(effect["name"] for effect in plan.get("effects", []) if effect["on"])
+    return data_sha256({**decided, "effects": on, "allocation": manifest.get("allocation")})
 
 
 def build_manifest(job: Job, plan: RunPlan) -> dict[str, Any]:

@@ -5,22 +5,25 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import numpy as np
 from pydantic import BaseModel, Field
 
-from mbtf_core.atomic import read_json
+from mbtf_core.atomic import read_checksummed, read_json
 from mbtf_core.config_file import check_document, check_schema
 from mbtf_core.errors import InputError
 from mbtf_core.lattice import MAX_LEVEL, Lattice
-from mbtf_core.shard_schema import FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, Layout
+from mbtf_core.shard_schema import FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, Layout, ShardEntry, Split
 from mbtf_core.suggest import suggest_path
-from mbtf_gen.dataset.shard_io import Arrays, read_shard, row_bytes
+from mbtf_gen.dataset.shard_io import Arrays, check_values, column_means, read_shard
+from mbtf_gen.dataset.sidecar import ABSENT, read_sidecar, repair_hint, sidecar_of, sidecars
 
 _Count = Annotated[int, Field(strict=True, ge=0, lt=1 << 40)]
 _FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*\.(npz|exr)$", max_length=100)]
 _MAKE_AGAIN = "generate or download the data set again"
+# The sidecar's mean and that of the shard are float64 sums in different orders.
+_SAME_MEAN = 1e-7
 
 
 class _Entry(BaseModel):
@@ -51,23 +54,83 @@ class _Manifest(BaseModel):
     patch_size: _Count | None = None
 
 
+class _Statistics(BaseModel, allow_inf_nan=False):
+    mean_value: tuple[float, float, float]
+
+
 class _Sidecar(BaseModel):
     """Keys of a sidecar that readers need; others are ignored."""
 
-    rows: _Count
+    statistics: _Statistics
 
 
 @dataclass(frozen=True)
 class Shard:
-    """One finished shard: its file and the content of its sidecar."""
+    """One finished shard.
+
+    Attributes
+    ----------
+    path : Path
+        Its file.
+    sidecar : dict
+        The content of its sidecar.
+    image : tuple of int
+        Rows and columns of an image in the image layout; empty in the shuffled layout.
+    """
 
     path: Path
     sidecar: dict[str, Any]
+    image: tuple[int, ...] = ()
 
     @property
     def rows(self) -> int:
         """Queries in the shuffled layout, images in the image layout."""
         return int(self.sidecar["rows"])
+
+    def read(self, names: Iterable[str] | None = None) -> Arrays:
+        """Its arrays, memory-mapped if the format allows, every number checked.
+
+        Parameters
+        ----------
+        names : iterable of str, optional
+            Arrays to read; all by default.
+
+        Returns
+        -------
+        dict of str to float32 array
+
+        Raises
+        ------
+        InputError
+            It cannot be read, its numbers are invalid, or they are those of another shard: where both values
+            are read, their mean is compared with the sidecar's.
+        """
+        arrays = read_shard(self.path, names)
+        hint = f"check the data set with: mbtf-gen verify {self.path.parent}"
+        for array in arrays.values():
+            rows, image = len(array), array.shape[1:3] if array.ndim > 2 else ()
+            if rows != self.rows:
+                what = f"has {rows} rows, its sidecar says {self.rows}"
+                raise InputError(what, where=self.path, hint=hint)
+            if image != self.image:
+                found, expected = (" x ".join(map(str, s)) or "1" for s in (image, self.image))
+                what = f"has {found} queries per row, {MANIFEST_NAME} says {expected}"
+                raise InputError(what, where=self.path, hint=hint)
+        try:
+            check_values(arrays, self.path)
+        except InputError as error:
+            raise InputError(error.what, where=self.path, hint=hint) from None
+        if self.rows and {"value_a", "value_b"} <= arrays.keys():
+            mean = 0.5 * (column_means(arrays["value_a"]) + column_means(arrays["value_b"]))
+            stated = np.asarray(self.sidecar["statistics"]["mean_value"])
+            if np.abs(mean - stated).max() > _SAME_MEAN * np.abs(stated).max():
+                raise InputError("is not the shard that its sidecar describes", where=self.path, hint=hint)
+        return arrays
+
+
+def is_dataset(folder: Path) -> bool:
+    """Whether a folder contains a data set, possibly without its manifest."""
+    return (folder / MANIFEST_NAME).exists() or bool(sidecars(folder))
 
 
 @dataclass(frozen=True)
@@ -108,14 +171,19 @@ class Dataset:
             raise InputError("no such folder", where=folder, hint=suggest_path(folder, Path.is_dir))
         path = folder / MANIFEST_NAME
         if not path.exists():
+            lost = repair_hint(folder) if is_dataset(folder) else ""
             raise InputError(
                 f"no {MANIFEST_NAME} in it",
                 where=folder,
-                hint="generate one: mbtf-gen heightfield.exr -o FOLDER",
+                hint=lost or "generate one: mbtf-gen heightfield.exr -o FOLDER",
             )
-        manifest = read_json(path)
+        hint = repair_hint(folder)
+        manifest = read_json(path, hint)
         if manifest.get("format") != FORMAT_NAME:
-            raise InputError(f"is not a manifest of {FORMAT_NAME}", where=path)
+            hint = hint if sidecars(folder) else ""
+            raise InputError(f"is not a manifest of {FORMAT_NAME}", where=path, hint=hint)
+        if manifest.get("schema") == SCHEMA_VERSION or "checksum" in manifest:
+            read_checksummed(path, hint)
         check_schema(
             manifest, SCHEMA_VERSION, path, "generate the shards again with this version of mbtf-gen"
         )
@@ -144,13 +212,20 @@ class Dataset:
         """Names of the splits, usually ``train`` and ``test``."""
         return list(self.manifest["splits"])
 
-    def shards(self, split: str) -> list[Shard]:
+    def entries(self, split: str) -> list[ShardEntry]:
+        """Shards that the manifest lists for a split, finished or not."""
+        listed = self.manifest["splits"].get(split, {"shards": []})["shards"]
+        return [ShardEntry(cast(Split, split), i, e["file"], e["rows"]) for i, e in enumerate(listed)]
+
+    def shards(self, split: str, *, finished_only: bool = False) -> list[Shard]:
         """Shards of a split in order.
 
         Parameters
         ----------
         split : str
             ``train`` or ``test``.
+        finished_only : bool
+            Leave out shards that are not rendered yet.
 
         Returns
         -------
@@ -159,29 +234,31 @@ class Dataset:
         Raises
         ------
         InputError
-            No such split, a missing shard, or a corrupt sidecar.
+            No such split, a missing shard, a corrupt sidecar, or a shard that is not the one listed.
         """
         if split not in self.manifest["splits"]:
             raise InputError(f"has no split '{split}' (it has: {', '.join(self.splits)})", where=self.folder)
+        image: tuple[int, ...] = ()
+        if self.layout == "image":
+            image = self.lattice.shape() if self.patch_size is None else (self.patch_size,) * 2
         out = []
-        for entry in self.manifest["splits"][split]["shards"]:
-            path = self.folder / entry["file"]
-            sidecar = path.with_suffix(".json")
-            if not path.exists() or not sidecar.exists():
-                raise InputError(
-                    f"shard {entry['file']} is missing or unfinished",
-                    where=self.folder,
-                    hint="run the mbtf-gen command that generated it again: it resumes",
-                )
-            record = read_json(sidecar)
-            check_document(_Sidecar, record, sidecar, _MAKE_AGAIN)
-            if record["rows"] * row_bytes(holes=False) > path.stat().st_size:
-                raise InputError(
-                    f"is too short for the {record['rows']} rows in its sidecar",
-                    where=path,
-                    hint="check the data set with: mbtf-gen verify",
-                )
-            out.append(Shard(path, record))
+        for entry in self.entries(split):
+            path = self.folder / entry.file
+            try:
+                record = read_sidecar(self.folder, entry, self.manifest["config_hash"])
+            except InputError as error:
+                if error.what in ABSENT and finished_only:
+                    continue
+                if error.what in ABSENT:
+                    raise InputError(
+                        f"shard {entry.file} is missing or unfinished",
+                        where=self.folder,
+                        hint="run the mbtf-gen command that generated it again: it resumes",
+                    ) from None
+                hint = f"check the data set with: mbtf-gen verify {self.folder}"
+                raise InputError(error.what, where=path, hint=hint) from None
+            check_document(_Sidecar, record, sidecar_of(path), _MAKE_AGAIN)
+            out.append(Shard(path, record, image))
         return out
 
     def iterate(self, split: str, names: Iterable[str] | None = None) -> Iterator[Arrays]:
@@ -202,10 +279,10 @@ class Dataset:
         Raises
         ------
         InputError
-            See :meth:`shards`; or a shard cannot be read.
+            See :meth:`shards` and :meth:`Shard.read`.
         """
         wanted = None if names is None else list(names)
-        yield from (read_shard(shard.path, wanted) for shard in self.shards(split))
+        yield from (shard.read(wanted) for shard in self.shards(split))
 
     def load(self, split: str, names: Iterable[str] | None = None) -> Arrays:
         """All queries of a split in memory.

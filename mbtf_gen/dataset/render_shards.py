@@ -21,8 +21,8 @@ from mbtf_core.shard_schema import FORMAT_NAME, SCHEMA_VERSION, ShardEntry
 from mbtf_gen.dataset.folder import remove_leftovers
 from mbtf_gen.dataset.manifest import plan_digest
 from mbtf_gen.dataset.shard_io import write_shard
+from mbtf_gen.dataset.sidecar import finished_record, sidecar_of
 from mbtf_gen.dataset.summary import ShardStatistics, refuse_nonfinite
-from mbtf_gen.dataset.verify import finished_record, sidecar_of
 from mbtf_gen.dataset.writer import ShardWriter
 from mbtf_gen.job import Job, most_paths, planned_paths, split_spp, split_target
 from mbtf_gen.planning.adaptive import estimate_shard
@@ -203,7 +203,7 @@ def _claims(
     def finished(entry: ShardEntry, path: Path) -> dict[str, Any] | None:
         if entry.file in stamps and stamps[entry.file] == _stamp(path):
             return None
-        return finished_record(path, entry.rows, job.config_hash)
+        return finished_record(folder, entry, job.config_hash)
 
     held: deque[_Claim] = deque()
     try:

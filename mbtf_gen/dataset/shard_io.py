@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import math
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -33,6 +33,10 @@ _ALIGNMENT = 64
 # Bytes of a local header without name and extra fields, and of the extra field of 64-bit sizes (APPNOTE.TXT
 # 6.3.3, sections 4.3.7 and 4.5.3).
 _HEADER, _SIZES_64 = 30, 20
+# Unit vectors: largest distance of a squared length from 1. Computing in float32 gives 1e-6 at most.
+_UNIT_TOLERANCE = 1e-5
+# Values of the queries that are checked at once, so that temporary arrays stay in the cache.
+_CHECKED = 1 << 16
 
 
 def row_bytes(holes: bool) -> int:
@@ -68,6 +72,59 @@ def check_arrays(
         if array.shape[len(lead) :] != trailing or len(lead) not in (1, 3) or len(leads) > 1:
             raise InputError(f"array '{name}' has the shape {array.shape}", where=where)
     return leads.pop()
+
+
+def _are_directions(omega: NDArray[np.float32]) -> NDArray[np.bool_]:
+    x, y, z = (omega[..., k] for k in range(3))
+    found: NDArray[np.bool_] = (np.abs(x * x + y * y + z * z - 1) <= _UNIT_TOLERANCE) & (z > 0)
+    return found
+
+
+# Which elements of an array are valid, and what the others are.
+_VALID: dict[str, tuple[Callable[[NDArray[np.float32]], NDArray[np.bool_]], str]] = {
+    "u": (lambda a: (a >= 0) & (a < 1), "numbers outside [0, 1)"),
+    "sigma": (lambda a: (a > 0) & (a < np.inf), "numbers that are not positive"),
+    "omega_i": (_are_directions, "vectors that are not unit vectors with z > 0"),
+    "omega_o": (_are_directions, "vectors that are not unit vectors with z > 0"),
+    "value_a": (np.isfinite, "NaN or infinite numbers"),
+    "value_b": (np.isfinite, "NaN or infinite numbers"),
+    "spp": (lambda a: (a > 0) & (a < np.inf), "numbers that are not positive"),
+    "transmittance": (np.isfinite, "NaN or infinite numbers"),
+}
+# One per image of the image layout.
+_SHARED = ("sigma", "omega_i", "omega_o")
+
+
+def check_values(arrays: Mapping[str, NDArray[np.float32]], where: object) -> None:
+    """Refuse numbers that the arrays of a shard cannot hold.
+
+    Raises
+    ------
+    InputError : with the array, the number of invalid elements, and the row of the first
+    """
+    with np.errstate(all="ignore"):
+        for name, array in arrays.items():
+            valid, fault = _VALID[name]
+            step = max(1, _CHECKED * len(array) // max(array.size, 1))
+            parts = range(0, len(array), step)
+            if not all(valid(array[i : i + step]).all() for i in parts):
+                if not np.isfinite(array).all():
+                    valid, fault = np.isfinite, "NaN or infinite numbers"
+                bad = np.argwhere(~valid(array))
+                what = f"'{name}' holds {fault}: {len(bad)}, the first in row {bad[0][0]}"
+                raise InputError(what, where=where)
+            if name in _SHARED and array.ndim > 2 and (array != array[:, :1, :1]).any():
+                raise InputError(f"'{name}' differs between texels of an image", where=where)
+
+
+def column_means(array: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Means (3,) of an array (..., 3), in float64."""
+    flat = array.reshape(-1, 3)
+    # Long rows are summed several times faster than short ones.
+    head = len(flat) - len(flat) % 256
+    long = flat[:head].reshape(-1, 768).sum(0, dtype=np.float64).reshape(-1, 3).sum(0)
+    mean: NDArray[np.float64] = (long + flat[head:].sum(0, dtype=np.float64)) / max(len(flat), 1)
+    return mean
 
 
 class _Chunks(list[bytes | memoryview]):

@@ -20,7 +20,7 @@ from mbtf_gen.config.effects_request import EFFECTS
 from mbtf_gen.dataset.folder import read_manifest, remove_leftovers
 from mbtf_gen.dataset.manifest import software_versions
 from mbtf_gen.dataset.reader import Dataset
-from mbtf_gen.dataset.verify import finished_record, sidecar_of
+from mbtf_gen.dataset.sidecar import finished_record, sidecar_of
 from mbtf_gen.planning.effects import EffectsPlan
 from mbtf_gen.planning.run_plan import RunPlan
 from mbtf_gen.planning.sample_allocation import Allocation
@@ -233,19 +233,17 @@ def finish(
     InputError : no data set, or a corrupt manifest or sidecar
     PartialError : too many non-finite samples, or the folder cannot be written
     """
-    Dataset.open(folder)
+    dataset = Dataset.open(folder)
     manifest = read_manifest(folder)
     effects = check_document(_Plan, manifest, folder / MANIFEST_NAME, _CHECK).effects
     totals, complete = ShardStatistics(), True
-    for content in manifest["splits"].values():
-        for entry in content["shards"]:
-            file = folder / entry["file"]
-            record = finished_record(file, entry["rows"], manifest["config_hash"])
-            if record is None:
-                complete = False
-            else:
-                check_document(_Sidecar, record, sidecar_of(file), _CHECK)
-                totals.add(record)
+    for entry in (entry for split in dataset.splits for entry in dataset.entries(split)):
+        record = finished_record(folder, entry, manifest["config_hash"])
+        if record is None:
+            complete = False
+        else:
+            check_document(_Sidecar, record, sidecar_of(folder / entry.file), _CHECK)
+            totals.add(record)
     if complete:
         refuse_nonfinite(totals, totals.paths, folder)
     sums: dict[str, Any] = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,10 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.atomic import checksummed
+from mbtf_core.digest import file_sha256
+from mbtf_core.shard_schema import FORMAT_NAME, SCHEMA_VERSION
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.dataset.folder import open_folder
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.dataset.render_shards import store_shard
+from mbtf_gen.dataset.shard_io import read_shard, write_shard
 from mbtf_gen.dataset.summary import finish
 from mbtf_gen.job import Job, split_spp
 from mbtf_gen.planning.effects_plan import reference_plan
@@ -64,3 +68,76 @@ def edit(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
     document = json.loads(path.read_text())
     change(document)
     path.write_bytes(checksummed(document))
+
+
+def write_sidecar(shard: Path, split: str, index: int, config_hash: str, **changes: Any) -> None:
+    """The sidecar of a shard that is written without a run."""
+    arrays = read_shard(shard)
+    halves = [arrays[name].reshape(-1, 3) for name in ("value_a", "value_b")]
+    mean = 0.5 * sum(a.mean(axis=0, dtype=np.float64) if len(a) else np.zeros(3) for a in halves)
+    record = {
+        "format": FORMAT_NAME,
+        "schema": SCHEMA_VERSION,
+        "config_hash": config_hash,
+        "file": shard.name,
+        "split": split,
+        "index": index,
+        "rows": len(arrays["sigma"]),
+        "bytes": shard.stat().st_size,
+        "sha256": file_sha256(shard),
+        "statistics": {"mean_value": np.nan_to_num(mean).tolist()},
+    }
+    shard.with_suffix(".json").write_bytes(checksummed({**record, **changes}))
+
+
+def rewrite(shard: Path, **arrays: F32) -> None:
+    """Replace arrays of a shard, with a sidecar that agrees."""
+    write_shard(shard, {**read_shard(shard, mapped=False), **arrays})
+    record = json.loads(shard.with_suffix(".json").read_text())
+    kept = {key: record[key] for key in ("split", "index", "config_hash", "file")}
+    write_sidecar(shard, **kept)
+
+
+def _copy(data: Path, source: Path, suffixes: tuple[str, ...], number: int = 1) -> None:
+    """Put shard 0 or 1 of a data set in the place of shard 1 of `data`."""
+    for suffix in suffixes:
+        shutil.copy(source / f"train-{number:05d}{suffix}", data / f"train-00001{suffix}")
+
+
+def _change(data: Path, suffix: str, name: str, change: Callable[[F32], F32]) -> None:
+    shard = data / f"train-00001{suffix}"
+    rewrite(shard, **{name: change(read_shard(shard, mapped=False)[name])})
+
+
+def _times(factor: float) -> Callable[[F32], F32]:
+    return lambda array: (array * factor).astype(np.float32)
+
+
+def _downwards(omega: F32) -> F32:
+    return omega * np.array([1, 1, -1], np.float32)
+
+
+# Damages that leave a readable data set: how, of (data, another run's data, suffix), and what is said of it.
+FOREIGN: dict[str, tuple[Callable[[Path, Path, str], object], str]] = {
+    "shard": (lambda d, o, s: _copy(d, o, (s,)), "not the shard that its sidecar describes"),
+    "shard with sidecar": (lambda d, o, s: _copy(d, o, (s, ".json")), "belongs to another data set"),
+    "copy": (lambda d, o, s: _copy(d, d, (s,), 0), "not the shard that its sidecar describes"),
+    "copy with sidecar": (lambda d, o, s: _copy(d, d, (s, ".json"), 0), "has the sidecar of train-00000"),
+    "manifest": (lambda d, o, s: shutil.copy(o / "manifest.json", d), "belongs to another data set"),
+    "index": (
+        lambda d, o, s: edit(d / "train-00001.json", lambda record: record.update(index=2)),
+        "is shard train 2, manifest.json lists it as train 1",
+    ),
+    "split": (
+        lambda d, o, s: edit(d / "train-00001.json", lambda record: record.update(split="test")),
+        "is shard test 1, manifest.json lists it as train 1",
+    ),
+    "negative sigma": (lambda d, o, s: _change(d, s, "sigma", _times(-1)), "'sigma' holds numbers that"),
+    "long vectors": (lambda d, o, s: _change(d, s, "omega_i", _times(1.001)), "'omega_i' holds vectors that"),
+    "downwards": (lambda d, o, s: _change(d, s, "omega_o", _downwards), "'omega_o' holds vectors that"),
+    "other tile": (
+        lambda d, o, s: _change(d, s, "u", lambda u: u + 1),
+        r"'u' holds numbers outside \[0, 1\)",
+    ),
+    "NaN": (lambda d, o, s: _change(d, s, "spp", _times(np.nan)), "'spp' holds NaN or infinite numbers"),
+}

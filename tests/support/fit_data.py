@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from mbtf_core.atomic import checksummed
 from mbtf_core.directions import from_projected_disk
 from mbtf_core.lattice import Lattice, sigma_of_level
 from mbtf_core.shard_schema import FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION
@@ -20,6 +20,8 @@ from mbtf_fit.models.registry import build_model
 from mbtf_fit.objective.noise import NoiseModel, typical_value
 from mbtf_fit.training.trainer import Trainer
 from mbtf_gen.dataset.shard_io import write_shard
+
+from .datasets import write_sidecar
 
 F32 = NDArray[np.float32]
 # (u, sigma, omega_i, omega_o) → (n, 3)
@@ -36,7 +38,8 @@ def random_directions(random: np.random.Generator, n: int) -> F32:
 def random_queries(random: np.random.Generator, n: int, lattice: Lattice) -> dict[str, F32]:
     """Queries of all levels and directions."""
     return {
-        "u": random.random((n, 2)).astype(np.float32),
+        # Rounding can reach 1, which is 0 on the torus.
+        "u": random.random((n, 2)).astype(np.float32) % 1,
         "sigma": sigma_of_level(lattice.finest * random.random(n)).astype(np.float32),
         "omega_i": random_directions(random, n),
         "omega_o": random_directions(random, n),
@@ -82,6 +85,7 @@ def write_data(
     folder.mkdir(parents=True, exist_ok=True)
     lattice = Lattice(finest, aspect)
     random = np.random.default_rng(seed)
+    config_hash = f"{function.__name__}-{seed}-{noise}"
     splits: dict[str, dict[str, object]] = {}
     for split, total, count in (("train", train, shards), ("test", test, 1)):
         entries = []
@@ -99,13 +103,13 @@ def write_data(
                 arrays["transmittance"] = seen.astype(np.float32)
             name = f"{split}-{index:05d}{suffix}"
             write_shard(folder / name, arrays)
-            (folder / name).with_suffix(".json").write_text(json.dumps({"rows": n}))
+            write_sidecar(folder / name, split, index, config_hash)
             entries.append({"file": name, "rows": n})
         splits[split] = {"queries": total, "shards": entries}
     manifest = {
         "format": FORMAT_NAME,
         "schema": schema,
-        "config_hash": f"{function.__name__}-{seed}-{noise}",
+        "config_hash": config_hash,
         "layout": layout,
         "levels": {"finest": finest},
         "tile": {"aspect": aspect},
@@ -113,7 +117,7 @@ def write_data(
     }
     if through is not None:
         manifest["arrays"] = {"transmittance": {}}
-    (folder / MANIFEST_NAME).write_text(json.dumps(manifest))
+    (folder / MANIFEST_NAME).write_bytes(checksummed(manifest))
     return folder
 
 

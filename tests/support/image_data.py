@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from mbtf_core.atomic import checksummed
 from mbtf_core.lattice import Lattice, sigma_of_level, texel_centers
 from mbtf_core.shard_schema import FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION
 from mbtf_gen.dataset.shard_io import write_shard
 from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
 
+from .datasets import write_sidecar
 from .fit_data import F32, Function, random_directions
 
 
@@ -55,6 +56,7 @@ def write_images(
     """
     folder.mkdir(parents=True, exist_ok=True)
     lattice, random = Lattice(finest, aspect), np.random.default_rng(seed)
+    config_hash = f"images-{function.__name__}-{seed}-{noise}"
     splits: dict[str, dict[str, object]] = {}
     for split, counts in (("train", (train // 2, train - train // 2)), ("test", (test,))):
         entries = []
@@ -75,13 +77,13 @@ def write_images(
                 halves["transmittance"] = seen.reshape(shape).astype(np.float32)
             name = f"{split}-{index:05d}.npz"
             write_shard(folder / name, {**queries, **halves, "spp": np.full(shape, 2, np.float32)})
-            (folder / name).with_suffix(".json").write_text(json.dumps({"rows": items}))
+            write_sidecar(folder / name, split, index, config_hash)
             entries.append({"file": name, "rows": items})
         splits[split] = {"queries": sum(counts), "shards": entries}
     manifest: dict[str, Any] = {
         "format": FORMAT_NAME,
         "schema": SCHEMA_VERSION,
-        "config_hash": f"images-{function.__name__}-{seed}-{noise}",
+        "config_hash": config_hash,
         "layout": "image",
         "levels": {"finest": finest},
         "tile": {"aspect": aspect},
@@ -90,5 +92,5 @@ def write_images(
     }
     if through is not None:
         manifest["arrays"] = {"transmittance": {}}
-    (folder / MANIFEST_NAME).write_text(json.dumps(manifest))
+    (folder / MANIFEST_NAME).write_bytes(checksummed(manifest))
     return folder

@@ -17,7 +17,7 @@ import numpy as np
 from mbtf_core.console import run
 
 from .commands import Done
-from .datasets import write_dataset
+from .datasets import edit, write_dataset
 from .fit_data import constant, write_data
 
 # Group → command lines.
@@ -170,7 +170,7 @@ def _shards(folder: Path) -> None:
     path.write_bytes(content)
     path = folder / "shards-cut" / "train-00000.npz"
     path.write_bytes(path.read_bytes()[:-100])
-    (folder / "shards-rows" / "train-00000.json").write_text(json.dumps({"rows": 99}))
+    edit(folder / "shards-rows" / "train-00000.json", lambda record: record.update(rows=99))
 
 
 def call(words: list[str]) -> Done:

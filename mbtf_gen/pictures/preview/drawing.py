@@ -19,7 +19,7 @@ from mbtf_gen.pictures.camera import tiles_camera
 from mbtf_gen.pictures.folder import PictureFolder
 from mbtf_gen.pictures.preview import mesh
 from mbtf_gen.pictures.preview.plots import level_histogram, write_plots
-from mbtf_gen.pictures.preview.sample import finished_shards, sampled_queries, stored_queries
+from mbtf_gen.pictures.preview.sample import sampled_queries, stored_queries
 from mbtf_gen.pictures.reference import PNG_BYTES, picture_seconds, render_reference, to_display, write_png
 from mbtf_gen.planning.effects_plan import reference_plan
 from mbtf_gen.planning.simulation import build_estimator
@@ -93,7 +93,7 @@ class PreviewPictures:
             inputs |= self.job.material.digests
         if self.dataset is not None:
             inputs["data set"] = self.dataset.manifest["config_hash"]
-            stages["queries"] = len(finished_shards(self.dataset))
+            stages["queries"] = len(self.dataset.shards("train", finished_only=True))
         size = len(stages) * PNG_BYTES * self.config.preview.size**2
         check_space(path, size, "reduce --size, or choose another folder with -o")
         folder = PictureFolder.claim(

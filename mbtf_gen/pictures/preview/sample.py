@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,8 +12,6 @@ from numpy.typing import NDArray
 from mbtf_core.errors import InputError
 from mbtf_core.lattice import level_of_sigma
 from mbtf_gen.dataset.reader import Dataset
-from mbtf_gen.dataset.shard_io import read_shard
-from mbtf_gen.dataset.verify import finished_record
 from mbtf_gen.job import Job, split_queries
 from mbtf_gen.sampling.query_sampler import Mixture, Queries
 
@@ -54,16 +51,6 @@ def sampled_queries(job: Job) -> QuerySample:
     return QuerySample(*columns, total, plan.mixture, job.lattice.finest, plan.min_cos, job.lattice.aspect)
 
 
-def finished_shards(dataset: Dataset) -> list[Path]:
-    """Files of the finished training shards, in order."""
-    manifest = dataset.manifest
-    return [
-        dataset.folder / entry["file"]
-        for entry in manifest["splits"]["train"]["shards"]
-        if finished_record(dataset.folder / entry["file"], entry["rows"], manifest["config_hash"])
-    ]
-
-
 def stored_queries(dataset: Dataset) -> QuerySample:
     """Queries of the first finished shards of a data set, with the distributions stated in its manifest.
 
@@ -71,8 +58,8 @@ def stored_queries(dataset: Dataset) -> QuerySample:
     ------
     InputError : no shard is finished, or one cannot be read
     """
-    manifest, files = dataset.manifest, finished_shards(dataset)
-    if not files:
+    manifest, shards = dataset.manifest, dataset.shards("train", finished_only=True)
+    if not shards:
         raise InputError(
             "holds no finished train shard yet",
             where=dataset.folder,
@@ -80,7 +67,7 @@ def stored_queries(dataset: Dataset) -> QuerySample:
         )
     names = ("u", "sigma", "omega_i", "omega_o")
     return QuerySample(
-        *_columns(Queries(**read_shard(path, names)) for path in files),
+        *_columns(Queries(**shard.read(names)) for shard in shards),
         int(manifest["splits"]["train"]["queries"]),
         Mixture(**manifest["levels"]["mixture"]),
         dataset.lattice.finest,

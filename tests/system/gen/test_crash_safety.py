@@ -20,7 +20,9 @@ from support.file_operations import FileOperations, Operation
 from support.paths import ROOT
 from support.small_runs import command, contents, die, ending, generate, in_child, noisy_plane
 
-from mbtf_gen.dataset.verify import finished_record, verify
+from mbtf_core.shard_schema import ShardEntry
+from mbtf_gen.dataset.sidecar import finished_record
+from mbtf_gen.dataset.verify import verify
 from mbtf_gen.planning.simulation import ClosedForm
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.sampling.query_sampler import Queries
@@ -234,8 +236,8 @@ def test_an_interrupted_run_keeps_its_shards(
     assert errors[1] == "  the same command resumes"
     # The shard that was rendered, and no other one of those to make.
     assert rendered == 1
-    assert finished_record(small.out / "train-00000.npz", 40, small.hash)
-    assert not finished_record(small.out / "test-00000.npz", 30, small.hash)
+    shards = [ShardEntry("train", 0, "train-00000.npz", 40), ShardEntry("test", 0, "test-00000.npz", 30)]
+    assert [bool(finished_record(small.out, shard, small.hash)) for shard in shards] == [True, False]
     assert (small.out / "train-00000.npz").read_bytes() == small.expected["train-00000.npz"]
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
     assert generate(line) == 0

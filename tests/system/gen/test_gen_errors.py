@@ -12,8 +12,10 @@ import OpenEXR
 import pytest
 from PIL import Image
 from support.commands import Done, finished, run_all, start
-from support.datasets import write_dataset
+from support.datasets import edit, write_dataset
 from support.image_files import exr
+
+from mbtf_core.shard_schema import SCHEMA_VERSION
 
 INPUT, USAGE = 3, 2
 
@@ -40,7 +42,7 @@ INPUT_CASES = {
     "heights.npy --config config.yaml": ["config.yaml:3", "'queries.mincos'", "'min_cos'"],
     "heights.npy --config config.yaml --seed 1": ["config.yaml:3", "'queries.mincos'"],
     "heights.npy --config no.yaml": ["no.yaml", "no such file"],
-    "verify schema": ["schema version 99", "version 2"],
+    "verify schema": ["schema version 99", f"version {SCHEMA_VERSION}"],
     "merge schema": ["schema version 99"],
     "verify empty": ["empty", "manifest.json"],
     "merge empty": ["empty", "manifest.json"],
@@ -134,7 +136,7 @@ def write_inputs(folder: Path) -> None:
     (folder / "config.yaml").write_text("queries:\n  spp: 4\n  mincos: 0.2\n")
     write_dataset(folder / "schema", queries={"train": "8", "test": "8"})
     manifest = folder / "schema/manifest.json"
-    manifest.write_text(manifest.read_text().replace('"schema": 2', '"schema": 99'))
+    edit(manifest, lambda document: document.update(schema=99))
 
 
 def listing(folder: Path) -> dict[str, bytes]:
@@ -189,7 +191,7 @@ def test_verify_counts_what_an_interrupted_run_has_not_made(tmp_path: Path) -> N
         "set: 4 of 11 shards missing, first train-00003.npz; "
         "run the same mbtf-gen command again: it renders the missing shards",
         "set/train-00001.npz: has changed since it was written (SHA-256 differs); "
-        "repair it with: mbtf-gen repair FOLDER",
+        "repair it with: mbtf-gen repair set",
     ]
     assert [f["file"] for f in json.loads(data.out)["faults"]] == [
         f"train-{number:05d}.npz" for number in (1, 3, 4, 7, 8)

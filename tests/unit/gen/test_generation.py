@@ -23,8 +23,9 @@ from mbtf_gen.dataset import render_shards
 from mbtf_gen.dataset.manifest import build_manifest
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.dataset.shard_io import read_shard
+from mbtf_gen.dataset.sidecar import sidecar_of
 from mbtf_gen.dataset.summary import finish
-from mbtf_gen.dataset.verify import sidecar_of, verify
+from mbtf_gen.dataset.verify import verify
 from mbtf_gen.generation import generate, unfinished
 from mbtf_gen.job import Job, planned_paths, split_queries
 from mbtf_gen.planning.effects_plan import reference_plan

@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,11 +14,15 @@ import pytest
 from support.datasets import edit
 from support.small_runs import command, contents, generate, noisy_plane
 
+from mbtf_core.console import run
 from mbtf_core.errors import InputError
+from mbtf_fit.cli.app import app as fit_app
 from mbtf_gen import repairs
+from mbtf_gen.cli.app import app
 from mbtf_gen.dataset.verify import verify
+from mbtf_gen.job import Job
 from mbtf_gen.planning.effects_plan import reference_plan
-from mbtf_gen.planning.run_plan import RunPlan
+from mbtf_gen.planning.run_plan import RunPlan, plan_run
 from mbtf_gen.planning.simulation import ClosedForm
 from mbtf_gen.repairs import Corruption, repair
 
@@ -104,14 +109,151 @@ def test_faulty_files_are_restored_and_nothing_else(name: str, out: Path) -> Non
     assert moments(out) == before
 
 
-def test_foreign_files_are_named_and_left_alone(out: Path) -> None:
+def test_foreign_files_are_named_and_left_alone(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shutil.copy(out / "train-00000.npz", out / "train-00007.npz")
     flip(out / "train-00000.npz", 700)
     done = repair(out)
-    assert [f.file for f in done.left] == ["train-00007.npz"]
+    (out / "notes.txt").write_text("harmless")
+    assert done.foreign == ["train-00007.npz"]
     assert done.shards == ["train-00000.npz"]
-    assert [f.file for f in verify(out)] == ["train-00007.npz"]
+    assert verify(out) == []
+    capsys.readouterr()
+    # The data set is whole: both commands say so, and name what else is there.
+    for name, says in (("repair", "nothing to repair"), ("verify", "4 shards, all intact")):
+        assert generate([name, str(out)]) == 0
+        text = capsys.readouterr().out
+        assert f"{out}: {says}\n" in text
+        assert f"{out}: not part of the data set, left alone: notes.txt, train-00007.npz\n" in text
+        assert generate([name, str(out), "--json"]) == 0
+        assert json.loads(capsys.readouterr().out)["foreign"] == ["notes.txt", "train-00007.npz"]
+
+
+@pytest.fixture
+def other(out: Path) -> Path:
+    """The same of another seed."""
+    line = command(out.parent, out.parent / "other")
+    assert generate([*line, "--seed", "1"]) == 0
+    return out.parent / "other"
+
+
+def copy_files(source: Path, out: Path, *names: str) -> None:
+    for name in names:
+        shutil.copy(source / name, out)
+
+
+DISAGREEMENTS: dict[str, tuple[tuple[str, ...], str, str, set[str]]] = {
+    # files of the other run: what belongs to this run and to the other one, shards to render for this run
+    "manifest": (("manifest.json",), "config.yaml, 4 shards", "manifest.json", set()),
+    "manifest and configuration": (
+        ("manifest.json", "config.yaml"),
+        "4 shards",
+        "manifest.json, config.yaml",
+        set(),
+    ),
+    "configuration": (("config.yaml",), "manifest.json, 4 shards", "config.yaml", set()),
+    "shard": (
+        ("train-00001.npz", "train-00001.json"),
+        "manifest.json, config.yaml, 3 shards",
+        "1 shard",
+        {"train-00001.npz"},
+    ),
+    "everything but shards": (
+        ("train-00000.json", "manifest.json"),
+        "config.yaml, 3 shards",
+        "manifest.json, 1 shard",
+        {"train-00000.npz"},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", DISAGREEMENTS)
+def test_files_that_disagree_are_named_and_not_touched(name: str, out: Path, other: Path) -> None:
+    files, mine, theirs, rendered = DISAGREEMENTS[name]
+    this, that = (json.loads((f / "manifest.json").read_text())["config_hash"][:8] for f in (out, other))
+    copy_files(other, out, *files)
+    before = moments(out)
+    for dry_run in (False, True):
+        with pytest.raises(InputError, match="its files belong to 2 data sets") as caught:
+            Corruption(out).entries if dry_run else repair(out)
+        assert f"{this} ({mine})" in caught.value.what
+        assert f"{that} ({theirs})" in caught.value.what
+        assert caught.value.hint == f"nothing was changed; choose one: mbtf-gen repair {out} --keep NAME"
+    with pytest.raises(InputError, match="--keep 01234567 names no data set"):
+        repair(out, keep="01234567")
     assert generate(["repair", str(out), "-q"]) == 3
+    assert moments(out) == before
+    if name == "manifest and configuration":
+        # Nothing knows this run's options any more.
+        with pytest.raises(InputError, match="the material or the configuration has changed"):
+            repair(out, keep=this)
+        assert moments(out) == before
+        return
+    done = repair(out, keep=this)
+    assert set(done.shards) == rendered
+    assert contents(out) == contents(out.parent / "whole")
+    assert verify(out) == []
+
+
+def test_the_other_data_set_can_be_kept(out: Path, other: Path) -> None:
+    copy_files(other, out, "manifest.json")
+    that = json.loads((other / "manifest.json").read_text())["config_hash"][:8]
+    assert len(repair(out, keep=that).shards) == 4
+    assert contents(out) == contents(other)
+
+
+def test_a_configuration_alone_is_nothing_to_keep(out: Path, other: Path) -> None:
+    copy_files(other, out, "config.yaml")
+    that = json.loads((other / "manifest.json").read_text())["config_hash"][:8]
+    before = moments(out)
+    with pytest.raises(InputError, match=f"--keep {that} names no data set that can be restored"):
+        repair(out, keep=that)
+    assert moments(out) == before
+
+
+@pytest.mark.parametrize("damage", ["deleted", "flipped"])
+def test_a_lost_manifest_is_answered_everywhere(
+    damage: str, out: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = out / "manifest.json"
+    if damage == "deleted":
+        path.unlink()
+    else:
+        flip(path, path.read_bytes().index(b'"aspect": ') + 10)
+    before = contents_of_shards(out)
+    again = command(out.parent, out)
+    lines = [again, ["verify", str(out)], ["merge", str(out)]]
+    lines.append(["preview", str(out), "-o", str(out.parent / "pictures")])
+    if damage == "deleted":
+        lines.append([*again, "--overwrite"])
+    fits = [[str(out), "--time", "1s", "-o", str(out.parent / "material")], ["info", str(out)]]
+    for program, line in [*((app, line) for line in lines), *((fit_app, line) for line in fits)]:
+        capsys.readouterr()
+        assert run(program, line) == 3, line
+        assert f"repair it with: mbtf-gen repair {out}" in capsys.readouterr().err, line
+    assert contents_of_shards(out) == before
+    assert repair(out).documents == ["manifest.json"]
+    assert contents(out) == contents(out.parent / "whole")
+
+
+def contents_of_shards(out: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in out.glob("t*-*")}
+
+
+def test_words_of_another_version_are_no_other_plan(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def reworded(job: Job) -> RunPlan:
+        plan = plan_run(job)
+        effects = tuple(
+            replace(effect, explanation=f"in other words: {effect.explanation}", error=0.1)
+            for effect in plan.effects.effects
+        )
+        return replace(plan, effects=replace(plan.effects, effects=effects))
+
+    monkeypatch.setattr(repairs, "plan_run", reworded)
+    (out / "manifest.json").unlink()
+    done = repair(out)
+    assert (done.shards, done.documents, done.complete) == ([], ["manifest.json"], True)
+    assert "in other words" in (out / "manifest.json").read_text()
+    assert verify(out) == []
 
 
 def test_another_material_is_refused_untouched(out: Path) -> None:

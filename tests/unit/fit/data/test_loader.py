@@ -7,13 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.datasets import FOREIGN, edit, rewrite
 from support.fit_data import constant, parallax, write_data
+from support.image_data import write_images
 
 from mbtf_core.errors import InputError
 from mbtf_fit.config import HeldOutSection
 from mbtf_fit.data.loader import Partition, in_region, load_split, load_training
 from mbtf_fit.data.queries import ShardQueries, batch_starts
 from mbtf_gen.dataset.reader import Dataset
+from mbtf_gen.dataset.shard_io import read_shard
 
 HELD_OUT = HeldOutSection(queries=0.1, radius=0.3)
 
@@ -106,12 +109,10 @@ def test_exr_shards_hold_the_same(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["value_b", "sigma"])
 def test_a_shard_with_nan_or_infinity_is_refused_by_name(tmp_path: Path, bad: float, name: str) -> None:
     folder = write_data(tmp_path / "d", parallax, train=1000)
-    from mbtf_gen.dataset.shard_io import read_shard, write_shard
-
     path = folder / "train-00001.npz"
-    arrays = read_shard(path, mapped=False)
-    arrays[name][7] = bad
-    write_shard(path, arrays)
+    array = read_shard(path, mapped=False)[name]
+    array[7] = bad
+    rewrite(path, **{name: array})
     with pytest.raises(InputError, match=rf"train-00001\.npz: '{name}' holds NaN or infinite .* row 7"):
         partition(folder)
 
@@ -135,6 +136,21 @@ def test_nothing_to_train_on_is_refused(tmp_path: Path) -> None:
 
 def test_rows_that_contradict_the_sidecar_are_refused(tmp_path: Path) -> None:
     folder = write_data(tmp_path / "d", parallax, train=100, shards=1)
-    (folder / "train-00000.json").write_text('{"rows": 90}')
-    with pytest.raises(InputError, match=r"train-00000.*100 rows, its sidecar says 90"):
+    edit(folder / "train-00000.json", lambda record: record.update(rows=90))
+    with pytest.raises(InputError, match=r"train-00000.*has 90 rows, manifest.json says 100"):
         partition(folder)
+    edit(folder / "manifest.json", lambda m: m["splits"]["train"]["shards"][0].update(rows=90))
+    with pytest.raises(InputError, match=r"train-00000.*has 100 rows, its sidecar says 90"):
+        partition(folder)
+
+
+@pytest.mark.parametrize("layout", ["shuffled", "image"])
+@pytest.mark.parametrize("name", sorted(FOREIGN.keys() - {"NaN"}))
+def test_foreign_and_impossible_data_are_not_trained_on(name: str, layout: str, tmp_path: Path) -> None:
+    write = write_data if layout == "shuffled" else write_images
+    for seed in (0, 1):
+        write(tmp_path / f"{seed}", parallax, train=20, test=4, noise=0.1, seed=seed)
+    change, says = FOREIGN[name]
+    change(tmp_path / "0", tmp_path / "1", ".npz")
+    with pytest.raises(InputError, match=says):
+        partition(tmp_path / "0")

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from support.datasets import NOISE, formula, write_dataset
+from support.datasets import FOREIGN, NOISE, formula, rewrite, write_dataset
 
 from mbtf_core.errors import InputError
 from mbtf_core.stats import pooled_error
 from mbtf_gen.dataset.reader import Dataset
-from mbtf_gen.dataset.shard_io import Arrays
+from mbtf_gen.dataset.shard_io import Arrays, read_shard
 from mbtf_gen.sampling.query_sampler import Queries
 
 OUTPUT = {"shard_queries": 64}
@@ -101,10 +103,79 @@ def test_folders_that_hold_no_data_set(tmp_path: Path) -> None:
         ("{", "not readable as JSON"),
         ("[1]", "must hold a JSON object"),
         ('{"format": "other"}', "is not a manifest"),
-        ('{"format": "mbtf-shards", "schema": 99}', "schema version 99, this program reads version 2"),
+        ('{"format": "mbtf-shards", "schema": 99}', "schema version 99, this program reads version 3"),
         ('{"format": "mbtf-shards"}', "schema version None"),
     ):
         path.write_text(text)
         with pytest.raises(InputError, match=message) as caught:
             Dataset.open(tmp_path)
         assert caught.value.exit_code == 3
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Data sets of two layouts and formats, and beside each the same of another seed."""
+    folder = tmp_path_factory.mktemp("runs")
+    for layout in ("shuffled", "image"):
+        for suffix in ("npz", "exr"):
+            for seed in (0, 1):
+                write_dataset(
+                    folder / f"{layout}-{suffix}-{seed}",
+                    queries={"train": "128", "test": "32", "layout": layout},
+                    output={"shard_queries": 64, "format": suffix},
+                    seed=seed,
+                )
+    return {name: folder / f"{name}-0" for name in ("shuffled-npz", "shuffled-exr", "image-npz", "image-exr")}
+
+
+@pytest.mark.parametrize("kind", ["shuffled-npz", "shuffled-exr", "image-npz", "image-exr"])
+@pytest.mark.parametrize("name", FOREIGN)
+def test_foreign_and_impossible_data_are_refused(
+    name: str, kind: str, runs: dict[str, Path], tmp_path: Path
+) -> None:
+    shutil.copytree(runs[kind], tmp_path / "set")
+    other = runs[kind].with_name(f"{kind}-1")
+    change, says = FOREIGN[name]
+    change(tmp_path / "set", other, f".{kind[-3:]}")
+    with pytest.raises(InputError, match=says) as caught:
+        Dataset.open(tmp_path / "set").load("train")
+    assert caught.value.exit_code == 3
+    assert caught.value.hint == f"check the data set with: mbtf-gen verify {tmp_path / 'set'}"
+    with pytest.raises(InputError, match=says):
+        list(Dataset.open(tmp_path / "set").iterate("train"))
+
+
+def test_images_have_one_direction_and_the_size_of_the_lattice(runs: dict[str, Path], tmp_path: Path) -> None:
+    shard = tmp_path / "set/train-00001.npz"
+
+    def found(**arrays: Any) -> str:
+        shutil.copytree(runs["image-npz"], tmp_path / "set", dirs_exist_ok=True)
+        rewrite(shard, **arrays)
+        with pytest.raises(InputError) as caught:
+            Dataset.open(tmp_path / "set").load("train")
+        return caught.value.what
+
+    intact = {n: np.array(a) for n, a in read_shard(runs["image-npz"] / shard.name).items()}
+    sigma = intact["sigma"].copy()
+    sigma[1, 2, 3] *= 0.5
+    assert found(sigma=sigma) == "'sigma' differs between texels of an image"
+    smaller = {name: array[:, :, :4] for name, array in intact.items()}
+    assert found(**smaller) == "has 4 x 4 queries per row, manifest.json says 4 x 8"
+    flat = {name: array[:, 0, 0] for name, array in intact.items()}
+    assert found(**flat) == "has 1 queries per row, manifest.json says 4 x 8"
+
+
+@pytest.mark.parametrize("damage", ["deleted", "flipped", "cut", "other format"])
+def test_a_lost_manifest_is_answered_by_repair(damage: str, runs: dict[str, Path], tmp_path: Path) -> None:
+    folder = tmp_path / "set"
+    shutil.copytree(runs["shuffled-npz"], folder)
+    path = folder / "manifest.json"
+    text = path.read_text()
+    path.write_text(
+        {"flipped": text.replace("0.5", "0.4"), "cut": text[:99], "other format": "{}"}.get(damage, "")
+    )
+    if damage == "deleted":
+        path.unlink()
+    with pytest.raises(InputError) as caught:
+        Dataset.open(folder)
+    assert caught.value.hint == f"repair it with: mbtf-gen repair {folder}"

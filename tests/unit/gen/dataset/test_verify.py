@@ -13,8 +13,11 @@ import pytest
 from support.datasets import edit, write_dataset
 
 from mbtf_core.digest import file_sha256
+from mbtf_core.shard_schema import ShardEntry
+from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.dataset.shard_io import Arrays, read_shard, write_shard
-from mbtf_gen.dataset.verify import finished_record, sidecar_of, verify
+from mbtf_gen.dataset.sidecar import finished_record, sidecar_of
+from mbtf_gen.dataset.verify import foreign_files, verify
 
 FORMATS = ["npz", "exr"]
 
@@ -43,8 +46,17 @@ def shard(folder: Path, number: int = 1) -> Path:
     return folder / f"train-{number:05d}.{folder.name}"
 
 
+def entry(folder: Path, rows: int, number: int = 1) -> ShardEntry:
+    return ShardEntry("train", number, shard(folder, number).name, rows)
+
+
 def faults(folder: Path) -> dict[str, str]:
     return {f.file: f.what for f in verify(folder)}
+
+
+def foreign(folder: Path) -> list[str]:
+    dataset = Dataset.open(folder)
+    return foreign_files(folder, [e for split in dataset.splits for e in dataset.entries(split)])
 
 
 def test_an_intact_set_has_no_fault(copy: Path) -> None:
@@ -62,8 +74,8 @@ def test_every_flipped_byte_is_found(copy: Path) -> None:
         assert list(faults(copy)) == [path.name], position
     wanted = json.loads((copy / "manifest.json").read_text())["config_hash"]
     # On resuming, sidecar and size alone are checked.
-    assert finished_record(path, 40, wanted)
-    assert finished_record(path, 39, wanted) is None
+    assert finished_record(copy, entry(copy, 40), wanted)
+    assert finished_record(copy, entry(copy, 39), wanted) is None
     path.write_bytes(intact)
     assert verify(copy) == []
 
@@ -75,8 +87,8 @@ def test_a_truncated_shard_is_found(copy: Path, kept: int) -> None:
     assert "bytes" in faults(copy)[path.name]
     # Size alone decides whether it counts as finished on resuming.
     manifest = json.loads((copy / "manifest.json").read_text())
-    assert not finished_record(path, 40, manifest["config_hash"])
-    assert finished_record(shard(copy, 0), 40, manifest["config_hash"])
+    assert not finished_record(copy, entry(copy, 40), manifest["config_hash"])
+    assert finished_record(copy, entry(copy, 40, 0), manifest["config_hash"])
 
 
 def test_missing_parts_are_found(copy: Path) -> None:
@@ -92,9 +104,9 @@ def test_a_doubled_shard_is_found(copy: Path) -> None:
     # Under a new name, with or without its sidecar.
     extra = shard(copy, 7)
     shutil.copy(shard(copy, 1), extra)
-    assert faults(copy) == {extra.name: "is not listed in the manifest"}
+    assert (faults(copy), foreign(copy)) == ({}, [extra.name])
     shutil.copy(sidecar_of(shard(copy, 1)), sidecar_of(extra))
-    assert extra.name in faults(copy)
+    assert (faults(copy), foreign(copy)) == ({}, sorted([sidecar_of(extra).name, extra.name]))
     extra.unlink()
     sidecar_of(extra).unlink()
     # In place of its neighbor.
@@ -103,6 +115,8 @@ def test_a_doubled_shard_is_found(copy: Path) -> None:
     shutil.copy(sidecar_of(shard(copy, 1)), sidecar_of(shard(copy, 0)))
     assert faults(copy)[shard(copy, 0).name] == f"has the sidecar of {shard(copy, 1).name}"
     edit(sidecar_of(shard(copy, 0)), lambda record: record.update(file=shard(copy, 0).name))
+    assert "is shard train 1, manifest.json lists it as train 0" in faults(copy)[shard(copy, 0).name]
+    edit(sidecar_of(shard(copy, 0)), lambda record: record.update(index=0))
     # Which of the two is the copy, nobody knows.
     assert faults(copy) == {
         shard(copy, i).name: f"has the same content as {shard(copy, 1 - i).name}" for i in (0, 1)
@@ -130,8 +144,11 @@ def test_wrong_records_are_found(copy: Path) -> None:
 def test_foreign_files_are_found(copy: Path, made: dict[str, Path], tmp_path: Path) -> None:
     (copy / "render.exr").write_bytes(b"of somebody else")
     (copy / "notes.txt").write_text("harmless")
-    assert faults(copy) == {"render.exr": "is not listed in the manifest"}
-    (copy / "render.exr").unlink()
+    (copy / "preview").mkdir()
+    # Of a killed run, and the lock of a running one.
+    (copy / ".train-00001.npz.0123abcd-77.tmp").touch()
+    (copy / ".train-00002.lock").touch()
+    assert (faults(copy), foreign(copy)) == ({}, ["notes.txt", "preview/", "render.exr"])
     other = write_dataset(
         tmp_path / "other",
         queries={"train": "100", "test": "40"},
@@ -140,7 +157,7 @@ def test_foreign_files_are_found(copy: Path, made: dict[str, Path], tmp_path: Pa
     )
     for path in (shard(copy), sidecar_of(shard(copy))):
         shutil.copy(other.folder / path.name, path)
-    assert faults(copy) == {shard(copy).name: "belongs to another data set"}
+    assert faults(copy) == {shard(copy).name: "belongs to another data set than manifest.json"}
 
 
 def test_wrong_rows_and_bad_numbers_are_found_behind_a_true_digest(copy: Path) -> None:
@@ -157,14 +174,16 @@ def test_wrong_rows_and_bad_numbers_are_found_behind_a_true_digest(copy: Path) -
     for bad in (np.nan, np.inf):
         spoilt = intact["value_b"].copy()
         spoilt[7, 1] = bad
-        assert replace({**intact, "value_b": spoilt}) == "has NaN or infinite values in 'value_b'"
+        found = replace({**intact, "value_b": spoilt})
+        assert found == "'value_b' holds NaN or infinite numbers: 1, the first in row 7"
+    assert "unit vectors" in replace({**intact, "omega_o": 2 * intact["omega_o"]})
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "{}", '{"format": "mbtf-shards"}'])
 def test_a_broken_sidecar_is_a_fault_not_an_abort(copy: Path, text: str) -> None:
     sidecar_of(shard(copy)).write_text(text)
     assert list(faults(copy)) == [shard(copy).name]
-    assert not finished_record(shard(copy), 40, "any")
+    assert not finished_record(copy, entry(copy, 40), "any")
 
 
 def test_headers_are_parsed_in_one_thread(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,7 +21,7 @@ from mbtf_gen.pictures.camera import Camera, tiles_camera
 from mbtf_gen.pictures.preview import mesh
 from mbtf_gen.pictures.preview.mesh import MOST_CELLS, draw, tiled_mesh
 from mbtf_gen.pictures.preview.plots import level_histogram, query_figure, write_plots
-from mbtf_gen.pictures.preview.sample import QuerySample, finished_shards, sampled_queries, stored_queries
+from mbtf_gen.pictures.preview.sample import QuerySample, sampled_queries, stored_queries
 from mbtf_gen.sampling.query_sampler import Mixture
 
 LIGHT = from_angles(35, 150)
@@ -163,7 +163,8 @@ def test_unfinished_shards_are_left_out(tmp_path: Path) -> None:
         tmp_path / "set", queries={"train": "100", "test": "8"}, output={"shard_queries": 40}
     )
     (tmp_path / "set/train-00001.json").unlink()
-    assert [p.name for p in finished_shards(dataset)] == ["train-00000.npz", "train-00002.npz"]
+    finished = dataset.shards("train", finished_only=True)
+    assert [shard.path.name for shard in finished] == ["train-00000.npz", "train-00002.npz"]
     sample = stored_queries(dataset)
     assert (len(sample.u), sample.total) == (60, 100)
     for name in ("train-00000.npz", "train-00002.npz"):
