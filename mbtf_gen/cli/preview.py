@@ -13,7 +13,7 @@ from mbtf_gen.config.pictures import RENDERING, PreviewConfig
 _QUERIES = ("train", "resolution", "min_cos", "layout", "patch_size")
 
 
-@takes_options(PreviewConfig, "preview", *(f"queries.{key}" for key in _QUERIES), *RENDERING)
+@takes_options(PreviewConfig, "preview", "exposure", *(f"queries.{key}" for key in _QUERIES), *RENDERING)
 def preview(
     material: str | None = None,
     /,
@@ -45,7 +45,7 @@ def preview(
         from mbtf_gen.dataset.reader import Dataset
 
         dataset = Dataset.open(material)
-        given = [options.flags[key] for key in options.given if not key.startswith("preview.")]
+        given = [options.flags[key] for key in options.given if not key.startswith(("preview.", "exposure"))]
         given += ["--config"] * (options.config is not None) + ["--set"] * bool(options.assignments)
         if given:
             raise UsageError(
