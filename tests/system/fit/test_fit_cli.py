@@ -134,7 +134,7 @@ def test_data_of_another_material_cause_a_warning(tmp_path: Path, run_python: Ru
 def test_evaluate_and_info_report_text_and_json(shards: Path, material: Path) -> None:
     for words, texts in (
         (
-            ["evaluate", str(material), str(shards)],
+            ["evaluate", str(material), str(shards), "--verbose"],
             ("held-out directions", "training queries", "level 3", "cosine 0.7-1"),
         ),
         (["info", str(material)], ("3254 network weights", "conformance: 256 queries")),
