@@ -41,7 +41,7 @@ import numpy as np
 from curved_meshes import F64, Surface, displaced, load_object, refined
 from numpy.typing import NDArray
 
-from mbtf_gen.pictures.reference import auto_exposure, to_display
+from mbtf_core.exposure import auto_exposure, brightness, to_display
 from mbtf_gen.render.runtime import load_mitsuba
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -335,8 +335,8 @@ def draw(rows: list[tuple[dict[str, Any], list[F64]]], path: Path) -> None:
         pen.text((column * (size + gap) + 2, 4), title, (30, 30, 30), ImageFont.load_default(13))
     for row, (_, (true, found)) in enumerate(rows):
         lit = true[true.max(-1) > 0]
-        exposure = auto_exposure(lit.astype(np.float32))
-        difference = np.clip(0.5 + 0.5 * exposure * (found - true).mean(-1, keepdims=True), 0, 1)
+        exposure = auto_exposure([brightness(lit)])
+        difference = np.clip(0.5 + 0.5 * 2.0**exposure * (found - true).mean(-1, keepdims=True), 0, 1)
         pictures = [to_display(p.astype(np.float32), exposure) for p in (true, found)]
         pictures.append(np.repeat(np.round(255 * difference).astype(np.uint8), 3, -1))
         for column, picture in enumerate(pictures):

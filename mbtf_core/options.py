@@ -48,6 +48,7 @@ Output = Annotated[Path, Parameter(name=["--output", "-o"], help="Output folder.
 Overwrite = Annotated[Switch, Parameter(help="Replace existing output.")]
 Time = Annotated[str | None, Parameter(metavar="DURATION", help="Time budget: 90s, 2min, 1h.")]
 DryRun = Annotated[Switch, Parameter(help="Write nothing; only report what would be done.")]
+Verbose = Annotated[Switch, Parameter(alias="-v", help="Print all details.")]
 Config = Annotated[Path | None, Parameter(help="YAML file with the options.")]
 Set = Annotated[
     list[str] | None,

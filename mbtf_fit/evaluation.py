@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from mbtf_core.directions import ELEVATION_BANDS
 from mbtf_core.errors import InputError
+from mbtf_core.exposure import auto_exposure, brightness, white_of
 from mbtf_core.lattice import Lattice
 from mbtf_core.stats import (
     Estimate,
@@ -19,11 +20,13 @@ from mbtf_core.stats import (
     elevation_groups,
     level_groups,
     noise_free_mse,
+    psnr,
     signal_variance,
     unexplained_variance,
 )
 from mbtf_fit.data.loader import MAX_HELD_OUT_OF_IMAGES, SAMPLE, Partition, load_split, load_training
-from mbtf_fit.data.queries import ShardQueries
+from mbtf_fit.data.queries import ShardQueries, mean_value
+from mbtf_fit.formatting import visibility
 from mbtf_fit.material.transmittance_fit import TransmittanceError, evaluate_transmittance, has_transmittance
 from mbtf_gen.dataset.reader import Dataset
 
@@ -72,16 +75,23 @@ class SplitErrors:
         Nearest level → errors.
     elevations : dict
         (lower, upper) edge of the smaller cosine of light and view → errors.
+    exposure : float
+        Exposure in EV that displays the values, see :mod:`mbtf_core.exposure`.
     """
 
     overall: Errors
     levels: dict[int, Errors]
     elevations: dict[tuple[float, float], Errors]
+    exposure: float
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain data for JSON."""
+        """Plain data for JSON; the peak of the PSNR is the value that the exposure shows as white."""
+        found = {"mse": self.overall.mse.as_dict(), "exposure": self.exposure}
         return {
             **self.overall.as_dict(),
+            "exposure": self.exposure,
+            "psnr": psnr(self.overall.mse, white_of(self.exposure)).as_dict(),
+            "visibility": visibility(found)[1],
             "levels": {str(level): errors.as_dict() for level, errors in self.levels.items()},
             "elevations": {f"{low:g}-{high:g}": e.as_dict() for (low, high), e in self.elevations.items()},
         }
@@ -94,21 +104,30 @@ def _grouped(labels: NDArray[np.int64], *arrays: NDArray[np.float32]) -> dict[in
     return {k: Errors(mse[k].n, mse[k], variance[k], unexplained[k]) for k in mse}
 
 
-def split_errors(predict: Predict, queries: ShardQueries, lattice: Lattice) -> SplitErrors | None:
-    """Errors of a prediction on queries; None where there are none."""
+def exposure_of(queries: ShardQueries) -> float:
+    """Automatic exposure in EV of the values of queries."""
+    return auto_exposure([brightness(mean_value(queries.value_a, queries.value_b))])
+
+
+def split_errors(
+    predict: Predict, queries: ShardQueries, lattice: Lattice, exposure: float | None = None
+) -> SplitErrors | None:
+    """Errors of a prediction on queries, at an exposure in EV (by default, their own); None where there are
+    none."""
     if len(queries) == 0:
         return None
+    exposure = exposure_of(queries) if exposure is None else exposure
     arrays = predict(queries), queries.value_a, queries.value_b
     overall = noise_free_mse(*arrays), signal_variance(*arrays[1:]), unexplained_variance(*arrays)
     levels = _grouped(level_groups(queries.sigma, lattice.finest), *arrays)
     bands = _grouped(elevation_groups(queries.omega_i, queries.omega_o), *arrays)
     elevations = {(ELEVATION_BANDS[k], ELEVATION_BANDS[k + 1]): errors for k, errors in bands.items()}
-    return SplitErrors(Errors(len(queries), *overall), levels, elevations)
+    return SplitErrors(Errors(len(queries), *overall), levels, elevations, exposure)
 
 
 def evaluate_splits(predict: Predict, data: Dataset, partition: Partition) -> dict[str, SplitErrors]:
     """Errors of a prediction on ``test``, ``held_out_queries``, ``held_out_directions`` and ``training``
-    queries; a set without queries is left out.
+    queries; a set without queries is left out. The exposure of all is that of the first.
 
     The error on training queries is underestimated by twice the covariance of prediction and noise: its
     distance from the error on held-out queries measures overfitting.
@@ -122,7 +141,9 @@ def evaluate_splits(predict: Predict, data: Dataset, partition: Partition) -> di
     parts["training"] = partition.sample.take(
         slice(None, None, SAMPLE // MAX_HELD_OUT_OF_IMAGES if data.layout == "image" else 1)
     )
-    found = {name: split_errors(predict, queries, data.lattice) for name, queries in parts.items()}
+    parts = {name: queries for name, queries in parts.items() if len(queries)}
+    exposure = exposure_of(next(iter(parts.values()))) if parts else None
+    found = {name: split_errors(predict, queries, data.lattice, exposure) for name, queries in parts.items()}
     return {name: errors for name, errors in found.items() if errors is not None}
 
 

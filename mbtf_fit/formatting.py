@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from typing import Any
 
+from mbtf_core.exposure import describe_exposure, white_of
 from mbtf_core.units import clock
 
 SPLIT_NAMES = {
@@ -13,6 +16,67 @@ SPLIT_NAMES = {
     "training": "training queries",
     "held_out": "held out",
 }
+
+
+# Smallest PSNR in dB of each word for a fit beside its reference. There, the mean HDR-FLIP of pictures is
+# that of grays that differ by 1, 2.3 and 5 in L*; materials vary by 3 dB (benchmarks/visible_errors.py).
+VISIBILITY = (
+    (40.0, "not visible"),
+    (33.0, "barely visible"),
+    (26.0, "visible"),
+    (-math.inf, "clearly visible"),
+)
+# Standard errors of a significant difference from zero.
+_SIGNIFICANT = 2.0
+
+
+def visibility(split: Mapping[str, Any]) -> tuple[str, str | None]:
+    """PSNR as text, and a word of :data:`VISIBILITY`, of the errors of a split; where the error is below its
+    own uncertainty, lower bounds. None without an error."""
+    mse, error = split["mse"]["value"], split["mse"]["error"]
+    # Materials of earlier versions record no exposure.
+    if mse is None or error is None or "exposure" not in split:
+        return "PSNR unknown", None
+    resolved = mse > _SIGNIFICANT * error
+    squared = mse if resolved else mse + _SIGNIFICANT * error
+    if squared <= 0:
+        return "PSNR infinite", VISIBILITY[0][1]
+    psnr = 10.0 * math.log10(white_of(split["exposure"]) ** 2 / squared)
+    word = next(word for least, word in VISIBILITY if psnr >= least)
+    bound = not resolved and word != VISIBILITY[0][1]
+    return f"PSNR {'' if resolved else 'above '}{psnr:.1f} dB", f"at most {word}" if bound else word
+
+
+def headline(errors: Mapping[str, Any]) -> str:
+    """The split whose errors are reported first: test, else held-out queries, else any."""
+    return next((name for name in ("test", "held_out_queries") if name in errors), next(iter(errors)))
+
+
+def summarize_errors(errors: dict[str, Any], transmittance: dict[str, Any] | None = None) -> list[str]:
+    """Three lines, and advice: unexplained variance (where defined) and PSNR of the first split, and the
+    other splits."""
+    first = headline(errors)
+    split, of = errors[first], f"of {errors[first]['n']} {SPLIT_NAMES[first]}"
+    lines = []
+    if split["unexplained"]["value"] is not None:
+        value = format_estimate(split["unexplained"])
+        lines.append(f"unexplained variance {value} {of} (0: exact, 1: as good as the mean value)")
+    text, word = visibility(split)
+    if word is not None:
+        shown = describe_exposure(split["exposure"])
+        lines.append(f"{text} {'' if lines else of + ' '}at {shown}: {word} beside the reference")
+    others = [
+        f"{SPLIT_NAMES[name]} {format_estimate(errors[name]['unexplained'])}"
+        for name in errors
+        if name != first
+    ]
+    if transmittance:
+        found = next(iter(transmittance.values()))
+        others.append(f"rms error of transmittance {max(0.0, found['mse']['value']) ** 0.5:.3f}")
+    return [*lines, *([", ".join(others)] if others else []), *_remarks({first: split | _NO_GROUPS})]
+
+
+_NO_GROUPS: dict[str, Any] = {"levels": {}, "elevations": {}}
 
 
 def format_table(rows: list[list[str]]) -> str:
@@ -45,9 +109,9 @@ def _remarks(errors: dict[str, Any]) -> list[str]:
     found = []
     groups = [g for e in errors.values() for g in (e, *e["levels"].values(), *e["elevations"].values())]
     if any(group["unexplained"]["value"] is None for group in groups):
-        found.append("undefined: the noise exceeds the variance of these values")
-    test = errors.get("test", {}).get("unexplained", {}).get("value")
-    if test is not None and test >= 1:
+        found.append("undefined unexplained variance: the noise exceeds the variance of these values")
+    value = errors[headline(errors)]["unexplained"]["value"]
+    if value is not None and value >= 1:
         found.append(
             "above 1: worse than the mean value; generate more queries (mbtf-gen --queries), more paths per "
             "query (--spp), or a wider light (--light-width)"
@@ -82,15 +146,23 @@ def describe_coverage(coverage: dict[str, float]) -> str:
     return f"gradients reached only {', '.join(partly)}" if partly else "gradients reached every texel"
 
 
-def describe_fit(data: dict[str, Any]) -> str:
+def report_errors(
+    errors: dict[str, Any], transmittance: dict[str, Any] | None, verbose: bool = False
+) -> list[str]:
+    """The summary, followed by the tables if `verbose`."""
+    lines = summarize_errors(errors, transmittance)
+    return [*lines, *describe_errors(errors), *describe_transmittance(transmittance)] if verbose else lines
+
+
+def describe_fit(data: dict[str, Any], verbose: bool = False) -> str:
     training = data["training"]
     rate = training["steps"] * training["batch"] / max(training["seconds"], 1e-9)
     lines = [
         f"{data['material']}: {data['model']}, {training['steps']} steps of {training['batch']} queries in "
         f"{clock(training['seconds'])} on {training['device']} with {training['backend']} "
         f"({rate / 1e6:.2f} M queries/s)",
-        describe_coverage(training["coverage"]),
-        *describe_errors(data["errors"]),
-        *describe_transmittance(training.get("transmittance")),
+        *report_errors(data["errors"], training.get("transmittance"), verbose),
     ]
+    if verbose or min(training["coverage"].values(), default=1) < 1:
+        lines.insert(1, describe_coverage(training["coverage"]))
     return "\n".join(lines)

@@ -14,6 +14,7 @@ from mbtf_core.config_file import Settings, dump_yaml, line_of, read_yaml, resol
 from mbtf_core.errors import InputError
 from mbtf_fit.config import FitConfig
 from mbtf_gen.config.generator import GeneratorConfig, Paths
+from mbtf_gen.config.pictures import EXPOSURE, Exposure
 
 RECIPE_NAME = "recipe.yaml"
 # Names become file and folder names.
@@ -93,9 +94,7 @@ class ReportSection(Settings):
     """Options of the report."""
 
     title: str | None = Field(None, description="title; default: the recipe's name")
-    exposure: float | None = Field(
-        None, gt=0, description="factor from 1/sr to display white; default: from the references"
-    )
+    exposure: Exposure = Field(None, description=EXPOSURE)
     max_megabytes: float = Field(9.5, ge=1, le=100, description="size limit of the file")
 
 
@@ -140,7 +139,7 @@ class Recipe(Settings):
         Title, exposure and size of the report.
     """
 
-    version: Literal[2] = 2
+    version: Literal[3] = 3
     name: Name
     description: str = ""
     output: str | None = Field(None, description="folder of the run; default: out/NAME")

@@ -283,18 +283,20 @@ def survey(recipe: Recipe, folder: Path) -> dict[str, Decision]:
     return out
 
 
-def rerender(folder: Path) -> Path:
+def rerender(folder: Path, exposure: float | None = None) -> tuple[Path, float]:
     """Write the report of a finished run again.
 
     Parameters
     ----------
     folder : Path
         Folder of the run.
+    exposure : float, optional
+        Exposure in EV; that of the recipe by default.
 
     Returns
     -------
-    Path
-        HTML file.
+    (Path, float)
+        HTML file, and the exposure of its images in EV.
 
     Raises
     ------
@@ -302,7 +304,13 @@ def rerender(folder: Path) -> Path:
         The folder contains no run of this version, or its comparison is not finished.
     """
     is_run(folder)
-    run = _RecipeRun(read_resolved(folder), folder, Console(quiet=True))
+    recipe = read_resolved(folder)
+    if exposure is not None:
+        recipe = recipe.model_copy(update={"report": recipe.report.model_copy(update={"exposure": exposure})})
+    run = _RecipeRun(recipe, folder, Console(quiet=True))
     with locked(folder):
         run_again(folder, run.stages({})[-1])
-    return folder / REPORT
+    used = recipe.report.exposure
+    return folder / REPORT, read_json(folder / COMPARE / COMPARISON_NAME)[
+        "exposure"
+    ] if used is None else used

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from mbtf_core.color import linear_to_srgb
+from mbtf_core.exposure import to_display
 from mbtf_fit import Material
 
-SIZE, EXTENT, EXPOSURE = 256, 0.6, 3.0
+SIZE, EXTENT, EXPOSURE = 256, 0.6, 1.58
 # (elevation, azimuth) of view and light in degrees.
 VIEWS = (((90, 0), (50, 45)), ((35, -90), (25, 160)))
 
@@ -36,8 +36,8 @@ def picture(material: Material) -> NDArray[np.uint8]:
     parts = []
     for view, light in VIEWS:
         omega_i, omega_o = (np.tile(direction(*d), (len(u), 1)) for d in (light, view))
-        value = EXPOSURE * material.evaluate(u, sigma, omega_i, omega_o).reshape(SIZE, SIZE, 3)
-        parts.append((np.clip(linear_to_srgb(value), 0, 1) * 255).astype(np.uint8))
+        value = material.evaluate(u, sigma, omega_i, omega_o).reshape(SIZE, SIZE, 3)
+        parts.append(to_display(value, EXPOSURE))
     return np.concatenate(parts, 1)
 
 

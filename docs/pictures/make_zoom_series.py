@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from mbtf_core.directions import from_angles
+from mbtf_core.exposure import auto_exposure, brightness, to_display
 from mbtf_gen.dataset.shard_io import read_exr
 from mbtf_gen.pictures.camera import Camera
-from mbtf_gen.pictures.reference import auto_exposure, to_display
 from mbtf_gen.render.runtime import load_mitsuba
 
 ROOT = Path(__file__).parents[2]
@@ -118,7 +118,7 @@ def main() -> None:
         level = 0.5 * (a.mean() + b.mean())
         contrast = ((a - a.mean()) * (b - b.mean())).mean()
         pictures = (truth, rendered(mi, tiles_across, "mbtf_path"), rendered(mi, tiles_across, "path"))
-        exposure = auto_exposure(truth.astype(np.float32))
+        exposure = auto_exposure([brightness(truth)])
         for row, (name, picture) in enumerate(zip(ROWS, pictures, strict=True)):
             place = (column * (SIZE + GAP), row * (SIZE + CAPTION))
             caption = name if column == 0 else f"{tiles_across:g} tiles across" if row == 0 else ""

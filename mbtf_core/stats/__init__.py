@@ -13,6 +13,7 @@ from mbtf_core.stats.paired import (
     pooled_error,
     pooled_relative_error,
     pooled_variance,
+    psnr,
     signal_variance,
     unexplained_variance,
 )
@@ -35,6 +36,7 @@ __all__ = [
     "pooled_error",
     "pooled_relative_error",
     "pooled_variance",
+    "psnr",
     "signal_variance",
     "t_test",
     "unexplained_variance",

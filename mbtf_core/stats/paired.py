@@ -218,6 +218,27 @@ def unexplained_variance(prediction: ArrayLike, a: ArrayLike, b: ArrayLike) -> E
     return _ratio(per_unit((p - first) * (p - second)), products + correction)
 
 
+def psnr(mse: Estimate, peak: float) -> Estimate:
+    """PSNR in dB of a mean squared error; infinite where the error is not positive.
+
+    Parameters
+    ----------
+    mse : Estimate
+        Noise-free mean squared error, 1/sr².
+    peak : float
+        Value of full scale, 1/sr.
+
+    Returns
+    -------
+    Estimate
+        In dB, with the standard error that follows from the one of `mse`.
+    """
+    if mse.value <= 0 or peak <= 0:
+        return Estimate(math.inf, math.inf, mse.n)
+    value = 10.0 * math.log10(peak**2 / mse.value)
+    return Estimate(value, 10.0 / math.log(10.0) * mse.relative_error, mse.n)
+
+
 def _centered_products(a: NDArray[np.float64], b: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
     """Per unit ``(a-ā)(b-b̄)`` (n,), and what must be added to its mean to make it unbiased."""
     n = len(a)

@@ -5,14 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 
 from mbtf_core.console import CONSOLE, Console
-from mbtf_fit.formatting import describe_errors, describe_transmittance
+from mbtf_core.options import Verbose
+from mbtf_fit.formatting import report_errors
 
 
-def evaluate(material: Path, shards: Path, /, *, console: Console = CONSOLE) -> None:
+def evaluate(
+    material: Path, shards: Path, /, *, verbose: Verbose = False, console: Console = CONSOLE
+) -> None:
     """Measure the errors of a material on a data set, without the noise of the data.
 
-    Errors are listed for the test split and for held-out queries and directions: overall, by level of
-    detail, and by elevation.
+    Errors are those of the test split, of held-out queries and directions, and of training queries; with
+    --verbose also by level of detail and by elevation.
 
     Parameters
     ----------
@@ -35,8 +38,8 @@ def evaluate(material: Path, shards: Path, /, *, console: Console = CONSOLE) -> 
     found = evaluate(loaded, shards)
     errors = {name: e.as_dict() for name, e in found.values.items()}
     through = {name: e.as_dict() for name, e in (found.transmittance or {}).items()}
-    lines = [f"{material}: {loaded.config.model} on {shards}", *describe_errors(errors)]
+    lines = [f"{material}: {loaded.config.model} on {shards}", *report_errors(errors, through, verbose)]
     report = {"material": material, "shards": shards, "foreign_inputs": foreign, "errors": errors}
     if found.transmittance is not None:
         report["transmittance"] = through
-    console.report(report, "\n".join(lines + describe_transmittance(through)))
+    console.report(report, "\n".join(lines))

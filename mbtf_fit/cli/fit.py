@@ -10,10 +10,10 @@ from cyclopts import Parameter
 
 from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import PartialError, UsageError
-from mbtf_core.options import DryRun, Options, Output, Overwrite, takes_options
+from mbtf_core.options import DryRun, Options, Output, Overwrite, Verbose, takes_options
 from mbtf_core.units import clock, expectation, format_duration
 from mbtf_fit.config import FitConfig
-from mbtf_fit.formatting import describe_fit, format_estimate, format_table
+from mbtf_fit.formatting import describe_fit, format_estimate, format_table, headline, visibility
 from mbtf_gen.config.presets import Quality, QualityOption, as_assignments, overrides_of
 
 
@@ -29,6 +29,7 @@ def fit(
     processes: Annotated[int | None, Parameter(show_default="one per GPU, or 1")] = None,
     dry_run: DryRun = False,
     overwrite: Overwrite = False,
+    verbose: Verbose = False,
     console: Console = CONSOLE,
 ) -> None:
     """Fit a material to a data set: mbtf-fit shards/ -o material/
@@ -109,7 +110,7 @@ def fit(
         console.note(f"{output}: this fit is already finished; --overwrite trains it again")
     summary = result.as_dict()
     cost = [result.marginal_cost.describe()] if result.marginal_cost is not None else []
-    console.report(summary, "\n".join([describe_fit(summary), *cost]))
+    console.report(summary, "\n".join([describe_fit(summary, verbose), *cost]))
 
 
 def resolve_config(options: Options[FitConfig], quality: Quality | None) -> FitConfig:
@@ -157,14 +158,16 @@ def _fit_many(
         outcomes = fit_many(
             config, shards, folders, processes=processes, overwrite=overwrite, finished=finished
         )
-    rows = [["material", "unexplained variance, test", "steps", "training"]]
+    rows = [["material", "unexplained variance", "PSNR", "beside the reference", "steps", "training"]]
     for outcome in outcomes:
         if outcome.result is None:
-            rows.append([outcome.folder.name, "failed", "-", "-"])
+            rows.append([outcome.folder.name, "failed", "-", "-", "-", "-"])
             continue
         training, errors = outcome.result["training"], outcome.result["errors"]
-        error = format_estimate((errors.get("test") or next(iter(errors.values())))["unexplained"])
-        rows.append([outcome.folder.name, error, str(training["steps"]), clock(training["seconds"])])
+        split = errors[headline(errors)]
+        psnr, word = visibility(split)
+        cells = [format_estimate(split["unexplained"]), psnr.removeprefix("PSNR "), word or "-"]
+        rows.append([outcome.folder.name, *cells, str(training["steps"]), clock(training["seconds"])])
     console.report({"fits": [o.as_dict() for o in outcomes]}, format_table(rows))
     failed = [o for o in outcomes if o.error is not None]
     for outcome in failed:

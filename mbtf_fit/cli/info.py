@@ -7,12 +7,13 @@ from typing import Any
 
 from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import InputError
+from mbtf_core.options import Verbose
 from mbtf_core.suggest import suggest_path
 from mbtf_core.units import clock
-from mbtf_fit.formatting import describe_errors, describe_transmittance
+from mbtf_fit.formatting import report_errors
 
 
-def info(path: Path, /, *, console: Console = CONSOLE) -> None:
+def info(path: Path, /, *, verbose: Verbose = False, console: Console = CONSOLE) -> None:
     """Describe a material or a data set.
 
     Parameters
@@ -24,7 +25,7 @@ def info(path: Path, /, *, console: Console = CONSOLE) -> None:
         raise InputError("no such folder", where=path, hint=suggest_path(path, Path.is_dir))
     from mbtf_gen.dataset.reader import is_dataset
 
-    data, text = _shards_info(path) if is_dataset(path) else _material_info(path)
+    data, text = _shards_info(path) if is_dataset(path) else _material_info(path, verbose)
     console.report(data, text)
 
 
@@ -55,7 +56,7 @@ def _shards_info(path: Path) -> tuple[dict[str, Any], str]:
     }, "\n".join(lines)
 
 
-def _material_info(path: Path) -> tuple[dict[str, Any], str]:
+def _material_info(path: Path, verbose: bool) -> tuple[dict[str, Any], str]:
     from mbtf_fit.material.format import WEIGHTS_NAME
     from mbtf_fit.material.material import Material
     from mbtf_fit.native import describe
@@ -67,17 +68,13 @@ def _material_info(path: Path) -> tuple[dict[str, Any], str]:
     deviation = material.deviation()
     rows, columns = material.lattice.shape()
     lines = [
-        f"{path}: {description['model']}",
-        f"levels 0 to {material.lattice.finest}, finest {columns} x {rows} texels, "
-        f"aspect {material.lattice.aspect:g}",
-        f"{weights['network_weights']} network weights, {weights['texels']} texture values, "
-        f"{size / 1e6:.2f} MB",
+        f"{path}: {description['model']}, levels 0 to {material.lattice.finest}, finest {columns} x {rows} "
+        f"texels, aspect {material.lattice.aspect:g}; {weights['network_weights']} network weights, "
+        f"{weights['texels']} texture values, {size / 1e6:.2f} MB",
         f"trained for {training['steps']} steps of {training['batch']} queries in "
-        f"{clock(training['seconds'])}",
-        f"evaluation on this CPU: {describe()}",
-        *describe_errors(training["errors"]),
-        *describe_transmittance(training.get("transmittance")),
-        f"conformance: {description['conformance']['count']} queries, largest deviation {deviation:.2g}",
+        f"{clock(training['seconds'])}; evaluation on this CPU: {describe()}; conformance: "
+        f"{description['conformance']['count']} queries, largest deviation {deviation:.2g}",
+        *report_errors(training["errors"], training.get("transmittance"), verbose),
     ]
     return {
         "material": path,

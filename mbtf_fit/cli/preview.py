@@ -6,7 +6,7 @@ from pathlib import Path
 
 from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import UsageError
-from mbtf_core.options import Options, Output, Overwrite, PathText, takes_options
+from mbtf_core.options import Options, Output, Overwrite, PathText, Switch, takes_options
 from mbtf_fit.mitsuba_plugin.preview.config import PreviewConfig
 
 
@@ -17,20 +17,30 @@ def preview(
     *,
     output: Output = Path("preview"),
     options: Options[PreviewConfig],
+    sheet_only: Switch = False,
+    mp4: Switch = False,
     overwrite: Overwrite = False,
     console: Console = CONSOLE,
 ) -> None:
     """Draw a material: a contact sheet of views, lights and zooms, and a turntable.
 
-    Needs neither a scene nor PyTorch. Writes sheet.png and turntable.gif.
+    Needs neither a scene nor PyTorch. Writes sheet.png and turntable.gif. --view and --light replace all
+    views and lights of the sheet. Sheet and turntable have one exposure.
 
     Parameters
     ----------
     material
         Folder made by mbtf-fit.
+    sheet_only
+        Draw no turntable.
+    mp4
+        Write the turntable as MP4, too; needs ffmpeg or the extra 'video'.
     """
     from mbtf_fit.mitsuba_plugin.preview.command import draw
 
+    if sheet_only and mp4:
+        raise UsageError("--sheet-only draws no turntable", where="--mp4", hint="leave out one of them")
     if material is None and options.config is None:
         raise UsageError("no material given", hint="mbtf-fit preview material/ -o preview/")
-    draw(options.resolve(material=material), output, overwrite=overwrite, console=console)
+    config = options.resolve(material=material)
+    draw(config, output, sheet_only=sheet_only, mp4=mp4, overwrite=overwrite, console=console)

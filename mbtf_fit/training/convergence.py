@@ -24,39 +24,37 @@ class MarginalCost:
     Attributes
     ----------
     validation_set : the set of queries that the errors are of, in words
-    half, half_error : unexplained variance after half of the training time, and its standard error
+    half, half_error : unexplained variance of a subset of it after half of the training time, and its
+        standard error; None where the history does not resolve it
     end, end_error : the same at the end
     halving : seconds of training that would halve the error if every doubling of the time divided it as the
         last one did; None where that one was not significant. The learning rate falls towards the end, which
         favors the last doubling, so this is a lower bound
-    noise_share : share of the held-out queries' error that is overfitting to the noise of the training
-        queries; None where it is not significant
+    noise_share : share of the error on queries without training that is overfitting to the noise of the
+        training queries; None where it is not significant
     """
 
     validation_set: str
-    half: float
-    half_error: float
-    end: float
-    end_error: float
+    half: float | None
+    half_error: float | None
+    end: float | None
+    end_error: float | None
     halving: float | None
     noise_share: float | None
 
     def describe(self) -> str:
-        """One line, or two."""
-        text = (
-            f"unexplained variance of {self.validation_set}: {self.half:.3f} ± {self.half_error:.3f} at half "
-            f"of the training time, {self.end:.3f} ± {self.end_error:.3f} at the end; "
-        )
-        if self.halving is None:
-            text += "longer training alone would hardly reduce it"
-        else:
-            text += f"halving the error takes about {clock(self.halving)} more, or longer"
+        """One line, or two, without another number for the error."""
+        lines = []
+        if self.halving is not None:
+            lines.append(f"halving the error takes about {clock(self.halving)} more of training, or longer")
+        elif self.end is not None:
+            lines.append("longer training alone would hardly reduce the error")
         if self.noise_share is not None:
-            text += (
-                f"\noverfitting to noise causes {self.noise_share:.0%} of the error of held-out queries: "
-                "use more queries, or more paths per query"
+            lines.append(
+                f"overfitting to noise causes {self.noise_share:.0%} of the error of new queries: use more "
+                "queries, or more paths per query"
             )
-        return text
+        return "\n".join(lines)
 
 
 def marginal_cost_of(
@@ -66,15 +64,16 @@ def marginal_cost_of(
     validation_set: str = "test",
 ) -> MarginalCost | None:
     """Marginal cost of a finished fit, from the records of its history and its errors by split; None where
-    the history does not resolve it.
+    neither the history nor the errors resolve anything.
 
-    `noise` is the variance of the noise of training values over that of the values (None: unknown),
-    `validation_set` the split that the history is of.
+    `noise` is the variance of the noise of training values in 1/sr² (None: unknown), `validation_set` the
+    split that the history is of.
     """
+    share, name = _noise_share(errors, noise), SPLIT_NAMES[validation_set]
     known = [r for r in history if _number(r.get("unexplained")) and _number(r.get("unexplained_error"))]
     middle = [r for r in known if _MIDDLE[0] <= r.get("fraction", -1.0) <= _MIDDLE[1]]
     if not middle or known[-1].get("fraction", 0.0) < 1.0:
-        return None
+        return None if share is None else MarginalCost(name, None, None, None, None, None, share)
     last, half = known[-1], min(middle, key=lambda r: abs(r["fraction"] - 0.5))
     before, after = half["unexplained"], last["unexplained"]
     spread = math.hypot(half["unexplained_error"], last["unexplained_error"])
@@ -85,13 +84,13 @@ def marginal_cost_of(
         if doublings < _MOST_DOUBLINGS:
             halving = last["seconds"] * (2.0**doublings - 1.0)
     return MarginalCost(
-        validation_set=SPLIT_NAMES[validation_set],
+        validation_set=name,
         half=before,
         half_error=half["unexplained_error"],
         end=after,
         end_error=last["unexplained_error"],
         halving=halving,
-        noise_share=_noise_share(errors, noise),
+        noise_share=share,
     )
 
 
@@ -100,18 +99,19 @@ def _number(x: Any) -> bool:
 
 
 def _noise_share(errors: dict[str, Any], noise: float | None) -> float | None:
-    """Overfitting over the error of held-out queries.
+    """Overfitting over the error of held-out queries, or of test queries where that one is not significant.
 
-    A fit that overfits the noise of its training queries gains an error on held-out queries that equals the
+    A fit that overfits the noise of its training queries gains an error on other queries that equals the
     variance of what it has overfitted, and its error on the training queries falls by as much. The difference
     is twice that. Few queries cause such a difference without noise too, so the noise itself is the bound.
     """
-    found = [errors.get(name, {}).get("unexplained", {}) for name in ("held_out_queries", "training")]
-    if noise is None or not all(_number(e.get(k)) for e in found for k in ("value", "error")):
+    mse = {name: of["mse"] for name, of in errors.items() if all(map(_number, of["mse"].values()))}
+    others = (mse[name] for name in ("held_out_queries", "test") if name in mse)
+    new = next((e for e in others if e["value"] > _SIGNIFICANT * e["error"]), None)
+    training = mse.get("training")
+    if noise is None or training is None or new is None:
         return None
-    held_out, training = found
-    overfit = min(0.5 * (held_out["value"] - training["value"]), noise)
-    spread = 0.5 * math.hypot(held_out["error"], training["error"])
-    if held_out["value"] <= 0 or overfit <= _SIGNIFICANT * spread:
+    overfit = min(0.5 * (new["value"] - training["value"]), noise)
+    if overfit <= _SIGNIFICANT * 0.5 * math.hypot(new["error"], training["error"]):
         return None
-    return min(1.0, float(overfit / held_out["value"]))
+    return min(1.0, float(overfit / new["value"]))

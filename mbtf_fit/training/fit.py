@@ -104,7 +104,7 @@ class FitResult:
         """Estimated training time that halves the error; None where the history does not resolve it."""
         training = self.material.description["training"]
         return marginal_cost_of(
-            self.history, self.errors, training.get("noise_ratio"), training.get("validation_set", "test")
+            self.history, self.errors, training.get("noise_variance"), training.get("validation_set", "test")
         )
 
 
@@ -217,7 +217,8 @@ def fit(
         "backend": trainer.backend,
         "torch": torch.__version__,
         "errors": {split: e.as_dict() for split, e in errors.items()},
-        # Variance of the noise of values over that of the values.
+        # Variance of the noise of values, in 1/sr² and over that of the values.
+        "noise_variance": noise,
         "noise_ratio": noise / variance if variance > 0 else None,
     }
     transmittance = fit_transmittance(data, partition.selection)

@@ -64,7 +64,7 @@ def describe_record(record: dict[str, Any]) -> str:
     """One line for the progress bar."""
     text = f"loss {record['loss']:.3f}"
     if record["unexplained"] is not None:
-        text += f", unexplained {record['unexplained']:.3f} ± {record['unexplained_error']:.3f}"
+        text += f", validation error {record['unexplained']:.3f} ± {record['unexplained_error']:.3f}"
     return f"{text}, {record['queries_per_second'] / 1e6:.2f} M queries/s"
 
 

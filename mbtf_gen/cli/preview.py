@@ -13,7 +13,7 @@ from mbtf_gen.config.pictures import RENDERING, PreviewConfig
 _QUERIES = ("train", "resolution", "min_cos", "layout", "patch_size")
 
 
-@takes_options(PreviewConfig, "preview", *(f"queries.{key}" for key in _QUERIES), *RENDERING)
+@takes_options(PreviewConfig, "preview", "exposure", *(f"queries.{key}" for key in _QUERIES), *RENDERING)
 def preview(
     material: PathText | None = None,
     /,
@@ -43,7 +43,7 @@ def preview(
     dataset = None
     if material is not None and is_dataset(Path(material)):
         dataset = Dataset.open(material)
-        given = [options.flags[key] for key in options.given if not key.startswith("preview.")]
+        given = [options.flags[key] for key in options.given if not key.startswith(("preview.", "exposure"))]
         given += ["--config"] * (options.config is not None) + ["--set"] * bool(options.assignments)
         if given:
             raise UsageError(

@@ -12,7 +12,7 @@ from mbtf_gen.cli.generate import resolve_config
 from mbtf_gen.config.pictures import RENDERING, ReferenceConfig
 
 
-@takes_options(ReferenceConfig, "reference", *RENDERING)
+@takes_options(ReferenceConfig, "reference", "exposure", *RENDERING)
 def reference(
     material: PathText | None = None,
     /,
@@ -24,7 +24,8 @@ def reference(
 ) -> None:
     """Render reference pictures of the micro-geometry on the plane: EXR with two estimates, and PNG.
 
-    The same command again renders the missing pictures.
+    The same command again renders the missing pictures. All pictures have one exposure. Another --exposure
+    renders nothing again.
 
     Parameters
     ----------
@@ -33,6 +34,7 @@ def reference(
     """
     resolved = resolve_config(options, material)
     from mbtf_core.directions import from_angles
+    from mbtf_core.exposure import auto_exposure, brightness, describe_exposure
     from mbtf_core.folders import check_space
     from mbtf_core.stats import pooled_relative_error
     from mbtf_gen.dataset.shard_io import row_bytes
@@ -40,7 +42,13 @@ def reference(
     from mbtf_gen.job import Job
     from mbtf_gen.pictures.camera import Camera, PixelKind
     from mbtf_gen.pictures.folder import PictureFolder
-    from mbtf_gen.pictures.reference import PNG_BYTES, auto_exposure, picture_seconds, render_reference
+    from mbtf_gen.pictures.reference import (
+        PNG_BYTES,
+        picture_seconds,
+        read_value,
+        render_reference,
+        write_display,
+    )
     from mbtf_gen.planning.effects_plan import reference_plan
     from mbtf_gen.planning.simulation import build_estimator
 
@@ -74,7 +82,7 @@ def reference(
         seconds = picture_seconds(estimator, cameras[0], omega_i, left * wanted.spp)
         console.note(expectation(seconds, size))
     pictures: list[dict[str, Any]] = []
-    exposure: float | None = None
+    bright: list[float] = []
     with console.progress(total=len(cameras) * len(kinds), label="rendering", unit="pictures") as bar:
         for index, camera in enumerate(cameras):
             for one in kinds:
@@ -86,12 +94,10 @@ def reference(
                     image = render_reference(
                         estimator, camera, omega_i, kind=one, spp=wanted.spp, seed=resolved.seed, index=index
                     )
-                    exposure = exposure or auto_exposure(image.value)
                     noise = pooled_relative_error(image.value_a.reshape(-1, 3), image.value_b.reshape(-1, 3))
-                    facts = {"relative_noise": noise.value, "exposure": exposure}
-                    folder.keep(name, image.write(folder.path / name, exposure), facts)
-                # One exposure for all: that of the first picture.
-                exposure = facts["exposure"]
+                    facts = {"relative_noise": noise.value, "brightness": brightness(image.value)}
+                    folder.keep(name, [image.write(folder.path / name)], facts)
+                bright.append(facts["brightness"])
                 pictures.append(
                     {
                         "file": folder.path / f"{name}.exr",
@@ -102,8 +108,14 @@ def reference(
                     }
                 )
                 bar.advance(1)
-    text = "\n".join(
+    exposure = auto_exposure(bright) if resolved.exposure is None else resolved.exposure
+    for name in names.values():
+        if folder.finished(f"{name}.png") != {"exposure": exposure}:
+            png = write_display(folder.path / name, read_value(folder.path / f"{name}.exr"), exposure)
+            folder.keep(f"{name}.png", [png], {"exposure": exposure})
+    lines = [
         f"{p['file']}: noise {p['relative_noise']:.2%} of the mean value{' (kept)' if p['kept'] else ''}"
         for p in pictures
-    )
+    ]
+    text = "\n".join([*lines, f"PNG: {describe_exposure(exposure)}"])
     console.report({"pictures": pictures, "exposure": exposure}, text)

@@ -45,6 +45,8 @@ TilesAcross = Annotated[
     AfterValidator(_distinct),
 ]
 PATHS_PER_PIXEL = "paths per pixel"
+Exposure = Annotated[float | None, Field(ge=-40, le=40), Flag("--exposure", "EV")]
+EXPOSURE = "exposure of the pictures: a value v in 1/sr is shown as 2^EV v; default: from the pictures"
 # Sections of the generator's configuration that decide what a picture shows.
 RENDERING = ("geometry", "light", "transport", "effects", "seed")
 
@@ -90,9 +92,11 @@ class ReferenceConfig(GeneratorConfig):
     """Everything ``mbtf-gen reference`` needs."""
 
     reference: ReferenceSection = ReferenceSection()
+    exposure: Exposure = Field(None, description=EXPOSURE)
 
 
 class PreviewConfig(GeneratorConfig):
     """Everything ``mbtf-gen preview`` needs."""
 
     preview: PreviewSection = PreviewSection()
+    exposure: Exposure = Field(None, description=EXPOSURE)

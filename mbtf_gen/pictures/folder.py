@@ -23,7 +23,9 @@ from mbtf_core.shard_schema import CONFIG_NAME
 
 RECORD_NAME = "pictures.json"
 FORMAT_NAME = "mbtf-pictures"
-_VERSION = 1
+_VERSION = 2
+# What does not change the content of pictures: the name of the material, and how values are displayed.
+_DISPLAY = ("material", "exposure")
 
 
 class _Picture(BaseModel):
@@ -71,7 +73,8 @@ class PictureFolder:
         ----------
         kind : kind of the pictures, as stored in the record
         files : names of all files that may be written
-        config : resolved options, written beside the pictures; all but ``material`` determine their content
+        config : resolved options, written beside the pictures; ``material`` and ``exposure`` do not
+            determine their content, the others do
         inputs : digests of the input files by role, which determine it as well
         overwrite : remove what the folder's record lists, and start anew
         command : command that draws these pictures, for messages; ``mbtf-gen`` and the kind by default
@@ -81,13 +84,15 @@ class PictureFolder:
         InputError : the folder holds something else
         """
         command = command or f"mbtf-gen {kind}"
-        depends = {**{k: v for k, v in config.items() if k != "material"}, "inputs": dict(inputs)}
+        depends = {**{k: v for k, v in config.items() if k not in _DISPLAY}, "inputs": dict(inputs)}
         existing = path / RECORD_NAME
         if check_folder(path, lambda folder: (folder / RECORD_NAME).exists(), f"pictures of {command}"):
             old = read_json(existing)
-            if old.get("format") != FORMAT_NAME or old.get("kind") != kind:
+            if [old.get(key) for key in ("format", "version", "kind")] != [FORMAT_NAME, _VERSION, kind]:
                 raise InputError(
-                    f"holds pictures of something else than {command}", where=path, hint=ELSEWHERE
+                    f"holds pictures of something else than {command}, or of another version",
+                    where=path,
+                    hint=ELSEWHERE,
                 )
             check_document(_Record, old, existing, ELSEWHERE)
             if not overwrite and old["hash"] != data_sha256(depends):
@@ -95,8 +100,9 @@ class PictureFolder:
             # Unfinished files of a killed run.
             remove_unfinished(path, (CONFIG_NAME, RECORD_NAME, *old["files"]))
             if not overwrite:
-                if not (path / CONFIG_NAME).exists():
-                    write_text(path / CONFIG_NAME, dump_yaml(config))
+                config_file, text = path / CONFIG_NAME, dump_yaml(config)
+                if not config_file.exists() or config_file.read_text(encoding="utf-8") != text:
+                    write_text(config_file, text)
                 return cls(path, old)
             # What the record lists and nothing else; the record last, which keeps the claim.
             for name in (*old["files"], CONFIG_NAME, RECORD_NAME):

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.atomic import write_file
-from mbtf_core.color import linear_to_srgb
-from mbtf_gen.dataset.shard_io import write_exr
+from mbtf_core.exposure import to_display
+from mbtf_gen.dataset.shard_io import read_exr, write_exr
 from mbtf_gen.pictures.camera import PIXEL_SIGMA, Camera, PixelKind
 from mbtf_gen.sampling.query_sampler import Queries
 
@@ -60,29 +60,29 @@ class ReferenceImage:
         """Mean of the halves, (rows, columns, 3)."""
         return 0.5 * (self.value_a + self.value_b)
 
-    def write(self, path: Path, exposure: float | None = None) -> tuple[Path, Path]:
-        """Write the picture as EXR and PNG, each atomically.
-
-        Parameters
-        ----------
-        path : Path
-            Path without suffix.
-        exposure : float, optional
-            Factor of the PNG; :func:`auto_exposure` by default.
-
-        Returns
-        -------
-        (Path, Path)
-            The EXR image with all channels, and the sRGB PNG.
-        """
+    def write(self, path: Path) -> Path:
+        """Write ``path`` + ``.exr`` with all channels, atomically, and return its path."""
         spp = np.full(self.queries.lead, self.spp, np.float32)
         arrays = {**vars(self.queries), "value_a": self.value_a, "value_b": self.value_b, "spp": spp}
         if self.transmittance is not None:
             arrays["transmittance"] = self.transmittance
-        exr, png = (path.with_name(f"{path.name}{suffix}") for suffix in (".exr", ".png"))
+        exr = path.with_name(f"{path.name}.exr")
         write_exr(exr, {name: array[None] for name, array in arrays.items()})
-        write_png(png, to_display(self.value, exposure))
-        return exr, png
+        return exr
+
+
+def read_value(path: Path) -> NDArray[np.float32]:
+    """Value (rows, columns, 3) of a picture that :meth:`ReferenceImage.write` wrote."""
+    stored = read_exr(path, ("value_a", "value_b"))
+    value: NDArray[np.float32] = 0.5 * (stored["value_a"] + stored["value_b"])
+    return value.reshape(value.shape[-3:])
+
+
+def write_display(path: Path, value: NDArray[np.float32], exposure: float) -> Path:
+    """Write ``path`` + ``.png``, sRGB of a linear picture at an exposure in EV, and return its path."""
+    png = path.with_name(f"{path.name}.png")
+    write_png(png, to_display(value, exposure))
+    return png
 
 
 def write_png(path: Path, pixels: NDArray[np.uint8]) -> None:
@@ -90,19 +90,6 @@ def write_png(path: Path, pixels: NDArray[np.uint8]) -> None:
     from PIL import Image
 
     write_file(path, lambda stream: Image.fromarray(pixels).save(stream, format="PNG"))
-
-
-def auto_exposure(value: NDArray[np.float32]) -> float:
-    """Exposure that maps the 95th percentile of the mean channel to 0.8; 1 for a black picture."""
-    bright = float(np.percentile(np.asarray(value).mean(axis=-1), 95))
-    return 0.8 / bright if bright > 0 else 1.0
-
-
-def to_display(value: NDArray[np.float32], exposure: float | None = None) -> NDArray[np.uint8]:
-    """8-bit sRGB of linear values (..., 3) times an exposure factor (by default :func:`auto_exposure`)."""
-    factor = auto_exposure(value) if exposure is None else exposure
-    linear = np.clip(np.asarray(value, np.float64) * factor, 0, 1)
-    return np.round(255.0 * linear_to_srgb(linear)).astype(np.uint8)
 
 
 def _camera_rays(camera: Camera, estimator: Estimator) -> Any:

@@ -3,30 +3,26 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
-
-from cyclopts import Parameter
+from typing import Any
 
 from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import InputError, MbtfError
-from mbtf_core.options import Switch
+from mbtf_core.options import Verbose
 
 
 def list_recipes(
     folder: Path = Path("pipelines"),
     /,
     *,
-    verbose: Annotated[Switch, Parameter(alias="-v")] = False,
+    verbose: Verbose = False,
     console: Console = CONSOLE,
 ) -> None:
-    """List the recipes of a folder.
+    """List the recipes of a folder; with --verbose also the stages that would run, given earlier runs.
 
     Parameters
     ----------
     folder
         Folder of recipes.
-    verbose
-        Also list the stages that would run; reads the output of earlier runs.
     """
     if not folder.is_dir():
         raise InputError("no such folder", where=folder)

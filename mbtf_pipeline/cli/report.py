@@ -3,21 +3,44 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+from cyclopts.validators import Number
 
 from mbtf_core.console import CONSOLE, Console
+from mbtf_core.errors import UsageError
 
 
-def report(folder: Path, /, *, console: Console = CONSOLE) -> None:
+def report(
+    folder: Path,
+    /,
+    *,
+    exposure: Annotated[
+        float | None, Parameter(metavar="EV", show_default=False, validator=Number(gte=-40, lte=40))
+    ] = None,
+    console: Console = CONSOLE,
+) -> None:
     """Write the report of a finished run again, or the page and tables of a paper recipe.
 
     Parameters
     ----------
     folder
         Folder of the run.
+    exposure
+        Exposure of the pictures: a value v in 1/sr is shown as 2^EV v.
     """
+    from mbtf_core.exposure import describe_exposure
     from mbtf_pipeline.paper_tables.suite import is_paper, write_again
     from mbtf_pipeline.run import rerender
 
-    path = write_again(folder) if is_paper(folder) else rerender(folder)
+    used = None
+    if is_paper(folder):
+        if exposure is not None:
+            raise UsageError("the page of a paper recipe has no exposure", where="--exposure")
+        path = write_again(folder)
+    else:
+        path, used = rerender(folder, exposure)
     size = path.stat().st_size
-    console.report({"report": path, "bytes": size}, f"{path}: {size / 1e6:.1f} MB")
+    text = f"{path}: {size / 1e6:.1f} MB" + ("" if used is None else f", {describe_exposure(used)}")
+    console.report({"report": path, "bytes": size, "exposure": used}, text)

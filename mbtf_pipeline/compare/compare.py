@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from mbtf_core.atomic import write_json
 from mbtf_core.directions import from_angles
+from mbtf_core.exposure import auto_exposure, brightness, white_of
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_pipeline.compare.dataset_errors import dataset_errors
-from mbtf_pipeline.compare.metrics import DEFINITIONS, image_errors, reference_difference, white_point
+from mbtf_pipeline.compare.metrics import DEFINITIONS, image_errors, reference_difference
 from mbtf_pipeline.compare.offsets import write_offsets
 from mbtf_pipeline.compare.perceptual_metrics import perceptual_scores
 from mbtf_pipeline.compare.pictures import (
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
 COMPARISON_NAME = "comparison.json"
 COMPARISON_FORMAT = "mbtf-comparison"
 # Raised when the record or its files change; part of the stage's key.
-COMPARISON_SCHEMA = 7
+COMPARISON_SCHEMA = 8
 
 F32 = NDArray[np.float32]
 Progress = Callable[[str], None]
@@ -93,9 +94,10 @@ def compare(
     rendered = _render_references(section, estimator, progress)
     seconds = time.perf_counter() - start
     # From the query references if there are any, otherwise from the pixel references.
-    white = white_point([next(iter(images.values())).value for _, images in rendered])
+    exposure = auto_exposure(brightness(next(iter(images.values())).value) for _, images in rendered)
+    white = white_of(exposure)
     pictures = [
-        _compare_scene(scene, images, materials, white, section.st_lpips, out, progress)
+        _compare_scene(scene, images, materials, exposure, section.st_lpips, out, progress)
         for scene, images in rendered
     ]
     data = Dataset.open(shards)
@@ -106,6 +108,7 @@ def compare(
         "kinds": list(section.kinds),
         "size": section.size,
         "spp": section.spp,
+        "exposure": exposure,
         "white": white,
         "finest": data.lattice.finest,
         "test_spp": data.manifest["splits"]["test"]["spp"],
@@ -116,7 +119,7 @@ def compare(
         "seconds": {"references": round(seconds, 3)},
     }
     if section.unmodified_mitsuba:
-        record["unmodified_mitsuba"] = write_agreement(section, job.config, job.material, white, out)
+        record["unmodified_mitsuba"] = write_agreement(section, job.config, job.material, exposure, out)
     if section.timing:
         import torch
 
@@ -151,7 +154,7 @@ def _compare_scene(
     scene: Scene,
     images: Mapping[PixelKind, ReferenceImage],
     materials: Mapping[str, Material],
-    white: float,
+    exposure: float,
     with_st_lpips: bool,
     out: Path,
     progress: Progress,
@@ -159,7 +162,9 @@ def _compare_scene(
     """Write the images of one scene and measure their errors."""
     from mbtf_core.lattice import level_of_sigma
     from mbtf_core.stats import mse_difference, pooled_relative_error
+    from mbtf_gen.pictures.reference import write_display
 
+    white = white_of(exposure)
     record: dict[str, Any] = {
         "name": scene.name,
         "view": scene.view.model_dump(),
@@ -170,7 +175,8 @@ def _compare_scene(
     }
     for kind, image in images.items():
         file = scene.file(f"reference-{kind}")
-        image.write(out / file, 1.0 / white)
+        image.write(out / file)
+        write_display(out / file, image.value, exposure)
         noise = pooled_relative_error(image.value_a.reshape(-1, 3), image.value_b.reshape(-1, 3))
         record["references"][kind] = {"file": file, "noise": noise.as_dict()}
     if len(images) == 2:
@@ -189,7 +195,7 @@ def _compare_scene(
         flat_value, seconds = timed(partial(material.evaluate, *arrays))
         value = flat_value.reshape(main.value.shape)
         file = scene.file(f"fit-{name}")
-        write_picture(out / file, value, white)
+        write_picture(out / file, value, exposure)
         scores, hdr_flip = perceptual_scores(value, main.value, white, with_st_lpips)
         write_map(out / file, hdr_flip)
         errors = {kind: image_errors(value, x.value_a, x.value_b, white) for kind, x in images.items()}

@@ -1,4 +1,4 @@
-"""FLIP and HDR-FLIP of an image against its reference, at stated exposures.
+"""FLIP and HDR-FLIP of an image against its reference, at the exposure of the comparison.
 
 FLIP: Andersson et al., "FLIP: A Difference Evaluator for Alternating Images", HPG 2020; HDR-FLIP: Andersson
 et al., "Visualizing Errors in Rendered High Dynamic Range Images", Eurographics 2021. Both predict how
@@ -16,19 +16,19 @@ from numpy.typing import ArrayLike, NDArray
 
 F32 = NDArray[np.float32]
 
-# Exposures of HDR-FLIP in stops; at 0 the white point is displayed as white.
+# Exposures of HDR-FLIP in stops from that of the comparison.
 EXPOSURES = (-2.0, 0.0, 2.0)
 TONE_MAPPER = "ACES"
 # Pixels per degree of visual angle: a 0.7 m wide screen of 3840 pixels at a distance of 0.7 m.
 PIXELS_PER_DEGREE = 67.0
 
+_STOPS = ", ".join(f"{stop:+g}".replace("-", "−").replace("+0", "0") for stop in EXPOSURES)
 DEFINITION = (
-    "LDR-FLIP (Andersson et al. 2020) is the mean over pixels of the visible difference at 0 EV, with values "
-    "above white clipped. HDR-FLIP (2021) takes per pixel the largest difference at "
-    + ", ".join(f"{stop:+g}".replace("-", "−").replace("+0", "0") for stop in EXPOSURES)
-    + f" EV, tone mapper {TONE_MAPPER}. Both assume {PIXELS_PER_DEGREE:g} pixels per degree; 0 is no "
-    "difference, 1 the largest. They include the reference noise; its two estimates, compared, give a "
-    "baseline."
+    "LDR-FLIP (Andersson et al. 2020) is the mean over pixels of the visible difference, with values above "
+    f"white clipped. HDR-FLIP (2021) takes per pixel the largest difference at {_STOPS} stops from the "
+    f"comparison's exposure, tone mapper {TONE_MAPPER}. Both assume {PIXELS_PER_DEGREE:g} pixels per degree; "
+    "0 is no difference, 1 the largest. They include the reference noise; its two estimates, compared, "
+    "give a baseline."
 )
 
 
@@ -45,7 +45,7 @@ def flip(image: ArrayLike, reference: ArrayLike, white: float) -> Flip:
 
     Parameters
     ----------
-    white : linear value displayed as white at 0 EV, 1/sr
+    white : linear value displayed as white, 1/sr
     """
     test, truth = (np.maximum(np.asarray(x, np.float32) / np.float32(white), 0) for x in (image, reference))
     exposures = {

@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbtf_core.stats import Estimate, mean_estimate, noise_free_mse
+from mbtf_core.stats import Estimate, mean_estimate, noise_free_mse, psnr
 from mbtf_pipeline.compare.flip import DEFINITION as FLIP_DEFINITION
 from mbtf_pipeline.compare.ssim import DEFINITION as SSIM_DEFINITION
 from mbtf_pipeline.compare.st_lpips import DEFINITION as ST_LPIPS_DEFINITION
@@ -23,7 +23,7 @@ RELATIVE_FLOOR = 0.1
 DEFINITIONS: dict[str, str] = {
     "mse": "mean of (p-a)(p-b) over pixels and channels, in 1/sr². p is the image; a and b are independent "
     "halves of the reference. The reference noise does not bias it, so it can be slightly negative.",
-    "psnr": "10 log10(peak²/MSE) in dB, with the noise-free MSE. The peak is the value of white at 0 EV.",
+    "psnr": "10 log10(peak²/MSE) in dB, with the noise-free MSE. The peak is the value shown as white.",
     "relative_mse": "mean of (p-a)(p-b) / (t² + (0.1 m)²). t = (a+b)/2 per pixel and channel; m is the mean "
     "value of the image.",
     "flip": FLIP_DEFINITION,
@@ -32,27 +32,6 @@ DEFINITIONS: dict[str, str] = {
     "error_bar": "one standard error, over pixels of an image or queries of a data set. A value within "
     "two standard errors of zero is marked as not significant.",
 }
-
-
-def psnr(mse: Estimate, peak: float) -> Estimate:
-    """PSNR in dB of a mean squared error; infinite where the error is not positive.
-
-    Parameters
-    ----------
-    mse : Estimate
-        Noise-free mean squared error, 1/sr².
-    peak : float
-        Value of full scale, 1/sr.
-
-    Returns
-    -------
-    Estimate
-        In dB, with the standard error that follows from the one of `mse`.
-    """
-    if mse.value <= 0 or peak <= 0:
-        return Estimate(math.inf, math.inf, mse.n)
-    value = 10.0 * math.log10(peak**2 / mse.value)
-    return Estimate(value, 10.0 / math.log(10.0) * mse.relative_error, mse.n)
 
 
 def image_errors(
@@ -82,13 +61,3 @@ def reference_difference(
     """Noise-free mean squared difference of two references, each given as two independent halves."""
     a1, b1, a2, b2 = (np.asarray(x, np.float64).reshape(-1, 3) for x in (*first, value_a, value_b))
     return mean_estimate((a1 - a2) * (b1 - b2))
-
-
-def white_point(values: list[ArrayLike]) -> float:
-    """The linear value shown as white: the median over images of the 95th percentile, divided by 0.8.
-
-    1 if every image is black.
-    """
-    bright = [float(np.percentile(np.asarray(v, np.float64).mean(axis=-1), 95)) for v in values]
-    level = float(np.median(bright)) / 0.8
-    return level if level > 0 else 1.0

@@ -22,7 +22,7 @@ def perceptual_scores(
 
     Parameters
     ----------
-    white : linear value displayed as white at 0 EV, 1/sr
+    white : linear value displayed as white, 1/sr
 
     Raises
     ------

@@ -77,12 +77,13 @@ def write_channels(path: Path, values: NDArray[Any], names: str) -> None:
     write_through(path, lambda p: OpenEXR.File(header, channels).write(str(p)))
 
 
-def write_picture(path: Path, value: NDArray[Any], white: float) -> None:
-    """Write linear RGB (rows, columns, 3) in 1/sr as ``path`` + ``.exr``, and with `white` as ``.png``."""
-    from mbtf_gen.pictures.reference import to_display, write_png
+def write_picture(path: Path, value: NDArray[Any], exposure: float) -> None:
+    """Write linear RGB (rows, columns, 3) in 1/sr as ``path`` + ``.exr``, and at an exposure in EV as
+    ``.png``."""
+    from mbtf_gen.pictures.reference import write_display
 
     write_channels(with_ending(path, ".exr"), value, "RGB")
-    write_png(with_ending(path, ".png"), to_display(value, 1.0 / white))
+    write_display(path, value, exposure)
 
 
 # Ending of a fit's HDR-FLIP map.

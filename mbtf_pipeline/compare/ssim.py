@@ -1,4 +1,4 @@
-"""SSIM of an image against its reference, as displayed in sRGB at 0 EV.
+"""SSIM of an image against its reference, as displayed in sRGB.
 
 Wang, Bovik, Sheikh, Simoncelli: "Image Quality Assessment: From Error Visibility to Structural Similarity",
 IEEE TIP 13(4), 2004, as implemented in scikit-image with the paper's Gaussian window. SSIM responds to
@@ -18,7 +18,7 @@ WINDOW = 1.5
 _WINDOW_SIZE = 11
 
 DEFINITION = (
-    "structural similarity (Wang et al. 2004) of the images in sRGB at 0 EV, values above white clipped: "
+    "structural similarity (Wang et al. 2004) of the images in sRGB, values above white clipped: "
     f"mean over pixels and channels, Gaussian window with σ = {WINDOW:g} pixels; 1 means equal. It includes "
     "the reference noise; its two estimates, compared, give a baseline."
 )
@@ -35,7 +35,7 @@ def ssim(image: ArrayLike, reference: ArrayLike, white: float) -> float | None:
 
     Parameters
     ----------
-    white : linear value displayed as white at 0 EV, 1/sr
+    white : linear value displayed as white, 1/sr
     """
     from skimage.metrics import structural_similarity
 

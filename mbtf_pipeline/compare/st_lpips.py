@@ -30,7 +30,7 @@ _WEIGHTS = Path("weights/vST0.0/alex_shift_tolerant.pth")
 _SMALLEST = 32
 
 DEFINITION = (
-    "ST-LPIPS (Ghildyal and Liu 2022, network alex) of the images in sRGB at 0 EV, with values above white "
+    "ST-LPIPS (Ghildyal and Liu 2022, network alex) of the images in sRGB, with values above white "
     "clipped; 0 means equal. It includes the reference noise; its two estimates, compared, give a baseline."
 )
 
@@ -116,7 +116,7 @@ def st_lpips(image: ArrayLike, reference: ArrayLike, white: float) -> float | No
 
     Parameters
     ----------
-    white : linear value displayed as white at 0 EV, 1/sr
+    white : linear value displayed as white, 1/sr
 
     Raises
     ------

@@ -141,7 +141,7 @@ def pick_scene(section: CompareSection) -> tuple[SceneView, SceneDirection, floa
 
 
 def write_agreement(
-    section: CompareSection, generate: GeneratorConfig, material: Material, white: float, out: Path
+    section: CompareSection, generate: GeneratorConfig, material: Material, exposure: float, out: Path
 ) -> dict[str, Any]:
     """Compare with unmodified Mitsuba and write the images below `out`; returns plain data."""
     view, light, tiles_across = pick_scene(section)
@@ -150,7 +150,7 @@ def write_agreement(
         stem = f"{PICTURES}/check-{surface.replace(' ', '-')}"
         files = {renderer: f"{stem}-{renderer}" for renderer in ("mbtf", "mitsuba")}
         for file, value in zip(files.values(), (found.mbtf, found.mitsuba), strict=True):
-            write_picture(out / file, value.astype(np.float32), white)
+            write_picture(out / file, value.astype(np.float32), exposure)
         mean, square = found.mean.as_dict(), found.square.as_dict()
         surfaces.append({"surface": surface, "mean": mean, "square": square, "files": files})
     return {

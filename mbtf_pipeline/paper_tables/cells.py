@@ -13,8 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.stats import Estimate
-from mbtf_pipeline.compare.metrics import psnr
+from mbtf_core.stats import Estimate, psnr
 from mbtf_pipeline.compare.perceptual_metrics import PerceptualMetric
 from mbtf_pipeline.compare.pictures import with_ending
 from mbtf_pipeline.formatting import decibel, estimate_text, is_significant, signed

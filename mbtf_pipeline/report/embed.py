@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_core.exposure import to_display, white_of
 from mbtf_pipeline.report.error_maps import Palette, indices, palette
 from mbtf_pipeline.report.linear_images import Coding, pack
 
@@ -96,14 +97,19 @@ class Gallery:
 
     Attributes
     ----------
-    white : linear value displayed as white, 1/sr
+    exposure : of the linear images, in EV
     linear : images (rows, columns, 3) in 1/sr
     maps : palettes and maps (rows, columns), scaled to [0, 1] or, if signed, to [-1, 1]
     """
 
-    white: float
+    exposure: float
     linear: dict[str, F32] = field(default_factory=dict)
     maps: dict[str, tuple[Palette, Pixels]] = field(default_factory=dict)
+
+    @property
+    def white(self) -> float:
+        """Linear value displayed as white, 1/sr."""
+        return white_of(self.exposure)
 
 
 def encode(
@@ -114,18 +120,16 @@ def encode(
     Returns
     -------
     coding : of all linear images
-    images : ``data:`` URIs of maps, and of linear images at 0 EV, by name
+    images : ``data:`` URIs of maps, and of linear images, by name
     packed : rows, columns and data of linear images by name
     """
-    from mbtf_gen.pictures.reference import to_display
-
     coding = Coding.spanning(gallery.linear.values(), gallery.white, encoding.bits)
     images: dict[str, str] = {}
     packed: dict[str, dict[str, int | str]] = {}
     for name, picture in gallery.linear.items():
         small = shrink(picture, encoding.shrink).astype(np.float32)
         preview = shrink(small, encoding.preview_shrink).astype(np.float32)
-        images[name] = jpeg_uri(to_display(preview, 1.0 / gallery.white), encoding.quality)
+        images[name] = jpeg_uri(to_display(preview, gallery.exposure), encoding.quality)
         data = base64.b64encode(pack(coding.encode(small))).decode()
         packed[name] = {"rows": small.shape[0], "columns": small.shape[1], "data": data}
     for name, (colors, values) in gallery.maps.items():

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from statistics import median_high
 from typing import Any
 
+from mbtf_core.exposure import describe_exposure
 from mbtf_fit.formatting import SPLIT_NAMES
 from mbtf_pipeline.compare.perceptual_metrics import available_metrics
 from mbtf_pipeline.formatting import data_errors, decibel, estimate, estimate_text, short_direction
@@ -142,5 +143,5 @@ def _pictures_table(comparison: Mapping[str, Any]) -> dict[str, Any]:
     names = ("MSE [10⁻³/sr²]", "PSNR", "relative MSE")
     heads = [f"{name}, {kind} reference" for kind in kinds for name in names]
     heads += [m.title for m in metrics]
-    title = f"Images (white at 0 EV and peak of the PSNR: {comparison['white']:.3g} 1/sr)"
+    title = f"Images at {describe_exposure(comparison['exposure'])}; white is the peak of the PSNR"
     return {"title": title, "head": ["view", "light", "tiles across", "fit", *heads], "rows": rows}

@@ -111,7 +111,7 @@ def picture_section(folder: Path, comparison: Mapping[str, Any], gallery: Galler
             "HDR-FLIP",
             flip,
             "from 0 to 1",
-            "Visible difference: maximum over −2, 0 and +2 EV. Includes the noise of the reference.",
+            "Visible difference: maximum over −2, 0 and +2 stops. Includes the noise of the reference.",
         ),
         color_bar(
             "signed",

@@ -9,6 +9,7 @@ from typing import Any
 
 from mbtf_core.atomic import read_json, write_text
 from mbtf_core.config_file import check_schema
+from mbtf_core.exposure import describe_exposure
 from mbtf_pipeline.compare.compare import COMPARISON_NAME, COMPARISON_SCHEMA
 from mbtf_pipeline.formatting import NOT_SIGNIFICANT
 from mbtf_pipeline.recipe import RECIPE_NAME, Recipe
@@ -75,8 +76,8 @@ def write_report(folder: Path, recipe: Recipe, stages: Sequence[str]) -> None:
     check_schema(comparison, COMPARISON_SCHEMA, path, hint)
     manifest = read_json(folder / SHARDS / "manifest.json")
     run = read_json(folder / RUN_NAME)
-    white = comparison["white"] if recipe.report.exposure is None else 1.0 / recipe.report.exposure
-    gallery = Gallery(white)
+    asked = recipe.report.exposure
+    gallery = Gallery(comparison["exposure"] if asked is None else asked)
     shown = picture_section(folder / COMPARE, comparison, gallery)
     fit_folders = {name: folder / FITS / name for name in comparison["fits"]}
     histories = {name: read_training(path) for name, path in fit_folders.items()}
@@ -97,14 +98,14 @@ def write_report(folder: Path, recipe: Recipe, stages: Sequence[str]) -> None:
         **error_context(comparison, float(manifest["config"]["queries"]["min_cos"])),
         **training_context(histories),
         **time_context(folder, stages, manifest, comparison, histories),
-        "white": white,
+        "exposure": describe_exposure(gallery.exposure),
         "stops": EXPOSURE_STOPS,
     }
     viewer = {
-        "white": white,
+        "exposure": gallery.exposure,
         "fits": comparison["fits"],
         "scenes": shown["scenes"],
-        "difference": {"scale": shown["difference"] * white, "colors": palette("signed")},
+        "difference": {"scale": shown["difference"] * gallery.white, "colors": palette("signed")},
     }
     # From best quality to smallest size.
     for encoding in ENCODINGS:

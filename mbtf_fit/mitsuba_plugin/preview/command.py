@@ -3,75 +3,106 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from mbtf_core.console import Console
 
 if TYPE_CHECKING:
     from mbtf_fit.mitsuba_plugin.preview.config import PreviewConfig
 
-SHEET_NAME, TURNTABLE_NAME = "sheet.png", "turntable.gif"
+SHEET_NAME, GIF_NAME, MP4_NAME = "sheet.png", "turntable.gif", "turntable.mp4"
 
 
-def draw(config: PreviewConfig, path: Path, *, overwrite: bool, console: Console) -> None:
+def draw(
+    config: PreviewConfig, path: Path, *, sheet_only: bool, mp4: bool, overwrite: bool, console: Console
+) -> None:
     """Draw the pictures that are missing and report them.
+
+    Parameters
+    ----------
+    sheet_only : no turntable
+    mp4 : the turntable as MP4, too
 
     Raises
     ------
     InputError : the material cannot be used, or the folder holds something else
     UsageError : a view shows the horizon
+    EngineError : MP4 is asked for, and there is no ffmpeg
     """
+    from mbtf_core.exposure import describe_exposure, to_display
     from mbtf_core.folders import check_space
     from mbtf_core.units import expectation
     from mbtf_fit.material.format import read_description
     from mbtf_fit.mitsuba_plugin import load_scene
+    from mbtf_fit.mitsuba_plugin.preview.animation import find_encoder, write_gif, write_mp4
     from mbtf_gen.forecast import LONG_RUN
     from mbtf_gen.pictures.folder import PictureFolder
     from mbtf_gen.pictures.reference import PNG_BYTES, write_png
     from mbtf_gen.render.runtime import load_mitsuba
 
-    sheet, turn = config.sheet, config.turntable
-    panels_of = len(sheet.views) * len(sheet.lights) * len(sheet.tiles_across)
-    size = PNG_BYTES * (panels_of * sheet.size**2 + turn.frames * turn.size**2)
+    encoder = find_encoder() if mp4 else ""
+    sheet, turn, asked = config.sheet, config.turntable, config.exposure
+    panels_of = len(sheet.cameras) * len(sheet.lamps) * len(sheet.tiles_across)
+    size = PNG_BYTES * panels_of * sheet.size**2
+    if not sheet_only:
+        size += PNG_BYTES * turn.frames * turn.size**2
     check_space(path, size, "reduce --size or --frames, or choose another folder with -o")
     description, _ = read_description(Path(config.material))
     folder = PictureFolder.claim(
         path,
         "material",
         command="mbtf-fit preview",
-        files=(SHEET_NAME, TURNTABLE_NAME),
+        files=(SHEET_NAME, GIF_NAME, MP4_NAME),
         config=config.model_dump(mode="json"),
         inputs={"weights": description["weights"]["sha256"]},
         overwrite=overwrite,
     )
+    ball = f"a ball with {turn.tiles} tiles around its equator on a plate; "
+    ball += f"{turn.frames} frames, {turn.spp} paths per pixel"
     shows = {
-        SHEET_NAME: f"{len(sheet.views)} views x {len(sheet.lights)} lights (columns) x "
-        f"{len(sheet.tiles_across)} zooms (rows), one exposure",
-        TURNTABLE_NAME: f"a ball with {turn.tiles} tiles around its equator on a plate; "
-        f"{turn.frames} frames, {turn.spp} paths per pixel",
+        SHEET_NAME: f"{_count(sheet.cameras, 'view')} x {_count(sheet.lamps, 'light')} (columns) x "
+        f"{_count(sheet.tiles_across, 'zoom')} (rows)"
     }
-    kept = {name: folder.finished(name) is not None for name in shows}
+    if not sheet_only:
+        shows |= {GIF_NAME: ball, **({MP4_NAME: ball} if mp4 else {})}
+    # The exposure in use, by picture; the turntable has that of the sheet.
+    found = {name: folder.finished(name) for name in shows}
+    kept = {name: facts is not None and facts["of"] == asked for name, facts in found.items()}
+    exposure = (found[SHEET_NAME] or {}).get("exposure", 0.0)
     if not all(kept.values()):
         load_mitsuba()
-        from mbtf_fit.mitsuba_plugin.preview.sheet import contact_sheet, panels
-        from mbtf_fit.mitsuba_plugin.preview.turntable import frames, seconds_of, to_pictures, write_gif
+        from mbtf_fit.mitsuba_plugin.preview.sheet import contact_sheet, exposure_of, panels
+        from mbtf_fit.mitsuba_plugin.preview.turntable import frames, seconds_of
 
         bsdf = load_scene({"type": "mbtf", "material": config.material})
+        missing = [name for name in shows if not kept[name] and name != SHEET_NAME]
         paths = turn.frames * turn.size**2 * turn.spp
-        if paths >= LONG_RUN and not kept[TURNTABLE_NAME]:
+        if paths >= LONG_RUN and missing:
             console.note(expectation(seconds_of(bsdf, turn, paths), size))
-        with console.progress(total=turn.frames + 1, label="drawing", unit="pictures") as bar:
+        total = 1 + turn.frames * bool(missing)
+        with console.progress(total=total, label="drawing", unit="pictures") as bar:
             if not kept[SHEET_NAME]:
-                write_png(folder.path / SHEET_NAME, contact_sheet(panels(bsdf.evaluator, sheet), sheet))
-                folder.keep(SHEET_NAME, [folder.path / SHEET_NAME], {})
+                values = panels(bsdf.evaluator, sheet)
+                exposure = exposure_of(values) if asked is None else asked
+                write_png(folder.path / SHEET_NAME, contact_sheet(values, sheet, exposure))
+                folder.keep(SHEET_NAME, [folder.path / SHEET_NAME], {"exposure": exposure, "of": asked})
             bar.advance(1)
-            if not kept[TURNTABLE_NAME]:
+            if missing:
                 pictures = []
                 for picture in frames(bsdf, turn):
-                    pictures.append(picture)
+                    pictures.append(to_display(picture, exposure))
                     bar.advance(1)
-                write_gif(folder.path / TURNTABLE_NAME, to_pictures(pictures))
-                folder.keep(TURNTABLE_NAME, [folder.path / TURNTABLE_NAME], {})
+                for name in missing:
+                    if name == GIF_NAME:
+                        write_gif(folder.path / name, pictures)
+                    else:
+                        write_mp4(folder.path / name, pictures, encoder)
+                    folder.keep(name, [folder.path / name], {"exposure": exposure, "of": asked})
     made = [{"file": folder.path / name, "shows": text, "kept": kept[name]} for name, text in shows.items()]
     lines = [f"{p['file']}: {p['shows']}{' (kept)' if p['kept'] else ''}" for p in made]
-    console.report({"folder": path, "pictures": made}, "\n".join(lines))
+    lines.append(describe_exposure(exposure))
+    console.report({"folder": path, "pictures": made, "exposure": exposure}, "\n".join(lines))
+
+
+def _count(items: list[Any], name: str) -> str:
+    return f"{len(items)} {name}{'' if len(items) == 1 else 's'}"

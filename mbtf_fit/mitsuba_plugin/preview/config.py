@@ -9,22 +9,29 @@ from pydantic import BeforeValidator, Field, model_validator
 from mbtf_core.config_file import Settings
 from mbtf_core.options import Flag
 from mbtf_core.units import parse_numbers
-from mbtf_gen.config.pictures import Direction
+from mbtf_gen.config.pictures import EXPOSURE, Direction, Exposure
 
 # Limits the memory of sheet and turntable to a gigabyte.
 MOST_PIXELS = 1 << 25
 
+Directions = Annotated[list[Direction], Field(min_length=1, max_length=8)]
 Width = Annotated[float, Field(gt=0, le=1e4)]
 
 
 class SheetSection(Settings):
     """The contact sheet: a column per view and light, a row per width of the field of view."""
 
-    views: Annotated[list[Direction], Field(min_length=1, max_length=8)] = Field(
+    view: Annotated[Direction | None, Flag("--view", "ELEVATION,AZIMUTH")] = Field(
+        None, description="direction of the camera in degrees; default: all of views"
+    )
+    views: Directions = Field(
         [Direction(elevation=70, azimuth=-90), Direction(elevation=30, azimuth=-90)],
         description="directions towards the camera",
     )
-    lights: Annotated[list[Direction], Field(min_length=1, max_length=8)] = Field(
+    light: Annotated[Direction | None, Flag("--light", "ELEVATION,AZIMUTH")] = Field(
+        None, description="direction of the light in degrees; default: all of lights"
+    )
+    lights: Directions = Field(
         [
             Direction(elevation=65, azimuth=60),
             Direction(elevation=35, azimuth=180),
@@ -43,6 +50,16 @@ class SheetSection(Settings):
     size: Annotated[int, Flag("--size")] = Field(
         160, ge=64, le=2048, description="pixels along each side of a picture"
     )
+
+    @property
+    def cameras(self) -> list[Direction]:
+        """Directions of the columns: `view`, or else `views`."""
+        return self.views if self.view is None else [self.view]
+
+    @property
+    def lamps(self) -> list[Direction]:
+        """Lights of the columns: `light`, or else `lights`."""
+        return self.lights if self.light is None else [self.light]
 
 
 class TurntableSection(Settings):
@@ -64,11 +81,12 @@ class PreviewConfig(Settings):
     material: str = Field(description="folder made by mbtf-fit")
     sheet: SheetSection = SheetSection()
     turntable: TurntableSection = TurntableSection()
+    exposure: Exposure = Field(None, description=EXPOSURE)
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
         sheet, turn = self.sheet, self.turntable
-        panels = len(sheet.views) * len(sheet.lights) * len(sheet.tiles_across)
+        panels = len(sheet.cameras) * len(sheet.lamps) * len(sheet.tiles_across)
         if max(panels * sheet.size**2, turn.frames * turn.size**2) > MOST_PIXELS:
             raise ValueError(f"asks for more than {MOST_PIXELS:,} pixels; use smaller or fewer pictures")
         return self

@@ -14,16 +14,14 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from mbtf_core.directions import from_angles
+from mbtf_core.exposure import auto_exposure, brightness, to_display
 from mbtf_fit.mitsuba_plugin.evaluator import Evaluator
 from mbtf_fit.mitsuba_plugin.material_arrays import F32
 from mbtf_fit.mitsuba_plugin.preview.config import SheetSection
 from mbtf_gen.config.pictures import Direction
 from mbtf_gen.pictures.camera import Camera
-from mbtf_gen.pictures.reference import auto_exposure, to_display
 
 GAP, MARGIN, CAPTION = 4, 8, 34
-# Factor of the automatic exposure: pictures of one sheet differ in brightness.
-HEADROOM = 0.8
 INK, PAPER = (30, 30, 30), (255, 255, 255)
 
 
@@ -35,21 +33,25 @@ def panels(evaluator: Evaluator, section: SheetSection) -> F32:
     UsageError : a view shows the horizon
     """
     aspect = evaluator.lattice.aspect
-    lights = [from_angles(light.elevation, light.azimuth) for light in section.lights]
+    lights = [from_angles(light.elevation, light.azimuth) for light in section.lamps]
     size, target = section.size, (0.5, 0.5 * aspect)
     pictures = []
-    for view, light, tiles_across in product(section.views, lights, section.tiles_across):
+    for view, light, tiles_across in product(section.cameras, lights, section.tiles_across):
         camera = Camera(view.elevation, view.azimuth, tiles_across, target, rows=size, columns=size)
         q = camera.queries(light, aspect).flat()
         pictures.append(evaluator.evaluate(q.u, q.sigma, q.omega_i, q.omega_o))
-    lead = (len(section.views), len(lights), len(section.tiles_across))
+    lead = (len(section.cameras), len(lights), len(section.tiles_across))
     return np.stack(pictures).reshape(*lead, size, size, 3)
 
 
-def contact_sheet(values: F32, section: SheetSection) -> NDArray[np.uint8]:
-    """The sheet (rows, columns, 3): a column per view and light, a row per width, one exposure for all."""
+def exposure_of(values: F32) -> float:
+    """The automatic exposure of a sheet, in EV."""
+    return auto_exposure(map(brightness, values.reshape(-1, *values.shape[-3:])))
+
+
+def contact_sheet(values: F32, section: SheetSection, exposure: float) -> NDArray[np.uint8]:
+    """The sheet (rows, columns, 3): a column per view and light, a row per width."""
     views, lights, widths, size = values.shape[:4]
-    exposure = HEADROOM * auto_exposure(values)
     pitch = size + GAP
     width = 2 * MARGIN + views * lights * pitch - GAP + (views - 1) * GAP
     height = MARGIN + widths * pitch - GAP + CAPTION + MARGIN
@@ -60,7 +62,7 @@ def contact_sheet(values: F32, section: SheetSection) -> NDArray[np.uint8]:
         for light in range(lights):
             # A wider gap separates views.
             left = MARGIN + (view * lights + light) * pitch + view * GAP
-            text = f"{_caption('view', section.views[view])}\n{_caption('light', section.lights[light])}"
+            text = f"{_caption('view', section.cameras[view])}\n{_caption('light', section.lamps[light])}"
             draw.multiline_text((left + 1, MARGIN), text, INK, font, spacing=2)
             for row in range(widths):
                 picture = Image.fromarray(to_display(values[view, light, row], exposure))

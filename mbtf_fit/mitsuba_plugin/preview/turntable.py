@@ -1,5 +1,8 @@
 """The turntable: a ball and a plate of the material, with a key light, a rim light and a dim sky.
 
+Together the lights have unit irradiance on the plate, as the light of the sheet, so that both pictures have
+the same exposure.
+
 The ball's texture coordinates are a Mercator projection, which is conformal: tiles are square everywhere and
 shrink towards the poles, where footprints exceed them. Tiles on the plate are as large as on the equator.
 """
@@ -7,21 +10,16 @@ shrink towards the poles, where footprints exceed them. Tiles on the plate are a
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
-from pathlib import Path
+from collections.abc import Iterator
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import NDArray
-from PIL import Image
 
-from mbtf_core.atomic import write_file
 from mbtf_core.directions import from_angles
 from mbtf_fit.mitsuba_plugin.material_arrays import F32
 from mbtf_fit.mitsuba_plugin.preview.config import TurntableSection
-from mbtf_gen.pictures.reference import to_display
 from mbtf_gen.render.types import BSDF, Scene
 
 # Latitude beyond which the projection continues with constant scale.
@@ -29,12 +27,13 @@ STEEPEST = np.radians(84.0)
 # Cells around and from pole to pole; the plate's radius in those of the ball.
 CELLS = (192, 96)
 PLATE = 1.9
-# Elevation and azimuth of camera, key and rim light, in degrees; irradiance of the lights across their rays.
+# Elevation and azimuth of camera, key and rim light, in degrees.
 CAMERA, KEY, RIM = (24.0, -90.0), (42.0, -150.0), (25.0, 60.0)
-KEY_IRRADIANCE, RIM_IRRADIANCE, SKY = 2.6, 0.7, 0.22
+# Irradiance of the lights across their rays and radiance of the sky, before their scaling to unit irradiance.
+_KEY, _RIM, _SKY = 2.6, 0.7, 0.22
+_TOTAL = float(_KEY * np.sin(np.radians(KEY[0])) + _RIM * np.sin(np.radians(RIM[0])) + np.pi * _SKY)
+KEY_IRRADIANCE, RIM_IRRADIANCE, SKY = _KEY / _TOTAL, _RIM / _TOTAL, _SKY / _TOTAL
 FIELD_OF_VIEW = 26.0
-# Milliseconds of one rotation.
-TURN = 2400
 
 
 def ball(bsdf: BSDF, tiles: int) -> Any:
@@ -141,25 +140,3 @@ def seconds_of(bsdf: BSDF, section: TurntableSection, paths: int) -> float:
     small = section.model_copy(update={"frames": 2, "size": 64, "spp": 16})
     stamps = [time.perf_counter() for _ in frames(bsdf, small)]
     return (stamps[1] - stamps[0]) * paths / (small.size**2 * small.spp)
-
-
-def to_pictures(linear: Sequence[F32]) -> list[NDArray[np.uint8]]:
-    """8-bit frames of one exposure, which maps the 90th percentile of all pixels of the first but the sky to
-    0.6."""
-    bright = linear[0].mean(-1)
-    shown = bright[np.abs(bright - SKY) > 1e-3 * SKY]
-    level = float(np.percentile(shown, 90)) if shown.size else 0.0
-    return [to_display(picture, 0.6 / level if level > 0 else 1.0) for picture in linear]
-
-
-def write_gif(path: Path, pictures: Sequence[NDArray[np.uint8]]) -> None:
-    """Write an endlessly repeated animation with a common palette, atomically."""
-    strip = Image.fromarray(np.concatenate(pictures[:: max(1, len(pictures) // 8)], axis=0))
-    palette = strip.quantize(255, method=Image.Quantize.MEDIANCUT)
-    coded = [
-        Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures
-    ]
-    pause = max(20, round(TURN / len(coded)))
-
-    options = {"append_images": coded[1:], "duration": pause, "loop": 0, "optimize": False}
-    write_file(path, lambda file: coded[0].save(file, format="GIF", save_all=True, **options))

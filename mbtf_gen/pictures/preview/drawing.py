@@ -9,6 +9,7 @@ from typing import Any
 from mbtf_core.console import Console
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import InputError, PartialError
+from mbtf_core.exposure import auto_exposure, brightness, describe_exposure
 from mbtf_core.folders import check_space
 from mbtf_core.units import expectation
 from mbtf_gen.config.pictures import PreviewConfig
@@ -20,7 +21,7 @@ from mbtf_gen.pictures.folder import PictureFolder
 from mbtf_gen.pictures.preview import mesh
 from mbtf_gen.pictures.preview.plots import level_histogram, write_plots
 from mbtf_gen.pictures.preview.sample import sampled_queries, stored_queries
-from mbtf_gen.pictures.reference import PNG_BYTES, picture_seconds, render_reference, to_display, write_png
+from mbtf_gen.pictures.reference import PNG_BYTES, picture_seconds, render_reference, write_display
 from mbtf_gen.planning.effects_plan import reference_plan
 from mbtf_gen.planning.simulation import build_estimator
 
@@ -48,6 +49,7 @@ class PreviewPictures:
     def __init__(self, config: PreviewConfig, dataset: Dataset | None, console: Console) -> None:
         self.config, self.dataset, self.console = config, dataset, console
         options = config.preview
+        self.exposure = 0.0
         view, light = options.view, options.light
         self.job: Job | None = None
         try:
@@ -87,9 +89,10 @@ class PreviewPictures:
         makers: dict[str, Callable[[Path], dict[str, Any]]] = {"queries": self._queries}
         inputs: dict[str, str] = {}
         # Plots of stored queries also depend on how many shards are finished.
-        stages = {"mesh": 0, "beauty": 0, "queries": 0}
+        stages: dict[str, Any] = {"mesh": self.config.exposure, "beauty": self.config.exposure, "queries": 0}
         if self.job is not None:
-            makers = {"mesh": self._mesh, "beauty": self._beauty, **makers}
+            # The mesh has the exposure of the path-traced picture.
+            makers = {"beauty": self._beauty, "mesh": self._mesh, **makers}
             inputs |= self.job.material.digests
         if self.dataset is not None:
             inputs["data set"] = self.dataset.manifest["config_hash"]
@@ -104,7 +107,7 @@ class PreviewPictures:
             inputs=inputs,
             overwrite=overwrite,
         )
-        pictures: list[dict[str, Any]] = []
+        found: dict[str, dict[str, Any]] = {}
         fault = ""
         with self.console.progress(total=len(makers), label="drawing", unit="pictures") as bar:
             for name, maker in makers.items():
@@ -112,15 +115,19 @@ class PreviewPictures:
                 kept = facts is not None and facts.get("of") == stages[name]
                 if facts is None or not kept:
                     facts = {**maker(file), "of": stages[name]}
+                self.exposure = facts.get("exposure", self.exposure)
                 bar.advance(1)
                 if "fault" in facts:
                     fault = facts["fault"]
                     continue
                 if not kept:
                     folder.keep(name, [file], facts)
-                pictures.append({"file": file, "kept": kept, **{k: v for k, v in facts.items() if k != "of"}})
-        text = "\n".join(f"{p['file']}: {p['shows']}{' (kept)' if p['kept'] else ''}" for p in pictures)
-        self.console.report({"folder": path, "pictures": pictures, "fault": fault or None}, text)
+                found[name] = {"file": file, "kept": kept, **{k: v for k, v in facts.items() if k != "of"}}
+        pictures = [found[name] for name in stages if name in found]
+        lines = [f"{p['file']}: {p['shows']}{' (kept)' if p['kept'] else ''}" for p in pictures]
+        if self.job is not None:
+            lines.append(describe_exposure(self.exposure))
+        self.console.report({"folder": path, "pictures": pictures, "fault": fault or None}, "\n".join(lines))
         if fault:
             raise PartialError(
                 f"could not be drawn ({fault})",
@@ -133,8 +140,8 @@ class PreviewPictures:
             mesh.show(self._tiled_mesh(self.job), self.camera, self.omega_i)
 
     def _tiled_mesh(self, job: Job) -> mesh.TiledMesh:
-        geometry = self.config.geometry
-        return mesh.tiled_mesh(job.material, self.config.preview.tiles, geometry.height_scale, geometry.mesh)
+        geometry, tiles = self.config.geometry, self.config.preview.tiles
+        return mesh.tiled_mesh(job.material, tiles, self.exposure, geometry.height_scale, geometry.mesh)
 
     def _mesh(self, file: Path) -> dict[str, Any]:
         assert self.job is not None
@@ -144,7 +151,8 @@ class PreviewPictures:
         tiles, (rows, columns) = self.config.preview.tiles, drawn.cells
         return {
             "shows": f"the displaced mesh ({columns} x {rows} cells per tile) of {tiles} x {tiles} tiles "
-            f"with its base color, {self.seen}"
+            f"with its base color, {self.seen}",
+            "exposure": self.exposure,
         }
 
     def _beauty(self, file: Path) -> dict[str, Any]:
@@ -156,8 +164,14 @@ class PreviewPictures:
             seconds = picture_seconds(estimator, self.camera, self.omega_i, paths)
             self.console.note(expectation(seconds, PNG_BYTES * self.config.preview.size**2))
         image = render_reference(estimator, self.camera, self.omega_i, kind="pixel", spp=spp, seed=seed)
-        write_png(file, to_display(image.value))
-        return {"shows": f"the infinite plane from the same camera, path-traced with {spp} paths per pixel"}
+        exposure = self.config.exposure
+        if exposure is None:
+            exposure = auto_exposure([brightness(image.value)])
+        write_display(file.with_suffix(""), image.value, exposure)
+        return {
+            "shows": f"the infinite plane from the same camera, path-traced with {spp} paths per pixel",
+            "exposure": exposure,
+        }
 
     def _queries(self, file: Path) -> dict[str, Any]:
         if self.dataset is not None:

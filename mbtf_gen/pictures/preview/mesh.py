@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from mbtf_core.child_process import run_child
 from mbtf_core.errors import EngineError
+from mbtf_core.exposure import to_display
 from mbtf_gen.geometry.heightfield import HeightGrid, grid_faces, grid_vertices
 from mbtf_gen.images.resample import resample
 from mbtf_gen.material.material import Material
 from mbtf_gen.pictures.camera import Camera
-from mbtf_gen.pictures.reference import auto_exposure, to_display
 
 # Largest number of cells along each side of all tiles together, and of texels across the texture.
 MOST_CELLS = 1024
@@ -46,7 +46,7 @@ class TiledMesh:
     ----------
     points : (rows, columns, 3) positions in tile widths; uv : (rows, columns, 2), above 1 where tiles repeat
     hole : (rows-1, columns-1) cells that are left out, because their mean opacity is below 1/2
-    texture : (h, w, 3) sRGB, row 0 at ``v → 1``, at the exposure of the path-traced picture
+    texture : (h, w, 3) sRGB of base color over π, row 0 at ``v → 1``
     cells : (rows, columns) of one tile's mesh
     """
 
@@ -58,12 +58,13 @@ class TiledMesh:
 
 
 def tiled_mesh(
-    material: Material, tiles: int, height: float | None = None, mesh: int | None = None
+    material: Material, tiles: int, exposure: float, height: float | None = None, mesh: int | None = None
 ) -> TiledMesh:
     """Mesh of `tiles` × `tiles` tiles of a material: the mesh that is traced, or a coarser one.
 
     Parameters
     ----------
+    exposure : of the texture, in EV
     height, mesh : as :meth:`~mbtf_gen.material.material.Material.grid` takes them
     """
     grid = material.grid(height, mesh)
@@ -87,7 +88,7 @@ def tiled_mesh(
         points.astype(np.float32),
         (points[..., :2] / (1.0, grid.aspect)).astype(np.float32),
         hole,
-        to_display(resample(color, *texels).astype(np.float32), auto_exposure(color)),
+        to_display(resample(color, *texels) / np.pi, exposure),
         (grid.z.shape[0], grid.z.shape[1]),
     )
 

@@ -44,7 +44,7 @@
   const linear = code => code ? low * 2 ** ((code - 1) * step) : 0;
   // A table from code to 8-bit sRGB at the selected exposure.
   const brightness = () => {
-    const factor = 2 ** state.stops / data.white;
+    const factor = 2 ** (data.exposure + state.stops);
     return Uint8ClampedArray.from({ length: 1 << bits }, (_, code) => {
       const x = Math.min(1, factor * linear(code));
       return Math.round(255 * (x <= 0.0031308 ? 12.92 * x : 1.055 * x ** (1 / 2.4) - 0.055));
@@ -82,7 +82,10 @@
   });
 
   const signed = (x, digits) => (x < 0 ? '−' : '+') + Math.abs(x).toFixed(digits);
-  const exposureText = () => `${state.stops ? signed(state.stops, 1) : 0} EV: ${(data.white / 2 ** state.stops).toPrecision(3)} 1/sr is white`;
+  const exposureText = () => {
+    const exposure = data.exposure + state.stops;
+    return `exposure ${signed(exposure, 2)} EV (${Number((2 ** -exposure).toPrecision(3))} 1/sr is white)`;
+  };
   const stage = $('stage');
 
   const place = at => {
@@ -111,7 +114,7 @@
     stage.querySelector('.left').textContent = side.label;
     stage.querySelector('.right').textContent = name;
     place(state.at);
-    $('caption').textContent = `${scene.where}. Left: ${side.label.toLowerCase()} (path-traced); right: ${name}. ${exposureText()}.`;
+    $('caption').textContent = `${scene.where}. Left: ${side.label.toLowerCase()} (path-traced); right: ${name}; ${exposureText()}.`;
     const chart = $(`${scene.fits[state.fit]}-${state.map}`);
     $('map-image').hidden = !chart;
     $('map-canvas').hidden = !!chart;

@@ -165,5 +165,5 @@ def test_pictures_store_the_transmittance(tmp_path: Path) -> None:
     expected = np.zeros((16, 16))
     expected[:, 8:] = 1.0
     np.testing.assert_allclose(image.transmittance[:, [2, 4, 11, 13]], expected[:, [2, 4, 11, 13]])
-    exr, _ = image.write(tmp_path / "picture")
+    exr = image.write(tmp_path / "picture")
     np.testing.assert_array_equal(read_channels(exr, 10_000)["transmittance"], image.transmittance)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import subprocess
 import sys
@@ -28,8 +29,8 @@ def material(shards: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "training for 5 steps (change it with --time or --steps)" in done.stderr
-    assert "unexplained variance  test" in done.stdout
-    assert "gradients reached every texel" in done.stdout
+    assert len(done.stdout.splitlines()) <= 5
+    assert re.search(r"^unexplained variance [\d.]+ ± [\d.]+ of \d+ test queries", done.stdout, re.M)
     return folder
 
 
@@ -75,6 +76,26 @@ def test_json_is_one_object(shards: Path, tmp_path: Path, run_python: RunPython)
     assert set(found["errors"]) == {"test", "held_out_queries", "held_out_directions", "training"}
 
 
+def test_all_commands_print_the_same_summary(shards: Path, material: Path, run_python: RunPython) -> None:
+    """Of the same numbers, which JSON holds in full."""
+    lines = {}
+    for name, words in (("evaluate", (str(material), str(shards))), ("info", (str(material),))):
+        lines[name] = run_python("-m", "mbtf_fit", name, *words).stdout.splitlines()
+        # Five steps are too few, which is said, too.
+        assert len([line for line in lines[name] if not line.startswith("above 1")]) <= 5, lines[name]
+        table = run_python("-m", "mbtf_fit", name, *words, "-v").stdout
+        assert "cosine 0.7-1" in table
+        assert table.splitlines()[: len(lines[name])] == lines[name]
+    assert lines["evaluate"][1:] == lines["info"][2:]
+    found = json.loads(run_python("-m", "mbtf_fit", "evaluate", str(material), str(shards), "--json").stdout)
+    test = found["errors"]["test"]
+    psnr = 10 * math.log10(2 ** (-2 * test["exposure"]) / test["mse"]["value"])
+    assert test["psnr"]["value"] == pytest.approx(psnr)
+    assert f"PSNR {psnr:.1f} dB at exposure {test['exposure']:+.2f} EV" in lines["info"][3]
+    assert lines["info"][3].endswith(f": {test['visibility']} beside the reference")
+    assert {errors["exposure"] for errors in found["errors"].values()} == {test["exposure"]}
+
+
 def test_a_finished_fit_is_not_trained_again(shards: Path, material: Path, run_python: RunPython) -> None:
     before = (material / "material.json").read_bytes()
     done = run_python("-m", "mbtf_fit", str(shards), "-o", str(material), *QUICK)
@@ -82,7 +103,10 @@ def test_a_finished_fit_is_not_trained_again(shards: Path, material: Path, run_p
     assert done.stderr.splitlines() == [
         f"{material}: this fit is already finished; --overwrite trains it again"
     ]
-    assert "unexplained variance  test" in done.stdout
+    assert "gradients reached every texel" not in done.stdout
+    told = run_python("-m", "mbtf_fit", str(shards), "-o", str(material), *QUICK, "--verbose")
+    assert "gradients reached every texel" in told.stdout
+    assert "unexplained variance  test" in told.stdout
     assert (material / "material.json").read_bytes() == before
     done = run_python("-m", "mbtf_fit", str(shards), "-o", str(material), *QUICK, "--overwrite")
     assert "training for 5 steps" in done.stderr
@@ -110,7 +134,7 @@ def test_data_of_another_material_cause_a_warning(tmp_path: Path, run_python: Ru
 def test_evaluate_and_info_report_text_and_json(shards: Path, material: Path) -> None:
     for words, texts in (
         (
-            ["evaluate", str(material), str(shards)],
+            ["evaluate", str(material), str(shards), "--verbose"],
             ("held-out directions", "training queries", "level 3", "cosine 0.7-1"),
         ),
         (["info", str(material)], ("3254 network weights", "conformance: 256 queries")),

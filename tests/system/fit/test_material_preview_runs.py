@@ -39,6 +39,22 @@ def test_pictures_without_pytorch_kept_and_refused(tmp_path: Path, run_python: R
     (tmp_path / "out/turntable.gif").unlink()
     again = json.loads(run_python("-c", BLOCKED, *words, *SMALL, "--json").stdout)
     assert [p["kept"] for p in again["pictures"]] == [True, False]
+    shown = [
+        json.loads(run_python("-c", BLOCKED, *words, *SMALL, "--exposure", e, "--json").stdout) for e in "11"
+    ]
+    assert [p["kept"] for p in shown[0]["pictures"] + shown[1]["pictures"]] == [False, False, True, True]
+    assert (shown[0]["exposure"], shown[1]["exposure"]) == (1.0, 1.0) != (report["exposure"],) * 2
+    record = json.loads((tmp_path / "out/pictures.json").read_text())
+    assert [p["facts"]["exposure"] for p in record["pictures"].values()] == [1.0, 1.0]
+    sheet = json.loads(
+        run_python(
+            "-c", BLOCKED, *words[:2], "-o", str(tmp_path / "sheet"), *SMALL, "--sheet-only",
+            "--view", "60,-90", "--light", "45,45", "--json",
+        ).stdout
+    )  # fmt: skip
+    assert [Path(p["file"]).name for p in sheet["pictures"]] == ["sheet.png"]
+    with Image.open(tmp_path / "sheet/sheet.png") as picture:
+        assert picture.width < 2 * 64
     other = run_python("-c", BLOCKED, *words, *SMALL, "--tiles-around", "5")
     assert other.returncode == 3
     assert "holds pictures of another configuration: turntable.tiles: 8 -> 5" in other.stderr

@@ -157,6 +157,7 @@ def batch(work: Path, whole: Path) -> dict[str, Done]:
         "pictures again": f"{PICTURES} --json --spp 4",
         "pictures changed": PICTURES,
         "from its own file": "reference maps -o pictures --json --config pictures/config.yaml",
+        "pictures exposed": f"{PICTURES} --json --spp 4 --exposure 1.5",
         "one reference": "reference maps/height.npy -o one --tiles-across 1 --size 8 --spp 2 --kind query",
     }
     return run_named(lines, work)
@@ -235,6 +236,12 @@ def test_pictures_that_are_there_are_kept_and_others_refused(batch: dict[str, Do
         assert [p["relative_noise"] for p in again["pictures"]] == [
             p["relative_noise"] for p in first["pictures"]
         ]
+    # Another exposure writes the PNG files again, and renders nothing.
+    exposed = batch["pictures exposed"].result()
+    assert [p["kept"] for p in exposed["pictures"]] == [True] * 4
+    assert exposed["exposure"] == 1.5 != first["exposure"]
+    record = json.loads((work / "pictures/pictures.json").read_text())["pictures"]
+    assert {p["facts"]["exposure"] for name, p in record.items() if name.endswith(".png")} == {1.5}
     refused = batch["pictures changed"]
     assert refused.code == 3
     assert "pictures: holds pictures of another configuration: reference.spp: 4 -> 256" in refused.err

@@ -12,6 +12,7 @@ from PIL import Image
 from support.commands import Done, finished, run_named, start
 from support.datasets import write_dataset
 
+from mbtf_core.color import srgb_to_linear
 from mbtf_core.directions import from_angles
 from mbtf_core.lattice import level_of_sigma
 from mbtf_gen.dataset.reader import Dataset
@@ -51,7 +52,7 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def drawing(work: Path) -> None:
     """Skips tests of what VTK draws where it cannot."""
-    block = tiled_mesh(load_material(work / "maps"), 1)
+    block = tiled_mesh(load_material(work / "maps"), 1, 0.0)
     camera = tiles_camera(40, -90, tiles=1, aspect=0.5, displacement_range=0.04, columns=64)
     fault = draw(block, camera, from_angles(35, 150), work / "trial.png")
     if fault:
@@ -67,6 +68,8 @@ def batch(work: Path) -> dict[str, Done]:
         "flat": f"preview flat.npy -o flat {FAST}",
         "again": f"preview maps -o tilted --tiles 1 {FAST} --json",
         "changed": f"preview maps -o tilted --tiles 2 {FAST}",
+        "darker": f"preview flat.npy -o darker {FAST} --json",
+        "darker again": f"preview flat.npy -o darker --exposure -0.5 {FAST} --json",
         "replaced": f"preview flat.npy -o flat --tiles 1 --overwrite {FAST} --json",
         "data": "preview data -o data-pictures --size 64 --spp 2 --json",
         "lonely": "preview lonely -o lonely-pictures --json",
@@ -146,6 +149,19 @@ def test_the_same_command_keeps_and_another_is_refused(batch: dict[str, Done], w
 
 
 @pytest.mark.usefixtures("drawing")
+def test_another_exposure_shows_the_same_values(batch: dict[str, Done], work: Path) -> None:
+    """A flat gray tile of albedo 1/2: the automatic exposure shows it as 0.8 of white, 2^EV / (2 π)."""
+    mesh, beauty, _ = batch["darker"].result()["pictures"]
+    assert beauty["exposure"] == mesh["exposure"] == pytest.approx(np.log2(0.8 * 2 * np.pi), abs=0.05)
+    mesh, beauty, queries = batch["darker again"].result()["pictures"]
+    assert (mesh["exposure"], beauty["exposure"]) == (-0.5, -0.5)
+    assert (mesh["kept"], beauty["kept"], queries["kept"]) == (False, False, True)
+    shown = srgb_to_linear(pixels(work / "darker/beauty.png")).mean()
+    assert shown == pytest.approx(2**-0.5 / (2 * np.pi), rel=0.03)
+    assert "exposure: -0.5" in (work / "darker/config.yaml").read_text()
+
+
+@pytest.mark.usefixtures("drawing")
 def test_plots_of_a_data_set_are_of_its_stored_queries(batch: dict[str, Done], work: Path) -> None:
     pictures = {Path(p["file"]).stem: p for p in batch["data"].result()["pictures"]}
     assert list(pictures) == ["mesh", "beauty", "queries"]
@@ -199,12 +215,14 @@ def test_a_preview_without_drawing_is_partial_and_resumes(
         patch.setattr(mesh, "draw", lambda *_: "the process was ended by SIGSEGV")
         assert run(app, line) == 4
     out, err = capsys.readouterr()
-    assert [Path(text.partition(": ")[0]).name for text in out.splitlines()] == ["beauty.png", "queries.png"]
+    lines = out.splitlines()
+    assert [Path(text.partition(": ")[0]).name for text in lines[:-1]] == ["beauty.png", "queries.png"]
+    assert lines[-1].startswith("exposure ")
     assert "mesh.png: could not be drawn (the process was ended by SIGSEGV)" in err
     assert "doctor" in err
     assert run(app, line) == 0
     out, _ = capsys.readouterr()
-    assert [text.endswith("(kept)") for text in out.splitlines()] == [False, True, True]
+    assert [text.endswith("(kept)") for text in out.splitlines()[:-1]] == [False, True, True]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems always have a display")

@@ -168,11 +168,20 @@ def test_a_flipped_byte_is_detected_and_repaired(again: Any, folder: Path) -> No
     assert shard.read_bytes() == whole
 
 
-def test_the_report_can_be_written_again(again: Any, folder: Path) -> None:
+def test_the_report_can_be_written_again(
+    again: Any, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (folder / "report.html").unlink()
     assert run(app, ["report", str(folder)]) == 0
     assert (folder / "report.html").exists()
     assert again() == {}
+    capsys.readouterr()
+    assert run(app, ["report", str(folder), "--exposure", "-0.5", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["exposure"] == -0.5
+    assert "exposure -0.50 EV (1.41 1/sr is white)" in (folder / "report.html").read_text(encoding="utf-8")
+    assert run(app, ["report", str(folder), "--exposure", "90"]) == 2
+    # The recipe has its own exposure.
+    assert list(again()) == ["report"]
 
 
 def test_a_run_of_another_schema_is_refused(

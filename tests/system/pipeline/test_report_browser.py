@@ -15,8 +15,8 @@ from PIL import Image
 from support.paths import ROOT
 
 from mbtf_core.console import run
+from mbtf_core.exposure import to_display
 from mbtf_gen.diagnostics.doctor import BROWSERS
-from mbtf_gen.pictures.reference import to_display
 from mbtf_pipeline.cli.app import app
 from mbtf_pipeline.compare.pictures import read_picture
 
@@ -128,7 +128,7 @@ class Page:
         picture = self.record["pictures"][scene]
         file = (picture["references"] if what in ("query", "pixel") else picture["fits"])[what]["file"]
         value = read_picture(self.folder / "compare" / file)
-        return to_display(value, 2.0**stops / self.record["white"]).astype(np.int64)
+        return to_display(value, self.record["exposure"] + stops).astype(np.int64)
 
     def collect(self) -> None:
         """Collect the browser's logs."""
@@ -247,7 +247,7 @@ def test_exposure_scales_linear_values_of_both_sides(page: Page, stage: Any, key
     assert matches(page.screen(), page.expected(0, "neumip", stops))
     white = page.record["white"] / 2.0**stops
     caption = page.find("#caption").text
-    assert f"{stops:+.1f} EV".replace("-", "−") in caption
+    assert f"exposure {page.record['exposure'] + stops:+.2f} EV".replace("-", "−") in caption
     assert f"{float(f'{white:.3g}'):g} 1/sr is white" in caption
     page.until(lambda: page.js("return document.body.dataset.exposure") == text, "the sheet's exposure")
     cells = "button.zoom[data-scene='1'] canvas"

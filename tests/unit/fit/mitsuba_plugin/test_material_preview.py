@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,8 @@ from support.scenes import mi
 import mbtf_fit.mitsuba_plugin
 from mbtf_core.config_file import resolve
 from mbtf_core.directions import from_angles
-from mbtf_core.errors import UsageError
+from mbtf_core.errors import EngineError, UsageError
+from mbtf_core.exposure import to_display
 from mbtf_fit.mitsuba_plugin.preview.config import PreviewConfig, SheetSection, TurntableSection
 from mbtf_gen.config.pictures import Direction
 from mbtf_gen.pictures.camera import Camera
@@ -26,7 +28,7 @@ mbtf_fit.mitsuba_plugin.register()
 from mbtf_fit.mitsuba_plugin.bsdf import Frame  # noqa: E402
 from mbtf_fit.mitsuba_plugin.evaluator import Evaluator  # noqa: E402
 from mbtf_fit.mitsuba_plugin.material_arrays import read_material  # noqa: E402
-from mbtf_fit.mitsuba_plugin.preview import sheet, turntable  # noqa: E402
+from mbtf_fit.mitsuba_plugin.preview import animation, sheet, turntable  # noqa: E402
 
 SECTION = SheetSection(
     views=[Direction(elevation=70, azimuth=-90), Direction(elevation=35, azimuth=20)],
@@ -41,8 +43,8 @@ def test_pictures_are_ordered_by_view_light_and_width(tmp_path: Path) -> None:
     material = write_material(tmp_path, aspect=2.0, contrast=1.0)
     values = sheet.panels(Evaluator(read_material(tmp_path), "cooperative"), SECTION)
     assert values.shape == (2, 2, 3, 64, 64, 3)
-    pixels = sheet.contact_sheet(values, SECTION)
-    exposure = sheet.HEADROOM * sheet.auto_exposure(values)
+    exposure = sheet.exposure_of(values)
+    pixels = sheet.contact_sheet(values, SECTION, exposure)
     pitch = 64 + sheet.GAP
     for view, light, row in np.ndindex(2, 2, 3):
         v, i = SECTION.views[view], SECTION.lights[light]
@@ -53,7 +55,7 @@ def test_pictures_are_ordered_by_view_light_and_width(tmp_path: Path) -> None:
         left = sheet.MARGIN + (2 * view + light) * pitch + view * sheet.GAP
         top = sheet.MARGIN + sheet.CAPTION + row * pitch
         shown = pixels[top : top + 64, left : left + 64].astype(int)
-        difference = np.abs(shown - sheet.to_display(wanted, exposure))
+        difference = np.abs(shown - to_display(wanted, exposure))
         # The first column carries labels below.
         assert difference[: 32 if (view, light) == (0, 0) else 64].max() <= 1
     flat = values.reshape(12, -1)
@@ -117,14 +119,50 @@ def test_rotation_changes_patterned_materials_only(tmp_path: Path) -> None:
 
 def test_the_animation_repeats_and_keeps_its_frames(tmp_path: Path) -> None:
     pictures = [np.full((8, 8, 3), (40 * k, 90, 250 - 40 * k), np.uint8) for k in range(5)]
-    turntable.write_gif(tmp_path / "turn.gif", pictures)
+    animation.write_gif(tmp_path / "turn.gif", pictures)
     with Image.open(tmp_path / "turn.gif") as file:
         assert file.info["loop"] == 0
         for k, picture in enumerate(pictures):
             file.seek(k)
             assert np.abs(np.asarray(file.convert("RGB")).astype(int) - picture).max() <= 8
-            assert file.info["duration"] == turntable.TURN // 5
+            assert file.info["duration"] == animation.TURN // 5
         assert file.n_frames == 5
+
+
+def test_a_white_plate_and_a_white_sheet_have_one_exposure(tmp_path: Path) -> None:
+    """Constant value 1/4 under unit irradiance: the turntable's plate shows what the sheet shows."""
+    section = TurntableSection(size=24, frames=1, spp=256)
+    (picture,) = turntable.frames(white(tmp_path), section)
+    # The plate in front of the ball, which shadows none of the lights there and hides some of the sky.
+    assert picture[19:21, 8:11].mean() == pytest.approx(0.25, rel=0.12)
+
+
+def test_a_video_needs_an_encoder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(animation.shutil, "which", lambda name: None)
+        patch.setitem(sys.modules, "imageio_ffmpeg", None)
+        with pytest.raises(EngineError, match="there is no ffmpeg") as caught:
+            animation.find_encoder()
+        check_message(caught.value)
+        assert "mbtf[video]" in caught.value.message
+    pictures = [np.full((9, 7, 3), 90, np.uint8)] * 3
+    with pytest.raises(EngineError, match="ffmpeg failed") as caught:
+        animation.write_mp4(tmp_path / "turn.mp4", pictures, "false")
+    check_message(caught.value)
+    assert not list(tmp_path.iterdir())
+    try:
+        encoder = animation.find_encoder()
+    except EngineError:
+        pytest.skip("no ffmpeg here")
+    animation.write_mp4(tmp_path / "turn.mp4", pictures, encoder)
+    assert (tmp_path / "turn.mp4").read_bytes()[4:8] == b"ftyp"
+
+
+def test_view_and_light_replace_those_of_the_sheet() -> None:
+    """Spelled as in ``mbtf-gen reference``."""
+    config = resolve(PreviewConfig, flags={"material": "m", "sheet.view": "60,-90", "sheet.light": "45,30"})
+    assert config.sheet.cameras == [Direction(elevation=60, azimuth=-90)]
+    assert config.sheet.lamps == [Direction(elevation=45, azimuth=30)]
 
 
 def test_invalid_options_are_refused() -> None:
@@ -132,7 +170,7 @@ def test_invalid_options_are_refused() -> None:
         ("sheet.size", 2000, "pixels; use smaller or fewer"),
         ("turntable.frames", 0, "turntable.frames"),
         ("sheet.tiles_across", [], "sheet.tiles_across"),
-        ("sheet.view", 3, "did you mean 'views'"),
+        ("sheet.vews", 3, "did you mean 'views'"),
     ):
         flags = {"material": "m", key: value}
         if key == "sheet.size":
@@ -150,6 +188,9 @@ def test_bad_input_of_previews_is_refused(tmp_path: Path, capsys: pytest.Capture
         (3, "no material.json", str(tmp_path), "-o", str(tmp_path / "out")),
         (2, "--tiles-across: 'sheet.tiles_across': must be numbers", "m", "--tiles-across", "1;2"),
         (2, "no material given"),
+        (2, "--view: 'sheet.view': must be ELEVATION,AZIMUTH", "m", "--view", "60"),
+        (2, "--exposure: 'exposure': must be a", "m", "--exposure", "nan"),
+        (2, "--mp4: --sheet-only draws no turntable", "m", "--sheet-only", "--mp4"),
     ):
         assert run(app, ["preview", *words]) == code
         assert what in capsys.readouterr().err

@@ -19,8 +19,8 @@ def history(power: float, error: float = 1e-4, total: float = 80.0) -> list[dict
 
 def errors(held_out: float, training: float, error: float = 0.002) -> dict[str, Any]:
     return {
-        "held_out_queries": {"unexplained": {"value": held_out, "error": error}},
-        "training": {"unexplained": {"value": training, "error": error}},
+        "held_out_queries": {"mse": {"value": held_out, "error": error}},
+        "training": {"mse": {"value": training, "error": error}},
     }
 
 
@@ -33,7 +33,9 @@ def cost(records: list[dict[str, Any]], *arguments: Any, **options: Any) -> Marg
 @pytest.mark.parametrize("power", [0.25, 0.5, 1.0])
 def test_halving_follows_the_power_law(power: float) -> None:
     found = cost(history(power), {}, validation_set="held_out_queries")
-    assert found.describe().startswith("unexplained variance of held-out queries: 0.")
+    # The table holds the error; the subset that the history is of has another one.
+    assert found.describe().startswith("halving the error takes about ")
+    assert "0." not in found.describe()
     assert found.end == pytest.approx(0.2)
     assert found.half == pytest.approx(0.2 * 0.49**-power)
     assert found.halving == pytest.approx(80.0 * (2 ** (1 / power) - 1), rel=1e-6)
@@ -42,7 +44,7 @@ def test_halving_follows_the_power_law(power: float) -> None:
 def test_insignificant_improvements_give_no_estimate() -> None:
     found = cost(history(0.25, error=0.03), {})
     assert found.halving is None
-    assert "would hardly reduce it" in found.describe()
+    assert "would hardly reduce the error" in found.describe()
     assert cost(history(-0.2), {}).halving is None
     # Hardly falling at all: more years than anyone has, or than a number holds.
     assert cost(history(1e-4, error=1e-9), {}).halving is None
@@ -65,6 +67,18 @@ def test_overfitting_is_bounded_by_the_noise(noise: float | None, share: float |
     """Few queries without noise leave the same distance: what lies between them was not learned."""
     found = cost(history(0.5), errors(0.25, 0.15), noise).noise_share
     assert found == (share if share is None else pytest.approx(share))
+
+
+def test_overfitting_is_seen_where_the_unexplained_variance_is_undefined() -> None:
+    """Noisy queries, in training and held out: the history and the ratio have no number."""
+    unknown = [{**r, "unexplained": None, "unexplained_error": None} for r in history(0.5)]
+    found = cost(unknown, errors(0.05, -0.05), 0.3)
+    assert found.noise_share == 1.0
+    assert found.describe().startswith("overfitting to noise causes 100% of the error of new queries")
+    # Held-out queries that resolve nothing at all, and a test split of many paths.
+    both = errors(0.01, -0.05, 0.02) | {"test": {"mse": {"value": 0.06, "error": 0.001}}}
+    both["training"]["mse"]["error"] = 0.001
+    assert cost(unknown, both, 0.3).noise_share == pytest.approx(0.055 / 0.06)
 
 
 def test_incomplete_histories_give_no_marginal_cost() -> None:

@@ -59,7 +59,7 @@ def test_the_camera_frames_the_block(
 @pytest.mark.parametrize("tiles", [1, 2, 3])
 def test_the_block_is_the_repeated_tile(tiles: int) -> None:
     m = material()
-    block = tiled_mesh(m, tiles)
+    block = tiled_mesh(m, tiles, 0.0)
     assert block.cells == (4, 8)
     assert block.points.shape == (4 * tiles + 1, 8 * tiles + 1, 3)
     z = m.height - m.height.max()
@@ -80,21 +80,21 @@ def test_the_block_is_the_repeated_tile(tiles: int) -> None:
 def test_holes_are_cut_where_little_is_left() -> None:
     opacity = np.ones((4, 8), np.float32)
     opacity[1:3, 2:6] = 0.0
-    block = tiled_mesh(material(opacity=opacity), 2)
+    block = tiled_mesh(material(opacity=opacity), 2, 0.0)
     assert block.hole.shape == (8, 16)
     # Cells lie between texel centers: those whose four corners average below one half.
     expected = np.zeros((4, 8), bool)
     expected[1:2, 2:5] = True
     np.testing.assert_array_equal(block.hole, np.tile(expected, (2, 2)))
-    assert tiled_mesh(material(opacity=0.2), 1).hole.all()
+    assert tiled_mesh(material(opacity=0.2), 1, 0.0).hole.all()
 
 
 def test_a_large_mesh_is_coarsened() -> None:
     m = material()
     for tiles, wide in ((1, MOST_CELLS), (4, MOST_CELLS // 4)):
-        block = tiled_mesh(m, tiles, mesh=4000)
+        block = tiled_mesh(m, tiles, 0.0, mesh=4000)
         assert block.cells == (wide // 2, wide)
-    tall = tiled_mesh(material(8, 4), 2, mesh=2000)
+    tall = tiled_mesh(material(8, 4), 2, 0.0, mesh=2000)
     assert tall.cells == (MOST_CELLS // 2, MOST_CELLS // 4)
 
 
@@ -213,7 +213,7 @@ def test_a_crash_while_drawing_is_one_line(tmp_path: Path, monkeypatch: pytest.M
         return run_child("support.crashing", "crash", *arguments, timeout=timeout)
 
     monkeypatch.setattr(mesh, "run_child", crashing)
-    block, camera = tiled_mesh(material(), 1), Camera(rows=8, columns=8)
+    block, camera = tiled_mesh(material(), 1, 0.0), Camera(rows=8, columns=8)
     fault = draw(block, camera, LIGHT, tmp_path / "mesh.png")
     assert fault == "the process was ended by SIGSEGV"
     assert list(tmp_path.iterdir()) == []

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from mbtf_pipeline.compare.metrics import image_errors, reference_difference, white_point
+from mbtf_pipeline.compare.metrics import image_errors, reference_difference
 
 
 def noisy(truth: np.ndarray, noise: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -64,10 +64,3 @@ def test_two_references_of_one_truth_agree() -> None:
     assert abs(same.value) < 4 * same.error
     shifted = reference_difference((first[0] + 0.1, first[1] + 0.1), *second)
     assert shifted.value > 4 * shifted.error
-
-
-def test_white_point() -> None:
-    ramp = np.linspace(0, 1, 2001)[:, None, None] * np.ones(3)
-    assert white_point([ramp]) == pytest.approx(0.95 / 0.8)
-    assert white_point([ramp, 100 * ramp, 3 * ramp]) == pytest.approx(3 * 0.95 / 0.8)
-    assert white_point([0 * ramp]) == 1.0

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mbtf_core.errors import EngineError
-from mbtf_gen.pictures.reference import to_display
+from mbtf_core.exposure import to_display
 from mbtf_pipeline.compare import st_lpips as perceptual
 from mbtf_pipeline.compare.ssim import ssim, to_srgb
 from mbtf_pipeline.compare.st_lpips import st_lpips, weights_file
@@ -29,7 +29,7 @@ def pair(shape: tuple[int, int] = (40, 33)) -> tuple[F64, F64]:
 
 def test_srgb_matches_the_display_conversion() -> None:
     values = np.linspace(-0.1, 0.4, 300).reshape(10, 10, 3).astype(np.float32)
-    np.testing.assert_array_equal(np.round(255 * to_srgb(values, 0.25)), to_display(values, 1 / 0.25))
+    np.testing.assert_array_equal(np.round(255 * to_srgb(values, 0.25)), to_display(values, 2.0))
 
 
 def test_ssim_of_uniform_images_is_known() -> None:

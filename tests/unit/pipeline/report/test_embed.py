@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mbtf_gen.pictures.reference import to_display
+from mbtf_core.exposure import to_display
 from mbtf_pipeline.report.embed import ENCODINGS, Encoding, Gallery, encode, shrink
 from mbtf_pipeline.report.error_maps import palette
 
@@ -25,7 +25,7 @@ def gallery() -> Gallery:
     noise = np.random.default_rng(1).random((96, 128, 3)).astype(np.float32)
     values = np.tile(np.linspace(0, 1, 128), (96, 1))
     linear = {"a": noise, "b": 3 * noise[::-1]}
-    return Gallery(0.5, linear, {"map": ("local", values), "offset": ("signed", 2 * values - 1)})
+    return Gallery(1.0, linear, {"map": ("local", values), "offset": ("signed", 2 * values - 1)})
 
 
 def test_every_encoding_is_smaller_than_the_one_before(gallery: Gallery) -> None:
@@ -48,7 +48,7 @@ def test_reductions_are_reported(gallery: Gallery) -> None:
 def test_previews_match_their_sources(gallery: Gallery) -> None:
     _, images, _ = encode(gallery, ENCODINGS[0])
     shown = decoded(images["b"]).astype(int)
-    assert np.abs(shown - to_display(gallery.linear["b"], 1 / 0.5)).mean() < 7
+    assert np.abs(shown - to_display(gallery.linear["b"], 1.0)).mean() < 7
     colors = decoded(images["map"])
     assert colors[0, 0].tolist() == list(palette("local")[0])
     assert colors[0, -1].tolist() == list(palette("local")[-1])

@@ -34,7 +34,13 @@ def test_both_errors_of_a_group_are_significant_or_neither() -> None:
     picture["references"] = {"query": {"flip": flip}}
     picture["fits"] = {"a": {"errors": {"query": error}, "flip": flip}}
     test = {"a": {"splits": {"test": split}, "network_weights": 9, "texels": 9}}
-    record: dict[str, Any] = {"fits": ["a"], "kinds": ["query"], "white": 1.0, "definitions": {}}
+    record: dict[str, Any] = {
+        "fits": ["a"],
+        "kinds": ["query"],
+        "exposure": 0.0,
+        "white": 1.0,
+        "definitions": {},
+    }
     record |= {"pictures": [picture], "test": test}
     context = error_context(record, 0.3)
     levels, cosines = (table["rows"] for table in context["group_tables"])
