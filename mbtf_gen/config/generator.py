@@ -217,6 +217,8 @@ class OutputSection(Settings):
 class GeneratorConfig(Settings):
     """Everything that ``mbtf-gen`` needs to generate a data set."""
 
+    exclusive = (("queries.spp", "queries.target_error"),)
+
     version: Literal[2] = 2
     material: FileName = Field(description="height map, folder of maps, or material.yaml")
     geometry: GeometrySection = GeometrySection()

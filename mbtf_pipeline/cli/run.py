@@ -63,7 +63,7 @@ def run(
     from mbtf_pipeline.recipe import load_recipe
     from mbtf_pipeline.run import run_recipe
 
-    loaded = load_recipe(recipe, [*quality_assignments(recipe, quality, own), *own])
+    loaded = load_recipe(recipe, own, presets=quality_assignments(recipe, quality, own))
     if time is not None:
         from mbtf_core.units import asked_duration
         from mbtf_pipeline.cost_study.time_split import split_time, with_split

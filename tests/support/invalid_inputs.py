@@ -25,6 +25,9 @@ LINES: dict[str, list[str]] = {
     "command lines": [
         "mbtf-gen heights.npy --queries 1.5",
         "mbtf-gen heights.npy --set seed=-1",
+        "mbtf-gen inspect heights.npy --set seed=true",
+        "mbtf-gen inspect heights.npy --set material=5",
+        "mbtf-gen plan heights.npy --no-measure --spp 4 --target-error 2%",
         "mbtf-gen heights.npy --set seed=2001-01-01",
         "mbtf-gen heights.npy -o textures",
         "mbtf-gen heights.npy -o set --queries 10",
