@@ -26,7 +26,7 @@ from pydantic import (
 )
 
 from mbtf_core.errors import InputError, MbtfError, UsageError, reason
-from mbtf_core.suggest import suggest_path
+from mbtf_core.suggest import refuse_special, suggest_path
 from mbtf_core.validation_messages import explain, models_in, parts_of
 
 
@@ -106,6 +106,7 @@ def read_yaml(path: Path) -> Any:
     """
     from ruamel.yaml.error import MarkedYAMLError
 
+    refuse_special(path)
     try:
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:

@@ -21,8 +21,11 @@ def format_table(rows: list[list[str]]) -> str:
     return "\n".join(line.rstrip() for line in lines)
 
 
-def describe_errors(errors: dict[str, Any]) -> list[str]:
-    """A table of unexplained variance: overall, by level and by lowest cosine; a column per split."""
+def describe_errors(errors: dict[str, Any], *, foreign: bool = False) -> list[str]:
+    """A table of unexplained variance: overall, by level and by lowest cosine; a column per split.
+
+    `foreign`: the errors are of the data of another material.
+    """
     splits = list(errors)
     rows = [["unexplained variance", *(SPLIT_NAMES[name] for name in splits)]]
     rows.append(["all", *(format_estimate(errors[name]["unexplained"]) for name in splits)])
@@ -37,17 +40,17 @@ def describe_errors(errors: dict[str, Any]) -> list[str]:
                 ]
             )
     rows.append(["queries", *(str(errors[name]["n"]) for name in splits)])
-    return [*format_table(rows).splitlines(), *_remarks(errors)]
+    return [*format_table(rows).splitlines(), *_remarks(errors, foreign)]
 
 
-def _remarks(errors: dict[str, Any]) -> list[str]:
+def _remarks(errors: dict[str, Any], foreign: bool) -> list[str]:
     """Notes on undefined and large errors."""
     found = []
     groups = [g for e in errors.values() for g in (e, *e["levels"].values(), *e["elevations"].values())]
     if any(group["unexplained"]["value"] is None for group in groups):
         found.append("undefined: the noise exceeds the variance of these values")
     test = errors.get("test", {}).get("unexplained", {}).get("value")
-    if test is not None and test >= 1:
+    if test is not None and test >= 1 and not foreign:
         found.append(
             "above 1: worse than the mean value; generate more queries (mbtf-gen --queries), more paths per "
             "query (--spp), or a wider light (--light-width)"

@@ -35,7 +35,10 @@ def evaluate(material: Path, shards: Path, /, *, console: Console = CONSOLE) -> 
     found = evaluate(loaded, shards)
     errors = {name: e.as_dict() for name, e in found.values.items()}
     through = {name: e.as_dict() for name, e in (found.transmittance or {}).items()}
-    lines = [f"{material}: {loaded.config.model} on {shards}", *describe_errors(errors)]
+    lines = [
+        f"{material}: {loaded.config.model} on {shards}",
+        *describe_errors(errors, foreign=bool(foreign)),
+    ]
     report = {"material": material, "shards": shards, "foreign_inputs": foreign, "errors": errors}
     if found.transmittance is not None:
         report["transmittance"] = through

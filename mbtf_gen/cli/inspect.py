@@ -29,5 +29,13 @@ def inspect(
     resolved = resolve_config(options, material)
     geometry = resolved.geometry
     loaded = load_material(resolved.material, geometry.make_tileable)
+    if loaded.bsdf is not None:
+        from mbtf_gen.render.runtime import load_mitsuba
+
+        load_mitsuba()
+        from mbtf_gen.render.scene import build_tile
+
+        # Mitsuba refuses what it does not know.
+        build_tile(loaded.grid(mesh=1), loaded.bsdf)
     found = {"material": resolved.material, **inspect_material(loaded, geometry.height_scale, geometry.mesh)}
     console.report(found, inspection_text(found, resolved.material))

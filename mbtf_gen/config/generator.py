@@ -95,6 +95,9 @@ class GeometrySection(Settings):
         le=100,
         description="factor on the stored heights, in tile widths; default: the material's own",
     )
+    max_displacement: float = Field(
+        100.0, gt=0, le=1e6, description="largest accepted displacement range, in tile widths"
+    )
     mesh: Annotated[int | None, Flag("--mesh")] = Field(
         None, ge=1, le=8192, description="mesh cells across the tile; default: the map's width, at most 512"
     )
@@ -233,5 +236,6 @@ class GeneratorConfig(Settings):
 
     def hash(self, inputs: dict[str, str]) -> str:
         """SHA-256 of everything that determines the data: options, and digests of the input files by role."""
-        fields = self.model_dump(exclude={"material"})
+        # The limit does not change the data.
+        fields = self.model_dump(exclude={"material": True, "geometry": {"max_displacement"}})
         return data_sha256({"schema": SCHEMA_VERSION, "inputs": inputs, **fields})

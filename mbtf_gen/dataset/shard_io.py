@@ -6,7 +6,6 @@ A shard is a mapping of array name to array; all arrays share their leading axes
 
 from __future__ import annotations
 
-import errno
 import io
 import math
 import zipfile
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 from mbtf_core.atomic import Stored, write_chunks, write_through
 from mbtf_core.errors import InputError, reason
 from mbtf_core.shard_schema import ARRAY, ARRAYS
+from mbtf_core.suggest import refuse_special
 
 Arrays = dict[str, NDArray[np.float32]]
 
@@ -184,15 +184,7 @@ def write_exr(path: Path, arrays: Mapping[str, NDArray[np.float32]]) -> Stored:
         "type": OpenEXR.scanlineimage,
         "mbtf.lead": ",".join(str(n) for n in lead),
     }
-
-    def write(temporary: Path) -> None:
-        try:
-            OpenEXR.File(header, channels).write(str(temporary))
-        except RuntimeError as error:
-            # The library's message ends with the file's name and the system's error.
-            raise OSError(errno.EIO, reason(str(error).rpartition('". ')[2].rstrip("."))) from None
-
-    return write_through(path, write)
+    return write_through(path, lambda temporary: OpenEXR.File(header, channels).write(str(temporary)))
 
 
 def read_exr(path: Path, names: Iterable[str] | None = None) -> Arrays:
@@ -239,6 +231,7 @@ def read_shard(path: Path, names: Iterable[str] | None = None, *, mapped: bool =
     ------
     InputError : missing, corrupt, or arrays with inconsistent shapes
     """
+    refuse_special(path)
     arrays = read_exr(path, names) if path.suffix == ".exr" else read_npz(path, names, mapped=mapped)
     if arrays:
         check_arrays(arrays, path, complete=False)

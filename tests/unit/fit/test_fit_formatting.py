@@ -34,3 +34,7 @@ def test_bad_errors_are_explained(value: float | None, by_level: float | None, r
     assert len(lines) == 4 + len(remarks)
     for line, remark in zip(lines[4:], remarks, strict=True):
         assert line.startswith(remark)
+
+
+def test_errors_on_the_data_of_another_material_give_no_advice_about_queries() -> None:
+    assert len(describe_errors(errors(1.5, 0.4), foreign=True)) == 4
