@@ -16,6 +16,7 @@ from typing import Any, BinaryIO
 
 from mbtf_core.digest import file_sha256
 from mbtf_core.errors import InputError, PartialError, reason
+from mbtf_core.suggest import refuse_special
 
 _CHECKSUM = "checksum"
 
@@ -135,7 +136,11 @@ def write_chunks(path: Path, chunks: Iterable[Buffer]) -> Stored:
 def write_through(path: Path, write: Callable[[Path], None]) -> Stored:
     """Like :func:`write_chunks` for libraries that need a file name: `write(temporary)` creates it."""
     with _temporary(path) as temporary:
-        write(temporary)
+        try:
+            write(temporary)
+        except RuntimeError as error:
+            # OpenEXR's, which ends with the file's name and the system's error.
+            raise OSError(errno.EIO, reason(str(error).rpartition('". ')[2].rstrip("."))) from None
         with temporary.open("rb+") as stream:
             os.fsync(stream.fileno())
         stored = Stored(temporary.stat().st_size, file_sha256(temporary))
@@ -234,6 +239,7 @@ def read_checksummed(path: Path, hint: str = "") -> dict[str, Any]:
 
 
 def _read_json(path: Path, hint: str = "") -> tuple[bytes, dict[str, Any]]:
+    refuse_special(path)
     try:
         content = path.read_bytes()
         data = json.loads(content.decode(), parse_constant=_refuse_constant)

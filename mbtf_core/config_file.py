@@ -13,22 +13,54 @@ import re
 from collections.abc import Iterator, Mapping, Sequence, Set
 from datetime import date
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, ClassVar, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+)
 
 from mbtf_core.errors import InputError, MbtfError, UsageError, reason
-from mbtf_core.suggest import suggest_path
-from mbtf_core.validation_messages import explain, models_in
+from mbtf_core.suggest import refuse_special, suggest_path
+from mbtf_core.validation_messages import explain, models_in, parts_of
 
 
 class Settings(BaseModel):
-    """Base of every configuration section: unknown keys are errors, values are fixed once read."""
+    """Base of every configuration section: unknown keys are errors, numbers are finite, values are fixed.
 
-    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
+    Attributes
+    ----------
+    exclusive : class attribute, pairs of dotted keys that a file or a command line must not both give
+    """
+
+    exclusive: ClassVar[tuple[tuple[str, str], ...]] = ()
+    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False)
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _no_boolean_numbers(cls, value: Any, info: ValidationInfo) -> Any:
+        """Spell out true and false where a number is wanted: pydantic would read them as 1 and 0."""
+        kinds = parts_of(cls.model_fields[str(info.field_name)].annotation)
+        numeric = (int in kinds or float in kinds) and bool not in kinds
+        return _spelled_out(value) if numeric else value
 
 
-S = TypeVar("S", bound=BaseModel)
+def _spelled_out(value: Any) -> Any:
+    # The YAML reader's boolean with an anchor is no bool.
+    if isinstance(value, bool) or type(value).__name__ == "ScalarBoolean":
+        return "true" if value else "false"
+    if isinstance(value, list | tuple):
+        return [_spelled_out(item) for item in value]
+    return value
+
+
+B = TypeVar("B", bound=BaseModel)
+S = TypeVar("S", bound=Settings)
 
 
 def _file_name(name: str) -> str:
@@ -74,6 +106,7 @@ def read_yaml(path: Path) -> Any:
     """
     from ruamel.yaml.error import MarkedYAMLError
 
+    refuse_special(path)
     try:
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
@@ -171,6 +204,12 @@ def _known_keys(model: type[BaseModel], location: Sequence[str | int]) -> list[s
     return sorted({key for m in models for key in m.model_fields})
 
 
+def _holder(data: Any, key: str) -> Any:
+    """The mapping that states a key: `data`, or one that is merged into it (``<<: *name``)."""
+    merged = () if key in (data.lc.data or {}) else data.merge
+    return next((_holder(one, key) for one in merged if key in one), data)
+
+
 def line_of(data: Any, location: Sequence[str | int]) -> int | None:
     """Line (from 1) of a key in data that :func:`read_yaml` returned; None where it is not in the file."""
     line = None
@@ -178,6 +217,7 @@ def line_of(data: Any, location: Sequence[str | int]) -> int | None:
         try:
             if isinstance(part, str) and part not in data:
                 continue  # pydantic inserts tags of unions into its locations
+            data = _holder(data, part) if isinstance(part, str) else data
             position = data.lc.key(part) if isinstance(part, str) else data.lc.item(part)
             line = position[0] + 1
             data = data[part]
@@ -213,13 +253,13 @@ def _explain(
 
 
 def build(
-    model: type[S],
+    model: type[B],
     data: Mapping[str, Any],
     *,
     source: str,
     error: type[MbtfError] = InputError,
     spelled: Mapping[str, str] | None = None,
-) -> S:
+) -> B:
     """Check `data` against `model`.
 
     Parameters
@@ -252,7 +292,7 @@ def check_schema(document: Mapping[str, Any], version: int, where: Path, hint: s
         raise InputError(what, where=where, hint=hint)
 
 
-def check_document(model: type[S], data: Mapping[str, Any], path: Path, hint: str) -> S:
+def check_document(model: type[B], data: Mapping[str, Any], path: Path, hint: str) -> B:
     """A JSON document of the programs as `model`.
 
     Raises
@@ -275,6 +315,33 @@ def _parse_value(text: str) -> Any:
         return text
     _check_tree(value, "--set")
     return value
+
+
+def _parse_assignment(text: str) -> tuple[str, Any]:
+    """(dotted key, value) of ``a.b=c``."""
+    key, sign, value = text.partition("=")
+    if not sign or not key:
+        raise UsageError(f"{_shown(text)} is not of the form key=value", where="--set")
+    return key.strip(), _parse_value(value)
+
+
+def _contradiction(model: type[Settings], data: Mapping[str, Any]) -> tuple[str, str] | None:
+    """The first two keys of nested data that the model declares exclusive, at any depth."""
+    given = [key for key, value in _leaves(data) if value is not None]
+    for key in given:
+        for first, second in model.exclusive:
+            other = key.removesuffix(first) + second
+            if f".{key}".endswith(f".{first}") and other in given:
+                return key, other
+    return None
+
+
+def _leaves(data: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in data.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
 
 
 def merge(base: Any, path: Sequence[str], value: Any) -> None:
@@ -309,14 +376,16 @@ def resolve(
     model: type[S],
     *,
     file: Path | None = None,
+    presets: Sequence[str] = (),
     assignments: Sequence[str] = (),
     flags: Mapping[str, Any] | None = None,
     spelled: Mapping[str, str] | None = None,
 ) -> S:
-    """Resolved configuration: defaults, then the file, then ``a.b=c`` assignments, then flags.
+    """Resolved configuration: defaults, then the file, presets, ``a.b=c`` assignments, and flags.
 
     Parameters
     ----------
+    presets : ``a.b=c`` that assignments and flags override
     flags : dotted key → value; None values are flags that were not given
     spelled : dotted key → its flag, for messages
 
@@ -326,14 +395,23 @@ def resolve(
     UsageError : an assignment or a flag is at fault
     """
     data: Any = read_yaml(file) if file is not None else {}
-    given: list[tuple[str, Any]] = []
-    for assignment in assignments:
-        key, sign, text = assignment.partition("=")
-        if not sign or not key:
-            raise UsageError(f"{_shown(assignment)} is not of the form key=value", where="--set")
-        given.append((key.strip(), _parse_value(text)))
-    given += [(key, value) for key, value in (flags or {}).items() if value is not None]
+    own = [_parse_assignment(text) for text in assignments]
+    switches = [(key, value) for key, value in (flags or {}).items() if value is not None]
+    given = [*map(_parse_assignment, presets), *own, *switches]
+    names = {key: flag for key, flag in (spelled or {}).items() if (flags or {}).get(key) is not None}
+    both = _contradiction(model, nested(dict(own) | {key: value for key, value in switches if key in names}))
+    if both:
+        raise UsageError(
+            " and ".join(names.get(key, f"'{key}'") for key in both) + " are mutually exclusive",
+            hint="give one of them",
+        )
     if file is not None:
+        both = _contradiction(model, data)
+        # A resolved configuration, which states its version, holds every key.
+        if both and "version" not in data:
+            what = f"'{both[0]}' and '{both[1]}' are mutually exclusive"
+            line = max(line_of(data, key.split(".")) or 1 for key in both)
+            raise InputError(what, where=f"{file}:{line}", hint="give one of them")
         # Report errors of the file as such, also where the command line supplies a key that it lacks.
         for key, value in given:
             if key in model.model_fields and model.model_fields[key].is_required() and key not in data:
@@ -343,7 +421,6 @@ def resolve(
             return resolved
     for key, value in given:
         merge(data, key.split("."), value)
-    names = {key: flag for key, flag in (spelled or {}).items() if (flags or {}).get(key) is not None}
     return build(model, data, source=_COMMAND_LINE, error=UsageError, spelled=names)
 
 

@@ -33,6 +33,7 @@ import signal
 import sys
 import threading
 import traceback
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -56,6 +57,8 @@ from mbtf_core.progress import BarProgress, LineProgress, Progress
 
 EXIT_INTERNAL = 1
 _EXIT_BROKEN_PIPE = 141
+# Whether the running command has printed its result.
+_reported = False
 _PACKAGES = ("mbtf_core", "mbtf_gen", "mbtf_fit", "mbtf_pipeline")
 
 
@@ -100,6 +103,8 @@ class Console:
 
         Paths, arrays, NumPy numbers and pydantic models are converted; NaN and infinities become null.
         """
+        global _reported
+        _reported = True
         if self.json:
             text = json_module.dumps(_plain(data), indent=2, ensure_ascii=False, allow_nan=False)
         print(text)
@@ -269,12 +274,24 @@ def _usage_message(app: App, fault: CycloptsError, tokens: Sequence[str]) -> str
     return f"{text}\n  see {app.name[0]}{command} --help"
 
 
-def _fail(text: str, code: int, debug: bool) -> int:
+def _fail(text: str, code: int, debug: bool, json: bool) -> int:
     with contextlib.suppress(OSError):
         if debug:
             traceback.print_exc()
         print(f"error: {text}", file=sys.stderr, flush=True)
+        if json and not _reported:
+            found = {"error": text.replace("\n  ", "; "), "exit_code": code}
+            print(json_module.dumps(found, indent=2, ensure_ascii=False), flush=True)
     return code
+
+
+@contextlib.contextmanager
+def _library_warnings(shown: bool) -> Iterator[None]:
+    """Hide Python's raw warnings, which are for developers, unless they are asked for."""
+    with warnings.catch_warnings():
+        if not shown and not sys.warnoptions:
+            warnings.simplefilter("ignore")
+        yield
 
 
 def run(app: App, argv: Sequence[str] | None = None) -> int:
@@ -286,9 +303,14 @@ def run(app: App, argv: Sequence[str] | None = None) -> int:
     argv : arguments after the program's name; the process's own by default
 
     Exit codes: 0 done, 2 usage, 3 bad input or machine, 4 partial and resumable, 130 interrupted, 1 a bug.
-    Errors are one or two lines on standard error; ``--debug`` anywhere adds the traceback.
+    Errors are one or two lines on standard error; ``--debug`` anywhere adds the traceback and the warnings of
+    libraries. With ``--json``, a failure prints an object with ``error`` and ``exit_code``, unless the
+    command has printed its result.
     """
+    global _reported
+    _reported = False
     debug, tokens = _take_debug(sys.argv[1:] if argv is None else list(argv))
+    as_json = "--json" in tokens
     _route_logs(tokens, debug)
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
@@ -298,23 +320,24 @@ def run(app: App, argv: Sequence[str] | None = None) -> int:
         if {"-h", "--help"} & set(tokens):
             _join_lines(app)
         tokens = _command_first(app, _join_negative_pairs(tokens))
-        with _ended_like_interrupted():
+        with _ended_like_interrupted(), _library_warnings(debug):
             result = app(tokens)
         sys.stdout.flush()
         return result if type(result) is int else EXIT_OK
     except MbtfError as error:
-        return _fail(error.message, error.exit_code, debug)
+        return _fail(error.message, error.exit_code, debug, as_json)
     except CycloptsError as error:
-        return _fail(_usage_message(app, error, tokens), EXIT_USAGE, debug)
+        return _fail(_usage_message(app, error, tokens), EXIT_USAGE, debug, as_json)
     except KeyboardInterrupt:
-        return _fail("interrupted", EXIT_INTERRUPTED, debug)
+        return _fail("interrupted", EXIT_INTERRUPTED, debug, as_json)
     except BrokenPipeError:
         # The reader of the output has exited (`| head`); Python would fail again when it flushes at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _EXIT_BROKEN_PIPE
     except Exception as error:
-        if isinstance(error, OSError) and error.filename is not None:
-            return _fail(f"{reason(str(error.filename))}: {error.strerror}", EXIT_BAD_INPUT, debug)
+        if isinstance(error, OSError) and error.strerror:
+            place = "" if error.filename is None else f"{reason(str(error.filename))}: "
+            return _fail(f"{place}{error.strerror}", EXIT_BAD_INPUT, debug, as_json)
         hint = "" if debug else " (run again with --debug for the traceback)"
         text = f"internal error: {type(error).__name__}: {reason(error, 1000)}{hint}"
-        return _fail(text, EXIT_INTERNAL, debug)
+        return _fail(text, EXIT_INTERNAL, debug, as_json)

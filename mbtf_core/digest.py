@@ -7,9 +7,12 @@ import json
 from pathlib import Path
 from typing import Any
 
+from mbtf_core.suggest import refuse_special
+
 
 def file_sha256(path: Path) -> str:
-    """SHA-256 of a file, in hexadecimal (what ``sha256sum`` prints)."""
+    """SHA-256 of a regular file, in hexadecimal (what ``sha256sum`` prints)."""
+    refuse_special(path)
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 

@@ -9,8 +9,28 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mbtf_core.errors import InputError
+
 # Edges of the bands of cos θ in which errors are reported.
 ELEVATION_BANDS: tuple[float, ...] = (0.0, 0.2, 0.4, 0.7, 1.0)
+
+# Largest difference of a unit vector's length from 1: half precision rounds by less.
+_ROUNDING = 1e-3
+
+
+def check_unit(omega: ArrayLike, name: str) -> None:
+    """Refuse directions (..., 3) that are not unit vectors.
+
+    Raises
+    ------
+    InputError : with the number of such directions, and the first length
+    """
+    length = np.linalg.norm(np.asarray(omega, np.float64), axis=-1).reshape(-1)
+    bad = np.flatnonzero(~(np.abs(length - 1.0) <= _ROUNDING))
+    if len(bad):
+        what = f"{len(bad)} of {len(length)} directions are not unit vectors; "
+        what += f"the first, at index {bad[0]}, has the length {length[bad[0]]:.4g}"
+        raise InputError(what, where=name, hint="normalize them: mbtf_core.directions.normalize")
 
 
 def from_projected_disk(xy: ArrayLike) -> NDArray[np.float64]:

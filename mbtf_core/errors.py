@@ -13,17 +13,11 @@ EXIT_PARTIAL = 4
 EXIT_INTERRUPTED = 130
 
 
-_BLANKS = str.maketrans("\n\r\t", "   ")
-
-
 def printable(text: str) -> str:
-    """Replace line breaks and tabs by blanks, and other unprintable characters by escapes.
+    """Replace unprintable characters, line breaks among them, by escapes.
 
     Names and values come from untrusted files and may contain control codes of terminals.
     """
-    if text.isprintable():
-        return text
-    text = text.translate(_BLANKS)
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 

@@ -29,9 +29,10 @@ from cyclopts import Parameter
 from pydantic import BaseModel, TypeAdapter
 from pydantic.fields import FieldInfo
 
-from mbtf_core.config_file import resolve
+from mbtf_core.config_file import Settings, resolve
+from mbtf_core.errors import UsageError
 
-S = TypeVar("S", bound=BaseModel)
+S = TypeVar("S", bound=Settings)
 C = TypeVar("C", bound=Callable[..., Any])
 
 # What a description says of a default that only the command knows.
@@ -202,16 +203,22 @@ class Options(Generic[S]):
         InputError : the file is at fault
         UsageError : an assignment or a flag is at fault
         """
+        assigned = {text.partition("=")[0].strip() for text in self.assignments}
+        doubled = [key for key, value in arguments.items() if value is not None and key in assigned]
+        if doubled:
+            raise UsageError(
+                f"the argument gives '{doubled[0]}' already", where="--set", hint="give one of them"
+            )
         resolved = resolve(
             self.model,
             file=self.config,
-            assignments=[*presets, *self.assignments],
+            presets=presets,
+            assignments=self.assignments,
             flags={**arguments, **self.given},
             spelled=self.flags,
         )
         if self.config is None:
             return resolved
-        assigned = {text.partition("=")[0].strip() for text in self.assignments}
         folder = self.config.parent
         paths = [k for k, given in arguments.items() if given is None and k not in assigned]
         return resolved.model_copy(update={k: str(folder / getattr(resolved, k)) for k in paths})

@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 from mbtf_core.units import clock
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
 
 # Seconds between two plain progress lines.
 _LINE_SECONDS = 10.0
@@ -94,15 +99,27 @@ class BarProgress(Progress):
         super().__init__(total, label, unit)
         from rich import progress
         from rich.console import Console as RichConsole
+        from rich.text import Text
 
-        self._rich = progress.Progress(
+        class Rows(progress.Progress):
+            """The bar, and the note below it, so that both fit in narrow terminals."""
+
+            def get_renderables(self) -> Iterator[RenderableType]:
+                yield from super().get_renderables()
+                for task in self.tasks:
+                    if task.fields["note"]:
+                        yield Text(task.fields["note"], no_wrap=True, overflow="ellipsis")
+
+        console = RichConsole(stderr=True)
+        # What the label, the percentage and the two times leave.
+        width = min(40, max(4, console.width - len(label) - 24))
+        self._rich = Rows(
             progress.TextColumn("{task.description}", markup=False),
-            progress.BarColumn(),
+            progress.BarColumn(width),
             progress.TaskProgressColumn(),
             progress.TimeElapsedColumn(),
             progress.TimeRemainingColumn(),
-            progress.TextColumn("{task.fields[note]}", markup=False),
-            console=RichConsole(stderr=True),
+            console=console,
             # Standard output is for results; rich would redirect it to standard error.
             redirect_stdout=False,
         )

@@ -1,11 +1,16 @@
-"""Suggestions for misspelt file names."""
+"""Checks of the names of input files: suggestions for misspelt names; special files are refused."""
 
 from __future__ import annotations
 
 import difflib
+import os
+import stat
 from collections.abc import Callable
 from pathlib import Path
 
+from mbtf_core.errors import InputError
+
+_SPECIAL = {stat.S_IFIFO: "pipe", stat.S_IFSOCK: "socket", stat.S_IFCHR: "device", stat.S_IFBLK: "device"}
 # Smallest similarity, in [0, 1], of a suggested name.
 _LEAST = 0.6
 
@@ -24,6 +29,8 @@ def suggest_path(path: Path, wanted: Callable[[Path], bool] | None = None) -> st
     missing = next((p for p in reversed(parts) if not p.exists()), None)
     if missing is None:
         return ""
+    if missing.is_symlink():
+        return f"{missing} is a symbolic link to '{os.readlink(missing)}', which leads to no file"
     try:
         beside = sorted(p for p in missing.parent.iterdir() if not p.name.startswith("."))
     except OSError:
@@ -36,3 +43,18 @@ def suggest_path(path: Path, wanted: Callable[[Path], bool] | None = None) -> st
     alike = [n for n in near if difflib.SequenceMatcher(None, stem, Path(n).stem).ratio() >= _LEAST]
     near = alike or [n for n, p in names.items() if p.stem.lower() == stem][:1]
     return f"did you mean '{names[near[0]]}'?" if near else ""
+
+
+def refuse_special(path: Path) -> None:
+    """Refuse a pipe, a socket or a device, whose content may never end; a missing file passes.
+
+    Raises
+    ------
+    InputError : it is one
+    """
+    try:
+        kind = _SPECIAL.get(stat.S_IFMT(path.stat().st_mode))
+    except (OSError, ValueError):
+        return
+    if kind is not None:
+        raise InputError(f"is a {kind}, not a regular file", where=path, hint="save its content in a file")

@@ -32,18 +32,18 @@ _FAMILIES = {
 
 def models_in(annotation: Any) -> list[type[BaseModel]]:
     """The models that a field's annotation may hold: through Optional, unions, lists and dicts."""
-    return [part for part in _parts(annotation) if isinstance(part, type) and issubclass(part, BaseModel)]
+    return [part for part in parts_of(annotation) if isinstance(part, type) and issubclass(part, BaseModel)]
 
 
-def _parts(annotation: Any) -> list[Any]:
+def parts_of(annotation: Any) -> list[Any]:
     """An annotation without its Optional, unions, lists and dicts; `Annotated` parts stay whole."""
     origin = typing.get_origin(annotation)
     if origin is Annotated:
         inner, *notes = typing.get_args(annotation)
-        deeper = _parts(inner)
+        deeper = parts_of(inner)
         return [*deeper, *notes]
     if origin in (Union, types.UnionType, list, tuple, dict):
-        return [p for a in typing.get_args(annotation) for p in _parts(a)]
+        return [p for a in typing.get_args(annotation) for p in parts_of(a)]
     return [annotation]
 
 
@@ -53,7 +53,7 @@ def _limits(model: type[BaseModel], location: Sequence[str | int]) -> dict[str, 
     for part in location:
         fields = [m.model_fields[part] for m in models if isinstance(part, str) and part in m.model_fields]
         if fields:
-            notes = [n for f in fields for n in (*f.metadata, *_parts(f.annotation))]
+            notes = [n for f in fields for n in (*f.metadata, *parts_of(f.annotation))]
             models = [m for f in fields for m in models_in(f.annotation)] or models
     found = {}
     for note in notes:

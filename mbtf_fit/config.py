@@ -220,6 +220,8 @@ class FitConfig(Settings):
         A key is unknown, or a value is out of range.
     """
 
+    exclusive = (("training.time", "training.steps"),)
+
     version: Literal[2] = 2
     model: Annotated[ModelName, Flag("--model")] = Field("neumip", description="model to fit")
     init_from: Annotated[str | None, Flag("--init-from", "FOLDER")] = Field(

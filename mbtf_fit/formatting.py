@@ -52,9 +52,11 @@ def headline(errors: Mapping[str, Any]) -> str:
     return next((name for name in ("test", "held_out_queries") if name in errors), next(iter(errors)))
 
 
-def summarize_errors(errors: dict[str, Any], transmittance: dict[str, Any] | None = None) -> list[str]:
+def summarize_errors(
+    errors: dict[str, Any], transmittance: dict[str, Any] | None = None, *, foreign: bool = False
+) -> list[str]:
     """Three lines, and advice: unexplained variance (where defined) and PSNR of the first split, and the
-    other splits."""
+    other splits. `foreign`: the errors are of the data of another material."""
     first = headline(errors)
     split, of = errors[first], f"of {errors[first]['n']} {SPLIT_NAMES[first]}"
     lines = []
@@ -73,7 +75,7 @@ def summarize_errors(errors: dict[str, Any], transmittance: dict[str, Any] | Non
     if transmittance:
         found = next(iter(transmittance.values()))
         others.append(f"rms error of transmittance {max(0.0, found['mse']['value']) ** 0.5:.3f}")
-    return [*lines, *([", ".join(others)] if others else []), *_remarks({first: split | _NO_GROUPS})]
+    return [*lines, *([", ".join(others)] if others else []), *_remarks({first: split | _NO_GROUPS}, foreign)]
 
 
 _NO_GROUPS: dict[str, Any] = {"levels": {}, "elevations": {}}
@@ -85,8 +87,11 @@ def format_table(rows: list[list[str]]) -> str:
     return "\n".join(line.rstrip() for line in lines)
 
 
-def describe_errors(errors: dict[str, Any]) -> list[str]:
-    """A table of unexplained variance: overall, by level and by lowest cosine; a column per split."""
+def describe_errors(errors: dict[str, Any], *, foreign: bool = False) -> list[str]:
+    """A table of unexplained variance: overall, by level and by lowest cosine; a column per split.
+
+    `foreign`: the errors are of the data of another material.
+    """
     splits = list(errors)
     rows = [["unexplained variance", *(SPLIT_NAMES[name] for name in splits)]]
     rows.append(["all", *(format_estimate(errors[name]["unexplained"]) for name in splits)])
@@ -101,17 +106,17 @@ def describe_errors(errors: dict[str, Any]) -> list[str]:
                 ]
             )
     rows.append(["queries", *(str(errors[name]["n"]) for name in splits)])
-    return [*format_table(rows).splitlines(), *_remarks(errors)]
+    return [*format_table(rows).splitlines(), *_remarks(errors, foreign)]
 
 
-def _remarks(errors: dict[str, Any]) -> list[str]:
+def _remarks(errors: dict[str, Any], foreign: bool) -> list[str]:
     """Notes on undefined and large errors."""
     found = []
     groups = [g for e in errors.values() for g in (e, *e["levels"].values(), *e["elevations"].values())]
     if any(group["unexplained"]["value"] is None for group in groups):
         found.append("undefined unexplained variance: the noise exceeds the variance of these values")
     value = errors[headline(errors)]["unexplained"]["value"]
-    if value is not None and value >= 1:
+    if value is not None and value >= 1 and not foreign:
         found.append(
             "above 1: worse than the mean value; generate more queries (mbtf-gen --queries), more paths per "
             "query (--spp), or a wider light (--light-width)"
@@ -147,11 +152,17 @@ def describe_coverage(coverage: dict[str, float]) -> str:
 
 
 def report_errors(
-    errors: dict[str, Any], transmittance: dict[str, Any] | None, verbose: bool = False
+    errors: dict[str, Any],
+    transmittance: dict[str, Any] | None,
+    verbose: bool = False,
+    *,
+    foreign: bool = False,
 ) -> list[str]:
-    """The summary, followed by the tables if `verbose`."""
-    lines = summarize_errors(errors, transmittance)
-    return [*lines, *describe_errors(errors), *describe_transmittance(transmittance)] if verbose else lines
+    """The summary, followed by the tables if `verbose`. `foreign`: as in :func:`summarize_errors`."""
+    lines = summarize_errors(errors, transmittance, foreign=foreign)
+    if not verbose:
+        return lines
+    return [*lines, *describe_errors(errors, foreign=foreign), *describe_transmittance(transmittance)]
 
 
 def describe_fit(data: dict[str, Any], verbose: bool = False) -> str:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-from mbtf_core.errors import UsageError
+from mbtf_core.errors import InputError, UsageError
 from mbtf_core.lattice import Lattice
 from mbtf_core.shard_schema import SPLITS, ShardEntry, Split
 from mbtf_gen.config.generator import GeneratorConfig, count_queries
@@ -91,9 +91,9 @@ class Job:
         job, given = cls.load(config), config.geometry.height_scale
         for note in job.material.notes:
             log.info(note)
+        rows, columns = job.grid.z.shape
         for warning in job.material.warnings_at(given):
             log.warning(warning)
-        rows, columns = job.grid.z.shape
         log.info(
             "mesh: %d x %d cells, height scale %.4g (%s), displacement range %.4g tile widths",
             columns,
@@ -116,8 +116,17 @@ class Job:
 
     @cached_property
     def grid(self) -> HeightGrid:
-        """Heights of the mesh, in tile widths."""
-        return self.material.grid(self.config.geometry.height_scale, self.config.geometry.mesh)
+        """Heights of the mesh, in tile widths; an InputError where their range exceeds the limit."""
+        geometry = self.config.geometry
+        grid = self.material.grid(geometry.height_scale, geometry.mesh)
+        found, limit = grid.displacement_range, geometry.max_displacement
+        if found > limit:
+            raise InputError(
+                f"the displacement range is {found:.4g} tile widths; at most {limit:g} are accepted",
+                where=self.material.files.get("height"),
+                hint="set a smaller --height-scale, or raise geometry.max_displacement",
+            )
+        return grid
 
     @cached_property
     def query_plan(self) -> QueryPlan:

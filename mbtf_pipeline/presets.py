@@ -61,7 +61,7 @@ def preset_recipe(
     UsageError : an assignment is invalid
     """
     preset = quality_assignments(path, quality, assignments, training)
-    recipe = load_recipe(path, [*preset, *assignments])
+    recipe = load_recipe(path, assignments, presets=preset)
     if not any(text.startswith(f"generate.{RESOLUTION}=") for text in preset):
         return recipe
     from mbtf_gen.job import Job, limit_resolution

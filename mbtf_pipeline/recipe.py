@@ -139,6 +139,8 @@ class Recipe(Settings):
         Title, exposure and size of the report.
     """
 
+    exclusive = (*GeneratorConfig.exclusive, *FitConfig.exclusive)
+
     version: Literal[3] = 3
     name: Name
     description: str = ""
@@ -159,7 +161,7 @@ class Recipe(Settings):
         return self.report.title or self.name
 
 
-def load_recipe(path: Path, assignments: Sequence[str] = ()) -> Recipe:
+def load_recipe(path: Path, assignments: Sequence[str] = (), presets: Sequence[str] = ()) -> Recipe:
     """Read a recipe.
 
     The path of a material in the file is relative to the file, that in an assignment to the current folder.
@@ -169,6 +171,8 @@ def load_recipe(path: Path, assignments: Sequence[str] = ()) -> Recipe:
     path : Path
         YAML file.
     assignments : sequence of str
+        ``a.b=c``; override values of the file and of `presets`.
+    presets : sequence of str
         ``a.b=c``; override values of the file.
 
     Returns
@@ -184,7 +188,7 @@ def load_recipe(path: Path, assignments: Sequence[str] = ()) -> Recipe:
         An assignment is invalid.
     """
     path = _find(path)
-    recipe = resolve(Recipe, file=path, assignments=assignments)
+    recipe = resolve(Recipe, file=path, presets=presets, assignments=assignments)
     assigned = any(a.partition("=")[0].strip() == "generate.material" for a in assignments)
     written = Path(recipe.generate.material)
     material = written if assigned else path.parent / written

@@ -56,8 +56,12 @@ class Estimate:
         }
 
     def __str__(self) -> str:
-        if not math.isfinite(self.value) or not math.isfinite(self.error) or self.error <= 0:
-            return f"{self.value:.4g} ± {self.error:.4g}"
+        if not math.isfinite(self.value):
+            return "undefined"
+        if not math.isfinite(self.error):
+            return f"{self.value:.4g} ± ?"
+        if self.error <= 0:
+            return f"{self.value:.4g} ± 0"
         exponent = _exponent(max(abs(self.value), self.error))
         scale = exponent if exponent < -3 or exponent > 5 else 0
         value, error = self.value / 10.0**scale, self.error / 10.0**scale

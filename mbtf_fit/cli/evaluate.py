@@ -38,7 +38,10 @@ def evaluate(
     found = evaluate(loaded, shards)
     errors = {name: e.as_dict() for name, e in found.values.items()}
     through = {name: e.as_dict() for name, e in (found.transmittance or {}).items()}
-    lines = [f"{material}: {loaded.config.model} on {shards}", *report_errors(errors, through, verbose)]
+    lines = [
+        f"{material}: {loaded.config.model} on {shards}",
+        *report_errors(errors, through, verbose, foreign=bool(foreign)),
+    ]
     report = {"material": material, "shards": shards, "foreign_inputs": foreign, "errors": errors}
     if found.transmittance is not None:
         report["transmittance"] = through

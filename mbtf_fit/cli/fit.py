@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -118,16 +118,14 @@ def resolve_config(options: Options[FitConfig], quality: Quality | None) -> FitC
     from mbtf_fit.presets import fitter_options
 
     given = options.given
-    if {"training.time", "training.steps"} <= set(given):
-        raise UsageError("--time and --steps are mutually exclusive", hint="give one of them")
     presets: list[str] = []
     if quality is not None:
         flags = [f"{key}={value}" for key, value in given.items()]
         overrides = {"model": "neumip", **overrides_of(options.config, [*options.assignments, *flags])}
         presets = as_assignments(fitter_options(quality, {"": overrides})[""])
     if "training.time" in given:
-        # A time given with its flag overrides steps from anywhere else.
-        options = replace(options, assignments=[*options.assignments, "training.steps=null"])
+        # A time overrides the steps of a file or a preset.
+        presets.append("training.steps=null")
     return options.resolve(presets)
 
 

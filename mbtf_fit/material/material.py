@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mbtf_core.atomic import write_json
 from mbtf_core.config_file import build
-from mbtf_core.directions import from_projected_disk
+from mbtf_core.directions import check_unit, from_projected_disk
 from mbtf_core.errors import InputError
 from mbtf_core.lattice import Lattice, sigma_of_level
 from mbtf_core.shard_schema import CONVENTIONS
@@ -141,7 +141,14 @@ class Material:
         Returns
         -------
         (n, 3) float32 array
+
+        Raises
+        ------
+        InputError
+            A direction is not a unit vector.
         """
+        check_unit(omega_i, "omega_i")
+        check_unit(omega_o, "omega_o")
         return predict(self.model, u, sigma, omega_i, omega_o)
 
     def offset(self, u: ArrayLike, omega_o: ArrayLike) -> NDArray[np.float32]:
@@ -158,7 +165,13 @@ class Material:
         -------
         (n, 2) float32 array
             Offsets along u and v in tile widths; zero for a model without offset.
+
+        Raises
+        ------
+        InputError
+            A direction is not a unit vector.
         """
+        check_unit(omega_o, "omega_o")
         device = next(self.model.parameters()).device
         return evaluate_in_chunks(self.model.offset, device, 2, u, omega_o)
 

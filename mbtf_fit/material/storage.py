@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from mbtf_core.atomic import Stored, write_chunks
 from mbtf_core.errors import InputError, reason
+from mbtf_core.suggest import refuse_special
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -37,6 +38,7 @@ def read_tensors(path: Path, framework: str = "pt") -> tuple[dict[str, Any], dic
     """
     from safetensors import SafetensorError, safe_open
 
+    refuse_special(path)
     try:
         with safe_open(path, framework=framework) as file:
             data = json.loads((file.metadata() or {}).get(_KEY, "{}"))

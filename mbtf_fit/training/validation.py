@@ -12,6 +12,7 @@ import numpy as np
 from mbtf_core.stats import Estimate, unexplained_variance
 from mbtf_fit.data.loader import Partition, load_split
 from mbtf_fit.data.queries import ShardQueries
+from mbtf_fit.formatting import format_estimate
 from mbtf_fit.training.trainer import Trainer
 from mbtf_gen.dataset.reader import Dataset
 
@@ -64,7 +65,8 @@ def describe_record(record: dict[str, Any]) -> str:
     """One line for the progress bar."""
     text = f"loss {record['loss']:.3f}"
     if record["unexplained"] is not None:
-        text += f", validation error {record['unexplained']:.3f} ± {record['unexplained_error']:.3f}"
+        estimate = {"value": record["unexplained"], "error": record["unexplained_error"]}
+        text += f", validation error {format_estimate(estimate)}"
     return f"{text}, {record['queries_per_second'] / 1e6:.2f} M queries/s"
 
 

@@ -60,6 +60,14 @@ def inspect(
         make_folder(export.parent)
         write_channels(export, {"Y": loaded.grid(height, geometry.mesh).z.astype("float32")})
         outputs["exported"] = export
+    if loaded.bsdf is not None:
+        from mbtf_gen.render.runtime import load_mitsuba
+
+        load_mitsuba()
+        from mbtf_gen.render.scene import build_tile
+
+        # Mitsuba refuses what it does not know.
+        build_tile(loaded.grid(mesh=1), loaded.bsdf)
     described = inspect_material(loaded, height, geometry.mesh, finest)
     found = {"material": resolved.material, **described, **outputs}
     console.report(found, inspection_text(found, resolved.material))

@@ -97,6 +97,9 @@ class GeometrySection(Settings):
         le=MAX_SCALE,
         description="factor on the stored heights, in tile widths; default: the material's own",
     )
+    max_displacement: float = Field(
+        100.0, gt=0, le=1e6, description="largest accepted displacement range, in tile widths"
+    )
     mesh: Annotated[int | None, Flag("--mesh")] = Field(
         None, ge=1, le=8192, description="mesh cells across the tile; default: the map's width, at most 512"
     )
@@ -222,6 +225,8 @@ class OutputSection(Settings):
 class GeneratorConfig(Settings):
     """Everything that ``mbtf-gen`` needs to generate a data set."""
 
+    exclusive = (("queries.spp", "queries.target_error"),)
+
     version: Literal[2] = 2
     material: FileName = Field(description="height map, folder of maps, or material.yaml")
     geometry: GeometrySection = GeometrySection()
@@ -236,5 +241,6 @@ class GeneratorConfig(Settings):
 
     def hash(self, inputs: dict[str, str]) -> str:
         """SHA-256 of everything that determines the data: options, and digests of the input files by role."""
-        fields = self.model_dump(exclude={"material"})
+        # The limit does not change the data.
+        fields = self.model_dump(exclude={"material": True, "geometry": {"max_displacement"}})
         return data_sha256({"schema": SCHEMA_VERSION, "inputs": inputs, **fields})

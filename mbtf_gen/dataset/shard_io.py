@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from mbtf_core.atomic import Stored, write_chunks
 from mbtf_core.errors import InputError, reason
 from mbtf_core.shard_schema import ARRAY, ARRAYS, ShardEntry
+from mbtf_core.suggest import refuse_special
 from mbtf_gen.job import Job, row_queries
 
 Arrays = dict[str, NDArray[np.float32]]
@@ -289,6 +290,7 @@ def read_shard(path: Path, names: Iterable[str] | None = None, *, mapped: bool =
     ------
     InputError : missing, corrupt, or arrays with inconsistent shapes
     """
+    refuse_special(path)
     arrays = read_exr(path, names) if path.suffix == ".exr" else read_npz(path, names, mapped=mapped)
     if arrays:
         check_arrays(arrays, path, complete=False)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import difflib
-import errno
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -15,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.atomic import Stored, write_through
-from mbtf_core.errors import InputError, reason
+from mbtf_core.errors import InputError
 
 # Limit of the numbers in all channels of all parts, in multiples of the largest image.
 _MOST_CHANNELS = 4
@@ -169,15 +168,7 @@ def write_channels(
     import OpenEXR
 
     head = {"compression": OpenEXR.NO_COMPRESSION, "type": OpenEXR.scanlineimage, **(header or {})}
-
-    def write(temporary: Path) -> None:
-        try:
-            OpenEXR.File(head, dict(channels)).write(str(temporary))
-        except RuntimeError as error:
-            # The library's message ends with the file's name and the system's error.
-            raise OSError(errno.EIO, reason(str(error).rpartition('". ')[2].rstrip("."))) from None
-
-    return write_through(path, write)
+    return write_through(path, lambda temporary: OpenEXR.File(head, dict(channels)).write(str(temporary)))
 
 
 def layers(names: list[str]) -> dict[str, list[str]]:

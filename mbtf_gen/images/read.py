@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError, reason
-from mbtf_core.suggest import suggest_path
+from mbtf_core.suggest import refuse_special, suggest_path
 from mbtf_gen.images.exr import check_floats, choose_channels, read_channels, silenced
 from mbtf_gen.images.metadata import NO_TAGS, Tags, tags_of
 from mbtf_gen.images.tiff import read_tiff
@@ -145,6 +145,7 @@ def _kind(path: Path) -> str:
     named = _KINDS.get(path.suffix.lower())
     if path.is_dir():
         raise InputError("is a folder, not an image", where=path)
+    refuse_special(path)
     try:
         with path.open("rb") as stream:
             start = stream.read(8)

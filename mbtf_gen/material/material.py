@@ -41,6 +41,8 @@ from mbtf_gen.material.tiling import Seam, retile, seams
 
 # Tile widths per stored height: the range of integer images is unknown, floats are in tile widths.
 _INTEGER_SCALE, _FLOAT_SCALE = 0.05, 1.0
+# Largest stored height; squares of larger ones are beyond float32.
+_MOST = 1e15
 # Displacement range, in tile widths, above which a default height scale is probably wrong.
 _STEEP = 0.5
 # Defaults of a glossy surface, and of the roughness of its layers.
@@ -385,17 +387,20 @@ def _heights(spec: MaterialFile, load: MapLoader) -> tuple[NDArray[np.float64], 
     refuse_color(image)
     height, warnings = gray(image)
     load.warnings += warnings
+    largest = float(np.abs(height).max())
+    if largest > _MOST:
+        raise InputError(f"stores heights up to {largest:.4g}; at most {_MOST:g} are read", where=image.path)
     default = _FLOAT_SCALE if image.bits is None else _INTEGER_SCALE
     scale = default if entry.scale is None else entry.scale
     codes, step = None, None
     if image.bits is not None:
-        largest = 2**image.bits - 1
-        codes = code_use(np.rint(height * largest))
+        white = 2**image.bits - 1
+        codes = code_use(np.rint(height * white))
         step = coarse_step(codes, image.bits)
         if step is not None and codes.levels > 1:
             load.warnings.append(level_warning(image.path, codes, image.bits, step, entry.dequantize))
             if entry.dequantize:
-                height = dequantize(height, step / largest)
+                height = dequantize(height, step / white)
     load.settings["height"] = [scale, step if entry.dequantize else None]
     if entry.colorspace == "srgb":
         height = np.asarray(srgb_to_linear(height), np.float64)

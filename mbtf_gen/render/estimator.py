@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_core.directions import check_unit
 from mbtf_core.errors import PartialError
 from mbtf_gen.render.directional_light import DirectionalLight
 from mbtf_gen.render.estimates import MOST_LOCATED, BadSample, Estimates, Stream
@@ -114,9 +115,13 @@ class Estimator:
         ------
         ValueError
             A number of paths is odd or zero.
+        InputError
+            A direction is not a unit vector.
         PartialError
             Samples stay non-finite after several draws; says which query and which effect.
         """
+        check_unit(queries.omega_i, "omega_i")
+        check_unit(queries.omega_o, "omega_o")
         counts = np.full(len(queries.sigma), spp, np.int64) if isinstance(spp, int) else spp
         if counts.min() < 2 or (counts % 2).any():
             raise ValueError(f"spp must be even, for two equal halves, not {spp}")

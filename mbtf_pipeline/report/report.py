@@ -29,10 +29,14 @@ from mbtf_pipeline.run_folder import COMPARE, FITS, REPORT, RUN_NAME, SHARDS
 LAYOUT = 6
 
 _TABLE = """
-<table><thead><tr>{% for h in t.head %}<th>{{ h }}</th>{% endfor %}</tr></thead><tbody>
+{%- set below = t.head[-1] == "command" %}
+<table><thead><tr>{% for h in (t.head[:-1] if below else t.head) %}<th>{{ h }}</th>{% endfor %}</tr></thead>
+<tbody>
 {% for row in t.rows %}<tr>
 {%- for cell in row %}
-{%- if cell is command %}<td class=command><code>{{ cell }}</code></td>
+{%- if below and loop.last %}</tr>
+<tr class=command><td class=command colspan={{ row|length - 1 }}><code>{{ cell }}</code></td>
+{%- elif cell is command %}<td class=command><code>{{ cell }}</code></td>
 {%- else %}<td{{ ' class=long' if cell is long }}>{{ cell }}</td>{% endif %}
 {%- endfor %}</tr>
 {% endfor %}</tbody></table>

@@ -9,6 +9,7 @@ import contextlib
 import io
 import json
 import logging
+import os
 import shutil
 from pathlib import Path
 
@@ -25,6 +26,9 @@ LINES: dict[str, list[str]] = {
     "command lines": [
         "mbtf-gen heights.npy --queries 1.5",
         "mbtf-gen heights.npy --set seed=-1",
+        "mbtf-gen inspect heights.npy --set seed=true",
+        "mbtf-gen inspect heights.npy --set material=5",
+        "mbtf-gen plan heights.npy --no-measure --spp 4 --target-error 2%",
         "mbtf-gen heights.npy --set seed=2001-01-01",
         "mbtf-gen heights.npy -o textures",
         "mbtf-gen heights.npy -o set --queries 10",
@@ -70,6 +74,18 @@ LINES: dict[str, list[str]] = {
             *("recipe-fits", "recipe-model", "recipe-twice"),
         )
     ],
+    "special files": [
+        *(
+            f"mbtf-gen inspect {name}"
+            for name in ("pipe.npy", "pipe.exr", "pipe.yaml", "zero.png", "zero.yaml")
+        ),
+        *(f"mbtf-gen inspect {name}" for name in ("piped.yaml", "loop.npy", "loop.yaml", "lost.npy")),
+        "mbtf-gen plan heights.npy --config pipe.yaml",
+        "mbtf-pipeline run pipe.yaml",
+        "mbtf-gen inspect bsdf.yaml",
+        "mbtf-gen verify shards-pipe",
+        "mbtf-fit shards-pipe --steps 1",
+    ],
     "shards": [
         *(f"mbtf-gen verify {name}" for name in ("textures", "foreign", "nojson")),
         *(
@@ -90,6 +106,11 @@ def write_files(folder: Path) -> None:
     _folders(folder, heights)
     for name, text in _TEXTS.items():
         (folder / f"{name}.yaml").write_text(text)
+    for suffix in ("npy", "exr", "yaml"):
+        os.mkfifo(folder / f"pipe.{suffix}")
+    links = {"zero.png": "/dev/zero", "zero.yaml": "/dev/zero", "lost.npy": "nowhere/heights.npy"}
+    for name, target in {**links, "loop.npy": "loop.npy", "loop.yaml": "loop.yaml"}.items():
+        (folder / name).symlink_to(target)
     (folder / "latin.yaml").write_bytes("# größer\nheight: heights.npy\n".encode("latin-1"))
     _shards(folder)
 
@@ -125,6 +146,8 @@ _TEXTS = {
     "tag": "height: !mine heights.npy\n",
     "deep": "height: " + "[" * 500 + "]" * 500,
     "key": "height: heights.npy\n1: 2\n",
+    "bsdf": "height: heights.npy\nbsdf: {type: difuse}\n",
+    "piped": "height: heights.npy\nroughness: pipe.npy\n",
     "channel": "height: {file: heights.npy, channel: G}\n",
     "escape": 'height: heights.npy\n"\\e[2Jroughness": 1\n',
     "types": "queries:\n  spp: few\n",
@@ -171,6 +194,9 @@ def _shards(folder: Path) -> None:
     path = folder / "shards-cut" / "train-00000.npz"
     path.write_bytes(path.read_bytes()[:-100])
     edit(folder / "shards-rows" / "train-00000.json", lambda record: record.update(rows=99))
+    shutil.copytree(folder / "set", folder / "shards-pipe")
+    (folder / "shards-pipe" / "train-00000.npz").unlink()
+    os.mkfifo(folder / "shards-pipe" / "train-00000.npz")
 
 
 def call(words: list[str]) -> Done:

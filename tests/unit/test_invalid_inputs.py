@@ -39,6 +39,7 @@ def test_invalid_input_is_refused_in_two_lines(
         ["heights.npy", "--set", "\x1b[2J=1"],
         ["heights.npy", "two\x1b[31mwords"],
         ["\x1b]0;title\x07.npy"],
+        ["two\nlines.npy"],
         ["x" * 5000],
     ],
 )
@@ -51,3 +52,4 @@ def test_control_characters_are_escaped(
     lines = done.err[done.err.index("error: ") :].splitlines()
     assert len(lines) <= 2
     assert all(text.isprintable() and len(text) < 600 for text in lines), done.err
+    assert "two\\nlines" in done.err or "\n" not in "".join(line), done.err

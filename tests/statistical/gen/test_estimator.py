@@ -23,6 +23,7 @@ from support.scenes import (
     rocks,
 )
 
+from mbtf_core.errors import InputError
 from mbtf_gen.render.estimates import MOST_LOCATED
 
 
@@ -42,6 +43,12 @@ def test_equal_queries_get_paths_of_their_own() -> None:
     assert abs(np.corrcoef(a, b)[0, 1]) < bound
     for x in (a, b):
         assert abs(np.corrcoef(x[1:], x[:-1])[0, 1]) < bound
+
+
+def test_directions_that_are_no_unit_vectors_are_refused() -> None:
+    long = queries([0.3, 0.7], 0.1, 5.0 * direction(40, 60), direction(55, 200), 2)
+    with pytest.raises(InputError, match="omega_i: 2 of 2 directions are not unit vectors"):
+        estimator().estimate(long, 2, Stream(0, "train", 0))
 
 
 def test_values_differ_between_streams_and_are_uncorrelated() -> None:

@@ -23,6 +23,8 @@ class Stage(Settings):
 
 
 class Whole(Settings):
+    exclusive = (("levels", "stages"),)
+
     height: float = 1.0
     light: Light = Light()
     levels: int | None = None
@@ -32,6 +34,9 @@ class Whole(Settings):
 class Needy(Settings):
     source: str
     spp: int = 1
+
+
+_ONE, _LIGHT = "give one of them", "valid keys: kind, width_deg"
 
 
 @pytest.fixture
@@ -82,6 +87,20 @@ def test_assignments_are_read_as_yaml_and_later_ones_win() -> None:
         ("light:\n  width_deg: 31\n", 2, "'light.width_deg': must be at least 0 and at most 30", ""),
         ("light:\n  kind: lamp\n", 2, "'light.kind': must be 'lobe' or 'delta'", ""),
         ("stages:\n- spp: 2\n", 2, "key 'stages.0.name' is missing", "add it"),
+        ("height: true\n", 1, "'height': must be a number (given 'true')", ""),
+        ("levels: &on true\n", 1, "'levels': must be a whole number (given 'true')", ""),
+        ("light: {width_deg: false}\n", 1, "'light.width_deg': must be a number (given 'false')", ""),
+        ("stages: [{name: a, spp: yes}]\n", 1, "'stages.0.spp': must be a whole number (given 'yes')", ""),
+        ("height: .inf\n", 1, "'height': must be a finite number (given inf)", ""),
+        ("height: .nan\n", 1, "'height': must be a finite number (given nan)", ""),
+        (
+            "stages:\n- &a\n  name: a\n  ssp: 2\n- <<: *a\n  name: b\n",
+            4,
+            "unknown key 'stages.0.ssp'",
+            "did you mean 'spp'?",
+        ),
+        ("stages: [&a {name: b}]\nlight:\n  <<: *a\n", 1, "unknown key 'light.name'", _LIGHT),
+        ("stages: [{name: a}]\nlevels: 2\n", 2, "'levels' and 'stages' are mutually exclusive", _ONE),
     ],
 )
 def test_faults_name_line_and_hint(write: Any, text: str, where: int, what: str, hint: str) -> None:
@@ -101,6 +120,8 @@ def test_faults_name_line_and_hint(write: Any, text: str, where: int, what: str,
         ("light.width_deg=31", "'light.width_deg': must be at least 0 and at most 30"),
         ("height", "'height' is not of the form key=value"),
         ("=3", "'=3' is not of the form key=value"),
+        ("levels=true", "'levels': must be a whole number (given 'true')"),
+        ("height=1e400", "'height': must be a finite number (given inf)"),
     ],
 )
 def test_bad_assignments_are_usage_errors(assignment: str, what: str) -> None:

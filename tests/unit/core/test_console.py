@@ -8,6 +8,7 @@ import logging
 import math
 import re
 import sys
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -83,6 +84,56 @@ def test_json_is_one_object(app: App, capsys: pytest.CaptureFixture[str]) -> Non
     assert capsys.readouterr().out == "code 0\n"
 
 
+@pytest.mark.parametrize(
+    ("error", "text", "code"),
+    [
+        (InputError("is empty", where="a.npy", hint="fill it"), "a.npy: is empty; fill it", 3),
+        (PartialError("2 of 3 failed"), "2 of 3 failed", 4),
+        (KeyboardInterrupt(), "interrupted", 130),
+        (OSError(28, "No space left on device"), "No space left on device", 3),
+    ],
+)
+def test_json_is_one_object_on_failure(
+    error: BaseException, text: str, code: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    app = new_app("prog", "A program.")
+
+    @app.default
+    def fail(*, after: bool = False, console: Console = CONSOLE) -> None:
+        if after:
+            console.report({"done": 1}, "done")
+        raise error
+
+    assert run(app, ["--json"]) == code
+    assert json.loads(capsys.readouterr().out) == {"error": text, "exit_code": code}
+    # A command that fails after its result prints no second object.
+    assert run(app, ["--json", "--after"]) == code
+    assert json.loads(capsys.readouterr().out) == {"done": 1}
+    assert run(app, []) == code
+    assert capsys.readouterr().out == ""
+
+
+def test_json_is_one_object_on_wrong_usage(app: App, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(app, ["plan", "a", "--dpth", "2", "--json"]) == 2
+    assert json.loads(capsys.readouterr().out)["exit_code"] == 2
+
+
+def test_raw_warnings_of_libraries_are_hidden_unless_debugging(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    app = new_app("prog", "A program.")
+
+    @app.default
+    def divide() -> None:
+        np.log(np.zeros(1))
+
+    monkeypatch.setattr(sys, "warnoptions", [])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert run(app, []) == 0
+        assert run(app, ["--debug"]) == 1
+
+
 def test_json_takes_arrays_paths_and_missing_numbers(capsys: pytest.CaptureFixture[str]) -> None:
     array, number, count = np.array([[1.5, math.nan]], np.float32), np.float32(0.25), np.int64(3)
     data = {"array": array, "number": number, "count": count, "infinite": math.inf}
@@ -126,7 +177,7 @@ def test_usage_errors(app: App, arguments: str, expected: str, capsys: pytest.Ca
     assert len(lines) <= 2
     assert lines[0].startswith("error: ")
     assert expected in captured.err
-    assert captured.out == ""
+    assert captured.out == "" or "--json" in arguments
 
 
 def test_a_file_named_like_a_misspelt_command_is_a_file(
@@ -228,7 +279,8 @@ def test_quiet_shows_nothing(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no pseudo-terminals")
-def test_progress_on_a_terminal_is_a_bar() -> None:
+@pytest.mark.parametrize("columns", [60, 80, 100])
+def test_progress_on_a_terminal_is_a_bar(columns: int) -> None:
     import os
     import pty
     import subprocess
@@ -236,11 +288,11 @@ def test_progress_on_a_terminal_is_a_bar() -> None:
     code = (
         "from mbtf_core.console import CONSOLE\n"
         "with CONSOLE.progress(3, 'rendering') as bar:\n"
-        "    bar.advance(3, 'last')\n"
+        "    bar.advance(3, 'loss 0.123, unexplained 0.250 ± 0.010, 1.23 M queries/s')\n"
         "CONSOLE.report({}, 'result')\n"
     )
     reader, writer = pty.openpty()
-    environment = {**os.environ, "TERM": "xterm", "COLUMNS": "100"}
+    environment = {**os.environ, "TERM": "xterm", "COLUMNS": str(columns)}
     done = subprocess.run(
         [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=writer, env=environment, check=True
     )
@@ -249,6 +301,10 @@ def test_progress_on_a_terminal_is_a_bar() -> None:
     os.close(reader)
     assert "━" in shown
     assert "100%" in shown
+    assert "loss 0.123, unexplained 0.250 ± 0.010, 1.23 M queries/s" in shown
+    plain = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", shown)
+    lines = [line.strip() for line in re.split(r"[\r\n]+", plain) if line.strip()]
+    assert all(re.match(r"rendering ━+ |loss ", line) and len(line) <= columns for line in lines), lines
     assert done.stdout == b"result\n"
 
 

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mbtf_core.directions import from_angles, from_projected_disk, normalize, to_angles
+from mbtf_core.directions import check_unit, from_angles, from_projected_disk, normalize, to_angles
+from mbtf_core.errors import InputError
 
 
 @given(st.floats(0.01, 89.9), st.floats(0, 359.9))
@@ -43,3 +44,14 @@ def test_normalize() -> None:
     assert normalize([[0.0, 0.0, 5.0], [3.0, 0.0, 4.0]]) == pytest.approx(
         np.array([[0, 0, 1], [0.6, 0, 0.8]])
     )
+
+
+def test_directions_that_are_no_unit_vectors_are_refused() -> None:
+    good = from_angles([10.0, 45.0, 90.0], [0.0, 120.0, -30.0])
+    check_unit(good, "omega_i")
+    check_unit(good.astype(np.float16), "omega_i")
+    for factor in (5.0, 0.99, 0.0, np.nan):
+        bad = good.copy()
+        bad[1] *= factor
+        with pytest.raises(InputError, match=r"omega_i: 1 of 3 directions are not .* at index 1"):
+            check_unit(bad, "omega_i")

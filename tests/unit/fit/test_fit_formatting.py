@@ -97,3 +97,7 @@ def test_where_the_unexplained_variance_is_undefined_the_psnr_is_the_number() ->
     lines = summarize_errors({"test": split(1e-5, 1e-6, None), "training": split(1e-5, 1e-6, None)})
     assert lines[0].startswith("PSNR 50.0 dB of 4096 test queries at exposure +0.00 EV")
     assert lines[-1].startswith("undefined unexplained variance: the noise exceeds")
+
+
+def test_errors_on_the_data_of_another_material_give_no_advice_about_queries() -> None:
+    assert len(describe_errors(errors(1.5, 0.4), foreign=True)) == 4

@@ -5,6 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import pytest
+
+from mbtf_core.config_file import dump_yaml
+from mbtf_core.errors import UsageError
 from mbtf_fit.cli.app import app
 from mbtf_fit.cli.fit import resolve_config
 from mbtf_fit.config import FitConfig
@@ -20,14 +24,34 @@ def config_of(*words: str) -> FitConfig:
 def test_flags_override_assignments_presets_and_files(tmp_path: Path) -> None:
     file = tmp_path / "c.yaml"
     file.write_text("model: neumip-baseline\ntraining: {steps: 9, batch: 300, warmup: 7}\n")
-    words = ("--config", str(file), "--set", "training.batch=400", "--set", "training.steps=8")
-    found = config_of(*words, "--steps", "2")
+    words = ("--config", str(file), "--set", "training.batch=400")
+    found = config_of(*words, "--set", "training.steps=8", "--steps", "2")
     assert found.model == "neumip-baseline"
     assert (found.training.steps, found.training.batch, found.training.warmup) == (2, 400, 7)
     found = config_of(*words, "--time", "1min")
     assert (found.training.steps, found.training.time) == (None, 60.0)
     found = config_of("--quality", "paper", "--batch", "500")
     assert (found.training.steps, found.training.batch, found.network.width) == (30_000, 500, 64)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("--time", "1min", "--steps", "3"),
+        ("--time", "1min", "--set", "training.steps=3"),
+        ("--set", "training.time=1min", "--set", "training.steps=3"),
+        ("--set", "training={time: 1min, steps: 3}"),
+    ],
+)
+def test_a_time_and_a_number_of_steps_exclude_each_other(words: tuple[str, ...]) -> None:
+    with pytest.raises(UsageError, match=r"time.* and .*steps'? are mutually exclusive"):
+        config_of(*words)
+
+
+def test_a_resolved_configuration_with_steps_reads_back(tmp_path: Path) -> None:
+    found = config_of("--steps", "3")
+    (tmp_path / "c.yaml").write_text(dump_yaml(found.model_dump(mode="json")))
+    assert config_of("--config", str(tmp_path / "c.yaml")) == found
 
 
 def test_presets_keep_what_flags_set() -> None:

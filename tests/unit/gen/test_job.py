@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from mbtf_core.errors import UsageError
+from mbtf_core.errors import InputError, UsageError
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job, most_paths, planned_paths, split_queries
 
@@ -41,6 +42,33 @@ def test_shards_cover_the_rows(heights: Path) -> None:
     assert [n for _, n in rows(patches)] == [4, 4, 4]
     assert split_queries(patches, "train") == 108
     assert sum(n for _, n in rows(job_of(heights, train="3/texel"))) == 96
+
+
+@pytest.mark.parametrize("factor", [1e3, 1e30, 1e300])
+def test_absurd_heights_are_refused(tmp_path: Path, factor: float) -> None:
+    heights = np.random.default_rng(0).random((4, 8))
+    np.save(tmp_path / "tall.npy", factor * heights)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(InputError) as caught:
+            job_of(tmp_path / "tall.npy")
+    assert caught.value.where == str(tmp_path / "tall.npy")
+    assert "at most 100 are accepted" in caught.value.what or "at most 1e+15 are read" in caught.value.what
+
+
+def test_the_limit_of_the_displacement_range_can_be_raised(tmp_path: Path) -> None:
+    np.save(tmp_path / "tall.npy", np.linspace(0.0, 200.0, 32).reshape(4, 8))
+
+    def config(**geometry: float) -> GeneratorConfig:
+        return GeneratorConfig.model_validate({"material": str(tmp_path / "tall.npy"), "geometry": geometry})
+
+    with pytest.raises(InputError, match=r"200 tile widths; at most 100"):
+        Job.prepare(config())
+    raised = Job.prepare(config(max_displacement=300.0))
+    assert raised.grid.displacement_range == 200.0
+    assert Job.prepare(config(height_scale=0.4)).grid.displacement_range == 80.0
+    # The limit does not change the data.
+    assert raised.config_hash == Job(config(), raised.material).config_hash
 
 
 def test_too_many_shards_are_refused(heights: Path) -> None:

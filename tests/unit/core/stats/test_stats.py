@@ -37,8 +37,10 @@ from mbtf_core.stats import (
         (1.5e7, 2e4, "(1.500 ± 0.002)e+07"),
         (0.0, 0.02, "0.00 ± 0.02"),
         (0.5, 0.0, "0.5 ± 0"),
-        (0.5, math.inf, "0.5 ± inf"),
-        (math.nan, math.inf, "nan ± inf"),
+        (0.5, math.inf, "0.5 ± ?"),
+        (0.5, math.nan, "0.5 ± ?"),
+        (math.nan, math.inf, "undefined"),
+        (math.inf, 1.0, "undefined"),
     ],
 )
 def test_estimates_print_with_as_many_digits_as_they_know(value: float, error: float, text: str) -> None:

@@ -127,6 +127,15 @@ def test_conformance_is_pytorchs(fitted: FitResult, tmp_path: Path, monkeypatch:
     assert again.deviation() == pytest.approx(0.25, rel=1e-3)
 
 
+def test_directions_that_are_no_unit_vectors_are_refused(fitted: FitResult) -> None:
+    queries = random_queries(np.random.default_rng(3), 10, fitted.material.lattice)
+    for name in ("omega_i", "omega_o"):
+        with pytest.raises(InputError, match=f"{name}: 10 of 10 directions"):
+            fitted.material.evaluate(**{**queries, name: 5.0 * queries[name]})
+    with pytest.raises(InputError, match="omega_o: 10 of 10 directions"):
+        fitted.material.offset(queries["u"], 5.0 * queries["omega_o"])
+
+
 def test_evaluation_takes_any_number_of_queries(fitted: FitResult) -> None:
     material = fitted.material
     queries = random_queries(np.random.default_rng(3), 70_000, material.lattice)

@@ -52,10 +52,10 @@ def test_nonsense_counts_are_usage_errors(text: str) -> None:
         ("queries.layout", "rows", "'shuffled' or 'image'"),
         ("light.width", 46, "45"),
         ("light.width", 1e-3, "delta light"),
-        ("light.width", float("nan"), "at most 45"),
+        ("light.width", float("nan"), "must be a finite number"),
         ("seed", 1 << 63, "below"),
         ("seed", -1, "at least 0"),
-        ("geometry.height_scale", float("inf"), "at most 100"),
+        ("geometry.height_scale", float("inf"), "must be a finite number"),
     ],
 )
 def test_values_out_of_range_are_refused_with_key_and_reason(key: str, value: Any, says: str) -> None:
