@@ -85,13 +85,15 @@ def _construct(plugin: Any, props: Properties) -> Any:
         raise
 
 
-def load_scene(source: str | Path | Mapping[str, Any]) -> Scene:
+def load_scene(source: str | Path | Mapping[str, Any], **parameters: Any) -> Scene:
     """Load and check a scene with fitted materials; errors of the plugins are raised as they are.
 
     Parameters
     ----------
     source : str, Path or mapping
         Path of an XML file, XML text, or a dictionary as for ``mitsuba.load_dict``.
+    **parameters
+        For Mitsuba's loader: values of the ``$name`` in XML.
 
     Returns
     -------
@@ -112,11 +114,11 @@ def load_scene(source: str | Path | Mapping[str, Any]) -> Scene:
     _last_error = None
     try:
         if isinstance(source, Mapping):
-            scene = mi.load_dict(dict(source))
+            scene = mi.load_dict(dict(source), **parameters)
         elif str(source).lstrip().startswith("<"):
-            scene = mi.load_string(str(source))
+            scene = mi.load_string(str(source), **parameters)
         else:
-            scene = mi.load_file(str(source))
+            scene = mi.load_file(str(source), **parameters)
     except Exception:
         error, _last_error = _last_error, None
         if error is None:

@@ -6,6 +6,7 @@ A part fails by aborting or hanging as often as by an exception, therefore in a 
 
 from __future__ import annotations
 
+import contextlib
 import os
 import platform
 import shutil
@@ -115,9 +116,7 @@ def _disk() -> Part:
     free = {folder: shutil.disk_usage(folder).free for folder in folders}
     found = ", ".join(f"{free[folder] / 1e9:.1f} GB free in {folder}{use}" for folder, use in folders.items())
     if min(free.values()) < _LITTLE_DISK:
-        return Part(
-            "Disk", "failed", False, found, "free some, or write elsewhere with -o; TMPDIR moves the latter"
-        )
+        return Part("Disk", "failed", False, found, "free some, or write elsewhere with -o")
     return Part("Disk", "ok", False, found)
 
 
@@ -130,16 +129,11 @@ def _memory() -> Part:
     except (OSError, ValueError, KeyError, IndexError):
         return Part("Memory", "absent", False, "this system does not state it")
     found = f"{free / 1e9:.1f} GB free of {total / 1e9:.1f} GB"
-    group = Path("/sys/fs/cgroup")
-    try:
-        limit, used = (float((group / name).read_text()) for name in ("memory.max", "memory.current"))
-        free, found = min(free, limit - used), f"{found}, limited to {limit / 1e9:.1f} GB"
-    except (OSError, ValueError):
-        pass
+    with contextlib.suppress(OSError, ValueError):
+        limit = float(Path("/sys/fs/cgroup/memory.max").read_text())
+        free, found = min(free, limit), f"{found}, limited to {limit / 1e9:.1f} GB"
     if free < _LITTLE_MEMORY:
-        return Part(
-            "Memory", "failed", False, found, "end other programs; --memory limits what mbtf-fit takes"
-        )
+        return Part("Memory", "failed", False, found, "end other programs, or fit with --memory")
     return Part("Memory", "ok", False, found)
 
 

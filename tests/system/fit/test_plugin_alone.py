@@ -56,18 +56,18 @@ def test_the_example_of_the_documentation_runs(tmp_path: Path, run_python: RunPy
     assert (tmp_path / "ball.png").stat().st_size > 0
 
 
-def test_a_scene_in_xml_of_the_documentation_runs(tmp_path: Path, run_python: RunPython) -> None:
+def test_the_example_scene_in_xml_loads(tmp_path: Path, run_python: RunPython) -> None:
     write_material(tmp_path / "material")
-    page = (PROJECT / "docs" / "how-to" / "render-in-mitsuba.md").read_text(encoding="utf-8")
-    (tmp_path / "scene.xml").write_text(page.split("```xml\n")[1].split("```")[0], encoding="utf-8")
+    (tmp_path / "scene.xml").write_bytes((PROJECT / "examples" / "ball.xml").read_bytes())
     code = (
         "import mbtf_fit.mitsuba_plugin\nmbtf_fit.mitsuba_plugin.register('llvm_ad_rgb')\n"
-        "scene = mbtf_fit.mitsuba_plugin.load_scene('scene.xml')\n"
-        "print(type(scene.integrator()).__name__, scene.shapes()[0].bsdf().uv_scale)"
+        "scene = mbtf_fit.mitsuba_plugin.load_scene('scene.xml', spp=9)\n"
+        "print(type(scene.integrator()).__name__, scene.shapes()[0].bsdf().uv_scale, "
+        "scene.sensors()[0].sampler().sample_count())"
     )
     done = run_python("-c", MOVE + code, str(tmp_path), DRJIT_LIBLLVM_PATH=None)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.split() == ["ConePath", "[4]"]
+    assert done.stdout.split() == ["ConePath", "[8]", "9"]
 
 
 def test_a_late_import_is_refused(run_python: RunPython) -> None:

@@ -1,0 +1,63 @@
+"""The notebook of ``examples/`` runs, from maps to a rendered ball, with the scene file beside it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import RunPython
+from PIL import Image
+from support.paths import ROOT
+
+EXAMPLES = ROOT / "examples"
+# Of the cell tagged `parameters`: seconds in place of a minute.
+SMALL = 'RESOLUTION, QUERIES, SECONDS, SIZE, SPP = 16, "50/texel", 1.0, 48, 4'
+
+
+def cells(notebook: Path) -> list[dict[str, Any]]:
+    """Code cells in order."""
+    stored = json.loads(notebook.read_text(encoding="utf-8"))
+    assert stored["nbformat"] == 4
+    return [cell for cell in stored["cells"] if cell["cell_type"] == "code"]
+
+
+def names(source: str) -> set[str]:
+    """Names that the lines of a parameter cell set."""
+    left = [line.partition("=")[0] for line in source.splitlines() if "=" in line and line[0] != "#"]
+    return {name.strip() for part in left for name in part.split(",")}
+
+
+def test_the_notebook_renders_a_ball(tmp_path: Path, run_python: RunPython) -> None:
+    sources = []
+    for cell in cells(EXAMPLES / "maps_to_ball.ipynb"):
+        source = "".join(cell["source"])
+        if "parameters" in cell["metadata"].get("tags", []):
+            assert names(source) == names(SMALL)
+            source = SMALL
+        sources.append(source)
+    assert SMALL in sources
+    (tmp_path / "assets").symlink_to(ROOT / "assets")
+    folder = tmp_path / "examples"
+    folder.mkdir()
+    (folder / "ball.xml").write_bytes((EXAMPLES / "ball.xml").read_bytes())
+    script = folder / "cells.py"
+    script.write_text(f"import os\nos.chdir({str(folder)!r})\n" + "\n".join(sources), encoding="utf-8")
+    done = run_python(str(script), MPLBACKEND="Agg")
+    assert done.returncode == 0, done.stderr
+    assert "unexplained variance" in done.stdout
+    ball = np.asarray(Image.open(folder / "ball.png").convert("RGB")).astype(float)
+    assert ball.shape == (48, 48, 3)
+    # Above are the gray sky and the ball before it, below the floor.
+    assert ball[0].std() < 2
+    assert 20 < ball[15:30, 18:32].mean() < 240
+    assert ball[15:30, 18:32].std() > 5
+    assert ball[30:].std() > 5
+
+
+@pytest.mark.parametrize("name", ["ball.xml", "maps_to_ball.ipynb"])
+def test_examples_are_named_in_the_documentation(name: str) -> None:
+    pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
+    assert any(f"examples/{name}" in page.read_text(encoding="utf-8") for page in pages)
