@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 from mbtf_core.atomic import read_json
 from mbtf_core.console import Console
 from mbtf_core.errors import InputError
+from mbtf_core.folders import check_folder, owned
 from mbtf_core.units import clock
 from mbtf_fit.config import FitConfig
 from mbtf_gen.config.generator import GeneratorConfig
@@ -22,10 +23,8 @@ from mbtf_pipeline.run_folder import (
     FITS,
     REPORT,
     SHARDS,
-    claim_run_folder,
     clear,
     is_run,
-    locked,
     write_run_record,
 )
 from mbtf_pipeline.stages import (
@@ -245,7 +244,6 @@ def run_recipe(
     folder = recipe.folder if folder is None else folder
     console = console or Console(quiet=True)
     inputs = _material_inputs(recipe)
-    claim_run_folder(folder)
 
     def notify(stage: str, decision: Decision, stamp: Stamp | None) -> None:
         if stamp is None:
@@ -254,7 +252,8 @@ def run_recipe(
         elif decision.runs:
             console.note(f"{stage}: finished in {clock(stamp.seconds)}")
 
-    with locked(folder):
+    with owned(folder):
+        check_folder(folder, is_run, "run")
         write_run_record(folder, recipe, command)
         run = _RecipeRun(recipe, folder, console)
         results = run_stages(folder, run.stages(inputs), force=force, notify=notify)
@@ -290,6 +289,6 @@ def rerender(folder: Path) -> Path:
     """
     is_run(folder)
     run = _RecipeRun(read_resolved(folder), folder, Console(quiet=True))
-    with locked(folder):
+    with owned(folder):
         run_again(folder, run.stages({})[-1])
     return folder / REPORT

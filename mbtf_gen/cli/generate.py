@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 
 from cyclopts import Parameter
 
-from mbtf_core.console import CONSOLE, Console, resumable
+from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import UsageError
+from mbtf_core.interruption import keep_on_interruption
 from mbtf_core.options import Options, Output, Overwrite, takes_options
 from mbtf_core.units import clock
 from mbtf_gen.config.generator import GeneratorConfig
@@ -75,10 +76,8 @@ def generate(
         f"{resolved.material} -> {output}: {split_queries(job, 'train')} training + "
         f"{split_queries(job, 'test')} test queries, resolution {job.lattice.shape()[1]}"
     )
-    with (
-        resumable(f"the shards that are finished are kept in {output}"),
-        console.progress(paths_left(job, output, *part), "generating", "paths") as bar,
-    ):
+    keep_on_interruption(f"the shards that are finished are kept in {output}")
+    with console.progress(paths_left(job, output, *part), "generating", "paths") as bar:
         index, count = part
         summary = generate(
             job, output, overwrite=overwrite, slice_index=index, slice_count=count, progress=bar.update

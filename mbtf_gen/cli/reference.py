@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.console import CONSOLE, Console
+from mbtf_core.interruption import keep_on_interruption
 from mbtf_core.options import Options, Output, Overwrite, takes_options
 from mbtf_gen.cli.generate import resolve_config
 from mbtf_gen.config.pictures import RENDERING, ReferenceConfig
@@ -32,6 +33,7 @@ def reference(
     """
     resolved = resolve_config(options, material)
     from mbtf_core.directions import from_angles
+    from mbtf_core.folders import owned
     from mbtf_core.stats import pooled_relative_error
     from mbtf_gen.job import Job
     from mbtf_gen.pictures.camera import Camera, PixelKind
@@ -53,18 +55,22 @@ def reference(
         camera.queries(omega_i)  # refuses a view of the horizon before anything is written
     kinds: tuple[PixelKind, ...] = ("query", "pixel") if wanted.kind == "both" else (wanted.kind,)
     names = {(camera, one): f"{one}-tiles{camera.tiles_across:g}" for camera in cameras for one in kinds}
-    folder = PictureFolder.claim(
-        output,
-        "reference",
-        files=[f"{name}.{suffix}" for name in names.values() for suffix in ("exr", "png")],
-        config=resolved.model_dump(mode="json", exclude={"queries", "output"}),
-        inputs=job.material.digests,
-        overwrite=overwrite,
-    )
     estimator: Any = None
     pictures: list[dict[str, Any]] = []
     exposure: float | None = None
-    with console.progress(total=len(cameras) * len(kinds), label="rendering", unit="pictures") as bar:
+    keep_on_interruption(f"the finished pictures are kept in {output}")
+    with (
+        owned(output),
+        console.progress(total=len(cameras) * len(kinds), label="rendering", unit="pictures") as bar,
+    ):
+        folder = PictureFolder.claim(
+            output,
+            "reference",
+            files=[f"{name}.{suffix}" for name in names.values() for suffix in ("exr", "png")],
+            config=resolved.model_dump(mode="json", exclude={"queries", "output"}),
+            inputs=job.material.digests,
+            overwrite=overwrite,
+        )
         for index, camera in enumerate(cameras):
             for one in kinds:
                 name = names[camera, one]

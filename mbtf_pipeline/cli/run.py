@@ -9,6 +9,7 @@ from cyclopts import Parameter
 
 from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import UsageError
+from mbtf_core.interruption import keep_on_interruption
 from mbtf_core.options import Output, Set, Switch, Time, command_line
 from mbtf_core.units import clock
 from mbtf_gen.config.presets import QualityOption
@@ -64,6 +65,7 @@ def run(
     from mbtf_pipeline.run import run_recipe
 
     loaded = load_recipe(recipe, [*quality_assignments(recipe, quality, own), *own])
+    keep_on_interruption(f"the finished stages are kept in {output or loaded.folder}")
     if time is not None:
         from mbtf_core.units import asked_duration
         from mbtf_pipeline.cost_study.time_split import split_time, with_split
@@ -91,6 +93,7 @@ def _run_paper(
     paper = load_paper_recipe(file, assignments)
     planned, missing = plan(paper, file, quick)
     folder = output if output is not None else paper.folder(quick)
+    keep_on_interruption(f"the finished stages are kept in {folder}")
     done = run_paper(
         paper, planned, missing, folder, quick=quick, command=command, force=force, console=console
     )

@@ -32,13 +32,14 @@ from mbtf_core.atomic import read_json, write_json
 from mbtf_core.config_file import deep_merge
 from mbtf_core.digest import data_sha256
 from mbtf_core.errors import InputError, UsageError
+from mbtf_core.folders import check_folder, owned
 from mbtf_core.units import clock, format_duration
 from mbtf_fit.config import FitConfig
 from mbtf_pipeline.cost_study.fit_runs import round_down
 from mbtf_pipeline.cost_study.runs import DataRequest, Run, RunRunner, forecast_seconds
 from mbtf_pipeline.recipe import Recipe
 from mbtf_pipeline.run import layout_of
-from mbtf_pipeline.run_folder import claim_run_folder, locked, write_run_record
+from mbtf_pipeline.run_folder import is_run, write_run_record
 
 SPLIT_NAME = "time_split.json"
 SPLIT_SCHEMA = 4
@@ -106,8 +107,8 @@ def split_time(
         raise UsageError(problem, where="--time", hint="leave out the fits of 'hierarchical'")
     options = recipe.model_dump(mode="json", include={"generate", "fit"})
     key = data_sha256({"schema": SPLIT_SCHEMA, "time": seconds, "share": share, "recipe": options})
-    claim_run_folder(folder)
-    with locked(folder):
+    with owned(folder):
+        check_folder(folder, is_run, "run")
         split = _stored(folder, key)
         if split is None:
             write_run_record(folder, recipe, command)

@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mbtf_core.console import Console
+from mbtf_core.folders import owned
+from mbtf_core.interruption import keep_on_interruption
 
 if TYPE_CHECKING:
     from mbtf_fit.mitsuba_plugin.preview.config import PreviewConfig
@@ -20,7 +22,14 @@ def draw(config: PreviewConfig, path: Path, *, overwrite: bool, console: Console
     ------
     InputError : the material cannot be used, or the folder holds something else
     UsageError : a view shows the horizon
+    PartialError : another process writes to the folder
     """
+    keep_on_interruption(f"the finished pictures are kept in {path}")
+    with owned(path):
+        _draw(config, path, overwrite, console)
+
+
+def _draw(config: PreviewConfig, path: Path, overwrite: bool, console: Console) -> None:
     from mbtf_fit.material.format import read_description
     from mbtf_fit.mitsuba_plugin import load_scene
     from mbtf_gen.pictures.folder import PictureFolder

@@ -9,6 +9,8 @@ from typing import Any
 from mbtf_core.console import Console
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import InputError, PartialError
+from mbtf_core.folders import owned
+from mbtf_core.interruption import keep_on_interruption
 from mbtf_gen.config.pictures import PreviewConfig
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.job import Job
@@ -91,17 +93,21 @@ class PreviewPictures:
         if self.dataset is not None:
             inputs["data set"] = self.dataset.manifest["config_hash"]
             stages["queries"] = len(finished_shards(self.dataset))
-        folder = PictureFolder.claim(
-            path,
-            "preview",
-            files=[f"{name}.png" for name in stages],
-            config=self.config.model_dump(mode="json"),
-            inputs=inputs,
-            overwrite=overwrite,
-        )
         pictures: list[dict[str, Any]] = []
         fault = ""
-        with self.console.progress(total=len(makers), label="drawing", unit="pictures") as bar:
+        keep_on_interruption(f"the finished pictures are kept in {path}")
+        with (
+            owned(path),
+            self.console.progress(total=len(makers), label="drawing", unit="pictures") as bar,
+        ):
+            folder = PictureFolder.claim(
+                path,
+                "preview",
+                files=[f"{name}.png" for name in stages],
+                config=self.config.model_dump(mode="json"),
+                inputs=inputs,
+                overwrite=overwrite,
+            )
             for name, maker in makers.items():
                 file, facts = folder.path / f"{name}.png", folder.finished(name)
                 kept = facts is not None and facts.get("of") == stages[name]
