@@ -29,9 +29,7 @@ import logging
 import math
 import os
 import re
-import signal
 import sys
-import threading
 import traceback
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -40,13 +38,13 @@ from typing import Annotated, Any
 
 from cyclopts import App, CycloptsError, Parameter, UnusedCliTokensError
 
+from mbtf_core import interruption
 from mbtf_core.completion import CompletedApp, add_completion
 from mbtf_core.errors import (
     EXIT_BAD_INPUT,
     EXIT_INTERRUPTED,
     EXIT_OK,
     EXIT_USAGE,
-    Interrupted,
     MbtfError,
     UsageError,
     printable,
@@ -123,35 +121,6 @@ class Console:
             yield bar
         finally:
             bar._close()
-
-
-@contextlib.contextmanager
-def resumable(kept: str) -> Iterator[None]:
-    """Report an interruption as :class:`Interrupted`, which says what is kept."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        raise Interrupted(f"interrupted; {kept}", hint="the same command resumes") from None
-
-
-def _interrupt(number: int, frame: object) -> None:
-    raise KeyboardInterrupt
-
-
-@contextlib.contextmanager
-def _ended_like_interrupted() -> Iterator[None]:
-    """Treat SIGTERM, which batch systems send, like Ctrl-C."""
-    usual = threading.current_thread() is threading.main_thread()
-    usual = usual and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
-    if usual:
-        signal.signal(signal.SIGTERM, _interrupt)
-        # A renderer in this process may have installed a native handler that is no longer valid.
-        signal.signal(signal.SIGINT, signal.getsignal(signal.SIGINT) or signal.default_int_handler)
-    try:
-        yield
-    finally:
-        if usual:
-            signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 # Default of every command's `console` parameter: text, with progress.
@@ -275,6 +244,9 @@ def _usage_message(app: App, fault: CycloptsError, tokens: Sequence[str]) -> str
 
 
 def _fail(text: str, code: int, debug: bool, json: bool) -> int:
+    if interruption.exit_code():
+        # Libraries turn an interruption into errors of their own.
+        text, code = interruption.message(), interruption.exit_code()
     with contextlib.suppress(OSError):
         if debug:
             traceback.print_exc()
@@ -302,7 +274,8 @@ def run(app: App, argv: Sequence[str] | None = None) -> int:
     app : made by :func:`new_app`
     argv : arguments after the program's name; the process's own by default
 
-    Exit codes: 0 done, 2 usage, 3 bad input or machine, 4 partial and resumable, 130 interrupted, 1 a bug.
+    Exit codes: 0 done, 2 usage, 3 bad input or machine, 4 partial and resumable, 130 or 143 interrupted by
+    SIGINT or SIGTERM, 1 a bug.
     Errors are one or two lines on standard error; ``--debug`` anywhere adds the traceback and the warnings of
     libraries. With ``--json``, a failure prints an object with ``error`` and ``exit_code``, unless the
     command has printed its result.
@@ -317,19 +290,21 @@ def run(app: App, argv: Sequence[str] | None = None) -> int:
             # A terminal that lacks Greek letters or ± shows question marks.
             stream.reconfigure(errors="replace")
     try:
-        if {"-h", "--help"} & set(tokens):
-            _join_lines(app)
-        tokens = _command_first(app, _join_negative_pairs(tokens))
-        with _ended_like_interrupted(), _library_warnings(debug):
+        with interruption.raising(), _library_warnings(debug):
+            if {"-h", "--help"} & set(tokens):
+                _join_lines(app)
+            tokens = _command_first(app, _join_negative_pairs(tokens))
             result = app(tokens)
         sys.stdout.flush()
+        if interruption.exit_code():
+            raise KeyboardInterrupt
         return result if type(result) is int else EXIT_OK
     except MbtfError as error:
         return _fail(error.message, error.exit_code, debug, as_json)
     except CycloptsError as error:
         return _fail(_usage_message(app, error, tokens), EXIT_USAGE, debug, as_json)
     except KeyboardInterrupt:
-        return _fail("interrupted", EXIT_INTERRUPTED, debug, as_json)
+        return _fail(interruption.message(), EXIT_INTERRUPTED, debug, as_json)
     except BrokenPipeError:
         # The reader of the output has exited (`| head`); Python would fail again when it flushes at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -73,12 +73,6 @@ class PartialError(MbtfError):
     exit_code = EXIT_PARTIAL
 
 
-class Interrupted(MbtfError):
-    """The user or the system ended the run (exit code 130); finished parts are kept."""
-
-    exit_code = EXIT_INTERRUPTED
-
-
 def reason(fault: BaseException | str | None, longest: int = 160) -> str:
     """Message of another library's error, on one line of at most `longest` characters."""
     text = printable(" ".join((str(fault) or type(fault).__name__).split()))

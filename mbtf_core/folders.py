@@ -1,26 +1,74 @@
 """Output folders: new, empty, resumed, or refused.
 
-A command writes its record first, such as ``manifest.json``: the folder is then its own, whatever instant the
-process is killed at.
+A command owns its folder while it writes there. It writes its record first, such as ``manifest.json``: the
+folder is then its own, whatever instant the process is killed at.
 """
 
 from __future__ import annotations
 
+import contextlib
 import re
 import shutil
-from collections.abc import Callable, Container, Mapping
+import threading
+from collections.abc import Callable, Container, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from mbtf_core.atomic import TEMPORARY, remove_file
 from mbtf_core.config_file import differences, in_short
-from mbtf_core.errors import InputError
+from mbtf_core.errors import InputError, PartialError
+from mbtf_core.locks import RENEW_SECONDS, Lock, lock_owner, take_lock
 from mbtf_core.units import size_text
 
 # Names of temporary files and locks, such as a killed process leaves.
 _LEFTOVER = re.compile(rf"\..+(?:{TEMPORARY}|\.lock)")
 
 ELSEWHERE = "choose another folder with -o"
+
+
+@contextlib.contextmanager
+def owned(folder: Path) -> Iterator[None]:
+    """Own a folder in a block that writes to it, so that no other command does.
+
+    The folder is made if it is missing, and removed again if nothing was written.
+
+    Raises
+    ------
+    PartialError : another process owns it, or it cannot be written
+    InputError : it cannot be made
+    """
+    if folder.exists() and not folder.is_dir():
+        raise InputError("is a file, not a folder", where=folder)
+    made = not folder.exists()
+    make_folder(folder)
+    lock = take_lock(folder / "folder")
+    if lock is None:
+        owner = lock_owner(folder / "folder")
+        raise PartialError(
+            f"is being written by another process{'' if owner is None else f' ({owner})'}",
+            where=folder,
+            hint=f"wait for it and run the same command again, or {ELSEWHERE}",
+        )
+    done = threading.Event()
+
+    def renew() -> None:
+        while not done.wait(RENEW_SECONDS):
+            Lock.renew()
+
+    threading.Thread(target=renew, name="lock renewal", daemon=True).start()
+    try:
+        yield
+    finally:
+        done.set()
+        lock.release()
+        if made:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+
+
+def is_empty(folder: Path) -> bool:
+    """Is a folder missing, or empty but for temporary files and locks?"""
+    return not folder.exists() or all(_LEFTOVER.fullmatch(p.name) for p in folder.iterdir())
 
 
 def check_folder(folder: Path, is_ours: Callable[[Path], bool], what: str) -> bool:
@@ -46,7 +94,7 @@ def check_folder(folder: Path, is_ours: Callable[[Path], bool], what: str) -> bo
     """
     if folder.exists() and not folder.is_dir():
         raise InputError("is a file, not a folder", where=folder)
-    empty = not folder.exists() or all(_LEFTOVER.fullmatch(p.name) for p in folder.iterdir())
+    empty = is_empty(folder)
     # Checked last: another process may write the record meanwhile.
     if is_ours(folder):
         return True

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
+from mbtf_core import interruption
 from mbtf_core.atomic import unwritable
 from mbtf_core.errors import PartialError
 
@@ -83,6 +84,16 @@ class Lock:
             for lock in cls._held:
                 with contextlib.suppress(OSError):
                     os.utime(lock._handle)
+
+    @classmethod
+    def abandon(cls) -> None:
+        """Remove the files of all locks of this process, which is about to end."""
+        for lock in tuple(cls._held):
+            with contextlib.suppress(OSError):
+                lock.path.unlink()
+
+
+interruption.at_end(Lock.abandon)
 
 
 def lock_file_of(path: Path) -> Path:

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import sys
 
+from mbtf_core.interruption import finish, handle_signals
+
 
 def main() -> int:
     """Run the command line; returns the exit code."""
+    handle_signals()
     from mbtf_core.console import run
     from mbtf_fit.cli.app import app
 
-    return run(app)
+    return finish(run(app))
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 from mbtf_core.atomic import read_json
 from mbtf_core.console import Console
 from mbtf_core.errors import InputError
+from mbtf_core.folders import check_folder, owned
 from mbtf_core.units import clock
 from mbtf_fit.config import FitConfig
 from mbtf_gen.config.generator import GeneratorConfig
@@ -22,10 +23,8 @@ from mbtf_pipeline.run_folder import (
     FITS,
     REPORT,
     SHARDS,
-    claim_run_folder,
     clear,
     is_run,
-    locked,
     write_run_record,
 )
 from mbtf_pipeline.stages import (
@@ -251,7 +250,6 @@ def run_recipe(
     folder = recipe.folder if folder is None else folder
     console = console or Console(quiet=True)
     inputs = _material_inputs(recipe)
-    claim_run_folder(folder)
 
     def notify(stage: str, decision: Decision, stamp: Stamp | None) -> None:
         if stamp is None:
@@ -260,7 +258,8 @@ def run_recipe(
         elif decision.runs:
             console.note(f"{stage}: finished in {clock(stamp.seconds)}")
 
-    with locked(folder):
+    with owned(folder):
+        check_folder(folder, is_run, "run")
         write_run_record(folder, recipe, command)
         stages = _RecipeRun(recipe, folder, console).stages(inputs)
         results: dict[str, StageResult] = {}
@@ -308,7 +307,7 @@ def rerender(folder: Path, exposure: float | None = None) -> tuple[Path, float]:
     if exposure is not None:
         recipe = recipe.model_copy(update={"report": recipe.report.model_copy(update={"exposure": exposure})})
     run = _RecipeRun(recipe, folder, Console(quiet=True))
-    with locked(folder):
+    with owned(folder):
         run_again(folder, run.stages({})[-1])
     used = recipe.report.exposure
     return folder / REPORT, read_json(folder / COMPARE / COMPARISON_NAME)[

@@ -11,15 +11,12 @@ out/NAME/run.json        command and software versions
 
 from __future__ import annotations
 
-import contextlib
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 from mbtf_core.atomic import read_json, write_json
 from mbtf_core.config_file import check_schema
-from mbtf_core.errors import InputError, PartialError
-from mbtf_core.folders import check_folder, make_folder
+from mbtf_core.errors import InputError
 from mbtf_pipeline.recipe import Recipe, write_recipe
 
 RUN_NAME = "run.json"
@@ -32,17 +29,6 @@ def clear(folder: Path) -> None:
     """Remove a sub-folder of a run with everything in it."""
     if folder.exists():
         shutil.rmtree(folder)
-
-
-def claim_run_folder(folder: Path) -> None:
-    """Create a run's folder, or accept an empty one or one that contains a run.
-
-    Raises
-    ------
-    InputError : it contains something else
-    """
-    check_folder(folder, is_run, "run")
-    make_folder(folder)
 
 
 def write_run_record(folder: Path, recipe: Recipe, command: str) -> None:
@@ -101,23 +87,3 @@ def has_record(folder: Path, name: str, record_format: str, schema: int) -> bool
         return False
     check_schema(record, schema, folder / name, "run the recipe again in another folder with -o")
     return True
-
-
-@contextlib.contextmanager
-def locked(folder: Path, record: str = RUN_NAME) -> Iterator[None]:
-    """Lock a folder against other processes; `record` names the lock.
-
-    Raises
-    ------
-    PartialError : another process has locked it
-    """
-    from mbtf_core.locks import shard_lock
-
-    with shard_lock(folder / record) as held:
-        if not held:
-            raise PartialError(
-                "another run uses this folder",
-                where=folder,
-                hint="wait until it has finished, or choose another folder with -o",
-            )
-        yield

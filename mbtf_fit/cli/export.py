@@ -39,7 +39,7 @@ def export_material(
     half
         Round all weights and texels to 16 bits, and print the resulting error.
     """
-    from mbtf_core.folders import make_folder
+    from mbtf_core.folders import is_empty, owned
     from mbtf_fit.material.export import LAYERS_NAME, TEXTURES_NAME, to_half, write_layers, write_textures
     from mbtf_fit.material.format import DESCRIPTION_NAME, WEIGHTS_NAME
     from mbtf_fit.material.material import Material, export
@@ -48,31 +48,31 @@ def export_material(
     wanted = list(dict.fromkeys(to or ["exr", "json"]))
     folder = material if output is None else output
     loaded = Material.load(material)
-    if "material" in wanted and folder.is_dir() and any(folder.iterdir()):
-        raise InputError("is not empty", where=folder, hint="name a new folder with -o for --to material")
-    written, error = loaded, None
-    if half:
-        written, error = to_half(loaded)
-    make_folder(folder)
-    files = []
-    if "exr" in wanted:
-        write_textures(written, folder / TEXTURES_NAME, half=half)
-        files.append(TEXTURES_NAME)
-    if "json" in wanted:
-        write_layers(written, folder / LAYERS_NAME, half=half)
-        files.append(LAYERS_NAME)
-    if "material" in wanted:
-        description = loaded.description
-        export(
-            written.model,
-            written.config,
-            folder,
-            data=description["data"],
-            training=description["training"],
-            half=half,
-            transmittance=written.transmittance,
-        )
-        files += [WEIGHTS_NAME, DESCRIPTION_NAME, *([TRANSMITTANCE_NAME] if loaded.transmittance else [])]
+    with owned(folder):
+        if "material" in wanted and not is_empty(folder):
+            raise InputError("is not empty", where=folder, hint="name a new folder with -o for --to material")
+        written, error = loaded, None
+        if half:
+            written, error = to_half(loaded)
+        files = []
+        if "exr" in wanted:
+            write_textures(written, folder / TEXTURES_NAME, half=half)
+            files.append(TEXTURES_NAME)
+        if "json" in wanted:
+            write_layers(written, folder / LAYERS_NAME, half=half)
+            files.append(LAYERS_NAME)
+        if "material" in wanted:
+            description = loaded.description
+            export(
+                written.model,
+                written.config,
+                folder,
+                data=description["data"],
+                training=description["training"],
+                half=half,
+                transmittance=written.transmittance,
+            )
+            files += [WEIGHTS_NAME, DESCRIPTION_NAME, *([TRANSMITTANCE_NAME] if loaded.transmittance else [])]
     sizes = {name: (folder / name).stat().st_size for name in files}
     lines = [f"{folder / name}: {size / 1e6:.3f} MB" for name, size in sizes.items()]
     console.report(

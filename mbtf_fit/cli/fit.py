@@ -10,6 +10,7 @@ from cyclopts import Parameter
 
 from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import PartialError, UsageError
+from mbtf_core.interruption import keep_on_interruption
 from mbtf_core.options import DryRun, Options, Output, Overwrite, Verbose, takes_options
 from mbtf_core.units import clock, expectation, format_duration
 from mbtf_fit.config import FitConfig
@@ -97,6 +98,7 @@ def fit(
             console.note(expectation(seconds, size))
     if missing := missing_reason():
         console.note(f"note: training runs in PyTorch, not in the compiled kernel ({missing})")
+    keep_on_interruption(f"the last checkpoint is kept in {output}")
     with console.progress(total=100, label="fitting", unit="%") as bar:
         result = fit(
             resolved,
@@ -148,6 +150,7 @@ def _fit_many(
     console.note(
         f"{len(shards)} data set{'s' * (len(shards) != 1)} -> {output}: {config.model}, {processes} at a time"
     )
+    keep_on_interruption(f"finished fits and the last checkpoints are kept in {output}")
     with console.progress(total=len(shards), label="fitting", unit="data sets") as bar:
 
         def finished(outcome: FitOutcome) -> None:

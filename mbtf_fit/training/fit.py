@@ -5,12 +5,9 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import json
-import signal
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +16,8 @@ import torch
 
 from mbtf_core.atomic import write_text
 from mbtf_core.errors import EngineError, InputError
+from mbtf_core.folders import owned
+from mbtf_core.interruption import stop_on_interruption
 from mbtf_core.stats import pooled_variance
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import Partition, load_training, open_data
@@ -173,7 +172,7 @@ def fit(
     EngineError
         The device is not available.
     PartialError
-        The disk is full; the same command resumes.
+        The disk is full, or another process writes to the folder; the same command resumes.
     """
     begin = time.perf_counter()
     device = choose_device(config.device)
@@ -187,9 +186,24 @@ def fit(
         )
     data = open_data(shards, layout, config.model)
     identity = identity_of(config, data)
-    claim(out, identity, config, overwrite)
-    if (out / DESCRIPTION_NAME).exists():
-        return _finished(out, time.perf_counter() - begin)
+    with owned(out):
+        claim(out, identity, config, overwrite)
+        progress = progress or (lambda fraction, note: None)
+        finished = (out / DESCRIPTION_NAME).exists()
+        resumed = finished or _fit(config, data, identity, partition, device, out, progress)
+        return _finished(out, time.perf_counter() - begin, resumed=resumed)
+
+
+def _fit(
+    config: FitConfig,
+    data: Dataset,
+    identity: dict[str, Any],
+    partition: Partition | None,
+    device: torch.device,
+    out: Path,
+    progress: ProgressCallback,
+) -> bool:
+    """Train and export; whether an earlier run was resumed."""
     keep_freed_memory()
     if partition is None:
         partition = load_training(data, config.held_out, config.seed, config.data.memory)
@@ -198,7 +212,7 @@ def fit(
     name, queries = validation_set(data, partition)
     subset = validation_subset(trainer.model.positions, queries)
     del queries
-    _train(trainer, subset, out, progress or (lambda fraction, note: None))
+    _train(trainer, subset, out, progress)
     trainer.calibrate()
     errors = evaluate_splits(trainer.predict, data, partition)
     variance = errors["training"].overall.variance.value
@@ -227,7 +241,7 @@ def fit(
         training["transmittance"] = {split: e.as_dict() for split, e in found.items()}
     export(trainer.model, config, out, data=identity["data"], training=training, transmittance=transmittance)
     (out / CHECKPOINT_NAME).unlink(missing_ok=True)
-    return _finished(out, time.perf_counter() - begin, resumed=resumed)
+    return resumed
 
 
 def prepare_trainer(config: FitConfig, data: Dataset, partition: Partition, device: torch.device) -> Trainer:
@@ -275,7 +289,7 @@ def _resume(trainer: Trainer, out: Path) -> bool:
 def _train(trainer: Trainer, subset: ShardQueries, out: Path, progress: ProgressCallback) -> None:
     saved = time.perf_counter()
     done = trainer.fraction >= 1.0
-    with _stop_on_interrupt() as stop:
+    with stop_on_interruption() as stop:
         while not (done or stop.is_set()):
             done = trainer.train(_REPORT_SECONDS, stop)
             record = history_record(trainer, subset)
@@ -289,28 +303,7 @@ def _train(trainer: Trainer, subset: ShardQueries, out: Path, progress: Progress
             raise KeyboardInterrupt
 
 
-@contextmanager
-def _stop_on_interrupt() -> Iterator[threading.Event]:
-    """An event that the first Ctrl-C sets, so that training ends after its current step and the checkpoint
-    keeps it; the second Ctrl-C interrupts at once."""
-    stop = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield stop
-        return
-
-    def handle(number: int, frame: object) -> None:
-        if stop.is_set():
-            raise KeyboardInterrupt
-        stop.set()
-
-    before = signal.signal(signal.SIGINT, handle)
-    try:
-        yield stop
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-def _finished(out: Path, total: float, *, resumed: bool = True) -> FitResult:
+def _finished(out: Path, total: float, *, resumed: bool) -> FitResult:
     material = Material.load(out)
     training = material.description["training"]
     return FitResult(

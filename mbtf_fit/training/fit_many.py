@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -14,6 +15,7 @@ from queue import SimpleQueue
 from typing import Any
 
 from mbtf_core.errors import InputError, MbtfError, UsageError, reason
+from mbtf_core.interruption import SIGNALS, at_end
 from mbtf_fit.config import FitConfig
 from mbtf_gen.dataset.reader import is_dataset
 
@@ -84,7 +86,10 @@ def _work(
         visible = os.environ.get("CUDA_VISIBLE_DEVICES")
         devices = visible.split(",") if visible else []
         os.environ["CUDA_VISIBLE_DEVICES"] = devices[worker % len(devices)] if devices else str(worker)
+    for number in SIGNALS:
+        signal.signal(number, signal.default_int_handler)
     try:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
         import torch
 
         from mbtf_fit.training.fit import fit
@@ -98,6 +103,11 @@ def _work(
         pipe.send((None, "interrupted; the same command resumes"))
     except Exception as error:
         pipe.send((None, f"internal error: {type(error).__name__}: {reason(error)}"))
+
+
+def _kill_children() -> None:
+    for child in multiprocessing.active_children():
+        child.kill()
 
 
 def fit_many(
@@ -115,6 +125,7 @@ def fit_many(
     GPU of its number; on CPUs the workers divide the cores. `finished` is called with each outcome.
     """
     context = multiprocessing.get_context("spawn")
+    at_end(_kill_children)
     free: SimpleQueue[int] = SimpleQueue()
     for worker in range(processes):
         free.put(worker)
@@ -124,6 +135,8 @@ def fit_many(
         mine, theirs = context.Pipe(duplex=False)
         arguments = (config, data, folder, overwrite, worker, processes, theirs)
         process = context.Process(target=_work, args=arguments)
+        # The process inherits this mask until it handles signals.
+        signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
         try:
             process.start()
             theirs.close()
@@ -142,7 +155,9 @@ def fit_many(
             for outcome in as_completed(fits):
                 finished(outcome.result())
         except KeyboardInterrupt:
-            # A terminal sends Ctrl-C to the children too, which write their checkpoints and exit.
+            # The children write their checkpoints and exit.
+            for child in multiprocessing.active_children():
+                child.terminate()
             pool.shutdown(cancel_futures=True)
             raise
     return [fit.result() for fit in fits]

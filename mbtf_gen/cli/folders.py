@@ -7,8 +7,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mbtf_core.console import CONSOLE, Console, resumable
+from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import EXIT_BAD_INPUT, EXIT_OK, EXIT_PARTIAL
+from mbtf_core.interruption import keep_on_interruption
 from mbtf_core.options import DryRun, PathText
 from mbtf_core.units import clock
 from mbtf_gen.cli.generate import describe
@@ -96,10 +97,8 @@ def repair(
         shards = [entry.file for entry in found.entries]
         done = RepairResult(str(folder), found.faults, shards, found.documents, found.foreign, False, 0, 0.0)
     else:
-        with (
-            resumable(f"{folder}: the shards rendered so far are kept"),
-            console.progress(None, "repairing", "paths") as bar,
-        ):
+        keep_on_interruption(f"{folder}: the shards rendered so far are kept")
+        with console.progress(None, "repairing", "paths") as bar:
             done = found.repair(bar.update)
     data = {"dry_run": dry_run, **asdict(done)}
     console.report(data, _describe_repair(done, dry_run))

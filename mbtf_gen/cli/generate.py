@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 
 from cyclopts import Parameter
 
-from mbtf_core.console import CONSOLE, Console, resumable
+from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import UsageError
+from mbtf_core.interruption import keep_on_interruption
 from mbtf_core.options import Options, Output, Overwrite, PathText, takes_options
 from mbtf_core.units import clock, expectation, size_text
 from mbtf_gen.config.generator import GeneratorConfig
@@ -112,10 +113,8 @@ def generate(
         if seconds is not None:
             console.note(expectation(seconds, size))
 
-    with (
-        resumable(f"the shards that are finished are kept in {output}"),
-        console.progress(None, "generating", "paths") as bar,
-    ):
+    keep_on_interruption(f"the shards that are finished are kept in {output}")
+    with console.progress(None, "generating", "paths") as bar:
         summary = generate(
             job,
             output,

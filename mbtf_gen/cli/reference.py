@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.console import CONSOLE, Console
+from mbtf_core.interruption import keep_on_interruption
 from mbtf_core.options import Options, Output, Overwrite, PathText, takes_options
 from mbtf_core.units import expectation
 from mbtf_gen.cli.generate import resolve_config
@@ -35,7 +36,7 @@ def reference(
     resolved = resolve_config(options, material)
     from mbtf_core.directions import from_angles
     from mbtf_core.exposure import auto_exposure, brightness, describe_exposure
-    from mbtf_core.folders import check_space
+    from mbtf_core.folders import check_space, owned
     from mbtf_core.stats import pooled_relative_error
     from mbtf_gen.dataset.shard_io import row_bytes
     from mbtf_gen.forecast import LONG_RUN
@@ -67,23 +68,27 @@ def reference(
     names = {(camera, one): f"{one}-tiles{camera.tiles_across:g}" for camera in cameras for one in kinds}
     size = len(names) * wanted.size**2 * (row_bytes(job.material.opacity is not None) + PNG_BYTES)
     check_space(output, size, "reduce --size, or choose another folder with -o")
-    folder = PictureFolder.claim(
-        output,
-        "reference",
-        files=[f"{name}.{suffix}" for name in names.values() for suffix in ("exr", "png")],
-        config=job.config.model_dump(mode="json", exclude={"queries", "output"}),
-        inputs=job.material.digests,
-        overwrite=overwrite,
-    )
-    left = sum(camera.rows * camera.columns for (camera, _), n in names.items() if not folder.finished(n))
     estimator: Any = None
-    if left * wanted.spp >= LONG_RUN:
-        estimator = build_estimator(job, reference_plan(job))
-        seconds = picture_seconds(estimator, cameras[0], omega_i, left * wanted.spp)
-        console.note(expectation(seconds, size))
     pictures: list[dict[str, Any]] = []
     bright: list[float] = []
-    with console.progress(total=len(cameras) * len(kinds), label="rendering", unit="pictures") as bar:
+    keep_on_interruption(f"the finished pictures are kept in {output}")
+    with (
+        owned(output),
+        console.progress(total=len(cameras) * len(kinds), label="rendering", unit="pictures") as bar,
+    ):
+        folder = PictureFolder.claim(
+            output,
+            "reference",
+            files=[f"{name}.{suffix}" for name in names.values() for suffix in ("exr", "png")],
+            config=job.config.model_dump(mode="json", exclude={"queries", "output"}),
+            inputs=job.material.digests,
+            overwrite=overwrite,
+        )
+        missing = sum(c.rows * c.columns for (c, _), name in names.items() if not folder.finished(name))
+        if missing * wanted.spp >= LONG_RUN:
+            estimator = build_estimator(job, reference_plan(job))
+            seconds = picture_seconds(estimator, cameras[0], omega_i, missing * wanted.spp)
+            console.note(expectation(seconds, size))
         for index, camera in enumerate(cameras):
             for one in kinds:
                 name = names[camera, one]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Generator, Iterable, Set
+from collections.abc import Callable, Generator, Iterable, Mapping, Set
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, field
@@ -120,11 +120,11 @@ def render_shards(
     total, own = ShardStatistics(), ShardStatistics()
     result = RenderResult()
     records: list[dict[str, Any]] = []
-    busy: list[Path] = []
     limit = most_paths(job)
 
     def skip(entry: ShardEntry, record: dict[str, Any] | None) -> None:
-        del pending[entry.file]
+        if record is not None:
+            del pending[entry.file]
         report(record)
 
     def report(record: dict[str, Any] | None = None) -> None:
@@ -143,41 +143,48 @@ def render_shards(
     # Leftovers of killed runs take disk space.
     remove_leftovers(folder)
     estimator: Any = None
-    with ExitStack() as stack:
-        ahead = stack.enter_context(ThreadPoolExecutor(1, "queries"))
-        claims = stack.enter_context(closing(_claims(job, folder, entries, corrupt, ahead, busy, skip)))
-        writer = stack.enter_context(ShardWriter())
-        for claim in claims:
-            if estimator is None:
-                estimator = build_estimator(job, plan.effects)
-            began = time.perf_counter()
-            queries, entry = claim.queries.result(), claim.entry
-            estimates = estimate_shard(
-                estimator,
-                queries.flat(),
-                split_spp(job.config, entry.split),
-                split_target(job.config, entry.split),
-                Stream(job.config.seed, entry.split, entry.index),
-                plan.allocation,
+    # A corrupt shard counts as finished once its sidecar has changed.
+    stamps = {file: _stamp(folder / file) for file in corrupt}
+    # Shards of other processes are tried again after the own ones: the process that ends last leaves none.
+    while pending:
+        tried, busy = [*pending.values()], list[ShardEntry]()
+        with ExitStack() as stack:
+            ahead = stack.enter_context(ThreadPoolExecutor(1, "queries"))
+            claims = stack.enter_context(closing(_claims(job, folder, tried, stamps, ahead, busy, skip)))
+            writer = stack.enter_context(ShardWriter())
+            for claim in claims:
+                if estimator is None:
+                    estimator = build_estimator(job, plan.effects)
+                began = time.perf_counter()
+                queries, entry = claim.queries.result(), claim.entry
+                estimates = estimate_shard(
+                    estimator,
+                    queries.flat(),
+                    split_spp(job.config, entry.split),
+                    split_target(job.config, entry.split),
+                    Stream(job.config.seed, entry.split, entry.index),
+                    plan.allocation,
+                )
+                seconds = time.perf_counter() - began
+                writer.submit(partial(store, entry, queries, estimates, seconds), claim.lock.release)
+                result.paths += estimates.paths
+                expected.add(pending.pop(entry.file), estimates.paths)
+                result.shards.append(entry.file)
+                report()
+                own.add_quarantined(entry.file, _quarantined(estimates))
+                # These shards alone may exceed the limit of the whole data set.
+                refuse_nonfinite(own, limit, folder)
+        result.writing += writer.busy
+        result.waiting += writer.waited
+        if len(busy) == len(tried):
+            owner = lock_owner(folder / busy[0].file)
+            who = "" if owner is None else f" ({owner})"
+            raise PartialError(
+                f"{len(busy)} shard(s) are being written by another process, first {busy[0].file}{who}",
+                where=folder,
+                hint="wait for it, then run the same command again",
             )
-            seconds = time.perf_counter() - began
-            writer.submit(partial(store, entry, queries, estimates, seconds), claim.lock.release)
-            result.paths += estimates.paths
-            expected.add(pending.pop(entry.file), estimates.paths)
-            result.shards.append(entry.file)
-            report()
-            own.add_quarantined(entry.file, _quarantined(estimates))
-            # These shards alone may exceed the limit of the whole data set.
-            refuse_nonfinite(own, limit, folder)
-    if busy:
-        owner = lock_owner(busy[0])
-        who = "" if owner is None else f" ({owner})"
-        raise PartialError(
-            f"{len(busy)} shard(s) are being written by another process, first {busy[0].name}{who}",
-            where=folder,
-            hint="wait for it, then run the same command again",
-        )
-    result.seconds, result.writing, result.waiting = time.perf_counter() - start, writer.busy, writer.waited
+    result.seconds = time.perf_counter() - start
     return result
 
 
@@ -185,20 +192,18 @@ def _claims(
     job: Job,
     folder: Path,
     entries: Iterable[ShardEntry],
-    corrupt: Set[str],
+    stamps: Mapping[str, tuple[int, int] | None],
     pool: ThreadPoolExecutor,
-    busy: list[Path],
+    busy: list[ShardEntry],
     skipped: Callable[[ShardEntry, dict[str, Any] | None], None],
 ) -> Generator[_Claim]:
     """Lock the shards that are not finished, one ahead of the caller, so that their queries are sampled while
     the previous shard is rendered.
 
     The caller must have handed a lock over when it asks for the next claim; closing the generator releases
-    the others. Files that other processes render go to `busy`. `skipped` is called for every shard that is
+    the others. Shards that other processes render go to `busy`. `skipped` is called for every shard that is
     not claimed, with its sidecar if it is finished.
     """
-    # A corrupt shard counts as finished once its sidecar has changed.
-    stamps = {file: _stamp(folder / file) for file in corrupt}
 
     def finished(entry: ShardEntry, path: Path) -> dict[str, Any] | None:
         if entry.file in stamps and stamps[entry.file] == _stamp(path):
@@ -212,7 +217,7 @@ def _claims(
             record = finished(entry, path)
             lock = take_lock(path) if record is None else None
             if record is None and lock is None:
-                busy.append(path)
+                busy.append(entry)
             elif lock is not None:
                 # Another process may have finished it since.
                 record = finished(entry, path)

@@ -67,7 +67,7 @@ class PictureFolder:
         overwrite: bool = False,
         command: str = "",
     ) -> PictureFolder:
-        """Claim a folder that is new, empty, of the same configuration, or to be replaced.
+        """Claim a folder that is empty, of the same configuration, or to be replaced; the caller owns it.
 
         Parameters
         ----------

@@ -36,6 +36,8 @@ def cost(
     seed
         Root seed of all random numbers.
     """
+    from mbtf_core.folders import owned
+    from mbtf_core.interruption import keep_on_interruption
     from mbtf_core.units import asked_duration, format_duration
     from mbtf_pipeline.cost_study.page import whole_runs, write_page
     from mbtf_pipeline.cost_study.pareto import pareto_front
@@ -46,6 +48,7 @@ def cost(
     loaded = load_recipe(recipe, assignments or [])
     folder = output if output is not None else loaded.folder.with_name(f"{loaded.folder.name}-cost")
     seconds = time_of(folder) if time is None else asked_duration(time, "--time")
+    keep_on_interruption(f"the measurements are kept in {folder}")
     with console.progress(total=100, label="cost", unit="%") as bar:
         study = run_study(
             loaded,
@@ -64,7 +67,9 @@ def cost(
             announce=console.note,
             progress=lambda share, note: bar.update(round(100 * share, 1), note),
         )
-    page, measured = write_page(study), len(study.measurements)
+    with owned(folder):
+        page = write_page(study)
+    measured = len(study.measurements)
     front = pareto_front(whole_runs(study.measurements))
     lines = [f"{page}: {measured} configurations measured, {len(study.skipped)} skipped for lack of time"]
     lines += [f"failed: {text}" for text in study.failed]

@@ -10,6 +10,7 @@ from cyclopts import Parameter
 
 from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import UsageError
+from mbtf_core.interruption import keep_on_interruption
 from mbtf_core.options import Output, Set, Switch, Time, command_line
 from mbtf_core.units import clock
 from mbtf_gen.config.presets import Quality, QualityOption
@@ -107,6 +108,7 @@ def _run_paper(
     paper = load_paper_recipe(file, assignments)
     planned, missing = plan(paper, file, quick)
     folder = output if output is not None else paper.folder(quick)
+    keep_on_interruption(f"the finished stages are kept in {folder}")
     done = run_paper(
         paper, planned, missing, folder, quick=quick, command=command, force=force, console=console
     )

@@ -12,7 +12,7 @@ from typing import Any
 from mbtf_core.atomic import read_json, write_json, write_text
 from mbtf_core.config_file import dump_yaml
 from mbtf_core.errors import InputError
-from mbtf_core.folders import ELSEWHERE, check_folder, check_space, make_folder
+from mbtf_core.folders import ELSEWHERE, check_folder, check_space, owned
 from mbtf_core.stats import Estimate, signal_variance
 from mbtf_core.units import expectation
 from mbtf_gen.config.generator import GeneratorConfig
@@ -25,7 +25,7 @@ from mbtf_pipeline.cost_study.measurements import Measurement, MeasurementFolder
 from mbtf_pipeline.cost_study.repeats import FEWEST_SEEDS, MOST_SEEDS, combined, measure_runs, seed_deviation
 from mbtf_pipeline.cost_study.runs import TEST, Run, RunRunner, forecast_seconds
 from mbtf_pipeline.recipe import Recipe
-from mbtf_pipeline.run_folder import has_record, locked, machine
+from mbtf_pipeline.run_folder import has_record, machine
 
 STUDY_NAME = "study.json"
 STUDY_FORMAT = "mbtf-cost"
@@ -62,9 +62,8 @@ def is_study(folder: Path) -> bool:
 
 
 def claim(folder: Path) -> None:
-    """Create a study's folder, or take an empty one or one that holds a study of this kind of machine."""
+    """Take an empty folder, or one that holds a study of this kind of machine."""
     if not check_folder(folder, is_study, "cost study"):
-        make_folder(folder)
         return
     there, here = read_json(folder / STUDY_NAME)["machine"]["system"], machine()["system"]
     if there != here:
@@ -129,8 +128,8 @@ def run_study(
     config = study_config(recipe.generate, seed)
     job = Job.prepare(config)
     config, material = job.config, job.material
-    claim(folder)
-    with locked(folder, STUDY_NAME):
+    with owned(folder):
+        claim(folder)
         benchmark = GeneratorBenchmark(config, material)
         note("reference")
         # Before anything is written: a refused study leaves the folder as it was.

@@ -38,7 +38,7 @@ from mbtf_pipeline.forecast import RunForecaster
 from mbtf_pipeline.presets import preset_recipe
 from mbtf_pipeline.recipe import Recipe
 from mbtf_pipeline.run import layout_of
-from mbtf_pipeline.run_folder import claim_run_folder, locked, write_run_record
+from mbtf_pipeline.run_folder import write_run_record
 
 SPLIT_NAME = "time_split.json"
 SPLIT_SCHEMA = 5
@@ -86,6 +86,7 @@ class Split:
 class TimedRun:
     """A recipe that is to end within a total time.
 
+
     Parameters
     ----------
     file, assignments : recipe and ``a.b=c``, which override presets
@@ -129,8 +130,8 @@ class TimedRun:
             r.model_dump(mode="json", include={"generate", "fit", "compare"}) for r in recipes.values()
         ]
         self._key = data_sha256({"schema": SPLIT_SCHEMA, "time": seconds, "recipes": options})
-        claim_run_folder(self.folder)
-        with locked(self.folder):
+        with owned(self.folder):
+            check_folder(self.folder, is_run, "run")
             split = self._stored()
             if split is None:
                 split = self._plan(recipes)

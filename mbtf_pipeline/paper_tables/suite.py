@@ -10,7 +10,7 @@ from typing import Any
 from mbtf_core.atomic import read_json, write_json, write_text
 from mbtf_core.console import Console
 from mbtf_core.errors import InputError
-from mbtf_core.folders import check_folder, make_folder
+from mbtf_core.folders import check_folder, owned
 from mbtf_pipeline.compare.metrics import DEFINITIONS
 from mbtf_pipeline.compare.st_lpips import weights_file
 from mbtf_pipeline.paper_tables.ablations import ablations
@@ -26,7 +26,7 @@ from mbtf_pipeline.paper_tables.zooms import zooms
 from mbtf_pipeline.report.plots import ERROR_BAR_NOTE
 from mbtf_pipeline.report.report import render
 from mbtf_pipeline.run import run_recipe
-from mbtf_pipeline.run_folder import has_record, locked, machine
+from mbtf_pipeline.run_folder import has_record, machine
 
 PAPER_NAME = "paper.json"
 PAPER_FORMAT = "mbtf-paper"
@@ -113,8 +113,6 @@ def run_paper(
         Another process uses the folder, or the disk is full; the same command resumes.
     """
     console = console or Console(quiet=True)
-    check_folder(folder, is_paper, "paper recipe")
-    make_folder(folder)
     record: dict[str, Any] = {
         "format": PAPER_FORMAT,
         "schema": PAPER_SCHEMA,
@@ -129,8 +127,9 @@ def run_paper(
         "planned": len(planned),
         "runs": [],
     }
-    write_json(folder / PAPER_NAME, record)
-    with locked(folder, PAPER_NAME):
+    with owned(folder):
+        check_folder(folder, is_paper, "paper recipe")
+        write_json(folder / PAPER_NAME, record)
         for name, where in missing.items():
             console.note(f"{name}: skipped, {where} does not exist")
         for number, one in enumerate(planned, 1):
@@ -144,7 +143,7 @@ def run_paper(
 
 def write_again(folder: Path) -> Path:
     """Write the page and tables of the finished runs again; returns the page's path."""
-    with locked(folder, PAPER_NAME):
+    with owned(folder):
         return _write_page(folder, read_json(folder / PAPER_NAME))[0]
 
 

@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mbtf_core.console import Console
+from mbtf_core.folders import owned
+from mbtf_core.interruption import keep_on_interruption
 
 if TYPE_CHECKING:
     from mbtf_fit.mitsuba_plugin.preview.config import PreviewConfig
@@ -28,7 +30,16 @@ def draw(
     InputError : the material cannot be used, or the folder holds something else
     UsageError : a view shows the horizon
     EngineError : MP4 is asked for, and there is no ffmpeg
+    PartialError : another process writes to the folder
     """
+    keep_on_interruption(f"the finished pictures are kept in {path}")
+    with owned(path):
+        _draw(config, path, overwrite, console, sheet_only, mp4)
+
+
+def _draw(
+    config: PreviewConfig, path: Path, overwrite: bool, console: Console, sheet_only: bool, mp4: bool
+) -> None:
     from mbtf_core.exposure import describe_exposure, to_display
     from mbtf_core.folders import check_space
     from mbtf_core.units import expectation

@@ -10,7 +10,8 @@ from mbtf_core.console import Console
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import InputError, PartialError
 from mbtf_core.exposure import auto_exposure, brightness, describe_exposure
-from mbtf_core.folders import check_space
+from mbtf_core.folders import check_space, owned
+from mbtf_core.interruption import keep_on_interruption
 from mbtf_core.units import expectation
 from mbtf_gen.config.pictures import PreviewConfig
 from mbtf_gen.dataset.reader import Dataset
@@ -99,17 +100,21 @@ class PreviewPictures:
             stages["queries"] = len(self.dataset.shards("train", finished_only=True))
         size = len(stages) * PNG_BYTES * self.config.preview.size**2
         check_space(path, size, "reduce --size, or choose another folder with -o")
-        folder = PictureFolder.claim(
-            path,
-            "preview",
-            files=[f"{name}.png" for name in stages],
-            config=self.config.model_dump(mode="json"),
-            inputs=inputs,
-            overwrite=overwrite,
-        )
         found: dict[str, dict[str, Any]] = {}
         fault = ""
-        with self.console.progress(total=len(makers), label="drawing", unit="pictures") as bar:
+        keep_on_interruption(f"the finished pictures are kept in {path}")
+        with (
+            owned(path),
+            self.console.progress(total=len(makers), label="drawing", unit="pictures") as bar,
+        ):
+            folder = PictureFolder.claim(
+                path,
+                "preview",
+                files=[f"{name}.png" for name in stages],
+                config=self.config.model_dump(mode="json"),
+                inputs=inputs,
+                overwrite=overwrite,
+            )
             for name, maker in makers.items():
                 file, facts = folder.path / f"{name}.png", folder.finished(name)
                 kept = facts is not None and facts.get("of") == stages[name]

@@ -226,7 +226,7 @@ def test_an_interrupted_run_keeps_its_shards(
     try:
         with monkeypatch.context() as patch:
             patch.setattr(ClosedForm, "estimate", interrupted)
-            assert generate(line) == 130
+            assert generate(line) == 128 + number
     finally:
         signal.signal(signal.SIGINT, handler)
     errors = [x for x in capsys.readouterr().err.splitlines() if not x.startswith("warning: ")]
@@ -248,9 +248,9 @@ def test_two_runs_at_once_make_every_shard_once(tmp_path: Path) -> None:
     assert generate(command(tmp_path, tmp_path / "whole", train=600)) == 0
     line = command(tmp_path, tmp_path / "out", train=600)
     children = [in_child(lambda: generate(line)) for _ in range(3)]
-    # A shard that another one still writes at the end is left to it.
-    assert {ending(child) for child in children} <= {0, 4}
-    assert generate(line) == 0
+    # A shard that another one still writes at the end is left to it; the last one finishes the data set.
+    endings = {ending(child) for child in children}
+    assert {0} <= endings <= {0, 4}
     assert contents(tmp_path / "out") == contents(tmp_path / "whole")
 
 

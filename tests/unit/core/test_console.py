@@ -192,7 +192,7 @@ def test_a_file_named_like_a_misspelt_command_is_a_file(
 @pytest.mark.parametrize(
     ("error", "code", "message"),
     [
-        (KeyboardInterrupt(), 130, "interrupted"),
+        (KeyboardInterrupt(), 130, "interrupted\n  run the same command again"),
         (FileNotFoundError(2, "No such file", "/no/map"), 3, "/no/map: No such file"),
         (
             ZeroDivisionError("first\nsecond"),
@@ -201,7 +201,7 @@ def test_a_file_named_like_a_misspelt_command_is_a_file(
         ),
     ],
 )
-def test_other_errors_are_one_line(
+def test_other_errors_are_short(
     error: BaseException, code: int, message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(failing(error), []) == code

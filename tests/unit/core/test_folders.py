@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import threading
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -9,14 +11,16 @@ import pytest
 
 from mbtf_core import folders
 from mbtf_core.atomic import temporary_of
-from mbtf_core.errors import InputError
+from mbtf_core.errors import InputError, PartialError
 from mbtf_core.folders import (
     check_folder,
     check_space,
     make_folder,
     other_configuration,
+    owned,
     remove_unfinished,
 )
+from mbtf_core.locks import Lock
 from mbtf_core.units import expectation
 
 
@@ -33,6 +37,27 @@ def test_new_and_empty_folders_are_taken_and_ours_is_resumed(tmp_path: Path) -> 
     assert not check_folder(folder, is_ours, "record")
     (folder / "record.json").touch()
     assert check_folder(folder, is_ours, "record")
+
+
+def test_one_command_owns_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder, renewed = tmp_path / "a/b", threading.Event()
+    monkeypatch.setattr("mbtf_core.folders.RENEW_SECONDS", 0.01)
+    monkeypatch.setattr(Lock, "renew", renewed.set)
+    with owned(folder):
+        assert renewed.wait(10), "machines without common locks look at the age"
+        with pytest.raises(PartialError, match=rf"process {os.getpid()} on .*, for 0 s"), owned(folder):
+            pass
+        with owned(tmp_path / "a"):
+            pass
+    assert not folder.exists(), "nothing was written"
+    with owned(folder):
+        (folder / "file").touch()
+    with owned(folder):
+        assert (folder / "file").exists()
+    (folder / "file").unlink()
+    with owned(folder):
+        pass
+    assert folder.exists(), "it was there before"
 
 
 @pytest.mark.parametrize("name", ["notes.txt", ".env"])

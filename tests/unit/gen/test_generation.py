@@ -16,7 +16,7 @@ from support.datasets import formula
 
 from mbtf_core.atomic import checksummed, create_file
 from mbtf_core.errors import InputError, PartialError
-from mbtf_core.locks import shard_lock
+from mbtf_core.locks import shard_lock, take_lock
 from mbtf_gen import generation
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.dataset import render_shards
@@ -425,6 +425,38 @@ def test_a_locked_shard_is_left_to_its_writer(config: GeneratorConfig, engine: F
             generate(config, out)
         assert sorted(contents(out)) == sorted(set(FILES) - {FILES[1]})
     assert generate(config, out).complete
+
+
+@pytest.mark.parametrize("finished", [True, False])
+def test_the_run_that_ends_last_finishes_the_data_set(
+    finished: bool,
+    config: GeneratorConfig,
+    engine: Formula,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    out: Path,
+) -> None:
+    """Another process renders a shard at first; it finishes it, or ends without."""
+    whole = tmp_path / "whole"
+    generate(config, whole)
+    engine.estimated.clear()
+    out.mkdir()
+    lock = take_lock(out / FILES[1])
+    assert lock is not None
+    estimate = engine.estimate
+
+    def meanwhile(queries: Any, spp: int, stream: Any) -> Any:
+        if stream.split == "test":
+            for path in (out / FILES[1], sidecar_of(out / FILES[1])) if finished else ():
+                shutil.copy(whole / path.name, path)
+            lock.release()
+        return estimate(queries, spp, stream)
+
+    monkeypatch.setattr(engine, "estimate", meanwhile)
+    assert generate(config, out).complete
+    assert engine.estimated == [("train", 0), ("train", 2), ("test", 0), *[("train", 1)] * (not finished)]
+    assert contents(out) == contents(whole)
+    assert not list(out.glob(".*"))
 
 
 def test_a_shard_finished_before_its_lock_is_not_rendered(

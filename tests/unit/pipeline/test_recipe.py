@@ -11,7 +11,6 @@ import pytest
 
 from mbtf_core.console import Console, run
 from mbtf_core.errors import InputError
-from mbtf_core.locks import shard_lock
 from mbtf_pipeline.cli.app import app
 from mbtf_pipeline.recipe import load_recipe, read_resolved, write_recipe
 from mbtf_pipeline.run import _material_inputs, _RecipeRun, survey
@@ -164,17 +163,6 @@ def test_exit_codes(
     err = capsys.readouterr().err
     assert what in err
     assert len(err.splitlines()) <= 2
-
-
-def test_a_locked_folder_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = written(tmp_path, SINGLE)
-    folder = tmp_path / "out"
-    folder.mkdir()
-    with shard_lock(folder / "run.json") as held:
-        assert held
-        assert run(app, ["run", str(path), "-o", str(folder), "-q"]) == 4
-    assert "another run uses this folder" in capsys.readouterr().err
-    assert list(folder.iterdir()) == []
 
 
 def test_the_resolved_recipe_can_be_run_again(tmp_path: Path) -> None:

@@ -86,6 +86,7 @@ def test_folders_of_something_else_are_refused(tmp_path: Path) -> None:
         module.claim(tmp_path)
     folder = tmp_path / "study"
     module.claim(folder)
+    folder.mkdir()
     record = {"format": module.STUDY_FORMAT, "schema": module.STUDY_SCHEMA, "machine": machine()}
     changes: list[tuple[dict[str, Any], str | None]] = [
         ({}, None),

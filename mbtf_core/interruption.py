@@ -1,0 +1,191 @@
+"""Signals that end a program: SIGINT of Ctrl-C, and SIGTERM, which batch systems send.
+
+A signal raises KeyboardInterrupt, so that finished work is stored and locks are released. Libraries may
+delay, swallow or convert that exception; a thread therefore ends the process after a grace period. A second
+signal, or one during an import, ends it at once: files are absent or complete at every instant.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from types import FrameType
+from typing import NoReturn
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+# Seconds from the signal to a note on standard error, and from there to the end of the process.
+_NOTE_SECONDS, _GRACE_SECONDS = 1.5, 10.0
+# A terminal and a wrapper such as `uv run` may both send the signal of one Ctrl-C.
+_ECHO_SECONDS = 0.5
+
+
+class _State:
+    """State of this process.
+
+    Attributes
+    ----------
+    program : it runs one of our programs, so that a signal may end it; not so in notebooks and tests
+    raising : a signal raises KeyboardInterrupt, which :func:`mbtf_core.console.run` handles
+    received, since : the first signal, or 0, and its time
+    kept : what an interruption leaves, for the message
+    cleanups : called before the process ends without unwinding
+    """
+
+    program = False
+    raising = False
+    received = 0
+    since = 0.0
+    kept = ""
+    cleanups: list[Callable[[], None]] = []  # noqa: RUF012
+
+
+def handle_signals() -> None:
+    """Prepare a new process of a program for signals; precedes all slow imports."""
+    _State.program = True
+    for number in SIGNALS:
+        # `nohup` and shells without job control have it ignored.
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, _handle)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    # Native code delays Python's handlers, but not these bytes.
+    signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+    threading.Thread(target=_watch, args=(reader,), name="interruption", daemon=True).start()
+
+
+def _handle(number: int, frame: FrameType | None) -> None:
+    now = time.monotonic()
+    again = _State.received != 0
+    if again and now - _State.since < _ECHO_SECONDS:
+        return
+    _note(number)
+    if _State.program and (again or not _State.raising or _importing(frame)):
+        _end_process()
+    raise KeyboardInterrupt
+
+
+def _note(number: int) -> None:
+    if not _State.received:
+        _State.received, _State.since = number, time.monotonic()
+
+
+def _importing(frame: FrameType | None) -> bool:
+    """Is a module being imported? Native modules turn exceptions into crashes or into failed imports."""
+    while frame is not None:
+        if frame.f_code.co_filename.startswith("<frozen importlib"):
+            return True
+        frame = frame.f_back
+    return False
+
+
+def _watch(reader: int) -> None:
+    while (number := os.read(reader, 1)[0]) not in SIGNALS:
+        pass
+    time.sleep(_NOTE_SECONDS)
+    with contextlib.suppress(OSError):
+        os.write(2, b"stopping after the current step; a second signal stops at once\n")
+    time.sleep(_GRACE_SECONDS)
+    _note(number)
+    _end_process()
+
+
+def _end_process() -> NoReturn:
+    for cleanup in _State.cleanups:
+        cleanup()
+    # A progress bar hides the cursor.
+    start = "\x1b[?25h\n" if os.isatty(2) else ""
+    with contextlib.suppress(OSError):
+        os.write(2, f"{start}error: {message()}\n".encode())
+    os._exit(exit_code())
+
+
+def exit_code() -> int:
+    """Exit code of the signal that was received: 130 or 143 as in shells; 0 without one."""
+    return 128 + _State.received if _State.received else 0
+
+
+def message() -> str:
+    """An interruption in words, and how to continue."""
+    if _State.kept:
+        return f"interrupted; {_State.kept}\n  the same command resumes"
+    return "interrupted\n  run the same command again"
+
+
+def keep_on_interruption(kept: str) -> None:
+    """State what an interruption leaves from now on, for a command that resumes."""
+    _State.kept = kept
+
+
+def at_end(cleanup: Callable[[], None]) -> None:
+    """Call a function before a signal ends the process without unwinding."""
+    _State.cleanups.append(cleanup)
+
+
+@contextlib.contextmanager
+def raising() -> Iterator[None]:
+    """Signals raise KeyboardInterrupt in this block; it runs a command."""
+    before = {}
+    if not _State.program:
+        _State.received, _State.kept = 0, ""
+        if threading.current_thread() is threading.main_thread():
+            usual = (signal.SIG_DFL, signal.default_int_handler, None)
+            before = {n: signal.getsignal(n) for n in SIGNALS if signal.getsignal(n) in usual}
+    for number in before:
+        signal.signal(number, _handle)
+    _State.raising = True
+    try:
+        yield
+    finally:
+        _State.raising = False
+        for number, handler in before.items():
+            # None stands for a native handler, which a renderer leaves and which is no longer valid.
+            signal.signal(number, signal.default_int_handler if handler is None else handler)
+
+
+@contextlib.contextmanager
+def stop_on_interruption() -> Iterator[threading.Event]:
+    """An event that the first signal sets, instead of an exception, so that work ends after its current step;
+    the second signal interrupts as usual. The block raises KeyboardInterrupt itself once it has stored its
+    state."""
+    stop = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+    before = {n: h for n in SIGNALS if callable(h := signal.getsignal(n))}
+    first = 0.0
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        nonlocal first
+        if not stop.is_set():
+            first = time.monotonic()
+            stop.set()
+            _note(number)
+        elif time.monotonic() - first >= _ECHO_SECONDS:
+            before[signal.Signals(number)](number, frame)
+
+    for number in before:
+        signal.signal(number, handle)
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def finish(code: int) -> int:
+    """Last act of a program: the exit code of its command. After an interruption it ends the process, whose
+    threads may still work; else a signal can no longer change the code."""
+    if _State.received:
+        with contextlib.suppress(OSError, ValueError):
+            sys.stdout.flush()
+            sys.stderr.flush()
+        os._exit(code)
+    for number in SIGNALS:
+        signal.signal(number, lambda *_: os._exit(code))
+    return code
