@@ -25,7 +25,7 @@ from mbtf_core.atomic import read_json, write_json
 from mbtf_core.config_file import deep_merge
 from mbtf_core.digest import data_sha256
 from mbtf_core.errors import InputError, UsageError
-from mbtf_core.folders import check_space
+from mbtf_core.folders import check_folder, check_space, owned
 from mbtf_core.units import clock, format_duration
 from mbtf_fit.config import FitConfig
 from mbtf_fit.training.forecast import QUERY_SECONDS
@@ -38,7 +38,7 @@ from mbtf_pipeline.forecast import RunForecaster
 from mbtf_pipeline.presets import preset_recipe
 from mbtf_pipeline.recipe import Recipe
 from mbtf_pipeline.run import layout_of
-from mbtf_pipeline.run_folder import write_run_record
+from mbtf_pipeline.run_folder import is_run, write_run_record
 
 SPLIT_NAME = "time_split.json"
 SPLIT_SCHEMA = 5
@@ -187,7 +187,7 @@ class TimedRun:
         """A preset scaled to the time, and its bytes."""
         whole, fits = forecaster.of(recipe), len(recipe.fit)
         start, path = forecaster.speed
-        job = Job(recipe.generate, forecaster.material)
+        job = Job.of(recipe.generate, forecaster.material)
         own = split_queries(job, "train")
         query = recipe.generate.queries.spp * path + fits * QUERY_SECONDS
         fixed = whole.seconds - own * query - whole.training
