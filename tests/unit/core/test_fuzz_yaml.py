@@ -49,7 +49,7 @@ training: {time: 2min, batch: 1024, blur: {initial_sigma: 4}}
 held_out: {queries: 0.1, direction: [0.1, 0.2]}
 """
 RECIPE = """\
-version: 2
+version: 3
 name: small
 generate:
   material: heights.npy
