@@ -7,8 +7,7 @@ With n queries, f fits, and the seconds g of generating a query and b of loading
     T = fixed + n g + f n b + training.
 
 Disk space, memory and the queries per texel of the largest preset limit n; training gets what is left. Once
-the data are generated, training gets the time that is then left, so that a run that generates slower than
-expected still ends in time.
+the data are generated, training gets the time that is then left, but no less than that of the preset.
 """
 
 from __future__ import annotations
@@ -60,7 +59,7 @@ class Split:
     Attributes
     ----------
     quality : the preset; queries : of training, `scale` times those of the preset
-    training_each : seconds of training each fit, and the preset's
+    training_each, least_each : seconds of training each fit, as planned and at least
     generating : seconds of generating
     after : seconds of loading, evaluation, comparison and report
     final : whether the training time counts how long generating took
@@ -70,6 +69,7 @@ class Split:
     queries: int
     scale: float
     training_each: float
+    least_each: float
     generating: float
     after: float
     final: bool = False
@@ -152,7 +152,7 @@ class TimedRun:
         """The recipe with the training time that is left now that the data are generated."""
         if not self.split.final:
             left = self._left() - self.split.after
-            each = max(1.0, round(left / len(recipe.fit), 1))
+            each = max(self.split.least_each, round(left / len(recipe.fit), 1))
             self._store(replace(self.split, training_each=each, final=True))
         fits = {name: _with_time(fit, self.split.training_each) for name, fit in recipe.fit.items()}
         return recipe.model_copy(update={"fit": fits})
@@ -204,6 +204,7 @@ class TimedRun:
             queries=queries,
             scale=scale,
             training_each=round(each, 1),
+            least_each=max(1.0, whole.training / fits) if scale >= 1.0 else 1.0,
             generating=round(start + whole.generating + more * recipe.generate.queries.spp * path, 1),
             after=round(whole.evaluating + whole.comparing + more * fits * QUERY_SECONDS, 1),
         )
