@@ -123,10 +123,12 @@ def test_training_is_shortened_when_generating_overran(fake: Machine, one: Path)
     again = timed(one, 120.0)
     assert again.generated(again.recipe).fit["neumip"].training.time == after
     fake.now = 0.0
-    late = timed(one, 120.0, folder=one.parent / "late")
+    notes: list[str] = []
+    late = timed(one, 120.0, folder=one.parent / "late", progress=notes.append)
     fake.now = 500.0
     # No less than the preset's: never worse.
     assert late.generated(late.recipe).fit["neumip"].training.time == 20.0
+    assert "the run will be about" in notes[-1]
 
 
 @pytest.mark.parametrize("scarce", ["disk", "memory", "data.memory", "preset"])
