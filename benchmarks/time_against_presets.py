@@ -1,6 +1,7 @@
 """``mbtf-pipeline run --time`` against the quality preset that fits the same time.
 
-    python benchmarks/time_against_presets.py [MATERIAL ...] [--time 2min] [--seeds 2] [--out FOLDER]
+    python benchmarks/time_against_presets.py [MATERIAL ...] [--time 2min] [--seeds 2] [--resolution N]
+        [--out FOLDER]
 
 For each material and seed, runs ``--time`` and then the preset that it chose, in processes of their own. Both
 have the same test queries. By default six texture sets that lie beside the project; other materials are
@@ -35,6 +36,7 @@ name: timed
 generate:
   material: {material}
   geometry: {{height_scale: {height}}}
+  queries: {{resolution: {resolution}}}
   seed: {seed}
 fit: {{model: neumip, seed: {seed}}}
 """
@@ -71,14 +73,15 @@ def run(recipe: Path, *options: str) -> dict[str, Any]:
         }
 
 
-def pair(name: str, seed: int, duration: str, folder: Path) -> dict[str, Any]:
+def pair(name: str, seed: int, duration: str, resolution: int | None, folder: Path) -> dict[str, Any]:
     """One material and seed under ``--time`` and at the preset that it chose; kept in a folder."""
-    path = folder / f"{name}-{seed}-{duration}.json"
+    path = folder / f"{name}-{seed}-{duration}-{resolution}.json"
     if path.exists():
         return read_json(path)
     material, height = source(name)
     recipe = folder / "recipe.yaml"
-    text = RECIPE.format(material=json.dumps(str(material)), height=json.dumps(height), seed=seed)
+    values = {"material": str(material), "height": height, "seed": seed, "resolution": resolution}
+    text = RECIPE.format(**{key: json.dumps(value) for key, value in values.items()})
     recipe.write_text(text, encoding="utf-8")
     timed = run(recipe, "--time", duration)
     preset = run(recipe, "--quality", timed["quality"])
@@ -106,6 +109,7 @@ def main() -> int:
     parser.add_argument("materials", nargs="*", default=list(HEIGHT_SCALES))
     parser.add_argument("--time", default="2min", help="total time of a run")
     parser.add_argument("--seeds", type=int, default=2)
+    parser.add_argument("--resolution", type=int, help="texels across; default: the preset's")
     parser.add_argument("--out", type=Path, help="folder of the finished runs")
     arguments = parser.parse_args()
     seconds = parse_duration(arguments.time)
@@ -116,7 +120,9 @@ def main() -> int:
         if not source(name)[0].is_dir():
             print(f"{name}: skipped, {source(name)[0]} is missing", file=sys.stderr)
             continue
-        pairs = [pair(name, seed, arguments.time, folder) for seed in range(arguments.seeds)]
+        pairs = [
+            pair(name, seed, arguments.time, arguments.resolution, folder) for seed in range(arguments.seeds)
+        ]
         one = compared(name, pairs, seconds)
         found.append(one)
         print(

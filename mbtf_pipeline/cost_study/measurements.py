@@ -85,7 +85,6 @@ class MeasurementFolder:
     def __init__(self, folder: Path, basis: str) -> None:
         self.folder = folder / FOLDER
         self.basis = basis
-        self.folder.mkdir(parents=True, exist_ok=True)
 
     def _path(self, task: Configuration) -> Path:
         key = {"schema": SCHEMA, "basis": self.basis, "study": task.study, "key": task.key}
@@ -104,5 +103,6 @@ class MeasurementFolder:
 
     def put(self, task: Configuration, found: Measurement) -> None:
         """Store a measurement."""
+        self.folder.mkdir(parents=True, exist_ok=True)
         numbers = {name: e and e.as_dict() for name in ESTIMATES for e in (getattr(found, name),)}
         write_json(self._path(task), {"label": task.label, **numbers, "details": found.details})

@@ -187,6 +187,7 @@ def path_seconds(config: GeneratorConfig, store: MeasurementFolder) -> float:
 
 def keep_path_seconds(store: MeasurementFolder, seconds: float) -> None:
     """Store what :func:`path_seconds` then returns."""
+    store.folder.mkdir(parents=True, exist_ok=True)
     write_json(_seconds_file(store), {"path_seconds": seconds})
 
 

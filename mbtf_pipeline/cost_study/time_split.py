@@ -7,8 +7,8 @@ With n queries, f fits, and the seconds g of generating a query and b of loading
     T = fixed + n g + f n b + training.
 
 Disk space, memory and the queries per texel of the largest preset limit n; training gets what is left. Once
-the data are generated, training gets the time that is then left, so that a run that generates slower than
-expected still ends in time.
+the data are generated, training gets the time that is then left, but no less than that of the preset: a run
+that thus takes longer than its time says so. A time too short for any preset gets a reduced draft.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class Split:
     Attributes
     ----------
     quality : the preset; queries : of training, `scale` times those of the preset
-    training_each : seconds of training each fit, and the preset's
+    training_each, least_each : seconds of training each fit, as planned and at least
     generating : seconds of generating
     after : seconds of loading, evaluation, comparison and report
     final : whether the training time counts how long generating took
@@ -70,6 +70,7 @@ class Split:
     queries: int
     scale: float
     training_each: float
+    least_each: float
     generating: float
     after: float
     final: bool = False
@@ -93,7 +94,7 @@ class TimedRun:
     seconds : total time
     folder : of the run; it stores the split, so that the same command resumes with the same one
     quality : the preset to use; by default the best that fits
-    progress : receives the split as a line
+    progress : receives lines: the split, and by how much the run will be late
     began : start of the run by ``time.perf_counter``; now by default
 
     Raises
@@ -114,6 +115,7 @@ class TimedRun:
         assignments: Sequence[str] = (),
         began: float | None = None,
     ) -> None:
+        self._progress = progress
         self._began = time.perf_counter() if began is None else began
         self._seconds, self._file, self._assignments = seconds, file, assignments
         if seconds < SHORTEST:
@@ -153,7 +155,10 @@ class TimedRun:
         """The recipe with the training time that is left now that the data are generated."""
         if not self.split.final:
             left = self._left() - self.split.after
-            each = max(1.0, round(left / len(recipe.fit), 1))
+            each = max(self.split.least_each, round(left / len(recipe.fit), 1))
+            late = each * len(recipe.fit) - left
+            if late > 1.0:
+                self._progress(f"time: generating took long; the run will be about {clock(late)} late")
             self._store(replace(self.split, training_each=each, final=True))
         fits = {name: _with_time(fit, self.split.training_each) for name, fit in recipe.fit.items()}
         return recipe.model_copy(update={"fit": fits})
@@ -205,6 +210,8 @@ class TimedRun:
             queries=queries,
             scale=scale,
             training_each=round(each, 1),
+            # A reduced draft gets half of its training at least.
+            least_each=whole.training / fits if scale >= 1.0 and whole.training else 0.5 * each,
             generating=round(start + whole.generating + more * recipe.generate.queries.spp * path, 1),
             after=round(whole.evaluating + whole.comparing + more * fits * QUERY_SECONDS, 1),
         )

@@ -14,6 +14,7 @@ import pytest
 from support.fake_runs import FakeRunner, run
 from support.paths import ROOT
 
+from mbtf_core import folders
 from mbtf_core.atomic import write_json
 from mbtf_core.errors import InputError
 from mbtf_core.stats import Estimate
@@ -162,6 +163,19 @@ def test_a_study_keeps_its_time_and_resumes(runners: list[FakeRunner], tmp_path:
     assert module.time_of(folder) == 150.0
     assert module.time_of(tmp_path / "none") == module.NEW_TIME
     assert second.measurements[2].error.value == first.measurements[2].error.value
+
+
+def test_a_study_states_its_size_and_is_refused_if_the_disk_is_full(
+    runners: list[FakeRunner], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe, folder, said = load_recipe(RECIPE, []), tmp_path / "study", list[str]()
+    monkeypatch.setattr(folders.shutil, "disk_usage", lambda path: SimpleNamespace(free=1e6))
+    with pytest.raises(InputError, match=r"needs 72 MB; 1.0 MB are free\n.*--time"):
+        module.run_study(recipe, folder, seconds=150.0, announce=said.append)
+    assert not [path for path in folder.iterdir() if path.suffix != ".lock"]
+    assert not said
+    monkeypatch.undo()
+    assert module.disk_bytes(RUNS) == (module.TEST[0] + 2 * 3000) * 68
 
 
 def test_other_seeds_and_materials_are_not_mixed(runners: list[FakeRunner], tmp_path: Path) -> None:

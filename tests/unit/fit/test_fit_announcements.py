@@ -1,0 +1,69 @@
+"""A long fit states its time and size before it starts, and is refused where it does not fit on the disk."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from support.fit_data import parallax, write_data
+
+from mbtf_core import folders
+from mbtf_core.console import run
+from mbtf_core.lattice import Lattice
+from mbtf_fit.cli.app import app
+from mbtf_fit.config import FitConfig
+from mbtf_fit.training import fit as fits
+from mbtf_fit.training import forecast
+from mbtf_fit.training.forecast import fit_bytes, training_seconds
+
+
+@pytest.fixture(scope="module")
+def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_data(tmp_path_factory.mktemp("data") / "shards", parallax, train=6000, noise=0.01)
+
+
+def stop(*_: Any, **__: Any) -> Any:
+    raise KeyboardInterrupt
+
+
+def test_a_long_fit_states_time_and_size(
+    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(fits, "fit", stop)
+    out = tmp_path / "material"
+    assert run(app, [str(shards), "--time", "2min", "-o", str(out)]) == 130
+    # Loading and evaluation are included.
+    assert "expected: about 2:02, " in capsys.readouterr().err
+    assert run(app, [str(shards), "--time", "20s", "-o", str(out)]) == 130
+    assert "expected" not in capsys.readouterr().err
+    # Steps are timed.
+    monkeypatch.setattr(forecast, "LONG_FIT", 1)
+    monkeypatch.setattr(forecast, "_STEPS_PILOT", 0.05)
+    assert run(app, [str(shards), "--steps", "1000000", "--batch", "500", "-o", str(out)]) == 130
+    assert "expected: about " in capsys.readouterr().err
+    monkeypatch.setattr(folders.shutil, "disk_usage", lambda path: SimpleNamespace(free=1e4))
+    assert run(app, [str(shards), "-o", str(out)]) == 3
+    assert "10 kB are free" in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_steps_are_timed_where_they_take_long(shards: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    few = FitConfig.model_validate({"training": {"steps": 100, "batch": 500}})
+    assert training_seconds(few, shards) == (0.0, None)
+    monkeypatch.setattr(forecast, "_STEPS_PILOT", 0.05)
+    many = FitConfig.model_validate({"training": {"steps": 100_000, "batch": 500}})
+    seconds, partition = training_seconds(many, shards)
+    assert partition is not None
+    # Between a microsecond and a second a step.
+    assert 0.1 < seconds < 1e5
+
+
+def test_the_size_is_that_of_two_checkpoints(shards: Path, tmp_path: Path) -> None:
+    """Weights and two moments each, as one is written beside the one before."""
+    config = FitConfig.model_validate({"training": {"steps": 2, "batch": 500}})
+    fits.fit(config, shards, tmp_path / "material")
+    stored = (tmp_path / "material" / "weights.safetensors").stat().st_size
+    assert fit_bytes(config, Lattice(3)) == pytest.approx(6 * stored, rel=0.5)
+    assert fit_bytes(config, Lattice(10)) > 4e8
