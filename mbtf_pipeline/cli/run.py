@@ -73,6 +73,7 @@ def run(
         timed = TimedRun(
             recipe, seconds, output, command, console.note, quality=quality, assignments=own, began=began
         )
+        keep_on_interruption(f"the finished stages are kept in {timed.folder}")
         result = run_recipe(
             timed.recipe,
             timed.folder,
@@ -86,6 +87,7 @@ def run(
     from mbtf_pipeline.presets import preset_recipe
 
     loaded = preset_recipe(recipe, quality, own)
+    keep_on_interruption(f"the finished stages are kept in {output or loaded.folder}")
     expected = forecast_left(loaded, output or loaded.folder)
     if expected is not None:
         console.note(expected.describe())
