@@ -54,7 +54,7 @@ def find_data(arguments: Sequence[Path]) -> list[Path]:
             mine = sorted(p.parent for p in argument.glob(f"*/{MANIFEST_NAME}"))
         if not mine:
             raise InputError(
-                "holds no data sets", where=argument, hint="generate some: mbtf-gen ... -o FOLDER"
+                "contains no data sets", where=argument, hint="generate some: mbtf-gen ... -o FOLDER"
             )
         found += mine
     return found

@@ -74,7 +74,7 @@ def stored_queries(dataset: Dataset) -> QuerySample:
     manifest, files = dataset.manifest, finished_shards(dataset)
     if not files:
         raise InputError(
-            "holds no finished train shard yet",
+            "contains no finished train shard yet",
             where=dataset.folder,
             hint="run the mbtf-gen command that made the folder again: it resumes",
         )
