@@ -136,7 +136,7 @@ def make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"cannot be made ({error.strerror})", where=folder) from None
+        raise InputError(f"cannot be created ({error.strerror})", where=folder) from None
 
 
 def other_configuration(

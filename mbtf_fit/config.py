@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, PlainSerializer, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, model_validator
 
 from mbtf_core.config_file import Settings, deep_merge
 from mbtf_core.digest import data_sha256
@@ -159,11 +159,17 @@ class DataSection(Settings):
     )
 
 
+def _on_disk(point: tuple[float, float]) -> tuple[float, float]:
+    if point[0] ** 2 + point[1] ** 2 >= 1.0:
+        raise ValueError("must lie within the unit disk: x² + y² below 1")
+    return point
+
+
 class HeldOutSection(Settings):
     """Queries of the train split that are held out for validation."""
 
     queries: float = Field(0.01, ge=0, lt=0.5, description="fraction of the queries, selected at random")
-    direction: tuple[float, float] = Field(
+    direction: Annotated[tuple[float, float], AfterValidator(_on_disk)] = Field(
         (0.45, 0.3), description="center (x, y) of the held-out region on the projected disk"
     )
     radius: float = Field(

@@ -128,9 +128,7 @@ def load_training(
     shards = data.shards("train")
     total = sum(shard.rows for shard in shards)
     if total == 0:
-        raise InputError(
-            "its train split holds no queries", where=data.folder, hint="generate more: --queries"
-        )
+        raise InputError("its train split has no queries", where=data.folder, hint="generate more: --queries")
     if data.layout == "image":
         return _load_images(data, shards, held_out, seed)
     streamed = memory is None or total * QUERY_BYTES > memory
@@ -233,5 +231,5 @@ def load_split(data: Dataset, split: Split, limit: int | None = None) -> ShardQu
         if left is None or left > 0:
             parts.append(read_checked(shard).flat().take(slice(left)))
     if not parts or not sum(map(len, parts)):
-        raise InputError(f"its {split} split holds no queries", where=data.folder)
+        raise InputError(f"its {split} split has no queries", where=data.folder)
     return ShardQueries.join(parts)

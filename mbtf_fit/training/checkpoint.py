@@ -46,7 +46,7 @@ def read_checkpoint(trainer: Trainer, path: Path) -> None:
         trainer.progress = Progress(int(step), float(seconds), float(loss))
     except (InputError, KeyError, TypeError, ValueError, RuntimeError):
         raise InputError(
-            "is no checkpoint of this fit: corrupt, or of an older version",
+            "is not a checkpoint of this fit: corrupt, or of an older version",
             where=path,
             hint="remove it: the same command then starts from the beginning",
         ) from None

@@ -56,7 +56,7 @@ def find_data(arguments: Sequence[Path]) -> list[Path]:
             mine = sorted(path for path in argument.iterdir() if path.is_dir() and is_dataset(path))
         if not mine:
             raise InputError(
-                "holds no data sets", where=argument, hint="generate some: mbtf-gen ... -o FOLDER"
+                "contains no data sets", where=argument, hint="generate some: mbtf-gen ... -o FOLDER"
             )
         found += mine
     return found

@@ -163,7 +163,7 @@ def _kind(path: Path) -> str:
         raise InputError("is empty", where=path)
     found = next((kind for magic, kind in _MAGIC.items() if start.startswith(magic)), None)
     if found is None:
-        raise InputError(f"is no {named} image", where=path)
+        raise InputError(f"is not a valid {named} image", where=path)
     if found != named:
         suffix = next(s for s, kind in _KINDS.items() if kind == found)
         raise InputError(f"contains {found} data", where=path, hint=f"rename it to {path.stem}{suffix}")
@@ -225,11 +225,11 @@ def _from_npy(path: Path) -> Image:
         what = "cannot be read as an npy array: it is damaged, cut short, or holds Python objects"
         raise InputError(what, where=path) from None
     if array.ndim not in (2, 3) or (array.ndim == 3 and not 1 <= array.shape[2] <= 4):
-        raise InputError(f"has the shape {array.shape}; (H, W) or (H, W, 1..4) is wanted", where=path)
+        raise InputError(f"has the shape {array.shape}; (H, W) or (H, W, 1..4) is expected", where=path)
     _check_size(array.shape[0], array.shape[1], path)
     if array.dtype.kind == "f" or array.dtype in (np.uint8, np.uint16):
         return _decoded(array, path)
-    raise InputError(f"contains {array.dtype} numbers; uint8, uint16 or floats are wanted", where=path)
+    raise InputError(f"contains {array.dtype} numbers; uint8, uint16 or floats are expected", where=path)
 
 
 def _from_pillow(path: Path, kind: str) -> Image:
@@ -329,6 +329,6 @@ def gray(image: Image) -> tuple[NDArray[np.float64], list[str]]:
     tolerance = _GRAY_CODES if image.bits == 8 else 1e-4 * float(np.abs(rgb).max())
     if spread > tolerance:
         warnings.append(
-            f"{image.path}: is colored where one number per pixel is wanted; its luminance is used"
+            f"{image.path}: is colored where one number per pixel is expected; its luminance is used"
         )
     return rgb.astype(np.float64) @ np.asarray(LUMINANCE), warnings

@@ -48,7 +48,7 @@ def read_tiff(path: Path, check_size: Callable[[int, int, Path], None]) -> NDArr
                 return None if page.bitspersample < 8 else _refuse(f"{page.bitspersample}-bit", path)
             if page.dtype.kind == "f" or page.dtype in (np.uint8, np.uint16):
                 if not 1 <= channels <= 4 or page.imagedepth != 1:
-                    raise InputError(f"has {channels} channels; 1 to 4 are wanted", where=path)
+                    raise InputError(f"has {channels} channels; 1 to 4 are expected", where=path)
                 # Missing strips or tiles of a truncated file would be read as zeros.
                 ends = (o + n for o, n in zip(page.dataoffsets, page.databytecounts, strict=True))
                 if not page.is_contiguous and any(end > path.stat().st_size for end in ends):

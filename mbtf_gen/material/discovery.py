@@ -120,7 +120,7 @@ def find_maps(folder: Path) -> FoundMaps:
     files = _images(folder)
     if not files:
         raise InputError(
-            "the folder holds no image",
+            "the folder contains no image",
             where=folder,
             hint=_elsewhere(folder) or f"a height map is required ({', '.join(SUFFIXES)})",
         )

@@ -256,7 +256,7 @@ def described(path: Path) -> tuple[MaterialFile, Path, FoundMaps]:
         return read_material_file(path), path.parent, FoundMaps()
     if not is_image(path):
         raise InputError(
-            f"'{path.suffix}' is no height map",
+            f"'{path.suffix}' is not a height map",
             where=path,
             hint=unpack(path) or f"give a folder, a .yaml file, or {', '.join(SUFFIXES)}",
         )
@@ -439,7 +439,7 @@ def _bsdf_file(name: str, load: MapLoader) -> Path:
         path = (load.folder / name).resolve()
         found = path.is_file()
     except (OSError, ValueError):
-        raise InputError("the bsdf names a file that cannot be", where=load.folder) from None
+        raise InputError("the bsdf names a file whose name is not valid", where=load.folder) from None
     if not found:
         raise InputError("no such file (named in the bsdf)", where=path, hint=suggest_path(path))
     load.files[f"bsdf.{sum(role.startswith('bsdf.') for role in load.files)}"] = path

@@ -30,8 +30,8 @@ LAYOUT = 6
 
 _TABLE = """
 {%- set below = t.head[-1] == "command" %}
-<table><thead><tr>{% for h in (t.head[:-1] if below else t.head) %}<th>{{ h }}</th>{% endfor %}</tr></thead>
-<tbody>
+{%- set head = t.head[:-1] if below else t.head %}
+<table><thead><tr>{% for h in head %}<th>{{ h }}</th>{% endfor %}</tr></thead><tbody>
 {% for row in t.rows %}<tr>
 {%- for cell in row %}
 {%- if below and loop.last %}</tr>

@@ -61,7 +61,7 @@ def stored_queries(dataset: Dataset) -> QuerySample:
     manifest, shards = dataset.manifest, dataset.shards("train", finished_only=True)
     if not shards:
         raise InputError(
-            "holds no finished train shard yet",
+            "contains no finished train shard yet",
             where=dataset.folder,
             hint="run the mbtf-gen command that made the folder again: it resumes",
         )

@@ -62,7 +62,7 @@ def test_data_sets_come_from_folders_folders_of_folders_and_lists(tmp_path: Path
     names = [p.relative_to(tmp_path).as_posix() for p in find_data([tmp_path / "x", tmp_path / "list.txt"])]
     assert names == ["x/one", "x/two", "three", "x/one"]
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match="holds no data sets"):
+    with pytest.raises(InputError, match="contains no data sets"):
         find_data([tmp_path / "empty"])
 
 

@@ -236,3 +236,12 @@ def test_a_failing_sync_is_partial(
     with pytest.raises(PartialError, match=os.strerror(number)):
         atomic.write_text(tmp_path / "a", "text")
     assert no_leftovers(tmp_path)
+
+
+def test_write_errors_of_openexr_are_those_of_the_system(tmp_path: Path) -> None:
+    def write(temporary: Path) -> None:
+        raise RuntimeError(f'Cannot write image file "{temporary}". No space left on device.')
+
+    with pytest.raises(PartialError, match=r"a\.exr: cannot be written \(No space left on device\)"):
+        atomic.write_through(tmp_path / "a.exr", write)
+    assert not list(tmp_path.iterdir())

@@ -69,7 +69,7 @@ def test_files_of_others_are_refused(tmp_path: Path, name: str) -> None:
         check_folder(tmp_path, is_ours, "record")
     with pytest.raises(InputError, match="is a file, not a folder"):
         check_folder(tmp_path / name, is_ours, "record")
-    with pytest.raises(InputError, match="cannot be made"):
+    with pytest.raises(InputError, match="cannot be created"):
         make_folder(tmp_path / name / "below")
 
 

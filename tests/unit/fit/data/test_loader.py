@@ -123,14 +123,14 @@ def test_large_finite_values_are_no_fault(tmp_path: Path) -> None:
 
 
 def test_nothing_to_train_on_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="holds no queries"):
+    with pytest.raises(InputError, match="has no queries"):
         partition(write_data(tmp_path / "none", parallax, train=0, shards=0))
-    with pytest.raises(InputError, match="holds no queries"):
+    with pytest.raises(InputError, match="has no queries"):
         partition(write_data(tmp_path / "empty", parallax, train=0, shards=1))
     folder = write_data(tmp_path / "all", parallax, train=100)
     with pytest.raises(InputError, match="held out"):
         partition(folder, held_out=HeldOutSection(direction=(0, 0), radius=0.999, queries=0.4))
-    with pytest.raises(InputError, match="test split holds no queries"):
+    with pytest.raises(InputError, match="test split has no queries"):
         load_split(Dataset.open(write_data(tmp_path / "t", parallax, train=9, test=0)), "test")
 
 

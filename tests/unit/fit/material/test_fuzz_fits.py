@@ -149,7 +149,7 @@ def test_a_checkpoint_of_something_else(content: bytes, shards: Path, tmp_path: 
     for name in (DESCRIPTION, WEIGHTS):
         (out / name).unlink()
     (out / "checkpoint.safetensors").write_bytes(content)
-    with pytest.raises(InputError, match="is no checkpoint of this fit") as caught:
+    with pytest.raises(InputError, match="is not a checkpoint of this fit") as caught:
         fit(CONFIG, shards, out)
     # The hint cures.
     (out / "checkpoint.safetensors").unlink()

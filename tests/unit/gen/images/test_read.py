@@ -148,8 +148,8 @@ def test_files_that_are_no_images(tmp_path: Path) -> None:
     cases = {
         "missing.png": (None, "no such file"),
         "empty.png": (b"", "is empty"),
-        "text.png": (b"hello, this is text", "is no PNG image"),
-        "text.exr": (b"hello, this is text", "is no EXR image"),
+        "text.png": (b"hello, this is text", "is not a valid PNG image"),
+        "text.exr": (b"hello, this is text", "is not a valid EXR image"),
         "notes.txt": (b"hello", "'.txt' is not an image format"),
         "none": (b"hello", "'' is not an image format"),
         "jpeg.png": (b"\xff\xd8\xff\xe0rest", "contains JPEG data"),

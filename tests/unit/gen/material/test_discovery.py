@@ -92,10 +92,10 @@ class TestPacked:
 
 class TestOtherPlaces:
     def test_an_archive_is_to_be_unpacked(self, tmp_path: Path) -> None:
-        with pytest.raises(InputError, match="holds no image") as caught:
+        with pytest.raises(InputError, match="contains no image") as caught:
             find_maps(fill(tmp_path, "Rock.zip", "LICENSE.txt"))
         assert caught.value.hint == "unpack Rock.zip and give its folder"
-        with pytest.raises(InputError, match=r"'\.zip' is no height map") as caught:
+        with pytest.raises(InputError, match=r"'\.zip' is not a height map") as caught:
             load_material(tmp_path / "Rock.zip")
         assert caught.value.hint == "unpack Rock.zip and give its folder"
 
