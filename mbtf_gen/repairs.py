@@ -112,6 +112,8 @@ class Corruption:
         try:
             return verify(self.folder)
         except InputError as error:
+            if self._intact is not None:
+                raise
             return [Fault(MANIFEST_NAME, error.what, _AGAIN)]
 
     @cached_property

@@ -118,6 +118,8 @@ def _describe_repair(done: RepairResult, dry_run: bool) -> str:
         lines.append(f"{done.folder}: {' and '.join(done.documents)} {written} again")
     if not done.shards and not done.documents:
         lines.append(f"{done.folder}: nothing to repair")
+    if not done.complete and not dry_run:
+        lines.append(f"{done.folder}: unfinished; run the same command again")
     return "\n".join([*lines, *_describe_foreign(Path(done.folder), done.foreign)])
 
 
