@@ -26,6 +26,7 @@ from pydantic import (
 )
 
 from mbtf_core.errors import InputError, MbtfError, UsageError, reason
+from mbtf_core.nested import leaves, merge, nested
 from mbtf_core.suggest import refuse_special, suggest_path
 from mbtf_core.validation_messages import explain, models_in, parts_of
 
@@ -327,49 +328,13 @@ def _parse_assignment(text: str) -> tuple[str, Any]:
 
 def _contradiction(model: type[Settings], data: Mapping[str, Any]) -> tuple[str, str] | None:
     """The first two keys of nested data that the model declares exclusive, at any depth."""
-    given = [key for key, value in _leaves(data) if value is not None]
+    given = [key for key, value in leaves(data) if value is not None]
     for key in given:
         for first, second in model.exclusive:
             other = key.removesuffix(first) + second
             if f".{key}".endswith(f".{first}") and other in given:
                 return key, other
     return None
-
-
-def _leaves(data: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in data.items():
-        if isinstance(value, Mapping):
-            yield from _leaves(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
-
-
-def merge(base: Any, path: Sequence[str], value: Any) -> None:
-    """Set ``base[path[0]][path[1]]… = value`` in nested mappings, making sections as needed."""
-    for part in path[:-1]:
-        if not isinstance(base.get(part), Mapping):
-            base[part] = {}
-        base = base[part]
-    base[path[-1]] = value
-
-
-def nested(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Options by dotted name as nested mappings."""
-    out: dict[str, Any] = {}
-    for name, value in options.items():
-        merge(out, name.split("."), value)
-    return out
-
-
-def deep_merge(base: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """A new mapping: `base`, overridden by `given` section by section."""
-    out = dict(base)
-    for key, value in given.items():
-        under = out.get(key)
-        if isinstance(under, Mapping) and isinstance(value, Mapping):
-            value = deep_merge(under, value)
-        out[key] = value
-    return out
 
 
 def resolve(

@@ -7,8 +7,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, model_validator
 
-from mbtf_core.config_file import Settings, deep_merge
+from mbtf_core.config_file import Settings
 from mbtf_core.digest import data_sha256
+from mbtf_core.nested import deep_merge
 from mbtf_core.options import Flag
 from mbtf_core.units import format_duration, format_size, parse_duration, parse_size
 

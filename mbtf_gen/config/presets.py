@@ -12,7 +12,8 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from mbtf_core.config_file import merge, read_yaml
+from mbtf_core.config_file import read_yaml
+from mbtf_core.nested import merge
 
 Quality = Literal["draft", "standard", "high", "paper"]
 QualityOption = Annotated[

@@ -9,8 +9,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
-from mbtf_core.config_file import Settings, build, deep_merge, read_yaml, resolve
+from mbtf_core.config_file import Settings, build, read_yaml, resolve
 from mbtf_core.errors import InputError
+from mbtf_core.nested import deep_merge
 from mbtf_pipeline.compare.st_lpips import weights_file
 from mbtf_pipeline.recipe import Name, Recipe
 
