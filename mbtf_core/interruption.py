@@ -148,6 +148,15 @@ def raising() -> Iterator[None]:
             signal.signal(number, signal.default_int_handler if handler is None else handler)
 
 
+def reinstall_handlers() -> None:
+    """Install Python's handlers again. After rendering with an integrator that is written in Python, Mitsuba
+    leaves its own one behind, which ignores SIGINT: the inner of nested handlers restores the outer one."""
+    if threading.current_thread() is threading.main_thread():
+        for number in SIGNALS:
+            if callable(handler := signal.getsignal(number)):
+                signal.signal(number, handler)
+
+
 @contextlib.contextmanager
 def stop_on_interruption() -> Iterator[threading.Event]:
     """An event that the first signal sets, instead of an exception, so that work ends after its current step;

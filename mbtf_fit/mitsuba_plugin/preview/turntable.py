@@ -9,6 +9,7 @@ shrink towards the poles, where footprints exceed them. Tiles on the plate are a
 
 from __future__ import annotations
 
+import signal
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -18,6 +19,7 @@ import mitsuba as mi
 import numpy as np
 
 from mbtf_core.directions import from_angles
+from mbtf_core.interruption import reinstall_handlers
 from mbtf_fit.mitsuba_plugin.material_arrays import F32
 from mbtf_fit.mitsuba_plugin.preview.config import TurntableSection
 from mbtf_gen.render.types import BSDF, Scene
@@ -131,6 +133,9 @@ def frames(bsdf: BSDF, section: TurntableSection) -> Iterator[F32]:
             parameters[f"{name}.to_world"] = mi.Transform4f(to_world)
         parameters.update()
         picture = mi.render(scene, integrator=integrator, spp=section.spp, seed=frame)
+        reinstall_handlers()
+        if integrator.should_stop():
+            signal.raise_signal(signal.SIGINT)
         dr.eval(picture)
         yield np.array(picture, np.float32)
 

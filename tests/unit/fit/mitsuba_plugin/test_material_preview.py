@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from support.plugin_materials import write_material
 from support.scenes import mi
 
 import mbtf_fit.mitsuba_plugin
+from mbtf_core import interruption
 from mbtf_core.config_file import resolve
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import EngineError, UsageError
@@ -115,6 +117,16 @@ def test_rotation_changes_patterned_materials_only(tmp_path: Path) -> None:
     )
     turned = list(turntable.frames(patterned, section.model_copy(update={"tiles": 2})))
     assert np.abs(turned[1] - turned[0]).mean() > 0.12 * turned[0].mean()
+
+
+def test_a_signal_after_a_frame_interrupts(tmp_path: Path) -> None:
+    """Mitsuba's own handler, which ignores the signal, may stay behind after an integrator in Python."""
+    section = TurntableSection(frames=3, size=16, spp=1, tiles=1)
+    with interruption.raising():
+        pictures = turntable.frames(white(tmp_path), section)
+        next(pictures)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
 
 
 def test_the_animation_repeats_and_keeps_its_frames(tmp_path: Path) -> None:
