@@ -19,9 +19,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy.ndimage
-import scipy.special
-import scipy.stats
 from numpy.typing import NDArray
 
 from mbtf_gen.images.resample import resample
@@ -47,14 +44,19 @@ class _Layer:
 
     @classmethod
     def of_ranks(cls, image: Floats) -> _Layer:
+        from scipy.special import ndtri
+        from scipy.stats import rankdata
+
         flat = image.reshape(-1, image.shape[-1])
-        ranks = scipy.stats.rankdata(flat, axis=0)
-        return cls(scipy.special.ndtri((ranks - 0.5) / len(flat)).reshape(image.shape), np.sort(flat, axis=0))
+        ranks = rankdata(flat, axis=0)
+        return cls(ndtri((ranks - 0.5) / len(flat)).reshape(image.shape), np.sort(flat, axis=0))
 
     def result(self) -> Floats:
         if self.histogram is None:
             return self.values
-        ranks = scipy.special.ndtr(self.values) * len(self.histogram) - 0.5
+        from scipy.special import ndtr
+
+        ranks = ndtr(self.values) * len(self.histogram) - 0.5
         at = np.arange(len(self.histogram))
         channels = [np.interp(ranks[..., c], at, self.histogram[:, c]) for c in range(ranks.shape[-1])]
         return np.stack(channels, axis=-1)
@@ -123,9 +125,11 @@ def _shifted(image: Floats, axis: int, shift: float) -> Floats:
     texels = shift * image.shape[axis]
     if texels == round(texels):
         return np.roll(image, round(texels), axis)
+    from scipy.ndimage import shift as interpolate
+
     offset = np.zeros(3)
     offset[axis] = texels
-    return scipy.ndimage.shift(image, offset, order=3, mode="grid-wrap")
+    return interpolate(image, offset, order=3, mode="grid-wrap")
 
 
 def _correlation(f: Floats, g: Floats, mean: Floats, weight: Floats) -> Floats:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+from itertools import pairwise
 from pathlib import Path
 
 from support.documented import in_blocks
@@ -45,8 +46,9 @@ def test_inputs_exist_and_no_output_folder_belongs_to_two_commands() -> None:
         for shown in in_blocks(page.read_text(), page.name):
             words = shlex.split(shown.text)
             output = output_of(words)
+            written = [after for flag, after in pairwise(words) if flag == "--write"]
             for word in words[1:]:
-                new = word != output and word not in made and not (ROOT / word).exists()
+                new = word not in (output, *written) and word not in made and not (ROOT / word).exists()
                 if new and word.endswith(("/", ".txt", ".yaml")):
                     faults.append(f"{shown.where}: {shown.text}: nothing made {word}")
             if output and made.setdefault(output, configuration(shown.text)) != configuration(shown.text):

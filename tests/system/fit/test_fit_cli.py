@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from conftest import RunPython
+from support.datasets import edit
 from support.fit_data import parallax, write_data
 from support.invalid_inputs import call
 
@@ -117,9 +118,8 @@ def test_data_of_another_material_cause_a_warning(tmp_path: Path, run_python: Ru
     made = {}
     for name, digest in (("own", "1"), ("other", "2")):
         made[name] = write_data(tmp_path / name, parallax, train=2000, test=500)
-        path = made[name] / "manifest.json"
         inputs = {"height": digest, "settings": "same"}
-        path.write_text(json.dumps({**json.loads(path.read_text()), "inputs": inputs}))
+        edit(made[name] / "manifest.json", lambda manifest, inputs=inputs: manifest.update(inputs=inputs))
     fitted = tmp_path / "fitted"
     done = run_python("-m", "mbtf_fit", str(made["own"]), "-o", str(fitted), *QUICK)
     assert done.returncode == 0, done.stderr

@@ -89,7 +89,7 @@ def test_json_is_one_object(app: App, capsys: pytest.CaptureFixture[str]) -> Non
     [
         (InputError("is empty", where="a.npy", hint="fill it"), "a.npy: is empty; fill it", 3),
         (PartialError("2 of 3 failed"), "2 of 3 failed", 4),
-        (KeyboardInterrupt(), "interrupted", 130),
+        (KeyboardInterrupt(), "interrupted; run the same command again", 130),
         (OSError(28, "No space left on device"), "No space left on device", 3),
     ],
 )

@@ -68,7 +68,7 @@ def test_the_limit_of_the_displacement_range_can_be_raised(tmp_path: Path) -> No
     assert raised.grid.displacement_range == 200.0
     assert Job.prepare(config(height_scale=0.4)).grid.displacement_range == 80.0
     # The limit does not change the data.
-    assert raised.config_hash == Job(config(), raised.material).config_hash
+    assert raised.config_hash == Job.of(config(), raised.material).config_hash
 
 
 def test_too_many_shards_are_refused(heights: Path) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from safetensors.numpy import load_file
+from support.datasets import edit
 from support.fit_data import constant, parallax, random_queries, write_data
 
 import mbtf_fit.material.material
@@ -41,9 +42,7 @@ def fitted(data: Path, tmp_path_factory: pytest.TempPathFactory) -> FitResult:
 
 def test_a_fit_states_the_lowest_direction_of_its_data(tmp_path: Path) -> None:
     folder = write_data(tmp_path / "d", constant(0.25))
-    path = folder / "manifest.json"
-    manifest = json.loads(path.read_text())
-    path.write_text(json.dumps(manifest | {"config": {"queries": {"min_cos": 0.3}}}))
+    edit(folder / "manifest.json", lambda manifest: manifest.update(config={"queries": {"min_cos": 0.3}}))
     assert fit(config(), folder, tmp_path / "m").material.description["data"]["min_cos"] == 0.3
 
 

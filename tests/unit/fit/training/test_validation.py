@@ -10,8 +10,8 @@ from mbtf_fit.training.validation import describe_record
 @pytest.mark.parametrize(
     ("value", "error", "text"),
     [
-        (0.25, 0.01, ", unexplained 0.250 ± 0.010, "),
-        (0.25, None, ", unexplained 0.250 ± ?, "),
+        (0.25, 0.01, ", validation error 0.250 ± 0.010, "),
+        (0.25, None, ", validation error 0.250 ± ?, "),
         (None, None, "0, 2"),
     ],
 )

@@ -125,11 +125,15 @@ class TestWrite:
     def test_a_bsdf_keeps_its_textures(self, maps: Path) -> None:
         text = (
             "height: height.png\n"
-            "bsdf: {type: diffuse, reflectance: {type: bitmap, filename: color.npy, raw: true}}\n"
+            "bsdf: {type: diffuse, reflectance: {type: bitmap, filename: height.png, raw: true}}\n"
         )
         (maps / "material.yaml").write_text(text)
         content = written(maps, file="../rock.yaml")
-        assert content["bsdf"]["reflectance"] == {"type": "bitmap", "filename": "maps/color.npy", "raw": True}
+        assert content["bsdf"]["reflectance"] == {
+            "type": "bitmap",
+            "filename": "maps/height.png",
+            "raw": True,
+        }
         # The seams stay: the textures could not follow.
         assert content["make_tileable"] == "none"
 
