@@ -7,6 +7,7 @@ signal, or one during an import, ends it at once: files are absent or complete a
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import os
 import signal
@@ -52,11 +53,18 @@ def handle_signals() -> None:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _handle)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
+    # Called last. While it ends, the interpreter restores default actions, but not of ignored signals.
+    atexit.register(_ignore_signals)
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
     # Native code delays Python's handlers, but not these bytes.
     signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
     threading.Thread(target=_watch, args=(reader,), name="interruption", daemon=True).start()
+
+
+def _ignore_signals() -> None:
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
 
 
 def _handle(number: int, frame: FrameType | None) -> None:

@@ -119,6 +119,15 @@ def test_a_signal_after_the_last_act_changes_nothing(tmp_path: Path) -> None:
     assert run_program(signal.SIGTERM, tmp_path, "-c", code).returncode == 4
 
 
+def test_a_signal_while_the_interpreter_ends_changes_nothing(tmp_path: Path) -> None:
+    """Objects of modules are removed after the interpreter has restored the default actions."""
+    late = "class Late:\n    def __del__(self, kill=os.kill, me=os.getpid(), number=number): kill(me, number)"
+    code = f"{SEND}\nimport mbtf_core.interruption as i\ni.handle_signals()\n"
+    code += f"number = int(os.environ['TEST_SIGNAL'])\n{late}\nlate = Late()\nsys.exit(i.finish(4))"
+    for number in interruption.SIGNALS:
+        assert run_program(number, tmp_path, "-c", code).returncode == 4
+
+
 def test_work_stops_at_a_step_and_then_as_usual(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(interruption._State, "received", 0)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
