@@ -101,6 +101,15 @@ def _check_same(job: Job, folder: Path) -> None:
     old = _check_format(folder / MANIFEST_NAME)
     if old.get("config_hash") == job.config_hash:
         read_manifest(folder)
+        for path in sidecars(folder):
+            try:
+                found = read_checksummed(path).get("config_hash")
+            except InputError:  # rendered again
+                continue
+            # Rendering would overwrite files of another run.
+            if found != job.config_hash:
+                what = f"{path.stem} belongs to another data set than {MANIFEST_NAME}"
+                raise InputError(what, where=folder, hint=f"move it away, or see: mbtf-gen repair {folder}")
         return
     config = old["config"] if isinstance(old.get("config"), dict) else {}
     before = {**config, "inputs": old.get("inputs", {}), "schema": old.get("schema")}

@@ -192,6 +192,17 @@ def test_a_finished_run_renders_nothing(
     assert before == {p.name: (p.stat().st_mtime_ns, p.read_bytes()) for p in out.iterdir()}
 
 
+def test_a_shard_of_another_run_is_not_overwritten(config: GeneratorConfig, out: Path) -> None:
+    generate(config, out)
+    generate(changed(config, light={"width": 2.0}), out.with_name("other"))
+    for name in ("train-00000.npz", "train-00000.json"):
+        (out / name).write_bytes((out.with_name("other") / name).read_bytes())
+    before = listing(out)
+    with pytest.raises(InputError, match="train-00000 belongs to another data set"):
+        generate(config, out)
+    assert listing(out) == before
+
+
 @pytest.mark.parametrize("done", range(4))
 def test_an_interrupted_run_resumes(
     config: GeneratorConfig, engine: Formula, tmp_path: Path, done: int, out: Path
