@@ -57,11 +57,8 @@ docs: $(INSTALLED)
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet -b html docs docs/_build/html
 	@echo "documentation: docs/_build/html/index.html"
 
-# One more than cores: some tests wait for other processes.
-WORKERS = $(shell $(BIN)/python -c "import os; print(min(8, (os.cpu_count() or 1) + 1))")
-
 test: lint
-	$(BIN)/python -m pytest -q -m "not slow" -n $(WORKERS) --dist worksteal
+	$(BIN)/python -m pytest -q -m "not slow" -n auto --maxprocesses 8 --dist worksteal
 	$(BIN)/mbtf-pipeline run pipelines/ci.yaml --force --quiet
 	$(MAKE) docs
 
