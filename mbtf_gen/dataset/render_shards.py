@@ -114,7 +114,6 @@ def render_shards(
         samples; finished shards are kept
     """
     start = time.perf_counter() if start is None else start
-    entries = list(entries)
     pending = {entry.file: entry for entry in entries}
     expected = _ExpectedPaths(job)
     total, own = ShardStatistics(), ShardStatistics()

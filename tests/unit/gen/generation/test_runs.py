@@ -1,101 +1,34 @@
-"""Generating a data set without tracing: folders, slices, resuming, several writers."""
+"""Generating a data set without tracing: folders, resuming, summaries."""
 
 from __future__ import annotations
 
-import dataclasses
 import json
-import os
 import shutil
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from support.datasets import formula
+from support.formula_runs import FILES, Formula, changed, cheap_plan, contents, left_of, listing
 
-from mbtf_core.atomic import checksummed, create_file
 from mbtf_core.errors import InputError, PartialError
-from mbtf_core.locks import shard_lock, take_lock
 from mbtf_gen import generation
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.dataset import render_shards
-from mbtf_gen.dataset.manifest import build_manifest
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.dataset.shard_io import read_shard
 from mbtf_gen.dataset.sidecar import sidecar_of
 from mbtf_gen.dataset.summary import finish
 from mbtf_gen.dataset.verify import verify
 from mbtf_gen.generation import generate, unfinished
-from mbtf_gen.job import Job, planned_paths, split_queries
-from mbtf_gen.planning.effects_plan import reference_plan
+from mbtf_gen.job import Job, split_queries
 from mbtf_gen.planning.run_plan import RunPlan
 from mbtf_gen.render.runtime import load_mitsuba
 
 load_mitsuba()
 
-from mbtf_gen.render.estimates import BadSample, Estimates  # noqa: E402
-
-SMALL = {
-    "queries": {"train": "100", "test": "30", "spp": 2, "test_spp": 4},
-    "output": {"shard_queries": 40},
-}
-FILES = ["train-00000.npz", "train-00001.npz", "train-00002.npz", "test-00000.npz"]
-
-
-class Formula:
-    """Replaces the estimator: values from a formula, and a list of the shards that it estimated."""
-
-    def __init__(self) -> None:
-        self.estimated: list[tuple[str, int]] = []
-        self.fail_at: int | None = None
-        self.bad = (BadSample(7, "direct light"),)
-        self.more = 1
-
-    def estimate(self, queries: Any, spp: int, stream: Any) -> Any:
-        if self.fail_at == len(self.estimated):
-            raise KeyboardInterrupt
-        self.estimated.append((stream.split, stream.shard))
-        value = formula(queries).astype(np.float32)
-        return Estimates(value, value, None, self.more * len(value) * spp, 1, 2, len(self.bad), self.bad)
-
-
-def cheap_plan(job: Job) -> RunPlan:
-    return RunPlan(reference_plan(job))
-
-
-@pytest.fixture(autouse=True)
-def engine(monkeypatch: pytest.MonkeyPatch) -> Formula:
-    fake = Formula()
-    monkeypatch.setattr(generation, "plan_run", cheap_plan)
-    monkeypatch.setattr(render_shards, "build_estimator", lambda job, plan: fake)
-    return fake
-
-
-@pytest.fixture
-def out(tmp_path: Path) -> Path:
-    return tmp_path / "out"
-
-
-@pytest.fixture
-def config(tmp_path: Path) -> GeneratorConfig:
-    np.save(tmp_path / "height.npy", np.random.default_rng(0).random((4, 8)))
-    return GeneratorConfig.model_validate({"material": str(tmp_path / "height.npy"), **SMALL})
-
-
-def changed(config: GeneratorConfig, **sections: dict[str, Any]) -> GeneratorConfig:
-    data = config.model_dump()
-    for name, section in sections.items():
-        data[name] = {**data[name], **section} if isinstance(section, dict) else section
-    return GeneratorConfig.model_validate(data)
-
-
-def listing(folder: Path) -> dict[str, bytes]:
-    return {p.name: p.read_bytes() for p in folder.iterdir()}
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {p.name: p.read_bytes() for p in folder.iterdir() if p.suffix == ".npz"}
+from mbtf_gen.render.estimates import BadSample  # noqa: E402
 
 
 def test_a_run_is_complete_and_counts(config: GeneratorConfig, out: Path) -> None:
@@ -333,11 +266,6 @@ def test_foreign_folders_are_refused_untouched(
     assert {p.name: p.read_text() for p in out.iterdir()} == files
 
 
-def left_of(job: Job, out: Path, *part: int) -> int:
-    """Paths of the shards that are not finished."""
-    return planned_paths(job, unfinished(job, out, *part))
-
-
 def test_paths_left_are_those_of_unfinished_shards(
     config: GeneratorConfig, engine: Formula, out: Path
 ) -> None:
@@ -361,135 +289,6 @@ def test_paths_left_are_those_of_unfinished_shards(
     image = Job.prepare(changed(config, queries={"layout": "image"}))
     assert split_queries(image, "train") == 4 * 32
     assert left_of(image, out) == 4 * 32 * 2 + 32 * 4
-
-
-def write_while_planning(patch: pytest.MonkeyPatch, out: Path, job: Job, plan: RunPlan) -> bytes:
-    """Let another process write this manifest while the next run plans."""
-    content = checksummed(build_manifest(job, plan))
-
-    def plan_run(job: Job) -> RunPlan:
-        out.mkdir()
-        assert create_file(out / "manifest.json", content)
-        return cheap_plan(job)
-
-    patch.setattr(generation, "plan_run", plan_run)
-    return content
-
-
-def test_the_second_writer_adopts_the_plan_of_the_first(
-    config: GeneratorConfig, monkeypatch: pytest.MonkeyPatch, out: Path
-) -> None:
-    job = Job.prepare(config)
-    other = RunPlan(dataclasses.replace(reference_plan(job), cap_bias_bound=0.125))
-    write_while_planning(monkeypatch, out, job, other)
-    assert generate(config, out).complete
-    assert json.loads((out / "manifest.json").read_text())["effects"] == other.effects.to_manifest()
-    assert other != cheap_plan(job)
-    assert verify(out) == []
-
-
-def test_a_concurrent_writer_of_another_data_set_is_refused(
-    config: GeneratorConfig, monkeypatch: pytest.MonkeyPatch, out: Path
-) -> None:
-    another = Job.prepare(changed(config, queries={"spp": 8}))
-    content = write_while_planning(monkeypatch, out, another, cheap_plan(another))
-    with pytest.raises(InputError, match=r"another configuration: queries\.spp"):
-        generate(config, out)
-    assert (out / "manifest.json").read_bytes() == content
-    assert not contents(out)
-
-
-def test_a_data_set_being_written_is_not_replaced(config: GeneratorConfig, out: Path) -> None:
-    generate(config, out)
-    before = listing(out)
-    with shard_lock(out / FILES[1]) as held:
-        assert held
-        with pytest.raises(PartialError, match="is being written by another process"):
-            generate(changed(config, seed=7), out, overwrite=True)
-    assert listing(out) == before
-    assert generate(changed(config, seed=7), out, overwrite=True).complete
-
-
-@pytest.mark.parametrize("count", [1, 2, 3, 5, 7])
-def test_slices_cover_every_shard_once(
-    count: int, config: GeneratorConfig, engine: Formula, tmp_path: Path, out: Path
-) -> None:
-    generate(config, tmp_path / "whole")
-    engine.estimated.clear()
-    for index in range(1, count + 1):
-        # What other slices have begun is kept.
-        summary = generate(config, out, slice_index=index, slice_count=count, overwrite=True)
-        assert summary.complete == (len(contents(out)) == len(FILES))
-    assert sorted(engine.estimated) == [("test", 0), ("train", 0), ("train", 1), ("train", 2)]
-    assert contents(out) == contents(tmp_path / "whole")
-    assert finish(out).complete
-
-
-def test_a_locked_shard_is_left_to_its_writer(config: GeneratorConfig, engine: Formula, out: Path) -> None:
-    engine.fail_at = 0
-    with pytest.raises(KeyboardInterrupt):
-        generate(config, out)
-    engine.fail_at = None
-    with shard_lock(out / FILES[1]) as held:
-        assert held
-        with pytest.raises(PartialError, match=rf"{FILES[1]} \(process {os.getpid()} on .*, for 0 s\)"):
-            generate(config, out)
-        assert sorted(contents(out)) == sorted(set(FILES) - {FILES[1]})
-    assert generate(config, out).complete
-
-
-@pytest.mark.parametrize("finished", [True, False])
-def test_the_run_that_ends_last_finishes_the_data_set(
-    finished: bool,
-    config: GeneratorConfig,
-    engine: Formula,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    out: Path,
-) -> None:
-    """Another process renders a shard at first; it finishes it, or ends without."""
-    whole = tmp_path / "whole"
-    generate(config, whole)
-    engine.estimated.clear()
-    out.mkdir()
-    lock = take_lock(out / FILES[1])
-    assert lock is not None
-    estimate = engine.estimate
-
-    def meanwhile(queries: Any, spp: int, stream: Any) -> Any:
-        if stream.split == "test":
-            for path in (out / FILES[1], sidecar_of(out / FILES[1])) if finished else ():
-                shutil.copy(whole / path.name, path)
-            lock.release()
-        return estimate(queries, spp, stream)
-
-    monkeypatch.setattr(engine, "estimate", meanwhile)
-    assert generate(config, out).complete
-    assert engine.estimated == [("train", 0), ("train", 2), ("test", 0), *[("train", 1)] * (not finished)]
-    assert contents(out) == contents(whole)
-    assert not list(out.glob(".*"))
-
-
-def test_a_shard_finished_before_its_lock_is_not_rendered(
-    config: GeneratorConfig, engine: Formula, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, out: Path
-) -> None:
-    """Between the check of a shard and its lock another process may finish it and release the lock."""
-    whole = tmp_path / "whole"
-    generate(config, whole)
-    engine.estimated.clear()
-    take = render_shards.take_lock
-
-    def late(path: Path) -> Any:
-        if path.name == FILES[1]:
-            for name in (path.name, sidecar_of(path).name):
-                shutil.copy(whole / name, out / name)
-        return take(path)
-
-    monkeypatch.setattr(render_shards, "take_lock", late)
-    assert generate(config, out).complete
-    assert engine.estimated == [("train", 0), ("train", 2), ("test", 0)]
-    assert contents(out) == contents(whole)
-    assert not list(out.glob(".*"))
 
 
 def test_the_sidecar_describes_the_shard(config: GeneratorConfig, out: Path) -> None:

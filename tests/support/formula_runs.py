@@ -1,0 +1,67 @@
+"""Runs of the generator without tracing: values from a formula, and small configurations."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.generation import unfinished
+from mbtf_gen.job import Job, planned_paths
+from mbtf_gen.planning.effects_plan import reference_plan
+from mbtf_gen.planning.run_plan import RunPlan
+from mbtf_gen.render.runtime import load_mitsuba
+from support.datasets import formula
+
+load_mitsuba()
+
+from mbtf_gen.render.estimates import BadSample, Estimates  # noqa: E402
+
+SMALL = {
+    "queries": {"train": "100", "test": "30", "spp": 2, "test_spp": 4},
+    "output": {"shard_queries": 40},
+}
+FILES = ["train-00000.npz", "train-00001.npz", "train-00002.npz", "test-00000.npz"]
+
+
+class Formula:
+    """Replaces the estimator: values from a formula, and a list of the shards that it estimated."""
+
+    def __init__(self) -> None:
+        self.estimated: list[tuple[str, int]] = []
+        self.fail_at: int | None = None
+        self.bad = (BadSample(7, "direct light"),)
+        self.more = 1
+
+    def estimate(self, queries: Any, spp: int, stream: Any) -> Any:
+        if self.fail_at == len(self.estimated):
+            raise KeyboardInterrupt
+        self.estimated.append((stream.split, stream.shard))
+        value = formula(queries).astype(np.float32)
+        return Estimates(value, value, None, self.more * len(value) * spp, 1, 2, len(self.bad), self.bad)
+
+
+def cheap_plan(job: Job) -> RunPlan:
+    return RunPlan(reference_plan(job))
+
+
+def changed(config: GeneratorConfig, **sections: dict[str, Any]) -> GeneratorConfig:
+    data = config.model_dump()
+    for name, section in sections.items():
+        data[name] = {**data[name], **section} if isinstance(section, dict) else section
+    return GeneratorConfig.model_validate(data)
+
+
+def listing(folder: Path) -> dict[str, bytes]:
+    return {p.name: p.read_bytes() for p in folder.iterdir()}
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {p.name: p.read_bytes() for p in folder.iterdir() if p.suffix == ".npz"}
+
+
+def left_of(job: Job, out: Path, *part: int) -> int:
+    """Paths of the shards that are not finished."""
+    return planned_paths(job, unfinished(job, out, *part))
