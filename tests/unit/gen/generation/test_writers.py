@@ -18,6 +18,7 @@ from mbtf_core.locks import shard_lock, take_lock
 from mbtf_gen import generation
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.dataset import render_shards
+from mbtf_gen.dataset.geometry import geometry_of, geometry_record
 from mbtf_gen.dataset.manifest import build_manifest
 from mbtf_gen.dataset.sidecar import sidecar_of
 from mbtf_gen.dataset.summary import finish
@@ -33,7 +34,8 @@ load_mitsuba()
 
 def write_while_planning(patch: pytest.MonkeyPatch, out: Path, job: Job, plan: RunPlan) -> bytes:
     """Let another process write this manifest while the next run plans."""
-    content = checksummed(build_manifest(job, plan))
+    record = geometry_record(geometry_of(job, plan.effects))
+    content = checksummed(build_manifest(job, plan, record))
 
     def plan_run(job: Job) -> RunPlan:
         out.mkdir()
