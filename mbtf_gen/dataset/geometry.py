@@ -268,7 +268,7 @@ def _check(geometry: Geometry, path: Path) -> None:
             raise InputError(f"'{name}' has another size than 'slope'", where=path)
         if not np.isfinite(array).all():
             raise InputError(f"'{name}' holds NaN or infinite numbers", where=path)
-        if spec.unit == "1" and not (0 <= array.min() and array.max() <= 1):
+        if spec.unit == "1" and not (array.min() >= 0 and array.max() <= 1):
             raise InputError(f"'{name}' holds numbers outside [0, 1]", where=path)
     if geometry.heights.max() != 0:
         raise InputError("the maximum of 'height' is not 0", where=path)

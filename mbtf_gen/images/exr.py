@@ -102,7 +102,7 @@ def read_channels(path: Path, max_pixels: int) -> dict[str, NDArray[Any]]:
 
 
 def read_parts(path: Path, max_pixels: int) -> dict[str, tuple[dict[str, Any], dict[str, NDArray[Any]]]]:
-    """Header and channels (H, W) of every part by its name, float16 or float32. Parts may have different sizes.
+    """Header and channels (H, W) of every part by its name, float16 or float32; their sizes may differ.
 
     Raises
     ------

@@ -340,6 +340,16 @@ def test_a_dry_run_changes_nothing(out: Path, capsys: pytest.CaptureFixture[str]
     assert f"{out}: config.yaml written again" in text
 
 
+def test_verify_tells_documents_from_shards(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (out / "geometry.exr").unlink()
+    (out / "test-00000.json").unlink()
+    capsys.readouterr()
+    assert generate(["verify", str(out)]) == 3
+    text = capsys.readouterr().out
+    assert f"{out}: 1 of 4 shards missing, first test-00000.npz" in text
+    assert f"{out / 'geometry.exr'}: is missing; repair it with: mbtf-gen repair {out}" in text
+
+
 def test_folders_without_a_data_set_are_refused(tmp_path: Path) -> None:
     for folder, message in ((tmp_path / "nowhere", "no such folder"), (tmp_path, r"no manifest\.json")):
         with pytest.raises(InputError, match=message):
