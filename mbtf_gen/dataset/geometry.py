@@ -100,7 +100,7 @@ def geometry_of(job: Job, plan: EffectsPlan) -> Geometry:
     )
     if material.bsdf is not None:
         return geometry
-    maps = {"base_color": _means(material.base_color, shape)}
+    maps: dict[str, Any] = {"base_color": _means(material.base_color, shape)}
     if plan.on("specular") or plan.on("metallic"):
         weights = {name: getattr(material, name) if plan.on(name) else 0.0 for name in _GLOSSY[1:]}
         shares = {"roughness": material.roughness, **weights}

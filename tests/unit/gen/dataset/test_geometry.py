@@ -117,12 +117,24 @@ def test_moments_keep_detail_below_a_texel(tmp_path: Path) -> None:
     """Waves of four periods per texel: no mean slope, variance a²/2, b²/2, and ab/2 for waves in step."""
     phase = 2 * np.pi * 64 * centers(256, 256)[0]
     a, b = 0.4, 0.15
+    # A displaced mesh of lower resolution takes nothing away.
+    heights = 1e-9 * np.random.default_rng(0).random(SQUARE)
     for sy, product in ((b * np.sin(phase), a * b / 2), (b * np.cos(phase), 0.0)):
         maps = {"normal": normals(np.broadcast_to(a * np.sin(phase), (256, 256)), sy)}
-        found = made(job_of(tmp_path, np.zeros(SQUARE), **maps))
+        found = made(job_of(tmp_path, heights, **maps))
         np.testing.assert_allclose(found.slopes, 0.0, atol=1e-6)
         expected = np.broadcast_to([a * a / 2, product, b * b / 2], (16, 16, 3))
         np.testing.assert_allclose(found.slope_moments, expected, atol=1e-6)
+
+
+def test_moments_keep_detail_of_a_mesh_under_a_coarser_map(tmp_path: Path) -> None:
+    """Four vertices per period: the central differences are 256 amplitudes at most."""
+    phase = 2 * np.pi * 64 * centers(256, 256)[0]
+    heights = np.broadcast_to(1e-3 * np.sin(phase), (256, 256))
+    found = made(job_of(tmp_path, heights, normal=normals(np.zeros(SQUARE), np.zeros(SQUARE))))
+    np.testing.assert_allclose(found.slopes, 0.0, atol=1e-6)
+    expected = np.broadcast_to([0.256**2 / 2, 0.0, 0.0], (16, 16, 3))
+    np.testing.assert_allclose(found.slope_moments, expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("mesh", [64, 256])
@@ -244,7 +256,7 @@ def test_what_is_written_is_read(full: Geometry, tmp_path: Path) -> None:
     path = tmp_path / "geometry.exr"
     digest = write_geometry(path, full)
     assert digest == hashlib.sha256(path.read_bytes()).hexdigest() == geometry_record(full)["sha256"]
-    bare = replace(full, roughness=None, metallic=None, specular=None, opacity=None, aspect=1 / 3 + 1 / 6)
+    bare = replace(full, roughness=None, metallic=None, specular=None, opacity=None, aspect=0.5 + 2**-40)
     for expected in (full, bare):
         write_geometry(path, expected)
         for name, value in vars(read_geometry(path)).items():
