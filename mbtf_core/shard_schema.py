@@ -11,9 +11,10 @@ from typing import Literal
 import numpy as np
 
 FORMAT_NAME = "mbtf-shards"
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 MANIFEST_NAME = "manifest.json"
 CONFIG_NAME = "config.yaml"
+GEOMETRY_NAME = "geometry.exr"
 
 Layout = Literal["shuffled", "image"]
 ArrayFormat = Literal["npz", "exr"]
@@ -80,6 +81,18 @@ ARRAYS: tuple[ArraySpec, ...] = (
     _array("transmittance", "", "1", "fraction of the footprint that rays pass through", optional=True),
 )
 ARRAY: dict[str, ArraySpec] = {a.name: a for a in ARRAYS}
+
+# Images of `GEOMETRY_NAME`. Means are over a texel; the optional ones are left out where they do not apply.
+GEOMETRY: tuple[ArraySpec, ...] = (
+    _array("height", "", "tile widths", "height z <= 0 of the mesh at its vertices, maximum 0"),
+    _array("slope", "x y", "rise per length", "mean slopes dz/dx and dz/dy of the shading normal"),
+    _array("slope_moment", "xx xy yy", "(rise per length)^2", "means of the products of these slopes"),
+    _array("base_color", "R G B", "1", "mean base color (linear Rec.709 RGB)", optional=True),
+    _array("roughness", "", "1", "mean roughness", optional=True),
+    _array("metallic", "", "1", "mean metallic", optional=True),
+    _array("specular", "", "1", "mean specular", optional=True),
+    _array("opacity", "", "1", "mean opacity", optional=True),
+)
 
 CONVENTIONS: dict[str, str] = {
     "tile": "the material's period; uv in [0,1)^2; position on the reference plane x = (u, a*v), "

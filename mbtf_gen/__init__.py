@@ -11,6 +11,7 @@ from typing import Any
 _PUBLIC = {
     "Camera": "mbtf_gen.pictures.camera",
     "Dataset": "mbtf_gen.dataset.reader",
+    "Geometry": "mbtf_gen.dataset.geometry",
     "GeneratorConfig": "mbtf_gen.config.generator",
     "Lattice": "mbtf_core.lattice",
     "LightKernel": "mbtf_gen.sampling.light_kernel",

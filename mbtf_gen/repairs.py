@@ -21,8 +21,17 @@ from mbtf_core.config_file import differences, dump_yaml, in_short, read_yaml
 from mbtf_core.digest import file_sha256
 from mbtf_core.errors import InputError, MbtfError
 from mbtf_core.locks import brief_lock
-from mbtf_core.shard_schema import CONFIG_NAME, FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, ShardEntry
+from mbtf_core.shard_schema import (
+    CONFIG_NAME,
+    FORMAT_NAME,
+    GEOMETRY_NAME,
+    MANIFEST_NAME,
+    SCHEMA_VERSION,
+    ShardEntry,
+)
 from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.dataset.folder import check_geometry
+from mbtf_gen.dataset.geometry import Geometry, geometry_of, geometry_record, write_geometry
 from mbtf_gen.dataset.manifest import build_manifest, plan_digest
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.dataset.render_shards import ProgressCallback, render_shards
@@ -33,7 +42,7 @@ from mbtf_gen.job import Job
 from mbtf_gen.planning.run_plan import RunPlan, plan_run
 
 _AGAIN = "generate the data set again, into another folder"
-_DOCUMENTS = (MANIFEST_NAME, CONFIG_NAME)
+_DOCUMENTS = (MANIFEST_NAME, CONFIG_NAME, GEOMETRY_NAME)
 
 
 @dataclass(frozen=True)
@@ -49,7 +58,7 @@ class RepairResult:
     shards : list of str
         Files of the shards that were rendered again.
     documents : list of str
-        Manifest and configuration, if they were written again.
+        Manifest, configuration and geometry, if they were written again.
     foreign : list of str
         Files in the folder that are no part of the data set; they are left alone.
     complete : bool
@@ -270,15 +279,27 @@ class Corruption:
 
     @cached_property
     def documents(self) -> list[str]:
-        """Manifest and configuration, if they have to be written again."""
+        """Manifest, configuration and geometry, if they have to be written again."""
         names = {f.file for f in self.faults if f.file in _DOCUMENTS and f.what != INCOMPLETE}
         if self._manifest is None or any(f.what == TWICE for f in self.faults):
+            restored = self._restored
+            digests = {CONFIG_NAME: restored["config_yaml"], GEOMETRY_NAME: restored["geometry"]["sha256"]}
+            for name, digest in digests.items():
+                path = self.folder / name
+                names |= {name} if not path.exists() or file_sha256(path) != digest else set()
             names.add(MANIFEST_NAME)
-        if self._manifest is None:
-            path = self.folder / CONFIG_NAME
-            restored = build_manifest(self.job, self.plan)["config_yaml"]
-            names |= {CONFIG_NAME} if not path.exists() or file_sha256(path) != restored else set()
+        elif GEOMETRY_NAME in names:
+            check_geometry(self.folder, self._geometry, self._manifest)
         return sorted(names, reverse=True)
+
+    @cached_property
+    def _geometry(self) -> Geometry:
+        return geometry_of(self.job, self.plan.effects)
+
+    @cached_property
+    def _restored(self) -> dict[str, Any]:
+        """The manifest as it was before any shard was rendered."""
+        return build_manifest(self.job, self.plan, geometry_record(self._geometry))
 
     @cached_property
     def entries(self) -> list[ShardEntry]:
@@ -302,13 +323,15 @@ class Corruption:
         if documents or entries:
             with brief_lock(path):
                 if MANIFEST_NAME in documents:
-                    write_checksummed(path, build_manifest(self.job, plan))
+                    write_checksummed(path, self._restored)
                 manifest = read_checksummed(path)
                 if entries and manifest["complete"]:
                     # Readers rely on this key, and rendering removes the corrupt shards.
                     write_checksummed(path, {**manifest, "complete": False, "summary": None})
                 if CONFIG_NAME in documents:
                     write_text(self.folder / CONFIG_NAME, dump_yaml(manifest["config"]))
+                if GEOMETRY_NAME in documents:
+                    write_geometry(self.folder / GEOMETRY_NAME, self._geometry)
         corrupt = {e.file for e in entries}
         result = render_shards(self.job, self.folder, entries, plan, corrupt=corrupt, progress=progress)
         return RepairResult(

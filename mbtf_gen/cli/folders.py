@@ -41,6 +41,7 @@ def verify(folder: Path, /, *, console: Console = CONSOLE) -> int:
     folder
         Folder of shards.
     """
+    from mbtf_core.shard_schema import GEOMETRY_NAME
     from mbtf_gen.dataset.reader import Dataset
     from mbtf_gen.dataset.sidecar import ABSENT
     from mbtf_gen.dataset.verify import foreign_files, verify
@@ -52,8 +53,9 @@ def verify(folder: Path, /, *, console: Console = CONSOLE) -> int:
     entries = [entry for split in dataset.splits for entry in dataset.entries(split)]
     files, foreign = [folder / entry.file for entry in entries], foreign_files(folder, entries)
     read = sum(path.stat().st_size for path in files if path.exists())
-    lines = [f"{folder / f.file}: {f.what}; {f.hint}" for f in faults if f.what not in ABSENT]
-    if absent := [f for f in faults if f.what in ABSENT]:
+    absent = [f for f in faults if f.what in ABSENT and folder / f.file in files]
+    lines = [f"{folder / f.file}: {f.what}; {f.hint}" for f in faults if f not in absent]
+    if absent:
         missing = f"{len(absent)} of {len(files)} shards missing, first {absent[0].file}"
         lines.insert(0, f"{folder}: {missing}; {absent[0].hint}")
     data = {
@@ -64,7 +66,8 @@ def verify(folder: Path, /, *, console: Console = CONSOLE) -> int:
         "faults": [asdict(f) for f in faults],
         "foreign": foreign,
     }
-    lines = lines or [f"{folder}: {len(files)} shards, all intact"]
+    known = "" if dataset.manifest["geometry"] is None else f" and {GEOMETRY_NAME}"
+    lines = lines or [f"{folder}: {len(files)} shards{known}, all intact"]
     console.report(data, "\n".join([*lines, *_describe_foreign(folder, foreign)]))
     console.note(f"{read / 1e6:.1f} MB read in {clock(seconds)} ({read / 1e6 / max(seconds, 1e-9):.0f} MB/s)")
     return EXIT_BAD_INPUT if faults else EXIT_OK
@@ -79,7 +82,7 @@ def repair(
     dry_run: DryRun = False,
     console: Console = CONSOLE,
 ) -> int:
-    """Generate missing and corrupt shards again; the data set is then identical to the original.
+    """Generate missing and corrupt files again; the data set is then identical to the original.
 
     Parameters
     ----------

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -21,15 +21,24 @@ from mbtf_core.config_file import differences, dump_yaml
 from mbtf_core.errors import InputError, PartialError
 from mbtf_core.folders import ELSEWHERE, check_folder, make_folder, other_configuration, remove_unfinished
 from mbtf_core.locks import brief_lock, lock_owner, shard_lock, take_lock
-from mbtf_core.shard_schema import CONFIG_NAME, FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, SPLITS
-from mbtf_gen.dataset.manifest import build_manifest
+from mbtf_core.shard_schema import (
+    CONFIG_NAME,
+    FORMAT_NAME,
+    GEOMETRY_NAME,
+    MANIFEST_NAME,
+    SCHEMA_VERSION,
+    SPLITS,
+)
+from mbtf_gen.dataset.geometry import Geometry, geometry_of, geometry_record, write_geometry
+from mbtf_gen.dataset.manifest import build_manifest, stored_plan
 from mbtf_gen.dataset.sidecar import repair_hint, sidecars
 from mbtf_gen.job import Job
 from mbtf_gen.planning.run_plan import RunPlan
 
 # Files that a run writes, unfinished files that a killed run leaves, and locks.
 _SHARD = rf"(?:{'|'.join(SPLITS)})-\d+"
-_OWN = re.compile(rf"{re.escape(MANIFEST_NAME)}|{re.escape(CONFIG_NAME)}|{_SHARD}\.(?:npz|exr|json)")
+_DOCUMENTS = "|".join(re.escape(name) for name in (MANIFEST_NAME, CONFIG_NAME, GEOMETRY_NAME))
+_OWN = re.compile(rf"{_DOCUMENTS}|{_SHARD}\.(?:npz|exr|json)")
 _UNFINISHED = re.compile(rf"\.({_OWN.pattern}){TEMPORARY}")
 _LOCK = re.compile(rf"\.({_SHARD}|{re.escape(Path(MANIFEST_NAME).stem)})\.lock")
 
@@ -73,20 +82,42 @@ def open_folder(job: Job, folder: Path, plan: Callable[[Job], RunPlan], overwrit
         _check_format(existing)
     elif present:
         _check_same(job, folder)
-        if (folder / CONFIG_NAME).exists():
+        if (folder / CONFIG_NAME).exists() and (folder / GEOMETRY_NAME).exists():
             return
     # Planning takes long: it comes before any change, and outside the lock.
-    content = checksummed(build_manifest(job, plan(job))) if replace or not existing.exists() else b""
+    content = b""
+    if replace or not existing.exists():
+        new = plan(job)
+        geometry = geometry_of(job, new.effects)
+        content = checksummed(build_manifest(job, new, geometry_record(geometry)))
+    else:
+        geometry = geometry_of(job, stored_plan(read_manifest(folder), existing).effects)
     if replace:
         _clear(folder)
     make_folder(folder)
     with brief_lock(existing):
-        remove_unfinished(folder, (MANIFEST_NAME, CONFIG_NAME))
+        remove_unfinished(folder, (MANIFEST_NAME, CONFIG_NAME, GEOMETRY_NAME))
         # The manifest comes first: it marks the folder as a data set, at whatever instant the run is killed.
         if content and not create_file(existing, content):
             _check_same(job, folder)
+            # The plan of the other writer may simulate other effects.
+            geometry = geometry_of(job, stored_plan(read_manifest(folder), existing).effects)
+        manifest = read_manifest(folder)
         if not (folder / CONFIG_NAME).exists():
-            write_text(folder / CONFIG_NAME, dump_yaml(read_manifest(folder)["config"]))
+            write_text(folder / CONFIG_NAME, dump_yaml(manifest["config"]))
+        if not (folder / GEOMETRY_NAME).exists():
+            check_geometry(folder, geometry, manifest)
+            write_geometry(folder / GEOMETRY_NAME, geometry)
+
+
+def check_geometry(folder: Path, geometry: Geometry, manifest: Mapping[str, Any]) -> None:
+    """An InputError unless a geometry is the one whose digest a manifest contains."""
+    if geometry_record(geometry)["sha256"] != manifest["geometry"]["sha256"]:
+        raise InputError(
+            "cannot be restored: this machine computes it differently",
+            where=folder / GEOMETRY_NAME,
+            hint="repair it on the machine that generated it, or generate the data set again",
+        )
 
 
 def _check_format(path: Path) -> dict[str, Any]:
@@ -129,16 +160,16 @@ def _locks(folder: Path) -> Iterator[Path]:
 
 def remove_leftovers(folder: Path) -> None:
     """Remove the locks and unfinished files of killed runs, unless a process holds the lock."""
-    general = Path(MANIFEST_NAME).stem
+    general, documents = Path(MANIFEST_NAME).stem, [CONFIG_NAME, GEOMETRY_NAME]
     stems = {path.stem for path in _locks(folder)}
     for path in folder.iterdir():
         if match := _UNFINISHED.fullmatch(path.name):
-            stems.add(general if match[1] == CONFIG_NAME else Path(match[1]).stem)
+            stems.add(general if match[1] in documents else Path(match[1]).stem)
     for stem in sorted(stems):
         with shard_lock(folder / f"{stem}.npz") as held:
             if held:
                 files = [f"{stem}{suffix}" for suffix in (".npz", ".exr", ".json")]
-                remove_unfinished(folder, [*files, *([CONFIG_NAME] if stem == general else [])])
+                remove_unfinished(folder, [*files, *(documents if stem == general else [])])
 
 
 def _clear(folder: Path) -> None:

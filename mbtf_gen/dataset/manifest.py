@@ -6,14 +6,22 @@ import hashlib
 import platform
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import Any
 
-from mbtf_core.config_file import dump_yaml
+from pydantic import BaseModel, field_validator
+
+from mbtf_core.config_file import check_document, dump_yaml
 from mbtf_core.digest import data_sha256
 from mbtf_core.lattice import sigma_of_level
 from mbtf_core.shard_schema import ARRAYS, CONVENTIONS, FORMAT_NAME, SCHEMA_VERSION, SPLITS
+from mbtf_gen.config.effects_request import EFFECTS
 from mbtf_gen.job import Job, split_queries, split_spp
+from mbtf_gen.planning.effects import EffectsPlan
 from mbtf_gen.planning.run_plan import RunPlan
+from mbtf_gen.planning.sample_allocation import Allocation
+
+CHECK_HINT = "check the data set with: mbtf-gen verify"
 
 
 def software_versions() -> dict[str, str]:
@@ -38,8 +46,29 @@ def plan_digest(manifest: Mapping[str, Any]) -> str:
     return data_sha256({**decided, "effects": on, "allocation": manifest.get("allocation")})
 
 
-def build_manifest(job: Job, plan: RunPlan) -> dict[str, Any]:
-    """Manifest of a data set without shards (``complete`` is false)."""
+class _Plan(BaseModel, allow_inf_nan=False):
+    """Keys of a manifest that a run needs, besides those that readers need."""
+
+    complete: bool
+    effects: EffectsPlan
+    allocation: Allocation | None
+
+    @field_validator("effects")
+    @classmethod
+    def _lists_all(cls, plan: EffectsPlan) -> EffectsPlan:
+        if [e.name for e in plan.effects] != list(EFFECTS):
+            raise ValueError("must list all effects")
+        return plan
+
+
+def stored_plan(manifest: Mapping[str, Any], path: Path) -> RunPlan:
+    """The run plan in a manifest, of the file `path`; an InputError where that is corrupt."""
+    found = check_document(_Plan, manifest, path, CHECK_HINT)
+    return RunPlan(found.effects, found.allocation)
+
+
+def build_manifest(job: Job, plan: RunPlan, geometry: Mapping[str, Any]) -> dict[str, Any]:
+    """Manifest of a data set without shards (``complete`` is false); `geometry` is its key of that name."""
     config, material, lattice = job.config, job.material, job.lattice
     plain = config.model_dump(mode="json")
     grid, queries = job.grid, job.query_plan
@@ -76,6 +105,7 @@ def build_manifest(job: Job, plan: RunPlan) -> dict[str, Any]:
             for a in ARRAYS
             if not a.optional or plan.effects.on("opacity")
         },
+        "geometry": dict(geometry),
         **plan.to_manifest(),
         "splits": {
             split: {

@@ -5,19 +5,21 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Annotated, Any, Literal, cast
 
 import numpy as np
 from pydantic import BaseModel, Field
 
 from mbtf_core.atomic import read_checksummed, read_json
 from mbtf_core.config_file import check_document, check_schema
+from mbtf_core.digest import file_sha256
 from mbtf_core.errors import InputError
 from mbtf_core.lattice import MAX_LEVEL, Lattice
 from mbtf_core.shard_schema import FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, Layout, ShardEntry, Split
 from mbtf_core.suggest import suggest_path
+from mbtf_gen.dataset.geometry import Geometry, read_geometry
 from mbtf_gen.dataset.shard_io import Arrays, check_values, column_means, read_shard
-from mbtf_gen.dataset.sidecar import ABSENT, read_sidecar, repair_hint, sidecar_of, sidecars
+from mbtf_gen.dataset.sidecar import ABSENT, CHANGED, read_sidecar, repair_hint, sidecar_of, sidecars
 
 _Count = Annotated[int, Field(strict=True, ge=0, lt=1 << 40)]
 _FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*\.(npz|exr)$", max_length=100)]
@@ -43,6 +45,11 @@ class _Tile(BaseModel):
     aspect: float = Field(gt=0, le=1e6, allow_inf_nan=False)
 
 
+class _Geometry(BaseModel):
+    file: Literal["geometry.exr"]
+    sha256: str
+
+
 class _Manifest(BaseModel):
     """Keys of a manifest that readers need; others are ignored."""
 
@@ -51,6 +58,7 @@ class _Manifest(BaseModel):
     levels: _Levels
     tile: _Tile
     splits: dict[str, _Split]
+    geometry: _Geometry | None
     patch_size: _Count | None = None
 
 
@@ -260,6 +268,33 @@ class Dataset:
             check_document(_Sidecar, record, sidecar_of(path), _MAKE_AGAIN)
             out.append(Shard(path, record, image))
         return out
+
+    def geometry(self) -> Geometry | None:
+        """Heights, slopes and reflectance of the surface, their digest checked.
+
+        Returns
+        -------
+        Geometry or None
+            None where the data set has none.
+
+        Raises
+        ------
+        InputError
+            The file is missing or is not the one that was written.
+        """
+        record = self.manifest["geometry"]
+        if record is None:
+            return None
+        path, hint = self.folder / record["file"], repair_hint(self.folder)
+        try:
+            changed = file_sha256(path) != record["sha256"]
+        except FileNotFoundError:
+            raise InputError(ABSENT[0], where=path, hint=hint) from None
+        except OSError as error:
+            raise InputError(f"cannot be read ({error.strerror})", where=path) from None
+        if changed:
+            raise InputError(CHANGED, where=path, hint=hint)
+        return read_geometry(path)
 
     def iterate(self, split: str, names: Iterable[str] | None = None) -> Iterator[Arrays]:
         """Arrays of each shard of a split in turn, memory-mapped if the format allows.

@@ -11,6 +11,8 @@ from mbtf_core.shard_schema import FORMAT_NAME, MANIFEST_NAME, SPLITS, ShardEntr
 
 # Faults of shards that are not rendered yet; an interrupted run leaves many of them.
 ABSENT = ("is missing", "is unfinished (no sidecar)")
+# A file whose bytes are not those that were written.
+CHANGED = "has changed since it was written (SHA-256 differs)"
 
 
 def repair_hint(folder: Path) -> str:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, PositiveInt, field_validator
+from pydantic import BaseModel, PositiveInt
 
 from mbtf_core.atomic import write_checksummed
 from mbtf_core.config_file import check_document
@@ -18,12 +18,10 @@ from mbtf_core.locks import brief_lock
 from mbtf_core.shard_schema import MANIFEST_NAME
 from mbtf_gen.config.effects_request import EFFECTS
 from mbtf_gen.dataset.folder import read_manifest, remove_leftovers
-from mbtf_gen.dataset.manifest import software_versions
+from mbtf_gen.dataset.manifest import CHECK_HINT, software_versions, stored_plan
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.dataset.sidecar import finished_record, sidecar_of
-from mbtf_gen.planning.effects import EffectsPlan
 from mbtf_gen.planning.run_plan import RunPlan
-from mbtf_gen.planning.sample_allocation import Allocation
 from mbtf_gen.render.estimates import BadSample, TargetReached
 
 # A run fails beyond this share of non-finite samples, but never for so few: with one expected, more than four
@@ -31,7 +29,6 @@ from mbtf_gen.render.estimates import BadSample, TargetReached
 NONFINITE_SHARE = 1e-6
 NONFINITE_FEW = 4
 _SHOWN = 3
-_CHECK = "check the data set with: mbtf-gen verify"
 
 
 @dataclass(frozen=True)
@@ -173,21 +170,6 @@ def refuse_nonfinite(totals: ShardStatistics, paths: int, folder: Path) -> None:
         )
 
 
-class _Plan(BaseModel, allow_inf_nan=False):
-    """Keys of a manifest that a run needs, besides those that readers need."""
-
-    complete: bool
-    effects: EffectsPlan
-    allocation: Allocation | None
-
-    @field_validator("effects")
-    @classmethod
-    def _lists_all(cls, plan: EffectsPlan) -> EffectsPlan:
-        if [e.name for e in plan.effects] != list(EFFECTS):
-            raise ValueError("must list all effects")
-        return plan
-
-
 class _Statistics(BaseModel, allow_inf_nan=False):
     mean_value: tuple[float, float, float]
     mean_variance: tuple[float, float, float]
@@ -215,8 +197,7 @@ class _Sidecar(BaseModel, allow_inf_nan=False):
 
 def read_run_plan(folder: Path) -> RunPlan:
     """The run plan in a data set's manifest; an InputError where that is corrupt."""
-    found = check_document(_Plan, read_manifest(folder), folder / MANIFEST_NAME, _CHECK)
-    return RunPlan(found.effects, found.allocation)
+    return stored_plan(read_manifest(folder), folder / MANIFEST_NAME)
 
 
 def finish(
@@ -235,14 +216,14 @@ def finish(
     """
     dataset = Dataset.open(folder)
     manifest = read_manifest(folder)
-    effects = check_document(_Plan, manifest, folder / MANIFEST_NAME, _CHECK).effects
+    effects = stored_plan(manifest, folder / MANIFEST_NAME).effects
     totals, complete = ShardStatistics(), True
     for entry in (entry for split in dataset.splits for entry in dataset.entries(split)):
         record = finished_record(folder, entry, manifest["config_hash"])
         if record is None:
             complete = False
         else:
-            check_document(_Sidecar, record, sidecar_of(folder / entry.file), _CHECK)
+            check_document(_Sidecar, record, sidecar_of(folder / entry.file), CHECK_HINT)
             totals.add(record)
     if complete:
         refuse_nonfinite(totals, totals.paths, folder)

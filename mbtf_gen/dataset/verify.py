@@ -12,18 +12,17 @@ from typing import Any
 
 from mbtf_core.digest import file_sha256
 from mbtf_core.errors import InputError, reason
-from mbtf_core.shard_schema import CONFIG_NAME, MANIFEST_NAME, ShardEntry
+from mbtf_core.shard_schema import CONFIG_NAME, GEOMETRY_NAME, MANIFEST_NAME, ShardEntry
 from mbtf_gen.dataset.folder import is_leftover
 from mbtf_gen.dataset.manifest import plan_digest
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.dataset.shard_io import check_arrays, check_values, read_shard
-from mbtf_gen.dataset.sidecar import ABSENT, read_sidecar, repair_hint, sidecar_of
+from mbtf_gen.dataset.sidecar import ABSENT, CHANGED, read_sidecar, repair_hint, sidecar_of
 
 # The manifest only lacks its completion.
 INCOMPLETE = "is not complete"
 # A fault of the manifest, not of the shard that it names.
 TWICE = "is listed twice"
-_CHANGED = "has changed since it was written (SHA-256 differs)"
 _RESUME = "run the same mbtf-gen command again: it renders the missing shards"
 
 # The reader of EXR files redirects the standard error stream of the whole process. NumPy parses headers with
@@ -65,7 +64,7 @@ def examine(folder: Path, entry: ShardEntry, config_hash: str) -> tuple[dict[str
 def _check_content(path: Path, rows: int, record: dict[str, Any]) -> None:
     """An InputError where the bytes or values of a shard are at fault."""
     if file_sha256(path) != record["sha256"]:
-        raise InputError(_CHANGED)
+        raise InputError(CHANGED)
     with _ONE_AT_A_TIME:
         arrays = read_shard(path)
     found = check_arrays(arrays, path)[0]
@@ -74,13 +73,17 @@ def _check_content(path: Path, rows: int, record: dict[str, Any]) -> None:
     check_values(arrays, path)
 
 
-def _manifest_faults(dataset: Dataset) -> Iterator[Fault]:
-    config = dataset.folder / CONFIG_NAME
+def _document_faults(dataset: Dataset) -> Iterator[Fault]:
+    digests = {CONFIG_NAME: dataset.manifest.get("config_yaml")}
+    if dataset.manifest["geometry"] is not None:
+        digests[GEOMETRY_NAME] = dataset.manifest["geometry"]["sha256"]
     hint = repair_hint(dataset.folder)
-    if not config.exists():
-        yield Fault(CONFIG_NAME, "is missing", hint)
-    elif file_sha256(config) != dataset.manifest.get("config_yaml"):
-        yield Fault(CONFIG_NAME, _CHANGED, hint)
+    for name, digest in digests.items():
+        path = dataset.folder / name
+        if not path.exists():
+            yield Fault(name, ABSENT[0], hint)
+        elif file_sha256(path) != digest:
+            yield Fault(name, CHANGED, hint)
 
 
 def shard_faults(folder: Path, entries: Sequence[ShardEntry], config_hash: str, plan: str) -> Iterator[Fault]:
@@ -114,7 +117,7 @@ def shard_faults(folder: Path, entries: Sequence[ShardEntry], config_hash: str, 
 
 def foreign_files(folder: Path, entries: Iterable[ShardEntry]) -> list[str]:
     """Names in a folder that are no part of the data set with these shards; folders end with "/"."""
-    own = {MANIFEST_NAME, CONFIG_NAME}
+    own = {MANIFEST_NAME, CONFIG_NAME, GEOMETRY_NAME}
     for entry in entries:
         own |= {entry.file, sidecar_of(Path(entry.file)).name}
     found = (path for path in folder.iterdir() if path.name not in own and not is_leftover(path.name))
@@ -141,7 +144,7 @@ def verify(folder: Path) -> list[Fault]:
     """
     folder = Path(folder)
     dataset = Dataset.open(folder)
-    faults = list(_manifest_faults(dataset))
+    faults = list(_document_faults(dataset))
     entries = [entry for split in dataset.splits for entry in dataset.entries(split)]
     faults += shard_faults(folder, entries, dataset.manifest["config_hash"], plan_digest(dataset.manifest))
     if not faults and not dataset.manifest.get("complete"):

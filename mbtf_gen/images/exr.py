@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import errno
 import os
 import sys
+import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -13,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.atomic import Stored, write_through
-from mbtf_core.errors import InputError
+from mbtf_core.atomic import Stored, unwritable, write_through
+from mbtf_core.errors import InputError, reason
 
 # Limit of the numbers in all channels of all parts, in multiples of the largest image.
 _MOST_CHANNELS = 4
@@ -99,7 +101,26 @@ def read_channels(path: Path, max_pixels: int) -> dict[str, NDArray[Any]]:
     return out
 
 
-def _read(path: Path, max_pixels: int) -> list[tuple[dict[str, Any], dict[str, NDArray[Any]]]]:
+def read_parts(path: Path, max_pixels: int) -> dict[str, tuple[dict[str, Any], dict[str, NDArray[Any]]]]:
+    """Header and channels (H, W) of every part by its name, float16 or float32; their sizes may differ.
+
+    Raises
+    ------
+    InputError : as :func:`read_file`, or two parts of one name
+    """
+    out: dict[str, tuple[dict[str, Any], dict[str, NDArray[Any]]]] = {}
+    for head, channels in _read(path, max_pixels, cropped=True):
+        name = str(head.get("name", ""))
+        if name in out:
+            raise InputError(f"two parts are named '{name}'", where=path)
+        check_floats(channels, path)
+        out[name] = head, channels
+    return out
+
+
+def _read(
+    path: Path, max_pixels: int, cropped: bool = False
+) -> list[tuple[dict[str, Any], dict[str, NDArray[Any]]]]:
     """(header, channels) of every part; all sizes are checked before any pixel is read."""
     import OpenEXR
 
@@ -110,7 +131,7 @@ def _read(path: Path, max_pixels: int) -> list[tuple[dict[str, Any], dict[str, N
             heads = [part.header for part in file.parts]
     except Exception:  # a damaged file may make the library raise anything
         raise broken from None
-    sizes = [_checked_size(head, path, max_pixels) for head in heads]
+    sizes = [_checked_size(head, path, max_pixels, cropped) for head in heads]
     numbers = sum(h * w * len(head["channels"]) for (h, w), head in zip(sizes, heads, strict=True))
     if numbers > _MOST_CHANNELS * max_pixels:
         raise InputError(
@@ -129,7 +150,7 @@ def _read(path: Path, max_pixels: int) -> list[tuple[dict[str, Any], dict[str, N
     return list(zip(heads, parts, strict=True))
 
 
-def _checked_size(head: dict[str, Any], path: Path, max_pixels: int) -> tuple[int, int]:
+def _checked_size(head: dict[str, Any], path: Path, max_pixels: int, cropped: bool) -> tuple[int, int]:
     """(rows, columns) of a part; refuses unsupported kinds."""
     import OpenEXR
 
@@ -139,7 +160,7 @@ def _checked_size(head: dict[str, Any], path: Path, max_pixels: int) -> tuple[in
     columns, rows = window[2] - window[0] + 1, window[3] - window[1] + 1
     if rows * columns > max_pixels:
         raise InputError(f"claims {columns} x {rows} pixels; at most {max_pixels:,} are read", where=path)
-    if window != shown:
+    if window != shown and not cropped:
         raise InputError(
             "data window and display window differ: a cropped tile", where=path, hint="crop the image"
         )
@@ -169,6 +190,41 @@ def write_channels(
 
     head = {"compression": OpenEXR.NO_COMPRESSION, "type": OpenEXR.scanlineimage, **(header or {})}
     return write_through(path, lambda temporary: OpenEXR.File(head, dict(channels)).write(str(temporary)))
+
+
+def encode_parts(
+    parts: Mapping[str, Mapping[str, NDArray[np.float32]]], header: Mapping[str, Any] | None = None
+) -> bytes:
+    """The bytes of an uncompressed EXR file of several named parts with channels (H, W) by name.
+
+    All parts begin in the upper left corner of one display window, which is as large as the largest of them.
+
+    Parameters
+    ----------
+    header : attributes of every part
+
+    Raises
+    ------
+    PartialError : the folder for temporary files cannot be written
+    """
+    import OpenEXR
+
+    rows, columns = np.max([c.shape for channels in parts.values() for c in channels.values()], axis=0)
+    head = {
+        "compression": OpenEXR.NO_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+        # The format demands that all parts have the same one.
+        "displayWindow": (np.zeros(2, np.int32), np.array([columns - 1, rows - 1], np.int32)),
+        **(header or {}),
+    }
+    # The library writes to files only.
+    with tempfile.TemporaryDirectory(prefix="mbtf-") as folder:
+        path = Path(folder) / "parts.exr"
+        try:
+            OpenEXR.File([OpenEXR.Part(dict(head), dict(parts[n]), name=n) for n in parts]).write(str(path))
+            return path.read_bytes()
+        except (RuntimeError, OSError) as error:
+            raise unwritable(path, OSError(errno.EIO, reason(error))) from None
 
 
 def layers(names: list[str]) -> dict[str, list[str]]:

@@ -66,7 +66,7 @@ def build_estimator(job: Job, plan: EffectsPlan, tiles: dict[frozenset[str], Any
     tiles = {} if tiles is None else tiles
     key = plan.names_on & _TILE_EFFECTS
     if key not in tiles:
-        tiles[key] = build_tile(job.grid, bsdf_of(job.material, key, _shading_slopes(job, plan)))
+        tiles[key] = build_tile(job.grid, bsdf_of(job.material, key, shading_slopes(job, plan)))
     transport = Transport(
         plan.max_depth,
         plan.roulette_depth,
@@ -88,7 +88,7 @@ def normal_map_slopes(job: Job) -> tuple[NDArray[np.float64], float] | None:
     return residual_slopes(material.normal, job.grid, mode)
 
 
-def _shading_slopes(job: Job, plan: EffectsPlan) -> NDArray[np.float64] | None:
+def shading_slopes(job: Job, plan: EffectsPlan) -> NDArray[np.float64] | None:
     """Slopes (h, w, 2) that shading adds to the geometry's: those of the normal map, and those of the heights
     where they are not displaced."""
     mapped = normal_map_slopes(job) if plan.on("normal") else None

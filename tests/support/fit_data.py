@@ -113,6 +113,7 @@ def write_data(
         "layout": layout,
         "levels": {"finest": finest},
         "tile": {"aspect": aspect},
+        "geometry": None,
         "splits": splits,
     }
     if through is not None:

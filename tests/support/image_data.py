@@ -87,6 +87,7 @@ def write_images(
         "layout": "image",
         "levels": {"finest": finest},
         "tile": {"aspect": aspect},
+        "geometry": None,
         "splits": splits,
         "patch_size": patch_size,
     }

@@ -73,7 +73,12 @@ class Small:
         """A shard, a sidecar, the configuration, and what a kill leaves."""
         self.absent()
         shutil.copytree(self.whole, self.out)
-        for name, at in (("train-00000.npz", 900), ("test-00000.json", 300), ("config.yaml", 40)):
+        for name, at in (
+            ("train-00000.npz", 900),
+            ("test-00000.json", 300),
+            ("config.yaml", 40),
+            ("geometry.exr", 900),
+        ):
             flip(self.out / name, at)
         (self.out / ".train-00001.lock").write_text("{}")
         (self.out / ".train-00001.json.0123abcd-9.tmp").write_text("{")

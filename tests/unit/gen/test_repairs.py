@@ -68,6 +68,14 @@ CORRUPTIONS: dict[str, tuple[Callable[[Path], object], set[str], set[str]]] = {
     "copy": (replace_by_another, {"train-00000.npz", "train-00001.npz"}, set()),
     "configuration": (lambda out: flip(out / "config.yaml", 30), set(), {"config.yaml"}),
     "configuration gone": (lambda out: (out / "config.yaml").unlink(), set(), {"config.yaml"}),
+    "geometry": (lambda out: flip(out / "geometry.exr", 700), set(), {"geometry.exr"}),
+    "geometry cut": (lambda out: os.truncate(out / "geometry.exr", 900), set(), {"geometry.exr"}),
+    "geometry gone": (lambda out: (out / "geometry.exr").unlink(), set(), {"geometry.exr"}),
+    "manifest and geometry": (
+        lambda out: (flip(out / "manifest.json", 90), flip(out / "geometry.exr", 2000)),
+        set(),
+        {"manifest.json", "geometry.exr"},
+    ),
     "blank of the manifest": (lambda out: flip(out / "manifest.json", 3), set(), {"manifest.json"}),
     "manifest gone": (lambda out: (out / "manifest.json").unlink(), set(), {"manifest.json"}),
     "no JSON": (lambda out: (out / "manifest.json").write_text("{"), set(), {"manifest.json"}),
@@ -119,7 +127,7 @@ def test_foreign_files_are_named_and_left_alone(out: Path, capsys: pytest.Captur
     assert verify(out) == []
     capsys.readouterr()
     # The data set is whole: both commands say so, and name what else is there.
-    for name, says in (("repair", "nothing to repair"), ("verify", "4 shards, all intact")):
+    for name, says in (("repair", "nothing to repair"), ("verify", "4 shards and geometry.exr, all intact")):
         assert generate([name, str(out)]) == 0
         text = capsys.readouterr().out
         assert f"{out}: {says}\n" in text
@@ -330,6 +338,16 @@ def test_a_dry_run_changes_nothing(out: Path, capsys: pytest.CaptureFixture[str]
     text = capsys.readouterr().out
     assert f"{out}: 1 shards rendered again (train-00000.npz)" in text
     assert f"{out}: config.yaml written again" in text
+
+
+def test_verify_tells_documents_from_shards(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (out / "geometry.exr").unlink()
+    (out / "test-00000.json").unlink()
+    capsys.readouterr()
+    assert generate(["verify", str(out)]) == 3
+    text = capsys.readouterr().out
+    assert f"{out}: 1 of 4 shards missing, first test-00000.npz" in text
+    assert f"{out / 'geometry.exr'}: is missing; repair it with: mbtf-gen repair {out}" in text
 
 
 def test_folders_without_a_data_set_are_refused(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import pytest
 from support.datasets import write_dataset
 from support.paths import ROOT
 
-from mbtf_core.shard_schema import ARRAYS, CONVENTIONS, SCHEMA_VERSION
+from mbtf_core.shard_schema import ARRAYS, CONVENTIONS, GEOMETRY, SCHEMA_VERSION
 
 DOCUMENT = (ROOT / "docs/reference/data-format.md").read_text(encoding="utf-8")
 QUERIES = {"train": "160", "test": "64"}
@@ -53,12 +53,27 @@ def test_the_reader_refuses_other_schemas_and_unfinished_data(tmp_path: Path) ->
             read_split(data.folder, "train")
 
 
+def table(title: str) -> dict[str, list[str]]:
+    """Cells of the rows of a section's table by the name in the first one."""
+    rows = [line.split("|")[1:-1] for line in section(title).splitlines() if line.startswith("| `")]
+    return {cells[0].strip(" `"): [c.strip() for c in cells[1:]] for cells in rows}
+
+
+def test_every_image_of_the_geometry_has_its_row() -> None:
+    rows = table("Geometry")
+    assert list(rows) == [spec.name for spec in GEOMETRY]
+    for spec in GEOMETRY:
+        part, unit, channels, _ = rows[spec.name]
+        assert part == ("`heights`" if spec.name == "height" else "`maps`")
+        assert unit == spec.unit
+        assert re.findall(r"`([^`]+)`", channels) == list(spec.channels)
+
+
 def test_every_array_has_its_row() -> None:
-    rows = [line.split("|")[1:-1] for line in section("Arrays").splitlines() if line.startswith("| `")]
-    table = {cells[0].strip(" `"): [c.strip() for c in cells[1:]] for cells in rows}
-    assert list(table) == [a.name for a in ARRAYS]
+    rows = table("Arrays")
+    assert list(rows) == [a.name for a in ARRAYS]
     for spec in ARRAYS:
-        trailing, unit, channels, _ = table[spec.name]
+        trailing, unit, channels, _ = rows[spec.name]
         assert trailing == (str(spec.trailing[0]) if spec.trailing else "–")
         assert unit == spec.unit
         assert re.findall(r"`([^`]+)`", channels) == list(spec.channels)
@@ -70,7 +85,7 @@ def test_every_key_of_manifest_and_sidecar_is_explained(tmp_path: Path) -> None:
     split = manifest["splits"]["train"]
     in_manifest = [manifest, manifest["tile"], manifest["levels"], manifest["levels"]["mixture"], split]
     in_manifest += [manifest["effects"], manifest["effects"]["effects"][0]]
-    in_manifest += [split["shards"][0], next(iter(manifest["arrays"].values()))]
+    in_manifest += [split["shards"][0], next(iter(manifest["arrays"].values())), manifest["geometry"]]
     in_sidecar = [sidecar, sidecar["seed"], sidecar["quarantined"], sidecar["statistics"]]
     counts = set(sidecar["quarantined"])
     for title, objects in (

@@ -91,6 +91,21 @@ def test_a_truncated_shard_is_found(copy: Path, kept: int) -> None:
     assert finished_record(copy, entry(copy, 40, 0), manifest["config_hash"])
 
 
+def test_every_flipped_byte_of_the_geometry_is_found(copy: Path) -> None:
+    path = copy / "geometry.exr"
+    intact = path.read_bytes()
+    for position in [*range(0, len(intact), len(intact) // 40), len(intact) - 1]:
+        damaged = bytearray(intact)
+        damaged[position] ^= 0x10
+        path.write_bytes(damaged)
+        assert list(faults(copy)) == [path.name], position
+    path.write_bytes(intact[:-1])
+    assert "SHA-256" in faults(copy)[path.name]
+    path.unlink()
+    assert (faults(copy), foreign(copy)) == ({path.name: "is missing"}, [])
+    assert "mbtf-gen repair" in verify(copy)[0].hint
+
+
 def test_missing_parts_are_found(copy: Path) -> None:
     shard(copy, 0).unlink()
     sidecar_of(shard(copy, 1)).unlink()

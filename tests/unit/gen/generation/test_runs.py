@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,10 @@ from support.datasets import formula
 from support.formula_runs import FILES, Formula, changed, cheap_plan, contents, left_of, listing
 
 from mbtf_core.errors import InputError, PartialError
-from mbtf_gen import generation
+from mbtf_gen import generation, repairs
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.dataset import render_shards
+from mbtf_gen.dataset import folder, render_shards
+from mbtf_gen.dataset.geometry import Geometry, geometry_of
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.dataset.shard_io import read_shard
 from mbtf_gen.dataset.sidecar import sidecar_of
@@ -23,6 +25,7 @@ from mbtf_gen.dataset.summary import finish
 from mbtf_gen.dataset.verify import verify
 from mbtf_gen.generation import generate, unfinished
 from mbtf_gen.job import Job, split_queries
+from mbtf_gen.planning.effects import EffectsPlan
 from mbtf_gen.planning.run_plan import RunPlan
 from mbtf_gen.render.runtime import load_mitsuba
 
@@ -158,8 +161,10 @@ def test_temporary_files_of_a_killed_run_are_removed(config: GeneratorConfig, ou
     out.mkdir()
     (out / ".manifest.json.0123abcd-123.tmp").write_text("{")
     generate(config, out)
+    known = (out / "geometry.exr").read_bytes()
     # Killed between manifest and configuration, within a shard, and between a shard and its sidecar.
     (out / "config.yaml").unlink()
+    (out / "geometry.exr").unlink()
     (out / FILES[0]).unlink()
     (out / f".{FILES[0]}.0123abcd-99999999.tmp").write_bytes(b"half")
     sidecar_of(out / FILES[0]).unlink()
@@ -169,6 +174,37 @@ def test_temporary_files_of_a_killed_run_are_removed(config: GeneratorConfig, ou
     assert verify(out) == []
     assert (out / "config.yaml").exists()
     assert [p.name for p in out.glob(".train*")] == []
+    # Killed within the geometry.
+    (out / "geometry.exr").rename(out / ".geometry.exr.0123abcd-99999999.tmp")
+    assert generate(config, out).complete
+    assert (out / "geometry.exr").read_bytes() == known
+    # A finished run leaves nothing of another one.
+    (out / ".geometry.exr.0123abcd-99999999.tmp").write_bytes(b"half")
+    assert generate(config, out).complete
+    assert not list(out.glob(".*"))
+
+
+def test_a_geometry_of_another_machine_is_not_mixed_in(
+    config: GeneratorConfig, monkeypatch: pytest.MonkeyPatch, out: Path
+) -> None:
+    """Its heights differ by rounding, and its digest from the manifest's."""
+    generate(config, out)
+    (out / "geometry.exr").unlink()
+    before = listing(out)
+
+    def rounded(job: Job, plan: EffectsPlan) -> Geometry:
+        found = geometry_of(job, plan)
+        return replace(found, slopes=np.nextafter(found.slopes, np.float32(9)))
+
+    with monkeypatch.context() as patch:
+        for module in (folder, repairs):
+            patch.setattr(module, "geometry_of", rounded)
+        for act in (lambda: generate(config, out), lambda: repairs.repair(out)):
+            with pytest.raises(InputError, match="this machine computes it differently"):
+                act()
+            assert listing(out) == before
+    assert repairs.repair(out).documents == ["geometry.exr"]
+    assert verify(out) == []
 
 
 def test_a_truncated_shard_is_rendered_again(config: GeneratorConfig, engine: Formula, out: Path) -> None:

@@ -18,12 +18,16 @@ from mbtf_core.locks import shard_lock, take_lock
 from mbtf_gen import generation
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.dataset import render_shards
+from mbtf_gen.dataset.folder import remove_leftovers
+from mbtf_gen.dataset.geometry import geometry_of, geometry_record
 from mbtf_gen.dataset.manifest import build_manifest
+from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.dataset.sidecar import sidecar_of
 from mbtf_gen.dataset.summary import finish
 from mbtf_gen.dataset.verify import verify
 from mbtf_gen.generation import generate
 from mbtf_gen.job import Job
+from mbtf_gen.planning.effects import without
 from mbtf_gen.planning.effects_plan import reference_plan
 from mbtf_gen.planning.run_plan import RunPlan
 from mbtf_gen.render.runtime import load_mitsuba
@@ -33,7 +37,8 @@ load_mitsuba()
 
 def write_while_planning(patch: pytest.MonkeyPatch, out: Path, job: Job, plan: RunPlan) -> bytes:
     """Let another process write this manifest while the next run plans."""
-    content = checksummed(build_manifest(job, plan))
+    record = geometry_record(geometry_of(job, plan.effects))
+    content = checksummed(build_manifest(job, plan, record))
 
     def plan_run(job: Job) -> RunPlan:
         out.mkdir()
@@ -54,6 +59,35 @@ def test_the_second_writer_adopts_the_plan_of_the_first(
     assert json.loads((out / "manifest.json").read_text())["effects"] == other.effects.to_manifest()
     assert other != cheap_plan(job)
     assert verify(out) == []
+
+
+def test_the_geometry_is_that_of_the_adopted_plan(
+    config: GeneratorConfig, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, out: Path
+) -> None:
+    """The first writer's plan leaves out the metal that the second one's simulates."""
+    (tmp_path / "material.yaml").write_text("height: height.npy\nmetallic: 0.5\n")
+    glossy = changed(config, **{"material": str(tmp_path / "material.yaml")})
+    job = Job.prepare(glossy)
+    write_while_planning(monkeypatch, out, job, RunPlan(without(reference_plan(job), "metallic")))
+    assert generate(glossy, out).complete
+    assert verify(out) == []
+    found = Dataset.open(out).geometry()
+    assert found is not None
+    assert found.metallic is not None
+    assert not found.metallic.any()
+
+
+def test_the_unfinished_geometry_of_another_writer_is_left_alone(config: GeneratorConfig, out: Path) -> None:
+    """The lock of the manifest protects it."""
+    generate(config, out)
+    unfinished = out / ".geometry.exr.0123abcd-99999999.tmp"
+    unfinished.write_bytes(b"half")
+    with shard_lock(out / "manifest.npz") as held:
+        assert held
+        remove_leftovers(out)
+        assert unfinished.exists()
+    remove_leftovers(out)
+    assert not unfinished.exists()
 
 
 def test_a_concurrent_writer_of_another_data_set_is_refused(
