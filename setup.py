@@ -28,7 +28,7 @@ setup(
     ext_modules=[
         Extension(
             "mbtf_fit.native._kernel",
-            [f"{SOURCES}/kernel.c"],
+            [f"{SOURCES}/{name}.c" for name in ("kernel", "heightfield", "hints")],
             depends=sorted(str(path) for path in Path(SOURCES).glob("*.[hi]*")),
             extra_compile_args=[
                 "-std=gnu11",

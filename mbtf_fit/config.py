@@ -13,7 +13,7 @@ from mbtf_core.nested import deep_merge
 from mbtf_core.options import Flag
 from mbtf_core.units import format_duration, format_size, parse_duration, parse_size
 
-ModelName = Literal["neumip-baseline", "neumip", "hierarchical"]
+ModelName = Literal["neumip-baseline", "neumip", "relief", "hierarchical"]
 OutputTransform = Literal["expm1", "exp", "identity", "softplus", "fourth-root"]
 LossKind = Literal["relative", "squared", "linear", "log", "fourth-root", "gradient"]
 Correction = Literal["none", "second-order", "linear"]
@@ -39,9 +39,27 @@ class EncodingSection(Settings):
     )
     raw: bool = Field(False, description="append encoded coordinates to the raw ones")
     direction_xyz: bool = Field(False, description="directions as (x, y, z); false: (x, y)")
+    half_vector: bool = Field(
+        False, description="append the half vector and the difference vector to the directions"
+    )
     band_attenuation: bool = Field(False, description="divide band k by 2^k, so that all slopes are equal")
     footprint_filtered: bool = Field(
         False, description="position: average each band over the query's footprint"
+    )
+
+
+class ReliefSection(Settings):
+    """What the model `relief` takes from the data set's geometry; every part can be left out."""
+
+    places: Literal[1, 4] = Field(
+        1, description="view rays that are traced per query, spread over its footprint"
+    )
+    hints: bool = Field(
+        True, description="irradiance, normal and single scattering of the known surface as inputs"
+    )
+    frame: bool = Field(True, description="light and view about the known normal as inputs")
+    gate: bool = Field(
+        True, description="value = gate · single scattering of the known surface + the network's own part"
     )
 
 
@@ -68,6 +86,7 @@ class NetworkSection(Settings):
         "blend", description="features of two adjacent levels: weighted sum, or concatenation"
     )
     encoding: EncodingSection = EncodingSection()
+    relief: ReliefSection = ReliefSection()
 
 
 class BlurSection(Settings):
@@ -181,6 +200,10 @@ class HeldOutSection(Settings):
 # Defaults that depend on the model: those of its paper, or measured ones.
 PRESETS: dict[str, dict[str, Any]] = {
     "neumip-baseline": {"network": {"offset": "none"}},
+    "relief": {
+        "network": {"offset": "none", "encoding": {"direction_xyz": True, "half_vector": True}},
+        "training": {"texture_weight_decay": 1.0, "blur": {"min_sigma": 0.8}},
+    },
     "hierarchical": {
         "network": {
             "decoder": "inception",
@@ -205,7 +228,7 @@ class FitConfig(Settings):
     Parameters
     ----------
     model : str
-        ``neumip``, ``neumip-baseline`` or ``hierarchical``.
+        ``relief``, ``neumip``, ``neumip-baseline`` or ``hierarchical``.
     init_from : str, optional
         Folder of a material that initializes textures and offset.
     network : NetworkSection
@@ -257,8 +280,8 @@ class FitConfig(Settings):
     @model_validator(mode="after")
     def _consistent(self) -> FitConfig:
         network = self.network
-        if self.model == "neumip-baseline" and network.offset != "none":
-            raise ValueError("neumip-baseline has no offset: choose the model neumip, or network.offset none")
+        if self.model in ("neumip-baseline", "relief") and network.offset != "none":
+            raise ValueError(f"{self.model} has no offset: choose the model neumip, or network.offset none")
         if self.model != "hierarchical" and network.decoder == "inception":
             raise ValueError(
                 "the inception decoder reads neighboring queries: it needs the model hierarchical"

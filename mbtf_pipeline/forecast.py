@@ -97,7 +97,7 @@ class RunForecaster:
         stages : names of the stages that will run; all by default
         speed : as :attr:`speed`, which is measured by default
         """
-        from mbtf_fit.training.forecast import FIT_SECONDS, QUERY_SECONDS, fit_bytes
+        from mbtf_fit.training.forecast import FIT_SECONDS, fit_bytes, query_seconds
 
         start, path = self.speed if speed is None else speed
 
@@ -127,7 +127,7 @@ class RunForecaster:
             start=_START + (start if paths else 0.0),
             generating=paths * path,
             training=sum(timed),
-            evaluating=len(fits) * (FIT_SECONDS + queries * QUERY_SECONDS),
+            evaluating=len(fits) * (FIT_SECONDS + queries * query_seconds(self.material.opacity is not None)),
             comparing=comparing,
             bytes=size,
             by_steps=tuple(name for name, fit in fits.items() if fit.training.steps is not None),

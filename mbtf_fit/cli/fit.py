@@ -75,10 +75,11 @@ def fit(
     from mbtf_core.folders import check_space
     from mbtf_fit.data.loader import open_data
     from mbtf_fit.material.format import DESCRIPTION_NAME
+    from mbtf_fit.material.transmittance_fit import has_transmittance
     from mbtf_fit.models.registry import MODELS
     from mbtf_fit.native import missing_reason
     from mbtf_fit.training.fit import fit
-    from mbtf_fit.training.forecast import FIT_SECONDS, QUERY_SECONDS, fit_bytes, training_seconds
+    from mbtf_fit.training.forecast import FIT_SECONDS, fit_bytes, query_seconds, training_seconds
 
     finished = not overwrite and (output / DESCRIPTION_NAME).exists()
     partition = None
@@ -93,7 +94,8 @@ def fit(
             "(change it with --time or --steps)"
         )
         seconds, partition = training_seconds(resolved, shards)
-        seconds += FIT_SECONDS + QUERY_SECONDS * int(data.manifest["splits"]["train"].get("queries", 0))
+        queries = int(data.manifest["splits"]["train"].get("queries", 0))
+        seconds += FIT_SECONDS + queries * query_seconds(has_transmittance(data))
         if seconds >= 60.0 or size >= 1e9:
             console.note(expectation(seconds, size))
     if missing := missing_reason():

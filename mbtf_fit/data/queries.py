@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -13,8 +13,8 @@ from torch import Tensor
 
 # Arrays of a shard that the fitter reads.
 NEEDED = ("u", "sigma", "omega_i", "omega_o", "value_a", "value_b")
-# Bytes of a training query in memory.
-QUERY_BYTES = 48
+# Bytes of a training query in memory, and of its hints.
+QUERY_BYTES, HINT_BYTES = 48, 28
 
 
 @dataclass(frozen=True)
@@ -85,13 +85,15 @@ def mean_value(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.flo
 
 @dataclass(frozen=True)
 class TrainingQueries:
-    """Queries for training: contiguous tensors on the device; the value is the mean of both halves."""
+    """Queries for training: contiguous tensors on the device; the value is the mean of both halves. Models of a
+    known surface have :mod:`hints <mbtf_fit.surface.known>` (n, 7)."""
 
     u: Tensor
     sigma: Tensor
     omega_i: Tensor
     omega_o: Tensor
     value: Tensor
+    hints: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.sigma)
@@ -110,8 +112,12 @@ class TrainingQueries:
 
     def slice(self, start: int, stop: int) -> TrainingQueries:
         """Consecutive queries, without a copy."""
-        return TrainingQueries(*(getattr(self, f.name)[start:stop] for f in fields(self)))
+        return self._each(lambda a: a[start:stop])
 
     def to(self, device: torch.device) -> TrainingQueries:
         """The same queries on another device."""
-        return TrainingQueries(*(getattr(self, f.name).to(device) for f in fields(self)))
+        return self._each(lambda a: a.to(device))
+
+    def _each(self, function: Callable[[Tensor], Tensor]) -> TrainingQueries:
+        arrays = (getattr(self, f.name) for f in fields(self))
+        return TrainingQueries(*(None if a is None else function(a) for a in arrays))

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from mbtf_fit.models.interface import NeuralMaterial
 from mbtf_fit.models.neumip import Neumip
+from mbtf_fit.models.relief import Relief
 from mbtf_fit.native import Kernel, kernel
 from mbtf_fit.native.library import QueryPointers
 from mbtf_fit.native.model import NativeModel, supports
@@ -64,9 +65,12 @@ def _predict_natively(found: Kernel, model: NeuralMaterial, *arrays: ArrayLike) 
         raise ValueError(f"queries of the shapes {[a.shape for a in inputs]}, not {shapes}")
     native = NativeModel(found, model)
     out = np.empty((n, 3), np.float32)
+    read = list(inputs)
+    if isinstance(model, Relief):
+        read.append(model.hints(*map(torch.from_numpy, inputs)).numpy())
 
     def evaluate(start: int, stop: int) -> None:
-        addresses = (a.ctypes.data + start * a.strides[0] for a in inputs)
+        addresses = (a.ctypes.data + start * a.strides[0] for a in read)
         queries = QueryPointers(stop - start, *addresses)
         native.forward(queries, native.state(1), out.ctypes.data + start * out.strides[0], clamp=True)
 

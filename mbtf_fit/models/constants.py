@@ -26,6 +26,11 @@ def direction_size(options: EncodingSection) -> int:
     return encoded_size(3 if options.direction_xyz else 2, options.direction, options)
 
 
+def directions_size(options: EncodingSection) -> int:
+    """Numbers that encode light and view."""
+    return 2 * direction_size(options) + (6 if options.half_vector else 0)
+
+
 def position_size(options: EncodingSection) -> int:
     """Numbers that encode a position."""
     return encoded_size(2, options.position, options) if options.position else 0

@@ -52,6 +52,27 @@ def encode_direction(omega: Tensor, options: EncodingSection) -> Tensor:
     )
 
 
+def rotate_to_z(axis: Tensor, omega: Tensor) -> Tensor:
+    """Directions (n, 3), rotated by the shortest rotation that takes unit vectors (n, 3) with z > 0 to z."""
+    tangential = (axis[:, :2] * omega[:, :2]).sum(1, keepdim=True)
+    share = omega[:, 2:] + tangential / (1.0 + axis[:, 2:])
+    return torch.cat([omega[:, :2] - axis[:, :2] * share, axis[:, 2:] * omega[:, 2:] + tangential], 1)
+
+
+def encode_directions(omega_i: Tensor, omega_o: Tensor, options: EncodingSection) -> Tensor:
+    """Encoded light and view (n, 3): (n, :func:`directions_size`).
+
+    With ``half_vector``, the half vector h and the difference vector follow: the light in a frame whose z is h
+    (Rusinkiewicz, EGSR 1998). The shortest rotation to h defines the frame, which is continuous also where h
+    is the normal.
+    """
+    parts = [encode_direction(omega, options) for omega in (omega_i, omega_o)]
+    if options.half_vector:
+        half = torch.nn.functional.normalize(omega_i + omega_o, dim=1)
+        parts += [half, rotate_to_z(half, omega_i)]
+    return torch.cat(parts, 1)
+
+
 def encode_position(u: Tensor, level: Tensor, aspect: float, options: EncodingSection) -> Tensor:
     """Encoded uv positions (..., 2): (..., :func:`position_size`), empty without bands.
 

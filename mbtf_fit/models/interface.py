@@ -12,8 +12,8 @@ from mbtf_core.errors import InputError
 from mbtf_core.lattice import Lattice
 from mbtf_core.shard_schema import Layout
 from mbtf_fit.config import NetworkSection
-from mbtf_fit.models.constants import GRAZING, OFFSET_SCALE, direction_size, position_size
-from mbtf_fit.models.encodings import encode_direction, encode_position, encoding_formula
+from mbtf_fit.models.constants import GRAZING, OFFSET_SCALE, directions_size, position_size
+from mbtf_fit.models.encodings import encode_directions, encode_position, encoding_formula
 from mbtf_fit.models.inception import InceptionDecoder
 from mbtf_fit.models.lookup import coarse_level
 from mbtf_fit.models.mlp import Mlp, initialize_layers
@@ -51,11 +51,12 @@ class NeuralMaterial(nn.Module, ABC):
         self.pyramid = FeatureTextures(lattice, range(lattice.finest + 1), network.channels)
         features = network.channels * (2 if network.blending == "concatenate" else 1)
         features += position_size(network.encoding)
-        directions = 2 * direction_size(network.encoding)
+        directions = directions_size(network.encoding) + self.hint_size(network)
         hidden = [network.width] * (network.layers - 1)
         self.decoder: Mlp | InceptionDecoder
         if network.decoder == "mlp":
-            self.decoder = Mlp([features + directions, *hidden, network.output_channels], network.activation)
+            outputs = network.output_channels + self.gate_size(network)
+            self.decoder = Mlp([features + directions, *hidden, outputs], network.activation)
         else:
             sizes = network.width, network.layers - 2, network.output_channels
             self.decoder = InceptionDecoder(features, directions, *sizes, network.activation)
@@ -66,6 +67,16 @@ class NeuralMaterial(nn.Module, ABC):
             )
             outputs = 1 if network.offset == "depth" else 2
             self.offset_network = Mlp([network.channels + 2, *hidden, outputs], network.activation)
+
+    @classmethod
+    def hint_size(cls, network: NetworkSection) -> int:
+        """Inputs of the decoder besides features and directions."""
+        return 0
+
+    @classmethod
+    def gate_size(cls, network: NetworkSection) -> int:
+        """Outputs of the decoder besides those of the value."""
+        return 0
 
     @property
     def margin(self) -> int:
@@ -87,7 +98,7 @@ class NeuralMaterial(nn.Module, ABC):
         initialize_layers(self.decoder, generator)
         *_, last_bias = self.decoder.parameters()
         start = start_of(self.network.output_transform, self.network.output_channels)
-        last_bias.data.copy_(torch.tensor(start))
+        last_bias.data[: len(start)] = torch.tensor(start)
         self.unit.fill_(unit)
         if self.network.offset != "none":
             nn.init.zeros_(self.offset_texture.texels)
@@ -146,7 +157,7 @@ class NeuralMaterial(nn.Module, ABC):
 
     def directions(self, omega_i: Tensor, omega_o: Tensor) -> Tensor:
         """Inputs (n, d) of the decoder for light and view (n, 3)."""
-        return torch.cat([encode_direction(omega, self.network.encoding) for omega in (omega_i, omega_o)], 1)
+        return encode_directions(omega_i, omega_o, self.network.encoding)
 
     def to_value(self, x: Tensor) -> Tensor:
         """Values (..., 3) in 1/sr of the decoder's outputs."""

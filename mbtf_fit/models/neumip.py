@@ -73,12 +73,15 @@ class Neumip(NeuralMaterial):
         return torch.cat([features, by_view, level[:, None]], 1)
 
     def stage2(self, features: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
-        directions = self.directions(omega_i, omega_o)
         if self.calibration is None:
-            return self.to_value(self.decoder(torch.cat([features, directions], 1)))
+            return self.decode(features, omega_i, omega_o)
         features, by_view, level = features.tensor_split([-4, -1], 1)
-        value = self.to_value(self.decoder(torch.cat([features, directions], 1)))
+        value = self.decode(features, omega_i, omega_o)
         return value * by_view * interpolate_factors(self.calibration[0], level[:, 0], omega_i[:, 2])
+
+    def decode(self, features: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
+        """Value (n, 3) in 1/sr of :meth:`features`, without calibration."""
+        return self.to_value(self.decoder(torch.cat([features, self.directions(omega_i, omega_o)], 1)))
 
     def calibration_factors(self, sigma: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
         """Product (n, 3) of both calibration factors; 1 without calibration."""

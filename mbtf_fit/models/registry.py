@@ -9,8 +9,9 @@ from mbtf_fit.config import FitConfig
 from mbtf_fit.models.hierarchical import Hierarchical
 from mbtf_fit.models.interface import NeuralMaterial
 from mbtf_fit.models.neumip import Neumip, NeumipBaseline
+from mbtf_fit.models.relief import Relief
 
-MODELS: dict[str, type[NeuralMaterial]] = {m.name: m for m in (NeumipBaseline, Neumip, Hierarchical)}
+MODELS: dict[str, type[NeuralMaterial]] = {m.name: m for m in (NeumipBaseline, Neumip, Relief, Hierarchical)}
 
 
 def build_model(name: str, lattice: Lattice, **network: Any) -> NeuralMaterial:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from mbtf_fit.data.queries import TrainingQueries
-from mbtf_fit.native.library import GradientSums, QuadraticLoss, QueryPointers
+from mbtf_fit.native.library import MAX_LEVELS, GradientSums, QuadraticLoss, QueryPointers
 from mbtf_fit.native.model import NativeModel, aligned, networks, pointers, share
 from mbtf_fit.objective.losses import Objective, Quadratic
 from mbtf_fit.objective.parallel import Workers
@@ -26,7 +26,10 @@ _PIECE_BYTES = 6 << 20
 def query_pointers(batch: TrainingQueries, start: int, stop: int) -> QueryPointers:
     """Addresses of queries [start, stop) of a batch; its tensors are contiguous float32."""
     arrays = (batch.u, batch.sigma, batch.omega_i, batch.omega_o)
-    return QueryPointers(stop - start, *(a.data_ptr() + 4 * start * a.stride(0) for a in arrays))
+    addresses = [a.data_ptr() + 4 * start * a.stride(0) for a in arrays]
+    if batch.hints is not None:
+        addresses.append(batch.hints.data_ptr() + 4 * start * batch.hints.stride(0))
+    return QueryPointers(stop - start, *addresses)
 
 
 class _Sums:
@@ -45,7 +48,8 @@ class _Sums:
         self.out = torch.empty(max(piece, 2 * native.kernel.block), 3)
         addresses = [t.data_ptr() for t in self.textures], [t.data_ptr() for t in self.networks]
         texture, network = ([*a, 0][:2] for a in addresses)
-        self.pointers = GradientSums(*texture, *network)
+        self.depth_weights = torch.zeros(MAX_LEVELS)
+        self.pointers = GradientSums(*texture, *network, self.depth_weights.data_ptr())
 
 
 class NativeGradients:
@@ -54,6 +58,7 @@ class NativeGradients:
     Attributes
     ----------
     textures, networks : gradients by the tables and by the weights of each network, of the last batch
+    depth_weights : those by the depth weights of relief
     """
 
     def __init__(self, native: NativeModel) -> None:
@@ -62,6 +67,7 @@ class NativeGradients:
         per_block = 4 * native.kernel.library.mbtf_state_floats(ctypes.byref(native.description))
         self.piece = block * max(4, _PIECE_BYTES // per_block)
         self._sums: list[_Sums] = []
+        self.depth_weights = torch.zeros(MAX_LEVELS)
         self.textures = [torch.empty_like(t.texels) for t in native.model.textures()]
         self.networks = [[torch.empty_like(p) for p in n.parameters()] for n in networks(native.model)]
 
@@ -87,6 +93,9 @@ class NativeGradients:
         for k, gradients in enumerate(self.networks):
             self._collect_network(k, gradients)
         workers.each(self._collect_textures)
+        self.depth_weights = torch.stack([s.depth_weights for s in self._sums]).sum(0)
+        for sums in self._sums:
+            sums.depth_weights.zero_()
         # Added in a fixed order: the sum does not depend on which thread finishes first.
         total = losses[0]
         for loss in losses[1:]:

@@ -15,7 +15,7 @@ ENVIRONMENT = "MBTF_KERNEL"
 # Name of the library in this folder, without suffix.
 LIBRARY = "_kernel"
 # Largest sizes that the kernel takes; as in src/kernel.h.
-MAX_CHANNELS, MAX_WIDTH, MAX_LAYERS, MAX_LEVELS = 64, 128, 16, 16
+MAX_CHANNELS, MAX_WIDTH, MAX_LAYERS, MAX_LEVELS, MAX_PLACES = 64, 128, 16, 16, 4
 
 _I32, _I64, _F32, _POINTER = ctypes.c_int32, ctypes.c_int64, ctypes.c_float, ctypes.c_void_p
 
@@ -43,21 +43,50 @@ class Model(ctypes.Structure):
     _fields_ = (
         *((name, Textures) for name in ("pyramid", "offset_texture")),
         *((name, Network) for name in ("decoder", "offset")),
-        *((name, _F32) for name in ("unit", "offset_scale", "grazing", "aspect")),
-        ("coordinates", _I32),
+        *((name, _F32) for name in ("unit", "offset_scale", "grazing", "aspect", "irradiance_scale")),
+        *((name, _I32) for name in ("coordinates", "half_vector", "hints", "frame", "gate")),
+        ("depth_weights", _POINTER),
     )
 
 
 class QueryPointers(ctypes.Structure):
     """``mbtf_queries``"""
 
-    _fields_ = (("n", _I64), *((name, _POINTER) for name in ("u", "sigma", "omega_i", "omega_o")))
+    _fields_ = (
+        ("n", _I64),
+        *((name, _POINTER) for name in ("u", "sigma", "omega_i", "omega_o", "hints")),
+    )
+
+
+class Heightfield(ctypes.Structure):
+    """``mbtf_heightfield``"""
+
+    _fields_ = (
+        *((name, _POINTER) for name in ("nodes", "z")),
+        *((name, _I32) for name in ("columns", "rows", "columns_log2", "both_log2", "finest")),
+        ("aspect", _F32),
+    )
+
+
+class Surface(ctypes.Structure):
+    """``mbtf_surface``"""
+
+    _fields_ = (
+        ("heightfield", Heightfield),
+        *((name, Textures) for name in ("maps", "horizons")),
+        ("places", _I32),
+        ("offsets", _F32 * (2 * MAX_PLACES)),
+        *((name, _F32) for name in ("finer", "light_width", "light_blur", "least_light", "least_view")),
+        ("alpha2", _F32 * 2),
+    )
 
 
 class GradientSums(ctypes.Structure):
     """``mbtf_gradients``"""
 
-    _fields_ = tuple((name, _POINTER) for name in ("pyramid", "offset_texture", "decoder", "offset"))
+    _fields_ = tuple(
+        (name, _POINTER) for name in ("pyramid", "offset_texture", "decoder", "offset", "depth_weights")
+    )
 
 
 class QuadraticLoss(ctypes.Structure):
@@ -100,6 +129,9 @@ _PROTOTYPES = {
     "mbtf_adam": "viplpppp",
     "mbtf_blur_down": "vipllplllpp",
     "mbtf_blur_across": "vipllplllppp",
+    "mbtf_trace": "vplppip",
+    "mbtf_horizons": "vpifllp",
+    "mbtf_hints": "vppfip",
 }
 
 

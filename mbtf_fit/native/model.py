@@ -13,6 +13,7 @@ from mbtf_fit.models.constants import GRAZING, OFFSET_SCALE, direction_size
 from mbtf_fit.models.interface import NeuralMaterial
 from mbtf_fit.models.mlp import Mlp
 from mbtf_fit.models.neumip import Neumip, NeumipBaseline
+from mbtf_fit.models.relief import IRRADIANCE_SCALE, Relief
 from mbtf_fit.native.library import (
     MAX_CHANNELS,
     MAX_LAYERS,
@@ -32,14 +33,18 @@ _SUPPORTED: dict[str, tuple[Any, ...]] = {
     "output_transform": ("expm1",),
     "offset": ("depth", "none"),
     "blending": ("blend",),
-    "encoding": tuple(EncodingSection(direction_xyz=xyz).model_dump() for xyz in (False, True)),
+    "encoding": tuple(
+        EncodingSection(direction_xyz=xyz, half_vector=half).model_dump()
+        for xyz in (False, True)
+        for half in (False, True)
+    ),
 }
-_SIZES = {"channels", "width", "layers"}
+_SIZES = {"channels", "width", "layers", "relief"}
 
 
 def supports(model: NeuralMaterial) -> bool:
     """Whether the kernel can evaluate a model."""
-    if type(model) not in (Neumip, NeumipBaseline):
+    if type(model) not in (Neumip, NeumipBaseline, Relief):
         return False
     options, textures = model.network.model_dump(), model.textures()
     tensors = [*model.parameters(), *(t.table for t in textures)]
@@ -89,7 +94,11 @@ class NativeModel:
         self.model = model
         self.description = d = Model()
         d.offset_scale, d.grazing, d.aspect = OFFSET_SCALE, GRAZING, model.lattice.aspect
-        d.coordinates = direction_size(model.network.encoding)
+        encoding, relief = model.network.encoding, model.network.relief
+        d.coordinates, d.half_vector = direction_size(encoding), encoding.half_vector
+        if isinstance(model, Relief):
+            d.irradiance_scale = IRRADIANCE_SCALE
+            d.hints, d.frame, d.gate = relief.hints, relief.frame, relief.gate
         self._networks: list[tuple[Mlp, Network, Tensor]] = []
         for network, target in zip(networks(model), (d.decoder, d.offset), strict=False):
             widths = [network.weights[0].shape[1], *(len(w) for w in network.weights)]
@@ -115,6 +124,9 @@ class NativeModel:
         for network, target, packed in self._networks:
             held = [p.detach().contiguous() for p in network.parameters()]
             library.mbtf_pack(variant, ctypes.byref(target), pointers(held), packed.data_ptr())
+        if isinstance(self.model, Relief):
+            self._depth_weights = self.model.depth_weights.detach().contiguous()
+            self.description.depth_weights = self._depth_weights.data_ptr()
         # Kept: the description has their addresses.
         self._tables = [texture.table.detach().contiguous() for texture, _ in self._textures]
         for (_, layout), table in zip(self._textures, self._tables, strict=True):

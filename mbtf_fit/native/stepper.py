@@ -12,6 +12,7 @@ from torch import Tensor
 
 from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.models.interface import NeuralMaterial
+from mbtf_fit.models.relief import Relief
 from mbtf_fit.native.blur import Blur
 from mbtf_fit.native.gradients import NativeGradients
 from mbtf_fit.native.library import AdamStep, Kernel
@@ -60,6 +61,9 @@ class NativeStepper:
             found[texture.texels] = gradient
         for network, gradients in zip(networks(self.model), self._gradients.networks, strict=True):
             found.update(zip(network.parameters(), gradients, strict=True))
+        if isinstance(self.model, Relief):
+            weights = self.model.depth_weights
+            found[weights] = self._gradients.depth_weights[: len(weights)].contiguous()
         adam(self.kernel, self.optimizer, found, workers)
         return loss
 

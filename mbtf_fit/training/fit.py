@@ -28,7 +28,9 @@ from mbtf_fit.material.material import Material, export
 from mbtf_fit.material.transmittance_fit import evaluate_transmittance, fit_transmittance
 from mbtf_fit.models.interface import NeuralMaterial
 from mbtf_fit.models.registry import MODELS, build_model
+from mbtf_fit.models.relief import Relief
 from mbtf_fit.objective.noise import NoiseModel, typical_value
+from mbtf_fit.surface.known import KnownSurface
 from mbtf_fit.training.checkpoint import CHECKPOINT_NAME, read_checkpoint, write_checkpoint
 from mbtf_fit.training.convergence import MarginalCost, marginal_cost_of
 from mbtf_fit.training.fit_folder import claim, identity_of
@@ -247,12 +249,26 @@ def _fit(
 def prepare_trainer(config: FitConfig, data: Dataset, partition: Partition, device: torch.device) -> Trainer:
     """A trainer at its first step, for the model and the data of a configuration."""
     model = build_model(config.model, data.lattice, **config.network.model_dump())
+    if isinstance(model, Relief):
+        model.know(_known_surface(config, data))
     unit = typical_value(mean_value(partition.sample.value_a, partition.sample.value_b))
     model.initialize(torch.Generator().manual_seed(config.seed), unit)
     if config.init_from is not None:
         _initialize_from(model, config.init_from)
     noise = NoiseModel.of(partition.sample, data.lattice, unit)
     return Trainer(config, model.to(device), partition.training.to(device), noise, partition.selection)
+
+
+def _known_surface(config: FitConfig, data: Dataset) -> KnownSurface:
+    """Heights and maps of a data set's surface, filtered for its levels."""
+    geometry = data.geometry()
+    if geometry is None:
+        raise InputError(
+            f"the data set has no geometry, which {config.model} traces",
+            where=data.folder,
+            hint="fit another model: --model neumip",
+        )
+    return KnownSurface.of(geometry, data.lattice, data.manifest["config"]["light"]["width"])
 
 
 def _initialize_from(model: NeuralMaterial, folder: str | Path) -> None:

@@ -24,15 +24,20 @@ PILOT_SECONDS = (4.0, 8.0)
 # squares over fits of 60 s with quality options on draft data of eleven materials
 # (benchmarks/forecasts.py).
 PERSISTENCE = 0.45
-# Seconds of a fit besides training (loading, calibration, evaluation), and of each query of its data, on two
-# processor cores (benchmarks/quality.py).
-FIT_SECONDS, QUERY_SECONDS = 1.5, 0.6e-6
+# Seconds of a fit besides training (loading, calibration, evaluation), of each query of its data, and of each
+# query's transmittance, on two processor cores (benchmarks/quality.py, benchmarks/time_against_presets.py).
+FIT_SECONDS, _QUERY_SECONDS, _TRANSMITTANCE_SECONDS = 1.5, 0.6e-6, 1.6e-6
 # Fits of fewer queries in all steps take less than a minute at a third of a million queries per second.
 LONG_FIT = 20_000_000
 # Seconds of the pilot of a fit by steps.
 _STEPS_PILOT = 2.0
 # Most queries of the validation subset.
 _SUBSET = 1 << 17
+
+
+def query_seconds(transmittance: bool) -> float:
+    """Seconds of loading and evaluating a query of data with or without a transmittance."""
+    return _QUERY_SECONDS + (_TRANSMITTANCE_SECONDS if transmittance else 0.0)
 
 
 @dataclass(frozen=True)

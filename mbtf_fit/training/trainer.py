@@ -19,13 +19,14 @@ from torch import Tensor
 from mbtf_core.errors import InputError
 from mbtf_fit.config import FitConfig, TrainingSection
 from mbtf_fit.data.images import Patches, TrainingImages
-from mbtf_fit.data.queries import ShardQueries, TrainingQueries
+from mbtf_fit.data.queries import HINT_BYTES, QUERY_BYTES, ShardQueries, TrainingQueries
 from mbtf_fit.data.streaming import Selection, StreamedQueries
 from mbtf_fit.material.inference import predict
 from mbtf_fit.models.blur import annealed_sigma
 from mbtf_fit.models.hierarchical import Hierarchical
 from mbtf_fit.models.interface import NeuralMaterial
 from mbtf_fit.models.neumip import Neumip
+from mbtf_fit.models.relief import Relief
 from mbtf_fit.native import kernel
 from mbtf_fit.native.model import supports
 from mbtf_fit.native.stepper import NativeStepper
@@ -48,6 +49,21 @@ def learning_rate_factor(training: TrainingSection, step: int, fraction: float) 
     last = training.final_learning_rate_factor
     fall = last + (1 - last) * 0.5 * (1 + math.cos(math.pi * min(fraction, 1.0)))
     return rise * fall
+
+
+def _hints(model: Relief, queries: TrainingQueries) -> Tensor:
+    return model.hints(queries.u, queries.sigma, queries.omega_i, queries.omega_o)
+
+
+def _with_hints(
+    model: NeuralMaterial, queries: TrainingQueries | TrainingImages | StreamedQueries, memory: float
+) -> TrainingQueries | TrainingImages | StreamedQueries:
+    """The queries with the hints of a model that has some, where they fit in so many bytes. Otherwise each
+    batch gets its own."""
+    fits = len(queries) * (QUERY_BYTES + HINT_BYTES) <= memory
+    if not (isinstance(model, Relief) and isinstance(queries, TrainingQueries) and fits):
+        return queries
+    return replace(queries, hints=_hints(model, queries))
 
 
 @dataclass
@@ -82,7 +98,7 @@ class Trainer:
         self.model = model
         if isinstance(queries, TrainingImages):
             queries = replace(queries, patch_size=config.training.patch_size)
-        self.queries = queries
+        self.queries = _with_hints(model, queries, config.data.memory)
         self.selection = selection
         self.device = next(model.parameters()).device
         self.progress = Progress()
@@ -175,8 +191,10 @@ class Trainer:
 
     def _loss(self, batch: Batch) -> Tensor:
         evaluate = self.model.evaluate_patches if isinstance(self.model, Hierarchical) else self.model
-        prediction = evaluate(batch.u, batch.sigma, batch.omega_i, batch.omega_o)
-        return self.loss(prediction, batch)
+        arrays = [batch.u, batch.sigma, batch.omega_i, batch.omega_o]
+        if isinstance(batch, TrainingQueries) and batch.hints is not None:
+            arrays.append(batch.hints)
+        return self.loss(evaluate(*arrays), batch)
 
     def _step(self, batch: Batch, workers: Workers) -> Tensor:
         training = self.config.training
@@ -185,6 +203,8 @@ class Trainer:
         for group, rate in zip(self.optimizer.param_groups, rates, strict=True):
             group["lr"] = rate
         self.weight_decay.apply(self.model, *rates)
+        if isinstance(self.model, Relief) and isinstance(batch, TrainingQueries) and batch.hints is None:
+            batch = replace(batch, hints=_hints(self.model, batch))
         if self._stepper is not None and not isinstance(batch, Patches):
             return self._stepper.step(self.loss, batch, self._sigmas(), workers)
         texels, weights = self.model.parameter_groups()

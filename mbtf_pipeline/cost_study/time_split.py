@@ -28,7 +28,7 @@ from mbtf_core.folders import check_folder, check_space, owned
 from mbtf_core.nested import deep_merge
 from mbtf_core.units import clock, format_duration
 from mbtf_fit.config import FitConfig
-from mbtf_fit.training.forecast import QUERY_SECONDS
+from mbtf_fit.training.forecast import query_seconds
 from mbtf_gen.config.generator import count_queries
 from mbtf_gen.config.presets import GENERATOR, Quality
 from mbtf_gen.dataset.shard_io import row_bytes
@@ -194,7 +194,8 @@ class TimedRun:
         start, path = forecaster.speed
         job = Job.of(recipe.generate, forecaster.material)
         own = split_queries(job, "train")
-        query = recipe.generate.queries.spp * path + fits * QUERY_SECONDS
+        evaluating = fits * query_seconds(job.material.opacity is not None)
+        query = recipe.generate.queries.spp * path + evaluating
         fixed = whole.seconds - own * query - whole.training
         left = self._left() - fixed
         # `paper` counts steps; its training takes what is left.
@@ -213,7 +214,7 @@ class TimedRun:
             # A reduced draft gets half of its training at least.
             least_each=whole.training / fits if scale >= 1.0 and whole.training else 0.5 * each,
             generating=round(start + whole.generating + more * recipe.generate.queries.spp * path, 1),
-            after=round(whole.evaluating + whole.comparing + more * fits * QUERY_SECONDS, 1),
+            after=round(whole.evaluating + whole.comparing + more * evaluating, 1),
         )
         return split, whole.bytes + more * row_bytes(holes=True)
 

@@ -29,7 +29,7 @@ static inline int64_t network_rows(const mbtf_network *net) {
 }
 
 static int64_t state_floats(const mbtf_model *m) {
-    return BLOCK * (7 + network_rows(&m->decoder) + (m->offset.layers ? network_rows(&m->offset) : 0));
+    return BLOCK * (8 + network_rows(&m->decoder) + (m->offset.layers ? network_rows(&m->offset) : 0));
 }
 
 #define JOIN_(a, b) a##b

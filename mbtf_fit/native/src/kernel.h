@@ -14,6 +14,8 @@
 #define MAX_WIDTH 128
 #define MAX_LAYERS 16
 #define MAX_LEVELS 16
+#define MAX_PLACES 4
+#define HINTS 7
 /* Floats that a vector register may hold at most; a weight's gradient is kept as so many partial sums. */
 #define LANES 16
 
@@ -34,25 +36,48 @@ typedef struct {
     const float *table;
 } mbtf_textures;
 
-/* neumip, or neumip-baseline where offset.layers is 0. The decoder sees so many coordinates of light and of
- * view: 2 (x, y) or 3. */
+/* neumip, neumip-baseline where offset.layers is 0, or relief where depth_weights (a number per level) are
+ * given. The decoder sees so many coordinates of light and of view: 2 (x, y) or 3; then, where they are not 0,
+ * half vector and difference vector, hints, light and view about the known normal. With `gate`, its last output
+ * is that of the gate. */
 typedef struct {
     mbtf_textures pyramid, offset_texture;
     mbtf_network decoder, offset;
-    float unit, offset_scale, grazing, aspect;
-    int32_t coordinates;
+    float unit, offset_scale, grazing, aspect, irradiance_scale;
+    int32_t coordinates, half_vector, hints, frame, gate;
+    const float *depth_weights;
 } mbtf_model;
 
-/* u (n, 2), sigma (n), omega_i and omega_o (n, 3). */
+/* A periodic height field: nodes and logarithms as in mbtf_gen/geometry/height_planes.py; heights z (rows,
+ * columns) at most 0, row index along +y. */
+typedef struct {
+    const float *nodes, *z;
+    int32_t columns, rows, columns_log2, both_log2, finest;
+    float aspect;
+} mbtf_heightfield;
+
+float mbtf_height(const mbtf_heightfield *f, float u, float v, const float *omega, int32_t most);
+
+/* What is known of a surface, see mbtf_fit/surface/known.py: heights, filtered maps and horizons, places of a
+ * footprint (offsets x, y in sigma), levels by which lookups are finer there, RMS angle per axis of the light. */
+typedef struct {
+    mbtf_heightfield heightfield;
+    mbtf_textures maps, horizons;
+    int32_t places;
+    float offsets[2 * MAX_PLACES];
+    float finer, light_width, light_blur, least_light, least_view, alpha2[2];
+} mbtf_surface;
+
+/* u (n, 2), sigma (n), omega_i and omega_o (n, 3), hints (n, HINTS) for relief. */
 typedef struct {
     int64_t n;
-    const float *u, *sigma, *omega_i, *omega_o;
+    const float *u, *sigma, *omega_i, *omega_o, *hints;
 } mbtf_queries;
 
 /* Sums that one thread adds to. Texture rows are padded to a multiple of 8 floats, weights are LANES
- * partial sums each. */
+ * partial sums each, depth weights are single numbers. */
 typedef struct {
-    float *pyramid, *offset_texture, *decoder, *offset;
+    float *pyramid, *offset_texture, *decoder, *offset, *depth_weights;
 } mbtf_gradients;
 
 /* Loss of a prediction p on a value t that the kernel takes by itself, the mean over queries and colors of

@@ -1,0 +1,129 @@
+/* Hints of queries: what is known of the surface that they see (mbtf_fit/surface/known.py). */
+#include "kernel.h"
+
+#include <math.h>
+
+#define EXPORT __attribute__((visibility("default")))
+#define PI 3.14159265f
+/* Channels of the maps: slopes (x, y), their squares, diffuse albedo; F0 and squared alpha of glossy surfaces. */
+#define GLOSSY 11
+
+static inline float clamped(float x, float low, float high) { return x > low ? (x < high ? x : high) : low; }
+
+static inline float wrapped(float i, float size) {
+    const float w = i - size * floorf(i / size);
+    return w >= 0.0f && w < size ? w : 0.0f;
+}
+
+/* Rows of a table around a point, and their weights: four of each of two levels. */
+typedef struct {
+    int64_t rows[8];
+    float weights[8];
+} place;
+
+static void find(const mbtf_textures *t, float level, float u, float v, place *p) {
+    const int last = t->levels - 1;
+    level = clamped(level, 0.0f, (float)last);
+    int coarse = (int)level;
+    if (coarse > last - 1) coarse = last > 0 ? last - 1 : 0;
+    const float finer = level - (float)coarse;
+    for (int k = 0; k < 2; k++) {
+        const int s = coarse + k < last ? coarse + k : last;
+        const float columns = (float)t->columns[s], rows = (float)t->rows[s], scale = k ? finer : 1.0f - finer;
+        const float x = u * columns - 0.5f, y = (1.0f - v) * rows - 0.5f;
+        const float fx = x - floorf(x), fy = y - floorf(y);
+        const int64_t left = (int64_t)wrapped(floorf(x), columns), top = (int64_t)wrapped(floorf(y), rows);
+        const int64_t right = left + 1 < t->columns[s] ? left + 1 : 0, bottom = top + 1 < t->rows[s] ? top + 1 : 0;
+        const int64_t upper = t->starts[s] + top * t->columns[s], lower = t->starts[s] + bottom * t->columns[s];
+        p->rows[4 * k] = upper + left;
+        p->rows[4 * k + 1] = upper + right;
+        p->rows[4 * k + 2] = lower + left;
+        p->rows[4 * k + 3] = lower + right;
+        p->weights[4 * k] = scale * (1.0f - fx) * (1.0f - fy);
+        p->weights[4 * k + 1] = scale * fx * (1.0f - fy);
+        p->weights[4 * k + 2] = scale * (1.0f - fx) * fy;
+        p->weights[4 * k + 3] = scale * fx * fy;
+    }
+}
+
+/* Share of the footprint that sees the light. */
+static float visibility(const mbtf_surface *s, float level, float u, float v, const float *light) {
+    const int count = s->horizons.channels / 2;
+    float azimuth = atan2f(light[1], light[0]) * ((float)count / (2.0f * PI));
+    azimuth -= (float)count * floorf(azimuth / (float)count);
+    const int first = (int)clamped(azimuth, 0.0f, (float)(count - 1)), after = (first + 1) % count;
+    const float weight = azimuth - (float)first;
+    place p;
+    find(&s->horizons, level, u, v, &p);
+    float mean = 0.0f, square = 0.0f;
+    for (int k = 0; k < 8; k++) {
+        const float *row = s->horizons.table + p.rows[k] * s->horizons.channels;
+        mean += p.weights[k] * (row[first] + weight * (row[after] - row[first]));
+        square += p.weights[k] * (row[count + first] + weight * (row[count + after] - row[count + first]));
+    }
+    const float blur = s->light_blur * s->light_width, variance = square - mean * mean;
+    const float total = (variance > 0.0f ? variance : 0.0f) + blur * blur;
+    const float elevation = asinf(clamped(light[2], 0.0f, 1.0f));
+    return 0.5f + 0.5f * erff((elevation - mean) / sqrtf(2.0f * (total > 1e-8f ? total : 1e-8f)));
+}
+
+static float masking(float alpha2, float c) { return sqrtf(1.0f + alpha2 * (1.0f / (c * c) - 1.0f)); }
+
+/* Adds irradiance, normal (x, y) and core at a surface point. */
+static void shade(const mbtf_surface *s, float level, float u, float v, const float *i, const float *o, float *sum) {
+    float m[GLOSSY] = {0};
+    place p;
+    find(&s->maps, level, u, v, &p);
+    const int channels = s->maps.channels;
+    for (int k = 0; k < 8; k++) {
+        const float *row = s->maps.table + p.rows[k] * channels;
+        for (int c = 0; c < channels; c++) m[c] += p.weights[k] * row[c];
+    }
+    const float size = 1.0f / sqrtf(m[0] * m[0] + m[1] * m[1] + 1.0f);
+    const float nx = -m[0] * size, ny = -m[1] * size, nz = size;
+    float light = nx * i[0] + ny * i[1] + nz * i[2];
+    const float irradiance = visibility(s, level, u, v, i) * (light > 0.0f ? light : 0.0f) / i[2];
+    float value[3];
+    for (int c = 0; c < 3; c++) value[c] = m[4 + c] / PI;
+    if (channels == GLOSSY) {
+        const float vx = m[2] - m[0] * m[0], vy = m[3] - m[1] * m[1];
+        const float variance = (vx > 0.0f ? vx : 0.0f) + (vy > 0.0f ? vy : 0.0f);
+        const float alpha2 = clamped(m[10] + variance + s->light_width * s->light_width, s->alpha2[0], s->alpha2[1]);
+        light = light > s->least_light ? light : s->least_light;
+        float view = nx * o[0] + ny * o[1] + nz * o[2];
+        view = view > s->least_view ? view : s->least_view;
+        float hx = i[0] + o[0], hy = i[1] + o[1], hz = i[2] + o[2];
+        const float length = sqrtf(hx * hx + hy * hy + hz * hz);
+        hx /= length, hy /= length, hz /= length;
+        const float cosine = clamped(nx * hx + ny * hy + nz * hz, 0.0f, 2.0f);
+        const float inside = cosine * cosine * (alpha2 - 1.0f) + 1.0f;
+        const float facets = alpha2 / (PI * inside * inside);
+        const float rest = 1.0f - clamped(o[0] * hx + o[1] * hy + o[2] * hz, 0.0f, 1.0f);
+        const float schlick = rest * rest * rest * rest * rest;
+        const float lobe = facets / (2.0f * (masking(alpha2, light) + masking(alpha2, view)) * light * view);
+        for (int c = 0; c < 3; c++) value[c] += (m[7 + c] + (1.0f - m[7 + c]) * schlick) * lobe;
+    }
+    sum[0] += irradiance;
+    sum[1] += nx;
+    sum[2] += ny;
+    for (int c = 0; c < 3; c++) sum[3 + c] += irradiance * value[c];
+}
+
+/* Hints (n, HINTS) of queries; `top` is the finest level of the data. */
+EXPORT void mbtf_hints(const mbtf_surface *s, const mbtf_queries *q, float top, int32_t most, float *out) {
+    const float aspect = s->heightfield.aspect;
+    for (int64_t k = 0; k < q->n; k++) {
+        const float *u = q->u + 2 * k, *i = q->omega_i + 3 * k, *o = q->omega_o + 3 * k;
+        const float size = 2.0f * q->sigma[k];
+        const float level = clamped(-log2f(size > 1e-30f ? size : 1e-30f), 0.0f, top);
+        const float sigma = 0.5f * exp2f(-level);
+        float sum[HINTS] = {0};
+        for (int p = 0; p < s->places; p++) {
+            const float x = u[0] + sigma * s->offsets[2 * p], y = u[1] + sigma * s->offsets[2 * p + 1] / aspect;
+            const float z = mbtf_height(&s->heightfield, x, y, o, most), t = z / o[2];
+            sum[0] += z;
+            shade(s, level + s->finer, x + t * o[0], y + t * o[1] / aspect, i, o, sum + 1);
+        }
+        for (int c = 0; c < HINTS; c++) out[HINTS * k + c] = sum[c] / (float)s->places;
+    }
+}

@@ -1,0 +1,1 @@
+"""What is known of the surface of a displaced tile: intersections, horizons, and prefiltered maps."""

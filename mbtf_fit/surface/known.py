@@ -1,0 +1,285 @@
+r"""Hints: what the geometry of a data set tells about a query before anything is learned.
+
+For a query (u, σ, ω_i, ω_o) the view rays of one or more places of the footprint are traced to the heights.
+At each intersection, maps filtered to the footprint give the normal n̄, the diffuse albedo, the reflectance F0
+and the roughness of a GGX lobe, widened by the variance of the slopes below the footprint (LEAN mapping,
+Olano and Baker 2010). The light is visible from a share V of the footprint: the elevation of the horizon in
+the light's azimuth has the mean h and the variance s² there, and for normally distributed horizons
+
+    V = Φ((elevation of ω_i - h) / √(s² + w²)),    w = 0.8 times the light kernel's width.
+
+The hints of a query are means over its places:
+
+- the height z of the intersection, which gives the displacement ``z/ω_o,z · ω_o,xy``;
+- the irradiance ``e = V max(0, n̄·ω_i) / ω_i,z`` of the visible surface, 1 on the reference plane;
+- the normal's x and y;
+- the core ``e · f(n̄, ω_i, ω_o)`` in 1/sr: light that is scattered once, where f is diffuse plus GGX.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mbtf_core.lattice import Lattice
+from mbtf_fit.models.lookup import Packing, lookup
+from mbtf_fit.surface.heightfield import HeightfieldTracer
+from mbtf_fit.surface.prefilter import prefiltered_levels
+from mbtf_gen.images.resample import resample
+
+if TYPE_CHECKING:
+    from mbtf_gen.dataset.geometry import Geometry
+
+# Columns of the hints: height, irradiance, normal (x, y), core (RGB).
+HINTS = 7
+# Channels of the maps: slopes (x, y), their squares (x, y), diffuse albedo (RGB); of a glossy surface besides
+# F0 (RGB) and α².
+DIFFUSE_CHANNELS, GLOSSY_CHANNELS = 7, 11
+# Azimuths of the horizons.
+AZIMUTHS = 16
+# Share of the light kernel's width (RMS per axis) that blurs the horizon.
+LIGHT_BLUR = 0.8
+# Reflectance of the surface where the data set states none.
+UNKNOWN_COLOR = 0.5
+# F0 of a dielectric per unit of `specular`, as in mbtf_gen.render.bsdf.surface.
+DIELECTRIC_F0 = 0.08
+# Smallest cosines of light and view to a normal, least and largest α² of the lobe.
+LEAST_LIGHT, LEAST_VIEW, ALPHA2 = 0.01, 0.05, (1e-4, 4.0)
+# Offsets of the places from the footprint's center, per axis, in σ; levels that lookups there are finer by.
+# Lookups at one place have the footprint itself. Four places at ±√(3/4) σ with half the footprint each have
+# the same variance.
+PLACES: dict[int, tuple[tuple[tuple[float, float], ...], float]] = {
+    1: (((0.0, 0.0),), 0.0),
+    4: (tuple((x * math.sqrt(0.75), y * math.sqrt(0.75)) for y in (-1, 1) for x in (-1, 1)), 1.0),
+}
+# Tensors of a surface in a material, before the level.
+HEIGHTS, MAPS, HORIZONS = "surface.heights", "surface.maps", "surface.horizons"
+LIGHT_WIDTH = "surface.light_width"
+
+
+@dataclass(frozen=True)
+class KnownSurface:
+    """Heights and prefiltered maps of a tile.
+
+    Attributes
+    ----------
+    lattice : Lattice
+        Levels of the data; maps have one more.
+    heights : (H, W) tensor
+        z of the traced grid in tile widths; row 0 is the side ``v → 1``.
+    maps : tuple of (rows, columns, channels) tensors
+        Prefiltered maps by level, coarsest first: levels 0 to k + 1.
+    horizons : tuple of (rows, columns, 2·azimuths) tensors
+        Prefiltered horizon angles in radians by level, then their squares: levels 0 to k.
+    light_width : float
+        RMS angle per axis of the light kernel, in radians.
+    """
+
+    lattice: Lattice
+    heights: Tensor
+    maps: tuple[Tensor, ...]
+    horizons: tuple[Tensor, ...]
+    light_width: float
+
+    @classmethod
+    def of(cls, geometry: Geometry, lattice: Lattice, light_width: float) -> KnownSurface:
+        """Filter the geometry of a data set for its levels.
+
+        Parameters
+        ----------
+        geometry : Geometry
+        lattice : Lattice
+            Levels of the data.
+        light_width : float
+            RMS angle per axis of the light kernel, in degrees.
+        """
+        angles = HeightfieldTracer(geometry.heights, geometry.aspect).horizons(AZIMUTHS)
+        # A grid coarser than the texels is interpolated linearly: a Fourier series would ring.
+        rows, columns = (max(a, b) for a, b in zip(lattice.shape(), angles.shape, strict=False))
+        if (rows, columns) != tuple(angles.shape[:2]):
+            angles = torch.from_numpy(np.asarray(resample(angles.numpy(), rows, columns), np.float32))
+        maps = torch.from_numpy(np.concatenate(_channels(geometry), -1))
+        horizons = torch.cat([angles, angles.square()], -1)
+        finer = Lattice(lattice.finest + 1, lattice.aspect)
+        return cls(
+            lattice,
+            torch.from_numpy(geometry.heights.copy()),
+            tuple(prefiltered_levels(maps, finer)),
+            tuple(prefiltered_levels(horizons, lattice)),
+            math.radians(light_width),
+        )
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Its tensors by their names in a material."""
+        return {
+            HEIGHTS: self.heights,
+            LIGHT_WIDTH: torch.tensor(self.light_width),
+            **{f"{MAPS}.{level}": t for level, t in enumerate(self.maps)},
+            **{f"{HORIZONS}.{level}": t for level, t in enumerate(self.horizons)},
+        }
+
+    @classmethod
+    def from_tensors(cls, tensors: Mapping[str, Tensor], lattice: Lattice) -> KnownSurface:
+        """Inverse of :meth:`tensors`.
+
+        Raises
+        ------
+        KeyError : a tensor is missing
+        """
+        levels = range(lattice.finest + 1)
+        return cls(
+            lattice,
+            tensors[HEIGHTS].float(),
+            tuple(tensors[f"{MAPS}.{level}"].float() for level in (*levels, lattice.finest + 1)),
+            tuple(tensors[f"{HORIZONS}.{level}"].float() for level in levels),
+            float(tensors[LIGHT_WIDTH]),
+        )
+
+    @property
+    def glossy(self) -> bool:
+        """Whether the maps describe a glossy lobe."""
+        return self.maps[0].shape[2] == GLOSSY_CHANNELS
+
+    @cached_property
+    def tracer(self) -> HeightfieldTracer:
+        """Traces view rays to the heights."""
+        return HeightfieldTracer(self.heights.cpu().numpy(), self.lattice.aspect)
+
+    @cached_property
+    def map_table(self) -> tuple[Tensor, Packing]:
+        """All levels of the maps, one after the other."""
+        return _packed(self.maps)
+
+    @cached_property
+    def horizon_table(self) -> tuple[Tensor, Packing]:
+        """All levels of the horizons, one after the other."""
+        return _packed(self.horizons)
+
+    def hints(self, u: Tensor, level: Tensor, omega_i: Tensor, omega_o: Tensor, places: int = 1) -> Tensor:
+        """Hints of queries, in PyTorch.
+
+        Parameters
+        ----------
+        u : (n, 2) tensor
+            Positions, uv.
+        level : (n,) tensor
+            Fractional levels of the footprints, in [0, k].
+        omega_i, omega_o : (n, 3) tensor
+            Unit vectors towards light and viewer, z > 0.
+        places : int
+            Places of the footprint, a key of :data:`PLACES`.
+
+        Returns
+        -------
+        (n, 7) tensor
+            Height, irradiance, normal (x, y), core (RGB).
+        """
+        height, hits = self.intersections(u, level, omega_o, places)
+        return torch.cat([height, self.shading(hits, level, omega_i, omega_o, places)], 1)
+
+    def intersections(self, u: Tensor, level: Tensor, omega_o: Tensor, places: int) -> tuple[Tensor, Tensor]:
+        """Mean height (n, 1), and uv (n, 2·places), of the intersections of the places' view rays."""
+        sigma = 0.5 * torch.exp2(-level)[:, None]
+        aspect = u.new_tensor([1.0, self.lattice.aspect])
+        total, hits = u.new_zeros(len(u), 1), []
+        for offset in PLACES[places][0]:
+            at = u + sigma * u.new_tensor(offset) / aspect
+            z = self.tracer.trace(at, omega_o)[:, None]
+            hits.append(at + z / omega_o[:, 2:] * omega_o[:, :2] / aspect)
+            total = total + z
+        return total / places, torch.cat(hits, 1)
+
+    def shading(self, hits: Tensor, level: Tensor, omega_i: Tensor, omega_o: Tensor, places: int) -> Tensor:
+        """Hints (n, 6) but the height: means over the intersections (n, 2·places)."""
+        finer = PLACES[places][1]
+        parts = [self._shade(hit, level + finer, omega_i, omega_o) for hit in hits.split(2, 1)]
+        return torch.stack(parts).mean(0)
+
+    def _shade(self, hit: Tensor, level: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
+        """Irradiance, normal and core (n, 6) at surface points."""
+        table, packing = self.map_table
+        maps = lookup(table, packing, hit, level)
+        slopes, squares, diffuse = maps[:, :2], maps[:, 2:4], maps[:, 4:7]
+        normal = torch.nn.functional.normalize(torch.cat([-slopes, torch.ones_like(slopes[:, :1])], 1), dim=1)
+        light = (normal * omega_i).sum(1, keepdim=True)
+        visibility = self.visibility(hit, level, omega_i)
+        irradiance = visibility * light.clamp_min(0.0) / omega_i[:, 2:]
+        value = diffuse / math.pi
+        if self.glossy:
+            variance = (squares - slopes.square()).clamp_min(0.0).sum(1, keepdim=True)
+            alpha2 = (maps[:, 10:11] + variance + self.light_width**2).clamp(*ALPHA2)
+            light = light.clamp_min(LEAST_LIGHT)
+            view = (normal * omega_o).sum(1, keepdim=True).clamp_min(LEAST_VIEW)
+            value = value + ggx(maps[:, 7:10], alpha2, normal, light, view, omega_i, omega_o)
+        return torch.cat([irradiance, normal[:, :2], irradiance * value], 1)
+
+    def visibility(self, hit: Tensor, level: Tensor, omega_i: Tensor) -> Tensor:
+        """Share (n, 1) of footprints at surface points from which the light is visible."""
+        table, packing = self.horizon_table
+        both = lookup(table, packing, hit, level)
+        count = both.shape[1] // 2
+        azimuth = torch.atan2(omega_i[:, 1], omega_i[:, 0]) * (count / (2.0 * math.pi))
+        azimuth = azimuth - count * (azimuth / count).floor()
+        first = azimuth.floor().clamp(0, count - 1)
+        weight = (azimuth - first)[:, None]
+        index = first.long()[:, None]
+        after = (index + 1) % count
+        mean = torch.lerp(both.gather(1, index), both.gather(1, after), weight)
+        square = torch.lerp(both.gather(1, index + count), both.gather(1, after + count), weight)
+        variance = (square - mean.square()).clamp_min(0.0) + (LIGHT_BLUR * self.light_width) ** 2
+        elevation = omega_i[:, 2:].clamp(0.0, 1.0).asin()
+        return 0.5 + 0.5 * torch.erf((elevation - mean) / (2.0 * variance.clamp_min(1e-8)).sqrt())
+
+
+def ggx(
+    f0: Tensor,
+    alpha2: Tensor,
+    normal: Tensor,
+    light: Tensor,
+    view: Tensor,
+    omega_i: Tensor,
+    omega_o: Tensor,
+) -> Tensor:
+    """BRDF (n, 3) of GGX facets of reflectance F0 (n, 3) and α² (n, 1) (Walter et al. 2007; Schlick 1994).
+
+    Parameters
+    ----------
+    light, view : (n, 1) cosines of light and view to the normal, greater than 0
+    """
+    half = torch.nn.functional.normalize(omega_i + omega_o, dim=1)
+    cosine = (normal * half).sum(1, keepdim=True).clamp_min(0.0)
+    facets = alpha2 / (math.pi * (cosine.square() * (alpha2 - 1.0) + 1.0).square())
+
+    def masking(c: Tensor) -> Tensor:
+        return (1.0 + alpha2 * (1.0 / c.square() - 1.0)).sqrt()
+
+    schlick = (1.0 - (omega_o * half).sum(1, keepdim=True).clamp(0.0, 1.0)) ** 5
+    fresnel = f0 + (1.0 - f0) * schlick
+    return fresnel * facets / (2.0 * (masking(light) + masking(view)) * light * view)
+
+
+def _channels(geometry: Geometry) -> list[np.ndarray]:
+    """Maps (h, w, c) of a geometry, in the order of the channels."""
+    slopes, moments = geometry.slopes, geometry.slope_moments[..., (0, 2)]
+    shape = slopes.shape[:2]
+    if geometry.base_color is None:
+        return [slopes, moments, np.full((*shape, 3), UNKNOWN_COLOR, np.float32)]
+    base = geometry.base_color
+    if geometry.roughness is None or geometry.metallic is None or geometry.specular is None:
+        return [slopes, moments, base]
+    metal, specular = geometry.metallic[..., None], geometry.specular[..., None]
+    f0 = DIELECTRIC_F0 * specular * (1.0 - metal) + base * metal
+    # α = roughness².
+    return [slopes, moments, base * (1.0 - metal), f0, geometry.roughness[..., None] ** 4]
+
+
+def _packed(levels: tuple[Tensor, ...]) -> tuple[Tensor, Packing]:
+    table = torch.cat([level.flatten(0, 1) for level in levels])
+    return table, Packing(tuple((level.shape[0], level.shape[1]) for level in levels))
