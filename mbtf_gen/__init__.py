@@ -11,8 +11,8 @@ from typing import Any
 _PUBLIC = {
     "Camera": "mbtf_gen.pictures.camera",
     "Dataset": "mbtf_gen.dataset.reader",
-    "Geometry": "mbtf_gen.dataset.geometry",
     "GeneratorConfig": "mbtf_gen.config.generator",
+    "Geometry": "mbtf_gen.dataset.geometry",
     "Lattice": "mbtf_core.lattice",
     "LightKernel": "mbtf_gen.sampling.light_kernel",
     "MbtfError": "mbtf_core.errors",

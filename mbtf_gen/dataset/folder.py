@@ -98,14 +98,16 @@ def open_folder(job: Job, folder: Path, plan: Callable[[Job], RunPlan], overwrit
     with brief_lock(existing):
         remove_unfinished(folder, (MANIFEST_NAME, CONFIG_NAME, GEOMETRY_NAME))
         # The manifest comes first: it marks the folder as a data set, at whatever instant the run is killed.
-        if content and not create_file(existing, content):
+        adopted = bool(content) and not create_file(existing, content)
+        if adopted:
             _check_same(job, folder)
-            # The plan of the other writer may simulate other effects.
-            geometry = geometry_of(job, stored_plan(read_manifest(folder), existing).effects)
         manifest = read_manifest(folder)
         if not (folder / CONFIG_NAME).exists():
             write_text(folder / CONFIG_NAME, dump_yaml(manifest["config"]))
         if not (folder / GEOMETRY_NAME).exists():
+            if adopted:
+                # The plan of the other writer may simulate other effects.
+                geometry = geometry_of(job, stored_plan(manifest, existing).effects)
             check_geometry(folder, geometry, manifest)
             write_geometry(folder / GEOMETRY_NAME, geometry)
 
