@@ -35,6 +35,7 @@ class _State:
     received, since : the first signal, or 0, and its time
     kept : what an interruption leaves, for the message
     cleanups : called before the process ends without unwinding
+    code : exit code of the program's command once it has ended
     """
 
     program = False
@@ -42,6 +43,7 @@ class _State:
     received = 0
     since = 0.0
     kept = ""
+    code: int | None = None
     cleanups: list[Callable[[], None]] = []  # noqa: RUF012
 
 
@@ -53,8 +55,8 @@ def handle_signals() -> None:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _handle)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
-    # Called last. While it ends, the interpreter restores default actions, but not of ignored signals.
-    atexit.register(_ignore_signals)
+    # Called last: after threads are joined and all other exit functions have run.
+    atexit.register(_skip_unloading)
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
     # Native code delays Python's handlers, but not these bytes.
@@ -62,9 +64,19 @@ def handle_signals() -> None:
     threading.Thread(target=_watch, args=(reader,), name="interruption", daemon=True).start()
 
 
-def _ignore_signals() -> None:
-    for number in SIGNALS:
-        signal.signal(number, signal.SIG_IGN)
+def _skip_unloading() -> None:
+    """End the process where a command has ended. The interpreter would unload all modules, PyTorch's for a
+    second, and restore the default actions of signals meanwhile."""
+    if _State.code is not None:
+        _flush()
+        os._exit(_State.code)
+
+
+def _flush() -> None:
+    """Flush the standard streams; the reader of a closed pipe has seen enough."""
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError):
+            stream.flush()
 
 
 def _handle(number: int, frame: FrameType | None) -> None:
@@ -197,12 +209,11 @@ def stop_on_interruption() -> Iterator[threading.Event]:
 
 def finish(code: int) -> int:
     """Last act of a program: the exit code of its command. After an interruption it ends the process, whose
-    threads may still work; else a signal can no longer change the code."""
+    threads may still work; else exit functions run, and a signal can no longer change the code."""
     if _State.received:
-        with contextlib.suppress(OSError, ValueError):
-            sys.stdout.flush()
-            sys.stderr.flush()
+        _flush()
         os._exit(code)
+    _State.code = code
     for number in SIGNALS:
         signal.signal(number, lambda *_: os._exit(code))
     return code

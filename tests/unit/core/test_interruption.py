@@ -119,13 +119,49 @@ def test_a_signal_after_the_last_act_changes_nothing(tmp_path: Path) -> None:
     assert run_program(signal.SIGTERM, tmp_path, "-c", code).returncode == 4
 
 
-def test_a_signal_while_the_interpreter_ends_changes_nothing(tmp_path: Path) -> None:
-    """Objects of modules are removed after the interpreter has restored the default actions."""
-    late = "class Late:\n    def __del__(self, kill=os.kill, me=os.getpid(), number=number): kill(me, number)"
-    code = f"{SEND}\nimport mbtf_core.interruption as i\ni.handle_signals()\n"
-    code += f"number = int(os.environ['TEST_SIGNAL'])\n{late}\nlate = Late()\nsys.exit(i.finish(4))"
-    for number in interruption.SIGNALS:
-        assert run_program(number, tmp_path, "-c", code).returncode == 4
+# What a command may leave to the end of the interpreter, and what it may not: objects of modules would be
+# removed after the default actions of signals are restored.
+ENDING = """
+import atexit, tempfile, threading, weakref
+import mbtf_core.interruption as i
+i.handle_signals()
+number = int(os.environ["TEST_SIGNAL"])
+class Late:
+    def __del__(self, write=os.write, kill=os.kill, me=os.getpid()):
+        write(1, b"unloaded\\n")
+        kill(me, number)
+late = Late()
+folder = tempfile.TemporaryDirectory(dir=".")
+atexit.register(print, "exit function")
+threading.Timer(0.2, print, ["thread"]).start()
+print("command")
+sys.exit(i.finish(4))
+"""
+
+
+@pytest.mark.parametrize("number", interruption.SIGNALS)
+def test_a_program_ends_without_unloading(number: signal.Signals, tmp_path: Path) -> None:
+    done = run_program(number, tmp_path, "-c", f"import os, sys\n{ENDING}")
+    assert (done.returncode, done.stdout, done.stderr) == (4, "command\nthread\nexit function\n", "")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_reader_that_has_gone_is_no_error(tmp_path: Path) -> None:
+    code = "import sys\nimport mbtf_core.interruption as i\ni.handle_signals()\n"
+    code += "print('late')\nsys.exit(i.finish(4))"
+    reader, writer = os.pipe()
+    os.close(reader)
+    buffered = {**os.environ, "PYTHONUNBUFFERED": ""}
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        stdout=writer,
+        stderr=subprocess.PIPE,
+        env=buffered,
+        timeout=15,
+        check=False,
+    )
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (4, b"")
 
 
 def test_work_stops_at_a_step_and_then_as_usual(monkeypatch: pytest.MonkeyPatch) -> None:
