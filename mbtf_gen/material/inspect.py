@@ -116,9 +116,7 @@ def inspect_material(
 def _refusal(material: Material, grid: HeightGrid, limit: float) -> list[str]:
     """The warning that generation will refuse the material."""
     fault = displacement_fault(abs(grid.displacement_range), limit)
-    return (
-        [] if fault is None else [f"{material.files['height']}: mbtf-gen will refuse it: {'; '.join(fault)}"]
-    )
+    return [] if fault is None else [f"{material.files['height']}: generation refuses it: {'; '.join(fault)}"]
 
 
 def _albedo(material: Material) -> dict[str, Any] | None:

@@ -228,7 +228,7 @@ class TestCommand:
         self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         np.save(tmp_path / "tall.npy", np.linspace(0.0, 200.0, 32).reshape(4, 8))
-        refused = "tall.npy: mbtf-gen will refuse it: the displacement range is 200 tile widths; at most 100"
+        refused = "tall.npy: generation refuses it: the displacement range is 200 tile widths; at most 100"
 
         def warned(*options: str) -> bool:
             assert run(app, ["inspect", str(tmp_path / "tall.npy"), "--json", *options]) == 0
