@@ -33,6 +33,7 @@ COMMANDS = {
     "converted": "try: send()\n    except BaseException: raise RuntimeError('callback failed') from None",
     "swallowed": "try: send()\n    except BaseException: time.sleep(20)",
     "swallowed until the end": "try: send()\n    except BaseException: pass",
+    "dropped": "class Late:\n      def __del__(self): send_once()\n    Late(); time.sleep(20)",
     "native code": "send_later()\n    ctypes.CDLL(None).usleep(20_000_000)",
     "a pool": "from concurrent.futures import ThreadPoolExecutor\n"
     "    with ThreadPoolExecutor(1) as pool: pool.submit(time.sleep, 20); send()",
@@ -46,6 +47,8 @@ interruption.handle_signals()
 from mbtf_core.console import new_app, run
 from mbtf_core.folders import owned
 app = new_app("prog", "A program.")
+def send_once():
+    os.kill(os.getpid(), int(os.environ["TEST_SIGNAL"]))
 def send_later():
     threading.Timer(0.2, os.kill, (os.getpid(), int(os.environ["TEST_SIGNAL"]))).start()
 @app.default
