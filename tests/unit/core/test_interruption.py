@@ -33,7 +33,6 @@ COMMANDS = {
     "converted": "try: send()\n    except BaseException: raise RuntimeError('callback failed') from None",
     "swallowed": "try: send()\n    except BaseException: time.sleep(20)",
     "swallowed until the end": "try: send()\n    except BaseException: pass",
-    "dropped": "class Late:\n      def __del__(self): send_once()\n    Late(); time.sleep(20)",
     "native code": "send_later()\n    ctypes.CDLL(None).usleep(20_000_000)",
     "a pool": "from concurrent.futures import ThreadPoolExecutor\n"
     "    with ThreadPoolExecutor(1) as pool: pool.submit(time.sleep, 20); send()",
@@ -115,6 +114,15 @@ def test_one_ctrl_c_that_arrives_twice_is_one(tmp_path: Path) -> None:
     twice = "try: send()\n    except KeyboardInterrupt: os.kill(os.getpid(), 2); print('stored')"
     done = run_program(signal.SIGINT, tmp_path, "-c", SEND + PROGRAM.replace("BODY", twice))
     assert (done.returncode, done.stdout) == (130, "stored\n")
+
+
+def test_an_interruption_in_a_finalizer_is_raised_again(tmp_path: Path) -> None:
+    """Python prints and drops exceptions of finalizers."""
+    body = "class Late:\n      def __del__(self): send_once()\n"
+    body += "    try: Late(); time.sleep(20)\n    except KeyboardInterrupt: print('stored')"
+    done = run_program(signal.SIGINT, tmp_path, "-c", SEND + PROGRAM.replace("BODY", body))
+    assert (done.returncode, done.stdout) == (130, "stored\n")
+    assert done.stderr == "error: interrupted; two shards are kept\n  the same command resumes\n"
 
 
 def test_a_signal_after_the_last_act_changes_nothing(tmp_path: Path) -> None:
