@@ -79,7 +79,8 @@ def _skip_unloading() -> None:
 
 def _flush() -> None:
     """Flush the standard streams; the reader of a closed pipe has seen enough."""
-    for stream in (sys.stdout, sys.stderr):
+    # A stream that was closed before the start is None.
+    for stream in filter(None, (sys.stdout, sys.stderr)):
         with contextlib.suppress(OSError, ValueError):
             stream.flush()
 
