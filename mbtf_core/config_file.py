@@ -26,7 +26,7 @@ from pydantic import (
 )
 
 from mbtf_core.errors import InputError, MbtfError, UsageError, reason
-from mbtf_core.nested import leaves, merge, nested
+from mbtf_core.nested import deep_merge, leaves, merge, nested
 from mbtf_core.suggest import refuse_special, suggest_path
 from mbtf_core.validation_messages import explain, models_in, parts_of
 
@@ -306,7 +306,7 @@ def check_document(model: type[B], data: Mapping[str, Any], path: Path, hint: st
         raise InputError(f"is damaged ({error.what})", where=path, hint=hint) from None
 
 
-def _parse_value(text: str) -> Any:
+def parse_value(text: str) -> Any:
     """A ``--set`` value, read as YAML reads a scalar."""
     from ruamel.yaml import YAML
 
@@ -323,7 +323,15 @@ def _parse_assignment(text: str) -> tuple[str, Any]:
     key, sign, value = text.partition("=")
     if not sign or not key:
         raise UsageError(f"{_shown(text)} is not of the form key=value", where="--set")
-    return key.strip(), _parse_value(value)
+    return key.strip(), parse_value(value)
+
+
+def _over_presets(presets: Any, key: str, value: Any) -> tuple[str, Any]:
+    """An assignment that replaces all of a section but what presets say of it and the assignment does not."""
+    for part in key.split("."):
+        presets = presets.get(part) if isinstance(presets, Mapping) else None
+    both = isinstance(presets, Mapping) and isinstance(value, Mapping)
+    return key, deep_merge(presets, value) if both else value
 
 
 def _contradiction(model: type[Settings], data: Mapping[str, Any]) -> tuple[str, str] | None:
@@ -350,7 +358,8 @@ def resolve(
 
     Parameters
     ----------
-    presets : ``a.b=c`` that assignments and flags override
+    presets : ``a.b=c`` that assignments and flags override, value by value also where one of them gives a
+        whole section
     flags : dotted key → value; None values are flags that were not given
     spelled : dotted key → its flag, for messages
 
@@ -360,9 +369,10 @@ def resolve(
     UsageError : an assignment or a flag is at fault
     """
     data: Any = read_yaml(file) if file is not None else {}
-    own = [_parse_assignment(text) for text in assignments]
+    defaults = [_parse_assignment(text) for text in presets]
+    own = [_over_presets(nested(dict(defaults)), *_parse_assignment(text)) for text in assignments]
     switches = [(key, value) for key, value in (flags or {}).items() if value is not None]
-    given = [*map(_parse_assignment, presets), *own, *switches]
+    given = [*defaults, *own, *switches]
     names = {key: flag for key, flag in (spelled or {}).items() if (flags or {}).get(key) is not None}
     both = _contradiction(model, nested(dict(own) | {key: value for key, value in switches if key in names}))
     if both:

@@ -295,7 +295,9 @@ def run(app: App, argv: Sequence[str] | None = None) -> int:
                 _join_lines(app)
             tokens = _command_first(app, _join_negative_pairs(tokens))
             result = app(tokens)
-        sys.stdout.flush()
+        # None where it was closed before the start.
+        if sys.stdout is not None:
+            sys.stdout.flush()
         if interruption.exit_code():
             raise KeyboardInterrupt
         return result if type(result) is int else EXIT_OK

@@ -41,7 +41,12 @@ def owned(folder: Path) -> Iterator[None]:
         raise InputError("is a file, not a folder", where=folder)
     made = not folder.exists()
     make_folder(folder)
-    lock = take_lock(folder / "folder")
+    try:
+        lock = take_lock(folder / "folder")
+    except PartialError:
+        if made:
+            _remove_empty(folder)
+        raise
     if lock is None:
         owner = lock_owner(folder / "folder")
         raise PartialError(
@@ -62,8 +67,12 @@ def owned(folder: Path) -> Iterator[None]:
         done.set()
         lock.release()
         if made:
-            with contextlib.suppress(OSError):
-                folder.rmdir()
+            _remove_empty(folder)
+
+
+def _remove_empty(folder: Path) -> None:
+    with contextlib.suppress(OSError):
+        folder.rmdir()
 
 
 def is_empty(folder: Path) -> bool:

@@ -23,6 +23,8 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _NOTE_SECONDS, _GRACE_SECONDS = 1.5, 10.0
 # A terminal and a wrapper such as `uv run` may both send the signal of one Ctrl-C.
 _ECHO_SECONDS = 0.5
+# From an interruption that Python dropped to the next one; the finalizer has ended by then.
+_AGAIN_SECONDS = 0.01
 
 
 class _State:
@@ -33,15 +35,19 @@ class _State:
     program : it runs one of our programs, so that a signal may end it; not so in notebooks and tests
     raising : a signal raises KeyboardInterrupt, which :func:`mbtf_core.console.run` handles
     received, since : the first signal, or 0, and its time
+    dropped : its exception was raised where Python drops exceptions, and is to be raised again
     kept : what an interruption leaves, for the message
     cleanups : called before the process ends without unwinding
+    code : exit code of the program's command once it has ended
     """
 
     program = False
     raising = False
     received = 0
     since = 0.0
+    dropped = False
     kept = ""
+    code: int | None = None
     cleanups: list[Callable[[], None]] = []  # noqa: RUF012
 
 
@@ -53,8 +59,9 @@ def handle_signals() -> None:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _handle)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
-    # Called last. While it ends, the interpreter restores default actions, but not of ignored signals.
-    atexit.register(_ignore_signals)
+    sys.unraisablehook = _raise_again
+    # Called last: after threads are joined and all other exit functions have run.
+    atexit.register(_skip_unloading)
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
     # Native code delays Python's handlers, but not these bytes.
@@ -62,20 +69,45 @@ def handle_signals() -> None:
     threading.Thread(target=_watch, args=(reader,), name="interruption", daemon=True).start()
 
 
-def _ignore_signals() -> None:
-    for number in SIGNALS:
-        signal.signal(number, signal.SIG_IGN)
+def _skip_unloading() -> None:
+    """End the process where a command has ended. The interpreter would unload all modules, PyTorch's for a
+    second, and restore the default actions of signals meanwhile."""
+    if _State.code is not None:
+        _flush()
+        os._exit(_State.code)
+
+
+def _flush() -> None:
+    """Flush the standard streams; the reader of a closed pipe has seen enough."""
+    # A stream that was closed before the start is None.
+    for stream in filter(None, (sys.stdout, sys.stderr)):
+        with contextlib.suppress(OSError, ValueError):
+            stream.flush()
 
 
 def _handle(number: int, frame: FrameType | None) -> None:
     now = time.monotonic()
-    again = _State.received != 0
+    again = _State.received != 0 and not _State.dropped
+    _State.dropped = False
     if again and now - _State.since < _ECHO_SECONDS:
         return
     _note(number)
     if _State.program and (again or not _State.raising or _importing(frame)):
         _end_process()
     raise KeyboardInterrupt
+
+
+def _raise_again(unraisable: sys.UnraisableHookArgs) -> None:
+    """Raise an interruption again that arrived in a finalizer or in a callback of a weak reference."""
+    if unraisable.exc_type is not KeyboardInterrupt or not _State.received:
+        sys.__unraisablehook__(unraisable)
+        return
+    main = threading.main_thread().ident
+    assert main is not None
+    _State.dropped = True
+    again = threading.Timer(_AGAIN_SECONDS, signal.pthread_kill, (main, _State.received))
+    again.daemon = True
+    again.start()
 
 
 def _note(number: int) -> None:
@@ -197,12 +229,11 @@ def stop_on_interruption() -> Iterator[threading.Event]:
 
 def finish(code: int) -> int:
     """Last act of a program: the exit code of its command. After an interruption it ends the process, whose
-    threads may still work; else a signal can no longer change the code."""
+    threads may still work; else exit functions run, and a signal can no longer change the code."""
     if _State.received:
-        with contextlib.suppress(OSError, ValueError):
-            sys.stdout.flush()
-            sys.stderr.flush()
+        _flush()
         os._exit(code)
+    _State.code = code
     for number in SIGNALS:
         signal.signal(number, lambda *_: os._exit(code))
     return code

@@ -171,8 +171,13 @@ def take_lock(path: Path, stale: float = STALE_SECONDS) -> Lock | None:
                 if _held_elsewhere(handle, supported, stale):
                     return None
                 owner = {"host": socket.gethostname(), "process": os.getpid(), "since": time.time()}
-                os.ftruncate(handle, 0)
-                os.pwrite(handle, json.dumps(owner).encode(), 0)
+                try:
+                    os.ftruncate(handle, 0)
+                    os.pwrite(handle, json.dumps(owner).encode(), 0)
+                except OSError:
+                    # The disk is full.
+                    file.unlink(missing_ok=True)
+                    raise
             except OSError as error:
                 raise unwritable(file, error) from None
             stack.pop_all()

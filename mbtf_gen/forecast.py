@@ -6,7 +6,7 @@ import os
 import statistics
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_core.console import Console
 from mbtf_core.shard_schema import ShardEntry, Split
 from mbtf_core.stats import pooled_error
-from mbtf_core.units import clock, size_text
+from mbtf_core.units import clock, expectation, size_text
 from mbtf_gen.dataset.shard_io import row_bytes, write_shard
 from mbtf_gen.job import Job, most_paths, planned_paths, split_queries, split_spp, split_target
 from mbtf_gen.planning.adaptive import estimate_shard
@@ -160,13 +161,30 @@ def forecast(job: Job, plan: RunPlan, seconds: float = 2.0) -> Forecast:
     )
 
 
-def time_left(job: Job, plan: RunPlan, entries: Sequence[ShardEntry]) -> float | None:
-    """Forecast of the seconds to render some of the job's shards; None where no machine needs a minute."""
+def announce(console: Console, paths: float, seconds: Callable[[], float], size: float) -> None:
+    """State the expected time and size of a command, unless no machine needs a minute for it.
+
+    Parameters
+    ----------
+    paths : that it traces
+    seconds : measures its duration; called for many paths only
+    size : bytes that it writes
+    """
+    if paths >= LONG_RUN:
+        console.note(expectation(seconds(), size))
+
+
+def announce_shards(
+    console: Console, job: Job, plan: RunPlan, entries: Sequence[ShardEntry], size: float
+) -> None:
+    """:func:`announce` for rendering some of the job's shards."""
     share = planned_paths(job, entries) / max(planned_paths(job, job.shards), 1)
-    if share * most_paths(job) < LONG_RUN or plan.effects.closed_form:
-        return None
-    expected = forecast(job, plan, seconds=1.0)
-    return expected.start + share * expected.seconds
+
+    def seconds() -> float:
+        expected = forecast(job, plan, seconds=1.0)
+        return expected.start + share * expected.seconds
+
+    announce(console, 0 if plan.effects.closed_form else share * most_paths(job), seconds, size)
 
 
 def _piece(job: Job, plan: RunPlan, estimator: Any, split: Split, number: int, count: int) -> _Piece:

@@ -14,6 +14,7 @@ from mbtf_core.lattice import Lattice
 from mbtf_core.shard_schema import SPLITS, ShardEntry, Split
 from mbtf_gen.config.generator import GeneratorConfig, count_queries
 from mbtf_gen.geometry.heightfield import HeightGrid
+from mbtf_gen.material.checks import displacement_fault
 from mbtf_gen.material.material import Material, load_material
 from mbtf_gen.render.estimates import TARGET_PILOT_SPP, Target
 from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
@@ -119,13 +120,9 @@ class Job:
         """Heights of the mesh, in tile widths; an InputError where their range exceeds the limit."""
         geometry = self.config.geometry
         grid = self.material.grid(geometry.height_scale, geometry.mesh)
-        found, limit = grid.displacement_range, geometry.max_displacement
-        if found > limit:
-            raise InputError(
-                f"the displacement range is {found:.4g} tile widths; at most {limit:g} are accepted",
-                where=self.material.files.get("height"),
-                hint="set a smaller --height-scale, or raise geometry.max_displacement",
-            )
+        fault = displacement_fault(grid.displacement_range, geometry.max_displacement)
+        if fault is not None:
+            raise InputError(fault[0], where=self.material.files.get("height"), hint=fault[1])
         return grid
 
     @cached_property

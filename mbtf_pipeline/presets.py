@@ -39,7 +39,7 @@ def quality_assignments(
     generate = given.get("generate")
     preset = generator_options(quality, generate if isinstance(generate, Mapping) else {})
     out = as_assignments(preset, "generate.")
-    fits = {prefix: _options_of_fit(given, prefix) for prefix in fit_names(path)}
+    fits = {prefix: _options_of_fit(given, prefix) for prefix in fit_names(given)}
     for prefix, options in fitter_options(quality, fits, training).items():
         out += as_assignments(options, f"{prefix}.")
     return out + as_assignments(COMPARE[quality])

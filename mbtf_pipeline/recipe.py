@@ -203,14 +203,9 @@ def load_recipe(path: Path, assignments: Sequence[str] = (), presets: Sequence[s
     return recipe.model_copy(update={"generate": generate})
 
 
-def fit_names(path: Path) -> list[str]:
-    """Dotted names of the fits in a recipe file: ``fit``, or ``fit.NAME`` for each.
-
-    Raises
-    ------
-    InputError : the file cannot be read
-    """
-    fits = read_yaml(_find(path)).get("fit")
+def fit_names(recipe: Mapping[str, Any]) -> list[str]:
+    """Dotted names of the fits in a recipe's options: ``fit``, or ``fit.NAME`` for each."""
+    fits = recipe.get("fit")
     if not isinstance(fits, Mapping) or _is_single(fits):
         return ["fit"]
     return [f"fit.{name}" for name in fits]

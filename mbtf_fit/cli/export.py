@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from mbtf_core.console import CONSOLE, Console
-from mbtf_core.errors import InputError
-from mbtf_core.options import Output, Switch
+from mbtf_core.interruption import keep_on_interruption
+from mbtf_core.options import Output, Overwrite, Switch
 
 
 def export_material(
@@ -22,13 +22,15 @@ def export_material(
     ] = None,
     output: Annotated[Output | None, Parameter(show_default="the material's own")] = None,
     half: Switch = False,
+    overwrite: Overwrite = False,
     console: Console = CONSOLE,
 ) -> None:
     """Export a material to other programs: mbtf-fit export material/ --to exr
 
     exr: the latent textures, a part per level and a channel per feature, and those of the transmittance of a
     material with holes. json: the networks as a list of layers, with formulas, conventions and queries with
-    expected values. material: another material folder.
+    expected values. material: another material folder, in a folder of its own; the same command again keeps
+    it.
 
     Parameters
     ----------
@@ -39,8 +41,9 @@ def export_material(
     half
         Round all weights and texels to 16 bits, and print the resulting error.
     """
-    from mbtf_core.folders import is_empty, owned
+    from mbtf_core.folders import owned
     from mbtf_fit.material.export import LAYERS_NAME, TEXTURES_NAME, to_half, write_layers, write_textures
+    from mbtf_fit.material.export_folder import claim_export
     from mbtf_fit.material.format import DESCRIPTION_NAME, WEIGHTS_NAME
     from mbtf_fit.material.material import Material, export
     from mbtf_fit.material.transmittance import TRANSMITTANCE_NAME
@@ -48,9 +51,11 @@ def export_material(
     wanted = list(dict.fromkeys(to or ["exr", "json"]))
     folder = material if output is None else output
     loaded = Material.load(material)
+    keep_on_interruption(f"the finished files are kept in {folder}")
     with owned(folder):
-        if "material" in wanted and not is_empty(folder):
-            raise InputError("is not empty", where=folder, hint="name a new folder with -o for --to material")
+        kept = False
+        if "material" in wanted:
+            kept = claim_export(folder, material, half=half, overwrite=overwrite)
         written, error = loaded, None
         if half:
             written, error = to_half(loaded)
@@ -63,15 +68,16 @@ def export_material(
             files.append(LAYERS_NAME)
         if "material" in wanted:
             description = loaded.description
-            export(
-                written.model,
-                written.config,
-                folder,
-                data=description["data"],
-                training=description["training"],
-                half=half,
-                transmittance=written.transmittance,
-            )
+            if not kept:
+                export(
+                    written.model,
+                    written.config,
+                    folder,
+                    data=description["data"],
+                    training=description["training"],
+                    half=half,
+                    transmittance=written.transmittance,
+                )
             files += [WEIGHTS_NAME, DESCRIPTION_NAME, *([TRANSMITTANCE_NAME] if loaded.transmittance else [])]
     sizes = {name: (folder / name).stat().st_size for name in files}
     lines = [f"{folder / name}: {size / 1e6:.3f} MB" for name, size in sizes.items()]

@@ -16,6 +16,7 @@ from typing import Any
 
 from mbtf_core.errors import InputError, MbtfError, UsageError, reason
 from mbtf_core.interruption import SIGNALS, at_end
+from mbtf_core.suggest import refuse_special
 from mbtf_fit.config import FitConfig
 from mbtf_gen.dataset.reader import is_dataset
 
@@ -41,15 +42,23 @@ class FitOutcome:
 
 def find_data(arguments: Sequence[Path]) -> list[Path]:
     """Data sets of the arguments: a data set's folder, a folder of such folders, or a text file with one
-    folder per line, relative to the file; lines that start with # are comments."""
+    folder per line, relative to the file; lines that start with # are comments.
+
+    Raises
+    ------
+    InputError : a list cannot be read, a folder contains no data sets, or one is a pipe or a device
+    """
     found: list[Path] = []
     for argument in arguments:
+        refuse_special(argument)
         if argument.is_file():
             try:
                 lines = [line.strip() for line in argument.read_text(encoding="utf-8").splitlines()]
             except (OSError, UnicodeDecodeError) as error:
                 raise InputError(f"cannot be read as a list ({reason(error)})", where=argument) from None
             mine = [argument.parent / line for line in lines if line and not line.startswith("#")]
+            for folder in mine:
+                refuse_special(folder)
         elif not argument.is_dir() or is_dataset(argument):
             mine = [argument]
         else:

@@ -14,7 +14,7 @@ from mbtf_core.console import CONSOLE, Console
 from mbtf_core.errors import UsageError
 from mbtf_core.interruption import keep_on_interruption
 from mbtf_core.options import Options, Output, Overwrite, PathText, takes_options
-from mbtf_core.units import clock, expectation, size_text
+from mbtf_core.units import clock, size_text
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.config.presets import (
     RESOLUTION,
@@ -28,7 +28,6 @@ from mbtf_gen.config.presets import (
 if TYPE_CHECKING:
     from mbtf_gen.dataset.summary import Summary
     from mbtf_gen.job import Job
-    from mbtf_gen.planning.run_plan import RunPlan
 
 G = TypeVar("G", bound=GeneratorConfig)
 
@@ -96,7 +95,7 @@ def generate(
     job = prepare_job(options, material, quality)
     from mbtf_core.folders import check_space
     from mbtf_gen.dataset.shard_io import data_bytes
-    from mbtf_gen.forecast import time_left
+    from mbtf_gen.forecast import announce_shards
     from mbtf_gen.generation import generate, unfinished
     from mbtf_gen.job import split_queries
 
@@ -108,11 +107,6 @@ def generate(
     )
     check_space(output, size, SMALLER)
 
-    def announce(plan: RunPlan) -> None:
-        seconds = time_left(job, plan, left)
-        if seconds is not None:
-            console.note(expectation(seconds, size))
-
     keep_on_interruption(f"the shards that are finished are kept in {output}")
     with console.progress(None, "generating", "paths") as bar:
         summary = generate(
@@ -121,7 +115,7 @@ def generate(
             overwrite=overwrite,
             slice_index=index,
             slice_count=count,
-            planned=announce,
+            planned=lambda plan: announce_shards(console, job, plan, left, size),
             progress=bar.update,
         )
     console.report(asdict(summary), describe(summary))

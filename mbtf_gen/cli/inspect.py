@@ -68,7 +68,7 @@ def inspect(
 
         # Mitsuba refuses what it does not know.
         build_tile(loaded.grid(mesh=1), loaded.bsdf)
-    described = inspect_material(loaded, height, geometry.mesh, finest)
+    described = inspect_material(loaded, height, geometry.mesh, finest, geometry.max_displacement)
     found = {"material": resolved.material, **described, **outputs}
     console.report(found, inspection_text(found, resolved.material))
 

@@ -8,7 +8,6 @@ from typing import Any
 from mbtf_core.console import CONSOLE, Console
 from mbtf_core.interruption import keep_on_interruption
 from mbtf_core.options import Options, Output, Overwrite, PathText, takes_options
-from mbtf_core.units import expectation
 from mbtf_gen.cli.generate import resolve_config
 from mbtf_gen.config.pictures import RENDERING, ReferenceConfig
 
@@ -39,7 +38,7 @@ def reference(
     from mbtf_core.folders import check_space, owned
     from mbtf_core.stats import pooled_relative_error
     from mbtf_gen.dataset.shard_io import row_bytes
-    from mbtf_gen.forecast import LONG_RUN
+    from mbtf_gen.forecast import announce
     from mbtf_gen.job import Job
     from mbtf_gen.pictures.camera import Camera, PixelKind
     from mbtf_gen.pictures.folder import PictureFolder
@@ -85,17 +84,16 @@ def reference(
             overwrite=overwrite,
         )
         missing = sum(c.rows * c.columns for (c, _), name in names.items() if not folder.finished(name))
-        if missing * wanted.spp >= LONG_RUN:
+        paths = missing * wanted.spp
+        if missing:
             estimator = build_estimator(job, reference_plan(job))
-            seconds = picture_seconds(estimator, cameras[0], omega_i, missing * wanted.spp)
-            console.note(expectation(seconds, size))
+        announce(console, paths, lambda: picture_seconds(estimator, cameras[0], omega_i, paths), size)
         for index, camera in enumerate(cameras):
             for one in kinds:
                 name = names[camera, one]
                 facts = folder.finished(name)
                 kept = facts is not None
                 if facts is None:
-                    estimator = estimator or build_estimator(job, reference_plan(job))
                     image = render_reference(
                         estimator, camera, omega_i, kind=one, spp=wanted.spp, seed=resolved.seed, index=index
                     )

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from mbtf_core.config_file import read_yaml
+from mbtf_core.config_file import parse_value, read_yaml
 from mbtf_core.nested import merge
 
 Quality = Literal["draft", "standard", "high", "paper"]
@@ -56,7 +56,7 @@ def generator_options(quality: Quality | None, given: Mapping[str, Any]) -> dict
 
 
 def overrides_of(file: Path | None, assignments: Sequence[str]) -> dict[str, Any]:
-    """Options of a configuration file and of ``a.b=c``, nested; values of the latter as text.
+    """Options of a configuration file and of ``a.b=c``, nested; single values of the latter as text.
 
     Raises
     ------
@@ -66,7 +66,8 @@ def overrides_of(file: Path | None, assignments: Sequence[str]) -> dict[str, Any
     given = dict(found) if isinstance(found, Mapping) else {}
     for text in assignments:
         name, _, value = text.partition("=")
-        merge(given, name.strip().split("."), value.strip())
+        parsed = parse_value(value)
+        merge(given, name.strip().split("."), parsed if isinstance(parsed, Mapping) else value.strip())
     return given
 
 

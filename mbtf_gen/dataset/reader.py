@@ -110,8 +110,10 @@ class Shard:
         Raises
         ------
         InputError
-            It cannot be read, its numbers are invalid, or they are those of another shard: where both values
-            are read, their mean is compared with the sidecar's.
+            It cannot be read, its numbers are invalid, or they are those of another shard. Its size and its
+            rows are compared with the sidecar's, and where both values are read, their mean. Without the
+            values, the numbers of a shard that was copied over another of the same size are returned;
+            ``mbtf-gen verify`` compares digests and finds it.
         """
         arrays = read_shard(self.path, names)
         hint = f"check the data set with: mbtf-gen verify {self.path.parent}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 from dataclasses import asdict
 from pathlib import Path
@@ -9,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from mbtf_gen.geometry.heightfield import HeightGrid
 from mbtf_gen.geometry.slope_statistics import detail_size, repeats, rms_slope, slope_angles
 from mbtf_gen.images.read import LUMINANCE
-from mbtf_gen.material.checks import CONVENTION_NAMES, signed
+from mbtf_gen.material.checks import CONVENTION_NAMES, displacement_fault, signed
 from mbtf_gen.material.material import MAPS, Material, layers_above
 from mbtf_gen.material.tiling import broken
 
@@ -43,7 +45,11 @@ _KINDS = {1: "gray", 2: "gray+alpha", 3: "RGB", 4: "RGBA"}
 
 
 def inspect_material(
-    material: Material, height: float | None = None, mesh: int | None = None, finest: int | None = None
+    material: Material,
+    height: float | None = None,
+    mesh: int | None = None,
+    finest: int | None = None,
+    max_displacement: float = math.inf,
 ) -> dict[str, Any]:
     """Collect the statistics of a material.
 
@@ -54,6 +60,8 @@ def inspect_material(
         As in :meth:`mbtf_gen.material.material.Material.grid`.
     finest : int or None
         As in :meth:`mbtf_gen.material.material.Material.lattice`.
+    max_displacement : float
+        Largest displacement range that generation accepts, in tile widths.
 
     Returns
     -------
@@ -99,10 +107,16 @@ def inspect_material(
         "normal": _normal(material),
         "opacity": _opacity(material),
         "unused": material.unused,
-        "warnings": list(material.warnings_at(height)),
+        "warnings": [*material.warnings_at(height), *_refusal(material, grid, max_displacement)],
         "notes": list(material.notes),
     }
     return {**found, "oddities": _oddities(found)}
+
+
+def _refusal(material: Material, grid: HeightGrid, limit: float) -> list[str]:
+    """The warning that generation will refuse the material."""
+    fault = displacement_fault(abs(grid.displacement_range), limit)
+    return [] if fault is None else [f"{material.files['height']}: generation refuses it: {'; '.join(fault)}"]
 
 
 def _albedo(material: Material) -> dict[str, Any] | None:

@@ -42,11 +42,10 @@ def _draw(
 ) -> None:
     from mbtf_core.exposure import describe_exposure, to_display
     from mbtf_core.folders import check_space
-    from mbtf_core.units import expectation
     from mbtf_fit.material.format import read_description
     from mbtf_fit.mitsuba_plugin import load_scene
     from mbtf_fit.mitsuba_plugin.preview.animation import find_encoder, write_gif, write_mp4
-    from mbtf_gen.forecast import LONG_RUN
+    from mbtf_gen.forecast import announce
     from mbtf_gen.pictures.folder import PictureFolder
     from mbtf_gen.pictures.reference import PNG_BYTES, write_png
     from mbtf_gen.render.runtime import load_mitsuba
@@ -88,8 +87,7 @@ def _draw(
         bsdf = load_scene({"type": "mbtf", "material": config.material})
         missing = [name for name in shows if not kept[name] and name != SHEET_NAME]
         paths = turn.frames * turn.size**2 * turn.spp
-        if paths >= LONG_RUN and missing:
-            console.note(expectation(seconds_of(bsdf, turn, paths), size))
+        announce(console, paths if missing else 0, lambda: seconds_of(bsdf, turn, paths), size)
         total = 1 + turn.frames * bool(missing)
         with console.progress(total=total, label="drawing", unit="pictures") as bar:
             if not kept[SHEET_NAME]:

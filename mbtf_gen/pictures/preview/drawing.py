@@ -12,10 +12,9 @@ from mbtf_core.errors import InputError, PartialError
 from mbtf_core.exposure import auto_exposure, brightness, describe_exposure
 from mbtf_core.folders import check_space, owned
 from mbtf_core.interruption import keep_on_interruption
-from mbtf_core.units import expectation
 from mbtf_gen.config.pictures import PreviewConfig
 from mbtf_gen.dataset.reader import Dataset
-from mbtf_gen.forecast import LONG_RUN
+from mbtf_gen.forecast import announce
 from mbtf_gen.job import Job
 from mbtf_gen.pictures.camera import tiles_camera
 from mbtf_gen.pictures.folder import PictureFolder
@@ -165,9 +164,12 @@ class PreviewPictures:
         estimator = build_estimator(self.job, reference_plan(self.job))
         spp, seed = self.config.preview.spp, self.config.seed
         paths = self.camera.rows * self.camera.columns * self.config.preview.spp
-        if paths >= LONG_RUN:
-            seconds = picture_seconds(estimator, self.camera, self.omega_i, paths)
-            self.console.note(expectation(seconds, PNG_BYTES * self.config.preview.size**2))
+        announce(
+            self.console,
+            paths,
+            lambda: picture_seconds(estimator, self.camera, self.omega_i, paths),
+            PNG_BYTES * self.config.preview.size**2,
+        )
         image = render_reference(estimator, self.camera, self.omega_i, kind="pixel", spp=spp, seed=seed)
         exposure = self.config.exposure
         if exposure is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import pytest
@@ -64,6 +65,14 @@ def test_data_sets_come_from_folders_folders_of_folders_and_lists(tmp_path: Path
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="contains no data sets"):
         find_data([tmp_path / "empty"])
+
+
+@pytest.mark.parametrize("name", ["pipe", "list.txt"])
+def test_a_pipe_is_refused_at_once(tmp_path: Path, name: str) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "list.txt").write_text("pipe\n")
+    with pytest.raises(InputError, match="pipe: is a pipe, not a regular file"):
+        find_data([tmp_path / name])
 
 
 def test_materials_are_named_after_their_data(tmp_path: Path) -> None:

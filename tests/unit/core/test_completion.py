@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import pty
+import select
 import shlex
+import shutil
 import subprocess
 from pathlib import Path
 
@@ -71,6 +75,71 @@ def test_bash_completes(app: App, line: str, wanted: str, unwanted: str, home: P
     found = offered(script, line)
     assert set(wanted.split()) <= found
     assert not set(unwanted.split()) & found
+
+
+@pytest.mark.skipif(shutil.which("fish") is None, reason="needs fish")
+@pytest.mark.parametrize(
+    ("app", "line", "wanted", "unwanted"),
+    [
+        (generate, "mbtf-gen pl", "plan", "inspect"),
+        (generate, "mbtf-gen a.exr --sp", "--spp", "--slice"),
+        (generate, "mbtf-gen a.exr --quality ", "draft standard", "a.exr"),
+        (generate, "mbtf-gen verify --qu", "--quiet", "--quality"),
+        (fit, "mbtf-fit shards --model neu", "neumip neumip-baseline", "hierarchical"),
+        (pipeline, "mbtf-pipeline run --q", "--quality --quick --quiet", "--force"),
+    ],
+)
+def test_fish_completes(app: App, line: str, wanted: str, unwanted: str, home: Path) -> None:
+    assert run(app, ["--install-completion", "--shell", "fish"]) == 0
+    (home / "a.exr").touch()
+    # Fish completes only what it could run.
+    code = f"function {app.name[0]}; end; complete -C {shlex.quote(line)}"
+    environment = {**os.environ, "XDG_CONFIG_HOME": str(home / ".config")}
+    done = subprocess.run(["fish", "-c", code], capture_output=True, text=True, cwd=home, env=environment)
+    assert done.stderr == ""
+    found = {offer.split("\t")[0] for offer in done.stdout.splitlines()}
+    assert set(wanted.split()) <= found
+    assert not set(unwanted.split()) & found
+
+
+@pytest.mark.skipif(shutil.which("zsh") is None, reason="needs zsh")
+@pytest.mark.parametrize(
+    ("app", "line", "completed"),
+    [
+        (generate, "mbtf-gen pl", "plan"),
+        (generate, "mbtf-gen a.exr --sp", "a.exr --spp"),
+        (fit, "mbtf-fit shards --quality d", "shards --quality draft"),
+        (pipeline, "mbtf-pipeline run --qual", "run --quality"),
+    ],
+)
+def test_zsh_completes(app: App, line: str, completed: str, home: Path) -> None:
+    """In a new user's shell, which has no completion of its own."""
+    startup = home / ".zshrc"
+    startup.write_text(f'PROMPT=READY\n{app.name[0]}() print -r -- "<$*>"\n')
+    for _ in range(2):
+        assert run(app, ["--install-completion", "--shell", "zsh"]) == 0
+    assert startup.read_text().count("compinit &&") == 1
+    shell, terminal = pty.openpty()
+    environment = {**os.environ, "ZDOTDIR": str(home), "TERM": "dumb"}
+    process = subprocess.Popen(
+        ["zsh", "-i"], stdin=terminal, stdout=terminal, stderr=terminal, cwd=home, env=environment
+    )
+    try:
+        shown = b""
+        for awaited, typed in (
+            (b"READY", f"{line}\t".encode()),
+            (b"", b"\n"),
+            (f"<{completed}>".encode(), b""),
+        ):
+            while awaited not in shown:
+                assert select.select([shell], [], [], 10)[0], shown
+                shown += os.read(shell, 1 << 16)
+            os.write(shell, typed)
+    finally:
+        process.kill()
+        process.wait()
+        os.close(shell)
+        os.close(terminal)
 
 
 def test_zsh_completes_the_material_as_a_file() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import threading
 from pathlib import Path
 from types import SimpleNamespace
@@ -94,3 +95,16 @@ def test_what_does_not_fit_on_the_disk_is_refused(tmp_path: Path, monkeypatch: p
     assert not (tmp_path / "new").exists()
     assert expectation(75.0, 27e9) == "expected: about 1:15, 27 GB on disk"
     assert expectation(None, 5e5) == "expected: 500 kB on disk"
+
+
+def test_a_full_disk_leaves_neither_lock_nor_folder(tmp_path: Path) -> None:
+    (tmp_path / "there").mkdir()
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, before[1]))
+    try:
+        for name in ("there", "new"):
+            with pytest.raises(PartialError, match="cannot be written"), owned(tmp_path / name):
+                pytest.fail("a lock that names nobody")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert [path.name for path in tmp_path.rglob("*")] == ["there"]

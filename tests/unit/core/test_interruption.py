@@ -46,6 +46,8 @@ interruption.handle_signals()
 from mbtf_core.console import new_app, run
 from mbtf_core.folders import owned
 app = new_app("prog", "A program.")
+def send_once():
+    os.kill(os.getpid(), int(os.environ["TEST_SIGNAL"]))
 def send_later():
     threading.Timer(0.2, os.kill, (os.getpid(), int(os.environ["TEST_SIGNAL"]))).start()
 @app.default
@@ -114,18 +116,77 @@ def test_one_ctrl_c_that_arrives_twice_is_one(tmp_path: Path) -> None:
     assert (done.returncode, done.stdout) == (130, "stored\n")
 
 
+def test_an_interruption_in_a_finalizer_is_raised_again(tmp_path: Path) -> None:
+    """Python prints and drops exceptions of finalizers."""
+    body = "class Late:\n      def __del__(self): send_once()\n"
+    body += "    try: Late(); time.sleep(20)\n    except KeyboardInterrupt: print('stored')"
+    done = run_program(signal.SIGINT, tmp_path, "-c", SEND + PROGRAM.replace("BODY", body))
+    assert (done.returncode, done.stdout) == (130, "stored\n")
+    assert done.stderr == "error: interrupted; two shards are kept\n  the same command resumes\n"
+
+
 def test_a_signal_after_the_last_act_changes_nothing(tmp_path: Path) -> None:
     code = f"{SEND}\nfrom mbtf_core.interruption import *\nhandle_signals()\ncode = finish(4)\nsend()"
     assert run_program(signal.SIGTERM, tmp_path, "-c", code).returncode == 4
 
 
-def test_a_signal_while_the_interpreter_ends_changes_nothing(tmp_path: Path) -> None:
-    """Objects of modules are removed after the interpreter has restored the default actions."""
-    late = "class Late:\n    def __del__(self, kill=os.kill, me=os.getpid(), number=number): kill(me, number)"
-    code = f"{SEND}\nimport mbtf_core.interruption as i\ni.handle_signals()\n"
-    code += f"number = int(os.environ['TEST_SIGNAL'])\n{late}\nlate = Late()\nsys.exit(i.finish(4))"
-    for number in interruption.SIGNALS:
-        assert run_program(number, tmp_path, "-c", code).returncode == 4
+# What a command may leave to the end of the interpreter, and what it may not: objects of modules would be
+# removed after the default actions of signals are restored.
+ENDING = """
+import atexit, tempfile, threading, weakref
+import mbtf_core.interruption as i
+i.handle_signals()
+number = int(os.environ["TEST_SIGNAL"])
+class Late:
+    def __del__(self, write=os.write, kill=os.kill, me=os.getpid()):
+        write(1, b"unloaded\\n")
+        kill(me, number)
+late = Late()
+folder = tempfile.TemporaryDirectory(dir=".")
+atexit.register(print, "exit function")
+threading.Timer(0.2, print, ["thread"]).start()
+print("command")
+sys.exit(i.finish(4))
+"""
+
+
+@pytest.mark.parametrize("number", interruption.SIGNALS)
+def test_a_program_ends_without_unloading(number: signal.Signals, tmp_path: Path) -> None:
+    done = run_program(number, tmp_path, "-c", f"import os, sys\n{ENDING}")
+    assert (done.returncode, done.stdout, done.stderr) == (4, "command\nthread\nexit function\n", "")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_reader_that_has_gone_is_no_error(tmp_path: Path) -> None:
+    code = "import sys\nimport mbtf_core.interruption as i\ni.handle_signals()\n"
+    code += "print('late')\nsys.exit(i.finish(4))"
+    reader, writer = os.pipe()
+    os.close(reader)
+    buffered = {**os.environ, "PYTHONUNBUFFERED": ""}
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        stdout=writer,
+        stderr=subprocess.PIPE,
+        env=buffered,
+        timeout=15,
+        check=False,
+    )
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (4, b"")
+
+
+@pytest.mark.parametrize("closed", ["stdout", "stderr"])
+def test_a_closed_stream_is_no_error(closed: str, tmp_path: Path) -> None:
+    code = "import sys\nfrom mbtf_core import interruption as i\ni.handle_signals()\n"
+    code += "from mbtf_core.console import new_app, run\napp = new_app('prog', 'A program.')\n"
+    code += "app.default(lambda: print('result'))\nsys.exit(i.finish(run(app, [])))"
+    number = {"stdout": 1, "stderr": 2}[closed]
+    shell = f'exec "$0" -c "$1" {number}>&-'
+    done = subprocess.run(
+        ["sh", "-c", shell, sys.executable, code], capture_output=True, timeout=15, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert done.stdout == (b"" if closed == "stdout" else b"result\n")
 
 
 def test_work_stops_at_a_step_and_then_as_usual(monkeypatch: pytest.MonkeyPatch) -> None:

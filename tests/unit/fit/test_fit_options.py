@@ -54,6 +54,12 @@ def test_a_resolved_configuration_with_steps_reads_back(tmp_path: Path) -> None:
     assert config_of("--config", str(tmp_path / "c.yaml")) == found
 
 
+def test_presets_keep_what_sections_set() -> None:
+    single = config_of("--quality", "draft", "--set", "training.batch=50")
+    assert config_of("--quality", "draft", "--set", "training={batch: 50}") == single
+    assert (single.training.time, single.network.width) == (20.0, 40)
+
+
 def test_presets_keep_what_flags_set() -> None:
     assert config_of("--quality", "draft", "--model", "hierarchical").network.width == 25
     assert config_of("--quality", "draft", "--init-from", "material/").network.width == 25

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mbtf_core import folders
-from mbtf_core.console import run
+from mbtf_core.console import CONSOLE, run
 from mbtf_gen import forecast, generation
 from mbtf_gen.cli.app import app
 from mbtf_gen.dataset import render_shards
@@ -80,6 +80,15 @@ def test_a_long_run_states_time_and_size(
     assert f"resolution {options[1] if options else 128}, {size}" in err
     assert f"expected: about 10:05, {size} on disk" in err
     assert seen == [False]
+
+
+@pytest.mark.parametrize(("paths", "line"), [(3e7, "expected: about 1:15, 27 GB on disk\n"), (2.9e7, "")])
+def test_only_many_paths_are_announced(paths: float, line: str, capsys: pytest.CaptureFixture[str]) -> None:
+    def seconds() -> float:
+        return 75.0 if line else pytest.fail("a measurement")
+
+    forecast.announce(CONSOLE, paths, seconds, 27e9)
+    assert capsys.readouterr().err == line
 
 
 def test_a_short_run_needs_no_forecast(

@@ -110,6 +110,36 @@ def test_explicit_options_override_the_preset(tmp_path: Path) -> None:
     assert resolved.training.time == 20
 
 
+SECTIONS = [
+    ("fit.neumip={network: {width: 7}}", "fit.neumip.network.width=7"),
+    ("fit.neumip={training: {batch: 50}}", "fit.neumip.training.batch=50"),
+    ("fit={neumip: {network: {width: 7}}}", "fit.neumip.network.width=7"),
+    ("fit={neumip: {training: {blur: {fraction: 0.4}}}}", "fit.neumip.training.blur.fraction=0.4"),
+]
+
+
+@pytest.mark.parametrize(("section", "single"), SECTIONS)
+def test_a_section_overrides_the_preset_value_by_value(section: str, single: str, tmp_path: Path) -> None:
+    np.save(tmp_path / "height.npy", np.zeros((8, 8)))
+    path = tmp_path / "recipe.yaml"
+    path.write_text("name: r\ngenerate: {material: height.npy}\nfit: {neumip: {}}\n")
+    found, expected = (preset_recipe(path, "draft", [text]) for text in (section, single))
+    assert found == expected
+    assert found.fit["neumip"].training.time == 20
+
+
+def test_a_section_replaces_the_fits_of_the_file(tmp_path: Path) -> None:
+    np.save(tmp_path / "height.npy", np.zeros((8, 8)))
+    path = tmp_path / "recipe.yaml"
+    path.write_text("name: r\ngenerate: {material: height.npy}\nfit: {neumip: {seed: 3}, hierarchical: {}}\n")
+    fits = preset_recipe(path, "draft", ["fit={neumip-baseline: {}}"]).fit
+    assert list(fits) == ["neumip-baseline"]
+    assert fits["neumip-baseline"].network.width == best_at("draft")["network.width"]
+    assert preset_recipe(path, "draft", ["fit={model: neumip}"]).fit["neumip"].seed == 0
+    generate = preset_recipe(path, "draft", ["generate.queries={spp: 8}"]).generate
+    assert (generate.queries.spp, generate.queries.train) == (8, GENERATOR["draft"]["queries.train"])
+
+
 def test_a_preset_sets_the_resolution_unless_told(tmp_path: Path) -> None:
     """A draft of large maps is a draft; explicit resolutions of recipes and assignments are kept."""
     np.save(tmp_path / "height.npy", np.zeros((256, 256)))

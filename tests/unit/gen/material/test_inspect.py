@@ -224,6 +224,21 @@ class TestCommand:
         assert run(app, ["inspect", str(folder), "--make-tileable", "mirror"]) == 0
         assert "make-tileable mirror" in capsys.readouterr().out
 
+    def test_a_displacement_that_generation_refuses(
+        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        np.save(tmp_path / "tall.npy", np.linspace(0.0, 200.0, 32).reshape(4, 8))
+        refused = "tall.npy: generation refuses it: the displacement range is 200 tile widths; at most 100"
+
+        def warned(*options: str) -> bool:
+            assert run(app, ["inspect", str(tmp_path / "tall.npy"), "--json", *options]) == 0
+            warnings = json.loads(capsys.readouterr().out)["warnings"]
+            return any(refused in warning for warning in warnings)
+
+        assert warned()
+        assert not warned("--height-scale", "0.4")
+        assert not warned("--set", "geometry.max_displacement=300")
+
     def test_a_missing_material_is_refused(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert run(app, ["inspect", str(folder.parent / "rok")]) == 3
         assert f"did you mean '{folder}'" in capsys.readouterr().err

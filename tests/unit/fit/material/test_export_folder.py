@@ -1,0 +1,75 @@
+"""``mbtf-fit export --to material``: the same command again keeps its output and replaces nothing else."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+from support.plugin_materials import write_material
+
+from mbtf_core.console import run
+from mbtf_fit.cli.app import app
+from mbtf_fit.material.material import Material
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("export") / "material"
+    write_material(folder, finest=1)
+    return folder
+
+
+def export(source: Path, out: Path, *options: str) -> int:
+    return run(app, ["export", str(source), "--to", "material", "-o", str(out), *options])
+
+
+def stamps(folder: Path) -> dict[str, int]:
+    return {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
+
+
+def test_the_same_command_again_keeps_the_export(source: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert export(source, out) == 0
+    before = stamps(out)
+    assert {"material.json", "weights.safetensors"} < before.keys()
+    assert export(source, out) == 0
+    assert stamps(out) == before
+
+
+@pytest.mark.parametrize(
+    "lost", [("material.json",), ("material.json", "weights.safetensors"), ("weights.safetensors",)]
+)
+def test_an_unfinished_export_is_resumed(source: Path, tmp_path: Path, lost: tuple[str, ...]) -> None:
+    out = tmp_path / "out"
+    assert export(source, out) == 0
+    for name in lost:
+        (out / name).unlink()
+    assert export(source, out) == 0
+    assert Material.load(out).deviation() < 1e-4
+
+
+def test_another_export_is_refused_unless_told(
+    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert export(source, out) == 0
+    before = stamps(out)
+    capsys.readouterr()
+    assert export(source, out, "--half") == 3
+    message = capsys.readouterr().err
+    assert "half: False -> True" in message
+    assert "--overwrite" in message
+    assert stamps(out) == before
+    assert export(source, out, "--half", "--overwrite") == 0
+    assert Material.load(out).description["weights"]["dtype"] == "float16"
+
+
+@pytest.mark.parametrize("name", ["material.json", "notes.txt"])
+def test_what_is_no_export_is_refused(source: Path, tmp_path: Path, name: str) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / name).write_text("mine")
+    assert export(source, out, "--overwrite") == 3
+    assert os.listdir(out) == [name]
+    assert (out / name).read_text() == "mine"
