@@ -15,6 +15,8 @@ from mbtf_core.units import format_duration, format_size, parse_duration, parse_
 
 ModelName = Literal["neumip-baseline", "neumip", "relief", "hierarchical"]
 OutputTransform = Literal["expm1", "exp", "identity", "softplus", "fourth-root"]
+# The best of them where the data set has a geometry.
+DEFAULT_MODEL: ModelName = "relief"
 LossKind = Literal["relative", "squared", "linear", "log", "fourth-root", "gradient"]
 Correction = Literal["none", "second-order", "linear"]
 
@@ -81,6 +83,9 @@ class NetworkSection(Settings):
     )
     offset: Literal["depth", "direct", "none"] = Field(
         "depth", description="neural offset: a depth along the view, a 2-D vector, or none"
+    )
+    oversampling: Literal[1, 2] = Field(
+        1, description="texels of the feature textures per texel of the data, along each axis"
     )
     blending: Literal["blend", "concatenate"] = Field(
         "blend", description="features of two adjacent levels: weighted sum, or concatenation"
@@ -201,7 +206,12 @@ class HeldOutSection(Settings):
 PRESETS: dict[str, dict[str, Any]] = {
     "neumip-baseline": {"network": {"offset": "none"}},
     "relief": {
-        "network": {"offset": "none", "encoding": {"direction_xyz": True, "half_vector": True}},
+        "network": {
+            "offset": "none",
+            "channels": 8,
+            "oversampling": 2,
+            "encoding": {"direction_xyz": True, "half_vector": True},
+        },
         "training": {"texture_weight_decay": 1.0, "blur": {"min_sigma": 0.8}},
     },
     "hierarchical": {
@@ -253,7 +263,7 @@ class FitConfig(Settings):
     exclusive = (("training.time", "training.steps"),)
 
     version: Literal[2] = 2
-    model: Annotated[ModelName, Flag("--model")] = Field("neumip", description="model to fit")
+    model: Annotated[ModelName, Flag("--model")] = Field(DEFAULT_MODEL, description="model to fit")
     init_from: Annotated[str | None, Flag("--init-from", "FOLDER")] = Field(
         None, description="folder of a material that initializes textures and offset"
     )

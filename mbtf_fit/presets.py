@@ -7,18 +7,25 @@ from collections.abc import Mapping
 from typing import Any
 
 from mbtf_core.units import parse_duration
+from mbtf_fit.config import DEFAULT_MODEL, ModelName
 from mbtf_gen.config.presets import Quality
 
 # Options of least error per time in the cost studies: larger networks and textures than the paper's, growing
-# with the training time (seconds), directions with z, and smooth textures where data are few.
-_SIZES = (
+# with the training time (seconds); for the models of the paper directions with z, and smooth textures where
+# data are few.
+_SIZES: tuple[tuple[float, dict[str, Any]], ...] = (
     (0.0, {"network.width": 40, "network.channels": 12}),
     (300.0, {"network.width": 64, "network.channels": 16}),
 )
-_XYZ: dict[str, Any] = {"network.encoding.direction_xyz": True}
-_SMOOTH: dict[str, Any] = {"training.texture_weight_decay": 1.0, "training.blur.min_sigma": 0.8}
-# Models of those studies.
-_MODELS = ("neumip", "neumip-baseline")
+_NEUMIP: dict[str, Any] = {
+    "network.encoding.direction_xyz": True,
+    "training.texture_weight_decay": 1.0,
+    "training.blur.min_sigma": 0.8,
+}
+# View rays per footprint of `relief`, by the training time: four take three times as long to evaluate.
+_PLACES: tuple[tuple[float, int], ...] = ((0.0, 1), (300.0, 4))
+# Models that have such options.
+_MODELS: tuple[ModelName, ...] = ("relief", "neumip", "neumip-baseline")
 
 # Budget of each preset.
 FITTER: dict[Quality, dict[str, Any]] = {
@@ -30,24 +37,28 @@ FITTER: dict[Quality, dict[str, Any]] = {
 }
 
 
-def best_options(seconds: float) -> dict[str, Any]:
-    """Network and smoothing options of `neumip` and its baseline, dotted names, for a training time (seconds)
-    on two processor cores."""
+def best_options(seconds: float, model: ModelName = DEFAULT_MODEL) -> dict[str, Any]:
+    """Network and smoothing options of a model, dotted names, for a training time (seconds) on two processor
+    cores; none for a model other than `relief`, `neumip` and its baseline."""
+    if model not in _MODELS:
+        return {}
     size = [size for least, size in _SIZES if seconds >= least][-1]
-    return size | _XYZ | _SMOOTH
+    if model != "relief":
+        return size | _NEUMIP
+    return size | {"network.relief.places": [n for least, n in _PLACES if seconds >= least][-1]}
 
 
-def best_at(quality: Quality) -> dict[str, Any]:
+def best_at(quality: Quality, model: ModelName = DEFAULT_MODEL) -> dict[str, Any]:
     """:func:`best_options` for the training time of a quality preset: infinite for a number of steps."""
     training = FITTER[quality].get("training.time")
-    return best_options(math.inf if training is None else parse_duration(training))
+    return best_options(math.inf if training is None else parse_duration(training), model)
 
 
 def fitter_options(
     quality: Quality, fits: Mapping[str, Mapping[str, Any]], seconds: float | None = None
 ) -> dict[str, dict[str, Any]]:
-    """Options of fits at a quality preset, dotted names: their budget, and for `neumip` and its baseline
-    :func:`best_at`. Explicit values override the preset.
+    """Options of fits at a quality preset, dotted names: their budget, and :func:`best_at`. Explicit values
+    override the preset.
 
     If any fit sets a network option, all keep the networks of their papers, so that they can be compared.
 
@@ -61,8 +72,8 @@ def fitter_options(
     for name, given in fits.items():
         training = given.get("training")
         training = training if isinstance(training, Mapping) else {}
-        chosen = best_at(quality) if seconds is None else best_options(seconds)
-        best = chosen if given.get("model") in _MODELS else {}
+        model = given.get("model", DEFAULT_MODEL)
+        best = best_at(quality, model) if seconds is None else best_options(seconds, model)
         kept = {
             key: value
             for key, value in best.items()

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from mbtf_fit.config import DEFAULT_MODEL
 from mbtf_fit.presets import fitter_options
 from mbtf_gen.config.presets import RESOLUTION, Quality, as_assignments, generator_options, overrides_of
 from mbtf_pipeline.recipe import Recipe, fit_names, load_recipe
@@ -74,4 +75,4 @@ def _options_of_fit(given: Mapping[str, Any], prefix: str) -> dict[str, Any]:
     _, _, name = prefix.partition(".")
     fits = given.get("fit")
     fit = fits.get(name) if name and isinstance(fits, Mapping) else fits
-    return {"model": name or "neumip", **(fit if isinstance(fit, Mapping) else {})}
+    return {"model": name or DEFAULT_MODEL, **(fit if isinstance(fit, Mapping) else {})}

@@ -13,7 +13,7 @@ from mbtf_core.errors import PartialError, UsageError
 from mbtf_core.interruption import keep_on_interruption
 from mbtf_core.options import DryRun, Options, Output, Overwrite, Verbose, takes_options
 from mbtf_core.units import clock, expectation, format_duration
-from mbtf_fit.config import FitConfig
+from mbtf_fit.config import DEFAULT_MODEL, FitConfig
 from mbtf_fit.formatting import describe_fit, format_estimate, format_table, headline, visibility
 from mbtf_gen.config.presets import Quality, QualityOption, as_assignments, overrides_of
 
@@ -125,7 +125,7 @@ def resolve_config(options: Options[FitConfig], quality: Quality | None) -> FitC
     presets: list[str] = []
     if quality is not None:
         flags = [f"{key}={value}" for key, value in given.items()]
-        overrides = {"model": "neumip", **overrides_of(options.config, [*options.assignments, *flags])}
+        overrides = {"model": DEFAULT_MODEL, **overrides_of(options.config, [*options.assignments, *flags])}
         presets = as_assignments(fitter_options(quality, {"": overrides})[""])
     if "training.time" in given:
         # A time overrides the steps of a file or a preset.

@@ -48,7 +48,9 @@ class NeuralMaterial(nn.Module, ABC):
         super().__init__()
         self.lattice = lattice
         self.network = network
-        self.pyramid = FeatureTextures(lattice, range(lattice.finest + 1), network.channels)
+        finer = network.oversampling.bit_length() - 1
+        grids = Lattice(lattice.finest + finer, lattice.aspect)
+        self.pyramid = FeatureTextures(grids, range(finer, grids.finest + 1), network.channels)
         features = network.channels * (2 if network.blending == "concatenate" else 1)
         features += position_size(network.encoding)
         directions = directions_size(network.encoding) + self.hint_size(network)

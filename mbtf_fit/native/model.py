@@ -39,7 +39,7 @@ _SUPPORTED: dict[str, tuple[Any, ...]] = {
         for half in (False, True)
     ),
 }
-_SIZES = {"channels", "width", "layers", "relief"}
+_SIZES = {"channels", "width", "layers", "oversampling", "relief"}
 
 
 def supports(model: NeuralMaterial) -> bool:
