@@ -132,7 +132,7 @@ def main() -> int:
         }
         print(json.dumps({"material": name, "figures": figures}))
         return 0
-    assets = sorted(path.name for path in (ROOT / "assets").iterdir() if path.is_dir())
+    assets = sorted(path.parent.name for path in (ROOT / "assets").glob("*/height.*"))
     found = []
     for name in arguments.materials or [*assets, *HEIGHT_SCALES]:
         if not source(name)[0].is_dir():

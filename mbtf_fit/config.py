@@ -212,7 +212,7 @@ PRESETS: dict[str, dict[str, Any]] = {
             "oversampling": 2,
             "encoding": {"direction_xyz": True, "half_vector": True},
         },
-        "training": {"texture_weight_decay": 1.0, "blur": {"min_sigma": 0.8}},
+        "training": {"texture_weight_decay": 1.0, "blur": {"min_sigma": 1.6}},
     },
     "hierarchical": {
         "network": {

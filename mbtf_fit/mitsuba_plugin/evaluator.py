@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mbtf_fit.mitsuba_plugin.known_surface import KnownSurface, displaced
 from mbtf_fit.mitsuba_plugin.material_arrays import F32, StoredMaterial
 from mbtf_fit.mitsuba_plugin.network import (
     MOST_UNROLLED,
@@ -18,12 +19,13 @@ from mbtf_fit.mitsuba_plugin.network import (
     Network,
     count_weights,
     default_arithmetic,
-    encode_direction,
+    encode_directions,
     encode_position,
+    rotate_to_z,
     to_value,
 )
 from mbtf_fit.mitsuba_plugin.textures import Textures
-from mbtf_fit.models.constants import GRAZING, OFFSET_SCALE
+from mbtf_fit.models.constants import GRAZING, IRRADIANCE_SCALE, OFFSET_SCALE
 from mbtf_gen.render.types import Color3f, Float, Point2f, UInt32, Vector3f
 
 
@@ -74,6 +76,10 @@ class Evaluator:
         self.pyramid = Textures(stored.pyramid)
         self.coefficients = None if stored.transmittance is None else Textures(stored.transmittance)
         self.decoder = Network(stored.decoder, self.arithmetic, stored.network.activation)
+        self.surface: KnownSurface | None = None
+        if stored.surface is not None:
+            self.surface = KnownSurface(stored.surface, stored.lattice, stored.network.relief.places)
+            self._depth_weights = mi.Float(stored.surface.depth_weights)
         self.offset_texture: Textures | None = None
         if stored.offset_texture is not None and stored.offset_network is not None:
             self.offset_texture = Textures([stored.offset_texture])
@@ -88,9 +94,14 @@ class Evaluator:
         return dr.clip(-dr.log2(2.0 * sigma), 0.0, float(self.lattice.finest))
 
     def features(self, u: Point2f, level: Float, omega_o: Vector3f) -> list[Float]:
-        """Stage 1, independent of the light: features at uv positions for unit view vectors, followed by the
-        calibration factors of the view and the level, where the material has some."""
-        moved = u
+        """Stage 1, independent of the light: features at uv positions for unit view vectors, followed by what is
+        known of the surface there, the calibration factors of the view and the level, where the material has
+        some."""
+        moved, known = u, []
+        if self.surface is not None:
+            height, known = self.surface.intersections(u, level, omega_o)
+            moved = displaced(u, self._depth_weight(level) * height, omega_o, self.lattice.aspect)
+            known = [*known, level]
         if self.offset_texture is not None:
             r = self.offset_network([*self.offset_texture.first(u), omega_o.x, omega_o.y])
             if len(r) == 1:
@@ -101,19 +112,48 @@ class Evaluator:
             )
         read = self.pyramid.blended if self.network.blending == "blend" else self.pyramid.side_by_side
         encoded = encode_position(u, level, self.lattice.aspect, self.network.encoding)
-        features = [*read(moved, level), *encoded]
+        features = [*read(moved, level), *encoded, *known]
         return features if self.factors is None else [*features, *self.factors.at(1, level, omega_o.z), level]
 
     def value(self, features: list[Float], omega_i: Vector3f, omega_o: Vector3f) -> Color3f:
         """Stage 2: value in 1/sr, at least 0."""
-        options = self.network.encoding
-        directions = [*encode_direction(omega_i, options), *encode_direction(omega_o, options)]
         inputs = features if self.factors is None else features[:-4]
-        value = to_value(self.decoder([*inputs, *directions]), self.unit, self.network)
+        value = self._decode(inputs, omega_i, omega_o)
         if self.factors is None:
             return value
         *by_view, level = features[-4:]
         return value * mi.Color3f(*by_view) * self.factors.at(0, level, omega_i.z)
+
+    def _depth_weight(self, level: Float) -> Float:
+        """Weight of the displacement at fractional levels."""
+        if self.lattice.finest == 0:
+            return dr.gather(mi.Float, self._depth_weights, mi.UInt32(0))
+        coarse = dr.minimum(mi.UInt32(level), self.lattice.finest - 1)
+        pair = (dr.gather(mi.Float, self._depth_weights, coarse + k) for k in (0, 1))
+        return dr.lerp(*pair, level - mi.Float(coarse))
+
+    def _decode(self, features: list[Float], omega_i: Vector3f, omega_o: Vector3f) -> Color3f:
+        """Value of features without calibration."""
+        directions = encode_directions(omega_i, omega_o, self.network.encoding)
+        if self.surface is None:
+            return to_value(self.decoder([*features, *directions]), self.unit, self.network)
+        relief = self.network.relief
+        count = relief.places * self.surface.numbers + 1
+        learned, known, level = features[:-count], features[-count:-1], features[-1]
+        irradiance, x, y, *core = self.surface.shading(known, level, omega_i, omega_o)
+        inputs = [*learned, *directions]
+        if relief.hints:
+            logarithms = (dr.log(1.0 + c / self.unit) for c in core)
+            inputs += [dr.log(dr.fma(IRRADIANCE_SCALE, irradiance, 1.0)), x, y, *logarithms]
+        if relief.frame:
+            normal = mi.Vector3f(x, y, dr.safe_sqrt(1.0 - dr.fma(x, x, y * y)))
+            for omega in (omega_i, omega_o):
+                inputs += [*rotate_to_z(normal, omega)]
+        out = self.decoder(inputs)
+        if not relief.gate:
+            return to_value(out, self.unit, self.network)
+        gate = 2.0 / (1.0 + dr.exp(-out[-1]))
+        return dr.maximum(to_value(out[:-1], self.unit, self.network, clamp=False) + gate * mi.Color3f(*core), 0.0)
 
     def transmittance(self, u: Point2f, level: Float, omega_o: Vector3f) -> Float:
         """Transparent fraction of the footprint for unit vectors on either side of the plane, equal for

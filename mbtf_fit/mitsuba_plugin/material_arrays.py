@@ -22,11 +22,41 @@ from mbtf_fit.material.format import (
 )
 from mbtf_fit.material.storage import read_tensors
 from mbtf_fit.material.transmittance import read_transmittance
-from mbtf_fit.models.constants import direction_size, position_size
+from mbtf_fit.models.constants import (
+    DIFFUSE_CHANNELS,
+    GLOSSY_CHANNELS,
+    HEIGHTS,
+    HORIZONS,
+    LIGHT_WIDTH,
+    MAPS,
+    directions_size,
+    hint_size,
+    position_size,
+)
 
 F32 = NDArray[np.float32]
 # (weight (outputs, inputs), bias (outputs,)) of each layer.
 Layers = list[tuple[F32, F32]]
+
+
+@dataclass(frozen=True)
+class StoredSurface:
+    """Known surface of the model `relief` as float32 arrays.
+
+    Attributes
+    ----------
+    heights : (H, W) heights in tile widths
+    maps : filtered maps (rows, columns, 7 or 11) of the levels 0 to k + 1
+    horizons : means of the horizons' angles and of their squares (rows, columns, 2·azimuths) of the levels 0 to k
+    depth_weights : (levels,) weights of the displacement
+    light_width : RMS angle per axis of the light kernel, in radians
+    """
+
+    heights: F32
+    maps: list[F32]
+    horizons: list[F32]
+    depth_weights: F32
+    light_width: float
 
 
 @dataclass(frozen=True)
@@ -43,6 +73,7 @@ class StoredMaterial:
     offset_texture, offset_network : those of the neural offset; None for a material without
     unit : factor of the value, in 1/sr
     calibration : factors (2, levels, knots, 3) by elevation of light and of view, or None
+    surface : heights and maps of the model `relief`, or None
     transmittance : coefficients (rows, columns, 6) by level; None for an opaque material
     conformance : queries ``u``, ``sigma``, ``omega_i``, ``omega_o`` and their values ``rgb`` (n, 3)
     """
@@ -57,6 +88,7 @@ class StoredMaterial:
     offset_network: Layers | None
     unit: float
     calibration: F32 | None
+    surface: StoredSurface | None
     transmittance: list[F32] | None
     conformance: dict[str, F32]
 
@@ -94,7 +126,11 @@ def read_material(folder: str | Path) -> StoredMaterial:
     conformance = check_conformance(tensors, description, weights)
     reader = _Reader(tensors, weights)
     transmittance = read_transmittance(folder, description)
-    pyramid = [reader.take(f"pyramid.{s}", (*lattice.shape(s), None)) for s in range(lattice.finest + 1)]
+    finer = network.oversampling.bit_length() - 1
+    grids = Lattice(lattice.finest + finer, lattice.aspect)
+    pyramid = [
+        reader.take(f"pyramid.{s}", (*grids.shape(s + finer), None)) for s in range(lattice.finest + 1)
+    ]
     channels = pyramid[0].shape[2]
     offset_texture, offset_network = None, None
     if network.offset != "none":
@@ -102,20 +138,42 @@ def read_material(folder: str | Path) -> StoredMaterial:
         outputs = 1 if network.offset == "depth" else 2
         offset_network = reader.layers("offset_network", offset_texture.shape[2] + 2, outputs)
     features = channels * (2 if network.blending == "concatenate" else 1)
-    encoded = position_size(network.encoding) + 2 * direction_size(network.encoding)
+    inputs = features + position_size(network.encoding) + directions_size(network.encoding)
+    outputs = network.output_channels
+    surface = None
+    if config.model == "relief":
+        inputs, outputs = inputs + hint_size(network), outputs + network.relief.gate
+        surface = _surface(reader, lattice)
     return StoredMaterial(
         folder,
         lattice,
         description["data"].get("min_cos", DEFAULT_MIN_COS),
         network,
         pyramid,
-        reader.layers("decoder", features + encoded, network.output_channels),
+        reader.layers("decoder", inputs, outputs),
         offset_texture,
         offset_network,
         float(reader.take("unit", ())),
         reader.take("calibration", (2, lattice.finest + 1, None, 3)) if "calibration" in tensors else None,
+        surface,
         None if transmittance is None else transmittance.levels,
         conformance,
+    )
+
+
+def _surface(reader: _Reader, lattice: Lattice) -> StoredSurface:
+    levels = range(lattice.finest + 2)
+    finer = Lattice(lattice.finest + 1, lattice.aspect)
+    maps = [reader.take(f"{MAPS}.{s}", (*finer.shape(s), None)) for s in levels]
+    if {level.shape[2] for level in maps} not in ({DIFFUSE_CHANNELS}, {GLOSSY_CHANNELS}):
+        known = f"{DIFFUSE_CHANNELS} nor {GLOSSY_CHANNELS}"
+        raise InputError(f"its tensor '{MAPS}.0' has neither {known} channels", where=reader.path)
+    return StoredSurface(
+        reader.take(HEIGHTS, (None, None)),
+        maps,
+        [reader.take(f"{HORIZONS}.{s}", (*lattice.shape(s), None)) for s in levels[:-1]],
+        reader.take("depth_weights", (lattice.finest + 1,)),
+        float(reader.take(LIGHT_WIDTH, ())),
     )
 
 

@@ -124,6 +124,24 @@ def encode_direction(omega: Vector3f, options: EncodingSection) -> list[Float]:
     return encode(coordinates, options.direction, options.direction_pi, options)
 
 
+def rotate_to_z(axis: Vector3f, omega: Vector3f) -> Vector3f:
+    """Directions, rotated by the shortest rotation that takes unit vectors with z > 0 to z."""
+    along = dr.fma(axis.x, omega.x, axis.y * omega.y)
+    share = omega.z + along / (1.0 + axis.z)
+    return mi.Vector3f(
+        dr.fma(-axis.x, share, omega.x), dr.fma(-axis.y, share, omega.y), dr.fma(axis.z, omega.z, along)
+    )
+
+
+def encode_directions(omega_i: Vector3f, omega_o: Vector3f, options: EncodingSection) -> list[Float]:
+    """Encoded light and view; with ``half_vector``, half vector and difference vector."""
+    out = [*encode_direction(omega_i, options), *encode_direction(omega_o, options)]
+    if options.half_vector:
+        half = dr.normalize(omega_i + omega_o)
+        out += [*half, *rotate_to_z(half, omega_i)]
+    return out
+
+
 def encode_position(u: Point2f, level: Float, aspect: float, options: EncodingSection) -> list[Float]:
     """Encoded uv position at a fractional level: empty without bands."""
     if options.position == 0:
@@ -143,12 +161,12 @@ _TRANSFORMS: dict[str, Callable[[Float], Float]] = {
 }
 
 
-def to_value(x: Sequence[Float], unit: float, network: NetworkSection) -> Color3f:
-    """Value in 1/sr, at least 0, of a decoder's three or six outputs."""
+def to_value(x: Sequence[Float], unit: float, network: NetworkSection, *, clamp: bool = True) -> Color3f:
+    """Value in 1/sr, at least 0 if it is clamped, of a decoder's three or six outputs."""
     gates = [GATE + dr.rcp(1.0 + dr.exp(-v)) for v in x[3:]]
     if gates:
         x = [sum(weight * v for weight, v in zip(row, x[:3], strict=True) if weight) for row in RGB_OF_YUV]
     colors = [unit * _TRANSFORMS[network.output_transform](v) for v in x]
     if gates:
         colors = [color * gate for color, gate in zip(colors, gates, strict=True)]
-    return mi.Color3f(*(dr.maximum(v, 0.0) for v in colors))
+    return mi.Color3f(*(dr.maximum(v, 0.0) if clamp else v for v in colors))

@@ -7,6 +7,7 @@ channels padded to a multiple of :data:`GROUP`, so that wide loads read a texel.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -52,12 +53,15 @@ class Textures:
         layout = (mi.UInt32(rows), mi.UInt32(columns), mi.UInt32(0))
         return self._bilinear(in_image(u), *layout, None, [0.0] * self.channels)
 
-    def blended(self, u: Point2f, level: Float) -> list[Float]:
-        """Features between two levels: (1 - frac(level)) of the coarser, frac(level) of the finer one."""
+    def blended(self, u: Point2f, level: Float, group: UInt32 | None = None) -> list[Float]:
+        """Features between two levels: (1 - frac(level)) of the coarser, frac(level) of the finer one; of one
+        group of four channels where its number is given."""
+        out: list[Any] = [0.0] * (self.channels if group is None else GROUP)
         if len(self.shapes) == 1:
-            return self.first(u)
+            return self._level(u, mi.UInt32(0), mi.Float(1.0), out, group)
         coarse, weight = self._coarse(level)
-        return self._level(u, coarse + 1, weight, self._level(u, coarse, 1.0 - weight, [0.0] * self.channels))
+        low = self._level(u, coarse, 1.0 - weight, out, group)
+        return self._level(u, coarse + 1, weight, low, group)
 
     def side_by_side(self, u: Point2f, level: Float) -> list[Float]:
         """The same two terms, concatenated: that of the even level, then that of the odd one."""
@@ -76,12 +80,21 @@ class Textures:
         coarse = dr.minimum(mi.UInt32(level), len(self.shapes) - 2)
         return coarse, level - mi.Float(coarse)
 
-    def _level(self, u: Point2f, level: UInt32, scale: Float, out: list[Float]) -> list[Float]:
+    def _level(
+        self, u: Point2f, level: UInt32, scale: Float, out: list[Float], group: UInt32 | None = None
+    ) -> list[Float]:
         rows, columns, start, _ = dr.gather(mi.Vector4u, self.table, level)
-        return self._bilinear(in_image(u), rows, columns, start, scale, out)
+        return self._bilinear(in_image(u), rows, columns, start, scale, out, group)
 
     def _bilinear(
-        self, x: Point2f, rows: UInt32, columns: UInt32, start: UInt32, scale: Float, out: list[Float]
+        self,
+        x: Point2f,
+        rows: UInt32,
+        columns: UInt32,
+        start: UInt32,
+        scale: Float,
+        out: list[Float],
+        group: UInt32 | None = None,
     ) -> list[Float]:
         """`out` plus the texture of one level times a scale, at image positions x in [0, 1]."""
         px, py = dr.fma(x.x, mi.Float(columns), -0.5), dr.fma(x.y, mi.Float(rows), -0.5)
@@ -102,12 +115,15 @@ class Textures:
             (j1 + i0, low_left),
             (j1 + i1, low_right),
         ):
-            texel = self._texel(index)
+            texel = self._texel(index) if group is None else self._group(index, group)
             out = [dr.fma(value, weight, total) for value, total in zip(texel, out, strict=True)]
         return out
+
+    def _group(self, index: UInt32, group: UInt32) -> list[Float]:
+        return list(dr.gather(mi.Vector4f, self.buffer, index * self.groups + group))
 
     def _texel(self, index: UInt32) -> list[Float]:
         values: list[Float] = []
         for group in range(self.groups):
-            values += list(dr.gather(mi.Vector4f, self.buffer, index * self.groups + group))
+            values += self._group(index, mi.UInt32(group))
         return values[: self.channels]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from mbtf_fit.config import EncodingSection
+import math
+
+from mbtf_fit.config import EncodingSection, NetworkSection
 
 # Slope of leaky-relu below zero.
 LEAK = 0.01
@@ -14,6 +16,32 @@ GRAZING = 0.6
 RGB_OF_YUV = ((1.0, 0.0, 1.13983), (1.0, -0.39465, -0.58060), (1.0, 2.03211, 0.0))
 # Least value of the gate, so that its gradient never vanishes.
 GATE = 0.1
+
+# Of the model `relief`. Columns of the hints: height, irradiance, normal (x, y), core (RGB).
+HINTS = 7
+# Inputs of the decoder from the hints, and of light and view about the known normal.
+HINT_INPUTS, FRAME_INPUTS = 6, 6
+# Factor of the irradiance under the logarithm.
+IRRADIANCE_SCALE = 4.0
+# Channels of the maps: slopes (x, y), their squares (x, y), diffuse albedo (RGB); of a glossy surface besides
+# F0 (RGB) and α².
+DIFFUSE_CHANNELS, GLOSSY_CHANNELS = 7, 11
+# Azimuths of the horizons; share of the light kernel's width (RMS per axis) that blurs them.
+AZIMUTHS, LIGHT_BLUR = 16, 0.8
+# Smallest cosines of light and view to a normal, least and largest α² of the lobe, least variance of a horizon.
+LEAST_LIGHT, LEAST_VIEW, ALPHA2, LEAST_VARIANCE = 0.01, 0.05, (1e-4, 4.0), 1e-8
+# Tile borders that a view ray may cross; a ray at a cosine of 1e-4 crosses more above deep surfaces.
+MAX_CROSSINGS = 64
+# Offsets of the places from the footprint's center, per axis, in σ; levels that lookups there are finer by.
+# Lookups at one place have the footprint itself. Four places at ±√(3/4) σ with half the footprint each have
+# the same variance.
+PLACES: dict[int, tuple[tuple[tuple[float, float], ...], float]] = {
+    1: (((0.0, 0.0),), 0.0),
+    4: (tuple((x * math.sqrt(0.75), y * math.sqrt(0.75)) for y in (-1, 1) for x in (-1, 1)), 1.0),
+}
+# Tensors of the surface in a material, before the level.
+HEIGHTS, MAPS, HORIZONS = "surface.heights", "surface.maps", "surface.horizons"
+LIGHT_WIDTH = "surface.light_width"
 
 
 def encoded_size(coordinates: int, bands: int, options: EncodingSection) -> int:
@@ -34,3 +62,8 @@ def directions_size(options: EncodingSection) -> int:
 def position_size(options: EncodingSection) -> int:
     """Numbers that encode a position."""
     return encoded_size(2, options.position, options) if options.position else 0
+
+
+def hint_size(network: NetworkSection) -> int:
+    """Inputs of the decoder of `relief` besides features and directions."""
+    return HINT_INPUTS * network.relief.hints + FRAME_INPUTS * network.relief.frame

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from mbtf_core.errors import InputError
 from mbtf_core.lattice import Lattice
 from mbtf_fit.config import NetworkSection
+from mbtf_fit.models.constants import IRRADIANCE_SCALE, hint_size
 from mbtf_fit.models.encodings import rotate_to_z
 from mbtf_fit.models.lookup import coarse_level
 from mbtf_fit.models.neumip import Neumip
@@ -27,10 +28,6 @@ from mbtf_fit.surface.known import KnownSurface
 
 # Weight of the displacement at all levels before training.
 FIRST_WEIGHT = 0.9
-# Factor of the irradiance under the logarithm.
-IRRADIANCE_SCALE = 4.0
-# Inputs from the hints, and of light and view about the known normal.
-HINT_INPUTS, FRAME_INPUTS = 6, 6
 
 
 class Relief(Neumip):
@@ -53,8 +50,7 @@ class Relief(Neumip):
 
     @classmethod
     def hint_size(cls, network: NetworkSection) -> int:
-        relief = network.relief
-        return HINT_INPUTS * relief.hints + FRAME_INPUTS * relief.frame
+        return hint_size(network)
 
     @classmethod
     def gate_size(cls, network: NetworkSection) -> int:

@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from mbtf_fit.config import EncodingSection
-from mbtf_fit.models.constants import GRAZING, OFFSET_SCALE, direction_size
+from mbtf_fit.models.constants import GRAZING, IRRADIANCE_SCALE, OFFSET_SCALE, direction_size
 from mbtf_fit.models.interface import NeuralMaterial
 from mbtf_fit.models.mlp import Mlp
 from mbtf_fit.models.neumip import Neumip, NeumipBaseline
-from mbtf_fit.models.relief import IRRADIANCE_SCALE, Relief
+from mbtf_fit.models.relief import Relief
 from mbtf_fit.native.library import (
     MAX_CHANNELS,
     MAX_LAYERS,

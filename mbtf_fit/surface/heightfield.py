@@ -19,11 +19,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mbtf_fit.models.constants import MAX_CROSSINGS
 from mbtf_fit.native.library import Heightfield, kernel
 from mbtf_gen.geometry.height_planes import node_table
 
-# Tile borders that a ray may cross; a ray at a cosine of 1e-4 crosses more above deep surfaces.
-MAX_CROSSINGS = 64
 # Rays, and vertices, per task of a thread.
 _RAYS, _VERTICES = 1 << 14, 1 << 12
 # Smallest magnitude of a direction's component, which avoids 0/0 for rays parallel to an axis.

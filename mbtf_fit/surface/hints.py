@@ -9,17 +9,17 @@ import torch
 from torch import Tensor
 
 from mbtf_fit.native.library import MAX_LEVELS, QueryPointers, Surface, Textures, kernel
-from mbtf_fit.models.lookup import Packing
-from mbtf_fit.surface.heightfield import MAX_CROSSINGS
-from mbtf_fit.surface.known import (
+from mbtf_fit.models.constants import (
     ALPHA2,
     HINTS,
     LEAST_LIGHT,
     LEAST_VIEW,
     LIGHT_BLUR,
+    MAX_CROSSINGS,
     PLACES,
-    KnownSurface,
 )
+from mbtf_fit.models.lookup import Packing
+from mbtf_fit.surface.known import KnownSurface
 
 # Queries per task of a thread.
 _TASK = 1 << 14
@@ -45,7 +45,7 @@ def compute_hints(
     u, sigma, omega_i, omega_o : (n, 2), (n,), (n, 3), (n, 3) tensors
         Position in uv, footprint in tile widths, light and view.
     places : int
-        Places of the footprint that are traced, a key of :data:`~mbtf_fit.surface.known.PLACES`.
+        Places of the footprint that are traced: 1 or 4.
 
     Returns
     -------

@@ -29,6 +29,21 @@ import torch
 from torch import Tensor
 
 from mbtf_core.lattice import Lattice
+from mbtf_fit.models.constants import (
+    ALPHA2,
+    AZIMUTHS,
+    GLOSSY_CHANNELS,
+    HEIGHTS,
+    HINTS,
+    HORIZONS,
+    LEAST_LIGHT,
+    LEAST_VARIANCE,
+    LEAST_VIEW,
+    LIGHT_BLUR,
+    LIGHT_WIDTH,
+    MAPS,
+    PLACES,
+)
 from mbtf_fit.models.lookup import Packing, lookup
 from mbtf_fit.surface.heightfield import HeightfieldTracer
 from mbtf_fit.surface.prefilter import prefiltered_levels
@@ -37,32 +52,10 @@ from mbtf_gen.images.resample import resample
 if TYPE_CHECKING:
     from mbtf_gen.dataset.geometry import Geometry
 
-# Columns of the hints: height, irradiance, normal (x, y), core (RGB).
-HINTS = 7
-# Channels of the maps: slopes (x, y), their squares (x, y), diffuse albedo (RGB); of a glossy surface besides
-# F0 (RGB) and α².
-DIFFUSE_CHANNELS, GLOSSY_CHANNELS = 7, 11
-# Azimuths of the horizons.
-AZIMUTHS = 16
-# Share of the light kernel's width (RMS per axis) that blurs the horizon.
-LIGHT_BLUR = 0.8
 # Reflectance of the surface where the data set states none.
 UNKNOWN_COLOR = 0.5
 # F0 of a dielectric per unit of `specular`, as in mbtf_gen.render.bsdf.surface.
 DIELECTRIC_F0 = 0.08
-# Smallest cosines of light and view to a normal, least and largest α² of the lobe.
-LEAST_LIGHT, LEAST_VIEW, ALPHA2 = 0.01, 0.05, (1e-4, 4.0)
-# Offsets of the places from the footprint's center, per axis, in σ; levels that lookups there are finer by.
-# Lookups at one place have the footprint itself. Four places at ±√(3/4) σ with half the footprint each have
-# the same variance.
-PLACES: dict[int, tuple[tuple[tuple[float, float], ...], float]] = {
-    1: (((0.0, 0.0),), 0.0),
-    4: (tuple((x * math.sqrt(0.75), y * math.sqrt(0.75)) for y in (-1, 1) for x in (-1, 1)), 1.0),
-}
-# Tensors of a surface in a material, before the level.
-HEIGHTS, MAPS, HORIZONS = "surface.heights", "surface.maps", "surface.horizons"
-LIGHT_WIDTH = "surface.light_width"
-
 
 @dataclass(frozen=True)
 class KnownSurface:
@@ -174,7 +167,7 @@ class KnownSurface:
         omega_i, omega_o : (n, 3) tensor
             Unit vectors towards light and viewer, z > 0.
         places : int
-            Places of the footprint, a key of :data:`PLACES`.
+            Places of the footprint, 1 or 4.
 
         Returns
         -------
@@ -235,7 +228,7 @@ class KnownSurface:
         square = torch.lerp(both.gather(1, index + count), both.gather(1, after + count), weight)
         variance = (square - mean.square()).clamp_min(0.0) + (LIGHT_BLUR * self.light_width) ** 2
         elevation = omega_i[:, 2:].clamp(0.0, 1.0).asin()
-        return 0.5 + 0.5 * torch.erf((elevation - mean) / (2.0 * variance.clamp_min(1e-8)).sqrt())
+        return 0.5 + 0.5 * torch.erf((elevation - mean) / (2.0 * variance.clamp_min(LEAST_VARIANCE)).sqrt())
 
 
 def ggx(
