@@ -15,6 +15,7 @@ from mbtf_core.atomic import write_text, write_through
 from mbtf_core.errors import InputError
 from mbtf_fit.material.material import Material, conformance_values, describe_model
 from mbtf_fit.material.transmittance import FORMULA
+from mbtf_fit.models.constants import DIELECTRIC, LIGHT_WIDTH
 from mbtf_fit.models.registry import build_model
 
 TEXTURES_NAME, LAYERS_NAME = "textures.exr", "layers.json"
@@ -169,6 +170,13 @@ def _layers(material: Material, half: bool) -> dict[str, list[dict[str, Any]]]:
     return out
 
 
+def _surface_numbers(material: Material, half: bool) -> dict[str, Any]:
+    """Numbers of a known surface that are no textures."""
+    weights = material.model.weights()
+    names = (name for name in ("depth_weights", LIGHT_WIDTH, DIELECTRIC) if name in weights)
+    return {name: _numbers(weights[name].cpu(), half) for name in names}
+
+
 def write_layers(material: Material, path: Path, *, half: bool = False) -> None:
     """Write everything but the textures: layers, formulas and conventions as text, shapes, and the
     conformance queries with their expected values, that of the transmittance included.
@@ -197,6 +205,7 @@ def write_layers(material: Material, path: Path, *, half: bool = False) -> None:
         "unit": _numbers(material.model.unit.cpu()),
         "textures": {"file": TEXTURES_NAME, "parts": parts},
         "networks": _layers(material, half),
+        **_surface_numbers(material, half),
         **({} if calibration is None else {"calibration": _numbers(calibration.cpu(), half)}),
         **({} if transmittance is None else {"transmittance": FORMULA}),
         "conformance": {

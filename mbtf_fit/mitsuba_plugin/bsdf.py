@@ -40,6 +40,9 @@ from mbtf_gen.render.types import (
 # Largest deviation from the conformance values, as a share of max(value, their mean), that loading accepts.
 TOLERANCE = {"unrolled": 1e-4, "cooperative": 1e-4, "half": 1e-2}
 
+# One conformance query of so many may deviate where view rays are traced.
+MISSED_EDGES = 100
+
 PARAMETERS = ("material", "uv_scale", "sigma", "networks", "sampling")
 
 _log = logging.getLogger(__name__)
@@ -284,7 +287,10 @@ def _check_conformance(evaluator: Evaluator, stored: StoredMaterial) -> None:
     expected = stored.conformance["rgb"]
     found = evaluator.evaluate(*(stored.conformance[name] for name in QUERY))
     scale = np.maximum(np.abs(expected), max(float(expected.mean()), 1e-12))
-    worst = float(np.max(np.abs(found - expected) / scale))
+    deviations = np.sort(np.max(np.abs(found - expected) / scale, axis=1))
+    # A traced ray may just miss an edge that it hits in other arithmetic.
+    allowed = 0 if stored.surface is None else len(expected) // MISSED_EDGES
+    worst = float(deviations[len(expected) - 1 - allowed])
     if not worst <= TOLERANCE[evaluator.arithmetic]:
         raise InputError(
             f"the renderer's plugin does not reproduce its conformance values ({100 * worst:.2g} % off)",

@@ -44,7 +44,7 @@ class KnownSurface:
         self._heightfield = HeightField.of(grid, 1.0, two_sided=False)
         self._maps = Textures(stored.maps)
         self._horizons = Textures([adjacent_azimuths(level) for level in stored.horizons])
-        self._light_width = stored.light_width
+        self._light_width, self._dielectric = stored.light_width, stored.dielectric
 
     @property
     def numbers(self) -> int:
@@ -85,11 +85,14 @@ class KnownSurface:
         normal = dr.normalize(mi.Normal3f(-maps[0], -maps[1], 1.0))
         light = dr.dot(normal, omega_i)
         irradiance = self._visibility(hit, level, omega_i) * dr.maximum(light, 0.0) / omega_i.z
-        value = mi.Color3f(*maps[4:7]) / math.pi
+        base = mi.Color3f(*maps[3:6])
+        value = base / math.pi
         if len(maps) == GLOSSY_CHANNELS:
-            variance = sum(dr.maximum(maps[2 + k] - dr.square(maps[k]), 0.0) for k in range(2))
-            alpha2 = dr.clip(maps[10] + variance + self._light_width**2, *ALPHA2)
-            value += ggx(mi.Color3f(*maps[7:10]), alpha2, normal, omega_i, omega_o)
+            metallic = maps[7]
+            variance = dr.maximum(maps[2] - dr.fma(maps[0], maps[0], dr.square(maps[1])), 0.0)
+            alpha2 = dr.clip(maps[6] + variance + self._light_width**2, *ALPHA2)
+            f0 = dr.lerp(mi.Color3f(self._dielectric), base, metallic)
+            value = (1.0 - metallic) * value + ggx(f0, alpha2, normal, omega_i, omega_o)
         return [irradiance, normal.x, normal.y, *(irradiance * value)]
 
     def _visibility(self, hit: Point2f, level: Float, omega_i: Vector3f) -> Float:

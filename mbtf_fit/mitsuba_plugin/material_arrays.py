@@ -23,6 +23,7 @@ from mbtf_fit.material.format import (
 from mbtf_fit.material.storage import read_tensors
 from mbtf_fit.material.transmittance import read_transmittance
 from mbtf_fit.models.constants import (
+    DIELECTRIC,
     DIFFUSE_CHANNELS,
     GLOSSY_CHANNELS,
     HEIGHTS,
@@ -46,10 +47,11 @@ class StoredSurface:
     Attributes
     ----------
     heights : (H, W) heights in tile widths
-    maps : filtered maps (rows, columns, 7 or 11) of the levels 0 to k + 1
+    maps : filtered maps (rows, columns, 6 or 8) of the levels 0 to k + 1
     horizons : means of the horizons' angles and of their squares (rows, columns, 2·azimuths) of the levels 0 to k
     depth_weights : (levels,) weights of the displacement
     light_width : RMS angle per axis of the light kernel, in radians
+    dielectric : F0 where the surface is no metal
     """
 
     heights: F32
@@ -57,6 +59,7 @@ class StoredSurface:
     horizons: list[F32]
     depth_weights: F32
     light_width: float
+    dielectric: float
 
 
 @dataclass(frozen=True)
@@ -169,11 +172,12 @@ def _surface(reader: _Reader, lattice: Lattice) -> StoredSurface:
         known = f"{DIFFUSE_CHANNELS} nor {GLOSSY_CHANNELS}"
         raise InputError(f"its tensor '{MAPS}.0' has neither {known} channels", where=reader.path)
     return StoredSurface(
-        reader.take(HEIGHTS, (None, None)),
+        reader.take(HEIGHTS, (None, None, 1))[..., 0],
         maps,
         [reader.take(f"{HORIZONS}.{s}", (*lattice.shape(s), None)) for s in levels[:-1]],
         reader.take("depth_weights", (lattice.finest + 1,)),
         float(reader.take(LIGHT_WIDTH, ())),
+        float(reader.take(DIELECTRIC, ())),
     )
 
 

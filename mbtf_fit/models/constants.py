@@ -23,9 +23,9 @@ HINTS = 7
 HINT_INPUTS, FRAME_INPUTS = 6, 6
 # Factor of the irradiance under the logarithm.
 IRRADIANCE_SCALE = 4.0
-# Channels of the maps: slopes (x, y), their squares (x, y), diffuse albedo (RGB); of a glossy surface besides
-# F0 (RGB) and α².
-DIFFUSE_CHANNELS, GLOSSY_CHANNELS = 7, 11
+# Channels of the maps: slopes (x, y), their squared length, base color (RGB); of a glossy surface besides α² and
+# metallic.
+DIFFUSE_CHANNELS, GLOSSY_CHANNELS = 6, 8
 # Azimuths of the horizons; share of the light kernel's width (RMS per axis) that blurs them.
 AZIMUTHS, LIGHT_BLUR = 16, 0.8
 # Smallest cosines of light and view to a normal, least and largest α² of the lobe, least variance of a horizon.
@@ -41,7 +41,7 @@ PLACES: dict[int, tuple[tuple[tuple[float, float], ...], float]] = {
 }
 # Tensors of the surface in a material, before the level.
 HEIGHTS, MAPS, HORIZONS = "surface.heights", "surface.maps", "surface.horizons"
-LIGHT_WIDTH = "surface.light_width"
+LIGHT_WIDTH, DIELECTRIC = "surface.light_width", "surface.dielectric"
 
 
 def encoded_size(coordinates: int, bands: int, options: EncodingSection) -> int:

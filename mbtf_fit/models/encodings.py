@@ -89,6 +89,20 @@ def encode_position(u: Tensor, level: Tensor, aspect: float, options: EncodingSe
     return encode(2.0 * (u - u.floor()) - 1.0, options.position, options.pi, options, spread)
 
 
+def directions_formula(options: EncodingSection) -> str:
+    """Formula of :func:`encode_directions` as text for an export."""
+    coordinates = "(x, y, z)" if options.direction_xyz else "(x, y)"
+    text = encoding_formula(
+        f"{coordinates} of omega_i, of omega_o", options.direction, options.direction_pi, options
+    )
+    if options.half_vector:
+        text += (
+            "; then h = normalize(omega_i + omega_o), then rotate(h, omega_i), where rotate(a, w) = "
+            "(w.x - a.x * s, w.y - a.y * s, a.z * w.z + t), t = a.x * w.x + a.y * w.y, s = w.z + t / (1 + a.z)"
+        )
+    return text
+
+
 def encoding_formula(
     coordinates: str, bands: int, pi: bool, options: EncodingSection, spread: str = ""
 ) -> str:

@@ -13,7 +13,12 @@ from mbtf_core.lattice import Lattice
 from mbtf_core.shard_schema import Layout
 from mbtf_fit.config import NetworkSection
 from mbtf_fit.models.constants import GRAZING, OFFSET_SCALE, directions_size, position_size
-from mbtf_fit.models.encodings import encode_directions, encode_position, encoding_formula
+from mbtf_fit.models.encodings import (
+    directions_formula,
+    encode_directions,
+    encode_position,
+    encoding_formula,
+)
 from mbtf_fit.models.inception import InceptionDecoder
 from mbtf_fit.models.lookup import coarse_level
 from mbtf_fit.models.mlp import Mlp, initialize_layers
@@ -210,7 +215,6 @@ class NeuralMaterial(nn.Module, ABC):
     def formula(self) -> dict[str, str]:
         """Formulas of the value in terms of :meth:`weights`, as text for an export."""
         network, encoding = self.network, self.network.encoding
-        omega = "(x, y, z)" if encoding.direction_xyz else "(x, y)"
         r = f"{OFFSET_SCALE} * offset_network(texture offset_texture.0 at u, omega_o.x, omega_o.y)"
         out: dict[str, str] = {}
         if network.offset == "depth":
@@ -235,9 +239,7 @@ class NeuralMaterial(nn.Module, ABC):
         return {
             **out,
             "features": features,
-            "light, view": encoding_formula(
-                f"{omega} of omega_i, of omega_o", encoding.direction, encoding.direction_pi, encoding
-            ),
+            "light, view": directions_formula(encoding),
             "x": "decoder(features, light, view)",
             "value": output_formula(network.output_transform, network.output_channels),
         }

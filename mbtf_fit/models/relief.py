@@ -24,6 +24,7 @@ from mbtf_fit.models.encodings import rotate_to_z
 from mbtf_fit.models.lookup import coarse_level
 from mbtf_fit.models.neumip import Neumip
 from mbtf_fit.surface.hints import compute_hints
+from mbtf_fit.surface.formulas import surface_formula
 from mbtf_fit.surface.known import KnownSurface
 
 # Weight of the displacement at all levels before training.
@@ -138,18 +139,17 @@ class Relief(Neumip):
 
     def formula(self) -> dict[str, str]:
         out = super().formula()
-        relief = self.network.relief
-        position = "u' = u + w * z / omega_o.z * (omega_o.x, omega_o.y) / (1, aspect)"
-        out["w"] = "depth_weights, linear between levels"
-        out["z"] = "height at which the view ray meets surface.heights, mean over the places"
-        out["features"] = out["features"].replace("at u,", f"at {position},")
+        relief, known = self.network.relief, surface_formula(self.known, self.network.relief.places)
+        position = "u' = u + w * z / omega_o.z * (omega_o.x, omega_o.y) / (1, aspect), w = depth_weights at l"
+        out["features"] = out["features"].replace(" at u,", f" at {position},")
         inputs = ["features", "light, view"]
         if relief.hints:
             inputs.append(f"log(1 + {IRRADIANCE_SCALE:g} e), n.x, n.y, log(1 + core / unit)")
         if relief.frame:
-            inputs.append("omega_i, omega_o about n")
+            inputs.append("rotate(n, omega_i), rotate(n, omega_o)")
         out["x"] = f"decoder({', '.join(inputs)})"
         if relief.gate:
-            out["value"] = f"{out['value']} + 2 / (1 + exp(-g)) * core, where g = the last output"
-        return out
+            value = out["value"].replace("the last outputs", "the outputs")
+            out["value"] = f"{value} + 2 / (1 + exp(-g)) * core, where g is the last output, x the others"
+        return known | out
 

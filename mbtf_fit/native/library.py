@@ -76,7 +76,8 @@ class Surface(ctypes.Structure):
         *((name, Textures) for name in ("maps", "horizons")),
         ("places", _I32),
         ("offsets", _F32 * (2 * MAX_PLACES)),
-        *((name, _F32) for name in ("finer", "light_width", "light_blur", "least_light", "least_view")),
+        *((name, _F32) for name in ("finer", "light_width", "light_blur", "dielectric")),
+        *((name, _F32) for name in ("least_light", "least_view")),
         ("alpha2", _F32 * 2),
     )
 

@@ -66,6 +66,7 @@ def compute_hints(
     description.places = places
     description.offsets[: 2 * places] = [x for offset in offsets for x in offset]
     description.light_width, description.light_blur = surface.light_width, LIGHT_BLUR
+    description.dielectric = surface.dielectric
     description.least_light, description.least_view = LEAST_LIGHT, LEAST_VIEW
     description.alpha2[:] = ALPHA2
 

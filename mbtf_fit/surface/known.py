@@ -1,9 +1,9 @@
 r"""Hints: what the geometry of a data set tells about a query before anything is learned.
 
 For a query (u, σ, ω_i, ω_o) the view rays of one or more places of the footprint are traced to the heights.
-At each intersection, maps filtered to the footprint give the normal n̄, the diffuse albedo, the reflectance F0
-and the roughness of a GGX lobe, widened by the variance of the slopes below the footprint (LEAN mapping,
-Olano and Baker 2010). The light is visible from a share V of the footprint: the elevation of the horizon in
+At each intersection, maps filtered to the footprint give the normal n̄, base color, metallic, and the
+roughness of a GGX lobe, widened by the variance of the slopes below the footprint (LEAN mapping, Olano and
+Baker 2010). The light is visible from a share V of the footprint: the elevation of the horizon in
 the light's azimuth has the mean h and the variance s² there, and for normally distributed horizons
 
     V = Φ((elevation of ω_i - h) / √(s² + w²)),    w = 0.8 times the light kernel's width.
@@ -32,6 +32,7 @@ from mbtf_core.lattice import Lattice
 from mbtf_fit.models.constants import (
     ALPHA2,
     AZIMUTHS,
+    DIELECTRIC,
     GLOSSY_CHANNELS,
     HEIGHTS,
     HINTS,
@@ -73,6 +74,8 @@ class KnownSurface:
         Prefiltered horizon angles in radians by level, then their squares: levels 0 to k.
     light_width : float
         RMS angle per axis of the light kernel, in radians.
+    dielectric : float
+        F0 of the surface where it is no metal.
     """
 
     lattice: Lattice
@@ -80,6 +83,7 @@ class KnownSurface:
     maps: tuple[Tensor, ...]
     horizons: tuple[Tensor, ...]
     light_width: float
+    dielectric: float
 
     @classmethod
     def of(cls, geometry: Geometry, lattice: Lattice, light_width: float) -> KnownSurface:
@@ -107,13 +111,15 @@ class KnownSurface:
             tuple(prefiltered_levels(maps, finer)),
             tuple(prefiltered_levels(horizons, lattice)),
             math.radians(light_width),
+            DIELECTRIC_F0 * float(np.mean(0.0 if geometry.specular is None else geometry.specular)),
         )
 
     def tensors(self) -> dict[str, Tensor]:
         """Its tensors by their names in a material."""
         return {
-            HEIGHTS: self.heights,
+            HEIGHTS: self.heights[..., None],
             LIGHT_WIDTH: torch.tensor(self.light_width),
+            DIELECTRIC: torch.tensor(self.dielectric),
             **{f"{MAPS}.{level}": t for level, t in enumerate(self.maps)},
             **{f"{HORIZONS}.{level}": t for level, t in enumerate(self.horizons)},
         }
@@ -129,10 +135,11 @@ class KnownSurface:
         levels = range(lattice.finest + 1)
         return cls(
             lattice,
-            tensors[HEIGHTS].float(),
+            tensors[HEIGHTS][..., 0].float(),
             tuple(tensors[f"{MAPS}.{level}"].float() for level in (*levels, lattice.finest + 1)),
             tuple(tensors[f"{HORIZONS}.{level}"].float() for level in levels),
             float(tensors[LIGHT_WIDTH]),
+            float(tensors[DIELECTRIC]),
         )
 
     @property
@@ -199,18 +206,21 @@ class KnownSurface:
         """Irradiance, normal and core (n, 6) at surface points."""
         table, packing = self.map_table
         maps = lookup(table, packing, hit, level)
-        slopes, squares, diffuse = maps[:, :2], maps[:, 2:4], maps[:, 4:7]
+        slopes, square, base = maps[:, :2], maps[:, 2:3], maps[:, 3:6]
         normal = torch.nn.functional.normalize(torch.cat([-slopes, torch.ones_like(slopes[:, :1])], 1), dim=1)
         light = (normal * omega_i).sum(1, keepdim=True)
         visibility = self.visibility(hit, level, omega_i)
         irradiance = visibility * light.clamp_min(0.0) / omega_i[:, 2:]
-        value = diffuse / math.pi
+        value = base / math.pi
         if self.glossy:
-            variance = (squares - slopes.square()).clamp_min(0.0).sum(1, keepdim=True)
-            alpha2 = (maps[:, 10:11] + variance + self.light_width**2).clamp(*ALPHA2)
+            metallic = maps[:, 7:8]
+            variance = (square - slopes.square().sum(1, keepdim=True)).clamp_min(0.0)
+            alpha2 = (maps[:, 6:7] + variance + self.light_width**2).clamp(*ALPHA2)
+            f0 = torch.lerp(base.new_tensor(self.dielectric), base, metallic)
             light = light.clamp_min(LEAST_LIGHT)
             view = (normal * omega_o).sum(1, keepdim=True).clamp_min(LEAST_VIEW)
-            value = value + ggx(maps[:, 7:10], alpha2, normal, light, view, omega_i, omega_o)
+            lobe = ggx(f0, alpha2, normal, light, view, omega_i, omega_o)
+            value = (1.0 - metallic) * value + lobe
         return torch.cat([irradiance, normal[:, :2], irradiance * value], 1)
 
     def visibility(self, hit: Tensor, level: Tensor, omega_i: Tensor) -> Tensor:
@@ -260,17 +270,15 @@ def ggx(
 
 def _channels(geometry: Geometry) -> list[np.ndarray]:
     """Maps (h, w, c) of a geometry, in the order of the channels."""
-    slopes, moments = geometry.slopes, geometry.slope_moments[..., (0, 2)]
-    shape = slopes.shape[:2]
-    if geometry.base_color is None:
-        return [slopes, moments, np.full((*shape, 3), UNKNOWN_COLOR, np.float32)]
+    square = geometry.slope_moments[..., 0] + geometry.slope_moments[..., 2]
     base = geometry.base_color
-    if geometry.roughness is None or geometry.metallic is None or geometry.specular is None:
-        return [slopes, moments, base]
-    metal, specular = geometry.metallic[..., None], geometry.specular[..., None]
-    f0 = DIELECTRIC_F0 * specular * (1.0 - metal) + base * metal
-    # α = roughness².
-    return [slopes, moments, base * (1.0 - metal), f0, geometry.roughness[..., None] ** 4]
+    if base is None:
+        base = np.full((*square.shape, 3), UNKNOWN_COLOR, np.float32)
+    out = [geometry.slopes, square[..., None], base]
+    if geometry.roughness is not None and geometry.metallic is not None:
+        # α = roughness².
+        out += [geometry.roughness[..., None] ** 4, geometry.metallic[..., None]]
+    return out
 
 
 def _packed(levels: tuple[Tensor, ...]) -> tuple[Tensor, Packing]:

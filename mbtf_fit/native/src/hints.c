@@ -5,8 +5,8 @@
 
 #define EXPORT __attribute__((visibility("default")))
 #define PI 3.14159265f
-/* Channels of the maps: slopes (x, y), their squares, diffuse albedo; F0 and squared alpha of glossy surfaces. */
-#define GLOSSY 11
+/* Channels of the maps: slopes (x, y), their squared length, base color; squared alpha, metallic of glossy ones. */
+#define GLOSSY 8
 
 static inline float clamped(float x, float low, float high) { return x > low ? (x < high ? x : high) : low; }
 
@@ -84,11 +84,10 @@ static void shade(const mbtf_surface *s, float level, float u, float v, const fl
     float light = nx * i[0] + ny * i[1] + nz * i[2];
     const float irradiance = visibility(s, level, u, v, i) * (light > 0.0f ? light : 0.0f) / i[2];
     float value[3];
-    for (int c = 0; c < 3; c++) value[c] = m[4 + c] / PI;
+    for (int c = 0; c < 3; c++) value[c] = m[3 + c] / PI;
     if (channels == GLOSSY) {
-        const float vx = m[2] - m[0] * m[0], vy = m[3] - m[1] * m[1];
-        const float variance = (vx > 0.0f ? vx : 0.0f) + (vy > 0.0f ? vy : 0.0f);
-        const float alpha2 = clamped(m[10] + variance + s->light_width * s->light_width, s->alpha2[0], s->alpha2[1]);
+        const float rest2 = m[2] - (m[0] * m[0] + m[1] * m[1]), variance = rest2 > 0.0f ? rest2 : 0.0f;
+        const float alpha2 = clamped(m[6] + variance + s->light_width * s->light_width, s->alpha2[0], s->alpha2[1]);
         light = light > s->least_light ? light : s->least_light;
         float view = nx * o[0] + ny * o[1] + nz * o[2];
         view = view > s->least_view ? view : s->least_view;
@@ -101,7 +100,10 @@ static void shade(const mbtf_surface *s, float level, float u, float v, const fl
         const float rest = 1.0f - clamped(o[0] * hx + o[1] * hy + o[2] * hz, 0.0f, 1.0f);
         const float schlick = rest * rest * rest * rest * rest;
         const float lobe = facets / (2.0f * (masking(alpha2, light) + masking(alpha2, view)) * light * view);
-        for (int c = 0; c < 3; c++) value[c] += (m[7 + c] + (1.0f - m[7 + c]) * schlick) * lobe;
+        for (int c = 0; c < 3; c++) {
+            const float f0 = s->dielectric + m[7] * (m[3 + c] - s->dielectric);
+            value[c] = (1.0f - m[7]) * value[c] + (f0 + (1.0f - f0) * schlick) * lobe;
+        }
     }
     sum[0] += irradiance;
     sum[1] += nx;

@@ -65,7 +65,7 @@ typedef struct {
     mbtf_textures maps, horizons;
     int32_t places;
     float offsets[2 * MAX_PLACES];
-    float finer, light_width, light_blur, least_light, least_view, alpha2[2];
+    float finer, light_width, light_blur, dielectric, least_light, least_view, alpha2[2];
 } mbtf_surface;
 
 /* u (n, 2), sigma (n), omega_i and omega_o (n, 3), hints (n, HINTS) for relief. */
