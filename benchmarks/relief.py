@@ -46,11 +46,11 @@ PARTS: dict[str, dict[str, Any]] = {
     "four places": {"relief": {"places": 4}},
     "no gate": {"relief": {"gate": False}},
     "no hints": {"relief": {"hints": False}},
-    "no known frame": {"relief": {"frame": False}},
+    "known frame": {"relief": {"frame": True}},
     "no half and difference vector": {"encoding": {"half_vector": False}},
     "no oversampling": {"oversampling": 1},
     "tracing alone": {
-        "relief": {"gate": False, "hints": False, "frame": False},
+        "relief": {"gate": False, "hints": False},
         "encoding": {"half_vector": False},
         "oversampling": 1,
     },
@@ -68,7 +68,9 @@ def shards(name: str, folder: Path) -> Path:
     return out
 
 
-def train(label: str, options: dict[str, Any], data: Path, folder: Path, time: str, seed: int) -> dict[str, Any]:
+def train(
+    label: str, options: dict[str, Any], data: Path, folder: Path, time: str, seed: int
+) -> dict[str, Any]:
     """Error of one fit; kept in a folder."""
     name = f"{re.sub('[^a-z]+', '-', label)}-{time}-{seed}"
     path = folder / f"{name}.json"

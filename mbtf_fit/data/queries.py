@@ -85,8 +85,8 @@ def mean_value(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.flo
 
 @dataclass(frozen=True)
 class TrainingQueries:
-    """Queries for training: contiguous tensors on the device; the value is the mean of both halves. Models of a
-    known surface have :mod:`hints <mbtf_fit.surface.known>` (n, 7)."""
+    """Queries for training: contiguous tensors on the device; the value is the mean of both halves. Models of
+    a known surface have :mod:`hints <mbtf_fit.surface.known>` (n, 7)."""
 
     u: Tensor
     sigma: Tensor

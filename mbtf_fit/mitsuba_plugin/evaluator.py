@@ -94,9 +94,9 @@ class Evaluator:
         return dr.clip(-dr.log2(2.0 * sigma), 0.0, float(self.lattice.finest))
 
     def features(self, u: Point2f, level: Float, omega_o: Vector3f) -> list[Float]:
-        """Stage 1, independent of the light: features at uv positions for unit view vectors, followed by what is
-        known of the surface there, the calibration factors of the view and the level, where the material has
-        some."""
+        """Stage 1, independent of the light: features at uv positions for unit view vectors, followed by what
+        is known of the surface there, the calibration factors of the view and the level, where the material
+        has some."""
         moved, known = u, []
         if self.surface is not None:
             height, known = self.surface.intersections(u, level, omega_o)
@@ -141,9 +141,12 @@ class Evaluator:
         count = relief.places * self.surface.numbers + 1
         learned, known, level = features[:-count], features[-count:-1], features[-1]
         irradiance, x, y, *core = self.surface.shading(known, level, omega_i, omega_o)
+        # Black data have no unit: their value is 0.
+        unit = self.unit or 1.0
+        core = [c if self.unit else 0.0 * c for c in core]
         inputs = [*learned, *directions]
         if relief.hints:
-            logarithms = (dr.log(1.0 + c / self.unit) for c in core)
+            logarithms = (dr.log(1.0 + c / unit) for c in core)
             inputs += [dr.log(dr.fma(IRRADIANCE_SCALE, irradiance, 1.0)), x, y, *logarithms]
         if relief.frame:
             normal = mi.Vector3f(x, y, dr.safe_sqrt(1.0 - dr.fma(x, x, y * y)))
@@ -153,7 +156,9 @@ class Evaluator:
         if not relief.gate:
             return to_value(out, self.unit, self.network)
         gate = 2.0 / (1.0 + dr.exp(-out[-1]))
-        return dr.maximum(to_value(out[:-1], self.unit, self.network, clamp=False) + gate * mi.Color3f(*core), 0.0)
+        return dr.maximum(
+            to_value(out[:-1], self.unit, self.network, clamp=False) + gate * mi.Color3f(*core), 0.0
+        )
 
     def transmittance(self, u: Point2f, level: Float, omega_o: Vector3f) -> Float:
         """Transparent fraction of the footprint for unit vectors on either side of the plane, equal for

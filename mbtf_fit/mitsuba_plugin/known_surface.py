@@ -69,9 +69,7 @@ class KnownSurface:
             out += [hit.x, hit.y, *self._maps.blended(hit, level + self._finer)]
         return total / len(self._offsets), out
 
-    def shading(
-        self, places: list[Float], level: Float, omega_i: Vector3f, omega_o: Vector3f
-    ) -> list[Float]:
+    def shading(self, places: list[Float], level: Float, omega_i: Vector3f, omega_o: Vector3f) -> list[Float]:
         """Stage 2: irradiance, normal (x, y), core (RGB), means over the places of :meth:`intersections`."""
         count = self.numbers
         parts = [
@@ -106,7 +104,9 @@ class KnownSurface:
         mean, square = (dr.lerp(numbers[k], numbers[k + 2], weight) for k in (0, 1))
         variance = dr.maximum(square - dr.square(mean), 0.0) + (LIGHT_BLUR * self._light_width) ** 2
         elevation = dr.asin(dr.clip(omega_i.z, 0.0, 1.0))
-        return dr.fma(0.5, dr.erf((elevation - mean) * dr.rsqrt(2.0 * dr.maximum(variance, LEAST_VARIANCE))), 0.5)
+        return dr.fma(
+            0.5, dr.erf((elevation - mean) * dr.rsqrt(2.0 * dr.maximum(variance, LEAST_VARIANCE))), 0.5
+        )
 
 
 def displaced(u: Point2f, height: Float, omega_o: Vector3f, aspect: float) -> Point2f:
@@ -116,15 +116,15 @@ def displaced(u: Point2f, height: Float, omega_o: Vector3f, aspect: float) -> Po
 
 
 def adjacent_azimuths(horizons: F32) -> F32:
-    """Horizons (rows, columns, 2n), means and then squares, as n groups of four: mean and square of an azimuth,
-    and of the next one."""
+    """Horizons (rows, columns, 2n), means and then squares, as n groups of four: mean and square of an
+    azimuth, and of the next one."""
     mean, square = np.split(horizons, 2, axis=2)
     parts = (mean, square, np.roll(mean, -1, 2), np.roll(square, -1, 2))
     return np.stack(parts, -1).reshape(*mean.shape[:2], GROUP * mean.shape[2])
 
 
 def ggx(f0: mi.Color3f, alpha2: Float, normal: Normal3f, omega_i: Vector3f, omega_o: Vector3f) -> mi.Color3f:
-    """BRDF of GGX facets of reflectance F0 and α²; the formula is that of :func:`mbtf_fit.surface.known.ggx`."""
+    """BRDF of GGX facets of reflectance F0 and α²: :func:`mbtf_fit.surface.known.ggx`."""
     light = dr.maximum(dr.dot(normal, omega_i), LEAST_LIGHT)
     view = dr.maximum(dr.dot(normal, omega_o), LEAST_VIEW)
     half = dr.normalize(omega_i + omega_o)

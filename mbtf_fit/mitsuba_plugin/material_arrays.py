@@ -48,7 +48,8 @@ class StoredSurface:
     ----------
     heights : (H, W) heights in tile widths
     maps : filtered maps (rows, columns, 6 or 8) of the levels 0 to k + 1
-    horizons : means of the horizons' angles and of their squares (rows, columns, 2·azimuths) of the levels 0 to k
+    horizons : means of the horizons' angles, then of their squares, (rows, columns, 2·azimuths) of the levels
+        0 to k
     depth_weights : (levels,) weights of the displacement
     light_width : RMS angle per axis of the light kernel, in radians
     dielectric : F0 where the surface is no metal

@@ -23,12 +23,12 @@ HINTS = 7
 HINT_INPUTS, FRAME_INPUTS = 6, 6
 # Factor of the irradiance under the logarithm.
 IRRADIANCE_SCALE = 4.0
-# Channels of the maps: slopes (x, y), their squared length, base color (RGB); of a glossy surface besides α² and
-# metallic.
+# Channels of the maps: slopes (x, y), their squared length, base color (RGB); of a glossy surface besides α²
+# and metallic.
 DIFFUSE_CHANNELS, GLOSSY_CHANNELS = 6, 8
 # Azimuths of the horizons; share of the light kernel's width (RMS per axis) that blurs them.
 AZIMUTHS, LIGHT_BLUR = 16, 0.8
-# Smallest cosines of light and view to a normal, least and largest α² of the lobe, least variance of a horizon.
+# Smallest cosines of light and view to a normal, least and largest α² of the lobe, least variance of horizons.
 LEAST_LIGHT, LEAST_VIEW, ALPHA2, LEAST_VARIANCE = 0.01, 0.05, (1e-4, 4.0), 1e-8
 # Tile borders that a view ray may cross; a ray at a cosine of 1e-4 crosses more above deep surfaces.
 MAX_CROSSINGS = 64

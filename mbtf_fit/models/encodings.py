@@ -62,9 +62,9 @@ def rotate_to_z(axis: Tensor, omega: Tensor) -> Tensor:
 def encode_directions(omega_i: Tensor, omega_o: Tensor, options: EncodingSection) -> Tensor:
     """Encoded light and view (n, 3): (n, :func:`directions_size`).
 
-    With ``half_vector``, the half vector h and the difference vector follow: the light in a frame whose z is h
-    (Rusinkiewicz, EGSR 1998). The shortest rotation to h defines the frame, which is continuous also where h
-    is the normal.
+    With ``half_vector``, the half vector h and the difference vector follow: the light in a frame whose z is
+    h (Rusinkiewicz, EGSR 1998). The shortest rotation to h defines the frame, which is continuous also where
+    h is the normal.
     """
     parts = [encode_direction(omega, options) for omega in (omega_i, omega_o)]
     if options.half_vector:
@@ -97,8 +97,8 @@ def directions_formula(options: EncodingSection) -> str:
     )
     if options.half_vector:
         text += (
-            "; then h = normalize(omega_i + omega_o), then rotate(h, omega_i), where rotate(a, w) = "
-            "(w.x - a.x * s, w.y - a.y * s, a.z * w.z + t), t = a.x * w.x + a.y * w.y, s = w.z + t / (1 + a.z)"
+            "; then h = normalize(omega_i + omega_o), then rotate(h, omega_i), where rotate(a, w) = (w.x - "
+            "a.x * s, w.y - a.y * s, a.z * w.z + t), t = a.x * w.x + a.y * w.y, s = w.z + t / (1 + a.z)"
         )
     return text
 

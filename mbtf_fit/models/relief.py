@@ -5,8 +5,8 @@ The view ray is intersected with the stored heights instead (relief mapping: Pol
 I3D 2005). The textures are read at ``u' = u + w_l · z/ω_o,z · ω_o,xy``, where z is the height of the
 intersection and w_l a learned weight of the level. The decoder sees :mod:`hints <mbtf_fit.surface.known>` of
 the known surface besides features and directions (shadow and highlight hints: Zeng et al., SIGGRAPH 2023;
-difference vector: Rusinkiewicz, EGSR 1998), and the value is the sum of its own part and of the known surface's
-single scattering, scaled by a learned gate:
+difference vector: Rusinkiewicz, EGSR 1998), and the value is the sum of its own part and of the known
+surface's single scattering, scaled by a learned gate:
 
     M = 2 σ(g) · core + unit · (exp(x) - 1),    σ(g) = 1 / (1 + exp(-g)).
 """
@@ -23,8 +23,8 @@ from mbtf_fit.models.constants import IRRADIANCE_SCALE, hint_size
 from mbtf_fit.models.encodings import rotate_to_z
 from mbtf_fit.models.lookup import coarse_level
 from mbtf_fit.models.neumip import Neumip
-from mbtf_fit.surface.hints import compute_hints
 from mbtf_fit.surface.formulas import surface_formula
+from mbtf_fit.surface.hints import compute_hints
 from mbtf_fit.surface.known import KnownSurface
 
 # Weight of the displacement at all levels before training.
@@ -109,9 +109,11 @@ class Relief(Neumip):
         """Value (n, 3) of learned features and hints (n, 7), whose first column is not used."""
         relief = self.network.relief
         irradiance, slope, core = hints[:, 1:2], hints[:, 2:4], hints[:, 4:7]
+        # Black data have no unit: their value is 0.
+        core, unit = torch.where(self.unit > 0, core, 0.0), torch.where(self.unit > 0, self.unit, 1.0)
         inputs = [features, self.directions(omega_i, omega_o)]
         if relief.hints:
-            inputs += [torch.log1p(IRRADIANCE_SCALE * irradiance), slope, torch.log1p(core / self.unit)]
+            inputs += [torch.log1p(IRRADIANCE_SCALE * irradiance), slope, torch.log1p(core / unit)]
         if relief.frame:
             upright = (1.0 - slope.square().sum(1, keepdim=True)).clamp_min(0.0).sqrt()
             normal = torch.cat([slope, upright], 1)
@@ -152,4 +154,3 @@ class Relief(Neumip):
             value = out["value"].replace("the last outputs", "the outputs")
             out["value"] = f"{value} + 2 / (1 + exp(-g)) * core, where g is the last output, x the others"
         return known | out
-

@@ -36,17 +36,17 @@ def surface_formula(surface: KnownSurface, places: int) -> dict[str, str]:
     return {
         "rotate(a, w)": "(w.x - a.x * s, w.y - a.y * s, a.z * w.z + t), where t = a.x * w.x + a.y * w.y, "
         "s = w.z + t / (1 + a.z)",
-        "places": f"x_j = u + 2^-l / 2 * o_j / (1, aspect), o_j: {named}; maps and horizons are read at the level "
-        f"l + {finer:g}; z, e, n.x, n.y and core are means over the places",
+        "places": f"x_j = u + 2^-l / 2 * o_j / (1, aspect), o_j: {named}; maps and horizons are read at the "
+        f"level l + {finer:g}; z, e, n.x, n.y and core are means over the places",
         "z": "height of the first point of the line x_j + t * omega_o that lies on the surface: heights "
-        "surface.heights at texel centers, linear on the two triangles of each cell, which meet where x + y = 1, "
-        "x along u and y along v from 0 to 1",
+        "surface.heights at texel centers, linear on the two triangles of each cell, which meet where "
+        "x + y = 1, x along u and y along v from 0 to 1",
         "hit": "x_j + z / omega_o.z * (omega_o.x, omega_o.y) / (1, aspect)",
         "maps": f"the textures surface.maps.0 ... k+1 (levels 0 to k+1) at hit, blended by level: {channels}",
-        "n": "normalize(-sx, -sy, 1); as an input of rotate: n.z = sqrt(max(0, 1 - n.x^2 - n.y^2)) of the means",
+        "n": "normalize(-sx, -sy, 1); in rotate: n.z = sqrt(max(0, 1 - n.x^2 - n.y^2)) of the means",
         "horizon": "m, q = the textures surface.horizons.0 ... k at hit, blended by level, at the azimuth of "
-        "omega_i: the first half of the channels are m, the second half q, of the azimuths 2 pi j / count from +x "
-        "towards +y, linear between them",
+        "omega_i: the first half of the channels are m, the second half q, of the azimuths 2 pi j / count "
+        "from +x towards +y, linear between them",
         "V": f"(1 + erf((asin(omega_i.z) - m) / sqrt(2 * max({LEAST_VARIANCE:g}, max(0, q - m^2) + "
         f"({LIGHT_BLUR:g} * surface.light_width)^2)))) / 2",
         "e": "V * max(0, dot(n, omega_i)) / omega_i.z",

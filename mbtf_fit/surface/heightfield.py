@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import ctypes
 import math
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -120,7 +121,7 @@ class HeightfieldTracer:
         return torch.from_numpy(out[::-1].copy())
 
 
-def _each(task, starts) -> None:
+def _each(task: Callable[[int], None], starts: Iterable[int]) -> None:
     with ThreadPoolExecutor(max(1, torch.get_num_threads())) as pool:
         list(pool.map(task, starts))
 
@@ -160,7 +161,9 @@ def trace_reference(cells: Tensor, aspect: float, u: Tensor, omega: Tensor) -> T
         passes = (diagonal > 0) & (diagonal < end)
         free = (here + end * slope - fold > 0) & ~(passes & (here + diagonal * slope <= 0))
 
-        second = ((across > 0) | ((across == 0) & (both[active] > 0))) ^ (passes & (here + diagonal * slope > 0))
+        second = ((across > 0) | ((across == 0) & (both[active] > 0))) ^ (
+            passes & (here + diagonal * slope > 0)
+        )
         bend = torch.where(second, node[:, 3], 0.0)
         t = (here - across * bend) / (both[active] * bend - slope)
         t = torch.where(free, end, torch.minimum(t.clamp_min(0), end))
@@ -197,7 +200,7 @@ def horizons_reference(z: F32, aspect: float, azimuths: int) -> F32:
             if (-z <= distance * tangent).all():
                 break
             at = per_length * distance
-            i, j = (int(math.floor(x + 1e-6)) for x in at)
+            i, j = (math.floor(x + 1e-6) for x in at)
             fx, fy = (max(0.0, x - n) for x, n in zip(at, (i, j), strict=True))
             near = np.roll(z, (-j, -i), (0, 1))
             if fx > 1e-6:

@@ -8,7 +8,6 @@ from concurrent.futures import ThreadPoolExecutor
 import torch
 from torch import Tensor
 
-from mbtf_fit.native.library import MAX_LEVELS, QueryPointers, Surface, Textures, kernel
 from mbtf_fit.models.constants import (
     ALPHA2,
     HINTS,
@@ -19,6 +18,7 @@ from mbtf_fit.models.constants import (
     PLACES,
 )
 from mbtf_fit.models.lookup import Packing
+from mbtf_fit.native.library import MAX_LEVELS, QueryPointers, Surface, Textures, kernel
 from mbtf_fit.surface.known import KnownSurface
 
 # Queries per task of a thread.

@@ -35,7 +35,6 @@ from mbtf_fit.models.constants import (
     DIELECTRIC,
     GLOSSY_CHANNELS,
     HEIGHTS,
-    HINTS,
     HORIZONS,
     LEAST_LIGHT,
     LEAST_VARIANCE,
@@ -57,6 +56,7 @@ if TYPE_CHECKING:
 UNKNOWN_COLOR = 0.5
 # F0 of a dielectric per unit of `specular`, as in mbtf_gen.render.bsdf.surface.
 DIELECTRIC_F0 = 0.08
+
 
 @dataclass(frozen=True)
 class KnownSurface:
@@ -239,6 +239,13 @@ class KnownSurface:
         variance = (square - mean.square()).clamp_min(0.0) + (LIGHT_BLUR * self.light_width) ** 2
         elevation = omega_i[:, 2:].clamp(0.0, 1.0).asin()
         return 0.5 + 0.5 * torch.erf((elevation - mean) / (2.0 * variance.clamp_min(LEAST_VARIANCE)).sqrt())
+
+
+def surface_bytes(lattice: Lattice) -> int:
+    """Bytes of the surface in a material, besides its heights."""
+    finer = Lattice(lattice.finest + 1, lattice.aspect)
+    maps = GLOSSY_CHANNELS * sum(finer.texels(s) for s in range(finer.finest + 1))
+    return 4 * (maps + 2 * AZIMUTHS * sum(lattice.texels(s) for s in range(lattice.finest + 1)))
 
 
 def ggx(

@@ -1,8 +1,8 @@
 """Gaussian prefilter of periodic maps: the values that bilinear lookups at a level of detail should return.
 
 A lookup at level s stands for the footprint σ_s. Bilinear interpolation between texels of width w adds the
-variance w²/6 of its tent, so a map is filtered with the Gaussian of variance ``σ_s² - w²/6`` before its texels
-are sampled: the lookup then has the footprint's variance, wherever it falls between the texels.
+variance w²/6 of its tent, so a map is filtered with the Gaussian of variance ``σ_s² - w²/6`` before its
+texels are sampled: the lookup then has the footprint's variance.
 """
 
 from __future__ import annotations

@@ -268,7 +268,8 @@ def _known_surface(config: FitConfig, data: Dataset) -> KnownSurface:
             where=data.folder,
             hint="fit another model: --model neumip",
         )
-    return KnownSurface.of(geometry, data.lattice, data.manifest["config"]["light"]["width"])
+    light = data.manifest.get("config", {}).get("light", {})
+    return KnownSurface.of(geometry, data.lattice, light.get("width", 0.0))
 
 
 def _initialize_from(model: NeuralMaterial, folder: str | Path) -> None:

@@ -15,6 +15,8 @@ from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import Partition, load_training, open_data
 from mbtf_fit.formatting import SPLIT_NAMES
 from mbtf_fit.models.registry import MODELS, build_model
+from mbtf_fit.models.relief import Relief
+from mbtf_fit.surface.known import surface_bytes
 from mbtf_fit.training.fit import choose_device, keep_freed_memory, prepare_trainer
 from mbtf_fit.training.validation import validation_error, validation_set, validation_subset
 
@@ -95,10 +97,12 @@ def extrapolated(
 
 
 def fit_bytes(config: FitConfig, lattice: Lattice) -> int:
-    """Bytes that a fit writes at most: a checkpoint of weights and two moments, while it replaces another."""
+    """Bytes that a fit writes at most: a checkpoint of weights and two moments, while it replaces another, and
+    the known surface."""
     with torch.device("meta"):
         model = build_model(config.model, lattice, **config.network.model_dump())
-    return 6 * sum(p.nbytes for p in model.parameters())
+    surface = surface_bytes(lattice) if isinstance(model, Relief) else 0
+    return 6 * sum(p.nbytes for p in model.parameters()) + surface
 
 
 def training_seconds(config: FitConfig, shards: str | Path) -> tuple[float, Partition | None]:

@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 from mbtf_core.atomic import checksummed
 from mbtf_core.directions import from_projected_disk
 from mbtf_core.lattice import Lattice, sigma_of_level
-from mbtf_core.shard_schema import FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION
+from mbtf_core.shard_schema import FORMAT_NAME, GEOMETRY_NAME, MANIFEST_NAME, SCHEMA_VERSION
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.models.registry import build_model
 from mbtf_fit.objective.noise import NoiseModel, typical_value
 from mbtf_fit.training.trainer import Trainer
+from mbtf_gen.dataset.geometry import Geometry, geometry_record, write_geometry
 from mbtf_gen.dataset.shard_io import write_shard
 
 from .datasets import write_sidecar
@@ -113,13 +114,24 @@ def write_data(
         "layout": layout,
         "levels": {"finest": finest},
         "tile": {"aspect": aspect},
-        "geometry": None,
+        "config": {"light": {"width": 1.0}},
+        "geometry": write_flat_geometry(folder, lattice),
         "splits": splits,
     }
     if through is not None:
         manifest["arrays"] = {"transmittance": {}}
     (folder / MANIFEST_NAME).write_bytes(checksummed(manifest))
     return folder
+
+
+def write_flat_geometry(folder: Path, lattice: Lattice) -> dict[str, Any]:
+    """Write the geometry of a flat gray tile; returns the manifest's record of it."""
+    shape = Lattice(lattice.finest + 1, lattice.aspect).shape()
+    heights = np.zeros((8, 8), np.float32)
+    slopes, moments, color = (np.zeros((*shape, n), np.float32) for n in (2, 3, 3))
+    geometry = Geometry(heights, lattice.aspect, slopes, moments, base_color=color + np.float32(0.5))
+    write_geometry(folder / GEOMETRY_NAME, geometry)
+    return geometry_record(geometry)
 
 
 def training_queries(arrays: dict[str, F32], value: NDArray[np.floating]) -> TrainingQueries:

@@ -31,6 +31,8 @@ mbtf_gen.cli
 mbtf_gen
 mbtf_fit.config mbtf_fit.presets mbtf_fit.formatting
 mbtf_fit.data
+mbtf_fit.native.library mbtf_fit.models.constants mbtf_fit.models.lookup
+mbtf_fit.surface
 mbtf_fit.models
 mbtf_fit.objective
 mbtf_fit.native
@@ -61,8 +63,11 @@ FORBIDDEN = {
 # The fitter reads data sets; only its Mitsuba plugin, and the command that draws with it, knows the renderer.
 PLUGIN = "mbtf_fit.mitsuba_plugin"
 READS = (
+    "mbtf_gen.dataset.geometry",
     "mbtf_gen.dataset.reader",
     "mbtf_gen.dataset.shard_io",
+    "mbtf_gen.geometry.height_planes",
+    "mbtf_gen.images.resample",
     "mbtf_gen.sampling.rng",
     "mbtf_gen.config.presets",
 )

@@ -62,8 +62,11 @@ def test_steps_are_timed_where_they_take_long(shards: Path, monkeypatch: pytest.
 
 def test_the_size_is_that_of_two_checkpoints(shards: Path, tmp_path: Path) -> None:
     """Weights and two moments each, as one is written beside the one before."""
-    config = FitConfig.model_validate({"training": {"steps": 2, "batch": 500}})
+    config = FitConfig.model_validate({"model": "neumip", "training": {"steps": 2, "batch": 500}})
     fits.fit(config, shards, tmp_path / "material")
     stored = (tmp_path / "material" / "weights.safetensors").stat().st_size
     assert fit_bytes(config, Lattice(3)) == pytest.approx(6 * stored, rel=0.5)
     assert fit_bytes(config, Lattice(10)) > 4e8
+    relief = FitConfig.model_validate({"training": {"steps": 2, "batch": 500}})
+    fits.fit(relief, shards, tmp_path / "relief")
+    assert fit_bytes(relief, Lattice(3)) > (tmp_path / "relief" / "weights.safetensors").stat().st_size

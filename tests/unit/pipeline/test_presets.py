@@ -65,7 +65,7 @@ def test_recipes_that_compare_networks_keep_them(quality: Quality, name: str) ->
 def test_other_recipes_get_the_network_of_the_preset() -> None:
     path = ROOT / "pipelines" / "rock_cliff.yaml"
     fits = {"neumip": {"model": "neumip"}, "neumip-baseline": {"model": "neumip-baseline"}}
-    assert {n: {**best_at("draft"), **FITTER["draft"]} for n in fits} == fitter_options("draft", fits)
+    assert {n: {**best_at("draft", n), **FITTER["draft"]} for n in fits} == fitter_options("draft", fits)
     fits["hierarchical"] = {"model": "hierarchical"}
     assert fitter_options("draft", fits)["hierarchical"] == FITTER["draft"]
     text = quality_assignments(path, "draft")

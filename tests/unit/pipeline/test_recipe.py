@@ -83,7 +83,7 @@ def test_an_assigned_material_is_relative_to_the_current_folder(
     ("fit", "models"),
     [
         ("fit: {model: neumip}\n", {"neumip": "neumip"}),
-        ("fit: {training: {time: 9s}}\n", {"neumip": "neumip"}),
+        ("fit: {training: {time: 9s}}\n", {"relief": "relief"}),
         (NAMED.removeprefix(HEAD), {"neumip": "neumip", "quick": "neumip-baseline"}),
     ],
 )
@@ -102,7 +102,7 @@ def test_names_and_models_default_to_each_other(tmp_path: Path, fit: str, models
         (HEAD + "fit:\n  modle: neumip\n", 6, "did you mean 'model'"),
         (NAMED.replace("time: 5s", "tmie: 5s"), 10, "did you mean 'time'"),
         (NAMED.replace("model: neumip-baseline", "model: neural"), 8, "neumip-baseline"),
-        (HEAD + "fit:\n  other:\n", 6, "'neumip' or 'hierarchical'"),
+        (HEAD + "fit:\n  other:\n", 6, "'relief' or 'hierarchical'"),
         (HEAD + "fit: {}\n", 5, "contains no fit"),
         (SINGLE.replace("small", "a/b"), 1, "'name'"),
         (SINGLE + "compare:\n  views:\n  - {elevation: 3}\n", 8, "at least"),

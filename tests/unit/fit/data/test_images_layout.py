@@ -288,4 +288,4 @@ def test_the_other_layout_is_refused_with_a_hint(tmp_path: Path) -> None:
         fit(quick(1), shuffled, tmp_path / "m")
     image = write_images(tmp_path / "d", constant(0.1), train=4)
     with pytest.raises(InputError, match=r"image layout, but neumip .*\n.*--layout shuffled"):
-        fit(FitConfig(), image, tmp_path / "m")
+        fit(FitConfig(model="neumip"), image, tmp_path / "m")

@@ -27,7 +27,7 @@ from mbtf_gen.dataset.reader import Dataset
 
 def config(steps: int = 30, **options: Any) -> FitConfig:
     training = {"steps": steps, "batch": 1000, "warmup": 5, **options.pop("training", {})}
-    return FitConfig.model_validate({"training": training, **options})
+    return FitConfig.model_validate({"model": "neumip", "training": training, **options})
 
 
 @pytest.fixture(scope="module")

@@ -168,7 +168,11 @@ def test_fits_are_calibrated_by_default(tmp_path: Path) -> None:
     off = {}
     for calibrate in (True, False):
         training = {"steps": 40, "batch": 2000, "energy_calibration": calibrate}
-        result = fit(FitConfig.model_validate({"training": training}), folder, tmp_path / str(calibrate))
+        result = fit(
+            FitConfig.model_validate({"model": "neumip", "training": training}),
+            folder,
+            tmp_path / str(calibrate),
+        )
         model = result.material.model
         assert isinstance(model, Neumip)
         assert (model.calibration is not None) == calibrate
