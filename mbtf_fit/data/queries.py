@@ -119,5 +119,5 @@ class TrainingQueries:
         return self._each(lambda a: a.to(device))
 
     def _each(self, function: Callable[[Tensor], Tensor]) -> TrainingQueries:
-        arrays = (getattr(self, f.name) for f in fields(self))
-        return TrainingQueries(*(None if a is None else function(a) for a in arrays))
+        arrays = {f.name: getattr(self, f.name) for f in fields(self)}
+        return TrainingQueries(**{name: a if a is None else function(a) for name, a in arrays.items()})

@@ -97,7 +97,8 @@ class Evaluator:
         """Stage 1, independent of the light: features at uv positions for unit view vectors, followed by what
         is known of the surface there, the calibration factors of the view and the level, where the material
         has some."""
-        moved, known = u, []
+        moved = u
+        known: list[Float] = []
         if self.surface is not None:
             height, known = self.surface.intersections(u, level, omega_o)
             moved = displaced(u, self._depth_weight(level) * height, omega_o, self.lattice.aspect)

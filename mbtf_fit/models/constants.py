@@ -28,7 +28,7 @@ IRRADIANCE_SCALE = 4.0
 DIFFUSE_CHANNELS, GLOSSY_CHANNELS = 6, 8
 # Azimuths of the horizons; share of the light kernel's width (RMS per axis) that blurs them.
 AZIMUTHS, LIGHT_BLUR = 16, 0.8
-# Smallest cosines of light and view to a normal, least and largest α² of the lobe, least variance of horizons.
+# Smallest cosines of light and view to a normal, bounds of the lobe's α², least variance of horizons.
 LEAST_LIGHT, LEAST_VIEW, ALPHA2, LEAST_VARIANCE = 0.01, 0.05, (1e-4, 4.0), 1e-8
 # Tile borders that a view ray may cross; a ray at a cosine of 1e-4 crosses more above deep surfaces.
 MAX_CROSSINGS = 64

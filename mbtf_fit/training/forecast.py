@@ -97,8 +97,8 @@ def extrapolated(
 
 
 def fit_bytes(config: FitConfig, lattice: Lattice) -> int:
-    """Bytes that a fit writes at most: a checkpoint of weights and two moments, while it replaces another, and
-    the known surface."""
+    """Bytes that a fit writes at most: a checkpoint of weights and two moments, while it replaces another,
+    and the known surface."""
     with torch.device("meta"):
         model = build_model(config.model, lattice, **config.network.model_dump())
     surface = surface_bytes(lattice) if isinstance(model, Relief) else 0
