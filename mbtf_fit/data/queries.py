@@ -119,5 +119,5 @@ class TrainingQueries:
         return self._each(lambda a: a.to(device))
 
     def _each(self, function: Callable[[Tensor], Tensor]) -> TrainingQueries:
-        arrays = {f.name: getattr(self, f.name) for f in fields(self)}
-        return TrainingQueries(**{name: a if a is None else function(a) for name, a in arrays.items()})
+        given = (self.u, self.sigma, self.omega_i, self.omega_o, self.value)
+        return TrainingQueries(*map(function, given), None if self.hints is None else function(self.hints))

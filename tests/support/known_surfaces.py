@@ -1,0 +1,56 @@
+"""Small known surfaces: rough, flat, tilted."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbtf_core.lattice import Lattice
+from mbtf_fit.surface.known import KnownSurface
+from mbtf_gen.dataset.geometry import Geometry
+
+F32 = NDArray[np.float32]
+
+
+def rough_heights(rows: int, columns: int, depth: float = 0.2, seed: int = 0) -> F32:
+    """Random periodic heights with maximum 0, smooth over a few vertices."""
+    random = np.random.default_rng(seed).standard_normal((rows, columns))
+    waves = np.fft.fft2(random)
+    for axis, size in enumerate((rows, columns)):
+        frequency = np.abs(np.fft.fftfreq(size)) * size
+        waves = waves * np.expand_dims(1.0 / (1.0 + frequency), 1 - axis)
+    z = np.fft.ifft2(waves).real
+    z = (z - z.max()) * depth / max(float(np.ptp(z)), 1e-9)
+    return z.astype(np.float32)
+
+
+def geometry(
+    lattice: Lattice,
+    heights: F32,
+    *,
+    slope: tuple[float, float] = (0.0, 0.0),
+    color: tuple[float, float, float] = (0.5, 0.4, 0.3),
+    roughness: float | None = None,
+    metallic: float = 0.0,
+    seed: int | None = None,
+) -> Geometry:
+    """Geometry of heights with constant maps; random maps with a `seed`."""
+    shape = Lattice(lattice.finest + 1, lattice.aspect).shape()
+    random = np.random.default_rng(seed)
+
+    def varied(value: NDArray[np.floating]) -> F32:
+        full = np.broadcast_to(value, (*shape, *np.shape(value))).astype(np.float32)
+        return full if seed is None else full * random.uniform(0.3, 1.0, full.shape).astype(np.float32)
+
+    slopes = varied(np.asarray(slope) if seed is None else np.ones(2))
+    moments = np.stack([slopes[..., 0] ** 2, slopes[..., 0] * slopes[..., 1], slopes[..., 1] ** 2], -1)
+    glossy = {"roughness": roughness, "metallic": metallic, "specular": 0.5}
+    maps = {} if roughness is None else {n: varied(np.asarray(v)) for n, v in glossy.items()}
+    return Geometry(heights, lattice.aspect, slopes, moments, base_color=varied(np.asarray(color)), **maps)
+
+
+def rough_surface(lattice: Lattice, *, glossy: bool = True, size: int = 16, seed: int = 0) -> KnownSurface:
+    """A rough surface with random maps."""
+    heights = rough_heights(max(1, round(size * lattice.aspect)), size, seed=seed)
+    given = geometry(lattice, heights, roughness=0.4 if glossy else None, metallic=0.7, seed=seed)
+    return KnownSurface.of(given, lattice, 5.0)

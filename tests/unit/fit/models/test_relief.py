@@ -1,0 +1,168 @@
+"""The model that traces the known heights: kernel, stages, files, and refusals."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from support.fit_data import parallax, random_queries, training_queries, write_data
+from support.fuzzing import check_message
+from support.known_surfaces import rough_surface
+
+from mbtf_core.atomic import checksummed, read_checksummed
+from mbtf_core.errors import InputError
+from mbtf_core.lattice import Lattice
+from mbtf_core.shard_schema import MANIFEST_NAME
+from mbtf_fit import FitConfig, fit
+from mbtf_fit.material.inference import predict
+from mbtf_fit.models.encodings import encode_directions, rotate_to_z
+from mbtf_fit.models.registry import build_model
+from mbtf_fit.models.relief import Relief
+from mbtf_fit.native import library
+from mbtf_fit.native.gradients import NativeGradients
+from mbtf_fit.native.model import NativeModel, supports
+from mbtf_fit.objective.losses import Objective
+from mbtf_fit.objective.noise import NoiseModel
+from mbtf_fit.objective.parallel import Workers
+
+LATTICE = Lattice(3, 0.5)
+VARIANTS: dict[str, dict[str, Any]] = {
+    "default": {},
+    "all parts": {"relief": {"frame": True, "places": 4}},
+    "tracing alone": {
+        "relief": {"hints": False, "gate": False},
+        "encoding": {"half_vector": False},
+        "oversampling": 1,
+    },
+    "wide": {"width": 31, "channels": 11, "layers": 3, "encoding": {"direction_xyz": False}},
+}
+
+
+def model_of(name: str) -> Relief:
+    """A model with random parameters on a rough surface."""
+    model = build_model("relief", LATTICE, **VARIANTS[name])
+    assert isinstance(model, Relief)
+    model.know(rough_surface(LATTICE))
+    generator = torch.Generator().manual_seed(0)
+    model.initialize(generator, 0.1)
+    with torch.no_grad():
+        for p in model.parameters():
+            p += 0.1 * torch.randn(p.shape, generator=generator)
+    return model
+
+
+def batch_of(model: Relief, n: int = 700) -> Any:
+    arrays = random_queries(np.random.default_rng(0), n, LATTICE)
+    arrays["u"] = (5 * arrays["u"] - 2).astype(np.float32)
+    batch = training_queries(arrays, parallax(*arrays.values()))
+    return replace(batch, hints=model.hints(batch.u, batch.sigma, batch.omega_i, batch.omega_o))
+
+
+@pytest.mark.skipif(library.kernel() is None, reason=library.missing_reason() or "kernel")
+@pytest.mark.parametrize("name", VARIANTS)
+def test_kernel_and_pytorch_agree(name: str) -> None:
+    """Values and the gradients by texels, depth weights and all layers."""
+    model, found = model_of(name), library.kernel()
+    assert found is not None
+    assert supports(model)
+    batch = batch_of(model)
+    arrays = (batch.u, batch.sigma, batch.omega_i, batch.omega_o)
+    wanted = model(*arrays, batch.hints).clamp_min(0).detach().numpy()
+    np.testing.assert_allclose(predict(model, *arrays), wanted, atol=1e-5, rtol=1e-5)
+
+    objective = Objective(FitConfig().training, NoiseModel.silent(0.1, LATTICE))
+    texels, weights = model.parameter_groups()
+    loss = objective(model(*arrays, batch.hints), batch)
+    by_texels, *by_weights = torch.autograd.grad(loss, [*texels, *weights])
+    gradients = NativeGradients(NativeModel(found, model))
+    with Workers(torch.device("cpu")) as workers:
+        native = gradients.compute(objective, batch, workers)
+    assert float(native) == pytest.approx(float(loss.detach()), rel=1e-5)
+    names = [n for n, _ in model.named_parameters() if not n.endswith("texels")]
+    layers = iter(gradients.networks[0])
+    mine = [gradients.depth_weights[:4] if n == "depth_weights" else next(layers) for n in names]
+    pairs = zip(["texels", *names], [by_texels, *by_weights], [gradients.textures[0], *mine], strict=True)
+    for label, a, b in pairs:
+        assert float((a - b).abs().max()) < 1e-4 * float(a.abs().max()), label
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_two_stages_are_the_whole(name: str) -> None:
+    model = model_of(name)
+    model.calibration = 0.5 + torch.rand(2, 4, 5, 3)
+    batch = batch_of(model, 200)
+    features = model.stage1(batch.u, batch.sigma, batch.omega_o)
+    staged = model.stage2(features, batch.omega_i, batch.omega_o)
+    whole = model(batch.u, batch.sigma, batch.omega_i, batch.omega_o)
+    torch.testing.assert_close(staged, whole, atol=1e-5, rtol=1e-4)
+
+
+def test_depth_weights_move_the_lookup() -> None:
+    """Without weight a lookup stays in its place; with weight 1 it is that of the intersection."""
+    model = model_of("default")
+    batch = batch_of(model, 100)
+    level, height = model.level(batch.sigma), batch.hints[:, :1]
+    with torch.no_grad():
+        model.depth_weights.zero_()
+        still = model.displaced(batch.u, level, height, batch.omega_o)
+        model.depth_weights.fill_(1.0)
+        moved = model.displaced(batch.u, level, height, batch.omega_o)
+    torch.testing.assert_close(still, batch.u)
+    hits = model.known.intersections(batch.u, level, batch.omega_o, 1)[1]
+    torch.testing.assert_close(moved, hits, atol=1e-5, rtol=1e-5)
+
+
+def test_the_difference_vector_is_the_light_about_the_half_vector() -> None:
+    random = np.random.default_rng(0)
+    arrays = random_queries(random, 100, LATTICE)
+    light, view = (torch.from_numpy(arrays[k]) for k in ("omega_i", "omega_o"))
+    options = FitConfig().network.encoding
+    found = encode_directions(light, view, options)
+    half, difference = found[:, 6:9], found[:, 9:]
+    torch.testing.assert_close(half, torch.nn.functional.normalize(light + view, dim=1))
+    up = torch.tensor([0.0, 0.0, 1.0]).expand_as(half)
+    # Rodrigues' rotation about the horizontal axis h × z.
+    axis = torch.nn.functional.normalize(torch.linalg.cross(half, up), dim=1)
+    c = half[:, 2:]
+    s = (1 - c * c).sqrt()
+    along = (axis * light).sum(1, keepdim=True)
+    wanted = light * c + torch.linalg.cross(axis, light) * s + axis * along * (1 - c)
+    torch.testing.assert_close(difference, wanted, atol=2e-5, rtol=1e-4)
+    torch.testing.assert_close(rotate_to_z(half, half), up, atol=1e-5, rtol=0)
+
+
+def test_black_data_stay_black() -> None:
+    model = model_of("default")
+    model.unit.zero_()
+    batch = batch_of(model, 50)
+    arrays = (batch.u, batch.sigma, batch.omega_i, batch.omega_o)
+    assert float(model(*arrays).abs().max()) == 0
+    assert np.abs(predict(model, *arrays)).max() == 0
+
+
+def test_weights_survive_a_round_trip_and_others_are_refused() -> None:
+    model = model_of("default")
+    tensors = model.weights()
+    again = build_model("relief", LATTICE)
+    again.load_weights(tensors)
+    batch = batch_of(model, 50)
+    arrays = (batch.u, batch.sigma, batch.omega_i, batch.omega_o)
+    torch.testing.assert_close(again(*arrays), model(*arrays), atol=0, rtol=0)
+    for missing in ("surface.heights", "surface.maps.4", "surface.light_width", "depth_weights"):
+        others = {name: tensor for name, tensor in tensors.items() if name != missing}
+        with pytest.raises(InputError, match="do not fit the model relief") as caught:
+            build_model("relief", LATTICE).load_weights(others)
+        check_message(caught.value)
+
+
+def test_data_without_geometry_are_refused(tmp_path: Path) -> None:
+    folder = write_data(tmp_path / "data", parallax, train=2000, test=100)
+    path = folder / MANIFEST_NAME
+    path.write_bytes(checksummed({**read_checksummed(path), "geometry": None}))
+    with pytest.raises(InputError, match=r"no geometry, which relief traces\n.*--model neumip") as caught:
+        fit(FitConfig.model_validate({"training": {"steps": 2}}), folder, tmp_path / "material")
+    check_message(caught.value)

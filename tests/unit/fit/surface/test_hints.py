@@ -1,0 +1,111 @@
+"""Hints of a known surface: closed forms, brute force, and the kernel against PyTorch."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from support.fit_data import random_queries
+from support.known_surfaces import geometry, rough_heights, rough_surface
+from torch import Tensor
+
+from mbtf_core.lattice import Lattice
+from mbtf_fit.native import library
+from mbtf_fit.surface.hints import compute_hints
+from mbtf_fit.surface.known import KnownSurface
+
+LATTICE = Lattice(3)
+needs_kernel = pytest.mark.skipif(library.kernel() is None, reason=library.missing_reason() or "kernel")
+
+
+def queries(n: int, lattice: Lattice = LATTICE, seed: int = 0) -> list[Tensor]:
+    arrays = random_queries(np.random.default_rng(seed), n, lattice)
+    return [torch.from_numpy(arrays[name]) for name in ("u", "sigma", "omega_i", "omega_o")]
+
+
+def surface(**options: object) -> KnownSurface:
+    """A flat tile under a delta light."""
+    return KnownSurface.of(geometry(LATTICE, np.zeros((8, 8), np.float32), **options), LATTICE, 0.0)
+
+
+@pytest.mark.parametrize("places", [1, 4])
+def test_a_flat_lambert_tile(places: int) -> None:
+    found = compute_hints(surface(), *queries(500), places)
+    wanted = torch.tensor([0.0, 1.0, 0.0, 0.0, *(c / math.pi for c in (0.5, 0.4, 0.3))])
+    torch.testing.assert_close(found, wanted.expand(500, 7), atol=1e-5, rtol=1e-5)
+
+
+def test_a_tilted_facet_gets_its_cosine() -> None:
+    u, sigma, light, view = queries(500)
+    found = compute_hints(surface(slope=(0.5, -0.2)), u, sigma, light, view, 1)
+    normal = torch.tensor([-0.5, 0.2, 1.0]) / math.sqrt(1 + 0.5**2 + 0.2**2)
+    wanted = (light @ normal).clamp_min(0) / light[:, 2]
+    torch.testing.assert_close(found[:, 1], wanted, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(found[:, 2:4], normal[:2].expand(500, 2), atol=1e-5, rtol=0)
+
+
+def test_a_smooth_mirror_of_facets_keeps_the_energy() -> None:
+    """White metal facets of α = 0.09 reflect 99 % of the light from above."""
+    n = 400
+    cosine, azimuth = (np.arange(n) + 0.5) / n, 2 * np.pi * (np.arange(16) + 0.5) / 16
+    c, a = (x.ravel() for x in np.meshgrid(cosine, azimuth))
+    s = np.sqrt(1 - c * c)
+    light = torch.from_numpy(np.stack([s * np.cos(a), s * np.sin(a), c], -1).astype(np.float32))
+    view = torch.tensor([[0.0, 0.0, 1.0]]).expand(len(light), 3)
+    white = surface(color=(1.0, 1.0, 1.0), roughness=0.3, metallic=1.0)
+    u, sigma = torch.full((len(light), 2), 0.3), torch.full((len(light),), 0.1)
+    core = compute_hints(white, u, sigma, light, view, 1)[:, 4].numpy()
+    # ∫ f cos dω: means over cosine and azimuth times 2π.
+    assert 2 * np.pi * (core * c).mean() == pytest.approx(0.99, abs=0.01)
+
+
+@needs_kernel
+@pytest.mark.parametrize("glossy", [True, False])
+@pytest.mark.parametrize("aspect", [1.0, 0.5])
+@pytest.mark.parametrize("places", [1, 4])
+def test_kernel_and_pytorch_agree(glossy: bool, aspect: float, places: int) -> None:
+    lattice = Lattice(3, aspect)
+    known = rough_surface(lattice, glossy=glossy)
+    u, sigma, light, view = queries(3000, lattice)
+    u, sigma = 5 * u - 2, 1.5 * sigma
+    found = compute_hints(known, u, sigma, light, view, places)
+    level = (-torch.log2(2 * sigma)).clamp(0, 3)
+    wanted = known.hints(u, level, light, view, places)
+    scale = wanted.abs().mean(0)
+    assert float(((found - wanted).abs() / (scale + wanted.abs())).quantile(0.999)) < 1e-4
+
+
+@pytest.mark.parametrize("level", [2.0, 4.0])
+def test_visibility_is_that_of_shadow_rays(level: float) -> None:
+    """Shares of Gaussian footprints that see the light, by many shadow rays, against the prefiltered horizon."""
+    lattice = Lattice(5)
+    heights = rough_heights(64, 64, depth=0.35, seed=3)
+    known = KnownSurface.of(geometry(lattice, heights), lattice, 1.0)
+    random = np.random.default_rng(0)
+    n, samples = 150, 200
+    u, sigma, light, _ = queries(n, lattice, seed=5)
+    light = torch.nn.functional.normalize(light * torch.tensor([1.0, 1.0, 0.5]), dim=1)
+    spread = 0.5 * 2**-level * random.standard_normal((n, samples, 2))
+    at = (u[:, None] + torch.from_numpy(spread).float()).reshape(-1, 2)
+    up = torch.tensor([0.0, 0.0, 1.0]).expand(len(at), 3).contiguous()
+    z = known.tracer.trace(at, up)
+    to_light = light[:, None].expand(n, samples, 3).reshape(-1, 3).contiguous()
+    # Where the ray towards the light passes the reference plane: seen from there, the point is the first hit.
+    above = at - z[:, None] / to_light[:, 2:] * to_light[:, :2]
+    lit = (known.tracer.trace(above, to_light) - z).abs() < 1e-4
+    wanted = lit.view(n, samples).float().mean(1)
+    found = known.visibility(u, torch.full((n,), level), light)[:, 0]
+    assert 0.2 < wanted.mean() < 0.8
+    assert float(found.mean()) == pytest.approx(float(wanted.mean()), abs=0.05)
+    assert float((found - wanted).square().mean()) < 0.25 * float(wanted.var())
+
+
+def test_a_surface_survives_its_tensors() -> None:
+    known = rough_surface(LATTICE)
+    again = KnownSurface.from_tensors(known.tensors(), LATTICE)
+    arrays = queries(200)
+    torch.testing.assert_close(
+        compute_hints(again, *arrays, 4), compute_hints(known, *arrays, 4), atol=0, rtol=0
+    )
