@@ -39,7 +39,7 @@ BAR = 1.0
 
 def fitted(shards: Path, out: Path, steps: int, noise_regularization: float, seed: int) -> dict[str, Any]:
     """One fit: rounds, and what it misses."""
-    options = best_options(0.0) | {
+    options = best_options(0.0, "neumip") | {
         "training.steps": steps,
         "training.noise_regularization": noise_regularization,
         "seed": seed,

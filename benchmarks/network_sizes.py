@@ -65,7 +65,7 @@ def measure(
     for width, channels in sizes:
         size = f"{width}x{channels}"
         network = {"network.width": width, "network.channels": channels}
-        options = {**best_options(seconds), **network, "training.time": f"{seconds:g}s"}
+        options = {**best_options(seconds, "neumip"), **network, "training.time": f"{seconds:g}s"}
         fit = nested({"model": "neumip", **options})
         found = runner.measure(Run("models", "neumip", size, data, fit))
         size_bytes = found.details["bytes"]
@@ -117,7 +117,7 @@ def main() -> int:
     try:
         load_mitsuba()
         seconds = parse_duration(arguments.time)
-        best = best_options(seconds)
+        best = best_options(seconds, "neumip")
         chosen = (best["network.width"], best["network.channels"])
         # The others are compared with the chosen one, so it is always measured.
         sizes = list(dict.fromkeys([*(arguments.size or SIZES), chosen]))

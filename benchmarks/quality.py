@@ -66,7 +66,7 @@ name: quality
 generate:
   material: {material}
   geometry: {{height_scale: {height}}}
-fit: {{model: neumip}}
+fit: {{model: relief}}
 """
 
 
@@ -157,7 +157,7 @@ def run(name: str, quality: Quality, resolution: int, work: Path) -> MeasuredRun
         raise SystemExit(f"{name} at {quality} ended with exit code {done.returncode}")
     summary = json.loads(done.stdout)
     stages = {stage: record["seconds"] for stage, record in summary["stages"].items()}
-    unexplained = summary["test"]["neumip"]["unexplained_variance"]
+    unexplained = summary["test"]["relief"]["unexplained_variance"]
     if unexplained["value"] is None:
         raise SystemExit(f"{name} at {quality}: the unexplained variance of its test values is undefined")
     found = MeasuredRun(
@@ -170,7 +170,7 @@ def run(name: str, quality: Quality, resolution: int, work: Path) -> MeasuredRun
         round(unexplained["value"], 4),
         round(unexplained["error"], 4),
         sum(p.stat().st_size for p in (out / "shards").rglob("*") if p.is_file()),
-        sum(p.stat().st_size for p in (out / "fits" / "neumip").glob("weights*")),
+        sum(p.stat().st_size for p in (out / "fits" / "relief").glob("weights*")),
         options_hash(quality),
     )
     shutil.rmtree(work)

@@ -38,7 +38,7 @@ generate:
   geometry: {{height_scale: {height}}}
   queries: {{resolution: {resolution}}}
   seed: {seed}
-fit: {{model: neumip, seed: {seed}}}
+fit: {{model: relief, seed: {seed}}}
 """
 THRESHOLDS = {"time": 1.1, "ratio": 1.0}
 STANDARD_ERRORS = 2.0
@@ -60,7 +60,7 @@ def run(recipe: Path, *options: str) -> dict[str, Any]:
         if done.returncode:
             raise SystemExit(f"{' '.join(command)} ended with exit code {done.returncode}")
         summary = json.loads(done.stdout)
-        error = summary["test"]["neumip"]["unexplained_variance"]
+        error = summary["test"]["relief"]["unexplained_variance"]
         manifest = read_json(out / "shards" / "manifest.json")
         return {
             "quality": summary["quality"],

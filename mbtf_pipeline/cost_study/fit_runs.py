@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from itertools import product
 
 from mbtf_core.nested import nested
+from mbtf_fit.config import DEFAULT_MODEL
 from mbtf_fit.presets import best_options
 from mbtf_pipeline.cost_study.repeats import FEWEST_SEEDS
 from mbtf_pipeline.cost_study.runs import DataRequest, Run
@@ -21,7 +22,7 @@ SHARE, OTHER_SHARES = 0.35, (0.6, 0.15)
 PATHS = (2, 4, 16, 64)
 TOTAL_PATHS = (0.4, 1.6)
 # The series of fits with the options of the quality presets.
-PRESET = "neumip of the presets"
+PRESET = f"{DEFAULT_MODEL} of the presets"
 # Models as in their papers, and networks of other sizes.
 MODELS_OF_PAPERS = ("neumip", "neumip-baseline")
 SIZES: dict[str, dict[str, object]] = {
@@ -56,7 +57,7 @@ def round_down(count: float) -> int:
 
 def _preset(seconds: float) -> dict[str, object]:
     """A fit with the options of the quality presets."""
-    return nested({"model": "neumip", **best_options(seconds), "training.time": f"{seconds:.3g}s"})
+    return nested({"model": DEFAULT_MODEL, **best_options(seconds), "training.time": f"{seconds:.3g}s"})
 
 
 def _plain(model: str, seconds: float, **network: object) -> dict[str, object]:
