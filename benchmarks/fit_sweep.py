@@ -90,7 +90,7 @@ def configuration(name: str, **training: Any) -> FitConfig:
     """A configuration of the sweep."""
     options = json.loads(json.dumps({k: v for k, v in SWEEP[name].items() if k != "queries"}))
     options.setdefault("training", {}).update(training)
-    return FitConfig.model_validate(options)
+    return FitConfig.model_validate({"model": "neumip", **options})
 
 
 def seconds_per_step(name: str, lattice: Lattice) -> float:
