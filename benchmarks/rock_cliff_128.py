@@ -37,7 +37,13 @@ MODELS: dict[str, dict[str, Any]] = {
     },
 }
 # Both explain all but this share; the baseline misses at least so many times what neumip misses.
-BARS = {"relief": 0.10, "relief, four places": 0.085, "neumip": 0.30, "neumip-wide": 0.20, "baseline_over_neumip": 1.2}
+BARS = {
+    "relief": 0.10,
+    "relief, four places": 0.085,
+    "neumip": 0.30,
+    "neumip-wide": 0.20,
+    "baseline_over_neumip": 1.2,
+}
 
 
 def make_shards(folder: Path) -> Path:
@@ -87,7 +93,18 @@ def main() -> int:
         out = arguments.out or Path(temporary)
         try:
             shards = arguments.shards or make_shards(out / "shards")
-            found = {m: figures(train(m, shards, out / m.replace(", ", "-").replace(" ", "-"), arguments.time, arguments.seed)) for m in MODELS}
+            found = {
+                m: figures(
+                    train(
+                        m,
+                        shards,
+                        out / m.replace(", ", "-").replace(" ", "-"),
+                        arguments.time,
+                        arguments.seed,
+                    )
+                )
+                for m in MODELS
+            }
         except MbtfError as error:
             print(f"error: {error.message}", file=sys.stderr)
             return error.exit_code

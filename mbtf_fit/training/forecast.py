@@ -155,6 +155,6 @@ def forecast_fit(config: FitConfig, shards: str | Path) -> FitForecast:
         unexplained=extrapolated(errors[0], errors[1], doublings) if errors else None,
         at_most=errors[-1] if errors else None,
         pilots=tuple(errors),
-        bytes=sum(p.nbytes for p in trainer.model.parameters()),
+        bytes=sum(tensor.nbytes for tensor in trainer.model.weights().values()),
         pilot_seconds=time.perf_counter() - began,
     )

@@ -44,7 +44,7 @@ def answers(model: NeuralMaterial, n: int, seed: int) -> TrainingQueries:
 def trainer(model: NeuralMaterial, data: TrainingQueries, **training: Any) -> Trainer:
     blur = {"initial_sigma": 0, "offset_sigma": 0}
     options = {"losses": [{"kind": "squared"}], "huber_delta": None, "warmup": 20, "blur": blur, **training}
-    config = FitConfig.model_validate({"training": options})
+    config = FitConfig.model_validate({"model": "neumip", "training": options})
     return Trainer(config, model, data, NoiseModel.silent(0.02, LATTICE))
 
 
@@ -149,7 +149,7 @@ def test_a_homogeneous_brdf_is_fitted_to_the_noise_floor(tmp_path: Path) -> None
     noise, train = 0.1, 40_000
     folder = write_data(tmp_path / "d", glossy, train=train, test=10_000, noise=noise)
     options = {"steps": 300, "batch": 4000, "warmup": 20}
-    result = fit(FitConfig.model_validate({"training": options}), folder, tmp_path / "m")
+    result = fit(FitConfig.model_validate({"model": "neumip", "training": options}), folder, tmp_path / "m")
     test = result.errors["test"]
     parameters = result.material.description["weights"]["network_weights"]
     # The noise of the mean of both halves, times the share that so many parameters can follow.
@@ -178,7 +178,7 @@ def test_the_offset_of_a_sunk_plane_is_its_depth(tmp_path: Path) -> None:
     """The learned offset is ``-d ω_o,xy / ω_o,z`` within 5 %."""
     folder = write_data(tmp_path / "d", sunk_plane, train=60_000, test=1000, finest=4, noise=0.01)
     options = {"steps": 500, "batch": 4000, "warmup": 20, "losses": [{"kind": "squared"}]}
-    result = fit(FitConfig.model_validate({"training": options}), folder, tmp_path / "m")
+    result = fit(FitConfig.model_validate({"model": "neumip", "training": options}), folder, tmp_path / "m")
     assert result.errors["test"]["unexplained"]["value"] < 0.05
     queries = random_queries(np.random.default_rng(7), 5000, Lattice(4))
     u, view = queries["u"], queries["omega_o"]

@@ -55,7 +55,7 @@ def test_export_writes_the_reported_files(material: Path, tmp_path: Path, run_py
     # Between the values of PyTorch, which are stored, and those of whatever evaluates here.
     assert float(deviation[1]) < 1e-6
     message = fails(3, "export", str(material), "--to", "material")
-    assert "name a new folder with -o" in message
+    assert "choose another folder with -o" in message
 
 
 def fails(code: int, *arguments: str) -> str:
@@ -137,7 +137,7 @@ def test_evaluate_and_info_report_text_and_json(shards: Path, material: Path) ->
             ["evaluate", str(material), str(shards), "--verbose"],
             ("held-out directions", "training queries", "level 3", "cosine 0.7-1"),
         ),
-        (["info", str(material)], ("3254 network weights", "conformance: 256 queries")),
+        (["info", str(material)], ("2083 network weights", "conformance: 256 queries")),
         (["info", str(shards)], ("train: 3000 queries in 2 shards",)),
     ):
         done = call(["mbtf-fit", *words])

@@ -23,4 +23,4 @@ def test_the_recipe_of_a_page_is_valid(page: str, tmp_path: Path) -> None:
     if is_paper_recipe(path):
         assert list(load_paper_recipe(path, []).materials) == ["turtle_shell", "steep"]
     else:
-        assert list(load_recipe(path).fit) == ["neumip", "neumip-baseline", "wide"]
+        assert list(load_recipe(path).fit) == ["relief", "neumip", "wide"]

@@ -43,15 +43,15 @@ def test_all_stages_count() -> None:
     assert found.seconds == sum(parts)
     assert found.describe().startswith("expected: about 3:")
     # What is finished costs nothing.
-    left = forecaster.of(recipe, ["fit neumip-baseline", "compare", "report"])
-    assert (left.generating, left.training) == (0.0, 30.0)
+    left = forecaster.of(recipe, ["fit neumip", "compare", "report"])
+    assert (left.generating, left.training) == (0.0, 60.0)
     assert left.bytes < 2e8
 
 
 def test_fits_by_steps_are_named() -> None:
     recipe = load_recipe(FILE, ["fit.neumip.training.steps=100"])
     found = RunForecaster(recipe).of(recipe)
-    assert found.training == 30.0
+    assert found.training == 60.0
     assert found.describe().endswith(", and the steps of neumip")
 
 
@@ -73,7 +73,7 @@ def test_a_run_states_its_cost_and_is_refused_if_the_disk_is_full(
     monkeypatch.setattr(folders.shutil, "disk_usage", lambda path: SimpleNamespace(free=1e6))
     assert run(app, ["run", str(FILE), "-o", str(out)]) == 3
     problem, hint = capsys.readouterr().err.splitlines()
-    assert problem.startswith(f"error: {out}: needs 500 MB; 1.0 MB are free")
+    assert problem.startswith(f"error: {out}: needs 519 MB; 1.0 MB are free")
     assert "--set" in hint
     assert not out.exists()
     with pytest.raises(InputError, match="holds no run"):

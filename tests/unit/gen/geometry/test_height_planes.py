@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from mbtf_gen.geometry import height_planes
 from mbtf_gen.geometry.height_planes import node_table
 from mbtf_gen.geometry.heightfield import HeightGrid, grid_faces, grid_vertices
-from mbtf_gen.render import heightfield
 
 SHAPES = [(1, 1), (1, 7), (2, 2), (5, 3), (8, 8), (13, 32), (33, 9)]
 
@@ -45,7 +45,7 @@ def test_cells_are_the_meshs_triangles(shape: tuple[int, int]) -> None:
 def test_no_vertex_pierces_a_plane(
     shape: tuple[int, int], below: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(heightfield, "_PASS_NUMBERS", 100)
+    monkeypatch.setattr(height_planes, "_PASS_NUMBERS", 100)
     z = heights(shape)
     table = node_table(z, below)
     rows, columns = shape
