@@ -3,9 +3,9 @@
     python benchmarks/rock_cliff_128.py [--shards FOLDER] [--out FOLDER] [--time 100s] [--seed 0]
 
 Without ``--shards`` the data set of ``pipelines/rock_cliff.yaml`` is made first (minutes); its maps lie
-beside the project. Trains ``relief``, also with four places per footprint, ``neumip``, ``neumip-baseline`` and a
-``neumip`` of up to twice the cost of evaluation for the same time and prints their unexplained variance on the test split (noise-free mean squared
-error over the variance of the test values), overall and by level.
+beside the project. Trains ``relief``, also with four places per footprint, ``neumip``, ``neumip-baseline`` and
+a ``neumip`` of up to twice the cost of evaluation for the same time. Prints their unexplained variance on the
+test split (noise-free mean squared error over the variance of the test values), overall and by level.
 
 The last line is one JSON object with the figures and their thresholds. Exit code 1 if a threshold is missed.
 """
@@ -93,18 +93,10 @@ def main() -> int:
         out = arguments.out or Path(temporary)
         try:
             shards = arguments.shards or make_shards(out / "shards")
-            found = {
-                m: figures(
-                    train(
-                        m,
-                        shards,
-                        out / m.replace(", ", "-").replace(" ", "-"),
-                        arguments.time,
-                        arguments.seed,
-                    )
-                )
-                for m in MODELS
-            }
+            found = {}
+            for model in MODELS:
+                folder = out / model.replace(", ", "-").replace(" ", "-")
+                found[model] = figures(train(model, shards, folder, arguments.time, arguments.seed))
         except MbtfError as error:
             print(f"error: {error.message}", file=sys.stderr)
             return error.exit_code

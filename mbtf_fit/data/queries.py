@@ -119,5 +119,8 @@ class TrainingQueries:
         return self._each(lambda a: a.to(device))
 
     def _each(self, function: Callable[[Tensor], Tensor]) -> TrainingQueries:
-        given = (self.u, self.sigma, self.omega_i, self.omega_o, self.value)
-        return TrainingQueries(*map(function, given), None if self.hints is None else function(self.hints))
+        u, sigma, omega_i, omega_o, value = map(
+            function, (self.u, self.sigma, self.omega_i, self.omega_o, self.value)
+        )
+        hints = None if self.hints is None else function(self.hints)
+        return TrainingQueries(u, sigma, omega_i, omega_o, value, hints)

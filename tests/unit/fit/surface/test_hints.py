@@ -79,13 +79,13 @@ def test_kernel_and_pytorch_agree(glossy: bool, aspect: float, places: int) -> N
 
 @pytest.mark.parametrize("level", [2.0, 4.0])
 def test_visibility_is_that_of_shadow_rays(level: float) -> None:
-    """Shares of Gaussian footprints that see the light, by many shadow rays, against the prefiltered horizon."""
+    """Shares of Gaussian footprints that see the light: by many shadow rays, and by the filtered horizon."""
     lattice = Lattice(5)
     heights = rough_heights(64, 64, depth=0.35, seed=3)
     known = KnownSurface.of(geometry(lattice, heights), lattice, 1.0)
     random = np.random.default_rng(0)
     n, samples = 150, 200
-    u, sigma, light, _ = queries(n, lattice, seed=5)
+    u, _, light, _ = queries(n, lattice, seed=5)
     light = torch.nn.functional.normalize(light * torch.tensor([1.0, 1.0, 0.5]), dim=1)
     spread = 0.5 * 2**-level * random.standard_normal((n, samples, 2))
     at = (u[:, None] + torch.from_numpy(spread).float()).reshape(-1, 2)

@@ -28,8 +28,8 @@ def test_a_wave_keeps_its_phase_and_the_gaussian_share_of_its_amplitude(
 
 
 def test_lookups_are_gaussian_averages_wherever_they_fall() -> None:
-    """Direct sums over a random map, at the centers and the corners of texels of two levels. Textures of twice
-    the texels of a level have little error of interpolation."""
+    """Direct sums over a random map, at the centers and the corners of texels of two levels. Textures of
+    twice the texels of a level have little error of interpolation."""
     size, lattice = 64, Lattice(3)
     image = np.random.default_rng(0).random((size, size, 1)).astype(np.float32)
     levels = prefiltered_levels(torch.from_numpy(image), lattice, finer=1)
