@@ -23,7 +23,7 @@ from mbtf_fit.models.constants import (
 )
 from mbtf_gen.geometry.heightfield import HeightGrid
 from mbtf_gen.render.heightfield import HeightField
-from mbtf_gen.render.heightfield_tracer import closest_hit
+from mbtf_gen.render.heightfield_tracer import closest_height
 from mbtf_gen.render.types import Float, Normal3f, Point2f, Vector3f
 
 
@@ -43,7 +43,8 @@ class KnownSurface:
         grid = HeightGrid(stored.heights.astype(np.float64), lattice.aspect)
         self._heightfield = HeightField.of(grid, 1.0, two_sided=False)
         self._maps = Textures(stored.maps)
-        self._horizons = Textures([adjacent_azimuths(level) for level in stored.horizons])
+        pairs = [adjacent_azimuths(level) for level in stored.horizons]
+        self._horizons = Textures(pairs, by_group=True)
         self._light_width, self._dielectric = stored.light_width, stored.dielectric
 
     @property
@@ -55,7 +56,7 @@ class KnownSurface:
         """Heights in tile widths at which lines through points of the plane meet the surface."""
         x, y = u.x - dr.floor(u.x), u.y - dr.floor(u.y)
         ray = mi.Ray3f(mi.Point3f(x - 0.5, (y - 0.5) * self._aspect, 0.0), -omega_o)
-        return closest_hit(self._heightfield, ray, mi.Bool(True), MAX_CROSSINGS)[0].p.z
+        return closest_height(self._heightfield, ray, MAX_CROSSINGS)
 
     def intersections(self, u: Point2f, level: Float, omega_o: Vector3f) -> tuple[Float, list[Float]]:
         """Stage 1: mean height over the places; of each place uv of the intersection, then the maps there."""

@@ -23,6 +23,7 @@ from mbtf_fit.material.format import (
 from mbtf_fit.material.storage import read_tensors
 from mbtf_fit.material.transmittance import read_transmittance
 from mbtf_fit.models.constants import (
+    AZIMUTHS,
     DIELECTRIC,
     DIFFUSE_CHANNELS,
     GLOSSY_CHANNELS,
@@ -170,12 +171,18 @@ def _surface(reader: _Reader, lattice: Lattice) -> StoredSurface:
     finer = Lattice(lattice.finest + 1, lattice.aspect)
     maps = [reader.take(f"{MAPS}.{s}", (*finer.shape(s), None)) for s in levels]
     if {level.shape[2] for level in maps} not in ({DIFFUSE_CHANNELS}, {GLOSSY_CHANNELS}):
-        known = f"{DIFFUSE_CHANNELS} nor {GLOSSY_CHANNELS}"
-        raise InputError(f"its tensor '{MAPS}.0' has neither {known} channels", where=reader.path)
+        raise InputError(
+            f"its tensors '{MAPS}' have neither {DIFFUSE_CHANNELS} nor {GLOSSY_CHANNELS} channels",
+            where=reader.path,
+        )
+    heights = reader.take(HEIGHTS, (None, None, 1))[..., 0]
+    if heights.size == 0 or heights.max() > 0:
+        fault = "is empty" if heights.size == 0 else "has heights above the reference plane"
+        raise InputError(f"its tensor '{HEIGHTS}' {fault}", where=reader.path)
     return StoredSurface(
-        reader.take(HEIGHTS, (None, None, 1))[..., 0],
+        heights,
         maps,
-        [reader.take(f"{HORIZONS}.{s}", (*lattice.shape(s), None)) for s in levels[:-1]],
+        [reader.take(f"{HORIZONS}.{s}", (*lattice.shape(s), 2 * AZIMUTHS)) for s in levels[:-1]],
         reader.take("depth_weights", (lattice.finest + 1,)),
         float(reader.take(LIGHT_WIDTH, ())),
         float(reader.take(DIELECTRIC, ())),

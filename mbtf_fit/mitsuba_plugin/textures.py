@@ -31,18 +31,23 @@ class Textures:
     Parameters
     ----------
     levels : (rows, columns, channels) each
+    by_group : whether all texels of a group of channels follow each other, for lookups of a single group
     """
 
-    def __init__(self, levels: Sequence[F32]) -> None:
+    def __init__(self, levels: Sequence[F32], *, by_group: bool = False) -> None:
         self.channels = levels[0].shape[2]
         self.groups = -(-self.channels // GROUP)
-        padded = [
-            np.pad(level, ((0, 0), (0, 0), (0, self.groups * GROUP - self.channels))).reshape(-1)
-            for level in levels
-        ]
+        padded = np.concatenate([level.reshape(-1, self.channels) for level in levels])
+        padded = np.pad(padded, ((0, 0), (0, self.groups * GROUP - self.channels)))
+        # Distances of texels and of groups in the buffer.
+        self._strides = (self.groups, 1)
+        if by_group:
+            self._strides = (1, len(padded))
+            padded = padded.reshape(-1, self.groups, GROUP).transpose(1, 0, 2)
         self.shapes = [level.shape[:2] for level in levels]
         starts = np.cumsum([0, *(rows * columns for rows, columns in self.shapes)])
-        self.buffer = mi.Float(np.concatenate(padded))
+        # A copy: NumPy's memory is aligned to less than a cache line.
+        self.buffer = mi.Float(padded.reshape(-1)) + dr.opaque(mi.Float, 0.0)
         table = [(*shape, start, 0) for shape, start in zip(self.shapes, starts, strict=False)]
         self.table = mi.UInt32(np.array(table, np.uint32).reshape(-1))
         dr.eval(self.buffer, self.table)
@@ -120,7 +125,8 @@ class Textures:
         return out
 
     def _group(self, index: UInt32, group: UInt32) -> list[Float]:
-        return list(dr.gather(mi.Vector4f, self.buffer, index * self.groups + group))
+        texel, after = self._strides
+        return list(dr.gather(mi.Vector4f, self.buffer, index * texel + group * after))
 
     def _texel(self, index: UInt32) -> list[Float]:
         values: list[Float] = []

@@ -331,6 +331,14 @@ def closest_hit(
     return _surface(heightfield, state, constants, ray.d), state.crossings, state.capped, rng
 
 
+def closest_height(heightfield: HeightField, ray: Ray3f, max_crossings: int) -> Float:
+    """Heights in scene units of the first intersections of rays from above; of rays that reached
+    `max_crossings`, the height there. Parameters as of :func:`closest_hit`."""
+    state, constants = _start(heightfield, ray, mi.Bool(True), mi.Bool(False))
+    state = _follow(heightfield, state, constants, max_crossings)
+    return dr.select(state.hit, _surface(heightfield, state, constants, ray.d).p.z, state.z)
+
+
 def occluded(
     heightfield: HeightField,
     ray: Ray3f,

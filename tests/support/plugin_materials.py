@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from safetensors.numpy import load_file, save_file
 
+from mbtf_core.digest import file_sha256
 from mbtf_core.lattice import Lattice
 from mbtf_fit.config import FitConfig
 from mbtf_fit.material.material import Material, export
 from mbtf_fit.material.transmittance import Transmittance
 from mbtf_fit.models.registry import build_model
+from mbtf_fit.models.relief import Relief
+
+from .known_surfaces import rough_surface
 
 _TRAINING = {"steps": 0, "batch": 1, "seconds": 0.0, "device": "cpu", "threads": 1, "errors": {}}
 
@@ -30,6 +36,7 @@ def write_material(
     brightness: float = 0.3,
     seed: int = 0,
     transmittance: Transmittance | None = None,
+    glossy: bool = True,
     **data: Any,
 ) -> Material:
     """Write a material of random weights that all matter, and return it as read back.
@@ -41,11 +48,15 @@ def write_material(
     contrast : standard deviation of the features
     brightness : mean of all biases
     transmittance : None for an opaque material
+    glossy : whether the known surface of `relief` has a glossy lobe
     data : what material.json states of the data set
     """
     config = FitConfig.model_validate({"model": model, "network": network or {}})
     torch.manual_seed(seed)
-    built = build_model(model, Lattice(finest, aspect), **(network or {}))
+    lattice = Lattice(finest, aspect)
+    built = build_model(model, lattice, **(network or {}))
+    if isinstance(built, Relief):
+        built.know(rough_surface(lattice, glossy=glossy))
     built.initialize(torch.Generator().manual_seed(seed), 0.2)
     tensors = built.weights()
     for name, tensor in tensors.items():
@@ -53,6 +64,8 @@ def write_material(
             tensors[name] = contrast * torch.randn_like(tensor)
         elif "bias" in name:
             tensors[name] = brightness + 0.1 * torch.randn_like(tensor)
+        elif name == "depth_weights":
+            tensors[name] = 0.5 + torch.rand_like(tensor)
     if constant is not None:
         last = max(int(name.split(".")[1]) for name in tensors if name.startswith("decoder."))
         tensors["unit"] = torch.ones(())
@@ -63,6 +76,20 @@ def write_material(
     folder.mkdir(parents=True, exist_ok=True)
     stated = {"hash": "0" * 64, **data}
     return export(built, config, folder, data=stated, training=_TRAINING, transmittance=transmittance)
+
+
+def replace_tensors(folder: Path, changes: dict[str, np.ndarray | None]) -> None:
+    """Change tensors of a material, or remove them (None), and restore its digest."""
+    path = folder / "weights.safetensors"
+    tensors = load_file(path)
+    for name, tensor in changes.items():
+        del tensors[name]
+        if tensor is not None:
+            tensors[name] = np.ascontiguousarray(tensor)
+    save_file(tensors, path)
+    description = json.loads((folder / "material.json").read_text())
+    description["weights"]["sha256"] = file_sha256(path)
+    (folder / "material.json").write_text(json.dumps(description))
 
 
 def net(**options: Any) -> dict[str, Any]:

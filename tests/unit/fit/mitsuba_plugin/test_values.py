@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from safetensors.numpy import load_file
 from support.fit_data import random_queries
 from support.fuzzing import check_message
-from support.plugin_materials import deviation, net, write_material
+from support.known_surfaces import rough_heights
+from support.plugin_materials import deviation, net, replace_tensors, write_material
 from support.scenes import mi
 
 from mbtf_core.errors import InputError
 from mbtf_core.lattice import Lattice
+from mbtf_fit.surface.heightfield import HeightfieldTracer
 
 assert mi.variant()
 
@@ -28,6 +32,14 @@ RANDOM = torch.Generator().manual_seed(1)
 
 def calibration(levels: int) -> dict[str, Any]:
     return {"weights": {"calibration": 0.7 + 0.6 * torch.rand((2, levels, 6, 3), generator=RANDOM)}}
+
+
+def tensor(heights: np.ndarray) -> torch.Tensor:
+    return torch.from_numpy(heights[..., None])
+
+
+def relief(**options: Any) -> dict[str, Any]:
+    return {"model": "relief", **net(relief=options)}
 
 
 VARIANTS: dict[str, dict[str, Any]] = {
@@ -48,9 +60,20 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "attenuated": net(
         encoding={"position": 3, "direction": 3, "direction_pi": False, "band_attenuation": True}
     ),
+    "half vector": net(encoding={"direction_xyz": True, "half_vector": True}),
     "fourth root": net(output_transform="fourth-root", channels=9, width=8, layers=2),
+    "relief": relief(),
+    "four places": {"aspect": 0.5, **relief(places=4)},
+    "Lambert": {"aspect": 2.3, "glossy": False, **relief()},
+    "calibrated relief": {**relief(), **calibration(4)},
+    "relief, one texel": {"finest": 0, **relief()},
+    "no hints": relief(hints=False),
+    "known frame, four places": relief(frame=True, places=4),
+    "no gate": {"glossy": False, **relief(gate=False)},
+    "tracing alone": relief(hints=False, gate=False),
+    "relief, six outputs": {"model": "relief", **net(output_channels=6, oversampling=1)},
 }
-UNROLLED = ("neumip", "fourth root", "encoded")
+UNROLLED = ("neumip", "fourth root", "encoded", "relief")
 
 
 @pytest.mark.parametrize("name", VARIANTS)
@@ -72,7 +95,12 @@ def test_conformance_and_random_queries(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "options",
-    [{}, {"finest": 6, "contrast": 0.5}, {"model": "neumip-baseline", "finest": 6, "contrast": 1.0}],
+    [
+        {},
+        {"finest": 6, "contrast": 0.5},
+        {"model": "neumip-baseline", "finest": 6, "contrast": 1.0},
+        {"model": "relief", "finest": 6},
+    ],
 )
 def test_half_precision_errs_by_less_than_one_percent(options: dict[str, Any], tmp_path: Path) -> None:
     """Also where neighboring texels differ much, so that an offset's rounding would show."""
@@ -80,6 +108,41 @@ def test_half_precision_errs_by_less_than_one_percent(options: dict[str, Any], t
     half = Evaluator(read_material(tmp_path), "half")
     queries = random_queries(np.random.default_rng(4), 20_000, material.lattice)
     assert 1e-5 < deviation(half.evaluate(*queries.values()), material.evaluate(*queries.values())) < 1e-2
+
+
+def test_black_data_are_black(tmp_path: Path) -> None:
+    """Their unit is 0, whatever is known of the surface."""
+    material = write_material(tmp_path, model="relief", weights={"unit": torch.zeros(())})
+    assert Evaluator(read_material(tmp_path), "cooperative").unit == 0
+    queries = random_queries(np.random.default_rng(5), 100, material.lattice)
+    plugin = Evaluator(read_material(tmp_path), "cooperative")
+    assert not plugin.evaluate(*queries.values()).any()
+
+
+@pytest.mark.parametrize("cosine", [0.3, 1e-2, 1e-4])
+def test_lines_that_pass_many_tiles_end_as_in_the_fit(cosine: float, tmp_path: Path) -> None:
+    """The surface is so deep that the lowest ones reach the cap on crossings: against PyTorch and the cap."""
+    heights = rough_heights(8, 12, depth=3.0)
+    write_material(tmp_path, model="relief", aspect=0.75, weights={"surface.heights": tensor(heights)})
+    surface = Evaluator(read_material(tmp_path), "cooperative").surface
+    assert surface is not None
+    random = np.random.default_rng(6)
+    angle, sine = 2 * np.pi * random.random(500), np.sqrt(1 - cosine**2)
+    view = np.stack([sine * np.cos(angle), sine * np.sin(angle), np.full(500, cosine)], -1)
+    u, view = (a.astype(np.float32) for a in (3 * random.random((500, 2)) - 1, view))
+    found = np.array(surface.height(mi.Point2f(u.T), mi.Vector3f(view.T)))
+    wanted = HeightfieldTracer(heights, 0.75).trace(torch.from_numpy(u), torch.from_numpy(view)).numpy()
+    difference = np.abs(found - wanted)
+    # A line that just misses an edge in one of them meets it in the other.
+    assert np.quantile(difference, 0.98) < 1e-4
+    if cosine < 1e-3:
+        # Nearly all end at a border of a tile, after 64 others.
+        borders = -found / cosine * (np.abs(view[:, 0]) + np.abs(view[:, 1]) / 0.75)
+        capped = borders > 63
+        assert capped.mean() > 0.9
+        assert borders.max() < 67
+        end = (u - (found / -cosine)[:, None] * view[:, :2] / [1, 0.75]) % 1
+        assert np.minimum(end, 1 - end).min(1)[capped].max() < 1e-3
 
 
 def test_half_precision_does_not_round_inputs() -> None:
@@ -117,5 +180,32 @@ def test_weights_of_other_networks_are_refused(network: dict[str, Any], fault: s
     description["config"]["network"] |= network
     path.write_text(json.dumps(description))
     with pytest.raises(InputError, match=fault) as caught:
+        read_material(tmp_path)
+    check_message(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "fault"),
+    [
+        ("surface.heights", None, "lacks the tensor 'surface.heights'"),
+        ("surface.heights", lambda a: a[..., 0], "has the shape (16, 16)"),
+        ("surface.heights", lambda a: a[:0], "is empty"),
+        ("surface.heights", lambda a: a + 0.01, "has heights above the reference plane"),
+        ("surface.heights", lambda a: np.where(a == a.min(), np.nan, a), "not finite"),
+        ("surface.maps.4", None, "lacks the tensor 'surface.maps.4'"),
+        ("surface.maps.2", lambda a: a[:-1], "has the shape (3, 4, 8)"),
+        ("surface.maps.1", lambda a: a[..., :6], "have neither 6 nor 8 channels"),
+        ("surface.horizons.3", None, "lacks the tensor 'surface.horizons.3'"),
+        ("surface.horizons.0", lambda a: a[..., :-1], "has the shape (1, 1, 31)"),
+        ("surface.light_width", None, "lacks the tensor 'surface.light_width'"),
+        ("surface.dielectric", lambda a: a[None], "has the shape (1,)"),
+        ("depth_weights", lambda a: a[1:], "has the shape (3,)"),
+    ],
+)
+def test_corrupt_surfaces_are_refused(name: str, change: Any, fault: str, tmp_path: Path) -> None:
+    write_material(tmp_path, model="relief")
+    tensor = load_file(tmp_path / "weights.safetensors")[name]
+    replace_tensors(tmp_path, {name: None if change is None else change(tensor)})
+    with pytest.raises(InputError, match=re.escape(fault)) as caught:
         read_material(tmp_path)
     check_message(caught.value)
