@@ -46,11 +46,11 @@ PARTS: dict[str, dict[str, Any]] = {
     "four places": {"relief": {"places": 4}},
     "no gate": {"relief": {"gate": False}},
     "no hints": {"relief": {"hints": False}},
-    "known frame": {"relief": {"frame": True}},
+    "no known frame": {"relief": {"frame": False}},
     "no half and difference vector": {"encoding": {"half_vector": False}},
     "no oversampling": {"oversampling": 1},
     "tracing alone": {
-        "relief": {"gate": False, "hints": False},
+        "relief": {"gate": False, "hints": False, "frame": False},
         "encoding": {"half_vector": False},
         "oversampling": 1,
     },

@@ -4,8 +4,8 @@
 
 Without ``--shards`` the data set of ``pipelines/rock_cliff.yaml`` is made first (minutes); its maps lie
 beside the project. Trains ``relief``, also with four places per footprint, ``neumip``, ``neumip-baseline``
-and a ``neumip`` of up to twice the cost of evaluation for the same time. Prints their unexplained variance on the
-test split (noise-free mean squared error over the variance of the test values), overall and by level.
+and a ``neumip`` of up to twice the cost of evaluation for the same time. Prints their unexplained variance on
+the test split (noise-free mean squared error over the variance of the test values), overall and by level.
 
 The last line is one JSON object with the figures and their thresholds. Exit code 1 if a threshold is missed.
 """

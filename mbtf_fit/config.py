@@ -59,7 +59,7 @@ class ReliefSection(Settings):
     hints: bool = Field(
         True, description="irradiance, normal and single scattering of the known surface as inputs"
     )
-    frame: bool = Field(False, description="light and view about the known normal as inputs")
+    frame: bool = Field(True, description="light and view about the known normal as inputs")
     gate: bool = Field(
         True, description="value = gate · single scattering of the known surface + the network's own part"
     )

@@ -137,7 +137,7 @@ def test_evaluate_and_info_report_text_and_json(shards: Path, material: Path) ->
             ["evaluate", str(material), str(shards), "--verbose"],
             ("held-out directions", "training queries", "level 3", "cosine 0.7-1"),
         ),
-        (["info", str(material)], ("2083 network weights", "conformance: 256 queries")),
+        (["info", str(material)], ("2233 network weights", "conformance: 256 queries")),
         (["info", str(shards)], ("train: 3000 queries in 2 shards",)),
     ):
         done = call(["mbtf-fit", *words])

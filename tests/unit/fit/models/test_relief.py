@@ -32,9 +32,9 @@ from mbtf_fit.objective.parallel import Workers
 LATTICE = Lattice(3, 0.5)
 VARIANTS: dict[str, dict[str, Any]] = {
     "default": {},
-    "all parts": {"relief": {"frame": True, "places": 4}},
+    "four places, no frame": {"relief": {"frame": False, "places": 4}},
     "tracing alone": {
-        "relief": {"hints": False, "gate": False},
+        "relief": {"hints": False, "gate": False, "frame": False},
         "encoding": {"half_vector": False},
         "oversampling": 1,
     },
