@@ -292,6 +292,8 @@ class FitConfig(Settings):
         network = self.network
         if self.model in ("neumip-baseline", "relief") and network.offset != "none":
             raise ValueError(f"{self.model} has no offset: choose the model neumip, or network.offset none")
+        if self.model != "relief" and network.relief != ReliefSection():
+            raise ValueError(f"{self.model} has no options network.relief: choose the model relief")
         if self.model != "hierarchical" and network.decoder == "inception":
             raise ValueError(
                 "the inception decoder reads neighboring queries: it needs the model hierarchical"

@@ -101,6 +101,7 @@ def test_unset_options_are_the_models_own() -> None:
     ("assignments", "words"),
     [
         (["model=neumip-baseline", "network.offset=depth"], "has no offset"),
+        (["model=neumip", "network.relief.places=4"], "has no options network.relief"),
         (["network.decoder=inception"], "it needs the model hierarchical"),
     ],
 )
