@@ -23,7 +23,7 @@ def split(scene: str) -> NDArray[np.uint8]:
     """One picture: the reference on the left, the fit on the right, a white seam between them."""
     reference, fit = (
         np.asarray(Image.open(RUN / f"{scene}-{name}.png").convert("RGB"))
-        for name in ("reference-query", "fit-neumip")
+        for name in ("reference-query", "fit-relief")
     )
     middle = reference.shape[1] // 2
     out = np.concatenate([reference[:, :middle], fit[:, middle:]], axis=1)

@@ -28,7 +28,7 @@ from mbtf_gen.pictures.camera import Camera
 from mbtf_gen.render.runtime import load_mitsuba
 
 ROOT = Path(__file__).parents[2]
-MATERIAL = ROOT / "out" / "quickstart" / "fits" / "neumip"
+MATERIAL = ROOT / "out" / "quickstart" / "fits" / "relief"
 TILES_ACROSS = (0.5, 2.0, 8.0, 32.0, 128.0)
 VIEW, LIGHT, SIZE, SPP = (60.0, -90.0), (45.0, 45.0), 160, 64
 # As the recipe generates its data.
