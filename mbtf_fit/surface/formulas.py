@@ -43,8 +43,8 @@ def surface_formula(surface: KnownSurface, places: int) -> dict[str, str]:
         "z": "height of the first point, from above, of the line x_j + t * omega_o that lies on the "
         "surface: heights surface.heights at texel centers, linear on the two triangles of each cell, which "
         "meet where x + y = 1, x along u and y along v from 0 to 1; at least that of the point where the "
-        f"line leaves the grid, whose periods begin at the first texel's center, for the {MAX_CROSSINGS + 1}th "
-        "time",
+        "line leaves the grid, whose periods begin at the first texel's center, for the "
+        f"{MAX_CROSSINGS + 1}th time",
         "hit": "x_j + z / omega_o.z * (omega_o.x, omega_o.y) / (1, aspect)",
         "maps": f"the textures surface.maps.0 ... k+1 (levels 0 to k+1) at hit, blended by level: {channels}",
         "n": "normalize(-sx, -sy, 1); in rotate: n.z = sqrt(max(0, 1 - n.x^2 - n.y^2)) of the means",
