@@ -238,6 +238,8 @@ class MbtfBSDF(mi.BSDF):
         callback.put("pyramid", self.evaluator.pyramid.buffer, mi.ParamFlags.Differentiable)
         if self.evaluator.offset_texture is not None:
             callback.put("offset_texture", self.evaluator.offset_texture.buffer, mi.ParamFlags.Differentiable)
+        if self.evaluator.surface is not None:
+            callback.put("surface_maps", self.evaluator.surface.maps.buffer, mi.ParamFlags.Differentiable)
 
     def to_string(self) -> str:
         """Text that Mitsuba prints."""

@@ -28,7 +28,7 @@ from mbtf_gen.render.types import Float, Normal3f, Point2f, Vector3f
 
 
 class KnownSurface:
-    """Heights, maps and horizons of a material.
+    """Heights, maps and horizons of a material; the texels of its `maps` may be changed.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ class KnownSurface:
         self._offsets, self._finer = PLACES[places]
         grid = HeightGrid(stored.heights.astype(np.float64), lattice.aspect)
         self._heightfield = HeightField.of(grid, 1.0, two_sided=False)
-        self._maps = Textures(stored.maps)
+        self.maps = Textures(stored.maps)
         pairs = [adjacent_azimuths(level) for level in stored.horizons]
         self._horizons = Textures(pairs, by_group=True)
         self._light_width, self._dielectric = stored.light_width, stored.dielectric
@@ -50,7 +50,7 @@ class KnownSurface:
     @property
     def numbers(self) -> int:
         """Numbers of :meth:`intersections` per place."""
-        return 2 + self._maps.channels
+        return 2 + self.maps.channels
 
     def height(self, u: Point2f, omega_o: Vector3f) -> Float:
         """Heights in tile widths at which lines through points of the plane meet the surface."""
@@ -67,7 +67,7 @@ class KnownSurface:
             z = self.height(at, omega_o)
             hit = displaced(at, z, omega_o, self._aspect)
             total += z
-            out += [hit.x, hit.y, *self._maps.blended(hit, level + self._finer)]
+            out += [hit.x, hit.y, *self.maps.blended(hit, level + self._finer)]
         return total / len(self._offsets), out
 
     def shading(self, places: list[Float], level: Float, omega_i: Vector3f, omega_o: Vector3f) -> list[Float]:

@@ -23,6 +23,7 @@ from mbtf_fit.models.constants import IRRADIANCE_SCALE, hint_size
 from mbtf_fit.models.encodings import rotate_to_z
 from mbtf_fit.models.lookup import coarse_level
 from mbtf_fit.models.neumip import Neumip
+from mbtf_fit.models.outputs import output_formula
 from mbtf_fit.surface.formulas import surface_formula
 from mbtf_fit.surface.hints import compute_hints
 from mbtf_fit.surface.known import KnownSurface
@@ -142,8 +143,11 @@ class Relief(Neumip):
     def formula(self) -> dict[str, str]:
         out = super().formula()
         relief, known = self.network.relief, surface_formula(self.known, self.network.relief.places)
-        position = "u' = u + w * z / omega_o.z * (omega_o.x, omega_o.y) / (1, aspect), w = depth_weights at l"
-        out["features"] = out["features"].replace(" at u,", f" at {position},")
+        position = (
+            "u' = u + w * z / omega_o.z * (omega_o.x, omega_o.y) / (1, aspect), w = depth_weights at l, "
+            "linear between levels,"
+        )
+        out["features"] = out["features"].replace(" at u,", f" at {position}")
         inputs = ["features", "light, view"]
         if relief.hints:
             inputs.append(f"log(1 + {IRRADIANCE_SCALE:g} e), n.x, n.y, log(1 + core / unit)")
@@ -151,6 +155,10 @@ class Relief(Neumip):
             inputs.append("rotate(n, omega_i), rotate(n, omega_o)")
         out["x"] = f"decoder({', '.join(inputs)})"
         if relief.gate:
-            value = out["value"].replace("the last outputs", "the outputs")
-            out["value"] = f"{value} + 2 / (1 + exp(-g)) * core, where g is the last output, x the others"
+            out["x"] += " without its last output, g"
+            out["own"] = output_formula(self.network.output_transform, self.network.output_channels)
+            value = "own + 2 / (1 + exp(-g)) * core"
+            out["value"] = value if self.calibration is None else f"calibration * ({value})"
+        if not self.unit:
+            out["value"] = "0"
         return known | out

@@ -8,6 +8,7 @@ from mbtf_fit.models.constants import (
     LEAST_VARIANCE,
     LEAST_VIEW,
     LIGHT_BLUR,
+    MAX_CROSSINGS,
     PLACES,
 )
 from mbtf_fit.surface.known import KnownSurface
@@ -37,10 +38,13 @@ def surface_formula(surface: KnownSurface, places: int) -> dict[str, str]:
         "rotate(a, w)": "(w.x - a.x * s, w.y - a.y * s, a.z * w.z + t), where t = a.x * w.x + a.y * w.y, "
         "s = w.z + t / (1 + a.z)",
         "places": f"x_j = u + 2^-l / 2 * o_j / (1, aspect), o_j: {named}; maps and horizons are read at the "
-        f"level l + {finer:g}; z, e, n.x, n.y and core are means over the places",
-        "z": "height of the first point of the line x_j + t * omega_o that lies on the surface: heights "
-        "surface.heights at texel centers, linear on the two triangles of each cell, which meet where "
-        "x + y = 1, x along u and y along v from 0 to 1",
+        f"level l + {finer:g}, at most that of their last texture; z, e, n.x, n.y and core are means over "
+        "the places",
+        "z": "height of the first point, from above, of the line x_j + t * omega_o that lies on the "
+        "surface: heights surface.heights at texel centers, linear on the two triangles of each cell, which "
+        "meet where x + y = 1, x along u and y along v from 0 to 1; at least that of the point where the "
+        "line leaves the grid, whose periods begin at the first texel's center, for the "
+        f"{MAX_CROSSINGS + 1}th time",
         "hit": "x_j + z / omega_o.z * (omega_o.x, omega_o.y) / (1, aspect)",
         "maps": f"the textures surface.maps.0 ... k+1 (levels 0 to k+1) at hit, blended by level: {channels}",
         "n": "normalize(-sx, -sy, 1); in rotate: n.z = sqrt(max(0, 1 - n.x^2 - n.y^2)) of the means",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,9 @@ from mbtf_fit.material.material import Material, export
 from mbtf_fit.material.transmittance import Transmittance
 from mbtf_fit.models.registry import build_model
 from mbtf_fit.models.relief import Relief
+from mbtf_fit.surface.known import KnownSurface
 
-from .known_surfaces import rough_surface
+from .known_surfaces import geometry, rough_surface
 
 _TRAINING = {"steps": 0, "batch": 1, "seconds": 0.0, "device": "cpu", "threads": 1, "errors": {}}
 
@@ -43,7 +45,8 @@ def write_material(
 
     Parameters
     ----------
-    constant : the value, in 1/sr, everywhere, in place of random weights; for models of three outputs
+    constant : the value, in 1/sr, everywhere, in place of random weights; for models of three outputs. Of
+        `relief` it is that of the known surface alone
     weights : tensors by name that replace those of the model
     contrast : standard deviation of the features
     brightness : mean of all biases
@@ -56,7 +59,7 @@ def write_material(
     lattice = Lattice(finest, aspect)
     built = build_model(model, lattice, **(network or {}))
     if isinstance(built, Relief):
-        built.know(rough_surface(lattice, glossy=glossy))
+        built.know(rough_surface(lattice, glossy=glossy) if constant is None else flat(lattice, constant))
     built.initialize(torch.Generator().manual_seed(seed), 0.2)
     tensors = built.weights()
     for name, tensor in tensors.items():
@@ -70,12 +73,21 @@ def write_material(
         last = max(int(name.split(".")[1]) for name in tensors if name.startswith("decoder."))
         tensors["unit"] = torch.ones(())
         tensors[f"decoder.{last}.weight"] = torch.zeros_like(tensors[f"decoder.{last}.weight"])
-        tensors[f"decoder.{last}.bias"] = torch.log1p(torch.tensor(constant, dtype=torch.float32))
+        own = torch.log1p(torch.tensor(constant, dtype=torch.float32))
+        # With a gate of 1.
+        tensors[f"decoder.{last}.bias"] = torch.zeros(4) if isinstance(built, Relief) else own
     tensors |= weights or {}
     built.load_weights(tensors)
     folder.mkdir(parents=True, exist_ok=True)
     stated = {"hash": "0" * 64, **data}
     return export(built, config, folder, data=stated, training=_TRAINING, transmittance=transmittance)
+
+
+def flat(lattice: Lattice, value: tuple[float, float, float]) -> KnownSurface:
+    """A flat Lambert tile of a value in 1/sr, under a delta light."""
+    r, g, b = (math.pi * c for c in value)
+    heights = np.zeros(lattice.shape(), np.float32)
+    return KnownSurface.of(geometry(lattice, heights, color=(r, g, b)), lattice, 0.0)
 
 
 def replace_tensors(folder: Path, changes: dict[str, np.ndarray | None]) -> None:

@@ -30,11 +30,11 @@ def even(finest: int = 2) -> Transmittance:
     return Transmittance(Lattice(finest), levels)
 
 
-@pytest.fixture(scope="module")
-def lace(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+@pytest.fixture(scope="module", params=["neumip", "relief"])
+def lace(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """A gray material with partial transmittance."""
     folder = tmp_path_factory.mktemp("lace")
-    write_material(folder, constant=(GRAY,) * 3, finest=2, transmittance=even())
+    write_material(folder, model=request.param, constant=(GRAY,) * 3, finest=2, transmittance=even())
     return {"type": "mbtf", "material": str(folder), "networks": "cooperative", "sampling": "cosine"}
 
 

@@ -128,10 +128,10 @@ def test_a_lambert_material_keeps_the_cosine() -> None:
     assert np.concatenate([level[..., 5:].ravel() for level in fit_lobes(evaluator)]).max() == 0
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture(scope="module", params=["neumip", "relief"])
+def folder(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("material")
-    write_material(out, finest=3, aspect=0.7, contrast=0.3, brightness=0.5)
+    write_material(out, model=request.param, finest=3, aspect=0.7, contrast=0.3, brightness=0.5)
     return out
 
 
@@ -177,22 +177,27 @@ def furnace(bsdf: dict[str, Any], integrator: str, seed: int, spp: int = 64) -> 
     return np.array(mi.render(scene, integrator=tracer, spp=spp, seed=seed), np.float64)
 
 
-@pytest.mark.parametrize("integrator", ["path", "mbtf_path"])
-def test_a_white_sphere_vanishes_in_a_furnace(integrator: str, tmp_path: Path) -> None:
+MODELS = pytest.mark.parametrize(
+    ("model", "integrator"), [("neumip", "path"), ("neumip", "mbtf_path"), ("relief", "mbtf_path")]
+)
+
+
+@MODELS
+def test_a_white_sphere_vanishes_in_a_furnace(model: str, integrator: str, tmp_path: Path) -> None:
     """A material of value 1/π everywhere, with every sampling method."""
-    write_material(tmp_path, constant=(1 / np.pi,) * 3)
+    write_material(tmp_path, model=model, constant=(1 / np.pi,) * 3)
     seen = furnace({"type": "mbtf", "material": str(tmp_path), "networks": "cooperative"}, integrator, 0)
     np.testing.assert_allclose(seen.mean((0, 1)), 1.0, atol=0.005)
     # Near the silhouette and in the middle alike.
     np.testing.assert_allclose(seen.mean(2)[5:7, 5:7].mean(), 1.0, atol=0.03)
 
 
-@pytest.mark.parametrize("integrator", ["path", "mbtf_path"])
-def test_a_constant_material_equals_mitsubas_diffuse(integrator: str, tmp_path: Path) -> None:
+@MODELS
+def test_a_constant_material_equals_mitsubas_diffuse(model: str, integrator: str, tmp_path: Path) -> None:
     """Several bounces between a sphere and a plane, under two kinds of light, by t-test over runs; Mitsuba's
     BSDF in Mitsuba's path tracer."""
     color = (0.2, 0.5, 0.8)
-    write_material(tmp_path, constant=tuple(c / np.pi for c in color))
+    write_material(tmp_path, model=model, constant=tuple(c / np.pi for c in color))
     ours = {"type": "mbtf", "material": str(tmp_path), "networks": "cooperative"}
     theirs = {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(color)}}
     lamp = {"type": "point", "position": [2, 1, 3], "intensity": 20.0}

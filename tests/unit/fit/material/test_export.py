@@ -11,6 +11,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 from support.plugin_materials import net, write_material
+from support.surface_formulas import WrittenSurface, bilinear, rotate
 
 from mbtf_core.errors import InputError
 from mbtf_core.lattice import Lattice
@@ -35,6 +36,16 @@ CASES: dict[str, dict[str, Any]] = {
         "model": "hierarchical",
         **net(decoder="mlp", channels=11, encoding={"raw": True, "direction_xyz": True}),
     },
+    "half vector": net(encoding={"direction_xyz": True, "half_vector": True}),
+    "relief": {"model": "relief"},
+    "calibrated relief": {"model": "relief"},
+    "relief, four places": {
+        "model": "relief",
+        "glossy": False,
+        **net(relief={"places": 4, "frame": True}, encoding={"half_vector": False}),
+    },
+    "relief without hints": {"model": "relief", **net(relief={"hints": False}, oversampling=1)},
+    "relief without gate": {"model": "relief", **net(relief={"gate": False}, output_channels=6)},
     "encoded": net(encoding={"position": 4, "direction": 2, "direction_pi": False, **FILTERED}),
 }
 
@@ -42,7 +53,7 @@ CASES: dict[str, dict[str, Any]] = {
 def make(case: str, folder: Path, contrast: float = 1.0) -> Material:
     generator, lattice = torch.Generator().manual_seed(0), Lattice(4, 0.5)
     options = {"finest": 4, "aspect": 0.5, "contrast": contrast, **CASES[case]}
-    if case == "calibrated":
+    if case.startswith("calibrated"):
         calibration = 0.7 + 0.6 * torch.rand((2, 5, 6, 3), generator=generator)
         options["weights"] = {"calibration": calibration}
     if case == "with holes":
@@ -76,16 +87,7 @@ class Reader:
         }
 
     def texture(self, name: str, at: F64) -> F64:
-        t = self.textures[name]
-        rows, columns = t.shape[:2]
-        x, y = at[..., 0] * columns - 0.5, (1 - at[..., 1]) * rows - 0.5
-        i, j = np.floor(x).astype(int), np.floor(y).astype(int)
-        fx, fy = (x - i)[..., None], (y - j)[..., None]
-        top, bottom = (
-            t[(j + k) % rows, i % columns] * (1 - fx) + t[(j + k) % rows, (i + 1) % columns] * fx
-            for k in (0, 1)
-        )
-        return np.asarray(top * (1 - fy) + bottom * fy)
+        return bilinear(self.textures[name], at)
 
     def layer(self, name: str, x: F64) -> F64:
         weight, bias, activation = self.weights[name]
@@ -135,6 +137,19 @@ class Reader:
             r = 0.1 * self.network("offset_network", seen)
             along = view[..., :2] / np.maximum(view[..., 2:], 0.6) if options["offset"] == "depth" else 1.0
             moved = places + r * along / [1, document["tile"]["aspect"]]
+        hints: F64 | None = None
+        if "depth_weights" in document:
+            surface = WrittenSurface(
+                self.textures,
+                document["surface.light_width"],
+                document["surface.dielectric"],
+                document["tile"]["aspect"],
+                finest,
+            )
+            z, hints = surface.hints(u, level, omega_i, omega_o, options["relief"]["places"])
+            weight = np.interp(level, np.arange(finest + 1), document["depth_weights"])
+            step = (weight * z / omega_o[:, 2])[:, None] * omega_o[:, :2] / [1, surface.aspect]
+            moved = places + step[:, None, None]
         low = np.floor(level).astype(int)
         fine = (level - low)[:, None, None, None]
         levels = np.stack([self.texture(f"pyramid.{s}", moved) for s in range(finest + 1)])
@@ -155,10 +170,32 @@ class Reader:
             features = np.concatenate([features, encoded], -1)
         size = 3 if encoding["direction_xyz"] else 2
         lights = [self.encoded(o[:, :size], "direction", encoding) for o in (omega_i, omega_o)]
+        if encoding["half_vector"]:
+            half = omega_i + omega_o
+            half /= np.linalg.norm(half, axis=1, keepdims=True)
+            lights += [half, rotate(half, omega_i)]
+        if hints is not None:
+            lights += self.known_inputs(hints, omega_i, omega_o, options["relief"])
         shared = np.concatenate(lights, -1)[:, None, None]
         x = np.concatenate([features, np.broadcast_to(shared, (*features.shape[:3], shared.shape[-1]))], -1)
         x = self.inception(x) if inception else self.network("decoder", x)
-        return self.output(x[:, 0, 0], options) * self.calibration(level, omega_i, omega_o)
+        x = x[:, 0, 0]
+        if hints is None or not options["relief"]["gate"]:
+            value = self.output(x, options)
+        else:
+            gated = 2 / (1 + np.exp(-x[:, -1:])) * hints[:, 3:]
+            value = self.output(x[:, :-1], options) + gated
+        return np.maximum(value, 0) * self.calibration(level, omega_i, omega_o)
+
+    def known_inputs(self, hints: F64, omega_i: F64, omega_o: F64, options: dict[str, Any]) -> list[F64]:
+        e, slope, core = hints[:, :1], hints[:, 1:3], hints[:, 3:]
+        out = []
+        if options["hints"]:
+            out += [np.log(1 + 4 * e), slope, np.log(1 + core / self.document["unit"])]
+        if options["frame"]:
+            normal = np.concatenate([slope, np.sqrt(1 - (slope**2).sum(1, keepdims=True))], 1)
+            out += [rotate(normal, omega_i), rotate(normal, omega_o)]
+        return out
 
     def calibration(self, level: F64, omega_i: F64, omega_o: F64) -> F64:
         total = np.ones((len(level), 3))
@@ -208,7 +245,7 @@ class Reader:
             "fourth-root": lambda v: v * np.abs(v) ** 3,
             "softplus": lambda v: np.log1p(np.exp(v)),
         }[options["output_transform"]](x)
-        return np.asarray(np.maximum(self.document["unit"] * value * gate, 0))
+        return np.asarray(self.document["unit"] * value * gate)
 
 
 @pytest.mark.parametrize("half", [False, True], ids=["single", "half"])
@@ -226,7 +263,7 @@ def test_an_export_is_sufficient_for_evaluation(case: str, half: bool, tmp_path:
     found = reader.value(material.config.network.model_dump())
     np.testing.assert_allclose(found, expected, rtol=2e-3, atol=1e-5)
     assert (expected.astype(np.float32) == material.conformance["rgb"]).all() != half
-    assert ("calibration" in reader.document["formula"]) == (case == "calibrated")
+    assert ("calibration" in reader.document["formula"]) == case.startswith("calibrated")
     assert ("transmittance" in reader.document) == (case == "with holes")
     if case == "with holes":
         assert reader.document["textures"]["parts"]["transmittance.4"]["channels"][0] == "c0"
@@ -270,3 +307,20 @@ def test_a_material_in_half_precision_loads_like_any_other(tmp_path: Path) -> No
 def test_numbers_beyond_half_precision_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"'pyramid\.\d' holds .* beyond half precision"):
         to_half(make("neumip", tmp_path, contrast=1e5))
+
+
+def test_formulas_of_relief_name_all_parts(tmp_path: Path) -> None:
+    """The gated core is part of what is calibrated, and the gate is no color."""
+    formula = make("calibrated relief", tmp_path / "all").model.formula()
+    assert formula["value"] == "calibration * (own + 2 / (1 + exp(-g)) * core)"
+    assert formula["own"] == "unit * (exp(x) - 1)"
+    assert formula["x"].endswith("log(1 + core / unit)) without its last output, g")
+    none = make("relief without gate", tmp_path / "none").model.formula()
+    assert "core *" not in none["value"]
+    assert "own" not in none
+    assert (
+        write_material(tmp_path / "black", model="relief", weights={"unit": torch.zeros(())}).model.formula()[
+            "value"
+        ]
+        == "0"
+    )

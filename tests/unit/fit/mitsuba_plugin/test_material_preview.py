@@ -40,9 +40,10 @@ SECTION = SheetSection(
 )
 
 
-def test_pictures_are_ordered_by_view_light_and_width(tmp_path: Path) -> None:
+@pytest.mark.parametrize("model", ["neumip", "relief"])
+def test_pictures_are_ordered_by_view_light_and_width(model: str, tmp_path: Path) -> None:
     """Against PyTorch at the same pixels."""
-    material = write_material(tmp_path, aspect=2.0, contrast=1.0)
+    material = write_material(tmp_path, model=model, aspect=2.0, contrast=1.0)
     values = sheet.panels(Evaluator(read_material(tmp_path), "cooperative"), SECTION)
     assert values.shape == (2, 2, 3, 64, 64, 3)
     exposure = sheet.exposure_of(values)

@@ -28,9 +28,14 @@ CAMERA = Camera(50.0, -70.0, tiles_across=1.3, target=(0.3, 0.6), rows=24, colum
 
 
 @pytest.fixture(scope="module")
-def material(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Material]:
-    folder = tmp_path_factory.mktemp("material")
-    return folder, write_material(folder, aspect=1.5, finest=4, contrast=0.2, brightness=0.5)
+def material(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, Material]:
+    folder, model = tmp_path_factory.mktemp("material"), getattr(request, "param", "neumip")
+    return folder, write_material(folder, model=model, aspect=1.5, finest=4, contrast=0.2, brightness=0.5)
+
+
+BOTH_MODELS = pytest.mark.parametrize("material", ["neumip", "relief"], indirect=True)
 
 
 def bsdf(folder: Path, **options: Any) -> dict[str, Any]:
@@ -52,6 +57,7 @@ def shown(mesh: Any, camera: Camera = CAMERA, light: Any = LIGHT) -> np.ndarray:
     return through_pixel_centers(lit(mesh, sensor_of(camera), light), camera, cones())
 
 
+@BOTH_MODELS
 @pytest.mark.parametrize("zoom", [0.5, 1.0, 8.0, 64.0])
 def test_a_plane_equals_the_material_at_its_pixels(material: tuple[Path, Material], zoom: float) -> None:
     """Positions, footprints, directions, orientation of the tile: all of them, at all distances."""
@@ -66,6 +72,7 @@ def test_a_plane_equals_the_material_at_its_pixels(material: tuple[Path, Materia
 ROTATION = np.array([[np.cos(0.5), -np.sin(0.5)], [np.sin(0.5), np.cos(0.5)]])
 
 
+@BOTH_MODELS
 @pytest.mark.parametrize("mirrored", [False, True])
 @pytest.mark.parametrize("scale", [1.0, 2.5])
 def test_the_tile_follows_its_uv(material: tuple[Path, Material], mirrored: bool, scale: float) -> None:
@@ -154,6 +161,7 @@ def test_other_integrators_use_the_given_footprint(tmp_path: Path, caplog: pytes
         assert len([r for r in caplog.records if "mbtf_path" in r.message]) == (0 if given else 1)
 
 
+@BOTH_MODELS
 def test_nothing_is_seen_from_below_or_lit_from_below(material: tuple[Path, Material]) -> None:
     below = from_angles(-40.0, 20.0)
     mesh = plane(bsdf(material[0]))
@@ -191,15 +199,20 @@ def test_directions_below_the_data_are_raised_to_their_edge(min_cos: float | Non
     assert deviation(unraised, wanted) > 1e-3
 
 
-def test_parameters_can_be_changed(material: tuple[Path, Material]) -> None:
+@pytest.mark.parametrize(
+    ("material", "name"),
+    [("neumip", "pyramid"), ("neumip", "offset_texture"), ("relief", "pyramid"), ("relief", "surface_maps")],
+    indirect=["material"],
+)
+def test_parameters_can_be_changed(material: tuple[Path, Material], name: str) -> None:
     mesh = plane(bsdf(material[0]))
     before = shown(mesh)
     parameters = mi.traverse(mesh)
-    assert {"bsdf.uv_scale", "bsdf.sigma", "bsdf.pyramid", "bsdf.offset_texture"} <= set(parameters.keys())
-    parameters["bsdf.pyramid"] = parameters["bsdf.pyramid"] * 0.0
+    assert {"bsdf.uv_scale", "bsdf.sigma"} <= set(parameters.keys())
+    parameters[f"bsdf.{name}"] = parameters[f"bsdf.{name}"] * 0.0
     parameters.update()
     after = shown(mesh)
-    assert np.abs(after - before).mean() > 0.01
+    assert np.abs(after - before).mean() > 1e-3
 
 
 def scene_of(folder: Path | str, **options: Any) -> dict[str, Any]:
@@ -286,11 +299,15 @@ def test_a_refused_material_does_not_affect_later_renders(material: tuple[Path, 
     assert found.mean() > 0.0
 
 
-def test_deviations_from_conformance_values_are_refused(tmp_path: Path) -> None:
-    """A material whose conformance values say otherwise than its weights."""
-    write_material(tmp_path)
+@pytest.mark.parametrize(("model", "allowed"), [("neumip", 0), ("relief", 2)])
+def test_deviations_from_conformance_values_are_refused(model: str, allowed: int, tmp_path: Path) -> None:
+    """A material whose conformance values say otherwise than its weights. Few of those of `relief` may."""
+    write_material(tmp_path, model=model)
     values = load_file(tmp_path / "weights.safetensors")["conformance.rgb"]
-    values[7] *= 1.01
+    for wrong in range(allowed + 1):
+        replace_tensors(tmp_path, {"conformance.rgb": values})
+        load_scene(scene_of(tmp_path, sampling="cosine", networks="cooperative"))
+        values[7 + wrong] = 1.01 * values[7 + wrong] + 0.01
     replace_tensors(tmp_path, {"conformance.rgb": values})
     with pytest.raises(InputError, match="does not reproduce its conformance values"):
         load_scene(scene_of(tmp_path, sampling="cosine", networks="cooperative"))
