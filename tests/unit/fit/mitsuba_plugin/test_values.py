@@ -68,9 +68,9 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "calibrated relief": {**relief(), **calibration(4)},
     "relief, one texel": {"finest": 0, **relief()},
     "no hints": relief(hints=False),
-    "known frame, four places": relief(frame=True, places=4),
+    "no known frame, four places": relief(frame=False, places=4),
     "no gate": {"glossy": False, **relief(gate=False)},
-    "tracing alone": relief(hints=False, gate=False),
+    "tracing alone": relief(hints=False, frame=False, gate=False),
     "relief, six outputs": {"model": "relief", **net(output_channels=6, oversampling=1)},
 }
 UNROLLED = ("neumip", "fourth root", "encoded", "relief")
