@@ -49,8 +49,8 @@ def surface_formula(surface: KnownSurface, places: int) -> dict[str, str]:
         "maps": f"the textures surface.maps.0 ... k+1 (levels 0 to k+1) at hit, blended by level: {channels}",
         "n": "normalize(-sx, -sy, 1); in rotate: n.z = sqrt(max(0, 1 - n.x^2 - n.y^2)) of the means",
         "horizon": "m, q = the textures surface.horizons.0 ... k at hit, blended by level, at the azimuth of "
-        "omega_i: the first half of the channels are m, the second half q, of the azimuths 2 pi j / count "
-        "from +x towards +y, linear between them",
+        "omega_i (0 of a vertical one): the first half of the channels are m, the second half q, of the "
+        "azimuths 2 pi j / count from +x towards +y, linear between them",
         "V": f"(1 + erf((asin(omega_i.z) - m) / sqrt(2 * max({LEAST_VARIANCE:g}, max(0, q - m^2) + "
         f"({LIGHT_BLUR:g} * surface.light_width)^2)))) / 2",
         "e": "V * max(0, dot(n, omega_i)) / omega_i.z",

@@ -228,7 +228,8 @@ class KnownSurface:
         table, packing = self.horizon_table
         both = lookup(table, packing, hit, level)
         count = both.shape[1] // 2
-        azimuth = torch.atan2(omega_i[:, 1], omega_i[:, 0]) * (count / (2.0 * math.pi))
+        # A vertical light has azimuth 0, whatever the signs of its zeros.
+        azimuth = torch.atan2(omega_i[:, 1] + 0.0, omega_i[:, 0] + 0.0) * (count / (2.0 * math.pi))
         azimuth = azimuth - count * (azimuth / count).floor()
         first = azimuth.floor().clamp(0, count - 1)
         weight = (azimuth - first)[:, None]

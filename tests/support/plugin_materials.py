@@ -69,8 +69,14 @@ def write_material(
             tensors[name] = brightness + 0.1 * torch.randn_like(tensor)
         elif name == "depth_weights":
             tensors[name] = 0.5 + torch.rand_like(tensor)
+    last = max(
+        (int(n) for name in tensors if name.startswith("decoder.") and (n := name.split(".")[1]).isdigit()),
+        default=0,
+    )
+    if isinstance(built, Relief):
+        # Few values are 0.
+        tensors[f"decoder.{last}.weight"] *= 0.3
     if constant is not None:
-        last = max(int(name.split(".")[1]) for name in tensors if name.startswith("decoder."))
         tensors["unit"] = torch.ones(())
         tensors[f"decoder.{last}.weight"] = torch.zeros_like(tensors[f"decoder.{last}.weight"])
         own = torch.log1p(torch.tensor(constant, dtype=torch.float32))

@@ -126,7 +126,7 @@ class WrittenSurface:
         """V (n,)."""
         horizons = self.blended("surface.horizons", self.finest, hit, level)
         count = horizons.shape[1] // 2
-        azimuth = np.degrees(np.arctan2(omega_i[:, 1], omega_i[:, 0])) % 360
+        azimuth = np.degrees(np.arctan2(omega_i[:, 1] + 0.0, omega_i[:, 0] + 0.0)) % 360
         known = np.arange(count + 1) * 360 / count
         m, q = (
             np.array([np.interp(a, known, [*row, row[0]]) for a, row in zip(azimuth, part, strict=True)])

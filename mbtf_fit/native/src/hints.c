@@ -49,7 +49,8 @@ static void find(const mbtf_textures *t, float level, float u, float v, place *p
 /* Share of the footprint that sees the light. */
 static float visibility(const mbtf_surface *s, float level, float u, float v, const float *light) {
     const int count = s->horizons.channels / 2;
-    float azimuth = atan2f(light[1], light[0]) * ((float)count / (2.0f * PI));
+    /* A vertical light has azimuth 0, whatever the signs of its zeros. */
+    float azimuth = atan2f(light[1] + 0.0f, light[0] + 0.0f) * ((float)count / (2.0f * PI));
     azimuth -= (float)count * floorf(azimuth / (float)count);
     const int first = (int)clamped(azimuth, 0.0f, (float)(count - 1)), after = (first + 1) % count;
     const float weight = azimuth - (float)first;

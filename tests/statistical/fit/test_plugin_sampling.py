@@ -131,7 +131,9 @@ def test_a_lambert_material_keeps_the_cosine() -> None:
 @pytest.fixture(scope="module", params=["neumip", "relief"])
 def folder(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("material")
-    write_material(out, model=request.param, finest=3, aspect=0.7, contrast=0.3, brightness=0.5)
+    # The highlights of `relief` are those of the known surface.
+    brightness = {"neumip": 0.5, "relief": 0.1}[request.param]
+    write_material(out, model=request.param, finest=3, aspect=0.7, contrast=0.3, brightness=brightness)
     return out
 
 
@@ -145,7 +147,8 @@ def test_weights_are_value_over_density_of_the_same_directions(folder: Path) -> 
     context = mi.BSDFContext()
     bs, weight = bsdf.sample(context, si, *uniform(n, 3))
     kept = np.array(bs.pdf) > 0
-    assert kept.mean() > 0.9
+    # A tilted lobe has samples below the surface.
+    assert kept.mean() > 0.7
     value, pdf = bsdf.eval_pdf(context, si, bs.wo)
     np.testing.assert_allclose(np.array(pdf)[kept], np.array(bs.pdf)[kept], rtol=2e-3)
     np.testing.assert_allclose(np.array(bsdf.pdf(context, si, bs.wo)), np.array(pdf), rtol=1e-5)

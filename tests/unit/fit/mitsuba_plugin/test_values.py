@@ -68,9 +68,9 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "calibrated relief": {**relief(), **calibration(4)},
     "relief, one texel": {"finest": 0, **relief()},
     "no hints": relief(hints=False),
-    "known frame, four places": relief(frame=True, places=4),
+    "no known frame, four places": relief(frame=False, places=4),
     "no gate": {"glossy": False, **relief(gate=False)},
-    "tracing alone": relief(hints=False, gate=False),
+    "tracing alone": relief(hints=False, frame=False, gate=False),
     "relief, six outputs": {"model": "relief", **net(output_channels=6, oversampling=1)},
 }
 UNROLLED = ("neumip", "fourth root", "encoded", "relief")
@@ -143,6 +143,28 @@ def test_lines_that_pass_many_tiles_end_as_in_the_fit(cosine: float, tmp_path: P
         assert borders.max() < 67
         end = u + (found / cosine)[:, None] * view[:, :2] / [1, 0.75] - 0.5 / np.array([12, 8])
         assert np.quantile(np.abs(end - np.round(end)).min(1)[capped], 0.98) < 1e-3
+
+
+def test_vertical_light_has_the_azimuth_0(tmp_path: Path) -> None:
+    """Whatever the signs of its zeros; in deep surfaces, whose horizons reach the zenith."""
+    horizons = 0.5 + torch.rand((8, 8, 16), generator=RANDOM)
+    both = torch.cat([horizons, horizons.square() + 0.1], -1)
+    material = write_material(tmp_path, model="relief", weights={"surface.horizons.3": both})
+    plugin = Evaluator(read_material(tmp_path), "cooperative")
+    n = 100
+    queries = random_queries(np.random.default_rng(8), n, material.lattice)
+    queries["sigma"][:] = 2.0**-4
+    level, found, visible = torch.full((n,), 3.0), [], []
+    for x, y in ((1e-12, 0.0), (0.0, 0.0), (-0.0, 0.0), (0.0, -0.0), (-0.0, -0.0)):
+        queries["omega_i"] = np.tile(np.float32([x, y, 1.0]), (n, 1))
+        u, light = (torch.from_numpy(queries[name]) for name in ("u", "omega_i"))
+        found += [plugin.evaluate(*queries.values()), material.evaluate(*queries.values())]
+        visible.append(material.model.known.visibility(u, level, light).numpy())
+    assert np.ptp(visible[0]) > 0.3
+    for shares in visible[1:]:
+        np.testing.assert_allclose(shares, visible[0], atol=1e-6)
+    for values in found[1:]:
+        assert deviation(values, found[0]) < 1e-4
 
 
 def test_half_precision_does_not_round_inputs() -> None:
