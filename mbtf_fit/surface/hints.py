@@ -56,7 +56,7 @@ def compute_hints(
     finest = surface.lattice.finest
     if found is None or u.device.type != "cpu" or finest + 2 > MAX_LEVELS:
         level = (-torch.log2(2.0 * sigma)).clamp(0.0, float(finest))
-        chunks = [slice(start, start + _CHUNK) for start in range(0, max(1, len(u)), _CHUNK)]
+        chunks = [slice(start, start + _CHUNK) for start in range(0, len(u), _CHUNK)]
         parts = [surface.hints(u[c], level[c], omega_i[c], omega_o[c], places) for c in chunks]
         return torch.cat(parts)
     arrays = [a.detach().float().contiguous() for a in (u, sigma, omega_i, omega_o)]
