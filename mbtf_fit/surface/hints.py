@@ -21,8 +21,8 @@ from mbtf_fit.models.lookup import Packing
 from mbtf_fit.native.library import MAX_LEVELS, QueryPointers, Surface, Textures, kernel
 from mbtf_fit.surface.known import KnownSurface
 
-# Queries per task of a thread.
-_TASK = 1 << 14
+# Queries per task of a thread; in PyTorch, queries at once, which bounds the memory of the lookups.
+_TASK, _CHUNK = 1 << 14, 1 << 17
 
 
 def describe_textures(table: Tensor, packing: Packing, into: Textures) -> None:
@@ -56,7 +56,9 @@ def compute_hints(
     finest = surface.lattice.finest
     if found is None or u.device.type != "cpu" or finest + 2 > MAX_LEVELS:
         level = (-torch.log2(2.0 * sigma)).clamp(0.0, float(finest))
-        return surface.hints(u, level, omega_i, omega_o, places)
+        chunks = [slice(start, start + _CHUNK) for start in range(0, len(u), _CHUNK)]
+        parts = [surface.hints(u[c], level[c], omega_i[c], omega_o[c], places) for c in chunks]
+        return torch.cat(parts)
     arrays = [a.detach().float().contiguous() for a in (u, sigma, omega_i, omega_o)]
     out = torch.empty(len(u), HINTS)
     description = Surface(heightfield=surface.tracer.description)

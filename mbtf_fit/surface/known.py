@@ -33,6 +33,7 @@ from mbtf_fit.models.constants import (
     ALPHA2,
     AZIMUTHS,
     DIELECTRIC,
+    DIFFUSE_CHANNELS,
     GLOSSY_CHANNELS,
     HEIGHTS,
     HORIZONS,
@@ -131,15 +132,26 @@ class KnownSurface:
         Raises
         ------
         KeyError : a tensor is missing
+        ValueError : a tensor has the shape of another lattice, or is no surface below the reference plane
         """
         levels = range(lattice.finest + 1)
+        finer = Lattice(lattice.finest + 1, lattice.aspect)
+        heights = _take(tensors, HEIGHTS, (None, None, 1))[..., 0]
+        if heights.numel() == 0 or not bool((heights <= 0).all() and heights.isfinite().all()):
+            raise ValueError(f"'{HEIGHTS}'")
+        channels = tensors[f"{MAPS}.0"].shape[-1:]
+        if channels not in ((DIFFUSE_CHANNELS,), (GLOSSY_CHANNELS,)):
+            raise ValueError(f"'{MAPS}.0'")
         return cls(
             lattice,
-            tensors[HEIGHTS][..., 0].float(),
-            tuple(tensors[f"{MAPS}.{level}"].float() for level in (*levels, lattice.finest + 1)),
-            tuple(tensors[f"{HORIZONS}.{level}"].float() for level in levels),
-            float(tensors[LIGHT_WIDTH]),
-            float(tensors[DIELECTRIC]),
+            heights,
+            tuple(
+                _take(tensors, f"{MAPS}.{s}", (*finer.shape(s), *channels))
+                for s in (*levels, lattice.finest + 1)
+            ),
+            tuple(_take(tensors, f"{HORIZONS}.{s}", (*lattice.shape(s), 2 * AZIMUTHS)) for s in levels),
+            float(_take(tensors, LIGHT_WIDTH, ())),
+            float(_take(tensors, DIELECTRIC, ())),
         )
 
     @property
@@ -205,7 +217,7 @@ class KnownSurface:
     def _shade(self, hit: Tensor, level: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
         """Irradiance, normal and core (n, 6) at surface points."""
         table, packing = self.map_table
-        maps = lookup(table, packing, hit, level)
+        maps = lookup(table.to(hit.device), packing, hit, level)
         slopes, square, base = maps[:, :2], maps[:, 2:3], maps[:, 3:6]
         normal = torch.nn.functional.normalize(torch.cat([-slopes, torch.ones_like(slopes[:, :1])], 1), dim=1)
         light = (normal * omega_i).sum(1, keepdim=True)
@@ -226,7 +238,7 @@ class KnownSurface:
     def visibility(self, hit: Tensor, level: Tensor, omega_i: Tensor) -> Tensor:
         """Share (n, 1) of footprints at surface points from which the light is visible."""
         table, packing = self.horizon_table
-        both = lookup(table, packing, hit, level)
+        both = lookup(table.to(hit.device), packing, hit, level)
         count = both.shape[1] // 2
         # A vertical light has azimuth 0, whatever the signs of its zeros.
         azimuth = torch.atan2(omega_i[:, 1] + 0.0, omega_i[:, 0] + 0.0) * (count / (2.0 * math.pi))
@@ -287,6 +299,14 @@ def _channels(geometry: Geometry) -> list[np.ndarray]:
         # α = roughness².
         out += [geometry.roughness[..., None] ** 4, geometry.metallic[..., None]]
     return out
+
+
+def _take(tensors: Mapping[str, Tensor], name: str, shape: tuple[int | None, ...]) -> Tensor:
+    """A tensor of a shape; None stands for any size."""
+    tensor = tensors[name]
+    if tensor.ndim != len(shape) or any(a not in (None, b) for a, b in zip(shape, tensor.shape, strict=True)):
+        raise ValueError(f"'{name}'")
+    return tensor.float()
 
 
 def _packed(levels: tuple[Tensor, ...]) -> tuple[Tensor, Packing]:

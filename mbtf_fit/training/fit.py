@@ -51,6 +51,8 @@ _CHECKPOINT_SECONDS = 15.0
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 # Tensors that ``init_from`` copies, by the first part of their names; the decoder keeps its initialization.
 _SHARED = ("pyramid", "offset_texture", "offset_network")
+# Displacement of `relief`, copied from materials that have it.
+_DEPTH_WEIGHTS = "depth_weights"
 
 # Called with the fraction of the budget that is spent, and one line of text.
 ProgressCallback = Callable[[float, str], None]
@@ -280,13 +282,14 @@ def _initialize_from(model: NeuralMaterial, folder: str | Path) -> None:
     """
     given, mine = Material.load(folder).model.weights(), model.weights()
     names = [name for name in mine if name.partition(".")[0] in _SHARED]
+    names += [_DEPTH_WEIGHTS] if _DEPTH_WEIGHTS in mine and _DEPTH_WEIGHTS in given else []
     for name in names:
         if name not in given or given[name].shape != mine[name].shape:
             raise InputError(
                 f"its '{name}' does not have the shape that the fit needs",
                 where=folder,
-                hint="fit it with the same levels, network.channels, network.width, network.layers and "
-                "network.offset",
+                hint="fit it with the same levels, network.channels, network.width, network.layers, "
+                "network.offset and network.oversampling",
             )
     model.load_weights({**mine, **{name: given[name] for name in names}})
 

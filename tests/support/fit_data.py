@@ -76,16 +76,20 @@ def write_data(
     schema: int = SCHEMA_VERSION,
     seed: int = 0,
     through: Callable[[F32, F32, F32], NDArray[np.float64]] | None = None,
+    geometry: Geometry | None = None,
 ) -> Path:
     """Write a data set of a known function with independent noise in both halves; returns its folder.
 
     Parameters
     ----------
+    geometry : what the data set says of its surface; None: a flat gray tile
     through : transmittance at u, σ and view, of a material with holes
     """
     folder.mkdir(parents=True, exist_ok=True)
     lattice = Lattice(finest, aspect)
     random = np.random.default_rng(seed)
+    geometry = geometry or flat_geometry(lattice)
+    write_geometry(folder / GEOMETRY_NAME, geometry)
     config_hash = f"{function.__name__}-{seed}-{noise}"
     splits: dict[str, dict[str, object]] = {}
     for split, total, count in (("train", train, shards), ("test", test, 1)):
@@ -115,7 +119,7 @@ def write_data(
         "levels": {"finest": finest},
         "tile": {"aspect": aspect},
         "config": {"light": {"width": 1.0}},
-        "geometry": write_flat_geometry(folder, lattice),
+        "geometry": geometry_record(geometry),
         "splits": splits,
     }
     if through is not None:
@@ -124,14 +128,12 @@ def write_data(
     return folder
 
 
-def write_flat_geometry(folder: Path, lattice: Lattice) -> dict[str, Any]:
-    """Write the geometry of a flat gray tile; returns the manifest's record of it."""
+def flat_geometry(lattice: Lattice) -> Geometry:
+    """Geometry of a flat gray tile."""
     shape = Lattice(lattice.finest + 1, lattice.aspect).shape()
     heights = np.zeros((8, 8), np.float32)
     slopes, moments, color = (np.zeros((*shape, n), np.float32) for n in (2, 3, 3))
-    geometry = Geometry(heights, lattice.aspect, slopes, moments, base_color=color + np.float32(0.5))
-    write_geometry(folder / GEOMETRY_NAME, geometry)
-    return geometry_record(geometry)
+    return Geometry(heights, lattice.aspect, slopes, moments, base_color=color + np.float32(0.5))
 
 
 def training_queries(arrays: dict[str, F32], value: NDArray[np.floating]) -> TrainingQueries:

@@ -287,5 +287,7 @@ def test_the_other_layout_is_refused_with_a_hint(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"shuffled layout, but hierarchical .*\n.*--layout image"):
         fit(quick(1), shuffled, tmp_path / "m")
     image = write_images(tmp_path / "d", constant(0.1), train=4)
-    with pytest.raises(InputError, match=r"image layout, but neumip .*\n.*--layout shuffled"):
-        fit(FitConfig(model="neumip"), image, tmp_path / "m")
+    for config in (FitConfig(model="neumip"), FitConfig(model="relief")):
+        message = rf"image layout, but {config.model} .*\n.*--layout shuffled"
+        with pytest.raises(InputError, match=message):
+            fit(config, image, tmp_path / "m")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import torch
 from support.fit_data import parallax, random_queries, training_queries, write_data
 from support.fuzzing import check_message
 from support.known_surfaces import rough_surface
+from torch import Tensor
 
 from mbtf_core.atomic import checksummed, read_checksummed
 from mbtf_core.errors import InputError
@@ -38,6 +40,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
         "encoding": {"half_vector": False},
         "oversampling": 1,
     },
+    "no gate": {"relief": {"gate": False}},
+    "no hints": {"relief": {"hints": False}},
     "wide": {"width": 31, "channels": 11, "layers": 3, "encoding": {"direction_xyz": False}},
 }
 
@@ -116,6 +120,30 @@ def test_depth_weights_move_the_lookup() -> None:
     torch.testing.assert_close(moved, hits, atol=1e-5, rtol=1e-5)
 
 
+def test_gradients_by_depth_weights_are_finite_differences() -> None:
+    """In double precision, at given intersections."""
+    model = model_of("default").double()
+    batch = batch_of(model_of("default"), 100)
+    queries = (batch.u, batch.sigma, batch.omega_i, batch.omega_o, batch.hints)
+    arrays = [a.double() for a in queries]
+
+    def loss() -> Tensor:
+        out: Tensor = model(*arrays)
+        return (out * torch.linspace(-1, 1, 3)).sum()
+
+    (found,) = torch.autograd.grad(loss(), [model.depth_weights])
+    assert float(found.abs().min()) > 1e-4
+    for level, gradient in enumerate(found.tolist()):
+        values = []
+        for step in (1e-7, -2e-7):
+            with torch.no_grad():
+                model.depth_weights[level] += step
+                values.append(float(loss()))
+        with torch.no_grad():
+            model.depth_weights[level] += 1e-7
+        assert (values[0] - values[1]) / 2e-7 == pytest.approx(gradient, rel=1e-4)
+
+
 def test_the_difference_vector_is_the_light_about_the_half_vector() -> None:
     random = np.random.default_rng(0)
     arrays = random_queries(random, 100, LATTICE)
@@ -133,6 +161,9 @@ def test_the_difference_vector_is_the_light_about_the_half_vector() -> None:
     wanted = light * c + torch.linalg.cross(axis, light) * s + axis * along * (1 - c)
     torch.testing.assert_close(difference, wanted, atol=2e-5, rtol=1e-4)
     torch.testing.assert_close(rotate_to_z(half, half), up, atol=1e-5, rtol=0)
+    # The view lies opposite, whichever of both is the light.
+    opposite = encode_directions(view, light, options)[:, 9:] * torch.tensor([-1.0, -1.0, 1.0])
+    torch.testing.assert_close(opposite, difference, atol=2e-5, rtol=1e-4)
 
 
 def test_black_data_stay_black() -> None:
@@ -157,6 +188,31 @@ def test_weights_survive_a_round_trip_and_others_are_refused() -> None:
         with pytest.raises(InputError, match="do not fit the model relief") as caught:
             build_model("relief", LATTICE).load_weights(others)
         check_message(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("surface.heights", lambda t: t[..., 0]),
+        ("surface.heights", lambda t: t[:0]),
+        ("surface.heights", lambda t: t + 0.01),
+        ("surface.heights", lambda t: torch.where(t == t.min(), torch.nan, t)),
+        ("surface.maps.2", lambda t: t[:-1]),
+        ("surface.maps.1", lambda t: t[..., :6]),
+        ("surface.maps.0", lambda t: t.repeat(1, 1, 4)),
+        ("surface.horizons.0", lambda t: t[..., :-1]),
+        ("surface.horizons.3", lambda t: t[:, :-1]),
+        ("surface.light_width", lambda t: t[None]),
+        ("surface.dielectric", lambda t: t.repeat(2)),
+        ("depth_weights", lambda t: t[1:]),
+    ],
+)
+def test_tensors_of_other_shapes_are_refused(name: str, change: Callable[[Tensor], Tensor]) -> None:
+    """Also heights above the reference plane, and such as are no numbers."""
+    tensors = model_of("default").weights()
+    with pytest.raises(InputError, match=f"do not fit the model relief: '{name}'") as caught:
+        build_model("relief", LATTICE).load_weights({**tensors, name: change(tensors[name])})
+    check_message(caught.value)
 
 
 def test_data_without_geometry_are_refused(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from support.known_surfaces import rough_heights
 from support.scenes import mi
 
 from mbtf_fit.native import library
+from mbtf_fit.surface import heightfield
 from mbtf_fit.surface.heightfield import HeightfieldTracer, horizons_reference, trace_reference
 from mbtf_gen.geometry.heightfield import HeightGrid
 from mbtf_gen.render.heightfield import HeightField
@@ -56,6 +57,44 @@ def test_a_ridge_is_hit_where_its_flank_says() -> None:
     omega = torch.from_numpy(np.tile(view, (2, 1)).astype(np.float32))
     wanted = -(h / 2) / (1 + 4 * h * view[0] / view[2])
     np.testing.assert_allclose(tracer.trace(u, omega), wanted, rtol=1e-5)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 9), (8, 8), (5, 12)])
+def test_a_flat_grid_is_met_at_once_and_hides_no_light(shape: tuple[int, int]) -> None:
+    tracer = HeightfieldTracer(np.zeros(shape, np.float32), shape[0] / shape[1])
+    assert float(tracer.trace(*rays(500)).abs().max()) < 1e-6
+    assert float(tracer.horizons(16).abs().max()) == 0
+
+
+@pytest.mark.parametrize("compiled", [pytest.param(True, marks=needs_kernel), False])
+@pytest.mark.parametrize("towards", [(1, 0), (-1, 0), (0, 1)])
+def test_lines_along_a_trench_meet_its_floor_many_tiles_away(
+    compiled: bool, towards: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Walls touch the plane, the floor lies at -0.3. Grazing lines end behind their 65th border."""
+    if not compiled:
+        monkeypatch.setattr(heightfield, "kernel", lambda: None)
+    trench = np.tile(np.float32([0, -0.3, -0.3, -0.3, -0.3, -0.3]), (3, 1))
+    aspect = 0.5 if towards[1] else 2.0
+    tracer = HeightfieldTracer(trench if towards[1] else trench.T.copy(), aspect)
+    columns, rows = tracer._z.shape[::-1]
+    along = 1 if towards[1] else 0
+    period, texels = ((1.0, columns), (aspect, rows))[along]
+    n = 200
+    u = np.random.default_rng(0).uniform(-2, 2, (n, 2))
+    # Columns 1 to 5 of the trench, rows from its top.
+    u[:, 1 - along] = 0.6
+    for cosine in (0.3, 0.05):
+        sine = np.sqrt(1 - cosine**2)
+        omega = np.tile([sine * towards[0], sine * towards[1], cosine], (n, 1))
+        found = tracer.trace(*(torch.from_numpy(a.astype(np.float32)) for a in (u, omega)))
+        np.testing.assert_allclose(found, -0.3, rtol=1e-5)
+    cosine = 1e-3
+    omega = np.tile([*towards, cosine], (n, 1)) / np.sqrt(1 + cosine**2)
+    found = tracer.trace(*(torch.from_numpy(a.astype(np.float32)) for a in (u, omega))).numpy()
+    # The line runs against omega; periods begin at the center of the first texel.
+    first = (u[:, along] - 0.5 / texels) * sum(towards) % 1
+    np.testing.assert_allclose(found, -cosine * period * (64 + first), rtol=1e-4)
 
 
 def test_numbers_that_are_not_finite_end() -> None:

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from support.fit_data import random_queries
 from support.known_surfaces import geometry, rough_heights, rough_surface
+from support.scenes import mi
 from torch import Tensor
 
 from mbtf_core.lattice import Lattice
+from mbtf_fit.models.lookup import lookup
 from mbtf_fit.native import library
+from mbtf_fit.surface import hints, known
 from mbtf_fit.surface.hints import compute_hints
 from mbtf_fit.surface.known import KnownSurface
 
@@ -25,7 +30,15 @@ def queries(n: int, lattice: Lattice = LATTICE, seed: int = 0) -> list[Tensor]:
     return [torch.from_numpy(arrays[name]) for name in ("u", "sigma", "omega_i", "omega_o")]
 
 
-def surface(**options: object) -> KnownSurface:
+@pytest.fixture(params=[pytest.param(True, marks=needs_kernel), False], ids=["kernel", "pytorch"])
+def compiled(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bool:
+    """With and without the kernel."""
+    if not request.param:
+        monkeypatch.setattr(hints, "kernel", lambda: None)
+    return bool(request.param)
+
+
+def surface(**options: Any) -> KnownSurface:
     """A flat tile under a delta light."""
     return KnownSurface.of(geometry(LATTICE, np.zeros((8, 8), np.float32), **options), LATTICE, 0.0)
 
@@ -44,6 +57,44 @@ def test_a_tilted_facet_gets_its_cosine() -> None:
     wanted = (light @ normal).clamp_min(0) / light[:, 2]
     torch.testing.assert_close(found[:, 1], wanted, atol=1e-4, rtol=1e-4)
     torch.testing.assert_close(found[:, 2:4], normal[:2].expand(500, 2), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("roughness", [0.3, 0.6])
+@pytest.mark.parametrize("metallic", [1.0, 0.0])
+def test_the_lobe_is_that_of_unmodified_mitsuba(roughness: float, metallic: float, compiled: bool) -> None:
+    """Against `roughconductor` without Fresnel term, seen from above: there joint and separate masking by
+    facets agree. Light and view may be exchanged."""
+    color = (1.0, 0.8, 0.6)
+    known = surface(color=color, roughness=roughness, metallic=metallic)
+    u, sigma, light, _ = queries(300)
+    up = torch.tensor([[0.0, 0.0, 1.0]]).expand(300, 3)
+    found = compute_hints(known, u, sigma, light, up, 1)
+    description = {"type": "roughconductor", "alpha": roughness**2, "distribution": "ggx", "material": "none"}
+    conductor = mi.load_dict(description)
+    interaction = mi.SurfaceInteraction3f()
+    interaction.wi = mi.Vector3f(0, 0, 1)
+    omega = mi.Vector3f(light.numpy().T.copy())
+    value = np.array(conductor.eval(mi.BSDFContext(), interaction, omega))[0] / light[:, 2].numpy()
+    half = torch.nn.functional.normalize(light + up, dim=1)
+    schlick = ((1 - half[:, 2:]) ** 5).numpy()
+    f0 = np.array(color) if metallic else np.full(3, 0.04)
+    wanted = value[:, None] * (f0 + (1 - f0) * schlick)
+    if not metallic:
+        wanted += np.array(color) / np.pi
+    np.testing.assert_allclose(found[:, 4:], wanted, rtol=2e-3)
+    exchanged = compute_hints(known, u, sigma, up, light, 1)
+    torch.testing.assert_close(exchanged[:, 4:], found[:, 4:], rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("size", [1e-30, 1e-6, 0.5, 10.0])
+def test_footprints_beyond_the_levels_are_clamped(size: float, compiled: bool) -> None:
+    known = rough_surface(LATTICE)
+    u, _, light, view = queries(200)
+    found, wanted = (
+        compute_hints(known, u, torch.full((200,), s), light, view, 4)
+        for s in (size, 0.5 if size > 0.1 else 0.5 * 2.0**-LATTICE.finest)
+    )
+    torch.testing.assert_close(found, wanted, atol=0, rtol=0)
 
 
 def test_a_smooth_mirror_of_facets_keeps_the_energy() -> None:
@@ -75,6 +126,34 @@ def test_kernel_and_pytorch_agree(glossy: bool, aspect: float, places: int) -> N
     wanted = known.hints(u, level, light, view, places)
     scale = wanted.abs().mean(0)
     assert float(((found - wanted).abs() / (scale + wanted.abs())).quantile(0.999)) < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("elevation", "wanted"),
+    [(0.0, 0.0), (0.4, 0.158655), (0.5, 0.5), (0.6, 0.841345), (0.7, 0.977250), (1.2, 1.0)],
+)
+def test_visibility_is_the_normal_distribution_of_the_horizon(
+    elevation: float, wanted: float, compiled: bool
+) -> None:
+    """Of mean 0.5 and standard deviation 0.1 at the azimuth 3.25 of 16: 0 below all horizons, 1 above.
+    Lights at azimuths that are not between 3 and 4 are hidden."""
+    count = 16
+    mean, square = torch.full((count,), 1.5), torch.full((count,), 2.25)
+    # Linear between azimuths: 3/4 of the third, 1/4 of the fourth.
+    mean[3:5] = torch.tensor([0.45, 0.65])
+    square[3:5] = torch.tensor([0.23, 0.35])
+    horizon = torch.cat([mean, square])
+    flat = surface()
+    known = replace(flat, horizons=tuple(h * 0 + horizon for h in flat.horizons))
+    azimuth = 2 * math.pi / count * torch.tensor([3.25, 1.0, 8.5, 15.9])
+    light = torch.stack(
+        [math.cos(elevation) * azimuth.cos(), math.cos(elevation) * azimuth.sin(), azimuth * 0], 1
+    )
+    light[:, 2] = max(1e-4, math.sin(elevation))
+    u, sigma, _, view = queries(4)
+    # Irradiance of a flat tile: the visible share.
+    found = compute_hints(known, u, sigma, light, view, 1)[:, 1]
+    torch.testing.assert_close(found, torch.tensor([wanted, 0.0, 0.0, 0.0]), atol=2e-4, rtol=0)
 
 
 @pytest.mark.parametrize("level", [2.0, 4.0])
@@ -109,3 +188,26 @@ def test_a_surface_survives_its_tensors() -> None:
     torch.testing.assert_close(
         compute_hints(again, *arrays, 4), compute_hints(known, *arrays, 4), atol=0, rtol=0
     )
+
+
+def test_parts_are_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    """PyTorch computes hints part by part, which bounds memory."""
+    monkeypatch.setattr(hints, "kernel", lambda: None)
+    surface, arrays = rough_surface(LATTICE), queries(250)
+    whole = compute_hints(surface, *arrays, 1)
+    monkeypatch.setattr(hints, "_CHUNK", 100)
+    torch.testing.assert_close(compute_hints(surface, *arrays, 1), whole, atol=1e-6, rtol=1e-5)
+
+
+def test_maps_are_read_where_the_queries_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a GPU; the device without numbers stands for it."""
+    devices = []
+
+    def recorded(table: Tensor, *arguments: Any) -> Tensor:
+        devices.append(table.device.type)
+        return lookup(table, *arguments)
+
+    monkeypatch.setattr(known, "lookup", recorded)
+    u, sigma, light, view = (a.to("meta") for a in queries(10))
+    assert rough_surface(LATTICE).shading(u, sigma, light, view, 1).shape == (10, 6)
+    assert devices == ["meta", "meta"]

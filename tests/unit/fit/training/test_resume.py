@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 import torch
 from support.fit_data import parallax, write_data
+from support.known_surfaces import geometry, rough_heights
 
 import mbtf_fit.training.fit
+from mbtf_core.lattice import Lattice
 from mbtf_fit.config import FitConfig
 from mbtf_fit.training.fit import fit
 from mbtf_fit.training.trainer import Trainer
@@ -25,7 +27,9 @@ class Killed(BaseException):
 
 @pytest.fixture(scope="module")
 def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_data(tmp_path_factory.mktemp("data") / "shards", parallax, train=3000, test=300, noise=0.01)
+    rough = geometry(Lattice(3), rough_heights(16, 16), roughness=0.4, metallic=0.7, seed=0)
+    folder = tmp_path_factory.mktemp("data") / "shards"
+    return write_data(folder, parallax, train=3000, test=300, noise=0.01, geometry=rough)
 
 
 def config(memory: str = "1GB") -> FitConfig:

@@ -1,0 +1,156 @@
+"""Fits of the model that traces the known heights: from data to a material."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from support.fit_data import F32, parallax, random_queries, write_data
+from support.known_surfaces import geometry, rough_heights
+from support.paths import ROOT
+from torch import Tensor
+
+import mbtf_fit.training.trainer
+from mbtf_core.lattice import Lattice
+from mbtf_fit import FitConfig, Material, fit
+from mbtf_fit.native import library
+from mbtf_fit.training.fit import FitResult
+from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.generation import generate
+
+LATTICE = Lattice(3, 0.75)
+ROUGH = geometry(LATTICE, rough_heights(12, 16), roughness=0.4, metallic=0.7, seed=0)
+
+
+@pytest.fixture(scope="module")
+def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("data") / "shards"
+    return write_data(folder, parallax, train=3000, test=500, aspect=0.75, noise=0.01, geometry=ROUGH)
+
+
+@pytest.fixture
+def no_kernel(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setenv(library.ENVIRONMENT, "off")
+    library.reload()
+    yield
+    monkeypatch.undo()
+    library.reload()
+
+
+def config(steps: int, *, memory: str = "1GB", **options: Any) -> FitConfig:
+    training = {"steps": steps, "batch": 300, "warmup": 3, **options.pop("training", {})}
+    described = {"model": "relief", "training": training, "data": {"memory": memory}, **options}
+    return FitConfig.model_validate(described)
+
+
+def weights(result: FitResult) -> dict[str, Tensor]:
+    return result.material.model.weights()
+
+
+@pytest.mark.parametrize("places", [1, 4])
+def test_hints_of_the_data_and_of_batches_give_one_fit(
+    places: int, shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In memory; computed for each batch, as they do not fit; of queries that are streamed."""
+    sizes: list[int] = []
+    compute = mbtf_fit.training.trainer._hints
+
+    def counted(model: Any, queries: Any) -> Tensor:
+        sizes.append(len(queries))
+        return compute(model, queries)
+
+    monkeypatch.setattr(mbtf_fit.training.trainer, "_hints", counted)
+    found = {}
+    for memory in ("1GB", "180kB", "1kB"):
+        sizes.clear()
+        options = config(14, memory=memory, network={"relief": {"places": places}})
+        found[memory] = fit(options, shards, tmp_path / memory)
+        if memory == "1GB":
+            assert len(sizes) == 1
+            assert sizes[0] > 2000
+        else:
+            assert sizes == [300] * 14
+    whole = found.pop("1GB")
+    for other in found.values():
+        assert all(torch.equal(tensor, weights(whole)[name]) for name, tensor in weights(other).items())
+        assert other.errors == whole.errors
+
+
+@pytest.mark.skipif(library.kernel() is None, reason=library.missing_reason() or "kernel")
+def test_pytorch_fits_as_the_kernel_does(
+    shards: Path, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    compiled = fit(config(20), shards, tmp_path / "compiled")
+    request.getfixturevalue("no_kernel")
+    plain = fit(config(20), shards, tmp_path / "plain")
+    described = [r.material.description["training"] for r in (compiled, plain)]
+    assert [d["backend"].split()[0] for d in described] == ["kernel", "pytorch"]
+    assert described[1]["loss"] == pytest.approx(described[0]["loss"], rel=1e-3)
+    errors = [r.errors["test"]["unexplained"]["value"] for r in (compiled, plain)]
+    assert errors[1] == pytest.approx(errors[0], rel=1e-2)
+
+
+def test_a_material_keeps_its_surface(shards: Path, tmp_path: Path) -> None:
+    """That of the data, and values that a loaded material repeats."""
+    result = fit(config(5), shards, tmp_path / "m")
+    again = Material.load(tmp_path / "m")
+    np.testing.assert_array_equal(again.model.weights()["surface.heights"][..., 0], ROUGH.heights)
+    assert float(again.model.weights()["surface.light_width"]) == pytest.approx(np.radians(1.0))
+    assert again.deviation() < 1e-5
+    queries = random_queries(np.random.default_rng(1), 100, LATTICE).values()
+    np.testing.assert_array_equal(again.evaluate(*queries), result.material.evaluate(*queries))
+
+
+def test_holes_are_learned(tmp_path: Path) -> None:
+    """Values are premultiplied; the transmittance is a part of the material."""
+
+    def through(u: F32, sigma: F32, omega: F32) -> NDArray[np.float64]:
+        wave = np.exp(-2 * (2 * np.pi * sigma) ** 2) * np.cos(2 * np.pi * u[:, 0])
+        return 0.5 + 0.4 * wave
+
+    def value(u: F32, sigma: F32, light: F32, view: F32) -> NDArray[np.float64]:
+        return parallax(u, sigma, light, view) * (1 - through(u, sigma, view))[:, None]
+
+    shards = write_data(tmp_path / "data", value, train=20_000, test=1000, through=through)
+    result = fit(config(200, training={"batch": 2000}), shards, tmp_path / "m")
+    assert result.errors["test"]["unexplained"]["value"] < 0.3
+    q = random_queries(np.random.default_rng(1), 1000, Lattice(3))
+    assert result.material.transmittance is not None
+    found = result.material.transmittance.evaluate(q["u"], q["sigma"], q["omega_o"])
+    assert np.abs(found - through(q["u"], q["sigma"], q["omega_o"])).mean() < 0.05
+
+
+def test_another_material_gives_textures_and_depth_weights(shards: Path, tmp_path: Path) -> None:
+    """Decoder and surface are those of the fit."""
+    fit(config(60), shards, tmp_path / "first")
+    flat = write_data(tmp_path / "flat", parallax, train=1000, test=100, aspect=0.75)
+    # At rates this low what training starts from is what it ends with.
+    slow: dict[str, Any] = {"learning_rate": 1e-9, "texture_learning_rate": 1e-9}
+    slow |= {"blur": {"initial_sigma": 0, "min_sigma": 0}, "energy_calibration": False}
+    own = weights(fit(config(1, training=slow), flat, tmp_path / "own"))
+    options = config(1, training=slow, init_from=str(tmp_path / "first"))
+    found = weights(fit(options, flat, tmp_path / "m"))
+    given = Material.load(tmp_path / "first").model.weights()
+    assert float((given["depth_weights"] - own["depth_weights"]).abs().max()) > 1e-3
+    for name, tensor in found.items():
+        source = given if name.startswith(("pyramid.", "depth_weights")) else own
+        torch.testing.assert_close(tensor, source[name], atol=1e-6, rtol=0)
+
+
+def test_relief_learns_rendered_rock_sooner_than_neumip(tmp_path: Path) -> None:
+    """After as many steps. Measured: unexplained variances of 0.17 and 0.29, ± 0.01 over seeds."""
+    queries = {"resolution": 16, "train": "20000", "spp": 16}
+    described = {"material": str(ROOT / "assets" / "cliff_rock"), "queries": queries}
+    generate(GeneratorConfig.model_validate(described), tmp_path / "data")
+    errors = {}
+    for model in ("relief", "neumip"):
+        options = config(200, model=model, training={"batch": 2000})
+        errors[model] = fit(options, tmp_path / "data", tmp_path / model).errors["test"]["unexplained"][
+            "value"
+        ]
+    assert errors["relief"] < 0.75 * errors["neumip"]
