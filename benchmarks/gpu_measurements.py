@@ -1,4 +1,4 @@
-"""What `gpu.py` measures, each in a process of its own: a crash of a compiler or driver ends that process alone.
+"""What `gpu.py` measures, each in a process of its own, as a compiler or driver may abort it.
 
 Every function takes texts and yields JSON objects, as :func:`mbtf_core.child_process.run_child` asks. Devices
 are ``cpu`` and ``cuda``.
@@ -196,8 +196,11 @@ def infer(device: str, sizes: str, folder: str) -> Answers:
     names = ("u", "sigma", "omega_i", "omega_o")
     found = material.evaluate(*(material.conformance[name] for name in names))
     yield {"deviation": deviation(found, material.conformance["rgb"])}
+    # Fewer for a model that reads many positions.
+    every = slice(None, None, material.model.positions)
     queries = picture(Sizes.read(sizes))
-    yield timed(lambda: material.evaluate(*(getattr(queries, name) for name in names)))
+    arrays = [getattr(queries, name)[every] for name in names]
+    yield {"queries": len(arrays[0])} | timed(lambda: material.evaluate(*arrays))
 
 
 def evaluate_plugin(device: str, arithmetic: Any, sizes: str, folder: str) -> Answers:
@@ -225,4 +228,4 @@ def evaluate_plugin(device: str, arithmetic: Any, sizes: str, folder: str) -> An
         dr.eval(evaluator.value(evaluator.features(u, evaluator.level(sigma), view), light, view))
         dr.sync_thread()
 
-    yield timed(work)
+    yield {"queries": len(queries.sigma)} | timed(work)
