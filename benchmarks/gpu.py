@@ -8,8 +8,8 @@ One data set of an asset is generated on the CPU. Then follow, each in a process
 - **estimator**: the values of the test queries on both devices with the same seed. Means agree, and so do the
   values of every level: the product of the differences of both halves has the expectation
   ``(M_gpu - M_cpu)²``, whatever the noise;
-- **training** of every model, a tenth of the steps and all: by the compiled kernel, by PyTorch on the CPU, and
-  on the device; their test errors agree;
+- **training** of every model, a tenth of the steps and all: by the compiled kernel, by PyTorch on the CPU,
+  and on the device; their test errors agree;
 - **materials** fitted on the CPU: conformance values in PyTorch and by the Mitsuba plugin, unrolled, by
   cooperative vectors and in half precision, and milliseconds of a 1080p picture.
 
@@ -199,7 +199,7 @@ class Comparison:
 
     def estimator(self, shards: Path) -> None:
         """Values of the test queries."""
-        found = []
+        found: list[Arrays] = []
         for number, device in enumerate((self.reference, self.device)):
             out = self.folder / f"estimates-{number}.npz"
             given = (device, self.sizes.text(), str(shards), str(out))
@@ -207,7 +207,7 @@ class Comparison:
                 with np.load(out) as arrays:
                     found.append(dict(arrays))
         if len(found) == 2:
-            self.checks += compare_estimates(*found, self.sizes.resolution.bit_length() - 1)
+            self.checks += compare_estimates(found[0], found[1], self.sizes.resolution.bit_length() - 1)
 
     def model(self, model: str, shards: Path) -> None:
         """Fits of a model, and its material."""
