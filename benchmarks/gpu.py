@@ -11,7 +11,8 @@ One data set of an asset is generated on the CPU. Then follow, each in a process
 - **training** of every model, a tenth of the steps and all: by the compiled kernel, by PyTorch on the CPU,
   and on the device; their test errors agree;
 - **materials** fitted on the CPU: conformance values in PyTorch and by the Mitsuba plugin, unrolled, by
-  cooperative vectors and in half precision, and milliseconds of a 1080p picture.
+  cooperative vectors and in half precision, milliseconds of a 1080p picture, and a ball that the plugin
+  renders.
 
 A difference passes if it is at most its tolerance plus 4.5 standard errors. Rates are reported only. Without
 a CUDA device, nothing is measured and the exit code is 0. The last line is one JSON object: figures, and the
@@ -34,7 +35,7 @@ from gpu_measurements import PREDICTIONS, Sizes
 from numpy.typing import NDArray
 
 from mbtf_core.child_process import Outcome, run_child
-from mbtf_core.stats import by_group, level_groups, mean_estimate, mse_difference, noise_free_mse
+from mbtf_core.stats import Estimate, level_groups, mean_estimate, mse_difference, noise_free_mse
 from mbtf_gen.diagnostics.selftest import STANDARD_ERRORS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -87,6 +88,23 @@ class Check:
         return f"{verdict:6s}  {self.name:62s} {found:>9s}  at most {self.limit:.2g}  {self.note}".rstrip()
 
 
+def compare_mean(name: str, reference: Arrays, other: Arrays, tolerance: float) -> Check:
+    """Check of the means of two sets of halves ``value_a``, ``value_b`` (n, 3) at the same places."""
+    a, b = _differences(reference, other)
+    mean = 0.5 * float((reference["value_a"] + reference["value_b"]).mean(dtype=np.float64))
+    shift = mean_estimate(0.5 * (a + b))
+    limit = tolerance + STANDARD_ERRORS * shift.error / mean
+    return Check(f"{name}: mean value, relative", abs(shift.value) / mean, limit)
+
+
+def compare_values(name: str, reference: Arrays, other: Arrays) -> Check:
+    """Check of two sets of halves ``value_a``, ``value_b`` (n, 3), place by place."""
+    apart = _product(*_differences(reference, other))
+    scale = _product(reference["value_a"], reference["value_b"]).value
+    limit = VALUES**2 + STANDARD_ERRORS * apart.error / scale
+    return Check(f"{name}, relative squared", apart.value / scale, limit)
+
+
 def compare_estimates(reference: Arrays, other: Arrays, finest: int) -> list[Check]:
     """Checks of two sets of halves at the same queries.
 
@@ -95,28 +113,22 @@ def compare_estimates(reference: Arrays, other: Arrays, finest: int) -> list[Che
     reference, other : ``value_a``, ``value_b`` (n, 3) in 1/sr and ``sigma`` (n,) in tile widths
     finest : finest level
     """
-    a, b = (other[f"value_{half}"].astype(np.float64) - reference[f"value_{half}"] for half in "ab")
-    mean = 0.5 * float((reference["value_a"] + reference["value_b"]).mean(dtype=np.float64))
-    shift = mean_estimate(0.5 * (a + b))
     levels = level_groups(reference["sigma"], finest)
-    power = by_group(_product, levels, reference["value_a"], reference["value_b"])
-    checks = [
-        Check(
-            "estimator: mean value, relative",
-            abs(shift.value) / mean,
-            MEAN + STANDARD_ERRORS * shift.error / mean,
-        )
-    ]
-    for level, apart in by_group(_product, levels, a, b).items():
-        scale = power[level].value
-        limit = VALUES**2 + STANDARD_ERRORS * apart.error / scale
-        checks.append(
-            Check(f"estimator: values of level {level}, relative squared", apart.value / scale, limit)
-        )
+    checks = [compare_mean("estimator", reference, other, MEAN)]
+    for level in np.unique(levels).tolist():
+        chosen = levels == level
+        parts = ({name: array[chosen] for name, array in side.items()} for side in (reference, other))
+        checks.append(compare_values(f"estimator: values of level {level}", *parts))
     return checks
 
 
-def _product(a: NDArray[Any], b: NDArray[Any]) -> Any:
+def _differences(reference: Arrays, other: Arrays) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Differences of both halves."""
+    a, b = (other[f"value_{half}"].astype(np.float64) - reference[f"value_{half}"] for half in "ab")
+    return a, b
+
+
+def _product(a: NDArray[Any], b: NDArray[Any]) -> Estimate:
     return mean_estimate(np.asarray(a, np.float64) * b)
 
 
@@ -199,15 +211,19 @@ class Comparison:
 
     def estimator(self, shards: Path) -> None:
         """Values of the test queries."""
+        found = self.both("estimator", "estimate", self.sizes.text(), str(shards))
+        if found is not None:
+            self.checks += compare_estimates(*found, self.sizes.resolution.bit_length() - 1)
+
+    def both(self, name: str, function: str, *arguments: str) -> tuple[Arrays, Arrays] | None:
+        """Arrays that a measurement writes on the reference and on the device."""
         found: list[Arrays] = []
         for number, device in enumerate((self.reference, self.device)):
-            out = self.folder / f"estimates-{number}.npz"
-            given = (device, self.sizes.text(), str(shards), str(out))
-            if self.measure(f"estimator on {_side(number, device)}", "estimate", *given) is not None:
+            out = self.folder / f"{name}-{number}.npz"
+            if self.measure(f"{name} on {_side(number, device)}", function, device, *arguments, str(out)):
                 with np.load(out) as arrays:
                     found.append(dict(arrays))
-        if len(found) == 2:
-            self.checks += compare_estimates(found[0], found[1], self.sizes.resolution.bit_length() - 1)
+        return (found[0], found[1]) if len(found) == 2 else None
 
     def model(self, model: str, shards: Path) -> None:
         """Fits of a model, and its material."""
@@ -257,6 +273,14 @@ class Comparison:
                 found = self.measure(name, function, *given, environment=NO_KERNEL)
                 if found is not None:
                     self.checks.append(Check(f"conformance of {name}", found["deviation"], most))
+        if model == "hierarchical":
+            return
+        name = f"picture of {model}"
+        pictures = self.both(name, "render", self.sizes.text(), str(folder))
+        if pictures is not None:
+            # The plugin's default on a GPU is half precision.
+            self.checks.append(compare_mean(name, *pictures, HALF))
+            self.checks.append(compare_values(f"{name}: pixels", *pictures))
 
 
 def _side(number: int, device: str) -> str:

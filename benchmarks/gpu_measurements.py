@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_core.errors import InputError
 from mbtf_core.shard_schema import Layout
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.render.runtime import CPU_VARIANT, CUDA_VARIANT
@@ -84,6 +85,15 @@ def configuration(sizes: Sizes, layout: Layout) -> GeneratorConfig:
     )
 
 
+def save_finite(path: str | Path, **arrays: Any) -> None:
+    """Write arrays to a file; an InputError if some number is not finite."""
+    for name, array in arrays.items():
+        bad = int(np.count_nonzero(~np.isfinite(array)))
+        if bad:
+            raise InputError(f"{bad} of {array.size} numbers of {name} are not finite")
+    np.savez(path, **arrays)
+
+
 def selftest(sizes: str) -> Answers:
     """State of every check of ``mbtf-gen selftest``, or why it could not run."""
     from mbtf_gen.diagnostics.checks import all_checks
@@ -126,7 +136,7 @@ def estimate(device: str, sizes: str, shards: str, out: str) -> Answers:
         found = estimator.estimate(queries, wanted.spp, Stream(job.config.seed, "test", number))
         seconds.append(time.perf_counter() - start)
     # The values of the second run, whose random numbers are those of the first shard.
-    np.savez(out, sigma=test.sigma, value_a=found.value_a, value_b=found.value_b)
+    save_finite(out, sigma=test.sigma, value_a=found.value_a, value_b=found.value_b)
     yield {
         "first_seconds": seconds[0],
         "queries_per_second": len(test) / seconds[1],
@@ -229,3 +239,34 @@ def evaluate_plugin(device: str, arithmetic: Any, sizes: str, folder: str) -> An
         dr.sync_thread()
 
     yield {"queries": len(queries.sigma)} | timed(work)
+
+
+def render(device: str, sizes: str, folder: str, out: str) -> Answers:
+    """Two pictures of a ball of the material, of other random numbers, as arrays in a file."""
+    from mbtf_fit.mitsuba_plugin import register
+
+    register(VARIANTS[device])
+    import mitsuba as mi
+
+    from mbtf_fit.mitsuba_plugin import load_scene
+
+    wanted = Sizes.read(sizes)
+    scene = load_scene(
+        {
+            "type": "scene",
+            "integrator": {"type": "mbtf_path", "max_depth": 3},
+            "ball": {"type": "sphere", "bsdf": {"type": "mbtf", "material": folder, "uv_scale": 4.0}},
+            "light": {"type": "constant"},
+            "sensor": {
+                "type": "perspective",
+                "to_world": mi.ScalarTransform4f().look_at([0, -5, 2], [0, 0, 0], [0, 0, 1]),
+                "film": {"type": "hdrfilm", "width": wanted.columns // 8, "height": wanted.rows // 8},
+            },
+        }
+    )
+    start = time.perf_counter()
+    pictures = [np.array(mi.render(scene, spp=16, seed=seed), np.float32)[..., :3] for seed in (1, 2)]
+    seconds = time.perf_counter() - start
+    first, second = (picture.reshape(-1, 3) for picture in pictures)
+    save_finite(out, value_a=first, value_b=second)
+    yield {"seconds": seconds}

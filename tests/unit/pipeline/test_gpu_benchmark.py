@@ -14,6 +14,7 @@ from support.paths import ROOT
 from support.scripts import BENCHMARKS, benchmark_module
 
 from mbtf_core.child_process import Outcome
+from mbtf_core.errors import InputError
 from mbtf_core.lattice import sigma_of_level
 
 FINEST = 3
@@ -78,10 +79,11 @@ class Fake:
         answers: dict[str, Any] = {"deviation": 0.5 if wrong else 1e-6}
         if function == "selftest":
             answers = {"V-groove": "ok", "CUDA": "absent" if self.edit == function else "ok"}
-        elif function == "estimate":
+        elif function in ("estimate", "render"):
             arrays = halves(len(arguments[0]))
             scaled = {name: a * factor for name, a in arrays.items() if name != "sigma"}
             np.savez(arguments[-1], **scaled, sigma=arrays["sigma"])
+            answers = {"seconds": 1.0}
         elif function == "train":
             data = halves(0)
             out = Path(arguments[-1])
@@ -111,6 +113,7 @@ def test_equal_results_pass(gpu: Any, tmp_path: Path, capsys: pytest.CaptureFixt
     [
         ("selftest", "selftest: CUDA"),
         ("estimate", "estimator: mean value, relative"),
+        ("render", "picture of relief: mean value, relative"),
         ("train", "error of relief, begun, by the device cuda, relative"),
         ("infer", "conformance of hierarchical on the device cuda, PyTorch"),
         ("evaluate_plugin", "conformance of relief on the device cuda, half"),
@@ -138,6 +141,11 @@ def test_a_crash_is_one_line_and_the_rest_runs(
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("FAILED")]
     assert len(lines) == 1
     assert "ended by SIGABRT" in lines[0]
+
+
+def test_numbers_that_are_not_finite_end_a_measurement(gpu: Any, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="1 of 3 numbers of value_a are not finite"):
+        sys.modules["gpu_measurements"].save_finite(tmp_path / "a.npz", value_a=np.array([1, np.nan, 2]))
 
 
 def test_without_a_device_nothing_is_measured(
@@ -169,5 +177,5 @@ def test_the_cpu_agrees_with_itself(gpu: Any, monkeypatch: pytest.MonkeyPatch, t
     comparison = gpu.Comparison(here, "cpu", "cpu", sizes, tmp_path)
     comparison.all()
     assert failed(comparison.checks) == []
-    assert len(comparison.checks) == 1 + FINEST + 1 + 4 + 8
+    assert len(comparison.checks) == 1 + FINEST + 1 + 4 + 8 + 2
     assert comparison.figures["estimator on the device cpu"]["paths_per_second"] > 0
