@@ -171,7 +171,7 @@ def add_up(index: Tensor, weights: Tensor, values: Tensor, rows: int) -> Tensor:
     ``index_add_`` of rows this short, and the same bits at every run.
     """
     n, corners = index.shape
-    if values.is_cuda:
+    if values.device.type != "cpu":
         out = values.new_zeros(rows, values.shape[1])
         return out.index_add_(0, index.reshape(-1), (weights[..., None] * values[:, None]).flatten(0, 1))
     from scipy.sparse import csr_array

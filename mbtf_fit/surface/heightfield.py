@@ -22,6 +22,7 @@ from torch import Tensor
 
 from mbtf_fit.models.constants import MAX_CROSSINGS
 from mbtf_fit.native.library import Heightfield, kernel
+from mbtf_fit.surface.copies import DeviceCopies
 from mbtf_gen.geometry.height_planes import node_table
 
 # Rays, and vertices, per task of a thread.
@@ -53,8 +54,10 @@ class HeightfieldTracer:
         # Row index along +y.
         self._z = np.ascontiguousarray(heights[::-1], np.float32)
         self._nodes = np.ascontiguousarray(node_table(self._z.astype(np.float64)))
-        self.aspect = aspect
         rows, columns = self._z.shape
+        cells = torch.from_numpy(self._nodes[: self._z.size])
+        self._cells = DeviceCopies(cells.view(rows, columns, 4))
+        self.aspect = aspect
         columns_log2, rows_log2 = (columns - 1).bit_length(), (rows - 1).bit_length()
         self.description = Heightfield(
             self._nodes.ctypes.data,
@@ -79,8 +82,7 @@ class HeightfieldTracer:
         """
         found = kernel()
         if found is None or u.device.type != "cpu":
-            cells = torch.from_numpy(self._nodes[: self._z.size]).to(u.device)
-            return trace_reference(cells.view(*self._z.shape, 4), self.aspect, u, omega)
+            return trace_reference(self._cells.on(u.device), self.aspect, u, omega)
         u, omega = (a.detach().float().contiguous() for a in (u, omega))
         out = torch.empty(len(u))
 

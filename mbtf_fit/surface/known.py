@@ -46,6 +46,7 @@ from mbtf_fit.models.constants import (
     PLACES,
 )
 from mbtf_fit.models.lookup import Packing, lookup
+from mbtf_fit.surface.copies import DeviceCopies
 from mbtf_fit.surface.heightfield import HeightfieldTracer
 from mbtf_fit.surface.prefilter import prefiltered_levels
 from mbtf_gen.images.resample import resample
@@ -174,6 +175,14 @@ class KnownSurface:
         """All levels of the horizons, one after the other."""
         return _packed(self.horizons)
 
+    @cached_property
+    def _map_copies(self) -> DeviceCopies:
+        return DeviceCopies(self.map_table[0])
+
+    @cached_property
+    def _horizon_copies(self) -> DeviceCopies:
+        return DeviceCopies(self.horizon_table[0])
+
     def hints(self, u: Tensor, level: Tensor, omega_i: Tensor, omega_o: Tensor, places: int = 1) -> Tensor:
         """Hints of queries, in PyTorch.
 
@@ -216,8 +225,7 @@ class KnownSurface:
 
     def _shade(self, hit: Tensor, level: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
         """Irradiance, normal and core (n, 6) at surface points."""
-        table, packing = self.map_table
-        maps = lookup(table.to(hit.device), packing, hit, level)
+        maps = lookup(self._map_copies.on(hit.device), self.map_table[1], hit, level)
         slopes, square, base = maps[:, :2], maps[:, 2:3], maps[:, 3:6]
         normal = torch.nn.functional.normalize(torch.cat([-slopes, torch.ones_like(slopes[:, :1])], 1), dim=1)
         light = (normal * omega_i).sum(1, keepdim=True)
@@ -237,8 +245,7 @@ class KnownSurface:
 
     def visibility(self, hit: Tensor, level: Tensor, omega_i: Tensor) -> Tensor:
         """Share (n, 1) of footprints at surface points from which the light is visible."""
-        table, packing = self.horizon_table
-        both = lookup(table.to(hit.device), packing, hit, level)
+        both = lookup(self._horizon_copies.on(hit.device), self.horizon_table[1], hit, level)
         count = both.shape[1] // 2
         # A vertical light has azimuth 0, whatever the signs of its zeros.
         azimuth = torch.atan2(omega_i[:, 1] + 0.0, omega_i[:, 0] + 0.0) * (count / (2.0 * math.pi))

@@ -154,7 +154,10 @@ class Trainer:
                 self.progress.step += 1
                 self.progress.seconds += time.perf_counter() - start
         if losses:
+            start = time.perf_counter()
+            # A GPU may still work on the last steps: reading the loss waits for them.
             self.progress.loss = float(torch.stack(losses).mean())
+            self.progress.seconds += time.perf_counter() - start
             if not math.isfinite(self.progress.loss + float(torch.stack(health).sum())):
                 self._stop_diverged(first, losses, health)
         return self.fraction >= 1.0

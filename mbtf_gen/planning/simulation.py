@@ -12,6 +12,7 @@ from mbtf_gen.images.resample import resample
 from mbtf_gen.job import Job
 from mbtf_gen.planning.effects import EffectsPlan
 from mbtf_gen.render.estimates import Estimates, Stream
+from mbtf_gen.render.runtime import CPU_VARIANT
 from mbtf_gen.sampling.query_sampler import Queries
 
 # Effects that change the tile: its shape or its surface.
@@ -30,7 +31,12 @@ class ClosedForm:
         return Estimates(value.copy(), value.copy(), None, 0, 0, 0, 0)
 
 
-def build_estimator(job: Job, plan: EffectsPlan, tiles: dict[frozenset[str], Any] | None = None) -> Any:
+def build_estimator(
+    job: Job,
+    plan: EffectsPlan,
+    tiles: dict[frozenset[str], Any] | None = None,
+    variant: str = CPU_VARIANT,
+) -> Any:
     """Estimator of M for a job's material under an effects plan; loads Mitsuba unless M has a closed form.
 
     Parameters
@@ -42,6 +48,8 @@ def build_estimator(job: Job, plan: EffectsPlan, tiles: dict[frozenset[str], Any
     tiles : dict, optional
         Tiles of this job built so far, by the effects that change them. Plans that share a dictionary share
         their tiles.
+    variant : str
+        Variant of Mitsuba, which sets the device; one per process.
 
     Returns
     -------
@@ -51,12 +59,14 @@ def build_estimator(job: Job, plan: EffectsPlan, tiles: dict[frozenset[str], Any
     ------
     InputError
         Mitsuba does not accept the material's BSDF.
+    EngineError
+        Mitsuba or the device cannot be used here.
     """
     if plan.closed_form:
         return ClosedForm(np.asarray(job.material.base_color, np.float64).reshape(-1, 3)[0])
     from mbtf_gen.render.runtime import load_mitsuba
 
-    load_mitsuba()
+    load_mitsuba(variant)
     from mbtf_gen.render.bsdf.plugin import bsdf_of
     from mbtf_gen.render.estimator import Estimator
     from mbtf_gen.render.path_tracer import Transport

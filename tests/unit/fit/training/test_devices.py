@@ -1,0 +1,75 @@
+"""Training on a GPU: the device without numbers, which refuses tensors of other devices, stands for it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from support.fit_data import random_queries
+from support.known_surfaces import rough_surface
+from torch import Tensor
+
+from mbtf_core.lattice import Lattice
+from mbtf_fit.config import FitConfig
+from mbtf_fit.data.images import Patches
+from mbtf_fit.data.queries import TrainingQueries
+from mbtf_fit.models.hierarchical import Hierarchical
+from mbtf_fit.models.neumip import KNOTS, Neumip
+from mbtf_fit.models.registry import MODELS, build_model
+from mbtf_fit.models.relief import Relief
+from mbtf_fit.objective.losses import Objective
+from mbtf_fit.objective.noise import NoiseModel
+from mbtf_fit.surface import heightfield
+from mbtf_fit.surface.copies import DeviceCopies
+
+LATTICE, META = Lattice(3), torch.device("meta")
+
+
+@pytest.fixture(autouse=True)
+def no_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without numbers no ray arrives; its table must be where the rays are."""
+
+    def trace(cells: Tensor, aspect: float, u: Tensor, omega: Tensor) -> Tensor:
+        return (cells[0, 0, 0] + u[:, 0] * omega[:, 0]) * 0
+
+    monkeypatch.setattr(heightfield, "trace_reference", trace)
+
+
+def batch(model: str, margin: int, n: int = 12) -> TrainingQueries | Patches:
+    """Queries without values."""
+    arrays = random_queries(np.random.default_rng(0), n, LATTICE)
+    u, sigma, light, view = (torch.from_numpy(a).to(META) for a in arrays.values())
+    if MODELS[model].layout == "shuffled":
+        return TrainingQueries(u, sigma, light, view, torch.zeros(n, 3, device=META))
+    wide = 4 + 2 * margin
+    positions, values = (torch.zeros(n, k, k, c, device=META) for k, c in ((wide, 2), (4, 3)))
+    return Patches(positions, sigma, light, view, values)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_loss_and_gradients_stay_on_the_device(name: str) -> None:
+    model = build_model(name, LATTICE)
+    if isinstance(model, Relief):
+        model.know(rough_surface(LATTICE))
+    model.initialize(torch.Generator().manual_seed(0), 0.1)
+    model.to(META)
+    if isinstance(model, Neumip):
+        model.calibration = torch.ones(2, LATTICE.finest + 1, KNOTS, 3, device=META)
+    for texture in model.textures():
+        texture.read(texture.blurred(1.5))
+    queries = batch(name, model.margin)
+    evaluate = model.evaluate_patches if isinstance(model, Hierarchical) else model
+    config = FitConfig.model_validate({"model": name})
+    objective = Objective(config.training, NoiseModel.silent(0.1, LATTICE))
+    loss = objective(evaluate(queries.u, queries.sigma, queries.omega_i, queries.omega_o), queries)
+    texels, weights = model.parameter_groups()
+    gradients = torch.autograd.grad(loss, [*texels, *weights])
+    assert {g.device for g in gradients} == {META}
+
+
+def test_a_tensor_is_copied_once_per_device() -> None:
+    tensor = torch.ones(3)
+    copies = DeviceCopies(tensor)
+    assert copies.on(torch.device("cpu")) is tensor
+    assert copies.on(META) is copies.on(META)
+    assert copies.on(META).device == META
