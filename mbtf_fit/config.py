@@ -212,7 +212,7 @@ PRESETS: dict[str, dict[str, Any]] = {
             "oversampling": 2,
             "encoding": {"direction_xyz": True, "half_vector": True},
         },
-        # Oversampled texels have a quarter of the queries each: with a decay of 1, dark glossy materials overfit.
+        # Oversampled texels see a quarter of the queries each: with a decay of 1, glossy materials overfit.
         "training": {"texture_weight_decay": 2.0, "blur": {"min_sigma": 1.6}},
     },
     "hierarchical": {

@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 from mbtf_core.atomic import write_json
 from mbtf_core.directions import from_angles
 from mbtf_core.exposure import auto_exposure, brightness, white_of
+from mbtf_core.stats import Estimate
 from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_pipeline.compare.contrast import contrast, phase_contrasts, picture_blocks
 from mbtf_pipeline.compare.dataset_errors import dataset_errors
 from mbtf_pipeline.compare.metrics import DEFINITIONS, image_errors, reference_difference
 from mbtf_pipeline.compare.offsets import write_offsets
@@ -40,7 +42,7 @@ if TYPE_CHECKING:
 COMPARISON_NAME = "comparison.json"
 COMPARISON_FORMAT = "mbtf-comparison"
 # Raised when the record or its files change; part of the stage's key.
-COMPARISON_SCHEMA = 8
+COMPARISON_SCHEMA = 9
 
 F32 = NDArray[np.float32]
 Progress = Callable[[str], None]
@@ -101,6 +103,8 @@ def compare(
         for scene, images in rendered
     ]
     data = Dataset.open(shards)
+    first = next(scenes(section))
+    light, view = (from_angles(d.elevation, d.azimuth) for d in (first.light, first.view))
     record: dict[str, Any] = {
         "format": COMPARISON_FORMAT,
         "schema": COMPARISON_SCHEMA,
@@ -115,6 +119,7 @@ def compare(
         "definitions": DEFINITIONS,
         "pictures": pictures,
         "test": dataset_errors(materials, data),
+        "phases": phase_contrasts(estimator, materials, data.lattice, light, view, section.seed),
         "offsets": write_offsets(estimator, materials, section.offset_views, data.lattice, out),
         "seconds": {"references": round(seconds, 3)},
     }
@@ -203,6 +208,10 @@ def _compare_scene(
             "file": file,
             "seconds": round(seconds, 4),
             "errors": {kind: {key: e.as_dict() for key, e in of.items()} for kind, of in errors.items()},
+            "contrast": {
+                kind: {key: e and e.as_dict() for key, e in _contrast(value, image).items()}
+                for kind, image in images.items()
+            },
             **scores,
         }
         if first is None:
@@ -212,3 +221,8 @@ def _compare_scene(
             record["fits"][name]["mse_minus_first"] = difference.as_dict()
         progress(f"{name} {scene.name}")
     return record
+
+
+def _contrast(value: F32, image: ReferenceImage) -> dict[str, Estimate | None]:
+    p, a, b = (x.reshape(-1, 3) for x in (value, image.value_a, image.value_b))
+    return contrast(p, a, b, picture_blocks(*value.shape[:2]))

@@ -21,6 +21,7 @@ _TERMS = {
     "flip": "FLIP",
     "ssim": "SSIM",
     "st_lpips": "ST-LPIPS",
+    "contrast": "contrast",
     "error_bar": "error bar",
 }
 
@@ -40,6 +41,8 @@ def error_context(comparison: Mapping[str, Any], min_cos: float) -> dict[str, An
         "error_plots": [_plot(tests, min_cos, *grouping[:3]) for grouping in _GROUPINGS],
         "group_tables": [_group_table(tests, min_cos, *grouping) for grouping in _GROUPINGS],
         "picture_table": _pictures_table(comparison),
+        "contrast_table": _contrast_table(comparison),
+        "phase_table": _phase_table(comparison),
         "definitions": [(_TERMS[k], v) for k, v in comparison["definitions"].items()],
     }
 
@@ -145,3 +148,38 @@ def _pictures_table(comparison: Mapping[str, Any]) -> dict[str, Any]:
     heads += [m.title for m in metrics]
     title = f"Images at {describe_exposure(comparison['exposure'])}; white is the peak of the PSNR"
     return {"title": title, "head": ["view", "light", "tiles across", "fit", *heads], "rows": rows}
+
+
+def _relative(record: Mapping[str, Any] | None) -> str:
+    return "–" if record is None else estimate_text(estimate(record))
+
+
+def _contrast_table(comparison: Mapping[str, Any]) -> dict[str, Any]:
+    """One row per image and fit: contrast relative to each kind of reference."""
+    rows = []
+    for picture in comparison["pictures"]:
+        for fit in comparison["fits"]:
+            row = [short_direction(picture[d]) for d in ("view", "light")]
+            row += [f"{picture['tiles_across']:g}", fit]
+            for kind in comparison["kinds"]:
+                found = picture["fits"][fit]["contrast"][kind]
+                row += [_relative(found[name]) for name in ("luminance", "chroma", "correlation")]
+            rows.append(row)
+    names = ("luminance", "chroma", "correlation of chroma")
+    heads = [f"{name}, {kind} reference" for kind in comparison["kinds"] for name in names]
+    title = "Contrast relative to the reference (1 is right)"
+    return {"title": title, "head": ["view", "light", "tiles across", "fit", *heads], "rows": rows}
+
+
+def _phase_table(comparison: Mapping[str, Any]) -> dict[str, Any]:
+    """One row per level and fit: contrast of luminance at places between texels."""
+    levels = sorted({row["level"] for row in comparison["phases"]})
+    phases = list(dict.fromkeys(row["phase"] for row in comparison["phases"]))
+    found = {(row["level"], row["phase"]): row["fits"] for row in comparison["phases"]}
+    rows = [
+        [str(level), fit, *(_relative(found[level, phase][fit]) for phase in phases)]
+        for level in levels
+        for fit in comparison["fits"]
+    ]
+    title = "Contrast at places of the texels, relative to path-traced values there (1 is right)"
+    return {"title": title, "head": ["level", "fit", *phases], "rows": rows}

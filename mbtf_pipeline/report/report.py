@@ -26,7 +26,7 @@ from mbtf_pipeline.report.training import read_training, training_context
 from mbtf_pipeline.run_folder import COMPARE, FITS, REPORT, RUN_NAME, SHARDS
 
 # Raised when the page changes; part of the stage's key.
-LAYOUT = 7
+LAYOUT = 8
 
 _TABLE = """
 {%- set below = t.head[-1] == "command" %}

@@ -32,7 +32,8 @@ def test_both_errors_of_a_group_are_significant_or_neither() -> None:
     direction = {"elevation": 45, "azimuth": 0}
     picture: dict[str, Any] = {"view": direction, "light": direction, "tiles_across": 1}
     picture["references"] = {"query": {"flip": flip}}
-    picture["fits"] = {"a": {"errors": {"query": error}, "flip": flip}}
+    contrast = {"query": {"luminance": number(0.95, 0.02), "chroma": None, "correlation": None}}
+    picture["fits"] = {"a": {"errors": {"query": error}, "flip": flip, "contrast": contrast}}
     test = {"a": {"splits": {"test": split}, "network_weights": 9, "texels": 9}}
     record: dict[str, Any] = {
         "fits": ["a"],
@@ -41,13 +42,18 @@ def test_both_errors_of_a_group_are_significant_or_neither() -> None:
         "white": 1.0,
         "definitions": {},
     }
-    record |= {"pictures": [picture], "test": test}
+    shown = {"a": number(1.1, 0.01)}
+    phases = [{"level": 3, "phase": phase, "fits": shown} for phase in ("centers", "corners")]
+    record |= {"pictures": [picture], "test": test, "phases": phases}
     context = error_context(record, 0.3)
     levels, cosines = (table["rows"] for table in context["group_tables"])
     assert levels[0] == ["0", "50", "not significant (11 ± 6 %)", "not significant (0.20 ± 0.09)"]
     assert levels[1] == ["1", "50", "20.0 ± 1.0 %", "0.400 ± 0.010"]
     assert cosines[0][0] == "0.3–0.4"
     assert context["facts"][0]["value"] == "20.0 ± 1.0 %"
+    # Of a gray material there is no chroma.
+    assert context["contrast_table"]["rows"][0][3:] == ["a", "0.95 ± 0.02", "–", "–"]
+    assert context["phase_table"]["rows"] == [["3", "a", "1.100 ± 0.010", "1.100 ± 0.010"]]
 
 
 def test_errors_over_training_time_have_error_bars() -> None:
