@@ -4,9 +4,9 @@
 
 FOLDER is that of ``relief.py``, whose fits are used where they are, and trained where they are missing. Each
 fit is compared with pixels of 0.5 to 32 tiles across, from above and from 16 degrees above the plane, by
-contrast of luminance, contrast of chroma and correlation of chroma, and with values at texel centers, quarters
-and corners. ``docs/how-to/read-the-report.md`` defines them. ``FOLDER/MATERIAL/pictures.png`` shows all pictures:
-path-traced, then each fit.
+contrast of luminance, contrast of chroma and correlation of chroma, and with values at texel centers,
+quarters and corners. ``docs/how-to/read-the-report.md`` defines them. ``FOLDER/MATERIAL/pictures.png`` shows
+all pictures: path-traced, then each fit.
 
 The last line is one JSON object with the figures and their thresholds for ``relief``, each up to two standard
 errors: luminance within 10 %, chroma at one tile across at least 0.9, places between texels within 5 %. Exit
