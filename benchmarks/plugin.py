@@ -1,7 +1,7 @@
 """One 1080p picture's queries, evaluated by the Mitsuba plugin and by PyTorch, or of two models.
 
     python benchmarks/plugin.py [--material FOLDER] [--runs 7] [--resolution 512] [--threads N]
-    python benchmarks/plugin.py --model relief [--places 4]
+    python benchmarks/plugin.py --model relief [--places 2]
 
 The queries are those of a perspective picture of the plane: 1920 × 1080 positions, footprints and views, one
 light. **unrolled** and **cooperative** are the plugin's ways to evaluate networks, ``unrolled`` its default
@@ -101,7 +101,7 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--model", choices=("neumip", "relief"), default="neumip")
-    parser.add_argument("--places", type=int, choices=(1, 4), default=1)
+    parser.add_argument("--places", type=int, choices=(1, 2, 4), default=1)
     parser.add_argument("--material", type=Path)
     parser.add_argument("--runs", type=int, default=7)
     parser.add_argument("--resolution", type=int, default=512, help="texels across, a power of two")

@@ -53,7 +53,7 @@ class EncodingSection(Settings):
 class ReliefSection(Settings):
     """What the model `relief` takes from the data set's geometry; every part can be left out."""
 
-    places: Literal[1, 4] = Field(
+    places: Literal[1, 2, 4] = Field(
         1, description="view rays that are traced per query, spread over its footprint"
     )
     hints: bool = Field(

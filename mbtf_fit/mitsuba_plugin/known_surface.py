@@ -62,8 +62,10 @@ class KnownSurface:
         """Stage 1: mean height over the places; of each place uv of the intersection, then the maps there."""
         sigma = 0.5 * dr.exp2(-level)
         total, out = mi.Float(0.0), []
+        along = azimuth(omega_o)
         for x, y in self._offsets:
-            at = mi.Point2f(dr.fma(sigma, x, u.x), dr.fma(sigma, y / self._aspect, u.y))
+            step = sigma * mi.Vector2f(y * along.x - x * along.y, (y * along.y + x * along.x) / self._aspect)
+            at = u + step
             z = self.height(at, omega_o)
             hit = displaced(at, z, omega_o, self._aspect)
             total += z
@@ -108,6 +110,12 @@ class KnownSurface:
         return dr.fma(
             0.5, dr.erf((elevation - mean) * dr.rsqrt(2.0 * dr.maximum(variance, LEAST_VARIANCE))), 0.5
         )
+
+
+def azimuth(omega: Vector3f) -> mi.Vector2f:
+    """Unit vectors of the azimuths of directions; (1, 0) of vertical ones."""
+    length = dr.sqrt(dr.fma(omega.x, omega.x, dr.square(omega.y)))
+    return dr.select(length > 0.0, mi.Vector2f(omega.x, omega.y) / length, mi.Vector2f(1.0, 0.0))
 
 
 def displaced(u: Point2f, height: Float, omega_o: Vector3f, aspect: float) -> Point2f:

@@ -65,8 +65,9 @@ class Textures:
         if len(self.shapes) == 1:
             return self._level(u, mi.UInt32(0), mi.Float(1.0), out, group)
         coarse, weight = self._coarse(level)
-        low = self._level(u, coarse, 1.0 - weight, out, group)
-        return self._level(u, coarse + 1, weight, low, group)
+        # A level of weight 0 is read where the other one is, from the same cache lines.
+        low = self._level(u, dr.select(weight < 1.0, coarse, coarse + 1), 1.0 - weight, out, group)
+        return self._level(u, dr.select(weight > 0.0, coarse + 1, coarse), weight, low, group)
 
     def side_by_side(self, u: Point2f, level: Float) -> list[Float]:
         """The same two terms, concatenated: that of the even level, then that of the odd one."""

@@ -32,11 +32,13 @@ AZIMUTHS, LIGHT_BLUR = 16, 0.8
 LEAST_LIGHT, LEAST_VIEW, ALPHA2, LEAST_VARIANCE = 0.01, 0.05, (1e-4, 4.0), 1e-8
 # Tile borders that a view ray may cross; a ray at a cosine of 1e-4 crosses more above deep surfaces.
 MAX_CROSSINGS = 64
-# Offsets of the places from the footprint's center, per axis, in σ; levels that lookups there are finer by.
-# Lookups at one place have the footprint itself. Four places at ±√(3/4) σ with half the footprint each have
-# the same variance.
+# Offsets of the places from the footprint's center, across and along the view's azimuth, in σ; levels that
+# lookups there are finer by. Lookups at one place have the footprint itself. Four places at ±√(3/4) σ with
+# half the footprint each have the same variance. Two places have it across the view alone, which gives most
+# of the gain.
 PLACES: dict[int, tuple[tuple[tuple[float, float], ...], float]] = {
     1: (((0.0, 0.0),), 0.0),
+    2: (tuple((x * math.sqrt(0.75), 0.0) for x in (-1, 1)), 1.0),
     4: (tuple((x * math.sqrt(0.75), y * math.sqrt(0.75)) for y in (-1, 1) for x in (-1, 1)), 1.0),
 }
 # Tensors of the surface in a material, before the level.

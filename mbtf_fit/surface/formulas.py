@@ -37,9 +37,10 @@ def surface_formula(surface: KnownSurface, places: int) -> dict[str, str]:
     return {
         "rotate(a, w)": "(w.x - a.x * s, w.y - a.y * s, a.z * w.z + t), where t = a.x * w.x + a.y * w.y, "
         "s = w.z + t / (1 + a.z)",
-        "places": f"x_j = u + 2^-l / 2 * o_j / (1, aspect), o_j: {named}; maps and horizons are read at the "
-        f"level l + {finer:g}, at most that of their last texture; z, e, n.x, n.y and core are means over "
-        "the places",
+        "places": "x_j = u + 2^-l / 2 * (o_j.x * (-a.y, a.x) + o_j.y * a) / (1, aspect), a = "
+        f"normalize(omega_o.x, omega_o.y), (1, 0) of a vertical omega_o; o_j: {named}; maps and horizons "
+        f"are read at the level l + {finer:g}, at most that of their last texture; z, e, n.x, n.y and core "
+        "are means over the places",
         "z": "height of the first point, from above, of the line x_j + t * omega_o that lies on the "
         "surface: heights surface.heights at texel centers, linear on the two triangles of each cell, which "
         "meet where x + y = 1, x along u and y along v from 0 to 1; at least that of the point where the "

@@ -195,7 +195,7 @@ class KnownSurface:
         omega_i, omega_o : (n, 3) tensor
             Unit vectors towards light and viewer, z > 0.
         places : int
-            Places of the footprint, 1 or 4.
+            Places of the footprint, 1, 2 or 4.
 
         Returns
         -------
@@ -210,8 +210,10 @@ class KnownSurface:
         sigma = 0.5 * torch.exp2(-level)[:, None]
         aspect = u.new_tensor([1.0, self.lattice.aspect])
         total, hits = u.new_zeros(len(u), 1), []
-        for offset in PLACES[places][0]:
-            at = u + sigma * u.new_tensor(offset) / aspect
+        along = _azimuth(omega_o)
+        across = torch.stack([-along[:, 1], along[:, 0]], 1)
+        for x, y in PLACES[places][0]:
+            at = u + sigma * (x * across + y * along) / aspect
             z = self.tracer.trace(at, omega_o)[:, None]
             hits.append(at + z / omega_o[:, 2:] * omega_o[:, :2] / aspect)
             total = total + z
@@ -259,6 +261,12 @@ class KnownSurface:
         variance = (square - mean.square()).clamp_min(0.0) + (LIGHT_BLUR * self.light_width) ** 2
         elevation = omega_i[:, 2:].clamp(0.0, 1.0).asin()
         return 0.5 + 0.5 * torch.erf((elevation - mean) / (2.0 * variance.clamp_min(LEAST_VARIANCE)).sqrt())
+
+
+def _azimuth(omega: Tensor) -> Tensor:
+    """Unit vectors (n, 2) of the azimuths of directions; (1, 0) of vertical ones."""
+    length = omega[:, :2].norm(dim=1, keepdim=True)
+    return torch.where(length > 0, omega[:, :2] / length, omega.new_tensor([1.0, 0.0]))
 
 
 def surface_bytes(lattice: Lattice) -> int:

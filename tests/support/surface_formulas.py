@@ -86,12 +86,20 @@ class WrittenSurface:
 
     def hints(self, u: F64, level: F64, omega_i: F64, omega_o: F64, places: int) -> tuple[F64, F64]:
         """(z (n,), [e, n.x, n.y, core] (n, 6)): means over the places."""
-        half = np.sqrt(0.75) if places == 4 else 0.0
-        offsets = [(0.0, 0.0)] if places == 1 else [(x * half, y * half) for y in (-1, 1) for x in (-1, 1)]
-        finer = 1 if places == 4 else 0
+        step = np.sqrt(0.75)
+        offsets = {
+            1: [(0.0, 0.0)],
+            2: [(-step, 0.0), (step, 0.0)],
+            4: [(x * step, y * step) for y in (-1, 1) for x in (-1, 1)],
+        }[places]
+        finer = 0 if places == 1 else 1
+        flat = omega_o[:, :2]
+        along = np.array([w / np.hypot(*w) if w.any() else [1.0, 0.0] for w in flat])
+        across = along[:, ::-1] * [-1, 1]
         heights, parts = [], []
         for offset in offsets:
-            x = u + (2.0**-level / 2)[:, None] * np.array(offset) / [1, self.aspect]
+            moved = offset[0] * across + offset[1] * along
+            x = u + (2.0**-level / 2)[:, None] * moved / [1, self.aspect]
             z = np.array([self.seen(*both) for both in zip(x, omega_o, strict=True)])
             hit = x + (z / omega_o[:, 2])[:, None] * omega_o[:, :2] / [1, self.aspect]
             heights.append(z)

@@ -120,9 +120,13 @@ EXPORT void mbtf_hints(const mbtf_surface *s, const mbtf_queries *q, float top, 
         const float size = 2.0f * q->sigma[k];
         const float level = clamped(-log2f(size > 1e-30f ? size : 1e-30f), 0.0f, top);
         const float sigma = 0.5f * exp2f(-level);
+        /* Unit vector of the view's azimuth; (1, 0) of a vertical one. */
+        const float length = sqrtf(o[0] * o[0] + o[1] * o[1]);
+        const float ax = length > 0.0f ? o[0] / length : 1.0f, ay = length > 0.0f ? o[1] / length : 0.0f;
         float sum[HINTS] = {0};
         for (int p = 0; p < s->places; p++) {
-            const float x = u[0] + sigma * s->offsets[2 * p], y = u[1] + sigma * s->offsets[2 * p + 1] / aspect;
+            const float across = sigma * s->offsets[2 * p], along = sigma * s->offsets[2 * p + 1];
+            const float x = u[0] + along * ax - across * ay, y = u[1] + (along * ay + across * ax) / aspect;
             const float z = mbtf_height(&s->heightfield, x, y, o, most), t = z / o[2];
             sum[0] += z;
             shade(s, level + s->finer, x + t * o[0], y + t * o[1] / aspect, i, o, sum + 1);

@@ -44,6 +44,7 @@ CASES: dict[str, dict[str, Any]] = {
         "glossy": False,
         **net(relief={"places": 4}, encoding={"half_vector": False}),
     },
+    "relief, two places": {"model": "relief", **net(relief={"places": 2})},
     "relief without hints": {"model": "relief", **net(relief={"hints": False}, oversampling=1)},
     "relief without gate": {
         "model": "relief",

@@ -68,6 +68,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "calibrated relief": {**relief(), **calibration(4)},
     "relief, one texel": {"finest": 0, **relief()},
     "no hints": relief(hints=False),
+    "two places": {"aspect": 0.5, **relief(places=2)},
     "no known frame, four places": relief(frame=False, places=4),
     "no gate": {"glossy": False, **relief(gate=False)},
     "tracing alone": relief(hints=False, frame=False, gate=False),

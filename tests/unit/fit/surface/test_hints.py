@@ -43,7 +43,7 @@ def surface(**options: Any) -> KnownSurface:
     return KnownSurface.of(geometry(LATTICE, np.zeros((8, 8), np.float32), **options), LATTICE, 0.0)
 
 
-@pytest.mark.parametrize("places", [1, 4])
+@pytest.mark.parametrize("places", [1, 2, 4])
 def test_a_flat_lambert_tile(places: int) -> None:
     found = compute_hints(surface(), *queries(500), places)
     wanted = torch.tensor([0.0, 1.0, 0.0, 0.0, *(c / math.pi for c in (0.5, 0.4, 0.3))])
@@ -115,7 +115,7 @@ def test_a_smooth_mirror_of_facets_keeps_the_energy() -> None:
 @needs_kernel
 @pytest.mark.parametrize("glossy", [True, False])
 @pytest.mark.parametrize("aspect", [1.0, 0.5])
-@pytest.mark.parametrize("places", [1, 4])
+@pytest.mark.parametrize("places", [1, 2, 4])
 def test_kernel_and_pytorch_agree(glossy: bool, aspect: float, places: int) -> None:
     lattice = Lattice(3, aspect)
     known = rough_surface(lattice, glossy=glossy)
