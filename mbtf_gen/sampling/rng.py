@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 MAX_SHARDS = 1 << 28
 # Data splits, reference pictures and pilots have separate streams.
-_SPLIT_NUMBER: dict[str, int] = {"train": 0, "test": 1, "reference": 2, "pilot": 3, "phase": 4}
+_SPLIT_NUMBER: dict[str, int] = {"train": 0, "test": 1, "reference": 2, "pilot": 3}
 
 
 class Purpose(IntEnum):

@@ -38,6 +38,8 @@ BLOCKS = 8
 PHASES: dict[str, float] = {"centers": 0.5, "quarters": 0.25, "corners": 0.0}
 # Queries of each phase, paths of each, and levels below the finest.
 _PHASE_QUERIES, _PHASE_PATHS, _PHASE_LEVELS = 1024, 256, (0, 2)
+# Random numbers beyond those of pictures.
+_FIRST_STREAM = 1 << 27
 
 DEFINITION = (
     "standard deviation over pixels of luminance L, and of chroma d = RGB - L mean(RGB) / mean(L), over that "
@@ -138,7 +140,7 @@ def phase_contrasts(
     for level in sorted({max(0, lattice.finest - below) for below in _PHASE_LEVELS}):
         for number, (phase, place) in enumerate(PHASES.items()):
             queries = phase_queries(lattice, level, place, omega_i, omega_o, _PHASE_QUERIES)
-            stream = Stream(seed, "phase", len(PHASES) * level + number)
+            stream = Stream(seed, "reference", _FIRST_STREAM + len(PHASES) * level + number)
             found = estimator.estimate(queries, _PHASE_PATHS, stream)
             arrays = queries.u, queries.sigma, queries.omega_i, queries.omega_o
             # Texels are in random order, so every 32nd one is a random subset.
