@@ -47,6 +47,7 @@ RELIEF: dict[str, Any] = {"model": "relief", "network": NETWORK}
 # What an ablation changes.
 PARTS: dict[str, dict[str, Any]] = {
     "relief": {},
+    "two places": {"relief": {"places": 2}},
     "four places": {"relief": {"places": 4}},
     "no gate": {"relief": {"gate": False}},
     "no hints": {"relief": {"hints": False}},

@@ -41,7 +41,8 @@ MODELS = {"neumip": NEUMIP, "relief": RELIEF, "four places": with_part("four pla
 WIDTHS = (0.5, 1.0, 2.0, 8.0, 32.0)
 # Elevations of the view, and direction of the light, in degrees.
 ELEVATIONS, LIGHT = (90.0, 16.0), (40.0, 30.0)
-SIZE, PATHS = 160, 256
+# Pixels as wide as texels at one tile across; at half a tile they are finer than the data.
+SIZE, PATHS = RESOLUTION, 256
 # Largest deviation of the contrast of luminance from 1, least contrast and correlation of chroma, largest
 # deviation at places between texels.
 THRESHOLDS = {"luminance": 0.1, "chroma": 0.9, "phase": 0.05}
@@ -81,12 +82,22 @@ def measure(name: str, folder: Path, time: str, seed: int) -> dict[str, Any]:
     return {"material": name, "pictures": rows, "phases": phases}
 
 
-def below(estimate: Mapping[str, float] | None, least: float) -> bool:
-    return estimate is not None and estimate["value"] + STANDARD_ERRORS * estimate["error"] < least
+def interval(estimate: Mapping[str, float | None] | None) -> tuple[float, float] | None:
+    """Two standard errors about an estimate, where it has both."""
+    value, error = (estimate["value"], estimate["error"]) if estimate else (None, None)
+    if value is None or error is None:
+        return None
+    return value - STANDARD_ERRORS * error, value + STANDARD_ERRORS * error
 
 
-def off(estimate: Mapping[str, float] | None, most: float) -> bool:
-    return estimate is not None and abs(estimate["value"] - 1) - STANDARD_ERRORS * estimate["error"] > most
+def below(estimate: Mapping[str, float | None] | None, least: float) -> bool:
+    found = interval(estimate)
+    return found is not None and found[1] < least
+
+
+def off(estimate: Mapping[str, float | None] | None, most: float) -> bool:
+    found = interval(estimate)
+    return found is not None and (found[0] > 1 + most or found[1] < 1 - most)
 
 
 def faults(found: Mapping[str, Any], label: str = "relief") -> Iterable[str]:
@@ -106,8 +117,11 @@ def faults(found: Mapping[str, Any], label: str = "relief") -> Iterable[str]:
             yield f"{row['fits'][label]['value']:.2f} at {row['phase']} of level {row['level']}"
 
 
-def text(estimate: Mapping[str, float] | None) -> str:
-    return "–" if estimate is None else f"{estimate['value']:.2f} ± {estimate['error']:.2f}"
+def text(estimate: Mapping[str, float | None] | None) -> str:
+    if estimate is None or estimate["value"] is None:
+        return "–"
+    error = "?" if estimate["error"] is None else f"{estimate['error']:.2f}"
+    return f"{estimate['value']:.2f} ± {error}"
 
 
 def show(found: Mapping[str, Any]) -> None:
