@@ -56,6 +56,9 @@ def test_a_gray_reference_has_no_chroma() -> None:
     assert found["chroma"] is None
     assert found["correlation"] is None
     assert found["luminance"].value == pytest.approx(1.0, abs=4 * found["luminance"].error)
+    # 0.02 · |OPPONENT| is 3.4 % of 0.3 times the mean luminance; 0.04 is 6.9 %.
+    assert of(picture(0.3, 1.0), halves(picture(0.3, 0.02), 0.0))["chroma"] is None
+    assert of(picture(0.3, 1.0), halves(picture(0.3, 0.04), 0.0))["chroma"] is not None
 
 
 def test_error_bars_cover_the_truth() -> None:
