@@ -43,12 +43,19 @@ def evaluate_in_chunks(
 
 
 def predict(
-    model: NeuralMaterial, u: ArrayLike, sigma: ArrayLike, omega_i: ArrayLike, omega_o: ArrayLike
+    model: NeuralMaterial,
+    u: ArrayLike,
+    sigma: ArrayLike,
+    omega_i: ArrayLike,
+    omega_o: ArrayLike,
+    *,
+    hints: Tensor | None = None,
 ) -> NDArray[np.float32]:
-    """Values (n, 3) of a model in 1/sr, clamped at 0."""
+    """Values (n, 3) of a model in 1/sr, clamped at 0. `hints` (n, 7) of `relief` are computed where they are
+    not given."""
     found = kernel()
     if found is not None and supports(model):
-        return _predict_natively(found, model, u, sigma, omega_i, omega_o)
+        return _predict_natively(found, model, hints, u, sigma, omega_i, omega_o)
     device = next(model.parameters()).device
     arrays = (u, sigma, omega_i, omega_o)
     return evaluate_in_chunks(
@@ -56,7 +63,9 @@ def predict(
     )
 
 
-def _predict_natively(found: Kernel, model: NeuralMaterial, *arrays: ArrayLike) -> NDArray[np.float32]:
+def _predict_natively(
+    found: Kernel, model: NeuralMaterial, hints: Tensor | None, *arrays: ArrayLike
+) -> NDArray[np.float32]:
     assert isinstance(model, Neumip)
     inputs = [np.ascontiguousarray(a, np.float32) for a in arrays]
     n = len(inputs[1])
@@ -67,7 +76,8 @@ def _predict_natively(found: Kernel, model: NeuralMaterial, *arrays: ArrayLike) 
     out = np.empty((n, 3), np.float32)
     read = list(inputs)
     if isinstance(model, Relief):
-        read.append(model.hints(*map(torch.from_numpy, inputs)).numpy())
+        given = model.hints(*map(torch.from_numpy, inputs)) if hints is None else hints
+        read.append(np.ascontiguousarray(given.numpy()))
 
     def evaluate(start: int, stop: int) -> None:
         addresses = (a.ctypes.data + start * a.strides[0] for a in read)

@@ -35,12 +35,12 @@ from mbtf_fit.data.streaming import StreamedQueries
 from mbtf_fit.models.neumip import KNOTS
 
 # Most training queries that are used, and queries per block.
-MAX_QUERIES = 1 << 22
+MAX_QUERIES = 1 << 21
 _CHUNK = 1 << 18
 # Footprint of level 0.
 _COARSEST = np.float32(0.5)
 # Points per level, at most; fewer where queries are few.
-POINTS = 1 << 20
+POINTS = 1 << 19
 _LEAST_POINTS = 1 << 12
 # Prior standard deviations of the factors: of second differences between knots, and of distances from 1.
 CURVATURES, DISTANCES = (0.0003, 0.001, 0.003, 0.01), (0.003, 0.01, 0.03)
@@ -53,7 +53,7 @@ _PRIORS = np.stack(
     ]
 )
 # Relative error of means of level 0 over low-discrepancy points.
-POINT_ERROR = 3e-4
+POINT_ERROR = 6e-4
 # Bins of the cosine.
 _BINS = 16 * (KNOTS - 1)
 # Hat functions about the knots at the bins' middles: (bins, knots).
@@ -67,8 +67,8 @@ ROUNDS = 2
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
-# Values (n, 3) at u, sigma, omega_i, omega_o.
-Evaluate = Callable[[F32, F32, F32, F32], F32]
+# Values (n, 3) at u, sigma, omega_i, omega_o, and at hints of `relief` where they are known.
+Evaluate = Callable[..., F32]
 
 
 def _bin(omega: F32) -> NDArray[np.int64]:
@@ -136,7 +136,8 @@ def fit_calibration(
     for start in range(0, used, _CHUNK):
         part = queries.slice(start, min(start + _CHUNK, used))
         u, sigma, *directions = (a.cpu().numpy() for a in (part.u, part.sigma, part.omega_i, part.omega_o))
-        own = evaluate(u, sigma, *directions)
+        known = {} if part.hints is None else {"hints": part.hints}
+        own = evaluate(u, sigma, *directions, **known)
         residual = part.value.cpu().numpy() - own
         most = bound(part.value.new_tensor(own))
         if most is not None:
