@@ -7,7 +7,6 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 
 from mbtf_core.errors import InputError, UsageError
 from mbtf_core.lattice import Lattice
@@ -15,7 +14,8 @@ from mbtf_core.shard_schema import SPLITS, ShardEntry, Split
 from mbtf_gen.config.generator import GeneratorConfig, count_queries
 from mbtf_gen.geometry.heightfield import HeightGrid
 from mbtf_gen.material.checks import displacement_fault
-from mbtf_gen.material.material import Material, load_material
+from mbtf_gen.material.latest import latest_material
+from mbtf_gen.material.material import Material
 from mbtf_gen.render.estimates import TARGET_PILOT_SPP, Target
 from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
 
@@ -58,7 +58,7 @@ class Job:
         InputError
             The material cannot be used.
         """
-        return cls.of(config, load_material(Path(config.material), config.geometry.make_tileable))
+        return cls.of(config, latest_material(config.material, config.geometry.make_tileable))
 
     @classmethod
     def of(cls, config: GeneratorConfig, material: Material) -> Job:

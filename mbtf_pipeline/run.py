@@ -204,9 +204,9 @@ def _unfinished(out: Path, config: FitConfig, shards: Path) -> bool:
 
 
 def _material_inputs(recipe: Recipe) -> dict[str, str]:
-    from mbtf_gen.material.material import load_material
+    from mbtf_gen.material.latest import latest_material
 
-    return dict(load_material(recipe.generate.material).digests)
+    return dict(latest_material(recipe.generate.material).digests)
 
 
 def run_recipe(

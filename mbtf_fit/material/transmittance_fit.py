@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from mbtf_core.lattice import Lattice, level_of_sigma
 from mbtf_core.stats import Estimate, mean_estimate
@@ -30,7 +31,7 @@ _TRAILING = {"u": (2,), "sigma": (), "omega_o": (3,), "transmittance": (), "spp"
 # Queries and texels per block; most queries of a split that are evaluated.
 _BLOCK, _TEXELS, _EVALUATED = 1 << 16, 1 << 16, 1 << 18
 # Upper triangle of a texel's matrix.
-_PAIRS = [(a, b) for a in range(COEFFICIENTS) for b in range(a, COEFFICIENTS)]
+_FIRST, _SECOND = np.triu_indices(COEFFICIENTS)
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -54,30 +55,25 @@ def _blocks(path: Path, chosen: NDArray[np.bool_] | None = None) -> Iterator[Arr
 
 
 class _Sums:
-    """Normal equations of a level's texels."""
+    """Normal equations of a level's texels: upper triangles of their matrices, then right-hand sides."""
 
     def __init__(self, lattice: Lattice, level: int) -> None:
         self.lattice, self.level = lattice, level
-        self.squares = np.zeros((len(_PAIRS), lattice.texels(level)))
-        self.products = np.zeros((COEFFICIENTS, lattice.texels(level)))
+        self.sums = np.zeros((lattice.texels(level), len(_FIRST) + COEFFICIENTS))
 
-    def add(self, block: Arrays) -> None:
-        """Add a block of queries."""
-        level = np.clip(level_of_sigma(block["sigma"].astype(np.float64)), 0.0, self.lattice.finest)
+    def add(self, u: F32, level: F64, products: F64) -> None:
+        """Add queries at `u` (n, 2), fractional levels (n,), with their terms (n, 27) of the sums."""
         near = np.flatnonzero(np.abs(level - self.level) < 1.0)
-        texel, share = corners(block["u"][near], self.lattice.shape(self.level))
+        texel, share = corners(u[near], self.lattice.shape(self.level))
         share *= (1.0 - np.abs(level[near] - self.level))[:, None]
-        query = np.repeat(np.arange(len(near)), 4)
-        # Most texels of a fine level have no query in the block.
-        found, index = np.unique(texel.ravel(), return_inverse=True)
-        weight, terms = share.ravel(), basis(block["omega_o"][near])
-        through = block["transmittance"][near].astype(np.float64)
-        for k, (a, b) in enumerate(_PAIRS):
-            x = weight * (terms[:, a] * terms[:, b])[query]
-            self.squares[k, found] += np.bincount(index, x, len(found))
-        for a in range(COEFFICIENTS):
-            x = weight * (terms[:, a] * through)[query]
-            self.products[a, found] += np.bincount(index, x, len(found))
+        # Most texels of a fine level have no query here.
+        found = np.zeros(len(self.sums), bool)
+        found[texel] = True
+        index = (np.cumsum(found) - 1)[texel]
+        pointers = np.arange(0, share.size + 1, 4)
+        shape = len(near), int(found.sum())
+        shares = csr_array((share.ravel(), index.ravel(), pointers), shape=shape)
+        self.sums[found] += shares.T @ products[near]
 
     def solve(self, levels: list[F32]) -> None:
         """Solve for the texels of the level and write them to `levels`, whose coarser level is complete."""
@@ -87,10 +83,10 @@ class _Sums:
             part = slice(start, min(start + _TEXELS, len(out)))
             prior = _from_coarser(levels, self.lattice, self.level, np.arange(part.start, part.stop))
             matrix = np.empty((len(prior), COEFFICIENTS, COEFFICIENTS))
-            for k, (a, b) in enumerate(_PAIRS):
-                matrix[:, a, b] = matrix[:, b, a] = self.squares[k, part]
+            for k, (a, b) in enumerate(zip(_FIRST, _SECOND, strict=True)):
+                matrix[:, a, b] = matrix[:, b, a] = self.sums[part, k]
             matrix += ridge * np.eye(COEFFICIENTS)
-            right = self.products[:, part].T + ridge * prior
+            right = self.sums[part, len(_FIRST) :] + ridge * prior
             out[part] = np.linalg.solve(matrix, right[..., None])[..., 0]
 
 
@@ -115,8 +111,12 @@ def fit_transmittance(data: Dataset, selection: Selection) -> Transmittance | No
     sums = [_Sums(lattice, s) for s in range(lattice.finest + 1)]
     for path, chosen in selection.masks():
         for block in _blocks(path, chosen):
+            level = np.clip(level_of_sigma(block["sigma"].astype(np.float64)), 0.0, lattice.finest)
+            terms = basis(block["omega_o"])
+            right = terms * block["transmittance"].astype(np.float64)[:, None]
+            products = np.concatenate([terms[:, _FIRST] * terms[:, _SECOND], right], 1)
             for part in sums:
-                part.add(block)
+                part.add(block["u"], level, products)
     for part in sums:
         part.solve(levels)
     return Transmittance(lattice, levels)

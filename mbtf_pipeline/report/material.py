@@ -12,7 +12,8 @@ from mbtf_core.color import linear_to_srgb
 from mbtf_core.errors import MbtfError
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.material.inspect import USES, inspect_material, inspection_text
-from mbtf_gen.material.material import MAPS, load_material
+from mbtf_gen.material.latest import latest_material
+from mbtf_gen.material.material import MAPS
 from mbtf_pipeline.report.embed import U8, Pixels, jpeg_uri, shrink
 
 # Largest width and height of a thumbnail, pixels, and its JPEG quality.
@@ -37,7 +38,7 @@ def material_section(config: GeneratorConfig, inputs: Mapping[str, str]) -> dict
     nothing = {"maps": [], "warnings": [], "inspection": ""}
     geometry = config.geometry
     try:
-        material = load_material(config.material, geometry.make_tileable)
+        material = latest_material(config.material, geometry.make_tileable)
         found = inspect_material(material, geometry.height_scale, geometry.mesh)
     except (MbtfError, OSError) as error:
         return nothing | {"missing": f"The material cannot be read any more: {error}"}
