@@ -3,8 +3,8 @@
     python benchmarks/quality.py --out FOLDER [--only MATERIAL:QUALITY ...] [--store] [--check]
     python benchmarks/quality.py --table
 
-Runs ``mbtf-pipeline run --quality`` in a process of its own: ``draft`` and ``standard`` on six texture sets
-that lie beside the project, ``high`` on one of them. ``paper`` needs a GPU and is not run. ``--only``
+Runs ``mbtf-pipeline run --quality`` in a process of its own: ``draft`` on six texture sets that lie beside
+the project, ``standard`` on three of them, ``high`` on one. ``paper`` needs a GPU and is not run. ``--only``
 (repeatable) selects single runs, also of ``assets/``, such as ``turtle_shell:draft``. FOLDER keeps every
 finished run, so the same command resumes; a run is repeated only if its preset has changed since.
 
@@ -54,8 +54,11 @@ HEIGHT_SCALES: dict[str, float] = {
     "stone_bricks": 0.06,
     "tree_bark": 0.1,
 }
-# The texture set of the `high` run.
-LONG = "rock_cliff"
+# Texture sets of the longer runs.
+LONGER: dict[Quality, tuple[str, ...]] = {
+    "standard": ("metal_plate", "rock_cliff", "tree_bark"),
+    "high": ("rock_cliff",),
+}
 # Seconds of a whole run.
 THRESHOLDS = {"draft": 60.0, "standard": 600.0}
 # Largest factors between a stored figure and a new one.
@@ -185,8 +188,8 @@ def requested(only: Sequence[str] | None) -> list[tuple[str, Quality]]:
     SystemExit : an unknown material or preset
     """
     if not only:
-        short: tuple[Quality, ...] = ("draft", "standard")
-        return [*((name, q) for q in short for name in HEIGHT_SCALES), (LONG, "high")]
+        sets: dict[Quality, tuple[str, ...]] = {"draft": tuple(HEIGHT_SCALES), **LONGER}
+        return [(name, quality) for quality, names in sets.items() for name in names]
     out: list[tuple[str, Quality]] = []
     for text in only:
         name, _, quality = text.partition(":")
