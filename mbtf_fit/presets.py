@@ -35,7 +35,7 @@ _MODELS: tuple[ModelName, ...] = ("relief", "neumip", "neumip-baseline")
 
 # Budget of each preset.
 FITTER: dict[Quality, dict[str, Any]] = {
-    "draft": {"training.time": "15s", "training.steps": None},
+    "draft": {"training.time": "12s", "training.steps": None},
     "standard": {"training.time": "3min", "training.steps": None},
     "high": {"training.time": "10min", "training.steps": None},
     # Kuznetsov et al. 2021: 30 000 steps of 2^20 queries.

@@ -294,10 +294,11 @@ def _shadowing(scene: _Analysis, bounds: DisplacementBounds | None) -> Effect:
     lowest = float(np.arcsin(config.queries.min_cos) - LOBE_TAIL * np.radians(config.light.width))
     slopes = f"slopes up to {_degrees(scene.steepest)}"
     if lowest > 0 and scene.steepest <= np.tan(lowest):
-        text = f"{slopes}, light no lower than {_degrees(np.tan(lowest))}"
+        text = f"{slopes}, light and its kernel no lower than {_degrees(np.tan(lowest))}"
         below = LOBE_TAIL_SHARE if config.light.width > 0 else 0.0
         return Effect("shadowing", True, text, below, "bound")
-    text = f"{slopes}, light down to {'the horizon' if lowest <= 0 else _degrees(np.tan(lowest))}"
+    least = "the horizon" if lowest <= 0 else _degrees(np.tan(lowest))
+    text = f"{slopes}, light and its kernel down to {least}"
     return Effect("shadowing", True, text, bounds.shadowing if bounds else None, "pilot")
 
 

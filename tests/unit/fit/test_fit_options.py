@@ -57,7 +57,7 @@ def test_a_resolved_configuration_with_steps_reads_back(tmp_path: Path) -> None:
 def test_presets_keep_what_sections_set() -> None:
     single = config_of("--quality", "draft", "--set", "training.batch=50")
     assert config_of("--quality", "draft", "--set", "training={batch: 50}") == single
-    assert (single.training.time, single.network.width) == (15.0, 40)
+    assert (single.training.time, single.network.width) == (12.0, 40)
 
 
 def test_presets_keep_what_flags_set() -> None:

@@ -83,7 +83,7 @@ def test_longer_training_gets_a_larger_network() -> None:
     assert widths == sorted(widths)
     assert widths[0] < widths[-1]
     # The network follows the training time; counted steps count as the longest.
-    assert best_at("draft") == best_options(15.0)
+    assert best_at("draft") == best_options(12.0)
     assert best_at("high") == best_options(600.0) == best_at("paper")
     path = ROOT / "pipelines" / "rock_cliff.yaml"
     assert "fit.neumip.network.width=64" in quality_assignments(path, "high")
@@ -107,7 +107,7 @@ def test_explicit_options_override_the_preset(tmp_path: Path) -> None:
     file.write_text("training: {steps: 7}\n")
     resolved = resolve(FitConfig, file=file, assignments=as_assignments(FITTER["draft"]))
     assert resolved.training.steps is None
-    assert resolved.training.time == 15
+    assert resolved.training.time == 12
 
 
 SECTIONS = [
@@ -125,7 +125,7 @@ def test_a_section_overrides_the_preset_value_by_value(section: str, single: str
     path.write_text("name: r\ngenerate: {material: height.npy}\nfit: {neumip: {}}\n")
     found, expected = (preset_recipe(path, "draft", [text]) for text in (section, single))
     assert found == expected
-    assert found.fit["neumip"].training.time == 15
+    assert found.fit["neumip"].training.time == 12
 
 
 def test_a_section_replaces_the_fits_of_the_file(tmp_path: Path) -> None:

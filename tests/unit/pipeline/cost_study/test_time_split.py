@@ -105,7 +105,7 @@ def test_less_than_a_draft_is_a_smaller_draft(fake: Machine, one: Path) -> None:
     assert found.split.quality == "draft"
     assert found.split.scale < 1.0
     assert found.split.queries < 400 * 128**2
-    assert found.split.training_each < 15.0
+    assert found.split.training_each < 12.0
     assert seconds_of(found) == pytest.approx(0.96 * 90.0, rel=0.02)
 
 
@@ -127,7 +127,7 @@ def test_training_is_shortened_when_generating_overran(fake: Machine, one: Path)
     late = timed(one, 120.0, folder=one.parent / "late", progress=notes.append)
     fake.now = 500.0
     # No less than the preset's: never worse.
-    assert late.generated(late.recipe).fit["neumip"].training.time == 15.0
+    assert late.generated(late.recipe).fit["neumip"].training.time == 12.0
     assert "the run will be about" in notes[-1]
 
 
