@@ -28,7 +28,7 @@ PILOT_SECONDS = (4.0, 8.0)
 PERSISTENCE = 0.45
 # Seconds of a fit besides training (loading, calibration, evaluation), of each query of its data, and of each
 # query's transmittance, on two processor cores (benchmarks/quality.py, benchmarks/time_against_presets.py).
-FIT_SECONDS, _QUERY_SECONDS, _TRANSMITTANCE_SECONDS = 1.5, 0.6e-6, 1.6e-6
+FIT_SECONDS, _QUERY_SECONDS, _TRANSMITTANCE_SECONDS = 4.0, 1.1e-6, 0.4e-6
 # Fits of fewer queries in all steps take less than a minute at a third of a million queries per second.
 LONG_FIT = 20_000_000
 # Seconds of the pilot of a fit by steps.
