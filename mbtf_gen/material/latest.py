@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from mbtf_core.digest import file_sha256
 from mbtf_core.shard_schema import Tiling
-from mbtf_gen.material.material import MAPS, Material, described, load_material
+from mbtf_gen.material.material import MAPS, Material, described, material_of
 
 # Bytes of the maps up to which a material is kept: a training process has no use for larger ones.
 _KEPT_BYTES = 1 << 28
@@ -35,13 +36,15 @@ def latest_material(path: str | Path, tile: Tiling | None = None) -> Material:
         As ``load_material``.
     """
     global _kept
-    asked = (*described(Path(path)), tile)
+    spec, folder, found = described(Path(path))
+    # Loading adds notes to `found`.
+    asked = (spec, folder, replace(found, notes=[*found.notes]), tile)
     if _kept is not None and _kept[0] == asked and _unchanged(_kept[1]):
         return _kept[1]
-    found = load_material(path, tile)
-    size = sum(np.asarray(getattr(found, name)).nbytes for name in MAPS)
-    _kept = (asked, found) if size <= _KEPT_BYTES else None
-    return found
+    material = material_of(spec, folder, found, tile)
+    size = sum(np.asarray(getattr(material, name)).nbytes for name in MAPS)
+    _kept = (asked, material) if size <= _KEPT_BYTES else None
+    return material
 
 
 def _unchanged(material: Material) -> bool:
