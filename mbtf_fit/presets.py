@@ -11,25 +11,25 @@ from mbtf_fit.config import DEFAULT_MODEL, ModelName
 from mbtf_gen.config.presets import Quality
 
 # Options of least error per time in the cost studies: larger networks and textures than the paper's, growing
-# with the training time (seconds); for the models of the paper directions with z, and smooth textures where
-# data are few.
-_SIZES: tuple[tuple[float, dict[str, Any]], ...] = (
+# with the training time (seconds).
+_Sizes = tuple[tuple[float, dict[str, Any]], ...]
+_NEUMIP: _Sizes = (
     (0.0, {"network.width": 40, "network.channels": 12}),
     (300.0, {"network.width": 64, "network.channels": 16}),
 )
-# Oversampled textures of `relief` gain nothing from more channels in a few minutes, and steps take longer.
-_RELIEF_SIZES: tuple[tuple[float, dict[str, Any]], ...] = (
-    (0.0, {"network.width": 40, "network.channels": 8}),
-    (300.0, {"network.width": 64, "network.channels": 16}),
-)
-_NEUMIP: dict[str, Any] = {
+# For the models of the paper: directions with z, and smooth textures where data are few.
+_SMOOTH: dict[str, Any] = {
     "network.encoding.direction_xyz": True,
     "training.texture_weight_decay": 1.0,
     "training.blur.min_sigma": 0.8,
 }
-# View rays per footprint of `relief`, by the training time: two take 1.3 times as long to evaluate, four
-# twice.
-_PLACES: tuple[tuple[float, int], ...] = ((0.0, 1), (100.0, 2), (300.0, 4))
+# Oversampled textures of `relief` gain nothing from more channels in a few minutes, and steps take longer.
+# Two view rays per footprint take 1.3 times as long to evaluate, four twice.
+_RELIEF: _Sizes = (
+    (0.0, {"network.width": 40, "network.channels": 8, "network.relief.places": 1}),
+    (100.0, {"network.width": 40, "network.channels": 8, "network.relief.places": 2}),
+    (300.0, {"network.width": 64, "network.channels": 16, "network.relief.places": 4}),
+)
 # Models that have such options.
 _MODELS: tuple[ModelName, ...] = ("relief", "neumip", "neumip-baseline")
 
@@ -48,11 +48,8 @@ def best_options(seconds: float, model: ModelName = DEFAULT_MODEL) -> dict[str, 
     cores; none for a model other than `relief`, `neumip` and its baseline."""
     if model not in _MODELS:
         return {}
-    sizes = _RELIEF_SIZES if model == "relief" else _SIZES
-    size = [size for least, size in sizes if seconds >= least][-1]
-    if model != "relief":
-        return size | _NEUMIP
-    return size | {"network.relief.places": [n for least, n in _PLACES if seconds >= least][-1]}
+    sizes, rest = (_RELIEF, {}) if model == "relief" else (_NEUMIP, _SMOOTH)
+    return [size for least, size in sizes if seconds >= least][-1] | rest
 
 
 def best_at(quality: Quality, model: ModelName = DEFAULT_MODEL) -> dict[str, Any]:

@@ -57,7 +57,7 @@ def predict(
     if found is not None and supports(model):
         return _predict_natively(found, model, hints, u, sigma, omega_i, omega_o)
     device = next(model.parameters()).device
-    arrays = (u, sigma, omega_i, omega_o)
+    arrays = (u, sigma, omega_i, omega_o, *([] if hints is None else [hints.cpu()]))
     return evaluate_in_chunks(
         lambda *a: model(*a).clamp_min(0), device, 3, *arrays, chunk=max(1, _CHUNK // model.positions)
     )

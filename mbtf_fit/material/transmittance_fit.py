@@ -12,12 +12,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 
 from mbtf_core.lattice import Lattice, level_of_sigma
 from mbtf_core.stats import Estimate, mean_estimate
 from mbtf_fit.material.transmittance import COEFFICIENTS, Transmittance, basis, corners
+from mbtf_fit.models.lookup import add_up
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.dataset.shard_io import Arrays, check_values, read_shard
 
@@ -72,10 +73,8 @@ class _Sums:
         found = np.zeros(len(self.sums), bool)
         found[texel] = True
         index = (np.cumsum(found) - 1)[texel]
-        pointers = np.arange(0, share.size + 1, 4)
-        shape = len(near), int(found.sum())
-        shares = csr_array((share.ravel(), index.ravel(), pointers), shape=shape)
-        self.sums[found] += shares.T @ products[near]
+        places, shares, values = map(torch.from_numpy, (index, share, products[near]))
+        self.sums[found] += add_up(places, shares, values, int(found.sum())).numpy()
 
     def solve(self, levels: list[F32]) -> None:
         """Solve for the texels of the level and write them to `levels`, whose coarser level is complete."""
@@ -108,10 +107,10 @@ def _first(selection: Selection, count: int) -> Iterator[Arrays]:
     """Blocks of the first selected rows, until they are as many as `count`; rows are in random order."""
     for path, chosen in selection.masks():
         for block in _blocks(path, chosen):
+            yield block
+            count -= len(block["sigma"])
             if count <= 0:
                 return
-            count -= len(block["sigma"])
-            yield block
 
 
 def fit_transmittance(data: Dataset, selection: Selection) -> Transmittance | None:

@@ -45,7 +45,7 @@ def compute_hints(
     u, sigma, omega_i, omega_o : (n, 2), (n,), (n, 3), (n, 3) tensors
         Position in uv, footprint in tile widths, light and view.
     places : int
-        Places of the footprint that are traced: 1 or 4.
+        Places of the footprint that are traced: 1, 2 or 4.
 
     Returns
     -------

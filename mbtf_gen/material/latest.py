@@ -37,11 +37,12 @@ def latest_material(path: str | Path, tile: Tiling | None = None) -> Material:
     """
     global _kept
     spec, folder, found = described(Path(path))
+    method = spec.tiling(tile)
     # Loading adds notes to `found`.
-    asked = (spec, folder, replace(found, notes=[*found.notes]), tile)
+    asked = (spec, folder, replace(found, notes=[*found.notes]), method)
     if _kept is not None and _kept[0] == asked and _unchanged(_kept[1]):
         return _kept[1]
-    material = material_of(spec, folder, found, tile)
+    material = material_of(spec, folder, found, method)
     size = sum(np.asarray(getattr(material, name)).nbytes for name in MAPS)
     _kept = (asked, material) if size <= _KEPT_BYTES else None
     return material

@@ -219,12 +219,12 @@ def load_material(path: str | Path, tile: Tiling | None = None) -> Material:
     InputError
         A file is missing, unreadable or ambiguous, a value is out of range, or aspects differ.
     """
-    return material_of(*described(Path(path)), tile)
+    spec, folder, found = described(Path(path))
+    return material_of(spec, folder, found, spec.tiling(tile))
 
 
-def material_of(spec: MaterialFile, folder: Path, found: FoundMaps, tile: Tiling | None) -> Material:
+def material_of(spec: MaterialFile, folder: Path, found: FoundMaps, tile: Tiling) -> Material:
     """The material that :func:`described` found."""
-    tile = tile or spec.make_tileable or "none"
     material = _assemble(spec, folder, found, tile)
     return material if tile == "none" else _retiled(material, tile)
 

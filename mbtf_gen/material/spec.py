@@ -148,6 +148,10 @@ class MaterialFile(Settings):
             raise ValueError("'bsdf' needs a 'type', such as diffuse")
         return self
 
+    def tiling(self, given: Tiling | None) -> Tiling:
+        """Method for maps that do not tile: the given one, else that of the file, else ``none``."""
+        return given or self.make_tileable or "none"
+
 
 def read_material_file(path: Path) -> MaterialFile:
     """Read a ``material.yaml``."""

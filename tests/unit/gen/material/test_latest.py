@@ -29,6 +29,8 @@ def folder(tmp_path: Path) -> Path:
 def test_an_unchanged_material_is_not_decoded_again(folder: Path) -> None:
     first = latest_material(folder)
     assert latest_material(folder) is first
+    # A job states the method that it found.
+    assert latest_material(folder, "none") is first
     assert latest_material(folder, "mirror") is not first
 
 
