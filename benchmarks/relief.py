@@ -1,14 +1,15 @@
-"""The model ``relief`` against ``neumip``: error at equal training time, and what each part of it is worth.
+"""``relief`` and ``neumip+`` against ``neumip``: error at equal training time, and what each part is worth.
 
     python benchmarks/relief.py --out FOLDER [MATERIAL ...] [--time 60s] [--seed 0]
-    python benchmarks/relief.py --out FOLDER --ablation [MATERIAL] [--time 30s]
+    python benchmarks/relief.py --out FOLDER --ablation relief|neumip+ [MATERIAL] [--time 30s]
 
-For each material, both models are trained for the same time on the same data: those of the preset ``draft``
+For each material, all models are trained for the same time on the same data: those of the preset ``draft``
 at 128 texels across, of the five ``assets/`` and of six texture sets that lie beside the project. Test
-queries have 256 paths: with fewer, the noise of highlights hides the differences. Both models have networks
-of the same width; ``relief`` is also trained with four places. ``--ablation`` leaves out one part of
-``relief`` at a time, on one material (``rock_cliff`` by default). FOLDER keeps data and figures, so the same
-command resumes.
+queries have 256 paths: with fewer, the noise of highlights hides the differences. The models have the
+networks of ``draft``, of the same width; ``relief`` is also trained with four places. ``neumip+`` is not given
+the geometry: it learns heights. On the materials of Kuznetsov et al. 2021, ``neumip-baseline`` is trained,
+too, for the ratios that they published. ``--ablation`` leaves out one part of a model at a time, on one
+material (``rock_cliff`` by default). FOLDER keeps data and figures, so the same command resumes.
 
 The last line is one JSON object with the figures and their thresholds: the unexplained variance of the test
 queries over that of ``neumip`` is at most 0.6 on displaced materials, and nowhere above 1 by more than two
@@ -32,33 +33,46 @@ from mbtf_core.nested import deep_merge
 from mbtf_fit import FitConfig, fit
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.generation import generate
+from mbtf_pipeline.paper_tables.published import mse_ratio
 
 RESOLUTION = 128
 # Paths per test query.
 TEST_SPP = 256
-# Width and channels of both models' networks.
-NETWORK = {"width": 40, "channels": 12}
 NEUMIP: dict[str, Any] = {
     "model": "neumip",
-    "network": {**NETWORK, "encoding": {"direction_xyz": True}},
+    "network": {"width": 40, "channels": 12, "encoding": {"direction_xyz": True}},
     "training": {"texture_weight_decay": 1.0, "blur": {"min_sigma": 0.8}},
 }
-RELIEF: dict[str, Any] = {"model": "relief", "network": NETWORK}
-# What an ablation changes.
-PARTS: dict[str, dict[str, Any]] = {
-    "relief": {},
-    "two places": {"relief": {"places": 2}},
-    "four places": {"relief": {"places": 4}},
-    "no gate": {"relief": {"gate": False}},
+BASELINE: dict[str, Any] = {**NEUMIP, "model": "neumip-baseline"}
+RELIEF: dict[str, Any] = {"model": "relief", "network": {"width": 40, "channels": 8}}
+LEARNED: dict[str, Any] = {"model": "neumip+", "network": {"width": 40, "channels": 12}}
+# What an ablation changes in the network, by model.
+COMMON: dict[str, dict[str, Any]] = {
     "no hints": {"relief": {"hints": False}},
     "no known frame": {"relief": {"frame": False}},
     "no half and difference vector": {"encoding": {"half_vector": False}},
-    "no oversampling": {"oversampling": 1},
     "tracing alone": {
         "relief": {"gate": False, "hints": False, "frame": False},
         "encoding": {"half_vector": False},
         "oversampling": 1,
     },
+}
+PARTS: dict[str, dict[str, dict[str, Any]]] = {
+    "relief": {
+        "relief": {},
+        "two places": {"relief": {"places": 2}},
+        "four places": {"relief": {"places": 4}},
+        "no gate": {"relief": {"gate": False}},
+        "no oversampling": {"oversampling": 1},
+        **COMMON,
+    },
+    "neumip+": {"neumip+": {}, **{f"neumip+, {part}": change for part, change in COMMON.items()}},
+}
+MODELS: dict[str, dict[str, Any]] = {
+    "neumip": NEUMIP,
+    "neumip+": LEARNED,
+    "relief": RELIEF,
+    "four places": deep_merge(RELIEF, {"network": PARTS["relief"]["four places"]}),
 }
 THRESHOLDS = {"displaced": 0.6, "any": 1.0}
 STANDARD_ERRORS = 2.0
@@ -79,7 +93,7 @@ def train(
     label: str, options: dict[str, Any], data: Path, folder: Path, time: str, seed: int
 ) -> dict[str, Any]:
     """Error of one fit; kept in a folder."""
-    name = f"{re.sub('[^a-z]+', '-', label)}-{time}-{seed}"
+    name = fit_name(label, time, seed)
     path = folder / f"{name}.json"
     if path.exists():
         return read_json(path)
@@ -101,29 +115,37 @@ def train(
     return found
 
 
-def with_part(label: str) -> dict[str, Any]:
-    """Configuration of ``relief`` with one change of an ablation."""
-    return deep_merge(RELIEF, {"network": PARTS[label]})
+def fit_name(label: str, time: str, seed: int) -> str:
+    """Folder of a fit, in that of its material."""
+    return f"{re.sub('[^a-z+]+', '-', label)}-{time}-{seed}"
+
+
+def ratio_of(a: dict[str, Any], b: dict[str, Any]) -> tuple[float, float]:
+    """Error of a fit over that of another, and its standard error."""
+    ratio = a["value"] / b["value"]
+    return ratio, ratio * math.hypot(a["error"] / a["value"], b["error"] / b["value"])
 
 
 def compared(name: str, folder: Path, time: str, seed: int) -> dict[str, Any]:
-    """Both models on one material."""
+    """All models on one material."""
     data = shards(name, folder)
-    base = train("neumip", NEUMIP, data, folder / name, time, seed)
-    ours = train("relief", RELIEF, data, folder / name, time, seed)
-    four = train("four places", with_part("four places"), data, folder / name, time, seed)
-    ratio = ours["value"] / base["value"]
-    bar = ratio * math.hypot(ours["error"] / ours["value"], base["error"] / base["value"])
+    fits = {label: train(label, o, data, folder / name, time, seed) for label, o in MODELS.items()}
+    ratio, bar = ratio_of(fits["relief"], fits["neumip"])
     extent = Dataset.open(data).manifest["tile"]["displacement_range"]
     limit = THRESHOLDS["displaced" if extent >= DISPLACED else "any"]
+    published = mse_ratio(name, "neumip", "neumip-baseline")
+    over_baseline = {}
+    if published is not None:
+        plain = train("neumip-baseline", BASELINE, data, folder / name, time, seed)
+        ratios = {label: ratio_of(one, plain) for label, one in fits.items()}
+        over_baseline = {"neumip-baseline": plain, "published neumip": published[0], "ratios": ratios}
     return {
         "material": name,
-        "neumip": base,
-        "relief": ours,
-        "four_places": four,
+        "fits": fits,
         "ratio": ratio,
         "ratio_error": bar,
         "displacement_range": extent,
+        "over_baseline": over_baseline,
         "met": ratio - STANDARD_ERRORS * bar <= limit,
     }
 
@@ -134,16 +156,16 @@ def main() -> int:
     parser.add_argument("--out", type=Path, required=True, help="folder of data and figures")
     parser.add_argument("--time", default="60s", help="training time of each fit")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--ablation", action="store_true")
+    parser.add_argument("--ablation", choices=PARTS, help="model whose parts are left out")
     arguments = parser.parse_args()
     if arguments.ablation:
         name = (arguments.materials or ["rock_cliff"])[0]
         folder = arguments.out / name
         data = shards(name, arguments.out)
-        figures = {
-            label: train(label, with_part(label), data, folder, arguments.time, arguments.seed)
-            for label in PARTS
-        }
+        figures = {}
+        for label, change in PARTS[arguments.ablation].items():
+            options = deep_merge(MODELS[arguments.ablation], {"network": change})
+            figures[label] = train(label, options, data, folder, arguments.time, arguments.seed)
         print(json.dumps({"material": name, "figures": figures}))
         return 0
     assets = sorted(path.parent.name for path in (ROOT / "assets").glob("*/height.*"))
@@ -154,13 +176,16 @@ def main() -> int:
             continue
         one = compared(name, arguments.out, arguments.time, arguments.seed)
         found.append(one)
+        errors = "   ".join(f"{k} {fit['value']:.3f} ± {fit['error']:.3f}" for k, fit in one["fits"].items())
         print(
-            f"{name:16s} neumip {one['neumip']['value']:.3f} ± {one['neumip']['error']:.3f}   relief "
-            f"{one['relief']['value']:.3f} ± {one['relief']['error']:.3f}   ratio {one['ratio']:.2f} ± "
-            f"{one['ratio_error']:.2f}   four places {one['four_places']['value']:.3f} ± "
-            f"{one['four_places']['error']:.3f}   displacement range {one['displacement_range']:.3f}",
+            f"{name:16s} {errors}   relief over neumip {one['ratio']:.2f} ± {one['ratio_error']:.2f}   "
+            f"displacement range {one['displacement_range']:.3f}",
             flush=True,
         )
+        if over := one["over_baseline"]:
+            ratios = "   ".join(f"{k} {ratio:.2f} ± {bar:.2f}" for k, (ratio, bar) in over["ratios"].items())
+            published = f"published for neumip {over['published neumip']:.2f}"
+            print(f"{'':16s} over neumip-baseline: {ratios}   {published}", flush=True)
     met = bool(found) and all(one["met"] for one in found)
     print(json.dumps({"figures": found, "thresholds": THRESHOLDS, "met": met}))
     return 0 if met else 1

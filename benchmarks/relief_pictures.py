@@ -1,4 +1,4 @@
-"""Contrast of pictures of ``relief`` and ``neumip`` beside path-traced ones, from near to far.
+"""Contrast of pictures of ``relief``, ``neumip+`` and ``neumip`` beside path-traced ones, from near to far.
 
     python benchmarks/relief_pictures.py --out FOLDER [MATERIAL ...] [--time 60s] [--seed 0]
 
@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 from quality import HEIGHT_SCALES, ROOT, generator_config, source
-from relief import NEUMIP, RELIEF, RESOLUTION, shards, train, with_part
+from relief import MODELS, RESOLUTION, fit_name, shards, train
 
 from mbtf_core.directions import from_angles
 from mbtf_core.exposure import auto_exposure, brightness, to_display
@@ -37,7 +37,6 @@ from mbtf_gen.planning.simulation import build_estimator
 from mbtf_pipeline.compare.contrast import contrast, phase_contrasts, picture_blocks
 from mbtf_pipeline.recipe import FIELD_OF_VIEW
 
-MODELS = {"neumip": NEUMIP, "relief": RELIEF, "four places": with_part("four places")}
 WIDTHS = (0.5, 1.0, 2.0, 8.0, 32.0)
 # Elevations of the view, and direction of the light, in degrees.
 ELEVATIONS, LIGHT = (90.0, 16.0), (40.0, 30.0)
@@ -55,7 +54,7 @@ def measure(name: str, folder: Path, time: str, seed: int) -> dict[str, Any]:
     materials = {}
     for label, options in MODELS.items():
         train(label, options, data, folder / name, time, seed)
-        materials[label] = Material.load(folder / name / f"{label.replace(' ', '-')}-{time}-{seed}")
+        materials[label] = Material.load(folder / name / fit_name(label, time, seed))
     job = Job.load(generator_config(name, "draft", RESOLUTION))
     estimator = build_estimator(job, reference_plan(job))
     light = from_angles(*LIGHT)

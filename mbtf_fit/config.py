@@ -13,10 +13,12 @@ from mbtf_core.nested import deep_merge
 from mbtf_core.options import Flag
 from mbtf_core.units import format_duration, format_size, parse_duration, parse_size
 
-ModelName = Literal["neumip-baseline", "neumip", "relief", "hierarchical"]
+ModelName = Literal["neumip-baseline", "neumip", "neumip+", "relief", "hierarchical"]
 OutputTransform = Literal["expm1", "exp", "identity", "softplus", "fourth-root"]
 # The best of them where the data set has a geometry.
 DEFAULT_MODEL: ModelName = "relief"
+# Models that trace view rays to heights: those of the geometry, or learned ones.
+TRACING_MODELS: tuple[ModelName, ...] = ("relief", "neumip+")
 LossKind = Literal["relative", "squared", "linear", "log", "fourth-root", "gradient"]
 Correction = Literal["none", "second-order", "linear"]
 
@@ -51,7 +53,8 @@ class EncodingSection(Settings):
 
 
 class ReliefSection(Settings):
-    """What the model `relief` takes from the data set's geometry; every part can be left out."""
+    """What the model `relief` takes from the data set's geometry, and `neumip+` from the heights that it
+    learns; every part can be left out."""
 
     places: Literal[1, 2, 4] = Field(
         1, description="view rays that are traced per query, spread over its footprint"
@@ -106,7 +109,10 @@ class BlurSection(Settings):
         0.0, ge=0, le=256, description="minimum sigma of the pyramid, also after the annealing"
     )
     offset_sigma: float = Field(
-        2.0, ge=0, le=256, description="minimum sigma of the offset texture, also after the annealing"
+        2.0,
+        ge=0,
+        le=256,
+        description="minimum sigma of the offset texture, or of learned heights, also after the annealing",
     )
 
 
@@ -215,6 +221,16 @@ PRESETS: dict[str, dict[str, Any]] = {
         # Oversampled texels see a quarter of the queries each: with a decay of 1, glossy materials overfit.
         "training": {"texture_weight_decay": 2.0, "blur": {"min_sigma": 1.6}},
     },
+    "neumip+": {
+        "network": {
+            "offset": "none",
+            "channels": 12,
+            "encoding": {"direction_xyz": True, "half_vector": True},
+            # Without the reflectance of the surface there is no single scattering to scale.
+            "relief": {"gate": False},
+        },
+        "training": {"texture_weight_decay": 1.0, "blur": {"min_sigma": 0.8, "offset_sigma": 2.0}},
+    },
     "hierarchical": {
         "network": {
             "decoder": "inception",
@@ -239,7 +255,7 @@ class FitConfig(Settings):
     Parameters
     ----------
     model : str
-        ``relief``, ``neumip``, ``neumip-baseline`` or ``hierarchical``.
+        ``relief``, ``neumip+``, ``neumip``, ``neumip-baseline`` or ``hierarchical``.
     init_from : str, optional
         Folder of a material that initializes textures and offset.
     network : NetworkSection
@@ -291,10 +307,14 @@ class FitConfig(Settings):
     @model_validator(mode="after")
     def _consistent(self) -> FitConfig:
         network = self.network
-        if self.model in ("neumip-baseline", "relief") and network.offset != "none":
+        if self.model in ("neumip-baseline", *TRACING_MODELS) and network.offset != "none":
             raise ValueError(f"{self.model} has no offset: choose the model neumip, or network.offset none")
-        if self.model != "relief" and network.relief != ReliefSection():
-            raise ValueError(f"{self.model} has no options network.relief: choose the model relief")
+        if self.model == "neumip+" and network.relief.places != 1:
+            raise ValueError("neumip+ traces one view ray per query: leave network.relief.places at 1")
+        if self.model not in TRACING_MODELS and network.relief != ReliefSection():
+            raise ValueError(
+                f"{self.model} has no options network.relief: choose the model relief or neumip+"
+            )
         if self.model != "hierarchical" and network.decoder == "inception":
             raise ValueError(
                 "the inception decoder reads neighboring queries: it needs the model hierarchical"

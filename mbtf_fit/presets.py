@@ -31,7 +31,7 @@ _RELIEF: _Sizes = (
     (300.0, {"network.width": 64, "network.channels": 16, "network.relief.places": 4}),
 )
 # Models that have such options.
-_MODELS: tuple[ModelName, ...] = ("relief", "neumip", "neumip-baseline")
+_MODELS: tuple[ModelName, ...] = ("relief", "neumip+", "neumip", "neumip-baseline")
 
 # Budget of each preset.
 FITTER: dict[Quality, dict[str, Any]] = {

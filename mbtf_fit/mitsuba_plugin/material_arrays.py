@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mbtf_core.config_file import build
 from mbtf_core.errors import InputError
 from mbtf_core.lattice import Lattice
-from mbtf_fit.config import FitConfig, NetworkSection
+from mbtf_fit.config import TRACING_MODELS, FitConfig, NetworkSection
 from mbtf_fit.material.format import (
     DEFAULT_MIN_COS,
     DESCRIPTION_NAME,
@@ -146,7 +146,7 @@ def read_material(folder: str | Path) -> StoredMaterial:
     inputs = features + position_size(network.encoding) + directions_size(network.encoding)
     outputs = network.output_channels
     surface = None
-    if config.model == "relief":
+    if config.model in TRACING_MODELS:
         inputs, outputs = inputs + hint_size(network), outputs + network.relief.gate
         surface = _surface(reader, lattice)
     return StoredMaterial(

@@ -41,6 +41,9 @@ PLACES: dict[int, tuple[tuple[tuple[float, float], ...], float]] = {
     2: (tuple((x * math.sqrt(0.75), 0.0) for x in (-1, 1)), 1.0),
     4: (tuple((x * math.sqrt(0.75), y * math.sqrt(0.75)) for y in (-1, 1) for x in (-1, 1)), 1.0),
 }
+# Of the model `neumip+`. Heights in tile widths per unit of the learned texture, and depth at its start.
+# Bound from below, in gradients by the heights, of the view's cosine and of 1 - ∇h·ω_o,xy/ω_o,z.
+HEIGHT_SCALE, FIRST_DEPTH, LEAST_FACING = 0.25, 0.04, 0.3
 # Tensors of the surface in a material, before the level.
 HEIGHTS, MAPS, HORIZONS = "surface.heights", "surface.maps", "surface.horizons"
 LIGHT_WIDTH, DIELECTRIC = "surface.light_width", "surface.dielectric"

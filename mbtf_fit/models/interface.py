@@ -174,6 +174,10 @@ class NeuralMaterial(nn.Module, ABC):
         """The model's learned textures: the pyramid, then the offset's."""
         return [module for module in self.children() if isinstance(module, FeatureTextures)]
 
+    def stored_textures(self) -> dict[str, FeatureTextures]:
+        """Textures that a material stores, by name."""
+        return {n: module for n, module in self.named_children() if isinstance(module, FeatureTextures)}
+
     def parameter_groups(self) -> tuple[list[nn.Parameter], list[nn.Parameter]]:
         """(texels, network weights)."""
         return [texture.texels for texture in self.textures()], [*self._layers().values()]
@@ -192,8 +196,7 @@ class NeuralMaterial(nn.Module, ABC):
         convolutions as ``NAME.weight`` (outputs, inputs, rows, columns)."""
         textures = {
             f"{name}.{level}": tensor
-            for name, module in self.named_children()
-            if isinstance(module, FeatureTextures)
+            for name, module in self.stored_textures().items()
             for level, tensor in module.export().items()
         }
         others = {**dict(self.named_buffers()), **self._layers()}
@@ -208,9 +211,8 @@ class NeuralMaterial(nn.Module, ABC):
         with torch.no_grad():
             for name, tensor in (*self.named_buffers(), *self._layers().items()):
                 tensor.copy_(tensors[name])
-            for name, module in self.named_children():
-                if isinstance(module, FeatureTextures):
-                    module.load({k.removeprefix(f"{name}."): t for k, t in tensors.items()})
+            for name, module in self.stored_textures().items():
+                module.load({k.removeprefix(f"{name}."): t for k, t in tensors.items()})
 
     def formula(self) -> dict[str, str]:
         """Formulas of the value in terms of :meth:`weights`, as text for an export."""

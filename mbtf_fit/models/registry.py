@@ -8,10 +8,13 @@ from mbtf_core.lattice import Lattice
 from mbtf_fit.config import FitConfig
 from mbtf_fit.models.hierarchical import Hierarchical
 from mbtf_fit.models.interface import NeuralMaterial
+from mbtf_fit.models.learned_relief import LearnedRelief
 from mbtf_fit.models.neumip import Neumip, NeumipBaseline
 from mbtf_fit.models.relief import Relief
 
-MODELS: dict[str, type[NeuralMaterial]] = {m.name: m for m in (NeumipBaseline, Neumip, Relief, Hierarchical)}
+MODELS: dict[str, type[NeuralMaterial]] = {
+    m.name: m for m in (NeumipBaseline, Neumip, LearnedRelief, Relief, Hierarchical)
+}
 
 
 def build_model(name: str, lattice: Lattice, **network: Any) -> NeuralMaterial:

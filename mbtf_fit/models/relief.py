@@ -69,7 +69,7 @@ class Relief(Neumip):
         return self.surface
 
     def hints(self, u: Tensor, sigma: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
-        """Hints (n, 7) of queries; they do not depend on anything learned."""
+        """Hints (n, 7) of queries."""
         with torch.no_grad():
             return compute_hints(self.known, u, sigma, omega_i, omega_o, self.network.relief.places)
 
@@ -86,12 +86,15 @@ class Relief(Neumip):
 
     def displaced(self, u: Tensor, level: Tensor, height: Tensor, omega_o: Tensor) -> Tensor:
         """Positions (n, 2) at which the learned textures are read, for heights (n, 1) of intersections."""
+        slope = height * omega_o[:, :2] / omega_o[:, 2:]
+        return u + self.depth_weight(level)[:, None] * slope / u.new_tensor([1.0, self.lattice.aspect])
+
+    def depth_weight(self, level: Tensor) -> Tensor:
+        """Weight (n,) of the displacement at fractional levels (n,)."""
         coarse, finer = coarse_level(level, self.lattice.finest + 1)
         index = coarse.long()
         weights = self.depth_weights
-        weight = torch.lerp(weights[index], weights[(index + 1).clamp_max(len(weights) - 1)], finer)
-        slope = height * omega_o[:, :2] / omega_o[:, 2:]
-        return u + weight[:, None] * slope / u.new_tensor([1.0, self.lattice.aspect])
+        return torch.lerp(weights[index], weights[(index + 1).clamp_max(len(weights) - 1)], finer)
 
     def features(self, u: Tensor, sigma: Tensor, omega_o: Tensor) -> Tensor:
         """Learned features, level, and uv of the intersections of all places."""

@@ -43,7 +43,8 @@ class Model(ctypes.Structure):
     _fields_ = (
         *((name, Textures) for name in ("pyramid", "offset_texture")),
         *((name, Network) for name in ("decoder", "offset")),
-        *((name, _F32) for name in ("unit", "offset_scale", "grazing", "aspect", "irradiance_scale")),
+        *((name, _F32) for name in ("unit", "offset_scale", "grazing", "aspect")),
+        *((name, _F32) for name in ("irradiance_scale", "height_scale", "least_facing")),
         *((name, _I32) for name in ("coordinates", "half_vector", "hints", "frame", "gate")),
         ("depth_weights", _POINTER),
     )

@@ -9,8 +9,16 @@ import torch
 from torch import Tensor
 
 from mbtf_fit.config import EncodingSection
-from mbtf_fit.models.constants import GRAZING, IRRADIANCE_SCALE, OFFSET_SCALE, direction_size
+from mbtf_fit.models.constants import (
+    GRAZING,
+    HEIGHT_SCALE,
+    IRRADIANCE_SCALE,
+    LEAST_FACING,
+    OFFSET_SCALE,
+    direction_size,
+)
 from mbtf_fit.models.interface import NeuralMaterial
+from mbtf_fit.models.learned_relief import LearnedRelief
 from mbtf_fit.models.mlp import Mlp
 from mbtf_fit.models.neumip import Neumip, NeumipBaseline
 from mbtf_fit.models.relief import Relief
@@ -44,7 +52,7 @@ _SIZES = {"channels", "width", "layers", "oversampling", "relief"}
 
 def supports(model: NeuralMaterial) -> bool:
     """Whether the kernel can evaluate a model."""
-    if type(model) not in (Neumip, NeumipBaseline, Relief):
+    if type(model) not in (Neumip, NeumipBaseline, LearnedRelief, Relief):
         return False
     options, textures = model.network.model_dump(), model.textures()
     tensors = [*model.parameters(), *(t.table for t in textures)]
@@ -99,6 +107,8 @@ class NativeModel:
         if isinstance(model, Relief):
             d.irradiance_scale = IRRADIANCE_SCALE
             d.hints, d.frame, d.gate = relief.hints, relief.frame, relief.gate
+        if isinstance(model, LearnedRelief):
+            d.height_scale, d.least_facing = HEIGHT_SCALE, LEAST_FACING
         self._networks: list[tuple[Mlp, Network, Tensor]] = []
         for network, target in zip(networks(model), (d.decoder, d.offset), strict=False):
             widths = [network.weights[0].shape[1], *(len(w) for w in network.weights)]

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -115,6 +115,13 @@ class KnownSurface:
             math.radians(light_width),
             DIELECTRIC_F0 * float(np.mean(0.0 if geometry.specular is None else geometry.specular)),
         )
+
+    def with_heights(self, heights: Tensor) -> KnownSurface:
+        """The same maps on other heights (H, W)."""
+        out = replace(self, heights=heights)
+        # Not packed again.
+        vars(out).update(map_table=self.map_table, horizon_table=self.horizon_table)
+        return out
 
     def tensors(self) -> dict[str, Tensor]:
         """Its tensors by their names in a material."""

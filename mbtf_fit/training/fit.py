@@ -27,6 +27,7 @@ from mbtf_fit.material.format import DESCRIPTION_NAME
 from mbtf_fit.material.material import Material, export
 from mbtf_fit.material.transmittance_fit import evaluate_transmittance, fit_transmittance
 from mbtf_fit.models.interface import NeuralMaterial
+from mbtf_fit.models.learned_relief import LearnedRelief
 from mbtf_fit.models.registry import MODELS, build_model
 from mbtf_fit.models.relief import Relief
 from mbtf_fit.objective.noise import NoiseModel, typical_value
@@ -251,7 +252,9 @@ def _fit(
 def prepare_trainer(config: FitConfig, data: Dataset, partition: Partition, device: torch.device) -> Trainer:
     """A trainer at its first step, for the model and the data of a configuration."""
     model = build_model(config.model, data.lattice, **config.network.model_dump())
-    if isinstance(model, Relief):
+    if isinstance(model, LearnedRelief):
+        model.light_width = _light_width(data)
+    elif isinstance(model, Relief):
         model.know(_known_surface(config, data))
     unit = typical_value(mean_value(partition.sample.value_a, partition.sample.value_b))
     model.initialize(torch.Generator().manual_seed(config.seed), unit)
@@ -268,10 +271,14 @@ def _known_surface(config: FitConfig, data: Dataset) -> KnownSurface:
         raise InputError(
             f"the data set has no geometry, which {config.model} traces",
             where=data.folder,
-            hint="fit another model: --model neumip",
+            hint="fit a model that learns heights: --model neumip+",
         )
-    light = data.manifest.get("config", {}).get("light", {})
-    return KnownSurface.of(geometry, data.lattice, light.get("width", 0.0))
+    return KnownSurface.of(geometry, data.lattice, _light_width(data))
+
+
+def _light_width(data: Dataset) -> float:
+    """RMS angle per axis of the light kernel, in degrees."""
+    return float(data.manifest.get("config", {}).get("light", {}).get("width", 0.0))
 
 
 def _initialize_from(model: NeuralMaterial, folder: str | Path) -> None:

@@ -25,6 +25,7 @@ from mbtf_fit.material.inference import predict
 from mbtf_fit.models.blur import annealed_sigma
 from mbtf_fit.models.hierarchical import Hierarchical
 from mbtf_fit.models.interface import NeuralMaterial
+from mbtf_fit.models.learned_relief import LearnedRelief
 from mbtf_fit.models.neumip import Neumip
 from mbtf_fit.models.relief import Relief
 from mbtf_fit.native import kernel
@@ -58,11 +59,13 @@ def _hints(model: Relief, queries: TrainingQueries) -> Tensor:
 def _with_hints(
     model: NeuralMaterial, queries: TrainingQueries | TrainingImages | StreamedQueries, memory: float
 ) -> TrainingQueries | TrainingImages | StreamedQueries:
-    """The queries with the hints of a model that has some, where they fit in so many bytes. Otherwise each
-    batch gets its own."""
+    """The queries with the hints of a surface that stays as it is, where they fit in so many bytes. Otherwise
+    each batch gets its own."""
     fits = len(queries) * (QUERY_BYTES + HINT_BYTES) <= memory
-    if not (isinstance(model, Relief) and isinstance(queries, TrainingQueries) and fits):
+    still = isinstance(model, Relief) and not isinstance(model, LearnedRelief)
+    if not (still and isinstance(queries, TrainingQueries) and fits):
         return queries
+    assert isinstance(model, Relief)
     return replace(queries, hints=_hints(model, queries))
 
 
@@ -160,6 +163,7 @@ class Trainer:
             self.progress.seconds += time.perf_counter() - start
             if not math.isfinite(self.progress.loss + float(torch.stack(health).sum())):
                 self._stop_diverged(first, losses, health)
+            self._follow_heights(final=self.fraction >= 1.0)
         return self.fraction >= 1.0
 
     def _health(self) -> Tensor:
@@ -188,6 +192,11 @@ class Trainer:
             max(sigma, blur.offset_sigma if t.moves_lookups else blur.min_sigma) for t in model.textures()
         ]
 
+    def _follow_heights(self, *, final: bool = False) -> None:
+        if isinstance(self.model, LearnedRelief):
+            sigma = self._sigmas()[self.model.textures().index(self.model.heights)]
+            self.model.follow(self.progress.step, sigma, final=final)
+
     def _tables(self) -> list[Tensor]:
         """The textures with the current blur."""
         return [t.blurred(sigma) for t, sigma in zip(self.model.textures(), self._sigmas(), strict=True)]
@@ -206,6 +215,7 @@ class Trainer:
         for group, rate in zip(self.optimizer.param_groups, rates, strict=True):
             group["lr"] = rate
         self.weight_decay.apply(self.model, *rates)
+        self._follow_heights()
         if isinstance(self.model, Relief) and isinstance(batch, TrainingQueries) and batch.hints is None:
             batch = replace(batch, hints=_hints(self.model, batch))
         if self._stepper is not None and not isinstance(batch, Patches):

@@ -23,6 +23,7 @@ from mbtf_core.atomic import write_chunks
 from mbtf_core.errors import InputError
 from mbtf_core.lattice import Lattice
 from mbtf_core.shard_schema import GEOMETRY, GEOMETRY_NAME, ArraySpec
+from mbtf_gen.geometry.heightfield import HeightGrid
 from mbtf_gen.geometry.slopes import height_slopes
 from mbtf_gen.images.resample import resample
 from mbtf_gen.job import Job
@@ -73,6 +74,13 @@ class Geometry:
     metallic: F32 | None = None
     specular: F32 | None = None
     opacity: F32 | None = None
+
+    @classmethod
+    def of_heights(cls, heights: F32, aspect: float) -> Geometry:
+        """Geometry of heights (H, W) alone, without detail below a texel: slopes are those of the mesh."""
+        slopes = height_slopes(HeightGrid(heights.astype(np.float64), aspect)).astype(np.float32)
+        x, y = np.moveaxis(slopes, -1, 0)
+        return cls(heights, aspect, slopes, np.stack([x * x, x * y, y * y], axis=-1))
 
 
 def geometry_of(job: Job, plan: EffectsPlan) -> Geometry:

@@ -58,9 +58,9 @@ def write_material(
     torch.manual_seed(seed)
     lattice = Lattice(finest, aspect)
     built = build_model(model, lattice, **(network or {}))
+    built.initialize(torch.Generator().manual_seed(seed), 0.2)
     if isinstance(built, Relief):
         built.know(rough_surface(lattice, glossy=glossy) if constant is None else flat(lattice, constant))
-    built.initialize(torch.Generator().manual_seed(seed), 0.2)
     tensors = built.weights()
     for name, tensor in tensors.items():
         if "texture" in name or "pyramid" in name:

@@ -37,13 +37,13 @@ typedef struct {
 } mbtf_textures;
 
 /* neumip, neumip-baseline where offset.layers is 0, or relief where depth_weights (a number per level) are
- * given. The decoder sees so many coordinates of light and of view: 2 (x, y) or 3; then, where they are not 0,
+ * given. Where height_scale is not 0, the offset texture holds learned heights over height_scale, in one channel. The decoder sees so many coordinates of light and of view: 2 (x, y) or 3; then, where they are not 0,
  * half vector and difference vector, hints, light and view about the known normal. With `gate`, its last output
  * is that of the gate. */
 typedef struct {
     mbtf_textures pyramid, offset_texture;
     mbtf_network decoder, offset;
-    float unit, offset_scale, grazing, aspect, irradiance_scale;
+    float unit, offset_scale, grazing, aspect, irradiance_scale, height_scale, least_facing;
     int32_t coordinates, half_vector, hints, frame, gate;
     const float *depth_weights;
 } mbtf_model;

@@ -38,6 +38,7 @@ CASES: dict[str, dict[str, Any]] = {
     },
     "half vector": net(encoding={"direction_xyz": True, "half_vector": True}),
     "relief": {"model": "relief"},
+    "learned heights": {"model": "neumip+", "glossy": False},
     "calibrated relief": {"model": "relief"},
     "relief, four places": {
         "model": "relief",

@@ -72,6 +72,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "no known frame, four places": relief(frame=False, places=4),
     "no gate": {"glossy": False, **relief(gate=False)},
     "tracing alone": relief(hints=False, frame=False, gate=False),
+    "learned heights": {"model": "neumip+", "aspect": 0.5, "glossy": False},
     "relief, six outputs": {"model": "relief", **net(output_channels=6, oversampling=1)},
 }
 UNROLLED = ("neumip", "fourth root", "encoded", "relief")
