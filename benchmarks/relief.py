@@ -6,10 +6,10 @@
 For each material, all models are trained for the same time on the same data: those of the preset ``draft``
 at 128 texels across, of the five ``assets/`` and of six texture sets that lie beside the project. Test
 queries have 256 paths: with fewer, the noise of highlights hides the differences. The models have the
-networks of ``draft``, of the same width; ``relief`` is also trained with four places. ``neumip+`` is not given
-the geometry: it learns heights. On the materials of Kuznetsov et al. 2021, ``neumip-baseline`` is trained,
-too, for the ratios that they published. ``--ablation`` leaves out one part of a model at a time, on one
-material (``rock_cliff`` by default). FOLDER keeps data and figures, so the same command resumes.
+networks of ``draft``, of the same width; ``relief`` is also trained with four places. ``neumip+`` learns
+heights, without the geometry. On the materials of Kuznetsov et al. 2021, ``neumip-baseline`` is trained, too,
+for the ratios that they published. ``--ablation`` leaves out one part of a model at a time, on one material
+(``rock_cliff`` by default). FOLDER keeps data and figures, so the same command resumes.
 
 The last line is one JSON object with the figures and their thresholds: the unexplained variance of the test
 queries over that of ``neumip`` is at most 0.6 on displaced materials, and nowhere above 1 by more than two

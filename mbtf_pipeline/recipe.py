@@ -18,7 +18,7 @@ from mbtf_gen.config.pictures import EXPOSURE, Exposure
 
 RECIPE_NAME = "recipe.yaml"
 # Names become file and folder names.
-_NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]*$"
+_NAME = r"^[A-Za-z0-9][A-Za-z0-9._+-]*$"
 # Field of view in degrees: narrow, so that the elevation hardly varies within an image.
 FIELD_OF_VIEW = 20.0
 

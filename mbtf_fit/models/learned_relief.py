@@ -27,6 +27,7 @@ from torch import Tensor, nn
 from mbtf_core.lattice import Lattice
 from mbtf_fit.config import NetworkSection
 from mbtf_fit.models.constants import FIRST_DEPTH, HEIGHT_SCALE, LEAST_FACING
+from mbtf_fit.models.lookup import lookup
 from mbtf_fit.models.relief import Relief
 from mbtf_fit.models.textures import FeatureTextures
 from mbtf_fit.surface.known import KnownSurface
@@ -98,8 +99,9 @@ class LearnedRelief(Relief):
         aspect = u.new_tensor([1.0, self.lattice.aspect])
         slope = omega_o[:, :2] / omega_o[:, 2:]
         hit = (u + height * slope / aspect).detach().requires_grad_()
-        x = self.heights(hit)
-        (gradient,) = torch.autograd.grad(x.sum(), hit, retain_graph=True)
+        still = lookup(self.heights.table.detach(), self.heights.packing, hit)
+        (gradient,) = torch.autograd.grad(still.sum(), hit)
+        x = self.heights(hit.detach())
         facing = 1.0 - HEIGHT_SCALE * (gradient / aspect * slope).sum(1, keepdim=True)
         # Of value 0.
         rise = HEIGHT_SCALE * (x - x.detach()) / facing.clamp_min(LEAST_FACING)

@@ -163,7 +163,8 @@ class Trainer:
             self.progress.seconds += time.perf_counter() - start
             if not math.isfinite(self.progress.loss + float(torch.stack(health).sum())):
                 self._stop_diverged(first, losses, health)
-            self._follow_heights(final=self.fraction >= 1.0)
+            if self.fraction >= 1.0:
+                self._follow_heights(final=True)
         return self.fraction >= 1.0
 
     def _health(self) -> Tensor:

@@ -7,6 +7,8 @@
 #define PI 3.14159265f
 /* Channels of the maps: slopes (x, y), their squared length, base color; squared alpha, metallic of glossy ones. */
 #define GLOSSY 8
+/* Rays that are traced before the first of them is shaded. */
+#define AHEAD 8
 
 static inline float clamped(float x, float low, float high) { return x > low ? (x < high ? x : high) : low; }
 
@@ -46,21 +48,31 @@ static void find(const mbtf_textures *t, float level, float u, float v, place *p
     }
 }
 
+/* Where a view ray meets the surface: rows that are read there. */
+typedef struct {
+    float z;
+    place maps, horizons;
+} hit;
+
+/* Ask for a place's rows ahead of their use. */
+static void prefetch(const mbtf_textures *t, const place *p) {
+    for (int k = 0; k < 8; k++)
+        for (int c = 0; c < t->channels; c += 16) __builtin_prefetch(t->table + p->rows[k] * t->channels + c);
+}
+
 /* Share of the footprint that sees the light. */
-static float visibility(const mbtf_surface *s, float level, float u, float v, const float *light) {
+static float visibility(const mbtf_surface *s, const place *p, const float *light) {
     const int count = s->horizons.channels / 2;
     /* A vertical light has azimuth 0, whatever the signs of its zeros. */
     float azimuth = atan2f(light[1] + 0.0f, light[0] + 0.0f) * ((float)count / (2.0f * PI));
     azimuth -= (float)count * floorf(azimuth / (float)count);
     const int first = (int)clamped(azimuth, 0.0f, (float)(count - 1)), after = (first + 1) % count;
     const float weight = azimuth - (float)first;
-    place p;
-    find(&s->horizons, level, u, v, &p);
     float mean = 0.0f, square = 0.0f;
     for (int k = 0; k < 8; k++) {
-        const float *row = s->horizons.table + p.rows[k] * s->horizons.channels;
-        mean += p.weights[k] * (row[first] + weight * (row[after] - row[first]));
-        square += p.weights[k] * (row[count + first] + weight * (row[count + after] - row[count + first]));
+        const float *row = s->horizons.table + p->rows[k] * s->horizons.channels;
+        mean += p->weights[k] * (row[first] + weight * (row[after] - row[first]));
+        square += p->weights[k] * (row[count + first] + weight * (row[count + after] - row[count + first]));
     }
     const float blur = s->light_blur * s->light_width, variance = square - mean * mean;
     const float total = (variance > 0.0f ? variance : 0.0f) + blur * blur;
@@ -71,19 +83,17 @@ static float visibility(const mbtf_surface *s, float level, float u, float v, co
 static float masking(float alpha2, float c) { return sqrtf(1.0f + alpha2 * (1.0f / (c * c) - 1.0f)); }
 
 /* Adds irradiance, normal (x, y) and core at a surface point. */
-static void shade(const mbtf_surface *s, float level, float u, float v, const float *i, const float *o, float *sum) {
+static void shade(const mbtf_surface *s, const hit *h, const float *i, const float *o, float *sum) {
     float m[GLOSSY] = {0};
-    place p;
-    find(&s->maps, level, u, v, &p);
     const int channels = s->maps.channels;
     for (int k = 0; k < 8; k++) {
-        const float *row = s->maps.table + p.rows[k] * channels;
-        for (int c = 0; c < channels; c++) m[c] += p.weights[k] * row[c];
+        const float *row = s->maps.table + h->maps.rows[k] * channels;
+        for (int c = 0; c < channels; c++) m[c] += h->maps.weights[k] * row[c];
     }
     const float size = 1.0f / sqrtf(m[0] * m[0] + m[1] * m[1] + 1.0f);
     const float nx = -m[0] * size, ny = -m[1] * size, nz = size;
     float light = nx * i[0] + ny * i[1] + nz * i[2];
-    const float irradiance = visibility(s, level, u, v, i) * (light > 0.0f ? light : 0.0f) / i[2];
+    const float irradiance = visibility(s, &h->horizons, i) * (light > 0.0f ? light : 0.0f) / i[2];
     float value[3];
     for (int c = 0; c < 3; c++) value[c] = m[3 + c] / PI;
     if (channels == GLOSSY) {
@@ -112,25 +122,43 @@ static void shade(const mbtf_surface *s, float level, float u, float v, const fl
     for (int c = 0; c < 3; c++) sum[3 + c] += irradiance * value[c];
 }
 
-/* Hints (n, HINTS) of queries; `top` is the finest level of the data. */
+/* Traces one view ray of a query. */
+static void meet(const mbtf_surface *s, const mbtf_queries *q, int64_t k, int p, float top, int32_t most, hit *h) {
+    const float aspect = s->heightfield.aspect, *u = q->u + 2 * k, *o = q->omega_o + 3 * k;
+    const float size = 2.0f * q->sigma[k];
+    const float level = clamped(-log2f(size > 1e-30f ? size : 1e-30f), 0.0f, top);
+    const float sigma = 0.5f * exp2f(-level);
+    /* Unit vector of the view's azimuth; (1, 0) of a vertical one. */
+    const float length = sqrtf(o[0] * o[0] + o[1] * o[1]);
+    const float ax = length > 0.0f ? o[0] / length : 1.0f, ay = length > 0.0f ? o[1] / length : 0.0f;
+    const float across = sigma * s->offsets[2 * p], along = sigma * s->offsets[2 * p + 1];
+    const float x = u[0] + along * ax - across * ay, y = u[1] + (along * ay + across * ax) / aspect;
+    h->z = mbtf_height(&s->heightfield, x, y, o, most);
+    const float t = h->z / o[2], at = level + s->finer;
+    find(&s->maps, at, x + t * o[0], y + t * o[1] / aspect, &h->maps);
+    find(&s->horizons, at, x + t * o[0], y + t * o[1] / aspect, &h->horizons);
+}
+
+/* Hints (n, HINTS) of queries; `top` is the finest level of the data. Rows of some queries are on their way from
+ * memory while the rays of others are traced. */
 EXPORT void mbtf_hints(const mbtf_surface *s, const mbtf_queries *q, float top, int32_t most, float *out) {
-    const float aspect = s->heightfield.aspect;
-    for (int64_t k = 0; k < q->n; k++) {
-        const float *u = q->u + 2 * k, *i = q->omega_i + 3 * k, *o = q->omega_o + 3 * k;
-        const float size = 2.0f * q->sigma[k];
-        const float level = clamped(-log2f(size > 1e-30f ? size : 1e-30f), 0.0f, top);
-        const float sigma = 0.5f * exp2f(-level);
-        /* Unit vector of the view's azimuth; (1, 0) of a vertical one. */
-        const float length = sqrtf(o[0] * o[0] + o[1] * o[1]);
-        const float ax = length > 0.0f ? o[0] / length : 1.0f, ay = length > 0.0f ? o[1] / length : 0.0f;
-        float sum[HINTS] = {0};
-        for (int p = 0; p < s->places; p++) {
-            const float across = sigma * s->offsets[2 * p], along = sigma * s->offsets[2 * p + 1];
-            const float x = u[0] + along * ax - across * ay, y = u[1] + (along * ay + across * ax) / aspect;
-            const float z = mbtf_height(&s->heightfield, x, y, o, most), t = z / o[2];
-            sum[0] += z;
-            shade(s, level + s->finer, x + t * o[0], y + t * o[1] / aspect, i, o, sum + 1);
+    hit hits[AHEAD];
+    const int64_t places = s->places, rays = q->n * places;
+    for (int64_t ray = 0; ray < rays + AHEAD; ray++) {
+        hit *h = hits + ray % AHEAD;
+        if (ray >= AHEAD) {
+            const int64_t before = ray - AHEAD, k = before / places;
+            float *to = out + HINTS * k;
+            if (before % places == 0)
+                for (int c = 0; c < HINTS; c++) to[c] = 0.0f;
+            to[0] += h->z;
+            shade(s, h, q->omega_i + 3 * k, q->omega_o + 3 * k, to + 1);
+            if (before % places == places - 1)
+                for (int c = 0; c < HINTS; c++) to[c] /= (float)places;
         }
-        for (int c = 0; c < HINTS; c++) out[HINTS * k + c] = sum[c] / (float)s->places;
+        if (ray >= rays) continue;
+        meet(s, q, ray / places, (int)(ray % places), top, most, h);
+        prefetch(&s->maps, &h->maps);
+        prefetch(&s->horizons, &h->horizons);
     }
 }

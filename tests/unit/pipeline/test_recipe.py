@@ -85,6 +85,7 @@ def test_an_assigned_material_is_relative_to_the_current_folder(
         ("fit: {model: neumip}\n", {"neumip": "neumip"}),
         ("fit: {training: {time: 9s}}\n", {"relief": "relief"}),
         (NAMED.removeprefix(HEAD), {"neumip": "neumip", "quick": "neumip-baseline"}),
+        ("fit: {neumip+: }\n", {"neumip+": "neumip+"}),
     ],
 )
 def test_names_and_models_default_to_each_other(tmp_path: Path, fit: str, models: dict[str, str]) -> None:
