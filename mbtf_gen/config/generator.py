@@ -21,6 +21,7 @@ from mbtf_gen.config.effects_request import EffectsRequest
 from mbtf_gen.geometry.slopes import NormalMode
 from mbtf_gen.sampling.light_kernel import MAX_WIDTH_DEG, MIN_WIDTH_DEG
 
+Tracer = Literal["heightfield", "mesh"]
 # Largest height scale.
 MAX_SCALE = 100
 _PERCENT = re.compile(r"^\s*(\d+(?:\.\d*)?|\.\d+)\s*%\s*$")
@@ -102,6 +103,10 @@ class GeometrySection(Settings):
     )
     mesh: Annotated[int | None, Flag("--mesh")] = Field(
         None, ge=1, le=8192, description="mesh cells across the tile; default: the map's width, at most 512"
+    )
+    tracer: Annotated[Tracer, Flag("--tracer")] = Field(
+        "heightfield",
+        description="how rays find the surface: cell by cell, or by Mitsuba as triangles",
     )
     make_tileable: Annotated[Tiling | None, Flag("--make-tileable")] = Field(
         None,

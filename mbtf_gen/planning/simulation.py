@@ -76,7 +76,9 @@ def build_estimator(
     tiles = {} if tiles is None else tiles
     key = plan.names_on & _TILE_EFFECTS
     if key not in tiles:
-        tiles[key] = build_tile(job.grid, bsdf_of(job.material, key, shading_slopes(job, plan)))
+        tiles[key] = build_tile(
+            job.grid, bsdf_of(job.material, key, shading_slopes(job, plan)), job.config.geometry.tracer
+        )
     transport = Transport(
         plan.max_depth,
         plan.roulette_depth,

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from typing import Self
 
 import drjit as dr
 import mitsuba as mi
@@ -61,7 +62,7 @@ class HeightField:
     powers: bool
 
     @classmethod
-    def of(cls, grid: HeightGrid, unit: float, two_sided: bool) -> HeightField:
+    def of(cls, grid: HeightGrid, unit: float, two_sided: bool) -> Self:
         """Height field of a grid; `unit` is the number of scene units per tile width. Rays may be below the
         surface if it is `two_sided`, as behind an opacity mask."""
         # Row 0 of a map is the side y → max.
@@ -106,24 +107,35 @@ class HeightField:
         return mi.Ray3f(dr.fma(si.n, side, si.p), d)
 
     def interaction(self, p: Point3f, n: Normal3f, d: Vector3f, valid: Mask) -> SurfaceInteraction3f:
-        """Surface interaction as Mitsuba's BSDFs and textures expect it, of rays in direction d.
+        """Surface interaction at a position, see :func:`surface_interaction`."""
+        return surface_interaction(p, n, d, valid, self.size)
 
-        Parameters
-        ----------
-        p, n : Point3f, Normal3f
-            Position in scene units from the tile's center, and unit normal with z > 0.
-        valid : Mask
-            Lanes with a hit. They get t = 0, the others t = ∞; distances are not needed.
-        """
-        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(p))
-        si.t = dr.select(valid, mi.Float(0.0), dr.inf)
-        si.p = p
-        si.n = n
-        # Mitsuba's bitmaps have row 0 at v = 0, ours at v → 1.
-        si.uv = mi.Point2f(p.x / self.size[0] + 0.5, 0.5 - p.y / self.size[1])
-        si.dp_du = self.size[0] * mi.Vector3f(1.0, 0.0, -n.x / n.z)
-        si.dp_dv = -self.size[1] * mi.Vector3f(0.0, 1.0, -n.y / n.z)
-        s = dr.normalize(si.dp_du)
-        si.sh_frame = mi.Frame3f(s, dr.cross(n, s), n)
-        si.wi = si.to_local(-d)
-        return si
+
+def surface_interaction(
+    p: Point3f, n: Normal3f, d: Vector3f, valid: Mask, size: tuple[Float, Float]
+) -> SurfaceInteraction3f:
+    """Surface interaction of a height field as Mitsuba's BSDFs and textures expect it.
+
+    Parameters
+    ----------
+    p, n : Point3f, Normal3f
+        Position in scene units from the tile's center, and unit normal with z > 0.
+    d : Vector3f
+        Directions of the rays.
+    valid : Mask
+        Lanes with a hit. They get t = 0, the others t = ∞; distances are not needed.
+    size : (Float, Float)
+        Lengths of the tile along x and y.
+    """
+    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(p))
+    si.t = dr.select(valid, mi.Float(0.0), dr.inf)
+    si.p = p
+    si.n = n
+    # Mitsuba's bitmaps have row 0 at v = 0, ours at v → 1.
+    si.uv = mi.Point2f(p.x / size[0] + 0.5, 0.5 - p.y / size[1])
+    si.dp_du = size[0] * mi.Vector3f(1.0, 0.0, -n.x / n.z)
+    si.dp_dv = -size[1] * mi.Vector3f(0.0, 1.0, -n.y / n.z)
+    s = dr.normalize(si.dp_du)
+    si.sh_frame = mi.Frame3f(s, dr.cross(n, s), n)
+    si.wi = si.to_local(-d)
+    return si

@@ -288,87 +288,56 @@ def _search(
     return state, constants, rng
 
 
-def closest_hit(
-    heightfield: HeightField,
-    ray: Ray3f,
-    active: Mask,
-    max_crossings: int,
-    below: Mask = False,
-    holes: Any = None,
-    rng: SobolSampler | None = None,
-) -> tuple[SurfaceInteraction3f, UInt32, Mask, Any]:
-    """First intersection of rays with the periodic height field.
+class HeightfieldGeometry(HeightField):
+    """A height field that paths are traced on, see :class:`~mbtf_gen.render.geometry.TileGeometry`."""
 
-    Parameters
-    ----------
-    heightfield : HeightField
-        The surface.
-    ray : Ray3f
-        Rays in scene units; the tile is centered on the origin.
-    active : Mask
-        Lanes to trace.
-    max_crossings : int
-        Tile borders that a ray may cross.
-    below : Mask
-        Lanes whose ray starts below the surface; only for two-sided height fields.
-    holes : object with a method ``opacity(si)``, optional
-        Gives the probability in [0, 1] that a hit stops the ray. None for opaque surfaces.
-    rng : SobolSampler, optional
-        Random numbers for `holes`.
+    def closest_hit(
+        self,
+        ray: Ray3f,
+        active: Mask,
+        max_crossings: int,
+        below: Mask = False,
+        holes: Any = None,
+        rng: SobolSampler | None = None,
+    ) -> tuple[SurfaceInteraction3f, UInt32, Mask, Any]:
+        """First intersections of rays; only those with two-sided height fields may start below."""
+        state, constants, rng = _search(self, ray, active, max_crossings, below, holes, rng)
+        return _surface(self, state, constants, ray.d), state.crossings, state.capped, rng
 
-    Returns
-    -------
-    si : SurfaceInteraction3f
-        Hits within the tile.
-    crossings : UInt32
-        Tile borders crossed.
-    capped : Mask
-        Lanes that reached `max_crossings`.
-    rng : SobolSampler
-        State of the random numbers after tracing.
-    """
-    state, constants, rng = _search(heightfield, ray, active, max_crossings, below, holes, rng)
-    return _surface(heightfield, state, constants, ray.d), state.crossings, state.capped, rng
+    def occluded(
+        self,
+        ray: Ray3f,
+        active: Mask,
+        max_crossings: int,
+        below: Mask = False,
+        holes: Any = None,
+        rng: SobolSampler | None = None,
+    ) -> tuple[Mask, UInt32, Mask, Any]:
+        """Which rays are occluded."""
+        state, _, rng = _search(self, ray, active, max_crossings, below, holes, rng)
+        return state.hit | state.capped, state.crossings, state.capped, rng
+
+    def hit_and_shadow(
+        self,
+        ray: Ray3f,
+        active: Mask,
+        shadow_ray: Ray3f,
+        shadow_active: Mask,
+        max_crossings: int,
+        below: Mask = False,
+        shadow_below: Mask = False,
+    ) -> tuple[SurfaceInteraction3f, Mask, Mask, Mask]:
+        """Both in one loop."""
+        state, constants = _start(self, ray, active, below)
+        shadow, shadow_constants = _start(self, shadow_ray, shadow_active, shadow_below)
+        state, shadow = _follow_two(self, state, constants, shadow, shadow_constants, max_crossings)
+        hit = _surface(self, state, constants, ray.d)
+        return hit, state.capped, shadow.hit | shadow.capped, shadow.capped
 
 
 def closest_height(heightfield: HeightField, ray: Ray3f, max_crossings: int) -> Float:
-    """Heights in scene units of the first intersections of rays from above; of rays that reached
-    `max_crossings`, the height there. Parameters as of :func:`closest_hit`."""
+    """Heights in scene units of the first intersections of rays from above; of rays that would cross more
+    than `max_crossings` borders of the tile, the height there."""
     state, constants = _start(heightfield, ray, mi.Bool(True), mi.Bool(False))
     state = _follow(heightfield, state, constants, max_crossings)
     return dr.select(state.hit, _surface(heightfield, state, constants, ray.d).p.z, state.z)
-
-
-def occluded(
-    heightfield: HeightField,
-    ray: Ray3f,
-    active: Mask,
-    max_crossings: int,
-    below: Mask = False,
-    holes: Any = None,
-    rng: SobolSampler | None = None,
-) -> tuple[Mask, UInt32, Mask, Any]:
-    """(lanes whose ray is occluded, crossings, capped lanes, state of the random numbers); parameters as of
-    :func:`closest_hit`. Rays that reached the cap count as occluded."""
-    state, _, rng = _search(heightfield, ray, active, max_crossings, below, holes, rng)
-    return state.hit | state.capped, state.crossings, state.capped, rng
-
-
-def hit_and_shadow(
-    heightfield: HeightField,
-    ray: Ray3f,
-    active: Mask,
-    shadow_ray: Ray3f,
-    shadow_active: Mask,
-    max_crossings: int,
-    below: Mask = False,
-    shadow_below: Mask = False,
-) -> tuple[SurfaceInteraction3f, Mask, Mask, Mask]:
-    """:func:`closest_hit` of a ray and :func:`occluded` of a shadow ray in one loop, for opaque surfaces:
-    (hits of the first ray, lanes where it reached the cap, lanes whose shadow ray is occluded, lanes where
-    that reached the cap)."""
-    state, constants = _start(heightfield, ray, active, below)
-    shadow, shadow_constants = _start(heightfield, shadow_ray, shadow_active, shadow_below)
-    state, shadow = _follow_two(heightfield, state, constants, shadow, shadow_constants, max_crossings)
-    hit = _surface(heightfield, state, constants, ray.d)
-    return hit, state.capped, shadow.hit | shadow.capped, shadow.capped

@@ -22,7 +22,6 @@ import drjit as dr
 import mitsuba as mi
 
 from mbtf_gen.render.directional_light import DirectionalLight
-from mbtf_gen.render.heightfield_tracer import closest_hit, hit_and_shadow, occluded
 from mbtf_gen.render.scene import Tile
 from mbtf_gen.render.types import (
     Float,
@@ -274,29 +273,28 @@ class PathTracer:
     ) -> tuple[SurfaceInteraction3f, Mask]:
         """Parallax, shadowing, periodicity, opacity masks: (hits of the paths' rays, lanes that reached the
         cap). Contributions of shadow rays that are not occluded are added to the paths."""
-        heightfield, holes, most = self.tile.heightfield, self._holes, self.transport.max_crossings
+        geometry, holes, most = self.tile.geometry, self._holes, self.transport.max_crossings
         ray, below = scattered.ray, scattered.below
         if shadow is not None and holes is None:
-            si, capped, blocked, shadow_capped = hit_and_shadow(
-                heightfield, ray, path.active, shadow.ray, shadow.active, most, below, shadow.below
+            si, capped, blocked, shadow_capped = geometry.hit_and_shadow(
+                ray, path.active, shadow.ray, shadow.active, most, below, shadow.below
             )
             _add_unoccluded(path, shadow, blocked, shadow_capped)
             return si, capped
         if shadow is not None:
             self._trace_shadow(path, shadow)
         if self.transport.displacement:
-            si, _, capped, path.rng = closest_hit(heightfield, ray, path.active, most, below, holes, path.rng)
+            si, _, capped, path.rng = geometry.closest_hit(ray, path.active, most, below, holes, path.rng)
             return si, capped
         p = ray(-ray.o.z / ray.d.z)
-        si = heightfield.interaction(p, mi.Normal3f(0, 0, 1), ray.d, path.active & (ray.d.z < 0))
+        si = geometry.interaction(p, mi.Normal3f(0, 0, 1), ray.d, path.active & (ray.d.z < 0))
         if holes is not None:
             si.t = dr.select(path.rng.chance() < holes.opacity(si), si.t, dr.inf)
         return si, mi.Bool(False)
 
     def _trace_shadow(self, path: Path, shadow: Shadow) -> None:
         """Shadowing alone, for paths that end."""
-        blocked, _, capped, path.rng = occluded(
-            self.tile.heightfield,
+        blocked, _, capped, path.rng = self.tile.geometry.occluded(
             shadow.ray,
             shadow.active,
             self.transport.max_crossings,
@@ -308,8 +306,8 @@ class PathTracer:
 
     def _interact(self, path: Path) -> tuple[ScatteredRay, Shadow | None]:
         """One surface interaction of every path: its scattered ray and its shadow ray."""
-        heightfield = self.tile.heightfield
-        si = heightfield.interaction(path.p, path.n, path.d, path.active)
+        geometry = self.tile.geometry
+        si = geometry.interaction(path.p, path.n, path.d, path.active)
         point = self.tile.surface.at(si, -path.d)
         shadow = self._direct(path, si, point)
         path.depth[path.active] += 1
@@ -318,7 +316,7 @@ class PathTracer:
         omega, weight, pdf = point.sample(path.rng.next_1d(), path.rng.next_2d())
         path.throughput *= weight
         pdf = pdf * _russian_roulette(path, pdf, self.roulette)
-        return ScatteredRay(heightfield.leave(si, omega), dr.dot(si.n, omega) < 0, pdf), shadow
+        return ScatteredRay(geometry.leave(si, omega), dr.dot(si.n, omega) < 0, pdf), shadow
 
     def _direct(self, path: Path, si: SurfaceInteraction3f, point: Any) -> Shadow | None:
         """Direct light reflected at a vertex, by next-event estimation. Without shadowing it is added to the
@@ -343,7 +341,7 @@ class PathTracer:
         lit = path.active & ~(dr.max(value) <= 0)
         radiance = path.throughput * (value * incoming)
         if self.transport.shadowing:
-            return Shadow(self.tile.heightfield.leave(si, omega), dr.dot(si.n, omega) < 0, lit, radiance)
+            return Shadow(self.tile.geometry.leave(si, omega), dr.dot(si.n, omega) < 0, lit, radiance)
         path.radiance += dr.select(lit, radiance, 0.0)
         return None
 

@@ -14,10 +14,13 @@ from typing import Any
 import mitsuba as mi
 
 from mbtf_core.errors import InputError, reason
+from mbtf_gen.config.generator import Tracer
 from mbtf_gen.geometry.heightfield import HeightGrid
 from mbtf_gen.render.bsdf.plugin import SurfaceBSDF, surface_of
 from mbtf_gen.render.directional_light import SmoothedDirectional
-from mbtf_gen.render.heightfield import HeightField
+from mbtf_gen.render.geometry import TileGeometry
+from mbtf_gen.render.heightfield_tracer import HeightfieldGeometry
+from mbtf_gen.render.mesh_tracer import MeshGeometry
 from mbtf_gen.render.sensor import QuerySensor
 from mbtf_gen.render.types import BSDF
 
@@ -44,7 +47,7 @@ class Tile:
         Heights in tile widths.
     unit : float
         Scene units per tile width.
-    heightfield : HeightField
+    geometry : TileGeometry
         Geometry in scene units.
     surface : Surface or MitsubaSurface
         Reflection, see :mod:`mbtf_gen.render.bsdf.surface`.
@@ -52,7 +55,7 @@ class Tile:
 
     grid: HeightGrid
     unit: float
-    heightfield: HeightField
+    geometry: TileGeometry
     surface: Any
 
     @property
@@ -66,7 +69,7 @@ def unit_of(aspect: float) -> float:
     return LONG_SIDE / max(1.0, aspect)
 
 
-def build_tile(grid: HeightGrid, bsdf: Mapping[str, Any] | BSDF) -> Tile:
+def build_tile(grid: HeightGrid, bsdf: Mapping[str, Any] | BSDF, tracer: Tracer = "heightfield") -> Tile:
     """Build the scene of a tile.
 
     Parameters
@@ -75,6 +78,8 @@ def build_tile(grid: HeightGrid, bsdf: Mapping[str, Any] | BSDF) -> Tile:
         Heights in tile widths.
     bsdf : mapping or mitsuba.BSDF
         A Mitsuba dictionary, or a loaded BSDF.
+    tracer : str
+        ``heightfield``: rays follow the grid's cells. ``mesh``: Mitsuba traces the grid's triangles.
 
     Raises
     ------
@@ -90,4 +95,6 @@ def build_tile(grid: HeightGrid, bsdf: Mapping[str, Any] | BSDF) -> Tile:
             text = re.sub(r"\[\w+\.cpp:\d+\]\s*", "", reason(error, 250))
             raise InputError(f"Mitsuba rejects the BSDF '{bsdf.get('type')}' ({text})") from None
     surface = surface_of(bsdf)
-    return Tile(grid, unit, HeightField.of(grid, unit, surface.transmits), surface)
+    if tracer == "mesh":
+        return Tile(grid, unit, MeshGeometry.of_grid(grid, unit), surface)
+    return Tile(grid, unit, HeightfieldGeometry.of(grid, unit, surface.transmits), surface)

@@ -40,7 +40,6 @@ def traced_offset(estimator: Estimator, u: F32, omega_o: NDArray[np.float64]) ->
     import drjit as dr
     import mitsuba as mi
 
-    from mbtf_gen.render.heightfield_tracer import closest_hit
     from mbtf_gen.render.scene import CLEARANCE
     from mbtf_gen.render.sensor import ray_through
 
@@ -48,7 +47,7 @@ def traced_offset(estimator: Estimator, u: F32, omega_o: NDArray[np.float64]) ->
     towards = mi.Vector3f([float(c) for c in omega_o])
     point = mi.Point2f(np.ascontiguousarray(u.T, np.float32))
     ray = ray_through(point, dr.repeat(towards, len(u)), tile.unit, tile.aspect, CLEARANCE)
-    hit, *_ = closest_hit(tile.heightfield, ray, mi.Bool(True), estimator.transport.max_crossings)
+    hit, *_ = tile.geometry.closest_hit(ray, mi.Bool(True), estimator.transport.max_crossings)
     z = np.array(dr.select(hit.is_valid(), hit.p.z, 0.0)) / tile.unit
     return (z[:, None] * omega_o[None, :2] / omega_o[2]).astype(np.float32)
 

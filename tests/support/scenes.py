@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
+from mbtf_gen.config.generator import Tracer
 from mbtf_gen.render.runtime import load_mitsuba
 from support.paths import ROOT
 
@@ -91,9 +92,10 @@ def estimate(
     *,
     transport: Transport | None = None,
     seed: int = 1,
+    tracer: Tracer = "heightfield",
 ) -> Estimates:
     """Both halves of M at the queries."""
-    estimator = Estimator(build_tile(grid, bsdf), light, transport or Transport())
+    estimator = Estimator(build_tile(grid, bsdf, tracer), light, transport or Transport())
     return estimator.estimate(q, spp, Stream(seed, "test", 0))
 
 

@@ -1,4 +1,4 @@
-"""Rays over the height field hit the same points as in Embree on a mesh of many tiles."""
+"""Rays hit the same points as in Embree on a mesh of many tiles, whichever tracer finds them."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import pytest
 from numpy.typing import NDArray
 from support.scenes import HeightGrid, build_tile, lambert, mi, rocks
 
+from mbtf_gen.config.generator import Tracer
 from mbtf_gen.geometry.heightfield import mesh_of_grid
-from mbtf_gen.render.heightfield import HeightField
-from mbtf_gen.render.heightfield_tracer import closest_hit, hit_and_shadow, occluded
+from mbtf_gen.render.heightfield_tracer import HeightfieldGeometry
 from mbtf_gen.sampling.rng import sequence
 
 N = 200_000
@@ -52,17 +52,18 @@ def ray_of(o: NDArray, d: NDArray) -> mi.Ray3f:
     return mi.Ray3f(*(t(a) for t, a in zip((mi.Point3f, mi.Vector3f), arrays, strict=True)))
 
 
+@pytest.mark.parametrize("tracer", ["heightfield", "mesh"])
 @pytest.mark.parametrize("grid", GRIDS, ids=NAMES)
-def test_hits_and_shadows_are_those_of_the_mesh(grid: HeightGrid) -> None:
+def test_hits_and_shadows_are_those_of_many_tiles(grid: HeightGrid, tracer: Tracer) -> None:
     rng = np.random.default_rng(0)
-    tile = build_tile(grid, lambert(0.5))
+    tile = build_tile(grid, lambert(0.5), tracer)
     rows, columns = grid.z.shape
     around = round(5 / grid.aspect)
     mesh = mesh_of_grid(grid, tile.unit, (around * rows, around * columns), mi.load_dict(lambert(0.5)))
     scene = mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, "mesh": mesh})
     ray = ray_of(*rays(rng, grid, tile.unit))
     expected = scene.ray_intersect(ray)
-    found, _, capped, _ = closest_hit(tile.heightfield, ray, mi.Bool(True), 100)
+    found, _, capped, _ = tile.geometry.closest_hit(ray, mi.Bool(True), 100)
     assert np.all(np.array(expected.is_valid()))
     assert np.all(np.array(found.is_valid()))
     assert not np.any(np.array(capped))
@@ -78,8 +79,8 @@ def test_hits_and_shadows_are_those_of_the_mesh(grid: HeightGrid) -> None:
     assert np.mean(np.abs(u - np.round(u)).max(axis=0) > 2e-4) < 1e-4
 
     light = np.array([0.75, -0.55, 0.37]) * (rng.choice([-1, 1], (N, 1)) * [1, 1, 0] + [0, 0, 1])
-    shadow = tile.heightfield.leave(found, ray_of(light, light).d)
-    blocked, _, capped, _ = occluded(tile.heightfield, shadow, mi.Bool(True), 100)
+    shadow = tile.geometry.leave(found, ray_of(light, light).d)
+    blocked, _, capped, _ = tile.geometry.occluded(shadow, mi.Bool(True), 100)
     assert not np.any(np.array(capped))
     truth = np.array(scene.ray_test(shadow))
     assert 0.02 < truth.mean() < 0.98
@@ -91,13 +92,13 @@ def test_rays_from_below_meet_the_surface_from_below(grid: HeightGrid) -> None:
     """Hits from below equal those from above on the inverted height field, at mirrored positions."""
     rng = np.random.default_rng(1)
     upside_down = HeightGrid.from_map(grid.z, -1.0, grid.aspect)
-    field, mirrored = (HeightField.of(g, 32.0, True) for g in (grid, upside_down))
+    field, mirrored = (HeightfieldGeometry.of(g, 32.0, True) for g in (grid, upside_down))
     o, d = rays(rng, grid, 32.0)
     o[:, 2] = 0.1
-    expected = closest_hit(mirrored, ray_of(o, d), mi.Bool(True), 100)[0]
+    expected = mirrored.closest_hit(ray_of(o, d), mi.Bool(True), 100)[0]
     flip = np.array([1.0, 1.0, -1.0])
     o[:, 2] += 32.0 * grid.displacement_range
-    found = closest_hit(field, ray_of(o * flip, d * flip), mi.Bool(True), 100, mi.Bool(True))[0]
+    found = field.closest_hit(ray_of(o * flip, d * flip), mi.Bool(True), 100, mi.Bool(True))[0]
     assert np.all(np.array(found.is_valid()))
     back = np.array(found.p).T * flip - [0, 0, 32.0 * grid.displacement_range]
     # The table's triangles meet along the same diagonals, whichever side is up.
@@ -107,7 +108,7 @@ def test_rays_from_below_meet_the_surface_from_below(grid: HeightGrid) -> None:
 def test_two_rays_at_once_are_as_each_alone() -> None:
     """If one ray ends first, at the cap too, its result does not change while the other continues."""
     grid, rng = rocks(64), np.random.default_rng(2)
-    field = HeightField.of(grid, 32.0, False)
+    field = HeightfieldGeometry.of(grid, 32.0, False)
     n = N // 4
     o, d = (a[:n] for a in rays(rng, grid, 32.0))
     o[:, 2] = -0.5 * 32.0 * grid.displacement_range * rng.random(n)
@@ -115,9 +116,9 @@ def test_two_rays_at_once_are_as_each_alone() -> None:
     d[:, 2] *= 0.2 * rng.choice([-1, 1], n)
     one, two = ray_of(o, d), ray_of(o, d[::-1])
     active = [mi.Bool(rng.random(n) < 0.8) for _ in range(2)]
-    si, capped, blocked, shadow_capped = hit_and_shadow(field, one, active[0], two, active[1], 1)
-    alone, _, alone_capped, _ = closest_hit(field, one, active[0], 1)
-    other, _, other_capped, _ = occluded(field, two, active[1], 1)
+    si, capped, blocked, shadow_capped = field.hit_and_shadow(one, active[0], two, active[1], 1)
+    alone, _, alone_capped, _ = field.closest_hit(one, active[0], 1)
+    other, _, other_capped, _ = field.occluded(two, active[1], 1)
     for pair in ((si.is_valid(), alone.is_valid()), (capped, alone_capped), (shadow_capped, other_capped)):
         first, second = (np.array(x) for x in pair)
         assert 0.005 < second.mean() < 0.9
@@ -128,11 +129,12 @@ def test_two_rays_at_once_are_as_each_alone() -> None:
     assert np.mean(np.abs(gap).max(axis=0) > 1e-3) < 1e-4
 
 
-def test_grazing_rays_and_rays_that_bounced_meet_what_the_mesh_has() -> None:
+@pytest.mark.parametrize("tracer", ["heightfield", "mesh"])
+def test_grazing_rays_and_rays_that_bounced_meet_what_many_tiles_have(tracer: Tracer) -> None:
     """First hits of rays down to a cosine of 1e-3, and second hits of rays that leave those points in random
     directions. A few may differ, because Embree has large coordinates at grazing angles."""
     grid, around = HeightGrid(rocks(16).z * 0.15, 1.0), 26
-    tile = build_tile(grid, lambert(0.5))
+    tile = build_tile(grid, lambert(0.5), tracer)
     n = N // 2
     mesh = mesh_of_grid(grid, tile.unit, (around * 16, around * 16), mi.load_dict(lambert(0.5)))
     scene = mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, "mesh": mesh})
@@ -144,7 +146,7 @@ def test_grazing_rays_and_rays_that_bounced_meet_what_the_mesh_has() -> None:
 
     def compared(ray: mi.Ray3f, most: float) -> tuple[Any, NDArray]:
         expected = scene.ray_intersect(ray)
-        found, _, capped, _ = closest_hit(tile.heightfield, ray, mi.Bool(True), 4096)
+        found, _, capped, _ = tile.geometry.closest_hit(ray, mi.Bool(True), 4096)
         assert not np.any(np.array(capped))
         met = np.array(found.is_valid())
         # Rays that leave upwards leave the mesh as well.
@@ -162,7 +164,7 @@ def test_grazing_rays_and_rays_that_bounced_meet_what_the_mesh_has() -> None:
     normal = np.array(first.n).T
     d *= np.sign(np.sum(d * normal, axis=1))[:, None]
     d /= np.linalg.norm(d, axis=1)[:, None]
-    _, met = compared(tile.heightfield.leave(first, ray_of(d, d).d), 2e-3)
+    _, met = compared(tile.geometry.leave(first, ray_of(d, d).d), 2e-3)
     assert 0.2 < met.mean() < 0.9
 
 
@@ -183,7 +185,7 @@ def numbers(n: int) -> Any:
 def test_borders_are_counted_through_holes() -> None:
     """Rays through holes cross as many borders as straight lines; the cap ends those that cross more."""
     grid, n = rocks(32), 20_000
-    field = HeightField.of(grid, 32.0, True)
+    field = HeightfieldGeometry.of(grid, 32.0, True)
     rng = np.random.default_rng(3)
     o, d = (a[:n] for a in rays(rng, grid, 32.0))
     o[:, 2] = -0.4 * 32.0 * grid.displacement_range
@@ -192,9 +194,7 @@ def test_borders_are_counted_through_holes() -> None:
     ray, below = ray_of(o, d), mi.Bool(False)
 
     def run(most: int) -> tuple[Any, NDArray, NDArray]:
-        si, crossings, capped, _ = closest_hit(
-            field, ray, mi.Bool(True), most, below, Sieve(0.15), numbers(n)
-        )
+        si, crossings, capped, _ = field.closest_hit(ray, mi.Bool(True), most, below, Sieve(0.15), numbers(n))
         return si, np.array(crossings), np.array(capped)
 
     si, crossings, capped = run(1000)
@@ -216,13 +216,14 @@ def test_borders_are_counted_through_holes() -> None:
         assert (fewer == np.minimum(crossings, most)).all()
 
 
+@pytest.mark.parametrize("tracer", ["heightfield", "mesh"])
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_rays_that_are_not_finite_end(bad: float) -> None:
+def test_rays_that_are_not_finite_end(bad: float, tracer: Tracer) -> None:
     """They read no memory outside the table, and every kernel terminates."""
-    field = HeightField.of(rocks(16), 32.0, False)
+    field = build_tile(rocks(16), lambert(0.5), tracer).geometry
     for place in range(6):
         o, d = np.array([[0.0, 0.0, 0.1]]), np.array([[0.3, 0.4, -0.5]])
         (o if place < 3 else d)[0, place % 3] = bad
-        si, crossings, capped, _ = closest_hit(field, ray_of(o, d), mi.Bool(True), 50)
+        si, crossings, capped, _ = field.closest_hit(ray_of(o, d), mi.Bool(True), 50)
         dr.eval(si, crossings, capped)
         assert int(crossings[0]) <= 50

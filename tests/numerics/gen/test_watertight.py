@@ -7,25 +7,24 @@ import pytest
 from numpy.typing import NDArray
 from support.scenes import build_tile, lambert, mi, rocks
 
+from mbtf_gen.config.generator import Tracer
 from mbtf_gen.geometry.heightfield import HeightGrid
-from mbtf_gen.render.heightfield_tracer import closest_hit
 from mbtf_gen.render.scene import CLEARANCE
 
 RAYS = 10_000_000
 RESOLUTION = 64
 
 
-def misses(grid: HeightGrid, uv: NDArray[np.float64], direction: NDArray[np.float64]) -> int:
+def misses(grid: HeightGrid, uv: NDArray[np.float64], direction: NDArray[np.float64], tracer: Tracer) -> int:
     """Rays through uv (n, 2) of the reference plane along `direction` (n, 3) that hit nothing."""
-    tile = build_tile(grid, lambert(0.5))
+    tile = build_tile(grid, lambert(0.5), tracer)
     plane = np.column_stack([(uv - 0.5) * (1.0, grid.aspect) * tile.unit, np.zeros(len(uv))])
     origin = plane - direction * (CLEARANCE / -direction[:, 2:])
     total = 0
     for part in range(0, len(uv), 1 << 20):
         o, d = (np.ascontiguousarray(x[part : part + (1 << 20)].T, np.float32) for x in (origin, direction))
-        si, _, capped, _ = closest_hit(
-            tile.heightfield, mi.Ray3f(mi.Point3f(o), mi.Vector3f(d)), mi.Bool(True), 4096
-        )
+        ray = mi.Ray3f(mi.Point3f(o), mi.Vector3f(d))
+        si, _, capped, _ = tile.geometry.closest_hit(ray, mi.Bool(True), 4096)
         total += int(np.sum(~np.array(si.is_valid()))) + int(np.sum(np.array(capped)))
     return total
 
@@ -41,8 +40,9 @@ def downward(rng: np.random.Generator, n: int, smallest_cosine: float) -> NDArra
     return np.stack([r * np.cos(phi), r * np.sin(phi), -z], axis=-1)
 
 
+@pytest.mark.parametrize("tracer", ["heightfield", "mesh"])
 @pytest.mark.parametrize("aspect", [1.0, 0.5], ids=["square", "wide"])
-def test_ten_million_rays_onto_borders_and_corners(aspect: float) -> None:
+def test_ten_million_rays_onto_borders_and_corners(aspect: float, tracer: Tracer) -> None:
     rng = np.random.default_rng(0)
     n = RAYS // 2
     grid = HeightGrid(rocks(RESOLUTION, 0.2).z, aspect)
@@ -55,11 +55,12 @@ def test_ten_million_rays_onto_borders_and_corners(aspect: float) -> None:
     uv[2 * fifth : 3 * fifth] = rng.choice(lines, (fifth, 2))
     uv[3 * fifth : 4 * fifth] = (rng.integers(0, RESOLUTION, (fifth, 2)) + 0.5) / RESOLUTION
     uv[4 * fifth :, 0] = (rng.integers(0, RESOLUTION, n - 4 * fifth) + 0.5) / RESOLUTION
-    assert misses(grid, uv, downward(rng, n, 0.02)[rng.permutation(n)]) == 0
+    assert misses(grid, uv, downward(rng, n, 0.02)[rng.permutation(n)], tracer) == 0
 
 
-def test_grazing_rays_on_a_plane_all_arrive() -> None:
+@pytest.mark.parametrize("tracer", ["heightfield", "mesh"])
+def test_grazing_rays_on_a_plane_all_arrive(tracer: Tracer) -> None:
     rng = np.random.default_rng(1)
     n = 200_000
     flat = HeightGrid(np.zeros((8, 8)), 1.0)
-    assert misses(flat, rng.random((n, 2)), downward(rng, n, 1e-4)) == 0
+    assert misses(flat, rng.random((n, 2)), downward(rng, n, 1e-4), tracer) == 0

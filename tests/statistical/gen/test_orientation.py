@@ -24,7 +24,6 @@ from support.scenes import (
 from mbtf_core.lattice import Lattice, texel_centers
 from mbtf_gen.geometry.heightfield import tile_mesh
 from mbtf_gen.pictures.camera import Camera
-from mbtf_gen.render.heightfield_tracer import closest_hit
 from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
 
 ROWS, COLUMNS = 4, 8
@@ -72,7 +71,7 @@ def test_vertices_sit_on_texel_centers() -> None:
         [(u[:, 0] - 0.5) * tile.unit, (u[:, 1] - 0.5) * ASPECT * tile.unit, np.full(len(u), 1.0)]
     )
     ray = mi.Ray3f(mi.Point3f(origin.T.astype(np.float32).copy()), mi.Vector3f(0, 0, -1))
-    si, *_ = closest_hit(tile.heightfield, ray, mi.Bool(True), 16)
+    si, *_ = tile.geometry.closest_hit(ray, mi.Bool(True), 16)
     np.testing.assert_allclose(np.array(si.p.z) / tile.unit, grid.z.ravel(), atol=1e-5)
     # Mitsuba's texture coordinates of the hits: (u, 1-v).
     np.testing.assert_allclose(np.array(si.uv).T % 1.0, u * [1, -1] + [0, 1], atol=1e-5)

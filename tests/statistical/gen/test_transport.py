@@ -22,7 +22,6 @@ from support.scenes import (
 )
 
 from mbtf_core.stats import mean_of_halves
-from mbtf_gen.render.heightfield_tracer import closest_hit, occluded
 
 MIRROR = {"type": "conductor", "material": "none"}
 # A trough along y: walls one tile width high, the floor between them flat.
@@ -71,11 +70,11 @@ def test_endless_rays_end_at_the_cap(cap: int) -> None:
     tile = build_tile(TROUGH, lambert(0.5))
     z = -0.9 * tile.unit
     ray = mi.Ray3f(mi.Point3f([0.0, 0.5], 0.0, z), mi.Vector3f(0.0, [1.0, -1.0], 0.0))
-    si, crossings, capped, _ = closest_hit(tile.heightfield, ray, mi.Bool(True), cap)
+    si, crossings, capped, _ = tile.geometry.closest_hit(ray, mi.Bool(True), cap)
     assert not np.any(np.array(si.is_valid()))
     assert np.all(np.array(capped))
     assert list(np.array(crossings)) == [cap, cap]
-    blocked, crossings, capped, _ = occluded(tile.heightfield, ray, mi.Bool(True), cap)
+    blocked, crossings, capped, _ = tile.geometry.occluded(ray, mi.Bool(True), cap)
     assert np.all(np.array(blocked))
     assert np.all(np.array(capped))
     assert list(np.array(crossings)) == [cap, cap]
@@ -84,7 +83,7 @@ def test_endless_rays_end_at_the_cap(cap: int) -> None:
 def test_rays_that_leave_upwards_are_neither_capped_nor_occluded() -> None:
     tile = build_tile(TROUGH, lambert(0.5))
     ray = mi.Ray3f(mi.Point3f(0.0, 0.0, -0.1 * tile.unit), mi.Vector3f(0.0, [1.0, -0.6], [0.1, 0.8]))
-    blocked, crossings, capped, _ = occluded(tile.heightfield, ray, mi.Bool(True), 4096)
+    blocked, crossings, capped, _ = tile.geometry.occluded(ray, mi.Bool(True), 4096)
     assert not np.any(np.array(blocked | capped))
     # 0.1 tile widths up at a slope of 0.1 is one tile width along; the steep ray crosses none.
     assert list(np.array(crossings)) == [1, 0]
