@@ -114,6 +114,7 @@ def test_hash_ignores_names_and_places_but_not_contents(tmp_path: Path) -> None:
 
 CHANGES = (
     *("seed=1", "geometry.height_scale=0.5", "geometry.mesh=8", "geometry.make_tileable=mirror"),
+    *("geometry.tracer=mesh",),
     *("light.width=2", "effects.mode=all", "effects.tolerance=0.01", "effects.normal=off"),
     *("transport.max_depth=3", "transport.roulette_depth=5", "transport.max_crossings=9"),
     *("output.format=exr", "output.shard_queries=99", "queries.train=3", "queries.test=3"),
