@@ -32,7 +32,7 @@ from error_per_second import independent_points
 
 from mbtf_core.errors import MbtfError
 from mbtf_core.stats import Estimate
-from mbtf_gen.material.material import load_material
+from mbtf_gen.material.load import load_material
 from mbtf_gen.render.runtime import load_mitsuba
 from mbtf_pipeline.cost_study.generator_benchmark import GeneratorBenchmark
 from mbtf_pipeline.cost_study.generator_runs import UNIFORM, generator_tasks

@@ -263,7 +263,7 @@ def compare(mi: Any, scene: Scene, folder: Path, size: int, spp: int) -> tuple[d
     """Figures of a scene, and its two pictures."""
     from mbtf_gen.config.generator import GeneratorConfig
     from mbtf_gen.job import Job
-    from mbtf_gen.material.material import load_material
+    from mbtf_gen.material.load import load_material
     from mbtf_gen.planning.effects_plan import reference_plan
     from mbtf_gen.planning.simulation import build_estimator
     from mbtf_gen.render.bsdf.plugin import bsdf_of

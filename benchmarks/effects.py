@@ -33,7 +33,8 @@ import numpy as np
 
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
-from mbtf_gen.material.material import Material, load_material
+from mbtf_gen.material.load import load_material
+from mbtf_gen.material.material import Material
 from mbtf_gen.planning.effects import EffectsPlan, without
 from mbtf_gen.planning.effects_plan import plan_effects
 from mbtf_gen.planning.pilot import PILOT_ROULETTE, measured, relative_change

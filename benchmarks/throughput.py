@@ -36,7 +36,8 @@ from numpy.typing import NDArray
 from mbtf_core.errors import MbtfError
 from mbtf_core.lattice import Lattice
 from mbtf_gen.config.generator import Tracer
-from mbtf_gen.material.material import Material, load_material
+from mbtf_gen.material.load import load_material
+from mbtf_gen.material.material import Material
 from mbtf_gen.render.runtime import load_mitsuba
 from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
 

@@ -17,6 +17,8 @@ ModelName = Literal["neumip-baseline", "neumip", "neumip+", "relief", "hierarchi
 OutputTransform = Literal["expm1", "exp", "identity", "softplus", "fourth-root"]
 # The best of them where the data set has a geometry.
 DEFAULT_MODEL: ModelName = "relief"
+# The best of them for fibers, which have none.
+FIBER_MODEL: ModelName = "neumip+"
 # Models that trace view rays to heights: those of the geometry, or learned ones.
 TRACING_MODELS: tuple[ModelName, ...] = ("relief", "neumip+")
 LossKind = Literal["relative", "squared", "linear", "log", "fourth-root", "gradient"]

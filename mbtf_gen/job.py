@@ -11,7 +11,7 @@ from functools import cached_property
 from mbtf_core.errors import InputError, UsageError
 from mbtf_core.lattice import Lattice
 from mbtf_core.shard_schema import SPLITS, ShardEntry, Split
-from mbtf_gen.config.generator import GeneratorConfig, count_queries
+from mbtf_gen.config.generator import GeneratorConfig, GeometrySection, count_queries
 from mbtf_gen.geometry.heightfield import HeightGrid
 from mbtf_gen.material.checks import displacement_fault
 from mbtf_gen.material.latest import latest_material
@@ -62,8 +62,13 @@ class Job:
 
     @classmethod
     def of(cls, config: GeneratorConfig, material: Material) -> Job:
-        """The job of a loaded material, whose height scale, tiling and resolution replace unset ones."""
+        """The job of a loaded material, whose height scale, tiling and resolution replace unset ones; a
+        UsageError where options are for another kind of material."""
         geometry, queries = config.geometry, config.queries
+        if material.fibers is not None:
+            for key, flag in (("height_scale", "--height-scale"), ("mesh", "--mesh"), ("tracer", "--tracer")):
+                if getattr(geometry, key) not in (None, GeometrySection.model_fields[key].default, 1.0):
+                    raise UsageError("is for height maps, not for yarns and fibers", where=flag)
         scale = material.height_scale if geometry.height_scale is None else geometry.height_scale
         own = {
             "geometry": geometry.model_copy(update={"height_scale": scale, "make_tileable": material.tile}),
@@ -92,9 +97,11 @@ class Job:
         job, given = cls.load(config), config.geometry.height_scale
         for note in job.material.notes:
             log.info(note)
-        rows, columns = job.grid.z.shape
         for warning in job.material.warnings_at(given):
             log.warning(warning)
+        if job.material.fibers is not None:
+            return job
+        rows, columns = job.grid.z.shape
         log.info(
             "mesh: %d x %d cells, height scale %.4g (%s), displacement range %.4g tile widths",
             columns,
@@ -117,13 +124,20 @@ class Job:
 
     @cached_property
     def grid(self) -> HeightGrid:
-        """Heights of the mesh, in tile widths; an InputError where their range exceeds the limit."""
+        """Heights of the mesh, in tile widths, a plane for fibers; an InputError where their range exceeds
+        the limit."""
         geometry = self.config.geometry
         grid = self.material.grid(geometry.height_scale, geometry.mesh)
         fault = displacement_fault(grid.displacement_range, geometry.max_displacement)
         if fault is not None:
             raise InputError(fault[0], where=self.material.files.get("height"), hint=fault[1])
         return grid
+
+    @property
+    def displacement_range(self) -> float:
+        """Largest height difference of the surface, or the thickness of the fibers, in tile widths."""
+        fibers = self.material.fibers
+        return self.grid.displacement_range if fibers is None else fibers.thickness
 
     @cached_property
     def query_plan(self) -> QueryPlan:

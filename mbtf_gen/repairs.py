@@ -283,17 +283,19 @@ class Corruption:
         names = {f.file for f in self.faults if f.file in _DOCUMENTS and f.what != INCOMPLETE}
         if self._manifest is None or any(f.what == TWICE for f in self.faults):
             restored = self._restored
-            digests = {CONFIG_NAME: restored["config_yaml"], GEOMETRY_NAME: restored["geometry"]["sha256"]}
+            digests = {CONFIG_NAME: restored["config_yaml"]}
+            if restored["geometry"] is not None:
+                digests[GEOMETRY_NAME] = restored["geometry"]["sha256"]
             for name, digest in digests.items():
                 path = self.folder / name
                 names |= {name} if not path.exists() or file_sha256(path) != digest else set()
             names.add(MANIFEST_NAME)
-        elif GEOMETRY_NAME in names:
+        elif GEOMETRY_NAME in names and self._geometry is not None:
             check_geometry(self.folder, self._geometry, self._manifest)
         return sorted(names, reverse=True)
 
     @cached_property
-    def _geometry(self) -> Geometry:
+    def _geometry(self) -> Geometry | None:
         return geometry_of(self.job, self.plan.effects)
 
     @cached_property
@@ -330,7 +332,7 @@ class Corruption:
                     write_checksummed(path, {**manifest, "complete": False, "summary": None})
                 if CONFIG_NAME in documents:
                     write_text(self.folder / CONFIG_NAME, dump_yaml(manifest["config"]))
-                if GEOMETRY_NAME in documents:
+                if GEOMETRY_NAME in documents and self._geometry is not None:
                     write_geometry(self.folder / GEOMETRY_NAME, self._geometry)
         corrupt = {e.file for e in entries}
         result = render_shards(self.job, self.folder, entries, plan, corrupt=corrupt, progress=progress)

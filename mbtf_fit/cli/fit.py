@@ -9,11 +9,11 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from mbtf_core.console import CONSOLE, Console
-from mbtf_core.errors import PartialError, UsageError
+from mbtf_core.errors import InputError, PartialError, UsageError
 from mbtf_core.interruption import keep_on_interruption
 from mbtf_core.options import DryRun, Options, Output, Overwrite, Verbose, takes_options
 from mbtf_core.units import clock, expectation, format_duration
-from mbtf_fit.config import DEFAULT_MODEL, FitConfig
+from mbtf_fit.config import DEFAULT_MODEL, FIBER_MODEL, FitConfig, ModelName
 from mbtf_fit.formatting import describe_fit, format_estimate, format_table, headline, visibility
 from mbtf_gen.config.presets import Quality, QualityOption, as_assignments, overrides_of
 
@@ -59,11 +59,11 @@ def fit(
         raise UsageError("--processes must be a positive number and requires --many")
     if shards is None and many is None:
         raise UsageError("no shards given", hint="mbtf-fit shards/ -o material/")
-    resolved = resolve_config(options, quality)
     if many is not None:
-        _fit_many(resolved, many, output, processes, overwrite, console)
+        _fit_many(options, quality, many, output, processes, overwrite, console)
         return
     assert shards is not None
+    resolved = resolve_config(options, quality, shards)
     if dry_run:
         from mbtf_fit.training.forecast import forecast_fit
 
@@ -117,24 +117,36 @@ def fit(
     console.report(summary, "\n".join([describe_fit(summary, verbose), *cost]))
 
 
-def resolve_config(options: Options[FitConfig], quality: Quality | None) -> FitConfig:
-    """Configuration of a fit."""
+def resolve_config(options: Options[FitConfig], quality: Quality | None, shards: Path) -> FitConfig:
+    """Configuration of a fit. Without a model among the options, the data set decides."""
     from mbtf_fit.presets import fitter_options
 
     given = options.given
-    presets: list[str] = []
+    flags = [f"{key}={value}" for key, value in given.items()]
+    overrides = {"model": _model_for(shards), **overrides_of(options.config, [*options.assignments, *flags])}
+    presets = [f"model={overrides['model']}"]
     if quality is not None:
-        flags = [f"{key}={value}" for key, value in given.items()]
-        overrides = {"model": DEFAULT_MODEL, **overrides_of(options.config, [*options.assignments, *flags])}
-        presets = as_assignments(fitter_options(quality, {"": overrides})[""])
+        presets += as_assignments(fitter_options(quality, {"": overrides})[""])
     if "training.time" in given:
         # A time overrides the steps of a file or a preset.
         presets.append("training.steps=null")
     return options.resolve(presets)
 
 
+def _model_for(shards: Path) -> ModelName:
+    """The model that is best for a data set."""
+    from mbtf_gen.dataset.reader import Dataset
+
+    try:
+        known = Dataset.open(shards).manifest["geometry"] is not None
+    except InputError:  # the fit refuses it, with the reason
+        known = True
+    return DEFAULT_MODEL if known else FIBER_MODEL
+
+
 def _fit_many(
-    config: FitConfig,
+    options: Options[FitConfig],
+    quality: Quality | None,
     many: list[Path],
     output: Path,
     processes: int | None,
@@ -145,12 +157,14 @@ def _fit_many(
 
     shards = find_data(many)
     folders = name_materials(shards, output)
+    configs = [resolve_config(options, quality, folder) for folder in shards]
     if processes is None:
         import torch
 
-        processes = max(1, torch.cuda.device_count()) if config.device != "cpu" else 1
+        processes = max(1, torch.cuda.device_count()) if configs[0].device != "cpu" else 1
     console.note(
-        f"{len(shards)} data set{'s' * (len(shards) != 1)} -> {output}: {config.model}, {processes} at a time"
+        f"{len(shards)} data set{'s' * (len(shards) != 1)} -> {output}: "
+        f"{' and '.join(sorted({config.model for config in configs}))}, {processes} at a time"
     )
     keep_on_interruption(f"finished fits and the last checkpoints are kept in {output}")
     with console.progress(total=len(shards), label="fitting", unit="data sets") as bar:
@@ -159,7 +173,7 @@ def _fit_many(
             bar.advance(1, f"{outcome.folder.name}: {'failed' if outcome.error else 'done'}")
 
         outcomes = fit_many(
-            config, shards, folders, processes=processes, overwrite=overwrite, finished=finished
+            configs, shards, folders, processes=processes, overwrite=overwrite, finished=finished
         )
     rows = [["material", "unexplained variance", "PSNR", "beside the reference", "steps", "training"]]
     for outcome in outcomes:

@@ -120,7 +120,7 @@ def _kill_children() -> None:
 
 
 def fit_many(
-    config: FitConfig,
+    configs: Sequence[FitConfig],
     shards: Sequence[Path],
     folders: Sequence[Path],
     *,
@@ -128,7 +128,8 @@ def fit_many(
     overwrite: bool,
     finished: Callable[[FitOutcome], None],
 ) -> list[FitOutcome]:
-    """Fit every data set, at most `processes` at a time; outcomes in the order of the data sets.
+    """Fit every data set with its configuration, at most `processes` at a time; outcomes in the order of the
+    data sets.
 
     Each fit has its own process, so that a failure does not stop the others. With CUDA each worker uses the
     GPU of its number; on CPUs the workers divide the cores. `finished` is called with each outcome.
@@ -139,7 +140,7 @@ def fit_many(
     for worker in range(processes):
         free.put(worker)
 
-    def run(data: Path, folder: Path) -> FitOutcome:
+    def run(config: FitConfig, data: Path, folder: Path) -> FitOutcome:
         worker = free.get()
         mine, theirs = context.Pipe(duplex=False)
         arguments = (config, data, folder, overwrite, worker, processes, theirs)
@@ -159,7 +160,7 @@ def fit_many(
         return FitOutcome(data, folder, result, error)
 
     with ThreadPoolExecutor(processes) as pool:
-        fits = [pool.submit(run, *pair) for pair in zip(shards, folders, strict=True)]
+        fits = [pool.submit(run, *pair) for pair in zip(configs, shards, folders, strict=True)]
         try:
             for outcome in as_completed(fits):
                 finished(outcome.result())

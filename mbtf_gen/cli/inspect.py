@@ -42,14 +42,27 @@ def inspect(
     resolved = resolve_config(options, material)
     _check_new(write, "--write", (".yaml", ".yml"), overwrite)
     _check_new(export, "--export", (".exr",), overwrite)
+    from mbtf_gen.fibers.inspect import fiber_text, inspect_fibers
     from mbtf_gen.images.exr import write_channels
     from mbtf_gen.material.choices import write_material_file
     from mbtf_gen.material.inspect import inspect_material, inspection_text
-    from mbtf_gen.material.material import load_material
+    from mbtf_gen.material.load import load_material
 
     geometry = resolved.geometry
     height, finest = geometry.height_scale, resolved.queries.finest
     loaded = load_material(resolved.material, geometry.make_tileable)
+    if loaded.fibers is not None:
+        if write is not None or export is not None:
+            raise UsageError("is for height maps", where="--export" if write is None else "--write")
+        found = {
+            "material": resolved.material,
+            "resolution": loaded.lattice(finest).shape()[1],
+            **inspect_fibers(loaded.fibers),
+            "warnings": list(loaded.warnings),
+            "notes": list(loaded.notes),
+        }
+        console.report(found, fiber_text(found, resolved.material))
+        return
     outputs: dict[str, Any] = {}
     if write is not None:
         choices = write_material_file(write, loaded, resolved)

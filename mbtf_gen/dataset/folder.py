@@ -82,7 +82,9 @@ def open_folder(job: Job, folder: Path, plan: Callable[[Job], RunPlan], overwrit
         _check_format(existing)
     elif present:
         _check_same(job, folder)
-        if (folder / CONFIG_NAME).exists() and (folder / GEOMETRY_NAME).exists():
+        if (folder / CONFIG_NAME).exists() and (
+            job.material.fibers is not None or (folder / GEOMETRY_NAME).exists()
+        ):
             return
     # Planning takes long: it comes before any change, and outside the lock.
     content = b""
@@ -104,17 +106,19 @@ def open_folder(job: Job, folder: Path, plan: Callable[[Job], RunPlan], overwrit
         manifest = read_manifest(folder)
         if not (folder / CONFIG_NAME).exists():
             write_text(folder / CONFIG_NAME, dump_yaml(manifest["config"]))
-        if not (folder / GEOMETRY_NAME).exists():
+        if geometry is not None and not (folder / GEOMETRY_NAME).exists():
             if adopted:
                 # The plan of the other writer may simulate other effects.
                 geometry = geometry_of(job, stored_plan(manifest, existing).effects)
+            assert geometry is not None
             check_geometry(folder, geometry, manifest)
             write_geometry(folder / GEOMETRY_NAME, geometry)
 
 
 def check_geometry(folder: Path, geometry: Geometry, manifest: Mapping[str, Any]) -> None:
     """An InputError unless a geometry is the one whose digest a manifest contains."""
-    if geometry_record(geometry)["sha256"] != manifest["geometry"]["sha256"]:
+    record = geometry_record(geometry)
+    if record is None or record["sha256"] != manifest["geometry"]["sha256"]:
         raise InputError(
             "cannot be restored: this machine computes it differently",
             where=folder / GEOMETRY_NAME,

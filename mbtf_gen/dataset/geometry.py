@@ -83,7 +83,7 @@ class Geometry:
         return cls(heights, aspect, slopes, np.stack([x * x, x * y, y * y], axis=-1))
 
 
-def geometry_of(job: Job, plan: EffectsPlan) -> Geometry:
+def geometry_of(job: Job, plan: EffectsPlan) -> Geometry | None:
     """Geometry of a job's surface, without the effects that its plan leaves out.
 
     Parameters
@@ -95,9 +95,12 @@ def geometry_of(job: Job, plan: EffectsPlan) -> Geometry:
 
     Returns
     -------
-    Geometry
+    Geometry or None
+        None for fibers, which have neither heights nor slopes.
     """
     material, grid = job.material, job.grid
+    if material.fibers is not None:
+        return None
     shape = Lattice(min(job.lattice.finest + 1, FINEST_LEVEL), grid.aspect).shape()
     x, y = np.moveaxis(_slopes(job, plan), -1, 0)
     geometry = Geometry(
@@ -188,8 +191,10 @@ def write_geometry(path: Path, geometry: Geometry) -> str:
     return write_chunks(path, [encode_geometry(geometry)]).sha256
 
 
-def geometry_record(geometry: Geometry) -> dict[str, Any]:
-    """The manifest's key ``geometry``: file, digest, channels and shapes."""
+def geometry_record(geometry: Geometry | None) -> dict[str, Any] | None:
+    """The manifest's key ``geometry``: file, digest, channels and shapes; None without a geometry."""
+    if geometry is None:
+        return None
     return {
         "file": GEOMETRY_NAME,
         "sha256": hashlib.sha256(encode_geometry(geometry)).hexdigest(),

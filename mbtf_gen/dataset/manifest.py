@@ -67,11 +67,23 @@ def stored_plan(manifest: Mapping[str, Any], path: Path) -> RunPlan:
     return RunPlan(found.effects, found.allocation)
 
 
-def build_manifest(job: Job, plan: RunPlan, geometry: Mapping[str, Any]) -> dict[str, Any]:
+def _shape(job: Job) -> dict[str, Any]:
+    """What the tile is made of: heights or fibers."""
+    material, scale = job.material, job.config.geometry.height_scale
+    if material.fibers is not None:
+        return {"fibers": len(material.fibers.curves), "segments": material.fibers.segments}
+    return {
+        "maps_shape": list(material.height.shape),
+        "mesh_shape": list(job.grid.z.shape),
+        "height_scale": material.height_scale if scale is None else scale,
+    }
+
+
+def build_manifest(job: Job, plan: RunPlan, geometry: Mapping[str, Any] | None) -> dict[str, Any]:
     """Manifest of a data set without shards (``complete`` is false); `geometry` is its key of that name."""
     config, material, lattice = job.config, job.material, job.lattice
     plain = config.model_dump(mode="json")
-    grid, queries = job.grid, job.query_plan
+    queries = job.query_plan
     lead = ["n"] if queries.layout == "shuffled" else ["items", "rows", "columns"]
     return {
         "format": FORMAT_NAME,
@@ -84,12 +96,8 @@ def build_manifest(job: Job, plan: RunPlan, geometry: Mapping[str, Any]) -> dict
         "conventions": CONVENTIONS,
         "tile": {
             "aspect": lattice.aspect,
-            "maps_shape": list(material.height.shape),
-            "mesh_shape": list(grid.z.shape),
-            "height_scale": material.height_scale
-            if config.geometry.height_scale is None
-            else config.geometry.height_scale,
-            "displacement_range": grid.displacement_range,
+            **_shape(job),
+            "displacement_range": job.displacement_range,
         },
         "levels": {
             "finest": lattice.finest,
@@ -105,7 +113,7 @@ def build_manifest(job: Job, plan: RunPlan, geometry: Mapping[str, Any]) -> dict
             for a in ARRAYS
             if not a.optional or plan.effects.on("opacity")
         },
-        "geometry": dict(geometry),
+        "geometry": None if geometry is None else dict(geometry),
         **plan.to_manifest(),
         "splits": {
             split: {

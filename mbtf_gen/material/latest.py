@@ -10,7 +10,8 @@ import numpy as np
 
 from mbtf_core.digest import file_sha256
 from mbtf_core.shard_schema import Tiling
-from mbtf_gen.material.material import MAPS, Material, described, material_of
+from mbtf_gen.material.load import described, material_of
+from mbtf_gen.material.material import MAPS, Material
 
 # Bytes of the maps up to which a material is kept: a training process has no use for larger ones.
 _KEPT_BYTES = 1 << 28
@@ -18,7 +19,7 @@ _kept: tuple[Any, Material] | None = None
 
 
 def latest_material(path: str | Path, tile: Tiling | None = None) -> Material:
-    """:func:`~mbtf_gen.material.material.load_material`; maps are not decoded again while the contents of
+    """:func:`~mbtf_gen.material.load.load_material`; maps are not decoded again while the contents of
     folder and files are the same.
 
     Parameters

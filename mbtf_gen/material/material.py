@@ -1,8 +1,7 @@
-"""A material: heights and reflectance, from a height map, a folder of maps, or a ``material.yaml``."""
+"""A material: the shape and the reflectance of one tile."""
 
 from __future__ import annotations
 
-import contextlib
 import json
 from collections.abc import Container
 from dataclasses import dataclass, field, replace
@@ -18,8 +17,9 @@ from mbtf_core.errors import InputError
 from mbtf_core.lattice import Lattice
 from mbtf_core.shard_schema import Tiling
 from mbtf_core.suggest import suggest_path
+from mbtf_gen.fibers.tile import FiberTile
 from mbtf_gen.geometry.heightfield import HeightGrid
-from mbtf_gen.images.read import MAX_PIXELS, SUFFIXES, gray, is_image
+from mbtf_gen.images.read import MAX_PIXELS, gray
 from mbtf_gen.images.resample import dequantize, resample
 from mbtf_gen.material.blending import BAND
 from mbtf_gen.material.checks import (
@@ -32,11 +32,11 @@ from mbtf_gen.material.checks import (
     seam_warning,
     suggestion_warning,
 )
-from mbtf_gen.material.discovery import Convention, FoundMaps, find_maps, normal_convention, unpack
+from mbtf_gen.material.discovery import Convention, FoundMaps, normal_convention
 from mbtf_gen.material.loader import Color, MapFacts, MapLoader, Share
 from mbtf_gen.material.normal_map import NormalFit, fit_normals
 from mbtf_gen.material.quantization import Codes, code_use
-from mbtf_gen.material.spec import MaterialFile, NormalEntry, read_material_file
+from mbtf_gen.material.spec import MaterialFile, NormalEntry
 from mbtf_gen.material.tiling import Seam, retile, seams
 
 # Tile widths per stored height: the range of integer images is unknown, floats are in tile widths.
@@ -57,12 +57,12 @@ MAPS = (
     *("height", "base_color", "roughness", "metallic", "specular", "clearcoat", "clearcoat_roughness"),
     *("sheen", "sheen_color", "sheen_roughness", "normal", "opacity"),
 )
-_YAML = ("material.yaml", "material.yml")
 
 
 @dataclass(frozen=True)
 class Material:
-    """Maps and constants of one tile, as :func:`load_material` returns them.
+    """Maps and constants of one tile, or its fibers, as :func:`~mbtf_gen.material.load.load_material` returns
+    them.
 
     All maps have row 0 at ``v → 1``; their resolutions may differ.
 
@@ -107,6 +107,8 @@ class Material:
         Method that made the maps tileable.
     resolution : int or None
         Texels across at the finest level, from the material file; None without one there.
+    fibers : FiberTile or None
+        Fibers in place of heights, which are a single 0 then; `bsdf` names their scattering.
     """
 
     height: NDArray[np.float64]
@@ -137,11 +139,12 @@ class Material:
     normal_convention: Convention | None = None
     tile: Tiling = "none"
     resolution: int | None = None
+    fibers: FiberTile | None = None
 
     @property
     def aspect(self) -> float:
         """Height of the tile over its width, H/W of the maps."""
-        return self.height.shape[0] / self.height.shape[1]
+        return self.height.shape[0] / self.height.shape[1] if self.fibers is None else self.fibers.aspect
 
     @property
     def is_lambert(self) -> bool:
@@ -150,6 +153,8 @@ class Material:
 
     def warnings_at(self, height: float | None = None) -> tuple[str, ...]:
         """Warnings at a height scale that the user gave; by default at the material's own."""
+        if self.fibers is not None:
+            return self.warnings
         path, extent = self.files["height"], float(np.ptp(self.height))
         text = None
         if extent == 0:
@@ -171,6 +176,8 @@ class Material:
         that of the map."""
         if finest is None and self.resolution is not None:
             finest = self.resolution.bit_length() - 1
+        if self.fibers is not None and finest is not None:
+            return Lattice(finest, self.aspect)
         rows, columns = self.height.shape
         return Lattice.for_map(rows, columns, finest)
 
@@ -197,92 +204,14 @@ class Material:
         )
 
 
-def load_material(path: str | Path, tile: Tiling | None = None) -> Material:
-    """Load a material.
-
-    Parameters
-    ----------
-    path : str or Path
-        A height map, a ``material.yaml``, or a folder that contains one or maps with customary names. Other
-        maps beside a height map are ignored.
-    tile : {"none", "mirror", "blend"} or None
-        Method for maps that do not tile. ``mirror``: 2 × 2 mirrored copies, a tile of twice the width;
-        ``blend``: the edges blended over an eighth of the tile (:mod:`mbtf_gen.material.blending`); None:
-        that of the material file, else ``none``.
-
-    Returns
-    -------
-    Material
-
-    Raises
-    ------
-    InputError
-        A file is missing, unreadable or ambiguous, a value is out of range, or aspects differ.
-    """
-    spec, folder, found = described(Path(path))
-    return material_of(spec, folder, found, spec.tiling(tile))
-
-
-def material_of(spec: MaterialFile, folder: Path, found: FoundMaps, tile: Tiling) -> Material:
-    """The material that :func:`described` found."""
-    material = _assemble(spec, folder, found, tile)
-    return material if tile == "none" else _retiled(material, tile)
-
-
-def described(path: Path) -> tuple[MaterialFile, Path, FoundMaps]:
-    """Material file of what :func:`load_material` loads.
-
-    Parameters
-    ----------
-    path : Path
-        As for :func:`load_material`.
-
-    Returns
-    -------
-    (MaterialFile, Path, FoundMaps)
-        The file, the folder that its file names are relative to, and the maps found there.
-
-    Raises
-    ------
-    InputError
-        Nothing usable is at the path.
-    """
-    if path.is_dir():
-        described = next((path / name for name in _YAML if (path / name).is_file()), None)
-        if described is not None:
-            return read_material_file(described), path, FoundMaps()
-        found = find_maps(path)
-        spec = MaterialFile.model_validate({role: str(file.name) for role, file in found.maps.items()})
-        return spec, path, found
-    if not path.exists():
-        raise InputError("no such file or folder", where=path, hint=suggest_path(path))
-    if path.suffix.lower() in (".yaml", ".yml"):
-        return read_material_file(path), path.parent, FoundMaps()
-    if not is_image(path):
-        raise InputError(
-            f"'{path.suffix}' is not a height map",
-            where=path,
-            hint=unpack(path) or f"give a folder, a .yaml file, or {', '.join(SUFFIXES)}",
-        )
-    spec = MaterialFile.model_validate({"height": path.name})
-    notes = []
-    with contextlib.suppress(InputError):
-        others = {role: file for role, file in find_maps(path.parent).maps.items() if file != path}
-        if others and "height" not in others:
-            names = ", ".join(file.name for file in others.values())
-            notes = [
-                f"only the heights of {path.name} are used; for {names} too, give the folder {path.parent}"
-            ]
-    return spec, path.parent, FoundMaps(notes=notes)
-
-
 def layers_above(given: Container[str]) -> str:
     """``" under a clear coat and a sheen"``, as far as they are among the given roles."""
     texts = [text for role, text in (("clearcoat", "a clear coat"), ("sheen", "a sheen")) if role in given]
     return f" under {' and '.join(texts)}" if texts else ""
 
 
-def _assemble(spec: MaterialFile, folder: Path, found: FoundMaps, tile: Tiling) -> Material:
+def assemble(spec: MaterialFile, folder: Path, found: FoundMaps, tile: Tiling) -> Material:
+    """The material of a material file and the maps found in a folder."""
     load = MapLoader(folder, found.notes)
     load.warnings += found.warnings
     height, codes, scale = _heights(spec, load)
@@ -346,7 +275,7 @@ def _assemble(spec: MaterialFile, folder: Path, found: FoundMaps, tile: Tiling) 
     )
 
 
-def _retiled(material: Material, tile: Literal["mirror", "blend"]) -> Material:
+def retiled(material: Material, tile: Literal["mirror", "blend"]) -> Material:
     """The material with all its maps mirrored or blended."""
     folder = material.files["height"].parent
     if any(role.startswith("bsdf.") for role in material.files):

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from mbtf_core.config_file import FileName, Settings, build, read_yaml
+from mbtf_core.config_file import FileName, Settings
 from mbtf_core.shard_schema import Tiling
 from mbtf_gen.config.generator import MAX_SCALE, Resolution
 from mbtf_gen.images.metadata import ColorSpace
@@ -151,8 +150,3 @@ class MaterialFile(Settings):
     def tiling(self, given: Tiling | None) -> Tiling:
         """Method for maps that do not tile: the given one, else that of the file, else ``none``."""
         return given or self.make_tileable or "none"
-
-
-def read_material_file(path: Path) -> MaterialFile:
-    """Read a ``material.yaml``."""
-    return build(MaterialFile, read_yaml(path), source=str(path))

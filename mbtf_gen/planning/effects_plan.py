@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_gen.config.effects_request import DISPLACEMENT_EFFECTS, EFFECTS, EffectsRequest
+from mbtf_gen.fibers.tile import FiberTile
 from mbtf_gen.geometry.slope_statistics import triangle_slopes
 from mbtf_gen.images.resample import resample
 from mbtf_gen.job import Job
@@ -52,6 +53,8 @@ class _Analysis:
     @cached_property
     def steepest(self) -> float:
         """Largest slope of any triangle of the mesh (tangent of its angle to the plane)."""
+        if self.fibers is not None:
+            return math.inf
         return float(triangle_slopes(self.job.grid).max())
 
     @cached_property
@@ -62,7 +65,12 @@ class _Analysis:
     @property
     def flat(self) -> bool:
         """Whether nothing is displaced."""
-        return self.job.grid.displacement_range == 0.0
+        return self.job.displacement_range == 0.0
+
+    @property
+    def fibers(self) -> FiberTile | None:
+        """Fibers in place of heights."""
+        return self.job.material.fibers
 
 
 def plan_effects(job: Job, *, pilots: bool = True) -> EffectsPlan:
@@ -107,7 +115,7 @@ def reference_plan(job: Job) -> EffectsPlan:
     request = EffectsRequest.parse(job.config.effects.mode)
     scene = _analysis(job, False)
     effects = [*_surface(scene), _normal(scene, None), _opacity(scene, None)]
-    explanation = "flat" if scene.flat else "displaced"
+    explanation = "flat" if scene.flat else "displaced" if scene.fibers is None else "fibers"
     effects += [Effect(name, not scene.flat, explanation) for name in DISPLACEMENT_EFFECTS]
     effects.append(Effect("bsdf_sampling", True, "reference"))
     decided = consistent({e.name: decide(request, e) for e in effects}, request)
@@ -219,6 +227,8 @@ def _normal(scene: _Analysis, bounds: DisplacementBounds | None) -> Effect:
 
 
 def _opacity(scene: _Analysis, bounds: DisplacementBounds | None) -> Effect:
+    if scene.fibers is not None:
+        return Effect("opacity", True, "rays pass between the fibers", present=False)
     through = _through(scene)
     if through is None:
         opacity = scene.job.material.opacity
@@ -267,10 +277,13 @@ def _displacement_plan(
     parallax = Effect(
         "parallax",
         True,
-        f"displacement range {100.0 * job.grid.displacement_range:.2g} % of the tile's width",
+        f"displacement range {100.0 * job.displacement_range:.2g} % of the tile's width",
         bounds.parallax if bounds else None,
         "pilot",
     )
+    if scene.fibers is not None:
+        text = f"fibers, {100.0 * scene.fibers.thickness:.2g} % of the tile's width thick"
+        parallax = Effect("parallax", True, text, present=False)
     bounces = _bounce_bound(scene) if bounds is not None and bounds.parallax <= left else 0.0
     if bounds is not None and bounds.parallax + bounces <= left:
         # Without the displaced tile its other effects are off too; the sum includes their bounds.
@@ -292,6 +305,8 @@ def _shadowing(scene: _Analysis, bounds: DisplacementBounds | None) -> Effect:
     config = scene.job.config
     # Elevation in radians below which the cut light lobe has no light; ≤ 0 if there is none.
     lowest = float(np.arcsin(config.queries.min_cos) - LOBE_TAIL * np.radians(config.light.width))
+    if scene.fibers is not None:
+        return Effect("shadowing", True, "between fibers")
     slopes = f"slopes up to {_degrees(scene.steepest)}"
     if lowest > 0 and scene.steepest <= np.tan(lowest):
         text = f"{slopes}, light and its kernel no lower than {_degrees(np.tan(lowest))}"
@@ -309,6 +324,13 @@ def _bsdf_sampling(scene: _Analysis) -> Effect:
     name = "bsdf_sampling"
     if width == 0.0:
         return Effect(name, False, "samples of the BSDF never hit a delta light", 0.0)
+    if scene.fibers is not None:
+        # The transmitted lobe is half as wide as the reflected one.
+        lobe, text = 0.5 * scene.fibers.scattering.deviation, "narrowest lobe of the fibers"
+        text += f" {np.degrees(lobe):.2g}°, light {job.config.light.width:g}°"
+        if lobe >= WIDER * width:
+            return Effect(name, False, f"{text}: sampling the light suffices", 0.0)
+        return Effect(name, True, text)
     if scene.own_bsdf:
         return Effect(name, True, "the material's own BSDF, not analyzed")
     if scene.lambert:
@@ -355,19 +377,23 @@ def _interreflection(
     """(interreflection, cap on interactions, the cap's bias bound), by a pilot with and without them on the
     same random numbers."""
     depth = scene.job.config.transport.max_depth
-    effect = Effect("interreflection", True, "displaced")
+    effect = Effect("interreflection", True, "displaced" if scene.fibers is None else "fibers")
     if depth == 1:
         off = Effect("interreflection", False, "max_depth 1", reason="forced")
         return decide(request, off), 1, 0.0
     if "interreflection" in request.forced or request.base != "auto" or not decided["parallax"].on:
         return decide(request, effect), depth, 0.0
     most = _bounce_bound(scene) if scene.lambert else np.inf
-    text = "light between facets"
+    text = "light between facets" if scene.fibers is None else "light scattered by several fibers"
     if most <= left:
         text += f"; slopes up to {_degrees(scene.steepest)} interreflect little"
         return Effect("interreflection", False, text, most, "bound"), 1, 0.0
     if not scene.pilots:
-        return replace(effect, explanation="displaced; the run is too small for a pilot"), depth, 0.0
+        return (
+            replace(effect, explanation=f"{effect.explanation}; the run is too small for a pilot"),
+            depth,
+            0.0,
+        )
     pilot = Pilot(
         scene.job,
         _assemble(scene.job, consistent({**decided, "interreflection": effect}, request), depth),

@@ -77,7 +77,9 @@ def build_estimator(
     key = plan.names_on & _TILE_EFFECTS
     if key not in tiles:
         tiles[key] = build_tile(
-            job.grid, bsdf_of(job.material, key, shading_slopes(job, plan)), job.config.geometry.tracer
+            job.material.fibers or job.grid,
+            bsdf_of(job.material, key, shading_slopes(job, plan)),
+            job.config.geometry.tracer,
         )
     transport = Transport(
         plan.max_depth,
@@ -105,7 +107,7 @@ def shading_slopes(job: Job, plan: EffectsPlan) -> NDArray[np.float64] | None:
     where they are not displaced."""
     mapped = normal_map_slopes(job) if plan.on("normal") else None
     residual = None if mapped is None else mapped[0]
-    if plan.on("parallax") or job.grid.displacement_range == 0.0:
+    if plan.on("parallax") or job.displacement_range == 0.0:
         return residual
     slopes = height_slopes(job.grid)
     if residual is None:

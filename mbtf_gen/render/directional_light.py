@@ -45,7 +45,7 @@ class DirectionalLight:
     Attributes
     ----------
     kind : {"lobe", "delta", "constant"}
-        ``constant`` is radiance 1 from the whole upper hemisphere.
+        ``constant`` is radiance 1 from above, and from below where rays can pass through the tile.
     omega_i : Vector3f
         Direction towards the light.
     inverse_irradiance : Float

@@ -53,7 +53,8 @@ class Estimator:
     tile : Tile
         The displaced tile, see :func:`~mbtf_gen.render.scene.build_tile`.
     light : LightKernel or None
-        Smoothed directional light; None for constant radiance 1 from the upper hemisphere (white furnace).
+        Smoothed directional light; None for constant radiance 1, from below as well where rays can pass
+        through the tile (white furnace).
     transport : Transport
         Effects that are simulated.
     launch : int
@@ -62,7 +63,7 @@ class Estimator:
     Attributes
     ----------
     holes : bool
-        Whether the surface has an opacity mask, so that the transmittance is estimated.
+        Whether rays can pass through the tile, so that the transmittance is estimated.
     """
 
     def __init__(
@@ -72,7 +73,7 @@ class Estimator:
         self.light = light
         self.transport = transport
         self.launch = launch
-        self.holes = bool(tile.surface.parts.opacity)
+        self.holes = bool(tile.surface.parts.opacity) or tile.geometry.open
         self._sensor = mi.load_dict(
             {"type": "mbtf_queries", "unit": tile.unit, "aspect": tile.aspect, "start": CLEARANCE}
         )
@@ -279,7 +280,7 @@ class _Launch:
     def _trace(
         self, which: UInt32 | None = None, attempt: int = 0, limit: UInt32 | None = None
     ) -> tuple[Color3f, Float, int, int]:
-        """Radiance of some of the lanes (all, if None); with an opacity mask, 1 where the first ray was
+        """Radiance of some of the lanes (all, if None); where rays can pass, 1 where the first ray was
         transmitted; counts of lost and capped rays."""
         everything = which is None
         if everything:

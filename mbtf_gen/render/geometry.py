@@ -1,16 +1,51 @@
 """What the path tracer asks of a tile's geometry: implemented by a height field, traced cell by cell
-(:mod:`~mbtf_gen.render.heightfield_tracer`), and by triangles (:mod:`~mbtf_gen.render.mesh_tracer`)."""
+(:mod:`~mbtf_gen.render.heightfield_tracer`), by triangles (:mod:`~mbtf_gen.render.mesh_tracer`), and by
+fibers (:mod:`~mbtf_gen.render.curve_tracer`)."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, Protocol
 
-from mbtf_gen.render.types import Mask, Normal3f, Point3f, Ray3f, SurfaceInteraction3f, UInt32, Vector3f
+from mbtf_gen.render.types import (
+    Mask,
+    Normal3f,
+    Point2f,
+    Point3f,
+    Ray3f,
+    SurfaceInteraction3f,
+    UInt32,
+    Vector3f,
+)
+
+
+@dataclass
+class Vertex:
+    """What is stored of a vertex of a path.
+
+    Attributes
+    ----------
+    p, n : position in scene units, unit normal
+    s, uv : tangent and texture coordinates; None where they follow from the position
+    """
+
+    p: Point3f
+    n: Normal3f
+    s: Vector3f | None = None
+    uv: Point2f | None = None
 
 
 class TileGeometry(Protocol):
     """A periodic surface, centered on the origin, in scene units. Rays may start anywhere; hits lie within
-    one period."""
+    one period.
+
+    Attributes
+    ----------
+    open : bool
+        Whether rays can pass through the tile where its surface is opaque.
+    """
+
+    open: bool
 
     def closest_hit(
         self,
@@ -79,6 +114,8 @@ class TileGeometry(Protocol):
     def leave(self, si: SurfaceInteraction3f, d: Vector3f) -> Ray3f:
         """Ray that starts at a surface point, offset along the normal, in direction d."""
 
-    def interaction(self, p: Point3f, n: Normal3f, d: Vector3f, valid: Mask) -> SurfaceInteraction3f:
-        """Surface interaction at a position p with the unit normal n, of rays in direction d; lanes that are
-        not `valid` have t = ∞."""
+    def vertex(self, si: SurfaceInteraction3f) -> Vertex:
+        """What :meth:`interaction` needs of a hit."""
+
+    def interaction(self, vertex: Vertex, d: Vector3f, valid: Mask) -> SurfaceInteraction3f:
+        """Surface interaction at a vertex, of rays in direction d; lanes that are not `valid` have t = ∞."""

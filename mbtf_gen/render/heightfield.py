@@ -14,6 +14,7 @@ import numpy as np
 
 from mbtf_gen.geometry.height_planes import logarithms, node_table
 from mbtf_gen.geometry.heightfield import HeightGrid
+from mbtf_gen.render.geometry import Vertex
 from mbtf_gen.render.types import Float, Int32, Mask, Normal3f, Point3f, Ray3f, SurfaceInteraction3f, Vector3f
 
 # Ray offset relative to the largest coordinate: a few units in the last place of float32. An offset four
@@ -106,9 +107,13 @@ class HeightField:
         side = dr.select(dr.dot(si.n, d) < 0, -self.offset, self.offset)
         return mi.Ray3f(dr.fma(si.n, side, si.p), d)
 
-    def interaction(self, p: Point3f, n: Normal3f, d: Vector3f, valid: Mask) -> SurfaceInteraction3f:
-        """Surface interaction at a position, see :func:`surface_interaction`."""
-        return surface_interaction(p, n, d, valid, self.size)
+    def vertex(self, si: SurfaceInteraction3f) -> Vertex:
+        """Position and normal."""
+        return Vertex(mi.Point3f(si.p), mi.Normal3f(si.n))
+
+    def interaction(self, vertex: Vertex, d: Vector3f, valid: Mask) -> SurfaceInteraction3f:
+        """Surface interaction at a vertex, see :func:`surface_interaction`."""
+        return surface_interaction(vertex.p, vertex.n, d, valid, self.size)
 
 
 def surface_interaction(

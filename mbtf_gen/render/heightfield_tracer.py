@@ -22,6 +22,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mbtf_gen.render.geometry import Vertex
 from mbtf_gen.render.heightfield import HeightField
 from mbtf_gen.render.types import Float, Int32, Mask, Ray3f, SurfaceInteraction3f, UInt32, Vector3f, Vector4f
 from mbtf_gen.sampling.sobol import SobolSampler
@@ -229,7 +230,7 @@ def _surface(
     )
     dz_dx, dz_dy = (node.y + fold) / heightfield.cell[0], (node.z + fold) / heightfield.cell[1]
     n = dr.normalize(mi.Normal3f(-dz_dx, -dz_dy, 1.0))
-    return heightfield.interaction(p, n, d, state.hit)
+    return heightfield.interaction(Vertex(p, n), d, state.hit)
 
 
 @dr.syntax
@@ -290,6 +291,8 @@ def _search(
 
 class HeightfieldGeometry(HeightField):
     """A height field that paths are traced on, see :class:`~mbtf_gen.render.geometry.TileGeometry`."""
+
+    open = False
 
     def closest_hit(
         self,

@@ -1,9 +1,4 @@
-"""Triangles of one period, traced by Mitsuba's ray tracing: Embree on the CPU, OptiX on CUDA.
-
-A ray is traced within the box of one period at a time. Where it leaves the box through a side without a
-hit, it enters again through the opposite one, so the tile repeats exactly, however low the ray. Segments
-overlap by a few units in the last place, so that no ray slips through the seam.
-"""
+"""Triangles of one period, see :mod:`~mbtf_gen.render.periodic_scene`."""
 
 from __future__ import annotations
 
@@ -17,71 +12,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_gen.geometry.heightfield import HeightGrid, grid_faces, grid_vertices
+from mbtf_gen.render.geometry import Vertex
 from mbtf_gen.render.heightfield import surface_interaction
-from mbtf_gen.render.types import (
-    Float,
-    Mask,
-    Normal3f,
-    Point2f,
-    Point3f,
-    Ray3f,
-    Scene,
-    SurfaceInteraction3f,
-    UInt32,
-    Vector3f,
-)
+from mbtf_gen.render.periodic_scene import OVERLAP, PeriodicScene
+from mbtf_gen.render.types import Mask, Point3f, Ray3f, SurfaceInteraction3f, Vector3f
 
-# Overlap of segments, and distance at which scattered rays start, relative to the largest coordinate.
-_OVERLAP, _OFFSET = 1.0e-6, 5.0e-7
-# Smallest magnitude of a direction's component, which avoids 0/0 for rays parallel to an axis.
-_TINY = 1e-18
-
-
-@dataclass
-class _Search:
-    """State of rays on their way: where they enter the box, and what they hit.
-
-    Attributes
-    ----------
-    o : origin within the box
-    searching : lanes whose search continues
-    hit, prim, uv : lanes with a hit, its triangle, barycentric coordinates
-    crossings, capped : tile borders crossed, lanes that reached the cap
-    """
-
-    o: Point3f
-    searching: Mask
-    hit: Mask
-    prim: UInt32
-    uv: Point2f
-    crossings: UInt32
-    capped: Mask
+# Distance at which scattered rays start, relative to the largest coordinate.
+_OFFSET = 5.0e-7
 
 
 @dataclass(frozen=True)
-class MeshGeometry:
+class MeshGeometry(PeriodicScene):
     """Triangles that cover one period and its seams. Rays may start on either side of them.
-
-    The methods are those of :class:`~mbtf_gen.render.geometry.TileGeometry`.
 
     Attributes
     ----------
-    scene : the triangles, in scene units
     vertices, faces : of the triangles
-    low, size : (x, y) of the box's first corner, and its lengths
-    bottom, top : z of the lowest and of the highest vertex
-    offset, overlap : distance from the surface at which scattered rays start; overlap of segments
     """
 
-    scene: Scene
     vertices: Point3f
     faces: Any
-    low: tuple[Float, Float]
-    size: tuple[Float, Float]
-    bottom: Float
-    top: Float
-    offset: Float
-    overlap: Float
+    open = False
 
     @classmethod
     def of_grid(cls, grid: HeightGrid, unit: float) -> MeshGeometry:
@@ -112,132 +63,34 @@ class MeshGeometry:
         extent = float(max(0.5 * size[0], 0.5 * size[1], np.ptp(vertices[:, 2])))
         return cls(
             mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, "mesh": mesh}),
-            mi.Point3f(vertices.T.astype(np.float32).copy()),
-            mi.Vector3u(faces.T.astype(np.uint32).copy()),
             (number(low[0]), number(low[1])),
             (number(size[0]), number(size[1])),
             number(float(vertices[:, 2].min())),
             number(float(vertices[:, 2].max())),
             number(_OFFSET * extent),
-            number(_OVERLAP * extent),
+            number(OVERLAP * extent),
+            mi.Point3f(vertices.T.astype(np.float32).copy()),
+            mi.Vector3u(faces.T.astype(np.uint32).copy()),
         )
 
-    def closest_hit(
-        self,
-        ray: Ray3f,
-        active: Mask,
-        max_crossings: int,
-        below: Mask = False,
-        holes: Any = None,
-        rng: Any = None,
-    ) -> tuple[SurfaceInteraction3f, UInt32, Mask, Any]:
-        """First intersections of rays."""
-        state, rng = self._search(ray, active, max_crossings, holes, rng)
-        return self._surface(state, ray.d), state.crossings, state.capped, rng
+    def vertex(self, si: SurfaceInteraction3f) -> Vertex:
+        """Position and normal."""
+        return Vertex(mi.Point3f(si.p), mi.Normal3f(si.n))
 
-    def occluded(
-        self,
-        ray: Ray3f,
-        active: Mask,
-        max_crossings: int,
-        below: Mask = False,
-        holes: Any = None,
-        rng: Any = None,
-    ) -> tuple[Mask, UInt32, Mask, Any]:
-        """Which rays are occluded."""
-        state, rng = self._search(ray, active, max_crossings, holes, rng)
-        return state.hit | state.capped, state.crossings, state.capped, rng
+    def interaction(self, vertex: Vertex, d: Vector3f, valid: Mask) -> SurfaceInteraction3f:
+        """Surface interaction at a vertex, with the texture coordinates of a height field."""
+        return surface_interaction(vertex.p, vertex.n, d, valid, self.size)
 
-    def hit_and_shadow(
-        self,
-        ray: Ray3f,
-        active: Mask,
-        shadow_ray: Ray3f,
-        shadow_active: Mask,
-        max_crossings: int,
-        below: Mask = False,
-        shadow_below: Mask = False,
-    ) -> tuple[SurfaceInteraction3f, Mask, Mask, Mask]:
-        """One after the other."""
-        si, _, capped, _ = self.closest_hit(ray, active, max_crossings)
-        blocked, _, shadow_capped, _ = self.occluded(shadow_ray, shadow_active, max_crossings)
-        return si, capped, blocked, shadow_capped
+    def _located(self, found: Any, segment: Ray3f) -> Any:
+        """Triangle and barycentric coordinates."""
+        return found.prim_index, found.prim_uv
 
-    def leave(self, si: SurfaceInteraction3f, d: Vector3f) -> Ray3f:
-        """Ray that starts at a surface point, offset along the normal, in direction d."""
-        side = dr.select(dr.dot(si.n, d) < 0, -self.offset, self.offset)
-        return mi.Ray3f(dr.fma(si.n, side, si.p), d)
-
-    def interaction(self, p: Point3f, n: Normal3f, d: Vector3f, valid: Mask) -> SurfaceInteraction3f:
-        """Surface interaction at a position, with the texture coordinates of a height field."""
-        return surface_interaction(p, n, d, valid, self.size)
-
-    @dr.syntax
-    def _search(
-        self, ray: Ray3f, active: Mask, max_crossings: int, holes: Any, rng: Any
-    ) -> tuple[_Search, Any]:
-        """Trace rays, box by box, until they hit an opaque point, leave the slab, or reach the cap."""
-        d, low, size = ray.d, self.low, self.size
-        high = (low[0] + size[0], low[1] + size[1])
-        # Origins outside of the box are those of another period.
-        o = mi.Point3f(_wrapped(ray.o.x, low[0], size[0]), _wrapped(ray.o.y, low[1], size[1]), ray.o.z)
-        over_x, over_y = _inverse(d.x), _inverse(d.y)
-        right, up, rising = d.x >= 0, d.y >= 0, d.z >= 0
-        constants = (d, low, high, over_x, over_y, right, up, rising)
-        state = _Search(
-            o, mi.Bool(active), mi.Bool(False), mi.UInt32(0), mi.Point2f(0.0), mi.UInt32(0), mi.Bool(False)
-        )
-        back = mi.Float(0.0)
-        while dr.hint(state.searching, exclude=[self, holes, constants]):
-            to_x = (dr.select(right, high[0], low[0]) - state.o.x) * over_x
-            to_y = (dr.select(up, high[1], low[1]) - state.o.y) * over_y
-            end = dr.maximum(dr.minimum(to_x, to_y), 0.0)
-            segment = mi.Ray3f(dr.fma(d, -back, state.o), d)
-            segment.maxt = end + back + self.overlap
-            found = self.scene.ray_intersect_preliminary(segment, coherent=False, active=state.searching)
-            hit = state.searching & found.is_valid()
-            state.prim = dr.select(hit, found.prim_index, state.prim)
-            state.uv = dr.select(hit, found.prim_uv, state.uv)
-            state.hit |= hit
-            if dr.hint(holes is not None, mode="scalar"):
-                si = self._surface(state, d)
-                passes = hit & (rng.chance() >= holes.opacity(si))
-                state.hit &= ~passes
-                hit &= ~passes
-                on = self.leave(si, d).o
-                state.o = dr.select(passes, on, state.o)
-            else:
-                passes = mi.Bool(False)
-            back = dr.select(passes, 0.0, self.overlap)
-
-            # Into the next box.
-            moves = state.searching & ~hit & ~passes
-            p = dr.fma(d, end, state.o)
-            along_x = to_x <= to_y
-            p.x = dr.select(along_x, dr.select(right, low[0], high[0]), dr.clip(p.x, low[0], high[0]))
-            p.y = dr.select(along_x, dr.clip(p.y, low[1], high[1]), dr.select(up, low[1], high[1]))
-            gone = dr.select(rising, p.z >= self.top, p.z <= self.bottom)
-            state.o = dr.select(moves, p, state.o)
-            crossed = moves & ~gone
-            state.capped |= crossed & (state.crossings >= max_crossings)
-            state.crossings += dr.select(crossed & ~state.capped, mi.UInt32(1), 0)
-            state.searching &= ~hit & ~(moves & gone) & ~state.capped
-        return state, rng
-
-    def _surface(self, state: _Search, d: Vector3f) -> SurfaceInteraction3f:
-        """Surface interactions of lanes with a hit. Positions from barycentric coordinates are exact to a few
-        units in the last place, whatever the length of the ray."""
-        face = dr.gather(type(self.faces), self.faces, state.prim, state.hit)
-        a, b, c = (dr.gather(mi.Point3f, self.vertices, face[k], state.hit) for k in range(3))
-        p = dr.fma(b - a, state.uv.x, dr.fma(c - a, state.uv.y, a))
+    def _surface(self, at: Any, d: Vector3f, valid: Mask) -> SurfaceInteraction3f:
+        """Positions from barycentric coordinates are exact to a few units in the last place, whatever the
+        length of the ray."""
+        prim, uv = at
+        face = dr.gather(type(self.faces), self.faces, prim, valid)
+        a, b, c = (dr.gather(mi.Point3f, self.vertices, face[k], valid) for k in range(3))
+        p = dr.fma(b - a, uv.x, dr.fma(c - a, uv.y, a))
         n = dr.normalize(mi.Normal3f(dr.cross(b - a, c - a)))
-        return self.interaction(p, n, d, state.hit)
-
-
-def _inverse(x: Float) -> Float:
-    return dr.rcp(dr.select(x >= 0, dr.maximum(x, _TINY), dr.minimum(x, -_TINY)))
-
-
-def _wrapped(x: Float, low: Float, size: Float) -> Float:
-    """Coordinate within [low, low + size]."""
-    return x - dr.floor((x - low) / size) * size
+        return self.interaction(Vertex(p, n), d, valid)

@@ -22,12 +22,11 @@ import drjit as dr
 import mitsuba as mi
 
 from mbtf_gen.render.directional_light import DirectionalLight
+from mbtf_gen.render.geometry import Vertex
 from mbtf_gen.render.scene import Tile
 from mbtf_gen.render.types import (
     Float,
     Mask,
-    Normal3f,
-    Point3f,
     Ray3f,
     Spectrum,
     SurfaceInteraction3f,
@@ -89,7 +88,7 @@ class Path:
 
     Attributes
     ----------
-    p, n : position of the current vertex in scene units, and the geometric normal there
+    vertex : the current vertex; None before the first
     d : direction of the ray that arrived there
     radiance : accumulated so far
     throughput : product of the BSDF weights so far
@@ -97,12 +96,11 @@ class Path:
     rng : state of the random numbers
     capped : number of rays that reached the cap on crossings
     lost : rays that went down and hit nothing
-    passed : the first ray was transmitted by the opacity mask
+    passed : the first ray was transmitted, by the opacity mask or between fibers
     active : lanes that continue
     """
 
-    p: Point3f
-    n: Normal3f
+    vertex: Vertex | None
     d: Vector3f
     radiance: Spectrum
     throughput: Spectrum
@@ -176,6 +174,11 @@ class PathTracer:
         return self.tile.surface if self.tile.surface.parts.opacity else None
 
     @property
+    def _open(self) -> bool:
+        """Whether rays may leave the tile downward."""
+        return self.tile.geometry.open or self._holes is not None
+
+    @property
     def _bsdf_sampling(self) -> bool:
         """Whether light is also found by sampling the BSDF, which alone finds constant light."""
         return self.transport.bsdf_sampling or self.light.kind == "constant"
@@ -201,8 +204,7 @@ class PathTracer:
             the counts ``lost`` and ``capped``.
         """
         path = Path(
-            p=mi.Point3f(0.0),
-            n=mi.Normal3f(0.0, 0.0, 1.0),
+            vertex=None,
             d=mi.Vector3f(0.0, 0.0, -1.0),
             radiance=mi.Spectrum(0.0),
             throughput=mi.Spectrum(1.0),
@@ -260,13 +262,13 @@ class PathTracer:
         path.capped[capped] += 1
         escaped = path.active & ~si.is_valid() & ~capped
         downward = escaped & (scattered.ray.d.z <= 0)
-        if self._holes is not None:
+        if self._open:
             path.passed |= downward & (path.depth == 0)
         else:
             path.lost |= downward
         path.radiance += self._escaped(path, scattered, escaped)
         path.active &= si.is_valid() & (path.depth < self.limit)
-        path.p, path.n, path.d = mi.Point3f(si.p), mi.Normal3f(si.n), mi.Vector3f(scattered.ray.d)
+        path.vertex, path.d = self.tile.geometry.vertex(si), mi.Vector3f(scattered.ray.d)
 
     def _visible(
         self, path: Path, scattered: ScatteredRay, shadow: Shadow | None
@@ -286,8 +288,8 @@ class PathTracer:
         if self.transport.displacement:
             si, _, capped, path.rng = geometry.closest_hit(ray, path.active, most, below, holes, path.rng)
             return si, capped
-        p = ray(-ray.o.z / ray.d.z)
-        si = geometry.interaction(p, mi.Normal3f(0, 0, 1), ray.d, path.active & (ray.d.z < 0))
+        plane = Vertex(ray(-ray.o.z / ray.d.z), mi.Normal3f(0, 0, 1))
+        si = geometry.interaction(plane, ray.d, path.active & (ray.d.z < 0))
         if holes is not None:
             si.t = dr.select(path.rng.chance() < holes.opacity(si), si.t, dr.inf)
         return si, mi.Bool(False)
@@ -307,7 +309,8 @@ class PathTracer:
     def _interact(self, path: Path) -> tuple[ScatteredRay, Shadow | None]:
         """One surface interaction of every path: its scattered ray and its shadow ray."""
         geometry = self.tile.geometry
-        si = geometry.interaction(path.p, path.n, path.d, path.active)
+        assert path.vertex is not None
+        si = geometry.interaction(path.vertex, path.d, path.active)
         point = self.tile.surface.at(si, -path.d)
         shadow = self._direct(path, si, point)
         path.depth[path.active] += 1
@@ -346,13 +349,15 @@ class PathTracer:
         return None
 
     def _escaped(self, path: Path, scattered: ScatteredRay, escaped: Mask) -> Spectrum:
-        """Light found by BSDF sampling: radiance along rays that left the tile upwards."""
+        """Light found by BSDF sampling: radiance along rays that left the tile."""
         light = self.light
         if light.kind == "delta" or not self._bsdf_sampling:
             return mi.Spectrum(0.0)
         d, pdf = scattered.ray.d, scattered.pdf
         share = dr.select(dr.isinf(pdf), 1.0, pdf / (pdf + light.sampling_density(d)))
-        found = escaped & (path.depth > 0) & (d.z > 0)
+        found = escaped & (path.depth > 0)
+        if light.kind != "constant" or not self._open:
+            found &= d.z > 0
         return dr.select(found, path.throughput * (light.radiance(d) * share), 0.0)
 
 

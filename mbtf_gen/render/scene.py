@@ -1,4 +1,4 @@
-"""The displaced tile as a scene: its geometry and its BSDF, centered on the origin.
+"""The tile as a scene: its geometry and its BSDF, centered on the origin.
 
 Scene units: the longer side of the tile is 32 units. There single precision resolves 2e-6 units, which
 suffices for a ray offset of 8e-6 units.
@@ -15,8 +15,10 @@ import mitsuba as mi
 
 from mbtf_core.errors import InputError, reason
 from mbtf_gen.config.generator import Tracer
+from mbtf_gen.fibers.tile import FiberTile
 from mbtf_gen.geometry.heightfield import HeightGrid
 from mbtf_gen.render.bsdf.plugin import SurfaceBSDF, surface_of
+from mbtf_gen.render.curve_tracer import CurveGeometry
 from mbtf_gen.render.directional_light import SmoothedDirectional
 from mbtf_gen.render.geometry import TileGeometry
 from mbtf_gen.render.heightfield_tracer import HeightfieldGeometry
@@ -39,12 +41,12 @@ def register_plugins() -> None:
 
 @dataclass(frozen=True)
 class Tile:
-    """A displaced periodic tile as a scene.
+    """A periodic tile as a scene.
 
     Attributes
     ----------
-    grid : HeightGrid
-        Heights in tile widths.
+    aspect : float
+        H/W of the tile.
     unit : float
         Scene units per tile width.
     geometry : TileGeometry
@@ -53,15 +55,10 @@ class Tile:
         Reflection, see :mod:`mbtf_gen.render.bsdf.surface`.
     """
 
-    grid: HeightGrid
+    aspect: float
     unit: float
     geometry: TileGeometry
     surface: Any
-
-    @property
-    def aspect(self) -> float:
-        """H/W of the tile."""
-        return self.grid.aspect
 
 
 def unit_of(aspect: float) -> float:
@@ -69,17 +66,20 @@ def unit_of(aspect: float) -> float:
     return LONG_SIDE / max(1.0, aspect)
 
 
-def build_tile(grid: HeightGrid, bsdf: Mapping[str, Any] | BSDF, tracer: Tracer = "heightfield") -> Tile:
+def build_tile(
+    shape: HeightGrid | FiberTile, bsdf: Mapping[str, Any] | BSDF, tracer: Tracer = "heightfield"
+) -> Tile:
     """Build the scene of a tile.
 
     Parameters
     ----------
-    grid : HeightGrid
-        Heights in tile widths.
+    shape : HeightGrid or FiberTile
+        Heights, or fibers, in tile widths.
     bsdf : mapping or mitsuba.BSDF
         A Mitsuba dictionary, or a loaded BSDF.
     tracer : str
-        ``heightfield``: rays follow the grid's cells. ``mesh``: Mitsuba traces the grid's triangles.
+        Of heights. ``heightfield``: rays follow the grid's cells. ``mesh``: Mitsuba traces the grid's
+        triangles.
 
     Raises
     ------
@@ -87,7 +87,7 @@ def build_tile(grid: HeightGrid, bsdf: Mapping[str, Any] | BSDF, tracer: Tracer 
         Mitsuba rejects the BSDF.
     """
     register_plugins()
-    unit = unit_of(grid.aspect)
+    unit = unit_of(shape.aspect)
     if isinstance(bsdf, Mapping):
         try:
             bsdf = mi.load_dict(dict(bsdf))
@@ -95,6 +95,11 @@ def build_tile(grid: HeightGrid, bsdf: Mapping[str, Any] | BSDF, tracer: Tracer 
             text = re.sub(r"\[\w+\.cpp:\d+\]\s*", "", reason(error, 250))
             raise InputError(f"Mitsuba rejects the BSDF '{bsdf.get('type')}' ({text})") from None
     surface = surface_of(bsdf)
-    if tracer == "mesh":
-        return Tile(grid, unit, MeshGeometry.of_grid(grid, unit), surface)
-    return Tile(grid, unit, HeightfieldGeometry.of(grid, unit, surface.transmits), surface)
+    geometry: TileGeometry
+    if isinstance(shape, FiberTile):
+        geometry = CurveGeometry.of_fibers(shape, unit)
+    elif tracer == "mesh":
+        geometry = MeshGeometry.of_grid(shape, unit)
+    else:
+        geometry = HeightfieldGeometry.of(shape, unit, surface.transmits)
+    return Tile(shape.aspect, unit, geometry, surface)

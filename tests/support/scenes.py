@@ -56,7 +56,7 @@ def real_heights(name: str, resolution: int = 96) -> HeightGrid:
 
     The test is skipped, by name, where the set is not there.
     """
-    from mbtf_gen.material.material import load_material
+    from mbtf_gen.material.load import load_material
 
     root = ROOT
     folder = root / "assets" / name

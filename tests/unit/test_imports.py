@@ -19,6 +19,7 @@ mbtf_gen.images
 mbtf_gen.geometry
 mbtf_gen.sampling
 mbtf_gen.config
+mbtf_gen.fibers
 mbtf_gen.material
 mbtf_gen.render
 mbtf_gen.job

@@ -68,11 +68,11 @@ class PreviewPictures:
             view.elevation,
             view.azimuth,
             tiles=options.tiles,
-            aspect=job.grid.aspect,
-            displacement_range=job.grid.displacement_range,
+            aspect=job.material.aspect,
+            displacement_range=job.displacement_range,
             columns=options.size,
         )
-        self.camera.queries(self.omega_i, job.grid.aspect)  # refuses a view of the horizon
+        self.camera.queries(self.omega_i, job.material.aspect)  # refuses a view of the horizon
         self.seen = (
             f"from elevation {view.elevation:g}, azimuth {view.azimuth:g}, "
             f"light from {light.elevation:g}, {light.azimuth:g} degrees"
@@ -93,6 +93,8 @@ class PreviewPictures:
         if self.job is not None:
             # The mesh has the exposure of the path-traced picture.
             makers = {"beauty": self._beauty, "mesh": self._mesh, **makers}
+            if self.job.material.fibers is not None:
+                del makers["mesh"], stages["mesh"]
             inputs |= self.job.material.digests
         if self.dataset is not None:
             inputs["data set"] = self.dataset.manifest["config_hash"]
@@ -139,7 +141,9 @@ class PreviewPictures:
                 hint="the other pictures are finished; mbtf-gen doctor names the missing package, "
                 "then the same command draws it",
             )
-        if interactive and self.job is not None:
+        if interactive and self.job is not None and self.job.material.fibers is not None:
+            self.console.note("fibers are not shown in a window")
+        elif interactive and self.job is not None:
             self.console.note("the mesh is shown in a window: close it to continue")
             mesh.show(self._tiled_mesh(self.job), self.camera, self.omega_i)
 

@@ -170,6 +170,8 @@ def bsdf_of(
     on : names of the effects that are simulated; all but opacity by default
     slopes : (h, w, 2) slopes added to the mesh's
     """
+    if material.fibers is not None:
+        return material.fibers.bsdf()
     if material.bsdf is not None:
         return dict(material.bsdf)
     names = ["base_color", "roughness"]

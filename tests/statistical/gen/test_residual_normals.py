@@ -11,7 +11,8 @@ from support.paths import ROOT
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.geometry.slopes import height_slopes
 from mbtf_gen.job import Job
-from mbtf_gen.material.material import Material, load_material
+from mbtf_gen.material.load import load_material
+from mbtf_gen.material.material import Material
 from mbtf_gen.planning.effects_plan import reference_plan
 from mbtf_gen.planning.pilot import pilot_queries, relative_change
 from mbtf_gen.planning.simulation import build_estimator

@@ -16,7 +16,7 @@ from mbtf_core.color import srgb_to_linear
 from mbtf_core.directions import from_angles
 from mbtf_core.lattice import level_of_sigma
 from mbtf_gen.dataset.reader import Dataset
-from mbtf_gen.material.material import load_material
+from mbtf_gen.material.load import load_material
 from mbtf_gen.pictures.camera import tiles_camera
 from mbtf_gen.pictures.preview.mesh import draw, tiled_mesh
 

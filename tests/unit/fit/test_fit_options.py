@@ -18,7 +18,7 @@ def config_of(*words: str) -> FitConfig:
     command: Any
     command, bound, _ = app.parse_args(["shards", *words], exit_on_error=False, print_error=False)
     arguments = dict(bound.arguments)
-    return resolve_config(command.read_options(arguments), arguments.get("quality"))
+    return resolve_config(command.read_options(arguments), arguments.get("quality"), Path("shards"))
 
 
 def test_flags_override_assignments_presets_and_files(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from mbtf_core.console import run
 from mbtf_gen.cli.app import app
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
-from mbtf_gen.material.material import load_material
+from mbtf_gen.material.load import load_material
 
 # Height scale of the normal map, and the one that it suggests: 8-bit normals of gentle slopes are rounded.
 SCALE = 0.0123

@@ -9,7 +9,7 @@ import pytest
 
 from mbtf_core.errors import InputError
 from mbtf_gen.material.discovery import find_maps, role_of
-from mbtf_gen.material.material import load_material
+from mbtf_gen.material.load import load_material
 
 
 def fill(folder: Path, *names: str) -> Path:

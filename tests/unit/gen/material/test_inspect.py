@@ -21,7 +21,7 @@ from mbtf_gen.geometry.slope_statistics import (
     triangle_slopes,
 )
 from mbtf_gen.material.inspect import USES, inspect_material, inspection_text
-from mbtf_gen.material.material import load_material
+from mbtf_gen.material.load import load_material
 from mbtf_gen.material.spec import MaterialFile
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError
 from mbtf_gen.material.discovery import normal_convention, role_of, tokens
-from mbtf_gen.material.material import load_material
+from mbtf_gen.material.load import load_material
 
 
 def rng() -> np.random.Generator:

@@ -8,7 +8,7 @@ from pathlib import Path
 from support.paths import ROOT
 
 from mbtf_gen.material.discovery import UNUSED, WORDS, role_of
-from mbtf_gen.material.material import load_material
+from mbtf_gen.material.load import load_material
 
 DOCUMENT = (ROOT / "docs/reference/material-yaml.md").read_text()
 

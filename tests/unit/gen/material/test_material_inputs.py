@@ -10,7 +10,8 @@ from support.image_files import exr, png, rng
 
 from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError
-from mbtf_gen.material.material import Material, load_material
+from mbtf_gen.material.load import load_material
+from mbtf_gen.material.material import Material
 
 
 def write(folder: Path, text: str) -> Path:

@@ -12,7 +12,7 @@ import pytest
 from support.paths import SHARED
 
 from mbtf_gen.material.inspect import inspect_material, inspection_text
-from mbtf_gen.material.material import load_material
+from mbtf_gen.material.load import load_material
 
 MATERIALS = SHARED / "data/materials"
 

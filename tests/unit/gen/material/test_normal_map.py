@@ -10,7 +10,7 @@ from support.height_maps import Floats, fractal, normals_of, save_heights, save_
 from support.paths import ROOT
 
 from mbtf_gen.images.read import gray, read_image
-from mbtf_gen.material.material import load_material
+from mbtf_gen.material.load import load_material
 from mbtf_gen.material.normal_map import SYMMETRIES, NormalFit, fit_normals
 
 # What undoes each symmetry.

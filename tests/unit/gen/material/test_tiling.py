@@ -10,7 +10,8 @@ from support.height_maps import Floats, fractal, normals_of, save_heights, save_
 
 from mbtf_core.errors import InputError
 from mbtf_core.shard_schema import Tiling
-from mbtf_gen.material.material import Material, load_material
+from mbtf_gen.material.load import load_material
+from mbtf_gen.material.material import Material
 from mbtf_gen.material.normal_map import fit_normals
 from mbtf_gen.material.tiling import broken, mirror, mirror_normals, seams
 

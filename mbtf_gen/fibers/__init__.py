@@ -1,0 +1,1 @@
+"""Fibers and yarns: curves, cloth, and the files that describe them."""

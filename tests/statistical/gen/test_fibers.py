@@ -1,0 +1,212 @@
+"""Fibers against energy conservation, the integral of their scattering, and unmodified Mitsuba."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from support.scenes import (
+    DIRECT,
+    Estimator,
+    LightKernel,
+    Stream,
+    Transport,
+    build_tile,
+    direction,
+    directional,
+    lambert,
+    mi,
+    queries,
+    tile_mean_queries,
+)
+
+from mbtf_core.stats import Estimate, mean_of_halves
+from mbtf_gen.fibers.curves import Curve
+from mbtf_gen.fibers.tile import FiberScattering, FiberTile
+
+WHITE = (1.0, 1.0, 1.0)
+GRAY = (0.8, 0.6, 0.3)
+ALONG_X, ALONG_Y = np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
+
+
+def felt(
+    count: int, radius: float, color: Sequence[float] = WHITE, seed: int = 0, aspect: float = 1.0
+) -> FiberTile:
+    """Wavy fibers along both sides of the tile, at random depths."""
+    rng = np.random.default_rng(0)
+    s = np.arange(10) / 10
+    curves = []
+    for k in range(count):
+        wave = 2.0 * np.pi * (s + rng.random())
+        across, down = rng.random() + 0.06 * np.sin(wave), 0.03 * np.cos(wave) - 0.25 * rng.random()
+        points = np.column_stack([s, across * aspect, down] if k % 2 else [across, s * aspect, down])
+        curves.append(Curve.through(points, radius, ALONG_X if k % 2 else ALONG_Y * aspect))
+    return FiberTile.settled(
+        aspect, curves, np.zeros(count, int), np.array([color]), FiberScattering(0.35, 0.4, 3.0)
+    )
+
+
+def cylinder(radius: float) -> FiberTile:
+    """One straight fiber along x."""
+    points = np.arange(6)[:, None] / 6 * ALONG_X + (0.0, 0.5, 0.0)
+    curve = Curve.through(points, radius, ALONG_X)
+    scattering = FiberScattering(0.3, 0.3, 2.0)
+    return FiberTile.settled(1.0, [curve], np.zeros(1, int), np.array([GRAY]), scattering)
+
+
+def traced(
+    tile: FiberTile, light: LightKernel | None, transport: Transport | None = None, bsdf: Any = None
+) -> Estimator:
+    return Estimator(build_tile(tile, bsdf or tile.bsdf()), light, transport or Transport())
+
+
+def mean_value(
+    tile: FiberTile, omega_i: NDArray[np.float64], omega_o: NDArray[np.float64], n: int, bsdf: Any = None
+) -> Estimate:
+    """Tile mean under a delta light, over channels."""
+    estimator = traced(tile, LightKernel(0.0), bsdf=bsdf)
+    e = estimator.estimate(tile_mean_queries(omega_i, omega_o, n), 64, Stream(3, "test", 0))
+    return mean_of_halves(e.value_a.mean(axis=1), e.value_b.mean(axis=1))
+
+
+@pytest.mark.parametrize(("count", "radius"), [(60, 0.02), (300, 0.004), (40, 1e-4)])
+def test_white_fibers_return_constant_light_at_any_depth(count: int, radius: float) -> None:
+    tile = felt(count, radius)
+    e = traced(tile, None).estimate(
+        tile_mean_queries([0, 0, 1], direction(25, 40), 400), 64, Stream(1, "test", 0)
+    )
+    assert e.transmittance is not None
+    # What the fibers send back, and what passes between them.
+    total = 0.5 * (e.value_a + e.value_b).mean(axis=1) + e.transmittance
+    assert np.abs(total - 1.0).max() < 1e-4
+    assert (e.lost, e.capped, e.nonfinite) == (0, 0, 0)
+    assert e.transmittance.mean() == pytest.approx({60: 0.0, 300: 0.1, 40: 0.99}[count], abs=0.12)
+
+
+def test_one_straight_fiber_is_the_integral_of_its_scattering_function() -> None:
+    radius = 0.05
+    tile = cylinder(radius)
+    omega_i, omega_o = direction(50, 70), direction(35, -60)
+    e = traced(tile, LightKernel(0.0), DIRECT).estimate(
+        tile_mean_queries(omega_i, omega_o, 40_000), 16, Stream(2, "test", 0)
+    )
+    measured = mean_of_halves(e.value_a.mean(axis=1), e.value_b.mean(axis=1))
+    # Rays hit the fiber at the offset h in [-1, 1] from its axis, seen along ω_o across x. Frames: x around
+    # the fiber, y along it, z the normal.
+    bsdf = mi.load_dict(tile.bsdf())
+    h = (np.arange(4000) + 0.5) / 2000 - 1.0
+    across = np.array([0.0, *omega_o[1:]]) / np.hypot(*omega_o[1:])
+    side = np.cross(ALONG_X, across)
+    normal = h[:, None] * side + np.sqrt(1.0 - h[:, None] ** 2) * across
+    around = np.cross(ALONG_X, normal)
+
+    def local(w: NDArray[np.float64]) -> Any:
+        return mi.Vector3f(*(mi.Float(f @ w) for f in (around, np.tile(ALONG_X, (len(h), 1)), normal)))
+
+    si = mi.SurfaceInteraction3f()
+    si.wi, si.uv, si.t = local(omega_o), mi.Point2f(0.5), mi.Float(0.0)
+    value = np.array(bsdf.eval(mi.BSDFContext(), si, local(omega_i))).mean()
+    share = 2.0 * radius * np.hypot(*omega_o[1:]) / omega_o[2]
+    expected = share * value / omega_i[2]
+    assert abs(measured.value / expected - 1.0) < 4.0 * measured.error / expected + 1e-3
+    assert measured.error / expected < 0.01
+
+
+def test_a_fiber_of_a_ten_thousandth_of_the_tile_does_not_shadow_itself() -> None:
+    # The same integral is proportional to the radius, whatever the radius is.
+    omega_i, omega_o = direction(50, 70), direction(35, -60)
+    found = []
+    for radius in (1e-4, 1e-2):
+        # All queries on the fiber: footprints of its width.
+        u = np.column_stack([np.random.default_rng(0).random(4000), np.full(4000, 0.5)])
+        q = queries(u, 3.0 * radius, omega_i, omega_o, 4000)
+        e = traced(cylinder(radius), LightKernel(0.0)).estimate(q, 64, Stream(5, "test", 0))
+        found.append(mean_of_halves(e.value_a.mean(axis=1), e.value_b.mean(axis=1)))
+    small, large = found
+    error = np.hypot(small.error / small.value, large.error / large.value)
+    assert abs(small.value / large.value - 1.0) < 4.0 * error
+    assert error < 0.01
+
+
+def test_diffuse_tubes_are_reciprocal() -> None:
+    # The scattering model of Chiang et al. is not: its absorption depends on the view alone.
+    tile = felt(80, 0.012)
+    a, b = direction(60, 20), direction(25, 200)
+    forth, back = (mean_value(tile, i, o, 6000, lambert(0.7)) for i, o in ((a, b), (b, a)))
+    error = float(np.hypot(forth.error, back.error))
+    assert abs(forth.value - back.value) < 4.0 * error
+    assert error < 0.02 * forth.value
+
+
+@pytest.mark.parametrize("aspect", [1.0, 0.7])
+def test_the_tile_repeats(aspect: float) -> None:
+    tile = felt(50, 0.01, GRAY, aspect=aspect)
+    rng = np.random.default_rng(4)
+    u = rng.random((3000, 2))
+    omega_i, omega_o = direction(8, 100), direction(6, 33)
+    moved = np.array([0.37, 0.61 * aspect, 0.0])
+    other = FiberTile(aspect, [c.moved(moved) for c in tile.curves], tile.yarn, tile.colors, tile.scattering)
+    found = []
+    for fibers, where in ((tile, u), (tile, u + np.array([3, -2])), (other, u + np.array([0.37, 0.61]))):
+        q = queries(where, 0.01, omega_i, omega_o, len(u))
+        e = traced(fibers, LightKernel(1.0), DIRECT).estimate(q, 8, Stream(6, "test", 0))
+        found.append(np.stack([e.value_a, e.value_b]))
+    # Rounding of the positions sends a few paths past another fiber.
+    for value in found[1:]:
+        assert np.mean(np.abs(value - found[0]) < 1e-4 * found[0].mean()) > 0.97
+        assert value.mean() == pytest.approx(found[0].mean(), rel=5e-3)
+
+
+def test_fibers_agree_with_instances_in_unmodified_mitsuba(tmp_path_factory: pytest.TempPathFactory) -> None:
+    tile = felt(60, 0.015, GRAY)
+    unit = 32.0
+    lines = []
+    for curve in tile.curves:
+        run = curve.unrolled().copy()
+        run[:, :3] -= (0.5, 0.5, 0.0)
+        lines.append("\n".join(" ".join(f"{c:.9g}" for c in row) for row in run * unit))
+    file = tmp_path_factory.mktemp("curves") / "felt.txt"
+    file.write_text("\n\n".join(lines) + "\n")
+    omega_i = direction(50, 25)
+    shift = mi.ScalarTransform4f().translate
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "path", "max_depth": -1, "rr_depth": 1000, "hide_emitters": True},
+            "group": {
+                "type": "shapegroup",
+                "curves": {"type": "bsplinecurve", "filename": str(file), "bsdf": tile.bsdf()},
+            },
+            **{
+                f"at_{i}_{j}": {
+                    "type": "instance",
+                    "to_world": shift([unit * i, unit * j, 0.0]),
+                    "group": {"type": "ref", "id": "group"},
+                }
+                for i in range(-2, 3)
+                for j in range(-2, 3)
+            },
+            "light": directional(omega_i),
+            "sensor": {
+                "type": "orthographic",
+                "to_world": mi.ScalarTransform4f().look_at([0, 0, 10], [0, 0, 0], [0, 1, 0])
+                @ mi.ScalarTransform4f().scale([0.5 * unit, 0.5 * unit, 1.0]),
+                "film": {
+                    "type": "hdrfilm",
+                    "width": 32,
+                    "height": 32,
+                    "rfilter": {"type": "box"},
+                    "pixel_format": "rgb",
+                },
+            },
+        }
+    )
+    runs = [np.array(mi.render(scene, spp=64, seed=k), np.float64).mean() for k in range(12)]
+    theirs, error = np.mean(runs), np.std(runs, ddof=1) / np.sqrt(len(runs))
+    ours = mean_value(tile, omega_i, np.array([0.0, 0.0, 1.0]), 10_000)
+    both = float(np.hypot(ours.error, error))
+    assert abs(ours.value - theirs) < 4.0 * both
+    assert both < 0.02 * theirs
