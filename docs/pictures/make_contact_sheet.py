@@ -1,7 +1,7 @@
 """Make docs/pictures/contact_sheet.png: every material of assets/ as a close view and from afar.
 
 One run of ``mbtf-gen reference`` renders each picture; its command is printed. Labels are added here.
-From the repository's root, in a minute or two: ``.venv/bin/python docs/pictures/make_contact_sheet.py``.
+From the repository's root, in ten minutes: ``.venv/bin/python docs/pictures/make_contact_sheet.py``.
 """
 
 from __future__ import annotations
@@ -14,7 +14,12 @@ from pathlib import Path
 
 from PIL import Image, ImageDraw, ImageFont
 
-MATERIALS = ("twisted_wool", "straight_wool", "turtle_shell", "cliff_rock", "insulation_foam")
+# In blocks of four across.
+MATERIALS = (
+    *("twisted_wool", "straight_wool", "turtle_shell", "cliff_rock"),
+    *("insulation_foam", "basket_weave", "twill_silk", "stockinette"),
+)
+ACROSS = 4
 # Caption of each row, and the options of its pictures.
 ROWS = (
     ("one tile across, view at 55°, light at 40°", "--view 55,-90 --light 40,140 --tiles-across 1"),
@@ -49,14 +54,15 @@ def render(material: str, options: str) -> Image.Image:
 def main() -> None:
     """Write the sheet."""
     pitch = SIZE + GAP
-    width = len(MATERIALS) * pitch - GAP
-    sheet = Image.new("RGB", (width, TITLE + len(ROWS) * (CAPTION + pitch) - GAP), PAPER)
+    block = TITLE + len(ROWS) * (CAPTION + pitch)
+    sheet = Image.new("RGB", (ACROSS * pitch - GAP, len(MATERIALS) // ACROSS * block - GAP), PAPER)
     draw = ImageDraw.Draw(sheet)
-    for column, material in enumerate(MATERIALS):
+    for number, material in enumerate(MATERIALS):
+        column, above = number % ACROSS, number // ACROSS * block
         title = material.replace("_", " ")
-        draw.text((column * pitch + 2, 2), title, INK, ImageFont.load_default(18))
+        draw.text((column * pitch + 2, above + 2), title, INK, ImageFont.load_default(18))
         for row, (caption, options) in enumerate(ROWS):
-            top = TITLE + row * (CAPTION + pitch)
+            top = above + TITLE + row * (CAPTION + pitch)
             if column == 0:
                 draw.text((2, top + 2), caption, INK, ImageFont.load_default(14))
             sheet.paste(render(material, options), (column * pitch, top + CAPTION))

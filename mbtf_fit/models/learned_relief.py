@@ -36,8 +36,9 @@ from mbtf_gen.dataset.geometry import Geometry
 # Steps of training after which rays are traced to the current heights.
 TRACED = 10
 # Steps after which normals and horizons are filtered again, for textures of so many texels and fewer; for
-# larger ones in proportion, so that the filter takes a fixed share of the time.
-FILTERED, FILTERED_TEXELS = 40, 1 << 14
+# larger ones in proportion, so that the filter takes a fixed share of the time. In short fits they are
+# filtered so many times at least, in equal parts of the budget.
+FILTERED, FILTERED_TEXELS, FILTERED_LEAST = 40, 1 << 14, 8
 
 
 class LearnedRelief(Relief):
@@ -57,6 +58,8 @@ class LearnedRelief(Relief):
         super().__init__(lattice, network)
         self.heights = FeatureTextures(lattice, [lattice.finest], 1, moves_lookups=True)
         self.light_width = 0.0
+        # Part of the budget in which normals and horizons were filtered.
+        self._part = 0
         self._filtered = torch.zeros(lattice.shape())
 
     def initialize(self, generator: torch.Generator, unit: float) -> None:
@@ -64,14 +67,18 @@ class LearnedRelief(Relief):
         nn.init.zeros_(self.heights.texels)
         self.follow(0, 0.0)
 
-    def follow(self, step: int, sigma: float, *, final: bool = False) -> None:
+    def follow(self, step: int, sigma: float, fraction: float = 0.0) -> None:
         """Let rays and hints see the learned heights, blurred by `sigma` texels, where it is their turn
-        before a step of training; both at once where `final`."""
+        before a step of training, after a fraction of its budget."""
         interval = FILTERED * max(1, self.heights.packing.texels // FILTERED_TEXELS)
-        filtered = final or step % interval == 0
-        if not (filtered or step % TRACED == 0):
-            return
+        part = int(FILTERED_LEAST * fraction)
+        filtered = step % interval == 0 or part != self._part
+        self._part = part
         with torch.no_grad():
+            # Above the reference plane a texel would have a gradient without an effect.
+            self.heights.texels.clamp_(max=FIRST_DEPTH / HEIGHT_SCALE)
+            if not (filtered or step % TRACED == 0):
+                return
             x = self.heights.blurred(sigma).view(self.lattice.shape())
             self._see((HEIGHT_SCALE * x - FIRST_DEPTH).clamp_max(0.0).cpu(), filtered=filtered)
 
@@ -84,13 +91,24 @@ class LearnedRelief(Relief):
         self.know(KnownSurface.of(geometry, self.lattice, self.light_width))
 
     def surface_state(self) -> dict[str, Tensor]:
-        """Heights (H, W) that rays see, and those that normals and horizons were filtered from."""
-        return {"heights": self.known.heights, "filtered": self._filtered}
+        """Heights (H, W) that rays see, those that normals and horizons were filtered from, and in which part
+        of the budget."""
+        part = torch.tensor(self._part)
+        return {"heights": self.known.heights, "filtered": self._filtered, "part": part}
 
     def restore_surface(self, state: Mapping[str, Tensor]) -> None:
         """Inverse of :meth:`surface_state`."""
         self._see(state["filtered"], filtered=True)
         self._see(state["heights"], filtered=False)
+        self._part = int(state["part"])
+
+    def start_from(self, heights: Tensor) -> None:
+        """Start from heights (H, W) of another material."""
+        with torch.no_grad():
+            self.heights.texels.copy_(
+                ((heights + FIRST_DEPTH) / HEIGHT_SCALE).reshape(self.heights.texels.shape)
+            )
+        self._see(heights, filtered=True)
 
     def displaced(self, u: Tensor, level: Tensor, height: Tensor, omega_o: Tensor) -> Tensor:
         moved = super().displaced(u, level, height, omega_o)

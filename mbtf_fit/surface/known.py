@@ -120,7 +120,8 @@ class KnownSurface:
         """The same maps on other heights (H, W)."""
         out = replace(self, heights=heights)
         # Not packed again.
-        vars(out).update(map_table=self.map_table, horizon_table=self.horizon_table)
+        tables = ("map_table", "horizon_table", "_map_copies", "_horizon_copies")
+        vars(out).update({name: getattr(self, name) for name in tables})
         return out
 
     def tensors(self) -> dict[str, Tensor]:

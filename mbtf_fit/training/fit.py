@@ -277,8 +277,9 @@ def _known_surface(config: FitConfig, data: Dataset) -> KnownSurface:
 
 
 def _light_width(data: Dataset) -> float:
-    """RMS angle per axis of the light kernel, in degrees."""
-    return float(data.manifest.get("config", {}).get("light", {}).get("width", 0.0))
+    """RMS angle per axis of the light kernel, in degrees; 0 where the data set does not say."""
+    config: Any = data.manifest.get("config") or {}
+    return float((config.get("light") or {}).get("width") or 0.0)
 
 
 def _initialize_from(model: NeuralMaterial, folder: str | Path) -> None:
@@ -287,7 +288,8 @@ def _initialize_from(model: NeuralMaterial, folder: str | Path) -> None:
     A step of the hierarchical model takes a hundred times as long per query as a step of ``neumip``. Both
     share textures and offset, which ``neumip`` learns sooner.
     """
-    given, mine = Material.load(folder).model.weights(), model.weights()
+    source = Material.load(folder).model
+    given, mine = source.weights(), model.weights()
     names = [name for name in mine if name.partition(".")[0] in _SHARED]
     names += [_DEPTH_WEIGHTS] if _DEPTH_WEIGHTS in mine and _DEPTH_WEIGHTS in given else []
     for name in names:
@@ -299,6 +301,8 @@ def _initialize_from(model: NeuralMaterial, folder: str | Path) -> None:
                 "network.offset and network.oversampling",
             )
     model.load_weights({**mine, **{name: given[name] for name in names}})
+    if isinstance(model, LearnedRelief) and isinstance(source, LearnedRelief):
+        model.start_from(source.known.heights)
 
 
 def _resume(trainer: Trainer, out: Path) -> bool:

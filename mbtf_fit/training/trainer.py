@@ -163,8 +163,6 @@ class Trainer:
             self.progress.seconds += time.perf_counter() - start
             if not math.isfinite(self.progress.loss + float(torch.stack(health).sum())):
                 self._stop_diverged(first, losses, health)
-            if self.fraction >= 1.0:
-                self._follow_heights(final=True)
         return self.fraction >= 1.0
 
     def _health(self) -> Tensor:
@@ -193,10 +191,10 @@ class Trainer:
             max(sigma, blur.offset_sigma if t.moves_lookups else blur.min_sigma) for t in model.textures()
         ]
 
-    def _follow_heights(self, *, final: bool = False) -> None:
+    def _follow_heights(self) -> None:
         if isinstance(self.model, LearnedRelief):
             sigma = self._sigmas()[self.model.textures().index(self.model.heights)]
-            self.model.follow(self.progress.step, sigma, final=final)
+            self.model.follow(self.progress.step, sigma, self.fraction)
 
     def _tables(self) -> list[Tensor]:
         """The textures with the current blur."""

@@ -32,7 +32,7 @@ def inspect(
     Parameters
     ----------
     material
-        Height map, folder of maps, or material.yaml.
+        Height map, folder of maps, material.yaml, or file of yarns or fibers.
     write
         Store the height scale, tiling, resolution, normal convention and color space in a material.yaml, as
         given or as the maps suggest. Other commands then need no flags.
@@ -42,9 +42,10 @@ def inspect(
     resolved = resolve_config(options, material)
     _check_new(write, "--write", (".yaml", ".yml"), overwrite)
     _check_new(export, "--export", (".exr",), overwrite)
-    from mbtf_gen.fibers.inspect import fiber_text, inspect_fibers
+    from mbtf_gen.fibers.inspect import fiber_text
     from mbtf_gen.images.exr import write_channels
     from mbtf_gen.material.choices import write_material_file
+    from mbtf_gen.material.cloth import inspect_cloth
     from mbtf_gen.material.inspect import inspect_material, inspection_text
     from mbtf_gen.material.load import load_material
 
@@ -54,13 +55,7 @@ def inspect(
     if loaded.fibers is not None:
         if write is not None or export is not None:
             raise UsageError("is for height maps", where="--export" if write is None else "--write")
-        found = {
-            "material": resolved.material,
-            "resolution": loaded.lattice(finest).shape()[1],
-            **inspect_fibers(loaded.fibers),
-            "warnings": list(loaded.warnings),
-            "notes": list(loaded.notes),
-        }
+        found = {"material": resolved.material, **inspect_cloth(loaded, finest)}
         console.report(found, fiber_text(found, resolved.material))
         return
     outputs: dict[str, Any] = {}

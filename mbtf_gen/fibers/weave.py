@@ -126,7 +126,7 @@ def _undulating(crossings: F64, shift: F64) -> Curve:
 def knitted_lines(stitches: int, rows: int, aspect: float) -> list[Curve]:
     """Center lines of a stockinette of `rows` yarns of `stitches` loops each.
 
-    A yarn is ``x = t + a sin 2t``, ``y = h cos t``, ``z = d cos 2t``, with 2π per stitch: it leans over
+    A yarn is ``x = t + a sin 2t``, ``y = h cos t``, ``z = -d cos 2t``, with 2π per stitch: it leans over
     itself, and its loops pass through those of the row below.
     """
     t = 2.0 * np.pi * np.arange(_PER_STITCH * stitches) / _PER_STITCH
@@ -135,6 +135,6 @@ def knitted_lines(stitches: int, rows: int, aspect: float) -> list[Curve]:
     for row in range(rows):
         x = (t / (2.0 * np.pi) + _LEAN * np.sin(2.0 * t)) * wale
         y = (row + 0.5) * course + _TALL * max(wale, course) * np.cos(t)
-        z = _DEEP * wale * np.cos(2.0 * t)
+        z = -_DEEP * wale * np.cos(2.0 * t)
         out.append(Curve.through(np.column_stack([x, y, z]), 0.0, np.array([1.0, 0.0, 0.0])))
     return out

@@ -4,13 +4,26 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from mbtf_core.digest import data_sha256, file_sha256
 from mbtf_gen.fibers.cloth import fiber_tile, loose_ends
 from mbtf_gen.fibers.cloth_file import ClothFile
+from mbtf_gen.fibers.inspect import inspect_fibers
 from mbtf_gen.material.material import Material
+
+
+def inspect_cloth(material: Material, finest: int | None = None) -> dict[str, Any]:
+    """What :func:`~mbtf_gen.fibers.inspect.fiber_text` prints of a cloth, up to level `finest`."""
+    assert material.fibers is not None
+    return {
+        "resolution": material.lattice(finest).shape()[1],
+        **inspect_fibers(material.fibers),
+        "warnings": list(material.warnings),
+        "notes": list(material.notes),
+    }
 
 
 def cloth_material(spec: ClothFile, folder: Path) -> Material:

@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_core.errors import InputError
 from mbtf_gen.geometry.heightfield import HeightGrid, grid_faces, grid_vertices
 from mbtf_gen.render.geometry import Vertex
 from mbtf_gen.render.heightfield import surface_interaction
@@ -19,6 +20,8 @@ from mbtf_gen.render.types import Mask, Point3f, Ray3f, SurfaceInteraction3f, Ve
 
 # Distance at which scattered rays start, relative to the largest coordinate.
 _OFFSET = 5.0e-7
+# Each cell takes about 300 bytes, with Mitsuba's and Embree's own data.
+MOST_CELLS = 1 << 24
 
 
 @dataclass(frozen=True)
@@ -37,6 +40,12 @@ class MeshGeometry(PeriodicScene):
     @classmethod
     def of_grid(cls, grid: HeightGrid, unit: float) -> MeshGeometry:
         """The triangles of a height grid: those that :mod:`~mbtf_gen.render.heightfield_tracer` traces."""
+        if grid.z.size > MOST_CELLS:
+            raise InputError(
+                f"a mesh of {grid.z.size:,} cells is too large for triangles; at most {MOST_CELLS:,} are",
+                where="geometry.tracer",
+                hint="reduce --mesh, or use --tracer heightfield",
+            )
         # One more cell on each side: rays along the seam meet triangles on either side of it.
         vertices = (grid_vertices(grid, (1, 1)) - (0.5, 0.5 * grid.aspect, 0.0)) * unit
         rows, columns = grid.z.shape

@@ -131,8 +131,12 @@ class PeriodicScene(ABC):
         over_x, over_y = _inverse(d.x), _inverse(d.y)
         right, up, rising = d.x >= 0, d.y >= 0, d.z >= 0
         constants = (d, low, high, over_x, over_y, right, up, rising)
-        nothing = self._located(dr.zeros(mi.PreliminaryIntersection3f, dr.width(d)), mi.Ray3f(o, d))
-        state = Search(o, mi.Bool(active), mi.Bool(False), nothing, mi.UInt32(0), mi.Bool(False))
+        # NaN counts as a hit: it must reach the value, where the sample is detected and drawn again.
+        faulty = active & ~dr.isfinite(dr.sum(o) + dr.sum(d))
+        nothing = dr.zeros(mi.PreliminaryIntersection3f, dr.width(d))
+        nothing.prim_uv = dr.select(faulty, mi.Point2f(dr.nan), 0.0)
+        at = self._located(nothing, mi.Ray3f(o, d))
+        state = Search(o, active & ~faulty, mi.Bool(faulty), at, mi.UInt32(0), mi.Bool(False))
         back = mi.Float(0.0)
         while dr.hint(state.searching, exclude=[self, holes, constants]):
             to_x = (dr.select(right, high[0], low[0]) - state.o.x) * over_x
@@ -153,7 +157,8 @@ class PeriodicScene(ABC):
                 state.o = dr.select(passes, on, state.o)
             else:
                 passes = mi.Bool(False)
-            back = dr.select(passes, 0.0, self.overlap)
+            # A ray that starts just before the border must not meet the surface behind its start.
+            back = dr.select(passes, 0.0, dr.minimum(self.overlap, back + end))
 
             # Into the next box.
             moves = state.searching & ~hit & ~passes

@@ -218,34 +218,22 @@ def _mitsuba_scene(job: Job, camera: Camera, omega_i: F64, folder: Path) -> dict
     """Scene dictionary for Mitsuba."""
     import mitsuba as mi
 
-    from mbtf_gen.geometry.heightfield import tile_mesh
     from mbtf_gen.render.scene import LONG_SIDE
 
-    grid = job.grid
-    unit = LONG_SIDE / max(1.0, grid.aspect)
-    mesh = tile_mesh(grid)
-    mesh.apply_translation([-0.5, -0.5 * grid.aspect, 0.0])
-    mesh.apply_scale(unit)
-    file = folder / "tile.ply"
-    file.write_bytes(mesh.export(file_type="ply", vertex_normal=False))
-    tile = {
-        "type": "ply",
-        "filename": str(file),
-        "face_normals": True,
-        "flip_tex_coords": True,
-        "bsdf": _mitsuba_bsdf(job),
-    }
+    aspect = job.material.aspect
+    unit = LONG_SIDE / max(1.0, aspect)
+    tile = _mitsuba_tile(job, unit, folder)
     # Surfaces within this distance affect a pixel at the edge by visibility, shadowing or interreflection.
     slope = math.tan(math.radians(LOWEST_LIGHT))
-    reach = 0.75 * camera.tiles_across + 2.0 * grid.displacement_range / slope + 1.0
-    columns, rows = (math.ceil(reach / side) for side in (1.0, grid.aspect))
+    reach = 0.75 * camera.tiles_across + 2.0 * job.displacement_range / slope + 1.0
+    columns, rows = (math.ceil(reach / side) for side in (1.0, aspect))
     shift = mi.ScalarTransform4f().translate
     # The camera looks at the central tile.
-    middle = np.array([camera.target[0] - 0.5, camera.target[1] - 0.5 * grid.aspect])
+    middle = np.array([camera.target[0] - 0.5, camera.target[1] - 0.5 * aspect])
     instances = {
         f"tile_{i + columns}_{j + rows}": {
             "type": "instance",
-            "to_world": shift([float(i * unit), float(j * grid.aspect * unit), 0.0]),
+            "to_world": shift([float(i * unit), float(j * aspect * unit), 0.0]),
             "group": {"type": "ref", "id": "group"},
         }
         for i in range(-columns, columns + 1)
@@ -284,6 +272,33 @@ def _mitsuba_scene(job: Job, camera: Camera, omega_i: F64, folder: Path) -> dict
         },
         "group": {"type": "shapegroup", "tile": tile},
         **instances,
+    }
+
+
+def _mitsuba_tile(job: Job, unit: float, folder: Path) -> dict[str, Any]:
+    """One period of the mesh or of the fibers, centered, with `unit` scene units per tile width."""
+    fibers, aspect = job.material.fibers, job.material.aspect
+    if fibers is not None:
+        file = folder / "tile.txt"
+        with file.open("w") as text:
+            for curve in fibers.curves:
+                rows = (curve.unrolled() - (0.5, 0.5 * aspect, 0.0, 0.0)) * unit
+                np.savetxt(text, rows, fmt="%.9g")
+                text.write("\n")
+        return {"type": "bsplinecurve", "filename": str(file), "bsdf": fibers.bsdf()}
+    from mbtf_gen.geometry.heightfield import tile_mesh
+
+    mesh = tile_mesh(job.grid)
+    mesh.apply_translation([-0.5, -0.5 * aspect, 0.0])
+    mesh.apply_scale(unit)
+    file = folder / "tile.ply"
+    file.write_bytes(mesh.export(file_type="ply", vertex_normal=False))
+    return {
+        "type": "ply",
+        "filename": str(file),
+        "face_normals": True,
+        "flip_tex_coords": True,
+        "bsdf": _mitsuba_bsdf(job),
     }
 
 

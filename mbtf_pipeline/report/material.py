@@ -11,6 +11,8 @@ import numpy as np
 from mbtf_core.color import linear_to_srgb
 from mbtf_core.errors import MbtfError
 from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.fibers.inspect import fiber_text
+from mbtf_gen.material.cloth import inspect_cloth
 from mbtf_gen.material.inspect import USES, inspect_material, inspection_text
 from mbtf_gen.material.latest import latest_material
 from mbtf_gen.material.material import MAPS
@@ -39,7 +41,10 @@ def material_section(config: GeneratorConfig, inputs: Mapping[str, str]) -> dict
     geometry = config.geometry
     try:
         material = latest_material(config.material, geometry.make_tileable)
-        found = inspect_material(material, geometry.height_scale, geometry.mesh)
+        if material.fibers is not None:
+            found = inspect_cloth(material)
+        else:
+            found = inspect_material(material, geometry.height_scale, geometry.mesh)
     except (MbtfError, OSError) as error:
         return nothing | {"missing": f"The material cannot be read any more: {error}"}
     if material.digests != inputs:
@@ -59,8 +64,8 @@ def material_section(config: GeneratorConfig, inputs: Mapping[str, str]) -> dict
         maps.append({"label": title, "lines": lines, "image": image, "alt": alt, "file": ""})
     # Without the folders of their files.
     parts = (warning.partition(": ") for warning in found["warnings"])
-    warnings = [f"{Path(path).name}: {text}" for path, _, text in parts] + found["oddities"]
-    text = inspection_text(found, config.material)
+    warnings = [f"{Path(path).name}: {text}" for path, _, text in parts] + found.get("oddities", [])
+    text = (inspection_text if material.fibers is None else fiber_text)(found, config.material)
     return {"maps": maps, "warnings": warnings, "inspection": text, "missing": ""}
 
 

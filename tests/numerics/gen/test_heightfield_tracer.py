@@ -227,3 +227,7 @@ def test_rays_that_are_not_finite_end(bad: float, tracer: Tracer) -> None:
         si, crossings, capped, _ = field.closest_hit(ray_of(o, d), mi.Bool(True), 50)
         dr.eval(si, crossings, capped)
         assert int(crossings[0]) <= 50
+        if np.isnan(bad):
+            # It must reach the value, where it is detected.
+            assert bool(si.is_valid()[0])
+            assert np.isnan(np.array(si.p) + np.array(si.wi)).any()

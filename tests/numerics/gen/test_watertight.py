@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -15,18 +16,23 @@ RAYS = 10_000_000
 RESOLUTION = 64
 
 
-def misses(grid: HeightGrid, uv: NDArray[np.float64], direction: NDArray[np.float64], tracer: Tracer) -> int:
-    """Rays through uv (n, 2) of the reference plane along `direction` (n, 3) that hit nothing."""
+def faults(
+    grid: HeightGrid, uv: NDArray[np.float64], direction: NDArray[np.float64], tracer: Tracer
+) -> tuple[int, int]:
+    """Rays through uv (n, 2) of the reference plane along `direction` (n, 3) that hit nothing, and those that
+    hit the surface from below."""
     tile = build_tile(grid, lambert(0.5), tracer)
     plane = np.column_stack([(uv - 0.5) * (1.0, grid.aspect) * tile.unit, np.zeros(len(uv))])
     origin = plane - direction * (CLEARANCE / -direction[:, 2:])
-    total = 0
+    missed, turned = 0, 0
     for part in range(0, len(uv), 1 << 20):
         o, d = (np.ascontiguousarray(x[part : part + (1 << 20)].T, np.float32) for x in (origin, direction))
         ray = mi.Ray3f(mi.Point3f(o), mi.Vector3f(d))
         si, _, capped, _ = tile.geometry.closest_hit(ray, mi.Bool(True), 4096)
-        total += int(np.sum(~np.array(si.is_valid()))) + int(np.sum(np.array(capped)))
-    return total
+        missed += int(np.sum(~np.array(si.is_valid()))) + int(np.sum(np.array(capped)))
+        # Rays along a facet meet it from either side, up to rounding.
+        turned += int(np.sum(np.array(dr.dot(si.n, ray.d)) > 1e-3))
+    return missed, turned
 
 
 def downward(rng: np.random.Generator, n: int, smallest_cosine: float) -> NDArray[np.float64]:
@@ -55,7 +61,10 @@ def test_ten_million_rays_onto_borders_and_corners(aspect: float, tracer: Tracer
     uv[2 * fifth : 3 * fifth] = rng.choice(lines, (fifth, 2))
     uv[3 * fifth : 4 * fifth] = (rng.integers(0, RESOLUTION, (fifth, 2)) + 0.5) / RESOLUTION
     uv[4 * fifth :, 0] = (rng.integers(0, RESOLUTION, n - 4 * fifth) + 0.5) / RESOLUTION
-    assert misses(grid, uv, downward(rng, n, 0.02)[rng.permutation(n)], tracer) == 0
+    missed, turned = faults(grid, uv, downward(rng, n, 0.02)[rng.permutation(n)], tracer)
+    assert missed == 0
+    # Of rays onto an edge, some are given the facet behind it: measured, 1 in 10⁶ and 5 in 10⁶.
+    assert turned < 1e-5 * n
 
 
 @pytest.mark.parametrize("tracer", ["heightfield", "mesh"])
@@ -63,4 +72,4 @@ def test_grazing_rays_on_a_plane_all_arrive(tracer: Tracer) -> None:
     rng = np.random.default_rng(1)
     n = 200_000
     flat = HeightGrid(np.zeros((8, 8)), 1.0)
-    assert misses(flat, rng.random((n, 2)), downward(rng, n, 1e-4), tracer) == 0
+    assert faults(flat, rng.random((n, 2)), downward(rng, n, 1e-4), tracer) == (0, 0)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -19,8 +20,16 @@ from support.scenes import (
     tile_mean_queries,
 )
 
+from mbtf_core.errors import InputError
 from mbtf_core.stats import aggregate_test, elevation_groups
+from mbtf_gen.config.generator import GeneratorConfig, Tracer
 from mbtf_gen.geometry.heightfield import HeightGrid
+from mbtf_gen.job import Job
+from mbtf_gen.planning.effects_plan import reference_plan
+from mbtf_gen.planning.simulation import build_estimator
+from mbtf_gen.render.geometry import Vertex
+from mbtf_gen.render.heightfield_tracer import HeightfieldGeometry
+from mbtf_gen.render.mesh_tracer import MeshGeometry
 
 WHITE = lambert(1.0)
 SURFACES: dict[str, dict[str, Any]] = {
@@ -83,3 +92,43 @@ def test_shifts_by_periods_change_nothing() -> None:
         gap = np.abs(hits(shift) - here).max(axis=0) / tile.unit
         # Origins far away are rounded more coarsely; over rims rounding decides.
         assert np.mean(gap > 1e-5) < 1e-3
+
+
+def test_rays_that_leave_points_on_the_border_do_not_meet_their_own_triangle() -> None:
+    """The border runs through the outermost vertices, where texel centers lie."""
+    z = np.full((16, 16), -0.02)
+    z[4, 4] = 0.0
+    rng = np.random.default_rng(0)
+    n = 20_000
+    phi, sine = 2.0 * np.pi * rng.random(n), np.sqrt(rng.random(n))
+    d = np.stack([sine * np.cos(phi), sine * np.sin(phi), np.sqrt(1.0 - sine**2)])
+    found = []
+    for tracer in ("heightfield", "mesh"):
+        tile = build_tile(HeightGrid(z, 1.0), lambert(0.5), cast(Tracer, tracer))
+        edge = 0.5 * tile.unit * (1.0 - 1.0 / 16.0)
+        floor = -0.02 * tile.unit
+        up = mi.Normal3f(0, 0, 1)
+        blocked = []
+        for gap in (0.0, 2e-6, 1e-4):
+            p = mi.Point3f(mi.Float(edge - gap), mi.Float(5.0), mi.Float(floor))
+            si = tile.geometry.interaction(Vertex(p, up), mi.Vector3f(0, 0, -1), mi.Bool(True))
+            ray = tile.geometry.leave(si, mi.Vector3f(d.astype(np.float32)))
+            blocked.append(np.array(tile.geometry.occluded(ray, mi.Bool(True), 100)[0]).mean())
+        found.append(blocked)
+    assert np.abs(np.array(found[1]) - found[0]).max() < 2e-3
+
+
+@pytest.mark.parametrize("tracer", ["heightfield", "mesh"])
+def test_a_job_is_traced_as_its_options_say(tmp_path: Path, tracer: Tracer) -> None:
+    np.save(tmp_path / "height.npy", 0.1 * np.random.default_rng(0).random((8, 8)))
+    described = {"material": str(tmp_path / "height.npy"), "geometry": {"tracer": tracer}}
+    job = Job.load(GeneratorConfig.model_validate(described))
+    estimator = build_estimator(job, reference_plan(job))
+    kind = MeshGeometry if tracer == "mesh" else HeightfieldGeometry
+    assert isinstance(estimator.tile.geometry, kind)
+
+
+def test_a_mesh_too_large_for_memory_is_refused() -> None:
+    cells = np.lib.stride_tricks.as_strided(np.zeros(1), (1 << 12, 1 << 13), (0, 0))
+    with pytest.raises(InputError, match="--tracer heightfield"):
+        build_tile(HeightGrid(cells, 0.5), lambert(0.5), "mesh")

@@ -13,8 +13,9 @@ from torch import Tensor
 from mbtf_core.lattice import Lattice
 from mbtf_fit import FitConfig
 from mbtf_fit.data.queries import TrainingQueries
+from mbtf_fit.models import learned_relief
 from mbtf_fit.models.constants import HEIGHT_SCALE
-from mbtf_fit.models.learned_relief import FILTERED, TRACED, LearnedRelief
+from mbtf_fit.models.learned_relief import FILTERED, FILTERED_LEAST, TRACED, LearnedRelief
 from mbtf_fit.models.registry import build_model
 from mbtf_fit.native import library
 from mbtf_fit.native.gradients import NativeGradients
@@ -153,8 +154,36 @@ def test_heights_stay_below_the_reference_plane() -> None:
     model = model_of()
     with torch.no_grad():
         model.heights.texels += 10
+    # At any step, so that no texel has a gradient without an effect.
+    model.follow(1, 0.0)
+    assert float(model.heights.texels.detach().max()) == pytest.approx(0.04 / HEIGHT_SCALE)
     model.follow(0, 0.0)
-    assert float(model.known.heights.max()) == 0
+    assert float(model.known.heights.max()) == pytest.approx(0, abs=1e-8)
+    assert float(model.known.heights.max()) <= 0
+
+
+def test_short_fits_filter_normals_and_horizons_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(learned_relief, "FILTERED", 10**6)
+    model = model_of()
+    seen = []
+    for step in range(1, 100):
+        before = model.known.maps
+        model.follow(step, 0.0, step / 100)
+        seen += [step] if model.known.maps is not before else []
+    assert len(seen) == FILTERED_LEAST - 1
+    assert seen[-1] < 90
+
+
+def test_heights_start_from_those_of_another_material() -> None:
+    first, second = model_of(), model_of()
+    with torch.no_grad():
+        first.heights.texels -= torch.rand(first.heights.texels.shape)
+    first.follow(0, 0.0)
+    second.start_from(first.known.heights)
+    assert torch.equal(second.known.heights, first.known.heights)
+    # The next step of training goes on from there.
+    second.follow(0, 0.0)
+    torch.testing.assert_close(second.known.heights, first.known.heights, atol=1e-6, rtol=0)
 
 
 def test_the_surface_is_restored() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import torch
 from support.fit_data import parallax, write_data
 from support.paths import ROOT
 
+from mbtf_core.atomic import read_checksummed, write_checksummed
 from mbtf_core.lattice import Lattice
 from mbtf_fit import FitConfig, fit
 from mbtf_fit.data.loader import load_training, open_data
@@ -60,6 +62,27 @@ def test_a_resumed_fit_is_the_same(shards: Path, tmp_path: Path) -> None:
     wanted = whole.model.weights()
     for name, tensor in second.model.weights().items():
         assert torch.equal(tensor, wanted[name]), name
+
+
+def test_measured_data_have_neither_geometry_nor_configuration(shards: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "measured"
+    shutil.copytree(shards, folder)
+    manifest = read_checksummed(folder / "manifest.json")
+    write_checksummed(folder / "manifest.json", {**manifest, "geometry": None, "config": None})
+    result = fit(config(4), folder, tmp_path / "m")
+    assert isinstance(result.material.model, LearnedRelief)
+
+
+def test_a_fit_starts_from_the_heights_of_another(shards: Path, tmp_path: Path) -> None:
+    first = fit(config(60), shards, tmp_path / "a").material.model
+    assert isinstance(first, LearnedRelief)
+    options = config(4, init_from=str(tmp_path / "a"))
+    data = open_data(shards, "shuffled", options.model)
+    partition = load_training(data, options.held_out, options.seed)
+    second = prepare_trainer(options, data, partition, torch.device("cpu")).model
+    assert isinstance(second, LearnedRelief)
+    assert float(first.known.heights.std()) > 1e-6
+    assert torch.equal(second.known.heights, first.known.heights)
 
 
 @pytest.mark.skipif(library.kernel() is None, reason=library.missing_reason() or "kernel")

@@ -1,0 +1,125 @@
+"""Whole runs on cloth: data, pictures, repairs, and a fit with its preview."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import RunPython
+from PIL import Image
+from support.commands import Done, run_named
+
+from mbtf_gen.dataset.reader import Dataset
+
+# Loose yarns of few fibers, one and a half times as high as wide.
+CLOTH = """weave: "X.\\n.X\\nXX"
+yarn: {type: silk1, fibers: 6, radius: 4, color: [0.8, 0.5, 0.2], width: 0.7}
+weft: {type: rayon2, fibers: 6, radius: 4, color: 0.3, width: 0.7}
+resolution: 16
+"""
+SMALL = "--queries 40/texel --test-queries 256 --test-spp 64 --set output.shard_queries=4000"
+LINES = {
+    "generate": f"cloth.yaml {SMALL} -o data --json",
+    "again": f"cloth.yaml {SMALL} -o data --json",
+    "verify": "verify data",
+    "plan": "plan cloth.yaml --queries 40/texel",
+    "images": "cloth.yaml --queries 4/texel --test-queries 256 --layout image --patch-size 4 -o images",
+    "inspect": "inspect cloth.yaml --json",
+    "reference": "reference cloth.yaml --view 50,20 --tiles-across 1 --size 24 --spp 8 -o reference",
+    "preview": "preview cloth.yaml -o preview --size 64 --spp 4 --set queries.train=3000",
+    "height scale": "cloth.yaml --height-scale 0.2 -o other",
+    "tileable": "cloth.yaml --make-tileable mirror -o other",
+    "write": "inspect cloth.yaml --write other.yaml",
+    "no fibers": "cloth.yaml --effects -parallax -o other",
+}
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("cloth")
+    (folder / "cloth.yaml").write_text(CLOTH)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def done(work: Path) -> dict[str, Done]:
+    return run_named(LINES, work)
+
+
+def test_a_data_set_holds_light_that_fibers_reflect_and_pass(work: Path, done: dict[str, Done]) -> None:
+    summary = done["generate"].result()
+    assert summary["complete"]
+    assert (summary["lost"], summary["nonfinite"]) == (0, 0)
+    assert done["again"].result()["paths"] == 0
+    assert done["verify"].code == 0, done["verify"].err
+    dataset = Dataset.open(work / "data")
+    tile = dataset.manifest["tile"]
+    assert (tile["aspect"], dataset.geometry()) == (1.5, None)
+    assert tile["fibers"] > 5 * 6 * 2
+    test = dataset.load("test")
+    through = test["transmittance"]
+    assert 0.02 < through.mean() < 0.9
+    value = 0.5 * (test["value_a"] + test["value_b"]).mean(axis=-1)
+    assert value.mean() > 0.01
+    # Low views hardly see through; what they see is mostly cloth.
+    low = test["omega_o"][:, 2] < 0.3
+    assert through[low].mean() < 0.5 * through[~low].mean()
+    assert Dataset.open(work / "images").load("test")["value_a"].shape[1:] == (4, 4, 3)
+
+
+def test_the_plan_measures_multiple_scattering(done: dict[str, Done]) -> None:
+    lines = {line[:23].strip(): line for line in done["plan"].out.splitlines()}
+    assert " on " in lines["interreflection"]
+    assert "scattered by several fibers" in lines["interreflection"]
+    assert " on " in lines["opacity"]
+    assert " off " in lines["normal map"]
+
+
+def test_pictures_and_description(work: Path, done: dict[str, Done]) -> None:
+    for name in ("reference", "preview", "inspect"):
+        assert done[name].code == 0, done[name].err
+    found = done["inspect"].result()
+    assert found["aspect"] == 1.5
+    assert len(found["colors"]) == 2
+    assert not (work / "preview/mesh.png").exists()
+    with Image.open(work / "preview/beauty.png") as picture:
+        assert np.asarray(picture).std() > 5
+    assert len(list((work / "reference").glob("*.exr"))) == 2
+
+
+@pytest.mark.parametrize("name", ["height scale", "tileable", "write", "no fibers"])
+def test_options_that_do_not_apply_are_refused_in_one_line(done: dict[str, Done], name: str) -> None:
+    assert done[name].code != 0
+    (line,) = [line for line in done[name].err.splitlines() if line.startswith("error:")]
+    assert "internal" not in line
+
+
+def test_damaged_data_are_repaired(work: Path, done: dict[str, Done]) -> None:
+    shutil.copytree(work / "data", work / "damaged")
+    for name in ("manifest.json", "train-00001.npz"):
+        (work / "damaged" / name).write_bytes(b"damaged")
+    found = run_named({"repair": "repair damaged --material cloth.yaml", "verify": "verify damaged"}, work)
+    assert found["repair"].code == 0, found["repair"].err
+    assert found["verify"].code == 0, found["verify"].err
+    a, b = (Dataset.open(work / name).load("train") for name in ("data", "damaged"))
+    assert all(np.array_equal(a[key], b[key]) for key in a)
+
+
+def test_a_fit_learns_heights_by_default_and_draws_cloth(
+    work: Path, done: dict[str, Done], run_python: RunPython
+) -> None:
+    out = work / "material"
+    fitted = run_python(
+        "-m", "mbtf_fit", str(work / "data"), "--steps", "40", "--batch", "2048", "-o", str(out)
+    )
+    assert fitted.returncode == 0, fitted.stderr
+    assert "neumip+" in fitted.stdout
+    assert "transmittance" in fitted.stdout
+    drawn = run_python(
+        "-m", "mbtf_fit", "preview", str(out), "-o", str(work / "drawn"), "--size", "64", "--spp", "4"
+    )
+    assert drawn.returncode == 0, drawn.stderr
+    with Image.open(work / "drawn/sheet.png") as picture:
+        assert np.asarray(picture).std() > 5
