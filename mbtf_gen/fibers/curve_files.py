@@ -11,6 +11,7 @@ The text has one control point ``x y z radius`` per line, and an empty line betw
 
 from __future__ import annotations
 
+import logging
 import struct
 from pathlib import Path
 
@@ -18,6 +19,8 @@ import numpy as np
 
 from mbtf_core.errors import InputError, reason
 from mbtf_gen.fibers.curves import F64, LEAST_POINTS, Curve, interpolating
+
+log = logging.getLogger(__name__)
 
 _HEADER = struct.Struct("<3sBccBBQQ40s")
 _COMPLETE = "check that the file is complete"
@@ -57,6 +60,7 @@ def _bcc(data: bytes, path: Path) -> list[Curve]:
             hint=_COMPLETE,
         )
     out, at = [], _HEADER.size
+    deviation = 0.0
     for number in range(curves):
         if at + 4 > len(data):
             raise InputError(f"ends in curve {number}", where=path, hint=_COMPLETE)
@@ -70,7 +74,20 @@ def _bcc(data: bytes, path: Path) -> list[Curve]:
         xyz = np.roll(xyz, 2 - up, axis=1)
         _check(xyz, number, path)
         out.append(_through(xyz, count < 0))
+        deviation = max(deviation, _deviation(out[-1], xyz))
+    log.info(
+        f"{path.name}: splines deviate from its Catmull-Rom curves by at most {deviation:.2g} of its units"
+    )
     return out
+
+
+def _deviation(curve: Curve, points: F64) -> float:
+    """Largest distance from the Catmull-Rom curve halfway between its points, where it is largest."""
+    closed = curve.shift is not None
+    around = np.concatenate([points[-1:], points, points[:2]]) if closed else points
+    halfway = (9.0 * (around[1:-2] + around[2:-1]) - around[:-3] - around[3:]) / 16.0
+    at = np.arange(len(halfway)) + (0.5 if closed else 1.5)
+    return float(np.linalg.norm(curve.at(at)[0][:, :3] - halfway, axis=1).max(initial=0.0))
 
 
 def _through(points: F64, closed: bool) -> Curve:

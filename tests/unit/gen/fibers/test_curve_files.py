@@ -127,6 +127,23 @@ def test_a_bcc_has_open_and_closed_curves_through_its_points(tmp_path: Path) -> 
         assert np.abs(at - ring[:, order][[0, 1, 2, 3, 4, 0]]).max() < 1e-6
 
 
+def test_the_deviation_from_catmull_rom_curves_is_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    path = tmp_path / "a.bcc"
+    found = []
+    for count in (8, 16):
+        t = 2.0 * np.pi * np.arange(count) / count
+        path.write_bytes(bcc([(np.column_stack([np.cos(t), np.sin(t), 0.0 * t]), True)]))
+        read_curves(path)
+        found.append(float(caplog.messages[-1].split("at most ")[1].split()[0]))
+    # Of the unit circle, both curves miss the middles in fourth order of the distance of the points.
+    halfway = [(9.0 * np.cos(np.pi / n) - np.cos(3.0 * np.pi / n)) / 8.0 for n in (8, 16)]
+    assert found[0] == pytest.approx(abs(1.0 - halfway[0]), rel=0.6)
+    assert 10.0 < found[0] / found[1] < 22.0
+
+
 def test_text_has_control_points_and_radii(tmp_path: Path) -> None:
     path = tmp_path / "a.curves"
     path.write_text(CURVES)
