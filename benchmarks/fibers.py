@@ -29,6 +29,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mbtf_gen.fibers.tile import FiberTile
 from mbtf_gen.material.load import load_material
 from mbtf_gen.render.runtime import load_mitsuba
 from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
@@ -46,9 +47,9 @@ def our_run(material: Path, count: int, spp: int):  # type: ignore[no-untyped-de
     from mbtf_gen.sampling.light_kernel import LightKernel
 
     loaded = load_material(material)
-    assert loaded.fibers is not None
+    assert isinstance(loaded.shape, FiberTile)
     transport = Transport(bsdf_sampling=False)
-    estimator = Estimator(build_tile(loaded.fibers, loaded.fibers.bsdf()), LightKernel(1.0), transport)
+    estimator = Estimator(build_tile(loaded.shape, loaded.shape.bsdf()), LightKernel(1.0), transport)
     plan = QueryPlan(loaded.lattice(), Mixture(1.0, 0.0), 0.1, "shuffled", 0, count)
 
     def run(number: int) -> float:
@@ -69,8 +70,8 @@ def mitsuba_run(material: Path, count: int, spp: int):  # type: ignore[no-untype
 
     from mbtf_gen.render.scene import unit_of
 
-    fibers = load_material(material).fibers
-    assert fibers is not None
+    fibers = load_material(material).shape
+    assert isinstance(fibers, FiberTile)
     unit = unit_of(fibers.aspect)
     runs, _ = fibers.runs()
     with tempfile.TemporaryDirectory() as folder:

@@ -65,10 +65,10 @@ class Job:
         """The job of a loaded material, whose height scale, tiling and resolution replace unset ones; a
         UsageError where options are for another kind of material."""
         geometry, queries = config.geometry, config.queries
-        if material.fibers is not None:
+        if material.shape is not None:
             for key, flag in (("height_scale", "--height-scale"), ("mesh", "--mesh"), ("tracer", "--tracer")):
                 if getattr(geometry, key) not in (None, GeometrySection.model_fields[key].default, 1.0):
-                    raise UsageError("is for height maps, not for yarns and fibers", where=flag)
+                    raise UsageError("is for height maps, not for fibers and triangles", where=flag)
         scale = material.height_scale if geometry.height_scale is None else geometry.height_scale
         own = {
             "geometry": geometry.model_copy(update={"height_scale": scale, "make_tileable": material.tile}),
@@ -99,7 +99,7 @@ class Job:
             log.info(note)
         for warning in job.material.warnings_at(given):
             log.warning(warning)
-        if job.material.fibers is not None:
+        if job.material.shape is not None:
             return job
         rows, columns = job.grid.z.shape
         log.info(
@@ -124,8 +124,8 @@ class Job:
 
     @cached_property
     def grid(self) -> HeightGrid:
-        """Heights of the mesh, in tile widths, a plane for fibers; an InputError where their range exceeds
-        the limit."""
+        """Heights of the mesh, in tile widths, a plane for fibers and triangles; an InputError where their
+        range exceeds the limit."""
         geometry = self.config.geometry
         grid = self.material.grid(geometry.height_scale, geometry.mesh)
         fault = displacement_fault(grid.displacement_range, geometry.max_displacement)
@@ -135,9 +135,9 @@ class Job:
 
     @property
     def displacement_range(self) -> float:
-        """Largest height difference of the surface, or the thickness of the fibers, in tile widths."""
-        fibers = self.material.fibers
-        return self.grid.displacement_range if fibers is None else fibers.thickness
+        """Largest height difference of the surface, or the thickness of other shapes, in tile widths."""
+        shape = self.material.shape
+        return self.grid.displacement_range if shape is None else shape.thickness
 
     @cached_property
     def query_plan(self) -> QueryPlan:

@@ -87,7 +87,7 @@ def generate(
     Parameters
     ----------
     material
-        Height map, folder of maps, material.yaml, or file of yarns or fibers.
+        Height map, folder of maps, material.yaml, mesh, or file of yarns or fibers.
     slice
         Render only every n-th shard, from the i-th; finish with mbtf-gen merge.
     """

@@ -32,7 +32,7 @@ def inspect(
     Parameters
     ----------
     material
-        Height map, folder of maps, material.yaml, or file of yarns or fibers.
+        Height map, folder of maps, material.yaml, mesh, or file of yarns or fibers.
     write
         Store the height scale, tiling, resolution, normal convention and color space in a material.yaml, as
         given or as the maps suggest. Other commands then need no flags.
@@ -48,15 +48,18 @@ def inspect(
     from mbtf_gen.material.cloth import inspect_cloth
     from mbtf_gen.material.inspect import inspect_material, inspection_text
     from mbtf_gen.material.load import load_material
+    from mbtf_gen.material.mesh import inspect_mesh, mesh_text
+    from mbtf_gen.meshes.tile import MeshTile
 
     geometry = resolved.geometry
     height, finest = geometry.height_scale, resolved.queries.finest
     loaded = load_material(resolved.material, geometry.make_tileable)
-    if loaded.fibers is not None:
+    if loaded.shape is not None:
         if write is not None or export is not None:
             raise UsageError("is for height maps", where="--export" if write is None else "--write")
-        found = {"material": resolved.material, **inspect_cloth(loaded, finest)}
-        console.report(found, fiber_text(found, resolved.material))
+        mesh = isinstance(loaded.shape, MeshTile)
+        found = {"material": resolved.material, **(inspect_mesh if mesh else inspect_cloth)(loaded, finest)}
+        console.report(found, (mesh_text if mesh else fiber_text)(found, resolved.material))
         return
     outputs: dict[str, Any] = {}
     if write is not None:

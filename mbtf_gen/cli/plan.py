@@ -40,7 +40,7 @@ def plan(
     Parameters
     ----------
     material
-        Height map, folder of maps, material.yaml, or file of yarns or fibers.
+        Height map, folder of maps, material.yaml, mesh, or file of yarns or fibers.
     measure
         Measure the bias of omitting each simulated effect by a pilot run, and forecast the run.
     """

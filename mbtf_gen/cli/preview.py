@@ -29,7 +29,7 @@ def preview(
     Parameters
     ----------
     material
-        Height map, folder of maps, material.yaml, file of yarns or fibers, or a folder of shards.
+        Height map, folder of maps, material.yaml, mesh, file of yarns or fibers, or a folder of shards.
     interactive
         Also show the mesh in a window, where the mouse turns it.
     """

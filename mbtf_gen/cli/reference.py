@@ -30,7 +30,7 @@ def reference(
     Parameters
     ----------
     material
-        Height map, folder of maps, material.yaml, or file of yarns or fibers.
+        Height map, folder of maps, material.yaml, mesh, or file of yarns or fibers.
     """
     resolved = resolve_config(options, material)
     from mbtf_core.directions import from_angles

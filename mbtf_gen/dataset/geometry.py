@@ -99,7 +99,7 @@ def geometry_of(job: Job, plan: EffectsPlan) -> Geometry | None:
         None for fibers, which have neither heights nor slopes.
     """
     material, grid = job.material, job.grid
-    if material.fibers is not None:
+    if material.shape is not None:
         return None
     shape = Lattice(min(job.lattice.finest + 1, FINEST_LEVEL), grid.aspect).shape()
     x, y = np.moveaxis(_slopes(job, plan), -1, 0)

@@ -16,6 +16,7 @@ from mbtf_core.digest import data_sha256
 from mbtf_core.lattice import sigma_of_level
 from mbtf_core.shard_schema import ARRAYS, CONVENTIONS, FORMAT_NAME, SCHEMA_VERSION, SPLITS
 from mbtf_gen.config.effects_request import EFFECTS
+from mbtf_gen.fibers.tile import FiberTile
 from mbtf_gen.job import Job, split_queries, split_spp
 from mbtf_gen.planning.effects import EffectsPlan
 from mbtf_gen.planning.run_plan import RunPlan
@@ -70,8 +71,10 @@ def stored_plan(manifest: Mapping[str, Any], path: Path) -> RunPlan:
 def _shape(job: Job) -> dict[str, Any]:
     """What the tile is made of: heights or fibers."""
     material, scale = job.material, job.config.geometry.height_scale
-    if material.fibers is not None:
-        return {"fibers": len(material.fibers.curves), "segments": material.fibers.segments}
+    if isinstance(material.shape, FiberTile):
+        return {"fibers": len(material.shape.curves), "segments": material.shape.segments}
+    if material.shape is not None:
+        return {"triangles": len(material.shape.faces)}
     return {
         "maps_shape": list(material.height.shape),
         "mesh_shape": list(job.grid.z.shape),

@@ -86,7 +86,7 @@ def _deviation(curve: Curve, points: F64) -> float:
     closed = curve.shift is not None
     around = np.concatenate([points[-1:], points, points[:2]]) if closed else points
     halfway = (9.0 * (around[1:-2] + around[2:-1]) - around[:-3] - around[3:]) / 16.0
-    at = np.arange(len(halfway)) + (0.5 if closed else 1.5)
+    at = np.arange(len(halfway), dtype=np.float64) + (0.5 if closed else 1.5)
     return float(np.linalg.norm(curve.at(at)[0][:, :3] - halfway, axis=1).max(initial=0.0))
 
 

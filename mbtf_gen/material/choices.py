@@ -14,7 +14,6 @@ from mbtf_core.errors import UsageError
 from mbtf_core.folders import make_folder
 from mbtf_core.shard_schema import Tiling
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.fibers.cloth_file import ClothFile
 from mbtf_gen.material.load import described
 from mbtf_gen.material.material import Material
 from mbtf_gen.material.spec import MAX_SCALE, MaterialFile
@@ -109,8 +108,8 @@ def write_material_file(path: Path, material: Material, config: GeneratorConfig)
     InputError, PartialError : the file cannot be written
     """
     spec, folder, _ = described(Path(config.material))
-    if isinstance(spec, ClothFile):
-        raise UsageError("is for height maps: yarns and fibers need no choices", where="--write")
+    if not isinstance(spec, MaterialFile):
+        raise UsageError("is for height maps, not for fibers and triangles", where="--write")
     choices = choose(spec, material, config)
     make_folder(path.parent)
     source, target = folder.resolve(), path.parent.resolve()

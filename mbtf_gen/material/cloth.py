@@ -12,15 +12,16 @@ from mbtf_core.digest import data_sha256, file_sha256
 from mbtf_gen.fibers.cloth import fiber_tile, loose_ends
 from mbtf_gen.fibers.cloth_file import ClothFile
 from mbtf_gen.fibers.inspect import inspect_fibers
+from mbtf_gen.fibers.tile import FiberTile
 from mbtf_gen.material.material import Material
 
 
 def inspect_cloth(material: Material, finest: int | None = None) -> dict[str, Any]:
     """What :func:`~mbtf_gen.fibers.inspect.fiber_text` prints of a cloth, up to level `finest`."""
-    assert material.fibers is not None
+    assert isinstance(material.shape, FiberTile)
     return {
         "resolution": material.lattice(finest).shape()[1],
-        **inspect_fibers(material.fibers),
+        **inspect_fibers(material.shape),
         "warnings": list(material.warnings),
         "notes": list(material.notes),
     }
@@ -68,7 +69,7 @@ def cloth_material(spec: ClothFile, folder: Path) -> Material:
         height_bits=None,
         base_color=fibers.colors.mean(axis=0),
         bsdf={"type": "hair"},
-        fibers=fibers,
+        shape=fibers,
         files=files,
         digests=digests,
         warnings=warnings,

@@ -1,4 +1,4 @@
-"""Loads a material: a height map, a folder of maps, a ``material.yaml``, or a file of yarns or fibers."""
+"""Loads a material: a height map, a folder of maps, a ``material.yaml``, a mesh, or a file of fibers."""
 
 from __future__ import annotations
 
@@ -14,7 +14,11 @@ from mbtf_gen.images.read import SUFFIXES, is_image
 from mbtf_gen.material.cloth import cloth_material
 from mbtf_gen.material.discovery import FoundMaps, find_maps, unpack
 from mbtf_gen.material.material import Material, assemble, retiled
+from mbtf_gen.material.mesh import mesh_material
 from mbtf_gen.material.spec import MaterialFile
+from mbtf_gen.meshes.mesh_file import MESH_FILES, MeshFile
+
+Described = MaterialFile | ClothFile | MeshFile
 
 _YAML = ("material.yaml", "material.yml")
 
@@ -25,8 +29,9 @@ def load_material(path: str | Path, tile: Tiling | None = None) -> Material:
     Parameters
     ----------
     path : str or Path
-        A height map, a ``material.yaml``, a folder that contains one or maps with customary names, or a file
-        of yarns or fibers (``.pyp``, ``.bcc``, ``.curves``). Other maps beside a height map are ignored.
+        A height map, a ``material.yaml``, a folder that contains one or maps with customary names, a mesh
+        (``.glb``, ``.gltf``, ``.ply``, ``.obj``), or a file of yarns or fibers (``.pyp``, ``.bcc``,
+        ``.curves``). Other maps beside a height map are ignored.
     tile : {"none", "mirror", "blend"} or None
         Method for maps that do not tile. ``mirror``: 2 × 2 mirrored copies, a tile of twice the width;
         ``blend``: the edges blended over an eighth of the tile (:mod:`mbtf_gen.material.blending`); None:
@@ -45,15 +50,17 @@ def load_material(path: str | Path, tile: Tiling | None = None) -> Material:
     return material_of(spec, folder, found, spec.tiling(tile))
 
 
-def material_of(spec: MaterialFile | ClothFile, folder: Path, found: FoundMaps, tile: Tiling) -> Material:
+def material_of(spec: Described, folder: Path, found: FoundMaps, tile: Tiling) -> Material:
     """The material that :func:`described` found."""
     if isinstance(spec, ClothFile):
         return cloth_material(spec, folder)
+    if isinstance(spec, MeshFile):
+        return mesh_material(spec, folder)
     material = assemble(spec, folder, found, tile)
     return material if tile == "none" else retiled(material, tile)
 
 
-def described(path: Path) -> tuple[MaterialFile | ClothFile, Path, FoundMaps]:
+def described(path: Path) -> tuple[Described, Path, FoundMaps]:
     """Material file of what :func:`load_material` loads.
 
     Parameters
@@ -63,7 +70,7 @@ def described(path: Path) -> tuple[MaterialFile | ClothFile, Path, FoundMaps]:
 
     Returns
     -------
-    (MaterialFile or ClothFile, Path, FoundMaps)
+    (MaterialFile, ClothFile or MeshFile, Path, FoundMaps)
         The file, the folder that its file names are relative to, and the maps found there.
 
     Raises
@@ -85,11 +92,14 @@ def described(path: Path) -> tuple[MaterialFile | ClothFile, Path, FoundMaps]:
         return _read(path), path.parent, FoundMaps()
     if suffix in CURVE_FILES:
         return build(ClothFile, {CURVE_FILES[suffix]: path.name}, source=str(path)), path.parent, FoundMaps()
+    if suffix in MESH_FILES:
+        return build(MeshFile, {"mesh": path.name}, source=str(path)), path.parent, FoundMaps()
     if not is_image(path):
         raise InputError(
             f"'{path.suffix}' is not a height map",
             where=path,
-            hint=unpack(path) or f"give a folder, a .yaml file, or {', '.join((*SUFFIXES, *CURVE_FILES))}",
+            hint=unpack(path)
+            or f"give a folder, a .yaml file, or {', '.join((*SUFFIXES, *MESH_FILES, *CURVE_FILES))}",
         )
     spec = MaterialFile.model_validate({"height": path.name})
     notes = []
@@ -103,8 +113,10 @@ def described(path: Path) -> tuple[MaterialFile | ClothFile, Path, FoundMaps]:
     return spec, path.parent, FoundMaps(notes=notes)
 
 
-def _read(path: Path) -> MaterialFile | ClothFile:
+def _read(path: Path) -> Described:
     document = read_yaml(path)
+    if "mesh" in document:
+        return build(MeshFile, document, source=str(path))
     if CLOTH_KEYS & document.keys():
         return build(ClothFile, document, source=str(path))
     return build(MaterialFile, document, source=str(path))

@@ -38,6 +38,7 @@ from mbtf_gen.material.normal_map import NormalFit, fit_normals
 from mbtf_gen.material.quantization import Codes, code_use
 from mbtf_gen.material.spec import MaterialFile, NormalEntry
 from mbtf_gen.material.tiling import Seam, retile, seams
+from mbtf_gen.meshes.tile import MeshTile
 
 # Tile widths per stored height: the range of integer images is unknown, floats are in tile widths.
 _INTEGER_SCALE, _FLOAT_SCALE = 0.05, 1.0
@@ -61,8 +62,8 @@ MAPS = (
 
 @dataclass(frozen=True)
 class Material:
-    """Maps and constants of one tile, or its fibers, as :func:`~mbtf_gen.material.load.load_material` returns
-    them.
+    """Maps and constants of one tile, or its fibers or triangles, as
+    :func:`~mbtf_gen.material.load.load_material` returns them.
 
     All maps have row 0 at ``v → 1``; their resolutions may differ.
 
@@ -107,8 +108,8 @@ class Material:
         Method that made the maps tileable.
     resolution : int or None
         Texels across at the finest level, from the material file; None without one there.
-    fibers : FiberTile or None
-        Fibers in place of heights, which are a single 0 then; `bsdf` names their scattering.
+    shape : FiberTile, MeshTile or None
+        Fibers or triangles in place of heights, which are a single 0 then; `bsdf` names their scattering.
     """
 
     height: NDArray[np.float64]
@@ -139,12 +140,12 @@ class Material:
     normal_convention: Convention | None = None
     tile: Tiling = "none"
     resolution: int | None = None
-    fibers: FiberTile | None = None
+    shape: FiberTile | MeshTile | None = None
 
     @property
     def aspect(self) -> float:
         """Height of the tile over its width, H/W of the maps."""
-        return self.height.shape[0] / self.height.shape[1] if self.fibers is None else self.fibers.aspect
+        return self.height.shape[0] / self.height.shape[1] if self.shape is None else self.shape.aspect
 
     @property
     def is_lambert(self) -> bool:
@@ -153,7 +154,7 @@ class Material:
 
     def warnings_at(self, height: float | None = None) -> tuple[str, ...]:
         """Warnings at a height scale that the user gave; by default at the material's own."""
-        if self.fibers is not None:
+        if self.shape is not None:
             return self.warnings
         path, extent = self.files["height"], float(np.ptp(self.height))
         text = None
@@ -176,7 +177,7 @@ class Material:
         that of the map."""
         if finest is None and self.resolution is not None:
             finest = self.resolution.bit_length() - 1
-        if self.fibers is not None and finest is not None:
+        if self.shape is not None and finest is not None:
             return Lattice(finest, self.aspect)
         rows, columns = self.height.shape
         return Lattice.for_map(rows, columns, finest)

@@ -16,6 +16,7 @@ from mbtf_gen.fibers.tile import FiberTile
 from mbtf_gen.geometry.slope_statistics import triangle_slopes
 from mbtf_gen.images.resample import resample
 from mbtf_gen.job import Job
+from mbtf_gen.meshes.tile import MeshTile
 from mbtf_gen.planning.bounds import POINTS, DisplacementBounds, displacement_bounds
 from mbtf_gen.planning.effects import Effect, EffectsPlan, consistent, decide, without
 from mbtf_gen.planning.pilot import Pilot, pilot_queries
@@ -53,7 +54,7 @@ class _Analysis:
     @cached_property
     def steepest(self) -> float:
         """Largest slope of any triangle of the mesh (tangent of its angle to the plane)."""
-        if self.fibers is not None:
+        if self.shape is not None:
             return math.inf
         return float(triangle_slopes(self.job.grid).max())
 
@@ -68,9 +69,16 @@ class _Analysis:
         return self.job.displacement_range == 0.0
 
     @property
-    def fibers(self) -> FiberTile | None:
-        """Fibers in place of heights."""
-        return self.job.material.fibers
+    def shape(self) -> FiberTile | MeshTile | None:
+        """Fibers or triangles in place of heights."""
+        return self.job.material.shape
+
+    @property
+    def kind(self) -> str:
+        """The surface, in a word."""
+        if self.shape is None:
+            return "displaced"
+        return "fibers" if isinstance(self.shape, FiberTile) else "mesh"
 
 
 def plan_effects(job: Job, *, pilots: bool = True) -> EffectsPlan:
@@ -115,7 +123,7 @@ def reference_plan(job: Job) -> EffectsPlan:
     request = EffectsRequest.parse(job.config.effects.mode)
     scene = _analysis(job, False)
     effects = [*_surface(scene), _normal(scene, None), _opacity(scene, None)]
-    explanation = "flat" if scene.flat else "displaced" if scene.fibers is None else "fibers"
+    explanation = "flat" if scene.flat else scene.kind
     effects += [Effect(name, not scene.flat, explanation) for name in DISPLACEMENT_EFFECTS]
     effects.append(Effect("bsdf_sampling", True, "reference"))
     decided = consistent({e.name: decide(request, e) for e in effects}, request)
@@ -227,8 +235,8 @@ def _normal(scene: _Analysis, bounds: DisplacementBounds | None) -> Effect:
 
 
 def _opacity(scene: _Analysis, bounds: DisplacementBounds | None) -> Effect:
-    if scene.fibers is not None:
-        return Effect("opacity", True, "rays pass between the fibers", present=False)
+    if scene.shape is not None:
+        return Effect("opacity", True, f"rays can pass through the {scene.kind}", present=False)
     through = _through(scene)
     if through is None:
         opacity = scene.job.material.opacity
@@ -281,8 +289,8 @@ def _displacement_plan(
         bounds.parallax if bounds else None,
         "pilot",
     )
-    if scene.fibers is not None:
-        text = f"fibers, {100.0 * scene.fibers.thickness:.2g} % of the tile's width thick"
+    if scene.shape is not None:
+        text = f"{scene.kind}, {100.0 * scene.shape.thickness:.2g} % of the tile's width thick"
         parallax = Effect("parallax", True, text, present=False)
     bounces = _bounce_bound(scene) if bounds is not None and bounds.parallax <= left else 0.0
     if bounds is not None and bounds.parallax + bounces <= left:
@@ -305,8 +313,8 @@ def _shadowing(scene: _Analysis, bounds: DisplacementBounds | None) -> Effect:
     config = scene.job.config
     # Elevation in radians below which the cut light lobe has no light; ≤ 0 if there is none.
     lowest = float(np.arcsin(config.queries.min_cos) - LOBE_TAIL * np.radians(config.light.width))
-    if scene.fibers is not None:
-        return Effect("shadowing", True, "between fibers")
+    if scene.shape is not None:
+        return Effect("shadowing", True, scene.kind)
     slopes = f"slopes up to {_degrees(scene.steepest)}"
     if lowest > 0 and scene.steepest <= np.tan(lowest):
         text = f"{slopes}, light and its kernel no lower than {_degrees(np.tan(lowest))}"
@@ -324,9 +332,9 @@ def _bsdf_sampling(scene: _Analysis) -> Effect:
     name = "bsdf_sampling"
     if width == 0.0:
         return Effect(name, False, "samples of the BSDF never hit a delta light", 0.0)
-    if scene.fibers is not None:
+    if isinstance(scene.shape, FiberTile):
         # The transmitted lobe is half as wide as the reflected one.
-        lobe, text = 0.5 * scene.fibers.scattering.deviation, "narrowest lobe of the fibers"
+        lobe, text = 0.5 * scene.shape.scattering.deviation, "narrowest lobe of the fibers"
         text += f" {np.degrees(lobe):.2g}°, light {job.config.light.width:g}°"
         if lobe >= WIDER * width:
             return Effect(name, False, f"{text}: sampling the light suffices", 0.0)
@@ -377,14 +385,14 @@ def _interreflection(
     """(interreflection, cap on interactions, the cap's bias bound), by a pilot with and without them on the
     same random numbers."""
     depth = scene.job.config.transport.max_depth
-    effect = Effect("interreflection", True, "displaced" if scene.fibers is None else "fibers")
+    effect = Effect("interreflection", True, scene.kind)
     if depth == 1:
         off = Effect("interreflection", False, "max_depth 1", reason="forced")
         return decide(request, off), 1, 0.0
     if "interreflection" in request.forced or request.base != "auto" or not decided["parallax"].on:
         return decide(request, effect), depth, 0.0
     most = _bounce_bound(scene) if scene.lambert else np.inf
-    text = "light between facets" if scene.fibers is None else "light scattered by several fibers"
+    text = "light scattered by several fibers" if scene.kind == "fibers" else "light between facets"
     if most <= left:
         text += f"; slopes up to {_degrees(scene.steepest)} interreflect little"
         return Effect("interreflection", False, text, most, "bound"), 1, 0.0

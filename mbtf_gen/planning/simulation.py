@@ -77,7 +77,7 @@ def build_estimator(
     key = plan.names_on & _TILE_EFFECTS
     if key not in tiles:
         tiles[key] = build_tile(
-            job.material.fibers or job.grid,
+            job.material.shape or job.grid,
             bsdf_of(job.material, key, shading_slopes(job, plan)),
             job.config.geometry.tracer,
         )

@@ -27,12 +27,14 @@ class Vertex:
     ----------
     p, n : position in scene units, unit normal
     s, uv : tangent and texture coordinates; None where they follow from the position
+    part : number of the surface, of those of a mesh; None for a single one
     """
 
     p: Point3f
     n: Normal3f
     s: Vector3f | None = None
     uv: Point2f | None = None
+    part: UInt32 | None = None
 
 
 class TileGeometry(Protocol):

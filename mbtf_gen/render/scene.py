@@ -7,7 +7,7 @@ suffices for a ray offset of 8e-6 units.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,12 +17,13 @@ from mbtf_core.errors import InputError, reason
 from mbtf_gen.config.generator import Tracer
 from mbtf_gen.fibers.tile import FiberTile
 from mbtf_gen.geometry.heightfield import HeightGrid
-from mbtf_gen.render.bsdf.plugin import SurfaceBSDF, surface_of
+from mbtf_gen.meshes.tile import MeshTile
+from mbtf_gen.render.bsdf.plugin import PartSurface, SurfaceBSDF, surface_of
 from mbtf_gen.render.curve_tracer import CurveGeometry
 from mbtf_gen.render.directional_light import SmoothedDirectional
 from mbtf_gen.render.geometry import TileGeometry
 from mbtf_gen.render.heightfield_tracer import HeightfieldGeometry
-from mbtf_gen.render.mesh_tracer import MeshGeometry
+from mbtf_gen.render.mesh_tracer import MeshGeometry, MeshTileGeometry
 from mbtf_gen.render.sensor import QuerySensor
 from mbtf_gen.render.types import BSDF
 
@@ -67,16 +68,18 @@ def unit_of(aspect: float) -> float:
 
 
 def build_tile(
-    shape: HeightGrid | FiberTile, bsdf: Mapping[str, Any] | BSDF, tracer: Tracer = "heightfield"
+    shape: HeightGrid | FiberTile | MeshTile,
+    bsdf: Mapping[str, Any] | BSDF | Sequence[Mapping[str, Any]],
+    tracer: Tracer = "heightfield",
 ) -> Tile:
     """Build the scene of a tile.
 
     Parameters
     ----------
-    shape : HeightGrid or FiberTile
-        Heights, or fibers, in tile widths.
-    bsdf : mapping or mitsuba.BSDF
-        A Mitsuba dictionary, or a loaded BSDF.
+    shape : HeightGrid, FiberTile or MeshTile
+        Heights, fibers or triangles, in tile widths.
+    bsdf : mapping, mitsuba.BSDF or sequence of mapping
+        A Mitsuba dictionary, or a loaded BSDF; one dictionary per part of a mesh.
     tracer : str
         Of heights. ``heightfield``: rays follow the grid's cells. ``mesh``: Mitsuba traces the grid's
         triangles.
@@ -88,6 +91,9 @@ def build_tile(
     """
     register_plugins()
     unit = unit_of(shape.aspect)
+    if isinstance(shape, MeshTile) and isinstance(bsdf, Sequence):
+        parts = PartSurface([mi.load_dict(dict(part)).surface for part in bsdf])
+        return Tile(shape.aspect, unit, MeshTileGeometry.of_tile(shape, unit), parts)
     if isinstance(bsdf, Mapping):
         try:
             bsdf = mi.load_dict(dict(bsdf))
@@ -98,6 +104,8 @@ def build_tile(
     geometry: TileGeometry
     if isinstance(shape, FiberTile):
         geometry = CurveGeometry.of_fibers(shape, unit)
+    elif isinstance(shape, MeshTile):
+        geometry = MeshTileGeometry.of_tile(shape, unit)
     elif tracer == "mesh":
         geometry = MeshGeometry.of_grid(shape, unit)
     else:

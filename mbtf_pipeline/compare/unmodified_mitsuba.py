@@ -277,7 +277,11 @@ def _mitsuba_scene(job: Job, camera: Camera, omega_i: F64, folder: Path) -> dict
 
 def _mitsuba_tile(job: Job, unit: float, folder: Path) -> dict[str, Any]:
     """One period of the mesh or of the fibers, centered, with `unit` scene units per tile width."""
-    fibers, aspect = job.material.fibers, job.material.aspect
+    from mbtf_gen.meshes.tile import MeshTile
+
+    fibers, aspect = job.material.shape, job.material.aspect
+    if isinstance(fibers, MeshTile):
+        raise UsageError("compares height maps and fibers, not meshes", where="compare.unmodified_mitsuba")
     if fibers is not None:
         file = folder / "tile.txt"
         with file.open("w") as text:
@@ -312,7 +316,9 @@ def _mitsuba_bsdf(job: Job) -> dict[str, Any]:
     material = job.material
     if material.bsdf is not None or not _is_lambertian(material):
         mapped = normal_map_slopes(job)
-        return bsdf_of(material, slopes=None if mapped is None else mapped[0])
+        found = bsdf_of(material, slopes=None if mapped is None else mapped[0])
+        assert isinstance(found, dict)
+        return found
     base = np.asarray(material.base_color, np.float32)
     if base.ndim == 1:
         return {"type": "diffuse", "reflectance": {"type": "rgb", "value": [float(c) for c in base]}}

@@ -16,6 +16,8 @@ from mbtf_gen.material.cloth import inspect_cloth
 from mbtf_gen.material.inspect import USES, inspect_material, inspection_text
 from mbtf_gen.material.latest import latest_material
 from mbtf_gen.material.material import MAPS
+from mbtf_gen.material.mesh import inspect_mesh, mesh_text
+from mbtf_gen.meshes.tile import MeshTile
 from mbtf_pipeline.report.embed import U8, Pixels, jpeg_uri, shrink
 
 # Largest width and height of a thumbnail, pixels, and its JPEG quality.
@@ -41,10 +43,15 @@ def material_section(config: GeneratorConfig, inputs: Mapping[str, str]) -> dict
     geometry = config.geometry
     try:
         material = latest_material(config.material, geometry.make_tileable)
-        if material.fibers is not None:
-            found = inspect_cloth(material)
-        else:
+        if material.shape is None:
             found = inspect_material(material, geometry.height_scale, geometry.mesh)
+            text = inspection_text(found, config.material)
+        elif isinstance(material.shape, MeshTile):
+            found = inspect_mesh(material)
+            text = mesh_text(found, config.material)
+        else:
+            found = inspect_cloth(material)
+            text = fiber_text(found, config.material)
     except (MbtfError, OSError) as error:
         return nothing | {"missing": f"The material cannot be read any more: {error}"}
     if material.digests != inputs:
@@ -65,7 +72,6 @@ def material_section(config: GeneratorConfig, inputs: Mapping[str, str]) -> dict
     # Without the folders of their files.
     parts = (warning.partition(": ") for warning in found["warnings"])
     warnings = [f"{Path(path).name}: {text}" for path, _, text in parts] + found.get("oddities", [])
-    text = (inspection_text if material.fibers is None else fiber_text)(found, config.material)
     return {"maps": maps, "warnings": warnings, "inspection": text, "missing": ""}
 
 

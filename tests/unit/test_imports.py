@@ -20,6 +20,7 @@ mbtf_gen.geometry
 mbtf_gen.sampling
 mbtf_gen.config
 mbtf_gen.fibers
+mbtf_gen.meshes
 mbtf_gen.material
 mbtf_gen.render
 mbtf_gen.job

@@ -93,7 +93,7 @@ class PreviewPictures:
         if self.job is not None:
             # The mesh has the exposure of the path-traced picture.
             makers = {"beauty": self._beauty, "mesh": self._mesh, **makers}
-            if self.job.material.fibers is not None:
+            if self.job.material.shape is not None:
                 del makers["mesh"], stages["mesh"]
             inputs |= self.job.material.digests
         if self.dataset is not None:
@@ -141,7 +141,7 @@ class PreviewPictures:
                 hint="the other pictures are finished; mbtf-gen doctor names the missing package, "
                 "then the same command draws it",
             )
-        if interactive and self.job is not None and self.job.material.fibers is not None:
+        if interactive and self.job is not None and self.job.material.shape is not None:
             self.console.note("fibers are not shown in a window")
         elif interactive and self.job is not None:
             self.console.note("the mesh is shown in a window: close it to continue")

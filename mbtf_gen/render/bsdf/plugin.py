@@ -7,7 +7,7 @@ is the side ``v → 1``, because of the mesh's texture coordinates.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
@@ -15,6 +15,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_gen.fibers.tile import FiberTile
+from mbtf_gen.meshes.tile import MeshTile
 from mbtf_gen.render.bsdf.surface import Surface, SurfaceParts
 from mbtf_gen.render.types import (
     BSDF,
@@ -107,6 +109,42 @@ class SurfaceBSDF(mi.BSDF):
         return f"SurfaceBSDF[{self.surface.parts}]"
 
 
+class PartSurface:
+    """Surfaces of several parts, with the interface of one; interactions name their part."""
+
+    transmits = False
+
+    def __init__(self, parts: Sequence[Surface]) -> None:
+        self.surfaces = parts
+        self.parts = SurfaceParts()
+
+    def at(self, si: SurfaceInteraction3f, towards_viewer: Vector3f) -> PartSurfacePoint:
+        """The surfaces at surface interactions."""
+        points = [surface.at(si, towards_viewer) for surface in self.surfaces]
+        return PartSurfacePoint(points, [si.prim_index == k for k in range(len(points))])
+
+
+class PartSurfacePoint:
+    """Surfaces of several parts at one surface interaction per lane."""
+
+    def __init__(self, points: Sequence[Any], masks: Sequence[Mask]) -> None:
+        self.points, self.masks = points, masks
+
+    def eval_pdf(self, omega: Vector3f) -> tuple[Spectrum, Float]:
+        """(f·cos, density) of a direction in the scene."""
+        return self._chosen([point.eval_pdf(omega) for point in self.points])
+
+    def sample(self, xi_lobe: Float, xi: Point2f) -> tuple[Vector3f, Spectrum, Float]:
+        """(direction in the scene, weight, density; infinite for a delta lobe)."""
+        return self._chosen([point.sample(xi_lobe, xi) for point in self.points])
+
+    def _chosen(self, values: Sequence[tuple[Any, ...]]) -> Any:
+        out = values[0]
+        for mask, value in zip(self.masks[1:], values[1:], strict=True):
+            out = tuple(dr.select(mask, new, old) for new, old in zip(value, out, strict=True))
+        return out
+
+
 class MitsubaSurface:
     """A BSDF of Mitsuba with the interface of :class:`~mbtf_gen.render.bsdf.surface.Surface`."""
 
@@ -160,18 +198,36 @@ def _parameter(value: Any, color: bool) -> Any:
     }
 
 
+def reflectance(base_color: Any, roughness: Any = None, metallic: Any = None) -> dict[str, Any]:
+    """Mitsuba dictionary of a Lambert surface, or of a glossy one where the roughness is given; maps have
+    row 0 at ``v → 1``."""
+    out = {"type": "mbtf_surface", "base_color": _parameter(base_color, True)}
+    if roughness is None:
+        return out
+    metals = metallic is not None and np.any(np.asarray(metallic) > 0)
+    given = {"roughness": roughness, "specular": 0.5, **({"metallic": metallic} if metals else {})}
+    return out | {name: _parameter(value, False) for name, value in given.items()}
+
+
+def part_bsdfs(tile: MeshTile) -> list[dict[str, Any]]:
+    """Mitsuba dictionaries of the parts of a mesh."""
+    return [reflectance(part.base_color, part.roughness, part.metallic) for part in tile.parts]
+
+
 def bsdf_of(
     material: Material, on: Collection[str] = REFLECTION, slopes: NDArray[np.float64] | None = None
-) -> dict[str, Any]:
-    """Mitsuba dictionary of a material's BSDF.
+) -> dict[str, Any] | list[dict[str, Any]]:
+    """Mitsuba dictionary of a material's BSDF; one per part of a mesh.
 
     Parameters
     ----------
     on : names of the effects that are simulated; all but opacity by default
     slopes : (h, w, 2) slopes added to the mesh's
     """
-    if material.fibers is not None:
-        return material.fibers.bsdf()
+    if isinstance(material.shape, FiberTile):
+        return material.shape.bsdf()
+    if isinstance(material.shape, MeshTile):
+        return part_bsdfs(material.shape)
     if material.bsdf is not None:
         return dict(material.bsdf)
     names = ["base_color", "roughness"]

@@ -24,7 +24,7 @@ def write(tmp_path: Path, text: str) -> Path:
 
 
 def fibers(tmp_path: Path, text: str) -> Any:
-    found = load_material(write(tmp_path, text)).fibers
+    found = load_material(write(tmp_path, text)).shape
     assert found is not None
     return found
 

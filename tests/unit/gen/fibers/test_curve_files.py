@@ -85,9 +85,9 @@ def test_real_patterns_are_read_as_they_are(name: str) -> None:
         length = np.linalg.norm(step, axis=1)
         assert length.max() < 4.0 * np.median(length)
     material = load_material(path)
-    assert material.fibers is not None
+    assert material.shape is not None
     assert material.aspect == pytest.approx(pattern.aspect)
-    assert max(curve.heights()[1] for curve in material.fibers.curves) == pytest.approx(0.0, abs=1e-12)
+    assert max(curve.heights()[1] for curve in material.shape.curves) == pytest.approx(0.0, abs=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -208,5 +208,5 @@ def test_altered_files_load_or_are_refused(
     path.write_text(f"{CURVE_FILES[kind]}: a{kind}\nyarn: {{fibers: 1, flyaways: 0}}\n")
     with contextlib.suppress(MbtfError):
         material = load_material(path)
-        assert material.fibers is not None
-        assert np.isfinite(material.fibers.thickness)
+        assert material.shape is not None
+        assert np.isfinite(material.shape.thickness)

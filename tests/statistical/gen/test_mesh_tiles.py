@@ -1,0 +1,158 @@
+"""Tiles of triangles against closed forms, the height field's tracer, and energy conservation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from numpy.typing import NDArray
+from PIL import Image
+from support.scenes import (
+    Estimator,
+    LightKernel,
+    Stream,
+    Transport,
+    build_tile,
+    direction,
+    estimate,
+    lambert,
+    queries,
+    rocks,
+    tile_mean_queries,
+)
+
+from mbtf_core.stats import mean_of_halves
+from mbtf_gen.geometry.heightfield import tile_mesh
+from mbtf_gen.material.load import load_material
+from mbtf_gen.meshes.tile import MeshPart, MeshTile
+from mbtf_gen.render.bsdf.plugin import part_bsdfs
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def plate(low: tuple[float, float], high: tuple[float, float], z: float = 0.0) -> NDArray[np.float64]:
+    """Corners (4, 3) of a horizontal rectangle, counter-clockwise from above."""
+    (a, b), (c, d) = low, high
+    return np.array([[a, b, z], [c, b, z], [c, d, z], [a, d, z]])
+
+
+def tile_of(plates: list[NDArray[np.float64]], colors: list[float], aspect: float = 1.0) -> MeshTile:
+    """A tile of rectangles, a part each."""
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    return MeshTile(
+        aspect,
+        np.concatenate(plates),
+        np.concatenate([faces + 4 * k for k in range(len(plates))]),
+        np.zeros((4 * len(plates), 2)),
+        np.repeat(np.arange(len(plates)), 2),
+        [MeshPart(str(k), np.full(3, c)) for k, c in enumerate(colors)],
+    )
+
+
+def traced(tile: MeshTile, light: LightKernel | None, q: Any, spp: int = 16) -> Any:
+    estimator = Estimator(build_tile(tile, part_bsdfs(tile)), light, Transport())
+    return estimator.estimate(q, spp, Stream(1, "test", 0))
+
+
+def test_a_plate_of_two_colors_and_a_hole_is_the_mean_of_its_parts() -> None:
+    # Half of the tile 0.8, a quarter 0.2, a quarter open. Rectangles reach over the border.
+    plates = [plate((-0.25, 0.0), (0.25, 1.0)), plate((0.25, 0.0), (0.75, 0.5))]
+    tile = tile_of(plates, [0.8, 0.2])
+    for omega_o in (direction(80, 10), direction(12, 200)):
+        e = traced(tile, LightKernel(1.0), tile_mean_queries(direction(40, 60), omega_o, 8000))
+        found = mean_of_halves(e.value_a.mean(axis=1), e.value_b.mean(axis=1))
+        assert abs(found.value - (0.5 * 0.8 + 0.25 * 0.2) / np.pi) < 4.0 * found.error
+        assert found.error < 0.005
+        assert e.transmittance.mean() == pytest.approx(0.25, abs=0.006)
+
+
+def test_a_plate_below_another_is_seen_through_its_gap_and_lit_from_aside() -> None:
+    # A black strip above a white floor: of the floor a share is hidden, as in the closed form of a slit.
+    depth, half = 0.1, 0.25
+    tile = tile_of([plate((0, 0), (1, 1), -depth), plate((0.5 - half, 0), (0.5 + half, 1))], [0.5, 0.0])
+    omega_i, omega_o = direction(60, 0), direction(90, 0)
+    shift = depth / np.tan(np.radians(60.0))
+    e = traced(tile, LightKernel(0.0), tile_mean_queries(omega_i, omega_o, 8000))
+    # Seen: 1 - 2 half. Of it, a strip of `shift` is in the shadow.
+    expected = 0.5 / np.pi * (1.0 - 2.0 * half - shift)
+    found = mean_of_halves(e.value_a.mean(axis=1), e.value_b.mean(axis=1))
+    # Nothing scatters from the black strip back to the floor, but the floor lights itself not at all.
+    assert abs(found.value - expected) < 4.0 * found.error
+    assert found.error < 0.01 * expected
+
+
+def test_a_height_field_as_a_file_of_triangles_gives_its_values(tmp_path: Path) -> None:
+    grid = rocks(32, 0.15)
+    tile_mesh(grid).export(tmp_path / "rocks.ply")
+    (tmp_path / "material.yaml").write_text("mesh: rocks.ply\nperiod: [1, 1]\nbase_color: 0.6\n")
+    shape = load_material(tmp_path).shape
+    assert isinstance(shape, MeshTile)
+    assert shape.open_edges() == (0, 0)
+    omega_i, omega_o = direction(35, 50), direction(25, -100)
+    q = tile_mean_queries(omega_i, omega_o, 8000)
+    ours = traced(shape, LightKernel(1.0), q)
+    heights = estimate(grid, lambert(0.6), LightKernel(1.0), q, 16, seed=2)
+    a, b = (mean_of_halves(e.value_a[:, 0], e.value_b[:, 0]) for e in (ours, heights))
+    assert abs(a.value - b.value) < 4.0 * np.hypot(a.error, b.error)
+    assert a.error < 0.01 * a.value
+    assert ours.transmittance.max() == 0.0
+
+
+def test_white_bodies_above_a_grid_return_all_light() -> None:
+    rng = np.random.default_rng(0)
+    balls = []
+    for _ in range(12):
+        ball = trimesh.creation.icosphere(subdivisions=2, radius=0.05 + 0.1 * rng.random())
+        ball.apply_translation([*rng.random(2), -0.2 - 0.2 * rng.random()])
+        balls.append(ball)
+    whole = trimesh.util.concatenate(balls)
+    vertices = np.asarray(whole.vertices) - (0, 0, whole.vertices[:, 2].max())
+    faces = np.asarray(whole.faces)
+    tile = MeshTile(
+        1.0,
+        vertices,
+        faces,
+        np.zeros((len(vertices), 2)),
+        np.zeros(len(faces), int),
+        [MeshPart("w", np.ones(3))],
+    )
+    e = traced(tile, None, tile_mean_queries(UP, direction(30, 20), 2000), 64)
+    total = 0.5 * (e.value_a + e.value_b)[:, 0] + e.transmittance
+    assert total.mean() == pytest.approx(1.0, abs=4.0 * total.std() / np.sqrt(len(total)) + 1e-4)
+    assert 0.1 < e.transmittance.mean() < 0.9
+
+
+def test_textures_are_the_right_way_round(tmp_path: Path) -> None:
+    """Quadrants of a glTF texture on a plate whose v runs along y."""
+    pixels = np.zeros((16, 16, 3), np.uint8)
+    pixels[:8, :8], pixels[:8, 8:], pixels[8:, :8], pixels[8:, 8:] = (
+        (255, 0, 0),
+        (0, 255, 0),
+        (0, 0, 255),
+        (255,) * 3,
+    )
+    material = trimesh.visual.material.PBRMaterial(
+        baseColorTexture=Image.fromarray(pixels), roughnessFactor=1.0, metallicFactor=0.0
+    )
+    corners = plate((0, 0), (2, 2))
+    # glTF has y up: our y is its -z.
+    mesh = trimesh.Trimesh(
+        corners[:, [0, 2, 1]] * (1, 1, -1),
+        [[0, 1, 2], [0, 2, 3]],
+        process=False,
+        visual=trimesh.visual.TextureVisuals(uv=corners[:, :2] / 2, material=material),
+    )
+    mesh.export(tmp_path / "plate.glb")
+    shape = load_material(tmp_path / "plate.glb").shape
+    assert isinstance(shape, MeshTile)
+    assert (shape.aspect, shape.thickness) == (1.0, 0.0)
+    u = np.array([[0.25, 0.75], [0.75, 0.75], [0.25, 0.25], [0.75, 0.25]])
+    e = traced(shape, LightKernel(0.0), queries(u, 0.02, direction(60, 0), UP, 4))
+    value = 0.5 * (e.value_a + e.value_b)
+    # The first row of the image is the side v → 1.
+    for row, color in zip(value, np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]]), strict=True):
+        assert (row[color == 1] > 0.2).all()
+        assert (row[color == 0] < 0.1).all()
