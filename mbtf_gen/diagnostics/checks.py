@@ -16,6 +16,8 @@ from mbtf_core.directions import from_angles, normalize
 from mbtf_core.stats import Estimate, mean_estimate, mean_of_halves
 from mbtf_gen.diagnostics.closed_forms import Groove, Wall, mirror
 from mbtf_gen.diagnostics.selftest import Case, Check
+from mbtf_gen.fibers.curves import Curve
+from mbtf_gen.fibers.tile import FiberTile
 from mbtf_gen.geometry.heightfield import HeightGrid
 from mbtf_gen.sampling.light_kernel import LightKernel
 from mbtf_gen.sampling.query_sampler import Queries
@@ -48,6 +50,12 @@ def all_checks() -> list[Check]:
         Check("V-groove", "tile means of a groove agree with the closed form", 1e-3, _groove),
         Check("wall", "shadow and flank of a wall of slope 100 agree with the closed form", 1e-3, _wall),
         Check("furnace", "a white surface under constant radiance 1 has radiance 1", 2e-4, _furnace),
+        Check(
+            "fibers",
+            "what white fibers return of constant radiance 1 and what passes between them add up to 1",
+            2e-4,
+            _fibers,
+        ),
         Check(
             "reciprocity",
             "exchanging light and view leaves the tile mean unchanged, interreflection included",
@@ -108,7 +116,7 @@ def _positions(n: int, round_number: int) -> F64:
 
 
 def _estimates(
-    grid: HeightGrid,
+    shape: HeightGrid | FiberTile,
     bsdf: dict[str, Any],
     light: LightKernel | None,
     queries: Queries,
@@ -128,7 +136,7 @@ def _estimates(
     from mbtf_gen.render.path_tracer import Transport
     from mbtf_gen.render.scene import build_tile
 
-    estimator = Estimator(build_tile(grid, bsdf), light, Transport(max_depth=1 if direct else 0), launch)
+    estimator = Estimator(build_tile(shape, bsdf), light, Transport(max_depth=1 if direct else 0), launch)
     return estimator.estimate(queries, spp, Stream(17, "test", round_number))
 
 
@@ -249,6 +257,27 @@ def _furnace(round_number: int) -> Cases:
         )
         for elevation in (90.0, 30.0, 3.0, 0.5)
     }
+
+
+def _fibers(round_number: int) -> Cases:
+    from mbtf_gen.render.runtime import load_mitsuba
+
+    load_mitsuba()
+    rng, s, out = np.random.default_rng(5), np.arange(8) / 8, {}
+    curves = []
+    for k in range(40):
+        wave = 2.0 * np.pi * (s + rng.random())
+        across, down = rng.random() + 0.05 * np.sin(wave), 0.02 * np.cos(wave) - 0.2 * rng.random()
+        points = np.column_stack([s, across, down] if k % 2 else [across, s, down])
+        curves.append(Curve.through(points, 0.01, np.eye(3)[1 - k % 2]))
+    felt = FiberTile.settled(1.0, curves, np.zeros(len(curves), int), np.ones((1, 3)))
+    for elevation in (90.0, 20.0, 3.0):
+        n = 1000
+        q = _queries(_positions(n, round_number), 4.0, _UP, from_angles(elevation, 40), n)
+        e = _estimates(felt, felt.bsdf(), None, q, 16, round_number)
+        total = 0.5 * (e.value_a.astype(np.float64) + e.value_b)[:, 0] + e.transmittance
+        out[f"view {elevation:g}°"] = _off(mean_estimate(total), 1.0)
+    return out
 
 
 def _reciprocity(round_number: int) -> Cases:
