@@ -65,10 +65,7 @@ class Job:
         """The job of a loaded material, whose height scale, tiling and resolution replace unset ones; a
         UsageError where options are for another kind of material."""
         geometry, queries = config.geometry, config.queries
-        if material.shape is not None:
-            for key, flag in (("height_scale", "--height-scale"), ("mesh", "--mesh"), ("tracer", "--tracer")):
-                if getattr(geometry, key) not in (None, GeometrySection.model_fields[key].default, 1.0):
-                    raise UsageError("is for height maps, not for fibers and triangles", where=flag)
+        check_options(config, material)
         scale = material.height_scale if geometry.height_scale is None else geometry.height_scale
         own = {
             "geometry": geometry.model_copy(update={"height_scale": scale, "make_tileable": material.tile}),
@@ -161,6 +158,30 @@ class Job:
     def shards(self) -> tuple[ShardEntry, ...]:
         """All shards, the training split first; a UsageError if a split has more than ``MAX_SHARD_FILES``."""
         return tuple(entry for split in SPLITS for entry in _shards(self, split))
+
+
+def check_options(config: GeneratorConfig, material: Material) -> None:
+    """Refuse options of height maps for fibers and triangles, and shapes that are too thick.
+
+    Raises
+    ------
+    UsageError, InputError : so it is
+    """
+    geometry, shape = config.geometry, material.shape
+    if shape is None:
+        return
+    given = {
+        # A finished job states the scale 1.
+        "--height-scale": geometry.height_scale not in (None, 1.0),
+        "--mesh": geometry.mesh is not None,
+        "--tracer": geometry.tracer != GeometrySection.model_fields["tracer"].default,
+    }
+    for flag, refused in given.items():
+        if refused:
+            raise UsageError("is for height maps, not for fibers and triangles", where=flag)
+    fault = displacement_fault(shape.thickness, geometry.max_displacement)
+    if fault is not None:
+        raise InputError(fault[0], where=config.material, hint=fault[1])
 
 
 def limit_resolution(job: Job) -> Job:

@@ -44,6 +44,7 @@ def inspect(
     _check_new(export, "--export", (".exr",), overwrite)
     from mbtf_gen.fibers.inspect import fiber_text
     from mbtf_gen.images.exr import write_channels
+    from mbtf_gen.job import check_options
     from mbtf_gen.material.choices import write_material_file
     from mbtf_gen.material.cloth import inspect_cloth
     from mbtf_gen.material.inspect import inspect_material, inspection_text
@@ -55,6 +56,7 @@ def inspect(
     height, finest = geometry.height_scale, resolved.queries.finest
     loaded = load_material(resolved.material, geometry.make_tileable)
     if loaded.shape is not None:
+        check_options(resolved, loaded)
         if write is not None or export is not None:
             raise UsageError("is for height maps", where="--export" if write is None else "--write")
         mesh = isinstance(loaded.shape, MeshTile)

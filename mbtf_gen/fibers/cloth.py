@@ -15,7 +15,7 @@ from mbtf_gen.fibers.curve_files import read_curves
 from mbtf_gen.fibers.curves import F64, Curve
 from mbtf_gen.fibers.tile import FiberScattering, FiberTile
 from mbtf_gen.fibers.weave import knitted_lines, parse_draft, woven_lines
-from mbtf_gen.fibers.yarn import CrossSection, YarnModel, fibers_of
+from mbtf_gen.fibers.yarn import CrossSection, YarnModel, count_segments, fibers_of
 from mbtf_gen.fibers.yarn_pattern import read_pattern
 from mbtf_gen.fibers.yarn_sets import YARNS, roughness_of
 
@@ -27,6 +27,8 @@ _CURVE_RADIUS = 0.002
 _AT_BORDER = 2e-3
 # Crossings of one tile, each of some hundred fiber segments.
 _MOST_CROSSINGS = 1 << 16
+# Periods that one fiber may reach over.
+_MOST_PERIODS = 16
 # Spline segments of one period: they take two gigabytes.
 MOST_SEGMENTS = 4_000_000
 
@@ -59,12 +61,12 @@ def fiber_tile(spec: ClothFile, folder: Path) -> FiberTile:
         aspect, yarns = _knitted(spec)
     else:
         aspect, yarns = _woven(spec)
-    total = sum(_model(entry).fibers * _model(entry).plies * len(line.control) for line, _, entry, _ in yarns)
-    if total > MOST_SEGMENTS:
+    total = sum(count_segments(line, section, _model(entry)) for line, section, entry, _ in yarns)
+    if not total <= MOST_SEGMENTS:
         raise InputError(
-            f"would have more than {MOST_SEGMENTS:,} fiber segments",
+            f"would have {total:.2g} fiber segments, more than {MOST_SEGMENTS:,}",
             where=folder,
-            hint="fewer repeats, or fewer fibers",
+            hint="take fewer repeats or fibers, or wider yarns",
         )
     curves: list[Curve] = []
     kind: list[int] = []
@@ -73,7 +75,8 @@ def fiber_tile(spec: ClothFile, folder: Path) -> FiberTile:
         curves += fibers
         kind += [color] * len(fibers)
     colors = [spec.yarn.color] if spec.weft is None else [spec.yarn.color, spec.weft.color]
-    return FiberTile.settled(aspect, curves, np.array(kind), np.array(colors), _scattering(spec))
+    tile = FiberTile.settled(aspect, curves, np.array(kind), np.array(colors), _scattering(spec))
+    return _checked(tile, folder)
 
 
 _Yarn = tuple[Curve, CrossSection, YarnEntry, int]
@@ -109,6 +112,21 @@ def _of_pattern(spec: ClothFile, path: Path) -> tuple[float, list[_Yarn]]:
     period = np.array([1.0, pattern.aspect, 0.0])
     lines = [Curve.through(yarn.points, 0.0, np.append(yarn.shift, 0) * period) for yarn in pattern.yarns]
     return pattern.aspect, [(line, section, spec.yarn, 0) for line in lines]
+
+
+def _checked(tile: FiberTile, where: Path) -> FiberTile:
+    """The tile, unless fibers are thicker than a period or reach over many: tracing would never end."""
+    size = np.array([1.0, tile.aspect])
+    for curve in tile.curves:
+        points = curve.unrolled()
+        reach = np.ptp(points[:, :2], axis=0) + 2.0 * points[:, 3].max()
+        if not (reach <= _MOST_PERIODS * size).all():
+            raise InputError(
+                f"a fiber reaches over {np.max(reach / size):.3g} periods, more than {_MOST_PERIODS}",
+                where=where,
+                hint="check radii, widths and the period",
+            )
+    return tile
 
 
 def _section(entry: YarnEntry, space: float, width: float, height: float, flat: bool) -> CrossSection:
@@ -156,10 +174,9 @@ def _of_curves(spec: ClothFile, path: Path) -> FiberTile:
         control[:, :3] = (control[:, :3] - low) / width
         control[:, 3] = np.where(control[:, 3] > 0, control[:, 3] / width * spec.yarn.radius, radius)
         out.append(replace(curve, control=control))
-    if sum(len(curve.control) for curve in out) > MOST_SEGMENTS:
-        raise InputError(f"has more than {MOST_SEGMENTS:,} points", where=path)
     kind = np.zeros(len(out), int)
-    return FiberTile.settled(height / width, out, kind, np.array([spec.yarn.color]), _scattering(spec))
+    colors = np.array([spec.yarn.color])
+    return _checked(FiberTile.settled(height / width, out, kind, colors, _scattering(spec)), path)
 
 
 def _bounds(curves: Sequence[Curve]) -> tuple[F64, F64]:
@@ -169,15 +186,21 @@ def _bounds(curves: Sequence[Curve]) -> tuple[F64, F64]:
 
 def loose_ends(tile: FiberTile) -> int:
     """Number of curves' ends on the tile's border that no end on the opposite side continues."""
-    ends = [c.at(np.array([0.0, len(c.windows())]))[0][:, :3] for c in tile.curves if c.shift is None]
+    ends = [c.at(np.array([0.0, len(c.windows())])) for c in tile.curves if c.shift is None]
     if not ends:
         return 0
-    end = np.concatenate(ends)
-    size = np.array([1.0, tile.aspect])
-    place = end[:, :2] / size
-    border = (np.abs(place - np.round(place)) * size < _AT_BORDER).any(axis=1)
-    # Ends of the same place in the period are neighbors in a box that repeats.
-    place = (place + 0.5 * _AT_BORDER) % 1.0
-    tree = cKDTree(np.column_stack([place, end[:, 2] % 1.0]), boxsize=1.0)
-    partners = tree.query_ball_point(np.column_stack([place, end[:, 2] % 1.0])[border], 2.0 * _AT_BORDER)
-    return sum(len(found) < 2 for found in partners)
+    end, slope = (np.concatenate([both[k] for both in ends]) for k in (0, 1))
+    loose = 0
+    for axis, size in enumerate((1.0, tile.aspect)):
+        # A curve crosses the border that it runs towards.
+        crossing = np.abs(slope[:, axis]) >= np.abs(slope[:, 1 - axis])
+        low, high = (end[crossing & (np.abs(end[:, axis] - side) < _AT_BORDER)] for side in (0.0, size))
+        if not len(low) or not len(high):
+            loose += len(low) + len(high)
+            continue
+        other, box = 1 - axis, [(1.0, tile.aspect)[1 - axis], 0.0]
+        places = [np.column_stack([side[:, other] % box[0], side[:, 2]]) for side in (low, high)]
+        near, index = cKDTree(places[1], boxsize=box).query(places[0], distance_upper_bound=_AT_BORDER)
+        # Each end continues at most one of the other side.
+        loose += len(low) + len(high) - 2 * len(np.unique(index[np.isfinite(near)]))
+    return loose

@@ -53,16 +53,17 @@ class YarnEntry(Settings):
 class FiberEntry(Settings):
     """How fibers scatter light."""
 
-    roughness: Share | None = Field(
+    # Mitsuba loses light and overflows below.
+    roughness: Annotated[float, Field(ge=0.08, le=1)] | None = Field(
         None, description="longitudinal roughness; default: that of the yarn's material"
     )
-    azimuthal_roughness: Share | None = Field(
+    azimuthal_roughness: Annotated[float, Field(ge=0.02, le=1)] | None = Field(
         None, description="azimuthal roughness; default: that of the yarn's material"
     )
-    scale_tilt: Annotated[float, Field(ge=-30, le=30)] = Field(
+    scale_tilt: Annotated[float, Field(ge=-10, le=10)] = Field(
         0.0, description="tilt of the scales in degrees"
     )
-    ior: Annotated[float, Field(gt=1, le=3)] = Field(1.55, description="index of refraction")
+    ior: Annotated[float, Field(ge=1.1, le=2)] = Field(1.55, description="index of refraction")
 
 
 class KnitEntry(Settings):
@@ -70,7 +71,8 @@ class KnitEntry(Settings):
 
     stitches: Annotated[int, Field(ge=1, le=256)] = Field(4, description="stitches across the tile")
     rows: Annotated[int, Field(ge=1, le=256)] = Field(4, description="rows up the tile")
-    aspect: Annotated[float, Field(gt=0.2, le=5)] = Field(
+    # Loops of other shapes pass through one another.
+    aspect: Annotated[float, Field(ge=0.72, le=0.85)] = Field(
         0.8, description="height of a stitch over its width"
     )
 
@@ -106,6 +108,11 @@ class ClothFile(Settings):
             raise ValueError(
                 f"needs one of weave, knit, pattern, curves, not {' and '.join(given) or 'none'}"
             )
+        unused = {"width", "height", "fibers", "flyaways"} & self.yarn.model_fields_set
+        if self.curves is not None and unused:
+            raise ValueError(f"'yarn.{min(unused)}' does not apply to 'curves', which are fibers")
+        if self.curves is not None and "seed" in self.model_fields_set:
+            raise ValueError("'seed' does not apply to 'curves', which are fibers")
         for key, owner in (("repeat", "weave"), ("weft", "weave"), ("period", "curves")):
             if key in self.model_fields_set and given != [owner]:
                 raise ValueError(f"'{key}' goes with '{owner}'")

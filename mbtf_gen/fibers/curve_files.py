@@ -24,8 +24,8 @@ log = logging.getLogger(__name__)
 
 _HEADER = struct.Struct("<3sBccBBQQ40s")
 _COMPLETE = "check that the file is complete"
-# Most control points of a tile: they take a gigabyte while they are read.
-_MOST_POINTS = 20_000_000
+# Most control points of a tile: they take 1.5 GB while they are read.
+MOST_POINTS = 4_000_000
 
 
 def read_curves(path: Path) -> list[Curve]:
@@ -59,6 +59,8 @@ def _bcc(data: bytes, path: Path) -> list[Curve]:
             where=path,
             hint=_COMPLETE,
         )
+    if points > MOST_POINTS:
+        raise InputError(f"has {points:,} points, more than {MOST_POINTS:,}", where=path)
     out, at = [], _HEADER.size
     deviation = 0.0
     for number in range(curves):
@@ -112,8 +114,8 @@ def _text(data: bytes, path: Path) -> list[Curve]:
         lines = data.decode("utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
         raise InputError(f"is not text (byte {error.start})", where=path) from None
-    if len(lines) > _MOST_POINTS:
-        raise InputError(f"has {len(lines)} lines, more than {_MOST_POINTS}", where=path)
+    if len(lines) > MOST_POINTS:
+        raise InputError(f"has {len(lines):,} lines, more than {MOST_POINTS:,}", where=path)
     runs: list[list[list[float]]] = [[]]
     for number, line in enumerate(lines, 1):
         if not line.strip():

@@ -116,14 +116,8 @@ def fibers_of(line: Curve, section: CrossSection, model: YarnModel, rng: np.rand
         Of each ply, its fibers and then its hairs.
     """
     assert line.shift is not None
-    segments = len(line.control)
-    fine = np.arange(16 * segments) / 16.0
-    length = float(np.linalg.norm(line.at(fine)[1][:, :3], axis=1).mean() * segments)
-    # Tile widths per centimeter.
-    scale = 0.5 * (section.width + section.height) / model.radius
-    turns = _whole(length / (scale * model.pitch))
-    ply_turns = _whole(length / (scale * model.ply_pitch)) if model.plies > 1 else 0
-    n = max(_PER_SEGMENT * segments, _PER_TURN * max(abs(turns + ply_turns), abs(turns)), LEAST_POINTS)
+    length, scale, turns, ply_turns = _turns(line, section, model)
+    n = _points(line, turns, ply_turns)
     s = np.arange(n) / n
     frame = _Frame(line, s, section, model)
     radius = model.fiber_radius * scale
@@ -144,6 +138,30 @@ def fibers_of(line: Curve, section: CrossSection, model: YarnModel, rng: np.rand
             out.append(Curve.through(points, radius, line.shift))
         out += _hairs(rng, model, frame, (ply_turns, ply / model.plies), length / scale, radius)
     return out
+
+
+def count_segments(line: Curve, section: CrossSection, model: YarnModel) -> float:
+    """Number of spline segments of :func:`fibers_of`."""
+    length, scale, turns, ply_turns = _turns(line, section, model)
+    hairs = model.hairs * length / scale * (_HAIR_POINTS - 3)
+    return model.plies * (model.fibers * _points(line, turns, ply_turns) + hairs)
+
+
+def _turns(line: Curve, section: CrossSection, model: YarnModel) -> tuple[float, float, int, int]:
+    """(length of a center line, tile widths per centimeter, turns of fibers, turns of plies)."""
+    segments = len(line.control)
+    fine = np.arange(16 * segments) / 16.0
+    length = float(np.linalg.norm(line.at(fine)[1][:, :3], axis=1).mean() * segments)
+    scale = 0.5 * (section.width + section.height) / model.radius
+    ply_turns = _whole(length / (scale * model.ply_pitch)) if model.plies > 1 else 0
+    return length, scale, _whole(length / (scale * model.pitch)), ply_turns
+
+
+def _points(line: Curve, turns: int, ply_turns: int) -> int:
+    """Points of a fiber."""
+    return max(
+        _PER_SEGMENT * len(line.control), _PER_TURN * max(abs(turns + ply_turns), abs(turns)), LEAST_POINTS
+    )
 
 
 def _whole(turns: float) -> int:

@@ -18,6 +18,8 @@ from mbtf_core.errors import InputError
 from mbtf_gen.fibers.curves import F64, LEAST_POINTS
 
 _SECTIONS = {"*pattern": 4, "*Q": 4, "*E": 4}
+# Periods that a yarn may reach over.
+_MOST_PERIODS = 16
 # Vertices of a pattern, which bounds what a damaged file may claim.
 _MOST_VERTICES = 10_000_000
 
@@ -81,8 +83,10 @@ def read_pattern(path: Path) -> YarnPattern:
         raise InputError(what, where=path)
     vertices = np.array(rows["*Q"])[:, :3]
     edges = np.array(rows["*E"])
-    if (edges != np.round(edges)).any() or len(edges) > _MOST_VERTICES:
+    if (edges != np.round(edges)).any() or np.abs(edges).max() > _MOST_VERTICES:
         raise InputError("its section '*E' has numbers that are no indices", where=path)
+    if np.abs(edges[:, 2:]).max() > _MOST_PERIODS or np.abs(vertices).max() > _MOST_PERIODS * max(px, py):
+        raise InputError(f"its yarns reach over more than {_MOST_PERIODS} periods", where=path)
     loops = _loops(edges.astype(int), len(vertices), path)
     period = np.array([px, py])
     yarns = []
@@ -91,6 +95,9 @@ def read_pattern(path: Path) -> YarnPattern:
             raise InputError(f"a yarn has {len(index)} vertices, fewer than {LEAST_POINTS}", where=path)
         points = vertices[index].copy()
         points[:, :2] += turns * period
+        following = np.concatenate([points[1:], points[:1] + np.append(shift * period, 0.0)])
+        if not (np.linalg.norm(following - points, axis=1) > 0).all():
+            raise InputError("two vertices of a yarn are at the same place", where=path)
         yarns.append(YarnLoop(points / px, shift))
     return YarnPattern(py / px, radius / px, px, tuple(yarns))
 

@@ -13,6 +13,7 @@ from mbtf_gen.fibers.cloth import fiber_tile, loose_ends
 from mbtf_gen.fibers.cloth_file import ClothFile
 from mbtf_gen.fibers.inspect import inspect_fibers
 from mbtf_gen.fibers.tile import FiberTile
+from mbtf_gen.fibers.yarn_sets import YARNS
 from mbtf_gen.material.material import Material
 
 
@@ -52,6 +53,7 @@ def cloth_material(spec: ClothFile, folder: Path) -> Material:
     # What the defaults stand for changes the data as well.
     settings = spec.model_dump(mode="json", exclude={"pattern", "curves"})
     settings["scattering"] = asdict(fibers.scattering)
+    settings["yarns"] = [asdict(YARNS[entry.type]) for entry in (spec.yarn, spec.weft) if entry is not None]
     digests["settings"] = data_sha256(settings)
     kind = next(key for key in ("weave", "knit", "pattern", "curves") if getattr(spec, key) is not None)
     named = f" of {files[kind].name}" if kind in files else ""

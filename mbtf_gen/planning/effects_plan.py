@@ -333,8 +333,7 @@ def _bsdf_sampling(scene: _Analysis) -> Effect:
     if width == 0.0:
         return Effect(name, False, "samples of the BSDF never hit a delta light", 0.0)
     if isinstance(scene.shape, FiberTile):
-        # The transmitted lobe is half as wide as the reflected one.
-        lobe, text = 0.5 * scene.shape.scattering.deviation, "narrowest lobe of the fibers"
+        lobe, text = scene.shape.scattering.narrowest, "narrowest lobe of the fibers"
         text += f" {np.degrees(lobe):.2g}°, light {job.config.light.width:g}°"
         if lobe >= WIDER * width:
             return Effect(name, False, f"{text}: sampling the light suffices", 0.0)

@@ -29,6 +29,7 @@ from mbtf_pipeline.compare.pictures import PICTURES, write_picture
 
 if TYPE_CHECKING:
     from mbtf_gen.config.generator import GeneratorConfig
+    from mbtf_gen.fibers.tile import FiberTile
     from mbtf_gen.job import Job
     from mbtf_gen.material.material import Material
     from mbtf_pipeline.recipe import CompareSection, SceneDirection, SceneView
@@ -270,26 +271,28 @@ def _mitsuba_scene(job: Job, camera: Camera, omega_i: F64, folder: Path) -> dict
             "direction": [float(-c) for c in omega_i],
             "irradiance": float(1.0 / omega_i[2]),
         },
-        "group": {"type": "shapegroup", "tile": tile},
+        "group": {"type": "shapegroup", **tile},
         **instances,
     }
 
 
 def _mitsuba_tile(job: Job, unit: float, folder: Path) -> dict[str, Any]:
-    """One period of the mesh or of the fibers, centered, with `unit` scene units per tile width."""
+    """Shapes of one period of the mesh or of the fibers, centered, with `unit` scene units per tile width."""
     from mbtf_gen.meshes.tile import MeshTile
 
     fibers, aspect = job.material.shape, job.material.aspect
     if isinstance(fibers, MeshTile):
         raise UsageError("compares height maps and fibers, not meshes", where="compare.unmodified_mitsuba")
     if fibers is not None:
-        file = folder / "tile.txt"
-        with file.open("w") as text:
-            for curve in fibers.curves:
-                rows = (curve.unrolled() - (0.5, 0.5 * aspect, 0.0, 0.0)) * unit
-                np.savetxt(text, rows, fmt="%.9g")
-                text.write("\n")
-        return {"type": "bsplinecurve", "filename": str(file), "bsdf": fibers.bsdf()}
+        # One shape per color: Mitsuba's own texture coordinates run around the fiber.
+        return {
+            f"color_{number}": {
+                "type": "bsplinecurve",
+                "filename": str(_write_curves(fibers, number, unit, folder)),
+                "bsdf": dataclasses.replace(fibers, colors=fibers.colors[[number]]).bsdf(),
+            }
+            for number in np.unique(fibers.yarn)
+        }
     from mbtf_gen.geometry.heightfield import tile_mesh
 
     mesh = tile_mesh(job.grid)
@@ -297,13 +300,25 @@ def _mitsuba_tile(job: Job, unit: float, folder: Path) -> dict[str, Any]:
     mesh.apply_scale(unit)
     file = folder / "tile.ply"
     file.write_bytes(mesh.export(file_type="ply", vertex_normal=False))
-    return {
+    mesh = {
         "type": "ply",
         "filename": str(file),
         "face_normals": True,
         "flip_tex_coords": True,
         "bsdf": _mitsuba_bsdf(job),
     }
+    return {"tile": mesh}
+
+
+def _write_curves(fibers: FiberTile, color: int, unit: float, folder: Path) -> Path:
+    """Text file of the fibers of one color, in scene units, centered."""
+    file = folder / f"color_{color}.txt"
+    with file.open("w") as text:
+        for number in np.flatnonzero(fibers.yarn == color):
+            points = fibers.curves[int(number)].unrolled() - (0.5, 0.5 * fibers.aspect, 0.0, 0.0)
+            np.savetxt(text, points * unit, fmt="%.9g")
+            text.write("\n")
+    return file
 
 
 def _mitsuba_bsdf(job: Job) -> dict[str, Any]:

@@ -68,6 +68,17 @@ def test_a_shifted_image_differs(glossy: Material, monkeypatch: pytest.MonkeyPat
     assert found.square.value > 10 * found.square.error
 
 
+def test_cloth_of_two_colors_agrees(tmp_path: Path) -> None:
+    (tmp_path / "cloth.yaml").write_text(
+        "weave: plain\nyarn: {type: rayon1, fibers: 5, radius: 8, flyaways: 0, color: [0.9, 0.3, 0.1]}\n"
+        "weft: {type: rayon1, fibers: 5, radius: 8, flyaways: 0, color: [0.1, 0.3, 0.9]}\n"
+    )
+    described = GeneratorConfig.model_validate({"material": str(tmp_path / "cloth.yaml")})
+    (found,) = compare_with_mitsuba(SECTION, described, load_material(tmp_path / "cloth.yaml")).values()
+    assert found.verdict == "agree", (found.mean, found.square)
+    assert found.mean.error < 0.05
+
+
 def test_noise_of_both_sides_cancels() -> None:
     random = np.random.default_rng(3)
     truth = 0.5 + random.random((64, 64, 3))

@@ -7,12 +7,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.paths import ASSETS
 
 from mbtf_core.errors import InputError, MbtfError, UsageError
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.fibers.tile import absorption
+from mbtf_gen.fibers.tile import FiberScattering, FiberTile, absorption
 from mbtf_gen.job import Job
 from mbtf_gen.material.load import load_material
+
+# Sum of all control points and radii of the basket weave.
+GOLDEN = 31350.997477935016
 
 WEAVE = "weave: plain\nyarn: {type: silk1, fibers: 3}\n"
 
@@ -79,6 +83,13 @@ def test_every_option_changes_the_digest(tmp_path: Path) -> None:
         ("pattern: missing.pyp\n", "cannot be read"),
         ("weave: basket 64\nrepeat: 64\n", "crossings"),
         ("weave: basket 9\nyarn: {fibers: 90000}\n", "segments"),
+        ("weave: plain\nyarn: {width: 0.00001}\n", "segments"),
+        ("weave: plain\nyarn: {flyaways: 100, width: 0.001}\n", "segments"),
+        ("weave: plain\nyarn: {width: 1000000}\n", "periods"),
+        ("weave: plain\nfiber: {roughness: 0.01}\n", "roughness"),
+        ("knit: {aspect: 0.5}\n", "aspect"),
+        ("curves: a.curves\nyarn: {flyaways: 2}\n", "flyaways"),
+        ("curves: a.curves\nseed: 2\n", "seed"),
     ],
 )
 def test_faults_are_one_line(tmp_path: Path, text: str, says: str) -> None:
@@ -89,7 +100,7 @@ def test_faults_are_one_line(tmp_path: Path, text: str, says: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "geometry", [{"height_scale": 0.5}, {"mesh": 8}, {"tracer": "mesh"}, {"make_tileable": "mirror"}]
+    "geometry", [{"height_scale": 0.5}, {"mesh": 1}, {"tracer": "mesh"}, {"make_tileable": "mirror"}]
 )
 def test_options_of_height_maps_are_refused(tmp_path: Path, geometry: dict[str, Any]) -> None:
     path = write(tmp_path, WEAVE)
@@ -112,6 +123,44 @@ def test_curves_that_do_not_repeat_are_noted(tmp_path: Path) -> None:
     for name, count in (("a", 0), ("b", 1)):
         path = write(tmp_path, f"curves: {name}.curves\nperiod: [1, 1]\n")
         assert len(load_material(path).warnings) == count
+
+
+def test_neighbors_do_not_hide_a_seam(tmp_path: Path) -> None:
+    rows = [
+        "".join(f"{x / 4} {y + 0.1 * x} 0 .001\n" for x in range(-1, 6)) + "\n" for y in (0.2, 0.2015, 0.203)
+    ]
+    (tmp_path / "a.curves").write_text("".join(rows))
+    found = load_material(write(tmp_path, "curves: a.curves\nperiod: [1, 1]\n"))
+    assert "6 ends" in found.warnings[0]
+
+
+def test_a_thick_cloth_is_refused_as_steep_heights_are(tmp_path: Path) -> None:
+    path = write(tmp_path, WEAVE)
+    described = {"material": str(path), "geometry": {"max_displacement": 0.01}}
+    with pytest.raises(InputError, match="displacement"):
+        Job.load(GeneratorConfig.model_validate(described))
+
+
+@pytest.mark.parametrize("name", ["basket_weave", "twill_silk", "stockinette"])
+def test_the_documented_figures_are_those_of_the_assets(name: str) -> None:
+    found = load_material(ASSETS / name).shape
+    assert isinstance(found, FiberTile)
+    page = (ASSETS.parent / "docs/reference/assets.md").read_text(encoding="utf-8")
+    row = f"| `{name}` | {len(found.curves):,} | {found.segments:,} | {found.thickness:.3f} |"
+    assert row in page
+
+
+def test_fibers_are_the_same_on_every_machine() -> None:
+    """Shards of one data set may come from several."""
+    found = load_material(ASSETS / "basket_weave").shape
+    assert isinstance(found, FiberTile)
+    points = np.concatenate([curve.control for curve in found.curves])
+    assert points.sum() == pytest.approx(GOLDEN, abs=1e-6)
+
+
+def test_narrow_lobes_are_found_along_and_around_the_fiber() -> None:
+    assert FiberScattering(0.72, 0.6).narrowest == pytest.approx(np.radians(27.0), rel=0.02)
+    assert FiberScattering(0.72, 0.02).narrowest < np.radians(1.0)
 
 
 def test_curves_that_reach_too_far_are_refused(tmp_path: Path) -> None:

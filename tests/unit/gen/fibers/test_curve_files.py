@@ -102,6 +102,11 @@ def test_real_patterns_are_read_as_they_are(name: str) -> None:
         ("3 0 1 0\n", "", "closed yarns"),
         ("1 2 0 0", "1 2.5 0 0", "indices"),
         ("*pattern", "", "*pattern"),
+        ("3 0 1 0", "3 0 100000000 0", "indices"),
+        ("3 0 1 0", "3 0 1e300 0", "indices"),
+        ("3 0 1 0", "3 0 90 0", "periods"),
+        ("0.0005 0.0005 0 0", "0.0005 1e200 0 0", "periods"),
+        ("0.0015 0.0005 0.0002 0", "0.0005 0.0005 0 0", "same place"),
     ],
 )
 def test_damaged_patterns_are_refused(tmp_path: Path, old: str, new: str, says: str) -> None:

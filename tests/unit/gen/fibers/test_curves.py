@@ -11,11 +11,11 @@ from mbtf_gen.fibers.curves import Curve, closed_frames, copies, interpolating, 
 SHIFT = np.array([1.0, 0.0, 0.0])
 
 
-def wavy(n: int = 12, seed: int = 0) -> Curve:
-    """A closed curve along x that leaves the tile on the other sides as well."""
+def wavy(n: int = 12, seed: int = 0, shift: np.ndarray = SHIFT) -> Curve:
+    """A closed curve that leaves the tile on several sides."""
     rng = np.random.default_rng(seed)
-    points = np.column_stack([np.arange(n) / n, 0.9 + 0.3 * rng.random(n), 0.1 * rng.random(n)])
-    return Curve.through(points, 0.01, SHIFT)
+    points = np.column_stack([np.zeros(n), 0.9 + 0.3 * rng.random(n), 0.1 * rng.random(n)])
+    return Curve.through(points + np.arange(n)[:, None] / n * shift, 0.01, shift)
 
 
 def test_a_closed_curve_passes_through_its_points_and_repeats_after_its_shift() -> None:
@@ -43,9 +43,13 @@ def test_straight_lines_are_kept() -> None:
     assert np.abs(interpolating(points, SHIFT) - points).max() < 1e-15
 
 
+@pytest.mark.parametrize("kind", ["closed", "two periods", "diagonal", "open"])
 @pytest.mark.parametrize("aspect", [1.0, 0.6])
-def test_copies_cover_the_box_exactly(aspect: float) -> None:
-    curve = wavy()
+def test_copies_cover_the_box_exactly(aspect: float, kind: str) -> None:
+    shift = {"two periods": np.array([2.0, 0, 0]), "diagonal": np.array([1.0, aspect, 0.0])}.get(kind, SHIFT)
+    curve = wavy(shift=shift)
+    if kind == "open":
+        curve = Curve(curve.unrolled())
     runs = list(copies(curve, (1.0, aspect)))
     segments = np.concatenate(
         [np.lib.stride_tricks.sliding_window_view(run, 4, axis=0).transpose(0, 2, 1) for run in runs]

@@ -15,6 +15,8 @@ from mbtf_gen.fibers.yarn_sets import YARNS, roughness_of
 
 # One tile width is four centimeters of a straight yarn.
 SECTION = CrossSection(0.25, 0.25, True)
+# Sign of the angle from y to z along x of a fiber with a negative pitch.
+TURNS = -1
 
 
 def straight(n: int = 64) -> Curve:
@@ -63,13 +65,15 @@ def test_plies_and_fibers_have_the_pitches_of_the_model() -> None:
     # In the half axes of its ply, the fiber turns clockwise at 0.369 cm.
     angle = np.unwrap(np.arctan2(z / model.long_axis, y / model.short_axis))
     turns = (angle[-1] - angle[0]) / (2.0 * np.pi)
-    assert abs(turns) == pytest.approx(round(centimeters / 0.369), abs=0.01)
+    # Seen along x, y points to the right and z up: clockwise turns have falling angles from y to z.
+    assert turns == pytest.approx(TURNS * round(centimeters / 0.369), abs=0.01)
     # Many fibers of a ply have their mean on its center, which turns at 0.453 cm.
     model = plain(plies=2, fibers=200)
     fibers = fibers_of(straight(), section(model, centimeters), model, np.random.default_rng(2))
     at = np.mean([np.stack(cylinder(fiber)) for fiber in fibers[:200]], axis=0)
     angle = np.unwrap(np.arctan2(at[2], at[1]))
-    assert abs(angle[-1] - angle[0]) / (2.0 * np.pi) == pytest.approx(round(centimeters / 0.453), abs=0.05)
+    turns = (angle[-1] - angle[0]) / (2.0 * np.pi)
+    assert turns == pytest.approx(-TURNS * round(centimeters / 0.453), abs=0.05)
     distance = np.hypot(at[1], at[2]) * centimeters
     assert distance.mean() == pytest.approx(model.ply_distance, rel=0.05)
 
