@@ -142,7 +142,7 @@ class PreviewPictures:
                 "then the same command draws it",
             )
         if interactive and self.job is not None and self.job.material.shape is not None:
-            self.console.note("fibers are not shown in a window")
+            self.console.note("only height maps are shown in a window")
         elif interactive and self.job is not None:
             self.console.note("the mesh is shown in a window: close it to continue")
             mesh.show(self._tiled_mesh(self.job), self.camera, self.omega_i)
