@@ -2,35 +2,27 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from mbtf_core.config_file import FileName, Settings
-from mbtf_core.errors import UsageError
 from mbtf_core.shard_schema import Tiling
 from mbtf_gen.config.generator import Resolution
+from mbtf_gen.config.values import Positive, Rgb, no_tiling
 from mbtf_gen.fibers.yarn_sets import YarnName
 
-Share = Annotated[float, Field(ge=0, le=1)]
-Positive = Annotated[float, Field(gt=0, le=1e6)]
 # Files that can be given in place of a material file, by suffix, with the key that names them there.
 CURVE_FILES = {".pyp": "pattern", ".bcc": "curves", ".curves": "curves"}
 # Exactly one of them describes the cloth.
 CLOTH_KEYS = {"weave", "knit", "pattern", "curves"}
 
 
-def _gray(value: Any) -> Any:
-    return (value, value, value) if isinstance(value, int | float) and not isinstance(value, bool) else value
-
-
 class YarnEntry(Settings):
     """One kind of yarn."""
 
     type: YarnName = Field("cotton2", description="published yarn: its plies, fibers, twist and flyaways")
-    color: Annotated[tuple[Share, Share, Share], BeforeValidator(_gray)] = Field(
-        (0.7, 0.7, 0.7), description="color of a mass of its fibers, linear"
-    )
+    color: Rgb = Field((0.7, 0.7, 0.7), description="color of a mass of its fibers, linear")
     width: Positive | None = Field(
         None,
         description="width over the distance of neighboring yarns, default 0.95 woven and 0.45 knitted; over "
@@ -119,12 +111,5 @@ class ClothFile(Settings):
         return self
 
     def tiling(self, given: Tiling | None) -> Tiling:
-        """``none``: cloth tiles as it is.
-
-        Raises
-        ------
-        UsageError : a method for maps is given
-        """
-        if given not in (None, "none"):
-            raise UsageError("is for height maps: yarns and fibers tile as they are", where="--make-tileable")
-        return "none"
+        """Method for maps that do not tile, which these are not."""
+        return no_tiling(given)

@@ -5,20 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from mbtf_core.config_file import FileName, Settings
 from mbtf_core.shard_schema import Tiling
 from mbtf_gen.config.generator import MAX_SCALE, Resolution
+from mbtf_gen.config.values import Rgb, Share
 from mbtf_gen.images.metadata import ColorSpace
 
-Share = Annotated[float, Field(ge=0, le=1)]
 Channel = Annotated[str, Field(min_length=1)]
 _CHANNEL = "channel or layer of an EXR file; R, G, B, A or Y of others; default: all that belongs together"
-
-
-def _gray(value: Any) -> Any:
-    return (value, value, value) if isinstance(value, int | float) and not isinstance(value, bool) else value
 
 
 class _Entry(Settings):
@@ -64,9 +60,7 @@ class _FileOrValue(_Entry):
 class ColorEntry(_FileOrValue):
     """A color map or one color."""
 
-    value: Annotated[tuple[Share, Share, Share], BeforeValidator(_gray)] | None = Field(
-        None, description="one color, three numbers or one"
-    )
+    value: Rgb | None = Field(None, description="one color, three numbers or one")
     colorspace: ColorSpace | None = Field(
         None, description="default: srgb for integer images, linear for float images and values"
     )

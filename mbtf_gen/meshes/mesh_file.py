@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field
+from pydantic import Field
 
 from mbtf_core.color import srgb_to_linear
 from mbtf_core.config_file import FileName, Settings
-from mbtf_core.errors import InputError, UsageError, reason
+from mbtf_core.errors import InputError, reason
 from mbtf_core.shard_schema import Tiling
 from mbtf_gen.config.generator import Resolution
+from mbtf_gen.config.values import Positive, Rgb, Share, no_tiling
 from mbtf_gen.meshes.tile import F64, MeshPart, MeshTile
 
 MESH_FILES = (".glb", ".gltf", ".ply", ".obj")
@@ -25,13 +26,6 @@ MOST_TRIANGLES = 20_000_000
 _BEYOND = 1.0
 _GRAY = 0.5
 
-Share = Annotated[float, Field(ge=0, le=1)]
-Positive = Annotated[float, Field(gt=0, le=1e6)]
-
-
-def _gray(value: Any) -> Any:
-    return (value, value, value) if isinstance(value, int | float) and not isinstance(value, bool) else value
-
 
 class MeshFile(Settings):
     """Content of a ``material.yaml`` of triangles; file names are relative to its folder."""
@@ -41,7 +35,7 @@ class MeshFile(Settings):
         None, description="width and height of one period in the file's units; default: the mesh's bounds"
     )
     up: Literal["y", "z"] | None = Field(None, description="axis that points up; default: y for glTF, else z")
-    base_color: Annotated[tuple[Share, Share, Share] | None, BeforeValidator(_gray)] = Field(
+    base_color: Rgb | None = Field(
         None, description="linear color of all parts; default: that of the file, else 0.5"
     )
     roughness: Share | None = Field(None, description="roughness of all parts; default: that of the file")
@@ -49,15 +43,8 @@ class MeshFile(Settings):
     resolution: Resolution = Field(256, description="texels across at the finest level, a power of two")
 
     def tiling(self, given: Tiling | None) -> Tiling:
-        """``none``: there are no maps to make tileable.
-
-        Raises
-        ------
-        UsageError : a method for maps is given
-        """
-        if given not in (None, "none"):
-            raise UsageError("is for height maps, not for triangles", where="--make-tileable")
-        return "none"
+        """Method for maps that do not tile, which these are not."""
+        return no_tiling(given)
 
 
 def read_mesh(spec: MeshFile, folder: Path) -> MeshTile:
