@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from mbtf_core.errors import InputError
 from mbtf_gen.fibers.cloth_file import ClothFile, YarnEntry
@@ -189,6 +188,8 @@ def loose_ends(tile: FiberTile) -> int:
     ends = [c.at(np.array([0.0, len(c.windows())])) for c in tile.curves if c.shift is None]
     if not ends:
         return 0
+    from scipy.spatial import cKDTree
+
     end, slope = (np.concatenate([both[k] for both in ends]) for k in (0, 1))
     loose = 0
     for axis, size in enumerate((1.0, tile.aspect)):

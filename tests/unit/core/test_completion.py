@@ -143,8 +143,9 @@ def test_zsh_completes(app: App, line: str, completed: str, home: Path) -> None:
 
 
 def test_zsh_completes_the_material_as_a_file() -> None:
-    assert "'1:Height map, folder of maps, or material.yaml.:_files'" in generate.generate_completion(
-        shell="zsh"
+    assert (
+        "'1:Height map, folder of maps, material.yaml, mesh, or file of yarns or fibers.:_files'"
+        in generate.generate_completion(shell="zsh")
     )
 
 
