@@ -16,6 +16,7 @@ EFFECTS: dict[str, str] = {
     "metallic": "metallic",
     "clearcoat": "clearcoat",
     "sheen": "sheen",
+    "transmission": "fiber transmission",
     "normal": "normal map",
     "opacity": "opacity",
     "bsdf_sampling": "BSDF sampling of light",

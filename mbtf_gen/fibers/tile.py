@@ -15,6 +15,8 @@ from mbtf_gen.fibers.curves import F64, Curve, copies
 # Coefficients of σ_a from the color of many fibers, of a polynomial in the azimuthal roughness: Chiang et al.
 # 2016, "A practical and controllable hair and fur model for production path tracing", equation 9.
 _ABSORPTION = (5.969, -0.215, 2.532, -10.73, 5.574, 0.245)
+# σ_a of fibers without transmission. Light inside a fiber travels 1.5 radii at least, so e⁻¹⁵⁰ of it is left.
+_OPAQUE = 100.0
 
 
 @dataclass(frozen=True)
@@ -103,12 +105,14 @@ class FiberTile:
         found = [(run, k) for k, curve in enumerate(self.curves) for run in copies(curve, (1.0, self.aspect))]
         return [run for run, _ in found], np.array([k for _, k in found])
 
-    def bsdf(self) -> dict[str, Any]:
-        """Mitsuba dictionary of the scattering of all colors: σ_a is a texture along u."""
+    def bsdf(self, *, transmission: bool = True) -> dict[str, Any]:
+        """Mitsuba dictionary of the scattering of all colors: σ_a is a texture along u. Without
+        `transmission`, fibers absorb all light that enters them."""
         import mitsuba as mi
 
         s = self.scattering
-        pixels = absorption(self.colors, s.azimuthal_roughness).astype(np.float32)[None]
+        sigma_a = absorption(self.colors, s.azimuthal_roughness)
+        pixels = np.asarray(sigma_a if transmission else np.full_like(sigma_a, _OPAQUE), np.float32)[None]
         return {
             "type": "hair",
             "sigma_a": {

@@ -4,31 +4,30 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mbtf_gen.config.effects_request import DISPLACEMENT_EFFECTS, EFFECTS, EffectsRequest
-from mbtf_gen.fibers.tile import FiberTile
-from mbtf_gen.geometry.slope_statistics import triangle_slopes
-from mbtf_gen.images.resample import resample
 from mbtf_gen.job import Job
-from mbtf_gen.meshes.tile import MeshTile
 from mbtf_gen.planning.bounds import POINTS, DisplacementBounds, displacement_bounds
 from mbtf_gen.planning.effects import Effect, EffectsPlan, consistent, decide, without
 from mbtf_gen.planning.pilot import Pilot, pilot_queries
-from mbtf_gen.planning.simulation import normal_map_slopes
+from mbtf_gen.planning.surface_effects import (
+    Analysis,
+    analyze,
+    bsdf_sampling,
+    normal_map,
+    opacity,
+    passing,
+    transmission,
+)
 from mbtf_gen.sampling.light_kernel import LightKernel
 
 # The light lobe is cut at this many standard deviations; the second number is the tail of a Gaussian there.
 LOBE_TAIL = 3.5
 LOBE_TAIL_SHARE = 2.4e-4
-# Next-event estimation alone has no more variance than both techniques if the narrowest lobe of the surface,
-# about 2α wide, is at least this many times wider than the light's.
-WIDER = 4.0
 # Deepest cap on surface interactions that is tried.
 DEEPEST_CAP = 4
 # A specular lobe, clearcoat or sheen below this strength may be negligible: a pilot measures it.
@@ -39,46 +38,6 @@ LAYERS = {"specular": 4.0, "metallic": math.inf, "clearcoat": 1.0, "sheen": 1.0}
 # Safety factor on the bias of a faint layer, which we scale down from that of a full one. Scaling is exact
 # except for light that meets the layer more than once.
 FAINT_CAUTION = 2.0
-
-
-@dataclass(frozen=True)
-class _Analysis:
-    """Facts about a job that the decisions need."""
-
-    job: Job
-    albedo: NDArray[np.float64]
-    lambert: bool
-    own_bsdf: bool
-    pilots: bool
-
-    @cached_property
-    def steepest(self) -> float:
-        """Largest slope of any triangle of the mesh (tangent of its angle to the plane)."""
-        if self.shape is not None:
-            return math.inf
-        return float(triangle_slopes(self.job.grid).max())
-
-    @cached_property
-    def mapped(self) -> tuple[NDArray[np.float64], float] | None:
-        """Slopes that the normal map adds, and the share of the mesh's slopes that it repeats."""
-        return normal_map_slopes(self.job)
-
-    @property
-    def flat(self) -> bool:
-        """Whether nothing is displaced."""
-        return self.job.displacement_range == 0.0
-
-    @property
-    def shape(self) -> FiberTile | MeshTile | None:
-        """Fibers or triangles in place of heights."""
-        return self.job.material.shape
-
-    @property
-    def kind(self) -> str:
-        """The surface, in a word."""
-        if self.shape is None:
-            return "displaced"
-        return "fibers" if isinstance(self.shape, FiberTile) else "mesh"
 
 
 def plan_effects(job: Job, *, pilots: bool = True) -> EffectsPlan:
@@ -101,7 +60,7 @@ def plan_effects(job: Job, *, pilots: bool = True) -> EffectsPlan:
         The user requests an effect that the material lacks, or that needs one switched off.
     """
     request = EffectsRequest.parse(job.config.effects.mode)
-    scene = _analysis(job, pilots)
+    scene = analyze(job, pilots)
     tolerance = job.config.effects.tolerance
     reflecting = _surface(scene, [n for n in LAYERS if request.base == "auto" and n not in request.forced])
     decided = {e.name: decide(request, e) for e in _affordable(reflecting, tolerance)}
@@ -109,7 +68,7 @@ def plan_effects(job: Job, *, pilots: bool = True) -> EffectsPlan:
     if not any(e.on for e in decided.values()):
         scene = replace(scene, lambert=True)
     bounds = _displacement_bounds(scene)
-    others = _affordable([_normal(scene, bounds), _opacity(scene, bounds)], left)
+    others = _affordable([normal_map(scene, bounds), opacity(scene, bounds)], left)
     decided |= {e.name: decide(request, e) for e in others}
     left = tolerance - sum(e.bias_bound or 0.0 for e in decided.values() if not e.on)
     plan = _displacement_plan(scene, request, decided, bounds, left)
@@ -121,8 +80,8 @@ def plan_effects(job: Job, *, pilots: bool = True) -> EffectsPlan:
 def reference_plan(job: Job) -> EffectsPlan:
     """The plan of reference pictures: all effects that the material has, whatever their size."""
     request = EffectsRequest.parse(job.config.effects.mode)
-    scene = _analysis(job, False)
-    effects = [*_surface(scene), _normal(scene, None), _opacity(scene, None)]
+    scene = analyze(job, False)
+    effects = [*_surface(scene), transmission(scene), normal_map(scene, None), opacity(scene, None)]
     explanation = "flat" if scene.flat else scene.kind
     effects += [Effect(name, not scene.flat, explanation) for name in DISPLACEMENT_EFFECTS]
     effects.append(Effect("bsdf_sampling", True, "reference"))
@@ -131,21 +90,7 @@ def reference_plan(job: Job) -> EffectsPlan:
     return replace(plan, mode=job.config.effects.mode)
 
 
-def _analysis(job: Job, pilots: bool) -> _Analysis:
-    material = job.material
-    base = np.asarray(material.base_color, np.float64)
-    own = material.bsdf is not None
-    albedo = np.ones((1, 1, 3)) if own else base.reshape(*(base.shape[:-1] or (1, 1)), 3)
-    return _Analysis(
-        job,
-        albedo,
-        material.is_lambert and material.clearcoat is None and material.sheen is None,
-        own,
-        pilots,
-    )
-
-
-def _displacement_bounds(scene: _Analysis) -> DisplacementBounds | None:
+def _displacement_bounds(scene: Analysis) -> DisplacementBounds | None:
     """Bias bounds of displacement and normal map; None unless they apply, to a Lambert surface that is not
     black."""
     job, mapped = scene.job, scene.mapped
@@ -159,7 +104,7 @@ def _displacement_bounds(scene: _Analysis) -> DisplacementBounds | None:
         LightKernel(job.config.light.width),
         scene.albedo,
         None if mapped is None else mapped[0],
-        _through(scene),
+        passing(scene),
     )
 
 
@@ -175,7 +120,7 @@ def _affordable(effects: list[Effect], tolerance: float) -> list[Effect]:
     return list(out.values())
 
 
-def _surface(scene: _Analysis, measured: Sequence[str] = ()) -> list[Effect]:
+def _surface(scene: Analysis, measured: Sequence[str] = ()) -> list[Effect]:
     """Specular lobe, metal, clearcoat, sheen; those in `measured` are measured where they are faint."""
     material = scene.job.material
     if scene.own_bsdf:
@@ -206,7 +151,7 @@ def _surface(scene: _Analysis, measured: Sequence[str] = ()) -> list[Effect]:
     return out
 
 
-def _faint_bound(scene: _Analysis, name: str, strength: float) -> float | None:
+def _faint_bound(scene: Analysis, name: str, strength: float) -> float | None:
     """Bias bound of leaving out a faint layer. Noise would hide its effect, so a pilot measures the layer at
     full strength and the result is scaled down."""
     if not scene.pilots:
@@ -218,54 +163,26 @@ def _faint_bound(scene: _Analysis, name: str, strength: float) -> float | None:
     return FAINT_CAUTION * strength * Pilot(job, plan).changed(without(plan, name)).bound()
 
 
-def _normal(scene: _Analysis, bounds: DisplacementBounds | None) -> Effect:
-    job = scene.job
-    if scene.mapped is None:
-        text = "no map" if job.material.normal is None else "off in the configuration"
-        text = "the material has its own BSDF" if scene.own_bsdf else text
-        return Effect("normal", False, text, 0.0, present=False)
-    slopes, share = scene.mapped
-    rms = float(np.sqrt(np.mean(np.sum(slopes**2, axis=-1))))
-    text = f"adds slopes of {np.degrees(np.arctan(rms)):.2g}° (RMS)"
-    if job.config.effects.normal == "residual" and not scene.flat:
-        text += f"; {100.0 * share:.0f} % of the mesh's slopes are also in the map and are counted once"
-    if rms == 0.0:
-        return Effect("normal", False, text, 0.0)
-    return Effect("normal", True, text, bounds.normal if bounds else None, "pilot")
-
-
-def _opacity(scene: _Analysis, bounds: DisplacementBounds | None) -> Effect:
-    if scene.shape is not None:
-        return Effect("opacity", True, f"rays can pass through the {scene.kind}", present=False)
-    through = _through(scene)
-    if through is None:
-        opacity = scene.job.material.opacity
-        text = "no map" if opacity is None else "own BSDF" if scene.own_bsdf else "opaque everywhere"
-        return Effect("opacity", False, text, 0.0, present=False)
-    text = f"{100.0 * through.mean():.2g} % of the rays that meet the surface pass through"
-    if not scene.lambert:
-        return Effect("opacity", True, text)
-    if not scene.flat:
-        return Effect("opacity", True, text, bounds.opacity if bounds else None, "pilot")
-    # M of a plane is its color times its opacity.
-    rows, columns = (max(a, b) for a, b in zip(through.shape, scene.albedo.shape[:2], strict=True))
-    passed = np.asarray(resample(through, rows, columns), np.float64)[..., None]
-    color = np.asarray(resample(scene.albedo, rows, columns), np.float64)
-    mean = float(np.mean((1.0 - passed) * color))
-    bound = float(np.sqrt(np.mean((passed * color) ** 2))) / mean if mean > 0 else None
-    return Effect("opacity", True, text, bound, "bound")
-
-
-def _through(scene: _Analysis) -> NDArray[np.float64] | None:
-    """(h, w) share of the rays that pass through; None if all is opaque."""
-    opacity = scene.job.material.opacity
-    if opacity is None or scene.own_bsdf or np.all(np.asarray(opacity) == 1.0):
-        return None
-    return 1.0 - np.atleast_2d(np.asarray(opacity, np.float64))
+def _measured_transmission(
+    scene: Analysis, request: EffectsRequest, decided: dict[str, Effect], left: float
+) -> Effect:
+    """The decision on transmission through fibers, by a pilot with and without it."""
+    effect = decided["transmission"]
+    requested = "transmission" in request.forced or request.base != "auto"
+    if not effect.present or requested or not scene.pilots:
+        return effect
+    many = decide(request, Effect("interreflection", True, scene.kind))
+    on = {**decided, "interreflection": many}
+    plan = _assemble(scene.job, consistent(on, request), scene.job.config.transport.max_depth)
+    change = Pilot(scene.job, plan).changed(without(plan, "transmission"))
+    upper = change.bound()
+    if upper <= left:
+        return replace(effect, on=False, bias_bound=upper, reason="pilot")
+    return replace(effect, bias_bound=change.rms, reason="pilot")
 
 
 def _displacement_plan(
-    scene: _Analysis,
+    scene: Analysis,
     request: EffectsRequest,
     decided: dict[str, Effect],
     bounds: DisplacementBounds | None,
@@ -274,7 +191,8 @@ def _displacement_plan(
     """The plan, given the decisions on the surface: decides on displacement and on BSDF sampling."""
     job = scene.job
     cap = job.config.transport.max_depth
-    decided["bsdf_sampling"] = decide(request, _bsdf_sampling(scene))
+    decided["bsdf_sampling"] = decide(request, bsdf_sampling(scene))
+    decided["transmission"] = decide(request, transmission(scene))
     black = not scene.albedo.any() and scene.lambert and not decided["opacity"].on
     if scene.flat or black:
         text = "flat" if scene.flat else "black: reflects nothing"
@@ -305,11 +223,14 @@ def _displacement_plan(
         left -= shadowing.bias_bound
         shadowing = replace(shadowing, on=False)
     decided["shadowing"] = decide(request, shadowing)
+    decided["transmission"] = _measured_transmission(scene, request, decided, left)
+    if not decided["transmission"].on:
+        left -= decided["transmission"].bias_bound or 0.0
     decided["interreflection"], cap, bound = _interreflection(scene, request, decided, left)
     return _assemble(job, consistent(decided, request), cap, bound)
 
 
-def _shadowing(scene: _Analysis, bounds: DisplacementBounds | None) -> Effect:
+def _shadowing(scene: Analysis, bounds: DisplacementBounds | None) -> Effect:
     config = scene.job.config
     # Elevation in radians below which the cut light lobe has no light; ≤ 0 if there is none.
     lowest = float(np.arcsin(config.queries.min_cos) - LOBE_TAIL * np.radians(config.light.width))
@@ -325,45 +246,12 @@ def _shadowing(scene: _Analysis, bounds: DisplacementBounds | None) -> Effect:
     return Effect("shadowing", True, text, bounds.shadowing if bounds else None, "pilot")
 
 
-def _bsdf_sampling(scene: _Analysis) -> Effect:
-    """Whether sampling the BSDF finds light that next-event estimation finds only with high variance."""
-    job = scene.job
-    width = np.radians(job.config.light.width)
-    name = "bsdf_sampling"
-    if width == 0.0:
-        return Effect(name, False, "samples of the BSDF never hit a delta light", 0.0)
-    if isinstance(scene.shape, FiberTile):
-        lobe, text = scene.shape.scattering.narrowest, "narrowest lobe of the fibers"
-        text += f" {np.degrees(lobe):.2g}°, light {job.config.light.width:g}°"
-        if lobe >= WIDER * width:
-            return Effect(name, False, f"{text}: sampling the light suffices", 0.0)
-        return Effect(name, True, text)
-    if scene.own_bsdf:
-        return Effect(name, True, "the material's own BSDF, not analyzed")
-    if scene.lambert:
-        if job.config.light.width <= 20.0:
-            text = f"Lambert under a light of {job.config.light.width:g}°: sampling the light is best"
-            return Effect(name, False, text, 0.0)
-        return Effect(name, True, "a wide light")
-    material = job.material
-    lobes = [2.0] if material.is_lambert else [2.0 * float(np.min(np.asarray(material.roughness))) ** 2]
-    if material.clearcoat is not None:
-        lobes.append(2.0 * float(np.min(np.asarray(material.clearcoat_roughness))) ** 2)
-    if material.sheen is not None:
-        # The fibers of sheen lean by less than about √α.
-        lobes.append(float(np.min(np.asarray(material.sheen_roughness))))
-    text = f"narrowest lobe {np.degrees(min(lobes)):.2g}°, light {job.config.light.width:g}°"
-    if min(lobes) >= WIDER * width:
-        return Effect(name, False, f"{text}: sampling the light suffices", 0.0)
-    return Effect(name, True, text)
-
-
 def _degrees(slope: float) -> str:
     angle = float(np.degrees(np.arctan(slope)))
     return f"{angle:.0f}°" if angle >= 10.0 else f"{angle:.1g}°"
 
 
-def _bounce_bound(scene: _Analysis) -> float:
+def _bounce_bound(scene: Analysis) -> float:
     """Upper bound of interreflection between gentle slopes. A facet of slope s sees others only within
     2·atan(s) of its plane, a share sin² of its cosine-weighted hemisphere. No facet receives more than 1/E,
     with E the irradiance of a unit lobe on the plane. Bright texels may be rare, so the bound includes the
@@ -379,7 +267,7 @@ def _bounce_bound(scene: _Analysis) -> float:
 
 
 def _interreflection(
-    scene: _Analysis, request: EffectsRequest, decided: dict[str, Effect], left: float
+    scene: Analysis, request: EffectsRequest, decided: dict[str, Effect], left: float
 ) -> tuple[Effect, int, float]:
     """(interreflection, cap on interactions, the cap's bias bound), by a pilot with and without them on the
     same random numbers."""
@@ -429,7 +317,7 @@ def _assemble(job: Job, decided: dict[str, Effect], cap: int, bound: float = 0.0
     return EffectsPlan(effects, cap, bound, job.config.transport.roulette_depth)
 
 
-def _has_closed_form(scene: _Analysis, plan: EffectsPlan) -> bool:
+def _has_closed_form(scene: Analysis, plan: EffectsPlan) -> bool:
     """Whether M follows without tracing: a plane of one Lambert color, or black."""
     if plan.names_on & {*LAYERS, "opacity"} or scene.own_bsdf:
         return False

@@ -16,7 +16,9 @@ from mbtf_gen.render.runtime import CPU_VARIANT
 from mbtf_gen.sampling.query_sampler import Queries
 
 # Effects that change the tile: its shape or its surface.
-_TILE_EFFECTS = frozenset({"parallax", "specular", "metallic", "clearcoat", "sheen", "normal", "opacity"})
+_TILE_EFFECTS = frozenset(
+    {"parallax", "specular", "metallic", "clearcoat", "sheen", "transmission", "normal", "opacity"}
+)
 
 
 class ClosedForm:

@@ -215,7 +215,9 @@ def part_bsdfs(tile: MeshTile) -> list[dict[str, Any]]:
 
 
 def bsdf_of(
-    material: Material, on: Collection[str] = REFLECTION, slopes: NDArray[np.float64] | None = None
+    material: Material,
+    on: Collection[str] = (*REFLECTION, "transmission"),
+    slopes: NDArray[np.float64] | None = None,
 ) -> dict[str, Any] | list[dict[str, Any]]:
     """Mitsuba dictionary of a material's BSDF; one per part of a mesh.
 
@@ -225,7 +227,7 @@ def bsdf_of(
     slopes : (h, w, 2) slopes added to the mesh's
     """
     if isinstance(material.shape, FiberTile):
-        return material.shape.bsdf()
+        return material.shape.bsdf(transmission="transmission" in on)
     if isinstance(material.shape, MeshTile):
         return part_bsdfs(material.shape)
     if material.bsdf is not None:

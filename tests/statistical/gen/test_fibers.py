@@ -148,6 +148,22 @@ def test_one_straight_fiber_is_the_integral_of_its_scattering_function() -> None
     assert measured.error / expected < 0.01
 
 
+def test_opaque_fibers_reflect_by_fresnel_alone() -> None:
+    """Seen at right angles to a fiber, the offset from its axis is uniform."""
+    tile = replace(cylinder(0.05), scattering=FiberScattering(0.3, 0.3, 0.0, 1.7))
+    estimator = traced(tile, None, bsdf=tile.bsdf(transmission=False))
+    e = estimator.estimate(tile_mean_queries(UP, UP, 2000), 64, Stream(5, "test", 0))
+    offset = (np.arange(20_000) + 0.5) / 20_000
+    cosine = np.sqrt(1.0 - offset**2)
+    inside = np.sqrt(1.0 - (offset / 1.7) ** 2)
+    parallel = (1.7 * cosine - inside) / (1.7 * cosine + inside)
+    vertical = (cosine - 1.7 * inside) / (cosine + 1.7 * inside)
+    expected = 0.1 * np.mean(0.5 * (parallel**2 + vertical**2))
+    found = mean_of_halves(e.value_a[:, 1], e.value_b[:, 1])
+    assert found.error < 0.02 * expected
+    assert abs(found.value - expected) < 4 * found.error
+
+
 def test_a_fiber_of_a_ten_thousandth_of_the_tile_does_not_shadow_itself() -> None:
     # The same integral is proportional to the radius, whatever the radius is.
     omega_i, omega_o = direction(50, 70), direction(35, -60)

@@ -25,6 +25,7 @@ LINES = {
     "again": f"cloth.yaml {SMALL} -o data --json",
     "verify": "verify data",
     "plan": "plan cloth.yaml --queries 40/texel",
+    "opaque": "plan cloth.yaml --queries 40/texel --effects=-transmission",
     "images": "cloth.yaml --queries 4/texel --test-queries 256 --layout image --patch-size 4 -o images",
     "inspect": "inspect cloth.yaml --json",
     "reference": "reference cloth.yaml --view 50,20 --tiles-across 1 --size 24 --spp 8 -o reference",
@@ -74,6 +75,12 @@ def test_the_plan_measures_multiple_scattering(done: dict[str, Done]) -> None:
     assert " on " in lines["interreflection"]
     assert "scattered by several fibers" in lines["interreflection"]
     assert " on " in lines["opacity"]
+    assert " on " in lines["fiber transmission"]
+    # Most of the light has passed through a fiber.
+    assert float(lines["fiber transmission"].split()[3]) > 20.0
+    (opaque,) = [line for line in done["opaque"].out.splitlines() if line.startswith("fiber transmission")]
+    assert " off " in opaque
+    assert "forced" in opaque
     assert " off " in lines["normal map"]
 
 

@@ -95,7 +95,9 @@ def test_effects_that_need_the_displaced_tile_are_off_without_it() -> None:
         plan_effects(job_of(LAMBERT, "-parallax,+shadowing"))
 
 
-@pytest.mark.parametrize("name", ["specular", "metallic", "clearcoat", "sheen", "normal", "opacity"])
+@pytest.mark.parametrize(
+    "name", ["specular", "metallic", "clearcoat", "sheen", "transmission", "normal", "opacity"]
+)
 def test_effects_that_the_material_lacks_cannot_be_forced_on(name: str) -> None:
     with pytest.raises(UsageError, match="the material has none"):
         plan_effects(job_of(LAMBERT, f"+{name}"))
