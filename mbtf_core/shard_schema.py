@@ -16,7 +16,15 @@ MANIFEST_NAME = "manifest.json"
 CONFIG_NAME = "config.yaml"
 GEOMETRY_NAME = "geometry.exr"
 
-Layout = Literal["shuffled", "image"]
+Layout = Literal["shuffled", "image", "slices"]
+# Leading axes of all arrays.
+LEADING_AXES: dict[Layout, tuple[str, ...]] = {
+    "shuffled": ("n",),
+    "image": ("items", "rows", "columns"),
+    "slices": ("items", "directions"),
+}
+# Directions of the slices layout: a spiral, or those of the measured BTFs of Bonn.
+SliceDirections = Literal["spiral", "ubo2003"]
 ArrayFormat = Literal["npz", "exr"]
 # How maps that do not tile are made tileable.
 Tiling = Literal["none", "mirror", "blend"]
@@ -36,7 +44,7 @@ class ShardEntry:
     file : str
         File name.
     rows : int
-        Number of queries, or of images in the image layout.
+        Number of queries, of images in the image layout, or of positions in the slices layout.
     """
 
     split: Split

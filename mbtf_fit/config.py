@@ -13,7 +13,9 @@ from mbtf_core.nested import deep_merge
 from mbtf_core.options import Flag
 from mbtf_core.units import format_duration, format_size, parse_duration, parse_size
 
-ModelName = Literal["neumip-baseline", "neumip", "neumip+", "relief", "hierarchical"]
+ModelName = Literal[
+    "neumip-baseline", "neumip", "neumip+", "relief", "hierarchical", "rainer2019", "rainer2020"
+]
 OutputTransform = Literal["expm1", "exp", "identity", "softplus", "fourth-root"]
 # The best of them where the data set has a geometry.
 DEFAULT_MODEL: ModelName = "relief"
@@ -178,6 +180,12 @@ class TrainingSection(Settings):
         "r min(1, 2r) over the number of queries; r: noise-to-signal ratio of the data; at most 1",
     )
     warmup: int = Field(100, ge=0, description="steps in which the learning rates rise to their peaks")
+    materials: tuple[str, ...] = Field(
+        (), description="rainer2020: folders of slices of other materials that the network learns, too"
+    )
+    own_material: bool = Field(
+        True, description="rainer2020: whether the network also learns the material that it encodes"
+    )
     energy_calibration: bool = Field(
         True, description="after training, scale the mean reflectance at each elevation to that of the data"
     )
@@ -248,7 +256,18 @@ PRESETS: dict[str, dict[str, Any]] = {
         # Whole images are held out; each has a single light, view and footprint.
         "held_out": {"queries": 0.05},
     },
+    # Of 8 and 32 latents; the texture has six channels more.
+    "rainer2019": {
+        "network": {"offset": "none", "channels": 8, "width": 106, "layers": 5},
+        "training": {"learning_rate": 3e-3},
+    },
+    "rainer2020": {
+        "network": {"offset": "none", "channels": 32, "width": 106, "layers": 5},
+        "training": {"learning_rate": 3e-3},
+    },
 }
+# Models that encode angular slices.
+SLICE_MODELS: tuple[ModelName, ...] = ("rainer2019", "rainer2020")
 
 
 class FitConfig(Settings):
@@ -257,7 +276,8 @@ class FitConfig(Settings):
     Parameters
     ----------
     model : str
-        ``relief``, ``neumip+``, ``neumip``, ``neumip-baseline`` or ``hierarchical``.
+        ``relief``, ``neumip+``, ``neumip``, ``neumip-baseline``, ``hierarchical``, ``rainer2019`` or
+        ``rainer2020``.
     init_from : str, optional
         Folder of a material that initializes textures and offset.
     network : NetworkSection
@@ -317,6 +337,20 @@ class FitConfig(Settings):
             raise ValueError(
                 f"{self.model} has no options network.relief: choose the model relief or neumip+"
             )
+        fixed = (
+            network.offset,
+            network.oversampling,
+            network.blending,
+            network.encoding,
+            network.output_channels,
+        )
+        if self.model in SLICE_MODELS and fixed != ("none", 1, "blend", EncodingSection(), 3):
+            raise ValueError(
+                f"{self.model} has no offset, oversampling, blending, encoding or output options"
+            )
+        shared = self.training.materials, self.training.own_material
+        if self.model != "rainer2020" and shared != ((), True):
+            raise ValueError("training.materials and training.own_material are options of rainer2020")
         if self.model != "hierarchical" and network.decoder == "inception":
             raise ValueError(
                 "the inception decoder reads neighboring queries: it needs the model hierarchical"

@@ -17,7 +17,8 @@ from mbtf_gen.material.checks import displacement_fault
 from mbtf_gen.material.latest import latest_material
 from mbtf_gen.material.material import Material
 from mbtf_gen.render.estimates import TARGET_PILOT_SPP, Target
-from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
+from mbtf_gen.sampling.query_sampler import F32, Mixture, QueryPlan
+from mbtf_gen.sampling.slice_directions import UBO2003_COUNT, UBO2003_LOWEST, slice_directions
 
 log = logging.getLogger(__name__)
 
@@ -152,6 +153,7 @@ class Job:
             self.config.seed,
             _shard_rows(self),
             queries.patch_size,
+            slice_of(self),
         )
 
     @cached_property
@@ -195,22 +197,48 @@ def limit_resolution(job: Job) -> Job:
     return replace(job, config=job.config.model_copy(update={"queries": queries}))
 
 
-def row_queries(job: Job) -> int:
-    """Queries in one row of a shard: one, or those of an image."""
+def slice_of(job: Job) -> F32 | None:
+    """Directions (n, 3) of the slices layout, lights and views alike; None in other layouts.
+
+    Raises
+    ------
+    UsageError : the number of training queries does not suit the directions
+    """
     queries = job.config.queries
-    if queries.layout == "shuffled":
-        return 1
-    return job.lattice.texels() if queries.patch_size is None else queries.patch_size**2
+    if queries.layout != "slices":
+        return None
+    each, rest = divmod(count_queries(queries.train, job.lattice.texels()), job.lattice.texels())
+    if queries.slice_directions == "ubo2003":
+        needed = UBO2003_COUNT**2
+        if (each, rest) != (needed, 0):
+            raise UsageError(f"the slices of ubo2003 need {needed}/texel", where="--queries")
+        if queries.min_cos > UBO2003_LOWEST:
+            hint = f"use --min-cos {UBO2003_LOWEST - 5e-3:.2f} or less"
+            raise UsageError("the directions of ubo2003 are lower", where="--min-cos", hint=hint)
+    if each < 1:
+        raise UsageError("slices need at least one query per texel", where="--queries", hint="400/texel")
+    return slice_directions(queries.slice_directions, math.isqrt(each), queries.min_cos)
+
+
+def row_queries(job: Job, split: Split) -> int:
+    """Queries in one row of a shard: one, or those of an image, or those of a training slice."""
+    queries = job.config.queries
+    if queries.layout == "image":
+        return job.lattice.texels() if queries.patch_size is None else queries.patch_size**2
+    directions = slice_of(job)
+    return 1 if directions is None or split == "test" else len(directions) ** 2
 
 
 def _shard_rows(job: Job) -> int:
-    return max(1, job.config.output.shard_queries // row_queries(job))
+    return max(1, job.config.output.shard_queries // row_queries(job, "train"))
 
 
 def _shards(job: Job, split: Split) -> list[ShardEntry]:
     config = job.config
     count = config.queries.train if split == "train" else config.queries.test
-    rows = math.ceil(count_queries(count, job.lattice.texels()) / row_queries(job))
+    rows = math.ceil(count_queries(count, job.lattice.texels()) / row_queries(job, split))
+    if split == "train" and config.queries.layout == "slices":
+        rows = job.lattice.texels()
     size = _shard_rows(job)
     if rows > size * MAX_SHARD_FILES:
         raise UsageError(
@@ -238,13 +266,17 @@ def split_target(config: GeneratorConfig, split: Split) -> Target | None:
 
 
 def split_queries(job: Job, split: Split) -> int:
-    """Queries of a split; the image layout rounds up to whole images."""
-    return row_queries(job) * sum(entry.rows for entry in job.shards if entry.split == split)
+    """Queries of a split; the image layout rounds up to whole images, the slices layout down to n² per
+    texel."""
+    return row_queries(job, split) * sum(entry.rows for entry in job.shards if entry.split == split)
 
 
 def planned_paths(job: Job, entries: Iterable[ShardEntry]) -> int:
     """Paths of some shards; a target error may change them."""
-    return row_queries(job) * sum(entry.rows * split_spp(job.config, entry.split) for entry in entries)
+    rows = (
+        entry.rows * row_queries(job, entry.split) * split_spp(job.config, entry.split) for entry in entries
+    )
+    return sum(rows)
 
 
 def most_paths(job: Job) -> int:

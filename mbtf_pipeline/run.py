@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 from mbtf_core.atomic import read_json
 from mbtf_core.console import Console
+from mbtf_core.digest import file_sha256
 from mbtf_core.errors import InputError
 from mbtf_core.folders import check_folder, owned
 from mbtf_core.units import clock
@@ -75,6 +76,11 @@ def data_sets(recipe: Recipe) -> list[DataSet]:
     return out
 
 
+def slices_folder(recipe: Recipe) -> str:
+    """Sub-folder of the recipe's data set of slices."""
+    return next(data.sub for data in data_sets(recipe) if data.config.queries.layout == "slices")
+
+
 @dataclass(frozen=True)
 class RunResult:
     """Result of a run.
@@ -118,7 +124,8 @@ class _RecipeRun:
         for name, config in recipe.fit.items():
             data = data_of[layout_of(config)]
             files, run = self._files(f"{FITS}/{name}"), partial(self._fit, name, data)
-            out.append(Stage(fit_stage(name), (data.stage,), config.fields(), {}, files, run))
+            digests = {folder: _manifest_digest(Path(folder)) for folder in config.training.materials}
+            out.append(Stage(fit_stage(name), (data.stage,), config.fields(), digests, files, run))
         compared = {"record": COMPARISON_SCHEMA, **recipe.compare.model_dump(mode="json")}
         needs = (GENERATE_STAGE, *map(fit_stage, recipe.fit))
         out.append(Stage(COMPARE_STAGE, needs, compared, {}, self._files(COMPARE), self._compare))
@@ -191,6 +198,14 @@ class _RecipeRun:
         write_report(self.folder, self.recipe, [stage.name for stage in self.stages({})][:-1])
 
 
+def _manifest_digest(shards: Path) -> str:
+    """SHA-256 of a data set's manifest; empty where there is none."""
+    from mbtf_core.shard_schema import MANIFEST_NAME
+
+    path = shards / MANIFEST_NAME
+    return file_sha256(path) if path.is_file() else ""
+
+
 def _unfinished(out: Path, config: FitConfig, shards: Path) -> bool:
     """Whether a folder contains this fit from an interrupted run."""
     from mbtf_core.shard_schema import MANIFEST_NAME
@@ -207,6 +222,27 @@ def _material_inputs(recipe: Recipe) -> dict[str, str]:
     from mbtf_gen.material.latest import latest_material
 
     return dict(latest_material(recipe.generate.material).digests)
+
+
+def generate_data(recipe: Recipe, folder: Path, *, command: str = "", console: Console | None = None) -> None:
+    """Run the stages of a recipe that generate data, for fits that learn from the data of several runs.
+
+    Parameters and exceptions are those of :func:`run_recipe`.
+    """
+    console = console or Console(quiet=True)
+    with owned(folder):
+        check_folder(folder, is_run, "run")
+        write_run_record(folder, recipe, command)
+        stages = _RecipeRun(recipe, folder, console).stages(_material_inputs(recipe))
+        run_stages(folder, stages[: len(data_sets(recipe))], notify=partial(_announce, console))
+
+
+def _announce(console: Console, stage: str, decision: Decision, stamp: Stamp | None) -> None:
+    if stamp is None:
+        state = f"running ({decision.reason})" if decision.runs else "up to date"
+        console.note(f"{stage}: {state}")
+    elif decision.runs:
+        console.note(f"{stage}: finished in {clock(stamp.seconds)}")
 
 
 def run_recipe(
@@ -250,13 +286,7 @@ def run_recipe(
     folder = recipe.folder if folder is None else folder
     console = console or Console(quiet=True)
     inputs = _material_inputs(recipe)
-
-    def notify(stage: str, decision: Decision, stamp: Stamp | None) -> None:
-        if stamp is None:
-            state = f"running ({decision.reason})" if decision.runs else "up to date"
-            console.note(f"{stage}: {state}")
-        elif decision.runs:
-            console.note(f"{stage}: finished in {clock(stamp.seconds)}")
+    notify = partial(_announce, console)
 
     with owned(folder):
         check_folder(folder, is_run, "run")

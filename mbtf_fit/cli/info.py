@@ -38,7 +38,7 @@ def _shards_info(path: Path) -> tuple[dict[str, Any], str]:
     splits = {
         s: {"shards": len(data.shards(s)), "rows": sum(x.rows for x in data.shards(s))} for s in data.splits
     }
-    kind = "queries" if data.layout == "shuffled" else "images"
+    kind = {"shuffled": "queries", "image": "images", "slices": "positions"}[data.layout]
     lines = [
         f"{path}: shards, {data.layout} layout",
         f"levels 0 to {lattice.finest}, finest {columns} x {rows} texels, aspect {lattice.aspect:g}",

@@ -15,6 +15,7 @@ from mbtf_core.shard_schema import Layout, Split
 from mbtf_fit.config import HeldOutSection
 from mbtf_fit.data.images import TrainingImages, nearest_shapes, philox, strides
 from mbtf_fit.data.queries import NEEDED, QUERY_BYTES, ShardQueries, TrainingQueries, mean_value
+from mbtf_fit.data.slices import TrainingSlices
 from mbtf_fit.data.streaming import Selection, StreamedQueries
 from mbtf_gen.dataset.reader import Dataset, Shard
 
@@ -35,15 +36,15 @@ class Partition:
 
     Attributes
     ----------
-    training : training queries in the order of the shards; images in the image layout; streamed from disk
-        where they exceed the memory limit
+    training : training queries in the order of the shards, streamed from disk where they exceed the memory
+        limit; images in the image layout; slices of all texels in the slices layout
     held_out_queries : a random fraction of the queries outside the held-out region
     held_out_directions : queries with light or view in the held-out region; at most `MAX_HELD_OUT`
     sample : a sample of the training queries with both halves; about `SAMPLE` queries from all shards
-    selection : rows of the shards that are trained on: queries, or images in the image layout
+    selection : rows of the shards that are trained on: queries, images or slices
     """
 
-    training: TrainingQueries | TrainingImages | StreamedQueries
+    training: TrainingQueries | TrainingImages | TrainingSlices | StreamedQueries
     held_out_queries: ShardQueries
     held_out_directions: ShardQueries
     sample: ShardQueries
@@ -93,10 +94,15 @@ def label_images(data: Dataset, held_out: HeldOutSection, random: np.random.Gene
         light, view = (np.array(arrays[name][:, 0, 0]) for name in ("omega_i", "omega_o"))
         parts.append(in_region(held_out, light) | in_region(held_out, view))
     labels = np.where(np.concatenate(parts), HELD_OUT_DIRECTION, TRAINING)
-    inside = np.flatnonzero(labels == TRAINING)
-    count = max(1, round(held_out.queries * len(inside))) if held_out.queries and len(inside) > 1 else 0
-    labels[random.permutation(inside)[:count]] = HELD_OUT_QUERY
+    _hold_out(labels, held_out.queries, random)
     return labels
+
+
+def _hold_out(labels: NDArray[np.int8], share: float, random: np.random.Generator) -> None:
+    """Label a share of the training rows as held out, at least one unless the share is 0."""
+    inside = np.flatnonzero(labels == TRAINING)
+    count = max(1, round(share * len(inside))) if share and len(inside) > 1 else 0
+    labels[random.permutation(inside)[:count]] = HELD_OUT_QUERY
 
 
 def sample_images(images: ShardQueries, most: int, random: np.random.Generator) -> ShardQueries:
@@ -114,7 +120,7 @@ def load_training(
 ) -> Partition:
     """Read the train split and divide it; the division depends on the data and `seed` alone.
 
-    The image layout holds out whole images.
+    The image layout holds out whole images, the slices layout pairs of light and view.
 
     Parameters
     ----------
@@ -131,6 +137,8 @@ def load_training(
         raise InputError("its train split has no queries", where=data.folder, hint="generate more: --queries")
     if data.layout == "image":
         return _load_images(data, shards, held_out, seed)
+    if data.layout == "slices":
+        return _load_slices(data, shards, held_out, seed)
     streamed = memory is None or total * QUERY_BYTES > memory
     if memory is not None and streamed and any(shard.path.suffix == ".exr" for shard in shards):
         raise InputError(
@@ -216,6 +224,56 @@ def _load_images(data: Dataset, shards: list[Shard], held_out: HeldOutSection, s
         sample_images(ShardQueries.join(group), MAX_HELD_OUT_OF_IMAGES, random) for group in kept_out
     )
     return Partition(training, queries, directions, ShardQueries.join(sample), selection)
+
+
+def _load_slices(data: Dataset, shards: list[Shard], held_out: HeldOutSection, seed: int) -> Partition:
+    """Read the train split of the slices layout and divide it by pairs of light and view."""
+    random = philox(seed, SPLIT_STREAM)
+    first = shards[0].read(("sigma", "omega_i", "omega_o"))
+    light, view = (np.array(first[name][0]) for name in ("omega_i", "omega_o"))
+    region = in_region(held_out, light) | in_region(held_out, view)
+    labels = np.where(region, HELD_OUT_DIRECTION, TRAINING)
+    _hold_out(labels, held_out.queries, random)
+    kept = np.flatnonzero(labels == TRAINING)
+    if len(kept) == 0:
+        raise _all_held_out(data, f"{len(labels)} pairs of light and view")
+    rows, columns = data.lattice.shape()
+    value = np.full((rows * columns, len(kept), 3), np.nan, np.float32)
+    kept_out: tuple[list[ShardQueries], list[ShardQueries]] = ([], [])
+    sample: list[ShardQueries] = []
+    selection = Selection()
+    for shard in shards:
+        slices = read_checked(shard)
+        if (slices.omega_i != light).any() or (slices.omega_o != view).any():
+            raise InputError("its slices do not share their directions", where=shard.path)
+        for group, label in zip(kept_out, (HELD_OUT_QUERY, HELD_OUT_DIRECTION), strict=True):
+            group.append(
+                _pairs(slices, labels == label, MAX_HELD_OUT * len(slices) // value.shape[0] + 1, random)
+            )
+        sample.append(_pairs(slices, labels == TRAINING, SAMPLE * len(slices) // value.shape[0] + 1, random))
+        selection.add(shard.path, np.ones(len(slices), bool))
+        place = slices.u[:, 0].astype(np.float64) * (columns, rows)
+        texel = (rows - 1 - np.floor(place[:, 1]).astype(np.int64)) * columns + np.floor(place[:, 0]).astype(
+            np.int64
+        )
+        value[texel] = mean_value(slices.value_a, slices.value_b)[:, kept]
+    if np.isnan(value).any():
+        raise InputError("lacks slices of some texels", where=data.folder, hint="generate the data set again")
+    mean, omega_i, omega_o = (
+        torch.from_numpy(np.ascontiguousarray(a)) for a in (value, light[kept], view[kept])
+    )
+    training = TrainingSlices(mean, omega_i, omega_o, float(first["sigma"][0, 0]))
+    queries, directions = (ShardQueries.join(group) for group in kept_out)
+    return Partition(training, queries, directions, ShardQueries.join(sample), selection)
+
+
+def _pairs(
+    slices: ShardQueries, chosen: NDArray[np.bool_], most: int, random: np.random.Generator
+) -> ShardQueries:
+    """At most `most` of the queries of slices (items, D) at the chosen directions (D,), in random order."""
+    items, pairs = np.arange(len(slices)), np.flatnonzero(chosen)
+    flat = (items[:, None] * slices.sigma.shape[1] + pairs).ravel()
+    return slices.flat().take(random.permutation(flat)[:most])
 
 
 def load_split(data: Dataset, split: Split, limit: int | None = None) -> ShardQueries:

@@ -6,6 +6,7 @@ regularizes them towards the next coarser level where queries are few.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -103,7 +104,7 @@ def _from_coarser(levels: list[F32], lattice: Lattice, level: int, texel: NDArra
     return out
 
 
-def _first(selection: Selection, count: int) -> Iterator[Arrays]:
+def _first(selection: Selection, count: float) -> Iterator[Arrays]:
     """Blocks of the first selected rows, until they are as many as `count`; rows are in random order."""
     for path, chosen in selection.masks():
         for block in _blocks(path, chosen):
@@ -120,7 +121,9 @@ def fit_transmittance(data: Dataset, selection: Selection) -> Transmittance | No
     lattice = data.lattice
     levels = [np.zeros((*lattice.shape(s), COEFFICIENTS), np.float32) for s in range(lattice.finest + 1)]
     sums = [_Sums(lattice, s) for s in range(lattice.finest + 1)]
-    for block in _first(selection, _PER_TEXEL * lattice.texels(lattice.finest)):
+    # Rows of slices are texels, of which none may be left out.
+    most = math.inf if data.layout == "slices" else _PER_TEXEL * lattice.texels(lattice.finest)
+    for block in _first(selection, most):
         level = np.clip(level_of_sigma(block["sigma"].astype(np.float64)), 0.0, lattice.finest)
         terms = basis(block["omega_o"])
         right = terms * block["transmittance"].astype(np.float64)[:, None]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mbtf_core.config_file import build
 from mbtf_core.errors import InputError
 from mbtf_core.lattice import Lattice
-from mbtf_fit.config import TRACING_MODELS, FitConfig, NetworkSection
+from mbtf_fit.config import SLICE_MODELS, TRACING_MODELS, FitConfig, NetworkSection
 from mbtf_fit.material.format import (
     DEFAULT_MIN_COS,
     DESCRIPTION_NAME,
@@ -121,6 +121,12 @@ def read_material(folder: str | Path) -> StoredMaterial:
     named = {key: description["config"][key] for key in ("model", "network") if key in description["config"]}
     config = build(FitConfig, named, source=str(folder / DESCRIPTION_NAME))
     network, lattice = config.network, lattice_of(description)
+    if config.model in SLICE_MODELS:
+        raise InputError(
+            f"the renderer's plugin does not support '{config.model}'",
+            where=folder / DESCRIPTION_NAME,
+            hint="generate shuffled shards of the material, and fit the model neumip to them",
+        )
     if network.decoder != "mlp":
         raise InputError(
             f"the renderer's plugin does not support the inception decoder of '{config.model}'",

@@ -55,7 +55,8 @@ class NeuralMaterial(nn.Module, ABC):
         self.network = network
         finer = network.oversampling.bit_length() - 1
         grids = Lattice(lattice.finest + finer, lattice.aspect)
-        self.pyramid = FeatureTextures(grids, range(finer, grids.finest + 1), network.channels)
+        channels = self.texture_channels(network)
+        self.pyramid = FeatureTextures(grids, range(finer, grids.finest + 1), channels)
         features = network.channels * (2 if network.blending == "concatenate" else 1)
         features += position_size(network.encoding)
         directions = directions_size(network.encoding) + self.hint_size(network)
@@ -74,6 +75,11 @@ class NeuralMaterial(nn.Module, ABC):
             )
             outputs = 1 if network.offset == "depth" else 2
             self.offset_network = Mlp([network.channels + 2, *hidden, outputs], network.activation)
+
+    @classmethod
+    def texture_channels(cls, network: NetworkSection) -> int:
+        """Channels of the pyramid."""
+        return network.channels
 
     @classmethod
     def hint_size(cls, network: NetworkSection) -> int:
@@ -181,6 +187,10 @@ class NeuralMaterial(nn.Module, ABC):
     def parameter_groups(self) -> tuple[list[nn.Parameter], list[nn.Parameter]]:
         """(texels, network weights)."""
         return [texture.texels for texture in self.textures()], [*self._layers().values()]
+
+    def trained(self) -> tuple[list[nn.Parameter], list[nn.Parameter]]:
+        """(texels, network weights) that training changes."""
+        return self.parameter_groups()
 
     def _layers(self) -> dict[str, nn.Parameter]:
         """Network weights by their names in a material."""

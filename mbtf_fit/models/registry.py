@@ -10,10 +10,11 @@ from mbtf_fit.models.hierarchical import Hierarchical
 from mbtf_fit.models.interface import NeuralMaterial
 from mbtf_fit.models.learned_relief import LearnedRelief
 from mbtf_fit.models.neumip import Neumip, NeumipBaseline
+from mbtf_fit.models.rainer import Rainer2019, Rainer2020
 from mbtf_fit.models.relief import Relief
 
 MODELS: dict[str, type[NeuralMaterial]] = {
-    m.name: m for m in (NeumipBaseline, Neumip, LearnedRelief, Relief, Hierarchical)
+    m.name: m for m in (NeumipBaseline, Neumip, LearnedRelief, Relief, Hierarchical, Rainer2019, Rainer2020)
 }
 
 

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from mbtf_fit.data.images import Patches
 from mbtf_fit.data.queries import TrainingQueries
+from mbtf_fit.data.slices import SliceBatch
 
 # Python code runs in one thread at a time: more threads are not faster.
 MAX_THREADS = 4
@@ -25,7 +26,7 @@ MAX_KERNEL_THREADS = 32
 
 T = TypeVar("T")
 
-Batch = TrainingQueries | Patches
+Batch = TrainingQueries | Patches | SliceBatch
 Loss = Callable[[Any], Tensor]
 
 

@@ -22,12 +22,14 @@ from mbtf_core.stats import pooled_variance
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import Partition, load_training, open_data
 from mbtf_fit.data.queries import ShardQueries, mean_value
+from mbtf_fit.data.slices import SharedSlices, TrainingSlices
 from mbtf_fit.evaluation import evaluate_splits
 from mbtf_fit.material.format import DESCRIPTION_NAME
 from mbtf_fit.material.material import Material, export
 from mbtf_fit.material.transmittance_fit import evaluate_transmittance, fit_transmittance
 from mbtf_fit.models.interface import NeuralMaterial
 from mbtf_fit.models.learned_relief import LearnedRelief
+from mbtf_fit.models.rainer import Rainer2019
 from mbtf_fit.models.registry import MODELS, build_model
 from mbtf_fit.models.relief import Relief
 from mbtf_fit.objective.noise import NoiseModel, typical_value
@@ -35,7 +37,7 @@ from mbtf_fit.surface.known import KnownSurface
 from mbtf_fit.training.checkpoint import CHECKPOINT_NAME, read_checkpoint, write_checkpoint
 from mbtf_fit.training.convergence import MarginalCost, marginal_cost_of
 from mbtf_fit.training.fit_folder import claim, identity_of
-from mbtf_fit.training.trainer import Trainer
+from mbtf_fit.training.trainer import Trainer, TrainingData
 from mbtf_fit.training.validation import (
     HISTORY_NAME,
     describe_record,
@@ -261,7 +263,35 @@ def prepare_trainer(config: FitConfig, data: Dataset, partition: Partition, devi
     if config.init_from is not None:
         _initialize_from(model, config.init_from)
     noise = NoiseModel.of(partition.sample, data.lattice, unit)
-    return Trainer(config, model.to(device), partition.training.to(device), noise, partition.selection)
+    training: TrainingData = partition.training.to(device)
+    if isinstance(model, Rainer2019):
+        assert isinstance(training, TrainingSlices)
+        generator = torch.Generator().manual_seed(config.seed + 1)
+        model.prepare(len(training.omega_i), generator)
+        training = shared_slices(config, training, unit, device)
+    return Trainer(config, model.to(device), training, noise, partition.selection)
+
+
+def shared_slices(
+    config: FitConfig, own: TrainingSlices, unit: float, device: torch.device
+) -> TrainingSlices | SharedSlices:
+    """The slices that a network learns: those of one material, or of several, all in units of the first."""
+    if not (config.training.materials or config.training.own_material):
+        raise InputError(
+            "there is nothing to learn from without the material itself",
+            where="training.own_material",
+            hint="add folders of slices of other materials: training.materials",
+        )
+    if not config.training.materials:
+        return own
+    learned = [own] if config.training.own_material else []
+    for folder in config.training.materials:
+        data = open_data(folder, "slices", config.model)
+        partition = load_training(data, config.held_out, config.seed)
+        assert isinstance(partition.training, TrainingSlices)
+        typical = typical_value(mean_value(partition.sample.value_a, partition.sample.value_b))
+        learned.append(partition.training.to(device).scaled(unit / typical if typical > 0 else 1.0))
+    return SharedSlices(own, learned)
 
 
 def _known_surface(config: FitConfig, data: Dataset) -> KnownSurface:

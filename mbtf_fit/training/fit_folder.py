@@ -36,6 +36,8 @@ def identity_of(config: FitConfig, data: Dataset) -> dict[str, Any]:
     if config.init_from is not None:
         description, _ = read_description(Path(config.init_from))
         config_hash += f"-{description['weights']['sha256']}"
+    for folder in config.training.materials:
+        config_hash += f"-{Dataset.open(folder).manifest['config_hash']}"
     queries = (data.manifest.get("config") or {}).get("queries") or {}
     directions = {"min_cos": queries["min_cos"]} if "min_cos" in queries else {}
     return {

@@ -20,6 +20,7 @@ from mbtf_core.errors import InputError
 from mbtf_fit.config import FitConfig, TrainingSection
 from mbtf_fit.data.images import Patches, TrainingImages
 from mbtf_fit.data.queries import HINT_BYTES, QUERY_BYTES, ShardQueries, TrainingQueries
+from mbtf_fit.data.slices import SharedSlices, SliceBatch, TrainingSlices
 from mbtf_fit.data.streaming import Selection, StreamedQueries
 from mbtf_fit.material.inference import predict
 from mbtf_fit.models.blur import annealed_sigma
@@ -27,6 +28,7 @@ from mbtf_fit.models.hierarchical import Hierarchical
 from mbtf_fit.models.interface import NeuralMaterial
 from mbtf_fit.models.learned_relief import LearnedRelief
 from mbtf_fit.models.neumip import Neumip
+from mbtf_fit.models.rainer import Rainer2019
 from mbtf_fit.models.relief import Relief
 from mbtf_fit.native import kernel
 from mbtf_fit.native.model import supports
@@ -37,6 +39,7 @@ from mbtf_fit.objective.parallel import MAX_KERNEL_THREADS, MAX_THREADS, Batch, 
 from mbtf_fit.objective.regularization import WeightDecay
 from mbtf_fit.training.calibration import fit_calibration
 
+TrainingData = TrainingQueries | TrainingImages | TrainingSlices | SharedSlices | StreamedQueries
 # Decay rates of Adam's moments.
 BETAS = (0.8, 0.95)
 # Widest blur, in tile widths. A blur of half a tile made training unstable on textures of 16 × 16 texels: the
@@ -56,9 +59,7 @@ def _hints(model: Relief, queries: TrainingQueries) -> Tensor:
     return model.hints(queries.u, queries.sigma, queries.omega_i, queries.omega_o)
 
 
-def _with_hints(
-    model: NeuralMaterial, queries: TrainingQueries | TrainingImages | StreamedQueries, memory: float
-) -> TrainingQueries | TrainingImages | StreamedQueries:
+def _with_hints(model: NeuralMaterial, queries: TrainingData, memory: float) -> TrainingData:
     """The queries with the hints of a surface that stays as it is, where they fit in so many bytes. Otherwise
     each batch gets its own."""
     fits = len(queries) * (QUERY_BYTES + HINT_BYTES) <= memory
@@ -93,7 +94,7 @@ class Trainer:
         self,
         config: FitConfig,
         model: NeuralMaterial,
-        queries: TrainingQueries | TrainingImages | StreamedQueries,
+        queries: TrainingData,
         noise: NoiseModel,
         selection: Selection | None = None,
     ) -> None:
@@ -106,7 +107,7 @@ class Trainer:
         self.device = next(model.parameters()).device
         self.progress = Progress()
         self.batch = min(config.training.batch, len(queries))
-        texels, weights = model.parameter_groups()
+        texels, weights = model.trained()
         self.optimizer = torch.optim.Adam([{"params": texels}, {"params": weights}], betas=BETAS, fused=True)
         self.loss = Objective(config.training, noise)
         self.weight_decay = WeightDecay.of(config.training, noise.ratio, len(queries))
@@ -201,6 +202,9 @@ class Trainer:
         return [t.blurred(sigma) for t, sigma in zip(self.model.textures(), self._sigmas(), strict=True)]
 
     def _loss(self, batch: Batch) -> Tensor:
+        if isinstance(batch, SliceBatch):
+            assert isinstance(self.model, Rainer2019)
+            return self.loss(self.model.reconstruct(batch), batch.queries())
         evaluate = self.model.evaluate_patches if isinstance(self.model, Hierarchical) else self.model
         arrays = [batch.u, batch.sigma, batch.omega_i, batch.omega_o]
         if isinstance(batch, TrainingQueries) and batch.hints is not None:
@@ -217,6 +221,13 @@ class Trainer:
         self._follow_heights()
         if isinstance(self.model, Relief) and isinstance(batch, TrainingQueries) and batch.hints is None:
             batch = replace(batch, hints=_hints(self.model, batch))
+        if isinstance(batch, SliceBatch):
+            weights = self.model.trained()[1]
+            loss, gradients = workers.gradients(self._loss, batch, weights)
+            for p, g in zip(weights, gradients, strict=True):
+                p.grad = g
+            self.optimizer.step()
+            return loss
         if self._stepper is not None and not isinstance(batch, Patches):
             return self._stepper.step(self.loss, batch, self._sigmas(), workers)
         texels, weights = self.model.parameter_groups()
@@ -240,7 +251,12 @@ class Trainer:
         return predict(self.model, queries.u, queries.sigma, queries.omega_i, queries.omega_o)
 
     def _read_blurred(self) -> None:
-        """Let lookups read the textures with the current blur."""
+        """Let lookups read the textures with the current blur, or those that the encoder writes."""
+        if isinstance(self.model, Rainer2019):
+            assert isinstance(self.queries, TrainingSlices | SharedSlices)
+            own = self.queries.own if isinstance(self.queries, SharedSlices) else self.queries
+            self.model.write_textures(own)
+            return
         with torch.no_grad():
             for texture, table in zip(self.model.textures(), self._tables(), strict=True):
                 texture.read(table)
@@ -251,7 +267,7 @@ class Trainer:
         model = self.model
         if not (self.config.training.energy_calibration and isinstance(model, Neumip)):
             return
-        assert not isinstance(self.queries, TrainingImages)
+        assert isinstance(self.queries, TrainingQueries | StreamedQueries)
         self._read_blurred()
         model.calibration = None
         found = fit_calibration(
@@ -262,6 +278,8 @@ class Trainer:
     def coverage(self) -> dict[int, float]:
         """Level → fraction of the pyramid's texels that have received gradients."""
         pyramid = self.model.pyramid
+        if isinstance(self.model, Rainer2019):
+            return dict.fromkeys(range(self.model.lattice.finest + 1), 1.0)
         moment = self.optimizer.state.get(pyramid.texels, {}).get("exp_avg_sq")
         return {
             s: 0.0 if moment is None else float((moment[a:b] > 0).any(1).float().mean())

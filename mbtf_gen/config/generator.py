@@ -16,7 +16,7 @@ from mbtf_core.digest import data_sha256
 from mbtf_core.errors import UsageError
 from mbtf_core.lattice import MAX_LEVEL
 from mbtf_core.options import Flag
-from mbtf_core.shard_schema import SCHEMA_VERSION, ArrayFormat, Layout, Tiling
+from mbtf_core.shard_schema import SCHEMA_VERSION, ArrayFormat, Layout, SliceDirections, Tiling
 from mbtf_gen.config.effects_request import EffectsRequest
 from mbtf_gen.geometry.slopes import NormalMode
 from mbtf_gen.sampling.light_kernel import MAX_WIDTH_DEG, MIN_WIDTH_DEG
@@ -158,7 +158,14 @@ class QueriesSection(Settings):
         0.1, gt=0, lt=1, description="smallest cosine of light and view directions to the normal"
     )
     layout: Annotated[Layout, Flag("--layout")] = Field(
-        "shuffled", description="shuffled queries, or images that share one light, view and footprint each"
+        "shuffled",
+        description="shuffled queries; images that share one light, view and footprint each; or slices: "
+        "every texel of the finest level at the same lights and views",
+    )
+    slice_directions: SliceDirections = Field(
+        "spiral",
+        description="slices layout: a spiral of n lights and n views for n² queries per texel, or the 81 of "
+        "the BTF database Bonn 2003 (6561/texel)",
     )
     patch_size: Annotated[int | None, Flag("--patch-size")] = Field(
         None,

@@ -14,7 +14,7 @@ from pydantic import BaseModel, field_validator
 from mbtf_core.config_file import check_document, dump_yaml
 from mbtf_core.digest import data_sha256
 from mbtf_core.lattice import sigma_of_level
-from mbtf_core.shard_schema import ARRAYS, CONVENTIONS, FORMAT_NAME, SCHEMA_VERSION, SPLITS
+from mbtf_core.shard_schema import ARRAYS, CONVENTIONS, FORMAT_NAME, LEADING_AXES, SCHEMA_VERSION, SPLITS
 from mbtf_gen.config.effects_request import EFFECTS
 from mbtf_gen.fibers.tile import FiberTile
 from mbtf_gen.job import Job, split_queries, split_spp
@@ -87,7 +87,6 @@ def build_manifest(job: Job, plan: RunPlan, geometry: Mapping[str, Any] | None) 
     config, material, lattice = job.config, job.material, job.lattice
     plain = config.model_dump(mode="json")
     queries = job.query_plan
-    lead = ["n"] if queries.layout == "shuffled" else ["items", "rows", "columns"]
     return {
         "format": FORMAT_NAME,
         "schema": SCHEMA_VERSION,
@@ -110,9 +109,14 @@ def build_manifest(job: Job, plan: RunPlan, geometry: Mapping[str, Any] | None) 
         },
         "layout": queries.layout,
         "patch_size": queries.patch_size,
+        "slice_size": None if queries.directions is None else len(queries.directions) ** 2,
         "array_format": config.output.format,
         "arrays": {
-            a.name: {"shape": [*lead, *a.trailing], "unit": a.unit, "meaning": a.meaning}
+            a.name: {
+                "shape": [*LEADING_AXES[queries.layout], *a.trailing],
+                "unit": a.unit,
+                "meaning": a.meaning,
+            }
             for a in ARRAYS
             if not a.optional or plan.effects.on("opacity")
         },

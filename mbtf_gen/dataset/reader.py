@@ -15,7 +15,15 @@ from mbtf_core.config_file import check_document, check_schema
 from mbtf_core.digest import file_sha256
 from mbtf_core.errors import InputError
 from mbtf_core.lattice import MAX_LEVEL, Lattice
-from mbtf_core.shard_schema import FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, Layout, ShardEntry, Split
+from mbtf_core.shard_schema import (
+    ARRAY,
+    FORMAT_NAME,
+    MANIFEST_NAME,
+    SCHEMA_VERSION,
+    Layout,
+    ShardEntry,
+    Split,
+)
 from mbtf_core.suggest import suggest_path
 from mbtf_gen.dataset.geometry import Geometry, read_geometry
 from mbtf_gen.dataset.shard_io import Arrays, check_values, column_means, read_shard
@@ -60,6 +68,7 @@ class _Manifest(BaseModel):
     splits: dict[str, _Split]
     geometry: _Geometry | None
     patch_size: _Count | None = None
+    slice_size: _Count | None = None
 
 
 class _Statistics(BaseModel, allow_inf_nan=False):
@@ -83,7 +92,8 @@ class Shard:
     sidecar : dict
         The content of its sidecar.
     image : tuple of int
-        Rows and columns of an image in the image layout; empty in the shuffled layout.
+        Rows and columns of an image in the image layout, the number of directions in the slices layout;
+        empty in the shuffled layout.
     """
 
     path: Path
@@ -92,7 +102,7 @@ class Shard:
 
     @property
     def rows(self) -> int:
-        """Queries in the shuffled layout, images in the image layout."""
+        """Queries in the shuffled layout, images in the image layout, positions in the slices layout."""
         return int(self.sidecar["rows"])
 
     def read(self, names: Iterable[str] | None = None) -> Arrays:
@@ -117,8 +127,8 @@ class Shard:
         """
         arrays = read_shard(self.path, names)
         hint = f"check the data set with: mbtf-gen verify {self.path.parent}"
-        for array in arrays.values():
-            rows, image = len(array), array.shape[1:3] if array.ndim > 2 else ()
+        for name, array in arrays.items():
+            rows, image = len(array), array.shape[1 : array.ndim - len(ARRAY[name].trailing)]
             if rows != self.rows:
                 what = f"has {rows} rows, its sidecar says {self.rows}"
                 raise InputError(what, where=self.path, hint=hint)
@@ -202,7 +212,7 @@ class Dataset:
 
     @property
     def layout(self) -> Layout:
-        """``shuffled`` or ``image``."""
+        """``shuffled``, ``image`` or ``slices``."""
         layout: Layout = self.manifest["layout"]
         return layout
 
@@ -251,6 +261,8 @@ class Dataset:
         image: tuple[int, ...] = ()
         if self.layout == "image":
             image = self.lattice.shape() if self.patch_size is None else (self.patch_size,) * 2
+        elif self.layout == "slices":
+            image = (int(self.manifest["slice_size"] or 1) if split == "train" else 1,)
         out = []
         for entry in self.entries(split):
             path = self.folder / entry.file

@@ -1,7 +1,8 @@
 """One shard on disk: npz (uncompressed, memory-mappable) or EXR (named float32 channels).
 
 A shard is a mapping of array name to array; all arrays share their leading axes: ``(n,)`` queries in the
-``shuffled`` layout, ``(items, rows, columns)`` in the ``image`` layout. See the data-format page.
+``shuffled`` layout, ``(items, rows, columns)`` in the ``image`` layout,
+``(items, directions)`` in the ``slices`` layout. See the data-format page.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ def row_bytes(holes: bool) -> int:
 
 def data_bytes(job: Job, entries: Iterable[ShardEntry]) -> int:
     """Bytes of some shards of a job."""
-    queries = row_queries(job) * sum(entry.rows for entry in entries)
+    queries = sum(entry.rows * row_queries(job, entry.split) for entry in entries)
     return queries * row_bytes(job.material.opacity is not None)
 
 
@@ -70,7 +71,7 @@ def check_arrays(
         trailing = ARRAY[name].trailing
         lead = array.shape[: array.ndim - len(trailing)]
         leads.add(lead)
-        if array.shape[len(lead) :] != trailing or len(lead) not in (1, 3) or len(leads) > 1:
+        if array.shape[len(lead) :] != trailing or len(lead) not in (1, 2, 3) or len(leads) > 1:
             raise InputError(f"array '{name}' has the shape {array.shape}", where=where)
     return leads.pop()
 
@@ -114,7 +115,8 @@ def check_values(arrays: Mapping[str, NDArray[np.float32]], where: object) -> No
                 bad = np.argwhere(~valid(array))
                 what = f"'{name}' holds {fault}: {len(bad)}, the first in row {bad[0][0]}"
                 raise InputError(what, where=where)
-            if name in _SHARED and array.ndim > 2 and (array != array[:, :1, :1]).any():
+            lead = array.ndim - len(ARRAY[name].trailing)
+            if name in _SHARED and lead == 3 and (array != array[:, :1, :1]).any():
                 raise InputError(f"'{name}' differs between texels of an image", where=where)
 
 
@@ -222,9 +224,10 @@ def _npy_header(stream: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any]]
 
 
 def _fold(array: NDArray[np.float32], lead: tuple[int, ...]) -> NDArray[np.float32]:
-    """Fold leading axes to (rows, columns) of one image: queries row by row, images stacked vertically."""
+    """Fold leading axes to (rows, columns) of one image: queries row by row, images stacked vertically, a
+    slice in each row."""
     trailing = array.shape[len(lead) :]
-    width = _FOLD_WIDTH if len(lead) == 1 else lead[2]
+    width = _FOLD_WIDTH if len(lead) == 1 else lead[-1]
     if len(lead) == 1:
         array = np.pad(array, [(0, -lead[0] % width), *[(0, 0)] * len(trailing)])
     return array.reshape(-1, width, *trailing)
@@ -233,7 +236,8 @@ def _fold(array: NDArray[np.float32], lead: tuple[int, ...]) -> NDArray[np.float
 def write_exr(path: Path, arrays: Mapping[str, NDArray[np.float32]]) -> Stored:
     """Write a shard as one EXR image with a named float32 channel per component, atomically.
 
-    The header's string ``mbtf.lead`` holds the leading axes ("n" or "items,rows,columns").
+    The header's string ``mbtf.lead`` holds the leading axes: "n", "items,rows,columns" or
+    "items,directions".
     """
     from mbtf_gen.images.exr import write_channels
 

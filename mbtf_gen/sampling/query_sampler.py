@@ -8,7 +8,7 @@ uniform on the projected disk, ``r ≤ √(1 - cos²_min)``. All arithmetic is e
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from mbtf_core.shard_schema import Layout
 from mbtf_core.stats import level_groups
 from mbtf_gen.sampling.exact_math import exp2, sincos_turns
 from mbtf_gen.sampling.rng import Purpose, numpy_generator
+from mbtf_gen.sampling.slice_directions import direction_pairs
 
 F32 = NDArray[np.float32]
 
@@ -113,11 +114,13 @@ class QueryPlan:
     lattice : texel grids of the tile
     mixture : distribution of the levels
     min_cos : smallest cosine of both directions to the normal, in (0, 1)
-    layout : "shuffled" or "image"
+    layout : "shuffled", "image" or "slices"
     root : root seed
-    shard_rows : queries (shuffled layout) or images (image layout) per full shard
+    shard_rows : queries (shuffled layout), images (image layout) or positions (slices layout) per full shard
     patch_size : texels along each side of an image, of the level nearest to its footprint; None: an image
         covers the finest level
+    directions : (n, 3) float32 array
+        Lights and views of the slices layout.
     """
 
     lattice: Lattice
@@ -127,13 +130,21 @@ class QueryPlan:
     root: int
     shard_rows: int
     patch_size: int | None = None
+    directions: F32 | None = None
 
     def draw(self, split: str, shard: int, rows: int) -> Queries:
-        """Sample `rows` queries (shuffled layout) or images (image layout) of a shard.
+        """Sample `rows` queries (shuffled layout), images (image layout) or positions (slices layout) of a
+        shard.
 
         The split is ``train``, ``test``, or a stream of :mod:`mbtf_gen.sampling.rng`. Leading axes are
-        ``(rows,)``, or ``(rows, height, width)`` of images.
+        ``(rows,)``, or ``(rows, height, width)`` of images. Slices are ``(rows, n²)``, one at the center of
+        each texel of the finest level; those of other splits hold one query, as of the shuffled layout.
         """
+        if self.layout == "slices":
+            if split == "train":
+                return self._slices(self._texels(split, shard * self.shard_rows, rows))
+            flat = replace(self, layout="shuffled").draw(split, shard, rows)
+            return Queries(flat.u[:, None], flat.sigma[:, None], flat.omega_i[:, None], flat.omega_o[:, None])
         generator = numpy_generator(self.root, split, shard, Purpose.QUERIES)
         sigma = self._sigma(generator, rows)
         omega_i = self._directions(generator, rows)
@@ -163,6 +174,22 @@ class QueryPlan:
             for sweep in range(first, -(-(start + count) // texels))
         ]
         return np.concatenate(orders)[start - first * texels :][:count]
+
+    def _slices(self, texel: NDArray[np.int64]) -> Queries:
+        """All pairs of light and view at the centers of texels (n,), with the finest footprint."""
+        assert self.directions is not None
+        light, view = direction_pairs(self.directions)
+        shape = (len(texel), len(light))
+        rows, columns = self.lattice.shape()
+        j, i = np.divmod(texel, columns)
+        center = _rounded((i + 0.5) / columns, 1.0 - (j + 0.5) / rows)
+        sigma = np.full(shape, np.float32(self.lattice.sigma_range[0]), np.float32)
+        return Queries(
+            np.broadcast_to(center[:, None], (*shape, 2)).copy(),
+            sigma,
+            np.broadcast_to(light, (*shape, 3)).copy(),
+            np.broadcast_to(view, (*shape, 3)).copy(),
+        )
 
     def _patch(self, generator: np.random.Generator, sigma: F32, size: int) -> F32:
         """Texel positions (n, size, size, 2): patches of the level nearest to footprints (n,), at random

@@ -19,7 +19,6 @@ from mbtf_pipeline.compare.pictures import with_ending
 from mbtf_pipeline.formatting import decibel, estimate_text, is_significant, signed
 from mbtf_pipeline.report.embed import jpeg_uri, map_uri
 
-NOT_IMPLEMENTED = "not implemented"
 _QUALITY = 86
 
 

@@ -12,7 +12,6 @@ from mbtf_pipeline.formatting import estimate, signed
 from mbtf_pipeline.paper_tables.cells import (
     MATERIAL,
     METHOD,
-    NOT_IMPLEMENTED,
     Cell,
     Column,
     Shown,
@@ -25,7 +24,7 @@ from mbtf_pipeline.paper_tables.cells import (
     ratio_of,
     rows_of,
 )
-from mbtf_pipeline.paper_tables.published import NOT_HERE, mse_ratio
+from mbtf_pipeline.paper_tables.published import mse_ratio
 from mbtf_pipeline.paper_tables.runs import FinishedRun, each_fit
 
 # Records of images.
@@ -85,8 +84,6 @@ _ERRORS = [
 
 def _errors(runs: Sequence[FinishedRun]) -> Table:
     rows = rows_of(_ERRORS, each_fit(runs))
-    empty = [None] * (len(_ERRORS) - 3)
-    rows += [["all", title, NOT_IMPLEMENTED, *empty] for title, _, _ in NOT_HERE.values()]
     text = (
         "Unexplained variance and MSE are measured on the same test queries of each material, which are "
         "not used for training. The other metrics are means over the same path-traced images. MSE, "
@@ -125,10 +122,6 @@ def _ratios(runs: Sequence[FinishedRun]) -> Table:
         for base, fit in combinations(run.fits, 2):
             published = mse_ratio(run.material, fit, base) or (None, None)
             rows.append([run.title, fit, base, ratio_of(run.mse(fit), run.mse(base)), *published])
-        for method, (title, _, _) in NOT_HERE.items():
-            known = mse_ratio(run.material, method, "neumip")
-            if known is not None:
-                rows.append([run.title, title, "neumip", NOT_IMPLEMENTED, *known])
     text = (
         "A ratio below 1 means that the method is better than the one it is divided by. Published numbers "
         "belong to other data: another material with the same name, other light, other training. The "

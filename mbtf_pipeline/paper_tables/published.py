@@ -27,11 +27,8 @@ _ZOOM_MSE = (3.98, 2.10, 1.47, 1.07, 0.74, 1.16, 1.17, 1.08)
 WEIGHTS: dict[str, tuple[str, str]] = {
     "neumip": ("3332; 3254 with the three outputs described in the text", NEUMIP),
     "hierarchical": ("about 6500 to 7100, decoder", HIERARCHICAL),
-}
-# Methods not implemented here: title, decoder weights and latent channels according to Kuznetsov et al. 2021.
-NOT_HERE: dict[str, tuple[str, int, int]] = {
-    "rainer2019": ("Rainer et al. 2019", 35725, 14),
-    "rainer2020": ("Rainer et al. 2020", 38269, 38),
+    "rainer2019": ("35725, decoder; 14 channels", NEUMIP),
+    "rainer2020": ("38269, decoder; 38 channels", NEUMIP),
 }
 
 

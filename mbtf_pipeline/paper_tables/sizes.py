@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from mbtf_pipeline.paper_tables.cells import NOT_IMPLEMENTED, Cell, Column, Table, rows_of
-from mbtf_pipeline.paper_tables.published import NEUMIP, NOT_HERE, WEIGHTS
+from mbtf_pipeline.paper_tables.cells import Cell, Column, Table, rows_of
+from mbtf_pipeline.paper_tables.published import WEIGHTS
 from mbtf_pipeline.paper_tables.runs import FinishedRun
 
 _WEIGHTS = (
@@ -25,9 +25,6 @@ def weights(runs: Sequence[FinishedRun]) -> list[Table]:
     """Parameter counts of every model, beside published ones."""
     run = runs[0]
     rows = rows_of(_WEIGHTS, ((fit, run.fit(fit)) for fit in run.fits))
-    for title, decoder, channels in NOT_HERE.values():
-        published = f"{decoder:,}, decoder; {channels} latent channels"
-        rows.append([title, NOT_IMPLEMENTED, None, None, None, None, published, NEUMIP])
     across = 2 ** run.comparison["finest"]
     text = f"Counts include biases. Textures have {across} texels across at the finest level."
     return [Table("weights", "Parameter counts", text, _WEIGHTS, rows)]
@@ -79,5 +76,4 @@ def timing(runs: Sequence[FinishedRun]) -> list[Table]:
         Column("timed queries", "queries", lambda fit, record: record["queries"]),
     ]
     rows = rows_of(columns, items)
-    rows += [[title, NOT_IMPLEMENTED, *([None] * (len(columns) - 2))] for title, _, _ in NOT_HERE.values()]
     return [Table("timing", "Time of one evaluation of 1080p", _TIMING_TEXT, columns, rows)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from mbtf_pipeline.paper_tables.sizes import timing, weights
 from mbtf_pipeline.paper_tables.zooms import zooms
 from mbtf_pipeline.report.plots import ERROR_BAR_NOTE
 from mbtf_pipeline.report.report import render
-from mbtf_pipeline.run import run_recipe
+from mbtf_pipeline.run import generate_data, run_recipe, slices_folder
 from mbtf_pipeline.run_folder import has_record, machine
 
 PAPER_NAME = "paper.json"
@@ -132,6 +132,11 @@ def run_paper(
         write_json(folder / PAPER_NAME, record)
         for name, where in missing.items():
             console.note(f"{name}: skipped, {where} does not exist")
+        planned = [_with_other_materials(one, planned, folder) for one in planned]
+        for one in planned:
+            if any(config.training.materials for config in one.recipe.fit.values()):
+                console.note(f"{one.name}: data")
+                generate_data(one.recipe, folder / RUNS / one.name, command=command, console=console)
         for number, one in enumerate(planned, 1):
             console.note(f"{one.name}: run {number} of {len(planned)}")
             run_recipe(one.recipe, folder / RUNS / one.name, force=force, command=command, console=console)
@@ -139,6 +144,18 @@ def run_paper(
             write_json(folder / PAPER_NAME, record)
         page, tables = _write_page(folder, record)
     return PaperResult(folder, page, tables, record)
+
+
+def _with_other_materials(one: Planned, planned: Sequence[Planned], folder: Path) -> Planned:
+    """A recipe whose fits of ``rainer2020`` also learn from the slices of all other materials."""
+    others = [p for p in planned if p.material != one.material and p.variant == one.variant]
+    fits = dict(one.recipe.fit)
+    for name, config in fits.items():
+        if config.model == "rainer2020" and not config.training.materials:
+            data = (folder / RUNS / p.name / slices_folder(p.recipe) for p in others)
+            training = config.training.model_copy(update={"materials": tuple(map(str, data))})
+            fits[name] = config.model_copy(update={"training": training})
+    return replace(one, recipe=one.recipe.model_copy(update={"fit": fits}))
 
 
 def write_again(folder: Path) -> Path:

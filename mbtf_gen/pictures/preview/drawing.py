@@ -192,7 +192,7 @@ class PreviewPictures:
             sample, source = sampled_queries(self.job), f"sampled for {self.config.material}"
         shown = f"{len(sample.u)} of {sample.total} training queries {source}"
         if len(sample.level) < len(sample.u):
-            shown += f", in {len(sample.level)} images of one footprint, light and view each"
+            shown += f", in {len(sample.level)} images or slices, of which the first query is shown"
         write_plots(file, sample, shown)
         edges, found, expected = level_histogram(sample)
         return {

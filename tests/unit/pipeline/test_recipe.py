@@ -103,7 +103,7 @@ def test_names_and_models_default_to_each_other(tmp_path: Path, fit: str, models
         (HEAD + "fit:\n  modle: neumip\n", 6, "did you mean 'model'"),
         (NAMED.replace("time: 5s", "tmie: 5s"), 10, "did you mean 'time'"),
         (NAMED.replace("model: neumip-baseline", "model: neural"), 8, "neumip-baseline"),
-        (HEAD + "fit:\n  other:\n", 6, "'relief' or 'hierarchical'"),
+        (HEAD + "fit:\n  other:\n", 6, "'rainer2019' or 'rainer2020'"),
         (HEAD + "fit: {}\n", 5, "contains no fit"),
         (SINGLE.replace("small", "a/b"), 1, "'name'"),
         (SINGLE + "compare:\n  views:\n  - {elevation: 3}\n", 8, "at least"),

@@ -49,7 +49,7 @@ def test_nonsense_counts_are_usage_errors(text: str) -> None:
         ("queries.test_spp", 0, "at least 2 and at most 1048576"),
         ("queries.min_cos", 0, "above 0 and below 1"),
         ("queries.resolution", 100, "must be a power of two from 1 to 16384"),
-        ("queries.layout", "rows", "'shuffled' or 'image'"),
+        ("queries.layout", "rows", "'shuffled', 'image' or 'slices'"),
         ("light.width", 46, "45"),
         ("light.width", 1e-3, "delta light"),
         ("light.width", float("nan"), "must be a finite number"),
@@ -120,7 +120,7 @@ CHANGES = (
     *("output.format=exr", "output.shard_queries=99", "queries.train=3", "queries.test=3"),
     *("queries.spp=8", "queries.test_spp=8", "queries.allocation=uniform", "queries.target_error=5%"),
     *("queries.max_spp=64", "queries.resolution=2", "queries.mixture.finest=0.3", "queries.min_cos=0.2"),
-    *("queries.layout=image", "queries.patch_size=8"),
+    *("queries.layout=image", "queries.patch_size=8", "queries.slice_directions=ubo2003"),
 )
 
 

@@ -136,7 +136,10 @@ CLAIMS = {
     "no array": (archive({"sigma": b"not an array"}), "cannot be read"),
     "giant elements": (archive({"sigma": npy(header("|V999999999", "(4,)"))}), "not C-ordered float32"),
     "one number": (archive({"sigma": npy(header("<f4", "()"), b"\0" * 4)}), "has the shape ()"),
-    "two axes": (archive({"sigma": npy(header("<f4", "(2, 2)"), b"\0" * 16)}), "has the shape (2, 2)"),
+    "four axes": (
+        archive({"sigma": npy(header("<f4", "(2, 1, 1, 2)"), b"\0" * 16)}),
+        "has the shape (2, 1, 1, 2)",
+    ),
     "another array": (archive({"weights": npy(header("<f4", "(1,)"), b"\0" * 4)}), "unknown array"),
     "a bomb": (
         archive({"sigma": npy(header("<f4", "(2500000,)"), bytes(10_000_000))}, zipfile.ZIP_DEFLATED),

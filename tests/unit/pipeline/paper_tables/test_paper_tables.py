@@ -79,22 +79,19 @@ def csv_of(table: Table) -> list[dict[str, str]]:
 
 def test_methods_mark_insignificant_and_missing_numbers(tmp_path: Path) -> None:
     table, ratios = methods([make(tmp_path)])
-    first, second, *absent = rows_of(table)
+    first, second = rows_of(table)
     assert first["MSE [10⁻³/sr²]"] == "0.4000 ± 0.0010"
     assert second["MSE − MSE of the first method [10⁻³/sr²]"] == "not significant (−0.2 ± 0.3)"
     assert second["HDR-FLIP"] == "0.300, within noise"
     assert second["LDR-FLIP"] == "0.200"
     assert second["ST-LPIPS"] == "–"
-    assert [row["unexplained variance [%]"] for row in absent] == ["not implemented"] * 2
-    assert [row["method"] for row in absent] == ["Rainer et al. 2019", "Rainer et al. 2020"]
     # PSNR of the mean MSE over the images, with white as peak.
     assert float(csv_of(table)[0]["psnr"]) == pytest.approx(10 * math.log10(0.04 / 4e-4), rel=1e-4)
     assert csv_of(table)[1]["mse_minus_first_se"] == "0.0003"
-    measured, *unbuilt = rows_of(ratios)
+    (measured,) = rows_of(ratios)
     assert measured["MSE ratio, measured here"] == "0.500 ± 0.003"
     assert float(csv_of(ratios)[0]["published"]) == pytest.approx(1.31 / 3.35, rel=1e-4)
     assert measured["source"] == "Kuznetsov et al. 2021"
-    assert [row["MSE ratio, measured here"] for row in unbuilt] == ["not implemented"] * 2
 
 
 def test_published_numbers_match_the_papers() -> None:
@@ -140,15 +137,12 @@ def test_sizes_and_times(tmp_path: Path) -> None:
     times = {"device": "cpu", "queries": 7, "evaluate_ms": 9.0, "stage1_ms": 5.0, "stage2_ms": 2.0}
     times |= {"lights_ms": {"1": 7.0, "16": 37.0}, "parts_ms": {"pyramid": 4.0}}
     run = make(tmp_path, timing={"neumip": [times]})
-    row, *unbuilt = rows_of(timing([run])[0])
+    (row,) = rows_of(timing([run])[0])
     assert row["offset texture"] == "–"
     assert (row["pyramid"], row["1 light"], row["16 lights"]) == ("4.0", "7.0", "37.0")
-    assert [r["device"] for r in unbuilt] == ["not implemented"] * 2
     counted = rows_of(weights([run])[0])
     assert counted[1]["all networks"] == "3,254"
     assert counted[1]["published"].startswith("3332; 3254")
-    assert counted[2]["decoder"] == "not implemented"
-    assert "35,725" in counted[2]["published"]
 
 
 def test_zooms_have_one_row_per_span_and_fit(tmp_path: Path) -> None:

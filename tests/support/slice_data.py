@@ -1,0 +1,84 @@
+"""Small data sets of the slices layout, of known functions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mbtf_core.atomic import checksummed
+from mbtf_core.lattice import Lattice
+from mbtf_core.shard_schema import FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION
+from mbtf_gen.dataset.shard_io import write_shard
+from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
+from mbtf_gen.sampling.slice_directions import slice_directions
+
+from .datasets import write_sidecar
+from .fit_data import F32, Function
+
+
+def spots(u: F32, sigma: F32, omega_i: F32, omega_o: F32) -> Any:
+    """A base and a highlight that vary over the tile, averaged over the footprint: smooth in everything."""
+    half = omega_i + omega_o
+    half = half / np.linalg.norm(half, axis=-1, keepdims=True)
+    fade = np.exp(-0.5 * (2 * np.pi * sigma) ** 2)
+    base = 0.1 * (1.0 + 0.5 * fade * np.sin(2 * np.pi * u[:, 1]))
+    highlight = 0.2 * (1.0 + 0.5 * fade * np.cos(2 * np.pi * u[:, 0])) * half[:, 2] ** 10
+    return (base + highlight)[:, None] * np.array([1.0, 0.8, 0.5])
+
+
+def write_slices(
+    folder: Path,
+    function: Function = spots,
+    *,
+    finest: int = 3,
+    aspect: float = 1.0,
+    lights: int = 10,
+    test: int = 2000,
+    noise: float = 0.0,
+    seed: int = 0,
+    rows: int = 40,
+    change: Callable[[dict[str, F32]], None] | None = None,
+) -> Path:
+    """Write a data set of `lights` lights and views per texel with independent noise in both halves; returns
+    its folder. `change` alters the arrays of the first shard."""
+    folder.mkdir(parents=True)
+    lattice = Lattice(finest, aspect)
+    directions = slice_directions("spiral", lights, 0.2)
+    plan = QueryPlan(lattice, Mixture(0.6, 0.4), 0.2, "slices", seed, rows, None, directions)
+    random = np.random.default_rng(seed)
+    config_hash = f"{function.__name__}-{seed}-{noise}-{lights}"
+    splits: dict[str, Any] = {}
+    for split, total in (("train", lattice.texels()), ("test", test)):
+        entries = []
+        for index, start in enumerate(range(0, total, rows)):
+            queries = plan.draw(split, index, min(rows, total - start))
+            flat, lead = queries.flat(), queries.lead
+            value = function(flat.u, flat.sigma, flat.omega_i, flat.omega_o)
+            arrays: dict[str, F32] = dict(vars(queries))
+            for half in "ab":
+                noisy = value + noise * random.standard_normal(value.shape)
+                arrays[f"value_{half}"] = noisy.reshape(*lead, 3).astype(np.float32)
+            arrays["spp"] = np.full(lead, 2, np.float32)
+            if change is not None and (split, index) == ("train", 0):
+                change(arrays)
+            name = f"{split}-{index:05d}.npz"
+            write_shard(folder / name, arrays)
+            write_sidecar(folder / name, split, index, config_hash)
+            entries.append({"file": name, "rows": lead[0]})
+        splits[split] = {"queries": total, "shards": entries}
+    manifest = {
+        "format": FORMAT_NAME,
+        "schema": SCHEMA_VERSION,
+        "config_hash": config_hash,
+        "layout": "slices",
+        "slice_size": lights**2,
+        "levels": {"finest": finest},
+        "tile": {"aspect": aspect},
+        "geometry": None,
+        "splits": splits,
+    }
+    (folder / MANIFEST_NAME).write_bytes(checksummed(manifest))
+    return folder

@@ -1,0 +1,91 @@
+"""Reading of the slices layout: texels in order, directions held out, damaged data."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from support.slice_data import write_slices
+
+from mbtf_core.errors import InputError
+from mbtf_fit.config import HeldOutSection
+from mbtf_fit.data.loader import load_training
+from mbtf_fit.data.slices import DECODED, SharedSlices, TrainingSlices
+from mbtf_gen.dataset.reader import Dataset
+
+
+def place(u, sigma, omega_i, omega_o):  # type: ignore[no-untyped-def]
+    """Position and directions as a color."""
+    return np.stack([u[:, 0], u[:, 1], omega_i[:, 0] + 2 * omega_o[:, 1]], axis=-1)
+
+
+@pytest.mark.parametrize("aspect", [1.0, 0.5])
+def test_slices_are_in_the_order_of_the_texels(tmp_path: Path, aspect: float) -> None:
+    data = Dataset.open(write_slices(tmp_path / "data", place, aspect=aspect))
+    found = load_training(data, HeldOutSection(queries=0.05), 0)
+    slices = found.training
+    assert isinstance(slices, TrainingSlices)
+    rows, columns = data.lattice.shape()
+    j, i = np.divmod(np.arange(rows * columns), columns)
+    values = slices.values.numpy()
+    np.testing.assert_allclose(values[:, 0, 0], (i + 0.5) / columns, atol=1e-6)
+    np.testing.assert_allclose(values[:, 0, 1], 1 - (j + 0.5) / rows, atol=1e-6)
+    expected = slices.omega_i[:, 0] + 2 * slices.omega_o[:, 1]
+    np.testing.assert_allclose(values[3, :, 2], expected.numpy(), atol=1e-6)
+
+
+def test_held_out_pairs_are_not_trained_on(tmp_path: Path) -> None:
+    data = Dataset.open(write_slices(tmp_path / "data"))
+    found = load_training(data, HeldOutSection(queries=0.1, radius=0.2), 0)
+    slices = found.training
+    assert isinstance(slices, TrainingSlices)
+    pairs = {tuple(p) for p in torch.cat([slices.omega_i, slices.omega_o], 1).tolist()}
+    for held in (found.held_out_queries, found.held_out_directions):
+        assert len(held) > 100
+        assert not pairs & {tuple(p) for p in np.concatenate([held.omega_i, held.omega_o], 1).tolist()}
+    sampled = np.concatenate([found.sample.omega_i, found.sample.omega_o], 1).tolist()
+    assert {tuple(p) for p in sampled} <= pairs
+    assert len(pairs) < 100
+
+
+def test_a_batch_decodes_pairs_of_whole_slices(tmp_path: Path) -> None:
+    found = load_training(Dataset.open(write_slices(tmp_path / "data")), HeldOutSection(), 0)
+    slices = found.training
+    assert isinstance(slices, TrainingSlices)
+    batch, again = next(slices.batches(640, 1, 5)), next(slices.batches(640, 1, 5))
+    assert len(batch) == 640 // DECODED
+    assert torch.equal(batch.chosen, again.chosen)
+    assert torch.equal(batch.values, again.values)
+    queries = batch.queries()
+    k = batch.chosen.shape[1]
+    assert torch.equal(queries.value[k + 2], batch.values[1, batch.chosen[1, 2]])
+    assert torch.equal(queries.omega_o[k + 2], batch.omega_o[batch.chosen[1, 2]])
+    numbers = [r.start for r in slices.batch_ranges(640, 1, 5)]
+    assert {tuple(v) for v in slices.values[numbers][:, 0].tolist()} == {
+        tuple(v) for v in batch.values[:, 0].tolist()
+    }
+    shared = SharedSlices(slices, [slices.scaled(2.0), slices])
+    assert len(shared) == 2 * len(slices)
+    assert torch.equal(next(shared.batches(640, 1, 4)).values, 2 * next(slices.batches(640, 1, 4)).values)
+
+
+def test_slices_with_other_directions_are_refused(tmp_path: Path) -> None:
+    def turn(arrays) -> None:  # type: ignore[no-untyped-def]
+        arrays["omega_i"] = arrays["omega_i"].copy()
+        arrays["omega_i"][1] = arrays["omega_i"][1][::-1]
+
+    data = Dataset.open(write_slices(tmp_path / "data", change=turn))
+    with pytest.raises(InputError, match="do not share their directions"):
+        load_training(data, HeldOutSection(), 0)
+
+
+def test_a_texel_without_a_slice_is_named(tmp_path: Path) -> None:
+    def repeat(arrays) -> None:  # type: ignore[no-untyped-def]
+        arrays["u"] = arrays["u"].copy()
+        arrays["u"][1] = arrays["u"][0]
+
+    data = Dataset.open(write_slices(tmp_path / "data", change=repeat))
+    with pytest.raises(InputError, match="lacks slices of some texels"):
+        load_training(data, HeldOutSection(), 0)

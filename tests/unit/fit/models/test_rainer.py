@@ -1,0 +1,179 @@
+"""The models of Rainer et al.: sizes, normalization, levels, what the shared network learns."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from support.slice_data import spots, write_slices
+
+from mbtf_core.errors import InputError, UsageError
+from mbtf_core.lattice import Lattice
+from mbtf_fit import fit
+from mbtf_fit.config import FitConfig
+from mbtf_fit.data.loader import load_training
+from mbtf_fit.data.slices import SharedSlices, TrainingSlices
+from mbtf_fit.material.material import Material
+from mbtf_fit.mitsuba_plugin.material_arrays import StoredMaterial
+from mbtf_fit.models.rainer import Rainer2019, Rainer2020
+from mbtf_fit.models.registry import build_model
+from mbtf_fit.training.checkpoint import read_checkpoint, write_checkpoint
+from mbtf_fit.training.fit import prepare_trainer, shared_slices
+from mbtf_gen.dataset.reader import Dataset
+from mbtf_gen.sampling.slice_directions import direction_pairs, slice_directions
+
+NAMES = ("rainer2019", "rainer2020")
+
+
+def config(name: str, **training: Any) -> FitConfig:
+    options = {"steps": 300, "batch": 2048, "warmup": 20, **training}
+    return FitConfig.model_validate({"model": name, "training": options})
+
+
+def prepared(name: str, finest: int = 2, lights: int = 6) -> tuple[Rainer2019, TrainingSlices]:
+    """An initialized model, and random slices."""
+    model = build_model(name, Lattice(finest))
+    assert isinstance(model, Rainer2019)
+    generator = torch.Generator().manual_seed(0)
+    model.initialize(generator, 0.1)
+    model.prepare(lights**2, generator)
+    light, view = map(torch.from_numpy, direction_pairs(slice_directions("spiral", lights, 0.2)))
+    values = 0.2 * torch.rand(4**finest, lights**2, 3, generator=generator)
+    return model, TrainingSlices(values, light, view, 0.5 * 2.0**-finest)
+
+
+@pytest.mark.parametrize(
+    ("name", "weights", "channels"), [("rainer2019", 35725, 14), ("rainer2020", 38269, 38)]
+)
+def test_sizes_are_the_published_ones(name: str, weights: int, channels: int) -> None:
+    """Kuznetsov et al. 2021 count them."""
+    model, _ = prepared(name)
+    assert sum(p.numel() for p in model.parameter_groups()[1]) == weights
+    assert model.pyramid.texels.shape[1] == channels
+    assert sum(p.numel() for p in model.trained()[1]) > weights
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_normalization_is_undone(name: str) -> None:
+    """A decoder that returned the normalized logarithms would reproduce the slices."""
+    model, slices = prepared(name)
+    normalized, statistics = model.normalized(slices.values, slices.omega_i)
+    assert normalized.mean(1).abs().max() < 1e-5
+    features = torch.cat([torch.zeros(16, model.network.channels), statistics], 1)
+    for pair in (0, 7, 35):
+        x = normalized[:, pair]
+        model.decoder.forward = lambda _, x=x: x  # type: ignore[method-assign, misc]
+        light, view = (omega[pair].expand(16, 3) for omega in (slices.omega_i, slices.omega_o))
+        value = model.stage2(features, light, view)
+        torch.testing.assert_close(value, slices.values[:, pair], rtol=1e-4, atol=1e-6)
+
+
+def test_constant_and_black_slices_need_no_decoder() -> None:
+    model, slices = prepared("rainer2019")
+    for value in (0.0, 0.3):
+        same = TrainingSlices(
+            value / slices.omega_i[None, :, 2:].expand_as(slices.values), slices.omega_i, slices.omega_o, 0.1
+        )
+        model.write_textures(same)
+        u, sigma = torch.rand(50, 2), torch.full((50,), 0.125)
+        light = slices.omega_i[:36].repeat(2, 1)[:50]
+        found = model(u, sigma, light, light)
+        torch.testing.assert_close(found * light[:, 2:], torch.full((50, 3), value), atol=0.01, rtol=0.02)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_coarser_levels_are_averages(name: str) -> None:
+    model, slices = prepared(name)
+    model.write_textures(slices)
+    levels = model.pyramid.export()
+    torch.testing.assert_close(levels["0"][0, 0], levels["2"].mean((0, 1)), rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(levels["1"][1, 0], levels["2"][2:, :2].mean((0, 1)), rtol=1e-4, atol=1e-6)
+    encoded = model.encode(slices.values[9:10], slices.omega_i, slices.omega_o)
+    torch.testing.assert_close(levels["2"][2, 1], encoded[0].detach(), rtol=1e-4, atol=1e-6)
+
+
+def test_the_encoder_of_2020_takes_any_set_of_samples() -> None:
+    model, slices = prepared("rainer2020")
+    assert isinstance(model, Rainer2020)
+    order = torch.randperm(36)
+    whole = model.encode(slices.values, slices.omega_i, slices.omega_o)
+    mixed = model.encode(slices.values[:, order], slices.omega_i[order], slices.omega_o[order])
+    torch.testing.assert_close(mixed, whole, rtol=1e-3, atol=1e-5)
+    half = model.encode(slices.values[:, ::2], slices.omega_i[::2], slices.omega_o[::2])
+    assert half.shape == whole.shape
+    # Directions matter, not only the values.
+    swapped = model.encode(slices.values, slices.omega_o, slices.omega_o)
+    assert (swapped - whole).abs().max() > 0.01
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_smooth_material_is_learned_and_loads_again(name: str, tmp_path: Path) -> None:
+    shards = write_slices(tmp_path / "data", noise=0.002, finest=4, lights=16)
+    result = fit(config(name), shards, tmp_path / "fit")
+    # Queries between the texels and the directions of the slices, at every level.
+    assert result.errors["test"]["unexplained"]["value"] < 0.15
+    assert "held_out_queries" in result.errors
+    material = Material.load(tmp_path / "fit")
+    assert material.deviation() == 0.0
+    assert not any("encoder" in key for key in material.description["weights"]["shapes"])
+    with pytest.raises(InputError, match="plugin does not support 'rainer"):
+        StoredMaterial.load(tmp_path / "fit")
+
+
+def test_a_fit_resumes_where_it_stopped(tmp_path: Path) -> None:
+    data = Dataset.open(write_slices(tmp_path / "data"))
+    options = config("rainer2019", steps=8)
+    partition = load_training(data, options.held_out, 0)
+    whole, first, second = (prepare_trainer(options, data, partition, torch.device("cpu")) for _ in range(3))
+    assert whole.train(1e3)
+    while first.progress.step < 5:
+        first.train(0.0)
+    write_checkpoint(first, tmp_path / "state")
+    read_checkpoint(second, tmp_path / "state")
+    assert second.train(1e3)
+    for a, b in zip(whole.model.trained()[1], second.model.trained()[1], strict=True):
+        assert torch.equal(a, b)
+
+
+def dark(u: Any, sigma: Any, omega_i: Any, omega_o: Any) -> Any:
+    """Another material, a tenth as bright."""
+    return 0.1 * spots(1.0 - u, sigma, omega_i, omega_o)
+
+
+def test_a_network_of_other_materials_encodes_a_new_one(tmp_path: Path) -> None:
+    own, other = (
+        write_slices(tmp_path / name, function, finest=4, lights=lights)
+        for name, function, lights in (("own", dark, 16), ("other", spots, 14))
+    )
+    shared = {"materials": [str(other)], "own_material": False}
+    result = fit(config("rainer2020", **shared), own, tmp_path / "fit")
+    assert result.errors["test"]["unexplained"]["value"] < 0.3
+
+
+def test_the_network_learns_others_in_units_of_its_own_material(tmp_path: Path) -> None:
+    own, other = write_slices(tmp_path / "own", dark), write_slices(tmp_path / "other", lights=12)
+    found = load_training(Dataset.open(own), config("rainer2020").held_out, 0).training
+    assert isinstance(found, TrainingSlices)
+    for own_material, count in ((False, 1), (True, 2)):
+        options = config("rainer2020", materials=[str(other)], own_material=own_material)
+        shared = shared_slices(options, found, 0.02, torch.device("cpu"))
+        assert isinstance(shared, SharedSlices)
+        assert shared.own is found
+        assert len(shared.learned) == count
+        assert (shared.learned[0] is found) == own_material
+        # Ten times as bright as `dark`, before it is scaled to the typical value 0.02.
+        level = shared.learned[-1].values.mean() / found.values.mean()
+        assert 0.5 < level < 2.0
+
+
+def test_options_of_other_models_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"training\.materials and training\.own_material are options"):
+        config("rainer2019", materials=["x"])
+    with pytest.raises(ValueError, match="has no offset, oversampling"):
+        FitConfig.model_validate({"model": "rainer2020", "network": {"offset": "depth"}})
+    with pytest.raises(InputError, match="nothing to learn from"):
+        fit(config("rainer2020", own_material=False), write_slices(tmp_path / "data"), tmp_path / "fit")
+    with pytest.raises((InputError, UsageError), match="no such folder"):
+        fit(config("rainer2020", materials=["missing"]), tmp_path / "data", tmp_path / "other")
