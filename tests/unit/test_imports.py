@@ -11,7 +11,7 @@ from conftest import RunPython
 from support.paths import ROOT
 
 PACKAGES = ("mbtf_core", "mbtf_gen", "mbtf_fit", "mbtf_pipeline")
-HEAVY = {"torch", "mitsuba", "drjit", "matplotlib", "scipy", "trimesh", "pyvista", "OpenEXR"}
+HEAVY = {"torch", "mitsuba", "drjit", "matplotlib", "scipy", "trimesh", "pyvista", "OpenEXR", "h5py"}
 # From the lowest to the highest: a module imports from its own line and from those above it.
 ORDER = """
 mbtf_core
@@ -21,6 +21,7 @@ mbtf_gen.sampling
 mbtf_gen.config
 mbtf_gen.fibers
 mbtf_gen.meshes
+mbtf_gen.measured
 mbtf_gen.material
 mbtf_gen.render
 mbtf_gen.job

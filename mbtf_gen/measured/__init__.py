@@ -1,0 +1,1 @@
+"""Files of measured BTFs, and data sets of other programs."""

@@ -1,0 +1,153 @@
+"""Bonn's DFMF files: values of a known function, and files that are refused."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support import measured_files as files
+from support.fuzzing import damaged, examples, loads_or_refuses
+
+from mbtf_core.errors import InputError
+from mbtf_gen.measured.ubo2014 import Ubo2014, read_ubo2014
+
+PAIRS, TEXELS = 9, files.ROWS * files.COLUMNS
+
+
+def opened(folder: Path, content: bytes) -> Ubo2014:
+    path = folder / "a.btf"
+    path.write_bytes(content)
+    return read_ubo2014(path)
+
+
+def all_values(btf: Ubo2014) -> tuple[np.ndarray, np.ndarray]:
+    """Values of all pairs and texels, and what they should be, in a shuffled order."""
+    order = np.random.default_rng(3).permutation(PAIRS * TEXELS)
+    pair, texel = order // TEXELS, order % TEXELS
+    light, view = btf.light[pair].astype(np.float64), btf.view[pair].astype(np.float64)
+    row, column = np.divmod(texel, btf.columns)
+    return btf.values(pair, texel), files.value(row, column, light, view)
+
+
+@pytest.mark.parametrize("model", [0, 1, 3, 4, 9, 11, 12])
+@pytest.mark.parametrize("transposed", [False, True])
+def test_the_known_function(model: int, transposed: bool, tmp_path: Path) -> None:
+    btf = opened(tmp_path, files.btf(model, 4, transposed))
+    assert (btf.rows, btf.columns, btf.left_out, btf.cosine) == (files.ROWS, files.COLUMNS, 3, True)
+    values, expected = all_values(btf)
+    np.testing.assert_allclose(values, expected, rtol=2e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize(("width", "tolerance"), [(2, 5e-3), (8, 1e-5)])
+def test_widths_of_numbers(width: int, tolerance: float, tmp_path: Path) -> None:
+    values, expected = all_values(opened(tmp_path, files.btf(0, width)))
+    np.testing.assert_allclose(values, expected, rtol=tolerance, atol=tolerance)
+
+
+def test_directions_are_lights_within_views(tmp_path: Path) -> None:
+    btf = opened(tmp_path, files.btf())
+    np.testing.assert_allclose(btf.light, np.tile(files.unit(files.LIGHTS), (3, 1)), atol=1e-6)
+    np.testing.assert_allclose(btf.view, np.repeat(files.unit(files.VIEWS[:3]), 3, axis=0), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("version", "cosine", "said"), [(1, 0, None), (2, 0, False), (3, 1, True), (4, 0, False)]
+)
+def test_versions_of_the_header(version: int, cosine: int, said: bool | None, tmp_path: Path) -> None:
+    btf = opened(tmp_path, files.btf(version=version, cosine=cosine))
+    assert btf.cosine is said
+    values, expected = all_values(btf)
+    np.testing.assert_allclose(values, expected, rtol=1e-4)
+
+
+def test_another_reader_reads_the_same_factors(tmp_path: Path) -> None:
+    module = pytest.importorskip("pysmtb.btf")
+    path = tmp_path / "a.btf"
+    # It reads three of the nine numbers of a rotation; the published files have none.
+    path.write_bytes(files.btf(0, 4, rotations=0))
+    meta, data = module.read_ubo_btf_dfmf(str(path))
+    # Of view 1, light 2: its rows are `view · lights + light`, its columns row-major.
+    pictures = np.stack([data.SxV[c] @ data.U[c][1 * 3 + 2] for c in range(3)], axis=-1)
+    btf = read_ubo2014(path)
+    ours = btf.values(np.full(TEXELS, 5), np.arange(TEXELS))
+    np.testing.assert_allclose(ours, pictures, rtol=1e-5)
+    np.testing.assert_allclose(np.array(meta.views_3d)[:3], btf.view[::3], atol=1e-6)
+    assert (meta.width, meta.height, bool(meta.cosine_in_data)) == (btf.columns, btf.rows, btf.cosine)
+
+
+def patched(content: bytes, at: int, new: bytes) -> bytes:
+    return content[:at] + new + content[at + len(new) :]
+
+
+def broken() -> dict[str, bytes]:
+    """Part of the message → file."""
+    good = files.btf()
+    views = good.index(struct.pack("<I", 4) + np.deg2rad(files.VIEWS[0]).astype("<f4").tobytes())
+    size = good.index(struct.pack("<II", files.COLUMNS, files.ROWS))
+    model = size + 8 + 40 + 4
+    factors = model + 4 + 48
+    huge = struct.pack("<I", 1_000_000_000)
+    return {
+        "is not a Bonn BTF": b"PNG" + good,
+        "of the kind '!FMF12FCER'": b"!FMF12FCER" + good[10:],
+        "the version 9": patched(good, 14, struct.pack("<I", 9)),
+        "header of": patched(good, 10, struct.pack("<I", 99)),
+        "claims 1,000,000,000 views": patched(good, views, huge),
+        "claims 1,000,000,000 lights": patched(good, views + 12, huge),
+        "lights of view 1": patched(good, views + 16 + 24 + 8, struct.pack("<I", 2)),
+        "NaN or infinite numbers in its directions": patched(good, views + 4, struct.pack("<f", np.nan)),
+        "polar angles": patched(good, views + 4, struct.pack("<f", -1.0)),
+        "claims 1000000000 x 5 texels": patched(good, size, huge),
+        "claims images of 0 x 5": patched(good, size, bytes(4)),
+        "ends within the rotations": patched(good, size + 8, huge),
+        "the color model 2": patched(good, model, struct.pack("<i", 2)),
+        "numbers of 3 bytes": patched(good, factors, b"\3"),
+        "claims 1,000,000,000 components": patched(good, factors + 1, huge),
+        "ends within the factors of channel 0": patched(good, factors + 1, struct.pack("<I", 60_000)),
+        "not those of 12 pairs and 20 texels": patched(good, factors + 5, struct.pack("<I", 13)),
+        "ends within the factors of channel 2": good[:-1],
+        "3 bytes after": good + b"abc",
+    }
+
+
+@pytest.mark.parametrize("message", sorted(broken()))
+def test_refused(message: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"a\.btf") as caught:
+        opened(tmp_path, broken()[message])
+    assert message in caught.value.what
+
+
+def test_nan_factors_are_refused_where_they_are_used(tmp_path: Path) -> None:
+    btf = opened(tmp_path, patched(files.btf(), len(files.btf()) - 4, struct.pack("<f", np.nan)))
+    btf.values(np.array([0]), np.array([0]))
+    with pytest.raises(InputError, match="NaN or infinite"):
+        btf.values(np.array([0, 1]), np.array([TEXELS - 1, 0]))
+
+
+def test_indices_out_of_range(tmp_path: Path) -> None:
+    btf = opened(tmp_path, files.btf())
+    for pair, texel in ((9, 0), (0, TEXELS), (-1, 0)):
+        with pytest.raises(IndexError):
+            btf.values(np.array([pair]), np.array([texel]))
+    assert btf.values(np.zeros(0, int), np.zeros(0, int)).shape == (0, 3)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("btf")
+
+
+@given(data=st.data())
+@examples(300)
+def test_a_damaged_file(data: st.DataObject, folder: Path) -> None:
+    samples = {"v1": files.btf(version=1), "yuv": files.btf(11, 2)}
+    _, content = data.draw(damaged(samples))
+    btf = loads_or_refuses(lambda: opened(folder, content))
+    if btf is not None and len(btf.light):
+        texels = np.arange(min(btf.rows * btf.columns, 50))
+        values = loads_or_refuses(lambda: btf.values(np.zeros_like(texels), texels))
+        assert values is None or np.isfinite(values).all()
