@@ -1,0 +1,222 @@
+"""Photographs whose names are the directions, in a folder or a zip archive: UBO2003 and its relatives.
+
+The BTF Database Bonn of 2003 (Sattler, Sarlette and Klein 2003, "Efficient and realistic visualization of
+cloth") has 81 lights and 81 views, 256 x 256 texels, as archives of JPEG images. Each name has four angles in
+degrees: ``00001 tl000 pl000 tv000 pv000.jpg`` has the light's polar angle and azimuth, then the viewer's. The
+separators, the order and the folders vary (UTIA: ``tv000_pv000/tl000_pl000_tv000_pv000.png``); the four
+letters do not. The readers btf-extractor and btf-rendering, and UTIA's description, agree on this.
+
+Nothing says these three: the codes are taken as sRGB; azimuths run from the images' right side to their top;
+and whether the values include the cosine of the light is left open (plain photographs do).
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import warnings as python_warnings
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbtf_core.color import srgb_to_linear
+from mbtf_core.errors import InputError, reason
+from mbtf_core.suggest import refuse_special
+from mbtf_gen.measured.interface import F32, HORIZON, check_indices, check_texels, from_angles
+
+SUFFIXES = (".jpg", ".jpeg", ".png")
+_ANGLES = tuple(
+    re.compile(rf"(?<![a-z]){letters}(\d{{1,3}}(?:\.\d+)?)") for letters in ("tl", "pl", "tv", "pv")
+)
+_MOST_FILES = 200_000
+# Largest file of an image, and the largest ratio to its compressed size in an archive.
+_MOST_BYTES = 1 << 28
+_MOST_RATIO = 100
+
+
+class Ubo2003:
+    """An opened set of photographs; see :class:`~mbtf_gen.measured.interface.MeasuredBtf`.
+
+    Images are decoded anew by each call of :meth:`values`.
+    """
+
+    cosine = None
+
+    def __init__(
+        self, path: Path, names: list[str], angles: NDArray[np.float64], content: Callable[[str], bytes]
+    ) -> None:
+        self.path = path
+        self._content = content
+        radians = np.deg2rad(angles)
+        light, view = from_angles(radians[:, 0], radians[:, 1]), from_angles(radians[:, 2], radians[:, 3])
+        above = (light[:, 2] > HORIZON) & (view[:, 2] > HORIZON)
+        self.light, self.view, self.left_out = light[above], view[above], int((~above).sum())
+        self._names = [name for name, kept in zip(names, above, strict=True) if kept]
+        if not self._names:
+            raise InputError("has no image with light and view above the horizon", where=path)
+        self.rows, self.columns = self._decoded(0).shape[:2]
+
+    def values(self, pair: NDArray[np.integer[Any]], texel: NDArray[np.integer[Any]]) -> F32:
+        """Linear values (n, 3) in [0, 1]."""
+        texels = self.rows * self.columns
+        pair, texel = check_indices(pair, texel, len(self._names), texels)
+        out = np.empty((len(pair), 3), np.float32)
+        order = np.argsort(pair, kind="stable")
+        used, starts = np.unique(pair[order], return_index=True)
+        table = srgb_to_linear(np.arange(256) / 255.0).astype(np.float32)
+        for number, group in zip(used, np.split(order, starts[1:]), strict=True):
+            codes = self._decoded(int(number))
+            if codes.shape[:2] != (self.rows, self.columns):
+                raise InputError(
+                    f"'{self._names[number]}' has {codes.shape[1]} x {codes.shape[0]} texels,"
+                    f" other images {self.columns} x {self.rows}",
+                    where=self.path,
+                )
+            out[group] = table[codes.reshape(texels, 3)[texel[group]]]
+        return out
+
+    def _decoded(self, number: int) -> NDArray[np.uint8]:
+        """Codes (H, W, 3) of an image; gray becomes RGB."""
+        from PIL import Image as Pillow
+
+        name = self._names[number]
+        content = self._content(name)
+        try:
+            with python_warnings.catch_warnings():
+                python_warnings.simplefilter("ignore")
+                with Pillow.open(io.BytesIO(content), formats=["JPEG", "PNG"]) as picture:
+                    check_texels(picture.height, picture.width, self.path)
+                    if picture.mode not in ("RGB", "L"):
+                        raise InputError(f"'{name}' has the pixel mode '{picture.mode}'", where=self.path)
+                    return np.asarray(picture.convert("RGB"))
+        except InputError:
+            raise
+        except Exception as error:  # a damaged file may make the decoder raise anything
+            raise InputError(
+                f"'{_short(name)}' cannot be decoded ({reason(error)})", where=self.path
+            ) from None
+
+
+def angles_of(name: str) -> tuple[float, float, float, float] | None:
+    """Polar angle and azimuth of the light, then of the viewer, in degrees; None of other names."""
+    stem = name.replace("\\", "/").rsplit("/", 1)[-1].lower()
+    if not stem.endswith(SUFFIXES):
+        return None
+    found = [pattern.findall(stem) for pattern in _ANGLES]
+    if any(len(numbers) != 1 for numbers in found):
+        return None
+    tl, pl, tv, pv = (float(numbers[0]) for numbers in found)
+    return tl, pl, tv, pv
+
+
+def read_ubo2003(path: str | Path) -> Ubo2003:
+    """Open a folder or a zip archive of photographs; nothing is unpacked to disk.
+
+    Parameters
+    ----------
+    path : str or Path
+        The folder may have sub-folders; links are not followed out of it.
+
+    Returns
+    -------
+    Ubo2003
+
+    Raises
+    ------
+    InputError
+        No image is named by its directions, two have the same, there are too many, or the first cannot be
+        decoded.
+    """
+    path = Path(path)
+    names, content = _folder(path) if path.is_dir() else _archive(path)
+    table: dict[tuple[float, float, float, float], str] = {}
+    for name in names:
+        angles = angles_of(name)
+        if angles is None:
+            continue
+        if max(angles[0], angles[2]) > 180 or max(angles[1], angles[3]) > 720:
+            raise InputError(f"'{_short(name)}' has angles out of range", where=path)
+        if angles in table:
+            raise InputError(
+                f"has two images of the same directions: '{_short(table[angles])}' and '{_short(name)}'",
+                where=path,
+            )
+        table[angles] = name
+    if not table:
+        raise InputError(
+            "has no JPG or PNG images that are named by their directions",
+            where=path,
+            hint="a name has the angles of the light and the viewer: tl015 pl060 tv030 pv090.jpg",
+        )
+    keys = sorted(table)
+    return Ubo2003(path, [table[key] for key in keys], np.array(keys), content)
+
+
+def _short(name: str) -> str:
+    return name if len(name) <= 80 else f"...{name[-77:]}"
+
+
+def _folder(path: Path) -> tuple[list[str], Callable[[str], bytes]]:
+    names = []
+    root = path.resolve()
+    for file in path.rglob("*"):
+        if file.suffix.lower() in SUFFIXES and file.resolve().is_relative_to(root):
+            names.append(file.relative_to(path).as_posix())
+        if len(names) > _MOST_FILES:
+            raise InputError(f"has more than {_MOST_FILES:,} images", where=path)
+
+    def content(name: str) -> bytes:
+        file = path / name
+        refuse_special(file)
+        try:
+            if file.stat().st_size > _MOST_BYTES:
+                raise InputError(f"has more than {_MOST_BYTES:,} bytes", where=file)
+            return file.read_bytes()
+        except OSError as error:
+            raise InputError(f"cannot be read ({error.strerror})", where=file) from None
+
+    return names, content
+
+
+def _archive(path: Path) -> tuple[list[str], Callable[[str], bytes]]:
+    refuse_special(path)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            entries = archive.infolist()
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
+    except Exception as error:  # a damaged archive may make the library raise anything
+        raise InputError(f"is not a valid zip archive ({reason(error)})", where=path) from None
+    if len(entries) > _MOST_FILES:
+        raise InputError(f"has more than {_MOST_FILES:,} files", where=path)
+    by_name: dict[str, zipfile.ZipInfo] = {}
+    for entry in entries:
+        if angles_of(entry.filename) is None or entry.filename.startswith("__MACOSX/"):
+            continue
+        name = entry.filename
+        if name in by_name:
+            raise InputError(f"has two files of the name '{_short(name)}'", where=path)
+        if entry.flag_bits & 1:
+            raise InputError(f"'{_short(name)}' is encrypted", where=path)
+        if entry.file_size > min(_MOST_BYTES, _MOST_RATIO * entry.compress_size + 10_000):
+            raise InputError(
+                f"'{_short(name)}' claims {entry.file_size:,} bytes in {entry.compress_size:,}", where=path
+            )
+        by_name[name] = entry
+
+    def content(name: str) -> bytes:
+        entry = by_name[name]
+        try:
+            with zipfile.ZipFile(path) as archive, archive.open(entry) as stream:
+                data = stream.read(entry.file_size + 1)
+        except Exception as error:  # a damaged archive may make the library raise anything
+            raise InputError(f"'{_short(name)}' cannot be unpacked ({reason(error)})", where=path) from None
+        if len(data) != entry.file_size:
+            raise InputError(f"'{_short(name)}' has another size than the archive claims", where=path)
+        return data
+
+    return list(by_name), content

@@ -1,0 +1,155 @@
+"""Photographs named by their directions, in folders and archives."""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support import measured_files as files
+from support.fuzzing import damaged, examples, loads_or_refuses
+
+from mbtf_core.errors import InputError
+from mbtf_gen.measured.ubo2003 import Ubo2003, angles_of, read_ubo2003
+
+UP = files.unit([(0, 0)])[0]
+
+
+def check(btf: Ubo2003) -> None:
+    """The known function at every pair, at a texel of each quarter, in a shuffled order."""
+    assert (btf.rows, btf.columns, btf.left_out, btf.cosine) == (16, 24, 3, None)
+    assert len(btf.light) == 9
+    pair, quarter = (a.ravel() for a in np.mgrid[:9, :4])
+    order = np.random.default_rng(1).permutation(36)
+    pair, row, column = pair[order], quarter[order] // 2, quarter[order] % 2
+    values = btf.values(pair, (3 + 8 * row) * 24 + 5 + 12 * column)
+    light, view = btf.light[pair].astype(np.float64), btf.view[pair].astype(np.float64)
+    # JPEG rounds, and a code is up to 0.9 % of the value 1.
+    np.testing.assert_allclose(values, files.value(2 * row, 2 * column, light, view), atol=0.012)
+
+
+def test_a_folder(tmp_path: Path) -> None:
+    check(read_ubo2003(files.write_folder(tmp_path, files.photographs())))
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
+def test_an_archive(method: int, tmp_path: Path) -> None:
+    (tmp_path / "a.zip").write_bytes(files.zipped(files.photographs() | {"read me.txt": b"hello"}, method))
+    check(read_ubo2003(tmp_path / "a.zip"))
+
+
+def test_png_is_exact(tmp_path: Path) -> None:
+    light, view = files.unit([(30, 20)])[0], files.unit([(45, 60)])[0]
+    name = "tl030_pl020_tv045_pv060.png"
+    btf = read_ubo2003(files.write_folder(tmp_path, {name: files.encoded(light, view, "PNG")}))
+    c = files.codes(light, view).reshape(-1, 3) / 255
+    linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+    texels = np.arange(16 * 24)
+    np.testing.assert_allclose(btf.values(np.zeros_like(texels), texels), linear, rtol=1e-6)
+    np.testing.assert_allclose(btf.light[0], light, atol=1e-6)
+    np.testing.assert_allclose(btf.view[0], view, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "angles"),
+    [
+        ("00001 tl000 pl010 tv020 pv030.jpg", (0, 10, 20, 30)),
+        ("tv075_pv345/tl060_pl045_tv075_pv345.png", (60, 45, 75, 345)),
+        ("tv7.5_pv345_tl60_pl45.JPG", (60, 45, 7.5, 345)),
+        ("img_tv0_pv1_tl15_pl2.jpeg", (15, 2, 0, 1)),
+        ("tv000_pv000/a.jpg", None),
+        ("tl000 pl010 tv020 pv030.txt", None),
+        ("tl000 tl001 pl010 tv020 pv030.jpg", None),
+    ],
+)
+def test_names(name: str, angles: tuple[float, ...] | None) -> None:
+    assert angles_of(name) == angles
+
+
+def test_each_image_is_decoded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    btf = read_ubo2003(files.write_folder(tmp_path, files.photographs()))
+    seen = []
+    decoded = btf._decoded
+    monkeypatch.setattr(btf, "_decoded", lambda number: seen.append(number) or decoded(number))
+    btf.values(np.array([3, 1, 3, 1, 3]), np.arange(5))
+    assert seen == [1, 3]
+
+
+def good(name: str = "tl000 pl000 tv000 pv000.jpg") -> dict[str, bytes]:
+    return {name: files.encoded(UP, UP)}
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"a.jpg": b"x"}, "named by their directions"),
+        ({"tl000 pl000 tv000 pv000.jpg": b"not an image"}, "cannot be decoded"),
+        ({"tl200 pl000 tv000 pv000.jpg": b""}, "angles out of range"),
+        ({"tl095 pl000 tv000 pv000.jpg": b""}, "above the horizon"),
+        (good() | good("b/tl000 pl000 tv000 pv000.jpg"), "the same directions"),
+    ],
+)
+@pytest.mark.parametrize("zipped", [False, True])
+def test_refused(content: dict[str, bytes], message: str, zipped: bool, tmp_path: Path) -> None:
+    path = tmp_path / "a.zip"
+    if zipped:
+        path.write_bytes(files.zipped(content))
+    else:
+        path = files.write_folder(tmp_path / "a", content)
+    with pytest.raises(InputError, match=message):
+        read_ubo2003(path)
+
+
+def test_sizes_differ(tmp_path: Path) -> None:
+    other = {"tl010 pl000 tv000 pv000.jpg": files.encoded(UP, UP, rows=8)}
+    btf = read_ubo2003(files.write_folder(tmp_path, good() | other))
+    with pytest.raises(InputError, match="24 x 8 texels, other images 24 x 16"):
+        btf.values(np.array([1]), np.array([0]))
+
+
+def test_archives_that_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.zip"
+    path.write_bytes(files.zipped({"tl000 pl000 tv000 pv000.jpg": bytes(10**7)}, zipfile.ZIP_DEFLATED))
+    with pytest.raises(InputError, match="claims 10,000,000 bytes in"):
+        read_ubo2003(path)
+    path.write_bytes(files.zipped(good())[:-30])
+    with pytest.raises(InputError, match="not a valid zip archive"):
+        read_ubo2003(path)
+    with pytest.raises(InputError, match="No such file"):
+        read_ubo2003(tmp_path / "b.zip")
+
+
+def test_links_out_of_the_folder_are_not_followed(tmp_path: Path) -> None:
+    (tmp_path / "secret.jpg").write_bytes(files.encoded(UP, UP))
+    folder = files.write_folder(tmp_path / "a", good())
+    os.symlink(tmp_path / "secret.jpg", folder / "tl010 pl000 tv000 pv000.jpg")
+    assert len(read_ubo2003(folder).light) == 1
+
+
+def test_names_that_climb_out_of_an_archive_are_harmless(tmp_path: Path) -> None:
+    (tmp_path / "a.zip").write_bytes(files.zipped(good("../../tl000 pl000 tv000 pv000.jpg")))
+    assert read_ubo2003(tmp_path / "a.zip").rows == 16
+    assert [p.name for p in tmp_path.iterdir()] == ["a.zip"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("photographs")
+
+
+@given(data=st.data())
+@examples(200)
+def test_a_damaged_archive(data: st.DataObject, folder: Path) -> None:
+    two = good() | {"tl010 pl000 tv000 pv000.jpg": files.encoded(UP, UP)}
+    samples = {"a": files.zipped(two), "b": files.zipped(two, zipfile.ZIP_DEFLATED)}
+    _, content = data.draw(damaged(samples))
+    path = folder / "a.zip"
+    path.write_bytes(content)
+    btf = loads_or_refuses(lambda: read_ubo2003(path))
+    if btf is not None:
+        pairs = np.arange(len(btf.light))
+        loads_or_refuses(lambda: btf.values(pairs, np.zeros_like(pairs)))
