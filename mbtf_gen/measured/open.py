@@ -1,0 +1,61 @@
+"""Which reader a file or folder is for, by its content."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mbtf_core.errors import InputError
+from mbtf_core.suggest import refuse_special, suggest_path
+from mbtf_gen.measured.hdf5 import MAGIC as HDF5
+from mbtf_gen.measured.hdf5 import names_of, opened
+from mbtf_gen.measured.interface import MeasuredBtf, MeasuredQueries
+from mbtf_gen.measured.neumip_hdf5 import RADIUS, read_neumip
+from mbtf_gen.measured.neural_btf_hdf5 import COLOR, read_neural_btf
+from mbtf_gen.measured.ubo2003 import read_ubo2003
+from mbtf_gen.measured.ubo2014 import read_ubo2014
+
+_ZIP = b"PK"
+_KNOWN = (
+    "a .btf file (Bonn, DFMF), a folder or zip of photographs named by angles, or HDF5 of NeuMIP or NeuralBTF"
+)
+
+
+def open_measured(path: str | Path) -> MeasuredBtf | MeasuredQueries:
+    """Open a measured BTF or a data set of another program.
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Returns
+    -------
+    MeasuredBtf or MeasuredQueries
+        The latter has ``count`` and ``read``.
+
+    Raises
+    ------
+    InputError
+        The file is missing, of no known kind, or damaged.
+    """
+    path = Path(path)
+    if path.is_dir():
+        return read_ubo2003(path)
+    refuse_special(path)
+    try:
+        with path.open("rb") as stream:
+            start = stream.read(8)
+    except FileNotFoundError:
+        raise InputError("no such file", where=path, hint=suggest_path(path)) from None
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
+    if start.startswith(b"!"):
+        return read_ubo2014(path)
+    if start.startswith(_ZIP):
+        return read_ubo2003(path)
+    if start != HDF5:
+        raise InputError("is not a measured BTF of a known kind", where=path, hint=f"known are {_KNOWN}")
+    with opened(path) as file:
+        names = names_of(file)
+    if COLOR not in names:
+        raise InputError(f"is an HDF5 file without '{COLOR}'", where=path, hint=f"known are {_KNOWN}")
+    return read_neumip(path) if RADIUS in names or "ground_valid" in names else read_neural_btf(path)
