@@ -84,8 +84,9 @@ ARRAYS: tuple[ArraySpec, ...] = (
     _array("omega_i", "x y z", "unit vector", "direction from the surface towards the light, z > 0"),
     _array("omega_o", "x y z", "unit vector", "direction from the surface towards the viewer, z > 0"),
     _array("value_a", "R G B", "1/sr", "first independent estimate of M (linear Rec.709 RGB)"),
-    _array("value_b", "R G B", "1/sr", "second independent estimate of M (linear Rec.709 RGB)"),
-    _array("spp", "", "paths", "paths traced for this query, both halves together"),
+    # Measured data have neither a second value nor paths.
+    _array("value_b", "R G B", "1/sr", "second estimate, independent of the first", optional=True),
+    _array("spp", "", "paths", "paths traced for this query, both halves together", optional=True),
     _array("transmittance", "", "1", "fraction of the footprint that rays pass through", optional=True),
 )
 ARRAY: dict[str, ArraySpec] = {a.name: a for a in ARRAYS}

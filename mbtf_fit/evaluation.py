@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -77,12 +77,15 @@ class SplitErrors:
         (lower, upper) edge of the smaller cosine of light and view → errors.
     exposure : float
         Exposure in EV that displays the values, see :mod:`mbtf_core.exposure`.
+    includes_noise : bool
+        Whether the errors include the noise of the data, which have a single value per query.
     """
 
     overall: Errors
     levels: dict[int, Errors]
     elevations: dict[tuple[float, float], Errors]
     exposure: float
+    includes_noise: bool = False
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data for JSON; the peak of the PSNR is the value that the exposure shows as white."""
@@ -92,6 +95,7 @@ class SplitErrors:
             "exposure": self.exposure,
             "psnr": psnr(self.overall.mse, white_of(self.exposure)).as_dict(),
             "visibility": visibility(found)[1],
+            "includes_noise": self.includes_noise,
             "levels": {str(level): errors.as_dict() for level, errors in self.levels.items()},
             "elevations": {f"{low:g}-{high:g}": e.as_dict() for (low, high), e in self.elevations.items()},
         }
@@ -144,7 +148,10 @@ def evaluate_splits(predict: Predict, data: Dataset, partition: Partition) -> di
     parts = {name: queries for name, queries in parts.items() if len(queries)}
     exposure = exposure_of(next(iter(parts.values()))) if parts else None
     found = {name: split_errors(predict, queries, data.lattice, exposure) for name, queries in parts.items()}
-    return {name: errors for name, errors in found.items() if errors is not None}
+    noisy = data.estimates == 1
+    return {
+        name: replace(errors, includes_noise=noisy) for name, errors in found.items() if errors is not None
+    }
 
 
 def foreign_inputs(material: Material, shards: str | Path) -> list[str]:

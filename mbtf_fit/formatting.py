@@ -115,6 +115,8 @@ def _remarks(errors: dict[str, Any], foreign: bool) -> list[str]:
     groups = [g for e in errors.values() for g in (e, *e["levels"].values(), *e["elevations"].values())]
     if any(group["unexplained"]["value"] is None for group in groups):
         found.append("undefined unexplained variance: the noise exceeds the variance of these values")
+    if errors[headline(errors)].get("includes_noise"):
+        found.append("these errors include the noise of the data, which have one value per query")
     value = errors[headline(errors)]["unexplained"]["value"]
     if value is not None and value >= 1 and not foreign:
         found.append(

@@ -112,6 +112,12 @@ class Corruption:
         lost = not (self.folder / MANIFEST_NAME).exists()
         if self._intact is not None or (lost and not sidecars(self.folder)):
             Dataset.open(self.folder)
+        if "measured" in (self._intact or {}):
+            raise InputError(
+                "holds measured data, which cannot be generated again",
+                where=self.folder,
+                hint="remove the damaged files, then run the same mbtf-gen import again",
+            )
 
     @cached_property
     def faults(self) -> list[Fault]:

@@ -14,7 +14,7 @@ from mbtf_core.errors import InputError
 from mbtf_core.shard_schema import Layout, Split
 from mbtf_fit.config import HeldOutSection
 from mbtf_fit.data.images import TrainingImages, nearest_shapes, philox, strides
-from mbtf_fit.data.queries import NEEDED, QUERY_BYTES, ShardQueries, TrainingQueries, mean_value
+from mbtf_fit.data.queries import QUERY_BYTES, ShardQueries, TrainingQueries, mean_value, needed
 from mbtf_fit.data.slices import TrainingSlices
 from mbtf_fit.data.streaming import Selection, StreamedQueries
 from mbtf_gen.dataset.reader import Dataset, Shard
@@ -65,7 +65,7 @@ def open_data(folder: str | Path, layout: Layout, model: str) -> Dataset:
 
 def read_checked(shard: Shard) -> ShardQueries:
     """One shard, every number checked."""
-    return ShardQueries(**shard.read(NEEDED))
+    return ShardQueries.of(shard.read(needed(shard.estimates)))
 
 
 def in_region(held_out: HeldOutSection, omega: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -170,7 +170,7 @@ def load_training(
             store["value"][part] = mean_value(queries.value_a[rows], queries.value_b[rows])
     if len(selection) == 0:
         raise _all_held_out(data, f"{total} queries")
-    training: TrainingQueries | StreamedQueries = StreamedQueries(selection)
+    training: TrainingQueries | StreamedQueries = StreamedQueries(selection, estimates=data.estimates)
     if not streamed:
         training = TrainingQueries(**{n: torch.from_numpy(a[: len(selection)]) for n, a in store.items()})
     queries, directions, sampled = (ShardQueries.join(group) for group in (*kept_out, sample))

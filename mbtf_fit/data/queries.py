@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -17,9 +17,15 @@ NEEDED = ("u", "sigma", "omega_i", "omega_o", "value_a", "value_b")
 QUERY_BYTES, HINT_BYTES = 48, 28
 
 
+def needed(estimates: int) -> tuple[str, ...]:
+    """Arrays of shards with so many estimates of every value."""
+    return NEEDED if estimates == 2 else tuple(name for name in NEEDED if name != "value_b")
+
+
 @dataclass(frozen=True)
 class ShardQueries:
-    """Queries with both estimates of their value, float32 NumPy arrays.
+    """Queries with both estimates of their value, float32 NumPy arrays. Measured data have one, which then
+    stands for both: their errors include its noise.
 
     Images of the image layout have (items, rows, columns) in place of n, until :meth:`flat`.
 
@@ -37,6 +43,11 @@ class ShardQueries:
 
     def __len__(self) -> int:
         return len(self.sigma)
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, NDArray[np.float32]]) -> ShardQueries:
+        """Queries of the arrays of a shard."""
+        return cls(**{"value_b": arrays["value_a"], **arrays})
 
     @classmethod
     def join(cls, parts: Iterable[ShardQueries]) -> ShardQueries:

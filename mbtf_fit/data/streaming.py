@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mbtf_fit.data.queries import NEEDED, TrainingQueries, batch_ranges, batch_starts, mean_value
+from mbtf_fit.data.queries import TrainingQueries, batch_ranges, batch_starts, mean_value, needed
 from mbtf_gen.dataset.shard_io import Arrays, read_shard
 
 # Rows of a shard between two cumulative counts of selected rows.
@@ -85,11 +85,14 @@ class Selection:
 
 
 class StreamedQueries:
-    """Training queries on disk: rows of npz shards, and the device of the batches. Each batch maps the shards
-    that it reads, and then releases them."""
+    """Training queries on disk: rows of npz shards with so many estimates of every value, and the device of
+    the batches. Each batch maps the shards that it reads, and then releases them."""
 
-    def __init__(self, selection: Selection, device: torch.device | None = None) -> None:
+    def __init__(
+        self, selection: Selection, device: torch.device | None = None, *, estimates: int = 2
+    ) -> None:
         self.selection = selection
+        self.estimates = estimates
         self.device = device or torch.device("cpu")
 
     def __len__(self) -> int:
@@ -97,7 +100,7 @@ class StreamedQueries:
 
     def to(self, device: torch.device) -> StreamedQueries:
         """The same queries with batches on another device."""
-        return StreamedQueries(self.selection, device)
+        return StreamedQueries(self.selection, device, estimates=self.estimates)
 
     def batch_ranges(self, size: int, seed: int, step: int) -> list[range]:
         """Indices of the queries in the batch of a step."""
@@ -107,11 +110,12 @@ class StreamedQueries:
         """Consecutive queries, read from disk."""
         parts: list[Arrays] = []
         for path, rows in self.selection.pieces(start, stop):
-            mapped = read_shard(path, NEEDED)
+            mapped = read_shard(path, needed(self.estimates))
             span, inside = slice(rows[0], rows[-1] + 1), rows - rows[0]
             parts.append({name: array[span][inside] for name, array in mapped.items()})
-        joined = {name: np.concatenate([p[name] for p in parts]) for name in NEEDED}
-        joined["value"] = mean_value(joined.pop("value_a"), joined.pop("value_b"))
+        joined = {name: np.concatenate([p[name] for p in parts]) for name in needed(self.estimates)}
+        first = joined.pop("value_a")
+        joined["value"] = mean_value(first, joined.pop("value_b", first))
         return TrainingQueries(**{k: torch.from_numpy(v) for k, v in joined.items()}).to(self.device)
 
     def batches(self, size: int, seed: int, step: int, margin: int = 0) -> Iterator[TrainingQueries]:

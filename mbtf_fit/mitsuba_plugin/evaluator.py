@@ -25,7 +25,7 @@ from mbtf_fit.mitsuba_plugin.network import (
     to_value,
 )
 from mbtf_fit.mitsuba_plugin.textures import Textures
-from mbtf_fit.models.constants import GRAZING, IRRADIANCE_SCALE, OFFSET_SCALE
+from mbtf_fit.models.constants import GRAZING, IRRADIANCE_SCALE, LEAST_COSINE, OFFSET_SCALE, STATISTICS
 from mbtf_gen.render.types import Color3f, Float, Point2f, UInt32, Vector3f
 
 
@@ -69,6 +69,7 @@ class Evaluator:
     def __init__(self, stored: StoredMaterial, arithmetic: Arithmetic | None = None) -> None:
         self.lattice = stored.lattice
         self.network = stored.network
+        self.sliced = stored.sliced
         self.unit = stored.unit
         weights = count_weights(stored.decoder) + count_weights(stored.offset_network or [])
         self.arithmetic: Arithmetic = default_arithmetic(weights) if arithmetic is None else arithmetic
@@ -135,6 +136,8 @@ class Evaluator:
 
     def _decode(self, features: list[Float], omega_i: Vector3f, omega_o: Vector3f) -> Color3f:
         """Value of features without calibration."""
+        if self.sliced:
+            return self._of_slices(features, omega_i, omega_o)
         directions = encode_directions(omega_i, omega_o, self.network.encoding)
         if self.surface is None:
             return to_value(self.decoder([*features, *directions]), self.unit, self.network)
@@ -160,6 +163,15 @@ class Evaluator:
         return dr.maximum(
             to_value(out[:-1], self.unit, self.network, clamp=False) + gate * mi.Color3f(*core), 0.0
         )
+
+    def _of_slices(self, features: list[Float], omega_i: Vector3f, omega_o: Vector3f) -> Color3f:
+        """Value of latents, means and deviations; the formula is that of :mod:`mbtf_fit.models.rainer`."""
+        latents, mean, deviation = features[:-STATISTICS], features[-6:-3], features[-3:]
+        projected = [c * dr.rcp(1.0 + w.z) for w in (omega_i, omega_o) for c in (w.x, w.y)]
+        x = self.decoder([*latents, *projected])
+        scale = self.unit / dr.maximum(omega_i.z, LEAST_COSINE)
+        parts = zip(mean, deviation, x, strict=True)
+        return mi.Color3f(*(dr.maximum(scale * (dr.exp(dr.fma(d, v, m)) - 1.0), 0.0) for m, d, v in parts))
 
     def transmittance(self, u: Point2f, level: Float, omega_o: Vector3f) -> Float:
         """Transparent fraction of the footprint for unit vectors on either side of the plane, equal for

@@ -31,6 +31,7 @@ from mbtf_fit.models.constants import (
     HORIZONS,
     LIGHT_WIDTH,
     MAPS,
+    STATISTICS,
     directions_size,
     hint_size,
     position_size,
@@ -73,6 +74,7 @@ class StoredMaterial:
     folder, network : the material's folder and architecture
     lattice : texel grids of the tile
     min_cos : smallest cosine of the directions in the data
+    sliced : whether it is one of the models that encode angular slices
     pyramid : feature textures (rows, columns, channels), coarsest level first
     decoder : layers of the decoder
     offset_texture, offset_network : those of the neural offset; None for a material without
@@ -87,6 +89,7 @@ class StoredMaterial:
     lattice: Lattice
     min_cos: float
     network: NetworkSection
+    sliced: bool
     pyramid: list[F32]
     decoder: Layers
     offset_texture: F32 | None
@@ -121,12 +124,6 @@ def read_material(folder: str | Path) -> StoredMaterial:
     named = {key: description["config"][key] for key in ("model", "network") if key in description["config"]}
     config = build(FitConfig, named, source=str(folder / DESCRIPTION_NAME))
     network, lattice = config.network, lattice_of(description)
-    if config.model in SLICE_MODELS:
-        raise InputError(
-            f"the renderer's plugin does not support '{config.model}'",
-            where=folder / DESCRIPTION_NAME,
-            hint="generate shuffled shards of the material, and fit the model neumip to them",
-        )
     if network.decoder != "mlp":
         raise InputError(
             f"the renderer's plugin does not support the inception decoder of '{config.model}'",
@@ -151,6 +148,8 @@ def read_material(folder: str | Path) -> StoredMaterial:
     features = channels * (2 if network.blending == "concatenate" else 1)
     inputs = features + position_size(network.encoding) + directions_size(network.encoding)
     outputs = network.output_channels
+    if config.model in SLICE_MODELS:
+        inputs -= STATISTICS
     surface = None
     if config.model in TRACING_MODELS:
         inputs, outputs = inputs + hint_size(network), outputs + network.relief.gate
@@ -160,6 +159,7 @@ def read_material(folder: str | Path) -> StoredMaterial:
         lattice,
         description["data"].get("min_cos", DEFAULT_MIN_COS),
         network,
+        config.model in SLICE_MODELS,
         pyramid,
         reader.layers("decoder", inputs, outputs),
         offset_texture,

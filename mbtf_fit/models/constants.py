@@ -44,6 +44,9 @@ PLACES: dict[int, tuple[tuple[tuple[float, float], ...], float]] = {
 # Of the model `neumip+`. Heights in tile widths per unit of the learned texture, and depth at its start.
 # Bound from below, in gradients by the heights, of the view's cosine and of 1 - ∇h·ω_o,xy/ω_o,z.
 HEIGHT_SCALE, FIRST_DEPTH, LEAST_FACING = 0.25, 0.04, 0.3
+# Of the models `rainer2019` and `rainer2020`: channels besides the latents, mean and standard deviation of
+# each color; smallest cosine of the light that values are divided by.
+STATISTICS, LEAST_COSINE = 6, 0.01
 # Tensors of the surface in a material, before the level.
 HEIGHTS, MAPS, HORIZONS = "surface.heights", "surface.maps", "surface.horizons"
 LIGHT_WIDTH, DIELECTRIC = "surface.light_width", "surface.dielectric"

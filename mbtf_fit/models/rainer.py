@@ -29,11 +29,10 @@ from mbtf_core.lattice import Lattice
 from mbtf_core.shard_schema import Layout
 from mbtf_fit.config import NetworkSection
 from mbtf_fit.data.slices import SliceBatch, TrainingSlices
+from mbtf_fit.models.constants import LEAST_COSINE, STATISTICS
 from mbtf_fit.models.interface import NeuralMaterial
 from mbtf_fit.models.mlp import Mlp, initialize_layers
 
-# Channels besides the latents: mean and standard deviation of each color.
-STATISTICS = 6
 # Least standard deviation of a slice's logarithms.
 LEAST_DEVIATION = 1e-3
 # Texels that are encoded at once when the texture is written.
@@ -136,7 +135,7 @@ class Rainer2019(NeuralMaterial):
     def stage2(self, features: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
         latents, mean, deviation = features.tensor_split([-6, -3], 1)
         x = self.decoder(torch.cat([latents, self.directions(omega_i, omega_o)], 1))
-        return self.unit * torch.expm1(mean + deviation * x) / omega_i[:, 2:]
+        return self.unit * torch.expm1(mean + deviation * x) / omega_i[:, 2:].clamp_min(LEAST_COSINE)
 
     def normalized(self, values: Tensor, omega_i: Tensor) -> tuple[Tensor, Tensor]:
         """Logarithms (items, D, 3) of slices with mean 0 and variance 1 per item and color, and both (items,
@@ -185,7 +184,7 @@ class Rainer2019(NeuralMaterial):
             "latents, then mean m (RGB) and standard deviation d (RGB)",
             "light, view": "(x, y) / (1 + z) of omega_i, of omega_o",
             "x": "decoder(latents, light, view)",
-            "value": "unit * (exp(m + d * x) - 1) / omega_i.z",
+            "value": f"unit * (exp(m + d * x) - 1) / max(omega_i.z, {LEAST_COSINE})",
         }
 
 

@@ -223,7 +223,8 @@ def _fit(
     trainer.calibrate()
     errors = evaluate_splits(trainer.predict, data, partition)
     variance = errors["training"].overall.variance.value
-    noise = pooled_variance(partition.sample.value_a, partition.sample.value_b).value
+    sample = partition.sample
+    noise = pooled_variance(sample.value_a, sample.value_b).value if data.estimates == 2 else None
     training = {
         "steps": trainer.progress.step,
         "batch": trainer.batch,
@@ -238,9 +239,9 @@ def _fit(
         "backend": trainer.backend,
         "torch": torch.__version__,
         "errors": {split: e.as_dict() for split, e in errors.items()},
-        # Variance of the noise of values, in 1/sr² and over that of the values.
+        # Variance of the noise of values, in 1/sr² and over that of the values; null where it is unknown.
         "noise_variance": noise,
-        "noise_ratio": noise / variance if variance > 0 else None,
+        "noise_ratio": noise / variance if noise is not None and variance > 0 else None,
     }
     transmittance = fit_transmittance(data, partition.selection)
     if transmittance is not None:

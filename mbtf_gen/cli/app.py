@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from mbtf_core.console import new_app
 from mbtf_gen.cli.doctor import doctor
+from mbtf_gen.cli.export import export
 from mbtf_gen.cli.folders import merge, repair, verify
 from mbtf_gen.cli.generate import generate
+from mbtf_gen.cli.import_measured import import_measured
 from mbtf_gen.cli.inspect import inspect
 from mbtf_gen.cli.plan import plan
 from mbtf_gen.cli.preview import preview
@@ -16,3 +18,5 @@ app = new_app("mbtf-gen", "Generate multi-resolution BTF (MBTF) data sets from d
 app.default(generate)
 for command in (inspect, plan, preview, merge, verify, repair, reference, selftest, doctor):
     app.command(command)
+app.command(import_measured, name="import")
+app.command(export)

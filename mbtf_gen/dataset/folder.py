@@ -95,7 +95,7 @@ def open_folder(job: Job, folder: Path, plan: Callable[[Job], RunPlan], overwrit
     else:
         geometry = geometry_of(job, stored_plan(read_manifest(folder), existing).effects)
     if replace:
-        _clear(folder)
+        clear(folder)
     make_folder(folder)
     with brief_lock(existing):
         remove_unfinished(folder, (MANIFEST_NAME, CONFIG_NAME, GEOMETRY_NAME))
@@ -178,7 +178,7 @@ def remove_leftovers(folder: Path) -> None:
                 remove_unfinished(folder, [*files, *(documents if stem == general else [])])
 
 
-def _clear(folder: Path) -> None:
+def clear(folder: Path) -> None:
     """Remove a data set and nothing else, the manifest last, so that shards never remain without it."""
     with ExitStack() as held:
         for path in _locks(folder):

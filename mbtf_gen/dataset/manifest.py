@@ -41,7 +41,8 @@ def plan_digest(manifest: Mapping[str, Any]) -> str:
 
     Explanations and bias bounds are left out: they decide nothing, and other versions word them differently.
     """
-    plan = manifest.get("effects", {})
+    # Measured data have no plan.
+    plan = manifest.get("effects") or {}
     decided = {key: plan.get(key) for key in ("max_depth", "roulette_depth", "closed_form")}
     on = sorted(effect["name"] for effect in plan.get("effects", []) if effect["on"])
     return data_sha256({**decided, "effects": on, "allocation": manifest.get("allocation")})
@@ -118,7 +119,7 @@ def build_manifest(job: Job, plan: RunPlan, geometry: Mapping[str, Any] | None) 
                 "meaning": a.meaning,
             }
             for a in ARRAYS
-            if not a.optional or plan.effects.on("opacity")
+            if a.name != "transmittance" or plan.effects.on("opacity")
         },
         "geometry": None if geometry is None else dict(geometry),
         **plan.to_manifest(),

@@ -69,6 +69,7 @@ class _Manifest(BaseModel):
     geometry: _Geometry | None
     patch_size: _Count | None = None
     slice_size: _Count | None = None
+    estimates: Literal[1, 2] = 2
 
 
 class _Statistics(BaseModel, allow_inf_nan=False):
@@ -94,11 +95,14 @@ class Shard:
     image : tuple of int
         Rows and columns of an image in the image layout, the number of directions in the slices layout;
         empty in the shuffled layout.
+    estimates : int
+        Independent estimates of every value: 2, or 1 of measured data.
     """
 
     path: Path
     sidecar: dict[str, Any]
     image: tuple[int, ...] = ()
+    estimates: int = 2
 
     @property
     def rows(self) -> int:
@@ -140,8 +144,9 @@ class Shard:
             check_values(arrays, self.path)
         except InputError as error:
             raise InputError(error.what, where=self.path, hint=hint) from None
-        if self.rows and {"value_a", "value_b"} <= arrays.keys():
-            mean = 0.5 * (column_means(arrays["value_a"]) + column_means(arrays["value_b"]))
+        halves = ("value_a", "value_b")[: self.estimates]
+        if self.rows and all(name in arrays for name in halves):
+            mean = np.mean([column_means(arrays[name]) for name in halves], axis=0)
             stated = np.asarray(self.sidecar["statistics"]["mean_value"])
             if np.abs(mean - stated).max() > _SAME_MEAN * np.abs(stated).max():
                 raise InputError("is not the shard that its sidecar describes", where=self.path, hint=hint)
@@ -223,6 +228,11 @@ class Dataset:
         return size
 
     @property
+    def estimates(self) -> int:
+        """Independent estimates of every value: 2, or 1 of measured data, which have no array ``value_b``."""
+        return int(self.manifest.get("estimates", 2))
+
+    @property
     def lattice(self) -> Lattice:
         """Texel grids of the tile."""
         return Lattice(int(self.manifest["levels"]["finest"]), float(self.manifest["tile"]["aspect"]))
@@ -280,7 +290,7 @@ class Dataset:
                 hint = f"check the data set with: mbtf-gen verify {self.folder}"
                 raise InputError(error.what, where=path, hint=hint) from None
             check_document(_Sidecar, record, sidecar_of(path), _MAKE_AGAIN)
-            out.append(Shard(path, record, image))
+            out.append(Shard(path, record, image, self.estimates))
         return out
 
     def geometry(self) -> Geometry | None:

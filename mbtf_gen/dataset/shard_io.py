@@ -43,7 +43,7 @@ _CHECKED = 1 << 16
 
 def row_bytes(holes: bool) -> int:
     """Bytes of one query in a shard."""
-    return sum(4 * max(1, math.prod(a.trailing)) for a in ARRAYS if holes or not a.optional)
+    return sum(4 * max(1, math.prod(a.trailing)) for a in ARRAYS if holes or a.name != "transmittance")
 
 
 def data_bytes(job: Job, entries: Iterable[ShardEntry]) -> int:

@@ -216,7 +216,8 @@ def finish(
     """
     dataset = Dataset.open(folder)
     manifest = read_manifest(folder)
-    effects = stored_plan(manifest, folder / MANIFEST_NAME).effects
+    measured = "measured" in manifest
+    effects = () if measured else stored_plan(manifest, folder / MANIFEST_NAME).effects.effects
     totals, complete = ShardStatistics(), True
     for entry in (entry for split in dataset.splits for entry in dataset.entries(split)):
         record = finished_record(folder, entry, manifest["config_hash"])
@@ -256,6 +257,6 @@ def finish(
         lost=totals.counts["lost_rays"],
         capped=totals.counts["capped_rays"],
         nonfinite=totals.counts["nonfinite_samples"],
-        effects=[EFFECTS[e.name] for e in effects.effects if e.on],
+        effects=[EFFECTS[e.name] for e in effects if e.on],
         **sums,
     )

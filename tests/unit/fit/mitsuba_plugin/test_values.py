@@ -73,6 +73,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "no gate": {"glossy": False, **relief(gate=False)},
     "tracing alone": relief(hints=False, frame=False, gate=False),
     "learned heights": {"model": "neumip+", "aspect": 0.5, "glossy": False},
+    "rainer2019": {"model": "rainer2019", "aspect": 0.5},
+    "rainer2020": {"model": "rainer2020"},
     "relief, six outputs": {"model": "relief", **net(output_channels=6, oversampling=1)},
 }
 UNROLLED = ("neumip", "fourth root", "encoded", "relief")

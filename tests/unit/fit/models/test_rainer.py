@@ -16,7 +16,6 @@ from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import load_training
 from mbtf_fit.data.slices import SharedSlices, TrainingSlices
 from mbtf_fit.material.material import Material
-from mbtf_fit.mitsuba_plugin.material_arrays import read_material
 from mbtf_fit.models.rainer import Rainer2019, Rainer2020
 from mbtf_fit.models.registry import build_model
 from mbtf_fit.training.checkpoint import read_checkpoint, write_checkpoint
@@ -118,8 +117,6 @@ def test_a_smooth_material_is_learned_and_loads_again(name: str, tmp_path: Path)
     material = Material.load(tmp_path / "fit")
     assert material.deviation() == 0.0
     assert not any("encoder" in key for key in material.description["weights"]["shapes"])
-    with pytest.raises(InputError, match="plugin does not support 'rainer"):
-        read_material(tmp_path / "fit")
 
 
 def test_a_fit_resumes_where_it_stopped(tmp_path: Path) -> None:

@@ -1,0 +1,42 @@
+"""``mbtf-gen export``: data sets for the training code of others."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from mbtf_core.console import CONSOLE, Console
+from mbtf_core.errors import UsageError
+from mbtf_core.options import Overwrite
+
+
+def export(
+    shards: Path,
+    file: Path,
+    /,
+    *,
+    format: Literal["neumip", "neuralbtf"] = "neumip",
+    overwrite: Overwrite = False,
+    console: Console = CONSOLE,
+) -> None:
+    """Write the training queries of a data set as HDF5 for other programs.
+
+    Parameters
+    ----------
+    shards
+        Folder of shards.
+    file
+        HDF5 file to write.
+    format
+        The program that reads it: NeuMIP (shuffled layout) or NeuralBTF (slices layout).
+    """
+    from mbtf_gen.dataset.exported import export_neumip, export_neural_btf
+    from mbtf_gen.dataset.reader import Dataset
+
+    if file.exists() and not overwrite:
+        raise UsageError("exists", where=file, hint="choose another name, or --overwrite")
+    data = Dataset.open(shards)
+    count = (export_neumip if format == "neumip" else export_neural_btf)(data, file)
+    total = int(data.manifest["splits"]["train"]["queries"])
+    left = f"; {total - count} that do not fill an image are left out" if count < total else ""
+    console.report({"file": file, "format": format, "values": count}, f"{file}: {count} values{left}")

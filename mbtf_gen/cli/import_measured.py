@@ -1,0 +1,59 @@
+"""``mbtf-gen import``: measured BTFs as data sets."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+
+from mbtf_core.console import CONSOLE, Console
+from mbtf_core.interruption import keep_on_interruption
+from mbtf_core.options import Options, Output, Overwrite, PathText, takes_options
+from mbtf_core.units import clock, size_text
+from mbtf_gen.config.measured import ImportConfig
+
+
+@takes_options(ImportConfig)
+def import_measured(
+    measured: PathText,
+    /,
+    *,
+    output: Output = Path("shards"),
+    options: Options[ImportConfig],
+    overwrite: Overwrite = False,
+    console: Console = CONSOLE,
+) -> None:
+    """Import a measured BTF as a data set: mbtf-gen import carpet07.btf -o shards/
+
+    The same command again resumes an unfinished import.
+
+    Parameters
+    ----------
+    measured
+        File of a BTF (.btf, .hdf5), or folder or zip archive of images.
+    """
+    from mbtf_core.folders import check_space
+    from mbtf_gen.dataset.imported import MEASURED_BYTES, Import
+    from mbtf_gen.dataset.imported import import_measured as run
+
+    job = Import.prepare(Path(measured), options.resolve())
+    total = job.count("train") + job.count("test")
+    size = total * MEASURED_BYTES
+    console.note(
+        f"{measured} ({type(job.source).__name__}) -> {output}: {job.count('train')} training + "
+        f"{job.count('test')} test queries, {size_text(size)}"
+    )
+    if job.pairs is not None:
+        console.note(
+            f"{job.left_out} of {job.left_out + sum(map(len, job.pairs))} pairs of light and view are "
+            "left out: too low"
+        )
+    check_space(output, size, "reduce --queries, or choose another folder with -o")
+    keep_on_interruption(f"the shards that are finished are kept in {output}")
+    with console.progress(total=total, label="importing", unit="queries") as bar:
+        summary = run(job, output, overwrite=overwrite, progress=bar.update)
+    mean = sum(summary.mean_value) / 3
+    text = (
+        f"{output}: {summary.splits['train']} training + {summary.splits['test']} test queries in "
+        f"{clock(summary.seconds)}\n  mean value {mean:.4g} 1/sr; one value per query: its noise is unknown"
+    )
+    console.report(asdict(summary), text)

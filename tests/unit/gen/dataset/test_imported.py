@@ -1,0 +1,156 @@
+"""Imports of measured BTFs: values, conventions, splits, resumption, and what readers make of one value."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.measured_data import Images, Listed, known
+
+from mbtf_core.errors import InputError
+from mbtf_fit import fit
+from mbtf_fit.config import FitConfig
+from mbtf_fit.data.loader import load_training
+from mbtf_fit.formatting import summarize_errors
+from mbtf_gen.config.measured import ImportConfig
+from mbtf_gen.dataset import imported
+from mbtf_gen.dataset.imported import Import, import_measured
+from mbtf_gen.dataset.reader import Dataset
+from mbtf_gen.dataset.verify import verify
+from mbtf_gen.repairs import Corruption
+
+Open = Callable[..., Import]
+
+
+@pytest.fixture
+def opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Open:
+    """Opens a source as if it were a file."""
+    file = tmp_path / "measured.btf"
+    file.write_bytes(b"measured")
+
+    def open_(source: Any, **options: Any) -> Import:
+        monkeypatch.setattr(imported, "open_measured", lambda path: source)
+        options["output"] = {"shard_queries": 300, **options.get("output", {})}
+        return Import.prepare(file, ImportConfig.model_validate(options))
+
+    return open_
+
+
+def test_values_are_those_of_the_reference_plane(opened: Open, tmp_path: Path) -> None:
+    job = opened(Images(), queries={"train": "20/texel", "test": "150", "min_cos": 0.2})
+    summary = import_measured(job, tmp_path / "shards")
+    assert summary.complete
+    assert verify(tmp_path / "shards") == []
+    data = Dataset.open(tmp_path / "shards")
+    assert (data.lattice.finest, data.lattice.aspect, data.estimates) == (4, 0.5, 1)
+    assert data.geometry() is None
+    for split, count in (("train", 20 * 72), ("test", 150)):
+        arrays = data.load(split)
+        assert set(arrays) == {"u", "sigma", "omega_i", "omega_o", "value_a"}
+        assert len(arrays["sigma"]) == count
+        # The stored cosine is divided out.
+        expected = known(arrays["u"], arrays["omega_i"], arrays["omega_o"])
+        np.testing.assert_allclose(arrays["value_a"], expected, rtol=1e-5)
+        np.testing.assert_allclose(arrays["sigma"], 0.5 / 12)
+        assert min(arrays["omega_i"][:, 2].min(), arrays["omega_o"][:, 2].min()) >= 0.2
+    measured = data.manifest["measured"]
+    assert measured["divided_by_cosine"]
+    assert measured["left_out"] + sum(map(len, job.pairs or ())) == 64 + 3
+
+
+def test_test_queries_have_pairs_of_their_own(opened: Open, tmp_path: Path) -> None:
+    import_measured(opened(Images(), queries={"test": "500"}), tmp_path / "shards")
+    data = Dataset.open(tmp_path / "shards")
+    train, test = (
+        {tuple(p) for p in np.concatenate([a["omega_i"], a["omega_o"]], 1).tolist()}
+        for a in (data.load("train"), data.load("test"))
+    )
+    assert len(test) == 3
+    assert not train & test
+    assert len(train | test) > 55
+
+
+def test_options_of_values(opened: Open, tmp_path: Path) -> None:
+    plain = opened(Images(), queries={"train": "300", "test": "1"}, seed=3)
+    import_measured(plain, tmp_path / "plain")
+    kept = opened(Images(), queries={"train": "300", "test": "1"}, seed=3, cosine="excluded", scale=2.0)
+    import_measured(kept, tmp_path / "kept")
+    a, b = (Dataset.open(tmp_path / name).load("train") for name in ("plain", "kept"))
+    assert (a["u"] == b["u"]).all()
+    np.testing.assert_allclose(b["value_a"], 2.0 * a["value_a"] * a["omega_i"][:, 2:], rtol=1e-5)
+    silent = Images()
+    silent.cosine = None
+    with pytest.raises(InputError, match="does not say whether values include the cosine"):
+        import_measured(opened(silent), tmp_path / "silent")
+    with pytest.raises(InputError, match="no pair of light and view"):
+        opened(Images(), queries={"min_cos": 0.9999})
+
+
+def test_an_interrupted_import_resumes_with_the_same_bytes(opened: Open, tmp_path: Path) -> None:
+    queries = {"train": "20/texel", "test": "100"}
+    import_measured(opened(Images(), queries=queries), tmp_path / "whole")
+    for name in ("train-00002.json", "train-00004.npz"):
+        job = opened(Images(), queries=queries)
+        import_measured(job, tmp_path / "part")
+        before = {p.name: p.read_bytes() for p in (tmp_path / "part").glob("*.npz")}
+        (tmp_path / "part" / name).unlink()
+        import_measured(opened(Images(), queries=queries), tmp_path / "part")
+        assert {p.name: p.read_bytes() for p in (tmp_path / "part").glob("*.npz")} == before
+    assert before == {p.name: p.read_bytes() for p in (tmp_path / "whole").glob("*.npz")}
+    again = Images()
+    import_measured(opened(again, queries=queries), tmp_path / "part")
+    assert again.calls == 0
+    with pytest.raises(InputError, match="seed"):
+        import_measured(opened(Images(), queries=queries, seed=1), tmp_path / "part")
+    import_measured(opened(Images(), queries=queries, seed=1), tmp_path / "part", overwrite=True)
+    with pytest.raises(InputError, match="cannot be generated again"):
+        Corruption(tmp_path / "part")
+
+
+def test_blocks_of_a_list_keep_every_query_once(
+    opened: Open, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(imported, "_AT_ONCE", 512)
+    source = Listed()
+    import_measured(opened(source, queries={"test": "100"}), tmp_path / "shards")
+    data = Dataset.open(tmp_path / "shards")
+    parts = [data.load(split) for split in ("train", "test")]
+    assert [len(p["sigma"]) for p in parts] == [900, 100]
+
+    def rows(*arrays: Any) -> list[tuple[float, ...]]:
+        return sorted(map(tuple, np.concatenate(arrays, 1).tolist()))
+
+    found = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
+    names = ("u", "omega_i", "omega_o")
+    assert rows(*(found[n] for n in names), found["value_a"]) == rows(
+        *(source.arrays[n] for n in names), source.arrays["value"]
+    )
+    # In random order, and test queries from the whole list.
+    assert (found["u"][:100] != source.arrays["u"][:100]).any()
+    order = {tuple(u): k for k, u in enumerate(source.arrays["u"].tolist())}
+    at = [order[tuple(u)] for u in parts[1]["u"].tolist()]
+    assert min(at) < 50
+    assert max(at) > 950
+
+
+def test_errors_of_a_fit_include_the_noise(opened: Open, tmp_path: Path) -> None:
+    class Noisy(Images):
+        def values(self, pair: Any, texel: Any) -> Any:
+            noise = np.random.default_rng(0).normal(0, 0.05, (len(pair), 1)).astype(np.float32)
+            return super().values(pair, texel) + noise * self.light[pair, 2:]
+
+    queries = {"train": "200/texel", "test": "2000", "min_cos": 0.2}
+    import_measured(opened(Noisy(lights=16), queries=queries), tmp_path / "shards")
+    config = FitConfig.model_validate({"model": "neumip-baseline", "training": {"steps": 200, "batch": 4096}})
+    result = fit(config, tmp_path / "shards", tmp_path / "fit")
+    test = result.errors["test"]
+    assert test["includes_noise"]
+    assert test["mse"]["value"] == pytest.approx(0.05**2, rel=0.15)
+    assert result.material.description["training"]["noise_variance"] is None
+    assert any("include the noise of the data" in line for line in summarize_errors(result.errors))
+    streamed = load_training(Dataset.open(tmp_path / "shards"), config.held_out, 0, memory=None).training
+    kept = load_training(Dataset.open(tmp_path / "shards"), config.held_out, 0).training
+    assert (streamed.slice(5, 50).value == kept.slice(5, 50).value).all()  # type: ignore[union-attr]
