@@ -18,7 +18,7 @@ from torch import Tensor
 
 from mbtf_core.errors import InputError
 from mbtf_fit.config import FitConfig, TrainingSection
-from mbtf_fit.data.images import Patches, TrainingImages
+from mbtf_fit.data.images import TrainingImages
 from mbtf_fit.data.queries import HINT_BYTES, QUERY_BYTES, ShardQueries, TrainingQueries
 from mbtf_fit.data.streaming import Selection, StreamedQueries
 from mbtf_fit.material.inference import predict
@@ -29,7 +29,7 @@ from mbtf_fit.models.learned_relief import LearnedRelief
 from mbtf_fit.models.neumip import Neumip
 from mbtf_fit.models.relief import Relief
 from mbtf_fit.native import kernel
-from mbtf_fit.native.model import supports
+from mbtf_fit.native.model import supports, supports_patches
 from mbtf_fit.native.stepper import NativeStepper
 from mbtf_fit.objective.losses import Objective
 from mbtf_fit.objective.noise import NoiseModel
@@ -112,7 +112,9 @@ class Trainer:
         self.weight_decay = WeightDecay.of(config.training, noise.ratio, len(queries))
         found = kernel()
         self._stepper = (
-            NativeStepper(found, model, self.optimizer) if found is not None and supports(model) else None
+            NativeStepper(found, model, self.optimizer)
+            if found is not None and (supports(model) or supports_patches(model))
+            else None
         )
 
     @property
@@ -217,7 +219,7 @@ class Trainer:
         self._follow_heights()
         if isinstance(self.model, Relief) and isinstance(batch, TrainingQueries) and batch.hints is None:
             batch = replace(batch, hints=_hints(self.model, batch))
-        if self._stepper is not None and not isinstance(batch, Patches):
+        if self._stepper is not None:
             return self._stepper.step(self.loss, batch, self._sigmas(), workers)
         texels, weights = self.model.parameter_groups()
         # Lookups read detached tables; their gradients pass through the blur once, for the whole batch.
