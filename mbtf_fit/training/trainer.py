@@ -232,7 +232,9 @@ class Trainer:
         for p, g in zip(texels, torch.autograd.grad(tables, texels, by_table), strict=True):
             p.grad = g
         for p, g in zip(weights, by_weight, strict=True):
-            p.grad = g
+            # Convolutions return gradients with the channels last in memory, which PyTorch's fused Adam on CPUs
+            # reads in the order of the parameter.
+            p.grad = g.contiguous()
         self.optimizer.step()
         return loss
 
