@@ -22,7 +22,7 @@ from mbtf_fit.objective.losses import Objective, Quadratic
 from mbtf_fit.objective.parallel import Workers
 
 # Bytes of activations per piece: about a core's part of the last-level cache.
-PIECE_BYTES = 6 << 20
+_PIECE_BYTES = 6 << 20
 
 
 def query_pointers(batch: TrainingQueries, start: int, stop: int) -> QueryPointers:
@@ -126,7 +126,7 @@ class NativeGradients(CollectedGradients):
         super().__init__(native)
         block = native.kernel.block
         per_block = 4 * native.kernel.library.mbtf_state_floats(ctypes.byref(native.description))
-        self.piece = block * max(4, PIECE_BYTES // per_block)
+        self.piece = block * max(4, _PIECE_BYTES // per_block)
         self._sums: list[_QuerySums] = []
         self.depth_weights = torch.zeros(MAX_LEVELS)
 

@@ -17,7 +17,7 @@ from mbtf_fit.data.images import Patches
 from mbtf_fit.models.encodings import position_factors
 from mbtf_fit.models.hierarchical import Hierarchical
 from mbtf_fit.models.inception import InceptionDecoder
-from mbtf_fit.native.gradients import PIECE_BYTES, CollectedGradients, Sums, quadratic_form, total_of
+from mbtf_fit.native.gradients import CollectedGradients, Sums, quadratic_form, total_of
 from mbtf_fit.native.library import PatchPointers
 from mbtf_fit.native.model import NativeModel, aligned, inception_parameters, pointers, share
 from mbtf_fit.objective.losses import Objective
@@ -25,6 +25,8 @@ from mbtf_fit.objective.parallel import Workers
 
 # Positions of a group of patches, whose activations stay in the cache.
 _GROUP = 2048
+# Bytes of activations whose loss PyTorch computes at once: its operations on few values are mostly overhead.
+_PIECE_BYTES = 24 << 20
 
 
 class PatchInputs:
@@ -115,7 +117,7 @@ class _PatchSums(Sums):
             self.inception = aligned(int(native.kernel.library.mbtf_lanes()) * numbers)
             self.pointers.inception = self.inception.data_ptr()
         state, scratch = _floats(native, inputs)
-        groups = max(1, PIECE_BYTES // (4 * state))
+        groups = max(1, _PIECE_BYTES // (4 * state))
         # Items whose loss PyTorch computes at once.
         self.piece = groups * inputs.group
         self.state, self.scratch = aligned(groups * state), aligned(scratch)

@@ -217,6 +217,7 @@ class Trainer:
             group["lr"] = rate
         self.weight_decay.apply(self.model, *rates)
         self._follow_heights()
+        self.loss.fraction = self.fraction
         if isinstance(self.model, Relief) and isinstance(batch, TrainingQueries) and batch.hints is None:
             batch = replace(batch, hints=_hints(self.model, batch))
         if self._stepper is not None:
@@ -232,8 +233,8 @@ class Trainer:
         for p, g in zip(texels, torch.autograd.grad(tables, texels, by_table), strict=True):
             p.grad = g
         for p, g in zip(weights, by_weight, strict=True):
-            # Convolutions return gradients with the channels last in memory, which PyTorch's fused Adam on CPUs
-            # reads in the order of the parameter.
+            # Gradients of convolutions have the channels last in memory, which PyTorch's fused Adam does not
+            # support on CPUs: it would mix up the weights.
             p.grad = g.contiguous()
         self.optimizer.step()
         return loss

@@ -204,7 +204,7 @@ def test_outputs_of_any_size_give_finite_values(variant: str) -> None:
 @needs_kernel
 @pytest.mark.parametrize("kind", ["log", "fourth-root"])
 def test_other_losses_go_through_pytorch_in_pieces(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mbtf_fit.native.gradients.PIECE_BYTES", 1)
+    monkeypatch.setattr("mbtf_fit.native.gradients._PIECE_BYTES", 1)
     model, batch = random_model("neumip", LATTICE), random_batch(1500)
     loss = objective(losses=[{"kind": kind, "weight": 1.0}, {"kind": "relative", "weight": 0.5}])
     assert loss.quadratic() is None

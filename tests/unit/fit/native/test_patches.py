@@ -211,7 +211,7 @@ def test_patches_of_any_size(size: int) -> None:
 
 
 def test_other_losses_go_through_pytorch_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mbtf_fit.native.patches.PIECE_BYTES", 1)
+    monkeypatch.setattr("mbtf_fit.native.patches._PIECE_BYTES", 1)
     for decoder in ("inception", "mlp"):
         model = random_model(decoder=decoder)
         loss = objective(losses=[{"kind": "fourth-root"}, {"kind": "gradient"}], correction="none")
