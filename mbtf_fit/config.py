@@ -125,6 +125,7 @@ class LossTerm(Settings):
 
     kind: LossKind
     weight: float = Field(1.0, gt=0, le=1e6)
+    start: float = Field(0.0, ge=0, lt=1, description="fraction of the training after which the term counts")
 
 
 class TrainingSection(Settings):
@@ -147,7 +148,7 @@ class TrainingSection(Settings):
     losses: tuple[LossTerm, ...] = Field(
         (LossTerm(kind="relative", weight=1.0),),
         min_length=1,
-        description="terms of the loss, which are added: {kind, weight}",
+        description="terms of the loss, which are added: {kind, weight, start}",
     )
     correction: Correction = Field(
         "linear", description="correction of the bias of nonlinear losses by noise"
@@ -190,6 +191,12 @@ class TrainingSection(Settings):
         True, description="after training, scale the mean reflectance at each elevation to that of the data"
     )
     blur: BlurSection = BlurSection()
+
+    @model_validator(mode="after")
+    def _some_loss(self) -> TrainingSection:
+        if all(term.start > 0 for term in self.losses):
+            raise ValueError("losses: no term counts from the start: set start of one of them to 0")
+        return self
 
 
 class DataSection(Settings):

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -25,6 +26,12 @@ from mbtf_core.lattice import Lattice, level_of_sigma
 def philox(seed: int, stream: int) -> np.random.Generator:
     """Generator of a numbered random stream."""
     return np.random.Generator(np.random.Philox(key=[seed, stream]))
+
+
+@lru_cache(maxsize=4)
+def _order(seed: int, epoch: int, count: int) -> NDArray[np.int64]:
+    """Order in which an epoch visits the images."""
+    return philox(seed, 2 * epoch).permutation(count)
 
 
 @dataclass(frozen=True)
@@ -153,7 +160,7 @@ class TrainingImages:
         side = min(self.patch_size, rows, columns, max(1, round(size**0.5)))
         items = max(1, size // side**2)
         epochs, position = np.divmod(np.arange(step * items, (step + 1) * items), count)
-        order = {int(s): philox(seed, 2 * int(s)).permutation(count) for s in np.unique(epochs)}
+        order = {int(s): _order(seed, int(s), count) for s in np.unique(epochs)}
         return np.array([order[int(s)][p] for s, p in zip(epochs, position, strict=True)]), side
 
     def batch_ranges(self, size: int, seed: int, step: int) -> list[range]:

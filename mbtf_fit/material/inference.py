@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import numpy as np
 import torch
@@ -15,7 +16,8 @@ from mbtf_fit.models.neumip import Neumip
 from mbtf_fit.models.relief import Relief
 from mbtf_fit.native import Kernel, kernel
 from mbtf_fit.native.library import QueryPointers
-from mbtf_fit.native.model import NativeModel, supports
+from mbtf_fit.native.model import NativeModel, supports, supports_patches
+from mbtf_fit.native.patches import evaluate as evaluate_hierarchical
 
 # Queries per chunk: bounds memory and keeps activations in the cache.
 _CHUNK = 1 << 15
@@ -56,11 +58,29 @@ def predict(
     found = kernel()
     if found is not None and supports(model):
         return _predict_natively(found, model, hints, u, sigma, omega_i, omega_o)
+    if found is not None and supports_patches(model):
+        return _predict_patches(found, model, u, sigma, omega_i, omega_o)
     device = next(model.parameters()).device
     arrays = (u, sigma, omega_i, omega_o, *([] if hints is None else [hints.cpu()]))
     return evaluate_in_chunks(
         lambda *a: model(*a).clamp_min(0), device, 3, *arrays, chunk=max(1, _CHUNK // model.positions)
     )
+
+
+def _predict_patches(found: Kernel, model: NeuralMaterial, *arrays: ArrayLike) -> NDArray[np.float32]:
+    native = NativeModel(found, model)
+    inputs = [np.asarray(a, np.float32) for a in arrays]
+    n = len(inputs[1])
+
+    def evaluate(start: int, stop: int) -> NDArray[np.float32]:
+        part = (a[start:stop] for a in inputs)
+        return evaluate_in_chunks(partial(evaluate_hierarchical, native), device, 3, *part, chunk=chunk)
+
+    device, chunk = torch.device("cpu"), max(1, _CHUNK // model.positions)
+    count = max(1, min(torch.get_num_threads(), n // chunk))
+    edges = [n * k // count for k in range(count + 1)]
+    with ThreadPoolExecutor(count) as pool:
+        return np.concatenate(list(pool.map(evaluate, edges[:-1], edges[1:])))
 
 
 def _predict_natively(

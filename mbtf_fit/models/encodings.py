@@ -29,20 +29,30 @@ def encode(p: Tensor, bands: int, pi: bool, options: EncodingSection, spread: Te
     """
     if bands == 0:
         return p
-    frequencies = 2.0 ** torch.arange(bands, dtype=p.dtype, device=p.device)
-    if pi:
-        frequencies = frequencies * math.pi
+    frequencies = _frequencies(bands, pi, p)
     angles = (p[..., None] * frequencies).flatten(-2)
     sines, cosines = angles.sin(), angles.cos()
     if spread is not None or options.band_attenuation:
-        size = torch.ones_like(frequencies)
-        if options.band_attenuation:
-            size = size * frequencies[0] / frequencies
-        if spread is not None:
-            size = size * (-0.5 * (spread[..., None] * frequencies).square()).exp()
+        size = _band_factors(frequencies, options, spread)
         size = size.expand(*size.shape[:-2], p.shape[-1], bands).flatten(-2)
         sines, cosines = sines * size, cosines * size
     return torch.cat([*([p] if options.raw else []), sines, cosines], -1)
+
+
+def _frequencies(bands: int, pi: bool, like: Tensor) -> Tensor:
+    """Frequencies (bands,), of the type of another tensor."""
+    frequencies = 2.0 ** torch.arange(bands, dtype=like.dtype, device=like.device)
+    return frequencies * math.pi if pi else frequencies
+
+
+def _band_factors(frequencies: Tensor, options: EncodingSection, spread: Tensor | None) -> Tensor:
+    """Factors of sines and cosines (..., bands) by attenuation and spread (...)."""
+    size = torch.ones_like(frequencies)
+    if options.band_attenuation:
+        size = size * frequencies[0] / frequencies
+    if spread is not None:
+        size = size * (-0.5 * (spread[..., None] * frequencies).square()).exp()
+    return size
 
 
 def encode_direction(omega: Tensor, options: EncodingSection) -> Tensor:
@@ -83,10 +93,21 @@ def encode_position(u: Tensor, level: Tensor, aspect: float, options: EncodingSe
     """
     if options.position == 0:
         return u[..., :0]
-    spread = None
-    if options.footprint_filtered:
-        spread = torch.exp2(-level)[..., None] / u.new_tensor([1.0, aspect])
+    spread = _position_spread(level, aspect) if options.footprint_filtered else None
     return encode(2.0 * (u - u.floor()) - 1.0, options.position, options.pi, options, spread)
+
+
+def _position_spread(level: Tensor, aspect: float) -> Tensor:
+    """Standard deviation (..., 2) of p over the footprint at fractional levels (...)."""
+    return torch.exp2(-level)[..., None] / level.new_tensor([1.0, aspect])
+
+
+def position_factors(level: Tensor, aspect: float, options: EncodingSection) -> Tensor:
+    """Factors of the sines, and of the cosines, of :func:`encode_position` at levels (n,): (n, 2·bands), all
+    bands of the first coordinate, then those of the second."""
+    frequencies = _frequencies(options.position, options.pi, level)
+    spread = _position_spread(level, aspect) if options.footprint_filtered else None
+    return _band_factors(frequencies, options, spread).expand(len(level), 2, -1).flatten(1)
 
 
 def directions_formula(options: EncodingSection) -> str:

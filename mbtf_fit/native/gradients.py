@@ -9,13 +9,15 @@ on the number of threads only.
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from mbtf_fit.data.queries import TrainingQueries
+from mbtf_fit.models.relief import Relief
 from mbtf_fit.native.library import MAX_LEVELS, GradientSums, QuadraticLoss, QueryPointers
-from mbtf_fit.native.model import NativeModel, aligned, networks, pointers, share
+from mbtf_fit.native.model import NativeModel, aligned, network_weights, networks, pointers, share
 from mbtf_fit.objective.losses import Objective, Quadratic
 from mbtf_fit.objective.parallel import Workers
 
@@ -32,50 +34,113 @@ def query_pointers(batch: TrainingQueries, start: int, stop: int) -> QueryPointe
     return QueryPointers(stop - start, *addresses)
 
 
-class _Sums:
-    """Sums and working memory of one thread."""
+def total_of(losses: Sequence[Tensor]) -> Tensor:
+    """Sum of the threads' losses, in a fixed order: it does not depend on which thread finishes first."""
+    total = losses[0]
+    for loss in losses[1:]:
+        total = total + loss
+    return total
 
-    def __init__(self, native: NativeModel, piece: int) -> None:
+
+class Sums:
+    """Sums of gradients of one thread."""
+
+    def __init__(self, native: NativeModel) -> None:
         lanes = int(native.kernel.library.mbtf_lanes())
         textures = native.model.textures()
         self.textures = [aligned(t.packing.texels * (-(-t.texels.shape[1] // 8) * 8)) for t in textures]
         self.networks = [
-            aligned(lanes * sum(p.numel() for p in network.parameters()))
-            for network in networks(native.model)
+            aligned(lanes * sum(w.numel() for w in weights)) for weights in network_weights(native.model)
         ]
-        self.state = native.state(piece)
-        self.scratch = aligned(int(native.kernel.library.mbtf_scratch_floats()))
-        self.out = torch.empty(max(piece, 2 * native.kernel.block), 3)
         addresses = [t.data_ptr() for t in self.textures], [t.data_ptr() for t in self.networks]
         texture, network = ([*a, 0][:2] for a in addresses)
         self.depth_weights = torch.zeros(MAX_LEVELS)
         self.pointers = GradientSums(*texture, *network, self.depth_weights.data_ptr())
 
 
-class NativeGradients:
-    """Computes gradients of one model for many batches; holds the memory for it.
+class _QuerySums(Sums):
+    """Sums, and working memory for a piece of queries."""
+
+    def __init__(self, native: NativeModel, piece: int) -> None:
+        super().__init__(native)
+        self.state = native.state(piece)
+        self.scratch = aligned(int(native.kernel.library.mbtf_scratch_floats()))
+        self.out = torch.empty(max(piece, 2 * native.kernel.block), 3)
+
+
+def quadratic_form(loss: Quadratic) -> QuadraticLoss:
+    """A quadratic loss, as the kernel takes it."""
+    bound = (ctypes.c_float * 3)(*(loss.bound or (0.0, 0.0, 0.0)))
+    return QuadraticLoss(loss.relative, loss.squared, loss.scale, bound, loss.bound is not None)
+
+
+class CollectedGradients:
+    """Gradients of one model, collected from the sums of all threads.
 
     Attributes
     ----------
     textures, networks : gradients by the tables and by the weights of each network, of the last batch
-    depth_weights : those by the depth weights of relief
     """
 
     def __init__(self, native: NativeModel) -> None:
         self.native = native
+        self.textures = [torch.empty_like(t.texels) for t in native.model.textures()]
+        self.networks = [[torch.empty_like(w) for w in n] for n in network_weights(native.model)]
+
+    def collect(self, sums: Sequence[Sums], workers: Workers) -> None:
+        """Move the threads' sums to the gradients."""
+        library = self.native.kernel.library
+        for k, gradients in enumerate(self.networks):
+            description = (self.native.description.decoder, self.native.description.offset)[k]
+            addresses = pointers([s.networks[k] for s in sums])
+            library.mbtf_collect_weights(ctypes.byref(description), addresses, len(sums), pointers(gradients))
+        workers.each(lambda part: self._collect_textures(sums, part))
+
+    def _collect_textures(self, sums: Sequence[Sums], part: int) -> None:
+        kernel, count = self.native.kernel, len(sums)
+        for k, gradient in enumerate(self.textures):
+            texels, channels = gradient.shape
+            addresses = pointers([s.textures[k] for s in sums])
+            edges = share(texels, part, count)
+            kernel.library.mbtf_collect(
+                kernel.variant, addresses, count, channels, *edges, gradient.data_ptr()
+            )
+
+    def weights(self) -> dict[Tensor, Tensor]:
+        """Gradients by all parameters but the texels."""
+        found: dict[Tensor, Tensor] = {}
+        for network, gradients in zip(networks(self.native.model), self.networks, strict=True):
+            found.update(zip(network.parameters(), gradients, strict=True))
+        return found
+
+
+class NativeGradients(CollectedGradients):
+    """Computes gradients of one model for many batches; holds the memory for it.
+
+    Attributes
+    ----------
+    depth_weights : gradients by the depth weights of relief
+    """
+
+    def __init__(self, native: NativeModel) -> None:
+        super().__init__(native)
         block = native.kernel.block
         per_block = 4 * native.kernel.library.mbtf_state_floats(ctypes.byref(native.description))
         self.piece = block * max(4, _PIECE_BYTES // per_block)
-        self._sums: list[_Sums] = []
+        self._sums: list[_QuerySums] = []
         self.depth_weights = torch.zeros(MAX_LEVELS)
-        self.textures = [torch.empty_like(t.texels) for t in native.model.textures()]
-        self.networks = [[torch.empty_like(p) for p in n.parameters()] for n in networks(native.model)]
+
+    def weights(self) -> dict[Tensor, Tensor]:
+        found, model = super().weights(), self.native.model
+        if isinstance(model, Relief):
+            found[model.depth_weights] = self.depth_weights[: len(model.depth_weights)].contiguous()
+        return found
 
     def compute(self, objective: Objective, batch: TrainingQueries, workers: Workers) -> Tensor:
         """Mean loss of a batch; the gradients by tables and weights are left in :attr:`textures` and
         :attr:`networks`."""
         if len(self._sums) != workers.count:
-            self._sums = [_Sums(self.native, self.piece) for _ in range(workers.count)]
+            self._sums = [_QuerySums(self.native, self.piece) for _ in range(workers.count)]
         self.native.refresh()
         quadratic = objective.quadratic()
 
@@ -90,22 +155,17 @@ class NativeGradients:
             return total
 
         losses = workers.each(work)
-        for k, gradients in enumerate(self.networks):
-            self._collect_network(k, gradients)
-        workers.each(self._collect_textures)
+        self.collect(self._sums, workers)
         self.depth_weights = torch.stack([s.depth_weights for s in self._sums]).sum(0)
         for sums in self._sums:
             sums.depth_weights.zero_()
-        # Added in a fixed order: the sum does not depend on which thread finishes first.
-        total = losses[0]
-        for loss in losses[1:]:
-            total = total + loss
-        return total
+        return total_of(losses)
 
-    def _learn(self, sums: _Sums, loss: Quadratic, batch: TrainingQueries, start: int, stop: int) -> Tensor:
+    def _learn(
+        self, sums: _QuerySums, loss: Quadratic, batch: TrainingQueries, start: int, stop: int
+    ) -> Tensor:
         native = self.native
-        bound = (ctypes.c_float * 3)(*(loss.bound or (0.0, 0.0, 0.0)))
-        form = QuadraticLoss(loss.relative, loss.squared, loss.scale, bound, loss.bound is not None)
+        form = quadratic_form(loss)
         queries = query_pointers(batch, start, stop)
         weight = 1.0 / (3 * len(batch))
         total = native.kernel.library.mbtf_learn(
@@ -123,7 +183,7 @@ class NativeGradients:
         return torch.tensor(weight * total)
 
     def _piece(
-        self, sums: _Sums, objective: Objective, batch: TrainingQueries, start: int, stop: int
+        self, sums: _QuerySums, objective: Objective, batch: TrainingQueries, start: int, stop: int
     ) -> Tensor:
         native, part = self.native, batch.slice(start, stop)
         queries = query_pointers(batch, start, stop)
@@ -142,20 +202,3 @@ class NativeGradients:
             ctypes.byref(sums.pointers),
         )
         return loss.detach()
-
-    def _collect_network(self, k: int, gradients: list[Tensor]) -> None:
-        description = (self.native.description.decoder, self.native.description.offset)[k]
-        self.native.kernel.library.mbtf_collect_weights(
-            ctypes.byref(description),
-            pointers([s.networks[k] for s in self._sums]),
-            len(self._sums),
-            pointers(gradients),
-        )
-
-    def _collect_textures(self, part: int) -> None:
-        kernel, count = self.native.kernel, len(self._sums)
-        for k, gradient in enumerate(self.textures):
-            texels, channels = gradient.shape
-            sums = pointers([s.textures[k] for s in self._sums])
-            edges = share(texels, part, count)
-            kernel.library.mbtf_collect(kernel.variant, sums, count, channels, *edges, gradient.data_ptr())

@@ -16,7 +16,10 @@ from mbtf_fit.models.constants import (
     LEAST_FACING,
     OFFSET_SCALE,
     direction_size,
+    directions_size,
 )
+from mbtf_fit.models.hierarchical import Hierarchical
+from mbtf_fit.models.inception import InceptionDecoder
 from mbtf_fit.models.interface import NeuralMaterial
 from mbtf_fit.models.learned_relief import LearnedRelief
 from mbtf_fit.models.mlp import Mlp
@@ -47,31 +50,75 @@ _SUPPORTED: dict[str, tuple[Any, ...]] = {
         for half in (False, True)
     ),
 }
+# Those of the model `hierarchical`: its encodings are supported by :func:`supports_patches`.
+_SUPPORTED_PATCHES: dict[str, tuple[Any, ...]] = {
+    **{name: values for name, values in _SUPPORTED.items() if name != "encoding"},
+    "decoder": ("mlp", "inception"),
+    "output_transform": ("expm1", "fourth-root"),
+}
 _SIZES = {"channels", "width", "layers", "oversampling", "relief"}
 
 
 def supports(model: NeuralMaterial) -> bool:
-    """Whether the kernel can evaluate a model."""
-    if type(model) not in (Neumip, NeumipBaseline, LearnedRelief, Relief):
-        return False
-    options, textures = model.network.model_dump(), model.textures()
-    tensors = [*model.parameters(), *(t.table for t in textures)]
+    """Whether the kernel can evaluate a model on single queries."""
+    known = type(model) in (Neumip, NeumipBaseline, LearnedRelief, Relief)
+    return known and _has(model, _SUPPORTED) and _fits(model)
+
+
+def supports_patches(model: NeuralMaterial) -> bool:
+    """Whether the kernel can evaluate a model on patches (:mod:`mbtf_fit.native.patches`)."""
+    encoding = model.network.encoding
     return (
-        options.keys() == _SUPPORTED.keys() | _SIZES
-        and all(options[name] in supported for name, supported in _SUPPORTED.items())
-        and all(t.device.type == "cpu" and t.dtype == torch.float32 for t in tensors)
-        and all(len(network.weights) <= MAX_LAYERS for network in networks(model))
-        and all(max(w.shape) <= MAX_WIDTH for network in networks(model) for w in network.weights)
+        type(model) is Hierarchical
+        and _has(model, _SUPPORTED_PATCHES)
+        and (encoding.position == 0 or (encoding.pi and not encoding.raw))
+        and _fits(model)
+    )
+
+
+def _has(model: NeuralMaterial, supported: dict[str, tuple[Any, ...]]) -> bool:
+    """Whether all options of the architecture have supported values."""
+    options = model.network.model_dump()
+    return options.keys() == _SUPPORTED.keys() | _SIZES and all(
+        options[name] in values for name, values in supported.items()
+    )
+
+
+def _fits(model: NeuralMaterial) -> bool:
+    """Whether a model is on the CPU, and within the kernel's sizes."""
+    textures = model.textures()
+    tensors = [*model.parameters(), *(t.table for t in textures)]
+    weights = network_weights(model)
+    return (
+        all(t.device.type == "cpu" and t.dtype == torch.float32 for t in tensors)
+        and all(len(network) <= 2 * MAX_LAYERS for network in weights)
+        and all(max(w.shape) <= MAX_WIDTH for network in weights for w in network)
         and all(t.texels.shape[1] <= MAX_CHANNELS and len(t.packing.shapes) <= MAX_LEVELS for t in textures)
         and all(t.packing.texels < 1 << 31 for t in textures)
     )
 
 
 def networks(model: NeuralMaterial) -> list[Mlp]:
-    """Networks that the kernel evaluates: the decoder, and the offset network if there is one."""
-    assert isinstance(model, Neumip)
-    assert isinstance(model.decoder, Mlp)
-    return [model.decoder, *([] if model.network.offset == "none" else [model.offset_network])]
+    """Fully connected networks that the kernel evaluates: the decoder if it is one, and the offset network if
+    there is one."""
+    decoder = [model.decoder] if isinstance(model.decoder, Mlp) else []
+    return [*decoder, *([] if model.network.offset == "none" else [model.offset_network])]
+
+
+def network_weights(model: NeuralMaterial) -> list[list[Tensor]]:
+    """Weight 0 (outputs, inputs), bias 0, ... of the networks that the kernel evaluates: the decoder, and the
+    offset network if there is one. Of an inception decoder, they are those of its first layer for inputs
+    that differ between the positions of a patch, with biases 0."""
+    found = [[p.detach() for p in network.parameters()] for network in networks(model)]
+    if isinstance(model.decoder, InceptionDecoder):
+        first = model.decoder.first
+        found.insert(0, [first.matrix[:, : model.decoder.features].detach(), torch.zeros_like(first.bias)])
+    return found
+
+
+def inception_parameters(decoder: InceptionDecoder) -> list[Tensor]:
+    """Weight and bias of each convolution behind the first layer."""
+    return [*decoder.modules_.parameters(), *decoder.last.parameters()]
 
 
 def pointers(tensors: list[Tensor]) -> Any:
@@ -109,14 +156,20 @@ class NativeModel:
             d.hints, d.frame, d.gate = relief.hints, relief.frame, relief.gate
         if isinstance(model, LearnedRelief):
             d.height_scale, d.least_facing = HEIGHT_SCALE, LEAST_FACING
-        self._networks: list[tuple[Mlp, Network, Tensor]] = []
-        for network, target in zip(networks(model), (d.decoder, d.offset), strict=False):
-            widths = [network.weights[0].shape[1], *(len(w) for w in network.weights)]
-            target.layers, target.wanted = len(network.weights), model.textures()[0].texels.shape[1]
+        if isinstance(model, Hierarchical):
+            d.fourth_root = model.network.output_transform == "fourth-root"
+            d.bands, d.inputs = encoding.position, directions_size(encoding)
+        self._inception: tuple[InceptionDecoder, Tensor] | None = None
+        if isinstance(model.decoder, InceptionDecoder):
+            self._describe_inception(model.decoder)
+        self._networks: list[tuple[Network, Tensor]] = []
+        for weights, target in zip(network_weights(model), (d.decoder, d.offset), strict=False):
+            widths = [weights[0].shape[1], *(len(w) for w in weights[::2])]
+            target.layers, target.wanted = len(weights) // 2, model.textures()[0].texels.shape[1]
             target.widths[: len(widths)] = widths
             packed = aligned(kernel.library.mbtf_packed_floats(ctypes.byref(target)))
             target.packed = packed.data_ptr()
-            self._networks.append((network, target, packed))
+            self._networks.append((target, packed))
         self._textures = list(zip(model.textures(), (d.pyramid, d.offset_texture), strict=False))
         for texture, layout in self._textures:
             shapes = texture.packing.shapes
@@ -126,14 +179,28 @@ class NativeModel:
             layout.starts[: len(shapes) + 1] = texture.packing.starts
         self.refresh()
 
+    def _describe_inception(self, decoder: InceptionDecoder) -> None:
+        target, module = self.description.inception, decoder.modules_[0]
+        target.modules, target.width = len(decoder.modules_), len(decoder.first.bias)
+        for name in ("one", "before3", "three", "before5", "five"):
+            setattr(target, name, len(getattr(module, name).bias))
+        self.description.inputs = target.width
+        packed = aligned(self.kernel.library.mbtf_inception_floats(ctypes.byref(target)))
+        target.packed = packed.data_ptr()
+        self._inception = decoder, packed
+
     def refresh(self) -> None:
         """Copy the current weights, and the tables that lookups read."""
         library, variant = self.kernel.library, self.kernel.variant
-        assert isinstance(self.model, Neumip)
         self.description.unit = float(self.model.unit)
-        for network, target, packed in self._networks:
-            held = [p.detach().contiguous() for p in network.parameters()]
+        for weights, (target, packed) in zip(network_weights(self.model), self._networks, strict=True):
+            held = [w.contiguous() for w in weights]
             library.mbtf_pack(variant, ctypes.byref(target), pointers(held), packed.data_ptr())
+        if self._inception is not None:
+            decoder, packed = self._inception
+            held = [p.detach().contiguous() for p in inception_parameters(decoder)]
+            inception = ctypes.byref(self.description.inception)
+            library.mbtf_pack_inception(variant, inception, pointers(held), packed.data_ptr())
         if isinstance(self.model, Relief):
             self._depth_weights = self.model.depth_weights.detach().contiguous()
             self.description.depth_weights = self._depth_weights.data_ptr()

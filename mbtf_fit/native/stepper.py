@@ -10,15 +10,17 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
+from mbtf_fit.data.images import Patches
 from mbtf_fit.data.queries import TrainingQueries
+from mbtf_fit.models.hierarchical import Hierarchical
 from mbtf_fit.models.interface import NeuralMaterial
-from mbtf_fit.models.relief import Relief
 from mbtf_fit.native.blur import Blur
 from mbtf_fit.native.gradients import NativeGradients
 from mbtf_fit.native.library import AdamStep, Kernel
-from mbtf_fit.native.model import NativeModel, networks, share
+from mbtf_fit.native.model import NativeModel, share
+from mbtf_fit.native.patches import PatchGradients
 from mbtf_fit.objective.losses import Objective
-from mbtf_fit.objective.parallel import Workers
+from mbtf_fit.objective.parallel import Batch, Workers
 
 # Parameters with fewer numbers are updated by one thread.
 _SMALL = 1 << 14
@@ -32,15 +34,17 @@ class NativeStepper:
         self.model = model
         self.optimizer = optimizer
         self._native = NativeModel(kernel, model)
-        self._gradients = NativeGradients(self._native)
+        self._gradients: PatchGradients | NativeGradients
+        if isinstance(model, Hierarchical):
+            self._gradients = PatchGradients(self._native)
+        else:
+            self._gradients = NativeGradients(self._native)
         # Memory for the blur of each texture and of its gradient.
         self._tables, self._between, self._blurred = (
             [torch.empty_like(texture.texels) for texture in model.textures()] for _ in range(3)
         )
 
-    def step(
-        self, objective: Objective, batch: TrainingQueries, sigmas: Sequence[float], workers: Workers
-    ) -> Tensor:
+    def step(self, objective: Objective, batch: Batch, sigmas: Sequence[float], workers: Workers) -> Tensor:
         """One step on a batch, textures blurred by `sigmas` texels of the finest level; its mean loss."""
         textures = self.model.textures()
         blurs = [Blur(self.kernel, t, sigma) for t, sigma in zip(textures, sigmas, strict=True)]
@@ -50,7 +54,12 @@ class NativeStepper:
             else:
                 blur.apply(texture.texels.detach(), between, table, workers)
                 texture.read(table)
-        loss = self._gradients.compute(objective, batch, workers)
+        if isinstance(self._gradients, PatchGradients):
+            assert isinstance(batch, Patches)
+            loss = self._gradients.compute(objective, batch, workers)
+        else:
+            assert isinstance(batch, TrainingQueries)
+            loss = self._gradients.compute(objective, batch, workers)
         found: dict[Tensor, Tensor] = {}
         for k, (texture, blur) in enumerate(zip(textures, blurs, strict=True)):
             gradient = self._gradients.textures[k]
@@ -59,11 +68,7 @@ class NativeStepper:
                 blur.apply(gradient, self._between[k], self._blurred[k], workers)
                 gradient = self._blurred[k]
             found[texture.texels] = gradient
-        for network, gradients in zip(networks(self.model), self._gradients.networks, strict=True):
-            found.update(zip(network.parameters(), gradients, strict=True))
-        if isinstance(self.model, Relief):
-            weights = self.model.depth_weights
-            found[weights] = self._gradients.depth_weights[: len(weights)].contiguous()
+        found.update(self._gradients.weights())
         adam(self.kernel, self.optimizer, found, workers)
         return loss
 

@@ -83,10 +83,12 @@ class FourthRoot(Curve):
 
     def value(self, x: Tensor) -> Tensor:
         y = x.clamp_min(0)
-        return (y + _ROOT_FLOOR) ** 0.25 + (x - y) * self.slope(y)
+        return (y + _ROOT_FLOOR).sqrt().sqrt() + (x - y) * self.slope(y)
 
     def slope(self, x: Tensor) -> Tensor:
-        return 0.25 * (x.clamp_min(0) + _ROOT_FLOOR) ** -0.75
+        # Two square roots are several times faster than a power.
+        z = x.clamp_min(0) + _ROOT_FLOOR
+        return 0.25 * z.sqrt().sqrt() / z
 
     def curvature(self, x: Tensor) -> Tensor:
         return torch.where(x > 0, -0.1875 * (x.clamp_min(0) + _ROOT_FLOOR) ** -1.75, 0.0)
@@ -151,7 +153,9 @@ def relative(
     return ((p - t).square() / (detached.square() + 1)).mean()
 
 
-_TERMS: dict[LossKind, Callable[[Tensor, Tensor, Tensor, Tensor | None, Correction], Tensor]] = {
+# Of prediction, detached prediction, value, and its variance.
+Term = Callable[[Tensor, Tensor, Tensor, Tensor | None, Correction], Tensor]
+_TERMS: dict[LossKind, Term] = {
     "relative": relative,
     "squared": CurveTerm(Curve(), squared),
     "linear": CurveTerm(Curve(), absolute),
@@ -182,16 +186,24 @@ class Quadratic:
 class Objective:
     """Sum of a configuration's terms, for data of one noise model.
 
+    A term counts once a fraction of the training is spent, its ``start``.
+
     Parameters
     ----------
     training : TrainingSection
         Terms, their weights, correction and Huber threshold.
     noise : NoiseModel
         Model of the data's noise; its scale, the typical value of the data in 1/sr, is the unit of all terms.
+
+    Attributes
+    ----------
+    fraction : float
+        Fraction of the training that is spent; by default 1, so that all terms count.
     """
 
     def __init__(self, training: TrainingSection, noise: NoiseModel) -> None:
-        self._terms = [(term.weight, _TERMS[term.kind]) for term in training.losses]
+        self._all_terms = training.losses
+        self.fraction = 1.0
         self._correction = training.correction
         self._huber_delta = training.huber_delta
         self._noise = noise
@@ -199,6 +211,12 @@ class Objective:
         self._unit = noise.scale if noise.scale > 0 else 1.0
         quadratic = all(term.kind in _QUADRATIC for term in training.losses)
         self._needs_variance = training.correction != "none" and not quadratic
+
+    @property
+    def _terms(self) -> list[tuple[float, Term]]:
+        """Weight and function of the terms that count."""
+        counting = (term for term in self._all_terms if term.start <= self.fraction)
+        return [(term.weight, _TERMS[term.kind]) for term in counting]
 
     def quadratic(self) -> Quadratic | None:
         """The same loss for the compiled kernel; None if it has another form."""

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from mbtf_core.errors import InputError
 from mbtf_fit.config import FitConfig, TrainingSection
-from mbtf_fit.data.images import Patches, TrainingImages
+from mbtf_fit.data.images import TrainingImages
 from mbtf_fit.data.queries import HINT_BYTES, QUERY_BYTES, ShardQueries, TrainingQueries
 from mbtf_fit.data.slices import SharedSlices, SliceBatch, TrainingSlices
 from mbtf_fit.data.streaming import Selection, StreamedQueries
@@ -31,7 +31,7 @@ from mbtf_fit.models.neumip import Neumip
 from mbtf_fit.models.rainer import Rainer2019
 from mbtf_fit.models.relief import Relief
 from mbtf_fit.native import kernel
-from mbtf_fit.native.model import supports
+from mbtf_fit.native.model import supports, supports_patches
 from mbtf_fit.native.stepper import NativeStepper
 from mbtf_fit.objective.losses import Objective
 from mbtf_fit.objective.noise import NoiseModel
@@ -113,7 +113,9 @@ class Trainer:
         self.weight_decay = WeightDecay.of(config.training, noise.ratio, len(queries))
         found = kernel()
         self._stepper = (
-            NativeStepper(found, model, self.optimizer) if found is not None and supports(model) else None
+            NativeStepper(found, model, self.optimizer)
+            if found is not None and (supports(model) or supports_patches(model))
+            else None
         )
 
     @property
@@ -219,6 +221,7 @@ class Trainer:
             group["lr"] = rate
         self.weight_decay.apply(self.model, *rates)
         self._follow_heights()
+        self.loss.fraction = self.fraction
         if isinstance(self.model, Relief) and isinstance(batch, TrainingQueries) and batch.hints is None:
             batch = replace(batch, hints=_hints(self.model, batch))
         if isinstance(batch, SliceBatch):
@@ -228,7 +231,7 @@ class Trainer:
                 p.grad = g
             self.optimizer.step()
             return loss
-        if self._stepper is not None and not isinstance(batch, Patches):
+        if self._stepper is not None:
             return self._stepper.step(self.loss, batch, self._sigmas(), workers)
         texels, weights = self.model.parameter_groups()
         # Lookups read detached tables; their gradients pass through the blur once, for the whole batch.
@@ -241,7 +244,9 @@ class Trainer:
         for p, g in zip(texels, torch.autograd.grad(tables, texels, by_table), strict=True):
             p.grad = g
         for p, g in zip(weights, by_weight, strict=True):
-            p.grad = g
+            # Gradients of convolutions have the channels last in memory, which PyTorch's fused Adam does not
+            # support on CPUs: it would mix up the weights.
+            p.grad = g.contiguous()
         self.optimizer.step()
         return loss
 

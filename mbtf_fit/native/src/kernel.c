@@ -11,7 +11,7 @@
 
 #define EXPORT __attribute__((visibility("default")))
 
-enum { PLAIN, RECTIFY, GATE };
+enum { PLAIN, RECTIFY, GATE, ADD };
 
 static inline int32_t padded(int32_t channels) { return (channels + 7) / 8 * 8; }
 
@@ -31,6 +31,8 @@ static inline int64_t network_rows(const mbtf_network *net) {
 static int64_t state_floats(const mbtf_model *m) {
     return BLOCK * (8 + network_rows(&m->decoder) + (m->offset.layers ? network_rows(&m->offset) : 0));
 }
+
+#include "patches.h"
 
 #define JOIN_(a, b) a##b
 #define JOIN(a, b) JOIN_(a, b)
@@ -116,15 +118,17 @@ EXPORT int32_t mbtf_layout(void) { return (int32_t)(sizeof(mbtf_model) + 4096 * 
 EXPORT int64_t mbtf_state_floats(const mbtf_model *m) { return state_floats(m); }
 EXPORT int64_t mbtf_scratch_floats(void) { return 2 * MAX_WIDTH * BLOCK; }
 
-/* Matrix (outputs, inputs), element (o, i) at w[o·down + i·across], into tiles of at most `most` outputs. */
-static float *pack_matrix(const float *w, int64_t down, int64_t across, const float *bias, int outputs,
+/* Weights (outputs, inputs, taps), element (o, i, t) at w[o·down + i·across + t], into tiles of at most `most`
+ * outputs. */
+static float *pack_matrix(const float *w, int64_t down, int64_t across, int taps, const float *bias, int outputs,
                           int inputs, int most, float *to) {
     const int tiles = (outputs + most - 1) / most;
     for (int t = 0, o = 0; t < tiles; t++) {
         const int R = outputs / tiles + (t < outputs % tiles);
         for (int r = 0; r < R; r++) *to++ = bias ? bias[o + r] : 0.0f;
         for (int i = 0; i < inputs; i++)
-            for (int r = 0; r < R; r++) *to++ = w[(o + r) * down + i * across];
+            for (int tap = 0; tap < taps; tap++)
+                for (int r = 0; r < R; r++) *to++ = w[(o + r) * down + i * across + tap];
         o += R;
     }
     return to;
@@ -142,9 +146,9 @@ EXPORT void mbtf_pack(int32_t variant, const mbtf_network *net, const float *con
     for (int k = 0; k < net->layers; k++) {
         const int inputs = net->widths[k], outputs = net->widths[k + 1];
         const float *w = parameters[2 * k];
-        pack_matrix(w, inputs, 1, parameters[2 * k + 1], outputs, inputs, most, packed);
+        pack_matrix(w, inputs, 1, 1, parameters[2 * k + 1], outputs, inputs, most, packed);
         float *transposed = packed + packed_forward(inputs, outputs);
-        pack_matrix(w, 1, inputs, NULL, k ? inputs : net->wanted, outputs, most, transposed);
+        pack_matrix(w, 1, inputs, 1, NULL, k ? inputs : net->wanted, outputs, most, transposed);
         packed += packed_layer(inputs, outputs);
     }
 }
@@ -169,23 +173,113 @@ EXPORT double mbtf_learn(int32_t variant, const mbtf_model *m, const mbtf_querie
     return VARIANTS[variant]->learn(m, q, targets, loss, share, state, scratch, out, to);
 }
 
-/* Partial sums of all threads into gradients (weight 0, bias 0, ...), in a fixed order; clears them. */
+/* Partial sums of all threads, from number `at` on, into gradients, in a fixed order; clears them. */
+static void collect_sums(float *const *sums, int64_t at, int64_t threads, int64_t count, float *gradient) {
+    for (int64_t i = 0; i < count; i++, at += LANES) {
+        double sum = 0.0;
+        for (int64_t t = 0; t < threads; t++)
+            for (int lane = 0; lane < LANES; lane++) {
+                sum += sums[t][at + lane];
+                sums[t][at + lane] = 0.0f;
+            }
+        gradient[i] = (float)sum;
+    }
+}
+
+/* Those of a network (weight 0, bias 0, ...). */
 EXPORT void mbtf_collect_weights(const mbtf_network *net, float *const *sums, int64_t threads,
                                  float *const *gradients) {
     int64_t at = 0;
     for (int k = 0; k < 2 * net->layers; k++) {
         const int64_t outputs = net->widths[k / 2 + 1];
         const int64_t count = k % 2 ? outputs : outputs * net->widths[k / 2];
-        for (int64_t i = 0; i < count; i++, at += LANES) {
-            double sum = 0.0;
-            for (int64_t t = 0; t < threads; t++)
-                for (int lane = 0; lane < LANES; lane++) {
-                    sum += sums[t][at + lane];
-                    sums[t][at + lane] = 0.0f;
-                }
-            gradients[k][i] = (float)sum;
-        }
+        collect_sums(sums, at, threads, count, gradients[k]);
+        at += LANES * count;
     }
+}
+
+/* Those of an Inception decoder, likewise. */
+EXPORT void mbtf_collect_inception(const mbtf_inception *d, float *const *sums, int64_t threads,
+                                   float *const *gradients) {
+    convolution list[MAX_CONVOLUTIONS];
+    const int count = convolutions(d, list);
+    for (int k = 0; k < count; k++) {
+        const int64_t weights = (int64_t)list[k].outputs * columns_of(&list[k]);
+        collect_sums(sums, LANES * list[k].sums, threads, weights, gradients[2 * k]);
+        collect_sums(sums, LANES * (list[k].sums + weights), threads, list[k].outputs, gradients[2 * k + 1]);
+    }
+}
+
+EXPORT int64_t mbtf_inception_floats(const mbtf_inception *d) {
+    convolution list[MAX_CONVOLUTIONS];
+    const convolution *last = &list[convolutions(d, list) - 1];
+    return last->packed + packed_layer(last->inputs, last->outputs);
+}
+
+/* `parameters`: weight (outputs, inputs, size, size) and bias of each convolution. */
+EXPORT void mbtf_pack_inception(int32_t variant, const mbtf_inception *d, const float *const *parameters,
+                                float *packed) {
+    convolution list[MAX_CONVOLUTIONS];
+    const int count = convolutions(d, list), most = VARIANTS[variant]->tile_outputs;
+    for (int k = 0; k < count; k++) {
+        const convolution *c = &list[k];
+        const int taps = c->size * c->size;
+        const float *w = parameters[2 * k];
+        pack_matrix(w, columns_of(c), taps, taps, parameters[2 * k + 1], c->outputs, c->inputs, most, packed + c->packed);
+        pack_matrix(w, taps, columns_of(c), taps, NULL, c->inputs, c->outputs, most, packed + c->transposed);
+    }
+}
+
+EXPORT int64_t mbtf_patch_state_floats(const mbtf_model *m, int32_t rows, int32_t columns, int64_t items) {
+    const patch_layout l = layout_of(m, rows, columns, items);
+    return l.flat_floats + l.blocks * l.block_floats;
+}
+
+EXPORT int64_t mbtf_patch_scratch_floats(const mbtf_model *m, int32_t rows, int32_t columns, int64_t items) {
+    const patch_layout l = layout_of(m, rows, columns, items);
+    return l.scratch_floats;
+}
+
+/* Values (items, rows, columns, 3) of patches without their margins, `group` items at a time. `state` keeps those
+ * of all groups where `keep`, of one group otherwise. */
+EXPORT void mbtf_patch_forward(int32_t variant, const mbtf_model *m, const mbtf_patches *p, int64_t group,
+                               int32_t clamp, int32_t keep, float *state, float *out) {
+    const int64_t floats = keep ? mbtf_patch_state_floats(m, p->rows, p->columns, group) : 0;
+    for (int64_t first = 0; first < p->items; first += group, state += floats) {
+        const mbtf_patches part = part_of(m, p, first, group);
+        VARIANTS[variant]->patch_forward(m, &part, clamp, keep, state, out + first * values_of(m, p));
+    }
+}
+
+/* Gradients after a forward that kept its state; those by `inputs` (items, m->inputs) where there are modules. */
+EXPORT void mbtf_patch_backward(int32_t variant, const mbtf_model *m, const mbtf_patches *p, int64_t group,
+                                const float *state, const float *by_value, float *by_inputs, float *scratch,
+                                const mbtf_gradients *to) {
+    const int64_t floats = mbtf_patch_state_floats(m, p->rows, p->columns, group);
+    for (int64_t first = 0; first < p->items; first += group, state += floats) {
+        const mbtf_patches part = part_of(m, p, first, group);
+        VARIANTS[variant]->patch_backward(m, &part, state, by_value + first * values_of(m, p),
+                                          by_inputs + first * m->inputs, scratch, to);
+    }
+}
+
+/* Both at once with a quadratic loss, as in mbtf_learn. `out` has room for the values of two groups. */
+EXPORT double mbtf_patch_learn(int32_t variant, const mbtf_model *m, const mbtf_patches *p, int64_t group,
+                               const float *targets, const mbtf_loss *loss, float share, float *state,
+                               float *out, float *by_inputs, float *scratch, const mbtf_gradients *to) {
+    const int64_t values = values_of(m, p);
+    double sum = 0.0;
+    for (int64_t first = 0; first < p->items; first += group) {
+        const mbtf_patches part = part_of(m, p, first, group);
+        float *by_value = out + group * values;
+        VARIANTS[variant]->patch_forward(m, &part, 0, 1, state, out);
+        for (int64_t at = 0; at < part.items * values; at += 3 * BLOCK) {
+            const int64_t left = part.items * values - at, n = left < 3 * BLOCK ? left : 3 * BLOCK;
+            sum += VARIANTS[variant]->loss(loss, out + at, targets + first * values + at, n, share, by_value + at);
+        }
+        VARIANTS[variant]->patch_backward(m, &part, state, by_value, by_inputs + first * m->inputs, scratch, to);
+    }
+    return sum;
 }
 
 EXPORT void mbtf_collect(int32_t variant, float *const *sums, int64_t threads, int64_t channels, int64_t from,

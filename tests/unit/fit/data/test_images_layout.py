@@ -23,6 +23,7 @@ from mbtf_fit.evaluation import evaluate_splits
 from mbtf_fit.models.hierarchical import Hierarchical
 from mbtf_fit.models.registry import build_model
 from mbtf_fit.training.fit import prepare_trainer
+from mbtf_fit.training.trainer import BETAS
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.sampling.query_sampler import Mixture, QueryPlan
 
@@ -280,6 +281,26 @@ def test_a_hierarchical_material_is_fitted_and_loads_again(tmp_path: Path) -> No
     found = material.evaluate(*queries.values())
     alone = material.evaluate(*(a[500:501] for a in queries.values()))
     np.testing.assert_allclose(alone[0], found[500], rtol=1e-4, atol=1e-6)
+
+
+def test_every_weight_gets_its_own_gradient(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Gradients of convolutions have another order in memory than the weights."""
+    monkeypatch.setattr("mbtf_fit.training.trainer.kernel", lambda: None)
+    data = Dataset.open(write_images(tmp_path / "d", parallax, train=8))
+    config = quick(1)
+    trainer = prepare_trainer(config, data, load_training(data, config.held_out, 0), torch.device("cpu"))
+    batch = next(trainer._batches())
+    assert isinstance(trainer.model, Hierarchical)
+    assert isinstance(batch, Patches)
+    for texture, table in zip(trainer.model.textures(), trainer._tables(), strict=True):
+        texture.read(table.detach())
+    found = trainer.model.evaluate_patches(batch.u, batch.sigma, batch.omega_i, batch.omega_o)
+    weights = trainer.model.parameter_groups()[1]
+    expected = torch.autograd.grad(trainer.loss(found, batch), weights)
+    trainer.train(60.0)
+    for weight, gradient in zip(weights, expected, strict=True):
+        moment = trainer.optimizer.state[weight]["exp_avg"] / (1 - BETAS[0])
+        assert float((moment - gradient).norm()) <= 1e-3 * float(gradient.norm()) + 1e-9
 
 
 def test_the_other_layout_is_refused_with_a_hint(tmp_path: Path) -> None:

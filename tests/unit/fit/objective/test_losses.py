@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from pydantic import ValidationError
 from torch import Tensor
 
+from mbtf_core.lattice import Lattice
 from mbtf_fit.config import TrainingSection
 from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.objective.losses import Curve, FourthRoot, Log, Objective
@@ -168,3 +170,24 @@ def test_the_gradient_term_depends_on_differences_of_neighbors_alone() -> None:
     # Five differences along each row, one of them the edge; half the weight is that of columns.
     assert float(loss(edge, data)) == pytest.approx(height / 5 / 2)
     assert float(objective("gradient", 0.01)(edge, data)) > 0
+
+
+def test_a_term_counts_from_its_start_on() -> None:
+    terms = [{"kind": "fourth-root"}, {"kind": "gradient", "weight": 3.0, "start": 0.25}]
+    both = Objective(TrainingSection.model_validate({"losses": terms}), NoiseModel.silent(SCALE, Lattice(3)))
+    first = objective("fourth-root")
+    value, p = torch.rand(2, 5, 5, 3), torch.rand(2, 5, 5, 3)
+    whole = both(p, patches(value))
+    both.fraction = 0.2
+    torch.testing.assert_close(both(p, patches(value)), first(p, patches(value)))
+    both.fraction = 0.25
+    torch.testing.assert_close(both(p, patches(value)), whole)
+    assert float(whole) > float(first(p, patches(value))) + 0.1
+    # A quadratic start is one for the kernel.
+    terms = [{"kind": "relative"}, {"kind": "log", "start": 0.5}]
+    mixed = Objective(TrainingSection.model_validate({"losses": terms}), NoiseModel.silent(SCALE, Lattice(3)))
+    assert mixed.quadratic() is None
+    mixed.fraction = 0.4
+    assert mixed.quadratic() is not None
+    with pytest.raises(ValidationError, match="no term counts from the start"):
+        TrainingSection.model_validate({"losses": terms[1:]})
