@@ -101,4 +101,5 @@ def _check_stored(found: Any, name: str, path: Path) -> None:
 
 def floats(found: Any, start: int, stop: int) -> NDArray[np.float64]:
     """Numbers of the first axis from `start` to before `stop`; those beyond the range become infinite."""
-    return np.asarray(found[start:stop]).astype(np.float64)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(found[start:stop]).astype(np.float64)

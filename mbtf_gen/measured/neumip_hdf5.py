@@ -28,10 +28,12 @@ from numpy.typing import NDArray
 from mbtf_core.atomic import write_through
 from mbtf_core.errors import InputError
 from mbtf_gen.measured.hdf5 import data_set, floats, opened
-from mbtf_gen.measured.interface import F32, HORIZON, Queries, check_texels, from_plane
+from mbtf_gen.measured.interface import F32, HORIZON, Queries, from_plane
 
 COLOR, PLACE, RADIUS = "ground_color", "ground_camera_target_loc", "ground_camera_query_radius"
 VIEW, LIGHT, OTHER_LIGHT = "ground_camera_dir", "ground_light", "ground_light_dir"
+# Most queries of an image, which is read as a whole.
+_MOST_OF_IMAGE = 1 << 24
 _CHANNELS = {COLOR: 3, PLACE: 2, RADIUS: 1, VIEW: 2, LIGHT: 2}
 
 
@@ -140,7 +142,8 @@ def read_neumip(path: str | Path) -> NeumipQueries:
                     f"has the shape {found} of '{stored}'; {(*shape, channels)} is expected", where=path
                 )
         assert shape is not None
-        check_texels(math.prod(shape[1:]), 1, path)
+        if math.prod(shape[1:]) > _MOST_OF_IMAGE:
+            raise InputError(f"has images of more than {_MOST_OF_IMAGE:,} queries", where=path)
         base = file.attrs.get("base_radius")
     if base is None:
         return NeumipQueries(path, shape, light, 0.5 / shape[2] if len(shape) == 3 else None)
@@ -186,7 +189,8 @@ def write_neumip(
     """
     path = Path(path)
     each = image[0] * image[1]
-    check_texels(image[0], image[1], path)
+    if min(image) < 1 or each > _MOST_OF_IMAGE:
+        raise InputError(f"images of {image[0]} x {image[1]} queries are not written", where=path)
     written = 0
 
     def write(temporary: Path) -> None:

@@ -53,7 +53,7 @@ class NeuralBtf:
         order = np.argsort(pair, kind="stable")
         used, starts = np.unique(pair[order], return_index=True)
         row, column = np.divmod(texel, self.columns)
-        with opened(self.path) as file, np.errstate(over="ignore"):
+        with opened(self.path) as file, np.errstate(over="ignore", invalid="ignore"):
             color = data_set(file, COLOR, self.path)
             if color.shape != (*self._shape, 3):
                 raise InputError("has changed while it was read", where=self.path)

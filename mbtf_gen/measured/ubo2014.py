@@ -97,7 +97,8 @@ class _Cursor:
 
     def floats(self, count: int, what: str) -> NDArray[np.float64]:
         """Finite float32 numbers."""
-        numbers = np.frombuffer(self.bytes(4 * count, what), "<f4").astype(np.float64)
+        with np.errstate(invalid="ignore"):
+            numbers = np.frombuffer(self.bytes(4 * count, what), "<f4").astype(np.float64)
         if not np.isfinite(numbers).all():
             raise InputError(f"has NaN or infinite numbers in {what}", where=self.path)
         return numbers

@@ -9,15 +9,11 @@ import pytest
 from support import measured_files as files
 
 from mbtf_core.errors import InputError
-from mbtf_gen.measured.interface import MeasuredBtf, MeasuredQueries
 from mbtf_gen.measured.neumip_hdf5 import NeumipQueries
 from mbtf_gen.measured.neural_btf_hdf5 import NeuralBtf
 from mbtf_gen.measured.open import open_measured
 from mbtf_gen.measured.ubo2003 import Ubo2003
 from mbtf_gen.measured.ubo2014 import Ubo2014
-
-# The type checker compares the readers with what they promise.
-READERS: list[type[MeasuredBtf] | type[MeasuredQueries]] = [Ubo2003, Ubo2014, NeuralBtf, NeumipQueries]
 
 
 def test_each_kind(tmp_path: Path) -> None:
