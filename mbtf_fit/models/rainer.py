@@ -171,12 +171,9 @@ class Rainer2019(NeuralMaterial):
                 self.encode(slices.values[a : a + _AT_ONCE], slices.omega_i, slices.omega_o)
                 for a in range(0, len(slices.values), _AT_ONCE)
             ]
-            finest = torch.cat(parts).t().view(1, -1, *self.lattice.shape())
-            levels = [
-                nn.functional.adaptive_avg_pool2d(finest, self.lattice.shape(s)).flatten(2)[0].t()
-                for s in range(self.lattice.finest + 1)
-            ]
-            self.pyramid.texels.copy_(torch.cat(levels))
+            finest = torch.cat(parts)
+            self.pyramid.texels[-len(finest) :] = finest
+        self.pyramid.average_coarser(self.lattice.finest)
 
     def formula(self) -> dict[str, str]:
         return {

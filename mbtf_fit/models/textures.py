@@ -63,6 +63,16 @@ class FeatureTextures(nn.Module):
             parts.append(blurred.reshape(texture.shape))
         return torch.cat(parts)
 
+    def average_coarser(self, first: int) -> None:
+        """Replace all levels coarser than `first` by averages of that level."""
+        starts, shapes = self.packing.starts, self.packing.shapes
+        if first == 0:
+            return
+        with torch.no_grad():
+            finer = self.texels[starts[first] : starts[first + 1]].t().view(1, -1, *shapes[first])
+            averages = (nn.functional.adaptive_avg_pool2d(finer, shape)[0] for shape in shapes[:first])
+            self.texels[: starts[first]] = torch.cat([a.flatten(1).t() for a in averages])
+
     def export(self) -> dict[str, Tensor]:
         """Current table by level, ``0`` the coarsest: (rows, columns, channels) each."""
         starts, table = self.packing.starts, self.table.detach()

@@ -220,6 +220,7 @@ def _fit(
     subset = validation_subset(trainer.model.positions, queries)
     del queries
     _train(trainer, subset, out, progress)
+    trainer.fill_levels()
     trainer.calibrate()
     errors = evaluate_splits(trainer.predict, data, partition)
     variance = errors["training"].overall.variance.value

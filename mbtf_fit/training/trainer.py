@@ -280,6 +280,13 @@ class Trainer:
         )
         model.calibration = torch.from_numpy(found).to(self.device)
 
+    def fill_levels(self) -> None:
+        """Give levels of the pyramid that are coarser than all data the averages of the coarsest level with
+        data. Measured BTFs have one footprint: their coarser levels would keep their initial noise."""
+        reached = [level for level, share in self.coverage().items() if share > 0]
+        if reached:
+            self.model.pyramid.average_coarser(min(reached))
+
     def coverage(self) -> dict[int, float]:
         """Level → fraction of the pyramid's texels that have received gradients."""
         pyramid = self.model.pyramid

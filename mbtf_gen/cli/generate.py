@@ -134,6 +134,11 @@ def describe(summary: Summary, *, ran: bool = True) -> str:
         )
     elif ran:
         lines.append("  this run: nothing left to do")
+    if summary.measured:
+        lines.append(
+            f"  mean value {sum(summary.mean_value) / 3:.4g} 1/sr; one value per query: its noise is unknown"
+        )
+        return "\n".join(lines)
     noise = f"pooled noise of a training query {summary.relative_error:.1%} of the mean"
     if summary.complete and summary.relative_error > 0:
         # The variance of every value falls at least like one over the number of paths.

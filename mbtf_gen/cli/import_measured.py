@@ -8,7 +8,8 @@ from pathlib import Path
 from mbtf_core.console import CONSOLE, Console
 from mbtf_core.interruption import keep_on_interruption
 from mbtf_core.options import Options, Output, Overwrite, PathText, takes_options
-from mbtf_core.units import clock, size_text
+from mbtf_core.units import size_text
+from mbtf_gen.cli.generate import describe
 from mbtf_gen.config.measured import ImportConfig
 
 
@@ -51,9 +52,4 @@ def import_measured(
     keep_on_interruption(f"the shards that are finished are kept in {output}")
     with console.progress(total=total, label="importing", unit="queries") as bar:
         summary = run(job, output, overwrite=overwrite, progress=bar.update)
-    mean = sum(summary.mean_value) / 3
-    text = (
-        f"{output}: {summary.splits['train']} training + {summary.splits['test']} test queries in "
-        f"{clock(summary.seconds)}\n  mean value {mean:.4g} 1/sr; one value per query: its noise is unknown"
-    )
-    console.report(asdict(summary), text)
+    console.report(asdict(summary), describe(summary))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from mbtf_core.console import CONSOLE, Console
-from mbtf_core.errors import UsageError
+from mbtf_core.errors import InputError, UsageError
 from mbtf_core.options import Options, Output, Overwrite, PathText, Switch, takes_options
 from mbtf_gen.cli.generate import resolve_config
 from mbtf_gen.config.pictures import RENDERING, PreviewConfig
@@ -50,6 +50,12 @@ def preview(
                 f"{material} holds a data set, whose configuration is fixed",
                 where=given[0],
                 hint="leave it out, or name the material instead of its shards",
+            )
+        if dataset.estimates == 1:
+            raise InputError(
+                "holds measured data, whose surface is unknown",
+                where=material,
+                hint="fit it, then: mbtf-fit preview MATERIAL",
             )
         resolved = options.resolve(**dataset.manifest["config"])
     else:

@@ -65,6 +65,8 @@ class Summary:
     target : dict or None
         Under a target error: the RMS error ``reached``, the number of queries that ``missed`` it, their
         ``share``, and the ``worst`` error among them.
+    measured : bool
+        Whether the values are measured, not rendered.
     """
 
     folder: str
@@ -84,6 +86,7 @@ class Summary:
     nonfinite: int
     effects: list[str]
     target: dict[str, float] | None
+    measured: bool = False
 
 
 class ShardStatistics:
@@ -258,5 +261,6 @@ def finish(
         capped=totals.counts["capped_rays"],
         nonfinite=totals.counts["nonfinite_samples"],
         effects=[EFFECTS[e.name] for e in effects if e.on],
+        measured=measured,
         **sums,
     )

@@ -20,6 +20,9 @@ from mbtf_gen.meshes.mesh_file import MESH_FILES, MeshFile
 
 Described = MaterialFile | ClothFile | MeshFile
 
+# Files that are imported, not rendered.
+MEASURED_FILES = (".btf", ".h5", ".hdf5")
+
 _YAML = ("material.yaml", "material.yml")
 
 
@@ -94,6 +97,8 @@ def described(path: Path) -> tuple[Described, Path, FoundMaps]:
         return build(ClothFile, {CURVE_FILES[suffix]: path.name}, source=str(path)), path.parent, FoundMaps()
     if suffix in MESH_FILES:
         return build(MeshFile, {"mesh": path.name}, source=str(path)), path.parent, FoundMaps()
+    if suffix in MEASURED_FILES:
+        raise InputError("is a measured BTF", where=path, hint=f"import it: mbtf-gen import {path}")
     if not is_image(path):
         raise InputError(
             f"'{path.suffix}' is not a height map",

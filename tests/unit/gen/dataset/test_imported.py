@@ -21,6 +21,7 @@ from mbtf_gen.dataset.imported import Import, import_measured
 from mbtf_gen.dataset.reader import Dataset
 from mbtf_gen.dataset.verify import verify
 from mbtf_gen.repairs import Corruption
+from mbtf_gen.sampling.slice_directions import slice_directions
 
 Open = Callable[..., Import]
 
@@ -154,3 +155,18 @@ def test_errors_of_a_fit_include_the_noise(opened: Open, tmp_path: Path) -> None
     streamed = load_training(Dataset.open(tmp_path / "shards"), config.held_out, 0, memory=None).training
     kept = load_training(Dataset.open(tmp_path / "shards"), config.held_out, 0).training
     assert (streamed.slice(5, 50).value == kept.slice(5, 50).value).all()  # type: ignore[union-attr]
+
+
+def test_levels_without_data_are_averages(opened: Open, tmp_path: Path) -> None:
+    queries = {"train": "400/texel", "test": "500", "min_cos": 0.2}
+    import_measured(opened(Images(lights=16), queries=queries), tmp_path / "shards")
+    config = FitConfig.model_validate({"model": "neumip-baseline", "training": {"steps": 400, "batch": 4096}})
+    material = fit(config, tmp_path / "shards", tmp_path / "fit").material
+    pyramid = material.model.pyramid.export()
+    np.testing.assert_allclose(pyramid["0"][0, 0], pyramid["3"].mean((0, 1)), atol=1e-5)
+    omega = slice_directions("spiral", 40, 0.3)
+    light, view = omega[:20], omega[20:]
+    found = material.evaluate(np.full((20, 2), 0.5), np.full(20, 0.5), light, view)
+    grid = (np.stack(np.mgrid[:12, :12], -1).reshape(-1, 2) + 0.5) / 12
+    mean = np.mean([known(np.repeat(u[None], 20, 0), light, view) for u in grid], axis=0)
+    assert np.abs(found - mean).mean() < 0.1 * mean.mean()
