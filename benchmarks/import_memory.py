@@ -9,6 +9,7 @@ in a process of its own, and removes both.
 from __future__ import annotations
 
 import argparse
+import json
 import resource
 import subprocess
 import sys
@@ -22,9 +23,11 @@ from mbtf_gen.measured.neural_btf_hdf5 import write_neural_btf
 from mbtf_gen.sampling.slice_directions import direction_pairs, slice_directions
 
 SIDE = 128
+# Largest peak in GiB.
+THRESHOLD = 4.0
 
 
-def main() -> None:
+def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--values", type=int, default=100_000_000)
     parser.add_argument("--folder", type=Path)
@@ -40,8 +43,10 @@ def main() -> None:
         subprocess.run([*command, "--queries", str(arguments.values), "-o", "shards"], cwd=folder, check=True)
         seconds = time.perf_counter() - start
         peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20
-        print(f"{arguments.values} values: {seconds:.0f} s, {peak:.2f} GiB at most")
+    print(f"{arguments.values} values: {seconds:.0f} s, {peak:.2f} GiB at most")
+    print(json.dumps({"values": arguments.values, "seconds": seconds, "gib": peak, "threshold": THRESHOLD}))
+    return int(peak > THRESHOLD)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
